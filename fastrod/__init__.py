@@ -1,0 +1,1 @@
+"""fastrod: tendon-driven continuum robots, simulated in batches and corrected by measured data."""

@@ -1,0 +1,40 @@
+"""Every exception that fastrod raises on purpose: what was given, what would be right, the nearest known name."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class FastrodError(Exception):
+    """Base of every error that a user can cause and mend; the command line exits with 2 on it."""
+
+
+class RobotError(FastrodError, ValueError):
+    """A robot description that cannot be a robot."""
+
+
+class InputError(FastrodError, ValueError):
+    """An actuation, a load or a pose of the wrong shape, unit or range."""
+
+
+class LogError(FastrodError, ValueError):
+    """A run log that cannot be read, with the row and the column named."""
+
+
+class UnknownNameError(FastrodError, KeyError):
+    """A name that is not known, answered with the near ones."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """The end of an error sentence: the nearest known name, or all of them.
+
+    >>> nearest("lenght", ["length", "mode"])
+    "did you mean 'length'?"
+    """
+    names = sorted(known)
+    close = difflib.get_close_matches(name, names, n=1)
+    return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names) or 'none'}."

@@ -1,0 +1,216 @@
+"""The words of a robot: `Tendon`, `Segment`, `Robot`; frozen and validated once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fastrod.errors import RobotError, UnknownNameError, nearest
+
+Mode: TypeAlias = Literal["tendon_length", "tendon_tension", "passive", "paper"]
+"""Boundary mode of a segment: what is prescribed at its end (model.md, four boundary modes)."""
+
+MODES: tuple[str, ...] = get_args(Mode)
+_LONGEST = 10.0  # m; a longer segment or offset was given in mm
+
+
+def _positive(where: str, value: float, unit: str) -> None:
+    if not (math.isfinite(value) and value > 0.0):
+        raise RobotError(f"{where} is {value!r} {unit}; it must be positive and finite.")
+
+
+def _finite(where: str, values: tuple[float, ...], count: int, unit: str) -> None:
+    if len(values) != count or not all(math.isfinite(v) for v in values):
+        raise RobotError(f"{where} is {list(values)!r}; it must be {count} finite numbers [{unit}].")
+
+
+def _per_segment(value: float | tuple[float, ...], n_crossed: int, where: str) -> tuple[float, ...]:
+    if not isinstance(value, tuple):
+        return (float(value),) * n_crossed
+    if len(value) != n_crossed:
+        raise RobotError(
+            f"{where} has {len(value)} values; give one, or {n_crossed}: one for each segment that the tendon crosses, base first."
+        )
+    return value
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tendon:
+    """A wire along the backbone, fixed at the end of its segment (the paper's pull wire).
+
+    A tendon of a distal segment crosses the proximal ones; `offset` and `angle` are then one number for all
+    segments or a tuple with one for each segment crossed, base first.
+
+    >>> Tendon(offset=0.01, angle=0.0).position(1)
+    ((0.01, 0.0),)
+    """
+
+    offset: float | tuple[float, ...]
+    """Distance from the backbone [m]."""
+    angle: float | tuple[float, ...]
+    """Position around it, from d1 toward d2 [rad]."""
+    compliance: float = 1e-5
+    """Stretch per tension, l(l) = L + compliance (T - pretension) [m/N]; 0 is an inextensible wire."""
+    pretension: float = 0.0
+    """Tension at which the tendon has its commanded length [N]."""
+    unilateral: bool = False
+    """True: a wire that goes slack at T = 0; False: a push-pull rod that carries T < 0 too."""
+
+    def __post_init__(self) -> None:
+        for offset in self.offset if isinstance(self.offset, tuple) else (self.offset,):
+            _positive("Tendon.offset", offset, "m")
+        angles = self.angle if isinstance(self.angle, tuple) else (self.angle,)
+        _finite("Tendon.angle", angles, len(angles), "rad")
+        if any(abs(a) > 4.0 * math.pi for a in angles):
+            raise RobotError(f"Tendon.angle is {self.angle!r} rad; more than two turns. Was it given in degrees?")
+        if not (math.isfinite(self.compliance) and self.compliance >= 0.0):
+            raise RobotError(f"Tendon.compliance is {self.compliance!r} m/N; it must be zero or positive, for example 1e-5.")
+        if not math.isfinite(self.pretension) or (self.unilateral and self.pretension < 0.0):
+            raise RobotError(f"Tendon.pretension is {self.pretension!r} N; it must be finite, and not negative for a wire that can go slack.")
+
+    def position(self, n_crossed: int) -> tuple[tuple[float, float], ...]:
+        """Position d_i in the material frame [m] in each of the `n_crossed` segments, base first."""
+        offset = _per_segment(self.offset, n_crossed, "Tendon.offset")
+        angle = _per_segment(self.angle, n_crossed, "Tendon.angle")
+        return tuple((d * math.cos(b), d * math.sin(b)) for d, b in zip(offset, angle, strict=True))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Segment:
+    """A length of backbone with one stiffness, and the tendons that end at its end."""
+
+    length: float
+    """Backbone length without extension [m]."""
+    bending_stiffness: tuple[float, float]
+    """EI about d1 and about d2 [N m^2]."""
+    torsional_stiffness: float
+    """GJ [N m^2]."""
+    extension: tuple[float, float] = (0.0, 0.0)
+    """Allowed change of length, smallest and largest [m]."""
+    precurvature: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """u*, curvature without moment, material frame [1/m]."""
+    body_radius: float = 0.0
+    """Radius of the body, for contact and drawing [m]; 0 stands for just beyond the outermost tendon."""
+    line_density: float = 0.0
+    """Mass per length [kg/m]; 0 is weightless."""
+    mode: Mode = "tendon_length"
+    tendons: tuple[Tendon, ...] = ()
+
+    def __post_init__(self) -> None:
+        _positive("Segment.length", self.length, "m")
+        if self.length > _LONGEST:
+            raise RobotError(f"Segment.length is {self.length!r} m; more than {_LONGEST:g} m. Was it given in mm?")
+        if len(self.bending_stiffness) != 2:
+            raise RobotError(f"Segment.bending_stiffness is {list(self.bending_stiffness)!r}; give EI_x and EI_y [N m^2].")
+        for value in self.bending_stiffness:
+            _positive("Segment.bending_stiffness", value, "N m^2")
+        _positive("Segment.torsional_stiffness", self.torsional_stiffness, "N m^2")
+        _finite("Segment.precurvature", self.precurvature, 3, "1/m")
+        _finite("Segment.extension", self.extension, 2, "m")
+        low, high = self.extension
+        if not -self.length < low <= 0.0 <= high <= _LONGEST:
+            raise RobotError(
+                f"Segment.extension is {list(self.extension)!r} m; give [smallest, largest] change of the {self.length:g} m length, around 0."
+            )
+        if not (math.isfinite(self.line_density) and self.line_density >= 0.0):
+            raise RobotError(f"Segment.line_density is {self.line_density!r} kg/m; it must be zero or positive.")
+        if self.mode not in MODES:
+            raise RobotError(f"Segment.mode is {self.mode!r}; {nearest(str(self.mode), MODES)}")
+        if self.mode == "passive" and self.tendons:
+            raise RobotError(f"A passive segment has no tendons; it was given {len(self.tendons)}.")
+        if self.mode != "passive" and not self.tendons:
+            raise RobotError(f"A segment in mode {self.mode!r} needs tendons; give some, or mode 'passive'.")
+        if not (math.isfinite(self.body_radius) and 0.0 <= self.body_radius <= _LONGEST):
+            raise RobotError(f"Segment.body_radius is {self.body_radius!r} m; it must be between 0 and {_LONGEST:g} m. Was it given in mm?")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Robot:
+    """A chain of segments on a base, and the world it stands in.
+
+    >>> wire = Tendon(offset=0.0075, angle=0.0)
+    >>> rod = Segment(length=0.07, bending_stiffness=(0.0022, 0.0022), torsional_stiffness=0.001, tendons=(wire,))
+    >>> Robot(name="one", segments=(rod,)).rest_tendon_length
+    array([0.07])
+    """
+
+    name: str
+    segments: tuple[Segment, ...]
+    base_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """World frame [m]."""
+    base_quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    """world_from_base, w x y z; d3 of the base is the rod's first tangent."""
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
+    """World frame [m/s^2]."""
+    log_points: tuple[float, ...] = ()
+    """Arclengths of the further measured points p1 ... pk of a run log [m]."""
+    fit: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Parameters that are not known exactly, each with its prior (contracts: `[fit]`)."""
+    sensor: Mapping[str, float] = field(default_factory=dict)
+    """Priors of the measurement (contracts: `[sensor]`)."""
+
+    def __post_init__(self) -> None:
+        if not self.segments:
+            raise RobotError(f"Robot {self.name!r} has no segments; give at least one.")
+        _finite("Robot.base_position", self.base_position, 3, "m")
+        _finite("Robot.base_quaternion", self.base_quaternion, 4, "w x y z")
+        if abs(math.hypot(*self.base_quaternion) - 1.0) > 1e-6:
+            raise RobotError(f"Robot.base_quaternion {list(self.base_quaternion)!r} has norm {math.hypot(*self.base_quaternion):.6g}; it must be 1.")
+        _finite("Robot.gravity", self.gravity, 3, "m/s^2")
+        paper = [segment.mode == "paper" for segment in self.segments]
+        if any(paper) and not all(paper):
+            raise RobotError(
+                f"Robot {self.name!r} mixes mode 'paper' with other modes; the paper's reduced model drops the tendons "
+                "from the balance, so it holds for a whole robot or not at all."
+            )
+        for k, segment in enumerate(self.segments):
+            for tendon in segment.tendons:
+                for crossed, (x, y) in zip(self.segments, tendon.position(k + 1), strict=False):
+                    if crossed.body_radius and math.hypot(x, y) > crossed.body_radius:
+                        raise RobotError(
+                            f"Tendon offset {math.hypot(x, y):.6g} m of segment {k + 1} lies beyond the body radius "
+                            f"{crossed.body_radius:g} m; it must run inside the body."
+                        )
+        total = sum(segment.length for segment in self.segments)
+        if any(not 0.0 <= s <= total for s in self.log_points):
+            raise RobotError(f"[log] points is {list(self.log_points)!r}; each must be an arclength between 0 and {total:g} m.")
+
+    @property
+    def n_segments(self) -> int:
+        return len(self.segments)
+
+    @property
+    def tendons(self) -> tuple[Tendon, ...]:
+        """All tendons, segment after segment: the order of every (n_tendons,) axis."""
+        return tuple(tendon for segment in self.segments for tendon in segment.tendons)
+
+    @property
+    def n_tendons(self) -> int:
+        return len(self.tendons)
+
+    @property
+    def tendon_segment(self) -> NDArray[np.int64]:
+        """(n_tendons,) index of the segment at whose end the tendon is fixed."""
+        return np.array([k for k, segment in enumerate(self.segments) for _ in segment.tendons], dtype=np.int64)
+
+    @property
+    def length(self) -> float:
+        """Backbone length of the whole chain without extension [m]."""
+        return sum(segment.length for segment in self.segments)
+
+    @property
+    def rest_tendon_length(self) -> NDArray[np.float64]:
+        """(n_tendons,) length of each tendon of the straight rest robot, base to where it ends [m]."""
+        ends = np.cumsum([segment.length for segment in self.segments])
+        return np.asarray(ends[self.tendon_segment], dtype=np.float64)
+
+    def segment_index(self, number: int) -> int:
+        """Index of segment `number`, which counts from 1 as in robot files."""
+        if not 1 <= number <= self.n_segments:
+            raise UnknownNameError(f"no segment {number}; robot {self.name!r} has segments 1 to {self.n_segments}.")
+        return number - 1

@@ -1,0 +1,182 @@
+"""Robot files: TOML to `Robot` and back, and the robots that ship with the package."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import fields
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+import tomli_w
+
+from fastrod.errors import RobotError, UnknownNameError, nearest
+from fastrod.robot import Robot, Segment, Tendon
+
+_Word = TypeVar("_Word", Segment, Tendon)
+_MODULI = ("youngs_modulus", "shear_modulus", "second_moment", "polar_moment")
+_SENSOR = ("noise", "registration_sd", "marker_offset_sd", "latency_sd")
+
+
+def robot_names() -> list[str]:
+    """Names of the robots that ship with the package, for `load_robot`."""
+    return sorted(entry.name.removesuffix(".toml") for entry in files("fastrod").joinpath("robots").iterdir() if entry.name.endswith(".toml"))
+
+
+def load_robot(source: str | Path) -> Robot:
+    """The robot of a shipped name, or of a path to a .toml (contracts: robot file).
+
+    Raises `UnknownNameError` for a name that is not shipped, `RobotError` for a file that is not a robot.
+    """
+    text = str(source)
+    if text in robot_names():
+        return loads(files("fastrod").joinpath("robots").joinpath(f"{text}.toml").read_text(encoding="utf-8"), text)
+    path = Path(source)
+    if path.suffix != ".toml" and not path.is_file():
+        raise UnknownNameError(f"no robot {text!r}; {nearest(text, robot_names())} A path must end in .toml.")
+    try:
+        content = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise RobotError(f"robot file {text!r} cannot be read: {getattr(error, 'strerror', None) or error}.") from error
+    return loads(content, text)
+
+
+def loads(text: str, where: str = "robot file") -> Robot:
+    """The robot of a TOML text; `where` names it in errors."""
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise RobotError(f"{where} is not TOML: {error}.") from error
+    _check_keys(data, ("name", "segment", "base", "world", "log", "fit", "sensor"), where)
+    segments = data.get("segment", [])
+    if not isinstance(segments, list):
+        raise RobotError(f"{where}: segment is one table; write [[segment]], in double brackets.")
+    base = _section(data, "base", ("position", "quaternion"), where)
+    world = _section(data, "world", ("gravity",), where)
+    log = _section(data, "log", ("points",), where)
+    optional = {
+        "base_position": base.get("position"),
+        "base_quaternion": base.get("quaternion"),
+        "gravity": world.get("gravity"),
+        "log_points": log.get("points"),
+        "fit": data.get("fit"),
+        "sensor": _section(data, "sensor", _SENSOR, where) or None,
+    }
+    if "name" not in data:
+        raise RobotError(f"{where} has no name; add name = \"...\".")
+    try:
+        return Robot(
+            name=msgspec.convert(data["name"], str),
+            segments=tuple(_segment(table, f"{where}: segment {k}") for k, table in enumerate(segments, 1)),
+            **{key: _convert(value, key, where) for key, value in optional.items() if value is not None},
+        )
+    except msgspec.ValidationError as error:
+        raise RobotError(f"{where}: {_plain(error)}") from error
+
+
+def dumps(robot: Robot) -> str:
+    """The TOML text of `robot`; `loads` of it gives an equal robot."""
+    data: dict[str, Any] = {"name": robot.name}
+    data["segment"] = [_written(segment) for segment in robot.segments]
+    data["base"] = {"position": list(robot.base_position), "quaternion": list(robot.base_quaternion)}
+    data["world"] = {"gravity": list(robot.gravity)}
+    if robot.log_points:
+        data["log"] = {"points": list(robot.log_points)}
+    for section in ("fit", "sensor"):
+        if content := getattr(robot, section):
+            data[section] = {key: dict(value) if isinstance(value, Mapping) else value for key, value in content.items()}
+    return tomli_w.dumps(data)
+
+
+def save_robot(robot: Robot, path: str | Path) -> None:
+    """Write `robot` to a .toml, whole or not at all."""
+    target = Path(path)
+    part = target.with_suffix(".toml.part")
+    part.write_text(dumps(robot), encoding="utf-8")
+    part.replace(target)
+
+
+def _segment(table: Any, where: str) -> Segment:
+    known = [f.name for f in fields(Segment)]
+    _check_keys(table, (*known, *_MODULI), where)
+    table = dict(table)
+    given = [key for key in _MODULI if key in table]
+    if given:
+        stiff = [key for key in ("bending_stiffness", "torsional_stiffness") if key in table]
+        missing = [key for key in _MODULI if key not in table]
+        if stiff or missing:
+            raise RobotError(f"{where}: give bending_stiffness and torsional_stiffness, or all of {', '.join(_MODULI)}; it has {', '.join(given + stiff)}.")
+        e, g, i, j = (_convert(table.pop(key), key, where, float) for key in _MODULI)
+        table |= {"bending_stiffness": [e * i, e * i], "torsional_stiffness": g * j}
+    tendons = table.pop("tendons", [])
+    if not isinstance(tendons, list):
+        raise RobotError(f"{where}: tendons must be a list of tables, [ {{offset = ..., angle = ...}}, ... ].")
+    made = tuple(_word(Tendon, tendon, f"{where}, tendon {k}") for k, tendon in enumerate(tendons, 1))
+    return _word(Segment, table, where, tendons=made)
+
+
+def _word(cls: type[_Word], table: Any, where: str, **made: Any) -> _Word:
+    known = {f.name: f for f in fields(cls)}
+    _check_keys(table, known, where)
+    missing = [name for name in known if name in ("length", "bending_stiffness", "torsional_stiffness", "offset", "angle") and name not in table]
+    if missing:
+        raise RobotError(f"{where} lacks {', '.join(missing)}.")
+    try:
+        plain = msgspec.convert({**table}, cls)
+        return cls(**{name: getattr(plain, name) for name in known if name not in made}, **made) if made else plain
+    except msgspec.ValidationError as error:
+        raise RobotError(f"{where}: {_plain(error)}") from error
+    except RobotError as error:
+        raise RobotError(f"{where}: {error}") from error
+
+
+def _written(segment: Segment) -> dict[str, Any]:
+    data = {f.name: getattr(segment, f.name) for f in fields(Segment) if f.name != "tendons"}
+    data = {key: list(value) if isinstance(value, tuple) else value for key, value in data.items()}
+    if segment.tendons:
+        data["tendons"] = [
+            {f.name: list(v) if isinstance(v := getattr(tendon, f.name), tuple) else v for f in fields(Tendon)} for tendon in segment.tendons
+        ]
+    return data
+
+
+def _section(data: Mapping[str, Any], name: str, known: Iterable[str], where: str) -> dict[str, Any]:
+    table = data.get(name, {})
+    _check_keys(table, known, f"{where}: [{name}]")
+    return dict(table)
+
+
+_TYPES: dict[str, Any] = {
+    "base_position": tuple[float, float, float],
+    "base_quaternion": tuple[float, float, float, float],
+    "gravity": tuple[float, float, float],
+    "log_points": tuple[float, ...],
+    "fit": dict[str, dict[str, float]],
+    "sensor": dict[str, float | tuple[float, ...]],
+}
+
+
+def _convert(value: Any, key: str, where: str, kind: Any = None) -> Any:
+    try:
+        made = msgspec.convert(value, kind or _TYPES[key])
+    except msgspec.ValidationError as error:
+        raise RobotError(f"{where}: {key}: {_plain(error)}") from error
+    if isinstance(made, float) and not math.isfinite(made):
+        raise RobotError(f"{where}: {key} is {made}; it must be finite.")
+    return made
+
+
+def _check_keys(table: Any, known: Iterable[str], where: str) -> None:
+    if not isinstance(table, Mapping):
+        raise RobotError(f"{where} is {table!r}; it must be a table.")
+    names = list(known)
+    for key in table:
+        if key not in names:
+            raise RobotError(f"{where} has an unknown key {key!r}; {nearest(key, names)}")
+
+
+def _plain(error: msgspec.ValidationError) -> str:
+    return str(error).replace("`", "'").replace(" - at '$.", " at '").rstrip(".") + "."
