@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import msgspec
 import tomli_w
@@ -16,7 +16,6 @@ import tomli_w
 from fastrod.errors import RobotError, UnknownNameError, nearest
 from fastrod.robot import Robot, Segment, Tendon
 
-_Word = TypeVar("_Word", Segment, Tendon)
 _MODULI = ("youngs_modulus", "shear_modulus", "second_moment", "polar_moment")
 _SENSOR = ("noise", "registration_sd", "marker_offset_sd", "latency_sd")
 
@@ -111,26 +110,17 @@ def _segment(table: Any, where: str) -> Segment:
             raise RobotError(f"{where}: give bending_stiffness and torsional_stiffness, or all of {', '.join(_MODULI)}; it has {', '.join(given + stiff)}.")
         e, g, i, j = (_convert(table.pop(key), key, where, float) for key in _MODULI)
         table |= {"bending_stiffness": [e * i, e * i], "torsional_stiffness": g * j}
-    tendons = table.pop("tendons", [])
+    tendons = table.get("tendons", [])
     if not isinstance(tendons, list):
         raise RobotError(f"{where}: tendons must be a list of tables, [ {{offset = ..., angle = ...}}, ... ].")
-    made = tuple(_word(Tendon, tendon, f"{where}, tendon {k}") for k, tendon in enumerate(tendons, 1))
-    return _word(Segment, table, where, tendons=made)
-
-
-def _word(cls: type[_Word], table: Any, where: str, **made: Any) -> _Word:
-    known = {f.name: f for f in fields(cls)}
-    _check_keys(table, known, where)
-    missing = [name for name in known if name in ("length", "bending_stiffness", "torsional_stiffness", "offset", "angle") and name not in table]
-    if missing:
-        raise RobotError(f"{where} lacks {', '.join(missing)}.")
+    _check_needed(table, ("length", "bending_stiffness", "torsional_stiffness"), where)
+    for k, tendon in enumerate(tendons, 1):
+        _check_keys(tendon, [f.name for f in fields(Tendon)], f"{where}, tendon {k}")
+        _check_needed(tendon, ("offset", "angle"), f"{where}, tendon {k}")
     try:
-        plain = msgspec.convert({**table}, cls)
-        return cls(**{name: getattr(plain, name) for name in known if name not in made}, **made) if made else plain
+        return msgspec.convert(table, Segment)
     except msgspec.ValidationError as error:
         raise RobotError(f"{where}: {_plain(error)}") from error
-    except RobotError as error:
-        raise RobotError(f"{where}: {error}") from error
 
 
 def _written(segment: Segment) -> dict[str, Any]:
@@ -176,6 +166,11 @@ def _check_keys(table: Any, known: Iterable[str], where: str) -> None:
     for key in table:
         if key not in names:
             raise RobotError(f"{where} has an unknown key {key!r}; {nearest(key, names)}")
+
+
+def _check_needed(table: Mapping[str, Any], needed: Iterable[str], where: str) -> None:
+    if missing := [name for name in needed if name not in table]:
+        raise RobotError(f"{where} lacks {', '.join(missing)}.")
 
 
 def _plain(error: msgspec.ValidationError) -> str:
