@@ -1,0 +1,173 @@
+"""The `fastrod` command: words to functions, errors to exit codes; no logic of its own."""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import runpy
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout
+from pathlib import Path
+from typing import NoReturn
+
+from fastrod.errors import FastrodError, InputError, UnknownNameError, nearest
+
+DONE, FAILED, WRONG_INPUT = 0, 1, 2
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line `argv`; the exit code: 0 done, 2 the input is wrong (one sentence on stderr), 1 it failed."""
+    parser, commands = _parser()
+    words = list(sys.argv[1:] if argv is None else argv)
+    if words and not words[0].startswith("-") and words[0] not in commands:
+        return _refuse(f"no command {words[0]!r}; {nearest(words[0], commands)}")
+    try:
+        arguments, rest = parser.parse_known_args(words)
+        if rest:
+            return _refuse(f"{parser.prog} {arguments.command} does not know {rest[0]!r}; `{parser.prog} {arguments.command} --help` tells.")
+        run: Callable[[argparse.Namespace], int] = arguments.run_command
+        return run(arguments)
+    except _UsageError as error:
+        return _refuse(str(error))
+    except FastrodError as error:
+        return _refuse(str(error))
+    except OSError as error:
+        print(f"fastrod: {error.filename or 'a file'}: {error.strerror or error}.", file=sys.stderr)
+        return FAILED
+    except KeyboardInterrupt:
+        print("fastrod: interrupted.", file=sys.stderr)
+        return FAILED
+
+
+class _UsageError(Exception):
+    """What argparse would have printed over several lines."""
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise _UsageError(f"{self.prog}: {message}; `{self.prog} --help` says how it is used.")
+
+
+def _refuse(sentence: str) -> int:
+    print(sentence, file=sys.stderr)
+    return WRONG_INPUT
+
+
+def _parser() -> tuple[argparse.ArgumentParser, list[str]]:
+    """The parser, and the names of its commands."""
+    parser = _Parser(prog="fastrod", description="Tendon-driven continuum robots, simulated in batches and met with measured data.")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
+
+    demo = commands.add_parser("demo", help="the main job on an embedded default, start to end")
+    demo.add_argument("--out", type=Path, metavar="DIR", help="write the replay's residuals and plot there")
+    demo.set_defaults(run_command=_demo)
+
+    replay = commands.add_parser("replay", help="the model beside a measurement: residual table and plot")
+    replay.add_argument("log", type=Path, metavar="LOG", help="run log (.csv or .parquet), or the raw file of a measured set")
+    replay.add_argument("--robot", metavar="R", help="a shipped robot's name or a path to a .toml; a measured set brings its own")
+    replay.add_argument("--run", metavar="RUN", help="only this run of the log")
+    replay.add_argument("--out", type=Path, metavar="DIR", help="where residuals.csv and replay.png go (default: LOG's name + _replay)")
+    replay.set_defaults(run_command=_replay)
+
+    bench = commands.add_parser("bench", help="the figures of perf/ as ratios")
+    bench.add_argument("name", nargs="?", metavar="NAME", help="one benchmark (default: all)")
+    bench.add_argument("--json", action="store_true", help="print JSON to stdout and nothing else")
+    bench.set_defaults(run_command=_bench)
+    return parser, list(commands.choices)
+
+
+def _demo(arguments: argparse.Namespace) -> int:
+    from fastrod.demo import run
+
+    run(arguments.out)
+    return DONE
+
+
+def _replay(arguments: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from fastrod.identification import replay as room
+    from fastrod.robotfile import load_robot
+    from fastrod.runlog import read_log
+    from fastrod_scenes.measured import detect
+
+    path: Path = arguments.log
+    given = None if arguments.robot is None else load_robot(arguments.robot)
+    if adapter := detect(path):
+        log, robot = adapter(path)
+        if given is not None and given.n_tendons != robot.n_tendons:
+            raise InputError(
+                f"robot {given.name!r} has {given.n_tendons} tendons, the one of {path.name} has {robot.n_tendons}; "
+                "leave --robot out to take its own."
+            )
+        robot = given or robot
+    elif given is None:
+        raise InputError(f"{path.name} is a run log and does not say whose; name its robot with --robot.")
+    else:
+        robot = given
+        log = read_log(path, robot)
+    if arguments.run is not None:
+        log = log.only(arguments.run)
+    with _progress("replay") as progress:
+        result = room.replay(log, robot, progress=progress)
+    console = Console()
+    console.print(room.table(result))
+    if not result.compared.any():
+        print(f"fastrod: the model converged on none of the {len(log)} rows.", file=sys.stderr)
+        return FAILED
+    for written in room.write(result, arguments.out or Path(f"{path.stem}_replay")):
+        console.print(f"wrote {written}", soft_wrap=True, highlight=False)
+    return DONE
+
+
+def _bench(arguments: argparse.Namespace) -> int:
+    """Each perf/bench_NAME.py has `main(argv) -> int`; with --json it prints one JSON value."""
+    scripts = {path.stem.removeprefix("bench_"): path for path in sorted(_PERF.glob("bench_*.py"))}
+    if not scripts:
+        raise InputError("fastrod bench needs the source checkout, whose folder perf/ holds the benchmarks; an installed package has none.")
+    if arguments.name is not None and arguments.name not in scripts:
+        raise UnknownNameError(f"no benchmark {arguments.name!r}; {nearest(arguments.name, scripts)}")
+    chosen = scripts if arguments.name is None else {arguments.name: scripts[arguments.name]}
+    if not arguments.json:
+        return max(_script(path, []) for path in chosen.values())
+    figures: dict[str, object] = {}
+    for name, path in chosen.items():
+        with redirect_stdout(io.StringIO()) as out:
+            if code := _script(path, ["--json"]):
+                return code
+        figures[name] = json.loads(out.getvalue())
+    print(json.dumps(figures if arguments.name is None else figures[arguments.name], indent=1))
+    return DONE
+
+
+_PERF = Path(__file__).parents[1] / "perf"
+"""Beside the package's source in a checkout, editable installs included."""
+
+
+def _script(path: Path, argv: list[str]) -> int:
+    """The exit code of the script's `main(argv)`."""
+    sys.path.insert(0, str(path.parent))  # as `python perf/bench_NAME.py` has it, for what the scripts share
+    try:
+        return int(runpy.run_path(str(path))["main"](argv) or DONE)
+    finally:
+        sys.path.remove(str(path.parent))
+
+
+@contextmanager
+def _progress(what: str) -> Iterator[Callable[[int, int], None] | None]:
+    """A callback (done, total) that draws a bar on stderr, or None where stderr is no terminal."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,204 @@
+"""What a caller gives, checked and broadcast into `Ports`: shapes are refused at once, bad values row by row."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fastrod.compile import Rest
+from fastrod.errors import InputError
+from fastrod.types import Floats, Layout, Params, Ports
+
+PointForces: TypeAlias = Sequence[tuple[ArrayLike, ArrayLike]]
+
+
+class Reader:
+    """Turns inputs into arrays with a robot axis of 1 or n_robots, and collects what is wrong with which robot."""
+
+    def __init__(self, layout: Layout, params: Params, rest: Rest, n_robots: int) -> None:
+        self.layout, self.params, self.rest, self.n_robots = layout, params, rest, n_robots
+        self.problems: dict[int, str] = {}
+
+    def ports(
+        self,
+        tendon_length: ArrayLike | None,
+        tension: ArrayLike | None,
+        extension: ArrayLike | None,
+        tip_force: ArrayLike | None,
+        tip_moment: ArrayLike | None,
+        line_force: ArrayLike | None,
+        point_force: PointForces | None,
+        follower_tip_force: ArrayLike | None,
+        base_pose: ArrayLike | None,
+    ) -> Ports:
+        """The ports of one step; see `Simulator.step` for shapes and units."""
+        self.problems = {}
+        layout, rest = self.layout, self.rest
+        n_segments, n_tendons = len(layout.first_tendon), len(layout.tendon_segment)
+        given_tension = np.ones(n_tendons, bool)
+        given_tension[layout.row_tendon] = False
+        stretch = self._optional("extension", extension, (n_segments,), "m")
+        self._check_extension(stretch)
+        lengths = self._lengths(tendon_length, stretch)
+        if tension is None and given_tension.any():
+            raise InputError(f"tension is missing; segments in mode tendon_tension need tension (n_robots, {n_tendons}) [N].")
+        pull = self._optional("tension", tension, (n_tendons,), "N")
+        grid, node_force = self._point_forces(point_force, stretch)
+        return Ports(
+            tendon_length=lengths,
+            tension=np.where(given_tension, pull, 0.0),
+            extension=stretch,
+            stiffness=rest.stiffness,
+            precurvature=rest.precurvature,
+            tip_force=self._optional("tip_force", tip_force, (3,), "N"),
+            tip_moment=self._optional("tip_moment", tip_moment, (3,), "N m"),
+            follower_force=np.zeros((0, 3)) if follower_tip_force is None else self._array("follower_tip_force", follower_tip_force, (3,), "N"),
+            line_force=self._line_force(line_force),
+            node_force=node_force,
+            grid=grid,
+            base_pose=rest.base_pose if base_pose is None else self._pose(base_pose),
+        )
+
+    def _array(self, name: str, value: ArrayLike, shape: tuple[int, ...], unit: str) -> Floats:
+        """(1 or n_robots, *shape), finite but for rows that are noted as problems."""
+        try:
+            a = np.asarray(value, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{name} is not an array of numbers; give (n_robots, {', '.join(map(str, shape))}) [{unit}].") from error
+        if a.shape == shape:
+            a = a[None]
+        if a.shape[1:] != shape or a.shape[0] not in (1, self.n_robots):
+            wanted = ", ".join(map(str, shape))
+            raise InputError(f"{name} has shape {np.shape(value)}; it must be ({self.n_robots}, {wanted}) or ({wanted},) [{unit}].")
+        a = np.ascontiguousarray(a)
+        if not np.isfinite(a.sum()):
+            self._note(~np.isfinite(a.reshape(len(a), -1)).all(1), lambda i: f"{name} holds a value that is not finite: {a[i].ravel()[:6]}.")
+        return a
+
+    def _optional(self, name: str, value: ArrayLike | None, shape: tuple[int, ...], unit: str) -> Floats:
+        return np.zeros((1, *shape)) if value is None else self._array(name, value, shape, unit)
+
+    def _note(self, bad: np.ndarray, sentence: object) -> None:
+        """Note bad rows; where no row is good there is nothing to simulate, so say so at once."""
+        rows = np.flatnonzero(bad)
+        if not len(rows):
+            return
+        if len(rows) == len(bad):
+            raise InputError(sentence(0))  # type: ignore[operator]
+        for i in rows:
+            self.problems.setdefault(int(i), sentence(i))  # type: ignore[operator]
+
+    def _check_extension(self, stretch: Floats) -> None:
+        low, high = self.rest.extension_range[..., 0], self.rest.extension_range[..., 1]
+        bad = ((stretch < low - 1e-12) | (stretch > high + 1e-12)).any(1)
+        if bad.any():
+            reach = f"{np.array2string(low[0])} to {np.array2string(high[0])} m"
+            self._note(bad, lambda i: f"extension {stretch[min(i, len(stretch) - 1)]} m lies outside the range of the segments, {reach}.")
+
+    def _lengths(self, tendon_length: ArrayLike | None, stretch: Floats) -> Floats:
+        layout, params = self.layout, self.params
+        n_tendons = len(layout.tendon_segment)
+        if tendon_length is None:
+            if len(layout.row_tendon):
+                raise InputError(
+                    f"tendon_length is missing; give (n_robots, {n_tendons}) absolute lengths, base to where each tendon ends [m]; "
+                    "Robot.rest_tendon_length holds those of the straight robot."
+                )
+            return np.zeros((1, n_tendons))
+        lengths = self._array("tendon_length", tendon_length, (n_tendons,), "m")
+        ends = np.cumsum(params.length + stretch, axis=1)[:, layout.tendon_segment]
+        # A tendon at distance d can differ from the backbone by d times the bend; more than a full turn per segment is no shape.
+        slack = 2.0 * np.pi * np.linalg.norm(params.offset, axis=-1).sum(1)
+        rows = layout.row_tendon
+        with np.errstate(invalid="ignore"):
+            bad = ((lengths <= 0.0) | (np.abs(lengths - ends) > slack))[:, rows].any(1)
+        if bad.any():
+            self._note(bad, lambda i: _length_sentence(lengths[min(i, len(lengths) - 1)][rows], ends[min(i, len(ends) - 1)][rows]))
+        return lengths
+
+    def _line_force(self, line_force: ArrayLike | None) -> Floats:
+        """Self-weight plus the given line force: uniform, or at the nodes of the steps."""
+        weight, layout = self.rest.weight, self.layout
+        if line_force is None:
+            return weight
+        a = np.asarray(line_force, dtype=np.float64)
+        if a.ndim <= 2:
+            return weight + self._array("line_force", line_force, (3,), "N/m")[:, None, None, :]
+        n_segments = len(layout.first_tendon)
+        sampled = self._array("line_force", line_force, (n_segments, a.shape[-2], 3), "N/m")
+        if a.shape[-2] == 1:
+            return weight + sampled
+        at = np.linspace(0.0, a.shape[-2] - 1.0, layout.n_steps + 1)
+        low = np.minimum(at.astype(int), a.shape[-2] - 2)
+        part = (at - low)[:, None]
+        return np.ascontiguousarray(weight + (1.0 - part) * sampled[:, :, low] + part * sampled[:, :, low + 1])
+
+    def _pose(self, base_pose: ArrayLike) -> Floats:
+        pose = self._array("base_pose", base_pose, (7,), "position m, quaternion w x y z")
+        norm = np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
+        with np.errstate(invalid="ignore"):
+            bad = np.abs(norm[:, 0] - 1.0) > 1e-3
+        self._note(bad, lambda i: f"base_pose has a quaternion of norm {norm[min(i, len(norm) - 1), 0]:.4g}; it must be 1, as w x y z.")
+        return np.column_stack([pose[:, :3], pose[:, 3:] / np.where(norm > 0.0, norm, 1.0)])
+
+    def _point_forces(self, point_force: PointForces | None, stretch: Floats) -> tuple[Floats, Floats]:
+        """The grid with a node at each point force, and the forces on the nodes."""
+        layout, params = self.layout, self.params
+        n_segments, n_steps = len(layout.first_tendon), layout.n_steps
+        if not point_force:
+            return np.zeros((0, n_segments, n_steps + 1)), np.zeros((0, n_segments * n_steps + 1, 3))
+        try:
+            pairs = [(s, f) for s, f in point_force]
+        except (TypeError, ValueError) as error:
+            raise InputError("point_force must be (arclength [m], force [N]) pairs, for example [(0.03, (0, 0.1, 0))].") from error
+        at = [self._array("arclength of a point_force", np.atleast_1d(np.asarray(s, float))[:, None], (1,), "m")[:, 0] for s, _ in pairs]
+        forces = [self._array("point_force", f, (3,), "N") for _, f in pairs]
+        ends = np.cumsum(params.length + stretch, axis=1)
+        n = max(len(ends), *(len(a) for a in at), *(len(f) for f in forces))
+        starts = np.broadcast_to(np.column_stack([np.zeros(len(ends)), ends]), (n, n_segments + 1))
+        s = np.stack([np.broadcast_to(a, n) for a in at], axis=1)
+        total = starts[:, -1:]
+        self._note(
+            ((s < 0.0) | (s > total * (1.0 + 1e-9))).any(1),
+            lambda i: f"point_force at arclength {s[i]} m; the rod runs from 0 to {total[i, 0]:.6g} m.",
+        )
+        grid = np.broadcast_to(np.linspace(0.0, 1.0, n_steps + 1), (n, n_segments, n_steps + 1)).copy()
+        node_force = np.zeros((n, n_segments * n_steps + 1, 3))
+        for i in range(n):
+            for j, node in _place_nodes(s[i], starts[i], n_steps, grid[i]):
+                node_force[i, node] += forces[j][min(i, len(forces[j]) - 1)]
+        return grid, node_force
+
+
+def _place_nodes(s: Floats, starts: Floats, n_steps: int, grid: Floats) -> list[tuple[int, int]]:
+    """Move the nodes nearest to the arclengths s onto them (in `grid`); pairs of (which s, its node)."""
+    placed: list[tuple[int, int]] = []
+    segment = np.clip(np.searchsorted(starts, s, side="right") - 1, 0, len(starts) - 2)
+    fraction = (s - starts[segment]) / np.diff(starts)[segment]
+    for k in range(len(starts) - 1):
+        members = np.flatnonzero(segment == k)
+        inside = sorted({float(f) for f in fraction[members] if 1e-9 < f < 1.0 - 1e-9})
+        if len(inside) > n_steps - 1:
+            raise InputError(f"{len(inside)} point forces on one segment of {n_steps} steps; give Simulator at least {len(inside) + 1} points_per_segment.")
+        nodes, last = {0.0: 0, 1.0: n_steps}, 0
+        for i, f in enumerate(inside):
+            last = nodes[f] = int(np.clip(round(f * n_steps), last + 1, n_steps - len(inside) + i))
+        fixed = sorted(nodes.items())
+        grid[k] = np.interp(np.arange(n_steps + 1), [node for _, node in fixed], [f for f, _ in fixed])
+        for j in members:
+            f = float(fraction[j])
+            placed.append((int(j), k * n_steps + (nodes[f] if f in nodes else (0 if f < 0.5 else n_steps))))
+    return placed
+
+
+def _length_sentence(lengths: Floats, ends: Floats) -> str:
+    worst = int(np.argmax(np.where(np.isfinite(lengths), np.abs(lengths - ends), 0.0)))
+    hint = ""
+    if lengths[worst] > 20.0 * ends[worst]:
+        hint = " Was it given in mm?"
+    elif abs(lengths[worst]) < 0.5 * ends[worst]:
+        hint = " Is it a change of length? Add Robot.rest_tendon_length."
+    return f"tendon_length {lengths[worst]:.6g} m is impossible for a tendon that ends at arclength {ends[worst]:.6g} m.{hint}"

@@ -1,0 +1,427 @@
+"""One forward pass of up to LANES robots: gather, march along the chain, form the residuals, update the boundary, scatter.
+
+Unknowns x: the total base moment m(0) (3, material frame), the tension of every free tendon, and with a follower force
+its world value (3). Residuals e: tendon lengths, the tip moment (3) and the follower force (3), all in metres: moments
+times l^2/EI, forces times l^3/EI. In paper mode the unknowns are (m_x, m_y) at the base of each segment, with u_z = 0
+there, and the residuals are the lengths alone (the paper's eqs. 2b and 3b).
+"""
+
+from __future__ import annotations
+
+from fastrod.kernels import columns as col
+from fastrod.kernels import shape as sh
+from fastrod.kernels.gather import feed_forward, gather_base, gather_segment, gather_step, pick, scatter_node
+from fastrod.kernels.jit import LANES, inline, kernel
+from fastrod.kernels.observer import BLOCK, gain
+from fastrod.kernels.shape import Lanes
+from fastrod.kernels.vec import cross, mul, mul_t, sub
+from fastrod.types import Layout, Memory, Params, Ports, Response, Shape
+
+W = LANES
+CUTS = 2  # Newton steps on u at each stage; the guess of second order makes the second one exact to rounding
+FIRST_CUTS = 6  # at the base, where the guess is the last pass's curvature
+
+
+@inline
+def padded(n: int, block: int) -> int:
+    return block * ((n + block - 1) // block)
+
+
+@kernel
+def scratch_size(n_tendons: int, n_x: int, n_col: int, n_e: int) -> int:
+    """Numbers of scratch that `pass_chunk` needs."""
+    n_t, n_p = n_tendons + sh.GROUP, padded(n_x, BLOCK)
+    march = sh.NODE + 5 * sh.STAGE + n_t * (sh.TENDON + 4 * sh.PATH + 1) + n_col * (col.COLUMN + n_t) + col.D_U
+    return W * (march + 8 + n_e + n_e * n_col + n_p * n_p + 2 * n_e * n_p + n_p + 2 + 2 * n_x)
+
+
+@kernel
+def solve_section(node: Lanes, stage: Lanes, tendon: Lanes, path: Lanes, half: int, first: int, n: int, loaded: bool, cuts: int) -> None:
+    """Curvature of a stage from its moment, and the paths of the tendons that cross it."""
+    if not loaded:
+        sh.curvature_without_tendons(node, stage, half)
+        for g in range(first, n, sh.GROUP):
+            sh.tendon_paths(stage, tendon[g * sh.TENDON * W :], path[g * sh.PATH * W :])
+        return
+    for _ in range(cuts):
+        sh.clear_sums(stage)
+        for g in range(first, n, sh.GROUP):
+            sh.tendon_sums(stage, tendon[g * sh.TENDON * W :], path[g * sh.PATH * W :])
+        sh.correct_curvature(node, stage, half)
+
+
+@kernel
+def march_columns(
+    k: int, n_x: int, n_col: int, placed: bool, layout: Layout, node: Lanes, stages: Lanes, paths: Lanes, columns: Lanes, du: Lanes, change: Lanes
+) -> None:
+    """Carry every column over one step and add its share of the tendon lengths."""
+    n, first = len(layout.tendon_segment), layout.first_tendon[k]
+    n_t = n + sh.GROUP
+    size = n_t * sh.PATH * W
+    p1, p2, p3, p4 = paths[:size], paths[size : 2 * size], paths[2 * size : 3 * size], paths[3 * size : 4 * size]
+    n_base = 2 * len(layout.first_tendon) if layout.paper else 3
+    n_free = len(layout.free_tendon)
+    for c in range(n_col):
+        if layout.paper and c < n_base and c // 2 > k:
+            continue  # its segment has not begun
+        column = columns[c * col.COLUMN * W : (c + 1) * col.COLUMN * W]
+        tendon = layout.free_tendon[c - n_base] if n_base <= c < n_base + n_free else -1
+        axis = c - n_base - n_free
+        unit = (1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, 1.0 if axis == 2 else 0.0)
+        if tendon >= first:
+            o = tendon * sh.PATH * W
+            if placed:
+                col.placed_column(column, du, node, stages, p1[o:], p2[o:], p3[o:], p4[o:], True, 0.0, 0.0, 0.0)
+            else:
+                col.tendon_column(column, du, node, stages, p1[o:], p2[o:], p3[o:], p4[o:])
+        elif placed:
+            col.placed_column(column, du, node, stages, p1, p2, p3, p4, False, unit[0], unit[1], unit[2])
+        elif axis >= 0:
+            col.force_column(column, du, node, stages, unit[0], unit[1], unit[2])
+        else:
+            col.free_column(column, du, node, stages)
+        for g in range(first, n, sh.GROUP):
+            o = g * sh.PATH * W
+            col.add_length_changes(change[(c * n_t + g) * W :], du, p1[o:], p2[o:], p3[o:], p4[o:])
+
+
+@kernel
+def load_unknowns(robots: Lanes, ports: Ports, params: Params, memory: Memory, layout: Layout, x: Lanes, tendon: Lanes) -> None:
+    """x of each lane, and the tensions that it means."""
+    n_x = memory.x.shape[1]
+    n_base = 2 * len(layout.first_tendon) if layout.paper else 3
+    for w in range(W):
+        i = robots[w]
+        for a in range(n_x):
+            x[a * W + w] = memory.x[i, a]
+        given = ports.tension[pick(i, len(ports.tension))]
+        for t in range(len(layout.tendon_segment)):
+            tendon[(t * sh.TENDON + sh.T_T) * W + w] = 0.0 if layout.paper else given[t]
+        unilateral = params.unilateral[pick(i, len(params.unilateral))]
+        for f in range(len(layout.free_tendon)):
+            t = layout.free_tendon[f]
+            value = x[(n_base + f) * W + w]
+            tendon[(t * sh.TENDON + sh.T_T) * W + w] = max(value, 0.0) if unilateral[t] else value
+
+
+@kernel
+def start_segment(k: int, layout: Layout, node: Lanes, x: Lanes, columns: Lanes, n_col: int) -> None:
+    """The moment with which segment k begins, where it is an unknown, and its columns."""
+    n_base = 2 * len(layout.first_tendon) if layout.paper else 3
+    if layout.paper:
+        for c in range(n_col):
+            for i in range((c * col.COLUMN + col.C_M) * W, (c * col.COLUMN + col.C_M + 3) * W):
+                columns[i] = 0.0
+        for w in range(W):  # u_z = 0: the paper's eq. 2b
+            node[sh.N_M * W + w] = x[2 * k * W + w]
+            node[(sh.N_M + 1) * W + w] = x[(2 * k + 1) * W + w]
+            node[(sh.N_M + 2) * W + w] = -node[(sh.N_K + 2) * W + w] * node[(sh.N_USTAR + 2) * W + w]
+    elif k == 0:
+        for i in range(3 * W):
+            node[sh.N_M * W + i] = x[i]
+    begin, end = (2 * k, 2 * k + 2) if layout.paper else (0, n_base if k == 0 else 0)
+    for c in range(begin, end):
+        for w in range(W):
+            columns[(c * col.COLUMN + col.C_M + c - begin) * W + w] = 1.0
+
+
+@kernel
+def close_lengths(
+    robots: Lanes, ports: Ports, params: Params, layout: Layout, x: Lanes, length: Lanes, change: Lanes, n_col: int, error: Lanes, gamma: Lanes
+) -> None:
+    """l_i - L_i - c_i (T_i - T0_i) and its derivatives, one row for each commanded tendon."""
+    n_t, n_rows, n_free = len(layout.tendon_segment) + sh.GROUP, len(layout.row_tendon), len(layout.free_tendon)
+    n_base = 2 * len(layout.first_tendon) if layout.paper else 3
+    for r in range(n_rows):
+        t = layout.row_tendon[r]
+        for w in range(W):
+            i = robots[w]
+            error[r * W + w] = length[t * W + w] - ports.tendon_length[pick(i, len(ports.tendon_length)), t]
+        for c in range(n_col):
+            for w in range(W):
+                gamma[(r * n_col + c) * W + w] = change[(c * n_t + t) * W + w]
+    for f in range(n_free):
+        t = layout.free_tendon[f]
+        for w in range(W):
+            i = robots[w]
+            compliance = params.compliance[pick(i, len(params.compliance)), t]
+            value = x[(n_base + f) * W + w]
+            # a slack wire's unknown is no tension but a measure of how loose it hangs, and needs some slope
+            stretch = max(compliance, 1e-5) if value < 0.0 and params.unilateral[pick(i, len(params.unilateral)), t] else compliance
+            error[f * W + w] -= stretch * value - compliance * params.pretension[pick(i, len(params.pretension)), t]
+            gamma[(f * n_col + n_base + f) * W + w] -= stretch
+
+
+@kernel
+def close_tip(robots: Lanes, ports: Ports, params: Params, node: Lanes, x: Lanes, columns: Lanes, n_x: int, n_col: int, row: int, error: Lanes, gamma: Lanes) -> None:
+    """m - R^T M_tip, and with a follower force F - R F_material, as lengths, with their derivatives."""
+    follower = len(ports.follower_force) > 0
+    for w in range(W):
+        i = robots[w]
+        s = pick(i, len(params.reach))
+        to_length = params.reach[s] / params.moment_scale[s]
+        rotation = sh.get_mat(node, sh.N_R, w)
+        tip_moment = ports.tip_moment[pick(i, len(ports.tip_moment))]
+        target = mul_t(rotation, (tip_moment[0], tip_moment[1], tip_moment[2]))
+        m = sh.get(node, sh.N_M, w)
+        for a in range(3):
+            error[(row + a) * W + w] = to_length * (m[a] - target[a])
+        for c in range(n_col):
+            o = c * col.COLUMN
+            v = sub(sh.get(columns, o + col.C_M, w), cross(target, sh.get(columns, o + col.C_PHI, w)))
+            for a in range(3):
+                gamma[((row + a) * n_col + c) * W + w] = to_length * v[a]
+        if follower:
+            g = ports.follower_force[pick(i, len(ports.follower_force))]
+            given = (g[0], g[1], g[2])
+            world = mul(rotation, given)
+            to_length *= params.reach[s]
+            for a in range(3):
+                error[(row + 3 + a) * W + w] = to_length * (x[(n_x - 3 + a) * W + w] - world[a])
+            for c in range(n_col):
+                v = mul(rotation, cross(sh.get(columns, c * col.COLUMN + col.C_PHI, w), given))
+                for a in range(3):
+                    unit = 1.0 if c == n_x - 3 + a else 0.0
+                    gamma[((row + 3 + a) * n_col + c) * W + w] = to_length * (unit - v[a])
+
+
+@kernel
+def loosen(robots: Lanes, params: Params, layout: Layout, x: Lanes, n_col: int, n_e: int, gamma: Lanes) -> None:
+    """A slack wire carries nothing: its unknown moves no residual but its own."""
+    for f in range(len(layout.free_tendon)):
+        t = layout.free_tendon[f]
+        for w in range(W):
+            s = pick(robots[w], len(params.unilateral))
+            if params.unilateral[s, t] and x[(3 + f) * W + w] < 0.0:
+                for r in range(n_e):
+                    gamma[(r * n_col + 3 + f) * W + w] = 0.0
+                gamma[(f * n_col + 3 + f) * W + w] = -max(params.compliance[pick(robots[w], len(params.compliance)), t], 1e-5)
+
+
+@kernel
+def update_boundary(
+    robots: Lanes, count: int, params: Params, memory: Memory, layout: Layout, x: Lanes, error: Lanes, gamma: Lanes, n_col: int, n_e: int,
+    P: Lanes, G: Lanes, scaled: Lanes, work: Lanes, process: float, noise: float, carry: bool,
+) -> None:
+    """The observer's update of x and P, and the gain kept for the next inputs."""
+    n_x, n_rows = memory.x.shape[1], len(layout.row_tendon)
+    n_p = padded(n_x, BLOCK)
+    n_base, n_free = (2 * len(layout.first_tendon) if layout.paper else 3), len(layout.free_tendon)
+    units = work[(n_p + 2) * W :]
+    for w in range(W):
+        s = pick(robots[w], len(params.reach))
+        for a in range(n_x):
+            unit = params.moment_scale[s]
+            if a >= n_base:
+                unit = params.tension_scale[s] if a < n_base + n_free else unit / params.reach[s]
+            units[a * W + w] = unit
+    for i in range(n_p * n_p * W):
+        P[i] = 0.0
+    for i in range(n_e * n_p * W):
+        scaled[i] = 0.0
+        G[i] = 0.0
+    for i in range((n_p + 2) * W):
+        work[i] = 0.0
+    for r in range(n_e):
+        for a in range(n_x):
+            for w in range(W):
+                scaled[(r * n_p + a) * W + w] = gamma[(r * n_col + a) * W + w] * units[a * W + w]
+    for a in range(n_x):
+        if carry:
+            for b in range(a + 1):
+                for w in range(W):
+                    value = float(memory.covariance[robots[w], a * (a + 1) // 2 + b])
+                    P[(a * n_p + b) * W + w] = value
+                    P[(b * n_p + a) * W + w] = value
+        for w in range(W):
+            P[(a * n_p + a) * W + w] += process
+    gain(P, G, scaled, work, n_x, n_e, noise)
+    for a in range(n_x):
+        for r in range(n_e):
+            for w in range(W):
+                x[a * W + w] -= units[a * W + w] * G[(r * n_p + a) * W + w] * error[r * W + w]
+    for w in range(count):
+        i = robots[w]
+        for a in range(n_x):
+            memory.x[i, a] = x[a * W + w]
+            unit = units[a * W + w]
+            for r in range(n_rows):
+                memory.gain[i, a, r] = unit * G[(r * n_p + a) * W + w]
+            if len(memory.force_before) > 0:
+                for b in range(3):
+                    moved = 0.0
+                    for r in range(n_e):
+                        moved += G[(r * n_p + a) * W + w] * gamma[(r * n_col + n_col - 3 + b) * W + w]
+                    memory.gain[i, a, n_rows + b] = -unit * moved
+            if carry:
+                for b in range(a + 1):
+                    memory.covariance[i, a * (a + 1) // 2 + b] = P[(a * n_p + b) * W + w]
+
+
+@kernel
+def write_summary(
+    robots: Lanes, count: int, ports: Ports, layout: Layout, node: Lanes, tendon: Lanes, length: Lanes, error: Lanes, n_e: int, wrench: Lanes, shape: Shape
+) -> None:
+    """Tip, tensions, path lengths, base wrench and the largest residual of each robot."""
+    for w in range(count):
+        i = robots[w]
+        largest = 0.0
+        for r in range(n_e):
+            e = abs(error[r * W + w])
+            largest = e if not e <= largest else largest  # NaN wins
+        shape.residual[i] = largest
+        for a in range(3):
+            shape.tip_position[i, a] = node[(sh.N_POS + a) * W + w]
+            for b in range(3):
+                shape.tip_rotation[i, a, b] = node[(sh.N_R + 3 * a + b) * W + w]
+        if len(shape.base_wrench) > 0:
+            for a in range(6):
+                shape.base_wrench[i, a] = wrench[a * W + w]
+        if len(shape.tension) > 0:
+            for t in range(len(layout.tendon_segment)):
+                shape.tension[i, t] = tendon[(t * sh.TENDON + sh.T_T) * W + w]
+                shape.path_length[i, t] = length[t * W + w]
+
+
+@kernel
+def write_response(robots: Lanes, count: int, node: Lanes, columns: Lanes, error: Lanes, gamma: Lanes, n_col: int, n_e: int, response: Response) -> None:
+    for w in range(count):
+        i = robots[w]
+        rotation = sh.get_mat(node, sh.N_R, w)
+        for c in range(n_col):
+            turn = mul(rotation, sh.get(columns, c * col.COLUMN + col.C_PHI, w))
+            for r in range(n_e):
+                response.residual[i, r, c] = gamma[(r * n_col + c) * W + w]
+            for a in range(3):
+                response.tip[i, a, c] = columns[(c * col.COLUMN + col.C_POS + a) * W + w]
+                response.tip[i, 3 + a, c] = turn[a]
+        for r in range(n_e):
+            response.error[i, r] = error[r * W + w]
+
+
+@kernel
+def add_base_moment(node: Lanes, wrench: Lanes, sign: float) -> None:
+    """Moment at the node, world frame, added to the base moment."""
+    for w in range(W):
+        m = mul(sh.get_mat(node, sh.N_R, w), sh.get(node, sh.N_M, w))
+        for a in range(3):
+            wrench[(3 + a) * W + w] += sign * m[a]
+
+
+@kernel
+def pass_chunk(
+    robots: Lanes, count: int, params: Params, ports: Ports, layout: Layout, memory: Memory, shape: Shape, response: Response, scratch: Lanes,
+    n_col: int, feed: bool, carry: bool, update: bool, process: float, noise: float,
+) -> None:
+    """One observer pass of the robots whose indices are the first `count` of `robots` (the rest repeat the last one)."""
+    n, n_x, n_rows = len(layout.tendon_segment), memory.x.shape[1], len(layout.row_tendon)
+    n_segments, n_steps = params.length.shape[1], layout.n_steps
+    n_e = n_rows + (0 if layout.paper else 3) + (3 if len(ports.follower_force) > 0 else 0)
+    n_t, n_p = n + sh.GROUP, padded(n_x, BLOCK)
+    dense, placed = len(shape.position) > 0, len(response.tip) > 0
+
+    o = 0
+    node, o = scratch[o : o + sh.NODE * W], o + sh.NODE * W
+    stages, o = scratch[o : o + 5 * sh.STAGE * W], o + 5 * sh.STAGE * W
+    tendon, o = scratch[o : o + n_t * sh.TENDON * W], o + n_t * sh.TENDON * W
+    paths, o = scratch[o : o + 4 * n_t * sh.PATH * W], o + 4 * n_t * sh.PATH * W
+    length, o = scratch[o : o + n_t * W], o + n_t * W
+    columns, o = scratch[o : o + n_col * col.COLUMN * W], o + n_col * col.COLUMN * W
+    change, o = scratch[o : o + n_col * n_t * W], o + n_col * n_t * W
+    du, o = scratch[o : o + col.D_U * W], o + col.D_U * W
+    x, o = scratch[o : o + n_x * W], o + n_x * W
+    error, o = scratch[o : o + n_e * W], o + n_e * W
+    wrench, o = scratch[o : o + 6 * W], o + 6 * W
+    s, o = scratch[o : o + W], o + W
+    gamma, o = scratch[o : o + n_e * n_col * W], o + n_e * n_col * W
+    P, o = scratch[o : o + n_p * n_p * W], o + n_p * n_p * W
+    G, o = scratch[o : o + n_e * n_p * W], o + n_e * n_p * W
+    scaled, o = scratch[o : o + n_e * n_p * W], o + n_e * n_p * W
+    work = scratch[o:]
+
+    for i in range(len(length)):
+        length[i] = 0.0
+    for i in range(len(columns)):
+        columns[i] = 0.0
+    for i in range(len(change)):
+        change[i] = 0.0
+    for i in range(len(tendon)):
+        tendon[i] = 0.0
+    if feed:
+        feed_forward(robots, count, ports, memory, layout)
+    load_unknowns(robots, ports, params, memory, layout, x, tendon)
+    gather_base(robots, ports, params, memory, layout, node, x)
+    for w in range(W):
+        s[w] = 0.0
+        for a in range(3):
+            wrench[a * W + w] = node[(sh.N_N + a) * W + w]
+            wrench[(3 + a) * W + w] = 0.0
+
+    size = n_t * sh.PATH * W
+    for k in range(n_segments):
+        first = layout.first_tendon[k]
+        loaded = first < n and not layout.paper
+        gather_segment(k, robots, ports, params, layout, tendon)
+        for j in range(n_steps):
+            gather_step(k, j, robots, ports, params, layout, node)
+            if j == 0:
+                start_segment(k, layout, node, x, columns, n_col)
+                if k == 0 or layout.paper:
+                    add_base_moment(node, wrench, 1.0)
+            sh.start_step(node, stages)
+            cuts = FIRST_CUTS if j == 0 else CUTS
+            solve_section(node, stages, tendon, paths, 0, first, n, loaded, cuts)
+            if j == 0 or dense:
+                for i in range(3 * W):
+                    node[sh.N_U * W + i] = stages[sh.S_U * W + i]
+            if j == 0 and k == 0:
+                for w in range(count):
+                    for a in range(3):
+                        memory.curvature_guess[robots[w], a] = node[(sh.N_U + a) * W + w]
+            if dense:
+                scatter_node(k * n_steps + j, count, robots, node, s, shape)
+            sh.second_stage(node, stages)
+            solve_section(node, stages[sh.STAGE * W :], tendon, paths[size:], 1, first, n, loaded, CUTS)
+            sh.third_stage(node, stages)
+            solve_section(node, stages[2 * sh.STAGE * W :], tendon, paths[2 * size :], 1, first, n, loaded, CUTS)
+            sh.fourth_stage(node, stages)
+            solve_section(node, stages[3 * sh.STAGE * W :], tendon, paths[3 * size :], 2, first, n, loaded, CUTS)
+            sh.end_step(node, stages)
+            for g in range(first, n, sh.GROUP):
+                p = g * sh.PATH * W
+                sh.add_lengths(length[g * W :], node, paths[p:], paths[size + p :], paths[2 * size + p :], paths[3 * size + p :])
+            if update or placed:
+                march_columns(k, n_x, n_col, placed, layout, node, stages, paths, columns, du, change)
+            sh.advance(node, stages)
+            for w in range(W):
+                s[w] += node[sh.N_H * W + w]
+        if layout.paper:
+            add_base_moment(node, wrench, -1.0)
+    if dense:
+        sh.start_step(node, stages)
+        solve_section(node, stages, tendon, paths, 2, layout.first_tendon[n_segments - 1], n, layout.first_tendon[n_segments - 1] < n and not layout.paper, FIRST_CUTS)
+        for i in range(3 * W):
+            node[sh.N_U * W + i] = stages[sh.S_U * W + i]
+        scatter_node(n_segments * n_steps, count, robots, node, s, shape)
+
+    close_lengths(robots, ports, params, layout, x, length, change, n_col, error, gamma)
+    if not layout.paper:
+        close_tip(robots, ports, params, node, x, columns, n_x, n_col, n_rows, error, gamma)
+        loosen(robots, params, layout, x, n_col, n_e, gamma)
+    if layout.paper:
+        for w in range(W):
+            tip_moment = ports.tip_moment[pick(robots[w], len(ports.tip_moment))]
+            for a in range(3):
+                wrench[(3 + a) * W + w] += tip_moment[a]
+    write_summary(robots, count, ports, layout, node, tendon, length, error, n_e, wrench, shape)
+    if placed:
+        write_response(robots, count, node, columns, error, gamma, n_col, n_e, response)
+    if update:
+        update_boundary(robots, count, params, memory, layout, x, error, gamma, n_col, n_e, P, G, scaled, work, process, noise, carry)
+        for w in range(count):
+            i = robots[w]
+            for r in range(n_rows):
+                memory.length_before[i, r] = ports.tendon_length[pick(i, len(ports.tendon_length)), layout.row_tendon[r]]
+            if len(memory.force_before) > 0:
+                for a in range(3):
+                    memory.force_before[i, a] = ports.tip_force[pick(i, len(ports.tip_force)), a]

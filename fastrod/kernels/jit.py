@@ -1,0 +1,73 @@
+"""How kernels are compiled: one set of flags, and a cache that never goes stale.
+
+numba keys its cache on the one file of the cached function, so an edit in a helper module would give stale results.
+The cache directory is therefore named after a hash of every kernel source and of numba's version.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+LANES = 16
+"""Robots that one pass of a kernel's inner loop holds side by side; the loop over them becomes SIMD code."""
+
+# contract: fused multiply-add. nsz: x + 0 is x. Neither may assume that NaN is absent: NaN is how a lost robot is seen.
+_FAST = {"contract", "nsz"}
+
+
+def _cache_dir() -> str | None:
+    """A writable folder for compiled kernels, or None."""
+    digest = hashlib.sha256(numba.__version__.encode())
+    for source in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(source.name.encode() + source.read_bytes())
+    name = digest.hexdigest()[:16]
+    homes = [os.environ.get("FASTROD_CACHE_DIR"), os.environ.get("XDG_CACHE_HOME"), Path.home() / ".cache", tempfile.gettempdir()]
+    for home in homes:
+        if not home:
+            continue
+        folder = Path(home) / "fastrod" / name
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                return str(folder)
+        except OSError:
+            continue
+    return None
+
+
+_CACHE_DIR = _cache_dir()
+
+
+def kernel(function: _Function) -> _Function:
+    """Compile `function` on first call, and keep the result across processes where a folder is writable."""
+    return _compile(function, parallel=False)
+
+
+def parallel_kernel(function: _Function) -> _Function:
+    """As `kernel`, with `prange` spread over threads."""
+    return _compile(function, parallel=True)
+
+
+def inline(function: _Function) -> _Function:
+    """A helper that is pasted into its caller: a call left in a loop over lanes would keep it from becoming SIMD code."""
+    made: _Function = numba.njit(inline="always", error_model="numpy", fastmath=_FAST)(function)
+    return made
+
+
+def _compile(function: _Function, parallel: bool) -> _Function:
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = _CACHE_DIR or before
+    try:
+        made: _Function = numba.njit(cache=_CACHE_DIR is not None, parallel=parallel, error_model="numpy", fastmath=_FAST, nogil=True)(function)
+    finally:
+        numba.config.CACHE_DIR = before
+    return made

@@ -1,0 +1,121 @@
+"""Repeat the observer's pass on frozen inputs until every boundary residual is small: damped Newton, then load continuation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+import numpy as np
+
+from fastrod.guess import cold_start
+from fastrod.kernels.gather import feed_forward
+from fastrod.types import Floats, Ints, Layout, Memory, Params, Ports
+
+Pass: TypeAlias = Callable[[Ints, Ports], Floats]
+"""(robots, ports) -> residual of these robots at the x before the update [m]."""
+
+_MAX_PASSES = 40
+_SMALLEST_STEP = 1.0 / 64.0
+_SMALLEST_LOAD_STEP = 1.0 / 256.0
+
+
+def settle(rows: Ints, warm: np.ndarray, layout: Layout, params: Params, ports: Ports, memory: Memory, tolerance: float, run: Pass) -> Ints:
+    """Bring the robots `rows` to rest on `ports`; the passes that each took, and -1 where none of three ways converged.
+
+    Warm robots start from their last x, moved to first order to the new inputs; others, and warm ones that fail, from a
+    cold guess; what still fails is led there by its loads, from none to all.
+    """
+    passes = np.zeros(memory.x.shape[0], np.int64)
+    left = rows[warm[rows]]
+    if len(left):
+        feed_forward(left, len(left), ports, memory, layout)
+        left = _newton(left, params, layout, ports, memory, tolerance, run, passes)
+    left = np.sort(np.concatenate([left, rows[~warm[rows]]]))
+    if len(left):
+        cold_start(left, layout, params, ports, memory)
+        left = _newton(left, params, layout, ports, memory, tolerance, run, passes)
+    if len(left):
+        left = _continuation(left, params, layout, ports, memory, tolerance, run, passes)
+    passes[left] = -1
+    return passes
+
+
+def _newton(rows: Ints, params: Params, layout: Layout, ports: Ports, memory: Memory, tolerance: float, run: Pass, passes: Ints) -> Ints:
+    """Newton with step halving; the robots that did not converge."""
+    failed: list[Ints] = []
+    x_at = memory.x[rows]
+    step = np.zeros_like(x_at)
+    best = np.full(len(rows), np.inf)
+    damping = np.ones(len(rows))
+    for _ in range(_MAX_PASSES):
+        x_tried = memory.x[rows]
+        residual = run(rows, ports)
+        passes[rows] += 1
+        after = memory.x[rows]
+        better = residual < best
+        if better.all():
+            x_at, step, best = x_tried, after - x_tried, residual
+            damping[:] = 1.0
+        else:
+            x_at = np.where(better[:, None], x_tried, x_at)
+            step = np.where(better[:, None], after - x_tried, step)
+            best = np.where(better, residual, best)
+            damping = np.where(better, 1.0, 0.5 * damping)
+            memory.x[rows] = x_at + damping[:, None] * step
+        done = (best <= tolerance) & _still(step, rows, layout, params)
+        lost = ~done & ((damping < _SMALLEST_STEP) | ~np.isfinite(step).all(1))
+        failed.append(rows[lost])
+        keep = ~(done | lost)
+        if not keep.any():
+            rows = rows[:0]
+            break
+        if not keep.all():
+            rows, x_at, step, best, damping = rows[keep], x_at[keep], step[keep], best[keep], damping[keep]
+    return np.sort(np.concatenate([rows, *failed]))
+
+
+def _still(step: Floats, rows: Ints, layout: Layout, params: Params) -> np.ndarray:
+    """The tensions no longer move: a small residual says little about them where tendons hardly stretch."""
+    if layout.paper or not len(layout.free_tendon):
+        return np.ones(len(step), bool)
+    moved = np.abs(step[:, 3 : 3 + len(layout.free_tendon)]).max(1)
+    unit = params.tension_scale if len(params.tension_scale) == 1 else params.tension_scale[rows]
+    return np.asarray(moved <= 1e-6 * unit)
+
+
+def _continuation(rows: Ints, params: Params, layout: Layout, ports: Ports, memory: Memory, tolerance: float, run: Pass, passes: Ints) -> Ints:
+    """From the unloaded robot to the loaded one, in load steps that grow with success; the robots that did not arrive."""
+    part = np.zeros(len(memory.x))
+    stride = np.full(len(memory.x), 0.25)
+    unloaded = _loaded(ports, part)
+    cold_start(rows, layout, params, unloaded, memory)
+    lost = _newton(rows, params, layout, unloaded, memory, tolerance, run, passes)
+    rows = np.setdiff1d(rows, lost)
+    held = memory.x.copy()
+    while len(rows):
+        aim = np.minimum(part + stride, 1.0)
+        missed = _newton(rows, params, layout, _loaded(ports, aim), memory, tolerance, run, passes)
+        arrived = np.setdiff1d(rows, missed)
+        part[arrived] = aim[arrived]
+        held[arrived] = memory.x[arrived]
+        stride[arrived] *= 2.0
+        memory.x[missed] = held[missed]
+        stride[missed] *= 0.5
+        lost = np.concatenate([lost, missed[stride[missed] < _SMALLEST_LOAD_STEP]])
+        rows = np.setdiff1d(rows[part[rows] < 1.0], lost)
+    return np.sort(lost)
+
+
+def _loaded(ports: Ports, part: Floats) -> Ports:
+    """The ports with each robot's loads scaled."""
+
+    def scaled(a: Floats) -> Floats:
+        return a if not len(a) else np.ascontiguousarray(part.reshape(-1, *[1] * (a.ndim - 1)) * a)
+
+    return ports._replace(
+        tip_force=scaled(ports.tip_force),
+        tip_moment=scaled(ports.tip_moment),
+        line_force=scaled(ports.line_force),
+        node_force=scaled(ports.node_force),
+        follower_force=scaled(ports.follower_force),
+    )

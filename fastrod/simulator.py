@@ -1,0 +1,447 @@
+"""`Simulator`: many robots, one observer pass a step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fastrod.compile import compile_robots
+from fastrod.errors import InputError
+from fastrod.guess import cold_start
+from fastrod.inputs import PointForces, Reader
+from fastrod.kernels.batch import pass_parallel, pass_serial
+from fastrod.kernels.chunk import scratch_size
+from fastrod.kernels.dense import between_nodes
+from fastrod.kernels.jit import LANES
+from fastrod.robot import Robot
+from fastrod.settle import settle
+from fastrod.types import Flags, Floats, Ints, Memory, Ports, Response, Shape
+
+_SMALL = 4 * LANES  # robots below which starting threads costs more than it saves
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observer:
+    """Gains of the boundary observer (the paper's Q and V; model.md, "The observer"), on unknowns scaled to about one.
+
+    The defaults make a step a Gauss-Newton step. More `measurement_noise` smooths the boundary over time.
+    """
+
+    process_noise: float = 100.0
+    """Q, growth of the variance of the scaled unknowns (moment by EI/l, tension by EI/(d l)) [1/s]."""
+    measurement_noise: float = 1e-20
+    """V^-1, variance of a boundary residual times time [m^2 s]."""
+
+    def __post_init__(self) -> None:
+        for name in ("process_noise", "measurement_noise"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0.0):
+                raise InputError(f"Observer.{name} is {value!r}; it must be positive and finite.")
+
+
+@dataclass(frozen=True)
+class State:
+    """The robots after a step: new arrays, robot axis first, world frame. With outputs="tip", those along the rod are empty.
+
+    A node is shared by two segments at a joint; its curvature is that of the distal one.
+    """
+
+    position: Floats
+    """(n_robots, n_points, 3) backbone [m]."""
+    rotation: Floats
+    """(n_robots, n_points, 3, 3) world_from_material."""
+    curvature: Floats
+    """(n_robots, n_points, 3) material frame [1/m]."""
+    arclength: Floats
+    """(n_robots, n_points) [m]."""
+    moment: Floats
+    """(n_robots, n_points, 3) total internal moment of rod and tendons, material frame [N m]."""
+    force: Floats
+    """(n_robots, n_points, 3) total internal force: the loads beyond the node [N]."""
+    tip_position: Floats
+    """(n_robots, 3) [m]."""
+    tip_rotation: Floats
+    """(n_robots, 3, 3) world_from_material."""
+    tension: Floats
+    """(n_robots, n_tendons) positive pulls [N]."""
+    path_length: Floats
+    """(n_robots, n_tendons) length of the tendon's path along the bent rod, without its stretch [m]."""
+    base_wrench: Floats
+    """(n_robots, 6) force [N], then moment about the base point [N m], that the robot exerts on its host."""
+    residual: Floats
+    """(n_robots,) largest boundary residual [m]: lengths as they are, moments times l^2/EI, forces times l^3/EI."""
+    ok: Flags
+    """(n_robots,) the robot's inputs were good and its numbers are; after `settle`, also that it converged."""
+    passes: Ints
+    """(n_robots,) forward passes that were spent; -1 where `settle` did not converge."""
+    problems: Mapping[int, str]
+    """Robot index -> what is wrong with it, for the robots that are not ok."""
+
+
+class Pose(NamedTuple):
+    """Cross-sections at given arclengths."""
+
+    position: Floats
+    """(n_robots, n_queries, 3) world [m]."""
+    rotation: Floats
+    """(n_robots, n_queries, 3, 3) world_from_material."""
+    curvature: Floats
+    """(n_robots, n_queries, 3) material frame [1/m]."""
+
+
+class Snapshot(NamedTuple):
+    """Everything that a later step depends on."""
+
+    memory: Memory
+    warm: Flags
+    ports: Ports | None
+    state: State | None
+
+
+class Simulator:
+    """Many tendon-driven continuum robots at once (contracts.md).
+
+    >>> import fastrod
+    >>> robot = fastrod.load_robot("prototype")
+    >>> sim = fastrod.Simulator(robot, n_robots=2)
+    >>> state = sim.settle(robot.rest_tendon_length, tip_force=[[0, 0, 0], [0, 0.1, 0]])
+    >>> state.ok
+    array([ True,  True])
+    """
+
+    def __init__(
+        self,
+        robot: Robot | Sequence[Robot],
+        n_robots: int | None = None,
+        dt: float = 0.01,
+        points_per_segment: int = 20,
+        *,
+        outputs: Literal["full", "tip"] = "full",
+        observer: Observer | None = None,
+        threads: int | None = None,
+    ) -> None:
+        """Compile `robot` (one for all, or a list with one each) for `n_robots` and a time step `dt` [s].
+
+        `points_per_segment` is the number of integration steps of a segment; the shape has n_segments times as many
+        nodes and one more. `outputs="tip"` keeps only tip pose, residual and ok: some 2 kB a five-segment robot.
+        `threads` defaults to numba's; 1 is the serial twin. Raises `InputError`, `RobotError`.
+        """
+        robots = [robot] if isinstance(robot, Robot) else list(robot)
+        if n_robots is None:
+            n_robots = len(robots)
+        if not isinstance(n_robots, (int, np.integer)) or n_robots < 1:
+            raise InputError(f"n_robots is {n_robots!r}; it must be a whole number, at least 1.")
+        if not robots or len(robots) not in (1, n_robots):
+            raise InputError(f"{len(robots)} robots for n_robots {n_robots}; give one for all, or a list of n_robots.")
+        if not isinstance(points_per_segment, (int, np.integer)) or points_per_segment < 2:
+            raise InputError(f"points_per_segment is {points_per_segment!r}; it must be a whole number, at least 2.")
+        if not (np.isfinite(dt) and dt > 0.0):
+            raise InputError(f"dt is {dt!r} s; it must be positive and finite.")
+        if outputs not in ("full", "tip"):
+            raise InputError(f"outputs is {outputs!r}; it must be 'full' or 'tip'.")
+        if threads is not None and not 1 <= threads <= numba.config.NUMBA_NUM_THREADS:
+            raise InputError(f"threads is {threads!r}; it must be from 1 to {numba.config.NUMBA_NUM_THREADS} here.")
+        self.robots = tuple(robots)
+        self.n_robots = int(n_robots)
+        self.dt = float(dt)
+        self.observer = observer or Observer()
+        self.outputs = outputs
+        self._threads = threads or numba.get_num_threads()
+        self._layout, self._params, self._rest = compile_robots(self.robots, int(points_per_segment))
+        self._reader = Reader(self._layout, self._params, self._rest, self.n_robots)
+        self._all = np.arange(self.n_robots)
+        self._warm = np.zeros(self.n_robots, bool)
+        self._ports: Ports | None = None
+        self._state: State | None = None
+        self._memory = self._new_memory(follower=False, track_force=False)
+
+    @property
+    def n_points(self) -> int:
+        """Nodes along the whole robot."""
+        return len(self._layout.first_tendon) * self._layout.n_steps + 1
+
+    def step(
+        self,
+        tendon_length: ArrayLike | None = None,
+        *,
+        tension: ArrayLike | None = None,
+        extension: ArrayLike | None = None,
+        tip_force: ArrayLike | None = None,
+        tip_moment: ArrayLike | None = None,
+        line_force: ArrayLike | None = None,
+        point_force: PointForces | None = None,
+        follower_tip_force: ArrayLike | None = None,
+        base_pose: ArrayLike | None = None,
+    ) -> State:
+        """One observer pass: one forward integration per robot.
+
+        Every input has shape (n_robots, ...), or without the robot axis for all. What is not given is zero, or the
+        robot's own. `tendon_length` (n_tendons,) absolute, base to where the tendon ends [m]; `tension` (n_tendons,) of
+        tendon_tension segments [N]; `extension` (n_segments,) [m]; `tip_force` [N], `tip_moment` [N m], `line_force`
+        [N/m], each (3,) world, the last also (n_segments, points, 3), linear between evenly spaced points, on top of the
+        self-weight; `point_force` (arclength [m], force (3,) world [N]) pairs; `follower_tip_force` (3,) material frame of
+        the tip [N]; `base_pose` (7,) position [m] and quaternion w x y z.
+
+        The state belongs to the boundary that the last pass predicted for these inputs. Raises `InputError` on a wrong
+        shape, or where no robot's input is usable; a single bad row only clears that robot's `ok`.
+        """
+        ports, rows = self._read(tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force, follower_tip_force, base_pose)
+        cold = rows[~self._warm[rows]]
+        self._start(cold, ports)
+        shape = self._new_shape(self.outputs, len(rows) < self.n_robots)
+        process, noise = self.observer.process_noise * self.dt, self.observer.measurement_noise / self.dt
+        self._pass(rows, ports, shape, feed=True, carry=True, process=process, noise=noise)
+        ok = np.zeros(self.n_robots, bool)
+        ok[rows] = np.isfinite(self._memory.x[rows]).all(1) & (shape.residual[rows] < self._reach(rows))
+        passes = np.zeros(self.n_robots, np.int64)
+        passes[rows] = 1
+        return self._finish(ports, shape, ok, passes, "the observer diverged; use settle, or smaller changes of input")
+
+    def settle(
+        self,
+        tendon_length: ArrayLike | None = None,
+        *,
+        tension: ArrayLike | None = None,
+        extension: ArrayLike | None = None,
+        tip_force: ArrayLike | None = None,
+        tip_moment: ArrayLike | None = None,
+        line_force: ArrayLike | None = None,
+        point_force: PointForces | None = None,
+        follower_tip_force: ArrayLike | None = None,
+        base_pose: ArrayLike | None = None,
+        tolerance: float = 1e-9,
+    ) -> State:
+        """Repeat the pass on frozen inputs until every boundary residual is below `tolerance` [m]; inputs as for `step`.
+
+        Where Newton's method would diverge the loads are brought on step by step. Robots that still do not converge
+        have `ok` False and `passes` -1.
+        """
+        if not (np.isfinite(tolerance) and tolerance > 0.0):
+            raise InputError(f"tolerance is {tolerance!r} m; it must be positive and finite.")
+        ports, rows = self._read(tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force, follower_tip_force, base_pose)
+        shape = self._new_shape(self.outputs, len(rows) < self.n_robots)
+
+        def run(which: Ints, at: Ports) -> Floats:
+            self._pass(which, at, shape, feed=False, carry=False, process=1.0, noise=1e-18)
+            return shape.residual[which]
+
+        passes = settle(rows, self._warm, self._layout, self._params, ports, self._memory, tolerance, run)
+        ok = np.zeros(self.n_robots, bool)
+        ok[rows] = (passes[rows] > 0) & (shape.residual[rows] <= tolerance)
+        return self._finish(ports, shape, ok, passes, f"settle did not bring the boundary residual below {tolerance:g} m")
+
+    def shape(self, arclength: ArrayLike) -> Pose:
+        """Pose and curvature of the last state at any arclength [m]: (n_queries,), or (n_robots, n_queries).
+
+        Between nodes the rod is integrated from the node before, so the answer has the integrator's order everywhere.
+        """
+        state, ports = self._last("shape")
+        if self.outputs != "full":
+            raise InputError("shape needs Simulator(..., outputs='full'); this one keeps the tip only.")
+        s = np.asarray(arclength, dtype=np.float64)
+        s = np.broadcast_to(np.atleast_1d(s), (self.n_robots, s.shape[-1] if s.ndim else 1)) if s.ndim <= 1 else s
+        if s.ndim != 2 or len(s) != self.n_robots:
+            raise InputError(f"arclength has shape {np.shape(arclength)}; it must be (n_queries,) or ({self.n_robots}, n_queries) [m].")
+        end = state.arclength[:, -1:]
+        if (bad := ~((s >= 0.0) & (s <= end * (1.0 + 1e-9))) & state.ok[:, None]).any():
+            i, j = np.argwhere(bad)[0]
+            raise InputError(f"arclength {s[i, j]:.6g} m; robot {i} runs from 0 to {end[i, 0]:.6g} m.")
+        found = Pose(np.full((*s.shape, 3), np.nan), np.full((*s.shape, 3, 3), np.nan), np.full((*s.shape, 3), np.nan))
+        whole = np.isfinite(end[:, 0])
+        robot, query = np.nonzero(np.broadcast_to(whole[:, None], s.shape))
+        between_nodes(robot, query, np.ascontiguousarray(s), self._params, ports, self._layout, *_nodes(state), state.tension, found)
+        return found
+
+    def jacobian(self) -> Floats:
+        """(n_robots, 6, n_tendons + n_segments) d(tip position [m], rotation vector [rad]) / d(input [m or N]), world frame.
+
+        Inputs: the tendons (length, or tension where that is the mode), then the segments' extensions, the other inputs
+        held. Columns of lengths come from the sensitivities of the pass (model.md); those of tensions and extensions from
+        central differences of the pass, closed by the same sensitivities.
+        """
+        _, ports = self._last("jacobian")
+        layout = self._layout
+        n_tendons, n_segments = len(layout.tendon_segment), len(layout.first_tendon)
+        response, _ = self._respond(ports)
+        inverse = np.linalg.pinv(response.residual[:, :, : self._memory.x.shape[1]])
+        by_unknown = response.tip[:, :, : self._memory.x.shape[1]] @ inverse
+        jacobian = np.empty((self.n_robots, 6, n_tendons + n_segments))
+        jacobian[:, :, layout.row_tendon] = by_unknown[:, :, : len(layout.row_tendon)]
+        pulled = np.setdiff1d(np.arange(n_tendons), layout.row_tendon)
+        for name, members, start in (("tension", pulled, 0), ("extension", np.arange(n_segments), n_tendons)):
+            delta = 1e-4 * (self._params.tension_scale if name == "tension" else self._params.reach)[:, None]
+            for a in members:
+                tip, error = self._difference(ports, name, int(a), delta)
+                jacobian[:, :, start + a] = tip - np.einsum("rie,re->ri", by_unknown, error)
+        return jacobian
+
+    def compliance(self) -> Floats:
+        """(n_robots, 6, 3) d(tip position [m], rotation vector [rad]) / d(tip force [N]), world frame, actuation held."""
+        _, ports = self._last("compliance")
+        response, _ = self._respond(ports)
+        n_x = self._memory.x.shape[1]
+        free, load = response.residual[:, :, :n_x], response.residual[:, :, -3:]
+        if len(ports.follower_force):  # the follower force is an unknown; a dead force enters as its column, but not its own row
+            load = load.copy()
+            load[:, -3:] -= (self._params.reach**2 / self._params.moment_scale)[:, None, None] * np.eye(3)
+        return np.asarray(response.tip[:, :, -3:] - response.tip[:, :, :n_x] @ (np.linalg.pinv(free) @ load))
+
+    def reset(self, rows: ArrayLike | None = None) -> None:
+        """Forget the boundary of these robots (all by default): their next step begins from the cold guess."""
+        self._warm[slice(None) if rows is None else np.asarray(rows)] = False
+
+    def snapshot(self) -> Snapshot:
+        """A copy of everything that a later step depends on."""
+        return Snapshot(Memory(*(a.copy() for a in self._memory)), self._warm.copy(), self._ports, self._state)
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Go back to a `snapshot` of this simulator."""
+        if snapshot.warm.shape != self._warm.shape:
+            raise InputError(f"the snapshot holds {len(snapshot.warm)} robots, this simulator {self.n_robots}.")
+        self._memory = Memory(*(a.copy() for a in snapshot.memory))
+        self._warm, self._ports, self._state = snapshot.warm.copy(), snapshot.ports, snapshot.state
+
+    def _read(
+        self,
+        tendon_length: ArrayLike | None,
+        tension: ArrayLike | None,
+        extension: ArrayLike | None,
+        tip_force: ArrayLike | None,
+        tip_moment: ArrayLike | None,
+        line_force: ArrayLike | None,
+        point_force: PointForces | None,
+        follower_tip_force: ArrayLike | None,
+        base_pose: ArrayLike | None,
+    ) -> tuple[Ports, Ints]:
+        """The ports, and the robots whose inputs are good."""
+        ports = self._reader.ports(tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force, follower_tip_force, base_pose)
+        problems = self._reader.problems
+        rows = np.setdiff1d(self._all, list(problems)) if problems else self._all
+        before = self._ports.tip_force if self._ports is not None else np.zeros((1, 3))
+        moved = tip_force is not None and self._warm.any() and not np.array_equal(np.broadcast_to(ports.tip_force, (self.n_robots, 3)), np.broadcast_to(before, (self.n_robots, 3)), equal_nan=True)
+        self._remember(follower=len(ports.follower_force) > 0, track_force=bool(moved) or len(self._memory.force_before) > 0)
+        return ports, rows
+
+    def _new_memory(self, follower: bool, track_force: bool) -> Memory:
+        layout, n = self._layout, self.n_robots
+        n_rows = len(layout.row_tendon)
+        n_x = 2 * len(layout.first_tendon) if layout.paper else 3 + len(layout.free_tendon)
+        n_x += 3 if follower else 0
+        return Memory(
+            x=np.zeros((n, n_x)),
+            covariance=np.zeros((n, n_x * (n_x + 1) // 2), np.float32),
+            gain=np.zeros((n, n_x, n_rows + (3 if track_force else 0)), np.float32),
+            length_before=np.zeros((n, n_rows)),
+            force_before=np.zeros((n if track_force else 0, 3)),
+            curvature_guess=np.zeros((n, 3)),
+        )
+
+    def _remember(self, follower: bool, track_force: bool) -> None:
+        """Widen or narrow the memory when a follower force or a moving tip force comes or goes; x of the rod itself is kept."""
+        new = self._new_memory(follower, track_force)
+        old = self._memory
+        if [a.shape for a in new] == [a.shape for a in old]:
+            return
+        kept = min(old.x.shape[1], new.x.shape[1])
+        new.x[:, :kept] = old.x[:, :kept]
+        columns = min(old.gain.shape[2], new.gain.shape[2])
+        new.gain[:, :kept, :columns] = old.gain[:, :kept, :columns]
+        new.length_before[:] = old.length_before
+        new.curvature_guess[:] = old.curvature_guess
+        if track_force and self._ports is not None:
+            new.force_before[:] = self._ports.tip_force
+        self._memory = new
+
+    def _start(self, rows: Ints, ports: Ports) -> None:
+        """Cold robots: x from the inputs alone, and nothing to move or to remember."""
+        if not len(rows):
+            return
+        cold_start(rows, self._layout, self._params, ports, self._memory)
+        self._memory.gain[rows] = 0.0
+        self._memory.covariance[rows] = 0.0
+
+    def _new_shape(self, outputs: str, holes: bool) -> Shape:
+        n, n_points, n_tendons = self.n_robots, self.n_points, len(self._layout.tendon_segment)
+
+        def make(wanted: bool, *axes: int) -> Floats:
+            return (np.full((n, *axes), np.nan) if holes else np.empty((n, *axes))) if wanted else np.empty((0, *axes))
+
+        full, tip = outputs == "full", outputs != "none"
+        return Shape(
+            make(full, n_points, 3), make(full, n_points, 3, 3), make(full, n_points, 3), make(full, n_points), make(full, n_points, 3),
+            make(full, n_points, 3), make(tip, 3), make(tip, 3, 3), make(full, n_tendons), make(full, n_tendons), make(full, 6), make(tip),
+        )  # fmt: skip
+
+    def _pass(
+        self, rows: Ints, ports: Ports, shape: Shape, *, response: Response | None = None, feed: bool = False, carry: bool = False,
+        update: bool = True, process: float = 1.0, noise: float = 1.0, n_col: int | None = None,
+    ) -> None:
+        memory, layout = self._memory, self._layout
+        follower, n_x = len(ports.follower_force) > 0, memory.x.shape[1]
+        if n_col is None:
+            n_col = n_x + (3 if len(memory.force_before) and not follower else 0)
+        n_e = len(layout.row_tendon) + (0 if layout.paper else 3) + (3 if follower else 0)
+        parts = 1 if len(rows) <= _SMALL else min(self._threads, -(-len(rows) // LANES))
+        scratch = np.empty((parts, scratch_size(len(layout.tendon_segment), n_x, n_col, n_e)))
+        if response is None:
+            response = Response(np.empty((0, 0, 0)), np.empty((0, 0, 0)), np.empty((0, 0)))
+        body = pass_serial if parts == 1 else pass_parallel
+        body(rows, self._params, ports, layout, memory, shape, response, scratch, n_col, feed, carry, update, process, noise)
+
+    def _finish(self, ports: Ports, shape: Shape, ok: Flags, passes: Ints, reason: str) -> State:
+        """Note who is lost, so that nothing continues on NaN, and hand out the state."""
+        problems = dict(self._reader.problems)
+        for i in np.flatnonzero(~ok):
+            problems.setdefault(int(i), f"{reason}; residual {shape.residual[i]:.3g} m.")
+        self._warm[:] = ok if not self._reader.problems else np.where(np.isin(self._all, list(self._reader.problems)), self._warm, ok)
+        self._ports = ports
+        self._state = State(
+            position=shape.position, rotation=shape.rotation, curvature=shape.curvature, arclength=shape.arclength, moment=shape.moment,
+            force=shape.force, tip_position=shape.tip_position, tip_rotation=shape.tip_rotation, tension=shape.tension,
+            path_length=shape.path_length, base_wrench=shape.base_wrench, residual=shape.residual, ok=ok, passes=passes, problems=problems,
+        )  # fmt: skip
+        return self._state
+
+    def _last(self, what: str) -> tuple[State, Ports]:
+        if self._state is None or self._ports is None:
+            raise InputError(f"{what} needs a state; call step or settle first.")
+        return self._state, self._ports
+
+    def _reach(self, rows: Ints) -> Floats:
+        reach = self._params.reach
+        return reach if len(reach) == 1 else reach[rows]
+
+    def _respond(self, ports: Ports, columns: bool = True) -> tuple[Response, Shape]:
+        """A pass at the present x that changes nothing, with its linear response."""
+        layout, n_x = self._layout, self._memory.x.shape[1]
+        follower = len(ports.follower_force) > 0
+        n_col = (n_x if follower else n_x + 3) if columns else 0
+        n_e = len(layout.row_tendon) + (0 if layout.paper else 3) + (3 if follower else 0)
+        n = self.n_robots
+        response = Response(np.full((n, n_e, n_col), np.nan), np.full((n, 6, n_col), np.nan), np.full((n, n_e), np.nan))
+        shape = self._new_shape("tip", True)
+        self._pass(np.flatnonzero(self._warm), ports, shape, response=response, update=False, n_col=n_col)
+        return response, shape
+
+    def _difference(self, ports: Ports, name: str, a: int, delta: Floats) -> tuple[Floats, Floats]:
+        """Central difference of tip pose (n, 6) and residuals (n, n_e) by one input, at fixed unknowns."""
+        base = getattr(ports, name)
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = np.broadcast_to(base, (max(len(base), len(delta)), base.shape[1])).copy()
+            moved[:, a : a + 1] += sign * delta
+            response, shape = self._respond(ports._replace(**{name: moved}), columns=False)
+            ends.append((shape.tip_position, shape.tip_rotation, response.error))
+        (p1, r1, e1), (p0, r0, e0) = ends
+        turn = r1 @ np.swapaxes(r0, 1, 2)
+        skew = 0.5 * np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=1)
+        return np.concatenate([p1 - p0, skew], axis=1) / (2.0 * delta), (e1 - e0) / (2.0 * delta)
+
+
+def _nodes(state: State) -> tuple[Floats, ...]:
+    return state.arclength, state.position, state.rotation, state.moment, state.force, state.curvature
