@@ -31,7 +31,7 @@ def padded(n: int, block: int) -> int:
 def scratch_size(n_tendons: int, n_x: int, n_col: int, n_e: int) -> int:
     """Numbers of scratch that `pass_chunk` needs."""
     n_t, n_p = n_tendons + sh.GROUP, padded(n_x, BLOCK)
-    march = sh.NODE + 5 * sh.STAGE + n_t * (sh.TENDON + 4 * sh.PATH + 1) + n_col * (col.COLUMN + n_t) + col.D_U
+    march = sh.NODE + 5 * sh.STAGE + n_t * (sh.TENDON + sh.PATHS + 1) + n_col * (col.COLUMN + n_t)
     return W * (march + 8 + n_e + n_e * n_col + n_p * n_p + 2 * n_e * n_p + n_p + 2 + 2 * n_x)
 
 
@@ -41,48 +41,35 @@ def solve_section(node: Lanes, stage: Lanes, tendon: Lanes, path: Lanes, half: i
     if not loaded:
         sh.curvature_without_tendons(node, stage, half)
         for g in range(first, n, sh.GROUP):
-            sh.tendon_paths(stage, tendon[g * sh.TENDON * W :], path[g * sh.PATH * W :])
+            sh.tendon_paths(stage, tendon[g * sh.TENDON * W :], path[g * sh.PATHS * W :])
         return
     for _ in range(cuts):
         sh.clear_sums(stage)
         for g in range(first, n, sh.GROUP):
-            sh.tendon_sums(stage, tendon[g * sh.TENDON * W :], path[g * sh.PATH * W :])
+            sh.tendon_sums(stage, tendon[g * sh.TENDON * W :], path[g * sh.PATHS * W :])
         sh.correct_curvature(node, stage, half)
 
 
 @kernel
-def march_columns(
-    k: int, n_x: int, n_col: int, placed: bool, layout: Layout, node: Lanes, stages: Lanes, paths: Lanes, columns: Lanes, du: Lanes, change: Lanes
-) -> None:
+def march_columns(k: int, n_col: int, placed: bool, layout: Layout, node: Lanes, stages: Lanes, paths: Lanes, columns: Lanes, change: Lanes) -> None:
     """Carry every column over one step and add its share of the tendon lengths."""
     n, first = len(layout.tendon_segment), layout.first_tendon[k]
     n_t = n + sh.GROUP
-    size = n_t * sh.PATH * W
-    p1, p2, p3, p4 = paths[:size], paths[size : 2 * size], paths[2 * size : 3 * size], paths[3 * size : 4 * size]
     n_base = 2 * len(layout.first_tendon) if layout.paper else 3
     n_free = len(layout.free_tendon)
     for c in range(n_col):
         if layout.paper and c < n_base and c // 2 > k:
             continue  # its segment has not begun
-        column = columns[c * col.COLUMN * W : (c + 1) * col.COLUMN * W]
-        tendon = layout.free_tendon[c - n_base] if n_base <= c < n_base + n_free else -1
+        tendon = layout.free_tendon[c - n_base] if n_base <= c < n_base + n_free else n
+        drive = paths[(tendon if tendon >= first else n) * sh.PATHS * W :]  # after the last tendon all is zero
         axis = c - n_base - n_free
-        unit = (1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, 1.0 if axis == 2 else 0.0)
-        if tendon >= first:
-            o = tendon * sh.PATH * W
-            if placed:
-                col.placed_column(column, du, node, stages, p1[o:], p2[o:], p3[o:], p4[o:], True, 0.0, 0.0, 0.0)
-            else:
-                col.tendon_column(column, du, node, stages, p1[o:], p2[o:], p3[o:], p4[o:])
-        elif placed:
-            col.placed_column(column, du, node, stages, p1, p2, p3, p4, False, unit[0], unit[1], unit[2])
-        elif axis >= 0:
-            col.force_column(column, du, node, stages, unit[0], unit[1], unit[2])
-        else:
-            col.free_column(column, du, node, stages)
+        load = node[(sh.N_R + 3 * axis) * W :] if axis >= 0 else paths[n * sh.PATHS * W :]  # R^T e_axis is a row of R
+        column = columns[c * col.COLUMN * W : (c + 1) * col.COLUMN * W]
+        col.step_column(column, node, stages, drive, load)
+        if placed:
+            col.place_column(column, node, stages)
         for g in range(first, n, sh.GROUP):
-            o = g * sh.PATH * W
-            col.add_length_changes(change[(c * n_t + g) * W :], du, p1[o:], p2[o:], p3[o:], p4[o:])
+            col.add_length_changes(change[(c * n_t + g) * W :], column, paths[g * sh.PATHS * W :])
 
 
 @kernel
@@ -324,11 +311,10 @@ def pass_chunk(
     node, o = scratch[o : o + sh.NODE * W], o + sh.NODE * W
     stages, o = scratch[o : o + 5 * sh.STAGE * W], o + 5 * sh.STAGE * W
     tendon, o = scratch[o : o + n_t * sh.TENDON * W], o + n_t * sh.TENDON * W
-    paths, o = scratch[o : o + 4 * n_t * sh.PATH * W], o + 4 * n_t * sh.PATH * W
+    paths, o = scratch[o : o + n_t * sh.PATHS * W], o + n_t * sh.PATHS * W
     length, o = scratch[o : o + n_t * W], o + n_t * W
     columns, o = scratch[o : o + n_col * col.COLUMN * W], o + n_col * col.COLUMN * W
     change, o = scratch[o : o + n_col * n_t * W], o + n_col * n_t * W
-    du, o = scratch[o : o + col.D_U * W], o + col.D_U * W
     x, o = scratch[o : o + n_x * W], o + n_x * W
     error, o = scratch[o : o + n_e * W], o + n_e * W
     wrench, o = scratch[o : o + 6 * W], o + 6 * W
@@ -345,6 +331,8 @@ def pass_chunk(
         columns[i] = 0.0
     for i in range(len(change)):
         change[i] = 0.0
+    for i in range(len(paths)):
+        paths[i] = 0.0
     for i in range(len(tendon)):
         tendon[i] = 0.0
     if feed:
@@ -357,7 +345,6 @@ def pass_chunk(
             wrench[a * W + w] = node[(sh.N_N + a) * W + w]
             wrench[(3 + a) * W + w] = 0.0
 
-    size = n_t * sh.PATH * W
     for k in range(n_segments):
         first = layout.first_tendon[k]
         loaded = first < n and not layout.paper
@@ -381,17 +368,16 @@ def pass_chunk(
             if dense:
                 scatter_node(k * n_steps + j, count, robots, node, s, shape)
             sh.second_stage(node, stages)
-            solve_section(node, stages[sh.STAGE * W :], tendon, paths[size:], 1, first, n, loaded, CUTS)
+            solve_section(node, stages[sh.STAGE * W :], tendon, paths[sh.PATH * W :], 1, first, n, loaded, CUTS)
             sh.third_stage(node, stages)
-            solve_section(node, stages[2 * sh.STAGE * W :], tendon, paths[2 * size :], 1, first, n, loaded, CUTS)
+            solve_section(node, stages[2 * sh.STAGE * W :], tendon, paths[2 * sh.PATH * W :], 1, first, n, loaded, CUTS)
             sh.fourth_stage(node, stages)
-            solve_section(node, stages[3 * sh.STAGE * W :], tendon, paths[3 * size :], 2, first, n, loaded, CUTS)
+            solve_section(node, stages[3 * sh.STAGE * W :], tendon, paths[3 * sh.PATH * W :], 2, first, n, loaded, CUTS)
             sh.end_step(node, stages)
             for g in range(first, n, sh.GROUP):
-                p = g * sh.PATH * W
-                sh.add_lengths(length[g * W :], node, paths[p:], paths[size + p :], paths[2 * size + p :], paths[3 * size + p :])
+                sh.add_lengths(length[g * W :], node, paths[g * sh.PATHS * W :])
             if update or placed:
-                march_columns(k, n_x, n_col, placed, layout, node, stages, paths, columns, du, change)
+                march_columns(k, n_col, placed, layout, node, stages, paths, columns, change)
             sh.advance(node, stages)
             for w in range(W):
                 s[w] += node[sh.N_H * W + w]

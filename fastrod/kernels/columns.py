@@ -14,6 +14,7 @@ from fastrod.kernels.shape import (
     N_R,
     P_C,
     PATH,
+    PATHS,
     S_C,
     S_INV,
     S_M,
@@ -29,10 +30,10 @@ from fastrod.kernels.shape import (
     get_mat,
     put,
 )
-from fastrod.kernels.vec import Mat, Vec, add, axpy, cross, exp_map_variation, mul, mul_t, scale, sub, sym_mul
+from fastrod.kernels.vec import Mat, Vec, add, axpy, cross, dot, exp_map_variation, mul, mul_t, scale, sub, sym_mul
 
-C_PHI, C_M, C_POS, COLUMN = 0, 3, 6, 9
-D_U = 12  # the weighted change of u at the four stages
+C_PHI, C_M, C_POS, COLUMN = 0, 3, 6, 27
+C_U, C_PHI_BEFORE, C_TANGENT = 9, 21, 24  # of the last step: weighted changes of u at the stages, phi at its start, of the tangents
 
 
 @inline
@@ -69,41 +70,38 @@ def _tangent(rotation: Mat, psi: Vec) -> Vec:
     )
 
 
-@inline
-def _step(column: Lanes, du: Lanes, node: Lanes, stages: Lanes, paths: tuple[Lanes, Lanes, Lanes, Lanes], dn: Vec, forced: bool, loaded: bool, placed: bool) -> None:
+@kernel
+def step_column(column: Lanes, node: Lanes, stages: Lanes, path: Lanes, load: Lanes) -> None:
+    """Carry one column over the step. `path`: of the tendon whose tension the column is, or zeros; `load`: the tip force
+    that it is, in the frame of the start, or zeros. One body for all columns: a second one would compile for seconds."""
     for w in range(W):
         h = node[N_H * W + w]
         phi, dm1 = get(column, C_PHI, w), get(column, C_M, w)
         n1, n2, n4 = get(stages, S_N, w), get(stages, STAGE + S_N, w), get(stages, 3 * STAGE + S_N, w)
         dn1, dn2, dn4 = cross(n1, phi), cross(n2, phi), cross(n4, phi)
-        if loaded:
-            load = mul_t(get_mat(node, N_R, w), dn)
-            dn1, dn2, dn4 = add(dn1, load), add(dn2, load), add(dn4, load)
+        dn = get(load, 0, w)
+        dn1, dn2, dn4 = add(dn1, dn), add(dn2, dn), add(dn4, dn)
         u1, u2, u4 = get(stages, S_U, w), get(stages, STAGE + S_U, w), get(stages, 3 * STAGE + S_U, w)
 
-        pull = get(paths[0], P_C, w) if forced else (0.0, 0.0, 0.0)
-        du1 = _curvature(stages, 0, w, sub(dm1, pull))
+        du1 = _curvature(stages, 0, w, sub(dm1, get(path, P_C, w)))
         k1 = (dn1[1], -dn1[0], 0.0)
         w1 = _torsion_slope(stages, 0, w, du1, dm1)
 
         rotation, psi, dm = _turned(stages, 1, w, scale(0.5 * h, du1), axpy(0.5 * h, k1, dm1), dm1[2] + 0.5 * h * w1)
-        pull = get(paths[1], P_C, w) if forced else (0.0, 0.0, 0.0)
-        du2 = _curvature(stages, 1, w, sub(dm, pull))
+        du2 = _curvature(stages, 1, w, sub(dm, get(path, 1 * PATH + P_C, w)))
         w2 = _torsion_slope(stages, 1, w, du2, dm)
         t2 = _tangent(rotation, psi)
         k2 = add(cross(n2, t2), cross(dn2, (rotation[2], rotation[5], rotation[8])))
 
         turn = add(cross(du1, u2), cross(u1, du2))
         rotation, psi, dm = _turned(stages, 2, w, axpy(0.5 * h, du2, scale(0.125 * h * h, turn)), axpy(0.5 * h, k2, dm1), dm1[2] + 0.5 * h * w2)
-        pull = get(paths[2], P_C, w) if forced else (0.0, 0.0, 0.0)
-        du3 = _curvature(stages, 2, w, sub(dm, pull))
+        du3 = _curvature(stages, 2, w, sub(dm, get(path, 2 * PATH + P_C, w)))
         w3 = _torsion_slope(stages, 2, w, du3, dm)
         t3 = _tangent(rotation, psi)
         k3 = add(cross(n2, t3), cross(dn2, (rotation[2], rotation[5], rotation[8])))
 
         rotation, psi, dm = _turned(stages, 3, w, scale(h, du3), axpy(h, k3, dm1), dm1[2] + h * w3)
-        pull = get(paths[3], P_C, w) if forced else (0.0, 0.0, 0.0)
-        du4 = _curvature(stages, 3, w, sub(dm, pull))
+        du4 = _curvature(stages, 3, w, sub(dm, get(path, 3 * PATH + P_C, w)))
         w4 = _torsion_slope(stages, 3, w, du4, dm)
         t4 = _tangent(rotation, psi)
         k4 = add(cross(n4, t4), cross(dn4, (rotation[2], rotation[5], rotation[8])))
@@ -112,57 +110,32 @@ def _step(column: Lanes, du: Lanes, node: Lanes, stages: Lanes, paths: tuple[Lan
         do = axpy(h / 6.0, axpy(2.0, add(du2, du3), add(du1, du4)), scale(h * h / 12.0, turn))
         dmm = axpy(h / 6.0, axpy(2.0, add(k2, k3), add(k1, k4)), dm1)
         rotation, psi, dm = _turned(stages, 4, w, do, dmm, dm1[2] + h / 6.0 * (w1 + 2.0 * (w2 + w3) + w4))
-        if placed:
-            start = get_mat(node, N_R, w)
-            c2, c3, c4 = get_mat(stages, STAGE + S_C, w), get_mat(stages, 2 * STAGE + S_C, w), get_mat(stages, 3 * STAGE + S_C, w)
-            tangent = axpy(2.0, (c2[2] + c3[2], c2[5] + c3[5], c2[8] + c3[8]), (c4[2], c4[5], 1.0 + c4[8]))
-            change = add(cross(phi, tangent), axpy(2.0, add(t2, t3), t4))
-            put(column, C_POS, w, axpy(h / 6.0, mul(start, change), get(column, C_POS, w)))
+        put(column, C_PHI_BEFORE, w, phi)
+        put(column, C_TANGENT, w, axpy(2.0, add(t2, t3), t4))
         put(column, C_PHI, w, add(mul_t(rotation, phi), psi))
         put(column, C_M, w, dm)
-        put(du, 0, w, scale(h / 6.0, du1))
-        put(du, 3, w, scale(h / 3.0, du2))
-        put(du, 6, w, scale(h / 3.0, du3))
-        put(du, 9, w, scale(h / 6.0, du4))
+        put(column, C_U, w, scale(h / 6.0, du1))
+        put(column, C_U + 3, w, scale(h / 3.0, du2))
+        put(column, C_U + 6, w, scale(h / 3.0, du3))
+        put(column, C_U + 9, w, scale(h / 6.0, du4))
 
 
 @kernel
-def free_column(column: Lanes, du: Lanes, node: Lanes, stages: Lanes) -> None:
-    """A column that nothing drives within this step."""
-    _step(column, du, node, stages, (node, node, node, node), (0.0, 0.0, 0.0), False, False, False)
+def place_column(column: Lanes, node: Lanes, stages: Lanes) -> None:
+    """The change of position over the step that `step_column` has just done: Jacobians want it, the observer does not."""
+    for w in range(W):
+        c2, c3, c4 = get_mat(stages, STAGE + S_C, w), get_mat(stages, 2 * STAGE + S_C, w), get_mat(stages, 3 * STAGE + S_C, w)
+        tangent = axpy(2.0, (c2[2] + c3[2], c2[5] + c3[5], c2[8] + c3[8]), (c4[2], c4[5], 1.0 + c4[8]))
+        change = add(cross(get(column, C_PHI_BEFORE, w), tangent), get(column, C_TANGENT, w))
+        put(column, C_POS, w, axpy(node[N_H * W + w] / 6.0, mul(get_mat(node, N_R, w), change), get(column, C_POS, w)))
 
 
 @kernel
-def tendon_column(column: Lanes, du: Lanes, node: Lanes, stages: Lanes, p1: Lanes, p2: Lanes, p3: Lanes, p4: Lanes) -> None:
-    """The column of the tension of a tendon that crosses this step."""
-    _step(column, du, node, stages, (p1, p2, p3, p4), (0.0, 0.0, 0.0), True, False, False)
-
-
-@kernel
-def force_column(column: Lanes, du: Lanes, node: Lanes, stages: Lanes, nx: float, ny: float, nz: float) -> None:
-    """The column of a force that acts beyond this step, in the world direction (nx, ny, nz)."""
-    _step(column, du, node, stages, (node, node, node, node), (nx, ny, nz), False, True, False)
-
-
-@kernel
-def placed_column(column: Lanes, du: Lanes, node: Lanes, stages: Lanes, p1: Lanes, p2: Lanes, p3: Lanes, p4: Lanes, forced: bool, nx: float, ny: float, nz: float) -> None:
-    """Any column, with the change of position too: for Jacobian and compliance, not for the observer."""
-    if forced:
-        _step(column, du, node, stages, (p1, p2, p3, p4), (0.0, 0.0, 0.0), True, False, True)
-    else:
-        _step(column, du, node, stages, (node, node, node, node), (nx, ny, nz), False, True, True)
-
-
-@kernel
-def add_length_changes(change: Lanes, du: Lanes, p1: Lanes, p2: Lanes, p3: Lanes, p4: Lanes) -> None:
+def add_length_changes(change: Lanes, column: Lanes, path: Lanes) -> None:
     """Change of the path length of GROUP tendons over the step, for one column."""
     for w in range(W):
-        du1, du2, du3, du4 = get(du, 0, w), get(du, 3, w), get(du, 6, w), get(du, 9, w)
+        du1, du2, du3, du4 = get(column, C_U, w), get(column, C_U + 3, w), get(column, C_U + 6, w), get(column, C_U + 9, w)
         for i in range(GROUP):
-            c1, c2, c3, c4 = get(p1, i * PATH, w), get(p2, i * PATH, w), get(p3, i * PATH, w), get(p4, i * PATH, w)
-            change[i * W + w] += (
-                c1[0] * du1[0] + c1[1] * du1[1] + c1[2] * du1[2]
-                + c2[0] * du2[0] + c2[1] * du2[1] + c2[2] * du2[2]
-                + c3[0] * du3[0] + c3[1] * du3[1] + c3[2] * du3[2]
-                + c4[0] * du4[0] + c4[1] * du4[1] + c4[2] * du4[2]
-            )  # fmt: skip
+            p = i * PATHS + P_C
+            c1, c2, c3, c4 = get(path, p, w), get(path, p + PATH, w), get(path, p + 2 * PATH, w), get(path, p + 3 * PATH, w)
+            change[i * W + w] += dot(c1, du1) + dot(c2, du2) + dot(c3, du3) + dot(c4, du4)

@@ -65,7 +65,7 @@ def between_nodes(
     n = len(layout.tendon_segment)
     n_t = n + sh.GROUP
     node, stages = np.zeros(sh.NODE * W), np.zeros(5 * sh.STAGE * W)
-    tendon, path = np.zeros(n_t * sh.TENDON * W), np.zeros(n_t * sh.PATH * W)
+    tendon, path = np.zeros(n_t * sh.TENDON * W), np.zeros(n_t * sh.PATHS * W)
     loaded = n > 0 and not layout.paper
     for start in range(0, len(robots), W):
         count = min(W, len(robots) - start)

@@ -59,7 +59,7 @@ def parallel_kernel(function: _Function) -> _Function:
 
 def inline(function: _Function) -> _Function:
     """A helper that is pasted into its caller: a call left in a loop over lanes would keep it from becoming SIMD code."""
-    made: _Function = numba.njit(inline="always", error_model="numpy", fastmath=_FAST)(function)
+    made: _Function = numba.njit(forceinline=True, error_model="numpy", fastmath=_FAST)(function)
     return made
 
 

@@ -30,6 +30,7 @@ STAGE = 45
 # tendon: position and tension; path: what a tendon does at a stage
 T_DX, T_DY, T_T, TENDON = 0, 1, 2, 3
 P_C, P_Q, PATH = 0, 3, 4
+PATHS = 4 * PATH  # of one tendon, stage after stage
 GROUP = 4  # tendons that one loop takes together: fewer loads and stores of the sums
 
 
@@ -193,8 +194,8 @@ def tendon_sums(stage: Lanes, tendon: Lanes, path: Lanes) -> None:
         for i in range(GROUP):
             dx, dy, t = get(tendon, i * TENDON, w)
             q, c, inverse = tendon_path(u, dx, dy)
-            put(path, i * PATH + P_C, w, c)
-            path[(i * PATH + P_Q) * W + w] = q
+            put(path, i * PATHS + P_C, w, c)
+            path[(i * PATHS + P_Q) * W + w] = q
             a = tendon_stiffness(dx, dy, c, t * inverse)
             sum_m = axpy(t, c, sum_m)
             sum_a = add((a[0], a[1], a[2]), sum_a)
@@ -212,8 +213,8 @@ def tendon_paths(stage: Lanes, tendon: Lanes, path: Lanes) -> None:
         for i in range(GROUP):
             dx, dy, _ = get(tendon, i * TENDON, w)
             q, c, _ = tendon_path(u, dx, dy)
-            put(path, i * PATH + P_C, w, c)
-            path[(i * PATH + P_Q) * W + w] = q
+            put(path, i * PATHS + P_C, w, c)
+            path[(i * PATHS + P_Q) * W + w] = q
 
 
 @kernel
@@ -231,12 +232,10 @@ def correct_curvature(node: Lanes, stage: Lanes, half: int) -> None:
 
 
 @kernel
-def add_lengths(length: Lanes, node: Lanes, p1: Lanes, p2: Lanes, p3: Lanes, p4: Lanes) -> None:
+def add_lengths(length: Lanes, node: Lanes, path: Lanes) -> None:
     """Path length of GROUP tendons over the step."""
     for w in range(W):
         h = node[N_H * W + w] / 6.0
         for i in range(GROUP):
-            q = (i * PATH + P_Q) * W + w
-            length[i * W + w] += h * (p1[q] + 2.0 * (p2[q] + p3[q]) + p4[q])
-
-
+            q = (i * PATHS + P_Q) * W + w
+            length[i * W + w] += h * (path[q] + 2.0 * (path[q + PATH * W] + path[q + 2 * PATH * W]) + path[q + 3 * PATH * W])
