@@ -1,7 +1,26 @@
 """fastrod: tendon-driven continuum robots, simulated in batches and corrected by measured data."""
 
+from typing import TYPE_CHECKING, Any
+
 from fastrod.robot import Robot, Segment, Tendon
 from fastrod.robotfile import load_robot, robot_names, save_robot
-from fastrod.simulator import Observer, Pose, Simulator, State
 
-__all__ = ["Observer", "Pose", "Robot", "Segment", "Simulator", "State", "Tendon", "load_robot", "robot_names", "save_robot"]
+if TYPE_CHECKING:
+    from fastrod import reference
+    from fastrod.simulator import Simulator
+    from fastrod.state import Observer, Pose, State
+
+__all__ = ["Observer", "Pose", "Robot", "Segment", "Simulator", "State", "Tendon", "load_robot", "reference", "robot_names", "save_robot"]
+
+
+def __getattr__(name: str) -> Any:
+    """The simulator and the twins on first use: numba and scipy take half a second that a robot file does not need."""
+    import importlib
+
+    if name == "reference":
+        return importlib.import_module("fastrod.reference")
+    if name in __all__:
+        return getattr(importlib.import_module("fastrod.simulator" if name == "Simulator" else "fastrod.state"), name)
+    from fastrod.errors import nearest
+
+    raise AttributeError(f"module 'fastrod' has no {name!r}; {nearest(name, __all__)}")

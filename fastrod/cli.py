@@ -26,7 +26,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         arguments, rest = parser.parse_known_args(words)
         if rest:
-            return _refuse(f"{parser.prog} {arguments.command} does not know {rest[0]!r}; `{parser.prog} {arguments.command} --help` tells.")
+            return _refuse(
+                f"{parser.prog} {arguments.command} does not know {rest[0]!r}; `{parser.prog} {arguments.command} --help` tells."
+            )
         run: Callable[[argparse.Namespace], int] = arguments.run_command
         return run(arguments)
     except _UsageError as error:

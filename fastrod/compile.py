@@ -36,7 +36,8 @@ def compile_robots(robots: Sequence[Robot], n_steps: int) -> tuple[Layout, Param
     for i, robot in enumerate(robots):
         for what in ("n_segments", "n_tendons"):
             if getattr(robot, what) != getattr(first, what):
-                raise RobotError(f"robot {i} of the batch has {what} {getattr(robot, what)}, robot 0 has {getattr(first, what)}; counts must agree.")
+                here, there = getattr(robot, what), getattr(first, what)
+                raise RobotError(f"robot {i} of the batch has {what} {here}, robot 0 has {there}; counts must agree.")
         if [s.mode for s in robot.segments] != [s.mode for s in first.segments] or list(robot.tendon_segment) != list(first.tendon_segment):
             raise RobotError(f"robot {i} of the batch has other segment modes or tendon ends than robot 0; they must agree.")
     return _layout(first, n_steps), _params(robots), _rest(robots)

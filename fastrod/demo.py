@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 import time
+from contextlib import AbstractContextManager, nullcontext
 from importlib.resources import as_file, files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +23,7 @@ N_ROBOTS = 1000
 N_STEPS = 200
 DT = 0.01  # s
 _BEND = 1.0  # rad, largest bend of a random robot
-_FORCE = 0.2  # N, largest random tip load: a third of what folds the prototype by itself
+_FORCE = 0.2  # N, largest random tip load
 _SEED = 7
 
 
@@ -51,8 +53,10 @@ def _batch(robot: Robot, console: Console) -> None:
     start, end = random_bend(rng, robot, N_ROBOTS), random_bend(rng, robot, N_ROBOTS)
     force = rng.uniform(-_FORCE, _FORCE, (N_ROBOTS, 3)) / np.sqrt(3.0)
     sim = Simulator(robot, n_robots=N_ROBOTS, dt=DT)
-    console.print(f"[bold]{N_ROBOTS} prototypes[/] (0.07 m, four tendons), random tendon lengths and tip loads up to {_FORCE:g} N")
-    sim.settle(start, tip_force=force)  # the first call compiles, or loads what an earlier process compiled
+    console.print(f"[bold]{N_ROBOTS} prototypes[/], random tendon lengths, random tip loads to {_FORCE:g} N")
+    with _waiting("compiling the kernels, once on this machine"):
+        sim.settle(start, tip_force=force)
+        sim.step(start, tip_force=force)
     clock = time.perf_counter()
     state = Simulator(robot, n_robots=N_ROBOTS, dt=DT).settle(start, tip_force=force)
     settled = time.perf_counter() - clock
@@ -63,14 +67,13 @@ def _batch(robot: Robot, console: Console) -> None:
     )
     per_pass, residual = _steps(sim, start, end, force)
     console.print(
-        f"  step: {N_STEPS} steps of {1e3 * DT:g} ms toward other random lengths, {1e6 * per_pass:.2f} us a robot and pass, "
-        f"median boundary residual {1e6 * residual:.2g} um"
+        f"  step:   {N_STEPS} steps of {1e3 * DT:g} ms to other lengths, {1e6 * per_pass:.2f} us a robot and step\n"
+        f"          median boundary residual at the end {1e6 * residual:.2g} um"
     )
 
 
 def _steps(sim: Any, start: Floats, end: Floats, force: Floats) -> tuple[float, float]:
     """Seconds a robot and pass, and the median boundary residual at the end [m], on the way from `start` to `end`."""
-    sim.step(start, tip_force=force)
     commands = [start + (k + 1) / N_STEPS * (end - start) for k in range(N_STEPS)]
     clock = time.perf_counter()
     for command in commands:
@@ -79,13 +82,20 @@ def _steps(sim: Any, start: Floats, end: Floats, force: Floats) -> tuple[float, 
     return elapsed / (N_STEPS * len(start)), float(np.median(state.residual))
 
 
+def _waiting(why: str) -> AbstractContextManager[object]:
+    """A line on stderr while something takes long, where stderr is a terminal."""
+    from rich.console import Console
+
+    return Console(stderr=True).status(why) if sys.stderr.isatty() else nullcontext()
+
+
 def _replayed(robot: Robot, console: Console, out: Path | None) -> None:
     from fastrod.identification.replay import replay, table, write
     from fastrod.runlog import read_log
 
     with as_file(files("fastrod").joinpath("data").joinpath("demo_log.csv")) as path:
         result = replay(read_log(path, robot), robot)
-    console.print("\n[bold]demo_log.csv[/]: simulated by an independent solver with other geometry and noise, not measured")
+    console.print("\n[bold]demo_log.csv[/], simulated by another solver with a slightly other robot, and noise")
     console.print(table(result))
     for written in write(result, out) if out is not None else []:
         console.print(f"wrote {written}", soft_wrap=True, highlight=False)

@@ -19,7 +19,7 @@ def cold_start(rows: np.ndarray, layout: Layout, params: Params, ports: Ports, m
     take = _Rows(rows)
     curvature = _arc_curvature(layout, take, params, ports)
     rotation, position, weights = _arcs(curvature, take, params, ports)
-    at_base, mean = _load_moment(rotation, position, weights, take, params, ports)
+    at_base, mean = _load_moment(rotation, position, weights, take, ports)
     stiffness = take(ports.stiffness)[:, :, 0]
     elastic = stiffness * (curvature - take(ports.precurvature)[:, :, 0])
     n_segments = curvature.shape[1]
@@ -86,7 +86,7 @@ def _arcs(curvature: Floats, take: _Rows, params: Params, ports: Ports) -> tuple
     return np.stack(rotations, 1), np.stack(positions, 1), length[:, :, None] / _SAMPLES * weights
 
 
-def _load_moment(rotation: Floats, position: Floats, weights: Floats, take: _Rows, params: Params, ports: Ports) -> tuple[Floats, Floats]:
+def _load_moment(rotation: Floats, position: Floats, weights: Floats, take: _Rows, ports: Ports) -> tuple[Floats, Floats]:
     """Moment of the loads beyond, material frame: (n, n_segments, 3) at each segment's base, and its mean over the segment."""
     n, n_segments, n_nodes = position.shape[:3]
     force = take(ports.tip_force).copy()
@@ -143,5 +143,3 @@ def _exp(vector: Floats) -> Floats:
     angle = np.linalg.norm(vector, axis=1)
     half = 0.5 * angle
     return _matrix(np.column_stack([np.cos(half), 0.5 * np.sinc(half / np.pi)[:, None] * vector]))
-
-

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TypeAlias
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +15,20 @@ from fastrod.types import Floats, Layout, Params, Ports
 PointForces: TypeAlias = Sequence[tuple[ArrayLike, ArrayLike]]
 
 
+class Inputs(NamedTuple):
+    """What a caller may give at one step; shapes, units and frames as in `Simulator.step`."""
+
+    tendon_length: ArrayLike | None = None
+    tension: ArrayLike | None = None
+    extension: ArrayLike | None = None
+    tip_force: ArrayLike | None = None
+    tip_moment: ArrayLike | None = None
+    line_force: ArrayLike | None = None
+    point_force: PointForces | None = None
+    follower_tip_force: ArrayLike | None = None
+    base_pose: ArrayLike | None = None
+
+
 class Reader:
     """Turns inputs into arrays with a robot axis of 1 or n_robots, and collects what is wrong with which robot."""
 
@@ -22,44 +36,35 @@ class Reader:
         self.layout, self.params, self.rest, self.n_robots = layout, params, rest, n_robots
         self.problems: dict[int, str] = {}
 
-    def ports(
-        self,
-        tendon_length: ArrayLike | None,
-        tension: ArrayLike | None,
-        extension: ArrayLike | None,
-        tip_force: ArrayLike | None,
-        tip_moment: ArrayLike | None,
-        line_force: ArrayLike | None,
-        point_force: PointForces | None,
-        follower_tip_force: ArrayLike | None,
-        base_pose: ArrayLike | None,
-    ) -> Ports:
-        """The ports of one step; see `Simulator.step` for shapes and units."""
+    def ports(self, given: Inputs) -> Ports:
+        """The ports of one step; `problems` then names the robots whose inputs are not usable."""
         self.problems = {}
         layout, rest = self.layout, self.rest
         n_segments, n_tendons = len(layout.first_tendon), len(layout.tendon_segment)
         given_tension = np.ones(n_tendons, bool)
         given_tension[layout.row_tendon] = False
-        stretch = self._optional("extension", extension, (n_segments,), "m")
+        stretch = self._optional("extension", given.extension, (n_segments,), "m")
         self._check_extension(stretch)
-        lengths = self._lengths(tendon_length, stretch)
-        if tension is None and given_tension.any():
+        lengths = self._lengths(given.tendon_length, stretch)
+        if given.tension is None and given_tension.any():
             raise InputError(f"tension is missing; segments in mode tendon_tension need tension (n_robots, {n_tendons}) [N].")
-        pull = self._optional("tension", tension, (n_tendons,), "N")
-        grid, node_force = self._point_forces(point_force, stretch)
+        pull = self._optional("tension", given.tension, (n_tendons,), "N")
+        grid, node_force = self._point_forces(given.point_force, stretch)
         return Ports(
             tendon_length=lengths,
             tension=np.where(given_tension, pull, 0.0),
             extension=stretch,
             stiffness=rest.stiffness,
             precurvature=rest.precurvature,
-            tip_force=self._optional("tip_force", tip_force, (3,), "N"),
-            tip_moment=self._optional("tip_moment", tip_moment, (3,), "N m"),
-            follower_force=np.zeros((0, 3)) if follower_tip_force is None else self._array("follower_tip_force", follower_tip_force, (3,), "N"),
-            line_force=self._line_force(line_force),
+            tip_force=self._optional("tip_force", given.tip_force, (3,), "N"),
+            tip_moment=self._optional("tip_moment", given.tip_moment, (3,), "N m"),
+            follower_force=np.zeros((0, 3))
+            if given.follower_tip_force is None
+            else self._array("follower_tip_force", given.follower_tip_force, (3,), "N"),
+            line_force=self._line_force(given.line_force),
             node_force=node_force,
             grid=grid,
-            base_pose=rest.base_pose if base_pose is None else self._pose(base_pose),
+            base_pose=rest.base_pose if given.base_pose is None else self._pose(given.base_pose),
         )
 
     def _array(self, name: str, value: ArrayLike, shape: tuple[int, ...], unit: str) -> Floats:
@@ -73,23 +78,24 @@ class Reader:
         if a.shape[1:] != shape or a.shape[0] not in (1, self.n_robots):
             wanted = ", ".join(map(str, shape))
             raise InputError(f"{name} has shape {np.shape(value)}; it must be ({self.n_robots}, {wanted}) or ({wanted},) [{unit}].")
-        a = np.ascontiguousarray(a)
+        a = np.require(a, requirements=("C", "W", "O"))  # one kind of array: numba would compile anew for another
         if not np.isfinite(a.sum()):
-            self._note(~np.isfinite(a.reshape(len(a), -1)).all(1), lambda i: f"{name} holds a value that is not finite: {a[i].ravel()[:6]}.")
+            bad = ~np.isfinite(a.reshape(len(a), -1)).all(1)
+            self._note(bad, lambda i: f"{name} holds a value that is not finite: {a[i].ravel()[:6]}.")
         return a
 
     def _optional(self, name: str, value: ArrayLike | None, shape: tuple[int, ...], unit: str) -> Floats:
         return np.zeros((1, *shape)) if value is None else self._array(name, value, shape, unit)
 
-    def _note(self, bad: np.ndarray, sentence: object) -> None:
+    def _note(self, bad: Any, sentence: Callable[[int], str]) -> None:
         """Note bad rows; where no row is good there is nothing to simulate, so say so at once."""
         rows = np.flatnonzero(bad)
         if not len(rows):
             return
         if len(rows) == len(bad):
-            raise InputError(sentence(0))  # type: ignore[operator]
+            raise InputError(sentence(0))
         for i in rows:
-            self.problems.setdefault(int(i), sentence(i))  # type: ignore[operator]
+            self.problems.setdefault(int(i), sentence(int(i)))
 
     def _check_extension(self, stretch: Floats) -> None:
         low, high = self.rest.extension_range[..., 0], self.rest.extension_range[..., 1]
@@ -182,7 +188,10 @@ def _place_nodes(s: Floats, starts: Floats, n_steps: int, grid: Floats) -> list[
         members = np.flatnonzero(segment == k)
         inside = sorted({float(f) for f in fraction[members] if 1e-9 < f < 1.0 - 1e-9})
         if len(inside) > n_steps - 1:
-            raise InputError(f"{len(inside)} point forces on one segment of {n_steps} steps; give Simulator at least {len(inside) + 1} points_per_segment.")
+            raise InputError(
+                f"{len(inside)} point forces on one segment of {n_steps} steps; "
+                f"give Simulator at least {len(inside) + 1} points_per_segment."
+            )
         nodes, last = {0.0: 0, 1.0: n_steps}, 0
         for i, f in enumerate(inside):
             last = nodes[f] = int(np.clip(round(f * n_steps), last + 1, n_steps - len(inside) + i))
@@ -190,7 +199,7 @@ def _place_nodes(s: Floats, starts: Floats, n_steps: int, grid: Floats) -> list[
         grid[k] = np.interp(np.arange(n_steps + 1), [node for _, node in fixed], [f for f, _ in fixed])
         for j in members:
             f = float(fraction[j])
-            placed.append((int(j), k * n_steps + (nodes[f] if f in nodes else (0 if f < 0.5 else n_steps))))
+            placed.append((int(j), k * n_steps + nodes.get(f, 0 if f < 0.5 else n_steps)))
     return placed
 
 

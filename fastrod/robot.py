@@ -71,7 +71,9 @@ class Tendon:
         if not (math.isfinite(self.compliance) and self.compliance >= 0.0):
             raise RobotError(f"Tendon.compliance is {self.compliance!r} m/N; it must be zero or positive, for example 1e-5.")
         if not math.isfinite(self.pretension) or (self.unilateral and self.pretension < 0.0):
-            raise RobotError(f"Tendon.pretension is {self.pretension!r} N; it must be finite, and not negative for a wire that can go slack.")
+            raise RobotError(
+                f"Tendon.pretension is {self.pretension!r} N; it must be finite, and not negative for a wire that can go slack."
+            )
 
     def position(self, n_crossed: int) -> tuple[tuple[float, float], ...]:
         """Position d_i in the material frame [m] in each of the `n_crossed` segments, base first."""
@@ -115,7 +117,8 @@ class Segment:
         low, high = self.extension
         if not -self.length < low <= 0.0 <= high <= _LONGEST:
             raise RobotError(
-                f"Segment.extension is {list(self.extension)!r} m; give [smallest, largest] change of the {self.length:g} m length, around 0."
+                f"Segment.extension is {list(self.extension)!r} m; "
+                f"give [smallest, largest] change of the {self.length:g} m length, around 0."
             )
         if not (math.isfinite(self.line_density) and self.line_density >= 0.0):
             raise RobotError(f"Segment.line_density is {self.line_density!r} kg/m; it must be zero or positive.")
@@ -160,7 +163,8 @@ class Robot:
         _finite("Robot.base_position", self.base_position, 3, "m")
         _finite("Robot.base_quaternion", self.base_quaternion, 4, "w x y z")
         if abs(math.hypot(*self.base_quaternion) - 1.0) > 1e-6:
-            raise RobotError(f"Robot.base_quaternion {list(self.base_quaternion)!r} has norm {math.hypot(*self.base_quaternion):.6g}; it must be 1.")
+            norm = math.hypot(*self.base_quaternion)
+            raise RobotError(f"Robot.base_quaternion {list(self.base_quaternion)!r} has norm {norm:.6g}; it must be 1.")
         _finite("Robot.gravity", self.gravity, 3, "m/s^2")
         paper = [segment.mode == "paper" for segment in self.segments]
         if any(paper) and not all(paper):

@@ -22,7 +22,8 @@ _SENSOR = ("noise", "registration_sd", "marker_offset_sd", "latency_sd")
 
 def robot_names() -> list[str]:
     """Names of the robots that ship with the package, for `load_robot`."""
-    return sorted(entry.name.removesuffix(".toml") for entry in files("fastrod").joinpath("robots").iterdir() if entry.name.endswith(".toml"))
+    names = [entry.name for entry in files("fastrod").joinpath("robots").iterdir()]
+    return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
 
 
 def load_robot(source: str | Path) -> Robot:
@@ -65,7 +66,7 @@ def loads(text: str, where: str = "robot file") -> Robot:
         "sensor": _section(data, "sensor", _SENSOR, where) or None,
     }
     if "name" not in data:
-        raise RobotError(f"{where} has no name; add name = \"...\".")
+        raise RobotError(f'{where} has no name; add name = "...".')
     try:
         return Robot(
             name=msgspec.convert(data["name"], str),
@@ -107,7 +108,10 @@ def _segment(table: Any, where: str) -> Segment:
         stiff = [key for key in ("bending_stiffness", "torsional_stiffness") if key in table]
         missing = [key for key in _MODULI if key not in table]
         if stiff or missing:
-            raise RobotError(f"{where}: give bending_stiffness and torsional_stiffness, or all of {', '.join(_MODULI)}; it has {', '.join(given + stiff)}.")
+            raise RobotError(
+                f"{where}: give bending_stiffness and torsional_stiffness, or all of {', '.join(_MODULI)}; "
+                f"it has {', '.join(given + stiff)}."
+            )
         e, g, i, j = (_convert(table.pop(key), key, where, float) for key in _MODULI)
         table |= {"bending_stiffness": [e * i, e * i], "torsional_stiffness": g * j}
     tendons = table.get("tendons", [])
@@ -127,9 +131,8 @@ def _written(segment: Segment) -> dict[str, Any]:
     data = {f.name: getattr(segment, f.name) for f in fields(Segment) if f.name != "tendons"}
     data = {key: list(value) if isinstance(value, tuple) else value for key, value in data.items()}
     if segment.tendons:
-        data["tendons"] = [
-            {f.name: list(v) if isinstance(v := getattr(tendon, f.name), tuple) else v for f in fields(Tendon)} for tendon in segment.tendons
-        ]
+        plain = [{f.name: getattr(tendon, f.name) for f in fields(Tendon)} for tendon in segment.tendons]
+        data["tendons"] = [{key: list(v) if isinstance(v, tuple) else v for key, v in tendon.items()} for tendon in plain]
     return data
 
 

@@ -105,9 +105,7 @@ class RunLog:
         """The samples `which`: a mask (n,), indices or a slice."""
         index = np.arange(len(self))[which]
         cut = {
-            f.name: value[index]
-            for f in fields(self)
-            if f.name not in ("name", "extra") and (value := getattr(self, f.name)) is not None
+            f.name: value[index] for f in fields(self) if f.name not in ("name", "extra") and (value := getattr(self, f.name)) is not None
         }
         extra = {key: _taken(value, index) for key, value in self.extra.items()}
         return replace(self, extra=extra, **cut)

@@ -83,7 +83,9 @@ def _still(step: Floats, rows: Ints, layout: Layout, params: Params) -> np.ndarr
     return np.asarray(moved <= 1e-6 * unit)
 
 
-def _continuation(rows: Ints, params: Params, layout: Layout, ports: Ports, memory: Memory, tolerance: float, run: Pass, passes: Ints) -> Ints:
+def _continuation(
+    rows: Ints, params: Params, layout: Layout, ports: Ports, memory: Memory, tolerance: float, run: Pass, passes: Ints
+) -> Ints:
     """From the unloaded robot to the loaded one, in load steps that grow with success; the robots that did not arrive."""
     part = np.zeros(len(memory.x))
     stride = np.full(len(memory.x), 0.25)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from collections.abc import Sequence
+from typing import Any, Literal
 
 import numba
 import numpy as np
@@ -13,94 +12,18 @@ from numpy.typing import ArrayLike
 from fastrod.compile import compile_robots
 from fastrod.errors import InputError
 from fastrod.guess import cold_start
-from fastrod.inputs import PointForces, Reader
+from fastrod.inputs import Inputs, PointForces, Reader
 from fastrod.kernels.batch import pass_parallel, pass_serial
 from fastrod.kernels.chunk import scratch_size
 from fastrod.kernels.dense import between_nodes
 from fastrod.kernels.jit import LANES
 from fastrod.robot import Robot
 from fastrod.settle import settle
+from fastrod.state import Observer, Pose, Snapshot, State
 from fastrod.types import Flags, Floats, Ints, Memory, Ports, Response, Shape
 
+_config: Any = numba.config
 _SMALL = 4 * LANES  # robots below which starting threads costs more than it saves
-
-
-@dataclass(frozen=True, kw_only=True)
-class Observer:
-    """Gains of the boundary observer (the paper's Q and V; model.md, "The observer"), on unknowns scaled to about one.
-
-    The defaults make a step a Gauss-Newton step. More `measurement_noise` smooths the boundary over time.
-    """
-
-    process_noise: float = 100.0
-    """Q, growth of the variance of the scaled unknowns (moment by EI/l, tension by EI/(d l)) [1/s]."""
-    measurement_noise: float = 1e-20
-    """V^-1, variance of a boundary residual times time [m^2 s]."""
-
-    def __post_init__(self) -> None:
-        for name in ("process_noise", "measurement_noise"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0.0):
-                raise InputError(f"Observer.{name} is {value!r}; it must be positive and finite.")
-
-
-@dataclass(frozen=True)
-class State:
-    """The robots after a step: new arrays, robot axis first, world frame. With outputs="tip", those along the rod are empty.
-
-    A node is shared by two segments at a joint; its curvature is that of the distal one.
-    """
-
-    position: Floats
-    """(n_robots, n_points, 3) backbone [m]."""
-    rotation: Floats
-    """(n_robots, n_points, 3, 3) world_from_material."""
-    curvature: Floats
-    """(n_robots, n_points, 3) material frame [1/m]."""
-    arclength: Floats
-    """(n_robots, n_points) [m]."""
-    moment: Floats
-    """(n_robots, n_points, 3) total internal moment of rod and tendons, material frame [N m]."""
-    force: Floats
-    """(n_robots, n_points, 3) total internal force: the loads beyond the node [N]."""
-    tip_position: Floats
-    """(n_robots, 3) [m]."""
-    tip_rotation: Floats
-    """(n_robots, 3, 3) world_from_material."""
-    tension: Floats
-    """(n_robots, n_tendons) positive pulls [N]."""
-    path_length: Floats
-    """(n_robots, n_tendons) length of the tendon's path along the bent rod, without its stretch [m]."""
-    base_wrench: Floats
-    """(n_robots, 6) force [N], then moment about the base point [N m], that the robot exerts on its host."""
-    residual: Floats
-    """(n_robots,) largest boundary residual [m]: lengths as they are, moments times l^2/EI, forces times l^3/EI."""
-    ok: Flags
-    """(n_robots,) the robot's inputs were good and its numbers are; after `settle`, also that it converged."""
-    passes: Ints
-    """(n_robots,) forward passes that were spent; -1 where `settle` did not converge."""
-    problems: Mapping[int, str]
-    """Robot index -> what is wrong with it, for the robots that are not ok."""
-
-
-class Pose(NamedTuple):
-    """Cross-sections at given arclengths."""
-
-    position: Floats
-    """(n_robots, n_queries, 3) world [m]."""
-    rotation: Floats
-    """(n_robots, n_queries, 3, 3) world_from_material."""
-    curvature: Floats
-    """(n_robots, n_queries, 3) material frame [1/m]."""
-
-
-class Snapshot(NamedTuple):
-    """Everything that a later step depends on."""
-
-    memory: Memory
-    warm: Flags
-    ports: Ports | None
-    state: State | None
 
 
 class Simulator:
@@ -144,8 +67,8 @@ class Simulator:
             raise InputError(f"dt is {dt!r} s; it must be positive and finite.")
         if outputs not in ("full", "tip"):
             raise InputError(f"outputs is {outputs!r}; it must be 'full' or 'tip'.")
-        if threads is not None and not 1 <= threads <= numba.config.NUMBA_NUM_THREADS:
-            raise InputError(f"threads is {threads!r}; it must be from 1 to {numba.config.NUMBA_NUM_THREADS} here.")
+        if threads is not None and not 1 <= threads <= _config.NUMBA_NUM_THREADS:
+            raise InputError(f"threads is {threads!r}; it must be from 1 to {_config.NUMBA_NUM_THREADS} here.")
         self.robots = tuple(robots)
         self.n_robots = int(n_robots)
         self.dt = float(dt)
@@ -190,7 +113,8 @@ class Simulator:
         The state belongs to the boundary that the last pass predicted for these inputs. Raises `InputError` on a wrong
         shape, or where no robot's input is usable; a single bad row only clears that robot's `ok`.
         """
-        ports, rows = self._read(tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force, follower_tip_force, base_pose)
+        given = Inputs(tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force, follower_tip_force, base_pose)
+        ports, rows = self._read(given)
         cold = rows[~self._warm[rows]]
         self._start(cold, ports)
         shape = self._new_shape(self.outputs, len(rows) < self.n_robots)
@@ -223,7 +147,8 @@ class Simulator:
         """
         if not (np.isfinite(tolerance) and tolerance > 0.0):
             raise InputError(f"tolerance is {tolerance!r} m; it must be positive and finite.")
-        ports, rows = self._read(tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force, follower_tip_force, base_pose)
+        given = Inputs(tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force, follower_tip_force, base_pose)
+        ports, rows = self._read(given)
         shape = self._new_shape(self.outputs, len(rows) < self.n_robots)
 
         def run(which: Ints, at: Ports) -> Floats:
@@ -254,7 +179,7 @@ class Simulator:
         found = Pose(np.full((*s.shape, 3), np.nan), np.full((*s.shape, 3, 3), np.nan), np.full((*s.shape, 3), np.nan))
         whole = np.isfinite(end[:, 0])
         robot, query = np.nonzero(np.broadcast_to(whole[:, None], s.shape))
-        between_nodes(robot, query, np.ascontiguousarray(s), self._params, ports, self._layout, *_nodes(state), state.tension, found)
+        between_nodes(robot, query, np.ascontiguousarray(s), self._params, ports, self._layout, _as_shape(state), found)
         return found
 
     def jacobian(self) -> Floats:
@@ -297,35 +222,31 @@ class Simulator:
 
     def snapshot(self) -> Snapshot:
         """A copy of everything that a later step depends on."""
-        return Snapshot(Memory(*(a.copy() for a in self._memory)), self._warm.copy(), self._ports, self._state)
+        return Snapshot(_copied(self._memory), self._warm.copy(), self._ports, self._state)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Go back to a `snapshot` of this simulator."""
         if snapshot.warm.shape != self._warm.shape:
             raise InputError(f"the snapshot holds {len(snapshot.warm)} robots, this simulator {self.n_robots}.")
-        self._memory = Memory(*(a.copy() for a in snapshot.memory))
+        self._memory = _copied(snapshot.memory)
         self._warm, self._ports, self._state = snapshot.warm.copy(), snapshot.ports, snapshot.state
 
-    def _read(
-        self,
-        tendon_length: ArrayLike | None,
-        tension: ArrayLike | None,
-        extension: ArrayLike | None,
-        tip_force: ArrayLike | None,
-        tip_moment: ArrayLike | None,
-        line_force: ArrayLike | None,
-        point_force: PointForces | None,
-        follower_tip_force: ArrayLike | None,
-        base_pose: ArrayLike | None,
-    ) -> tuple[Ports, Ints]:
+    def _read(self, given: Inputs) -> tuple[Ports, Ints]:
         """The ports, and the robots whose inputs are good."""
-        ports = self._reader.ports(tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force, follower_tip_force, base_pose)
+        ports = self._reader.ports(given)
         problems = self._reader.problems
         rows = np.setdiff1d(self._all, list(problems)) if problems else self._all
-        before = self._ports.tip_force if self._ports is not None else np.zeros((1, 3))
-        moved = tip_force is not None and self._warm.any() and not np.array_equal(np.broadcast_to(ports.tip_force, (self.n_robots, 3)), np.broadcast_to(before, (self.n_robots, 3)), equal_nan=True)
-        self._remember(follower=len(ports.follower_force) > 0, track_force=bool(moved) or len(self._memory.force_before) > 0)
+        track_force = len(self._memory.force_before) > 0 or self._force_moves(ports.tip_force)
+        self._remember(follower=len(ports.follower_force) > 0, track_force=track_force)
         return ports, rows
+
+    def _force_moves(self, force: Floats) -> bool:
+        """The tip force of a running robot changes: from now on the gain for it is worth its three columns."""
+        if self._ports is None or not self._warm.any():
+            return False
+        before = self._ports.tip_force
+        same = force.shape == before.shape and np.array_equal(force, before, equal_nan=True)
+        return not same and bool((force != before)[self._warm if max(len(force), len(before)) > 1 else slice(None)].any())
 
     def _new_memory(self, follower: bool, track_force: bool) -> Memory:
         layout, n = self._layout, self.n_robots
@@ -378,8 +299,18 @@ class Simulator:
         )  # fmt: skip
 
     def _pass(
-        self, rows: Ints, ports: Ports, shape: Shape, *, response: Response | None = None, feed: bool = False, carry: bool = False,
-        update: bool = True, process: float = 1.0, noise: float = 1.0, n_col: int | None = None,
+        self,
+        rows: Ints,
+        ports: Ports,
+        shape: Shape,
+        *,
+        response: Response | None = None,
+        feed: bool = False,
+        carry: bool = False,
+        update: bool = True,
+        process: float = 1.0,
+        noise: float = 1.0,
+        n_col: int | None = None,
     ) -> None:
         memory, layout = self._memory, self._layout
         follower, n_x = len(ports.follower_force) > 0, memory.x.shape[1]
@@ -400,11 +331,7 @@ class Simulator:
             problems.setdefault(int(i), f"{reason}; residual {shape.residual[i]:.3g} m.")
         self._warm[:] = ok if not self._reader.problems else np.where(np.isin(self._all, list(self._reader.problems)), self._warm, ok)
         self._ports = ports
-        self._state = State(
-            position=shape.position, rotation=shape.rotation, curvature=shape.curvature, arclength=shape.arclength, moment=shape.moment,
-            force=shape.force, tip_position=shape.tip_position, tip_rotation=shape.tip_rotation, tension=shape.tension,
-            path_length=shape.path_length, base_wrench=shape.base_wrench, residual=shape.residual, ok=ok, passes=passes, problems=problems,
-        )  # fmt: skip
+        self._state = State(**shape._asdict(), ok=ok, passes=passes, problems=problems)
         return self._state
 
     def _last(self, what: str) -> tuple[State, Ports]:
@@ -443,5 +370,10 @@ class Simulator:
         return np.concatenate([p1 - p0, skew], axis=1) / (2.0 * delta), (e1 - e0) / (2.0 * delta)
 
 
-def _nodes(state: State) -> tuple[Floats, ...]:
-    return state.arclength, state.position, state.rotation, state.moment, state.force, state.curvature
+def _as_shape(state: State) -> Shape:
+    return Shape(*(getattr(state, name) for name in Shape._fields))
+
+
+def _copied(memory: Memory) -> Memory:
+    fields: dict[str, Any] = {name: a.copy() for name, a in memory._asdict().items()}
+    return Memory(**fields)

@@ -12,8 +12,20 @@ from fastrod.types import Layout, Memory, Params, Ports, Response, Shape
 
 
 def _pass(
-    robots: Lanes, params: Params, ports: Ports, layout: Layout, memory: Memory, shape: Shape, response: Response,
-    scratch: Lanes, n_col: int, feed: bool, carry: bool, update: bool, process: float, noise: float,
+    robots: Lanes,
+    params: Params,
+    ports: Ports,
+    layout: Layout,
+    memory: Memory,
+    shape: Shape,
+    response: Response,
+    scratch: Lanes,
+    n_col: int,
+    feed: bool,
+    carry: bool,
+    update: bool,
+    process: float,
+    noise: float,
 ) -> None:
     """One forward pass of the robots with these indices, chunk by chunk, in as many parts as `scratch` has rows.
 
@@ -28,7 +40,9 @@ def _pass(
             count = min(LANES, n - start)
             for w in range(LANES):
                 lanes[w] = robots[start + min(w, count - 1)]
-            pass_chunk(lanes, count, params, ports, layout, memory, shape, response, scratch[part], n_col, feed, carry, update, process, noise)
+            pass_chunk(
+                lanes, count, params, ports, layout, memory, shape, response, scratch[part], n_col, feed, carry, update, process, noise
+            )
 
 
 pass_serial = kernel(_pass)

@@ -94,7 +94,9 @@ def step_column(column: Lanes, node: Lanes, stages: Lanes, path: Lanes, load: La
         k2 = add(cross(n2, t2), cross(dn2, (rotation[2], rotation[5], rotation[8])))
 
         turn = add(cross(du1, u2), cross(u1, du2))
-        rotation, psi, dm = _turned(stages, 2, w, axpy(0.5 * h, du2, scale(0.125 * h * h, turn)), axpy(0.5 * h, k2, dm1), dm1[2] + 0.5 * h * w2)
+        rotation, psi, dm = _turned(
+            stages, 2, w, axpy(0.5 * h, du2, scale(0.125 * h * h, turn)), axpy(0.5 * h, k2, dm1), dm1[2] + 0.5 * h * w2
+        )
         du3 = _curvature(stages, 2, w, sub(dm, get(path, 2 * PATH + P_C, w)))
         w3 = _torsion_slope(stages, 2, w, du3, dm)
         t3 = _tangent(rotation, psi)

@@ -9,17 +9,26 @@ from fastrod.kernels.chunk import FIRST_CUTS, solve_section
 from fastrod.kernels.gather import pick
 from fastrod.kernels.jit import LANES, kernel
 from fastrod.kernels.shape import Lanes
-from fastrod.types import Floats, Layout, Params, Ports
+from fastrod.types import Floats, Layout, Params, Ports, Shape
 
 W = LANES
 
 
 @kernel
 def _fill(
-    lane: int, i: int, s: float, params: Params, ports: Ports, layout: Layout, arclength: Lanes, position: Floats, rotation: Floats,
-    moment: Floats, force: Floats, curvature: Floats, tension: Floats, node: Lanes, tendon: Lanes,
-) -> int:
-    """Put the node before arclength s of robot i, and the step from there to s, into a lane; the segment it lies in."""
+    lane: int,
+    i: int,
+    s: float,
+    params: Params,
+    ports: Ports,
+    layout: Layout,
+    shape: Shape,
+    node: Lanes,
+    tendon: Lanes,
+) -> None:
+    """Put the node before arclength s of robot i, and the step from there to s, into a lane."""
+    arclength, position, rotation, tension = shape.arclength, shape.position, shape.rotation, shape.tension
+    moment, force, curvature = shape.moment, shape.force, shape.curvature
     n_steps, n_points = layout.n_steps, arclength.shape[1]
     at = min(max(np.searchsorted(arclength[i], s, side="right") - 1, 0), n_points - 2)
     k, j = at // n_steps, at % n_steps
@@ -53,13 +62,18 @@ def _fill(
         tendon[(t * sh.TENDON + sh.T_DX) * W + lane] = offset[t, 0] if crosses else 0.0
         tendon[(t * sh.TENDON + sh.T_DY) * W + lane] = offset[t, 1] if crosses else 0.0
         tendon[(t * sh.TENDON + sh.T_T) * W + lane] = tension[i, t] if crosses else 0.0
-    return k
 
 
 @kernel
 def between_nodes(
-    robots: Lanes, queries: Lanes, s: Floats, params: Params, ports: Ports, layout: Layout, arclength: Floats, position: Floats,
-    rotation: Floats, moment: Floats, force: Floats, curvature: Floats, tension: Floats, found: tuple[Floats, Floats, Floats],
+    robots: Lanes,
+    queries: Lanes,
+    s: Floats,
+    params: Params,
+    ports: Ports,
+    layout: Layout,
+    shape: Shape,
+    found: tuple[Floats, Floats, Floats],
 ) -> None:
     """Pose and curvature of query `queries[q]` of robot `robots[q]`, at arclength s[robot, query]."""
     n = len(layout.tendon_segment)
@@ -71,10 +85,7 @@ def between_nodes(
         count = min(W, len(robots) - start)
         for w in range(W):
             q = start + min(w, count - 1)
-            _fill(
-                w, robots[q], s[robots[q], queries[q]], params, ports, layout, arclength, position, rotation, moment, force, curvature,
-                tension, node, tendon,
-            )  # fmt: skip
+            _fill(w, robots[q], s[robots[q], queries[q]], params, ports, layout, shape, node, tendon)
         sh.start_step(node, stages)
         solve_section(node, stages, tendon, path, 0, 0, n, loaded, FIRST_CUTS)
         sh.second_stage(node, stages)

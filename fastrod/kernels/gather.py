@@ -81,7 +81,7 @@ def gather_base(robots: Lanes, ports: Ports, params: Params, memory: Memory, lay
 
 
 @kernel
-def gather_segment(k: int, robots: Lanes, ports: Ports, params: Params, layout: Layout, tendon: Lanes) -> None:
+def gather_segment(k: int, robots: Lanes, params: Params, layout: Layout, tendon: Lanes) -> None:
     """Positions of the tendons that cross segment k."""
     for w in range(W):
         offset = params.offset[pick(robots[w], len(params.offset)), k]

@@ -111,7 +111,15 @@ def second_stage(node: Lanes, stages: Lanes) -> None:
         inverse = get(stages, S_INV, w)[0:3] + get(stages, S_INV + 3, w)
         turn = cross(u1, m)
         slope = sym_mul(inverse, (n[1] - turn[0], -n[0] - turn[1], -turn[2]))
-        _enter(stages, 1, w, scale(0.5 * h, u1), axpy(0.5 * h, get(stages, S_DM, w), m), m[2] + 0.5 * h * torsion_slope(stages, 0, w), axpy(0.5 * h, slope, u1))
+        _enter(
+            stages,
+            1,
+            w,
+            scale(0.5 * h, u1),
+            axpy(0.5 * h, get(stages, S_DM, w), m),
+            m[2] + 0.5 * h * torsion_slope(stages, 0, w),
+            axpy(0.5 * h, slope, u1),
+        )
         put(stages, S_O, w, slope)  # stage 1 needs no rotation vector; its place keeps du/ds for the fourth stage's guess
 
 
@@ -147,7 +155,9 @@ def end_step(node: Lanes, stages: Lanes) -> None:
         slope = axpy(2.0, k23, add(get(stages, S_DM, w), get(stages, 3 * STAGE + S_DM, w)))
         put(stages, 4 * STAGE + S_N, w, get(stages, 3 * STAGE + S_N, w))
         m = get(stages, S_M, w)
-        torsion = torsion_slope(stages, 0, w) + 2.0 * (torsion_slope(stages, 1, w) + torsion_slope(stages, 2, w)) + torsion_slope(stages, 3, w)
+        torsion = (
+            torsion_slope(stages, 0, w) + 2.0 * (torsion_slope(stages, 1, w) + torsion_slope(stages, 2, w)) + torsion_slope(stages, 3, w)
+        )
         _enter(stages, 4, w, o, axpy(h / 6.0, slope, m), m[2] + h / 6.0 * torsion, u4)
 
 

@@ -1,0 +1,1 @@
+"""The prototype: motors, camera and their emulator."""

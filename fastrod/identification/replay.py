@@ -1,0 +1,351 @@
+"""Replay: the model beside a measurement, sample by sample, as one static batch."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fastrod.errors import InputError, LogError
+from fastrod.robot import Robot
+from fastrod.runlog import RunLog
+from fastrod.types import Floats
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from rich.table import Table
+
+
+Mask = NDArray[np.bool_]
+Progress = Callable[[int, int], None]
+
+CHUNK = 4096  # rows a batch: enough to fill every core, small enough for a steady progress bar
+_MOST_RUNS = 20  # lines of the table; a log with more runs is read in residuals.csv
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Replay:
+    """A log and what the model says to the same inputs. Lengths in metres, base frame; residual = measured - predicted."""
+
+    log: RunLog
+    robot: Robot
+    tip_position: Floats
+    """(n, 3) predicted tip [m]; nan where the inputs are missing or the model did not converge."""
+    converged: Mask
+    """(n,) rows that the model solved."""
+    points: Floats | None = None
+    """(n, k, 3) predicted further points at the robot's `log_points` [m], where the log measured some."""
+
+    @property
+    def compared(self) -> Mask:
+        """(n,) rows that count: measured and converged."""
+        return self.log.measured & self.converged
+
+    @property
+    def residual(self) -> Floats:
+        """(n, 3) measured - predicted tip [m]; nan where either is missing."""
+        return np.where(self.compared[:, None], self.log.tip_position - self.tip_position, np.nan)
+
+    @property
+    def points_residual(self) -> Floats | None:
+        """(n, k, 3) measured - predicted further points [m]."""
+        return None if self.points is None or self.log.points is None else self.log.points - self.points
+
+    @property
+    def axis_rms(self) -> Floats:
+        """(3,) residual of the tip along x, y, z of the base frame, root mean square [m]."""
+        return np.asarray(np.sqrt(np.mean(self.residual[self.compared] ** 2, axis=0)), dtype=np.float64)
+
+    @property
+    def rms(self) -> float:
+        """Distance between measured and predicted tip, root mean square [m]."""
+        return _rms(self.residual[self.compared])
+
+    @property
+    def max(self) -> float:
+        """Largest distance between measured and predicted tip [m]."""
+        return float(np.linalg.norm(self.residual[self.compared], axis=1).max(initial=0.0))
+
+    @property
+    def excursion_rms(self) -> float:
+        """How far the measured tip moves: its distance from its own mean, root mean square [m]."""
+        tip = self.log.tip_position[self.compared]
+        return _rms(tip - tip.mean(axis=0))
+
+    @property
+    def baseline_rms(self) -> float:
+        """What no model at all leaves: the measured tip's distance from the straight robot's tip, root mean square [m]."""
+        return _rms(self.log.tip_position[self.compared] - (0.0, 0.0, self.robot.length))
+
+    @property
+    def run_rms(self) -> dict[str, float]:
+        """`rms` of each run that has compared rows [m]."""
+        return {label: part.rms for label, part in self.parts() if part.compared.any()}
+
+    def parts(self) -> Iterator[tuple[str, Replay]]:
+        """Each run's label and its part of this replay."""
+        for label in self.log.runs:
+            rows = self.log.run == label
+            points = None if self.points is None else self.points[rows]
+            tip, converged = self.tip_position[rows], self.converged[rows]
+            yield label, Replay(log=self.log.rows(rows), robot=self.robot, tip_position=tip, converged=converged, points=points)
+
+
+def replay(log: RunLog, robot: Robot, *, simulator: Callable[..., Any] | None = None, progress: Progress | None = None) -> Replay:
+    """The static model's answer to every row of `log`, each row one robot of a batch.
+
+    The measured frame is taken as the robot's base frame: nothing is registered and nothing is fitted. `simulator` is
+    `fastrod.Simulator` or a stand-in; `progress` is called with the rows done and the rows in all.
+    Raises `LogError` where no row of the log can be compared, `InputError` for a robot that lengths do not drive.
+    """
+    _check_driven_by_lengths(robot)
+    if not log.measured.any():
+        raise LogError(f"log {log.name!r} has no row in which every input and the tip are there; there is nothing to compare.")
+    if simulator is None:
+        from fastrod.simulator import Simulator  # it loads numba, which no other command line word needs
+
+        simulator = Simulator
+    n_points = 0 if log.points is None else len(robot.log_points)
+    tip, points, converged = np.full((len(log), 3), np.nan), np.full((len(log), n_points, 3), np.nan), np.zeros(len(log), dtype=np.bool_)
+    rows = np.flatnonzero(log.driven)
+    for start in range(0, len(rows), CHUNK):
+        chunk = rows[start : start + CHUNK]
+        tip[chunk], points[chunk], converged[chunk] = _solve(log.rows(chunk), robot, simulator)
+        if progress is not None:
+            progress(start + len(chunk), len(rows))
+    tip[~converged], points[~converged] = np.nan, np.nan
+    return Replay(log=log, robot=robot, tip_position=tip, converged=converged, points=points if n_points else None)
+
+
+def tendon_length(log: RunLog, robot: Robot) -> Floats | None:
+    """(n, n_tendons) absolute tendon lengths [m]; None without tendons.
+
+    `dl` is counted from the straight rest robot, extension and all: a robot that grows straight pays out its tendons.
+    """
+    return np.asarray(robot.rest_tendon_length + log.dl, dtype=np.float64) if robot.n_tendons else None
+
+
+def inputs(log: RunLog, robot: Robot) -> dict[str, Floats]:
+    """Keyword inputs of `Simulator.settle` for the rows of `log`: world frame, SI, robot axis first."""
+    given: dict[str, Floats] = {}
+    if (lengths := tendon_length(log, robot)) is not None:
+        given["tendon_length"] = lengths
+    if log.ext is not None:
+        given["extension"] = log.ext
+    if log.base_quaternion is not None:
+        position = np.broadcast_to(np.array(robot.base_position), (len(log), 3))
+        given["base_pose"] = np.concatenate([position, log.base_quaternion], axis=1)
+    if log.tip_force is not None or log.payload is not None:
+        given["tip_force"] = _tip_force(log, robot)
+    return given
+
+
+def write(result: Replay, out_dir: str | Path) -> list[Path]:
+    """Write residuals.csv and replay.png into `out_dir`, each whole or not at all; the paths written."""
+    out = Path(out_dir)
+    out.mkdir(parents=True, exist_ok=True)
+    residuals, picture = out / "residuals.csv", out / "replay.png"
+    part = residuals.with_name("residuals.csv.part")
+    _write_residuals(result, part)
+    part.replace(residuals)
+    part = picture.with_name("replay.png.part")
+    draw(result).savefig(part, format="png", dpi=130)
+    part.replace(picture)
+    return [residuals, picture]
+
+
+def table(result: Replay) -> Table:
+    """The residual of each run and of all, in mm, as a rich table 80 columns wide at most."""
+    from rich import box
+    from rich.markup import escape
+    from rich.table import Table
+
+    title = f"{result.log.name} on {result.robot.name}: tip residual [mm], base frame"
+    grid = Table(
+        title=escape(title), title_justify="left", caption_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0)
+    )
+    for name in ("run", "rms x", "rms y", "rms z", "rms", "max", "excursion", "converged"):
+        grid.add_column(name, justify="left" if name == "run" else "right")
+    parts = list(result.parts())
+    for label, part in parts[:_MOST_RUNS] if len(parts) > 1 else []:
+        grid.add_row(escape(label or "-"), *_cells(part))
+    if len(parts) > _MOST_RUNS:
+        grid.add_row(f"... {len(parts) - _MOST_RUNS} more runs")
+    grid.add_row("all", *_cells(result), style="bold")
+    grid.caption = "rms, max: distance from measured to predicted tip\nexcursion: measured tip from its own mean"
+    return grid
+
+
+def draw(result: Replay) -> Figure:
+    """Measured and predicted x, y, z and their distance over time, and the two paths seen along y and along z."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # no window, and no pyplot state to clean up
+    from matplotlib.figure import Figure
+
+    time, breaks = _timeline(result.log)
+    gaps = _gaps(time, breaks)
+    measured, predicted = 1e3 * result.log.tip_position, 1e3 * result.tip_position
+    figure = Figure(figsize=(13.0, 8.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    halves: Any = figure.subfigures(1, 2, width_ratios=(2.0, 1.0))
+    left, right = halves
+    panels = left.subplots(4, 1, sharex=True)
+    for k, axis in enumerate("xyz"):
+        panels[k].plot(*_broken(time, measured[:, k], gaps), color=_MEASURED, lw=1.4, label="measured")
+        panels[k].plot(*_broken(time, predicted[:, k], gaps), color=_PREDICTED, lw=0.9, label="predicted")
+        panels[k].set_ylabel(f"tip {axis} [mm]")
+    _distance(panels[3], time, result, gaps)
+    panels[3].set_xlabel("time, runs one after the other [s]" if len(breaks) else "time [s]")
+    _name_runs(list(panels), result.log.runs, time, breaks)
+    for axes, (a, b) in zip(right.subplots(2, 1), ((0, 2), (0, 1)), strict=True):
+        _path(axes, measured, predicted, (a, b), gaps)
+    right.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=2, frameon=False)
+    share = f", {1e2 * result.rms / result.excursion_rms:.0f} % of the excursion" if result.excursion_rms > 0.0 else ""
+    figure.suptitle(
+        f"{result.log.name} on {result.robot.name}: tip error {1e3 * result.rms:.3g} mm rms{share}", x=0.01, ha="left", fontweight="bold"
+    )
+    return figure
+
+
+def _check_driven_by_lengths(robot: Robot) -> None:
+    for number, segment in enumerate(robot.segments, 1):
+        if segment.mode == "tendon_tension":
+            raise InputError(
+                f"segment {number} of robot {robot.name!r} is in mode 'tendon_tension', but a run log gives tendon lengths; "
+                "replay it in mode 'tendon_length'."
+            )
+
+
+def _solve(log: RunLog, robot: Robot, simulator: Callable[..., Any]) -> tuple[Floats, Floats, Mask]:
+    """Tip (n, 3) and further points (n, k, 3) in the base frame [m], and which rows converged, of one batch."""
+    sim = simulator(robot, n_robots=len(log))
+    state = sim.settle(**inputs(log, robot))
+    rotation, origin = _base(log, robot)
+    points = np.zeros((len(log), 0, 3))
+    if log.points is not None and robot.log_points:
+        shape = sim.shape(np.array(robot.log_points))
+        points = np.asarray(shape.position, dtype=np.float64)
+    tip = np.asarray(state.tip_position, dtype=np.float64)
+    return _into_base(tip[:, None] - origin, rotation)[:, 0], _into_base(points - origin, rotation), np.asarray(state.ok, dtype=np.bool_)
+
+
+def _into_base(world: Floats, rotation: Floats) -> Floats:
+    """(n, k, 3) vectors of the world frame, in the base frame of each row; `rotation` (n, 3, 3) is world_from_base."""
+    return np.asarray(np.einsum("nji,nkj->nki", rotation, world), dtype=np.float64)
+
+
+def _base(log: RunLog, robot: Robot) -> tuple[Floats, Floats]:
+    """world_from_base (n, 3, 3) of each row, and the base's position in the world [m]."""
+    quaternion = log.base_quaternion if log.base_quaternion is not None else np.tile(robot.base_quaternion, (len(log), 1))
+    return _matrix(quaternion), np.array(robot.base_position)
+
+
+def _tip_force(log: RunLog, robot: Robot) -> Floats:
+    """(n, 3) force on the tip, world [N]: the log's, turned with the base, and the weight of the payload."""
+    force = np.zeros((len(log), 3))
+    if log.tip_force is not None:
+        force += np.einsum("nij,nj->ni", _base(log, robot)[0], log.tip_force)
+    if log.payload is not None:
+        force += log.payload[:, None] * np.array(robot.gravity)
+    return force
+
+
+def _matrix(quaternion: Floats) -> Floats:
+    """(n, 3, 3) rotation matrices of unit quaternions (n, 4), w x y z."""
+    w, x, y, z = quaternion.T
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _rms(vectors: Floats) -> float:
+    return math.sqrt(float(np.mean(np.sum(vectors**2, axis=-1)))) if len(vectors) else math.nan
+
+
+def _cells(part: Replay) -> list[str]:
+    converged = f"{int(part.compared.sum())}/{int(part.log.measured.sum())}"
+    if not part.compared.any():
+        return ["-"] * 6 + [converged]
+    return [*(f"{1e3 * length:.2f}" for length in (*part.axis_rms, part.rms, part.max, part.excursion_rms)), converged]
+
+
+def _write_residuals(result: Replay, path: Path) -> None:
+    log, residual = result.log, result.residual
+    names = [f"{what}_{axis}" for what in ("measured", "predicted", "residual") for axis in "xyz"]
+    values = np.concatenate([log.tip_position, result.tip_position, residual, np.linalg.norm(residual, axis=1)[:, None]], axis=1)
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["t", "run", *names, "residual_norm", "converged"])
+        for t, run, row, ok in zip(log.t.tolist(), log.run.tolist(), values.tolist(), result.converged.tolist(), strict=True):
+            writer.writerow([_text(t), run, *map(_text, row), int(ok)])
+
+
+def _text(value: float) -> str:
+    return "" if math.isnan(value) else f"{value:.9g}"
+
+
+_MEASURED, _PREDICTED, _RESIDUAL, _INK = "#1f2937", "#e4572e", "#2a78b5", "#4b5563"
+
+
+def _timeline(log: RunLog) -> tuple[Floats, NDArray[np.int64]]:
+    """(n,) time with the runs laid one after the other [s], and the first row of each run but the first."""
+    breaks = np.flatnonzero(log.run[1:] != log.run[:-1]) + 1
+    time = log.t.copy()
+    for start in breaks:
+        before, after = time[:start], time[start:]
+        if np.isfinite(before).any() and np.isfinite(after).any():
+            time[start:] += before[np.isfinite(before)][-1] - after[np.isfinite(after)][0]
+    return time, breaks
+
+
+def _broken(x: Floats, y: Floats, gaps: NDArray[np.int64]) -> tuple[Floats, Floats]:
+    """A curve with a gap before each of the rows `gaps`."""
+    return np.insert(x, gaps, np.nan), np.insert(y, gaps, np.nan)
+
+
+def _gaps(time: Floats, breaks: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Rows before which a curve is interrupted: where a run starts, or where the log skips far more time than it usually does."""
+    skip = np.diff(time)
+    usual = float(np.nanmedian(skip)) if np.isfinite(skip).any() else 0.0
+    long = np.flatnonzero(skip > 30.0 * usual) + 1 if usual > 0.0 else breaks
+    return np.union1d(breaks, long)
+
+
+def _distance(axes: Axes, time: Floats, result: Replay, gaps: NDArray[np.int64]) -> None:
+    norm, rms = 1e3 * np.linalg.norm(result.residual, axis=1), 1e3 * result.rms
+    axes.plot(*_broken(time, norm, gaps), color=_RESIDUAL, lw=0.9)
+    axes.axhline(rms, color=_INK, lw=0.8, ls="--", label=f"rms {rms:.3g} mm")
+    axes.set_ylim(0.0, 1.3e3 * result.max or None)
+    axes.set_ylabel("distance [mm]")
+    axes.legend(loc="upper right", fontsize=8, frameon=False)
+
+
+def _path(axes: Axes, measured: Floats, predicted: Floats, plane: tuple[int, int], gaps: NDArray[np.int64]) -> None:
+    a, b = plane
+    for values, colour, width in ((measured, _MEASURED, 0.9), (predicted, _PREDICTED, 0.7)):
+        axes.plot(*_broken(values[:, a], values[:, b], gaps), color=colour, lw=width, marker=".", ms=2.0, alpha=0.8)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel(f"{'xyz'[a]} [mm]")
+    axes.set_ylabel(f"{'xyz'[b]} [mm]")
+    axes.set_title(f"tip path, {'xyz'[a]}{'xyz'[b]} plane of the base", fontsize=10)
+    axes.grid(alpha=0.25)
+
+
+def _name_runs(panels: list[Axes], runs: list[str], time: Floats, breaks: NDArray[np.int64]) -> None:
+    for axes in panels:
+        axes.grid(alpha=0.25)
+        axes.margins(x=0.01)
+        for start in breaks:
+            axes.axvline(time[start], color=_INK, lw=0.7, ls=":")
+    if len(breaks) and len(breaks) < 8:
+        for start, label in zip((0, *breaks), runs, strict=False):
+            panels[0].text(time[start], 1.02, f" {label}", transform=panels[0].get_xaxis_transform(), fontsize=8)

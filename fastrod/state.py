@@ -1,0 +1,89 @@
+"""What a `Simulator` takes besides inputs, and what it hands out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from fastrod.errors import InputError
+from fastrod.types import Flags, Floats, Ints, Memory, Ports
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observer:
+    """Gains of the boundary observer (the paper's Q and V; model.md, "The observer"), on unknowns scaled to about one.
+
+    The defaults make a step a Gauss-Newton step. More `measurement_noise` smooths the boundary over time.
+    """
+
+    process_noise: float = 100.0
+    """Q, growth of the variance of the scaled unknowns (moment by EI/l, tension by EI/(d l)) [1/s]."""
+    measurement_noise: float = 1e-20
+    """V^-1, variance of a boundary residual times time [m^2 s]."""
+
+    def __post_init__(self) -> None:
+        for name in ("process_noise", "measurement_noise"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise InputError(f"Observer.{name} is {value!r}; it must be positive and finite.")
+
+
+@dataclass(frozen=True)
+class State:
+    """The robots after a step: new arrays, robot axis first, world frame. With outputs="tip", those along the rod are empty.
+
+    A node is shared by two segments at a joint; its curvature is that of the distal one.
+    """
+
+    position: Floats
+    """(n_robots, n_points, 3) backbone [m]."""
+    rotation: Floats
+    """(n_robots, n_points, 3, 3) world_from_material."""
+    curvature: Floats
+    """(n_robots, n_points, 3) material frame [1/m]."""
+    arclength: Floats
+    """(n_robots, n_points) [m]."""
+    moment: Floats
+    """(n_robots, n_points, 3) total internal moment of rod and tendons, material frame [N m]."""
+    force: Floats
+    """(n_robots, n_points, 3) total internal force: the loads beyond the node [N]."""
+    tip_position: Floats
+    """(n_robots, 3) [m]."""
+    tip_rotation: Floats
+    """(n_robots, 3, 3) world_from_material."""
+    tension: Floats
+    """(n_robots, n_tendons) positive pulls [N]."""
+    path_length: Floats
+    """(n_robots, n_tendons) length of the tendon's path along the bent rod, without its stretch [m]."""
+    base_wrench: Floats
+    """(n_robots, 6) force [N], then moment about the base point [N m], that the robot exerts on its host."""
+    residual: Floats
+    """(n_robots,) largest boundary residual [m]: lengths as they are, moments times l^2/EI, forces times l^3/EI."""
+    ok: Flags
+    """(n_robots,) the robot's inputs were good and its numbers are; after `settle`, also that it converged."""
+    passes: Ints
+    """(n_robots,) forward passes that were spent; -1 where `settle` did not converge."""
+    problems: Mapping[int, str]
+    """Robot index -> what is wrong with it, for the robots that are not ok."""
+
+
+class Pose(NamedTuple):
+    """Cross-sections at given arclengths."""
+
+    position: Floats
+    """(n_robots, n_queries, 3) world [m]."""
+    rotation: Floats
+    """(n_robots, n_queries, 3, 3) world_from_material."""
+    curvature: Floats
+    """(n_robots, n_queries, 3) material frame [1/m]."""
+
+
+class Snapshot(NamedTuple):
+    """Everything that a later step depends on."""
+
+    memory: Memory
+    warm: Flags
+    ports: Ports | None
+    state: State | None

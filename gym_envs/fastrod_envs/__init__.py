@@ -1,0 +1,1 @@
+"""Vectorised Gymnasium environments over one Simulator: N robots are N environments."""

@@ -1,0 +1,196 @@
+"""Measured data of three real robots, each as a `RunLog` and the `Robot` that it was measured on.
+
+Every adapter turns a published table into SI units and into the robot's base frame: z along the straight rod away from
+the base, right-handed. What the authors publish is used as published; what they do not is *nominal*: a round number of
+the right size, never fitted to the log. A replay with nominal geometry is therefore the error before any identification.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fastrod.errors import LogError, nearest
+from fastrod.robot import Robot, Segment, Tendon
+from fastrod.robotfile import load_robot
+from fastrod.runlog import RunLog, Table, numbers, read_table
+
+_UPSIDE_DOWN = (0.0, 1.0, 0.0, 0.0)
+"""world_from_base of a robot that hangs: half a turn about x, so that z of the base points down."""
+
+ASL_DISKS = (0.106, 0.202, 0.320)
+"""Distance of the three disks below the base at rest [m], published."""
+ASL_MOTORS = ((3, 5), (1, 6), (2, 4))
+"""Motors whose tendons end at disk 1, 2, 3, published."""
+ASL_DIRECTION = {1: -45.0, 2: -105.0, 3: 195.0, 4: 165.0, 5: 105.0, 6: 45.0}
+"""Pull direction of each motor in the mocap x-z plane, from x toward z [deg], published."""
+ASL_SPOOL_RADIUS = 0.03
+"""Nominal [m]. Without loads the shape knows only its ratio to the pitch radius; here that ratio is 1."""
+ASL_PITCH_RADIUS = 0.03
+"""Nominal [m]."""
+
+ARMLAB_LENGTH = 0.108
+"""Nominal [m]: the middle of the published fits, 0.096 to 0.119 m."""
+ARMLAB_PITCH_RADIUS = 0.0045
+"""Nominal [m]: the middle of the published fits, 0.0038 to 0.0051 m."""
+ARMLAB_DIRECTION = (205.0, 85.0, 325.0)
+"""Pull direction of each tendon in the mocap x-z plane, from x toward z [deg]: nominal, see `armlab_tdcr`."""
+
+
+def asl_trunk(path: str | Path, run: str | None = None) -> tuple[RunLog, Robot]:
+    """Three-segment trunk of Stanford ASL, hanging: one run, or all of them.
+
+    Frame: base x = mocap x, base y = mocap z, base z = -mocap y (down), at the height y = 0 of the mocap frame. The base
+    point is not published: in each run it lies over the mean of the three disk centres in the run's first row, where the
+    motors are within 4 deg of rest (rest pose and motor zeros change between sessions).
+
+    Published: disk heights, which motor ends where, pull directions, payload. Antagonistic pairs on one spool are one
+    push-pull tendon each, so the robot has six, in the order of motors 3 5 | 1 6 | 2 4. `dl` = -spool radius times the
+    *measured* motor angle phi (up to 5 rows stale); `extra` keeps the commanded angles. Tip = disk 3; points p1, p2 =
+    disks 1 and 2.
+    Nominal: spool radius, pitch radius, bending stiffness 0.05 N m^2, torsional stiffness 0.5 N m^2 (a corrugated hose bends
+    but hardly twists; much less, and the pushing half of the pairs, which has no pretension here, would buckle it), a
+    weightless body, stiff tendons. Only `payload` loads the rod, and how far it sags rests on the nominal stiffness.
+    """
+    table, where = _table(path, "asl_trunk"), Path(path).name
+    disks = [_metres(table, (f"x{k}_mm", f"z{k}_mm", f"y{k}_mm"), where) * (1.0, 1.0, -1.0) for k in (1, 2, 3)]
+    labels = np.array(table["run"])
+    for label in dict.fromkeys(labels.tolist()):
+        rows = labels == label
+        base = np.mean([disk[rows][0] for disk in disks], axis=0) * (1.0, 1.0, 0.0)
+        for disk in disks:
+            disk[rows] -= base
+    order = [motor for pair in ASL_MOTORS for motor in pair]
+    log = RunLog(
+        name=Path(path).stem,
+        t=numbers(table, "t_s", where),
+        run=labels,
+        dl=np.stack([-ASL_SPOOL_RADIUS * np.radians(numbers(table, f"phi{motor}_deg", where)) for motor in order], axis=1),
+        tip_position=disks[2],
+        points=np.stack(disks[:2], axis=1),
+        payload=numbers(table, "payload_g", where) / 1000.0,
+        extra={f"u{k}_deg": numbers(table, f"u{k}_deg", where) for k in range(1, 7)},
+    )
+    return log if run is None else log.only(run), _asl_robot()
+
+
+def _asl_robot() -> Robot:
+    starts = (0.0, *ASL_DISKS[:-1])
+    segments = [
+        Segment(
+            length=end - start,
+            bending_stiffness=(0.05, 0.05),
+            torsional_stiffness=0.5,
+            body_radius=0.04,
+            tendons=tuple(Tendon(offset=ASL_PITCH_RADIUS, angle=math.radians(ASL_DIRECTION[motor])) for motor in motors),
+        )
+        for start, end, motors in zip(starts, ASL_DISKS, ASL_MOTORS, strict=True)
+    ]
+    return Robot(name="asl_trunk", segments=tuple(segments), base_quaternion=_UPSIDE_DOWN, log_points=ASL_DISKS[:2])
+
+
+def ethz_beam(path: str | Path, run: str | None = None, *, settled: float | None = 1.0) -> tuple[RunLog, Robot]:
+    """Clamped silicone beam of ETH Zurich, let go from straight under a known tip load: one run, or all of them.
+
+    Frame: axes as measured (gravity -x, beam axis +z), origin such that the mean of the three tip markers starts at
+    (0, 0, length). The clamp's markers move between sessions and the start is held straight by hand (scatter 0.4 mm in x,
+    more in y and z), so no better origin is known: only the drop along x since the own start is a clean measurement.
+
+    Published: dimensions, density, modulus (the shipped robot `ethz_beam` has them), tip load, gravity. The load hangs
+    from the upper edge of the tip face; here it acts at the centre. `tip_force` = the load along -x, constant.
+    `settled`: the tip counts as measured in the last so many seconds of a run; what comes before, held by hand and then
+    ringing at 4 to 8 Hz, is given as missing, for a static model says nothing about it. None gives the whole run.
+    """
+    robot = load_robot("ethz_beam")
+    table, where = _table(path, "ethz_beam"), Path(path).name
+    tip = np.mean([_metres(table, [f"tip{k}_{axis}_mm" for axis in "xyz"], where) for k in (1, 2, 3)], axis=0)
+    labels, t = np.array(table["run"]), numbers(table, "t_s", where)
+    for label in dict.fromkeys(labels.tolist()):
+        rows = labels == label
+        tip[rows] += (0.0, 0.0, robot.length) - tip[rows][0]
+        if settled is not None:
+            tip[rows & (t < t[rows][-1] - settled)] = np.nan
+    log = RunLog(
+        name=Path(path).stem,
+        t=t,
+        run=labels,
+        dl=np.zeros((len(t), 0)),
+        tip_position=tip,
+        tip_force=numbers(table, "tip_load_N", where)[:, None] * (-1.0, 0.0, 0.0),
+    )
+    return log if run is None else log.only(run), robot
+
+
+def armlab_tdcr(path: str | Path) -> tuple[RunLog, Robot]:
+    """One segment with three tendons of ARM-Lab, hanging, static: the whole grid of shortenings as one run.
+
+    Frame: base x = mocap x, base y = mocap z, base z = -mocap y (down); the rest tip, the mean of the three rows with at
+    most 0.1 mm of pull, lies at (0, 0, length). There is no clock: `t` counts the rows as acquired, 1 s each.
+
+    Published: three tendons 120 deg apart, their shortening (`dl` = -l_mm / 1000), tip position. Every sweep only loads.
+    Rows with glitch = 1 are given as missing.
+    Nominal: length and pitch radius in the middle of the published fits; stiffness as the paper's prototype; weightless;
+    angles 205, 85, 325 deg, which is where the tip went when one tendon was pulled alone (-155, 86, -37 deg), rounded to 5
+    deg and 120 deg apart. The grid pulls all three tendons together too. The real body shortens then; this rod cannot, so
+    the common part of the pull stretches the tendons and only the differences bend: the tensions mean nothing here.
+    """
+    table, where = _table(path, "armlab_tdcr"), Path(path).name
+    pull = _metres(table, ("l1_mm", "l2_mm", "l3_mm"), where)
+    tip = _metres(table, ("x_mm", "z_mm", "y_mm"), where) * (1.0, 1.0, -1.0)
+    glitch = numbers(table, "glitch", where) == 1.0
+    rest = (pull.sum(axis=1) < 1.5e-4) & ~glitch
+    if not rest.any():
+        raise LogError(f"{where} has no row at rest (at most 0.1 mm of pull in all), which places the base.")
+    tip += (0.0, 0.0, ARMLAB_LENGTH) - tip[rest].mean(axis=0)
+    tip[glitch] = np.nan
+    t = numbers(table, "row", where)
+    log = RunLog(name=Path(path).stem, t=t, run=np.full(len(t), ""), dl=-pull, tip_position=tip)
+    return log, _armlab_robot()
+
+
+def _armlab_robot() -> Robot:
+    tendons = tuple(Tendon(offset=ARMLAB_PITCH_RADIUS, angle=math.radians(angle)) for angle in ARMLAB_DIRECTION)
+    rod = Segment(length=ARMLAB_LENGTH, bending_stiffness=(0.0022, 0.0022), torsional_stiffness=0.001, body_radius=0.008, tendons=tendons)
+    return Robot(name="armlab_tdcr", segments=(rod,), base_quaternion=_UPSIDE_DOWN)
+
+
+_HEADERS = {
+    "asl_trunk": (
+        *("run", "payload_g", "t_s"),
+        *(f"{angle}{k}_deg" for angle in ("u", "phi") for k in range(1, 7)),
+        *(f"{axis}{k}_mm" for k in (1, 2, 3) for axis in "xyz"),
+    ),
+    "ethz_beam": ("run", "tip_load_N", "t_s", *(f"tip{k}_{axis}_mm" for k in (1, 2, 3) for axis in "xyz")),
+    "armlab_tdcr": ("l1_mm", "l2_mm", "l3_mm", "x_mm", "y_mm", "z_mm", "glitch"),
+}
+_ADAPTERS: dict[str, Callable[[str | Path], tuple[RunLog, Robot]]] = {
+    "asl_trunk": asl_trunk,
+    "ethz_beam": ethz_beam,
+    "armlab_tdcr": armlab_tdcr,
+}
+
+
+def detect(path: str | Path) -> Callable[[str | Path], tuple[RunLog, Robot]] | None:
+    """The adapter of the measured set whose raw file `path` is, known by its header; None for any other file."""
+    try:
+        with Path(path).open(encoding="utf-8-sig") as file:
+            header = {name.strip() for name in file.readline(4096).split(",")}
+    except (OSError, UnicodeDecodeError):
+        return None  # whoever reads the file says what is wrong with it
+    return next((_ADAPTERS[name] for name, columns in _HEADERS.items() if header.issuperset(columns)), None)
+
+
+def _table(path: str | Path, name: str) -> Table:
+    table = read_table(path)
+    if missing := [column for column in _HEADERS[name] if column not in table]:
+        raise LogError(f"{Path(path).name} is not the raw file of {name}: it lacks column {missing[0]}; {nearest(missing[0], table)}")
+    return table
+
+
+def _metres(table: Table, names: Sequence[str], where: str) -> NDArray[np.float64]:
+    """(n, len(names)) columns given in mm, in m."""
+    return np.stack([numbers(table, name, where) for name in names], axis=1) / 1000.0

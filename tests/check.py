@@ -1,0 +1,48 @@
+"""The one door: every check that the project has, in order, stopping at the first that fails.
+
+python tests/check.py            all of it
+python tests/check.py lint       only the checks with this name
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+BIN = Path(sys.executable).parent
+
+CHECKS: list[tuple[str, list[str], dict[str, str]]] = [
+    ("lint", ["ruff", "check", "."], {}),
+    ("format", ["ruff", "format", "--check", "."], {}),
+    ("types", ["mypy"], {}),
+    ("imports", ["lint-imports"], {}),
+    ("tests", ["pytest"], {}),
+    # The kernels once more as plain Python: what the compiler might hide, and the lines that it hides from coverage.
+    ("plain python", ["pytest", "tests/plain", "-p", "no:doctest"], {"NUMBA_DISABLE_JIT": "1"}),
+    # And with every index checked: a compiled kernel does not notice that it reads beyond its scratch.
+    (
+        "bounds",
+        ["pytest", "tests/plain", "-p", "no:doctest"],
+        {"NUMBA_BOUNDSCHECK": "1", "FASTROD_CACHE_DIR": str(ROOT / ".pytest_cache" / "bounds")},
+    ),
+]
+
+
+def main() -> int:
+    wanted = sys.argv[1:]
+    for name, command, extra in CHECKS:
+        if wanted and name not in wanted:
+            continue
+        print(f"== {name}: {' '.join(command)}", flush=True)
+        code = subprocess.run([BIN / command[0], *command[1:]], cwd=ROOT, env={**os.environ, **extra}).returncode
+        if code:
+            print(f"== {name} failed", flush=True)
+            return code
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,167 @@
+"""The command line: exit codes, and one sentence on stderr for each bad input."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fastrod import cli
+from fastrod.robot import Robot
+
+HEADER = "t,run,dl_1,dl_2,dl_3,dl_4,tip_x,tip_y,tip_z\n"
+LOG = HEADER + "0,a,0,0,0,0,0,0,0.07\n0.1,a,0,0,0,0,0.001,0,0.07\n0,b,0,0,0,0,0,0,0.07\n"
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    path = tmp_path / "log.csv"
+    path.write_text(LOG)
+    return path
+
+
+@pytest.fixture
+def straight(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A simulator whose robots stay straight, so that the words of the command line are tested without the model."""
+
+    class Straight:
+        def __init__(self, robot: Robot, n_robots: int) -> None:
+            self.tip = np.tile((0.0, 0.0, robot.length), (n_robots, 1))
+
+        def settle(self, **given: Any) -> SimpleNamespace:
+            return SimpleNamespace(tip_position=self.tip, ok=np.ones(len(self.tip), dtype=bool))
+
+    monkeypatch.setitem(sys.modules, "fastrod.simulator", SimpleNamespace(Simulator=Straight))
+
+
+def refused(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
+    """The sentence on stderr of a command line that must exit with 2 and print nothing else."""
+    assert cli.main(argv) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1, err
+    assert "Traceback" not in err
+    return err
+
+
+@pytest.mark.usefixtures("straight")
+def test_replay_prints_the_table_and_names_its_files(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert cli.main(["replay", str(log), "--robot", "prototype", "--out", str(out)]) == 0
+    printed, err = capsys.readouterr()
+    assert "excursion" in printed
+    assert str(out / "residuals.csv") in printed
+    assert str(out / "replay.png") in printed
+    assert err == ""
+    assert sorted(path.name for path in out.iterdir()) == ["replay.png", "residuals.csv"]
+
+
+@pytest.mark.usefixtures("straight")
+def test_replay_of_one_run_into_the_default_folder(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["replay", str(log), "--robot", "prototype", "--run", "b"]) == 0
+    assert len((tmp_path / "log_replay" / "residuals.csv").read_text().splitlines()) == 2
+
+
+@pytest.mark.usefixtures("straight")
+def test_replay_knows_a_measured_set_by_its_header(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "raw.csv"
+    path.write_text("row,l1_mm,l2_mm,l3_mm,x_mm,y_mm,z_mm,glitch,after_jump\n0,0,0,0.1,-43,-144,276,0,0\n1,0,4,0,-42,-136,305,0,0\n")
+    assert cli.main(["replay", str(path), "--out", str(tmp_path / "out")]) == 0
+    assert "armlab_tdcr" in capsys.readouterr().out
+    assert "robot 'prototype' has 4 tendons, the one of raw.csv has 3" in refused(capsys, "replay", str(path), "--robot", "prototype")
+
+
+@pytest.mark.usefixtures("straight")
+def test_replay_that_converges_nowhere_has_failed(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def settle(self: Any, **given: Any) -> SimpleNamespace:
+        return SimpleNamespace(tip_position=self.tip, ok=np.zeros(len(self.tip), dtype=bool))
+
+    monkeypatch.setattr(sys.modules["fastrod.simulator"].Simulator, "settle", settle)
+    assert cli.main(["replay", str(log), "--robot", "prototype", "--out", str(tmp_path / "out")]) == 1
+    assert "converged on none of the 3 rows" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("straight")
+def test_folder_that_cannot_be_written_has_failed(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["replay", str(log), "--robot", "prototype", "--out", str(log)]) == 1
+    assert capsys.readouterr().err == f"fastrod: {log}: File exists.\n"
+
+
+WRONG = {
+    "no command": ([], "the following arguments are required: COMMAND"),
+    "unknown command": (["repaly"], "no command 'repaly'; did you mean 'replay'?"),
+    "unknown option": (["demo", "--speed"], "fastrod demo does not know '--speed'"),
+    "no log": (["replay"], "the following arguments are required: LOG"),
+    "log not there": (["replay", "none.csv", "--robot", "prototype"], "log 'none.csv' cannot be read: No such file or directory."),
+    "unknown robot": (["replay", "LOG", "--robot", "prototpye"], "no robot 'prototpye'; did you mean 'prototype'?"),
+    "no robot": (["replay", "LOG"], "log.csv is a run log and does not say whose; name its robot with --robot."),
+    "unknown run": (["replay", "LOG", "--robot", "prototype", "--run", "c"], "no run 'c' in log 'log'; known: a, b."),
+    "other robot": (["replay", "LOG", "--robot", "tdcr_a"], "has 4 dl_ columns (dl_1 to dl_4); robot 'tdcr_a' has 6 tendons"),
+    "bench option": (["bench", "--jsno"], "fastrod bench does not know '--jsno'"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_input_is_one_sentence_and_code_2(log: Path, capsys: pytest.CaptureFixture[str], case: str) -> None:
+    argv, sentence = WRONG[case]
+    assert sentence in refused(capsys, *(str(log) if word == "LOG" else word for word in argv))
+
+
+BAD_CELLS = {
+    "text in a number": (LOG.replace("0.001", "left"), "log.csv row 2, column tip_x is 'left'"),
+    "millimetres": (LOG.replace("0.001", "1000"), "Was it given in mm?"),
+    "empty": ("", "log.csv is empty"),
+    "nothing measured": (HEADER + "0,a,0,0,0,0,,,\n", "there is nothing to compare"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_CELLS)
+def test_bad_log_is_one_sentence_and_code_2(log: Path, capsys: pytest.CaptureFixture[str], case: str) -> None:
+    text, sentence = BAD_CELLS[case]
+    log.write_text(text)
+    assert sentence in refused(capsys, "replay", str(log), "--robot", "prototype")
+
+
+def test_bad_robot_file_is_one_sentence_and_code_2(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    robot = tmp_path / "robot.toml"
+    robot.write_text('name = "x"\n[[segmnt]]\n')
+    assert "did you mean 'segment'?" in refused(capsys, "replay", str(log), "--robot", str(robot))
+
+
+def test_bench_runs_the_scripts_of_perf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, figure in (("step", 1), ("settle", 2)):
+        text = f"def main(argv):\n    print('{{\"ratio\": {figure}}}' if argv == ['--json'] else 'ratio {figure}')\n    return 0\n"
+        (tmp_path / f"bench_{name}.py").write_text(text)
+    monkeypatch.setattr(cli, "_PERF", tmp_path)
+    assert cli.main(["bench", "step"]) == 0
+    assert capsys.readouterr().out == "ratio 1\n"
+    assert cli.main(["bench", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"settle": {"ratio": 2}, "step": {"ratio": 1}}
+    assert "no benchmark 'stepp'; did you mean 'step'?" in refused(capsys, "bench", "stepp")
+    monkeypatch.setattr(cli, "_PERF", tmp_path / "absent")
+    assert "fastrod bench needs the source checkout" in refused(capsys, "bench")
+
+
+def test_help_does_not_load_numba() -> None:
+    code = "import sys; from fastrod.cli import main\ntry: main(['--help'])\nexcept SystemExit as end: assert not end.code\n"
+    done = subprocess.run([sys.executable, "-c", code + "assert 'numba' not in sys.modules"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "replay" in done.stdout
+
+
+def test_demo_prints_both_parts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("fastrod.simulator")
+    assert cli.main(["demo", "--out", str(tmp_path)]) == 0
+    printed = capsys.readouterr().out
+    assert "1000 of 1000 converged" in printed
+    assert "demo_log on prototype" in printed
+    assert (tmp_path / "replay.png").stat().st_size > 10_000

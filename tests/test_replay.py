@@ -1,0 +1,230 @@
+"""Replay: physics of the inputs, frames, the figures, the files; and the log that the demo ships."""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import replace as changed
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from fastrod.errors import InputError, LogError
+from fastrod.identification.replay import Replay, inputs, replay, table, tendon_length, write
+from fastrod.robot import Robot
+from fastrod.robotfile import load_robot
+from fastrod.runlog import RunLog, read_log, write_log
+
+DEMO_LOG = Path(__file__).parents[1] / "fastrod" / "data" / "demo_log.csv"
+DEMO_COMMENT = """Simulated, not measured: shooting by scipy (fastrod.reference.shoot) on the prototype, as tests/test_replay.py has it,
+with what the shipped robot file does not know: tendon offset 7.8 mm instead of 7.5, routing turned by 2 deg, length
+70.6 mm instead of 70, and 0.3 mm of tracker noise on every axis. Run "free": no load. Run "loaded": a known tip force."""
+UPSIDE_DOWN = (0.0, 1.0, 0.0, 0.0)
+
+
+def demo_robot() -> Robot:
+    """The prototype that `demo_log.csv` was made on: a little different from the shipped one."""
+    robot = load_robot("prototype")
+    tendons = tuple(changed(tendon, offset=0.0078, angle=float(tendon.angle) + math.radians(2.0)) for tendon in robot.tendons)  # type: ignore[arg-type]
+    return changed(robot, segments=(changed(robot.segments[0], length=0.0706, tendons=tendons),))
+
+
+def make_demo_log(rows: slice = slice(None)) -> RunLog:
+    """The demo's log, or `rows` of it: two runs of 8 s at 15 Hz, a spiral of bends, the second one under a known load."""
+    from fastrod.reference import shoot
+
+    n, rate = 120, 15.0
+    t = np.tile(np.round(np.arange(n) / rate, 4), 2)
+    bend = 0.9 * np.sin(2.0 * np.pi * t / 16.0)
+    turn = 2.0 * np.pi * t / 4.0
+    nominal, real = load_robot("prototype"), demo_robot()
+    places = np.array([tendon.position(1)[0] for tendon in nominal.tendons])
+    dl = np.round(-np.stack([bend * np.cos(turn), bend * np.sin(turn)], axis=1) @ places.T, 7)
+    force = np.where(np.arange(2 * n)[:, None] < n, 0.0, (0.1, -0.05, 0.05))
+    noise = np.random.default_rng(20).normal(0.0, 3e-4, (2 * n, 3))
+    log = RunLog(
+        name="demo_log", t=t, run=np.repeat(["free", "loaded"], n), dl=dl, tip_position=noise, tip_force=force,
+    ).rows(rows)  # fmt: skip
+    tips = [shoot(real, real.rest_tendon_length + d, tip_force=f).tip_position for d, f in zip(log.dl, log.tip_force, strict=True)]  # type: ignore[arg-type]
+    return changed(log, tip_position=np.round(np.array(tips) + log.tip_position, 7))
+
+
+class Arc:
+    """A stand-in for the simulator: constant curvature of a one-segment robot, no loads; it remembers its inputs."""
+
+    seen: dict[str, Any]
+    refuse: tuple[int, ...] = ()
+
+    def __init__(self, robot: Robot, n_robots: int) -> None:
+        self.robot, self.n_robots = robot, n_robots
+
+    def settle(self, **given: Any) -> SimpleNamespace:
+        type(self).seen = given
+        tip = np.zeros((self.n_robots, 3))
+        tip[:, 2] = self.robot.length
+        if "tendon_length" in given:
+            places = np.array([tendon.position(1)[0] for tendon in self.robot.tendons])
+            bend = -(given["tendon_length"] - self.robot.rest_tendon_length) @ np.linalg.pinv(places).T
+            angle = np.linalg.norm(bend, axis=1)[:, None] + 1e-12
+            tip = self.robot.length * np.hstack([bend / angle * (1.0 - np.cos(angle)) / angle, np.sin(angle) / angle])
+        ok = np.ones(self.n_robots, dtype=bool)
+        ok[[row for row in self.refuse if row < self.n_robots]] = False
+        return SimpleNamespace(tip_position=tip, ok=ok)
+
+
+def small_log(n: int = 6, **more: Any) -> RunLog:
+    dl = np.outer(np.linspace(-1.0, 1.0, n), (0.002, 0.0, -0.002, 0.0))
+    tip = np.zeros((n, 3))
+    tip[:, 2] = 0.07
+    return RunLog(name="small", t=np.arange(n) / 10.0, run=np.repeat(["a", "b"], n // 2), dl=dl, tip_position=tip, **more)
+
+
+@pytest.fixture
+def prototype() -> Robot:
+    return load_robot("prototype")
+
+
+def test_figures_follow_from_the_residual(prototype: Robot) -> None:
+    log = small_log()
+    exact = replay(log, prototype, simulator=Arc)
+    measured = exact.tip_position + np.array([0.003, 0.0, -0.004])
+    measured[0] += 0.003, 0.0, -0.004  # row 0 is off by twice as much
+    result = replay(changed(log, tip_position=measured), prototype, simulator=Arc)
+    assert_allclose(result.residual[1], [0.003, 0.0, -0.004], atol=1e-15)
+    assert result.rms == pytest.approx(math.sqrt((4.0 + 5.0) / 6.0) * 0.005)
+    assert result.max == pytest.approx(0.010)
+    assert_allclose(result.axis_rms, math.sqrt(9.0 / 6.0) * np.array([0.003, 0.0, 0.004]), atol=1e-15)
+    assert result.run_rms == pytest.approx({"a": math.sqrt(6.0 / 3.0) * 0.005, "b": 0.005})
+    assert result.excursion_rms == pytest.approx(math.sqrt(np.var(measured, axis=0).sum()))
+    straight = replay(small_log(), prototype, simulator=Arc)
+    assert straight.baseline_rms == 0.0
+
+
+def test_rows_that_miss_or_fail_are_left_out(prototype: Robot) -> None:
+    log = small_log()
+    tip, dl = log.tip_position.copy(), log.dl.copy()
+    tip[1], dl[2] = np.nan, np.nan
+
+    class Stubborn(Arc):
+        refuse = (3,)  # of the driven rows: row 4 of the log
+
+    result = replay(changed(log, tip_position=tip, dl=dl), prototype, simulator=Stubborn)
+    assert np.flatnonzero(result.compared).tolist() == [0, 3, 5]
+    assert np.isfinite(result.tip_position[1]).all()  # predicted, though nothing was measured
+    assert np.isnan(result.tip_position[[2, 4]]).all()
+    with pytest.raises(LogError, match="nothing to compare"):
+        replay(changed(log, tip_position=np.full((6, 3), np.nan)), prototype, simulator=Arc)
+
+
+def test_tendon_length_adds_the_extension_of_every_segment_crossed() -> None:
+    robot = load_robot("five_segment_reacher")
+    ext = np.array([[0.01, 0.0, 0.0, 0.0, 0.02]])
+    log = RunLog(name="x", t=np.zeros(1), run=np.array([""]), dl=np.full((1, 15), -0.001), tip_position=np.zeros((1, 3)), ext=ext)
+    lengths = tendon_length(log, robot)
+    assert lengths is not None
+    assert_allclose(lengths[0] - robot.rest_tendon_length, [0.009] * 12 + [0.029] * 3)
+
+
+def test_loads_turn_with_the_base_and_weight_does_not(prototype: Robot) -> None:
+    q = np.tile(UPSIDE_DOWN, (6, 1))
+    log = small_log(base_quaternion=q, tip_force=np.tile((0.1, 0.2, 0.3), (6, 1)), payload=np.full(6, 0.01))
+    given = inputs(log, prototype)
+    assert_allclose(given["base_pose"][0], (0.0, 0.0, 0.0, *UPSIDE_DOWN))
+    assert_allclose(given["tip_force"][0], [0.1, -0.2, -0.3 - 0.0981], atol=1e-15)
+
+
+def test_prediction_is_given_in_the_base_frame(prototype: Robot) -> None:
+    class World(Arc):
+        def settle(self, **given: Any) -> SimpleNamespace:
+            state = super().settle(**given)
+            state.tip_position = state.tip_position * (1.0, -1.0, -1.0) + (1.0, 2.0, 3.0)  # hung up at (1, 2, 3)
+            return state
+
+    hung = changed(prototype, base_position=(1.0, 2.0, 3.0), base_quaternion=UPSIDE_DOWN)
+    upright = replay(small_log(), prototype, simulator=Arc)
+    assert_allclose(replay(small_log(), hung, simulator=World).tip_position, upright.tip_position, atol=1e-15)
+
+
+def test_tension_robot_is_refused(prototype: Robot) -> None:
+    tense = changed(prototype, segments=(changed(prototype.segments[0], mode="tendon_tension"),))
+    with pytest.raises(InputError, match="mode 'tendon_tension', but a run log gives tendon lengths"):
+        replay(small_log(), tense, simulator=Arc)
+
+
+def test_files_are_whole(prototype: Robot, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    result = replay(small_log(), prototype, simulator=Arc)
+    paths = write(result, tmp_path / "deep" / "out")
+    assert sorted(p.name for p in (tmp_path / "deep" / "out").iterdir()) == ["replay.png", "residuals.csv"] == sorted(p.name for p in paths)
+    rows = list(csv.DictReader((tmp_path / "deep" / "out" / "residuals.csv").read_text().splitlines()))
+    assert len(rows) == 6
+    assert float(rows[0]["residual_norm"]) == pytest.approx(float(np.linalg.norm(result.residual[0])), rel=1e-8)
+    assert rows[0]["run"] == "a"
+    assert rows[0]["converged"] == "1"
+
+
+def test_progress_is_told(prototype: Robot) -> None:
+    told: list[tuple[int, int]] = []
+    replay(small_log(), prototype, simulator=Arc, progress=lambda done, total: told.append((done, total)))
+    assert told == [(6, 6)]
+
+
+def test_table_has_a_line_for_each_run_and_for_all(prototype: Robot) -> None:
+    assert table(replay(small_log(), prototype, simulator=Arc)).row_count == 3
+
+
+def test_demo_log_is_what_its_maker_makes() -> None:
+    pytest.importorskip("fastrod.reference")
+    rows = slice(100, 240, 45)
+    made, shipped = make_demo_log(rows), read_log(DEMO_LOG, load_robot("prototype")).rows(rows)
+    assert_allclose(made.dl, shipped.dl, atol=1e-9)
+    assert_allclose(made.tip_position, shipped.tip_position, atol=2e-7)  # solver tolerance, rounded to 0.1 um
+
+
+def test_demo_log_shows_its_hidden_difference_and_the_right_model_leaves_noise() -> None:
+    pytest.importorskip("fastrod.simulator")
+    shipped, real = load_robot("prototype"), demo_robot()
+    log = read_log(DEMO_LOG, shipped)
+    nominal = replay(log, shipped)
+    assert nominal.converged.all()
+    assert nominal.rms > 1.2e-3  # the noise alone leaves 0.52 mm
+    # the log's dl are against the rest length of either robot; noise 0.3 mm an axis on 240 rows, 4 sigma
+    truth = replay(log, real)
+    assert truth.rms == pytest.approx(math.sqrt(3.0) * 3e-4, rel=4.0 / math.sqrt(2.0 * 3.0 * len(log)))
+
+
+@pytest.mark.parametrize("orientation", [(1.0, 0.0, 0.0, 0.0), UPSIDE_DOWN, (0.5, 0.5, 0.5, 0.5)])
+def test_replay_of_the_simulators_own_run_leaves_nothing(prototype: Robot, orientation: tuple[float, ...]) -> None:
+    simulator = pytest.importorskip("fastrod.simulator")
+    rod = changed(prototype.segments[0], line_density=0.2)
+    heavy = changed(prototype, segments=(rod,), base_position=(0.1, 0.2, 0.3), log_points=(0.02, 0.05))
+    log = small_log(8, base_quaternion=np.tile(orientation, (8, 1)), payload=np.full(8, 0.005), points=np.zeros((8, 2, 3)))
+    first = replay(log, heavy)
+    assert first.converged.all()
+    assert first.points is not None
+    again = replay(changed(log, tip_position=first.tip_position, points=first.points), heavy)
+    assert again.rms == 0.0
+    # hanging or standing, the base frame sees gravity turn: the upright and the hung robot differ only through weight
+    one = simulator.Simulator(heavy, n_robots=1)
+    pose = np.array([[0.0, 0.0, 0.0, *orientation]])
+    weight = 0.005 * np.array([[0.0, 0.0, -9.81]])
+    state = one.settle(heavy.rest_tendon_length + log.dl[:1], tip_force=weight, base_pose=pose)
+    assert np.linalg.norm(state.tip_position[0]) == pytest.approx(float(np.linalg.norm(first.tip_position[0])), abs=1e-9)
+
+
+def test_points_of_the_straight_robot_lie_on_its_axis(prototype: Robot) -> None:
+    pytest.importorskip("fastrod.simulator")
+    marked = changed(prototype, log_points=(0.02, 0.05))
+    straight = changed(small_log(2, points=np.zeros((2, 2, 3))), dl=np.zeros((2, 4)))
+    result = replay(straight, marked)
+    assert result.points is not None
+    assert_allclose(result.points[0], [[0.0, 0.0, 0.02], [0.0, 0.0, 0.05]], atol=1e-9)
+    assert isinstance(result, Replay)
+
+
+if __name__ == "__main__":
+    write_log(make_demo_log(), DEMO_LOG, comment=DEMO_COMMENT)

@@ -1,0 +1,156 @@
+"""Adapters of the measured sets: units, frames, order, on a few rows in the published form; and on the sets where they are there."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from fastrod.errors import LogError, UnknownNameError
+from fastrod.robotfile import dumps, loads
+from fastrod.runlog import read_log, write_log
+from fastrod_scenes import measured
+from fastrod_scenes.measured import armlab_tdcr, asl_trunk, detect, ethz_beam
+
+DATA = Path(os.environ.get("FASTROD_DATA", Path(__file__).parents[3] / "shared" / "data"))
+needs_data = pytest.mark.skipif(not (DATA / "asl_trunk.csv").is_file(), reason="no measured sets here; FASTROD_DATA names their folder")
+
+ASL_HEADER = (
+    "run,payload_g,row,t_s," + ",".join(f"u{k}_deg" for k in range(1, 7)) + "," + ",".join(f"phi{k}_deg" for k in range(1, 7)) + ","
+    + ",".join(f"{axis}{k}_mm" for k in (1, 2, 3) for axis in "xyz")
+)  # fmt: skip
+ETHZ_HEADER = "run,tip_load_N,t_s," + ",".join(f"{m}{k}_{axis}_mm" for m in ("tip", "base") for k in (1, 2, 3) for axis in "xyz")
+ARMLAB = """row,l1_mm,l2_mm,l3_mm,x_mm,y_mm,z_mm,glitch,after_jump
+0,0,0,0.1,-43,-144,276,0,0
+1,0,0.1,0,-43,-144,278,0,0
+7,0,8,0,-36,-114,334,0,0
+8,0,8.1,0,500,500,500,1,0
+"""
+
+
+def asl_file(tmp_path: Path) -> Path:
+    rest = "100,-106,105,100,-202,105,100,-320,105"
+    pulled = "100,-106,105,100,-202,105,130,-310,145"
+    rows = [f"first,100,0,0,{','.join('0' * 6)},{','.join('0' * 6)},{rest}", f"first,100,1,0.04,1,2,3,4,5,6,10,20,30,40,50,60,{pulled}"]
+    path = tmp_path / "trunk.csv"
+    path.write_text("\n".join([ASL_HEADER, *rows, rows[0].replace("first", "second")]))
+    return path
+
+
+def test_asl_trunk_units_frame_and_order(tmp_path: Path) -> None:
+    log, robot = asl_trunk(asl_file(tmp_path))
+    assert log.runs == ["first", "second"]
+    assert_allclose(log.tip_position[:2], [[0.0, 0.0, 0.320], [0.030, 0.040, 0.310]], atol=1e-12)
+    assert log.points is not None
+    assert_allclose(log.points[0], [[0.0, 0.0, 0.106], [0.0, 0.0, 0.202]], atol=1e-12)
+    assert_allclose(np.degrees(-log.dl[1] / measured.ASL_SPOOL_RADIUS), [30, 50, 10, 60, 20, 40])  # motors 3 5 | 1 6 | 2 4
+    assert log.payload is not None
+    assert_allclose(log.payload, 0.1)
+    assert robot.length == pytest.approx(0.320)
+    assert_allclose(robot.rest_tendon_length, [0.106, 0.106, 0.202, 0.202, 0.320, 0.320])
+    places = np.array([tendon.position(1)[0] for tendon in robot.tendons]) / measured.ASL_PITCH_RADIUS
+    assert_allclose(places[4], [math.cos(math.radians(-105.0)), math.sin(math.radians(-105.0))])
+    # the two tendons of a segment pull at right angles, so that they set its whole bend
+    assert_allclose(np.sum(places[::2] * places[1::2], axis=1), 0.0, atol=1e-12)
+    assert_allclose(asl_trunk(asl_file(tmp_path), run="second")[0].t, [0.0])
+
+
+def test_ethz_beam_starts_straight_and_drops_along_gravity(tmp_path: Path) -> None:
+    def row(t: float, drop: float) -> str:
+        markers = [f"{60 - drop + 10 * k},30,{75 + 3 * k}" for k in (-1, 0, 1)]
+        return f"load,0.5,{t}," + ",".join(markers) + ",0" * 9
+
+    path = tmp_path / "beam.csv"
+    path.write_text("\n".join([ETHZ_HEADER, row(0.0, 0.0), row(3.0, 20.0), row(5.5, 16.0), row(6.0, 16.0)]))
+    log, robot = ethz_beam(path)
+    assert_array_equal(log.measured, [False, False, True, True])
+    assert_allclose(log.tip_position[2], [-0.016, 0.0, 0.1], atol=1e-12)
+    assert log.tip_force is not None
+    assert_allclose(log.tip_force[0], [-0.5, 0.0, 0.0])
+    assert np.dot(log.tip_force[0], robot.gravity) > 0.0  # the load hangs down
+    assert log.dl.shape == (4, 0)
+    whole, _ = ethz_beam(path, settled=None)
+    assert_allclose(whole.tip_position[0], [0.0, 0.0, 0.1], atol=1e-12)
+    assert whole.measured.all()
+
+
+def test_armlab_tdcr_rest_tip_is_straight_and_glitches_are_missing(tmp_path: Path) -> None:
+    path = tmp_path / "tdcr.csv"
+    path.write_text(ARMLAB)
+    log, robot = armlab_tdcr(path)
+    assert_allclose(log.tip_position[:2].mean(axis=0), [0.0, 0.0, measured.ARMLAB_LENGTH], atol=1e-12)
+    assert_allclose(log.tip_position[2] - (0.0, 0.0, measured.ARMLAB_LENGTH), [0.007, 0.057, -0.030], atol=1e-12)
+    assert_array_equal(log.measured, [True, True, True, False])
+    assert_allclose(log.dl[2], [0.0, -0.008, 0.0])
+    # the tip goes toward the tendon that is pulled, tendon 2 at 85 deg
+    assert np.dot(log.tip_position[2, :2], robot.tendons[1].position(1)[0]) > 0.0
+
+
+def test_base_frames_hang_right_handed(tmp_path: Path) -> None:
+    (tmp_path / "tdcr.csv").write_text(ARMLAB)
+    for _, robot in (asl_trunk(asl_file(tmp_path)), armlab_tdcr(tmp_path / "tdcr.csv")):
+        w, x, y, z = robot.base_quaternion
+        down = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])  # d3 of the base in the world
+        assert np.dot(down, robot.gravity) == pytest.approx(9.81)
+        assert loads(dumps(robot)) == robot  # an identified robot can be written down
+
+
+def test_detect_knows_the_raw_files_by_their_header(tmp_path: Path) -> None:
+    (tmp_path / "tdcr.csv").write_text(ARMLAB)
+    (tmp_path / "beam.csv").write_text(ETHZ_HEADER)
+    (tmp_path / "log.csv").write_text("t,dl_1,tip_x,tip_y,tip_z\n")
+    assert detect(asl_file(tmp_path)) is asl_trunk
+    assert detect(tmp_path / "tdcr.csv") is armlab_tdcr
+    assert detect(tmp_path / "beam.csv") is ethz_beam
+    assert detect(tmp_path / "log.csv") is None
+    assert detect(tmp_path / "absent.csv") is None
+
+
+def test_wrong_file_and_wrong_run_answer_with_one_sentence(tmp_path: Path) -> None:
+    path = asl_file(tmp_path)
+    with pytest.raises(LogError, match=r"trunk\.csv is not the raw file of armlab_tdcr: it lacks column l1_mm"):
+        armlab_tdcr(path)
+    with pytest.raises(UnknownNameError, match="no run 'frist' in log 'trunk'; did you mean 'first'"):
+        asl_trunk(path, run="frist")
+    path.write_text(path.read_text().replace("60,100", "60,1oo"))
+    with pytest.raises(LogError, match=r"trunk\.csv row 2, column x1_mm is '1oo'; it must be a number"):
+        asl_trunk(path)
+
+
+@needs_data
+@pytest.mark.parametrize("name", ["asl_trunk", "ethz_beam", "armlab_tdcr"])
+def test_measured_set_is_a_valid_run_log(name: str, tmp_path: Path) -> None:
+    adapter = detect(DATA / f"{name}.csv")
+    assert adapter is not None
+    log, robot = adapter(DATA / f"{name}.csv")
+    write_log(log, tmp_path / "log.csv")
+    back = read_log(tmp_path / "log.csv", robot)
+    assert_array_equal(back.tip_position, log.tip_position)
+    assert_array_equal(back.measured, log.measured)
+
+
+@needs_data
+def test_ethz_beam_drops_as_published() -> None:
+    log, _ = ethz_beam(DATA / "ethz_beam.csv")
+    drop = {run: -1e3 * float(log.only(run).tip_position[log.only(run).measured, 0].mean()) for run in log.runs}
+    assert drop["gravity_a"] == pytest.approx(6.5, abs=0.1)
+    assert drop["gravity_b"] == pytest.approx(6.5, abs=0.1)
+    assert drop["load52_a"] == pytest.approx(16.95, abs=0.1)
+    assert drop["load52_b"] == pytest.approx(16.95, abs=0.1)
+
+
+@needs_data
+def test_nominal_replay_of_the_beam_is_an_unshearable_rod() -> None:
+    pytest.importorskip("fastrod.simulator")
+    from fastrod.identification.replay import replay
+
+    log, robot = ethz_beam(DATA / "ethz_beam.csv")
+    result = replay(log, robot)
+    assert result.converged.all()
+    drop = {run: -1e3 * float(result.tip_position[log.run == run, 0].mean()) for run in log.runs}
+    assert drop["gravity_a"] == pytest.approx(6.6, abs=0.1)  # published for an unshearable rod: 6.6 and 15.8 mm
+    assert drop["load52_a"] == pytest.approx(15.8, abs=0.1)

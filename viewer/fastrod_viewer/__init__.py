@@ -1,0 +1,1 @@
+"""The browser: 3D view, teleoperation and replay, on viser."""
