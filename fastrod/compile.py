@@ -12,6 +12,9 @@ from fastrod.robot import Robot
 from fastrod.types import Floats, Layout, Params
 
 
+_INEXTENSIBLE = 1e-9  # m/N; below it the tensions of three wires that lock the twist grow without bound (model.md)
+
+
 class Rest(NamedTuple):
     """What the ports hold when nobody asks for anything else; robot axis 1 or n_robots."""
 
@@ -70,7 +73,7 @@ def _params(robots: Sequence[Robot]) -> Params:
     return Params(
         length=np.array([[s.length for s in robot.segments] for robot in robots]),
         offset=offset,
-        compliance=np.array([[t.compliance for t in row] for row in tendons]).reshape(len(robots), -1),
+        compliance=np.array([[max(t.compliance, _INEXTENSIBLE) for t in row] for row in tendons]).reshape(len(robots), -1),
         pretension=np.array([[t.pretension for t in row] for row in tendons]).reshape(len(robots), -1),
         unilateral=np.array([[t.unilateral for t in row] for row in tendons], dtype=bool).reshape(len(robots), -1),
         moment_scale=softest / reach,

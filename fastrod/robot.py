@@ -55,7 +55,8 @@ class Tendon:
     angle: float | tuple[float, ...]
     """Position around it, from d1 toward d2 [rad]."""
     compliance: float = 1e-5
-    """Stretch per tension, l(l) = L + compliance (T - pretension) [m/N]; 0 is an inextensible wire."""
+    """Stretch per tension, l(l) = L + compliance (T - pretension) [m/N]. Below 1e-9 counts as 1e-9: three or more wires that do
+    not stretch at all lock the twist with tensions beyond bound."""
     pretension: float = 0.0
     """Tension at which the tendon has its commanded length [N]."""
     unilateral: bool = False

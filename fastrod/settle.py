@@ -9,17 +9,18 @@ import numpy as np
 
 from fastrod.guess import cold_start
 from fastrod.kernels.gather import feed_forward
-from fastrod.types import Floats, Ints, Layout, Memory, Params, Ports
+from fastrod.types import Flags, Floats, Ints, Layout, Memory, Params, Ports
 
 Pass: TypeAlias = Callable[[Ints, Ports], Floats]
 """(robots, ports) -> residual of these robots at the x before the update [m]."""
 
 _MAX_PASSES = 40
+_PATIENCE = 4  # passes within tolerance after which tensions that still wander are let go: nothing determines them
 _SMALLEST_STEP = 1.0 / 64.0
 _SMALLEST_LOAD_STEP = 1.0 / 256.0
 
 
-def settle(rows: Ints, warm: np.ndarray, layout: Layout, params: Params, ports: Ports, memory: Memory, tolerance: float, run: Pass) -> Ints:
+def settle(rows: Ints, warm: Flags, layout: Layout, params: Params, ports: Ports, memory: Memory, tolerance: float, run: Pass) -> Ints:
     """Bring the robots `rows` to rest on `ports`; the passes that each took, and -1 where none of three ways converged.
 
     Warm robots start from their last x, moved to first order to the new inputs; others, and warm ones that fail, from a
@@ -28,7 +29,7 @@ def settle(rows: Ints, warm: np.ndarray, layout: Layout, params: Params, ports: 
     passes = np.zeros(memory.x.shape[0], np.int64)
     left = rows[warm[rows]]
     if len(left):
-        feed_forward(left, len(left), ports, memory, layout)
+        feed_forward(left, len(left), ports, params, memory, layout)
         left = _newton(left, params, layout, ports, memory, tolerance, run, passes)
     left = np.sort(np.concatenate([left, rows[~warm[rows]]]))
     if len(left):
@@ -47,12 +48,14 @@ def _newton(rows: Ints, params: Params, layout: Layout, ports: Ports, memory: Me
     step = np.zeros_like(x_at)
     best = np.full(len(rows), np.inf)
     damping = np.ones(len(rows))
+    patience = np.full(len(rows), _PATIENCE)
     for _ in range(_MAX_PASSES):
         x_tried = memory.x[rows]
         residual = run(rows, ports)
         passes[rows] += 1
         after = memory.x[rows]
-        better = residual < best
+        # in paper mode the wires may contradict each other: at the least-squares boundary the residual stays
+        better = residual <= 2.0 * best if layout.paper else residual < best
         if better.all():
             x_at, step, best = x_tried, after - x_tried, residual
             damping[:] = 1.0
@@ -62,7 +65,9 @@ def _newton(rows: Ints, params: Params, layout: Layout, ports: Ports, memory: Me
             best = np.where(better, residual, best)
             damping = np.where(better, 1.0, 0.5 * damping)
             memory.x[rows] = x_at + damping[:, None] * step
-        done = (best <= tolerance) & _still(step, rows, layout, params)
+        closed = np.isfinite(best) if layout.paper else best <= tolerance
+        patience -= closed
+        done = closed & (_still(step, rows, layout, params, tolerance) | ((patience <= 0) & (best <= tolerance)))
         lost = ~done & ((damping < _SMALLEST_STEP) | ~np.isfinite(step).all(1))
         failed.append(rows[lost])
         keep = ~(done | lost)
@@ -70,17 +75,28 @@ def _newton(rows: Ints, params: Params, layout: Layout, ports: Ports, memory: Me
             rows = rows[:0]
             break
         if not keep.all():
-            rows, x_at, step, best, damping = rows[keep], x_at[keep], step[keep], best[keep], damping[keep]
+            rows, x_at, step = rows[keep], x_at[keep], step[keep]
+            best, damping, patience = best[keep], damping[keep], patience[keep]
     return np.sort(np.concatenate([rows, *failed]))
 
 
-def _still(step: Floats, rows: Ints, layout: Layout, params: Params) -> np.ndarray:
-    """The tensions no longer move: a small residual says little about them where tendons hardly stretch."""
-    if layout.paper or not len(layout.free_tendon):
+def _still(step: Floats, rows: Ints, layout: Layout, params: Params, tolerance: float) -> Flags:
+    """The unknowns no longer move.
+
+    A small residual says little about tensions where tendons hardly stretch, and in paper mode the wires may disagree:
+    then the least-squares boundary is the answer, and the residual says by how much they do.
+    """
+
+    def of(a: Floats) -> Floats:
+        return a if len(a) == 1 else a[rows]
+
+    if layout.paper:
+        bend = np.abs(step).max(1) / of(params.moment_scale)
+        return np.asarray(bend * of(params.reach) <= max(tolerance, 1e-12))
+    n_free = len(layout.free_tendon)
+    if not n_free:
         return np.ones(len(step), bool)
-    moved = np.abs(step[:, 3 : 3 + len(layout.free_tendon)]).max(1)
-    unit = params.tension_scale if len(params.tension_scale) == 1 else params.tension_scale[rows]
-    return np.asarray(moved <= 1e-6 * unit)
+    return np.asarray(np.abs(step[:, 3 : 3 + n_free]).max(1) <= 1e-6 * of(params.tension_scale))
 
 
 def _continuation(

@@ -73,6 +73,7 @@ class Simulator:
         self.n_robots = int(n_robots)
         self.dt = float(dt)
         self.observer = observer or Observer()
+        self._carry = observer is not None
         self.outputs = outputs
         self._threads = threads or numba.get_num_threads()
         self._layout, self._params, self._rest = compile_robots(self.robots, int(points_per_segment))
@@ -119,11 +120,10 @@ class Simulator:
         self._start(cold, ports)
         shape = self._new_shape(self.outputs, len(rows) < self.n_robots)
         process, noise = self.observer.process_noise * self.dt, self.observer.measurement_noise / self.dt
-        self._pass(rows, ports, shape, feed=True, carry=True, process=process, noise=noise)
+        self._pass(rows, ports, shape, feed=True, carry=self._carry, process=process, noise=noise)
         ok = np.zeros(self.n_robots, bool)
         ok[rows] = np.isfinite(self._memory.x[rows]).all(1) & (shape.residual[rows] < self._reach(rows))
-        passes = np.zeros(self.n_robots, np.int64)
-        passes[rows] = 1
+        passes = np.broadcast_to(np.int64(1), self.n_robots)
         return self._finish(ports, shape, ok, passes, "the observer diverged; use settle, or smaller changes of input")
 
     def settle(
@@ -143,7 +143,8 @@ class Simulator:
         """Repeat the pass on frozen inputs until every boundary residual is below `tolerance` [m]; inputs as for `step`.
 
         Where Newton's method would diverge the loads are brought on step by step. Robots that still do not converge
-        have `ok` False and `passes` -1.
+        have `ok` False and `passes` -1. In paper mode four wires may contradict each other; then the least-squares
+        boundary has converged, and `residual` says by how much they do.
         """
         if not (np.isfinite(tolerance) and tolerance > 0.0):
             raise InputError(f"tolerance is {tolerance!r} m; it must be positive and finite.")
@@ -152,12 +153,12 @@ class Simulator:
         shape = self._new_shape(self.outputs, len(rows) < self.n_robots)
 
         def run(which: Ints, at: Ports) -> Floats:
-            self._pass(which, at, shape, feed=False, carry=False, process=1.0, noise=1e-18)
+            self._pass(which, at, shape, feed=False, carry=False, process=1.0, noise=1e-14 if self._layout.paper else 1e-20)
             return shape.residual[which]
 
         passes = settle(rows, self._warm, self._layout, self._params, ports, self._memory, tolerance, run)
         ok = np.zeros(self.n_robots, bool)
-        ok[rows] = (passes[rows] > 0) & (shape.residual[rows] <= tolerance)
+        ok[rows] = passes[rows] > 0
         return self._finish(ports, shape, ok, passes, f"settle did not bring the boundary residual below {tolerance:g} m")
 
     def shape(self, arclength: ArrayLike) -> Pose:
@@ -255,8 +256,10 @@ class Simulator:
         n_x += 3 if follower else 0
         return Memory(
             x=np.zeros((n, n_x)),
-            covariance=np.zeros((n, n_x * (n_x + 1) // 2), np.float32),
+            covariance=np.zeros((n if self._carry else 0, n_x * (n_x + 1) // 2), np.float32),
             gain=np.zeros((n, n_x, n_rows + (3 if track_force else 0)), np.float32),
+            move=np.zeros((n, n_x), np.float32),
+            defect=np.zeros((n, n_x), np.float32),
             length_before=np.zeros((n, n_rows)),
             force_before=np.zeros((n if track_force else 0, 3)),
             curvature_guess=np.zeros((n, 3)),
@@ -283,8 +286,8 @@ class Simulator:
         if not len(rows):
             return
         cold_start(rows, self._layout, self._params, ports, self._memory)
-        self._memory.gain[rows] = 0.0
-        self._memory.covariance[rows] = 0.0
+        for kept in (self._memory.gain, self._memory.move, self._memory.defect, *([self._memory.covariance] if self._carry else [])):
+            kept[rows] = 0.0
 
     def _new_shape(self, outputs: str, holes: bool) -> Shape:
         n, n_points, n_tendons = self.n_robots, self.n_points, len(self._layout.tendon_segment)

@@ -15,7 +15,9 @@ from fastrod.types import Flags, Floats, Ints, Memory, Ports
 class Observer:
     """Gains of the boundary observer (the paper's Q and V; model.md, "The observer"), on unknowns scaled to about one.
 
-    The defaults make a step a Gauss-Newton step. More `measurement_noise` smooths the boundary over time.
+    A simulator without an observer of its own takes the gains so high that a step is a Gauss-Newton step; the variance
+    that is then left over is far below the process noise, and is not carried. More `measurement_noise` smooths the boundary
+    over time.
     """
 
     process_noise: float = 100.0

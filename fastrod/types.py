@@ -91,9 +91,13 @@ class Memory(NamedTuple):
     """(n_robots, n_x) boundary unknowns: base moment, material [N m]; tensions of the free tendons [N]; with a follower
     force its world value [N]. Paper mode: m_x and m_y at the base of each segment."""
     covariance: Singles
-    """(n_robots, n_x (n_x + 1) / 2) P of the scaled unknowns, lower triangle row by row."""
+    """(n_robots, n_x (n_x + 1) / 2) P of the scaled unknowns, lower triangle row by row; length 0 where it is not carried."""
     gain: Singles
     """(n_robots, n_x, n_in) change of x per change of a commanded tendon length and, where tracked, of the tip force."""
+    move: Singles
+    """(n_robots, n_x) first-order change of the scaled unknowns at the last change of inputs."""
+    defect: Singles
+    """(n_robots, n_x) second-order change of the scaled unknowns at that change: what was foreseen and what the pass added."""
     length_before: Floats
     """(n_robots, n_rows) tendon lengths that x belongs to [m]."""
     force_before: Floats

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from fastrod.kernels import columns as col
 from fastrod.kernels import shape as sh
-from fastrod.kernels.gather import pick
+from fastrod.kernels.gather import pick, unknown_unit
 from fastrod.kernels.jit import LANES, inline, kernel
 from fastrod.kernels.observer import BLOCK, gain
 from fastrod.kernels.shape import Lanes
@@ -55,7 +55,8 @@ def close_lengths(
             # a slack wire's unknown is no tension but a measure of how loose it hangs, and needs some slope
             stretch = max(compliance, 1e-5) if value < 0.0 and params.unilateral[pick(i, len(params.unilateral)), t] else compliance
             error[f * W + w] -= stretch * value - compliance * params.pretension[pick(i, len(params.pretension)), t]
-            gamma[(f * n_col + n_base + f) * W + w] -= stretch
+            if n_col > 0:
+                gamma[(f * n_col + n_base + f) * W + w] -= stretch
 
 
 @kernel
@@ -106,7 +107,7 @@ def close_tip(
 @kernel
 def loosen(robots: Lanes, params: Params, layout: Layout, x: Lanes, n_col: int, n_e: int, gamma: Lanes) -> None:
     """A slack wire carries nothing: its unknown moves no residual but its own."""
-    for f in range(len(layout.free_tendon)):
+    for f in range(len(layout.free_tendon) if n_col > 0 else 0):
         t = layout.free_tendon[f]
         for w in range(W):
             s = pick(robots[w], len(params.unilateral))
@@ -139,15 +140,11 @@ def update_boundary(
     """The observer's update of x and P, and the gain kept for the next inputs."""
     n_x, n_rows = memory.x.shape[1], len(layout.row_tendon)
     n_p = padded(n_x, BLOCK)
-    n_base, n_free = (2 * len(layout.first_tendon) if layout.paper else 3), len(layout.free_tendon)
     units = work[(n_p + 2) * W :]
     for w in range(W):
         s = pick(robots[w], len(params.reach))
         for a in range(n_x):
-            unit = params.moment_scale[s]
-            if a >= n_base:
-                unit = params.tension_scale[s] if a < n_base + n_free else unit / params.reach[s]
-            units[a * W + w] = unit
+            units[a * W + w] = unknown_unit(a, s, params, layout)
     for i in range(n_p * n_p * W):
         P[i] = 0.0
     for i in range(n_e * n_p * W):
@@ -169,15 +166,19 @@ def update_boundary(
         for w in range(W):
             P[(a * n_p + a) * W + w] += process
     gain(P, G, scaled, work, n_x, n_e, noise)
+    defect = work[: n_x * W]
     for a in range(n_x):
+        for w in range(W):
+            defect[a * W + w] = 0.0
         for r in range(n_e):
             for w in range(W):
-                x[a * W + w] -= units[a * W + w] * G[(r * n_p + a) * W + w] * error[r * W + w]
+                defect[a * W + w] -= G[(r * n_p + a) * W + w] * error[r * W + w]
     for w in range(count):
         i = robots[w]
         for a in range(n_x):
-            memory.x[i, a] = x[a * W + w]
             unit = units[a * W + w]
+            memory.x[i, a] = x[a * W + w] + unit * defect[a * W + w]
+            memory.defect[i, a] += defect[a * W + w]
             for r in range(n_rows):
                 memory.gain[i, a, r] = unit * G[(r * n_p + a) * W + w]
             if len(memory.force_before) > 0:

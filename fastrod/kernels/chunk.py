@@ -19,7 +19,8 @@ from fastrod.kernels.vec import mul
 from fastrod.types import Layout, Memory, Params, Ports, Response, Shape
 
 W = LANES
-CUTS = 2  # Newton steps on u at each stage; the guess of second order makes the second one exact to rounding
+CUTS = 2  # Newton steps on u at each stage; the guess is of second order, so little is left after the second
+RESPONSE_CUTS = 5  # where derivatives are asked for: then they are those of the converged u
 FIRST_CUTS = 6  # at the base, where the guess is the last pass's curvature
 
 
@@ -105,7 +106,7 @@ def start_segment(k: int, layout: Layout, node: Lanes, x: Lanes, columns: Lanes,
         for i in range(3 * W):
             node[sh.N_M * W + i] = x[i]
     begin, end = (2 * k, 2 * k + 2) if layout.paper else (0, n_base if k == 0 else 0)
-    for c in range(begin, end):
+    for c in range(begin, min(end, n_col)):
         for w in range(W):
             columns[(c * col.COLUMN + col.C_M + c - begin) * W + w] = 1.0
 
@@ -225,7 +226,7 @@ def pass_chunk(
     for i in range(len(tendon)):
         tendon[i] = 0.0
     if feed:
-        feed_forward(robots, count, ports, memory, layout)
+        feed_forward(robots, count, ports, params, memory, layout)
     load_unknowns(robots, ports, params, memory, layout, x, tendon)
     gather_base(robots, ports, params, memory, layout, node, x)
     for w in range(W):
@@ -245,8 +246,8 @@ def pass_chunk(
                 if k == 0 or layout.paper:
                     add_base_moment(node, wrench, 1.0)
             sh.start_step(node, stages)
-            cuts = FIRST_CUTS if j == 0 else CUTS
-            solve_section(node, stages, tendon, paths, 0, first, n, loaded, cuts)
+            cuts = RESPONSE_CUTS if placed else CUTS
+            solve_section(node, stages, tendon, paths, 0, first, n, loaded, FIRST_CUTS if j == 0 else cuts)
             if j == 0 or dense:
                 for i in range(3 * W):
                     node[sh.N_U * W + i] = stages[sh.S_U * W + i]
@@ -257,11 +258,11 @@ def pass_chunk(
             if dense:
                 scatter_node(k * n_steps + j, count, robots, node, s, shape)
             sh.second_stage(node, stages)
-            solve_section(node, stages[sh.STAGE * W :], tendon, paths[sh.PATH * W :], 1, first, n, loaded, CUTS)
+            solve_section(node, stages[sh.STAGE * W :], tendon, paths[sh.PATH * W :], 1, first, n, loaded, cuts)
             sh.third_stage(node, stages)
-            solve_section(node, stages[2 * sh.STAGE * W :], tendon, paths[2 * sh.PATH * W :], 1, first, n, loaded, CUTS)
+            solve_section(node, stages[2 * sh.STAGE * W :], tendon, paths[2 * sh.PATH * W :], 1, first, n, loaded, cuts)
             sh.fourth_stage(node, stages)
-            solve_section(node, stages[3 * sh.STAGE * W :], tendon, paths[3 * sh.PATH * W :], 2, first, n, loaded, CUTS)
+            solve_section(node, stages[3 * sh.STAGE * W :], tendon, paths[3 * sh.PATH * W :], 2, first, n, loaded, cuts)
             sh.end_step(node, stages)
             for g in range(first, n, sh.GROUP):
                 sh.add_lengths(length[g * W :], node, paths[g * sh.PATHS * W :])

@@ -16,22 +16,50 @@ def pick(i: int, n: int) -> int:
     return i if n > 1 else 0
 
 
+@inline
+def unknown_unit(a: int, s: int, params: Params, layout: Layout) -> float:
+    """Natural size of unknown a: a moment, a tension, or with a follower force a force."""
+    n_base = 2 * len(layout.first_tendon) if layout.paper else 3
+    if a < n_base:
+        return params.moment_scale[s]
+    if a < n_base + len(layout.free_tendon):
+        return params.tension_scale[s]
+    return params.moment_scale[s] / params.reach[s]
+
+
 @kernel
-def feed_forward(robots: Lanes, count: int, ports: Ports, memory: Memory, layout: Layout) -> None:
-    """Move x to first order from the inputs of the last pass to the new ones: x += G (L - L_before) - G (de/dF) (F - F_before)."""
-    n_rows = len(layout.row_tendon)
+def feed_forward(robots: Lanes, count: int, ports: Ports, params: Params, memory: Memory, layout: Layout) -> None:
+    """Move x from the inputs of the last pass to the new ones, to second order where the motion goes on.
+
+    First order: x += v, v = G (L - L_before) - G (de/dF) (F - F_before). What the last pass then had to correct is the
+    second-order term of the last move; a move along the same line by the ratio k needs k^2 of it again.
+    """
+    n_rows, n_x = len(layout.row_tendon), memory.x.shape[1]
     for w in range(count):
         i = robots[w]
+        s = pick(i, len(params.reach))
         length = ports.tendon_length[pick(i, len(ports.tendon_length))]
         force = ports.tip_force[pick(i, len(ports.tip_force))]
-        for a in range(memory.x.shape[1]):
-            moved = 0.0
+        along, old, new = 0.0, 0.0, 0.0
+        for a in range(n_x):
+            v = 0.0
             for r in range(n_rows):
-                moved += memory.gain[i, a, r] * (length[layout.row_tendon[r]] - memory.length_before[i, r])
+                v += memory.gain[i, a, r] * (length[layout.row_tendon[r]] - memory.length_before[i, r])
             if len(memory.force_before) > 0:
                 for b in range(3):
-                    moved += memory.gain[i, a, n_rows + b] * (force[b] - memory.force_before[i, b])
-            memory.x[i, a] += moved
+                    v += memory.gain[i, a, n_rows + b] * (force[b] - memory.force_before[i, b])
+            unit = unknown_unit(a, s, params, layout)
+            v /= unit
+            before = memory.move[i, a]
+            along += v * before
+            old += before * before
+            new += v * v
+            memory.x[i, a] += unit * v
+            memory.move[i, a] = v
+        again = min((along / old) ** 2, 4.0) if old > 0.0 and along * along > 0.8 * old * new else 0.0
+        for a in range(n_x):
+            memory.defect[i, a] *= again
+            memory.x[i, a] += unknown_unit(a, s, params, layout) * memory.defect[i, a]
         for r in range(n_rows):
             memory.length_before[i, r] = length[layout.row_tendon[r]]
         if len(memory.force_before) > 0:

@@ -69,7 +69,7 @@ def gain(P: Lanes, G: Lanes, gamma: Lanes, work: Lanes, n_x: int, n_e: int, nois
         for b in range(0, row, block):
             dot_block(number, work[b : b + block], g_i[b : b + block])
         for w in range(W):
-            inverse[w] = 1.0 / number[w]
+            inverse[w] = 1.0 / max(number[w], noise)  # rounding may take P a little below zero where nothing is left to learn
         k_i = G[i * row : (i + 1) * row]
         for b in range(0, row, block):
             scale_block(k_i[b : b + block], work[b : b + block], inverse)
