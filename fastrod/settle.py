@@ -8,7 +8,7 @@ from typing import TypeAlias
 import numpy as np
 
 from fastrod.guess import cold_start
-from fastrod.kernels.gather import feed_forward
+from fastrod.kernels.batch import move_to_inputs
 from fastrod.types import Flags, Floats, Ints, Layout, Memory, Params, Ports
 
 Pass: TypeAlias = Callable[[Ints, Ports], Floats]
@@ -29,7 +29,7 @@ def settle(rows: Ints, warm: Flags, layout: Layout, params: Params, ports: Ports
     passes = np.zeros(memory.x.shape[0], np.int64)
     left = rows[warm[rows]]
     if len(left):
-        feed_forward(left, len(left), ports, params, memory, layout)
+        move_to_inputs(left, ports, params, memory, layout)
         left = _newton(left, params, layout, ports, memory, tolerance, run, passes)
     left = np.sort(np.concatenate([left, rows[~warm[rows]]]))
     if len(left):
@@ -67,7 +67,7 @@ def _newton(rows: Ints, params: Params, layout: Layout, ports: Ports, memory: Me
             memory.x[rows] = x_at + damping[:, None] * step
         closed = np.isfinite(best) if layout.paper else best <= tolerance
         patience -= closed
-        done = closed & (_still(step, rows, layout, params, tolerance) | ((patience <= 0) & (best <= tolerance)))
+        done = closed & (_still(step, rows, layout, params, tolerance + 1e-4 * best) | ((patience <= 0) & (best <= tolerance)))
         lost = ~done & ((damping < _SMALLEST_STEP) | ~np.isfinite(step).all(1))
         failed.append(rows[lost])
         keep = ~(done | lost)
@@ -80,7 +80,7 @@ def _newton(rows: Ints, params: Params, layout: Layout, ports: Ports, memory: Me
     return np.sort(np.concatenate([rows, *failed]))
 
 
-def _still(step: Floats, rows: Ints, layout: Layout, params: Params, tolerance: float) -> Flags:
+def _still(step: Floats, rows: Ints, layout: Layout, params: Params, small: Floats) -> Flags:
     """The unknowns no longer move.
 
     A small residual says little about tensions where tendons hardly stretch, and in paper mode the wires may disagree:
@@ -92,7 +92,7 @@ def _still(step: Floats, rows: Ints, layout: Layout, params: Params, tolerance: 
 
     if layout.paper:
         bend = np.abs(step).max(1) / of(params.moment_scale)
-        return np.asarray(bend * of(params.reach) <= max(tolerance, 1e-12))
+        return np.asarray(bend * of(params.reach) <= small)
     n_free = len(layout.free_tendon)
     if not n_free:
         return np.ones(len(step), bool)

@@ -24,19 +24,22 @@ RESPONSE_CUTS = 5  # where derivatives are asked for: then they are those of the
 FIRST_CUTS = 6  # at the base, where the guess is the last pass's curvature
 
 
-@kernel
 def scratch_size(n_tendons: int, n_x: int, n_col: int, n_e: int) -> int:
     """Numbers of scratch that `pass_chunk` needs."""
-    n_t, n_p = n_tendons + sh.GROUP, padded(n_x, BLOCK)
+    n_t, n_p = n_tendons + sh.GROUP, BLOCK * -(-n_x // BLOCK)
     march = sh.NODE + 5 * sh.STAGE + n_t * (sh.TENDON + sh.PATHS + 1) + n_col * (col.COLUMN + n_t)
     return W * (march + 8 + n_e + n_e * n_col + n_p * n_p + 2 * n_e * n_p + n_p + 2 + 2 * n_x)
 
 
 @kernel
-def solve_section(node: Lanes, stage: Lanes, tendon: Lanes, path: Lanes, half: int, first: int, n: int, loaded: bool, cuts: int) -> None:
-    """Curvature of a stage from its moment, and the paths of the tendons that cross it."""
+def solve_section(half: Lanes, stage: Lanes, tendon: Lanes, path: Lanes, first: int, n: int, loaded: bool, cuts: int) -> None:
+    """Curvature of a stage from its moment, and the paths of the tendons that cross it.
+
+    `half`: K there, and u* three half steps further on, a view into the node.
+    """
+    rest = half[(sh.N_USTAR - sh.N_K) * W :]
     if not loaded:
-        sh.curvature_without_tendons(node, stage, half)
+        sh.curvature_without_tendons(stage, half, rest)
         for g in range(first, n, sh.GROUP):
             sh.tendon_paths(stage, tendon[g * sh.TENDON * W :], path[g * sh.PATHS * W :])
         return
@@ -44,7 +47,7 @@ def solve_section(node: Lanes, stage: Lanes, tendon: Lanes, path: Lanes, half: i
         sh.clear_sums(stage)
         for g in range(first, n, sh.GROUP):
             sh.tendon_sums(stage, tendon[g * sh.TENDON * W :], path[g * sh.PATHS * W :])
-        sh.correct_curvature(node, stage, half)
+        sh.correct_curvature(stage, half, rest)
 
 
 @kernel
@@ -215,6 +218,8 @@ def pass_chunk(
     scaled, o = scratch[o : o + n_e * n_p * W], o + n_e * n_p * W
     work = scratch[o:]
 
+    at_start, at_middle, at_end = node[sh.N_K * W :], node[(sh.N_K + 3) * W :], node[(sh.N_K + 6) * W :]
+    first_cuts, cuts = FIRST_CUTS, RESPONSE_CUTS if placed else CUTS
     for i in range(len(length)):
         length[i] = 0.0
     for i in range(len(columns)):
@@ -246,8 +251,7 @@ def pass_chunk(
                 if k == 0 or layout.paper:
                     add_base_moment(node, wrench, 1.0)
             sh.start_step(node, stages)
-            cuts = RESPONSE_CUTS if placed else CUTS
-            solve_section(node, stages, tendon, paths, 0, first, n, loaded, FIRST_CUTS if j == 0 else cuts)
+            solve_section(at_start, stages, tendon, paths, first, n, loaded, first_cuts if j == 0 else cuts)
             if j == 0 or dense:
                 for i in range(3 * W):
                     node[sh.N_U * W + i] = stages[sh.S_U * W + i]
@@ -258,11 +262,11 @@ def pass_chunk(
             if dense:
                 scatter_node(k * n_steps + j, count, robots, node, s, shape)
             sh.second_stage(node, stages)
-            solve_section(node, stages[sh.STAGE * W :], tendon, paths[sh.PATH * W :], 1, first, n, loaded, cuts)
+            solve_section(at_middle, stages[sh.STAGE * W :], tendon, paths[sh.PATH * W :], first, n, loaded, cuts)
             sh.third_stage(node, stages)
-            solve_section(node, stages[2 * sh.STAGE * W :], tendon, paths[2 * sh.PATH * W :], 1, first, n, loaded, cuts)
+            solve_section(at_middle, stages[2 * sh.STAGE * W :], tendon, paths[2 * sh.PATH * W :], first, n, loaded, cuts)
             sh.fourth_stage(node, stages)
-            solve_section(node, stages[3 * sh.STAGE * W :], tendon, paths[3 * sh.PATH * W :], 2, first, n, loaded, cuts)
+            solve_section(at_end, stages[3 * sh.STAGE * W :], tendon, paths[3 * sh.PATH * W :], first, n, loaded, cuts)
             sh.end_step(node, stages)
             for g in range(first, n, sh.GROUP):
                 sh.add_lengths(length[g * W :], node, paths[g * sh.PATHS * W :])
@@ -276,7 +280,7 @@ def pass_chunk(
     if dense:
         sh.start_step(node, stages)
         first = layout.first_tendon[n_segments - 1]
-        solve_section(node, stages, tendon, paths, 2, first, n, first < n and not layout.paper, FIRST_CUTS)
+        solve_section(at_end, stages, tendon, paths, first, n, first < n and not layout.paper, first_cuts + cuts)
         for i in range(3 * W):
             node[sh.N_U * W + i] = stages[sh.S_U * W + i]
         scatter_node(n_segments * n_steps, count, robots, node, s, shape)

@@ -7,7 +7,7 @@ import numpy as np
 from fastrod.kernels import shape as sh
 from fastrod.kernels.chunk import FIRST_CUTS, solve_section
 from fastrod.kernels.gather import pick
-from fastrod.kernels.jit import LANES, kernel
+from fastrod.kernels.jit import LANES, entry, kernel
 from fastrod.kernels.shape import Lanes
 from fastrod.types import Floats, Layout, Params, Ports, Shape
 
@@ -64,7 +64,7 @@ def _fill(
         tendon[(t * sh.TENDON + sh.T_T) * W + lane] = tension[i, t] if crosses else 0.0
 
 
-@kernel
+@entry
 def between_nodes(
     robots: Lanes,
     queries: Lanes,
@@ -81,23 +81,24 @@ def between_nodes(
     node, stages = np.zeros(sh.NODE * W), np.zeros(5 * sh.STAGE * W)
     tendon, path = np.zeros(n_t * sh.TENDON * W), np.zeros(n_t * sh.PATHS * W)
     loaded = n > 0 and not layout.paper
+    at_start, at_middle, at_end = node[sh.N_K * W :], node[(sh.N_K + 3) * W :], node[(sh.N_K + 6) * W :]
     for start in range(0, len(robots), W):
         count = min(W, len(robots) - start)
         for w in range(W):
             q = start + min(w, count - 1)
             _fill(w, robots[q], s[robots[q], queries[q]], params, ports, layout, shape, node, tendon)
         sh.start_step(node, stages)
-        solve_section(node, stages, tendon, path, 0, 0, n, loaded, FIRST_CUTS)
+        solve_section(at_start, stages, tendon, path, 0, n, loaded, FIRST_CUTS)
         sh.second_stage(node, stages)
-        solve_section(node, stages[sh.STAGE * W :], tendon, path, 1, 0, n, loaded, FIRST_CUTS)
+        solve_section(at_middle, stages[sh.STAGE * W :], tendon, path, 0, n, loaded, FIRST_CUTS)
         sh.third_stage(node, stages)
-        solve_section(node, stages[2 * sh.STAGE * W :], tendon, path, 1, 0, n, loaded, FIRST_CUTS)
+        solve_section(at_middle, stages[2 * sh.STAGE * W :], tendon, path, 0, n, loaded, FIRST_CUTS)
         sh.fourth_stage(node, stages)
-        solve_section(node, stages[3 * sh.STAGE * W :], tendon, path, 2, 0, n, loaded, FIRST_CUTS)
+        solve_section(at_end, stages[3 * sh.STAGE * W :], tendon, path, 0, n, loaded, FIRST_CUTS)
         sh.end_step(node, stages)
         sh.advance(node, stages)
         sh.start_step(node, stages)
-        solve_section(node, stages, tendon, path, 2, 0, n, loaded, FIRST_CUTS)
+        solve_section(at_end, stages, tendon, path, 0, n, loaded, FIRST_CUTS)
         for w in range(count):
             i, q = robots[start + w], queries[start + w]
             for a in range(3):

@@ -49,12 +49,21 @@ _CACHE_DIR = _cache_dir()
 
 
 def kernel(function: _Function) -> _Function:
-    """Compile `function` on first call, and keep the result across processes where a folder is writable."""
-    return _compile(function, parallel=False)
+    """Compile `function` as part of the `entry` that calls it.
+
+    Without numba's reference counts: an atomic increment for each array of a NamedTuple at each call cost as much as the
+    arithmetic. A kernel may therefore slice arrays but not make them.
+    """
+    return cast(_Function, numba.njit(error_model="numpy", fastmath=_FAST, nogil=True, _nrt=False)(function))
 
 
-def parallel_kernel(function: _Function) -> _Function:
-    """As `kernel`, with `prange` spread over threads."""
+def entry(function: _Function) -> _Function:
+    """Compile what Python calls, on first call, and keep it across processes where a folder is writable. It may make arrays."""
+    return _compile(function)
+
+
+def parallel_entry(function: _Function) -> _Function:
+    """As `entry`, with `prange` spread over threads."""
     return _compile(function, parallel=True)
 
 
@@ -63,14 +72,14 @@ def inline(function: _Function) -> _Function:
 
     numba's own inline="always" pastes before typing and compiles three times as long.
     """
-    return cast(_Function, numba.njit(forceinline=True, error_model="numpy", fastmath=_FAST)(function))
+    return cast(_Function, numba.njit(forceinline=True, error_model="numpy", fastmath=_FAST, _nrt=False)(function))
 
 
-def _compile(function: _Function, parallel: bool) -> _Function:
+def _compile(function: _Function, **options: bool) -> _Function:
     before = _config.CACHE_DIR
     _config.CACHE_DIR = _CACHE_DIR or before
     try:
-        made = numba.njit(cache=_CACHE_DIR is not None, parallel=parallel, error_model="numpy", fastmath=_FAST, nogil=True)(function)
+        made = numba.njit(cache=_CACHE_DIR is not None, error_model="numpy", fastmath=_FAST, nogil=True, **options)(function)
     finally:
         _config.CACHE_DIR = before
     return cast(_Function, made)

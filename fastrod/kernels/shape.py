@@ -177,9 +177,8 @@ def advance(node: Lanes, stages: Lanes) -> None:
 
 
 @kernel
-def curvature_without_tendons(node: Lanes, stage: Lanes, half: int) -> None:
+def curvature_without_tendons(stage: Lanes, stiffness: Lanes, rest: Lanes) -> None:
     """u = u* + K^-1 m: a passive rod, and the paper's reduced model."""
-    stiffness, rest = node[(N_K + 3 * half) * W : (N_K + 3 * half + 3) * W], node[(N_USTAR + 3 * half) * W : (N_USTAR + 3 * half + 3) * W]
     for w in range(W):
         k, m = get(stiffness, 0, w), get(stage, S_M, w)
         inverse = (1.0 / k[0], 1.0 / k[1], 1.0 / k[2])
@@ -228,9 +227,8 @@ def tendon_paths(stage: Lanes, tendon: Lanes, path: Lanes) -> None:
 
 
 @kernel
-def correct_curvature(node: Lanes, stage: Lanes, half: int) -> None:
+def correct_curvature(stage: Lanes, stiffness: Lanes, rest: Lanes) -> None:
     """One Newton step of the stage's u on the sums of all tendons."""
-    stiffness, rest = node[(N_K + 3 * half) * W : (N_K + 3 * half + 3) * W], node[(N_USTAR + 3 * half) * W : (N_USTAR + 3 * half + 3) * W]
     for w in range(W):
         hessian = get(stage, S_SUM + 3, w) + get(stage, S_SUM + 6, w)
         u, inverse = curvature_correction(
