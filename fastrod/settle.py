@@ -67,7 +67,7 @@ def _newton(rows: Ints, params: Params, layout: Layout, ports: Ports, memory: Me
             memory.x[rows] = x_at + damping[:, None] * step
         closed = np.isfinite(best) if layout.paper else best <= tolerance
         patience -= closed
-        done = closed & (_still(step, rows, layout, params, tolerance + 1e-4 * best) | ((patience <= 0) & (best <= tolerance)))
+        done = closed & (_still(step, rows, layout, params, tolerance + 1e-6 * best) | ((patience <= 0) & (best <= tolerance)))
         lost = ~done & ((damping < _SMALLEST_STEP) | ~np.isfinite(step).all(1))
         failed.append(rows[lost])
         keep = ~(done | lost)

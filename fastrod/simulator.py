@@ -153,7 +153,7 @@ class Simulator:
         shape = self._new_shape(self.outputs, len(rows) < self.n_robots)
 
         def run(which: Ints, at: Ports) -> Floats:
-            self._pass(which, at, shape, feed=False, carry=False, process=1.0, noise=1e-14 if self._layout.paper else 1e-20)
+            self._pass(which, at, shape, feed=False, carry=False, process=1.0, noise=1e-10 if self._layout.paper else 1e-20)
             return shape.residual[which]
 
         passes = settle(rows, self._warm, self._layout, self._params, ports, self._memory, tolerance, run)
