@@ -7,16 +7,23 @@ from __future__ import annotations
 
 import numpy as np
 
-from fastrod.types import Floats, Layout, Memory, Params, Ports
+from fastrod.types import Floats, Ints, Layout, Memory, Params, Ports
 
 _SAMPLES = 8  # arcs are sampled this often per segment; the guess needs no more
 
 
-def cold_start(rows: np.ndarray, layout: Layout, params: Params, ports: Ports, memory: Memory) -> None:
+def cold_start(rows: Ints, layout: Layout, params: Params, ports: Ports, memory: Memory) -> None:
     """Fill x and the curvature guess of the robots `rows` from their inputs alone."""
     if not len(rows):
         return
     take = _Rows(rows)
+    _fill(rows, take, layout, params, ports, memory)
+    # Single precision: numpy's sums differ in their last bits with the size of the batch, a batch of robots must not.
+    memory.x[rows] = memory.x[rows].astype(np.float32)
+    memory.curvature_guess[rows] = memory.curvature_guess[rows].astype(np.float32)
+
+
+def _fill(rows: Ints, take: _Rows, layout: Layout, params: Params, ports: Ports, memory: Memory) -> None:
     curvature = _arc_curvature(layout, take, params, ports)
     rotation, position, weights = _arcs(curvature, take, params, ports)
     at_base, mean = _load_moment(rotation, position, weights, take, ports)

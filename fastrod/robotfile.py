@@ -14,7 +14,7 @@ import msgspec
 import tomli_w
 
 from fastrod.errors import RobotError, UnknownNameError, nearest
-from fastrod.robot import Robot, Segment, Tendon
+from fastrod.robot import MODES, Robot, Segment, Tendon
 
 _MODULI = ("youngs_modulus", "shear_modulus", "second_moment", "polar_moment")
 _SENSOR = ("noise", "registration_sd", "marker_offset_sd", "latency_sd")
@@ -118,6 +118,8 @@ def _segment(table: Any, where: str) -> Segment:
     if not isinstance(tendons, list):
         raise RobotError(f"{where}: tendons must be a list of tables, [ {{offset = ..., angle = ...}}, ... ].")
     _check_needed(table, ("length", "bending_stiffness", "torsional_stiffness"), where)
+    if table.get("mode", MODES[0]) not in MODES:
+        raise RobotError(f"{where}: mode is {table['mode']!r}; {nearest(str(table['mode']), MODES)}")
     for k, tendon in enumerate(tendons, 1):
         _check_keys(tendon, [f.name for f in fields(Tendon)], f"{where}, tendon {k}")
         _check_needed(tendon, ("offset", "angle"), f"{where}, tendon {k}")

@@ -15,7 +15,9 @@ Pass: TypeAlias = Callable[[Ints, Ports], Floats]
 """(robots, ports) -> residual of these robots at the x before the update [m]."""
 
 _MAX_PASSES = 40
+_STEEP = 6.0
 _PATIENCE = 4  # passes within tolerance after which tensions that still wander are let go: nothing determines them
+_LONGEST_STEP = 1.5  # in EI/l, about radians of bend: a longer Newton step lands on another equilibrium, if on any
 _SMALLEST_STEP = 1.0 / 64.0
 _SMALLEST_LOAD_STEP = 1.0 / 256.0
 
@@ -32,13 +34,31 @@ def settle(rows: Ints, warm: Flags, layout: Layout, params: Params, ports: Ports
         move_to_inputs(left, ports, params, memory, layout)
         left = _newton(left, params, layout, ports, memory, tolerance, run, passes)
     left = np.sort(np.concatenate([left, rows[~warm[rows]]]))
+    steep = left[_load_parameter(left, params, ports) > _STEEP]
+    left = np.setdiff1d(left, steep)
     if len(left):
         cold_start(left, layout, params, ports, memory)
         left = _newton(left, params, layout, ports, memory, tolerance, run, passes)
+    left = np.sort(np.concatenate([left, steep]))
     if len(left):
         left = _continuation(left, params, layout, ports, memory, tolerance, run, passes)
     passes[left] = -1
     return passes
+
+
+def _load_parameter(rows: Ints, params: Params, ports: Ports) -> Floats:
+    """F l^2/EI of all forces together: beyond about six a rod has equilibria that no growing load would lead to."""
+
+    def of(a: Floats) -> Floats:
+        return a if len(a) == 1 else a[rows]
+
+    length = params.length + ports.extension
+    force = np.linalg.norm(of(ports.tip_force), axis=1) + np.linalg.norm(of(ports.tip_moment), axis=1) / of(params.reach)
+    force = force + (of(length) * np.linalg.norm(of(ports.line_force), axis=-1).max(-1)).sum(1)
+    for extra in (ports.follower_force[:, None], ports.node_force):
+        if len(extra):
+            force = force + np.linalg.norm(of(extra), axis=-1).sum(1)
+    return np.broadcast_to(force * of(params.reach) / of(params.moment_scale), len(rows))
 
 
 def _newton(rows: Ints, params: Params, layout: Layout, ports: Ports, memory: Memory, tolerance: float, run: Pass, passes: Ints) -> Ints:
@@ -56,10 +76,13 @@ def _newton(rows: Ints, params: Params, layout: Layout, ports: Ports, memory: Me
         after = memory.x[rows]
         # in paper mode the wires may contradict each other: at the least-squares boundary the residual stays
         better = residual <= 2.0 * best if layout.paper else residual < best
-        if better.all():
+        shorter = _within_reach(after - x_tried, rows, layout, params)
+        if better.all() and shorter is None:
             x_at, step, best = x_tried, after - x_tried, residual
             damping[:] = 1.0
         else:
+            if shorter is not None:
+                after = x_tried + shorter[:, None] * (after - x_tried)
             x_at = np.where(better[:, None], x_tried, x_at)
             step = np.where(better[:, None], after - x_tried, step)
             best = np.where(better, residual, best)
@@ -78,6 +101,16 @@ def _newton(rows: Ints, params: Params, layout: Layout, ports: Ports, memory: Me
             rows, x_at, step = rows[keep], x_at[keep], step[keep]
             best, damping, patience = best[keep], damping[keep], patience[keep]
     return np.sort(np.concatenate([rows, *failed]))
+
+
+def _within_reach(step: Floats, rows: Ints, layout: Layout, params: Params) -> Floats | None:
+    """Factors that keep the base moment from changing by more than `_LONGEST_STEP` EI/l in a pass; None where all do."""
+    n_base = 2 * len(layout.first_tendon) if layout.paper else 3
+    moment = params.moment_scale if len(params.moment_scale) == 1 else params.moment_scale[rows]
+    turn = np.abs(step[:, :n_base]).max(1) / moment
+    if not (turn > _LONGEST_STEP).any():
+        return None
+    return np.asarray(np.minimum(1.0, _LONGEST_STEP / np.maximum(turn, 1e-300)))
 
 
 def _still(step: Floats, rows: Ints, layout: Layout, params: Params, small: Floats) -> Flags:
@@ -104,7 +137,9 @@ def _continuation(
 ) -> Ints:
     """From the unloaded robot to the loaded one, in load steps that grow with success; the robots that did not arrive."""
     part = np.zeros(len(memory.x))
-    stride = np.full(len(memory.x), 0.25)
+    longest = np.full(len(memory.x), 0.25)  # a longer stride than a load parameter of three could land on another equilibrium
+    longest[rows] = np.minimum(0.25, 0.5 * _STEEP / np.maximum(_load_parameter(rows, params, ports), 1e-9))
+    stride = longest.copy()
     unloaded = _loaded(ports, part)
     cold_start(rows, layout, params, unloaded, memory)
     lost = _newton(rows, params, layout, unloaded, memory, tolerance, run, passes)
@@ -116,7 +151,7 @@ def _continuation(
         arrived = np.setdiff1d(rows, missed)
         part[arrived] = aim[arrived]
         held[arrived] = memory.x[arrived]
-        stride[arrived] *= 2.0
+        stride[arrived] = np.minimum(2.0 * stride[arrived], longest[arrived])
         memory.x[missed] = held[missed]
         stride[missed] *= 0.5
         lost = np.concatenate([lost, missed[stride[missed] < _SMALLEST_LOAD_STEP]])

@@ -105,8 +105,8 @@ def close_tip(
 
 
 @kernel
-def loosen(robots: Lanes, params: Params, layout: Layout, x: Lanes, n_col: int, n_e: int, gamma: Lanes) -> None:
-    """A slack wire carries nothing: its unknown moves no residual but its own."""
+def loosen(robots: Lanes, params: Params, layout: Layout, x: Lanes, columns: Lanes, n_col: int, n_e: int, gamma: Lanes) -> None:
+    """A slack wire carries nothing: its unknown moves no residual but its own, and not the tip."""
     for f in range(len(layout.free_tendon) if n_col > 0 else 0):
         t = layout.free_tendon[f]
         for w in range(W):
@@ -114,6 +114,8 @@ def loosen(robots: Lanes, params: Params, layout: Layout, x: Lanes, n_col: int, 
             if params.unilateral[s, t] and x[(3 + f) * W + w] < 0.0:
                 for r in range(n_e):
                     gamma[(r * n_col + 3 + f) * W + w] = 0.0
+                for k in range(col.COLUMN):
+                    columns[((3 + f) * col.COLUMN + k) * W + w] = 0.0
                 gamma[(f * n_col + 3 + f) * W + w] = -max(params.compliance[pick(robots[w], len(params.compliance)), t], 1e-5)
 
 
@@ -186,6 +188,9 @@ def update_boundary(
                     moved = 0.0
                     for r in range(n_e):
                         moved += G[(r * n_p + a) * W + w] * gamma[(r * n_col + n_col - 3 + b) * W + w]
+                    if n_col == n_x:  # the force columns are the follower force's; a dead force does not enter its own row
+                        s = pick(i, len(params.reach))
+                        moved -= G[((n_e - 3 + b) * n_p + a) * W + w] * params.reach[s] * params.reach[s] / params.moment_scale[s]
                     memory.gain[i, a, n_rows + b] = -unit * moved
             if carry:
                 for b in range(a + 1):

@@ -288,7 +288,7 @@ def pass_chunk(
     close_lengths(robots, ports, params, layout, x, length, change, n_col, error, gamma)
     if not layout.paper:
         close_tip(robots, ports, params, node, x, columns, n_x, n_col, n_rows, error, gamma)
-        loosen(robots, params, layout, x, n_col, n_e, gamma)
+        loosen(robots, params, layout, x, columns, n_col, n_e, gamma)
     if layout.paper:
         for w in range(W):
             tip_moment = ports.tip_moment[pick(robots[w], len(ports.tip_moment))]

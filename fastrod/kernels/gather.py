@@ -21,10 +21,10 @@ def unknown_unit(a: int, s: int, params: Params, layout: Layout) -> float:
     """Natural size of unknown a: a moment, a tension, or with a follower force a force."""
     n_base = 2 * len(layout.first_tendon) if layout.paper else 3
     if a < n_base:
-        return params.moment_scale[s]
+        return float(params.moment_scale[s])
     if a < n_base + len(layout.free_tendon):
-        return params.tension_scale[s]
-    return params.moment_scale[s] / params.reach[s]
+        return float(params.tension_scale[s])
+    return float(params.moment_scale[s] / params.reach[s])
 
 
 @kernel

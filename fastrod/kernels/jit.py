@@ -17,6 +17,7 @@ import numba
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 _config: Any = numba.config
+_njit: Any = numba.njit  # its type does not know _nrt
 
 LANES = 16
 """Robots that one pass of a kernel's inner loop holds side by side; the loop over them becomes SIMD code."""
@@ -54,7 +55,7 @@ def kernel(function: _Function) -> _Function:
     Without numba's reference counts: an atomic increment for each array of a NamedTuple at each call cost as much as the
     arithmetic. A kernel may therefore slice arrays but not make them.
     """
-    return cast(_Function, numba.njit(error_model="numpy", fastmath=_FAST, nogil=True, _nrt=False)(function))
+    return cast(_Function, _njit(error_model="numpy", fastmath=_FAST, nogil=True, _nrt=False)(function))
 
 
 def entry(function: _Function) -> _Function:
@@ -72,14 +73,14 @@ def inline(function: _Function) -> _Function:
 
     numba's own inline="always" pastes before typing and compiles three times as long.
     """
-    return cast(_Function, numba.njit(forceinline=True, error_model="numpy", fastmath=_FAST, _nrt=False)(function))
+    return cast(_Function, _njit(forceinline=True, error_model="numpy", fastmath=_FAST, _nrt=False)(function))
 
 
 def _compile(function: _Function, **options: bool) -> _Function:
     before = _config.CACHE_DIR
     _config.CACHE_DIR = _CACHE_DIR or before
     try:
-        made = numba.njit(cache=_CACHE_DIR is not None, error_model="numpy", fastmath=_FAST, nogil=True, **options)(function)
+        made = _njit(cache=_CACHE_DIR is not None, error_model="numpy", fastmath=_FAST, nogil=True, **options)(function)
     finally:
         _config.CACHE_DIR = before
     return cast(_Function, made)

@@ -1,0 +1,270 @@
+"""The simulator as its users meet it: batches, threads, memory, neighbours, errors."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from rods import bend, rod
+
+import fastrod
+from fastrod import Observer, Simulator, load_robot
+from fastrod.errors import InputError, RobotError, UnknownNameError
+from fastrod.kernels.columns import step_column
+from fastrod.robotfile import dumps, loads
+
+
+def random_lengths(n: int, seed: int, reach: float = 1.0) -> np.ndarray:
+    robot = load_robot("prototype")
+    angle = np.random.default_rng(seed).uniform(-reach, reach, (n, 2))
+    return np.stack([bend(robot, *a) for a in angle])
+
+
+def test_threads_change_no_bit() -> None:
+    lengths = random_lengths(200, 3)
+    one, two = (Simulator(load_robot("prototype"), n_robots=200, points_per_segment=6, threads=t) for t in (1, 2))
+    assert_array_equal(one.settle(lengths).position, two.settle(lengths).position)
+    assert_array_equal(one.step(1.001 * lengths).curvature, two.step(1.001 * lengths).curvature)
+
+
+def test_hot_loops_are_simd_code() -> None:
+    rod_sim = Simulator(rod(), points_per_segment=3)
+    rod_sim.step(rod().rest_tendon_length)
+    if not step_column.signatures:  # loaded from the cache: compile this one for its assembly
+        a = np.zeros(2000)
+        step_column(a.copy(), a.copy(), a.copy(), a.copy(), a.copy())
+    assembly = step_column.inspect_asm(step_column.signatures[0])
+    assert assembly.count("zmm") + assembly.count("ymm") > 200
+
+
+def test_one_bad_robot_leaves_its_neighbours_alone() -> None:
+    lengths = random_lengths(40, 5)
+    clean = Simulator(load_robot("prototype"), n_robots=40).settle(lengths)
+    broken = lengths.copy()
+    broken[7, 2] = np.nan
+    broken[11] = -0.07
+    sim = Simulator(load_robot("prototype"), n_robots=40)
+    state = sim.settle(broken)
+    good = np.setdiff1d(np.arange(40), [7, 11])
+    assert_array_equal(np.flatnonzero(~state.ok), [7, 11])
+    assert set(state.problems) == {7, 11}
+    assert "finite" in state.problems[7]
+    assert "impossible" in state.problems[11]
+    assert np.isnan(state.position[[7, 11]]).all()
+    assert_array_equal(state.position[good], clean.position[good])
+    mended = sim.settle(lengths)
+    assert mended.ok.all()
+    assert_allclose(mended.tip_position, clean.tip_position, atol=1e-8)
+
+
+def test_a_diverged_robot_starts_anew_and_nothing_continues_on_nan() -> None:
+    sim = Simulator(load_robot("prototype"), n_robots=2)
+    rest = load_robot("prototype").rest_tendon_length
+    sim.settle(rest)
+    wild = np.array([[0.0, 0.0, 0.0], [0.0, 1e6, 0.0]])
+    for _ in range(5):
+        state = sim.step(rest, tip_force=wild)
+    assert state.ok[0]
+    assert not state.ok[1]
+    assert "diverged" in state.problems[1]
+    for _ in range(6):
+        state = sim.step(rest, tip_force=0.0 * wild)
+    assert state.ok.all()
+    assert_allclose(state.tip_position[1], [0.0, 0.0, 0.07], atol=1e-9)
+
+
+def test_settle_says_who_did_not_converge() -> None:
+    sim = Simulator(load_robot("prototype"), n_robots=2)
+    rest = load_robot("prototype").rest_tendon_length
+    state = sim.settle(rest, tip_force=[[0.0, 0.1, 0.0], [0.0, 1e7, 0.0]])
+    assert state.ok.tolist() == [True, False]
+    assert state.passes[1] == -1
+
+
+def test_steep_loads_arrive_by_continuation() -> None:
+    force = np.array([[0.0, 20.0 * 0.0022 / 0.07**2, 0.0]])  # P l^2/EI = 20
+    state = Simulator(rod("passive"), points_per_segment=40).settle(tip_force=force)
+    assert state.ok.all()
+    assert 0.0 < state.tip_position[0, 2] < 0.03
+    assert 0.05 < state.tip_position[0, 1] < 0.07
+
+
+def test_snapshot_restores_every_bit() -> None:
+    lengths = random_lengths(3, 8)
+    sim = Simulator(load_robot("prototype"), n_robots=3)
+    sim.settle(lengths)
+    sim.step(1.001 * lengths)
+    kept = sim.snapshot()
+    one = [sim.step(k * lengths, tip_force=(0.0, 0.0, k - 1.0)).position for k in (1.002, 1.003)]
+    sim.restore(kept)
+    two = [sim.step(k * lengths, tip_force=(0.0, 0.0, k - 1.0)).position for k in (1.002, 1.003)]
+    assert_array_equal(one, two)
+
+
+def test_a_soft_observer_follows_slowly_whatever_the_time_step() -> None:
+    robot = load_robot("prototype")
+    lengths = bend(robot, 0.5, 0.0)
+    for dt in (1e-3, 1e-1, 10.0):
+        sim = Simulator(robot, dt=dt, observer=Observer(process_noise=1.0 / dt, measurement_noise=1e-4 * dt))
+        residual = [sim.step(robot.rest_tendon_length).residual[0]]
+        residual += [sim.step(lengths).residual[0] for _ in range(60)]
+        assert np.isfinite(residual).all()
+        assert residual[2] > 0.1 * residual[1]
+        assert residual[-1] < 0.1 * residual[1]
+
+
+def test_tip_outputs_keep_little_memory() -> None:
+    robot = load_robot("five_segment_reacher")
+    sim = Simulator(robot, n_robots=64, points_per_segment=4, outputs="tip")
+    state = sim.settle(robot.rest_tendon_length)
+    kept = sum(a.nbytes for a in sim._memory) + state.residual.nbytes + state.ok.nbytes
+    kept += sum(
+        a.nbytes for a in (state.position, state.rotation, state.tension, state.base_wrench, state.tip_position, state.tip_rotation)
+    )
+    assert kept / 64 <= 2000
+    with pytest.raises(InputError, match="outputs='full'"):
+        sim.shape([0.1])
+
+
+def test_robots_of_a_batch_may_differ_but_not_in_their_counts() -> None:
+    with pytest.raises(RobotError, match="n_tendons 4, robot 0 has 3"):
+        Simulator([rod(n_tendons=3), rod(n_tendons=4)])
+    with pytest.raises(RobotError, match="modes"):
+        Simulator([rod(), rod("tendon_tension")])
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        ({"tendon_length": np.zeros((3, 4))}, r"shape \(3, 4\); it must be \(2, 4\)"),
+        ({"tendon_length": "abc"}, "not an array of numbers"),
+        ({"tendon_length": [70.0] * 4}, "Was it given in mm"),
+        ({"tendon_length": [0.001, 0.0, -0.001, 0.0]}, "Add Robot.rest_tendon_length"),
+        ({"tendon_length": [np.nan] * 4}, "not finite"),
+        ({"tendon_length": [-0.07] * 4}, "impossible"),
+        ({}, "tendon_length is missing"),
+        ({"tendon_length": [0.07] * 4, "tip_force": [1.0, 2.0]}, r"tip_force has shape \(2,\)"),
+        ({"tendon_length": [0.07] * 4, "extension": [0.01]}, "outside the range"),
+        ({"tendon_length": [0.07] * 4, "point_force": [(0.1, (0, 0, 1))]}, "the rod runs from 0 to 0.07"),
+        ({"tendon_length": [0.07] * 4, "point_force": [0.1, 0.2]}, "pairs"),
+        ({"tendon_length": [0.07] * 4, "base_pose": [0, 0, 0, 1, 1, 0, 0]}, "norm"),
+        ({"tendon_length": [0.07] * 4, "tolerance": 0.0}, "tolerance"),
+        ({"tendon_length": [0.07] * 4, "line_force": np.zeros((2, 5, 3, 2))}, "line_force has shape"),
+    ],
+)
+def test_bad_input_gets_one_sentence(given: dict[str, object], sentence: str) -> None:
+    sim = Simulator(rod(), n_robots=2)
+    with pytest.raises(InputError, match=sentence) as caught:
+        sim.settle(**given)  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        ({"n_robots": 0}, "n_robots is 0"),
+        ({"n_robots": 2.5}, "whole number"),
+        ({"dt": -1.0}, "dt is -1.0"),
+        ({"points_per_segment": 1}, "at least 2"),
+        ({"outputs": "tips"}, "'full' or 'tip'"),
+        ({"threads": 1000}, "threads is 1000"),
+    ],
+)
+def test_a_simulator_that_cannot_be(given: dict[str, object], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        Simulator(rod(), **given)  # type: ignore[arg-type]
+
+
+def test_queries_before_a_state() -> None:
+    sim = Simulator(rod())
+    for query in (sim.jacobian, sim.compliance, lambda: sim.shape(0.01)):
+        with pytest.raises(InputError, match="call step or settle first"):
+            query()
+    sim.settle(rod().rest_tendon_length)
+    with pytest.raises(InputError, match=r"arclength 0.08 m; robot 0 runs from 0 to 0.07"):
+        sim.shape(0.08)
+
+
+@pytest.mark.parametrize("name", fastrod.robot_names())
+def test_robot_files_survive_a_round_trip(name: str) -> None:
+    robot = load_robot(name)
+    assert loads(dumps(robot)) == robot
+
+
+SEGMENT = "[[segment]]\nlength = 0.07\nbending_stiffness = [0.002, 0.002]\ntorsional_stiffness = 0.001\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ('name = "a"', "no segments"),
+        (SEGMENT + 'mode = "passive"', "no name"),
+        ('name = "a"\nlenght = 3\n', "unknown key 'lenght'"),
+        ('name = "a"\n' + SEGMENT.replace("length", "lenght"), "did you mean 'length'"),
+        ('name = "a"\n' + SEGMENT.replace("0.07", "70"), "Was it given in mm"),
+        ('name = "a"\n' + SEGMENT.replace("0.07", "-0.07"), "must be positive"),
+        ('name = "a"\n' + SEGMENT.replace("0.07", '"long"'), "at 'length'"),
+        ('name = "a"\n' + SEGMENT + 'mode = "tendon_lenght"', "tendon_length"),
+        ('name = "a"\n' + SEGMENT + "tendons = [{offset = 0.01, angle = 0.0, colour = 1}]", "unknown key 'colour'"),
+        ('name = "a"\n' + SEGMENT + "tendons = [{offset = 0.01, angle = 90.0}]", "degrees"),
+        ('name = "a"\n' + SEGMENT + "body_radius = 0.005\ntendons = [{offset = 0.01, angle = 0.0}]", "beyond the body radius"),
+        ('name = "a"\n' + SEGMENT + "youngs_modulus = 3e5", "all of youngs_modulus"),
+        ('name = "a"\n' + SEGMENT + 'mode = "passive"\n[base]\nquaternion = [1, 1, 0, 0]', "it must be 1"),
+        ("name = ", "not TOML"),
+    ],
+)
+def test_bad_robot_files_get_one_sentence(text: str, sentence: str) -> None:
+    with pytest.raises(RobotError, match=sentence) as caught:
+        loads(text)
+    assert "\n" not in str(caught.value)
+
+
+def test_moduli_stand_for_stiffness() -> None:
+    moduli = "[[segment]]\nlength = 0.07\nyoungs_modulus = 3e5\nshear_modulus = 7e4\nsecond_moment = 7e-9\npolar_moment = 1.4e-8\n"
+    segment = loads('name = "a"\n' + moduli + 'mode = "passive"').segments[0]
+    assert segment.bending_stiffness == pytest.approx((2.1e-3, 2.1e-3))
+    assert segment.torsional_stiffness == pytest.approx(9.8e-4)
+
+
+def test_unknown_names_answer_with_the_near_ones() -> None:
+    with pytest.raises(UnknownNameError, match="did you mean 'prototype'"):
+        load_robot("prototpye")
+    with pytest.raises(AttributeError, match="did you mean 'Simulator'"):
+        fastrod.Simulater  # noqa: B018
+
+
+def test_mixed_paper_mode_is_refused() -> None:
+    robot = load_robot("tdcr_a")
+    with pytest.raises(RobotError, match="whole robot"):
+        replace(robot, segments=(replace(robot.segments[0], mode="paper"), robot.segments[1]))
+
+
+def test_an_edit_in_a_kernel_is_never_stale(tmp_path: Path) -> None:
+    """The cache folder is named after every kernel source: another source, another folder."""
+    script = "from fastrod.kernels import jit; print(jit._cache_dir())"
+    package = Path(fastrod.__file__).parent
+    copy = tmp_path / "fastrod"
+    copy.mkdir()
+    for source in package.rglob("*.py"):
+        target = copy / source.relative_to(package)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(source.read_bytes())
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path), "FASTROD_CACHE_DIR": str(tmp_path / "cache")}
+
+    def folder() -> str:
+        return subprocess.run(
+            [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True, cwd=tmp_path
+        ).stdout
+
+    before = folder()
+    helper = copy / "kernels" / "vec.py"
+    helper.write_text(helper.read_text() + "\n# edited\n")
+    assert folder() != before
+    (copy / "types.py").write_text((copy / "types.py").read_text() + "\n# edited\n")
+    assert len({before, folder()}) == 2
