@@ -111,19 +111,25 @@ class Simulator:
         self-weight; `point_force` (arclength [m], force (3,) world [N]) pairs; `follower_tip_force` (3,) material frame of
         the tip [N]; `base_pose` (7,) position [m] and quaternion w x y z.
 
-        The state belongs to the boundary that the last pass predicted for these inputs. Raises `InputError` on a wrong
-        shape, or where no robot's input is usable; a single bad row only clears that robot's `ok`.
+        The state belongs to the boundary that the last pass predicts for these tendon lengths and tip forces; what other
+        inputs change is corrected with the next pass, and shows as `residual`. When the tip force of running robots first
+        moves, one pass more learns the gain for it (`passes` is 2). Raises `InputError` on a wrong shape, or where no
+        robot's input is usable; a single bad row only clears that robot's `ok`.
         """
         given = Inputs(tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force, follower_tip_force, base_pose)
+        tracked = len(self._memory.force_before) > 0
         ports, rows = self._read(given)
-        cold = rows[~self._warm[rows]]
-        self._start(cold, ports)
-        shape = self._new_shape(self.outputs, len(rows) < self.n_robots)
         process, noise = self.observer.process_noise * self.dt, self.observer.measurement_noise / self.dt
+        before = self._ports
+        learns = before is not None and not tracked and len(self._memory.force_before) > 0
+        if before is not None and learns and bool(len(before.follower_force)) == bool(len(ports.follower_force)):
+            self._pass(rows[self._warm[rows]], before, self._new_shape("tip", True), carry=self._carry, process=process, noise=noise)
+        self._start(rows[~self._warm[rows]], ports)
+        shape = self._new_shape(self.outputs, len(rows) < self.n_robots)
         self._pass(rows, ports, shape, feed=True, carry=self._carry, process=process, noise=noise)
         ok = np.zeros(self.n_robots, bool)
         ok[rows] = np.isfinite(self._memory.x[rows]).all(1) & (shape.residual[rows] < self._reach(rows))
-        passes = np.broadcast_to(np.int64(1), self.n_robots)
+        passes = np.broadcast_to(np.int64(1 + learns), self.n_robots)
         return self._finish(ports, shape, ok, passes, "the observer diverged; use settle, or smaller changes of input")
 
     def settle(

@@ -1,7 +1,7 @@
 """How kernels are compiled: one set of flags, and a cache that never goes stale.
 
 numba keys its cache on the one file of the cached function, so an edit in a helper module would give stale results.
-The cache directory is therefore named after a hash of every kernel source and of numba's version.
+The cache directory is therefore named after a hash of every kernel source, of the arrays' names and of numba's version.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ _FAST = {"contract", "nsz"}
 def _cache_dir() -> str | None:
     """A writable folder for compiled kernels, or None."""
     digest = hashlib.sha256(numba.__version__.encode())
-    for source in sorted(Path(__file__).parent.glob("*.py")):
+    here = Path(__file__).parent
+    for source in (*sorted(here.glob("*.py")), here.parent / "types.py"):
         digest.update(source.name.encode() + source.read_bytes())
     name = digest.hexdigest()[:16]
     homes = [os.environ.get("FASTROD_CACHE_DIR"), os.environ.get("XDG_CACHE_HOME"), Path.home() / ".cache", tempfile.gettempdir()]
