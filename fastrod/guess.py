@@ -13,11 +13,14 @@ _SAMPLES = 8  # arcs are sampled this often per segment; the guess needs no more
 
 
 def cold_start(rows: Ints, layout: Layout, params: Params, ports: Ports, memory: Memory) -> None:
-    """Fill x and the curvature guess of the robots `rows` from their inputs alone."""
+    """Fill x and the curvature guess of the robots `rows` from their inputs alone, and forget what was learned before."""
     if not len(rows):
         return
     take = _Rows(rows)
     _fill(rows, take, layout, params, ports, memory)
+    for learned in (memory.gain, memory.move, memory.defect, memory.covariance):
+        if len(learned):
+            learned[rows] = 0.0
     # Single precision: numpy's sums differ in their last bits with the size of the batch, a batch of robots must not.
     memory.x[rows] = memory.x[rows].astype(np.float32)
     memory.curvature_guess[rows] = memory.curvature_guess[rows].astype(np.float32)

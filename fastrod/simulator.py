@@ -124,7 +124,7 @@ class Simulator:
         learns = before is not None and not tracked and len(self._memory.force_before) > 0
         if before is not None and learns and bool(len(before.follower_force)) == bool(len(ports.follower_force)):
             self._pass(rows[self._warm[rows]], before, self._new_shape("tip", True), carry=self._carry, process=process, noise=noise)
-        self._start(rows[~self._warm[rows]], ports)
+        cold_start(rows[~self._warm[rows]], self._layout, self._params, ports, self._memory)
         shape = self._new_shape(self.outputs, len(rows) < self.n_robots)
         self._pass(rows, ports, shape, feed=True, carry=self._carry, process=process, noise=noise)
         ok = np.zeros(self.n_robots, bool)
@@ -286,14 +286,6 @@ class Simulator:
         if track_force and self._ports is not None:
             new.force_before[:] = self._ports.tip_force
         self._memory = new
-
-    def _start(self, rows: Ints, ports: Ports) -> None:
-        """Cold robots: x from the inputs alone, and nothing to move or to remember."""
-        if not len(rows):
-            return
-        cold_start(rows, self._layout, self._params, ports, self._memory)
-        for kept in (self._memory.gain, self._memory.move, self._memory.defect, *([self._memory.covariance] if self._carry else [])):
-            kept[rows] = 0.0
 
     def _new_shape(self, outputs: str, holes: bool) -> Shape:
         n, n_points, n_tendons = self.n_robots, self.n_points, len(self._layout.tendon_segment)
