@@ -184,3 +184,26 @@ def test_sampled_line_force_and_extension_match_the_twin() -> None:
     assert_allclose(state.tip_position[0], twin.tip_position, atol=1e-7)
     assert_allclose(state.tension[0], twin.tension, atol=1e-4)
     assert state.arclength[0, -1] == pytest.approx(0.23)
+
+
+def test_stiffness_and_precurvature_that_vary_along_the_rod() -> None:
+    """The port for K(s) and u*(s), at every half step: the effects of a later day change it in place."""
+    n, length, force = 10, 0.07, 1e-6
+    sim = Simulator(rod("passive"), points_per_segment=n)
+    s = np.linspace(0.0, length, 2 * n + 1)
+    stiffness = np.tile([0.0022, 0.0022, 0.001], (2 * n + 1, 1)) * (1.0 + 0.5 * (1.0 - 2.0 * s / length))[:, None]
+    bare = sim._rest
+    rest = np.zeros((1, 1, 2 * n + 1, 3))
+    sim._reader.rest = bare._replace(stiffness=stiffness[None, None], precurvature=rest)
+    state = sim.settle(tip_force=(0.0, force, 0.0))
+    # so small a force bends as the linear beam does: w = integral of F (l - s)^2 / EI(s)
+    fine = np.linspace(0.0, length, 20001)
+    w = np.trapezoid((length - fine) ** 2 / (0.0022 * (1.0 + 0.5 * (1.0 - 2.0 * fine / length))), fine)
+    assert_allclose(state.tip_position[0, 1], force * w, rtol=1e-5)
+    assert_allclose(sim.shape([0.033]).position[0, 0, 1], np.interp(0.033, state.arclength[0], state.position[0, :, 1]), rtol=2e-2)
+    # and a plane u*(s) without load turns the tip by its integral
+    rest[0, 0, :, 0] = 8.0 * np.cos(20.0 * s)
+    sim._reader.rest = bare._replace(stiffness=stiffness[None, None], precurvature=rest)
+    state = sim.settle()
+    angle = 8.0 / 20.0 * np.sin(20.0 * length)
+    assert_allclose(np.arctan2(-state.tip_rotation[0, 1, 2], state.tip_rotation[0, 2, 2]), angle, atol=1e-6)
