@@ -36,11 +36,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except FastrodError as error:
         return _refuse(str(error))
     except OSError as error:
-        print(f"fastrod: {error.filename or 'a file'}: {error.strerror or error}.", file=sys.stderr)
-        return FAILED
+        return _refuse(f"{error.filename or 'a file'}: {error.strerror or error}.", FAILED)
     except KeyboardInterrupt:
-        print("fastrod: interrupted.", file=sys.stderr)
-        return FAILED
+        return _refuse("interrupted.", FAILED)
 
 
 class _UsageError(Exception):
@@ -49,17 +47,29 @@ class _UsageError(Exception):
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        raise _UsageError(f"{self.prog}: {message}; `{self.prog} --help` says how it is used.")
+        raise _UsageError(f"{message}; `{self.prog} --help` says how it is used.")
 
 
-def _refuse(sentence: str) -> int:
-    print(sentence, file=sys.stderr)
-    return WRONG_INPUT
+class _Version(argparse.Action):
+    """Prints the version; looked up only then, so that no other command waits for it."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
+        from importlib.metadata import version
+
+        print(f"{parser.prog} {version('fastrod')}")
+        parser.exit()
+
+
+def _refuse(sentence: str, code: int = WRONG_INPUT) -> int:
+    """Print `sentence` on stderr, in one line whatever names it quotes; the exit code `code`."""
+    print(" ".join(sentence.split()), file=sys.stderr)
+    return code
 
 
 def _parser() -> tuple[argparse.ArgumentParser, list[str]]:
     """The parser, and the names of its commands."""
     parser = _Parser(prog="fastrod", description="Tendon-driven continuum robots, simulated in batches and met with measured data.")
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
 
     demo = commands.add_parser("demo", help="the main job on an embedded default, start to end")
@@ -112,14 +122,14 @@ def _replay(arguments: argparse.Namespace) -> int:
         log = read_log(path, robot)
     if arguments.run is not None:
         log = log.only(arguments.run)
+    out = room.make_folder(arguments.out or Path(f"{path.stem}_replay"))
     with _progress("replay") as progress:
         result = room.replay(log, robot, progress=progress)
     console = Console()
     console.print(room.table(result))
     if not result.compared.any():
-        print(f"fastrod: the model converged on none of the {len(log)} rows.", file=sys.stderr)
-        return FAILED
-    for written in room.write(result, arguments.out or Path(f"{path.stem}_replay")):
+        return _refuse(f"the model converged on none of the {len(log)} rows.", FAILED)
+    for written in room.write(result, out):
         console.print(f"wrote {written}", soft_wrap=True, highlight=False)
     return DONE
 
@@ -127,6 +137,8 @@ def _replay(arguments: argparse.Namespace) -> int:
 def _bench(arguments: argparse.Namespace) -> int:
     """Each perf/bench_NAME.py has `main(argv) -> int`; with --json it prints one JSON value."""
     scripts = {path.stem.removeprefix("bench_"): path for path in sorted(_PERF.glob("bench_*.py"))}
+    if not scripts and (_PERF.parent / "pyproject.toml").is_file():
+        raise InputError(f"no benchmarks are in {str(_PERF)!r}; each is a bench_NAME.py there.")
     if not scripts:
         raise InputError("fastrod bench needs the source checkout, whose folder perf/ holds the benchmarks; an installed package has none.")
     if arguments.name is not None and arguments.name not in scripts:

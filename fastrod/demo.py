@@ -28,9 +28,16 @@ _SEED = 7
 
 
 def run(out: Path | None = None) -> None:
-    """Print a batch of random prototypes and the replay of the shipped log; files of the replay go to `out` if given."""
+    """Print a batch of random prototypes and the replay of the shipped log; files of the replay go to the folder `out` if given.
+
+    Raises `InputError`, before the work, where that folder cannot be written.
+    """
     from rich.console import Console
 
+    from fastrod.identification.replay import make_folder
+
+    if out is not None:
+        make_folder(out)
     console = Console()
     robot = load_robot("prototype")
     _batch(robot, console)

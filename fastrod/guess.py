@@ -21,9 +21,20 @@ def cold_start(rows: Ints, layout: Layout, params: Params, ports: Ports, memory:
     for learned in (memory.gain, memory.move, memory.defect, memory.covariance):
         if len(learned):
             learned[rows] = 0.0
-    # Single precision: numpy's sums differ in their last bits with the size of the batch, a batch of robots must not.
-    memory.x[rows] = memory.x[rows].astype(np.float32)
-    memory.curvature_guess[rows] = memory.curvature_guess[rows].astype(np.float32)
+    # On a coarse grid: numpy's sums differ in their last bits with the size of the batch, a batch of robots must not.
+    unit = _grid(rows, layout, params, memory.x.shape[1])
+    memory.x[rows] = np.round(memory.x[rows] / unit) * unit
+    memory.curvature_guess[rows] = np.round(memory.curvature_guess[rows] * 2.0**20) / 2.0**20
+
+
+def _grid(rows: Ints, layout: Layout, params: Params, n_x: int) -> Floats:
+    """(n, n_x) a millionth of the natural size of each unknown."""
+    take = _Rows(rows)
+    moment, tension, reach = (take(a)[:, None] for a in (params.moment_scale, params.tension_scale, params.reach))
+    n_base = 2 * len(layout.first_tendon) if layout.paper else 3
+    n_free = len(layout.free_tendon)
+    sizes = [np.repeat(moment, n_base, 1), np.repeat(tension, n_free, 1), np.repeat(moment / reach, n_x - n_base - n_free, 1)]
+    return np.asarray(np.concatenate(sizes, axis=1) * 2.0**-20)
 
 
 def _fill(rows: Ints, take: _Rows, layout: Layout, params: Params, ports: Ports, memory: Memory) -> None:
@@ -135,7 +146,9 @@ def _tensions(layout: Layout, take: _Rows, params: Params, ports: Ports, wanted:
             arms = np.stack([offset[:, k, :, 1], -offset[:, k, :, 0]], axis=1)  # (n, 2, n_tendons): moment of a unit tension
             missing = wanted[:, k, :2] - np.einsum("rat,rt->ra", arms, tension)
             tension[:, ends] += np.einsum("rta,ra->rt", np.linalg.pinv(arms[:, :, ends]), missing)
-    return tension
+    # A wire that can go slack starts taut: from there Newton finds which ones let go; from slack it would not see them.
+    taut = take(params.unilateral) & free
+    return np.where(taut, np.maximum(tension, 0.01 * take(params.tension_scale)[:, None]), tension)
 
 
 def _matrix(quaternion: Floats) -> Floats:

@@ -42,14 +42,18 @@ class Reader:
         layout, rest = self.layout, self.rest
         n_segments, n_tendons = len(layout.first_tendon), len(layout.tendon_segment)
         given_tension = np.ones(n_tendons, bool)
-        given_tension[layout.row_tendon] = False
+        given_tension[layout.row_tendon] = False  # those of tendon_tension segments remain
         stretch = self._optional("extension", given.extension, (n_segments,), "m")
         self._check_extension(stretch)
         lengths = self._lengths(given.tendon_length, stretch)
+        if given.tension is not None and not given_tension.any():
+            raise InputError("tension was given, but no segment of this robot is in mode tendon_tension.")
+        if given.follower_tip_force is not None and layout.paper:
+            raise InputError("follower_tip_force was given, but mode paper has dead loads only; give tip_force.")
         if given.tension is None and given_tension.any():
             raise InputError(f"tension is missing; segments in mode tendon_tension need tension (n_robots, {n_tendons}) [N].")
         pull = self._optional("tension", given.tension, (n_tendons,), "N")
-        grid, node_force = self._point_forces(given.point_force, stretch)
+        grid, node_force = self.point_forces(given.point_force, stretch)
         return Ports(
             tendon_length=lengths,
             tension=np.where(given_tension, pull, 0.0),
@@ -61,7 +65,7 @@ class Reader:
             follower_force=np.zeros((0, 3))
             if given.follower_tip_force is None
             else self._array("follower_tip_force", given.follower_tip_force, (3,), "N"),
-            line_force=self._line_force(given.line_force),
+            line_force=self.line_force(given.line_force, grid),
             node_force=node_force,
             grid=grid,
             base_pose=rest.base_pose if given.base_pose is None else self._pose(given.base_pose),
@@ -70,7 +74,10 @@ class Reader:
     def _array(self, name: str, value: ArrayLike, shape: tuple[int, ...], unit: str) -> Floats:
         """(1 or n_robots, *shape), finite but for rows that are noted as problems."""
         try:
-            a = np.asarray(value, dtype=np.float64)
+            a = np.asarray(value)
+            if np.iscomplexobj(a):
+                raise TypeError
+            a = a.astype(np.float64)
         except (TypeError, ValueError) as error:
             raise InputError(f"{name} is not an array of numbers; give (n_robots, {', '.join(map(str, shape))}) [{unit}].") from error
         if a.shape == shape:
@@ -78,7 +85,7 @@ class Reader:
         if a.shape[1:] != shape or a.shape[0] not in (1, self.n_robots):
             wanted = ", ".join(map(str, shape))
             raise InputError(f"{name} has shape {np.shape(value)}; it must be ({self.n_robots}, {wanted}) or ({wanted},) [{unit}].")
-        a = np.require(a, requirements=("C", "W", "O"))  # one kind of array: numba would compile anew for another
+        a = np.array(a, order="C")  # a copy: the caller may write into his own before the next step asks what has changed
         if not np.isfinite(a.sum()):
             bad = ~np.isfinite(a.reshape(len(a), -1)).all(1)
             self._note(bad, lambda i: f"{name} holds a value that is not finite: {a[i].ravel()[:6]}.")
@@ -101,8 +108,12 @@ class Reader:
         low, high = self.rest.extension_range[..., 0], self.rest.extension_range[..., 1]
         bad = ((stretch < low - 1e-12) | (stretch > high + 1e-12)).any(1)
         if bad.any():
-            reach = f"{np.array2string(low[0])} to {np.array2string(high[0])} m"
-            self._note(bad, lambda i: f"extension {stretch[min(i, len(stretch) - 1)]} m lies outside the range of the segments, {reach}.")
+
+            def sentence(i: int) -> str:
+                given, least, most = (np.array2string(a[min(i, len(a) - 1)], precision=6) for a in (stretch, low, high))
+                return f"extension {given} m lies outside the range of the segments, {least} to {most} m."
+
+            self._note(bad, sentence)
 
     def _lengths(self, tendon_length: ArrayLike | None, stretch: Floats) -> Floats:
         layout, params = self.layout, self.params
@@ -120,27 +131,30 @@ class Reader:
         slack = 2.0 * np.pi * np.linalg.norm(params.offset, axis=-1).sum(1)
         rows = layout.row_tendon
         with np.errstate(invalid="ignore"):
-            bad = ((lengths <= 0.0) | (np.abs(lengths - ends) > slack))[:, rows].any(1)
+            long = (lengths - ends > slack) & ~params.unilateral  # a wire that can go slack may hang as loose as it likes
+            bad = ((lengths <= 0.0) | (ends - lengths > slack) | long | (lengths > 20.0 * ends))[:, rows].any(1)
         if bad.any():
             self._note(bad, lambda i: _length_sentence(lengths[min(i, len(lengths) - 1)][rows], ends[min(i, len(ends) - 1)][rows]))
         return lengths
 
-    def _line_force(self, line_force: ArrayLike | None) -> Floats:
-        """Self-weight plus the given line force: uniform, or at the nodes of the steps."""
-        weight, layout = self.rest.weight, self.layout
+    def line_force(self, line_force: ArrayLike | None, grid: Floats) -> Floats:
+        """Self-weight plus the given line force: uniform, or linear over each step with the true force and moment of that step."""
+        weight = self.rest.weight
         if line_force is None:
             return weight
-        a = np.asarray(line_force, dtype=np.float64)
-        if a.ndim <= 2:
+        try:
+            axes = np.ndim(line_force)
+        except ValueError:
+            axes = 0
+        if axes <= 2:
             return weight + self._array("line_force", line_force, (3,), "N/m")[:, None, None, :]
-        n_segments = len(layout.first_tendon)
-        sampled = self._array("line_force", line_force, (n_segments, a.shape[-2], 3), "N/m")
-        if a.shape[-2] == 1:
-            return weight + sampled
-        at = np.linspace(0.0, a.shape[-2] - 1.0, layout.n_steps + 1)
-        low = np.minimum(at.astype(int), a.shape[-2] - 2)
-        part = (at - low)[:, None]
-        return np.ascontiguousarray(weight + (1.0 - part) * sampled[:, :, low] + part * sampled[:, :, low + 1])
+        n_segments, n_steps = len(self.layout.first_tendon), self.layout.n_steps
+        points = np.shape(line_force)[-2]
+        sampled = self._array("line_force", line_force, (n_segments, points, 3), "N/m")
+        if points < 2:
+            raise InputError(f"line_force has {points} points a segment; give two or more, or one force (3,) for all.")
+        nodes = grid if len(grid) else np.broadcast_to(np.linspace(0.0, 1.0, n_steps + 1), (1, n_segments, n_steps + 1))
+        return np.ascontiguousarray(weight + _per_step(sampled, nodes))
 
     def _pose(self, base_pose: ArrayLike) -> Floats:
         pose = self._array("base_pose", base_pose, (7,), "position m, quaternion w x y z")
@@ -150,17 +164,17 @@ class Reader:
         self._note(bad, lambda i: f"base_pose has a quaternion of norm {norm[min(i, len(norm) - 1), 0]:.4g}; it must be 1, as w x y z.")
         return np.column_stack([pose[:, :3], pose[:, 3:] / np.where(norm > 0.0, norm, 1.0)])
 
-    def _point_forces(self, point_force: PointForces | None, stretch: Floats) -> tuple[Floats, Floats]:
+    def point_forces(self, point_force: PointForces | None, stretch: Floats) -> tuple[Floats, Floats]:
         """The grid with a node at each point force, and the forces on the nodes."""
         layout, params = self.layout, self.params
         n_segments, n_steps = len(layout.first_tendon), layout.n_steps
-        if not point_force:
+        if point_force is None or (isinstance(point_force, (list, tuple)) and not point_force):
             return np.zeros((0, n_segments, n_steps + 1)), np.zeros((0, n_segments * n_steps + 1, 3))
         try:
-            pairs = [(s, f) for s, f in point_force]
+            pairs = [(np.atleast_1d(np.asarray(s, float))[:, None], f) for s, f in point_force]
         except (TypeError, ValueError) as error:
             raise InputError("point_force must be (arclength [m], force [N]) pairs, for example [(0.03, (0, 0.1, 0))].") from error
-        at = [self._array("arclength of a point_force", np.atleast_1d(np.asarray(s, float))[:, None], (1,), "m")[:, 0] for s, _ in pairs]
+        at = [self._array("arclength of a point_force", s, (1,), "m")[:, 0] for s, _ in pairs]
         forces = [self._array("point_force", f, (3,), "N") for _, f in pairs]
         ends = np.cumsum(params.length + stretch, axis=1)
         n = max(len(ends), *(len(a) for a in at), *(len(f) for f in forces))
@@ -177,6 +191,35 @@ class Reader:
             for j, node in _place_nodes(s[i], starts[i], n_steps, grid[i]):
                 node_force[i, node] += forces[j][min(i, len(forces[j]) - 1)]
         return grid, node_force
+
+
+def _per_step(sampled: Floats, nodes: Floats) -> Floats:
+    """(n, n_segments, 2 n_steps, 3) line force at both ends of each step, from samples evenly spaced over each segment.
+
+    The polyline through the samples may bend inside a step; the straight line put in its place has its integral and its
+    first moment.
+    """
+    n_cells = sampled.shape[2] - 1
+    n = max(len(sampled), len(nodes))
+    f = np.broadcast_to(sampled, (n, *sampled.shape[1:]))
+    t = np.broadcast_to(nodes, (n, *nodes.shape[1:])) * n_cells  # in cells
+    cell = np.minimum(t.astype(int), n_cells - 1)
+    part = (t - cell)[..., None]
+    f0, f1 = (np.take_along_axis(f, (cell + k)[..., None], axis=2) for k in (0, 1))
+    start = np.arange(n_cells)[:, None]
+    force = 0.5 * (f[:, :, :-1] + f[:, :, 1:])  # of whole cells, and their moment about the start of the segment
+    moment = start * force + (f[:, :, :-1] + 2.0 * f[:, :, 1:]) / 6.0
+    before_f, before_m = (np.concatenate([np.zeros_like(a[:, :, :1]), np.cumsum(a, axis=2)], axis=2) for a in (force, moment))
+    slope = f1 - f0
+    own_f = part * f0 + 0.5 * part**2 * slope
+    own_m = cell[..., None] * own_f + 0.5 * part**2 * f0 + part**3 * slope / 3.0
+    F, M = (np.take_along_axis(a, cell[..., None], axis=2) + own for a, own in ((before_f, own_f), (before_m, own_m)))
+    width = np.maximum(np.diff(t, axis=2), 1e-12)[..., None]
+    middle = (0.5 * (t[:, :, 1:] + t[:, :, :-1]))[..., None]
+    mean = np.diff(F, axis=2) / width
+    rise = 12.0 * (np.diff(M, axis=2) - middle * np.diff(F, axis=2)) / width**2
+    pairs = np.stack([mean - 0.5 * rise, mean + 0.5 * rise], axis=3)
+    return np.asarray(pairs.reshape(n, f.shape[1], -1, 3))
 
 
 def _place_nodes(s: Floats, starts: Floats, n_steps: int, grid: Floats) -> list[tuple[int, int]]:

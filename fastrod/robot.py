@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ Mode: TypeAlias = Literal["tendon_length", "tendon_tension", "passive", "paper"]
 """Boundary mode of a segment: what is prescribed at its end (model.md, four boundary modes)."""
 
 MODES: tuple[str, ...] = get_args(Mode)
-_LONGEST = 10.0  # m; a longer segment or offset was given in mm
+_LONGEST = 10.0  # m; a longer segment was given in mm
 
 
 def _positive(where: str, value: float, unit: str) -> None:
@@ -63,12 +63,15 @@ class Tendon:
     """True: a wire that goes slack at T = 0; False: a push-pull rod that carries T < 0 too."""
 
     def __post_init__(self) -> None:
+        for name in ("offset", "angle"):
+            if isinstance(getattr(self, name), list):
+                object.__setattr__(self, name, tuple(getattr(self, name)))
         for offset in self.offset if isinstance(self.offset, tuple) else (self.offset,):
             _positive("Tendon.offset", offset, "m")
         angles = self.angle if isinstance(self.angle, tuple) else (self.angle,)
         _finite("Tendon.angle", angles, len(angles), "rad")
-        if any(abs(a) > 4.0 * math.pi for a in angles):
-            raise RobotError(f"Tendon.angle is {self.angle!r} rad; more than two turns. Was it given in degrees?")
+        if any(abs(a) > 2.0 * math.pi + 1e-6 for a in angles):
+            raise RobotError(f"Tendon.angle is {self.angle!r} rad; more than a turn. Was it given in degrees?")
         if not (math.isfinite(self.compliance) and self.compliance >= 0.0):
             raise RobotError(f"Tendon.compliance is {self.compliance!r} m/N; it must be zero or positive, for example 1e-5.")
         if not math.isfinite(self.pretension) or (self.unilateral and self.pretension < 0.0):
@@ -108,8 +111,8 @@ class Segment:
         _positive("Segment.length", self.length, "m")
         if self.length > _LONGEST:
             raise RobotError(f"Segment.length is {self.length!r} m; more than {_LONGEST:g} m. Was it given in mm?")
-        if len(self.bending_stiffness) != 2:
-            raise RobotError(f"Segment.bending_stiffness is {list(self.bending_stiffness)!r}; give EI_x and EI_y [N m^2].")
+        if not isinstance(self.bending_stiffness, (tuple, list)) or len(self.bending_stiffness) != 2:
+            raise RobotError(f"Segment.bending_stiffness is {self.bending_stiffness!r}; give two values, EI_x and EI_y [N m^2].")
         for value in self.bending_stiffness:
             _positive("Segment.bending_stiffness", value, "N m^2")
         _positive("Segment.torsional_stiffness", self.torsional_stiffness, "N m^2")
@@ -153,6 +156,8 @@ class Robot:
     """World frame [m/s^2]."""
     log_points: tuple[float, ...] = ()
     """Arclengths of the further measured points p1 ... pk of a run log [m]."""
+    effects: tuple[Mapping[str, Any], ...] = ()
+    """What a robot file adds to the rod (contracts: `[[effect]]`): a name, and the effect's parameters."""
     fit: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Parameters that are not known exactly, each with its prior (contracts: `[fit]`)."""
     sensor: Mapping[str, float] = field(default_factory=dict)
@@ -176,6 +181,11 @@ class Robot:
         for k, segment in enumerate(self.segments):
             for tendon in segment.tendons:
                 for crossed, (x, y) in zip(self.segments, tendon.position(k + 1), strict=False):
+                    if math.hypot(x, y) > crossed.length:
+                        raise RobotError(
+                            f"Tendon offset {math.hypot(x, y):.6g} m of segment {k + 1} is larger than the length {crossed.length:g} m "
+                            "of a segment that it crosses. Was it given in mm?"
+                        )
                     if crossed.body_radius and math.hypot(x, y) > crossed.body_radius:
                         raise RobotError(
                             f"Tendon offset {math.hypot(x, y):.6g} m of segment {k + 1} lies beyond the body radius "

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import msgspec
 import tomli_w
@@ -31,6 +32,8 @@ def load_robot(source: str | Path) -> Robot:
 
     Raises `UnknownNameError` for a name that is not shipped, `RobotError` for a file that is not a robot.
     """
+    if not isinstance(source, (str, Path)):
+        raise UnknownNameError(f"robot is {source!r}; give the name of a shipped robot or the path of a .toml.")
     text = str(source)
     if text in robot_names():
         return loads(files("fastrod").joinpath("robots").joinpath(f"{text}.toml").read_text(encoding="utf-8"), text)
@@ -50,7 +53,7 @@ def loads(text: str, where: str = "robot file") -> Robot:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise RobotError(f"{where} is not TOML: {error}.") from error
-    _check_keys(data, ("name", "segment", "base", "world", "log", "fit", "sensor"), where)
+    _check_keys(data, ("name", "segment", "base", "world", "effect", "log", "fit", "sensor"), where)
     segments = data.get("segment", [])
     if not isinstance(segments, list):
         raise RobotError(f"{where}: segment is one table; write [[segment]], in double brackets.")
@@ -62,6 +65,7 @@ def loads(text: str, where: str = "robot file") -> Robot:
         "base_quaternion": base.get("quaternion"),
         "gravity": world.get("gravity"),
         "log_points": log.get("points"),
+        "effects": data.get("effect"),
         "fit": data.get("fit"),
         "sensor": _section(data, "sensor", _SENSOR, where) or None,
     }
@@ -75,6 +79,8 @@ def loads(text: str, where: str = "robot file") -> Robot:
         )
     except msgspec.ValidationError as error:
         raise RobotError(f"{where}: {_plain(error)}") from error
+    except RobotError as error:
+        raise error if str(error).startswith(where) else RobotError(f"{where}: {error}") from error
 
 
 def dumps(robot: Robot) -> str:
@@ -83,6 +89,8 @@ def dumps(robot: Robot) -> str:
     data["segment"] = [_written(segment) for segment in robot.segments]
     data["base"] = {"position": list(robot.base_position), "quaternion": list(robot.base_quaternion)}
     data["world"] = {"gravity": list(robot.gravity)}
+    if robot.effects:
+        data["effect"] = [dict(effect) for effect in robot.effects]
     if robot.log_points:
         data["log"] = {"points": list(robot.log_points)}
     for section in ("fit", "sensor"):
@@ -92,11 +100,17 @@ def dumps(robot: Robot) -> str:
 
 
 def save_robot(robot: Robot, path: str | Path) -> None:
-    """Write `robot` to a .toml, whole or not at all."""
+    """Write `robot` to a .toml, whole or not at all. Raises `RobotError` where it cannot be written."""
     target = Path(path)
+    if target.suffix != ".toml":
+        raise RobotError(f"{str(path)!r} does not end in .toml; a robot file does.")
     part = target.with_suffix(".toml.part")
-    part.write_text(dumps(robot), encoding="utf-8")
-    part.replace(target)
+    try:
+        part.write_text(dumps(robot), encoding="utf-8")
+        part.replace(target)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise RobotError(f"{str(path)!r} cannot be written: {error.strerror}.") from error
 
 
 def _segment(table: Any, where: str) -> Segment:
@@ -144,6 +158,10 @@ def _section(data: Mapping[str, Any], name: str, known: Iterable[str], where: st
     return dict(table)
 
 
+class _Effect(TypedDict):
+    name: str
+
+
 _TYPES: dict[str, Any] = {
     "base_position": tuple[float, float, float],
     "base_quaternion": tuple[float, float, float, float],
@@ -156,6 +174,9 @@ _TYPES: dict[str, Any] = {
 
 def _convert(value: Any, key: str, where: str, kind: Any = None) -> Any:
     try:
+        if key == "effects":
+            msgspec.convert(value, list[_Effect])
+            return tuple(value)
         made = msgspec.convert(value, kind or _TYPES[key])
     except msgspec.ValidationError as error:
         raise RobotError(f"{where}: {key}: {_plain(error)}") from error
@@ -179,4 +200,9 @@ def _check_needed(table: Mapping[str, Any], needed: Iterable[str], where: str) -
 
 
 def _plain(error: msgspec.ValidationError) -> str:
-    return str(error).replace("`", "'").replace(" - at '$.", " at '").rstrip(".") + "."
+    """One of our own sentences as it is; one of msgspec's with the place in front."""
+    sentence, _, place = str(error).replace("`", "'").partition(" - at '$.")
+    place = place.rstrip("'")
+    numbered = re.sub(r"\[(\d+)\]", lambda m: f" {int(m[1]) + 1}", place)  # robot files count from 1
+    end = "" if sentence.endswith((".", "?")) else "."
+    return f"{numbered}: {sentence}{end}" if numbered else sentence + end

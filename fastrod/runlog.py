@@ -111,9 +111,11 @@ class RunLog:
         return replace(self, extra=extra, **cut)
 
     def only(self, run: str) -> RunLog:
-        """The samples of one run. Raises `UnknownNameError` with the nearest label."""
+        """The samples of one run. Raises `UnknownNameError` with the nearest label, or saying that the log names none."""
         if run not in self.runs:
-            raise UnknownNameError(f"no run {run!r} in log {self.name!r}; {nearest(run, self.runs)}")
+            if not (named := [" ".join(label.split()) for label in self.runs if label]):
+                raise UnknownNameError(f"no run {run!r}; log {self.name!r} names no runs.")
+            raise UnknownNameError(f"no run {run!r} in log {self.name!r}; {nearest(run, named)}")
         return self.rows(self.run == run)
 
 
@@ -272,7 +274,7 @@ def _nearest_column(name: str, table: Table) -> str:
     if same := [column for column in table if column.lower() == name.lower()]:
         return f"did you mean {same[0]!r}?"
     near = nearest(name, table)
-    return near if near.startswith("did") else f"its columns are {', '.join(table)}."
+    return near if near.startswith("did") else f"its columns are {', '.join(' '.join(column.split()) for column in table)}."
 
 
 def _dl_columns(table: Table, robot: Robot, where: str) -> list[str]:

@@ -15,6 +15,7 @@ Pass: TypeAlias = Callable[[Ints, Ports], Floats]
 """(robots, ports) -> residual of these robots at the x before the update [m]."""
 
 _MAX_PASSES = 40
+_FREE_PASSES = 20  # robots with wires that can go slack: semi-smooth Newton first, monotone only after that
 _STEEP = 6.0
 _PATIENCE = 4  # passes within tolerance after which tensions that still wander are let go: nothing determines them
 _LONGEST_STEP = 1.5  # in EI/l, about radians of bend: a longer Newton step lands on another equilibrium, if on any
@@ -69,13 +70,17 @@ def _newton(rows: Ints, params: Params, layout: Layout, ports: Ports, memory: Me
     best = np.full(len(rows), np.inf)
     damping = np.ones(len(rows))
     patience = np.full(len(rows), _PATIENCE)
-    for _ in range(_MAX_PASSES):
+    one_sided = np.broadcast_to(params.unilateral.any(1), len(memory.x))[rows]
+    for count in range(_MAX_PASSES):
         x_tried = memory.x[rows]
         residual = run(rows, ports)
         passes[rows] += 1
         after = memory.x[rows]
         # in paper mode the wires may contradict each other: at the least-squares boundary the residual stays
         better = residual <= 2.0 * best if layout.paper else residual < best
+        if count < _FREE_PASSES:
+            # a wire that goes slack or taut puts a corner into the residuals: over it they rise before they fall
+            better |= one_sided & np.isfinite(residual)
         shorter = _within_reach(after - x_tried, rows, layout, params)
         if better.all() and shorter is None:
             x_at, step, best = x_tried, after - x_tried, residual
@@ -99,7 +104,7 @@ def _newton(rows: Ints, params: Params, layout: Layout, ports: Ports, memory: Me
             break
         if not keep.all():
             rows, x_at, step = rows[keep], x_at[keep], step[keep]
-            best, damping, patience = best[keep], damping[keep], patience[keep]
+            best, damping, patience, one_sided = best[keep], damping[keep], patience[keep], one_sided[keep]
     return np.sort(np.concatenate([rows, *failed]))
 
 

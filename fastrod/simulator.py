@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fastrod.compile import compile_robots
-from fastrod.errors import InputError
+from fastrod.errors import InputError, RobotError
 from fastrod.guess import cold_start
 from fastrod.inputs import Inputs, PointForces, Reader
 from fastrod.kernels.batch import pass_parallel, pass_serial
@@ -23,6 +23,7 @@ from fastrod.state import Observer, Pose, Snapshot, State
 from fastrod.types import Flags, Floats, Ints, Memory, Ports, Response, Shape
 
 _config: Any = numba.config
+_LOST = 0.1  # of the robot's length: a residual beyond it is no shape of this robot
 _SMALL = 4 * LANES  # robots below which starting threads costs more than it saves
 
 
@@ -54,21 +55,27 @@ class Simulator:
         nodes and one more. `outputs="tip"` keeps only tip pose, residual and ok: some 2 kB a five-segment robot.
         `threads` defaults to numba's; 1 is the serial twin. Raises `InputError`, `RobotError`.
         """
-        robots = [robot] if isinstance(robot, Robot) else list(robot)
+        robots = [robot] if isinstance(robot, Robot) else list(robot) if isinstance(robot, (list, tuple)) else []
+        if not robots or not all(isinstance(r, Robot) for r in robots):
+            raise RobotError(f"robot is {robot!r}; give a Robot, for example fastrod.load_robot('prototype'), or a list of them.")
+        if named := next((r for r in robots if r.effects), None):
+            names = ", ".join(str(effect["name"]) for effect in named.effects)
+            raise RobotError(f"robot {named.name!r} asks for {names}; this version has no effects: take [[effect]] out of its file.")
         if n_robots is None:
             n_robots = len(robots)
         if not isinstance(n_robots, (int, np.integer)) or n_robots < 1:
             raise InputError(f"n_robots is {n_robots!r}; it must be a whole number, at least 1.")
-        if not robots or len(robots) not in (1, n_robots):
+        if len(robots) not in (1, n_robots):
             raise InputError(f"{len(robots)} robots for n_robots {n_robots}; give one for all, or a list of n_robots.")
         if not isinstance(points_per_segment, (int, np.integer)) or points_per_segment < 2:
             raise InputError(f"points_per_segment is {points_per_segment!r}; it must be a whole number, at least 2.")
-        if not (np.isfinite(dt) and dt > 0.0):
-            raise InputError(f"dt is {dt!r} s; it must be positive and finite.")
+        _check_positive("dt", dt, "s")
         if outputs not in ("full", "tip"):
             raise InputError(f"outputs is {outputs!r}; it must be 'full' or 'tip'.")
-        if threads is not None and not 1 <= threads <= _config.NUMBA_NUM_THREADS:
-            raise InputError(f"threads is {threads!r}; it must be from 1 to {_config.NUMBA_NUM_THREADS} here.")
+        if observer is not None and not isinstance(observer, Observer):
+            raise InputError(f"observer is {observer!r}; give fastrod.Observer(...) or None.")
+        if threads is not None and (not isinstance(threads, int) or not 1 <= threads <= _config.NUMBA_NUM_THREADS):
+            raise InputError(f"threads is {threads!r}; it must be a whole number from 1 to {_config.NUMBA_NUM_THREADS} here.")
         self.robots = tuple(robots)
         self.n_robots = int(n_robots)
         self.dt = float(dt)
@@ -81,6 +88,7 @@ class Simulator:
         self._all = np.arange(self.n_robots)
         self._warm = np.zeros(self.n_robots, bool)
         self._ports: Ports | None = None
+        self._given = Inputs()
         self._state: State | None = None
         self._memory = self._new_memory(follower=False, track_force=False)
 
@@ -128,8 +136,10 @@ class Simulator:
         shape = self._new_shape(self.outputs, len(rows) < self.n_robots)
         self._pass(rows, ports, shape, feed=True, carry=self._carry, process=process, noise=noise)
         ok = np.zeros(self.n_robots, bool)
-        ok[rows] = np.isfinite(self._memory.x[rows]).all(1) & (shape.residual[rows] < self._reach(rows))
+        ok[rows] = np.isfinite(self._memory.x[rows]).all(1) & (shape.residual[rows] < _LOST * self._reach(rows))
         passes = np.broadcast_to(np.int64(1 + learns), self.n_robots)
+        if len(rows) < self.n_robots:
+            passes = np.where(np.isin(self._all, rows), passes, 0)
         return self._finish(ports, shape, ok, passes, "the observer diverged; use settle, or smaller changes of input")
 
     def settle(
@@ -152,8 +162,7 @@ class Simulator:
         have `ok` False and `passes` -1. In paper mode four wires may contradict each other; then the least-squares
         boundary has converged, and `residual` says by how much they do.
         """
-        if not (np.isfinite(tolerance) and tolerance > 0.0):
-            raise InputError(f"tolerance is {tolerance!r} m; it must be positive and finite.")
+        _check_positive("tolerance", tolerance, "m")
         given = Inputs(tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force, follower_tip_force, base_pose)
         ports, rows = self._read(given)
         shape = self._new_shape(self.outputs, len(rows) < self.n_robots)
@@ -163,6 +172,8 @@ class Simulator:
             return shape.residual[which]
 
         passes = settle(rows, self._warm, self._layout, self._params, ports, self._memory, tolerance, run)
+        if self._carry:
+            self._memory.covariance[rows] = 0.0
         ok = np.zeros(self.n_robots, bool)
         ok[rows] = passes[rows] > 0
         return self._finish(ports, shape, ok, passes, f"settle did not bring the boundary residual below {tolerance:g} m")
@@ -175,7 +186,11 @@ class Simulator:
         state, ports = self._last("shape")
         if self.outputs != "full":
             raise InputError("shape needs Simulator(..., outputs='full'); this one keeps the tip only.")
-        s = np.asarray(arclength, dtype=np.float64)
+        try:
+            s = np.asarray(arclength, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"arclength is {arclength!r}; give numbers [m], (n_queries,) or (n_robots, n_queries).") from error
+        s = np.broadcast_to(s, (self.n_robots, s.shape[1])) if s.ndim == 2 and len(s) == 1 else s
         s = np.broadcast_to(np.atleast_1d(s), (self.n_robots, s.shape[-1] if s.ndim else 1)) if s.ndim <= 1 else s
         if s.ndim != 2 or len(s) != self.n_robots:
             raise InputError(f"arclength has shape {np.shape(arclength)}; it must be (n_queries,) or ({self.n_robots}, n_queries) [m].")
@@ -193,14 +208,15 @@ class Simulator:
         """(n_robots, 6, n_tendons + n_segments) d(tip position [m], rotation vector [rad]) / d(input [m or N]), world frame.
 
         Inputs: the tendons (length, or tension where that is the mode), then the segments' extensions, the other inputs
-        held. Columns of lengths come from the sensitivities of the pass (model.md); those of tensions and extensions from
-        central differences of the pass, closed by the same sensitivities.
+        held: a point force at its arclength. A slack wire's column is zero, a robot's that is not ok nan. Columns of
+        lengths come from the sensitivities of the pass (model.md); those of tensions and extensions from central
+        differences of the pass, closed by the same sensitivities.
         """
         _, ports = self._last("jacobian")
         layout = self._layout
         n_tendons, n_segments = len(layout.tendon_segment), len(layout.first_tendon)
         response, _ = self._respond(ports)
-        inverse = np.linalg.pinv(response.residual[:, :, : self._memory.x.shape[1]])
+        inverse = _inverse(response.residual[:, :, : self._memory.x.shape[1]])
         by_unknown = response.tip[:, :, : self._memory.x.shape[1]] @ inverse
         jacobian = np.empty((self.n_robots, 6, n_tendons + n_segments))
         jacobian[:, :, layout.row_tendon] = by_unknown[:, :, : len(layout.row_tendon)]
@@ -221,26 +237,30 @@ class Simulator:
         if len(ports.follower_force):  # the follower force is an unknown; a dead force enters as its column, but not its own row
             load = load.copy()
             load[:, -3:] -= (self._params.reach**2 / self._params.moment_scale)[:, None, None] * np.eye(3)
-        return np.asarray(response.tip[:, :, -3:] - response.tip[:, :, :n_x] @ (np.linalg.pinv(free) @ load))
+        return np.asarray(response.tip[:, :, -3:] - response.tip[:, :, :n_x] @ (_inverse(free) @ load))
 
     def reset(self, rows: ArrayLike | None = None) -> None:
         """Forget the boundary of these robots (all by default): their next step begins from the cold guess."""
-        self._warm[slice(None) if rows is None else np.asarray(rows)] = False
+        try:
+            self._warm[slice(None) if rows is None else np.asarray(rows)] = False
+        except IndexError as error:
+            raise InputError(f"rows is {rows!r}; give indices of robots from 0 to {self.n_robots - 1}, or a mask.") from error
 
     def snapshot(self) -> Snapshot:
         """A copy of everything that a later step depends on."""
-        return Snapshot(_copied(self._memory), self._warm.copy(), self._ports, self._state)
+        return Snapshot(_copied(self._memory), self._warm.copy(), self._given, self._ports, self._state)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Go back to a `snapshot` of this simulator."""
-        if snapshot.warm.shape != self._warm.shape:
-            raise InputError(f"the snapshot holds {len(snapshot.warm)} robots, this simulator {self.n_robots}.")
+        if snapshot.memory.x.shape[0] != self.n_robots or snapshot.memory.length_before.shape != self._memory.length_before.shape:
+            raise InputError("the snapshot is of another simulator; its robots, tendons or their number differ.")
         self._memory = _copied(snapshot.memory)
-        self._warm, self._ports, self._state = snapshot.warm.copy(), snapshot.ports, snapshot.state
+        self._warm, self._given, self._ports, self._state = snapshot.warm.copy(), snapshot.given, snapshot.ports, snapshot.state
 
     def _read(self, given: Inputs) -> tuple[Ports, Ints]:
         """The ports, and the robots whose inputs are good."""
         ports = self._reader.ports(given)
+        self._given = given
         problems = self._reader.problems
         rows = np.setdiff1d(self._all, list(problems)) if problems else self._all
         track_force = len(self._memory.force_before) > 0 or self._force_moves(ports.tip_force)
@@ -283,6 +303,8 @@ class Simulator:
         new.gain[:, :kept, :columns] = old.gain[:, :kept, :columns]
         new.length_before[:] = old.length_before
         new.curvature_guess[:] = old.curvature_guess
+        new.move[:, :kept], new.defect[:, :kept] = old.move[:, :kept], old.defect[:, :kept]
+        new.covariance[:, : kept * (kept + 1) // 2] = old.covariance[:, : kept * (kept + 1) // 2]
         if track_force and self._ports is not None:
             new.force_before[:] = self._ports.tip_force
         self._memory = new
@@ -330,7 +352,8 @@ class Simulator:
         problems = dict(self._reader.problems)
         for i in np.flatnonzero(~ok):
             problems.setdefault(int(i), f"{reason}; residual {shape.residual[i]:.3g} m.")
-        self._warm[:] = ok if not self._reader.problems else np.where(np.isin(self._all, list(self._reader.problems)), self._warm, ok)
+        unread = np.isin(self._all, list(self._reader.problems))  # no pass touched these: they keep the boundary they had
+        self._warm = np.where(unread, self._warm, ok)
         self._ports = ports
         self._state = State(**shape._asdict(), ok=ok, passes=passes, problems=problems)
         return self._state
@@ -363,12 +386,29 @@ class Simulator:
         for sign in (1.0, -1.0):
             moved = np.broadcast_to(base, (max(len(base), len(delta)), base.shape[1])).copy()
             moved[:, a : a + 1] += sign * delta
-            response, shape = self._respond(ports._replace(**{name: moved}), columns=False)
+            changed = {name: moved}
+            if name == "extension":  # forces stay at their arclength, so nodes and samples move over the material
+                grid, node_force = self._reader.point_forces(self._given.point_force, moved)
+                changed |= {"grid": grid, "node_force": node_force, "line_force": self._reader.line_force(self._given.line_force, grid)}
+            response, shape = self._respond(ports._replace(**changed), columns=False)
             ends.append((shape.tip_position, shape.tip_rotation, response.error))
         (p1, r1, e1), (p0, r0, e0) = ends
         turn = r1 @ np.swapaxes(r0, 1, 2)
         skew = 0.5 * np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=1)
         return np.concatenate([p1 - p0, skew], axis=1) / (2.0 * delta), (e1 - e0) / (2.0 * delta)
+
+
+def _check_positive(name: str, value: float, unit: str) -> None:
+    if not isinstance(value, (int, float, np.floating, np.integer)) or not (np.isfinite(value) and value > 0.0):
+        raise InputError(f"{name} is {value!r} {unit}; it must be a number, positive and finite.")
+
+
+def _inverse(a: Floats) -> Floats:
+    """Least-squares inverse of the matrices without nan, and nan for the others."""
+    inverse = np.full((len(a), a.shape[2], a.shape[1]), np.nan)
+    good = np.isfinite(a).all((1, 2))
+    inverse[good] = np.linalg.pinv(a[good])
+    return inverse
 
 
 def _as_shape(state: State) -> Shape:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from fastrod.errors import InputError
+from fastrod.inputs import Inputs
 from fastrod.types import Flags, Floats, Ints, Memory, Ports
 
 
@@ -36,7 +37,8 @@ class Observer:
 class State:
     """The robots after a step: new arrays, robot axis first, world frame. With outputs="tip", those along the rod are empty.
 
-    A node is shared by two segments at a joint; its curvature is that of the distal one.
+    A node is shared by two segments at a joint; its curvature is that of the distal one. Read, do not write: `shape` goes by
+    these arrays.
     """
 
     position: Floats
@@ -56,7 +58,7 @@ class State:
     tip_rotation: Floats
     """(n_robots, 3, 3) world_from_material."""
     tension: Floats
-    """(n_robots, n_tendons) positive pulls [N]."""
+    """(n_robots, n_tendons) positive pulls; in paper mode, which has no tensions, 0 [N]."""
     path_length: Floats
     """(n_robots, n_tendons) length of the tendon's path along the bent rod, without its stretch [m]."""
     base_wrench: Floats
@@ -64,9 +66,9 @@ class State:
     residual: Floats
     """(n_robots,) largest boundary residual [m]: lengths as they are, moments times l^2/EI, forces times l^3/EI."""
     ok: Flags
-    """(n_robots,) the robot's inputs were good and its numbers are; after `settle`, also that it converged."""
+    """(n_robots,) after `settle`: it converged. After `step`: it did not diverge; `residual` says how far the observer is behind."""
     passes: Ints
-    """(n_robots,) forward passes that were spent; -1 where `settle` did not converge."""
+    """(n_robots,) forward passes that were spent; -1 where `settle` did not converge, 0 where bad input left it nothing to do."""
     problems: Mapping[int, str]
     """Robot index -> what is wrong with it, for the robots that are not ok."""
 
@@ -87,5 +89,6 @@ class Snapshot(NamedTuple):
 
     memory: Memory
     warm: Flags
+    given: Inputs
     ports: Ports | None
     state: State | None

@@ -75,7 +75,7 @@ class Ports(NamedTuple):
     follower_force: Floats
     """(n_robots, 3) at the tip, material; length 0 if there is none [N]."""
     line_force: Floats
-    """(n_robots, n_segments, n_f, 3); n_f is 1, or n_steps + 1 at every node, linear between [N/m]."""
+    """(n_robots, n_segments, n_f, 3); n_f is 1, or 2 n_steps: at the start and the end of every step, linear between [N/m]."""
     node_force: Floats
     """(n_robots, n_points, 3) point forces on nodes; length 0 if there are none [N]."""
     grid: Floats

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -47,6 +48,7 @@ def refused(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
     assert out == ""
     assert err.count("\n") == 1, err
     assert "Traceback" not in err
+    assert not err.startswith("fastrod:")
     return err
 
 
@@ -87,13 +89,36 @@ def test_replay_that_converges_nowhere_has_failed(
 
     monkeypatch.setattr(sys.modules["fastrod.simulator"].Simulator, "settle", settle)
     assert cli.main(["replay", str(log), "--robot", "prototype", "--out", str(tmp_path / "out")]) == 1
-    assert "converged on none of the 3 rows" in capsys.readouterr().err
+    assert capsys.readouterr().err == "the model converged on none of the 3 rows.\n"
 
 
 @pytest.mark.usefixtures("straight")
-def test_folder_that_cannot_be_written_has_failed(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["replay", str(log), "--robot", "prototype", "--out", str(log)]) == 1
-    assert capsys.readouterr().err == f"fastrod: {log}: File exists.\n"
+def test_folder_that_cannot_be_written_is_refused_before_the_work(
+    log: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def work(*args: Any, **given: Any) -> None:
+        raise AssertionError("the work began")
+
+    monkeypatch.setattr("fastrod.identification.replay.replay", work)
+    monkeypatch.setattr("fastrod.demo._batch", work)
+    for command in (("replay", str(log), "--robot", "prototype"), ("demo",)):
+        assert refused(capsys, *command, "--out", str(log)) == f"folder {str(log)!r} cannot be written: it is a file.\n"
+        below = log / "below"
+        assert refused(capsys, *command, "--out", str(below)) == f"folder {str(below)!r} cannot be written: Not a directory.\n"
+
+
+@pytest.mark.usefixtures("straight")
+def test_file_that_cannot_be_written_has_failed(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "out" / "residuals.csv.part").mkdir(parents=True)
+    assert cli.main(["replay", str(log), "--robot", "prototype", "--out", str(tmp_path / "out")]) == 1
+    assert capsys.readouterr().err == f"{tmp_path / 'out' / 'residuals.csv.part'}: Is a directory.\n"
+
+
+def test_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        cli.main(["--version"])
+    assert not end.value.code
+    assert capsys.readouterr().out == f"fastrod {version('fastrod')}\n"
 
 
 WRONG = {
@@ -120,6 +145,10 @@ BAD_CELLS = {
     "text in a number": (LOG.replace("0.001", "left"), "log.csv row 2, column tip_x is 'left'"),
     "millimetres": (LOG.replace("0.001", "1000"), "Was it given in mm?"),
     "empty": ("", "log.csv is empty"),
+    "column name over two lines": (
+        't,"zz\nyy"\n0,0\n',
+        "lacks columns tip_x, tip_y, tip_z that every run log has; its columns are t, zz yy.",
+    ),
     "nothing measured": (HEADER + "0,a,0,0,0,0,,,\n", "there is nothing to compare"),
 }
 
@@ -149,6 +178,14 @@ def test_bench_runs_the_scripts_of_perf(tmp_path: Path, monkeypatch: pytest.Monk
     assert "no benchmark 'stepp'; did you mean 'step'?" in refused(capsys, "bench", "stepp")
     monkeypatch.setattr(cli, "_PERF", tmp_path / "absent")
     assert "fastrod bench needs the source checkout" in refused(capsys, "bench")
+    (tmp_path / "pyproject.toml").touch()
+    assert f"no benchmarks are in {str(tmp_path / 'absent')!r}" in refused(capsys, "bench")
+
+
+def test_run_of_a_log_without_runs(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log.write_text("t,dl_1,dl_2,dl_3,dl_4,tip_x,tip_y,tip_z\n0,0,0,0,0,0,0,0.07\n")
+    sentence = refused(capsys, "replay", str(log), "--robot", "prototype", "--run", "zz")
+    assert sentence == "no run 'zz'; log 'log' names no runs.\n"
 
 
 def test_help_does_not_load_numba() -> None:

@@ -14,7 +14,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from fastrod.errors import InputError, LogError
-from fastrod.identification.replay import Replay, inputs, replay, table, tendon_length, write
+from fastrod.identification.replay import DENSE, Replay, draw, inputs, replay, table, tendon_length, write
 from fastrod.robot import Robot
 from fastrod.robotfile import load_robot
 from fastrod.runlog import RunLog, read_log, write_log
@@ -167,6 +167,43 @@ def test_files_are_whole(prototype: Robot, tmp_path: Path) -> None:
     assert rows[0]["converged"] == "1"
 
 
+def axes_of(result: Replay) -> list[Any]:
+    """The panels: x, y, z and distance over time, the two paths, the histogram."""
+    pytest.importorskip("matplotlib")
+    figure = draw(result)
+    figure.draw_without_rendering()
+    return [axes for half in figure.subfigs for axes in half.axes]
+
+
+def long_log(n: int) -> RunLog:
+    """Rows at 10 Hz of a tip that swings 20 mm along x."""
+    tip = np.stack([0.02 * np.sin(0.1 * np.arange(n)), np.zeros(n), np.full(n, 0.07)], axis=1)
+    return RunLog(name="long", t=np.arange(n) / 10.0, run=np.full(n, ""), dl=np.zeros((n, 4)), tip_position=tip)
+
+
+def test_picture_leaves_out_what_was_not_measured(prototype: Robot) -> None:
+    log = small_log(20)
+    tip = log.tip_position.copy()
+    tip[:6], tip[10:16] = np.nan, np.nan  # 4 rows are left of each run
+    panels = axes_of(replay(changed(log, tip_position=tip), prototype, simulator=Arc))
+    predicted, measured = panels[0].lines[:2]
+    assert np.isfinite(predicted.get_ydata()).sum() == np.isfinite(measured.get_ydata()).sum() == 8
+    assert_allclose(np.nanmax(predicted.get_xdata()), 0.6)  # two runs of 0.3 s, from 0
+    assert [text.get_text().strip() for text in panels[0].texts] == ["a", "b"]
+
+
+def test_picture_of_a_dense_log_shows_envelopes_and_points_of_both(prototype: Robot) -> None:
+    result = replay(long_log(2 * DENSE + 1), prototype, simulator=Arc)
+    panels = axes_of(result)
+    assert [band.get_label() for band in panels[0].collections] == ["predicted", "measured"]
+    low, high = panels[0].collections[1].get_datalim(panels[0].transData).intervaly
+    assert_allclose([low, high], [-20.0, 20.0], atol=1e-3)
+    points = panels[4].collections[0]
+    assert len(points.get_offsets()) == 2 * math.ceil(len(result.log) / 3)
+    assert len({tuple(colour) for colour in points.get_facecolors()}) == 2
+    assert sum(bar.get_height() for bar in panels[6].patches) == len(result.log)
+
+
 def test_progress_is_told(prototype: Robot) -> None:
     told: list[tuple[int, int]] = []
     replay(small_log(), prototype, simulator=Arc, progress=lambda done, total: told.append((done, total)))
@@ -175,6 +212,19 @@ def test_progress_is_told(prototype: Robot) -> None:
 
 def test_table_has_a_line_for_each_run_and_for_all(prototype: Robot) -> None:
     assert table(replay(small_log(), prototype, simulator=Arc)).row_count == 3
+
+
+def test_table_shows_no_excursion_of_a_run_that_stands_still(prototype: Robot) -> None:
+    log = small_log()
+    tip = log.tip_position + np.array([0.0, 0.001, 0.0])
+    tip[3:, 0] += (-0.05, 0.0, 0.05)  # run b moves
+    grid = table(replay(changed(log, dl=np.zeros((6, 4)), tip_position=tip), prototype, simulator=Arc))
+    excursion = list(grid.columns[6].cells)
+    assert excursion[0] == "–"
+    assert "measured - predicted" in str(grid.caption)
+    assert "quasi-static" in str(grid.caption)
+    still = replay(changed(log, dl=np.zeros((6, 4)), tip_position=log.tip_position + np.array([0.0, 0.001, 0.0])), prototype, simulator=Arc)
+    assert "excursion" not in draw(still).get_suptitle()
 
 
 def test_demo_log_is_what_its_maker_makes() -> None:

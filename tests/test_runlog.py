@@ -169,6 +169,11 @@ def test_unreadable_files(tmp_path: Path, robot: Robot) -> None:
 def test_unknown_run_answers_with_the_nearest(tmp_path: Path, robot: Robot) -> None:
     with pytest.raises(UnknownNameError, match="no run 'c' in log 'log'; known: a, b"):
         read(tmp_path, GOOD, robot).only("c")
+    with pytest.raises(UnknownNameError, match=r"no run 'c'; log 'log' names no runs\."):
+        read(tmp_path, GOOD.replace(",a,", ",,").replace("0.0,b,", "0.2,,"), robot).only("c")
+    with pytest.raises(UnknownNameError, match="known: a, two lines") as caught:
+        read(tmp_path, GOOD.replace(",b,", ',"two\nlines",'), robot).only("c")
+    assert "\n" not in str(caught.value)
 
 
 def test_shapes_are_checked_once() -> None:

@@ -95,6 +95,34 @@ def test_steep_loads_arrive_by_continuation() -> None:
     assert 0.05 < state.tip_position[0, 1] < 0.07
 
 
+def test_a_lost_robot_has_no_response_and_takes_none_from_others() -> None:
+    lengths = random_lengths(3, 9)
+    lengths[1] = np.nan
+    sim = Simulator(load_robot("prototype"), n_robots=3)
+    sim.settle(lengths)
+    for response in (sim.jacobian(), sim.compliance()):
+        assert np.isfinite(response[[0, 2]]).all()
+        assert np.isnan(response[1]).all()
+
+
+def test_a_buffer_that_its_owner_writes_into_is_a_new_input() -> None:
+    rest = load_robot("prototype").rest_tendon_length
+    one, two = (Simulator(load_robot("prototype")) for _ in range(2))
+    force = np.zeros((1, 3))
+    one.settle(rest, tip_force=force)
+    two.settle(rest, tip_force=force)
+    for k in range(1, 6):
+        force[:] = [0.0, 0.01 * k, 0.0]
+        assert_array_equal(one.step(rest, tip_force=force).position, two.step(rest, tip_force=force.copy()).position)
+
+
+def test_effects_of_a_robot_file_are_kept_but_not_simulated() -> None:
+    robot = loads(dumps(load_robot("prototype")) + '\n[[effect]]\nname = "backlash"\nhalf_width = 0.0002\n')
+    assert loads(dumps(robot)) == robot
+    with pytest.raises(RobotError, match="asks for backlash"):
+        Simulator(robot)
+
+
 def test_snapshot_restores_every_bit() -> None:
     lengths = random_lengths(3, 8)
     sim = Simulator(load_robot("prototype"), n_robots=3)
@@ -156,6 +184,13 @@ def test_robots_of_a_batch_may_differ_but_not_in_their_counts() -> None:
         ({"tendon_length": [0.07] * 4, "base_pose": [0, 0, 0, 1, 1, 0, 0]}, "norm"),
         ({"tendon_length": [0.07] * 4, "tolerance": 0.0}, "tolerance"),
         ({"tendon_length": [0.07] * 4, "line_force": np.zeros((2, 5, 3, 2))}, "line_force has shape"),
+        ({"tendon_length": [0.07] * 4, "line_force": "a"}, "not an array of numbers"),
+        ({"tendon_length": [0.07] * 4, "line_force": np.zeros((1, 1, 3))}, "two or more"),
+        ({"tendon_length": [0.07] * 4, "tension": [1.0] * 4}, "no segment of this robot"),
+        ({"tendon_length": [0.07j] * 4}, "not an array of numbers"),
+        ({"tendon_length": [0.07] * 4, "tolerance": "x"}, "must be a number"),
+        ({"tendon_length": [0.07] * 4, "point_force": 0}, "pairs"),
+        ({"tendon_length": [0.07] * 4, "point_force": [("a", (0, 0, 1))]}, "pairs"),
     ],
 )
 def test_bad_input_gets_one_sentence(given: dict[str, object], sentence: str) -> None:
@@ -174,11 +209,20 @@ def test_bad_input_gets_one_sentence(given: dict[str, object], sentence: str) ->
         ({"points_per_segment": 1}, "at least 2"),
         ({"outputs": "tips"}, "'full' or 'tip'"),
         ({"threads": 1000}, "threads is 1000"),
+        ({"threads": 1.5}, "threads is 1.5"),
+        ({"dt": "a"}, "dt is 'a'"),
+        ({"observer": 3}, "observer is 3"),
     ],
 )
 def test_a_simulator_that_cannot_be(given: dict[str, object], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         Simulator(rod(), **given)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("robot", ["prototype", ["prototype"], None, []])
+def test_what_is_not_a_robot(robot: object) -> None:
+    with pytest.raises(RobotError, match="load_robot"):
+        Simulator(robot)  # type: ignore[arg-type]
 
 
 def test_queries_before_a_state() -> None:
@@ -209,7 +253,7 @@ SEGMENT = "[[segment]]\nlength = 0.07\nbending_stiffness = [0.002, 0.002]\ntorsi
         ('name = "a"\n' + SEGMENT.replace("length", "lenght"), "did you mean 'length'"),
         ('name = "a"\n' + SEGMENT.replace("0.07", "70"), "Was it given in mm"),
         ('name = "a"\n' + SEGMENT.replace("0.07", "-0.07"), "must be positive"),
-        ('name = "a"\n' + SEGMENT.replace("0.07", '"long"'), "at 'length'"),
+        ('name = "a"\n' + SEGMENT.replace("0.07", '"long"'), "length: Expected 'float'"),
         ('name = "a"\n' + SEGMENT + 'mode = "tendon_lenght"', "tendon_length"),
         ('name = "a"\n' + SEGMENT + "tendons = [{offset = 0.01, angle = 0.0, colour = 1}]", "unknown key 'colour'"),
         ('name = "a"\n' + SEGMENT + "tendons = [{offset = 0.01, angle = 90.0}]", "degrees"),

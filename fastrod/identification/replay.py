@@ -6,7 +6,9 @@ import csv
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,7 +28,12 @@ if TYPE_CHECKING:
 Mask = NDArray[np.bool_]
 Progress = Callable[[int, int], None]
 
+DENSE = 3000  # rows above which a picture of every row is a blot
+_BINS = 400  # of an envelope: about two pixels of a panel each
 CHUNK = 4096  # rows a batch: enough to fill every core, small enough for a steady progress bar
+_NONE = "–"
+_MEANING = "residual = measured - predicted"
+_STATIC = "the model is quasi-static: fast motion shows as residual"
 _MOST_RUNS = 20  # lines of the table; a log with more runs is read in residuals.csv
 
 
@@ -92,10 +99,13 @@ class Replay:
     def parts(self) -> Iterator[tuple[str, Replay]]:
         """Each run's label and its part of this replay."""
         for label in self.log.runs:
-            rows = self.log.run == label
-            points = None if self.points is None else self.points[rows]
-            tip, converged = self.tip_position[rows], self.converged[rows]
-            yield label, Replay(log=self.log.rows(rows), robot=self.robot, tip_position=tip, converged=converged, points=points)
+            yield label, self.rows(self.log.run == label)
+
+    def rows(self, which: Mask) -> Replay:
+        """The rows of the mask `which` (n,)."""
+        points = None if self.points is None else self.points[which]
+        tip, converged = self.tip_position[which], self.converged[which]
+        return Replay(log=self.log.rows(which), robot=self.robot, tip_position=tip, converged=converged, points=points)
 
 
 def replay(log: RunLog, robot: Robot, *, simulator: Callable[..., Any] | None = None, progress: Progress | None = None) -> Replay:
@@ -147,10 +157,22 @@ def inputs(log: RunLog, robot: Robot) -> dict[str, Floats]:
     return given
 
 
+def make_folder(path: str | Path) -> Path:
+    """The folder at `path`, made where it is not there. Raises `InputError` where it cannot be made or written into."""
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        why = "it is a file" if folder.is_file() else error.strerror or str(error)
+        raise InputError(f"folder {str(folder)!r} cannot be written: {why}.") from error
+    return folder
+
+
 def write(result: Replay, out_dir: str | Path) -> list[Path]:
     """Write residuals.csv and replay.png into `out_dir`, each whole or not at all; the paths written."""
-    out = Path(out_dir)
-    out.mkdir(parents=True, exist_ok=True)
+    out = make_folder(out_dir)
     residuals, picture = out / "residuals.csv", out / "replay.png"
     part = residuals.with_name("residuals.csv.part")
     _write_residuals(result, part)
@@ -179,37 +201,37 @@ def table(result: Replay) -> Table:
     if len(parts) > _MOST_RUNS:
         grid.add_row(f"... {len(parts) - _MOST_RUNS} more runs")
     grid.add_row("all", *_cells(result), style="bold")
-    grid.caption = "rms, max: distance from measured to predicted tip\nexcursion: measured tip from its own mean"
+    grid.caption = f"{_MEANING}; rms, max of its length\nexcursion: measured tip from its own mean; {_NONE} if below the rms\n{_STATIC}"
     return grid
 
 
 def draw(result: Replay) -> Figure:
-    """Measured and predicted x, y, z and their distance over time, and the two paths seen along y and along z."""
+    """Measured and predicted x, y, z and their distance over time, the two paths seen along y and along z, and how the distance spreads.
+
+    Only rows that were measured are drawn. Above `DENSE` rows the curves over time are envelopes and the paths points.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # no window, and no pyplot state to clean up
     from matplotlib.figure import Figure
 
-    time, breaks = _timeline(result.log)
-    gaps = _gaps(time, breaks)
-    measured, predicted = 1e3 * result.log.tip_position, 1e3 * result.tip_position
     figure = Figure(figsize=(13.0, 8.0), layout="constrained")
     FigureCanvasAgg(figure)
     halves: Any = figure.subfigures(1, 2, width_ratios=(2.0, 1.0))
     left, right = halves
+    shown = result.rows(result.log.measured)
     panels = left.subplots(4, 1, sharex=True)
-    for k, axis in enumerate("xyz"):
-        panels[k].plot(*_broken(time, measured[:, k], gaps), color=_MEASURED, lw=1.4, label="measured")
-        panels[k].plot(*_broken(time, predicted[:, k], gaps), color=_PREDICTED, lw=0.9, label="predicted")
-        panels[k].set_ylabel(f"tip {axis} [mm]")
-    _distance(panels[3], time, result, gaps)
-    panels[3].set_xlabel("time, runs one after the other [s]" if len(breaks) else "time [s]")
-    _name_runs(list(panels), result.log.runs, time, breaks)
-    for axes, (a, b) in zip(right.subplots(2, 1), ((0, 2), (0, 1)), strict=True):
-        _path(axes, measured, predicted, (a, b), gaps)
+    _over_time(list(panels), shown)
+    places = right.subplots(3, 1, height_ratios=(3.0, 3.0, 2.0))
+    _path(places[0], shown, (0, 2))
+    _path(places[1], shown, (0, 1))
+    _spread(places[2], shown)
     right.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=2, frameon=False)
-    share = f", {1e2 * result.rms / result.excursion_rms:.0f} % of the excursion" if result.excursion_rms > 0.0 else ""
+    share = f", {1e2 * result.rms / result.excursion_rms:.0f} % of the excursion" if _moves(result) else ""
     figure.suptitle(
         f"{result.log.name} on {result.robot.name}: tip error {1e3 * result.rms:.3g} mm rms{share}", x=0.01, ha="left", fontweight="bold"
     )
+    rows = f"{int(result.compared.sum())} of {len(result.log)} rows compared; only measured rows are drawn"
+    rows += f"; a band spans the least to the greatest of {_stride(shown.log, _BINS)} rows" if len(shown.log) > DENSE else ""
+    left.supxlabel(f"{_MEANING}; {_STATIC}\n{rows}", x=0.01, ha="left", fontsize=8, color=_INK)
     return figure
 
 
@@ -275,7 +297,13 @@ def _cells(part: Replay) -> list[str]:
     converged = f"{int(part.compared.sum())}/{int(part.log.measured.sum())}"
     if not part.compared.any():
         return ["-"] * 6 + [converged]
-    return [*(f"{1e3 * length:.2f}" for length in (*part.axis_rms, part.rms, part.max, part.excursion_rms)), converged]
+    excursion = f"{1e3 * part.excursion_rms:.2f}" if _moves(part) else _NONE
+    return [*(f"{1e3 * length:.2f}" for length in (*part.axis_rms, part.rms, part.max)), excursion, converged]
+
+
+def _moves(part: Replay) -> bool:
+    """Whether the measured tip moves by at least the rms of its residual; otherwise a share of the excursion says nothing."""
+    return part.excursion_rms > 0.0 and part.excursion_rms >= part.rms
 
 
 def _write_residuals(result: Replay, path: Path) -> None:
@@ -297,13 +325,14 @@ _MEASURED, _PREDICTED, _RESIDUAL, _INK = "#1f2937", "#e4572e", "#2a78b5", "#4b55
 
 
 def _timeline(log: RunLog) -> tuple[Floats, NDArray[np.int64]]:
-    """(n,) time with the runs laid one after the other [s], and the first row of each run but the first."""
+    """(n,) time with the runs laid one after the other from 0 [s], and the first row of each run but the first.
+
+    A log of one run keeps its own time. Every row has a time.
+    """
     breaks = np.flatnonzero(log.run[1:] != log.run[:-1]) + 1
-    time = log.t.copy()
+    time = log.t - log.t[0] if len(breaks) else log.t.copy()
     for start in breaks:
-        before, after = time[:start], time[start:]
-        if np.isfinite(before).any() and np.isfinite(after).any():
-            time[start:] += before[np.isfinite(before)][-1] - after[np.isfinite(after)][0]
+        time[start:] += time[start - 1] - time[start]
     return time, breaks
 
 
@@ -320,19 +349,58 @@ def _gaps(time: Floats, breaks: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.union1d(breaks, long)
 
 
-def _distance(axes: Axes, time: Floats, result: Replay, gaps: NDArray[np.int64]) -> None:
-    norm, rms = 1e3 * np.linalg.norm(result.residual, axis=1), 1e3 * result.rms
-    axes.plot(*_broken(time, norm, gaps), color=_RESIDUAL, lw=0.9)
-    axes.axhline(rms, color=_INK, lw=0.8, ls="--", label=f"rms {rms:.3g} mm")
-    axes.set_ylim(0.0, 1.3e3 * result.max or None)
-    axes.set_ylabel("distance [mm]")
-    axes.legend(loc="upper right", fontsize=8, frameon=False)
+def _over_time(panels: list[Axes], shown: Replay) -> None:
+    """x, y, z of both tips and their distance [mm] over time [s], one panel each."""
+    time, breaks = _timeline(shown.log)
+    gaps = _gaps(time, breaks)
+    curve = partial(_band, stride=_stride(shown.log, _BINS)) if len(time) > DENSE else _line
+    for k, axis in enumerate("xyz"):
+        curve(panels[k], time, 1e3 * shown.tip_position[:, k], gaps, colour=_PREDICTED, width=2.2, label="predicted")
+        curve(panels[k], time, 1e3 * shown.log.tip_position[:, k], gaps, colour=_MEASURED, width=0.9, label="measured")
+        panels[k].set_ylabel(f"tip {axis} [mm]")
+    curve(panels[3], time, _norm(shown), gaps, colour=_RESIDUAL, width=0.9, label="")
+    _rms_line(panels[3].axhline, shown)
+    panels[3].set_ylim(0.0, 1.3e3 * shown.max or None)
+    panels[3].set_ylabel("distance [mm]")
+    panels[3].legend(loc="upper right", fontsize=8, frameon=False)
+    panels[3].set_xlabel("time, runs one after the other [s]" if len(breaks) else "time [s]")
+    _name_runs(panels, shown.log.run[[0, *breaks]].tolist(), time, breaks)
 
 
-def _path(axes: Axes, measured: Floats, predicted: Floats, plane: tuple[int, int], gaps: NDArray[np.int64]) -> None:
+def _line(axes: Axes, time: Floats, values: Floats, gaps: NDArray[np.int64], *, colour: str, width: float, label: str) -> None:
+    axes.plot(*_broken(time, values, gaps), color=colour, lw=width, alpha=0.85, label=label)
+
+
+def _band(axes: Axes, time: Floats, values: Floats, gaps: NDArray[np.int64], *, colour: str, width: float, label: str, stride: int) -> None:
+    """The least and the greatest of each `stride` rows, none across a gap, filled between; edges half as wide as a line's `width`."""
+    starts = np.union1d(np.arange(0, len(time), stride), gaps)
+    breaks = np.searchsorted(starts, gaps)
+    ends = np.append(starts[1:], len(time)) - 1
+    x = np.stack([time[starts], time[ends]], axis=1).ravel()
+    low, high = (np.repeat(extreme.reduceat(values, starts), 2) for extreme in (np.fmin, np.fmax))
+    across, bottom = _broken(x, low, 2 * breaks)
+    top = _broken(x, high, 2 * breaks)[1]
+    axes.fill_between(across, bottom, top, facecolor=(colour, 0.3), edgecolor=(colour, 0.9), lw=0.5 * min(width, 1.6), label=label)
+
+
+def _stride(log: RunLog, parts: int) -> int:
+    """Rows of each of at most `parts` equal parts of the log."""
+    return math.ceil(len(log) / parts)
+
+
+def _path(axes: Axes, shown: Replay, plane: tuple[int, int]) -> None:
+    """Both tips in a plane of the base [mm]: predicted below measured, or points of both in turns where there are many."""
     a, b = plane
-    for values, colour, width in ((measured, _MEASURED, 0.9), (predicted, _PREDICTED, 0.7)):
-        axes.plot(*_broken(values[:, a], values[:, b], gaps), color=colour, lw=width, marker=".", ms=2.0, alpha=0.8)
+    tips = [1e3 * shown.tip_position[:, plane], 1e3 * shown.log.tip_position[:, plane]]
+    if len(shown.log) > DENSE:
+        step = _stride(shown.log, DENSE)
+        points = np.stack([tip[::step] for tip in tips], axis=1).reshape(-1, 2)
+        colours = np.tile(np.array([_PREDICTED, _MEASURED]), len(points) // 2)
+        axes.scatter(points[:, 0], points[:, 1], c=colours.tolist(), s=1.6, lw=0.0, alpha=0.8)
+    else:
+        gaps = _gaps(*_timeline(shown.log))
+        for tip, colour, width, size in zip(tips, (_PREDICTED, _MEASURED), (1.6, 0.6), (4.5, 2.5), strict=True):
+            axes.plot(*_broken(tip[:, 0], tip[:, 1], gaps), color=colour, lw=width, marker=".", ms=size, mew=0.0, alpha=0.7)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel(f"{'xyz'[a]} [mm]")
     axes.set_ylabel(f"{'xyz'[b]} [mm]")
@@ -340,12 +408,31 @@ def _path(axes: Axes, measured: Floats, predicted: Floats, plane: tuple[int, int
     axes.grid(alpha=0.25)
 
 
-def _name_runs(panels: list[Axes], runs: list[str], time: Floats, breaks: NDArray[np.int64]) -> None:
+def _spread(axes: Axes, shown: Replay) -> None:
+    """How many rows have which residual distance [mm]."""
+    norm = _norm(shown)
+    axes.hist(norm[np.isfinite(norm)], bins=40, range=(0.0, 1e3 * shown.max or 1.0), color=_RESIDUAL, alpha=0.8)
+    _rms_line(axes.axvline, shown)
+    axes.set_xlabel("distance [mm]")
+    axes.set_ylabel("rows")
+    axes.grid(alpha=0.25)
+
+
+def _norm(shown: Replay) -> Floats:
+    """(n,) residual distance [mm]; nan where nothing is compared."""
+    return np.asarray(1e3 * np.linalg.norm(shown.residual, axis=1), dtype=np.float64)
+
+
+def _rms_line(across: Callable[..., Any], shown: Replay) -> None:
+    across(1e3 * shown.rms, color=_INK, lw=0.8, ls="--", label=f"rms {1e3 * shown.rms:.3g} mm")
+
+
+def _name_runs(panels: list[Axes], labels: list[str], time: Floats, breaks: NDArray[np.int64]) -> None:
     for axes in panels:
         axes.grid(alpha=0.25)
         axes.margins(x=0.01)
         for start in breaks:
             axes.axvline(time[start], color=_INK, lw=0.7, ls=":")
     if len(breaks) and len(breaks) < 8:
-        for start, label in zip((0, *breaks), runs, strict=False):
+        for start, label in zip((0, *breaks), labels, strict=True):
             panels[0].text(time[start], 1.02, f" {label}", transform=panels[0].get_xaxis_transform(), fontsize=8)

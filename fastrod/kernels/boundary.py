@@ -52,8 +52,10 @@ def close_lengths(
             i = robots[w]
             compliance = params.compliance[pick(i, len(params.compliance)), t]
             value = x[(n_base + f) * W + w]
-            # a slack wire's unknown is no tension but a measure of how loose it hangs, and needs some slope
-            stretch = max(compliance, 1e-5) if value < 0.0 and params.unilateral[pick(i, len(params.unilateral)), t] else compliance
+            # a slack wire's unknown is no tension but a measure of how loose it hangs; d/T as slope is about a taut wire's
+            s = pick(i, len(params.reach))
+            slope = max(compliance, params.moment_scale[s] / (params.tension_scale[s] * params.tension_scale[s]))
+            stretch = slope if value < 0.0 and params.unilateral[pick(i, len(params.unilateral)), t] else compliance
             error[f * W + w] -= stretch * value - compliance * params.pretension[pick(i, len(params.pretension)), t]
             if n_col > 0:
                 gamma[(f * n_col + n_base + f) * W + w] -= stretch
@@ -110,13 +112,14 @@ def loosen(robots: Lanes, params: Params, layout: Layout, x: Lanes, columns: Lan
     for f in range(len(layout.free_tendon) if n_col > 0 else 0):
         t = layout.free_tendon[f]
         for w in range(W):
-            s = pick(robots[w], len(params.unilateral))
-            if params.unilateral[s, t] and x[(3 + f) * W + w] < 0.0:
+            if params.unilateral[pick(robots[w], len(params.unilateral)), t] and x[(3 + f) * W + w] < 0.0:
                 for r in range(n_e):
                     gamma[(r * n_col + 3 + f) * W + w] = 0.0
                 for k in range(col.COLUMN):
                     columns[((3 + f) * col.COLUMN + k) * W + w] = 0.0
-                gamma[(f * n_col + 3 + f) * W + w] = -max(params.compliance[pick(robots[w], len(params.compliance)), t], 1e-5)
+                s = pick(robots[w], len(params.reach))
+                slope = params.moment_scale[s] / (params.tension_scale[s] * params.tension_scale[s])
+                gamma[(f * n_col + 3 + f) * W + w] = -max(params.compliance[pick(robots[w], len(params.compliance)), t], slope)
 
 
 @kernel

@@ -30,7 +30,7 @@ def _fill(
     arclength, position, rotation, tension = shape.arclength, shape.position, shape.rotation, shape.tension
     moment, force, curvature = shape.moment, shape.force, shape.curvature
     n_steps, n_points = layout.n_steps, arclength.shape[1]
-    at = min(max(np.searchsorted(arclength[i], s, side="right") - 1, 0), n_points - 2)
+    at = min(max(np.searchsorted(arclength[i], s * (1.0 + 1e-13), side="right") - 1, 0), n_points - 2)
     k, j = at // n_steps, at % n_steps
     whole, h = arclength[i, at + 1] - arclength[i, at], s - arclength[i, at]
     part = h / whole
@@ -44,7 +44,7 @@ def _fill(
             node[(sh.N_R + 3 * a + b) * W + lane] = rotation[i, at, a, b]
         line = ports.line_force[pick(i, len(ports.line_force)), k]
         many = line.shape[0] > 1
-        f0, f1 = line[j if many else 0, a], line[j + 1 if many else 0, a]
+        f0, f1 = line[2 * j if many else 0, a], line[2 * j + 1 if many else 0, a]
         node[(sh.N_F0 + a) * W + lane] = f0
         node[(sh.N_F1 + a) * W + lane] = f0 + part * (f1 - f0)
         stiffness = ports.stiffness[pick(i, len(ports.stiffness)), k]

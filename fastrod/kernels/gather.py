@@ -95,11 +95,11 @@ def gather_base(robots: Lanes, ports: Ports, params: Params, memory: Memory, lay
                     total += l_k * line[k, 0, a]
                 elif len(ports.grid) == 0:
                     for j in range(n_steps):
-                        total += 0.5 * l_k / n_steps * (line[k, j, a] + line[k, j + 1, a])
+                        total += 0.5 * l_k / n_steps * (line[k, 2 * j, a] + line[k, 2 * j + 1, a])
                 else:
                     grid = ports.grid[pick(i, len(ports.grid)), k]
                     for j in range(n_steps):
-                        total += 0.5 * l_k * (grid[j + 1] - grid[j]) * (line[k, j, a] + line[k, j + 1, a])
+                        total += 0.5 * l_k * (grid[j + 1] - grid[j]) * (line[k, 2 * j, a] + line[k, 2 * j + 1, a])
             if len(ports.node_force) > 0:
                 for j in range(n_segments * n_steps + 1):
                     total += ports.node_force[pick(i, len(ports.node_force)), j, a]
@@ -136,8 +136,8 @@ def gather_step(k: int, j: int, robots: Lanes, ports: Ports, params: Params, lay
         if j == 0 or n_f > 1:
             line = ports.line_force[pick(i, len(ports.line_force)), k]
             for a in range(3):
-                node[(sh.N_F0 + a) * W + w] = line[j if n_f > 1 else 0, a]
-                node[(sh.N_F1 + a) * W + w] = line[j + 1 if n_f > 1 else 0, a]
+                node[(sh.N_F0 + a) * W + w] = line[2 * j if n_f > 1 else 0, a]
+                node[(sh.N_F1 + a) * W + w] = line[2 * j + 1 if n_f > 1 else 0, a]
         if j == 0 or n_k > 1:
             stiffness = ports.stiffness[pick(i, len(ports.stiffness)), k]
             rest = ports.precurvature[pick(i, len(ports.precurvature)), k]

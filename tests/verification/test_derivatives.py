@@ -91,6 +91,17 @@ def test_compliance_beside_a_follower_force() -> None:
     check(robot, base)
 
 
+def test_extension_under_a_point_force_that_stays_at_its_arclength() -> None:
+    robot = rod("passive", extension=(0.0, 0.05))
+    sim = Simulator(robot, points_per_segment=8)
+    loads = {"point_force": [(0.04, (0.0, 0.2, 0.0))], "line_force": np.array([[[0.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 1.0]]])}
+    sim.settle(extension=[0.02], tolerance=1e-13, **loads)  # type: ignore[arg-type]
+    jacobian = sim.jacobian()[0, :3, 0]
+    ends = [sim.settle(extension=[0.02 + d], tolerance=1e-13, **loads).tip_position[0] for d in (1e-5, -1e-5)]  # type: ignore[arg-type]
+    expected = (ends[0] - ends[1]) / 2e-5
+    assert_allclose(jacobian, expected, atol=1e-6 * np.abs(expected).max())
+
+
 def test_shape_between_nodes_is_as_good_as_at_nodes() -> None:
     robot = load_robot("tdcr_a")
     lengths = bend(robot, 0.9, 0.2) + bend(robot, -0.5, 0.7, 1) - robot.rest_tendon_length
@@ -105,6 +116,7 @@ def test_shape_between_nodes_is_as_good_as_at_nodes() -> None:
     assert_allclose(one.rotation, two.rotation, atol=1e-5)
     away = np.abs(s - 0.2) > 1e-3  # at the joint the curvature jumps
     assert_allclose(one.curvature[:, away], two.curvature[:, away], atol=2e-3)
+    assert_allclose(coarse.shape(0.2).curvature[0, 0], state.curvature[0, 10], atol=1e-12)  # at a joint the distal side, as in the state
     again = coarse.shape(state.arclength[0])
     assert_allclose(again.position, state.position, atol=1e-15)
     assert_allclose(again.curvature[:, :-1], state.curvature[:, :-1], atol=1e-7)

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from rods import bend, rod
 from truth.energy import minimise
 
-from fastrod import Simulator, load_robot
+from fastrod import Robot, Simulator, load_robot
 from fastrod.reference import shoot
 
 ELASTICA = {1.0: 0.301720773800, 2.0: 0.493457480397, 5.0: 0.713791523612, 10.0: 0.810609024880}  # P l^2/EI -> w/l
@@ -207,3 +207,37 @@ def test_stiffness_and_precurvature_that_vary_along_the_rod() -> None:
     state = sim.settle()
     angle = 8.0 / 20.0 * np.sin(20.0 * length)
     assert_allclose(np.arctan2(-state.tip_rotation[0, 1, 2], state.tip_rotation[0, 2, 2]), angle, atol=1e-6)
+
+
+def one_sided(robot: Robot) -> Robot:
+    return replace(robot, segments=tuple(replace(s, tendons=tuple(replace(t, unilateral=True) for t in s.tendons)) for s in robot.segments))
+
+
+@pytest.mark.parametrize("pull", [0.0, 3e-4, -1e-3])
+def test_cable_robots_taut_and_loose_match_the_twin(pull: float) -> None:
+    """Wires that can only pull: pulled together, let go together, and at the edge where some hang loose."""
+    rng = np.random.default_rng(4)
+    for robot in (one_sided(rod()), one_sided(load_robot("tdcr_a"))):
+        angles = rng.uniform(-0.6, 0.6, (40, 2 * robot.n_segments))
+        lengths = np.stack([sum(bend(robot, *a[2 * k : 2 * k + 2], k) for k in range(robot.n_segments)) for a in angles])
+        lengths -= (robot.n_segments - 1) * robot.rest_tendon_length + pull * (1 + robot.tendon_segment)
+        force = rng.uniform(-0.1, 0.1, (40, 3))
+        state = Simulator(robot, n_robots=40).settle(lengths, tip_force=force)
+        assert state.ok.all(), state.problems
+        assert (state.tension >= 0.0).all()
+        assert (state.path_length <= lengths + 1e-5 * state.tension + 1e-8).all()  # a wire is never shorter than its path
+        for i in (0, 1):
+            twin = shoot(robot, lengths[i], tip_force=force[i])
+            assert_allclose(state.tip_position[i], twin.tip_position, atol=1e-7)
+
+
+def test_any_sampling_of_a_line_force_keeps_its_force_and_moment() -> None:
+    rng = np.random.default_rng(6)
+    for points in (2, 4, 7, 31, 200):
+        line = rng.uniform(-1.0, 1.0, (1, points, 3))
+        loads = {"line_force": line, "point_force": [(0.0237, (0.0, 1e-9, 0.0))]}  # which moves the nodes
+        state = Simulator(rod("passive")).settle(**loads)  # type: ignore[arg-type]
+        assert_allclose(state.base_wrench[0, :3], np.trapezoid(line[0], dx=0.07 / (points - 1), axis=0), atol=2e-9)
+        twin = shoot(rod("passive"), **loads)  # type: ignore[arg-type]
+        # a polyline that bends inside a step is met in force and moment there: what is left is of third order
+        assert_allclose(state.tip_position[0], twin.tip_position, atol=2e-6)
