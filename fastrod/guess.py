@@ -9,19 +9,23 @@ import numpy as np
 
 from fastrod.types import Floats, Ints, Layout, Memory, Params, Ports
 
+_BLOCK = 4096  # robots at a time
 _SAMPLES = 8  # arcs are sampled this often per segment; the guess needs no more
 
 
 def cold_start(rows: Ints, layout: Layout, params: Params, ports: Ports, memory: Memory) -> None:
     """Fill x and the curvature guess of the robots `rows` from their inputs alone, and forget what was learned before."""
-    if not len(rows):
-        return
-    take = _Rows(rows)
-    _fill(rows, take, layout, params, ports, memory)
+    for start in range(0, len(rows), _BLOCK):  # the arrays on the way are ten times what a robot keeps
+        block = rows[start : start + _BLOCK]
+        _fill(block, _Rows(block), layout, params, ports, memory)
+        _rounded(block, layout, params, memory)
     for learned in (memory.gain, memory.move, memory.defect, memory.covariance):
         if len(learned):
             learned[rows] = 0.0
-    # On a coarse grid: numpy's sums differ in their last bits with the size of the batch, a batch of robots must not.
+
+
+def _rounded(rows: Ints, layout: Layout, params: Params, memory: Memory) -> None:
+    """Put the guess on a coarse grid: numpy's sums differ in their last bits with the size of the batch, a batch must not."""
     unit = _grid(rows, layout, params, memory.x.shape[1])
     memory.x[rows] = np.round(memory.x[rows] / unit) * unit
     memory.curvature_guess[rows] = np.round(memory.curvature_guess[rows] * 2.0**20) / 2.0**20

@@ -93,9 +93,10 @@ def _newton(rows: Ints, params: Params, layout: Layout, ports: Ports, memory: Me
             best = np.where(better, residual, best)
             damping = np.where(better, 1.0, 0.5 * damping)
             memory.x[rows] = x_at + damping[:, None] * step
-        closed = np.isfinite(best) if layout.paper else best <= tolerance
+        # only a pass that was accepted can end it: what it wrote is what the caller gets
+        closed = better & (np.isfinite(residual) if layout.paper else residual <= tolerance)
         patience -= closed
-        done = closed & (_still(step, rows, layout, params, tolerance + 1e-6 * best) | ((patience <= 0) & (best <= tolerance)))
+        done = closed & (_still(step, rows, layout, params, tolerance + 1e-6 * residual) | ((patience <= 0) & (residual <= tolerance)))
         lost = ~done & ((damping < _SMALLEST_STEP) | ~np.isfinite(step).all(1))
         failed.append(rows[lost])
         keep = ~(done | lost)

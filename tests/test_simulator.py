@@ -95,6 +95,17 @@ def test_steep_loads_arrive_by_continuation() -> None:
     assert 0.05 < state.tip_position[0, 1] < 0.07
 
 
+def test_settled_means_that_the_state_handed_out_is_within_tolerance() -> None:
+    """Hard moves, loose tolerance: a step that was tried and taken back must not be what the caller gets."""
+    rng = np.random.default_rng(2)
+    robot = load_robot("prototype")
+    sim = Simulator(robot, n_robots=200, points_per_segment=8)
+    for _ in range(6):
+        state = sim.settle(random_lengths(200, int(rng.integers(1000)), 1.4), tip_force=rng.uniform(-1.5, 1.5, (200, 3)), tolerance=1e-4)
+        assert (state.residual[state.ok] <= 1e-4).all()
+        assert state.ok.mean() > 0.95
+
+
 def test_a_lost_robot_has_no_response_and_takes_none_from_others() -> None:
     lengths = random_lengths(3, 9)
     lengths[1] = np.nan
