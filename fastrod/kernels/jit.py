@@ -22,7 +22,8 @@ _njit: Any = numba.njit  # its type does not know _nrt
 LANES = 16
 """Robots that one pass of a kernel's inner loop holds side by side; the loop over them becomes SIMD code."""
 
-# contract: fused multiply-add. arcp: x / 6 is x times 1/6. nsz: x + 0 is x. None may assume that NaN is absent: NaN is how a lost robot is seen.
+# contract: fused multiply-add. arcp: x / 6 is x times 1/6. nsz: x + 0 is x. None of them may assume that NaN is absent:
+# NaN is how a lost robot is seen.
 _FAST = {"arcp", "contract", "nsz"}
 
 
