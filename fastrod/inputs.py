@@ -131,8 +131,11 @@ class Reader:
         slack = 2.0 * np.pi * np.linalg.norm(params.offset, axis=-1).sum(1)
         rows = layout.row_tendon
         with np.errstate(invalid="ignore"):
-            long = (lengths - ends > slack) & ~params.unilateral  # a wire that can go slack may hang as loose as it likes
-            bad = ((lengths <= 0.0) | (ends - lengths > slack) | long | (lengths > 20.0 * ends))[:, rows].any(1)
+            longer = lengths - ends
+            if lengths.min() > 0.0 and (np.abs(longer) <= slack).all():
+                return lengths
+            long = (longer > slack) & ~params.unilateral  # a wire that can go slack may hang as loose as it likes
+            bad = ((lengths <= 0.0) | (-longer > slack) | long | (lengths > 20.0 * ends))[:, rows].any(1)
         if bad.any():
             self._note(bad, lambda i: _length_sentence(lengths[min(i, len(lengths) - 1)][rows], ends[min(i, len(ends) - 1)][rows]))
         return lengths

@@ -135,11 +135,12 @@ class Simulator:
         cold_start(rows[~self._warm[rows]], self._layout, self._params, ports, self._memory)
         shape = self._new_shape(self.outputs, len(rows) < self.n_robots)
         self._pass(rows, ports, shape, feed=True, carry=self._carry, process=process, noise=noise)
-        ok = np.zeros(self.n_robots, bool)
-        ok[rows] = np.isfinite(self._memory.x[rows]).all(1) & (shape.residual[rows] < _LOST * self._reach(rows))
+        finite = np.isfinite(self._memory.x.sum(1))
+        ok = finite & (shape.residual < _LOST * self._params.reach)
         passes = np.broadcast_to(np.int64(1 + learns), self.n_robots)
         if len(rows) < self.n_robots:
-            passes = np.where(np.isin(self._all, rows), passes, 0)
+            read = np.isin(self._all, rows)
+            ok, passes = ok & read, np.where(read, passes, 0)
         return self._finish(ports, shape, ok, passes, "the observer diverged; use settle, or smaller changes of input")
 
     def settle(
@@ -352,8 +353,11 @@ class Simulator:
         problems = dict(self._reader.problems)
         for i in np.flatnonzero(~ok):
             problems.setdefault(int(i), f"{reason}; residual {shape.residual[i]:.3g} m.")
-        unread = np.isin(self._all, list(self._reader.problems))  # no pass touched these: they keep the boundary they had
-        self._warm = np.where(unread, self._warm, ok)
+        if self._reader.problems:  # no pass touched these: they keep the boundary they had
+            unread = np.isin(self._all, list(self._reader.problems))
+            self._warm = np.where(unread, self._warm, ok)
+        else:
+            self._warm = ok.copy()
         self._ports = ports
         self._state = State(**shape._asdict(), ok=ok, passes=passes, problems=problems)
         return self._state
@@ -362,10 +366,6 @@ class Simulator:
         if self._state is None or self._ports is None:
             raise InputError(f"{what} needs a state; call step or settle first.")
         return self._state, self._ports
-
-    def _reach(self, rows: Ints) -> Floats:
-        reach = self._params.reach
-        return reach if len(reach) == 1 else reach[rows]
 
     def _respond(self, ports: Ports, columns: bool = True) -> tuple[Response, Shape]:
         """A pass at the present x that changes nothing, with its linear response."""
