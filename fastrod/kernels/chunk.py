@@ -219,6 +219,7 @@ def pass_chunk(
     work = scratch[o:]
 
     at_start, at_middle, at_end = node[sh.N_K * W :], node[(sh.N_K + 3) * W :], node[(sh.N_K + 6) * W :]
+    varied = ports.stiffness.shape[2] > 1 or ports.line_force.shape[2] > 1 or len(ports.grid) > 0 or len(ports.node_force) > 0
     first_cuts, cuts = FIRST_CUTS, RESPONSE_CUTS if placed else CUTS
     for i in range(len(length)):
         length[i] = 0.0
@@ -245,7 +246,8 @@ def pass_chunk(
         loaded = first < n and not layout.paper
         gather_segment(k, robots, params, layout, tendon)
         for j in range(n_steps):
-            gather_step(k, j, robots, ports, params, layout, node)
+            if j == 0 or varied:
+                gather_step(k, j, robots, ports, params, layout, node)
             if j == 0:
                 start_segment(k, layout, node, x, columns, n_col)
                 if k == 0 or layout.paper:

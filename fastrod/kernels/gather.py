@@ -122,8 +122,6 @@ def gather_segment(k: int, robots: Lanes, params: Params, layout: Layout, tendon
 def gather_step(k: int, j: int, robots: Lanes, ports: Ports, params: Params, layout: Layout, node: Lanes) -> None:
     """Step length, line force, stiffness and point force of step j of segment k."""
     n_k, n_f = ports.stiffness.shape[2], ports.line_force.shape[2]
-    if j > 0 and n_k == 1 and n_f == 1 and len(ports.grid) == 0 and len(ports.node_force) == 0:
-        return  # the same as in the step before
     for w in range(W):
         i = robots[w]
         h = params.length[pick(i, len(params.length)), k] + ports.extension[pick(i, len(ports.extension)), k]
