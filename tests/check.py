@@ -21,11 +21,11 @@ CHECKS: list[tuple[str, list[str], dict[str, str]]] = [
     ("imports", ["lint-imports"], {}),
     ("tests", ["pytest"], {}),
     # The kernels once more as plain Python: what the compiler might hide, and the lines that it hides from coverage.
-    ("plain python", ["pytest", "tests/plain", "-p", "no:doctest"], {"NUMBA_DISABLE_JIT": "1"}),
+    ("plain python", ["pytest", "tests/plain"], {"NUMBA_DISABLE_JIT": "1"}),
     # And with every index checked: a compiled kernel does not notice that it reads beyond its scratch.
     (
         "bounds",
-        ["pytest", "tests/plain", "-p", "no:doctest"],
+        ["pytest", "tests/plain"],
         {"NUMBA_BOUNDSCHECK": "1", "FASTROD_CACHE_DIR": str(ROOT / ".pytest_cache" / "bounds")},
     ),
 ]
