@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from fastrod.rotation import matrix_from_quaternion
 from fastrod.types import Floats, Ints, Layout, Memory, Params, Ports
 
 _BLOCK = 4096  # robots at a time
@@ -91,7 +92,7 @@ def _arcs(curvature: Floats, take: _Rows, params: Params, ports: Ports) -> tuple
     """Rotation (n, n_segments, samples + 1, 3, 3), position of the samples, and the arclength that each node stands for."""
     length = take(params.length) + take(ports.extension)
     pose = take(ports.base_pose)
-    turn, place = _matrix(pose[:, 3:]), pose[:, :3].copy()
+    turn, place = matrix_from_quaternion(pose[:, 3:]), pose[:, :3].copy()
     rotations, positions = [], []
     for k in range(curvature.shape[1]):
         h = length[:, k, None] / _SAMPLES
@@ -155,18 +156,8 @@ def _tensions(layout: Layout, take: _Rows, params: Params, ports: Ports, wanted:
     return np.where(taut, np.maximum(tension, 0.01 * take(params.tension_scale)[:, None]), tension)
 
 
-def _matrix(quaternion: Floats) -> Floats:
-    w, x, y, z = quaternion.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)
-
-
 def _exp(vector: Floats) -> Floats:
     """Rotation matrices of rotation vectors (n, 3)."""
     angle = np.linalg.norm(vector, axis=1)
     half = 0.5 * angle
-    return _matrix(np.column_stack([np.cos(half), 0.5 * np.sinc(half / np.pi)[:, None] * vector]))
+    return matrix_from_quaternion(np.column_stack([np.cos(half), 0.5 * np.sinc(half / np.pi)[:, None] * vector]))

@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from fastrod.errors import RobotError, UnknownNameError, nearest
+from fastrod.errors import RobotError, nearest
 
 Mode: TypeAlias = Literal["tendon_length", "tendon_tension", "passive", "paper"]
 """Boundary mode of a segment: what is prescribed at its end (model.md, four boundary modes)."""
@@ -223,9 +223,3 @@ class Robot:
         """(n_tendons,) length of each tendon of the straight rest robot, base to where it ends [m]."""
         ends = np.cumsum([segment.length for segment in self.segments])
         return np.asarray(ends[self.tendon_segment], dtype=np.float64)
-
-    def segment_index(self, number: int) -> int:
-        """Index of segment `number`, which counts from 1 as in robot files."""
-        if not 1 <= number <= self.n_segments:
-            raise UnknownNameError(f"no segment {number}; robot {self.name!r} has segments 1 to {self.n_segments}.")
-        return number - 1

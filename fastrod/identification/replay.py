@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from fastrod.errors import InputError, LogError
 from fastrod.robot import Robot
+from fastrod.rotation import matrix_from_quaternion
 from fastrod.runlog import RunLog
 from fastrod.types import Floats
 
@@ -265,7 +266,7 @@ def _into_base(world: Floats, rotation: Floats) -> Floats:
 def _base(log: RunLog, robot: Robot) -> tuple[Floats, Floats]:
     """world_from_base (n, 3, 3) of each row, and the base's position in the world [m]."""
     quaternion = log.base_quaternion if log.base_quaternion is not None else np.tile(robot.base_quaternion, (len(log), 1))
-    return _matrix(quaternion), np.array(robot.base_position)
+    return matrix_from_quaternion(quaternion), np.array(robot.base_position)
 
 
 def _tip_force(log: RunLog, robot: Robot) -> Floats:
@@ -276,17 +277,6 @@ def _tip_force(log: RunLog, robot: Robot) -> Floats:
     if log.payload is not None:
         force += log.payload[:, None] * np.array(robot.gravity)
     return force
-
-
-def _matrix(quaternion: Floats) -> Floats:
-    """(n, 3, 3) rotation matrices of unit quaternions (n, 4), w x y z."""
-    w, x, y, z = quaternion.T
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def _rms(vectors: Floats) -> float:

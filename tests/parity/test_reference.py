@@ -2,37 +2,23 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from truthfiles import numbers, rows
 
 from fastrod.errors import InputError
 from fastrod.reference import constant_curvature, shoot, solve_bvp
 from fastrod.robot import Mode, Robot, Segment, Tendon
 from fastrod.robotfile import load_robot
 
-TRUTH = Path(__file__).parents[2].parent / "shared" / "truth"
 EI, LENGTH = 0.0022, 0.07
 
 # The truth files hold 1e-12 m; the integrator's rtol of 1e-9 over a rod of 0.1 to 0.4 m leaves 1e-11 m of each.
 TIP = 1e-9
-
-
-def rows(name: str) -> list[dict[str, str]]:
-    path = TRUTH / name
-    if not path.is_file():
-        pytest.skip(f"no truth file {name} beside the repository")
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def numbers(row: dict[str, str], *names: str) -> np.ndarray:
-    return np.array([float(row[name]) for name in names])
 
 
 def rotation(row: dict[str, str], letter: str) -> np.ndarray:

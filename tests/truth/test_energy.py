@@ -2,30 +2,16 @@
 
 from __future__ import annotations
 
-import csv
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from truthfiles import numbers, rows
 
 sys.path.insert(0, str(Path(__file__).parent))
 import energy
-
-TRUTH = Path(__file__).parents[2].parent / "shared" / "truth"
-
-
-def rows(name: str) -> list[dict[str, str]]:
-    path = TRUTH / name
-    if not path.is_file():
-        pytest.skip(f"no truth file {name} beside the repository")
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def numbers(row: dict[str, str], *names: str) -> np.ndarray:
-    return np.array([float(row[name]) for name in names])
 
 
 def ring(n: int, offset: float) -> np.ndarray:
