@@ -22,6 +22,10 @@ class LogError(FastrodError, ValueError):
     """A run log that cannot be read, with the row and the column named."""
 
 
+class EffectError(FastrodError, ValueError):
+    """An effect that is not one, or whose parameters cannot be."""
+
+
 class UnknownNameError(FastrodError, KeyError):
     """A name that is not known, answered with the near ones."""
 

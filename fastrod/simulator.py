@@ -9,6 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fastrod.chain import Chain, Measurement
 from fastrod.compile import compile_robots
 from fastrod.errors import InputError, RobotError
 from fastrod.guess import cold_start
@@ -18,6 +19,7 @@ from fastrod.kernels.chunk import scratch_size
 from fastrod.kernels.dense import between_nodes
 from fastrod.kernels.jit import LANES
 from fastrod.robot import Robot
+from fastrod.rotation import matrix_from_quaternion
 from fastrod.settle import settle
 from fastrod.state import Observer, Pose, Snapshot, State
 from fastrod.types import Flags, Floats, Ints, Memory, Ports, Response, Shape
@@ -58,9 +60,6 @@ class Simulator:
         robots = [robot] if isinstance(robot, Robot) else list(robot) if isinstance(robot, (list, tuple)) else []
         if not robots or not all(isinstance(r, Robot) for r in robots):
             raise RobotError(f"robot is {robot!r}; give a Robot, for example fastrod.load_robot('prototype'), or a list of them.")
-        if named := next((r for r in robots if r.effects), None):
-            names = ", ".join(str(effect["name"]) for effect in named.effects)
-            raise RobotError(f"robot {named.name!r} asks for {names}; this version has no effects: take [[effect]] out of its file.")
         if n_robots is None:
             n_robots = len(robots)
         if not isinstance(n_robots, (int, np.integer)) or n_robots < 1:
@@ -85,6 +84,9 @@ class Simulator:
         self._threads = threads or numba.get_num_threads()
         self._layout, self._params, self._rest = compile_robots(self.robots, int(points_per_segment))
         self._reader = Reader(self._layout, self._params, self._rest, self.n_robots)
+        self._chain = Chain(self.robots, self.n_robots)
+        self._plain = self._params  # the robot before its effects, and its last ports before them
+        self._bare: Ports | None = None
         self._all = np.arange(self.n_robots)
         self._warm = np.zeros(self.n_robots, bool)
         self._ports: Ports | None = None
@@ -209,7 +211,8 @@ class Simulator:
         """(n_robots, 6, n_tendons + n_segments) d(tip position [m], rotation vector [rad]) / d(input [m or N]), world frame.
 
         Inputs: the tendons (length, or tension where that is the mode), then the segments' extensions, the other inputs
-        held: a point force at its arclength. A slack wire's column is zero, a robot's that is not ok nan. Columns of
+        held: a point force at its arclength. With effects, the inputs are those commanded, and the effects stay where they
+        are in their loops. A slack wire's column is zero, a robot's that is not ok nan. Columns of
         lengths come from the sensitivities of the pass (model.md); those of tensions and extensions from central
         differences of the pass, closed by the same sensitivities.
         """
@@ -227,7 +230,9 @@ class Simulator:
             for a in members:
                 tip, error = self._difference(ports, name, int(a), delta)
                 jacobian[:, :, start + a] = tip - np.einsum("rie,re->ri", by_unknown, error)
-        return jacobian
+        if self._bare is None:
+            return jacobian
+        return np.asarray(jacobian @ self._chain.slopes(self._bare, self._plain, self._state, self.dt, layout.n_steps))
 
     def compliance(self) -> Floats:
         """(n_robots, 6, 3) d(tip position [m], rotation vector [rad]) / d(tip force [N]), world frame, actuation held."""
@@ -240,16 +245,45 @@ class Simulator:
             load[:, -3:] -= (self._params.reach**2 / self._params.moment_scale)[:, None, None] * np.eye(3)
         return np.asarray(response.tip[:, :, -3:] - response.tip[:, :, :n_x] @ (_inverse(free) @ load))
 
+    def measure(self) -> Measurement:
+        """What a camera on the base sees of the last state: tip (and `log_points`, with outputs="full") in the base frame, effects of
+        sensing included. Effects before the rod show in the state itself. Raises `InputError` before the first step."""
+        state, ports = self._last("measure")
+        pose = np.broadcast_to(ports.base_pose, (self.n_robots, 7))
+        turn = matrix_from_quaternion(pose[:, 3:])
+        points = np.zeros((self.n_robots, 0, 3))
+        if self.outputs == "full" and self.robots[0].log_points:
+            points = self.shape(np.array(self.robots[0].log_points)).position - pose[:, None, :3]
+        seen = Measurement(
+            np.einsum("nji,nj->ni", turn, state.tip_position - pose[:, :3]),
+            np.swapaxes(turn, 1, 2) @ state.tip_rotation,
+            np.einsum("nji,nkj->nki", turn, points),
+        )
+        return self._chain.sense(seen, ports, self._plain, self.dt, self._layout.n_steps)
+
     def reset(self, rows: ArrayLike | None = None) -> None:
-        """Forget the boundary of these robots (all by default): their next step begins from the cold guess."""
+        """Forget the boundary of these robots (all by default): their next step begins from the cold guess, their effects at rest."""
         try:
-            self._warm[slice(None) if rows is None else np.asarray(rows)] = False
+            which = slice(None) if rows is None else np.asarray(rows)
+            self._warm[which] = False
+            self._chain.reset(which)
         except IndexError as error:
             raise InputError(f"rows is {rows!r}; give indices of robots from 0 to {self.n_robots - 1}, or a mask.") from error
 
     def snapshot(self) -> Snapshot:
         """A copy of everything that a later step depends on."""
-        return Snapshot(_copied(self._memory), self._warm.copy(), self._given, self._ports, self._state)
+        effects = [link.memory.copy() for link in self._chain.links]
+        return Snapshot(
+            _copied(self._memory),
+            self._warm.copy(),
+            self._given,
+            self._ports,
+            self._state,
+            self._params,
+            self._bare,
+            effects,
+            self._chain.time.copy(),
+        )
 
     def restore(self, snapshot: Snapshot) -> None:
         """Go back to a `snapshot` of this simulator."""
@@ -257,6 +291,9 @@ class Simulator:
             raise InputError("the snapshot is of another simulator; its robots, tendons or their number differ.")
         self._memory = _copied(snapshot.memory)
         self._warm, self._given, self._ports, self._state = snapshot.warm.copy(), snapshot.given, snapshot.ports, snapshot.state
+        self._params, self._bare, self._chain.time = snapshot.params, snapshot.bare, snapshot.time.copy()
+        for link, memory in zip(self._chain.links, snapshot.effects, strict=True):
+            link.memory[:] = memory
 
     def _read(self, given: Inputs) -> tuple[Ports, Ints]:
         """The ports, and the robots whose inputs are good."""
@@ -264,6 +301,10 @@ class Simulator:
         self._given = given
         problems = self._reader.problems
         rows = np.setdiff1d(self._all, list(problems)) if problems else self._all
+        if self._chain:
+            skip = np.isin(self._all, list(problems)) if problems else np.zeros(self.n_robots, bool)
+            self._bare = ports
+            ports, self._params = self._chain.act(ports, self._plain, self._state, self.dt, self._layout.n_steps, skip)
         track_force = len(self._memory.force_before) > 0 or self._force_moves(ports.tip_force)
         self._remember(follower=len(ports.follower_force) > 0, track_force=track_force)
         return ports, rows

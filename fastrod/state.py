@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from fastrod.errors import InputError
 from fastrod.inputs import Inputs
-from fastrod.types import Flags, Floats, Ints, Memory, Ports
+from fastrod.types import Flags, Floats, Ints, Memory, Params, Ports
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,3 +92,7 @@ class Snapshot(NamedTuple):
     given: Inputs
     ports: Ports | None
     state: State | None
+    params: Params
+    bare: Ports | None
+    effects: list[Floats]
+    time: Floats

@@ -1,0 +1,35 @@
+"""Play of gears and of wires in their holes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fastrod.effect import Operator, Parameter, Seam, effect
+from fastrod.kernels.operators import play
+from fastrod.types import Floats
+from fastrod.wiring import Wiring
+
+
+@effect
+class Backlash(Operator):
+    """Play of gears and of wires in their holes.
+
+    Equation: p stays until |l - p| <= w is crossed: p = max(l - w, min(l + w, p))
+    Source: play operator (Visintin 1994); backlash of wire drives (Palli and Melchiorri)
+    Residual signature: flat spot after every reversal, as wide at small as at large bends, the same at every speed
+    """
+
+    seam = Seam.ACTUATION
+    order = 30.0
+    parameters = (Parameter("half_width", "m", bounds=(0.0, 0.6), typical=0.03, starts=(0.012, 0.04), per="segment", of="reach"),)
+    excited_by = "slow reversals of many sizes"
+    confounded_with = ("friction", "slack")
+    synonyms = ("gear_play", "play")
+
+    def memory(self, n_robots: int, n_tendons: int) -> Floats:
+        return np.full((n_robots, n_tendons), np.nan)
+
+    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Wiring) -> Floats:  # noqa: ARG002
+        out = dl.copy()
+        play(out, memory, wiring.by_end(values))
+        return out

@@ -1,0 +1,158 @@
+"""Operators with memory on the lengths of the wires: rows (robots or parameter sets) x steps x wires.
+
+Each changes `x` (n_rows, n_steps, n_wires) in place from command to effect and carries `memory` (n_rows, ...) on; nan in
+the memory means that the wire begins at rest at its first length. `dt` (n_steps,) is the time before each step [s].
+Parameters have the shape (n_rows, n_wires), so that every wire may have its own.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fastrod.kernels.jit import entry
+
+Floats = NDArray[np.float64]
+
+BUFFER = 128
+"""Past steps that `delay` keeps; a delay longer than they span is cut to it."""
+
+
+@entry
+def play(x: Floats, memory: Floats, half_width: Floats) -> None:
+    """Backlash: the output p stays until the input has crossed the gap, |x - p| <= w. memory (n_rows, n_wires): p."""
+    for r in range(x.shape[0]):
+        for w in range(x.shape[2]):
+            p, gap = memory[r, w], half_width[r, w]
+            if math.isnan(p):
+                p = x[r, 0, w]
+            for i in range(x.shape[1]):
+                here = x[r, i, w]
+                p = max(here - gap, min(here + gap, p))
+                x[r, i, w] = p
+            memory[r, w] = p
+
+
+@entry
+def dahl(x: Floats, memory: Floats, amplitude: Floats, presliding: Floats, growth: Floats) -> None:
+    """Dry friction without rates: z' = |x'|/r (sgn x' - z), out x - a (1 + g |x|) z; memory (n_rows, 2 n_wires): x, z."""
+    n = x.shape[2]
+    for r in range(x.shape[0]):
+        for w in range(n):
+            before, z = memory[r, w], memory[r, n + w]
+            a, length, g = amplitude[r, w], presliding[r, w], growth[r, w]
+            if math.isnan(before):
+                before, z = x[r, 0, w], 0.0
+            for i in range(x.shape[1]):
+                here = x[r, i, w]
+                move = here - before
+                if move != 0.0:
+                    side = 1.0 if move > 0.0 else -1.0
+                    z = side + (z - side) * math.exp(-abs(move) / length)
+                before = here
+                x[r, i, w] = here - a * (1.0 + g * abs(here)) * z
+            memory[r, w], memory[r, n + w] = before, z
+
+
+@entry
+def relaxation(x: Floats, memory: Floats, share: Floats, time_constant: Floats, dt: Floats) -> None:
+    """Standard linear solid: out x - c (x - y), tau y' = x - y, x linear in between; memory (n_rows, 2 n_wires): x, y."""
+    n = x.shape[2]
+    for r in range(x.shape[0]):
+        for w in range(n):
+            before, y = memory[r, w], memory[r, n + w]
+            c, tau = share[r, w], time_constant[r, w]
+            if math.isnan(before):
+                before = x[r, 0, w]
+                y = before
+            for i in range(x.shape[1]):
+                here, h = x[r, i, w], dt[i]
+                if h > 0.0:
+                    lag = tau * (here - before) / h
+                    y = here - lag + (y - before + lag) * math.exp(-h / tau)
+                before = here
+                x[r, i, w] = here - c * (here - y)
+            memory[r, w], memory[r, n + w] = before, y
+
+
+@entry
+def second_order(x: Floats, memory: Floats, period: Floats, damping: Floats, dt: Floats) -> None:
+    """T^2 y'' + 2 z T y' + y = x, exact for x linear in between; T = 0 is y = x. memory (n_rows, 3 n_wires): x, y, y'."""
+    n = x.shape[2]
+    for r in range(x.shape[0]):
+        for w in range(n):
+            before, y, v = memory[r, w], memory[r, n + w], memory[r, 2 * n + w]
+            T, z = period[r, w], damping[r, w]
+            if math.isnan(before):
+                before = x[r, 0, w]
+                y, v = before, 0.0
+            for i in range(x.shape[1]):
+                here, h = x[r, i, w], dt[i]
+                if T <= 0.0:
+                    y = here
+                elif h > 0.0:
+                    slope, lag = (here - before) / h, 2.0 * z * T
+                    rate = math.sqrt(1.0 - z * z) / T
+                    y0, v0 = y - before + lag * slope, v - slope
+                    decay, c, s = math.exp(-z * h / T), math.cos(rate * h), math.sin(rate * h)
+                    side = (v0 + z / T * y0) / rate
+                    y = here - lag * slope + decay * (y0 * c + side * s)
+                    v = slope + decay * ((side * rate - z / T * y0) * c - (z / T * side + rate * y0) * s)
+                before = here
+                x[r, i, w] = y
+            memory[r, w], memory[r, n + w], memory[r, 2 * n + w] = before, y, v
+
+
+@entry
+def yielding(x: Floats, memory: Floats, share: Floats, yield_at: Floats) -> None:
+    """Plastic set: out x + c p, p a play of half width y that begins at the straight rod; memory (n_rows, n_wires): p."""
+    for r in range(x.shape[0]):
+        for w in range(x.shape[2]):
+            p, y = memory[r, w], yield_at[r, w]
+            if math.isnan(p):
+                p = 0.0
+            for i in range(x.shape[1]):
+                here = x[r, i, w]
+                p = max(here - y, min(here + y, p))
+                x[r, i, w] = here + share[r, w] * p
+            memory[r, w] = p
+
+
+@entry
+def delay(x: Floats, memory: Floats, lag: Floats, dt: Floats) -> None:
+    """Out x(t - d), linear in between; memory (n_rows, 1 + BUFFER (1 + n_wires)): count, ages' clock, past lengths.
+
+    lag (n_rows,) [s]. Before the first step the wires are taken as at rest there.
+    """
+    n = x.shape[2]
+    width = 1 + n
+    for r in range(x.shape[0]):
+        if math.isnan(memory[r, 0]):
+            memory[r, 0] = 0.0
+        count = int(memory[r, 0])
+        clock = memory[r, 1 + ((count - 1) % BUFFER) * width] if count > 0 else 0.0
+        for i in range(x.shape[1]):
+            clock += dt[i] if count > 0 else 0.0
+            slot = 1 + (count % BUFFER) * width
+            memory[r, slot] = clock
+            for w in range(n):
+                memory[r, slot + 1 + w] = x[r, i, w]
+            count += 1
+            if lag[r] <= 0.0:
+                continue
+            wanted = clock - lag[r]
+            newer = older = slot
+            for back in range(1, min(count, BUFFER)):
+                newer = older
+                older = 1 + ((count - 1 - back) % BUFFER) * width
+                if memory[r, older] <= wanted:
+                    break
+            span = memory[r, newer] - memory[r, older]
+            part = (wanted - memory[r, older]) / span if span > 0.0 else 1.0
+            part = min(max(part, 0.0), 1.0)
+            for w in range(n):
+                old = memory[r, older + 1 + w]
+                x[r, i, w] = old + part * (memory[r, newer + 1 + w] - old)
+        memory[r, 0] = float(count)

@@ -1,0 +1,196 @@
+"""The rod of the plant: virtual work on Legendre curvatures, many samples at once. numpy only, nothing shared with the package under test.
+
+Equal segments with four wires each; wire i sits at OFFSET (cos a_i, sin a_i) in the material frame and runs from the base to the end of its
+segment. r' = R e3, R' = R [u]x; the base is the origin, its frame the identity. Energy, per arclength s,
+    integral (u - u*)' K (u - u*) / 2 ds  +  sum_i (l_i - L_i)^2 / (2 c)  -  work of dead loads,   l_i = integral |e3 + u x d_i| ds,
+is least over u(s) = sum_m P_m(s) a_m in every segment, by Newton steps with the whole second derivative.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cache
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+LENGTH, EI, GJ, OFFSET, COMPLIANCE, GRAVITY = 0.07, 2.2e-3, 1.0e-3, 0.0075, 1e-5, 9.81
+"""Of each segment: m, N m^2, N m^2, m; of each wire m/N; m/s^2 along -z of the world."""
+_NODES, _MODES = 8, 5
+
+
+def angles(segments: int) -> Array:
+    """Of the wires (tendons,) [rad]: each segment's four are 45 degrees on from those of the one before."""
+    return np.concatenate([0.25 * np.pi * k + 0.5 * np.pi * np.arange(4) for k in range(segments)])
+
+
+def routing(segments: int) -> Array:
+    """(2 segments, 2 segments) pair lengths [m] of bends [rad]; a distal pair feels the segments before its own too."""
+    angle = angles(segments).reshape(segments, 4)[:, :2].reshape(-1)
+    row = OFFSET * np.stack([np.sin(angle), -np.cos(angle)], axis=1)
+    crosses = np.arange(segments)[None] <= (np.arange(2 * segments) // 2)[:, None]
+    return np.asarray((crosses[:, :, None] * row[:, None]).reshape(2 * segments, -1))
+
+
+def pairs(dl: Array) -> Array:
+    """Half the difference of opposite wires (n, 2 segments) [m]."""
+    wire = dl.reshape(len(dl), -1, 2, 2)
+    return 0.5 * (wire[:, :, 0] - wire[:, :, 1]).reshape(len(dl), -1)
+
+
+def wires(pair: Array) -> Array:
+    """Both wires of each pair (n, tendons) [m] from the pairs (n, 2 segments)."""
+    first = pair.reshape(len(pair), -1, 1, 2)
+    return np.concatenate([first, -first], axis=2).reshape(len(pair), -1)
+
+
+def _lobatto() -> tuple[Array, Array, Array, Array]:
+    """On [0, 1]: nodes (n,), integral of a function from each node to 1 (n, n), Legendre modes there (n, modes) and at both Gauss points
+    of the steps between them (2, n - 1, modes)."""
+    n = _NODES
+    x = np.concatenate([[-1.0], np.sort(legendre.legroots(legendre.legder(np.eye(n)[n - 1]))), [1.0]])
+    primitive = [legendre.legint(row) for row in np.eye(n)]
+    beyond = np.stack([legendre.legval(1.0, p) - legendre.legval(x, p) for p in primitive], axis=1)
+    gauss = 0.5 * (x[:-1] + x[1:]) + 0.5 * np.diff(x) * np.array([[-1.0], [1.0]]) / np.sqrt(3.0)
+    inverse = np.linalg.inv(legendre.legvander(x, n - 1))
+    return 0.5 * (x + 1.0), 0.5 * beyond @ inverse, legendre.legvander(x, _MODES - 1), legendre.legvander(gauss, _MODES - 1)
+
+
+NODES, _BEYOND, _MODE, _MODE_GAUSS = _lobatto()
+"""NODES: where a segment's numbers are given, as shares of its length."""
+
+
+@cache
+def _chain(segments: int) -> tuple[Array, Array]:
+    """Integral from each node to the tip (nodes, nodes) [m] and modes at the nodes (nodes, modes), of the whole chain."""
+    later = np.triu(np.ones((segments, segments)), 1)
+    beyond = np.kron(np.eye(segments), _BEYOND) + np.kron(later, np.tile(_BEYOND[0], (len(NODES), 1)))
+    return LENGTH * beyond, np.kron(np.eye(segments), _MODE)
+
+
+@dataclass(frozen=True)
+class Rod:
+    """A chain of equal segments; nodes means all of them, (segments * len(NODES))."""
+
+    segments: int = 1
+    compliance: float = COMPLIANCE
+    """Of each wire [m/N]."""
+    angle: Array = field(default_factory=lambda: np.zeros(0))
+    """Of the wires (tendons,) [rad]; none given: where they belong."""
+    stiffness: Array = field(default_factory=lambda: np.diag([EI, EI, GJ]))
+    """(3, 3) or (nodes, 3, 3) [N m^2]."""
+    precurvature: Array = field(default_factory=lambda: np.zeros(3))
+    """(3,) or (nodes, 3) [1/m]."""
+    density: Array = field(default_factory=lambda: np.zeros(1))
+    """(1,) or (nodes,) [kg/m]."""
+
+    def rest(
+        self, dl: Array, tip_force: Array, down: Array, *, payload: Array | float = 0.0, lever: float = 0.0, start: Array | None = None
+    ) -> tuple[Array, Array, Array]:
+        """Where the energy is least: chords of the segments (n, segments, 3) [m], rotations of the tip (n, 3, 3), modes to start from.
+
+        - `dl` (n, tendons) [m]; `tip_force` (n, 3) [N] and `down` (n, 3) [m/s^2], the acceleration of gravity, in the base frame.
+        - `payload` (n, 1) [kg], with its centre `lever` [m] beyond the tip.
+        """
+        n = len(dl)
+        if start is None:
+            start = np.zeros((n, self.segments, _MODES, 3))
+            start[:, :, 0, :2] = (pairs(dl) @ np.linalg.inv(routing(self.segments)).T).reshape(n, -1, 2) / LENGTH
+        modes, tension, todo, weight = start.reshape(n, -1, 3).copy(), np.zeros_like(dl), np.arange(n), payload * down
+        for _ in range(60):
+            move, tension[todo] = self._newton(modes[todo], tension[todo], dl[todo], tip_force[todo], down[todo], weight[todo], lever)
+            # a third of a radian in one pass is far enough
+            most = LENGTH * np.abs(move).sum(axis=(1, 2))
+            modes[todo] += move * np.minimum(1.0, 0.35 / np.maximum(most, 1e-12))[:, None, None]
+            todo = todo[most > 1e-5]  # the next step would be its square
+            if not len(todo):
+                chords, frame = self._shape(modes)
+                return chords, frame[:, -1], modes
+        raise ArithmeticError(f"{len(todo)} of {n} samples have no rest within 60 passes")
+
+    def _shape(self, modes: Array) -> tuple[Array, Array]:
+        """Chords (n, segments, 3) [m] and frames at the nodes (n, nodes, 3, 3)."""
+        gauss = np.einsum("gjm,nsmx->gnsjx", _MODE_GAUSS, modes.reshape(len(modes), self.segments, _MODES, 3), optimize=True)
+        h = LENGTH * np.diff(NODES)[:, None]
+        # fourth order Magnus
+        step = _exponential(0.5 * h * (gauss[0] + gauss[1]) + (np.sqrt(3.0) / 12.0) * h**2 * _cross(gauss[0], gauss[1]))
+        frame = np.empty((len(modes), self.segments, len(NODES), 3, 3))
+        now = np.broadcast_to(np.eye(3), (len(modes), 3, 3))
+        for s in range(self.segments):
+            frame[:, s, 0] = now
+            for j in range(len(NODES) - 1):
+                now = now @ step[:, s, j]
+                frame[:, s, j + 1] = now
+        chords = LENGTH * np.einsum("j,nsjx->nsx", _BEYOND[0], frame[..., 2])
+        return chords, frame.reshape(len(modes), -1, 3, 3)
+
+    def _newton(
+        self, modes: Array, tension: Array, dl: Array, tip_force: Array, down: Array, weight: Array, lever: float
+    ) -> tuple[Array, Array]:
+        """A step of the modes (n, segments * modes, 3) and the tensions (n, tendons) [N] after it.
+
+        Tensions are unknowns of their own: what a stiff wire would pull in a shape that is not yet the right one is absurd.
+        """
+        n, size = len(modes), 3 * modes.shape[1]
+        beyond, mode = _chain(self.segments)
+        nodes, step = len(mode), beyond[0]
+        weighted = step[:, None] * mode
+        _, frame = self._shape(modes)
+        u = mode @ modes
+        stiffness = np.broadcast_to(self.stiffness, (nodes, 3, 3))
+        moment = np.einsum("jxy,njy->njx", stiffness, u - self.precurvature)
+        # wires
+        angle = self.angle if len(self.angle) else angles(self.segments)
+        place = OFFSET * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+        last = np.repeat(np.arange(self.segments), 4)
+        crosses = (np.repeat(np.arange(self.segments), len(NODES))[:, None] <= last).astype(float)  # (nodes, tendons)
+        q = _cross(u[:, :, None], place) + np.array([0.0, 0.0, 1.0])
+        speed = np.sqrt(np.sum(q * q, axis=-1))
+        taut = (np.einsum("j,nji,ji->ni", step, speed, crosses) - dl - LENGTH * (last + 1.0)) / self.compliance
+        turn = _cross(place, q) * (crosses / speed)[..., None]  # d|q|/du
+        slope = (weighted.T @ turn.reshape(n, nodes, -1)).reshape(n, len(mode.T), -1, 3).swapaxes(1, 2).reshape(n, -1, size)
+        moment = moment + np.einsum("ni,njix->njx", taut, turn)
+        # d2|q|/du2 = ([d]x'[d]x - turn turn') / |q|
+        pull = tension[:, None] * crosses / speed
+        lock = np.sum(place**2, axis=1)[:, None, None] * np.eye(3) - place[:, :, None] * place[:, None]
+        curving = stiffness + (pull @ lock.reshape(-1, 9)).reshape(n, nodes, 3, 3) - np.swapaxes(pull[..., None] * turn, 2, 3) @ turn
+        products = (weighted[:, :, None] * mode[:, None]).reshape(nodes, -1)
+        hessian = (np.swapaxes(curving.reshape(n, nodes, 9), 1, 2) @ products).reshape(n, 3, 3, len(mode.T), -1)
+        hessian = hessian.transpose(0, 3, 1, 4, 2).reshape(n, size, size) + np.swapaxes(slope, 1, 2) @ slope / self.compliance
+        # loads: dt = dtheta x t turns all that is beyond; two turns, the nearer to the base outermost, give t N' - (t.N) 1
+        force = (tip_force + weight)[:, None] + (beyond @ np.broadcast_to(self.density, nodes))[:, None] * down[:, None]
+        spread = _outer(frame[..., 2], force)
+        work = (beyond @ spread.reshape(n, nodes, 9)).reshape(n, nodes, 3, 3) + lever * _outer(frame[:, -1, :, 2], weight)[:, None]
+        lift = np.stack([work[..., 1, 2] - work[..., 2, 1], work[..., 2, 0] - work[..., 0, 2], work[..., 0, 1] - work[..., 1, 0]], axis=-1)
+        moment = moment - (lift[:, :, None] @ frame)[:, :, 0]
+        twice = (work - np.trace(work, axis1=2, axis2=3)[..., None, None] * np.eye(3)) @ frame
+        # what each mode has turned before a node: integral from the base of P_m R', then both orders of the two turns
+        turned = (beyond[0] - beyond) @ (mode[:, :, None, None] * frame[:, :, None]).reshape(n, nodes, -1)
+        turned = turned.reshape(n, nodes, -1, 3, 3).transpose(0, 2, 4, 1, 3).reshape(n, size, -1)
+        half = turned @ (weighted[:, None, :, None] * twice[:, :, :, None]).reshape(n, 3 * nodes, size)
+        gradient = (weighted.T @ moment).reshape(n, size, 1)
+        move = -np.linalg.solve(hessian - half - np.swapaxes(half, 1, 2), gradient)
+        return move.reshape(modes.shape), taut + (slope @ move)[..., 0] / self.compliance
+
+
+def _outer(a: Array, b: Array) -> Array:
+    return a[..., :, None] * b[..., None, :]
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """np.cross without its checks."""
+    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
+    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+
+
+def _exponential(w: Array) -> Array:
+    """exp [w]x (..., 3, 3) by Rodrigues."""
+    angle = np.sqrt(np.sum(w * w, axis=-1))[..., None, None]
+    x, y, z = w[..., 0], w[..., 1], w[..., 2]
+    o = np.zeros_like(x)
+    hat = np.stack([o, -z, y, z, o, -x, -y, x, o], axis=-1).reshape(*w.shape, 3)
+    return np.eye(3) + np.sinc(angle / np.pi) * hat + 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2 * (hat @ hat)
