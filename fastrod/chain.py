@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fastrod.effect import Effect, Seam, canonical_name, effect_names, get_effect, read_values
-from fastrod.errors import EffectError, RobotError
+from fastrod.errors import EffectError, RobotError, nearest
 from fastrod.ports import EffectPorts, close_ports, open_ports
 from fastrod.robot import Robot
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.types import Flags, Floats, Params, Ports
-from fastrod.wiring import wire
+from fastrod.wiring import Wiring, wire
 
 
 class Measurement(NamedTuple):
@@ -42,6 +42,8 @@ def named_effects(robot: Robot) -> dict[str, dict[str, Any]]:
     """Tables of a robot's effects by canonical name, in the order in which they act. Raises for a name that is not known."""
     tables: dict[str, dict[str, Any]] = {}
     for table in robot.effects:
+        if "name" not in table:
+            raise EffectError(f"robot {robot.name!r}: effect {dict(table)!r} has no name; {nearest('', effect_names())}")
         name = canonical_name(str(table["name"]))
         if name in tables:
             raise EffectError(f"robot {robot.name!r} has effect {name!r} twice; each effect stands once.")
@@ -49,6 +51,11 @@ def named_effects(robot: Robot) -> dict[str, dict[str, Any]]:
     if not tables:
         return {}
     return {name: tables[name] for name in effect_names() if name in tables}
+
+
+def _alike(one: Wiring, other: Wiring) -> bool:
+    """Whether wires and segments are the same to a part in a million million."""
+    return bool(np.allclose(one.arms, other.arms, rtol=1e-12, atol=0.0) and np.allclose(one.length, other.length, rtol=1e-12, atol=0.0))
 
 
 class Chain:
@@ -64,9 +71,15 @@ class Chain:
                     f"robot {i} of the batch has effects {', '.join(named) or 'none'}, robot 0 has {', '.join(tables[0]) or 'none'}; "
                     "name the same effects in each, with neutral values where one has none."
                 )
+            if named and robots[i] is not robots[0] and not _alike(wire(robots[i]), self.wiring):
+                raise RobotError(
+                    f"robot {i} of the batch has segments of other lengths or wires at other places than robot 0; "
+                    "with effects these must agree: give robots that differ there a simulator each."
+                )
         self.n_robots = n_robots
         self.rest_length = robots[0].rest_tendon_length
         self.gravity = np.array([robot.gravity for robot in robots])
+        self._pulled = np.array([robots[0].segments[end].mode == "tendon_tension" for end in robots[0].tendon_segment], dtype=bool)
         self.links: list[Link] = []
         for name in tables[0]:
             rows = [read_values(name, named[name], self.wiring, f"robot {r.name!r}") for named, r in zip(tables, robots, strict=True)]
@@ -114,6 +127,9 @@ class Chain:
         inputs = np.concatenate([np.broadcast_to(a, (self.n_robots, a.shape[1])) for a in (ports.tendon_length, ports.extension)], axis=1)
         slopes = np.empty((self.n_robots, inputs.shape[1], inputs.shape[1]))
         for j in range(inputs.shape[1]):
+            if j < n_tendons and self._pulled[j]:  # a tension: no effect changes it
+                slopes[:, :, j] = np.arange(inputs.shape[1]) == j
+                continue
             ends = []
             for sign in (1.0, -1.0):
                 moved = inputs.copy()
@@ -132,10 +148,14 @@ class Chain:
         return Measurement(opened.tip_position, opened.tip_rotation, opened.points)
 
     def _open(self, ports: Ports, params: Params, n_steps: int) -> EffectPorts:
-        return open_ports(
+        opened = open_ports(
             ports, params, self.wiring, n=self.n_robots, rest_length=self.rest_length, gravity=self.gravity,
             base_rotation=matrix_from_quaternion(ports.base_pose[:, 3:]), time=np.nan_to_num(self.time), n_steps=n_steps,
         )  # fmt: skip
+        opened.tendon_length[:, self._pulled] = self.rest_length[self._pulled]  # these are not commanded: nothing to act on
+        for given in (opened.tendon_length, opened.extension, opened.tip_force, opened.tip_moment, opened.line_force):
+            given[np.isinf(given)] = np.nan  # a bad input: nan passes through an effect without a warning, inf does not
+        return opened
 
     def _apply(self, opened: EffectPorts, state: Any, dt: float, links: Sequence[Link]) -> None:
         for link in links:

@@ -173,19 +173,22 @@ def effect(cls: _Class) -> _Class:
         raise EffectError(f"effect {name!r} has seam {made.seam!r}; give one of {', '.join(map(str, Seam))}.")
     if not made.parameters or not all(isinstance(p, Parameter) for p in made.parameters):
         raise EffectError(f"effect {name!r} has parameters {made.parameters!r}; give a tuple of Parameter, at least one.")
-    taken = _REGISTRY.get(name)
-    if taken is not None and type(taken).__qualname__ + type(taken).__module__ != cls.__qualname__ + cls.__module__:
-        raise EffectError(f"an effect named {name!r} is already registered by {type(taken).__module__}.")
+    synonyms = tuple(getattr(cls, "synonyms", ()))
+    for word in (name, *synonyms):
+        taken = _REGISTRY.get(_SYNONYMS.get(word, word))
+        if taken is not None and type(taken).__qualname__ + type(taken).__module__ != cls.__qualname__ + cls.__module__:
+            raise EffectError(f"an effect named {word!r} is already registered by {type(taken).__module__}.")
     _REGISTRY[name] = made
-    for synonym in getattr(cls, "synonyms", ()):
-        _SYNONYMS[synonym] = name
+    _SYNONYMS.update(dict.fromkeys(synonyms, name))
     return cls
 
 
 def unregister(name: str) -> None:
     """Take an effect out of the registry, for a library without it."""
-    get_effect(name)
+    name = canonical_name(name)
     del _REGISTRY[name]
+    for synonym in [synonym for synonym, meant in _SYNONYMS.items() if meant == name]:
+        del _SYNONYMS[synonym]
 
 
 def effect_names() -> list[str]:

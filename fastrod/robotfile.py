@@ -167,7 +167,7 @@ _TYPES: dict[str, Any] = {
     "base_quaternion": tuple[float, float, float, float],
     "gravity": tuple[float, float, float],
     "log_points": tuple[float, ...],
-    "fit": dict[str, dict[str, float]],
+    "fit": dict[str, dict[str, float | bool]],
     "sensor": dict[str, float | tuple[float, ...]],
 }
 

@@ -22,7 +22,7 @@ from fastrod.robot import Robot
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.settle import settle
 from fastrod.state import Observer, Pose, Snapshot, State
-from fastrod.types import Flags, Floats, Ints, Memory, Ports, Response, Shape
+from fastrod.types import Flags, Floats, Ints, Memory, Params, Ports, Response, Shape
 
 _config: Any = numba.config
 _LOST = 0.1  # of the robot's length: a residual beyond it is no shape of this robot
@@ -168,6 +168,17 @@ class Simulator:
         _check_positive("tolerance", tolerance, "m")
         given = Inputs(tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force, follower_tip_force, base_pose)
         ports, rows = self._read(given)
+        return self._settle(ports, rows, tolerance)
+
+    def settle_ports(self, ports: Ports, params: Params, tolerance: float = 1e-9) -> State:
+        """`settle` on what the kernel reads, with effects already in it: for those who carry effects over a whole log
+        themselves. `params` may have a row for each robot."""
+        self._reader.problems = {}
+        self._params, self._bare = params, None
+        self._remember(follower=False, track_force=False)
+        return self._settle(ports, self._all, tolerance)
+
+    def _settle(self, ports: Ports, rows: Ints, tolerance: float) -> State:
         shape = self._new_shape(self.outputs, len(rows) < self.n_robots)
 
         def run(which: Ints, at: Ports) -> Floats:
@@ -289,6 +300,8 @@ class Simulator:
         """Go back to a `snapshot` of this simulator."""
         if snapshot.memory.x.shape[0] != self.n_robots or snapshot.memory.length_before.shape != self._memory.length_before.shape:
             raise InputError("the snapshot is of another simulator; its robots, tendons or their number differ.")
+        if [memory.shape for memory in snapshot.effects] != [link.memory.shape for link in self._chain.links]:
+            raise InputError("the snapshot is of another simulator; its effects differ.")
         self._memory = _copied(snapshot.memory)
         self._warm, self._given, self._ports, self._state = snapshot.warm.copy(), snapshot.given, snapshot.ports, snapshot.state
         self._params, self._bare, self._chain.time = snapshot.params, snapshot.bare, snapshot.time.copy()

@@ -44,19 +44,27 @@ class Wiring:
 
     def by_tendon(self, per_drive: Floats) -> Floats:
         """(..., n_tendons) from (..., n_drives), unsigned."""
-        return np.asarray(per_drive[..., self.drive])
+        return np.ascontiguousarray(per_drive[..., self.drive])
 
     def by_end(self, per_segment: Floats) -> Floats:
         """(..., n_tendons) from (..., n_segments): the value of the segment at whose end the wire ends."""
-        return np.asarray(per_segment[..., self.tendon_segment])
+        return np.ascontiguousarray(per_segment[..., self.tendon_segment])
 
     def bend(self, dl: Floats) -> Floats:
         """(..., n_segments, 2) bend about d1 and d2 [rad] that these wire lengths (..., n_tendons) ask for."""
-        return np.asarray((dl @ self.bend_from_wires.T).reshape(*dl.shape[:-1], self.n_segments, 2))
+        return _times(dl, self.bend_from_wires.T).reshape(*dl.shape[:-1], self.n_segments, 2)
 
     def wires(self, bend: Floats) -> Floats:
         """(..., n_tendons) change of wire length [m] that goes with a bend (..., n_segments, 2) [rad]."""
-        return np.asarray(bend.reshape(*bend.shape[:-2], -1) @ self.arms.T)
+        return _times(bend.reshape(*bend.shape[:-2], 2 * self.n_segments), self.arms.T)
+
+
+def _times(a: Floats, matrix: Floats) -> Floats:
+    """a @ matrix, summed in one order: BLAS takes another one with the number of rows, and a batch must be its robots bit by bit."""
+    out = np.zeros((*a.shape[:-1], matrix.shape[1]))
+    for i, row in enumerate(matrix):
+        out += a[..., i, None] * row
+    return out
 
 
 def wire(robot: Robot) -> Wiring:

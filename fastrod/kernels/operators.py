@@ -16,6 +16,8 @@ from fastrod.kernels.jit import entry
 
 Floats = NDArray[np.float64]
 
+SLIDERS = 5
+"""Of `elastoplastic`."""
 BUFFER = 128
 """Past steps that `delay` keeps; a delay longer than they span is cut to it."""
 
@@ -36,24 +38,33 @@ def play(x: Floats, memory: Floats, half_width: Floats) -> None:
 
 
 @entry
-def dahl(x: Floats, memory: Floats, amplitude: Floats, presliding: Floats, growth: Floats) -> None:
-    """Dry friction without rates: z' = |x'|/r (sgn x' - z), out x - a (1 + g |x|) z; memory (n_rows, 2 n_wires): x, z."""
+def elastoplastic(x: Floats, memory: Floats, amplitude: Floats, presliding: Floats, spread: Floats, growth: Floats, angle: Floats) -> None:
+    """Dry friction without rates: sliders in parallel, each sticking until it has been dragged by its own r_j (Iwan,
+    Prandtl and Ishlinskii): z_j = min(1, max(-1, z_j + x' / r_j)), out x - a (1 + g angle) mean z_j.
+
+    The radii are spread evenly over r (1 - s) to r (1 + s). angle (n_rows, n_steps, n_wires) wrapped by the wire [rad];
+    memory (n_rows, (1 + SLIDERS) n_wires): x, z_j.
+    """
     n = x.shape[2]
     for r in range(x.shape[0]):
         for w in range(n):
-            before, z = memory[r, w], memory[r, n + w]
-            a, length, g = amplitude[r, w], presliding[r, w], growth[r, w]
+            before = memory[r, w]
+            a, g = amplitude[r, w], growth[r, w]
             if math.isnan(before):
-                before, z = x[r, 0, w], 0.0
+                before = x[r, 0, w]
+                for j in range(SLIDERS):
+                    memory[r, (1 + j) * n + w] = 0.0
             for i in range(x.shape[1]):
                 here = x[r, i, w]
-                move = here - before
-                if move != 0.0:
-                    side = 1.0 if move > 0.0 else -1.0
-                    z = side + (z - side) * math.exp(-abs(move) / length)
+                mean = 0.0
+                for j in range(SLIDERS):
+                    radius = presliding[r, w] * (1.0 + spread[r, w] * (2.0 * j / (SLIDERS - 1) - 1.0))
+                    z = min(1.0, max(-1.0, memory[r, (1 + j) * n + w] + (here - before) / radius))
+                    memory[r, (1 + j) * n + w] = z
+                    mean += z
                 before = here
-                x[r, i, w] = here - a * (1.0 + g * abs(here)) * z
-            memory[r, w], memory[r, n + w] = before, z
+                x[r, i, w] = here - a * (1.0 + g * angle[r, i, w]) * mean / SLIDERS
+            memory[r, w] = before
 
 
 @entry

@@ -16,13 +16,17 @@ import sys
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from plant_rod import EI, GJ, GRAVITY, LENGTH, NODES, OFFSET, Array, Rod, angles, pairs, routing, wires
 from scipy.interpolate import CubicSpline, PchipInterpolator
 from scipy.signal import bilinear, lfilter, lfilter_zi
 from scipy.spatial.transform import Rotation, Slerp
+from scipy.special import expit
+
+sys.path.insert(0, str(Path(__file__).parent))
+from plant_rod import EI, GJ, GRAVITY, LENGTH, NODES, OFFSET, Array, Rod, angles, pairs, routing, wires
 
 Size = Literal["small", "typical", "large"] | float
 
@@ -50,7 +54,7 @@ class Inputs:
 
     @property
     def segments(self) -> int:
-        return self.dl.shape[1] // 4
+        return int(self.dl.shape[1] // 4)
 
 
 @dataclass(frozen=True)
@@ -107,15 +111,18 @@ def _generator(seed: int, name: str) -> np.random.Generator:
 
 
 def _parameters(name: str, rng: np.random.Generator, segments: int, size: Size) -> dict[str, Any]:
-    """One effect's numbers; `amount` is what `size` scales."""
-    span = {"small": (0.0, 0.35), "typical": (0.35, 0.85), "large": (0.85, 1.0)}[size if isinstance(size, str) else "typical"]
+    """One effect's numbers; `amount` is what `size` scales. The longer robot has three times the reach: its typical is lower."""
+    as_ever = name in ("stiffness_anisotropy", "time_drift", "lens", "bump", "sway")
+    typical = (0.35, 0.85) if segments == 1 or as_ever else (0.05, 0.4)
+    span = {"small": (0.0, 0.35), "typical": typical, "large": (0.85, 1.0)}[size if isinstance(size, str) else "typical"]
     part, factor = rng.uniform(*span), 1.0 if isinstance(size, str) else size
-    pairs, reach = 2 * segments, 0.03 if segments == 1 else 0.09
+    n_pairs, reach = 2 * segments, 0.03 if segments == 1 else 0.09
 
-    def amount(low: float, high: float) -> float:
-        return float(factor * (low + part * (high - low)))
+    def amount(low: float, high: float, power: float = 1.0) -> float:
+        """The higher the power, the nearer to the low end: where the high end would drown all else."""
+        return float(factor * (low + part**power * (high - low)))
 
-    def signs(n: int = pairs) -> Array:
+    def signs(n: int = n_pairs) -> Array:
         return rng.choice([-1.0, 1.0], n)
 
     def direction(flat: float = 1.0) -> Array:
@@ -136,21 +143,22 @@ def _parameters(name: str, rng: np.random.Generator, segments: int, size: Size) 
         case "friction":  # bend lost [rad], growth [1/rad], radii [rad] of the plays and their shares
             n = int(rng.integers(3, 6))
             radii = np.sort(uniform(2.0, 15.0, n)) * degree
-            return {"loss": amount(1.0, 6.0) * degree, "growth": uniform(0.3, 0.8), "radii": radii, "shares": rng.dirichlet(4.0 * np.ones(n))}
+            loss = {"loss": amount(1.0, 6.0, 1.5) * degree, "growth": uniform(0.3, 0.8)}
+            return loss | {"radii": radii, "shares": rng.dirichlet(np.full(n, 4.0))}
         case "backlash":  # m of wire
-            return {"half_width": amount(1e-4, 4e-4) * uniform(0.88, 1.12, pairs)}
+            return {"half_width": amount(1e-4, 4e-4) * uniform(0.88, 1.12, n_pairs)}
         case "slack":  # m of wire
-            return {"half_width": amount(1.0, 5.0) * degree * OFFSET * uniform(0.88, 1.12, pairs)}
+            return {"half_width": amount(1.0, 5.0) * degree * OFFSET * uniform(0.88, 1.12, n_pairs)}
         case "tendon_stretch":
-            return {"gain_loss": amount(0.03, 0.26)}
-        case "coupling":  # share of the neighbour's bend: proximal into distal, distal into proximal; turned by an angle
+            return {"gain_loss": amount(0.03, 0.26, 1.5)}
+        case "coupling" if segments > 1:  # share of the neighbour's bend: proximal into distal, distal into proximal; turned by an angle
             return {"leak": amount(0.02, 0.20) * signs(1)[0] * np.array([1.0, uniform(0.0, 0.4)]), "turn": uniform(-12.0, 12.0) * degree}
         case "drum_gain":
-            return {"gain": amount(0.02, 0.05) * uniform(0.85, 1.0, pairs) * signs()}
+            return {"gain": amount(0.02, 0.05) * uniform(0.85, 1.0, n_pairs) * signs()}
         case "encoder_offset":  # rad of bend
-            return {"offset": amount(0.5, 3.0) * degree * uniform(0.7, 1.0, pairs) * signs()}
+            return {"offset": amount(0.5, 3.0) * degree * uniform(0.7, 1.0, n_pairs) * signs()}
         case "routing_angle":
-            return {"angle": amount(1.0, 5.0) * degree * uniform(0.6, 1.0, pairs) * signs()}
+            return {"angle": amount(1.0, 5.0) * degree * uniform(0.6, 1.0, n_pairs) * signs()}
         case "creep":
             split = uniform(0.35, 0.65)
             return {"share": amount(0.03, 0.15) * np.array([split, 1.0 - split]), "tau": np.array([log(1.0, 5.0), log(10.0, 60.0)])}
@@ -172,13 +180,13 @@ def _parameters(name: str, rng: np.random.Generator, segments: int, size: Size) 
         case "temperature":  # gain when warm, s
             return {"gain": amount(0.03, 0.10) * signs(1)[0], "tau": log(40.0, 200.0)}
         case "latency":  # s, s per s
-            return {"delay": amount(0.03, 0.2), "skew": uniform(-1e-4, 1e-4)}
+            return {"delay": amount(0.03, 0.2, 3.0), "skew": uniform(-1e-4, 1e-4)}
         case "dynamics":  # Hz of each pair, damping ratio; `amount` sets the period
-            return {"frequency": 1.0 / amount(1.0 / 3.0, 1.0) * uniform(0.9, 1.1, pairs), "damping": uniform(0.15, 0.5)}
+            return {"frequency": 1.0 / amount(1.0 / 3.0, 1.0, 3.0) * uniform(0.9, 1.1, n_pairs), "damping": uniform(0.15, 0.5)}
         case "frame_misalignment":  # rotation vector [rad], m
             return {"turn": amount(0.5, 3.0) * degree * direction(), "shift": amount(5e-4, 5e-3) * direction()}
         case "marker_offset":  # m in the tip's frame
-            return {"offset": amount(2e-3, 2e-2) * direction()}
+            return {"offset": amount(2e-3, 2e-2, 3.0) * direction()}
         case "camera_scale":  # across and along the axis of view
             return {"scale": amount(0.005, 0.02) * signs(1)[0] * np.array([1.0, 1.0, uniform(0.7, 1.3)])}
         case "lens":  # relative at the edge of the workspace; m; m
@@ -189,18 +197,18 @@ def _parameters(name: str, rng: np.random.Generator, segments: int, size: Size) 
             return {"sway": amount(3e-4, 2e-3) * direction(), "frequency": log(0.2, 2.0), "phase": uniform(0.0, 2.0 * np.pi)}
         case "ripple":  # m of wire; m; turns of the motor per turn of the drum; rad
             ripple = {"amplitude": amount(1e-4, 3e-4), "drum_radius": uniform(4e-3, 8e-3), "gear": float(rng.integers(4, 9))}
-            return ripple | {"phase": uniform(0.0, 2.0 * np.pi, pairs)}
+            return ripple | {"phase": uniform(0.0, 2.0 * np.pi, n_pairs)}
         case "contact":  # a plane: base frame, m, N/m
-            return {"normal": direction(0.2), "distance": uniform(0.25, 0.45) * reach, "stiffness": amount(20.0, 200.0)}
+            return {"normal": direction(0.0), "distance": uniform(0.35, 0.55) * reach, "stiffness": amount(20.0, 100.0) / segments}
         case "slip":  # m of wire, share of the log
-            jump = np.zeros(pairs)
-            jump[rng.integers(pairs)] = amount(1e-4, 4e-4) * signs(1)[0]
+            jump = amount(1e-4, 4e-4) * signs(1)[0] * (np.arange(n_pairs) == rng.integers(n_pairs))
             return {"jump": jump, "at": uniform(0.2, 0.7)}
-        case "magnet":  # m in the base frame; N at `distance`; force falls with 1/(d^2 + core^2)
-            angle, far = uniform(0.0, 2.0 * np.pi), uniform(1.6, 1.9) * reach
-            place = np.array([far * np.cos(angle), far * np.sin(angle), uniform(0.7, 1.0) * segments * LENGTH])
+        case "magnet":  # m in the base frame; N at `distance`; it falls with 1 / (d^2 + core^2)
+            where, far = uniform(0.0, 2.0 * np.pi), uniform(1.6, 1.9) * reach
+            place = np.array([far * np.cos(where), far * np.sin(where), uniform(0.7, 1.0) * segments * LENGTH])
             return {"place": place, "force": amount(0.06, 0.16) / segments, "distance": reach, "core": 0.35 * reach}
-    raise ValueError(f"no effect is called {name!r}; the names are {', '.join(LIBRARY + OUTSIDE)}")
+    names = ", ".join(library(segments) + OUTSIDE)
+    raise ValueError(f"no effect of a robot of {segments} segment(s) is called {name!r}; the names are {names}")
 
 
 # ---------------------------------------------------------------- the log
@@ -275,12 +283,6 @@ def _transmission(inputs: Inputs, effects: dict[str, dict[str, Any]]) -> tuple[A
     return common + wires(bend.reshape(len(t), -1) @ to_pairs.T), bend
 
 
-
-
-
-
-
-
 def _play(x: Array, radius: float | Array) -> Array:
     """The play operator: what a shaft in a slot of this half width passes on; it starts in the middle."""
     out = np.empty_like(x)
@@ -319,7 +321,8 @@ def _ringing(t: Array, x: Array, frequency: float, damping: float) -> Array:
     period = 1.0 / (2.0 * np.pi * frequency)
     top, bottom = bilinear([1.0], [period**2, 2.0 * damping * period, 1.0], 500.0)
     drive = np.interp(fine, t, x)
-    return np.interp(t, fine, lfilter(top, bottom, drive, zi=lfilter_zi(top, bottom) * drive[0])[0])
+    answer, _ = lfilter(top, bottom, drive, zi=lfilter_zi(top, bottom) * drive[0])
+    return np.asarray(np.interp(t, fine, answer))
 
 
 def _camera(t: Array, position: Array, rotation: Array, effects: dict[str, dict[str, Any]]) -> tuple[Array, Array]:
@@ -381,38 +384,27 @@ def _loaded(rod: Rod, dl: Array, bend: Array, payload: Array, down: Array, effec
     if e := effects.get("axial_compression"):  # every piece of the backbone is shorter by the same share
         size = np.linalg.norm(bend, axis=2, keepdims=True)
         squeeze = 1.0 - e["rate"] * size * (1.0 + e["growth"] * size)
-    modes = None
+    magnet, plane = effects.get("magnet"), effects.get("contact")
 
-    def tip(extra: Array) -> tuple[Array, Array]:
-        nonlocal modes
-        chords, turn, modes = rod.rest(dl, push + extra, down, payload=payload, lever=lever, start=modes)
-        return np.sum(squeeze * chords, axis=1), turn
+    def field(tip: Array) -> tuple[Array, Array]:
+        force, change = np.zeros_like(tip), np.zeros((len(tip), 3, 3))
+        if magnet:
+            gap = magnet["place"] - tip
+            far = np.linalg.norm(gap, axis=1)[:, None, None]
+            towards = gap[:, :, None] / far
+            pull = magnet["force"] * (magnet["distance"] ** 2 + magnet["core"] ** 2) / (far**2 + magnet["core"] ** 2)
+            force = force + (pull * towards)[..., 0]
+            along = towards * np.swapaxes(towards, 1, 2)
+            change = change + pull * (2.0 * far / (far**2 + magnet["core"] ** 2) * along - (np.eye(3) - along) / far)
+        if plane:  # one-sided, its edge rounded over 0.2 mm
+            soft, normal = 2e-4, plane["normal"]
+            depth = (tip @ normal - plane["distance"]) / soft
+            force = force - plane["stiffness"] * soft * np.logaddexp(0.0, depth)[:, None] * normal
+            change = change - (plane["stiffness"] * expit(depth))[:, None, None] * np.outer(normal, normal)
+        return force, change
 
-    extra = np.zeros_like(push)
-    position, turn = tip(extra)
-    if e := effects.get("magnet"):
-        for _ in range(12):
-            gap = e["place"] - position
-            far = np.sum(gap**2, axis=1, keepdims=True)
-            pull = e["force"] * (e["distance"] ** 2 + e["core"] ** 2) / (far + e["core"] ** 2) * gap / np.sqrt(far)
-            if np.abs(pull - extra).max() < 1e-5:
-                break
-            extra = pull
-            position, turn = tip(extra)
-    if e := effects.get("contact"):  # secant steps on the force, as the tip gives way
-        normal, stiff = e["normal"], e["stiffness"]
-        depth = position @ normal - e["distance"]
-        touched, give, force = depth > 0.0, np.full(len(depth), 1.0 / 77.0), np.zeros(len(depth))
-        for _ in range(5):
-            change = np.where(touched, (stiff * depth - force) / (1.0 + stiff * give), 0.0)
-            force = force + change
-            position, turn = tip(extra - force[:, None] * normal)
-            before, depth = depth, position @ normal - e["distance"]
-            large = np.abs(change) > 1e-4
-            give = np.where(large, (before - depth) / np.where(large, change, 1.0), give)
-            if np.abs(change).max() < 1e-4:
-                break
-    return position, turn
+    chords, turn = rod.rest(dl, push, down, payload=payload, lever=lever, field=field if magnet or plane else None)
+    return np.sum(squeeze * chords, axis=1), turn
 
 
 # ---------------------------------------------------------------- inputs of our own
@@ -424,12 +416,12 @@ def arc_lengths(bend: Array) -> Array:
 
 
 def designed_inputs(rng: np.random.Generator, segments: int = 1) -> Inputs:
-    """150 s at 15 Hz that separate effects: rest; four blocks of triangles, circles, holds and random motion in the orientations A-B-B-A with
-    a known load off, on, off, on; rest; the first 20 s again."""
+    """150 s at 15 Hz that separate effects: rest; four blocks of triangles, circles, holds and random motion, in the orientations A-B-B-A
+    and with a known load off, on, off, on; rest; the first 20 s again."""
     t, block = np.arange(2250) / 15.0, 26.5
     bend = np.zeros((len(t), segments, 2))
     payload, side = np.zeros(len(t)), np.zeros(len(t), dtype=bool)
-    mass = rng.uniform(0.05, 0.1)
+    mass = rng.uniform(0.05, 0.1) if segments == 1 else rng.uniform(0.02, 0.04)  # more twists the long robot until it snaps over
     peaks = np.array([0.0, 0.9, -0.9, 0.55, -0.55, 0.25, -0.25, 0.0])
     times = 5.0 * np.append(0.0, np.cumsum(np.abs(np.diff(peaks)))) / np.abs(np.diff(peaks)).sum()
     for k in range(4):
@@ -448,7 +440,7 @@ def designed_inputs(rng: np.random.Generator, segments: int = 1) -> Inputs:
                 if segments > 1 and j < 2 and j != s:  # each alone, then both
                     continue
                 angle, size = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.45, 0.9)
-                ramp = np.interp(x, 8.5 + 4.0 * j + np.array([0.0, 0.25, 3.75 + 0.25 * (j < 2), 4.0 + 0.25 * (j < 2)]), [0.0, size, size, 0.0])
+                ramp = np.interp(x, 8.5 + 4.0 * j + np.array([0.0, 0.25, 3.75, 4.0]), [0.0, size, size, 0.0])
                 mine[:, s] += ramp[:, None] * np.array([np.cos(angle), np.sin(angle)])
             mine[:, s] += _wander(rng, x - 20.6, 5.9, 0.5, 0.8)
         bend[now] = mine
@@ -472,7 +464,8 @@ def _wander(rng: np.random.Generator, x: Array, seconds: float, every: float, re
     n = max(int(seconds / every), 4)
     angle, size = rng.uniform(0.0, 2.0 * np.pi, n + 1), reach * np.sqrt(rng.uniform(0.0, 1.0, n + 1))
     size[[0, -1]] = 0.0
-    path = CubicSpline(np.linspace(0.0, seconds, n + 1), size[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1), bc_type="clamped")
+    points = size[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    path = CubicSpline(np.linspace(0.0, seconds, n + 1), points, bc_type="clamped")
     return np.where(((x > 0.0) & (x < seconds))[:, None], path(np.clip(x, 0.0, seconds)), 0.0)
 
 

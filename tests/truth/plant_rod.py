@@ -8,7 +8,8 @@ is least over u(s) = sum_m P_m(s) a_m in every segment, by Newton steps with the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -16,6 +17,8 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Field = Callable[[Array], tuple[Array, Array]]
+"""Of tip positions (n, 3) [m]: force (n, 3) [N] and its change with the position (n, 3, 3) [N/m]."""
 
 LENGTH, EI, GJ, OFFSET, COMPLIANCE, GRAVITY = 0.07, 2.2e-3, 1.0e-3, 0.0075, 1e-5, 9.81
 """Of each segment: m, N m^2, N m^2, m; of each wire m/N; m/s^2 along -z of the world."""
@@ -78,38 +81,39 @@ class Rod:
     segments: int = 1
     compliance: float = COMPLIANCE
     """Of each wire [m/N]."""
-    angle: Array = field(default_factory=lambda: np.zeros(0))
-    """Of the wires (tendons,) [rad]; none given: where they belong."""
-    stiffness: Array = field(default_factory=lambda: np.diag([EI, EI, GJ]))
-    """(3, 3) or (nodes, 3, 3) [N m^2]."""
-    precurvature: Array = field(default_factory=lambda: np.zeros(3))
-    """(3,) or (nodes, 3) [1/m]."""
-    density: Array = field(default_factory=lambda: np.zeros(1))
-    """(1,) or (nodes,) [kg/m]."""
+    angle: Array | None = None
+    """Of the wires (tendons,) [rad]; None: where they belong."""
+    stiffness: Array | None = None
+    """(nodes, 3, 3) [N m^2]; None: uniform."""
+    precurvature: Array | float = 0.0
+    """(nodes, 3) [1/m]."""
+    density: Array | float = 0.0
+    """(nodes,) [kg/m]."""
 
     def rest(
-        self, dl: Array, tip_force: Array, down: Array, *, payload: Array | float = 0.0, lever: float = 0.0, start: Array | None = None
-    ) -> tuple[Array, Array, Array]:
-        """Where the energy is least: chords of the segments (n, segments, 3) [m], rotations of the tip (n, 3, 3), modes to start from.
+        self, dl: Array, tip_force: Array, down: Array, *, payload: Array | float = 0.0, lever: float = 0.0, field: Field | None = None
+    ) -> tuple[Array, Array]:
+        """Where the energy is least: chords of the segments (n, segments, 3) [m] and rotations of the tip (n, 3, 3).
 
         - `dl` (n, tendons) [m]; `tip_force` (n, 3) [N] and `down` (n, 3) [m/s^2], the acceleration of gravity, in the base frame.
-        - `payload` (n, 1) [kg], with its centre `lever` [m] beyond the tip.
+        - `payload` (n, 1) [kg], with its centre `lever` [m] beyond the tip. `field` pulls the tip by what it gives there.
         """
         n = len(dl)
-        if start is None:
-            start = np.zeros((n, self.segments, _MODES, 3))
-            start[:, :, 0, :2] = (pairs(dl) @ np.linalg.inv(routing(self.segments)).T).reshape(n, -1, 2) / LENGTH
-        modes, tension, todo, weight = start.reshape(n, -1, 3).copy(), np.zeros_like(dl), np.arange(n), payload * down
-        for _ in range(60):
-            move, tension[todo] = self._newton(modes[todo], tension[todo], dl[todo], tip_force[todo], down[todo], weight[todo], lever)
-            # a third of a radian in one pass is far enough
+        modes = np.zeros((n, self.segments, _MODES, 3))
+        modes[:, :, 0, :2] = (pairs(dl) @ np.linalg.inv(routing(self.segments)).T).reshape(n, -1, 2) / LENGTH
+        modes, tension, todo, weight = modes.reshape(n, -1, 3), np.zeros_like(dl), np.arange(n), payload * down
+        for k in range(120):
+            move, pull = self._newton(modes[todo], tension[todo], dl[todo], tip_force[todo], down[todo], weight[todo], lever, field, k > 11)
             most = LENGTH * np.abs(move).sum(axis=(1, 2))
-            modes[todo] += move * np.minimum(1.0, 0.35 / np.maximum(most, 1e-12))[:, None, None]
+            # a radian in one pass is far enough, and less where it does not settle
+            part = np.minimum(1.0, (1.0 if k < 12 else 0.3) / np.maximum(most, 1e-12))[:, None]
+            modes[todo] += part[..., None] * move
+            tension[todo] += part * (pull - tension[todo])
             todo = todo[most > 1e-5]  # the next step would be its square
             if not len(todo):
                 chords, frame = self._shape(modes)
-                return chords, frame[:, -1], modes
-        raise ArithmeticError(f"{len(todo)} of {n} samples have no rest within 60 passes")
+                return chords, frame[:, -1]
+        raise ArithmeticError(f"{len(todo)} of {n} samples have no rest within 120 passes")
 
     def _shape(self, modes: Array) -> tuple[Array, Array]:
         """Chords (n, segments, 3) [m] and frames at the nodes (n, nodes, 3, 3)."""
@@ -128,7 +132,16 @@ class Rod:
         return chords, frame.reshape(len(modes), -1, 3, 3)
 
     def _newton(
-        self, modes: Array, tension: Array, dl: Array, tip_force: Array, down: Array, weight: Array, lever: float
+        self,
+        modes: Array,
+        tension: Array,
+        dl: Array,
+        tip_force: Array,
+        down: Array,
+        weight: Array,
+        lever: float,
+        field: Field | None,
+        cautious: bool,
     ) -> tuple[Array, Array]:
         """A step of the modes (n, segments * modes, 3) and the tensions (n, tendons) [N] after it.
 
@@ -140,10 +153,10 @@ class Rod:
         weighted = step[:, None] * mode
         _, frame = self._shape(modes)
         u = mode @ modes
-        stiffness = np.broadcast_to(self.stiffness, (nodes, 3, 3))
+        stiffness = np.tile(np.diag([EI, EI, GJ]), (nodes, 1, 1)) if self.stiffness is None else self.stiffness
         moment = np.einsum("jxy,njy->njx", stiffness, u - self.precurvature)
         # wires
-        angle = self.angle if len(self.angle) else angles(self.segments)
+        angle = angles(self.segments) if self.angle is None else self.angle
         place = OFFSET * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
         last = np.repeat(np.arange(self.segments), 4)
         crosses = (np.repeat(np.arange(self.segments), len(NODES))[:, None] <= last).astype(float)  # (nodes, tendons)
@@ -161,6 +174,14 @@ class Rod:
         hessian = (np.swapaxes(curving.reshape(n, nodes, 9), 1, 2) @ products).reshape(n, 3, 3, len(mode.T), -1)
         hessian = hessian.transpose(0, 3, 1, 4, 2).reshape(n, size, size) + np.swapaxes(slope, 1, 2) @ slope / self.compliance
         # loads: dt = dtheta x t turns all that is beyond; two turns, the nearer to the base outermost, give t N' - (t.N) 1
+        if field is not None:
+            arm = beyond @ frame[..., 2]
+            pull_tip, change = field(arm[:, 0])
+            tip_force = tip_force + pull_tip
+            # d tip = integral of dtheta x arm
+            moved = _cross(np.swapaxes(frame, 2, 3), arm[:, :, None])
+            moved = (weighted.T @ moved.reshape(n, nodes, 9)).reshape(n, size, 3)
+            hessian = hessian - moved @ change @ np.swapaxes(moved, 1, 2)
         force = (tip_force + weight)[:, None] + (beyond @ np.broadcast_to(self.density, nodes))[:, None] * down[:, None]
         spread = _outer(frame[..., 2], force)
         work = (beyond @ spread.reshape(n, nodes, 9)).reshape(n, nodes, 3, 3) + lever * _outer(frame[:, -1, :, 2], weight)[:, None]
@@ -172,7 +193,15 @@ class Rod:
         turned = turned.reshape(n, nodes, -1, 3, 3).transpose(0, 2, 4, 1, 3).reshape(n, size, -1)
         half = turned @ (weighted[:, None, :, None] * twice[:, :, :, None]).reshape(n, 3 * nodes, size)
         gradient = (weighted.T @ moment).reshape(n, size, 1)
-        move = -np.linalg.solve(hessian - half - np.swapaxes(half, 1, 2), gradient)
+        hessian = hessian - half - np.swapaxes(half, 1, 2)
+        move = -np.linalg.solve(hessian, gradient)
+        # where the energy is no bowl (a heavy load twists the robot), down along every axis
+        saddle = np.linalg.slogdet(hessian)[0] < 0.0
+        if cautious or saddle.any():
+            which = slice(None) if cautious else saddle
+            value, axis = np.linalg.eigh(hessian[which])
+            value = np.maximum(np.abs(value), 1e-6 * EI * LENGTH)[..., None]
+            move[which] = -axis @ ((np.swapaxes(axis, 1, 2) @ gradient[which]) / value)
         return move.reshape(modes.shape), taut + (slope @ move)[..., 0] / self.compliance
 
 

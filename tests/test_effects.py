@@ -1,0 +1,515 @@
+"""Laws over the whole registry of effects, so that a new one is tested the day it is written; robot files; a user's own effect."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from rods import bend, rod
+from verification.test_derivatives import difference
+
+import fastrod.effect as registry
+from fastrod import Robot, Simulator, load_robot, save_robot
+from fastrod.effect import Operator, Parameter, Seam, columns, effect, effect_names, get_effect, has_memory, unregister
+from fastrod.errors import EffectError, InputError, RobotError, UnknownNameError
+from fastrod.ports import EffectPorts
+from fastrod.robotfile import dumps, loads
+from fastrod.types import Floats
+from fastrod.wiring import wire
+
+NAMES = effect_names()
+OPERATORS = [name for name in NAMES if isinstance(get_effect(name), Operator)]
+N_STEPS, N_ROBOTS, DT = 15, 3, 0.05
+STATE = ("position", "rotation", "curvature", "arclength", "tension", "path_length", "base_wrench", "residual", "passes")
+Table = dict[str, Any]
+Seen = dict[str, np.ndarray]
+
+
+def one_segment() -> Robot:
+    return replace(rod(line_density=0.1, extension=(-0.01, 0.01)), name="one", log_points=(0.03,))
+
+
+def two_segments() -> Robot:
+    """Antagonistic wires, those of the far segment at places of their own in the near one."""
+    (near,) = one_segment().segments
+    wires = tuple(replace(t, offset=(0.006, 0.005), angle=(t.angle + 0.7, t.angle)) for t in near.tendons)  # type: ignore[operator]
+    far = replace(near, length=0.06, bending_stiffness=(0.0015, 0.002), tendons=wires)
+    return Robot(name="two", segments=(near, far), log_points=(0.05, 0.1))
+
+
+ROBOTS = pytest.mark.parametrize("robot", [one_segment(), two_segments()], ids=lambda robot: robot.name)
+
+
+def having(robot: Robot, *tables: Table) -> Robot:
+    return replace(robot, effects=tables)
+
+
+def at_neutral(name: str, robot: Robot, *, shaped: bool = False) -> Table:
+    """The effect's table with every value neutral; `shaped`: but for the parameters that only shape it."""
+    parameters = [p.on(wire(robot)) for p in get_effect(name).parameters]
+    return {"name": name} | {p.name: p.starts[0] if shaped and p.shape else p.neutral for p in parameters}
+
+
+def at_typical(name: str, robot: Robot, times: float = 1.0) -> Table:
+    """The effect's table with typical sizes, or a multiple of them; what shapes it is neutral."""
+    parameters = [p.on(wire(robot)) for p in get_effect(name).parameters]
+    sizes = {p.name: float(np.clip(p.neutral + times * (p.typical or 0.0), *p.bounds)) for p in parameters if not p.shape}
+    return {"name": name} | sizes
+
+
+def commands(robot: Robot, n_steps: int = N_STEPS) -> np.ndarray:
+    """(n_steps, N_ROBOTS, n_tendons) bends there and back, up to about 1.2 rad in all, with a little common pull; robots out of step."""
+    t = np.linspace(0.0, 1.0, n_steps)[:, None] + 0.1 * np.arange(N_ROBOTS)
+    lengths = np.zeros((n_steps, N_ROBOTS, robot.n_tendons))
+    for k in range(robot.n_segments):
+        size = 1.2 / robot.n_segments
+        x, y = size * np.sin(7.0 * t + k), 0.6 * size * np.cos(5.0 * t - 2 * k)
+        unit_x, unit_y = (bend(robot, *a, segment=k) - robot.rest_tendon_length for a in ((1.0, 0.0), (0.0, 1.0)))
+        lengths += x[..., None] * unit_x + y[..., None] * unit_y
+    return np.asarray(lengths + robot.rest_tendon_length * (1.0 - 1e-4 * t[..., None]))
+
+
+def given(robot: Robot, step: int, moving: bool) -> dict[str, np.ndarray]:
+    """Every kind of load and another base for each robot; `moving`: the tip force changes while they run."""
+    tip = np.outer(np.arange(N_ROBOTS), [0.02, -0.03, 0.01]) * (1.0 + 0.1 * step * moving)
+    half = 0.3 * np.arange(N_ROBOTS)
+    pose = np.column_stack([np.outer(np.arange(N_ROBOTS), [0.1, 0.2, 0.3]), np.cos(half), np.sin(half), 0.0 * half, 0.0 * half])
+    line = np.full((robot.n_segments, 4, 3), 0.05) * np.arange(4)[:, None]
+    return {"tip_force": tip, "base_pose": pose, "line_force": line, "tip_moment": np.array([1e-4, 0.0, 2e-4])}
+
+
+def simulator(robot: Robot | list[Robot], n_robots: int = N_ROBOTS) -> Simulator:
+    return Simulator(robot, n_robots=n_robots, dt=DT, points_per_segment=3)
+
+
+def run(sim: Simulator, lengths: np.ndarray, *, moving: bool = False, first: int = 0, rows: Any = slice(None)) -> Seen:
+    """Everything that is seen of a simulator while it steps along `lengths`; `rows`: which of the N_ROBOTS it has."""
+    seen: dict[str, list[np.ndarray]] = {}
+    for i, here in enumerate(lengths, first):
+        loads = {k: v[rows] if k in ("tip_force", "base_pose") else v for k, v in given(sim.robots[0], i, moving).items()}
+        state = sim.step(here[rows], **loads)  # type: ignore[arg-type]
+        for name in STATE:
+            seen.setdefault(name, []).append(getattr(state, name))
+        for name, value in sim.measure()._asdict().items():
+            seen.setdefault(f"measured {name}", []).append(value)
+    return {name: np.array(a) for name, a in seen.items()}
+
+
+def same(one: Seen, two: Seen, rows_one: Any = slice(None), rows_two: Any = slice(None)) -> None:
+    for name, a in one.items():
+        assert_array_equal(a[:, rows_one], two[name][:, rows_two], err_msg=name)
+
+
+@ROBOTS
+@pytest.mark.parametrize("name", NAMES)
+def test_a_neutral_effect_is_the_base_model_bit_for_bit(name: str, robot: Robot) -> None:
+    lengths = commands(robot)
+    base = run(simulator(robot), lengths, moving=True)
+    for shaped in (False, True):
+        with_effect = having(robot, at_neutral(name, robot, shaped=shaped))
+        same(base, run(simulator(with_effect), lengths, moving=True))
+    same(base, run(simulator([with_effect] * N_ROBOTS), lengths, moving=True))
+    one, two = simulator(robot), simulator(with_effect)
+    assert_array_equal(one.settle(lengths[0]).position, two.settle(lengths[0]).position)
+
+
+def test_the_whole_library_at_once_at_neutral_is_the_base_model() -> None:
+    robot = two_segments()
+    everything = having(robot, *(at_neutral(name, robot) for name in reversed(NAMES)))
+    same(run(simulator(robot), commands(robot), moving=True), run(simulator(everything), commands(robot), moving=True))
+
+
+@ROBOTS
+@pytest.mark.parametrize("name", NAMES)
+def test_a_typical_effect_is_seen_where_the_robot_can_show_it(name: str, robot: Robot) -> None:
+    lengths = commands(robot)
+    base, seen = (run(simulator(r), lengths) for r in (robot, having(robot, at_typical(name, robot))))
+    moved = np.abs(seen["measured tip_position"] - base["measured tip_position"]).max((0, 2))
+    assert np.isfinite(seen["measured tip_position"]).all()
+    if name == "coupling" and robot.n_segments == 1:
+        assert (moved == 0.0).all()
+    else:
+        assert (moved > 1e-6).all()  # a camera sees a tenth of a millimetre, a short run shows only a part of a slow effect
+    if get_effect(name).seam is Seam.SENSING:
+        assert_array_equal(seen["position"], base["position"])
+    assert_array_equal(seen["measured points"].shape, (N_STEPS, N_ROBOTS, len(robot.log_points), 3))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_snapshot_and_reset_take_the_effects_along(name: str) -> None:
+    robot = two_segments()
+    lengths = commands(robot)
+    sim = simulator(having(robot, at_typical(name, robot)))
+    whole = run(sim, lengths)
+    sim.reset()
+    same(whole, run(sim, lengths))
+    sim.reset()
+    run(sim, lengths[:7])
+    kept = sim.snapshot()
+    rest = [run(sim, lengths[7:], first=7)]
+    sim.restore(kept)
+    rest.append(run(sim, lengths[7:], first=7))
+    same(*rest)
+    same({key: a[7:] for key, a in whole.items()}, rest[0])
+    sim.restore(kept)
+    sim.reset([1])
+    after = run(sim, lengths[7:], first=7)
+    same(rest[0], after, [0, 2], [0, 2])
+    fresh = run(simulator(having(robot, at_typical(name, robot))), lengths[7:], first=7)
+    same(fresh, after, [1], [1])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_batch_of_different_values_is_its_robots_bit_by_bit(name: str) -> None:
+    robots = [having(two_segments(), at_typical(name, two_segments(), times)) for times in (0.0, 1.0, 1.4)]
+    lengths = commands(robots[0])
+    together = run(simulator(robots), lengths)
+    for i, robot in enumerate(robots):
+        same(run(simulator(robot, 1), lengths, rows=[i]), together, [0], [i])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_bad_input_spoils_no_memory(name: str) -> None:
+    """Robot 1 misses two steps: the others do not notice, and it goes on as if these two had not been."""
+    robot = having(two_segments(), at_typical(name, two_segments()))
+    lengths = commands(robot)
+    clean = run(simulator(robot), lengths)
+    broken = lengths.copy()
+    broken[5, 1, 2], broken[6, 1, 0] = np.nan, np.inf
+    sim = simulator(robot)
+    seen = run(sim, broken)
+    same(clean, seen, [0, 2], [0, 2])
+    assert np.isnan(seen["position"][5:7, 1]).all()
+    alone = run(simulator(robot, 1), np.delete(lengths, [5, 6], axis=0), rows=[1])
+    same(alone, {key: np.delete(a, [5, 6], axis=0) for key, a in seen.items()}, [0], [1])
+    late = lengths.copy()
+    late[0, 1] = np.nan  # and a robot whose first input is bad begins with its second
+    same(run(simulator(robot, 1), lengths[1:], rows=[1]), {key: a[1:] for key, a in run(simulator(robot), late).items()}, [0], [1])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_robots_without_wires_or_with_tensions_take_every_effect(name: str) -> None:
+    """Where no length is commanded there is nothing for an effect on lengths to do."""
+    for robot, inputs in (
+        (rod("passive", extension=(-0.01, 0.01)), {}),
+        (rod("tendon_tension", 3, extension=(-0.01, 0.01)), {"tension": [0.3, 0.0, 0.1]}),
+    ):
+        table = at_typical(name, robot)
+        base, sim = Simulator(robot, points_per_segment=3), Simulator(having(robot, table), points_per_segment=3)
+        for _ in range(2):
+            one, two = base.step(**inputs), sim.step(**inputs)  # type: ignore[arg-type]
+        assert two.ok.all()
+        what = get_effect(name)
+        if what.seam is Seam.ACTUATION and name not in ("tendon_stretch", "routing_angle"):
+            assert_array_equal(two.position, one.position)
+            assert_array_equal(sim.jacobian(), base.jacobian())
+
+
+@pytest.mark.parametrize("name", OPERATORS)
+def test_a_sweep_over_a_log_is_its_steps_one_by_one(name: str) -> None:
+    robot = two_segments()
+    wiring, what = wire(robot), get_effect(name)
+    assert isinstance(what, Operator)
+    rng = np.random.default_rng(11)
+    table = [at_typical(name, robot, times) for times in (1.0, 2.0)]
+    values = np.array([registry.read_values(name, row, wiring, "test") for row in table])
+    dl = 0.01 * np.cumsum(rng.uniform(-0.2, 0.2, (2, 300, robot.n_tendons)), axis=1)  # beyond the buffer of a delay
+    dt = rng.uniform(0.0, 0.04, 300) * (rng.random(300) > 0.1)  # irregular, and some at once
+    kept = dl.copy()
+    whole_memory, parts_memory = (what.memory(2, robot.n_tendons) for _ in range(2))
+    whole = what.sweep(values, whole_memory, dl, dt, wiring)
+    assert_array_equal(dl, kept)
+    parts = [what.sweep(values, parts_memory, dl[:, i : i + 1], dt[i : i + 1], wiring) for i in range(300)]
+    assert_array_equal(np.concatenate(parts, axis=1), whole)
+    assert_array_equal(parts_memory, whole_memory)
+    assert np.abs(whole - dl).max() > 0.0
+    alone = what.sweep(values[1:], what.memory(1, robot.n_tendons), dl[1:], dt, wiring)
+    assert_array_equal(alone[0], whole[1])
+
+
+JACOBIANS: list[Table] = [
+    {"name": "drum_gain", "gain": [0.2, -0.1, 0.1, 0.05]},
+    {"name": "coupling", "from_distal": 0.2, "from_proximal": -0.1},
+    {"name": "routing_angle", "angle": [0.1, -0.2, 0.1, 0.15]},
+    {"name": "tendon_stretch", "compliance": [3e-4, 1e-4]},
+    {"name": "axial_compression", "per_bend": [0.05, 0.1], "common_share": [0.5, 0.9]},
+    {"name": "stiffening", "cubic": [0.2, 0.1]},
+]
+
+
+@pytest.mark.parametrize("tables", [*([table] for table in JACOBIANS), JACOBIANS], ids=[*(t["name"] for t in JACOBIANS), "all"])
+def test_the_jacobian_is_by_what_is_commanded(tables: list[Table]) -> None:
+    robot = having(two_segments(), *tables)
+    lengths = bend(robot, 0.4, -0.3) + bend(robot, -0.3, 0.5, 1) - robot.rest_tendon_length - 1e-5
+    base = {"tendon_length": lengths, "tip_force": np.array([0.05, 0.02, -0.03]), "extension": np.array([0.001, -0.002])}
+    sim = Simulator(robot, points_per_segment=4)
+    assert sim.settle(**base, tolerance=1e-13).ok.all()  # type: ignore[arg-type]
+    jacobian = sim.jacobian()[0]
+    columns = [("tendon_length", i, 1e-6, 1e-6) for i in range(8)]
+    # stiff wires turn a stretch into twist, steeply: differences of 3e-6 m leave a part in a million
+    columns += [("extension", k, 3e-6, 2e-6) for k in range(2)]
+    for j, (name, i, delta, tolerance) in enumerate(columns):
+        expected = difference(sim, base, name, i, delta)
+        assert_allclose(jacobian[:, j], expected, atol=tolerance * np.abs(expected).max())
+
+
+def test_the_jacobian_of_an_effect_with_memory_stays_in_its_loop() -> None:
+    """Within its play a gear moves nothing; beyond it the wire follows at once."""
+    robot = having(rod(), {"name": "backlash", "half_width": 0.0004})
+    sim = Simulator(robot, points_per_segment=3)
+    for scale in (0.0, 0.5, 0.47):
+        sim.settle(bend(robot, scale, 0.0))
+    before = [link.memory.copy() for link in sim._chain.links]
+    jacobian = sim.jacobian()[0, :, :4]
+    assert_array_equal(before, [link.memory for link in sim._chain.links])
+    assert np.abs(jacobian @ [0.0, 1.0, 0.0, -1.0]).max() < 1e-6 * np.abs(jacobian).max()
+
+
+def test_effects_of_a_robot_file_come_back_and_act(tmp_path: Path) -> None:
+    tables = ({"name": "drum_gain", "gain": [0.1, 0.0, -0.1, 0.2]}, {"name": "creep", "share": 0.1, "time_constant": 2.0})
+    robot = having(two_segments(), *tables)
+    save_robot(robot, tmp_path / "mine.toml")
+    again = load_robot(tmp_path / "mine.toml")
+    assert again == robot
+    assert list(again.effects) == list(tables)
+    lengths = commands(robot, 4)
+    same(run(simulator(robot), lengths), run(simulator(again), lengths))
+    text = dumps(load_robot("prototype")) + '\n[[effect]]\nname = "play"\nhalf_width = 0.0002\n'
+    (link,) = Simulator(loads(text)).__dict__["_chain"].links
+    assert (link.name, link.values.tolist()) == ("backlash", [[0.0002]])
+
+
+@pytest.mark.parametrize(
+    ("tables", "kind", "sentence"),
+    [
+        ([{"name": "backlsh"}], UnknownNameError, "no effect 'backlsh'; did you mean 'backlash'"),
+        ([{"name": "gear_ply"}], UnknownNameError, "did you mean 'gear_play'"),
+        ([{"name": "backlash", "half_widht": 1e-4}], EffectError, "robot 'two': .* no parameter 'half_widht'; did you mean 'half_width'"),
+        ([{"name": "backlash", "half_width": -1e-4}], EffectError, r"is -0.0001 m; it must be a number from 0 to"),
+        ([{"name": "backlash", "half_width": 1.0}], EffectError, r"is 1.0 m; it must be a number from 0 to 0.00"),
+        ([{"name": "creep", "share": "a"}], EffectError, "share of effect 'creep' is 'a'"),
+        ([{"name": "creep", "share": True}], EffectError, "is True"),
+        ([{"name": "creep", "share": float("nan")}], EffectError, "is nan"),
+        ([{"name": "creep", "time_constant": 0.0}], EffectError, "it must be a number from 0.05 to 300"),
+        ([{"name": "drum_gain", "gain": [0.1, 0.2]}], EffectError, "gain of effect 'drum_gain' has 2 values; give one, or 4, one per drive"),
+        ([{"name": "creep", "share": [0.1, 0.2]}], EffectError, "has 2 values; give one"),
+        ([{"name": "payload"}, {"name": "payload"}], EffectError, "has effect 'payload' twice"),
+        ([{"name": "backlash"}, {"name": "gear_play"}], EffectError, "has effect 'backlash' twice"),
+        ([{"half_width": 1e-4}], EffectError, "has no name"),
+    ],
+)
+def test_bad_tables_get_one_sentence(tables: list[Table], kind: type[Exception], sentence: str) -> None:
+    with pytest.raises(kind, match=sentence) as caught:
+        Simulator(having(two_segments(), *tables))
+    assert "\n" not in str(caught.value)
+
+
+def test_robots_of_a_batch_name_the_same_effects_and_share_their_wiring() -> None:
+    plain, heavy = rod(), having(rod(), {"name": "gravity", "line_density": 0.1})
+    with pytest.raises(RobotError, match="robot 1 of the batch has effects gravity, robot 0 has none"):
+        Simulator([plain, heavy])
+    with pytest.raises(RobotError, match="robot 1 .* wires .* other"):
+        Simulator([heavy, having(rod(offset=0.008), *heavy.effects)])
+    Simulator([plain, rod(offset=0.008)])  # which robots without effects may
+    stiff = having(rod(bending_stiffness=(0.003, 0.003)), *heavy.effects)
+    assert Simulator([heavy, stiff]).settle(rod().rest_tendon_length).ok.all()
+
+
+def test_a_snapshot_of_other_effects_is_refused() -> None:
+    one, two = (Simulator(having(rod(), {"name": name})) for name in ("backlash", "creep"))
+    kept = one.snapshot()
+    with pytest.raises(InputError, match="another simulator"):
+        two.restore(kept)
+
+
+def test_measure_needs_a_state_and_sees_from_the_base() -> None:
+    robot = replace(rod(), log_points=(0.02,))
+    sim = Simulator(robot)
+    with pytest.raises(InputError, match="call step or settle first"):
+        sim.measure()
+    state = sim.settle(bend(robot, 0.5, 0.2), base_pose=(1.0, 2.0, 3.0, np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0))
+    seen = sim.measure()
+    turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # a quarter about x
+    assert_allclose(turn @ seen.tip_position[0] + [1.0, 2.0, 3.0], state.tip_position[0], atol=1e-15)
+    assert_allclose(turn @ seen.tip_rotation[0], state.tip_rotation[0], atol=1e-15)
+    assert_allclose(turn @ seen.points[0, 0] + [1.0, 2.0, 3.0], sim.shape(0.02).position[0, 0], atol=1e-15)
+
+
+# What the library says of itself
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_effect_says_what_it_is(name: str) -> None:
+    what = get_effect(name)
+    doc = type(what).__doc__ or ""
+    for section in ("Equation", "Source", "Residual signature"):
+        line = next(line.strip() for line in doc.splitlines() if line.strip().startswith(f"{section}:"))
+        assert len(line) > len(section) + 8
+    assert getattr(what, "excited_by", "x")
+    for other in getattr(what, "confounded_with", ()):
+        assert other in NAMES
+        assert other != name
+    for synonym in getattr(what, "synonyms", ()):
+        assert get_effect(synonym) is what
+        assert synonym not in NAMES
+    for p in what.parameters:
+        low, high = p.bounds
+        assert all(low <= start <= high for start in (*p.starts, p.scale))
+        assert p.shape or p.neutral == 0.0 != p.scale
+    assert any(not p.shape for p in what.parameters)
+    wiring = wire(two_segments())
+    assert len(columns(what, wiring)) == len(registry.read_values(name, {}, wiring, "test"))
+    assert has_memory(what) == isinstance(what, Operator)
+
+
+def test_effects_act_from_the_motor_to_the_camera() -> None:
+    seams = [get_effect(name).seam.value for name in NAMES]
+    assert seams == sorted(seams)
+    contracted = "gravity payload tip_force friction backlash tendon_stretch creep latency frame_misalignment marker_offset drum_gain "
+    contracted += "encoder_offset precurvature routing_angle coupling stiffness_anisotropy stiffness_taper stiffening axial_compression "
+    assert set(contracted.split()) | {"time_drift"} <= set(NAMES)
+
+
+def test_wires_and_bends_belong_together() -> None:
+    for robot in (one_segment(), two_segments(), load_robot("tdcr_b"), rod(n_tendons=3), rod("passive")):
+        wiring = wire(robot)
+        change = np.random.default_rng(2).uniform(-1.0, 1.0, (5, robot.n_segments, 2))
+        dl = wiring.wires(change)
+        for k in range(robot.n_segments) if robot.n_tendons else ():
+            alone = change * (np.arange(robot.n_segments) == k)[:, None]
+            expected = [bend(robot, *a[k], segment=k) - robot.rest_tendon_length for a in alone]
+            assert_allclose(wiring.wires(alone), expected, atol=1e-15)
+        if robot.n_tendons:
+            assert_allclose(wiring.bend(dl), change, atol=1e-12)
+    wiring = wire(two_segments())
+    assert wiring.drive.tolist() == [0, 1, 0, 1, 2, 3, 2, 3]
+    assert wiring.drive_sign.tolist() == [1.0, 1.0, -1.0, -1.0] * 2
+    assert wire(rod(n_tendons=3)).n_drives == 3
+
+
+# A user's own
+
+
+class Weight:
+    """Self-weight of the backbone, as style.md has it.
+
+    Equation: f(s) -= w e_z, world frame
+    Source: Rucker and Webster 2011, distributed load of the rod equations
+    Residual signature: tip error along gravity, grows with length, blind to speed
+    """
+
+    seam = Seam.LOAD
+    parameters = (Parameter("weight", "N/m", neutral=0.0, bounds=(0.0, 5.0)),)
+
+    def memory(self, n_robots: int, n_tendons: int) -> Floats:
+        return np.empty(0)
+
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
+        ports.line_force[..., 2] -= values[:, :, None]
+
+
+@pytest.fixture
+def clean_registry() -> Iterator[None]:
+    before, synonyms = dict(registry._REGISTRY), dict(registry._SYNONYMS)
+    yield
+    for kept, then in ((registry._REGISTRY, before), (registry._SYNONYMS, synonyms)):
+        kept.clear()
+        kept.update(then)  # type: ignore[arg-type]
+
+
+@pytest.mark.usefixtures("clean_registry")
+def test_a_users_effect_works_where_the_librarys_do() -> None:
+    assert effect(Weight) is Weight
+    effect(Weight)  # a module that is read again registers again
+    assert "weight" in effect_names()
+    robot = having(rod(), {"name": "weight", "weight": 0.1 * 9.81})
+    here = Simulator(robot).settle(bend(robot, 0.5, 0.0))
+    there = Simulator(rod(line_density=0.1)).settle(bend(robot, 0.5, 0.0))
+    assert_allclose(here.position, there.position, atol=1e-14)
+    base = run(simulator(two_segments()), commands(two_segments()), moving=True)
+    same(base, run(simulator(having(two_segments(), {"name": "weight"})), commands(two_segments()), moving=True))
+    unregister("weight")
+    with pytest.raises(UnknownNameError, match="no effect 'weight'"):
+        Simulator(robot)
+
+
+@pytest.mark.usefixtures("clean_registry")
+def test_unregister_takes_a_synonym_too() -> None:
+    unregister("gear_play")
+    assert "backlash" not in effect_names()
+    for name in ("backlash", "gear_play"):
+        with pytest.raises(UnknownNameError):
+            get_effect(name)
+    assert "gear_play" not in registry._SYNONYMS
+
+
+def variant(name: str = "Weight", **changes: Any) -> type:
+    return type(name, (Weight,), {"__doc__": Weight.__doc__, "__module__": "elsewhere"} | changes)
+
+
+@pytest.mark.parametrize(
+    ("made", "sentence"),
+    [
+        (variant(__doc__="Equation: x\nSource: y"), "'weight' does not say its Residual signature; its docstring needs a line"),
+        (variant(__doc__=None), "does not say its Equation"),
+        (type("Bare", (), {"__doc__": Weight.__doc__}), "'bare' has no seam"),
+        (variant(seam=3), "has seam 3; give one of"),
+        (variant(parameters=()), "at least one"),
+        (variant(parameters=("weight",)), "give a tuple of Parameter"),
+        (variant("Backlash"), "'backlash' is already registered by fastrod.effects.backlash"),
+        (variant("GearPlay"), "'gear_play' is already .*backlash"),
+        (variant(synonyms=("backlash",)), "'backlash' is already .*backlash"),
+        (variant(synonyms=("gear_play",)), "'gear_play' is already .*backlash"),
+    ],
+)
+@pytest.mark.usefixtures("clean_registry")
+def test_a_class_that_is_no_effect_is_refused(made: type, sentence: str) -> None:
+    with pytest.raises(EffectError, match=sentence) as caught:
+        effect(made)
+    assert "\n" not in str(caught.value)
+    assert effect_names() == NAMES
+    assert get_effect("gear_play") is get_effect("backlash")
+
+
+def test_a_parameter_has_its_neutral_value_in_its_bounds() -> None:
+    with pytest.raises(EffectError, match="'size' has neutral value 0.0; it must lie in its bounds 1.0 to 2.0"):
+        Parameter("size", "m", bounds=(1.0, 2.0))
+    assert Parameter("size", "m", bounds=(0.0, 2.0)).scale == pytest.approx(0.2)
+    assert Parameter("size", "m").starts == (1.0,)
+    scaled = Parameter("size", "m", bounds=(0.0, 2.0), typical=0.5, of="length").on(wire(two_segments()))
+    assert (scaled.bounds, scaled.typical, scaled.of) == ((0.0, pytest.approx(0.26)), pytest.approx(0.065), "")
+
+
+@pytest.mark.usefixtures("clean_registry")
+def test_installed_packages_bring_effects_by_entry_point(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    source = '''
+from fastrod.effect import Parameter, Seam, Static, effect
+
+@effect
+class Wind(Static):
+    """Equation: F += f e_x
+    Source: weather
+    Residual signature: sideways
+    """
+
+    seam = Seam.LOAD
+    parameters = (Parameter("force", "N", typical=0.1),)
+
+    def apply(self, values, memory, ports, state, dt):
+        ports.tip_force[:, :1] += values
+'''
+    (tmp_path / "breezy_effects.py").write_text(source)
+    monkeypatch.syspath_prepend(tmp_path)
+    plug_in = EntryPoint("breezy", "breezy_effects", "fastrod.effects")
+    monkeypatch.setattr(registry, "entry_points", lambda group: [plug_in] if group == "fastrod.effects" else [])
+    registry.load_library.cache_clear()
+    assert "wind" in effect_names()
+    robot = having(rod(), {"name": "wind", "force": 0.1})
+    here, there = Simulator(robot).settle(bend(robot, 0.3, 0.1)), Simulator(rod()).settle(bend(robot, 0.3, 0.1), tip_force=(0.1, 0.0, 0.0))
+    assert_array_equal(here.position, there.position)
