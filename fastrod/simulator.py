@@ -215,7 +215,7 @@ class Simulator:
         found = Pose(np.full((*s.shape, 3), np.nan), np.full((*s.shape, 3, 3), np.nan), np.full((*s.shape, 3), np.nan))
         whole = np.isfinite(end[:, 0])
         robot, query = np.nonzero(np.broadcast_to(whole[:, None], s.shape))
-        between_nodes(robot, query, np.ascontiguousarray(s), self._params, ports, self._layout, _as_shape(state), found)
+        between_nodes(robot, query, np.array(s, order="C"), self._params, ports, self._layout, _as_shape(state), found)
         return found
 
     def jacobian(self) -> Floats:

@@ -297,7 +297,11 @@ def test_effects_of_a_robot_file_come_back_and_act(tmp_path: Path) -> None:
         ([{"name": "creep", "share": True}], EffectError, "is True"),
         ([{"name": "creep", "share": float("nan")}], EffectError, "is nan"),
         ([{"name": "creep", "time_constant": 0.0}], EffectError, "it must be a number from 0.05 to 300"),
-        ([{"name": "drum_gain", "gain": [0.1, 0.2]}], EffectError, "gain of effect 'drum_gain' has 2 values; give one, or 4, one per drive"),
+        (
+            [{"name": "drum_gain", "gain": [0.1, 0.2]}],
+            EffectError,
+            "gain of effect 'drum_gain' has 2 values; give one, or 4, one per drive",
+        ),
         ([{"name": "creep", "share": [0.1, 0.2]}], EffectError, "has 2 values; give one"),
         ([{"name": "payload"}, {"name": "payload"}], EffectError, "has effect 'payload' twice"),
         ([{"name": "backlash"}, {"name": "gear_play"}], EffectError, "has effect 'backlash' twice"),
@@ -314,7 +318,7 @@ def test_robots_of_a_batch_name_the_same_effects_and_share_their_wiring() -> Non
     plain, heavy = rod(), having(rod(), {"name": "gravity", "line_density": 0.1})
     with pytest.raises(RobotError, match="robot 1 of the batch has effects gravity, robot 0 has none"):
         Simulator([plain, heavy])
-    with pytest.raises(RobotError, match="robot 1 .* wires .* other"):
+    with pytest.raises(RobotError, match="robot 1 of the batch has segments of other lengths or wires at other places"):
         Simulator([heavy, having(rod(offset=0.008), *heavy.effects)])
     Simulator([plain, rod(offset=0.008)])  # which robots without effects may
     stiff = having(rod(bending_stiffness=(0.003, 0.003)), *heavy.effects)
@@ -478,7 +482,7 @@ def test_a_class_that_is_no_effect_is_refused(made: type, sentence: str) -> None
 
 
 def test_a_parameter_has_its_neutral_value_in_its_bounds() -> None:
-    with pytest.raises(EffectError, match="'size' has neutral value 0.0; it must lie in its bounds 1.0 to 2.0"):
+    with pytest.raises(EffectError, match=r"'size' has neutral value 0\.0; it must lie in its bounds 1\.0 to 2\.0"):
         Parameter("size", "m", bounds=(1.0, 2.0))
     assert Parameter("size", "m", bounds=(0.0, 2.0)).scale == pytest.approx(0.2)
     assert Parameter("size", "m").starts == (1.0,)

@@ -127,13 +127,6 @@ def test_a_buffer_that_its_owner_writes_into_is_a_new_input() -> None:
         assert_array_equal(one.step(rest, tip_force=force).position, two.step(rest, tip_force=force.copy()).position)
 
 
-def test_effects_of_a_robot_file_are_kept_but_not_simulated() -> None:
-    robot = loads(dumps(load_robot("prototype")) + '\n[[effect]]\nname = "backlash"\nhalf_width = 0.0002\n')
-    assert loads(dumps(robot)) == robot
-    with pytest.raises(RobotError, match="asks for backlash"):
-        Simulator(robot)
-
-
 def test_snapshot_restores_every_bit() -> None:
     lengths = random_lengths(3, 8)
     sim = Simulator(load_robot("prototype"), n_robots=3)

@@ -1,0 +1,425 @@
+"""The search for what the model lacks: fit every candidate beside what is known, judge it on blocks it has not seen, keep the
+best, ask again.
+
+Every candidate starts from the same reference, weights and outlier mask. Foils (`foils`) compete on the same terms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import product
+
+import numpy as np
+
+from fastrod.effect import effect_names, get_effect
+from fastrod.identification.foils import Foil, foils
+from fastrod.identification.forward import Rod, Samples
+from fastrod.identification.local import Local, Target
+from fastrod.identification.solve import Fit, bic, effective_size, held_out_losses, minimise, paired
+from fastrod.identification.unknowns import Model
+from fastrod.types import Floats, Ints
+
+Z_ACCEPT, BIC_ACCEPT, SHARE_ACCEPT = 3.0, 10.0, 0.006
+Z_RIVAL, BIC_RIVAL = 2.0, 10.0
+Z_KEEP, BIC_KEEP = 2.0, 6.0
+N_BLOCKS = 20
+_STARTS = 8
+_SCREEN = 0.003  # of the loss: a candidate whose slopes promise less is not fitted
+_FEW, _MANY = 3, 12  # iterations of a start, and of the best of them
+_REFINED = 3  # candidates that are solved exactly at each stage
+_FOIL_SD = 30.0  # of a foil's amplitude, in units of its own columns' size that would explain all
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """A model with its fit: what is accepted so far."""
+
+    model: Model
+    local: Local
+    fit: Fit
+    """Of the unknowns, then of the accepted foils' amplitudes."""
+    losses: Floats
+    """(N_BLOCKS,) held out."""
+    foils: tuple[Foil, ...] = ()
+
+    @property
+    def theta(self) -> Floats:
+        return self.fit.theta[: len(self.model.unknowns)]
+
+    @property
+    def columns(self) -> Floats:
+        """(n, n_out, k) of the accepted foils."""
+        shape = (*self.fit.residual.shape, 0)
+        return np.concatenate([np.zeros(shape), *(f.columns for f in self.foils)], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """An effect, or a foil, beside a state."""
+
+    name: str
+    state: State | None
+    """With the candidate accepted; None where it was not fitted."""
+    z: float
+    """Of the gain over held-out blocks."""
+    bic_gain: float
+    share: float
+    """Of the loss that it takes away."""
+    n_parameters: int
+    why: str
+    """Why it is not the one, in a sentence."""
+    foil: Foil | None = None
+
+    @property
+    def passes(self) -> bool:
+        return self.state is not None and not self.why and self.z > Z_ACCEPT and self.bic_gain > BIC_ACCEPT and self.share > SHARE_ACCEPT
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One stage of the search: who ran, who was taken."""
+
+    before: State
+    candidates: tuple[Candidate, ...]
+    taken: Candidate | None
+    rivals: tuple[str, ...] = ()
+    """Effects that explain this stage as well as the one that was taken."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bound:
+    """The size from which an effect would have shown."""
+
+    name: str
+    parameter: str
+    unit: str
+    value: float
+    """nan: no size shows in this log."""
+
+
+@dataclass
+class Search:
+    """Samples, weights and blocks that all candidates share."""
+
+    samples: Samples
+    rod: Rod
+    target: Target
+    block: Ints
+    excluded: frozenset[str] = frozenset()
+    report: Callable[[str], None] = field(default=lambda _: None)
+
+    def start(self, model: Model, theta: Floats, iterations: int = 6) -> State:
+        """The state of a model without anything found, linearised twice."""
+        local = Local(model, theta, self.samples, self.rod, self.target)
+        fit = self._fit(local, model, theta, np.zeros((0,)), (), iterations)
+        return self.refined(self._state(model, local, fit, ()))
+
+    def refined(self, state: State, iterations: int = 4) -> State:
+        """The same with the rod solved at the state's own parameters."""
+        local = Local(state.model, state.theta, self.samples, self.rod, self.target)
+        fit = self._fit(local, state.model, state.theta, state.fit.theta[len(state.theta) :], state.foils, iterations)
+        if not np.isfinite(fit.loss):
+            return state
+        return self._state(state.model, local, fit, state.foils)
+
+    def _state(self, model: Model, local: Local, fit: Fit, found: tuple[Foil, ...]) -> State:
+        losses = held_out_losses(fit.residual, fit.slopes, fit.precision, self.block, N_BLOCKS)
+        return State(model, local, fit, losses, found)
+
+    def _fit(self, local: Local, model: Model, theta: Floats, amplitudes: Floats, found: Sequence[Foil], iterations: int) -> Fit:
+        """The best parameters near `local`, with the amplitudes of foils as further linear unknowns."""
+        n = len(model.unknowns)
+        mean, sd = model.prior
+        low, high = model.limits
+        if not found:
+            return local.fit(model, theta, iterations)
+        columns = np.concatenate([f.columns for f in found], axis=-1)
+        size = np.sqrt((columns**2).sum((0, 1)))
+        wide = _FOIL_SD * np.sqrt(local.residual(model, theta).size) / np.maximum(size, 1e-12)
+        k = columns.shape[-1]
+        free = np.full(k, np.inf)
+
+        def residual(both: Floats) -> Floats:
+            return local.residual(model, both[:n]) - columns @ both[n:]
+
+        def slopes(both: Floats, at: Floats) -> Floats:
+            own = local.slopes(model, both[:n], at + columns @ both[n:])
+            return np.concatenate([own, columns], axis=-1)
+
+        return minimise(
+            residual, slopes, np.concatenate([theta, amplitudes]), np.concatenate([mean, np.zeros(k)]),
+            np.concatenate([sd, wide]), (np.concatenate([low, -free]), np.concatenate([high, free])), iterations,
+        )  # fmt: skip
+
+    # ------------------------------------------------------------ candidates
+
+    def candidate(self, state: State, name: str) -> Candidate:
+        """An effect fitted beside a state, from each of its starts."""
+        drop = self._unseen(state, name)
+        every = state.model.with_effect(name)
+        added = [u for u in every.unknowns[len(state.model.unknowns) :]]
+        labels = [u.name.partition(".")[2] for u in added]
+        sizes = [label for label, u in zip(labels, added, strict=True) if not u.shape]
+        if all(label in drop for label in sizes):
+            return Candidate(
+                name,
+                None,
+                0.0,
+                0.0,
+                0.0,
+                0,
+                "this log does not excite it: " + (getattr(get_effect(name), "excited_by", "") or "no response"),
+            )
+        model = state.model.with_effect(name, drop=drop)
+        fits = self._from_starts(state, model, name)
+        if fits is None:
+            return Candidate(name, None, 0.0, 0.0, 0.0, len(model.unknowns) - len(state.model.unknowns), "its slopes promise nothing")
+        return self.judged(state, self._state(model, state.local, fits, state.foils), name)
+
+    def _unseen(self, state: State, name: str) -> list[str]:
+        """Size parameters of an effect that this log does not move at all: left at neutral."""
+        model = state.model.with_effect(name)
+        n = len(state.model.unknowns)
+        theta = np.concatenate([state.theta, model.start[n:]])
+        at_zero = theta.copy()
+        for j, u in enumerate(model.unknowns[n:], n):
+            if not u.shape:
+                at_zero[j] = u.mean
+        base = state.local.residual(model, at_zero)
+        unseen = []
+        for j, u in enumerate(model.unknowns[n:], n):
+            if u.shape:
+                continue
+            moved = at_zero.copy()
+            moved[j] = np.clip(u.mean + u.scale, *u.limits)
+            if float(((state.local.residual(model, moved) - base) ** 2).sum()) < 4.0:
+                unseen.append(u.name.partition(".")[2])
+        return unseen
+
+    def _from_starts(self, state: State, model: Model, name: str) -> Fit | None:
+        local, n = state.local, len(state.model.unknowns)
+        added = model.unknowns[n:]
+        starts = {p.name: p.on(model.wiring).starts for p in get_effect(name).parameters}
+        # per-segment and per-drive columns share their parameter's starts
+        own = [
+            starts[next(key for key in sorted(starts, key=len, reverse=True) if u.name.partition(".")[2].startswith(key))] for u in added
+        ]
+        grouped = list(dict.fromkeys(tuple(s) for s in own))
+        combos = list(product(*grouped))[: 2 * _STARTS]
+        combos = combos if len(combos) <= _STARTS else combos[:: -(-len(combos) // _STARTS)]
+        amplitudes = state.fit.theta[n:]
+        best: Fit | None = None
+        promising = []
+        for combo in combos:
+            pick = dict(zip(grouped, combo, strict=True))
+            theta = np.concatenate(
+                [state.theta, [u.outside(float(np.clip(pick[tuple(s)], *u.bounds))) for u, s in zip(added, own, strict=True)]]
+            )
+            promise = self._promise(state, model, theta)
+            promising.append((promise, theta))
+        promising.sort(key=lambda pair: -pair[0])
+        if promising[0][0] < _SCREEN * state.fit.loss:
+            return None
+        for _, theta in promising[:3]:
+            fit = self._fit(local, model, theta, amplitudes, state.foils, _FEW)
+            if best is None or fit.loss < best.loss:
+                best = fit
+        assert best is not None
+        return self._fit(local, model, best.theta[: len(model.unknowns)], best.theta[len(model.unknowns) :], state.foils, _MANY)
+
+    def _promise(self, state: State, model: Model, theta: Floats) -> float:
+        """Loss that the response to the new parameters could take away at best, beside what the others can absorb."""
+        n = len(state.model.unknowns)
+        at = state.local.residual(model, theta) - (state.columns @ state.fit.theta[n:] if state.foils else 0.0)
+        shift = (state.fit.residual - at).reshape(-1, 1)  # the response at the start itself: operators have no slope at neutral
+        base = state.fit.slopes.reshape(shift.shape[0], -1)
+        J = np.concatenate([base, shift], axis=1)
+        sizes = [j for j, u in enumerate(model.unknowns) if j >= n and not u.shape]
+        if len(sizes) > 1:
+            neutral = theta.copy()
+            columns = []
+            for j in sizes:
+                moved = neutral.copy()
+                moved[j] = model.unknowns[j].mean
+                columns.append(
+                    (state.local.residual(model, moved) - (state.columns @ state.fit.theta[n:] if state.foils else 0.0) - at).ravel()
+                )
+            J = np.concatenate([J, np.stack(columns, axis=1)], axis=1)
+        r = state.fit.residual.ravel()
+        gram = J.T @ J + np.diag(np.concatenate([state.fit.precision, np.full(J.shape[1] - base.shape[1], 1e-9)]))
+        b = J.T @ r
+        b[: base.shape[1]] = np.minimum(np.abs(b[: base.shape[1]]), 0.0)  # the base is at its minimum, priors and all
+        return float(b @ np.linalg.lstsq(gram, b, rcond=1e-12)[0])
+
+    def judged(self, state: State, with_it: State, name: str, foil: Foil | None = None) -> Candidate:
+        """A candidate's evidence against the state without it."""
+        k = len(with_it.fit.theta) - len(state.fit.theta) + (foil.n_hidden if foil else 0)
+        size = effective_size(with_it.fit.residual)
+        gain = bic(state.fit.loss, 0, size) - bic(with_it.fit.loss, k, size)
+        z = paired(state.losses, with_it.losses)
+        share = 1.0 - with_it.fit.loss / state.fit.loss
+        why = "" if foil else _unphysical(with_it, name)
+        if not why and not (z > Z_ACCEPT and gain > BIC_ACCEPT and share > SHARE_ACCEPT):
+            why = f"no gain on held-out blocks (z {z:.1f}, BIC {gain:.0f}, {100 * share:.1f} % of the loss)"
+        return Candidate(name, with_it, z, gain, share, k, why, foil)
+
+    def foil_candidates(self, state: State) -> list[Candidate]:
+        """The best foil of each family beside a state, linear in everything."""
+        made = []
+        for foil in foils(state.local, state.fit.slopes, state.fit.residual):
+            slopes = np.concatenate([state.fit.slopes, foil.columns], axis=-1)
+            flat = slopes.reshape(-1, slopes.shape[-1])
+            precision = np.concatenate([state.fit.precision, np.full(foil.columns.shape[-1], 1e-9)])
+            H = flat.T @ flat + np.diag(precision)
+            b = flat.T @ state.fit.residual.ravel()
+            b[: len(state.fit.theta)] = 0.0
+            step = np.linalg.lstsq(H, b, rcond=1e-12)[0]
+            residual = state.fit.residual - slopes @ step
+            theta = np.concatenate([state.fit.theta, np.zeros(foil.columns.shape[-1])]) + step
+            fit = Fit(theta, residual, slopes, precision, (*state.fit.at_bound, *(False,) * foil.columns.shape[-1]))
+            with_it = State(
+                state.model, state.local, fit, held_out_losses(residual, slopes, precision, self.block, N_BLOCKS), (*state.foils, foil)
+            )
+            made.append(self.judged(state, with_it, foil.name, foil))
+        return made
+
+    # ------------------------------------------------------------ stages
+
+    def names(self, state: State) -> list[str]:
+        """Effects that may be tried."""
+        single = state.model.wiring.n_segments < 2
+        driven = state.model.wiring.n_tendons > 0
+        return [
+            name for name in effect_names()
+            if name not in state.model.effects and name not in self.excluded and not (name == "coupling" and single)
+            and (driven or get_effect(name).seam.name != "ACTUATION")
+        ]  # fmt: skip
+
+    def stage(self, state: State, *, with_foils: bool = True) -> Step:
+        """Try everything beside `state`; take the best, if any passes."""
+        tried = []
+        for name in self.names(state):
+            self.report(name)
+            tried.append(self.candidate(state, name))
+        return self.choose(state, tried, with_foils=with_foils)
+
+    def choose(self, state: State, tried: list[Candidate], *, with_foils: bool) -> Step:
+        fitted = sorted((c for c in tried if c.state is not None), key=lambda c: -c.bic_gain)
+        exact = {}
+        for candidate in [c for c in fitted if c.z > 1.5 and c.share > SHARE_ACCEPT][:_REFINED]:
+            assert candidate.state is not None
+            exact[candidate.name] = self.judged(state, self.refined(candidate.state), candidate.name)
+        tried = [exact.get(c.name, c) for c in tried]
+        passing = sorted((c for c in tried if c.passes), key=lambda c: -c.bic_gain)
+        best = passing[0] if passing else None
+        foil = None
+        if with_foils:
+            others = self.foil_candidates(state)
+            tried += others
+            able = sorted((c for c in others if c.passes), key=lambda c: -c.bic_gain)
+            foil = able[0] if able else None
+        if foil is not None and foil.state is not None and (best is None or best.state is None or _beats(foil, best)):
+            return Step(state, tuple(tried), foil)
+        if best is None or best.state is None:
+            return Step(state, tuple(tried), None)
+        rivals = tuple(c.name for c in tried if c.foil is None and c.name != best.name and self._rival(best, c))
+        fewer = [
+            c
+            for c in tried
+            if c.name in rivals and c.passes and c.n_parameters < best.n_parameters and best.bic_gain - c.bic_gain < BIC_RIVAL
+        ]
+        if fewer:
+            simple = max(fewer, key=lambda c: c.bic_gain)
+            rivals = (best.name, *(name for name in rivals if name != simple.name))
+            best = simple
+        assert best.state is not None
+        return Step(state, tuple(tried), best, rivals)
+
+    def _rival(self, best: Candidate, other: Candidate) -> bool:
+        if other.state is None or best.state is None or other.share < SHARE_ACCEPT or _unphysical(other.state, other.name):
+            return False
+        return best.bic_gain - other.bic_gain < BIC_RIVAL or paired(other.state.losses, best.state.losses) < Z_RIVAL
+
+    def without(self, state: State, name: str) -> State:
+        """`state` without one of its effects, fitted again."""
+        model = state.model.without(name)
+        kept = [j for j, u in enumerate(state.model.unknowns) if u.place[:2] != ("effect", name)]
+        theta = state.theta[kept]
+        local = Local(model, theta, self.samples, self.rod, self.target)
+        fit = self._fit(local, model, theta, state.fit.theta[len(state.model.unknowns) :], state.foils, 8)
+        return self._state(model, local, fit, state.foils)
+
+    def eliminated(self, state: State, found: Sequence[str]) -> tuple[State, list[str]]:
+        """Drop effects that what came later has made needless; the state, and who is left."""
+        left = list(found)
+        while len(left) > 1:
+            weakest: tuple[float, str, State] | None = None
+            for name in left:
+                fewer = self.without(state, name)
+                verdict = self.judged(fewer, state, name)
+                if (verdict.z < Z_KEEP or verdict.bic_gain < BIC_KEEP) and (weakest is None or verdict.bic_gain < weakest[0]):
+                    weakest = verdict.bic_gain, name, fewer
+            if weakest is None:
+                break
+            state, left = weakest[2], [name for name in left if name != weakest[1]]
+        return state, left
+
+    def bounds(self, state: State) -> list[Bound]:
+        """For every effect that is not in the model, the size from which it would have shown: three standard errors beyond its
+        estimate, at the typical shape."""
+        inflate = np.sqrt(max(1.0, state.fit.loss / state.fit.residual.size) * state.fit.residual.size / effective_size(state.fit.residual))
+        flat = state.fit.slopes.reshape(state.fit.residual.size, -1)
+        base = flat.T @ flat + np.diag(state.fit.precision)
+        made = []
+        for name in self.names(state):
+            model = state.model.with_effect(name)
+            n = len(state.model.unknowns)
+            theta = np.concatenate([state.theta, model.start[n:]])
+            for j, u in enumerate(model.unknowns[n:], n):
+                if not u.shape:
+                    theta[j] = u.mean
+            at = state.local.residual(model, theta)
+            worst = 0.0
+            sizes = [j for j, u in enumerate(model.unknowns) if j >= n and not u.shape]
+            for j in sizes:
+                u = model.unknowns[j]
+                moved = theta.copy()
+                step = u.scale if u.mean + u.scale <= u.bounds[1] else -u.scale
+                moved[j] = u.mean + step
+                column = (at - state.local.residual(model, moved)).ravel() / step
+                cross = flat.T @ column
+                power = float(column @ column - cross @ np.linalg.lstsq(base, cross, rcond=1e-12)[0])
+                if power <= 1e-6 * float(column @ column) or power * u.scale**2 < 1e-2:
+                    worst = np.inf
+                    continue
+                estimate = float(column @ state.fit.residual.ravel()) / power
+                worst = max(worst, abs(estimate) + 3.0 * inflate / np.sqrt(power))
+            first = model.unknowns[sizes[0]]
+            made.append(Bound(name, first.name.partition(".")[2], first.unit, worst if np.isfinite(worst) else float("nan")))
+        return made
+
+
+def _beats(foil: Candidate, best: Candidate) -> bool:
+    assert foil.state is not None
+    assert best.state is not None
+    return foil.bic_gain > best.bic_gain + BIC_RIVAL and paired(best.state.losses, foil.state.losses) > Z_RIVAL
+
+
+def _unphysical(state: State, name: str) -> str:
+    """Why an effect's parameters cannot be, or nothing."""
+    sizes = []
+    for unknown, number, at_bound in zip(state.model.unknowns, state.fit.theta, state.fit.at_bound, strict=False):
+        if unknown.place[:2] != ("effect", name) or unknown.shape:
+            continue
+        value = unknown.inside(float(number))
+        sizes.append(abs(value - unknown.mean))
+        if at_bound and value != unknown.mean:
+            return f"its {unknown.name.partition('.')[2]} would be {value:.3g} {unknown.unit}, at the bound of what is physical"
+    return "" if any(size > 0.0 for size in sizes) else "its best size is zero"
+
+
+def with_weight(target: Target, weight: Floats) -> Target:
+    """`target` with outliers out of it."""
+    target.weight = weight
+    return target

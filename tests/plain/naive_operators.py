@@ -1,0 +1,61 @@
+"""The operators on wire lengths once more, one wire and one moment at a time: the whole path is known, nothing is carried on."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import expm
+
+
+def play(x: np.ndarray, half_width: float) -> np.ndarray:
+    p, out = x[0], []
+    for here in x:
+        if here - p > half_width:
+            p = here - half_width
+        if p - here > half_width:
+            p = here + half_width
+        out.append(p)
+    return np.array(out)
+
+
+def yielding(x: np.ndarray, share: float, yield_at: float) -> np.ndarray:
+    return np.asarray(x + share * play(np.append(0.0, x), yield_at)[1:])
+
+
+def elastoplastic(x: np.ndarray, amplitude: float, radii: np.ndarray, growth: float, angle: np.ndarray) -> np.ndarray:
+    """A slider that sticks is a play: what it lags behind by, in its own radius, is its force."""
+    force = np.mean([(np.append(0.0, x - x[0]) - play(np.append(0.0, x - x[0]), r))[1:] / r for r in radii], axis=0)
+    return np.asarray(x - amplitude * (1.0 + growth * angle) * force)
+
+
+def linear(A: np.ndarray, start: np.ndarray, x: np.ndarray, dt: np.ndarray) -> np.ndarray:
+    """(n_steps, n) z' = A z + (0 ... x)/(-A z_rest), so that rest at x is z = (x, 0 ...); x linear between samples."""
+    n = len(A)
+    z, out = start, [start]
+    for before, here, h in zip(x, x[1:], dt[1:], strict=False):
+        if h > 0.0:
+            # z, x and the slope of x as one linear system
+            whole = np.zeros((n + 2, n + 2))
+            whole[:n, :n], whole[:n, n], whole[n, n + 1] = A, -A[:, 0], 1.0
+            z = (expm(whole * h) @ np.concatenate([z, [before, (here - before) / h]]))[:n]
+        out.append(z)
+    return np.array(out)
+
+
+def relaxation(x: np.ndarray, share: float, time_constant: float, dt: np.ndarray) -> np.ndarray:
+    y = linear(np.array([[-1.0 / time_constant]]), np.array([x[0]]), x, dt)[:, 0]
+    return np.asarray(x - share * (x - y))
+
+
+def second_order(x: np.ndarray, period: float, damping: float, dt: np.ndarray) -> np.ndarray:
+    if period == 0.0:
+        return x
+    A = np.array([[0.0, 1.0], [-1.0 / period**2, -2.0 * damping / period]])
+    return linear(A, np.array([x[0], 0.0]), x, dt)[:, 0]
+
+
+def delay(x: np.ndarray, lag: float, dt: np.ndarray, buffer: int) -> np.ndarray:
+    t = np.cumsum(np.append(0.0, dt[1:]))
+    if lag == 0.0:
+        return x
+    oldest = t[np.maximum(np.arange(len(t)) - buffer + 1, 0)]
+    return np.interp(np.maximum(t - lag, oldest), t, x)

@@ -1,0 +1,487 @@
+"""Each effect against a closed form, a law, or a robot that is built the way the effect says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from rods import bend, rod
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from fastrod import Robot, Segment, Simulator, load_robot
+from fastrod.chain import Measurement
+from fastrod.effect import get_effect
+from fastrod.kernels.operators import BUFFER, SLIDERS, delay, elastoplastic, play, relaxation, second_order, yielding
+from fastrod.state import State
+from fastrod.wiring import wire
+
+ROUNDING = 1e-13  # of numbers of size one, after some hundred operations
+Law = Callable[[np.ndarray], np.ndarray]
+
+
+def full(width: int) -> np.ndarray:
+    return np.full((1, width), np.nan)
+
+
+def one(value: float) -> np.ndarray:
+    return np.array([[value]])
+
+
+def played(path: np.ndarray, half_width: float = 0.1) -> np.ndarray:
+    x = path[None, :, None].copy()
+    play(x, full(1), one(half_width))
+    return np.asarray(x[0, :, 0])
+
+
+def rubbed(path: np.ndarray, amplitude: float = 0.3, radius: float = 0.2, spread: float = 0.4, growth: float = 0.0) -> np.ndarray:
+    x = path[None, :, None].copy()
+    elastoplastic(x, full(1 + SLIDERS), one(amplitude), one(radius), one(spread), one(growth), np.abs(path)[None, :, None].copy())
+    return np.asarray(x[0, :, 0])
+
+
+def yielded(path: np.ndarray, share: float = 0.2, at: float = 0.5) -> np.ndarray:
+    x = path[None, :, None].copy()
+    yielding(x, full(1), one(share), one(at))
+    return np.asarray(x[0, :, 0])
+
+
+def along(corners: list[float], n: int) -> np.ndarray:
+    """A path through these corners, n steps from each to the next."""
+    parts = [np.linspace(a, b, n, endpoint=False) for a, b in pairwise(corners)]
+    return np.append(np.concatenate(parts), corners[-1])
+
+
+# Loops without rates
+
+
+@pytest.mark.parametrize("law", [played, rubbed, yielded])
+def test_a_loop_does_not_know_how_finely_its_path_is_sampled(law: Law) -> None:
+    corners = [0.0, 1.0, -0.4, 0.7, 0.1, 0.2, -1.0]
+    coarse, fine = law(along(corners, 1)), law(along(corners, 97))
+    assert_allclose(fine[::97], coarse, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("law", [played, rubbed, yielded])
+def test_a_loop_within_a_loop_is_wiped_out(law: Law) -> None:
+    """Return-point memory: back at the corner where a small loop left the large one, as if it had not been."""
+    plain, looped = law(along([0.0, 1.0, -0.8, 0.5, 0.9], 50)), law(along([0.0, 1.0, -0.8, 0.5, -0.1, 0.3, 0.05, 0.5, 0.9], 50))
+    assert_allclose(looped[-51:], plain[-51:], atol=ROUNDING)
+
+
+@pytest.mark.parametrize("amplitude", [0.15, 0.5, 3.0])
+def test_play_rests_for_twice_its_half_width_after_every_reversal(amplitude: float) -> None:
+    x = along([0.0, amplitude, -amplitude, amplitude], 3000)
+    p = played(x)
+    for turn, side in ((3000, 1.0), (6000, -1.0)):
+        leg_x, leg_p = x[turn : turn + 3001], p[turn : turn + 3001]
+        still = np.abs(leg_p - leg_p[0]) < ROUNDING
+        # two samples are where the flat spot may end; the step is 2 A / 3000
+        assert_allclose(abs(leg_x[still][-1] - leg_x[0]), 0.2, atol=2.0 * amplitude / 3000)
+        moving = ~still
+        assert_allclose(leg_p[moving], leg_x[moving] + side * 0.1, atol=ROUNDING)
+    assert (np.abs(p - x) <= 0.1 + ROUNDING).all()
+
+
+def test_friction_saturates_at_its_half_width() -> None:
+    r, s = 0.2, 0.4
+    x = along([0.0, 2.0, -2.0], 400)
+    lost = x - rubbed(x)
+    assert_allclose(lost[(x > r * (1 + s)) & (np.arange(801) < 401)], 0.3, atol=ROUNDING)
+    back = np.arange(801) > 400
+    assert_allclose(lost[back & (x < 2.0 - 2.0 * r * (1 + s))], -0.3, atol=ROUNDING)
+    assert np.abs(lost).max() <= 0.3 + ROUNDING
+    # and before any slider slips the wire sticks: the loss is linear with slope a mean(1 / r_j)
+    radii = r * (1.0 + s * np.linspace(-1.0, 1.0, SLIDERS))
+    sticks = (x < r * (1 - s)) & ~back
+    assert_allclose(lost[sticks], 0.3 * np.mean(1.0 / radii) * x[sticks], atol=ROUNDING)
+
+
+def test_the_area_of_a_friction_loop() -> None:
+    # one slider's loop is a parallelogram of height 2 a and width 2 (A - r_j): closed area 4 a mean max(A - r_j, 0)
+    radii = 0.2 * (1.0 + 0.4 * np.linspace(-1.0, 1.0, SLIDERS))
+    areas = []
+    for amplitude in (0.05, 0.2, 0.5, 1.0):
+        x = along([0.0, amplitude, -amplitude, amplitude], 4000)
+        y = rubbed(x)
+        loop = slice(4000, None)
+        area = np.trapezoid(y[loop], x[loop])
+        assert_allclose(y[-1], y[4000], atol=ROUNDING)  # closed
+        # corners of the loop lie between samples: an error of the second order in 2 A / 4000
+        assert_allclose(abs(area), 4.0 * 0.3 * np.maximum(amplitude - radii, 0.0).mean(), atol=1e-5)
+        areas.append(abs(area))
+    assert areas[0] < ROUNDING
+    assert np.all(np.diff(areas) > 0.0)
+
+
+def test_friction_grows_with_the_angle_that_a_wire_wraps() -> None:
+    x = along([0.0, 2.0], 10)
+    assert_allclose((x - rubbed(x, growth=0.5))[-1], 0.3 * (1.0 + 0.5 * 2.0), atol=ROUNDING)
+    robot = rod()
+    dl = np.linspace(0.0, 1.0, 50)[:, None] * (bend(robot, 0.8, 0.6) - robot.rest_tendon_length)  # a bend of one radian in the end
+    table = {"half_width": 2e-4, "presliding": 1e-4, "growth": 0.7, "spread": 0.0}
+    values = np.array([[*table.values()]])
+    what: Any = get_effect("friction")
+    lost = dl - what.sweep(values, what.memory(1, 4), dl[None], np.full(50, 0.1), wire(robot))[0]
+    assert_allclose(np.abs(lost[-1]), 2e-4 * 1.7, rtol=1e-12)
+
+
+def test_nothing_yields_below_the_yield_and_a_set_stays() -> None:
+    below = along([0.0, 0.5, -0.5, 0.3], 20)
+    assert_array_equal(yielded(below), below)
+    x = along([0.0, 0.9, 0.0, 0.5, 0.0], 90)
+    y = yielded(x)
+    assert_allclose(y[180], 0.2 * (0.9 - 0.5), atol=ROUNDING)  # what was beyond the yield, times the share
+    assert_allclose(y[180:] - x[180:], y[180], atol=ROUNDING)
+    assert_allclose(yielded(along([0.0, 2.0, -2.0, 2.0, 0.0], 40))[-1], 0.2 * 0.5, atol=ROUNDING)  # a large set shrinks on the way back
+
+
+# Laws in time
+
+
+def test_relaxation_after_a_step() -> None:
+    # c (1 - exp(-t / tau)) of it comes late: out = 1 - c exp(-t / tau); the step takes no time
+    dt = np.concatenate([[0.1, 0.0], np.random.default_rng(5).uniform(0.001, 2.0, 40)])
+    x = np.ones((1, 42, 1))
+    x[0, 0] = 0.0
+    relaxation(x, full(2), one(0.15), one(3.0), dt)
+    t = np.cumsum(dt[1:])
+    assert_allclose(x[0, 1:, 0], 1.0 - 0.15 * np.exp(-t / 3.0), atol=ROUNDING)
+
+
+def test_relaxation_behind_a_ramp_and_its_loop_depends_on_speed() -> None:
+    # of x = v t, once the start is forgotten, x - y is v tau
+    dt = np.full(400, 0.1)
+    ramp = 0.5 * np.cumsum(dt)
+    x = ramp[None, :, None].copy()
+    relaxation(x, full(2), one(0.15), one(2.0), dt)
+    assert_allclose((ramp - x[0, :, 0])[-1], 0.15 * 0.5 * 2.0, atol=1e-8)  # exp(-40 s / 2 s)
+    # the loop of x = sin wt is widest at w tau = 1: area pi c w tau / (1 + (w tau)^2)
+    for rate in (0.1, 0.5, 3.0):
+        t = np.linspace(0.0, 24.0 * np.pi / rate, 24001)
+        path = np.sin(rate * t)
+        y = path[None, :, None].copy()
+        relaxation(y, full(2), one(0.15), one(2.0), np.diff(t, prepend=0.0))
+        last = slice(22000, None)
+        area = np.trapezoid(y[0, last, 0], path[last])
+        # linear in between, at 2000 samples a turn: 1e-6; the start is forgotten to exp(-22 pi / w tau)
+        assert_allclose(abs(area), np.pi * 0.15 * rate * 2.0 / (1.0 + (rate * 2.0) ** 2), rtol=1e-4)
+
+
+@pytest.mark.parametrize("damping", [0.02, 0.3, 0.98])
+def test_second_order_after_a_step_rings_as_the_textbook_says_and_loses_energy(damping: float) -> None:
+    T = 0.3
+    dt = np.concatenate([[0.1, 0.0], np.random.default_rng(6).uniform(0.001, 0.1, 80)])
+    x = np.ones((1, 82, 1))
+    x[0, 0] = 0.0
+    memory = full(3)
+    energy = []
+    for i in range(82):
+        second_order(x[:, i : i + 1], memory, one(T), one(damping), dt[i : i + 1])
+        energy.append(0.5 * (memory[0, 1] - memory[0, 0]) ** 2 + 0.5 * (T * memory[0, 2]) ** 2)
+    t, w = np.cumsum(dt[1:]), np.sqrt(1.0 - damping**2) / T
+    expected = 1.0 - np.exp(-damping * t / T) * (np.cos(w * t) + damping / (T * w) * np.sin(w * t))
+    assert_allclose(x[0, 1:, 0], expected, atol=ROUNDING * 10)
+    assert (np.diff(energy[1:]) < 0.0).all()
+
+
+def test_second_order_against_an_integrator() -> None:
+    rng = np.random.default_rng(7)
+    t = np.cumsum(rng.uniform(0.01, 0.2, 40))
+    path = np.cumsum(rng.uniform(-0.3, 0.3, 40))
+    x = path[None, :, None].copy()
+    second_order(x, full(3), one(0.25), one(0.4), np.diff(t, prepend=0.0))
+
+    def slope(now: float, y: np.ndarray) -> list[float]:
+        return [y[1], (np.interp(now, t, path) - y[0] - 2.0 * 0.4 * 0.25 * y[1]) / 0.25**2]
+
+    y, found = np.array([path[0], 0.0]), [path[0]]
+    for a, b in pairwise(t):  # piece by piece: the integrator does not like corners
+        y = solve_ivp(slope, (a, b), y, rtol=1e-10, atol=1e-12).y[:, -1]
+        found.append(y[0])
+    assert_allclose(x[0, :, 0], found, atol=1e-8)
+
+
+def test_second_order_trails_a_ramp_by_twice_damping_times_period() -> None:
+    dt = np.full(300, 0.05)
+    ramp = np.cumsum(dt)
+    x = ramp[None, :, None].copy()
+    second_order(x, full(3), one(0.2), one(0.5), dt)
+    assert_allclose((ramp - x[0, :, 0])[-1], 2.0 * 0.5 * 0.2, atol=1e-12)  # exp(-0.5 * 15 / 0.2)
+
+
+def test_a_delayed_ramp_is_the_ramp_of_a_moment_ago() -> None:
+    dt = np.random.default_rng(8).uniform(0.005, 0.05, 500)
+    t = np.cumsum(dt)
+    for lag in (0.0, 0.003, 0.1, 0.7):
+        x = (2.0 * t)[None, :, None].copy()
+        delay(x, full(1 + BUFFER * 2), np.array([lag]), dt)
+        assert_allclose(x[0, :, 0], np.maximum(2.0 * (t - lag), 2.0 * t[0]), atol=ROUNDING * 20)  # times up to 14 s
+    # a delay beyond the buffer is cut to the oldest step that is kept
+    x = (2.0 * t)[None, :, None].copy()
+    delay(x, full(1 + BUFFER * 2), np.array([1e3]), dt)
+    assert_allclose(x[0, BUFFER - 1 :, 0], 2.0 * t[: 500 - BUFFER + 1], atol=ROUNDING * 20)
+    assert_array_equal(x[0, : BUFFER - 1, 0], 2.0 * t[0])
+
+
+# Effects against robots that are built so
+
+
+def having(robot: Robot, name: str, **values: Any) -> Robot:
+    return replace(robot, effects=({"name": name, **values},))
+
+
+def settled(robot: Robot, lengths: Any = None, **inputs: Any) -> State:
+    state = Simulator(robot, points_per_segment=8).settle(lengths, tolerance=1e-12, **inputs)
+    assert state.ok.all(), state.problems
+    return state
+
+
+def seen(robot: Robot, lengths: Any = None, **inputs: Any) -> Measurement:
+    sim = Simulator(robot, points_per_segment=8)
+    sim.settle(lengths, tolerance=1e-12, **inputs)
+    return sim.measure()
+
+
+def alike(one: State, two: State, atol: float = 1e-12) -> None:
+    """Settled to 1e-12 m, with tensions to a millionth of EI/(d l)."""
+    for name in ("position", "rotation"):
+        assert_allclose(getattr(one, name), getattr(two, name), atol=atol * (1.0 if name == "position" else 100.0))
+    assert_allclose(one.tension, two.tension, atol=1e-5)
+
+
+LOADS: dict[str, Any] = {
+    "tip_force": (0.05, 0.1, -0.1),
+    "line_force": (0.1, 0.0, 0.2),
+    "base_pose": (0.1, 0.2, 0.3, *Rotation.from_rotvec([0.4, -0.9, 0.3]).as_quat(scalar_first=True)),
+}
+
+
+def chain() -> Robot:
+    robot = load_robot("tdcr_b")
+    first, last = robot.segments
+    return replace(robot, segments=(first, replace(last, length=0.08, bending_stiffness=(0.002, 0.003))))
+
+
+def pull(robot: Robot) -> np.ndarray:
+    return bend(robot, 0.5, -0.3) + bend(robot, -0.2, 0.4, 1) - robot.rest_tendon_length
+
+
+def test_gravity_is_the_weight_of_the_body() -> None:
+    robot, density = chain(), [0.2, 0.4]
+    heavy = replace(robot, segments=tuple(replace(s, line_density=d) for s, d in zip(robot.segments, density, strict=True)))
+    alike(settled(having(robot, "gravity", line_density=density), pull(robot), **LOADS), settled(heavy, pull(robot), **LOADS))
+    sampled = LOADS | {"line_force": np.full((2, 5, 3), 0.1) * np.arange(5)[:, None]}
+    alike(settled(having(robot, "gravity", line_density=density), pull(robot), **sampled), settled(heavy, pull(robot), **sampled))
+
+
+def test_payload_is_a_tip_force_along_gravity() -> None:
+    robot = replace(chain(), gravity=(0.0, 3.0, -9.0))
+    more = LOADS | {"tip_force": np.add(LOADS["tip_force"], [0.0, 0.02 * 3.0, -0.02 * 9.0])}
+    alike(settled(having(robot, "payload", mass=0.02), pull(robot), **LOADS), settled(robot, pull(robot), **more))
+
+
+def test_the_effect_tip_force_turns_with_the_base() -> None:
+    robot = having(chain(), "tip_force", x=0.1, y=-0.05, z=0.2)
+    turned, still = (seen(robot, pull(robot), **given) for given in ({"base_pose": LOADS["base_pose"]}, {}))
+    assert_allclose(turned.tip_position, still.tip_position, atol=1e-11)
+    alike(settled(robot, pull(robot)), settled(chain(), pull(robot), tip_force=(0.1, -0.05, 0.2)))
+
+
+def with_tendons(robot: Robot, **changes: Callable[[Any, int, int], Any]) -> Robot:
+    """The robot with fields of its tendons changed: (tendon, its number, its segment) -> value."""
+    segments, t = [], 0
+    for k, segment in enumerate(robot.segments):
+        tendons = []
+        for tendon in segment.tendons:
+            tendons.append(replace(tendon, **{name: change(tendon, t, k) for name, change in changes.items()}))
+            t += 1
+        segments.append(replace(segment, tendons=tuple(tendons)))
+    return replace(robot, segments=tuple(segments))
+
+
+def test_tendon_stretch_is_compliance() -> None:
+    robot, more = chain(), [1e-4, 3e-4]
+    soft = with_tendons(robot, compliance=lambda tendon, t, k: tendon.compliance + more[k])
+    alike(settled(having(robot, "tendon_stretch", compliance=more), pull(robot), **LOADS), settled(soft, pull(robot), **LOADS))
+
+
+def test_routing_angle_is_the_angle_of_a_tendon() -> None:
+    robot, angles = chain(), [0.1, -0.2, 0.05, 0.0, 0.3, -0.1]  # three wires a segment: each is a drive
+    turned = with_tendons(robot, angle=lambda tendon, t, k: tendon.angle + angles[t])
+    alike(settled(having(robot, "routing_angle", angle=angles), pull(robot), **LOADS), settled(turned, pull(robot), **LOADS))
+    pairs = with_tendons(rod(), angle=lambda tendon, t, k: tendon.angle + (0.1, -0.2)[t % 2])
+    alike(settled(having(rod(), "routing_angle", angle=[0.1, -0.2]), bend(rod(), 0.5, 0.3)), settled(pairs, bend(rod(), 0.5, 0.3)))
+
+
+def test_encoder_offset_shifts_the_wires_antagonists_opposite() -> None:
+    robot, lengths = rod(), bend(rod(), 0.5, 0.3)
+    offset = settled(having(robot, "encoder_offset", offset=[3e-4, -2e-4]), lengths)
+    alike(offset, settled(robot, lengths + np.array([3e-4, -2e-4, -3e-4, 2e-4])))
+
+
+def test_drum_gain_and_temperature_scale_the_pull() -> None:
+    robot, lengths = rod(), bend(rod(), 0.5, 0.3)
+    dl = lengths - robot.rest_tendon_length
+    alike(settled(having(robot, "drum_gain", gain=[0.2, -0.1]), lengths), settled(robot, lengths + dl * [0.2, -0.1, 0.2, -0.1]))
+    sim = Simulator(having(robot, "temperature", gain=0.1, time_constant=10.0), dt=2.5, points_per_segment=8)
+    for k in range(4):  # the first input is at time zero
+        warm = 0.1 * (1.0 - np.exp(-2.5 * k / 10.0))
+        alike(sim.settle(lengths, tolerance=1e-12), settled(robot, lengths + warm * dl))
+
+
+def test_only_what_bends_is_gained() -> None:
+    """A pull that all wires share is the backbone's to take, not the gain's: it would be tension between stiff parts."""
+    robot = rod()
+    common = settled(having(robot, "drum_gain", gain=0.5), robot.rest_tendon_length - 1e-5)
+    alike(common, settled(robot, robot.rest_tendon_length - 1e-5))
+
+
+def test_coupling_slack_and_stiffening_change_the_bend_that_is_asked_for() -> None:
+    robot = chain()
+    near, far = np.array([0.5, -0.3]), np.array([-0.2, 0.4])
+
+    def asked(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        return bend(robot, *first) + bend(robot, *second, 1) - robot.rest_tendon_length
+
+    coupled = settled(having(robot, "coupling", from_distal=0.2, from_proximal=-0.1), asked(near, far))
+    alike(coupled, settled(robot, asked(near + 0.2 * far, far - 0.1 * near)))
+    stiff = settled(having(robot, "stiffening", cubic=[0.3, -0.2]), asked(near, far))
+    alike(stiff, settled(robot, asked(near * (1.0 - 0.3 * (near @ near)), far * (1.0 + 0.2 * (far @ far)))))
+    loose = settled(having(rod(), "slack", half_width=1e-3), bend(rod(), 0.5, 0.1))  # of 3.75 mm and of 0.75 mm
+    alike(loose, settled(rod(), bend(rod(), 0.5 - 1e-3 / 0.0075, 0.0)))
+
+
+def test_axial_compression_is_an_extension_that_the_wires_follow() -> None:
+    robot = rod(extension=(-0.02, 0.02))
+    lengths = bend(robot, 0.6, 0.8)  # a bend of one radian
+    short = settled(having(robot, "axial_compression", per_bend=0.05), lengths)
+    alike(short, settled(robot, lengths - 0.05 * 0.07, extension=[-0.05 * 0.07]))
+    assert_allclose(short.arclength[0, -1], 0.07 * 0.95, rtol=1e-12)
+    # and what the wires pull in common shortens a body that does not resist, without tension
+    common = settled(having(robot, "axial_compression", common_share=1.0), lengths - 0.002)
+    alike(common, settled(robot, lengths - 0.002, extension=[-0.002]))
+    plain = settled(robot, lengths)
+    assert_allclose(common.tension.sum(), plain.tension.sum(), atol=1e-4)
+    two = replace(chain(), segments=tuple(replace(s, extension=(-0.02, 0.02)) for s in chain().segments))
+    both = settled(having(two, "axial_compression", per_bend=[0.05, 0.1]), pull(two))
+    by = np.array([-0.05 * 0.1 * np.hypot(0.5, 0.3), -0.1 * 0.08 * np.hypot(0.2, 0.4)])
+    alike(both, settled(two, pull(two) + np.cumsum(by)[two.tendon_segment], extension=by))
+
+
+def test_anisotropy_is_another_stiffness_about_each_axis() -> None:
+    robot, ratio = chain(), [0.2, -0.3]
+    other = replace(
+        robot,
+        segments=tuple(
+            replace(s, bending_stiffness=(s.bending_stiffness[0] * (1.0 + e), s.bending_stiffness[1] * (1.0 - e)))
+            for s, e in zip(robot.segments, ratio, strict=True)
+        ),
+    )
+    alike(settled(having(robot, "stiffness_anisotropy", ratio=ratio), pull(robot), **LOADS), settled(other, pull(robot), **LOADS))
+
+
+def test_taper_is_a_chain_of_ever_softer_pieces() -> None:
+    n, slope = 40, 0.5
+    middles = (np.arange(n) + 0.5) / n
+    pieces = [
+        Segment(length=0.07 / n, bending_stiffness=(0.0022 * k, 0.0022 * k), torsional_stiffness=0.001 * k, mode="passive")
+        for k in 1.0 + slope * (1.0 - 2.0 * middles)
+    ]
+    loads = {"tip_force": (0.1, 0.3, -0.1), "tip_moment": (1e-3, 0.0, 2e-3)}
+    tapered = settled(having(rod("passive"), "stiffness_taper", slope=slope), **loads)
+    built = settled(Robot(name="pieces", segments=tuple(pieces)), **loads)
+    # steps of K at the middles: second order in 1 / 40
+    assert_allclose(tapered.tip_position, built.tip_position, atol=2e-4 * np.abs(built.tip_position).max())
+    assert np.abs(tapered.tip_position - settled(rod("passive"), **loads).tip_position).max() > 1e-3
+
+
+def test_uniform_precurvature_is_the_segments_own() -> None:
+    robot = chain()
+    own = replace(robot, segments=tuple(replace(s, precurvature=(k + 1.0, -2.0, 0.0)) for k, s in enumerate(robot.segments)))
+    alike(
+        settled(having(robot, "precurvature", uniform_x=[1.0, 2.0], uniform_y=-2.0), pull(robot), **LOADS),
+        settled(own, pull(robot), **LOADS),
+    )
+
+
+def test_a_bow_moves_the_tip_and_does_not_turn_it() -> None:
+    # theta(s) = b (s - s^2 / l): nothing at the tip, and its integral is b l^2 / 6; beyond it terms of theta^2, 1e-5 here
+    state = settled(having(rod("passive"), "precurvature", bow_x=0.3, bow_y=-0.2))
+    assert_allclose(state.tip_rotation[0], np.eye(3), atol=1e-5)
+    assert_allclose(state.tip_position[0, :2], np.array([-0.2, -0.3]) * 0.07**2 / 6.0, rtol=1e-4)
+    stiff = settled(having(rod(), "precurvature", uniform_x=2.0), rod().rest_tendon_length)
+    assert np.abs(stiff.tip_position[0, :2]).max() < 5e-5  # wires that hardly stretch straighten a uniform one, but not a bow
+    bowed = settled(having(rod(), "precurvature", bow_x=2.0), rod().rest_tendon_length)
+    assert_allclose(bowed.tip_position[0, 1], -2.0 * 0.07**2 / 6.0, rtol=2e-2)
+
+
+# What the camera sees
+
+
+def test_what_the_camera_makes_of_the_tip() -> None:
+    robot = replace(rod(), log_points=(0.03, 0.05))
+    lengths, given = bend(robot, 0.6, 0.4), {"base_pose": LOADS["base_pose"]}
+    plain = seen(robot, lengths, **given)
+    r, R, points = plain.tip_position[0], plain.tip_rotation[0], plain.points[0]
+
+    def look(name: str, **values: float) -> Measurement:
+        return seen(having(robot, name, **values), lengths, **given)
+
+    turn, shift = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix(), np.array([0.01, -0.02, 0.005])
+    values = {"rotation_x": 0.3, "rotation_y": -0.2, "rotation_z": 0.5, "shift_x": 0.01, "shift_y": -0.02, "shift_z": 0.005}
+    frame = look("frame_misalignment", **values)
+    assert_allclose(frame.tip_position[0], turn @ r + shift, atol=1e-15)
+    assert_allclose(frame.points[0], points @ turn.T + shift, atol=1e-15)
+    assert_allclose(frame.tip_rotation[0], turn @ R, atol=1e-14)
+
+    marker = look("marker_offset", x=0.003, y=-0.002, z=0.01)
+    assert_allclose(marker.tip_position[0], r + R @ [0.003, -0.002, 0.01], atol=1e-15)
+    assert_array_equal(marker.points, plain.points)  # it is the tip's marker
+    assert_array_equal(marker.tip_rotation, plain.tip_rotation)
+
+    scale = look("camera_scale", scale=0.05)
+    assert_allclose(scale.tip_position[0], 1.05 * r, rtol=1e-14)
+    assert_allclose(scale.points[0], 1.05 * points, rtol=1e-14)
+
+    lens = look("lens", radial=0.2)
+    for found, true in ((lens.tip_position[0], r), (lens.points[0, 1], points[1])):
+        assert_allclose(found[:2], true[:2] * (1.0 + 0.2 * (true[:2] @ true[:2]) / 0.07**2), rtol=1e-14)
+        assert found[2] == true[2]
+
+    drifting = Simulator(having(robot, "time_drift", x=1e-5, y=0.0, z=-2e-5), dt=0.5, points_per_segment=8)
+    for k in range(3):
+        drifting.settle(lengths, tolerance=1e-12, **given)
+        moved = 0.5 * k * np.array([1e-5, 0.0, -2e-5])
+        for _ in range(2):  # looking twice is not a step
+            now = drifting.measure()
+            assert_allclose(now.tip_position[0], r + moved, atol=1e-12)
+            assert_allclose(now.points[0], points + moved, atol=1e-12)
+
+
+def test_effects_of_the_camera_act_from_the_marker_on() -> None:
+    tables = ({"name": "time_drift", "x": 1e-3}, {"name": "camera_scale", "scale": 0.1}, {"name": "marker_offset", "z": 0.01})
+    robot = replace(rod(), effects=tables)
+    sim = Simulator(robot, dt=1.0)
+    for _ in range(2):
+        sim.settle(robot.rest_tendon_length)
+    assert_allclose(sim.measure().tip_position[0], [1e-3, 0.0, 1.1 * 0.08], atol=1e-9)  # drift after scale after marker
+
+
+@pytest.mark.parametrize(("name", "values"), [("latency", {"delay": 0.12}), ("dynamics", {"period": 0.2}), ("creep", {"share": 0.2})])
+def test_an_effect_on_the_wires_is_its_operator_on_what_bends(name: str, values: dict[str, float]) -> None:
+    """In a simulator, step by step, an operator is the simulator of the base model on wires that went through it."""
+    robot = rod()
+    path = np.stack([bend(robot, 0.8 * np.sin(0.4 * k), 0.5 * np.cos(0.3 * k)) for k in range(12)])
+    what: Any = get_effect(name)
+    row = np.array([[values.get(p.name, p.neutral) for p in what.parameters]])
+    dl = path - robot.rest_tendon_length
+    moved = what.sweep(row, what.memory(1, 4), dl[None], np.full(12, 0.05), wire(robot))[0]
+    sim, base = Simulator(having(robot, name, **values), dt=0.05), Simulator(robot, dt=0.05)
+    for there, here in zip(path, moved + robot.rest_tendon_length, strict=True):
+        assert_allclose(sim.step(there).tip_position, base.step(here).tip_position, atol=1e-11)
