@@ -15,7 +15,7 @@ class Friction(Operator):
     """Dry friction of the wires along the backbone, growing with the bend as a capstan.
 
     Equation: l -> l - a (1 + k phi) mean z_j, z_j = clip(z_j + l' / r_j, -1, 1), phi the angle that the wire wraps, r_j over r (1 -+ s)
-    Source: Iwan 1966, Prandtl and Ishlinskii (sliders in parallel); capstan T_out = T_in exp(-mu theta), Kato et al. 2015, Palli and Melchiorri
+    Source: Iwan 1966, Prandtl and Ishlinskii (sliders in parallel); capstan, Kato et al. 2015, Palli and Melchiorri
     Residual signature: sign of the last direction of motion, saturating with travel; loops that grow with the bend, blind to speed
     """
 

@@ -14,8 +14,8 @@ from fastrod.wiring import Wiring
 class PlasticSet(Operator):
     """The body yields at large bends and keeps a set.
 
-    Equation: dl -> dl + c p, p a play of half width y that begins at the straight rod
-    Source: elasto-plastic play (Visintin 1994)
+    Equation: theta -> theta + c p, p dragged along once |theta - p| > y; it begins at the straight rod
+    Source: elasto-plastic stop with an isotropic yield surface (Visintin 1994)
     Residual signature: nothing until a new extreme, then it stays: the rod does not return to zero
     """
 
@@ -23,17 +23,18 @@ class PlasticSet(Operator):
     order = 60.0
     parameters = (
         Parameter("share", "", bounds=(-0.5, 1.0), typical=0.08, starts=(0.08,)),
-        Parameter("yield_at", "m", neutral=0.7, bounds=(0.1, 2.0), typical=0.7, starts=(0.45, 0.65, 0.85), of="reach", shape=True),
+        Parameter("yield_at", "rad", neutral=0.7, bounds=(0.1, 2.0), typical=0.7, starts=(0.45, 0.65, 0.85), shape=True),
     )
     excited_by = "growing amplitudes with a return to zero after each"
     confounded_with = ("friction", "time_drift")
     synonyms = ("set", "permanent_set")
 
     def memory(self, n_robots: int, n_tendons: int) -> Floats:
-        return np.full((n_robots, n_tendons), np.nan)
+        return np.full((n_robots, 2 * n_tendons), np.nan)
 
     def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Wiring) -> Floats:  # noqa: ARG002
-        out = dl.copy()
-        share, at = (np.repeat(values[:, k : k + 1], wiring.n_tendons, axis=1) for k in (0, 1))
-        yielding(out, memory, share, at)
-        return out
+        before = wiring.bend(dl)
+        bend = before.copy()
+        share, at = (np.repeat(values[:, k : k + 1], wiring.n_segments, axis=1) for k in (0, 1))
+        yielding(bend, memory, share, at)
+        return dl + wiring.wires(bend - before)

@@ -11,12 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from fastrod.identification.forward import Samples
+from fastrod.identification.solve import paired
 from fastrod.types import Floats, Ints
 from fastrod.wiring import Wiring
 
 _RANDOM = 60  # Fourier features
 _PLAYS = (0.03, 0.1, 0.25, 0.5)  # of the largest bend
 _LAGS = (0.3, 1.5, 6.0, 25.0)  # s
+_PIECES = 60  # blocks that the folds take in turn
 _RIDGES = (1.0, 30.0, 1000.0)
 
 
@@ -45,13 +47,14 @@ class Audit:
         return name if self.structured > 0.0 and parts[name] > 0.0 else "none"
 
 
-def audit(samples: Samples, wiring: Wiring, residual: Floats, block: Ints, n_blocks: int, noise_lag1: float = 0.0) -> Audit:
-    """Audit a residual (n_rows, n_out) in order of time; `block` (n_rows,) numbers its blocks."""
+def audit(samples: Samples, wiring: Wiring, residual: Floats, noise_lag1: float = 0.0, n_blocks: int = 10) -> Audit:
+    """Audit a residual (n_rows, n_out) in order of time, on `n_blocks` folds of short blocks."""
     variance = float((residual**2).sum())
+    block = np.arange(len(residual)) * _PIECES // max(len(residual), 1) % n_blocks
     if variance <= 0.0 or n_blocks < 3:
         return Audit(0.0, 0.0, 0.0, 0.0, 0.0)
     static, memory, drift = _features(samples, wiring)
-    losses = [np.bincount(block, weights=(residual**2).sum(1), minlength=n_blocks)]
+    losses: list[Floats] = [np.asarray(np.bincount(block, weights=(residual**2).sum(1), minlength=n_blocks), dtype=np.float64)]
     columns = np.zeros((len(residual), 0))
     left = residual
     shares = []
@@ -59,8 +62,7 @@ def audit(samples: Samples, wiring: Wiring, residual: Floats, block: Ints, n_blo
         columns = np.concatenate([columns, more], axis=1)
         loss, rest = _ridge(columns, residual, block, n_blocks)
         gain = losses[-1] - loss
-        z = gain.mean() / max(gain.std(ddof=1), 1e-300) * np.sqrt(n_blocks)
-        if gain.sum() > 0.0 and z > 2.5:
+        if gain.sum() > 0.0 and paired(losses[-1], loss) > 2.5:
             shares.append(float(gain.sum()) / variance)
             losses.append(loss)
             left = rest
@@ -70,8 +72,7 @@ def audit(samples: Samples, wiring: Wiring, residual: Floats, block: Ints, n_blo
     pair = float((left[1:] * left[:-1])[order].sum()) / max(float((left**2).sum()), 1e-300)
     beyond = max(0.0, pair - max(noise_lag1, 0.0)) if len(left) > 50 else 0.0
     exogenous = beyond * float((left**2).sum()) / variance if beyond > 4.0 / np.sqrt(max(left.size, 1)) + 0.02 else 0.0
-    gain = losses[0] - losses[-1]
-    z = gain.mean() / max(gain.std(ddof=1), 1e-300) * np.sqrt(n_blocks) if len(losses) > 1 else 0.0
+    z = paired(losses[0], losses[-1]) if len(losses) > 1 else 0.0
     return Audit(shares[0], shares[1], shares[2], exogenous, float(max(z, beyond * np.sqrt(left.size))))
 
 
@@ -116,9 +117,7 @@ def _features(samples: Samples, wiring: Wiring) -> tuple[Floats, Floats, Floats]
         for width in (1.5, 5.0):
             direction = width * rng.normal(size=(now.shape[1], _RANDOM // 2))
             static.append(np.cos(now @ direction + rng.uniform(0.0, 2.0 * np.pi, _RANDOM // 2)))
-    memory = []
-    for part in samples.runs:
-        memory.append(_memory(b[part], samples.dt[part]))
+    memory = [_memory(b[part], samples.dt[part]) for part in samples.runs]
     t = np.cumsum(samples.dt)
     t = t / max(float(t[-1]), 1e-9)
     drift = np.stack([f(np.pi * k * t) for k in range(1, 7) for f in (np.sin, np.cos)] + [t, t**2], axis=1)
@@ -134,7 +133,7 @@ def _memory(b: Floats, dt: Floats) -> Floats:
     found = []
     for width in _PLAYS:
         x = b[None].copy()
-        play(x, np.full((1, b.shape[1]), np.nan), np.full((1, b.shape[1]), width))
+        play(x, np.full((1, 3 * b.shape[1]), np.nan), np.full((1, b.shape[1]), width), np.zeros((1, b.shape[1])))
         found.append((b - x[0]) / width)
     for lag in _LAGS:
         x = b[None].copy()

@@ -39,9 +39,10 @@ def foils(local: Local, tangent: Floats, residual: Floats) -> list[Foil]:
     """The best of each family for a residual (n, n_out) that `tangent` (n, n_out, p) can absorb part of."""
     solver = _Projected(tangent, residual)
     found = []
-    for family in (_bump, _slip, _sway, _ripple, _contact, _attraction, _patch):
+    families = (_bump(local), _slip(local), _sway(local, residual), _ripple(local), _contact(local), _attraction(local), _patch(local))
+    for family in families:
         best: tuple[float, Foil] | None = None
-        for foil in family(local, residual):
+        for foil in family:
             loss = solver.loss(foil.columns)
             if best is None or loss < best[0]:
                 best = loss, foil
@@ -71,7 +72,7 @@ class _Projected:
 
 def _sensed(local: Local, change: Floats) -> Floats:
     """(n, n_out, k) weighted columns of changes of the seen tip (n, 3, k) [m]."""
-    return _weighted(local, np.concatenate([change, np.zeros((len(change), local.by_bend.shape[1] - 3, change.shape[2]))], axis=1))
+    return _weighted(local, np.concatenate([change, np.zeros((len(change), 3 + 3 * local.pose.points.shape[1], change.shape[2]))], axis=1))
 
 
 def _weighted(local: Local, change: Floats) -> Floats:
@@ -91,7 +92,7 @@ def _log_time(local: Local) -> Floats:
     return np.cumsum(samples.dt)[samples.rows]
 
 
-def _bump(local: Local, residual: Floats) -> Iterator[Foil]:
+def _bump(local: Local) -> Iterator[Foil]:
     t = _log_time(local)
     for at in np.quantile(t, np.linspace(0.03, 0.97, _TIMES)):
         step = (t > at).astype(float)
@@ -99,8 +100,8 @@ def _bump(local: Local, residual: Floats) -> Iterator[Foil]:
         yield Foil("bump", "drift", f"the measured tip jumps at {at:.1f} s and stays: base or camera was moved", columns, 1)
 
 
-def _slip(local: Local, residual: Floats) -> Iterator[Foil]:
-    if not local.by_bend.shape[2]:
+def _slip(local: Local) -> Iterator[Foil]:
+    if not local.model.wiring.n_tendons:
         return
     t = _log_time(local)
     wiring = local.model.wiring
@@ -132,9 +133,9 @@ def _sway(local: Local, residual: Floats) -> Iterator[Foil]:
             yield Foil("sway", "exogenous", f"a line at {fine:.3f} Hz that no input has: the base or the camera sways", columns, 1)
 
 
-def _ripple(local: Local, residual: Floats) -> Iterator[Foil]:
+def _ripple(local: Local) -> Iterator[Foil]:
     wiring = local.model.wiring
-    if not local.by_bend.shape[2]:
+    if not local.model.wiring.n_tendons:
         return
     dl = local.bench.dl[local.samples.rows]
     span = float(np.ptp(dl, axis=0).max())
@@ -153,7 +154,7 @@ def _ripple(local: Local, residual: Floats) -> Iterator[Foil]:
         )  # fmt: skip
 
 
-def _contact(local: Local, residual: Floats) -> Iterator[Foil]:
+def _contact(local: Local) -> Iterator[Foil]:
     """One-sided push along n where the tip goes beyond a plane n . x = c."""
     tip = local.pose.position
     angle = np.arange(24) * np.pi / 12.0
@@ -174,7 +175,7 @@ def _contact(local: Local, residual: Floats) -> Iterator[Foil]:
             )
 
 
-def _attraction(local: Local, residual: Floats) -> Iterator[Foil]:
+def _attraction(local: Local) -> Iterator[Foil]:
     """A force towards a fixed point, as a magnet's."""
     tip = local.pose.position
     reach = float(np.quantile(np.linalg.norm(tip - tip.mean(0), axis=1), 0.98)) + 1e-9
@@ -191,7 +192,7 @@ def _attraction(local: Local, residual: Floats) -> Iterator[Foil]:
         )
 
 
-def _patch(local: Local, residual: Floats) -> Iterator[Foil]:
+def _patch(local: Local) -> Iterator[Foil]:
     """Something in one corner of the workspace only."""
     tip = local.pose.position[:, :2]
     reach = float(np.quantile(np.linalg.norm(tip - tip.mean(0), axis=1), 0.98)) + 1e-9

@@ -7,7 +7,7 @@ batch, and only those samples are solved that the loss looks at.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -220,7 +220,7 @@ def bench(samples: Samples, robot: Robot, wiring: Wiring) -> Bench:
 
 
 def _given(keywords: dict[str, Floats]) -> Inputs:
-    return Inputs()._replace(**keywords)
+    return Inputs(**dict[str, Any](keywords))
 
 
 def chain_of(model: Model, theta: Floats) -> list[tuple[Effect, Floats]]:

@@ -6,6 +6,8 @@ direction that its inputs can take; after that a candidate costs no rod at all. 
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 
 from fastrod.effect import Seam, get_effect, has_memory
@@ -70,9 +72,6 @@ class Local:
         self.opened = self.bench.drive(self.chain)
         self.pose = rod.solve(*self.bench.kernel(self.opened), self.robot)
         self._kept = rod.keep()
-        soft = min(min(s.bending_stiffness) for s in self.robot.segments) / self.robot.length**2
-        self.by_bend = self._slopes_by_bend()
-        self.by_force = self._slopes_by_force(_FORCE * soft)
         self._columns: dict[tuple[str, ...], Floats] = {}
         light = [link for link, name in zip(self.chain, model.effects, strict=True) if self.is_light(name)]
         at = self.bench.drive(light)
@@ -96,7 +95,8 @@ class Local:
         opened.tendon_length, opened.tip_force = before
         return self._difference(pose)
 
-    def _slopes_by_bend(self) -> Floats:
+    @cached_property
+    def by_bend(self) -> Floats:
         """(n, 6 + 3k, 2 n_segments) per rad."""
         wiring = self.model.wiring
         every = []
@@ -106,8 +106,10 @@ class Local:
             every.append(self._solved(length=self.opened.tendon_length + wiring.wires(change)) / _BEND)
         return np.stack(every, axis=-1) if every else np.zeros((len(self.samples.rows), 6 + 3 * self.pose.points.shape[1], 0))
 
-    def _slopes_by_force(self, step: float) -> Floats:
+    @cached_property
+    def by_force(self) -> Floats:
         """(n, 6 + 3k, 3) per N, world."""
+        step = _FORCE * min(min(s.bending_stiffness) for s in self.robot.segments) / self.robot.length**2
         return np.stack([self._solved(force=self.opened.tip_force + step * np.eye(3)[j]) / step for j in range(3)], axis=-1)
 
     def is_light(self, name: str) -> bool:
@@ -165,10 +167,10 @@ class Local:
         """(n, 6 + 3k) change of the true pose by wires and tip forces."""
         light = [link for link, name in zip(chain_of(model, theta), model.effects, strict=True) if self.is_light(name)]
         opened = self.bench.drive(light)
-        change = np.zeros((len(opened), self.by_bend.shape[1]))
-        if self.by_bend.shape[2]:
-            bend = self.model.wiring.bend(opened.tendon_length - self._length).reshape(len(opened), -1)
-            change += np.einsum("nij,nj->ni", self.by_bend, bend)
+        change = np.zeros((len(opened), 6 + 3 * self.pose.points.shape[1]))
+        moved = opened.tendon_length - self._length
+        if moved.any():
+            change += np.einsum("nij,nj->ni", self.by_bend, self.model.wiring.bend(moved).reshape(len(opened), -1))
         force = opened.tip_force - self._force
         if force.any():
             change += np.einsum("nij,nj->ni", self.by_force, force)
@@ -177,7 +179,7 @@ class Local:
     def solved(self, model: Model, theta: Floats) -> Floats:
         """(n, 6 + 3k) change of the true pose by what needs the rod."""
         at = {u.place: u.inside(float(v)) for u, v in zip(self.model.unknowns, self.theta, strict=True)}
-        change = np.zeros((len(self.samples.rows), self.by_bend.shape[1]))
+        change = np.zeros((len(self.samples.rows), 6 + 3 * self.pose.points.shape[1]))
         for unknown, number in zip(model.unknowns, theta, strict=True):
             if not self._is_light(unknown):
                 change += self.column(unknown) * (unknown.inside(float(number)) - at.get(unknown.place, unknown.mean))

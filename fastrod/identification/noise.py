@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fastrod.identification.forward import Samples
-from fastrod.types import Flags, Floats
+from fastrod.types import Flags, Floats, Ints
 
 _STILL = 2e-4  # of an input's range; less is no motion
 _SETTLE = 1.0  # s after a motion that do not count as rest
@@ -35,7 +35,7 @@ class Noise:
         return float(np.sqrt(np.sum(self.sigma**2)))
 
 
-def at_rest(samples: Samples) -> list[Floats]:
+def at_rest(samples: Samples) -> list[Ints]:
     """Stretches of rows at which no input has moved for a while: arrays of indices into `samples.rows`."""
     log = samples.log
     drives = [log.dl] + [a.reshape(len(log), -1) for a in (log.ext, log.tip_force, log.payload, log.base_quaternion) if a is not None]

@@ -21,13 +21,14 @@ from fastrod.identification.unknowns import Model
 from fastrod.types import Floats, Ints
 
 Z_ACCEPT, BIC_ACCEPT, SHARE_ACCEPT = 3.0, 10.0, 0.006
+Z_STRONG, BIC_STRONG = 1.7, 60.0  # an effect that shows in a few blocks only, but there beyond doubt
 Z_RIVAL, BIC_RIVAL = 2.0, 10.0
 Z_KEEP, BIC_KEEP = 2.0, 6.0
 N_BLOCKS = 20
 _STARTS = 8
 _SCREEN = 0.003  # of the loss: a candidate whose slopes promise less is not fitted
 _FEW, _MANY = 3, 12  # iterations of a start, and of the best of them
-_REFINED = 3  # candidates that are solved exactly at each stage
+_REFINED = 6  # candidates that are solved exactly at each stage
 _FOIL_SD = 30.0  # of a foil's amplitude, in units of its own columns' size that would explain all
 
 
@@ -73,7 +74,7 @@ class Candidate:
 
     @property
     def passes(self) -> bool:
-        return self.state is not None and not self.why and self.z > Z_ACCEPT and self.bic_gain > BIC_ACCEPT and self.share > SHARE_ACCEPT
+        return self.state is not None and not self.why
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,7 +261,7 @@ class Search:
         z = paired(state.losses, with_it.losses)
         share = 1.0 - with_it.fit.loss / state.fit.loss
         why = "" if foil else _unphysical(with_it, name)
-        if not why and not (z > Z_ACCEPT and gain > BIC_ACCEPT and share > SHARE_ACCEPT):
+        if not why and not (share > SHARE_ACCEPT and ((z > Z_ACCEPT and gain > BIC_ACCEPT) or (z > Z_STRONG and gain > BIC_STRONG))):
             why = f"no gain on held-out blocks (z {z:.1f}, BIC {gain:.0f}, {100 * share:.1f} % of the loss)"
         return Candidate(name, with_it, z, gain, share, k, why, foil)
 
@@ -305,41 +306,36 @@ class Search:
         return self.choose(state, tried, with_foils=with_foils)
 
     def choose(self, state: State, tried: list[Candidate], *, with_foils: bool) -> Step:
-        fitted = sorted((c for c in tried if c.state is not None), key=lambda c: -c.bic_gain)
+        """Solve the promising ones exactly, then take the best by evidence; foils only where they beat it clearly."""
+        fitted = sorted((c for c in tried if c.state is not None and c.z > 1.0 and c.share > SHARE_ACCEPT), key=lambda c: -c.share)
+        heavy = [c for c in fitted if not state.local.is_light(c.name)]  # of these even the fit so far is linear
         exact = {}
-        for candidate in [c for c in fitted if c.z > 1.5 and c.share > SHARE_ACCEPT][:_REFINED]:
+        for candidate in dict.fromkeys([*fitted[:_REFINED], *heavy]):
             assert candidate.state is not None
-            exact[candidate.name] = self.judged(state, self.refined(candidate.state), candidate.name)
+            exact[candidate.name] = self.judged(state, self.refined(self.refined(candidate.state)), candidate.name)
         tried = [exact.get(c.name, c) for c in tried]
-        passing = sorted((c for c in tried if c.passes), key=lambda c: -c.bic_gain)
-        best = passing[0] if passing else None
+        passing = [c for c in tried if c.passes]
+        best = _best(passing)
         foil = None
         if with_foils:
             others = self.foil_candidates(state)
             tried += others
-            able = sorted((c for c in others if c.passes), key=lambda c: -c.bic_gain)
-            foil = able[0] if able else None
-        if foil is not None and foil.state is not None and (best is None or best.state is None or _beats(foil, best)):
+            foil = _best([c for c in others if c.passes])
+        if foil is not None and (best is None or (advantage(foil, best) > BIC_RIVAL and _z_between(foil, best) > Z_RIVAL)):
             return Step(state, tuple(tried), foil)
-        if best is None or best.state is None:
+        if best is None:
             return Step(state, tuple(tried), None)
-        rivals = tuple(c.name for c in tried if c.foil is None and c.name != best.name and self._rival(best, c))
-        fewer = [
-            c
-            for c in tried
-            if c.name in rivals and c.passes and c.n_parameters < best.n_parameters and best.bic_gain - c.bic_gain < BIC_RIVAL
-        ]
-        if fewer:
-            simple = max(fewer, key=lambda c: c.bic_gain)
-            rivals = (best.name, *(name for name in rivals if name != simple.name))
-            best = simple
-        assert best.state is not None
-        return Step(state, tuple(tried), best, rivals)
+        rivals = [c for c in tried if c.foil is None and c.name != best.name and self._rival(best, c)]
+        fewer = _best([c for c in rivals if c.passes and c.n_parameters < best.n_parameters and advantage(best, c) < BIC_RIVAL])
+        if fewer is not None:
+            rivals = [best, *(c for c in rivals if c is not fewer)]
+            best = fewer
+        return Step(state, tuple(tried), best, tuple(c.name for c in rivals))
 
     def _rival(self, best: Candidate, other: Candidate) -> bool:
-        if other.state is None or best.state is None or other.share < SHARE_ACCEPT or _unphysical(other.state, other.name):
+        if other.state is None or other.share < SHARE_ACCEPT or _unphysical(other.state, other.name):
             return False
-        return best.bic_gain - other.bic_gain < BIC_RIVAL or paired(other.state.losses, best.state.losses) < Z_RIVAL
+        return advantage(best, other) < BIC_RIVAL or _z_between(best, other) < Z_RIVAL
 
     def without(self, state: State, name: str) -> State:
         """`state` without one of its effects, fitted again."""
@@ -400,10 +396,28 @@ class Search:
         return made
 
 
-def _beats(foil: Candidate, best: Candidate) -> bool:
-    assert foil.state is not None
-    assert best.state is not None
-    return foil.bic_gain > best.bic_gain + BIC_RIVAL and paired(best.state.losses, foil.state.losses) > Z_RIVAL
+def advantage(one: Candidate, other: Candidate) -> float:
+    """BIC by which one candidate is better than the other, with the effective samples of the one that leaves less."""
+    assert one.state is not None
+    assert other.state is not None
+    losses = one.state.fit.loss, other.state.fit.loss
+    size = effective_size((one if losses[0] <= losses[1] else other).state.fit.residual)  # type: ignore[union-attr]
+    return bic(losses[1], other.n_parameters, size) - bic(losses[0], one.n_parameters, size)
+
+
+def _best(candidates: Sequence[Candidate]) -> Candidate | None:
+    best: Candidate | None = None
+    for candidate in candidates:
+        if best is None or advantage(candidate, best) > 0.0:
+            best = candidate
+    return best
+
+
+def _z_between(one: Candidate, other: Candidate) -> float:
+    """z over held-out blocks of one candidate's gain on the other."""
+    assert one.state is not None
+    assert other.state is not None
+    return paired(other.state.losses, one.state.losses)
 
 
 def _unphysical(state: State, name: str) -> str:
@@ -417,9 +431,3 @@ def _unphysical(state: State, name: str) -> str:
         if at_bound and value != unknown.mean:
             return f"its {unknown.name.partition('.')[2]} would be {value:.3g} {unknown.unit}, at the bound of what is physical"
     return "" if any(size > 0.0 for size in sizes) else "its best size is zero"
-
-
-def with_weight(target: Target, weight: Floats) -> Target:
-    """`target` with outliers out of it."""
-    target.weight = weight
-    return target

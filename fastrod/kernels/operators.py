@@ -23,18 +23,26 @@ BUFFER = 128
 
 
 @entry
-def play(x: Floats, memory: Floats, half_width: Floats) -> None:
-    """Backlash: the output p stays until the input has crossed the gap, |x - p| <= w. memory (n_rows, n_wires): p."""
+def play(x: Floats, memory: Floats, half_width: Floats, rounding: Floats) -> None:
+    """Backlash: the output p stays until the input has crossed the gap, |x - p| <= w; with a rounding c the mean of three
+    plays of half widths w (1 - c), w, w (1 + c). memory (n_rows, 3 n_wires): p."""
+    n = x.shape[2]
     for r in range(x.shape[0]):
-        for w in range(x.shape[2]):
-            p, gap = memory[r, w], half_width[r, w]
-            if math.isnan(p):
-                p = x[r, 0, w]
+        for w in range(n):
+            p = (memory[r, w], memory[r, n + w], memory[r, 2 * n + w])
+            gap, c = half_width[r, w], rounding[r, w]
+            if math.isnan(p[0]):
+                p = (x[r, 0, w], x[r, 0, w], x[r, 0, w])
             for i in range(x.shape[1]):
                 here = x[r, i, w]
-                p = max(here - gap, min(here + gap, p))
-                x[r, i, w] = p
-            memory[r, w] = p
+                low, middle, high = gap * (1.0 - c), gap, gap * (1.0 + c)
+                p = (
+                    max(here - low, min(here + low, p[0])),
+                    max(here - middle, min(here + middle, p[1])),
+                    max(here - high, min(here + high, p[2])),
+                )
+                x[r, i, w] = p[1] + ((p[0] - p[1]) + (p[2] - p[1])) / 3.0
+            memory[r, w], memory[r, n + w], memory[r, 2 * n + w] = p
 
 
 @entry
@@ -117,23 +125,29 @@ def second_order(x: Floats, memory: Floats, period: Floats, damping: Floats, dt:
 
 
 @entry
-def yielding(x: Floats, memory: Floats, share: Floats, yield_at: Floats) -> None:
-    """Plastic set: out x + c p, p a play of half width y that begins at the straight rod; memory (n_rows, n_wires): p."""
-    for r in range(x.shape[0]):
-        for w in range(x.shape[2]):
-            p, y = memory[r, w], yield_at[r, w]
-            if math.isnan(p):
-                p = 0.0
-            for i in range(x.shape[1]):
-                here = x[r, i, w]
-                p = max(here - y, min(here + y, p))
-                x[r, i, w] = here + share[r, w] * p
-            memory[r, w] = p
+def yielding(bend: Floats, memory: Floats, share: Floats, yield_at: Floats) -> None:
+    """Plastic set of bends (n_rows, n_steps, n_segments, 2), in place: out b + c p, p dragged along once |b - p| exceeds y, in any
+    direction; it begins at the straight rod. memory (n_rows, 2 n_segments): p; share and yield_at (n_rows, n_segments)."""
+    for r in range(bend.shape[0]):
+        for k in range(bend.shape[2]):
+            px, py = memory[r, 2 * k], memory[r, 2 * k + 1]
+            if math.isnan(px):
+                px, py = 0.0, 0.0
+            for i in range(bend.shape[1]):
+                dx, dy = bend[r, i, k, 0] - px, bend[r, i, k, 1] - py
+                size = math.sqrt(dx * dx + dy * dy)
+                if size > yield_at[r, k]:
+                    part = 1.0 - yield_at[r, k] / size
+                    px += part * dx
+                    py += part * dy
+                bend[r, i, k, 0] += share[r, k] * px
+                bend[r, i, k, 1] += share[r, k] * py
+            memory[r, 2 * k], memory[r, 2 * k + 1] = px, py
 
 
 @entry
 def delay(x: Floats, memory: Floats, lag: Floats, dt: Floats) -> None:
-    """Out x(t - d), linear in between; memory (n_rows, 1 + BUFFER (1 + n_wires)): count, ages' clock, past lengths.
+    """Out x(t - d), a cubic through the four samples around it, linear where there are not four; memory (n_rows, 1 + BUFFER (1 + n_wires)): count, ages' clock, past lengths.
 
     lag (n_rows,) [s]. Before the first step the wires are taken as at rest there.
     """
@@ -154,16 +168,32 @@ def delay(x: Floats, memory: Floats, lag: Floats, dt: Floats) -> None:
             if lag[r] <= 0.0:
                 continue
             wanted = clock - lag[r]
-            newer = older = slot
+            newest = newer = older = slot
+            steps = 0
             for back in range(1, min(count, BUFFER)):
-                newer = older
+                newest, newer = newer, older
                 older = 1 + ((count - 1 - back) % BUFFER) * width
+                steps = back
                 if memory[r, older] <= wanted:
                     break
+            oldest = 1 + ((count - 2 - steps) % BUFFER) * width
             span = memory[r, newer] - memory[r, older]
             part = (wanted - memory[r, older]) / span if span > 0.0 else 1.0
             part = min(max(part, 0.0), 1.0)
+            cubic = steps >= 2 and steps + 1 < min(count, BUFFER)
+            before = memory[r, older] - memory[r, oldest]
+            after = memory[r, newest] - memory[r, newer]
+            cubic = cubic and before > 0.0 and after > 0.0
             for w in range(n):
-                old = memory[r, older + 1 + w]
-                x[r, i, w] = old + part * (memory[r, newer + 1 + w] - old)
+                old, new = memory[r, older + 1 + w], memory[r, newer + 1 + w]
+                out = old + part * (new - old)
+                if cubic:
+                    here = (new - old) / span
+                    earlier, later = (old - memory[r, oldest + 1 + w]) / before, (memory[r, newest + 1 + w] - new) / after
+                    # slopes at both ends; where the wire reverses they are zero, so that nothing overshoots
+                    a = (earlier * span + here * before) / (span + before) if earlier * here > 0.0 else 0.0
+                    b = (here * after + later * span) / (span + after) if here * later > 0.0 else 0.0
+                    u = part * (1.0 - part) * span
+                    out += u * ((1.0 - part) * (a - here) - part * (b - here))
+                x[r, i, w] = out
         memory[r, 0] = float(count)

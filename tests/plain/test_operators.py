@@ -63,6 +63,6 @@ def test_operator_is_its_twin(name: str) -> None:
     found = np.concatenate(parts, axis=1)
     for r in range(2):
         for w in range(3):
-            # rounding of some hundred steps, and of expm
+            # rounding of some hundred steps, and of a matrix squared ten times
             assert_allclose(found[r, :, w], twin(PATH[r, :, w], r, w), atol=1e-11, err_msg=f"row {r}, wire {w}")
     assert np.isfinite(memory[:, : width if "delay" not in name else 1]).all()
