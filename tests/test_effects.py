@@ -18,6 +18,7 @@ import fastrod.effect as registry
 from fastrod import Robot, Simulator, load_robot, save_robot
 from fastrod.effect import Operator, Parameter, Seam, columns, effect, effect_names, get_effect, has_memory, unregister
 from fastrod.errors import EffectError, InputError, RobotError, UnknownNameError
+from fastrod.kernels.operators import BUFFER
 from fastrod.ports import EffectPorts
 from fastrod.robotfile import dumps, loads
 from fastrod.types import Floats
@@ -129,6 +130,8 @@ def test_the_whole_library_at_once_at_neutral_is_the_base_model() -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_a_typical_effect_is_seen_where_the_robot_can_show_it(name: str, robot: Robot) -> None:
     lengths = commands(robot)
+    if name == "plastic_set":  # nothing yields below 0.7 rad of a segment
+        lengths = robot.rest_tendon_length + 2.0 * (lengths - robot.rest_tendon_length)
     base, seen = (run(simulator(r), lengths) for r in (robot, having(robot, at_typical(name, robot))))
     moved = np.abs(seen["measured tip_position"] - base["measured tip_position"]).max((0, 2))
     assert np.isfinite(seen["measured tip_position"]).all()
@@ -236,6 +239,45 @@ def test_a_sweep_over_a_log_is_its_steps_one_by_one(name: str) -> None:
     assert_array_equal(alone[0], whole[1])
 
 
+def test_memories_are_as_wide_as_their_operators_need() -> None:
+    """What a sweep leaves behind: numbers in every column that a wire, a bend or a past step has, and no column beside the memory."""
+    wires = {"backlash": 3, "friction": 6, "creep": 2, "dynamics": 3}
+    assert set(OPERATORS) == {*wires, "latency", "plastic_set"}
+    robot = two_segments()
+    wiring, n = wire(robot), robot.n_tendons
+    dl = 0.002 * np.cumsum(np.random.default_rng(3).uniform(-1.0, 1.0, (1, 20, n)), axis=1)
+    for name in OPERATORS:
+        what: Any = get_effect(name)
+        memory = what.memory(1, n)
+        what.sweep(np.array([registry.read_values(name, at_typical(name, robot), wiring, "test")]), memory, dl, np.full(20, 0.1), wiring)
+        if name == "latency":
+            assert memory.shape[1] == 1 + BUFFER * (1 + n)
+            used = 1 + 20 * (1 + n)
+        else:
+            used = 2 * robot.n_segments if name == "plastic_set" else wires[name] * n
+            assert memory.shape[1] == (2 * n if name == "plastic_set" else used)
+        assert np.isfinite(memory[0, :used]).all()
+        assert np.isnan(memory[0, used:]).all()
+
+
+def test_a_set_needs_no_memory_where_no_wire_ends() -> None:
+    """More segments than wires: a passive one, then one with two wires. What no wire commands keeps no set, and nothing is written
+    beside the memory."""
+    (near,) = one_segment().segments
+    chain = (replace(near, mode="passive", tendons=()),) * 2 + (replace(near, tendons=near.tendons[:2]),)
+    robot = having(Robot(name="few wires", segments=chain), {"name": "plastic_set", "share": 0.2, "yield_at": 0.1})
+    wiring = wire(robot)
+    what: Any = get_effect("plastic_set")
+    memory = what.memory(1, 2)
+    dl = 0.004 * np.ones((1, 5, 2)) * np.arange(5)[:, None]
+    held = np.vstack([memory, np.full((1, 4), 7.0)])  # the row behind it
+    out = what.sweep(np.array([[0.2, 0.1]]), held[:1], dl, np.full(5, 0.1), wiring)
+    assert (held[1] == 7.0).all()
+    assert np.isfinite(held[0, :2]).all()
+    assert np.isnan(held[0, 2:]).all()
+    assert np.abs(out - dl).max() > 1e-5
+
+
 JACOBIANS: list[Table] = [
     {"name": "drum_gain", "gain": [0.2, -0.1, 0.1, 0.05]},
     {"name": "coupling", "from_distal": 0.2, "from_proximal": -0.1},
@@ -286,7 +328,7 @@ def test_effects_of_a_robot_file_come_back_and_act(tmp_path: Path) -> None:
     same(run(simulator(robot), lengths), run(simulator(again), lengths))
     text = dumps(load_robot("prototype")) + '\n[[effect]]\nname = "play"\nhalf_width = 0.0002\n'
     (link,) = Simulator(loads(text)).__dict__["_chain"].links
-    assert (link.name, link.values.tolist()) == ("backlash", [[0.0002]])
+    assert (link.name, link.values.tolist()) == ("backlash", [[0.0002, 0.0]])
 
 
 @pytest.mark.parametrize(

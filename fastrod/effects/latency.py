@@ -14,7 +14,7 @@ from fastrod.wiring import Wiring
 class Latency(Operator):
     """Delay between command and measured tip, of the drives, the bus and the camera together.
 
-    Equation: l(t) = l_cmd(t - d), linear between samples
+    Equation: l(t) = l_cmd(t - d), a monotone cubic between samples
     Source: transport delay; sensor delay as a parameter, as in MATLAB System Identification (delay of a process model)
     Residual signature: along the velocity of the predicted tip, zero at rest, the same at every speed per speed
     """

@@ -33,8 +33,12 @@ class PlasticSet(Operator):
         return np.full((n_robots, 2 * n_tendons), np.nan)
 
     def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Wiring) -> Floats:  # noqa: ARG002
-        before = wiring.bend(dl)
-        bend = before.copy()
-        share, at = (np.repeat(values[:, k : k + 1], wiring.n_segments, axis=1) for k in (0, 1))
+        change = wiring.bend(dl)
+        driven = np.unique(wiring.tendon_segment)  # where no wire ends nothing is commanded, and `memory` has no room
+        bend = np.ascontiguousarray(change[:, :, driven])
+        share, at = (np.repeat(values[:, k : k + 1], len(driven), axis=1) for k in (0, 1))
         yielding(bend, memory, share, at)
-        return dl + wiring.wires(bend - before)
+        bend -= change[:, :, driven]
+        change[:] = 0.0
+        change[:, :, driven] = bend
+        return dl + wiring.wires(change)

@@ -33,6 +33,7 @@ LEAST_ROWS = 40
 _LOCAL_ROWS = 3000  # samples that the search looks at; the operators run over all
 _ALL_AT_ONCE = 20000  # samples a batch when all are predicted
 _SEEN = 0.7  # of the prior's sd: a parameter whose data say less is not identifiable
+_MENDS = 0.02  # of the error above the noise: an effect beside a dominant one that brings less is not named
 _MORE_STAGES = 3  # beyond max_effects: foils take stages too
 
 
@@ -167,10 +168,16 @@ def _found(
         state = base.weighed(search, step.taken.state)
         if step.taken.foil is None:
             found += [name for name in state.model.effects if name not in found and name not in start.model.effects]
-    if len(found) > 1:
-        state, found = search.eliminated(state, found)
-        state = base.weighed(search, state)
     return found, state, steps, start
+
+
+def _library(search: Search, base: _Base, start: State, state: State, found: list[str]) -> tuple[State, list[str]]:
+    """The effects that are needed once foils are gone, with their state."""
+    alone = search.bare(state) if state.foils else state
+    if len(found) > 1:
+        excess = start.fit.loss * float((base.weights[0] ** 2).mean()) - start.fit.residual.size * float((base.noise.sigma**2).mean())
+        alone, found = search.eliminated(alone, found, _MENDS * max(excess, 0.0))
+    return base.weighed(search, alone), found
 
 
 def _pair(search: Search, state: State, step: Step) -> Step | None:
@@ -195,6 +202,9 @@ def _result(
     threads: int | None,
 ) -> Result:  # fmt: skip
     tell("prediction on all samples", max_effects + 1, max_effects + 2)
+    last = state
+    if found:
+        state, found = _library(search, base, start, state, found)
     order = np.argsort([-_gain(search, state, name) for name in found]) if len(found) > 1 else range(len(found))
     found = [found[int(i)] for i in order]
     outlier = np.zeros(len(samples.log), bool)
@@ -209,14 +219,11 @@ def _result(
     train_error = _error(samples, before, after, used)
     test_error = _error(samples, before, after, test)
     path = _path(start, state, found, samples, robot, used, test, search, threads)
-    inspected = audit(search.samples, state.model.wiring, state.fit.residual, base.noise.lag1)
-    floor = base.noise.floor**2
-    sigma2 = float((base.target.sigma**2).mean())
-    left = float((state.fit.residual[:, :3] ** 2).mean()) * sigma2
-    library = _library_only(state)
+    inspected = audit(search.samples, last.model.wiring, last.fit.residual, base.noise.lag1)
+    library = _square(state, base.target.sigma)
     opinion = judge(
-        base=train_error.before**2, library=3.0 * float((library**2)[:, :3].mean()) * sigma2 if found else train_error.before**2,
-        after=3.0 * left, floor=floor, audit=inspected, steps=steps, found=found,
+        base=_square(start, base.weights[0]), library=library, after=min(library, _square(last, base.weights[-2 if found else -1])),
+        floor=base.noise.floor**2, audit=inspected, steps=steps, found=found,
     )  # fmt: skip
     kept = [] if opinion.drop_effects else found
     final = state if kept else start
@@ -264,10 +271,10 @@ def _result(
     )
 
 
-def _library_only(state: State) -> Floats:
-    """(n, n_out) residual without the foils' columns."""
-    n = len(state.model.unknowns)
-    return np.asarray(state.fit.residual + state.columns @ state.fit.theta[n:] if state.foils else state.fit.residual)
+def _square(state: State, sigma: Floats) -> float:
+    """Mean square distance that a state leaves at the samples of the search [m^2]."""
+    counted = state.fit.residual[np.any(state.fit.residual != 0.0, axis=1), :3]
+    return float(np.mean(((counted * sigma) ** 2).sum(1))) if len(counted) else 0.0
 
 
 def _gain(search: Search, state: State, name: str) -> float:

@@ -57,10 +57,10 @@ class Excitation:
 
 
 def excitation(
-    robot: Robot, *, bend: float = 0.9, payload: float = 0.05, rate: float = 15.0, speed: float = 1.0, seed: int = 1
+    robot: Robot, *, bend: float = 0.9, payload: float | None = None, rate: float = 15.0, speed: float = 1.0, seed: int = 1
 ) -> Excitation:
     """The run for `robot`: largest bend of a segment `bend` [rad], known tip mass `payload` [kg] on and off, samples at `rate` [Hz],
-    triangles at `speed` [rad/s].
+    triangles at `speed` [rad/s]. Without `payload`, one that bends the robot well but does not make it snap, F l^2 / EI = 1.
 
     Raises `InputError` for a robot that wires do not drive, or for numbers that are not positive.
     """
@@ -69,6 +69,9 @@ def excitation(
     for name, value, unit in (("bend", bend, "rad"), ("rate", rate, "Hz"), ("speed", speed, "rad/s")):
         if not (np.isfinite(value) and value > 0.0):
             raise InputError(f"{name} is {value!r} {unit}; it must be positive.")
+    if payload is None:
+        softest = min(min(segment.bending_stiffness) for segment in robot.segments)
+        payload = round(softest / robot.length**2 / 9.81, 3)
     if not 0.0 <= payload <= 10.0:
         raise InputError(f"payload is {payload!r} kg; it must be between 0 and 10 kg.")
     if bend > 3.0:

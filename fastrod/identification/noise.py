@@ -15,6 +15,7 @@ _LEAST = 8  # samples of a stretch at rest
 _ENOUGH = 30  # samples at rest from which a noise is believed
 _WINDOW = 7  # samples either side, of the Hampel filter
 _OUTLIER = 5.0  # sigma
+_MOVES = 0.3  # autocorrelation at rest beyond which more than noise is seen
 _TO_SIGMA = 1.4826  # of a median absolute deviation
 
 
@@ -71,10 +72,18 @@ def read_noise(samples: Samples, tip: Floats, residual: Floats) -> Noise:
         rough = _TO_SIGMA * np.median(np.abs(every), axis=0)
         good = np.abs(every) <= 4.0 * rough + 1e-12
         sigma = np.sqrt(np.array([np.mean(every[good[:, k], k] ** 2) for k in range(3)]))
-        return Noise(np.maximum(sigma, 1e-7), float(pairs[0] / max(pairs[1], 1e-30)), f"{len(every)} samples at rest")
-    third = np.diff(residual, n=3, axis=0)
-    sigma = _TO_SIGMA * np.median(np.abs(third), axis=0) / np.sqrt(20.0) if len(third) else np.full(3, 1e-4)
-    return Noise(np.maximum(sigma, 1e-7), 0.0, "third differences of the residual; the robot never rests in this log")
+        lag1 = float(pairs[0] / max(pairs[1], 1e-30))
+        if lag1 > _MOVES:  # what moves at rest is no noise: a base that sways
+            return Noise(
+                _fast(np.concatenate([np.diff(tip[rows], n=3, axis=0) for rows in parts])), lag1, f"{len(every)} samples at rest, fast part"
+            )
+        return Noise(np.maximum(sigma, 1e-7), lag1, f"{len(every)} samples at rest")
+    return Noise(_fast(np.diff(residual, n=3, axis=0)), 0.0, "third differences of the residual; the robot never rests in this log")
+
+
+def _fast(third: Floats) -> Floats:
+    """(3,) sigma of white noise with these third differences (n, 3), robustly."""
+    return np.asarray(np.maximum(_TO_SIGMA * np.median(np.abs(third), axis=0) / np.sqrt(20.0), 1e-7) if len(third) else np.full(3, 1e-4))
 
 
 def keep(samples: Samples, residual: Floats, noise: Noise) -> Flags:

@@ -159,7 +159,7 @@ class Search:
         """An effect fitted beside a state, from each of its starts."""
         drop = self._unseen(state, name)
         every = state.model.with_effect(name)
-        added = [u for u in every.unknowns[len(state.model.unknowns) :]]
+        added = every.unknowns[len(state.model.unknowns) :]
         labels = [u.name.partition(".")[2] for u in added]
         sizes = [label for label, u in zip(labels, added, strict=True) if not u.shape]
         if all(label in drop for label in sizes):
@@ -337,6 +337,12 @@ class Search:
             return False
         return advantage(best, other) < BIC_RIVAL or _z_between(best, other) < Z_RIVAL
 
+    def bare(self, state: State) -> State:
+        """`state` without its foils, fitted again: what the library alone explains."""
+        local = Local(state.model, state.theta, self.samples, self.rod, self.target)
+        fit = self._fit(local, state.model, state.theta, np.zeros(0), (), 8)
+        return self._state(state.model, local, fit, ())
+
     def without(self, state: State, name: str) -> State:
         """`state` without one of its effects, fitted again."""
         model = state.model.without(name)
@@ -346,15 +352,18 @@ class Search:
         fit = self._fit(local, model, theta, state.fit.theta[len(state.model.unknowns) :], state.foils, 8)
         return self._state(model, local, fit, state.foils)
 
-    def eliminated(self, state: State, found: Sequence[str]) -> tuple[State, list[str]]:
-        """Drop effects that what came later has made needless; the state, and who is left."""
+    def eliminated(self, state: State, found: Sequence[str], least: float) -> tuple[State, list[str]]:
+        """Drop effects that what came later has made needless, and those that bring less than `least` [m^2 summed over the
+        residual]: beside a dominant effect they only mend its form. The state, and who is left."""
         left = list(found)
         while len(left) > 1:
             weakest: tuple[float, str, State] | None = None
             for name in left:
                 fewer = self.without(state, name)
                 verdict = self.judged(fewer, state, name)
-                if (verdict.z < Z_KEEP or verdict.bic_gain < BIC_KEEP) and (weakest is None or verdict.bic_gain < weakest[0]):
+                needless = verdict.z < Z_KEEP or verdict.bic_gain < BIC_KEEP
+                small = (fewer.fit.loss - state.fit.loss) * float((self.target.sigma**2).mean()) < least
+                if (needless or small) and (weakest is None or verdict.bic_gain < weakest[0]):
                     weakest = verdict.bic_gain, name, fewer
             if weakest is None:
                 break

@@ -50,7 +50,7 @@ def elastoplastic(x: Floats, memory: Floats, amplitude: Floats, presliding: Floa
     """Dry friction without rates: sliders in parallel, each sticking until it has been dragged by its own r_j (Iwan,
     Prandtl and Ishlinskii): z_j = min(1, max(-1, z_j + x' / r_j)), out x - a (1 + g angle) mean z_j.
 
-    The radii are spread evenly over r (1 - s) to r (1 + s). angle (n_rows, n_steps, n_wires) wrapped by the wire [rad];
+    The radii are spread evenly in their logarithm over r exp(-s) to r exp(s). angle (n_rows, n_steps, n_wires) wrapped by the wire [rad];
     memory (n_rows, (1 + SLIDERS) n_wires): x, z_j.
     """
     n = x.shape[2]
@@ -62,11 +62,13 @@ def elastoplastic(x: Floats, memory: Floats, amplitude: Floats, presliding: Floa
                 before = x[r, 0, w]
                 for j in range(SLIDERS):
                     memory[r, (1 + j) * n + w] = 0.0
+            step = math.exp(2.0 * spread[r, w] / (SLIDERS - 1))  # from one radius to the next
+            least = presliding[r, w] * math.exp(-spread[r, w])
             for i in range(x.shape[1]):
                 here = x[r, i, w]
-                mean = 0.0
+                mean, radius = 0.0, least / step
                 for j in range(SLIDERS):
-                    radius = presliding[r, w] * (1.0 + spread[r, w] * (2.0 * j / (SLIDERS - 1) - 1.0))
+                    radius *= step
                     z = min(1.0, max(-1.0, memory[r, (1 + j) * n + w] + (here - before) / radius))
                     memory[r, (1 + j) * n + w] = z
                     mean += z
@@ -147,9 +149,10 @@ def yielding(bend: Floats, memory: Floats, share: Floats, yield_at: Floats) -> N
 
 @entry
 def delay(x: Floats, memory: Floats, lag: Floats, dt: Floats) -> None:
-    """Out x(t - d), a cubic through the four samples around it, linear where there are not four; memory (n_rows, 1 + BUFFER (1 + n_wires)): count, ages' clock, past lengths.
+    """Out x(t - d), a monotone cubic through the four samples around it, linear where there are not four.
 
-    lag (n_rows,) [s]. Before the first step the wires are taken as at rest there.
+    lag (n_rows,) [s]. memory (n_rows, 1 + BUFFER (1 + n_wires)): count, then clock and lengths of each past step. Before the
+    first step the wires are taken as at rest there.
     """
     n = x.shape[2]
     width = 1 + n
@@ -190,9 +193,12 @@ def delay(x: Floats, memory: Floats, lag: Floats, dt: Floats) -> None:
                 if cubic:
                     here = (new - old) / span
                     earlier, later = (old - memory[r, oldest + 1 + w]) / before, (memory[r, newest + 1 + w] - new) / after
-                    # slopes at both ends; where the wire reverses they are zero, so that nothing overshoots
+                    # slopes at both ends; zero where the wire reverses and at most three times either neighbour, so that nothing
+                    # overshoots (Fritsch and Carlson 1980)
                     a = (earlier * span + here * before) / (span + before) if earlier * here > 0.0 else 0.0
                     b = (here * after + later * span) / (span + after) if here * later > 0.0 else 0.0
+                    a = math.copysign(min(abs(a), 3.0 * abs(earlier), 3.0 * abs(here)), a)
+                    b = math.copysign(min(abs(b), 3.0 * abs(here), 3.0 * abs(later)), b)
                     u = part * (1.0 - part) * span
                     out += u * ((1.0 - part) * (a - here) - part * (b - here))
                 x[r, i, w] = out

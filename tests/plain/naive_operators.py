@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline
 
 
-def play(x: np.ndarray, half_width: float) -> np.ndarray:
+def play(x: np.ndarray, half_width: float, rounding: float = 0.0) -> np.ndarray:
+    """The mean of three sharp ones."""
+    return np.asarray(np.mean([sharp_play(x, half_width * factor) for factor in (1.0 - rounding, 1.0, 1.0 + rounding)], axis=0))
+
+
+def sharp_play(x: np.ndarray, half_width: float) -> np.ndarray:
     p, out = x[0], []
     for here in x:
         if here - p > half_width:
@@ -16,8 +22,15 @@ def play(x: np.ndarray, half_width: float) -> np.ndarray:
     return np.array(out)
 
 
-def yielding(x: np.ndarray, share: float, yield_at: float) -> np.ndarray:
-    return np.asarray(x + share * play(np.append(0.0, x), yield_at)[1:])
+def yielding(bend: np.ndarray, share: float, yield_at: float) -> np.ndarray:
+    """(n_steps, 2): a dog on a leash of length `yield_at` that begins at the straight rod."""
+    p, out = np.zeros(2), []
+    for here in bend:
+        leash = float(np.linalg.norm(here - p))
+        if leash > yield_at:
+            p = here - yield_at * (here - p) / leash
+        out.append(here + share * p)
+    return np.array(out)
 
 
 def elastoplastic(x: np.ndarray, amplitude: float, radii: np.ndarray, growth: float, angle: np.ndarray) -> np.ndarray:
@@ -64,8 +77,26 @@ def second_order(x: np.ndarray, period: float, damping: float, dt: np.ndarray) -
 
 
 def delay(x: np.ndarray, lag: float, dt: np.ndarray, buffer: int) -> np.ndarray:
+    """Each moment sees the last `buffer` samples, itself included, and interpolates among them."""
     t = np.cumsum(np.append(0.0, dt[1:]))
-    if lag == 0.0:
-        return x
-    oldest = t[np.maximum(np.arange(len(t)) - buffer + 1, 0)]
-    return np.interp(np.maximum(t - lag, oldest), t, x)
+    out = [x[0]]
+    for i in range(1, len(t)):
+        first = max(i - buffer + 1, 0)
+        earlier = [j for j in range(first, i) if t[j] <= t[i] - lag]
+        if lag == 0.0 or not earlier:
+            out.append(x[i] if lag == 0.0 else x[first])
+            continue
+        j = earlier[-1]
+        ends, values = t[j : j + 2], x[j : j + 2]
+        around = slice(j - 1, j + 3)
+        if j - 1 < first or j + 2 > i or (np.diff(t[around]) <= 0.0).any():
+            out.append(np.interp(t[i] - lag, ends, values))
+            continue
+        secants, gaps = np.diff(x[around]) / np.diff(t[around]), np.diff(t[around])
+        slopes = []
+        for s, h in ((secants[:2], gaps[:2]), (secants[1:], gaps[1:])):
+            parabola = (s[0] * h[1] + s[1] * h[0]) / (h[0] + h[1])
+            most = 3.0 * np.abs(s).min()
+            slopes.append(np.clip(parabola, -most, most) if s[0] * s[1] > 0.0 else 0.0)
+        out.append(float(CubicHermiteSpline(ends, values, slopes)(t[i] - lag)))
+    return np.array(out)

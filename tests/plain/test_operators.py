@@ -26,8 +26,16 @@ RADII = SLOW[..., None] * (1.0 + SPREAD[..., None] * np.linspace(-1.0, 1.0, SLID
 
 Case = tuple[int, Callable[..., Any], Callable[..., np.ndarray]]
 CASES: dict[str, Case] = {
-    "play": (3, lambda x, m, s: operators.play(x, m, WIDTH), lambda x, r, w: naive.play(x, WIDTH[r, w])),
-    "yielding": (3, lambda x, m, s: operators.yielding(x, m, SHARE, WIDTH), lambda x, r, w: naive.yielding(x, SHARE[r, w], WIDTH[r, w])),
+    "play": (
+        9,
+        lambda x, m, s: operators.play(x, m, WIDTH, SPREAD),
+        lambda x, r, w: naive.play(x, WIDTH[r, w], SPREAD[r, w]),
+    ),
+    "sharp play": (
+        9,
+        lambda x, m, s: operators.play(x, m, WIDTH, np.zeros((2, 3))),
+        lambda x, r, w: naive.sharp_play(x, WIDTH[r, w]),
+    ),
     "elastoplastic": (
         3 * (1 + SLIDERS),
         lambda x, m, s: operators.elastoplastic(x, m, SHARE, SLOW, SPREAD, WIDTH, ANGLE[:, s].copy()),
@@ -66,3 +74,18 @@ def test_operator_is_its_twin(name: str) -> None:
             # rounding of some hundred steps, and of a matrix squared ten times
             assert_allclose(found[r, :, w], twin(PATH[r, :, w], r, w), atol=1e-11, err_msg=f"row {r}, wire {w}")
     assert np.isfinite(memory[:, : width if "delay" not in name else 1]).all()
+
+
+def test_yielding_is_its_twin() -> None:
+    """Bends in a plane: (rows, steps, segments, 2)."""
+    path = np.cumsum(np.random.default_rng(13).uniform(-0.4, 0.4, (2, N_STEPS, 3, 2)), axis=1)
+    memory, found = np.full((2, 6), np.nan), path.copy()
+    for part in (slice(0, 50), slice(50, N_STEPS)):
+        bend = path[:, part].copy()
+        operators.yielding(bend, memory, SHARE, WIDTH)
+        found[:, part] = bend
+    for r in range(2):
+        for k in range(3):
+            # rounding of some hundred steps
+            assert_allclose(found[r, :, k], naive.yielding(path[r, :, k], SHARE[r, k], WIDTH[r, k]), atol=1e-13)
+    assert np.isfinite(memory).all()

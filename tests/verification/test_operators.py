@@ -33,10 +33,14 @@ def one(value: float) -> np.ndarray:
     return np.array([[value]])
 
 
-def played(path: np.ndarray, half_width: float = 0.1) -> np.ndarray:
+def played(path: np.ndarray, half_width: float = 0.1, rounding: float = 0.0) -> np.ndarray:
     x = path[None, :, None].copy()
-    play(x, full(1), one(half_width))
+    play(x, full(3), one(half_width), one(rounding))
     return np.asarray(x[0, :, 0])
+
+
+def rounded(path: np.ndarray) -> np.ndarray:
+    return played(path, rounding=0.3)
 
 
 def rubbed(path: np.ndarray, amplitude: float = 0.3, radius: float = 0.2, spread: float = 0.4, growth: float = 0.0) -> np.ndarray:
@@ -45,10 +49,19 @@ def rubbed(path: np.ndarray, amplitude: float = 0.3, radius: float = 0.2, spread
     return np.asarray(x[0, :, 0])
 
 
+def yielded_in_plane(path: np.ndarray, share: float = 0.2, at: float = 0.5) -> np.ndarray:
+    """Of bends (n, 2)."""
+    bends = path[None, :, None].copy()
+    yielding(bends, full(2), one(share), one(at))
+    return np.asarray(bends[0, :, 0])
+
+
 def yielded(path: np.ndarray, share: float = 0.2, at: float = 0.5) -> np.ndarray:
-    x = path[None, :, None].copy()
-    yielding(x, full(1), one(share), one(at))
-    return np.asarray(x[0, :, 0])
+    """Of a bend that keeps its plane."""
+    plane = np.array([0.6, -0.8])
+    found = yielded_in_plane(path[:, None] * plane, share, at)
+    assert_allclose(found @ [0.8, 0.6], 0.0, atol=ROUNDING)
+    return np.asarray(found @ plane)
 
 
 def along(corners: list[float], n: int) -> np.ndarray:
@@ -60,14 +73,14 @@ def along(corners: list[float], n: int) -> np.ndarray:
 # Loops without rates
 
 
-@pytest.mark.parametrize("law", [played, rubbed, yielded])
+@pytest.mark.parametrize("law", [played, rounded, rubbed, yielded])
 def test_a_loop_does_not_know_how_finely_its_path_is_sampled(law: Law) -> None:
     corners = [0.0, 1.0, -0.4, 0.7, 0.1, 0.2, -1.0]
     coarse, fine = law(along(corners, 1)), law(along(corners, 97))
     assert_allclose(fine[::97], coarse, atol=ROUNDING)
 
 
-@pytest.mark.parametrize("law", [played, rubbed, yielded])
+@pytest.mark.parametrize("law", [played, rounded, rubbed, yielded])
 def test_a_loop_within_a_loop_is_wiped_out(law: Law) -> None:
     """Return-point memory: back at the corner where a small loop left the large one, as if it had not been."""
     plain, looped = law(along([0.0, 1.0, -0.8, 0.5, 0.9], 50)), law(along([0.0, 1.0, -0.8, 0.5, -0.1, 0.3, 0.05, 0.5, 0.9], 50))
@@ -86,6 +99,20 @@ def test_play_rests_for_twice_its_half_width_after_every_reversal(amplitude: flo
         moving = ~still
         assert_allclose(leg_p[moving], leg_x[moving] + side * 0.1, atol=ROUNDING)
     assert (np.abs(p - x) <= 0.1 + ROUNDING).all()
+
+
+def test_rounded_play_turns_in_three_steps_about_the_same_gap() -> None:
+    """It rests for 2 w (1 - c) after a reversal, moves at a third and two thirds of the input's speed until 2 w and 2 w (1 + c), and
+    then follows at the same distance w as the sharp one."""
+    w, c, n = 0.1, 0.3, 3000
+    x = along([0.0, 1.0, -1.0], n)
+    travel = 1.0 - x[n:]
+    expected = sum(np.maximum(travel - 2.0 * w * factor, 0.0) for factor in (1.0 - c, 1.0, 1.0 + c)) / 3.0
+    assert_allclose((1.0 - w) - rounded(x)[n:], expected, atol=ROUNDING)
+    assert_allclose(rounded(x)[-1], played(x)[-1], atol=ROUNDING)
+    still = round(2.0 * w * (1.0 - c) / (2.0 / n))
+    assert_array_equal(rounded(x)[n : n + still], rounded(x)[n])
+    assert np.abs(rounded(x) - played(x)).max() > 0.3 * w * c / 3.0  # and it is not the sharp one
 
 
 def test_friction_saturates_at_its_half_width() -> None:
@@ -139,6 +166,28 @@ def test_nothing_yields_below_the_yield_and_a_set_stays() -> None:
     assert_allclose(y[180], 0.2 * (0.9 - 0.5), atol=ROUNDING)  # what was beyond the yield, times the share
     assert_allclose(y[180:] - x[180:], y[180], atol=ROUNDING)
     assert_allclose(yielded(along([0.0, 2.0, -2.0, 2.0, 0.0], 40))[-1], 0.2 * 0.5, atol=ROUNDING)  # a large set shrinks on the way back
+
+
+def test_a_bend_that_leaves_its_plane_drags_the_set_along_a_tractrix() -> None:
+    """A leash y pulled square to itself by s: the set is y tanh(s / y) behind and y sech(s / y) aside."""
+    y = 0.5
+    errors = []
+    for n in (2000, 4000):
+        s = np.linspace(0.0, 1.5, n + 1)
+        path = np.stack([s, np.full(n + 1, y)], axis=1)  # from (0, y), which only just does not yield
+        p = (yielded_in_plane(path, share=0.2, at=y) - path) / 0.2
+        errors.append(np.abs(p - np.stack([s - y * np.tanh(s / y), y - y / np.cosh(s / y)], axis=1)).max())
+        # the leash is never longer than y
+        assert (np.linalg.norm(path - p, axis=1) <= y + ROUNDING).all()
+    assert errors[1] < 1.5 / 4000  # less than a step
+    assert 1.8 < errors[0] / errors[1] < 2.2  # of the first order in it
+
+
+def test_yielding_has_no_favourite_direction() -> None:
+    path = np.cumsum(np.random.default_rng(9).uniform(-0.2, 0.2, (300, 2)), axis=0)
+    turn = Rotation.from_rotvec([0.0, 0.0, 0.7]).as_matrix()[:2, :2]
+    assert_allclose(yielded_in_plane(path @ turn.T), yielded_in_plane(path) @ turn.T, atol=10.0 * ROUNDING)
+    assert np.abs(yielded_in_plane(path) - path).max() > 0.01
 
 
 # Laws in time
@@ -227,6 +276,61 @@ def test_a_delayed_ramp_is_the_ramp_of_a_moment_ago() -> None:
     delay(x, full(1 + BUFFER * 2), np.array([1e3]), dt)
     assert_allclose(x[0, BUFFER - 1 :, 0], 2.0 * t[: 500 - BUFFER + 1], atol=ROUNDING * 20)
     assert_array_equal(x[0, : BUFFER - 1, 0], 2.0 * t[0])
+
+
+def delayed(path: np.ndarray, lag: float, dt: np.ndarray) -> np.ndarray:
+    x = path[None, :, None].copy()
+    delay(x, full(1 + BUFFER * 2), np.array([lag]), dt)
+    return np.asarray(x[0, :, 0])
+
+
+def test_a_delayed_parabola_is_exact_where_four_samples_surround_it() -> None:
+    """A cubic with the slopes of the parabolas through three samples is the parabola itself; a line would be off by up to h^2 / 4."""
+    dt = np.random.default_rng(10).uniform(0.01, 0.03, 100)
+    t = np.cumsum(dt)
+    for lag in (0.061, 0.25):  # two samples at least are newer than that, and the wire moves long before
+        found, past = delayed(t**2, lag, dt), t - lag
+        inside = past > t[3]
+        assert_allclose(found[inside], past[inside] ** 2, atol=ROUNDING)
+        assert np.abs(np.interp(past, t, t**2) - past**2)[inside].max() > 1e-5
+    # with one sample newer it is the line
+    found = delayed(t**2, 0.005, dt)
+    assert_allclose(found[1:], np.interp(t - 0.005, t, t**2)[1:], atol=ROUNDING)
+
+
+def test_a_delayed_wave_converges_faster_than_with_lines() -> None:
+    """Halved steps: errors of lines fall by 4, of cubics by 8 away from the turns, where the slope is taken as zero: 4 there too, but
+    less to begin with."""
+    errors = []
+    for n in (200, 400):
+        t = np.linspace(0.0, 10.0, n + 1)
+        dt = np.diff(t, prepend=0.0)
+        found, past = delayed(np.sin(t), 0.377, dt), t - 0.377
+        steep = (past > 0.5) & (np.abs(np.cos(past)) > 0.3)
+        line, cubic = (np.abs(y - np.sin(past)) for y in (np.interp(past, t, np.sin(t)), found))
+        assert cubic[past > 0.5].max() < 0.8 * line[past > 0.5].max()
+        errors.append(cubic[steep].max())
+    assert errors[0] / errors[1] > 7.0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_delay_overshoots_nowhere(seed: int) -> None:
+    """At reversals, sudden stops and irregular times: what comes out lies between the two samples around it."""
+    rng = np.random.default_rng(seed)
+    dt = rng.uniform(0.001, 0.05, 120)
+    t = np.cumsum(dt)
+    x = np.cumsum(rng.uniform(-1.0, 1.0, 120) * (rng.random(120) > 0.3) * 10.0 ** rng.uniform(-2.0, 0.0, 120))
+    for lag in (0.03, 0.1, 0.2):
+        found, past = delayed(x, lag, dt), t - lag
+        inside = past >= t[0]
+        j = np.clip(np.searchsorted(t, past, side="right") - 1, 0, 118)[inside]
+        low, high = np.minimum(x[j], x[j + 1]), np.maximum(x[j], x[j + 1])
+        assert (found[inside] >= low - ROUNDING).all()
+        assert (found[inside] <= high + ROUNDING).all()
+    triangle = along([0.0, 1.0, -1.0, 0.5], 20)
+    assert np.abs(delayed(triangle, 0.13, np.full(61, 0.1))).max() <= 1.0
+    ramp_and_rest = np.minimum(np.arange(40) * 0.1, 1.0)
+    assert_array_equal(delayed(ramp_and_rest, 0.25, np.full(40, 0.1))[14:], ramp_and_rest[-1])
 
 
 # Effects against robots that are built so
@@ -329,9 +433,9 @@ def test_drum_gain_and_temperature_scale_the_pull() -> None:
     robot, lengths = rod(), bend(rod(), 0.5, 0.3)
     dl = lengths - robot.rest_tendon_length
     alike(settled(having(robot, "drum_gain", gain=[0.2, -0.1]), lengths), settled(robot, lengths + dl * [0.2, -0.1, 0.2, -0.1]))
-    sim = Simulator(having(robot, "temperature", gain=0.1, time_constant=10.0), dt=2.5, points_per_segment=8)
+    sim = Simulator(having(robot, "temperature", gain=0.1, time_constant=40.0), dt=10.0, points_per_segment=8)
     for k in range(4):  # the first input is at time zero
-        warm = 0.1 * (1.0 - np.exp(-2.5 * k / 10.0))
+        warm = 0.1 * (1.0 - np.exp(-10.0 * k / 40.0))
         alike(sim.settle(lengths, tolerance=1e-12), settled(robot, lengths + warm * dl))
 
 
