@@ -9,10 +9,15 @@ import runpy
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
+from functools import partial
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from fastrod.errors import FastrodError, InputError, UnknownNameError, nearest
+
+if TYPE_CHECKING:
+    from fastrod.robot import Robot
+    from fastrod.runlog import RunLog
 
 DONE, FAILED, WRONG_INPUT = 0, 1, 2
 
@@ -25,6 +30,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _refuse(f"no command {words[0]!r}; {nearest(words[0], commands)}")
     try:
         arguments, rest = parser.parse_known_args(words)
+        if hasattr(arguments, "logs"):  # more of them after an option
+            arguments.logs += [Path(word) for word in rest if not word.startswith("-")]
+            rest = [word for word in rest if word.startswith("-")]
         if rest:
             return _refuse(
                 f"{parser.prog} {arguments.command} does not know {rest[0]!r}; `{parser.prog} {arguments.command} --help` tells."
@@ -83,6 +91,26 @@ def _parser() -> tuple[argparse.ArgumentParser, list[str]]:
     replay.add_argument("--out", type=Path, metavar="DIR", help="where residuals.csv and replay.png go (default: LOG's name + _replay)")
     replay.set_defaults(run_command=_replay)
 
+    identify = commands.add_parser("identify", help="find what the model lacks: report.json, report.html, identified.toml")
+    identify.add_argument("logs", type=Path, nargs="*", metavar="LOG", help="run logs of one robot, or raw files of a measured set")
+    identify.add_argument("--robot", metavar="R", help="a shipped robot's name or a path to a .toml; a measured set brings its own")
+    held_out = "runs that no fit sees, or RUN@START:END in seconds (default: every fourth stretch)"
+    identify.add_argument("--held-out", nargs="+", action="extend", default=[], metavar="RUN", help=held_out)
+    identify.add_argument("--max-effects", type=int, default=4, metavar="K", help="name this many at most (default: 4)")
+    identify.add_argument("--free-camera", action="store_true", help="fit the camera's registration, marker offset and latency too")
+    identify.add_argument("--out", type=Path, metavar="DIR", help="where the files go (default: LOG's name + _identified)")
+    identify.add_argument("--json", action="store_true", help="print report.json to stdout and nothing else; files only with --out")
+    identify.set_defaults(run_command=_identify)
+
+    excite = commands.add_parser("excite", help="write the run that separates effects, to be driven and measured")
+    excite.add_argument("--robot", required=True, metavar="R", help="a shipped robot's name or a path to a .toml")
+    excite.add_argument("--out", type=Path, metavar="FILE", help="the run log, .csv or .parquet (default: NAME_excitation.csv)")
+    excite.add_argument("--bend", type=float, default=0.9, metavar="RAD", help="largest bend of a segment (default: 0.9)")
+    excite.add_argument("--payload", type=float, default=0.05, metavar="KG", help="known mass at the tip, on and off (default: 0.05)")
+    excite.add_argument("--rate", type=float, default=15.0, metavar="HZ", help="samples a second (default: 15)")
+    excite.add_argument("--speed", type=float, default=1.0, metavar="RAD/S", help="of the triangles (default: 1)")
+    excite.set_defaults(run_command=_excite)
+
     bench = commands.add_parser("bench", help="the figures of perf/ as ratios")
     bench.add_argument("name", nargs="?", metavar="NAME", help="one benchmark (default: all)")
     bench.add_argument("--json", action="store_true", help="print JSON to stdout and nothing else")
@@ -102,11 +130,28 @@ def _replay(arguments: argparse.Namespace) -> int:
 
     from fastrod.identification import replay as room
     from fastrod.robotfile import load_robot
+
+    path: Path = arguments.log
+    log, robot = _read(path, None if arguments.robot is None else load_robot(arguments.robot))
+    if arguments.run is not None:
+        log = log.only(arguments.run)
+    out = room.make_folder(arguments.out or Path(f"{path.stem}_replay"))
+    with _progress() as bar:
+        result = room.replay(log, robot, progress=None if bar is None else partial(bar, "replay"))
+    console = Console()
+    console.print(room.table(result))
+    if not result.compared.any():
+        return _refuse(f"the model converged on none of the {len(log)} rows.", FAILED)
+    for written in room.write(result, out):
+        console.print(f"wrote {written}", soft_wrap=True, highlight=False)
+    return DONE
+
+
+def _read(path: Path, given: Robot | None) -> tuple[RunLog, Robot]:
+    """A run log of the robot `given`, or a raw file of a measured set, which brings its own."""
     from fastrod.runlog import read_log
     from fastrod_scenes.measured import detect
 
-    path: Path = arguments.log
-    given = None if arguments.robot is None else load_robot(arguments.robot)
     if adapter := detect(path):
         log, robot = adapter(path)
         if given is not None and given.n_tendons != robot.n_tendons:
@@ -114,23 +159,73 @@ def _replay(arguments: argparse.Namespace) -> int:
                 f"robot {given.name!r} has {given.n_tendons} tendons, the one of {path.name} has {robot.n_tendons}; "
                 "leave --robot out to take its own."
             )
-        robot = given or robot
-    elif given is None:
+        return log, given or robot
+    if given is None:
         raise InputError(f"{path.name} is a run log and does not say whose; name its robot with --robot.")
-    else:
-        robot = given
-        log = read_log(path, robot)
-    if arguments.run is not None:
-        log = log.only(arguments.run)
-    out = room.make_folder(arguments.out or Path(f"{path.stem}_replay"))
-    with _progress("replay") as progress:
-        result = room.replay(log, robot, progress=progress)
+    return read_log(path, given), given
+
+
+def _identify(arguments: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from fastrod.identification import report
+    from fastrod.identification.attribution import identify
+    from fastrod.identification.replay import make_folder
+    from fastrod.robotfile import load_robot
+
+    # `--held-out RUN LOG`: no run is named like a file that is there.
+    swallowed = [word for word in arguments.held_out if Path(word).suffix and Path(word).is_file()]
+    paths: list[Path] = arguments.logs + [Path(word) for word in swallowed]
+    if not paths:
+        raise _UsageError("the following arguments are required: LOG; `fastrod identify --help` says how it is used.")
+    given = None if arguments.robot is None else load_robot(arguments.robot)
+    logs, robots = zip(*(_read(path, given) for path in paths), strict=True)
+    if any(robot != robots[0] for robot in robots):
+        raise InputError("these files bring different robots; name one with --robot, or identify each alone.")
+    out = arguments.out or (None if arguments.json else Path(f"{paths[0].stem}_identified"))
+    if out is not None:
+        make_folder(out)
+    with _progress() as bar:
+        result = identify(
+            logs, robots[0], held_out=[word for word in arguments.held_out if word not in swallowed],
+            max_effects=arguments.max_effects, free_camera=arguments.free_camera, progress=bar,
+        )  # fmt: skip
+    written = [] if out is None else report.write(result, out)
+    if arguments.json:
+        print(report.text(result))
+        return DONE
     console = Console()
-    console.print(room.table(result))
-    if not result.compared.any():
-        return _refuse(f"the model converged on none of the {len(log)} rows.", FAILED)
-    for written in room.write(result, out):
-        console.print(f"wrote {written}", soft_wrap=True, highlight=False)
+    console.print(report.table(result))
+    for path in written:
+        console.print(f"wrote {path}", soft_wrap=True, highlight=False, markup=False)
+    return DONE
+
+
+def _excite(arguments: argparse.Namespace) -> int:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    from fastrod.identification.excite import excitation
+    from fastrod.robotfile import load_robot
+    from fastrod.runlog import write_log
+
+    robot = load_robot(arguments.robot)
+    made = excitation(robot, bend=arguments.bend, payload=arguments.payload, rate=arguments.rate, speed=arguments.speed)
+    path: Path = arguments.out or Path(f"{robot.name}_excitation.csv")
+    if path.suffix not in (".csv", ".parquet"):
+        raise InputError(f"{str(path)!r} does not end in .csv or .parquet; a run log does.")
+    write_log(made.log, path, comment=made.comment)
+    grid = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    for name in ("from", "to", "part", "tells"):
+        grid.add_column(f"{name} s" if name in ("from", "to") else name, justify="right" if name in ("from", "to") else "left")
+    said: set[str] = set()
+    for part in made.parts:
+        grid.add_row(f"{part.start:.1f}", f"{part.end:.1f}", part.name, part.purpose if part.purpose not in said else "as above")
+        said.add(part.purpose)
+    console = Console()
+    console.print(grid)
+    console.print(f"wrote {path}: drive it, fill tip_x tip_y tip_z, then fastrod identify", soft_wrap=True, highlight=False, markup=False)
     return DONE
 
 
@@ -170,8 +265,8 @@ def _script(path: Path, argv: list[str]) -> int:
 
 
 @contextmanager
-def _progress(what: str) -> Iterator[Callable[[int, int], None] | None]:
-    """A callback (done, total) that draws a bar on stderr, or None where stderr is no terminal."""
+def _progress() -> Iterator[Callable[[str, int, int], None] | None]:
+    """A callback (what, done, total) that draws a bar on stderr, or None where stderr is no terminal."""
     if not sys.stderr.isatty():
         yield None
         return
@@ -179,8 +274,8 @@ def _progress(what: str) -> Iterator[Callable[[int, int], None] | None]:
     from rich.progress import Progress
 
     with Progress(console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+        task = bar.add_task("", total=None)
+        yield lambda what, done, total: bar.update(task, description=what, completed=done, total=total)
 
 
 if __name__ == "__main__":

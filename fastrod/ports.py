@@ -68,6 +68,15 @@ class EffectPorts:
         """(n, n_segments, 2) bend about d1 and d2 that the wires ask for now [rad], a new array."""
         return self.wiring.bend(self.dl)
 
+    def common(self) -> Floats:
+        """(n, n_segments) change of length that the wires of a segment share, beyond that of the segment before [m]."""
+        odd = self.dl - self.wiring.wires(self.bend())
+        ends = np.zeros((len(odd), self.wiring.n_segments))
+        for k in range(self.wiring.n_segments):
+            if (own := self.wiring.tendon_segment == k).any():
+                ends[:, k] = odd[:, own].mean(1)
+        return np.diff(ends, axis=1, prepend=0.0)
+
     def shift_bend(self, change: Floats) -> None:
         """Let the wires ask for another bend: (n, n_segments, 2) [rad] more."""
         self.tendon_length += self.wiring.wires(change)

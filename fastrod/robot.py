@@ -158,9 +158,9 @@ class Robot:
     """Arclengths of the further measured points p1 ... pk of a run log [m]."""
     effects: tuple[Mapping[str, Any], ...] = ()
     """What a robot file adds to the rod (contracts: `[[effect]]`): a name, and the effect's parameters."""
-    fit: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    fit: Mapping[str, Mapping[str, float | bool]] = field(default_factory=dict)
     """Parameters that are not known exactly, each with its prior (contracts: `[fit]`)."""
-    sensor: Mapping[str, float] = field(default_factory=dict)
+    sensor: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
     """Priors of the measurement (contracts: `[sensor]`)."""
 
     def __post_init__(self) -> None:

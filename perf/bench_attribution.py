@@ -53,8 +53,7 @@ def cases(share: float, only: Iterable[str]) -> list[Case]:
         names = {
             "outside": plant.OUTSIDE, "none": ("none",), "two": ("two",), "dominant": ("dominant",), "segments": plant.library(2),
         }.get(kind, plant.library(1))  # fmt: skip
-        for i in range(max(1, round(share * count))):
-            made.append(Case(kind, 1000 + i, names[i % len(names)]))
+        made += [Case(kind, 1000 + i, names[i % len(names)]) for i in range(max(1, round(share * count)))]
     return made
 
 

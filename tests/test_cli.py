@@ -12,9 +12,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from reportlog import backlash_log
 
 from fastrod import cli
+from fastrod.errors import InputError
 from fastrod.robot import Robot
+from fastrod.robotfile import load_robot
+from fastrod.runlog import read_log, write_log
 
 HEADER = "t,run,dl_1,dl_2,dl_3,dl_4,tip_x,tip_y,tip_z\n"
 LOG = HEADER + "0,a,0,0,0,0,0,0,0.07\n0.1,a,0,0,0,0,0.001,0,0.07\n0,b,0,0,0,0,0,0,0.07\n"
@@ -114,6 +118,68 @@ def test_file_that_cannot_be_written_has_failed(log: Path, tmp_path: Path, capsy
     assert capsys.readouterr().err == f"{tmp_path / 'out' / 'residuals.csv.part'}: Is a directory.\n"
 
 
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log with backlash, as a file."""
+    path = tmp_path_factory.mktemp("log") / "small.csv"
+    write_log(backlash_log(), path)
+    return path
+
+
+def test_identify_prints_the_verdict_and_names_its_files(measured: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    # A log behind --held-out is a log all the same.
+    words = ["identify", "--robot", "prototype", "--max-effects", "1", "--out", str(out), "--held-out", "two", str(measured)]
+    assert cli.main(words) == 0
+    printed, err = capsys.readouterr()
+    assert err == ""
+    for word in ("backlash", "half width", "noise floor", "held out", str(out / "report.html"), str(out / "identified.toml")):
+        assert word in printed
+    assert json.loads((out / "report.json").read_text())["held_out"] == ["two"]
+
+
+def test_identify_json_prints_json_and_nothing_else(
+    measured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert (
+        cli.main(["identify", str(measured), "--robot", "prototype", "--held-out", "two", "three@8:", "--max-effects", "0", "--json"]) == 0
+    )
+    printed, err = capsys.readouterr()
+    assert json.loads(printed)["held_out"] == ["two", "three@8:"]
+    assert err == ""
+    assert not list(tmp_path.iterdir())
+
+
+def test_identify_takes_several_logs_and_the_default_folder(measured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: dict[str, Any] = {}
+
+    def stand_in(logs: Any, robot: Robot, **given: Any) -> Any:
+        seen.update(given, names=[log.name for log in logs])
+        raise InputError("seen enough.")
+
+    monkeypatch.setattr("fastrod.identification.attribution.identify", stand_in)
+    monkeypatch.chdir(tmp_path)
+    other = tmp_path / "other.csv"
+    other.write_bytes(measured.read_bytes())
+    assert cli.main(["identify", str(measured), "--robot", "prototype", str(other), "--free-camera", "--max-effects", "2"]) == 2
+    assert seen["names"] == ["small", "other"]
+    assert (seen["held_out"], seen["max_effects"], seen["free_camera"], seen["progress"]) == ([], 2, True, None)
+    assert (tmp_path / "small_identified").is_dir()
+
+
+def test_excite_writes_a_run_to_be_driven(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["excite", "--robot", "prototype", "--bend", "0.5", "--rate", "10"]) == 0
+    assert "step and hold" in capsys.readouterr().out
+    path = tmp_path / "prototype_excitation.csv"
+    assert path.read_text().startswith("# Inputs of a run that separates effects")
+    log = read_log(path, load_robot("prototype"))
+    assert log.payload is not None
+    assert (log.payload.max(), np.isnan(log.tip_position).all()) == (0.05, True)
+    assert log.t[1] == pytest.approx(0.1)
+
+
 def test_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as end:
         cli.main(["--version"])
@@ -131,6 +197,17 @@ WRONG = {
     "no robot": (["replay", "LOG"], "log.csv is a run log and does not say whose; name its robot with --robot."),
     "unknown run": (["replay", "LOG", "--robot", "prototype", "--run", "c"], "no run 'c' in log 'log'; known: a, b."),
     "other robot": (["replay", "LOG", "--robot", "tdcr_a"], "has 4 dl_ columns (dl_1 to dl_4); robot 'tdcr_a' has 6 tendons"),
+    "identify: no log": (["identify", "--robot", "prototype"], "the following arguments are required: LOG"),
+    "identify: no robot": (["identify", "LOG"], "log.csv is a run log and does not say whose; name its robot with --robot."),
+    "identify: unknown option": (["identify", "LOG", "--robot", "prototype", "--jsn"], "fastrod identify does not know '--jsn'"),
+    "identify: short log": (["identify", "LOG", "--robot", "prototype", "--json"], "has 3 measured rows; identification needs 40"),
+    "identify: the same log twice": (["identify", "LOG", "LOG", "--robot", "prototype", "--json"], "two logs are named 'log'"),
+    "identify: effects": (["identify", "LOG", "--robot", "prototype", "--json", "--max-effects", "-1"], "max_effects is -1"),
+    "identify: folder": (["identify", "LOG", "--robot", "prototype", "--out", "LOG"], "cannot be written: it is a file."),
+    "excite: no robot": (["excite"], "the following arguments are required: --robot"),
+    "excite: bend": (["excite", "--robot", "prototype", "--bend", "50"], "Was it given in degrees?"),
+    "excite: text": (["excite", "--robot", "prototype", "--rate", "fast"], "invalid float value: 'fast'"),
+    "excite: suffix": (["excite", "--robot", "prototype", "--out", "run.txt"], "'run.txt' does not end in .csv or .parquet"),
     "bench option": (["bench", "--jsno"], "fastrod bench does not know '--jsno'"),
 }
 

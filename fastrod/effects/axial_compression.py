@@ -35,17 +35,6 @@ class AxialCompression(Static):
         n = wiring.n_segments
         bend = np.linalg.norm(ports.bend(), axis=-1)
         pulled = -wiring.length * values[:, :n] * bend
-        ports.extension += pulled + values[:, n:] * _common(ports)
+        ports.extension += pulled + values[:, n:] * ports.common()
         # The wires follow what the bend takes from the body; of a common pull they keep what the body does not follow.
         ports.tendon_length += np.cumsum(pulled, axis=1)[:, wiring.tendon_segment]
-
-
-def _common(ports: EffectPorts) -> Floats:
-    """(n, n_segments) change of length that the wires of a segment share, beyond that of the segment before [m]."""
-    wiring, dl = ports.wiring, ports.dl
-    odd = dl - wiring.wires(wiring.bend(dl))
-    ends = np.zeros((len(odd), wiring.n_segments))
-    for k in range(wiring.n_segments):
-        if (own := wiring.tendon_segment == k).any():
-            ends[:, k] = odd[:, own].mean(1)
-    return np.diff(ends, axis=1, prepend=0.0)

@@ -16,6 +16,7 @@ from fastrod.errors import InputError, LogError
 from fastrod.identification import advice
 from fastrod.identification.audit import audit
 from fastrod.identification.forward import Rod, Samples, predict, sample
+from fastrod.identification.limits import limits
 from fastrod.identification.local import Local, Target
 from fastrod.identification.noise import Noise, keep, read_noise
 from fastrod.identification.result import Error, Estimate, Found, Result, Stage, Tried
@@ -100,7 +101,8 @@ class _Base:
             self.notes.append(f"the model did not converge on {lost} of {len(local.pose.ok)} rows; they do not count")
         raw = target.tip - local.pose.position
         self.noise = read_noise(self.samples, target.tip, np.nan_to_num(raw))
-        declared = float(self.robot.sensor.get("noise", 0.0))
+        given = self.robot.sensor.get("noise", 0.0)
+        declared = float(max(given) if isinstance(given, tuple) else given)
         if declared > 0.0:
             self.noise = Noise(np.full(3, declared), self.noise.lag1, "the robot file's [sensor] noise")
         target.weight = (keep(self.samples, np.nan_to_num(raw), self.noise) & local.pose.ok).astype(float)
@@ -254,7 +256,7 @@ def _result(
         train=train_error,
         test=test_error,
         verdict="ambiguous" if opinion.verdict == "explained" and effects and effects[0].cannot_be_told_from else opinion.verdict,
-        summary=opinion.summary,
+        summary=" ".join([opinion.summary, *(f"{line[0].upper()}{line[1:]}." for line in limits(robot, samples))]),
         effects=effects,
         base_parameters=base_estimates,
         correlation=correlation,

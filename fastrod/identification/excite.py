@@ -14,7 +14,7 @@ import numpy as np
 
 from fastrod.errors import InputError
 from fastrod.robot import Robot
-from fastrod.rotation import product
+from fastrod.rotation import matrix_from_quaternion, product
 from fastrod.runlog import RunLog
 from fastrod.types import Floats
 from fastrod.wiring import Wiring, wire
@@ -114,7 +114,10 @@ def excitation(
     turned.append(np.zeros(rest, bool))
     loaded.append(np.zeros(rest, bool))
     own = np.array(robot.base_quaternion)
-    other_way = product(own, np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0]))
+    down = matrix_from_quaternion(own).T @ np.array(robot.gravity)
+    turn = np.zeros(4)
+    turn[[0, 1 + int(abs(down[1]) < abs(down[0]))]] = np.sqrt(0.5)  # about the base's x, or y where x is the steeper: gravity must change
+    other_way = product(own, turn)
     log = RunLog(
         name=f"{robot.name}_excitation",
         t=np.arange(len(path)) / rate,

@@ -63,7 +63,9 @@ def read_noise(samples: Samples, tip: Floats, residual: Floats) -> Noise:
         for rows in parts:
             line = np.linspace(-1.0, 1.0, len(rows))[:, None]
             middle = tip[rows] - np.median(tip[rows], axis=0)
-            middle = middle - line * (line * middle).sum(0) / (line**2).sum()
+            for _ in range(2):  # the drift, of samples that are no outliers
+                near = np.abs(middle) <= 4.0 * _TO_SIGMA * np.median(np.abs(middle), axis=0)
+                middle = middle - line * (near * line * middle).sum(0) / np.maximum((near * line**2).sum(0), 1e-12)
             flat.append(middle * np.sqrt(len(rows) / (len(rows) - 2.0)))
             inside = np.clip(middle, *(side * 4.0 * _TO_SIGMA * np.median(np.abs(middle), axis=0) for side in (-1.0, 1.0)))
             pairs += [(inside[1:] * inside[:-1]).sum(), (inside**2).sum()]

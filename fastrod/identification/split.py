@@ -27,6 +27,10 @@ def merged(logs: Sequence[RunLog]) -> RunLog:
         raise LogError(
             f"two logs are named {next(n for n in names if names.count(n) > 1)!r}; rename one, so that their runs can be told apart."
         )
+    if len({log.dl.shape[1] for log in logs}) > 1:
+        raise LogError("the logs have different numbers of tendons; they must be of one robot.")
+    if len({log.points.shape[1] for log in logs if log.points is not None}) > 1:
+        raise LogError("the logs have different numbers of points; they must be of one robot.")
     optional = ("ext", "tip_quaternion", "points", "tip_force", "payload", "base_quaternion")
     columns: dict[str, Any] = {}
     for name in optional:
@@ -40,8 +44,6 @@ def merged(logs: Sequence[RunLog]) -> RunLog:
         elif any(have):
             has, lacks = (logs[have.index(flag)].name for flag in (True, False))
             raise LogError(f"log {has!r} has columns for {name}, log {lacks!r} has none; logs that share parameters need the same columns.")
-    if len({log.dl.shape[1] for log in logs}) > 1:
-        raise LogError("the logs have different numbers of tendons; they must be of one robot.")
     labels = [np.array([f"{log.name}:{label}" if label else log.name for label in log.run]) for log in logs]
     return RunLog(
         name=" + ".join(names),
@@ -75,7 +77,7 @@ def held_out_rows(samples: Samples, held_out: Sequence[str]) -> tuple[Flags, lis
             raise UnknownNameError(f"no run {label!r} to hold out in log {log.name!r}; {nearest(label, named)}")
         rows = (log.run == label) if label else np.ones(len(log), bool)
         if window:
-            match = re.fullmatch(r"([\d.]*):([\d.]*)", window)
+            match = re.fullmatch(r"(\d*\.?\d+|\d+\.|):(\d*\.?\d+|\d+\.|)", window)
             if match is None:
                 raise LogError(f"held-out {text!r} is no stretch of time; write RUN@START:END in seconds, for example {label}@90:150.")
             start, end = (float(part) if part else edge for part, edge in zip(match.groups(), (-np.inf, np.inf), strict=True))

@@ -183,20 +183,22 @@ def delay(x: Floats, memory: Floats, lag: Floats, dt: Floats) -> None:
             span = memory[r, newer] - memory[r, older]
             part = (wanted - memory[r, older]) / span if span > 0.0 else 1.0
             part = min(max(part, 0.0), 1.0)
-            cubic = steps >= 2 and steps + 1 < min(count, BUFFER)
             before = memory[r, older] - memory[r, oldest]
-            after = memory[r, newest] - memory[r, newer]
-            cubic = cubic and before > 0.0 and after > 0.0
+            after = memory[r, newest] - memory[r, newer] if steps >= 2 else 0.0
+            cubic = steps >= 1 and steps + 1 < min(count, BUFFER) and before > 0.0 and span > 0.0
             for w in range(n):
                 old, new = memory[r, older + 1 + w], memory[r, newer + 1 + w]
                 out = old + part * (new - old)
                 if cubic:
                     here = (new - old) / span
-                    earlier, later = (old - memory[r, oldest + 1 + w]) / before, (memory[r, newest + 1 + w] - new) / after
+                    earlier = (old - memory[r, oldest + 1 + w]) / before
+                    # between the last two samples there is none beyond: the parabola's slope at its end
+                    later = (memory[r, newest + 1 + w] - new) / after if after > 0.0 else 2.0 * here - earlier
                     # slopes at both ends; zero where the wire reverses and at most three times either neighbour, so that nothing
                     # overshoots (Fritsch and Carlson 1980)
                     a = (earlier * span + here * before) / (span + before) if earlier * here > 0.0 else 0.0
-                    b = (here * after + later * span) / (span + after) if here * later > 0.0 else 0.0
+                    reach = after if after > 0.0 else before
+                    b = (here * reach + later * span) / (span + reach) if here * later > 0.0 else 0.0
                     a = math.copysign(min(abs(a), 3.0 * abs(earlier), 3.0 * abs(here)), a)
                     b = math.copysign(min(abs(b), 3.0 * abs(here), 3.0 * abs(later)), b)
                     u = part * (1.0 - part) * span

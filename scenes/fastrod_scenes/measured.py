@@ -37,6 +37,8 @@ ARMLAB_LENGTH = 0.108
 """Nominal [m]: the middle of the published fits, 0.096 to 0.119 m."""
 ARMLAB_PITCH_RADIUS = 0.0045
 """Nominal [m]: the middle of the published fits, 0.0038 to 0.0051 m."""
+ARMLAB_CELL = 0.0025
+"""Edge of the cells of the cube of shortenings that label the rows: regions to hold out [m]."""
 ARMLAB_DIRECTION = (205.0, 85.0, 325.0)
 """Pull direction of each tendon in the mocap x-z plane, from x toward z [deg]: nominal, see `armlab_tdcr`."""
 
@@ -50,8 +52,8 @@ def asl_trunk(path: str | Path, run: str | None = None) -> tuple[RunLog, Robot]:
 
     Published: disk heights, which motor ends where, pull directions, payload. Antagonistic pairs on one spool are one
     push-pull tendon each, so the robot has six, in the order of motors 3 5 | 1 6 | 2 4. `dl` = -spool radius times the
-    *measured* motor angle phi (up to 5 rows stale); `extra` keeps the commanded angles. Tip = disk 3; points p1, p2 =
-    disks 1 and 2.
+    *commanded* motor angle u, for that is what a user has beforehand; `extra` keeps the measured angles phi (up to 5 rows
+    stale). Tip = disk 3; points p1, p2 = disks 1 and 2.
     Nominal: spool radius, pitch radius, bending stiffness 0.05 N m^2, torsional stiffness 0.5 N m^2 (a corrugated hose bends
     but hardly twists; much less, and the pushing half of the pairs, which has no pretension here, would buckle it), a
     weightless body, stiff tendons. Only `payload` loads the rod, and how far it sags rests on the nominal stiffness.
@@ -69,11 +71,11 @@ def asl_trunk(path: str | Path, run: str | None = None) -> tuple[RunLog, Robot]:
         name=Path(path).stem,
         t=numbers(table, "t_s", where),
         run=labels,
-        dl=np.stack([-ASL_SPOOL_RADIUS * np.radians(numbers(table, f"phi{motor}_deg", where)) for motor in order], axis=1),
+        dl=np.stack([-ASL_SPOOL_RADIUS * np.radians(numbers(table, f"u{motor}_deg", where)) for motor in order], axis=1),
         tip_position=disks[2],
         points=np.stack(disks[:2], axis=1),
         payload=numbers(table, "payload_g", where) / 1000.0,
-        extra={f"u{k}_deg": numbers(table, f"u{k}_deg", where) for k in range(1, 7)},
+        extra={f"phi{k}_deg": numbers(table, f"phi{k}_deg", where) for k in range(1, 7)},
     )
     return log if run is None else log.only(run), _asl_robot()
 
@@ -90,7 +92,14 @@ def _asl_robot() -> Robot:
         )
         for start, end, motors in zip(starts, ASL_DISKS, ASL_MOTORS, strict=True)
     ]
-    return Robot(name="asl_trunk", segments=tuple(segments), base_quaternion=_UPSIDE_DOWN, log_points=ASL_DISKS[:2])
+    return Robot(
+        name="asl_trunk",
+        segments=tuple(segments),
+        base_quaternion=_UPSIDE_DOWN,
+        log_points=ASL_DISKS[:2],
+        fit={"tendon.*.gain": {"sd": 0.5}, "tendon.*.zero": {"sd": 0.01}, "segment.*.length": {"sd": 0.005}},
+        sensor={"registration_sd": (0.01, 0.05)},
+    )
 
 
 def ethz_beam(path: str | Path, run: str | None = None, *, settled: float | None = 1.0) -> tuple[RunLog, Robot]:
@@ -148,14 +157,22 @@ def armlab_tdcr(path: str | Path) -> tuple[RunLog, Robot]:
     tip += (0.0, 0.0, ARMLAB_LENGTH) - tip[rest].mean(axis=0)
     tip[glitch] = np.nan
     t = numbers(table, "row", where)
-    log = RunLog(name=Path(path).stem, t=t, run=np.full(len(t), ""), dl=-pull, tip_position=tip)
+    cells = np.minimum(np.nan_to_num(pull) // ARMLAB_CELL, 9).astype(int)
+    run = np.array(["cell_" + "".join(map(str, cell)) for cell in cells.tolist()])
+    log = RunLog(name=Path(path).stem, t=t, run=run, dl=-pull, tip_position=tip)
     return log, _armlab_robot()
 
 
 def _armlab_robot() -> Robot:
     tendons = tuple(Tendon(offset=ARMLAB_PITCH_RADIUS, angle=math.radians(angle)) for angle in ARMLAB_DIRECTION)
     rod = Segment(length=ARMLAB_LENGTH, bending_stiffness=(0.0022, 0.0022), torsional_stiffness=0.001, body_radius=0.008, tendons=tendons)
-    return Robot(name="armlab_tdcr", segments=(rod,), base_quaternion=_UPSIDE_DOWN)
+    return Robot(
+        name="armlab_tdcr",
+        segments=(rod,),
+        base_quaternion=_UPSIDE_DOWN,
+        fit={"segment.1.length": {"sd": 0.01}, "tendon.*.gain": {"sd": 0.3, "shared": True}},
+        sensor={"registration_sd": (0.01, 0.05)},
+    )
 
 
 _HEADERS = {

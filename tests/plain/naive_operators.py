@@ -82,15 +82,16 @@ def delay(x: np.ndarray, lag: float, dt: np.ndarray, buffer: int) -> np.ndarray:
     out = [x[0]]
     for i in range(1, len(t)):
         first = max(i - buffer + 1, 0)
-        earlier = [j for j in range(first, i) if t[j] <= t[i] - lag]
+        wanted = max(t[i] - lag, t[first])
+        earlier = [j for j in range(first, i) if t[j] <= wanted]
         if lag == 0.0 or not earlier:
-            out.append(x[i] if lag == 0.0 else x[first])
+            out.append(x[i])
             continue
         j = earlier[-1]
         ends, values = t[j : j + 2], x[j : j + 2]
         around = slice(j - 1, j + 3)
         if j - 1 < first or j + 2 > i or (np.diff(t[around]) <= 0.0).any():
-            out.append(np.interp(t[i] - lag, ends, values))
+            out.append(np.interp(wanted, ends, values))
             continue
         secants, gaps = np.diff(x[around]) / np.diff(t[around]), np.diff(t[around])
         slopes = []
@@ -98,5 +99,5 @@ def delay(x: np.ndarray, lag: float, dt: np.ndarray, buffer: int) -> np.ndarray:
             parabola = (s[0] * h[1] + s[1] * h[0]) / (h[0] + h[1])
             most = 3.0 * np.abs(s).min()
             slopes.append(np.clip(parabola, -most, most) if s[0] * s[1] > 0.0 else 0.0)
-        out.append(float(CubicHermiteSpline(ends, values, slopes)(t[i] - lag)))
+        out.append(float(CubicHermiteSpline(ends, values, slopes)(wanted)))
     return np.array(out)

@@ -22,7 +22,7 @@ SHARE, WIDTH, SPREAD = rng.uniform(0.0, 1.0, (2, 3)), rng.uniform(0.05, 0.6, (2,
 WIDTH[0, 0] = SHARE[1, 1] = 0.0
 SLOW = WIDTH + 0.02
 LAG = np.array([0.11, 1e3])
-RADII = SLOW[..., None] * (1.0 + SPREAD[..., None] * np.linspace(-1.0, 1.0, SLIDERS))
+RADII = SLOW[..., None] * np.exp(SPREAD[..., None] * np.linspace(-1.0, 1.0, SLIDERS))
 
 Case = tuple[int, Callable[..., Any], Callable[..., np.ndarray]]
 CASES: dict[str, Case] = {

@@ -119,19 +119,19 @@ def test_friction_saturates_at_its_half_width() -> None:
     r, s = 0.2, 0.4
     x = along([0.0, 2.0, -2.0], 400)
     lost = x - rubbed(x)
-    assert_allclose(lost[(x > r * (1 + s)) & (np.arange(801) < 401)], 0.3, atol=ROUNDING)
+    assert_allclose(lost[(x > r * np.exp(s)) & (np.arange(801) < 401)], 0.3, atol=ROUNDING)
     back = np.arange(801) > 400
-    assert_allclose(lost[back & (x < 2.0 - 2.0 * r * (1 + s))], -0.3, atol=ROUNDING)
+    assert_allclose(lost[back & (x < 2.0 - 2.0 * r * np.exp(s))], -0.3, atol=ROUNDING)
     assert np.abs(lost).max() <= 0.3 + ROUNDING
     # and before any slider slips the wire sticks: the loss is linear with slope a mean(1 / r_j)
-    radii = r * (1.0 + s * np.linspace(-1.0, 1.0, SLIDERS))
-    sticks = (x < r * (1 - s)) & ~back
+    radii = r * np.exp(s * np.linspace(-1.0, 1.0, SLIDERS))
+    sticks = (x < r * np.exp(-s)) & ~back
     assert_allclose(lost[sticks], 0.3 * np.mean(1.0 / radii) * x[sticks], atol=ROUNDING)
 
 
 def test_the_area_of_a_friction_loop() -> None:
     # one slider's loop is a parallelogram of height 2 a and width 2 (A - r_j): closed area 4 a mean max(A - r_j, 0)
-    radii = 0.2 * (1.0 + 0.4 * np.linspace(-1.0, 1.0, SLIDERS))
+    radii = 0.2 * np.exp(0.4 * np.linspace(-1.0, 1.0, SLIDERS))
     areas = []
     for amplitude in (0.05, 0.2, 0.5, 1.0):
         x = along([0.0, amplitude, -amplitude, amplitude], 4000)
@@ -160,7 +160,9 @@ def test_friction_grows_with_the_angle_that_a_wire_wraps() -> None:
 
 def test_nothing_yields_below_the_yield_and_a_set_stays() -> None:
     below = along([0.0, 0.5, -0.5, 0.3], 20)
-    assert_array_equal(yielded(below), below)
+    circle = 0.5 * np.stack([np.cos(below), np.sin(below)], axis=1) * (1.0 - 1e-12)
+    assert_array_equal(yielded_in_plane(circle), circle)
+    assert_allclose(yielded(below), below, atol=ROUNDING)
     x = along([0.0, 0.9, 0.0, 0.5, 0.0], 90)
     y = yielded(x)
     assert_allclose(y[180], 0.2 * (0.9 - 0.5), atol=ROUNDING)  # what was beyond the yield, times the share
@@ -299,16 +301,17 @@ def test_a_delayed_parabola_is_exact_where_four_samples_surround_it() -> None:
 
 
 def test_a_delayed_wave_converges_faster_than_with_lines() -> None:
-    """Halved steps: errors of lines fall by 4, of cubics by 8 away from the turns, where the slope is taken as zero: 4 there too, but
-    less to begin with."""
+    """Halved steps: errors of lines fall by 4, of cubics by 8, but for the turns, where the slope is taken as zero and they are lines'."""
     errors = []
     for n in (200, 400):
         t = np.linspace(0.0, 10.0, n + 1)
         dt = np.diff(t, prepend=0.0)
-        found, past = delayed(np.sin(t), 0.377, dt), t - 0.377
+        lag = 7.3 * 10.0 / n  # at the same place between two samples: there the errors' slopes do not cancel
+        found, past = delayed(np.sin(t), lag, dt), t - lag
         steep = (past > 0.5) & (np.abs(np.cos(past)) > 0.3)
         line, cubic = (np.abs(y - np.sin(past)) for y in (np.interp(past, t, np.sin(t)), found))
-        assert cubic[past > 0.5].max() < 0.8 * line[past > 0.5].max()
+        assert cubic[past > 0.5].max() < line[past > 0.5].max()
+        assert cubic[steep].max() < 0.1 * line[steep].max()
         errors.append(cubic[steep].max())
     assert errors[0] / errors[1] > 7.0
 

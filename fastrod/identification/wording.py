@@ -1,10 +1,26 @@
-"""Numbers as a roboticist says them: millimetres, degrees, milliseconds, grams, per cent, with the digits that are known."""
+"""Words and numbers as a roboticist says them: millimetres, degrees, milliseconds, grams, with the digits that are known."""
 
 from __future__ import annotations
 
+import inspect
 import math
+import re
+
+from fastrod.effect import get_effect
+from fastrod.identification.search import Bound
 
 NOTHING = "–"
+VERDICTS = {
+    "none": "Nothing is missing",
+    "explained": "Explained",
+    "partly_explained": "Partly explained",
+    "ambiguous": "Ambiguous on this log",
+    "not_in_library": "Not in the library",
+}
+_NOUNS = {
+    "line_density": "self-weight", "cubic": "cubic term", "radial": "radial term", "per_bend": "shortening", "ratio": "difference",
+    "from_distal": "share of the neighbour", "from_proximal": "share of the neighbour",
+}  # fmt: skip
 
 _SCALES: dict[str, tuple[tuple[float, float, str], ...]] = {
     # SI unit: (least size, factor, unit), the largest first
@@ -83,6 +99,32 @@ def words(name: str) -> str:
 def a(noun: str) -> str:
     """The noun with its article."""
     return f"{'an' if noun[:1].lower() in 'aeiox' else 'a'} {noun}"
+
+
+def plain_name(name: str) -> str:
+    """`segment.*.bending_stiffness` as 'bending stiffness, all segments'."""
+    part, _, rest = name.partition(".")
+    number, _, what = rest.partition(".")
+    if part in ("segment", "tendon") and what:
+        return f"{words(what)}, {'all ' + part + 's' if number == '*' else f'{part} {number}'}"
+    return words(name.replace(".", ", "))
+
+
+def law(name: str) -> dict[str, str]:
+    """Equation, Source and Residual signature of an effect, from its docstring."""
+    text = inspect.cleandoc(type(get_effect(name)).__doc__ or "")
+    found = re.findall(r"^(Equation|Source|Residual signature): (.*(?:\n(?!\n|\w[\w ]*: ).*)*)", text, flags=re.MULTILINE)
+    return {key: " ".join(value.split()) for key, value in found}
+
+
+def bound_sentence(bound: Bound) -> str:
+    """From which size on an effect would have shown."""
+    stem = re.sub(r"_([xyz]|\d+)$", "", bound.parameter)
+    noun = _NOUNS.get(stem, f"component along {stem}" if len(stem) == 1 else words(stem))
+    if not math.isfinite(bound.value):
+        needs = str(getattr(get_effect(bound.name), "excited_by", ""))
+        return f"this log cannot show {words(bound.name)}" + (f"; it takes {needs}" if needs else "")
+    return f"{words(bound.name)}: {a(noun)} above {amount(bound.value, bound.unit)} would have shown"
 
 
 def _joined(number: str, unit: str) -> str:

@@ -1,0 +1,40 @@
+"""Pieces of HTML that the parts of the report share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from html import escape
+
+from fastrod.identification.result import Estimate
+
+SHARES = {
+    "static": ("follows from the present inputs", "#6d5bd0"),
+    "memory": ("follows from the inputs before", "#2166c4"),
+    "drift": ("slow in time", "#c2790a"),
+    "exogenous": ("a signal that no input explains", "#b4235a"),
+}
+
+
+def section(title: str, lead: str, *parts: str) -> str:
+    return f'<section><h2>{escape(title)}</h2><p class="lead">{lead}</p>{"".join(parts)}</section>'
+
+
+def figure(svg: str, caption: str) -> str:
+    return f'<figure><div class="scroll">{svg}</div><figcaption>{caption}</figcaption></figure>'
+
+
+def listed(lines: Iterable[str]) -> str:
+    return f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>"
+
+
+def mark(e: Estimate, always: bool = False) -> str:
+    marks = []
+    if e.at_bound:
+        marks.append('<span class="chip">at bound</span>')
+    if not e.identifiable:
+        marks.append(f'<span class="chip bad">not identifiable</span> {escape(e.why)}')
+    elif e.why:
+        marks.append(escape(e.why))
+    elif always and not e.at_bound:
+        marks.append('<span class="chip good">identifiable</span>')
+    return " ".join(marks)

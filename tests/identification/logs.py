@@ -1,0 +1,47 @@
+"""Small logs of small robots, and the model that answers to them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from rods import rod
+
+from fastrod import Robot
+from fastrod.runlog import RunLog
+from fastrod.wiring import wire
+
+
+def one_segment(**changes: Any) -> Robot:
+    return replace(rod(extension=(-0.01, 0.01)), name="one", log_points=(0.03,), **changes)
+
+
+def two_segments(**changes: Any) -> Robot:
+    """Antagonistic wires, those of the far segment at places of their own in the near one."""
+    (near,) = one_segment().segments
+    wires = tuple(replace(t, offset=(0.006, 0.005), angle=(t.angle + 0.7, t.angle)) for t in near.tendons)  # type: ignore[operator]
+    far = replace(near, length=0.06, bending_stiffness=(0.0015, 0.002), tendons=wires)
+    return Robot(name="two", segments=(near, far), log_points=(0.05, 0.1), **changes)
+
+
+def wires(robot: Robot, bends: np.ndarray) -> np.ndarray:
+    """(n, n_tendons) dl of bends (n, n_segments, 2)."""
+    return wire(robot).wires(bends)
+
+
+def wave(robot: Robot, n: int, dt: float = 0.05, size: float = 0.7, seed: int = 0) -> np.ndarray:
+    """(n, n_tendons) dl: every segment there and back at many amplitudes, with a hold."""
+    t = dt * np.arange(n)
+    phase = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, (robot.n_segments, 2))
+    held = np.where((t > 0.3 * t[-1]) & (t < 0.4 * t[-1]), 0.3 * t[-1], t)
+    way = np.sin(2.1 * held[:, None, None] + phase) * (0.6 + 0.4 * np.cos(0.7 * held[:, None, None]))
+    return wires(robot, size * way)
+
+
+def log_of(robot: Robot, dl: np.ndarray, dt: float | np.ndarray = 0.05, **columns: Any) -> RunLog:
+    """A run with these inputs, whose tip is at the base unless `columns` says where."""
+    n = len(dl)
+    t = dt * np.arange(n) if isinstance(dt, float) else np.cumsum(dt)
+    given = {"name": "log", "run": np.full(n, ""), "tip_position": np.zeros((n, 3)), "t": t} | columns
+    return RunLog(dl=dl, **given)

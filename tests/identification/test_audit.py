@@ -1,0 +1,124 @@
+"""The audit of a residual: what is planted comes out under its kind, and of nothing comes nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from identification.logs import log_of, one_segment
+from numpy.testing import assert_allclose
+from rods import rod
+
+from fastrod.identification.audit import Audit, audit
+from fastrod.identification.excite import excitation
+from fastrod.identification.forward import Samples, sample
+from fastrod.wiring import wire
+
+RATE, SIZE = 10.0, 0.9
+
+
+@cache
+def samples() -> Samples:
+    """The designed run: rests, holds, reversals, and its beginning once more at the end; no load, one base."""
+    run = excitation(one_segment(), rate=RATE).log
+    return sample(replace(run, tip_position=np.zeros((len(run), 3)), payload=None, base_quaternion=None))
+
+
+N, DT = len(samples().log), 1.0 / RATE
+
+
+def noise(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=(N, 3))
+
+
+def bends() -> np.ndarray:
+    """(N, 2) of unit size."""
+    return wire(one_segment()).bend(np.asarray(samples().log.dl))[:, 0] / SIZE
+
+
+def run(residual: np.ndarray, lag1: float = 0.0) -> Audit:
+    return audit(samples(), wire(one_segment()), residual, lag1)
+
+
+def planted(pattern: np.ndarray, share: float, seed: int) -> np.ndarray:
+    """White noise with a pattern (N, 3) that carries this share of the variance."""
+    pattern = pattern - pattern.mean(0)
+    return noise(seed) + pattern * np.sqrt(share / (1.0 - share) * 3.0 / (pattern**2).sum(1).mean())
+
+
+def patterns() -> dict[str, np.ndarray]:
+    b, t = bends(), np.arange(N)[:, None] * DT
+    lag = np.zeros_like(b)  # a low-pass of 3 s, which is none of the audit's own
+    for i in range(1, N):
+        lag[i] = lag[i - 1] + (b[i] - lag[i - 1]) * DT / 3.0
+    turn = np.array([[1.0, 0.2, 0.3], [-0.3, 1.0, 0.1]])
+    return {
+        "static": (b**2 * np.sign(b)) @ turn + 0.5 * (b[:, :1] * b[:, 1:]) * np.array([0.3, -0.2, 1.0]),
+        "memory": (b - lag) @ turn - ((b - lag) * b).mean(0) / (b**2).mean(0) * b @ turn,  # what no multiple of the input is
+        "drift": np.tanh(t / (N * DT) * 4.0 - 2.0) * np.array([1.0, -0.5, 0.2]),
+    }
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_white_noise_has_no_structure(seed: int) -> None:
+    found = run(noise(seed))
+    assert found.kind == "none"
+    assert found.structured == 0.0
+    # z of a best of two scores, and of an autocorrelation: the largest of four seeds
+    assert found.z < 4.0
+
+
+@pytest.mark.parametrize("kind", ["static", "memory", "drift"])
+@pytest.mark.parametrize("seed", range(2))
+def test_what_is_planted_comes_out_as_its_kind(kind: str, seed: int) -> None:
+    for share in (0.1, 0.5):
+        found = run(planted(patterns()[kind], share, seed))
+        assert found.kind == kind
+        # held-out features find most of it, and no more than the noise lets it look (0.03 of a variance of 5400 numbers)
+        assert 0.6 * share < getattr(found, kind) < share + 0.05
+        assert found.structured < share + 0.08
+        assert found.z > 3.0
+
+
+def test_a_line_that_no_input_has_is_unknown() -> None:
+    """0.9 Hz: no input moves with it, and the time features end at three periods of the whole run."""
+    t = np.arange(N)[:, None] * DT
+    found = run(planted(np.sin(2.0 * np.pi * 0.9 * t) * np.array([1.0, 0.5, 0.0]), 0.5, 1))
+    assert found.kind == "unknown"
+    # half of the variance, times its correlation from one sample to the next, cos(2 pi 0.9 / 15)
+    assert_allclose(found.exogenous, 0.5 * np.cos(2.0 * np.pi * 0.9 * DT), atol=0.08)
+
+
+def coloured(seed: int, rho: float = 0.5) -> np.ndarray:
+    e = noise(seed)
+    for i in range(1, N):
+        e[i] = rho * e[i - 1] + np.sqrt(1.0 - rho**2) * e[i]
+    return e
+
+
+def test_noise_that_is_coloured_at_rest_too_is_noise() -> None:
+    e = coloured(5)
+    assert run(e).exogenous > 0.3  # where the rest noise is said to be white, it is something
+    assert run(e, lag1=0.5).exogenous == 0.0
+
+
+def test_shares_are_of_the_variance() -> None:
+    """In whatever unit; and nothing has no share of anything."""
+    residual = planted(patterns()["static"], 0.5, 0)
+    one, other = run(residual), run(1e-4 * residual)
+    assert_allclose(
+        [other.static, other.memory, other.drift, other.exogenous], [one.static, one.memory, one.drift, one.exogenous], atol=1e-9
+    )
+    nothing = run(np.zeros((N, 3)))
+    assert (nothing.structured, nothing.kind, nothing.z) == (0.0, "none", 0.0)
+
+
+def test_only_some_rows_and_a_robot_without_wires() -> None:
+    few = samples().on(np.arange(0, N, 3))
+    residual = planted(patterns()["static"], 0.5, 2)[::3]
+    assert audit(few, wire(one_segment()), residual).kind == "static"
+    passive = sample(log_of(rod("passive"), np.zeros((N, 0)), DT))
+    assert audit(passive, wire(rod("passive")), noise(1)).kind == "none"
+    assert audit(passive, wire(rod("passive")), planted(patterns()["drift"], 0.5, 1)).kind == "drift"

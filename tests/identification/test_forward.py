@@ -1,0 +1,232 @@
+"""A log through the model in one go, against a simulator that goes through it step by step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from identification.logs import log_of, one_segment, two_segments, wave
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial.transform import Rotation
+
+import fastrod.effect as registry
+from fastrod import Robot, Simulator
+from fastrod.effect import Parameter, Seam, effect, get_effect, has_memory
+from fastrod.identification.forward import N_STEPS, Pose, Rod, predict, sample
+from fastrod.identification.unknowns import base_model
+from fastrod.ports import EffectPorts
+from fastrod.runlog import RunLog
+from fastrod.types import Floats
+from fastrod.wiring import wire
+
+N = 30
+TABLES: dict[str, dict[str, Any]] = {
+    "latency": {"delay": 0.13},
+    "temperature": {"gain": 0.1, "time_constant": 20.0},
+    "backlash": {"half_width": [3e-4, 5e-4], "rounding": 0.2},
+    "friction": {"half_width": [4e-4, 3e-4], "presliding": 6e-4, "growth": 0.5, "spread": 0.7},
+    "creep": {"share": 0.15, "time_constant": 0.4},
+    "plastic_set": {"share": 0.2, "yield_at": 0.3},
+    "dynamics": {"period": 0.08, "damping": 0.2},
+    "time_drift": {"x": 1e-4, "y": -2e-4, "z": 5e-5},
+}
+STATIC: list[dict[str, Any]] = [
+    {"name": "drum_gain", "gain": [0.03, -0.02, 0.04, 0.01]},
+    {"name": "encoder_offset", "offset": 1e-4},
+    {"name": "coupling", "from_distal": 0.1, "from_proximal": -0.05},
+    {"name": "slack", "half_width": 2e-4},
+    {"name": "stiffening", "cubic": 0.05},
+    {"name": "routing_angle", "angle": [0.05, -0.04, 0.02, 0.03]},
+    {"name": "tendon_stretch", "compliance": 3e-4},
+    {"name": "axial_compression", "per_bend": 0.02, "common_share": 0.5},
+    {"name": "precurvature", "uniform_x": 0.5, "bow_y": 1.0},
+    {"name": "gravity", "line_density": 0.1},
+    {"name": "payload", "mass": 0.01},
+    {"name": "marker_offset", "x": 2e-3, "z": 1e-3},
+    {"name": "frame_misalignment", "rotation_x": 0.03, "shift_y": 1e-3},
+]
+
+
+def times(n: int = N) -> np.ndarray:
+    """(n,) irregular, from 3 s on."""
+    return 3.0 + np.cumsum(np.random.default_rng(2).uniform(0.02, 0.08, n))
+
+
+def log(robot: Robot, n: int = N) -> RunLog:
+    """Every kind of input: wires, extensions, loads, another base half way."""
+    turned = Rotation.from_rotvec(np.where(np.arange(n)[:, None] < n // 2, 0.0, [0.9, -0.5, 0.3]))
+    return log_of(
+        robot, wave(robot, n), times(n), t=times(n), payload=np.where(np.arange(n) % 20 < 10, 0.0, 0.02), ext=np.full((n, robot.n_segments), 1e-3),
+        tip_force=np.outer(np.sin(np.arange(n)), [0.02, 0.01, -0.01]), base_quaternion=turned.as_quat(scalar_first=True),
+        points=np.zeros((n, len(robot.log_points), 3)),
+    )  # fmt: skip
+
+
+def stepped(robot: Robot, what: RunLog) -> Pose:
+    """What a simulator of the robot measures, settled at every sample, its clock that of the log."""
+    sim = Simulator(robot, points_per_segment=N_STEPS)
+    seen = []
+    for i in range(len(what)):
+        sim.dt = float(what.t[i] - what.t[i - 1]) if i else 1.0  # the first is no step
+        assert what.tip_force is not None
+        assert what.payload is not None
+        assert what.base_quaternion is not None
+        assert what.ext is not None
+        turn = Rotation.from_quat(what.base_quaternion[i].copy(), scalar_first=True)
+        given = {
+            "tip_force": turn.apply(what.tip_force[i].copy()) + what.payload[i] * np.array(robot.gravity),
+            "base_pose": np.concatenate([robot.base_position, what.base_quaternion[i]]),
+            "extension": what.ext[i],
+        }
+        assert sim.settle(robot.rest_tendon_length + what.dl[i], tolerance=1e-10 * robot.length, **given).ok.all()
+        seen.append(sim.measure())
+    position, rotation, points = (np.concatenate(parts) for parts in zip(*seen, strict=True))
+    return Pose(position, rotation, points, np.ones(len(what), bool))
+
+
+def predicted(robot: Robot, what: RunLog) -> Pose:
+    """The rows of a log as identification sees them: the robot's effects are known, nothing else is fitted."""
+    samples = sample(what)
+    model = base_model(robot)
+    pose = predict(model, model.start, samples, Rod(samples, robot, points=True))
+    assert pose.ok.all()
+    return pose
+
+
+def alike(one: Pose, two: Pose, length: float) -> None:
+    """Both settled, one to 1e-8 of the length: some of that at the tip, and over the length in angle."""
+    assert_allclose(one.position, two.position, atol=3e-8 * length)
+    assert_allclose(one.points, two.points, atol=3e-8 * length)
+    assert_allclose(one.rotation, two.rotation, atol=3e-7)
+
+
+def having(robot: Robot, *tables: dict[str, Any]) -> Robot:
+    return replace(robot, effects=tables)
+
+
+def test_every_effect_with_a_memory_or_a_clock_is_here() -> None:
+    assert {name for name in registry.effect_names() if has_memory(get_effect(name))} | {"temperature", "time_drift"} == set(TABLES)
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_log_in_one_go_is_a_simulator_step_by_step(name: str) -> None:
+    robot = having(two_segments(), {"name": name} | TABLES[name])
+    what = log(robot)
+    found = predicted(robot, what)
+    alike(found, stepped(robot, what), robot.length)
+    assert np.abs(found.position - predicted(two_segments(), what).position).max() > 1e-4  # and the effect is there
+
+
+def test_all_effects_at_once_are_the_simulator() -> None:
+    """With static ones before, between and after those with a memory."""
+    robot = having(two_segments(), *({"name": name} | table for name, table in TABLES.items()), *STATIC)
+    what = log(robot)
+    alike(predicted(robot, what), stepped(robot, what), robot.length)
+
+
+def test_static_effects_are_the_simulator() -> None:
+    robot = having(two_segments(), *STATIC)
+    what = log(robot)
+    alike(predicted(robot, what), stepped(robot, what), robot.length)
+
+
+def test_several_runs_begin_with_no_memory() -> None:
+    """Two runs, interleaved in the file, the second at another time of day: each as if it were alone."""
+    robot = having(two_segments(), *({"name": name} | table for name, table in TABLES.items()))
+    alone = log(robot)
+    other = replace(alone, dl=wave(robot, N, seed=5), t=alone.t + 100.0)
+    order = np.argsort(np.concatenate([np.arange(N), np.arange(N) + 0.5]), kind="stable")
+    both = RunLog(
+        name="both",
+        run=np.repeat(["a", "b"], N)[order],
+        **{
+            key: np.concatenate([getattr(alone, key), getattr(other, key)])[order]
+            for key in ("t", "dl", "tip_position", "payload", "ext", "tip_force", "base_quaternion", "points")
+        },
+    )
+    samples = sample(both)
+    assert [(part.start, part.stop) for part in samples.runs] == [(0, N), (N, 2 * N)]
+    assert_allclose(samples.time[[0, N]], 0.0)
+    assert_array_equal(samples.dt[[0, N]], 0.0)
+    assert_allclose(samples.dt[1:N], np.diff(alone.t), rtol=1e-12)
+    found = predicted(robot, both)
+    for part, single in zip(samples.runs, (alone, other), strict=True):
+        alike(Pose(*(a[part] for a in found)), predicted(robot, single), robot.length)
+    # and as one run they would be something else
+    merged = replace(both, run=np.full(2 * N, ""), t=0.05 * np.arange(2 * N))
+    assert np.abs(predicted(robot, merged).position - found.position).max() > 1e-4
+
+
+def test_a_loss_that_looks_at_some_rows_does_not_shorten_the_memory() -> None:
+    robot = having(two_segments(), *({"name": name} | table for name, table in TABLES.items()))
+    what = log(robot)
+    whole = predicted(robot, what)
+    samples = sample(what).on(np.array([3, 11, 12, 29]))
+    model = base_model(robot)
+    some = predict(model, model.start, samples, Rod(samples, robot, points=True))
+    alike(some, Pose(*(a[samples.rows] for a in whole)), robot.length)
+
+
+def test_rows_without_a_tip_are_driven_and_rows_without_an_input_are_not_there() -> None:
+    robot = having(one_segment(), {"name": "creep", "share": 0.3, "time_constant": 0.3})
+    what = log(robot)
+    tip, dl = what.tip_position.copy(), what.dl.copy()
+    tip[5:9], dl[20] = np.nan, np.nan
+    samples = sample(replace(what, tip_position=tip, dl=dl))
+    assert len(samples.log) == N - 1
+    assert_array_equal(samples.rows, [i for i in range(N - 1) if i not in (5, 6, 7, 8)])
+    assert_allclose(samples.dt[20], what.t[21] - what.t[19], rtol=1e-12)
+    model = base_model(robot)
+    found = predict(model, model.start, samples, Rod(samples, robot))
+    kept = np.delete(np.arange(N), [20])
+    alone = stepped(robot, what.rows(kept))
+    assert_allclose(found.position, alone.position[samples.rows], atol=3e-8 * robot.length)
+
+
+# A user's own, without `sweep`
+
+
+class Sluggish:
+    """A wire that follows by a share of the way in every time constant.
+
+    Equation: tau y' = l - y, a step at a time
+    Source: this test
+    Residual signature: lag
+    """
+
+    seam = Seam.ACTUATION
+    order = 52.0
+    parameters = (Parameter("tau", "s", bounds=(0.0, 10.0), typical=0.1),)
+
+    def memory(self, n_robots: int, n_tendons: int) -> Floats:
+        return np.full((n_robots, n_tendons), np.nan)
+
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
+        dl = ports.dl
+        memory[:] = np.where(np.isnan(memory), dl, memory)
+        memory += (dl - memory) * (dt / (dt + values))
+        ports.shift_wires(memory - dl)
+
+
+@pytest.fixture
+def sluggish() -> Iterator[str]:
+    registry.load_library()
+    before = dict(registry._REGISTRY)
+    effect(Sluggish)
+    yield "sluggish"
+    registry._REGISTRY.clear()
+    registry._REGISTRY.update(before)
+
+
+def test_a_users_effect_without_a_sweep_goes_step_by_step(sluggish: str) -> None:
+    """Between the library's, one before it and one after."""
+    tables = [{"name": name} | TABLES[name] for name in ("backlash", "plastic_set")]
+    robot = having(two_segments(), {"name": sluggish, "tau": 0.2}, *tables)
+    what = log(robot)
+    found = predicted(robot, what)
+    alike(found, stepped(robot, what), robot.length)
+    assert np.abs(found.position - predicted(having(two_segments(), *tables), what).position).max() > 1e-3
+    assert registry.columns(get_effect(sluggish), wire(robot)) == ["tau"]

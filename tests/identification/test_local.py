@@ -1,0 +1,234 @@
+"""The model near a reference, against the model itself."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from identification.logs import log_of, two_segments, wave
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial.transform import Rotation
+
+from fastrod import Robot
+from fastrod.identification.forward import Rod, Samples, predict, sample
+from fastrod.identification.local import Local, Target, exact_residual
+from fastrod.identification.unknowns import Model, base_model
+
+N = 40
+SIGMA = np.array([2e-4, 3e-4, 4e-4])
+
+
+def robot() -> Robot:
+    return two_segments(
+        fit={"segment.*.length": {"sd": 1e-3, "shared": True}, "tendon.*.gain": {"sd": 0.02}},
+        sensor={"marker_offset_sd": 2e-3, "registration_sd": (1e-3, 0.02)},
+    )
+
+
+def samples() -> Samples:
+    """Loads, two base orientations, and a measured tip that is some tenths of a millimetre from the nominal one."""
+    turned = Rotation.from_rotvec(np.where(np.arange(N)[:, None] < N // 2, 0.0, [0.9, -0.5, 0.3]))
+    inputs: dict[str, Any] = {
+        "payload": np.where(np.arange(N) % 20 < 10, 0.0, 0.02),
+        "base_quaternion": turned.as_quat(scalar_first=True),
+    }
+    bare = sample(log_of(two_segments(), wave(two_segments(), N), 0.1, points=np.zeros((N, 2, 3)), **inputs))
+    model = base_model(two_segments())
+    pose = predict(model, model.start, bare, Rod(bare, two_segments(), points=True))
+    rng = np.random.default_rng(3)
+    tip = pose.position + SIGMA * rng.normal(size=(N, 3))
+    turn = Rotation.from_rotvec(0.01 * rng.normal(size=(N, 3))) * Rotation.from_matrix(pose.rotation)
+    points = pose.points + SIGMA * rng.normal(size=(N, 2, 3))
+    points[4, 1] = np.nan  # a marker that was hidden
+    log = log_of(
+        two_segments(), wave(two_segments(), N), 0.1, tip_position=tip, tip_quaternion=turn.as_quat(scalar_first=True), points=points, **inputs
+    )  # fmt: skip
+    return sample(log)
+
+
+class Place:
+    """A reference, and everything at it."""
+
+    def __init__(self, *effects: str) -> None:
+        self.model = base_model(robot())
+        for name in effects:
+            self.model = self.model.with_effect(name)
+        self.theta = self.model.start
+        self.samples = samples()
+        self.rod = Rod(self.samples, self.model.robot, points=True)
+        self.target = Target(self.samples, SIGMA, rotation_sigma=0.01, points=True)
+        self.local = Local(self.model, self.theta, self.samples, self.rod, self.target)
+
+    def exact(self, model: Model, theta: np.ndarray) -> np.ndarray:
+        residual, ok = exact_residual(model, theta, self.samples, self.rod, self.target)
+        assert ok.all()
+        return residual
+
+
+@cache
+def base() -> Place:
+    return Place()
+
+
+@cache
+def with_memory() -> Place:
+    return Place("friction", "creep", "tendon_stretch")
+
+
+@pytest.mark.parametrize("place", [base, with_memory])
+def test_at_the_reference_it_is_the_model(place: Any) -> None:
+    here = place()
+    found, exact = here.local.residual(here.model, here.theta), here.exact(here.model, here.theta)
+    assert found.shape == (N, 3 + 3 + 6)
+    # the rod is settled to 1e-8 of 0.13 m, which is 1e-5 sigma
+    assert_allclose(found, exact, atol=1e-4)
+    assert np.abs(found).max() > 1.0
+    assert_array_equal(found[4, 9:], 0.0)  # a hidden marker says nothing
+
+
+def exact_slopes(here: Place, model: Model, theta: np.ndarray, j: int) -> np.ndarray:
+    """Central difference of exact predictions, over a step that is ten times smaller than the local one's."""
+    unknown = model.unknowns[j]
+    step = 0.01 if unknown.log else 0.01 * unknown.scale
+    ends = []
+    for sign in (1.0, -1.0):
+        moved = theta.copy()
+        moved[j] += sign * step
+        ends.append(here.exact(model, moved))
+    return (ends[1] - ends[0]) / (2.0 * step)
+
+
+# What a local slope may be off by, as a share of the exact one (root mean square over rows and numbers seen):
+# wires go through the rod by one-sided differences of 2 mrad, the camera by none;
+WIRES = dict.fromkeys(["drum_gain", "encoder_offset", "coupling", "slack", "stiffening", "temperature"], 0.004)
+CAMERA = dict.fromkeys(["marker_offset", "frame_misalignment", "lens", "camera_scale", "time_drift"], 1e-4)
+# a force from the tip by one-sided differences of 2e-3 EI / l^2, and from there on linear: a twentieth of a typical payload here;
+FORCE = dict.fromkeys(["payload", "tip_force"], 0.02)
+# operators have corners, which the local difference of a fiftieth of a typical size looks over: play has nothing but corners;
+MEMORY = {"latency": 0.015, "backlash": 0.15, "friction": 0.01, "creep": 0.004, "plastic_set": 0.006, "dynamics": 0.05}
+# what changes the rod has one secant, over a typical size: it is off by how much the effect saturates over that. Wires that stretch by
+# thirty times their compliance here do so by a third.
+ROD = {
+    "gravity": 0.07, "tendon_stretch": 0.45, "routing_angle": 0.15, "axial_compression": 0.03, "precurvature": 0.02, "stiffness_taper": 0.05,
+    "stiffness_anisotropy": 0.2,
+}  # fmt: skip
+NOTHING = 0.01  # sigma, by a typical size: a slope that small is not compared; nobody can see it
+
+
+def compare(here: Place, model: Model, theta: np.ndarray, first: int, tolerance: dict[str, float]) -> None:
+    residual = here.local.residual(model, theta)
+    J = here.local.slopes(model, theta, residual)
+    assert J.shape == (*residual.shape, len(theta))
+    seen = 0
+    for j in range(first, len(theta)):
+        unknown = model.unknowns[j]
+        exact = exact_slopes(here, model, theta, j)
+        unit = 1.0 if unknown.log else unknown.scale
+        if np.abs(exact).max() * unit < NOTHING:
+            assert np.abs(J[..., j]).max() * unit < 2.0 * NOTHING, unknown.name
+            continue
+        seen += 1
+        error = np.sqrt(((J[..., j] - exact) ** 2).sum() / (exact**2).sum())
+        assert error < tolerance[unknown.place[1]], f"{unknown.name}: {error:.4f}"
+    assert seen > 0
+
+
+def near_neutral(name: str) -> tuple[Place, Model, np.ndarray, int]:
+    """The base's reference and a candidate at hardly anything: a twentieth of its typical size, its shape where a fit starts. Dynamics as
+    a fit starts it: a period far below the time between samples rings at any phase."""
+    here = base()
+    model = here.model.without(name).with_effect(name)
+    first = len(model.without(name).unknowns)
+    theta = np.concatenate(
+        [[v for u, v in zip(here.model.unknowns, here.theta, strict=True) if u.place[:2] != ("effect", name)], model.start[first:]]
+    )
+    for j in range(first, len(theta)):
+        unknown = model.unknowns[j]
+        if name == "dynamics":
+            theta[j] = unknown.outside({"period": 0.16, "damping": 0.6}[unknown.name.partition(".")[2]])
+        elif not unknown.shape:
+            theta[j] = unknown.mean + 0.05 * unknown.scale
+    return here, model, theta, first
+
+
+def test_slopes_of_the_base_parameters() -> None:
+    """Stiffness by a one-sided difference of 5 %, lengths of two."""
+    here = base()
+    compare(here, here.model, here.theta, 0, {"bending_stiffness": 0.07, "torsional_stiffness": 0.05, "length": 0.01, **WIRES, **CAMERA})
+
+
+@pytest.mark.parametrize("name", [*WIRES, *CAMERA, *FORCE, *MEMORY])
+def test_slopes_of_effects_that_need_no_rod(name: str) -> None:
+    here, model, theta, first = near_neutral(name)
+    before = here.rod.runs
+    here.local.slopes(model, theta, here.local.residual(model, theta))
+    assert here.rod.runs - before <= 4 + 3  # at most what `by_bend` and `by_force` took, once
+    compare(here, model, theta, first, WIRES | CAMERA | FORCE | MEMORY)
+
+
+@pytest.mark.parametrize("name", ROD)
+def test_slopes_of_effects_that_need_the_rod(name: str) -> None:
+    compare(*near_neutral(name), ROD)
+
+
+@pytest.mark.parametrize("name", ROD)
+def test_one_effect_on_the_rod_is_exact_at_its_typical_size(name: str) -> None:
+    """The secant's other end, one parameter at a time."""
+    here = base()
+    first = len(here.theta)
+    model = here.model.with_effect(name)
+    for j in range(first, len(model.unknowns)):
+        theta = np.concatenate([here.theta, [u.mean for u in model.unknowns[first:]]])
+        theta[j] += model.unknowns[j].scale
+        found, exact = here.local.residual(model, theta), here.exact(model, theta)
+        # but for the rotation of what the camera sees, which is exact to the third order of a vector
+        assert_allclose(found, exact, atol=2e-3)
+
+
+def test_the_local_model_errs_by_the_square_of_the_distance() -> None:
+    """Wires, forces and camera together: half the way, a quarter of the error."""
+    here = base()
+    first = len(here.theta)
+    model = here.model.with_effect("payload").with_effect("stiffening").with_effect("lens")
+    errors = []
+    for part in (1.0, 0.5):
+        theta = np.concatenate([here.theta, [u.mean + part * u.scale for u in model.unknowns[first:]]])
+        errors.append(np.sqrt(((here.local.residual(model, theta) - here.exact(model, theta)) ** 2).mean()))
+    assert 3.0 < errors[0] / errors[1] < 5.0
+    moved = np.sqrt(((here.exact(model, theta) - here.exact(here.model, here.theta)) ** 2).mean())
+    assert errors[1] < 0.1 * moved
+
+
+def test_a_local_fit_finds_what_was_planted() -> None:
+    """A gain and a marker, planted exactly: the fit comes to them as near as the noise lets it."""
+    here = base()
+    true = here.theta.copy()
+    place = [u.name for u in here.model.unknowns].index("tendon.1.gain")
+    true[place] = 0.03
+    pose = predict(here.model, true, here.samples, here.rod)
+    log = here.samples.log
+    told = Target(here.samples, SIGMA, rotation_sigma=0.01, points=True)
+    told.tip = pose.position + SIGMA * np.random.default_rng(8).normal(size=(N, 3))
+    told.rotation, told.points, told.seen = None, np.zeros((N, 0, 3)), np.zeros((N, 0, 3), bool)
+    assert len(log) == N
+    local = Local(here.model, here.theta, here.samples, Rod(here.samples, here.model.robot, points=True), told)
+    fit = local.fit(here.model, here.theta, 20)
+    error = np.sqrt(np.diag(np.linalg.inv(fit.hessian)))
+    assert abs(fit.theta[place] - true[place]) < 3.0 * error[place]
+    assert error[place] < 0.02  # the data say more than the prior
+    assert fit.loss < 1.2 * N * 3
+
+
+def test_rows_that_do_not_count() -> None:
+    """Outliers and rows that did not converge have no residual and no slope."""
+    here = base()
+    target = Target(here.samples, SIGMA, rotation_sigma=0.01, points=True)
+    target.weight = np.where(np.arange(N) == 7, 0.0, 1.0)
+    pose = predict(here.model, here.theta, here.samples, here.rod)
+    ok = pose.ok.copy()
+    ok[9] = False
+    residual = target.residual(pose._replace(ok=ok))
+    assert_array_equal(residual[[7, 9]], 0.0)
+    assert_array_equal(np.delete(residual, [7, 9], axis=0), np.delete(here.target.residual(pose), [7, 9], axis=0))

@@ -1,0 +1,138 @@
+"""Noise of known size, read back; outliers of known places, found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from identification.logs import log_of, one_segment, wires
+from numpy.testing import assert_allclose
+
+from fastrod.identification.forward import Samples, sample
+from fastrod.identification.noise import Noise, at_rest, keep, read_noise
+
+SIGMA = np.array([2e-4, 3e-4, 5e-4])
+RATE = 15.0
+N = 1800  # two minutes
+LONG = 2250  # as long as a designed run
+REST = (slice(0, 360), slice(1200, 1560))
+
+
+def samples(n: int = N, *, rests: bool = True) -> Samples:
+    """Two minutes at 15 Hz: 24 s of rest, motion, 24 s of rest, motion; or motion alone."""
+    robot = one_segment()
+    moving = np.ones(n)
+    if rests:
+        for part in REST:
+            moving[part] = 0.0
+    angle = np.cumsum(moving) / RATE
+    bends = 0.8 * np.stack([np.sin(1.3 * angle), np.sin(0.9 * angle)], axis=1)[:, None]
+    return sample(log_of(robot, wires(robot, bends), 1.0 / RATE))
+
+
+def smooth(seed: int, n: int = N) -> np.ndarray:
+    """(n, 3) what the model lacks: slow, some sigma large."""
+    t = np.arange(n)[:, None] / RATE
+    return 4.0 * SIGMA * np.sin(np.array([0.5, 0.8, 1.1]) * t + np.random.default_rng(seed).uniform(0.0, 6.0, 3))
+
+
+def white(seed: int, n: int = N) -> np.ndarray:
+    return SIGMA * np.random.default_rng(seed).normal(size=(n, 3))
+
+
+def spoilt(noise: np.ndarray, share: float, seed: int, size: float) -> tuple[np.ndarray, np.ndarray]:
+    """The noise with outliers of one to two times `size` sigma along each axis, and which rows they are."""
+    rng = np.random.default_rng(seed)
+    bad = rng.random(len(noise)) < share
+    way = rng.uniform(1.0, 2.0, noise.shape) * rng.choice([-1.0, 1.0], noise.shape)
+    return noise + np.where(bad[:, None], size * SIGMA * way, 0.0), bad
+
+
+def test_rest_is_where_no_input_moves() -> None:
+    found = at_rest(samples())
+    assert len(found) == 2
+    for rows, part in zip(found, REST, strict=True):
+        assert part.start <= rows[0]
+        assert rows[0] <= part.start + RATE + 1  # the first second does not count: the robot may still ring
+        assert rows[-1] == part.stop - 1
+        assert (np.diff(rows) == 1).all()
+    assert at_rest(samples(rests=False)) == []
+    # a load that is hung on is a motion, and so is a new run
+    still = log_of(one_segment(), np.zeros((60, 4)), 0.1, payload=np.repeat([0.0, 0.02], 30), run=np.repeat(["a", "a", "b"], 20))
+    still = replace(still, t=np.concatenate([0.1 * np.arange(40), 0.1 * np.arange(20)]))
+    assert [(rows[0], rows[-1]) for rows in at_rest(sample(still))] == [(10, 29), (50, 59)]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_noise_at_rest(seed: int) -> None:
+    """Some 690 samples: known to 1 / sqrt(1380) = 2.7 %; a slow drift of the camera is not counted as noise."""
+    drift = np.linspace(0.0, 20.0, N)[:, None] * SIGMA
+    found = read_noise(samples(), white(seed) + drift, np.zeros((N, 3)))
+    assert "at rest" in found.how
+    assert_allclose(found.sigma, SIGMA, rtol=0.1)
+    assert abs(found.lag1) < 0.08  # 3.5 / sqrt(3 x 690)
+    assert_allclose(found.floor, np.linalg.norm(SIGMA), rtol=0.1)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_noise_without_rest(seed: int) -> None:
+    """From the fastest part of a residual that also has slow structure: a median of 2250 correlated third differences, 3 to 4 %."""
+    found = read_noise(samples(LONG, rests=False), np.zeros((LONG, 3)), white(seed, LONG) + smooth(seed, LONG))
+    assert "never rests" in found.how
+    assert_allclose(found.sigma, SIGMA, rtol=0.1)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_noise_at_rest_with_outliers(seed: int) -> None:
+    """A tenth of the samples is twenty to forty sigma off."""
+    tip, _ = spoilt(white(seed), 0.1, 100 + seed, 20.0)
+    found = read_noise(samples(), tip, np.zeros((N, 3)))
+    assert_allclose(found.sigma, SIGMA, rtol=0.1)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_noise_without_rest_with_outliers(seed: int) -> None:
+    """Each outlier spoils four third differences, in all 1 - 0.9^4 of them: their median is the 0.76 quantile of the good ones, and
+    the noise reads 1.74 times too large at worst; never too small."""
+    residual, _ = spoilt(white(seed, LONG) + smooth(seed, LONG), 0.1, 100 + seed, 20.0)
+    found = read_noise(samples(LONG, rests=False), np.zeros((LONG, 3)), residual)
+    assert (found.sigma > 0.9 * SIGMA).all()
+    assert (found.sigma < 1.74 * 1.1 * SIGMA).all()
+
+
+def test_what_sways_at_rest_is_no_noise() -> None:
+    """A line of half a hertz, three sigma: autocorrelated, so the noise is read from what is faster."""
+    t = np.arange(N)[:, None] / RATE
+    found = read_noise(samples(), white(3) + 3.0 * SIGMA * np.sin(2.0 * np.pi * 0.5 * t), np.zeros((N, 3)))
+    assert found.lag1 > 0.6  # 4.5 / 5.5 of the variance, cos(2 pi 0.5 / 15) of it from one sample to the next
+    assert "fast" in found.how
+    assert_allclose(found.sigma, SIGMA, rtol=0.15)  # third differences of 690 samples: 6 %
+
+
+def test_a_short_log_still_has_a_noise() -> None:
+    few = sample(log_of(one_segment(), np.zeros((3, 4))))
+    assert (read_noise(few, np.zeros((3, 3)), np.zeros((3, 3))).sigma > 0.0).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_planted_outliers_are_found_and_good_rows_kept(seed: int) -> None:
+    """A twentieth of the rows, twenty sigma and more off, on a residual that itself wanders by four sigma."""
+    residual, bad = spoilt(white(seed) + smooth(seed), 0.05, 50 + seed, 20.0)
+    good = keep(samples(), residual, Noise(SIGMA, 0.0, "known"))
+    assert not good[bad].any()
+    assert good[~bad].mean() >= 0.98
+    # and where nothing is planted hardly anything is thrown away: 5 sigma of a normal, with a spread from 15 samples
+    assert keep(samples(), white(seed) + smooth(seed), Noise(SIGMA, 0.0, "known")).mean() >= 0.995
+
+
+def test_outliers_are_looked_for_in_each_run_alone() -> None:
+    """A jump from one run to the next is none; of a run too short for the filter nothing is thrown away."""
+    robot = one_segment()
+    label = np.repeat(["a", "b", "c"], [60, 60, 10])
+    log = log_of(robot, np.zeros((130, 4)), 0.1, run=label)
+    residual = np.where(label == "a", 0.0, 1.0)[:, None] * 50.0 * SIGMA + SIGMA * np.random.default_rng(1).normal(size=(130, 3))
+    residual[30] += 30.0 * SIGMA
+    residual[125] += 30.0 * SIGMA
+    good = keep(sample(log), residual, Noise(SIGMA, 0.0, "known"))
+    assert np.flatnonzero(~good).tolist() == [30]
