@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from fastrod.identification.forward import Samples
 from fastrod.robot import Robot
 
@@ -20,15 +18,13 @@ def limits(robot: Robot, samples: Samples) -> list[str]:
     thickest = max((s.body_radius / robot.length for s in robot.segments), default=0.0)
     if (share := _SHEAR * thickest**2) > _WORTH_SAYING:
         found.append(
-            f"shear is not the rod's: {1.0 / (2.0 * thickest):.1f} times as long as thick, it takes some {100 * share:.0f} % of the deflection"
+            f"shear is not the rod's: {1.0 / (2.0 * thickest):.1f} times as long as thick, it is some {100 * share:.0f} % of the deflection"
         )
     mass = sum(s.line_density * s.length for s in robot.segments)
     if mass > 0.0:
         soft = min(min(s.bending_stiffness) for s in robot.segments)
         frequency = 0.56 * math.sqrt(soft / (mass * robot.length**3))
-        rate = (
-            1.0 / float(sorted(samples.dt[samples.dt > 0.0])[len(samples.dt[samples.dt > 0.0]) // 2]) if (samples.dt > 0.0).any() else 0.0
-        )
-        if frequency < _SLOW and rate > 2.0 * frequency:
+        steps = sorted(samples.dt[samples.dt > 0.0].tolist())
+        if frequency < _SLOW and steps and 2.0 * frequency * steps[len(steps) // 2] < 1.0:
             found.append(f"inertia and damping are not the rod's: it rings near {frequency:.1f} Hz, which a static model cannot follow")
     return found

@@ -29,6 +29,8 @@ _STARTS = 8
 _SCREEN = 0.003  # of the loss: a candidate whose slopes promise less is not fitted
 _FEW, _MANY = 3, 12  # iterations of a start, and of the best of them
 _REFINED = 6  # candidates that are solved exactly at each stage
+_NEAR = 4.0  # times what the best leaves, or less than it takes: others are not worth an exact solution
+_CLOSE = 200.0  # BIC to the best within which a candidate is solved once more
 _FOIL_SD = 30.0  # of a foil's amplitude, in units of its own columns' size that would explain all
 
 
@@ -308,11 +310,17 @@ class Search:
     def choose(self, state: State, tried: list[Candidate], *, with_foils: bool) -> Step:
         """Solve the promising ones exactly, then take the best by evidence; foils only where they beat it clearly."""
         fitted = sorted((c for c in tried if c.state is not None and c.z > 1.0 and c.share > SHARE_ACCEPT), key=lambda c: -c.share)
-        heavy = [c for c in fitted if not state.local.is_light(c.name)]  # of these even the fit so far is linear
+        most = fitted[0].share if fitted else 0.0
+        near = [c for c in fitted if 1.0 - c.share < _NEAR * (1.0 - most) and c.share > most / _NEAR][:_REFINED]
+        heavy = [c for c in fitted if not state.local.is_light(c.name) and c.share > most / _NEAR]  # of these even the fit so far is linear
         exact = {}
-        for candidate in dict.fromkeys([*fitted[:_REFINED], *heavy]):
+        for candidate in dict.fromkeys([*near, *heavy]):
             assert candidate.state is not None
-            exact[candidate.name] = self.judged(state, self.refined(self.refined(candidate.state)), candidate.name)
+            exact[candidate.name] = self.judged(state, self.refined(candidate.state), candidate.name)
+        best = _best([c for c in exact.values() if c.state is not None and c.share > SHARE_ACCEPT])
+        for name, candidate in exact.items():
+            if best is not None and candidate.state is not None and advantage(best, candidate) < _CLOSE:
+                exact[name] = self.judged(state, self.refined(candidate.state), name)
         tried = [exact.get(c.name, c) for c in tried]
         passing = [c for c in tried if c.passes]
         best = _best(passing)

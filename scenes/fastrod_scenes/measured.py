@@ -97,7 +97,12 @@ def _asl_robot() -> Robot:
         segments=tuple(segments),
         base_quaternion=_UPSIDE_DOWN,
         log_points=ASL_DISKS[:2],
-        fit={"tendon.*.gain": {"sd": 0.5}, "tendon.*.zero": {"sd": 0.01}, "segment.*.length": {"sd": 0.005}},
+        fit={
+            "tendon.*.gain": {"sd": 0.5},
+            "tendon.*.zero": {"sd": 0.01},
+            "segment.*.length": {"sd": 0.005},
+            "segment.*.bending_stiffness": {"sd": 0.02, "shared": True},
+        },
         sensor={"registration_sd": (0.01, 0.05)},
     )
 
