@@ -35,6 +35,8 @@ _LOCAL_ROWS = 3000  # samples that the search looks at; the operators run over a
 _ALL_AT_ONCE = 20000  # samples a batch when all are predicted
 _SEEN = 0.7  # of the prior's sd: a parameter whose data say less is not identifiable
 _MENDS = 0.02  # of the error above the noise: an effect beside a dominant one that brings less is not named
+_SAY_LIMITS = 0.05  # of the error above the noise: where so much is left, shear and inertia are worth a sentence
+_RESTLESS = 0.25  # of the motion: noise beyond it is no noise
 _MORE_STAGES = 3  # beyond max_effects: foils take stages too
 
 
@@ -72,6 +74,7 @@ def identify(
     base = _Base(samples.on(chosen), model, robot, threads)
     search = Search(base.samples, base.rod, base.target, base.block, frozenset(exclude))
     start, base_parameters = base.fit(search)
+    _check_motion(base, start)
     found, state, steps, reference = _found(search, base, start, max_effects, tell)
     return _result(
         samples, tested, labels, robot, base, search, reference, state, found, steps, base_parameters, tell, max_effects, threads
@@ -224,6 +227,7 @@ def _result(
     inspected = audit(search.samples, last.model.wiring, last.fit.residual, base.noise.lag1)
     library = _square(state, base.target.sigma)
     opinion = judge(
+        left_out=max(0.0, test_error.after**2 - base.noise.floor**2) / max(test_error.before**2 - base.noise.floor**2, 1e-30),
         base=_square(start, base.weights[0]), library=library, after=min(library, _square(last, base.weights[-2 if found else -1])),
         floor=base.noise.floor**2, audit=inspected, steps=steps, found=found,
     )  # fmt: skip
@@ -256,7 +260,9 @@ def _result(
         train=train_error,
         test=test_error,
         verdict="ambiguous" if opinion.verdict == "explained" and effects and effects[0].cannot_be_told_from else opinion.verdict,
-        summary=" ".join([opinion.summary, *(f"{line[0].upper()}{line[1:]}." for line in limits(robot, samples))]),
+        summary=" ".join(
+            [opinion.summary, *(_sentences(limits(robot, samples)) if opinion.left > _SAY_LIMITS or not robot.n_tendons else [])]
+        ),
         effects=effects,
         base_parameters=base_estimates,
         correlation=correlation,
@@ -405,6 +411,33 @@ def _path(
             part = search.without(part, name)
         stages.append(stage(found[i - 1], part))
     return stages
+
+
+def _sentences(lines: Sequence[str]) -> list[str]:
+    return [f"{line[0].upper()}{line[1:]}." for line in lines]
+
+
+def _check_motion(base: _Base, state: State) -> None:
+    """A model that follows the measurement worse than a robot that stands still is of another robot, or in other units."""
+    good = (base.target.weight > 0.0) & state.local.pose.ok
+    measured, predicted = (
+        base.target.tip[good],
+        state.local.seen(state.model, state.theta, state.local.solved(state.model, state.theta)).position[good],
+    )
+    measured, predicted = measured - measured.mean(0), predicted - predicted.mean(0)
+    moves = float((measured**2).sum())
+    name, robot = base.samples.log.name, base.robot.name
+    if base.noise.floor > _RESTLESS * np.sqrt(moves / max(len(measured), 1)) and base.noise.floor > 0.01 * base.robot.length:
+        raise LogError(
+            f"in log {name!r} the measured tip jumps by {1e3 * base.noise.floor:.3g} mm from sample to sample while the inputs rest, "
+            f"{100 * base.noise.floor / np.sqrt(moves / len(measured)):.0f} % of its motion; are two robots or two markers mixed?"
+        )
+    if float(((measured - predicted) ** 2).sum()) > moves:
+        scale = float((measured * predicted).sum() / max((predicted**2).sum(), 1e-30))
+        raise LogError(
+            f"log {name!r} is further from robot {robot!r} than from a robot that stands still: it moves {scale:.2g} times as predicted. "
+            "Are the units, the signs (negative = pulled) and the order of the dl_ columns right, and is it this robot?"
+        )
 
 
 def _check(samples: Samples, robot: Robot) -> None:

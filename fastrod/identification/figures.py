@@ -26,6 +26,7 @@ _WIDE = 11.0  # in
 _VECTOR = 500  # points of a scatter above which it is a picture inside the SVG
 _MOST = 4000  # points of a scatter
 _BINS = 420  # of a curve over time
+_SLIM = 4.0  # a path that is so much longer than wide has axes of their own scale
 _CLOSE_UP = 12.0  # s
 _PIECES = 90  # of the mean residual over time
 _LAG = 6.0  # s of autocorrelation
@@ -78,7 +79,9 @@ def whole_paths(result: Result, signals: Signals) -> str:
             _trail(axes, measured[:, (a, b)], gaps, "#dfe3e9", 1.6, "measured, fitted")
             _trail(axes, seen, gaps, MEASURED, 2.4, "measured, held out")
             _trail(axes, said, gaps, colour, 1.2, f"{title}, held out")
-            axes.set_aspect("equal", adjustable="box")
+            wide, high = (float(np.ptp(measured[:, k])) for k in (a, b))
+            if max(wide, high) < _SLIM * min(wide, high):
+                axes.set_aspect("equal", adjustable="box")
             axes.set(xlabel=f"tip {'xyz'[a]} [mm]", ylabel=f"tip {'xyz'[b]} [mm]", title=f"{title}, {'xyz'[a]}{'xyz'[b]} plane")
         named = {label: handle for axes in grid for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
         figure.legend(list(named.values()), list(named), loc="outside upper right", ncols=4)
@@ -291,7 +294,9 @@ def _loops(axes: Axes, view: View, values: Floats, held: Flags, colour: str) -> 
 def _trail(axes: Axes, points: Floats, gaps: Ints, colour: str, width: float, label: str) -> None:
     """A path (n, 2) with a break before each of the rows `gaps`."""
     x, y = (np.insert(points[:, k], gaps, np.nan) for k in (0, 1))
-    axes.plot(x, y, color=colour, lw=width, solid_joinstyle="round", label=label, rasterized=len(x) > _VECTOR)
+    axes.plot(
+        x, y, color=colour, lw=width, marker=".", ms=1.5 * width, mew=0.0, solid_joinstyle="round", label=label, rasterized=len(x) > _VECTOR
+    )
 
 
 def _rms_bins(time: Floats, residual: Floats) -> tuple[Floats, Floats]:
@@ -304,7 +309,10 @@ def _rms_bins(time: Floats, residual: Floats) -> tuple[Floats, Floats]:
         centre = np.bincount(place, weights=time, minlength=_BINS + 1) / count
     filled = count > 0
     if len(time) < 3 * _BINS:  # sparse: no gaps between samples
-        return centre[filled], rms[filled]
+        centre, rms = centre[filled], rms[filled]
+        step = np.diff(centre)
+        gaps = np.flatnonzero(step > 8.0 * np.median(step)) + 1 if len(step) else np.zeros(0, int)
+        return np.insert(centre, gaps, np.nan), np.insert(rms, gaps, np.nan)
     return np.where(filled, centre, np.nan), np.where(filled, rms, np.nan)
 
 

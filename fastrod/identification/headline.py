@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import re
 from html import escape
 
 from fastrod.identification.markup import SHARES, listed, mark
 from fastrod.identification.result import Result
 from fastrod.identification.wording import NOTHING, VERDICTS, bound_sentence, millimetres, percent, plain_name, rounded, with_error, words
+from fastrod.robotfile import robot_names
 
 
 def explained(result: Result) -> float:
@@ -33,7 +35,9 @@ def hero(result: Result) -> str:
     grid = ""
     for parts in (left, right):
         grid += f'<div class="col">{"".join(f"<div class={place}>{part}</div>" for place, part in parts)}</div>'
-    top = f'<span class="badge">{VERDICTS[result.verdict]}</span><h1>{escape(result.summary)}</h1>'
+    first, *rest = re.split(r"(?<=[.!?]) (?=[A-Z])", result.summary, maxsplit=1)
+    more = f'<p class="more">{escape(rest[0])}</p>' if rest else ""
+    top = f'<span class="badge">{VERDICTS[result.verdict]}</span><h1>{escape(first)}</h1>{more}'
     return f'<div class="hero {result.verdict}">{top}<div class="grid">{grid}</div></div>'
 
 
@@ -136,7 +140,9 @@ def _next(result: Result) -> str:
     use = "<pre><code>robot = fastrod.load_robot(&quot;identified.toml&quot;)\nsim = fastrod.Simulator(robot)</code></pre>"
     lines = [escape(line) for line in result.advice]
     if lines:
-        lines.append(f"<code>fastrod excite --robot {escape(result.robot.name)}</code> writes a run that separates most effects.")
+        if result.robot.n_tendons:
+            name = result.robot.name if result.robot.name in robot_names() else "R"
+            lines.append(f"<code>fastrod excite --robot {escape(name)}</code> writes a run that separates most effects.")
         return f"<h3>What to run next</h3><ul>{''.join(f'<li>{line}</li>' for line in lines)}</ul>"
     if result.effects:
         return f"<h3>What to do next</h3>Use the corrected model, which lies beside this page:{use}"

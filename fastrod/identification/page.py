@@ -128,7 +128,7 @@ def _estimates(groups: Mapping[str, Mapping[str, Estimate]]) -> str:
             rows.append(
                 f'<tr><td>{escape(plain_name(name))}</td><td class="n">{number}</td>'
                 f'<td class="n">{error if e.identifiable else NOTHING}</td>'
-                f'<td>{escape(unit)}</td><td class="n">{prior}</td><td>{mark(e, True)}</td></tr>'
+                f'<td class="u">{escape(unit)}</td><td class="n">{prior}</td><td>{mark(e, True)}</td></tr>'
             )
     if not rows:
         return "<p>Nothing was fitted: the robot file takes all of the robot as known.</p>"

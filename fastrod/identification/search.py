@@ -22,6 +22,7 @@ from fastrod.types import Floats, Ints
 
 Z_ACCEPT, BIC_ACCEPT, SHARE_ACCEPT = 3.0, 10.0, 0.006
 Z_STRONG, BIC_STRONG = 1.7, 60.0  # an effect that shows in a few blocks only, but there beyond doubt
+Z_BLOCKS, SHARE_BLOCKS = 3.5, 0.03  # or one that block after block confirms, where a smooth residual is worth few samples
 Z_RIVAL, BIC_RIVAL = 2.0, 10.0
 Z_KEEP, BIC_KEEP = 2.0, 6.0
 N_BLOCKS = 20
@@ -263,7 +264,8 @@ class Search:
         z = paired(state.losses, with_it.losses)
         share = 1.0 - with_it.fit.loss / state.fit.loss
         why = "" if foil else _unphysical(with_it, name)
-        if not why and not (share > SHARE_ACCEPT and ((z > Z_ACCEPT and gain > BIC_ACCEPT) or (z > Z_STRONG and gain > BIC_STRONG))):
+        evident = (z > Z_ACCEPT and gain > BIC_ACCEPT) or (z > Z_STRONG and gain > BIC_STRONG) or (z > Z_BLOCKS and share > SHARE_BLOCKS)
+        if not why and not (share > SHARE_ACCEPT and evident):
             why = f"no gain on held-out blocks (z {z:.1f}, BIC {gain:.0f}, {100 * share:.1f} % of the loss)"
         return Candidate(name, with_it, z, gain, share, k, why, foil)
 
@@ -369,7 +371,7 @@ class Search:
             for name in left:
                 fewer = self.without(state, name)
                 verdict = self.judged(fewer, state, name)
-                needless = verdict.z < Z_KEEP or verdict.bic_gain < BIC_KEEP
+                needless = verdict.z < Z_KEEP or (verdict.bic_gain < BIC_KEEP and (verdict.z < Z_ACCEPT or verdict.share < SHARE_BLOCKS))
                 small = (fewer.fit.loss - state.fit.loss) * float((self.target.sigma**2).mean()) < least
                 if (needless or small) and (weakest is None or verdict.bic_gain < weakest[0]):
                     weakest = verdict.bic_gain, name, fewer

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from fastrod.identification.audit import Audit
 from fastrod.identification.result import Verdict
 from fastrod.identification.search import Step
@@ -13,6 +15,7 @@ _CLEAN = 0.06  # of the residual's variance: structure below it is none
 _EXPLAINED, _PARTLY = 0.12, 0.4  # of the error above the noise: what may be left for these verdicts
 _FOREIGN = 0.3  # of the error above the noise: patterns outside the library that carry this much are the finding
 _CARRIES = 0.5  # of the error above the noise, by one effect, where three are needed
+_TRUSTED = 0.3  # of the held-out error: what is left there beyond it counts, whatever the training data say
 _MIN_EXCESS = 0.03  # of the noise's variance
 
 
@@ -29,9 +32,11 @@ class Opinion:
     """The effects that were found are not certain: do not name them."""
 
 
-def judge(*, base: float, library: float, after: float, floor: float, audit: Audit, steps: Sequence[Step], found: Sequence[str]) -> Opinion:
+def judge(
+    *, base: float, library: float, after: float, floor: float, left_out: float, audit: Audit, steps: Sequence[Step], found: Sequence[str]
+) -> Opinion:
     """The verdict. Mean squares of the distance on the training data [m^2]: of the `base` model, with the `library` effects found,
-    `after` those and foils, and the noise `floor`."""
+    `after` those and foils, and the noise `floor`; `left_out`: share of the held-out error above the noise that is left."""
     excess = max(base - floor, _MIN_EXCESS * floor, 1e-30)
     foils = [step.taken.foil for step in steps if step.taken is not None and step.taken.foil is not None]
     patterns = tuple(foil.what for foil in foils)
@@ -54,6 +59,7 @@ def judge(*, base: float, library: float, after: float, floor: float, audit: Aud
     if not found:
         return Opinion("not_in_library", f"No effect of the library explains the residual: {patterns[0]}.", kind, 1.0, patterns, False)
     names = " and ".join(found)
+    left = max(left, min(left_out, 1.0) if left_out > _TRUSTED and not np.isnan(left_out) else left)
     if left <= _EXPLAINED:
         more = f" What little remains: {patterns[0]}." if patterns else ""
         kind = kind if left > 0.02 else "none"

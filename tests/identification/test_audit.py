@@ -16,7 +16,7 @@ from fastrod.identification.excite import excitation
 from fastrod.identification.forward import Samples, sample
 from fastrod.wiring import wire
 
-RATE, SIZE = 10.0, 0.9
+RATE, SIZE = 8.0, 0.9
 
 
 @cache
@@ -61,22 +61,21 @@ def patterns() -> dict[str, np.ndarray]:
     }
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 def test_white_noise_has_no_structure(seed: int) -> None:
     found = run(noise(seed))
     assert found.kind == "none"
     assert found.structured == 0.0
-    # z of a best of two scores, and of an autocorrelation: the largest of four seeds
+    # z of a best of two scores, and of an autocorrelation: the largest of three seeds
     assert found.z < 4.0
 
 
 @pytest.mark.parametrize("kind", ["static", "memory", "drift"])
-@pytest.mark.parametrize("seed", range(2))
-def test_what_is_planted_comes_out_as_its_kind(kind: str, seed: int) -> None:
-    for share in (0.1, 0.5):
+def test_what_is_planted_comes_out_as_its_kind(kind: str) -> None:
+    for seed, share in ((0, 0.1), (1, 0.5)):
         found = run(planted(patterns()[kind], share, seed))
         assert found.kind == kind
-        # held-out features find most of it, and no more than the noise lets it look (0.03 of a variance of 5400 numbers)
+        # held-out features find most of it, and no more than the noise lets it look (0.05)
         assert 0.6 * share < getattr(found, kind) < share + 0.05
         assert found.structured < share + 0.08
         assert found.z > 3.0

@@ -59,7 +59,7 @@ def log(robot: Robot, n: int = N) -> RunLog:
     """Every kind of input: wires, extensions, loads, another base half way."""
     turned = Rotation.from_rotvec(np.where(np.arange(n)[:, None] < n // 2, 0.0, [0.9, -0.5, 0.3]))
     return log_of(
-        robot, wave(robot, n), times(n), t=times(n), payload=np.where(np.arange(n) % 20 < 10, 0.0, 0.02), ext=np.full((n, robot.n_segments), 1e-3),
+        robot, wave(robot, n), t=times(n), payload=np.where(np.arange(n) % 20 < 10, 0.0, 0.02), ext=np.full((n, robot.n_segments), 1e-3),
         tip_force=np.outer(np.sin(np.arange(n)), [0.02, 0.01, -0.01]), base_quaternion=turned.as_quat(scalar_first=True),
         points=np.zeros((n, len(robot.log_points), 3)),
     )  # fmt: skip

@@ -42,10 +42,8 @@ def samples() -> Samples:
     turn = Rotation.from_rotvec(0.01 * rng.normal(size=(N, 3))) * Rotation.from_matrix(pose.rotation)
     points = pose.points + SIGMA * rng.normal(size=(N, 2, 3))
     points[4, 1] = np.nan  # a marker that was hidden
-    log = log_of(
-        two_segments(), wave(two_segments(), N), 0.1, tip_position=tip, tip_quaternion=turn.as_quat(scalar_first=True), points=points, **inputs
-    )  # fmt: skip
-    return sample(log)
+    inputs |= {"tip_quaternion": turn.as_quat(scalar_first=True), "points": points}
+    return sample(log_of(two_segments(), wave(two_segments(), N), 0.1, tip_position=tip, **inputs))
 
 
 class Place:
@@ -106,13 +104,14 @@ WIRES = dict.fromkeys(["drum_gain", "encoder_offset", "coupling", "slack", "stif
 CAMERA = dict.fromkeys(["marker_offset", "frame_misalignment", "lens", "camera_scale", "time_drift"], 1e-4)
 # a force from the tip by one-sided differences of 2e-3 EI / l^2, and from there on linear: a twentieth of a typical payload here;
 FORCE = dict.fromkeys(["payload", "tip_force"], 0.02)
-# operators have corners, which the local difference of a fiftieth of a typical size looks over: play has nothing but corners;
-MEMORY = {"latency": 0.015, "backlash": 0.15, "friction": 0.01, "creep": 0.004, "plastic_set": 0.006, "dynamics": 0.05}
-# what changes the rod has one secant, over a typical size: it is off by how much the effect saturates over that. Wires that stretch by
-# thirty times their compliance here do so by a third.
+# operators have corners, which the local difference of a fiftieth of a typical size looks over: play has nothing but corners, and an
+# oscillator that is sampled more slowly than it rings answers to its period at any phase;
+MEMORY = {"latency": 0.015, "backlash": 0.15, "friction": 0.01, "creep": 0.004, "plastic_set": 0.006, "dynamics": 0.15}
+# what changes the rod has one secant, over a typical size: it is off by how much the effect saturates over that. Wires that stretch
+# by thirty times their compliance here do so by a third.
 ROD = {
-    "gravity": 0.07, "tendon_stretch": 0.45, "routing_angle": 0.15, "axial_compression": 0.03, "precurvature": 0.02, "stiffness_taper": 0.05,
-    "stiffness_anisotropy": 0.2,
+    "gravity": 0.07, "tendon_stretch": 0.45, "routing_angle": 0.15, "axial_compression": 0.03, "precurvature": 0.02,
+    "stiffness_taper": 0.05, "stiffness_anisotropy": 0.2,
 }  # fmt: skip
 NOTHING = 0.01  # sigma, by a typical size: a slope that small is not compared; nobody can see it
 

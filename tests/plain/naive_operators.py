@@ -89,11 +89,16 @@ def delay(x: np.ndarray, lag: float, dt: np.ndarray, buffer: int) -> np.ndarray:
             continue
         j = earlier[-1]
         ends, values = t[j : j + 2], x[j : j + 2]
-        around = slice(j - 1, j + 3)
-        if j - 1 < first or j + 2 > i or (np.diff(t[around]) <= 0.0).any():
+        gaps = [t[j] - t[j - 1] if j > first else 0.0, t[j + 1] - t[j], t[j + 2] - t[j + 1] if j + 2 <= i else 0.0]
+        if gaps[0] <= 0.0 or gaps[1] <= 0.0:
             out.append(np.interp(wanted, ends, values))
             continue
-        secants, gaps = np.diff(x[around]) / np.diff(t[around]), np.diff(t[around])
+        secants = [(x[j] - x[j - 1]) / gaps[0], (x[j + 1] - x[j]) / gaps[1]]
+        if gaps[2] > 0.0:
+            secants.append((x[j + 2] - x[j + 1]) / gaps[2])
+        else:  # nothing newer: the parabola through three goes on
+            gaps[2] = gaps[0]
+            secants.append(2.0 * secants[1] - secants[0])
         slopes = []
         for s, h in ((secants[:2], gaps[:2]), (secants[1:], gaps[1:])):
             parabola = (s[0] * h[1] + s[1] * h[0]) / (h[0] + h[1])
