@@ -87,7 +87,8 @@ def _newton(rows: Ints, params: Params, layout: Layout, ports: Ports, memory: Me
             damping[:] = 1.0
         else:
             if shorter is not None:
-                after = x_tried + shorter[:, None] * (after - x_tried)
+                with np.errstate(invalid="ignore"):  # a robot that is lost has no step to shorten
+                    after = x_tried + shorter[:, None] * (after - x_tried)
             x_at = np.where(better[:, None], x_tried, x_at)
             step = np.where(better[:, None], after - x_tried, step)
             best = np.where(better, residual, best)

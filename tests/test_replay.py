@@ -14,7 +14,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from fastrod.errors import InputError, LogError
-from fastrod.identification.replay import DENSE, Replay, draw, inputs, replay, table, tendon_length, write
+from fastrod.identification.inputs import inputs, tendon_length
+from fastrod.identification.replay import DENSE, Replay, draw, replay, table, write
 from fastrod.robot import Robot
 from fastrod.robotfile import load_robot
 from fastrod.runlog import RunLog, read_log, write_log

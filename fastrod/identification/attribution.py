@@ -180,8 +180,9 @@ def _library(search: Search, base: _Base, start: State, state: State, found: lis
     """The effects that are needed once foils are gone, with their state."""
     alone = search.bare(state) if state.foils else state
     if len(found) > 1:
-        excess = start.fit.loss * float((base.weights[0] ** 2).mean()) - start.fit.residual.size * float((base.noise.sigma**2).mean())
-        alone, found = search.eliminated(alone, found, _MENDS * max(excess, 0.0))
+        noise = start.fit.residual.size * float((base.noise.sigma**2).mean())
+        excess = start.fit.loss * float((base.weights[0] ** 2).mean()) - noise
+        alone, found = search.eliminated(alone, found, _MENDS * max(excess, 0.0), noise)
     return base.weighed(search, alone), found
 
 

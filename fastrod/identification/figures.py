@@ -26,6 +26,7 @@ _WIDE = 11.0  # in
 _VECTOR = 500  # points of a scatter above which it is a picture inside the SVG
 _MOST = 4000  # points of a scatter
 _BINS = 420  # of a curve over time
+_RUNS = 60  # starts of runs that are marked
 _SLIM = 4.0  # a path that is so much longer than wide has axes of their own scale
 _CLOSE_UP = 12.0  # s
 _PIECES = 90  # of the mean residual over time
@@ -51,7 +52,7 @@ def error_over_time(result: Result, signals: Signals) -> str:
         for label, colour, residual in pairs if result.effects else [("base model", BEFORE, signals.before)]:
             axes.plot(*_rms_bins(at, residual), color=colour, label=label)
         axes.axhline(1e3 * result.noise.floor, color=NOISE, ls="--", lw=1.3, label="noise floor")
-        for row in breaks:
+        for row in breaks[:_RUNS]:
             axes.axvline(time[row], color="#9ca3af", lw=0.7, ls=":")
         axes.set(xlabel=f"time{', runs one after the other' if len(breaks) else ''} [s]", ylabel="tip error [mm]")
         axes.set_ylim(bottom=0.0)
@@ -198,7 +199,7 @@ def left_over_time(result: Result, signals: Signals) -> str:
             axes.axhline(0.0, color="#9ca3af", lw=0.7)
             axes.plot(0.5 * (edges[1:] + edges[:-1]), mean, color=colour, drawstyle="steps-mid")
             axes.set_ylabel(f"{'xyz'[k]} [mm]")
-            for row in breaks:
+            for row in breaks[:_RUNS]:
                 axes.axvline(time[row], color="#9ca3af", lw=0.7, ls=":")
             axes.margins(x=0.0)
         axes.set_xlabel(f"time{', runs one after the other' if len(breaks) else ''} [s]")

@@ -13,7 +13,8 @@ import numpy as np
 
 from fastrod.compile import compile_robots
 from fastrod.effect import Effect, Seam, get_effect, has_memory
-from fastrod.identification.replay import inputs
+from fastrod.errors import InputError
+from fastrod.identification.inputs import inputs
 from fastrod.identification.unknowns import Model
 from fastrod.inputs import Inputs, Reader
 from fastrod.ports import EffectPorts, close_ports, open_ports
@@ -46,6 +47,8 @@ class Samples:
 
     log: RunLog
     """Only driven rows that have a time."""
+    origin: Ints
+    """(n,) their rows in the log that was given."""
     rows: Ints
     """(n_rows,) samples that are solved and compared."""
     runs: tuple[slice, ...]
@@ -73,7 +76,7 @@ def sample(log: RunLog, rows: Ints | None = None) -> Samples:
         time[part] = ordered.t[part] - ordered.t[part.start]
         dt[part.start + 1 : part.stop] = np.diff(ordered.t[part])
     measured = np.flatnonzero(ordered.measured) if rows is None else rows
-    return Samples(ordered, measured, runs, time, dt)
+    return Samples(ordered, order, measured, runs, time, dt)
 
 
 class Rod:
@@ -148,45 +151,48 @@ class Bench:
         if last < 0:
             return None
         samples, n = self.samples, len(self.dl)
-        length = self.dl + self.robot.rest_tendon_length
-        for part in samples.runs:
-            count = part.stop - part.start
-            bare = self.ports._replace(
-                tendon_length=length[part],
-                **{name: getattr(self.ports, name)[:1] for name in ("extension", "tip_force", "tip_moment", "line_force")},
-            )
-            opened = self._open(bare, count, samples.time[part], self.base_rotation[:1])
-            for what, values in chain[: last + 1]:
-                row = np.broadcast_to(values, (count, len(values)))
-                if not has_memory(what):
-                    what.apply(row, np.empty((count, 0)), opened, None, 0.0)
-                elif hasattr(what, "sweep"):
-                    dl = opened.dl
+        opened = self._open(self._alone(self.dl + self.robot.rest_tendon_length), n, samples.time, self.base_rotation[:1])
+        for what, values in chain[: last + 1]:
+            if not has_memory(what):
+                what.apply(np.broadcast_to(values, (n, len(values))), np.empty((n, 0)), opened, None, 0.0)
+                continue
+            dl = opened.dl
+            out = np.empty_like(dl)
+            for part in samples.runs:
+                if hasattr(what, "sweep"):
                     memory = what.memory(1, self.wiring.n_tendons)
-                    opened.shift_wires(what.sweep(values[None], memory, dl[None], samples.dt[part], self.wiring)[0] - dl)
+                    out[part] = what.sweep(values[None], memory, dl[None, part], samples.dt[part], self.wiring)[0]
                 else:
-                    self._step_by_step(what, values, opened, samples.dt[part])
-            length[part] = opened.tendon_length
-        assert len(length) == n
-        return length[samples.rows] - self.robot.rest_tendon_length
+                    out[part] = self._step_by_step(what, values, dl[part], part)
+            opened.shift_wires(out - dl)
+        return opened.dl[samples.rows]
 
-    def _step_by_step(self, what: Effect, values: Floats, opened: EffectPorts, dt: Floats) -> None:
-        """An effect with a memory that has no `sweep`: one sample after the other, slowly."""
+    def _alone(self, length: Floats) -> Ports:
+        """Ports with these wire lengths and nothing else."""
+        bare = {name: getattr(self.ports, name)[:1] for name in ("extension", "tip_force", "tip_moment", "line_force")}
+        return self.ports._replace(tendon_length=length, **bare)
+
+    def _step_by_step(self, what: Effect, values: Floats, dl: Floats, part: slice) -> Floats:
+        """An effect with a memory that has no `sweep`, over one run: one sample after the other, slowly."""
         memory = what.memory(1, self.wiring.n_tendons)
-        for i in range(len(opened)):
-            bare = self.ports._replace(
-                tendon_length=opened.tendon_length[i : i + 1],
-                **{name: getattr(self.ports, name)[:1] for name in ("extension", "tip_force", "tip_moment", "line_force")},
+        out = np.empty_like(dl)
+        for i in range(len(dl)):
+            at = part.start + i
+            one = self._open(
+                self._alone(dl[i : i + 1] + self.robot.rest_tendon_length), 1, self.samples.time[at : at + 1], self.base_rotation[:1]
             )
-            one = self._open(bare, 1, opened.time[i : i + 1], self.base_rotation[:1])
-            what.apply(values[None], memory, one, None, float(dt[i]))
-            opened.tendon_length[i] = one.tendon_length[0]
+            what.apply(values[None], memory, one, None, float(self.samples.dt[at]))
+            out[i] = one.dl[0]
+        return out
 
     def drive(self, chain: list[tuple[Effect, Floats]]) -> EffectPorts:
         """Ports of the rows after the effects of `chain`, but for sensing."""
         before = [link for link in chain if link[0].seam is Seam.ACTUATION]
         last = max((i for i, (what, _) in enumerate(before) if has_memory(what)), default=-1)
         opened = self.open()
+        for what, values in before[: last + 1]:  # for what they change beside the wires' lengths
+            if not has_memory(what):
+                what.apply(np.broadcast_to(values, (len(opened), len(values))), np.empty((len(opened), 0)), opened, None, 0.0)
         wires = self.wires(before)
         if wires is not None:
             opened.tendon_length = wires + self.robot.rest_tendon_length
@@ -224,7 +230,14 @@ def _given(keywords: dict[str, Floats]) -> Inputs:
 
 
 def chain_of(model: Model, theta: Floats) -> list[tuple[Effect, Floats]]:
-    """The effects of a model at `theta` with their values, in the order in which they act."""
+    """The effects of a model at `theta` with their values, in the order in which they act.
+
+    Raises `InputError` for a memory beyond the wires: only those are carried over a log.
+    """
+    for name in model.effects:
+        what = get_effect(name)
+        if what.seam is not Seam.ACTUATION and has_memory(what):
+            raise InputError(f"effect {name!r} has a memory at the seam {what.seam.name}; over a log only those of ACTUATION are carried.")
     return [(get_effect(name), values) for name, values in model.values(theta).items()]
 
 

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fastrod.errors import InputError, LogError
+from fastrod.identification.inputs import base_of, inputs
 from fastrod.robot import Robot
-from fastrod.rotation import matrix_from_quaternion
 from fastrod.runlog import RunLog
 from fastrod.types import Floats
 
@@ -110,15 +110,18 @@ class Replay:
 
 
 def replay(log: RunLog, robot: Robot, *, simulator: Callable[..., Any] | None = None, progress: Progress | None = None) -> Replay:
-    """The static model's answer to every row of `log`, each row one robot of a batch.
+    """The model's answer to every row of `log`, each row one robot of a batch.
 
-    The measured frame is taken as the robot's base frame: nothing is registered and nothing is fitted. `simulator` is
+    Effects of the robot are carried over the whole log, memories, clocks and camera included; each run begins at rest. The
+    measured frame is taken as the robot's base frame: nothing is registered and nothing is fitted. `simulator` is
     `fastrod.Simulator` or a stand-in; `progress` is called with the rows done and the rows in all.
     Raises `LogError` where no row of the log can be compared, `InputError` for a robot that lengths do not drive.
     """
     _check_driven_by_lengths(robot)
     if not log.measured.any():
         raise LogError(f"log {log.name!r} has no row in which every input and the tip are there; there is nothing to compare.")
+    if robot.effects and simulator is None:
+        return _with_effects(log, robot, progress)
     if simulator is None:
         from fastrod.simulator import Simulator  # it loads numba, which no other command line word needs
 
@@ -135,27 +138,21 @@ def replay(log: RunLog, robot: Robot, *, simulator: Callable[..., Any] | None = 
     return Replay(log=log, robot=robot, tip_position=tip, converged=converged, points=points if n_points else None)
 
 
-def tendon_length(log: RunLog, robot: Robot) -> Floats | None:
-    """(n, n_tendons) absolute tendon lengths [m]; None without tendons.
+def _with_effects(log: RunLog, robot: Robot, progress: Progress | None) -> Replay:
+    from fastrod.identification.forward import Rod, predict, sample  # they load numba
+    from fastrod.identification.unknowns import known_model
 
-    `dl` is counted from the straight rest robot, extension and all: a robot that grows straight pays out its tendons.
-    """
-    return np.asarray(robot.rest_tendon_length + log.dl, dtype=np.float64) if robot.n_tendons else None
-
-
-def inputs(log: RunLog, robot: Robot) -> dict[str, Floats]:
-    """Keyword inputs of `Simulator.settle` for the rows of `log`: world frame, SI, robot axis first."""
-    given: dict[str, Floats] = {}
-    if (lengths := tendon_length(log, robot)) is not None:
-        given["tendon_length"] = lengths
-    if log.ext is not None:
-        given["extension"] = log.ext
-    if log.base_quaternion is not None:
-        position = np.broadcast_to(np.array(robot.base_position), (len(log), 3))
-        given["base_pose"] = np.concatenate([position, log.base_quaternion], axis=1)
-    if log.tip_force is not None or log.payload is not None:
-        given["tip_force"] = _tip_force(log, robot)
-    return given
+    samples, model = sample(log), known_model(robot)
+    n_points = 0 if log.points is None else len(robot.log_points)
+    tip, points, converged = np.full((len(log), 3), np.nan), np.full((len(log), n_points, 3), np.nan), np.zeros(len(log), dtype=np.bool_)
+    for start in range(0, len(samples.log), CHUNK):
+        part = samples.on(np.arange(start, min(start + CHUNK, len(samples.log))))
+        pose = predict(model, np.zeros(0), part, Rod(part, robot, points=n_points > 0))
+        rows = samples.origin[part.rows[pose.ok]]
+        tip[rows], points[rows], converged[rows] = pose.position[pose.ok], pose.points[pose.ok], True
+        if progress is not None:
+            progress(part.rows[-1] + 1, len(samples.log))
+    return Replay(log=log, robot=robot, tip_position=tip, converged=converged, points=points if n_points else None)
 
 
 def make_folder(path: str | Path) -> Path:
@@ -249,7 +246,7 @@ def _solve(log: RunLog, robot: Robot, simulator: Callable[..., Any]) -> tuple[Fl
     """Tip (n, 3) and further points (n, k, 3) in the base frame [m], and which rows converged, of one batch."""
     sim = simulator(robot, n_robots=len(log))
     state = sim.settle(**inputs(log, robot))
-    rotation, origin = _base(log, robot)
+    rotation, origin = base_of(log, robot)
     points = np.zeros((len(log), 0, 3))
     if log.points is not None and robot.log_points:
         shape = sim.shape(np.array(robot.log_points))
@@ -261,22 +258,6 @@ def _solve(log: RunLog, robot: Robot, simulator: Callable[..., Any]) -> tuple[Fl
 def _into_base(world: Floats, rotation: Floats) -> Floats:
     """(n, k, 3) vectors of the world frame, in the base frame of each row; `rotation` (n, 3, 3) is world_from_base."""
     return np.asarray(np.einsum("nji,nkj->nki", rotation, world), dtype=np.float64)
-
-
-def _base(log: RunLog, robot: Robot) -> tuple[Floats, Floats]:
-    """world_from_base (n, 3, 3) of each row, and the base's position in the world [m]."""
-    quaternion = log.base_quaternion if log.base_quaternion is not None else np.tile(robot.base_quaternion, (len(log), 1))
-    return matrix_from_quaternion(quaternion), np.array(robot.base_position)
-
-
-def _tip_force(log: RunLog, robot: Robot) -> Floats:
-    """(n, 3) force on the tip, world [N]: the log's, turned with the base, and the weight of the payload."""
-    force = np.zeros((len(log), 3))
-    if log.tip_force is not None:
-        force += np.einsum("nij,nj->ni", _base(log, robot)[0], log.tip_force)
-    if log.payload is not None:
-        force += log.payload[:, None] * np.array(robot.gravity)
-    return force
 
 
 def _rms(vectors: Floats) -> float:

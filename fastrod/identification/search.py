@@ -362,9 +362,9 @@ class Search:
         fit = self._fit(local, model, theta, state.fit.theta[len(state.model.unknowns) :], state.foils, 8)
         return self._state(model, local, fit, state.foils)
 
-    def eliminated(self, state: State, found: Sequence[str], least: float) -> tuple[State, list[str]]:
-        """Drop effects that what came later has made needless, and those that bring less than `least` [m^2 summed over the
-        residual]: beside a dominant effect they only mend its form. The state, and who is left."""
+    def eliminated(self, state: State, found: Sequence[str], least: float, noise: float) -> tuple[State, list[str]]:
+        """Drop effects that what came later has made needless, and those that bring less than `least` where what is left
+        is of the size of the `noise` [both m^2 summed over the residual]: beside a dominant effect they only mend its form. The state, and who is left."""
         left = list(found)
         while len(left) > 1:
             weakest: tuple[float, str, State] | None = None
@@ -372,7 +372,8 @@ class Search:
                 fewer = self.without(state, name)
                 verdict = self.judged(fewer, state, name)
                 needless = verdict.z < Z_KEEP or (verdict.bic_gain < BIC_KEEP and (verdict.z < Z_ACCEPT or verdict.share < SHARE_BLOCKS))
-                small = (fewer.fit.loss - state.fit.loss) * float((self.target.sigma**2).mean()) < least
+                variance = float((self.target.sigma**2).mean())
+                small = (fewer.fit.loss - state.fit.loss) * variance < least and fewer.fit.loss * variance < 2.0 * noise
                 if (needless or small) and (weakest is None or verdict.bic_gain < weakest[0]):
                     weakest = verdict.bic_gain, name, fewer
             if weakest is None:

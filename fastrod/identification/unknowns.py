@@ -132,6 +132,11 @@ class Model:
         return replace(self.robot_at(theta), effects=tuple(tables))
 
 
+def known_model(robot: Robot) -> Model:
+    """A robot with its own effects, nothing unknown."""
+    return Model(robot, wire(robot), tuple(named_effects(robot)), ())
+
+
 def base_model(robot: Robot, *, free_camera: bool = False) -> Model:
     """The model before anything is found: the robot's `[fit]` and `[sensor]`, and its stiffness.
 

@@ -254,7 +254,6 @@ def test_the_identified_robot_is_the_prediction_and_survives_its_file() -> None:
     assert np.abs(replay(log, robot).tip_position - told.position).max() > 1e-3
 
 
-@pytest.mark.xfail(strict=True, reason="replay is a static batch of tips: it leaves out effects of the camera, memories and clocks")
 @pytest.mark.parametrize("name", ["marker_offset", "frame_misalignment", "time_drift", "creep", "temperature"])
 def test_replay_of_the_identified_robot_knows_camera_memory_and_time(name: str) -> None:
     robot = two_segments()
