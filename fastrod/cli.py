@@ -81,7 +81,7 @@ def _parser() -> tuple[argparse.ArgumentParser, list[str]]:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
 
     demo = commands.add_parser("demo", help="the main job on an embedded default, start to end")
-    demo.add_argument("--out", type=Path, metavar="DIR", help="write the replay's residuals and plot there")
+    demo.add_argument("--out", type=Path, metavar="DIR", help="write the report there")
     demo.set_defaults(run_command=_demo)
 
     replay = commands.add_parser("replay", help="the model beside a measurement: residual table and plot")
@@ -98,6 +98,7 @@ def _parser() -> tuple[argparse.ArgumentParser, list[str]]:
     identify.add_argument("--held-out", nargs="+", action="extend", default=[], metavar="RUN", help=held_out)
     identify.add_argument("--max-effects", type=int, default=4, metavar="K", help="name this many at most (default: 4)")
     identify.add_argument("--free-camera", action="store_true", help="fit the camera's registration, marker offset and latency too")
+    identify.add_argument("--network", action="store_true", help="train a network on what is left, reported apart (needs fastrod[network])")
     identify.add_argument("--out", type=Path, metavar="DIR", help="where the files go (default: LOG's name + _identified)")
     identify.add_argument("--json", action="store_true", help="print report.json to stdout and nothing else; files only with --out")
     identify.set_defaults(run_command=_identify)
@@ -188,7 +189,8 @@ def _identify(arguments: argparse.Namespace) -> int:
     with _progress() as bar:
         result = identify(
             logs, robots[0], held_out=[word for word in arguments.held_out if word not in swallowed],
-            max_effects=arguments.max_effects, free_camera=arguments.free_camera, progress=bar,
+            max_effects=arguments.max_effects, free_camera=arguments.free_camera,
+            network=arguments.network, progress=bar,
         )  # fmt: skip
     written = [] if out is None else report.write(result, out)
     if arguments.json:

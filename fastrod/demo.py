@@ -1,4 +1,4 @@
-"""The main job on an embedded default, start to end: a batch of robots, then a log beside the model."""
+"""The main job on an embedded default, start to end: a batch of robots, then a log and what the model lacks to explain it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _SEED = 7
 
 
 def run(out: Path | None = None) -> None:
-    """Print a batch of random prototypes and the replay of the shipped log; files of the replay go to the folder `out` if given.
+    """Print a batch of random prototypes and what the shipped log tells; the report goes to the folder `out` if given.
 
     Raises `InputError`, before the work, where that folder cannot be written.
     """
@@ -41,7 +41,7 @@ def run(out: Path | None = None) -> None:
     console = Console()
     robot = load_robot("prototype")
     _batch(robot, console)
-    _replayed(robot, console, out)
+    _identified(robot, console, out)
 
 
 def random_bend(rng: np.random.Generator, robot: Robot, n_robots: int) -> Floats:
@@ -96,14 +96,17 @@ def _waiting(why: str) -> AbstractContextManager[object]:
     return Console(stderr=True).status(why) if sys.stderr.isatty() else nullcontext()
 
 
-def _replayed(robot: Robot, console: Console, out: Path | None) -> None:
-    from fastrod.identification.replay import replay, table, write
+def _identified(robot: Robot, console: Console, out: Path | None) -> None:
+    from fastrod.identification import report
+    from fastrod.identification.attribution import identify
     from fastrod.runlog import read_log
 
+    console.print("\n[bold]demo_log.csv[/], a prototype simulated by another solver, with noise and an effect that nobody declared")
     with as_file(files("fastrod").joinpath("data").joinpath("demo_log.csv")) as path:
-        result = replay(read_log(path, robot), robot)
-    console.print("\n[bold]demo_log.csv[/], simulated by another solver with a slightly other robot, and noise")
-    console.print(table(result))
-    for written in write(result, out) if out is not None else []:
+        log = read_log(path, robot)
+    with _waiting("looking for what the model lacks"):
+        result = identify(log, robot)
+    console.print(report.table(result))
+    for written in report.write(result, out) if out is not None else []:
         console.print(f"wrote {written}", soft_wrap=True, highlight=False)
-    console.print("next: fastrod replay LOG --robot R shows your own log like this", highlight=False)
+    console.print("next: fastrod identify LOG --robot R looks for it in your own log; --out DIR writes the report", highlight=False)

@@ -53,6 +53,11 @@ def separating_run(one: str, other: str) -> str:
     return f"to tell {one} from {other}: {run}"
 
 
+def look_at(pattern: str) -> str:
+    """What to do about a pattern that no effect of the library makes."""
+    return f"look at the robot: {pattern}; mend it, or register an effect of your own for it, and run again"
+
+
 def why_unknown(name: str, samples: Samples) -> str:
     """Why this log says nothing about a parameter of the robot."""
     log = samples.log

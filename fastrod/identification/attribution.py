@@ -18,6 +18,7 @@ from fastrod.identification.audit import audit
 from fastrod.identification.forward import Rod, Samples, predict, sample
 from fastrod.identification.limits import limits
 from fastrod.identification.local import Local, Target
+from fastrod.identification.network import residual_network
 from fastrod.identification.noise import Noise, keep, read_noise
 from fastrod.identification.result import Error, Estimate, Found, Result, Stage, Tried
 from fastrod.identification.search import N_BLOCKS, Candidate, Search, State, Step
@@ -48,6 +49,7 @@ def identify(
     max_effects: int = MAX_EFFECTS,
     free_camera: bool = False,
     exclude: Sequence[str] = (),
+    network: bool = False,
     progress: Callable[[str, int, int], None] | None = None,
     threads: int | None = None,
 ) -> Result:
@@ -55,7 +57,8 @@ def identify(
 
     `held_out`: labels of runs, or `RUN@START:END` [s], that no fit sees; where none is given, every fourth stretch of each
     run. `max_effects` at most are named. `exclude` takes effects out of the library. `free_camera` leaves registration,
-    marker offset and latency to the fit. `progress` is called with what is done, and how far of how much.
+    marker offset and latency to the fit. `network` trains a small network on what is left and reports it apart. `progress`
+    is called with what is done, and how far of how much.
     Deterministic. Raises `LogError` for a log that cannot tell anything, `RobotError` for a wrong `[fit]`.
     """
     if isinstance(max_effects, bool) or not isinstance(max_effects, int) or max_effects < 0:
@@ -76,9 +79,10 @@ def identify(
     start, base_parameters = base.fit(search)
     _check_motion(base, start)
     found, state, steps, reference = _found(search, base, start, max_effects, tell)
-    return _result(
+    result = _result(
         samples, tested, labels, robot, base, search, reference, state, found, steps, base_parameters, tell, max_effects, threads
     )
+    return replace(result, network=residual_network(samples, state.model.wiring, result)) if network else result
 
 
 class _Base:
@@ -135,7 +139,7 @@ class _Base:
         model = self.model
         r = local.residual(model, model.start)
         J = local.slopes(model, model.start, r)
-        flat = J.reshape(-1, J.shape[-1])
+        flat = J.reshape(r.size, J.shape[-1])
         _, sd = model.prior
         H = flat.T @ flat + np.diag(1.0 / sd**2)
         fixed = {}
@@ -243,8 +247,9 @@ def _result(
     classes = _classes(steps, kept)
     effects = [_effect(name, estimates, classes, path, steps, base.noise.floor) for name in kept]
     wiring = state.model.wiring
-    lacks = advice.missing_excitation(search.samples, wiring.bend(np.asarray(samples.log.dl)) if wiring.n_tendons else np.zeros((1, 1, 2)))
-    recommended = [advice.separating_run(e.name, other) for e in effects for other in e.cannot_be_told_from]
+    lacks = advice.missing_excitation(search.samples, wiring.bend(np.asarray(samples.log.dl))) if wiring.n_tendons else []
+    recommended = [advice.look_at(pattern) for pattern in opinion.patterns]
+    recommended += [advice.separating_run(e.name, other) for e in effects for other in e.cannot_be_told_from]
     base_estimates = {name: e for name, e in estimates.items() if name.partition(".")[0] not in kept} | fixed
     return Result(
         log=samples.log,
@@ -346,7 +351,8 @@ def _estimates(state: State) -> tuple[dict[str, Estimate], tuple[list[str], Floa
         seen = bool(error < _SEEN * prior)
         made[u.name] = Estimate(
             value=value, stderr=float(error * value if u.log else error), unit=u.unit, identifiable=seen,
-            why="" if seen else "the data narrow its prior by less than a third", prior_sd=float(prior), at_bound=at,
+            why="" if seen else "the data narrow its prior by less than a third", at_bound=at,
+            prior_sd=float(prior * value if u.log else prior),
         )  # fmt: skip
     spread = np.where(stderr > 0.0, stderr, 1.0)
     return made, ([u.name for u in state.model.unknowns], np.asarray(C / spread[:, None] / spread[None, :]))

@@ -53,7 +53,7 @@ def audit(samples: Samples, wiring: Wiring, residual: Floats, noise_lag1: float 
     block = np.arange(len(residual)) * _PIECES // max(len(residual), 1) % n_blocks
     if variance <= 0.0 or n_blocks < 3:
         return Audit(0.0, 0.0, 0.0, 0.0, 0.0)
-    static, memory, drift = _features(samples, wiring)
+    static, memory, drift = features(samples, wiring)
     losses: list[Floats] = [np.asarray(np.bincount(block, weights=(residual**2).sum(1), minlength=n_blocks), dtype=np.float64)]
     columns = np.zeros((len(residual), 0))
     left = residual
@@ -97,7 +97,7 @@ def _ridge(features: Floats, residual: Floats, block: Ints, n_blocks: int) -> tu
     return best[1], best[2]
 
 
-def _features(samples: Samples, wiring: Wiring) -> tuple[Floats, Floats, Floats]:
+def features(samples: Samples, wiring: Wiring) -> tuple[Floats, Floats, Floats]:
     """Static, memory and time features (n_rows, any), each of about unit size."""
     log, rows = samples.log, samples.rows
     bend = wiring.bend(np.asarray(log.dl)).reshape(len(log), -1) if wiring.n_tendons else np.zeros((len(log), 0))

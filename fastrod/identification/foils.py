@@ -55,7 +55,7 @@ class _Projected:
     """Least-squares losses of many column sets beside one tangent space."""
 
     def __init__(self, tangent: Floats, residual: Floats) -> None:
-        flat = tangent.reshape(-1, tangent.shape[-1])
+        flat = tangent.reshape(residual.size, tangent.shape[-1])
         self._q = np.linalg.qr(flat)[0] if flat.shape[1] else np.zeros((residual.size, 0))
         r = residual.ravel()
         self._r = r - self._q @ (self._q.T @ r)

@@ -237,7 +237,7 @@ class Search:
         n = len(state.model.unknowns)
         at = state.local.residual(model, theta) - (state.columns @ state.fit.theta[n:] if state.foils else 0.0)
         shift = (state.fit.residual - at).reshape(-1, 1)  # the response at the start itself: operators have no slope at neutral
-        base = state.fit.slopes.reshape(shift.shape[0], -1)
+        base = state.fit.slopes.reshape(shift.shape[0], state.fit.slopes.shape[-1])
         J = np.concatenate([base, shift], axis=1)
         sizes = [j for j, u in enumerate(model.unknowns) if j >= n and not u.shape]
         if len(sizes) > 1:
@@ -364,7 +364,8 @@ class Search:
 
     def eliminated(self, state: State, found: Sequence[str], least: float, noise: float) -> tuple[State, list[str]]:
         """Drop effects that what came later has made needless, and those that bring less than `least` where what is left
-        is of the size of the `noise` [both m^2 summed over the residual]: beside a dominant effect they only mend its form. The state, and who is left."""
+        is of the size of the `noise` [both m^2 summed over the residual]: beside a dominant effect they only mend its form.
+        The state, and who is left."""
         left = list(found)
         while len(left) > 1:
             weakest: tuple[float, str, State] | None = None
@@ -385,7 +386,7 @@ class Search:
         """For every effect that is not in the model, the size from which it would have shown: three standard errors beyond its
         estimate, at the typical shape."""
         inflate = np.sqrt(max(1.0, state.fit.loss / state.fit.residual.size) * state.fit.residual.size / effective_size(state.fit.residual))
-        flat = state.fit.slopes.reshape(state.fit.residual.size, -1)
+        flat = state.fit.slopes.reshape(state.fit.residual.size, state.fit.slopes.shape[-1])
         base = flat.T @ flat + np.diag(state.fit.precision)
         made = []
         for name in self.names(state):

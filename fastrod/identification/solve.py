@@ -42,7 +42,7 @@ class Fit:
     @property
     def hessian(self) -> Floats:
         """(p, p) Gauss-Newton, priors included."""
-        flat = self.slopes.reshape(-1, self.slopes.shape[-1])
+        flat = self.slopes.reshape(self.residual.size, self.slopes.shape[-1])
         return np.asarray(flat.T @ flat + np.diag(self.precision))
 
 

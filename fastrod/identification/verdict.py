@@ -58,19 +58,14 @@ def judge(
         return Opinion("not_in_library", f"{why}; it is {_words(kind)}.", kind, left, (), False)
     if not found:
         return Opinion("not_in_library", f"No effect of the library explains the residual: {patterns[0]}.", kind, 1.0, patterns, False)
-    names = " and ".join(found)
+    names = ", ".join(found[:-1]) + " and " + found[-1] if len(found) > 1 else found[0]
     left = max(left, min(left_out, 1.0) if left_out > _TRUSTED and not np.isnan(left_out) else left)
     if left <= _EXPLAINED:
         more = f" What little remains: {patterns[0]}." if patterns else ""
-        kind = kind if left > 0.02 else "none"
-        return Opinion(
-            "explained",
-            f"The model lacked {names}; with it, {100 * (1 - left):.0f} % of the error above the noise is gone.{more}",
-            kind,
-            left,
-            patterns,
-            False,
-        )
+        gone = 100.0 * (1.0 - (left if np.isnan(left_out) else min(max(left_out, 0.0), 1.0)))
+        it = "it" if len(found) == 1 else "them"
+        said = f"The model lacked {names}; with {it}, {gone:.0f} % of the held-out error above the noise is gone.{more}"
+        return Opinion("explained", said, kind if left > 0.02 else "none", left, patterns, False)
     if foreign > _FOREIGN or left > _PARTLY:
         what = f": {patterns[0]}" if patterns else f"; what is left is {_words(kind)}"
         certain = foreign < 0.5 and left < 0.6
