@@ -80,7 +80,7 @@ def run(case: Case) -> dict[str, Any]:
     if case.kind == "two":
         seal = plant.draw_pair(case.seed)
     elif case.kind == "dominant":
-        seal = plant.draw_many(case.seed)
+        seal = plant.draw_many(case.seed, inputs)
     else:
         seal = plant.draw(case.seed, case.what, segments=segments)
     noise = NOISE if case.kind != "noise" else (1e-4, 1e-3)[case.seed % 2]

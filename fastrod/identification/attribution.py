@@ -180,11 +180,20 @@ def _found(
     return found, state, steps, start
 
 
-def _library(search: Search, base: _Base, start: State, state: State, found: list[str]) -> tuple[State, list[str]]:
+def _library(
+    search: Search, base: _Base, start: State, state: State, found: list[str], max_effects: int, steps: list[Step]
+) -> tuple[State, list[str]]:
     """The effects that are needed once foils are gone, with their state."""
     alone = search.bare(state) if state.foils else state
+    noise = start.fit.residual.size * float((base.noise.sigma**2).mean())
+    while state.foils and len(found) < max_effects and alone.fit.loss * float((base.target.sigma**2).mean()) > 2.0 * noise:
+        step = search.stage(alone, with_foils=False)
+        if step.taken is None or step.taken.state is None:
+            break
+        steps.append(step)
+        found = [*found, step.taken.name]
+        alone = base.weighed(search, step.taken.state)
     if len(found) > 1:
-        noise = start.fit.residual.size * float((base.noise.sigma**2).mean())
         excess = start.fit.loss * float((base.weights[0] ** 2).mean()) - noise
         alone, found = search.eliminated(alone, found, _MENDS * max(excess, 0.0), noise)
     return base.weighed(search, alone), found
@@ -212,9 +221,9 @@ def _result(
     threads: int | None,
 ) -> Result:  # fmt: skip
     tell("prediction on all samples", max_effects + 1, max_effects + 2)
-    last = state
+    last, last_weight = state, base.weights[-1]
     if found:
-        state, found = _library(search, base, start, state, found)
+        state, found = _library(search, base, start, state, found, max_effects, steps)
     order = np.argsort([-_gain(search, state, name) for name in found]) if len(found) > 1 else range(len(found))
     found = [found[int(i)] for i in order]
     outlier = np.zeros(len(samples.log), bool)
@@ -233,7 +242,7 @@ def _result(
     library = _square(state, base.target.sigma)
     opinion = judge(
         left_out=max(0.0, test_error.after**2 - base.noise.floor**2) / max(test_error.before**2 - base.noise.floor**2, 1e-30),
-        base=_square(start, base.weights[0]), library=library, after=min(library, _square(last, base.weights[-2 if found else -1])),
+        base=_square(start, base.weights[0]), library=library, after=min(library, _square(last, last_weight)),
         floor=base.noise.floor**2, audit=inspected, steps=steps, found=found,
     )  # fmt: skip
     kept = [] if opinion.drop_effects else found

@@ -24,7 +24,7 @@ Z_ACCEPT, BIC_ACCEPT, SHARE_ACCEPT = 3.0, 10.0, 0.006
 Z_STRONG, BIC_STRONG = 1.7, 60.0  # an effect that shows in a few blocks only, but there beyond doubt
 Z_BLOCKS, SHARE_BLOCKS = 3.5, 0.03  # or one that block after block confirms, where a smooth residual is worth few samples
 Z_RIVAL, BIC_RIVAL = 2.0, 10.0
-Z_KEEP, BIC_KEEP = 2.0, 6.0
+Z_KEEP, BIC_KEEP, SHARE_KEEP = 2.0, 6.0, 0.015
 N_BLOCKS = 20
 _STARTS = 8
 _SCREEN = 0.003  # of the loss: a candidate whose slopes promise less is not fitted
@@ -372,7 +372,8 @@ class Search:
             for name in left:
                 fewer = self.without(state, name)
                 verdict = self.judged(fewer, state, name)
-                needless = verdict.z < Z_KEEP or (verdict.bic_gain < BIC_KEEP and (verdict.z < Z_ACCEPT or verdict.share < SHARE_BLOCKS))
+                needed = verdict.z > Z_KEEP and (verdict.bic_gain > BIC_KEEP or verdict.share > SHARE_KEEP)
+                needless = not needed and not (verdict.z > Z_STRONG and verdict.bic_gain > BIC_STRONG)
                 variance = float((self.target.sigma**2).mean())
                 small = (fewer.fit.loss - state.fit.loss) * variance < least and fewer.fit.loss * variance < 2.0 * noise
                 if (needless or small) and (weakest is None or verdict.bic_gain < weakest[0]):

@@ -33,6 +33,9 @@ ASL_SPOOL_RADIUS = 0.03
 ASL_PITCH_RADIUS = 0.03
 """Nominal [m]."""
 
+ASL_COMPLIANCE = 1e-3
+"""Nominal [m/N]: the wires are kept tight by springs."""
+
 ARMLAB_LENGTH = 0.108
 """Nominal [m]: the middle of the published fits, 0.096 to 0.119 m."""
 ARMLAB_PITCH_RADIUS = 0.0045
@@ -56,9 +59,9 @@ def asl_trunk(path: str | Path, run: str | None = None) -> tuple[RunLog, Robot]:
     push-pull tendon each, so the robot has six, in the order of motors 3 5 | 1 6 | 2 4. `dl` = -spool radius times the
     *commanded* motor angle u, for that is what a user has beforehand; `extra` keeps the measured angles phi (up to 5 rows
     stale). Tip = disk 3; points p1, p2 = disks 1 and 2.
-    Nominal: spool radius, pitch radius, bending stiffness 0.05 N m^2, torsional stiffness 0.5 N m^2 (a corrugated hose bends
+    Nominal: spool radius, pitch radius, wire compliance, bending stiffness 0.05 N m^2, torsional stiffness 0.5 N m^2 (a corrugated hose bends
     but hardly twists; much less, and the pushing half of the pairs, which has no pretension here, would buckle it), a
-    weightless body, stiff tendons. Only `payload` loads the rod, and how far it sags rests on the nominal stiffness.
+    weightless body. Only `payload` loads the rod, and how far it sags rests on the nominal stiffness.
     """
     table, where = _table(path, "asl_trunk"), Path(path).name
     disks = [_metres(table, (f"x{k}_mm", f"z{k}_mm", f"y{k}_mm"), where) * (1.0, 1.0, -1.0) for k in (1, 2, 3)]
@@ -90,7 +93,9 @@ def _asl_robot() -> Robot:
             bending_stiffness=(0.05, 0.05),
             torsional_stiffness=0.5,
             body_radius=0.04,
-            tendons=tuple(Tendon(offset=ASL_PITCH_RADIUS, angle=math.radians(ASL_DIRECTION[motor])) for motor in motors),
+            tendons=tuple(
+                Tendon(offset=ASL_PITCH_RADIUS, angle=math.radians(ASL_DIRECTION[motor]), compliance=ASL_COMPLIANCE) for motor in motors
+            ),
         )
         for start, end, motors in zip(starts, ASL_DISKS, ASL_MOTORS, strict=True)
     ]
@@ -103,7 +108,8 @@ def _asl_robot() -> Robot:
             "tendon.*.gain": {"sd": 0.5},
             "tendon.*.zero": {"sd": 0.01},
             "segment.*.length": {"sd": 0.005},
-            "segment.*.bending_stiffness": {"sd": 0.02, "shared": True},
+            "tendon.*.compliance": {"sd": 1e-3},
+            "segment.*.bending_stiffness": {"sd": 0.002, "shared": True},
         },
         sensor={"registration_sd": (0.01, 0.05)},
     )

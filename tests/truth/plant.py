@@ -91,13 +91,22 @@ def draw_pair(seed: int, *, segments: int = 1) -> Seal:
     return draw(seed, [str(name) for name in names], segments=segments)
 
 
-def draw_many(seed: int, *, segments: int = 1) -> Seal:
-    """One dominant effect, which comes first, and eight others at 0.1 to 0.2 of their typical size."""
+def draw_many(seed: int, inputs: Inputs) -> Seal:
+    """One dominant effect, which comes first, and eight others that each move the tip by 0.1 to 0.2 of what it does on these inputs."""
     rng = np.random.default_rng([seed, 3])
+    segments = inputs.segments
     names = [str(name) for name in rng.choice(library(segments), 9, replace=False)]
+    straight = pose(inputs, Seal({}, seed))[0]
+
+    def moves(effects: dict[str, dict[str, Any]]) -> float:
+        return float(np.sqrt(np.mean((pose(inputs, Seal(effects, seed))[0] - straight) ** 2)))
+
     effects = draw(seed, names[0], segments=segments).effects
+    dominant = moves(effects)
     for name in names[1:]:
-        effects |= draw(seed, name, segments=segments, size=float(rng.uniform(0.1, 0.2))).effects
+        share = float(rng.uniform(0.1, 0.2))
+        factor = share * dominant / max(moves(draw(seed, name, segments=segments).effects), 1e-9)
+        effects = effects | draw(seed, name, segments=segments, size=min(factor, 2.0)).effects
     return Seal(effects, seed)
 
 

@@ -128,11 +128,13 @@ def test_draws_repeat_and_stay_in_their_kind() -> None:
     for seed in range(20):
         (name,) = plant.draw(seed).effects
         assert name in plant.library(1)
-        pair, many = plant.draw_pair(seed, segments=2), plant.draw_many(seed, segments=2)
+        pair, many = plant.draw_pair(seed, segments=2), plant.draw_many(seed, still(np.array([[0.3, 0.2], [0.1, -0.2]]), 0.02))
         assert len(pair.effects) == 2
         assert len(many.effects) == 9
         assert set(pair.effects) | set(many.effects) <= set(plant.LIBRARY)
-        assert repr(plant.draw_many(seed)) == repr(plant.draw_many(seed))
+        assert repr(plant.draw_many(seed, still(np.array([[0.6, 0.3]]), 0.05))) == repr(
+            plant.draw_many(seed, still(np.array([[0.6, 0.3]]), 0.05))
+        )
     assert plant.draw(4, "gravity").effects["gravity"] == plant.draw(4, ["payload", "gravity"]).effects["gravity"]
     with pytest.raises(ValueError, match="no effect of a robot of 1 segment"):
         plant.draw(0, "coupling")
