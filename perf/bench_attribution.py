@@ -21,14 +21,14 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "truth"))
 
 NOISE = 3e-4  # m
-COUNTS = {"single": 200, "none": 100, "outside": 90, "two": 60, "dominant": 60, "deleted": 100, "operator": 75, "noise": 50, "segments": 52}
+COUNTS = {"single": 200, "none": 100, "outside": 60, "two": 60, "dominant": 40, "deleted": 60, "operator": 50, "noise": 24, "segments": 26}
 GOALS = {
     "single": ">= 95 % right effect first; held-out <= 1.15 x floor",
     "none": ">= 98 % verdict none",
     "outside": ">= 90 % not_in_library",
     "two": ">= 90 % both named, up to class",
     "dominant": ">= 88 % dominant first, up to class",
-    "deleted": "<= 15 % a wrong sibling that leaves > 15 % of the error",
+    "deleted": "<= 15 % a sibling called the explanation that leaves > 15 % of the error",
     "operator": "<= 3 % a confident wrong name",
     "noise": "0.1 and 1 mm of noise",
     "segments": "two segments",
@@ -54,7 +54,7 @@ def cases(share: float, only: Iterable[str]) -> list[Case]:
             "outside": plant.OUTSIDE, "none": ("none",), "two": ("two",), "dominant": ("dominant",), "segments": plant.library(2),
         }.get(kind, plant.library(1))  # fmt: skip
         made += [Case(kind, 1000 + i, names[i % len(names)]) for i in range(max(1, round(share * count)))]
-    return made
+    return sorted(made, key=lambda case: (case.seed, case.kind))  # a run that is stopped has some of each
 
 
 def run(case: Case) -> dict[str, Any]:
@@ -141,7 +141,7 @@ def score(kind: str, row: dict[str, Any]) -> bool:
     if kind == "dominant":
         return bool(row["named"]) and (row["named"][0] == true[0] or true[0] in row["classes"][0])
     if kind == "deleted":
-        return not (row["named"] and row["verdict"] != "not_in_library" and leaves(row) > 0.15)
+        return not (row["named"] and row["verdict"] in ("explained", "ambiguous") and leaves(row) > 0.15)
     if kind == "operator":
         return not (row["verdict"] == "explained" and row["named"][0] != true[0])
     return first_right(row)

@@ -272,10 +272,38 @@ def test_help_does_not_load_numba() -> None:
     assert "replay" in done.stdout
 
 
-def test_demo_prints_both_parts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("fastrod.simulator")
-    assert cli.main(["demo", "--out", str(tmp_path)]) == 0
-    printed = capsys.readouterr().out
+def test_demo_names_what_was_sealed_into_its_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["demo", "--out", str(tmp_path / "out")]) == 0
+    printed, err = capsys.readouterr()
+    assert err == ""
     assert "1000 of 1000 converged" in printed
-    assert "demo_log on prototype" in printed
-    assert (tmp_path / "replay.png").stat().st_size > 10_000
+    made = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert made["effects"][0]["name"] == "friction"
+    assert made["verdict"] in ("explained", "ambiguous")
+    assert made["error"]["held_out"]["after_rms_m"] < 1.15 * made["noise_floor_m"]
+    assert "friction" in printed
+    for name in ("report.json", "report.html", "identified.toml"):
+        assert (tmp_path / "out" / name).stat().st_size > 100
+        assert f"wrote {tmp_path / 'out' / name}" in printed
+    found = load_robot(tmp_path / "out" / "identified.toml")
+    assert [table["name"] for table in found.effects] == [effect["name"] for effect in made["effects"]]
+
+
+def test_demo_without_a_folder_writes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """The words around the work; the work itself is above."""
+    seen: list[int] = []
+
+    def stand_in(log: Any, robot: Robot) -> Any:
+        seen.append(len(log))
+        return "a result"
+
+    monkeypatch.setattr("fastrod.demo._batch", lambda *args: None)
+    monkeypatch.setattr("fastrod.identification.attribution.identify", stand_in)
+    monkeypatch.setattr("fastrod.identification.report.table", str)
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["demo"]) == 0
+    printed = capsys.readouterr().out
+    assert "a result" in printed
+    assert "wrote" not in printed
+    assert seen[0] > 2000
+    assert not list(tmp_path.iterdir())

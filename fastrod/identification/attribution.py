@@ -36,6 +36,7 @@ _LOCAL_ROWS = 3000  # samples that the search looks at; the operators run over a
 _ALL_AT_ONCE = 20000  # samples a batch when all are predicted
 _SEEN = 0.7  # of the prior's sd: a parameter whose data say less is not identifiable
 _MENDS = 0.02  # of the error above the noise: an effect beside a dominant one that brings less is not named
+_SURE = 1.06  # the variance of the noise is known from rest to about 6 %
 _SAY_LIMITS = 0.05  # of the error above the noise: where so much is left, shear and inertia are worth a sentence
 _RESTLESS = 0.25  # of the motion: noise beyond it is no noise
 _MORE_STAGES = 3  # beyond max_effects: foils take stages too
@@ -241,7 +242,7 @@ def _result(
     inspected = audit(search.samples, last.model.wiring, last.fit.residual, base.noise.lag1)
     library = _square(state, base.target.sigma)
     opinion = judge(
-        left_out=max(0.0, test_error.after**2 - base.noise.floor**2) / max(test_error.before**2 - base.noise.floor**2, 1e-30),
+        left_out=max(0.0, test_error.after**2 - _SURE * base.noise.floor**2) / max(test_error.before**2 - base.noise.floor**2, 1e-30),
         base=_square(start, base.weights[0]), library=library, after=min(library, _square(last, last_weight)),
         floor=base.noise.floor**2, audit=inspected, steps=steps, found=found,
     )  # fmt: skip

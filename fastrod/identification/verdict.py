@@ -12,10 +12,9 @@ from fastrod.identification.result import Verdict
 from fastrod.identification.search import Step
 
 _CLEAN = 0.06  # of the residual's variance: structure below it is none
-_EXPLAINED, _PARTLY = 0.12, 0.4  # of the error above the noise: what may be left for these verdicts
+_EXPLAINED, _PARTLY = 0.03, 0.4  # of the mean square above the noise: what may be left for these verdicts; 0.03 is 17 % of the rms
 _FOREIGN = 0.3  # of the error above the noise: patterns outside the library that carry this much are the finding
 _CARRIES = 0.5  # of the error above the noise, by one effect, where three are needed
-_TRUSTED = 0.3  # of the held-out error: what is left there beyond it counts, whatever the training data say
 _MIN_EXCESS = 0.03  # of the noise's variance
 
 
@@ -59,7 +58,7 @@ def judge(
     if not found:
         return Opinion("not_in_library", f"No effect of the library explains the residual: {patterns[0]}.", kind, 1.0, patterns, False)
     names = ", ".join(found[:-1]) + " and " + found[-1] if len(found) > 1 else found[0]
-    left = max(left, min(left_out, 1.0) if left_out > _TRUSTED and not np.isnan(left_out) else left)
+    left = left if np.isnan(left_out) else max(left, min(left_out, 1.0))
     if left <= _EXPLAINED:
         more = f" What little remains: {patterns[0]}." if patterns else ""
         gone = 100.0 * (1.0 - (left if np.isnan(left_out) else min(max(left_out, 0.0), 1.0)))

@@ -59,7 +59,7 @@ def asl_trunk(path: str | Path, run: str | None = None) -> tuple[RunLog, Robot]:
     push-pull tendon each, so the robot has six, in the order of motors 3 5 | 1 6 | 2 4. `dl` = -spool radius times the
     *commanded* motor angle u, for that is what a user has beforehand; `extra` keeps the measured angles phi (up to 5 rows
     stale). Tip = disk 3; points p1, p2 = disks 1 and 2.
-    Nominal: spool radius, pitch radius, wire compliance, bending stiffness 0.05 N m^2, torsional stiffness 0.5 N m^2 (a corrugated hose bends
+    Nominal: spool radius, pitch radius, wire compliance, bending stiffness 0.05, torsional stiffness 0.5 N m^2 (a corrugated hose bends
     but hardly twists; much less, and the pushing half of the pairs, which has no pretension here, would buckle it), a
     weightless body. Only `payload` loads the rod, and how far it sags rests on the nominal stiffness.
     """

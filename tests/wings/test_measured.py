@@ -11,6 +11,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from fastrod.errors import LogError, UnknownNameError
+from fastrod.identification.unknowns import base_model
 from fastrod.robotfile import dumps, loads
 from fastrod.runlog import read_log, write_log
 from fastrod_scenes import measured
@@ -47,7 +48,9 @@ def test_asl_trunk_units_frame_and_order(tmp_path: Path) -> None:
     assert_allclose(log.tip_position[:2], [[0.0, 0.0, 0.320], [0.030, 0.040, 0.310]], atol=1e-12)
     assert log.points is not None
     assert_allclose(log.points[0], [[0.0, 0.0, 0.106], [0.0, 0.0, 0.202]], atol=1e-12)
-    assert_allclose(np.degrees(-log.dl[1] / measured.ASL_SPOOL_RADIUS), [30, 50, 10, 60, 20, 40])  # motors 3 5 | 1 6 | 2 4
+    assert_allclose(np.degrees(-log.dl[1] / measured.ASL_SPOOL_RADIUS), [3, 5, 1, 6, 2, 4])  # commanded; motors 3 5 | 1 6 | 2 4
+    assert sorted(log.extra) == [f"phi{k}_deg" for k in range(1, 7)]
+    assert_allclose([log.extra[f"phi{k}_deg"][1] for k in range(1, 7)], [10, 20, 30, 40, 50, 60])  # measured
     assert log.payload is not None
     assert_allclose(log.payload, 0.1)
     assert robot.length == pytest.approx(0.320)
@@ -86,8 +89,30 @@ def test_armlab_tdcr_rest_tip_is_straight_and_glitches_are_missing(tmp_path: Pat
     assert_allclose(log.tip_position[2] - (0.0, 0.0, measured.ARMLAB_LENGTH), [0.007, 0.057, -0.030], atol=1e-12)
     assert_array_equal(log.measured, [True, True, True, False])
     assert_allclose(log.dl[2], [0.0, -0.008, 0.0])
+    assert log.run.tolist() == ["cell_000", "cell_000", "cell_030", "cell_030"]  # 2.5 mm each: 8 mm of tendon 2 is in the fourth
     # the tip goes toward the tendon that is pulled, tendon 2 at 85 deg
     assert np.dot(log.tip_position[2, :2], robot.tendons[1].position(1)[0]) > 0.0
+
+
+def test_a_pull_at_the_edge_of_the_cube_is_in_the_last_cell(tmp_path: Path) -> None:
+    path = tmp_path / "tdcr.csv"
+    path.write_text(ARMLAB.replace("8,0,8.1,0", "8,2.5,25,30"))
+    log, _ = armlab_tdcr(path)
+    assert log.run[-1] == "cell_199"
+
+
+def test_robots_say_what_is_not_known_of_them(tmp_path: Path) -> None:
+    """Free are the numbers that nobody publishes: identification may move them, and the frame, but not what is published."""
+    (tmp_path / "tdcr.csv").write_text(ARMLAB)
+    (_, trunk), (_, tdcr) = asl_trunk(asl_file(tmp_path)), armlab_tdcr(tmp_path / "tdcr.csv")
+    free = {robot.name: [u.name for u in base_model(robot).unknowns] for robot in (trunk, tdcr)}
+    sides = [f"tendon.{k}." for k in range(1, 7)]
+    assert set(free["asl_trunk"]) >= {*(f"{side}gain" for side in sides), *(f"{side}zero" for side in sides), "segment.3.length"}
+    assert {"segment.1.length", "tendon.*.offset"} <= set(free["armlab_tdcr"])
+    for robot in (trunk, tdcr):
+        assert robot.sensor["registration_sd"] == (0.01, 0.05)
+        assert any(name.startswith("frame_misalignment.") for name in free[robot.name])
+    assert [tendon.compliance for tendon in tdcr.tendons] == [1e-4] * 3
 
 
 def test_base_frames_hang_right_handed(tmp_path: Path) -> None:
