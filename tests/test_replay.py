@@ -22,7 +22,8 @@ from fastrod.robotfile import load_robot
 from fastrod.runlog import RunLog, read_log, write_log
 
 DEMO_LOG = Path(__file__).parents[1] / "fastrod" / "data" / "demo_log.csv"
-DEMO_COMMENT = """A prototype moved by `fastrod excite`, simulated by another solver with an effect that this file does not name, and 0.3 mm of noise.
+DEMO_COMMENT = """\
+A prototype moved by `fastrod excite`, simulated by another solver with an effect that this file does not name, and 0.3 mm of noise.
 Written by tests/truth/plant.py, seed 2026."""
 DEMO_SEED = 2026
 UPSIDE_DOWN = (0.0, 1.0, 0.0, 0.0)

@@ -335,6 +335,8 @@ class Search:
             return Step(state, tuple(tried), foil)
         if best is None:
             return Step(state, tuple(tried), None)
+        sure = [c for c in passing if c is not best and c.share > best.share and _z_between(c, best) > Z_ACCEPT]
+        best = max(sure, key=lambda c: c.share) if sure else best  # blocks that no fit has seen overrule the count of parameters
         rivals = [c for c in tried if c.foil is None and c.name != best.name and self._rival(best, c)]
         fewer = _best([c for c in rivals if c.passes and c.n_parameters < best.n_parameters and advantage(best, c) < BIC_RIVAL])
         if fewer is not None:

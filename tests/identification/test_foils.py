@@ -1,0 +1,129 @@
+"""Foils against patterns that another program made: each family is the best name for its own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from truth import plant
+
+from fastrod.identification.excite import excitation
+from fastrod.identification.foils import Foil, foils
+from fastrod.identification.forward import Rod, sample
+from fastrod.identification.local import Local, Target
+from fastrod.identification.unknowns import base_model
+from fastrod.robotfile import load_robot
+
+NOISE = 3e-4  # m
+FAMILIES = {"bump", "slip", "sway", "ripple", "contact", "attraction", "patch"}
+KINDS = {
+    "bump": "drift", "slip": "drift", "sway": "exogenous", "ripple": "static", "contact": "static", "attraction": "static",
+    "patch": "static",
+}  # fmt: skip
+
+
+@cache
+def inputs() -> plant.Inputs:
+    """The designed run at 5 Hz."""
+    log = excitation(load_robot("prototype"), rate=5.0).log
+    assert log.payload is not None
+    assert log.base_quaternion is not None
+    return plant.Inputs(log.t, log.dl, log.payload, log.base_quaternion)
+
+
+@cache
+def bare() -> np.ndarray:
+    return plant.pose(inputs(), plant.draw(0, "none"))[0]
+
+
+@cache
+def local() -> Local:
+    robot = load_robot("prototype")
+    log = replace(excitation(robot, rate=5.0).log, tip_position=bare())
+    model, samples = base_model(robot), sample(log)
+    return Local(model, model.start, samples, Rod(samples, robot, threads=1), Target(samples, np.full(3, NOISE), rotation_sigma=0.01, points=False))
+
+
+@cache
+def tangent() -> np.ndarray:
+    here = local()
+    return here.slopes(here.model, here.theta, here.residual(here.model, here.theta))
+
+
+def residual(pattern: np.ndarray) -> np.ndarray:
+    """A pattern (n, 3) [m] with noise, weighted."""
+    return pattern / NOISE + np.random.default_rng(3).normal(size=pattern.shape)
+
+
+def left_by(columns: np.ndarray, residual: np.ndarray) -> float:
+    """Squares that no multiple of the columns and no change of the base model takes away."""
+    both = np.concatenate([tangent(), columns], axis=-1).reshape(residual.size, -1)
+    return float(((residual.ravel() - both @ np.linalg.lstsq(both, residual.ravel(), rcond=1e-9)[0]) ** 2).sum())
+
+
+def ranked(residual: np.ndarray) -> list[tuple[float, Foil]]:
+    """Every family's best by BIC, the best first."""
+    made = foils(local(), tangent(), residual)
+    assert {foil.name for foil in made} == FAMILIES
+    n = residual.size
+    scores = [n * np.log(left_by(f.columns, residual) / n) + (f.columns.shape[-1] + f.n_hidden) * np.log(n) for f in made]
+    return sorted(zip(scores, made, strict=True), key=lambda pair: pair[0])
+
+
+def planted(name: str, seed: int) -> np.ndarray:
+    return plant.pose(inputs(), plant.draw(seed, name))[0] - bare()
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize(
+    ("outside", "family"),
+    [("bump", "bump"), ("slip", "slip"), ("sway", "sway"), ("ripple", "ripple"), ("contact", "contact"), ("magnet", "attraction")],
+)
+def test_each_family_is_the_name_of_its_own_pattern(outside: str, family: str, seed: int) -> None:
+    (best, foil), (second, _) = ranked(residual(planted(outside, seed)))[:2]
+    assert foil.name == family
+    assert foil.kind == KINDS[family]
+    assert second - best > 10.0  # BIC
+
+
+def test_what_is_off_in_one_corner_is_a_patch() -> None:
+    """A round hat, which is no Gaussian, at three quarters of the reach."""
+    place = 0.75 * np.abs(bare()[:, :2]).max() * np.array([np.cos(0.7), np.sin(0.7)])
+    hat = np.maximum(0.0, 1.0 - ((bare()[:, :2] - place) ** 2).sum(1) / 0.02**2)
+    _, foil = ranked(residual(hat[:, None] * np.array([1e-3, 5e-4, -2e-3])))[0]
+    assert foil.name == "patch"
+
+
+def test_times_and_frequencies_are_those_that_were_planted() -> None:
+    log = inputs()
+    seal = plant.draw(2, ["bump"])
+    best = {f.name: f for f in foils(local(), tangent(), residual(planted("bump", 2)))}["bump"]
+    said = float(best.what.split("at ")[1].split(" s")[0])
+    assert_allclose(said, log.t[0] + seal.effects["bump"]["at"] * np.ptp(log.t), atol=0.015 * np.ptp(log.t))  # 48 places are tried
+    seal = plant.draw(2, ["sway"])
+    best = {f.name: f for f in foils(local(), tangent(), residual(planted("sway", 2)))}["sway"]
+    said = float(best.what.split("at ")[1].split(" Hz")[0])
+    assert_allclose(said, seal.effects["sway"]["frequency"], atol=1.0 / np.ptp(log.t))
+
+
+def test_of_noise_no_family_makes_anything() -> None:
+    """The BIC of the best of seven families, scans counted, is above that of the model without a foil."""
+    white = residual(np.zeros((len(inputs().t), 3)))
+    nothing = white.size * np.log(left_by(np.zeros((*white.shape, 0)), white) / white.size)
+    assert ranked(white)[0][0] > nothing - 5.0
+
+
+def test_columns_of_rows_that_do_not_count_are_zero() -> None:
+    here = local()
+    here.target.weight[5] = 0.0
+    try:
+        made = foils(here, tangent(), residual(planted("bump", 1)))
+    finally:
+        here.target.weight[5] = 1.0
+    for foil in made:
+        assert foil.columns.shape[:2] == (len(inputs().t), 3)
+        assert (foil.columns[5] == 0.0).all()
+        assert np.isfinite(foil.columns).all()

@@ -1,0 +1,156 @@
+"""Verdicts on numbers: which words they get, at both sides of every border."""
+
+from __future__ import annotations
+
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from fastrod.identification.audit import Audit
+from fastrod.identification.foils import Foil
+from fastrod.identification.result import Verdict
+from fastrod.identification.search import Candidate, Step
+from fastrod.identification.verdict import Opinion, judge
+
+BASE, FLOOR = 1.1, 0.1  # the error above the noise is 1
+CLEAN = Audit(0.0, 0.0, 0.0, 0.0, 0.0)
+KINDS = ("none", "static", "memory", "drift", "unknown")
+JUMP = Foil("bump", "drift", "the tip jumps", np.zeros((1, 3, 3)), 1)
+SWAY = Foil("sway", "exogenous", "a line", np.zeros((1, 3, 6)), 1)
+RIPPLE = Foil("ripple", "static", "periodic", np.zeros((1, 3, 2)), 1)
+
+
+def took(foil: Foil | None, name: str = "backlash") -> Step:
+    """A stage that took a foil, or an effect."""
+    taken = Candidate(foil.name if foil else name, None, 9.0, 99.0, 0.5, 1, "", foil)
+    return Step(None, (), taken)  # type: ignore[arg-type]
+
+
+def opinion(**changed: Any) -> Opinion:
+    given = {"base": BASE, "library": BASE, "after": BASE, "floor": FLOOR, "left_out": 0.0, "audit": CLEAN, "steps": [], "found": []}
+    made = judge(**(given | changed))
+    assert made.verdict in get_args(Verdict)
+    assert made.kind in KINDS
+    assert 0.0 <= made.left <= 1.0
+    assert made.summary.endswith(".")
+    assert "\n" not in made.summary
+    return made
+
+
+def found(left: float, **changed: Any) -> Opinion:
+    """Backlash, with a static structure that carries `left` of the error above the noise."""
+    after = 0.5
+    return opinion(library=after, after=after, audit=Audit(left / after, 0.0, 0.0, 0.0, 5.0), found=["backlash"], **changed)
+
+
+def test_a_residual_of_noise_is_none() -> None:
+    made = opinion(base=1.02 * FLOOR, library=1.02 * FLOOR, after=1.02 * FLOOR)
+    assert (made.verdict, made.kind, made.left, made.patterns, made.drop_effects) == ("none", "none", 0.0, (), False)
+
+
+@pytest.mark.parametrize(
+    ("audit", "kind"),
+    [
+        (Audit(0.07, 0.01, 0.0, 0.0, 5.0), "static"),
+        (Audit(0.01, 0.07, 0.0, 0.0, 5.0), "memory"),
+        (Audit(0.0, 0.01, 0.07, 0.0, 5.0), "drift"),
+        (Audit(0.0, 0.0, 0.01, 0.07, 5.0), "unknown"),
+    ],
+)
+def test_structure_that_nothing_explains_is_not_in_the_library(audit: Audit, kind: str) -> None:
+    made = opinion(audit=audit)
+    assert (made.verdict, made.kind, made.patterns) == ("not_in_library", kind, ())
+    assert_allclose(made.left, 0.08 * BASE)
+
+
+def test_structure_below_six_percent_is_none() -> None:
+    assert opinion(audit=Audit(0.03, 0.02, 0.009, 0.0, 5.0)).verdict == "none"
+    assert opinion(audit=Audit(0.03, 0.02, 0.011, 0.0, 5.0)).verdict == "not_in_library"
+
+
+@pytest.mark.parametrize(("foil", "kind"), [(JUMP, "drift"), (SWAY, "unknown"), (RIPPLE, "static")])
+def test_a_foil_alone_is_not_in_the_library_and_gives_its_kind(foil: Foil, kind: str) -> None:
+    made = opinion(after=FLOOR, steps=[took(foil), Step(None, (), None)])  # type: ignore[arg-type]
+    assert (made.verdict, made.kind, made.left, made.patterns) == ("not_in_library", kind, 1.0, (foil.what,))
+    assert foil.what in made.summary
+
+
+def test_the_kind_is_of_what_is_larger_the_foil_or_the_structure_behind_it() -> None:
+    after = 0.8  # the foil has taken 0.3
+    small, large = (opinion(after=after, steps=[took(JUMP)], audit=Audit(0.0, share / after, 0.0, 0.0, 5.0)) for share in (0.29, 0.31))
+    assert (small.kind, large.kind) == ("drift", "memory")
+
+
+@pytest.mark.parametrize(
+    ("left", "verdict", "dropped"),
+    [
+        (0.0, "explained", False),
+        (0.119, "explained", False),
+        (0.121, "partly_explained", False),
+        (0.399, "partly_explained", False),
+        (0.401, "not_in_library", False),
+        (0.45, "not_in_library", False),
+    ],
+)
+def test_what_is_left_beside_an_effect_decides(left: float, verdict: str, dropped: bool) -> None:
+    made = found(left)
+    assert (made.verdict, made.drop_effects) == (verdict, dropped)
+    assert_allclose(made.left, left)
+    assert "backlash" in made.summary
+    assert made.kind == ("none" if left <= 0.02 else "static")
+
+
+def test_held_out_error_counts_where_it_is_large() -> None:
+    """A model that fits what it has seen and fails on what it has not has explained nothing."""
+    assert found(0.01, left_out=0.299).verdict == "explained"
+    assert found(0.01, left_out=0.301).verdict == "partly_explained"
+    assert found(0.01, left_out=0.401).verdict == "not_in_library"
+    assert not found(0.01, left_out=0.599).drop_effects
+    assert found(0.01, left_out=0.601).drop_effects
+    worse = found(0.01, left_out=7.0)
+    assert (worse.left, worse.drop_effects) == (1.0, True)
+    assert "backlash" not in worse.summary
+    nothing_held_out = found(0.01, left_out=float("nan"))
+    assert nothing_held_out.verdict == "explained"
+    assert "99 %" in nothing_held_out.summary
+    assert found(0.2, left_out=float("nan")).verdict == "partly_explained"
+
+
+@pytest.mark.parametrize(
+    ("foreign", "verdict", "dropped"),
+    [
+        (0.05, "explained", False),
+        (0.2, "partly_explained", False),
+        (0.29, "partly_explained", False),
+        (0.31, "not_in_library", False),
+        (0.49, "not_in_library", False),
+        (0.51, "not_in_library", True),
+    ],
+)
+def test_a_foil_beside_an_effect_counts_by_what_it_takes(foreign: float, verdict: str, dropped: bool) -> None:
+    library = 0.7
+    made = opinion(library=library, after=library - foreign, steps=[took(None), took(JUMP)], found=["backlash"])
+    assert (made.verdict, made.drop_effects, made.patterns) == (verdict, dropped, (JUMP.what,))
+    assert JUMP.what in made.summary
+    assert ("backlash" in made.summary) != dropped
+    assert made.kind == "drift"
+
+
+def test_the_share_that_is_gone_is_of_the_held_out_error() -> None:
+    assert "93 % of the held-out error" in found(0.0, left_out=0.07).summary
+    assert "100 % of the held-out error" in found(0.0, left_out=0.0).summary
+
+
+def test_several_effects_are_listed() -> None:
+    made = opinion(library=FLOOR, after=FLOOR, found=["backlash", "creep", "gravity"])
+    assert "backlash, creep and gravity; with them" in made.summary
+
+
+def test_a_log_at_its_floor_divides_by_no_zero() -> None:
+    """The base model below the noise estimate: the error above it is none, and what seems left stays a share."""
+    for base in (0.5 * FLOOR, FLOOR):
+        assert opinion(base=base, library=base, after=base).verdict == "none"
+        assert opinion(base=base, library=base, after=base, audit=Audit(0.5, 0.0, 0.0, 0.0, 5.0)).left == 1.0
+    assert opinion(base=0.0, library=0.0, after=0.0, floor=0.0).verdict == "none"
