@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -126,7 +127,7 @@ class Static:
         return np.empty((n_robots, 0))
 
 
-class Operator:
+class Operator(ABC):
     """Base of the library's effects with a memory: operators on the wires' lengths over time.
 
     `sweep` is the law, over many steps at once: a simulator calls it with one step, identification with a whole log.
@@ -137,12 +138,13 @@ class Operator:
     synonyms: ClassVar[tuple[str, ...]] = ()
     order: ClassVar[float] = 50.0
 
+    @abstractmethod
     def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Wiring) -> Floats:
         """(n_robots, n_steps, n_tendons) what the wires end up at, from `dl` commanded [m] and `dt` (n_steps,) before each step [s].
 
         `memory` (n_robots, m) is changed in place; nan in it means that the wires begin at rest at the first step.
         """
-        raise NotImplementedError
+        ...
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
         """One step of `sweep`."""
