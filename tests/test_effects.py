@@ -285,6 +285,7 @@ JACOBIANS: list[Table] = [
     {"name": "tendon_stretch", "compliance": [3e-4, 1e-4]},
     {"name": "axial_compression", "per_bend": [0.05, 0.1], "common_share": [0.5, 0.9]},
     {"name": "stiffening", "cubic": [0.2, 0.1]},
+    {"name": "compression_softening", "gain": 40.0},
 ]
 
 

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from rods import bend, rod
 
 from fastrod.reference import shoot
 
 
 @pytest.fixture(autouse=True)
 def _perf_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "perf"))
+    for folder in (Path(__file__).parent / "truth", Path(__file__).parents[1] / "perf"):
+        monkeypatch.syspath_prepend(str(folder))
 
 
 @pytest.mark.parametrize("tension", [0.0, 2.0])
@@ -64,3 +69,109 @@ def test_rows_become_json_and_a_table(capsys: pytest.CaptureFixture[str]) -> Non
     assert "a [m]" in out
     assert "1.2" in out
     assert "yes" in out
+
+
+def told(case: str, true: str, named: list[str], verdict: str, left: float = 0.0, classes: list[list[str]] | None = None) -> dict[str, Any]:
+    """A row of the attribution benchmark: `left` of the error above a floor of 0.5 mm, 2 mm before."""
+    return {
+        "case": case, "seed": 1, "true": true.split(), "verdict": verdict, "kind": "none", "named": named,
+        "classes": classes or [[] for _ in named], "before": 2.5e-3, "after": 0.5e-3 + 2e-3 * left, "floor": 0.5e-3, "bounds": 3,
+        "left": left, "seconds": 1.0, "rows": 100,
+    }  # fmt: skip
+
+
+WANTED = [
+    (True, told("single", "creep", ["creep"], "explained")),
+    (False, told("single", "creep", ["friction", "creep"], "explained")),
+    (False, told("single", "creep", [], "none", 1.0)),
+    (True, told("none", "", [], "none", 1.0)),
+    (False, told("none", "", ["lens"], "explained")),
+    (True, told("outside", "bump", [], "not_in_library", 1.0)),
+    (False, told("outside", "bump", ["time_drift"], "partly_explained", 0.3)),
+    (True, told("two", "creep lens", ["lens", "creep"], "explained")),
+    (True, told("two", "creep lens", ["lens", "friction"], "explained", classes=[[], ["creep"]])),
+    (False, told("two", "creep lens", ["lens"], "partly_explained", 0.2)),
+    (True, told("dominant", "creep lens gravity", ["friction"], "explained", classes=[["creep"]])),
+    (False, told("dominant", "creep lens gravity", ["lens", "creep"], "explained")),
+    (False, told("dominant", "creep lens gravity", [], "none", 1.0)),
+    (True, told("deleted", "creep", ["friction"], "explained", 0.14)),
+    (False, told("deleted", "creep", ["friction"], "explained", 0.16)),
+    (False, told("deleted", "creep", ["friction"], "ambiguous", 0.16)),
+    (True, told("deleted", "creep", ["friction"], "not_in_library", 0.5)),
+    (True, told("deleted", "creep", [], "not_in_library", 1.0)),
+    (True, told("operator", "creep", ["friction"], "ambiguous")),
+    (True, told("operator", "creep", [], "none", 1.0)),
+    (False, told("operator", "creep", ["friction"], "explained")),
+    (True, told("noise", "lens", ["lens"], "ambiguous")),
+    (True, told("segments", "coupling", ["coupling"], "explained")),
+    (False, {"case": "segments", "seed": 1, "true": ["coupling"], "error": "ValueError: it broke"}),
+]
+
+
+@pytest.mark.parametrize(("wanted", "row"), WANTED)
+def test_a_verdict_is_scored_as_its_goal_wants(wanted: bool, row: dict[str, Any]) -> None:
+    from bench_attribution import score
+
+    assert score(row["case"], row) is wanted
+
+
+def test_verdicts_are_summed_up_by_case(capsys: pytest.CaptureFixture[str]) -> None:
+    from bench_attribution import confusion, show, summary
+
+    rows = [row for _, row in WANTED]
+    table = {line["case"]: line for line in summary(rows)}
+    assert {case: (line["logs"], round(line["as_wanted"] * line["logs"])) for case, line in table.items()} == {
+        case: (n, sum(wanted for wanted, row in WANTED if row["case"] == case)) for case, n in Counter(r["case"] for r in rows).items()
+    }
+    assert table["segments"]["crashed"] == 1
+    assert table["deleted"]["verdicts"] == {"explained": 2, "ambiguous": 1, "not_in_library": 2}
+    assert table["single"]["after_over_floor_median"] == pytest.approx(1.0)  # of those that named something
+    assert table["deleted"]["after_within_1.15"] == 0.0
+    assert confusion(rows) == {
+        "creep": {"creep": 1, "friction": 1, "none": 1}, "none": {"none": 1, "lens": 1}, "bump": {"not_in_library": 1, "time_drift": 1},
+        "lens": {"lens": 1},
+    }  # fmt: skip
+    assert json.loads(json.dumps(table))
+    show(rows, list(table.values()), 2)
+    out = capsys.readouterr().out
+    assert "ValueError: it broke" in out
+    assert "single: 33.3 % of 3 as wanted" in out
+
+
+def test_a_share_of_the_sealed_logs_has_some_of_each_kind() -> None:
+    from bench_attribution import COUNTS, GOALS, cases
+
+    few = cases(0.02, [])
+    assert {case.kind for case in few} == set(COUNTS) == set(GOALS)
+    assert len(few) < 0.05 * sum(COUNTS.values())
+    every = cases(1.0, [])
+    assert len(every) == sum(COUNTS.values())
+    assert set(few) <= set(every)
+    assert len(set(every)) == len(every)
+    assert {case.kind for case in cases(0.1, ["none", "two"])} == {"none", "two"}
+
+
+def test_a_log_that_breaks_is_a_row() -> None:
+    from bench_attribution import Case, _safely, score
+
+    row = _safely(Case("single", 3, "no such effect"))
+    assert row["error"]
+    assert not score("single", row)
+
+
+def test_a_robot_and_its_wires_stiffer_alike_change_under_loads_only() -> None:
+    from bench_measured import stiffer
+    from fastrod import Simulator
+
+    for effects in ((), ({"name": "tendon_stretch", "compliance": 2e-4},), ({"name": "drum_gain", "gain": [0.1, -0.05]},)):
+        soft = replace(rod(compliance=1e-4), effects=effects)
+        lengths = bend(soft, 0.6, -0.4)
+        for factor in (0.5, 8.0):
+            hard = stiffer(soft, factor)
+            one, two = (Simulator(r).settle(lengths, tolerance=1e-12) for r in (soft, hard))
+            assert one.ok.all()
+            assert two.ok.all()
+            np.testing.assert_allclose(two.tip_position, one.tip_position, rtol=0, atol=1e-9)
+            loaded = [Simulator(r).settle(lengths, tip_force=[0.1, 0.1, 0.0]).tip_position for r in (soft, hard)]
+            gives = [np.linalg.norm(tip - one.tip_position) for tip in loaded]
+            assert gives[1] * factor == pytest.approx(gives[0], rel=0.15)  # in proportion, but for the bend that it adds

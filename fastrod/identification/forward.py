@@ -85,6 +85,7 @@ class Rod:
     def __init__(self, samples: Samples, robot: Robot, *, points: bool = False, threads: int | None = None) -> None:
         from fastrod.simulator import Simulator
 
+        self.threads = threads
         self.samples, self.points = samples, points and samples.log.points is not None
         bare = replace(robot, effects=())
         n = len(samples.rows)

@@ -31,7 +31,9 @@ def residual_network(samples: Samples, wiring: Wiring, result: Result) -> dict[s
     train = result.used & np.isfinite(residual).all(1)
     test = result.tested & np.isfinite(residual).all(1)
     scale = float(residual[train].std())
-    model = make_pipeline(StandardScaler(), MLPRegressor(hidden_layer_sizes=_LAYERS, alpha=1e-2, early_stopping=True, max_iter=300, random_state=0))
+    model = make_pipeline(
+        StandardScaler(), MLPRegressor(hidden_layer_sizes=_LAYERS, alpha=1e-2, early_stopping=True, max_iter=300, random_state=0)
+    )
     model.fit(inputs[train], residual[train] / scale)
     left = residual[test] - scale * model.predict(inputs[test])
     return {"held_out_rms_m": float(np.sqrt((left**2).sum(1).mean())), "inputs": float(inputs.shape[1])}

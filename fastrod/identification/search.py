@@ -30,7 +30,7 @@ _STARTS = 8
 _SCREEN = 0.003  # of the loss: a candidate whose slopes promise less is not fitted
 _FEW, _MANY = 3, 12  # iterations of a start, and of the best of them
 _REFINED = 6  # candidates that are solved exactly at each stage
-_NEAR = 4.0  # times what the best leaves, or less than it takes: others are not worth an exact solution
+_NEAR = 3.0  # times what the best leaves, or less than it takes: others are not worth an exact solution
 _CLOSE = 200.0  # BIC to the best within which a candidate is solved once more
 _FOIL_SD = 30.0  # of a foil's amplitude, in units of its own columns' size that would explain all
 
@@ -126,6 +126,11 @@ class Search:
         if not np.isfinite(fit.loss):
             return state
         return self._state(state.model, local, fit, state.foils)
+
+    def again(self, state: State) -> State:
+        """A state of other samples, fitted to these; foils, which belong to their samples, are left behind."""
+        local = Local(state.model, state.theta, self.samples, self.rod, self.target)
+        return self.refined(self._state(state.model, local, self._fit(local, state.model, state.theta, np.zeros(0), (), 6), ()))
 
     def _state(self, model: Model, local: Local, fit: Fit, found: tuple[Foil, ...]) -> State:
         losses = held_out_losses(fit.residual, fit.slopes, fit.precision, self.block, N_BLOCKS)
@@ -314,7 +319,7 @@ class Search:
         fitted = sorted((c for c in tried if c.state is not None and c.z > 1.0 and c.share > SHARE_ACCEPT), key=lambda c: -c.share)
         most = fitted[0].share if fitted else 0.0
         near = [c for c in fitted if 1.0 - c.share < _NEAR * (1.0 - most) and c.share > most / _NEAR][:_REFINED]
-        heavy = [c for c in fitted if not state.local.is_light(c.name) and c.share > most / _NEAR]  # of these even the fit so far is linear
+        heavy = [c for c in fitted if not state.local.is_light(c.name) and c.share > 0.6 * most]  # of these even the fit so far is linear
         exact = {}
         for candidate in dict.fromkeys([*near, *heavy]):
             assert candidate.state is not None

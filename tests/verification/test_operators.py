@@ -461,6 +461,14 @@ def test_coupling_slack_and_stiffening_change_the_bend_that_is_asked_for() -> No
     alike(loose, settled(rod(), bend(rod(), 0.5 - 1e-3 / 0.0075, 0.0)))
 
 
+def test_a_body_that_its_wires_press_bends_more_easily() -> None:
+    """By the gain times the common pull of its own segment; nothing without one."""
+    robot = rod()
+    lengths, soft = bend(robot, 0.5, -0.3), having(robot, "compression_softening", gain=40.0)
+    alike(settled(soft, lengths), settled(robot, lengths))
+    alike(settled(soft, lengths - 1e-3), settled(robot, bend(robot, 0.5 * 1.04, -0.3 * 1.04) - 1e-3))
+
+
 def test_axial_compression_is_an_extension_that_the_wires_follow() -> None:
     robot = rod(extension=(-0.02, 0.02))
     lengths = bend(robot, 0.6, 0.8)  # a bend of one radian

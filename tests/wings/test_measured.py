@@ -179,3 +179,27 @@ def test_nominal_replay_of_the_beam_is_an_unshearable_rod() -> None:
     drop = {run: -1e3 * float(result.tip_position[log.run == run, 0].mean()) for run in log.runs}
     assert drop["gravity_a"] == pytest.approx(6.6, abs=0.1)  # published for an unshearable rod: 6.6 and 15.8 mm
     assert drop["load52_a"] == pytest.approx(15.8, abs=0.1)
+
+
+@needs_data
+def test_motors_of_the_trunk_follow_what_they_are_told_late() -> None:
+    """Why it matters whether `dl` is commanded or measured: on the wandering run they are 11.5 deg apart (rms, to 80 deg of motion)."""
+    log, _ = asl_trunk(DATA / "asl_trunk.csv", run="perlin_0g")
+    order = [motor for pair in measured.ASL_MOTORS for motor in pair]
+    told = np.degrees(-log.dl / measured.ASL_SPOOL_RADIUS)
+    felt = np.stack([log.extra[f"phi{motor}_deg"] for motor in order], axis=1)
+    assert np.sqrt(np.mean((felt - told) ** 2)) == pytest.approx(11.5, abs=0.1)
+    late = [np.sqrt(np.mean((felt[k:] - told[: len(told) - k]) ** 2)) for k in range(12)]
+    assert int(np.argmin(late)) > 0
+
+
+@needs_data
+def test_cells_of_the_tdcr_cover_its_cube_of_shortenings() -> None:
+    log, _ = armlab_tdcr(DATA / "armlab_tdcr.csv")
+    assert len(log.runs) == 52
+    for cell in ("cell_000", "cell_304"):
+        rows = log.run == cell
+        low = measured.ARMLAB_CELL * np.array([int(digit) for digit in cell.removeprefix("cell_")])
+        pull = -log.dl[rows]
+        assert (pull >= low - 1e-12).all()
+        assert (pull < low + measured.ARMLAB_CELL + 1e-12).all()
