@@ -20,9 +20,9 @@ from reportlog import backlash_log
 from fastrod.identification import report
 from fastrod.identification.attribution import identify
 from fastrod.identification.audit import Audit
+from fastrod.identification.evidence import Bound
 from fastrod.identification.page import page
 from fastrod.identification.result import Estimate, Found, Result
-from fastrod.identification.search import Bound
 from fastrod.identification.signals import Signals
 from fastrod.identification.wording import amount, bound_sentence, law, percent, plain_name, with_error
 from fastrod.robotfile import load_robot

@@ -11,11 +11,12 @@ from fastrod.effect import get_effect
 from fastrod.identification import advice
 from fastrod.identification.audit import audit
 from fastrod.identification.base import SEEN, Base, rms
+from fastrod.identification.evidence import State, Step
 from fastrod.identification.forward import Rod, Samples, predict
 from fastrod.identification.limits import limits
 from fastrod.identification.noise import keep
 from fastrod.identification.result import Error, Estimate, Found, Result, Stage, Tried
-from fastrod.identification.search import Search, State, Step
+from fastrod.identification.search import Search
 from fastrod.identification.solve import covariance
 from fastrod.identification.unknowns import Model
 from fastrod.identification.verdict import judge

@@ -14,10 +14,11 @@ import numpy as np
 from fastrod.errors import InputError, LogError
 from fastrod.identification.assemble import ALL_AT_ONCE, assemble
 from fastrod.identification.base import LEAST_ROWS, Base, check_log, check_motion
+from fastrod.identification.evidence import Candidate, State, Step
 from fastrod.identification.forward import sample
 from fastrod.identification.network import residual_network
 from fastrod.identification.result import Result
-from fastrod.identification.search import Candidate, Search, State, Step
+from fastrod.identification.search import Search
 from fastrod.identification.split import held_out_rows, merged
 from fastrod.identification.unknowns import base_model
 from fastrod.robot import Robot

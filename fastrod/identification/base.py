@@ -6,11 +6,12 @@ import numpy as np
 
 from fastrod.errors import InputError, LogError
 from fastrod.identification import advice
+from fastrod.identification.evidence import State
 from fastrod.identification.forward import Rod, Samples, predict
 from fastrod.identification.local import Local, Target
 from fastrod.identification.noise import Noise, keep, read_noise
 from fastrod.identification.result import Estimate
-from fastrod.identification.search import N_BLOCKS, Search, State
+from fastrod.identification.search import N_BLOCKS, Search
 from fastrod.identification.unknowns import Model
 from fastrod.robot import Robot
 from fastrod.types import Floats, Ints

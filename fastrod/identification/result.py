@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 
 from fastrod.identification.audit import Audit
+from fastrod.identification.evidence import Bound
 from fastrod.identification.noise import Noise
-from fastrod.identification.search import Bound
 from fastrod.robot import Robot
 from fastrod.runlog import RunLog
 from fastrod.types import Flags, Floats

@@ -13,6 +13,28 @@ from itertools import product
 import numpy as np
 
 from fastrod.effect import effect_names, get_effect
+from fastrod.identification.evidence import (
+    BIC_ACCEPT,
+    BIC_KEEP,
+    BIC_RIVAL,
+    BIC_STRONG,
+    SHARE_ACCEPT,
+    SHARE_BLOCKS,
+    SHARE_KEEP,
+    Z_ACCEPT,
+    Z_BLOCKS,
+    Z_KEEP,
+    Z_RIVAL,
+    Z_STRONG,
+    Bound,
+    Candidate,
+    State,
+    Step,
+    advantage,
+    best_of,
+    unphysical,
+    z_between,
+)  # fmt: skip
 from fastrod.identification.foils import Foil, foils
 from fastrod.identification.forward import Rod, Samples
 from fastrod.identification.local import Local, Target
@@ -20,11 +42,6 @@ from fastrod.identification.solve import Fit, bic, effective_size, held_out_loss
 from fastrod.identification.unknowns import Model
 from fastrod.types import Floats, Ints
 
-Z_ACCEPT, BIC_ACCEPT, SHARE_ACCEPT = 3.0, 10.0, 0.006
-Z_STRONG, BIC_STRONG = 1.7, 60.0  # an effect that shows in a few blocks only, but there beyond doubt
-Z_BLOCKS, SHARE_BLOCKS = 3.5, 0.03  # or one that block after block confirms, where a smooth residual is worth few samples
-Z_RIVAL, BIC_RIVAL = 2.0, 10.0
-Z_KEEP, BIC_KEEP, SHARE_KEEP = 2.0, 6.0, 0.015
 N_BLOCKS = 20
 _STARTS = 8
 _SCREEN = 0.003  # of the loss: a candidate whose slopes promise less is not fitted
@@ -33,73 +50,6 @@ _REFINED = 6  # candidates that are solved exactly at each stage
 _NEAR = 3.0  # times what the best leaves, or less than it takes: others are not worth an exact solution
 _CLOSE = 200.0  # BIC to the best within which a candidate is solved once more
 _FOIL_SD = 30.0  # of a foil's amplitude, in units of its own columns' size that would explain all
-
-
-@dataclass(frozen=True, eq=False)
-class State:
-    """A model with its fit: what is accepted so far."""
-
-    model: Model
-    local: Local
-    fit: Fit
-    """Of the unknowns, then of the accepted foils' amplitudes."""
-    losses: Floats
-    """(N_BLOCKS,) held out."""
-    foils: tuple[Foil, ...] = ()
-
-    @property
-    def theta(self) -> Floats:
-        return self.fit.theta[: len(self.model.unknowns)]
-
-    @property
-    def columns(self) -> Floats:
-        """(n, n_out, k) of the accepted foils."""
-        shape = (*self.fit.residual.shape, 0)
-        return np.concatenate([np.zeros(shape), *(f.columns for f in self.foils)], axis=-1)
-
-
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """An effect, or a foil, beside a state."""
-
-    name: str
-    state: State | None
-    """With the candidate accepted; None where it was not fitted."""
-    z: float
-    """Of the gain over held-out blocks."""
-    bic_gain: float
-    share: float
-    """Of the loss that it takes away."""
-    n_parameters: int
-    why: str
-    """Why it is not the one, in a sentence."""
-    foil: Foil | None = None
-
-    @property
-    def passes(self) -> bool:
-        return self.state is not None and not self.why
-
-
-@dataclass(frozen=True, eq=False)
-class Step:
-    """One stage of the search: who ran, who was taken."""
-
-    before: State
-    candidates: tuple[Candidate, ...]
-    taken: Candidate | None
-    rivals: tuple[str, ...] = ()
-    """Effects that explain this stage as well as the one that was taken."""
-
-
-@dataclass(frozen=True, eq=False)
-class Bound:
-    """The size from which an effect would have shown."""
-
-    name: str
-    parameter: str
-    unit: str
-    value: float
-    """nan: no size shows in this log."""
 
 
 @dataclass
@@ -268,7 +218,7 @@ class Search:
         gain = bic(state.fit.loss, 0, size) - bic(with_it.fit.loss, k, size)
         z = paired(state.losses, with_it.losses)
         share = 1.0 - with_it.fit.loss / state.fit.loss
-        why = "" if foil else _unphysical(with_it, name)
+        why = "" if foil else unphysical(with_it, name)
         evident = (z > Z_ACCEPT and gain > BIC_ACCEPT) or (z > Z_STRONG and gain > BIC_STRONG) or (z > Z_BLOCKS and share > SHARE_BLOCKS)
         if not why and not (share > SHARE_ACCEPT and evident):
             why = f"no gain on held-out blocks (z {z:.1f}, BIC {gain:.0f}, {100 * share:.1f} % of the loss)"
@@ -324,35 +274,35 @@ class Search:
         for candidate in dict.fromkeys([*near, *heavy]):
             assert candidate.state is not None
             exact[candidate.name] = self.judged(state, self.refined(candidate.state), candidate.name)
-        best = _best([c for c in exact.values() if c.state is not None and c.share > SHARE_ACCEPT])
+        best = best_of([c for c in exact.values() if c.state is not None and c.share > SHARE_ACCEPT])
         for name, candidate in exact.items():
             if best is not None and candidate.state is not None and advantage(best, candidate) < _CLOSE:
                 exact[name] = self.judged(state, self.refined(candidate.state), name)
         tried = [exact.get(c.name, c) for c in tried]
         passing = [c for c in tried if c.passes]
-        best = _best(passing)
+        best = best_of(passing)
         foil = None
         if with_foils:
             others = self.foil_candidates(state)
             tried += others
-            foil = _best([c for c in others if c.passes])
-        if foil is not None and (best is None or (advantage(foil, best) > BIC_RIVAL and _z_between(foil, best) > Z_RIVAL)):
+            foil = best_of([c for c in others if c.passes])
+        if foil is not None and (best is None or (advantage(foil, best) > BIC_RIVAL and z_between(foil, best) > Z_RIVAL)):
             return Step(state, tuple(tried), foil)
         if best is None:
             return Step(state, tuple(tried), None)
-        sure = [c for c in passing if c is not best and c.share > best.share and _z_between(c, best) > Z_ACCEPT]
+        sure = [c for c in passing if c is not best and c.share > best.share and z_between(c, best) > Z_ACCEPT]
         best = max(sure, key=lambda c: c.share) if sure else best  # blocks that no fit has seen overrule the count of parameters
         rivals = [c for c in tried if c.foil is None and c.name != best.name and self._rival(best, c)]
-        fewer = _best([c for c in rivals if c.passes and c.n_parameters < best.n_parameters and advantage(best, c) < BIC_RIVAL])
+        fewer = best_of([c for c in rivals if c.passes and c.n_parameters < best.n_parameters and advantage(best, c) < BIC_RIVAL])
         if fewer is not None:
             rivals = [best, *(c for c in rivals if c is not fewer)]
             best = fewer
         return Step(state, tuple(tried), best, tuple(c.name for c in rivals))
 
     def _rival(self, best: Candidate, other: Candidate) -> bool:
-        if other.state is None or other.share < SHARE_ACCEPT or _unphysical(other.state, other.name):
+        if other.state is None or other.share < SHARE_ACCEPT or unphysical(other.state, other.name):
             return False
-        return advantage(best, other) < BIC_RIVAL or _z_between(best, other) < Z_RIVAL
+        return advantage(best, other) < BIC_RIVAL or z_between(best, other) < Z_RIVAL
 
     def bare(self, state: State) -> State:
         """`state` without its foils, fitted again: what the library alone explains."""
@@ -423,40 +373,3 @@ class Search:
             first = model.unknowns[sizes[0]]
             made.append(Bound(name, first.name.partition(".")[2], first.unit, worst if np.isfinite(worst) else float("nan")))
         return made
-
-
-def advantage(one: Candidate, other: Candidate) -> float:
-    """BIC by which one candidate is better than the other, with the effective samples of the one that leaves less."""
-    assert one.state is not None
-    assert other.state is not None
-    losses = one.state.fit.loss, other.state.fit.loss
-    size = effective_size((one if losses[0] <= losses[1] else other).state.fit.residual)  # type: ignore[union-attr]
-    return bic(losses[1], other.n_parameters, size) - bic(losses[0], one.n_parameters, size)
-
-
-def _best(candidates: Sequence[Candidate]) -> Candidate | None:
-    best: Candidate | None = None
-    for candidate in candidates:
-        if best is None or advantage(candidate, best) > 0.0:
-            best = candidate
-    return best
-
-
-def _z_between(one: Candidate, other: Candidate) -> float:
-    """z over held-out blocks of one candidate's gain on the other."""
-    assert one.state is not None
-    assert other.state is not None
-    return paired(other.state.losses, one.state.losses)
-
-
-def _unphysical(state: State, name: str) -> str:
-    """Why an effect's parameters cannot be, or nothing."""
-    sizes = []
-    for unknown, number, at_bound in zip(state.model.unknowns, state.fit.theta, state.fit.at_bound, strict=False):
-        if unknown.place[:2] != ("effect", name) or unknown.shape:
-            continue
-        value = unknown.inside(float(number))
-        sizes.append(abs(value - unknown.mean))
-        if at_bound and value != unknown.mean:
-            return f"its {unknown.name.partition('.')[2]} would be {value:.3g} {unknown.unit}, at the bound of what is physical"
-    return "" if any(size > 0.0 for size in sizes) else "its best size is zero"

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fastrod.identification.audit import Audit
+from fastrod.identification.evidence import Step
 from fastrod.identification.result import Verdict
-from fastrod.identification.search import Step
 
 _CLEAN = 0.06  # of the residual's variance: structure below it is none
 _EXPLAINED, _PARTLY = 0.03, 0.4  # of the mean square above the noise: what may be left for these verdicts; 0.03 is 17 % of the rms

@@ -7,7 +7,7 @@ import math
 import re
 
 from fastrod.effect import get_effect
-from fastrod.identification.search import Bound
+from fastrod.identification.evidence import Bound
 
 NOTHING = "–"
 VERDICTS = {

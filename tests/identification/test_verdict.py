@@ -9,9 +9,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 from fastrod.identification.audit import Audit
+from fastrod.identification.evidence import Candidate, Step
 from fastrod.identification.foils import Foil
 from fastrod.identification.result import Verdict
-from fastrod.identification.search import Candidate, Step
 from fastrod.identification.verdict import _EXPLAINED, _FOREIGN, _PARTLY, Opinion, judge
 
 BASE, FLOOR = 1.1, 0.1  # the error above the noise is 1

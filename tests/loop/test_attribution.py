@@ -64,7 +64,7 @@ def test_a_hidden_effect_is_named_and_leaves_the_noise(effect: str) -> None:
     assert result.verdict in ("explained", "ambiguous")
     assert result.effects[0].name == effect
     assert result.test.before > 1.5 * result.noise.floor
-    # 3 % of the ratio is that the floor is read from rest, 2 to 7 % another functional form than the plant's
+    # measured when this was written: 1.03 for a clean log on this run, 1.03 to 1.07 for these
     assert result.test.after < 1.15 * result.noise.floor
     assert result.test.interval[0] <= result.test.after <= result.test.interval[1]
     assert result.train.after < 1.15 * result.noise.floor
@@ -113,7 +113,7 @@ def test_a_camera_that_is_bumped_is_not_in_the_library() -> None:
 
 
 def test_without_the_true_effect_no_sibling_is_called_the_explanation() -> None:
-    """Where nothing else predicts as well, that is what must be said."""
+    """Where nothing else predicts as well, that is what must be said. One effect of several: for others a sibling fits to the noise."""
     result = found("stiffness_anisotropy", "stiffness_anisotropy")
     assert all(c.name != "stiffness_anisotropy" for c in result.tried)
     assert result.verdict in ("not_in_library", "partly_explained")
