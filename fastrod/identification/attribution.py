@@ -16,7 +16,7 @@ from fastrod.identification.assemble import ALL_AT_ONCE, assemble
 from fastrod.identification.base import LEAST_ROWS, Base, check_log, check_motion
 from fastrod.identification.evidence import Candidate, State, Step
 from fastrod.identification.forward import sample
-from fastrod.identification.network import residual_network
+from fastrod.identification.network import check_network, residual_network
 from fastrod.identification.result import Result
 from fastrod.identification.search import Search
 from fastrod.identification.split import held_out_rows, merged
@@ -53,7 +53,11 @@ def identify(
     """
     if isinstance(max_effects, bool) or not isinstance(max_effects, int) or max_effects < 0:
         raise InputError(f"max_effects is {max_effects!r}; it must be a whole number, 0 or more.")
+    if network:
+        check_network()
     log = merged([logs] if isinstance(logs, RunLog) else list(logs))
+    if not log.driven.any():
+        raise LogError(f"log {log.name!r} has no row in which every input is there; there is nothing to drive the model with.")
     samples = sample(log)
     check_log(samples, robot)
     tell = progress or (lambda *_: None)

@@ -113,16 +113,16 @@ def check_motion(base: Base, state: State) -> None:
     measured, predicted = measured - measured.mean(0), predicted - predicted.mean(0)
     moves = float((measured**2).sum())
     name, robot = base.samples.log.name, base.robot.name
-    if base.noise.floor > _RESTLESS * np.sqrt(moves / max(len(measured), 1)) and base.noise.floor > 0.01 * base.robot.length:
-        raise LogError(
-            f"in log {name!r} the measured tip jumps by {1e3 * base.noise.floor:.3g} mm from sample to sample while the inputs rest, "
-            f"{100 * base.noise.floor / np.sqrt(moves / len(measured)):.0f} % of its motion; are two robots or two markers mixed?"
-        )
     if float(((measured - predicted) ** 2).sum()) > moves:
         scale = float((measured * predicted).sum() / max((predicted**2).sum(), 1e-30))
         raise LogError(
             f"log {name!r} is further from robot {robot!r} than from a robot that stands still: it moves {scale:.2g} times as predicted. "
             "Are the units, the signs (negative = pulled) and the order of the dl_ columns right, and is it this robot?"
+        )
+    if base.noise.floor > _RESTLESS * np.sqrt(moves / max(len(measured), 1)) and base.noise.floor > 0.01 * base.robot.length:
+        raise LogError(
+            f"in log {name!r} the measured tip jumps by {1e3 * base.noise.floor:.3g} mm from sample to sample while the inputs rest, "
+            f"{100 * base.noise.floor / np.sqrt(moves / len(measured)):.0f} % of its motion; are two robots or two markers mixed?"
         )
 
 

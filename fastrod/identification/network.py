@@ -13,17 +13,24 @@ from fastrod.wiring import Wiring
 _LAYERS = (32, 32)
 
 
+def check_network() -> None:
+    """Raise `InputError` where scikit-learn is not installed."""
+    try:
+        import sklearn.neural_network  # noqa: F401
+    except ImportError as error:
+        raise InputError("the residual network needs scikit-learn; install fastrod[network], or leave --network out.") from error
+
+
 def residual_network(samples: Samples, wiring: Wiring, result: Result) -> dict[str, float]:
     """Train on the residual after the named effects, test on the samples held out: distance rms with it [m], and its input count.
 
     Inputs are those of the audit without time: present inputs, plays, lags, velocities. Raises `InputError` without scikit-learn.
     """
-    try:
-        from sklearn.neural_network import MLPRegressor
-        from sklearn.pipeline import make_pipeline
-        from sklearn.preprocessing import StandardScaler
-    except ImportError as error:
-        raise InputError("the residual network needs scikit-learn; install fastrod[network], or leave --network out.") from error
+    check_network()
+    from sklearn.neural_network import MLPRegressor
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+
     every = samples.on(np.arange(len(samples.log)))
     static, memory, _ = features(every, wiring)
     inputs = np.concatenate([static, memory], axis=1)

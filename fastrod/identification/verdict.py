@@ -38,7 +38,7 @@ def judge(
     `after` those and foils, and the noise `floor`; `left_out`: share of the held-out error above the noise that is left."""
     excess = max(base - floor, _MIN_EXCESS * floor, 1e-30)
     foils = [step.taken.foil for step in steps if step.taken is not None and step.taken.foil is not None]
-    patterns = tuple(foil.what for foil in foils)
+    patterns = tuple({foil.name: foil.what for foil in reversed(foils)}.values())[::-1]  # the strongest of each family
     foreign = max(library - after, 0.0) / excess if foils else 0.0
     structured = audit.structured * after / excess
     left = min(1.0, foreign + structured)

@@ -221,7 +221,7 @@ BAD = {
     "three rows": (lambda: backlash_log().rows(slice(0, 3)), "has 3 measured rows; identification needs 40"),
     "constant input": (lambda: replace(backlash_log(), dl=np.full((420, 4), 1e-3)), "no input ever changes; nothing can be told"),
     "no tip": (lambda: replace(backlash_log(), tip_position=np.full((420, 3), np.nan)), "there is nothing to explain"),
-    "no input": (lambda: replace(backlash_log(), dl=np.full((420, 4), np.nan)), "has no rows"),
+    "no input": (lambda: replace(backlash_log(), dl=np.full((420, 4), np.nan)), "no row in which every input is there"),
     "a tip that stands still": (lambda: replace(backlash_log(), tip_position=np.full((420, 3), 0.05)), "the measured tip never moves"),
     "signs": (lambda: replace(backlash_log(), dl=-backlash_log().dl), r"it moves -0\.9\d* times as predicted.*signs \(negative = pulled\)"),
     "columns turned on": (
