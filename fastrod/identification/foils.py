@@ -15,6 +15,7 @@ import numpy as np
 from fastrod.identification.local import Local
 from fastrod.types import Floats
 
+_LONG = 20.0  # s, of a run in which something can happen
 _TIMES = 48  # change points tried
 _FREQUENCIES = (0.08, 3.0)  # Hz, of a line
 _NARROW = 4.0  # lines tried per 1 / duration
@@ -39,7 +40,9 @@ def foils(local: Local, tangent: Floats, residual: Floats) -> list[Foil]:
     """The best of each family for a residual (n, n_out) that `tangent` (n, n_out, p) can absorb part of."""
     solver = _Projected(tangent, residual)
     found = []
-    families = (_bump(local), _slip(local), _sway(local, residual), _ripple(local), _contact(local), _attraction(local), _patch(local))
+    families = [_ripple(local), _contact(local), _attraction(local), _patch(local)]
+    if all(local.samples.time[part].max() > _LONG for part in local.samples.runs):  # short runs have no history of their own
+        families += [_bump(local), _slip(local), _sway(local, residual)]
     for family in families:
         best: tuple[float, Foil] | None = None
         for foil in family:

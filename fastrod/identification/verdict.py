@@ -12,7 +12,8 @@ from fastrod.identification.evidence import Step
 from fastrod.identification.result import Verdict
 
 _CLEAN = 0.06  # of the residual's variance: structure below it is none
-_EXPLAINED, _PARTLY = 0.03, 0.4  # of the mean square above the noise: what may be left for these verdicts; 0.03 is 17 % of the rms
+_EXPLAINED, _PARTLY = 0.03, 0.5  # of the mean square above the noise: what may be left for these verdicts; 0.03 is 17 % of the rms
+_UNCERTAIN = 0.75  # left beyond this: what was found may be a stand-in for what is missing
 _FOREIGN = 0.3  # of the error above the noise: patterns outside the library that carry this much are the finding
 _CARRIES = 0.5  # of the error above the noise, by one effect, where three are needed
 _MIN_EXCESS = 0.03  # of the noise's variance
@@ -67,7 +68,7 @@ def judge(
         return Opinion("explained", said, kind if left > 0.02 else "none", left, patterns, False)
     if foreign > _FOREIGN or left > _PARTLY:
         what = f": {patterns[0]}" if patterns else f"; what is left is {_words(kind)}"
-        certain = foreign < 0.5 and left < 0.6
+        certain = foreign < 0.5 and left < _UNCERTAIN
         also = f" {names} is there too." if certain else ""
         return Opinion("not_in_library", f"Most of what is missing is not in the library{what}.{also}", kind, left, patterns, not certain)
     what = f": {patterns[0]}" if patterns else f"; it is {_words(kind)}"

@@ -33,6 +33,8 @@ ASL_SPOOL_RADIUS = 0.03
 ASL_PITCH_RADIUS = 0.03
 """Nominal [m]."""
 
+ASL_NOISE = 5e-6
+"""Of the tip at rest, per axis, published [m]."""
 ASL_COMPLIANCE = 1e-3
 """Nominal [m/N]: the wires are kept tight by springs."""
 
@@ -42,6 +44,8 @@ ARMLAB_PITCH_RADIUS = 0.0045
 """Nominal [m]: the middle of the published fits, 0.0038 to 0.0051 m."""
 ARMLAB_COMPLIANCE = 1e-4
 """Nominal [m/N]: all three wires pulled by 10 mm then draw 100 N each, on a body that cannot shorten."""
+ARMLAB_NOISE = 6e-5
+"""Of the tip, per axis, published as 0.03 to 0.06 mm [m]."""
 ARMLAB_CELL = 0.0025
 """Edge of the cells of the cube of shortenings that label the rows: regions to hold out [m]."""
 ARMLAB_DIRECTION = (205.0, 85.0, 325.0)
@@ -111,7 +115,7 @@ def _asl_robot() -> Robot:
             "tendon.*.compliance": {"sd": 1e-3},
             "segment.*.bending_stiffness": {"sd": 0.002, "shared": True},
         },
-        sensor={"registration_sd": (0.01, 0.05)},
+        sensor={"registration_sd": (0.01, 0.05), "noise": ASL_NOISE},
     )
 
 
@@ -186,7 +190,7 @@ def _armlab_robot() -> Robot:
         segments=(rod,),
         base_quaternion=_UPSIDE_DOWN,
         fit={"segment.1.length": {"sd": 0.01}, "tendon.*.offset": {"sd": 0.001, "shared": True}},
-        sensor={"registration_sd": (0.01, 0.05)},
+        sensor={"registration_sd": (0.01, 0.05), "noise": ARMLAB_NOISE},
     )
 
 
