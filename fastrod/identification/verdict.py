@@ -12,7 +12,7 @@ from fastrod.identification.evidence import Step
 from fastrod.identification.result import Verdict
 
 _CLEAN = 0.06  # of the residual's variance: structure below it is none
-_EXPLAINED, _PARTLY = 0.03, 0.5  # of the mean square above the noise: what may be left for these verdicts; 0.03 is 17 % of the rms
+_EXPLAINED, _PARTLY = 0.03, 0.45  # of the mean square above the noise: what may be left for these verdicts; 0.03 is 17 % of the rms
 _UNCERTAIN = 0.75  # left beyond this: what was found may be a stand-in for what is missing
 _FOREIGN = 0.3  # of the error above the noise: patterns outside the library that carry this much are the finding
 _CARRIES = 0.5  # of the error above the noise, by one effect, where three are needed
