@@ -68,7 +68,7 @@ def identify(
     model = base_model(robot, free_camera=free_camera)
     chosen = _thinned(train, _SEARCH_ROWS)
     tell("base fit", 0, max_effects + 2)
-    base = Base(samples.on(chosen), model, robot, threads)
+    base = Base(samples.on(chosen), train, model, robot, threads)
     search = Search(base.samples, base.rod, base.target, base.block, frozenset(exclude))
     start, fixed = base.fit(search)
     check_motion(base, start)

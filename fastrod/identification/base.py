@@ -9,7 +9,7 @@ from fastrod.identification import advice
 from fastrod.identification.evidence import State
 from fastrod.identification.forward import Rod, Samples, predict
 from fastrod.identification.local import Local, Target
-from fastrod.identification.noise import Noise, keep, read_noise
+from fastrod.identification.noise import ENOUGH, Noise, at_rest, keep, read_noise
 from fastrod.identification.result import Estimate
 from fastrod.identification.search import N_BLOCKS, Search
 from fastrod.identification.unknowns import Model
@@ -19,13 +19,15 @@ from fastrod.types import Floats, Ints
 LEAST_ROWS = 40
 SEEN = 0.7
 """Of the prior's sd: a parameter whose data say less is not identifiable."""
+_FOR_NOISE = 20000  # samples
 _RESTLESS = 0.25  # of the motion: noise beyond it is no noise
 
 
 class Base:
-    """The train samples, their noise and weights, and the base model."""
+    """The samples of the search, their noise and weights, and the base model; `rows` are all that may be fitted."""
 
-    def __init__(self, samples: Samples, model: Model, robot: Robot, threads: int | None) -> None:
+    def __init__(self, samples: Samples, rows: Ints, model: Model, robot: Robot, threads: int | None) -> None:
+        self.rows = rows
         self.samples, self.model, self.robot = samples, model, robot
         self.rod = Rod(samples, robot, points=samples.log.points is not None, threads=threads)
         self.target = Target(samples, np.full(3, 1e-3 * robot.length), rotation_sigma=0.01, points=samples.log.points is not None)
@@ -44,7 +46,7 @@ class Base:
             lost = int((~local.pose.ok).sum())
             self.notes.append(f"the model did not converge on {lost} of {len(local.pose.ok)} rows; they do not count")
         raw = target.tip - local.pose.position
-        self.noise = read_noise(self.samples, target.tip, np.nan_to_num(raw))
+        self.noise = self._noise()
         given = self.robot.sensor.get("noise", 0.0)
         declared = float(max(given) if isinstance(given, tuple) else given)
         if declared > 0.0:
@@ -64,9 +66,18 @@ class Base:
         self.weights = self.weights[-1:]
         return state, fixed
 
+    def _noise(self) -> Noise:
+        """Noise from samples one after the other, whatever part of them the search looks at."""
+        every = self.samples.on(self.rows[:_FOR_NOISE])
+        tip = np.asarray(every.log.tip_position)[every.rows]
+        if sum(len(rows) for rows in at_rest(every)) >= ENOUGH:
+            return read_noise(every, tip, tip)
+        pose = predict(self.model, self.model.start, every, Rod(every, self.robot, threads=self.rod.threads))
+        return read_noise(every, tip, np.nan_to_num(tip - pose.position))
+
     def on(self, samples: Samples, state: State) -> Base:
         """The same robot, noise and weights at other samples; outliers by the residual of `state`."""
-        made = Base(samples, self.model, self.robot, self.rod.threads)
+        made = Base(samples, self.rows, self.model, self.robot, self.rod.threads)
         made.noise, made.notes, made.weights = self.noise, self.notes, self.weights
         made.target.sigma = self.target.sigma.copy()
         pose = predict(state.model, state.theta, samples, made.rod)

@@ -12,7 +12,7 @@ from fastrod.types import Flags, Floats, Ints
 _STILL = 2e-4  # of an input's range; less is no motion
 _SETTLE = 1.0  # s after a motion that do not count as rest
 _LEAST = 8  # samples of a stretch at rest
-_ENOUGH = 30  # samples at rest from which a noise is believed
+ENOUGH = 30  # samples at rest from which a noise is believed
 _WINDOW = 7  # samples either side, of the Hampel filter
 _OUTLIER = 5.0  # sigma
 _MOVES = 0.3  # autocorrelation at rest beyond which more than noise is seen
@@ -56,7 +56,7 @@ def read_noise(samples: Samples, tip: Floats, residual: Floats) -> Noise:
     """Noise of the measured `tip` (n_rows, 3) [m] from stretches at rest, or from the fastest part of a `residual` where the robot
     never rests."""
     parts = at_rest(samples)
-    if sum(len(p) for p in parts) >= _ENOUGH:
+    if sum(len(p) for p in parts) >= ENOUGH:
         flat = []
         pairs = np.zeros(2)
         weight = 0.0

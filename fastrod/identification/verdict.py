@@ -69,8 +69,9 @@ def judge(
     if foreign > _FOREIGN or left > _PARTLY:
         what = f": {patterns[0]}" if patterns else f"; what is left is {_words(kind)}"
         certain = foreign < 0.5 and left < _UNCERTAIN
-        also = f" {names} is there too." if certain else ""
-        return Opinion("not_in_library", f"Most of what is missing is not in the library{what}.{also}", kind, left, patterns, not certain)
+        also = f" {names} {'is' if len(found) == 1 else 'are'} there too." if certain else ""
+        part = "Most" if max(foreign, left) > 0.5 else "A good part"
+        return Opinion("not_in_library", f"{part} of what is missing is not in the library{what}.{also}", kind, left, patterns, not certain)
     what = f": {patterns[0]}" if patterns else f"; it is {_words(kind)}"
     return Opinion(
         "partly_explained",
