@@ -24,7 +24,7 @@ from fastrod.identification.evidence import Bound
 from fastrod.identification.page import page
 from fastrod.identification.result import Estimate, Found, Result
 from fastrod.identification.signals import Signals
-from fastrod.identification.wording import amount, bound_sentence, law, percent, plain_name, with_error
+from fastrod.identification.wording import VERDICTS, amount, bound_sentence, law, percent, plain_name, with_error
 from fastrod.robotfile import load_robot
 from fastrod.simulator import Simulator
 
@@ -149,7 +149,7 @@ def test_page_is_one_offline_file(html: str) -> None:
 def test_page_says_verdict_effects_and_what_to_run(result: Result, html: str) -> None:
     words = Reader(html).words
     assert all(sentence in words for sentence in re.split(r"(?<=\.) (?=[A-Z])", result.summary))
-    assert "Ambiguous on this log" in words or "Explained" in words
+    assert VERDICTS[result.verdict] in words
     half_width = result.effects[0].parameters["half_width"]
     assert with_error(half_width.value, half_width.stderr, "m") in words
     for text in (law("backlash")["Equation"], law("backlash")["Source"], *result.advice):

@@ -100,7 +100,7 @@ class Base:
         _, sd = model.prior
         H = flat.T @ flat + np.diag(1.0 / sd**2)
         fixed = {}
-        posterior = np.sqrt(np.diag(np.linalg.pinv(H))) if len(sd) else sd
+        posterior = np.sqrt(np.maximum(np.diag(np.linalg.pinv(H)), 0.0)) if len(sd) else sd
         for u, narrowed, prior in zip(model.unknowns, posterior, sd, strict=True):
             if narrowed > SEEN * prior:
                 fixed[u.name] = Estimate(
