@@ -107,7 +107,7 @@ def _parser() -> tuple[argparse.ArgumentParser, list[str]]:
     excite.add_argument("--robot", required=True, metavar="R", help="a shipped robot's name or a path to a .toml")
     excite.add_argument("--out", type=Path, metavar="FILE", help="the run log, .csv or .parquet (default: NAME_excitation.csv)")
     excite.add_argument("--bend", type=float, default=0.9, metavar="RAD", help="largest bend of a segment (default: 0.9)")
-    excite.add_argument("--payload", type=float, default=0.05, metavar="KG", help="known mass at the tip, on and off (default: 0.05)")
+    excite.add_argument("--payload", type=float, metavar="KG", help="known mass at the tip, on and off (default: F l^2/EI = 1)")
     excite.add_argument("--rate", type=float, default=15.0, metavar="HZ", help="samples a second (default: 15)")
     excite.add_argument("--speed", type=float, default=1.0, metavar="RAD/S", help="of the triangles (default: 1)")
     excite.set_defaults(run_command=_excite)

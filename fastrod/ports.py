@@ -75,6 +75,8 @@ class EffectPorts:
         for k in range(self.wiring.n_segments):
             if (own := self.wiring.tendon_segment == k).any():
                 ends[:, k] = odd[:, own].mean(1)
+            elif k:
+                ends[:, k] = ends[:, k - 1]
         return np.diff(ends, axis=1, prepend=0.0)
 
     def shift_bend(self, change: Floats) -> None:

@@ -223,7 +223,8 @@ class Simulator:
 
         Inputs: the tendons (length, or tension where that is the mode), then the segments' extensions, the other inputs
         held: a point force at its arclength. With effects, the inputs are those commanded, and the effects stay where they
-        are in their loops. A slack wire's column is zero, a robot's that is not ok nan. Columns of
+        are in their loops; what only follows in time (latency, dynamics) answers nothing at once: its columns are zero.
+        A slack wire's column is zero, a robot's that is not ok nan. Columns of
         lengths come from the sensitivities of the pass (model.md); those of tensions and extensions from central
         differences of the pass, closed by the same sensitivities.
         """

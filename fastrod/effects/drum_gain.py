@@ -13,7 +13,7 @@ from fastrod.types import Floats
 class DrumGain(Static):
     """Each drive pays out more or less wire than it reports: a drum of another radius, layers of wire.
 
-    Equation: dl_i -> (1 + g_i) dl_i, antagonists alike
+    Equation: dl_i -> (1 + g_i) dl_i, antagonists alike (the part that bends)
     Source: definition; multi-layer winding of a drum
     Residual signature: in proportion to the bend, per drive, blind to speed and load
     """

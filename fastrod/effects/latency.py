@@ -14,9 +14,9 @@ from fastrod.wiring import Wiring
 class Latency(Operator):
     """Delay between command and measured tip, of the drives, the bus and the camera together.
 
-    Equation: l(t) = l_cmd(t - d), a monotone cubic between samples
+    Equation: l(t) = l_cmd(t - d), a cubic between samples; d is cut to the last 128 samples
     Source: transport delay; sensor delay as a parameter, as in MATLAB System Identification (delay of a process model)
-    Residual signature: along the velocity of the predicted tip, zero at rest, the same at every speed per speed
+    Residual signature: along the velocity of the predicted tip and in proportion to it, zero at rest
     """
 
     seam = Seam.ACTUATION

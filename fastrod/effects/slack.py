@@ -15,7 +15,7 @@ from fastrod.types import Floats
 class Slack(Static):
     """Dead zone at neutral: an antagonistic pair that hangs loose before either wire pulls.
 
-    Equation: dl -> sgn(dl) max(|dl| - w, 0)
+    Equation: dl -> sgn(dl) max(|dl| - w, 0) (the part that bends)
     Source: dead zone of slack wires, T = max(0, k lambda)
     Residual signature: static, odd, only around neutral of each pair; no loop
     """

@@ -15,7 +15,7 @@ from fastrod.types import Floats
 class Stiffening(Static):
     """The body gets stiffer (or softer) as it bends, and its wires stretch for it.
 
-    Equation: theta -> theta (1 - c |theta|^2) in each segment
+    Equation: theta -> theta (1 - c min(|theta|^2, 2)) in each segment
     Source: Yeoh 1993, cubic term of a hyperelastic bending moment against wires in series
     Residual signature: odd and cubic in the bend, static
     """

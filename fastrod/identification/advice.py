@@ -50,7 +50,7 @@ def separating_run(one: str, other: str) -> str:
     if run is None:
         both = [getattr(get_effect(name), "excited_by", "") for name in (one, other)]
         run = "; ".join(dict.fromkeys(text for text in both if text)) or "motion over the whole workspace at two speeds, with holds"
-    return f"to tell {one} from {other}: {run}"
+    return f"to tell {one.replace('_', ' ')} from {other.replace('_', ' ')}: {run}"
 
 
 def look_at(pattern: str) -> str:
@@ -93,6 +93,7 @@ def missing_excitation(samples: Samples, bend: Floats) -> list[str]:
 
 
 def unique(lines: Sequence[str]) -> list[str]:
+    """Each line once, in order."""
     return list(dict.fromkeys(lines))
 
 

@@ -107,7 +107,7 @@ def assemble(
         patterns=opinion.patterns,
         tried=_tried(steps[0], kept, base) if steps else [],
         path=path,
-        bounds=search.bounds(state),
+        bounds=search.bounds(final),
         advice=advice.unique([*recommended, *lacks]),
         notes=base.notes,
         solves=base.rod.runs,

@@ -104,7 +104,7 @@ class Base:
         for u, narrowed, prior in zip(model.unknowns, posterior, sd, strict=True):
             if narrowed > SEEN * prior:
                 fixed[u.name] = Estimate(
-                    value=u.start,
+                    value=u.start if u.place[0] == "robot" else u.mean,
                     stderr=float(prior),
                     unit=u.unit,
                     identifiable=False,
@@ -157,5 +157,6 @@ def check_log(samples: Samples, robot: Robot) -> None:
 
 
 def rms(residual: Floats) -> float:
+    """Root mean square of a residual (n, n_out), rows that do not count left out."""
     counted = residual[np.any(residual != 0.0, axis=1)]
     return float(np.sqrt(np.mean(counted**2))) if counted.size else 0.0

@@ -95,12 +95,20 @@ def _log_time(local: Local) -> Floats:
     return np.cumsum(samples.dt)[samples.rows]
 
 
+def _when(local: Local, at: float) -> str:
+    """A moment of `_log_time` in the log's own time, with its run where there are several."""
+    samples = local.samples
+    row = int(samples.rows[int(np.argmax(_log_time(local) > at))])
+    run = f" of run {samples.log.run[row]!r}" if len(samples.runs) > 1 else ""
+    return f"{samples.log.t[row]:.1f} s{run}"
+
+
 def _bump(local: Local) -> Iterator[Foil]:
     t = _log_time(local)
     for at in np.quantile(t, np.linspace(0.03, 0.97, _TIMES)):
         step = (t > at).astype(float)
         columns = _sensed(local, step[:, None, None] * np.eye(3)[None])
-        yield Foil("bump", "drift", f"the measured tip jumps at {at:.1f} s and stays: base or camera was moved", columns, 1)
+        yield Foil("bump", "drift", f"the measured tip jumps at {_when(local, at)} and stays: base or camera was moved", columns, 1)
 
 
 def _slip(local: Local) -> Iterator[Foil]:
@@ -113,7 +121,7 @@ def _slip(local: Local) -> Iterator[Foil]:
         for drive in range(wiring.n_drives):
             pull = np.where(wiring.drive == drive, wiring.drive_sign, 0.0)
             columns = _weighted(local, (local.by_bend @ wiring.bend(pull).ravel() * step[:, None])[..., None])
-            yield Foil("slip", "drift", f"the zero of drive {drive + 1} jumps at {at:.1f} s: its wire slipped", columns, 2)
+            yield Foil("slip", "drift", f"the zero of drive {drive + 1} jumps at {_when(local, at)}: its wire slipped", columns, 2)
 
 
 def _sway(local: Local, residual: Floats) -> Iterator[Foil]:

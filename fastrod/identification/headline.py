@@ -20,6 +20,7 @@ def explained(result: Result) -> float:
 
 
 def header(result: Result) -> str:
+    """Log, robot and sample counts, in a line."""
     log = result.log
     used = f"{int(result.used.sum())} samples fitted, {int((result.tested & result.measured).sum())} held out"
     return (
@@ -29,6 +30,7 @@ def header(result: Result) -> str:
 
 
 def hero(result: Result) -> str:
+    """The first screen: verdict, error before and after, effects, what cannot be told, what to do."""
     error = f"<h3>Tip error on samples that no fit has seen</h3>{_numbers(result)}{_bars(result)}"
     left, right = [("a", error), ("c", _told_apart(result))], [("b", _found(result))]
     (left if len(result.effects) > 1 else right).append(("d", _next(result)))

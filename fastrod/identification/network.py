@@ -36,7 +36,7 @@ def residual_network(samples: Samples, wiring: Wiring, result: Result) -> dict[s
     inputs = np.concatenate([static, memory], axis=1)
     residual = result.residual_after
     train = result.used & np.isfinite(residual).all(1)
-    test = result.tested & np.isfinite(residual).all(1)
+    test = result.tested & ~result.outlier & np.isfinite(residual).all(1)
     scale = float(residual[train].std())
     model = make_pipeline(
         StandardScaler(), MLPRegressor(hidden_layer_sizes=_LAYERS, alpha=1e-2, early_stopping=True, max_iter=300, random_state=0)

@@ -158,7 +158,11 @@ def _remaining(result: Result, signals: Signals) -> str:
         )
         parts.append(figure(figures.left_over_time(result, signals), caption))
     if result.network:
-        parts.append(listed(f"with a network on what is left, {words(key)}: {rounded(value, 3)}" for key, value in result.network.items()))
+        with_it = result.network["held_out_rms_m"]
+        parts.append(
+            f"<p>A network on what is left brings the held-out error from {millimetres(result.test.after)} to {millimetres(with_it)} mm; "
+            "it names nothing and is no part of <em>after</em>.</p>"
+        )
     lead = f"{percent(result.remaining_share)} of the error above the noise remains unexplained."
     if result.remaining_share == 0.0:
         lead = "Nothing that held-out blocks confirm: what is left looks like noise."

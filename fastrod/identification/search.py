@@ -355,7 +355,8 @@ class Search:
                 if not u.shape:
                     theta[j] = u.mean
             at = state.local.residual(model, theta)
-            worst = 0.0
+            worst: dict[str, float] = {}
+            units: dict[str, str] = {}
             sizes = [j for j, u in enumerate(model.unknowns) if j >= n and not u.shape]
             for j in sizes:
                 u = model.unknowns[j]
@@ -365,11 +366,16 @@ class Search:
                 column = (at - state.local.residual(model, moved)).ravel() / step
                 cross = flat.T @ column
                 power = float(column @ column - cross @ np.linalg.lstsq(base, cross, rcond=1e-12)[0])
+                # x, y, z of one kind, and drives, are one size; a bound in another unit is a bound of its own
+                kind = next(p.name for p in get_effect(name).parameters if u.name.partition(".")[2].startswith(p.name))
+                key = kind if kind[-2:] not in ("_x", "_y", "_z") and kind not in ("x", "y", "z") else kind[:-1].rstrip("_")
                 if power <= 1e-6 * float(column @ column) or power * u.scale**2 < 1e-2:
-                    worst = np.inf
+                    worst[key] = np.inf
                     continue
                 estimate = float(column @ state.fit.residual.ravel()) / power
-                worst = max(worst, abs(estimate) + 3.0 * inflate / np.sqrt(power))
-            first = model.unknowns[sizes[0]]
-            made.append(Bound(name, first.name.partition(".")[2], first.unit, worst if np.isfinite(worst) else float("nan")))
+                worst[key] = max(worst.get(key, 0.0), abs(estimate) + 3.0 * inflate / np.sqrt(power))
+                units[key] = u.unit
+            made += [
+                Bound(name, key or "size", units.get(key, ""), size if np.isfinite(size) else float("nan")) for key, size in worst.items()
+            ]
         return made

@@ -118,7 +118,7 @@ class Model:
         return _whole(robot, self.robot)
 
     def identified(self, theta: Floats) -> Robot:
-        """The robot with its effects as tables, and nothing left to fit but what was not fitted."""
+        """The robot with its effects as tables; `[fit]` and `[sensor]` are left out, for what they asked for is in it now."""
         tables = []
         for name, values in self.values(theta).items():
             table: dict[str, Any] = {"name": name}
@@ -129,7 +129,7 @@ class Model:
                 at += count
                 table[parameter.name] = part[0] if len(set(part)) == 1 else part
             tables.append(table)
-        return replace(self.robot_at(theta), effects=tuple(tables))
+        return replace(self.robot_at(theta), effects=tuple(tables), fit={}, sensor={})
 
 
 def known_model(robot: Robot) -> Model:
@@ -199,7 +199,7 @@ def _targets(robot: Robot, wiring: Wiring, target: str, prior: Mapping[str, floa
     count = robot.n_segments if word == "segment" else robot.n_tendons
     if number != "*" and not 1 <= int(number) <= count:
         raise RobotError(f"robot {robot.name!r}: [fit] {target!r}; the robot has {word}s 1 to {count}.")
-    unknown = [key for key in prior if key not in ("sd", "mean", "shared")]
+    unknown = [key for key in prior if key not in ("sd", "shared")]
     if unknown or "sd" not in prior:
         raise RobotError(
             f"robot {robot.name!r}: [fit] {target!r} is {dict(prior)!r}; give {{sd = ...}} in its unit, and shared = true for one for all."

@@ -21,6 +21,8 @@ _MIN_EXCESS = 0.03  # of the noise's variance
 
 @dataclass(frozen=True)
 class Opinion:
+    """A verdict and what goes with it."""
+
     verdict: Verdict
     summary: str
     kind: str
@@ -58,13 +60,14 @@ def judge(
         return Opinion("not_in_library", f"{why}; it is {_words(kind)}.", kind, left, (), False)
     if not found:
         return Opinion("not_in_library", f"No effect of the library explains the residual: {patterns[0]}.", kind, 1.0, patterns, False)
-    names = ", ".join(found[:-1]) + " and " + found[-1] if len(found) > 1 else found[0]
+    spoken = [name.replace("_", " ") for name in found]
+    names = ", ".join(spoken[:-1]) + " and " + spoken[-1] if len(found) > 1 else spoken[0]
     left = left if np.isnan(left_out) else max(left, min(left_out, 1.0))
     if left <= _EXPLAINED:
         more = f" What little remains: {patterns[0]}." if patterns else ""
         gone = 100.0 * (1.0 - (left if np.isnan(left_out) else min(max(left_out, 0.0), 1.0)))
         it = "it" if len(found) == 1 else "them"
-        said = f"The model lacked {names}; with {it}, {gone:.0f} % of the held-out error above the noise is gone.{more}"
+        said = f"The model lacked {names}; with {it}, {_share(gone)} of the held-out mean square above the noise is gone.{more}"
         return Opinion("explained", said, kind if left > 0.02 else "none", left, patterns, False)
     if foreign > _FOREIGN or left > _PARTLY:
         what = f": {patterns[0]}" if patterns else f"; what is left is {_words(kind)}"
@@ -75,12 +78,16 @@ def judge(
     what = f": {patterns[0]}" if patterns else f"; it is {_words(kind)}"
     return Opinion(
         "partly_explained",
-        f"The model lacked {names}, but {100 * left:.0f} % of the error above the noise remains{what}.",
+        f"The model lacked {names}, but {100 * left:.0f} % of the mean square above the noise remains{what}.",
         kind,
         left,
         patterns,
         False,
     )
+
+
+def _share(percent: float) -> str:
+    return "over 99 %" if 99.0 < percent < 100.0 else f"{percent:.0f} %"
 
 
 def _words(kind: str) -> str:
@@ -89,5 +96,5 @@ def _words(kind: str) -> str:
         "memory": "a function of the inputs before",
         "drift": "slow in time, whatever the inputs",
         "unknown": "a signal that no input explains",
-        "none": "hardly above the noise",
+        "none": "of no kind that the audit can tell",
     }[kind]

@@ -83,6 +83,8 @@ def percent(share: float) -> str:
     """A share of one, never rounded up to all of it."""
     if not math.isfinite(share):
         return NOTHING
+    if 0.99 < share < 1.0:
+        return "over 99 %"
     return f"{100 * share:.0f} %" if abs(share) >= 0.0995 or share == 0.0 else f"{100 * share:.1f} %"
 
 
@@ -120,7 +122,7 @@ def law(name: str) -> dict[str, str]:
 def bound_sentence(bound: Bound) -> str:
     """From which size on an effect would have shown."""
     stem = re.sub(r"_([xyz]|\d+)$", "", bound.parameter)
-    noun = _NOUNS.get(stem, f"component along {stem}" if len(stem) == 1 else words(stem))
+    noun = _NOUNS.get(stem, f"component along {stem}" if len(stem) == 1 else "size" if stem == "size" else words(stem))
     if not math.isfinite(bound.value):
         needs = str(getattr(get_effect(bound.name), "excited_by", ""))
         return f"this log cannot show {words(bound.name)}" + (f"; it takes {needs}" if needs else "")
