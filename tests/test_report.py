@@ -56,7 +56,7 @@ def wild(result: Result) -> Result:
         result, log=replace(result.log, name="a <script>alert(1)</script> & $x$"), effects=[*result.effects, *more], base_parameters=base,
         remaining=Audit(0.1, 0.05, 0.02, 0.01, 3.0), remaining_kind="static", remaining_share=0.12, patterns=["it <jumps>"],
         test=replace(result.test, interval=(NAN, NAN)), advice=["turn <it>"], notes=["odd & even"], verdict="partly_explained",
-        network={"held_out": 0.0003},
+        network={"held_out_rms_m": 0.0003, "inputs": 40.0},
     )  # fmt: skip
 
 

@@ -143,9 +143,9 @@ def test_a_foil_beside_an_effect_counts_by_what_it_takes(foreign: float, verdict
 
 
 def test_the_share_that_is_gone_is_of_the_held_out_error() -> None:
-    assert "98 % of the held-out error" in found(0.0, left_out=0.02).summary
-    assert "100 % of the held-out error" in found(0.0, left_out=0.0).summary
-    assert "99 % of the held-out error" in found(0.01, left_out=float("nan")).summary
+    assert "98 % of the held-out mean square" in found(0.0, left_out=0.02).summary
+    assert "100 % of the held-out mean square" in found(0.0, left_out=0.0).summary
+    assert "99 % of the held-out mean square" in found(0.01, left_out=float("nan")).summary
 
 
 def test_several_effects_are_listed() -> None:
