@@ -39,7 +39,7 @@ def assemble(
     inspected = audit(search.samples, last.model.wiring, last.fit.residual, base.noise.lag1)
     squares = {"base": _square(start, base.weights[0]), "library": _square(state, base.target.sigma)}
     squares["after"] = min(squares["library"], _square(last, last_sigma))
-    order = np.argsort([-_gain(search, state, name) for name in found]) if len(found) > 1 else range(len(found))
+    order = np.argsort([-_own(state, name) for name in found]) if len(found) > 1 else range(len(found))
     found = [found[int(i)] for i in order]
     if len(rows) > len(search.samples.rows):
         whole = base.on(samples.on(rows), start)
@@ -120,9 +120,14 @@ def _square(state: State, sigma: Floats) -> float:
     return float(np.mean(((counted * sigma) ** 2).sum(1))) if len(counted) else 0.0
 
 
-def _gain(search: Search, state: State, name: str) -> float:
-    """Loss that comes back when an effect is taken out."""
-    return search.without(state, name).fit.loss - state.fit.loss
+def _own(state: State, name: str) -> float:
+    """How far an effect by itself moves the prediction: squares over the samples, the other parameters as they are."""
+    theta = state.theta.copy()
+    for j, unknown in enumerate(state.model.unknowns):
+        if unknown.place[:2] == ("effect", name) and not unknown.shape:
+            theta[j] = unknown.mean
+    with_it, without = (state.local.residual(state.model, at) for at in (state.theta, theta))
+    return float(((with_it - without) ** 2).sum())
 
 
 def _effect(

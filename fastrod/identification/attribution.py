@@ -28,6 +28,7 @@ from fastrod.types import Ints
 MAX_EFFECTS = 4
 _SEARCH_ROWS = 1500  # samples that the search looks at; the operators run over all, and what is found is fitted to all
 _MENDS = 0.02  # of the error above the noise: an effect beside a dominant one that brings less is not named
+_SPARE = 2  # effects beyond max_effects that the search may hold: among many small ones the dominant one may come late
 _MORE_STAGES = 3  # beyond max_effects: foils take stages too
 
 
@@ -67,15 +68,15 @@ def identify(
         raise LogError(f"log {log.name!r} leaves {len(train)} rows to fit once {', '.join(labels)} are held out; it needs {LEAST_ROWS}.")
     model = base_model(robot, free_camera=free_camera)
     chosen = _thinned(train, _SEARCH_ROWS)
-    tell("base fit", 0, max_effects + 2)
+    tell("base fit", 0, max_effects + _SPARE + 2)
     base = Base(samples.on(chosen), train, model, robot, threads)
     search = Search(base.samples, base.rod, base.target, base.block, frozenset(exclude))
     start, fixed = base.fit(search)
     check_motion(base, start)
-    found, last, steps = _found(search, base, start, max_effects, tell)
+    found, last, steps = _found(search, base, start, max_effects + _SPARE if max_effects else 0, tell)
     last_sigma = base.weights[-1]
     state, found = _library(search, base, start, last, found, max_effects, steps) if found else (start, found)
-    tell("prediction on all samples", max_effects + 1, max_effects + 2)
+    tell("prediction on all samples", max_effects + _SPARE + 1, max_effects + _SPARE + 2)
     result = assemble(
         samples=samples, rows=_thinned(train, ALL_AT_ONCE), tested=tested, labels=labels, base=base, search=search, start=start, last=last,
         last_sigma=last_sigma, state=state, found=found, steps=steps, fixed=fixed, threads=threads,
@@ -90,7 +91,7 @@ def _found(
     state, steps = start, list[Step]()
     found: list[str] = []
     for stage in range(max_effects + _MORE_STAGES):
-        search.report = lambda name, stage=stage: tell(name, min(stage + 1, max_effects + 1), max_effects + 2)  # type: ignore[misc]
+        search.report = lambda name, stage=stage: tell(name, min(stage + 1, max_effects), max_effects + 2)  # type: ignore[misc]
         step = search.stage(state)
         if step.taken is None and stage == 0:
             pair = _pair(search, state, step)
@@ -122,6 +123,10 @@ def _library(
     if len(found) > 1:
         excess = start.fit.loss * float((base.weights[0] ** 2).mean()) - noise
         alone, found = search.eliminated(alone, found, _MENDS * max(excess, 0.0), noise)
+    while len(found) > max_effects:
+        fewer = {name: search.without(alone, name) for name in found}
+        least = min(fewer, key=lambda name: fewer[name].fit.loss)
+        alone, found = fewer[least], [name for name in found if name != least]
     return base.weighed(search, alone), found
 
 

@@ -35,7 +35,7 @@ def left(residual: np.ndarray) -> tuple[float, float]:
     """Held-out rms of a residual, without the network and with it [m]."""
     here = samples()
     tested, _ = held_out_rows(here, ())
-    result = SimpleNamespace(residual_after=residual, used=~tested, tested=tested)
+    result = SimpleNamespace(residual_after=residual, used=~tested, tested=tested, outlier=np.zeros_like(tested))
     told = residual_network(here, wire(one_segment()), result)  # type: ignore[arg-type]
     assert told["inputs"] > 4
     return float(np.sqrt((residual[tested] ** 2).sum(1).mean())), told["held_out_rms_m"]
@@ -65,7 +65,7 @@ def test_missing_rows_are_left_out() -> None:
     residual[::7] = np.nan
     here = samples()
     tested, _ = held_out_rows(here, ())
-    result = SimpleNamespace(residual_after=residual, used=~tested, tested=tested)
+    result = SimpleNamespace(residual_after=residual, used=~tested, tested=tested, outlier=np.zeros_like(tested))
     assert np.isfinite(residual_network(here, wire(one_segment()), result)["held_out_rms_m"])  # type: ignore[arg-type]
 
 
