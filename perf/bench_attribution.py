@@ -21,6 +21,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "truth"))
 
 NOISE = 3e-4  # m
+FIRST_SEED = 1000  # rules were set while looking at these; other seeds are a fairer test
 COUNTS = {"single": 200, "none": 100, "outside": 60, "two": 60, "dominant": 40, "deleted": 60, "operator": 50, "noise": 24, "segments": 26}
 GOALS = {
     "single": ">= 95 % right effect first; held-out <= 1.15 x floor",
@@ -42,7 +43,7 @@ class Case:
     what: str
 
 
-def cases(share: float, only: Iterable[str]) -> list[Case]:
+def cases(share: float, only: Iterable[str], first_seed: int = FIRST_SEED) -> list[Case]:
     """The list of sealed logs; a case draws its parameters from its seed alone."""
     import plant
 
@@ -53,7 +54,7 @@ def cases(share: float, only: Iterable[str]) -> list[Case]:
         names = {
             "outside": plant.OUTSIDE, "none": ("none",), "two": ("two",), "dominant": ("dominant",), "segments": plant.library(2),
         }.get(kind, plant.library(1))  # fmt: skip
-        made += [Case(kind, 1000 + i, names[i % len(names)]) for i in range(max(1, round(share * count)))]
+        made += [Case(kind, first_seed + i, names[i % len(names)]) for i in range(max(1, round(share * count)))]
     return sorted(made, key=lambda case: (case.seed, case.kind))  # a run that is stopped has some of each
 
 
@@ -184,11 +185,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--share", type=float, default=1.0, help="of each case's count")
     parser.add_argument("--only", default="", help="cases, separated by commas")
+    parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--rows", type=Path, help="write one JSON line a log there")
     given = parser.parse_args(argv)
     os.environ |= {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    todo = cases(given.share, [k for k in given.only.split(",") if k])
+    todo = cases(given.share, [k for k in given.only.split(",") if k], given.first_seed)
     rows: list[dict[str, Any]] = []
     with multiprocessing.get_context("spawn").Pool(given.processes) as pool:
         for row in pool.imap_unordered(_safely, todo):

@@ -102,7 +102,7 @@ def run(sim: Simulator, lengths: np.ndarray, *, moving: bool = False, first: int
     return {name: np.array(a) for name, a in seen.items()}
 
 
-def same(one: Seen, two: Seen, rows_one: Any = slice(None), rows_two: Any = slice(None)) -> None:
+def assert_same(one: Seen, two: Seen, rows_one: Any = slice(None), rows_two: Any = slice(None)) -> None:
     for name, a in one.items():
         assert_array_equal(a[:, rows_one], two[name][:, rows_two], err_msg=name)
 
@@ -114,8 +114,8 @@ def test_a_neutral_effect_is_the_base_model_bit_for_bit(name: str, robot: Robot)
     base = run(simulator(robot), lengths, moving=True)
     for shaped in (False, True):
         with_effect = having(robot, at_neutral(name, robot, shaped=shaped))
-        same(base, run(simulator(with_effect), lengths, moving=True))
-    same(base, run(simulator([with_effect] * N_ROBOTS), lengths, moving=True))
+        assert_same(base, run(simulator(with_effect), lengths, moving=True))
+    assert_same(base, run(simulator([with_effect] * N_ROBOTS), lengths, moving=True))
     one, two = simulator(robot), simulator(with_effect)
     assert_array_equal(one.settle(lengths[0]).position, two.settle(lengths[0]).position)
 
@@ -123,7 +123,7 @@ def test_a_neutral_effect_is_the_base_model_bit_for_bit(name: str, robot: Robot)
 def test_the_whole_library_at_once_at_neutral_is_the_base_model() -> None:
     robot = two_segments()
     everything = having(robot, *(at_neutral(name, robot) for name in reversed(NAMES)))
-    same(run(simulator(robot), commands(robot), moving=True), run(simulator(everything), commands(robot), moving=True))
+    assert_same(run(simulator(robot), commands(robot), moving=True), run(simulator(everything), commands(robot), moving=True))
 
 
 @ROBOTS
@@ -151,21 +151,21 @@ def test_snapshot_and_reset_take_the_effects_along(name: str) -> None:
     sim = simulator(having(robot, at_typical(name, robot)))
     whole = run(sim, lengths)
     sim.reset()
-    same(whole, run(sim, lengths))
+    assert_same(whole, run(sim, lengths))
     sim.reset()
     run(sim, lengths[:7])
     kept = sim.snapshot()
     rest = [run(sim, lengths[7:], first=7)]
     sim.restore(kept)
     rest.append(run(sim, lengths[7:], first=7))
-    same(*rest)
-    same({key: a[7:] for key, a in whole.items()}, rest[0])
+    assert_same(*rest)
+    assert_same({key: a[7:] for key, a in whole.items()}, rest[0])
     sim.restore(kept)
     sim.reset([1])
     after = run(sim, lengths[7:], first=7)
-    same(rest[0], after, [0, 2], [0, 2])
+    assert_same(rest[0], after, [0, 2], [0, 2])
     fresh = run(simulator(having(robot, at_typical(name, robot))), lengths[7:], first=7)
-    same(fresh, after, [1], [1])
+    assert_same(fresh, after, [1], [1])
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -174,7 +174,7 @@ def test_a_batch_of_different_values_is_its_robots_bit_by_bit(name: str) -> None
     lengths = commands(robots[0])
     together = run(simulator(robots), lengths)
     for i, robot in enumerate(robots):
-        same(run(simulator(robot, 1), lengths, rows=[i]), together, [0], [i])
+        assert_same(run(simulator(robot, 1), lengths, rows=[i]), together, [0], [i])
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -187,16 +187,16 @@ def test_a_bad_input_spoils_no_memory(name: str) -> None:
     broken[5, 1, 2], broken[6, 1, 0] = np.nan, np.inf
     sim = simulator(robot)
     seen = run(sim, broken)
-    same(clean, seen, [0, 2], [0, 2])
+    assert_same(clean, seen, [0, 2], [0, 2])
     assert np.isnan(seen["position"][5:7, 1]).all()
     alone = run(simulator(robot, 1), np.delete(lengths, [5, 6], axis=0), rows=[1])
     state = sim.settle(broken[6], **given(robot, 6, False))  # type: ignore[arg-type]
     assert state.ok.tolist() == [True, False, True]
     assert np.isfinite(sim.jacobian()).all((1, 2)).tolist() == [True, False, True]
-    same(alone, {key: np.delete(a, [5, 6], axis=0) for key, a in seen.items()}, [0], [1])
+    assert_same(alone, {key: np.delete(a, [5, 6], axis=0) for key, a in seen.items()}, [0], [1])
     late = lengths.copy()
     late[0, 1] = np.nan  # and a robot whose first input is bad begins with its second
-    same(run(simulator(robot, 1), lengths[1:], rows=[1]), {key: a[1:] for key, a in run(simulator(robot), late).items()}, [0], [1])
+    assert_same(run(simulator(robot, 1), lengths[1:], rows=[1]), {key: a[1:] for key, a in run(simulator(robot), late).items()}, [0], [1])
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -326,7 +326,7 @@ def test_effects_of_a_robot_file_come_back_and_act(tmp_path: Path) -> None:
     assert again == robot
     assert list(again.effects) == list(tables)
     lengths = commands(robot, 4)
-    same(run(simulator(robot), lengths), run(simulator(again), lengths))
+    assert_same(run(simulator(robot), lengths), run(simulator(again), lengths))
     text = dumps(load_robot("prototype")) + '\n[[effect]]\nname = "play"\nhalf_width = 0.0002\n'
     (link,) = Simulator(loads(text)).__dict__["_chain"].links
     assert (link.name, link.values.tolist()) == ("backlash", [[0.0002, 0.0]])
@@ -484,7 +484,7 @@ def test_a_users_effect_works_where_the_librarys_do() -> None:
     there = Simulator(rod(line_density=0.1)).settle(bend(robot, 0.5, 0.0))
     assert_allclose(here.position, there.position, atol=1e-14)
     base = run(simulator(two_segments()), commands(two_segments()), moving=True)
-    same(base, run(simulator(having(two_segments(), {"name": "weight"})), commands(two_segments()), moving=True))
+    assert_same(base, run(simulator(having(two_segments(), {"name": "weight"})), commands(two_segments()), moving=True))
     unregister("weight")
     with pytest.raises(UnknownNameError, match="no effect 'weight'"):
         Simulator(robot)

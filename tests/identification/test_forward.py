@@ -96,7 +96,7 @@ def predicted(robot: Robot, what: RunLog) -> Pose:
     return pose
 
 
-def alike(one: Pose, two: Pose, length: float) -> None:
+def assert_alike(one: Pose, two: Pose, length: float) -> None:
     """Both settled, one to 1e-8 of the length: some of that at the tip, and over the length in angle."""
     assert_allclose(one.position, two.position, atol=3e-8 * length)
     assert_allclose(one.points, two.points, atol=3e-8 * length)
@@ -116,7 +116,7 @@ def test_a_log_in_one_go_is_a_simulator_step_by_step(name: str) -> None:
     robot = having(two_segments(), {"name": name} | TABLES[name])
     what = log(robot)
     found = predicted(robot, what)
-    alike(found, stepped(robot, what), robot.length)
+    assert_alike(found, stepped(robot, what), robot.length)
     assert np.abs(found.position - predicted(two_segments(), what).position).max() > 1e-4  # and the effect is there
 
 
@@ -124,13 +124,13 @@ def test_all_effects_at_once_are_the_simulator() -> None:
     """With static ones before, between and after those with a memory."""
     robot = having(two_segments(), *({"name": name} | table for name, table in TABLES.items()), *STATIC)
     what = log(robot)
-    alike(predicted(robot, what), stepped(robot, what), robot.length)
+    assert_alike(predicted(robot, what), stepped(robot, what), robot.length)
 
 
 def test_static_effects_are_the_simulator() -> None:
     robot = having(two_segments(), *STATIC)
     what = log(robot)
-    alike(predicted(robot, what), stepped(robot, what), robot.length)
+    assert_alike(predicted(robot, what), stepped(robot, what), robot.length)
 
 
 def test_several_runs_begin_with_no_memory() -> None:
@@ -154,7 +154,7 @@ def test_several_runs_begin_with_no_memory() -> None:
     assert_allclose(samples.dt[1:N], np.diff(alone.t), rtol=1e-12)
     found = predicted(robot, both)
     for part, single in zip(samples.runs, (alone, other), strict=True):
-        alike(Pose(*(a[part] for a in found)), predicted(robot, single), robot.length)
+        assert_alike(Pose(*(a[part] for a in found)), predicted(robot, single), robot.length)
     # and as one run they would be something else
     merged = replace(both, run=np.full(2 * N, ""), t=0.05 * np.arange(2 * N))
     assert np.abs(predicted(robot, merged).position - found.position).max() > 1e-4
@@ -167,7 +167,7 @@ def test_a_loss_that_looks_at_some_rows_does_not_shorten_the_memory() -> None:
     samples = sample(what).on(np.array([3, 11, 12, 29]))
     model = base_model(robot)
     some = predict(model, model.start, samples, Rod(samples, robot, points=True))
-    alike(some, Pose(*(a[samples.rows] for a in whole)), robot.length)
+    assert_alike(some, Pose(*(a[samples.rows] for a in whole)), robot.length)
 
 
 def test_rows_without_a_tip_are_driven_and_rows_without_an_input_are_not_there() -> None:
@@ -227,6 +227,6 @@ def test_a_users_effect_without_a_sweep_goes_step_by_step(sluggish: str) -> None
     robot = having(two_segments(), {"name": sluggish, "tau": 0.2}, *tables)
     what = log(robot)
     found = predicted(robot, what)
-    alike(found, stepped(robot, what), robot.length)
+    assert_alike(found, stepped(robot, what), robot.length)
     assert np.abs(found.position - predicted(having(two_segments(), *tables), what).position).max() > 1e-3
     assert registry.columns(get_effect(sluggish), wire(robot)) == ["tau"]

@@ -116,7 +116,7 @@ ROD = {
 NOTHING = 0.01  # sigma, by a typical size: a slope that small is not compared; nobody can see it
 
 
-def compare(here: Place, model: Model, theta: np.ndarray, first: int, tolerance: dict[str, float]) -> None:
+def assert_slopes(here: Place, model: Model, theta: np.ndarray, first: int, tolerance: dict[str, float]) -> None:
     residual = here.local.residual(model, theta)
     J = here.local.slopes(model, theta, residual)
     assert J.shape == (*residual.shape, len(theta))
@@ -155,7 +155,9 @@ def near_neutral(name: str) -> tuple[Place, Model, np.ndarray, int]:
 def test_slopes_of_the_base_parameters() -> None:
     """Stiffness by a one-sided difference of 5 %, lengths of two."""
     here = base()
-    compare(here, here.model, here.theta, 0, {"bending_stiffness": 0.07, "torsional_stiffness": 0.05, "length": 0.01, **WIRES, **CAMERA})
+    assert_slopes(
+        here, here.model, here.theta, 0, {"bending_stiffness": 0.07, "torsional_stiffness": 0.05, "length": 0.01, **WIRES, **CAMERA}
+    )
 
 
 @pytest.mark.parametrize("name", [*WIRES, *CAMERA, *FORCE, *MEMORY])
@@ -164,12 +166,12 @@ def test_slopes_of_effects_that_need_no_rod(name: str) -> None:
     before = here.rod.runs
     here.local.slopes(model, theta, here.local.residual(model, theta))
     assert here.rod.runs - before <= 4 + 3  # at most what `by_bend` and `by_force` took, once
-    compare(here, model, theta, first, WIRES | CAMERA | FORCE | MEMORY)
+    assert_slopes(here, model, theta, first, WIRES | CAMERA | FORCE | MEMORY)
 
 
 @pytest.mark.parametrize("name", ROD)
 def test_slopes_of_effects_that_need_the_rod(name: str) -> None:
-    compare(*near_neutral(name), ROD)
+    assert_slopes(*near_neutral(name), ROD)
 
 
 @pytest.mark.parametrize("name", ROD)
