@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from fastrod.compile import Rest
 from fastrod.errors import InputError
+from fastrod.kernels.batch import place_all
 from fastrod.types import Floats, Layout, Params, Ports
 
 PointForces: TypeAlias = Sequence[tuple[ArrayLike, ArrayLike]]
@@ -35,6 +36,8 @@ class Reader:
     def __init__(self, layout: Layout, params: Params, rest: Rest, n_robots: int) -> None:
         self.layout, self.params, self.rest, self.n_robots = layout, params, rest, n_robots
         self.problems: dict[int, str] = {}
+        self.loads: tuple[Floats, Floats] = (np.zeros((1, 0)), np.zeros((1, 0, 3)))
+        """Point forces of the last ports: arclength (n, m) [m] and force (n, m, 3) world [N]."""
 
     def ports(self, given: Inputs) -> Ports:
         """The ports of one step; `problems` then names the robots whose inputs are not usable."""
@@ -171,6 +174,7 @@ class Reader:
         """The grid with a node at each point force, and the forces on the nodes."""
         layout, params = self.layout, self.params
         n_segments, n_steps = len(layout.first_tendon), layout.n_steps
+        self.loads = np.zeros((1, 0)), np.zeros((1, 0, 3))
         if point_force is None or (isinstance(point_force, (list, tuple)) and not point_force):
             return np.zeros((0, n_segments, n_steps + 1)), np.zeros((0, n_segments * n_steps + 1, 3))
         try:
@@ -188,11 +192,18 @@ class Reader:
             ((s < 0.0) | (s > total * (1.0 + 1e-9))).any(1),
             lambda i: f"point_force at arclength {s[i]} m; the rod runs from 0 to {total[i, 0]:.6g} m.",
         )
-        grid = np.broadcast_to(np.linspace(0.0, 1.0, n_steps + 1), (n, n_segments, n_steps + 1)).copy()
+        grid, node = np.empty((n, n_segments, n_steps + 1)), np.empty(s.shape, np.int64)
+        if (crowded := place_all(np.ascontiguousarray(s), np.ascontiguousarray(starts), n_steps, grid, node)) >= 0:
+            raise InputError(
+                f"the point forces on one segment of robot {crowded} are more than its {n_steps} steps have nodes for; "
+                f"give Simulator more points_per_segment, up to {s.shape[1] + 1}."
+            )
+        force = np.stack([np.broadcast_to(f, (n, 3)) for f in forces], axis=1)
+        self.loads = s, force
         node_force = np.zeros((n, n_segments * n_steps + 1, 3))
-        for i in range(n):
-            for j, node in _place_nodes(s[i], starts[i], n_steps, grid[i]):
-                node_force[i, node] += forces[j][min(i, len(forces[j]) - 1)]
+        for q in range(s.shape[1]):
+            inside = np.flatnonzero(node[:, q] >= 0)
+            node_force[inside, node[inside, q]] += force[inside, q]
         return grid, node_force
 
 
@@ -223,30 +234,6 @@ def _per_step(sampled: Floats, nodes: Floats) -> Floats:
     rise = 12.0 * (np.diff(M, axis=2) - middle * np.diff(F, axis=2)) / width**2
     pairs = np.stack([mean - 0.5 * rise, mean + 0.5 * rise], axis=3)
     return np.asarray(pairs.reshape(n, f.shape[1], -1, 3))
-
-
-def _place_nodes(s: Floats, starts: Floats, n_steps: int, grid: Floats) -> list[tuple[int, int]]:
-    """Move the nodes nearest to the arclengths s onto them (in `grid`); pairs of (which s, its node)."""
-    placed: list[tuple[int, int]] = []
-    segment = np.clip(np.searchsorted(starts, s, side="right") - 1, 0, len(starts) - 2)
-    fraction = (s - starts[segment]) / np.diff(starts)[segment]
-    for k in range(len(starts) - 1):
-        members = np.flatnonzero(segment == k)
-        inside = sorted({float(f) for f in fraction[members] if 1e-9 < f < 1.0 - 1e-9})
-        if len(inside) > n_steps - 1:
-            raise InputError(
-                f"{len(inside)} point forces on one segment of {n_steps} steps; "
-                f"give Simulator at least {len(inside) + 1} points_per_segment."
-            )
-        nodes, last = {0.0: 0, 1.0: n_steps}, 0
-        for i, f in enumerate(inside):
-            last = nodes[f] = int(np.clip(round(f * n_steps), last + 1, n_steps - len(inside) + i))
-        fixed = sorted(nodes.items())
-        grid[k] = np.interp(np.arange(n_steps + 1), [node for _, node in fixed], [f for f, _ in fixed])
-        for j in members:
-            f = float(fraction[j])
-            placed.append((int(j), k * n_steps + nodes.get(f, 0 if f < 0.5 else n_steps)))
-    return placed
 
 
 def _length_sentence(lengths: Floats, ends: Floats) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numba
@@ -11,6 +11,9 @@ from numpy.typing import ArrayLike
 
 from fastrod.chain import Chain, Measurement
 from fastrod.compile import compile_robots
+from fastrod.contact.engine import Engine
+from fastrod.contact.scene import ContactScene
+from fastrod.contact.step import Ways, contact_step
 from fastrod.errors import InputError, RobotError
 from fastrod.guess import cold_start
 from fastrod.inputs import Inputs, PointForces, Reader
@@ -22,9 +25,11 @@ from fastrod.robot import Robot
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.settle import settle
 from fastrod.state import Observer, Pose, Snapshot, State
-from fastrod.types import Flags, Floats, Ints, Memory, Params, Ports, Response, Shape
+from fastrod.types import Flags, Floats, Ints, Memory, Params, Ports, Probes, Response, Shape
 
 _config: Any = numba.config
+NO_PROBES = Probes(np.empty((0, 0), np.int64), np.empty((0, 0, 3)), np.empty((0, 0, 3)), np.empty((0, 0, 0)), np.empty((0, 0, 0)))
+_AT_REST = 1e-7  # m: contact and boundary of a step, where `settle` has a tolerance of its own
 _LOST = 0.1  # of the robot's length: a residual beyond it is no shape of this robot
 _SMALL = 4 * LANES  # robots below which starting threads costs more than it saves
 
@@ -50,12 +55,14 @@ class Simulator:
         outputs: Literal["full", "tip"] = "full",
         observer: Observer | None = None,
         threads: int | None = None,
+        contact: ContactScene | None = None,
     ) -> None:
         """Compile `robot` (one for all, or a list with one each) for `n_robots` and a time step `dt` [s].
 
         `points_per_segment` is the number of integration steps of a segment; the shape has n_segments times as many
         nodes and one more. `outputs="tip"` keeps only tip pose, residual and ok: some 2 kB a five-segment robot.
-        `threads` defaults to numba's; 1 is the serial twin. Raises `InputError`, `RobotError`.
+        `threads` defaults to numba's; 1 is the serial twin. `contact` is what the rods may touch; without it they pass
+        through everything. Raises `InputError`, `RobotError`.
         """
         robots = [robot] if isinstance(robot, Robot) else list(robot) if isinstance(robot, (list, tuple)) else []
         if not robots or not all(isinstance(r, Robot) for r in robots):
@@ -93,6 +100,12 @@ class Simulator:
         self._given = Inputs()
         self._state: State | None = None
         self._memory = self._new_memory(follower=False, track_force=False)
+        if contact is not None and not isinstance(contact, ContactScene):
+            raise InputError(f"contact is {contact!r}; give fastrod.contact.ContactScene(obstacles=[...]) or None.")
+        self._engine: Engine | None = None
+        if contact is not None:
+            rods = contact.rods(self.robots, self.n_robots, self._layout, self._params)
+            self._engine = Engine(contact, rods, self._params.length, self.n_points, self._threads)
 
     @property
     def n_points(self) -> int:
@@ -111,6 +124,8 @@ class Simulator:
         point_force: PointForces | None = None,
         follower_tip_force: ArrayLike | None = None,
         base_pose: ArrayLike | None = None,
+        obstacle_pose: Mapping[str, ArrayLike] | None = None,
+        obstacle_velocity: Mapping[str, ArrayLike] | None = None,
     ) -> State:
         """One observer pass: one forward integration per robot.
 
@@ -125,8 +140,16 @@ class Simulator:
         inputs change is corrected with the next pass, and shows as `residual`. When the tip force of running robots first
         moves, one pass more learns the gain for it (`passes` is 2). Raises `InputError` on a wrong shape, or where no
         robot's input is usable; a single bad row only clears that robot's `ok`.
+
+        With a contact scene: `obstacle_pose` name -> (7,) or (n_robots, 7) position and quaternion, world; what is not given
+        stays where it was. `obstacle_velocity` name -> (6,) or (n_robots, 6) linear [m/s] and angular [rad/s] velocity of the
+        obstacle's origin: slip is then counted by it, and not by how the pose has changed. Robots that touch something take
+        as many passes as bring contact and boundary to rest; `state.contacts` tells.
         """
         given = Inputs(tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force, follower_tip_force, base_pose)
+        if self._engine is not None:
+            return self._touch(self._engine, given, obstacle_pose, obstacle_velocity, None)
+        _refuse_obstacles(obstacle_pose, obstacle_velocity)
         tracked = len(self._memory.force_before) > 0
         ports, rows = self._read(given)
         process, noise = self.observer.process_noise * self.dt, self.observer.measurement_noise / self.dt
@@ -157,6 +180,8 @@ class Simulator:
         point_force: PointForces | None = None,
         follower_tip_force: ArrayLike | None = None,
         base_pose: ArrayLike | None = None,
+        obstacle_pose: Mapping[str, ArrayLike] | None = None,
+        obstacle_velocity: Mapping[str, ArrayLike] | None = None,
         tolerance: float = 1e-9,
     ) -> State:
         """Repeat the pass on frozen inputs until every boundary residual is below `tolerance` [m]; inputs as for `step`.
@@ -167,8 +192,70 @@ class Simulator:
         """
         _check_positive("tolerance", tolerance, "m")
         given = Inputs(tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force, follower_tip_force, base_pose)
+        if self._engine is not None:
+            return self._touch(self._engine, given, obstacle_pose, obstacle_velocity, tolerance)
+        _refuse_obstacles(obstacle_pose, obstacle_velocity)
         ports, rows = self._read(given)
         return self._settle(ports, rows, tolerance)
+
+    def _touch(
+        self, engine: Engine, given: Inputs, pose: Mapping[str, ArrayLike] | None, velocity: Mapping[str, ArrayLike] | None, tolerance: float | None
+    ) -> State:
+        """A step (`tolerance` None), or `settle`, with a contact scene."""
+        poses = engine.scene.moved(engine.poses, pose, self.n_robots)
+        velocities = engine.scene.velocities(velocity, self.n_robots)
+        start = self._ports
+        ports, rows = self._read(given)
+        engine.given_arclength, engine.given_force = self._reader.loads
+        engine.move(poses, velocities, self.dt)
+        shape = self._new_shape("full", True)
+        passes = np.zeros(self.n_robots, np.int64)
+
+        def run(which: Ints, at: Ports, into: Shape, probes: Probes) -> None:
+            self._pass(which, at, into, probes=probes, update=False, noise=1e-10 if self._layout.paper else 1e-20)
+
+        def free(which: Ints, at: Ports, into: Shape) -> Flags:
+            if tolerance is not None:
+                return bring_to_rest(which, at, into)
+            process, noise = self.observer.process_noise * self.dt, self.observer.measurement_noise / self.dt
+            self._pass(which, at, into, feed=True, carry=self._carry, process=process, noise=noise)
+            passes[which] += 1
+            well = np.isfinite(self._memory.x.sum(1)) & (into.residual < _LOST * self._params.reach)
+            return np.asarray(well & np.isin(self._all, which))
+
+        def bring_to_rest(which: Ints, at: Ports, into: Shape) -> Flags:
+            def once(some: Ints, there: Ports) -> Floats:
+                self._pass(some, there, into, noise=1e-10 if self._layout.paper else 1e-20)
+                return into.residual[some]
+
+            used = settle(which, self._warm, self._layout, self._params, at, self._memory, tolerance or 1e-9, once)
+            passes[which] += np.abs(used[which])
+            return np.asarray(used > 0)
+
+        ok, done = contact_step(
+            engine, Ways(free, bring_to_rest, run), rows, self._warm, start, ports, self._unloaded(ports), self._memory, shape,
+            tolerance or _AT_REST, passes,
+        )  # fmt: skip
+        self._begin_next(np.flatnonzero(ok), ports)
+        for i in rows[~ok[rows]]:
+            self._reader.problems.setdefault(int(i), engine.why(int(i), float(done[i])))
+        return self._finish(ports, shape, ok, np.where(ok, passes, -1), "contact")
+
+    def _unloaded(self, ports: Ports) -> Ports:
+        """The straight robot on the same base, without loads."""
+        ends = np.cumsum(self._params.length + ports.extension, axis=1)[:, self._layout.tendon_segment]
+        zeros: dict[str, Any] = {
+            name: 0.0 * getattr(ports, name)
+            for name in ("tension", "tip_force", "tip_moment", "follower_force", "line_force", "node_force")
+        }
+        return ports._replace(tendon_length=np.ascontiguousarray(ends), **zeros)
+
+    def _begin_next(self, rows: Ints, ports: Ports) -> None:
+        """What the next free step moves from, for robots that were brought here by contact."""
+        memory, led = self._memory, rows
+        memory.length_before[led] = np.broadcast_to(ports.tendon_length, (self.n_robots, ports.tendon_length.shape[1]))[led][:, self._layout.row_tendon]
+        if len(memory.force_before):
+            memory.force_before[led] = np.broadcast_to(ports.tip_force, (self.n_robots, 3))[led]
 
     def settle_ports(self, ports: Ports, params: Params, tolerance: float = 1e-9) -> State:
         """`settle` on what the kernel reads, with effects already in it: for those who carry effects over a whole log
@@ -390,18 +477,20 @@ class Simulator:
         process: float = 1.0,
         noise: float = 1.0,
         n_col: int | None = None,
+        probes: Probes = NO_PROBES,
     ) -> None:
         memory, layout = self._memory, self._layout
         follower, n_x = len(ports.follower_force) > 0, memory.x.shape[1]
+        n_probes = probes.node.shape[1]
         if n_col is None:
-            n_col = n_x + (3 if len(memory.force_before) and not follower else 0)
+            n_col = n_x + 3 * n_probes if n_probes else n_x + (3 if len(memory.force_before) and not follower else 0)
         n_e = len(layout.row_tendon) + (0 if layout.paper else 3) + (3 if follower else 0)
         parts = 1 if len(rows) <= _SMALL else min(self._threads, -(-len(rows) // LANES))
-        scratch = np.empty((parts, scratch_size(len(layout.tendon_segment), n_x, n_col, n_e)))
+        scratch = np.empty((parts, scratch_size(len(layout.tendon_segment), n_x, n_col, n_e, n_probes)))
         if response is None:
             response = Response(np.empty((0, 0, 0)), np.empty((0, 0, 0)), np.empty((0, 0)))
         body = pass_serial if parts == 1 else pass_parallel
-        body(rows, self._params, ports, layout, memory, shape, response, scratch, n_col, feed, carry, update, process, noise)
+        body(rows, self._params, ports, layout, memory, shape, response, probes, scratch, n_col, feed, carry, update, process, noise)
 
     def _finish(self, ports: Ports, shape: Shape, ok: Flags, passes: Ints, reason: str) -> State:
         """Note who is lost, so that nothing continues on NaN, and hand out the state."""
@@ -414,7 +503,8 @@ class Simulator:
         else:
             self._warm = ok.copy()
         self._ports = ports
-        self._state = State(**shape._asdict(), ok=ok, passes=passes, problems=problems)
+        contacts = None if self._engine is None else self._engine.contacts(shape, ok)
+        self._state = State(**shape._asdict(), ok=ok, passes=passes, problems=problems, contacts=contacts)
         return self._state
 
     def _last(self, what: str) -> tuple[State, Ports]:
@@ -451,6 +541,11 @@ class Simulator:
         turn = r1 @ np.swapaxes(r0, 1, 2)
         skew = 0.5 * np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=1)
         return np.concatenate([p1 - p0, skew], axis=1) / (2.0 * delta), (e1 - e0) / (2.0 * delta)
+
+
+def _refuse_obstacles(*given: object) -> None:
+    if any(given):
+        raise InputError("obstacles were given to a simulator without a contact scene; give it one: Simulator(robot, contact=...).")
 
 
 def _check_positive(name: str, value: float, unit: str) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from fastrod.contact.contacts import Contacts
 from fastrod.errors import InputError
 from fastrod.inputs import Inputs
 from fastrod.types import Flags, Floats, Ints, Memory, Params, Ports
@@ -71,6 +72,8 @@ class State:
     """(n_robots,) forward passes that were spent; -1 where `settle` did not converge, 0 where bad input left it nothing to do."""
     problems: Mapping[int, str]
     """Robot index -> what is wrong with it, for the robots that are not ok."""
+    contacts: Contacts | None = None
+    """What touches what; None without a contact scene."""
 
 
 class Pose(NamedTuple):

@@ -134,3 +134,88 @@ class Response(NamedTuple):
     """(n_robots, 6, n_col) change of the tip: position, world [m], and rotation vector, world [rad]."""
     error: Floats
     """(n_robots, n_e) the boundary residuals [m]."""
+
+
+class Surfaces(NamedTuple):
+    """The obstacles of a contact scene, each in its own frame; triangles of all meshes stand in the order of their hierarchies' leaves."""
+
+    kind: Ints
+    """(n_obstacles,) mesh, sphere, box, ...: the codes of `kernels.primitive`."""
+    size: Floats
+    """(n_obstacles, 3) of a simple shape [m]."""
+    sphere: Floats
+    """(n_obstacles, 4) centre and radius of a ball that holds the obstacle; radius infinite for a plane [m]."""
+    friction: Floats
+    """(n_obstacles,) Coulomb coefficient against the rod."""
+    compliance: Floats
+    """(n_obstacles,) depth per normal force; 0 is rigid [m/N]."""
+    root: Ints
+    """(n_obstacles,) link to the top of a mesh's hierarchy."""
+    box: Floats
+    """(n_nodes, 12) boxes of both children: lower corner, upper corner [m]."""
+    link: Ints
+    """(n_nodes, 2) to both children (`kernels.bvh`)."""
+    corner: Floats
+    """(n_faces, 9) corners of each triangle [m]."""
+    normal: Floats
+    """(n_faces, 7, 3) pseudonormals of face, edges ab, bc, ca, corners a, b, c."""
+
+
+class Probes(NamedTuple):
+    """Contact points of the robots of one pass, in the order of its rows: loads in, linear response out. Length 0 if none."""
+
+    node: Ints
+    """(n_rows, n_probes) node that the contact is on; -1 where there is none."""
+    force: Floats
+    """(n_rows, n_probes, 3) on the rod, world [N]."""
+    arm: Floats
+    """(n_rows, n_probes, 3) from the centreline to the point of contact, world [m]."""
+    motion: Floats
+    """(n_rows, 3 n_probes, 1 + 3 n_probes) motion of the contact points, world: first what closing the boundary does at these
+    forces [m], then the compliance [m/N]."""
+    unknown: Floats
+    """(n_rows, n_x, 1 + 3 n_probes) the same of the boundary unknowns."""
+
+
+class Rods(NamedTuple):
+    """What contact needs to know of the robots themselves."""
+
+    radius: Floats
+    """(n_robots, n_segments) [m]."""
+    first: Floats
+    """(n_robots,) arclength where contact begins: what is nearer to the base belongs to its mounting [m]."""
+    spacing: Floats
+    """(n_robots,) length of an integration step [m]."""
+    reach: Floats
+    """(n_robots,) length of the whole chain [m]."""
+    moment_scale: Floats
+    """(n_robots,) EI/l [N m]."""
+    tension_scale: Floats
+    """(n_robots,) EI/(d l) [N]."""
+    n_free: int
+    """Tendons whose tension is an unknown."""
+    n_steps: int
+    friction: float
+    """Coulomb coefficient of rod on rod."""
+    compliance: float
+    """Depth per normal force of rod on rod; 0 is rigid [m/N]."""
+    own: int
+    """1: a rod touches itself too."""
+
+
+class Touching(NamedTuple):
+    """The contacts of every robot, kept from one step to the next."""
+
+    count: Ints
+    """(n_robots,)"""
+    slot: Floats
+    """(n_robots, n_slots, SLOT) the numbers of one contact, in the order of `kernels.slots`."""
+
+
+class Clearance(NamedTuple):
+    """What is known about how far each node is from all obstacles: while it moves less, it need not be asked again."""
+
+    distance: Floats
+    """(n_robots, n_points) lower bound of the signed distance of the centreline; -inf where nothing is known [m]."""
+    position: Floats
+    """(n_robots, n_points, 3) where that was, world [m]."""

@@ -8,11 +8,17 @@ from types import FunctionType
 import numpy as np
 from numba import prange
 
+from fastrod.kernels.centreline import curve_of
 from fastrod.kernels.chunk import pass_chunk
 from fastrod.kernels.gather import feed_forward
 from fastrod.kernels.jit import LANES, entry, parallel_entry
+from fastrod.kernels.placing import place_nodes
+from fastrod.kernels.search import search_obstacles
 from fastrod.kernels.shape import Lanes
-from fastrod.types import Layout, Memory, Params, Ports, Response, Shape
+from fastrod.kernels.slots import T_FORCE, T_N, T_RADIUS, T_S
+from fastrod.kernels.strands import search_rods
+from fastrod.kernels.touch import Scenery, iterate_world, sweep_of, went_through
+from fastrod.types import Clearance, Floats, Ints, Layout, Memory, Params, Ports, Probes, Response, Shape, Touching
 
 
 @entry
@@ -29,6 +35,7 @@ def _pass(
     memory: Memory,
     shape: Shape,
     response: Response,
+    probes: Probes,
     scratch: Lanes,
     n_col: int,
     feed: bool,
@@ -51,16 +58,106 @@ def _pass(
             for w in range(LANES):
                 lanes[w] = robots[start + min(w, count - 1)]
             pass_chunk(
-                lanes, count, params, ports, layout, memory, shape, response, scratch[part], n_col, feed, carry, update, process, noise
+                lanes, count, params, ports, layout, memory, shape, response, probes, start, scratch[part],
+                n_col, feed, carry, update, process, noise,
+            )  # fmt: skip
+
+
+def _iterate(
+    worlds: Ints,
+    rows: Ints,
+    scenery: Scenery,
+    touching: Touching,
+    clearance: Clearance,
+    probes: Probes,
+    memory: Memory,
+    proposed: Floats,
+    unknown: Floats,
+    gap: Floats,
+    status: Ints,
+    scratch: Floats,
+) -> None:
+    """One contact iteration (`iterate_world`) of the worlds whose rows begin at worlds[0], worlds[1], ...; the last entry is the end."""
+    n_parts = scratch.shape[0]
+    for part in prange(n_parts):
+        for k in range(part, len(worlds) - 1, n_parts):
+            iterate_world(
+                worlds[k], worlds[k + 1], rows, scenery, touching, clearance, probes, memory, proposed, unknown, gap, status, scratch[part]
             )
 
 
-def _named(name: str) -> Callable[..., None]:
+@entry
+def place_all(s: Floats, starts: Floats, n_steps: int, grid: Floats, node: Ints) -> int:
+    """`place_nodes` for every row of s (n, m); the first row that does not fit, or -1."""
+    work, crowded = np.empty(s.shape[1]), -1
+    for i in range(len(s)):
+        if not place_nodes(s[i], starts[i], n_steps, grid[i], node[i], work) and crowded < 0:
+            crowded = i
+    return crowded
+
+
+@entry
+def arrange(
+    rows: Ints, touching: Touching, s_given: Floats, starts: Floats, n_steps: int, grid: Floats, node_given: Ints, probes: Probes
+) -> bool:
+    """Put a node under every contact of these robots, and under the point forces that were given (arclengths `s_given`
+    (n_robots, m)); fills the loads of `probes`. False where a segment has more of them than nodes."""
+    m, n_slots = s_given.shape[1], probes.node.shape[1]
+    s, node, work = np.empty(m + n_slots), np.empty(m + n_slots, np.int64), np.empty(m + n_slots)
+    fits = True
+    for r in range(len(rows)):
+        i = rows[r]
+        for q in range(m):
+            s[q] = s_given[i, q]
+        for q in range(n_slots):
+            s[m + q] = touching.slot[i, q, T_S] if q < touching.count[i] else np.nan
+        fits = place_nodes(s, starts[i if len(starts) > 1 else 0], n_steps, grid[i], node, work) and fits
+        for q in range(m):
+            node_given[i, q] = node[q]
+        for q in range(n_slots):
+            probes.node[r, q] = node[m + q]
+            for a in range(3):
+                taken = q < touching.count[i]
+                probes.force[r, q, a] = touching.slot[i, q, T_FORCE + a] if taken else 0.0
+                probes.arm[r, q, a] = -touching.slot[i, q, T_RADIUS] * touching.slot[i, q, T_N + a] if taken else 0.0
+    return fits
+
+
+def _look(
+    rows: Ints, scenery: Scenery, touching: Touching, clearance: Clearance, gap: Floats, found: Floats, n_found: Ints, scratch: Floats
+) -> None:
+    """Smallest gap of each robot and, in row order, its candidates for contact (`search_obstacles`); n_found is -1 where the
+    rod has gone through an obstacle since the last step."""
+    n_parts = scratch.shape[0]
+    for part in prange(n_parts):
+        for r in range(part, len(rows), n_parts):
+            i = rows[r]
+            if went_through(i, scenery, clearance, False, scratch[part]):
+                n_found[r] = -1
+                continue
+            n_found[r], gap[i] = search_obstacles(
+                curve_of(scenery.shape, i), sweep_of(i, scenery, scenery.margin), scenery.surfaces,
+                scenery.frames[i if len(scenery.frames) > 1 else 0], clearance.distance[i], clearance.position[i], scratch[part], found[r],
+            )  # fmt: skip
+
+
+@entry
+def look_at_rods(worlds: Ints, rows: Ints, scenery: Scenery, touching: Touching, gap: Floats) -> None:
+    """Lower each robot's smallest gap to that between rods (`search_rods`)."""
+    for k in range(len(worlds) - 1):
+        search_rods(worlds[k], worlds[k + 1], rows, scenery.shape, scenery.rods, touching, len(scenery.surfaces.kind), 0.0, gap, False)
+
+
+def _named(body: Callable[..., None], name: str) -> Callable[..., None]:
     """The body under a name of its own: numba's cache would hand the serial code to a parallel function of the same name."""
-    twin = FunctionType(_pass.__code__, _pass.__globals__, name)
+    twin = FunctionType(body.__code__, body.__globals__, name)
     twin.__qualname__ = name
     return twin
 
 
-pass_serial = entry(_named("pass_serial"))
-pass_parallel = parallel_entry(_named("pass_parallel"))
+pass_serial = entry(_named(_pass, "pass_serial"))
+pass_parallel = parallel_entry(_named(_pass, "pass_parallel"))
+iterate_serial = entry(_named(_iterate, "iterate_serial"))
+iterate_parallel = parallel_entry(_named(_iterate, "iterate_parallel"))
+look_serial = entry(_named(_look, "look_serial"))
+look_parallel = parallel_entry(_named(_look, "look_parallel"))

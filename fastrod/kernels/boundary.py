@@ -123,14 +123,11 @@ def loosen(robots: Lanes, params: Params, layout: Layout, x: Lanes, columns: Lan
 
 
 @kernel
-def update_boundary(
+def form_gain(
     robots: Lanes,
-    count: int,
     params: Params,
     memory: Memory,
     layout: Layout,
-    x: Lanes,
-    error: Lanes,
     gamma: Lanes,
     n_col: int,
     n_e: int,
@@ -142,8 +139,8 @@ def update_boundary(
     noise: float,
     carry: bool,
 ) -> None:
-    """The observer's update of x and P, and the gain kept for the next inputs."""
-    n_x, n_rows = memory.x.shape[1], len(layout.row_tendon)
+    """G of the scaled unknowns from the derivatives of the residuals; their units stay in `work` after its first n_p + 2 fields."""
+    n_x = memory.x.shape[1]
     n_p = padded(n_x, BLOCK)
     units = work[(n_p + 2) * W :]
     for w in range(W):
@@ -171,6 +168,33 @@ def update_boundary(
         for w in range(W):
             P[(a * n_p + a) * W + w] += process
     gain(P, G, scaled, work, n_x, n_e, noise)
+
+
+@kernel
+def update_boundary(
+    robots: Lanes,
+    count: int,
+    params: Params,
+    memory: Memory,
+    layout: Layout,
+    x: Lanes,
+    error: Lanes,
+    gamma: Lanes,
+    n_col: int,
+    n_e: int,
+    P: Lanes,
+    G: Lanes,
+    scaled: Lanes,
+    work: Lanes,
+    process: float,
+    noise: float,
+    carry: bool,
+) -> None:
+    """The observer's update of x and P, and the gain kept for the next inputs."""
+    n_x, n_rows = memory.x.shape[1], len(layout.row_tendon)
+    n_p = padded(n_x, BLOCK)
+    units = work[(n_p + 2) * W :]
+    form_gain(robots, params, memory, layout, gamma, n_col, n_e, P, G, scaled, work, process, noise, carry)
     defect = work[: n_x * W]
     for a in range(n_x):
         for w in range(W):

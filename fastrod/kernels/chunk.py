@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from fastrod.kernels import columns as col
 from fastrod.kernels import shape as sh
-from fastrod.kernels.boundary import close_lengths, close_tip, loosen, padded, update_boundary
+from fastrod.kernels.boundary import close_lengths, close_tip, form_gain, loosen, padded, update_boundary
 from fastrod.kernels.gather import feed_forward, gather_base, gather_segment, gather_step, pick, scatter_node
 from fastrod.kernels.jit import LANES, kernel
 from fastrod.kernels.observer import BLOCK
+from fastrod.kernels.probes import arrive, leave, load_base, load_column, respond
 from fastrod.kernels.shape import Lanes
 from fastrod.kernels.vec import mul
-from fastrod.types import Layout, Memory, Params, Ports, Response, Shape
+from fastrod.types import Layout, Memory, Params, Ports, Probes, Response, Shape
 
 W = LANES
 CUTS = 2  # Newton steps on u at each stage; the guess is of second order, so little is left after the second
@@ -24,11 +25,12 @@ RESPONSE_CUTS = 5  # where derivatives are asked for: then they are those of the
 FIRST_CUTS = 6  # at the base, where the guess is the last pass's curvature
 
 
-def scratch_size(n_tendons: int, n_x: int, n_col: int, n_e: int) -> int:
+def scratch_size(n_tendons: int, n_x: int, n_col: int, n_e: int, n_probes: int = 0) -> int:
     """Numbers of scratch that `pass_chunk` needs."""
     n_t, n_p = n_tendons + sh.GROUP, BLOCK * -(-n_x // BLOCK)
     march = sh.NODE + 5 * sh.STAGE + n_t * (sh.TENDON + sh.PATHS + 1) + n_col * (col.COLUMN + n_t)
-    return W * (march + 8 + n_e + n_e * n_col + n_p * n_p + 2 * n_e * n_p + n_p + 2 + 2 * n_x)
+    touch = 3 + 3 * n_probes * (n_col + 1)
+    return W * (march + 8 + n_e + n_e * n_col + n_p * n_p + 2 * n_e * n_p + n_p + 2 + 2 * n_x + touch)
 
 
 @kernel
@@ -52,9 +54,23 @@ def solve_section(half: Lanes, stage: Lanes, tendon: Lanes, path: Lanes, first: 
 
 @kernel
 def march_columns(
-    k: int, n_col: int, placed: bool, layout: Layout, node: Lanes, stages: Lanes, paths: Lanes, columns: Lanes, change: Lanes
+    k: int,
+    j: int,
+    n_col: int,
+    n_x: int,
+    placed: bool,
+    layout: Layout,
+    node: Lanes,
+    stages: Lanes,
+    paths: Lanes,
+    columns: Lanes,
+    change: Lanes,
+    probes: Probes,
+    first_row: int,
+    count: int,
+    given: Lanes,
 ) -> None:
-    """Carry every column over one step and add its share of the tendon lengths."""
+    """Carry every column over step j of segment k and add its share of the tendon lengths."""
     n, first = len(layout.tendon_segment), layout.first_tendon[k]
     n_t = n + sh.GROUP
     n_base = 2 * len(layout.first_tendon) if layout.paper else 3
@@ -65,7 +81,10 @@ def march_columns(
         tendon = layout.free_tendon[c - n_base] if n_base <= c < n_base + n_free else n
         drive = paths[(tendon if tendon >= first else n) * sh.PATHS * W :]  # after the last tendon all is zero
         axis = c - n_base - n_free
-        load = node[(sh.N_R + 3 * axis) * W :] if axis >= 0 else paths[n * sh.PATHS * W :]  # R^T e_axis is a row of R
+        load = node[(sh.N_R + 3 * axis) * W :] if 0 <= axis < 3 else paths[n * sh.PATHS * W :]  # R^T e_axis is a row of R
+        if probes.node.shape[1] > 0 and c >= n_x:
+            load_column(c - n_x, k * layout.n_steps + j, node, probes, first_row, count, given)
+            load = given
         column = columns[c * col.COLUMN * W : (c + 1) * col.COLUMN * W]
         col.step_column(column, node, stages, drive, load)
         if placed:
@@ -185,6 +204,8 @@ def pass_chunk(
     memory: Memory,
     shape: Shape,
     response: Response,
+    probes: Probes,
+    first_row: int,
     scratch: Lanes,
     n_col: int,
     feed: bool,
@@ -193,7 +214,11 @@ def pass_chunk(
     process: float,
     noise: float,
 ) -> None:
-    """One observer pass of the robots whose indices are the first `count` of `robots` (the rest repeat the last one)."""
+    """One observer pass of the robots whose indices are the first `count` of `robots` (the rest repeat the last one).
+
+    With probes (the rows from `first_row` on are these robots') the boundary is not updated: how it would be, and how the
+    contact points then move, is written to the probes.
+    """
     n, n_x, n_rows = len(layout.tendon_segment), memory.x.shape[1], len(layout.row_tendon)
     n_segments, n_steps = params.length.shape[1], layout.n_steps
     n_e = n_rows + (0 if layout.paper else 3) + (3 if len(ports.follower_force) > 0 else 0)
@@ -216,6 +241,9 @@ def pass_chunk(
     P, o = scratch[o : o + n_p * n_p * W], o + n_p * n_p * W
     G, o = scratch[o : o + n_e * n_p * W], o + n_e * n_p * W
     scaled, o = scratch[o : o + n_e * n_p * W], o + n_e * n_p * W
+    n_probes = probes.node.shape[1]
+    given, o = scratch[o : o + 3 * W], o + 3 * W
+    moves, o = scratch[o : o + 3 * n_probes * n_col * W], o + 3 * n_probes * n_col * W
     work = scratch[o:]
 
     at_start, at_middle, at_end = node[sh.N_K * W :], node[(sh.N_K + 3) * W :], node[(sh.N_K + 6) * W :]
@@ -231,10 +259,14 @@ def pass_chunk(
         paths[i] = 0.0
     for i in range(len(tendon)):
         tendon[i] = 0.0
+    for i in range(len(moves)):
+        moves[i] = 0.0
     if feed:
         feed_forward(robots, count, ports, params, memory, layout)
     load_unknowns(robots, ports, params, memory, layout, x, tendon)
     gather_base(robots, ports, params, memory, layout, node, x)
+    if n_probes > 0:
+        load_base(probes, first_row, count, node)
     for w in range(W):
         s[w] = 0.0
         for a in range(3):
@@ -252,6 +284,8 @@ def pass_chunk(
                 start_segment(k, layout, node, x, columns, n_col)
                 if k == 0 or layout.paper:
                     add_base_moment(node, wrench, 1.0)
+            if n_probes > 0:
+                leave(k * n_steps + j, probes, first_row, count, node, columns, n_x, n_col)
             sh.start_step(node, stages)
             solve_section(at_start, stages, tendon, paths, first, n, loaded, first_cuts if j == 0 else cuts)
             if j == 0 or dense:
@@ -272,13 +306,19 @@ def pass_chunk(
             sh.end_step(node, stages)
             for g in range(first, n, sh.GROUP):
                 sh.add_lengths(length[g * W :], node, paths[g * sh.PATHS * W :])
-            if update or placed:
-                march_columns(k, n_col, placed, layout, node, stages, paths, columns, change)
+            if update or placed or n_probes > 0:
+                march_columns(
+                    k, j, n_col, n_x, placed or n_probes > 0, layout, node, stages, paths, columns, change, probes, first_row, count, given
+                )
             sh.advance(node, stages)
+            if n_probes > 0:
+                arrive(k * n_steps + j + 1, probes, first_row, count, node, columns, n_col, moves)
             for w in range(W):
                 s[w] += node[sh.N_H * W + w]
         if layout.paper:
             add_base_moment(node, wrench, -1.0)
+    if n_probes > 0:
+        leave(n_segments * n_steps, probes, first_row, count, node, columns, n_x, n_col)
     if dense:
         sh.start_step(node, stages)
         first = layout.first_tendon[n_segments - 1]
@@ -299,7 +339,10 @@ def pass_chunk(
     write_summary(robots, count, layout, node, tendon, length, error, n_e, wrench, shape)
     if placed:
         write_response(robots, count, node, columns, error, gamma, n_col, n_e, response)
-    if update:
+    if n_probes > 0:
+        form_gain(robots, params, memory, layout, gamma, n_col, n_e, P, G, scaled, work, 1.0, noise, False)
+        respond(robots, count, params, memory, layout, x, error, gamma, G, work[(n_p + 2) * W :], n_col, n_e, n_p, moves, probes, first_row)
+    elif update:
         update_boundary(robots, count, params, memory, layout, x, error, gamma, n_col, n_e, P, G, scaled, work, process, noise, carry)
         for w in range(count):
             i = robots[w]

@@ -1,0 +1,67 @@
+"""`Contacts`: what touches what, as a state hands it out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fastrod.errors import UnknownNameError, nearest
+from fastrod.types import Flags, Floats, Ints
+
+TOUCHES = 1e-6
+"""A gap below it is contact, also where no force is needed to keep it [m]."""
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """The contacts of a state, robot axis first, world frame. Rows are filled from the left; what is beyond `count` is nan, or
+    -1 in `obstacle`."""
+
+    names: tuple[str, ...]
+    """Of the obstacles; then come the rods of the robots, `rod 0`, `rod 1`, ..."""
+    count: Ints
+    """(n_robots,)"""
+    obstacle: Ints
+    """(n_robots, n) index of what is touched: an obstacle, or n_obstacles + i for the rod of robot i."""
+    point: Floats
+    """(n_robots, n, 3) on the rod's surface [m]."""
+    normal: Floats
+    """(n_robots, n, 3) unit, from the obstacle to the rod."""
+    gap: Floats
+    """(n_robots, n) [m]; negative by the depth in a soft obstacle."""
+    force: Floats
+    """(n_robots, n, 3) on the rod, friction included [N]."""
+    arclength: Floats
+    """(n_robots, n) of the rod [m]."""
+    wrench: Floats
+    """(n_robots, n_obstacles, 6) on each obstacle by each robot: force [N], moment about the obstacle's origin [N m]."""
+    clearance: Floats
+    """(n_robots,) smallest gap to anything; a lower bound where nothing is near [m]."""
+    deep: Flags
+    """(n_robots,) the centreline lies inside an obstacle: its surface was entered by more than the rod's radius."""
+    tip_arclength: Floats
+    """(n_robots,) [m]."""
+
+    def in_contact(self, name: str | None = None) -> Flags:
+        """(n_robots,) which robots touch the obstacle (or `rod 3`) of this name; None: anything. Raises `UnknownNameError`."""
+        if name is None:
+            return self.count > 0
+        if name in self.names:
+            k = self.names.index(name)
+        elif name.startswith("rod ") and name[4:].isdigit() and int(name[4:]) < len(self.count):
+            k = len(self.names) + int(name[4:])
+        else:
+            raise UnknownNameError(f"no obstacle {name!r}; {nearest(name, self.names)}")
+        return np.asarray((self.obstacle == k).any(1))
+
+    @property
+    def tip_in_contact(self) -> Flags:
+        """(n_robots,) which robots touch something with the half sphere of their tip."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray((self.arclength >= self.tip_arclength[:, None] * (1.0 - 1e-9)).any(1))
+
+    @property
+    def total_force(self) -> Floats:
+        """(n_robots, 3) of all contacts on each rod, world [N]."""
+        return np.asarray(np.nansum(self.force, axis=1))

@@ -1,0 +1,272 @@
+"""Contact in the step loop: free robots by their own pass, touching ones by passes and the contact law in turn until at rest.
+
+Inputs that lead a world too far for one linear model are followed in parts, from the last step to this one: a world that
+does not come to rest, or a rod that would go through an obstacle, goes half as far. A rod never continues beyond what it
+could solve: it stays where it came to, and says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from fastrod.contact.contacts import TOUCHES, Contacts
+from fastrod.contact.frames import back_by, between, blended, frames_of, longest_move
+from fastrod.contact.scene import ContactScene
+from fastrod.contact.tree import pack
+from fastrod.kernels.batch import arrange, iterate_parallel, iterate_serial, look_at_rods, look_parallel, look_serial
+from fastrod.kernels.bvh import STACK
+from fastrod.kernels.search import CANDIDATE
+from fastrod.kernels.slots import SLOT, T_FORCE, T_GAP, T_N, T_OBSTACLE, T_RADIUS, T_S
+from fastrod.kernels.touch import AT_REST, LOST, Scenery, world_size
+from fastrod.types import Clearance, Flags, Floats, Ints, Memory, Ports, Probes, Rods, Shape, Touching
+
+Pass = Callable[[Ints, Ports, Shape, Probes], None]
+"""(robots, ports, shape, probes): one forward pass into `shape` that leaves the boundary as it is."""
+
+_FOUND = 64
+_BLOCK = 2048  # robots whose linear models are held at once
+_MOST_PASSES = 30
+_SMALLEST_PART = 1.0 / 128.0
+_FEW = 64  # robots below which starting threads costs more than it saves
+
+
+class Engine:
+    """What contact remembers between steps, and how a step is done. Rows are robots' indices; arrays have the robot axis first."""
+
+    def __init__(self, scene: ContactScene, rods: Rods, length: Floats, n_points: int, threads: int) -> None:
+        n = len(rods.reach)
+        self.scene, self.rods, self.length, self.threads = scene, rods, length, threads
+        self.surfaces = pack(scene.obstacles)
+        self.world = scene.world_of(n)
+        self.poses_before = self.poses = scene.rest_poses()
+        self.velocities: dict[int, Floats] = {}
+        self.dt = 0.0
+        self.touching = Touching(np.zeros(n, np.int64), np.zeros((n, scene.max_contacts, SLOT)))
+        self.clearance = Clearance(np.full((n, n_points), -np.inf), np.zeros((n, n_points, 3)))
+        self.before: Shape | None = None
+        self.tracked, self.slides = np.zeros(n, bool), np.ones(n, bool)
+        self.gap = np.full(n, np.inf)
+        self.given_arclength, self.given_force = np.zeros((1, 0)), np.zeros((1, 0, 3))
+        """Point forces that the caller gave: (n_robots, m) [m] and (n_robots, m, 3) world [N]."""
+
+    def move(self, poses: Floats, velocities: dict[int, Floats], dt: float) -> None:
+        """The obstacles of this step; those with a velocity slip by it, the others by how far their pose has moved."""
+        self.poses, self.velocities, self.dt = poses, velocities, dt
+        self.clearance.distance[:] -= longest_move(self.poses_before, poses, self.surfaces.sphere)[:, None]
+
+    def place_at_once(self, rows: Flags) -> None:
+        """For these robots the obstacles have not come from anywhere: they are where they are."""
+        if rows.any() and self.poses is not self.poses_before:
+            shape = (len(rows), *self.poses.shape[1:])
+            self.poses_before = np.where(rows[:, None, None], np.broadcast_to(self.poses, shape), np.broadcast_to(self.poses_before, shape))
+
+    def forget(self, rows: Ints | Flags) -> None:
+        """No contacts, no history."""
+        self.touching.count[rows] = 0
+        self.clearance.distance[rows] = -np.inf
+        self.tracked[rows] = False
+
+    def pressed(self) -> Flags:
+        """(n_robots,) in a world where some contact carries a force."""
+        slots = np.arange(self.touching.slot.shape[1])
+        force = (self.touching.slot[:, :, T_FORCE : T_FORCE + 3] != 0.0).any(2) & (slots < self.touching.count[:, None])
+        return self.whole_worlds(force.any(1))
+
+    def whole_worlds(self, some: Flags) -> Flags:
+        """(n_robots,) all robots of the worlds of those that are marked."""
+        if self.scene.worlds is None:
+            return some
+        worlds = np.zeros(self.world.max() + 1, bool)
+        worlds[self.world[some]] = True
+        return np.asarray(worlds[self.world])
+
+    def touches(self, rows: Ints, shape: Shape) -> Flags:
+        """(n_robots,) which of `rows`, free until now, overlap something in `shape` or have gone through it; with their worlds."""
+        some = np.zeros(len(self.gap), bool)
+        if not len(rows):
+            return some
+        parts = self._parts(len(rows))
+        found, n_found = np.empty((len(rows), _FOUND, CANDIDATE)), np.zeros(len(rows), np.int64)
+        scratch = np.empty((parts, 4 * shape.arclength.shape[1] + 4 * STACK))
+        body = look_serial if parts == 1 else look_parallel
+        one = np.ones(1)
+        scenery = self._scenery(shape, 1e-9, 0.0 * one, one)._replace(margin=0.0)
+        body(rows, scenery, self.touching, self.clearance, self.gap, found, n_found, scratch)
+        if self.scene.self_contact or self.scene.worlds is not None:
+            ordered = rows[np.argsort(self.world[rows], kind="stable")]
+            worlds = np.append(np.flatnonzero(np.diff(self.world[ordered], prepend=-1)), len(ordered))
+            look_at_rods(worlds, ordered, scenery, self.touching, self.gap)
+        some[rows] = (self.gap[rows] < 0.0) | (n_found < 0)
+        return self.whole_worlds(some)
+
+    def follow(
+        self, rows: Ints, start: Ports | None, end: Ports, memory: Memory, shape: Shape, run: Pass, tolerance: float, passes: Ints
+    ) -> tuple[Flags, Floats]:
+        """Lead the worlds of `rows` from the inputs `start`, where they are at rest, to `end`, or settle them there at once.
+
+        (n_robots,) which arrived, and the part of the way that each came. Those that did not keep the last shape, boundary and
+        contacts in which they were at rest.
+        """
+        n = len(self.gap)
+        done, stride, arrived = np.zeros(n), np.ones(n), np.zeros(n, bool)
+        x, count, slot = memory.x.copy(), self.touching.count.copy(), self.touching.slot.copy()
+        way = rows
+        while len(way):
+            aim = np.minimum(done + stride, 1.0)
+            ports = end if start is None or (aim[way] >= 1.0).all() else blended(start, end, aim)
+            rest = self._settle(way, ports, memory, shape, run, self._scenery(shape, tolerance, done, aim), passes)
+            good, bad = way[rest[way]], way[~rest[way]]
+            done[good] = aim[good]
+            arrived[good] = done[good] >= 1.0
+            between_steps = good[~arrived[good]]
+            if len(between_steps):
+                self.accept(between_steps, shape, on_the_way=True)
+            x[good], count[good], slot[good] = memory.x[good], self.touching.count[good], self.touching.slot[good]
+            memory.x[bad], self.touching.count[bad], self.touching.slot[bad] = x[bad], count[bad], slot[bad]
+            stride[good] *= 2.0
+            stride[bad] *= 0.5
+            if start is None:
+                break
+            way = way[~arrived[way] & (stride[way] >= _SMALLEST_PART)]
+        lost = rows[~arrived[rows] & self.tracked[rows]]
+        if len(lost) and self.before is not None:
+            for now, last in zip(shape, self.before, strict=True):
+                now[lost] = last[lost]
+        return arrived, done
+
+    def accept(self, rows: Ints, shape: Shape, on_the_way: bool = False) -> None:
+        """These robots are at rest in `shape`: from there they slip and move. `on_the_way`: it will be written to again."""
+        if len(rows) == len(self.gap) and not on_the_way:
+            self.before = shape
+        else:
+            self.before = Shape(*(np.array(a) for a in (shape if self.before is None else self.before)))
+            for last, now in zip(self.before, shape, strict=True):
+                last[rows] = now[rows]
+        self.tracked[rows] = True
+
+    def end_step(self, done: Floats) -> None:
+        """The obstacles are where they were to go; for a robot that did not arrive, where it met them."""
+        self.poses_before = self.poses if (done >= 1.0).all() else between(self.poses_before, self.poses, done)
+
+    def why(self, i: int, done: float) -> str:
+        """What stopped robot i."""
+        if done > 0.0 or self.tracked[i]:
+            return f"contact: the rod stands where it could be solved, at {100.0 * done:.3g} % of the way to these inputs."
+        if self.gap[i] < 0.0:
+            return f"contact: the rod overlaps an obstacle by {-self.gap[i]:.3g} m, and no way out of it was found."
+        return "contact: neither the rod's rest shape nor these inputs could be solved."
+
+    def contacts(self, shape: Shape, ok: Flags) -> Contacts:
+        """What touches what now."""
+        n, n_obstacles = len(self.gap), len(self.surfaces.kind)
+        slot = self.touching.slot
+        live = (np.arange(slot.shape[1]) < self.touching.count[:, None]) & ok[:, None]
+        live &= (slot[:, :, T_FORCE : T_FORCE + 3] != 0.0).any(2) | (slot[:, :, T_GAP] < TOUCHES)
+        count = live.sum(1)
+        width = int(count.max(initial=0))
+        order = np.argsort(~live, axis=1, kind="stable")[:, :width]
+        kept = np.take_along_axis(slot, order[:, :, None], axis=1)
+        kept[np.arange(width) >= count[:, None]] = np.nan
+        obstacle, normal, force, s = kept[:, :, T_OBSTACLE], kept[:, :, T_N : T_N + 3], kept[:, :, T_FORCE : T_FORCE + 3], kept[:, :, T_S]
+        nodes = np.abs(np.where(np.isfinite(s), s, 0.0)[:, :, None] - shape.arclength[:, None, :])
+        at = np.where(np.isfinite(nodes), nodes, np.inf).argmin(2)  # every contact has a node of its own
+        point = np.take_along_axis(shape.position, at[:, :, None], axis=1) - kept[:, :, T_RADIUS, None] * normal
+        index = np.where(np.isfinite(obstacle), obstacle, -1).astype(np.int64)
+        wrench = np.zeros((n, n_obstacles, 6))
+        origin = np.broadcast_to(self.poses[:, :, :3], (n, n_obstacles, 3))
+        for k in range(n_obstacles):
+            on = np.where((index == k)[:, :, None], -force, 0.0)
+            wrench[:, k, :3] = on.sum(1)
+            wrench[:, k, 3:] = np.cross(np.where((index == k)[:, :, None], point - origin[:, None, k], 0.0), on).sum(1)
+        gap = np.where(ok, self.gap, np.nan)
+        return Contacts(
+            names=self.scene.names, count=count, obstacle=index, point=point, normal=normal, gap=kept[:, :, T_GAP], force=force, arclength=s,
+            wrench=wrench, clearance=gap, deep=ok & (self.gap < -np.maximum(self.rods.radius.min(1), 1e-6)),
+            tip_arclength=shape.arclength[:, -1],
+        )  # fmt: skip
+
+    def _settle(self, rows: Ints, ports: Ports, memory: Memory, shape: Shape, run: Pass, scenery: Scenery, passes: Ints) -> Flags:
+        """Pass and law in turn on these inputs; (n_robots,) which came to rest."""
+        rest = np.zeros(len(self.gap), bool)
+        for _ in range(_MOST_PASSES):
+            status = self._iterate(rows, ports, memory, shape, run, scenery)
+            passes[rows] += 1
+            rest[rows[status == AT_REST]] = True
+            rows = rows[(status != AT_REST) & (status != LOST)]
+            if not len(rows):
+                break
+        return rest
+
+    def _iterate(self, rows: Ints, ports: Ports, memory: Memory, shape: Shape, run: Pass, scenery: Scenery) -> Ints:
+        """One pass and one round of the law for the worlds of `rows`; their status. Worlds with as many contacts go together."""
+        status = np.zeros(len(rows), np.int64)
+        most = np.zeros(self.world.max() + 1, np.int64)
+        np.maximum.at(most, self.world[rows], self.touching.count[rows])
+        slots = np.minimum(2 ** np.ceil(np.log2(np.maximum(most[self.world[rows]], 1))).astype(np.int64), self.scene.max_contacts)
+        for n_slots in np.unique(slots):
+            members = np.flatnonzero(slots == n_slots)
+            members = members[np.argsort(self.world[rows[members]], kind="stable")]
+            starts = np.flatnonzero(np.diff(self.world[rows[members]], prepend=-1))
+            cuts = np.unique(np.searchsorted(starts, np.arange(_BLOCK, len(members), _BLOCK)))
+            for block in np.split(members, starts[cuts[cuts < len(starts)]]):
+                status[block] = self._iterate_block(rows[block], int(n_slots), ports, memory, shape, run, scenery)
+        return status
+
+    def _iterate_block(self, rows: Ints, n_slots: int, ports: Ports, memory: Memory, shape: Shape, run: Pass, scenery: Scenery) -> Ints:
+        n, n_x = len(rows), memory.x.shape[1]
+        n_f = 3 * n_slots
+        probes = Probes(
+            np.empty((n, n_slots), np.int64), np.empty((n, n_slots, 3)), np.empty((n, n_slots, 3)),
+            np.zeros((n, n_f, 1 + n_f)), np.empty((n, n_x, 1 + n_f)),
+        )  # fmt: skip
+        ports = self._arranged(rows, ports, probes)
+        run(rows, ports, shape, probes)
+        worlds = np.append(np.flatnonzero(np.diff(self.world[rows], prepend=-1)), n)
+        status = np.zeros(n, np.int64)
+        parts = self._parts(len(worlds) - 1)
+        scratch = np.empty((parts, world_size(int(np.diff(worlds).max()), self.touching.slot.shape[1], shape.arclength.shape[1])))
+        body = iterate_serial if parts == 1 else iterate_parallel
+        proposed, unknown = np.zeros((n, n_slots, 3)), np.zeros((n, n_x))
+        body(worlds, rows, scenery, self.touching, self.clearance, probes, memory, proposed, unknown, self.gap, status, scratch)
+        return status
+
+    def _arranged(self, rows: Ints, ports: Ports, probes: Probes) -> Ports:
+        """The ports with a node under every contact; fills the loads of the probes."""
+        n_robots, n_steps = len(self.gap), self.rods.n_steps
+        n_segments = self.rods.radius.shape[1]
+        ends = np.cumsum(self.length + ports.extension, axis=1)
+        starts = np.concatenate([np.zeros((len(ends), 1)), ends], axis=1)
+        grid = np.empty((n_robots, n_segments, n_steps + 1))
+        m = self.given_arclength.shape[1]
+        node = np.zeros((n_robots, m), np.int64)
+        given = np.broadcast_to(self.given_arclength, (n_robots, m))
+        arrange(rows, self.touching, np.ascontiguousarray(given), starts, n_steps, grid, node, probes)
+        if not m:
+            return ports._replace(grid=grid)
+        node_force = np.zeros((n_robots, n_segments * n_steps + 1, 3))
+        force = np.broadcast_to(self.given_force, (n_robots, m, 3))
+        for q in range(m):
+            np.add.at(node_force, (rows, node[rows, q]), force[rows, q])
+        return ports._replace(grid=grid, node_force=node_force)
+
+    def _parts(self, n: int) -> int:
+        return 1 if n <= _FEW else min(self.threads, n)
+
+    def _scenery(self, shape: Shape, tolerance: float, done: Floats, aim: Floats) -> Scenery:
+        """The obstacles at the part `aim` of their way, and at the part `done` that is behind."""
+        if self.poses is self.poses_before and not self.velocities:
+            frames = before = slip = frames_of(self.poses)
+        else:
+            poses, last = (between(self.poses_before, self.poses, part) for part in (aim, done))
+            ago = last.repeat(max(len(poses), 1) // max(len(last), 1), axis=0) if self.velocities else last
+            for k, velocity in self.velocities.items():
+                slid = back_by(poses[:, k], velocity, self.dt * (aim - done))
+                ago = ago.repeat(len(slid) // len(ago), axis=0)
+                ago[:, k] = slid
+            frames, before, slip = frames_of(poses), frames_of(last), frames_of(ago)
+        history = shape if self.before is None else self.before
+        return Scenery(
+            self.rods, self.surfaces, frames, before, slip, shape, history, self.tracked, self.tracked & self.slides, tolerance, self.scene.watch
+        )

@@ -1,0 +1,109 @@
+"""`[Obstacle] -> Surfaces`: every mesh's triangles in a bounding-volume hierarchy, every simple shape as its numbers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+
+from fastrod.contact.geometry import Obstacle
+from fastrod.contact.normals import pseudonormals
+from fastrod.kernels.bvh import LEAF_CODE
+from fastrod.kernels.primitive import BOX, CAPSULE, CYLINDER, MESH, PLANE, SPHERE
+from fastrod.types import Floats, Ints, Surfaces
+
+_KIND = {"mesh": MESH, "sphere": SPHERE, "box": BOX, "cylinder": CYLINDER, "capsule": CAPSULE, "plane": PLANE}
+_LEAF = 4  # triangles at most
+
+
+def pack(obstacles: Sequence[Obstacle]) -> Surfaces:
+    """The arrays that the kernels read; obstacle k of the list is row k."""
+    boxes, links, corners, normals, roots = [np.zeros((0, 12))], [np.zeros((0, 2), np.int64)], [np.zeros((0, 9))], [np.zeros((0, 7, 3))], []
+    n_nodes = n_faces = 0
+    for obstacle in obstacles:
+        if obstacle.shape != "mesh":
+            roots.append(0)
+            continue
+        box, link, root, corner, normal = _hierarchy(obstacle)
+        leaf = link < 0
+        links.append(np.where(leaf, link - LEAF_CODE * n_faces, link + n_nodes))
+        roots.append(root - LEAF_CODE * n_faces if root < 0 else root + n_nodes)
+        boxes.append(box)
+        corners.append(corner)
+        normals.append(normal)
+        n_nodes, n_faces = n_nodes + len(box), n_faces + len(corner)
+    return Surfaces(
+        kind=np.array([_KIND[o.shape] for o in obstacles], np.int64),
+        size=np.array([o.size for o in obstacles], float).reshape(-1, 3),
+        sphere=np.array([_ball(o) for o in obstacles], float).reshape(-1, 4),
+        friction=np.array([o.friction for o in obstacles], float),
+        compliance=np.array([1.0 / o.stiffness for o in obstacles], float),
+        root=np.array(roots, np.int64),
+        box=np.concatenate(boxes),
+        link=np.concatenate(links),
+        corner=np.concatenate(corners),
+        normal=np.concatenate(normals),
+    )
+
+
+def _ball(o: Obstacle) -> tuple[float, float, float, float]:
+    """Centre and radius of a ball that holds the obstacle."""
+    if o.shape == "mesh":
+        low, high = o.vertices.min(0), o.vertices.max(0)
+        centre = 0.5 * (low + high)
+        return (*centre.tolist(), float(np.linalg.norm(o.vertices - centre, axis=1).max()))  # type: ignore[return-value]
+    a, b, c = o.size
+    radius = {"sphere": a, "box": 0.5 * math.hypot(a, b, c), "cylinder": math.hypot(a, 0.5 * b), "capsule": a + 0.5 * b}
+    return 0.0, 0.0, 0.0, radius.get(o.shape, math.inf)
+
+
+@lru_cache(maxsize=64)
+def _hierarchy(obstacle: Obstacle) -> tuple[Floats, Ints, int, Floats, Floats]:
+    """Boxes, links, root, corners and pseudonormals of one mesh, built once for each Obstacle.
+
+    Split at the median of the triangles' centres along the longest side of their box, level by level.
+    """
+    corner = obstacle.vertices[obstacle.faces]
+    low, high, centre = corner.min(1), corner.max(1), corner.mean(1)
+    order = np.arange(len(corner))
+    starts, ends = np.array([0]), np.array([len(corner)])
+    box: list[Floats] = []
+    link: list[Ints] = []
+    n_nodes = 0
+    root = _leaf_link(starts, ends)[0] if ends[0] <= _LEAF else 0
+    while (inner := ends - starts > _LEAF).any():
+        starts, ends = starts[inner], ends[inner]
+        sizes = ends - starts
+        owner = np.repeat(np.arange(len(starts)), sizes)
+        where = np.concatenate([np.arange(a, b) for a, b in zip(starts, ends, strict=True)])
+        c = centre[order[where]]
+        first = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+        extent = np.maximum.reduceat(c, first) - np.minimum.reduceat(c, first)
+        key = c[np.arange(len(c)), extent.argmax(1)[owner]]
+        order[where] = order[where][np.lexsort((key, owner))]
+        middle = (starts + ends) // 2
+        children = np.stack([starts, middle, middle, ends], axis=1).reshape(-1, 2)  # left and right of each
+        begin, end = children[:, 0], children[:, 1]
+        box.append(np.concatenate([_reduce(np.minimum, low[order], begin, end), _reduce(np.maximum, high[order], begin, end)], axis=1))
+        deeper = end - begin > _LEAF
+        below = n_nodes + len(starts) + np.cumsum(deeper) - 1
+        link.append(np.where(deeper, below, _leaf_link(begin, end)))
+        n_nodes += len(starts)
+        starts, ends = begin, end
+    boxes = np.concatenate(box).reshape(-1, 12) if box else np.zeros((0, 12))
+    links = np.concatenate(link).reshape(-1, 2) if link else np.zeros((0, 2), np.int64)
+    normal = pseudonormals(obstacle.vertices, obstacle.faces)[order]
+    return boxes, links, int(root), np.ascontiguousarray(corner[order].reshape(-1, 9)), np.ascontiguousarray(normal)
+
+
+def _leaf_link(begin: Ints, end: Ints) -> Ints:
+    return np.asarray(-1 - (LEAF_CODE * begin + (end - begin)))
+
+
+def _reduce(how: np.ufunc, a: Floats, begin: Ints, end: Ints) -> Floats:
+    """(n_ranges, 3) smallest or largest over adjacent pairs of ranges."""
+    edges = np.stack([begin, end], axis=1).ravel()
+    padded = np.concatenate([a, a[-1:]])
+    return np.asarray(how.reduceat(padded, edges)[::2])

@@ -1,0 +1,203 @@
+"""The contacts of one robot: which to keep, to move and to add, from what the search has found.
+
+A contact holds at one arclength, against one wall of one obstacle. A superset does no harm, for the law opens those that
+are not needed; so contacts that carry a force stay, move along the rod to the minimum of the gap near them, and new ones
+come where the gap is violated (an exchange method for the constraint gap(s) >= 0 at every s).
+"""
+
+from __future__ import annotations
+
+from fastrod.kernels.bvh import FAR, Numbers
+from fastrod.kernels.jit import inline, kernel
+from fastrod.kernels.surface import ray_hit, signed_distance, walls
+from fastrod.kernels.vec import Vec, dot, scale
+from fastrod.types import Floats, Surfaces
+
+T_OBSTACLE, T_S, T_TWIN, T_N, T_GAP, T_FORCE, T_RADIUS, T_TAKEN, SLOT = 0, 1, 2, 3, 6, 7, 10, 11, 12
+"""Obstacle (from n_obstacles on: rods), arclength, number that links both sides of a contact between rods or -1, normal
+toward the rod, gap, force on the rod (world), radius of the rod there; taken: scratch of `choose`."""
+_SAME_WALL = 0.99999
+
+
+@inline
+def slot_normal(slot: Numbers) -> Vec:
+    return slot[T_N], slot[T_N + 1], slot[T_N + 2]
+
+
+@inline
+def slot_force(slot: Numbers) -> Vec:
+    return slot[T_FORCE], slot[T_FORCE + 1], slot[T_FORCE + 2]
+
+
+@inline
+def carries(slot: Numbers) -> bool:
+    f = slot_force(slot)
+    return dot(f, f) > 0.0
+
+
+@inline
+def open_slot(slot: Numbers, obstacle: int, s: float, twin: int, n: Vec, gap: float, radius: float) -> None:
+    slot[T_OBSTACLE], slot[T_S], slot[T_TWIN], slot[T_GAP], slot[T_RADIUS] = float(obstacle), s, float(twin), gap, radius
+    slot[T_N], slot[T_N + 1], slot[T_N + 2] = n
+    slot[T_FORCE], slot[T_FORCE + 1], slot[T_FORCE + 2], slot[T_TAKEN] = 0.0, 0.0, 0.0, 0.0
+
+
+@kernel
+def wall_at(k: int, frame: Floats, p: Vec, old: Vec, margin: float, surfaces: Surfaces, stack: Numbers, found: Numbers) -> tuple[float, Vec]:
+    """Signed distance of the centreline point p to that wall of obstacle k which faces as `old` does, and its normal.
+
+    Where the centreline has gone through the surface, the nearest side may be the wrong one: what counts is the side on which
+    the contact was, found by going back along its normal.
+    """
+    d, n, _ = signed_distance(k, frame, p, FAR, surfaces, stack)
+    if d < 0.0:
+        if dot(n, old) < 0.2:
+            t, wall = ray_hit(k, frame, p, old, FAR, surfaces, stack)
+            facing = dot(wall, old)
+            if t < FAR and facing > 0.0:
+                return -t * facing, wall
+        return d, n
+    best, alike = -1, dot(n, old) + 1e-6
+    count = walls(k, frame, p, d + margin, surfaces, stack, found)
+    for j in range(count):
+        facing = dot((found[5 * j + 1], found[5 * j + 2], found[5 * j + 3]), old)
+        if facing > alike:
+            best, alike = j, facing
+    if best >= 0:
+        return found[5 * best], (found[5 * best + 1], found[5 * best + 2], found[5 * best + 3])
+    return d, n
+
+
+@kernel
+def violation(n_found: int, found: Floats, count: int, slot: Floats, spacing: float) -> float:
+    """How far the gap falls below what the contacts that there are can mend [m]."""
+    worst = 0.0
+    for f in range(n_found):
+        level = 0.0
+        for c in range(count):
+            if int(slot[c, T_OBSTACLE]) == int(found[f, 0]) and abs(slot[c, T_S] - found[f, 1]) < spacing:
+                level = min(level, slot[c, T_GAP])
+        worst = max(worst, level - found[f, 2])
+    return worst
+
+
+@inline
+def segment_at(arclength: Floats, n_steps: int, s: float) -> int:
+    n_segments = (len(arclength) - 1) // n_steps
+    k = 0
+    while k < n_segments - 1 and arclength[(k + 1) * n_steps] <= s:
+        k += 1
+    return k
+
+
+@kernel
+def _segment_is_full(s: float, count: int, slot: Floats, arclength: Floats, n_steps: int) -> bool:
+    """As many contacts on this segment as it has nodes inside to put them on."""
+    k = segment_at(arclength, n_steps, s)
+    members = 0
+    for c in range(count):
+        members += segment_at(arclength, n_steps, slot[c, T_S]) == k
+    return members >= n_steps - 1
+
+
+@kernel
+def choose(
+    n_found: int,
+    found: Floats,
+    count: int,
+    slot: Floats,
+    n_obstacles: int,
+    radius: Floats,
+    n_steps: int,
+    arclength: Floats,
+    spacing: float,
+    tolerance: float,
+) -> int:
+    """Contacts for the next pass, in place; returns how many. Those with rods stay as long as they press or overlap."""
+    n = 0
+    for c in range(count):
+        if carries(slot[c]) or (int(slot[c, T_OBSTACLE]) >= n_obstacles and slot[c, T_GAP] < 0.0):
+            if n != c:
+                for a in range(SLOT):
+                    slot[n, a] = slot[c, a]
+            slot[n, T_TAKEN] = 0.0
+            n += 1
+    for f in range(n_found):
+        k, s, gap = int(found[f, 0]), found[f, 1], found[f, 2]
+        normal = (found[f, 3], found[f, 4], found[f, 5])
+        near, nearest = -1, FAR
+        for c in range(n):
+            away = abs(slot[c, T_S] - s)
+            if int(slot[c, T_OBSTACLE]) != k:
+                continue
+            free = slot[c, T_TAKEN] == 0.0 and dot(slot_normal(slot[c]), normal) > 0.5
+            if free and away < spacing and away < nearest:
+                near, nearest = c, away
+        if near >= 0:
+            slot[near, T_TAKEN] = 1.0
+            if gap < slot[near, T_GAP] - 1e-10:
+                slot[near, T_S] = s
+            continue
+        lonely = spacing if gap >= -tolerance else 0.1 * spacing
+        crowded = n >= len(slot) or _segment_is_full(s, n, slot, arclength, n_steps)
+        for c in range(n):
+            if int(slot[c, T_OBSTACLE]) == k and abs(slot[c, T_S] - s) < lonely and dot(slot_normal(slot[c]), normal) > 0.5:
+                crowded = True
+        if not crowded:
+            open_slot(slot[n], k, s, -1, normal, gap, radius[segment_at(arclength, n_steps, s)])
+            slot[n, T_TAKEN] = 1.0
+            n += 1
+    return n
+
+
+@kernel
+def add_walls(
+    count: int, slot: Floats, points: Floats, frames: Floats, margin: float, surfaces: Surfaces, stack: Numbers, found: Numbers
+) -> int:
+    """Give every further wall of a concave corner a contact of its own; `points` (n_slots, 3) are the centreline at each."""
+    n = count
+    for c in range(count):
+        k = int(slot[c, T_OBSTACLE])
+        if k >= len(frames):
+            continue
+        p = (points[c, 0], points[c, 1], points[c, 2])
+        n_walls = walls(k, frames[k], p, slot[c, T_RADIUS] + margin, surfaces, stack, found)
+        for j in range(n_walls):
+            normal = (found[5 * j + 1], found[5 * j + 2], found[5 * j + 3])
+            known = n >= len(slot)
+            for e in range(n):
+                same = int(slot[e, T_OBSTACLE]) == k and abs(slot[e, T_S] - slot[c, T_S]) < 1e-9
+                known = known or (same and dot(slot_normal(slot[e]), normal) > _SAME_WALL)
+            if not known:
+                open_slot(slot[n], k, slot[c, T_S], -1, normal, found[5 * j] - slot[c, T_RADIUS], slot[c, T_RADIUS])
+                n += 1
+    return n
+
+
+@kernel
+def merge(count: int, slot: Floats, spacing: float) -> int:
+    """Contacts of one obstacle at one place with one normal become one."""
+    n = 0
+    for c in range(count):
+        into = -1
+        for e in range(n):
+            same = slot[e, T_OBSTACLE] == slot[c, T_OBSTACLE] and slot[e, T_TWIN] < 0.0 and slot[c, T_TWIN] < 0.0
+            if same and abs(slot[e, T_S] - slot[c, T_S]) < 0.02 * spacing and dot(slot_normal(slot[e]), slot_normal(slot[c])) > _SAME_WALL:
+                into = e
+        if into >= 0:
+            for a in range(3):
+                slot[into, T_FORCE + a] += slot[c, T_FORCE + a]
+            continue
+        if n != c:
+            for a in range(SLOT):
+                slot[n, a] = slot[c, a]
+        n += 1
+    return n
+
+
+@kernel
+def arm_of(slot: Numbers) -> Vec:
+    """From the centreline to the point of contact."""
+    return scale(-slot[T_RADIUS], slot_normal(slot))
+
+
