@@ -199,7 +199,12 @@ class Simulator:
         return self._settle(ports, rows, tolerance)
 
     def _touch(
-        self, engine: Engine, given: Inputs, pose: Mapping[str, ArrayLike] | None, velocity: Mapping[str, ArrayLike] | None, tolerance: float | None
+        self,
+        engine: Engine,
+        given: Inputs,
+        pose: Mapping[str, ArrayLike] | None,
+        velocity: Mapping[str, ArrayLike] | None,
+        tolerance: float | None,
     ) -> State:
         """A step (`tolerance` None), or `settle`, with a contact scene."""
         poses = engine.scene.moved(engine.poses, pose, self.n_robots)
@@ -253,7 +258,9 @@ class Simulator:
     def _begin_next(self, rows: Ints, ports: Ports) -> None:
         """What the next free step moves from, for robots that were brought here by contact."""
         memory, led = self._memory, rows
-        memory.length_before[led] = np.broadcast_to(ports.tendon_length, (self.n_robots, ports.tendon_length.shape[1]))[led][:, self._layout.row_tendon]
+        memory.length_before[led] = np.broadcast_to(ports.tendon_length, (self.n_robots, ports.tendon_length.shape[1]))[led][
+            :, self._layout.row_tendon
+        ]
         if len(memory.force_before):
             memory.force_before[led] = np.broadcast_to(ports.tip_force, (self.n_robots, 3))[led]
 

@@ -206,8 +206,8 @@ class Rods(NamedTuple):
 class Touching(NamedTuple):
     """The contacts of every robot, kept from one step to the next."""
 
-    count: Ints
-    """(n_robots,)"""
+    used: Ints
+    """(n_robots,) slots in use."""
     slot: Floats
     """(n_robots, n_slots, SLOT) the numbers of one contact, in the order of `kernels.slots`."""
 

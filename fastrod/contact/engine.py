@@ -17,9 +17,10 @@ from fastrod.contact.scene import ContactScene
 from fastrod.contact.tree import pack
 from fastrod.kernels.batch import arrange, iterate_parallel, iterate_serial, look_at_rods, look_parallel, look_serial
 from fastrod.kernels.bvh import STACK
+from fastrod.kernels.forces import Scenery
 from fastrod.kernels.search import CANDIDATE
 from fastrod.kernels.slots import SLOT, T_FORCE, T_GAP, T_N, T_OBSTACLE, T_RADIUS, T_S
-from fastrod.kernels.touch import AT_REST, LOST, Scenery, world_size
+from fastrod.kernels.touch import AT_REST, LOST, world_size
 from fastrod.types import Clearance, Flags, Floats, Ints, Memory, Ports, Probes, Rods, Shape, Touching
 
 Pass = Callable[[Ints, Ports, Shape, Probes], None]
@@ -28,7 +29,9 @@ Pass = Callable[[Ints, Ports, Shape, Probes], None]
 _FOUND = 64
 _BLOCK = 2048  # robots whose linear models are held at once
 _MOST_PASSES = 30
-_SMALLEST_PART = 1.0 / 128.0
+_SMALLEST_PART = 1.0 / 64.0
+_HARD = 1.0 / 8.0  # part of the way below which a failure is taken for the loss of the equilibrium, not for too long a step
+_DAMPING, _MOST_DAMPED = 1.5, 150
 _FEW = 64  # robots below which starting threads costs more than it saves
 
 
@@ -64,14 +67,14 @@ class Engine:
 
     def forget(self, rows: Ints | Flags) -> None:
         """No contacts, no history."""
-        self.touching.count[rows] = 0
+        self.touching.used[rows] = 0
         self.clearance.distance[rows] = -np.inf
         self.tracked[rows] = False
 
     def pressed(self) -> Flags:
         """(n_robots,) in a world where some contact carries a force."""
         slots = np.arange(self.touching.slot.shape[1])
-        force = (self.touching.slot[:, :, T_FORCE : T_FORCE + 3] != 0.0).any(2) & (slots < self.touching.count[:, None])
+        force = (self.touching.slot[:, :, T_FORCE : T_FORCE + 3] != 0.0).any(2) & (slots < self.touching.used[:, None])
         return self.whole_worlds(force.any(1))
 
     def whole_worlds(self, some: Flags) -> Flags:
@@ -93,7 +96,7 @@ class Engine:
         body = look_serial if parts == 1 else look_parallel
         one = np.ones(1)
         scenery = self._scenery(shape, 1e-9, 0.0 * one, one)._replace(margin=0.0)
-        body(rows, scenery, self.touching, self.clearance, self.gap, found, n_found, scratch)
+        body(rows, scenery, self.clearance, self.gap, found, n_found, scratch)
         if self.scene.self_contact or self.scene.worlds is not None:
             ordered = rows[np.argsort(self.world[rows], kind="stable")]
             worlds = np.append(np.flatnonzero(np.diff(self.world[ordered], prepend=-1)), len(ordered))
@@ -111,20 +114,25 @@ class Engine:
         """
         n = len(self.gap)
         done, stride, arrived = np.zeros(n), np.ones(n), np.zeros(n, bool)
-        x, count, slot = memory.x.copy(), self.touching.count.copy(), self.touching.slot.copy()
+        x, count, slot = memory.x.copy(), self.touching.used.copy(), self.touching.slot.copy()
         way = rows
         while len(way):
             aim = np.minimum(done + stride, 1.0)
             ports = end if start is None or (aim[way] >= 1.0).all() else blended(start, end, aim)
-            rest = self._settle(way, ports, memory, shape, run, self._scenery(shape, tolerance, done, aim), passes)
+            rest = self._settle(way, ports, memory, shape, run, self._scenery(shape, tolerance, done, aim), passes, _MOST_PASSES)
+            hard = way[~rest[way] & (stride[way] <= _HARD)]
+            if len(hard):  # no equilibrium near: let it go to the next one, downhill
+                memory.x[hard], self.touching.used[hard], self.touching.slot[hard] = x[hard], count[hard], slot[hard]
+                damped = self._scenery(shape, tolerance, done, aim, _DAMPING)
+                rest |= self._settle(hard, ports, memory, shape, run, damped, passes, _MOST_DAMPED)
             good, bad = way[rest[way]], way[~rest[way]]
             done[good] = aim[good]
             arrived[good] = done[good] >= 1.0
             between_steps = good[~arrived[good]]
             if len(between_steps):
                 self.accept(between_steps, shape, on_the_way=True)
-            x[good], count[good], slot[good] = memory.x[good], self.touching.count[good], self.touching.slot[good]
-            memory.x[bad], self.touching.count[bad], self.touching.slot[bad] = x[bad], count[bad], slot[bad]
+            x[good], count[good], slot[good] = memory.x[good], self.touching.used[good], self.touching.slot[good]
+            memory.x[bad], self.touching.used[bad], self.touching.slot[bad] = x[bad], count[bad], slot[bad]
             stride[good] *= 2.0
             stride[bad] *= 0.5
             if start is None:
@@ -162,9 +170,9 @@ class Engine:
         """What touches what now."""
         n, n_obstacles = len(self.gap), len(self.surfaces.kind)
         slot = self.touching.slot
-        live = (np.arange(slot.shape[1]) < self.touching.count[:, None]) & ok[:, None]
+        live = (np.arange(slot.shape[1]) < self.touching.used[:, None]) & ok[:, None]
         live &= (slot[:, :, T_FORCE : T_FORCE + 3] != 0.0).any(2) | (slot[:, :, T_GAP] < TOUCHES)
-        count = live.sum(1)
+        count = np.asarray(live.sum(1))
         width = int(count.max(initial=0))
         order = np.argsort(~live, axis=1, kind="stable")[:, :width]
         kept = np.take_along_axis(slot, order[:, :, None], axis=1)
@@ -187,10 +195,12 @@ class Engine:
             tip_arclength=shape.arclength[:, -1],
         )  # fmt: skip
 
-    def _settle(self, rows: Ints, ports: Ports, memory: Memory, shape: Shape, run: Pass, scenery: Scenery, passes: Ints) -> Flags:
+    def _settle(
+        self, rows: Ints, ports: Ports, memory: Memory, shape: Shape, run: Pass, scenery: Scenery, passes: Ints, most: int
+    ) -> Flags:
         """Pass and law in turn on these inputs; (n_robots,) which came to rest."""
         rest = np.zeros(len(self.gap), bool)
-        for _ in range(_MOST_PASSES):
+        for _ in range(most):
             status = self._iterate(rows, ports, memory, shape, run, scenery)
             passes[rows] += 1
             rest[rows[status == AT_REST]] = True
@@ -203,7 +213,7 @@ class Engine:
         """One pass and one round of the law for the worlds of `rows`; their status. Worlds with as many contacts go together."""
         status = np.zeros(len(rows), np.int64)
         most = np.zeros(self.world.max() + 1, np.int64)
-        np.maximum.at(most, self.world[rows], self.touching.count[rows])
+        np.maximum.at(most, self.world[rows], self.touching.used[rows])
         slots = np.minimum(2 ** np.ceil(np.log2(np.maximum(most[self.world[rows]], 1))).astype(np.int64), self.scene.max_contacts)
         for n_slots in np.unique(slots):
             members = np.flatnonzero(slots == n_slots)
@@ -226,7 +236,7 @@ class Engine:
         worlds = np.append(np.flatnonzero(np.diff(self.world[rows], prepend=-1)), n)
         status = np.zeros(n, np.int64)
         parts = self._parts(len(worlds) - 1)
-        scratch = np.empty((parts, world_size(int(np.diff(worlds).max()), self.touching.slot.shape[1], shape.arclength.shape[1])))
+        scratch = np.empty((parts, world_size(int(np.diff(worlds).max()), n_slots, self.touching.slot.shape[1], shape.arclength.shape[1])))
         body = iterate_serial if parts == 1 else iterate_parallel
         proposed, unknown = np.zeros((n, n_slots, 3)), np.zeros((n, n_x))
         body(worlds, rows, scenery, self.touching, self.clearance, probes, memory, proposed, unknown, self.gap, status, scratch)
@@ -254,7 +264,7 @@ class Engine:
     def _parts(self, n: int) -> int:
         return 1 if n <= _FEW else min(self.threads, n)
 
-    def _scenery(self, shape: Shape, tolerance: float, done: Floats, aim: Floats) -> Scenery:
+    def _scenery(self, shape: Shape, tolerance: float, done: Floats, aim: Floats, damping: float = 0.0) -> Scenery:
         """The obstacles at the part `aim` of their way, and at the part `done` that is behind."""
         if self.poses is self.poses_before and not self.velocities:
             frames = before = slip = frames_of(self.poses)
@@ -268,5 +278,16 @@ class Engine:
             frames, before, slip = frames_of(poses), frames_of(last), frames_of(ago)
         history = shape if self.before is None else self.before
         return Scenery(
-            self.rods, self.surfaces, frames, before, slip, shape, history, self.tracked, self.tracked & self.slides, tolerance, self.scene.watch
+            self.rods,
+            self.surfaces,
+            frames,
+            before,
+            slip,
+            shape,
+            history,
+            self.tracked,
+            self.tracked & self.slides,
+            tolerance,
+            self.scene.watch,
+            damping,
         )

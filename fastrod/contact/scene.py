@@ -108,16 +108,19 @@ class ContactScene:
     def _radius(self, robot: Robot) -> list[float]:
         if self.rod_radius is None:
             return [
-                segment.body_radius
-                or _BEYOND_TENDONS * max([np.hypot(*t.position(k + 1)[k]) for t in segment.tendons], default=0.0)
+                segment.body_radius or _BEYOND_TENDONS * max([np.hypot(*t.position(k + 1)[k]) for t in segment.tendons], default=0.0)
                 for k, segment in enumerate(robot.segments)
             ]
         try:
             given = np.broadcast_to(np.asarray(self.rod_radius, float), (robot.n_segments,))
         except (TypeError, ValueError) as error:
-            raise InputError(f"ContactScene.rod_radius is {self.rod_radius!r}; give one radius or {robot.n_segments}, one a segment [m].") from error
+            raise InputError(
+                f"ContactScene.rod_radius is {self.rod_radius!r}; give one radius or {robot.n_segments}, one a segment [m]."
+            ) from error
         if not ((given >= 0.0) & (given <= robot.length)).all():
-            raise InputError(f"ContactScene.rod_radius is {self.rod_radius!r} m; it must be between 0 and the rod's length. Was it given in mm?")
+            raise InputError(
+                f"ContactScene.rod_radius is {self.rod_radius!r} m; it must be between 0 and the rod's length. Was it given in mm?"
+            )
         return list(map(float, given))
 
     def rest_poses(self) -> Floats:
@@ -140,7 +143,8 @@ class ContactScene:
     def velocities(self, given: Mapping[str, ArrayLike] | None, n_robots: int) -> dict[int, Floats]:
         """Obstacle index -> (1 or n_robots, 6) velocity of its origin [m/s] and angular velocity [rad/s], world."""
         return {
-            self.index(name): _rows(f"obstacle_velocity[{name!r}]", value, 6, n_robots, "m/s, rad/s") for name, value in (given or {}).items()
+            self.index(name): _rows(f"obstacle_velocity[{name!r}]", value, 6, n_robots, "m/s, rad/s")
+            for name, value in (given or {}).items()
         }
 
 

@@ -53,7 +53,7 @@ def _ball(o: Obstacle) -> tuple[float, float, float, float]:
     if o.shape == "mesh":
         low, high = o.vertices.min(0), o.vertices.max(0)
         centre = 0.5 * (low + high)
-        return (*centre.tolist(), float(np.linalg.norm(o.vertices - centre, axis=1).max()))  # type: ignore[return-value]
+        return (*centre.tolist(), float(np.linalg.norm(o.vertices - centre, axis=1).max()))
     a, b, c = o.size
     radius = {"sphere": a, "box": 0.5 * math.hypot(a, b, c), "cylinder": math.hypot(a, 0.5 * b), "capsule": a + 0.5 * b}
     return 0.0, 0.0, 0.0, radius.get(o.shape, math.inf)

@@ -8,16 +8,15 @@ from types import FunctionType
 import numpy as np
 from numba import prange
 
-from fastrod.kernels.centreline import curve_of
 from fastrod.kernels.chunk import pass_chunk
+from fastrod.kernels.forces import Scenery
 from fastrod.kernels.gather import feed_forward
 from fastrod.kernels.jit import LANES, entry, parallel_entry
 from fastrod.kernels.placing import place_nodes
-from fastrod.kernels.search import search_obstacles
 from fastrod.kernels.shape import Lanes
 from fastrod.kernels.slots import T_FORCE, T_N, T_RADIUS, T_S
 from fastrod.kernels.strands import search_rods
-from fastrod.kernels.touch import Scenery, iterate_world, sweep_of, went_through
+from fastrod.kernels.touch import iterate_world, look_at
 from fastrod.types import Clearance, Floats, Ints, Layout, Memory, Params, Ports, Probes, Response, Shape, Touching
 
 
@@ -110,35 +109,26 @@ def arrange(
         for q in range(m):
             s[q] = s_given[i, q]
         for q in range(n_slots):
-            s[m + q] = touching.slot[i, q, T_S] if q < touching.count[i] else np.nan
+            s[m + q] = touching.slot[i, q, T_S] if q < touching.used[i] else np.nan
         fits = place_nodes(s, starts[i if len(starts) > 1 else 0], n_steps, grid[i], node, work) and fits
         for q in range(m):
             node_given[i, q] = node[q]
         for q in range(n_slots):
             probes.node[r, q] = node[m + q]
             for a in range(3):
-                taken = q < touching.count[i]
+                taken = q < touching.used[i]
                 probes.force[r, q, a] = touching.slot[i, q, T_FORCE + a] if taken else 0.0
                 probes.arm[r, q, a] = -touching.slot[i, q, T_RADIUS] * touching.slot[i, q, T_N + a] if taken else 0.0
     return fits
 
 
-def _look(
-    rows: Ints, scenery: Scenery, touching: Touching, clearance: Clearance, gap: Floats, found: Floats, n_found: Ints, scratch: Floats
-) -> None:
-    """Smallest gap of each robot and, in row order, its candidates for contact (`search_obstacles`); n_found is -1 where the
-    rod has gone through an obstacle since the last step."""
+def _look(rows: Ints, scenery: Scenery, clearance: Clearance, gap: Floats, found: Floats, n_found: Ints, scratch: Floats) -> None:
+    """`look_at` of each robot: its smallest gap and, in row order, its candidates for contact."""
     n_parts = scratch.shape[0]
     for part in prange(n_parts):
         for r in range(part, len(rows), n_parts):
             i = rows[r]
-            if went_through(i, scenery, clearance, False, scratch[part]):
-                n_found[r] = -1
-                continue
-            n_found[r], gap[i] = search_obstacles(
-                curve_of(scenery.shape, i), sweep_of(i, scenery, scenery.margin), scenery.surfaces,
-                scenery.frames[i if len(scenery.frames) > 1 else 0], clearance.distance[i], clearance.position[i], scratch[part], found[r],
-            )  # fmt: skip
+            n_found[r], gap[i] = look_at(i, scenery, clearance, found[r], scratch[part])
 
 
 @entry

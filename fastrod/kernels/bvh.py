@@ -12,7 +12,7 @@ from typing import Any
 
 from fastrod.kernels.jit import inline, kernel
 from fastrod.kernels.vec import Vec, axpy, cross, dot, sub
-from fastrod.types import Surfaces
+from fastrod.types import Floats, Surfaces
 
 LEAF_CODE = 8
 STACK = 64  # links that wait: one for each level of the hierarchy
@@ -55,12 +55,12 @@ def closest_on_triangle(p: Vec, a: Vec, b: Vec, c: Vec) -> tuple[Vec, int]:
 
 
 @inline
-def _box_distance(p: Vec, box: Numbers, o: int) -> float:
+def _box_distance(p: Vec, box: Floats, o: int) -> float:
     """Squared distance to a box (lower corner, upper corner)."""
     x = max(max(box[o] - p[0], p[0] - box[o + 3]), 0.0)
     y = max(max(box[o + 1] - p[1], p[1] - box[o + 4]), 0.0)
     z = max(max(box[o + 2] - p[2], p[2] - box[o + 5]), 0.0)
-    return x * x + y * y + z * z
+    return float(x * x + y * y + z * z)
 
 
 @kernel
@@ -160,7 +160,7 @@ def facing_planes(p: Vec, reach: float, root: int, surfaces: Surfaces, stack: Nu
             d = dot(sub(p, a), normal)
             if d < 0.0 or d >= reach:
                 continue
-            q, feature = closest_on_triangle(p, a, corner(surfaces, t, 1), corner(surfaces, t, 2))
+            _, feature = closest_on_triangle(p, a, corner(surfaces, t, 1), corner(surfaces, t, 2))
             if feature != 0:
                 continue
             n_found = _keep_plane(d, normal, t, found, n_found, most)
@@ -175,7 +175,7 @@ def _enters_box(p: Vec, inverse: Vec, longest: float, box: Numbers, o: int) -> b
     z0, z1 = (box[o + 2] - p[2]) * inverse[2], (box[o + 5] - p[2]) * inverse[2]
     low = max(max(min(x0, x1), min(y0, y1)), max(min(z0, z1), 0.0))
     high = min(min(max(x0, x1), max(y0, y1)), min(max(z0, z1), longest))
-    return low <= high * (1.0 + 1e-12)
+    return bool(low <= high * (1.0 + 1e-12))
 
 
 @inline

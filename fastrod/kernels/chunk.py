@@ -340,7 +340,7 @@ def pass_chunk(
     if placed:
         write_response(robots, count, node, columns, error, gamma, n_col, n_e, response)
     if n_probes > 0:
-        form_gain(robots, params, memory, layout, gamma, n_col, n_e, P, G, scaled, work, 1.0, noise, False)
+        form_gain(robots, params, memory, layout, gamma, n_col, n_e, P, G, scaled, work, process, noise, carry)
         respond(robots, count, params, memory, layout, x, error, gamma, G, work[(n_p + 2) * W :], n_col, n_e, n_p, moves, probes, first_row)
     elif update:
         update_boundary(robots, count, params, memory, layout, x, error, gamma, n_col, n_e, P, G, scaled, work, process, noise, carry)

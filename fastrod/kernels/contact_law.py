@@ -31,8 +31,8 @@ def law_size(m: int) -> int:
 
 @kernel
 def solve_dense(a: Numbers, n: int, stride: int) -> bool:
-    """Gauss elimination with partial pivoting of the n x (n + 1) system in `a`, rows `stride` apart; the solution replaces
-    the last column. False where the matrix is singular."""
+    """Gauss elimination with partial pivoting of n equations in `a`, rows `stride` apart, with stride - n right-hand sides; the
+    solutions replace those. False where the matrix is singular."""
     for c in range(n):
         pivot = c
         for r in range(c + 1, n):
@@ -41,19 +41,21 @@ def solve_dense(a: Numbers, n: int, stride: int) -> bool:
         if not abs(a[pivot * stride + c]) > 0.0:
             return False
         if pivot != c:
-            for i in range(c, n + 1):
+            for i in range(c, stride):
                 a[c * stride + i], a[pivot * stride + i] = a[pivot * stride + i], a[c * stride + i]
         inverse = 1.0 / a[c * stride + c]
         for r in range(c + 1, n):
             factor = a[r * stride + c] * inverse
             if factor != 0.0:
-                for i in range(c + 1, n + 1):
+                for i in range(c + 1, stride):
                     a[r * stride + i] -= factor * a[c * stride + i]
     for c in range(n - 1, -1, -1):
-        value = a[c * stride + n]
-        for i in range(c + 1, n):
-            value -= a[c * stride + i] * a[i * stride + n]
-        a[c * stride + n] = value / a[c * stride + c]
+        inverse = 1.0 / a[c * stride + c]
+        for i in range(n, stride):
+            value = a[c * stride + i]
+            for q in range(c + 1, n):
+                value -= a[c * stride + q] * a[q * stride + i]
+            a[c * stride + i] = value * inverse
     return True
 
 
@@ -62,7 +64,7 @@ def _motion(W: Floats, b: Numbers, force: Numbers, row: int, n: int) -> float:
     u = b[row]
     for i in range(n):
         u += W[row, i] * force[i]
-    return u
+    return float(u)
 
 
 @kernel
@@ -168,9 +170,9 @@ def contact_forces(m: int, W: Floats, b: Numbers, friction: Numbers, compliance:
         slips = friction[c] > 0.0 and state[c] == STICK and size >= friction[c] * force[3 * c] * (1.0 - 1e-6) and size > 0.0
         along[2 * c], along[2 * c + 1] = (force[3 * c + 1] / size, force[3 * c + 2] / size) if slips else (0.0, 0.0)
         state[c] = SLIP if slips else state[c]
-    for _ in range(_ROUNDS):
+    for count in range(_ROUNDS):
         wrong = _correct_states(m, W, b, friction, compliance, force, state, along)
-        if wrong <= _AGREE and _ > 0:
+        if wrong <= _AGREE and count > 0:
             return True
         for c in range(m):
             for i in range(3):
@@ -181,7 +183,9 @@ def contact_forces(m: int, W: Floats, b: Numbers, friction: Numbers, compliance:
             force[i] = a[i * (n + 1) + n]
     for i in range(n):
         force[i] = best[i] if best[i] == best[i] else 0.0
+    left = 1.0
     for _ in range(_SWEEPS):
-        if _sweep(m, W, b, friction, compliance, force) < _AGREE:
-            return True
-    return False
+        left = _sweep(m, W, b, friction, compliance, force)
+        if left < _AGREE:
+            break
+    return left < _AGREE

@@ -25,7 +25,7 @@ def place_nodes(s: Floats, starts: Floats, n_steps: int, grid: Floats, node: Int
         for q in range(len(s)):
             f = (s[q] - low) / length
             ours = (f >= 0.0 or k == 0) and (f < 1.0 or k == n_segments - 1)
-            if not ours:
+            if not ours or f != f:
                 continue
             if f < _END or f > 1.0 - _END:
                 node[q] = k * n_steps + (0 if f < 0.5 else n_steps)

@@ -122,9 +122,7 @@ def search_obstacles(
     for k in range(n_obstacles):
         frame = frames[k]
         for j in range(start, n):
-            h = max(
-                curve.arclength[min(j + 1, n - 1)] - curve.arclength[j], curve.arclength[j] - curve.arclength[max(j - 1, start)]
-            )
+            h = max(curve.arclength[min(j + 1, n - 1)] - curve.arclength[j], curve.arclength[j] - curve.arclength[max(j - 1, start)])
             thick = max(radius_after(sweep, max(j - 1, 0)), radius_after(sweep, j))
             need = thick + sweep.margin + h
             if known[j] > need:
@@ -136,7 +134,9 @@ def search_obstacles(
             slope[j] = dot(normal, node_tangent(curve, j, start, part)) if near else 0.0
             least[j] = min(least[j], phi[j])
             if near and j == start and slope[j] > 0.0 and phi[j] - radius_after(sweep, j) < sweep.margin:
-                n_found = _note(k, max(sweep.first, curve.arclength[j]), phi[j] - radius_after(sweep, j), normal, sweep.spacing, found, n_found)
+                n_found = _note(
+                    k, max(sweep.first, curve.arclength[j]), phi[j] - radius_after(sweep, j), normal, sweep.spacing, found, n_found
+                )
             if near and j == n - 1 and slope[j] < 0.0 and phi[j] - radius_after(sweep, j - 1) < sweep.margin:
                 n_found = _note(k, curve.arclength[j], phi[j] - radius_after(sweep, j - 1), normal, sweep.spacing, found, n_found)
         for j in range(start, n - 1):

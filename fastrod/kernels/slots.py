@@ -43,7 +43,9 @@ def open_slot(slot: Numbers, obstacle: int, s: float, twin: int, n: Vec, gap: fl
 
 
 @kernel
-def wall_at(k: int, frame: Floats, p: Vec, old: Vec, margin: float, surfaces: Surfaces, stack: Numbers, found: Numbers) -> tuple[float, Vec]:
+def wall_at(
+    k: int, frame: Floats, p: Vec, old: Vec, margin: float, surfaces: Surfaces, stack: Numbers, found: Numbers
+) -> tuple[float, Vec]:
     """Signed distance of the centreline point p to that wall of obstacle k which faces as `old` does, and its normal.
 
     Where the centreline has gone through the surface, the nearest side may be the wrong one: what counts is the side on which
@@ -199,5 +201,3 @@ def merge(count: int, slot: Floats, spacing: float) -> int:
 def arm_of(slot: Numbers) -> Vec:
     """From the centreline to the point of contact."""
     return scale(-slot[T_RADIUS], slot_normal(slot))
-
-

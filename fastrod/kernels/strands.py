@@ -23,7 +23,7 @@ def twin_of(touching: Touching, n_obstacles: int, robot: int, q: int) -> int:
     """Slot on the other rod that belongs to slot q of `robot`."""
     slot = touching.slot[robot, q]
     other = int(slot[T_OBSTACLE]) - n_obstacles
-    for p in range(touching.count[other]):
+    for p in range(touching.used[other]):
         twin = touching.slot[other, p]
         if twin[T_TWIN] == slot[T_TWIN] and int(twin[T_OBSTACLE]) == n_obstacles + robot and not (other == robot and p == q):
             return p
@@ -78,7 +78,7 @@ def _nearest_on_curves(a: Curve, b: Curve, s: float, t: float, low_a: float, low
 @kernel
 def _known(touching: Touching, n_obstacles: int, robot: int, other: int, s: float, t: float, spacing: float) -> int:
     """Slot of `robot` that holds this contact with `other` already; -1 if none does."""
-    for q in range(touching.count[robot]):
+    for q in range(touching.used[robot]):
         slot = touching.slot[robot, q]
         if int(slot[T_OBSTACLE]) == n_obstacles + other and abs(slot[T_S] - s) < spacing:
             p = twin_of(touching, n_obstacles, robot, q)
@@ -94,19 +94,19 @@ def _add_pair(
     """A slot on both rods, linked by a number that neither has used; False where one of them is full."""
     need = 2 if robot == other else 1
     most = touching.slot.shape[1]
-    if touching.count[robot] + need > most or touching.count[other] + need > most:
+    if touching.used[robot] + need > most or touching.used[other] + need > most:
         return False
     link = 0.0
     for i in range(2):
         which = robot if i == 0 else other
-        for q in range(touching.count[which]):
+        for q in range(touching.used[which]):
             link = max(link, touching.slot[which, q, T_TWIN] + 1.0)
     r_a = rods.radius[robot, segment_at(a.arclength, rods.n_steps, s)]
     r_b = rods.radius[other, segment_at(b.arclength, rods.n_steps, t)]
-    open_slot(touching.slot[robot, touching.count[robot]], n_obstacles + other, s, int(link), n, gap, r_a)
-    touching.count[robot] += 1
-    open_slot(touching.slot[other, touching.count[other]], n_obstacles + robot, t, int(link), scale(-1.0, n), gap, r_b)
-    touching.count[other] += 1
+    open_slot(touching.slot[robot, touching.used[robot]], n_obstacles + other, s, int(link), n, gap, r_a)
+    touching.used[robot] += 1
+    open_slot(touching.slot[other, touching.used[other]], n_obstacles + robot, t, int(link), scale(-1.0, n), gap, r_b)
+    touching.used[other] += 1
     return True
 
 
@@ -150,7 +150,8 @@ def _search_pair(
             here = abs(s - a.arclength[i] - x * h_a) < 2.0 * h_a and abs(t - b.arclength[j] - y * h_b) < 2.0 * h_b
             if here and not (robot == other and t - s < apart):
                 thick = (
-                    rods.radius[robot, segment_at(a.arclength, rods.n_steps, s)] + rods.radius[other, segment_at(b.arclength, rods.n_steps, t)]
+                    rods.radius[robot, segment_at(a.arclength, rods.n_steps, s)]
+                    + rods.radius[other, segment_at(b.arclength, rods.n_steps, t)]
                 )
                 open_gap = distance - thick
                 gap[robot], gap[other] = min(gap[robot], open_gap), min(gap[other], open_gap)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from fastrod.kernels.bvh import FAR, Numbers, facing_planes, first_hit, signed_triangle
+from fastrod.kernels.bvh import FAR, Numbers, corner, facing_planes, first_hit, nearest_triangle, signed_triangle
 from fastrod.kernels.jit import inline, kernel
-from fastrod.kernels.primitive import MESH, ray_primitive, signed_primitive
+from fastrod.kernels.primitive import BOX, CAPSULE, MESH, PLANE, SPHERE, ray_primitive, signed_primitive
 from fastrod.kernels.vec import Mat, Vec, dot, mul, mul_t, sub
 from fastrod.types import Surfaces
 
@@ -85,3 +85,46 @@ def ray_hit(k: int, frame: Numbers, p: Vec, direction: Vec, longest: float, surf
         return FAR, (0.0, 0.0, 0.0)
     at = (local[0] + t * along[0], local[1] + t * along[1], local[2] + t * along[2])
     return t, mul(turn_of(frame), signed_primitive(surfaces.kind[k], _size(k, surfaces), at)[1])
+
+
+@kernel
+def surface_curvature(k: int, frame: Numbers, p: Vec, surfaces: Surfaces, stack: Numbers) -> tuple[float, float, Vec]:
+    """How the normal of obstacle k turns as the world point p, outside, moves across it: by the first number per length
+    [1/m], and along the unit direction that is returned by the second. (The second derivative of the distance.)"""
+    local = to_obstacle(frame, p)
+    kind, size = surfaces.kind[k], _size(k, surfaces)
+    first, second, along = 0.0, 0.0, (0.0, 0.0, 1.0)
+    if kind == MESH:
+        square, _, t, feature = nearest_triangle(local, FAR, surfaces.root[k], surfaces, stack)
+        if feature > 0 and square > 0.0:
+            first = 1.0 / math.sqrt(square)
+            second = first
+            if feature < 4:
+                a, b = corner(surfaces, t, feature - 1), corner(surfaces, t, feature % 3)
+                edge = sub(b, a)
+                length = math.sqrt(dot(edge, edge))
+                second, along = 0.0, (edge[0] / length, edge[1] / length, edge[2] / length)
+    elif kind == BOX:
+        x, y, z = abs(local[0]) - 0.5 * size[0], abs(local[1]) - 0.5 * size[1], abs(local[2]) - 0.5 * size[2]
+        beyond = (max(x, 0.0), max(y, 0.0), max(z, 0.0))
+        sides = (1.0 if x > 0.0 else 0.0) + (1.0 if y > 0.0 else 0.0) + (1.0 if z > 0.0 else 0.0)
+        if sides > 1.5:
+            first = 1.0 / math.sqrt(dot(beyond, beyond))
+            second = first if sides > 2.5 else 0.0
+            along = (0.0 if x > 0.0 else 1.0, 0.0 if y > 0.0 else 1.0, 0.0 if z > 0.0 else 1.0) if sides < 2.5 else along
+    elif kind == SPHERE:
+        first = 1.0 / max(math.sqrt(dot(local, local)), 1e-12)
+        second = first
+    elif kind != PLANE:
+        radial = max(math.sqrt(local[0] * local[0] + local[1] * local[1]), 1e-12)
+        over = abs(local[2]) - 0.5 * size[1]
+        if kind == CAPSULE:
+            first = 1.0 / max(math.sqrt(radial * radial + max(over, 0.0) ** 2), 1e-12)
+            second = first if over > 0.0 else 0.0
+        elif radial > size[0] and over > 0.0:  # the rim
+            d = math.sqrt((radial - size[0]) ** 2 + over * over)
+            first, second = 1.0 / d, (radial - size[0]) / d / radial
+            along = (-local[1] / radial, local[0] / radial, 0.0)
+        elif over <= 0.0 and radial - size[0] >= over:
+            first = 1.0 / radial
+    return first, second, mul(turn_of(frame), along)
