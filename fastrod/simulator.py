@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, Literal
 
 import numba
@@ -11,27 +12,26 @@ from numpy.typing import ArrayLike
 
 from fastrod.chain import Chain, Measurement
 from fastrod.compile import compile_robots
+from fastrod.contact import queries
 from fastrod.contact.engine import Engine
+from fastrod.contact.frames import blended
 from fastrod.contact.scene import ContactScene
 from fastrod.contact.step import Ways, contact_step
 from fastrod.errors import InputError, RobotError
 from fastrod.guess import cold_start
 from fastrod.inputs import Inputs, PointForces, Reader
-from fastrod.kernels.batch import pass_parallel, pass_serial
-from fastrod.kernels.chunk import scratch_size
 from fastrod.kernels.dense import between_nodes
-from fastrod.kernels.jit import LANES
+from fastrod.passes import Passes
+from fastrod.response import Linear
 from fastrod.robot import Robot
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.settle import settle
 from fastrod.state import Observer, Pose, Snapshot, State
-from fastrod.types import Flags, Floats, Ints, Memory, Params, Ports, Probes, Response, Shape
+from fastrod.types import Flags, Floats, Ints, Memory, Params, Ports, Probes, Shape
 
 _config: Any = numba.config
-NO_PROBES = Probes(np.empty((0, 0), np.int64), np.empty((0, 0, 3)), np.empty((0, 0, 3)), np.empty((0, 0, 0)), np.empty((0, 0, 0)))
 _AT_REST = 1e-7  # m: contact and boundary of a step, where `settle` has a tolerance of its own
 _LOST = 0.1  # of the robot's length: a residual beyond it is no shape of this robot
-_SMALL = 4 * LANES  # robots below which starting threads costs more than it saves
 
 
 class Simulator:
@@ -86,31 +86,30 @@ class Simulator:
         self.n_robots = int(n_robots)
         self.dt = float(dt)
         self.observer = observer or Observer()
-        self._carry = observer is not None
         self.outputs = outputs
-        self._threads = threads or numba.get_num_threads()
-        self._layout, self._params, self._rest = compile_robots(self.robots, int(points_per_segment))
-        self._reader = Reader(self._layout, self._params, self._rest, self.n_robots)
+        self._layout, self._plain, rest = compile_robots(self.robots, int(points_per_segment))
+        threads = threads or numba.get_num_threads()
+        self._passes = Passes(self._layout, self._plain, self.n_robots, threads, carry=observer is not None)
+        self._reader = Reader(self._layout, self._plain, rest, self.n_robots)
         self._chain = Chain(self.robots, self.n_robots)
-        self._plain = self._params  # the robot before its effects, and its last ports before them
+        # the last ports before effects; _plain is the robot before them
         self._bare: Ports | None = None
         self._all = np.arange(self.n_robots)
         self._warm = np.zeros(self.n_robots, bool)
         self._ports: Ports | None = None
         self._given = Inputs()
         self._state: State | None = None
-        self._memory = self._new_memory(follower=False, track_force=False)
         if contact is not None and not isinstance(contact, ContactScene):
             raise InputError(f"contact is {contact!r}; give fastrod.contact.ContactScene(obstacles=[...]) or None.")
         self._engine: Engine | None = None
         if contact is not None:
-            rods = contact.rods(self.robots, self.n_robots, self._layout, self._params)
-            self._engine = Engine(contact, rods, self._params.length, self.n_points, self._threads)
+            rods = contact.rods(self.robots, self.n_robots, self._layout, self._plain)
+            self._engine = Engine(contact, rods, self._plain.length, self.n_points, threads)
 
     @property
     def n_points(self) -> int:
         """Nodes along the whole robot."""
-        return len(self._layout.first_tendon) * self._layout.n_steps + 1
+        return self._passes.n_points
 
     def step(
         self,
@@ -150,18 +149,20 @@ class Simulator:
         if self._engine is not None:
             return self._touch(self._engine, given, obstacle_pose, obstacle_velocity, None)
         _refuse_obstacles(obstacle_pose, obstacle_velocity)
-        tracked = len(self._memory.force_before) > 0
+        tracked = len(self._passes.memory.force_before) > 0
         ports, rows = self._read(given)
         process, noise = self.observer.process_noise * self.dt, self.observer.measurement_noise / self.dt
         before = self._ports
-        learns = before is not None and not tracked and len(self._memory.force_before) > 0
+        learns = before is not None and not tracked and len(self._passes.memory.force_before) > 0
         if before is not None and learns and bool(len(before.follower_force)) == bool(len(ports.follower_force)):
-            self._pass(rows[self._warm[rows]], before, self._new_shape("tip", True), carry=self._carry, process=process, noise=noise)
-        cold_start(rows[~self._warm[rows]], self._layout, self._params, ports, self._memory)
-        shape = self._new_shape(self.outputs, len(rows) < self.n_robots)
-        self._pass(rows, ports, shape, feed=True, carry=self._carry, process=process, noise=noise)
-        finite = np.isfinite(self._memory.x.sum(1))
-        ok = finite & (shape.residual < _LOST * self._params.reach)
+            self._passes.run(
+                rows[self._warm[rows]], before, self._passes.new_shape("tip", True), carry=self._passes.carry, process=process, noise=noise
+            )
+        cold_start(rows[~self._warm[rows]], self._layout, self._passes.params, ports, self._passes.memory)
+        shape = self._passes.new_shape(self.outputs, len(rows) < self.n_robots)
+        self._passes.run(rows, ports, shape, feed=True, carry=self._passes.carry, process=process, noise=noise)
+        finite = np.isfinite(self._passes.memory.x.sum(1))
+        ok = finite & (shape.residual < _LOST * self._passes.params.reach)
         passes = np.broadcast_to(np.int64(1 + learns), self.n_robots)
         if len(rows) < self.n_robots:
             read = np.isin(self._all, rows)
@@ -213,75 +214,71 @@ class Simulator:
         ports, rows = self._read(given)
         engine.given_arclength, engine.given_force = self._reader.loads
         engine.move(poses, velocities, self.dt)
-        shape = self._new_shape("full", True)
+        shape = self._passes.new_shape("full", True)
         passes = np.zeros(self.n_robots, np.int64)
 
         def run(which: Ints, at: Ports, into: Shape, probes: Probes) -> None:
-            self._pass(which, at, into, probes=probes, update=False, noise=1e-10 if self._layout.paper else 1e-20)
+            self._passes.run(which, at, into, probes=probes, update=False, noise=1e-10 if self._layout.paper else 1e-20)
 
         def free(which: Ints, at: Ports, into: Shape) -> Flags:
             if tolerance is not None:
                 return bring_to_rest(which, at, into)
             process, noise = self.observer.process_noise * self.dt, self.observer.measurement_noise / self.dt
-            self._pass(which, at, into, feed=True, carry=self._carry, process=process, noise=noise)
+            self._passes.run(which, at, into, feed=True, carry=self._passes.carry, process=process, noise=noise)
             passes[which] += 1
-            well = np.isfinite(self._memory.x.sum(1)) & (into.residual < _LOST * self._params.reach)
+            well = np.isfinite(self._passes.memory.x.sum(1)) & (into.residual < _LOST * self._passes.params.reach)
             return np.asarray(well & np.isin(self._all, which))
 
         def bring_to_rest(which: Ints, at: Ports, into: Shape) -> Flags:
             def once(some: Ints, there: Ports) -> Floats:
-                self._pass(some, there, into, noise=1e-10 if self._layout.paper else 1e-20)
+                self._passes.run(some, there, into, noise=1e-10 if self._layout.paper else 1e-20)
                 return into.residual[some]
 
-            used = settle(which, self._warm, self._layout, self._params, at, self._memory, tolerance or 1e-9, once)
+            used = settle(which, self._warm, self._layout, self._passes.params, at, self._passes.memory, tolerance or 1e-9, once)
             passes[which] += np.abs(used[which])
             return np.asarray(used > 0)
 
         ok, done = contact_step(
-            engine, Ways(free, bring_to_rest, run), rows, self._warm, start, ports, self._unloaded(ports), self._memory, shape,
+            engine, Ways(free, bring_to_rest, run), rows, self._warm, start, ports, self._unloaded(ports), self._passes.memory, shape,
             tolerance or _AT_REST, passes,
         )  # fmt: skip
-        self._begin_next(np.flatnonzero(ok), ports)
         for i in rows[~ok[rows]]:
             self._reader.problems.setdefault(int(i), engine.why(int(i), float(done[i])))
-        return self._finish(ports, shape, ok, np.where(ok, passes, -1), "contact")
+        held = np.isin(self._all, rows) & ~ok & engine.tracked
+        if held.any() and start is not None:
+            ports = blended(start, ports, done)
+        self._passes.arrive_at(np.flatnonzero(held | (ok & engine.led)), ports)
+        state = self._finish(ports, shape, ok, np.where(ok, passes, -1), "contact")
+        self._warm[held] = True  # it stands where it came to, and goes on from there
+        return state
 
     def _unloaded(self, ports: Ports) -> Ports:
         """The straight robot on the same base, without loads."""
-        ends = np.cumsum(self._params.length + ports.extension, axis=1)[:, self._layout.tendon_segment]
+        ends = np.cumsum(self._passes.params.length + ports.extension, axis=1)[:, self._layout.tendon_segment]
         zeros: dict[str, Any] = {
             name: 0.0 * getattr(ports, name)
             for name in ("tension", "tip_force", "tip_moment", "follower_force", "line_force", "node_force")
         }
         return ports._replace(tendon_length=np.ascontiguousarray(ends), **zeros)
 
-    def _begin_next(self, rows: Ints, ports: Ports) -> None:
-        """What the next free step moves from, for robots that were brought here by contact."""
-        memory, led = self._memory, rows
-        memory.length_before[led] = np.broadcast_to(ports.tendon_length, (self.n_robots, ports.tendon_length.shape[1]))[led][
-            :, self._layout.row_tendon
-        ]
-        if len(memory.force_before):
-            memory.force_before[led] = np.broadcast_to(ports.tip_force, (self.n_robots, 3))[led]
-
     def settle_ports(self, ports: Ports, params: Params, tolerance: float = 1e-9) -> State:
         """`settle` on what the kernel reads, with effects already in it: for those who carry effects over a whole log
         themselves. `params` may have a row for each robot."""
         self._reader.problems = {}
-        self._params, self._bare = params, None
-        self._remember(follower=False, track_force=False)
+        self._passes.params, self._bare = params, None
+        self._passes.remember(False, False, None)
         return self._settle(ports, self._all, tolerance)
 
     def _settle(self, ports: Ports, rows: Ints, tolerance: float) -> State:
-        shape = self._new_shape(self.outputs, len(rows) < self.n_robots)
+        shape = self._passes.new_shape(self.outputs, len(rows) < self.n_robots)
 
         def run(which: Ints, at: Ports) -> Floats:
-            self._pass(which, at, shape, feed=False, carry=False, process=1.0, noise=1e-10 if self._layout.paper else 1e-20)
+            self._passes.run(which, at, shape, feed=False, carry=False, process=1.0, noise=1e-10 if self._layout.paper else 1e-20)
             return shape.residual[which]
 
-        passes = settle(rows, self._warm, self._layout, self._params, ports, self._memory, tolerance, run)
-        if self._carry:
-            self._memory.covariance[rows] = 0.0
+        passes = settle(rows, self._warm, self._layout, self._passes.params, ports, self._passes.memory, tolerance, run)
+        if self._passes.carry:
+            self._passes.memory.covariance[rows] = 0.0
         ok = np.zeros(self.n_robots, bool)
         ok[rows] = passes[rows] > 0
         return self._finish(ports, shape, ok, passes, f"settle did not bring the boundary residual below {tolerance:g} m")
@@ -291,9 +288,7 @@ class Simulator:
 
         Between nodes the rod is integrated from the node before, so the answer has the integrator's order everywhere.
         """
-        state, ports = self._last("shape")
-        if self.outputs != "full":
-            raise InputError("shape needs Simulator(..., outputs='full'); this one keeps the tip only.")
+        state, ports = self._full("shape"), self._last("shape")[1]
         try:
             s = np.asarray(arclength, dtype=np.float64)
         except (TypeError, ValueError) as error:
@@ -309,7 +304,7 @@ class Simulator:
         found = Pose(np.full((*s.shape, 3), np.nan), np.full((*s.shape, 3, 3), np.nan), np.full((*s.shape, 3), np.nan))
         whole = np.isfinite(end[:, 0])
         robot, query = np.nonzero(np.broadcast_to(whole[:, None], s.shape))
-        between_nodes(robot, query, np.array(s, order="C"), self._params, ports, self._layout, _as_shape(state), found)
+        between_nodes(robot, query, np.array(s, order="C"), self._passes.params, ports, self._layout, _as_shape(state), found)
         return found
 
     def jacobian(self) -> Floats:
@@ -320,36 +315,77 @@ class Simulator:
         are in their loops; what only follows in time (latency, dynamics) answers nothing at once: its columns are zero.
         A slack wire's column is zero, a robot's that is not ok nan. Columns of
         lengths come from the sensitivities of the pass (model.md); those of tensions and extensions from central
-        differences of the pass, closed by the same sensitivities.
+        differences of the pass, closed by the same sensitivities. Contact forces are held as they are.
         """
         _, ports = self._last("jacobian")
-        layout = self._layout
+        layout, linear = self._layout, self._linear(ports)
         n_tendons, n_segments = len(layout.tendon_segment), len(layout.first_tendon)
-        response, _ = self._respond(ports)
-        inverse = _inverse(response.residual[:, :, : self._memory.x.shape[1]])
-        by_unknown = response.tip[:, :, : self._memory.x.shape[1]] @ inverse
+        by_residual, _ = linear.by_lengths()
         jacobian = np.empty((self.n_robots, 6, n_tendons + n_segments))
-        jacobian[:, :, layout.row_tendon] = by_unknown[:, :, : len(layout.row_tendon)]
+        jacobian[:, :, layout.row_tendon] = by_residual[:, :, : len(layout.row_tendon)]
         pulled = np.setdiff1d(np.arange(n_tendons), layout.row_tendon)
+        params = self._passes.params
         for name, members, start in (("tension", pulled, 0), ("extension", np.arange(n_segments), n_tendons)):
-            delta = 1e-4 * (self._params.tension_scale if name == "tension" else self._params.reach)[:, None]
+            delta = 1e-4 * (params.tension_scale if name == "tension" else params.reach)[:, None]
             for a in members:
-                tip, error = self._difference(ports, name, int(a), delta)
-                jacobian[:, :, start + a] = tip - np.einsum("rie,re->ri", by_unknown, error)
+                tip, error = linear.difference(partial(self._moved, linear.ports, name, int(a), delta), delta)
+                jacobian[:, :, start + a] = tip - np.einsum("rie,re->ri", by_residual, error)
         if self._bare is None:
             return jacobian
         return np.asarray(jacobian @ self._chain.slopes(self._bare, self._plain, self._state, self.dt, layout.n_steps))
 
     def compliance(self) -> Floats:
-        """(n_robots, 6, 3) d(tip position [m], rotation vector [rad]) / d(tip force [N]), world frame, actuation held."""
-        _, ports = self._last("compliance")
-        response, _ = self._respond(ports)
-        n_x = self._memory.x.shape[1]
-        free, load = response.residual[:, :, :n_x], response.residual[:, :, -3:]
-        if len(ports.follower_force):  # the follower force is an unknown; a dead force enters as its column, but not its own row
-            load = load.copy()
-            load[:, -3:] -= (self._params.reach**2 / self._params.moment_scale)[:, None, None] * np.eye(3)
-        return np.asarray(response.tip[:, :, -3:] - response.tip[:, :, :n_x] @ (_inverse(free) @ load))
+        """(n_robots, 6, 3) d(tip position [m], rotation vector [rad]) / d(tip force [N]), world; actuation and contact forces held."""
+        return self._linear(self._last("compliance")[1]).by_force()
+
+    def _linear(self, ports: Ports) -> Linear:
+        """The linear response of the last state."""
+        rows = np.flatnonzero(self._warm)
+        if self._engine is None:
+            return Linear(self._passes, rows, ports)
+        return Linear(self._passes, rows, *self._engine.held(rows, ports, self._passes.n_x))
+
+    def _moved(self, ports: Ports, name: str, a: int, delta: Floats, sign: float) -> Ports:
+        """The ports with one input moved. Under an extension forces stay at their arclength, so nodes and samples move over the
+        material."""
+        base = getattr(ports, name)
+        moved = np.broadcast_to(base, (max(len(base), len(delta)), base.shape[1])).copy()
+        moved[:, a : a + 1] += sign * delta
+        changed = {name: moved}
+        if name == "extension" and self._engine is None:
+            grid, node_force = self._reader.point_forces(self._given.point_force, moved)
+            changed |= {"grid": grid, "node_force": node_force, "line_force": self._reader.line_force(self._given.line_force, grid)}
+        return ports._replace(**changed)
+
+    def clearance(self, obstacle: str | None = None) -> Floats:
+        """(n_robots,) smallest gap between the robot's surface and the obstacle of this name, or anything that it may touch [m]
+        (`contact.queries.clearance`). Raises `InputError` without a contact scene or a state, `UnknownNameError`."""
+        return queries.clearance(self._contact("clearance"), _as_shape(self._full("clearance")), obstacle)
+
+    def swept_clearance(self, tolerance: float = 1e-5) -> Floats:
+        """(n_robots,) smallest gap on the straight way from the state before to the last one, to `tolerance` [m]; after the first
+        state, its clearance. Raises `InputError` as `clearance`."""
+        engine = self._contact("swept_clearance")
+        _check_positive("tolerance", tolerance, "m")
+        now = _as_shape(self._full("swept_clearance"))
+        before, poses = engine.at_last_step
+        return queries.swept_clearance(engine, now if before is None else before, poses, now, tolerance)
+
+    def ray_cast(self, origin: ArrayLike, direction: ArrayLike, longest: float = np.inf) -> queries.Hits:
+        """What distance sensors see: rays (n_rays, 3) or (n_robots, n_rays, 3), world, against the obstacles where they are now, up
+        to `longest` [m]. Raises `InputError` without a contact scene, on a wrong shape or a direction of length 0."""
+        return queries.ray_cast(self._contact("ray_cast"), origin, direction, longest)
+
+    def _contact(self, what: str) -> Engine:
+        if self._engine is None:
+            raise InputError(f"{what} needs a contact scene; give Simulator(robot, contact=fastrod.contact.ContactScene(...)).")
+        return self._engine
+
+    def _full(self, what: str) -> State:
+        state, _ = self._last(what)
+        if self.outputs != "full":
+            raise InputError(f"{what} needs Simulator(..., outputs='full'); this one keeps the tip only.")
+        return state
 
     def measure(self) -> Measurement:
         """What a camera on the base sees of the last state: tip (and `log_points`, with outputs="full") in the base frame, effects of
@@ -380,12 +416,12 @@ class Simulator:
         """A copy of everything that a later step depends on."""
         effects = [link.memory.copy() for link in self._chain.links]
         return Snapshot(
-            _copied(self._memory),
+            _copied(self._passes.memory),
             self._warm.copy(),
             self._given,
             self._ports,
             self._state,
-            self._params,
+            self._passes.params,
             self._bare,
             effects,
             self._chain.time.copy(),
@@ -393,13 +429,13 @@ class Simulator:
 
     def restore(self, snapshot: Snapshot) -> None:
         """Go back to a `snapshot` of this simulator."""
-        if snapshot.memory.x.shape[0] != self.n_robots or snapshot.memory.length_before.shape != self._memory.length_before.shape:
+        if snapshot.memory.x.shape[0] != self.n_robots or snapshot.memory.length_before.shape != self._passes.memory.length_before.shape:
             raise InputError("the snapshot is of another simulator; its robots, tendons or their number differ.")
         if [memory.shape for memory in snapshot.effects] != [link.memory.shape for link in self._chain.links]:
             raise InputError("the snapshot is of another simulator; its effects differ.")
-        self._memory = _copied(snapshot.memory)
+        self._passes.memory = _copied(snapshot.memory)
         self._warm, self._given, self._ports, self._state = snapshot.warm.copy(), snapshot.given, snapshot.ports, snapshot.state
-        self._params, self._bare, self._chain.time = snapshot.params, snapshot.bare, snapshot.time.copy()
+        self._passes.params, self._bare, self._chain.time = snapshot.params, snapshot.bare, snapshot.time.copy()
         for link, memory in zip(self._chain.links, snapshot.effects, strict=True):
             link.memory[:] = memory
 
@@ -412,9 +448,9 @@ class Simulator:
         if self._chain:
             skip = np.isin(self._all, list(problems)) if problems else np.zeros(self.n_robots, bool)
             self._bare = ports
-            ports, self._params = self._chain.act(ports, self._plain, self._state, self.dt, self._layout.n_steps, skip)
-        track_force = len(self._memory.force_before) > 0 or self._force_moves(ports.tip_force)
-        self._remember(follower=len(ports.follower_force) > 0, track_force=track_force)
+            ports, self._passes.params = self._chain.act(ports, self._plain, self._state, self.dt, self._layout.n_steps, skip)
+        track_force = len(self._passes.memory.force_before) > 0 or self._force_moves(ports.tip_force)
+        self._passes.remember(len(ports.follower_force) > 0, track_force, None if self._ports is None else self._ports.tip_force)
         return ports, rows
 
     def _force_moves(self, force: Floats) -> bool:
@@ -424,80 +460,6 @@ class Simulator:
         before = self._ports.tip_force
         same = force.shape == before.shape and np.array_equal(force, before, equal_nan=True)
         return not same and bool((force != before)[self._warm if max(len(force), len(before)) > 1 else slice(None)].any())
-
-    def _new_memory(self, follower: bool, track_force: bool) -> Memory:
-        layout, n = self._layout, self.n_robots
-        n_rows = len(layout.row_tendon)
-        n_x = 2 * len(layout.first_tendon) if layout.paper else 3 + len(layout.free_tendon)
-        n_x += 3 if follower else 0
-        return Memory(
-            x=np.zeros((n, n_x)),
-            covariance=np.zeros((n if self._carry else 0, n_x * (n_x + 1) // 2), np.float32),
-            gain=np.zeros((n, n_x, n_rows + (3 if track_force else 0)), np.float32),
-            move=np.zeros((n, n_x), np.float32),
-            defect=np.zeros((n, n_x), np.float32),
-            length_before=np.zeros((n, n_rows)),
-            force_before=np.zeros((n if track_force else 0, 3)),
-            curvature_guess=np.zeros((n, 3)),
-        )
-
-    def _remember(self, follower: bool, track_force: bool) -> None:
-        """Widen or narrow the memory when a follower force or a moving tip force comes or goes; x of the rod itself is kept."""
-        new = self._new_memory(follower, track_force)
-        old = self._memory
-        if [a.shape for a in new] == [a.shape for a in old]:
-            return
-        kept = min(old.x.shape[1], new.x.shape[1])
-        new.x[:, :kept] = old.x[:, :kept]
-        columns = min(old.gain.shape[2], new.gain.shape[2])
-        new.gain[:, :kept, :columns] = old.gain[:, :kept, :columns]
-        new.length_before[:] = old.length_before
-        new.curvature_guess[:] = old.curvature_guess
-        new.move[:, :kept], new.defect[:, :kept] = old.move[:, :kept], old.defect[:, :kept]
-        new.covariance[:, : kept * (kept + 1) // 2] = old.covariance[:, : kept * (kept + 1) // 2]
-        if track_force and self._ports is not None:
-            new.force_before[:] = self._ports.tip_force
-        self._memory = new
-
-    def _new_shape(self, outputs: str, holes: bool) -> Shape:
-        n, n_points, n_tendons = self.n_robots, self.n_points, len(self._layout.tendon_segment)
-
-        def make(wanted: bool, *axes: int) -> Floats:
-            return (np.full((n, *axes), np.nan) if holes else np.empty((n, *axes))) if wanted else np.empty((0, *axes))
-
-        full, tip = outputs == "full", outputs != "none"
-        return Shape(
-            make(full, n_points, 3), make(full, n_points, 3, 3), make(full, n_points, 3), make(full, n_points), make(full, n_points, 3),
-            make(full, n_points, 3), make(tip, 3), make(tip, 3, 3), make(full, n_tendons), make(full, n_tendons), make(full, 6), make(tip),
-        )  # fmt: skip
-
-    def _pass(
-        self,
-        rows: Ints,
-        ports: Ports,
-        shape: Shape,
-        *,
-        response: Response | None = None,
-        feed: bool = False,
-        carry: bool = False,
-        update: bool = True,
-        process: float = 1.0,
-        noise: float = 1.0,
-        n_col: int | None = None,
-        probes: Probes = NO_PROBES,
-    ) -> None:
-        memory, layout = self._memory, self._layout
-        follower, n_x = len(ports.follower_force) > 0, memory.x.shape[1]
-        n_probes = probes.node.shape[1]
-        if n_col is None:
-            n_col = n_x + 3 * n_probes if n_probes else n_x + (3 if len(memory.force_before) and not follower else 0)
-        n_e = len(layout.row_tendon) + (0 if layout.paper else 3) + (3 if follower else 0)
-        parts = 1 if len(rows) <= _SMALL else min(self._threads, -(-len(rows) // LANES))
-        scratch = np.empty((parts, scratch_size(len(layout.tendon_segment), n_x, n_col, n_e, n_probes)))
-        if response is None:
-            response = Response(np.empty((0, 0, 0)), np.empty((0, 0, 0)), np.empty((0, 0)))
-        body = pass_serial if parts == 1 else pass_parallel
-        body(rows, self._params, ports, layout, memory, shape, response, probes, scratch, n_col, feed, carry, update, process, noise)
 
     def _finish(self, ports: Ports, shape: Shape, ok: Flags, passes: Ints, reason: str) -> State:
         """Note who is lost, so that nothing continues on NaN, and hand out the state."""
@@ -519,36 +481,6 @@ class Simulator:
             raise InputError(f"{what} needs a state; call step or settle first.")
         return self._state, self._ports
 
-    def _respond(self, ports: Ports, columns: bool = True) -> tuple[Response, Shape]:
-        """A pass at the present x that changes nothing, with its linear response."""
-        layout, n_x = self._layout, self._memory.x.shape[1]
-        follower = len(ports.follower_force) > 0
-        n_col = (n_x if follower else n_x + 3) if columns else 0
-        n_e = len(layout.row_tendon) + (0 if layout.paper else 3) + (3 if follower else 0)
-        n = self.n_robots
-        response = Response(np.full((n, n_e, n_col), np.nan), np.full((n, 6, n_col), np.nan), np.full((n, n_e), np.nan))
-        shape = self._new_shape("tip", True)
-        self._pass(np.flatnonzero(self._warm), ports, shape, response=response, update=False, n_col=n_col)
-        return response, shape
-
-    def _difference(self, ports: Ports, name: str, a: int, delta: Floats) -> tuple[Floats, Floats]:
-        """Central difference of tip pose (n, 6) and residuals (n, n_e) by one input, at fixed unknowns."""
-        base = getattr(ports, name)
-        ends = []
-        for sign in (1.0, -1.0):
-            moved = np.broadcast_to(base, (max(len(base), len(delta)), base.shape[1])).copy()
-            moved[:, a : a + 1] += sign * delta
-            changed = {name: moved}
-            if name == "extension":  # forces stay at their arclength, so nodes and samples move over the material
-                grid, node_force = self._reader.point_forces(self._given.point_force, moved)
-                changed |= {"grid": grid, "node_force": node_force, "line_force": self._reader.line_force(self._given.line_force, grid)}
-            response, shape = self._respond(ports._replace(**changed), columns=False)
-            ends.append((shape.tip_position, shape.tip_rotation, response.error))
-        (p1, r1, e1), (p0, r0, e0) = ends
-        turn = r1 @ np.swapaxes(r0, 1, 2)
-        skew = 0.5 * np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=1)
-        return np.concatenate([p1 - p0, skew], axis=1) / (2.0 * delta), (e1 - e0) / (2.0 * delta)
-
 
 def _refuse_obstacles(*given: object) -> None:
     if any(given):
@@ -558,14 +490,6 @@ def _refuse_obstacles(*given: object) -> None:
 def _check_positive(name: str, value: float, unit: str) -> None:
     if not isinstance(value, (int, float, np.floating, np.integer)) or not (np.isfinite(value) and value > 0.0):
         raise InputError(f"{name} is {value!r} {unit}; it must be a number, positive and finite.")
-
-
-def _inverse(a: Floats) -> Floats:
-    """Least-squares inverse of the matrices without nan, and nan for the others."""
-    inverse = np.full((len(a), a.shape[2], a.shape[1]), np.nan)
-    good = np.isfinite(a).all((1, 2))
-    inverse[good] = np.linalg.pinv(a[good])
-    return inverse
 
 
 def _as_shape(state: State) -> Shape:

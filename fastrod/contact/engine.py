@@ -46,16 +46,21 @@ class Engine:
         self.poses_before = self.poses = scene.rest_poses()
         self.velocities: dict[int, Floats] = {}
         self.dt = 0.0
+        self.at_last_step: tuple[Shape | None, Floats] = (None, self.poses)
+        """Shape and obstacles before the last step."""
         self.touching = Touching(np.zeros(n, np.int64), np.zeros((n, scene.max_contacts, SLOT)))
         self.clearance = Clearance(np.full((n, n_points), -np.inf), np.zeros((n, n_points, 3)))
         self.before: Shape | None = None
         self.tracked, self.slides = np.zeros(n, bool), np.ones(n, bool)
         self.gap = np.full(n, np.inf)
+        self.led = np.zeros(n, bool)
+        """Robots that contact brought to the inputs of the last step."""
         self.given_arclength, self.given_force = np.zeros((1, 0)), np.zeros((1, 0, 3))
         """Point forces that the caller gave: (n_robots, m) [m] and (n_robots, m, 3) world [N]."""
 
     def move(self, poses: Floats, velocities: dict[int, Floats], dt: float) -> None:
         """The obstacles of this step; those with a velocity slip by it, the others by how far their pose has moved."""
+        self.at_last_step = (self.before, self.poses_before)
         self.poses, self.velocities, self.dt = poses, velocities, dt
         self.clearance.distance[:] -= longest_move(self.poses_before, poses, self.surfaces.sphere)[:, None]
 
@@ -96,7 +101,7 @@ class Engine:
         body = look_serial if parts == 1 else look_parallel
         one = np.ones(1)
         scenery = self._scenery(shape, 1e-9, 0.0 * one, one)._replace(margin=0.0)
-        body(rows, scenery, self.clearance, self.gap, found, n_found, scratch)
+        body(rows, *scenery, self.clearance, self.gap, found, n_found, scratch)
         if self.scene.self_contact or self.scene.worlds is not None:
             ordered = rows[np.argsort(self.world[rows], kind="stable")]
             worlds = np.append(np.flatnonzero(np.diff(self.world[ordered], prepend=-1)), len(ordered))
@@ -158,6 +163,14 @@ class Engine:
         """The obstacles are where they were to go; for a robot that did not arrive, where it met them."""
         self.poses_before = self.poses if (done >= 1.0).all() else between(self.poses_before, self.poses, done)
 
+    def held(self, rows: Ints, ports: Ports, n_x: int) -> tuple[Ports, Probes]:
+        """The present contacts of these robots as loads of a pass, and a probe at the tip that carries none."""
+        most = int(self.touching.used[rows].max(initial=0))
+        probes = empty_probes(len(rows), most + 1, n_x)
+        ports = self._arranged(rows, ports, probes)
+        probes.node[:, -1], probes.force[:, -1], probes.arm[:, -1] = self.clearance.distance.shape[1] - 1, 0.0, 0.0
+        return ports, probes
+
     def why(self, i: int, done: float) -> str:
         """What stopped robot i."""
         if done > 0.0 or self.tracked[i]:
@@ -190,7 +203,8 @@ class Engine:
             wrench[:, k, 3:] = np.cross(np.where((index == k)[:, :, None], point - origin[:, None, k], 0.0), on).sum(1)
         gap = np.where(ok, self.gap, np.nan)
         return Contacts(
-            names=self.scene.names, count=count, obstacle=index, point=point, normal=normal, gap=kept[:, :, T_GAP], force=force, arclength=s,
+            names=self.scene.names, count=count, obstacle=index, point=point, normal=normal, gap=kept[:, :, T_GAP], force=force,
+            arclength=s,
             wrench=wrench, clearance=gap, deep=ok & (self.gap < -np.maximum(self.rods.radius.min(1), 1e-6)),
             tip_arclength=shape.arclength[:, -1],
         )  # fmt: skip
@@ -226,11 +240,7 @@ class Engine:
 
     def _iterate_block(self, rows: Ints, n_slots: int, ports: Ports, memory: Memory, shape: Shape, run: Pass, scenery: Scenery) -> Ints:
         n, n_x = len(rows), memory.x.shape[1]
-        n_f = 3 * n_slots
-        probes = Probes(
-            np.empty((n, n_slots), np.int64), np.empty((n, n_slots, 3)), np.empty((n, n_slots, 3)),
-            np.zeros((n, n_f, 1 + n_f)), np.empty((n, n_x, 1 + n_f)),
-        )  # fmt: skip
+        probes = empty_probes(n, n_slots, n_x)
         ports = self._arranged(rows, ports, probes)
         run(rows, ports, shape, probes)
         worlds = np.append(np.flatnonzero(np.diff(self.world[rows], prepend=-1)), n)
@@ -239,7 +249,7 @@ class Engine:
         scratch = np.empty((parts, world_size(int(np.diff(worlds).max()), n_slots, self.touching.slot.shape[1], shape.arclength.shape[1])))
         body = iterate_serial if parts == 1 else iterate_parallel
         proposed, unknown = np.zeros((n, n_slots, 3)), np.zeros((n, n_x))
-        body(worlds, rows, scenery, self.touching, self.clearance, probes, memory, proposed, unknown, self.gap, status, scratch)
+        body(worlds, rows, *scenery, self.touching, self.clearance, probes, memory, proposed, unknown, self.gap, status, scratch)
         return status
 
     def _arranged(self, rows: Ints, ports: Ports, probes: Probes) -> Ports:
@@ -291,3 +301,10 @@ class Engine:
             self.scene.watch,
             damping,
         )
+
+
+def empty_probes(n_rows: int, n_probes: int, n_x: int) -> Probes:
+    """Room for the contact points of a pass."""
+    n_f = 3 * n_probes
+    loads = np.zeros((n_rows, n_probes, 3)), np.zeros((n_rows, n_probes, 3))
+    return Probes(np.full((n_rows, n_probes), -1), *loads, np.zeros((n_rows, n_f, 1 + n_f)), np.zeros((n_rows, n_x, 1 + n_f)))

@@ -50,11 +50,13 @@ def contact_step(
         arrived, came = engine.follow(led, start, end, memory, shape, ways.run, tolerance, passes)
         ok |= arrived
         done[led] = came[led]
-    if len(new := cold_rows[touched[cold_rows] | ~ok[cold_rows]]):
+    new = cold_rows[touched[cold_rows] | ~ok[cold_rows]]
+    if len(new):
         ok[new] = False
         done[new] = _begin(engine, ways, new, end, rest, memory, shape, tolerance, passes)[new]
         ok[new] = done[new] >= 1.0
-    engine.slides[:] = True
+    engine.slides[:], engine.led[:] = True, False
+    engine.led[led], engine.led[new] = True, True
     engine.accept(rows[ok[rows]], shape)
     engine.end_step(done)
     return ok, done

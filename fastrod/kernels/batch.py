@@ -8,16 +8,33 @@ from types import FunctionType
 import numpy as np
 from numba import prange
 
+from fastrod.kernels.bvh import STACK
 from fastrod.kernels.chunk import pass_chunk
 from fastrod.kernels.forces import Scenery
 from fastrod.kernels.gather import feed_forward
 from fastrod.kernels.jit import LANES, entry, parallel_entry
 from fastrod.kernels.placing import place_nodes
 from fastrod.kernels.shape import Lanes
-from fastrod.kernels.slots import T_FORCE, T_N, T_RADIUS, T_S
+from fastrod.kernels.slots import T_ARM, T_FORCE, T_N, T_S
 from fastrod.kernels.strands import search_rods
+from fastrod.kernels.surface import ray_hit
 from fastrod.kernels.touch import iterate_world, look_at
-from fastrod.types import Clearance, Floats, Ints, Layout, Memory, Params, Ports, Probes, Response, Shape, Touching
+from fastrod.types import (
+    Clearance,
+    Flags,
+    Floats,
+    Ints,
+    Layout,
+    Memory,
+    Params,
+    Ports,
+    Probes,
+    Response,
+    Rods,
+    Shape,
+    Surfaces,
+    Touching,
+)  # fmt: skip
 
 
 @entry
@@ -65,7 +82,18 @@ def _pass(
 def _iterate(
     worlds: Ints,
     rows: Ints,
-    scenery: Scenery,
+    rods: Rods,
+    surfaces: Surfaces,
+    frames: Floats,
+    frames_before: Floats,
+    frames_slip: Floats,
+    shape: Shape,
+    before: Shape,
+    tracked: Flags,
+    slides: Flags,
+    tolerance: float,
+    margin: float,
+    damping: float,
     touching: Touching,
     clearance: Clearance,
     probes: Probes,
@@ -76,10 +104,16 @@ def _iterate(
     status: Ints,
     scratch: Floats,
 ) -> None:
-    """One contact iteration (`iterate_world`) of the worlds whose rows begin at worlds[0], worlds[1], ...; the last entry is the end."""
+    """One contact iteration (`iterate_world`) of the worlds whose rows begin at worlds[0], worlds[1], ...; the last entry is the end.
+
+    The fields of the `Scenery` come one by one, for numba hands no tuple of tuples to threads.
+    """
     n_parts = scratch.shape[0]
     for part in prange(n_parts):
         for k in range(part, len(worlds) - 1, n_parts):
+            scenery = Scenery(
+                rods, surfaces, frames, frames_before, frames_slip, shape, before, tracked, slides, tolerance, margin, damping
+            )
             iterate_world(
                 worlds[k], worlds[k + 1], rows, scenery, touching, clearance, probes, memory, proposed, unknown, gap, status, scratch[part]
             )
@@ -118,17 +152,61 @@ def arrange(
             for a in range(3):
                 taken = q < touching.used[i]
                 probes.force[r, q, a] = touching.slot[i, q, T_FORCE + a] if taken else 0.0
-                probes.arm[r, q, a] = -touching.slot[i, q, T_RADIUS] * touching.slot[i, q, T_N + a] if taken else 0.0
+                probes.arm[r, q, a] = -touching.slot[i, q, T_ARM] * touching.slot[i, q, T_N + a] if taken else 0.0
     return fits
 
 
-def _look(rows: Ints, scenery: Scenery, clearance: Clearance, gap: Floats, found: Floats, n_found: Ints, scratch: Floats) -> None:
+def _look(
+    rows: Ints,
+    rods: Rods,
+    surfaces: Surfaces,
+    frames: Floats,
+    frames_before: Floats,
+    frames_slip: Floats,
+    shape: Shape,
+    before: Shape,
+    tracked: Flags,
+    slides: Flags,
+    tolerance: float,
+    margin: float,
+    damping: float,
+    clearance: Clearance,
+    gap: Floats,
+    found: Floats,
+    n_found: Ints,
+    scratch: Floats,
+) -> None:
     """`look_at` of each robot: its smallest gap and, in row order, its candidates for contact."""
     n_parts = scratch.shape[0]
     for part in prange(n_parts):
         for r in range(part, len(rows), n_parts):
             i = rows[r]
+            scenery = Scenery(
+                rods, surfaces, frames, frames_before, frames_slip, shape, before, tracked, slides, tolerance, margin, damping
+            )
             n_found[r], gap[i] = look_at(i, scenery, clearance, found[r], scratch[part])
+
+
+@entry
+def cast_rays(
+    origin: Floats, direction: Floats, longest: float, surfaces: Surfaces, frames: Floats, distance: Floats, obstacle: Ints, normal: Floats
+) -> None:
+    """Nearest obstacle along the unit directions (n_robots, m, 3): `distance`, infinite where none is met up to `longest`, which
+    obstacle, or -1, and the outward normal there."""
+    stack = np.empty(2 * STACK)
+    for i in range(origin.shape[0]):
+        at = frames[i if len(frames) > 1 else 0]
+        for q in range(origin.shape[1]):
+            p = (origin[i, q, 0], origin[i, q, 1], origin[i, q, 2])
+            v = (direction[i, q, 0], direction[i, q, 1], direction[i, q, 2])
+            best = longest
+            distance[i, q], obstacle[i, q] = np.inf, -1
+            for k in range(len(at)):
+                t, n = ray_hit(k, at[k], p, v, best, surfaces, stack)
+                if t <= best:
+                    best, distance[i, q], obstacle[i, q] = t, t, k
+                    for a in range(3):
+                        normal[i, q, a] = n[a]
 
 
 @entry

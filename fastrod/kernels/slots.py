@@ -13,9 +13,10 @@ from fastrod.kernels.surface import ray_hit, signed_distance, walls
 from fastrod.kernels.vec import Vec, dot, scale
 from fastrod.types import Floats, Surfaces
 
-T_OBSTACLE, T_S, T_TWIN, T_N, T_GAP, T_FORCE, T_RADIUS, T_TAKEN, SLOT = 0, 1, 2, 3, 6, 7, 10, 11, 12
+T_OBSTACLE, T_S, T_TWIN, T_N, T_GAP, T_FORCE, T_RADIUS, T_ARM, T_TAKEN, SLOT = 0, 1, 2, 3, 6, 7, 10, 11, 12, 13
 """Obstacle (from n_obstacles on: rods), arclength, number that links both sides of a contact between rods or -1, normal
-toward the rod, gap, force on the rod (world), radius of the rod there; taken: scratch of `choose`."""
+toward the rod, gap, force on the rod (world), radius of the rod there; arm: how far below the centreline the force acts, the
+radius where there is friction, else 0, for a normal force has no moment; taken: scratch of `choose`."""
 _SAME_WALL = 0.99999
 
 
@@ -36,9 +37,10 @@ def carries(slot: Numbers) -> bool:
 
 
 @inline
-def open_slot(slot: Numbers, obstacle: int, s: float, twin: int, n: Vec, gap: float, radius: float) -> None:
+def open_slot(slot: Numbers, obstacle: int, s: float, twin: int, n: Vec, gap: float, radius: float, friction: float) -> None:
     slot[T_OBSTACLE], slot[T_S], slot[T_TWIN], slot[T_GAP], slot[T_RADIUS] = float(obstacle), s, float(twin), gap, radius
     slot[T_N], slot[T_N + 1], slot[T_N + 2] = n
+    slot[T_ARM] = radius if friction > 0.0 else 0.0
     slot[T_FORCE], slot[T_FORCE + 1], slot[T_FORCE + 2], slot[T_TAKEN] = 0.0, 0.0, 0.0, 0.0
 
 
@@ -110,6 +112,7 @@ def choose(
     slot: Floats,
     n_obstacles: int,
     radius: Floats,
+    friction: Floats,
     n_steps: int,
     arclength: Floats,
     spacing: float,
@@ -146,7 +149,7 @@ def choose(
             if int(slot[c, T_OBSTACLE]) == k and abs(slot[c, T_S] - s) < lonely and dot(slot_normal(slot[c]), normal) > 0.5:
                 crowded = True
         if not crowded:
-            open_slot(slot[n], k, s, -1, normal, gap, radius[segment_at(arclength, n_steps, s)])
+            open_slot(slot[n], k, s, -1, normal, gap, radius[segment_at(arclength, n_steps, s)], friction[k])
             slot[n, T_TAKEN] = 1.0
             n += 1
     return n
@@ -171,7 +174,7 @@ def add_walls(
                 same = int(slot[e, T_OBSTACLE]) == k and abs(slot[e, T_S] - slot[c, T_S]) < 1e-9
                 known = known or (same and dot(slot_normal(slot[e]), normal) > _SAME_WALL)
             if not known:
-                open_slot(slot[n], k, slot[c, T_S], -1, normal, found[5 * j] - slot[c, T_RADIUS], slot[c, T_RADIUS])
+                open_slot(slot[n], k, slot[c, T_S], -1, normal, found[5 * j] - slot[c, T_RADIUS], slot[c, T_RADIUS], surfaces.friction[k])
                 n += 1
     return n
 
@@ -199,5 +202,5 @@ def merge(count: int, slot: Floats, spacing: float) -> int:
 
 @kernel
 def arm_of(slot: Numbers) -> Vec:
-    """From the centreline to the point of contact."""
-    return scale(-slot[T_RADIUS], slot_normal(slot))
+    """From the centreline to where the force acts."""
+    return scale(-slot[T_ARM], slot_normal(slot))

@@ -103,9 +103,9 @@ def _add_pair(
             link = max(link, touching.slot[which, q, T_TWIN] + 1.0)
     r_a = rods.radius[robot, segment_at(a.arclength, rods.n_steps, s)]
     r_b = rods.radius[other, segment_at(b.arclength, rods.n_steps, t)]
-    open_slot(touching.slot[robot, touching.used[robot]], n_obstacles + other, s, int(link), n, gap, r_a)
+    open_slot(touching.slot[robot, touching.used[robot]], n_obstacles + other, s, int(link), n, gap, r_a, rods.friction)
     touching.used[robot] += 1
-    open_slot(touching.slot[other, touching.used[other]], n_obstacles + robot, t, int(link), scale(-1.0, n), gap, r_b)
+    open_slot(touching.slot[other, touching.used[other]], n_obstacles + robot, t, int(link), scale(-1.0, n), gap, r_b, rods.friction)
     touching.used[other] += 1
     return True
 

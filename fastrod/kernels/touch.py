@@ -136,7 +136,8 @@ def iterate_world(
         i = rows[r]
         found = all_found[(r - first) * size : (r - first + 1) * size].reshape((_MOST_FOUND, CANDIDATE))
         count, gap[i] = search_obstacles(
-            curve_of(scenery.shape, i), sweep_of(i, scenery, scenery.margin), scenery.surfaces, scenery.frames[pick(i, len(scenery.frames))],
+            curve_of(scenery.shape, i), sweep_of(i, scenery, scenery.margin), scenery.surfaces,
+            scenery.frames[pick(i, len(scenery.frames))],
             clearance.distance[i], clearance.position[i], scratch, found,
         )  # fmt: skip
         n_found[r - first] = float(count)
@@ -180,7 +181,17 @@ def _renew(
     slot, rods, frames = touching.slot[i], scenery.rods, scenery.frames[pick(i, len(scenery.frames))]
     spacing = rods.spacing[i]
     count = choose(
-        n_found, found, touching.used[i], slot, len(frames), rods.radius[i], rods.n_steps, curve.arclength, spacing, scenery.tolerance
+        n_found,
+        found,
+        touching.used[i],
+        slot,
+        len(frames),
+        rods.radius[i],
+        scenery.surfaces.friction,
+        rods.n_steps,
+        curve.arclength,
+        spacing,
+        scenery.tolerance,
     )
     count = merge(count, slot, spacing)
     for c in range(count):

@@ -1,0 +1,125 @@
+"""Questions about the last state: how near, how near on the way, and what a distance sensor sees."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fastrod.contact.engine import Engine
+from fastrod.contact.frames import between, frames_of
+from fastrod.errors import InputError
+from fastrod.kernels.batch import cast_rays, look_at_rods, look_serial
+from fastrod.kernels.bvh import STACK
+from fastrod.kernels.forces import Scenery
+from fastrod.kernels.search import CANDIDATE
+from fastrod.types import Clearance, Floats, Ints, Shape
+
+_EVERYTHING = 1e6  # of the rod's length: a margin within which all is near
+_MOST_LOOKS = 400
+
+
+class Hits(NamedTuple):
+    """What rays meet."""
+
+    distance: Floats
+    """(n_robots, n_rays) from the origin to the nearest surface; inf where none is met [m]."""
+    obstacle: Ints
+    """(n_robots, n_rays) index of the obstacle; -1 where none is met."""
+    normal: Floats
+    """(n_robots, n_rays, 3) outward normal there, world; nan where none is met."""
+
+
+def clearance(engine: Engine, shape: Shape, name: str | None = None) -> Floats:
+    """(n_robots,) smallest gap between a robot's surface, mounting excepted, and the obstacle of this name, or all obstacles and,
+    where they may touch, rods [m]. Negative by the depth where they overlap; inf where there is nothing; nan where there is no shape.
+    """
+    return _gap(engine, shape, engine.poses, None if name is None else engine.scene.index(name))
+
+
+def _gap(engine: Engine, shape: Shape, poses: Floats, only: int | None = None) -> Floats:
+    n, n_points = shape.arclength.shape
+    surfaces, which = engine.surfaces, slice(None) if only is None else [only]
+    surfaces = surfaces._replace(
+        kind=surfaces.kind[which], size=surfaces.size[which], sphere=surfaces.sphere[which], friction=surfaces.friction[which],
+        compliance=surfaces.compliance[which], root=surfaces.root[which],
+    )  # fmt: skip
+    frames = np.ascontiguousarray(frames_of(poses)[:, which])
+    nobody = np.zeros(n, bool)
+    scenery = Scenery(engine.rods, surfaces, frames, frames, frames, shape, shape, nobody, nobody, 1e-9, _EVERYTHING, 0.0)
+    gap, rows = np.full(n, np.nan), np.flatnonzero(np.isfinite(shape.position).all((1, 2)))
+    found, n_found = np.empty((len(rows), 64, CANDIDATE)), np.zeros(len(rows), np.int64)
+    unknown = Clearance(np.full((n, n_points), -np.inf), np.zeros((n, n_points, 3)))
+    gap[rows] = np.inf
+    if len(surfaces.kind):
+        look_serial(rows, *scenery, unknown, gap, found, n_found, np.empty((1, 4 * n_points + 4 * STACK)))
+    if only is None and (engine.scene.self_contact or engine.scene.worlds is not None):
+        ordered = rows[np.argsort(engine.world[rows], kind="stable")]
+        worlds = np.append(np.flatnonzero(np.diff(engine.world[ordered], prepend=-1)), len(ordered))
+        look_at_rods(worlds, ordered, scenery, engine.touching, gap)
+    return gap
+
+
+def swept_clearance(engine: Engine, before: Shape, poses_before: Floats, after: Shape, tolerance: float) -> Floats:
+    """(n_robots,) smallest gap on the way from one shape to another, to `tolerance` [m]: robots and obstacles move in straight
+    lines at even speed. The gap changes by no more than they move, so intervals that cannot hold the minimum are left out."""
+    n = len(after.arclength)
+    moved = np.linalg.norm(after.position - before.position, axis=2).max(1) + _obstacles_move(engine, poses_before)
+
+    def gap_at(t: Floats) -> Floats:
+        part = t[:, None, None]
+        tangent = (1.0 - part[..., None]) * before.rotation + part[..., None] * after.rotation
+        there = after._replace(position=(1.0 - part) * before.position + part * after.position, rotation=tangent)
+        return _gap(engine, there, between(poses_before, engine.poses, t))
+
+    times, gaps = np.tile([0.0, 1.0], (n, 1)), np.stack([gap_at(np.zeros(n)), gap_at(np.ones(n))], axis=1)
+    for _ in range(_MOST_LOOKS):
+        bound = 0.5 * (gaps[:, 1:] + gaps[:, :-1] - moved[:, None] * np.diff(times, axis=1))
+        worst = np.nan_to_num(bound, nan=np.inf).argmin(1)
+        if not (bound[np.arange(n), worst] < np.nanmin(gaps, axis=1) - tolerance).any():
+            break
+        middle = 0.5 * (times[np.arange(n), worst] + times[np.arange(n), worst + 1])
+        times, gaps = np.column_stack([times, middle]), np.column_stack([gaps, gap_at(middle)])
+        order = np.argsort(times, axis=1)
+        times, gaps = np.take_along_axis(times, order, 1), np.take_along_axis(gaps, order, 1)
+    return np.asarray(gaps.min(1))
+
+
+def _obstacles_move(engine: Engine, poses_before: Floats) -> Floats:
+    """(1 or n,) a bound of how far a point of an obstacle near the rods has moved; for a plane, of one within its robots' reach."""
+    ball = engine.surfaces.sphere.copy()
+    ball[~np.isfinite(ball[:, 3]), 3] = 10.0 * float(engine.rods.reach.max())
+    shift = np.linalg.norm(engine.poses[..., :3] - poses_before[..., :3], axis=-1)
+    turn = np.linalg.norm(np.abs(engine.poses[..., 3:]) - np.abs(poses_before[..., 3:]), axis=-1)
+    return np.asarray((shift + 2.0 * turn * (np.linalg.norm(ball[:, :3], axis=1) + ball[:, 3])).max(-1, initial=0.0))
+
+
+def ray_cast(engine: Engine, origin: ArrayLike, direction: ArrayLike, longest: float) -> Hits:
+    """Rays (n_robots, n_rays, 3) or (n_rays, 3), world, against the obstacles where they are now; directions need not be unit."""
+    n = len(engine.gap)
+    try:
+        o, v = (np.asarray(a, dtype=np.float64) for a in (origin, direction))
+        o, v = (np.broadcast_to(a, (n, a.shape[-2] if a.ndim > 1 else 1, 3)) for a in (o, v))
+        o, v = np.broadcast_arrays(o, v)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"rays have origins of shape {np.shape(origin)} and directions of shape {np.shape(direction)}; "
+            f"give (n_rays, 3) or ({n}, n_rays, 3) of both."
+        ) from error
+    length = np.linalg.norm(v, axis=-1, keepdims=True)
+    if not (np.isfinite(o).all() and np.isfinite(v).all() and (length > 0.0).all()):
+        raise InputError("a ray has an origin or direction that is not finite, or a direction of length 0.")
+    if not longest > 0.0:
+        raise InputError(f"longest is {longest!r} m; it must be positive.")
+    shape = o.shape[:2]
+    hits = Hits(np.full(shape, np.inf), np.full(shape, -1), np.full((*shape, 3), np.nan))
+    cast_rays(
+        np.ascontiguousarray(o),
+        np.ascontiguousarray(v / length),
+        float(min(longest, 1e12)),
+        engine.surfaces,
+        frames_of(engine.poses),
+        *hits,
+    )
+    return hits
