@@ -91,8 +91,9 @@ class Passes:
 
         full = outputs == "full"
         return Shape(
-            make(full, n_points, 3), make(full, n_points, 3, 3), make(full, n_points, 3), make(full, n_points), make(full, n_points, 3),
-            make(full, n_points, 3), make(True, 3), make(True, 3, 3), make(full, n_tendons), make(full, n_tendons), make(full, 6), make(True),
+            make(full, n_points, 3), make(full, n_points, 3, 3), make(full, n_points, 3), make(full, n_points),
+            make(full, n_points, 3), make(full, n_points, 3), make(True, 3), make(True, 3, 3), make(full, n_tendons),
+            make(full, n_tendons), make(full, 6), make(True),
         )  # fmt: skip
 
     def run(

@@ -155,7 +155,7 @@ def test_tip_outputs_keep_little_memory() -> None:
     robot = load_robot("five_segment_reacher")
     sim = Simulator(robot, n_robots=64, points_per_segment=4, outputs="tip")
     state = sim.settle(robot.rest_tendon_length)
-    kept = sum(a.nbytes for a in sim._memory) + state.residual.nbytes + state.ok.nbytes
+    kept = sum(a.nbytes for a in sim._passes.memory) + state.residual.nbytes + state.ok.nbytes
     kept += sum(
         a.nbytes for a in (state.position, state.rotation, state.tension, state.base_wrench, state.tip_position, state.tip_rotation)
     )

@@ -15,22 +15,24 @@ from numpy.testing import assert_allclose
 import fastrod
 
 sys.path.insert(0, str(Path(__file__).parent))
+import contact_cases
 import contact_energy
+import contact_shapes
 import energy
 
-CASES = contact_energy.cases()
-WALL = contact_energy.HalfSpace([0.012, 0.0, 0.0], [-1.0, 0.0, 0.0])
-RING = contact_energy.ring(4, 0.0075)
+CASES = contact_cases.cases()
+WALL = contact_shapes.HalfSpace([0.012, 0.0, 0.0], [-1.0, 0.0, 0.0])
+RING = contact_cases.ring(4, 0.0075)
 
 
 @cache
 def at_rest(name: str, elements: int = 40) -> contact_energy.Minimum:
-    return contact_energy.solve(CASES[name], elements=elements)
+    return contact_cases.solve(CASES[name], elements=elements)
 
 
 def pressed(kappa: float, compliance: float, elements: int = 20, **options: Any) -> contact_energy.Minimum:
     """The prototype, bent in the plane to a mean curvature kappa [1/m] that would take its tip through the wall at x = 12 mm."""
-    lengths = contact_energy.bent([0.07], [RING], [kappa], [0.0])
+    lengths = contact_cases.bent([0.07], [RING], [kappa], [0.0])
     return contact_energy.minimise(
         0.07, [0.0022, 0.0022, 0.001], RING, lengths, compliance, obstacle=WALL, elements=elements, load_steps=4, **options
     )
@@ -76,7 +78,7 @@ def test_bent_far_the_planar_answer_is_a_ridge() -> None:
 @pytest.mark.parametrize("name", ["sphere", "two_segments"])
 def test_away_from_the_obstacle_it_is_the_free_rod(name: str) -> None:
     case = {key: value for key, value in CASES[name].items() if key not in ("obstacle", "rho")}
-    far = contact_energy.Sphere([1.0, 0.0, 0.0], 0.1)
+    far = contact_shapes.Sphere([1.0, 0.0, 0.0], 0.1)
     coarse, fine = (contact_energy.minimise(**case, obstacle=far, elements=n, load_steps=3) for n in (20, 40))
     case.pop("base_rotation")  # upright in both
     free = energy.minimise(**case, levels=3)
@@ -97,7 +99,7 @@ def test_signorini(name: str) -> None:
     size = np.linalg.norm(found.contact_force, axis=1)
     assert (size * np.abs(found.gap)).max() < 1e-9
     touching = size > 1e-6
-    normal = contact_energy.obstacle(CASES[name]["obstacle"]).distance(found.positions[touching]).normal
+    normal = contact_shapes.obstacle(CASES[name]["obstacle"]).distance(found.positions[touching]).normal
     assert_allclose(found.contact_force[touching], size[touching, None] * normal, rtol=0, atol=1e-9)
     assert 0.1 < size.max() < 3.0
 
@@ -137,7 +139,7 @@ def test_base_force_is_the_work_of_moving_the_base(name: str) -> None:
     case, step = CASES[name], 2e-5
 
     def least(move: np.ndarray) -> float:
-        return contact_energy.solve(case, elements=10, load_steps=3, base_position=move).energy
+        return contact_cases.solve(case, elements=10, load_steps=3, base_position=move).energy
 
     slope = [(least(step * axis) - least(-step * axis)) / (2.0 * step) for axis in np.eye(3)]
     # the difference's own error: the square of the step over the obstacle's radius, and rounding of 1e-12 J
@@ -200,16 +202,16 @@ def robot(case: dict[str, Any]) -> fastrod.Robot:
 @pytest.mark.parametrize(
     "solid",
     [
-        contact_energy.HalfSpace([0.1, 0.0, 0.0], [1.0, 2.0, 0.5]),
-        contact_energy.Sphere([0.1, 0.2, 0.3], 0.5),
-        contact_energy.Cylinder([0.0, 0.0, 0.1], [1.0, 0.3, 0.2], 0.3),
-        contact_energy.Cylinder([0.0, 0.0, 0.1], [1.0, 0.3, 0.2], 0.3, 0.5),
-        contact_energy.Box([0.0, 0.1, 0.0], [0.3, 0.4, 0.5], [[0.6, 0.0, 0.8], [0.0, 1.0, 0.0], [-0.8, 0.0, 0.6]]),
-        contact_energy.Tube([0.0, 0.1, 0.0], [0.0, 0.1, 1.0], 2.0),
+        contact_shapes.HalfSpace([0.1, 0.0, 0.0], [1.0, 2.0, 0.5]),
+        contact_shapes.Sphere([0.1, 0.2, 0.3], 0.5),
+        contact_shapes.Cylinder([0.0, 0.0, 0.1], [1.0, 0.3, 0.2], 0.3),
+        contact_shapes.Cylinder([0.0, 0.0, 0.1], [1.0, 0.3, 0.2], 0.3, 0.5),
+        contact_shapes.Box([0.0, 0.1, 0.0], [0.3, 0.4, 0.5], [[0.6, 0.0, 0.8], [0.0, 1.0, 0.0], [-0.8, 0.0, 0.6]]),
+        contact_shapes.Tube([0.0, 0.1, 0.0], [0.0, 0.1, 1.0], 2.0),
     ],
     ids=lambda solid: type(solid).__name__,
 )
-def test_distances(solid: contact_energy.Obstacle) -> None:
+def test_distances(solid: contact_shapes.Obstacle) -> None:
     """A signed distance has a unit gradient; and ours are the derivatives they say, by differences."""
     points = np.random.default_rng(0).normal(size=(200, 3))
     found, step = solid.distance(points), 1e-6

@@ -192,7 +192,7 @@ def test_stiffness_and_precurvature_that_vary_along_the_rod() -> None:
     sim = Simulator(rod("passive"), points_per_segment=n)
     s = np.linspace(0.0, length, 2 * n + 1)
     stiffness = np.tile([0.0022, 0.0022, 0.001], (2 * n + 1, 1)) * (1.0 + 0.5 * (1.0 - 2.0 * s / length))[:, None]
-    bare = sim._rest
+    bare = sim._reader.rest
     rest = np.zeros((1, 1, 2 * n + 1, 3))
     sim._reader.rest = bare._replace(stiffness=stiffness[None, None], precurvature=rest)
     state = sim.settle(tip_force=(0.0, force, 0.0))
