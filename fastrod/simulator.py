@@ -30,7 +30,7 @@ from fastrod.state import Observer, Pose, Snapshot, State
 from fastrod.types import Flags, Floats, Ints, Memory, Params, Ports, Probes, Shape
 
 _config: Any = numba.config
-_AT_REST = 1e-7  # m: contact and boundary of a step, where `settle` has a tolerance of its own
+_AT_REST = 1e-6  # m: contact and boundary of a step, where `settle` has a tolerance of its own
 _LOST = 0.1  # of the robot's length: a residual beyond it is no shape of this robot
 
 

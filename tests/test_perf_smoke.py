@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -175,3 +176,40 @@ def test_a_robot_and_its_wires_stiffer_alike_change_under_loads_only() -> None:
             loaded = [Simulator(r).settle(lengths, tip_force=[0.1, 0.1, 0.0]).tip_position for r in (soft, hard)]
             gives = [np.linalg.norm(tip - one.tip_position) for tip in loaded]
             assert gives[1] * factor == pytest.approx(gives[0], rel=0.15)  # in proportion, but for the bend that it adds
+
+
+def test_the_contact_bench_runs_and_its_states_are_what_they_say(capsys: pytest.CaptureFixture[str]) -> None:
+    import bench_contact
+
+    assert bench_contact.main(["--quick", "--json", "--robots", "3"]) == 0
+    sections = json.loads(capsys.readouterr().out)["sections"]
+    steps = sections["contact_steps"]["rows"]
+    assert [row["state"] for row in steps] == ["no scene", "free", "free", "grazing", "grazing", "in contact", "in contact"]
+    assert {row["not_ok"] for row in steps} == {0}
+    assert {row["touching"] for row in steps if row["state"] != "in contact"} == {0.0}
+    assert {row["touching"] for row in steps if row["state"] == "in contact"} == {1.0}
+    assert all(1e-3 < row["gap_m"] < 6e-3 for row in steps if row["state"] == "grazing")
+    assert all(row["gap_m"] > 0.3 for row in steps if row["state"] == "free")
+    assert all(row["passes"] == 1.0 for row in steps if row["state"] in ("free", "grazing"))
+    queries = sections["contact_query"]["rows"]
+    assert [row["faces"] for row in queries] == [320, 1280] * 3
+    assert all(row["fcl_us"] > 0.0 and row["warm_us"] > 0.0 for row in queries)
+
+
+def test_fcl_is_asked_about_the_same_distances() -> None:
+    import touching
+    from fastrod.contact.direct import DirectScene
+
+    batch, obstacle = touching.make_batch(2), touching.make_mesh(2)
+    pose = touching.places(batch, touching.GRAZING)
+    timed = touching.run(batch, obstacle, touching.GRAZING, 1, 0.0)
+    for i in range(2):
+        scene = DirectScene([obstacle])
+        scene.place(0, pose[i, :3], pose[i, 3:])
+        nodes = timed.last.position[i]
+        chords = min(scene.segment(0, a, b).distance for a, b in pairwise(nodes))
+        assert timed.last.contacts is not None
+        assert timed.last.contacts.clearance[i] == pytest.approx(chords - batch.rod_radius, abs=2e-4)  # a curve and its chords
+        answer = touching.ask_fcl(touching.questions(timed, obstacle, pose, [i]))
+        assert answer == pytest.approx(chords, abs=1e-4)  # capsules of 1e-6 m, and the iteration of libccd
+    assert touching.fcl_seconds(timed, obstacle, pose, 2)[1] == 2

@@ -9,7 +9,7 @@ import numpy as np
 from fastrod.errors import UnknownNameError, nearest
 from fastrod.types import Flags, Floats, Ints
 
-TOUCHES = 1e-6
+TOUCHES = 1e-9
 """A gap below it is contact, also where no force is needed to keep it [m]."""
 
 

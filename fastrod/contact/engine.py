@@ -31,7 +31,8 @@ _BLOCK = 2048  # robots whose linear models are held at once
 _MOST_PASSES = 30
 _SMALLEST_PART = 1.0 / 64.0
 _HARD = 1.0 / 8.0  # part of the way below which a failure is taken for the loss of the equilibrium, not for too long a step
-_DAMPING, _MOST_DAMPED = 1.5, 150
+_DAMPING, _MOST_DAMPED = 1.5, 60
+_MOST_ROUNDS = 40  # parts of one step, those that failed included: a step ends
 _FEW = 64  # robots below which starting threads costs more than it saves
 
 
@@ -120,8 +121,9 @@ class Engine:
         n = len(self.gap)
         done, stride, arrived = np.zeros(n), np.ones(n), np.zeros(n, bool)
         x, count, slot = memory.x.copy(), self.touching.used.copy(), self.touching.slot.copy()
-        way = rows
-        while len(way):
+        way, spent = rows, 0
+        while len(way) and spent < _MOST_ROUNDS:
+            spent += 1
             aim = np.minimum(done + stride, 1.0)
             ports = end if start is None or (aim[way] >= 1.0).all() else blended(start, end, aim)
             rest = self._settle(way, ports, memory, shape, run, self._scenery(shape, tolerance, done, aim), passes, _MOST_PASSES)

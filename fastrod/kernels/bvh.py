@@ -132,8 +132,11 @@ def _keep_plane(d: float, normal: Vec, t: int, found: Numbers, n_found: int, mos
 
 
 @kernel
-def facing_planes(p: Vec, reach: float, root: int, surfaces: Surfaces, stack: Numbers, found: Numbers, most: int) -> int:
-    """Faces whose inside p projects onto, from in front of them, closer than `reach`: the walls of a concave corner.
+def facing_planes(p: Vec, reach: float, nearest: float, root: int, surfaces: Surfaces, stack: Numbers, found: Numbers, most: int) -> int:
+    """Faces that p is in front of, closer than `reach`: the walls of a concave corner.
+
+    p projects inside them, or their planes are no nearer than the surface itself, which is `nearest`: around a concave edge
+    each plane bounds the free side on both, around a convex one p beyond a face is nearer to its plane.
 
     Writes distance, normal and triangle of the `most` nearest with different normals to `found` (5 numbers each); returns
     how many.
@@ -160,8 +163,9 @@ def facing_planes(p: Vec, reach: float, root: int, surfaces: Surfaces, stack: Nu
             d = dot(sub(p, a), normal)
             if d < 0.0 or d >= reach:
                 continue
-            _, feature = closest_on_triangle(p, a, corner(surfaces, t, 1), corner(surfaces, t, 2))
-            if feature != 0:
+            q, feature = closest_on_triangle(p, a, corner(surfaces, t, 1), corner(surfaces, t, 2))
+            e = sub(p, q)
+            if dot(e, e) >= limit or (feature != 0 and d < nearest - 1e-9):
                 continue
             n_found = _keep_plane(d, normal, t, found, n_found, most)
     return n_found

@@ -21,6 +21,7 @@ from fastrod.types import Floats
 _ROUNDS = 40
 _SWEEPS = 400
 _AGREE = 1e-10
+_HOLDS = 1e-9
 OPEN, STICK, SLIP = 0.0, 1.0, 2.0
 
 
@@ -157,6 +158,26 @@ def _correct_states(
 
 
 @kernel
+def _obeys(m: int, W: Floats, b: Numbers, friction: Numbers, compliance: Numbers, force: Numbers) -> bool:
+    """The forces obey the law to 1e-9 m: a singular system can have a solution that does not."""
+    for c in range(m):
+        o = 3 * c
+        un = _motion(W, b, force, o, 3 * m) + compliance[c] * force[o]
+        closed = abs(un) <= _HOLDS or force[o] == 0.0
+        if not (force[o] >= 0.0 and un >= -_HOLDS and closed):
+            return False
+        u1, u2 = _motion(W, b, force, o + 1, 3 * m), _motion(W, b, force, o + 2, 3 * m)
+        most, size = friction[c] * force[o], math.sqrt(force[o + 1] ** 2 + force[o + 2] ** 2)
+        slip = math.sqrt(u1 * u1 + u2 * u2)
+        if not size <= most * (1.0 + 1e-6) + 1e-12:
+            return False
+        # what slips does so against a force at the edge of the cone
+        if most > 0.0 and slip > 10.0 * _HOLDS and not -(u1 * force[o + 1] + u2 * force[o + 2]) >= 0.999 * slip * most:
+            return False
+    return True
+
+
+@kernel
 def contact_forces(m: int, W: Floats, b: Numbers, friction: Numbers, compliance: Numbers, force: Numbers, work: Numbers) -> bool:
     """Forces (3 m: normal and two tangents of each contact), from the given ones as a start; whether they obey the law."""
     n = 3 * m
@@ -173,7 +194,7 @@ def contact_forces(m: int, W: Floats, b: Numbers, friction: Numbers, compliance:
     for count in range(_ROUNDS):
         wrong = _correct_states(m, W, b, friction, compliance, force, state, along)
         if wrong <= _AGREE and count > 0:
-            return True
+            break
         for c in range(m):
             for i in range(3):
                 _row_of_state(c, i, m, W, b, compliance, friction, state, along, a)
@@ -181,6 +202,8 @@ def contact_forces(m: int, W: Floats, b: Numbers, friction: Numbers, compliance:
             break
         for i in range(n):
             force[i] = a[i * (n + 1) + n]
+    if _obeys(m, W, b, friction, compliance, force):
+        return True
     for i in range(n):
         force[i] = best[i] if best[i] == best[i] else 0.0
     left = 1.0
@@ -188,4 +211,4 @@ def contact_forces(m: int, W: Floats, b: Numbers, friction: Numbers, compliance:
         left = _sweep(m, W, b, friction, compliance, force)
         if left < _AGREE:
             break
-    return left < _AGREE
+    return left < _AGREE and _obeys(m, W, b, friction, compliance, force)

@@ -54,18 +54,35 @@ def signed_primitive(kind: int, size: Vec, p: Vec) -> tuple[float, Vec]:
 
 @kernel
 def ray_primitive(kind: int, size: Vec, p: Vec, direction: Vec, longest: float) -> float:
-    """Length to the surface along a unit direction, by sphere tracing on the exact distance; FAR where it is not met."""
+    """Length to the surface along a unit direction, by stepping to tangent planes; FAR where it is not met up to `longest`."""
+    if signed_primitive(kind, size, p)[0] < 0.0:
+        return _way_out(kind, size, p, direction, longest)
     t = 0.0
-    inside = signed_primitive(kind, size, p)[0] < 0.0
     for _ in range(512):
         d, n = signed_primitive(kind, size, axpy(t, direction, p))
         away = dot(n, direction)
         if abs(d) < 1e-10:
             return t
-        if not inside and away >= 0.0:
+        if away >= 0.0:
             return FAR  # every shape here is convex: what moves away stays away
-        # the tangent plane lies between a convex shape and what is outside it: a step to it is as safe as one by d
-        t += abs(d) if inside else d / -away
+        t += d / -away  # the tangent plane lies between a convex shape and what is outside it: a step to it is safe
         if t > longest:
             return FAR
-    return t
+    return FAR
+
+
+@kernel
+def _way_out(kind: int, size: Vec, p: Vec, direction: Vec, longest: float) -> float:
+    """From inside: the distance is convex along the ray, so it has one root there; by doubling, then bisection."""
+    low, high = 0.0, 1e-3
+    while signed_primitive(kind, size, axpy(high, direction, p))[0] < 0.0:
+        low, high = high, 2.0 * high
+        if low > longest or low > 1e9:
+            return FAR
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        if signed_primitive(kind, size, axpy(middle, direction, p))[0] < 0.0:
+            low = middle
+        else:
+            high = middle
+    return high if high <= longest else FAR

@@ -13,11 +13,13 @@ from fastrod.kernels.surface import ray_hit, signed_distance, walls
 from fastrod.kernels.vec import Vec, dot, scale
 from fastrod.types import Floats, Surfaces
 
-T_OBSTACLE, T_S, T_TWIN, T_N, T_GAP, T_FORCE, T_RADIUS, T_ARM, T_TAKEN, SLOT = 0, 1, 2, 3, 6, 7, 10, 11, 12, 13
+T_OBSTACLE, T_S, T_TWIN, T_N, T_GAP, T_FORCE, T_RADIUS, T_ARM, T_TAKEN, T_SHIFT, SLOT = 0, 1, 2, 3, 6, 7, 10, 11, 12, 13, 14
 """Obstacle (from n_obstacles on: rods), arclength, number that links both sides of a contact between rods or -1, normal
 toward the rod, gap, force on the rod (world), radius of the rod there; arm: how far below the centreline the force acts, the
-radius where there is friction, else 0, for a normal force has no moment; taken: scratch of `choose`."""
+radius where there is friction, else 0, for a normal force has no moment; taken: scratch of `choose`; shift: how far it moved
+along the rod the last time."""
 _SAME_WALL = 0.99999
+_CLOSE = 1e-3  # of a step: the least that two contacts of one obstacle are apart
 
 
 @inline
@@ -40,7 +42,7 @@ def carries(slot: Numbers) -> bool:
 def open_slot(slot: Numbers, obstacle: int, s: float, twin: int, n: Vec, gap: float, radius: float, friction: float) -> None:
     slot[T_OBSTACLE], slot[T_S], slot[T_TWIN], slot[T_GAP], slot[T_RADIUS] = float(obstacle), s, float(twin), gap, radius
     slot[T_N], slot[T_N + 1], slot[T_N + 2] = n
-    slot[T_ARM] = radius if friction > 0.0 else 0.0
+    slot[T_ARM], slot[T_SHIFT] = radius if friction > 0.0 else 0.0, FAR
     slot[T_FORCE], slot[T_FORCE + 1], slot[T_FORCE + 2], slot[T_TAKEN] = 0.0, 0.0, 0.0, 0.0
 
 
@@ -62,7 +64,7 @@ def wall_at(
                 return -t * facing, wall
         return d, n
     best, alike = -1, dot(n, old) + 1e-6
-    count = walls(k, frame, p, d + margin, surfaces, stack, found)
+    count = walls(k, frame, p, d + margin, d, surfaces, stack, found)
     for j in range(count):
         facing = dot((found[5 * j + 1], found[5 * j + 2], found[5 * j + 3]), old)
         if facing > alike:
@@ -117,11 +119,16 @@ def choose(
     arclength: Floats,
     spacing: float,
     tolerance: float,
+    keep: float,
 ) -> int:
-    """Contacts for the next pass, in place; returns how many. Those with rods stay as long as they press or overlap."""
+    """Contacts for the next pass, in place; returns how many. Those that press stay, and idle ones whose gap is below `keep`:
+    they may be wanted next. A contact follows the minimum of the gap as long as its shifts shrink; where they do not (a rod that
+    hugs a curved surface), another is put beside it, and the law shares the force out."""
     n = 0
+    room = count <= len(slot) - 4
     for c in range(count):
-        if carries(slot[c]) or (int(slot[c, T_OBSTACLE]) >= n_obstacles and slot[c, T_GAP] < 0.0):
+        idle = slot[c, T_GAP] < (keep if int(slot[c, T_OBSTACLE]) < n_obstacles else 0.0)
+        if carries(slot[c]) or (idle and room):
             if n != c:
                 for a in range(SLOT):
                     slot[n, a] = slot[c, a]
@@ -130,7 +137,7 @@ def choose(
     for f in range(n_found):
         k, s, gap = int(found[f, 0]), found[f, 1], found[f, 2]
         normal = (found[f, 3], found[f, 4], found[f, 5])
-        near, nearest = -1, FAR
+        near, nearest, lonely = -1, FAR, spacing
         for c in range(n):
             away = abs(slot[c, T_S] - s)
             if int(slot[c, T_OBSTACLE]) != k:
@@ -138,12 +145,17 @@ def choose(
             free = slot[c, T_TAKEN] == 0.0 and dot(slot_normal(slot[c]), normal) > 0.5
             if free and away < spacing and away < nearest:
                 near, nearest = c, away
+        if gap < -tolerance:
+            lonely = _CLOSE * spacing
         if near >= 0:
             slot[near, T_TAKEN] = 1.0
-            if gap < slot[near, T_GAP] - 1e-10:
-                slot[near, T_S] = s
-            continue
-        lonely = spacing if gap >= -tolerance else 0.1 * spacing
+            if gap >= slot[near, T_GAP] - 1e-10:
+                continue
+            settles = nearest < max(0.5 * slot[near, T_SHIFT], _CLOSE * spacing)
+            if settles or not carries(slot[near]) or slot[near, T_ARM] > 0.0:
+                slot[near, T_S], slot[near, T_SHIFT] = s, nearest if carries(slot[near]) else FAR
+                continue
+            lonely = _CLOSE * spacing
         crowded = n >= len(slot) or _segment_is_full(s, n, slot, arclength, n_steps)
         for c in range(n):
             if int(slot[c, T_OBSTACLE]) == k and abs(slot[c, T_S] - s) < lonely and dot(slot_normal(slot[c]), normal) > 0.5:
@@ -151,6 +163,18 @@ def choose(
         if not crowded:
             open_slot(slot[n], k, s, -1, normal, gap, radius[segment_at(arclength, n_steps, s)], friction[k])
             slot[n, T_TAKEN] = 1.0
+            n += 1
+    return n
+
+
+@kernel
+def pressed_only(count: int, slot: Floats) -> int:
+    """Drop the contacts that carry nothing; returns how many are left."""
+    n = 0
+    for c in range(count):
+        if carries(slot[c]):
+            for a in range(SLOT if n != c else 0):
+                slot[n, a] = slot[c, a]
             n += 1
     return n
 
@@ -166,7 +190,9 @@ def add_walls(
         if k >= len(frames):
             continue
         p = (points[c, 0], points[c, 1], points[c, 2])
-        n_walls = walls(k, frames[k], p, slot[c, T_RADIUS] + margin, surfaces, stack, found)
+        d, _, _ = signed_distance(k, frames[k], p, FAR, surfaces, stack)
+        reach = slot[c, T_RADIUS] + margin
+        n_walls = walls(k, frames[k], p, reach, d, surfaces, stack, found) if 0.0 <= d < reach else 0
         for j in range(n_walls):
             normal = (found[5 * j + 1], found[5 * j + 2], found[5 * j + 3])
             known = n >= len(slot)
@@ -187,7 +213,7 @@ def merge(count: int, slot: Floats, spacing: float) -> int:
         into = -1
         for e in range(n):
             same = slot[e, T_OBSTACLE] == slot[c, T_OBSTACLE] and slot[e, T_TWIN] < 0.0 and slot[c, T_TWIN] < 0.0
-            if same and abs(slot[e, T_S] - slot[c, T_S]) < 0.02 * spacing and dot(slot_normal(slot[e]), slot_normal(slot[c])) > _SAME_WALL:
+            if same and abs(slot[e, T_S] - slot[c, T_S]) < 1e-4 * spacing and dot(slot_normal(slot[e]), slot_normal(slot[c])) > _SAME_WALL:
                 into = e
         if into >= 0:
             for a in range(3):

@@ -59,11 +59,12 @@ def signed_distance(k: int, frame: Numbers, p: Vec, bound: float, surfaces: Surf
 
 
 @kernel
-def walls(k: int, frame: Numbers, p: Vec, reach: float, surfaces: Surfaces, stack: Numbers, found: Numbers) -> int:
-    """Faces of obstacle k around the world point p, nearer than `reach` (`facing_planes`), normals in the world."""
+def walls(k: int, frame: Numbers, p: Vec, reach: float, nearest: float, surfaces: Surfaces, stack: Numbers, found: Numbers) -> int:
+    """Faces of obstacle k around the world point p, nearer than `reach` (`facing_planes`), normals in the world; `nearest` is its
+    distance."""
     if surfaces.kind[k] != MESH:
         return 0
-    n = facing_planes(to_obstacle(frame, p), reach, surfaces.root[k], surfaces, stack, found, MOST_PLANES)
+    n = facing_planes(to_obstacle(frame, p), reach, nearest, surfaces.root[k], surfaces, stack, found, MOST_PLANES)
     for j in range(n):
         normal = mul(turn_of(frame), (found[5 * j + 1], found[5 * j + 2], found[5 * j + 3]))
         found[5 * j + 1], found[5 * j + 2], found[5 * j + 3] = normal

@@ -15,7 +15,7 @@ from fastrod.kernels.forces import Scenery, apply_law, forces_size
 from fastrod.kernels.gather import pick
 from fastrod.kernels.jit import inline, kernel
 from fastrod.kernels.search import CANDIDATE, Sweep, crosses, search_obstacles
-from fastrod.kernels.slots import T_FORCE, T_S, add_walls, choose, merge, violation
+from fastrod.kernels.slots import T_FORCE, T_S, add_walls, choose, merge, pressed_only, violation
 from fastrod.kernels.strands import search_rods
 from fastrod.types import Clearance, Floats, Ints, Memory, Probes, Touching
 
@@ -150,6 +150,8 @@ def iterate_world(
     for r in range(first, last):
         status[r] = LOST if through else AT_REST if rest else GOES_ON
     if rest:
+        for r in range(first, last):
+            touching.used[rows[r]] = pressed_only(touching.used[rows[r]], touching.slot[rows[r]])
         return
     for r in range(first, last):
         i = rows[r]
@@ -180,22 +182,13 @@ def _renew(
     """The contacts of robot i for its next pass."""
     slot, rods, frames = touching.slot[i], scenery.rods, scenery.frames[pick(i, len(scenery.frames))]
     spacing = rods.spacing[i]
+    margin = scenery.margin * rods.reach[i]
     count = choose(
-        n_found,
-        found,
-        touching.used[i],
-        slot,
-        len(frames),
-        rods.radius[i],
-        scenery.surfaces.friction,
-        rods.n_steps,
-        curve.arclength,
-        spacing,
-        scenery.tolerance,
-    )
+        n_found, found, touching.used[i], slot, len(frames), rods.radius[i], scenery.surfaces.friction, rods.n_steps,
+        curve.arclength, spacing, scenery.tolerance, 0.2 * margin,
+    )  # fmt: skip
     count = merge(count, slot, spacing)
     for c in range(count):
         j, part = interval_of(curve, slot[c, T_S], 0)
         points[c, 0], points[c, 1], points[c, 2] = point_at(curve, j, part)
-    margin = scenery.margin * rods.reach[i]
     touching.used[i] = add_walls(count, slot, points, frames, margin, scenery.surfaces, scratch[2 * STACK :], scratch)

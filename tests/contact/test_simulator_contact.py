@@ -124,7 +124,7 @@ def test_friction_holds_then_slides_and_takes_energy():
         assert np.linalg.norm(across) <= friction * pressed * (1.0 + 1e-6)
         assert across @ slip <= 1e-12  # friction never adds energy
         if np.linalg.norm(across) < friction * pressed * (1.0 - 1e-4):
-            assert np.linalg.norm(slip) < 1e-6
+            assert np.linalg.norm(slip) < 2e-6  # a step is at rest to 1e-6 m
             stuck += 1
         else:
             slid += 1

@@ -66,7 +66,7 @@ def obstacle_of(o: dict[str, Any]) -> Obstacle:
         return box(tuple(2.0 * h for h in o["half"]), position=o["centre"])
     import trimesh
 
-    # a hole with 400 sides of the same mean radius: 0.3 um in and out
+    # a hole with 400 sides of the same mean radius: 0.3 um in and out, and facets of 0.16 mm, on which a tip may rest anywhere
     wide = o["radius"] / np.sqrt(np.cos(np.pi / 400))
     return mesh(trimesh.creation.annulus(wide, wide + 0.01, 0.3, sections=400), position=o["point"], quaternion=to_axis(o["axis"]))
 
@@ -82,10 +82,11 @@ def test_forces_and_shape(name: str) -> None:
     state = sim.settle(case["tendon_length"] or None, tip_force=case["tip_force"], line_force=case["line_force"])
     assert state.ok.all(), state.problems
     size = np.linalg.norm(force)
-    assert_allclose(state.tip_position[0], tip, rtol=0, atol=1e-5)
+    facet = 8e-5 if name == "tube" else 0.0
+    assert_allclose(state.tip_position[0], tip, rtol=0, atol=1e-5 + facet)
     assert_allclose(state.contacts.total_force[0], force, rtol=0, atol=2e-3 * size)
     along = sim.shape(fine.arclength).position[0]
-    assert_allclose(along, fine.positions, rtol=0, atol=2e-5)
+    assert_allclose(along, fine.positions, rtol=0, atol=2e-5 + facet)
     # the force stands where the truth's does; a corner of a mesh may hold it by two walls
     where = np.average(state.contacts.arclength[0], weights=np.linalg.norm(state.contacts.force[0], axis=1))
     weights = np.linalg.norm(fine.contact_force, axis=1)

@@ -1,0 +1,1 @@
+"""Scenes in which a rod touches something: one a file."""

@@ -1,0 +1,86 @@
+"""`Scene`: robots, what surrounds them, what they are told, and what physics expects of it; `load(name)` finds one."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, ClassVar, final
+
+from fastrod.errors import FastrodError, UnknownNameError, nearest
+
+if TYPE_CHECKING:
+    from fastrod.simulator import Simulator
+    from fastrod.state import State
+
+_SCENES: Mapping[str, str] = {
+    "airway": "fastrod_scenes.contact.airway:Airway",
+    "bar": "fastrod_scenes.contact.bar:Bar",
+    "draped": "fastrod_scenes.contact.draped:Draped",
+    "pair": "fastrod_scenes.contact.pair:Pair",
+    "wall": "fastrod_scenes.contact.wall:Wall",
+}
+
+
+class SceneError(FastrodError, AssertionError):
+    """A scene did not do what physics expects of it."""
+
+
+class Scene(ABC):
+    """A simulation from the first input to the last, and the figures by which it is judged. It keeps nothing between runs.
+
+    >>> load("wall").dt
+    0.01
+    """
+
+    name: ClassVar[str]
+    about: ClassVar[str]
+    """One sentence."""
+    dt: ClassVar[float]
+    """Time step [s]."""
+    duration: ClassVar[float]
+    """Of a run [s]."""
+
+    @abstractmethod
+    def simulator(self) -> Simulator:
+        """A new simulator with this scene's robots and obstacles, before its first step."""
+
+    @abstractmethod
+    def inputs(self, t: float) -> dict[str, Any]:
+        """Keyword arguments of `Simulator.step` at time t [s]."""
+
+    @abstractmethod
+    def check(self) -> dict[str, float]:
+        """Run, and return the figures measured (name with unit -> value); `SceneError` where one is not as it must be."""
+
+    @final
+    def run(self) -> Iterator[tuple[float, State]]:
+        """(t [s], state) of each step, from 0 to `duration`."""
+        simulator = self.simulator()
+        for k in range(round(self.duration / self.dt) + 1):
+            yield k * self.dt, simulator.step(**self.inputs(k * self.dt))
+
+    @final
+    def progress(self, t: float) -> float:
+        """Part of the run that is over at time t [s], from 0 to 1."""
+        return min(max(t / self.duration, 0.0), 1.0)
+
+    @final
+    def expect(self, fulfilled: bool, sentence: str) -> None:
+        """Raises `SceneError` with the sentence where an expectation is not fulfilled."""
+        if not fulfilled:
+            raise SceneError(f"scene {self.name}: {sentence}")
+
+
+def names() -> tuple[str, ...]:
+    """The scenes that there are, in alphabetical order."""
+    return tuple(sorted(_SCENES))
+
+
+def load(name: str) -> Scene:
+    """The scene of this name; `UnknownNameError` with the nearest one."""
+    if name not in _SCENES:
+        raise UnknownNameError(f"no scene {name!r}; {nearest(str(name), _SCENES)}")
+    module, word = _SCENES[name].split(":")
+    scene: Scene = getattr(import_module(module), word)()
+    return scene
