@@ -7,11 +7,16 @@ import io
 import re
 from pathlib import Path
 
+import pytest
+
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 
 
-def test_the_example_prints_its_output() -> None:
-    code, output = re.findall(r"```(?:python)?\n(.*?)```", README, flags=re.S)[:2]
+EXAMPLES = re.findall(r"```python\n(.*?)```\n\n```\n(.*?)```", README, flags=re.S)
+
+
+@pytest.mark.parametrize(("code", "output"), EXAMPLES, ids=["first screen", "contact"])
+def test_the_example_prints_its_output(code: str, output: str) -> None:
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
         exec(compile(code, "README.md", "exec"), {})

@@ -16,7 +16,7 @@ TOUCHES = 1e-9
 @dataclass(frozen=True)
 class Contacts:
     """The contacts of a state, robot axis first, world frame. Rows are filled from the left; what is beyond `count` is nan, or
-    -1 in `obstacle`."""
+    -1 in `obstacle`. One touch may be held by several neighbouring contacts that share its force."""
 
     names: tuple[str, ...]
     """Of the obstacles; then come the rods of the robots, `rod 0`, `rod 1`, ..."""

