@@ -265,10 +265,11 @@ def test_compliance_and_jacobian_hold_the_contact_forces():
     sim = fastrod.Simulator(prototype(1e-5), contact=bar())
     state = sim.settle(bent(12.0, 1.0))
     free = fastrod.Simulator(prototype(1e-5))
-    pair = [(state.contacts.arclength[0, 0], state.contacts.force[0, 0])]
-    free.settle(bent(12.0, 1.0), point_force=pair)
-    assert_allclose(sim.jacobian()[:, :, :4], free.jacobian()[:, :, :4], rtol=1e-5, atol=1e-6)
-    assert_allclose(sim.compliance(), free.compliance(), rtol=1e-5, atol=1e-6)
+    loads = list(zip(state.contacts.arclength[0], state.contacts.force[0], strict=True))
+    free.settle(bent(12.0, 1.0), point_force=loads)
+    # lengths closed to 1e-9 m leave 1e-4 N open in wires of 1e-5 m/N, of some newtons
+    assert_allclose(sim.jacobian()[:, :, :4], free.jacobian()[:, :, :4], rtol=1e-4, atol=1e-6)
+    assert_allclose(sim.compliance(), free.compliance(), rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize(
