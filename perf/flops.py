@@ -180,7 +180,7 @@ def _instrument() -> dict[str, Tally]:
 
     jit.LANES = 1
     import fastrod.kernels as package
-    from fastrod import simulator
+    from fastrod import passes
     from fastrod.types import Memory, Shape
 
     modules = [importlib.import_module(f"fastrod.kernels.{info.name}") for info in pkgutil.iter_modules(package.__path__)]
@@ -201,7 +201,7 @@ def _instrument() -> dict[str, Tally]:
             elif value is math:
                 names[name] = _Math()
         names["float"] = _kept
-    body = vars(simulator)["pass_serial"]
+    body = vars(passes)["pass_serial"]
 
     def counting(*arguments: Any) -> None:
         counted: list[Any] = [argument if isinstance(argument, Shape) else _countable(argument) for argument in arguments]
@@ -210,7 +210,7 @@ def _instrument() -> dict[str, Tally]:
         for kept, new in zip(arguments[memory], counted[memory], strict=True):  # what the next step begins from
             kept[...] = new.astype(float)
 
-    vars(simulator)["pass_serial"] = counting
+    vars(passes)["pass_serial"] = counting
     return sections
 
 

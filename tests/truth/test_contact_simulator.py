@@ -82,9 +82,9 @@ def test_forces_and_shape(name: str) -> None:
     state = sim.settle(case["tendon_length"] or None, tip_force=case["tip_force"], line_force=case["line_force"])
     assert state.ok.all(), state.problems
     size = np.linalg.norm(force)
-    facet = 8e-5 if name == "tube" else 0.0
+    facet, turn = (8e-5, 0.008) if name == "tube" else (0.0, 0.0)  # half a facet's width [m] and angle [rad]
     assert_allclose(state.tip_position[0], tip, rtol=0, atol=1e-5 + facet)
-    assert_allclose(state.contacts.total_force[0], force, rtol=0, atol=2e-3 * size)
+    assert_allclose(state.contacts.total_force[0], force, rtol=0, atol=(2e-3 + turn) * size)
     along = sim.shape(fine.arclength).position[0]
     assert_allclose(along, fine.positions, rtol=0, atol=2e-5 + facet)
     # the force stands where the truth's does; a corner of a mesh may hold it by two walls
