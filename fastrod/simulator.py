@@ -16,7 +16,7 @@ from fastrod.contact import queries
 from fastrod.contact.engine import Engine
 from fastrod.contact.frames import blended
 from fastrod.contact.scene import ContactScene
-from fastrod.contact.step import Ways, contact_step
+from fastrod.contact.step import COLD_PASSES, STEP_PASSES, Ways, contact_step
 from fastrod.errors import InputError, RobotError
 from fastrod.guess import cold_start
 from fastrod.inputs import Inputs, PointForces, Reader
@@ -240,7 +240,7 @@ class Simulator:
 
         ok, done = contact_step(
             engine, Ways(free, bring_to_rest, run), rows, self._warm, start, ports, self._unloaded(ports), self._passes.memory, shape,
-            tolerance or _AT_REST, passes,
+            tolerance or _AT_REST, passes, STEP_PASSES if tolerance is None else COLD_PASSES,
         )  # fmt: skip
         for i in rows[~ok[rows]]:
             self._reader.problems.setdefault(int(i), engine.why(int(i), float(done[i])))

@@ -28,11 +28,10 @@ Pass = Callable[[Ints, Ports, Shape, Probes], None]
 
 _FOUND = 64
 _BLOCK = 2048  # robots whose linear models are held at once
-_MOST_PASSES = 30
+_MOST_PASSES = 16
 _SMALLEST_PART = 1.0 / 64.0
-_HARD = 1.0 / 8.0  # part of the way below which a failure is taken for the loss of the equilibrium, not for too long a step
+_HARD = 1.0 / 4.0  # part of the way below which a failure is taken for the loss of the equilibrium, not for too long a step
 _DAMPING, _MOST_DAMPED = 1.5, 60
-_MOST_ROUNDS = 40  # parts of one step, those that failed included: a step ends
 _FEW = 64  # robots below which starting threads costs more than it saves
 
 
@@ -111,9 +110,19 @@ class Engine:
         return self.whole_worlds(some)
 
     def follow(
-        self, rows: Ints, start: Ports | None, end: Ports, memory: Memory, shape: Shape, run: Pass, tolerance: float, passes: Ints
+        self,
+        rows: Ints,
+        start: Ports | None,
+        end: Ports,
+        memory: Memory,
+        shape: Shape,
+        run: Pass,
+        tolerance: float,
+        passes: Ints,
+        most: int,
     ) -> tuple[Flags, Floats]:
-        """Lead the worlds of `rows` from the inputs `start`, where they are at rest, to `end`, or settle them there at once.
+        """Lead the worlds of `rows` from the inputs `start`, where they are at rest, to `end`, or settle them there at once, in about
+        `most` passes.
 
         (n_robots,) which arrived, and the part of the way that each came. Those that did not keep the last shape, boundary and
         contacts in which they were at rest.
@@ -121,9 +130,8 @@ class Engine:
         n = len(self.gap)
         done, stride, arrived = np.zeros(n), np.ones(n), np.zeros(n, bool)
         x, count, slot = memory.x.copy(), self.touching.used.copy(), self.touching.slot.copy()
-        way, spent = rows, 0
-        while len(way) and spent < _MOST_ROUNDS:
-            spent += 1
+        way, begun = rows, passes.copy()
+        while len(way):
             aim = np.minimum(done + stride, 1.0)
             ports = end if start is None or (aim[way] >= 1.0).all() else blended(start, end, aim)
             rest = self._settle(way, ports, memory, shape, run, self._scenery(shape, tolerance, done, aim), passes, _MOST_PASSES)
@@ -144,7 +152,7 @@ class Engine:
             stride[bad] *= 0.5
             if start is None:
                 break
-            way = way[~arrived[way] & (stride[way] >= _SMALLEST_PART)]
+            way = way[~arrived[way] & (stride[way] >= _SMALLEST_PART) & (passes[way] - begun[way] < most)]
         lost = rows[~arrived[rows] & self.tracked[rows]]
         if len(lost) and self.before is not None:
             for now, last in zip(shape, self.before, strict=True):

@@ -10,6 +10,8 @@ import numpy as np
 from fastrod.contact.engine import Engine, Pass
 from fastrod.types import Flags, Floats, Ints, Memory, Ports, Shape
 
+STEP_PASSES, COLD_PASSES = 600, 2000
+
 
 class Ways(NamedTuple):
     """How a simulator moves robots without contact."""
@@ -23,12 +25,13 @@ class Ways(NamedTuple):
 
 def contact_step(
     engine: Engine, ways: Ways, rows: Ints, warm: Flags, start: Ports | None, end: Ports, rest: Ports, memory: Memory, shape: Shape,
-    tolerance: float, passes: Ints,
+    tolerance: float, passes: Ints, most: int,
 ) -> tuple[Flags, Floats]:  # fmt: skip
     """Bring `rows` from the inputs `start` of the last step to `end`, in `shape`; (n_robots,) who is well, and how far each came.
 
     `rest` are the inputs of the straight, unloaded robots: a cold robot that would overlap something is led from there, if it
-    is clear there; else it is pushed out of where it is. Without a last step there is no slip, and so no friction.
+    is clear there; else it is pushed out of where it is. Without a last step there is no slip, and so no friction. `most` passes
+    are spent on a warm robot, about: a step ends.
     """
     n = len(warm)
     cold = engine.whole_worlds(np.isin(np.arange(n), rows) & ~warm)
@@ -47,7 +50,7 @@ def contact_step(
     if len(led):
         memory.x[led] = x[led]
         ok[led] = False
-        arrived, came = engine.follow(led, start, end, memory, shape, ways.run, tolerance, passes)
+        arrived, came = engine.follow(led, start, end, memory, shape, ways.run, tolerance, passes, most)
         ok |= arrived
         done[led] = came[led]
     new = cold_rows[touched[cold_rows] | ~ok[cold_rows]]
@@ -74,10 +77,10 @@ def _begin(
     done = np.zeros(len(clear))
     if len(able := rows[clear[rows]]):
         engine.accept(able, shape, on_the_way=True)
-        done = engine.follow(able, rest, end, memory, shape, ways.run, tolerance, passes)[1]
+        done = engine.follow(able, rest, end, memory, shape, ways.run, tolerance, passes, COLD_PASSES)[1]
     if len(stuck := rows[~clear[rows]]):
         memory.x[stuck] = x[stuck]
         for now, then in zip(shape, free_shape, strict=True):
             now[stuck] = then[stuck]
-        done[stuck] = engine.follow(stuck, None, end, memory, shape, ways.run, tolerance, passes)[1][stuck]
+        done[stuck] = engine.follow(stuck, None, end, memory, shape, ways.run, tolerance, passes, COLD_PASSES)[1][stuck]
     return done
