@@ -187,7 +187,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="few robots, coarse meshes: does it run? Its figures mean little")
     parser.add_argument("--robots", type=int, help="robots of a batch (default 1024, with --quick 8)")
     options = parser.parse_args(argv)
-    n_robots = options.robots or (8 if options.quick else 1024)
+    n_robots = options.robots or (8 if options.quick else 128)
     start, load = time.perf_counter(), os.getloadavg()[0]
     budget = 0.0 if options.quick else 0.6
     batch, cases, bare = measure(n_robots, (2, 3) if options.quick else (3, 5, 6), budget, 2 if options.quick else 24)
