@@ -185,7 +185,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="bench_contact", description=__doc__)
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
     parser.add_argument("--quick", action="store_true", help="few robots, coarse meshes: does it run? Its figures mean little")
-    parser.add_argument("--robots", type=int, help="robots of a batch (default 1024, with --quick 8)")
+    parser.add_argument("--robots", type=int, help="robots of a batch (default 128, with --quick 8)")
     options = parser.parse_args(argv)
     n_robots = options.robots or (8 if options.quick else 128)
     start, load = time.perf_counter(), os.getloadavg()[0]
