@@ -136,9 +136,16 @@ def _replay(arguments: argparse.Namespace) -> int:
     log, robot = _read(path, None if arguments.robot is None else load_robot(arguments.robot))
     if arguments.run is not None:
         log = log.only(arguments.run)
-    out = room.make_folder(arguments.out or Path(f"{path.stem}_replay"))
-    with _progress() as bar:
-        result = room.replay(log, robot, progress=None if bar is None else partial(bar, "replay"))
+    out = arguments.out or Path(f"{path.stem}_replay")
+    fresh = not out.exists()
+    room.make_folder(out)
+    try:
+        with _progress() as bar:
+            result = room.replay(log, robot, progress=None if bar is None else partial(bar, "replay"))
+    except FastrodError:
+        if fresh:
+            out.rmdir()
+        raise
     console = Console()
     console.print(room.table(result))
     if not result.compared.any():
