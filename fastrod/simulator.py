@@ -31,6 +31,7 @@ from fastrod.types import Flags, Floats, Ints, Memory, Params, Ports, Probes, Sh
 
 _config: Any = numba.config
 _AT_REST = 1e-6  # m: contact and boundary of a step, where `settle` has a tolerance of its own
+_ALONG = ("position", "rotation", "curvature", "arclength", "moment", "force", "tension", "path_length", "base_wrench")
 _LOST = 0.1  # of the robot's length: a residual beyond it is no shape of this robot
 
 
@@ -425,6 +426,7 @@ class Simulator:
             self._bare,
             effects,
             self._chain.time.copy(),
+            None if self._engine is None else self._engine.snapshot(),
         )
 
     def restore(self, snapshot: Snapshot) -> None:
@@ -433,11 +435,15 @@ class Simulator:
             raise InputError("the snapshot is of another simulator; its robots, tendons or their number differ.")
         if [memory.shape for memory in snapshot.effects] != [link.memory.shape for link in self._chain.links]:
             raise InputError("the snapshot is of another simulator; its effects differ.")
+        if (snapshot.contact is None) != (self._engine is None):
+            raise InputError("the snapshot is of another simulator; only one of them has a contact scene.")
         self._passes.memory = _copied(snapshot.memory)
         self._warm, self._given, self._ports, self._state = snapshot.warm.copy(), snapshot.given, snapshot.ports, snapshot.state
         self._passes.params, self._bare, self._chain.time = snapshot.params, snapshot.bare, snapshot.time.copy()
         for link, memory in zip(self._chain.links, snapshot.effects, strict=True):
             link.memory[:] = memory
+        if self._engine is not None and snapshot.contact is not None:
+            self._engine.restore(snapshot.contact)
 
     def _read(self, given: Inputs) -> tuple[Ports, Ints]:
         """The ports, and the robots whose inputs are good."""
@@ -473,6 +479,8 @@ class Simulator:
             self._warm = ok.copy()
         self._ports = ports
         contacts = None if self._engine is None else self._engine.contacts(shape, ok)
+        if self.outputs == "tip":  # contact needs the whole rod, the caller did not ask for it
+            shape = shape._replace(**{name: getattr(shape, name)[:0] for name in _ALONG})
         self._state = State(**shape._asdict(), ok=ok, passes=passes, problems=problems, contacts=contacts)
         return self._state
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from fastrod.contact.contacts import Contacts
+from fastrod.contact.engine import Snapshot as ContactSnapshot
 from fastrod.errors import InputError
 from fastrod.inputs import Inputs
 from fastrod.types import Flags, Floats, Ints, Memory, Params, Ports
@@ -99,3 +100,4 @@ class Snapshot(NamedTuple):
     bare: Ports | None
     effects: list[Floats]
     time: Floats
+    contact: ContactSnapshot | None

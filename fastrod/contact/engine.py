@@ -8,6 +8,7 @@ could solve: it stays where it came to, and says so.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,13 +27,27 @@ from fastrod.types import Clearance, Flags, Floats, Ints, Memory, Ports, Probes,
 Pass = Callable[[Ints, Ports, Shape, Probes], None]
 """(robots, ports, shape, probes): one forward pass into `shape` that leaves the boundary as it is."""
 
-_FOUND = 64
+MOST_FOUND = 64
+"""Candidates of one robot that a look notes."""
 _BLOCK = 2048  # robots whose linear models are held at once
 _MOST_PASSES = 16
 _SMALLEST_PART = 1.0 / 64.0
 _HARD = 1.0 / 4.0  # part of the way below which a failure is taken for the loss of the equilibrium, not for too long a step
 _DAMPING, _MOST_DAMPED = 1.5, 60
 _FEW = 64  # robots below which starting threads costs more than it saves
+
+
+class Snapshot(NamedTuple):
+    """What an `Engine` remembers."""
+
+    touching: Touching
+    clearance: Clearance
+    before: Shape | None
+    tracked: Flags
+    gap: Floats
+    poses: Floats
+    poses_before: Floats
+    at_last_step: tuple[Shape | None, Floats]
 
 
 class Engine:
@@ -76,6 +91,30 @@ class Engine:
         self.clearance.distance[rows] = -np.inf
         self.tracked[rows] = False
 
+    def snapshot(self) -> Snapshot:
+        """A copy of everything that a later step depends on; shapes are handed out once and not written again."""
+        return Snapshot(
+            Touching(self.touching.used.copy(), self.touching.slot.copy()), Clearance(self.clearance.distance.copy(), self.clearance.position.copy()), self.before,
+            self.tracked.copy(), self.gap.copy(), self.poses, self.poses_before, self.at_last_step,
+        )  # fmt: skip
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Go back to a `snapshot` of this engine."""
+        self.touching = Touching(snapshot.touching.used.copy(), snapshot.touching.slot.copy())
+        self.clearance = Clearance(snapshot.clearance.distance.copy(), snapshot.clearance.position.copy())
+        self.before, self.tracked, self.gap = snapshot.before, snapshot.tracked.copy(), snapshot.gap.copy()
+        self.poses, self.poses_before, self.at_last_step = snapshot.poses, snapshot.poses_before, snapshot.at_last_step
+
+    def in_worlds(self, rows: Ints) -> tuple[Ints, Ints]:
+        """`rows` world by world, and where each world begins, with the end at last."""
+        ordered = rows[np.argsort(self.world[rows], kind="stable")]
+        return ordered, np.append(np.flatnonzero(np.diff(self.world[ordered], prepend=-1)), len(ordered))
+
+    @property
+    def rods_touch(self) -> bool:
+        """A rod may touch itself or another."""
+        return self.scene.self_contact or self.scene.worlds is not None
+
     def pressed(self) -> Flags:
         """(n_robots,) in a world where some contact carries a force."""
         slots = np.arange(self.touching.slot.shape[1])
@@ -96,15 +135,14 @@ class Engine:
         if not len(rows):
             return some
         parts = self._parts(len(rows))
-        found, n_found = np.empty((len(rows), _FOUND, CANDIDATE)), np.zeros(len(rows), np.int64)
+        found, n_found = np.empty((len(rows), MOST_FOUND, CANDIDATE)), np.zeros(len(rows), np.int64)
         scratch = np.empty((parts, 4 * shape.arclength.shape[1] + 4 * STACK))
         body = look_serial if parts == 1 else look_parallel
         one = np.ones(1)
         scenery = self._scenery(shape, 1e-9, 0.0 * one, one)._replace(margin=0.0)
         body(rows, *scenery, self.clearance, self.gap, found, n_found, scratch)
-        if self.scene.self_contact or self.scene.worlds is not None:
-            ordered = rows[np.argsort(self.world[rows], kind="stable")]
-            worlds = np.append(np.flatnonzero(np.diff(self.world[ordered], prepend=-1)), len(ordered))
+        if self.rods_touch:
+            ordered, worlds = self.in_worlds(rows)
             look_at_rods(worlds, ordered, scenery, self.touching, self.gap)
         some[rows] = (self.gap[rows] < 0.0) | (n_found < 0)
         return self.whole_worlds(some)

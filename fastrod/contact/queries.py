@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fastrod.contact.engine import Engine
+from fastrod.contact.engine import MOST_FOUND, Engine
 from fastrod.contact.frames import between, frames_of
 from fastrod.errors import InputError
 from fastrod.kernels.batch import cast_rays, look_at_rods, look_serial
@@ -49,14 +49,13 @@ def _gap(engine: Engine, shape: Shape, poses: Floats, only: int | None = None) -
     nobody = np.zeros(n, bool)
     scenery = Scenery(engine.rods, surfaces, frames, frames, frames, shape, shape, nobody, nobody, 1e-9, _EVERYTHING, 0.0)
     gap, rows = np.full(n, np.nan), np.flatnonzero(np.isfinite(shape.position).all((1, 2)))
-    found, n_found = np.empty((len(rows), 64, CANDIDATE)), np.zeros(len(rows), np.int64)
+    found, n_found = np.empty((len(rows), MOST_FOUND, CANDIDATE)), np.zeros(len(rows), np.int64)
     unknown = Clearance(np.full((n, n_points), -np.inf), np.zeros((n, n_points, 3)))
     gap[rows] = np.inf
     if len(surfaces.kind):
         look_serial(rows, *scenery, unknown, gap, found, n_found, np.empty((1, 4 * n_points + 4 * STACK)))
-    if only is None and (engine.scene.self_contact or engine.scene.worlds is not None):
-        ordered = rows[np.argsort(engine.world[rows], kind="stable")]
-        worlds = np.append(np.flatnonzero(np.diff(engine.world[ordered], prepend=-1)), len(ordered))
+    if only is None and engine.rods_touch:
+        ordered, worlds = engine.in_worlds(rows)
         look_at_rods(worlds, ordered, scenery, engine.touching, gap)
     return gap
 

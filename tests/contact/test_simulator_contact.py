@@ -272,6 +272,31 @@ def test_compliance_and_jacobian_hold_the_contact_forces():
     assert_allclose(sim.compliance(), free.compliance(), rtol=1e-4, atol=1e-6)
 
 
+def test_a_snapshot_holds_the_contacts():
+    sim = fastrod.Simulator(prototype(1e-5), contact=bar(friction=0.3))
+    for part in np.linspace(0.0, 1.0, 8):
+        sim.step(bent(12.0 * part, 2.0 * part))
+    snapshot = sim.snapshot()
+    first = sim.step(bent(12.0, 4.0))
+    sim.step(bent(0.0, -5.0))
+    sim.restore(snapshot)
+    again = sim.step(bent(12.0, 4.0))
+    assert first.contacts.count[0] > 0
+    assert_allclose(again.tip_position, first.tip_position, rtol=0, atol=0)
+    assert_allclose(again.contacts.force, first.contacts.force, rtol=0, atol=0)
+    with pytest.raises(FastrodError, match="contact scene"):
+        fastrod.Simulator(prototype(1e-5)).restore(snapshot)
+
+
+def test_tip_outputs_touch_as_full_ones_do():
+    full, tip = (fastrod.Simulator(prototype(1e-5), contact=bar(), outputs=outputs) for outputs in ("full", "tip"))
+    for part in np.linspace(0.0, 1.0, 6):
+        whole, short = (sim.step(bent(12.0 * part, 1.0)) for sim in (full, tip))
+    assert short.position.size == 0
+    assert_allclose(short.tip_position, whole.tip_position, rtol=0, atol=0)
+    assert_allclose(short.contacts.force, whole.contacts.force, rtol=0, atol=0)
+
+
 @pytest.mark.parametrize(
     ("call", "words"),
     [
