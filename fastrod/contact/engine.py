@@ -93,10 +93,10 @@ class Engine:
 
     def snapshot(self) -> Snapshot:
         """A copy of everything that a later step depends on; shapes are handed out once and not written again."""
-        return Snapshot(
-            Touching(self.touching.used.copy(), self.touching.slot.copy()), Clearance(self.clearance.distance.copy(), self.clearance.position.copy()), self.before,
-            self.tracked.copy(), self.gap.copy(), self.poses, self.poses_before, self.at_last_step,
-        )  # fmt: skip
+        touching = Touching(self.touching.used.copy(), self.touching.slot.copy())
+        clearance = Clearance(self.clearance.distance.copy(), self.clearance.position.copy())
+        poses = self.poses, self.poses_before, self.at_last_step
+        return Snapshot(touching, clearance, self.before, self.tracked.copy(), self.gap.copy(), *poses)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Go back to a `snapshot` of this engine."""
