@@ -245,7 +245,8 @@ class Simulator:
         )  # fmt: skip
         for i in rows[~ok[rows]]:
             self._reader.problems.setdefault(int(i), engine.why(int(i), float(done[i])))
-        held = np.isin(self._all, rows) & ~ok & engine.tracked
+        # a cold robot has no last inputs to go on from: it begins anew
+        held = np.isin(self._all, rows) & ~ok & engine.tracked & ~engine.whole_worlds(~self._warm)
         if held.any() and start is not None:
             ports = blended(start, ports, done)
         self._passes.arrive_at(np.flatnonzero(held | (ok & engine.led)), ports)
