@@ -22,6 +22,10 @@ class LogError(FastrodError, ValueError):
     """A run log that cannot be read, with the row and the column named."""
 
 
+class HostError(FastrodError, RuntimeError):
+    """A rigid host, a body or a link that is not there, or cannot do what is asked."""
+
+
 class EffectError(FastrodError, ValueError):
     """An effect that is not one, or whose parameters cannot be."""
 

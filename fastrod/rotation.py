@@ -23,3 +23,33 @@ def product(a: Floats, b: Floats) -> Floats:
     w, v = a[..., :1], a[..., 1:]
     x, u = b[..., :1], b[..., 1:]
     return np.concatenate([w * x - (v * u).sum(-1, keepdims=True), w * u + x * v + np.cross(v, u)], axis=-1)
+
+
+def quaternion_from_matrix(rotation: Floats) -> Floats:
+    """(..., 4) unit quaternions w x y z, w not negative, of rotation matrices (..., 3, 3)."""
+    r = rotation
+    sums = np.stack(
+        [
+            1 + r[..., 0, 0] + r[..., 1, 1] + r[..., 2, 2],
+            1 + r[..., 0, 0] - r[..., 1, 1] - r[..., 2, 2],
+            1 - r[..., 0, 0] + r[..., 1, 1] - r[..., 2, 2],
+            1 - r[..., 0, 0] - r[..., 1, 1] + r[..., 2, 2],
+        ],
+        axis=-1,
+    )
+    a, b, c = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
+    d, e, f = r[..., 0, 1] + r[..., 1, 0], r[..., 0, 2] + r[..., 2, 0], r[..., 1, 2] + r[..., 2, 1]
+    w, x, y, z = np.moveaxis(sums, -1, 0)
+    # four times the quaternion's largest component times the quaternion (Shepperd 1978): never a small divisor
+    rows = np.stack(
+        [np.stack([w, a, b, c], -1), np.stack([a, x, d, e], -1), np.stack([b, d, y, f], -1), np.stack([c, e, f, z], -1)], axis=-2
+    )
+    found = np.take_along_axis(rows, sums.argmax(-1)[..., None, None], axis=-2)[..., 0, :]
+    found = found / np.linalg.norm(found, axis=-1, keepdims=True)
+    return np.asarray(np.where(found[..., :1] < 0.0, -found, found))
+
+
+def quaternion_from_vector(vector: Floats) -> Floats:
+    """(..., 4) quaternion w x y z of a rotation vector (..., 3) [rad]."""
+    angle = np.linalg.norm(vector, axis=-1, keepdims=True)
+    return np.concatenate([np.cos(angle / 2.0), 0.5 * np.sinc(angle / (2.0 * np.pi)) * vector], axis=-1)

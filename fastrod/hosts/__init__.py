@@ -1,0 +1,32 @@
+"""Rigid hosts: other physics engines that carry a rod, feel its weight, and whose bodies it touches.
+
+PyBullet (`pip install fastrod[hosts]`) is imported on first use.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from fastrod.hosts.host import Host, Motion
+
+if TYPE_CHECKING:
+    from fastrod.hosts.bodies import RodBodies
+    from fastrod.hosts.bullet import Bullet, connect
+    from fastrod.hosts.camera import Camera
+    from fastrod.hosts.link import BulletLink
+    from fastrod.hosts.mounted import MountedRod
+    from fastrod.hosts.softmanisim import SoftManiSim
+
+__all__ = ["Bullet", "BulletLink", "Camera", "Host", "Motion", "MountedRod", "RodBodies", "SoftManiSim", "connect"]
+_HOME = {
+    "Bullet": "bullet", "BulletLink": "link", "Camera": "camera", "MountedRod": "mounted", "RodBodies": "bodies",
+    "SoftManiSim": "softmanisim", "connect": "bullet",
+}  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    import importlib
+
+    if name in _HOME:
+        return getattr(importlib.import_module(f"fastrod.hosts.{_HOME[name]}"), name)
+    from fastrod.errors import nearest
+
+    raise AttributeError(f"module 'fastrod.hosts' has no {name!r}; {nearest(name, __all__)}")

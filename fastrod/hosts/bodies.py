@@ -1,0 +1,90 @@
+"""`RodBodies`: a rod as capsules in a PyBullet world."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, final
+
+import numpy as np
+
+from fastrod.errors import HostError
+from fastrod.hosts.bullet import Bullet
+from fastrod.hosts.link import to_xyzw
+from fastrod.rotation import product, quaternion_from_matrix
+from fastrod.types import Floats
+
+
+@final
+class RodBodies:
+    """Capsules along the backbone, their axes its chords and their cross-sections turned with it; they have no mass, and move as told.
+
+    A capsule pushes what it meets with the velocity at which it moves. It never touches its own kind, nor the bodies in `ignored`.
+    """
+
+    def __init__(
+        self, bullet: Any, length: float, radius: float | Sequence[float], n_capsules: int = 16, *,
+        color: Sequence[float] = (0.5, 0.0, 0.6, 1.0), head_color: Sequence[float] | None = None, friction: float = 0.5,
+    ) -> None:  # fmt: skip
+        """`length` of the backbone [m], split evenly; `radius` one, or one for each capsule [m]; colours RGBA. Raises `HostError`."""
+        if n_capsules < 1 or not length > 0.0:
+            raise HostError(f"{n_capsules} capsules for {length:g} m; give at least one, and a positive length.")
+        self.bullet = b = Bullet(bullet)
+        radii = np.broadcast_to(np.asarray(radius, float), n_capsules)
+        if not (radii > 0.0).all():
+            raise HostError(f"radius is {radius!r} m; it must be positive.")
+        self.ids: list[int] = []
+        """Body of each capsule, base first."""
+        for i, r in enumerate(radii.tolist()):
+            rgba = head_color if head_color is not None and i == n_capsules - 1 else color
+            shape = b.createCollisionShape(b.GEOM_CAPSULE, radius=r, height=length / n_capsules)
+            visual = b.createVisualShape(b.GEOM_CAPSULE, radius=r, length=length / n_capsules, rgbaColor=list(rgba))
+            self.ids.append(b.createMultiBody(0.0, shape, visual))
+            b.changeDynamics(self.ids[-1], -1, lateralFriction=friction, restitution=0.0)
+        self._position, self._quaternion = np.zeros((n_capsules, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (n_capsules, 1))
+
+    def ignore(self, body: int) -> None:
+        """Pass through a body, all its links."""
+        for link in range(-1, self.bullet.getNumJoints(body)):
+            for own in self.ids:
+                self.bullet.setCollisionFilterPair(own, body, -1, link, 0)
+
+    def place(self, position: Floats, rotation: Floats) -> None:
+        """Stand at rest along the nodes: `position` (n_capsules + 1, 3) world [m], `rotation` (n_capsules + 1, 3, 3)."""
+        self._position, self._quaternion = _chords(position, rotation)
+        for own, p, q in zip(self.ids, self._position.tolist(), to_xyzw(self._quaternion).tolist(), strict=True):
+            self.bullet.resetBasePositionAndOrientation(own, p, q)
+            self.bullet.resetBaseVelocity(own, [0.0] * 3, [0.0] * 3)
+
+    def head_for(self, position: Floats, rotation: Floats, dt: float) -> None:
+        """Move toward these nodes so that the next step of `dt` [s] ends there: what is in the way feels the velocity. `place` them
+        afterwards, or they go on."""
+        to, turned = _chords(position, rotation)
+        linear = (to - self._position) / dt
+        angular = _turn(self._quaternion, turned) / dt
+        for own, v, w in zip(self.ids, linear.tolist(), angular.tolist(), strict=True):
+            self.bullet.resetBaseVelocity(own, v, w)
+
+    def remove(self) -> None:
+        """Take the capsules out of the world."""
+        while self.ids:
+            self.bullet.removeBody(self.ids.pop())
+
+
+def _chords(position: Floats, rotation: Floats) -> tuple[Floats, Floats]:
+    """Middle and quaternion w x y z of each capsule: z along the chord, x as near as can be to the material's d1."""
+    chord = np.diff(position, axis=0)
+    z = chord / np.linalg.norm(chord, axis=1, keepdims=True)
+    x = 0.5 * (rotation[:-1, :, 0] + rotation[1:, :, 0])
+    x = x - np.einsum("ij,ij->i", x, z)[:, None] * z
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    frames = np.stack([x, np.cross(z, x), z], axis=-1)
+    return 0.5 * (position[:-1] + position[1:]), quaternion_from_matrix(frames)
+
+
+def _turn(before: Floats, after: Floats) -> Floats:
+    """(n, 3) rotation vector, world, from one set of quaternions to the next."""
+    turn = product(after, before * [1.0, -1.0, -1.0, -1.0])
+    turn = np.where(turn[:, :1] < 0.0, -turn, turn)
+    size = np.linalg.norm(turn[:, 1:], axis=1, keepdims=True)
+    angle = 2.0 * np.arctan2(size, turn[:, :1])
+    return np.asarray(np.where(size > 1e-12, angle / np.maximum(size, 1e-12), 2.0) * turn[:, 1:])

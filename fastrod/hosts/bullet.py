@@ -1,0 +1,90 @@
+"""PyBullet worlds: one client each, several in one process."""
+
+from __future__ import annotations
+
+import functools
+import os
+import sys
+from types import ModuleType
+from typing import Any
+
+from fastrod.errors import HostError
+
+
+def pybullet() -> Any:
+    """The module, imported on first use; `HostError` says how to get it."""
+    try:
+        import pybullet as module
+    except ImportError as error:
+        raise HostError("PyBullet is not installed; pip install 'fastrod[hosts]' brings it.") from error
+    return module
+
+
+class Bullet:
+    """One PyBullet world: every function of the module, called with this world's physicsClientId.
+
+    Takes what a user has: a client's number, the module itself, a `BulletClient`, another `Bullet`. `HostError` where no world
+    answers.
+    """
+
+    def __init__(self, bullet: Any) -> None:
+        if isinstance(bullet, Bullet):
+            number = bullet.number
+        elif isinstance(bullet, ModuleType) and bullet.__name__ == "pybullet":
+            number = 0
+        else:
+            number = getattr(bullet, "_client", bullet)
+        if isinstance(number, bool) or not isinstance(number, int):
+            raise HostError(f"bullet is {bullet!r}; give a physicsClientId, the pybullet module or a BulletClient that is connected.")
+        self.number = number
+        """physicsClientId."""
+        if not self.isConnected():
+            raise HostError(f"PyBullet has no world {number}; connect first, for example with fastrod.hosts.connect().")
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(pybullet(), name)
+        if callable(value):
+            value = functools.partial(value, physicsClientId=self.number)
+        self.__dict__[name] = value  # asked once
+        return value
+
+    @property
+    def dt(self) -> float:
+        """Time step of this world [s]."""
+        return float(self.getPhysicsEngineParameters()["fixedTimeStep"])
+
+    def check(self, body: int, link: int = -1) -> None:
+        """`HostError` where this world has no such body, or the body no such link."""
+        known = {self.getBodyUniqueId(i) for i in range(self.getNumBodies())}
+        if body not in known:
+            raise HostError(f"this PyBullet world has no body {body!r}; it has {sorted(known) or 'none'}.")
+        if not -1 <= link < (n := self.getNumJoints(body)):
+            raise HostError(f"body {body} has no link {link!r}; -1 is its base, links are numbered from 0 to {n - 1}.")
+
+    def link_named(self, body: int, name: str) -> int:
+        """Number of the link of this name; `HostError` with the nearest one."""
+        from fastrod.errors import nearest
+
+        self.check(body)
+        names = {self.getJointInfo(body, j)[12].decode(): j for j in range(self.getNumJoints(body))}
+        names[self.getBodyInfo(body)[0].decode()] = -1
+        if name not in names:
+            raise HostError(f"body {body} has no link {name!r}; {nearest(name, names)}")
+        return names[name]
+
+
+def connect(*, gui: bool = False, dt: float = 0.005, gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)) -> Bullet:
+    """A new, empty world with time step `dt` [s] and `gravity` [m/s^2]; headless unless `gui`.
+
+    `HostError` for a GUI without a display: PyBullet itself would end the process.
+    """
+    module = pybullet()
+    if gui and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+        raise HostError("PyBullet's GUI needs a display, and DISPLAY is not set; leave gui=False (headless), or start an X server.")
+    number = module.connect(module.GUI if gui else module.DIRECT)
+    if number < 0:
+        raise HostError("PyBullet opened no world; a GUI can be open only once in a process.")
+    world = Bullet(number)
+    world.setGravity(*gravity)
+    world.setTimeStep(dt)
+    return world

@@ -1,0 +1,87 @@
+"""`BulletLink`: any link of any PyBullet body as the host of a rod."""
+
+from __future__ import annotations
+
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fastrod.errors import HostError
+from fastrod.hosts.bullet import Bullet
+from fastrod.hosts.host import Motion
+from fastrod.rotation import matrix_from_quaternion, product
+from fastrod.types import Floats
+
+
+def from_xyzw(quaternion: ArrayLike) -> Floats:
+    """w x y z of PyBullet's x y z w."""
+    return np.roll(np.asarray(quaternion, float), 1, axis=-1)
+
+
+def to_xyzw(quaternion: ArrayLike) -> Floats:
+    """PyBullet's x y z w of w x y z."""
+    return np.roll(np.asarray(quaternion, float), -1, axis=-1)
+
+
+@final
+class BulletLink:
+    """A rod's base, fixed to a link (-1: the body's base).
+
+    The mount is given in the link's URDF frame, the one that a URDF's joints and meshes are drawn in, not in the frame of its centre
+    of mass. `fastrod.hosts.Host` says what the methods do.
+    """
+
+    def __init__(
+        self, bullet: Any, body: int, link: int | str = -1, *,
+        position: ArrayLike = (0.0, 0.0, 0.0), quaternion: ArrayLike = (1.0, 0.0, 0.0, 0.0),
+    ) -> None:  # fmt: skip
+        """`link`: number or name; `position` (3,) [m] and `quaternion` (4,) w x y z, link_from_base. Raises `HostError`."""
+        self.bullet = Bullet(bullet)
+        self.body = body
+        self.link = self.bullet.link_named(body, link) if isinstance(link, str) else int(link)
+        self.bullet.check(body, self.link)
+        self._position, self._quaternion = _pose(position, quaternion)
+
+    def motion(self) -> Motion:
+        """Of the rod's base."""
+        pose, velocity = link_motion(self.bullet, self.body, self.link)
+        arm = matrix_from_quaternion(pose[None, 3:])[0] @ self._position
+        velocity[:3] += np.cross(velocity[3:], arm)
+        return Motion(np.concatenate([pose[:3] + arm, product(pose[3:], self._quaternion)]), velocity)
+
+    def exert(self, wrench: Floats) -> None:
+        """Force and moment about the base point, world, during the next stepSimulation."""
+        point = self.motion().pose[:3]
+        exert(self.bullet, self.body, self.link, wrench, point)
+
+
+def link_motion(bullet: Bullet, body: int, link: int) -> Motion:
+    """Of a link's URDF frame."""
+    if link < 0:
+        com, turn = bullet.getBasePositionAndOrientation(body)
+        linear, angular = bullet.getBaseVelocity(body)
+        inertial = bullet.getDynamicsInfo(body, -1)
+        back = bullet.invertTransform(inertial[3], inertial[4])  # com_from_frame, for bodies whose mass is off their origin
+        position, quaternion = bullet.multiplyTransforms(com, turn, *back)
+    else:
+        state = bullet.getLinkState(body, link, computeLinkVelocity=1, computeForwardKinematics=1)
+        com, position, quaternion, linear, angular = state[0], state[4], state[5], state[6], state[7]
+    velocity = np.array([*linear, *angular])
+    velocity[:3] += np.cross(velocity[3:], np.subtract(position, com))  # PyBullet's velocity is that of the centre of mass
+    return Motion(np.array([*position, *from_xyzw(quaternion)]), velocity)
+
+
+def exert(bullet: Bullet, body: int, link: int, wrench: Floats, point: Floats) -> None:
+    """A wrench (6,) about a world point on a link, world frame, during the next stepSimulation."""
+    bullet.applyExternalForce(body, link, wrench[:3].tolist(), point.tolist(), bullet.WORLD_FRAME)
+    bullet.applyExternalTorque(body, link, wrench[3:].tolist(), bullet.WORLD_FRAME)
+
+
+def _pose(position: ArrayLike, quaternion: ArrayLike) -> tuple[Floats, Floats]:
+    p, q = np.asarray(position, float), np.asarray(quaternion, float)
+    if p.shape != (3,) or q.shape != (4,) or not np.isfinite([*p, *q]).all():
+        raise HostError(f"the mount is {position!r}, {quaternion!r}; give a position (3,) [m] and a quaternion (4,) w x y z.")
+    if abs((norm := float(np.linalg.norm(q))) - 1.0) > 1e-6:
+        raise HostError(f"the mount's quaternion {list(map(float, q))!r} has norm {norm:.6g}; it must be 1, as w x y z.")
+    return p, q
