@@ -60,7 +60,7 @@ class RodBodies:
         afterwards, or they go on."""
         to, turned = _chords(position, rotation)
         linear = (to - self._position) / dt
-        angular = _turn(self._quaternion, turned) / dt
+        angular = turn_between(self._quaternion, turned) / dt
         for own, v, w in zip(self.ids, linear.tolist(), angular.tolist(), strict=True):
             self.bullet.resetBaseVelocity(own, v, w)
 
@@ -81,7 +81,7 @@ def _chords(position: Floats, rotation: Floats) -> tuple[Floats, Floats]:
     return 0.5 * (position[:-1] + position[1:]), quaternion_from_matrix(frames)
 
 
-def _turn(before: Floats, after: Floats) -> Floats:
+def turn_between(before: Floats, after: Floats) -> Floats:
     """(n, 3) rotation vector, world, from one set of quaternions to the next."""
     turn = product(after, before * [1.0, -1.0, -1.0, -1.0])
     turn = np.where(turn[:, :1] < 0.0, -turn, turn)

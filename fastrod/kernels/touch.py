@@ -15,7 +15,7 @@ from fastrod.kernels.forces import Scenery, apply_law, forces_size
 from fastrod.kernels.gather import pick
 from fastrod.kernels.jit import inline, kernel
 from fastrod.kernels.search import CANDIDATE, Sweep, crosses, search_obstacles
-from fastrod.kernels.slots import T_FORCE, T_S, add_walls, choose, merge, pressed_only, violation
+from fastrod.kernels.slots import T_FORCE, T_OBSTACLE, T_S, add_walls, choose, merge, pressed_only, violation
 from fastrod.kernels.strands import search_rods
 from fastrod.types import Clearance, Floats, Ints, Memory, Probes, Touching
 
@@ -60,6 +60,18 @@ def _stride(r: int, i: int, count: int, scenery: Scenery, probes: Probes, propos
         move = max(move, math.sqrt(square))
     part = min(1.0, min(_LONGEST_TURN / max(turn, max(pull, 1e-300)), _LONGEST_MOVE * rods.reach[i] / max(move, 1e-300)))
     return max(move, turn * rods.reach[i]), part
+
+
+@kernel
+def _press(r: int, i: int, scenery: Scenery, touching: Touching, probes: Probes, proposed: Floats) -> float:
+    """How much deeper the proposed forces go into soft obstacles [m]; a rod pressed along its axis moves in no other way."""
+    deepest = 0.0
+    for q in range(touching.used[i]):
+        k = int(touching.slot[i, q, T_OBSTACLE])
+        soft = scenery.surfaces.compliance[k] if k < len(scenery.surfaces.kind) else scenery.rods.compliance
+        for a in range(3):
+            deepest = max(deepest, soft * abs(proposed[r, q, a] - probes.force[r, q, a]))
+    return deepest
 
 
 @inline
@@ -126,6 +138,7 @@ def iterate_world(
             for lost in range(first, last):
                 status[lost] = LOST
             return
+        move = max(move, _press(r, i, scenery, touching, probes, proposed))
         farthest, part = max(farthest, max(move, residual)), min(part, most)
     o, size, worst = 0, _MOST_FOUND * CANDIDATE, 0.0
     n_found, o = work[o : o + last - first], o + last - first

@@ -1,0 +1,347 @@
+"""`BulletArm`: a serial arm in a PyBullet world: its kinematics at any joint position, and its motors."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple, final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fastrod.errors import HostError, InputError, nearest
+from fastrod.hosts.bullet import Bullet, pybullet
+from fastrod.hosts.link import to_xyzw
+from fastrod.types import Flags, Floats, Ints
+
+_GAIN = 1.0  # of position and of velocity: one step ends at the target; the tests measure how well
+_STARTS = 8
+
+
+@final
+class BulletArm:
+    """The joints from a body's base to its tip link, one after the other, each turning or sliding.
+
+    The joints of one arm are numbered in the order of `names`; joint positions q are (n_joints,) [rad], or [m] where a joint slides.
+    Frames are URDF frames, not those of the centres of mass. The kinematics are computed outside of PyBullet, from what it tells of
+    the body: they hold at any q and move nothing. Joints on the way to the tip that are not the arm's own are taken where they stand.
+    """
+
+    def __init__(self, bullet: Any, body: int, tip: int | str, joints: Sequence[str] | None = None) -> None:
+        """`tip`: number or name of a link; `joints`: names, those between base and tip that move if left out. Raises `HostError`."""
+        self.bullet = b = Bullet(bullet)
+        self.body = body
+        self.tip = b.link_named(body, tip) if isinstance(tip, str) else int(tip)
+        """Number of the tip link."""
+        b.check(body, self.tip)
+        self._chain = _chain(b, body, self.tip)
+        known = {b.getJointInfo(body, j)[1].decode(): k for k, j in enumerate(self._chain.joint)}
+        self.names: tuple[str, ...] = tuple(known) if joints is None else tuple(joints)
+        """Of the joints."""
+        if not self.names or len(set(self.names)) < len(self.names):
+            raise HostError(f"the arm's joints are {list(self.names)!r}; name at least one between base and tip of body {body}, each once.")
+        for name in self.names:
+            if name not in known:
+                raise HostError(f"body {body} has no moving joint {name!r} between its base and the tip; {nearest(name, known)}")
+        self._own: Ints = np.array([known[name] for name in self.names])
+        self._joint = [self._chain.joint[k] for k in self._own]
+        self._axes = [(k, bool(self._chain.slides[k]), self._chain.axis[k].tolist()) for k in self._own.tolist()]
+        self._other = [k for k in range(len(known)) if k not in self._own]
+        self.n_joints = len(self.names)
+        info = [b.getJointInfo(body, j) for j in self._joint]
+        free = np.array([i[8] > i[9] for i in info])  # so PyBullet marks a joint that turns without end
+        self.lower: Floats = np.where(free, -np.inf, [i[8] for i in info])
+        """(n_joints,) limits [rad or m]; -inf where there is none."""
+        self.upper: Floats = np.where(free, np.inf, [i[9] for i in info])
+        """(n_joints,) limits [rad or m]; inf where there is none."""
+        self.velocity_limit: Floats = np.array([i[11] or np.inf for i in info])
+        """(n_joints,) [rad/s or m/s]; inf where the URDF has none."""
+        self.effort: Floats = np.array([i[10] or np.inf for i in info])
+        """(n_joints,) the motors' largest torque or force [N m or N]; inf where the URDF has none."""
+        self._stands: Any = None  # PyBullet's pose of the base that `_base` is the matrix of: most bases stay
+        self._base = np.eye(4)
+        self._motor = np.transpose([self.effort, self.velocity_limit]).tolist()
+
+    @classmethod
+    def load(
+        cls, bullet: Any, path: str, *, tip: int | str, joints: Sequence[str] | None = None,
+        position: ArrayLike = (0.0, 0.0, 0.0), quaternion: ArrayLike = (1.0, 0.0, 0.0, 0.0),
+    ) -> BulletArm:  # fmt: skip
+        """Load a URDF, with the inertia that it states, and fix its base frame at `position` (3,) [m] and `quaternion` (4,) w x y z,
+        world. Raises `HostError` for a file that PyBullet cannot load, `InputError` for a pose that is none."""
+        b = Bullet(bullet)
+        place, turn = _floats(position), _floats(quaternion)
+        if place.shape != (3,) or turn.shape != (4,):
+            raise InputError(f"the arm's base is at {position!r}, {quaternion!r}; give position (3,) [m] and quaternion (4,) w x y z.")
+        pose = _target(np.concatenate([place, turn]), "base pose", (7,))
+        flags = b.URDF_USE_INERTIA_FROM_FILE
+        try:
+            body = b.loadURDF(str(path), pose[:3].tolist(), to_xyzw(pose[3:]).tolist(), useFixedBase=True, flags=flags)
+        except pybullet().error as error:
+            raise HostError(f"PyBullet cannot load {str(path)!r}; is it the path of a URDF file?") from error
+        return cls(b, body, tip, joints)
+
+    def position(self) -> Floats:
+        """(n_joints,) measured [rad or m]."""
+        return np.array([state[0] for state in self.bullet.getJointStates(self.body, self._joint)])
+
+    def velocity(self) -> Floats:
+        """(n_joints,) measured [rad/s or m/s]."""
+        return np.array([state[1] for state in self.bullet.getJointStates(self.body, self._joint)])
+
+    def place(self, q: ArrayLike, q_dot: ArrayLike = 0.0) -> None:
+        """Be at q with velocity `q_dot`, (n_joints,) or one for all, at once; hold q from then on. Raises `InputError`."""
+        to, rate = self._inside(q, "q"), _floats(q_dot)
+        rate = self._checked(np.full(self.n_joints, rate) if rate.ndim == 0 else rate, "q_dot")
+        for joint, p, v in zip(self._joint, to.tolist(), rate.tolist(), strict=True):
+            self.bullet.resetJointState(self.body, joint, p, v)
+        self.drive(to)
+
+    def drive(self, q: ArrayLike, q_dot: ArrayLike | None = None) -> None:
+        """Let the motors move the joints during the next steps, no stronger than `effort`, no faster than `velocity_limit`.
+
+        Without `q_dot` the next step ends at q, and later ones stay there. With it, q is where the joints should be now and `q_dot` how
+        fast they go: the next step ends at q + dt q_dot; give both anew before each step. Raises `InputError`.
+        """
+        to = self._inside(q, "q").tolist()
+        rate = [0.0] * self.n_joints if q_dot is None else self._checked(q_dot, "q_dot").tolist()
+        command, mode = self.bullet.setJointMotorControl2, self.bullet.POSITION_CONTROL
+        for joint, p, v, (effort, fastest) in zip(self._joint, to, rate, self._motor, strict=True):
+            command(self.body, joint, mode, targetPosition=p, targetVelocity=v, force=effort, positionGain=_GAIN, velocityGain=_GAIN,
+                    maxVelocity=fastest)  # fmt: skip
+
+    def freeze(self) -> None:
+        """Hold all joints where they are."""
+        self.drive(np.clip(self.position(), self.lower, self.upper))
+
+    def frame(self, q: ArrayLike) -> Floats:
+        """(7,) pose of the tip link at q: position [m] and quaternion w x y z, w not negative, world. Raises `InputError`."""
+        return _pose(self._frames(self._checked(q, "q"))[1])
+
+    def jacobian(self, q: ArrayLike) -> Floats:
+        """(6, n_joints) velocity of the tip frame's origin, then angular velocity, world, per joint velocity at q. Raises `InputError`."""
+        return self._jacobian(*self._frames(self._checked(q, "q")))
+
+    def solve(self, target: ArrayLike, q0: ArrayLike) -> Floats:
+        """(n_joints,) within the limits, near q0, where the tip has the `target` pose (7,), or is at the `target` position (3,), world.
+
+        Damped least squares (Levenberg and Marquardt) to 1e-9 m and rad from q0, then from a few starts around it; the same q every
+        time. Raises `InputError` for what is no pose, `HostError` where no q is found.
+        """
+        to = _target(target, "target", (3,), (7,))
+        rows = 6 if len(to) == 7 else 3
+        goal = _matrix(to[:3].tolist(), to_xyzw(to[3:]).tolist() if rows == 6 else (0.0, 0.0, 0.0, 1.0))
+        start = self._inside(q0, "q0")
+        rng = np.random.default_rng(0)
+        best, off = start, np.full(6, np.inf)
+        for k in range(_STARTS):
+            nearby = np.clip(start + 0.15 * k * rng.standard_normal(self.n_joints), self.lower, self.upper)
+            q, e = self._descend(goal, rows, nearby)
+            if np.linalg.norm(e) < np.linalg.norm(off):
+                best, off = q, e
+            if _reached(off):
+                return best
+        turn = f" and {np.linalg.norm(off[3:]):.3g} rad" if rows == 6 else ""
+        raise HostError(
+            f"no joint positions within the limits were found near q0 for the target {np.round(to, 4).tolist()}; the best is "
+            f"{np.linalg.norm(off[:3]):.3g} m{turn} off."
+        )
+
+    def _descend(self, goal: Floats, rows: int, q: Floats) -> tuple[Floats, Floats]:
+        """(q, error) where the error is zero, or does not get smaller any more."""
+        damping = 1e-3
+        origins, tip = self._frames(q)
+        e = _error(goal, tip, rows)
+        for _ in range(200):
+            if _reached(e) or damping > 1e6:
+                break
+            J = self._jacobian(origins, tip)[:rows]
+            step = self._step(J, e, q, damping)
+            step *= min(1.0, 1.0 / max(float(np.abs(step).max()), 1e-300))
+            trial = np.clip(q + step, self.lower, self.upper)
+            frames = self._frames(trial)
+            new = _error(goal, frames[1], rows)
+            if np.linalg.norm(new) < np.linalg.norm(e):
+                q, e, damping, (origins, tip) = trial, new, max(0.1 * damping, 1e-12), frames
+            else:
+                damping *= 10.0
+        return q, e
+
+    def _step(self, J: Floats, e: Floats, q: Floats, damping: float) -> Floats:
+        """Damped step; joints that it would push beyond a limit go there, and the others make up for it."""
+        step = np.zeros(self.n_joints)
+        free: Flags = np.ones(self.n_joints, bool)
+        while free.any():
+            A, rest = J[:, free], e - J[:, ~free] @ step[~free]
+            step[free] = A.T @ np.linalg.solve(A @ A.T + damping * np.eye(len(A)), rest)
+            beyond = free & ((q + step < self.lower) | (q + step > self.upper))
+            if not beyond.any():
+                break
+            step[beyond] = np.clip(q + step, self.lower, self.upper)[beyond] - q[beyond]
+            free &= ~beyond
+        return step
+
+    def _frames(self, q: Floats) -> tuple[Floats, Floats]:
+        """(n, 4, 4) frames after each moving joint of the chain, and (4, 4) of the tip, world."""
+        c = self._chain
+        every = np.empty(len(c.joint))
+        every[self._own] = q
+        for k in self._other:
+            every[k] = self.bullet.getJointState(self.body, c.joint[k])[0]
+        s = np.where(c.slides, every, np.sin(every))[:, None, None]
+        moves = c.constant + s * c.sine + np.cos(every)[:, None, None] * c.cosine
+        frames = np.empty_like(moves)
+        pose = self.bullet.getBasePositionAndOrientation(self.body)
+        if pose != self._stands:
+            self._stands, self._base = pose, _matrix(*pose) @ c.base
+        before = self._base
+        for k in range(len(moves)):
+            before = np.matmul(before, moves[k], out=frames[k])
+        return frames, before @ c.tip
+
+    def _jacobian(self, frames: Floats, tip: Floats) -> Floats:
+        columns = []
+        p, q, r = tip[:3, 3].tolist()
+        every = frames.tolist()
+        for k, slides, (a, b, c) in self._axes:  # plain floats: four times as fast as arrays of this size
+            (xx, xy, xz, u), (yx, yy, yz, v), (zx, zy, zz, w), _ = every[k]
+            x, y, z = xx * a + xy * b + xz * c, yx * a + yy * b + yz * c, zx * a + zy * b + zz * c
+            u, v, w = p - u, q - v, r - w
+            columns.append((x, y, z, 0.0, 0.0, 0.0) if slides else (y * w - z * v, z * u - x * w, x * v - y * u, x, y, z))
+        return np.array(columns).T
+
+    def _checked(self, values: ArrayLike, name: str) -> Floats:
+        v = _floats(values)
+        if v.shape != (self.n_joints,) or not np.isfinite(v).all():
+            raise InputError(f"{name} is {values!r}; give {self.n_joints} finite numbers, one for each of {', '.join(self.names)}.")
+        return v
+
+    def _inside(self, values: ArrayLike, name: str) -> Floats:
+        q = self._checked(values, name)
+        beyond = (q < self.lower - 1e-9) | (q > self.upper + 1e-9)
+        if beyond.any():
+            k = int(beyond.argmax())
+            raise InputError(f"{name} of {self.names[k]} is {q[k]:.6g}; its limits are {self.lower[k]:.6g} and {self.upper[k]:.6g}.")
+        return q
+
+
+class _Chain(NamedTuple):
+    """Joints from base to tip as matrices: the frame after one is that before it times constant + sine sin q + cosine cos q, or
+    constant + sine q for one that slides."""
+
+    joint: list[int]
+    slides: Flags
+    axis: Floats
+    """(n, 3) in the frame after the joint."""
+    constant: Floats
+    """(n, 4, 4), with the fixed joints before it."""
+    sine: Floats
+    cosine: Floats
+    base: Floats
+    """(4, 4) com_from_base, for bodies whose mass is off their base's origin."""
+    tip: Floats
+    """(4, 4) tip in the frame after the last joint."""
+
+
+def _chain(b: Bullet, body: int, tip: int) -> _Chain:
+    links = [tip] if tip >= 0 else []
+    while links and (parent := b.getJointInfo(body, links[0])[16]) >= 0:
+        links.insert(0, parent)
+    inertial = [b.getDynamicsInfo(body, k)[3:5] for k in (-1, *links)]
+    com = [_matrix(*pose) for pose in inertial]  # frame_from_com
+    fixed = np.eye(4)
+    joint: list[int] = []
+    slides: list[bool] = []
+    axes, constant, sine, cosine = (list[Floats]() for _ in range(4))
+    for i, link in enumerate(links):
+        info = b.getJointInfo(body, link)
+        # PyBullet tells where the joint is in the parent's frame of mass, and the turn from there to the child's frame of mass inverted.
+        turn = _matrix((0.0, 0.0, 0.0), info[15]).T
+        turn[:3, :3] = turn[:3, :3] @ com[i + 1][:3, :3].T
+        turn[:3, 3] = info[14]
+        fixed = fixed @ com[i] @ turn
+        if info[2] == b.JOINT_FIXED:
+            continue
+        if info[2] not in (b.JOINT_REVOLUTE, b.JOINT_PRISMATIC):
+            raise HostError(f"joint {info[1].decode()!r} of body {body} neither turns about one axis nor slides; an arm's joints do.")
+        axis = com[i + 1][:3, :3] @ np.array(info[13])
+        still, s, c = np.eye(4), np.zeros((4, 4)), np.zeros((4, 4))
+        if info[2] == b.JOINT_PRISMATIC:
+            s[:3, 3] = axis
+        else:
+            still[:3, :3] = np.outer(axis, axis)
+            s[:3, :3] = np.cross(axis, np.eye(3)).T
+            c[:3, :3] = np.eye(3) - still[:3, :3]
+        joint.append(link)
+        slides.append(info[2] == b.JOINT_PRISMATIC)
+        axes.append(axis)
+        for matrices, part in ((constant, still), (sine, s), (cosine, c)):
+            matrices.append(fixed @ part)
+        fixed = np.eye(4)
+    if not joint:
+        raise HostError(f"body {body} has no joint that moves between its base and link {tip}; an arm needs one.")
+    base = np.asarray(np.linalg.inv(com[0]), float)
+    return _Chain(joint, np.array(slides), np.array(axes), np.array(constant), np.array(sine), np.array(cosine), base, fixed)
+
+
+def _matrix(position: Sequence[float], xyzw: Sequence[float]) -> Floats:
+    """(4, 4) of PyBullet's pose."""
+    (u, v, w), (x, y, z, s) = position, xyzw
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - s * z), 2 * (x * z + s * y), u],
+        [2 * (x * y + s * z), 1 - 2 * (x * x + z * z), 2 * (y * z - s * x), v],
+        [2 * (x * z - s * y), 2 * (y * z + s * x), 1 - 2 * (x * x + y * y), w],
+        [0.0, 0.0, 0.0, 1.0],
+    ])  # fmt: skip
+
+
+def _quaternion(rotation: Floats) -> tuple[float, float, float, float]:
+    """w x y z, w not negative, of (3, 3): `fastrod.rotation.quaternion_from_matrix` for one, in a fraction of its time."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+    sums = (1.0 + a + e + i, 1.0 + a - e - i, 1.0 - a + e - i, 1.0 - a - e + i)
+    k = sums.index(max(sums))
+    w, x, y, z = (
+        (sums[0], h - f, c - g, d - b), (h - f, sums[1], b + d, c + g), (c - g, b + d, sums[2], f + h), (d - b, c + g, f + h, sums[3])
+    )[k]  # fmt: skip
+    size = math.copysign(math.sqrt(w * w + x * x + y * y + z * z), w)
+    return w / size, x / size, y / size, z / size
+
+
+def _pose(matrix: Floats) -> Floats:
+    """(7,) of (4, 4)."""
+    return np.array([*matrix[:3, 3].tolist(), *_quaternion(matrix[:3, :3])])
+
+
+def _floats(values: ArrayLike) -> Floats:
+    """An empty array for what are no numbers: it has no shape that is asked for."""
+    try:
+        return np.asarray(values, float)
+    except (TypeError, ValueError):
+        return np.empty(0)
+
+
+def _target(values: ArrayLike, name: str, *shapes: tuple[int]) -> Floats:
+    pose = _floats(values)
+    if pose.shape not in shapes or not np.isfinite(pose).all():
+        kinds = " or ".join("a position (3,)" if n == 3 else "position and quaternion w x y z (7,)" for (n,) in shapes)
+        raise InputError(f"{name} is {values!r}; give {kinds}, world, in m.")
+    if len(pose) == 7 and abs((norm := float(np.linalg.norm(pose[3:]))) - 1.0) > 1e-6:
+        raise InputError(f"the {name}'s quaternion {pose[3:].tolist()} has norm {norm:.6g}; it must be 1, as w x y z.")
+    if len(pose) == 7:
+        pose = np.concatenate([pose[:3], pose[3:] / np.linalg.norm(pose[3:])])
+    return pose
+
+
+def _error(goal: Floats, tip: Floats, rows: int) -> Floats:
+    """(rows,) way [m] and, of 6, rotation vector [rad] from the tip to the goal, both (4, 4), world."""
+    way = goal[:3, 3] - tip[:3, 3]
+    if rows == 3:
+        return np.asarray(way)
+    w, *turn = _quaternion(goal[:3, :3] @ tip[:3, :3].T)
+    size = math.hypot(*turn)
+    scale = 2.0 * math.atan2(size, w) / size if size > 1e-12 else 2.0
+    return np.array([*way.tolist(), *(scale * t for t in turn)])
+
+
+def _reached(error: Floats) -> bool:
+    return math.hypot(*error[:3].tolist()) < 1e-9 and math.hypot(*error[3:].tolist()) < 1e-9

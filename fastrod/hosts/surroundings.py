@@ -1,0 +1,174 @@
+"""Bodies of a PyBullet world as obstacles of a rod, pushed by it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple, final
+
+import numpy as np
+
+from fastrod.contact import Obstacle, box, capsule, cylinder, mesh, plane, sphere
+from fastrod.errors import HostError
+from fastrod.hosts.bullet import Bullet
+from fastrod.hosts.host import Motion
+from fastrod.hosts.link import exert, from_xyzw
+from fastrod.rotation import matrix_from_quaternion, product
+from fastrod.types import Floats
+
+_WATCH = 0.05  # m
+
+
+class Part(NamedTuple):
+    """One collision shape of a link."""
+
+    obstacle: Obstacle
+    position: Floats
+    """(3,) in the frame of the link's centre of mass [m]."""
+    quaternion: Floats
+    """(4,) w x y z, com_from_obstacle."""
+
+
+@final
+class Touched:
+    """A link (-1: the base) that a rod touches, and what the rod does to it.
+
+    A step is implicit in the body's inertia: during dt a force F moves it by w F dt^2, where w = 1/m + (r x n) I^-1 (r x n) is its mobility
+    at the contact, so to the rod a free body is as stiff as 1 / (w dt^2) at the place where it would be without the force. What is
+    touched gets no more momentum than stops it at the rod, at any time step.
+
+    The rod answers a changing load with tau dF/dt more (Kelvin and Voigt): a rod without mass and damping would swing with what it
+    pushes for ever. That force is implicit too: the stiffness is 1 / (w (dt^2 + tau dt)).
+    """
+
+    def __init__(self, bullet: Any, body: int, link: int = -1, *, dt: float, relaxation: float, friction: float) -> None:
+        """`relaxation` tau [s]; `friction` of rod on the body. Raises `HostError` where the link has no shape to touch."""
+        self.bullet = Bullet(bullet)
+        self.bullet.check(body, link)
+        self.body, self.link, self.dt, self.relaxation = body, link, dt, relaxation
+        mass, _, inertia = self.bullet.getDynamicsInfo(body, link)[:3]
+        shapes = list(_shapes(self.bullet, body, link))
+        if not shapes:
+            raise HostError(f"link {link} of body {body} has no collision shape, so nothing can touch it.")
+        self.mass: float = mass
+        """0: it does not move for the rod."""
+        self._inertia: Floats = np.maximum(inertia, 1e-12)
+        self._mobility = 1.0 / mass if mass > 0.0 else 0.0
+        self.parts = [part._replace(obstacle=dataclasses.replace(part.obstacle, friction=friction)) for part in shapes]
+        self.names = tuple(part.obstacle.name for part in self.parts)
+        self._before: Floats = np.zeros(6)
+
+    def watch(self, capsules: Sequence[int]) -> None:
+        """Before the first touch: find where these bodies will meet the link."""
+        if self.mass == 0.0 or self._before.any():
+            return
+        near = [p for own in capsules for p in self.bullet.getClosestPoints(own, self.body, _WATCH, -1, self.link)]
+        if near:
+            first = min(near, key=lambda p: p[8])
+            self._mobility = self._mobility_at(np.cross(np.subtract(first[6], self._com().pose[:3]), first[7]))
+
+    def mobility(self) -> float:
+        """Velocity per impulse of the rod, along its force, at the place that is touched or will be next [1/kg]."""
+        if (size := float(np.linalg.norm(self._before[:3]))) > 0.0:
+            self._mobility = self._mobility_at(self._before[3:] / size)
+        return self._mobility
+
+    def _mobility_at(self, lever: Floats) -> float:
+        """`lever`: r x n of a contact, world [m]."""
+        if self.mass == 0.0:
+            return 0.0
+        lever = matrix_from_quaternion(self._com().pose[None, 3:])[0].T @ lever
+        return 1.0 / self.mass + float(lever @ (lever / self._inertia))
+
+    def _com(self) -> Motion:
+        return _com_motion(self.bullet, self.body, self.link)
+
+    def stiffness(self) -> float:
+        """Of the body in the rod's next step [N/m]; inf where it does not move."""
+        give = self.mobility() * (self.dt**2 + self.relaxation * self.dt)
+        return 1.0 / give if give > 0.0 else math.inf
+
+    def expected(self) -> tuple[dict[str, Floats], dict[str, Floats]]:
+        """Pose (7,) and velocity (6,) of each part at the end of the next step, were it not for the rod."""
+        motion = self._com()
+        pose = motion.after(self.dt)
+        pose[:3] -= self.mobility() * self.relaxation * self.dt * self._before[:3]
+        turn = matrix_from_quaternion(pose[None, 3:])[0]
+        poses, velocities = {}, {}
+        for part in self.parts:
+            arm = turn @ part.position
+            poses[part.obstacle.name] = np.concatenate([pose[:3] + arm, product(pose[3:], part.quaternion)])
+            linear = motion.velocity[:3] + np.cross(motion.velocity[3:], arm)
+            velocities[part.obstacle.name] = np.concatenate([linear, motion.velocity[3:]])
+        return poses, velocities
+
+    def push(self, points: Floats, forces: Floats, normals: Floats) -> tuple[Floats, Floats]:
+        """Exert the forces (n, 3) of the rod at world points (n, 3), where the surface has these unit normals (n, 3).
+
+        Returns what was exerted beyond these forces, (6,) with its moment about a point, and that point (3,): the rod's host takes
+        its opposite.
+        """
+        com = self._com().pose[:3]
+        if self.mass == 0.0:
+            return np.zeros(6), com
+        pressing = np.einsum("ij,ij->i", forces, normals)[:, None] * normals
+        wrench, pressed = _about(com, points, forces), _about(com, points, pressing)
+        more = self.relaxation / self.dt * (pressed - self._before)
+        along = pressed[:3] if pressed[:3].any() else self._before[:3]
+        if (pressed + more)[:3] @ along <= 0.0:
+            more = -wrench  # contact pushes, it does not hold
+        self._before = pressed
+        if (total := wrench + more).any():
+            exert(self.bullet, self.body, self.link, total, com)
+        return more, com
+
+    def forget(self) -> None:
+        """The body was put somewhere else: no force carries over."""
+        self._before = np.zeros(6)
+
+
+def _about(point: Floats, points: Floats, forces: Floats) -> Floats:
+    return np.concatenate([forces.sum(0), np.cross(points - point, forces).sum(0)])
+
+
+def _com_motion(bullet: Bullet, body: int, link: int) -> Motion:
+    if link < 0:
+        position, quaternion = bullet.getBasePositionAndOrientation(body)
+        linear, angular = bullet.getBaseVelocity(body)
+    else:
+        state = bullet.getLinkState(body, link, computeLinkVelocity=1, computeForwardKinematics=1)
+        position, quaternion, linear, angular = state[0], state[1], state[6], state[7]
+    return Motion(np.array([*position, *from_xyzw(quaternion)]), np.array([*linear, *angular]))
+
+
+def _shapes(bullet: Bullet, body: int, link: int) -> list[Part]:
+    """The collision shapes of a link."""
+    found = []
+    label = bullet.getBodyInfo(body)[1].decode() or "body"
+    for i, (_, _, kind, size, _file, position, quaternion) in enumerate(bullet.getCollisionShapeData(body, link)):
+        name = f"{label} {body}" + (f" link {link}" if link >= 0 else "") + (f" part {i}" if i else "")
+        if kind == bullet.GEOM_BOX:
+            made = box(size, name=name)
+        elif kind == bullet.GEOM_SPHERE:
+            made = sphere(size[0], name=name)
+        elif kind == bullet.GEOM_CYLINDER:
+            made = cylinder(size[1], size[0], name=name)
+        elif kind == bullet.GEOM_CAPSULE:
+            made = capsule(size[1], size[0], name=name)
+        elif kind == bullet.GEOM_PLANE:
+            made = plane(point=(0.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0), name=name)
+        elif kind == bullet.GEOM_MESH:
+            made = _hull(bullet, body, link, name)
+        else:
+            raise HostError(f"body {body} has a collision shape of PyBullet's kind {kind}, which a rod cannot touch; give it a mesh.")
+        found.append(Part(made, np.asarray(position, float), from_xyzw(quaternion)))
+    return found
+
+
+def _hull(bullet: Bullet, body: int, link: int, name: str) -> Obstacle:
+    """PyBullet takes the convex hull of a body's mesh, and so does the rod."""
+    import trimesh
+
+    _, vertices = bullet.getMeshData(body, link, flags=bullet.MESH_DATA_SIMULATION_MESH)
+    return mesh(trimesh.convex.convex_hull(np.asarray(vertices, float)), name=name)
