@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
+from copy import copy
+from typing import Any
 
 import numpy as np
 
+from fastrod.kernels.jit import LANES
 from fastrod.passes import NO_PROBES, Passes
-from fastrod.types import Floats, Ints, Ports, Probes, Response, Shape
+from fastrod.types import Floats, Ints, Memory, Params, Ports, Probes, Response, Shape
+
+_ROWS = 1024  # of one pass: robots times copies of them
+_HALF = 0.5e-4 * np.repeat(np.eye(3), 2, axis=0) * np.array([[1.0], [-1.0]] * 3)
+_TURNS: Floats = np.array([[[1.0, -x, -y, -z], [x, 1.0, -z, y], [y, z, 1.0, -x], [z, -y, x, 1.0]] for x, y, z in _HALF])[:, None]
+"""(6, 1, 4, 4) what turns a quaternion forward and back by 1e-4 rad about each axis of the world."""
+Relocate = Callable[[Floats], Mapping[str, Floats]]
+"""Extensions -> the ports that change with them."""
 
 
 class Linear:
@@ -20,23 +31,99 @@ class Linear:
     def __init__(self, passes: Passes, rows: Ints, ports: Ports, probes: Probes = NO_PROBES) -> None:
         self.passes, self.rows, self.ports, self.probes = passes, rows, ports, probes
 
-    def respond(self, ports: Ports | None = None, columns: bool = True) -> tuple[Response, Shape]:
+    def respond(self, columns: bool = True) -> tuple[Response, Shape]:
         """Residuals, tip and their derivatives by the unknowns and, last, by a tip force; rows that are not asked are nan."""
-        passes, ports = self.passes, ports or self.ports
+        passes, ports = self.passes, self.ports
         n, n_e, n_probes = passes.n_robots, passes.n_residuals(ports), self.probes.node.shape[1]
         extra = 3 * n_probes if n_probes else 0 if len(ports.follower_force) else 3
         n_col = passes.n_x + extra if columns or n_probes else 0
-        response = Response(np.full((n, n_e, n_col), np.nan), np.full((n, 6, n_col), np.nan), np.full((n, n_e), np.nan))
-        shape = passes.new_shape("tip", True)
+        holes = len(self.rows) < n
+        response = Response(np.empty((n, n_e, n_col)), np.empty((n, 6, n_col)), np.empty((n, n_e)))
+        if holes:
+            for a in response:
+                a.fill(np.nan)
+        shape = passes.new_shape("tip", holes)
         passes.run(self.rows, ports, shape, response=response, update=False, noise=1e-20, n_col=n_col, probes=self.probes)
         return response, shape
 
-    def by_lengths(self) -> tuple[Floats, Floats]:
-        """(n, 6, n_rows) change of the tip per residual closed: the columns of tendon lengths first."""
-        response, _ = self.respond()
+    def jacobian(self, relocate: Relocate | None = None, turning: bool = False) -> Floats:
+        """(n, 6, n_tendons + n_segments) change of the tip by tendons (length, or tension where that is the mode), then by extensions;
+        with `turning` three columns more, by the rotation vector of the base, world.
+
+        All but those of lengths come from central differences of the pass at fixed unknowns, as rows of one batch. `relocate` tells
+        what an extension moves besides itself.
+        """
+        layout, params, ports, n = self.passes.layout, self.passes.params, self.ports, self.passes.n_robots
+        n_tendons, n_segments = len(layout.tendon_segment), len(layout.first_tendon)
+        held = layout.row_tendon.tolist()
+        pulled = [] if len(held) == n_tendons else [t for t in range(n_tendons) if t not in held]
+        n_inputs = len(pulled) + n_segments
+        m = n_inputs + (3 if turning else 0)
+        delta = np.full((m, n), 1e-4)
+        delta[: len(pulled)] *= params.tension_scale
+        delta[len(pulled) : n_inputs] *= params.reach
+        # copy 0 as it is, then forward and back by each input
+        moved = {name: np.empty((1 + 2 * m, n, getattr(ports, name).shape[1])) for name in ("tension", "extension", "base_pose")}
+        for name, a in moved.items():
+            a[:] = getattr(ports, name)
+        for j in range(n_inputs):
+            a, i = (moved["tension"], pulled[j]) if j < len(pulled) else (moved["extension"], j - len(pulled))
+            a[1 + 2 * j, :, i] += delta[j]
+            a[2 + 2 * j, :, i] -= delta[j]
+        if turning:
+            turns = moved["base_pose"][1 + 2 * n_inputs :, :, 3:]
+            turns[:] = (_TURNS @ turns[..., None])[..., 0] / math.sqrt(1.0 + 0.25e-8)
+
+        def respond(copies: slice, columns: bool) -> tuple[Response, Shape]:
+            return self._copies({name: a[copies] for name, a in moved.items()}, relocate, columns)
+
+        if len(self.rows) * (1 + 2 * m) <= LANES:  # as fast as without the differences
+            response, shape = respond(slice(None), True)
+            by_residual = self._close(Response(*(a[0] for a in response)))
+            by_input, error = _differences(Response(*(a[1:] for a in response)), shape.tip_position[1:], shape.tip_rotation[1:], delta)
+        else:
+            by_residual = self._close(self.respond()[0])
+            by_input, error = np.empty((m, n, 6)), np.empty((m, n, by_residual.shape[2]))
+            per = m if 2 * m * len(self.rows) <= _ROWS else 1
+            for j in range(0, m, per):
+                response, shape = respond(slice(1 + 2 * j, 1 + 2 * (j + per)), False)
+                some = slice(j, j + per)
+                by_input[some], error[some] = _differences(response, shape.tip_position, shape.tip_rotation, delta[some])
+        jacobian = np.empty((n, 6, n_tendons + m - len(pulled)))
+        jacobian[:, :, layout.row_tendon] = by_residual[:, :, : len(held)]
+        closed = (by_input - np.matmul(by_residual, error[..., None])[..., 0]).transpose(1, 2, 0)
+        jacobian[:, :, pulled], jacobian[:, :, n_tendons:] = closed[:, :, : len(pulled)], closed[:, :, len(pulled) :]
+        return jacobian
+
+    def _close(self, response: Response) -> Floats:
+        """(n, 6, n_e) change of the tip per residual closed: tendon lengths first."""
         n_x = self.passes.n_x
-        by_residual = response.tip[:, :, :n_x] @ inverse(response.residual[:, :, :n_x])
-        return by_residual, response.residual
+        return np.asarray(response.tip[:, :, :n_x] @ inverse(response.residual[:, :, :n_x]))
+
+    def _copies(self, moved: dict[str, Floats], relocate: Relocate | None, columns: bool) -> tuple[Response, Shape]:
+        """`respond` of k copies, each with its own ports `moved` (k, n, ...), as one pass; the answer has the axis k first."""
+        passes, (k, n) = self.passes, moved["extension"].shape[:2]
+
+        def copied(a: Any) -> Any:
+            return np.concatenate([a] * k) if len(a) else a
+
+        if relocate is not None:
+            each = [relocate(one) for one in moved["extension"]]
+            moved |= {name: np.stack([np.broadcast_to(one[name], (n, *one[name].shape[1:])) for one in each]) for name in each[0]}
+        moved = {name: a.reshape(k * n, *a.shape[2:]) for name, a in moved.items()}
+        ports = Ports(
+            *(moved[name] if name in moved else a if len(a) == 1 else copied(a) for name, a in zip(Ports._fields, self.ports, strict=True))
+        )
+        twin = copy(passes)
+        twin.n_robots = k * n
+        params: tuple[Any, ...] = passes.params
+        twin.memory, twin.params = Memory(*map(copied, passes.memory)), Params(*(a if len(a) == 1 else copied(a) for a in params))
+        probes = Probes(*map(copied, self.probes)) if self.probes.node.shape[1] else self.probes
+        rows = (self.rows + n * np.arange(k)[:, None]).ravel()
+        response, shape = Linear(twin, rows, ports, probes).respond(columns)
+        return Response(*(a.reshape(k, n, *a.shape[1:]) for a in response)), Shape(
+            *(a.reshape(k, len(a) // k, *a.shape[1:]) for a in shape)
+        )
 
     def by_force(self) -> Floats:
         """(n, 6, 3) change of the tip per tip force."""
@@ -49,21 +136,37 @@ class Linear:
             load[:, -3:] -= (params.reach**2 / params.moment_scale)[:, None, None] * np.eye(3)
         return np.asarray(response.tip[:, :, -3:] - response.tip[:, :, :n_x] @ (inverse(free) @ load))
 
-    def difference(self, moved: Callable[[float], Ports], delta: Floats) -> tuple[Floats, Floats]:
-        """Central difference of tip pose (n, 6) and residuals (n, n_e) at fixed unknowns, by the input that `moved(+-1)` moves."""
-        ends = []
-        for sign in (1.0, -1.0):
-            response, shape = self.respond(moved(sign), columns=False)
-            ends.append((shape.tip_position, shape.tip_rotation, response.error))
-        (p1, r1, e1), (p0, r0, e0) = ends
-        turn = r1 @ np.swapaxes(r0, 1, 2)
-        skew = 0.5 * np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=1)
-        return np.concatenate([p1 - p0, skew], axis=1) / (2.0 * delta), (e1 - e0) / (2.0 * delta)
+
+def _differences(response: Response, p: Floats, r: Floats, delta: Floats) -> tuple[Floats, Floats]:
+    """(m, n, 6) and (m, n, n_e): central differences of tip pose (2 m, n, ...) and residuals, forward and back by turns."""
+    e, turn = response.error, r[::2] @ np.swapaxes(r[1::2], 2, 3)
+    change = np.empty((*delta.shape, 6))
+    change[..., :3] = p[::2] - p[1::2]
+    for a, (i, j) in enumerate(((2, 1), (0, 2), (1, 0))):
+        change[..., 3 + a] = 0.5 * (turn[..., i, j] - turn[..., j, i])
+    width = 2.0 * delta[..., None]
+    return change / width, (e[::2] - e[1::2]) / width
 
 
 def inverse(a: Floats) -> Floats:
     """Least-squares inverse of the matrices without nan, and nan for the others."""
     found = np.full((len(a), a.shape[2], a.shape[1]), np.nan)
     good = np.isfinite(a).all((1, 2))
+    if a.shape[1] == a.shape[2]:
+        try:
+            found[good] = np.linalg.inv(a[good])
+            return found
+        except np.linalg.LinAlgError:
+            pass
     found[good] = np.linalg.pinv(a[good])
     return found
+
+
+def stretch(passes: Passes, rows: Ints, change: Floats) -> None:
+    """These robots' extensions are about to change by this much (1 or n_robots, n_segments) [m]: the wires that grow along with
+    their segments are, for the boundary, as they were. The gain knows of wires alone; it would pull at every wire."""
+    if not change.any():
+        return
+    layout = passes.layout
+    grown = np.nan_to_num(np.cumsum(change, axis=1), nan=0.0, posinf=0.0, neginf=0.0)[:, layout.tendon_segment[layout.row_tendon]]
+    passes.memory.length_before[rows] += grown if len(grown) == 1 else grown[rows]

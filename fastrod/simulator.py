@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any, Literal
 
 import numba
@@ -22,7 +21,7 @@ from fastrod.guess import cold_start
 from fastrod.inputs import Inputs, PointForces, Reader
 from fastrod.kernels.dense import between_nodes
 from fastrod.passes import Passes
-from fastrod.response import Linear
+from fastrod.response import Linear, stretch
 from fastrod.robot import Robot
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.settle import settle
@@ -137,7 +136,8 @@ class Simulator:
         the tip [N]; `base_pose` (7,) position [m] and quaternion w x y z.
 
         The state belongs to the boundary that the last pass predicts for these tendon lengths and tip forces; what other
-        inputs change is corrected with the next pass, and shows as `residual`. When the tip force of running robots first
+        inputs change is corrected with the next pass, and shows as `residual`; wires that only grow along with an extension
+        count as unchanged. When the tip force of running robots first
         moves, one pass more learns the gain for it (`passes` is 2). Raises `InputError` on a wrong shape, or where no
         robot's input is usable; a single bad row only clears that robot's `ok`.
 
@@ -159,6 +159,8 @@ class Simulator:
             self._passes.run(
                 rows[self._warm[rows]], before, self._passes.new_shape("tip", True), carry=self._passes.carry, process=process, noise=noise
             )
+        if before is not None:
+            stretch(self._passes, rows, ports.extension - before.extension)
         cold_start(rows[~self._warm[rows]], self._layout, self._passes.params, ports, self._passes.memory)
         shape = self._passes.new_shape(self.outputs, len(rows) < self.n_robots)
         self._passes.run(rows, ports, shape, feed=True, carry=self._passes.carry, process=process, noise=noise)
@@ -309,7 +311,7 @@ class Simulator:
         between_nodes(robot, query, np.array(s, order="C"), self._passes.params, ports, self._layout, _as_shape(state), found)
         return found
 
-    def jacobian(self) -> Floats:
+    def jacobian(self, *, turning: bool = False) -> Floats:
         """(n_robots, 6, n_tendons + n_segments) d(tip position [m], rotation vector [rad]) / d(input [m or N]), world frame.
 
         Inputs: the tendons (length, or tension where that is the mode), then the segments' extensions, the other inputs
@@ -318,23 +320,18 @@ class Simulator:
         A slack wire's column is zero, a robot's that is not ok nan. Columns of
         lengths come from the sensitivities of the pass (model.md); those of tensions and extensions from central
         differences of the pass, closed by the same sensitivities. Contact forces are held as they are.
+
+        With `turning`, three columns more: by the rotation vector of the base about its origin, world [rad]. World loads keep their
+        direction, so the rod bends under them as it turns.
         """
         _, ports = self._last("jacobian")
-        layout, linear = self._layout, self._linear(ports)
-        n_tendons, n_segments = len(layout.tendon_segment), len(layout.first_tendon)
-        by_residual, _ = linear.by_lengths()
-        jacobian = np.empty((self.n_robots, 6, n_tendons + n_segments))
-        jacobian[:, :, layout.row_tendon] = by_residual[:, :, : len(layout.row_tendon)]
-        pulled = np.setdiff1d(np.arange(n_tendons), layout.row_tendon)
-        params = self._passes.params
-        for name, members, start in (("tension", pulled, 0), ("extension", np.arange(n_segments), n_tendons)):
-            delta = 1e-4 * (params.tension_scale if name == "tension" else params.reach)[:, None]
-            for a in members:
-                tip, error = linear.difference(partial(self._moved, linear.ports, name, int(a), delta), delta)
-                jacobian[:, :, start + a] = tip - np.einsum("rie,re->ri", by_residual, error)
+        follows = self._engine is None and bool(self._given.point_force)
+        jacobian = self._linear(ports).jacobian(self._relocated if follows else None, turning)
         if self._bare is None:
             return jacobian
-        return np.asarray(jacobian @ self._chain.slopes(self._bare, self._plain, self._state, self.dt, layout.n_steps))
+        slopes = self._chain.slopes(self._bare, self._plain, self._state, self.dt, self._layout.n_steps)
+        n = slopes.shape[1]
+        return np.concatenate([jacobian[:, :, :n] @ slopes, jacobian[:, :, n:]], axis=2)
 
     def compliance(self) -> Floats:
         """(n_robots, 6, 3) d(tip position [m], rotation vector [rad]) / d(tip force [N]), world; actuation and contact forces held."""
@@ -347,17 +344,26 @@ class Simulator:
             return Linear(self._passes, rows, ports)
         return Linear(self._passes, rows, *self._engine.held(rows, ports, self._passes.n_x))
 
-    def _moved(self, ports: Ports, name: str, a: int, delta: Floats, sign: float) -> Ports:
-        """The ports with one input moved. Under an extension forces stay at their arclength, so nodes and samples move over the
-        material."""
-        base = getattr(ports, name)
-        moved = np.broadcast_to(base, (max(len(base), len(delta)), base.shape[1])).copy()
-        moved[:, a : a + 1] += sign * delta
-        changed = {name: moved}
-        if name == "extension" and self._engine is None:
-            grid, node_force = self._reader.point_forces(self._given.point_force, moved)
-            changed |= {"grid": grid, "node_force": node_force, "line_force": self._reader.line_force(self._given.line_force, grid)}
-        return ports._replace(**changed)
+    def _relocated(self, extension: Floats) -> dict[str, Floats]:
+        """The loads at other extensions: point forces stay at their arclength, so nodes and samples move over the material."""
+        grid, node_force = self._reader.point_forces(self._given.point_force, extension)
+        return {"grid": grid, "node_force": node_force, "line_force": self._reader.line_force(self._given.line_force, grid)}
+
+    def set_free(self, obstacle: str, translation: float, rotation: ArrayLike, center: ArrayLike, body: int | None = None) -> None:
+        """From the next step on this obstacle gives way to the rods: what it is told by `obstacle_pose` is where it would be without
+        them. `translation` [m/N] under a force at its `center` (3,) of mass, `rotation` (3, 3) [rad/(N m)] under a moment, both world
+        and within one step: dt^2 / m and dt^2 I^-1 for a body in free flight. Obstacles of one rigid body have the same number
+        `body`. Raises `InputError` without a contact scene or where these are not numbers, `UnknownNameError`.
+        """
+        engine = self._contact("set_free")
+        k = engine.scene.index(obstacle)
+        numbers = np.concatenate([np.ravel(translation), np.ravel(rotation), np.ravel(center)]).astype(float)
+        if numbers.shape != (13,) or not np.isfinite(numbers).all() or not numbers[0] >= 0.0:
+            raise InputError(
+                f"the mobility of {obstacle!r} is {numbers}; give [m/N], (3, 3) [rad/(N m)] and (3,) [m], finite, none negative."
+            )
+        engine.surfaces.give[k] = numbers
+        engine.surfaces.body[k] = k if body is None else len(engine.surfaces.body) + body
 
     def clearance(self, obstacle: str | None = None) -> Floats:
         """(n_robots,) smallest gap between the robot's surface and the obstacle of this name, or anything that it may touch [m]
@@ -456,6 +462,9 @@ class Simulator:
             skip = np.isin(self._all, list(problems)) if problems else np.zeros(self.n_robots, bool)
             self._bare = ports
             ports, self._passes.params = self._chain.act(ports, self._plain, self._state, self.dt, self._layout.n_steps, skip)
+        if problems and self._ports is not None:  # who is left out stays as extended as its boundary is
+            out = np.isin(self._all, list(problems))[:, None]
+            ports = ports._replace(extension=np.where(out, self._ports.extension, ports.extension))
         track_force = len(self._passes.memory.force_before) > 0 or self._force_moves(ports.tip_force)
         self._passes.remember(len(ports.follower_force) > 0, track_force, None if self._ports is None else self._ports.tip_force)
         return ports, rows

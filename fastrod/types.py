@@ -149,6 +149,11 @@ class Surfaces(NamedTuple):
     """(n_obstacles,) Coulomb coefficient against the rod."""
     compliance: Floats
     """(n_obstacles,) depth per normal force; 0 is rigid [m/N]."""
+    body: Ints
+    """(n_obstacles,) number of the rigid body that it is part of."""
+    give: Floats
+    """(n_obstacles, 13) how far that body moves within a step under a unit force at its centre of mass [m/N], and turns under a unit
+    moment [rad/(N m)], (3, 3) row by row, world; the centre of mass, world [m]. Zero: it goes where it is told."""
     root: Ints
     """(n_obstacles,) link to the top of a mesh's hierarchy."""
     box: Floats

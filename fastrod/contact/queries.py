@@ -43,7 +43,7 @@ def _gap(engine: Engine, shape: Shape, poses: Floats, only: int | None = None) -
     surfaces, which = engine.surfaces, slice(None) if only is None else [only]
     surfaces = surfaces._replace(
         kind=surfaces.kind[which], size=surfaces.size[which], sphere=surfaces.sphere[which], friction=surfaces.friction[which],
-        compliance=surfaces.compliance[which], root=surfaces.root[which],
+        compliance=surfaces.compliance[which], body=surfaces.body[which], give=surfaces.give[which], root=surfaces.root[which],
     )  # fmt: skip
     frames = np.ascontiguousarray(frames_of(poses)[:, which])
     nobody = np.zeros(n, bool)

@@ -40,6 +40,8 @@ def pack(obstacles: Sequence[Obstacle]) -> Surfaces:
         sphere=np.array([_ball(o) for o in obstacles], float).reshape(-1, 4),
         friction=np.array([o.friction for o in obstacles], float),
         compliance=np.array([1.0 / o.stiffness for o in obstacles], float),
+        body=np.arange(len(obstacles)),
+        give=np.zeros((len(obstacles), 13)),
         root=np.array(roots, np.int64),
         box=np.concatenate(boxes),
         link=np.concatenate(links),

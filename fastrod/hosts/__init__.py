@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from fastrod.hosts.host import Host, Motion
 
 if TYPE_CHECKING:
+    from fastrod.hosts.arm import BulletArm
     from fastrod.hosts.bodies import RodBodies
     from fastrod.hosts.bullet import Bullet, connect
     from fastrod.hosts.camera import Camera
@@ -15,9 +16,9 @@ if TYPE_CHECKING:
     from fastrod.hosts.mounted import MountedRod
     from fastrod.hosts.softmanisim import SoftManiSim
 
-__all__ = ["Bullet", "BulletLink", "Camera", "Host", "Motion", "MountedRod", "RodBodies", "SoftManiSim", "connect"]
+__all__ = ["Bullet", "BulletArm", "BulletLink", "Camera", "Host", "Motion", "MountedRod", "RodBodies", "SoftManiSim", "connect"]
 _HOME = {
-    "Bullet": "bullet", "BulletLink": "link", "Camera": "camera", "MountedRod": "mounted", "RodBodies": "bodies",
+    "Bullet": "bullet", "BulletArm": "arm", "BulletLink": "link", "Camera": "camera", "MountedRod": "mounted", "RodBodies": "bodies",
     "SoftManiSim": "softmanisim", "connect": "bullet",
 }  # fmt: skip
 

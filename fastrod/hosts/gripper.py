@@ -20,8 +20,9 @@ _FINGER_MASS = 0.02  # kg
 _SPEED = 0.05  # m/s at which a finger opens and closes
 _GRIP = 10.0  # N, the most that a finger pushes with
 _SUCTION = 200.0  # N
+_FRICTION = 0.5, 2.0  # head, fingers; PyBullet multiplies it with the other body's, 0.5 by default: rubber on anything is 1
 _GAIN = 0.3  # of a finger's error that its motor removes in a step
-_SQUEEZE = 5e-4  # m that a finger is told to go beyond what stops it
+_SQUEEZE = 0.2  # m/s, times the step: how far a finger is told to go beyond what stops it, so that its motor pushes in full
 
 
 @final
@@ -32,7 +33,7 @@ class Gripper:
     Both are told the same opening, so that what is held stays in the middle.
     """
 
-    def __init__(self, bullet: Any, radius: float, max_width: float, color: Sequence[float], friction: float = 1.0) -> None:
+    def __init__(self, bullet: Any, radius: float, max_width: float, color: Sequence[float]) -> None:
         """`radius` of the head [m]; `max_width` between the inner faces of the open fingers [m], 0 for a head without fingers.
         Stands at the origin, fingers open. Raises `HostError`."""
         self.bullet = b = Bullet(bullet)
@@ -58,10 +59,14 @@ class Gripper:
         self.reach = long
         """From the tip to the fingers' ends [m]."""
         for link in self.links:
+            friction = _FRICTION[link >= 0]
             b.changeDynamics(
                 self.body, link, lateralFriction=friction, restitution=0.0, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0
             )
+        for finger in self.fingers:
+            b.changeDynamics(self.body, finger, frictionAnchor=1)  # without it what is held creeps down, 5 mm/s with steps of 10 ms
         self._max, self._wanted, self._told = max_width, max_width, max_width
+        self._held = False
         for finger in self.fingers:
             b.resetJointState(self.body, finger, 0.5 * (max_width + _FINGER[0]))
         self._tell()
@@ -75,7 +80,7 @@ class Gripper:
 
     def open_to(self, fraction: float) -> None:
         """Tell the fingers to open or close to this fraction of the largest width; they get there at 5 cm/s, as time passes."""
-        self._wanted = fraction * self._max
+        self._wanted, self._held = fraction * self._max, False
 
     def place(self, position: Floats, quaternion: Floats) -> None:
         """Stand at rest at `position` (3,) world [m], turned by `quaternion` (4,) w x y z."""
@@ -91,10 +96,16 @@ class Gripper:
 
     def drive(self, dt: float) -> None:
         """Before each step: tell the fingers how far to go in it."""
-        step = _SPEED * dt
-        if self._told == self._wanted or (self._wanted < self._told and self._stopped(step)):
+        if self._held and not self._touching():
+            self._held = False  # what was held has gone
+        if self._held or self._told == self._wanted:
             return
-        self._told += float(np.clip(self._wanted - self._told, -2.0 * step, 2.0 * step))
+        step, beyond = _SPEED * dt, max(_SQUEEZE * dt, 5e-4)
+        if self._wanted < self._told and self.width - self._told > 2.0 * (beyond + step / _GAIN) and self._touching():
+            self._held = True
+            self._told = self.width - 2.0 * beyond
+        else:
+            self._told += float(np.clip(self._wanted - self._told, -2.0 * step, 2.0 * step))
         self._tell()
 
     def attach(self, others: Sequence[int]) -> int | None:
@@ -135,10 +146,8 @@ class Gripper:
         self.release()
         self.bullet.removeBody(self.body)
 
-    def _stopped(self, step: float) -> bool:
-        """Whether something between the fingers holds them back."""
-        if self.width - self._told < 2.0 * (_SQUEEZE + step / _GAIN):
-            return False
+    def _touching(self) -> bool:
+        """Whether both fingers had contact in the last step."""
         return all(self.bullet.getContactPoints(bodyA=self.body, linkIndexA=finger) for finger in self.fingers)
 
     def _tell(self) -> None:

@@ -116,10 +116,9 @@ class MountedRod:
         poses: dict[str, Floats] = {}
         velocities: dict[str, Floats] = {}
         for touched in self.touched:
-            touched.watch(self.bodies.ids)
             p, v = touched.expected()
             for name in touched.names:
-                self.simulator.stiffen(name, touched.stiffness())
+                self.simulator.set_free(name, *touched.give(), body=touched.body)
             poses |= p
             velocities |= v
         return poses, velocities
@@ -131,10 +130,10 @@ class MountedRod:
         return state.position[0, :: self._stride], state.rotation[0, :: self._stride]
 
 
-def _pushes(state: State, touched: Touched) -> tuple[Floats, Floats, Floats]:
-    """Points, forces of the rod and unit normals (n, 3), out of the rod, of the contacts with a link."""
+def _pushes(state: State, touched: Touched) -> tuple[Floats, Floats]:
+    """Points and forces of the rod (n, 3) in the contacts with a link."""
     contacts = state.contacts
     if contacts is None:
-        return np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3))
+        return np.empty((0, 3)), np.empty((0, 3))
     mine = np.isin(contacts.obstacle[0], [contacts.names.index(name) for name in touched.names])
-    return contacts.point[0][mine], -contacts.force[0][mine], -contacts.normal[0][mine]
+    return contacts.point[0][mine], -contacts.force[0][mine]

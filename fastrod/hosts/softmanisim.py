@@ -81,12 +81,8 @@ class SoftManiSim:
         """Where that camera stands and looks, world; set another to change it."""
         self.in_hand_camera = Camera(near=0.005, far=3.0)
         """Of `in_hand_camera_capture_image`."""
-        self._colors, self._radius, self._max_width, self._max_speed = (
-            (body_color, head_color),
-            body_sphere_radius,
-            max_grasp_width,
-            max_speed,
-        )
+        self._colors = numbers("body_color", body_color, 4).tolist(), numbers("head_color", head_color, 4).tolist()
+        self._radius, self._max_width, self._max_speed = body_sphere_radius, max_grasp_width, max_speed
         self._bodies: RodBodies | None = None
         self._marker: int | None = None
         try:
@@ -102,8 +98,8 @@ class SoftManiSim:
         """
         self._remove()
         body_color, head_color = self._colors
-        self._bodies = RodBodies(self.bullet, self._robot.length, self._radius, self._shapes.n_points - 1, color=body_color)
         self._gripper = Gripper(self.bullet, self._radius + _HEAD, self._max_width, head_color)
+        self._bodies = RodBodies(self.bullet, self._robot.length, self._radius, self._shapes.n_points - 1, color=body_color)
         self._bodies.ignore(self._gripper.body)
         self._collide(False)
         self._place(self._shapes.at(self._shapes.command(None, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from typing import Any, NamedTuple, final
 
 import numpy as np
@@ -16,8 +15,6 @@ from fastrod.hosts.host import Motion
 from fastrod.hosts.link import exert, from_xyzw
 from fastrod.rotation import matrix_from_quaternion, product
 from fastrod.types import Floats
-
-_WATCH = 0.05  # m
 
 
 class Part(NamedTuple):
@@ -34,12 +31,12 @@ class Part(NamedTuple):
 class Touched:
     """A link (-1: the base) that a rod touches, and what the rod does to it.
 
-    A step is implicit in the body's inertia: during dt a force F moves it by w F dt^2, where w = 1/m + (r x n) I^-1 (r x n) is its mobility
-    at the contact, so to the rod a free body is as stiff as 1 / (w dt^2) at the place where it would be without the force. What is
-    touched gets no more momentum than stops it at the rod, at any time step.
+    A step is implicit in the body's inertia: to the rod it is where it would be at the step's end without the rod, and gives way by
+    F dt^2 / m and M dt^2 / I. What is touched gets no more momentum than stops it at the rod, at any time step.
 
     The rod answers a changing load with tau dF/dt more (Kelvin and Voigt): a rod without mass and damping would swing with what it
-    pushes for ever. That force is implicit too: the stiffness is 1 / (w (dt^2 + tau dt)).
+    pushes for ever. That is implicit too: dt^2 becomes dt^2 + tau dt, and the body is expected where tau dF of the last force has
+    been taken off.
     """
 
     def __init__(self, bullet: Any, body: int, link: int = -1, *, dt: float, relaxation: float, friction: float) -> None:
@@ -54,32 +51,17 @@ class Touched:
         self.mass: float = mass
         """0: it does not move for the rod."""
         self._inertia: Floats = np.maximum(inertia, 1e-12)
-        self._mobility = 1.0 / mass if mass > 0.0 else 0.0
         self.parts = [part._replace(obstacle=dataclasses.replace(part.obstacle, friction=friction)) for part in shapes]
         self.names = tuple(part.obstacle.name for part in self.parts)
         self._before: Floats = np.zeros(6)
 
-    def watch(self, capsules: Sequence[int]) -> None:
-        """Before the first touch: find where these bodies will meet the link."""
-        if self.mass == 0.0 or self._before.any():
-            return
-        near = [p for own in capsules for p in self.bullet.getClosestPoints(own, self.body, _WATCH, -1, self.link)]
-        if near:
-            first = min(near, key=lambda p: p[8])
-            self._mobility = self._mobility_at(np.cross(np.subtract(first[6], self._com().pose[:3]), first[7]))
-
-    def mobility(self) -> float:
-        """Velocity per impulse of the rod, along its force, at the place that is touched or will be next [1/kg]."""
-        if (size := float(np.linalg.norm(self._before[:3]))) > 0.0:
-            self._mobility = self._mobility_at(self._before[3:] / size)
-        return self._mobility
-
-    def _mobility_at(self, lever: Floats) -> float:
-        """`lever`: r x n of a contact, world [m]."""
+    def give(self) -> tuple[float, Floats, Floats]:
+        """How far it moves per force [m/N] and turns per moment (3, 3) [rad/(N m)] in the next step, and its centre of mass (3,)."""
+        pose = self._com().pose
         if self.mass == 0.0:
-            return 0.0
-        lever = matrix_from_quaternion(self._com().pose[None, 3:])[0].T @ lever
-        return 1.0 / self.mass + float(lever @ (lever / self._inertia))
+            return 0.0, np.zeros((3, 3)), pose[:3]
+        turn, square = matrix_from_quaternion(pose[None, 3:])[0], self.dt**2 + self.relaxation * self.dt
+        return square / self.mass, square * turn @ (turn.T / self._inertia[:, None]), pose[:3]
 
     def _com(self) -> Motion:
         return _com_motion(self.bullet, self.body, self.link)
@@ -92,8 +74,12 @@ class Touched:
     def expected(self) -> tuple[dict[str, Floats], dict[str, Floats]]:
         """Pose (7,) and velocity (6,) of each part at the end of the next step, were it not for the rod."""
         motion = self._com()
+        if self.mass > 0.0:
+            back = self.relaxation / (self.dt**2 + self.relaxation * self.dt)  # per step: tau dt of the force before, as a velocity
+            by_force, by_moment, _ = self.give()
+            change = np.concatenate([by_force * self._before[:3], by_moment @ self._before[3:]])
+            motion = motion._replace(velocity=motion.velocity - back * change)
         pose = motion.after(self.dt)
-        pose[:3] -= self.mobility() * self.relaxation * self.dt * self._before[:3]
         turn = matrix_from_quaternion(pose[None, 3:])[0]
         poses, velocities = {}, {}
         for part in self.parts:
@@ -103,8 +89,8 @@ class Touched:
             velocities[part.obstacle.name] = np.concatenate([linear, motion.velocity[3:]])
         return poses, velocities
 
-    def push(self, points: Floats, forces: Floats, normals: Floats) -> tuple[Floats, Floats]:
-        """Exert the forces (n, 3) of the rod at world points (n, 3), where the surface has these unit normals (n, 3).
+    def push(self, points: Floats, forces: Floats) -> tuple[Floats, Floats]:
+        """Exert the forces (n, 3) of the rod at world points (n, 3).
 
         Returns what was exerted beyond these forces, (6,) with its moment about a point, and that point (3,): the rod's host takes
         its opposite.
@@ -112,13 +98,12 @@ class Touched:
         com = self._com().pose[:3]
         if self.mass == 0.0:
             return np.zeros(6), com
-        pressing = np.einsum("ij,ij->i", forces, normals)[:, None] * normals
-        wrench, pressed = _about(com, points, forces), _about(com, points, pressing)
-        more = self.relaxation / self.dt * (pressed - self._before)
-        along = pressed[:3] if pressed[:3].any() else self._before[:3]
-        if (pressed + more)[:3] @ along <= 0.0:
+        wrench = np.concatenate([forces.sum(0), np.cross(points - com, forces).sum(0)])
+        more = self.relaxation / self.dt * (wrench - self._before)
+        along = wrench[:3] if wrench[:3].any() else self._before[:3]
+        if (wrench + more)[:3] @ along <= 0.0:
             more = -wrench  # contact pushes, it does not hold
-        self._before = pressed
+        self._before = wrench
         if (total := wrench + more).any():
             exert(self.bullet, self.body, self.link, total, com)
         return more, com
@@ -126,10 +111,6 @@ class Touched:
     def forget(self) -> None:
         """The body was put somewhere else: no force carries over."""
         self._before = np.zeros(6)
-
-
-def _about(point: Floats, points: Floats, forces: Floats) -> Floats:
-    return np.concatenate([forces.sum(0), np.cross(points - point, forces).sum(0)])
 
 
 def _com_motion(bullet: Bullet, body: int, link: int) -> Motion:

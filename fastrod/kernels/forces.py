@@ -16,6 +16,7 @@ from fastrod.kernels.centreline import curve_of, interval_of, point_at, rotation
 from fastrod.kernels.contact_law import contact_forces, law_size, solve_dense
 from fastrod.kernels.gather import pick
 from fastrod.kernels.jit import inline, kernel
+from fastrod.kernels.mobile import add_mobility, axis_of
 from fastrod.kernels.search import carried
 from fastrod.kernels.slots import (
     T_GAP,
@@ -132,11 +133,6 @@ def _measure(
 @inline
 def _axis(a: int) -> Vec:
     return 1.0 if a == 0 else 0.0, 1.0 if a == 1 else 0.0, 1.0 if a == 2 else 0.0
-
-
-@inline
-def _axis_of(frame: Numbers, a: int) -> Vec:
-    return frame[3 * a], frame[3 * a + 1], frame[3 * a + 2]
 
 
 @inline
@@ -280,7 +276,7 @@ def _moved(n: int, model: Floats, a: int, change: Numbers) -> float:
 def _coupling(c: int, e: int, points: Numbers, axes: Numbers, a: int, b: int, model: Floats) -> float:
     """Motion of contact c along its axis a under a unit force of contact e along its axis b."""
     total = 0.0
-    u, v = _axis_of(axes[9 * c :], a), _axis_of(axes[9 * e :], b)
+    u, v = axis_of(axes[9 * c :], a), axis_of(axes[9 * e :], b)
     for s in range(2):
         g = int(points[2 * c + s])
         for t in range(2):
@@ -306,7 +302,7 @@ def forces_size(n_rows: int, n_slots: int) -> int:
     """Numbers of scratch that `apply_law` needs."""
     m = n_rows * n_slots
     n = 3 * m
-    return n_rows + 29 * m + 2 * n + n * n + n * (n + 1) + 4 * STACK + max(law_size(m), n * (2 * n + 1))
+    return n_rows + 33 * m + 2 * n + n * n + n * (n + 1) + 4 * STACK + max(law_size(m), n * (2 * n + 1))
 
 
 @kernel
@@ -325,6 +321,8 @@ def apply_law(
     compliance, o = work[o : o + most], o + most
     stiff, o = work[o : o + most], o + most
     force, o = work[o : o + 3 * most], o + 3 * most
+    touched, o = work[o : o + most], o + most
+    place, o = work[o : o + 3 * most], o + 3 * most
     bends, o = work[o : o + 9 * most].reshape((most, 9)), o + 9 * most
     now, o = work[o : o + size], o + size
     change, o = work[o : o + size], o + size
@@ -355,6 +353,10 @@ def apply_law(
             b[3 * m], b[3 * m + 1], b[3 * m + 2] = slot[T_GAP], dot(slip, t1), dot(slip, t2)
             mu = scenery.surfaces.friction[k] if other < 0 else scenery.rods.friction
             friction[m] = mu if scenery.slides[i] and (other < 0 or scenery.slides[rows[other]]) else 0.0
+            touched[m] = float(k) if other < 0 else -1.0
+            at = scenery.shape.position[i, probes.node[r, q]]
+            for a in range(3):
+                place[3 * m + a] = at[a] + probes.arm[r, q, a]
             compliance[m] = scenery.surfaces.compliance[k] if other < 0 else scenery.rods.compliance
             stiff[m] = _turning(r, q, other, twin, rows, scenery, touching, probes, stack, bends[m])
             bent = bent or stiff[m] > 0.0
@@ -374,16 +376,17 @@ def apply_law(
             if g >= 0:
                 v = (_moved(n, model, 3 * g, change), _moved(n, model, 3 * g + 1, change), _moved(n, model, 3 * g + 2, change))
                 for a in range(3):
-                    b[3 * c + a] += (1.0 if side == 0 else -1.0) * dot(v, _axis_of(axes[9 * c :], a))
+                    b[3 * c + a] += (1.0 if side == 0 else -1.0) * dot(v, axis_of(axes[9 * c :], a))
         for e in range(m):
             for a in range(3):
                 for d in range(3):
                     W[3 * c + a, 3 * e + d] = _coupling(c, e, points, axes, a, d, model)
+    add_mobility(m, touched, place, axes, scenery.surfaces.body, scenery.surfaces.give, W)
     solved = contact_forces(m, W, b, friction, compliance, force, scratch)
     for c in range(m):
         f = (0.0, 0.0, 0.0)
         for a in range(3):
-            f = axpy(force[3 * c + a], _axis_of(axes[9 * c :], a), f)
+            f = axpy(force[3 * c + a], axis_of(axes[9 * c :], a), f)
         for side in range(2):
             g = int(points[2 * c + side])
             for a in range(3 if g >= 0 else 0):

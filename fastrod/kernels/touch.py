@@ -64,11 +64,13 @@ def _stride(r: int, i: int, count: int, scenery: Scenery, probes: Probes, propos
 
 @kernel
 def _press(r: int, i: int, scenery: Scenery, touching: Touching, probes: Probes, proposed: Floats) -> float:
-    """How much deeper the proposed forces go into soft obstacles [m]; a rod pressed along its axis moves in no other way."""
+    """How much farther the proposed forces go into soft obstacles, or move free ones [m]; where a rod is pressed along its axis
+    nothing else moves."""
     deepest = 0.0
     for q in range(touching.used[i]):
         k = int(touching.slot[i, q, T_OBSTACLE])
-        soft = scenery.surfaces.compliance[k] if k < len(scenery.surfaces.kind) else scenery.rods.compliance
+        own = k < len(scenery.surfaces.kind)
+        soft = scenery.surfaces.compliance[k] + scenery.surfaces.give[k, 0] if own else scenery.rods.compliance
         for a in range(3):
             deepest = max(deepest, soft * abs(proposed[r, q, a] - probes.force[r, q, a]))
     return deepest

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, final
 from fastrod.errors import FastrodError, UnknownNameError, nearest
 
 if TYPE_CHECKING:
+    from fastrod.hosts import Bullet, MountedRod
     from fastrod.simulator import Simulator
     from fastrod.state import State
 
@@ -42,23 +43,12 @@ class Scene(ABC):
     """Of a run [s]."""
 
     @abstractmethod
-    def simulator(self) -> Simulator:
-        """A new simulator with this scene's robots and obstacles, before its first step."""
-
-    @abstractmethod
-    def inputs(self, t: float) -> dict[str, Any]:
-        """Keyword arguments of `Simulator.step` at time t [s]."""
+    def run(self) -> Iterator[tuple[float, State]]:
+        """(t [s], state) of each step, from 0 to `duration`."""
 
     @abstractmethod
     def check(self) -> dict[str, float]:
         """Run, and return the figures measured (name with unit -> value); `SceneError` where one is not as it must be."""
-
-    @final
-    def run(self) -> Iterator[tuple[float, State]]:
-        """(t [s], state) of each step, from 0 to `duration`."""
-        simulator = self.simulator()
-        for k in range(round(self.duration / self.dt) + 1):
-            yield k * self.dt, simulator.step(**self.inputs(k * self.dt))
 
     @final
     def progress(self, t: float) -> float:
@@ -70,6 +60,66 @@ class Scene(ABC):
         """Raises `SceneError` with the sentence where an expectation is not fulfilled."""
         if not fulfilled:
             raise SceneError(f"scene {self.name}: {sentence}")
+
+
+class RodScene(Scene):
+    """Rods and obstacles, without a host."""
+
+    @abstractmethod
+    def simulator(self) -> Simulator:
+        """A new simulator with this scene's robots and obstacles, before its first step."""
+
+    @abstractmethod
+    def inputs(self, t: float) -> dict[str, Any]:
+        """Keyword arguments of `Simulator.step` at time t [s]."""
+
+    @final
+    def run(self) -> Iterator[tuple[float, State]]:
+        simulator = self.simulator()
+        for k in range(round(self.duration / self.dt) + 1):
+            yield k * self.dt, simulator.step(**self.inputs(k * self.dt))
+
+
+class Stage(ABC):
+    """A world of its own with rods on hosts, as a scene has set it up."""
+
+    world: Bullet
+    rods: tuple[MountedRod, ...]
+
+    @abstractmethod
+    def advance(self, t: float) -> None:
+        """Command and simulate the step that begins at time t [s]."""
+
+    def close(self) -> None:
+        """Disconnect the world."""
+        self.world.disconnect()
+
+
+class HostedScene(Scene):
+    """Rods on the rigid robots of a PyBullet world (`pip install fastrod[hosts]`)."""
+
+    @abstractmethod
+    def stage(self) -> Stage:
+        """A new world, before its first step."""
+
+    @final
+    def run(self) -> Iterator[tuple[float, State]]:
+        """(t [s], state of the first rod) of each step."""
+        stage = self.stage()
+        for t in self.play(stage):
+            state = stage.rods[0].state
+            assert state is not None
+            yield t, state
+
+    @final
+    def play(self, stage: Stage) -> Iterator[float]:
+        """Advance to the end of the run, t [s] by t; the world is closed afterwards, whatever happens."""
+        try:
+            for k in range(round(self.duration / self.dt)):
+                stage.advance(k * self.dt)
+                yield (k + 1) * self.dt
+        finally:
+            stage.close()
 
 
 def names() -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from fastrod.simulator import Simulator
 from fastrod.state import State
 from fastrod_scenes.contact.airway_mesh import BRANCHES, RADIUS, airway, heading, lumen_distance, middle
 from fastrod_scenes.contact.balance import FORCE, Worst, contacts_of, watch, worst
-from fastrod_scenes.scene import Scene
+from fastrod_scenes.scene import RodScene
 
 SEGMENT = 0.045
 """Length of each of the three segments [m]."""
@@ -56,7 +56,7 @@ def _inside(state: State, robot: int) -> NDArray[np.float64]:
 
 
 @final
-class Airway(Scene):
+class Airway(RodScene):
     """Two robots, each in a world of its own: the first is steered left, the second right. The feed is straight, along z."""
 
     name = "airway"

@@ -14,7 +14,7 @@ from fastrod.contact import ContactScene, cylinder
 from fastrod.robotfile import load_robot
 from fastrod.simulator import Simulator
 from fastrod_scenes.contact.balance import FORCE, Worst, contacts_of, watch, worst
-from fastrod_scenes.scene import Scene
+from fastrod_scenes.scene import RodScene
 
 RADIUS = 0.065
 """Of the bar, whose axis is along y [m]: what a triangle of this robot can reach around."""
@@ -31,7 +31,7 @@ OFFSET = 0.0075
 
 
 @final
-class Bar(Scene):
+class Bar(RodScene):
     """The robot stands upright beside the bar; friction 0.3 keeps the grip from sliding along it."""
 
     name = "bar"

@@ -16,7 +16,7 @@ from fastrod.contact import ContactScene, cylinder
 from fastrod.robot import Robot, Segment
 from fastrod.simulator import Simulator
 from fastrod_scenes.contact.balance import DEPTH, FORCE, contacts_of, force_error, rises
-from fastrod_scenes.scene import Scene
+from fastrod_scenes.scene import RodScene
 
 LENGTH = 0.3
 STIFFNESS = 0.02
@@ -38,7 +38,7 @@ _ACROSS = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)
 
 
 @final
-class Draped(Scene):
+class Draped(RodScene):
     """The rod lies along x; the drum is frictionless."""
 
     name = "draped"

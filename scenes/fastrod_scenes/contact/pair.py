@@ -16,7 +16,7 @@ from fastrod.contact import ContactScene
 from fastrod.robotfile import load_robot
 from fastrod.simulator import Simulator
 from fastrod_scenes.contact.balance import FORCE, Worst, contacts_of, rises, watch, worst
-from fastrod_scenes.scene import Scene
+from fastrod_scenes.scene import RodScene
 
 ROD = 0.012
 """Radius of both rods [m]."""
@@ -33,7 +33,7 @@ TOUCH = 1e-7
 
 
 @final
-class Pair(Scene):
+class Pair(RodScene):
     """The first rod stands upright, the second lies along y, on the first one's side of larger x; no friction."""
 
     name = "pair"

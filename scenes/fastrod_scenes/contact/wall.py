@@ -10,7 +10,7 @@ from fastrod.contact import ContactScene, plane
 from fastrod.robotfile import load_robot
 from fastrod.simulator import Simulator
 from fastrod_scenes.contact.balance import FORCE, Worst, contacts_of, rises, watch, worst
-from fastrod_scenes.scene import Scene
+from fastrod_scenes.scene import RodScene
 
 DISTANCE = 0.02
 """Of the wall from the base, along x [m]."""
@@ -19,7 +19,7 @@ PULL = 0.009
 
 
 @final
-class Wall(Scene):
+class Wall(RodScene):
     """The wall is frictionless: x < `DISTANCE` is free."""
 
     name = "wall"

@@ -1,0 +1,10 @@
+"""Tip control: trajectories, the kinematics of a soft robot on a base that moves, and resolved rates."""
+
+from fastrod.control.kinematics import Arm, Base, FixedBase, MovingBase, SoftTip
+from fastrod.control.resolved_rate import ResolvedRate
+from fastrod.control.trajectories import Trajectory, circle, figure_eight, helix, names, square, square_helix, trajectory
+
+__all__ = [
+    "Arm", "Base", "FixedBase", "MovingBase", "ResolvedRate", "SoftTip", "Trajectory", "circle", "figure_eight", "helix", "names", "square",
+    "square_helix", "trajectory",
+]  # fmt: skip

@@ -1,0 +1,136 @@
+"""Actions of segments: the bends they name are the bends that come, and their matrix is the slope of their inputs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from rods import rod
+
+from fastrod import Robot, Segment, Simulator, Tendon, load_robot
+from fastrod.errors import InputError, RobotError
+from fastrod.reference import constant_curvature
+from fastrod.segments import SegmentActions
+
+
+def stiff_wires(n_segments: int = 2, n_tendons: int = 4, offset: float = 0.008) -> Robot:
+    """Weightless, of wires that hardly stretch; those of the second segment between those of the first."""
+    segments = tuple(
+        Segment(
+            length=0.1 - 0.02 * k, bending_stiffness=(0.0022, 0.0022), torsional_stiffness=0.001, extension=(-0.01, 0.03),
+            tendons=tuple(Tendon(offset=offset - 0.001 * k, angle=2.0 * np.pi * (i + 0.4 * k) / n_tendons, compliance=1e-9)
+                          for i in range(n_tendons)),
+        )
+        for k in range(n_segments)
+    )  # fmt: skip
+    return Robot(name="stiff", segments=segments)
+
+
+def arc(bend: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation and end of an arc along e3 that bends toward d1 by bend[0] and toward d2 by bend[1]: the closed form."""
+    angle = float(np.hypot(*bend))
+    if angle == 0.0:
+        return np.eye(3), np.array([0.0, 0.0, length])
+    toward = np.array([*bend, 0.0]) / angle
+    e3 = np.array([0.0, 0.0, 1.0])
+    axis = np.cross(e3, toward)
+    hat = np.cross(np.eye(3), axis)
+    turn = np.eye(3) + np.sin(angle) * hat + (1.0 - np.cos(angle)) * hat @ hat
+    return turn, length / angle * ((1.0 - np.cos(angle)) * toward + np.sin(angle) * e3)
+
+
+@pytest.mark.parametrize("n_tendons", [3, 4])
+@pytest.mark.parametrize("seed", range(4))
+def test_segments_are_arcs_of_displacement_over_offset(n_tendons: int, seed: int) -> None:
+    robot = stiff_wires(n_tendons=n_tendons)
+    actions = SegmentActions(robot)
+    bends = np.random.default_rng(seed).uniform(-0.9, 0.9, (2, 2))
+    stretch = np.random.default_rng(50 + seed).uniform(-0.01, 0.03, 2)
+    action = np.column_stack([stretch, bends * actions.offset[:, None]]).ravel()
+    inputs = actions.inputs(action)
+    state = Simulator(robot, points_per_segment=20).settle(**inputs)
+    assert state.ok[0]
+    turn, end = np.eye(3), np.zeros(3)
+    for k, segment in enumerate(robot.segments):
+        by, chord = arc(bends[k], segment.length + stretch[k])
+        end, turn = end + turn @ chord, turn @ by
+        assert_allclose(state.position[0, 20 * (k + 1)], end, atol=2e-7)  # fourth order: (0.9 / 20)^4 of 0.1 m, and 1e-9 m/N of stretch
+        assert_allclose(state.rotation[0, 20 * (k + 1)], turn, atol=2e-6)
+    shape = constant_curvature(robot, inputs["tendon_length"], inputs["extension"])
+    assert_allclose(shape.tip_position, end, atol=1e-12)
+    assert shape.residual < 1e-12
+
+
+@pytest.mark.parametrize(("entry", "axis"), [(1, 0), (2, 1)])
+def test_the_first_displacement_bends_toward_d1_and_the_second_toward_d2(entry: int, axis: int) -> None:
+    robot = stiff_wires(1)
+    action = np.zeros(3)
+    action[entry] = 0.5 * 0.008
+    tip = Simulator(robot, points_per_segment=10).settle(**SegmentActions(robot).inputs(action)).tip_position[0]
+    assert tip[axis] == pytest.approx(0.1 / 0.5 * (1.0 - np.cos(0.5)), abs=1e-6)
+    assert abs(tip[1 - axis]) < 1e-9
+    assert tip[2] == pytest.approx(0.1 / 0.5 * np.sin(0.5), abs=1e-6)
+
+
+def test_the_matrix_is_the_slope_of_the_inputs() -> None:
+    for robot in (stiff_wires(3), load_robot("five_segment_reacher"), rod("paper", n_tendons=3)):
+        actions = SegmentActions(robot)
+        n = actions.n_actions
+        assert n == 3 * robot.n_segments
+        assert actions.matrix.shape == (robot.n_tendons + robot.n_segments, n)
+        at = 1e-3 * np.random.default_rng(2).normal(size=n)
+        ends = [actions.inputs(at + sign * 1e-3 * np.eye(n)) for sign in (1.0, -1.0)]
+        for name, rows in (("tendon_length", slice(0, robot.n_tendons)), ("extension", slice(robot.n_tendons, None))):
+            slope = (ends[0][name] - ends[1][name]) / 2e-3  # type: ignore[literal-required]
+            assert_allclose(slope.T, actions.matrix[rows], atol=1e-12)  # linear: exact but for rounding
+
+
+def test_no_action_is_the_rest_robot_and_actions_add_up_over_a_batch() -> None:
+    robot = stiff_wires()
+    actions = SegmentActions(robot)
+    rest = actions.inputs(np.zeros(6))
+    assert_array_equal(rest["tendon_length"], robot.rest_tendon_length)
+    assert_array_equal(rest["extension"], 0.0)
+    many = np.random.default_rng(3).uniform(-1e-3, 1e-3, (5, 6))
+    got = actions.inputs(many)
+    assert got["tendon_length"].shape == (5, 8)
+    assert_allclose(got["tendon_length"], np.stack([actions.inputs(a)["tendon_length"] for a in many]), atol=1e-15)
+
+
+def test_an_offset_of_ones_own_scales_the_bends() -> None:
+    robot = stiff_wires()
+    own, other = SegmentActions(robot), SegmentActions(robot, offset=0.016)
+    assert_allclose(own.offset, [0.008, 0.007], rtol=1e-12)
+    assert_array_equal(other.offset, 0.016)
+    assert_allclose(other.inputs([0.0, 0.016, 0.0, 0.0, 0.0, 0.0])["tendon_length"],
+                    own.inputs([0.0, 0.008, 0.0, 0.0, 0.0, 0.0])["tendon_length"], atol=1e-15)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("action", "sentence"),
+    [
+        ([0.0, 0.0], "action has shape (2,); it must be (..., 6): extension and two displacements for each of 2 segments, base first [m]."),
+        (0.0, "action has shape (); it must be (..., 6): extension and two displacements for each of 2 segments, base first [m]."),
+        ([0.0, np.nan, 0.0, 0.0, 0.0, 0.0], "action holds a value that is not finite: [ 0. nan  0.  0.  0.  0.]."),
+        ("bend", "action is 'bend'; give 6 numbers [m]."),
+    ],
+)
+def test_what_is_no_action_is_refused(action: Any, sentence: str) -> None:
+    actions = SegmentActions(stiff_wires())
+    with pytest.raises(InputError) as caught:
+        actions.inputs(action)
+    assert str(caught.value) == sentence
+
+
+def test_a_robot_that_actions_cannot_drive_is_refused() -> None:
+    pulled = replace(stiff_wires(), segments=tuple(replace(s, mode="tendon_tension") for s in stiff_wires().segments))
+    with pytest.raises(RobotError) as caught:
+        SegmentActions(pulled)
+    assert str(caught.value) == "segment 1 of robot 'stiff' is tendon_tension; an action needs wires driven by length."
+    flat = replace(rod(n_tendons=2), name="flat")
+    with pytest.raises(RobotError) as caught:
+        SegmentActions(flat)
+    assert str(caught.value) == "the wires of segment 1 of robot 'flat' bend it in one plane; an action needs two."

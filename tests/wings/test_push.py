@@ -1,0 +1,174 @@
+"""A rod on a host pushes bodies of its world, and both feel it."""
+
+import numpy as np
+import pytest
+from bullets import carrier, carry, cube, empty_world, soft_robot
+
+from fastrod.contact import ContactScene, plane
+from fastrod.errors import HostError, InputError, UnknownNameError
+from fastrod.hosts import MountedRod
+from fastrod.hosts.surroundings import Touched
+from fastrod.simulator import Simulator
+
+SPEED = 0.1
+RADIUS, SIZE, MASS = 0.012, 0.08, 0.1
+END = {"axial": [0.2 + RADIUS + 0.002 + SIZE / 2, 0.0, 0.0], "side": [0.18, RADIUS + 0.002 + SIZE / 2, 0.0]}
+WAY = {"axial": np.array([1.0, 0.0, 0.0]), "side": np.array([0.0, 1.0, 0.0])}
+
+
+def push(dt, direction, gravity, duration=0.8, mass=MASS, size=SIZE, place=None, floor_friction=0.5):
+    """A rod along x is carried against a cube; velocity of the cube along the way, its momentum and the host's impulse."""
+    world = empty_world(dt, gravity)
+    if gravity:
+        floor = world.createCollisionShape(world.GEOM_BOX, halfExtents=[5.0, 5.0, 0.5])
+        world.changeDynamics(world.createMultiBody(0.0, floor, -1, [0.0, 0.0, -0.5 - size / 2]), -1, lateralFriction=floor_friction)
+    box = cube(world, size, mass, place or END[direction], friction=1.0)
+    link, robot = carrier(world, "x"), soft_robot()
+    rod = MountedRod(robot, link, touch=[box])
+    rod.settle(tendon_length=robot.rest_tendon_length)
+    way, impulse, speeds, ok = WAY[direction], np.zeros(3), [], True
+    for k in range(round(duration / dt)):
+        carry(link, SPEED * k * dt * way, SPEED * way)
+        state = rod.step()
+        impulse += dt * rod.wrench[:3]
+        speeds.append(np.array(world.getBaseVelocity(box)[0]) @ way)
+        ok = ok and bool(state.ok[0])
+    return np.array(speeds), mass * np.array(world.getBaseVelocity(box)[0]), impulse, ok
+
+
+@pytest.mark.parametrize("direction", ["axial", "side"])
+@pytest.mark.parametrize("dt", [0.001, 0.005, 0.01])
+def test_momentum_of_a_free_cube_is_the_impulse_on_the_host(dt, direction):
+    speeds, momentum, impulse, ok = push(dt, direction, gravity=0.0, duration=0.5)
+    assert ok
+    assert momentum @ WAY[direction] > 0.9 * MASS * SPEED
+    np.testing.assert_allclose(momentum, -impulse, atol=1e-9)
+    # an elastic rod without any loss would leave it at twice the speed; along its axis this one is stiff, and only stops it
+    assert speeds.max() < (1.01 if direction == "axial" else 1.5) * SPEED
+
+
+@pytest.mark.parametrize("direction", ["axial", "side"])
+@pytest.mark.parametrize("dt", [0.001, 0.002, 0.005, 0.01])
+def test_cube_on_the_floor_follows_the_tip(dt, direction):
+    # from the side the rod bends by some 3 cm until 20 g slide; a cube of 100 g would bend it as far as it is long
+    speeds, _, impulse, ok = push(dt, direction, gravity=9.81, duration=1.6, mass=MASS if direction == "axial" else 0.02)
+    assert ok
+    late = speeds[len(speeds) // 2 :]
+    np.testing.assert_allclose(late, SPEED, rtol=0.02)
+    assert speeds.max() < 1.05 * SPEED  # no launch
+    assert -impulse @ WAY[direction] > 0.0
+
+
+def test_push_against_friction_is_the_friction():
+    # once it slides the host holds mu m g against the way
+    _, _, first, _ = push(0.005, "axial", gravity=9.81, duration=1.0)
+    _, _, later, _ = push(0.005, "axial", gravity=9.81, duration=2.0)
+    assert (first - later)[0] == pytest.approx(0.5 * MASS * 9.81, rel=0.01)
+
+
+@pytest.mark.parametrize("mass", [0.01, 1.0])
+def test_light_and_heavy_cubes_are_not_launched(mass):
+    speeds, momentum, impulse, ok = push(0.01, "axial", gravity=0.0, duration=0.4, mass=mass)
+    assert ok
+    assert speeds[-1] == pytest.approx(SPEED, rel=0.05)
+    np.testing.assert_allclose(momentum, -impulse, atol=1e-9)
+
+
+def test_cube_that_is_hit_off_its_middle_turns_and_is_not_launched():
+    speeds, momentum, impulse, ok = push(0.005, "axial", gravity=0.0, duration=0.4, place=[END["axial"][0], 0.03, 0.02])
+    assert ok
+    assert speeds.max() < 1.5 * SPEED
+    np.testing.assert_allclose(momentum, -impulse, atol=1e-9)
+
+
+def test_still_wall_is_felt_by_the_host_as_the_simulator_has_it():
+    world, robot = empty_world(), soft_robot()
+    wall = world.createMultiBody(0.0, world.createCollisionShape(world.GEOM_BOX, halfExtents=[0.05, 0.5, 0.5]), -1, [0.12, 0.0, 0.1])
+    rod = MountedRod(robot, carrier(world), touch=[wall], friction=0.0)
+    rod.settle(tendon_length=robot.rest_tendon_length)
+    alone = Simulator(
+        robot, dt=world.dt, points_per_segment=10, contact=ContactScene(obstacles=[plane(point=(0.07, 0, 0), normal=(-1, 0, 0), name="w")])
+    )
+    for k in range(40):
+        pull = robot.rest_tendon_length + 0.0002 * k * np.array([-1, 0, 1, 0, -2, 0, 2, 0])
+        state, expected = rod.step(tendon_length=pull), alone.step(pull)
+    assert state.ok[0]
+    assert rod.wrench[0] < -0.1
+    np.testing.assert_allclose(rod.wrench, expected.base_wrench[0], atol=1e-6)
+    np.testing.assert_allclose(state.tip_position, expected.tip_position, atol=1e-6)
+    assert len(world.getContactPoints(rod.bodies.ids[-1], wall)) == 0  # one contact, not two
+
+
+def test_every_shape_of_pybullet_is_an_obstacle_where_it_is():
+    world = empty_world()
+    turn = world.getQuaternionFromEuler([0.3, -0.4, 0.5])
+    hull = np.random.default_rng(8).normal(size=(40, 3)) * 0.03
+    shapes = {
+        "box": world.createCollisionShape(world.GEOM_BOX, halfExtents=[0.01, 0.02, 0.03]),
+        "sphere": world.createCollisionShape(world.GEOM_SPHERE, radius=0.03),
+        "cylinder": world.createCollisionShape(world.GEOM_CYLINDER, radius=0.02, height=0.05),
+        "capsule": world.createCollisionShape(world.GEOM_CAPSULE, radius=0.02, height=0.05),
+        "mesh": world.createCollisionShape(world.GEOM_MESH, vertices=hull.tolist()),
+    }
+    probe = world.createMultiBody(0.0, world.createCollisionShape(world.GEOM_SPHERE, radius=0.001), -1, [0.15, 0.1, 0.12])
+    for name, shape in shapes.items():
+        body = world.createMultiBody(1.0, shape, -1, [0.1, 0.2, 0.3], turn, baseInertialFramePosition=[0.01, 0.0, 0.0])
+        touched = Touched(world, body, dt=0.005, relaxation=0.1, friction=0.3)
+        assert [part.obstacle.shape for part in touched.parts] == [name]
+        pose = touched.expected()[0][touched.names[0]]
+        robot = soft_robot(1)
+        sim = Simulator(robot, contact=ContactScene(obstacles=[touched.parts[0].obstacle], rod_radius=0.001, mounting=0.0))
+        # the rod's base is where the probe is, and its tip beside it: both must be as far from the body
+        state = sim.settle(robot.rest_tendon_length, base_pose=(0.15, 0.1, 0.12, 1, 0, 0, 0), obstacle_pose={touched.names[0]: pose})
+        ends = []
+        for point in state.position[0, [0, -1]]:
+            world.resetBasePositionAndOrientation(probe, point.tolist(), [0, 0, 0, 1])
+            ends.append(min(p[8] for p in world.getClosestPoints(probe, body, 1.0)))
+        assert min(ends) > 0.0
+        assert sim.clearance()[0] <= min(ends) + 1e-3  # PyBullet's cylinders and hulls have margins
+        assert sim.clearance()[0] > 0.0
+        world.removeBody(body)
+
+
+def test_touched_body_may_be_put_somewhere_else():
+    world, robot = empty_world(), soft_robot()
+    box = cube(world, SIZE, MASS, END["axial"])
+    link = carrier(world, "x")
+    rod = MountedRod(robot, link, touch=[box])
+    rod.settle(tendon_length=robot.rest_tendon_length)
+    for k in range(20):
+        carry(link, [SPEED * k * world.dt, 0.0, 0.0], [SPEED, 0.0, 0.0])
+        rod.step()
+    assert np.linalg.norm(world.getBaseVelocity(box)[0]) > 0.9 * SPEED
+    world.resetBasePositionAndOrientation(box, [2.0, 0.0, 0.0], [0, 0, 0, 1])
+    world.resetBaseVelocity(box, [0.0] * 3, [0.0] * 3)
+    rod.reset()
+    rod.step()
+    assert np.abs(rod.wrench).max() < 1e-9
+    assert np.abs(world.getBaseVelocity(box)[0]).max() == 0.0
+
+
+def test_what_cannot_be_touched_is_a_sentence():
+    world = empty_world()
+    ghost = world.createMultiBody(1.0, -1, -1, [0, 0, 0])
+    with pytest.raises(HostError, match=r"link -1 of body 0 has no collision shape, so nothing can touch it\."):
+        Touched(world, ghost, dt=0.005, relaxation=0.1, friction=0.3)
+    sim = Simulator(soft_robot(), contact=ContactScene(obstacles=[plane(point=(1, 0, 0), normal=(-1, 0, 0), name="wall")]))
+    with pytest.raises(InputError, match=r"the mobility of 'wall' is .*; give \[m/N\], \(3, 3\)"):
+        sim.set_free("wall", -1.0, np.eye(3), np.zeros(3))
+    with pytest.raises(UnknownNameError, match=r"no obstacle 'wal'; did you mean 'wall'\?"):
+        sim.set_free("wal", 1.0, np.eye(3), np.zeros(3))
+
+
+@pytest.mark.parametrize("stiffness", [10.0, 1e3, 1e5])
+def test_straight_rod_pressed_along_its_axis_on_something_soft(stiffness):
+    # it cannot give way, so the obstacle does: force = stiffness x depth
+    robot = soft_robot()
+    wall = plane(point=(0, 0, 0.2135), normal=(0, 0, -1), name="wall", stiffness=stiffness)
+    sim = Simulator(robot, points_per_segment=8, contact=ContactScene(obstacles=[wall]))
+    for z in (0.0, 0.001, 0.002):
+        state = sim.step(robot.rest_tendon_length, base_pose=(0, 0, z, 1, 0, 0, 0))
+    if stiffness < 1e4:  # below the load under which the straight rod buckles
+        np.testing.assert_allclose(state.contacts.total_force[0], [0, 0, -stiffness * 0.0005], atol=1e-6 * stiffness)
+    assert state.ok[0]
+    assert state.contacts.in_contact("wall")[0]
