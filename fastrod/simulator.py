@@ -215,6 +215,8 @@ class Simulator:
         velocities = engine.scene.velocities(velocity, self.n_robots)
         start = self._ports
         ports, rows = self._read(given)
+        if start is not None:
+            stretch(self._passes, rows, ports.extension - start.extension)
         engine.given_arclength, engine.given_force = self._reader.loads
         engine.move(poses, velocities, self.dt)
         shape = self._passes.new_shape("full", True)

@@ -143,6 +143,12 @@ class SoftTip:
         self._q, self._base_pose, self._state = q, pose, state
         return state
 
+    def follow(self, q: ArrayLike, state: State, base_pose: ArrayLike) -> None:
+        """Be where a step of the simulator that was taken elsewhere, as a host does, has left the robot: `state` is that of the
+        simulator's last step, q (n_q,) the coordinates that it belongs to, `base_pose` (7,) as for `place`. Raises `InputError`."""
+        q, pose = self._read(q), _pose("base_pose", base_pose)
+        self._q, self._base_pose, self._state = q, pose, state
+
     @property
     def position(self) -> Floats:
         """(3,) of the tip, world [m], where it was placed last. Raises `InputError` before the first `place`."""

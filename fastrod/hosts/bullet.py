@@ -36,7 +36,7 @@ class Bullet:
             number = getattr(bullet, "_client", bullet)
         if isinstance(number, bool) or not isinstance(number, int):
             raise HostError(f"bullet is {bullet!r}; give a physicsClientId, the pybullet module or a BulletClient that is connected.")
-        self.number = number
+        self.number: int = number
         """physicsClientId."""
         if not self.isConnected():
             raise HostError(f"PyBullet has no world {number}; connect first, for example with fastrod.hosts.connect().")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import Any, NamedTuple, final
 
 import numpy as np
@@ -53,6 +52,8 @@ class Touched:
         self._inertia: Floats = np.maximum(inertia, 1e-12)
         self.parts = [part._replace(obstacle=dataclasses.replace(part.obstacle, friction=friction)) for part in shapes]
         self.names = tuple(part.obstacle.name for part in self.parts)
+        self.exerted: Floats = np.zeros(6)
+        """Force [N] and moment about its centre of mass [N m] that the rod exerted on it in the last step, world."""
         self._before: Floats = np.zeros(6)
 
     def give(self) -> tuple[float, Floats, Floats]:
@@ -65,11 +66,6 @@ class Touched:
 
     def _com(self) -> Motion:
         return _com_motion(self.bullet, self.body, self.link)
-
-    def stiffness(self) -> float:
-        """Of the body in the rod's next step [N/m]; inf where it does not move."""
-        give = self.mobility() * (self.dt**2 + self.relaxation * self.dt)
-        return 1.0 / give if give > 0.0 else math.inf
 
     def expected(self) -> tuple[dict[str, Floats], dict[str, Floats]]:
         """Pose (7,) and velocity (6,) of each part at the end of the next step, were it not for the rod."""
@@ -103,9 +99,9 @@ class Touched:
         along = wrench[:3] if wrench[:3].any() else self._before[:3]
         if (wrench + more)[:3] @ along <= 0.0:
             more = -wrench  # contact pushes, it does not hold
-        self._before = wrench
-        if (total := wrench + more).any():
-            exert(self.bullet, self.body, self.link, total, com)
+        self._before, self.exerted = wrench, wrench + more
+        if self.exerted.any():
+            exert(self.bullet, self.body, self.link, self.exerted, com)
         return more, com
 
     def forget(self) -> None:

@@ -18,7 +18,18 @@ _SCENES: Mapping[str, str] = {
     "airway": "fastrod_scenes.contact.airway:Airway",
     "bar": "fastrod_scenes.contact.bar:Bar",
     "draped": "fastrod_scenes.contact.draped:Draped",
+    "dual_arm": "fastrod_scenes.ur5.dual_arm:DualArms",
+    "explore": "fastrod_scenes.ur5.explore:Explore",
+    "neck_look": "fastrod_scenes.a1.look:NeckLook",
+    "neck_push": "fastrod_scenes.a1.push:NeckPush",
     "pair": "fastrod_scenes.contact.pair:Pair",
+    "pick_gripper": "fastrod_scenes.ur5.pick:PickGripper",
+    "pick_suction": "fastrod_scenes.ur5.pick:PickSuction",
+    "track_circle": "fastrod_scenes.ur5.tracking:TrackCircle",
+    "track_figure_eight": "fastrod_scenes.ur5.tracking:TrackFigureEight",
+    "track_helix": "fastrod_scenes.ur5.tracking:TrackHelix",
+    "track_square": "fastrod_scenes.ur5.tracking:TrackSquare",
+    "track_square_helix": "fastrod_scenes.ur5.tracking:TrackSquareHelix",
     "wall": "fastrod_scenes.contact.wall:Wall",
 }
 
@@ -80,11 +91,15 @@ class RodScene(Scene):
             yield k * self.dt, simulator.step(**self.inputs(k * self.dt))
 
 
-class Stage(ABC):
-    """A world of its own with rods on hosts, as a scene has set it up."""
+class HostedWorld(ABC):
+    """A PyBullet world of its own with soft robots in it, as a scene has set it up."""
 
     world: Bullet
-    rods: tuple[MountedRod, ...]
+
+    @property
+    @abstractmethod
+    def state(self) -> State:
+        """Of the first soft robot, after a step."""
 
     @abstractmethod
     def advance(self, t: float) -> None:
@@ -95,24 +110,36 @@ class Stage(ABC):
         self.world.disconnect()
 
 
+class Stage(HostedWorld):
+    """A world with rods on hosts."""
+
+    rods: tuple[MountedRod, ...]
+
+    @property
+    @final
+    def state(self) -> State:
+        """Of the first rod."""
+        state = self.rods[0].state
+        assert state is not None
+        return state
+
+
 class HostedScene(Scene):
-    """Rods on the rigid robots of a PyBullet world (`pip install fastrod[hosts]`)."""
+    """Soft robots on the rigid robots of a PyBullet world (`pip install fastrod[hosts]`)."""
 
     @abstractmethod
-    def stage(self) -> Stage:
+    def stage(self) -> HostedWorld:
         """A new world, before its first step."""
 
     @final
     def run(self) -> Iterator[tuple[float, State]]:
-        """(t [s], state of the first rod) of each step."""
+        """(t [s], state of the first soft robot) of each step."""
         stage = self.stage()
         for t in self.play(stage):
-            state = stage.rods[0].state
-            assert state is not None
-            yield t, state
+            yield t, stage.state
 
     @final
-    def play(self, stage: Stage) -> Iterator[float]:
+    def play(self, stage: HostedWorld) -> Iterator[float]:
         """Advance to the end of the run, t [s] by t; the world is closed afterwards, whatever happens."""
         try:
             for k in range(round(self.duration / self.dt)):

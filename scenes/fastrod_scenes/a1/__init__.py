@@ -1,0 +1,1 @@
+"""A quadruped with a soft neck."""

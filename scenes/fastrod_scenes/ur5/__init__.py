@@ -1,0 +1,1 @@
+"""Scenes with soft robots on a UR5 (`pip install fastrod[hosts]`)."""

@@ -1,0 +1,102 @@
+"""Obstacles that give way with a body's own inertia."""
+
+import numpy as np
+import pytest
+
+from fastrod.contact import ContactScene, box, plane
+from fastrod.kernels.mobile import add_mobility
+from fastrod.robotfile import load_robot
+from fastrod.simulator import Simulator
+
+PULL = np.array([-0.009, 0.0, 0.009, 0.0])
+
+
+def wall_and_rod(**wall):
+    robot = load_robot("prototype")
+    scene = ContactScene(obstacles=[plane(point=(0.02, 0.0, 0.0), normal=(-1.0, 0.0, 0.0), name="wall", **wall)])
+    return robot.rest_tendon_length, Simulator(robot, points_per_segment=10, contact=scene)
+
+
+def pressed(rest, sim, most=1.0):
+    for part in np.linspace(0.0, most, 20):
+        state = sim.step(rest + part * PULL)
+    assert state.ok[0]
+    return state.contacts
+
+
+@pytest.mark.parametrize("give", [1e-5, 1e-3, 1e-2])
+def test_body_that_only_shifts_is_a_spring(give):
+    rest, sim = wall_and_rod()
+    sim.set_free("wall", give, np.zeros((3, 3)), np.zeros(3))
+    free = pressed(rest, sim)
+    spring = pressed(*wall_and_rod(stiffness=1.0 / give))
+    np.testing.assert_allclose(free.force[0, 0], spring.force[0, 0], rtol=1e-4)  # a step is at rest to 1e-6 m
+    assert -free.gap[0, 0] == pytest.approx(give * np.linalg.norm(free.force[0, 0]), rel=1e-2, abs=1e-6)
+
+
+def test_friction_moves_a_free_body_along():
+    # what gives way in every direction feels less friction than what is held: it goes with the rod
+    held = pressed(*wall_and_rod(friction=0.1), most=0.6)
+    rest, sim = wall_and_rod(friction=0.1)
+    sim.set_free("wall", 0.05, np.zeros((3, 3)), np.zeros(3))
+    free = pressed(rest, sim, most=0.6)
+    assert abs(free.force[0, 0, 2]) < abs(held.force[0, 0, 2])
+
+
+def test_body_that_is_hit_off_its_middle_gives_way_by_turning():
+    robot = load_robot("prototype")
+    center, size = np.array([0.05, 0.0, 0.1]), (0.06, 0.2, 0.2)
+    scene = ContactScene(obstacles=[box(size, name="box", position=center)])
+    depth = {}
+    for turn in (0.0, 2.0):
+        sim = Simulator(robot, points_per_segment=10, contact=scene)
+        sim.set_free("box", 1e-4, turn * np.eye(3), center)
+        contacts = pressed(robot.rest_tendon_length, sim)
+        lever = np.cross(contacts.point[0, 0] - center, contacts.normal[0, 0])
+        expected = (1e-4 + turn * lever @ lever) * (contacts.force[0, 0] @ contacts.normal[0, 0])
+        depth[turn] = -contacts.gap[0, 0]
+        assert depth[turn] == pytest.approx(expected, rel=1e-2, abs=2e-6)
+    assert depth[2.0] > 10.0 * depth[0.0]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_mobility_is_that_of_a_rigid_body(seed):
+    # W_ce = A_c (1/m + [r_c]^T I^-1 [r_e]) A_e^T for contacts on one body, nothing between two bodies or with a rod
+    rng = np.random.default_rng(seed)
+    m = 5
+    touched = np.array([0.0, 1.0, 2.0, 0.0, -1.0])
+    body = np.array([7, 7, 8])
+    place = rng.normal(size=(m, 3))
+    axes = np.array([np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(m)])
+    give = np.zeros((3, 13))
+    for number in (7, 8):
+        root = rng.normal(size=(3, 3))
+        give[body == number] = [rng.uniform(0.1, 1.0), *(root @ root.T).ravel(), *rng.normal(size=3)]
+    W = rng.normal(size=(3 * m, 3 * m))
+    expected = W.copy()
+
+    def hat(v):
+        return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+
+    for c in range(m):
+        for e in range(m):
+            if touched[c] >= 0 and touched[e] >= 0 and body[int(touched[c])] == body[int(touched[e])]:
+                g = give[int(touched[c])]
+                block = g[0] * np.eye(3) + hat(place[c] - g[10:]).T @ g[1:10].reshape(3, 3) @ hat(place[e] - g[10:])
+                expected[3 * c : 3 * c + 3, 3 * e : 3 * e + 3] += axes[c] @ block @ axes[e].T
+    add_mobility(m, touched, place.ravel(), axes.ravel(), body, give, W)
+    np.testing.assert_allclose(W, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("stiffness", [10.0, 1e3, 1e5])
+def test_straight_rod_pressed_along_its_axis_on_something_soft(stiffness):
+    # it cannot give way, so the obstacle does: force = stiffness x depth
+    robot = load_robot("prototype")
+    wall = plane(point=(0, 0, 0.0835), normal=(0, 0, -1), name="wall", stiffness=stiffness)
+    sim = Simulator(robot, points_per_segment=8, contact=ContactScene(obstacles=[wall]))
+    for z in (0.0, 0.001, 0.002):
+        state = sim.step(robot.rest_tendon_length, base_pose=(0, 0, z, 1, 0, 0, 0))
+    assert state.ok[0]
+    assert state.contacts.in_contact("wall")[0]
+    if stiffness < 1e4:  # below the load under which the straight rod buckles
+        np.testing.assert_allclose(state.contacts.total_force[0], [0, 0, -stiffness * 0.0005], atol=1e-6 * stiffness)
