@@ -38,6 +38,10 @@ class Passes:
         """Boundary residuals of a robot."""
         return len(self.layout.row_tendon) + (0 if self.layout.paper else 3) + (3 if len(ports.follower_force) else 0)
 
+    def n_columns(self, ports: Ports) -> int:
+        """Columns of sensitivities that a pass carries without contact."""
+        return self.n_x + (3 if len(self.memory.force_before) and not len(ports.follower_force) else 0)
+
     def _new_memory(self, follower: bool, track_force: bool) -> Memory:
         layout, n = self.layout, self.n_robots
         n_rows = len(layout.row_tendon)
@@ -112,10 +116,9 @@ class Passes:
         probes: Probes = NO_PROBES,
     ) -> None:
         """One forward pass of these robots (`kernels.batch`)."""
-        follower, n_probes = len(ports.follower_force) > 0, probes.node.shape[1]
+        n_probes = probes.node.shape[1]
         if n_col is None:
-            tracked = 3 if len(self.memory.force_before) and not follower else 0
-            n_col = self.n_x + (3 * n_probes if n_probes else tracked)
+            n_col = self.n_x + 3 * n_probes if n_probes else self.n_columns(ports)
         parts = 1 if len(rows) <= _SMALL else min(self.threads, -(-len(rows) // LANES))
         size = scratch_size(len(self.layout.tendon_segment), self.n_x, n_col, self.n_residuals(ports), n_probes)
         scratch = np.empty((parts, size))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from copy import copy
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -53,6 +53,52 @@ class Linear:
         All but those of lengths come from central differences of the pass at fixed unknowns, as rows of one batch. `relocate` tells
         what an extension moves besides itself.
         """
+        moved, delta, pulled = self._spread(turning)
+        (m, n), n_rows = delta.shape, len(self.rows)
+
+        def respond(copies: slice, columns: bool) -> tuple[Response, Shape]:
+            twin, k = self._copies({name: a[copies] for name, a in moved.items()}, relocate), len(moved["extension"][copies])
+            response, shape = twin.respond(columns)
+            return Response(*(_split(a, k) for a in response)), Shape(*(_split(a, k) for a in shape))
+
+        if n_rows * (1 + 2 * m) <= LANES:  # as fast as without the differences
+            return self._combine(*respond(slice(None), True), delta, pulled)
+        by_residual = self._close(self.respond()[0])
+        by_input, error = np.empty((m, n, 6)), np.empty((m, n, by_residual.shape[2]))
+        per = m if 2 * m * n_rows <= _ROWS else 1
+        for j in range(0, m, per):
+            response, shape = respond(slice(1 + 2 * j, 1 + 2 * (j + per)), False)
+            some = slice(j, j + per)
+            by_input[some], error[some] = _differences(response, shape.tip_position, shape.tip_rotation, delta[some])
+        return self._arrange(by_residual, by_input, error, pulled)
+
+    def fits(self, turning: bool) -> bool:
+        """`step` is one pass with all its differences."""
+        layout = self.passes.layout
+        m = len(layout.tendon_segment) - len(layout.row_tendon) + len(layout.first_tendon) + (3 if turning else 0)
+        return 0 < len(self.rows) * (1 + 2 * m) <= LANES
+
+    def step(
+        self, relocate: Relocate | None, turning: bool, outputs: Literal["full", "tip"], process: float, noise: float
+    ) -> tuple[Shape, Floats]:
+        """An observer pass of all robots that updates them, and the Jacobian at the shape that it hands out, in one: the differences
+        ride in the lanes that a few robots leave empty."""
+        passes = self.passes
+        moved, delta, pulled = self._spread(turning)
+        k, n = 1 + 2 * len(delta), passes.n_robots
+        twin = self._copies(moved, relocate)
+        n_e, n_col = passes.n_residuals(self.ports), passes.n_columns(self.ports)
+        response = Response(np.empty((k * n, n_e, n_col)), np.empty((k * n, 6, n_col)), np.empty((k * n, n_e)))
+        shape = twin.passes.new_shape(outputs, False)
+        twin.passes.run(twin.rows, twin.ports, shape, response=response, feed=True, carry=passes.carry, process=process, noise=noise)
+        for own, a in zip(passes.memory, twin.passes.memory, strict=True):
+            own[:] = a[: len(own)]
+        jacobian = self._combine(Response(*(_split(a, k) for a in response)), Shape(*(_split(a, k) for a in shape)), delta, pulled)
+        return Shape(*(a[: len(a) // k] for a in shape)), jacobian
+
+    def _spread(self, turning: bool) -> tuple[dict[str, Floats], Floats, list[int]]:
+        """Ports of 1 + 2 m copies, as they are and then forward and back by each input (1 + 2 m, n, ...), by how much (m, n), and the
+        tendons whose input is a tension."""
         layout, params, ports, n = self.passes.layout, self.passes.params, self.ports, self.passes.n_robots
         n_tendons, n_segments = len(layout.tendon_segment), len(layout.first_tendon)
         held = layout.row_tendon.tolist()
@@ -62,7 +108,6 @@ class Linear:
         delta = np.full((m, n), 1e-4)
         delta[: len(pulled)] *= params.tension_scale
         delta[len(pulled) : n_inputs] *= params.reach
-        # copy 0 as it is, then forward and back by each input
         moved = {name: np.empty((1 + 2 * m, n, getattr(ports, name).shape[1])) for name in ("tension", "extension", "base_pose")}
         for name, a in moved.items():
             a[:] = getattr(ports, name)
@@ -73,24 +118,19 @@ class Linear:
         if turning:
             turns = moved["base_pose"][1 + 2 * n_inputs :, :, 3:]
             turns[:] = (_TURNS @ turns[..., None])[..., 0] / math.sqrt(1.0 + 0.25e-8)
+        return moved, delta, pulled
 
-        def respond(copies: slice, columns: bool) -> tuple[Response, Shape]:
-            return self._copies({name: a[copies] for name, a in moved.items()}, relocate, columns)
+    def _combine(self, response: Response, shape: Shape, delta: Floats, pulled: list[int]) -> Floats:
+        """The Jacobian from the copies of `_spread`."""
+        by_residual = self._close(Response(*(a[0] for a in response)))
+        differences = _differences(Response(*(a[1:] for a in response)), shape.tip_position[1:], shape.tip_rotation[1:], delta)
+        return self._arrange(by_residual, *differences, pulled)
 
-        if len(self.rows) * (1 + 2 * m) <= LANES:  # as fast as without the differences
-            response, shape = respond(slice(None), True)
-            by_residual = self._close(Response(*(a[0] for a in response)))
-            by_input, error = _differences(Response(*(a[1:] for a in response)), shape.tip_position[1:], shape.tip_rotation[1:], delta)
-        else:
-            by_residual = self._close(self.respond()[0])
-            by_input, error = np.empty((m, n, 6)), np.empty((m, n, by_residual.shape[2]))
-            per = m if 2 * m * len(self.rows) <= _ROWS else 1
-            for j in range(0, m, per):
-                response, shape = respond(slice(1 + 2 * j, 1 + 2 * (j + per)), False)
-                some = slice(j, j + per)
-                by_input[some], error[some] = _differences(response, shape.tip_position, shape.tip_rotation, delta[some])
+    def _arrange(self, by_residual: Floats, by_input: Floats, error: Floats, pulled: list[int]) -> Floats:
+        layout, (m, n) = self.passes.layout, by_input.shape[:2]
+        n_tendons, n_held = len(layout.tendon_segment), len(layout.row_tendon)
         jacobian = np.empty((n, 6, n_tendons + m - len(pulled)))
-        jacobian[:, :, layout.row_tendon] = by_residual[:, :, : len(held)]
+        jacobian[:, :, layout.row_tendon] = by_residual[:, :, :n_held]
         closed = (by_input - np.matmul(by_residual, error[..., None])[..., 0]).transpose(1, 2, 0)
         jacobian[:, :, pulled], jacobian[:, :, n_tendons:] = closed[:, :, : len(pulled)], closed[:, :, len(pulled) :]
         return jacobian
@@ -100,8 +140,8 @@ class Linear:
         n_x = self.passes.n_x
         return np.asarray(response.tip[:, :, :n_x] @ inverse(response.residual[:, :, :n_x]))
 
-    def _copies(self, moved: dict[str, Floats], relocate: Relocate | None, columns: bool) -> tuple[Response, Shape]:
-        """`respond` of k copies, each with its own ports `moved` (k, n, ...), as one pass; the answer has the axis k first."""
+    def _copies(self, moved: dict[str, Floats], relocate: Relocate | None) -> Linear:
+        """k copies as rows of one pass, each with its own ports `moved` (k, n, ...)."""
         passes, (k, n) = self.passes, moved["extension"].shape[:2]
 
         def copied(a: Any) -> Any:
@@ -120,10 +160,7 @@ class Linear:
         twin.memory, twin.params = Memory(*map(copied, passes.memory)), Params(*(a if len(a) == 1 else copied(a) for a in params))
         probes = Probes(*map(copied, self.probes)) if self.probes.node.shape[1] else self.probes
         rows = (self.rows + n * np.arange(k)[:, None]).ravel()
-        response, shape = Linear(twin, rows, ports, probes).respond(columns)
-        return Response(*(a.reshape(k, n, *a.shape[1:]) for a in response)), Shape(
-            *(a.reshape(k, len(a) // k, *a.shape[1:]) for a in shape)
-        )
+        return Linear(twin, rows, ports, probes)
 
     def by_force(self) -> Floats:
         """(n, 6, 3) change of the tip per tip force."""
@@ -135,6 +172,11 @@ class Linear:
             load = load.copy()
             load[:, -3:] -= (params.reach**2 / params.moment_scale)[:, None, None] * np.eye(3)
         return np.asarray(response.tip[:, :, -3:] - response.tip[:, :, :n_x] @ (inverse(free) @ load))
+
+
+def _split(a: Any, k: int) -> Any:
+    """(k, n, ...) of (k n, ...)."""
+    return a.reshape(k, len(a) // k, *a.shape[1:])
 
 
 def _differences(response: Response, p: Floats, r: Floats, delta: Floats) -> tuple[Floats, Floats]:

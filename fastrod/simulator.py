@@ -99,6 +99,7 @@ class Simulator:
         self._ports: Ports | None = None
         self._given = Inputs()
         self._state: State | None = None
+        self._derived: Floats | None = None  # the Jacobian that came with the last step
         if contact is not None and not isinstance(contact, ContactScene):
             raise InputError(f"contact is {contact!r}; give fastrod.contact.ContactScene(obstacles=[...]) or None.")
         self._engine: Engine | None = None
@@ -125,6 +126,7 @@ class Simulator:
         base_pose: ArrayLike | None = None,
         obstacle_pose: Mapping[str, ArrayLike] | None = None,
         obstacle_velocity: Mapping[str, ArrayLike] | None = None,
+        derive: bool = False,
     ) -> State:
         """One observer pass: one forward integration per robot.
 
@@ -145,6 +147,9 @@ class Simulator:
         stays where it was. `obstacle_velocity` name -> (6,) or (n_robots, 6) linear [m/s] and angular [rad/s] velocity of the
         obstacle's origin: slip is then counted by it, and not by how the pose has changed. Robots that touch something take
         as many passes as bring contact and boundary to rest; `state.contacts` tells.
+
+        `derive` says that `jacobian(turning=True)` will be asked for: a robot or two without contact and effects then get it from the
+        same pass, at the shape of the state, at little cost.
         """
         given = Inputs(tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force, follower_tip_force, base_pose)
         if self._engine is not None:
@@ -162,8 +167,13 @@ class Simulator:
         if before is not None:
             stretch(self._passes, rows, ports.extension - before.extension)
         cold_start(rows[~self._warm[rows]], self._layout, self._passes.params, ports, self._passes.memory)
-        shape = self._passes.new_shape(self.outputs, len(rows) < self.n_robots)
-        self._passes.run(rows, ports, shape, feed=True, carry=self._passes.carry, process=process, noise=noise)
+        linear = Linear(self._passes, rows, ports)
+        if derive and self._bare is None and len(rows) == self.n_robots and linear.fits(turning=True):
+            relocate = self._relocated if given.point_force else None
+            shape, self._derived = linear.step(relocate, True, self.outputs, process, noise)
+        else:
+            shape = self._passes.new_shape(self.outputs, len(rows) < self.n_robots)
+            self._passes.run(rows, ports, shape, feed=True, carry=self._passes.carry, process=process, noise=noise)
         finite = np.isfinite(self._passes.memory.x.sum(1))
         ok = finite & (shape.residual < _LOST * self._passes.params.reach)
         passes = np.broadcast_to(np.int64(1 + learns), self.n_robots)
@@ -270,7 +280,7 @@ class Simulator:
     def settle_ports(self, ports: Ports, params: Params, tolerance: float = 1e-9) -> State:
         """`settle` on what the kernel reads, with effects already in it: for those who carry effects over a whole log
         themselves. `params` may have a row for each robot."""
-        self._reader.problems = {}
+        self._reader.problems, self._derived = {}, None
         self._passes.params, self._bare = params, None
         self._passes.remember(False, False, None)
         return self._settle(ports, self._all, tolerance)
@@ -327,6 +337,8 @@ class Simulator:
         direction, so the rod bends under them as it turns.
         """
         _, ports = self._last("jacobian")
+        if self._derived is not None:
+            return self._derived[:, :, : None if turning else -3]
         follows = self._engine is None and bool(self._given.point_force)
         jacobian = self._linear(ports).jacobian(self._relocated if follows else None, turning)
         if self._bare is None:
@@ -417,7 +429,7 @@ class Simulator:
         """Forget the boundary of these robots (all by default): their next step begins from the cold guess, their effects at rest."""
         try:
             which = slice(None) if rows is None else np.asarray(rows)
-            self._warm[which] = False
+            self._warm[which], self._derived = False, None
             self._chain.reset(which)
         except IndexError as error:
             raise InputError(f"rows is {rows!r}; give indices of robots from 0 to {self.n_robots - 1}, or a mask.") from error
@@ -447,6 +459,7 @@ class Simulator:
         if (snapshot.contact is None) != (self._engine is None):
             raise InputError("the snapshot is of another simulator; only one of them has a contact scene.")
         self._passes.memory = _copied(snapshot.memory)
+        self._derived = None
         self._warm, self._given, self._ports, self._state = snapshot.warm.copy(), snapshot.given, snapshot.ports, snapshot.state
         self._passes.params, self._bare, self._chain.time = snapshot.params, snapshot.bare, snapshot.time.copy()
         for link, memory in zip(self._chain.links, snapshot.effects, strict=True):
@@ -456,6 +469,7 @@ class Simulator:
 
     def _read(self, given: Inputs) -> tuple[Ports, Ints]:
         """The ports, and the robots whose inputs are good."""
+        self._derived = None
         ports = self._reader.ports(given)
         self._given = given
         problems = self._reader.problems

@@ -216,10 +216,11 @@ class SoftTip:
         return jacobian
 
     def _move(self, q: Floats, pose: Floats, settle: bool, loads: dict[str, Any]) -> State:
-        move = self.simulator.settle if settle else self.simulator.step
         inputs = self.actions.matrix @ q[self.n_base :] + self._rest  # `SegmentActions.inputs`, of what is known to be good
         n = len(inputs) - len(self.actions.offset)
-        return move(inputs[:n], extension=inputs[n:], base_pose=pose, **loads)
+        if settle:
+            return self.simulator.settle(inputs[:n], extension=inputs[n:], base_pose=pose, **loads)
+        return self.simulator.step(inputs[:n], extension=inputs[n:], base_pose=pose, derive=True, **loads)
 
     def _carried(self, q: Floats) -> Floats:
         """(7,) world_from_base that follows from q."""
