@@ -213,3 +213,14 @@ def test_fcl_is_asked_about_the_same_distances() -> None:
         answer = touching.ask_fcl(touching.questions(timed, obstacle, pose, [i]))
         assert answer == pytest.approx(chords, abs=1e-4)  # capsules of 1e-6 m, and the iteration of libccd
     assert touching.fcl_seconds(timed, obstacle, pose, 2)[1] == 2
+
+
+def test_the_control_bench_runs_and_both_ways_follow_the_path(capsys: pytest.CaptureFixture[str]) -> None:
+    import bench_control
+
+    assert bench_control.main(["--quick", "--json"]) == 0
+    (section,) = json.loads(capsys.readouterr().out)["sections"]
+    exact, differences = section["rows"]
+    assert exact["way"] == "analytic"
+    assert exact["ratio"] > 1.0
+    assert max(exact["error_m"], differences["error_m"]) < 1e-3

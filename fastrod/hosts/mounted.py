@@ -77,7 +77,13 @@ class MountedRod:
         return state
 
     def begin(self, **inputs: Any) -> State:
-        """Where the rod will be at the end of the next step; its wrench goes to the host, its pushes to what it touches."""
+        """Where the rod will be at the end of the next step; its wrench goes to the host, its pushes to what it touches.
+
+        In a step that cannot be solved (`state.ok` is false, and `state.problems` says why) the rod stands where it came to, and the
+        forces of the step before act once more. Raises `HostError` where the rod is lost, or the world's time step has changed.
+        """
+        if self.bullet.dt != self.dt:
+            raise HostError(f"the world's time step is now {self.bullet.dt:g} s, and the rod was mounted for {self.dt:g} s; mount it anew.")
         self._inputs = self._inputs | inputs
         if self.state is None:
             self.settle()
@@ -85,11 +91,15 @@ class MountedRod:
         base = self.host.motion().after(self.dt)
         state = self.simulator.step(base_pose=base, **self._scene(poses, velocities), **self._inputs)
         self._keep(state)
-        self.wrench = state.base_wrench[0].copy()
-        for touched in self.touched:
-            more, point = touched.push(*_pushes(state, touched))
-            self.wrench[:3] -= more[:3]
-            self.wrench[3:] -= more[3:] + np.cross(point - base[:3], more[:3])
+        if state.ok[0]:
+            self.wrench = state.base_wrench[0].copy()
+            for touched in self.touched:
+                more, point = touched.push(*_pushes(state, touched))
+                self.wrench[:3] -= more[:3]
+                self.wrench[3:] -= more[3:] + np.cross(point - base[:3], more[:3])
+        else:
+            for touched in self.touched:
+                touched.push_again()
         self.host.exert(self.wrench)
         self.bodies.head_for(*self._nodes(state), self.dt)
         return state
@@ -115,10 +125,10 @@ class MountedRod:
     def _surroundings(self) -> tuple[dict[str, Floats], dict[str, Floats]]:
         poses: dict[str, Floats] = {}
         velocities: dict[str, Floats] = {}
-        for touched in self.touched:
+        for k, touched in enumerate(self.touched):
             p, v = touched.expected()
             for name in touched.names:
-                self.simulator.set_free(name, *touched.give(), body=touched.body)
+                self.simulator.set_free(name, *touched.give(), body=k)
             poses |= p
             velocities |= v
         return poses, velocities

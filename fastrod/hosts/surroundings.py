@@ -100,13 +100,17 @@ class Touched:
         if (wrench + more)[:3] @ along <= 0.0:
             more = -wrench  # contact pushes, it does not hold
         self._before, self.exerted = wrench, wrench + more
-        if self.exerted.any():
-            exert(self.bullet, self.body, self.link, self.exerted, com)
+        self.push_again()
         return more, com
+
+    def push_again(self) -> None:
+        """Exert the last forces once more."""
+        if self.exerted.any():
+            exert(self.bullet, self.body, self.link, self.exerted, self._com().pose[:3])
 
     def forget(self) -> None:
         """The body was put somewhere else: no force carries over."""
-        self._before = np.zeros(6)
+        self._before, self.exerted = np.zeros(6), np.zeros(6)
 
 
 def _com_motion(bullet: Bullet, body: int, link: int) -> Motion:

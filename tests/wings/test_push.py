@@ -158,3 +158,33 @@ def test_what_cannot_be_touched_is_a_sentence():
         sim.set_free("wall", -1.0, np.eye(3), np.zeros(3))
     with pytest.raises(UnknownNameError, match=r"no obstacle 'wal'; did you mean 'wall'\?"):
         sim.set_free("wal", 1.0, np.eye(3), np.zeros(3))
+
+
+def test_step_that_cannot_be_solved_repeats_the_last_forces(monkeypatch):
+    from dataclasses import replace
+
+    world, robot = empty_world(), soft_robot()
+    box = cube(world, SIZE, MASS, END["axial"])
+    link = carrier(world, "x")
+    rod = MountedRod(robot, link, touch=[box])
+    rod.settle(tendon_length=robot.rest_tendon_length)
+    impulse, solved = np.zeros(3), rod.simulator.step
+    for k in range(30):
+        carry(link, [SPEED * k * world.dt, 0.0, 0.0], [SPEED, 0.0, 0.0])
+        if k == 8:  # while it presses
+            monkeypatch.setattr(rod.simulator, "step", lambda *a, **b: replace(solved(*a, **b), ok=np.array([False])))
+        elif k == 10:
+            monkeypatch.undo()
+        rod.step()
+        impulse += world.dt * rod.wrench[:3]
+    assert np.linalg.norm(impulse) > 0.5 * MASS * SPEED
+    np.testing.assert_allclose(MASS * np.array(world.getBaseVelocity(box)[0]), -impulse, atol=1e-9)
+
+
+def test_time_step_that_changes_is_a_sentence():
+    world, robot = empty_world(), soft_robot()
+    rod = MountedRod(robot, carrier(world))
+    rod.step(tendon_length=robot.rest_tendon_length)
+    world.setTimeStep(0.002)
+    with pytest.raises(HostError, match=r"the world's time step is now 0.002 s, and the rod was mounted for 0.005 s; mount it anew\."):
+        rod.step()
