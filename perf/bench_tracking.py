@@ -70,9 +70,11 @@ class Reach:
         goals = path.position(np.arange(POINTS + 1) * path.period / POINTS) - start
         found, last = 0, None
         for goal in goals:
-            x, y = goal[:2] / max(float(np.hypot(*goal[:2])), 1e-9)
+            away = float(np.hypot(*goal[:2]))
+            x, y = goal[:2] / away if away > 1e-6 else (1.0, 0.0)
             bent = np.array([self.high[0], self.bend * x, -self.bend * y, self.high[0], 0.0, 0.0])
-            starts = [self.straight, bent] if last is None else [last, bent, self.straight]
+            folded = self.bend * np.array([0.0, 0.6 * x, -0.6 * y, 0.0, -1.2 * x, 1.2 * y])  # short, its tip near the axis
+            starts = [bent, folded, self.straight] if last is None else [last, bent, folded, self.straight]
             q = next((q for q in (self.solve(goal, start) for start in starts) if q is not None), None)
             found, last = found + (q is not None), q if q is not None else last
             if whole and q is None:
@@ -167,7 +169,7 @@ def tracking_sections(quick: bool, dt: float | None) -> list[Section]:
             "A period is 20 s. The goal is on the path from t = 0 on, the tip rests at the path's center (soft alone: straight below its "
             "base). With the approach: the first 20 s from the jump on; after it: 20 s from t = 2 s on.",
             "Soft alone: the UR5's joints are held, the base is above the center. In reach: part of the full-size path that inverse "
-            "kinematics reaches from the best height; then the largest scale at which it reaches all, in steps of 0.05.",
+            "kinematics finds from the best height; then the largest scale at which it finds all, in steps of 0.05.",
             "The paper moves both; its figures are those of SoftManiSim (CoRL 2024).",
         ]),
         Section("motion", "Who moves the tip, after the approach", shares, rows, [
