@@ -92,6 +92,7 @@ class Linear:
         shape = twin.passes.new_shape(outputs, False)
         twin.passes.run(twin.rows, twin.ports, shape, response=response, feed=True, carry=passes.carry, process=process, noise=noise)
         own: Any
+        a: Any
         for own, a in zip(passes.memory, twin.passes.memory, strict=True):
             own[:] = a[: len(own)]
         jacobian = self._combine(Response(*(_split(a, k) for a in response)), Shape(*(_split(a, k) for a in shape)), delta, pulled)
