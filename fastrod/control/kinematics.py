@@ -193,24 +193,29 @@ class SoftTip:
 
     def finite_differences(self, q: ArrayLike, step: float = 1e-4, **loads: Any) -> Floats:
         """(3, n_q) the paper's way to the same (SoftManiSim, CoRL 2024): central differences of the settled tip, a column after the
-        other, by `step` [m or rad]. The simulator is left as it was. Raises `InputError`, also where an end does not settle; a `step`
-        beyond the range of an extension is one such."""
+        other, by `step` [m or rad]; one-sided at an end of an extension's range, zero where there is no range. The simulator is left as it
+        was. Raises `InputError`, also where an end does not settle."""
         q = self._read(q)
         if not isinstance(step, (int, float, np.floating)) or not (math.isfinite(step) and step > 0.0):
             raise InputError(f"step is {step!r}; it must be a number, positive and finite.")
         before = self.simulator.snapshot()
-        jacobian = np.empty((3, self.n_q))
+        jacobian = np.zeros((3, self.n_q))
+        low, high = np.full(self.n_q, -np.inf), np.full(self.n_q, np.inf)
+        for k, segment in enumerate(self.actions.robot.segments):
+            low[self.n_base + 3 * k], high[self.n_base + 3 * k] = segment.extension
         try:
             for j in range(self.n_q):
-                ends = []
-                for sign in (1.0, -1.0):
+                ends, at = [], np.clip([q[j] + step, q[j] - step], low[j], high[j])
+                if at[0] == at[1]:
+                    continue
+                for value in at:
                     moved = q.copy()
-                    moved[j] += sign * step
+                    moved[j] = value
                     state = self._move(moved, self._carried(moved), True, loads)
                     if not state.ok[0]:
-                        raise InputError(f"q[{j}] moved by {sign * step:g} does not settle: {state.problems[0]}")
+                        raise InputError(f"q[{j}] moved to {value:g} does not settle: {state.problems[0]}")
                     ends.append(state.tip_position[0])
-                jacobian[:, j] = (ends[0] - ends[1]) / (2.0 * step)
+                jacobian[:, j] = (ends[0] - ends[1]) / (at[0] - at[1])
         finally:
             self.simulator.restore(before)
         return jacobian

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fastrod.errors import HostError, InputError, nearest
-from fastrod.hosts.bullet import Bullet, pybullet
+from fastrod.hosts.bullet import Bullet
 from fastrod.hosts.link import to_xyzw
 from fastrod.types import Flags, Floats, Ints
 
@@ -77,9 +77,13 @@ class BulletArm:
         flags = b.URDF_USE_INERTIA_FROM_FILE
         try:
             body = b.loadURDF(str(path), pose[:3].tolist(), to_xyzw(pose[3:]).tolist(), useFixedBase=True, flags=flags)
-        except pybullet().error as error:
+        except HostError as error:
             raise HostError(f"PyBullet cannot load {str(path)!r}; is it the path of a URDF file?") from error
-        return cls(b, body, tip, joints)
+        try:
+            return cls(b, body, tip, joints)
+        except Exception:
+            b.removeBody(body)
+            raise
 
     def position(self) -> Floats:
         """(n_joints,) measured [rad or m]."""
@@ -100,8 +104,9 @@ class BulletArm:
     def drive(self, q: ArrayLike, q_dot: ArrayLike | None = None) -> None:
         """Let the motors move the joints during the next steps, no stronger than `effort`, no faster than `velocity_limit`.
 
-        Without `q_dot` the next step ends at q, and later ones stay there. With it, q is where the joints should be now and `q_dot` how
-        fast they go: the next step ends at q + dt q_dot; give both anew before each step. Raises `InputError`.
+        Without `q_dot` the next step ends at q where limits and effort allow, and later ones stay there. With it, q is where the joints
+        should be now and `q_dot` how fast they go: the next step ends at q + dt q_dot; give both anew before each step. Raises
+        `InputError`.
         """
         to = self._inside(q, "q").tolist()
         rate = [0.0] * self.n_joints if q_dot is None else self._checked(q_dot, "q_dot").tolist()

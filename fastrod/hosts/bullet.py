@@ -5,10 +5,13 @@ from __future__ import annotations
 import functools
 import os
 import sys
+from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
-from fastrod.errors import HostError
+import numpy as np
+
+from fastrod.errors import HostError, InputError, nearest
 
 
 def pybullet() -> Any:
@@ -42,11 +45,27 @@ class Bullet:
             raise HostError(f"PyBullet has no world {number}; connect first, for example with fastrod.hosts.connect().")
 
     def __getattr__(self, name: str) -> Any:
-        value = getattr(pybullet(), name)
+        module = pybullet()
+        try:
+            value = getattr(module, name)
+        except AttributeError:
+            raise AttributeError(f"PyBullet has no {name!r}; {nearest(name, dir(module))}") from None
         if callable(value):
-            value = functools.partial(value, physicsClientId=self.number)
+            value = self._bound(name, value, module.error)
         self.__dict__[name] = value  # asked once
         return value
+
+    def _bound(self, name: str, function: Callable[..., Any], error: type[Exception]) -> Callable[..., Any]:
+        @functools.wraps(function)
+        def call(*args: Any, **options: Any) -> Any:
+            try:
+                return function(*args, physicsClientId=self.number, **options)
+            except error as what:
+                if not pybullet().isConnected(physicsClientId=self.number):
+                    raise HostError(f"PyBullet's world {self.number} has been disconnected.") from what
+                raise HostError(f"PyBullet refused {name}: {str(what).rstrip('.')}; is the body still in the world?") from what
+
+        return call
 
     @property
     def dt(self) -> float:
@@ -59,12 +78,11 @@ class Bullet:
         if body not in known:
             raise HostError(f"this PyBullet world has no body {body!r}; it has {sorted(known) or 'none'}.")
         if not -1 <= link < (n := self.getNumJoints(body)):
-            raise HostError(f"body {body} has no link {link!r}; -1 is its base, links are numbered from 0 to {n - 1}.")
+            others = f"links are numbered from 0 to {n - 1}" if n else "it has no others"
+            raise HostError(f"body {body} has no link {link!r}; -1 is its base, {others}.")
 
     def link_named(self, body: int, name: str) -> int:
         """Number of the link of this name; `HostError` with the nearest one."""
-        from fastrod.errors import nearest
-
         self.check(body)
         names = {self.getJointInfo(body, j)[12].decode(): j for j in range(self.getNumJoints(body))}
         names[self.getBodyInfo(body)[0].decode()] = -1
@@ -76,9 +94,13 @@ class Bullet:
 def connect(*, gui: bool = False, dt: float = 0.005, gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)) -> Bullet:
     """A new, empty world with time step `dt` [s] and `gravity` [m/s^2]; headless unless `gui`.
 
-    `HostError` for a GUI without a display: PyBullet itself would end the process.
+    `HostError` for a GUI without a display: PyBullet itself would end the process. `InputError` on wrong numbers.
     """
     module = pybullet()
+    if not isinstance(dt, (int, float)) or not 0.0 < dt < 1.0:
+        raise InputError(f"dt is {dt!r} s; it must be positive, usually 0.001 to 0.01.")
+    if np.shape(gravity) != (3,) or not np.isfinite(gravity).all():
+        raise InputError(f"gravity is {gravity!r}; give three numbers, world [m/s^2], for example (0, 0, -9.81).")
     if gui and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
         raise HostError("PyBullet's GUI needs a display, and DISPLAY is not set; leave gui=False (headless), or start an X server.")
     number = module.connect(module.GUI if gui else module.DIRECT)

@@ -8,7 +8,7 @@ from typing import Any, final
 import numpy as np
 
 from fastrod.contact import ContactScene
-from fastrod.errors import HostError, InputError
+from fastrod.errors import HostError, InputError, nearest
 from fastrod.hosts.bodies import RodBodies
 from fastrod.hosts.link import BulletLink
 from fastrod.hosts.surroundings import Touched
@@ -16,6 +16,10 @@ from fastrod.robot import Robot
 from fastrod.simulator import Simulator
 from fastrod.state import State
 from fastrod.types import Floats
+
+_INPUTS = ("tendon_length", "tension", "extension", "tip_force", "tip_moment", "line_force", "point_force", "follower_tip_force")
+_PATIENCE = 2  # steps that fail before the rod settles anew
+_MOST_FAILED = 25
 
 
 @final
@@ -34,14 +38,17 @@ class MountedRod:
         points_per_segment: int = 10, capsules_per_segment: int = 10, max_contacts: int = 16,
         color: Sequence[float] = (0.5, 0.0, 0.6, 1.0), head_color: Sequence[float] | None = None,
     ) -> None:  # fmt: skip
-        """`touch`: bodies, each its base alone, or (body, link); `friction` of the rod on them; `relaxation` [s] of the rod against a
-        changing contact force (`Touched`). The time step is the world's. Raises `HostError`, `InputError`."""
+        """`touch`: numbers of bodies, each its base alone, or (body, link); `friction` of the rod on them; `relaxation` [s] of
+        the rod against a changing contact force (`Touched`). The time step is the world's. Raises `HostError`, `InputError`."""
+        if not isinstance(host, BulletLink):
+            raise HostError(f"host is {host!r}; give BulletLink(world, body, link), the link that carries the rod.")
         self.host, self.bullet, self.dt = host, host.bullet, host.bullet.dt
-        if points_per_segment % capsules_per_segment:
+        if capsules_per_segment < 1 or points_per_segment % capsules_per_segment:
             raise InputError(f"{capsules_per_segment} capsules for {points_per_segment} points of a segment; give a divisor of the points.")
-        if not relaxation >= 0.0:
-            raise InputError(f"relaxation is {relaxation!r} s; it must be zero or positive.")
-        links = [(t, -1) if isinstance(t, int) else t for t in touch]
+        for name, value, unit in (("relaxation", relaxation, " s"), ("friction", friction, "")):
+            if not isinstance(value, (int, float, np.floating)) or not 0.0 <= value < np.inf:
+                raise InputError(f"{name} is {value!r}{unit}; it must be a number, zero or positive.")
+        links = [_link_of(t) for t in touch]
         self.touched = [Touched(self.bullet, body, link, dt=self.dt, relaxation=relaxation, friction=friction) for body, link in links]
         scene = None
         if self.touched:
@@ -58,19 +65,24 @@ class MountedRod:
         """After the last step."""
         self.wrench: Floats = np.zeros(6)
         """Force [N] and moment about the base point [N m] that the host felt in the last step, world."""
-        self._inputs: dict[str, Any] = {}
+        wires = any(segment.mode in ("tendon_length", "paper") for segment in robot.segments)
+        self._inputs: dict[str, Any] = {"tendon_length": robot.rest_tendon_length} if wires else {}
+        self._failed = 0
 
     def settle(self, **inputs: Any) -> State:
-        """Bring the rod to rest where its host is now; inputs as for `Simulator.step`, without base_pose. The host feels nothing yet."""
-        self._inputs = self._inputs | inputs
-        poses, velocities = self._surroundings()
-        state = self.simulator.settle(base_pose=self.host.motion().pose, **self._scene(poses, velocities), **self._inputs)
-        self._keep(state)
+        """Bring the rod to rest where its host is now; inputs as for `step`. The host feels nothing yet."""
+        inputs = self._merged(inputs)
+        state = self.simulator.settle(base_pose=self.host.motion().pose, **self._scene(), **inputs)
+        self._keep(state, inputs)
         self.bodies.place(*self._nodes(state))
         return state
 
     def step(self, **inputs: Any) -> State:
-        """One step of rod and world together; what is not given stays as it was commanded last."""
+        """One step of rod and world together.
+
+        Inputs as for `Simulator.step`, but base and obstacles, which the world gives; what is not given stays as it was commanded last,
+        and the wires are those of the straight robot until then.
+        """
         state = self.begin(**inputs)
         self.bullet.stepSimulation()
         self.end()
@@ -79,18 +91,31 @@ class MountedRod:
     def begin(self, **inputs: Any) -> State:
         """Where the rod will be at the end of the next step; its wrench goes to the host, its pushes to what it touches.
 
-        In a step that cannot be solved (`state.ok` is false, and `state.problems` says why) the rod stands where it came to, and the
-        forces of the step before act once more. Raises `HostError` where the rod is lost, or the world's time step has changed.
+        A step that cannot be solved (`state.ok` is false, and `state.problems` says why) leaves the rod where it came to, with half the
+        forces of the step before; after a few in a row, without contact at once, the rod settles anew. Raises `InputError` as
+        `Simulator.step`, `HostError` where the rod is lost, where 25 steps in a row cannot be solved, or where the world's time step has
+        changed.
         """
         if self.bullet.dt != self.dt:
-            raise HostError(f"the world's time step is now {self.bullet.dt:g} s, and the rod was mounted for {self.dt:g} s; mount it anew.")
-        self._inputs = self._inputs | inputs
+            raise HostError(
+                f"the world's time step is now {self.bullet.dt:g} s, and the rod was mounted for {self.dt:g} s; "
+                "remove() it and mount it anew."
+            )
+        inputs = self._merged(inputs)
         if self.state is None:
-            self.settle()
-        poses, velocities = self._surroundings()
-        base = self.host.motion().after(self.dt)
-        state = self.simulator.step(base_pose=base, **self._scene(poses, velocities), **self._inputs)
-        self._keep(state)
+            self.settle(**inputs)
+        scene, base = self._scene(), self.host.motion().after(self.dt)
+        state = self.simulator.step(base_pose=base, **scene, **inputs)
+        if not state.ok[0] and (not self.touched or self._failed >= _PATIENCE):
+            self.simulator.reset()
+            state = self.simulator.settle(base_pose=base, **scene, **inputs)
+        self._keep(state, inputs)
+        self._failed = 0 if state.ok[0] else self._failed + 1
+        if self._failed > _MOST_FAILED:
+            raise HostError(
+                f"{self._failed} steps in a row could not be solved, the last: {state.problems.get(0)} "
+                "Move host, bodies and inputs by less in a step, or after a jump call reset()."
+            )
         if state.ok[0]:
             self.wrench = state.base_wrench[0].copy()
             for touched in self.touched:
@@ -98,8 +123,9 @@ class MountedRod:
                 self.wrench[:3] -= more[:3]
                 self.wrench[3:] -= more[3:] + np.cross(point - base[:3], more[:3])
         else:
+            self.wrench = 0.5 * self.wrench
             for touched in self.touched:
-                touched.push_again()
+                touched.push_half()
         self.host.exert(self.wrench)
         self.bodies.head_for(*self._nodes(state), self.dt)
         return state
@@ -111,18 +137,33 @@ class MountedRod:
         self.bodies.place(*self._nodes(self.state))
 
     def reset(self) -> None:
-        """Forget the rod's state and its contacts; the next step settles where the host then is."""
+        """Forget the rod's shape and its contacts, but not its inputs: after the host or a body was put somewhere else. The next step
+        settles where the host then is."""
         self.simulator.reset()
-        self.state = None
+        self.state, self._failed = None, 0
         for touched in self.touched:
             touched.forget()
 
-    def _keep(self, state: State) -> None:
+    def remove(self) -> None:
+        """Take the rod's capsules out of the world."""
+        self.bodies.remove()
+
+    def _merged(self, inputs: dict[str, Any]) -> dict[str, Any]:
+        for name in inputs:
+            if name not in _INPUTS:
+                why = "the host gives it" if name == "base_pose" else nearest(name, _INPUTS)
+                raise InputError(f"a mounted rod has no input {name!r}; {why}")
+        return self._inputs | inputs
+
+    def _keep(self, state: State, inputs: dict[str, Any]) -> None:
         if not np.isfinite(state.tip_position).all() or not np.isfinite(state.base_wrench).all():
             raise HostError(f"the rod is lost: {state.problems.get(0, 'its shape is not finite')}")
-        self.state = state
+        self.state, self._inputs = state, inputs
 
-    def _surroundings(self) -> tuple[dict[str, Floats], dict[str, Floats]]:
+    def _scene(self) -> dict[str, Any]:
+        """What the simulator is told of the bodies around."""
+        if not self.touched:
+            return {}
         poses: dict[str, Floats] = {}
         velocities: dict[str, Floats] = {}
         for k, touched in enumerate(self.touched):
@@ -131,13 +172,18 @@ class MountedRod:
                 self.simulator.set_free(name, *touched.give(), body=k)
             poses |= p
             velocities |= v
-        return poses, velocities
-
-    def _scene(self, poses: dict[str, Floats], velocities: dict[str, Floats]) -> dict[str, Any]:
-        return {"obstacle_pose": poses, "obstacle_velocity": velocities} if self.touched else {}
+        return {"obstacle_pose": poses, "obstacle_velocity": velocities}
 
     def _nodes(self, state: State) -> tuple[Floats, Floats]:
         return state.position[0, :: self._stride], state.rotation[0, :: self._stride]
+
+
+def _link_of(touch: object) -> tuple[int, int]:
+    """Body and link."""
+    pair = touch if isinstance(touch, (tuple, list)) else (touch, -1)
+    if len(pair) != 2 or not all(isinstance(i, (int, np.integer)) and not isinstance(i, bool) for i in pair):
+        raise HostError(f"touch holds {touch!r}; give the number of a body, or (body, link).")
+    return int(pair[0]), int(pair[1])
 
 
 def _pushes(state: State, touched: Touched) -> tuple[Floats, Floats]:

@@ -116,9 +116,9 @@ def turn_of(name: str, turn: ArrayLike) -> Floats:
 
 
 def numbers(name: str, value: ArrayLike, *lengths: int) -> Floats:
-    """A vector of one of these lengths. Raises `InputError`."""
+    """A vector of one of these lengths, columns and rows too. Raises `InputError`."""
     try:
-        v = np.array(value, dtype=float)
+        v = np.atleast_1d(np.squeeze(np.array(value, dtype=float)))
     except (TypeError, ValueError):
         v = np.empty(0)
     if v.ndim != 1 or len(v) not in lengths:

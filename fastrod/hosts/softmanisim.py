@@ -41,6 +41,11 @@ class SoftManiSim:
     The shape is the settled model without contact: objects do not bend the robot. Its bodies move at their true velocity, so an
     object is pushed at the robot's speed. Several robots may share a world, and several worlds a process.
 
+    What differs for users of the paper's public code (SoftRobotBasicEnvironment): `gui` is False by default; the second value of
+    `move_robot_ori` holds poses, as the first does; `calc_tip_pos` gives the tip's orientation; actions must be complete (there, zeros
+    are put in front of a short one); in `add_a_cube` the orientation comes second, as in table 8 (the code has size there); suction
+    releases; fingers hold; images are RGB with depth in metres.
+
     Source: Kasaei, Kasaei and Khadem, SoftManiSim, CoRL 2024, table 8.
     """
 
@@ -61,8 +66,10 @@ class SoftManiSim:
             if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
                 raise InputError(f"{name} is {value!r}; it must be a whole number, at least {least}.")
         for name, size, unit in (("body_sphere_radius", body_sphere_radius, "m"), ("max_speed", max_speed, "m/s")):
-            if not 0.0 < size < math.inf:
+            if not isinstance(size, (int, float, np.number)) or not 0.0 < size < math.inf:
                 raise InputError(f"{name} is {size!r} {unit}; it must be positive and finite.")
+        if robot is not None and not isinstance(robot, Robot):
+            raise InputError(f"robot is {robot!r}; give a Robot, for example fastrod.load_robot('prototype').")
         self._robot = robot or paper_robot(int(number_of_segment), body_sphere_radius)
         self._shapes = Shapes(self._robot, int(number_of_sphere))
         self._own_world = bullet is None
@@ -144,7 +151,7 @@ class SoftManiSim:
 
     def wait(self, sec: float) -> None:
         """Advance the world by `sec` [s], at least one step, with the robot at rest. Raises `InputError`."""
-        if not 0.0 <= sec < math.inf:
+        if not isinstance(sec, (int, float, np.number)) or not 0.0 <= sec < math.inf:
             raise InputError(f"sec is {sec!r}; it must be a time in seconds, zero or positive.")
         for _ in range(max(1, round(sec / self.bullet.dt))):
             self._step()
@@ -194,14 +201,17 @@ class SoftManiSim:
         self, pos: ArrayLike, ori: ArrayLike = (0.0, 0.0, 0.0, 1.0), size: ArrayLike = (0.1, 0.1, 0.1), mass: float = 0.1,
         color: Sequence[float] = (1.0, 1.0, 0.0, 1.0), textureUniqueId: int | None = None,
     ) -> int:  # fmt: skip
-        """A box of `size` (3,) [m] and `mass` [kg], 0 for one that never moves, at `pos` (3,) world [m], turned by `ori`, a quaternion
-        x y z w or three Euler angles [rad]; the body's id. Moves without damping. Raises `InputError`."""
+        """A box of `size` (3,) [m] and `mass` [kg], 0 for one that never moves, at `pos` (3,) world [m], turned by `ori` (4,), a
+        quaternion x y z w; the body's id. Moves without damping. Raises `InputError`."""
         b, half = self.bullet, 0.5 * numbers("size", size, 3)
         if not (half > 0.0).all():
             raise InputError(f"size is {size!r} m; three edge lengths must be positive.")
-        if not 0.0 <= mass < math.inf:
+        if not isinstance(mass, (int, float, np.number)) or not 0.0 <= mass < math.inf:
             raise InputError(f"mass is {mass!r} kg; it must be zero or positive.")
-        position, turn = numbers("pos", pos, 3).tolist(), to_xyzw(turn_of("ori", ori)).tolist()
+        position = numbers("pos", pos, 3).tolist()
+        if np.size(ori) == 3:
+            raise InputError(f"ori is {ori!r}; it must be a quaternion x y z w. The size comes third: add_a_cube(pos, ori, size, mass).")
+        turn = to_xyzw(turn_of("ori", ori)).tolist()
         shape = b.createCollisionShape(b.GEOM_BOX, halfExtents=half.tolist())
         seen = b.createVisualShape(b.GEOM_BOX, halfExtents=half.tolist(), rgbaColor=numbers("color", color, 4).tolist())
         body: int = b.createMultiBody(mass, shape, seen, position, turn)

@@ -100,11 +100,15 @@ class Touched:
         if (wrench + more)[:3] @ along <= 0.0:
             more = -wrench  # contact pushes, it does not hold
         self._before, self.exerted = wrench, wrench + more
-        self.push_again()
+        self._exert()
         return more, com
 
-    def push_again(self) -> None:
-        """Exert the last forces once more."""
+    def push_half(self) -> None:
+        """Exert half of the last forces: for a step in which the rod's are not known."""
+        self._before, self.exerted = 0.5 * self._before, 0.5 * self.exerted
+        self._exert()
+
+    def _exert(self) -> None:
         if self.exerted.any():
             exert(self.bullet, self.body, self.link, self.exerted, self._com().pose[:3])
 

@@ -246,3 +246,19 @@ def test_who_misses_a_step_goes_on_from_the_extension_it_had() -> None:
             alone = one.step(**inputs)
             assert_array_equal(got.tip_position[1], alone.tip_position[0])
             assert got.ok.all()
+
+
+def test_finite_differences_stay_within_the_range_of_an_extension():
+    # the prototype cannot extend: no column to compare; a segment at the end of its range is differenced to one side
+    fixed = SoftTip(Simulator(load_robot("prototype"), points_per_segment=6), MovingBase())
+    q = [0.0, 0.0, 0.0, 0.0, 0.002, -0.001]
+    fixed.place(q, settle=True)
+    columns = [0, 1, 2, 4, 5]
+    np.testing.assert_allclose(fixed.finite_differences(q)[:, columns], fixed.jacobian()[:, columns], rtol=1e-3, atol=1e-4)
+    np.testing.assert_array_equal(fixed.finite_differences(q)[:, 3], 0.0)
+    reacher = load_robot("five_segment_reacher")
+    tip = SoftTip(Simulator(reacher, points_per_segment=6))
+    q = np.zeros(tip.n_q)
+    q[1::3] = 0.002
+    tip.place(q, settle=True)
+    np.testing.assert_allclose(tip.finite_differences(q, step=1e-5)[:, -3], tip.jacobian()[:, -3], rtol=1e-3, atol=1e-3)

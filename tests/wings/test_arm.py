@@ -341,3 +341,10 @@ def test_bad_input(arm: BulletArm, error: type[Exception], sentence: str, do: ob
 
 def test_the_file_ships() -> None:
     assert Path(ur5_path()).is_file()
+
+
+def test_load_that_fails_leaves_nothing_in_the_world():
+    world = connect()
+    with pytest.raises(HostError, match="has no link 'tol0'; did you mean 'tool0'"):
+        BulletArm.load(world, ur5_path(), tip="tol0")
+    assert world.getNumBodies() == 0

@@ -226,10 +226,18 @@ def test_what_is_not_there_is_a_sentence():
         Bullet(9999)
     with pytest.raises(InputError, match=r"3 capsules for 10 points of a segment; give a divisor of the points\."):
         MountedRod(soft_robot(), carrier(world), capsules_per_segment=3)
-    with pytest.raises(InputError, match=r"relaxation is -1 s; it must be zero or positive\."):
+    with pytest.raises(InputError, match=r"relaxation is -1 s; it must be a number, zero or positive\."):
         MountedRod(soft_robot(), carrier(world), relaxation=-1)
     with pytest.raises(HostError, match=r"0 capsules for 0.2 m; give at least one"):
         RodBodies(world, 0.2, 0.01, 0)
+    with pytest.raises(HostError, match=r"^host is 3; give BulletLink\(world, body, link\)"):
+        MountedRod(soft_robot(), 3)
+    with pytest.raises(InputError, match=r"^gravity is 9.81; give three numbers"):
+        connect(gravity=9.81)
+    with pytest.raises(InputError, match=r"^dt is 0 s; it must be positive"):
+        connect(dt=0)
+    with pytest.raises(HostError, match=r"body \d+ has no link 2; -1 is its base, it has no others\."):
+        BulletLink(world, carrier(world).body, 2)
     with pytest.raises(HostError, match=r"end\(\) comes after begin\(\)"):
         MountedRod(soft_robot(), carrier(world)).end()
 

@@ -1,5 +1,7 @@
 """A rod on a host pushes bodies of its world, and both feel it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from bullets import carrier, carry, cube, empty_world, soft_robot
@@ -160,9 +162,7 @@ def test_what_cannot_be_touched_is_a_sentence():
         sim.set_free("wal", 1.0, np.eye(3), np.zeros(3))
 
 
-def test_step_that_cannot_be_solved_repeats_the_last_forces(monkeypatch):
-    from dataclasses import replace
-
+def test_step_that_cannot_be_solved_keeps_action_and_reaction(monkeypatch):
     world, robot = empty_world(), soft_robot()
     box = cube(world, SIZE, MASS, END["axial"])
     link = carrier(world, "x")
@@ -186,5 +186,79 @@ def test_time_step_that_changes_is_a_sentence():
     rod = MountedRod(robot, carrier(world))
     rod.step(tendon_length=robot.rest_tendon_length)
     world.setTimeStep(0.002)
-    with pytest.raises(HostError, match=r"the world's time step is now 0.002 s, and the rod was mounted for 0.005 s; mount it anew\."):
+    with pytest.raises(
+        HostError, match=r"the world's time step is now 0.002 s, and the rod was mounted for 0.005 s; remove\(\) it and mount it anew\."
+    ):
+        rod.step()
+
+
+@pytest.mark.parametrize(("mass", "place", "height"), [(0.02, 0.15, 0.1), (0.05, 0.25, 0.07), (0.1, 0.2, 0.1)])
+@pytest.mark.parametrize("dt", [0.005, 0.01])
+def test_cube_that_falls_on_a_long_soft_rod_gains_no_energy(dt, mass, place, height):
+    import fastrod
+
+    world = empty_world(dt, 9.81)
+    box = cube(world, 0.06, mass, [place, 0.0, height])
+    rod = MountedRod(fastrod.load_robot("five_segment_reacher"), carrier(world, "x"), touch=[box])
+    inertia, energy = mass * 0.06**2 / 6.0, []
+    for _ in range(round(0.6 / dt)):
+        rod.step()
+        position, (linear, angular) = world.getBasePositionAndOrientation(box)[0], world.getBaseVelocity(box)
+        energy.append(mass * 9.81 * position[2] + 0.5 * mass * np.dot(linear, linear) + 0.5 * inertia * np.dot(angular, angular))
+    assert max(energy) < mass * 9.81 * height * (1.0 + 1e-6)
+    assert min(energy[-5:]) < 0.9 * max(energy)  # what it hit took some
+
+
+def test_rod_that_stays_lost_is_told(monkeypatch):
+    world, robot = empty_world(), soft_robot()
+    rod = MountedRod(robot, carrier(world), touch=[cube(world, SIZE, MASS, [1.0, 0.0, 0.0])])
+    lost = replace(rod.step(), ok=np.array([False]), problems={0: "contact: it stands."})
+    for way in ("step", "settle"):
+        monkeypatch.setattr(rod.simulator, way, lambda *a, **b: lost)
+    for _ in range(25):
+        assert not rod.step().ok[0]
+    with pytest.raises(HostError, match=r"^26 steps in a row could not be solved, the last: contact: it stands\. Move .*call reset\(\)\.$"):
+        rod.step()
+
+
+def test_bad_input_is_not_kept():
+    world = empty_world()
+    rod = MountedRod(soft_robot(), carrier(world))
+    rod.step(tip_force=(0.01, 0.0, 0.0))
+    with pytest.raises(InputError, match="tip_force holds a value that is not finite"):
+        rod.step(tip_force=(0.0, 0.0, float("nan")))
+    with pytest.raises(InputError, match=r"^a mounted rod has no input 'base_pose'; the host gives it$"):
+        rod.step(base_pose=(0, 0, 0, 1, 0, 0, 0))
+    with pytest.raises(InputError, match=r"^a mounted rod has no input 'tendon_lenght'; did you mean 'tendon_length'\?$"):
+        rod.step(tendon_lenght=0)
+    rod.step()
+    np.testing.assert_allclose(rod.wrench[:3], [0.01, 0.0, 0.0], atol=1e-9)
+
+
+def test_rod_can_be_taken_out_of_the_world():
+    world = empty_world()
+    link = carrier(world)
+    rod = MountedRod(soft_robot(), link)
+    assert world.getNumBodies() == 21
+    rod.remove()
+    assert world.getNumBodies() == 1
+
+
+@pytest.mark.parametrize("touch", ["cube", (1, 2, 3), 1.5, True])
+def test_touch_names_bodies(touch):
+    with pytest.raises(HostError, match=r"^touch holds .*; give the number of a body, or \(body, link\)\.$"):
+        MountedRod(soft_robot(), carrier(empty_world()), touch=[touch])
+
+
+def test_world_or_body_that_has_gone_is_a_sentence():
+    world, robot = empty_world(), soft_robot()
+    link = carrier(world)
+    box = cube(world, SIZE, MASS, END["axial"])
+    rod = MountedRod(robot, link, touch=[np.int64(box)])
+    rod.step()
+    world.removeBody(box)
+    with pytest.raises(HostError, match=r"^PyBullet refused getBasePositionAndOrientation: .*; is the body still in the world\?$"):
+        rod.step()
+    world.disconnect()
+    with pytest.raises(HostError, match=r"^PyBullet's world \d+ has been disconnected\.$"):
         rod.step()

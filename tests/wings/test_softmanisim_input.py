@@ -26,6 +26,12 @@ WRONG: list[tuple[str, Callable[[SoftManiSim], Any], type[Exception], str]] = [
     ("width", lambda s: s.set_grasp_width(-0.1), InputError, "must be a fraction from 0"),
     ("width nan", lambda s: s.set_grasp_width(math.nan), InputError, "must be a fraction from 0"),
     ("cube", lambda s: s.add_a_cube([0, 0, 0], size=[0.1, 0.1, 0]), InputError, "three edge lengths must be positive"),
+    (
+        "cube size in the place of its turn",
+        lambda s: s.add_a_cube([0, 0, 0], [0.3, 0.03, 0.03]),
+        InputError,
+        "ori is .* The size comes third",
+    ),
     ("cube turn", lambda s: s.add_a_cube([0, 0, 0], ori=[0, 0, 0, 0]), InputError, "ori is .* norm 0; it must be 1"),
     ("mass", lambda s: s.add_a_cube([0, 0, 0], mass=-1), InputError, "mass is -1 kg; it must be zero or positive"),
     ("wait", lambda s: s.wait(-1.0), InputError, "sec is -1.0; it must be a time"),

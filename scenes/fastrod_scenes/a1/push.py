@@ -119,7 +119,7 @@ class NeckPush(HostedScene):
         self.expect(launch < LAUNCH, f"the cube moves {launch:.3g} times as fast as the tip ever does.")
         self.expect(gave < STANDS, f"the trunk gave way by {gave:.3g} m.")
         return {
-            "cube moved, m": moved,
+            "cube moved, m": float(moved),
             "impulse of the neck on the cube, N s": pushed,
             "balance of forces at the trunk, N": balance,
             "balance of the cube's momentum, N s": momentum,
