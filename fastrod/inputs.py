@@ -35,6 +35,8 @@ class Reader:
 
     def __init__(self, layout: Layout, params: Params, rest: Rest, n_robots: int) -> None:
         self.layout, self.params, self.rest, self.n_robots = layout, params, rest, n_robots
+        # A tendon at distance d can differ from the backbone by d times the bend; more than a full turn per segment is no shape.
+        self._slack: Floats = 2.0 * np.pi * np.linalg.norm(params.offset, axis=-1).sum(1)
         self.problems: dict[int, str] = {}
         self.loads: tuple[Floats, Floats] = (np.zeros((1, 0)), np.zeros((1, 0, 3)))
         """Point forces of the last ports: arclength (n, m) [m] and force (n, m, 3) world [N]."""
@@ -130,9 +132,7 @@ class Reader:
             return np.zeros((1, n_tendons))
         lengths = self._array("tendon_length", tendon_length, (n_tendons,), "m")
         ends = np.cumsum(params.length + stretch, axis=1)[:, layout.tendon_segment]
-        # A tendon at distance d can differ from the backbone by d times the bend; more than a full turn per segment is no shape.
-        slack = 2.0 * np.pi * np.linalg.norm(params.offset, axis=-1).sum(1)
-        rows = layout.row_tendon
+        slack, rows = self._slack, layout.row_tendon
         with np.errstate(invalid="ignore"):
             longer = lengths - ends
             if lengths.min() > 0.0 and (np.abs(longer) <= slack).all():
@@ -164,11 +164,13 @@ class Reader:
 
     def _pose(self, base_pose: ArrayLike) -> Floats:
         pose = self._array("base_pose", base_pose, (7,), "position m, quaternion w x y z")
-        norm = np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
-        with np.errstate(invalid="ignore"):
-            bad = np.abs(norm[:, 0] - 1.0) > 1e-3
-        self._note(bad, lambda i: f"base_pose has a quaternion of norm {norm[min(i, len(norm) - 1), 0]:.4g}; it must be 1, as w x y z.")
-        return np.column_stack([pose[:, :3], pose[:, 3:] / np.where(norm > 0.0, norm, 1.0)])
+        norm = np.sqrt(np.einsum("ij,ij->i", pose[:, 3:], pose[:, 3:]))
+        bad = np.abs(norm - 1.0) > 1e-3
+        if bad.any():
+            self._note(bad, lambda i: f"base_pose has a quaternion of norm {norm[min(i, len(norm) - 1)]:.4g}; it must be 1, as w x y z.")
+            norm[~(norm > 0.0)] = 1.0
+        pose[:, 3:] /= norm[:, None]
+        return pose
 
     def point_forces(self, point_force: PointForces | None, stretch: Floats) -> tuple[Floats, Floats]:
         """The grid with a node at each point force, and the forces on the nodes."""

@@ -212,5 +212,7 @@ def stretch(passes: Passes, rows: Ints, change: Floats) -> None:
     if not change.any():
         return
     layout = passes.layout
-    grown = np.nan_to_num(np.cumsum(change, axis=1), nan=0.0, posinf=0.0, neginf=0.0)[:, layout.tendon_segment[layout.row_tendon]]
+    grown = np.cumsum(change, axis=1)[:, layout.tendon_segment[layout.row_tendon]]
+    if not np.isfinite(grown).all():
+        grown = np.where(np.isfinite(grown), grown, 0.0)
     passes.memory.length_before[rows] += grown if len(grown) == 1 else grown[rows]
