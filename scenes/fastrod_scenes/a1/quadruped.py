@@ -44,9 +44,9 @@ def floor(world: Bullet) -> int:
 def standing(dt: float, pitch: float) -> tuple[Bullet, BulletLink]:
     """A world with an A1 that stands in it, and the mount of its neck, which points `pitch` above forward [rad]; its d1 is up from there,
     its d2 to the right."""
-    import pybullet_data
-
     world = connect(dt=dt)
+    import pybullet_data  # comes with PyBullet, which `connect` asks for in a sentence
+
     floor(world)
     body = world.loadURDF(f"{pybullet_data.getDataPath()}/a1/a1.urdf", [0.0, 0.0, _HEIGHT + 0.01])
     for j in range(world.getNumJoints(body)):
