@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
-import os
 import statistics
 import sys
 import time
@@ -161,23 +159,7 @@ def control_section(quick: bool) -> Section:
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure and print; the exit code."""
     parser = argparse.ArgumentParser(prog="bench_control", description=__doc__)
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    parser.add_argument("--quick", action="store_true", help="few steps: does it run? Its figures mean little")
-    options = parser.parse_args(argv)
-    start, load = time.perf_counter(), os.getloadavg()[0]
-    measured = [control_section(options.quick)]
-    machine = {
-        **report.machine(),
-        "load_before": f"{load:.2f}",
-        "load_after": f"{os.getloadavg()[0]:.2f}",
-        "seconds": f"{time.perf_counter() - start:.0f}",
-        "quick": str(options.quick).lower(),
-    }
-    if options.json:
-        print(json.dumps({"machine": machine, "sections": {section.key: section.as_json() for section in measured}}))
-    else:
-        report.show(measured, ", ".join(f"{key} {value}" for key, value in machine.items()))
-    return 0
+    return report.command(parser, argv, lambda options: [control_section(options.quick)])
 
 
 if __name__ == "__main__":

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import json
-import os
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -183,24 +180,8 @@ def tracking_sections(quick: bool, dt: float | None) -> list[Section]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure and print; the exit code."""
     parser = argparse.ArgumentParser(prog="bench_tracking", description=__doc__)
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    parser.add_argument("--quick", action="store_true", help="one path, few steps: does it run? Its figures mean little")
     parser.add_argument("--dt", type=float, help="time step [s], by default the scenes'")
-    options = parser.parse_args(argv)
-    start, load = time.perf_counter(), os.getloadavg()[0]
-    measured = tracking_sections(options.quick, options.dt)
-    machine = {
-        **report.machine(),
-        "load_before": f"{load:.2f}",
-        "load_after": f"{os.getloadavg()[0]:.2f}",
-        "seconds": f"{time.perf_counter() - start:.0f}",
-        "quick": str(options.quick).lower(),
-    }
-    if options.json:
-        print(json.dumps({"machine": machine, "sections": {section.key: section.as_json() for section in measured}}))
-    else:
-        report.show(measured, ", ".join(f"{key} {value}" for key, value in machine.items()))
-    return 0
+    return report.command(parser, argv, lambda options: tracking_sections(options.quick, options.dt))
 
 
 if __name__ == "__main__":

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import argparse
 import gc
+import json
 import math
+import os
 import platform
 import sys
 import time
@@ -120,3 +123,24 @@ def seconds(run: Callable[[], Result]) -> tuple[float, Result]:
 def best(run: Callable[[], object], repeats: int) -> float:
     """Least wall time of several calls [s]: what the machine can do when nothing else wants it."""
     return min((seconds(run)[0] for _ in range(repeats)), default=math.nan)
+
+
+def command(parser: argparse.ArgumentParser, argv: Sequence[str] | None, measure: Callable[[argparse.Namespace], Sequence[Section]]) -> int:
+    """A benchmark's command line: `--json`, `--quick` and what `parser` has besides; measure, print, and the exit code."""
+    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+    parser.add_argument("--quick", action="store_true", help="little of everything: does it run? Its figures mean little")
+    options = parser.parse_args(argv)
+    start, load = time.perf_counter(), os.getloadavg()[0]
+    measured = measure(options)
+    head = {
+        **machine(),
+        "load_before": f"{load:.2f}",
+        "load_after": f"{os.getloadavg()[0]:.2f}",
+        "seconds": f"{time.perf_counter() - start:.0f}",
+        "quick": str(options.quick).lower(),
+    }
+    if options.json:
+        print(json.dumps({"machine": head, "sections": {section.key: section.as_json() for section in measured}}))
+    else:
+        show(measured, ", ".join(f"{key} {value}" for key, value in head.items()))
+    return 0

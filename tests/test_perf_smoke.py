@@ -224,3 +224,15 @@ def test_the_control_bench_runs_and_both_ways_follow_the_path(capsys: pytest.Cap
     assert exact["way"] == "analytic"
     assert exact["ratio"] > 1.0
     assert max(exact["error_m"], differences["error_m"]) < 1e-3
+
+
+def test_the_hosts_bench_runs_and_its_states_are_what_they_say(capsys: pytest.CaptureFixture[str]) -> None:
+    import bench_hosts
+
+    assert bench_hosts.main(["--quick", "--json"]) == 0
+    (section,) = json.loads(capsys.readouterr().out)["sections"].values()
+    rows = {row["what"]: row for row in section["rows"]}
+    assert len(rows) == 7
+    assert rows["prototype, pushes a free cube"]["touching"] > 0.0
+    assert rows["prototype, free"]["touching"] == 0.0
+    assert all(row["failed"] == 0 for row in rows.values())
