@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import json
-import os
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -180,34 +177,22 @@ def growth_section(counts: Sequence[int], subdivisions: int, budget: float) -> S
     return Section("contact_growth", f"Free robots beside {len(obstacle.faces):,d} faces", columns, table, [])
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Measure and print; the exit code."""
-    parser = argparse.ArgumentParser(prog="bench_contact", description=__doc__)
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    parser.add_argument("--quick", action="store_true", help="few robots, coarse meshes: does it run? Its figures mean little")
-    parser.add_argument("--robots", type=int, help="robots of a batch (default 128, with --quick 8)")
-    options = parser.parse_args(argv)
-    n_robots = options.robots or (8 if options.quick else 128)
-    start, load = time.perf_counter(), os.getloadavg()[0]
-    budget = 0.0 if options.quick else 0.6
+def sections(options: argparse.Namespace) -> list[Section]:
+    """All of it."""
+    n_robots, budget = options.robots or (8 if options.quick else 128), 0.0 if options.quick else 0.6
     batch, cases, bare = measure(n_robots, (2, 3) if options.quick else (3, 5, 6), budget, 2 if options.quick else 24)
-    measured = [
+    return [
         step_section(batch, cases, bare),
         query_section(n_robots, cases),
         growth_section((4, n_robots) if options.quick else (64, 1024, 8192), 2 if options.quick else 5, budget),
     ]
-    machine = {
-        **report.machine(),
-        "load_before": f"{load:.2f}",
-        "load_after": f"{os.getloadavg()[0]:.2f}",
-        "seconds": f"{time.perf_counter() - start:.0f}",
-        "quick": str(options.quick).lower(),
-    }
-    if options.json:
-        print(json.dumps({"machine": machine, "sections": {section.key: section.as_json() for section in measured}}))
-    else:
-        report.show(measured, ", ".join(f"{key} {value}" for key, value in machine.items()))
-    return 0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure and print; the exit code."""
+    parser = argparse.ArgumentParser(prog="bench_contact", description=__doc__)
+    parser.add_argument("--robots", type=int, help="robots of a batch (default 128, with --quick 8)")
+    return report.command(parser, argv, sections)
 
 
 if __name__ == "__main__":

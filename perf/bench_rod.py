@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import json
-import os
 import sys
-import time
 from collections.abc import Sequence
 
 import report
@@ -38,24 +35,7 @@ def sections(quick: bool) -> list[report.Section]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure and print; the exit code."""
-    parser = argparse.ArgumentParser(prog="bench_rod", description=__doc__)
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    parser.add_argument("--quick", action="store_true", help="small batches, one round: does it run? Its figures mean little")
-    options = parser.parse_args(argv)
-    start, load = time.perf_counter(), os.getloadavg()[0]  # other work on the machine spoils the figures of two threads first
-    measured = sections(options.quick)
-    machine = {
-        **report.machine(),
-        "load_before": f"{load:.2f}",
-        "load_after": f"{os.getloadavg()[0]:.2f}",
-        "seconds": f"{time.perf_counter() - start:.0f}",
-        "quick": str(options.quick).lower(),
-    }
-    if options.json:
-        print(json.dumps({"machine": machine, "sections": {section.key: section.as_json() for section in measured}}))
-    else:
-        report.show(measured, ", ".join(f"{key} {value}" for key, value in machine.items()))
-    return 0
+    return report.command(argparse.ArgumentParser(prog="bench_rod", description=__doc__), argv, lambda options: sections(options.quick))
 
 
 if __name__ == "__main__":

@@ -130,7 +130,7 @@ def command(parser: argparse.ArgumentParser, argv: Sequence[str] | None, measure
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
     parser.add_argument("--quick", action="store_true", help="little of everything: does it run? Its figures mean little")
     options = parser.parse_args(argv)
-    start, load = time.perf_counter(), os.getloadavg()[0]
+    start, load = time.perf_counter(), os.getloadavg()[0]  # other work on the machine spoils figures, of two threads first
     measured = measure(options)
     head = {
         **machine(),
