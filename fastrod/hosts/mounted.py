@@ -167,7 +167,7 @@ class MountedRod:
         poses: dict[str, Floats] = {}
         velocities: dict[str, Floats] = {}
         for k, touched in enumerate(self.touched):
-            p, v = touched.expected()
+            p, v = touched.expected(self.bodies.ids)
             for name in touched.names:
                 self.simulator.set_free(name, *touched.give(), body=k)
             poses |= p

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple, final
 
 import numpy as np
@@ -14,6 +15,8 @@ from fastrod.hosts.host import Motion
 from fastrod.hosts.link import exert, from_xyzw
 from fastrod.rotation import matrix_from_quaternion, product
 from fastrod.types import Floats
+
+_LEFT = 0.8  # of an overlap after a step
 
 
 class Part(NamedTuple):
@@ -67,8 +70,20 @@ class Touched:
     def _com(self) -> Motion:
         return _com_motion(self.bullet, self.body, self.link)
 
-    def expected(self) -> tuple[dict[str, Floats], dict[str, Floats]]:
-        """Pose (7,) and velocity (6,) of each part at the end of the next step, were it not for the rod."""
+    def _overlap(self, capsules: Sequence[int]) -> Floats:
+        """(3,) the way out of what it overlaps most of these bodies, world [m]; zero where it overlaps none."""
+        found = [p for own in capsules for p in self.bullet.getClosestPoints(own, self.body, 0.0, -1, self.link)]
+        if not found:
+            return np.zeros(3)
+        deepest = min(found, key=lambda p: p[8])
+        return min(deepest[8], 0.0) * np.asarray(deepest[7])  # its normal points from the link to the capsule
+
+    def expected(self, capsules: Sequence[int]) -> tuple[dict[str, Floats], dict[str, Floats]]:
+        """Pose (7,) and velocity (6,) of each part at the end of the next step, were it not for the rod.
+
+        What overlaps the rod's `capsules` already (a contact that was lost for a step) is expected most of the way outside: out at once
+        it would leave at overlap / dt.
+        """
         motion = self._com()
         if self.mass > 0.0:
             back = self.relaxation / (self.dt**2 + self.relaxation * self.dt)  # per step: tau dt of the force before, as a velocity
@@ -76,6 +91,8 @@ class Touched:
             change = np.concatenate([by_force * self._before[:3], by_moment @ self._before[3:]])
             motion = motion._replace(velocity=motion.velocity - back * change)
         pose = motion.after(self.dt)
+        if self.mass > 0.0:
+            pose[:3] += _LEFT * self._overlap(capsules)
         turn = matrix_from_quaternion(pose[None, 3:])[0]
         poses, velocities = {}, {}
         for part in self.parts:

@@ -117,7 +117,7 @@ def test_every_shape_of_pybullet_is_an_obstacle_where_it_is():
         body = world.createMultiBody(1.0, shape, -1, [0.1, 0.2, 0.3], turn, baseInertialFramePosition=[0.01, 0.0, 0.0])
         touched = Touched(world, body, dt=0.005, relaxation=0.1, friction=0.3)
         assert [part.obstacle.shape for part in touched.parts] == [name]
-        pose = touched.expected()[0][touched.names[0]]
+        pose = touched.expected([])[0][touched.names[0]]
         robot = soft_robot(1)
         sim = Simulator(robot, contact=ContactScene(obstacles=[touched.parts[0].obstacle], rod_radius=0.001, mounting=0.0))
         # the rod's base is where the probe is, and its tip beside it: both must be as far from the body
