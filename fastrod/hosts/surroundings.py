@@ -76,7 +76,7 @@ class Touched:
         if not found:
             return np.zeros(3)
         deepest = min(found, key=lambda p: p[8])
-        return min(deepest[8], 0.0) * np.asarray(deepest[7])  # its normal points from the link to the capsule
+        return np.asarray(min(deepest[8], 0.0) * np.array(deepest[7]))  # its normal points from the link to the capsule
 
     def expected(self, capsules: Sequence[int]) -> tuple[dict[str, Floats], dict[str, Floats]]:
         """Pose (7,) and velocity (6,) of each part at the end of the next step, were it not for the rod.
