@@ -89,7 +89,7 @@ class ContactScene:
 
     def rods(self, robots: Sequence[Robot], n_robots: int, layout: Layout, params: Params) -> Rods:
         """What contact needs to know of the robots of a simulator."""
-        radius = np.array([self._radius(robot) for robot in robots])
+        radius = np.array([self.radius_of(robot) for robot in robots])
         reach = np.array([robot.length for robot in robots])
         first = 1.5 * radius[:, 0] if self.mounting is None else np.full(len(robots), self.mounting)
         if (first >= reach).any():
@@ -105,7 +105,8 @@ class ContactScene:
             1.0 / self.rod_stiffness, int(self.self_contact),
         )  # fmt: skip
 
-    def _radius(self, robot: Robot) -> list[float]:
+    def radius_of(self, robot: Robot) -> list[float]:
+        """Of each segment of a robot in this scene [m]; `InputError` where `rod_radius` does not fit it."""
         if self.rod_radius is None:
             return [
                 segment.body_radius or _BEYOND_TENDONS * max([np.hypot(*t.position(k + 1)[k]) for t in segment.tendons], default=0.0)

@@ -18,7 +18,7 @@ from fastrod.types import Floats
 class RodBodies:
     """Capsules along the backbone, their axes its chords and their cross-sections turned with it; they have no mass, and move as told.
 
-    A capsule pushes what it meets with the velocity at which it moves. It never touches its own kind, nor the bodies in `ignored`.
+    A capsule pushes what it meets with the velocity at which it moves. It never touches its own kind, nor bodies it is told to `ignore`.
     """
 
     def __init__(

@@ -57,7 +57,7 @@ class MountedRod:
         self.simulator = Simulator(robot, dt=self.dt, points_per_segment=points_per_segment, threads=1, contact=scene)
         self._stride = points_per_segment // capsules_per_segment
         n = robot.n_segments * capsules_per_segment
-        radii = [segment.body_radius or 0.01 for segment in robot.segments for _ in range(capsules_per_segment)]
+        radii = np.repeat(ContactScene().radius_of(robot), capsules_per_segment).tolist()  # as contact has them
         self.bodies = RodBodies(self.bullet, robot.length, radii, n, color=color, head_color=head_color)
         for body in {host.body, *(body for body, _ in links)}:
             self.bodies.ignore(body)

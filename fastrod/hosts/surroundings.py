@@ -34,7 +34,7 @@ class Touched:
     """A link (-1: the base) that a rod touches, and what the rod does to it.
 
     A step is implicit in the body's inertia: to the rod it is where it would be at the step's end without the rod, and gives way by
-    F dt^2 / m and M dt^2 / I. What is touched gets no more momentum than stops it at the rod, at any time step.
+    F dt^2 / m and M dt^2 / I. A contact that lasts gives no more momentum than stops the body at the rod, at any time step.
 
     The rod answers a changing load with tau dF/dt more (Kelvin and Voigt): a rod without mass and damping would swing with what it
     pushes for ever. That is implicit too: dt^2 becomes dt^2 + tau dt, and the body is expected where tau dF of the last force has
