@@ -102,6 +102,8 @@ class Simulator:
         self._derived: Floats | None = None  # the Jacobian that came with the last step
         if contact is not None and not isinstance(contact, ContactScene):
             raise InputError(f"contact is {contact!r}; give fastrod.contact.ContactScene(obstacles=[...]) or None.")
+        self.contact: ContactScene | None = contact
+        """What the rods may touch."""
         self._engine: Engine | None = None
         if contact is not None:
             rods = contact.rods(self.robots, self.n_robots, self._layout, self._plain)
