@@ -15,11 +15,14 @@ if TYPE_CHECKING:
     from fastrod.hosts.link import BulletLink
     from fastrod.hosts.mounted import MountedRod
     from fastrod.hosts.softmanisim import SoftManiSim
+    from fastrod.hosts.visuals import Visuals
 
-__all__ = ["Bullet", "BulletArm", "BulletLink", "Camera", "Host", "Motion", "MountedRod", "RodBodies", "SoftManiSim", "connect"]
+__all__ = [
+    "Bullet", "BulletArm", "BulletLink", "Camera", "Host", "Motion", "MountedRod", "RodBodies", "SoftManiSim", "Visuals", "connect",
+]  # fmt: skip
 _HOME = {
     "Bullet": "bullet", "BulletArm": "arm", "BulletLink": "link", "Camera": "camera", "MountedRod": "mounted", "RodBodies": "bodies",
-    "SoftManiSim": "softmanisim", "connect": "bullet",
+    "SoftManiSim": "softmanisim", "Visuals": "visuals", "connect": "bullet",
 }  # fmt: skip
 
 

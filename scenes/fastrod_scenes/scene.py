@@ -5,12 +5,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, ClassVar, final
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, final
 
 from fastrod.errors import FastrodError, UnknownNameError, nearest
 
 if TYPE_CHECKING:
-    from fastrod.hosts import Bullet, MountedRod
+    from fastrod.hosts import Bullet, BulletArm, MountedRod
+    from fastrod.hosts.camera import Image
+    from fastrod.robot import Robot
     from fastrod.simulator import Simulator
     from fastrod.state import State
 
@@ -20,6 +22,7 @@ _SCENES: Mapping[str, str] = {
     "draped": "fastrod_scenes.contact.draped:Draped",
     "dual_arm": "fastrod_scenes.ur5.dual_arm:DualArms",
     "explore": "fastrod_scenes.ur5.explore:Explore",
+    "grid": "fastrod_scenes.grid:Grid",
     "neck_look": "fastrod_scenes.a1.look:NeckLook",
     "neck_push": "fastrod_scenes.a1.push:NeckPush",
     "pair": "fastrod_scenes.contact.pair:Pair",
@@ -91,6 +94,16 @@ class RodScene(Scene):
             yield k * self.dt, simulator.step(**self.inputs(k * self.dt))
 
 
+class SoftBody(NamedTuple):
+    """A soft robot of a PyBullet world as it is now."""
+
+    robot: Robot
+    state: State
+    """Of this robot alone."""
+    capsules: tuple[int, ...]
+    """Numbers of the bodies that stand for it in the world: who draws the rod leaves them out."""
+
+
 class HostedWorld(ABC):
     """A PyBullet world of its own with soft robots in it, as a scene has set it up."""
 
@@ -101,9 +114,18 @@ class HostedWorld(ABC):
     def state(self) -> State:
         """Of the first soft robot, after a step."""
 
+    @property
+    @abstractmethod
+    def soft_bodies(self) -> tuple[SoftBody, ...]:
+        """All soft robots, after a step."""
+
     @abstractmethod
     def advance(self, t: float) -> None:
         """Command and simulate the step that begins at time t [s]."""
+
+    def picture(self) -> Image | None:
+        """What the camera on the first soft robot sees now, where there is one."""
+        return None
 
     def close(self) -> None:
         """Disconnect the world."""
@@ -114,6 +136,8 @@ class Stage(HostedWorld):
     """A world with rods on hosts."""
 
     rods: tuple[MountedRod, ...]
+    arm: BulletArm | None = None
+    """The serial arm that carries the first rod, where there is one."""
 
     @property
     @final
@@ -122,6 +146,16 @@ class Stage(HostedWorld):
         state = self.rods[0].state
         assert state is not None
         return state
+
+    @property
+    @final
+    def soft_bodies(self) -> tuple[SoftBody, ...]:
+        """All rods, in order."""
+        return tuple(SoftBody(rod.simulator.robots[0], rod.state, tuple(rod.bodies.ids)) for rod in self.rods if rod.state is not None)
+
+    def carry(self) -> None:
+        """Put what follows the arm for the eye alone to where the arm is now: `advance` does so itself, who drives the arm by other ways
+        does it after each step of the world."""
 
 
 class HostedScene(Scene):

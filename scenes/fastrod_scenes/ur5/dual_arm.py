@@ -61,6 +61,8 @@ def opposite(t: float) -> tuple[Floats, Floats]:
 class DualArm(Stage):
     """A UR5 with a fork at its flange, and a soft robot of two segments on either prong."""
 
+    arm: BulletArm
+
     def __init__(self, dt: float) -> None:
         self.world = connect(dt=dt)
         self.world.setPhysicsEngineParameter(numSolverIterations=200, solverResidualThreshold=0.0)  # the motors' rates to the last digit
@@ -112,6 +114,9 @@ class DualArm(Stage):
         self.world.stepSimulation()
         for rod in self.rods:
             rod.end()
+        self.carry()
+
+    def carry(self) -> None:
         self.bracket.follow()
 
     def begin(self, t: float) -> None:

@@ -64,6 +64,8 @@ class Look(NamedTuple):
 class Exploration(Stage):
     """UR5, soft robot and box, and an operator who drives by the clock; where the robots start follows from the seed."""
 
+    arm: BulletArm
+
     def __init__(self, box: Box, seed: int, dt: float) -> None:
         rng = np.random.default_rng(seed)
         self.box, self.dt = box, dt
@@ -137,9 +139,12 @@ class Exploration(Stage):
         elif end < APPROACH + 1e-9:
             self._go(np.zeros(9), t == 0.0, end / APPROACH)
         self.rod.step(**self.actions.inputs(self.action))
-        self.bracket.follow()
+        self.carry()
         if looking and bent > AIM - 1e-9:
             self.looks[corner] = self.look(corner)
+
+    def carry(self) -> None:
+        self.bracket.follow()
 
     def _go(self, to: Floats, begins: bool, part: float) -> None:
         """Be a part, from 0 to 1, of the way to an action."""
@@ -161,14 +166,22 @@ class Exploration(Stage):
         assert state is not None
         return state.tip_position[0], state.tip_rotation[0]
 
+    def picture(self) -> Image:
+        """From before the tip's cap, along d3; d2 is up in it."""
+        _, rotation = self.tip()
+        eye = self._eye()
+        return self.camera.look(self.world, eye, eye + 0.1 * rotation[:, 2], rotation[:, 1])
+
+    def _eye(self) -> Floats:
+        tip, rotation = self.tip()
+        return tip + 1.2 * RADIUS * rotation[:, 2]
+
     def look(self, corner: int) -> Look:
-        """A picture from before the tip's cap."""
+        """A picture of a corner, and by how much the line of sight misses its cube."""
         tip, rotation = self.tip()
         d1, d2, d3 = rotation.T
-        eye = tip + 1.2 * RADIUS * d3
-        image = self.camera.look(self.world, eye, eye + 0.1 * d3, d2)
         off = float(np.linalg.norm(miss(tip, rotation, self.box.cube_at(corner))))
-        return Look(image, eye, np.stack([-d1, d2, -d3], axis=1), off)
+        return Look(self.picture(), self._eye(), np.stack([-d1, d2, -d3], axis=1), off)
 
     def seen(self, corner: int) -> tuple[int, float]:
         """Pixels of the picture of a corner that show its cube in its colour, and the largest distance of what they show from the cube

@@ -17,7 +17,7 @@ from fastrod.simulator import Simulator
 from fastrod.state import State
 from fastrod.types import Floats
 from fastrod_scenes.robots import ur5_path
-from fastrod_scenes.scene import HostedWorld
+from fastrod_scenes.scene import HostedWorld, SoftBody
 from fastrod_scenes.ur5.carried import Bracket, eased
 
 SIDE = 0.03
@@ -138,6 +138,13 @@ class Picking(HostedWorld):
         pose = self._place.copy()
         pose[3:] = product(pose[3:], _MOUNT * [1.0, -1.0, -1.0, -1.0])  # fastrod's frame of the base: d3 along the robot's +y
         return self._model.settle(**self._actions.inputs(self._action(self._bend)), base_pose=pose)
+
+    @property
+    def soft_bodies(self) -> tuple[SoftBody, ...]:
+        """The one; its gripper is none of its capsules."""
+        b = self.world
+        capsules = (i for i in self.soft if any(shape[2] == b.GEOM_CAPSULE for shape in b.getCollisionShapeData(i, -1)))
+        return (SoftBody(self._model.robots[0], self.state, tuple(capsules)),)
 
     @property
     def tip(self) -> tuple[Floats, Floats]:

@@ -82,7 +82,7 @@ class Tracking(Stage):
         """`depth`: of the path's center below the soft robot's base at the start [m]."""
         self.path, self.dt = path, dt
         self.robot = SoftUR5(dt=dt, tip=path.center, depth=depth, movers=movers)
-        self.world, self.rods = self.robot.world, (self.robot.rod,)
+        self.world, self.rods, self.arm = self.robot.world, (self.robot.rod,), self.robot.arm
         self.tip: Floats = self.robot.tip()
         """(3,) measured, world [m]."""
         self.steps: list[tuple[Floats, ...]] = []
@@ -93,6 +93,9 @@ class Tracking(Stage):
         step = self.robot.advance(self.path.position(t) - self.tip, self.feedforward(t))
         self.steps.append((goal, step.tip, step.tip - self.tip, step.by_soft, step.by_arm, self.robot.q()))
         self.tip = step.tip
+
+    def carry(self) -> None:
+        self.robot.bracket.follow()
 
     def feedforward(self, t: float) -> Floats:
         """(3,) mean velocity of the goal in the step that begins at time t [s], world [m/s]: around corners it ends on the goal too."""
