@@ -112,6 +112,16 @@ def _parser() -> tuple[argparse.ArgumentParser, list[str]]:
     excite.add_argument("--speed", type=float, default=1.0, metavar="RAD/S", help="of the triangles (default: 1)")
     excite.set_defaults(run_command=_excite)
 
+    view = commands.add_parser("view", help="viewer and teleop in the browser, or a log beside the model")
+    view.add_argument("what", nargs="?", metavar="WHAT", help="a scene, a robot (name or .toml), or a run log (default: a robot to try)")
+    view.add_argument("--robot", metavar="R", help="whose log it is: a shipped robot's name or a path to a .toml")
+    view.add_argument("--robots", type=int, default=1, metavar="N", help="so many of the robot, in a grid, driven alike (default: 1)")
+    view.add_argument("--play", action="store_true", help="begin with the robot's demo motion; scenes always begin with their script")
+    view.add_argument("--port", type=int, metavar="P", help="default: the first free one from 8080 on")
+    view.add_argument("--host", default="127.0.0.1", metavar="H", help="address to listen on (default: 127.0.0.1, this machine alone)")
+    view.add_argument("--no-open", action="store_true", help="do not open a browser")
+    view.set_defaults(run_command=_view)
+
     bench = commands.add_parser("bench", help="the figures of perf/ as ratios")
     bench.add_argument("name", nargs="?", metavar="NAME", help="one benchmark (default: all)")
     bench.add_argument("--json", action="store_true", help="print JSON to stdout and nothing else")
@@ -235,6 +245,16 @@ def _excite(arguments: argparse.Namespace) -> int:
     console = Console()
     console.print(grid)
     console.print(f"wrote {path}: drive it, fill tip_x tip_y tip_z, then fastrod identify", soft_wrap=True, highlight=False, markup=False)
+    return DONE
+
+
+def _view(arguments: argparse.Namespace) -> int:
+    from fastrod_viewer.app import FIRST, view
+
+    view(
+        arguments.what or FIRST, robot=arguments.robot, n_robots=arguments.robots, host=arguments.host, port=arguments.port,
+        open_browser=not arguments.no_open, script=arguments.play,
+    )  # fmt: skip
     return DONE
 
 

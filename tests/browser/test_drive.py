@@ -1,0 +1,163 @@
+"""Driving a robot in a real browser: sliders, drag, keys, scenes, stop, and what happens when a page is closed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from windows import Window
+
+import fastrod
+from fastrod.simulated import SimulatedRobot
+from fastrod_viewer.app import App
+from fastrod_viewer.drive_page import DrivePage
+from fastrod_viewer.worlds import FreeWorld
+
+Windows = Callable[..., Window]
+
+
+def page_of(app: App) -> DrivePage:
+    assert isinstance(app.page, DrivePage)
+    return app.page
+
+
+def tip_of(app: App) -> np.ndarray:
+    return page_of(app).world.rods[0].state.tip_position[0].copy()
+
+
+def test_a_slider_moved_by_keys_bends_the_robot_and_the_picture(app: App, window: Windows) -> None:
+    app.open("prototype")
+    seen = window(app.address)
+    before, pixels = tip_of(app), seen.pixels()
+    thumb = seen.slider("Bend x [°]")
+    thumb.focus()
+    for _ in range(45):
+        thumb.press("ArrowRight")
+    assert seen.until(lambda: page_of(app).pilot.arrived and page_of(app).pilot.bent(0)[0] > np.radians(44.0))
+    # an arc of 45 degrees and 0.07 m ends at (1 - cos a) l / a beside its base; wires of 1e-5 m/N give way a little
+    a, length = np.radians(45.0), 0.07
+    assert tip_of(app)[0] - before[0] == pytest.approx((1.0 - np.cos(a)) * length / a, rel=0.03)
+    seen.page.wait_for_timeout(500)
+    moved = np.abs(seen.pixels().astype(int) - pixels)[100:700, 340:].max(axis=2) > 40
+    assert moved.sum() > 2000
+    assert seen.errors == []
+
+
+def test_the_tip_follows_a_drag(app: App, window: Windows) -> None:
+    app.open("five_segment_reacher")
+    seen = window(app.address)
+    before = tip_of(app)
+    seen.page.wait_for_timeout(2500)  # the camera has come to rest, and the server knows where
+    x, y = seen.place_of(page_of(app).drawing.tip(), app)
+    mouse = seen.page.mouse
+    mouse.move(x, y)
+    mouse.down()
+    for k in range(1, 21):
+        mouse.move(x + 6 * k, y + 3 * k)
+        seen.page.wait_for_timeout(30)
+    assert seen.until(lambda: page_of(app).pilot.dragged_to is not None)
+    pull = page_of(app).pilot.dragged_to
+    assert pull is not None
+    assert seen.until(lambda: bool(np.linalg.norm(tip_of(app) - pull) < 2e-3))
+    mouse.up()
+    assert seen.until(lambda: page_of(app).pilot.dragged_to is None)
+    held = tip_of(app)
+    seen.page.wait_for_timeout(500)
+    assert np.linalg.norm(held - before) > 0.02
+    assert np.linalg.norm(tip_of(app) - held) < 1e-4
+
+
+def test_keys_bend_pause_reset_and_stop(app: App, window: Windows) -> None:
+    app.open("five_segment_reacher")
+    seen = window(app.address)
+    page, keys = page_of(app), seen.page.keyboard
+    keys.press("2")
+    for _ in range(3):
+        keys.press("d")
+    assert seen.until(lambda: abs(page.pilot.bent(1)[0] - np.radians(15.0)) < 1e-6)
+    assert page.pilot.bent(0)[0] == pytest.approx(0.0, abs=1e-6)
+    keys.press("Space")
+    assert seen.until(lambda: page.session.paused)
+    keys.press("Space")
+    assert seen.until(lambda: not page.session.paused)
+    keys.press("Escape")
+    assert seen.until(lambda: page.session.stopped)
+    page.pilot.bend(0, 0.5, 0.0)
+    seen.page.wait_for_timeout(300)
+    assert abs(page.pilot.now.action[1]) < 1e-12
+    seen.page.get_by_role("button", name="GO ON").click()
+    assert seen.until(lambda: not page.session.stopped)
+    keys.press("r")
+    assert seen.until(lambda: float(np.abs(page.pilot.goals.action).max()) < 1e-9)
+
+
+def test_another_scene_is_picked_in_the_page(app: App, window: Windows) -> None:
+    app.open("prototype")
+    seen = window(app.address)
+    seen.pick("Scene", "tdcr_a")
+    assert seen.until(lambda: app.page is not None and app.page.title == "tdcr_a")
+    assert seen.until(lambda: seen.page.get_by_text("All bend x [°]").count() == 1)
+    assert seen.errors == []
+
+
+def test_a_load_bends_the_robot(app: App, window: Windows) -> None:
+    app.open("tdcr_b")
+    seen = window(app.address)
+    before = tip_of(app)
+    seen.page.get_by_role("tab", name="Loads").click()
+    thumb = seen.slider("Tip force x [N]")
+    thumb.focus()
+    for _ in range(10):
+        thumb.press("ArrowRight")
+    assert seen.until(lambda: float(tip_of(app)[0] - before[0]) > 1e-3)
+
+
+def test_two_pages_show_the_same_and_closing_one_changes_nothing(app: App, window: Windows) -> None:
+    app.open("prototype")
+    first, second = window(app.address), window(app.address)
+    thumb = first.slider("Bend x [°]")
+    thumb.focus()
+    for _ in range(20):
+        thumb.press("ArrowRight")
+    assert second.until(lambda: second.slider("Bend x [°]").get_attribute("aria-valuenow") == "20")
+    first.close()
+    assert second.until(lambda: len(app.server.get_clients()) == 1)
+    thumb = second.slider("Bend x [°]")
+    thumb.focus()
+    thumb.press("ArrowRight")
+    assert second.until(lambda: abs(page_of(app).pilot.bent(0)[0] - np.radians(21.0)) < 1e-6)
+
+
+def test_closing_the_page_stops_a_real_robot(app: App, window: Windows) -> None:
+    robot = fastrod.load_robot("prototype")
+    link = SimulatedRobot(robot, real=True)
+    app.open(FreeWorld(robot), link=link)
+    seen = window(app.address)
+    thumb = seen.slider("Speed [°/s]")
+    thumb.focus()
+    thumb.press("Home")  # slow, so that it is still on its way
+    thumb = seen.slider("Bend x [°]")
+    thumb.focus()
+    thumb.press("End")
+    assert seen.until(lambda: bool(link.read().dl.min() < -1e-5))
+    assert not link.stopped
+    seen.close()
+    other = window()
+    assert other.until(lambda: link.stopped)
+    there = link.read().dl
+    other.page.wait_for_timeout(500)
+    assert np.array_equal(link.read().dl, there)
+    assert there.min() > -0.0075 * np.pi / 2.0 + 1e-3  # it had not arrived
+    other.go(app.address)
+    other.page.get_by_role("button", name="GO ON").click()
+    assert other.until(lambda: not link.stopped)
+
+
+def test_it_fits_a_phone(app: App, window: Windows) -> None:
+    app.open("prototype")
+    seen = window(app.address, width=390, height=844)
+    wide = seen.page.evaluate("document.documentElement.scrollWidth")
+    assert wide <= 390
+    colors = np.unique(seen.pixels()[:400].reshape(-1, 3), axis=0)
+    assert len(colors) > 200  # the robot is drawn above the sheet of controls

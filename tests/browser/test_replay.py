@@ -1,0 +1,120 @@
+"""Record, replay, export in a real browser."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from windows import Window
+
+import fastrod
+from fastrod.identification.replay import replay
+from fastrod.runlog import read_log
+from fastrod_viewer.app import DEMO_LOG, App
+from fastrod_viewer.drive_page import DrivePage
+from fastrod_viewer.export import external_references
+from fastrod_viewer.playback import load
+from fastrod_viewer.replay_page import ReplayPage
+
+Windows = Callable[..., Window]
+
+
+def replayed(app: App) -> ReplayPage:
+    assert isinstance(app.page, ReplayPage)
+    return app.page
+
+
+def test_the_time_slider_moves_the_robot_and_the_figures(app: App, window: Windows) -> None:
+    app.open(DEMO_LOG)
+    seen = window(app.address)
+    page = replayed(app)
+    before = seen.pixels()
+    seen.page.get_by_role("button", name="Pause").click()
+    thumb = seen.slider("Time [s]")
+    thumb.focus()
+    thumb.press("End")
+    assert seen.until(lambda: page.frame == len(page.playback.frames) - 1)
+    row = page.playback.frames[-1]
+    shown = f"{1e3 * page.playback.before.residual[row]:.2f} mm"
+    assert seen.until(lambda: seen.page.get_by_text(shown).count() > 0)
+    seen.page.wait_for_timeout(500)
+    assert (np.abs(seen.pixels().astype(int) - before)[:500, 340:].max(axis=2) > 40).sum() > 1000
+    thumb.press("Home")
+    assert seen.until(lambda: page.frame == 0)
+    assert seen.errors == []
+
+
+def test_before_and_after_can_be_switched(app: App, window: Windows, tmp_path: Path, log_with_report: Path) -> None:
+    app.open(load(log_with_report))
+    seen = window(app.address)
+    page = replayed(app)
+    before, after = page.playback.tracks
+    assert after.rms < before.rms
+    chosen = [before.label, after.label, "both"]
+    for option in chosen:
+        seen.pick("Model", option)
+        assert seen.until(lambda option=option: page.choice == option)
+    assert seen.page.get_by_text("friction").count() > 0
+    assert seen.errors == []
+
+
+def test_a_session_is_recorded_read_back_and_replayed(app: App, window: Windows, tmp_path: Path) -> None:
+    app.open("prototype")
+    seen = window(app.address)
+    page = app.page
+    assert isinstance(page, DrivePage)
+    seen.page.get_by_role("tab", name="Save").click()
+    seen.page.get_by_role("button", name="Record a run log").click()
+    assert seen.until(lambda: page.session.recorder is not None)
+    for _ in range(6):
+        seen.page.keyboard.press("d")
+        seen.page.wait_for_timeout(150)
+    seen.page.get_by_role("button", name="Stop and save").click()
+    path = tmp_path / "prototype-session.csv"
+    assert seen.until(path.is_file)
+    robot = fastrod.load_robot("prototype")
+    log = read_log(path, robot)
+    assert len(log) > 20
+    assert log.dl[-1, 0] == pytest.approx(-0.0075 * np.radians(30.0), rel=1e-9)
+    result = replay(log, robot)  # the model that was driven answers as it did: 20 points a segment here, 10 there
+    assert result.rms < 1e-6
+    seen.page.get_by_role("button", name="Replay the recording").click()
+    assert seen.until(lambda: isinstance(app.page, ReplayPage))
+    assert seen.until(lambda: seen.page.get_by_text("Time [s]", exact=True).count() == 1)
+    assert seen.errors == []
+
+
+@pytest.mark.parametrize("what", ["prototype", DEMO_LOG])
+def test_an_exported_page_opens_from_disk_without_a_network(app: App, window: Windows, tmp_path: Path, what: str) -> None:
+    app.open(what)
+    seen = window(app.address)
+    if what == "prototype":
+        seen.page.get_by_role("tab", name="Save").click()
+    with seen.page.expect_download(timeout=60_000) as waiting:
+        seen.page.get_by_role("button", name="Export as a web page").click()
+    path = tmp_path / "page.html"
+    waiting.value.save_as(path)
+    assert external_references(path.read_text(encoding="utf-8")) == []
+    alone = window(offline=True)
+    alone.go(path.as_uri())
+    alone.page.wait_for_timeout(2500)
+    picture = alone.pixels()
+    assert len(np.unique(picture[150:600, 420:860].reshape(-1, 3), axis=0)) > 200  # a robot, and not a blank
+    assert alone.errors == []
+
+
+def test_a_picture_is_saved(app: App, window: Windows, tmp_path: Path) -> None:
+    from matplotlib.image import imread
+
+    app.open("prototype")
+    seen = window(app.address)
+    seen.page.get_by_role("tab", name="Save").click()
+    with seen.page.expect_download(timeout=60_000) as waiting:
+        seen.page.get_by_role("button", name="Save a picture (PNG)").click()
+    path = tmp_path / "picture.png"
+    waiting.value.save_as(path)
+    picture = imread(path)
+    assert picture.shape[0] > 300
+    assert picture.std() > 0.02

@@ -1,0 +1,234 @@
+"""What hands want becomes motion within limits; sessions that run, stop and record; all without a browser."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+import fastrod
+from fastrod.errors import InputError
+from fastrod.link import Measurement, RobotLink
+from fastrod.simulated import SimulatedRobot
+from fastrod_viewer.knobs import drive_knobs, largest_force, load_knobs, nice
+from fastrod_viewer.pilot import LARGEST_BEND, Pilot, Speeds
+from fastrod_viewer.record import Recorder
+from fastrod_viewer.session import Session, measure
+from fastrod_viewer.worlds import FreeWorld
+
+DT = 1.0 / 30.0
+
+
+def piloted(name: str = "five_segment_reacher") -> tuple[FreeWorld, Pilot]:
+    world = FreeWorld(fastrod.load_robot(name))
+    return world, Pilot(world)
+
+
+def until(holds: Callable[[], bool], seconds: float = 10.0) -> bool:
+    end = time.monotonic() + seconds
+    while not holds() and time.monotonic() < end:
+        time.sleep(0.01)
+    return holds()
+
+
+def test_a_bend_arrives_at_its_speed_and_bends_an_arc() -> None:
+    world, pilot = piloted("prototype")
+    pilot.speeds = Speeds(bend=1.0)
+    pilot.bend(0, 0.5, 0.0)
+    before = pilot.step(0.1).tendon_length
+    # 0.1 rad of the 0.5 in a tenth of a second, times the wires' 7.5 mm
+    np.testing.assert_allclose(before - 0.07, [-0.00075, 0.0, 0.00075, 0.0], atol=1e-12)
+    for _ in range(30):
+        world.drive(pilot.step(DT))
+    assert pilot.arrived
+    length, angle = 0.07, 0.5
+    tip = world.rods[0].state.tip_position[0]
+    arc = length / angle * np.array([1.0 - np.cos(angle), 0.0, np.sin(angle)])
+    np.testing.assert_allclose(tip, arc, atol=3e-4)  # the wires stretch by 1e-5 m/N
+
+
+def test_bends_and_extensions_stay_within_their_ranges() -> None:
+    _, pilot = piloted()
+    pilot.bend(2, 9.0, -9.0)
+    assert pilot.bent(2) == pytest.approx((LARGEST_BEND, -LARGEST_BEND))
+    pilot.extend(2, 0.1)
+    assert pilot.goals.action[6] == 0.0  # this robot does not extend
+
+
+@pytest.mark.parametrize("goal", [(0.10, 0.05, 0.40), (-0.15, 0.0, 0.35), (0.0, 0.2, 0.3)])
+def test_a_drag_brings_the_tip_there(goal: tuple[float, float, float]) -> None:
+    world, pilot = piloted()
+    world.drive(pilot.step(DT))
+    pilot.drag(goal)
+    away = []
+    for _ in range(120):
+        world.drive(pilot.step(DT))
+        away.append(float(np.linalg.norm(world.rods[0].state.tip_position[0] - goal)))
+    assert away[-1] < 1e-4
+    assert max(np.diff(away)) < 1e-3  # nearly straight there
+    pilot.drag(None)
+    assert pilot.arrived
+
+
+def test_a_drag_out_of_reach_ends_near_it_and_within_the_limits() -> None:
+    world, pilot = piloted()
+    world.drive(pilot.step(DT))
+    pilot.drag((2.0, 0.0, 0.3))
+    for _ in range(150):
+        world.drive(pilot.step(DT))
+    state = world.rods[0].state
+    assert np.isfinite(state.tip_position).all()
+    assert np.abs(pilot.goals.action.reshape(-1, 3)[:, 1:]).max() <= LARGEST_BEND * 0.0075 + 1e-12
+    assert state.tip_position[0, 0] > 0.35  # as far toward it as half a metre of robot goes
+
+
+def test_one_wire_moves_alone() -> None:
+    _, pilot = piloted("tdcr_a")
+    pilot.bend(0, 0.3, 0.1)
+    before = pilot.change
+    pilot.wire(4, -0.002)
+    expected = before.copy()
+    expected[4] = -0.002
+    np.testing.assert_allclose(pilot.change, expected, atol=1e-15)
+    assert pilot.bent(0) == pytest.approx((0.3, 0.1))
+
+
+def test_taking_over_moves_nothing() -> None:
+    world, pilot = piloted()
+    for _ in range(40):
+        world.play()
+    tip = world.rods[0].state.tip_position[0].copy()
+    now = measure(world, None)
+    pilot.adopt(now.dl, now.ext)
+    for _ in range(3):
+        world.drive(pilot.step(DT))
+    np.testing.assert_allclose(world.rods[0].state.tip_position[0], tip, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", fastrod.robot_names())
+def test_every_knob_reads_what_it_was_put_to(name: str) -> None:
+    world, pilot = piloted(name)
+    knobs = [knob for group in drive_knobs(world, pilot) for knob in group.knobs] + list(load_knobs(world.robot, pilot).knobs)
+    for knob in knobs:
+        assert knob.low < knob.high
+        assert knob.label.endswith("]")
+        wanted = knob.low + 0.7 * (knob.high - knob.low)
+        knob.put(wanted)
+        assert knob.get() == pytest.approx(wanted, abs=1e-9), knob.label
+        assert abs(knob.value - wanted) <= 0.11 * knob.step
+        pilot.reset()
+
+
+def test_ranges_are_round_numbers_that_suit_the_robot() -> None:
+    assert [nice(v) for v in (0.011, 0.2, 3.0, 51.0)] == [0.02, 0.2, 5.0, 100.0]
+    # twice EI / l^2 = 0.898 N for the prototype
+    assert largest_force(fastrod.load_robot("prototype")) == 1.0
+
+
+def test_speeds_are_positive() -> None:
+    with pytest.raises(InputError, match=r"Speeds.bend is 0.0; it must be positive"):
+        Speeds(bend=0.0)
+
+
+def test_a_session_moves_in_real_time_and_stops_at_once() -> None:
+    world, pilot = piloted("prototype")
+    drawn: list[float] = []
+    session = Session(world, pilot, draw=lambda frame: drawn.append(frame.world.t))
+    session.start()
+    pilot.speeds = Speeds(bend=0.2)
+    session.take_over()
+    pilot.bend(0, 1.0, 0.0)
+    session.touch()
+    assert until(lambda: pilot.now.action[1] > 1e-4)
+    session.stop()
+    there = pilot.now.action.copy()
+    time.sleep(0.2)
+    np.testing.assert_array_equal(pilot.now.action, there)
+    assert there[1] < 0.9 * 0.0075
+    session.release()
+    pilot.bend(0, 0.0, 0.0)
+    session.touch()
+    assert until(lambda: pilot.arrived)
+    session.close()
+    assert len(drawn) > 5
+
+
+def test_a_paused_session_steps_one_picture_at_a_time() -> None:
+    world, pilot = piloted("prototype")
+    session = Session(world, pilot, draw=lambda frame: None, script=True)
+    session.paused = True
+    session.start()
+    time.sleep(0.2)
+    before = world.t
+    session.step()
+    assert until(lambda: world.t > before)
+    time.sleep(0.2)
+    assert world.t - before == pytest.approx(DT, abs=1e-9)
+    session.close()
+
+
+def test_a_real_robot_stops_when_nobody_watches_and_a_simulated_one_holds() -> None:
+    robot = fastrod.load_robot("prototype")
+    for real in (True, False):
+        link = SimulatedRobot(robot, real=real)
+        assert isinstance(link, RobotLink)
+        world = FreeWorld(robot)
+        pilot = Pilot(world, Speeds(bend=0.1))
+        session = Session(world, pilot, draw=lambda frame: None, link=link)
+        session.start()
+        pilot.bend(0, 1.0, 0.0)
+        session.touch()
+        assert until(lambda link=link: bool(link.read().dl[0] < -1e-5))
+        session.nobody()
+        there = pilot.now.action[1]
+        time.sleep(0.3)
+        assert pilot.now.action[1] == pytest.approx(there, abs=1e-4)
+        assert link.stopped is real
+        session.close()
+        assert link.stopped
+
+
+def test_a_measured_robot_that_differs_shows_its_residual() -> None:
+    """The link's robot has softer wires than its model; what is measured is the link's."""
+    robot = fastrod.load_robot("prototype")
+    world = FreeWorld(robot)
+    pilot = Pilot(world)
+    seen: list[Measurement | None] = []
+    session = Session(world, pilot, draw=lambda frame: seen.append(frame.measured), link=SimulatedRobot(robot))
+    recorder = Recorder(robot)
+    recorder.start(0.0, "by hand")
+    session.recorder = recorder
+    session.start()
+    pilot.bend(0, 0.5, 0.0)
+    session.touch()
+    assert until(lambda: pilot.arrived and len(seen) > 20)
+    session.close()
+    last = seen[-1]
+    assert last is not None
+    state = world.rods[0].state
+    np.testing.assert_allclose(last.tip_position, state.tip_position[0], atol=1e-6)
+    assert len(recorder) > 10
+
+
+def test_a_simulated_robot_refuses_what_it_cannot_do() -> None:
+    link = SimulatedRobot(fastrod.load_robot("prototype"))
+    with pytest.raises(InputError, match=r"dl is \[0.0\]; give 4 finite numbers"):
+        link.command([0.0])
+    with pytest.raises(InputError, match="finite"):
+        link.command([np.nan, 0.0, 0.0, 0.0])
+    link.command([-0.004, 0.0, 0.004, 0.0])
+    link.stop()
+    link.command([0.0, 0.0, 0.0, 0.0])
+    np.testing.assert_array_equal(link.read().dl, [-0.004, 0.0, 0.004, 0.0])
+    link.release()
+    link.command([0.0, 0.0, 0.0, 0.0])
+    assert not link.read().dl.any()
+
+
+def test_a_measurement_has_the_shapes_of_a_log() -> None:
+    good = {"t": 0.0, "dl": np.zeros(4), "ext": np.zeros(1), "tip_position": np.zeros(3), "tip_quaternion": [1, 0, 0, 0], "tension": np.zeros(4)}
+    assert Measurement(**good).problem == ""  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"Measurement.tip_position has shape \(2,\); it must be \(3,\)"):
+        Measurement(**(good | {"tip_position": np.zeros(2)}))  # type: ignore[arg-type]

@@ -1,0 +1,217 @@
+"""The recorder: what is recorded is what is read back, and what a killed session has left is not lost."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+import fastrod
+from fastrod.errors import InputError, LogError
+from fastrod.link import Measurement
+from fastrod.robot import Robot
+from fastrod.runlog import RunLog, read_log
+from fastrod.types import Floats
+from fastrod_viewer.record import Recorder, free_path, recover
+
+ROBOT = fastrod.load_robot("prototype")
+
+
+def reading(t: float, rng: np.random.Generator, robot: Robot = ROBOT) -> Measurement:
+    quaternion = rng.normal(size=4)
+    return Measurement(
+        t=t,
+        dl=rng.uniform(-0.005, 0.005, robot.n_tendons),
+        ext=np.zeros(robot.n_segments),
+        tip_position=rng.uniform(-0.05, 0.05, 3),
+        tip_quaternion=quaternion / np.linalg.norm(quaternion),
+        tension=rng.uniform(0.0, 3.0, robot.n_tendons),
+    )
+
+
+def filled(recorder: Recorder, n: int = 200, seed: int = 3) -> Recorder:
+    """Two runs of `n` rows, the second with a payload."""
+    rng = np.random.default_rng(seed)
+    for run, payload in (("free", 0.0), ("loaded", 0.02)):
+        recorder.start(10.0, run)
+        for k in range(n):
+            recorder.add(reading(10.0 + 0.02 * k, rng), payload=payload, commanded_dl=rng.uniform(-0.005, 0.005, ROBOT.n_tendons))
+    return recorder
+
+
+def assert_same(a: RunLog, b: RunLog) -> None:
+    for name in ("t", "run", "dl", "tip_position", "ext", "tip_quaternion", "points", "tip_force", "payload", "base_quaternion"):
+        one, other = getattr(a, name), getattr(b, name)
+        assert (one is None) == (other is None), name
+        if one is not None:
+            assert_array_equal(one, other, err_msg=name)
+    assert sorted(a.extra) == sorted(b.extra)
+    for name, cells in a.extra.items():
+        assert_array_equal(numbers(cells), numbers(b.extra[name]), err_msg=name)
+
+
+def numbers(cells: object) -> Floats:
+    """A column of numbers, or of what a CSV has in their place."""
+    return np.array([float(cell or "nan") if isinstance(cell, str) else cell for cell in cells])  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_a_recording_reads_back_bit_for_bit(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"session{suffix}"
+    recorder = filled(Recorder(ROBOT, path))
+    assert recorder.recording
+    assert len(recorder) == 400
+    log = recorder.stop()
+    assert not recorder.recording
+    assert_same(log, read_log(path, ROBOT))
+    assert sorted(file.name for file in tmp_path.iterdir()) == [path.name]
+    assert log.runs == ["free", "loaded"]
+    assert log.measured.all()
+    assert log.payload is not None
+    assert log.tip_force is None  # none was ever given
+    assert log.ext is None  # this robot does not extend
+    assert_array_equal(log.t[:2], [0.0, 10.02 - 10.0])
+    assert sorted(log.extra) == [f"{what}_{k}" for what in ("cmd_dl", "tension") for k in range(1, 5)]
+
+
+def test_what_is_missing_stays_missing(tmp_path: Path) -> None:
+    path = tmp_path / "session.csv"
+    recorder = Recorder(ROBOT, path)
+    recorder.start(0.0)
+    unknown = np.full(3, np.nan)
+    for k in range(3):
+        tip = unknown if k == 1 else np.array([0.0, 0.0, 0.07])
+        force = (0.1, 0.0, 0.0) if k == 2 else None
+        given = Measurement(t=k, dl=np.zeros(4), ext=np.zeros(1), tip_position=tip, tip_quaternion=np.full(4, np.nan), tension=[np.inf] * 4)
+        recorder.add(given, tip_force=force)
+    log = recorder.stop()
+    assert_same(log, read_log(path, ROBOT))
+    assert log.measured.tolist() == [True, False, True]
+    assert log.tip_quaternion is None
+    assert log.extra == {}  # no tension was finite and nothing was commanded
+    assert log.tip_force is not None
+    assert_array_equal(log.tip_force, [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.1, 0.0, 0.0]])
+    assert log.runs == [""]
+
+
+def test_a_robot_that_extends_has_its_extension_recorded(tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    longer = replace(ROBOT, segments=tuple(replace(segment, extension=(0.0, 0.02)) for segment in ROBOT.segments))
+    recorder = Recorder(longer, tmp_path / "session.csv")
+    recorder.start(0.0)
+    recorder.add(
+        Measurement(t=0.0, dl=np.zeros(4), ext=[0.01], tip_position=[0, 0, 0.08], tip_quaternion=[1, 0, 0, 0], tension=np.zeros(4))
+    )
+    log = recorder.stop()
+    assert log.ext is not None
+    assert_array_equal(log.ext, [[0.01]])
+    assert_same(log, read_log(tmp_path / "session.csv", longer))
+
+
+def test_a_killed_session_is_recovered_row_by_row(tmp_path: Path) -> None:
+    path, kept = tmp_path / "session.csv", tmp_path / "kept"
+    kept.mkdir()
+    recorder = filled(Recorder(ROBOT, path))
+    (kept / "session.csv.part").write_bytes((tmp_path / "session.csv.part").read_bytes())  # as it lies there while rows still come
+    whole = recorder.stop()
+    log = recover(kept / "session.csv")
+    assert_same(log, whole)
+    assert_same(log, read_log(kept / "session.csv", ROBOT))
+    assert not (kept / "session.csv.part").exists()
+
+
+def test_a_row_cut_short_is_left_out(tmp_path: Path) -> None:
+    path, kept = tmp_path / "session.csv", tmp_path / "kept"
+    kept.mkdir()
+    recorder = filled(Recorder(ROBOT, path), n=5)
+    text = (tmp_path / "session.csv.part").read_text()
+    (kept / "session.csv.part").write_text(text[:-9])
+    whole = recorder.stop()
+    assert_same(recover(kept / "session.csv.part"), whole.rows(slice(0, 9)))
+
+
+def test_nothing_to_recover_is_said(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"session.csv.part' cannot be recovered: No such file"):
+        recover(tmp_path / "session.csv")
+    (tmp_path / "empty.csv.part").write_text("t,run,dl_1,tip_x,tip_y,tip_z\n")
+    with pytest.raises(LogError, match="no whole row"):
+        recover(tmp_path / "empty.csv")
+    (tmp_path / "other.csv.part").write_text("a,b\n1,2\n")
+    with pytest.raises(LogError, match="no recording: it lacks column t"):
+        recover(tmp_path / "other.csv")
+    (tmp_path / "other.csv").write_text("t\n")
+    with pytest.raises(InputError, match="is there already"):
+        recover(tmp_path / "other.csv")
+
+
+def test_a_failed_end_keeps_the_part(tmp_path: Path) -> None:
+    path = tmp_path / "session.csv"
+    recorder = filled(Recorder(ROBOT, path), n=5)
+    path.mkdir()  # somebody takes the name meanwhile
+    with pytest.raises(InputError, match=r"its rows are in session.csv.part"):
+        recorder.stop()
+    path.rmdir()
+    assert len(recover(path)) == 10
+
+
+def test_without_a_path_rows_stay_in_memory(tmp_path: Path) -> None:
+    first, second = (filled(recorder).stop() for recorder in (Recorder(ROBOT), Recorder(ROBOT, tmp_path / "session.csv")))
+    assert_same(first, second)
+    assert first.name == "session"
+
+
+def test_no_file_is_overwritten_unasked(tmp_path: Path) -> None:
+    path = tmp_path / "session.csv"
+    assert free_path(path) == path
+    filled(Recorder(ROBOT, path), n=2).stop()
+    with pytest.raises(InputError, match=r"is there already, or record to 'session-2.csv'"):
+        Recorder(ROBOT, path)
+    assert free_path(path) == tmp_path / "session-2.csv"
+    (tmp_path / "session-2.csv.part").touch()
+    assert free_path(path) == tmp_path / "session-3.csv"
+    with pytest.raises(InputError, match="recover it"):
+        Recorder(ROBOT, tmp_path / "session-2.csv")
+    assert len(filled(Recorder(ROBOT, path, overwrite=True), n=3).stop()) == 6
+    assert len(read_log(path, ROBOT)) == 6
+
+
+@pytest.mark.parametrize(("name", "sentence"), [("a.txt", "does not end in .csv or .parquet"), ("none/a.csv", "is not there; make it")])
+def test_a_path_that_cannot_be_one_is_refused(tmp_path: Path, name: str, sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        Recorder(ROBOT, tmp_path / name)
+
+
+def test_times_never_run_back_and_no_reading_counts_twice() -> None:
+    rng = np.random.default_rng(5)
+    recorder = Recorder(ROBOT)
+    recorder.start(1.0)
+    assert not recorder.add(reading(0.9, rng))  # the robot's newest reading, from before the start
+    assert recorder.add(reading(1.1, rng))
+    assert not recorder.add(reading(1.1, rng))
+    with pytest.raises(InputError, match="clock ran back"):
+        recorder.add(reading(1.05, rng))
+    assert recorder.stop().t.tolist() == [1.1 - 1.0]
+
+
+def test_wrong_use_is_said_in_a_sentence(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    recorder = Recorder(ROBOT, tmp_path / "a.csv")
+    with pytest.raises(InputError, match="start first"):
+        recorder.stop()
+    with pytest.raises(InputError, match="start first"):
+        recorder.add(reading(0.0, rng))
+    recorder.start(0.0, "one")
+    with pytest.raises(InputError, match="'one' is recorded already"):
+        recorder.start(0.0, "one")
+    with pytest.raises(InputError, match="one line"):
+        recorder.start(0.0, "a\nb")
+    with pytest.raises(InputError, match=r"dl of the reading has shape \(8,\); robot 'prototype' needs \(4,\)"):
+        recorder.add(Measurement(t=0, dl=np.zeros(8), ext=[0], tip_position=np.zeros(3), tip_quaternion=[1, 0, 0, 0], tension=np.zeros(8)))
+    with pytest.raises(InputError, match=r"tip_force of the reading has shape \(2,\)"):
+        recorder.add(reading(0.0, rng), tip_force=(0.0, 0.0))
+    with pytest.raises(InputError, match="no reading came in"):
+        recorder.stop()
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,537 @@
+"""What the viewer draws lies where the rod is; nothing here needs a browser."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from rods import bend, rod
+
+import fastrod
+from fastrod.errors import InputError
+from fastrod.segments import SegmentActions
+from fastrod_scenes import load
+from fastrod_viewer import palette
+from fastrod_viewer.chains import axes, tangents
+from fastrod_viewer.scene_graph import SHAPES, Options, Picture, Trail, ball, bounds, ghost, grid_places, legend
+from fastrod_viewer.world import Body, Rods
+
+
+def seen(robots, state, place=None):
+    robots = robots if isinstance(robots, tuple) else (robots,)
+    radius = tuple(segment.body_radius or 0.009 for segment in robots[0].segments)
+    return Rods(robots, state, np.zeros((len(state.ok), 3)) if place is None else place, radius)
+
+
+def bent(name, n_robots=1, seed=3, points=20):
+    """A simulator of robots bent at random, and their state."""
+    robot = fastrod.load_robot(name)
+    simulator = fastrod.Simulator(robot, n_robots, points_per_segment=points)
+    if not robot.n_tendons:
+        return robot, simulator, simulator.settle()
+    moves = np.random.default_rng(seed).uniform(-0.004, 0.004, (n_robots, robot.n_segments, 3)) * [0.0, 1.0, 1.0]
+    state = simulator.settle(**SegmentActions(robot).inputs(moves.reshape(n_robots, -1)))
+    assert state.ok.all()
+    return robot, simulator, state
+
+
+def ends(batch):
+    """Both ends of pieces along z, from their centres, turns and lengths."""
+    half = 0.5 * batch.scale[:, 2:] * tangents(batch.wxyz.astype(float))
+    return batch.position - half, batch.position + half
+
+
+def check(batches):
+    for batch in batches.values():
+        n = len(batch.position)
+        assert (batch.position.shape, batch.wxyz.shape, batch.scale.shape, batch.color.shape) == ((n, 3), (n, 4), (n, 3), (n, 3))
+        assert (batch.position.dtype, batch.wxyz.dtype, batch.scale.dtype, batch.color.dtype) == (np.float32,) * 3 + (np.uint8,)
+        assert all(np.isfinite(a).all() for a in batch[1:])
+        assert_allclose(np.linalg.norm(batch.wxyz, axis=1), 1.0, atol=1e-6)
+        assert (batch.scale >= 0.0).all()
+    return batches
+
+
+# -- the rod ---------------------------------------------------------------------------------------------------------------------------
+
+
+def test_pieces_of_an_arc_lie_on_the_arc():
+    robot = rod(compliance=0.0)  # wires that do not stretch bend it by just the angle
+    angle = 1.2
+    state = fastrod.Simulator(robot).settle(bend(robot, 0.0, angle))
+    body = check(Picture(seen(robot, state), Options(tendons=False)).frame(seen(robot, state)))["body"]
+    n, length = 40, 0.07
+    middle = (np.arange(n) + 0.5) / n * angle
+    turn = angle / n
+    radius = length / angle * np.cos(turn / 2)  # of the circle through the middles of chords of an arc
+    arc = np.stack([length / angle - radius * np.cos(middle), 0.0 * middle, radius * np.sin(middle)], axis=1)
+    assert_allclose(body.position, arc, atol=1e-5)
+    direction = np.stack([np.sin(middle), 0.0 * middle, np.cos(middle)], axis=1)
+    assert_allclose(tangents(body.wxyz.astype(float)), direction, atol=2e-4)
+
+
+@pytest.mark.parametrize("name", fastrod.robot_names())
+@pytest.mark.parametrize("points", [4, 10, 20])
+def test_chain_follows_the_rod(name, points):
+    robot, simulator, state = bent(name, points=points)
+    picture = Picture(seen(robot, state))
+    body = check(picture.frame(seen(robot, state)))["body"]
+    p = picture.pieces
+    at = np.linspace(0.0, 1.0, p + 1)
+    joints = state.arclength[0, ::points]
+    s = np.concatenate([a + at * (b - a) for a, b in itertools.pairwise(joints)])
+    pose = simulator.shape(np.minimum(s, joints[-1]))
+    points_on = pose.position[0].reshape(-1, p + 1, 3)
+    tolerance = 1e-4 * robot.length if points == 4 else 1e-5 * robot.length
+    assert_allclose(body.position.reshape(-1, p, 3), 0.5 * (points_on[:, 1:] + points_on[:, :-1]), atol=tolerance)
+    chord = points_on[:, 1:] - points_on[:, :-1]
+    size = np.linalg.norm(chord, axis=-1, keepdims=True)
+    assert_allclose(tangents(body.wxyz.astype(float)).reshape(-1, p, 3), chord / size, atol=0.01 if points == 4 else 1e-3)
+    # neighbours overlap, by the radius times the angle between them, so that no wedge opens on the outside of the bend
+    over = body.scale[:, 2].reshape(-1, p, 1) - size
+    tangent = pose.rotation[0, :, :, 2].reshape(-1, p + 1, 3)
+    turn = np.linalg.norm(tangent[:, 1:] - tangent[:, :-1], axis=-1, keepdims=True)
+    assert_allclose(over, picture.tube_radius[:, None, None] * turn, atol=1e-2 * size.max())  # turns evenly between nodes
+    assert (over >= -1e-6).all()
+
+
+def test_nodes_that_are_not_even_do_not_show():
+    robot = fastrod.load_robot("tdcr_a")
+    simulator = fastrod.Simulator(robot, points_per_segment=20)
+    state = simulator.settle(robot.rest_tendon_length, point_force=[(0.133, (0.1, 0.0, 0.0)), (0.207, (0.0, 0.1, 0.0))])
+    assert np.ptp(np.diff(state.arclength[0])) > 1e-3
+    body = Picture(seen(robot, state)).frame(seen(robot, state))["body"]
+    assert_allclose(np.linalg.norm(np.diff(body.position[:40], axis=0), axis=1), 0.2 / 40, rtol=1e-3)
+    assert_allclose(body.position, simulator.shape((np.arange(80) + 0.5) * 0.4 / 80).position[0], atol=1e-5)
+
+
+def test_tip_is_at_the_tip():
+    robot, _, state = bent("five_segment_reacher", n_robots=3)
+    tip = Picture(seen(robot, state), Options(body="skin")).frame(seen(robot, state))["tip"]
+    assert tip.shape == "cap"
+    assert_allclose(tip.position, state.tip_position, atol=1e-6)
+    assert_allclose(tangents(tip.wxyz.astype(float)), state.tip_rotation[:, :, 2], atol=1e-6)
+    assert_allclose(tip.scale, 0.012)
+
+
+# -- what sits on it -------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["prototype", "tdcr_a", "tdcr_b", "five_segment_reacher"])
+def test_tendons_run_at_their_offsets_and_are_as_long_as_they_are(name):
+    robot, simulator, state = bent(name)
+    rods = seen(robot, state)
+    tendons = check(Picture(rods).frame(rods))["tendons"]
+    first, last = ends(tendons)
+    pieces = 10
+    pairs = [(t, k) for t, end in enumerate(robot.tendon_segment) for k in range(end + 1)]
+    assert len(tendons.position) == pieces * len(pairs)
+    joints = state.arclength[0, ::20]
+    total = np.zeros(robot.n_tendons)
+    for i, (t, k) in enumerate(pairs):
+        own = slice(pieces * i, pieces * (i + 1))
+        pose = simulator.shape(np.minimum(joints[k] + np.linspace(0.0, 1.0, pieces + 1) * (joints[k + 1] - joints[k]), joints[-1]))
+        offset = np.array([*robot.tendons[t].position(int(robot.tendon_segment[t]) + 1)[k], 0.0])
+        on = pose.position[0] + pose.rotation[0] @ offset
+        assert_allclose(tendons.position[own], 0.5 * (on[1:] + on[:-1]), atol=2e-6)
+        assert_allclose(first[own], on[:-1], atol=3e-5)  # a chain is as long as its tendon, so pieces are as long as their arcs
+        assert_allclose(last[own], on[1:], atol=3e-5)
+        total[t] += tendons.scale[own, 2].sum(dtype=float)
+    assert_allclose(total, state.path_length[0], rtol=1e-4)
+
+
+def test_tendons_on_the_skin_are_on_its_surface():
+    robot, _, state = bent("tdcr_b")
+    rods = seen(robot, state)
+    assert "tendons" not in Picture(rods, Options(body="skin")).frame(rods)
+    found = Picture(rods, Options(body="skin", color_by="tension", pieces=32)).frame(rods)
+    nearest = np.linalg.norm(found["tendons"].position[:, None] - found["body"].position, axis=2).min(1)
+    assert_allclose(nearest, 0.012, atol=4e-4)
+
+
+def test_a_spacer_stands_at_the_base_and_at_the_end_of_every_segment():
+    robot, _, state = bent("five_segment_reacher")
+    spacers = check(Picture(seen(robot, state)).frame(seen(robot, state)))["spacers"]
+    assert spacers.shape == "disc"
+    for k in range(6):
+        away = np.linalg.norm(spacers.position - state.position[0, 20 * k], axis=1)
+        assert away.min() < 1e-6
+        at = int(away.argmin())
+        assert spacers.scale[at, 2] > np.median(spacers.scale[:, 2])
+        assert_allclose(tangents(spacers.wxyz[at].astype(float)), state.rotation[0, 20 * k, :, 2], atol=1e-5)
+    steps = np.linalg.norm(np.diff(spacers.position, axis=0), axis=1)
+    assert_allclose(steps, 1.6 * 0.012, rtol=0.2)
+    assert (spacers.scale[1:, 0] == np.float32(0.012)).all()
+
+
+def test_robot_without_tendons_is_its_body():
+    robot, _, state = bent("ethz_beam")
+    rods = seen(robot, state)
+    found = check(Picture(rods, Options(color_by="tension")).frame(rods))
+    assert set(found) == {"body", "tip", "load_shafts", "load_heads"}
+    assert_allclose(found["body"].scale[:, 0], 0.015)
+    assert "no tendons" in legend(rods, Options(color_by="tension"), Picture(rods, Options(color_by="tension"))).html()
+
+
+# -- frames ----------------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("options", [Options(frames=True), Options(color_by="strain", body="skin"), Options(color_by="tension")])
+def test_counts_stay_over_a_rollout(options):
+    robot = fastrod.load_robot("five_segment_reacher")
+    actions = SegmentActions(robot)
+    simulator = fastrod.Simulator(robot, 2, points_per_segment=10)
+    picture, counts = None, []
+    for k in range(20):
+        state = simulator.step(**actions.inputs(np.tile([0.0, 0.003 * k / 20, 0.001], 5)))
+        picture = picture or Picture(seen(robot, state), options)
+        found = check(picture.frame(seen(robot, state), tip_force=np.array([0.0, 0.01 * k, 0.0])))
+        counts.append({name: len(batch.position) for name, batch in found.items()})
+    assert all(count == counts[0] for count in counts)
+    assert counts[0]["body"] == 2 * 5 * 40
+
+
+@pytest.mark.parametrize("color_by", ["segment", "curvature", "tension"])
+def test_batch_is_its_robots(color_by):
+    robot, _, state = bent("tdcr_a", n_robots=3)
+    place = grid_places(3, 0.5)
+    picture = Picture(seen(robot, state, place), Options(color_by=color_by))
+    many = picture.frame(seen(robot, state, place), tip_force=np.eye(3))
+    along = [name for name, value in vars(state).items() if isinstance(value, np.ndarray)]
+    for i in range(3):
+        one = replace(state, **{name: getattr(state, name)[i : i + 1] for name in along})
+        single = Picture(seen(robot, one, place[i : i + 1]), Options(color_by=color_by))
+        if picture.range is not None:
+            single.range = picture.range
+        for name, batch in single.frame(seen(robot, one, place[i : i + 1]), tip_force=np.eye(3)[i]).items():
+            n = len(batch.position)
+            for mine, theirs in zip(batch[1:], many[name][1:], strict=True):
+                assert_array_equal(mine, theirs[i * n : (i + 1) * n])
+
+
+def test_place_moves_the_picture():
+    robot, _, state = bent("prototype", n_robots=2)
+    place = grid_places(2, 0.4)
+    here = Picture(seen(robot, state)).frame(seen(robot, state))
+    there = Picture(seen(robot, state, place)).frame(seen(robot, state, place))
+    for name in here:
+        shift = there[name].position.reshape(2, -1, 3) - here[name].position.reshape(2, -1, 3)
+        assert_allclose(shift, np.broadcast_to(place[:, None], shift.shape), atol=1e-7)
+
+
+def test_many_robots_are_drawn_light():
+    robot, _, state = bent("prototype", n_robots=17, points=10)
+    found = check(Picture(seen(robot, state), Options(tendons=True, spacers=True)).frame(seen(robot, state)))
+    assert set(found) == {"body", "tip", "load_shafts", "load_heads"}
+    assert len(found["body"].position) == 17 * 10
+
+
+def test_robot_that_is_lost_stays_and_is_red():
+    robot, _, state = bent("prototype", n_robots=2)
+    picture = Picture(seen(robot, state))
+    before = picture.frame(seen(robot, state))
+    along = ("position", "rotation", "curvature", "arclength", "tension")
+    gone = {
+        name: np.where(np.arange(2).reshape(-1, *[1] * (getattr(state, name).ndim - 1)) == 1, np.nan, getattr(state, name))
+        for name in along
+    }
+    after = check(picture.frame(seen(robot, replace(state, ok=np.array([True, False]), **gone))))
+    assert_array_equal(after["body"].position, before["body"].position)
+    assert_array_equal(after["tendons"].position, before["tendons"].position)
+    red = after["body"].color.reshape(2, -1, 3).astype(int)
+    assert_array_equal(red[0], before["body"].color.reshape(2, -1, 3)[0])
+    assert (red[1, :, 0] > red[1, :, 1] + 60).all()
+
+
+def test_robot_that_was_never_there_is_straight():
+    robot, _, state = bent("prototype")
+    gone = {name: np.full_like(getattr(state, name), np.nan) for name in ("position", "rotation", "curvature", "arclength", "tension")}
+    rods = seen(robot, replace(state, ok=np.array([False]), **gone))
+    found = check(Picture(rods).frame(rods))
+    assert_allclose(found["body"].position[:, 2], (np.arange(40) + 0.5) * 0.07 / 40, atol=1e-7)
+
+
+# -- colours ---------------------------------------------------------------------------------------------------------------------------
+
+
+def test_segments_have_colours_of_their_own():
+    robot, _, state = bent("five_segment_reacher")
+    color = Picture(seen(robot, state)).frame(seen(robot, state))["body"].color.reshape(5, 40, 3)
+    assert (color == color[:, :1]).all()
+    assert len(np.unique(color[:, 0], axis=0)) == 5
+    apart = [np.abs(np.subtract(a, b)).sum() for i, a in enumerate(palette.SEGMENTS) for b in palette.SEGMENTS[:i]]
+    assert len(palette.SEGMENTS) >= 8
+    assert min(apart) > 60
+
+
+def test_more_bend_is_brighter():
+    robot = fastrod.load_robot("prototype")
+    lengths = np.stack([bend(robot, 0.0, angle) for angle in (0.1, 0.5, 0.9, 1.3)])
+    state = fastrod.Simulator(robot, 4).settle(lengths)
+    brightness = {}
+    for color_by in ("curvature", "strain"):
+        picture = Picture(seen(robot, state), Options(color_by=color_by))
+        color = picture.frame(seen(robot, state))["body"].color.reshape(4, 40, 3)
+        brightness[color_by] = color.mean(1) @ [0.2126, 0.7152, 0.0722]
+        assert (np.diff(brightness[color_by]) > 10.0).all()
+    table = palette.SEQUENTIAL @ np.array([0.2126, 0.7152, 0.0722])
+    assert (np.diff(table) > -0.8).all()  # of 255: rounding
+    largest = 1.3 / 0.07
+    assert largest <= Picture(seen(robot, state), Options(color_by="curvature")).range.see(np.array([largest])) <= 1.5 * largest
+
+
+def test_proximal_segment_has_its_own_curvature_up_to_the_joint():
+    robot = fastrod.load_robot("tdcr_a")
+    actions = SegmentActions(robot)
+    weightless = replace(robot, gravity=(0.0, 0.0, 0.0))
+    state = fastrod.Simulator(weightless).settle(**actions.inputs([0.0, 0.008, 0.0, 0.0, -0.001, 0.0]))
+    picture = Picture(seen(robot, state), Options(color_by="curvature"))
+    color = picture.frame(seen(robot, state))["body"].color.reshape(2, 40, 3).astype(int)
+    assert np.abs(np.diff(color[0], axis=0)).max() <= 4
+    assert np.abs(color[0, -1] - color[1, 0]).max() > 60
+
+
+def test_range_grows_and_does_not_shrink():
+    scale = palette.Range(0.9)
+    assert scale.top == 1.0
+    assert scale.see(np.array([-2.4, 0.1])) == 3.0
+    assert scale.see(np.array([0.1])) == 3.0
+    outlier = np.append(np.zeros(200), 1e9)
+    assert scale.see(outlier) == 3.0
+    scale.forget()
+    assert scale.top == 1.0
+
+
+def test_slack_wire_is_light_and_thin():
+    whole = rod("tendon_length")
+    wires = tuple(replace(tendon, unilateral=True) for tendon in whole.segments[0].tendons)
+    robot = replace(whole, segments=(replace(whole.segments[0], tendons=wires),))
+    state = fastrod.Simulator(robot).settle(bend(robot, 0.0, 0.8) + np.array([-0.0001, 0.0001, 0.003, 0.0001]))
+    slack = state.tension[0] <= 1e-6
+    assert slack.any()
+    assert not slack.all()
+    rods = seen(robot, state)
+    picture = Picture(rods)
+    tendons = picture.frame(rods)["tendons"]
+    color, thick = tendons.color.reshape(4, -1, 3), tendons.scale[:, 0].reshape(4, -1)
+    assert (color[slack] == palette.SLACK).all()
+    assert (color[~slack] == palette.TAUT).all()
+    assert thick[slack].max() < thick[~slack].min()
+    assert "slack" in legend(rods, Options(), picture).html()
+    assert "pushing" not in legend(rods, Options(), picture).html()
+
+
+def test_pushing_rod_is_violet_and_tension_has_two_sides():
+    robot = fastrod.load_robot("prototype")
+    state = fastrod.Simulator(robot).settle(bend(robot, 0.0, 0.8))
+    pull, push = int(state.tension[0].argmax()), int(state.tension[0].argmin())
+    assert state.tension[0, push] < -0.01
+    rods = seen(robot, state)
+    color = Picture(rods).frame(rods)["tendons"].color.reshape(4, -1, 3)
+    assert (color[push] == palette.PUSHING).all()
+    assert (color[pull] == palette.TAUT).all()
+    by = Picture(rods, Options(color_by="tension"))
+    shown = by.frame(rods)
+    color = shown["tendons"].color.reshape(4, -1, 3)[:, 0].astype(int)
+    assert by.range.top >= state.tension.max()
+    assert color[pull, 0] > color[pull, 2] + 30
+    assert color[push, 2] > color[push, 0] + 30
+    assert (shown["body"].color == palette.BODY).all()
+
+
+# -- arrows ----------------------------------------------------------------------------------------------------------------------------
+
+
+def test_contact_arrow_begins_on_the_wall_and_points_off_it():
+    scene = load("wall")
+    simulator = scene.simulator()
+    picture, counts, drawn = None, set(), 0
+    for k in range(101):
+        state = simulator.step(**scene.inputs(k * scene.dt))
+        rods = seen(simulator.robots, state)
+        picture = picture or Picture(rods)
+        found = check(picture.frame(rods))
+        counts.add((len(found["contact_shafts"].position), len(found["contact_heads"].position)))
+        there = found["contact_heads"].scale[:, 2] > 0.0
+        n = int((np.linalg.norm(np.nan_to_num(state.contacts.force[0]), axis=-1) > 0.0).sum())
+        assert there.sum() == n
+        drawn += n
+    assert counts == {(32, 32)}
+    assert drawn > 40
+    # the wall is free where x < 0.02: off it is -x
+    head, shaft = (found[name] for name in ("contact_heads", "contact_shafts"))
+    assert_allclose(tangents(head.wxyz[there].astype(float)), [[-1.0, 0.0, 0.0]] * n, atol=1e-6)
+    start, end = ends(shaft._replace(**{name: getattr(shaft, name)[there] for name in ("position", "wxyz", "scale")}))
+    assert_allclose(start, state.contacts.point[0], atol=1e-6)
+    assert_allclose(end, head.position[there], atol=1e-6)
+    force = np.linalg.norm(state.contacts.force[0], axis=-1)
+    unit = 0.0022 / 0.07**2
+    assert_allclose(shaft.scale[there, 2] + head.scale[there, 2], 0.3 * 0.07 * force / (force + unit), rtol=1e-5)
+
+
+def test_load_arrow_is_at_the_tip():
+    robot, _, state = bent("prototype")
+    rods = seen(robot, state)
+    picture = Picture(rods)
+    assert not picture.frame(rods)["load_heads"].scale.any()
+    found = check(picture.frame(rods, tip_force=np.array([0.0, 0.0, -0.2])))
+    assert_allclose(tangents(found["load_shafts"].wxyz.astype(float)), [[0.0, 0.0, -1.0]], atol=1e-6)
+    assert_allclose(ends(found["load_shafts"])[0], state.tip_position, atol=1e-6)
+    assert not picture.frame(rods, tip_force=np.array([np.nan, 0.0, 0.0]))["load_heads"].scale.any()
+
+
+def test_axes_of_the_tip():
+    robot, _, state = bent("tdcr_a")
+    found = check(Picture(seen(robot, state), Options(frames=True)).frame(seen(robot, state)))["frames"]
+    assert_allclose(tangents(found.wxyz.astype(float)), state.tip_rotation[0].T, atol=1e-5)
+    assert_allclose(ends(found)[0], np.broadcast_to(state.tip_position, (3, 3)), atol=1e-5)
+    assert_array_equal(found.color, palette.AXES)
+
+
+def test_ghost_goes_through_its_points():
+    points = np.random.default_rng(1).normal(size=(9, 3))
+    points[3] = points[2] - [0.0, 0.0, 0.4]  # straight down, where the shortest turn of z is not unique
+    chain = ghost(points, 0.001, (9, 9, 9))
+    first, last = ends(chain)
+    assert_allclose(first, points[:-1], atol=1e-6)
+    assert_allclose(last, points[1:], atol=1e-6)
+    points[5] = np.nan
+    chain = check({"ghost": ghost(points, 0.001, (9, 9, 9))})["ghost"]
+    assert_array_equal(chain.scale[:, 2] > 0.0, [True] * 4 + [False] * 2 + [True] * 2)
+    with pytest.raises(InputError, match=r"points has shape \(1, 3\); a ghost needs \(n, 3\)"):
+        ghost(points[:1], 0.001, (9, 9, 9))
+
+
+def test_trail_keeps_the_last_positions_and_fades():
+    trail = Trail(4, 0.01)
+    assert not check({"trail": trail.instances(0.001, (200, 0, 0))})["trail"].scale.any()
+    for x in (0.0, 0.005, 0.02, np.nan, 0.04, 0.06, 0.08, 0.10):
+        trail.add(np.array([x, 0.0, 0.0]))
+    chain = check({"trail": trail.instances(0.001, (200, 0, 0))})["trail"]
+    assert len(trail) == 5
+    assert_allclose(chain.position[:, 0], [0.03, 0.05, 0.07, 0.09], atol=1e-7)
+    assert (np.diff(chain.color[:, 1].astype(int)) < 0).all()
+    assert (np.diff(chain.scale[:, 0]) > 0.0).all()
+    assert tuple(chain.color[-1]) == (200, 0, 0)
+    trail.clear()
+    assert len(trail) == 0
+    with pytest.raises(InputError, match="a trail of 0 pieces"):
+        Trail(0, 0.01)
+
+
+def test_ball_that_is_nowhere_has_no_size():
+    found = check({"ball": ball([[0.1, 0.2, 0.3], [np.nan, 0.0, 0.0]], 0.01, (1, 2, 3))})["ball"]
+    assert_allclose(found.scale[:, 0], [0.01, 0.0])
+
+
+# -- meshes, places, words -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "volume"), [("bar", np.pi), ("disc", np.pi), ("ball", 4.0 * np.pi / 3.0), ("cone", np.pi / 3.0)])
+def test_closed_meshes_are_closed_and_outward(name, volume):
+    mesh = SHAPES[name]
+    edges = {(int(a), int(b)) for face in mesh.faces for a, b in zip(face, np.roll(face, -1), strict=True)}
+    assert len(edges) == 3 * len(mesh.faces)
+    assert {(b, a) for a, b in edges} == edges
+    corners = mesh.vertices[mesh.faces].astype(float)
+    signed = np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0
+    assert signed == pytest.approx(volume, rel=0.05)
+    assert signed < volume
+
+
+@pytest.mark.parametrize("name", ["tube", "wire", "cap"])
+def test_open_meshes_face_outward(name):
+    mesh = SHAPES[name]
+    corners = mesh.vertices[mesh.faces].astype(float)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    outward = corners.mean(1) * [1.0, 1.0, name == "cap"]
+    assert (np.einsum("ij,ij->i", normal, outward) > 0.0).all()
+    assert_allclose(np.linalg.norm(mesh.vertices[:, : 3 if name == "cap" else 2], axis=1), 1.0, atol=1e-6)
+
+
+def test_meshes_have_the_sizes_they_are_said_to_have():
+    reach = {name: (mesh.vertices.min(0).round(5).tolist(), mesh.vertices.max(0).round(5).tolist()) for name, mesh in SHAPES.items()}
+    for name in ("tube", "wire", "bar", "disc"):
+        assert reach[name] == ([-1.0, -1.0, -0.5], [1.0, 1.0, 0.5])
+    assert reach["ball"] == ([-1.0] * 3, [1.0] * 3)
+    assert reach["cone"] == reach["cap"] == ([-1.0, -1.0, 0.0], [1.0, 1.0, 1.0])
+
+
+def test_axes_of_a_quaternion_are_the_columns_of_its_matrix():
+    q = np.random.default_rng(2).normal(size=(20, 4))
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    columns = fastrod.rotation.matrix_from_quaternion(q)
+    for k, axis in enumerate(axes(q)):
+        assert_allclose(axis, columns[:, :, k], atol=1e-14)
+
+
+def test_grid_is_square_and_centred():
+    for n in (1, 2, 5, 16, 64):
+        places = grid_places(n, 0.3)
+        assert places.shape == (n, 3)
+        assert_allclose(places.min(0) + places.max(0), 0.0, atol=1e-12)
+        assert len(np.unique(places.round(6), axis=0)) == n
+        assert np.ptp(places[:, 1]) <= np.ptp(places[:, 0]) == pytest.approx(0.3 * (np.ceil(np.sqrt(n)) - 1))
+
+
+def test_bounds_hold_the_robots():
+    robot, _, state = bent("five_segment_reacher", n_robots=5)
+    place = grid_places(5, 0.7)
+    centre, radius = bounds(seen(robot, state, place))
+    away = np.linalg.norm(state.position + place[:, None] - centre, axis=-1)
+    assert away.max() <= radius < 3.0
+    alone = seen(robot, replace(state, position=np.full_like(state.position, np.nan)), place)
+    assert_allclose(bounds(alone)[0], centre, atol=1e-12)
+    one, _, state = bent("prototype")
+    assert bounds(seen(one, state))[1] == pytest.approx(0.62 * 0.07)  # room to bend to both sides
+    cube = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]], np.float32)
+    far, wide = np.array([[0.4, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]]), Body("floor", cube, np.zeros((0, 3), np.uint32), (0, 0, 0))
+    near = wide._replace(name="box", vertices=0.05 * cube)
+    assert bounds(seen(one, state), [wide], far)[1] == pytest.approx(0.62 * 0.07)  # a floor is no reason to step back
+    centre, radius = bounds(seen(one, state), [near], far)
+    corners = np.array([[0.45, y, z] for y in (-0.05, 0.05) for z in (-0.05, 0.05)])
+    assert (np.linalg.norm(corners - centre, axis=1) <= radius + 1e-12).all()
+
+
+@pytest.mark.parametrize("color_by", ["segment", "curvature", "strain", "tension"])
+def test_legend_says_what_colours_mean(color_by):
+    robot, _, state = bent("tdcr_a")
+    options = Options(color_by=color_by)
+    picture = Picture(seen(robot, state), options)
+    picture.frame(seen(robot, state))
+    found = legend(seen(robot, state), options, picture)
+    html = found.html()
+    assert html.count("<div") == html.count("</div>")
+    assert html.count("<span") == html.count("</span>")
+    assert "class=" not in html
+    if color_by == "segment":
+        assert [(entry.name, entry.color) for entry in found.entries] == [
+            ("Segment 1", palette.SEGMENTS[0]),
+            ("Segment 2", palette.SEGMENTS[1]),
+        ]
+        assert "Segment 2" in html
+    else:
+        assert found.ticks[-1].value == picture.range.top
+        assert 3 <= len(found.ticks) <= 5
+        assert "linear-gradient" in html
+        assert f"[{found.unit}]" in html
+    assert ("taut" in html) == (color_by != "tension")
+
+
+def test_bad_option_is_one_sentence():
+    with pytest.raises(InputError, match=r"^Options.color_by is 'curvatur'; did you mean 'curvature'\?$"):
+        Options(color_by="curvatur")
+    with pytest.raises(InputError, match=r"^Options.body is 'skins'; did you mean 'skin'\?$"):
+        Options(body="skins")
+    with pytest.raises(InputError, match=r"^Options.tendons is 1; it must be True or False\.$"):
+        Options(tendons=1)
+    with pytest.raises(InputError, match=r"^Options.pieces is 0; it must be a whole number, at least 1, or None\.$"):
+        Options(pieces=0)
+
+
+def test_state_of_the_tip_only_is_refused():
+    robot = fastrod.load_robot("prototype")
+    state = fastrod.Simulator(robot, outputs="tip").settle(robot.rest_tendon_length)
+    with pytest.raises(InputError, match="outputs='full'"):
+        Picture(seen(robot, state))

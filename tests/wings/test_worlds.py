@@ -1,0 +1,407 @@
+"""The worlds that the viewer shows: they play and obey a hand, and what a hand does has the effect that physics gives it."""
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from fastrod import Robot, Segment, Tendon, load_robot, robot_names, save_robot
+from fastrod.errors import HostError, InputError, RobotError, UnknownNameError
+from fastrod.rotation import matrix_from_quaternion, quaternion_from_vector
+from fastrod_scenes import load, names
+from fastrod_viewer.catalogue import HOSTED_SCENES, ROD_SCENES, about, catalogue, open_world
+from fastrod_viewer.hosted import HostedView
+from fastrod_viewer.world import Hand
+from fastrod_viewer.worlds import FreeWorld, SceneWorld, sway
+
+HOSTED = ["dual_arm", "explore", "neck_look", "neck_push", "pick_suction", "track_circle"]
+
+
+def still(world, **options):
+    """A hand that keeps the straight robot."""
+    return Hand(world.robot.rest_tendon_length, np.zeros(world.robot.n_segments), **options)
+
+
+def heavy(mode="tendon_length"):
+    """A level, heavy robot of one segment."""
+    wires = tuple(Tendon(offset=0.0075, angle=k * np.pi / 2) for k in range(4))
+    segment = Segment(
+        length=0.2, bending_stiffness=(0.01, 0.01), torsional_stiffness=0.008, line_density=0.3, mode=mode,
+        tendons=() if mode == "passive" else wires,
+    )  # fmt: skip
+    return Robot(name="heavy", segments=(segment,), base_quaternion=(np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0))
+
+
+def tip(world):
+    return world.rods[0].state.tip_position[0].copy()
+
+
+def rest(world, hand, steps=8):
+    for _ in range(steps):
+        world.drive(hand)
+    return tip(world)
+
+
+@pytest.mark.parametrize("name", [*robot_names(), *ROD_SCENES, *HOSTED])
+def test_world_plays_and_obeys(name):
+    world = open_world(name)
+    try:
+        start = world.t
+        for move in [world.play] * 5 + [lambda: world.drive(still(world))] * 5 * world.by_hand + [world.reset]:
+            move()
+            poses = world.poses()
+            assert poses.shape == (len(world.bodies), 7)
+            assert np.isfinite(poses).all()
+            for rods in world.rods:
+                assert np.isfinite(rods.state.position).all()
+                assert rods.place.shape == (len(rods.state.ok), 3)
+                assert len(rods.radius) == rods.robots[0].n_segments
+                assert min(rods.radius) > 0.0
+        assert start == world.t == 0.0
+        assert len({body.name for body in world.bodies}) == len(world.bodies)
+        assert all(body.faces.max() < len(body.vertices) for body in world.bodies)
+    finally:
+        world.close()
+
+
+def test_scene_is_played_as_it_runs():
+    world, scene = open_world("wall"), load("wall")
+    for k, (t, state) in zip(range(80), scene.run(), strict=False):
+        if k:
+            world.play()
+        assert world.t == pytest.approx(t)
+        assert_allclose(tip(world), state.tip_position[0], atol=1e-12)
+
+
+def test_script_begins_again_after_its_end():
+    world = SceneWorld(load("wall"))
+    first = tip(world)
+    for _ in range(round(world.duration / world.dt)):
+        world.play()
+    assert world.t == pytest.approx(world.duration)
+    assert np.linalg.norm(tip(world) - first) > 0.001
+    world.play()
+    assert world.t == 0.0
+    assert_allclose(tip(world), first, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "robot", [*map(load_robot, robot_names()), *map(heavy, ("tendon_length", "passive", "tendon_tension"))], ids=lambda r: r.name
+)
+def test_free_robot_shows_itself_without_a_jump(robot):
+    world = FreeWorld(robot)
+    tips = [tip(world)]
+    for _ in range(round(2.0 * world.duration / world.dt)):
+        world.play()
+        tips.append(tip(world))
+    tips = np.array(tips)
+    n = round(world.duration / world.dt)
+    assert np.linalg.norm(np.ptp(tips, axis=0)) > 0.1 * robot.length
+    assert np.linalg.norm(np.diff(tips, axis=0), axis=1).max() < 0.1 * robot.length
+    assert_allclose(tips[-1], tips[n], atol=1e-3 * robot.length)
+
+
+@pytest.mark.parametrize("name", ["five_segment_reacher", "ethz_beam", "wall", "airway"])
+def test_base_moves_the_tip_along(name):
+    world = open_world(name)
+    before = rest(world, still(world))
+    by = np.array([-0.004, 0.002, -0.003])
+    moved = rest(world, still(world, base=np.concatenate([by, np.zeros(3)])))
+    assert_allclose(moved - before, by, atol=1e-8)
+
+
+def test_base_turns_about_its_origin():
+    world = FreeWorld(load_robot("prototype"))
+    before, turn = rest(world, still(world)), np.array([0.3, -0.2, 0.1])
+    turned = rest(world, still(world, base=np.concatenate([np.zeros(3), turn])))
+    assert_allclose(turned, matrix_from_quaternion(quaternion_from_vector(turn)[None])[0] @ before, atol=1e-8)
+
+
+def test_payload_is_the_force_of_its_weight():
+    robot = load_robot("tdcr_a")
+    robot = replace(robot, gravity=(3.0, -2.0, -9.0))
+    carries, feels = FreeWorld(robot), FreeWorld(robot)
+    by_mass = rest(carries, still(carries, payload=0.02))
+    by_force = rest(feels, still(feels, tip_force=0.02 * np.array(robot.gravity)))
+    assert_allclose(by_mass, by_force, atol=1e-12)
+    assert np.linalg.norm(by_mass - [0.0, 0.0, robot.length]) > 1e-3
+
+
+def test_gravity_off_takes_the_sag_away():
+    world = FreeWorld(heavy("passive"))
+    sag = rest(world, still(world))
+    weightless = rest(world, still(world, gravity=0.0))
+    assert sag[2] < -0.02
+    assert_allclose(weightless, [0.2, 0.0, 0.0], atol=1e-8)
+    double = FreeWorld(replace(heavy("passive"), gravity=(0.0, 0.0, -2.0 * 9.81)))
+    assert_allclose(rest(world, still(world, gravity=2.0, payload=0.01)), rest(double, still(double, payload=0.01)), atol=1e-7)
+
+
+def test_hand_sets_the_tension():
+    world = FreeWorld(heavy("tendon_tension"))
+    pulled = rest(world, replace(still(world), tension=np.array([0.0, 2.0, 0.0, 0.0])))
+    assert_allclose(world.rods[0].state.tension[0], [0.0, 2.0, 0.0, 0.0])
+    assert abs(pulled[1]) > 0.01
+
+
+@pytest.mark.parametrize(("name", "n_robots"), [("five_segment_reacher", 1), ("tdcr_b", 3)])
+def test_jacobian_of_a_free_robot(name, n_robots):
+    world = FreeWorld(load_robot(name), n_robots)
+    actions = world.actions
+    at = np.tile([0.0, 0.3, -0.2], world.robot.n_segments) * np.repeat(actions.offset, 3)
+    at[-3] = 0.5 * world.robot.segments[-1].extension[1]
+
+    def tip_at(action):
+        given = actions.inputs(action)
+        return rest(world, Hand(given["tendon_length"], given["extension"], tip_force=np.array([0.02, 0.0, 0.01])))
+
+    step, columns = 1e-5, [j for j in range(actions.n_actions) if j % 3 or world.robot.segments[j // 3].extension[1]]
+    differences = [(tip_at(at + step * e) - tip_at(at - step * e)) / (2.0 * step) for e in np.eye(actions.n_actions)[columns]]
+    tip_at(at)
+    jacobian = world.jacobian()
+    assert jacobian.shape == (3, actions.n_actions)
+    assert_allclose(jacobian[:, columns], np.transpose(differences), atol=2e-4 * np.abs(jacobian).max())
+
+
+def test_robots_in_a_grid_are_driven_alike():
+    world = FreeWorld(load_robot("prototype"), 7)
+    world.drive(still(world, tip_force=np.array([0.05, 0.0, 0.0])))
+    rods = world.rods[0]
+    assert_allclose(rods.state.tip_position, np.tile(rods.state.tip_position[:1], (7, 1)), atol=1e-12)
+    gaps = np.linalg.norm(rods.place[:, None] - rods.place[None], axis=2)[~np.eye(7, dtype=bool)]
+    assert gaps.min() == pytest.approx(0.8 * 0.07)
+
+
+def test_obstacle_follows_the_script_and_waits_for_the_hand():
+    world = SceneWorld(load("draped"))
+    low = world.poses()[0, 2]
+    for _ in range(60):
+        world.play()
+    risen = world.poses()[0, 2]
+    assert risen - low > 0.02
+    for _ in range(5):
+        world.drive(still(world))
+    assert world.poses()[0, 2] == risen
+    world.play()
+    assert risen < world.poses()[0, 2] < risen + 0.002
+    world.reset()
+    assert world.poses()[0, 2] == low
+
+
+def test_plane_is_a_square_beside_the_robot():
+    (wall,) = SceneWorld(load("wall")).bodies
+    pose = SceneWorld(load("wall")).poses()[0]
+    corners = wall.vertices @ matrix_from_quaternion(pose[None, 3:])[0].T + pose[:3]
+    assert_allclose(corners[:, 0], 0.02, atol=1e-7)
+    assert_allclose(corners.mean(axis=0)[1:], [0.0, 0.035], atol=1e-7)
+    assert_allclose(np.ptp(corners, axis=0)[1:], 1.5 * 0.07, rtol=1e-5)
+    assert wall.opacity < 0.5
+
+
+def test_world_goes_on_after_what_cannot_be_done():
+    world = FreeWorld(load_robot("five_segment_reacher"))
+    before, t = tip(world), world.t
+    for wrong, sentence in (
+        (replace(still(world), extension=np.full(5, 0.4)), "extension .* lies outside"),
+        (replace(still(world), tendon_length=np.full(15, 0.9)), "tendon_length"),
+        (still(world, base=np.full(6, np.nan)), "Hand.base is"),
+        (still(world, base=np.zeros(3)), "Hand.base is"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            world.drive(wrong)
+        assert world.t == t
+        assert_allclose(tip(world), before)
+    jump = world.actions.inputs(np.tile([0.0, 0.01, -0.01], 5))
+    world.drive(replace(still(world, tip_force=np.array([0.3, 0.2, -0.2])), tendon_length=jump["tendon_length"]))
+    assert np.isfinite(tip(world)).all()
+    assert world.t > t
+    with pytest.raises(InputError, match="not driven by tendon lengths"):
+        FreeWorld(load_robot("ethz_beam")).jacobian()
+
+
+def test_tracking_jacobian_against_the_model():
+    world = open_world("track_circle")
+    try:
+        hand = Hand(**{k: world.actions.inputs([0.015, 0.004, 0.002, 0.015, -0.003, 0.003])[k] for k in ("tendon_length", "extension")})
+        rest(world, hand, 40)
+        jacobian = world.jacobian()
+        assert jacobian.shape == (3, 6 + 6)
+        arm, kinematics = world._stage.arm, world._stage.robot.kinematics
+        q = np.concatenate([arm.position(), [0.015, 0.004, 0.002, 0.015, -0.003, 0.003]])
+        assert_allclose(jacobian, kinematics.finite_differences(q, 1e-5), atol=2e-3 * np.abs(jacobian).max())
+        world.drive(replace(hand, freeze=True))
+        held = arm.position()
+        rest(world, replace(hand, freeze=True, base=np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])), 10)
+        assert_allclose(arm.position(), held, atol=1e-4)
+        assert not world.jacobian()[:, :6].any()
+        assert_allclose(world.jacobian()[:, 6:], jacobian[:, 6:], atol=1e-2 * np.abs(jacobian).max())
+    finally:
+        world.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "bracket"),
+    [("track_circle", lambda s: s.robot.bracket), ("explore", lambda s: s.bracket), ("dual_arm", lambda s: s.bracket)],
+)
+def test_hand_moves_the_flange(name, bracket):
+    world = open_world(name)
+    try:
+        stage = world._stage
+        hand = still(world)
+        before = rest(world, hand, 60)
+        flange = stage.arm.frame(stage.arm.position())
+        by = np.array([0.01, -0.02, 0.015])
+        rest(world, replace(hand, base=np.concatenate([by, np.zeros(3)])), 60)
+        assert_allclose(stage.arm.frame(stage.arm.position())[:3] - flange[:3], by, atol=2e-4)
+        assert_allclose(tip(world) - before, by, atol=5e-4)
+        place = [w for w, body in zip(world.poses(), world.bodies, strict=True) if body.name == f"body {bracket(stage).body}"]
+        assert_allclose(place[0][:3], stage.arm.frame(stage.arm.position())[:3], atol=1e-4)  # the bracket has come along
+    finally:
+        world.close()
+
+
+def test_arm_stays_where_it_cannot_go_and_the_soft_robot_goes_on():
+    world = open_world("track_circle")
+    try:
+        hand = still(world)
+        rest(world, hand, 30)
+        before = world._stage.arm.position()
+        far = replace(hand, base=np.array([3.0, 0.0, 0.0, 0.0, 0.0, 0.0]), extension=np.array([0.01, 0.01]))
+        far = replace(far, tendon_length=world.actions.inputs([0.01, 0.0, 0.0, 0.01, 0.0, 0.0])["tendon_length"])
+        t = world.t
+        with pytest.raises(HostError, match=r"flange|no joint positions"):
+            world.drive(far)
+        assert world.t == pytest.approx(t + world.dt)
+        assert world.rods[0].state.arclength[0, -1] == pytest.approx(0.22)
+        assert_allclose(world._stage.arm.position(), before, atol=1e-4)
+        rate = np.array([0.3, 0.0, 0.0, 0.0, 0.0, -0.5])
+        rest(world, replace(hand, base_rate=rate), 50)
+        assert_allclose(world._stage.arm.position() - before, 50 * world.dt * rate, atol=2e-3)
+        after = world._stage.arm.position()
+        rest(world, replace(hand, base=far.base), 5)  # where a drag has brought the arm, the hand's base goes on
+        assert_allclose(world._stage.arm.position(), after, atol=2e-3)
+        with pytest.raises(InputError, match="extension"):
+            world.drive(replace(hand, extension=np.array([0.5, 0.0])))
+        world.play()
+        assert world.t == 0.0  # the script begins anew
+    finally:
+        world.close()
+
+
+def test_other_rods_keep_what_they_were_told():
+    world = open_world("dual_arm")
+    try:
+        second = world.rods[1].state.path_length.copy()
+        rest(world, Hand(world.actions.inputs([0.0, 0.004, 0.0, 0.0, 0.0, 0.004])["tendon_length"], np.zeros(2)), 30)
+        assert_allclose(world.rods[1].state.path_length, second, atol=1e-4)
+        assert np.abs(world.rods[0].state.path_length - second).max() > 1e-3
+    finally:
+        world.close()
+
+
+def test_pictures_and_scripts_without_a_hand():
+    explore, pick = open_world("explore"), open_world("pick_suction")
+    try:
+        picture = explore.picture()
+        assert picture.shape == (120, 160, 3)
+        assert picture.dtype == np.uint8
+        assert np.ptp(picture) > 0
+        assert pick.picture() is None
+        assert (pick.by_hand, pick.host, pick.base_moves, pick.loads) == (False,) * 4
+        assert not any("Capsule" in body.name for body in pick.bodies)
+        with pytest.raises(InputError, match="no hand can drive"):
+            pick.drive(still(pick))
+        with pytest.raises(InputError, match="no Jacobian"):
+            pick.jacobian()
+    finally:
+        explore.close()
+        pick.close()
+
+
+def test_rods_capsules_are_no_bodies():
+    world = open_world("neck_push")
+    try:
+        numbers = {int(body.name.split()[1]) for body in world.bodies}
+        assert not numbers & set(world._stage.rod.bodies.ids)
+        assert world._stage.cube in numbers
+        assert not world.host
+        assert world.by_hand
+    finally:
+        world.close()
+
+
+def test_close_disconnects():
+    world = open_world("track_circle")
+    number = world._stage.world.number
+    world.reset()
+    bullet = world._stage.world
+    assert bullet.number == number  # it was free again
+    assert bullet.isConnected()
+    world.close()
+    world.close()
+    assert not bullet.isConnected()
+    with pytest.raises(HostError, match="disconnected"):
+        world.drive(still(world))
+    world.close()
+
+
+def test_catalogue_says_what_the_scenes_say():
+    listed = catalogue()
+    assert set(listed) == {*names(), *robot_names()}
+    assert list(listed)[: len(robot_names())] == robot_names()
+    assert all(load(name).about == listed[name] for name in names())
+    assert all(sentence.endswith(".") for sentence in listed.values())
+    assert not set(ROD_SCENES) & set(HOSTED_SCENES)
+
+
+def test_world_of_a_robot_a_path_and_a_wrong_name(tmp_path):
+    robot = replace(load_robot("prototype"), name="mine")
+    save_robot(robot, tmp_path / "mine.toml")
+    assert open_world(str(tmp_path / "mine.toml")).robot == robot
+    assert open_world(robot).name == "mine"
+    assert about(robot) == "One segment, 0.07 m, driven by the lengths of its tendons."
+    with pytest.raises(UnknownNameError, match="no scene and no robot 'explor'; did you mean 'explore'"):
+        open_world("explor")
+    with pytest.raises(UnknownNameError, match="did you mean 'tdcr_a'"):
+        open_world("tdrc_a")
+    with pytest.raises(RobotError, match="cannot be read"):
+        open_world(tmp_path / "none.toml")
+
+
+def test_without_pybullet_a_hosted_scene_says_so(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    with pytest.raises(HostError, match=r"pip install 'fastrod\[hosts\]'"):
+        open_world("track_circle")
+    assert isinstance(open_world("wall"), SceneWorld)
+
+
+def test_sway_of_a_passive_robot_is_periodic():
+    beam = load_robot("ethz_beam")
+    first, last = sway(beam, None, 0.3)["tip_force"], sway(beam, None, 0.3 + 2.0 * np.pi)["tip_force"]
+    assert_allclose(first, last, atol=1e-12)
+    assert np.linalg.norm(first) > 0.0
+
+
+def test_grid_of_robots_is_drawn_where_it_stands():
+    world = SceneWorld(load("grid"))
+    bases = world.rods[0].state.position[:, 0]
+    assert len(np.unique(bases.round(6), axis=0)) == 64
+    assert not world.rods[0].place.any()
+    world.drive(still(world, base=np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])))
+    assert_allclose(world.rods[0].state.position[:, 0] - bases, np.tile([0.1, 0.0, 0.0], (64, 1)), atol=1e-12)
+    assert world.jacobian().shape == (3, 15)
+
+
+def test_hosted_view_resets_where_its_script_ends():
+    world = open_world("neck_push")
+    assert isinstance(world, HostedView)
+    try:
+        first = tip(world)
+        world._steps = round(world.duration / world.dt)
+        world.play()
+        assert world.t == 0.0
+        assert_allclose(tip(world), first, atol=1e-6)
+    finally:
+        world.close()

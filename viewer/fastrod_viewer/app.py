@@ -1,0 +1,277 @@
+"""`view`: the server behind `fastrod view`, with a picker of what it shows."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import ipaddress
+import socket
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, final
+
+from fastrod.errors import FastrodError, InputError
+from fastrod.link import RobotLink
+from fastrod.robot import Robot
+from fastrod.robotfile import load_robot
+from fastrod.runlog import RunLog
+from fastrod_scenes.scene import names
+from fastrod_viewer.canvas import Canvas
+from fastrod_viewer.catalogue import catalogue, open_world
+from fastrod_viewer.drive_page import DrivePage
+from fastrod_viewer.page import Page, is_upright, tell
+from fastrod_viewer.playback import Playback, load
+from fastrod_viewer.replay_page import ReplayPage
+from fastrod_viewer.watch import Watch
+from fastrod_viewer.world import World
+from fastrod_viewer.worlds import FreeWorld
+
+if TYPE_CHECKING:
+    import viser
+
+FIRST = "five_segment_reacher"
+"""What is shown where nothing is named."""
+PORT = 8080
+_TRIES = 20
+_BRAND = (37, 99, 235)
+
+
+@final
+class App:
+    """One page at a time on one server, for every browser that is connected. `close` it, or use it as a context."""
+
+    def __init__(
+        self, *, host: str = "127.0.0.1", port: int | None = None, folder: Path | None = None,
+        say: Callable[[str], None] = lambda sentence: print(sentence, file=sys.stderr, flush=True),
+    ) -> None:  # fmt: skip
+        """`port` None takes the first free one from 8080 on, 0 any; `folder` takes what is recorded (default: where one stands); `say`
+        hears what a person should know. Raises `InputError` where viser is missing, or the host or port cannot be had."""
+        self.host, self.folder, self.say = host, folder or Path.cwd(), say
+        self.server = _serve(host, free_port(host, port))
+        self.port = self.server.get_port()
+        self.page: Page | None = None
+        self._lock = threading.Lock()
+        gui = self.server.gui
+        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=_BRAND)
+        gui.set_panel_label("fastrod")
+        gui.main_panel.dock_left()
+        self.canvas = Canvas(self.server)
+        self._known = catalogue()
+        self._picker: Any = None
+        self._busy = gui.add_markdown("", visible=False)
+        self.server.on_client_connect(self._came)
+        self.watch = Watch(self.server, lost=self._lost, tick=self._tick)
+
+    def __enter__(self) -> App:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def address(self) -> str:
+        """Where a browser finds it."""
+        host = "localhost" if self.host in ("0.0.0.0", "::") else f"[{self.host}]" if ":" in self.host else self.host
+        return f"http://{host}:{self.port}"
+
+    def open(self, what: str | Path | World | Robot | Playback, *, link: RobotLink | None = None, script: bool = False) -> None:
+        """Show a scene or robot by name or file, a world, a robot, or a log with what models say to it. With a `link`, hands drive that
+        robot, and the world is its model. What was shown before stays where this cannot be: raises `FastrodError`."""
+        new = found(what)
+        with self._lock:
+            if self.page is not None:
+                self.page.close()
+                self.page = None
+            if isinstance(new, Playback):
+                self.page = ReplayPage(self.server, self.canvas, new)
+            else:
+                script = script or not isinstance(new, FreeWorld)
+                self.page = DrivePage(
+                    self.server,
+                    self.canvas,
+                    new,
+                    folder=self.folder,
+                    replay=self._replay,
+                    echo=lambda: self.watch.echo,
+                    link=link,
+                    script=script,
+                )
+            self._show_picker(str(what) if isinstance(what, str) and not is_log(what) else self.page.title)
+
+    def wait(self) -> None:
+        """Until Ctrl+C."""
+        with contextlib.suppress(KeyboardInterrupt):
+            self.server.sleep_forever()
+
+    def close(self) -> None:
+        """Stop what moves, save what is recorded, and end the server."""
+        self.watch.close()
+        with self._lock:
+            if self.page is not None:
+                self.page.close()
+                self.page = None
+        self.server.stop()
+
+    def _show_picker(self, current: str) -> None:
+        names = [*self._known, DEMO_LOG]
+        if current not in names:
+            names.insert(0, current)
+        if self._picker is None:
+            self._picker = self.server.gui.add_dropdown("Scene", tuple(names), initial_value=current, order=-1.0)
+            self._picker.on_update(self._picked)
+        elif self._picker.value != current or tuple(self._picker.options) != tuple(names):
+            self._picker.options = tuple(names)
+            self._picker.value = current
+
+    def _picked(self, event: Any) -> None:
+        if event.client_id is None:
+            return
+        name = event.target.value
+        before = self.page.title if self.page is not None else name
+        note = event.client.add_notification(f"Opening {name}", "", loading=True, with_close_button=False)
+        try:
+            self.open(name)
+        except FastrodError as error:
+            tell(event.client, f"{name} cannot be shown", str(error), failed=True)
+            self._picker.value = before
+        finally:
+            note.remove()
+
+    def _replay(self, log: RunLog, world: World) -> None:
+        """A recording beside the model, in a thread of its own: the session that calls this is closed by it."""
+
+        def job() -> None:
+            try:
+                self.open(Playback.of(log, world.robot, None))
+            except FastrodError as error:
+                self.say(str(error))
+                for client in self.server.get_clients().values():
+                    tell(client, "The recording cannot be replayed", str(error), failed=True)
+
+        threading.Thread(target=job, name="replay", daemon=True).start()
+
+    def _came(self, client: Any) -> None:
+        if self.page is not None and is_upright(client):
+            self.page.sight.show(client.camera, upright=True)
+
+    def _tick(self) -> None:
+        page = self.page
+        if page is not None:
+            page.tick()
+
+    def _lost(self, client: int, left: int) -> None:
+        page = self.page
+        if page is not None:
+            page.lost(client, left)
+        if left == 0:
+            self.say("The last page was closed; nothing is commanded until one is open.")
+
+
+DEMO_LOG = "measured log (demo)"
+"""The log that ships with the package, in the picker."""
+
+
+def found(what: str | Path | World | Robot | Playback, robot: str | Path | None = None, n_robots: int = 1) -> World | Playback:
+    """What a page shows: the log or world that a name or a path stands for, or what was given; `robot` is a log's, `n_robots` of a robot
+    stand in a grid. Raises `FastrodError`, one sentence, where there is none."""
+    if isinstance(what, (World, Playback)):
+        return what
+    if n_robots != 1:
+        if not isinstance(what, Robot) and str(what) in names():
+            raise InputError(f"{str(what)!r} is a scene, which has its own robots; several in a grid can be had of a robot.")
+        return FreeWorld(what if isinstance(what, Robot) else load_robot(what), n_robots)
+    if str(what) == DEMO_LOG:
+        return demo_log()
+    if not isinstance(what, Robot) and is_log(what):
+        return load(what, robot)
+    if robot is not None:
+        raise InputError(f"--robot goes with a run log; {str(what)!r} is none.")
+    return open_world(what)
+
+
+def demo_log() -> Playback:
+    """The log that ships with the package, beside the prototype."""
+    from importlib.resources import as_file, files
+
+    with as_file(files("fastrod") / "data" / "demo_log.csv") as path:
+        return load(path, "prototype")
+
+
+def is_log(what: str | Path) -> bool:
+    """It names a file that is not a robot's."""
+    suffix = Path(what).suffix
+    return suffix in (".csv", ".parquet") or (suffix != ".toml" and Path(what).is_file())
+
+
+def free_port(host: str, port: int | None) -> int:
+    """`port` if it is free, or for None the first free one from 8080 on. Raises `InputError`, one sentence, where there is none."""
+    if port is not None and not 0 <= port < 65536:
+        raise InputError(f"port is {port}; it must be between 1 and 65535, or 0 for any that is free.")
+    for candidate in range(PORT, PORT + _TRIES) if port is None else [port]:
+        if _free(host, candidate):
+            return candidate
+    if port is None:
+        raise InputError(f"ports {PORT} to {PORT + _TRIES - 1} are all in use on {host}; name a free one with --port.")
+    other = next((p for p in range(port + 1, min(port + 1 + _TRIES, 65536)) if _free(host, p)), None)
+    raise InputError(f"port {port} is in use on {host}; " + (f"{other} is free: --port {other}." if other else "name another with --port."))
+
+
+def _free(host: str, port: int) -> bool:
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+    except OSError as error:
+        raise InputError(
+            f"host {host!r} is not an address of this machine; 127.0.0.1 is, and 0.0.0.0 stands for all of its addresses."
+        ) from error
+    with socket.socket(family, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            if error.errno == 99:  # EADDRNOTAVAIL
+                raise InputError(
+                    f"host {host!r} is not an address of this machine; 127.0.0.1 is, and 0.0.0.0 stands for all of its addresses."
+                ) from error
+            return False
+    return True
+
+
+def is_loopback(host: str) -> bool:
+    """Only this machine reaches it."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _serve(host: str, port: int) -> viser.ViserServer:
+    try:
+        import viser
+    except ImportError as error:
+        raise InputError("viser is not installed; pip install 'fastrod[viewer]' brings it.") from error
+    with contextlib.redirect_stdout(io.StringIO()):  # it greets with a box
+        return viser.ViserServer(host=host, port=port, verbose=False)
+
+
+def view(
+    what: str | Path | World | Robot | Playback = FIRST, *, host: str = "127.0.0.1", port: int | None = None, open_browser: bool = True,
+    robot: str | Path | None = None, n_robots: int = 1, link: RobotLink | None = None, script: bool = False,
+) -> None:  # fmt: skip
+    """Show something in the browser until Ctrl+C: a scene or robot by name, a robot's file, a log with what models say to it.
+
+    Raises `FastrodError`, one sentence, for what cannot be shown.
+    """
+    shown = found(what, robot, n_robots)
+    with App(host=host, port=port) as app:
+        app.open(shown, link=link, script=script)
+        if not is_loopback(host):
+            app.say(f"Warning: everyone who reaches {host} on port {app.port} can drive this robot; there is no password.")
+        title = app.page.title if app.page is not None else ""
+        print(f"{title}: {app.address} (Ctrl+C ends it)", flush=True)
+        if open_browser:
+            import webbrowser
+
+            webbrowser.open(app.address)
+        app.wait()

@@ -1,0 +1,86 @@
+"""The worlds that there are by name: shipped robots, scenes, and robot files. Nothing heavy is imported before a world is opened."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fastrod.errors import UnknownNameError, nearest
+from fastrod.robot import Robot
+from fastrod.robotfile import load_robot, robot_names
+from fastrod_scenes.scene import HostedScene, RodScene, load, names
+
+if TYPE_CHECKING:
+    from fastrod_viewer.world import World
+
+ROD_SCENES: Mapping[str, str] = {
+    "airway": "A thin robot is fed into a forked airway and steered into the left bronchus, its twin into the right one.",
+    "bar": "The five-segment reacher closes around a bar and grips it.",
+    "draped": "A cylinder rises under a heavy, sagging rod, which drapes itself over it.",
+    "grid": "Sixty-four five-segment reachers sway in waves, each with a phase of its own, in one simulator.",
+    "pair": "A rod bends onto another that crosses it, and the two press on each other.",
+    "wall": "The prototype's tendons press its tip against a wall, and it slides along it.",
+}
+"""Scenes without a host, and what they are about: each scene's own sentence, here without importing it."""
+HOSTED_SCENES: Mapping[str, str] = {
+    "dual_arm": "A UR5 carries two soft robots that move in opposite phase, and feels the sum of both.",
+    "explore": "A soft robot on a UR5 enters a box and, the UR5 held still, looks at each of its eight corners.",
+    "neck_look": "A Unitree A1 bends its four-segment neck over the wall of a box and looks into every corner of it.",
+    "neck_push": "A Unitree A1 swings its three-segment neck as sin(w t) and pushes a cube over the floor, which its legs feel.",
+    "pick_gripper": "A soft robot on a UR5 takes a cube from a table with two fingers, carries it sideways and puts it on a spot.",
+    "pick_suction": "A soft robot on a UR5 takes a cube from a table by suction, carries it sideways and puts it on a spot.",
+    "track_circle": "The tip of a soft robot on a UR5 follows a circle.",
+    "track_figure_eight": "The tip of a soft robot on a UR5 follows a figure eight.",
+    "track_helix": "The tip of a soft robot on a UR5 follows a helix.",
+    "track_square": "The tip of a soft robot on a UR5 follows a square.",
+    "track_square_helix": "The tip of a soft robot on a UR5 follows a helix with the corners of a square.",
+}
+"""Scenes in a PyBullet world (`pip install fastrod[hosts]`), likewise."""
+_DRIVES = {
+    "tendon_length": "driven by the lengths of its tendons",
+    "tendon_tension": "driven by the tensions of its tendons",
+    "passive": "without tendons",
+    "paper": "driven by the lengths of its tendons, by the paper's reduced model",
+}
+
+
+def about(robot: Robot) -> str:
+    """One sentence on a robot.
+
+    >>> about(load_robot("prototype"))
+    'One segment, 0.07 m, driven by the lengths of its tendons.'
+    """
+    n = robot.n_segments
+    modes = dict.fromkeys(segment.mode for segment in robot.segments)
+    how = " and ".join(_DRIVES[mode] for mode in modes)
+    return f"{'One segment' if n == 1 else f'{n} segments'}, {robot.length:g} m{' in all' if n > 1 else ''}, {how}."
+
+
+def catalogue() -> dict[str, str]:
+    """Name -> one sentence on it, for `open_world`: robots first, then scenes of rods alone, then those with a host."""
+    return {**{name: about(load_robot(name)) for name in robot_names()}, **ROD_SCENES, **HOSTED_SCENES}
+
+
+def open_world(name: str | Path | Robot) -> World:
+    """The world of a scene's name; or a robot free in space, of a shipped name, of the path of a .toml, or as it is.
+
+    Raises `UnknownNameError` with the nearest name, `RobotError` for a file that is no robot, `HostError` where a scene needs PyBullet
+    and it is not installed.
+    """
+    from fastrod_viewer.worlds import FreeWorld, SceneWorld
+
+    if isinstance(name, Robot):
+        return FreeWorld(name)
+    text = str(name)
+    if text in names():
+        scene = load(text)
+        if isinstance(scene, RodScene):
+            return SceneWorld(scene)
+        assert isinstance(scene, HostedScene)
+        from fastrod_viewer.hosted import HostedView
+
+        return HostedView(scene)
+    if text not in robot_names() and not text.endswith(".toml"):
+        raise UnknownNameError(f"no scene and no robot {text!r}; {nearest(text, catalogue())} A robot file's path ends in .toml.")
+    return FreeWorld(load_robot(name))

@@ -1,0 +1,145 @@
+"""`Controls`: sliders, buttons and keys by which hands drive a robot, on a page."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+
+from fastrod_viewer.knobs import Group, drive_knobs, load_knobs
+from fastrod_viewer.pilot import Speeds
+from fastrod_viewer.session import Session
+
+if TYPE_CHECKING:
+    import viser
+
+_KEY_STEP = math.radians(5.0)  # of a segment's bend, by a press
+_SETTLED = 0.3  # s after a change in which a control is left alone: it may be under a finger
+
+
+@final
+class Controls:
+    """Handles of one robot's controls, made inside the tabs `drive` and `loads`; they follow the pilot, whoever moves it."""
+
+    def __init__(self, server: viser.ViserServer, session: Session, drive: Any, loads: Any) -> None:
+        self.server, self.session, self.pilot = server, session, session.pilot
+        self.chosen = 0
+        """Segment that keys bend."""
+        self._followers: list[tuple[Any, Callable[[], Any]]] = []
+        self._commands: list[Any] = []
+        with drive:
+            self._drive()
+        with loads:
+            self._loads()
+        self._keys()
+
+    def follow(self) -> None:
+        """Show where the pilot's goals stand."""
+        for handle, value in self._followers:
+            now = value()
+            if handle.value != now and time.time() - handle.update_timestamp > _SETTLED:
+                handle.value = now
+
+    def close(self) -> None:
+        """Take the keys back; the tabs are removed by their owner."""
+        for command in self._commands:
+            command.remove()
+        self._followers, self._commands = [], []
+
+    def _drive(self) -> None:
+        gui, session, pilot = self.server.gui, self.session, self.pilot
+        world = session.world
+        if not world.by_hand:
+            gui.add_markdown("This scene plays its own script; it cannot be driven by hand.")
+            return
+        if world.scripted and session.link is None:
+            script = gui.add_checkbox("Demo motion", session.scripted, hint="It moves by itself until you move it.")
+            self._listen(script, lambda on: setattr(session, "scripted", bool(on)), take_over=False)
+            self._followers.append((script, lambda: session.scripted))
+        if world.host:
+            frozen = gui.add_checkbox("Freeze the rigid host", False, hint="Its joints hold still; only the soft robot moves.")
+            self._listen(frozen, lambda on: pilot.freeze(bool(on)))
+        if not world.robot.n_tendons:
+            gui.add_markdown("This robot has no wires. Load its tip instead: tab *Loads*.")
+        groups = drive_knobs(world, pilot)
+        for group in [group for group in groups if not group.title or group.title.startswith("Segment")]:
+            self._add(group)
+        if pilot.actions is not None:
+            self._button("Straighten", pilot.all_zero)
+        for group in [group for group in groups if group.title and not group.title.startswith("Segment")]:
+            self._add(group)
+        if world.robot.n_tendons:
+            speed = gui.add_slider("Speed [°/s]", 5, 360, 5, 180, hint="Largest rate at which a segment bends; wires and base in step.")
+            self._listen(speed, self._set_speed, take_over=False)
+
+    def _set_speed(self, degrees: float) -> None:
+        part = degrees / 180.0
+        usual = Speeds()
+        self.pilot.speeds = Speeds(bend=usual.bend * part, extension=usual.extension * part, base=usual.base * part)
+
+    def _loads(self) -> None:
+        if not self.session.world.loads or self.session.link is not None:
+            self.server.gui.add_markdown("Loads cannot be put on this robot from here.")
+            return
+        self._add(load_knobs(self.session.world.robot, self.pilot))
+        self._button("No loads", lambda: self.pilot.load(tip_force=np.zeros(3), payload=0.0, gravity=1.0))
+
+    def _add(self, group: Group) -> None:
+        gui = self.server.gui
+        with gui.add_folder(group.title or None, expand_by_default=group.open):
+            for knob in group.knobs:
+                handle = gui.add_slider(knob.label, knob.low, knob.high, float(f"{knob.step:.6g}"), knob.value, hint=knob.hint)
+                self._listen(handle, knob.put)
+                self._followers.append((handle, partial(getattr, knob, "value")))
+
+    def _button(self, label: str, do: Callable[[], None]) -> None:
+        def press(_: object) -> None:
+            self.session.take_over()
+            do()
+            self.session.touch()
+
+        self.server.gui.add_button(label, color="gray").on_click(press)
+
+    def _listen(self, handle: Any, put: Callable[[Any], None], *, take_over: bool = True) -> None:
+        """What a person changes goes to `put`; what `follow` shows does not."""
+
+        def changed(event: Any) -> None:
+            if event.client_id is None:
+                return
+            if take_over:
+                self.session.take_over()
+            put(event.target.value)
+            self.session.touch()
+
+        handle.on_update(changed)
+
+    def _keys(self) -> None:
+        session = self.session
+        self._key("Stop", "escape", session.stop)
+        self._key("Pause, or go on", "space", self._pause)
+        self._key("Reset", "R", session.reset)
+        if self.pilot.actions is None or not session.world.by_hand:
+            return
+        for name, key, axis, sign in (("+x", "D", 0, 1), ("-x", "A", 0, -1), ("+y", "W", 1, 1), ("-y", "S", 1, -1)):
+            self._key(f"Bend toward {name}", key, lambda axis=axis, sign=sign: self._bend(axis, sign))  # type: ignore[misc]
+        for k in range(min(session.world.robot.n_segments, 9)):
+            self._key(f"Keys bend segment {k + 1}", str(k + 1), lambda k=k: setattr(self, "chosen", k))  # type: ignore[misc]
+
+    def _key(self, label: str, key: Any, do: Callable[[], None]) -> None:
+        command = self.server.gui.add_command(label, hotkey=key)
+        command.on_trigger(lambda _: do())
+        self._commands.append(command)
+
+    def _pause(self) -> None:
+        self.session.paused = not self.session.paused
+
+    def _bend(self, axis: int, sign: int) -> None:
+        self.session.take_over()
+        bends = list(self.pilot.bent(self.chosen))
+        bends[axis] += sign * _KEY_STEP
+        self.pilot.bend(self.chosen, *bends)
+        self.session.touch()

@@ -1,0 +1,106 @@
+"""`Drawing`: a world on a canvas, picture by picture."""
+
+from __future__ import annotations
+
+from typing import final
+
+import numpy as np
+
+from fastrod.rotation import matrix_from_quaternion
+from fastrod.types import Floats
+from fastrod_viewer.arrows import Trail
+from fastrod_viewer.canvas import Canvas
+from fastrod_viewer.legend import legend
+from fastrod_viewer.options import FINE, Options
+from fastrod_viewer.palette import MEASURED, TRAIL
+from fastrod_viewer.picture import Picture
+from fastrod_viewer.scene_graph import bounds
+from fastrod_viewer.session import Frame
+from fastrod_viewer.shapes import ball
+from fastrod_viewer.world import World
+
+_TRAIL = 160  # pieces
+_GLASS = 0.3  # opacity of what the tip is inside of
+
+
+@final
+class Drawing:
+    """Robots, surroundings, loads, the tip's trail, and what was measured beside them."""
+
+    def __init__(self, canvas: Canvas, world: World, options: Options, *, trail: bool = True) -> None:
+        self.canvas, self.world = canvas, world
+        self.options, self.trail = options, trail
+        rods = world.rods[0]
+        self.middle, self.size = bounds(rods, world.bodies, world.poses())
+        self.radius = max(rods.radius)
+        """Of the robot's body [m]."""
+        self._pictures = [Picture(r, options) for r in world.rods]
+        self._trails = self._new_trails()
+        self._ends: Floats = np.array([[b.vertices.min(axis=0), b.vertices.max(axis=0)] for b in world.bodies]).reshape(-1, 2, 3)
+        canvas.clear()
+        canvas.add_bodies(world.bodies, world.poses())
+        lowest = min(float(r.state.position[..., 2].min()) for r in world.rods)
+        if not any(body.name.startswith(("plane", "floor")) for body in world.bodies):
+            canvas.floor(self.size, min(lowest, 0.0 if lowest > -1e-6 else lowest), self.middle)
+
+    def look(self, options: Options, *, trail: bool) -> None:
+        """Draw so from the next picture on."""
+        if options != self.options:
+            self._pictures = [Picture(rods, options) for rods in self.world.rods]
+        self.options, self.trail = options, trail
+
+    def forget(self) -> None:
+        """The trail begins anew."""
+        self._trails = self._new_trails()
+
+    @property
+    def legend(self) -> str:
+        """HTML of what the colours mean."""
+        return legend(self.world.rods[0], self.options, self._pictures[0]).html()
+
+    def tip(self) -> Floats:
+        """(3,) where the tip of the robot that hands drive is drawn [m]."""
+        rods = self.world.rods[0]
+        return np.asarray(rods.state.tip_position[0] + rods.place[0])
+
+    def draw(self, frame: Frame) -> None:
+        """One picture."""
+        hand = frame.hand
+        force = None
+        if hand is not None:
+            weight = hand.payload * hand.gravity * np.array(self.world.robot.gravity)
+            force = hand.tip_force + weight
+        for k, (rods, picture) in enumerate(zip(self.world.rods, self._pictures, strict=True)):
+            self.canvas.show_all(picture.frame(rods, tip_force=force if k == 0 else None), f"rod{k}/")
+            if len(rods.state.tip_position) <= FINE:
+                for i, (path, tip) in enumerate(zip(self._trails[k], rods.state.tip_position + rods.place, strict=True)):
+                    path.add(tip)
+                    self.canvas.show(f"trail{k}/{i}", path.instances(0.12 * self.radius, TRAIL) if self.trail else None)
+        poses = self.world.poses()
+        self.canvas.move_bodies(poses)
+        self._see_through(poses)
+        self._measured(frame)
+        text = f"{np.linalg.norm(hand.tip_force):.3g} N" if hand is not None and hand.tip_force.any() else ""
+        self.canvas.note("force", text, self.tip() + 1.5 * self.radius if text else None)
+
+    def _see_through(self, poses: Floats) -> None:
+        """What the tip has entered hides it no longer."""
+        if not len(poses):
+            return
+        tip = self.world.rods[0].state.tip_position[0]
+        inside = np.einsum("nji,nj->ni", matrix_from_quaternion(poses[:, 3:]), tip - poses[:, :3])
+        within = ((inside > self._ends[:, 0] - self.radius) & (inside < self._ends[:, 1] + self.radius)).all(axis=1)
+        for k, body in enumerate(self.world.bodies):
+            self.canvas.fade(k, min(body.opacity, _GLASS) if within[k] else body.opacity)
+
+    def _measured(self, frame: Frame) -> None:
+        """The tip that the robot itself tells."""
+        if frame.measured is None or not np.isfinite(frame.measured.tip_position).all():
+            self.canvas.show("measured", None)
+            return
+        state = self.world.rods[0].state
+        place = state.position[0, 0] + state.rotation[0, 0] @ frame.measured.tip_position + self.world.rods[0].place[0]
+        self.canvas.show("measured", ball(place, 0.6 * self.radius, MEASURED))
+
+    def _new_trails(self) -> list[list[Trail]]:
+        return [[Trail(_TRAIL, 0.3 * self.radius) for _ in rods.state.tip_position[:FINE]] for rods in self.world.rods]

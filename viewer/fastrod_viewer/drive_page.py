@@ -1,0 +1,270 @@
+"""`DrivePage`: a robot that is driven by hand or by its script, recorded and exported."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fastrod.link import RobotLink
+from fastrod.runlog import RunLog
+from fastrod_viewer.canvas import Canvas
+from fastrod_viewer.controls import Controls
+from fastrod_viewer.drawing import Drawing
+from fastrod_viewer.export import wrap
+from fastrod_viewer.grip import Grip
+from fastrod_viewer.options import FINE, Options
+from fastrod_viewer.page import Page, Sight, facts, picture, save_name, send, stand_back, tell
+from fastrod_viewer.pilot import Pilot
+from fastrod_viewer.record import Recorder, free_path
+from fastrod_viewer.session import Frame, Session
+from fastrod_viewer.world import World
+
+if TYPE_CHECKING:
+    import viser
+
+_TOLD = 0.2  # s between two changes of figures and sliders
+_WIDE = 320  # pixels of the window for a camera in hand
+_LOOKS = 0.15  # s between two pictures of a camera in hand
+_LONG = 1.5  # s of one step
+_COMPILING = "Computing … The first use of contact compiles for a minute or two, once on this machine."
+_COLORS = {"segment": "segment", "curvature": "curvature", "surface strain": "strain", "wire tension": "tension"}
+_PARTS = {"spacers": "Spacers", "tendons": "Wires", "contacts": "Contact forces", "loads": "Loads", "frames": "Tip frame"}
+_BODIES = {"backbone and wires": "backbone", "skin": "skin"}
+
+
+@final
+class DrivePage(Page):
+    """Controls on one side, the robot, a legend, and what its camera sees."""
+
+    def __init__(
+        self, server: viser.ViserServer, canvas: Canvas, world: World, *, folder: Path, replay: Callable[[RunLog, World], None],
+        echo: Callable[[], float], link: RobotLink | None = None, script: bool = False,
+    ) -> None:  # fmt: skip
+        """`folder` takes recordings; `replay` shows one; `echo` is the time that pages take to draw [s]."""
+        self.server, self.world, self.title = server, world, world.name
+        self._folder, self._replay, self._echo = folder, replay, echo
+        self.pilot = Pilot(world)
+        touches = world.rods[0].state.contacts is not None
+        many = len(world.rods[0].state.ok) > FINE
+        self.drawing = Drawing(canvas, world, Options(body="skin" if touches or many else "backbone"))
+        self.sight = Sight(self.drawing.middle, self.drawing.size)
+        self.session = Session(world, self.pilot, draw=self._draw, link=link, script=script)
+        self.grip = (
+            Grip(server, self.session, min(1.25 * self.drawing.radius, 0.1 * world.robot.length), world.rods[0].place[0])
+            if self._can_drag()
+            else None
+        )
+        self._latency = float("nan")
+        self._told = self._looked = 0.0
+        self._last: RunLog | None = None
+        self._path = folder
+        self._build()
+        stand_back(server, self.sight)
+        self._draw(Frame(world, None, None, float("nan"), 1.0, ""))
+        self.session.start()
+
+    def close(self) -> None:
+        self.session.close()
+        self.controls.close()
+        if self.grip is not None:
+            self.grip.remove()
+        self.panel.remove()
+        self.aside.remove()
+        if self.camera is not None:
+            self.camera[0].remove()
+        self.drawing.canvas.clear()
+
+    def tick(self) -> None:
+        if self.session.waiting > _LONG:
+            self.figures.content = facts([("Tip", self._tip())], news=_COMPILING)
+
+    def lost(self, client: int, left: int) -> None:
+        if self.grip is not None:
+            self.grip.lost(client)
+        if left == 0:
+            self.session.nobody()
+
+    def export(self) -> str:
+        serializer = self.server.get_scene_serializer()
+        shown: list[tuple[str, str]] = [("robot", self.world.robot.name), ("t", f"{self.world.t:.2f} s"), ("tip", self._tip())]
+        return wrap(
+            serializer.as_html(), title=self.title, subtitle=self.world.about, legend_html=self.drawing.legend, plot_svg=None, facts=shown,
+            note="Drag to turn, scroll to zoom.",
+        )  # fmt: skip
+
+    def _can_drag(self) -> bool:
+        return self.world.by_hand and self.pilot.actions is not None
+
+    def _build(self) -> None:
+        import viser
+
+        gui, session = self.server.gui, self.session
+        self.panel = gui.add_folder(None)
+        with self.panel:
+            self.figures = gui.add_html("")
+            self.stop = gui.add_button("STOP", color="red", icon=viser.Icon.HAND_STOP, hint="Everything stands still at once. Key: Esc")
+            self.stop.on_click(lambda _: session.release() if session.stopped else session.stop())
+            self.run = gui.add_button_group("Run", ("Pause", "Step", "Reset"))
+            self.run.on_click(self._run)
+            tabs = gui.add_tab_group()
+            drive, loads = tabs.add_tab("Drive", viser.Icon.ADJUSTMENTS), tabs.add_tab("Loads", viser.Icon.WEIGHT)
+            self.controls = Controls(self.server, session, drive, loads)
+            with tabs.add_tab("View", viser.Icon.EYE):
+                self._view()
+            with tabs.add_tab("Save", viser.Icon.FILE_EXPORT):
+                self._save()
+            gui.add_markdown(self._keys())
+        self.aside = gui.add_panel()
+        with self.aside.add_tab("Legend"):
+            self.legend = gui.add_html(self.drawing.legend)
+        self.aside.float(x=-15, y=-15, width=230)
+        self.camera: tuple[Any, Any] | None = None
+        seen = self.world.picture()
+        if seen is not None:
+            window = gui.add_panel()
+            with window.add_tab("Camera in hand", viser.Icon.CAMERA):
+                self.camera = window, gui.add_image(enlarged(seen), format="jpeg")
+            window.float(x=-15, y=15, width=340)
+
+    def _keys(self) -> str:
+        keys = "<kbd>Space</kbd> pause · <kbd>Esc</kbd> stop · <kbd>R</kbd> reset"
+        if self._can_drag():
+            keys = "<kbd>A</kbd> <kbd>D</kbd> <kbd>W</kbd> <kbd>S</kbd> bend · " + keys
+            if (n := min(self.world.robot.n_segments, 9)) > 1:
+                keys += f" · <kbd>1</kbd>–<kbd>{n}</kbd> segment that keys bend"
+        return f"<small>{keys}</small>"
+
+    def _view(self) -> None:
+        gui, options = self.server.gui, self.drawing.options
+        color = gui.add_dropdown("Colour", tuple(_COLORS), initial_value="segment")
+        body = gui.add_dropdown("Body", tuple(_BODIES), initial_value=next(k for k, v in _BODIES.items() if v == options.body))
+        boxes = {name: gui.add_checkbox(label, getattr(options, name)) for name, label in _PARTS.items()}
+        trail = gui.add_checkbox("Trail of the tip", True)
+
+        def change(_: object) -> None:
+            shown = {name: bool(box.value) for name, box in boxes.items()}
+            new = Options(color_by=_COLORS[color.value], body=_BODIES[body.value], **shown)
+            self.session.ask(lambda: self._look(new, bool(trail.value)))
+
+        color.on_update(change)
+        body.on_update(change)
+        for box in (trail, *boxes.values()):
+            box.on_update(change)
+        back = gui.add_button("Look at the robot again", color="gray")
+        back.on_click(lambda _: stand_back(self.server, self.sight))
+
+    def _look(self, options: Options, trail: bool) -> None:
+        self.drawing.look(options, trail=trail)
+        self.legend.content = self.drawing.legend
+
+    def _save(self) -> None:
+        import viser
+
+        gui = self.server.gui
+        self.record = gui.add_button("Record a run log", icon=viser.Icon.PLAYER_RECORD, color="red")
+        self.record.on_click(lambda event: self.session.ask(lambda: self._toggle_record(event.client)))
+        self.recorded = gui.add_markdown("Inputs, tip and tensions at every step, as a CSV that `fastrod identify` reads.")
+        self.again = gui.add_button("Replay the recording", color="gray", disabled=True)
+        self.again.on_click(lambda _: self._play_back())
+        page = gui.add_button("Export as a web page", color="gray", hint="One HTML file; it opens without a server and without a network.")
+        page.on_click(lambda event: send(event.client, f"{self.title}.html", lambda: self.export().encode()))
+        png = gui.add_button("Save a picture (PNG)", color="gray")
+        png.on_click(lambda event: send(event.client, f"{self.title}.png", lambda: picture(event.client)))
+
+    def _play_back(self) -> None:
+        if self._last is not None:
+            self._replay(self._last, self.world)
+
+    def _toggle_record(self, client: Any) -> None:
+        """In the session's thread."""
+        session = self.session
+        if session.recorder is not None:
+            recorder, session.recorder = session.recorder, None
+            n = len(recorder)
+            if n == 0:
+                self.record.label = "Record a run log"
+                return
+            self._last = recorder.stop()
+            self.record.label, self.again.disabled = "Record a run log", False
+            self.recorded.content = f"Saved {n} samples in `{save_name(self._path)}`."
+            tell(client, "Saved", f"{n} samples in {save_name(self._path)}")
+            return
+        self._path = free_path(self._folder / f"{self.world.robot.name}-session.csv")
+        recorder = Recorder(self.world.robot, self._path)
+        recorder.start(self.world.t, "by script" if session.scripted else "by hand")
+        session.recorder = recorder
+        self.record.label = "Stop and save"
+        self.recorded.content = f"Recording to `{save_name(self._path)}` …"
+
+    def _run(self, event: Any) -> None:
+        session = self.session
+        match event.target.value:
+            case "Pause" | "Go on":
+                session.paused = not session.paused
+            case "Step":
+                session.step()
+            case "Reset":
+                session.reset()
+                self.session.ask(self.drawing.forget)
+
+    def _draw(self, frame: Frame) -> None:
+        """In the session's thread."""
+        began = time.perf_counter()
+        with self.server.atomic():
+            self.drawing.draw(frame)
+            if self.grip is not None:
+                self.grip.follow(self.drawing.tip())
+        self.server.flush()
+        if frame.latency == frame.latency:
+            self._latency = frame.latency + time.perf_counter() - began
+        if began - self._told > _TOLD or frame.latency == frame.latency:
+            self._told = began
+            self._tell(frame)
+        if self.camera is not None and began - self._looked > _LOOKS:
+            self._looked = began
+            seen = self.world.picture()
+            if seen is not None:
+                self.camera[1].image = enlarged(seen)
+
+    def _tell(self, frame: Frame) -> None:
+        rows = [("Tip", self._tip())]
+        if frame.measured is not None and np.isfinite(frame.measured.tip_position).all():
+            state = self.world.rods[0].state
+            model = state.rotation[0, 0].T @ (state.tip_position[0] - state.position[0, 0])
+            rows.append(("Measured − model", f"{1e3 * np.linalg.norm(frame.measured.tip_position - model):.2f} mm"))
+        rows.append(("Time", f"{self.world.t:.1f} s" + (f", {frame.pace:.0%} of real time" if frame.pace < 0.95 else "")))
+        if self._latency == self._latency:
+            echo = self._echo()
+            drawn = f" + {1e3 * echo:.0f} browser" if echo == echo else ""
+            rows.append(("Latency", f"{1e3 * self._latency:.0f}{drawn} ms"))
+        session = self.session
+        state_now = (
+            "Stopped. Press the green button to go on." if session.stopped else frame.problem and f"{frame.problem} Reset begins anew."
+        )
+        content = facts(rows, state_now)
+        if content != self.figures.content:
+            self.figures.content = content
+        label = "GO ON" if session.stopped else "STOP"
+        if self.stop.label != label:
+            self.stop.label, self.stop.color = label, "green" if session.stopped else "red"
+        options = ("Go on" if session.paused else "Pause", "Step", "Reset")
+        if tuple(self.run.options) != options:
+            self.run.options = options
+        self.controls.follow()
+        if self.drawing.options.color_by != "segment" and (legend := self.drawing.legend) != self.legend.content:
+            self.legend.content = legend
+
+    def _tip(self) -> str:
+        x, y, z = (1e3 * self.world.rods[0].state.tip_position[0]).tolist()
+        return f"{x:.1f}, {y:.1f}, {z:.1f} mm"
+
+
+def enlarged(seen: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(height, width, 3) a picture as wide as its window, pixel by pixel."""
+    times = max(1, round(_WIDE / seen.shape[1]))
+    return np.repeat(np.repeat(seen, times, axis=0), times, axis=1)

@@ -1,0 +1,65 @@
+"""`Grip`: the ball at the tip that hands pull."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+
+from fastrod.types import Floats
+from fastrod_viewer.palette import ACCENT
+from fastrod_viewer.session import Session
+
+if TYPE_CHECKING:
+    import viser
+
+_HINT = "drag me"
+
+
+@final
+class Grip:
+    """Follows the tip, or the hand that has got hold of it; the pilot then takes the tip there by inverse kinematics."""
+
+    def __init__(self, server: viser.ViserServer, session: Session, radius: float, place: Floats) -> None:
+        """`radius` of the ball [m]; `place` (3,) is where the world's origin is drawn for the robot that hands drive [m]."""
+        self.session, self._place = session, place
+        self._held_by: int | None = None
+        self._ball: Any = server.scene.add_icosphere(
+            "/grip", radius, color=ACCENT, opacity=0.55, subdivisions=3, cast_shadow=False, receive_shadow=False
+        )
+        self._hint: Any = server.scene.add_label("/grip/hint", _HINT, position=(0.0, 0.0, 2.2 * radius))
+        self._ball.on_drag("left")(self._dragged)
+
+    def follow(self, tip: Floats) -> None:
+        """Be at the tip (3,) as it is drawn [m], or at the hand."""
+        goal = self.session.pilot.dragged_to
+        at = tip if goal is None else goal + self._place
+        if np.isfinite(at).all() and math.dist(at, self._ball.position) > 1e-6:
+            self._ball.position = at
+
+    def lost(self, client: int) -> None:
+        """A client is gone; its hand lets go."""
+        if self._held_by == client:
+            self._held_by = None
+            self.session.pilot.drag(None)
+
+    def remove(self) -> None:
+        """Take the ball away."""
+        self._ball.remove()
+
+    def _dragged(self, event: Any) -> None:
+        session = self.session
+        if event.phase == "end":
+            self._held_by = None
+            session.pilot.drag(None)
+        elif session.stopped:
+            return
+        else:
+            if self._hint is not None:
+                self._hint.remove()
+                self._hint = None
+            self._held_by = event.client_id
+            session.take_over()
+            session.pilot.drag(np.array(event.end_position) - self._place)
+        session.touch()

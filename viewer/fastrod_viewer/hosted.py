@@ -1,0 +1,209 @@
+"""`HostedView`: a scene in a PyBullet world, played or driven by hand: its soft robots, the arm that carries them, and its other bodies."""
+
+from __future__ import annotations
+
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fastrod.control import SoftTip
+from fastrod.errors import HostError, InputError
+from fastrod.hosts import BulletArm, MountedRod, Visuals
+from fastrod.robot import Robot
+from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_vector
+from fastrod.types import Floats
+from fastrod_scenes.scene import HostedScene, HostedWorld, SoftBody, Stage
+from fastrod_viewer.world import Body, Hand, Rods, World
+from fastrod_viewer.worlds import Loads, actions_of, moved, radii, wires
+
+SWING = 1.0
+"""Largest way of a joint to where the flange is told to be [rad]: what is farther is another posture of the arm."""
+_INVERSE = np.array([1.0, -1.0, -1.0, -1.0])  # of a unit quaternion w x y z
+
+
+@final
+class HostedView(World):
+    """One scene. A hand drives the first soft robot and the arm that carries it; other soft robots keep what they were told last.
+
+    After a hand has driven, the script begins anew with the next `play`. Worlds whose soft robot is no `MountedRod` only play.
+    """
+
+    scripted = True
+
+    def __init__(self, scene: HostedScene) -> None:
+        """Raises `HostError` where PyBullet is missing."""
+        self.scene = scene
+        self.name, self.about, self.dt, self.duration = scene.name, scene.about, scene.dt, scene.duration
+        self._stage: HostedWorld = scene.stage()
+        self._kinematics: SoftTip | None = None
+        self._joints: Floats | None = None  # that a hand drives the arm to
+        self._home: Floats = np.zeros(7)  # of the flange, where Hand.base is zero
+        self._base: Floats | None = None  # the last that the arm has followed; None: it was moved by other ways since
+        self._steps, self._driven, self._frozen = 0, False, False
+        self.by_hand = self.loads = isinstance(self._stage, Stage)
+        self.host = self.base_moves = isinstance(self._stage, Stage) and self._stage.arm is not None
+        self._see()
+        self.robot: Robot = self._soft[0].robot
+        self.actions = actions_of(self.robot)
+        self._loads = Loads(self.robot)
+        self._radius = [radii(soft.robot) for soft in self._soft]
+        self._bodies = tuple(
+            Body(shape.name, shape.vertices, shape.faces, _color(shape.rgba), shape.rgba[3]) for shape in self._visuals.shapes
+        )
+
+    @property
+    def t(self) -> float:
+        return self._steps * self.dt
+
+    @property
+    def rods(self) -> tuple[Rods, ...]:
+        still = np.zeros((1, 3))
+        return tuple(Rods((soft.robot,), soft.state, still, radius) for soft, radius in zip(self._soft, self._radius, strict=True))
+
+    @property
+    def bodies(self) -> tuple[Body, ...]:
+        return self._bodies
+
+    def poses(self) -> Floats:
+        return self._visuals.poses()
+
+    def play(self) -> None:
+        """One step of the script, or from its end, or from a hand's, back to its beginning."""
+        if self._driven or self._steps >= round(self.duration / self.dt):
+            self.reset()
+            return
+        try:
+            self._stage.advance(self.t)
+        except HostError:
+            self.reset()
+            raise
+        self._arrived()
+
+    def drive(self, hand: Hand) -> None:
+        """One step by hand. Where the arm cannot do what it is told, it stays, the step is done, and `HostError` then says why; where the
+        soft robot is lost the world is reset. Raises `InputError` for what no robot can be told; the world then has not moved."""
+        stage = self._stage
+        if not isinstance(stage, Stage):
+            raise InputError(f"scene {self.name!r} has a script that moves its robots; no hand can drive them.")
+        given = self._loads.added(wires(self.robot, hand), hand)
+        moved(np.zeros(7), hand.base)  # refuses what is no motion
+        refused: HostError | None = None
+        if stage.arm is not None:
+            try:
+                self._drive_arm(stage.arm, hand)
+            except HostError as error:
+                refused = error
+        try:
+            for k, rod in enumerate(stage.rods):
+                rod.begin(**(given if k == 0 else {}))
+            stage.world.stepSimulation()
+            for rod in stage.rods:
+                rod.end()
+            stage.carry()
+        except HostError:
+            self.reset()
+            raise
+        self._driven = True
+        self._arrived()
+        if refused is not None:
+            raise refused
+
+    def reset(self) -> None:
+        """A new world, as the scene sets it up; the old one is closed."""
+        self.close()
+        self._stage = self.scene.stage()
+        self._see()
+
+    def jacobian(self) -> Floats:
+        """The arm's joints, then the actions; the columns of an arm that is frozen are zero."""
+        if not isinstance(self._stage, Stage):
+            raise InputError(f"scene {self.name!r} has a script that moves its robots; there is no Jacobian for a drag.")
+        if self.actions is None:
+            raise InputError(f"robot {self.robot.name!r} is not driven by tendon lengths, so no drag can move its tip.")
+        rod, arm = self._stage.rods[0], self._stage.arm
+        if arm is None:
+            jacobian = np.asarray(rod.simulator.jacobian()[0, :3] @ self.actions.matrix)
+            if not np.isfinite(jacobian).all():
+                raise InputError(f"there is no Jacobian here: {self._soft[0].state.problems.get(0, 'the robot is not ok')}")
+            return jacobian
+        if self._kinematics is None:
+            self._kinematics = SoftTip(rod.simulator, arm, flange_from_base=_mount(arm, rod))
+        q = np.concatenate([arm.position(), np.zeros(self.actions.n_actions)])  # the tip's way by an action is the simulator's own
+        self._kinematics.follow(q, self._soft[0].state, _unit(rod.host.motion().pose))
+        jacobian = self._kinematics.jacobian()
+        if self._frozen:
+            jacobian[:, : arm.n_joints] = 0.0
+        return jacobian
+
+    def picture(self) -> NDArray[np.uint8] | None:
+        image = self._stage.picture()
+        return None if image is None else image.rgb
+
+    def close(self) -> None:
+        """Disconnect the world; once more does nothing."""
+        if self._stage.world.isConnected():
+            self._stage.close()
+
+    def _see(self) -> None:
+        """A stage has been set up."""
+        self._soft: tuple[SoftBody, ...] = self._stage.soft_bodies
+        self._visuals = Visuals(self._stage.world, {body for soft in self._soft for body in soft.capsules})
+        self._kinematics = self._joints = self._base = None
+        self._steps, self._driven, self._frozen = 0, False, False
+
+    def _arrived(self) -> None:
+        self._soft = self._stage.soft_bodies
+        self._steps += 1
+
+    def _drive_arm(self, arm: BulletArm, hand: Hand) -> None:
+        """Tell the motors. Raises `HostError` where the flange cannot go there; what they were told before then holds."""
+        if self._joints is None:
+            self._joints = np.clip(arm.position(), arm.lower, arm.upper)
+            self._home, self._base = arm.frame(self._joints), np.zeros(6)
+        if hand.freeze:
+            if not self._frozen:
+                arm.freeze()
+                self._joints = np.clip(arm.position(), arm.lower, arm.upper)
+            self._frozen, self._base = True, None
+            return
+        self._frozen = False
+        base = np.asarray(hand.base, dtype=np.float64)
+        if hand.base_rate is not None:
+            rate = np.asarray(hand.base_rate, dtype=np.float64)
+            if rate.shape != (arm.n_joints,) or not np.isfinite(rate).all():
+                raise HostError(f"Hand.base_rate is {hand.base_rate!r}; give {arm.n_joints} finite numbers, one a joint [rad/s].")
+            self._joints, self._base = np.clip(self._joints + self.dt * rate, arm.lower, arm.upper), None
+            arm.drive(self._joints)
+            return
+        if self._base is None:  # from here the hand's base goes on
+            flange = arm.frame(self._joints)
+            back = quaternion_from_vector(base[3:]) * _INVERSE
+            self._home = np.concatenate([flange[:3] - base[:3], product(back, flange[3:])])
+        elif not np.array_equal(base, self._base):
+            to = arm.solve(moved(self._home, base), self._joints)
+            if (far := float(np.abs(to - self._joints).max())) > SWING:
+                raise HostError(
+                    f"the flange would get there by a swing of {far:.2g} rad of one joint, into another posture; the arm stays."
+                )
+            self._joints = to
+        self._base = base.copy()
+        arm.drive(self._joints)
+
+
+def _mount(arm: BulletArm, rod: MountedRod) -> Floats:
+    """(7,) flange_from_base of a rod on an arm."""
+    flange, base = arm.frame(arm.position()), rod.host.motion().pose
+    turn = matrix_from_quaternion(flange[None, 3:])[0]
+    mount: Floats = np.concatenate([(base[:3] - flange[:3]) @ turn, product(flange[3:] * _INVERSE, base[3:])])
+    return _unit(mount)
+
+
+def _unit(pose: Floats) -> Floats:
+    """With a quaternion of norm 1: PyBullet's is so to single precision."""
+    return np.concatenate([pose[:3], pose[3:] / np.linalg.norm(pose[3:])])
+
+
+def _color(rgba: Any) -> tuple[int, int, int]:
+    red, green, blue = (round(255.0 * c) for c in rgba[:3])
+    return red, green, blue

@@ -1,0 +1,178 @@
+"""`Knob`: one number that a hand sets, in the unit in which people think of it; and those of a robot, group by group."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from fastrod.robot import Robot
+from fastrod_viewer.pilot import LARGEST_BEND, LARGEST_TENSION, Pilot
+from fastrod_viewer.world import World
+
+_ALL = 60.0  # deg, of each segment
+_NICE = (1.0, 2.0, 5.0, 10.0)
+_MM, _GRAM, _DEGREE = 1e-3, 1e-3, math.pi / 180.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Knob:
+    """A slider without its page."""
+
+    label: str
+    """What it is, with its unit in brackets."""
+    low: float
+    high: float
+    step: float
+    get: Callable[[], float]
+    """Where it stands, in that unit."""
+    put: Callable[[float], None]
+    hint: str
+
+    @property
+    def value(self) -> float:
+        """Where it stands, rounded to a tenth of a step, within its ends."""
+        digits = max(0, 1 - math.floor(math.log10(self.step)))
+        return min(max(round(self.get(), digits) + 0.0, self.low), self.high)
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Knobs that belong together."""
+
+    title: str
+    """Empty for those that stand first, without a heading."""
+    knobs: tuple[Knob, ...]
+    open: bool = True
+    """At first."""
+
+
+def nice(value: float) -> float:
+    """The next of 1, 2, 5 times a power of ten that is not below a positive value.
+
+    >>> nice(0.43), nice(2.0)
+    (0.5, 2.0)
+    """
+    power = 10.0 ** math.floor(math.log10(value))
+    return float(f"{next(n for n in _NICE if n * power >= value * (1.0 - 1e-9)) * power:.6g}")
+
+
+def largest_force(robot: Robot) -> float:
+    """Tip force [N] that bends the robot by a good part of its length: twice EI / l^2, rounded up."""
+    return nice(2.0 * min(min(s.bending_stiffness) for s in robot.segments) / robot.length**2)
+
+
+def drive_knobs(world: World, pilot: Pilot) -> list[Group]:
+    """Bends and extensions, wires, base: what there is of them."""
+    robot, groups = world.robot, []
+    n = robot.n_segments
+    if pilot.actions is not None:
+        if n > 1:
+            groups.append(Group("", tuple(_all_bend(pilot, n, axis) for axis in (0, 1))))
+        groups += [Group(f"Segment {k + 1}", _segment(robot, pilot, k), n <= 2) for k in range(n)]
+    if robot.n_tendons:
+        groups.append(Group("Wires", tuple(_wire(robot, pilot, i) for i in range(robot.n_tendons)), pilot.actions is None))
+    if world.base_moves:
+        title = "Flange of the host" if world.host else "Base"
+        groups.append(Group(title, tuple(_base(robot, pilot, axis) for axis in range(6)), open=False))
+    return groups
+
+
+def load_knobs(robot: Robot, pilot: Pilot) -> Group:
+    """Tip force, payload, gravity."""
+    most = largest_force(robot)
+    heaviest = nice(most / 9.81 / _GRAM)
+    payload = Knob(
+        label="Payload [g]", low=0.0, high=heaviest, step=heaviest / 100.0, hint="Mass at the tip.",
+        get=lambda: pilot.loads[1] / _GRAM, put=lambda v: pilot.load(payload=v * _GRAM),
+    )  # fmt: skip
+    gravity = Knob(
+        label="Gravity [× g]", low=0.0, high=3.0, step=0.05, hint="On robot and payload.",
+        get=lambda: pilot.loads[2], put=lambda v: pilot.load(gravity=v),
+    )  # fmt: skip
+    return Group("", (*(_force(pilot, axis, most) for axis in range(3)), payload, gravity))
+
+
+def _all_bend(pilot: Pilot, n: int, axis: int) -> Knob:
+    def get() -> float:
+        return float(np.mean([pilot.bent(k)[axis] for k in range(n)])) / _DEGREE
+
+    def put(degrees: float) -> None:
+        for k in range(n):
+            _bend(pilot, k, axis, degrees)
+
+    name = "xy"[axis]
+    hint = f"Bends every segment by so many degrees toward {name}."
+    return Knob(label=f"All bend {name} [°]", low=-_ALL, high=_ALL, step=1.0, get=get, put=put, hint=hint)
+
+
+def _segment(robot: Robot, pilot: Pilot, k: int) -> tuple[Knob, ...]:
+    most = LARGEST_BEND / _DEGREE
+    bends = tuple(
+        Knob(
+            label=f"Bend {name} [°]", low=-most, high=most, step=1.0, hint=f"Bends the segment toward {name} of its base.",
+            get=lambda axis=axis: pilot.bent(k)[axis] / _DEGREE,  # type: ignore[misc]
+            put=lambda v, axis=axis: _bend(pilot, k, axis, v),  # type: ignore[misc]
+        )
+        for axis, name in enumerate("xy")
+    )  # fmt: skip
+    low, high = (v / _MM for v in robot.segments[k].extension)
+    if high <= low:
+        return bends
+    extend = Knob(
+        label="Extend [mm]", low=low, high=high, step=0.1, hint="Lengthens the segment.",
+        get=lambda: float(pilot.goals.action[3 * k]) / _MM, put=lambda v: pilot.extend(k, v * _MM),
+    )  # fmt: skip
+    return (*bends, extend)
+
+
+def _bend(pilot: Pilot, k: int, axis: int, degrees: float) -> None:
+    bends = list(pilot.bent(k))
+    bends[axis] = degrees * _DEGREE
+    pilot.bend(k, *bends)
+
+
+def _wire(robot: Robot, pilot: Pilot, i: int) -> Knob:
+    k = int(robot.tendon_segment[i])
+    segment = robot.segments[k]
+    name = f"Wire {i + 1}" + (f", segment {k + 1}" if robot.n_segments > 1 else "")
+    if segment.mode == "tendon_tension":
+        return Knob(
+            label=f"{name} [N]", low=0.0, high=LARGEST_TENSION, step=0.05, hint="Tension of the wire.",
+            get=lambda: float(pilot.goals.tension[i]), put=lambda v: pilot.pull_with(i, v),
+        )  # fmt: skip
+    most = nice(LARGEST_BEND * sum(math.hypot(*place) for place in robot.tendons[i].position(k + 1)) / _MM)
+    return Knob(
+        label=f"{name} [mm]", low=-most, high=most, step=0.05, hint="Positive pulls the wire, negative lets it out.",
+        get=lambda: -float(pilot.change[i]) / _MM, put=lambda v: pilot.wire(i, -v * _MM),
+    )  # fmt: skip
+
+
+def _base(robot: Robot, pilot: Pilot, axis: int) -> Knob:
+    straight = axis < 3
+    unit, word, factor = ("mm", "", _MM) if straight else ("°", "Turn ", _DEGREE)
+    most = nice(0.5 * robot.length / _MM) if straight else 90.0
+
+    def put(value: float) -> None:
+        base = pilot.goals.base.copy()
+        base[axis] = value * factor
+        pilot.move_base(base)
+
+    return Knob(
+        label=f"{word}{'xyz'[axis % 3]} [{unit}]", low=-most, high=most, step=1.0, hint="From where it began, world axes.",
+        get=lambda: float(pilot.goals.base[axis]) / factor, put=put,
+    )  # fmt: skip
+
+
+def _force(pilot: Pilot, axis: int, most: float) -> Knob:
+    def put(value: float) -> None:
+        force = pilot.loads[0].copy()
+        force[axis] = value
+        pilot.load(tip_force=force)
+
+    return Knob(
+        label=f"Tip force {'xyz'[axis]} [N]", low=-most, high=most, step=most / 100.0, hint="Force on the tip, world axes.",
+        get=lambda: float(pilot.loads[0][axis]), put=put,
+    )  # fmt: skip

@@ -1,0 +1,313 @@
+"""`Pilot`: what hands want, from sliders, keys or a drag of the tip, as motion within limits."""
+
+from __future__ import annotations
+
+import math
+import threading
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fastrod.errors import FastrodError, InputError
+from fastrod.robot import Robot
+from fastrod.segments import SegmentActions
+from fastrod.types import Floats
+from fastrod_viewer.drag import drag_rates
+from fastrod_viewer.world import Hand, World
+
+LARGEST_BEND = math.pi / 2.0
+"""Of a segment toward either side [rad]."""
+LARGEST_TENSION = 20.0
+"""Of a wire that is driven by tension [N]."""
+_NOTHING = 1e-6  # m of a wire, below which a robot is bent by its segments alone
+
+
+@dataclass(frozen=True, kw_only=True)
+class Speeds:
+    """Largest rates, each positive. Raises `InputError`."""
+
+    bend: float = math.pi
+    """Of a segment [rad/s]; wires move no faster than this bend needs."""
+    extension: float = 0.5
+    """Of a segment, in its own range a second [1/s]."""
+    base: float = 0.2
+    """Of a base [m/s], and in rad/s five times that."""
+
+    def __post_init__(self) -> None:
+        for name in ("bend", "extension", "base"):
+            value = getattr(self, name)
+            if not (isinstance(value, (int, float)) and math.isfinite(value) and value > 0.0):
+                raise InputError(f"Speeds.{name} is {value!r}; it must be positive and finite.")
+
+
+@dataclass(frozen=True, eq=False)
+class Goals:
+    """Where the controls of a robot stand, or where it is on its way there."""
+
+    action: Floats
+    """(3 n_segments,) extension and two displacements of each segment [m]; empty where it is not driven so."""
+    wire: Floats
+    """(n_tendons,) change of each tendon's length on top of what the actions take [m]."""
+    tension: Floats
+    """(n_tendons,) [N] of the segments that are driven by it."""
+    base: Floats
+    """(6,) displacement [m] and rotation vector [rad] from home, world."""
+
+    @staticmethod
+    def zero(n_actions: int, n_tendons: int) -> Goals:
+        """The robot at rest and at home."""
+        return Goals(np.zeros(n_actions), np.zeros(n_tendons), np.zeros(n_tendons), np.zeros(6))
+
+
+@final
+class Pilot:
+    """Takes what hands want from any thread, and tells a world step by step how to get there.
+
+    >>> import fastrod
+    >>> from fastrod_viewer.worlds import FreeWorld
+    >>> pilot = Pilot(FreeWorld(fastrod.load_robot("prototype")))
+    >>> pilot.bend(0, math.pi / 4, 0.0)
+    >>> hand = pilot.step(0.1)
+    >>> bool((hand.tendon_length != 0.07).any())
+    True
+    """
+
+    def __init__(self, world: World, speeds: Speeds | None = None) -> None:
+        self.robot: Robot = world.robot
+        self.actions: SegmentActions | None = world.actions
+        self._world = world
+        self._lock = threading.RLock()
+        self._zero = Goals.zero(0 if self.actions is None else self.actions.n_actions, self.robot.n_tendons)
+        self._speeds = speeds or Speeds()
+        self._lower, self._upper = _limits(self.robot, self.actions)
+        self._offset = _arm(self.robot)
+        self.reset()
+
+    def reset(self) -> None:
+        """Everything at rest, no loads, nothing dragged; the speeds stay."""
+        with self._lock:
+            self._goals, self._now = self._zero, self._zero
+            self._pull: Floats | None = None
+            self._tip_force, self._payload, self._gravity = np.zeros(3), 0.0, 1.0
+            self._freeze = False
+            self.problem = ""
+
+    @property
+    def speeds(self) -> Speeds:
+        """The limits of every motion."""
+        return self._speeds
+
+    @speeds.setter
+    def speeds(self, speeds: Speeds) -> None:
+        with self._lock:
+            self._speeds = speeds
+
+    @property
+    def goals(self) -> Goals:
+        """Where the controls stand."""
+        with self._lock:
+            return self._goals
+
+    @property
+    def now(self) -> Goals:
+        """What the robot was told last."""
+        with self._lock:
+            return self._now
+
+    @property
+    def dragged_to(self) -> Floats | None:
+        """(3,) world [m] where the tip is dragged, None where it is not."""
+        with self._lock:
+            return self._pull
+
+    @property
+    def arrived(self) -> bool:
+        """Nothing is on its way."""
+        with self._lock:
+            pairs = zip(_arrays(self._goals), _arrays(self._now), strict=True)
+            return self._pull is None and all(np.array_equal(goal, now) for goal, now in pairs)
+
+    @property
+    def change(self) -> Floats:
+        """(n_tendons,) change of tendon length at the goal, negative = pulled [m]."""
+        with self._lock:
+            return self._change(self._goals)
+
+    def bend(self, segment: int, toward_x: float, toward_y: float) -> None:
+        """Bend a segment (from 0, base first) toward x and y of its base [rad], within `LARGEST_BEND`."""
+        if self.actions is None:
+            raise InputError(f"robot {self.robot.name!r} has no segments that bends drive; move its wires.")
+        self._act(segment, 1, float(toward_x) * self.actions.offset[segment])
+        self._act(segment, 2, float(toward_y) * self.actions.offset[segment])
+
+    def bent(self, segment: int) -> tuple[float, float]:
+        """Bends of a segment at the goal, toward x and y of its base [rad]."""
+        if self.actions is None:
+            return 0.0, 0.0
+        x, y = self.goals.action[3 * segment + 1 : 3 * segment + 3] / self.actions.offset[segment]
+        return float(x), float(y)
+
+    def extend(self, segment: int, extension: float) -> None:
+        """Lengthen a segment (from 0) [m], within its range."""
+        self._act(segment, 0, float(extension))
+
+    def wire(self, tendon: int, change: float) -> None:
+        """Change one tendon's length to `change` against the straight rest robot [m], negative = pulled; the bends keep theirs."""
+        with self._lock:
+            wire = self._goals.wire.copy()
+            wire[tendon] += float(change) - self._change(self._goals)[tendon]
+            self._goals = _with(self._goals, wire=wire)
+            self._pull = None
+
+    def pull_with(self, tendon: int, tension: float) -> None:
+        """Pull a tendon of a segment that is driven by tension [N]."""
+        with self._lock:
+            forces = self._goals.tension.copy()
+            forces[tendon] = min(max(float(tension), 0.0), LARGEST_TENSION)
+            self._goals = _with(self._goals, tension=forces)
+
+    def move_base(self, displacement: ArrayLike) -> None:
+        """Move the base to (6,) displacement [m] and rotation vector [rad] from home, world."""
+        with self._lock:
+            self._goals = _with(self._goals, base=np.array(displacement, dtype=np.float64))
+
+    def load(self, *, tip_force: ArrayLike | None = None, payload: float | None = None, gravity: float | None = None) -> None:
+        """Loads: force on the tip (3,) world [N], mass at the tip [kg], times gravity. What is None stays."""
+        with self._lock:
+            if tip_force is not None:
+                self._tip_force = np.array(tip_force, dtype=np.float64)
+            if payload is not None:
+                self._payload = float(payload)
+            if gravity is not None:
+                self._gravity = float(gravity)
+
+    @property
+    def loads(self) -> tuple[Floats, float, float]:
+        """(3,) tip force [N], payload [kg], times gravity."""
+        with self._lock:
+            return self._tip_force, self._payload, self._gravity
+
+    def freeze(self, frozen: bool) -> None:
+        """Hold the rigid host still, or let it move."""
+        with self._lock:
+            self._freeze = bool(frozen)
+
+    def drag(self, point: ArrayLike | None) -> None:
+        """Pull the tip toward a point (3,) world [m]; None lets go, and the robot stays as it is."""
+        with self._lock:
+            self._pull = None if point is None else np.array(point, dtype=np.float64)
+            if point is None:
+                self.hold()
+
+    def hold(self) -> None:
+        """Stand still: what is on its way stops where it is."""
+        with self._lock:
+            self._goals, self._pull = self._now, None
+
+    def adopt(self, change: Floats, extension: Floats) -> None:
+        """Take over a robot as it stands: changes of tendon length (n_tendons,) and of segment length (n_segments,) [m]."""
+        with self._lock:
+            action, rest = self._zero.action, np.array(change, dtype=np.float64)
+            if self.actions is not None:
+                taken = np.linalg.lstsq(self.actions.matrix, np.concatenate([change, extension]), rcond=None)[0]
+                action = np.clip(taken, self._lower, self._upper)
+                rest -= self.actions.matrix[: len(rest)] @ action
+            rest[np.abs(rest) < _NOTHING] = 0.0
+            self._goals = self._now = _with(self._now, action=action, wire=rest)
+            self._pull = None
+
+    def all_zero(self) -> None:
+        """Straight and at home, at the speeds allowed; loads stay."""
+        with self._lock:
+            self._goals, self._pull = self._zero, None
+
+    def step(self, dt: float) -> Hand:
+        """What the world is told for the next `dt` [s]."""
+        with self._lock:
+            rate = self._follow_drag(dt) if self._pull is not None else None
+            goals, now, speeds = self._goals, self._now, self._speeds
+            if self.actions is not None:
+                limit = self._action_rates(self.actions, speeds) * dt
+                action = now.action + np.clip(goals.action - now.action, -limit, limit)
+            else:
+                action = now.action
+            wire = _toward(now.wire, goals.wire, speeds.bend * self._offset * dt)
+            tension = _toward(now.tension, goals.tension, LARGEST_TENSION * dt)
+            base = np.concatenate([
+                _toward(now.base[:3], goals.base[:3], speeds.base * dt), _toward(now.base[3:], goals.base[3:], 5.0 * speeds.base * dt)
+            ])  # fmt: skip
+            self._now = Goals(action, wire, tension, base)
+            extension = np.zeros(self.robot.n_segments) if self.actions is None else action[::3]
+            return Hand(
+                tendon_length=self.robot.rest_tendon_length + self._change(self._now), extension=extension, tension=tension, base=base,
+                base_rate=rate, tip_force=self._tip_force, payload=self._payload, gravity=self._gravity, freeze=self._freeze,
+            )  # fmt: skip
+
+    def _act(self, segment: int, which: int, value: float) -> None:
+        with self._lock:
+            k = 3 * segment + which
+            if not 0 <= k < len(self._goals.action):
+                raise InputError(f"segment {segment + 1} cannot be driven; robot {self.robot.name!r} has {self.robot.n_segments} segments.")
+            action = self._goals.action.copy()
+            action[k] = min(max(value, self._lower[k]), self._upper[k])
+            self._goals = _with(self._goals, action=action)
+            self._pull = None
+
+    def _change(self, goals: Goals) -> Floats:
+        if self.actions is None:
+            return goals.wire
+        return np.asarray(self.actions.matrix[: self.robot.n_tendons] @ goals.action + goals.wire)
+
+    def _action_rates(self, actions: SegmentActions, speeds: Speeds) -> Floats:
+        """(3 n_segments,) [m/s]"""
+        rates = np.repeat(speeds.bend * actions.offset, 3)
+        rates[::3] = speeds.extension * np.maximum((self._upper - self._lower)[::3], 1e-9)
+        return rates
+
+    def _follow_drag(self, dt: float) -> Floats | None:
+        """One step of the tip toward where it is dragged: the goals move; (n_joints,) rates of the host's joints [rad/s], or None."""
+        if self.actions is None or self._pull is None:
+            return None
+        try:
+            jacobian = self._world.jacobian()
+            error = self._pull - self._world.rods[0].state.tip_position[0]
+            limits = self._lower, self._upper, self._action_rates(self.actions, self._speeds)
+            rates = drag_rates(self.robot, self.actions, self._now.action, jacobian, error, limits, dt)
+        except FastrodError as error_of_world:
+            self.problem = str(error_of_world)
+            return None
+        self.problem = ""
+        n = len(rates) - self.actions.n_actions
+        action = np.clip(self._now.action + dt * rates[n:], self._lower, self._upper)
+        self._goals = _with(self._goals, action=action)
+        return rates[:n] if n else None
+
+
+def _arrays(goals: Goals) -> tuple[Floats, ...]:
+    return goals.action, goals.wire, goals.tension, goals.base
+
+
+def _with(goals: Goals, **changed: Floats) -> Goals:
+    kept = {"action": goals.action, "wire": goals.wire, "tension": goals.tension, "base": goals.base}
+    return Goals(**(kept | changed))
+
+
+def _toward(now: Floats, goal: Floats, step: float) -> Floats:
+    return np.asarray(now + np.clip(goal - now, -step, step))
+
+
+def _arm(robot: Robot) -> float:
+    """Largest distance of a tendon from the backbone [m]; 0 without tendons."""
+    return max((math.hypot(*t.position(k + 1)[k]) for k, s in enumerate(robot.segments) for t in s.tendons), default=0.0)
+
+
+def _limits(robot: Robot, actions: SegmentActions | None) -> tuple[Floats, Floats]:
+    """(3 n_segments,) least and largest action [m]."""
+    if actions is None:
+        return np.zeros(0), np.zeros(0)
+    upper = np.repeat(LARGEST_BEND * actions.offset, 3)
+    lower = -upper
+    lower[::3], upper[::3] = (np.array([segment.extension[i] for segment in robot.segments]) for i in (0, 1))
+    return lower, upper

@@ -1,0 +1,136 @@
+"""`World`: what the viewer shows and a hand drives; robots free in space, in a scene, or on a rigid host."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fastrod.robot import Robot
+from fastrod.segments import SegmentActions
+from fastrod.state import State
+from fastrod.types import Floats
+
+
+class Body(NamedTuple):
+    """A rigid thing that is drawn: part of a host, an obstacle, a floor."""
+
+    name: str
+    """Unique in its world."""
+    vertices: NDArray[np.float32]
+    """(n, 3) own frame [m]."""
+    faces: NDArray[np.uint32]
+    """(m, 3)"""
+    color: tuple[int, int, int]
+    """Red, green, blue, 0 to 255."""
+    opacity: float = 1.0
+
+
+class Rods(NamedTuple):
+    """Robots of one simulator."""
+
+    robots: tuple[Robot, ...]
+    """One for all, or one each."""
+    state: State
+    """After the last step."""
+    place: Floats
+    """(n_robots, 3) where each is drawn, added to world coordinates [m]: many robots stand in a grid."""
+    radius: tuple[float, ...]
+    """(n_segments,) of the body [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hand:
+    """What a hand tells a world for one step."""
+
+    tendon_length: Floats
+    """(n_tendons,) absolute [m]; for robots that are driven by tension, not used."""
+    extension: Floats
+    """(n_segments,) [m]."""
+    tension: Floats | None = None
+    """(n_tendons,) [N], where a segment is driven by it."""
+    base: Floats = field(default_factory=lambda: np.zeros(6))
+    """(6,) of base or flange from its home: displacement [m] and rotation vector [rad], world."""
+    base_rate: Floats | None = None
+    """(n_joints,) of the joints of the host, in the place of `base`, where a drag moves them [rad/s]."""
+    tip_force: Floats = field(default_factory=lambda: np.zeros(3))
+    """(3,) world [N]; the payload's weight comes on top."""
+    payload: float = 0.0
+    """At the tip [kg]."""
+    gravity: float = 1.0
+    """Times the robot's own gravity, for robot and payload."""
+    freeze: bool = False
+    """The rigid host holds still."""
+
+
+class World(ABC):
+    """Robots and their surroundings, advanced step by step, by a script or by hand."""
+
+    name: str
+    about: str
+    """One sentence."""
+    dt: float
+    """[s] of a step."""
+    robot: Robot
+    """The one that a hand drives; of many, all are driven alike."""
+    actions: SegmentActions | None
+    """Its segments as one drives them; None where they are not driven by tendon lengths."""
+    by_hand: bool
+    """It can be driven by hand; otherwise only its script moves it."""
+    scripted: bool
+    """It has a script."""
+    duration: float
+    """Of the script [s]; the script begins again after it."""
+    host: bool
+    """A rigid host carries the robot, and can be frozen."""
+    base_moves: bool
+    """`Hand.base` is heeded."""
+    loads: bool
+    """`Hand.tip_force`, `payload` and `gravity` are heeded."""
+
+    @property
+    @abstractmethod
+    def t(self) -> float:
+        """Time since the last reset [s]."""
+
+    @property
+    @abstractmethod
+    def rods(self) -> tuple[Rods, ...]:
+        """All soft robots; the first robot of the first is the one that a hand drives."""
+
+    @property
+    @abstractmethod
+    def bodies(self) -> tuple[Body, ...]:
+        """Rigid things, the same from reset to reset."""
+
+    @abstractmethod
+    def poses(self) -> Floats:
+        """(n_bodies, 7) position [m] and quaternion w x y z, world, after the last step."""
+
+    @abstractmethod
+    def play(self) -> None:
+        """One step of the script. Raises `FastrodError` where it cannot be done."""
+
+    @abstractmethod
+    def drive(self, hand: Hand) -> None:
+        """One step by hand. Raises `FastrodError` where it cannot be done; the world is then as after its last good step, or reset."""
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Back to the beginning."""
+
+    @abstractmethod
+    def jacobian(self) -> Floats:
+        """(3, n_joints + n_actions) d(tip position, world [m]) / d(joints of the host, action) at the last state; n_joints is 0 where no
+        host can be moved by a drag. Raises `FastrodError` where there is none."""
+
+    def picture(self) -> NDArray[np.uint8] | None:
+        """(height, width, 3) what a camera in hand sees now, where there is one."""
+        return None
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let go of everything outside of Python's memory."""

@@ -1,0 +1,340 @@
+"""Worlds without a rigid host: `FreeWorld`, robots in empty space, and `SceneWorld`, a scene of rods and obstacles."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fastrod.contact import ContactScene, Obstacle
+from fastrod.errors import InputError, RobotError
+from fastrod.robot import Robot
+from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_vector
+from fastrod.segments import SegmentActions
+from fastrod.simulator import Simulator
+from fastrod.state import State
+from fastrod.types import Floats
+from fastrod_scenes.scene import RodScene
+from fastrod_viewer.catalogue import about, catalogue, open_world
+from fastrod_viewer.scene_graph import grid_places
+from fastrod_viewer.world import Body, Hand, Rods, World
+
+__all__ = ["FreeWorld", "SceneWorld", "SimulatedWorld", "catalogue", "open_world"]
+
+PERIOD = 6.0
+"""Of the motion that shows what a free robot can do [s]."""
+SWAY = 1.6
+"""Largest bend of a free robot in that motion, all segments together [rad]."""
+PUSH = 0.3
+"""Slope of the tip under the force that sways a robot without tendons, about [rad]."""
+_APART = 0.8  # of the robot's length, between robots that stand in a grid
+_SQUARE = 1.5  # of the robot's length, edge of a plane
+_GLASS = 0.35  # opacity of planes and of meshes, which may surround a robot
+_COLORS = ((146, 154, 166), (176, 146, 110), (120, 150, 132), (160, 128, 146))
+
+
+class SimulatedWorld(World):
+    """What worlds of one simulator, without a host, have in common.
+
+    A step that is not ok is settled; where that fails too, the simulator is as before the step. Where contact is in the way the robots
+    stand as far as they came, and go on from there. Either way an `InputError` says why.
+    """
+
+    by_hand = True
+    scripted = True
+    host = False
+    base_moves = True
+    loads = True
+    endless: bool
+    """The script ends as it began, and runs on without a jump."""
+
+    def __init__(self, simulator: Simulator, contact: ContactScene | None, place: Floats) -> None:
+        """`contact`: the scene of the simulator, where it has one; `place` (n_robots, 3) as in `Rods` [m]."""
+        self.simulator = simulator
+        self.dt = simulator.dt
+        self.robot: Robot = simulator.robots[0]
+        self.actions = actions_of(self.robot)
+        self._touches = contact is not None
+        self._radius = radii(self.robot, contact)
+        self._place = place
+        self._home: Floats = np.array([[*r.base_position, *r.base_quaternion] for r in simulator.robots])
+        self._loads = Loads(self.robot)
+        self._start = simulator.snapshot()
+        self._one: Simulator | None = None
+        if simulator.n_robots > 1 and contact is None and not self.robot.effects:
+            self._one = Simulator(self.robot, 1, self.dt, (simulator.n_points - 1) // self.robot.n_segments, threads=1)
+        self._given: dict[str, Any] = {}
+        self._clock = self._t = 0.0
+
+    @abstractmethod
+    def inputs(self, t: float) -> dict[str, Any]:
+        """Of the script at time t [s]: keyword arguments of `Simulator.step`."""
+
+    @property
+    @final
+    def t(self) -> float:
+        return self._t
+
+    @property
+    @final
+    def rods(self) -> tuple[Rods, ...]:
+        return (Rods(self.simulator.robots, self._state, self._place, self._radius),)
+
+    @final
+    def reset(self) -> None:
+        self.simulator.restore(self._start)
+        self._clock, self._t = 0.0, -self.dt
+        self._advance(self.inputs(0.0))
+
+    @final
+    def play(self) -> None:
+        clock = self._clock + self.dt
+        if clock > self.duration + 1e-9 and not self.endless:
+            self.reset()
+            return
+        self._clock = clock % self.duration if self.endless else clock  # beyond a step that fails the script goes on
+        self._advance(self.inputs(self._clock))
+
+    @final
+    def drive(self, hand: Hand) -> None:
+        """One step by hand. What the hand does not tell, obstacles and the base's own way among it, stays as the script has it now.
+        Among obstacles, robots that the script has bent in ways of their own are moved by what the first one is: no robot could jump to
+        another's bends there."""
+        held = self.held(self._clock)
+        given = held | wires(self.robot, hand)
+        if self._touches and np.ndim(own := held.get("tendon_length", 0.0)) == 2:
+            given["tendon_length"] = np.asarray(own) + (hand.tendon_length - np.asarray(own)[0])
+        pose = np.asarray(given.get("base_pose", self._home), dtype=np.float64)
+        given["base_pose"] = moved(pose, hand.base)
+        self._advance(self._loads.added(given, hand))
+
+    @final
+    def jacobian(self) -> Floats:
+        if self.actions is None:
+            raise InputError(f"robot {self.robot.name!r} is not driven by tendon lengths, so no drag can move its tip.")
+        simulator, state = self.simulator, self._state
+        if self._one is not None:  # of many alike the first alone: a fraction of the time of all
+            simulator, state = self._one, self._one.settle(**_first(self._given))
+        jacobian = simulator.jacobian()[0, :3] @ self.actions.matrix
+        if not np.isfinite(jacobian).all():
+            raise InputError(f"there is no Jacobian here: {state.problems.get(0, 'the robot is not ok')}")
+        return np.asarray(jacobian)
+
+    @final
+    def close(self) -> None:
+        """All is in Python's memory."""
+
+    @abstractmethod
+    def held(self, t: float) -> dict[str, Any]:
+        """What of the script's inputs at time t [s] stays while a hand drives."""
+
+    @abstractmethod
+    def arrived(self, given: dict[str, Any]) -> None:
+        """These inputs have been simulated; after a reset they are the first."""
+
+    @final
+    def _advance(self, given: dict[str, Any]) -> None:
+        before = self.simulator.snapshot()
+        state = self.simulator.step(**given)
+        if not state.ok.all() and not self._touches:
+            state = self.simulator.settle(**given)
+        part_way = self._touches and not state.ok.all() and _finite(state)
+        if not _finite(state) or not (state.ok.all() or part_way):
+            self.simulator.restore(before)
+        else:
+            self._state, self._given = state, given
+            self._t = self._t + self.dt
+        if not (state.ok.all() and _finite(state)):
+            robot, problem = next(iter(state.problems.items()), (0, "its shape is not finite."))
+            raise InputError(f"robot {robot} cannot be brought there: {problem}")
+        self.arrived(given)
+
+
+@final
+class FreeWorld(SimulatedWorld):
+    """Robots without surroundings, all driven alike; more than one stand in a grid."""
+
+    endless = True
+    duration = PERIOD
+
+    def __init__(self, robot: Robot, n_robots: int = 1, dt: float = 1.0 / 30.0, *, points_per_segment: int = 10) -> None:
+        """As for `Simulator`. Raises `InputError`, `RobotError`."""
+        simulator = Simulator(robot, n_robots, dt, points_per_segment, threads=1 if n_robots == 1 else None)
+        super().__init__(simulator, None, grid_places(n_robots, _APART * robot.length))
+        self.name, self.about = robot.name, about(robot)
+        self.reset()
+
+    def inputs(self, t: float) -> dict[str, Any]:
+        """A gentle motion, periodic: bends toward both sides of every segment, or what takes their place."""
+        return sway(self.robot, self.actions, 2.0 * math.pi * t / PERIOD)
+
+    def held(self, t: float) -> dict[str, Any]:  # noqa: ARG002
+        """Nothing."""
+        return {}
+
+    def arrived(self, given: dict[str, Any]) -> None:
+        """There is nothing but the robots."""
+
+    @property
+    def bodies(self) -> tuple[Body, ...]:
+        """None."""
+        return ()
+
+    def poses(self) -> Floats:
+        return np.zeros((0, 7))
+
+
+@final
+class SceneWorld(SimulatedWorld):
+    """A scene of rods and obstacles. Robots of separate worlds are drawn in one: obstacles that all of them have stand there once, each
+    where it is for the first robot."""
+
+    endless = False
+
+    def __init__(self, scene: RodScene) -> None:
+        simulator = scene.simulator()
+        contact = simulator.contact
+        super().__init__(simulator, contact, np.zeros((simulator.n_robots, 3)))
+        self.scene = scene
+        self.name, self.about, self.duration = scene.name, scene.about, scene.duration
+        obstacles = contact.obstacles if contact is not None else ()
+        self._rest = {o.name: np.array([*o.position, *o.quaternion]) for o in obstacles}
+        self._poses = dict(self._rest)
+        self._bodies = tuple(_body(o, _COLORS[k % len(_COLORS)], self.robot) for k, o in enumerate(obstacles))
+        self.reset()
+
+    def inputs(self, t: float) -> dict[str, Any]:
+        """The scene's."""
+        return self.scene.inputs(t)
+
+    def held(self, t: float) -> dict[str, Any]:
+        """Obstacles, bases and loads, but no speed: the obstacles stand still."""
+        return {name: value for name, value in self.inputs(t).items() if name not in ("obstacle_velocity", "tension")}
+
+    def arrived(self, given: dict[str, Any]) -> None:
+        """The obstacles are where they were told to be."""
+        if self._t == 0.0:
+            self._poses = dict(self._rest)
+        for name, pose in (given.get("obstacle_pose") or {}).items():
+            self._poses[name] = np.atleast_2d(np.asarray(pose, dtype=np.float64))[0]
+
+    @property
+    def bodies(self) -> tuple[Body, ...]:
+        """The obstacles."""
+        return self._bodies
+
+    def poses(self) -> Floats:
+        return np.array(list(self._poses.values())).reshape(-1, 7)
+
+
+@final
+class Loads:
+    """What a hand loads a robot with: tip force, payload, more or less gravity."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._gravity = np.array(robot.gravity)
+        density = np.array([segment.line_density for segment in robot.segments])
+        self._weight: Floats = np.repeat((density[:, None] * self._gravity)[:, None], 2, axis=1)  # (n_segments, 2, 3) [N/m]
+
+    def added(self, given: dict[str, Any], hand: Hand) -> dict[str, Any]:
+        """`given` with these loads on top of its own, as `Simulator.step` takes them."""
+        force = np.asarray(hand.tip_force, dtype=np.float64) + hand.payload * hand.gravity * self._gravity
+        more: dict[str, Any] = {"tip_force": force + np.asarray(given.get("tip_force", np.zeros(3)))}
+        if hand.gravity != 1.0 and self._weight.any():
+            own = np.asarray(given.get("line_force", np.zeros(3)), dtype=np.float64)
+            own = own[:, None, None] if own.ndim == 2 else own
+            more["line_force"] = own + (hand.gravity - 1.0) * self._weight
+        return {**given, **more}
+
+
+def actions_of(robot: Robot) -> SegmentActions | None:
+    """Its segments as one drives them; None where they are not driven by tendon lengths, two ways each."""
+    try:
+        return SegmentActions(robot)
+    except RobotError:
+        return None
+
+
+def radii(robot: Robot, contact: ContactScene | None = None) -> tuple[float, ...]:
+    """(n_segments,) of its body [m], as contact has them; a robot of which nobody knows is drawn slim."""
+    return tuple(radius or 0.01 * robot.length for radius in (contact or ContactScene()).radius_of(robot))
+
+
+def wires(robot: Robot, hand: Hand) -> dict[str, Any]:
+    """What a hand tells the tendons and the segments, as `Simulator.step` takes it."""
+    modes = {segment.mode for segment in robot.segments}
+    given: dict[str, Any] = {"extension": hand.extension}
+    if modes & {"tendon_length", "paper"}:
+        given["tendon_length"] = hand.tendon_length
+    if "tendon_tension" in modes:
+        given["tension"] = np.zeros(robot.n_tendons) if hand.tension is None else hand.tension
+    return given
+
+
+def moved(pose: Floats, base: Floats) -> Floats:
+    """Poses (..., 7) displaced and turned, each about its own origin, by `base` (6,) as in `Hand`. Raises `InputError`."""
+    by = np.asarray(base, dtype=np.float64)
+    if by.shape != (6,) or not np.isfinite(by).all():
+        raise InputError(f"Hand.base is {base!r}; give six finite numbers, displacement [m] and rotation vector [rad], world.")
+    turn = np.broadcast_to(quaternion_from_vector(by[3:]), pose[..., 3:].shape)
+    return np.concatenate([pose[..., :3] + by[:3], product(turn, pose[..., 3:])], axis=-1)
+
+
+def sway(robot: Robot, actions: SegmentActions | None, angle: float) -> dict[str, Any]:
+    """Inputs that show what a robot can do, of period 2 pi in `angle` [rad]; it is straight at 0, and segments follow one another as a
+    wave."""
+    if not robot.n_tendons:
+        stiffness = float(np.mean([segment.bending_stiffness for segment in robot.segments]))
+        side = np.array([math.sin(angle), math.sin(2.0 * angle), 0.0]) * 2.0 * PUSH * stiffness / robot.length**2
+        return {"tip_force": matrix_from_quaternion(np.array([robot.base_quaternion]))[0] @ side}
+    n = robot.n_segments
+    behind = (math.pi / 3.0) * np.arange(n) / n
+    home = 0.5 * (1.0 + math.cos(angle))  # so that it begins straight
+    waves = [np.sin(k * (angle - behind)) + np.sin(k * behind) * home for k in (1.0, 2.0)]
+    bends = SWAY / n * np.stack(waves, axis=1) / math.sqrt(2.0)
+    low, high = np.array([segment.extension for segment in robot.segments]).T
+    extension = 0.3 * np.where(high > 0.0, high, low) * (1.0 - math.cos(angle))
+    if actions is not None:
+        return dict(actions.inputs(np.concatenate([extension[:, None], actions.offset[:, None] * bends], axis=1).ravel()))
+    given: dict[str, Any] = {"extension": extension}
+    longer = np.cumsum(extension)[robot.tendon_segment]
+    shorter, tension = np.zeros(robot.n_tendons), np.zeros(robot.n_tendons)
+    for i, (tendon, k) in enumerate(zip(robot.tendons, robot.tendon_segment.tolist(), strict=True)):
+        places = np.array(tendon.position(k + 1))
+        shorter[i] = (places * bends[: k + 1]).sum()
+        segment = robot.segments[k]
+        toward = places[-1] / np.linalg.norm(places[-1])
+        most = SWAY / n * float(np.mean(segment.bending_stiffness)) / (segment.length * np.linalg.norm(places[-1]))
+        tension[i] = 0.5 * most * (1.0 + toward @ bends[k] * n / SWAY)
+    modes = {segment.mode for segment in robot.segments}
+    if modes & {"tendon_length", "paper"}:
+        given["tendon_length"] = robot.rest_tendon_length + longer - shorter
+    if "tendon_tension" in modes:
+        given["tension"] = tension
+    return given
+
+
+def _first(given: dict[str, Any]) -> dict[str, Any]:
+    """Inputs of the first robot."""
+    shared = {"line_force": 3}  # axes of what has no robot axis, where these are not one
+    arrays = {name: np.asarray(value, dtype=np.float64) for name, value in given.items()}
+    return {name: a[0] if a.ndim > shared.get(name, 1) else a for name, a in arrays.items()}
+
+
+def _finite(state: State) -> bool:
+    return bool(np.isfinite(state.position).all())
+
+
+def _body(obstacle: Obstacle, color: tuple[int, int, int], robot: Robot) -> Body:
+    drawn = obstacle.as_trimesh()
+    vertices: NDArray[np.float64] = np.asarray(drawn.vertices)
+    if obstacle.shape == "plane":  # the part of it that is nearest to the robot
+        base = matrix_from_quaternion(np.array([robot.base_quaternion]))[0]
+        middle = np.array(robot.base_position) + 0.5 * robot.length * base[:, 2]
+        turn = matrix_from_quaternion(np.array([obstacle.quaternion]))[0]
+        vertices = _SQUARE * robot.length * vertices + ((middle - obstacle.position) @ turn) * [1.0, 1.0, 0.0]
+    opacity = _GLASS if obstacle.shape in ("plane", "mesh") else 1.0
+    return Body(obstacle.name, vertices.astype(np.float32), np.asarray(drawn.faces).astype(np.uint32), color, opacity)
