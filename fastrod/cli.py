@@ -249,11 +249,14 @@ def _excite(arguments: argparse.Namespace) -> int:
 
 
 def _view(arguments: argparse.Namespace) -> int:
+    from fastrod_viewer.server import serve
+
+    server = serve(arguments.host, arguments.port)  # first: a browser loads the page while the simulator is imported
     from fastrod_viewer.app import FIRST, view
 
     view(
-        arguments.what or FIRST, robot=arguments.robot, n_robots=arguments.robots, host=arguments.host, port=arguments.port,
-        open_browser=not arguments.no_open, script=arguments.play,
+        arguments.what or FIRST, robot=arguments.robot, n_robots=arguments.robots, host=arguments.host,
+        open_browser=not arguments.no_open, script=arguments.play, server=server,
     )  # fmt: skip
     return DONE
 

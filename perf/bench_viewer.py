@@ -72,7 +72,7 @@ def reached(page: Any, address: str, ready: Callable[[], bool], seconds: float =
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         try:
-            page.goto(address, timeout=1000)
+            page.goto(address, timeout=30_000)
             break
         except Exception:  # nobody listens yet
             time.sleep(0.02)

@@ -228,7 +228,14 @@ def test_a_simulated_robot_refuses_what_it_cannot_do() -> None:
 
 
 def test_a_measurement_has_the_shapes_of_a_log() -> None:
-    good = {"t": 0.0, "dl": np.zeros(4), "ext": np.zeros(1), "tip_position": np.zeros(3), "tip_quaternion": [1, 0, 0, 0], "tension": np.zeros(4)}
+    good = {
+        "t": 0.0,
+        "dl": np.zeros(4),
+        "ext": np.zeros(1),
+        "tip_position": np.zeros(3),
+        "tip_quaternion": [1, 0, 0, 0],
+        "tension": np.zeros(4),
+    }
     assert Measurement(**good).problem == ""  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"Measurement.tip_position has shape \(2,\); it must be \(3,\)"):
         Measurement(**(good | {"tip_position": np.zeros(2)}))  # type: ignore[arg-type]

@@ -13,7 +13,7 @@ from fastrod.errors import InputError
 from fastrod.segments import SegmentActions
 from fastrod_scenes import load
 from fastrod_viewer import palette
-from fastrod_viewer.chains import axes, tangents
+from fastrod_viewer.chains import tangents
 from fastrod_viewer.scene_graph import SHAPES, Options, Picture, Trail, ball, bounds, ghost, grid_places, legend
 from fastrod_viewer.world import Body, Rods
 
@@ -216,6 +216,8 @@ def test_place_moves_the_picture():
     here = Picture(seen(robot, state)).frame(seen(robot, state))
     there = Picture(seen(robot, state, place)).frame(seen(robot, state, place))
     for name in here:
+        if not here[name].scale.any():  # arrows of loads that are not there
+            continue
         shift = there[name].position.reshape(2, -1, 3) - here[name].position.reshape(2, -1, 3)
         assert_allclose(shift, np.broadcast_to(place[:, None], shift.shape), atol=1e-7)
 
@@ -458,14 +460,6 @@ def test_meshes_have_the_sizes_they_are_said_to_have():
     assert reach["cone"] == reach["cap"] == ([-1.0, -1.0, 0.0], [1.0, 1.0, 1.0])
 
 
-def test_axes_of_a_quaternion_are_the_columns_of_its_matrix():
-    q = np.random.default_rng(2).normal(size=(20, 4))
-    q /= np.linalg.norm(q, axis=1, keepdims=True)
-    columns = fastrod.rotation.matrix_from_quaternion(q)
-    for k, axis in enumerate(axes(q)):
-        assert_allclose(axis, columns[:, :, k], atol=1e-14)
-
-
 def test_grid_is_square_and_centred():
     for n in (1, 2, 5, 16, 64):
         places = grid_places(n, 0.3)
@@ -482,13 +476,13 @@ def test_bounds_hold_the_robots():
     away = np.linalg.norm(state.position + place[:, None] - centre, axis=-1)
     assert away.max() <= radius < 3.0
     alone = seen(robot, replace(state, position=np.full_like(state.position, np.nan)), place)
-    assert_allclose(bounds(alone)[0], centre, atol=1e-12)
-    one, _, state = bent("prototype")
-    assert bounds(seen(one, state))[1] == pytest.approx(0.62 * 0.07)  # room to bend to both sides
+    assert_allclose(bounds(alone)[0], [0.0, 0.0, 0.25], atol=1e-12)  # lost robots count as straight ones
+    one, _, state = bent("tdcr_a")
+    assert bounds(seen(one, state))[1] == pytest.approx(0.62 * 0.4)  # room to bend to both sides
     cube = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]], np.float32)
     far, wide = np.array([[0.4, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]]), Body("floor", cube, np.zeros((0, 3), np.uint32), (0, 0, 0))
     near = wide._replace(name="box", vertices=0.05 * cube)
-    assert bounds(seen(one, state), [wide], far)[1] == pytest.approx(0.62 * 0.07)  # a floor is no reason to step back
+    assert bounds(seen(one, state), [wide], far)[1] == pytest.approx(0.62 * 0.4)  # a floor is no reason to step back
     centre, radius = bounds(seen(one, state), [near], far)
     corners = np.array([[0.45, y, z] for y in (-0.05, 0.05) for z in (-0.05, 0.05)])
     assert (np.linalg.norm(corners - centre, axis=1) <= radius + 1e-12).all()

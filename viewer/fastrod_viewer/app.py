@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import ipaddress
-import socket
 import sys
 import threading
 from collections.abc import Callable
@@ -24,6 +22,7 @@ from fastrod_viewer.drive_page import DrivePage
 from fastrod_viewer.page import Page, is_upright, tell
 from fastrod_viewer.playback import Playback, load
 from fastrod_viewer.replay_page import ReplayPage
+from fastrod_viewer.server import is_loopback, serve
 from fastrod_viewer.watch import Watch
 from fastrod_viewer.world import World
 from fastrod_viewer.worlds import FreeWorld
@@ -33,8 +32,6 @@ if TYPE_CHECKING:
 
 FIRST = "five_segment_reacher"
 """What is shown where nothing is named."""
-PORT = 8080
-_TRIES = 20
 _BRAND = (37, 99, 235)
 
 
@@ -43,13 +40,14 @@ class App:
     """One page at a time on one server, for every browser that is connected. `close` it, or use it as a context."""
 
     def __init__(
-        self, *, host: str = "127.0.0.1", port: int | None = None, folder: Path | None = None,
+        self, *, host: str = "127.0.0.1", port: int | None = None, folder: Path | None = None, server: viser.ViserServer | None = None,
         say: Callable[[str], None] = lambda sentence: print(sentence, file=sys.stderr, flush=True),
     ) -> None:  # fmt: skip
-        """`port` None takes the first free one from 8080 on, 0 any; `folder` takes what is recorded (default: where one stands); `say`
-        hears what a person should know. Raises `InputError` where viser is missing, or the host or port cannot be had."""
+        """`port` None takes the first free one from 8080 on, 0 any; `server` is one that `serve` has started already; `folder` takes what
+        is recorded (default: where one stands); `say` hears what a person should know. Raises `InputError` where viser is missing, or the
+        host or port cannot be had."""
         self.host, self.folder, self.say = host, folder or Path.cwd(), say
-        self.server = _serve(host, free_port(host, port))
+        self.server = server or serve(host, port)
         self.port = self.server.get_port()
         self.page: Page | None = None
         self._lock = threading.Lock()
@@ -60,7 +58,6 @@ class App:
         self.canvas = Canvas(self.server)
         self._known = catalogue()
         self._picker: Any = None
-        self._busy = gui.add_markdown("", visible=False)
         self.server.on_client_connect(self._came)
         self.watch = Watch(self.server, lost=self._lost, tick=self._tick)
 
@@ -112,7 +109,8 @@ class App:
             if self.page is not None:
                 self.page.close()
                 self.page = None
-        self.server.stop()
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.server.stop()
 
     def _show_picker(self, current: str) -> None:
         names = [*self._known, DEMO_LOG]
@@ -205,73 +203,23 @@ def is_log(what: str | Path) -> bool:
     return suffix in (".csv", ".parquet") or (suffix != ".toml" and Path(what).is_file())
 
 
-def free_port(host: str, port: int | None) -> int:
-    """`port` if it is free, or for None the first free one from 8080 on. Raises `InputError`, one sentence, where there is none."""
-    if port is not None and not 0 <= port < 65536:
-        raise InputError(f"port is {port}; it must be between 1 and 65535, or 0 for any that is free.")
-    for candidate in range(PORT, PORT + _TRIES) if port is None else [port]:
-        if _free(host, candidate):
-            return candidate
-    if port is None:
-        raise InputError(f"ports {PORT} to {PORT + _TRIES - 1} are all in use on {host}; name a free one with --port.")
-    other = next((p for p in range(port + 1, min(port + 1 + _TRIES, 65536)) if _free(host, p)), None)
-    raise InputError(f"port {port} is in use on {host}; " + (f"{other} is free: --port {other}." if other else "name another with --port."))
-
-
-def _free(host: str, port: int) -> bool:
-    try:
-        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
-    except OSError as error:
-        raise InputError(
-            f"host {host!r} is not an address of this machine; 127.0.0.1 is, and 0.0.0.0 stands for all of its addresses."
-        ) from error
-    with socket.socket(family, socket.SOCK_STREAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((host, port))
-        except OSError as error:
-            if error.errno == 99:  # EADDRNOTAVAIL
-                raise InputError(
-                    f"host {host!r} is not an address of this machine; 127.0.0.1 is, and 0.0.0.0 stands for all of its addresses."
-                ) from error
-            return False
-    return True
-
-
-def is_loopback(host: str) -> bool:
-    """Only this machine reaches it."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
-
-
-def _serve(host: str, port: int) -> viser.ViserServer:
-    try:
-        import viser
-    except ImportError as error:
-        raise InputError("viser is not installed; pip install 'fastrod[viewer]' brings it.") from error
-    with contextlib.redirect_stdout(io.StringIO()):  # it greets with a box
-        return viser.ViserServer(host=host, port=port, verbose=False)
-
-
 def view(
     what: str | Path | World | Robot | Playback = FIRST, *, host: str = "127.0.0.1", port: int | None = None, open_browser: bool = True,
     robot: str | Path | None = None, n_robots: int = 1, link: RobotLink | None = None, script: bool = False,
+    server: viser.ViserServer | None = None,
 ) -> None:  # fmt: skip
     """Show something in the browser until Ctrl+C: a scene or robot by name, a robot's file, a log with what models say to it.
 
-    Raises `FastrodError`, one sentence, for what cannot be shown.
+    `server` is one that `serve` has started on that host. Raises `FastrodError`, one sentence, for what cannot be shown.
     """
-    shown = found(what, robot, n_robots)
-    with App(host=host, port=port) as app:
-        app.open(shown, link=link, script=script)
-        if not is_loopback(host):
-            app.say(f"Warning: everyone who reaches {host} on port {app.port} can drive this robot; there is no password.")
-        title = app.page.title if app.page is not None else ""
-        print(f"{title}: {app.address} (Ctrl+C ends it)", flush=True)
+    with App(host=host, port=port, server=server) as app:
+        shown = found(what, robot, n_robots)
         if open_browser:
             import webbrowser
 
             webbrowser.open(app.address)
+        app.open(shown, link=link, script=script)
+        if not is_loopback(host):
+            app.say(f"Warning: everyone who reaches {host} on port {app.port} can drive this robot; there is no password.")
+        print(f"{app.page.title if app.page else what}: {app.address} (Ctrl+C ends it)", flush=True)
         app.wait()

@@ -71,6 +71,7 @@ class Trail:
             raise InputError(f"a trail of {capacity} pieces of {min_step} m cannot be; give one piece or more, of 0 m or more.")
         self.capacity, self.min_step = capacity, min_step
         self._points = np.full((capacity + 1, 3), np.nan)
+        self._drawn: tuple[float, Color, Instances] | None = None
 
     def __len__(self) -> int:
         """Positions that are kept, at most `capacity` + 1."""
@@ -82,13 +83,17 @@ class Trail:
         if np.isfinite(position).all() and not step < self.min_step:
             self._points[:-1] = self._points[1:]
             self._points[-1] = position
+            self._drawn = None
 
     def instances(self, radius: float, color: Color) -> Instances:
         """`capacity` pieces, oldest first; the newest has the full `radius` [m] and colour."""
-        age = np.linspace(0.0, 1.0, self.capacity + 1)[1:]
-        chain = _chain(self._points, radius * (0.3 + 0.7 * age), color)
-        return chain._replace(color=blend(color, _PAPER, 0.85 * (1.0 - age)[:, None]))
+        if self._drawn is None or self._drawn[:2] != (radius, color):
+            age = np.linspace(0.0, 1.0, self.capacity + 1)[1:]
+            chain = _chain(self._points, radius * (0.3 + 0.7 * age), color)
+            self._drawn = radius, color, chain._replace(color=blend(color, _PAPER, 0.85 * (1.0 - age)[:, None]))
+        return self._drawn[2]
 
     def clear(self) -> None:
         """Forget all."""
         self._points[:] = np.nan
+        self._drawn = None

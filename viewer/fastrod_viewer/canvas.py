@@ -113,12 +113,17 @@ class Canvas:
                 setattr(handle, there, value)
         self._batches[name] = handle, batch
 
-    def show_all(self, batches: Mapping[str, Instances], prefix: str = "") -> None:
-        """Draw these and take away what had this prefix before."""
-        for name in [name for name in self._batches if name.startswith(prefix) and name.removeprefix(prefix) not in batches]:
+    def show_all(self, batches: Mapping[str, Instances], prefix: str) -> None:
+        """Draw these, those of one shape together, and take away what had this prefix before: each array costs as much to send as its
+        bytes, and a good deal on top."""
+        by_shape: dict[str, list[Instances]] = {}
+        for batch in batches.values():
+            by_shape.setdefault(batch.shape, []).append(batch)
+        for name in [name for name in self._batches if name.startswith(prefix) and name.removeprefix(prefix) not in by_shape]:
             self.show(name, None)
-        for name, batch in batches.items():
-            self.show(prefix + name, batch)
+        for shape, some in by_shape.items():
+            arrays = (np.concatenate(parts) for parts in zip(*(batch[1:] for batch in some), strict=True))
+            self.show(prefix + shape, some[0] if len(some) == 1 else Instances(shape, *arrays))
 
     def note(self, name: str, text: str, position: Sequence[float] | NDArray[np.floating] | None) -> None:
         """A few words at a place [m]; none where `position` is None."""

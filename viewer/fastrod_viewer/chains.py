@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fastrod.rotation import quaternion_from_matrix
 from fastrod.types import Floats, Ints
+from fastrod_viewer import chain_kernels as kernels
 
 
 class Nodes(NamedTuple):
@@ -37,7 +37,7 @@ class Samples(NamedTuple):
 
 
 class Pieces(NamedTuple):
-    """Straight pieces of a chain."""
+    """Straight pieces of strands: (n_robots, n_strands, n_pieces, ...)."""
 
     centre: Floats
     """(..., 3) [m]."""
@@ -45,65 +45,38 @@ class Pieces(NamedTuple):
     """(..., 4), z along the piece."""
     length: Floats
     """(...) from end to end [m]."""
+    bend: Floats
+    """(...) by how much the rod's tangent changes over the piece."""
 
 
 def nodes(position: Floats, rotation: Floats, arclength: Floats) -> Nodes:
     """Of positions (n_robots, n_points, 3), rotations (n_robots, n_points, 3, 3) and arclengths (n_robots, n_points), finite."""
-    quaternion = quaternion_from_matrix(rotation)
-    turned = np.where((quaternion[:, 1:] * quaternion[:, :-1]).sum(-1) < 0.0, -1.0, 1.0)
-    quaternion[:, 1:] *= np.cumprod(turned, axis=1)[..., None]
-    return Nodes(position, rotation[..., 2], quaternion, arclength)
+    quaternion = np.empty((*rotation.shape[:2], 4))
+    kernels.quaternions(rotation, quaternion)
+    return Nodes(np.ascontiguousarray(position), np.ascontiguousarray(rotation[..., 2]), quaternion, np.ascontiguousarray(arclength))
 
 
 class Sampler:
     """Cross-sections at fixed fractions of the segments: positions by cubic Hermite polynomials, rotations by normalised lerp."""
 
-    def __init__(self, n_segments: int, n_steps: int, segment: Ints, fraction: Floats) -> None:
-        """`segment` (m,) and `fraction` (m,) of its length, 0 to 1."""
+    def __init__(self, n_steps: int, segment: Ints, fraction: Floats) -> None:
+        """`segment` (m,) and `fraction` (m,) of its length, 0 to 1; a segment has `n_steps` intervals between nodes."""
         self.n_steps, self.segment, self.fraction = n_steps, segment, fraction
-        inner = np.arange(n_segments)[:, None] * n_steps + np.arange(1, n_steps)
-        self._inner = inner[segment]  # (m, n_steps - 1) the nodes inside the segment
 
     def __call__(self, rods: Nodes) -> Samples:
-        s = rods.arclength
-        joints = s[:, :: self.n_steps]
-        start, end = joints[:, self.segment], joints[:, self.segment + 1]
-        wanted = start + self.fraction * (end - start)
-        # where forces act on points, nodes stand at them, and are not even
-        interval = self.segment * self.n_steps + (s[:, self._inner] <= wanted[..., None]).sum(-1)
-        flat = interval + np.arange(len(s))[:, None] * s.shape[1]
-
-        def at(a: Floats) -> tuple[Floats, Floats]:
-            rows = a.reshape(-1, a.shape[-1])
-            return rows[flat], rows[flat + 1]
-
-        s0, s1 = s.ravel()[flat], s.ravel()[flat + 1]
-        h = np.maximum(s1 - s0, 1e-12)
-        t = np.clip((wanted - s0) / h, 0.0, 1.0)
-        (p0, p1), (d0, d1), (q0, q1) = at(rods.position), at(rods.tangent), at(rods.quaternion)
-        r, u, v = 1.0 - t, t[..., None], (t * (1.0 - t))[..., None]
-        weight = (t * t * (3.0 - 2.0 * t))[..., None]
-        position = p0 + weight * (p1 - p0) + v * h[..., None] * (r[..., None] * d0 - u * d1)
-        quaternion = q0 + u * (q1 - q0)
-        quaternion /= np.sqrt(np.einsum("...i,...i->...", quaternion, quaternion))[..., None]
-        return Samples(position, quaternion, interval, t)
+        n, m = len(rods.position), len(self.segment)
+        found = Samples(np.empty((n, m, 3)), np.empty((n, m, 4)), np.empty((n, m), np.int64), np.empty((n, m)))
+        kernels.sample(
+            rods.position, rods.tangent, rods.quaternion, rods.arclength, self.n_steps, self.segment, self.fraction,
+            found.position, found.quaternion, found.interval, found.part,
+        )  # fmt: skip
+        return found
 
 
 def along(between: tuple[Floats, Floats], samples: Samples) -> Floats:
     """(n_robots, m) linear between the values (n_robots, n_points - 1) at the start and the end of each interval."""
     start, end = (np.take_along_axis(a, samples.interval, axis=1) for a in between)
     return np.asarray(start + samples.part * (end - start))
-
-
-def axes(quaternion: Floats) -> tuple[Floats, Floats, Floats]:
-    """d1, d2, d3, each (..., 3), of quaternions (..., 4)."""
-    w, x, y, z = np.moveaxis(quaternion, -1, 0)
-    xx, yy, zz, xy, xz, yz, wx, wy, wz = x * x, y * y, z * z, x * y, x * z, y * z, w * x, w * y, w * z
-    return (
-        np.stack([1.0 - 2.0 * (yy + zz), 2.0 * (xy + wz), 2.0 * (xz - wy)], axis=-1),
-        np.stack([2.0 * (xy - wz), 1.0 - 2.0 * (xx + zz), 2.0 * (yz + wx)], axis=-1),
-        np.stack([2.0 * (xz + wy), 2.0 * (yz - wx), 1.0 - 2.0 * (xx + yy)], axis=-1),
-    )
 
 
 def tangents(quaternion: Floats) -> Floats:
@@ -120,33 +93,13 @@ def aim(direction: Floats) -> Floats:
     return np.asarray(found / np.linalg.norm(found, axis=-1, keepdims=True))
 
 
-def middles(quaternion: Floats) -> Floats:
-    """(..., n - 1, 4) half way between neighbours (..., n, 4) of a chain."""
-    q = quaternion[..., 1:, :] + quaternion[..., :-1, :]
-    return np.asarray(q / np.sqrt(np.einsum("...i,...i->...", q, q))[..., None])
-
-
-def backbone_pieces(position: Floats, quaternion: Floats) -> Pieces:
-    """Between neighbouring cross-sections (..., n, 3), (..., n, 4): the half-way tangent is parallel to the chord of an arc."""
-    chord = position[..., 1:, :] - position[..., :-1, :]
-    return Pieces(
-        0.5 * (position[..., 1:, :] + position[..., :-1, :]),
-        middles(quaternion),
-        np.sqrt(np.einsum("...i,...i->...", chord, chord)),
-    )
-
-
-def strand_pieces(position: Floats, quaternion: Floats) -> Pieces:
-    """Between neighbouring points (..., n, 3) of a strand that runs beside a rod; (..., n, 4) are the rod's cross-sections there, from
-    which it departs by less than a right angle."""
-    chord = position[..., 1:, :] - position[..., :-1, :]
-    length = np.sqrt(np.einsum("...i,...i->...", chord, chord))
-    q = middles(quaternion)
-    unit = chord / np.maximum(length, 1e-30)[..., None]
-    lx, ly, lz = (np.einsum("...i,...i->...", unit, axis) for axis in axes(q))
-    a, b, c = 1.0 + lz, -ly, lx  # in the rod's frame: from d3 to the chord
-    size = np.maximum(np.sqrt(a * a + b * b + c * c), 1e-30)
-    a, b, c = a / size, b / size, c / size
-    w, x, y, z = np.moveaxis(q, -1, 0)
-    turned = np.stack([w * a - x * b - y * c, w * b + x * a - z * c, w * c + y * a + z * b, z * a + x * c - y * b], axis=-1)
-    return Pieces(0.5 * (position[..., 1:, :] + position[..., :-1, :]), turned, length)
+def pieces(samples: Samples, n_strips: int, source: Ints, offset: Floats) -> Pieces:
+    """Of strands through segments: `samples` are those of `n_strips` segments, as many of each; strand c runs through those of `source[c]`
+    (n_strands,) at `offset` (1 or n_robots, n_strands, 2) along d1 and d2 [m]."""
+    n, count = samples.part.shape
+    ends = count // n_strips
+    shape = n, len(source), ends - 1
+    made = Pieces(np.empty((*shape, 3)), np.empty((*shape, 4)), np.empty(shape), np.empty(shape))
+    at, turn = (a.reshape(n, n_strips, ends, -1) for a in (samples.position, samples.quaternion))
+    kernels.strands(at, turn, source, offset, ends - 1, *made)
+    return made

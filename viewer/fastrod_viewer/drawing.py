@@ -19,7 +19,7 @@ from fastrod_viewer.session import Frame
 from fastrod_viewer.shapes import ball
 from fastrod_viewer.world import World
 
-_TRAIL = 160  # pieces
+_TRAIL = 100  # pieces
 _GLASS = 0.3  # opacity of what the tip is inside of
 
 
@@ -71,11 +71,12 @@ class Drawing:
             weight = hand.payload * hand.gravity * np.array(self.world.robot.gravity)
             force = hand.tip_force + weight
         for k, (rods, picture) in enumerate(zip(self.world.rods, self._pictures, strict=True)):
-            self.canvas.show_all(picture.frame(rods, tip_force=force if k == 0 else None), f"rod{k}/")
-            if len(rods.state.tip_position) <= FINE:
-                for i, (path, tip) in enumerate(zip(self._trails[k], rods.state.tip_position + rods.place, strict=True)):
+            shown = picture.frame(rods, tip_force=force if k == 0 else None)
+            if self.trail:
+                for i, (path, tip) in enumerate(zip(self._trails[k], rods.state.tip_position + rods.place, strict=False)):
                     path.add(tip)
-                    self.canvas.show(f"trail{k}/{i}", path.instances(0.12 * self.radius, TRAIL) if self.trail else None)
+                    shown[f"trail {i}"] = path.instances(0.12 * self.radius, TRAIL)
+            self.canvas.show_all(shown, f"rod{k}/")
         poses = self.world.poses()
         self.canvas.move_bodies(poses)
         self._see_through(poses)
@@ -103,4 +104,6 @@ class Drawing:
         self.canvas.show("measured", ball(place, 0.6 * self.radius, MEASURED))
 
     def _new_trails(self) -> list[list[Trail]]:
-        return [[Trail(_TRAIL, 0.3 * self.radius) for _ in rods.state.tip_position[:FINE]] for rods in self.world.rods]
+        """Of each robot, where they are few."""
+        counts = [len(rods.state.tip_position) for rods in self.world.rods]
+        return [[Trail(_TRAIL, 0.6 * self.radius) for _ in range(n if n <= FINE else 0)] for n in counts]

@@ -9,7 +9,7 @@ import numpy as np
 from fastrod.robot import Robot
 from fastrod.types import Flags, Floats, Params
 from fastrod_viewer import palette
-from fastrod_viewer.chains import Nodes, Sampler, axes, strand_pieces, tangents
+from fastrod_viewer.chains import Nodes, Sampler, pieces
 from fastrod_viewer.options import Options
 from fastrod_viewer.palette import Colors, Range
 from fastrod_viewer.shapes import Instances, instances
@@ -51,7 +51,7 @@ class Spacers:
             color.append(palette.segment_color(k) if options.color_by == "segment" else palette.SEGMENT_END)
         self._scale = np.stack([width, width, thick], axis=1) * radius[segment, None]
         self._color = np.array(color, np.uint8)
-        self._sample = Sampler(len(radius), n_steps, np.array(segment), np.array(fraction))
+        self._sample = Sampler(n_steps, np.array(segment), np.array(fraction))
 
     def instances(self, rod: Nodes, bad: Flags) -> Instances:
         """(n_robots * n_discs) robot by robot, base first; of `bad` robots reddish."""
@@ -74,29 +74,22 @@ class Tendons:
         offset = params.offset[:, self.segment, self.tendon]
         if surface is not None:
             offset = offset * (surface[self.segment] / np.linalg.norm(offset, axis=-1))[..., None]
-        self._offset = offset[:, :, None, :]  # (1 or n_robots, n_crossings, 1, 2)
+        self._offset: Floats = np.ascontiguousarray(offset)  # (1 or n_robots, n_crossings, 2)
         self._radius = _WIRE * smallest_offset(params)
         self._small = SLACK * params.tension_scale[:, None]
         # the reduced model of the paper has no tensions: it knows of no slack
         self._unilateral = params.unilateral & (robot.segments[0].mode != "paper")
         ends = np.linspace(0.0, 1.0, n_pieces + 1)
         n = robot.n_segments
-        self._sample = Sampler(n, n_steps, np.repeat(np.arange(n), len(ends)), np.tile(ends, n))
-        self._shape = (n, len(ends))
+        self._sample = Sampler(n_steps, np.repeat(np.arange(n), len(ends)), np.tile(ends, n))
+        self._n_segments = n
 
     def instances(self, rod: Nodes, tension: Floats, ok: Flags, colors: Range | None) -> Instances:
         """(n_robots * n_crossings * n_pieces) of `tension` (n_robots, n_tendons) [N], coloured by it within a range, which grows with the
         tensions of robots that are `ok`, or None: by taut, slack and pushing. What is not known, nan, is taut."""
-        at = self._sample(rod)
-        n = len(tension)
-        turns = at.quaternion.reshape(n, *self._shape, 4)
-        d1, d2, d3 = (a[:, self.segment] for a in axes(turns))
-        points = at.position.reshape(n, *self._shape, 3)[:, self.segment]
-        points = points + self._offset[..., :1] * d1 + self._offset[..., 1:] * d2
-        strand = strand_pieces(points, turns[:, self.segment])
-        bend = d3[:, :, 1:] - d3[:, :, :-1]
+        strand = pieces(self._sample(rod), self._n_segments, self.segment, self._offset)
         # the arc over the chord, so that a chain is as long as its tendon
-        length = strand.length * (1.0 + np.einsum("...i,...i->...", bend, bend) / 24.0)
+        length = strand.length * (1.0 + strand.bend**2 / 24.0)
         slack = self._unilateral & (tension <= self._small)
         thick = np.where(slack, 0.6 * self._radius, self._radius)[:, self.tendon, None]
         thick = np.broadcast_to(thick, length.shape)
@@ -108,10 +101,3 @@ class Tendons:
             color = palette.diverging(known, colors.see(known[ok]))
         color = np.broadcast_to(color[:, self.tendon, None], (*length.shape, 3))
         return instances("wire", strand.centre, strand.quaternion, np.stack([thick, thick, length], axis=-1), color)
-
-
-def turn_between(quaternion: Floats) -> Floats:
-    """(..., n - 1) how far the tangent turns between neighbouring cross-sections (..., n, 4) [rad, small]."""
-    d3 = tangents(quaternion)
-    step = d3[..., 1:, :] - d3[..., :-1, :]
-    return np.asarray(np.sqrt(np.einsum("...i,...i->...", step, step)))

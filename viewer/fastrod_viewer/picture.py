@@ -14,8 +14,8 @@ from fastrod.state import State
 from fastrod.types import Flags, Floats
 from fastrod_viewer import palette
 from fastrod_viewer.arrows import arrows, frames
-from fastrod_viewer.chains import Nodes, Sampler, Samples, along, backbone_pieces, nodes
-from fastrod_viewer.fittings import Spacers, Tendons, smallest_offset, turn_between, warned
+from fastrod_viewer.chains import Nodes, Sampler, Samples, along, nodes, pieces
+from fastrod_viewer.fittings import Spacers, Tendons, smallest_offset, warned
 from fastrod_viewer.options import FINE, Options
 from fastrod_viewer.palette import Color, Colors, Range
 from fastrod_viewer.shapes import Instances, instances
@@ -71,7 +71,7 @@ class Picture:
         self.pieces = options.pieces_of(self.n_robots)
         """A segment."""
         ends, k = np.linspace(0.0, 1.0, self.pieces + 1), np.arange(self.n_segments)
-        self._sample = Sampler(self.n_segments, n_steps, np.repeat(k, len(ends)), np.tile(ends, len(k)))
+        self._sample = Sampler(n_steps, np.repeat(k, len(ends)), np.tile(ends, len(k)))
         few = bool(crossed.any()) and self.n_robots <= FINE
         by_tension = options.color_by == "tension"
         self._spacers = Spacers(params, self.body_radius, options, n_steps) if few and options.spacers and not skin else None
@@ -95,6 +95,7 @@ class Picture:
         self._reach = params.reach
         self._last = _at_rest(rods, params.length, n_steps)
         self._tension: Floats = np.zeros(state.tension.shape)
+        self._hidden: dict[tuple[int, Color], tuple[Instances, Instances]] = {}
 
     @property
     def tendons_drawn(self) -> bool:
@@ -137,11 +138,10 @@ class Picture:
     def _body(self, rod: Nodes, curvature: Floats, bad: Flags) -> dict[str, Instances]:
         at = self._sample(rod)
         shape = (self.n_robots, self.n_segments, self.pieces + 1)
-        points, turns = at.position.reshape(*shape, 3), at.quaternion.reshape(*shape, 4)
-        piece = backbone_pieces(points, turns)
+        piece = pieces(at, self.n_segments, np.arange(self.n_segments), np.zeros((1, self.n_segments, 2)))
         thick = np.broadcast_to(self.tube_radius[:, None], piece.length.shape)
         # as much longer as the outside of the bend is: no wedge opens between neighbours
-        length = piece.length + thick * turn_between(turns)
+        length = piece.length + thick * piece.bend
         color = self._plain
         if self.range is not None and self.options.color_by != "tension":
             value = self._bending(curvature, at).reshape(shape)
@@ -151,7 +151,7 @@ class Picture:
         end = np.full((self.n_robots, 3), self.tube_radius[-1])
         return {
             "body": instances("tube", piece.centre, piece.quaternion, np.stack([thick, thick, length], axis=-1), color),
-            "tip": instances("cap", points[:, -1, -1], turns[:, -1, -1], end, color[:, -1, -1]),
+            "tip": instances("cap", at.position[:, -1], at.quaternion[:, -1], end, color[:, -1, -1]),
         }
 
     def _bending(self, curvature: Floats, at: Samples) -> Floats:
@@ -178,11 +178,20 @@ class Picture:
 
     def _arrows(self, start: Floats, force: Floats, color: Color) -> tuple[Instances, Instances]:
         """Shafts and heads from `start` (n_robots, n, 3) of `force` (n_robots, n, 3) [N]; none where it is zero or not finite."""
+        if not force.any():
+            return self._no_arrows(start.size // 3, color)
         force = np.where(np.isfinite(force).all(-1, keepdims=True), force, 0.0)
         size = np.linalg.norm(force, axis=-1)
         length = _ARROW * self._reach[:, None] * size / (size + self._half_force[:, None])
         direction = force / np.maximum(size, 1e-30)[..., None]
         return arrows(start.reshape(-1, 3), direction.reshape(-1, 3), length.ravel(), 0.15 * float(self.body_radius.max()), color)
+
+    def _no_arrows(self, n: int, color: Color) -> tuple[Instances, Instances]:
+        """n of them that are not there, the same each time: nothing is sent again."""
+        if (n, color) not in self._hidden:
+            up = np.broadcast_to([0.0, 0.0, 1.0], (n, 3))
+            self._hidden[n, color] = arrows(np.zeros((n, 3)), up, np.zeros(n), 0.0, color)
+        return self._hidden[n, color]
 
     def _finite(self, state: State) -> tuple[_Pose, Flags]:
         """The last finite pose of each robot, and whose is not that of `state`."""

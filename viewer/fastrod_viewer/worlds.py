@@ -160,7 +160,7 @@ class FreeWorld(SimulatedWorld):
     endless = True
     duration = PERIOD
 
-    def __init__(self, robot: Robot, n_robots: int = 1, dt: float = 1.0 / 30.0, *, points_per_segment: int = 10) -> None:
+    def __init__(self, robot: Robot, n_robots: int = 1, dt: float = 1.0 / 30.0, *, points_per_segment: int = 6) -> None:
         """As for `Simulator`. Raises `InputError`, `RobotError`."""
         simulator = Simulator(robot, n_robots, dt, points_per_segment, threads=1 if n_robots == 1 else None)
         super().__init__(simulator, None, grid_places(n_robots, _APART * robot.length))

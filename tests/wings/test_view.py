@@ -1,0 +1,113 @@
+"""`fastrod view`: ports, hosts and names, right and wrong, without a browser."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from fastrod.cli import main
+from fastrod.errors import InputError, UnknownNameError
+from fastrod_viewer.app import DEMO_LOG, App, found
+from fastrod_viewer.playback import Playback
+from fastrod_viewer.server import free_port, is_loopback
+from fastrod_viewer.worlds import FreeWorld, SceneWorld
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["wal"], "no scene and no robot 'wal'; did you mean 'wall'?"),
+        (["nope.csv"], "log 'nope.csv' cannot be read: there is no such file."),
+        (["nope.toml"], "nope.toml"),
+        (["prototype", "--port", "99999"], "port is 99999; it must be between 1 and 65535"),
+        (["prototype", "--robots", "0"], "n_robots is 0; it must be a whole number, at least 1."),
+        (["wall", "--robots", "3"], "'wall' is a scene, which has its own robots"),
+        (["prototype", "--robot", "tdcr_a"], "--robot goes with a run log; 'prototype' is none."),
+        (["prototype", "--host", "192.0.2.1"], "host '192.0.2.1' is not an address of this machine"),
+    ],
+)
+def test_what_cannot_be_shown_is_one_sentence(words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["view", "--no-open", *words]) == 2
+    said = capsys.readouterr()
+    assert sentence in said.err
+    assert len(said.err.strip().splitlines()) == 1
+    assert said.out == ""
+
+
+def test_a_log_without_its_robot_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "mine.csv"
+    path.write_text("t,dl_1,tip_x,tip_y,tip_z\n0,0,0,0,0.07\n")
+    assert main(["view", "--no-open", str(path)]) == 2
+    assert "name its robot with --robot" in capsys.readouterr().err
+
+
+def test_a_port_in_use_names_a_free_one() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(InputError, match=f"port {port} is in use on 127.0.0.1; "):
+            free_port("127.0.0.1", port)
+    assert free_port("127.0.0.1", 0) == 0
+
+
+def test_loopback_is_told_from_the_rest() -> None:
+    assert [is_loopback(h) for h in ("127.0.0.1", "localhost", "::1", "0.0.0.0", "192.168.1.2", "robot.lab")] == [True] * 3 + [False] * 3
+
+
+def test_names_and_files_stand_for_what_they_are(tmp_path: Path) -> None:
+    assert isinstance(found("prototype"), FreeWorld)
+    assert isinstance(found("wall"), SceneWorld)
+    assert isinstance(found(DEMO_LOG), Playback)
+    many = found("prototype", n_robots=9)
+    assert isinstance(many, FreeWorld)
+    assert len(many.rods[0].state.ok) == 9
+    with pytest.raises(UnknownNameError, match="did you mean 'prototype'"):
+        found("prototyp")
+
+
+def test_what_was_shown_stays_where_another_cannot_be(tmp_path: Path) -> None:
+    with App(port=0, folder=tmp_path, say=lambda _: None) as app:
+        app.open("prototype")
+        before = app.page
+        with pytest.raises(UnknownNameError):
+            app.open("prototyp")
+        assert app.page is before
+
+
+def test_it_serves_this_machine_alone_and_ends_at_once() -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    words = [sys.executable, "-m", "fastrod.cli", "view", "prototype", "--no-open", "--port", str(port)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stderr is not None
+            assert process.stdout.readline().strip() == f"prototype: http://127.0.0.1:{port} (Ctrl+C ends it)"
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=5) as page:
+                assert b"<html" in page.read(2000).lower()
+            with socket.socket() as other:
+                other.settimeout(1.0)
+                assert other.connect_ex((_address(), port)) != 0
+            process.send_signal(signal.SIGINT)
+            began = time.monotonic()
+            assert process.wait(timeout=20) == 0
+            assert time.monotonic() - began < 15
+            assert "Traceback" not in process.stderr.read()
+        finally:
+            process.kill()
+
+
+def _address() -> str:
+    """Of this machine as others see it, or a loopback address that nobody serves."""
+    address = socket.gethostbyname(socket.gethostname())
+    return "127.0.0.2" if address.startswith("127.") else address
