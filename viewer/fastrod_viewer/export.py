@@ -32,7 +32,7 @@ _CSS = """
 .fr-facts { border-collapse: collapse; width: 100%; margin-top: 5px; }
 .fr-facts th { text-align: left; font-weight: 400; color: #5b6472; padding: 4px 12px 4px 0; vertical-align: top; min-width: 8.2em; }
 .fr-facts td { text-align: right; font-weight: 600; padding: 4px 0; font-variant-numeric: tabular-nums; vertical-align: top;
-  overflow-wrap: anywhere; }
+  white-space: nowrap; }
 .fr-facts tr + tr > * { border-top: 1px solid #e9ecf1; }
 .fr-note { margin: 8px 0 0; color: #5b6472; font-size: 12px; }
 .fr-plot { position: absolute; right: 12px; bottom: BOTTOM; left: 334px; max-width: 940px; margin: 0 auto; padding: 7px 14px;

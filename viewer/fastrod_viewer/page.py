@@ -99,7 +99,7 @@ def facts(rows: Sequence[tuple[str, str]], problem: str = "", *, news: str = "")
         for text, color in ((problem, "#b91c1c"), (news, "#1d4ed8"))
         if text
     )
-    style = "display:grid;grid-template-columns:max-content 1fr;gap:2px 12px;font-size:13px;padding:4px 9px"
+    style = "display:grid;grid-template-columns:fit-content(60%) 1fr;gap:2px 12px;font-size:13px;padding:4px 9px"
     return f'<div style="{style}">{cells}{warning}</div>'
 
 

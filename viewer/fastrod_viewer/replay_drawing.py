@@ -25,6 +25,7 @@ from fastrod_viewer.worlds import radii
 BOTH = "both"
 """In the place of a model's label: all of them, the last one in full."""
 _TRAIL = 120  # pieces
+_UPRIGHT = 0.7  # cosine of the base's tilt, beyond which a robot may hang below its base
 
 
 @final
@@ -40,10 +41,12 @@ class ReplayDrawing:
         self._rods = [self._first(k, track.robot, radius) for k, track in enumerate(playback.tracks)]
         self._pictures = [Picture(rods, Options(contacts=False, loads=False)) for rods in self._rods]
         self._trail = Trail(_TRAIL, 0.02 * robot.length)
-        self.sight = Sight(np.array([0.0, 0.0, 0.22 * robot.length]), 0.95 * robot.length)
-        """The robot in the upper part of the picture, above the plot."""
+        up = matrix_from_quaternion(playback.base_quaternion)[:, 2, 2].min() > _UPRIGHT
+        middle, size, floor = (0.22, 0.95, 0.0) if up else (-0.4, 1.5, -1.15)
+        self.sight = Sight(np.array([0.0, 0.0, middle * robot.length]), size * robot.length)
+        """The robot in the upper part of the picture, above the plot, and all around its base where that turns."""
         canvas.clear()
-        canvas.floor(1.5 * robot.length, 0.0, np.zeros(3))
+        canvas.floor(1.5 * robot.length, floor * robot.length, np.zeros(3))
 
     @property
     def legend(self) -> str:

@@ -249,7 +249,11 @@ class ReplayPage(Page):
         rows = [("Time", f"{self._time:.2f} s of {playback.duration:.1f} s")]
         if run := playback.run_at(frame):
             rows.append(("Run", run))
-        rows += [(f"Residual, {t.label}", f"{1e3 * t.residual[row]:.2f} mm (rms {1e3 * t.rms:.2f})") for t in playback.tracks]
+        names = ("Residual before", "Residual after") if playback.after is not None else ("Residual",)
+        rows += [
+            (name, f"{1e3 * track.residual[row]:.2f} mm, rms {1e3 * track.rms:.2f}")
+            for name, track in zip(names, playback.tracks, strict=True)
+        ]
         self.figures.content = facts(rows)
         self.plot.data = self._plotted(frame)
         if self._playing and now - self._scrubbed > _HELD:
