@@ -166,21 +166,9 @@ def _replay(arguments: argparse.Namespace) -> int:
 
 
 def _read(path: Path, given: Robot | None) -> tuple[RunLog, Robot]:
-    """A run log of the robot `given`, or a raw file of a measured set, which brings its own."""
-    from fastrod.runlog import read_log
-    from fastrod_scenes.measured import detect
+    from fastrod_scenes.measured import read
 
-    if adapter := detect(path):
-        log, robot = adapter(path)
-        if given is not None and given.n_tendons != robot.n_tendons:
-            raise InputError(
-                f"robot {given.name!r} has {given.n_tendons} tendons, the one of {path.name} has {robot.n_tendons}; "
-                "leave --robot out to take its own."
-            )
-        return log, given or robot
-    if given is None:
-        raise InputError(f"{path.name} is a run log and does not say whose; name its robot with --robot.")
-    return read_log(path, given), given
+    return read(path, given)
 
 
 def _identify(arguments: argparse.Namespace) -> int:

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fastrod.errors import LogError, nearest
+from fastrod.errors import InputError, LogError, nearest
 from fastrod.robot import Robot, Segment, Tendon
 from fastrod.robotfile import load_robot
-from fastrod.runlog import RunLog, Table, numbers, read_table
+from fastrod.runlog import RunLog, Table, numbers, read_log, read_table
 
 _UPSIDE_DOWN = (0.0, 1.0, 0.0, 0.0)
 """world_from_base of a robot that hangs: half a turn about x, so that z of the base points down."""
@@ -218,6 +218,26 @@ def detect(path: str | Path) -> Callable[[str | Path], tuple[RunLog, Robot]] | N
     except (OSError, UnicodeDecodeError):
         return None  # whoever reads the file says what is wrong with it
     return next((_ADAPTERS[name] for name, columns in _HEADERS.items() if header.issuperset(columns)), None)
+
+
+def read(path: str | Path, given: Robot | None) -> tuple[RunLog, Robot]:
+    """A run log of the robot `given`, or a raw file of a measured set, which brings its own, with that robot.
+
+    Raises `InputError` where a run log comes without its robot, or the robot given has other tendons than the set's; `LogError` as the
+    readers.
+    """
+    path = Path(path)
+    if adapter := detect(path):
+        log, robot = adapter(path)
+        if given is not None and given.n_tendons != robot.n_tendons:
+            raise InputError(
+                f"robot {given.name!r} has {given.n_tendons} tendons, the one of {path.name} has {robot.n_tendons}; "
+                "leave --robot out to take its own."
+            )
+        return log, given or robot
+    if given is None:
+        raise InputError(f"{path.name} is a run log and does not say whose; name its robot with --robot.")
+    return read_log(path, given), given
 
 
 def _table(path: str | Path, name: str) -> Table:

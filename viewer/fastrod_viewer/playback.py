@@ -15,9 +15,9 @@ from fastrod.errors import FastrodError, InputError, LogError
 from fastrod.identification.replay import replay
 from fastrod.robot import Robot
 from fastrod.robotfile import load_robot
-from fastrod.runlog import RunLog, read_log
+from fastrod.runlog import RunLog
 from fastrod.types import Flags, Floats, Ints
-from fastrod_scenes.measured import detect
+from fastrod_scenes.measured import detect, read
 
 FRAMES = 1500
 """Most rows of a log whose whole shape is kept."""
@@ -291,21 +291,13 @@ def _report(folder: Path, path: Path) -> _Found | None:
 
 def _read(path: Path, given: Robot | None, found: _Found | None) -> tuple[RunLog, Robot]:
     """The log at `path`, and the robot that an identification starts from."""
-    if adapter := detect(path):
-        log, own = adapter(path)
-        if given is not None and given.n_tendons != own.n_tendons:
-            raise InputError(
-                f"robot {given.name!r} has {given.n_tendons} tendons, the one of {path.name} has {own.n_tendons}; "
-                "leave --robot out to take its own."
-            )
-        return log, given or own
+    if detect(path):
+        return read(path, given)
     beside = path.parent / "identified.toml"
     robot = given or (None if found is None else found.robot) or (load_robot(beside) if path.is_file() and beside.is_file() else None)
-    if robot is None:
-        if not path.is_file():
-            raise LogError(f"log {str(path)!r} cannot be read: there is no such file.")
-        raise InputError(f"{path.name} is a run log and does not say whose; name its robot with --robot.")
-    return read_log(path, robot), robot
+    if robot is None and not path.is_file():
+        raise LogError(f"log {str(path)!r} cannot be read: there is no such file.")
+    return read(path, robot)
 
 
 def _samples(log: RunLog) -> Any:
