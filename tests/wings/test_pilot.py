@@ -16,6 +16,7 @@ from fastrod_viewer.knobs import drive_knobs, largest_force, load_knobs, nice
 from fastrod_viewer.pilot import LARGEST_BEND, Pilot, Speeds
 from fastrod_viewer.record import Recorder
 from fastrod_viewer.session import Session, measure
+from fastrod_viewer.world import Hand
 from fastrod_viewer.worlds import FreeWorld
 
 DT = 1.0 / 30.0
@@ -153,6 +154,31 @@ def test_a_session_moves_in_real_time_and_stops_at_once() -> None:
     assert until(lambda: pilot.arrived)
     session.close()
     assert len(drawn) > 5
+
+
+def test_what_cannot_be_done_is_said_and_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A world that refuses bends beyond 0.5 rad: the robot stands before them, and the session goes on."""
+    world, pilot = piloted("prototype")
+    drive = FreeWorld.drive
+
+    def refuse(self: FreeWorld, hand: Hand) -> None:
+        if hand.tendon_length[0] < 0.07 - 0.5 * 0.0075:
+            raise InputError("robot 0 cannot be brought there: a wall.")
+        drive(self, hand)
+
+    monkeypatch.setattr(FreeWorld, "drive", refuse)
+    problems: list[str] = []
+    session = Session(world, pilot, draw=lambda frame: problems.append(frame.problem))
+    session.start()
+    pilot.bend(0, 1.0, 0.0)
+    session.touch()
+    assert until(lambda: "robot 0 cannot be brought there: a wall." in problems)
+    assert until(lambda: pilot.arrived)
+    assert pilot.bent(0)[0] < 0.5
+    pilot.all_zero()
+    session.touch()
+    assert until(lambda: bool(np.linalg.norm(world.rods[0].state.tip_position[0] - [0.0, 0.0, 0.07]) < 1e-6))
+    session.close()
 
 
 def test_a_paused_session_steps_one_picture_at_a_time() -> None:

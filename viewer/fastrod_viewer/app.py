@@ -76,8 +76,8 @@ class App:
     def open(self, what: str | Path | World | Robot | Playback, *, link: RobotLink | None = None, script: bool = False) -> None:
         """Show a scene or robot by name or file, a world, a robot, or a log with what models say to it. With a `link`, hands drive that
         robot, and the world is its model. What was shown before stays where this cannot be: raises `FastrodError`."""
-        new = found(what)
         with self._lock:
+            new = self._found(what)
             if self.page is not None:
                 self.page.close()
                 self.page = None
@@ -111,6 +111,17 @@ class App:
                 self.page = None
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
+
+    def _found(self, what: str | Path | World | Robot | Playback) -> World | Playback:
+        page = self.page
+        if page is not None:
+            page.rest(True)
+        try:
+            return found(what)
+        except FastrodError:
+            if page is not None:
+                page.rest(False)
+            raise
 
     def _show_picker(self, current: str) -> None:
         names = [*self._known, DEMO_LOG]

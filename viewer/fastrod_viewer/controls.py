@@ -73,13 +73,13 @@ class Controls:
         for group in [group for group in groups if group.title and not group.title.startswith("Segment")]:
             self._add(group)
         if world.robot.n_tendons:
-            speed = gui.add_slider("Speed [°/s]", 5, 360, 5, 180, hint="Largest rate at which a segment bends; wires and base in step.")
+            now = max(5, round(math.degrees(self.pilot.speeds.bend)))
+            speed = gui.add_slider("Speed [°/s]", 5, 360, 5, now, hint="Largest rate at which a segment bends; wires and base in step.")
             self._listen(speed, self._set_speed, take_over=False)
 
     def _set_speed(self, degrees: float) -> None:
-        part = degrees / 180.0
         usual = Speeds()
-        self.pilot.speeds = Speeds(bend=usual.bend * part, extension=usual.extension * part, base=usual.base * part)
+        self.pilot.speeds = usual.times(math.radians(degrees) / usual.bend)
 
     def _loads(self) -> None:
         if not self.session.world.loads or self.session.link is not None:

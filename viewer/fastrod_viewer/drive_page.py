@@ -19,7 +19,7 @@ from fastrod_viewer.export import wrap
 from fastrod_viewer.grip import Grip
 from fastrod_viewer.options import FINE, Options
 from fastrod_viewer.page import Page, Sight, facts, picture, save_name, send, stand_back, tell
-from fastrod_viewer.pilot import Pilot
+from fastrod_viewer.pilot import Pilot, Speeds
 from fastrod_viewer.record import Recorder, free_path
 from fastrod_viewer.session import Frame, Session
 from fastrod_viewer.world import World
@@ -27,6 +27,7 @@ from fastrod_viewer.world import World
 if TYPE_CHECKING:
     import viser
 
+_GENTLE = 1.0 / 6.0  # of the usual speeds, among obstacles
 _TOLD = 0.2  # s between two changes of figures and sliders
 _WIDE = 320  # pixels of the window for a camera in hand
 _LOOKS = 0.15  # s between two pictures of a camera in hand
@@ -48,8 +49,8 @@ class DrivePage(Page):
         """`folder` takes recordings; `replay` shows one; `echo` is the time that pages take to draw [s]."""
         self.server, self.world, self.title = server, world, world.name
         self._folder, self._replay, self._echo = folder, replay, echo
-        self.pilot = Pilot(world)
         touches = world.rods[0].state.contacts is not None
+        self.pilot = Pilot(world, Speeds().times(_GENTLE) if touches else None)
         many = len(world.rods[0].state.ok) > FINE
         self.drawing = Drawing(canvas, world, Options(body="skin" if touches or many else "backbone"))
         self.sight = Sight(self.drawing.middle, self.drawing.size)
@@ -78,6 +79,9 @@ class DrivePage(Page):
         if self.camera is not None:
             self.camera[0].remove()
         self.drawing.canvas.clear()
+
+    def rest(self, on: bool) -> None:
+        self.session.paused = on
 
     def tick(self) -> None:
         if self.session.waiting > _LONG:

@@ -40,6 +40,10 @@ class Page(ABC):
         """A client is gone, `left` remain."""
 
     @abstractmethod
+    def rest(self, on: bool) -> None:
+        """Compute nothing while another page is being made, or go on after all."""
+
+    @abstractmethod
     def tick(self) -> None:
         """Called every second."""
 

@@ -41,6 +41,10 @@ class Speeds:
             if not (isinstance(value, (int, float)) and math.isfinite(value) and value > 0.0):
                 raise InputError(f"Speeds.{name} is {value!r}; it must be positive and finite.")
 
+    def times(self, factor: float) -> Speeds:
+        """All of them, so many times as large."""
+        return Speeds(bend=self.bend * factor, extension=self.extension * factor, base=self.base * factor)
+
 
 @dataclass(frozen=True, eq=False)
 class Goals:
@@ -88,7 +92,7 @@ class Pilot:
     def reset(self) -> None:
         """Everything at rest, no loads, nothing dragged; the speeds stay."""
         with self._lock:
-            self._goals, self._now = self._zero, self._zero
+            self._goals, self._now, self._before = self._zero, self._zero, self._zero
             self._pull: Floats | None = None
             self._tip_force, self._payload, self._gravity = np.zeros(3), 0.0, 1.0
             self._freeze = False
@@ -206,6 +210,12 @@ class Pilot:
         with self._lock:
             self._goals, self._pull = self._now, None
 
+    def retreat(self) -> None:
+        """The last step could not be done: stand where it began, and want nothing more."""
+        with self._lock:
+            self._goals = self._now = self._before
+            self._pull = None
+
     def adopt(self, change: Floats, extension: Floats) -> None:
         """Take over a robot as it stands: changes of tendon length (n_tendons,) and of segment length (n_segments,) [m]."""
         with self._lock:
@@ -215,7 +225,7 @@ class Pilot:
                 action = np.clip(taken, self._lower, self._upper)
                 rest -= self.actions.matrix[: len(rest)] @ action
             rest[np.abs(rest) < _NOTHING] = 0.0
-            self._goals = self._now = _with(self._now, action=action, wire=rest)
+            self._goals = self._now = self._before = _with(self._now, action=action, wire=rest)
             self._pull = None
 
     def all_zero(self) -> None:
@@ -238,7 +248,7 @@ class Pilot:
             base = np.concatenate([
                 _toward(now.base[:3], goals.base[:3], speeds.base * dt), _toward(now.base[3:], goals.base[3:], 5.0 * speeds.base * dt)
             ])  # fmt: skip
-            self._now = Goals(action, wire, tension, base)
+            self._before, self._now = now, Goals(action, wire, tension, base)
             extension = np.zeros(self.robot.n_segments) if self.actions is None else action[::3]
             return Hand(
                 tendon_length=self.robot.rest_tendon_length + self._change(self._now), extension=extension, tension=tension, base=base,

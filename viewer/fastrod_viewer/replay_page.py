@@ -57,6 +57,9 @@ class ReplayPage(Page):
         with self._lock:
             self._clear()
 
+    def rest(self, on: bool) -> None:
+        """It computes next to nothing."""
+
     def tick(self) -> None:
         """Nothing to do."""
 

@@ -23,6 +23,7 @@ RATE = 30.0
 """Pictures a second."""
 _BEHIND = 0.25  # s: a world that falls farther behind runs slower than real time
 _REST = 12  # pictures after the last motion, in which an observer comes to rest
+_SAID = 4.0  # s for which a problem stays on the page
 _QUICKEST = 0.008  # s between two pictures, when hands are quick
 
 
@@ -66,7 +67,7 @@ class Session:
         self._since: float | None = None
         self._asked = 0.0
         self._hand: Hand | None = None
-        self._problem = ""
+        self._problem, self._said = "", 0.0
         self._pace = 1.0
         self._last = time.perf_counter(), world.t
         self._since_step: float | None = None
@@ -184,7 +185,7 @@ class Session:
                 did = self._do_jobs()
                 moves = self._moves()
                 due = self._advance(max(due, began - _BEHIND), began, at_once=since is not None) if moves else began
-                if moves or did or since is not None:
+                if (moves or did or since is not None) and not self._closed.is_set():
                     self._show(since)
                 left = 1.0 / RATE - (time.perf_counter() - began)
                 if self._wake.wait(max(left, 0.001)):
@@ -239,7 +240,9 @@ class Session:
             try:
                 self._one(dt)
             except FastrodError as error:
-                self._problem = str(error)
+                self._problem, self._said = str(error), time.perf_counter()
+                if not self._scripted:
+                    self.pilot.retreat()
                 due = began
                 break
             if time.perf_counter() - began > _BEHIND:
@@ -269,7 +272,8 @@ class Session:
             if self.link is not None:
                 self.link.command(hand.tendon_length - self.world.robot.rest_tendon_length, hand.extension)
             self.world.drive(hand)
-        self._problem = self.pilot.problem
+        if time.perf_counter() - self._said > _SAID:
+            self._problem = self.pilot.problem
         if self.recorder is not None and self.recorder.recording:
             self._record(self.recorder)
 
