@@ -175,7 +175,7 @@ class App:
         if page is not None:
             page.lost(client, left)
         if left == 0:
-            self.say("The last page was closed; nothing is commanded until one is open.")
+            self.say("No page is open, or none answers; nothing is commanded until one does.")
 
 
 DEMO_LOG = "measured log (demo)"

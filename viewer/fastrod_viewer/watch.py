@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     import viser
 
 _EVERY = 1.0  # s
-_PATIENCE = 2.0  # s without an answer: the page is lost, though its connection may still stand
+_PATIENCE = 3.0  # s without an answer: the page is lost, though its connection may still stand
 _KEY = "fastrod-echo"
 
 
@@ -19,7 +19,7 @@ _KEY = "fastrod-echo"
 class Watch:
     """Asks every page for an answer every second, and tells who came and went, `lost(client, clients left)` for the latter.
 
-    A page that does not answer within two seconds counts as gone until it answers again.
+    A page that does not answer within three seconds counts as gone until it answers again.
     """
 
     def __init__(self, server: viser.ViserServer, *, lost: Callable[[int, int], None], tick: Callable[[], None] = lambda: None) -> None:
