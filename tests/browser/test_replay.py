@@ -69,7 +69,7 @@ def test_a_session_is_recorded_read_back_and_replayed(app: App, window: Windows,
     seen.page.get_by_role("button", name="Record a run log").click()
     assert seen.until(lambda: page.session.recorder is not None)
     for _ in range(6):
-        seen.page.keyboard.press("d")
+        seen.page.keyboard.press("l")
         seen.page.wait_for_timeout(150)
     seen.page.get_by_role("button", name="Stop and save").click()
     path = tmp_path / "prototype-session.csv"

@@ -124,7 +124,8 @@ class Controls:
         self._key("Reset", "R", session.reset)
         if self.pilot.actions is None or not session.world.by_hand:
             return
-        for name, key, axis, sign in (("+x", "D", 0, 1), ("-x", "A", 0, -1), ("+y", "W", 1, 1), ("-y", "S", 1, -1)):
+        # not A, D, W, S, nor arrows: with these viser flies the camera
+        for name, key, axis, sign in (("+x", "L", 0, 1), ("-x", "J", 0, -1), ("+y", "I", 1, 1), ("-y", "K", 1, -1)):
             self._key(f"Bend toward {name}", key, lambda axis=axis, sign=sign: self._bend(axis, sign))  # type: ignore[misc]
         for k in range(min(session.world.robot.n_segments, 9)):
             self._key(f"Keys bend segment {k + 1}", str(k + 1), lambda k=k: setattr(self, "chosen", k))  # type: ignore[misc]

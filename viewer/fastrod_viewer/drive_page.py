@@ -138,7 +138,7 @@ class DrivePage(Page):
     def _keys(self) -> str:
         keys = "<kbd>Space</kbd> pause · <kbd>Esc</kbd> stop · <kbd>R</kbd> reset"
         if self._can_drag():
-            keys = "<kbd>A</kbd> <kbd>D</kbd> <kbd>W</kbd> <kbd>S</kbd> bend · " + keys
+            keys = "<kbd>J</kbd> <kbd>L</kbd> <kbd>I</kbd> <kbd>K</kbd> bend · " + keys
             if (n := min(self.world.robot.n_segments, 9)) > 1:
                 keys += f" · <kbd>1</kbd>–<kbd>{n}</kbd> segment that keys bend"
         return f"<small>{keys}</small>"
