@@ -27,7 +27,7 @@ def piloted(name: str = "five_segment_reacher") -> tuple[FreeWorld, Pilot]:
     return world, Pilot(world)
 
 
-def until(holds: Callable[[], bool], seconds: float = 10.0) -> bool:
+def until(holds: Callable[[], bool], seconds: float = 30.0) -> bool:
     end = time.monotonic() + seconds
     while not holds() and time.monotonic() < end:
         time.sleep(0.01)
