@@ -243,7 +243,7 @@ def _view(arguments: argparse.Namespace) -> int:
     from fastrod_viewer.app import FIRST, view
 
     view(
-        arguments.what or FIRST, robot=arguments.robot, n_robots=arguments.robots, host=arguments.host,
+        FIRST if arguments.what is None else arguments.what, robot=arguments.robot, n_robots=arguments.robots, host=arguments.host,
         open_browser=not arguments.no_open, script=arguments.play, server=server,
     )  # fmt: skip
     return DONE

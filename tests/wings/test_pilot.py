@@ -118,7 +118,7 @@ def test_every_knob_reads_what_it_was_put_to(name: str) -> None:
         wanted = knob.low + 0.7 * (knob.high - knob.low)
         knob.put(wanted)
         assert knob.get() == pytest.approx(wanted, abs=1e-9), knob.label
-        assert abs(knob.value - wanted) <= 0.11 * knob.step
+        assert abs(knob.value - wanted) <= 0.11 * knob.step or (knob.value == 0.0 and abs(wanted) < 0.5 * knob.step)
         pilot.reset()
 
 
@@ -214,6 +214,58 @@ def test_a_real_robot_stops_when_nobody_watches_and_a_simulated_one_holds() -> N
         assert link.stopped is real
         session.close()
         assert link.stopped
+
+
+def test_a_linked_robot_is_taken_over_where_it_stands_and_never_jumps() -> None:
+    robot = fastrod.load_robot("prototype")
+    link = SimulatedRobot(robot, real=True)
+    link.command([-0.006, 0.0, 0.006, 0.0])
+    told: list[np.ndarray] = []
+    command = link.command
+
+    class Heard:
+        """The link, and what it is told."""
+
+        robot, real = link.robot, link.real
+        read, stop, release, close = link.read, link.stop, link.release, link.close
+
+        def command(self, dl: np.ndarray, ext: np.ndarray | None = None) -> None:
+            told.append(np.array(dl))
+            command(dl, ext)
+
+    world = FreeWorld(robot)
+    pilot = Pilot(world, Speeds(bend=0.5))
+    session = Session(world, pilot, draw=lambda frame: None, link=Heard())
+    session.start()
+    assert until(lambda: len(told) > 3)
+    np.testing.assert_allclose(told[0], [-0.006, 0.0, 0.006, 0.0], atol=1e-9)
+    session.reset()
+    assert until(lambda: bool(np.abs(told[-1]).max() < 1e-9))
+    session.stop()
+    session.release()
+    time.sleep(0.2)
+    session.close()
+    steps = np.abs(np.diff(told, axis=0)).max()
+    assert steps <= 0.5 * 0.0075 * DT * 1.001
+
+
+def test_a_reset_while_recording_begins_another_run() -> None:
+    world, pilot = piloted("prototype")
+    session = Session(world, pilot, draw=lambda frame: None, script=True)
+    recorder = Recorder(world.robot)
+    recorder.start(0.0, "by script")
+    session.recorder = recorder
+    session.start()
+    assert until(lambda: len(recorder) > 20)
+    session.reset()
+    n = len(recorder)
+    assert until(lambda: len(recorder) > n + 20)
+    session.recorder = None
+    session.close()
+    log = recorder.stop()
+    assert log.runs == ["by script", "again 1"]
+    for run in log.runs:
+        assert (np.diff(log.only(run).t) >= 0.0).all()
 
 
 def test_a_measured_robot_that_differs_shows_its_residual() -> None:

@@ -15,6 +15,8 @@ import pytest
 
 from fastrod.cli import main
 from fastrod.errors import InputError, UnknownNameError
+from fastrod.robotfile import load_robot
+from fastrod.simulated import SimulatedRobot
 from fastrod_viewer.app import DEMO_LOG, App, found
 from fastrod_viewer.playback import Playback
 from fastrod_viewer.server import free_port, is_loopback
@@ -28,6 +30,8 @@ from fastrod_viewer.worlds import FreeWorld, SceneWorld
         (["nope.csv"], "log 'nope.csv' cannot be read: there is no such file."),
         (["nope.toml"], "nope.toml"),
         (["prototype", "--port", "99999"], "port is 99999; it must be between 1 and 65535"),
+        ([""], "no scene and no robot ''"),
+        (["prototype", "--robots", "100000"], "n_robots is 100000; a browser draws up to 1024."),
         (["prototype", "--robots", "0"], "n_robots is 0; it must be a whole number, at least 1."),
         (["wall", "--robots", "3"], "'wall' is a scene, which has its own robots"),
         (["prototype", "--robot", "tdcr_a"], "--robot goes with a run log; 'prototype' is none."),
@@ -83,7 +87,16 @@ def test_what_was_shown_stays_where_another_cannot_be(tmp_path: Path) -> None:
         assert app.page is before
 
 
-def test_it_serves_this_machine_alone_and_ends_at_once() -> None:
+def test_a_link_goes_with_its_own_model(tmp_path: Path) -> None:
+    with (
+        App(port=0, folder=tmp_path, say=lambda _: None) as app,
+        pytest.raises(InputError, match="the link's robot 'prototype' has 1 segments"),
+    ):
+        app.open(FreeWorld(load_robot("tdcr_a")), link=SimulatedRobot(load_robot("prototype")))
+
+
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
+def test_it_serves_this_machine_alone_and_ends_at_once(end: signal.Signals) -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -98,7 +111,7 @@ def test_it_serves_this_machine_alone_and_ends_at_once() -> None:
             with socket.socket() as other:
                 other.settimeout(1.0)
                 assert other.connect_ex((_address(), port)) != 0
-            process.send_signal(signal.SIGINT)
+            process.send_signal(end)
             began = time.monotonic()
             assert process.wait(timeout=20) == 0
             assert time.monotonic() - began < 15

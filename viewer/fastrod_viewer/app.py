@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import signal
 import sys
 import threading
 from collections.abc import Callable
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 
 FIRST = "five_segment_reacher"
 """What is shown where nothing is named."""
+MOST = 1024
+"""Robots in a grid."""
 _BRAND = (37, 99, 235)
 
 
@@ -78,6 +81,7 @@ class App:
         robot, and the world is its model. What was shown before stays where this cannot be: raises `FastrodError`."""
         with self._lock:
             new = self._found(what)
+            _check_link(new, link)
             if self.page is not None:
                 self.page.close()
                 self.page = None
@@ -96,6 +100,7 @@ class App:
                     script=script,
                 )
             self._show_picker(str(what) if isinstance(what, str) and not is_log(what) else self.page.title)
+            self._picker.disabled = link is not None  # another scene would let go of the robot
 
     def wait(self) -> None:
         """Until Ctrl+C."""
@@ -187,6 +192,8 @@ def found(what: str | Path | World | Robot | Playback, robot: str | Path | None 
     stand in a grid. Raises `FastrodError`, one sentence, where there is none."""
     if isinstance(what, (World, Playback)):
         return what
+    if n_robots > MOST:
+        raise InputError(f"n_robots is {n_robots}; a browser draws up to {MOST}.")
     if n_robots != 1:
         if not isinstance(what, Robot) and str(what) in names():
             raise InputError(f"{str(what)!r} is a scene, which has its own robots; several in a grid can be had of a robot.")
@@ -198,6 +205,19 @@ def found(what: str | Path | World | Robot | Playback, robot: str | Path | None 
     if robot is not None:
         raise InputError(f"--robot goes with a run log; {str(what)!r} is none.")
     return open_world(what)
+
+
+def _check_link(shown: World | Playback, link: RobotLink | None) -> None:
+    if link is None:
+        return
+    if isinstance(shown, Playback):
+        raise InputError("a robot link goes with a world, which is its model; a log has none.")
+    ours, theirs = shown.robot, link.robot
+    if (ours.n_tendons, ours.n_segments) != (theirs.n_tendons, theirs.n_segments):
+        raise InputError(
+            f"the link's robot {theirs.name!r} has {theirs.n_segments} segments and {theirs.n_tendons} tendons, its model {ours.name!r} "
+            f"{ours.n_segments} and {ours.n_tendons}; give the model of the robot that is driven."
+        )
 
 
 def demo_log() -> Playback:
@@ -221,8 +241,11 @@ def view(
 ) -> None:  # fmt: skip
     """Show something in the browser until Ctrl+C: a scene or robot by name, a robot's file, a log with what models say to it.
 
-    `server` is one that `serve` has started on that host. Raises `FastrodError`, one sentence, for what cannot be shown.
+    `server` is one that `serve` has started on that host. SIGTERM ends it as Ctrl+C does: robots are stopped, recordings saved. Raises
+    `FastrodError`, one sentence, for what cannot be shown.
     """
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
     with App(host=host, port=port, server=server) as app:
         shown = found(what, robot, n_robots)
         if open_browser:

@@ -64,12 +64,14 @@ class DrivePage(Page):
         self._told = self._looked = 0.0
         self._last: RunLog | None = None
         self._path = folder
+        self._closing = False
         self._build()
         stand_back(server, self.sight)
         self._draw(Frame(world, None, None, float("nan"), 1.0, ""))
         self.session.start()
 
     def close(self) -> None:
+        self._closing = True
         self.session.close()
         self.controls.close()
         if self.grip is not None:
@@ -218,6 +220,8 @@ class DrivePage(Page):
 
     def _draw(self, frame: Frame) -> None:
         """In the session's thread."""
+        if self._closing:
+            return
         began = time.perf_counter()
         with self.server.atomic():
             self.drawing.draw(frame)

@@ -33,9 +33,10 @@ class Knob:
 
     @property
     def value(self) -> float:
-        """Where it stands, rounded to a tenth of a step, within its ends."""
+        """Where it stands, rounded to a tenth of a step, and to 0 within half a step of it, within its ends."""
         digits = max(0, 1 - math.floor(math.log10(self.step)))
-        return min(max(round(self.get(), digits) + 0.0, self.low), self.high)
+        value = self.get()
+        return min(max(round(value, digits) if abs(value) >= 0.5 * self.step else 0.0, self.low), self.high)
 
 
 @dataclass(frozen=True, eq=False)

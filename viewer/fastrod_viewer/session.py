@@ -68,6 +68,7 @@ class Session:
         self._asked = 0.0
         self._hand: Hand | None = None
         self._problem, self._said = "", 0.0
+        self._recorded, self._restarts = -np.inf, 0
         self._pace = 1.0
         self._last = time.perf_counter(), world.t
         self._since_step: float | None = None
@@ -142,6 +143,7 @@ class Session:
         """Take commands again, from where the robot stands."""
         self.pilot.hold()
         if self.link is not None:
+            self._adopt()
             self.link.release()
         self._stopped = False
         self.touch()
@@ -160,9 +162,12 @@ class Session:
         self.touch()
 
     def reset(self) -> None:
-        """World and controls back to the beginning."""
+        """World and controls back to the beginning; a robot at the other end of a link goes there, straight, no faster than it may."""
 
         def job() -> None:
+            if self.link is not None:
+                self.pilot.all_zero()
+                return
             self.pilot.reset()
             self.world.reset()
             self._adopt()
@@ -171,9 +176,10 @@ class Session:
         self.ask(job)
 
     def _adopt(self) -> None:
-        """The controls stand where the robot is."""
-        now = measure(self.world, None)
-        self.pilot.adopt(now.dl, now.ext)
+        """The controls stand where the robot is: that at the other end of the link, where there is one."""
+        now = measure(self.world, None) if self.link is None else self.link.read()
+        if np.isfinite(now.dl).all():
+            self.pilot.adopt(now.dl, np.nan_to_num(now.ext))
 
     def _run(self) -> None:
         due = time.perf_counter()
@@ -274,12 +280,18 @@ class Session:
             self.world.drive(hand)
         if time.perf_counter() - self._said > _SAID:
             self._problem = self.pilot.problem
-        if self.recorder is not None and self.recorder.recording:
+        if self.recorder is None:
+            self._recorded = -np.inf
+        elif self.recorder.recording:
             self._record(self.recorder)
 
     def _record(self, recorder: Recorder) -> None:
         hand = self._hand
         measurement = self.link.read() if self.link is not None else measure(self.world, hand)
+        if measurement.t < self._recorded:  # a reset, or a script that begins again
+            self._restarts += 1
+            recorder.start(measurement.t, f"again {self._restarts}")
+        self._recorded = measurement.t
         if hand is None:
             recorder.add(measurement)
             return

@@ -96,7 +96,7 @@ class SimulatedWorld(World):
             self.reset()
             return
         self._clock = clock % self.duration if self.endless else clock  # beyond a step that fails the script goes on
-        self._advance(self.inputs(self._clock))
+        self._advance(self.inputs(self._clock), part_way=True)
 
     @final
     def drive(self, hand: Hand) -> None:
@@ -136,18 +136,20 @@ class SimulatedWorld(World):
         """These inputs have been simulated; after a reset they are the first."""
 
     @final
-    def _advance(self, given: dict[str, Any]) -> None:
+    def _advance(self, given: dict[str, Any], *, part_way: bool = False) -> None:
+        """Simulate these inputs; a step that cannot be done is as if it had not been, or with `part_way`, among obstacles, done as far as
+        it could be: a script goes on from there."""
         before = self.simulator.snapshot()
         state = self.simulator.step(**given)
         if not state.ok.all() and not self._touches:
             state = self.simulator.settle(**given)
-        part_way = self._touches and not state.ok.all() and _finite(state)
-        if not _finite(state) or not (state.ok.all() or part_way):
-            self.simulator.restore(before)
-        else:
+        done = bool(state.ok.all()) and _finite(state)
+        if done or (part_way and self._touches and _finite(state)):
             self._state, self._given = state, given
             self._t = self._t + self.dt
-        if not (state.ok.all() and _finite(state)):
+        else:
+            self.simulator.restore(before)
+        if not done:
             robot, problem = next(iter(state.problems.items()), (0, "its shape is not finite."))
             raise InputError(f"robot {robot} cannot be brought there: {problem}")
         self.arrived(given)
