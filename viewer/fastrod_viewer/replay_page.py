@@ -79,11 +79,15 @@ class ReplayPage(Page):
             self._draw(int(frames[0]))
             serializer = self.server.get_scene_serializer()
             for frame in frames:
+                self.drawing.forget()  # between frames far apart a trail is a zigzag
                 self._draw(int(frame))
                 serializer.insert_sleep(pause)
             html = serializer.as_html()
             self.frame = -1
         rows = [("samples", str(len(playback.log))), *((track.label, f"{1e3 * track.rms:.3f} mm rms") for track in playback.tracks)]
+        faster = playback.duration / max(pause * (len(frames) - 1), 1e-9)
+        if faster > 1.1:
+            rows.append(("shown", f"{faster:.1f} times as fast"))
         found = playback.findings
         if found is not None:
             rows.append(("verdict", found.verdict.replace("_", " ")))
@@ -148,7 +152,7 @@ class ReplayPage(Page):
         self._curves = curves(playback)
         with below.add_tab("Residual [mm]"):
             self.plot: Any = self._add_plot()
-        below.float(x=15, y=-15, width=900)
+        below.float(x=15, y=-15, width=760)
         key = gui.add_command("Play, or pause", hotkey="space")
         key.on_trigger(lambda _: self._toggle())
         self._made = [panel, aside, below, key]
