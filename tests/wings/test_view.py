@@ -101,7 +101,13 @@ def test_it_serves_this_machine_alone_and_ends_at_once(end: signal.Signals) -> N
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     words = [sys.executable, "-m", "fastrod.cli", "view", "prototype", "--no-open", "--port", str(port)]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ) as process:
+
+    def heed() -> None:
+        """Background jobs of a shell ignore SIGINT; this one does not."""
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+    pipe = subprocess.PIPE
+    with subprocess.Popen(words, stdout=pipe, stderr=pipe, text=True, env=os.environ, preexec_fn=heed) as process:
         try:
             assert process.stdout is not None
             assert process.stderr is not None
