@@ -30,7 +30,6 @@ def test_the_time_slider_moves_the_robot_and_the_figures(app: App, window: Windo
     app.open(DEMO_LOG)
     seen = window(app.address)
     page = replayed(app)
-    before = seen.pixels()
     seen.page.get_by_role("button", name="Pause").click()
     thumb = seen.slider("Time [s]")
     thumb.focus()
@@ -39,10 +38,17 @@ def test_the_time_slider_moves_the_robot_and_the_figures(app: App, window: Windo
     row = page.playback.frames[-1]
     shown = f"{1e3 * page.playback.before.residual[row]:.2f} mm"
     assert seen.until(lambda: seen.page.get_by_text(shown).count() > 0)
-    seen.page.wait_for_timeout(500)
-    assert (np.abs(seen.pixels().astype(int) - before)[:500, 340:].max(axis=2) > 40).sum() > 200  # tip, arrow and figure at least
+    right = thumb.bounding_box()
     thumb.press("Home")
     assert seen.until(lambda: page.frame == 0)
+    seen.page.wait_for_timeout(500)
+    before, left = seen.pixels(), thumb.bounding_box()
+    turned = float(page.playback.frame_time[np.argmin(np.abs(page.playback.base_quaternion[:, 0] - np.sqrt(0.5)))])
+    part = (turned + 5.0) / page.playback.duration  # the base lies on its side there
+    seen.page.mouse.click(left["x"] + 0.5 * left["width"] + part * (right["x"] - left["x"]), left["y"] + 0.5 * left["height"])
+    assert seen.until(lambda: abs(page.playback.frame_time[page.frame] - turned) < 10.0)
+    seen.page.wait_for_timeout(500)
+    assert (np.abs(seen.pixels().astype(int) - before)[:500, 340:].max(axis=2) > 40).sum() > 1000
     assert seen.errors == []
 
 

@@ -118,7 +118,7 @@ def test_every_knob_reads_what_it_was_put_to(name: str) -> None:
         wanted = knob.low + 0.7 * (knob.high - knob.low)
         knob.put(wanted)
         assert knob.get() == pytest.approx(wanted, abs=1e-9), knob.label
-        assert abs(knob.value - wanted) <= 0.11 * knob.step or (knob.value == 0.0 and abs(wanted) < 0.5 * knob.step)
+        assert abs(knob.value - wanted) <= 0.11 * knob.step
         pilot.reset()
 
 

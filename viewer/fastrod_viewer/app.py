@@ -90,14 +90,7 @@ class App:
             else:
                 script = script or not isinstance(new, FreeWorld)
                 self.page = DrivePage(
-                    self.server,
-                    self.canvas,
-                    new,
-                    folder=self.folder,
-                    replay=self._replay,
-                    echo=lambda: self.watch.echo,
-                    link=link,
-                    script=script,
+                    self.server, self.canvas, new, folder=self.folder, replay=self._replay, echo=self._echo, link=link, script=script
                 )
             self._show_picker(str(what) if isinstance(what, str) and not is_log(what) else self.page.title)
             self._picker.disabled = link is not None  # another scene would let go of the robot
@@ -169,6 +162,9 @@ class App:
     def _came(self, client: Any) -> None:
         if self.page is not None and is_upright(client):
             self.page.sight.show(client.camera, upright=True)
+
+    def _echo(self) -> float:
+        return self.watch.echo
 
     def _tick(self) -> None:
         page = self.page
