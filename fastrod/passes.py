@@ -45,12 +45,13 @@ class Passes:
     def _new_memory(self, follower: bool, track_force: bool) -> Memory:
         layout, n = self.layout, self.n_robots
         n_rows = len(layout.row_tendon)
+        n_e = n_rows + (0 if layout.paper else 3) + (3 if follower else 0)
         n_x = 2 * len(layout.first_tendon) if layout.paper else 3 + len(layout.free_tendon)
         n_x += 3 if follower else 0
         return Memory(
             x=np.zeros((n, n_x)),
             covariance=np.zeros((n if self.carry else 0, n_x * (n_x + 1) // 2), np.float32),
-            gain=np.zeros((n, n_x, n_rows + (3 if track_force else 0)), np.float32),
+            gain=np.zeros((n, n_x, n_e + (3 if track_force else 0)), np.float32),
             move=np.zeros((n, n_x), np.float32),
             defect=np.zeros((n, n_x), np.float32),
             length_before=np.zeros((n, n_rows)),
@@ -61,21 +62,30 @@ class Passes:
     def remember(self, follower: bool, track_force: bool, force: Floats | None) -> None:
         """Widen or narrow the memory when a follower force or a moving tip force comes or goes; x of the rod itself is kept.
         `force` is the tip force that x belongs to."""
+        self.memory = self._refitted(self.memory, follower, track_force, force)
+
+    def refit(self, memory: Memory, follower: bool, force: Floats | None) -> Memory:
+        """Another memory of these robots, widened or narrowed to what is remembered now."""
+        return self._refitted(memory, follower, len(self.memory.force_before) > 0, force)
+
+    def _refitted(self, old: Memory, follower: bool, track_force: bool, force: Floats | None) -> Memory:
         new = self._new_memory(follower, track_force)
-        old = self.memory
         if [a.shape for a in new] == [a.shape for a in old]:
-            return
+            return old
         kept = min(old.x.shape[1], new.x.shape[1])
         new.x[:, :kept] = old.x[:, :kept]
-        columns = min(old.gain.shape[2], new.gain.shape[2])
+        tracked = len(old.force_before) > 0
+        columns = min(old.gain.shape[2] - 3 * tracked, new.gain.shape[2] - 3 * track_force)
         new.gain[:, :kept, :columns] = old.gain[:, :kept, :columns]
+        if tracked and track_force:
+            new.gain[:, :kept, -3:] = old.gain[:, :kept, -3:]
         new.length_before[:] = old.length_before
         new.curvature_guess[:] = old.curvature_guess
         new.move[:, :kept], new.defect[:, :kept] = old.move[:, :kept], old.defect[:, :kept]
         new.covariance[:, : kept * (kept + 1) // 2] = old.covariance[:, : kept * (kept + 1) // 2]
         if track_force and force is not None:
             new.force_before[:] = force
-        self.memory = new
+        return new
 
     def arrive_at(self, rows: Ints, ports: Ports) -> None:
         """These robots were brought to these inputs by another way than a step: the next one moves from there."""

@@ -24,6 +24,7 @@ from fastrod.passes import Passes
 from fastrod.response import Linear, stretch
 from fastrod.robot import Robot
 from fastrod.rotation import matrix_from_quaternion
+from fastrod.rows import restore_contact, taken_each, taken_shape
 from fastrod.settle import settle
 from fastrod.state import Observer, Pose, Snapshot, State
 from fastrod.types import Flags, Floats, Ints, Memory, Params, Ports, Probes, Shape
@@ -56,13 +57,16 @@ class Simulator:
         observer: Observer | None = None,
         threads: int | None = None,
         contact: ContactScene | None = None,
+        hold_gain: float = 0.0,
     ) -> None:
         """Compile `robot` (one for all, or a list with one each) for `n_robots` and a time step `dt` [s].
 
         `points_per_segment` is the number of integration steps of a segment; the shape has n_segments times as many
         nodes and one more. `outputs="tip"` keeps only tip pose, residual and ok: some 2 kB a five-segment robot.
         `threads` defaults to numba's; 1 is the serial twin. `contact` is what the rods may touch; without it they pass
-        through everything. Raises `InputError`, `RobotError`.
+        through everything. While a robot's last residual is below `hold_gain` [m] (and it has no contact scene) a step corrects the
+        boundary by the gain that it has, without new sensitivities: a third of the time, and the observer lags by about so much.
+        Raises `InputError`, `RobotError`.
         """
         robots = [robot] if isinstance(robot, Robot) else list(robot) if isinstance(robot, (list, tuple)) else []
         if not robots or not all(isinstance(r, Robot) for r in robots):
@@ -82,6 +86,9 @@ class Simulator:
             raise InputError(f"observer is {observer!r}; give fastrod.Observer(...) or None.")
         if threads is not None and (not isinstance(threads, int) or not 1 <= threads <= _config.NUMBA_NUM_THREADS):
             raise InputError(f"threads is {threads!r}; it must be a whole number from 1 to {_config.NUMBA_NUM_THREADS} here.")
+        if not isinstance(hold_gain, (int, float, np.floating)) or not 0.0 <= hold_gain < np.inf:
+            raise InputError(f"hold_gain is {hold_gain!r} m; it must be a number, zero or positive.")
+        self.hold_gain = float(hold_gain)
         self.robots = tuple(robots)
         self.n_robots = int(n_robots)
         self.dt = float(dt)
@@ -175,7 +182,11 @@ class Simulator:
             shape, self._derived = linear.step(relocate, True, self.outputs, process, noise)
         else:
             shape = self._passes.new_shape(self.outputs, len(rows) < self.n_robots)
-            self._passes.run(rows, ports, shape, feed=True, carry=self._passes.carry, process=process, noise=noise)
+            held = self._held(learns)[rows]
+            if held.any():
+                self._passes.run(rows[held], ports, shape, feed=True, n_col=0)
+            if not held.all():
+                self._passes.run(rows[~held], ports, shape, feed=True, carry=self._passes.carry, process=process, noise=noise)
         finite = np.isfinite(self._passes.memory.x.sum(1))
         ok = finite & (shape.residual < _LOST * self._passes.params.reach)
         passes = np.broadcast_to(np.int64(1 + learns), self.n_robots)
@@ -199,20 +210,27 @@ class Simulator:
         obstacle_pose: Mapping[str, ArrayLike] | None = None,
         obstacle_velocity: Mapping[str, ArrayLike] | None = None,
         tolerance: float = 1e-9,
+        rows: ArrayLike | None = None,
     ) -> State:
         """Repeat the pass on frozen inputs until every boundary residual is below `tolerance` [m]; inputs as for `step`.
 
         Where Newton's method would diverge the loads are brought on step by step. Robots that still do not converge
         have `ok` False and `passes` -1. In paper mode four wires may contradict each other; then the least-squares
         boundary has converged, and `residual` says by how much they do.
+
+        `rows` are indices of robots, or a mask: the others stay as they are, in the state as well; their inputs are not read. Not with
+        a contact scene.
         """
         _check_positive("tolerance", tolerance, "m")
         given = Inputs(tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force, follower_tip_force, base_pose)
         if self._engine is not None:
+            if rows is not None:
+                raise InputError("settle with rows is for simulators without a contact scene; settle all, or restore a snapshot's rows.")
             return self._touch(self._engine, given, obstacle_pose, obstacle_velocity, tolerance)
         _refuse_obstacles(obstacle_pose, obstacle_velocity)
-        ports, rows = self._read(given)
-        return self._settle(ports, rows, tolerance)
+        only = None if rows is None else self._mask(rows)
+        ports, read = self._read(given, only)
+        return self._settle(ports, read, tolerance, only)
 
     def _touch(
         self,
@@ -287,7 +305,7 @@ class Simulator:
         self._passes.remember(False, False, None)
         return self._settle(ports, self._all, tolerance)
 
-    def _settle(self, ports: Ports, rows: Ints, tolerance: float) -> State:
+    def _settle(self, ports: Ports, rows: Ints, tolerance: float, only: Flags | None = None) -> State:
         shape = self._passes.new_shape(self.outputs, len(rows) < self.n_robots)
 
         def run(which: Ints, at: Ports) -> Floats:
@@ -299,7 +317,7 @@ class Simulator:
             self._passes.memory.covariance[rows] = 0.0
         ok = np.zeros(self.n_robots, bool)
         ok[rows] = passes[rows] > 0
-        return self._finish(ports, shape, ok, passes, f"settle did not bring the boundary residual below {tolerance:g} m")
+        return self._finish(ports, shape, ok, passes, f"settle did not bring the boundary residual below {tolerance:g} m", only)
 
     def shape(self, arclength: ArrayLike) -> Pose:
         """Pose and curvature of the last state at any arclength [m]: (n_queries,), or (n_robots, n_queries).
@@ -452,14 +470,18 @@ class Simulator:
             None if self._engine is None else self._engine.snapshot(),
         )
 
-    def restore(self, snapshot: Snapshot) -> None:
-        """Go back to a `snapshot` of this simulator."""
+    def restore(self, snapshot: Snapshot, rows: ArrayLike | None = None) -> None:
+        """Go back to a `snapshot` of this simulator, or only these robots: indices or a mask. Raises `InputError` for a snapshot of
+        another simulator."""
         if snapshot.memory.x.shape[0] != self.n_robots or snapshot.memory.length_before.shape != self._passes.memory.length_before.shape:
             raise InputError("the snapshot is of another simulator; its robots, tendons or their number differ.")
         if [memory.shape for memory in snapshot.effects] != [link.memory.shape for link in self._chain.links]:
             raise InputError("the snapshot is of another simulator; its effects differ.")
         if (snapshot.contact is None) != (self._engine is None):
             raise InputError("the snapshot is of another simulator; only one of them has a contact scene.")
+        if rows is not None and self._state is not None and self._ports is not None:
+            self._restore_rows(snapshot, self._mask(rows), self._state, self._ports)
+            return
         self._passes.memory = _copied(snapshot.memory)
         self._derived = None
         self._warm, self._given, self._ports, self._state = snapshot.warm.copy(), snapshot.given, snapshot.ports, snapshot.state
@@ -469,23 +491,94 @@ class Simulator:
         if self._engine is not None and snapshot.contact is not None:
             self._engine.restore(snapshot.contact)
 
-    def _read(self, given: Inputs) -> tuple[Ports, Ints]:
-        """The ports, and the robots whose inputs are good."""
+    def _restore_rows(self, snapshot: Snapshot, rows: Flags, state: State, ports: Ports) -> None:
+        if snapshot.state is None or snapshot.ports is None:
+            self.reset(rows)
+            return
+        then = self._passes.refit(snapshot.memory, len(ports.follower_force) > 0, snapshot.ports.tip_force)
+        for a, b in zip(self._passes.memory, then, strict=True):
+            if len(a):
+                a[rows] = b[rows]
+        self._warm, self._derived = np.where(rows, snapshot.warm, self._warm), None
+        self._ports = taken_each(ports, snapshot.ports, rows)
+        if self._bare is not None and snapshot.bare is not None:
+            self._bare = taken_each(self._bare, snapshot.bare, rows)
+        for link, memory in zip(self._chain.links, snapshot.effects, strict=True):
+            link.memory[rows] = memory[rows]
+        self._chain.time[rows] = snapshot.time[rows]
+        if self._engine is not None and snapshot.contact is not None:
+            restore_contact(self._engine, snapshot.contact, rows)
+        problems = {i: sentence for i, sentence in state.problems.items() if not rows[i]}
+        problems |= {i: sentence for i, sentence in snapshot.state.problems.items() if rows[i]}
+        ok, passes = np.where(rows, snapshot.state.ok, state.ok), np.where(rows, snapshot.state.passes, state.passes)
+        self._hand_out(taken_shape(_as_shape(state), snapshot.state, rows), ok, passes, problems)
+
+    def replace(self, rows: ArrayLike, robots: Sequence[Robot]) -> None:
+        """Other robots in these rows (indices, one robot each): their numbers and the values of their effects. They begin cold, their
+        effects at rest. Raises `RobotError` where counts, modes or effects differ from those here, and with effects or a contact
+        scene where segments or wires are elsewhere; `InputError` where rows and robots do not match."""
+        which = np.asarray(rows)
+        if which.ndim != 1 or which.dtype.kind not in "iu" or len(which) != len(robots):
+            raise InputError(f"rows has shape {which.shape} for {len(robots)} robots; give the index of each.")
+        if not len(which):
+            return
+        mask = self._mask(which)
+        _, params, rest = compile_robots([self.robots[0], *robots], self._layout.n_steps)
+        chain = Chain([self.robots[0], *robots], len(robots) + 1)
+        if self._engine is not None and not np.array_equal(params.length[1:], np.broadcast_to(params.length[:1], params.length[1:].shape)):
+            raise RobotError("a robot has segments of another length; with a contact scene these must agree.")
+
+        def put(now: Any, new: Any) -> Any:
+            full = np.array(np.broadcast_to(now, (self.n_robots, *now.shape[1:])))
+            full[which] = new[1:]
+            return full
+
+        plain: tuple[Any, ...] = self._plain
+        self._plain = Params(*(put(a, b) for a, b in zip(plain, params, strict=True)))
+        self._passes.params = self._plain
+        rest = type(rest)(*(put(a, b) for a, b in zip(self._reader.rest, rest, strict=True)))
+        self._reader = Reader(self._layout, self._plain, rest, self.n_robots)
+        self._chain.gravity = put(self._chain.gravity, chain.gravity)
+        for link, new in zip(self._chain.links, chain.links, strict=True):
+            link.values[which] = new.values[1:]
+        every = list(self.robots * (self.n_robots if len(self.robots) == 1 else 1))
+        for i, robot in zip(which, robots, strict=True):
+            every[i] = robot
+        self.robots = tuple(every)
+        self.reset(mask)
+
+    def _mask(self, rows: ArrayLike) -> Flags:
+        """(n_robots,) of indices or a mask."""
+        mask = np.zeros(self.n_robots, bool)
+        try:
+            mask[np.asarray(rows)] = True
+        except IndexError as error:
+            raise InputError(f"rows is {rows!r}; give indices of robots from 0 to {self.n_robots - 1}, or a mask.") from error
+        return mask
+
+    def _read(self, given: Inputs, only: Flags | None = None) -> tuple[Ports, Ints]:
+        """The ports, and the robots whose inputs are good; of those in `only`, where it is given."""
         self._derived = None
         ports = self._reader.ports(given)
         self._given = given
-        problems = self._reader.problems
-        rows = np.setdiff1d(self._all, list(problems)) if problems else self._all
+        out = np.zeros(self.n_robots, bool) if only is None else ~only
+        out[list(self._reader.problems)] = True
+        some_out = bool(out.any())
+        rows = np.flatnonzero(~out) if some_out else self._all
         if self._chain:
-            skip = np.isin(self._all, list(problems)) if problems else np.zeros(self.n_robots, bool)
             self._bare = ports
-            ports, self._passes.params = self._chain.act(ports, self._plain, self._state, self.dt, self._layout.n_steps, skip)
-        if problems and self._ports is not None:  # who is left out stays as extended as its boundary is
-            out = np.isin(self._all, list(problems))[:, None]
-            ports = ports._replace(extension=np.where(out, self._ports.extension, ports.extension))
+            ports, self._passes.params = self._chain.act(ports, self._plain, self._state, self.dt, self._layout.n_steps, out)
+        if some_out and self._ports is not None:  # who is left out stays as extended as its boundary is
+            ports = ports._replace(extension=np.where(out[:, None], self._ports.extension, ports.extension))
         track_force = len(self._passes.memory.force_before) > 0 or self._force_moves(ports.tip_force)
         self._passes.remember(len(ports.follower_force) > 0, track_force, None if self._ports is None else self._ports.tip_force)
         return ports, rows
+
+    def _held(self, learns: bool) -> Flags:
+        """(n_robots,) who corrects by the gain that it has."""
+        if not self.hold_gain or learns or self._state is None or self._passes.carry:
+            return np.zeros(self.n_robots, bool)
+        return np.asarray(self._warm & (self._state.residual < self.hold_gain))
 
     def _force_moves(self, force: Floats) -> bool:
         """The tip force of a running robot changes: from now on the gain for it is worth its three columns."""
@@ -495,17 +588,31 @@ class Simulator:
         same = force.shape == before.shape and np.array_equal(force, before, equal_nan=True)
         return not same and bool((force != before)[self._warm if max(len(force), len(before)) > 1 else slice(None)].any())
 
-    def _finish(self, ports: Ports, shape: Shape, ok: Flags, passes: Ints, reason: str) -> State:
+    def _finish(self, ports: Ports, shape: Shape, ok: Flags, passes: Ints, reason: str, only: Flags | None = None) -> State:
         """Note who is lost, so that nothing continues on NaN, and hand out the state."""
         problems = dict(self._reader.problems)
         for i in np.flatnonzero(~ok):
             problems.setdefault(int(i), f"{reason}; residual {shape.residual[i]:.3g} m.")
-        if self._reader.problems:  # no pass touched these: they keep the boundary they had
-            unread = np.isin(self._all, list(self._reader.problems))
+        if self._reader.problems or only is not None:  # no pass touched these: they keep the boundary they had
+            unread = np.zeros(self.n_robots, bool) if only is None else ~only
+            unread[list(self._reader.problems)] = True
             self._warm = np.where(unread, self._warm, ok)
         else:
             self._warm = ok.copy()
+        before = self._state
+        if only is not None and before is None:
+            problems |= {int(i): "left out before its first step." for i in np.flatnonzero(~only)}
+        elif only is not None and before is not None:
+            problems = {i: sentence for i, sentence in problems.items() if only[i]} | {
+                i: sentence for i, sentence in before.problems.items() if not only[i]
+            }
+            shape, ok, passes = taken_shape(shape, before, ~only), np.where(only, ok, before.ok), np.where(only, passes, before.passes)
+            if self._ports is not None:
+                ports = taken_each(ports, self._ports, ~only)
         self._ports = ports
+        return self._hand_out(shape, ok, passes, problems)
+
+    def _hand_out(self, shape: Shape, ok: Flags, passes: Ints, problems: dict[int, str]) -> State:
         contacts = None if self._engine is None else self._engine.contacts(shape, ok)
         if self.outputs == "tip":  # contact needs the whole rod, the caller did not ask for it
             shape = shape._replace(**{name: getattr(shape, name)[:0] for name in _ALONG})

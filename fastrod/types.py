@@ -93,7 +93,8 @@ class Memory(NamedTuple):
     covariance: Singles
     """(n_robots, n_x (n_x + 1) / 2) P of the scaled unknowns, lower triangle row by row; length 0 where it is not carried."""
     gain: Singles
-    """(n_robots, n_x, n_in) change of x per change of a commanded tendon length and, where tracked, of the tip force."""
+    """(n_robots, n_x, n_e) change of x per boundary residual, tendon lengths first, which is also that per commanded length; where
+    tracked, three columns more for the tip force."""
     move: Singles
     """(n_robots, n_x) first-order change of the scaled unknowns at the last change of inputs."""
     defect: Singles

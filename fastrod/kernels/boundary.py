@@ -191,7 +191,7 @@ def update_boundary(
     carry: bool,
 ) -> None:
     """The observer's update of x and P, and the gain kept for the next inputs."""
-    n_x, n_rows = memory.x.shape[1], len(layout.row_tendon)
+    n_x = memory.x.shape[1]
     n_p = padded(n_x, BLOCK)
     units = work[(n_p + 2) * W :]
     form_gain(robots, params, memory, layout, gamma, n_col, n_e, P, G, scaled, work, process, noise, carry)
@@ -208,7 +208,7 @@ def update_boundary(
             unit = units[a * W + w]
             memory.x[i, a] = x[a * W + w] + unit * defect[a * W + w]
             memory.defect[i, a] += defect[a * W + w]
-            for r in range(n_rows):
+            for r in range(n_e):
                 memory.gain[i, a, r] = unit * G[(r * n_p + a) * W + w]
             if len(memory.force_before) > 0:
                 for b in range(3):
@@ -218,7 +218,21 @@ def update_boundary(
                     if n_col == n_x:  # the force columns are the follower force's; a dead force does not enter its own row
                         s = pick(i, len(params.reach))
                         moved -= G[((n_e - 3 + b) * n_p + a) * W + w] * params.reach[s] * params.reach[s] / params.moment_scale[s]
-                    memory.gain[i, a, n_rows + b] = -unit * moved
+                    memory.gain[i, a, n_e + b] = -unit * moved
             if carry:
                 for b in range(a + 1):
                     memory.covariance[i, a * (a + 1) // 2 + b] = P[(a * n_p + b) * W + w]
+
+
+@kernel
+def hold_boundary(robots: Lanes, count: int, params: Params, memory: Memory, layout: Layout, x: Lanes, error: Lanes, n_e: int) -> None:
+    """The update of x by the gain of an earlier pass: Newton's method with a held derivative."""
+    for w in range(count):
+        i = robots[w]
+        s = pick(i, len(params.reach))
+        for a in range(memory.x.shape[1]):
+            correction = 0.0
+            for r in range(n_e):
+                correction -= memory.gain[i, a, r] * error[r * W + w]
+            memory.x[i, a] = x[a * W + w] + correction
+            memory.defect[i, a] += correction / unknown_unit(a, s, params, layout)

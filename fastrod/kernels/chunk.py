@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from fastrod.kernels import columns as col
 from fastrod.kernels import shape as sh
-from fastrod.kernels.boundary import close_lengths, close_tip, form_gain, loosen, padded, update_boundary
+from fastrod.kernels.boundary import close_lengths, close_tip, form_gain, hold_boundary, loosen, padded, update_boundary
 from fastrod.kernels.gather import feed_forward, gather_base, gather_segment, gather_step, pick, scatter_node
 from fastrod.kernels.jit import LANES, kernel
 from fastrod.kernels.observer import BLOCK
@@ -216,8 +216,8 @@ def pass_chunk(
 ) -> None:
     """One observer pass of the robots whose indices are the first `count` of `robots` (the rest repeat the last one).
 
-    With probes (the rows from `first_row` on are these robots') the boundary is not updated: how it would be, and how the
-    contact points then move, is written to the probes.
+    Without columns (`n_col` 0) the update is by the gain that the robot has. With probes (the rows from `first_row` on are
+    these robots') the boundary is not updated: how it would be, and how the contact points then move, is written to the probes.
     """
     n, n_x, n_rows = len(layout.tendon_segment), memory.x.shape[1], len(layout.row_tendon)
     n_segments, n_steps = params.length.shape[1], layout.n_steps
@@ -343,7 +343,10 @@ def pass_chunk(
         form_gain(robots, params, memory, layout, gamma, n_col, n_e, P, G, scaled, work, process, noise, carry)
         respond(robots, count, params, memory, layout, x, error, gamma, G, work[(n_p + 2) * W :], n_col, n_e, n_p, moves, probes, first_row)
     elif update:
-        update_boundary(robots, count, params, memory, layout, x, error, gamma, n_col, n_e, P, G, scaled, work, process, noise, carry)
+        if n_col > 0:
+            update_boundary(robots, count, params, memory, layout, x, error, gamma, n_col, n_e, P, G, scaled, work, process, noise, carry)
+        else:
+            hold_boundary(robots, count, params, memory, layout, x, error, n_e)
         for w in range(count):
             i = robots[w]
             for r in range(n_rows):

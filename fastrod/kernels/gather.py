@@ -35,6 +35,7 @@ def feed_forward(robots: Lanes, count: int, ports: Ports, params: Params, memory
     second-order term of the last move; a move along the same line by the ratio k needs k^2 of it again.
     """
     n_rows, n_x = len(layout.row_tendon), memory.x.shape[1]
+    n_e = memory.gain.shape[2] - (3 if len(memory.force_before) > 0 else 0)
     for w in range(count):
         i = robots[w]
         s = pick(i, len(params.reach))
@@ -47,7 +48,7 @@ def feed_forward(robots: Lanes, count: int, ports: Ports, params: Params, memory
                 v += memory.gain[i, a, r] * (length[layout.row_tendon[r]] - memory.length_before[i, r])
             if len(memory.force_before) > 0:
                 for b in range(3):
-                    v += memory.gain[i, a, n_rows + b] * (force[b] - memory.force_before[i, b])
+                    v += memory.gain[i, a, n_e + b] * (force[b] - memory.force_before[i, b])
             unit = unknown_unit(a, s, params, layout)
             v /= unit
             before = memory.move[i, a]
