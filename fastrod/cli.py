@@ -122,11 +122,49 @@ def _parser() -> tuple[argparse.ArgumentParser, list[str]]:
     view.add_argument("--no-open", action="store_true", help="do not open a browser")
     view.set_defaults(run_command=_view)
 
+    envs = commands.add_parser("envs", help="the environments; of one, its task, observation, action and options")
+    envs.add_argument("env", nargs="?", metavar="ENV", help="a task, such as Reach or fastrod/Reach-v0 (default: a line for each)")
+    _add_options(envs)
+    envs.set_defaults(run_command=_envs)
+
+    train = commands.add_parser("train", help="train a policy for an environment, on stable-baselines3")
+    train.add_argument("env", nargs="?", metavar="ENV", help="a task, such as Reach or fastrod/Reach-v0; with --resume the folder knows")
+    train.add_argument("--algo", metavar="A", help="sac, ppo or td3 (default: the task's preset)")
+    train.add_argument("--steps", type=int, metavar="N", help="environment steps in all (default: the preset's)")
+    train.add_argument("--envs", type=int, metavar="N", help="environments side by side (default: the preset's)")
+    train.add_argument("--seed", type=int, default=0, metavar="S", help="of policy and environments (default: 0)")
+    train.add_argument("--imitate", type=int, metavar="N", help="steps of lessons by the scripted baseline before (default: the preset's)")
+    train.add_argument("--curriculum", type=float, default=1.0, metavar="D", help="difficulty at the start, rising to 1 (default: 1, none)")
+    _add_options(train)
+    train.add_argument(
+        "--set", action="append", default=[], metavar="NAME=VALUE", help="a setting of the algorithm, such as batch_size=512"
+    )
+    train.add_argument("--out", type=Path, metavar="DIR", help="policy, configuration, checkpoints, curves (default: NAME_ALGO_SEED)")
+    train.add_argument("--resume", action="store_true", help="go on with the training in --out, after a kill or to more --steps")
+    train.set_defaults(run_command=_train)
+
+    evaluate = commands.add_parser("evaluate", help="a policy beside the baselines: success, distance, contacts")
+    evaluate.add_argument("env", metavar="ENV", help="a task, such as Reach or fastrod/Reach-v0")
+    evaluate.add_argument("policy", metavar="POLICY", help="a folder of `fastrod train`, `shipped`, or `none` for the baselines alone")
+    evaluate.add_argument("--episodes", type=int, default=100, metavar="N", help="one for each seed (default: 100)")
+    evaluate.add_argument("--seed", type=int, default=1000, metavar="S", help="of the first episode (default: 1000)")
+    evaluate.add_argument("--no-baselines", action="store_true", help="the policy alone")
+    _add_options(evaluate)
+    evaluate.add_argument("--out", type=Path, metavar="DIR", help="write evaluation.json and evaluation.png there")
+    evaluate.add_argument("--json", action="store_true", help="print the figures to stdout and nothing else")
+    evaluate.set_defaults(run_command=_evaluate)
+
     bench = commands.add_parser("bench", help="the figures of perf/ as ratios")
     bench.add_argument("name", nargs="?", metavar="NAME", help="one benchmark (default: all)")
     bench.add_argument("--json", action="store_true", help="print JSON to stdout and nothing else")
     bench.set_defaults(run_command=_bench)
     return parser, list(commands.choices)
+
+
+def _add_options(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--option", action="append", default=[], metavar="NAME=VALUE", help="of the environment, such as n_steps=1 or randomise=mine.toml"
+    )
 
 
 def _demo(arguments: argparse.Namespace) -> int:
@@ -247,6 +285,88 @@ def _view(arguments: argparse.Namespace) -> int:
         open_browser=not arguments.no_open, script=arguments.play, server=server,
     )  # fmt: skip
     return DONE
+
+
+def _envs(arguments: argparse.Namespace) -> int:
+    _need("gymnasium", "envs", "envs")
+    from fastrod_envs.describe import describe, summary
+
+    print(summary() if arguments.env is None else describe(arguments.env, _pairs(arguments.option, "--option")))
+    return DONE
+
+
+def _train(arguments: argparse.Namespace) -> int:
+    _need("stable_baselines3", "train", "rl")
+    from fastrod_envs.training import make_plan, read_config, resume, train
+
+    out: Path | None = arguments.out
+    if arguments.resume:
+        if out is None:
+            raise InputError("--resume needs --out DIR, the folder of the training to go on with.")
+        plan = read_config(out)[0]
+        with _progress() as bar:
+            path = resume(out, arguments.steps, bar)
+    else:
+        if arguments.env is None:
+            raise _UsageError("the following arguments are required: ENV; `fastrod train --help` says how it is used.")
+        plan = make_plan(
+            arguments.env, algorithm=arguments.algo, steps=arguments.steps, n_envs=arguments.envs, seed=arguments.seed,
+            imitate=arguments.imitate, options=_pairs(arguments.option, "--option"), settings=_pairs(arguments.set, "--set"),
+            curriculum=arguments.curriculum,
+        )  # fmt: skip
+        out = out or Path(f"{plan.env.partition('/')[2]}_{plan.algorithm}_{plan.seed}")
+        with _progress() as bar:
+            path = train(plan, out, bar)
+    print(f"wrote {path}; see it with: fastrod evaluate {plan.env} {out}")
+    return DONE
+
+
+def _evaluate(arguments: argparse.Namespace) -> int:
+    _need("stable_baselines3", "evaluate", "rl")
+    from rich.console import Console
+
+    from fastrod_envs import evaluation
+    from fastrod_envs.policies import Policy, find
+
+    options = _pairs(arguments.option, "--option")
+    policy = None if arguments.policy == "none" else Policy(find(arguments.env, arguments.policy))
+    with _progress() as bar:
+        result = evaluation.evaluate(
+            arguments.env, policy, episodes=arguments.episodes, seed=arguments.seed, options=options,
+            baselines=not arguments.no_baselines, progress=bar,
+        )  # fmt: skip
+    written = [] if arguments.out is None else evaluation.write(result, arguments.out)
+    if arguments.json:
+        print(json.dumps(evaluation.figures(result), indent=1))
+        return DONE
+    console = Console()
+    console.width = max(console.width, 140)
+    console.print(evaluation.table(result))
+    for path in written:
+        console.print(f"wrote {path}", soft_wrap=True, highlight=False, markup=False)
+    return DONE
+
+
+def _pairs(given: Sequence[str], flag: str) -> dict[str, object]:
+    """NAME=VALUE as names and numbers, lists, true, false, none, or words."""
+    told: dict[str, object] = {}
+    for pair in given:
+        name, equals, word = pair.partition("=")
+        if not equals or not name:
+            raise InputError(f"{flag} is {pair!r}; give NAME=VALUE.")
+        try:
+            told[name] = None if word in ("none", "None") else json.loads(word)
+        except ValueError:
+            told[name] = word
+    return told
+
+
+def _need(module: str, command: str, extra: str) -> None:
+    """Raises `InputError` where what a command stands on is not installed."""
+    from importlib.util import find_spec
+
+    if find_spec(module) is None:
+        raise InputError(f"fastrod {command} needs {module.replace('_', '-')}: pip install fastrod[{extra}].")
 
 
 def _bench(arguments: argparse.Namespace) -> int:

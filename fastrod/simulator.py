@@ -58,13 +58,15 @@ class Simulator:
         threads: int | None = None,
         contact: ContactScene | None = None,
         hold_gain: float = 0.0,
+        feel_contact: bool = True,
     ) -> None:
         """Compile `robot` (one for all, or a list with one each) for `n_robots` and a time step `dt` [s].
 
         `points_per_segment` is the number of integration steps of a segment; the shape has n_segments times as many
         nodes and one more. `outputs="tip"` keeps only tip pose, residual and ok: some 2 kB a five-segment robot.
         `threads` defaults to numba's; 1 is the serial twin. `contact` is what the rods may touch; without it they pass
-        through everything. While a robot's last residual is below `hold_gain` [m] (and it has no contact scene) a step corrects the
+        through everything. Without `feel_contact` they do so all the same, and the scene is for `clearance`, `swept_clearance` and
+        `ray_cast` alone. While a robot's last residual is below `hold_gain` [m] (and it feels no contact) a step corrects the
         boundary by the gain that it has, without new sensitivities: a third of the time, and the observer lags by about so much.
         Raises `InputError`, `RobotError`.
         """
@@ -115,11 +117,17 @@ class Simulator:
         if contact is not None:
             rods = contact.rods(self.robots, self.n_robots, self._layout, self._plain)
             self._engine = Engine(contact, rods, self._plain.length, self.n_points, threads)
+        self._felt = self._engine if feel_contact else None  # the engine, where contact bends the rods
 
     @property
     def n_points(self) -> int:
         """Nodes along the whole robot."""
         return self._passes.n_points
+
+    @property
+    def state(self) -> State:
+        """The last state. Raises `InputError` before the first step."""
+        return self._last("state")[0]
 
     def step(
         self,
@@ -161,9 +169,9 @@ class Simulator:
         same pass, at the shape of the state, at little cost.
         """
         given = Inputs(tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force, follower_tip_force, base_pose)
-        if self._engine is not None:
-            return self._touch(self._engine, given, obstacle_pose, obstacle_velocity, None)
-        _refuse_obstacles(obstacle_pose, obstacle_velocity)
+        if self._felt is not None:
+            return self._touch(self._felt, given, obstacle_pose, obstacle_velocity, None)
+        self._move_obstacles(obstacle_pose, obstacle_velocity)
         tracked = len(self._passes.memory.force_before) > 0
         ports, rows = self._read(given)
         process, noise = self.observer.process_noise * self.dt, self.observer.measurement_noise / self.dt
@@ -223,11 +231,11 @@ class Simulator:
         """
         _check_positive("tolerance", tolerance, "m")
         given = Inputs(tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force, follower_tip_force, base_pose)
-        if self._engine is not None:
+        if self._felt is not None:
             if rows is not None:
                 raise InputError("settle with rows is for simulators without a contact scene; settle all, or restore a snapshot's rows.")
-            return self._touch(self._engine, given, obstacle_pose, obstacle_velocity, tolerance)
-        _refuse_obstacles(obstacle_pose, obstacle_velocity)
+            return self._touch(self._felt, given, obstacle_pose, obstacle_velocity, tolerance)
+        self._move_obstacles(obstacle_pose, obstacle_velocity)
         only = None if rows is None else self._mask(rows)
         ports, read = self._read(given, only)
         return self._settle(ports, read, tolerance, only)
@@ -359,7 +367,7 @@ class Simulator:
         _, ports = self._last("jacobian")
         if self._derived is not None:
             return self._derived[:, :, : None if turning else -3]
-        follows = self._engine is None and bool(self._given.point_force)
+        follows = self._felt is None and bool(self._given.point_force)
         jacobian = self._linear(ports).jacobian(self._relocated if follows else None, turning)
         if self._bare is None:
             return jacobian
@@ -374,9 +382,9 @@ class Simulator:
     def _linear(self, ports: Ports) -> Linear:
         """The linear response of the last state."""
         rows = np.flatnonzero(self._warm)
-        if self._engine is None:
+        if self._felt is None:
             return Linear(self._passes, rows, ports)
-        return Linear(self._passes, rows, *self._engine.held(rows, ports, self._passes.n_x))
+        return Linear(self._passes, rows, *self._felt.held(rows, ports, self._passes.n_x))
 
     def _relocated(self, extension: Floats) -> dict[str, Floats]:
         """The loads at other extensions: point forces stay at their arclength, so nodes and samples move over the material."""
@@ -404,19 +412,30 @@ class Simulator:
         (`contact.queries.clearance`). Raises `InputError` without a contact scene or a state, `UnknownNameError`."""
         return queries.clearance(self._contact("clearance"), _as_shape(self._full("clearance")), obstacle)
 
-    def swept_clearance(self, tolerance: float = 1e-5) -> Floats:
+    def swept_clearance(self, tolerance: float = 1e-5, rows: ArrayLike | None = None) -> Floats:
         """(n_robots,) smallest gap on the straight way from the state before to the last one, to `tolerance` [m]; after the first
-        state, its clearance. Raises `InputError` as `clearance`."""
+        state, its clearance. nan but for `rows`, indices or a mask, where they are given. Raises `InputError` as `clearance`."""
         engine = self._contact("swept_clearance")
         _check_positive("tolerance", tolerance, "m")
         now = _as_shape(self._full("swept_clearance"))
         before, poses = engine.at_last_step
-        return queries.swept_clearance(engine, now if before is None else before, poses, now, tolerance)
+        some = None if rows is None else self._mask(rows)
+        return queries.swept_clearance(engine, now if before is None else before, poses, now, tolerance, some)
 
     def ray_cast(self, origin: ArrayLike, direction: ArrayLike, longest: float = np.inf) -> queries.Hits:
         """What distance sensors see: rays (n_rays, 3) or (n_robots, n_rays, 3), world, against the obstacles where they are now, up
         to `longest` [m]. Raises `InputError` without a contact scene, on a wrong shape or a direction of length 0."""
         return queries.ray_cast(self._contact("ray_cast"), origin, direction, longest)
+
+    def _move_obstacles(self, pose: Mapping[str, ArrayLike] | None, velocity: Mapping[str, ArrayLike] | None) -> None:
+        """Obstacles that no rod feels."""
+        if self._engine is None:
+            if pose or velocity:
+                raise InputError("obstacles were given to a simulator without a contact scene; give it one: Simulator(robot, contact=...).")
+            return
+        scene = self._engine.scene
+        self._engine.poses_before = self._engine.poses
+        self._engine.move(scene.moved(self._engine.poses, pose, self.n_robots), scene.velocities(velocity, self.n_robots), self.dt)
 
     def _contact(self, what: str) -> Engine:
         if self._engine is None:
@@ -496,6 +515,8 @@ class Simulator:
             self.reset(rows)
             return
         then = self._passes.refit(snapshot.memory, len(ports.follower_force) > 0, snapshot.ports.tip_force)
+        a: Any
+        b: Any
         for a, b in zip(self._passes.memory, then, strict=True):
             if len(a):
                 a[rows] = b[rows]
@@ -503,6 +524,13 @@ class Simulator:
         self._ports = taken_each(ports, snapshot.ports, rows)
         if self._bare is not None and snapshot.bare is not None:
             self._bare = taken_each(self._bare, snapshot.bare, rows)
+            self._passes.params = taken_each(self._passes.params, snapshot.params, rows)
+        alike = bool(len(ports.follower_force)) == bool(len(snapshot.ports.follower_force))
+        if self._engine is None and alike and len(self._passes.memory.force_before) > len(snapshot.memory.force_before):
+            # their gain knows no tip force yet, which moves by now: learned as `step` does
+            process, noise = self.observer.process_noise * self.dt, self.observer.measurement_noise / self.dt
+            learning, apart = np.flatnonzero(rows & snapshot.warm), self._passes.new_shape("tip", True)
+            self._passes.run(learning, self._ports, apart, carry=self._passes.carry, process=process, noise=noise)
         for link, memory in zip(self._chain.links, snapshot.effects, strict=True):
             link.memory[rows] = memory[rows]
         self._chain.time[rows] = snapshot.time[rows]
@@ -566,8 +594,12 @@ class Simulator:
         some_out = bool(out.any())
         rows = np.flatnonzero(~out) if some_out else self._all
         if self._chain:
+            bare, params = self._bare, self._passes.params
             self._bare = ports
             ports, self._passes.params = self._chain.act(ports, self._plain, self._state, self.dt, self._layout.n_steps, out)
+            if only is not None and bare is not None:
+                self._bare = taken_each(self._bare, bare, ~only)
+                self._passes.params = taken_each(self._passes.params, params, ~only)
         if some_out and self._ports is not None:  # who is left out stays as extended as its boundary is
             ports = ports._replace(extension=np.where(out[:, None], self._ports.extension, ports.extension))
         track_force = len(self._passes.memory.force_before) > 0 or self._force_moves(ports.tip_force)
@@ -613,7 +645,9 @@ class Simulator:
         return self._hand_out(shape, ok, passes, problems)
 
     def _hand_out(self, shape: Shape, ok: Flags, passes: Ints, problems: dict[int, str]) -> State:
-        contacts = None if self._engine is None else self._engine.contacts(shape, ok)
+        contacts = None if self._felt is None else self._felt.contacts(shape, ok)
+        if self._engine is not None and self._felt is None:
+            self._engine.before = shape
         if self.outputs == "tip":  # contact needs the whole rod, the caller did not ask for it
             shape = shape._replace(**{name: getattr(shape, name)[:0] for name in _ALONG})
         self._state = State(**shape._asdict(), ok=ok, passes=passes, problems=problems, contacts=contacts)
@@ -623,11 +657,6 @@ class Simulator:
         if self._state is None or self._ports is None:
             raise InputError(f"{what} needs a state; call step or settle first.")
         return self._state, self._ports
-
-
-def _refuse_obstacles(*given: object) -> None:
-    if any(given):
-        raise InputError("obstacles were given to a simulator without a contact scene; give it one: Simulator(robot, contact=...).")
 
 
 def _check_positive(name: str, value: float, unit: str) -> None:

@@ -14,7 +14,7 @@ from fastrod.kernels.batch import cast_rays, look_at_rods, look_serial
 from fastrod.kernels.bvh import STACK
 from fastrod.kernels.forces import Scenery
 from fastrod.kernels.search import CANDIDATE
-from fastrod.types import Clearance, Floats, Ints, Shape
+from fastrod.types import Clearance, Flags, Floats, Ints, Shape
 
 _EVERYTHING = 1e6  # of the rod's length: a margin within which all is near
 _MOST_LOOKS = 400
@@ -38,7 +38,7 @@ def clearance(engine: Engine, shape: Shape, name: str | None = None) -> Floats:
     return _gap(engine, shape, engine.poses, None if name is None else engine.scene.index(name))
 
 
-def _gap(engine: Engine, shape: Shape, poses: Floats, only: int | None = None) -> Floats:
+def _gap(engine: Engine, shape: Shape, poses: Floats, only: int | None = None, rows: Flags | None = None) -> Floats:
     n, n_points = shape.arclength.shape
     surfaces, which = engine.surfaces, slice(None) if only is None else [only]
     surfaces = surfaces._replace(
@@ -48,41 +48,49 @@ def _gap(engine: Engine, shape: Shape, poses: Floats, only: int | None = None) -
     frames = np.ascontiguousarray(frames_of(poses)[:, which])
     nobody = np.zeros(n, bool)
     scenery = Scenery(engine.rods, surfaces, frames, frames, frames, shape, shape, nobody, nobody, 1e-9, _EVERYTHING, 0.0)
-    gap, rows = np.full(n, np.nan), np.flatnonzero(np.isfinite(shape.position).all((1, 2)))
-    found, n_found = np.empty((len(rows), MOST_FOUND, CANDIDATE)), np.zeros(len(rows), np.int64)
+    finite = np.isfinite(shape.position).all((1, 2))
+    gap, some = np.full(n, np.nan), np.flatnonzero(finite if rows is None else finite & rows)
+    found, n_found = np.empty((len(some), MOST_FOUND, CANDIDATE)), np.zeros(len(some), np.int64)
     unknown = Clearance(np.full((n, n_points), -np.inf), np.zeros((n, n_points, 3)))
-    gap[rows] = np.inf
+    gap[some] = np.inf
     if len(surfaces.kind):
-        look_serial(rows, *scenery, unknown, gap, found, n_found, np.empty((1, 4 * n_points + 4 * STACK)))
+        look_serial(some, *scenery, unknown, gap, found, n_found, np.empty((1, 4 * n_points + 4 * STACK)))
     if only is None and engine.rods_touch:
-        ordered, worlds = engine.in_worlds(rows)
+        ordered, worlds = engine.in_worlds(some)
         look_at_rods(worlds, ordered, scenery, engine.touching, gap)
     return gap
 
 
-def swept_clearance(engine: Engine, before: Shape, poses_before: Floats, after: Shape, tolerance: float) -> Floats:
+def swept_clearance(
+    engine: Engine, before: Shape, poses_before: Floats, after: Shape, tolerance: float, rows: Flags | None = None
+) -> Floats:
     """(n_robots,) smallest gap on the way from one shape to another, to `tolerance` [m]: robots and obstacles move in straight
-    lines at even speed. The gap changes by no more than they move, so intervals that cannot hold the minimum are left out."""
+    lines at even speed. The gap changes by no more than they move, so intervals that cannot hold the minimum are left out. nan but for
+    `rows`, where they are given."""
     n = len(after.arclength)
     moved = np.linalg.norm(after.position - before.position, axis=2).max(1) + _obstacles_move(engine, poses_before)
 
-    def gap_at(t: Floats) -> Floats:
+    def gap_at(t: Floats, some: Flags) -> Floats:
         part = t[:, None, None]
         tangent = (1.0 - part[..., None]) * before.rotation + part[..., None] * after.rotation
         there = after._replace(position=(1.0 - part) * before.position + part * after.position, rotation=tangent)
-        return _gap(engine, there, between(poses_before, engine.poses, t))
+        gap = _gap(engine, there, between(poses_before, engine.poses, t), rows=some)
+        return np.where(np.isnan(gap), np.inf, gap)
 
-    times, gaps = np.tile([0.0, 1.0], (n, 1)), np.stack([gap_at(np.zeros(n)), gap_at(np.ones(n))], axis=1)
+    wanted = np.isfinite(after.position).all((1, 2)) & (np.ones(n, bool) if rows is None else rows)
+    each = np.arange(n)
+    times, gaps = np.tile([0.0, 1.0], (n, 1)), np.stack([gap_at(np.zeros(n), wanted), gap_at(np.ones(n), wanted)], axis=1)
     for _ in range(_MOST_LOOKS):
-        bound = 0.5 * (gaps[:, 1:] + gaps[:, :-1] - moved[:, None] * np.diff(times, axis=1))
-        worst = np.nan_to_num(bound, nan=np.inf).argmin(1)
-        if not (bound[np.arange(n), worst] < np.nanmin(gaps, axis=1) - tolerance).any():
+        bound = 0.5 * (gaps[:, 1:] + gaps[:, :-1] - np.nan_to_num(moved)[:, None] * np.diff(times, axis=1))
+        worst = bound.argmin(1)
+        still = wanted & (bound[each, worst] < gaps.min(1) - tolerance)
+        if not still.any():
             break
-        middle = 0.5 * (times[np.arange(n), worst] + times[np.arange(n), worst + 1])
-        times, gaps = np.column_stack([times, middle]), np.column_stack([gaps, gap_at(middle)])
+        middle = 0.5 * (times[each, worst] + times[each, worst + 1])
+        times, gaps = np.column_stack([times, middle]), np.column_stack([gaps, gap_at(middle, still)])
         order = np.argsort(times, axis=1)
         times, gaps = np.take_along_axis(times, order, 1), np.take_along_axis(gaps, order, 1)
-    return np.asarray(gaps.min(1))
+    return np.where(wanted, gaps.min(1), np.nan)
 
 
 def _obstacles_move(engine: Engine, poses_before: Floats) -> Floats:

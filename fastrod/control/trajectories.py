@@ -59,6 +59,13 @@ def square(*, side: float = 0.4, period: float = 20.0, center: ArrayLike = (0.0,
     return Trajectory(name="square", period=period, center=_center(center), path=lambda t: _square(t, side, period))
 
 
+def triangle(*, side: float = 0.04, period: float = 20.0, center: ArrayLike = (0.0, 0.0, 0.0)) -> Trajectory:
+    """An equilateral triangle of this side [m] about the center, counterclockwise from the corner at -y on the left, at constant speed:
+    a third of the period [s] a side. Source: SoftManiSim, CoRL 2024, its experiment with the prototype. Raises `InputError`."""
+    _check_positive("triangle", "side", side, "m")
+    return Trajectory(name="triangle", period=period, center=_center(center), path=lambda t: _triangle(t, side, period))
+
+
 def circle(*, radius: float = 0.2, period: float = 20.0, center: ArrayLike = (0.0, 0.0, 0.0)) -> Trajectory:
     """A circle of this radius [m] about the center, counterclockwise from (+x, 0), one turn a period [s]. Source: SoftManiSim, CoRL
     2024, its tracking experiment. Raises `InputError`."""
@@ -102,6 +109,7 @@ def square_helix(
 
 _KNOWN: dict[str, tuple[Callable[..., Trajectory], tuple[str, ...]]] = {
     "square": (square, ("side", "period", "center")),
+    "triangle": (triangle, ("side", "period", "center")),
     "circle": (circle, ("radius", "period", "center")),
     "figure_eight": (figure_eight, ("size", "period", "center")),
     "helix": (helix, ("radius", "pitch", "downward", "period", "center")),
@@ -130,15 +138,28 @@ def trajectory(name: str, **options: Any) -> Trajectory:
 
 
 def _square(t: Floats, side: float, period: float) -> tuple[Floats, Floats]:
-    turns = 4.0 * t / period
+    corners = side * np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
+    return _polygon(t, corners, np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), side, period)
+
+
+def _triangle(t: Floats, side: float, period: float) -> tuple[Floats, Floats]:
+    high, low = side / math.sqrt(3.0), -0.5 * side / math.sqrt(3.0)
+    corners = np.array([[-0.5 * side, low, 0.0], [0.5 * side, low, 0.0], [0.0, high, 0.0]])
+    c, s = 0.5, math.sqrt(0.75)
+    return _polygon(t, corners, np.array([[1.0, 0.0, 0.0], [-c, s, 0.0], [-c, -s, 0.0]]), side, period)
+
+
+def _polygon(t: Floats, corners: Floats, directions: Floats, side: float, period: float) -> tuple[Floats, Floats]:
+    """Along equal sides from corner to corner."""
+    n = len(corners)
+    turns = n * t / period
     k = np.floor(turns)
     # a corner belongs to the side that begins, also where the division fell short of the whole number by its rounding
     k += turns - k > 1.0 - 4.0 * np.spacing(np.maximum(np.abs(turns), 1.0))
     part = np.maximum(turns - k, 0.0)[..., None]
-    which = k.astype(np.int64) % 4
-    corner = side * np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
-    along = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])[which]
-    return corner[which] + side * part * along, 4.0 * side / period * along
+    which = k.astype(np.int64) % n
+    along = directions[which]
+    return corners[which] + side * part * along, n * side / period * along
 
 
 def _circle(t: Floats, radius: float, period: float) -> tuple[Floats, Floats]:

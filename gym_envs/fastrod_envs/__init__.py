@@ -1,1 +1,13 @@
-"""Vectorised Gymnasium environments over one Simulator: N robots are N environments."""
+"""Vectorised Gymnasium environments over one Simulator: N robots are N environments.
+
+>>> import fastrod_envs
+>>> fastrod_envs.ids()[0]
+'fastrod/Reach-v0'
+"""
+
+from fastrod_envs.randomisation import Randomisation
+from fastrod_envs.registration import ids, names, register_all
+
+register_all()
+
+__all__ = ["Randomisation", "ids", "names"]

@@ -1,0 +1,78 @@
+"""What a task is, for people: its documentation, and every number of its observations and actions with its unit."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from collections.abc import Mapping
+from typing import Any
+
+from fastrod_envs.registration import make_task, name_of, names, task_class
+from fastrod_envs.task import Field
+
+
+def summary() -> str:
+    """A line for each task."""
+    lines = []
+    for name in names():
+        kind = task_class(name)
+        first = (inspect.getdoc(kind) or "").partition("\n\n")[0].replace("\n", " ")
+        lines.append(f"fastrod/{name}-v0  {first}{' (PyBullet)' if kind.hosted else ''}")
+    return "\n".join(lines)
+
+
+def describe(name: str, options: Mapping[str, Any] | None = None) -> str:
+    """Documentation of a task: what it is, its options, observation and action number by number. Raises `UnknownNameError`, `InputError`."""
+    kind = task_class(name)
+    task = make_task(name, 1, options or {})
+    try:
+        seen = task.goals if task.options.observation == "goal" else task.states
+        parts = [
+            f"fastrod/{name_of(name)}-v0",
+            inspect.getdoc(kind) or "",
+            f"An episode has {task.options.n_steps or task.n_steps} steps of {task.dt:g} s.",
+            "Observation\n" + _fields(seen),
+            "Action, each number from -1 to 1, which mean\n" + _fields(task.actions),
+            "Options\n" + _options(kind.options_class),
+        ]
+    finally:
+        task.close()
+    return "\n\n".join(parts)
+
+
+def _fields(parts: tuple[Field, ...]) -> str:
+    lines, at = [], 0
+    for part in parts:
+        n = len(part.low)
+        where = f"{at}" if n == 1 else f"{at}..{at + n - 1}"
+        low, high = ("same" if len(set(side)) == 1 else "mixed" for side in (part.low, part.high))
+        span = f"{part.low[0]:g} to {part.high[0]:g}" if low == high == "same" else "; ".join(
+            f"{a:g} to {b:g}" for a, b in zip(part.low, part.high, strict=True)
+        )  # fmt: skip
+        lines.append(f"  {where:>7}  {part.name:<12} {part.unit or '-':<5} {part.about} ({span})")
+        at += n
+    return "\n".join(lines)
+
+
+def _options(kind: type[Any]) -> str:
+    lines = []
+    docs = {name: text for base in reversed(kind.__mro__) for name, text in _attribute_docs(base).items()}
+    for option in dataclasses.fields(kind):
+        lines.append(f"  {option.name} = {option.default!r}: {docs.get(option.name, '')}")
+    return "\n".join(lines)
+
+
+def _attribute_docs(kind: type[Any]) -> dict[str, str]:
+    """The sentences below the attributes of a class, by name."""
+    import ast
+
+    if kind is object:
+        return {}
+    body = ast.parse(inspect.getsource(kind)).body[0]
+    assert isinstance(body, ast.ClassDef)
+    found: dict[str, str] = {}
+    for one, following in zip(body.body, body.body[1:], strict=False):
+        text = following.value.value if isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant) else None
+        if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name) and isinstance(text, str):
+            found[one.target.id] = " ".join(text.split())
+    return found

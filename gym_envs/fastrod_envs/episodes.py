@@ -1,0 +1,101 @@
+"""`Episodes`: a task step by step, its episodes counted, its actions checked; what both kinds of environment share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fastrod.errors import InputError
+from fastrod.types import Flags, Floats, Ints
+from fastrod_envs.streams import Streams
+from fastrod_envs.task import Outcome, Task, bounds
+
+Singles = NDArray[np.float32]
+
+
+class Moment(NamedTuple):
+    """What a step brings, robot axis first."""
+
+    outcome: Outcome
+    reward: Floats
+    terminated: Flags
+    truncated: Flags
+
+
+class Episodes:
+    """Runs a task; robots whose episode is over wait to `begin` another."""
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        self.n = task.n_envs
+        self.n_steps = task.options.n_steps or task.n_steps
+        self.elapsed: Ints = np.zeros(self.n, np.int64)
+        """(n,) steps of the episode under way."""
+        self.returned: Floats = np.zeros(self.n)
+        """(n,) sum of its rewards."""
+        self._streams = Streams(self.n, task.total_draws)
+        parts = task.goals if task.options.observation == "goal" else task.states
+        low, high = bounds(parts)
+        self.low: Singles = low.astype(np.float32)
+        """(n_obs,) least observation."""
+        self.high: Singles = high.astype(np.float32)
+        """(n_obs,) largest observation."""
+        self._running = np.zeros(self.n, bool)
+
+    def seed(self, seeds: Sequence[int | None]) -> None:
+        """A seed for each environment, or None."""
+        self._streams.seed(seeds)
+
+    def begin(self, rows: Ints) -> None:
+        """New episodes for these robots."""
+        self.task.begin(rows, self._streams.draw(rows))
+        self.elapsed[rows] = 0
+        self.returned[rows] = 0.0
+        self._running[rows] = True
+
+    def checked(self, actions: ArrayLike) -> Floats:
+        """(n, n_actions) within -1 and 1. Raises `InputError` on a wrong shape and on what is not finite."""
+        try:
+            a = np.asarray(actions, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"actions are {actions!r}; give numbers from -1 to 1, ({self.n}, {self.task.n_actions}).") from error
+        if a.shape != (self.n, self.task.n_actions):
+            raise InputError(f"actions have shape {a.shape}; they must be ({self.n}, {self.task.n_actions}), each from -1 to 1.")
+        if not np.isfinite(a.sum()):
+            i = int(np.flatnonzero(~np.isfinite(a).all(1))[0])
+            raise InputError(f"the action of environment {i} is not finite: {a[i]}; nothing was simulated.")
+        return np.clip(a, -1.0, 1.0)
+
+    def advance(self, actions: ArrayLike) -> Moment:
+        """One step of all. Raises `InputError` as `checked`, and where an episode has not begun."""
+        checked = self.checked(actions)
+        if not self._running.all():
+            raise InputError(f"environment {int(np.flatnonzero(~self._running)[0])} has no episode under way; call reset() first.")
+        self.task.act(checked)
+        outcome = self.task.outcome()
+        reward = np.zeros(self.n)
+        for term in outcome.terms.values():
+            reward += term
+        self.elapsed += 1
+        self.returned += reward
+        terminated = outcome.terminated | outcome.lost
+        truncated = (self.elapsed >= self.n_steps) & ~terminated
+        self._running &= ~(terminated | truncated)
+        return Moment(outcome, reward, terminated, truncated)
+
+    def observation(self) -> Singles:
+        """(n, n_obs) a new array, within its bounds."""
+        seen = self.task.goal() if self.task.options.observation == "goal" else self.task.state()
+        return np.clip(seen.astype(np.float32), self.low, self.high)
+
+    def info(self, moment: Moment) -> dict[str, Any]:
+        """Arrays (n, ...) of what happened: distance, success, contact, lost, position, desired, the terms of the reward, and facts."""
+        o = moment.outcome
+        told: dict[str, Any] = {
+            "distance": o.distance, "success": o.success, "contact": o.contact, "lost": o.lost,
+            "position": o.position, "desired": o.desired, "reward_terms": dict(o.terms), **o.facts,
+        }  # fmt: skip
+        return told

@@ -1,0 +1,158 @@
+"""`HostedTask`: a task with rigid bodies; each environment is a `Cell`, a PyBullet world of its own."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from fastrod.errors import HostError
+from fastrod.robot import Robot
+from fastrod.types import Floats, Ints
+from fastrod_envs.options import Options
+from fastrod_envs.randomisation import Randomisation
+from fastrod_envs.task import Field, Outcome, Scenery, Task
+
+
+class Result(NamedTuple):
+    """How a step of one environment went; as `Outcome`, without the robot axis."""
+
+    terms: dict[str, float]
+    distance: float
+    success: bool
+    position: Floats
+    desired: Floats
+    terminated: bool = False
+    contact: bool = False
+    facts: dict[str, float] = {}  # noqa: RUF012: never written to
+
+
+class Cell(ABC):
+    """One environment in a PyBullet world of its own."""
+
+    @abstractmethod
+    def begin(self, draws: Floats, difficulty: float, robot: Robot | None) -> None:
+        """Start an episode from the same state as any other, but for its draws (n_draws,) and the soft robot, where it is another."""
+
+    @abstractmethod
+    def act(self, action: Floats, duration: float) -> None:
+        """Simulate this long [s] with this action (n_actions,), from -1 to 1. Raises `HostError` where the soft robot is lost."""
+
+    @abstractmethod
+    def result(self) -> Result:
+        """How the last step went."""
+
+    @abstractmethod
+    def state(self) -> Floats:
+        """(size of the task's `states`,)"""
+
+    @abstractmethod
+    def goal(self) -> Floats:
+        """(size of the task's `goals`,)"""
+
+    @abstractmethod
+    def baseline(self) -> Floats:
+        """(n_actions,) of the scripted baseline."""
+
+    @abstractmethod
+    def scenery(self) -> Scenery:
+        """What it looks like, for the page; pictures come from PyBullet."""
+
+    @abstractmethod
+    def picture(self, width: int, height: int) -> np.ndarray:
+        """(height, width, 3) uint8."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Disconnect the world."""
+
+
+class HostedTask(Task):
+    """Cells side by side. An episode lasts `duration`, whatever the number of its steps."""
+
+    hosted: ClassVar[bool] = True
+    duration: ClassVar[float]
+    """Of an episode [s]."""
+
+    def __init__(
+        self, n_envs: int, options: Options, robot: Robot, actions: tuple[Field, ...], states: tuple[Field, ...], goals: tuple[Field, ...]
+    ) -> None:
+        """`robot` is the soft robot, before anything of it is randomised."""
+        super().__init__(n_envs, options)
+        self.actions, self.states, self.goals = actions, states, goals
+        self.dt = self.duration / (options.n_steps or self.n_steps)
+        self._random = Randomisation.of(options.randomise)
+        self.base_robot = robot if self._random is None else self._random.base(robot)
+        if self._random is not None:
+            self.total_draws = self.n_draws + self._random.n_draws
+        self.cells: list[Cell] = []
+        for _ in range(n_envs):
+            self.cells.append(self.cell())
+        self._lost = np.zeros(n_envs, bool)
+        self._sane: list[Result | None] = [None] * n_envs
+        self._seen: Floats = np.zeros((n_envs, sum(len(part.low) for part in states)))
+
+    @abstractmethod
+    def cell(self) -> Cell:
+        """A new environment."""
+
+    def begin(self, rows: Ints, draws: Floats) -> None:
+        for i, row in zip(rows, draws, strict=True):
+            robot = None
+            if self._random is not None and self._random.n_draws:
+                robot = self._random.draw(self.base_robot, row[None, self.n_draws :])[0]
+            try:
+                self.cells[i].begin(row[: self.n_draws], self.difficulty, robot)
+            except HostError:  # a world in which the rod is lost is not mended: another takes its place
+                self.cells[i].close()
+                self.cells[i] = self.cell()
+                self.cells[i].begin(row[: self.n_draws], self.difficulty, robot)
+            self._lost[i] = False
+            self._seen[i] = self.cells[i].state()
+            self._sane[i] = self.cells[i].result()
+
+    def act(self, action: Floats) -> None:
+        for i, cell in enumerate(self.cells):
+            try:
+                cell.act(action[i], self.dt)
+                seen = cell.state()
+                if not np.isfinite(seen).all():
+                    raise HostError("the world holds a body that is not anywhere.")
+                self._seen[i], self._sane[i] = seen, cell.result()
+            except HostError:
+                self._lost[i] = True
+
+    def outcome(self) -> Outcome:
+        results = [result for result in self._sane if result is not None]
+
+        def each(values: list[Any]) -> Any:
+            return np.array(values)
+
+        return Outcome(
+            terms={name: each([r.terms[name] for r in results]) for name in results[0].terms},
+            distance=each([r.distance for r in results]), success=each([r.success for r in results]) & ~self._lost,
+            position=each([r.position for r in results]), desired=each([r.desired for r in results]),
+            terminated=each([r.terminated for r in results]), contact=each([r.contact for r in results]), lost=self._lost.copy(),
+            facts={name: each([r.facts[name] for r in results]) for name in results[0].facts},
+        )  # fmt: skip
+
+    def state(self) -> Floats:
+        return self._seen.copy()
+
+    def goal(self) -> Floats:
+        return np.array([cell.goal() for cell in self.cells])
+
+    def baseline(self) -> Floats:
+        return np.clip(np.array([cell.baseline() for cell in self.cells]), -1.0, 1.0)
+
+    def scenery(self, i: int) -> Scenery:
+        return self.cells[i].scenery()
+
+    def picture(self, i: int, width: int, height: int) -> np.ndarray | None:
+        return self.cells[i].picture(width, height)
+
+    def close(self) -> None:
+        for cell in self.cells:
+            cell.close()
+        self.cells = []

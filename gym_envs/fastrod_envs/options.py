@@ -1,0 +1,59 @@
+"""What every task can be told: length of an episode, what is observed, what an action is, what differs from robot to robot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args
+
+from fastrod.errors import InputError, nearest
+from fastrod.robot import Robot
+from fastrod_envs.randomisation import Randomisation
+
+Observation = Literal["state", "goal"]
+Action = Literal["rate", "displacement"]
+Made = TypeVar("Made", bound="Options")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Keyword arguments of `gymnasium.make` and `make_vec`, the same for every task; some tasks have more."""
+
+    n_steps: int | None = None
+    """Steps of an episode; 1 is the paper's bandit, None the task's own number."""
+    observation: Observation = "state"
+    """`state`: goal, robot and scene; `goal`: the goal alone, as in the paper."""
+    action: Action = "rate"
+    """`rate`: how fast tendons are displaced; `displacement`: where they go, at once (the paper's)."""
+    randomise: Randomisation | Robot | str | Path | Mapping[str, Any] | None = None
+    """What differs from episode to episode in the robot's parameters and effects (`Randomisation`): a robot file, such as an
+    identified.toml, or a mapping of names to ranges."""
+    difficulty: float = 1.0
+    """From 0, all goals are the easiest, to 1, the whole task; `set_difficulty` changes it between episodes (curriculum)."""
+    threads: int | None = None
+    """Of the simulator; None is numba's number."""
+
+    def __post_init__(self) -> None:
+        if self.n_steps is not None and (not isinstance(self.n_steps, int) or isinstance(self.n_steps, bool) or self.n_steps < 1):
+            raise InputError(f"n_steps is {self.n_steps!r}; it must be a whole number, at least 1, or None for the task's own.")
+        for name, kinds in (("observation", get_args(Observation)), ("action", get_args(Action))):
+            if getattr(self, name) not in kinds:
+                raise InputError(f"{name} is {getattr(self, name)!r}; it must be {' or '.join(map(repr, kinds))}.")
+        checked_difficulty(self.difficulty)
+
+    @classmethod
+    def read(cls: type[Made], given: Mapping[str, Any]) -> Made:
+        """Options from keyword arguments. Raises `InputError` with the nearest name."""
+        known = [field.name for field in fields(cls)]
+        for name in given:
+            if name not in known:
+                raise InputError(f"no option {name!r}; {nearest(name, known)}")
+        return cls(**given)
+
+
+def checked_difficulty(level: float) -> float:
+    """A level from 0 to 1, or `InputError`."""
+    if not isinstance(level, (int, float)) or not 0.0 <= level <= 1.0:
+        raise InputError(f"difficulty is {level!r}; it must be a number from 0 to 1.")
+    return float(level)

@@ -1,0 +1,161 @@
+"""`Page`: the first environments of a task side by side in a browser, with viser."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+import socket
+import sys
+from typing import Any, final
+
+import numpy as np
+
+from fastrod.errors import InputError
+from fastrod.types import Floats
+from fastrod_envs.painter import ball_mesh, tube_mesh
+from fastrod_envs.task import Scenery, Task
+
+SHOWN = 16
+"""Environments that are shown, at most."""
+_HOST, _PORT, _TRIES = "127.0.0.1", 8080, 20
+_STILL = 1e-7  # m: what has moved by less is not sent again
+_LAMPS = (("key", (1.0, -1.6, 2.2), 1.5), ("fill", (-1.8, 0.8, 0.9), 0.6))
+
+
+@final
+class Page:
+    """A viser server on 127.0.0.1, on the first free port from 8080 on; its address goes to stderr once."""
+
+    def __init__(self, task: Task) -> None:
+        """Raises `InputError` where viser is missing, or no port is free."""
+        try:
+            import viser
+        except ImportError as error:
+            raise InputError("render_mode 'viser' needs viser; pip install fastrod[viewer] brings it.") from error
+        with contextlib.redirect_stdout(io.StringIO()):  # it greets with a box
+            self._server = viser.ViserServer(host=_HOST, port=_free_port(), label=f"fastrod {task.name}", verbose=False)
+        self.address = f"http://{_HOST}:{self._server.get_port()}"
+        """Of the page."""
+        self._drawn: dict[str, tuple[Any, Floats]] = {}
+        first = task.scenery(0)
+        self._places = _places(min(task.n_envs, SHOWN), _extent(first))
+        self._furnish(first)
+        self.update(task)
+        print(f"{task.name}: {self.address}", file=sys.stderr, flush=True)
+
+    def update(self, task: Task) -> None:
+        """Show the environments as they are now."""
+        scenes = [task.scenery(i) for i in range(len(self._places))]
+        with self._server.atomic():
+            names = {name for i, scenery in enumerate(scenes) for name in self._draw(f"/env{i}", scenery)}
+            for name in set(self._drawn) - names:
+                self._drawn.pop(name)[0].remove()
+        self._server.flush()
+
+    def close(self) -> None:
+        """Stop the server."""
+        with contextlib.redirect_stdout(io.StringIO()):
+            self._server.stop()
+
+    def _furnish(self, scenery: Scenery) -> None:
+        """Light, a floor, a frame for every environment, and from where one looks."""
+        scene, self._server.initial_camera.fov = self._server.scene, math.radians(45.0)
+        self._server.gui.configure_theme(show_logo=False, show_share_button=False)
+        scene.set_up_direction("+z")
+        scene.world_axes.visible = False
+        scene.configure_environment_map(None)
+        scene.configure_default_lights(False)
+        scene.add_light_hemisphere("/lights/sky", sky_color=(255, 255, 255), ground_color=(205, 208, 216), intensity=1.9)
+        for name, place, intensity in _LAMPS:
+            scene.add_light_directional(f"/lights/{name}", position=place, intensity=intensity)
+        width = 4.0 * math.ceil(1.0 + float(np.abs(self._places).max()))
+        scene.add_grid(
+            "/floor", width=width, height=width, plane="xy", cell_size=0.1, section_size=0.5, cell_color=(226, 229, 235),
+            section_color=(196, 202, 212), shadow_opacity=0.0,
+        )  # fmt: skip
+        for i, place in enumerate(self._places):
+            scene.add_frame(f"/env{i}", show_axes=False, position=place)
+        eye, target = np.array(scenery.eye), np.array(scenery.target)
+        away = eye - target
+        back = 1.0 + 1.2 * float(np.ptp(self._places, axis=0).max()) / max(float(np.linalg.norm(away)), 1e-9)
+        self._server.initial_camera.position, self._server.initial_camera.look_at = target + back * away, target
+
+    def _draw(self, at: str, scenery: Scenery) -> list[str]:
+        """Everything of one environment; the names it has in the page."""
+        names = []
+        for i, tube in enumerate(scenery.tubes):
+            names.append(f"{at}/tube{i}")
+            self._mesh(names[-1], *tube_mesh(tube.points, tube.radius, 16), tube.color, 1.0, flat=False)
+        for i, ball in enumerate(scenery.balls):
+            names.append(f"{at}/ball{i}")
+            mesh = ball_mesh()
+            self._mesh(names[-1], np.asarray(ball.position) + ball.radius * mesh.vertices, mesh.faces, ball.color, 1.0, flat=False)
+        for i, solid in enumerate(scenery.solids):
+            names.append(f"{at}/solid{i}")
+            self._mesh(names[-1], solid.vertices, solid.faces, solid.color, solid.opacity, flat=True)
+        for i, line in enumerate(scenery.lines):
+            names.append(f"{at}/line{i}")
+            points = np.asarray(line.points, float)
+            self._line(names[-1], np.stack([points[:-1], points[1:]], axis=1), line.color)
+        return names
+
+    def _mesh(self, name: str, vertices: Floats, faces: Any, color: tuple[float, ...], opacity: float, *, flat: bool) -> None:
+        handle = self._known(name, vertices)
+        if handle is None:
+            handle = self._server.scene.add_mesh_simple(
+                name, np.asarray(vertices, np.float32), np.asarray(faces, np.uint32), color=_bytes(color),
+                opacity=None if opacity >= 1.0 else opacity, flat_shading=flat, side="double", cast_shadow=False, receive_shadow=False,
+            )  # fmt: skip
+        elif np.abs(self._drawn[name][1] - vertices).max() > _STILL:
+            handle.vertices = np.asarray(vertices, np.float32)
+        else:
+            return
+        self._drawn[name] = handle, np.array(vertices)
+
+    def _line(self, name: str, pairs: Floats, color: tuple[float, ...]) -> None:
+        handle = self._known(name, pairs)
+        if handle is None:
+            handle = self._server.scene.add_line_segments(name, np.asarray(pairs, np.float32), _bytes(color), thickness=0.004)
+        elif np.abs(self._drawn[name][1] - pairs).max(initial=0.0) > _STILL:
+            handle.points = np.asarray(pairs, np.float32)
+        else:
+            return
+        self._drawn[name] = handle, np.array(pairs)
+
+    def _known(self, name: str, points: Floats) -> Any:
+        """What is drawn under this name, if it has as many points."""
+        handle, before = self._drawn.get(name, (None, np.zeros(0)))
+        return handle if before.shape == np.shape(points) else None
+
+
+def _bytes(color: tuple[float, ...]) -> tuple[int, int, int]:
+    red, green, blue = (round(255.0 * part) for part in color)
+    return red, green, blue
+
+
+def _extent(scenery: Scenery) -> float:
+    """Width of a square around an environment, from above [m]."""
+    parts = [t.points for t in scenery.tubes] + [s.vertices for s in scenery.solids] + [line.points for line in scenery.lines]
+    parts += [np.asarray(ball.position)[None] for ball in scenery.balls]
+    points = np.concatenate([np.asarray(part, float)[:, :2] for part in parts])
+    lengths = [float(np.linalg.norm(np.diff(tube.points, axis=0), axis=1).sum()) for tube in scenery.tubes]
+    return float(max([np.ptp(points, axis=0).max(), *lengths])) + 0.2  # a rod may lie down
+
+
+def _places(n: int, width: float) -> Floats:
+    """(n, 3) middles of squares of this width, around the origin [m]."""
+    columns = math.ceil(math.sqrt(n))
+    i = np.arange(n)
+    places = width * np.stack([i % columns, i // columns, np.zeros(n)], axis=1)
+    return np.asarray(places - 0.5 * (places.min(0) + places.max(0)))
+
+
+def _free_port() -> int:
+    """The first from 8080 on. Raises `InputError`."""
+    for port in range(_PORT, _PORT + _TRIES):
+        with socket.socket() as probe, contextlib.suppress(OSError):
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((_HOST, port))
+            return port
+    raise InputError(f"ports {_PORT} to {_PORT + _TRIES - 1} are all in use on {_HOST}; close a page to free one.")

@@ -1,0 +1,73 @@
+"""`Policy`: what `fastrod train` writes and what ships with the package, loaded and asked."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from fastrod.errors import InputError
+from fastrod.types import Floats
+from fastrod_envs.registration import name_of
+from fastrod_envs.training import CHECKPOINT, CONFIG, POLICY, Plan, algorithm_class, read_config
+from fastrod_envs.vector import BatchEnv
+
+SHIPPED = "shipped"
+
+
+def shipped() -> tuple[str, ...]:
+    """Names of the tasks whose trained policy comes with the package."""
+    folder = files("fastrod_envs") / "trained"
+    return tuple(sorted(entry.name for entry in folder.iterdir() if (entry / POLICY).is_file())) if folder.is_dir() else ()
+
+
+def find(env: str, given: str) -> Path:
+    """The folder of a policy: one that `fastrod train` wrote (or a policy.zip in it), or `shipped` for the one that comes with the package.
+    Raises `InputError`."""
+    path = Path(given)
+    if given == SHIPPED:
+        name = name_of(env)
+        if name not in shipped():
+            raise InputError(f"no policy is shipped for {env!r}; there are those of {', '.join(shipped()) or 'none'}.")
+        return Path(str(files("fastrod_envs") / "trained" / name))
+    folder = path.parent if path.suffix == ".zip" else path
+    if not (folder / CONFIG).is_file():
+        raise InputError(f"{given!r} holds no policy; give the folder that `fastrod train` wrote, or 'shipped'.")
+    return folder
+
+
+@final
+class Policy:
+    """A trained policy without its noise."""
+
+    def __init__(self, folder: Path) -> None:
+        """Raises `InputError` where the folder holds neither policy nor checkpoint."""
+        self.plan: Plan = read_config(folder)[0]
+        path = next((folder / name for name in (POLICY, CHECKPOINT) if (folder / name).is_file()), None)
+        if path is None:
+            raise InputError(f"{str(folder)!r} holds no {POLICY}; the training has not written one yet.")
+        try:
+            self._model: Any = algorithm_class(self.plan.algorithm).load(path, device="cpu")
+        except (ValueError, KeyError, OSError, RuntimeError) as error:
+            raise InputError(f"{str(path)!r} is no policy of stable-baselines3 that can be read: {error}") from error
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Options of the environment on which its observations and actions depend."""
+        return {name: self.plan.options[name] for name in ("observation", "action", "n_steps", "grip") if name in self.plan.options}
+
+    def check(self, env: BatchEnv) -> None:
+        """Raises `InputError` where the policy was trained for other observations or actions."""
+        wanted, given = self._model.observation_space, env.single_observation_space
+        if wanted.shape != given.shape or self._model.action_space.shape != env.single_action_space.shape:
+            raise InputError(
+                f"the policy was trained on {self.plan.env} with observations {wanted.shape} and actions {self._model.action_space.shape}; "
+                f"here they are {given.shape} and {env.single_action_space.shape}."
+            )
+
+    def act(self, observation: Floats | np.ndarray) -> Floats:
+        """(n, n_actions) from -1 to 1."""
+        actions, _ = self._model.predict(observation, deterministic=True)
+        return np.asarray(actions, dtype=float)

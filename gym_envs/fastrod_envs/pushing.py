@@ -1,0 +1,435 @@
+"""A soft robot pushes a cube over a floor: what Push and QuadrupedPush share."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, final
+
+import numpy as np
+
+from fastrod.errors import HostError, InputError
+from fastrod.hosts.bodies import RodBodies
+from fastrod.hosts.bullet import Bullet, connect
+from fastrod.hosts.camera import Camera
+from fastrod.hosts.link import from_xyzw
+from fastrod.robot import Robot
+from fastrod.rotation import matrix_from_quaternion
+from fastrod.segments import SegmentActions
+from fastrod.simulator import Simulator
+from fastrod.state import State
+from fastrod.types import Floats
+from fastrod_envs.hosted import Cell, HostedTask, Result
+from fastrod_envs.options import Options
+from fastrod_envs.rodtask import resolved
+from fastrod_envs.shapes import box_mesh
+from fastrod_envs.task import Ball, Field, Scenery, Solid, Tube
+
+ACCURACY = 0.02
+"""Of the cube's place [m]."""
+SPEED = 0.15
+"""Of the baseline's tip, the largest [m/s]."""
+TIME = 0.2
+"""In which it covers what is left [s]."""
+_STEP = 0.1  # s, the longest of the rod
+_WITHIN = 10  # steps of the world in one of the rod
+_ON_BAR, _ON_FLOOR = 1.0, 0.25  # friction of the cube
+_POINTS = 4  # of a segment
+_CAPSULES = 2
+_STRIDE = _POINTS // _CAPSULES
+_NEAR = 0.1  # m, the longest vector to the goal in an observation
+_AROUND = 0.15  # m, the longest vector to the cube
+_AWAY = 0.6  # m, no cube is pushed farther
+_SHIFT, _TURN = 0.01, 0.1  # m and rad, the most by which the cube begins elsewhere
+_MOST = 1.0  # N that a robot feels: a bar that jams the cube against the floor would exert any force
+_AT_REST = 1e-5  # m, residual of a robot that counts as at rest
+_PASSES = 8
+_FASTEST = 0.3  # m/s, no tip moves faster
+_ROD, _BAR, _CUBE, _GOAL = (0.9, 0.55, 0.15), (0.35, 0.35, 0.38), (0.2, 0.45, 0.8), (0.85, 0.2, 0.15)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PushOptions(Options):
+    """Of Push and QuadrupedPush."""
+
+    feels: bool = True
+    """What the cube exerts on the bar bends the robot in its next step; False: the bar moves as if nothing were there."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not isinstance(self.feels, bool):
+            raise InputError(f"feels is {self.feels!r}; it must be True or False.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Course:
+    """Where a robot pushes which cube, and where to."""
+
+    robot: Robot
+    """Carries the bar at its tip, along its d2."""
+    width: float
+    """Of the bar, without its round ends [m]."""
+    thickness: float
+    """Radius of the bar [m]."""
+    size: float
+    """Edge of the cube [m]."""
+    mass: float
+    """Of the cube [kg]."""
+    place: tuple[float, float]
+    """Middle of the cube at first, x and y, world [m]."""
+    least: tuple[float, float]
+    """Corner of the goals' rectangle, x and y, world [m]."""
+    largest: tuple[float, float]
+    """The other corner."""
+    gap: float
+    """Between bar and cube at first [m]."""
+    bend: float
+    """Largest of a segment [rad]."""
+    steepness: float
+    """k of the reward exp(-k d^2) [1/m^2]."""
+
+    @property
+    def height(self) -> float:
+        """At which the bar pushes: half as high as the cube [m]."""
+        return 0.5 * self.size
+
+    @property
+    def behind(self) -> float:
+        """From the cube's middle to a tip whose bar touches it straight behind [m]."""
+        return 0.5 * self.size + self.thickness
+
+
+@final
+class Drive:
+    """Three numbers for all segments alike: extension, bends toward d1 and d2 as displacements [m]."""
+
+    def __init__(self, robot: Robot, bend: float) -> None:
+        """`bend`: the largest of a segment, each way [rad]."""
+        self.actions = SegmentActions(robot)
+        n, offset = robot.n_segments, self.actions.offset
+        self.spread: Floats = np.zeros((3 * n, 3))
+        """(3 n_segments, 3) displacements of the segments by these numbers."""
+        for k in range(3):
+            self.spread[k::3, k] = 1.0
+        short, long = (f(segment.extension[i] for segment in robot.segments) for f, i in ((max, 0), (min, 1)))
+        side = bend * float(offset.min())
+        self.low: Floats = np.array([short, -side, -side])
+        """(3,) [m]"""
+        self.high: Floats = np.array([long, side, side])
+        """(3,) [m]"""
+        self.rate: Floats = np.array([0.06, 0.5 * float(offset.min()), 0.5 * float(offset.min())])
+        """(3,) the largest rate [m/s]: half a radian a second in each segment."""
+
+    def inputs(self, q: Floats) -> Any:
+        """Of the simulator for these numbers (3,)."""
+        return self.actions.inputs(self.spread @ q)
+
+    def jacobian(self, simulator: Simulator) -> Floats:
+        """(3, 3) d(tip)/d(these numbers), world; zero where the rod's is not known."""
+        return np.asarray(np.nan_to_num(simulator.jacobian()[0, :3] @ self.actions.matrix) @ self.spread)
+
+    def posture(self, q: Floats) -> Floats:
+        """(3,) from -1, the least, to 1, the largest."""
+        return np.asarray((2.0 * q - self.low - self.high) / (self.high - self.low))
+
+    def placed(self, posture: Floats) -> Floats:
+        """(3,) of a posture from -1 to 1."""
+        return np.asarray(0.5 * (self.low + self.high) + 0.5 * (self.high - self.low) * posture)
+
+    def reach(self, simulator: Simulator, tip: Floats) -> Floats:
+        """(3,) with which the tip of a simulated robot is there, world [m], by Newton's method."""
+        q = self.placed(np.zeros(3))
+        for _ in range(30):
+            at = simulator.settle(**self.inputs(q)).tip_position[0]
+            off = tip - at
+            q = np.clip(q + np.linalg.solve(self.jacobian(simulator), np.clip(off, -0.05, 0.05)), self.low, self.high)
+        if np.abs(off).max() > 1e-4:
+            raise InputError(f"robot {simulator.robots[0].name!r} does not reach {tip.round(3).tolist()} m, where its tip is to begin.")
+        return q
+
+
+@final
+class PushCell(Cell):
+    """A cube on a floor, a soft robot with a bar at its tip on a base that stands still, and a goal. The world is built anew for every
+    episode: nothing is left of the one before."""
+
+    def __init__(self, course: Course, robot: Robot, options: PushOptions, duration: float, backdrop: Callable[[], Bullet]) -> None:
+        """`robot` before it is randomised; `duration` of an environment step [s]; `backdrop` makes the world in which pictures are taken."""
+        self.course, self.options, self._backdrop = course, options, backdrop
+        self._n = max(1, math.ceil(duration / _STEP - 1e-9))
+        self._dt = duration / self._n
+        self.drive = Drive(robot, course.bend)
+        self._own = self._simulator(robot)
+        self.home = self.drive.reach(self._own, np.array([course.place[0] - course.behind - course.gap, course.place[1], course.height]))
+        """(3,) of `Drive` at the start of an episode."""
+        self._own.reset()
+        self._own.settle(**self.drive.inputs(self.home), **_load(np.zeros(6)), tolerance=_AT_REST)
+        self._rest = self._own.snapshot()
+        self.simulator = self._own
+        self.world = connect(dt=self._dt / _WITHIN)
+        self._studio: Bullet | None = None
+        self._tube: RodBodies
+        self._bar: RodBodies
+        self._cube_body = -1
+        self.q: Floats = self.home
+        """(3,) of `Drive`."""
+        self.desired: Floats = np.zeros(2)
+        """(2,) goal of the cube, world [m]."""
+        self.felt: Floats = np.zeros(6)
+        """Force of the cube on the bar [N] and its moment about the tip [N m], world: of the last step and, by half, of those before."""
+        self.touched = False
+        """The robot met the cube in this episode."""
+
+    def begin(self, draws: Floats, difficulty: float, robot: Robot | None) -> None:
+        course = self.course
+        least, largest = np.array(course.least), np.array(course.largest)
+        self.desired = 0.5 * (least + largest) + difficulty * (draws[:2] - 0.5) * (largest - least)
+        self.q, self.felt, self.touched = self.home.copy(), np.zeros(6), False
+        if robot is None:
+            self.simulator = self._own
+            self.simulator.restore(self._rest)
+        else:
+            self.simulator = self._simulator(robot)
+            self._settled(passes=0)
+        self._build(np.array(course.place) + _SHIFT * (2.0 * draws[2:4] - 1.0), _TURN * (2.0 * draws[4] - 1.0))
+
+    def act(self, action: Floats, duration: float) -> None:
+        drive = self.drive
+        if self.options.action == "rate":
+            there = self.q + duration * drive.rate * action
+        else:
+            there = self.q + np.clip(drive.placed(action) - self.q, -duration * drive.rate, duration * drive.rate)
+        there = np.clip(there, drive.low, drive.high)
+        for left in range(self._n, 0, -1):
+            self.q = self._clear(self.q + (there - self.q) / left)
+            self._move(self._settled())
+
+    def result(self) -> Result:
+        position = self._cube()[0]
+        desired = np.array([*self.desired, 0.5 * self.course.size])
+        d = float(np.hypot(*(position - desired)[:2]))
+        terms = {"reach": math.exp(-self.course.steepness * d**2), "touch": 0.5 * self.touched}
+        return Result(terms, d, d < ACCURACY, position, desired, facts={"touched": float(self.touched)})
+
+    def state(self) -> Floats:
+        position, rotation = self._cube()
+        turn = 4.0 * math.atan2(rotation[1, 0], rotation[0, 0])
+        cube, tip = position[:2], self.tip
+        to_goal, to_cube = _at_most(self.desired - cube, _NEAR), _at_most(cube - tip[:2], _AROUND)
+        return np.array(
+            [*self.desired, *cube, math.cos(turn), math.sin(turn), *tip, *to_goal, *to_cube, *self.drive.posture(self.q), self.touched]
+        )
+
+    def goal(self) -> Floats:
+        return self.desired
+
+    def baseline(self) -> Floats:
+        """Straight along the way that the cube has to go, slower as it comes near; the cube stays on the bar. The bar keeps its height."""
+        drive, way = self.drive, self.desired - self._cube()[0][:2]
+        d = float(np.hypot(*way))
+        velocity = np.array([*(way * min(SPEED / max(d, 1e-9), 1.0 / TIME)), (self.course.height - self.tip[2]) / TIME])
+        jacobian = drive.jacobian(self.simulator) * drive.rate
+        rates = resolved(jacobian[None], velocity[None], np.zeros((1, 3)))[0]
+        if self.options.action == "rate":
+            return rates
+        return drive.posture(self.q + self._n * self._dt * drive.rate * rates)
+
+    def scenery(self) -> Scenery:
+        position, rotation = self._cube()
+        vertices, faces = box_mesh([self.course.size] * 3, position.tolist(), rotation)
+        points = self.simulator.state.position[0]
+        neck = Tube(points, self._own.robots[0].segments[0].body_radius or self.course.thickness, _ROD)
+        bar = Tube(_bar_nodes(self.course, self.simulator.state)[0], self.course.thickness, _BAR)
+        goal = np.array([*self.desired, 0.5 * self.course.size])
+        eye, target = self._view()
+        return Scenery(
+            tubes=(neck, bar), solids=(Solid(vertices, faces, _CUBE),),
+            balls=(Ball(goal, 0.012, _GOAL),), eye=eye, target=target,
+        )  # fmt: skip
+
+    def picture(self, width: int, height: int) -> np.ndarray:
+        course = self.course
+        if self._studio is None:
+            self._studio = self._backdrop()
+        studio, (position, _) = self._studio, self._cube()
+        tube, bar = _bodies(studio, course, self._own.robots[0])
+        _place(course, self.simulator.state, tube, bar)
+        turn = self.world.getBasePositionAndOrientation(self._cube_body)[1]
+        box = studio.createVisualShape(studio.GEOM_BOX, halfExtents=[0.5 * course.size] * 3, rgbaColor=[*_CUBE, 1.0])
+        disc = studio.createVisualShape(studio.GEOM_CYLINDER, radius=0.02, length=0.002, rgbaColor=[*_GOAL, 1.0])
+        shown = [
+            studio.createMultiBody(0.0, -1, box, position.tolist(), turn),
+            studio.createMultiBody(0.0, -1, disc, [*self.desired, 0.001]),
+        ]
+        eye, target = self._view()
+        picture = Camera(width=width, height=height, fov=45.0).look(studio, eye, target).rgb
+        tube.remove()
+        bar.remove()
+        for body in shown:
+            studio.removeBody(body)
+        return picture
+
+    def close(self) -> None:
+        for world in (self.world, self._studio):
+            if world is not None and world.isConnected():
+                world.disconnect()
+
+    @property
+    def tip(self) -> Floats:
+        """(3,) world [m]."""
+        return np.asarray(self.simulator.state.tip_position[0])
+
+    def _cube(self) -> tuple[Floats, Floats]:
+        """Middle (3,) and rotation (3, 3) of the cube."""
+        position, quaternion = self.world.getBasePositionAndOrientation(self._cube_body)
+        return np.array(position), matrix_from_quaternion(from_xyzw(quaternion)[None])[0]
+
+    def _view(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+        x, y = 0.5 * (np.array(self.course.place) + np.array(self.course.largest))
+        return (x + 0.35, y - 0.85, 0.55), (x - 0.1, 0.0, 0.12)
+
+    def _simulator(self, robot: Robot) -> Simulator:
+        return Simulator(robot, dt=self._dt, points_per_segment=_POINTS, threads=1)
+
+    def _build(self, place: Floats, turn: float) -> None:
+        """The world with the cube there [m], turned about z [rad], and the robot as it is."""
+        world, course = self.world, self.course
+        world.resetSimulation()
+        world.setGravity(0.0, 0.0, -9.81)
+        world.setTimeStep(self._dt / _WITHIN)
+        world.setPhysicsEngineParameter(deterministicOverlappingPairs=1)
+        half = [0.5 * course.size] * 3
+        ground = world.createMultiBody(0.0, world.createCollisionShape(world.GEOM_BOX, halfExtents=[5.0, 5.0, 0.5]), -1, [0.0, 0.0, -0.5])
+        box = world.createCollisionShape(world.GEOM_BOX, halfExtents=half)
+        turned = [0.0, 0.0, math.sin(0.5 * turn), math.cos(0.5 * turn)]
+        self._cube_body = int(world.createMultiBody(course.mass, box, -1, [*place, half[0]], turned))
+        self._tube, self._bar = _bodies(world, course, self._own.robots[0])
+        world.changeDynamics(self._cube_body, -1, lateralFriction=1.0, linearDamping=0.0, angularDamping=0.0)
+        world.changeDynamics(ground, -1, lateralFriction=_ON_FLOOR)  # PyBullet multiplies the two
+        for body in (*self._tube.ids, *self._bar.ids):
+            world.changeDynamics(body, -1, lateralFriction=_ON_BAR)
+        _place(course, self.simulator.state, self._tube, self._bar)
+
+    def _move(self, state: State) -> None:
+        """Bring the bodies there within a step of the rod, and note what the bar feels."""
+        self._tube.head_for(state.position[0, ::_STRIDE], state.rotation[0, ::_STRIDE], self._dt)
+        self._bar.head_for(*_bar_nodes(self.course, state), self._dt)
+        total, tip = np.zeros(6), state.tip_position[0]
+        for _ in range(_WITHIN):
+            self.world.stepSimulation()
+            for contact in self.world.getContactPoints(self._bar.ids[0], self._cube_body):
+                normal, size, first, along, second, across = (np.array(contact[k]) for k in (7, 9, 10, 11, 12, 13))
+                force = size * normal - first * along - second * across
+                total += np.concatenate([force, np.cross(np.array(contact[5]) - tip, force)])
+        met = {body for contact in self.world.getContactPoints(self._cube_body) for body in contact[1:3]}
+        self.touched = self.touched or bool(total.any()) or not met.isdisjoint(self._tube.ids)
+        if self.options.feels:
+            mean = 0.5 * (self.felt + total / _WITHIN)
+            self.felt = mean * (_MOST / max(float(np.linalg.norm(mean[:3])), _MOST))
+        _place(self.course, state, self._tube, self._bar)
+
+    def _settled(self, passes: int = _PASSES) -> State:
+        """The robot at rest under what it feels, or `HostError`. A few `passes` get there from the step before; not with effects, for
+        which each is a step in time."""
+        inputs = {**self.drive.inputs(self.q), **_load(self.felt)}
+        for _ in range(0 if self._own.robots[0].effects else passes):
+            state = self.simulator.step(**inputs)
+            if state.ok[0] and state.residual[0] < _AT_REST:
+                break
+        else:
+            state = self.simulator.settle(**inputs, tolerance=_AT_REST)
+        if not state.ok[0] or not np.isfinite(state.position).all():
+            raise HostError(f"the rod is lost: {state.problems.get(0, 'its shape is not finite')}")
+        return state
+
+    def _clear(self, q: Floats) -> Floats:
+        """Numbers near these with which the bar does not enter the floor."""
+        lowest = self.course.height - 0.01
+        if self.tip[2] > lowest + _FASTEST * self._dt:
+            return q
+        rise = self.drive.jacobian(self.simulator)[2]
+        lacks = lowest - self.tip[2] - float(rise @ (q - self.q))
+        if lacks <= 0.0:
+            return q
+        by = self.drive.rate**2 * rise
+        return np.clip(q + lacks / max(float(rise @ by), 1e-12) * by, self.drive.low, self.drive.high)
+
+
+class PushTask(HostedTask):
+    """What Push and QuadrupedPush share: three numbers move the tip, the cube goes where it is pushed."""
+
+    options_class: ClassVar[type[Options]] = PushOptions
+    n_steps: ClassVar[int] = 40
+    n_draws: ClassVar[int] = 5
+    accuracy: ClassVar[float] = ACCURACY
+    duration: ClassVar[float] = 4.0
+
+    def __init__(self, n_envs: int, options: Options, course: Course) -> None:
+        self.course = course
+        drive = Drive(course.robot, course.bend)
+        low, high, what = (-drive.rate, drive.rate, "rate of the") if options.action == "rate" else (drive.low, drive.high, "")
+        unit = "m/s" if options.action == "rate" else "m"
+        names = "extension, displacements toward d1 and d2 of every segment alike"
+        actions = (Field("displacement", unit, tuple(low), tuple(high), f"{what} {names}".strip()),)
+        foot, far = np.array(course.robot.base_position), 1.5 * course.robot.length
+        goal = Field("goal", "m", course.least, course.largest, "where the cube is to be, x and y, world")
+        states = (
+            goal,
+            Field("cube", "m", *(tuple(np.array(course.place) + s * _AWAY) for s in (-1, 1)), "its middle, x and y, world"),
+            Field(
+                "turn",
+                "",
+                (-1.0,) * 2,
+                (1.0,) * 2,
+                "cosine and sine of four times the cube's angle about z: a quarter turn changes nothing",
+            ),
+            Field("tip", "m", tuple(foot - far), tuple(foot + far), "of the robot, world"),
+            Field("error", "m", (-_NEAR,) * 2, (_NEAR,) * 2, f"from cube to goal, x and y, at most {_NEAR:g} m of it"),
+            Field("way", "m", (-_AROUND,) * 2, (_AROUND,) * 2, f"from tip to cube, x and y, at most {_AROUND:g} m of it"),
+            Field("posture", "", (-1.0,) * 3, (1.0,) * 3, "displacements, from their least to their largest"),
+            Field("touched", "", (0.0,), (1.0,), "the robot has touched the cube in this episode"),
+        )
+        super().__init__(n_envs, options, course.robot, actions, states, (goal,))
+
+    @abstractmethod
+    def backdrop(self) -> Bullet:
+        """A world for pictures, without robot and cube."""
+
+    def cell(self) -> Cell:
+        options = self.options
+        assert isinstance(options, PushOptions)
+        return PushCell(self.course, self.base_robot, options, self.dt, self.backdrop)
+
+
+def longer(robot: Robot, length: float, extension: tuple[float, float]) -> Robot:
+    """A robot whose segments have this length and extension [m]."""
+    return replace(robot, segments=tuple(replace(segment, length=length, extension=extension) for segment in robot.segments))
+
+
+def _load(wrench: Floats) -> dict[str, Floats]:
+    return {"tip_force": wrench[:3], "tip_moment": wrench[3:]}
+
+
+def _bodies(world: Bullet, course: Course, robot: Robot) -> tuple[RodBodies, RodBodies]:
+    """Of the robot and its bar."""
+    radii = [segment.body_radius or course.thickness for segment in robot.segments for _ in range(_CAPSULES)]
+    tube = RodBodies(world, robot.length, radii, len(radii), color=(*_ROD, 1.0))
+    return tube, RodBodies(world, course.width, course.thickness, 1, color=(*_BAR, 1.0))
+
+
+def _bar_nodes(course: Course, state: State) -> tuple[Floats, Floats]:
+    """Ends (2, 3) of the bar and the tip's rotation at both (2, 3, 3)."""
+    tip, rotation = state.tip_position[0], state.tip_rotation[0]
+    return tip + 0.5 * course.width * np.array([-rotation[:, 1], rotation[:, 1]]), np.array([rotation, rotation])
+
+
+def _place(course: Course, state: State, tube: RodBodies, bar: RodBodies) -> None:
+    tube.place(state.position[0, ::_STRIDE], state.rotation[0, ::_STRIDE])
+    bar.place(*_bar_nodes(course, state))
+
+
+def _at_most(vector: Floats, longest: float) -> Floats:
+    return np.asarray(vector * (longest / max(float(np.hypot(*vector)), longest)))
+

@@ -1,0 +1,192 @@
+"""`RodTask`: a task of rods alone, all of them robots of one simulator."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fastrod.contact import ContactScene
+from fastrod.robot import Robot
+from fastrod.rotation import matrix_from_quaternion
+from fastrod.segments import SegmentActions
+from fastrod.simulator import Simulator
+from fastrod.types import Flags, Floats, Ints
+from fastrod_envs.options import Options
+from fastrod_envs.randomisation import Randomisation
+from fastrod_envs.task import Field, Task, Tube
+
+_FAR = 2.0  # of the robot's length: no tip is farther from its base
+
+
+class RodTask(Task):
+    """Robots driven by the displacements of their segments (`SegmentActions`): all at home when an episode begins.
+
+    `action="rate"`: an action is the displacements' rate, as a part of the largest; one observer pass a step. `"displacement"`: it is
+    where they go, at once, from the least to the largest, and the rod settles there.
+    """
+
+    points_per_segment: ClassVar[int]
+    outputs: ClassVar[Any] = "tip"
+    hold_gain: ClassVar[float] = 5e-5
+    """`Simulator(hold_gain=...)` [m]."""
+    loaded: ClassVar[bool] = False
+    """An episode brings loads of its own: robots settle under them when it begins."""
+
+    def __init__(
+        self, n_envs: int, options: Options, robot: Robot, *, driven: ArrayLike, limit: ArrayLike, rate: ArrayLike,
+        home: ArrayLike | None = None, contact: ContactScene | None = None, feel_contact: bool = True,
+    ) -> None:  # fmt: skip
+        """`driven` are the driven numbers among the robot's 3 n_segments, `limit` (n_driven, 2) their range [m], `rate` (n_driven,) [m/s]
+        their largest rate, `home` (n_driven,) where they begin [m]. `contact` and `feel_contact` as in `Simulator`."""
+        super().__init__(n_envs, options)
+        self._random = Randomisation.of(options.randomise)
+        self.base_robot = robot if self._random is None else self._random.base(robot)
+        self._varies = self._random is not None and self._random.n_draws > 0
+        if self._varies and self._random is not None:
+            self.total_draws = self.n_draws + self._random.n_draws
+        self._actions = SegmentActions(self.base_robot)
+        self.driven = np.asarray(driven, np.int64)
+        self._low, self._high = np.asarray(limit, float).T
+        self._rate = np.asarray(rate, float)
+        self.home: Floats = np.zeros(len(self.driven)) if home is None else np.asarray(home, float)
+        """(n_driven,) displacements at the start of an episode [m]."""
+        rate_mode = options.action == "rate"
+        unit, reach = ("m/s", (-self._rate, self._rate)) if rate_mode else ("m", (self._low, self._high))
+        about = "rate of the displacements" if rate_mode else "displacements"
+        names = ", ".join(f"{k // 3 + 1}{'eab'[k % 3]}" for k in self.driven)
+        self.actions = (
+            Field(
+                "displacement", unit, tuple(reach[0]), tuple(reach[1]), f"{about} ({names}: segment, and e extension, a, b toward d1, d2)"
+            ),
+        )
+        robots = [self.base_robot] * n_envs if self._varies else [self.base_robot]
+        self.simulator = Simulator(
+            robots if self._varies else self.base_robot, n_robots=n_envs, dt=self.dt, points_per_segment=self.points_per_segment,
+            outputs=self.outputs, threads=options.threads, contact=contact, hold_gain=self.hold_gain,
+            feel_contact=feel_contact,
+        )  # fmt: skip
+        self._turn = matrix_from_quaternion(np.array([self.base_robot.base_quaternion]))[0]
+        self._foot = np.array(self.base_robot.base_position)
+        self.displacement: Floats = np.tile(self.home, (n_envs, 1))
+        """(n_envs, n_driven) [m]."""
+        self.tip: Floats = np.zeros((n_envs, 3))
+        """(n_envs, 3) world [m]."""
+        self.direction: Floats = np.zeros((n_envs, 3))
+        """(n_envs, 3) of the tip's d3, world."""
+        self.lost: Flags = np.zeros(n_envs, bool)
+        """(n_envs,) the simulator did not find the robot's shape."""
+        self._drawn: Simulator | None = None
+        self._model: Simulator | None = None
+        state = self.simulator.settle(**self._inputs())
+        self._home = self.simulator.snapshot()
+        self._keep(state.tip_position, state.tip_rotation[:, :, 2], state.ok)
+
+    def loads(self) -> dict[str, Any]:
+        """What the simulator is told besides wires: loads, obstacles."""
+        return {}
+
+    def start(self, rows: Ints, draws: Floats) -> None:
+        """Put these robots at home, made anew where they are randomised; `draws` as in `begin`."""
+        self.displacement[rows] = self.home
+        if self._varies and self._random is not None:
+            self.simulator.replace(rows, self._random.draw(self.base_robot, draws[:, self.n_draws :]))
+            state = self.simulator.settle(**self._inputs(), rows=rows)
+        else:
+            self.simulator.restore(self._home, rows)
+            state = self.simulator.settle(**self._inputs(), rows=rows) if self.loaded else self.simulator.state
+        self._keep(state.tip_position, state.tip_rotation[:, :, 2], state.ok, rows)
+
+    def act(self, action: Floats) -> None:
+        if self.options.action == "rate":
+            self.displacement = np.clip(self.displacement + self.dt * self._rate * action, self._low, self._high)
+            state = self.simulator.step(**self._inputs())
+        else:
+            self.displacement = 0.5 * (self._low + self._high) + 0.5 * (self._high - self._low) * action
+            state = self.simulator.settle(**self._inputs(), tolerance=1e-7)
+        self._keep(state.tip_position, state.tip_rotation[:, :, 2], state.ok)
+        self.moved()
+
+    def moved(self) -> None:
+        """What else happens in a step, once the robots have moved: nothing."""
+
+    def posture(self) -> Floats:
+        """(n_envs, n_driven) displacements from -1, the least, to 1, the largest."""
+        return np.asarray((2.0 * self.displacement - self._low - self._high) / (self._high - self._low))
+
+    def measured(self) -> Floats:
+        """(n_envs, 3) the tip as a camera sees it, effects of sensing included, world [m]."""
+        if not self.base_robot.effects:
+            return self.tip
+        seen = self.simulator.measure().tip_position
+        p = self._foot + (seen[:, :1] * self._turn[:, 0] + seen[:, 1:2] * self._turn[:, 1] + seen[:, 2:] * self._turn[:, 2])
+        return np.where(np.isfinite(p), p, self.tip)
+
+    def toward(self, velocity: Floats, jacobian: Floats | None = None, weight: ArrayLike = 1.0) -> Floats:
+        """(n_envs, n_actions) the action that moves the tips with these velocities (n_envs, 3) [m/s]: damped resolved rates, with the
+        simulator's Jacobian or one of d(tip)/d(driven) (n_envs, 3, n_driven). Numbers with a smaller `weight` (n_driven,) move less."""
+        if jacobian is None:
+            jacobian = self.model().jacobian()[:, :3] @ self._actions.matrix[:, self.driven]
+        scale = self._rate * np.asarray(weight)
+        q = scale * resolved(np.nan_to_num(jacobian) * scale, velocity, -self.posture())
+        if self.options.action == "rate":
+            return np.asarray(q / self._rate)
+        there = self.displacement + self.dt * q
+        return np.asarray((2.0 * there - self._low - self._high) / (self._high - self._low))
+
+    def model(self) -> Simulator:
+        """The simulator, or where effects act a model without them, at rest on the same commands: within a backlash nothing answers, and
+        a Jacobian that says so would stay there."""
+        if not self.base_robot.effects:
+            return self.simulator
+        if self._model is None:
+            plain = replace(self.base_robot, effects=())
+            self._model = Simulator(plain, n_robots=self.n_envs, points_per_segment=self.points_per_segment, outputs="tip")
+        self._model.settle(**self._inputs(), tolerance=1e-6)
+        return self._model
+
+    def tube(self, i: int) -> Tube:
+        """Robot i, for pictures: its backbone is found again, where only tips are kept."""
+        robot = self.simulator.robots[min(i, len(self.simulator.robots) - 1)]
+        radius = robot.segments[0].body_radius or 0.01
+        if self.outputs == "full":
+            return Tube(self.simulator.state.position[i], radius, (0.9, 0.55, 0.15))
+        if self._drawn is None:
+            self._drawn = Simulator(self.base_robot, dt=self.dt, points_per_segment=8, threads=1)
+        given = {name: a[i] if np.ndim(a) == 2 and len(a) == self.n_envs else a for name, a in self._inputs().items()}
+        return Tube(self._drawn.settle(**given).position[0], radius, (0.9, 0.55, 0.15))
+
+    def _inputs(self) -> dict[str, Any]:
+        n_tendons = self.base_robot.n_tendons
+        change = np.zeros((self.n_envs, len(self._actions.matrix)))
+        for j, k in enumerate(self.driven):  # term by term: a BLAS would sum otherwise for other numbers of robots
+            change += self.displacement[:, j, None] * self._actions.matrix[:, k]
+        return {
+            "tendon_length": self.base_robot.rest_tendon_length + change[:, :n_tendons],
+            "extension": change[:, n_tendons:],
+            **self.loads(),
+        }
+
+    def _keep(self, tip: Floats, direction: Floats, ok: Flags, rows: Ints | None = None) -> None:
+        """Note where the tips of these robots are; those that are lost stay where they were last seen."""
+        some = np.ones(self.n_envs, bool) if rows is None else np.isin(np.arange(self.n_envs), rows)
+        with np.errstate(invalid="ignore"):
+            sane = (np.abs(tip - self._foot) < _FAR * self.base_robot.length).all(1) & np.isfinite(direction).all(1)
+        good = some & ok & sane
+        self.tip = np.where(good[:, None], tip, self.tip)
+        self.direction = np.where(good[:, None], direction, self.direction)
+        self.lost = np.where(some, ~(ok & sane), self.lost)
+
+
+def resolved(jacobian: Floats, velocity: Floats, wish: Floats) -> Floats:
+    """(n, n_q) rates within -1 and 1 that give the velocities (n, m): damped pseudo-inverse of `jacobian` (n, m, n_q), and in its
+    null space slowly toward `wish` (n, n_q)."""
+    transposed = np.swapaxes(jacobian, 1, 2)
+    square = jacobian @ transposed
+    damping = 1e-3 * np.trace(square, axis1=1, axis2=2) + 1e-12
+    inverse = transposed @ np.linalg.inv(square + damping[:, None, None] * np.eye(jacobian.shape[1]))
+    free = 0.2 * (wish - (inverse @ (jacobian @ wish[:, :, None]))[:, :, 0])
+    rates = (inverse @ velocity[:, :, None])[:, :, 0] + free
+    return np.asarray(rates / np.maximum(np.abs(rates).max(1, keepdims=True), 1.0))

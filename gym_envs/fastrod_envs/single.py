@@ -1,0 +1,85 @@
+"""`SingleEnv`: one environment, for `gymnasium.make`; the same episodes as a batch of one."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, final
+
+import gymnasium
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fastrod.errors import InputError
+from fastrod_envs.episodes import Episodes, Singles
+from fastrod_envs.registration import make_task
+from fastrod_envs.rendering import Renderer
+from fastrod_envs.vector import action_space
+
+
+@final
+class SingleEnv(gymnasium.Env[Singles, Any]):
+    """One robot. `info` holds distance [m], success, contact, lost, position and desired (3,) [m], reward_terms, and facts of the task.
+
+    >>> env = SingleEnv("Reach")
+    >>> observation, info = env.reset(seed=0)
+    >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+    >>> sorted(info["reward_terms"])
+    ['height', 'reach']
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "viser"], "render_fps": 25}  # type: ignore[misc]
+
+    def __init__(self, task: str, *, max_episode_steps: int | None = None, render_mode: str | None = None, **options: Any) -> None:
+        """As `BatchEnv`, with one environment."""
+        self.render_mode = render_mode
+        self._renderer = Renderer(render_mode)
+        self.task = make_task(task, 1, options | ({} if max_episode_steps is None else {"n_steps": max_episode_steps}))
+        self._episodes = Episodes(self.task)
+        self.observation_space = gymnasium.spaces.Box(self._episodes.low, self._episodes.high, dtype=np.float32)
+        self.action_space = action_space(self.task)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Singles, dict[str, Any]]:
+        """Begin an episode; `options={"difficulty": level}` sets the curriculum's level. Raises `InputError`."""
+        super().reset(seed=seed)
+        options = dict(options or {})
+        if "difficulty" in options:
+            self.task.set_difficulty(options.pop("difficulty"))
+        if options:
+            raise InputError(f"reset has no option {next(iter(options))!r}; known: difficulty.")
+        if seed is not None:
+            self._episodes.seed([seed])
+        self._episodes.begin(np.array([0]))
+        return self._episodes.observation()[0], {}
+
+    def step(self, action: ArrayLike) -> tuple[Singles, float, bool, bool, dict[str, Any]]:
+        """One step. Raises `InputError` on a wrong shape and on what is not finite; then nothing was simulated."""
+        moment = self._episodes.advance(np.asarray(action)[None])
+        return (
+            self._episodes.observation()[0], float(moment.reward[0]), bool(moment.terminated[0]), bool(moment.truncated[0]),
+            _first(self._episodes.info(moment)),
+        )  # fmt: skip
+
+    def baseline(self) -> Singles:
+        """(n_actions,) what the task's scripted baseline does now."""
+        return np.asarray(self.task.baseline()[0], dtype=np.float32)
+
+    def set_difficulty(self, level: float) -> None:
+        """Curriculum: from the next episode on, from 0 to 1. Raises `InputError`."""
+        self.task.set_difficulty(level)
+
+    def render(self) -> np.ndarray | None:
+        """With rgb_array a picture (height, width, 3); with viser the page shows the robot now."""
+        pictures = self._renderer.render(self.task)
+        return None if pictures is None else pictures[0]
+
+    def close(self) -> None:
+        """Close worlds and pages."""
+        self._renderer.close()
+        self.task.close()
+
+
+def _first(told: dict[str, Any]) -> dict[str, Any]:
+    """The first row of every array, numbers as Python's own."""
+    row: dict[str, Any] = {}
+    for name, value in told.items():
+        row[name] = _first(value) if isinstance(value, dict) else value[0].item() if np.ndim(value) == 1 else value[0]
+    return row

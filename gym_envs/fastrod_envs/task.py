@@ -1,0 +1,197 @@
+"""`Task`: what a robot is to do, for n robots at once; pure arrays, robot axis first, no Gymnasium."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from fastrod.types import Flags, Floats, Ints
+from fastrod_envs.options import Options, checked_difficulty
+
+
+class Field(NamedTuple):
+    """A named part of an observation or an action."""
+
+    name: str
+    unit: str
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    about: str
+
+
+class Ball(NamedTuple):
+    """A ball to draw: a goal, a marker."""
+
+    position: Floats
+    """(3,) world [m]."""
+    radius: float
+    color: tuple[float, float, float]
+
+
+class Solid(NamedTuple):
+    """A box, cylinder or mesh to draw."""
+
+    vertices: Floats
+    """(n, 3) world [m]."""
+    faces: Ints
+    """(m, 3)"""
+    color: tuple[float, float, float]
+    opacity: float = 1.0
+
+
+class Line(NamedTuple):
+    """A path to draw."""
+
+    points: Floats
+    """(n, 3) world [m]."""
+    color: tuple[float, float, float]
+
+
+class Tube(NamedTuple):
+    """A rod to draw."""
+
+    points: Floats
+    """(n, 3) along its backbone, world [m]."""
+    radius: float
+    color: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Scenery:
+    """What one environment looks like now, world frame."""
+
+    tubes: tuple[Tube, ...] = ()
+    balls: tuple[Ball, ...] = ()
+    solids: tuple[Solid, ...] = ()
+    lines: tuple[Line, ...] = ()
+    eye: tuple[float, float, float] = (0.9, 0.9, 0.6)
+    """From where it is looked at [m]."""
+    target: tuple[float, float, float] = (0.0, 0.0, 0.25)
+    """What is in the middle of the picture [m]."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a step went, robot axis first."""
+
+    terms: dict[str, Floats]
+    """The terms of the reward, each (n,); their sum is the reward."""
+    distance: Floats
+    """(n,) by which the task is judged [m]."""
+    success: Flags
+    """(n,) the task's criterion holds now."""
+    position: Floats
+    """(n, 3) of what is to be somewhere, world [m]."""
+    desired: Floats
+    """(n, 3) where it is to be, world [m]."""
+    terminated: Flags
+    """(n,) the episode ends here, before its time: it succeeded for good, or failed."""
+    contact: Flags
+    """(n,) something was touched that should not be."""
+    lost: Flags
+    """(n,) the simulation did not find this robot's shape; the episode ends, and counts as failed."""
+    facts: dict[str, Floats] = field(default_factory=dict)
+    """What else a user may want to know, each (n, ...); goes into info."""
+
+
+class Task(ABC):
+    """A task for `n_envs` robots.
+
+    Class docstrings of tasks are their documentation: what is to be done, the reward's formula, the success criterion, the baseline.
+    """
+
+    name: ClassVar[str]
+    """Of the id fastrod/<name>-v0."""
+    n_steps: ClassVar[int]
+    """Of an episode, unless the options say otherwise."""
+    n_draws: ClassVar[int]
+    """Numbers from 0 to 1 that an episode draws for its goal and scene, randomisation apart."""
+    accuracy: ClassVar[float]
+    """Distance below which the task is done [m]."""
+    options_class: ClassVar[type[Options]] = Options
+    """Its options."""
+    hosted: ClassVar[bool] = False
+    """Needs PyBullet (`pip install fastrod[hosts]`)."""
+
+    dt: float
+    """Time of a step [s]."""
+    actions: tuple[Field, ...]
+    """Parts of an action; every number goes from -1 to 1, and low and high say what -1 and 1 mean, in the unit."""
+    states: tuple[Field, ...]
+    """Parts of an observation of the state, in the order of `state()`."""
+    goals: tuple[Field, ...]
+    """Parts of an observation of the goal, in the order of `goal()`."""
+
+    def __init__(self, n_envs: int, options: Options) -> None:
+        self.n_envs, self.options = n_envs, options
+        self.difficulty = options.difficulty
+        self.total_draws = self.n_draws
+        """Numbers that an episode draws, randomisation included."""
+
+    def set_difficulty(self, level: float) -> None:
+        """From the next episode on: 0 is the easiest, 1 the whole task. Raises `InputError`."""
+        self.difficulty = checked_difficulty(level)
+
+    @abstractmethod
+    def begin(self, rows: Ints, draws: Floats) -> None:
+        """Start an episode for these robots; `draws` (len(rows), total_draws) are even from 0 to 1. What a robot then is depends on
+        nothing but its draws."""
+
+    @abstractmethod
+    def act(self, action: Floats) -> None:
+        """One step of all robots; `action` (n_envs, n_actions) from -1 to 1, finite."""
+
+    @abstractmethod
+    def outcome(self) -> Outcome:
+        """How the last step went."""
+
+    @abstractmethod
+    def state(self) -> Floats:
+        """(n_envs, size of `states`)."""
+
+    @abstractmethod
+    def goal(self) -> Floats:
+        """(n_envs, size of `goals`)."""
+
+    @abstractmethod
+    def baseline(self) -> Floats:
+        """(n_envs, n_actions) what the scripted baseline does now, from -1 to 1; it may use what the simulator knows."""
+
+    @abstractmethod
+    def scenery(self, i: int) -> Scenery:
+        """What environment i looks like now."""
+
+    def picture(self, i: int, width: int, height: int) -> np.ndarray | None:  # noqa: ARG002
+        """(height, width, 3) uint8 of environment i where a host draws it; None leaves it to the drawing of `scenery`."""
+        return None
+
+    def close(self) -> None:  # noqa: B027
+        """Give back what the task holds."""
+
+    @property
+    def n_actions(self) -> int:
+        """Numbers of an action."""
+        return size(self.actions)
+
+
+def size(parts: tuple[Field, ...]) -> int:
+    """Numbers in these parts."""
+    return sum(len(part.low) for part in parts)
+
+
+def bounds(parts: tuple[Field, ...]) -> tuple[Floats, Floats]:
+    """Least and largest value of every number."""
+    return np.concatenate([np.array(p.low, float) for p in parts]), np.concatenate([np.array(p.high, float) for p in parts])
+
+
+def length(vectors: Floats) -> Floats:
+    """(n,) of vectors (n, 3): the same bits whatever n is, which a BLAS does not promise."""
+    return np.asarray(np.sqrt(vectors[:, 0] ** 2 + vectors[:, 1] ** 2 + vectors[:, 2] ** 2))
+
+
+def shortened(vectors: Floats, longest: float) -> Floats:
+    """Vectors (n, 3) of at most this length, their direction kept."""
+    return np.asarray(vectors * (longest / np.maximum(length(vectors), longest))[:, None])

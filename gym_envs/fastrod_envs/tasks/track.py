@@ -1,0 +1,165 @@
+"""Track: the prototype's tip follows a planar path that its surface of reach does not hold."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal, final, get_args
+
+import numpy as np
+
+from fastrod.control import Trajectory, circle, square, triangle
+from fastrod.errors import InputError
+from fastrod.robotfile import load_robot
+from fastrod.types import Floats, Ints
+from fastrod_envs.options import Options
+from fastrod_envs.rodtask import RodTask
+from fastrod_envs.surface import ReachableSurface
+from fastrod_envs.task import Ball, Field, Line, Outcome, Scenery, length, shortened
+
+Shape = Literal["triangle", "square", "circle"]
+Reward = Literal["paper", "precise"]
+PERIOD, APPROACH = 9.0, 1.0
+"""Of a turn; before the error counts, as the tip begins at rest [s]."""
+AHEAD = (0.1, 0.2, 0.4)
+"""The path is observed so far ahead of now [s]."""
+NEAR = 0.01
+"""Errors are observed up to this length [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackOptions(Options):
+    """Of Track."""
+
+    path: Shape | Literal["any"] = "any"
+    """Which path; `any` draws one for each episode."""
+    reward: Reward = "paper"
+    """`paper`: exp(-500 d^2) of the distance from the path; `precise`: exp(-e / 0.5 mm) on top, e from the nearest point in reach."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.path not in (*get_args(Shape), "any"):
+            raise InputError(f"path is {self.path!r}; it must be 'any', {' or '.join(map(repr, get_args(Shape)))}.")
+        if self.reward not in get_args(Reward):
+            raise InputError(f"reward is {self.reward!r}; it must be {' or '.join(map(repr, get_args(Reward)))}.")
+
+
+def paths(height: float) -> dict[str, Trajectory]:
+    """The paper's three references, in the plane of the straight robot's tip [m]."""
+    center = (0.0, 0.0, height)
+    return {
+        "triangle": triangle(side=0.04, period=PERIOD, center=center),
+        "square": square(side=0.025, period=PERIOD, center=center),
+        "circle": circle(radius=0.02, period=PERIOD, center=center),
+    }
+
+
+@final
+class Track(RodTask):
+    """Follow a triangle of 40 mm, a square of 25 mm or a circle of 20 mm radius with the tip of the prototype, one turn in 9 s.
+
+    Two tendon pairs and no extension reach a surface only; the paths lie in the plane of the straight robot's tip, millimetres off
+    it. Judged is what the camera measures, effects of sensing included, from 1 s on: `distance` is the mean distance of the tip from
+    the nearest point to the path that the robot can reach; `error` from the path itself, `floor` that of the nearest points, `mae` and
+    `mae_floor` (3,) the same axis by axis [m].
+    Reward (the paper's): exp(-500 d^2), d from the path [m]. Success: mean distance below 0.5 mm. 200 steps of 50 ms.
+    Path, where on it the episode begins, and which way round are drawn. With `randomise="identified.toml"` the effects of an identified
+    robot act. Baseline: resolved rates to the nearest point in reach, with its velocity.
+    """
+
+    name = "Track"
+    n_steps: ClassVar[int] = 200
+    n_draws: ClassVar[int] = 3
+    accuracy: ClassVar[float] = 5e-4
+    options_class: ClassVar[type[Options]] = TrackOptions
+    points_per_segment: ClassVar[int] = 6
+    dt = 0.05
+
+    def __init__(self, n_envs: int, options: Options) -> None:
+        super().__init__(n_envs, options, load_robot("prototype"), driven=[1, 2], limit=[(-0.008, 0.008)] * 2, rate=[0.01, 0.01])
+        assert isinstance(options, TrackOptions)
+        self._known = paths(self.base_robot.length)
+        self._names = [options.path] if options.path != "any" else list(get_args(Shape))
+        self._sharp = options.reward == "precise"
+        self._surface = ReachableSurface(self.base_robot, height=self.base_robot.length, radius=0.03)
+        reach = 1.2 * self.base_robot.length
+        box = (-reach,) * 3, (reach,) * 3
+        self.goals = (Field("path", "m", box[0] * 4, box[1] * 4, f"now and {', '.join(map(str, AHEAD))} s ahead, base frame"),)
+        self.states = (
+            *self.goals,
+            Field("tip", "m", *box, "where it is measured"),
+            Field("error", "m", (-NEAR,) * 3, (NEAR,) * 3, f"from the tip to the nearest point in reach of the path's, at most {NEAR:g} m"),
+            Field("posture", "", (-1.0,) * 2, (1.0,) * 2, "displacements, from their least to their largest"),
+            Field("last", "", (-1.0,) * 2, (1.0,) * 2, "the last action"),
+        )
+        n = n_envs
+        self._which, self._phase, self._way, self._size = np.zeros(n, np.int64), np.zeros(n), np.ones(n), np.ones(n)
+        self._t, self._last = np.zeros(n), np.zeros((n, 2))
+        self._sums, self._counted = np.zeros((n, 9)), np.zeros(n)
+
+    def begin(self, rows: Ints, draws: Floats) -> None:
+        self.start(rows, draws)
+        self._which[rows] = np.minimum((draws[:, 0] * len(self._names)).astype(np.int64), len(self._names) - 1)
+        self._phase[rows] = PERIOD * draws[:, 1]
+        self._way[rows] = np.where(draws[:, 2] < 0.5, 1.0, -1.0)
+        self._size[rows] = self.difficulty
+        self._t[rows], self._last[rows], self._sums[rows], self._counted[rows] = 0.0, 0.0, 0.0, 0.0
+
+    def path(self, ahead: float) -> Floats:
+        """(n_envs, 3) the path so many seconds from now, base frame [m]."""
+        t = self._phase + self._way * (self._t + ahead)
+        found = np.zeros((self.n_envs, 3))
+        for k, name in enumerate(self._names):
+            on = self._which == k
+            if on.any():
+                found[on] = self._known[name].position(t[on])
+        found[:, :2] *= self._size[:, None]
+        return found
+
+    def act(self, action: Floats) -> None:
+        super().act(action)
+        self._t += self.dt
+        self._last = action
+        wanted, seen = self.path(0.0), self.measured()
+        nearest = self._surface.nearest(wanted)
+        off, floor = np.abs(seen - wanted), np.abs(nearest - wanted)
+        row = np.column_stack([length(seen - nearest), length(off), length(floor), off, floor])
+        counts = self._t > APPROACH
+        self._sums += np.where(counts[:, None], row, 0.0)
+        self._counted += counts
+
+    def outcome(self) -> Outcome:
+        wanted, seen = self.path(0.0), self.measured()
+        nearest = self._surface.nearest(wanted)
+        terms = {"path": np.exp(-500.0 * length(seen - wanted) ** 2)}
+        if self._sharp:
+            terms["precise"] = np.exp(-length(seen - nearest) / 5e-4)
+        now = np.column_stack([length(seen - nearest), length(seen - wanted), length(nearest - wanted)])
+        now = np.column_stack([now, np.abs(seen - wanted), np.abs(nearest - wanted)])
+        mean = np.where(self._counted[:, None] > 0, self._sums / np.maximum(self._counted, 1)[:, None], now)
+        never = np.zeros(self.n_envs, bool)
+        return Outcome(
+            terms=terms, distance=mean[:, 0], success=(mean[:, 0] < self.accuracy) & ~self.lost, position=seen.copy(), desired=wanted,
+            terminated=never, contact=never, lost=self.lost,
+            facts={"error": mean[:, 1], "floor": mean[:, 2], "mae": mean[:, 3:6], "mae_floor": mean[:, 6:]},
+        )  # fmt: skip
+
+    def state(self) -> Floats:
+        seen = self.measured()
+        error = shortened(self._surface.nearest(self.path(0.0)) - seen, NEAR)
+        return np.concatenate([self.goal(), seen, error, self.posture(), self._last], axis=1)
+
+    def goal(self) -> Floats:
+        return np.concatenate([self.path(ahead) for ahead in (0.0, *AHEAD)], axis=1)
+
+    def baseline(self) -> Floats:
+        ahead = self._surface.nearest(self.path(self.dt)) - self._surface.nearest(self.path(0.0))
+        error = self._surface.nearest(self.path(0.0)) - self.measured()
+        return self.toward(ahead / self.dt + error / (2.0 * self.dt))
+
+    def scenery(self, i: int) -> Scenery:
+        t = np.linspace(0.0, PERIOD, 90)
+        line = self._known[self._names[self._which[i]]].position(t) * [self._size[i], self._size[i], 1.0]
+        now = Ball(self.path(0.0)[i], 0.0015, (0.85, 0.2, 0.15))
+        return Scenery(
+            tubes=(self.tube(i),), balls=(now,), lines=(Line(line, (0.2, 0.35, 0.8)),), eye=(0.13, 0.13, 0.12), target=(0.0, 0.0, 0.04)
+        )

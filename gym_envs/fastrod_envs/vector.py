@@ -1,0 +1,146 @@
+"""`BatchEnv`: a `gymnasium.vector.VectorEnv` whose N environments are the N robots of one simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar, final
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike
+
+from fastrod.errors import InputError
+from fastrod.types import Flags, Floats
+from fastrod_envs.episodes import Episodes, Singles
+from fastrod_envs.registration import make_task
+from fastrod_envs.rendering import Renderer
+from fastrod_envs.task import Task
+
+
+def action_space(task: Task) -> gymnasium.spaces.Box:
+    """Of one environment: from -1 to 1, whose meaning and units `Task.actions` has."""
+    return gymnasium.spaces.Box(-1.0, 1.0, (task.n_actions,), np.float32)
+
+
+@final
+class BatchEnv(VectorEnv[Singles, Any, Any]):
+    """N environments in one; those that end begin anew in the same step (`AutoresetMode.SAME_STEP`).
+
+    Environment i of `reset(seed=s)` is the environment of `gymnasium.make` after `reset(seed=s + i)`, bit for bit, whatever N is.
+
+    `info` holds arrays (n, ...), each with its mask `_name` as Gymnasium has it: distance [m], success, contact, lost, position and
+    desired (3,) [m], and reward_terms; after a step in which episodes ended also final_obs and final_info of those.
+
+    >>> env = BatchEnv("Reach", num_envs=3)
+    >>> observation, info = env.reset(seed=0)
+    >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+    >>> observation.shape == (3, *env.single_observation_space.shape), reward.shape
+    (True, (3,))
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]
+        "autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": ["rgb_array", "viser"], "render_fps": 25,
+    }  # fmt: skip
+
+    def __init__(
+        self, task: str, num_envs: int = 1, *, max_episode_steps: int | None = None, render_mode: str | None = None, **options: Any
+    ) -> None:
+        """`task` is the name in the id; `options` are those of the task (`Options`), `max_episode_steps` is another name of n_steps.
+        Raises `InputError`, `UnknownNameError`, `HostError`."""
+        if not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
+            raise InputError(f"num_envs is {num_envs!r}; it must be a whole number, at least 1.")
+        self.render_mode = render_mode
+        self._renderer = Renderer(render_mode)
+        self.task = make_task(task, int(num_envs), options | ({} if max_episode_steps is None else {"n_steps": max_episode_steps}))
+        self.num_envs = int(num_envs)
+        self._episodes = Episodes(self.task)
+        self.single_observation_space = gymnasium.spaces.Box(self._episodes.low, self._episodes.high, dtype=np.float32)
+        self.single_action_space = action_space(self.task)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._every = np.ones(self.num_envs, bool)
+
+    @property
+    def n_steps(self) -> int:
+        """Of an episode."""
+        return self._episodes.n_steps
+
+    @property
+    def returned(self) -> Floats:
+        """(n,) rewards so far of the episodes under way."""
+        return self._episodes.returned.copy()
+
+    @property
+    def elapsed(self) -> Any:
+        """(n,) steps of the episodes under way."""
+        return self._episodes.elapsed.copy()
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Singles, dict[str, Any]]:
+        """Begin episodes in all environments, or in those of `options={"reset_mask": (n,) bool}`. A whole-number seed s gives
+        environment i the seed s + i. Raises `InputError`."""
+        super().reset(seed=None)
+        rows = np.arange(self.num_envs)
+        options = dict(options or {})
+        if "difficulty" in options:
+            self.task.set_difficulty(options.pop("difficulty"))
+        if "reset_mask" in options:
+            mask = np.asarray(options.pop("reset_mask"))
+            if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
+                raise InputError(f"reset_mask has shape {mask.shape} and type {mask.dtype}; give ({self.num_envs},) bool, some of it True.")
+            rows = np.flatnonzero(mask)
+        if options:
+            raise InputError(f"reset has no option {next(iter(options))!r}; known: difficulty, reset_mask.")
+        if seed is not None:
+            one = isinstance(seed, (int, np.integer))
+            self._episodes.seed([seed + i for i in range(self.num_envs)] if one else list(seed))  # type: ignore[operator,arg-type]
+        self._episodes.begin(rows)
+        return self._episodes.observation(), {}
+
+    def step(self, actions: ArrayLike) -> tuple[Singles, Floats, Flags, Flags, dict[str, Any]]:
+        """One step of all environments. Raises `InputError` on a wrong shape and on what is not finite; then nothing was simulated."""
+        moment = self._episodes.advance(actions)
+        told = self._episodes.info(moment)
+        infos = _masked(told, self._every)
+        observation = self._episodes.observation()
+        done = moment.terminated | moment.truncated
+        if done.any():
+            rows = np.flatnonzero(done)
+            final = np.full(self.num_envs, None, dtype=object)
+            for i in rows:
+                final[i] = observation[i]
+            told["episode"] = {"r": self._episodes.returned.copy(), "l": self._episodes.elapsed.copy()}
+            infos |= {"final_obs": final, "_final_obs": done, "final_info": _masked(told, done), "_final_info": done}
+            self._episodes.begin(rows)
+            begun = self._episodes.observation()
+            observation = np.where(done[:, None], begun, observation)
+        return observation, moment.reward, moment.terminated, moment.truncated, infos
+
+    def baseline(self) -> Singles:
+        """(n, n_actions) what the task's scripted baseline does now."""
+        return self.task.baseline().astype(np.float32)
+
+    def set_difficulty(self, level: float) -> None:
+        """Curriculum: from the next episodes on, from 0 to 1. Raises `InputError`."""
+        self.task.set_difficulty(level)
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """With rgb_array a picture (height, width, 3) of every environment; with viser the page shows the first ones now."""
+        return self._renderer.render(self.task)
+
+    def close_extras(self, **kwargs: Any) -> None:  # noqa: ARG002
+        """Close worlds and pages."""
+        self._renderer.close()
+        self.task.close()
+
+
+def _masked(told: dict[str, Any], mask: Flags) -> dict[str, Any]:
+    """Gymnasium's infos of a batch: every array with the mask of those who have it."""
+    infos: dict[str, Any] = {}
+    for name, value in told.items():
+        infos[name] = _masked(value, mask) if isinstance(value, dict) else value
+        infos[f"_{name}"] = mask
+    return infos

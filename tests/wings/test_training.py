@@ -1,0 +1,160 @@
+"""Training on stable-baselines3: a small one to its end, one that is broken off and goes on, and what is written."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed (pip install fastrod[rl])")
+
+from fastrod.errors import FastrodError, InputError, UnknownNameError
+from fastrod_envs.imitation import imitate
+from fastrod_envs.policies import Policy, find, shipped
+from fastrod_envs.sb3 import BatchVecEnv
+from fastrod_envs.training import CHECKPOINT, CONFIG, POLICY, REPLAY, algorithm_class, make_plan, read_config, resume, train
+from fastrod_envs.vector import BatchEnv
+
+
+class BrokenOffError(Exception):
+    """The process is killed."""
+
+
+def test_training_writes_a_policy_with_its_configuration(tmp_path: Path) -> None:
+    plan = make_plan("Reach", steps=2560, n_envs=32, seed=3, options={"n_steps": 20}, settings={"n_epochs": 2})
+    path = train(plan, tmp_path / "run")
+    held = json.loads((tmp_path / "run" / CONFIG).read_text())
+    assert path == tmp_path / "run" / POLICY
+    assert path.is_file()
+    assert held["plan"]["env"] == "fastrod/Reach-v0"
+    assert held["plan"]["settings"]["gamma"] == 0.99
+    assert held["plan"]["settings"]["learning_rate"] == 3e-4
+    assert held["state"]["steps_done"] >= 2560
+    assert held["versions"]["stable-baselines3"]
+    assert any((tmp_path / "run" / "tensorboard").rglob("events*"))
+    assert not (tmp_path / "run" / CHECKPOINT).exists()
+    env = BatchEnv("Reach", num_envs=3, n_steps=20)
+    observation, _ = env.reset(seed=0)
+    policy = Policy(find("Reach", str(tmp_path / "run")))
+    policy.check(env)
+    actions = policy.act(observation)
+    assert actions.shape == (3, 11)
+    assert (np.abs(actions) <= 1.0).all()
+    model = algorithm_class("ppo").load(path, device="cpu")
+    widths = [layer.out_features for layer in model.policy.mlp_extractor.policy_net if hasattr(layer, "out_features")]
+    assert widths == [256, 256]
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "sac", "td3"])
+def test_a_training_that_is_killed_goes_on_from_its_checkpoint(tmp_path: Path, algorithm: str) -> None:
+    settings = {"n_steps": 10, "n_epochs": 1} if algorithm == "ppo" else {"learning_starts": 100, "batch_size": 64, "gradient_steps": 1}
+    plan = make_plan("Reach", algorithm=algorithm, steps=3200, n_envs=16, options={"n_steps": 10}, settings=settings)
+
+    def kill(_: str, done: int, __: int) -> None:
+        if done >= 1600:
+            raise BrokenOffError
+
+    with pytest.raises(BrokenOffError):
+        train(plan, tmp_path / "run", kill)
+    assert (tmp_path / "run" / CHECKPOINT).is_file()
+    assert not (tmp_path / "run" / POLICY).exists()
+    assert (tmp_path / "run" / REPLAY).exists() == (algorithm != "ppo")
+    before = read_config(tmp_path / "run")[1]["steps_done"]
+    seen: list[int] = []
+    path = resume(tmp_path / "run", progress=lambda _, done, __: seen.append(done))
+    after = read_config(tmp_path / "run")[1]
+    assert 0 < before < 1600
+    assert before < seen[0] <= before + 16
+    assert 3200 <= after["steps_done"] < 3200 + 16 * 10
+    assert path.is_file()
+    assert not list((tmp_path / "run").glob(".*part*"))
+
+
+def test_resume_takes_more_steps(tmp_path: Path) -> None:
+    settings = {"n_steps": 10, "n_epochs": 1}
+    train(make_plan("Reach", steps=320, n_envs=16, options={"n_steps": 10}, settings=settings), tmp_path / "run")
+    resume(tmp_path / "run", 640)
+    assert read_config(tmp_path / "run")[1]["steps_done"] >= 640
+    assert read_config(tmp_path / "run")[0].steps == 640
+
+
+def test_lessons_bring_the_policy_to_the_baseline() -> None:
+    env = BatchEnv("Reach", num_envs=32, n_steps=20)
+    plan = make_plan("Reach", n_envs=32, options={"n_steps": 20})
+    from fastrod_envs.sb3 import ScaledFeatures
+
+    kwargs = {"net_arch": [64, 64], "features_extractor_class": ScaledFeatures}
+    model = algorithm_class("ppo")("MlpPolicy", BatchVecEnv(env), seed=0, device="cpu", policy_kwargs=kwargs, **plan.settings)
+
+    def ends() -> float:
+        observation, _ = env.reset(seed=50)
+        for _ in range(20):
+            action, _ = model.predict(observation, deterministic=True)
+            observation, _, _, _, told = env.step(action)
+        return float(told["final_info"]["distance"].mean())
+
+    untaught = ends()
+    left = imitate(model, env, 6400, seed=0)
+    assert left < 0.3
+    assert ends() < 0.5 * untaught
+
+
+def test_the_adapter_tells_what_stable_baselines_asks_for() -> None:
+    env = BatchVecEnv(BatchEnv("Reach", num_envs=4, n_steps=3))
+    env.seed(7)
+    twin = BatchEnv("Reach", num_envs=4, n_steps=3)
+    expected, _ = twin.reset(seed=7)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (3, 4, 11))
+    np.testing.assert_array_equal(env.reset(), expected)
+    for k in range(3):
+        observation, reward, done, infos = env.step(actions[k])
+        own = twin.step(actions[k])
+        np.testing.assert_array_equal(observation, own[0])
+        np.testing.assert_allclose(reward, own[1], rtol=1e-6)
+        assert done.all() == (k == 2)
+    for i in range(4):
+        np.testing.assert_array_equal(infos[i]["terminal_observation"], own[4]["final_obs"][i])
+        assert infos[i]["TimeLimit.truncated"] is True
+        assert infos[i]["episode"]["l"] == 3
+    assert env.env_method("set_difficulty", 0.5) == [None] * 4
+    assert env.get_attr("n_steps", [0, 1]) == [3, 3]
+    assert env.env_is_wrapped(object) == [False] * 4  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="share their attributes"):
+        env.set_attr("n_steps", 4)
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_shipped_policies_are_small_and_fit_their_environment(name: str) -> None:
+    folder = find(name, "shipped")
+    policy = Policy(folder)
+    env = BatchEnv(name, num_envs=1, **policy.options)
+    try:
+        policy.check(env)
+        observation, _ = env.reset(seed=0)
+        acts = policy.act(observation)
+    finally:
+        env.close()
+    assert np.isfinite(acts).all()
+    assert sum(path.stat().st_size for path in folder.iterdir()) < 1_000_000
+
+
+def test_wrong_plans_are_refused_in_a_sentence(tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError, match="did you mean 'ppo'"):
+        make_plan("Reach", algorithm="pp0")
+    with pytest.raises(UnknownNameError, match="did you mean 'Reach'"):
+        make_plan("Reech")
+    with pytest.raises(InputError, match="no option 'n_step'; did you mean 'n_steps'"):
+        make_plan("Reach", options={"n_step": 3})
+    with pytest.raises(InputError, match="n_envs is 0"):
+        make_plan("Reach", n_envs=0)
+    with pytest.raises(InputError, match="curriculum is 2"):
+        make_plan("Reach", curriculum=2)
+    with pytest.raises(InputError, match="no configuration of a training"):
+        resume(tmp_path)
+    (tmp_path / CONFIG).write_text("{}")
+    with pytest.raises(InputError, match="holds a training; go on with it"):
+        train(make_plan("Reach"), tmp_path)
+    with pytest.raises(FastrodError, match="holds no policy"):
+        find("Reach", str(tmp_path / "nowhere"))
