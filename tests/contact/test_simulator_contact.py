@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 from contact.robots import bent, passive, prototype
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 import fastrod
 from fastrod.contact import ContactScene, box, cylinder, mesh, plane, sphere
@@ -258,6 +258,28 @@ def test_queries():
     free.step(bent(0.0, 3.0))
     ends = free.clearance()
     assert free.swept_clearance()[0] <= ends[0] + 1e-12
+
+
+def test_obstacles_that_are_seen_and_not_felt():
+    sim = fastrod.Simulator(prototype(1e-5), n_robots=2, contact=wall(), feel_contact=False)
+    twin = fastrod.Simulator(prototype(1e-5), n_robots=2)
+    felt = fastrod.Simulator(prototype(1e-5), contact=wall())
+    for curvature in (0.0, 4.0, 12.0):
+        free = twin.step(bent(curvature))
+        state = sim.step(bent(curvature))
+        assert_array_equal(state.position, free.position)
+        assert state.contacts is None
+    felt.settle(bent(0.0))
+    sim.settle(bent(0.0))
+    assert sim.clearance()[0] == felt.clearance()[0]
+    sim.settle(bent(12.0))
+    assert sim.clearance()[0] < -0.01
+    swept = sim.swept_clearance(rows=[1])
+    assert np.isnan(swept[0])
+    assert swept[1] <= sim.clearance()[1] + 1e-12
+    moved = sim.step(bent(12.0), obstacle_pose={"wall": [0, 0, -1.0, 1, 0, 0, 0]})  # its normal is now z
+    assert moved.ok.all()
+    assert sim.clearance()[0] == pytest.approx(1.0)
 
 
 def test_compliance_and_jacobian_hold_the_contact_forces():

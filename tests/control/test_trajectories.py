@@ -19,8 +19,9 @@ CENTER = (0.4, -0.2, 0.6)
 def test_velocity_is_the_derivative_of_position(name: str, period: float) -> None:
     path = trajectory(name, period=period, center=CENTER)
     t = np.random.default_rng(1).uniform(-2.0 * period, 3.0 * period, (4, 50))
-    corner = np.abs((4.0 * t / period + 0.5) % 1.0 - 0.5) < 1e-3
-    t = np.where(corner & ("square" in name), t + 0.01 * period, t)
+    sides = 3.0 if name == "triangle" else 4.0
+    corner = np.abs((sides * t / period + 0.5) % 1.0 - 0.5) < 1e-3
+    t = np.where(corner & ("square" in name or name == "triangle"), t + 0.01 * period, t)
     h = 1e-5 * period
     slope = (path.position(t + h) - path.position(t - h)) / (2.0 * h)
     assert path.velocity(t).shape == (4, 50, 3)
@@ -48,6 +49,14 @@ def test_a_helix_is_its_turn_that_sinks_by_the_pitch(name: str, pitch: float, tu
     assert_allclose(path.velocity(t)[:, 2], -pitch / 20.0, rtol=1e-12)
     up = trajectory(name, center=CENTER, downward=False)
     assert_allclose(up.position(t)[:, 2] - CENTER[2], CENTER[2] - path.position(t)[:, 2], atol=1e-12)
+
+
+def test_a_triangle_has_three_equal_sides_around_its_centre() -> None:
+    path = trajectory("triangle", side=0.04, period=9.0, center=CENTER)
+    corners = path.position(np.array([0.0, 3.0, 6.0]))
+    assert_allclose(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1), 0.04, rtol=1e-12)
+    assert_allclose(corners.mean(0), CENTER, atol=1e-15)
+    assert_allclose(np.linalg.norm(path.velocity(np.linspace(0.0, 9.0, 40)), axis=1), 0.12 / 9.0, rtol=1e-12)
 
 
 def test_sizes_are_those_of_the_paper() -> None:
