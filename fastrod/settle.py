@@ -88,12 +88,13 @@ def _newton(rows: Ints, params: Params, layout: Layout, ports: Ports, memory: Me
         else:
             if shorter is not None:
                 with np.errstate(invalid="ignore"):  # a robot that is lost has no step to shorten
-                    after = x_tried + shorter[:, None] * (after - x_tried)
+                    after = np.where(shorter[:, None] < 1.0, x_tried + shorter[:, None] * (after - x_tried), after)
             x_at = np.where(better[:, None], x_tried, x_at)
             step = np.where(better[:, None], after - x_tried, step)
             best = np.where(better, residual, best)
             damping = np.where(better, 1.0, 0.5 * damping)
-            memory.x[rows] = x_at + damping[:, None] * step
+            # a robot's bits do not depend on whether another one is damped
+            memory.x[rows] = np.where(better[:, None], after, x_at + damping[:, None] * step)
         # only a pass that was accepted can end it: what it wrote is what the caller gets
         closed = better & (np.isfinite(residual) if layout.paper else residual <= tolerance)
         patience -= closed

@@ -236,3 +236,16 @@ def test_the_hosts_bench_runs_and_its_states_are_what_they_say(capsys: pytest.Ca
     assert rows["prototype, pushes a free cube"]["touching"] > 0.0
     assert rows["prototype, free"]["touching"] == 0.0
     assert all(row["failed"] == 0 for row in rows.values())
+
+
+def test_the_envs_bench_runs_over_every_task(capsys: pytest.CaptureFixture[str]) -> None:
+    import bench_envs
+    import fastrod_envs
+
+    assert bench_envs.main(["--quick", "--json"]) == 0
+    sections = json.loads(capsys.readouterr().out)["sections"]
+    reach, others = sections["reach"]["rows"], sections["tasks"]["rows"]
+    assert {row["way"] for row in reach} == {"SyncVectorEnv", "native batch"}
+    assert all(row["rate"] > 0.0 for row in [*reach, *others])
+    assert all(0.0 < row["share"] < 1.0 for row in reach if row["way"] == "native batch")
+    assert {row["way"] for row in others} == set(fastrod_envs.names()) - {"Reach"}

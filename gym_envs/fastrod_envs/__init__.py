@@ -8,6 +8,9 @@
 from fastrod_envs.randomisation import Randomisation
 from fastrod_envs.registration import ids, names, register_all
 
-register_all()
+try:
+    register_all()
+except ModuleNotFoundError as error:
+    raise ImportError("fastrod_envs needs gymnasium: pip install fastrod[envs].") from error
 
 __all__ = ["Randomisation", "ids", "names"]

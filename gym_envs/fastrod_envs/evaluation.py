@@ -214,6 +214,7 @@ def _plot(evaluation: Evaluation, path: Path) -> Path:
         if not np.isnan(r):
             right.plot(1e3 * trial.desired[:, k], 1e3 * trial.position[:, k], ".", color=color, ms=4, label=f"{axis}, r = {r:.3f}")
     right.set(xlabel="desired [mm]", ylabel="at the end [mm]", title=f"{first}: end over goal")
-    right.legend(frameon=False, fontsize=8)
+    if right.get_legend_handles_labels()[0]:
+        right.legend(frameon=False, fontsize=8)
     figure.savefig(path, dpi=130)
     return path

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -25,7 +27,7 @@ class Result(NamedTuple):
     desired: Floats
     terminated: bool = False
     contact: bool = False
-    facts: dict[str, float] = {}  # noqa: RUF012: never written to
+    facts: Mapping[str, float] = MappingProxyType({})
 
 
 class Cell(ABC):
@@ -144,7 +146,7 @@ class HostedTask(Task):
         return np.array([cell.goal() for cell in self.cells])
 
     def baseline(self) -> Floats:
-        return np.clip(np.array([cell.baseline() for cell in self.cells]), -1.0, 1.0)
+        return np.asarray(np.clip(np.array([cell.baseline() for cell in self.cells]), -1.0, 1.0))
 
     def scenery(self, i: int) -> Scenery:
         return self.cells[i].scenery()

@@ -1,7 +1,8 @@
 """A small painter in numpy: what a `Scenery` looks like, in some milliseconds, without a window or a graphics card.
 
 Everything becomes triangles. Those of one layer are cut into rows of pixels, and rows into fragments, at twice the picture's
-resolution; the nearest fragment of every pixel is kept and only then shaded. See-through solids are layers of their own, laid over what is opaque.
+resolution; the nearest fragment of every pixel is kept and only then shaded. See-through solids are layers of their own, laid
+over what is opaque.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from fastrod_envs.task import Ball, Line, Scenery, Solid, Tube
 _FIELD_OF_VIEW = math.radians(36.0)  # from bottom to top
 _NEAR = 0.02  # m before the eye: nothing nearer is drawn
 _FINE = 2  # fragments a pixel, each way
-_SIDES = 20  # of a tube
+_SIDES = 24  # of a tube
 _LIGHT = np.array([0.35, -0.25, 0.9]) / np.linalg.norm([0.35, -0.25, 0.9])
 _SKY, _HORIZON, _FLOOR, _GRID = (np.array(c) for c in ((0.80, 0.86, 0.93), (0.96, 0.97, 0.98), (0.87, 0.89, 0.91), (0.71, 0.74, 0.78)))
 _MOUNT = (0.30, 0.33, 0.38)
@@ -192,16 +193,23 @@ def _tube_layers(tube: Tube) -> list[Layer]:
     body = tube_mesh(points, tube.radius)
     centre = np.concatenate([points, np.repeat(points[-1:], 5, axis=0)]).repeat(_SIDES, axis=0)
     normals = (body.vertices - centre) / tube.radius
-    along = (points[1] - points[0]) / max(float(np.linalg.norm(points[1] - points[0])), 1e-12)
-    stations = points[0] + tube.radius * np.array([0.0, 0.0, -0.7, -0.7])[:, None] * along
-    rim = tube_mesh(np.array([stations[2], stations[0]]), 2.2 * tube.radius).vertices[: 2 * _SIDES].reshape(2, _SIDES, 3)
-    rings = np.array([np.broadcast_to(stations[2], rim[0].shape), rim[0], rim[1], np.broadcast_to(stations[0], rim[0].shape)])
-    plate = Mesh(rings.reshape(-1, 3), _grid_faces(4, _SIDES))
     color = np.broadcast_to(np.array(tube.color, float), (len(body.faces), 3))
-    return [
-        Layer(body.vertices[body.faces], normals[body.faces], color, np.ones(len(body.faces))),
-        _lit(plate, _MOUNT, False),
-    ]
+    along = (points[1] - points[0]) / max(float(np.linalg.norm(points[1] - points[0])), 1e-12)
+    return [Layer(body.vertices[body.faces], normals[body.faces], color, np.ones(len(body.faces))), _plate(points[0], along, tube.radius)]
+
+
+def _plate(foot: Floats, along: Floats, radius: float) -> Layer:
+    """What a rod of this radius stands on."""
+    ends = np.array([foot - 0.7 * radius * along, foot])
+    rim = tube_mesh(ends, 2.2 * radius, 2 * _SIDES).vertices[: 4 * _SIDES].reshape(2, 2 * _SIDES, 3)
+    outward = (rim[1] - foot) / (2.2 * radius)
+    rings = np.concatenate([np.broadcast_to(ends[:1, None], rim[:1].shape), rim, np.broadcast_to(ends[1:, None], rim[:1].shape)])
+    faces = _grid_faces(4, 2 * _SIDES)
+    normals = np.broadcast_to(-along, (*faces.shape, 3)).reshape(3, -1, 3, 3).copy()  # lower side, rim, upper side
+    normals[1] = outward[faces.reshape(3, -1, 3)[1] % (2 * _SIDES)]
+    normals[2] = along
+    color = np.broadcast_to(np.array(_MOUNT), (len(faces), 3))
+    return Layer(rings.reshape(-1, 3)[faces], normals.reshape(-1, 3, 3), color, np.ones(len(faces)))
 
 
 def _smooth(points: Floats) -> Floats:
@@ -323,7 +331,11 @@ def _lay(picture: Floats, layers: list[tuple[Layer, float]], camera: Camera) -> 
         pixel, triangle, depth = _fragments(at, inverse, fine.width, fine.height)
         covered, which = _nearest(pixel, depth, fine.width * fine.height)
         triangle = triangle[which]
-        found.append((covered, depth[which], _shaded(layer, covered, triangle, at, inverse, fine), opacity))
+        # the left one of two neighbours within a pixel and a triangle is shaded for both
+        alone = np.ones(len(covered), np.bool_)
+        alone[1:] = (triangle[1:] != triangle[:-1]) | (covered[1:] != covered[:-1] + 1) | (covered[1:] % _FINE == 0)
+        shaded = _shaded(layer, covered[alone], triangle[alone], at, inverse, fine)[np.cumsum(alone) - 1]
+        found.append((covered, depth[which], shaded, opacity))
     mark = np.zeros(fine.width * fine.height, np.bool_)
     for covered, *_ in found:
         mark[covered] = True

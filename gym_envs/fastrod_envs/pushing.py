@@ -5,24 +5,23 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from typing import Any, ClassVar, final
 
 import numpy as np
 
-from fastrod.errors import HostError, InputError
+from fastrod.errors import HostError
 from fastrod.hosts.bodies import RodBodies
 from fastrod.hosts.bullet import Bullet, connect
 from fastrod.hosts.camera import Camera
 from fastrod.hosts.link import from_xyzw
 from fastrod.robot import Robot
 from fastrod.rotation import matrix_from_quaternion
-from fastrod.segments import SegmentActions
 from fastrod.simulator import Simulator
 from fastrod.state import State
 from fastrod.types import Floats
 from fastrod_envs.hosted import Cell, HostedTask, Result
 from fastrod_envs.options import Options
+from fastrod_envs.push_course import Course, Drive, PushOptions
 from fastrod_envs.rodtask import resolved
 from fastrod_envs.shapes import box_mesh
 from fastrod_envs.task import Ball, Field, Scenery, Solid, Tube
@@ -44,110 +43,12 @@ _AROUND = 0.15  # m, the longest vector to the cube
 _AWAY = 0.6  # m, no cube is pushed farther
 _SHIFT, _TURN = 0.01, 0.1  # m and rad, the most by which the cube begins elsewhere
 _MOST = 1.0  # N that a robot feels: a bar that jams the cube against the floor would exert any force
+_RELAXATION = 0.3  # s, in which a robot answers what it feels: it has no mass, and would swing with what it pushes
 _AT_REST = 1e-5  # m, residual of a robot that counts as at rest
 _PASSES = 8
+_CLEAR = 0.002  # m, of the bar above the floor
 _FASTEST = 0.3  # m/s, no tip moves faster
 _ROD, _BAR, _CUBE, _GOAL = (0.9, 0.55, 0.15), (0.35, 0.35, 0.38), (0.2, 0.45, 0.8), (0.85, 0.2, 0.15)
-
-
-@dataclass(frozen=True, kw_only=True)
-class PushOptions(Options):
-    """Of Push and QuadrupedPush."""
-
-    feels: bool = True
-    """What the cube exerts on the bar bends the robot in its next step; False: the bar moves as if nothing were there."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not isinstance(self.feels, bool):
-            raise InputError(f"feels is {self.feels!r}; it must be True or False.")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Course:
-    """Where a robot pushes which cube, and where to."""
-
-    robot: Robot
-    """Carries the bar at its tip, along its d2."""
-    width: float
-    """Of the bar, without its round ends [m]."""
-    thickness: float
-    """Radius of the bar [m]."""
-    size: float
-    """Edge of the cube [m]."""
-    mass: float
-    """Of the cube [kg]."""
-    place: tuple[float, float]
-    """Middle of the cube at first, x and y, world [m]."""
-    least: tuple[float, float]
-    """Corner of the goals' rectangle, x and y, world [m]."""
-    largest: tuple[float, float]
-    """The other corner."""
-    gap: float
-    """Between bar and cube at first [m]."""
-    bend: float
-    """Largest of a segment [rad]."""
-    steepness: float
-    """k of the reward exp(-k d^2) [1/m^2]."""
-
-    @property
-    def height(self) -> float:
-        """At which the bar pushes: half as high as the cube [m]."""
-        return 0.5 * self.size
-
-    @property
-    def behind(self) -> float:
-        """From the cube's middle to a tip whose bar touches it straight behind [m]."""
-        return 0.5 * self.size + self.thickness
-
-
-@final
-class Drive:
-    """Three numbers for all segments alike: extension, bends toward d1 and d2 as displacements [m]."""
-
-    def __init__(self, robot: Robot, bend: float) -> None:
-        """`bend`: the largest of a segment, each way [rad]."""
-        self.actions = SegmentActions(robot)
-        n, offset = robot.n_segments, self.actions.offset
-        self.spread: Floats = np.zeros((3 * n, 3))
-        """(3 n_segments, 3) displacements of the segments by these numbers."""
-        for k in range(3):
-            self.spread[k::3, k] = 1.0
-        short, long = (f(segment.extension[i] for segment in robot.segments) for f, i in ((max, 0), (min, 1)))
-        side = bend * float(offset.min())
-        self.low: Floats = np.array([short, -side, -side])
-        """(3,) [m]"""
-        self.high: Floats = np.array([long, side, side])
-        """(3,) [m]"""
-        self.rate: Floats = np.array([0.06, 0.5 * float(offset.min()), 0.5 * float(offset.min())])
-        """(3,) the largest rate [m/s]: half a radian a second in each segment."""
-
-    def inputs(self, q: Floats) -> Any:
-        """Of the simulator for these numbers (3,)."""
-        return self.actions.inputs(self.spread @ q)
-
-    def jacobian(self, simulator: Simulator) -> Floats:
-        """(3, 3) d(tip)/d(these numbers), world; zero where the rod's is not known."""
-        return np.asarray(np.nan_to_num(simulator.jacobian()[0, :3] @ self.actions.matrix) @ self.spread)
-
-    def posture(self, q: Floats) -> Floats:
-        """(3,) from -1, the least, to 1, the largest."""
-        return np.asarray((2.0 * q - self.low - self.high) / (self.high - self.low))
-
-    def placed(self, posture: Floats) -> Floats:
-        """(3,) of a posture from -1 to 1."""
-        return np.asarray(0.5 * (self.low + self.high) + 0.5 * (self.high - self.low) * posture)
-
-    def reach(self, simulator: Simulator, tip: Floats) -> Floats:
-        """(3,) with which the tip of a simulated robot is there, world [m], by Newton's method."""
-        q = self.placed(np.zeros(3))
-        for _ in range(30):
-            at = simulator.settle(**self.inputs(q)).tip_position[0]
-            off = tip - at
-            q = np.clip(q + np.linalg.solve(self.jacobian(simulator), np.clip(off, -0.05, 0.05)), self.low, self.high)
-        if np.abs(off).max() > 1e-4:
-            raise InputError(f"robot {simulator.robots[0].name!r} does not reach {tip.round(3).tolist()} m, where its tip is to begin.")
-        return q
 
 
 @final
@@ -156,7 +57,7 @@ class PushCell(Cell):
     episode: nothing is left of the one before."""
 
     def __init__(self, course: Course, robot: Robot, options: PushOptions, duration: float, backdrop: Callable[[], Bullet]) -> None:
-        """`robot` before it is randomised; `duration` of an environment step [s]; `backdrop` makes the world in which pictures are taken."""
+        """`robot` before it is randomised; `duration` of an environment step [s]; `backdrop` makes the world for pictures."""
         self.course, self.options, self._backdrop = course, options, backdrop
         self._n = max(1, math.ceil(duration / _STEP - 1e-9))
         self._dt = duration / self._n
@@ -178,7 +79,7 @@ class PushCell(Cell):
         self.desired: Floats = np.zeros(2)
         """(2,) goal of the cube, world [m]."""
         self.felt: Floats = np.zeros(6)
-        """Force of the cube on the bar [N] and its moment about the tip [N m], world: of the last step and, by half, of those before."""
+        """Force of the cube on the bar [N] and its moment about the tip [N m], world: as the robot answers it, with a delay."""
         self.touched = False
         """The robot met the cube in this episode."""
 
@@ -233,7 +134,7 @@ class PushCell(Cell):
         jacobian = drive.jacobian(self.simulator) * drive.rate
         rates = resolved(jacobian[None], velocity[None], np.zeros((1, 3)))[0]
         if self.options.action == "rate":
-            return rates
+            return np.asarray(rates)
         return drive.posture(self.q + self._n * self._dt * drive.rate * rates)
 
     def scenery(self) -> Scenery:
@@ -288,7 +189,7 @@ class PushCell(Cell):
 
     def _view(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
         x, y = 0.5 * (np.array(self.course.place) + np.array(self.course.largest))
-        return (x + 0.35, y - 0.85, 0.55), (x - 0.1, 0.0, 0.12)
+        return (x + 0.35, y - 0.85, 0.55), (x - 0.15, 0.0, 0.2)
 
     def _simulator(self, robot: Robot) -> Simulator:
         return Simulator(robot, dt=self._dt, points_per_segment=_POINTS, threads=1)
@@ -326,7 +227,7 @@ class PushCell(Cell):
         met = {body for contact in self.world.getContactPoints(self._cube_body) for body in contact[1:3]}
         self.touched = self.touched or bool(total.any()) or not met.isdisjoint(self._tube.ids)
         if self.options.feels:
-            mean = 0.5 * (self.felt + total / _WITHIN)
+            mean = self.felt + self._dt / (self._dt + _RELAXATION) * (total / _WITHIN - self.felt)
             self.felt = mean * (_MOST / max(float(np.linalg.norm(mean[:3])), _MOST))
         _place(self.course, state, self._tube, self._bar)
 
@@ -346,7 +247,7 @@ class PushCell(Cell):
 
     def _clear(self, q: Floats) -> Floats:
         """Numbers near these with which the bar does not enter the floor."""
-        lowest = self.course.height - 0.01
+        lowest = self.course.thickness + 0.5 * self.course.width * abs(float(self.simulator.state.tip_rotation[0, 2, 1])) + _CLEAR
         if self.tip[2] > lowest + _FASTEST * self._dt:
             return q
         rise = self.drive.jacobian(self.simulator)[2]
@@ -354,7 +255,7 @@ class PushCell(Cell):
         if lacks <= 0.0:
             return q
         by = self.drive.rate**2 * rise
-        return np.clip(q + lacks / max(float(rise @ by), 1e-12) * by, self.drive.low, self.drive.high)
+        return np.asarray(np.clip(q + lacks / max(float(rise @ by), 1e-12) * by, self.drive.low, self.drive.high))
 
 
 class PushTask(HostedTask):
@@ -373,17 +274,17 @@ class PushTask(HostedTask):
         unit = "m/s" if options.action == "rate" else "m"
         names = "extension, displacements toward d1 and d2 of every segment alike"
         actions = (Field("displacement", unit, tuple(low), tuple(high), f"{what} {names}".strip()),)
-        foot, far = np.array(course.robot.base_position), 1.5 * course.robot.length
+        foot, far, place = np.array(course.robot.base_position), 1.5 * course.robot.length, np.array(course.place)
         goal = Field("goal", "m", course.least, course.largest, "where the cube is to be, x and y, world")
         states = (
             goal,
-            Field("cube", "m", *(tuple(np.array(course.place) + s * _AWAY) for s in (-1, 1)), "its middle, x and y, world"),
+            Field("cube", "m", tuple(place - _AWAY), tuple(place + _AWAY), "its middle, x and y, world"),
             Field(
                 "turn",
                 "",
                 (-1.0,) * 2,
                 (1.0,) * 2,
-                "cosine and sine of four times the cube's angle about z: a quarter turn changes nothing",
+                "cosine and sine of four times the cube's angle about z",
             ),
             Field("tip", "m", tuple(foot - far), tuple(foot + far), "of the robot, world"),
             Field("error", "m", (-_NEAR,) * 2, (_NEAR,) * 2, f"from cube to goal, x and y, at most {_NEAR:g} m of it"),
@@ -403,12 +304,7 @@ class PushTask(HostedTask):
         return PushCell(self.course, self.base_robot, options, self.dt, self.backdrop)
 
 
-def longer(robot: Robot, length: float, extension: tuple[float, float]) -> Robot:
-    """A robot whose segments have this length and extension [m]."""
-    return replace(robot, segments=tuple(replace(segment, length=length, extension=extension) for segment in robot.segments))
-
-
-def _load(wrench: Floats) -> dict[str, Floats]:
+def _load(wrench: Floats) -> dict[str, Any]:
     return {"tip_force": wrench[:3], "tip_moment": wrench[3:]}
 
 
@@ -432,4 +328,3 @@ def _place(course: Course, state: State, tube: RodBodies, bar: RodBodies) -> Non
 
 def _at_most(vector: Floats, longest: float) -> Floats:
     return np.asarray(vector * (longest / max(float(np.hypot(*vector)), longest)))
-

@@ -34,8 +34,8 @@ EXTENSION_RATE, BEND_RATE = 0.04, 2.0
 """Largest [m/s], [rad/s]."""
 LEAST_PIXELS = 20
 """Of the cube in the tip's picture, for its corner to be seen (as the scene `explore` has it)."""
-FAR = 0.2
-"""The miss is observed up to this length [m]."""
+FAR, FINE = 0.2, 0.03
+"""The miss is observed twice, up to these lengths [m]."""
 NEAR_WALL = 0.05
 """Clearance is observed up to this [m]."""
 _EYE = Camera(width=160, height=120, fov=70.0, near=0.005, far=2.0)
@@ -104,6 +104,7 @@ class BoxExplore(HostedTask):
                 (FAR,) * 2,
                 f"of the line of sight from the cube toward d1 and d2 of the tip, at most {FAR:g} m of it",
             ),
+            Field("fine", "m", (-FINE,) * 2, (FINE,) * 2, f"the same, at most {FINE:g} m of it"),
             Field("far", "m", (0.0,), (1.0,), "from tip to cube"),
             Field("base", "m", *inside, "of the soft robot, world"),
             Field("base_right", "", *ones, "d1 of the base, world"),
@@ -184,10 +185,10 @@ class _Inside(Cell):
 
     def state(self) -> Floats:
         soft, rotation, base = self.soft, self.soft.tip_rotation, self._base_rotation
-        shown = self._miss * (FAR / max(self._off, FAR))
+        shown, fine = (self._miss * (most / max(self._off, most)) for most in (FAR, FINE))
         far = np.linalg.norm(self._goal - soft.tip)
         parts = [
-            self._goal, soft.tip, rotation[:, 0], rotation[:, 2], shown, [far], soft.base[:3], base[:, 0], base[:, 2],
+            self._goal, soft.tip, rotation[:, 0], rotation[:, 2], shown, fine, [far], soft.base[:3], base[:, 0], base[:, 2],
             [min(max(self._gap, -NEAR_WALL), NEAR_WALL)], soft.posture(),
         ]  # fmt: skip
         if self.camera:

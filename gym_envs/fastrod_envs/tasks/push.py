@@ -7,7 +7,8 @@ from typing import final
 
 from fastrod.hosts.bullet import Bullet, connect
 from fastrod_envs.options import Options
-from fastrod_envs.pushing import Course, PushTask, longer
+from fastrod_envs.push_course import Course, longer
+from fastrod_envs.pushing import PushTask
 from fastrod_scenes.a1.quadruped import floor, neck
 
 HEIGHT = 0.5
@@ -16,16 +17,15 @@ HEIGHT = 0.5
 
 def course() -> Course:
     """Robot, cube and goals."""
-    robot = replace(longer(neck(3), 0.165, (-0.03, 0.05)), name="pusher", base_position=(0.0, 0.0, HEIGHT), base_quaternion=(0.0, 1.0, 0.0, 0.0))
-    return Course(
-        robot=robot, width=0.08, thickness=0.015, size=0.08, mass=0.05, place=(0.1, 0.0), least=(0.2, -0.1), largest=(0.32, 0.1),
-        gap=0.01, bend=0.6, steepness=50.0,
-    )  # fmt: skip
+    robot = replace(
+        longer(neck(3), 0.165, (-0.03, 0.05)), name="pusher", base_position=(0.0, 0.0, HEIGHT), base_quaternion=(0.0, 1.0, 0.0, 0.0)
+    )
+    return Course(robot=robot, place=(0.1, 0.0), least=(0.22, -0.1), largest=(0.34, 0.1), steepness=50.0)
 
 
 @final
 class Push(PushTask):
-    """Push a cube over the floor to a goal with a soft robot that hangs from (0, 0, 0.5) m: goals x 0.2 to 0.32 m, y -0.1 to 0.1 m.
+    """Push a cube over the floor to a goal with a soft robot that hangs from (0, 0, 0.5) m: goals x 0.22 to 0.34 m, y -0.1 to 0.1 m.
 
     The robot has three segments of 0.165 m, which become 30 mm shorter or 50 mm longer, and a bar across its tip, 80 mm wide. Three
     numbers drive all segments alike: extension and bends toward d1 (+x) and d2 (-y). The cube, 80 mm and 50 g, begins within 1 cm of

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 from fastrod.contact import ContactScene, mesh
+from fastrod.errors import InputError
 from fastrod.robot import Robot, Segment, Tendon
 from fastrod.segments import SegmentActions
 from fastrod.simulator import Simulator
@@ -42,6 +43,8 @@ ASIDE = 0.0025
 """The rod's axis misses the mouth's middle by up to so much in x and in y [m]."""
 LAG = 0.006
 """The baseline bends a segment as the tube does so far behind its end: one that is half in the turn bends outside of it too [m]."""
+GAIN = 20.0
+"""Of the baseline: bend of the outer segment per distance of the tip from the tube's middle [rad/m]."""
 NEAR = 0.05
 """Errors are observed up to this length [m]."""
 PATIENCE = 5
@@ -49,8 +52,10 @@ PATIENCE = 5
 SUBSTEPS = 16
 """Steps of the simulator on the way to a displacement."""
 _BENDS = (1, 2, 4, 5)
-_LIMIT = np.array([(-0.8 * OFFSET, 0.8 * OFFSET)] * 4 + [(0.0, OUTSIDE + 2.0 * SEGMENT)])
-_RATE = np.array([0.4 * OFFSET] * 4 + [0.02])
+LIMIT = np.array([(-0.8 * OFFSET, 0.8 * OFFSET)] * 4 + [(0.0, OUTSIDE + 2.0 * SEGMENT)])
+"""(5, 2) ranges of the displacements of the wires, two a segment, and of the feed [m]."""
+RATE = np.array([0.4 * OFFSET] * 4 + [0.02])
+"""(5,) their largest rates [m/s]."""
 _SECTORS, _RINGS, _FILLET = 24, 12, 8
 
 
@@ -73,18 +78,19 @@ def thin_robot() -> Robot:
 class TubeInsert(Task):
     """Feed a rod of two bending segments into a curved tube until its tip is at a given depth, and do not press on the wall.
 
-    The tube stands still: its mouth is at the origin, it runs along z for 15 mm and then turns by 60 degrees toward x, on a radius of
-    70 mm; inside it is 14 mm wide, the rod 4 mm; nothing rubs. The base moves along z (feed, 0.03 m/s), and each of the two
-    segments of 40 mm bends both ways. For every episode are drawn: the goal's depth along the tube's middle, 30 to 70 mm; the angle by which
-    robot and base are rolled about z, any; and by how much the rod's axis misses the mouth's middle, 1.5 mm in x and y. What is
-    observed and what is done is in the robot's own axes, seen from the mouth's middle. The force is felt as the wrench at the base.
+    The tube stands still: the middle of its mouth is the origin, it runs along z for 15 mm and then turns by 60 degrees toward x on
+    a radius of 70 mm. It is 11 mm wide inside, the rod 4 mm; nothing rubs. The base moves along z (feed, up to 0.02 m/s), and each of
+    the two segments of 40 mm bends both ways (0.8 rad at most, 0.4 rad/s). Drawn for every episode: the goal's depth along the tube's
+    middle, 30 to 70 mm; the roll of robot and base about z, any; and by how much the rod's axis misses the mouth's middle, up to 2.5
+    mm in x and in y. What is observed and done is in the robot's own axes, seen from the mouth's middle; of the contacts only the wrench at
+    the base is felt. F is the sum of the sizes of all forces on the wall.
 
-    Reward a step: exp(-d / 0.02 m), d the tip's distance from the goal [m]; -(F - 0.3 N) / 0.3 N, at most -1, while the forces on
-    the wall sum up to F beyond 0.3 N; -10 when F is beyond 0.6 N, which ends the episode, failed. Success: d below 5 mm, and in
-    the whole episode F never beyond 0.3 N. An episode has 50 steps of 100 ms, or ends when a robot's shape is not found
-    5 times in a row (until then it stands still). With difficulty 0 the goal is 30 mm deep, straight ahead and not rolled. `action="displacement"` goes
-    there in 16 equal parts. Baseline: constant feed that slows down at the goal, each segment bent as the tube is at its place, and the
-    outer one against the tip's distance from the tube's middle.
+    Reward a step: exp(-d / 0.02 m), d the tip's distance from the goal [m]; -(F - 0.3 N) / 0.3 N, at most -1, where F is beyond
+    0.3 N; -10 where it is beyond 0.6 N, which ends the episode, failed. Success: d below 5 mm, and F never beyond 0.3 N in the
+    episode. An episode has 50 steps of 100 ms, and may end before by force, or when a robot's shape was not found 5 times in a
+    row (until then it stays where it was). With difficulty 0 the goal is 30 mm deep, the rod is in the middle and not rolled.
+    `action="displacement"` goes there in 16 equal parts, one after the other. Baseline: each segment bent as the tube is at its
+    place, the outer one also against the tip's distance from the middle; constant feed that slows down over the last 10 mm.
     """
 
     name = "TubeInsert"
@@ -97,6 +103,8 @@ class TubeInsert(Task):
         super().__init__(n_envs, options)
         self._random = Randomisation.of(options.randomise)
         self.base_robot = thin_robot() if self._random is None else self._random.base(thin_robot())
+        if abs(self.base_robot.length - 2.0 * SEGMENT) > 1e-9:
+            raise InputError(f"robot {self.base_robot.name!r} is {self.base_robot.length:g} m long; TubeInsert's is {2.0 * SEGMENT:g} m.")
         self._varies = self._random is not None and self._random.n_draws > 0
         if self._varies and self._random is not None:
             self.total_draws = self.n_draws + self._random.n_draws
@@ -134,7 +142,7 @@ class TubeInsert(Task):
 
     def _parts(self) -> None:
         rate = self.options.action == "rate"
-        low, high = (-_RATE, _RATE) if rate else _LIMIT.T
+        low, high = (-RATE, RATE) if rate else LIMIT.T
         unit, word = ("m/s", "rate of the ") if rate else ("m", "")
         self.actions = (
             Field("displacement", unit, tuple(low[:4]), tuple(high[:4]), f"{word}displacements (1a, 1b, 2a, 2b: toward d1, d2)"),
@@ -170,20 +178,20 @@ class TubeInsert(Task):
         self.roll[rows] = np.stack([np.cos(angle), np.sin(angle)], axis=1)
         self.aside[rows] = ease * ASIDE * (2.0 * draws[:, 2:4] - 1.0)
         self.displacement[rows] = 0.0
+        self.simulator.restore(self._home, rows)
         if self._varies and self._random is not None:
             self.simulator.replace(rows, self._random.draw(self.base_robot, draws[:, self.n_draws :]))
-        else:
-            self.simulator.restore(self._home, rows)
         # straight and weightless: no need to ask the simulator, whose next step comes from there
         self.tip[rows, :2], self.tip[rows, 2] = self.aside[rows], -OUTSIDE
         self.direction[rows] = (0.0, 0.0, 1.0)
-        for quantity in (self.wrench, self.force, self.largest, self.failed, self._in_a_row):
-            quantity[rows] = 0
+        self.wrench[rows] = 0.0
+        self.force[rows] = self.largest[rows] = 0.0
+        self.failed[rows] = self._in_a_row[rows] = 0
 
     def act(self, action: Floats) -> None:
-        low, high = _LIMIT.T
+        low, high = LIMIT.T
         if self.options.action == "rate":
-            way = [np.clip(self.displacement + self.dt * _RATE * action, low, high)]
+            way = [np.clip(self.displacement + self.dt * RATE * action, low, high)]
         else:
             end = 0.5 * (low + high) + 0.5 * (high - low) * action
             start = self.displacement
@@ -223,9 +231,9 @@ class TubeInsert(Task):
             "fail": np.where(beyond, -10.0, 0.0),
         }
         return Outcome(
-            terms=terms, distance=d, success=(d < self.accuracy) & (self.largest <= FORCE) & ~self.lost, position=self.tip,
+            terms=terms, distance=d, success=(d < self.accuracy) & (self.largest <= FORCE) & ~self.lost, position=self.tip.copy(),
             desired=desired, terminated=beyond, contact=self.force > FORCE, lost=self.lost,
-            facts={"force": self.force, "largest_force": self.largest.copy(), "failed": self.failed.copy()},
+            facts={"force": self.force.copy(), "largest_force": self.largest.copy(), "failed": self.failed.astype(float)},
         )  # fmt: skip
 
     def state(self) -> Floats:
@@ -243,7 +251,7 @@ class TubeInsert(Task):
 
     def posture(self) -> Floats:
         """(n_envs, 5) displacements from -1, the least, to 1, the largest."""
-        low, high = _LIMIT.T
+        low, high = LIMIT.T
         return np.asarray((2.0 * self.displacement - low - high) / (high - low))
 
     def measured(self) -> Floats:
@@ -259,18 +267,18 @@ class TubeInsert(Task):
     def baseline(self) -> Floats:
         station, out, across = place(self.measured())
         feed = np.clip((self.depth - station) / 0.01, -1.0, 1.0)
-        ahead = self.displacement[:, 4] - OUTSIDE + self.dt * _RATE[4] * feed
+        ahead = self.displacement[:, 4] - OUTSIDE + self.dt * RATE[4] * feed
         outer, inner = heading(ahead - LAG), heading(ahead - SEGMENT - LAG)
         inside = np.clip(station / 0.01, 0.0, 1.0)
         inward = outer - inner + inside * out * GAIN
         sideways = -inside * across * GAIN
         c, s = self.roll[:, 0], -self.roll[:, 1]
         bends = [c * inner, s * inner, c * inward - s * sideways, s * inward + c * sideways]
-        there = np.column_stack([OFFSET * np.stack(bends, axis=1), self.displacement[:, 4] + self.dt * _RATE[4] * feed])
-        low, high = _LIMIT.T
+        there = np.column_stack([OFFSET * np.stack(bends, axis=1), self.displacement[:, 4] + self.dt * RATE[4] * feed])
+        low, high = LIMIT.T
         if self.options.action == "rate":
-            return np.clip((there - self.displacement) / (self.dt * _RATE), -1.0, 1.0)
-        return np.clip((2.0 * there - low - high) / (high - low), -1.0, 1.0)
+            return np.asarray(np.clip((there - self.displacement) / (self.dt * RATE), -1.0, 1.0))
+        return np.asarray(np.clip((2.0 * there - low - high) / (high - low), -1.0, 1.0))
 
     def scenery(self, i: int) -> Scenery:
         vertices, faces = tube_mesh()
@@ -296,10 +304,6 @@ class TubeInsert(Task):
         """World vectors (n_envs, 3) along the robot's axes."""
         c, s = self.roll.T
         return np.stack([c * vectors[:, 0] + s * vectors[:, 1], c * vectors[:, 1] - s * vectors[:, 0], vectors[:, 2]], axis=1)
-
-
-GAIN = 20.0
-"""Of the baseline: bend of the outer segment per distance of the tip from the tube's middle [rad/m]."""
 
 
 def pressed(state: State) -> Floats:

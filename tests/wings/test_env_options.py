@@ -1,0 +1,280 @@
+"""What an environment can be told: its options, randomised robots, difficulty, and how it is shown."""
+
+from __future__ import annotations
+
+import re
+import sys
+import time
+import urllib.request
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+import fastrod_envs
+from fastrod import save_robot
+from fastrod.errors import InputError, UnknownNameError
+from fastrod_envs.painter import ball_mesh, paint, tube_mesh
+from fastrod_envs.randomisation import Randomisation
+from fastrod_envs.registration import task_class
+from fastrod_envs.rodtask import RodTask
+from fastrod_envs.single import SingleEnv
+from fastrod_envs.task import Ball, Line, Scenery, Solid, Tube
+from fastrod_envs.tasks.reach import hanging_robot
+from fastrod_envs.vector import BatchEnv
+
+NAMES = fastrod_envs.names()
+BACKLASH = {"bending_stiffness": (0.8, 1.2), "backlash.half_width": (0.0, 3e-4)}
+
+
+def made(name: str, n: int = 2, **options: Any) -> BatchEnv:
+    if task_class(name).hosted:
+        pytest.importorskip("pybullet")
+    return BatchEnv(name, n, threads=1, **options)
+
+
+def actions(env: BatchEnv, n: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-1.0, 1.0, (n, *env.action_space.shape))
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "options", [{"n_steps": 1}, {"observation": "goal"}, {"action": "displacement", "n_steps": 2}], ids=["bandit", "goal", "displacement"]
+)
+def test_every_task_knows_the_common_options(name: str, options: dict[str, Any]) -> None:
+    env = made(name, 1, **options)
+    observation, _ = env.reset(seed=1)
+    parts = env.task.goals if options.get("observation") == "goal" else env.task.states
+    assert observation.shape == (1, sum(len(part.low) for part in parts))
+    observation, reward, terminated, truncated, _ = env.step(actions(env, 1)[0])
+    assert env.observation_space.contains(observation)
+    assert np.isfinite(reward).all()
+    assert (terminated | truncated).all() == (options.get("n_steps") == 1 or terminated.all())
+    env.close()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_difficulty_is_a_number_from_zero_to_one(name: str) -> None:
+    env = made(name, difficulty=0.0)
+    env.reset(seed=4)
+    easiest = env.task.goal().copy()
+    env.reset(seed=4, options={"difficulty": 1.0})
+    assert not np.array_equal(env.task.goal(), easiest)
+    env.set_difficulty(0.0)
+    env.reset(seed=4)
+    assert_array_equal(env.task.goal(), easiest)
+    for level in (-0.1, 1.5, np.nan, "hard"):
+        with pytest.raises(InputError, match="difficulty"):
+            env.set_difficulty(level)  # type: ignore[arg-type]
+    env.close()
+
+
+def test_a_difficulty_scales_the_goals_of_reach() -> None:
+    goals = {}
+    for level in (0.0, 0.5, 1.0):
+        env = made("Reach", 64, difficulty=level)
+        env.reset(seed=0)
+        goals[level] = env.task.goal().copy()
+    assert_allclose(goals[0.0], goals[0.0][:1].repeat(64, axis=0))
+    assert_allclose(goals[0.5] - goals[0.0], 0.5 * (goals[1.0] - goals[0.0]), atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"n_step": 5}, r"n_step'.*n_steps"), ({"n_steps": 0}, "n_steps"), ({"n_steps": 2.5}, "n_steps"), ({"n_steps": True}, "n_steps"),
+        ({"observation": "image"}, "observation.*state.*goal"), ({"action": "torque"}, "action.*rate.*displacement"),
+        ({"difficulty": 2}, "difficulty"), ({"reward": "best"}, "reward.*paper.*precise"), ({"threads": 0}, "threads"),
+        ({"render_mode": "human"}, "render_mode.*rgb_array.*viser"), ({"num_envs": 0}, "num_envs"), ({"num_envs": 1.5}, "num_envs"),
+        ({"randomise": 3}, "randomise"), ({"randomise": {"bending_stifness": (1, 2)}}, "bending_stiffness"),
+        ({"randomise": {"backlash.half_widht": (0, 1)}}, "half_width"), ({"randomise": {"bending_stiffness": (2, 1)}}, "range"),
+        ({"randomise": {"bending_stiffness": (0, 1)}}, "positive"), ({"randomise": {"bending_stiffness": (1, np.nan)}}, "finite"),
+        ({"randomise": {"spread": 1.0}}, "spread"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_said_in_a_sentence(options: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence) as caught:
+        BatchEnv("Reach", **options)
+    assert len(str(caught.value)) < 400
+    assert "\n" not in str(caught.value)
+
+
+def test_unknown_names_answer_with_the_nearest() -> None:
+    with pytest.raises(UnknownNameError, match="backlash"):
+        made("Reach", randomise={"backlsh.half_width": (0.0, 1e-4)})
+    with pytest.raises(InputError, match="difficulty"):
+        made("Reach").reset(options={"dificulty": 0.5})
+    with pytest.raises(InputError, match="difficulty"):
+        SingleEnv("Reach", threads=1).reset(options={"reset_mask": [True]})
+
+
+def test_max_episode_steps_is_another_name() -> None:
+    assert made("Reach", max_episode_steps=7).n_steps == 7
+    assert made("Reach").n_steps == task_class("Reach").n_steps
+
+
+def test_the_precise_reward_adds_a_term() -> None:
+    env = made("Reach", reward="precise")
+    env.reset(seed=0)
+    _, reward, _, _, info = env.step(np.zeros(env.action_space.shape))
+    terms = info["reward_terms"]
+    assert_allclose(terms["precise"], np.exp(-info["distance"] / 0.01), rtol=1e-12)
+    assert_allclose(terms["reach"], np.exp(-50.0 * info["distance"] ** 2), rtol=1e-12)
+    assert_allclose(reward, terms["reach"] + terms["height"] + terms["precise"], rtol=1e-12)
+
+
+def test_robots_differ_from_episode_to_episode() -> None:
+    env = made("Reach", 3, n_steps=4, randomise=BACKLASH)
+    same = made("Reach", 3, n_steps=4)
+    task = env.task
+    assert isinstance(task, RodTask)
+    env.reset(seed=2)
+    same.reset(seed=2)
+    assert_array_equal(task.goal(), same.task.goal())  # the robot's numbers are drawn after the goal's
+    robots = [task.simulator.robots]
+    for action in actions(env, 4):
+        observation = env.step(action)[0]
+        assert_array_equal(np.isfinite(observation), True)
+        plain = same.step(action)[0]
+    assert np.abs(observation - plain).max() > 0.0
+    robots.append(task.simulator.robots)
+    nominal = task.base_robot.segments[0].bending_stiffness[0]
+    factors = np.array([[r.segments[0].bending_stiffness[0] / nominal for r in group] for group in robots])
+    widths = np.array([[r.effects[0]["half_width"] for r in group] for group in robots])
+    assert ((factors >= 0.8) & (factors <= 1.2)).all()
+    assert ((widths >= 0.0) & (widths <= 3e-4)).all()
+    assert len(np.unique(factors)) == len(np.unique(widths)) == 6
+    first = [r.segments for r in robots[0]]
+    env.reset(seed=2)
+    assert [r.segments for r in task.simulator.robots] == first
+
+
+def test_a_robot_file_with_effects_is_simulated_within_its_spread(tmp_path: Path) -> None:
+    path = tmp_path / "identified.toml"
+    save_robot(hanging_robot(), path)
+    path.write_text(path.read_text() + '\n[[effect]]\nname = "backlash"\nhalf_width = 2e-4\n')
+    for given in (path, str(path), {"robot": path, "spread": 0.2}):
+        env = made("Reach", 4, randomise=given)
+        env.reset(seed=0)
+        task = env.task
+        assert isinstance(task, RodTask)
+        widths = np.array([r.effects[0]["half_width"] for r in task.simulator.robots])
+        assert ((widths >= 0.8 * 2e-4) & (widths <= 1.2 * 2e-4)).all()
+        assert len(np.unique(widths)) == 4
+        assert np.isfinite(env.step(actions(env, 1)[0])[0]).all()
+    fixed = made("Reach", 4, randomise=Randomisation(robot=replace(hanging_robot(), effects=({"name": "backlash", "half_width": 2e-4},))))
+    fixed.reset(seed=0)
+    assert fixed.task.total_draws == task_class("Reach").n_draws
+    assert np.isfinite(fixed.step(actions(fixed, 1)[0])[0]).all()
+
+
+def test_a_robot_of_another_kind_is_refused() -> None:
+    with pytest.raises(InputError, match="segments"):
+        made("Reach", randomise="prototype")
+
+
+def flat(z: float = 0.0) -> Solid:
+    """A square plate of 0.4 m."""
+    corners = np.array([[-0.2, -0.2, z], [0.2, -0.2, z], [0.2, 0.2, z], [-0.2, 0.2, z]])
+    return Solid(corners, np.array([[0, 1, 2], [0, 2, 3]]), (0.0, 0.0, 1.0))
+
+
+def test_a_picture_shows_what_is_where() -> None:
+    # seen from the side, the target in the middle; at distance d a metre is 360 / (2 d tan 18 deg) pixels
+    view = {"eye": (2.0, 0.0, 0.3), "target": (0.0, 0.0, 0.3)}
+    empty = paint(Scenery(**view), 480, 360).astype(int)
+    ball = paint(Scenery(balls=(Ball(np.array([0.0, 0.2, 0.4]), 0.05, (1.0, 0.0, 0.0)),), **view), 480, 360).astype(int)
+    red = (ball[:, :, 0] - ball[:, :, 1] > 60) & (np.abs(ball - empty).sum(2) > 60)
+    rows, columns = np.nonzero(red)
+    scale = 360.0 / (2.0 * 2.0 * np.tan(np.radians(18.0)))
+    assert columns.mean() == pytest.approx(240 + 0.2 * scale, abs=1.0)
+    assert rows.mean() == pytest.approx(180 - 0.1 * scale, abs=1.0)
+    assert red.sum() == pytest.approx(np.pi * (0.05 * scale) ** 2, rel=0.05)
+    rod = Tube(np.array([[0.0, 0.0, z] for z in np.linspace(0.1, 0.5, 9)]), 0.01, (1.0, 0.5, 0.0))
+    line = Line(np.array([[0.0, -0.3, 0.35], [0.0, -0.1, 0.35]]), (0.0, 0.6, 0.0))
+    both = paint(Scenery(tubes=(rod,), lines=(line,), **view), 480, 360).astype(int)
+    assert (np.abs(both - empty).sum(2) > 90)[200:210, :].any(0).sum() == pytest.approx(0.02 * scale, abs=2)
+    assert (both[:, :, 1] - both[:, :, 0] > 60).any(0).sum() == pytest.approx(0.2 * scale, abs=2)
+
+
+def test_what_is_nearer_hides_what_is_behind() -> None:
+    above = {"eye": (0.0, -1e-3, 2.0), "target": (0.0, 0.0, 0.0)}
+    ball = Ball(np.array([0.05, 0.0, 0.1]), 0.05, (1.0, 0.0, 0.0))
+
+    def red(*solids: Solid) -> int:
+        picture = paint(Scenery(balls=(ball,), solids=solids, **above), 120, 90).astype(int)
+        return int((picture[:, :, 0] > picture[:, :, 2] + 40).sum())
+
+    assert red() > 20
+    assert red(flat(0.01)) == pytest.approx(red(), rel=0.3)  # below the ball, whose edge mixes with what is behind
+    assert red(flat(0.3)) == 0
+    assert red(flat(0.3)._replace(opacity=0.3)) > 20
+
+
+def test_meshes_are_closed_and_look_outward() -> None:
+    bow = np.array([[0.1 * np.sin(a), 0.0, 0.1 * (1.0 - np.cos(a))] for a in np.linspace(0.0, 1.5, 40)])
+    for mesh, volume in ((ball_mesh(64), 4.0 / 3.0 * np.pi), (tube_mesh(bow, 0.01, 64), np.pi * 1e-4 * 0.15 + 2.0 / 3.0 * np.pi * 1e-6)):
+        a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+        enclosed = float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum()) / 6.0  # the open foot of the tube lies at the origin
+        assert enclosed == pytest.approx(volume, rel=0.02)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_pictures_of_every_environment(name: str) -> None:
+    env = made(name, render_mode="rgb_array")
+    env.reset(seed=3)
+    pictures = env.render()
+    assert pictures is not None
+    assert len(pictures) == 2
+    for picture in pictures:
+        assert picture.shape == (360, 480, 3)
+        assert picture.dtype == np.uint8
+        assert len(np.unique(picture @ np.array([1, 256, 65536]))) > 50  # colours
+    assert not np.array_equal(*pictures)
+    assert made(name).render() is None
+    env.close()
+
+
+def test_a_picture_takes_some_milliseconds() -> None:
+    env = SingleEnv("Reach", threads=1, render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    took = []
+    for _ in range(5):
+        start = time.perf_counter()
+        again = env.render()
+        took.append(time.perf_counter() - start)
+    assert_array_equal(again, first)
+    assert min(took) < 0.15  # some 20 ms, on a machine with nothing else to do
+
+
+def test_a_page_shows_the_environments_and_goes_away(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("viser")
+    env = made("Reach", 20, render_mode="viser")
+    env.reset(seed=0)
+    assert env.render() is None
+    told = capsys.readouterr()
+    address = re.search(r"http://127\.0\.0\.1:\d+", told.err)
+    assert address
+    assert told.out == ""
+    page = urllib.request.urlopen(address.group(), timeout=10).read()
+    assert b"<html" in page.lower()
+    env.step(actions(env, 1)[0])
+    env.render()
+    env.reset()
+    env.render()
+    assert capsys.readouterr().err == ""  # the address once
+    env.close()
+    with pytest.raises(OSError, match=r"."):
+        urllib.request.urlopen(address.group(), timeout=1)
+
+
+def test_a_page_without_viser_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    env = made("Reach", render_mode="viser")
+    env.reset(seed=0)
+    with pytest.raises(InputError, match=re.escape("pip install fastrod[viewer]")):
+        env.render()
