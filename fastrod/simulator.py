@@ -15,7 +15,7 @@ from fastrod.contact import queries
 from fastrod.contact.engine import Engine
 from fastrod.contact.frames import blended
 from fastrod.contact.scene import ContactScene
-from fastrod.contact.step import COLD_PASSES, STEP_PASSES, Ways, contact_step
+from fastrod.contact.step import COLD_PASSES, Ways, contact_step
 from fastrod.errors import InputError, RobotError
 from fastrod.guess import cold_start
 from fastrod.inputs import Inputs, PointForces, Reader
@@ -283,7 +283,7 @@ class Simulator:
 
         ok, done = contact_step(
             engine, Ways(free, bring_to_rest, run), rows, self._warm, start, ports, self._unloaded(ports), self._passes.memory, shape,
-            tolerance or _AT_REST, passes, STEP_PASSES if tolerance is None else COLD_PASSES,
+            tolerance or _AT_REST, passes, engine.scene.max_passes if tolerance is None else COLD_PASSES,
         )  # fmt: skip
         for i in rows[~ok[rows]]:
             self._reader.problems.setdefault(int(i), engine.why(int(i), float(done[i])))
@@ -477,6 +477,7 @@ class Simulator:
         """A copy of everything that a later step depends on."""
         effects = [link.memory.copy() for link in self._chain.links]
         return Snapshot(
+            self.robots,
             _copied(self._passes.memory),
             self._warm.copy(),
             self._given,
@@ -498,6 +499,8 @@ class Simulator:
             raise InputError("the snapshot is of another simulator; its effects differ.")
         if (snapshot.contact is None) != (self._engine is None):
             raise InputError("the snapshot is of another simulator; only one of them has a contact scene.")
+        if len(snapshot.robots) != len(self.robots) or any(a is not b for a, b in zip(snapshot.robots, self.robots, strict=True)):
+            raise InputError("the snapshot is of other robots; some were replaced since.")
         if rows is not None and self._state is not None and self._ports is not None:
             self._restore_rows(snapshot, self._mask(rows), self._state, self._ports)
             return

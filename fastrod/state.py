@@ -11,6 +11,7 @@ from fastrod.contact.contacts import Contacts
 from fastrod.contact.engine import Snapshot as ContactSnapshot
 from fastrod.errors import InputError
 from fastrod.inputs import Inputs
+from fastrod.robot import Robot
 from fastrod.types import Flags, Floats, Ints, Memory, Params, Ports
 
 
@@ -91,6 +92,7 @@ class Pose(NamedTuple):
 class Snapshot(NamedTuple):
     """Everything that a later step depends on."""
 
+    robots: tuple[Robot, ...]
     memory: Memory
     warm: Flags
     given: Inputs

@@ -162,10 +162,63 @@ def task_section(quick: bool) -> Section:
     return Section("tasks", "The other tasks", columns, rows, notes)
 
 
+def endurance_section(total: int, quick: bool) -> Section:
+    """About `total` random steps over all tasks: what they leave behind."""
+    import resource
+
+    import fastrod_envs
+    from fastrod.errors import HostError
+    from fastrod_envs.registration import task_class
+    from fastrod_envs.vector import BatchEnv
+
+    part = {"Reach": 0.4, "Catch": 0.3, "Track": 0.2, "ReachObstacle": 0.08}
+    rows: list[Row] = []
+    for name in fastrod_envs.names():
+        note_progress(f"endurance of {name}")
+        n = 256 if name in part else 1 if task_class(name).hosted else 16
+        steps = 3 if quick else max(1, round(total * part.get(name, 0.004) / n))
+        try:
+            env = BatchEnv(name, n)
+        except HostError:  # PyBullet is not installed
+            continue
+        env.reset(seed=SEED)
+        rng, finite, within, lost, ended, start = np.random.default_rng(SEED), True, True, 0, 0, 0
+        space = env.single_observation_space
+        for k in range(steps):
+            observation, reward, terminated, truncated, told = env.step(rng.uniform(-1.0, 1.0, (n, env.task.n_actions)))
+            finite &= bool(np.isfinite(observation).all() and np.isfinite(reward).all() and np.isfinite(told["distance"]).all())
+            within &= bool(((observation >= space.low) & (observation <= space.high)).all())
+            lost, ended = lost + int(told["lost"].sum()), ended + int((terminated | truncated).sum())
+            if k == steps // 4:
+                start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - start) / 1024.0
+        rows.append({"way": name, "steps": n * steps, "finite": finite, "within": within, "ended": ended, "lost": lost, "grown": grown})
+        env.close()
+    columns = [
+        Column("way", "task"),
+        Column("steps", "random steps", ",d"),
+        Column("finite", "all finite"),
+        Column("within", "within the space"),
+        Column("ended", "episodes", ",d"),
+        Column("lost", "lost", ",d"),
+        Column("grown", "peak memory grown after\na quarter of them, MiB", ".1f"),
+    ]
+    return Section(
+        "endurance", "Random steps over all tasks", columns, rows, [f"{sum(int(r['steps'] or 0) for r in rows):,d} steps in all."]
+    )
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure and print; the exit code."""
     parser = argparse.ArgumentParser(prog="bench_envs", description=__doc__)
-    return report.command(parser, argv, lambda options: [reach_section(options.quick), task_section(options.quick)])
+    parser.add_argument("--endurance", type=int, default=0, metavar="N", help="only this: so many random steps over all tasks, 1000000 say")
+
+    def measure(options: argparse.Namespace) -> list[Section]:
+        if options.endurance:
+            return [endurance_section(options.endurance, options.quick)]
+        return [reach_section(options.quick), task_section(options.quick)]
+
+    return report.command(parser, argv, measure)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 EXAMPLES = re.findall(r"```python\n(.*?)```\n\n```\n(.*?)```", README, flags=re.S)
 
 
-@pytest.mark.parametrize(("code", "output"), EXAMPLES, ids=["first screen", "contact", "host"])
+@pytest.mark.parametrize(("code", "output"), EXAMPLES, ids=["first screen", "contact", "host", "gymnasium"])
 def test_the_example_prints_its_output(code: str, output: str) -> None:
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):

@@ -315,3 +315,15 @@ def test_what_does_not_go_with_contact_or_effects_is_refused() -> None:
         made("effect with memory")[0].replace([1], [rod(line_density=0.1)])
     with pytest.raises(RobotError):
         made("plain")[0].replace([1], [rod(n_tendons=3)])
+
+
+def test_a_snapshot_of_other_robots_is_refused() -> None:
+    robot = load_robot("prototype")
+    sim = Simulator([robot, robot])
+    sim.settle(robot.rest_tendon_length)
+    snapshot = sim.snapshot()
+    sim.restore(snapshot)
+    softer = replace(robot, segments=tuple(replace(s, torsional_stiffness=5e-4) for s in robot.segments))
+    sim.replace([1], [softer])
+    with pytest.raises(InputError, match="of other robots; some were replaced"):
+        sim.restore(snapshot)

@@ -45,6 +45,8 @@ class ContactScene:
     """Contacts that a rod can have at once."""
     watch: float = 0.01
     """Gap below which a contact is watched before it closes, as a part of the rod's length."""
+    max_passes: int = 600
+    """Passes after which a step that cannot be solved is given up: fewer where many robots wait for one, as in training."""
 
     def __post_init__(self) -> None:
         obstacles = (self.obstacles,) if isinstance(self.obstacles, Obstacle) else tuple(self.obstacles)
@@ -62,6 +64,8 @@ class ContactScene:
             raise InputError(f"ContactScene.rod_stiffness is {self.rod_stiffness!r} N/m; it must be positive, or inf for rigid.")
         if not isinstance(self.max_contacts, int) or not 1 <= self.max_contacts <= 64:
             raise InputError(f"ContactScene.max_contacts is {self.max_contacts!r}; it must be a whole number from 1 to 64.")
+        if not isinstance(self.max_passes, int) or self.max_passes < 20:
+            raise InputError(f"ContactScene.max_passes is {self.max_passes!r}; it must be a whole number, at least 20.")
         if not 0.0 < self.watch <= 0.2:
             raise InputError(f"ContactScene.watch is {self.watch!r}; it is a part of the rod's length, between 0 and 0.2.")
         if self.mounting is not None and not (math.isfinite(self.mounting) and self.mounting >= 0.0):

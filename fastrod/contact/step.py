@@ -10,7 +10,7 @@ import numpy as np
 from fastrod.contact.engine import Engine, Pass
 from fastrod.types import Flags, Floats, Ints, Memory, Ports, Shape
 
-STEP_PASSES, COLD_PASSES = 600, 2000
+COLD_PASSES = 2000
 
 
 class Ways(NamedTuple):

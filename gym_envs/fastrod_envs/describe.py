@@ -22,7 +22,8 @@ def summary() -> str:
 
 
 def describe(name: str, options: Mapping[str, Any] | None = None) -> str:
-    """Documentation of a task: what it is, its options, observation and action number by number. Raises `UnknownNameError`, `InputError`."""
+    """Documentation of a task: what it is, its options, observation and action number by number. Raises `UnknownNameError`,
+    `InputError`."""
     kind = task_class(name)
     task = make_task(name, 1, options or {})
     try:
@@ -55,11 +56,8 @@ def _fields(parts: tuple[Field, ...]) -> str:
 
 
 def _options(kind: type[Any]) -> str:
-    lines = []
     docs = {name: text for base in reversed(kind.__mro__) for name, text in _attribute_docs(base).items()}
-    for option in dataclasses.fields(kind):
-        lines.append(f"  {option.name} = {option.default!r}: {docs.get(option.name, '')}")
-    return "\n".join(lines)
+    return "\n".join(f"  {option.name} = {option.default!r}: {docs.get(option.name, '')}" for option in dataclasses.fields(kind))
 
 
 def _attribute_docs(kind: type[Any]) -> dict[str, str]:

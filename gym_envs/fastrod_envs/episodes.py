@@ -96,6 +96,6 @@ class Episodes:
         o = moment.outcome
         told: dict[str, Any] = {
             "distance": o.distance, "success": o.success, "contact": o.contact, "lost": o.lost,
-            "position": o.position, "desired": o.desired, "reward_terms": dict(o.terms), **o.facts,
+            "position": o.position, "desired": o.desired, **o.facts,
         }  # fmt: skip
-        return told
+        return {name: a.copy() for name, a in told.items()} | {"reward_terms": {name: a.copy() for name, a in o.terms.items()}}

@@ -39,8 +39,15 @@ _ROBOTS: Mapping[str, Any] = {
 """Effects of a prototype that may be: what Track is trained on."""
 
 _PRESETS: Mapping[str, Preset] = {
-    "Reach": Preset(n_envs=512, steps=4_000_000, options={"reward": "precise"}),
-    "ReachObstacle": Preset(n_envs=512, steps=5_000_000, options={"reward": "precise"}),
+    "Reach": Preset(n_envs=512, steps=3_000_000, options={"reward": "precise"}),
+    "ReachObstacle": Preset(n_envs=512, steps=4_000_000, options={"reward": "precise"}),
+    "Catch": Preset(n_envs=256, steps=2_000_000, imitate=50_000),
+    "TubeInsert": Preset(n_envs=32, steps=0, imitate=24_000),
+    "Push": Preset(n_envs=8, steps=0, imitate=12_000),
+    "QuadrupedPush": Preset(n_envs=8, steps=0, imitate=12_000),
+    "BoxExplore": Preset(n_envs=8, steps=0, imitate=12_000),
+    "PickPlace": Preset(n_envs=8, steps=0, imitate=12_000),
+    "DualArm": Preset(n_envs=8, steps=0, imitate=12_000),
     "Track": Preset(n_envs=128, steps=3_000_000, options={"reward": "precise", "randomise": dict(_ROBOTS)}),
 }
 
