@@ -322,7 +322,7 @@ def _train(arguments: argparse.Namespace) -> int:
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
-    _need("stable_baselines3", "evaluate", "rl")
+    _need("gymnasium", "evaluate", "envs")
     from rich.console import Console
 
     from fastrod_envs import evaluation

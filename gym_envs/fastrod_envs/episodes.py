@@ -46,7 +46,7 @@ class Episodes:
         self._running = np.zeros(self.n, bool)
 
     def seed(self, seeds: Sequence[int | None]) -> None:
-        """A seed for each environment, or None."""
+        """A seed for each environment; None leaves its stream as it is. Raises `InputError`."""
         self._streams.seed(seeds)
 
     def begin(self, rows: Ints) -> None:
@@ -64,7 +64,7 @@ class Episodes:
             raise InputError(f"actions are {actions!r}; give numbers from -1 to 1, ({self.n}, {self.task.n_actions}).") from error
         if a.shape != (self.n, self.task.n_actions):
             raise InputError(f"actions have shape {a.shape}; they must be ({self.n}, {self.task.n_actions}), each from -1 to 1.")
-        if not np.isfinite(a.sum()):
+        if not np.isfinite(a).all():
             i = int(np.flatnonzero(~np.isfinite(a).all(1))[0])
             raise InputError(f"the action of environment {i} is not finite: {a[i]}; nothing was simulated.")
         return np.clip(a, -1.0, 1.0)

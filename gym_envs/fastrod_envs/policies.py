@@ -10,8 +10,9 @@ import numpy as np
 
 from fastrod.errors import InputError
 from fastrod.types import Floats
+from fastrod_envs.actor import Actor, actor_of, load_actor
 from fastrod_envs.registration import name_of
-from fastrod_envs.training import CHECKPOINT, CONFIG, POLICY, Plan, algorithm_class, read_config
+from fastrod_envs.training import ACTOR, CHECKPOINT, CONFIG, POLICY, Plan, algorithm_class, read_config
 from fastrod_envs.vector import BatchEnv
 
 SHIPPED = "shipped"
@@ -20,7 +21,7 @@ SHIPPED = "shipped"
 def shipped() -> tuple[str, ...]:
     """Names of the tasks whose trained policy comes with the package."""
     folder = files("fastrod_envs") / "trained"
-    return tuple(sorted(entry.name for entry in folder.iterdir() if (entry / POLICY).is_file())) if folder.is_dir() else ()
+    return tuple(sorted(entry.name for entry in folder.iterdir() if (entry / ACTOR).is_file())) if folder.is_dir() else ()
 
 
 def find(env: str, given: str) -> Path:
@@ -43,13 +44,16 @@ class Policy:
     """A trained policy without its noise."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises `InputError` where the folder holds neither policy nor checkpoint."""
+        """From actor.npz, or while a training is under way from its checkpoint. Raises `InputError` where the folder holds neither."""
         self.plan: Plan = read_config(folder)[0]
+        if (folder / ACTOR).is_file():
+            self._actor: Actor = load_actor(folder / ACTOR)
+            return
         path = next((folder / name for name in (POLICY, CHECKPOINT) if (folder / name).is_file()), None)
         if path is None:
-            raise InputError(f"{str(folder)!r} holds no {POLICY}; the training has not written one yet.")
+            raise InputError(f"{str(folder)!r} holds no {ACTOR}; the training has not written one yet.")
         try:
-            self._model: Any = algorithm_class(self.plan.algorithm).load(path, device="cpu")
+            self._actor = actor_of(algorithm_class(self.plan.algorithm).load(path, device="cpu"))
         except (ValueError, KeyError, OSError, RuntimeError) as error:
             raise InputError(f"{str(path)!r} is no policy of stable-baselines3 that can be read: {error}") from error
 
@@ -60,14 +64,14 @@ class Policy:
 
     def check(self, env: BatchEnv) -> None:
         """Raises `InputError` where the policy was trained for other observations or actions."""
-        wanted, given = self._model.observation_space, env.single_observation_space
-        if wanted.shape != given.shape or self._model.action_space.shape != env.single_action_space.shape:
+        n_obs, n_actions = len(self._actor.middle), len(self._actor.biases[-1])
+        given = env.single_observation_space.shape, env.single_action_space.shape
+        if given != ((n_obs,), (n_actions,)):
             raise InputError(
-                f"the policy was trained on {self.plan.env} with observations {wanted.shape} and actions {self._model.action_space.shape}; "
-                f"here they are {given.shape} and {env.single_action_space.shape}."
+                f"the policy was trained on {self.plan.env} with {n_obs} observations and {n_actions} actions; here they are "
+                f"{given[0]} and {given[1]}."  # type: ignore[index]
             )
 
     def act(self, observation: Floats | np.ndarray) -> Floats:
         """(n, n_actions) from -1 to 1."""
-        actions, _ = self._model.predict(observation, deterministic=True)
-        return np.asarray(actions, dtype=float)
+        return self._actor.act(np.asarray(observation))

@@ -83,6 +83,7 @@ class RodTask(Task):
         state = self.simulator.settle(**self._inputs())
         self._home = self.simulator.snapshot()
         self._keep(state.tip_position, state.tip_rotation[:, :, 2], state.ok)
+        self._home_tip, self._home_direction = self.tip[0].copy(), self.direction[0].copy()
 
     def loads(self) -> dict[str, Any]:
         """What the simulator is told besides wires: loads, obstacles."""
@@ -91,6 +92,7 @@ class RodTask(Task):
     def start(self, rows: Ints, draws: Floats) -> None:
         """Put these robots at home, made anew where they are randomised; `draws` as in `begin`."""
         self.displacement[rows] = self.home
+        self.tip[rows], self.direction[rows] = self._home_tip, self._home_direction  # of one that is lost from the start
         if self._varies and self._random is not None:
             self.simulator.replace(rows, self._random.draw(self.base_robot, draws[:, self.n_draws :]))
             state = self.simulator.settle(**self._inputs(), rows=rows)

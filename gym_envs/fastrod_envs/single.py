@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from fastrod.errors import InputError
 from fastrod_envs.episodes import Episodes, Singles
+from fastrod_envs.options import checked_difficulty
 from fastrod_envs.registration import make_task
 from fastrod_envs.rendering import Renderer
 from fastrod_envs.vector import action_space
@@ -41,12 +42,11 @@ class SingleEnv(gymnasium.Env[Singles, Any]):
         """Begin an episode; `options={"difficulty": level}` sets the curriculum's level. Raises `InputError`."""
         super().reset(seed=seed)
         options = dict(options or {})
-        if "difficulty" in options:
-            self.task.set_difficulty(options.pop("difficulty"))
+        level = checked_difficulty(options.pop("difficulty", self.task.difficulty))
         if options:
             raise InputError(f"reset has no option {next(iter(options))!r}; known: difficulty.")
-        if seed is not None:
-            self._episodes.seed([seed])
+        self._episodes.seed([seed])
+        self.task.set_difficulty(level)
         self._episodes.begin(np.array([0]))
         return self._episodes.observation()[0], {}
 

@@ -25,13 +25,13 @@ class Streams:
         """A seed for each environment; None leaves that one's stream as it is. Raises `InputError`."""
         if len(seeds) != self._n:
             raise InputError(f"{len(seeds)} seeds for {self._n} environments; give one number, or one for each.")
-        for i, seed in enumerate(seeds):
-            if seed is None:
-                continue
-            if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+        for seed in seeds:
+            if seed is not None and (isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0):
                 raise InputError(f"seed is {seed!r}; it must be a whole number, zero or positive.")
-            self._generators[i] = np.random.default_rng(int(seed))
-            self._used[i] = _EPISODES
+        for i, seed in enumerate(seeds):
+            if seed is not None:
+                self._generators[i] = np.random.default_rng(int(seed))
+                self._used[i] = _EPISODES
 
     def draw(self, rows: Ints) -> Floats:
         """(len(rows), n_draws) for one episode of each."""

@@ -16,7 +16,7 @@ from fastrod_envs.presets import ALGORITHMS, NETWORK, preset_of, settings_of
 from fastrod_envs.registration import NAMESPACE, VERSION, name_of
 
 Progress = Callable[[str, int, int], None]
-CONFIG, POLICY, CHECKPOINT, REPLAY = "config.json", "policy.zip", "checkpoint.zip", "replay.pkl"
+CONFIG, POLICY, ACTOR, CHECKPOINT, REPLAY = "config.json", "policy.zip", "actor.npz", "checkpoint.zip", "replay.pkl"
 _EVERY = 20  # checkpoints of a training
 
 
@@ -72,7 +72,7 @@ def train(plan: Plan, out: Path, progress: Progress | None = None) -> Path:
     """Train into the folder `out`; the path of its policy.zip.
 
     The folder holds config.json (the plan, versions, steps and seconds done), checkpoint.zip (with replay.pkl for SAC and TD3), tensorboard
-    curves, and at the end policy.zip. Raises `InputError` where the folder holds a training already.
+    curves, and at the end policy.zip, and actor.npz with its network alone. Raises `InputError` where the folder holds a training already.
     """
     if (out / CONFIG).exists():
         raise InputError(f"{str(out)!r} holds a training; go on with it by --resume, or name another folder.")
@@ -111,6 +111,7 @@ def algorithm_class(name: str) -> Any:
 def _run(plan: Plan, out: Path, progress: Progress | None) -> Path:
     import torch
 
+    from fastrod_envs.actor import actor_of
     from fastrod_envs.imitation import imitate
     from fastrod_envs.sb3 import BatchVecEnv, ScaledFeatures
     from fastrod_envs.vector import BatchEnv
@@ -154,6 +155,7 @@ def _run(plan: Plan, out: Path, progress: Progress | None) -> Path:
         if left > 0:
             model.learn(left, callback=_callback(plan, note, progress), reset_num_timesteps=False, tb_log_name=plan.algorithm)
         note()
+        _atomically(out / ACTOR, actor_of(model).save)
         _atomically(out / POLICY, model.save)
         (out / REPLAY).unlink(missing_ok=True)
         (out / CHECKPOINT).unlink(missing_ok=True)

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from fastrod.errors import InputError
 from fastrod.types import Flags, Floats
 from fastrod_envs.episodes import Episodes, Singles
+from fastrod_envs.options import checked_difficulty
 from fastrod_envs.registration import make_task
 from fastrod_envs.rendering import Renderer
 from fastrod_envs.task import Task
@@ -81,24 +82,29 @@ class BatchEnv(VectorEnv[Singles, Any, Any]):
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Singles, dict[str, Any]]:
         """Begin episodes in all environments, or in those of `options={"reset_mask": (n,) bool}`. A whole-number seed s gives
-        environment i the seed s + i. Raises `InputError`."""
+        environment i the seed s + i; those that go on keep theirs. Raises `InputError`; then nothing has changed."""
         super().reset(seed=None)
-        rows = np.arange(self.num_envs)
         options = dict(options or {})
-        if "difficulty" in options:
-            self.task.set_difficulty(options.pop("difficulty"))
-        if "reset_mask" in options:
-            mask = np.asarray(options.pop("reset_mask"))
-            if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
-                raise InputError(f"reset_mask has shape {mask.shape} and type {mask.dtype}; give ({self.num_envs},) bool, some of it True.")
-            rows = np.flatnonzero(mask)
+        mask = np.asarray(options.pop("reset_mask", self._every))
+        if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
+            raise InputError(f"reset_mask has shape {mask.shape} and type {mask.dtype}; give ({self.num_envs},) bool, some of it True.")
+        level = checked_difficulty(options.pop("difficulty", self.task.difficulty))
         if options:
             raise InputError(f"reset has no option {next(iter(options))!r}; known: difficulty, reset_mask.")
-        if seed is not None:
-            one = isinstance(seed, (int, np.integer))
-            self._episodes.seed([seed + i for i in range(self.num_envs)] if one else list(seed))  # type: ignore[operator,arg-type]
-        self._episodes.begin(rows)
+        self._episodes.seed([s if begins else None for s, begins in zip(self._seeds(seed), mask, strict=True)])
+        self.task.set_difficulty(level)
+        self._episodes.begin(np.flatnonzero(mask))
         return self._episodes.observation(), {}
+
+    def _seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
+        """One for each environment. Raises `InputError`."""
+        if seed is None:
+            return [None] * self.num_envs
+        if isinstance(seed, (int, np.integer)) and not isinstance(seed, bool):
+            return [int(seed) + i for i in range(self.num_envs)]
+        if isinstance(seed, (bool, str)) or not isinstance(seed, (Sequence, np.ndarray)) or len(seed) != self.num_envs:
+            raise InputError(f"seed is {seed!r}; give one whole number, zero or positive, or one for each of {self.num_envs} environments.")
+        return list(seed)
 
     def step(self, actions: ArrayLike) -> tuple[Singles, Floats, Flags, Flags, dict[str, Any]]:
         """One step of all environments. Raises `InputError` on a wrong shape and on what is not finite; then nothing was simulated."""

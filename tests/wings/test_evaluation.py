@@ -102,5 +102,5 @@ def test_a_policy_for_other_observations_is_refused() -> None:
 
     if "Reach" not in shipped():
         pytest.skip("no policy of Reach is shipped")
-    with pytest.raises(InputError, match="was trained on fastrod/Reach-v0 with observations"):
+    with pytest.raises(InputError, match="was trained on fastrod/Reach-v0 with 23 observations"):
         evaluate("Track", Policy(find("Reach", "shipped")), episodes=1)

@@ -62,6 +62,7 @@ def test_a_training_that_is_killed_goes_on_from_its_checkpoint(tmp_path: Path, a
     assert not (tmp_path / "run" / POLICY).exists()
     assert (tmp_path / "run" / REPLAY).exists() == (algorithm != "ppo")
     before = read_config(tmp_path / "run")[1]["steps_done"]
+    assert Policy(tmp_path / "run").act(np.zeros((2, 23))).shape == (2, 11)
     seen: list[int] = []
     path = resume(tmp_path / "run", progress=lambda _, done, __: seen.append(done))
     after = read_config(tmp_path / "run")[1]
@@ -70,6 +71,12 @@ def test_a_training_that_is_killed_goes_on_from_its_checkpoint(tmp_path: Path, a
     assert 3200 <= after["steps_done"] < 3200 + 16 * 10
     assert path.is_file()
     assert not list((tmp_path / "run").glob(".*part*"))
+    env = BatchEnv("Reach", num_envs=64, n_steps=10)
+    observation, _ = env.reset(seed=5)
+    for _ in range(5):
+        observation, *_ = env.step(env.baseline())
+    model = algorithm_class(algorithm).load(path, device="cpu")
+    np.testing.assert_allclose(Policy(tmp_path / "run").act(observation), model.predict(observation, deterministic=True)[0], atol=2e-5)
 
 
 def test_resume_takes_more_steps(tmp_path: Path) -> None:

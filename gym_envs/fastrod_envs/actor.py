@@ -1,0 +1,88 @@
+"""`Actor`: a policy without its noise as plain arrays, so that asking it needs neither torch nor stable-baselines3."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fastrod.errors import InputError
+from fastrod.types import Floats
+
+Activation = Literal["tanh", "relu"]
+Singles = NDArray[np.float32]
+
+
+class Actor(NamedTuple):
+    """Layers of a network from observations, scaled by the bounds of their space, to actions from -1 to 1."""
+
+    weights: tuple[Singles, ...]
+    """Each (n_out, n_in)."""
+    biases: tuple[Singles, ...]
+    """Each (n_out,)."""
+    middle: Singles
+    """(n_obs,) of the observations' bounds."""
+    reach: Singles
+    """(n_obs,) from there to a bound."""
+    activation: Activation
+    """Of the hidden layers."""
+    squashed: bool
+    """The last layer ends in a tanh (SAC, TD3); otherwise it is clipped."""
+
+    def act(self, observation: np.ndarray) -> Floats:
+        """(n, n_actions) of observations (n, n_obs)."""
+        x = (np.asarray(observation, np.float32) - self.middle) / self.reach
+        for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            x = x @ weight.T + bias
+            if k < len(self.weights) - 1:
+                x = np.tanh(x) if self.activation == "tanh" else np.maximum(x, 0.0)
+        return np.asarray(np.tanh(x) if self.squashed else np.clip(x, -1.0, 1.0), dtype=float)
+
+    def save(self, path: Path) -> None:
+        """Write a .npz file."""
+        layers = {f"weight_{k}": w for k, w in enumerate(self.weights)} | {f"bias_{k}": b for k, b in enumerate(self.biases)}
+        with path.open("wb") as file:
+            np.savez_compressed(
+                file, middle=self.middle, reach=self.reach, activation=self.activation, squashed=self.squashed, **layers,
+            )  # fmt: skip
+
+
+def load_actor(path: Path) -> Actor:
+    """The actor in a .npz file. Raises `InputError`."""
+    try:
+        with np.load(path, allow_pickle=False) as held:
+            n = sum(name.startswith("weight_") for name in held.files)
+            activation = str(held["activation"])
+            if not n or activation not in get_args(Activation):
+                raise KeyError(activation)
+            return Actor(
+                tuple(held[f"weight_{k}"] for k in range(n)), tuple(held[f"bias_{k}"] for k in range(n)), held["middle"], held["reach"],
+                "tanh" if activation == "tanh" else "relu", bool(held["squashed"]),
+            )  # fmt: skip
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"{str(path)!r} is no actor that `fastrod train` wrote: {error}.") from error
+
+
+def actor_of(model: Any) -> Actor:
+    """The actor of a model of stable-baselines3 with `ScaledFeatures`."""
+    import torch
+
+    policy = model.policy
+    if hasattr(policy, "mlp_extractor"):  # PPO
+        parts, features, squashed = [*policy.mlp_extractor.policy_net, policy.action_net], policy.features_extractor, False
+    elif hasattr(policy.actor, "latent_pi"):  # SAC
+        parts, features, squashed = [*policy.actor.latent_pi, policy.actor.mu], policy.actor.features_extractor, True
+    else:  # TD3
+        parts, features, squashed = list(policy.actor.mu), policy.actor.features_extractor, True
+
+    def plain(a: Any) -> Singles:
+        return np.array(a.detach().cpu().numpy(), dtype=np.float32)
+
+    linear = [part for part in parts if isinstance(part, torch.nn.Linear)]
+    hidden = next(part for part in parts if not isinstance(part, torch.nn.Linear))
+    return Actor(
+        tuple(plain(part.weight) for part in linear), tuple(plain(part.bias) for part in linear), plain(features.middle),
+        plain(features.reach), "tanh" if isinstance(hidden, torch.nn.Tanh) else "relu", squashed,
+    )  # fmt: skip
