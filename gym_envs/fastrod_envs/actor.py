@@ -42,11 +42,11 @@ class Actor(NamedTuple):
 
     def save(self, path: Path) -> None:
         """Write a .npz file."""
-        layers = {f"weight_{k}": w for k, w in enumerate(self.weights)} | {f"bias_{k}": b for k, b in enumerate(self.biases)}
+        held: dict[str, Any] = {f"weight_{k}": w for k, w in enumerate(self.weights)}
+        held |= {f"bias_{k}": b for k, b in enumerate(self.biases)}
+        held |= {"middle": self.middle, "reach": self.reach, "activation": self.activation, "squashed": self.squashed}
         with path.open("wb") as file:
-            np.savez_compressed(
-                file, middle=self.middle, reach=self.reach, activation=self.activation, squashed=self.squashed, **layers,
-            )  # fmt: skip
+            np.savez_compressed(file, **held)
 
 
 def load_actor(path: Path) -> Actor:

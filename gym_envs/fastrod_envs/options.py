@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
@@ -21,7 +22,7 @@ class Options:
     """Keyword arguments of `gymnasium.make` and `make_vec`, the same for every task; some tasks have more."""
 
     n_steps: int | None = None
-    """Steps of an episode; 1 is the paper's bandit, None the task's own number."""
+    """Steps of an episode, None for the task's own number; 1, with `action="displacement"`, is the paper's bandit."""
     observation: Observation = "state"
     """`state`: goal, robot and scene; `goal`: the goal alone, as in the paper."""
     action: Action = "rate"
@@ -35,7 +36,7 @@ class Options:
     """Of the simulator; None is numba's number."""
 
     def __post_init__(self) -> None:
-        if self.n_steps is not None and (not isinstance(self.n_steps, int) or isinstance(self.n_steps, bool) or self.n_steps < 1):
+        if self.n_steps is not None and (not isinstance(self.n_steps, Integral) or isinstance(self.n_steps, bool) or self.n_steps < 1):
             raise InputError(f"n_steps is {self.n_steps!r}; it must be a whole number, at least 1, or None for the task's own.")
         for name, kinds in (("observation", get_args(Observation)), ("action", get_args(Action))):
             if getattr(self, name) not in kinds:
@@ -54,6 +55,22 @@ class Options:
 
 def checked_difficulty(level: float) -> float:
     """A level from 0 to 1, or `InputError`."""
-    if not isinstance(level, (int, float)) or not 0.0 <= level <= 1.0:
+    if not isinstance(level, Real) or not 0.0 <= level <= 1.0:
         raise InputError(f"difficulty is {level!r}; it must be a number from 0 to 1.")
     return float(level)
+
+
+def checked_mapping(given: object) -> dict[str, Any]:
+    """What `reset` is told, as a new dictionary, or `InputError`."""
+    if given is not None and not isinstance(given, Mapping):
+        raise InputError(f"options are {given!r}; give a dictionary, or None.")
+    return dict(given or {})
+
+
+def with_steps(options: Mapping[str, Any], max_episode_steps: int | None) -> dict[str, Any]:
+    """Options with Gymnasium's name of n_steps as ours. Raises `InputError` where both are given and differ."""
+    if max_episode_steps is None:
+        return dict(options)
+    if options.get("n_steps", max_episode_steps) != max_episode_steps:
+        raise InputError(f"n_steps is {options['n_steps']!r} and max_episode_steps {max_episode_steps!r}; give one of them.")
+    return {**options, "n_steps": max_episode_steps}

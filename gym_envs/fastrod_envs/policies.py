@@ -69,7 +69,7 @@ class Policy:
         if given != ((n_obs,), (n_actions,)):
             raise InputError(
                 f"the policy was trained on {self.plan.env} with {n_obs} observations and {n_actions} actions; here they are "
-                f"{given[0]} and {given[1]}."  # type: ignore[index]
+                f"{given[0]} and {given[1]}."
             )
 
     def act(self, observation: Floats | np.ndarray) -> Floats:

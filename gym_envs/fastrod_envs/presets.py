@@ -41,14 +41,14 @@ _ROBOTS: Mapping[str, Any] = {
 _PRESETS: Mapping[str, Preset] = {
     "Reach": Preset(n_envs=512, steps=3_000_000, options={"reward": "precise"}),
     "ReachObstacle": Preset(n_envs=512, steps=4_000_000, options={"reward": "precise"}),
-    "Catch": Preset(n_envs=256, steps=2_000_000, imitate=50_000),
+    "Catch": Preset(n_envs=256, steps=500_000, imitate=50_000),
     "TubeInsert": Preset(n_envs=32, steps=0, imitate=24_000),
     "Push": Preset(n_envs=8, steps=0, imitate=12_000),
     "QuadrupedPush": Preset(n_envs=8, steps=0, imitate=12_000),
     "BoxExplore": Preset(n_envs=8, steps=0, imitate=12_000),
     "PickPlace": Preset(n_envs=8, steps=0, imitate=12_000),
     "DualArm": Preset(n_envs=8, steps=0, imitate=12_000),
-    "Track": Preset(n_envs=128, steps=3_000_000, options={"reward": "precise", "randomise": dict(_ROBOTS)}),
+    "Track": Preset(n_envs=128, steps=2_000_000, imitate=100_000, options={"reward": "precise", "randomise": {**_ROBOTS, "absent": 0.4}}),
 }
 
 
@@ -57,7 +57,7 @@ def preset_of(env: str) -> Preset:
     return _PRESETS.get(name_of(env), Preset())
 
 
-def settings_of(algorithm: str, n_envs: int, n_steps: int, given: Mapping[str, Any]) -> dict[str, Any]:
+def settings_of(algorithm: str, n_envs: int, n_steps: int, steps: int, given: Mapping[str, Any]) -> dict[str, Any]:
     """Keyword arguments of stable-baselines3's class: the paper's network, learning rate and discount, and numbers that use the batch.
 
     PPO learns from whole episodes of the batch, in ten or more minibatches. SAC and TD3 take one gradient step for 16 environment
@@ -66,7 +66,7 @@ def settings_of(algorithm: str, n_envs: int, n_steps: int, given: Mapping[str, A
     """
     common = {"learning_rate": LEARNING_RATE, "gamma": DISCOUNT}
     if algorithm == "ppo":
-        rollout = int(given.get("n_steps", max(n_steps, 4096 // n_envs)))
+        rollout = int(given.get("n_steps", min(max(n_steps, 4096 // n_envs), max(steps // n_envs, 2))))
         batch = _divisor(n_envs * rollout, min(4096, n_envs * rollout // 8))
         own = {"n_steps": rollout, "batch_size": batch, "n_epochs": 8, "gae_lambda": 0.95, "clip_range": 0.2, "ent_coef": 0.0}
     elif algorithm in ALGORITHMS:

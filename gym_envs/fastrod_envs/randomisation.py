@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from fastrod.chain import named_effects
-from fastrod.effect import canonical_name, get_effect
+from fastrod.effect import canonical_name, get_effect, read_values
 from fastrod.errors import InputError, nearest
 from fastrod.robot import Robot
 from fastrod.robotfile import load_robot
 from fastrod.types import Floats
+from fastrod.wiring import wire
 
 _FACTORS = ("bending_stiffness", "torsional_stiffness", "line_density", "compliance", "offset")
 _SPREAD = 0.2
@@ -33,14 +34,19 @@ class Randomisation:
     robot: Robot | None = None
     """Stands for the task's robot: an identified one with its effects. Its segments and wires are those of the task's."""
     spread: float = 0.0
-    """Every number of the robot's own effects is drawn from (1 - spread, 1 + spread) of its value."""
+    """Every number of the robot's own effects is drawn from (1 - spread, 1 + spread) of its value, within what it can be."""
     parameters: Mapping[str, Range] = field(default_factory=dict)
     """Factors on the robot's own numbers, all segments alike: bending_stiffness, torsional_stiffness, line_density, compliance (of the
     tendons) and, where it has no effects, offset."""
     effects: Mapping[str, Range] = field(default_factory=dict)
     """`backlash.half_width`: the range of an effect's parameter, in its unit. What a robot file says of it is replaced."""
 
+    absent: float = 0.0
+    """Chance that an effect of `effects` is not there, its parameter neutral, each on its own: so that a policy meets plain robots too."""
+
     def __post_init__(self) -> None:
+        if not (isinstance(self.absent, (int, float)) and 0.0 <= self.absent < 1.0):
+            raise InputError(f"absent is {self.absent!r}; it must be a number from 0 to below 1.")
         if not (isinstance(self.spread, (int, float)) and 0.0 <= self.spread < 1.0):
             raise InputError(f"spread is {self.spread!r}; it must be a number from 0 to below 1.")
         for name in self.parameters:
@@ -52,7 +58,8 @@ class Randomisation:
             if parameter not in known:
                 raise InputError(f"{name!r} names no parameter of an effect; {nearest(parameter, known)}")
         for name, pair in [*self.parameters.items(), *self.effects.items()]:
-            if len(tuple(pair)) != 2 or not all(math.isfinite(v) for v in pair) or pair[0] > pair[1]:
+            numbers = isinstance(pair, (tuple, list)) and all(isinstance(v, (int, float, np.number)) and math.isfinite(v) for v in pair)
+            if not numbers or len(pair) != 2 or pair[0] > pair[1]:
                 raise InputError(f"the range of {name!r} is {pair!r}; give (least, largest), finite.")
             if name in self.parameters and pair[0] <= 0.0:
                 raise InputError(f"the range of {name!r} is {pair!r}; a factor must be positive.")
@@ -69,10 +76,12 @@ class Randomisation:
             return cls(robot=load_robot(given), spread=_SPREAD)
         if not isinstance(given, Mapping):
             raise InputError(f"randomise is {given!r}; give a Randomisation, a robot file, or a mapping of names to ranges.")
-        own = {name: given[name] for name in ("robot", "spread", "parameters", "effects") if name in given}
+        own = {name: given[name] for name in ("robot", "spread", "parameters", "effects", "absent") if name in given}
         if isinstance(own.get("robot"), (str, Path)):
             own["robot"] = load_robot(own["robot"])
-        ranges = {name: tuple(pair) for name, pair in given.items() if name not in own}
+        ranges = {
+            str(name): tuple(pair) if isinstance(pair, (list, np.ndarray)) else pair for name, pair in given.items() if name not in own
+        }
         parameters = {**own.pop("parameters", {}), **{name: pair for name, pair in ranges.items() if "." not in name}}
         effects = {**own.pop("effects", {}), **{name: pair for name, pair in ranges.items() if "." in name}}
         return cls(parameters=parameters, effects=effects, **own)
@@ -85,7 +94,7 @@ class Randomisation:
 
     def base(self, robot: Robot) -> Robot:
         """The robot of a task, with every effect that will be drawn at its neutral value. Raises `InputError` where the robot given
-        here has other segments or tendons."""
+        here has other segments or tendons, `EffectError` for a range that goes beyond what an effect's parameter can be."""
         own = robot
         if self.robot is not None:
             if (self.robot.n_segments, self.robot.n_tendons) != (robot.n_segments, robot.n_tendons):
@@ -97,8 +106,11 @@ class Randomisation:
         if not self.effects:
             return own
         tables = named_effects(own)
-        for name in self.effects:
-            tables.setdefault(canonical_name(name.partition(".")[0]), {})
+        for name, ends in self.effects.items():
+            effect, _, parameter = name.partition(".")
+            tables.setdefault(canonical_name(effect), {})
+            for value in ends:  # now, and not in the episode that draws it
+                read_values(canonical_name(effect), {parameter: float(value)}, wire(own), f"randomise, robot {own.name!r}")
         return replace(own, effects=tuple({"name": name, **table} for name, table in tables.items()))
 
     def draw(self, base: Robot, draws: Floats) -> list[Robot]:
@@ -109,10 +121,15 @@ class Randomisation:
         values = [low + u * (high - low) for u, (low, high) in zip(row, [*self.parameters.values(), *self.effects.values()], strict=False)]
         factor = dict(zip(self.parameters, values, strict=False))
         given = dict(zip(self.effects, values[len(self.parameters) :], strict=True))
+        for (name, (low, high)), u in zip(self.effects.items(), row[len(self.parameters) :], strict=False):
+            left = (u - self.absent) / (1.0 - self.absent)
+            given[name] = low + left * (high - low) if left >= 0.0 else _neutral(name)
         rest = row[len(values) :].tolist()
         tables = {name: dict(table) for name, table in named_effects(base).items()}
         for place, u in zip(self._spread_over(base) if self.spread else [], rest, strict=False):
-            tables[place[0]][place[1]] = np.multiply(tables[place[0]][place[1]], 1.0 + self.spread * (2.0 * u - 1.0)).tolist()
+            low, high = next(p.on(wire(base)).bounds for p in get_effect(place[0]).parameters if p.name == place[1])
+            times = 1.0 + self.spread * (2.0 * u - 1.0)
+            tables[place[0]][place[1]] = np.clip(np.multiply(tables[place[0]][place[1]], times), low, high).tolist()
         for name, value in given.items():
             effect, _, parameter = name.partition(".")
             tables[canonical_name(effect)][parameter] = value
@@ -125,6 +142,12 @@ class Randomisation:
         """Effect and key of every number, or list of numbers, of a robot's effects."""
         tables = named_effects(robot).items()
         return [(name, key) for name, table in tables for key, value in table.items() if isinstance(value, (int, float, list, tuple))]
+
+
+def _neutral(name: str) -> float:
+    """The value of `backlash.half_width` at which there is none."""
+    effect, _, parameter = name.partition(".")
+    return float(next(p.neutral for p in get_effect(canonical_name(effect)).parameters if p.name == parameter))
 
 
 def _scaled(segment: Any, factor: Mapping[str, float]) -> Any:

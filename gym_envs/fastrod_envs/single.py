@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from fastrod.errors import InputError
 from fastrod_envs.episodes import Episodes, Singles
-from fastrod_envs.options import checked_difficulty
+from fastrod_envs.options import checked_difficulty, checked_mapping, with_steps
 from fastrod_envs.registration import make_task
 from fastrod_envs.rendering import Renderer
 from fastrod_envs.vector import action_space
@@ -33,7 +33,7 @@ class SingleEnv(gymnasium.Env[Singles, Any]):
         """As `BatchEnv`, with one environment."""
         self.render_mode = render_mode
         self._renderer = Renderer(render_mode)
-        self.task = make_task(task, 1, options | ({} if max_episode_steps is None else {"n_steps": max_episode_steps}))
+        self.task = make_task(task, 1, with_steps(options, max_episode_steps))
         self._episodes = Episodes(self.task)
         self.observation_space = gymnasium.spaces.Box(self._episodes.low, self._episodes.high, dtype=np.float32)
         self.action_space = action_space(self.task)
@@ -41,7 +41,7 @@ class SingleEnv(gymnasium.Env[Singles, Any]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Singles, dict[str, Any]]:
         """Begin an episode; `options={"difficulty": level}` sets the curriculum's level. Raises `InputError`."""
         super().reset(seed=seed)
-        options = dict(options or {})
+        options = checked_mapping(options)
         level = checked_difficulty(options.pop("difficulty", self.task.difficulty))
         if options:
             raise InputError(f"reset has no option {next(iter(options))!r}; known: difficulty.")

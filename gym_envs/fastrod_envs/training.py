@@ -58,13 +58,13 @@ def make_plan(
     kind = task_class(env)
     chosen = algorithm or preset.algorithm
     own = dict(preset.settings) if chosen == preset.algorithm else {}
-    many = n_envs or preset.n_envs
+    many, in_all = n_envs or preset.n_envs, preset.steps if steps is None else steps
     wanted = {**preset.options, **(options or {})}
     n_steps = kind.options_class.read(wanted).n_steps or kind.n_steps
     return Plan(
         env=f"{NAMESPACE}/{name_of(env)}-{VERSION}", algorithm=chosen, n_envs=many,
-        steps=preset.steps if steps is None else steps, seed=seed, imitate=preset.imitate if imitate is None else imitate, options=wanted,
-        settings=settings_of(chosen, many, n_steps, {**own, **(settings or {})}), curriculum=curriculum,
+        steps=in_all, seed=seed, imitate=preset.imitate if imitate is None else imitate, options=wanted,
+        settings=settings_of(chosen, many, n_steps, in_all, {**own, **(settings or {})}), curriculum=curriculum,
     )  # fmt: skip
 
 
@@ -77,12 +77,13 @@ def train(plan: Plan, out: Path, progress: Progress | None = None) -> Path:
     if (out / CONFIG).exists():
         raise InputError(f"{str(out)!r} holds a training; go on with it by --resume, or name another folder.")
     out.mkdir(parents=True, exist_ok=True)
-    _write_config(out, plan, {"steps_done": 0, "seconds": 0.0, "lessons_done": False})
+    _write_config(out, plan, {"steps_done": 0, "seconds": 0.0})
     return _run(plan, out, progress)
 
 
 def resume(out: Path, steps: int | None = None, progress: Progress | None = None) -> Path:
-    """Go on with the training in `out` from its last checkpoint, to its own number of steps or to `steps`. Raises `InputError`."""
+    """Go on with the training in `out` from its last checkpoint, or where it has ended from its policy (SAC and TD3 then begin with an
+    empty replay buffer), to its own number of steps or to `steps`. Raises `InputError`."""
     plan, _ = read_config(out)
     if steps is not None:
         plan = replace(plan, steps=steps)
@@ -123,8 +124,9 @@ def _run(plan: Plan, out: Path, progress: Progress | None) -> Path:
         torch.set_num_threads(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
         vec, kind = BatchVecEnv(env), algorithm_class(plan.algorithm)
         started, before = time.monotonic(), float(state["seconds"])
-        if (out / CHECKPOINT).exists():
-            model = kind.load(out / CHECKPOINT, env=vec, device="cpu")
+        held = next((out / name for name in (CHECKPOINT, POLICY) if (out / name).exists()), None)
+        if held is not None:
+            model = kind.load(held, env=vec, device="cpu")
             if (out / REPLAY).exists():
                 model.load_replay_buffer(out / REPLAY)
             vec.seed(plan.seed + 1_000_003 * (1 + model.num_timesteps))
@@ -132,7 +134,7 @@ def _run(plan: Plan, out: Path, progress: Progress | None) -> Path:
             vec.seed(plan.seed)
             policy: dict[str, Any] = {"net_arch": list(NETWORK), "features_extractor_class": ScaledFeatures}
             if plan.algorithm == "ppo":
-                policy |= {"activation_fn": torch.nn.Tanh, "log_std_init": -1.0}
+                policy |= {"activation_fn": torch.nn.Tanh, "log_std_init": -2.0 if plan.imitate else -1.0}
             settings = dict(plan.settings)
             policy |= settings.pop("policy_kwargs", {})
             board = str(out / "tensorboard") if _has_tensorboard() else None
@@ -144,7 +146,6 @@ def _run(plan: Plan, out: Path, progress: Progress | None) -> Path:
                 finally:
                     lessons.close()
             _save(model, out)
-        state["lessons_done"] = True
 
         def note() -> None:
             _save(model, out)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from fastrod.errors import InputError
 from fastrod.types import Flags, Floats
 from fastrod_envs.episodes import Episodes, Singles
-from fastrod_envs.options import checked_difficulty
+from fastrod_envs.options import checked_difficulty, checked_mapping, with_steps
 from fastrod_envs.registration import make_task
 from fastrod_envs.rendering import Renderer
 from fastrod_envs.task import Task
@@ -54,7 +54,7 @@ class BatchEnv(VectorEnv[Singles, Any, Any]):
             raise InputError(f"num_envs is {num_envs!r}; it must be a whole number, at least 1.")
         self.render_mode = render_mode
         self._renderer = Renderer(render_mode)
-        self.task = make_task(task, int(num_envs), options | ({} if max_episode_steps is None else {"n_steps": max_episode_steps}))
+        self.task = make_task(task, int(num_envs), with_steps(options, max_episode_steps))
         self.num_envs = int(num_envs)
         self._episodes = Episodes(self.task)
         self.single_observation_space = gymnasium.spaces.Box(self._episodes.low, self._episodes.high, dtype=np.float32)
@@ -84,7 +84,7 @@ class BatchEnv(VectorEnv[Singles, Any, Any]):
         """Begin episodes in all environments, or in those of `options={"reset_mask": (n,) bool}`. A whole-number seed s gives
         environment i the seed s + i; those that go on keep theirs. Raises `InputError`; then nothing has changed."""
         super().reset(seed=None)
-        options = dict(options or {})
+        options = checked_mapping(options)
         mask = np.asarray(options.pop("reset_mask", self._every))
         if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
             raise InputError(f"reset_mask has shape {mask.shape} and type {mask.dtype}; give ({self.num_envs},) bool, some of it True.")

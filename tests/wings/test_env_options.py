@@ -16,7 +16,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import fastrod_envs
 from fastrod import save_robot
-from fastrod.errors import InputError, UnknownNameError
+from fastrod.errors import EffectError, InputError, UnknownNameError
 from fastrod_envs.painter import ball_mesh, paint, tube_mesh
 from fastrod_envs.randomisation import Randomisation
 from fastrod_envs.registration import task_class
@@ -111,6 +111,15 @@ def test_unknown_names_answer_with_the_nearest() -> None:
         SingleEnv("Reach", threads=1).reset(options={"reset_mask": [True]})
 
 
+def test_steps_and_options_of_the_wrong_kind_are_refused() -> None:
+    with pytest.raises(InputError, match="n_steps is 3 and max_episode_steps 5"):
+        BatchEnv("Reach", 2, n_steps=3, max_episode_steps=5)
+    env = BatchEnv("Reach", 2, n_steps=np.int64(3), difficulty=np.float32(0.5))
+    assert env.n_steps == 3
+    with pytest.raises(InputError, match="options are 3"):
+        env.reset(options=3)  # type: ignore[arg-type]
+
+
 def test_max_episode_steps_is_another_name() -> None:
     assert made("Reach", max_episode_steps=7).n_steps == 7
     assert made("Reach").n_steps == task_class("Reach").n_steps
@@ -169,6 +178,22 @@ def test_a_robot_file_with_effects_is_simulated_within_its_spread(tmp_path: Path
     fixed.reset(seed=0)
     assert fixed.task.total_draws == task_class("Reach").n_draws
     assert np.isfinite(fixed.step(actions(fixed, 1)[0])[0]).all()
+
+
+def test_an_effect_may_be_absent() -> None:
+    drawn = Randomisation(effects={"backlash.half_width": (1e-4, 3e-4), "latency.delay": (0.05, 0.1)}, absent=0.4)
+    base = drawn.base(hanging_robot())
+    robots = drawn.draw(base, np.random.default_rng(0).random((400, drawn.n_draws)))
+    values = np.array([[dict(table)[key] for table, key in zip(robot.effects, ("delay", "half_width"), strict=True)] for robot in robots])
+    assert {table["name"] for table in robots[0].effects} == {"latency", "backlash"}
+    for column, (low, high) in zip(values.T, ((0.05, 0.1), (1e-4, 3e-4)), strict=True):
+        there = column[column != 0.0]
+        assert abs(len(there) / 400 - 0.6) < 0.1
+        assert low <= there.min() < low + 0.05 * (high - low)
+        assert high - 0.05 * (high - low) < there.max() <= high
+    assert abs((values == 0.0).all(1).mean() - 0.16) < 0.08
+    with pytest.raises(InputError, match="absent is 1"):
+        Randomisation(absent=1.0)
 
 
 def test_a_robot_of_another_kind_is_refused() -> None:
@@ -278,3 +303,24 @@ def test_a_page_without_viser_says_what_to_install(monkeypatch: pytest.MonkeyPat
     env.reset(seed=0)
     with pytest.raises(InputError, match=re.escape("pip install fastrod[viewer]")):
         env.render()
+
+
+@pytest.mark.parametrize("wrong", [1.1, "ab", ("a", 1), None, (1.0,), (0.9, 1.0, 1.1), (2.0, 1.0), (1.0, float("nan"))])
+def test_a_range_is_two_numbers(wrong: Any) -> None:
+    with pytest.raises(InputError, match=r"the range of 'bending_stiffness' is .*least, largest"):
+        made("Reach", randomise={"bending_stiffness": wrong})
+
+
+def test_a_range_that_an_effect_cannot_have_is_refused_before_any_episode() -> None:
+    for pair in ((-1e-3, 1e-4), (0.0, 1.0)):
+        with pytest.raises(EffectError, match="half_width"):
+            made("Reach", randomise={"backlash.half_width": pair})
+
+
+def test_a_spread_stays_within_what_an_effect_can_be() -> None:
+    robot = replace(hanging_robot(), effects=({"name": "friction", "half_width": 3e-4, "spread": 1.6},))
+    random = Randomisation.of(robot)
+    assert random is not None
+    ends = random.draw(random.base(robot), np.array([[0.0, 0.0], [1.0, 1.0]]))
+    assert_allclose([one.effects[0]["spread"] for one in ends], [1.28, 1.6])
+    assert_allclose([one.effects[0]["half_width"] for one in ends], [2.4e-4, 3.6e-4])

@@ -148,3 +148,42 @@ def test_each_may_have_a_seed_of_its_own() -> None:
 def test_a_seed_is_a_whole_number(seed: Any) -> None:
     with pytest.raises(InputError, match="seed"):
         BatchEnv("Reach", 3, threads=1).reset(seed=[seed] * 3 if isinstance(seed, bool | float) else seed)
+
+
+def test_numpys_seeds_do_not_overflow() -> None:
+    env = BatchEnv("Reach", 2, threads=1)
+    assert_array_equal(env.reset(seed=np.uint8(255))[0], env.reset(seed=255)[0])  # type: ignore[arg-type]
+
+
+def test_a_masked_reset_seeds_those_that_begin() -> None:
+    seeded, other = (BatchEnv("Reach", 2, n_steps=2, threads=1) for _ in range(2))
+    mask = np.array([True, False])
+    for env, seed in ((seeded, 7), (other, None)):
+        env.reset(seed=0)
+        env.reset(seed=seed, options={"reset_mask": mask})
+    given = np.zeros(seeded.action_space.shape)
+    for _ in range(2):
+        one, two = seeded.step(given)[0], other.step(given)[0]
+    assert_array_equal(one[1], two[1])
+    assert not np.array_equal(one[0], two[0])
+
+
+def test_a_refused_reset_changes_nothing() -> None:
+    env, twin = (BatchEnv("Reach", 2, threads=1) for _ in range(2))
+    for one in (env, twin):
+        one.reset(seed=0, options={"difficulty": 0.5})
+    for wrong in ({"options": {"difficulty": 0.1, "level": 1}}, {"seed": [1, -1]}, {"seed": 3, "options": {"difficulty": 2.0}}):
+        with pytest.raises(InputError):
+            env.reset(**wrong)
+    assert env.task.difficulty == 0.5
+    assert_array_equal(env.reset()[0], twin.reset()[0])
+
+
+def test_a_robot_lost_from_the_start_knows_no_earlier_episode() -> None:
+    heavy = {"randomise": {"gravity.line_density": (1.0, 1.0)}, "threads": 1}  # too heavy for its first shape to be found
+    fresh, used = (BatchEnv("Reach", 1, **heavy) for _ in range(2))
+    used.reset(seed=1)
+    used.task.tip[:] += 0.1  # type: ignore[attr-defined]  # as if it had been elsewhere
+    assert_array_equal(used.reset(seed=3)[0], fresh.reset(seed=3)[0])
+    assert_array_equal(used.task.direction, fresh.task.direction)  # type: ignore[attr-defined]
+    assert_array_equal(used.task.tip, fresh.task.tip)  # type: ignore[attr-defined]

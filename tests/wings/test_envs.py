@@ -250,3 +250,13 @@ def test_nothing_breaks_under_random_actions(name: str) -> None:
             assert np.isfinite(info["distance"]).all()
     assert not info["lost"].all()
     env.close()
+
+
+def test_huge_actions_are_finite() -> None:
+    env = several("Reach", 2)
+    env.reset(seed=0)
+    huge = env.step(np.full(env.action_space.shape, 1e308))[0]
+    env.reset(seed=0)
+    assert_array_equal(env.step(np.ones(env.action_space.shape))[0], huge)
+    with pytest.raises(InputError, match="environment 0 is not finite"):
+        env.step(np.array([[np.inf], [-np.inf]]) * np.ones(env.action_space.shape))

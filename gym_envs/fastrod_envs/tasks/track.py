@@ -24,6 +24,8 @@ AHEAD = (0.1, 0.2, 0.4)
 """The path is observed so far ahead of now [s]."""
 NEAR = 0.01
 """Errors are observed up to this length [m]."""
+MEMORY = 0.5
+"""Time constant of the error's mean that is observed [s]: what integral action would go by."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,12 +90,15 @@ class Track(RodTask):
             *self.goals,
             Field("tip", "m", *box, "where it is measured"),
             Field("error", "m", (-NEAR,) * 3, (NEAR,) * 3, f"from the tip to the nearest point in reach of the path's, at most {NEAR:g} m"),
+            Field("before", "m", (-NEAR,) * 3, (NEAR,) * 3, "the error one step ago"),
+            Field("mean", "m", (-NEAR,) * 3, (NEAR,) * 3, f"of the error, over the last {MEMORY:g} s or so"),
             Field("posture", "", (-1.0,) * 2, (1.0,) * 2, "displacements, from their least to their largest"),
             Field("last", "", (-1.0,) * 2, (1.0,) * 2, "the last action"),
         )
         n = n_envs
         self._which, self._phase, self._way, self._size = np.zeros(n, np.int64), np.zeros(n), np.ones(n), np.ones(n)
         self._t, self._last = np.zeros(n), np.zeros((n, 2))
+        self._error, self._before, self._mean = np.zeros((3, n, 3))
         self._sums, self._counted = np.zeros((n, 9)), np.zeros(n)
 
     def begin(self, rows: Ints, draws: Floats) -> None:
@@ -103,6 +108,8 @@ class Track(RodTask):
         self._way[rows] = np.where(draws[:, 2] < 0.5, 1.0, -1.0)
         self._size[rows] = self.difficulty
         self._t[rows], self._last[rows], self._sums[rows], self._counted[rows] = 0.0, 0.0, 0.0, 0.0
+        self._error[rows] = self._off()[rows]
+        self._before[rows], self._mean[rows] = self._error[rows], 0.0
 
     def path(self, ahead: float) -> Floats:
         """(n_envs, 3) the path so many seconds from now, base frame [m]."""
@@ -119,6 +126,8 @@ class Track(RodTask):
         super().act(action)
         self._t += self.dt
         self._last = action
+        self._before, self._error = self._error, self._off()
+        self._mean = self._mean + self.dt / MEMORY * (self._error - self._mean)
         wanted, seen = self.path(0.0), self.measured()
         nearest = self._surface.nearest(wanted)
         off, floor = np.abs(seen - wanted), np.abs(nearest - wanted)
@@ -144,9 +153,12 @@ class Track(RodTask):
         )  # fmt: skip
 
     def state(self) -> Floats:
-        seen = self.measured()
-        error = shortened(self._surface.nearest(self.path(0.0)) - seen, NEAR)
-        return np.concatenate([self.goal(), seen, error, self.posture(), self._last], axis=1)
+        told = [self.goal(), self.measured(), self._error, self._before, self._mean, self.posture(), self._last]
+        return np.concatenate(told, axis=1)
+
+    def _off(self) -> Floats:
+        """(n_envs, 3) from the measured tip to the nearest point in reach, at most `NEAR` of it [m]."""
+        return shortened(self._surface.nearest(self.path(0.0)) - self.measured(), NEAR)
 
     def goal(self) -> Floats:
         return np.concatenate([self.path(ahead) for ahead in (0.0, *AHEAD)], axis=1)
