@@ -46,6 +46,9 @@ def smoke(wheel: Path, folder: Path) -> str:
 def test_wheel(artifacts: list[Path], tmp_path: Path) -> None:
     (wheel,) = (a for a in artifacts if a.suffix == ".whl")
     assert str(tmp_path / "site") in smoke(wheel, tmp_path)
+    with zipfile.ZipFile(wheel) as archive:
+        policies = [name for name in archive.namelist() if name.endswith("/actor.npz")]
+    assert len(policies) == 10
 
 
 def test_sdist_builds_the_same(artifacts: list[Path], tmp_path: Path) -> None:

@@ -46,9 +46,9 @@ _PRESETS: Mapping[str, Preset] = {
     "Push": Preset(n_envs=8, steps=0, imitate=12_000),
     "QuadrupedPush": Preset(n_envs=8, steps=0, imitate=12_000),
     "BoxExplore": Preset(n_envs=8, steps=0, imitate=12_000),
-    "PickPlace": Preset(n_envs=8, steps=0, imitate=12_000),
+    "PickPlace": Preset(n_envs=8, steps=0, imitate=40_000),
     "DualArm": Preset(n_envs=8, steps=0, imitate=12_000),
-    "Track": Preset(n_envs=128, steps=2_000_000, imitate=100_000, options={"reward": "precise", "randomise": {**_ROBOTS, "absent": 0.4}}),
+    "Track": Preset(n_envs=128, steps=1_000_000, imitate=100_000, options={"reward": "precise", "randomise": {**_ROBOTS, "absent": 0.4}}),
 }
 
 

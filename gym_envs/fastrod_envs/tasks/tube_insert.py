@@ -112,7 +112,7 @@ class TubeInsert(Task):
         self._wires = wires[:, list(_BENDS)]
         self.simulator = Simulator(
             [self.base_robot] * n_envs if self._varies else self.base_robot, n_robots=n_envs, dt=self.dt, points_per_segment=10,
-            threads=options.threads, contact=ContactScene(obstacles=[mesh(tube_mesh(), name="tube")], max_passes=100),
+            threads=options.threads, contact=ContactScene(obstacles=[mesh(tube_mesh(), name="tube")], max_passes=250),
         )  # fmt: skip
         self._parts()
         self.displacement: Floats = np.zeros((n_envs, 5))
