@@ -43,7 +43,7 @@ _PRESETS: Mapping[str, Preset] = {
     "ReachObstacle": Preset(n_envs=512, steps=4_000_000, options={"reward": "precise"}),
     "Catch": Preset(n_envs=256, steps=500_000, imitate=50_000),
     "TubeInsert": Preset(n_envs=32, steps=0, imitate=24_000),
-    "Push": Preset(n_envs=8, steps=0, imitate=12_000),
+    "Push": Preset(n_envs=8, steps=0, imitate=24_000),
     "QuadrupedPush": Preset(n_envs=8, steps=0, imitate=12_000),
     "BoxExplore": Preset(n_envs=8, steps=0, imitate=12_000),
     "PickPlace": Preset(n_envs=8, steps=0, imitate=40_000),

@@ -162,12 +162,15 @@ class RodTask(Task):
 
     def _inputs(self) -> dict[str, Any]:
         n_tendons = self.base_robot.n_tendons
-        change = np.zeros((self.n_envs, len(self._actions.matrix)))
-        for j, k in enumerate(self.driven):  # term by term: a BLAS would sum otherwise for other numbers of robots
-            change += self.displacement[:, j, None] * self._actions.matrix[:, k]
+        change, term = np.zeros((2, len(self._actions.matrix), self.n_envs))
+        for k, q in zip(
+            self.driven, self.displacement.T, strict=True
+        ):  # term by term: a BLAS would sum otherwise for other numbers of robots
+            np.multiply(self._actions.matrix[:, k, None], q, out=term)
+            change += term
         return {
-            "tendon_length": self.base_robot.rest_tendon_length + change[:, :n_tendons],
-            "extension": change[:, n_tendons:],
+            "tendon_length": (self.base_robot.rest_tendon_length[:, None] + change[:n_tendons]).T,
+            "extension": change[n_tendons:].T,
             **self.loads(),
         }
 
