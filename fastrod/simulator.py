@@ -491,19 +491,20 @@ class Simulator:
         )
 
     def restore(self, snapshot: Snapshot, rows: ArrayLike | None = None) -> None:
-        """Go back to a `snapshot` of this simulator, or only these robots: indices or a mask. Raises `InputError` for a snapshot of
-        another simulator."""
+        """Go back to a `snapshot` of this simulator, or only these robots: indices or a mask. Robots that were replaced since keep their
+        numbers, and take over the boundary alone; a whole simulator of which some were replaced is refused. Raises `InputError`
+        then, and for a snapshot of another simulator."""
         if snapshot.memory.x.shape[0] != self.n_robots or snapshot.memory.length_before.shape != self._passes.memory.length_before.shape:
             raise InputError("the snapshot is of another simulator; its robots, tendons or their number differ.")
         if [memory.shape for memory in snapshot.effects] != [link.memory.shape for link in self._chain.links]:
             raise InputError("the snapshot is of another simulator; its effects differ.")
         if (snapshot.contact is None) != (self._engine is None):
             raise InputError("the snapshot is of another simulator; only one of them has a contact scene.")
-        if len(snapshot.robots) != len(self.robots) or any(a is not b for a, b in zip(snapshot.robots, self.robots, strict=True)):
-            raise InputError("the snapshot is of other robots; some were replaced since.")
         if rows is not None and self._state is not None and self._ports is not None:
             self._restore_rows(snapshot, self._mask(rows), self._state, self._ports)
             return
+        if len(snapshot.robots) != len(self.robots) or any(a is not b for a, b in zip(snapshot.robots, self.robots, strict=True)):
+            raise InputError("the snapshot is of other robots; some were replaced since.")
         self._passes.memory = _copied(snapshot.memory)
         self._derived = None
         self._warm, self._given, self._ports, self._state = snapshot.warm.copy(), snapshot.given, snapshot.ports, snapshot.state
