@@ -95,7 +95,7 @@ def test_one_time_or_many() -> None:
     [
         (lambda: trajectory("sqare"), UnknownNameError, "no trajectory 'sqare'; did you mean 'square'?"),
         (lambda: trajectory("spiral", pitch=1.0), UnknownNameError,
-         "no trajectory 'spiral'; known: circle, figure_eight, helix, square, square_helix."),
+         "no trajectory 'spiral'; known: circle, figure_eight, helix, square, square_helix, triangle."),
         (lambda: trajectory("circle", radios=0.1), UnknownNameError, "circle has no option 'radios'; did you mean 'radius'?"),
         (lambda: square(side=-0.1), InputError, "side of square is -0.1 m; it must be a number, positive and finite."),
         (lambda: circle(radius=np.nan), InputError, "radius of circle is nan m; it must be a number, positive and finite."),
