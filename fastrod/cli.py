@@ -11,8 +11,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
+from fastrod.arguments import ACTIONS, UsageError, build
 from fastrod.errors import FastrodError, InputError, UnknownNameError, nearest
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ DONE, FAILED, WRONG_INPUT = 0, 1, 2
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line `argv`; the exit code: 0 done, 2 the input is wrong (one sentence on stderr), 1 it failed."""
-    parser, commands = _parser()
+    parser, commands = build()
     words = list(sys.argv[1:] if argv is None else argv)
     if words and not words[0].startswith("-") and words[0] not in commands:
         return _refuse(f"no command {words[0]!r}; {nearest(words[0], commands)}")
@@ -37,9 +38,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _refuse(
                 f"{parser.prog} {arguments.command} does not know {rest[0]!r}; `{parser.prog} {arguments.command} --help` tells."
             )
-        run: Callable[[argparse.Namespace], int] = arguments.run_command
-        return run(arguments)
-    except _UsageError as error:
+        return _RUN[arguments.command](arguments)
+    except UsageError as error:
         return _refuse(str(error))
     except FastrodError as error:
         return _refuse(str(error))
@@ -49,128 +49,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _refuse("interrupted.", FAILED)
 
 
-class _UsageError(Exception):
-    """What argparse would have printed over several lines."""
-
-
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise _UsageError(f"{message}; `{self.prog} --help` says how it is used.")
-
-
-class _Version(argparse.Action):
-    """Prints the version; looked up only then, so that no other command waits for it."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
-        from importlib.metadata import version
-
-        print(f"{parser.prog} {version('fastrod')}")
-        parser.exit()
-
-
 def _refuse(sentence: str, code: int = WRONG_INPUT) -> int:
     """Print `sentence` on stderr, in one line whatever names it quotes; the exit code `code`."""
     print(" ".join(sentence.split()), file=sys.stderr)
     return code
 
 
-def _parser() -> tuple[argparse.ArgumentParser, list[str]]:
-    """The parser, and the names of its commands."""
-    parser = _Parser(prog="fastrod", description="Tendon-driven continuum robots, simulated in batches and met with measured data.")
-    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
-
-    demo = commands.add_parser("demo", help="the main job on an embedded default, start to end")
-    demo.add_argument("--out", type=Path, metavar="DIR", help="write the report there")
-    demo.set_defaults(run_command=_demo)
-
-    replay = commands.add_parser("replay", help="the model beside a measurement: residual table and plot")
-    replay.add_argument("log", type=Path, metavar="LOG", help="run log (.csv or .parquet), or the raw file of a measured set")
-    replay.add_argument("--robot", metavar="R", help="a shipped robot's name or a path to a .toml; a measured set brings its own")
-    replay.add_argument("--run", metavar="RUN", help="only this run of the log")
-    replay.add_argument("--out", type=Path, metavar="DIR", help="where residuals.csv and replay.png go (default: LOG's name + _replay)")
-    replay.set_defaults(run_command=_replay)
-
-    identify = commands.add_parser("identify", help="find what the model lacks: report.json, report.html, identified.toml")
-    identify.add_argument("logs", type=Path, nargs="*", metavar="LOG", help="run logs of one robot, or raw files of a measured set")
-    identify.add_argument("--robot", metavar="R", help="a shipped robot's name or a path to a .toml; a measured set brings its own")
-    held_out = "runs that no fit sees, or RUN@START:END in seconds (default: every fourth stretch)"
-    identify.add_argument("--held-out", nargs="+", action="extend", default=[], metavar="RUN", help=held_out)
-    identify.add_argument("--max-effects", type=int, default=4, metavar="K", help="name this many at most (default: 4)")
-    identify.add_argument("--free-camera", action="store_true", help="fit the camera's registration, marker offset and latency too")
-    identify.add_argument("--network", action="store_true", help="train a network on what is left, reported apart (needs fastrod[network])")
-    identify.add_argument("--out", type=Path, metavar="DIR", help="where the files go (default: LOG's name + _identified)")
-    identify.add_argument("--json", action="store_true", help="print report.json to stdout and nothing else; files only with --out")
-    identify.set_defaults(run_command=_identify)
-
-    excite = commands.add_parser("excite", help="write the run that separates effects, to be driven and measured")
-    excite.add_argument("--robot", required=True, metavar="R", help="a shipped robot's name or a path to a .toml")
-    excite.add_argument("--out", type=Path, metavar="FILE", help="the run log, .csv or .parquet (default: NAME_excitation.csv)")
-    excite.add_argument("--bend", type=float, default=0.9, metavar="RAD", help="largest bend of a segment (default: 0.9)")
-    excite.add_argument("--payload", type=float, metavar="KG", help="known mass at the tip, on and off (default: F l^2/EI = 1)")
-    excite.add_argument("--rate", type=float, default=15.0, metavar="HZ", help="samples a second (default: 15)")
-    excite.add_argument("--speed", type=float, default=1.0, metavar="RAD/S", help="of the triangles (default: 1)")
-    excite.set_defaults(run_command=_excite)
-
-    view = commands.add_parser("view", help="viewer and teleop in the browser, or a log beside the model")
-    view.add_argument("what", nargs="?", metavar="WHAT", help="a scene, a robot (name or .toml), or a run log (default: a robot to try)")
-    view.add_argument("--robot", metavar="R", help="whose log it is: a shipped robot's name or a path to a .toml")
-    view.add_argument("--robots", type=int, default=1, metavar="N", help="so many of the robot, in a grid, driven alike (default: 1)")
-    view.add_argument("--play", action="store_true", help="begin with the robot's demo motion; scenes always begin with their script")
-    view.add_argument("--port", type=int, metavar="P", help="default: the first free one from 8080 on")
-    view.add_argument("--host", default="127.0.0.1", metavar="H", help="address to listen on (default: 127.0.0.1, this machine alone)")
-    view.add_argument("--no-open", action="store_true", help="do not open a browser")
-    view.set_defaults(run_command=_view)
-
-    envs = commands.add_parser("envs", help="the environments; of one, its task, observation, action and options")
-    envs.add_argument("env", nargs="?", metavar="ENV", help="a task, such as Reach or fastrod/Reach-v0 (default: a line for each)")
-    _add_options(envs)
-    envs.set_defaults(run_command=_envs)
-
-    train = commands.add_parser("train", help="train a policy for an environment, on stable-baselines3")
-    train.add_argument("env", nargs="?", metavar="ENV", help="a task, such as Reach or fastrod/Reach-v0; with --resume the folder knows")
-    train.add_argument("--algo", metavar="A", help="sac, ppo or td3 (default: the task's preset)")
-    train.add_argument("--steps", type=int, metavar="N", help="environment steps in all (default: the preset's)")
-    train.add_argument("--envs", type=int, metavar="N", help="environments side by side (default: the preset's)")
-    train.add_argument("--seed", type=int, default=0, metavar="S", help="of policy and environments (default: 0)")
-    train.add_argument("--imitate", type=int, metavar="N", help="steps of lessons by the scripted baseline before (default: the preset's)")
-    train.add_argument("--curriculum", type=float, default=1.0, metavar="D", help="difficulty at the start, rising to 1 (default: 1, none)")
-    _add_options(train)
-    train.add_argument(
-        "--set", action="append", default=[], metavar="NAME=VALUE", help="a setting of the algorithm, such as batch_size=512"
-    )
-    train.add_argument("--out", type=Path, metavar="DIR", help="policy, configuration, checkpoints, curves (default: NAME_ALGO_SEED)")
-    train.add_argument("--resume", action="store_true", help="go on with the training in --out, after a kill or to more --steps")
-    train.set_defaults(run_command=_train)
-
-    evaluate = commands.add_parser("evaluate", help="a policy beside the baselines: success, distance, contacts")
-    evaluate.add_argument("env", metavar="ENV", help="a task, such as Reach or fastrod/Reach-v0")
-    evaluate.add_argument("policy", metavar="POLICY", help="a folder of `fastrod train`, `shipped`, or `none` for the baselines alone")
-    evaluate.add_argument("--episodes", type=int, default=100, metavar="N", help="one for each seed (default: 100)")
-    evaluate.add_argument("--seed", type=int, default=1000, metavar="S", help="of the first episode (default: 1000)")
-    evaluate.add_argument("--no-baselines", action="store_true", help="the policy alone")
-    _add_options(evaluate)
-    evaluate.add_argument("--out", type=Path, metavar="DIR", help="write evaluation.json and evaluation.png there")
-    evaluate.add_argument("--json", action="store_true", help="print the figures to stdout and nothing else")
-    evaluate.set_defaults(run_command=_evaluate)
-
-    bench = commands.add_parser("bench", help="the figures of perf/ as ratios")
-    bench.add_argument("name", nargs="?", metavar="NAME", help="one benchmark (default: all)")
-    bench.add_argument("--json", action="store_true", help="print JSON to stdout and nothing else")
-    bench.set_defaults(run_command=_bench)
-    return parser, list(commands.choices)
-
-
-def _add_options(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--option", action="append", default=[], metavar="NAME=VALUE", help="of the environment, such as n_steps=1 or randomise=mine.toml"
-    )
-
-
 def _demo(arguments: argparse.Namespace) -> int:
     from fastrod.demo import run
 
-    run(arguments.out)
+    run(arguments.out, seed=arguments.seed, view=not arguments.no_view)
     return DONE
 
 
@@ -221,7 +109,7 @@ def _identify(arguments: argparse.Namespace) -> int:
     swallowed = [word for word in arguments.held_out if Path(word).suffix and Path(word).is_file()]
     paths: list[Path] = arguments.logs + [Path(word) for word in swallowed]
     if not paths:
-        raise _UsageError("the following arguments are required: LOG; `fastrod identify --help` says how it is used.")
+        raise UsageError("the following arguments are required: LOG; `fastrod identify --help` says how it is used.")
     given = None if arguments.robot is None else load_robot(arguments.robot)
     logs, robots = zip(*(_read(path, given) for path in paths), strict=True)
     if any(robot != robots[0] for robot in robots):
@@ -287,6 +175,19 @@ def _view(arguments: argparse.Namespace) -> int:
     return DONE
 
 
+def _drive(arguments: argparse.Namespace) -> int:
+    if arguments.action not in ACTIONS:
+        raise UnknownNameError(f"no action {arguments.action!r} of fastrod drive; {nearest(arguments.action, ACTIONS)}")
+    if arguments.emulate == (arguments.bus is not None):
+        raise UsageError("give --bus INTERFACE:CHANNEL or --emulate, and not both; `fastrod drive --help` says how it is used.")
+    for module in ("can", "canopen", "cv2"):
+        _need(module, "drive", "device")
+    from fastrod import driving
+
+    with _progress() as bar:
+        return driving.ACTIONS[arguments.action](arguments, bar)
+
+
 def _envs(arguments: argparse.Namespace) -> int:
     _need("gymnasium", "envs", "envs")
     from fastrod_envs.describe import describe, summary
@@ -308,7 +209,7 @@ def _train(arguments: argparse.Namespace) -> int:
             path = resume(out, arguments.steps, bar)
     else:
         if arguments.env is None:
-            raise _UsageError("the following arguments are required: ENV; `fastrod train --help` says how it is used.")
+            raise UsageError("the following arguments are required: ENV; `fastrod train --help` says how it is used.")
         plan = make_plan(
             arguments.env, algorithm=arguments.algo, steps=arguments.steps, n_envs=arguments.envs, seed=arguments.seed,
             imitate=arguments.imitate, options=_pairs(arguments.option, "--option"), settings=_pairs(arguments.set, "--set"),
@@ -402,6 +303,13 @@ def _script(path: Path, argv: list[str]) -> int:
         return int(runpy.run_path(str(path))["main"](argv) or DONE)
     finally:
         sys.path.remove(str(path.parent))
+
+
+_RUN: dict[str, Callable[[argparse.Namespace], int]] = {
+    "demo": _demo, "replay": _replay, "identify": _identify, "excite": _excite, "view": _view, "drive": _drive, "envs": _envs,
+    "train": _train, "evaluate": _evaluate, "bench": _bench,
+}  # fmt: skip
+"""What each command does."""
 
 
 @contextmanager

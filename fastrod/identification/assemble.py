@@ -26,6 +26,7 @@ from fastrod.types import Flags, Floats, Ints
 ALL_AT_ONCE = 20000
 """Samples a batch when all are predicted."""
 _SURE = 1.06  # the variance of the noise is known from rest to about 6 %
+_FAR = 0.3  # of the robot's length: an error beyond counts no more, as an outlier's
 _SAY_LIMITS = 0.05  # of the error above the noise: where so much is left, shear and inertia are worth a sentence
 
 
@@ -44,7 +45,12 @@ def assemble(
     if len(rows) > len(search.samples.rows):
         whole = base.on(samples.on(rows), start)
         search = Search(whole.samples, whole.rod, whole.target, whole.block, search.excluded)
-        start, state = search.again(start), search.again(state)
+        state = _nearer(state, search.again(state), samples, rows, robot, threads)
+        # with its own weights: what the base model does not explain must not push its parameters
+        rough = base.on(samples.on(rows), start)
+        rough.weigh(base.weights[0])
+        again = Search(rough.samples, rough.rod, rough.target, rough.block, search.excluded).again(start)
+        start = _nearer(start, again, samples, rows, robot, threads)
     outlier = np.zeros(len(samples.log), bool)
     before = _everywhere(start.model, start.theta, samples, robot, threads)
     after = _everywhere(state.model, state.theta, samples, robot, threads) if found else before
@@ -112,6 +118,18 @@ def assemble(
         notes=base.notes,
         solves=base.rod.runs,
     )
+
+
+def _nearer(one: State, other: State, samples: Samples, rows: Ints, robot: Robot, threads: int | None) -> State:
+    """The state whose prediction is nearer at the rows: a fit that goes by slopes can leave the valley where a load makes the rod snap."""
+    part = samples.on(rows)
+
+    def off(state: State) -> float:
+        pose = predict(state.model, state.theta, part, Rod(part, robot, threads=threads))
+        error = np.linalg.norm(np.asarray(samples.log.tip_position)[rows] - pose.position, axis=1)
+        return float(np.mean(np.where(pose.ok, np.minimum(error, _FAR * robot.length), _FAR * robot.length) ** 2))
+
+    return other if off(other) <= off(one) else one
 
 
 def _square(state: State, sigma: Floats) -> float:

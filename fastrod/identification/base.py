@@ -20,6 +20,7 @@ LEAST_ROWS = 40
 SEEN = 0.7
 """Of the prior's sd: a parameter whose data say less is not identifiable."""
 _FOR_NOISE = 20000  # samples
+_TURN = 0.01  # rad, noise of a measured orientation
 _RESTLESS = 0.25  # of the motion: noise beyond it is no noise
 
 
@@ -30,7 +31,7 @@ class Base:
         self.rows = rows
         self.samples, self.model, self.robot = samples, model, robot
         self.rod = Rod(samples, robot, points=samples.log.points is not None, threads=threads)
-        self.target = Target(samples, np.full(3, 1e-3 * robot.length), rotation_sigma=0.01, points=samples.log.points is not None)
+        self.target = Target(samples, np.full(3, 1e-3 * robot.length), rotation_sigma=_TURN, points=samples.log.points is not None)
         n = len(samples.rows)
         self.block: Ints = np.minimum(np.arange(n) * N_BLOCKS // n, N_BLOCKS - 1)
         self.noise = Noise(np.full(3, 1e-3), 0.0, "")
@@ -55,11 +56,11 @@ class Base:
         out = int((target.weight == 0.0).sum())
         if out > 0.005 * len(raw):
             self.notes.append(f"{out} of {len(raw)} rows are outliers and do not count")
-        target.sigma = self.noise.sigma.copy()
+        self.weigh(self.noise.sigma)
         fixed = self._unseen(local)
         model = Model(model.robot, model.wiring, model.effects, tuple(u for u in model.unknowns if u.name not in fixed))
         self.model = model
-        target.sigma = self.noise.sigma * max(1.0, rms(target.residual(local.pose)))
+        self.weigh(self.noise.sigma * max(1.0, rms(target.residual(local.pose))))
         state = search.start(model, model.start)
         for _ in range(2):
             state = self.weighed(search, state)
@@ -79,15 +80,21 @@ class Base:
         """The same robot, noise and weights at other samples; outliers by the residual of `state`."""
         made = Base(samples, self.rows, self.model, self.robot, self.rod.threads)
         made.noise, made.notes, made.weights = self.noise, self.notes, self.weights
-        made.target.sigma = self.target.sigma.copy()
+        made.weigh(self.target.sigma)
         pose = predict(state.model, state.theta, samples, made.rod)
         made.target.weight = (keep(samples, np.nan_to_num(made.target.tip - pose.position), self.noise) & pose.ok).astype(float)
         return made
 
+    def weigh(self, sigma: Floats) -> None:
+        """Positions count by `sigma` (3,) [m], and orientations as much more or less than by their noise as positions do: weighed apart,
+        what one of them cannot explain would leave the other to decide alone."""
+        self.target.sigma = sigma.copy()
+        self.target.rotation_sigma = _TURN * float((sigma / self.noise.sigma).max())
+
     def weighed(self, search: Search, state: State) -> State:
         """The state fitted again with weights of the size of its own residual, never below the noise: what a model does not
         explain yet must not push its parameters beyond their priors."""
-        self.target.sigma = self.target.sigma * max(rms(state.fit.residual), float((self.noise.sigma / self.target.sigma).max()))
+        self.weigh(self.target.sigma * max(rms(state.fit.residual), float((self.noise.sigma / self.target.sigma).max())))
         self.weights.append(self.target.sigma.copy())
         return search.refined(search.refined(state))
 

@@ -57,10 +57,18 @@ class Excitation:
 
 
 def excitation(
-    robot: Robot, *, bend: float = 0.9, payload: float | None = None, rate: float = 15.0, speed: float = 1.0, seed: int = 1
+    robot: Robot,
+    *,
+    bend: float = 0.9,
+    payload: float | None = None,
+    turn: bool = True,
+    rate: float = 15.0,
+    speed: float = 1.0,
+    seed: int = 1,
 ) -> Excitation:
     """The run for `robot`: largest bend of a segment `bend` [rad], known tip mass `payload` [kg] on and off, samples at `rate` [Hz],
-    triangles at `speed` [rad/s]. Without `payload`, one that bends the robot well but does not make it snap, F l^2 / EI = 1.
+    triangles at `speed` [rad/s]. Without `payload`, one that bends the robot well but does not make it snap, F l^2 / EI = 1. Without
+    `turn` the base stays as it is, where a bench cannot be turned.
 
     Raises `InputError` for a robot that wires do not drive, or for numbers that are not positive.
     """
@@ -93,6 +101,7 @@ def excitation(
     add("rest", still(REST), "noise of the camera, zero of the drives")
     turned, loaded = [np.zeros(len(rows[0]), bool)], [np.zeros(len(rows[0]), bool)]
     for number, (pieces, other, load) in enumerate(zip(blocks, (False, True, True, False), (False, True, False, True), strict=True)):
+        other = other and turn
         label = f"block {number + 1}, base {'B' if other else 'A'}{', load on' if load and payload else ''}"
         before = sum(len(r) for r in rows)
         add(
@@ -115,9 +124,11 @@ def excitation(
     loaded.append(np.zeros(rest, bool))
     own = np.array(robot.base_quaternion)
     down = matrix_from_quaternion(own).T @ np.array(robot.gravity)
-    turn = np.zeros(4)
-    turn[[0, 1 + int(abs(down[1]) < abs(down[0]))]] = np.sqrt(0.5)  # about the base's x, or y where x is the steeper: gravity must change
-    other_way = product(own, turn)
+    quarter = np.zeros(4)
+    quarter[[0, 1 + int(abs(down[1]) < abs(down[0]))]] = np.sqrt(
+        0.5
+    )  # about the base's x, or y where x is the steeper: gravity must change
+    other_way = product(own, quarter) if turn else own
     log = RunLog(
         name=f"{robot.name}_excitation",
         t=np.arange(len(path)) / rate,

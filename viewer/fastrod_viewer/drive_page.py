@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fastrod.link import RobotLink
+from fastrod.recording import Recorder, free_path
 from fastrod.runlog import RunLog
 from fastrod_viewer.canvas import Canvas
 from fastrod_viewer.controls import Controls
@@ -20,7 +21,6 @@ from fastrod_viewer.grip import Grip
 from fastrod_viewer.options import FINE, Options
 from fastrod_viewer.page import Page, Sight, facts, picture, save_name, send, stand_back, tell
 from fastrod_viewer.pilot import Pilot, Speeds
-from fastrod_viewer.record import Recorder, free_path
 from fastrod_viewer.session import Frame, Session
 from fastrod_viewer.world import World
 

@@ -13,10 +13,10 @@ import numpy as np
 
 from fastrod.errors import FastrodError
 from fastrod.link import Measurement, RobotLink
+from fastrod.recording import Recorder
 from fastrod.rotation import quaternion_from_matrix
 from fastrod.types import Floats
 from fastrod_viewer.pilot import Pilot
-from fastrod_viewer.record import Recorder
 from fastrod_viewer.world import Hand, World
 
 RATE = 30.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, Literal, final, get_args
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from fastrod.control import Trajectory, circle, square, triangle
 from fastrod.errors import InputError
+from fastrod.robot import Robot
 from fastrod.robotfile import load_robot
 from fastrod.types import Floats, Ints
 from fastrod_envs.options import Options
@@ -26,6 +28,12 @@ NEAR = 0.01
 """Errors are observed up to this length [m]."""
 MEMORY = 0.5
 """Time constant of the error's mean that is observed [s]: what integral action would go by."""
+DT = 0.05
+"""Of a step [s]."""
+DRIVEN, LIMIT, RATE = (1, 2), ((-0.008, 0.008), (-0.008, 0.008)), (0.01, 0.01)
+"""Numbers of the robot's action (`SegmentActions`) that are driven; their least and largest [m]; their largest rate [m/s]."""
+RADIUS = 0.03
+"""The surface of reach is known so far from the axis [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +63,58 @@ def paths(height: float) -> dict[str, Trajectory]:
     }
 
 
+def fields(robot: Robot) -> tuple[tuple[Field, ...], tuple[Field, ...]]:
+    """Parts of the goal, and of the state, as they are observed."""
+    reach = 1.2 * robot.length
+    box = (-reach,) * 3, (reach,) * 3
+    goals = (Field("path", "m", box[0] * 4, box[1] * 4, f"now and {', '.join(map(str, AHEAD))} s ahead, base frame"),)
+    states = (
+        *goals,
+        Field("tip", "m", *box, "where it is measured"),
+        Field("error", "m", (-NEAR,) * 3, (NEAR,) * 3, f"from the tip to the nearest point in reach of the path's, at most {NEAR:g} m"),
+        Field("before", "m", (-NEAR,) * 3, (NEAR,) * 3, "the error one step ago"),
+        Field("mean", "m", (-NEAR,) * 3, (NEAR,) * 3, f"of the error, over the last {MEMORY:g} s or so"),
+        Field("posture", "", (-1.0,) * 2, (1.0,) * 2, "displacements, from their least to their largest"),
+        Field("last", "", (-1.0,) * 2, (1.0,) * 2, "the last action"),
+    )
+    return goals, states
+
+
+def coming(path: Callable[[float], Floats]) -> Floats:
+    """(n, 12) a path (n, 3), of the seconds from now, as it is observed [m]."""
+    return np.concatenate([path(ahead) for ahead in (0.0, *AHEAD)], axis=1)
+
+
+@final
+class Sight:
+    """What n robots remember of their errors, and the state that they observe."""
+
+    def __init__(self, n: int) -> None:
+        self._last = np.zeros((n, 2))
+        self._error, self._before, self._mean = np.zeros((3, n, 3))
+
+    def begin(self, rows: Ints, wanted: Floats, seen: Floats) -> None:
+        """These robots begin; `wanted` points in reach and `seen` tips are (n, 3) of all [m]."""
+        self._last[rows] = 0.0
+        self._error[rows] = _off(wanted, seen)[rows]
+        self._before[rows], self._mean[rows] = self._error[rows], 0.0
+
+    def note(self, action: Floats, wanted: Floats, seen: Floats) -> None:
+        """A step was done: actions (n, 2), then points in reach that are wanted and measured tips (n, 3) [m]."""
+        self._last = action
+        self._before, self._error = self._error, _off(wanted, seen)
+        self._mean = self._mean + DT / MEMORY * (self._error - self._mean)
+
+    def state(self, goal: Floats, seen: Floats, posture: Floats) -> Floats:
+        """(n, size of the states) with the path that comes (n, 12), measured tips (n, 3) [m] and postures (n, 2)."""
+        return np.concatenate([goal, seen, self._error, self._before, self._mean, posture, self._last], axis=1)
+
+
+def _off(wanted: Floats, seen: Floats) -> Floats:
+    """(n, 3) from measured tips to points in reach, at most `NEAR` of it [m]."""
+    return shortened(wanted - seen, NEAR)
+
+
 @final
 class Track(RodTask):
     """Follow a triangle of 40 mm, a square of 25 mm or a circle of 20 mm radius with the tip of the prototype, one turn in 9 s.
@@ -74,31 +134,20 @@ class Track(RodTask):
     accuracy: ClassVar[float] = 5e-4
     options_class: ClassVar[type[Options]] = TrackOptions
     points_per_segment: ClassVar[int] = 6
-    dt = 0.05
+    dt = DT
 
     def __init__(self, n_envs: int, options: Options) -> None:
-        super().__init__(n_envs, options, load_robot("prototype"), driven=[1, 2], limit=[(-0.008, 0.008)] * 2, rate=[0.01, 0.01])
+        super().__init__(n_envs, options, load_robot("prototype"), driven=DRIVEN, limit=LIMIT, rate=RATE)
         assert isinstance(options, TrackOptions)
         self._known = paths(self.base_robot.length)
         self._names = [options.path] if options.path != "any" else list(get_args(Shape))
         self._sharp = options.reward == "precise"
-        self._surface = ReachableSurface(self.base_robot, height=self.base_robot.length, radius=0.03)
-        reach = 1.2 * self.base_robot.length
-        box = (-reach,) * 3, (reach,) * 3
-        self.goals = (Field("path", "m", box[0] * 4, box[1] * 4, f"now and {', '.join(map(str, AHEAD))} s ahead, base frame"),)
-        self.states = (
-            *self.goals,
-            Field("tip", "m", *box, "where it is measured"),
-            Field("error", "m", (-NEAR,) * 3, (NEAR,) * 3, f"from the tip to the nearest point in reach of the path's, at most {NEAR:g} m"),
-            Field("before", "m", (-NEAR,) * 3, (NEAR,) * 3, "the error one step ago"),
-            Field("mean", "m", (-NEAR,) * 3, (NEAR,) * 3, f"of the error, over the last {MEMORY:g} s or so"),
-            Field("posture", "", (-1.0,) * 2, (1.0,) * 2, "displacements, from their least to their largest"),
-            Field("last", "", (-1.0,) * 2, (1.0,) * 2, "the last action"),
-        )
+        self._surface = ReachableSurface(self.base_robot, height=self.base_robot.length, radius=RADIUS)
+        self.goals, self.states = fields(self.base_robot)
         n = n_envs
         self._which, self._phase, self._way, self._size = np.zeros(n, np.int64), np.zeros(n), np.ones(n), np.ones(n)
-        self._t, self._last = np.zeros(n), np.zeros((n, 2))
-        self._error, self._before, self._mean = np.zeros((3, n, 3))
+        self._t = np.zeros(n)
+        self._sight = Sight(n)
         self._sums, self._counted = np.zeros((n, 9)), np.zeros(n)
 
     def begin(self, rows: Ints, draws: Floats) -> None:
@@ -107,9 +156,8 @@ class Track(RodTask):
         self._phase[rows] = PERIOD * draws[:, 1]
         self._way[rows] = np.where(draws[:, 2] < 0.5, 1.0, -1.0)
         self._size[rows] = self.difficulty
-        self._t[rows], self._last[rows], self._sums[rows], self._counted[rows] = 0.0, 0.0, 0.0, 0.0
-        self._error[rows] = self._off()[rows]
-        self._before[rows], self._mean[rows] = self._error[rows], 0.0
+        self._t[rows], self._sums[rows], self._counted[rows] = 0.0, 0.0, 0.0
+        self._sight.begin(rows, self._surface.nearest(self.path(0.0)), self.measured())
 
     def path(self, ahead: float) -> Floats:
         """(n_envs, 3) the path so many seconds from now, base frame [m]."""
@@ -125,11 +173,9 @@ class Track(RodTask):
     def act(self, action: Floats) -> None:
         super().act(action)
         self._t += self.dt
-        self._last = action
-        self._before, self._error = self._error, self._off()
-        self._mean = self._mean + self.dt / MEMORY * (self._error - self._mean)
         wanted, seen = self.path(0.0), self.measured()
         nearest = self._surface.nearest(wanted)
+        self._sight.note(action, nearest, seen)
         off, floor = np.abs(seen - wanted), np.abs(nearest - wanted)
         row = np.column_stack([length(seen - nearest), length(off), length(floor), off, floor])
         counts = self._t > APPROACH
@@ -153,15 +199,10 @@ class Track(RodTask):
         )  # fmt: skip
 
     def state(self) -> Floats:
-        told = [self.goal(), self.measured(), self._error, self._before, self._mean, self.posture(), self._last]
-        return np.concatenate(told, axis=1)
-
-    def _off(self) -> Floats:
-        """(n_envs, 3) from the measured tip to the nearest point in reach, at most `NEAR` of it [m]."""
-        return shortened(self._surface.nearest(self.path(0.0)) - self.measured(), NEAR)
+        return self._sight.state(self.goal(), self.measured(), self.posture())
 
     def goal(self) -> Floats:
-        return np.concatenate([self.path(ahead) for ahead in (0.0, *AHEAD)], axis=1)
+        return coming(self.path)
 
     def baseline(self) -> Floats:
         ahead = self._surface.nearest(self.path(self.dt)) - self._surface.nearest(self.path(0.0))

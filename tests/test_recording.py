@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +15,10 @@ from numpy.testing import assert_array_equal
 import fastrod
 from fastrod.errors import InputError, LogError
 from fastrod.link import Measurement
+from fastrod.recording import Recorder, free_path, recover
 from fastrod.robot import Robot
 from fastrod.runlog import RunLog, read_log
 from fastrod.types import Floats
-from fastrod_viewer.record import Recorder, free_path, recover
 
 ROBOT = fastrod.load_robot("prototype")
 
@@ -131,6 +135,179 @@ def test_a_row_cut_short_is_left_out(tmp_path: Path) -> None:
     (kept / "session.csv.part").write_text(text[:-9])
     whole = recorder.stop()
     assert_same(recover(kept / "session.csv.part"), whole.rows(slice(0, 9)))
+
+
+CHILD = """
+import sys
+from pathlib import Path
+import numpy as np
+import fastrod
+from fastrod.link import Measurement
+from fastrod.recording import Recorder
+
+recorder = Recorder(fastrod.load_robot("prototype"), Path(sys.argv[1]), extra=["current_1"])
+recorder.start(0.0, "killed")
+while True:
+    k = len(recorder)
+    tip = [np.nan] * 3 if k % 7 == 3 else [1e-6 * k, 0.0, 0.07]
+    seen = Measurement(t=0.02 * k, dl=[0.0] * 4, ext=[0.0], tip_position=tip, tip_quaternion=[1.0, 0.0, 0.0, 0.0], tension=[1.0] * 4)
+    recorder.add(seen, extra={"current_1": float(k)})
+    print(len(recorder), flush=True)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL")
+def test_a_process_that_is_killed_loses_no_row(tmp_path: Path) -> None:
+    path = tmp_path / "session.csv"
+    child = subprocess.Popen([sys.executable, "-c", CHILD, str(path)], stdout=subprocess.PIPE, text=True)
+    assert child.stdout is not None
+    with child:
+        while int(child.stdout.readline()) < 100:
+            pass
+        os.kill(child.pid, signal.SIGKILL)
+        told = child.stdout.read().splitlines(keepends=True)
+    added = max([100, *(int(line) for line in told if line.endswith("\n"))])
+    assert child.returncode == -signal.SIGKILL
+    log = recover(path)
+    assert len(log) >= added
+    k = np.arange(len(log))
+    assert_array_equal(log.extra["current_1"], k.astype(float))
+    assert_array_equal(log.measured, k % 7 != 3)
+    assert_array_equal(log.tip_position[log.measured, 0], 1e-6 * k[log.measured])
+    assert_same(log, read_log(path, ROBOT))
+
+
+def test_each_row_is_one_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(7)
+    recorder = Recorder(ROBOT, tmp_path / "session.csv", extra=[f"further_{k}" for k in range(900)])  # a row beyond any buffer
+    recorder.start(0.0)
+    written: list[int] = []
+
+    class Counted:
+        """The file, counting."""
+
+        def __init__(self, file: object) -> None:
+            self.file = file
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(self.file, name)
+
+        def write(self, data: bytes) -> int:
+            written.append(len(data))
+            return self.file.write(data)  # type: ignore[attr-defined,no-any-return]
+
+    monkeypatch.setattr(recorder, "_file", Counted(recorder._file))
+    for k in range(5):
+        recorder.add(reading(0.1 * k, rng), extra={f"further_{j}": rng.normal() for j in range(900)})
+        assert len(written) == k + 1
+        assert (tmp_path / "session.csv.part").stat().st_size > sum(written)  # and the head
+        assert (tmp_path / "session.csv.part").read_bytes().endswith(b"\n")
+    assert min(written) > 8192
+    assert len(recorder.stop()) == 5
+
+
+FULL = """
+import resource, sys
+from pathlib import Path
+import fastrod
+from fastrod.errors import InputError
+from fastrod.link import Measurement
+from fastrod.recording import Recorder
+
+recorder = Recorder(fastrod.load_robot("prototype"), Path(sys.argv[1]))
+recorder.start(0.0)
+def add(k):
+    recorder.add(Measurement(t=k, dl=[1e-3 / 3] * 4, ext=[0], tip_position=[0.1 / 3] * 3, tip_quaternion=[1, 0, 0, 0], tension=[1] * 4))
+hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+for k in range(10):
+    if k in (4, 5):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (Path(sys.argv[1] + ".part").stat().st_size + 40, hard))
+        try:
+            add(k)
+        except InputError as error:
+            print(error)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+    else:
+        add(k)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="resource limits")
+def test_a_disk_that_was_full_leaves_whole_rows(tmp_path: Path) -> None:
+    path = tmp_path / "session.csv"
+    told = subprocess.run([sys.executable, "-c", FULL, str(path)], capture_output=True, text=True, check=True).stdout
+    assert told.splitlines() == ["session.csv.part cannot be written: File too large."] * 2
+    assert recover(path).t.tolist() == [0.0, 1.0, 2.0, 3.0, 6.0, 7.0, 8.0, 9.0]
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_further_columns_and_the_bases_orientation_are_kept(tmp_path: Path, suffix: str) -> None:
+    path, kept = tmp_path / f"session{suffix}", tmp_path / "kept"
+    kept.mkdir()
+    rng = np.random.default_rng(11)
+    recorder = Recorder(ROBOT, path, extra=["following error [m]", "never"])
+    recorder.start(0.0)
+    errors, bases = rng.normal(size=6), rng.normal(size=(6, 4))
+    bases /= np.linalg.norm(bases, axis=1)[:, None]
+    for k in range(6):
+        given = None if k == 2 else {"following error [m]": np.inf if k == 4 else errors[k]}
+        recorder.add(reading(0.1 * k, rng), base_quaternion=None if k == 3 else bases[k], extra=given)
+    part = (tmp_path / f"{path.name}.part").read_bytes()
+    (kept / f"{path.name}.part").write_bytes(part)
+    log = recorder.stop()
+    expected = np.where(np.isin(np.arange(6), (2, 4)), np.nan, errors)
+    assert_array_equal(numbers(log.extra["following error [m]"]), expected)
+    assert np.isnan(numbers(log.extra["never"])).all()
+    assert log.base_quaternion is not None
+    np.testing.assert_allclose(log.base_quaternion[[0, 1, 2, 4, 5]], bases[[0, 1, 2, 4, 5]], rtol=0.0, atol=1e-15)
+    assert np.isnan(log.base_quaternion[3]).all()
+    assert_same(log, read_log(path, ROBOT))
+    assert_same(recover(kept / path.name), log)
+
+
+def test_an_orientation_that_nobody_gave_is_none(tmp_path: Path) -> None:
+    recorder = filled(Recorder(ROBOT, tmp_path / "session.csv", extra=("temperature",)), n=3)
+    log = recorder.stop()
+    assert log.base_quaternion is None
+    assert np.isnan(numbers(log.extra["temperature"])).all()
+    assert "base_qw" not in (tmp_path / "session.csv").read_text()
+
+
+@pytest.mark.parametrize(
+    ("names", "sentence"),
+    [
+        (["a", "a"], "'a' is named twice"),
+        (["tension_9"], "'tension_9' is a name that run logs have"),
+        (["dl_12"], "for something else"),
+        (["base_qx"], "for something else"),
+        (["p3_z"], "for something else"),
+        (["t"], "for something else"),
+        (["a,b"], "is no name"),
+        (["a\nb"], "is no name"),
+        ([" a"], "is no name"),
+        ([""], "is no name"),
+        ([3], "is no name"),
+        ("current", "give a list of names"),
+    ],
+)
+def test_a_further_column_that_cannot_be_one_is_refused(names: list[str], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        Recorder(ROBOT, extra=names)
+
+
+def test_a_number_that_cannot_be_kept_is_refused() -> None:
+    rng = np.random.default_rng(5)
+    recorder = Recorder(ROBOT, extra=["current_1", "current_2"])
+    recorder.start(0.0)
+    with pytest.raises(InputError, match=r"no column 'curent_1' is recorded; did you mean 'current_1'\?"):
+        recorder.add(reading(0.0, rng), extra={"curent_1": 1.0})
+    with pytest.raises(InputError, match=r"extra of the reading is .*it must be numbers"):
+        recorder.add(reading(0.0, rng), extra={"current_1": "much"})  # type: ignore[dict-item]
+    with pytest.raises(InputError, match=r"base_quaternion of the reading has shape \(3,\)"):
+        recorder.add(reading(0.0, rng), base_quaternion=(1.0, 0.0, 0.0))
+    with pytest.raises(InputError, match="of norm 2; it must be 1"):
+        recorder.add(reading(0.0, rng), base_quaternion=(2.0, 0.0, 0.0, 0.0))
+    assert len(recorder) == 0
 
 
 def test_nothing_to_recover_is_said(tmp_path: Path) -> None:

@@ -6,14 +6,16 @@ import csv
 import io
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from io import FileIO
 from pathlib import Path
 from threading import Lock
-from typing import Any, TextIO, final
+from typing import Any, final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fastrod.errors import InputError, LogError
+from fastrod.errors import InputError, LogError, nearest
 from fastrod.link import Measurement
 from fastrod.robot import Robot
 from fastrod.runlog import RunLog, numbers, read_table, write_log
@@ -22,6 +24,10 @@ from fastrod.types import Floats
 _TIP = ("tip_x", "tip_y", "tip_z")
 _TIP_QUATERNION = ("tip_qw", "tip_qx", "tip_qy", "tip_qz")
 _TIP_FORCE = ("tip_fx", "tip_fy", "tip_fz")
+_BASE_QUATERNION = ("base_qw", "base_qx", "base_qy", "base_qz")
+_KNOWN = r"t|run|payload|tip_(q?[xyz]|qw|f[xyz])|base_q[wxyz]|(dl|ext|cmd_dl|tension)_\d+|p\d+_[xyz]"
+"""Names of columns that are a recorder's own, or a run log's."""
+_QUATERNION_SLACK = 1e-2  # what `read_log` allows
 _NUDGES = (1, -1, 2, -2, 3, -3, 4, -4)  # last places of one component: dividing by the norm alone need not end at norm 1
 
 
@@ -29,29 +35,34 @@ _NUDGES = (1, -1, 2, -2, 3, -3, 4, -4)  # last places of one component: dividing
 class Recorder:
     """Readings as the rows of a `RunLog`.
 
-    Each row goes to PATH.part at once; `stop` writes the finished log to PATH and takes the part away. What a killed session
-    leaves, `recover` turns into a log. Commands (cmd_dl_1 ...) and tensions (tension_1 ...) are kept as further columns. May be used
-    from several threads.
+    Each row goes to PATH.part at once, in one write to the operating system: a process that is killed loses none. Rows are not forced
+    onto the disk itself (fsync), so a machine that loses power may lose the last seconds. `stop` writes the finished log to PATH and
+    takes the part away; what a killed session leaves, `recover` turns into a log. Rows without a measured tip are kept. Commands
+    (cmd_dl_1 ...), tensions (tension_1 ...) and `extra` are kept as further columns. May be used from several threads.
     """
 
-    def __init__(self, robot: Robot, path: str | Path | None = None, *, overwrite: bool = False) -> None:
-        """Record `robot` to the .csv or .parquet at `path`, or, where it is None, in memory alone.
+    def __init__(self, robot: Robot, path: str | Path | None = None, *, overwrite: bool = False, extra: Sequence[str] = ()) -> None:
+        """Record `robot` to the .csv or .parquet at `path`, or, where it is None, in memory alone; `extra` names further columns of
+        numbers.
 
-        Raises `InputError` where the path cannot be one, or, but for `overwrite`, where a file or a left-over part is there.
+        Raises `InputError` where the path cannot be one, or, but for `overwrite`, where a file or a left-over part is there; where a
+        name of `extra` is taken, given twice, or none.
         """
         self.robot = robot
+        self.extra = _names(extra)
+        """Names of the further columns."""
         self.path = None if path is None else _checked(Path(path), overwrite)
         n = range(1, robot.n_tendons + 1)
         extends = any(segment.extension != (0.0, 0.0) for segment in robot.segments)
         self._ext = robot.n_segments if extends else 0
         self._columns = [
             "t", "run", *(f"dl_{k}" for k in n), *(f"ext_{k}" for k in range(1, self._ext + 1)), *_TIP, *_TIP_QUATERNION, *_TIP_FORCE,
-            "payload", *(f"cmd_dl_{k}" for k in n), *(f"tension_{k}" for k in n),
+            "payload", *_BASE_QUATERNION, *(f"cmd_dl_{k}" for k in n), *(f"tension_{k}" for k in n), *self.extra,
         ]  # fmt: skip
         self._rows: list[list[float]] = []
         self._labels: list[str] = []
         self._lock = Lock()
-        self._file: TextIO | None = None
+        self._file: FileIO | None = None
         self._run = ""
         self._runs: list[str] = []
         self._start = self._last = 0.0
@@ -89,26 +100,39 @@ class Recorder:
             self._recording = True
 
     def add(
-        self, measurement: Measurement, *, tip_force: ArrayLike | None = None, payload: float = 0.0, commanded_dl: ArrayLike | None = None
-    ) -> bool:
+        self, measurement: Measurement, *, tip_force: ArrayLike | None = None, payload: float = 0.0, commanded_dl: ArrayLike | None = None,
+        base_quaternion: ArrayLike | None = None, extra: Mapping[str, float] | None = None,
+    ) -> bool:  # fmt: skip
         """Append a reading; whether it was new: one from before the start, or the same one again, is left out.
 
         `tip_force` (3,) known force on the tip, base frame [N], None for none; `payload` known mass at the tip [kg]; nan where a load is
-        not known. `commanded_dl` (n_tendons,) [m], None where nothing was commanded.
-        Raises `InputError` for a reading of another robot, for a clock that runs back, and where the row cannot be written.
+        not known. `commanded_dl` (n_tendons,) [m], None where nothing was commanded. `base_quaternion` (4,) world_from_base, w x y z, None
+        where nobody asks: a log keeps it if any row has it. `extra` numbers of the further columns; what is not given is nan.
+        Raises `InputError` for a reading of another robot, for an `extra` that was not named before, for a clock that runs back, and
+        where the row cannot be written.
         """
         n = self.robot.n_tendons
+        more = {} if extra is None else extra
+        for name in more:
+            if name not in self.extra:
+                raise InputError(f"no column {name!r} is recorded; {nearest(str(name), self.extra)}")
         groups: list[tuple[str, Any, int]] = [
             ("dl", measurement.dl, n), ("ext", measurement.ext if self._ext else [], self._ext), ("tip", measurement.tip_position, 3),
             ("tip quaternion", measurement.tip_quaternion, 4), ("tip_force", np.zeros(3) if tip_force is None else tip_force, 3),
-            ("payload", [payload], 1), ("commanded_dl", np.full(n, np.nan) if commanded_dl is None else commanded_dl, n),
-            ("tension", measurement.tension, n),
+            ("payload", [payload], 1), ("base_quaternion", np.full(4, np.nan) if base_quaternion is None else base_quaternion, 4),
+            ("commanded_dl", np.full(n, np.nan) if commanded_dl is None else commanded_dl, n), ("tension", measurement.tension, n),
+            ("extra", [more.get(name, np.nan) for name in self.extra], len(self.extra)),
         ]  # fmt: skip
         values = []
         for name, given, size in groups:
-            row = np.asarray(given, dtype=np.float64)
+            try:
+                row = np.asarray(given, dtype=np.float64)
+            except (TypeError, ValueError) as error:
+                raise InputError(f"{name} of the reading is {given!r}; it must be numbers.") from error
             if row.shape != (size,):
                 raise InputError(f"{name} of the reading has shape {row.shape}; robot {self.robot.name!r} needs ({size},).")
+            if name == "base_quaternion" and abs(np.linalg.norm(row) - 1.0) > _QUATERNION_SLACK:
+                raise InputError(f"base_quaternion of the reading is {row.tolist()}, of norm {np.linalg.norm(row):.6g}; it must be 1.")
             values.append(np.where(np.isfinite(row), row, np.nan))
         with self._lock:
             if not self._recording:
@@ -125,7 +149,7 @@ class Recorder:
             self._labels.append(self._run)
             if self._file is not None and self.path is not None:
                 try:
-                    self._file.write(_line([_text(t), self._run, *map(_text, self._rows[-1][1:])]))
+                    _write(self._file, _line([_text(t), self._run, *map(_text, self._rows[-1][1:])]))
                 except OSError as error:
                     raise InputError(f"{self.path.name}.part cannot be written: {error.strerror or error}.") from error
             return True
@@ -154,8 +178,8 @@ class Recorder:
         if self.path is None:
             return
         try:
-            self._file = _part(self.path).open("w", encoding="utf-8", newline="", buffering=1)  # a line reaches the system at once
-            self._file.write(f"# Recorded on robot {' '.join(self.robot.name.split())}.\n" + _line(self._columns))
+            self._file = _part(self.path).open("wb", buffering=0)
+            _write(self._file, f"# Recorded on robot {' '.join(self.robot.name.split())}.\n" + _line(self._columns))
         except OSError as error:
             raise InputError(f"{str(self.path)!r} cannot be written: {error.strerror or error}.") from error
 
@@ -216,6 +240,33 @@ def _checked(path: Path, overwrite: bool) -> Path:
     return path
 
 
+def _names(extra: Sequence[str]) -> tuple[str, ...]:
+    if isinstance(extra, str):
+        raise InputError(f"extra is {extra!r}; give a list of names of columns.")
+    names = tuple(extra)
+    for name in names:
+        if not isinstance(name, str) or not name or name != name.strip() or re.search(r"[,\r\n]", name):
+            raise InputError(f"extra column {name!r} is no name; give one line of text without commas, no space around it.")
+        if re.fullmatch(_KNOWN, name):
+            raise InputError(f"extra column {name!r} is a name that run logs have for something else; give another.")
+        if names.count(name) > 1:
+            raise InputError(f"extra column {name!r} is named twice; each name stands for one column.")
+    return names
+
+
+def _write(file: FileIO, line: str) -> None:
+    """The line in one write; where it does not fit, no part of it stays, as the next would go on from there."""
+    data, end = line.encode(), file.tell()
+    try:
+        while data:
+            data = data[file.write(data) :]
+    except OSError:
+        with suppress(OSError):
+            file.seek(end)
+            file.truncate()
+        raise
+
+
 def _part(path: Path) -> Path:
     return path.with_name(path.name + ".part")
 
@@ -249,7 +300,12 @@ def _log(names: Sequence[str], labels: Sequence[str], rows: Floats, name: str) -
         return np.stack([column[name] for name in wanted], axis=1) if wanted else np.zeros((len(rows), 0))
 
     quaternion, force, payload, ext = group(_TIP_QUATERNION), group(_TIP_FORCE), column["payload"], group(r"ext_\d+")
-    extra = {name: values for name, values in column.items() if re.fullmatch(r"(cmd_dl|tension)_\d+", name) and not np.isnan(values).all()}
+    base = group(r"base_q[wxyz]")
+    extra = {
+        name: values
+        for name, values in column.items()
+        if not re.fullmatch(_KNOWN, name) or (re.fullmatch(r"(cmd_dl|tension)_\d+", name) and not np.isnan(values).all())
+    }
     return RunLog(
         name=name,
         t=column["t"],
@@ -260,6 +316,7 @@ def _log(names: Sequence[str], labels: Sequence[str], rows: Floats, name: str) -
         tip_quaternion=None if np.isnan(quaternion).all() else _unit(quaternion),
         tip_force=force if (force != 0.0).any() else None,  # nan counts: a load that nobody knows is not none
         payload=payload if (payload != 0.0).any() else None,
+        base_quaternion=None if np.isnan(base).all() else _unit(base),
         extra=extra,
     )
 

@@ -1,0 +1,180 @@
+"""What a drive is told once, by SDO, before it moves: who it is, its limits, its process data."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+
+from fastrod.errors import InputError
+from fastrod.types import Ints
+from fastrod_device.bus import Line, guest
+from fastrod_device.errors import DeviceError
+from fastrod_device.units import DriveSpec
+
+MASTER = 127
+"""Node id of the controller."""
+BEAT = 0.05
+"""Period of heartbeats, of the drives and of the controller [s]."""
+PATIENCE = 0.15
+"""Without the controller's heartbeat for so long, a drive stops by itself [s]."""
+STATUS, MOTION, COMMAND = 0x180, 0x280, 0x200
+"""COB-IDs, less the node id: TPDO 1 (statusword, position, torque), TPDO 2 (velocity, following error), RPDO 1 (controlword, target)."""
+_MILLI_RPM = 0xFDB44700  # unit of velocity; whole rpm would be 70 counts/s
+_MAPPING = {
+    0x1600: (0x6040_0010, 0x607A_0020),
+    0x1A00: (0x6041_0010, 0x6064_0020, 0x6077_0010),
+    0x1A01: (0x606C_0020, 0x60F4_0020),
+}
+_INVALID = 0x8000_0000
+_NO_SUCH_OBJECT = (0x06020000, 0x06090011)
+_MODES = {1: "profile position", 6: "homing", 8: "cyclic synchronous position"}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DriveLimits:
+    """What drives refuse by themselves, in counts; one number for all drives, or (n_drives,)."""
+
+    position_limit: Ints | int
+    """Greatest target position, either way [counts]."""
+    velocity_limit: Ints | int
+    """Greatest speed [counts/s]."""
+    following_error: Ints | int
+    """Beyond it a drive faults [counts]."""
+    deceleration: Ints | int
+    """Of a quick stop [counts/s2]."""
+    hold: bool
+    """After a quick stop the motor holds the wire; otherwise it is switched off."""
+
+    def of(self, name: str, n_drives: int) -> list[int]:
+        """One of them for each drive. Raises `InputError` where it is of another shape or cannot be."""
+        given = np.asarray(getattr(self, name))
+        if given.shape not in ((), (n_drives,)) or given.dtype.kind not in "iu":
+            raise InputError(f"{name} is {getattr(self, name)!r}; it must be a whole number, or one for each of {n_drives} drives.")
+        values = [int(value) for value in np.broadcast_to(given, (n_drives,))]
+        if not all(0 < value < 2**31 for value in values):
+            raise InputError(f"{name} is {values}; it must be positive, and a drive counts in 32 bits.")
+        return values
+
+
+@final
+class Configurator:
+    """Reads and writes objects of drives; never in the loop. `beat` is called with every request, as drives expect heartbeats meanwhile."""
+
+    def __init__(self, line: Line, dictionary: Any, specs: Sequence[DriveSpec], beat: Callable[[], None]) -> None:
+        """Subscribes to the answers."""
+        self._dictionary, self._specs, self._beat = dictionary, specs, beat
+        self._sdo = guest("canopen.sdo")
+        self._clients = []
+        for spec in specs:
+            client = self._sdo.SdoClient(0x600 + spec.node, 0x580 + spec.node, dictionary)
+            client.network, client.RESPONSE_TIMEOUT, client.MAX_RETRIES = line.network, 0.4, 2
+            line.network.subscribe(0x580 + spec.node, client.on_response)
+            self._clients.append(client)
+        self._error = line.error
+        self.requests = 0
+        """SDO requests so far."""
+        self._modes = [0] * len(specs)
+
+    def read(self, drive: int, index: int, sub: int = 0) -> int:
+        """A number. Raises `DeviceError`: no answer, or refused."""
+        return int(self._variable(index, sub).decode_raw(self._ask(drive, index, sub, None)))
+
+    def write(self, drive: int, index: int, sub: int, value: int, *, optional: bool = False) -> None:
+        """Write a number. An optional object may be absent. Raises `DeviceError`: no answer, or refused."""
+        self._ask(drive, index, sub, self._variable(index, sub).encode_raw(value), optional=optional)
+
+    def _variable(self, index: int, sub: int) -> Any:
+        return self._dictionary.get_variable(index, sub)
+
+    def _ask(self, drive: int, index: int, sub: int, data: bytes | None, *, optional: bool = False) -> bytes:
+        node, what = self._specs[drive].node, f"0x{index:04X}:{sub:02X}"
+        self._beat()
+        self.requests += 1
+        try:
+            if data is None:
+                return bytes(self._clients[drive].upload(index, sub))
+            self._clients[drive].download(index, sub, data)
+        except self._sdo.SdoAbortedError as error:
+            if not (optional and error.code in _NO_SUCH_OBJECT):
+                raise DeviceError(f"the drive at node {node} refuses object {what}: {error}.") from error
+        except self._sdo.SdoCommunicationError as error:
+            raise DeviceError(
+                f"the drive at node {node} does not answer (object {what}); are its power, its node id and the bit rate right?"
+            ) from error
+        except self._error as error:
+            raise DeviceError(f"nothing can be sent to node {node}: {error}.") from error
+        return b""
+
+    def identify(self, drive: int) -> None:
+        """It must be a drive of CiA 402 with our modes, and of the motor that the spec names. Raises `DeviceError` otherwise."""
+        spec = self._specs[drive]
+        kind = self.read(drive, 0x1000)
+        if kind & 0xFFFF != 402:
+            raise DeviceError(f"node {spec.node} is no drive: its device type is {kind & 0xFFFF}, that of CiA 402 is 402.")
+        self.read(drive, 0x1018, 1)
+        self._modes[drive] = self.read(drive, 0x6502)
+        rated = 1e-6 * self.read(drive, 0x6076)
+        if not math.isclose(rated, spec.rated_torque, rel_tol=0.02):
+            raise DeviceError(
+                f"the drive at node {spec.node} says its motor's rated torque is {rated:.4g} N m, DriveSpec.rated_torque is"
+                f" {spec.rated_torque:.4g} N m; tensions would be wrong by that ratio."
+            )
+
+    def set_mode(self, drive: int, mode: int) -> None:
+        """Mode of operation, confirmed. Raises `DeviceError` where the drive does not have it."""
+        node = self._specs[drive].node
+        if not self._modes[drive] >> (mode - 1) & 1:
+            raise DeviceError(f"the drive at node {node} has no {_MODES[mode]} mode (object 0x6502 is 0x{self._modes[drive]:08X}).")
+        self.write(drive, 0x6060, 0, mode)
+        if self.read(drive, 0x6061) != mode:
+            raise DeviceError(f"the drive at node {node} does not change to its {_MODES[mode]} mode; is it moving?")
+
+    def limit(self, drive: int, limits: DriveLimits, rate: float) -> None:
+        """Limits, units and what it does when the bus fails."""
+        n = len(self._specs)
+
+        def own(name: str) -> int:
+            return limits.of(name, n)[drive]
+
+        self.write(drive, 0x60A9, 0, _MILLI_RPM)
+        self.write(drive, 0x607F, 0, self.speed(drive, own("velocity_limit")))
+        self.write(drive, 0x6085, 0, self.acceleration(drive, own("deceleration")))
+        self.write(drive, 0x607D, 1, -own("position_limit"))
+        self.write(drive, 0x607D, 2, own("position_limit"))
+        self.write(drive, 0x6065, 0, own("following_error"))
+        self.write(drive, 0x6066, 0, 0, optional=True)
+        self.write(drive, 0x605A, 0, 6 if limits.hold else 2)
+        self.write(drive, 0x6007, 0, 3)  # connection lost: quick stop
+        self.write(drive, 0x60C2, 1, round(1e3 / rate))
+        self.write(drive, 0x60C2, 2, -3, optional=True)
+
+    def map(self, drive: int) -> None:
+        """Process data: what is exchanged with every SYNC. The node must be pre-operational."""
+        node = self._specs[drive].node
+        for mapping, entries in _MAPPING.items():
+            communication = mapping - 0x200
+            cob_id = {0x1600: COMMAND, 0x1A00: STATUS, 0x1A01: MOTION}[mapping] + node
+            self.write(drive, communication, 1, cob_id | _INVALID)
+            self.write(drive, communication, 2, 1)
+            self.write(drive, mapping, 0, 0)
+            for sub, entry in enumerate(entries, start=1):
+                self.write(drive, mapping, sub, entry)
+            self.write(drive, mapping, 0, len(entries))
+            self.write(drive, communication, 1, cob_id)
+
+    def watch(self, drive: int, on: bool) -> None:
+        """Heartbeats of the drive, and the controller's watched by it, on or off."""
+        self.write(drive, 0x1017, 0, round(1e3 * BEAT) if on else 0)
+        self.write(drive, 0x1016, 1, (MASTER << 16 | round(1e3 * PATIENCE)) if on else 0)
+
+    def speed(self, drive: int, counts: float) -> int:
+        """Counts/s in the drive's unit of velocity."""
+        return max(1, round(counts * 60_000.0 / self._specs[drive].counts_per_turn))
+
+    def acceleration(self, drive: int, counts: float) -> int:
+        """Counts/s2 in the drive's unit of acceleration, rpm/s."""
+        return max(1, round(counts * 60.0 / self._specs[drive].counts_per_turn))

@@ -1,0 +1,110 @@
+"""`Emulator`: the prototype without hardware; the same protocols through the same libraries, and a plant behind them that nothing reads.
+
+Drives on a CAN bus (`nodes`), a camera whose frames are drawn (`drawing`), wires that are slack until the robot is homed, and a sealed
+plant (`plant`). Hands that hang a load and turn the base are methods; so are faults.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from fastrod.rotation import quaternion_from_matrix
+from fastrod.types import Floats
+from fastrod_device.camera import Frame
+from fastrod_device.clock import Clock
+from fastrod_device.drawing import Eye, Scene
+from fastrod_device.hardware import Hardware
+from fastrod_device.nodes import EmulatedDrives
+from fastrod_device.plant import Plant
+from fastrod_device.plant_rod import COMPLIANCE
+from fastrod_device.seal import Seal
+
+if TYPE_CHECKING:
+    from can import BusABC
+
+_SHAKE = 1e-4  # m per axis, of the marker against the camera: a bench is not still
+_SCENE = Scene(blur=1.0, noise=5.0)
+_SLACK = 1e-3  # m, of a wire before it is homed, at most
+_KEPT = 8  # frames that nobody has fetched
+
+
+@final
+class Emulator:
+    """Drives, wires, plant and camera. It is the `Wires` of its drives and the `FrameSource` of whoever looks."""
+
+    def __init__(self, hardware: Hardware, bus: str | BusABC, *, clock: Clock, seal: Seal, seed: int = 0) -> None:
+        """On `bus` ("virtual:NAME", say), behind the effects of `seal`; `seed` draws slack and noise. Raises `DeviceError` where the bus
+        cannot be opened."""
+        self.hardware, self.clock = hardware, clock
+        self.seal, self.plant = seal, Plant(seal)
+        rng = np.random.default_rng(seed)
+        n = len(hardware.drives)
+        self._slack = rng.uniform(0.1, 1.0, n) * _SLACK
+        self._taut = False
+        self._lock = threading.Lock()
+        self._rng = rng
+        self._eye = Eye(hardware.camera, hardware.marker, seed=seed, scene=_SCENE)
+        self._due: deque[tuple[int, float, Floats, Floats]] = deque(maxlen=_KEPT)
+        self._number, self._next = 0, 0.0
+        self._last: Frame | None = None
+        self.frozen = self.hidden = False
+        """The camera repeats its last frame; the marker is covered."""
+        self.drives = EmulatedDrives(hardware.drives, bus, clock=clock, wires=self)
+
+    def move(self, t: float, pulled: Floats) -> Floats:
+        """Wires wound by (n_drives,) [m] since power-on: their tensions [N]. The rod stands straight until every wire is taut."""
+        with self._lock:
+            in_hand = pulled - self._slack
+            if not self._taut:
+                self._taut = bool((in_hand > -1e-6).all())
+                self.plant.advance(t, np.zeros(len(pulled)))
+                self._expose(t)
+                return np.asarray(np.maximum(in_hand, 0.0) / COMPLIANCE)
+            self.plant.advance(t, -in_hand)
+            self._expose(t)
+            return self.plant.tension()
+
+    def _expose(self, t: float) -> None:
+        """Keep the poses of the frames whose time has come."""
+        period = 1.0 / self.hardware.camera.rate
+        if t < self._next:
+            return
+        self._next = max(self._next + period, t)
+        self._number += 1
+        position, rotation = self.plant.tip_seen(t)
+        position = position + _SHAKE * self._rng.normal(size=3)
+        self._due.append((self._number, t, position, quaternion_from_matrix(rotation[None])[0]))
+
+    def read(self) -> Frame | None:
+        """The newest frame that has arrived and was not read yet; drawn now, stamped with the time of its exposure."""
+        arrived = self.clock.now() - self.hardware.camera.latency
+        found = None
+        with self._lock:
+            while self._due and self._due[0][1] <= arrived:
+                found = self._due.popleft()
+        if found is None:
+            return None
+        number, t, position, quaternion = found
+        if self.frozen and self._last is not None:
+            self._last = Frame(image=self._last.image, t=t, number=number)
+        else:
+            self._last = Frame(image=self._eye.draw(position, quaternion, marker=not self.hidden), t=t, number=number)
+        return self._last
+
+    def hang(self, mass: float) -> None:
+        """Hang a known load [kg] on the tip."""
+        with self._lock:
+            self.plant.hang(mass)
+
+    def turn(self, quaternion: Floats) -> None:
+        """Turn the whole bench: world_from_base."""
+        with self._lock:
+            self.plant.turn(quaternion)
+
+    def close(self) -> None:
+        """Switch it off."""
+        self.drives.close()

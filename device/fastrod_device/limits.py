@@ -1,0 +1,87 @@
+"""`Limits`: what a robot on the bench must keep within, and the step that keeps a wire's rate."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from fastrod.errors import InputError
+from fastrod.types import Floats
+
+_LARGEST = {"m": (0.5, "mm"), "m/s": (1.0, "mm/s"), "s": (60.0, "ms")}  # beyond this it was given in the other unit
+
+
+def _unit(name: str) -> str:
+    units = {"rate": "m/s", "curvature": "1/m", "tension": "N", "slack": "N"}
+    return units.get(name, "m" if name in ("displacement", "following_error", "encoder_jump") else "s")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """Of commands, of the robot, and of how old news may be; by default those of the 70 mm prototype. Raises `InputError`.
+
+    >>> Limits(displacement=0.006).displacement
+    0.006
+    """
+
+    displacement: float = 0.008
+    """Largest change of a wire's length, either way [m]."""
+    rate: float = 0.03
+    """Largest rate of a wire [m/s]: the set-points keep to it."""
+    curvature: float = 20.0
+    """Largest of any segment [1/m], by the constant curvature that the wires ask for."""
+    tension: float = 15.0
+    """Largest of any wire, from the motor's torque, either way [N]."""
+    slack: float | None = None
+    """Least tension of any wire while the drives are enabled [N]; None: a wire may hang."""
+    command_age: float = 0.5
+    """A command that was meant longer ago is refused, and one must be renewed this often while the robot moves [s]."""
+    feedback_age: float = 0.03
+    """Of a drive's process data [s]."""
+    heartbeat_age: float = 0.15
+    """Of a drive's heartbeat [s]."""
+    sighting_age: float | None = 0.5
+    """Of the newest good sighting of the marker [s]; None: the camera stops nothing."""
+    cycle: float = 0.05
+    """Longest gap between two control cycles [s]."""
+    following_error: float = 0.001
+    """Largest difference of where a drive was told to be and where it is, as wire [m]."""
+    encoder_jump: float = 0.0005
+    """Largest change of a wire's length between two samples beyond what `rate` explains [m]."""
+    clock_jump: float = 0.2
+    """Largest disagreement of the wall clock with the monotonic one over a control cycle [s]."""
+
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            value, unit = getattr(self, name), _unit(name)
+            if value is None and name in ("slack", "sighting_age"):
+                continue
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not (math.isfinite(value) and value > 0.0):
+                raise InputError(f"Limits.{name} is {value!r}; it must be a positive number [{unit}].")
+            largest, other = _LARGEST.get(unit, (math.inf, ""))
+            if value > largest:
+                raise InputError(f"Limits.{name} is {value!r} {unit}; more than {largest:g} {unit}. Was it given in {other}?")
+        if self.slack is not None and self.slack >= self.tension:
+            raise InputError(f"Limits.slack is {self.slack!r} N and tension {self.tension!r} N; the least must be below the largest.")
+
+
+def limited(previous: Floats, wanted: Floats, rate: float, dt: float) -> Floats:
+    """Wire lengths (n_tendons,) [m] after `dt` [s], from `previous` straight toward `wanted`, no wire faster than `rate` [m/s].
+
+    All wires are scaled alike, so that the robot goes straight to where it was told, and a way between two shapes within the limits stays
+    within them. Raises `InputError` for figures that are not finite or run back.
+
+    >>> limited(np.zeros(2), np.array([0.004, -0.002]), 0.03, 0.1)
+    array([ 0.003 , -0.0015])
+    """
+    if not (math.isfinite(rate) and rate > 0.0 and math.isfinite(dt) and dt >= 0.0):
+        raise InputError(f"rate is {rate!r} m/s and dt {dt!r} s; the rate must be positive and dt not negative.")
+    if not (np.isfinite(previous).all() and np.isfinite(wanted).all()):
+        raise InputError(f"the way from {previous.tolist()} to {wanted.tolist()} m is not finite; both ends must be.")
+    step = wanted - previous
+    largest = float(np.abs(step).max(initial=0.0))
+    if largest <= rate * dt:
+        return wanted.copy()
+    return np.asarray(previous + step * (rate * dt / largest), dtype=np.float64)

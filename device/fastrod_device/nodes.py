@@ -1,0 +1,367 @@
+"""Emulated drives: nodes of CiA 402 on a bus, as the drives of the prototype would be seen there."""
+
+from __future__ import annotations
+
+import struct
+import threading
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import TYPE_CHECKING, Protocol, final
+
+import numpy as np
+import numpy.typing as npt
+
+from fastrod.errors import InputError
+from fastrod.types import Floats
+from fastrod_device.bus import Line
+from fastrod_device.clock import Clock
+from fastrod_device.errors import DeviceError
+from fastrod_device.faultcodes import ENABLED
+from fastrod_device.motor import CYCLIC
+from fastrod_device.node import BOOT, LIFE, OPERATIONAL, PRE_OPERATIONAL, STOPPED, Node
+from fastrod_device.objects import Key
+from fastrod_device.units import DriveSpec, Transmission
+
+if TYPE_CHECKING:
+    import can
+
+_TICK = 5e-3  # s, of the thread that keeps time where nobody steps it
+_CHUNK = 0.02  # s; longer gaps are gone through in pieces
+
+
+class Wires(Protocol):
+    """What the wires are fastened to: the emulated robot."""
+
+    def move(self, t: float, pulled: Floats) -> Floats:
+        """(n,) tensions [N] at time `t` [s], when `pulled` (n,) [m] of each wire has been wound since power-on (+ = pulled)."""
+
+
+@final
+class EmulatedDrives:
+    """Drives on a bus, alive from construction to `close`; also a context.
+
+    One network and one thread for all of them. Where time is stepped they live by the SYNCs that come; otherwise a thread of theirs keeps
+    time as well. Faults on demand: one method each, and `restore`. A drive holds its wire by friction while it is switched off.
+
+    `moving`, `true_pulled` and `stopped_at` are what a test may know and a master never does.
+    """
+
+    def __init__(
+        self, specs: Sequence[DriveSpec], bus: str | can.BusABC, *, clock: Clock, wires: Wires, rate: float = 200.0, seed: int = 0,
+        torque_noise: float = 1.0,
+    ) -> None:  # fmt: skip
+        """`rate` [1/s]: of the set-points until the master tells it; `torque_noise` [thousandths of the rated torque], 1 sigma.
+
+        Raises `InputError` for drives that cannot be, `DeviceError` for the bus.
+        """
+        if not (np.isfinite(rate) and rate > 0.0):
+            raise InputError(f"EmulatedDrives.rate is {rate!r} 1/s; it must be positive.")
+        self._transmission = Transmission(specs)
+        self._clock, self._wires = clock, wires
+        self._rng, self._noise = np.random.default_rng(seed), torque_noise
+        self._nodes = [Node(spec, 1.0 / rate) for spec in specs]
+        self._motors = [node.motor for node in self._nodes]
+        self._wind: Floats = np.array([spec.direction * spec.metres_per_count for spec in specs])
+        self._per_newton: Floats = np.array([spec.direction / spec.newtons_per_torque / (1e-3 * spec.rated_torque) for spec in specs])
+        self._lock = threading.RLock()
+        self._t = self._synced = clock.now()
+        self._off = False
+        self._wrong: Exception | None = None
+        self.missed_setpoints = 0
+        """SYNCs in the cyclic mode, operation enabled, before which no set-point had come."""
+        self.sdo_served = 0
+        """SDO requests so far."""
+        self._line = Line(bus)
+        self._done = threading.Event()
+        self._subscribe()
+        self._line.start()
+        with self._lock:
+            for node in self._nodes:
+                self._boot(node)
+        self._thread = None if clock.stepped else threading.Thread(target=self._keep_time, name="emulated drives", daemon=True)
+        if self._thread is not None:
+            self._thread.start()
+
+    # what a test may know
+
+    @property
+    def n_drives(self) -> int:
+        """Number of drives."""
+        return len(self._nodes)
+
+    @property
+    def moving(self) -> npt.NDArray[np.bool_]:
+        """(n,) whose shaft turns."""
+        with self._lock:
+            return np.array([motor.v != 0.0 for motor in self._motors])
+
+    @property
+    def true_pulled(self) -> Floats:
+        """(n,) wire wound since power-on [m], + = pulled."""
+        with self._lock:
+            return self._pulled()
+
+    @property
+    def stopped_at(self) -> Floats:
+        """(n,) when each shaft came to rest last [s]; nan while it turns and before it ever did."""
+        with self._lock:
+            return np.array([motor.stopped_at for motor in self._motors])
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """State of each drive (CiA 402)."""
+        with self._lock:
+            return tuple(motor.state for motor in self._motors)
+
+    # faults on demand
+
+    def lose_heartbeat(self, drive: int) -> None:
+        """It tells no heartbeat any more."""
+        self._node(drive).no_heartbeat = True
+
+    def emergency(self, drive: int, code: int, *, lasting: bool = False) -> None:
+        """It tells an error and goes to its fault state; a lasting one cannot be reset before `restore`."""
+        with self._lock:
+            motor = self._node(drive).motor
+            motor.lasting = code if lasting else 0
+            motor.fault(code)
+
+    def block(self, drive: int) -> None:
+        """Its shaft stalls."""
+        self._node(drive).motor.blocked = True
+
+    def bus_off(self) -> None:
+        """Nothing is received or delivered any more."""
+        self._off = True
+
+    def reboot(self, drive: int, *, keep_position: bool = False) -> None:
+        """It loses power for a moment: switched off, pre-operational, mapping and parameters of power-on, its counter at 0 or kept."""
+        with self._lock:
+            self._boot(self._node(drive), keep_position=keep_position)
+
+    def encoder_jump(self, drive: int, counts: int) -> None:
+        """Its counter jumps while the shaft stands."""
+        with self._lock:
+            self._node(drive).motor.offset += counts
+
+    def silent(self, drive: int) -> None:
+        """It sends no process data any more."""
+        self._node(drive).silent = True
+
+    def restore(self) -> None:
+        """The causes of all faults are gone; what they did to the drives stays."""
+        with self._lock:
+            self._off = False
+            for node in self._nodes:
+                node.no_heartbeat = node.silent = node.motor.blocked = False
+                node.motor.lasting = 0
+
+    def _node(self, drive: int) -> Node:
+        if isinstance(drive, bool) or not 0 <= drive < len(self._nodes):
+            raise InputError(f"there is no drive {drive!r}; they count from 0 to {len(self._nodes) - 1}.")
+        return self._nodes[drive]
+
+    # life
+
+    def serve(self, stop: threading.Event | None = None) -> None:
+        """Stay alive until `stop` is set or `close` is called, for a process of its own."""
+        while not self._done.wait(0.05) and not (stop is not None and stop.is_set()):
+            pass
+
+    def close(self) -> None:
+        """Leave the bus. Raises `DeviceError` with its cause where the wires failed meanwhile."""
+        if self._done.is_set():
+            return
+        self._done.set()
+        if self._thread is not None:
+            self._thread.join(2.0)
+        self._line.close()
+        if self._wrong is not None:
+            raise DeviceError(f"the emulated drives had to stop: {type(self._wrong).__name__}: {self._wrong}") from self._wrong
+
+    def __enter__(self) -> EmulatedDrives:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    # the bus
+
+    def _subscribe(self) -> None:
+        subscribe = self._line.network.subscribe
+        subscribe(0x000, self._on(self._on_nmt))
+        subscribe(0x080, self._on(self._on_sync))
+        heartbeat, process_data = self._on(self._on_heartbeat), self._on(self._on_process_data)
+        for who in range(1, 128):
+            subscribe(0x700 + who, heartbeat)
+        for cob_id in range(0x181, 0x580):
+            subscribe(cob_id, process_data)
+        for node in self._nodes:
+            node.server.network = self._line.network
+            node.objects.written = self._written(node)
+            subscribe(0x600 + node.id, self._on(self._on_sdo))
+
+    def _on(self, handle: Callable[[int, bytes], None]) -> Callable[[int, bytearray, float], None]:
+        """A handler that is deaf while the bus is off, and keeps what goes wrong."""
+
+        def receive(cob_id: int, data: bytearray, timestamp: float) -> None:  # noqa: ARG001
+            with self._lock:
+                if self._off or self._done.is_set():
+                    return
+                try:
+                    handle(cob_id, bytes(data))
+                except Exception as error:  # of the wires; canopen would only log it
+                    self._wrong, self._off = error, True
+
+        return receive
+
+    def _send(self, cob_id: int, data: bytes) -> None:
+        if not self._off:
+            self._line.send(cob_id, data)
+
+    def _on_sdo(self, cob_id: int, data: bytes) -> None:
+        node = next(node for node in self._nodes if node.id == cob_id - 0x600)
+        if node.nmt != STOPPED:
+            self.sdo_served += 1
+            self._advance(self._clock.now())
+            node.server.on_request(cob_id, bytearray(data), 0.0)
+
+    def _written(self, node: Node) -> Callable[[Key, int], None]:
+        def written(key: Key, value: int) -> None:
+            node.motor.written(key, value)
+            if key == (0x1017, 0):
+                node.beat_due = self._clock.now() if value else np.inf
+            elif key[0] == 0x1016:
+                node.watched = {}  # a node is watched from its first heartbeat on
+
+        return written
+
+    def _on_heartbeat(self, cob_id: int, data: bytes) -> None:  # noqa: ARG002
+        who, now = cob_id - 0x700, self._clock.now()
+        self._advance(now)
+        for node in self._nodes:
+            if any((node.objects.values[(0x1016, sub)] >> 16) & 0x7F == who for sub in (1, 2)):
+                node.watched[who] = now
+
+    def _on_nmt(self, cob_id: int, data: bytes) -> None:  # noqa: ARG002
+        command, who = data[0], data[1]
+        for node in [node for node in self._nodes if who in (0, node.id)]:
+            if command in (129, 130):
+                self._boot(node, keep_position=True)
+            elif command in (1, 2, 128):
+                node.nmt = {1: OPERATIONAL, 2: STOPPED, 128: PRE_OPERATIONAL}[command]
+                if command == 1:
+                    node.map()
+                else:
+                    node.motor.quick_stop()
+                node.beat_due = min(node.beat_due, self._clock.now())  # the new state is told at once
+
+    def _on_process_data(self, cob_id: int, data: bytes) -> None:
+        for node in self._nodes:
+            pdo = node.rpdos.get(cob_id) if node.nmt == OPERATIONAL else None
+            if pdo is None:
+                continue
+            if pdo.kind <= 240:
+                node.received[cob_id] = (pdo, data)
+            else:
+                node.take(pdo, data)
+
+    def _on_sync(self, cob_id: int, data: bytes) -> None:  # noqa: ARG002
+        now = self._clock.now()
+        self._advance(now)
+        self._synced = now
+        noise = self._rng.normal(0.0, self._noise, len(self._nodes))
+        for node, wobble in zip(self._nodes, noise, strict=True):
+            if node.nmt != OPERATIONAL:
+                continue
+            node.fresh = False
+            for pdo, latched in node.received.values():
+                node.take(pdo, latched)
+            node.received.clear()
+            if node.fresh:
+                node.motor.setpoint()
+            elif node.motor.state == ENABLED and node.motor.mode == CYCLIC:
+                self.missed_setpoints += 1
+            node.motor.noise = float(wobble)
+            node.syncs += 1
+        self._speak(now)
+        for k in range(4):  # as the bus would have it: the lower COB-ID first
+            for node in self._nodes:
+                if node.nmt == OPERATIONAL and not node.silent and k < len(node.tpdos):
+                    pdo, sources = node.tpdos[k]
+                    if pdo.kind <= 240 and node.syncs % pdo.kind == 0:
+                        self._send(pdo.cob_id, pdo.layout.pack(*[source() for source in sources]))
+
+    def _speak(self, now: float) -> None:
+        """Emergencies that wait, heartbeats that are due."""
+        for node in self._nodes:
+            for code, register in node.motor.emergencies:
+                self._send(0x80 + node.id, struct.pack("<HB5x", code, register))
+            node.motor.emergencies.clear()
+            if now >= node.beat_due:
+                period = 1e-3 * node.objects.values[(0x1017, 0)]
+                node.beat_due = max(node.beat_due + period, now + 0.5 * period) if period else np.inf
+                if period and not node.no_heartbeat:
+                    self._send(0x700 + node.id, bytes([node.nmt]))
+
+    def _boot(self, node: Node, *, keep_position: bool = False) -> None:
+        if not keep_position:
+            node.motor.offset = -node.motor.x
+        node.objects.reset()
+        node.motor.v = 0.0
+        node.motor.restart()
+        node.rpdos, node.tpdos, node.received, node.watched = {}, [], {}, {}
+        node.beat_due = np.inf
+        node.nmt = PRE_OPERATIONAL
+        self._send(0x700 + node.id, bytes([BOOT]))
+
+    # time
+
+    def _keep_time(self) -> None:
+        while not self._done.wait(_TICK):
+            with self._lock:
+                try:
+                    now = self._clock.now()
+                    if now - self._synced > 2.0 * _TICK or any(now > node.deadline() for node in self._nodes):
+                        self._advance(now)
+                    self._speak(now)
+                except Exception as error:  # of the wires or of the bus
+                    self._wrong, self._off = error, True
+                    return
+
+    def _pulled(self) -> Floats:
+        return np.array([motor.x for motor in self._motors]) * self._wind
+
+    def _advance(self, now: float) -> None:
+        """Move all shafts until `now` [s], stopping where a heartbeat is missed on the way."""
+        while self._t < now:
+            to = min(now, self._t + _CHUNK)
+            late = [node for node in self._nodes if node.watched and node.deadline() < to]
+            if late:
+                to = max(self._t, min(node.deadline() for node in late))
+            for motor in self._motors:
+                turned = motor.v != 0.0
+                motor.advance(to - self._t)
+                if motor.v != 0.0:
+                    motor.stopped_at = np.nan
+                elif turned:
+                    motor.stopped_at = to
+            self._t = to
+            torque = self._wires.move(to, self._pulled()) * self._per_newton
+            for motor, value in zip(self._motors, torque, strict=True):
+                motor.torque = float(value)
+            for node in [node for node in late if node.deadline() <= to]:
+                node.watched = {}
+                self._miss(node)
+
+    def _miss(self, node: Node) -> None:
+        """The master's heartbeat did not come: as object 0x6007 says."""
+        option = node.objects.values[(0x6007, 0)]
+        if option == 1:
+            node.motor.fault(LIFE)
+            return
+        node.motor.emergency(LIFE)
+        if option == 2:
+            node.motor.control(0x0000)
+        elif option == 3:
+            node.motor.quick_stop()

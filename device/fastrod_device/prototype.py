@@ -1,0 +1,389 @@
+"""`Prototype`: four drives and a camera as a `RobotLink`; what teleop drives, what an experiment records, what a policy commands."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fastrod.errors import FastrodError
+from fastrod.link import Measurement
+from fastrod.recording import Recorder
+from fastrod.robot import Robot
+from fastrod.types import Floats
+from fastrod_device.camera import FrameSource
+from fastrod_device.clock import Clock, WallClock
+from fastrod_device.drive import DriveBus
+from fastrod_device.errors import DeviceError, RefusedError
+from fastrod_device.expectation import Expectation
+from fastrod_device.faultcodes import in_words
+from fastrod_device.hardware import Hardware
+from fastrod_device.homing import home
+from fastrod_device.journal import Journal
+from fastrod_device.pacer import Pacer
+from fastrod_device.readings import Readings
+from fastrod_device.safety import CameraWatch, Fault, State, Supervisor, limited
+from fastrod_device.tracker import MarkerTracker, Sighting
+from fastrod_device.units import Transmission
+
+Plan = Callable[[float], Floats]
+"""Seconds since it began -> (n_tendons,) changes of wire length [m], negative = pulled."""
+
+FLAGS = ("", "no marker", "outlier", "ambiguous", "frozen")
+EXTRA = ("marker_error", "marker_size", "marker_flag", "seen_x", "seen_y", "seen_z")
+"""Further columns of a recording: reprojection error [px], size of the marker in the picture [px], place of the sighting's flag in `FLAGS`
+(0: trusted), and where the tip was seen, trusted or not [m]; then current_1 ... [A]."""
+_REMEMBERED = 3.0  # s of wire lengths, for frames that come late
+_FROZEN = 3  # frames alike: a camera at 15 Hz never draws the same noise twice
+_MARGIN = 1.5  # of our limits: where the drives refuse by themselves
+_STOPS = 0.015  # s from the fastest to rest
+_POLL = 0.002  # s between two looks for a frame
+
+
+@final
+class Prototype:
+    """Commands become set-points of the drives, one a cycle, within limits; frames become tip poses; a supervisor watches both.
+
+    With a `WallClock` two threads do it, one for the drives and one for the camera; with a `SteppedClock` `wait` does. `start` it, or
+    use it as a context. It is `real`: it stops when nobody watches, and after any stop moves again only after `release`, a person's act.
+    """
+
+    real = True
+
+    def __init__(
+        self, hardware: Hardware, bus: str, source: FrameSource | None, *, clock: Clock | None = None, eds: str | Path | None = None,
+        journal: Journal | None = None,
+    ) -> None:  # fmt: skip
+        """Drives on `bus` ("socketcan:can0"), pictures from `source` (None: no camera). Raises `DeviceError` where there is no such bus."""
+        self.hardware, self.source = hardware, source
+        self._robot = hardware.robot
+        self.clock: Clock = WallClock() if clock is None else clock
+        self.journal = Journal(None) if journal is None else journal
+        self.transmission = Transmission(hardware.drives)
+        self.drives = DriveBus(hardware.drives, bus, clock=self.clock, rate=hardware.rate, eds=eds)
+        nodes = [spec.node for spec in hardware.drives]
+        self.supervisor = Supervisor(hardware.robot, hardware.limits, on_stop=self._on_stop, nodes=nodes, words=in_words)
+        self.tracker = MarkerTracker(hardware.camera, hardware.marker)
+        self.recorder: Recorder | None = None
+        self.payload = 0.0
+        """Known mass on the tip [kg]; whoever hangs it says so."""
+        self.base_quaternion: Floats | None = None
+        """world_from_base; None: as in the robot's file."""
+        self._expectation = Expectation(hardware.robot)
+        self._lock = threading.RLock()
+        self._looking = threading.Lock()
+        self._jobs: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._closed = threading.Event()
+        self._threads: list[threading.Thread] = []
+        self._plan: tuple[Plan, float] | None = None
+        n = hardware.robot.n_tendons
+        self._wanted: Floats = np.zeros(n)
+        self._set: Floats = np.zeros(n)
+        self._past: deque[tuple[float, Floats, Floats]] = deque(maxlen=int(_REMEMBERED * hardware.rate))
+        self._readings: Readings | None = None
+        self._sighting: Sighting | None = None
+        self._trusted, self._alike = self.clock.now(), 0
+        self._zero = self.clock.now()
+        self._pacer: Pacer | None = None
+        self.broken: Exception | None = None
+        """What went wrong in a thread of ours, if anything did."""
+
+    @property
+    def robot(self) -> Robot:
+        """What is driven: the hardware's model with the pretension that its wires had when they were homed."""
+        return self._robot
+
+    @property
+    def elapsed(self) -> float:
+        """Time as readings count it [s]."""
+        return self.clock.now() - self._zero
+
+    @property
+    def commanded(self) -> Floats:
+        """(n_tendons,) the set-point now [m]."""
+        with self._lock:
+            return self._set.copy()
+
+    @property
+    def sighting(self) -> Sighting | None:
+        """The newest, trusted or not."""
+        return self._sighting
+
+    @property
+    def readings(self) -> Readings | None:
+        """Of the newest cycle."""
+        return self._readings
+
+    def __enter__(self) -> Prototype:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def start(self, *, home: bool = True) -> None:
+        """Find the drives, wind the wires until each has its pretension (`home`; where they are then is zero), and enable them.
+
+        Raises `DeviceError`, one sentence, for what does not answer or will not move; nothing is enabled then.
+        """
+        hw, limits = self.hardware, self.hardware.limits
+        try:
+            per = 1.0 / np.abs(self.transmission.wound(np.ones(len(hw.drives), dtype=np.int64)))  # counts in a metre
+            self.drives.connect(
+                position_limit=np.rint(_MARGIN * limits.displacement * per).astype(np.int64),
+                velocity_limit=np.rint(_MARGIN * limits.rate * per).astype(np.int64),
+                following_error=np.rint(limits.following_error * per).astype(np.int64),
+                deceleration=np.rint(limits.rate / _STOPS * per).astype(np.int64),
+            )
+            if home:
+                self.home()
+            self._enable()
+        except BaseException:
+            self.close()
+            raise
+        self._pacer = Pacer(self.clock, hw.rate)
+        if not self.clock.stepped:
+            for name, job in (("drives", self._drive_forever), ("camera", self._look_forever)):
+                thread = threading.Thread(target=job, name=name, daemon=True)
+                self._threads.append(thread)
+                thread.start()
+
+    def home(self) -> None:
+        """Find where the robot is straight, as `homing.home` says; zero is there. Raises `DeviceError`."""
+        self.transmission, self._robot = home(self.drives, self.hardware, self.clock, None if self.source is None else self._see)
+
+    def _see(self) -> Sighting | None:
+        frame = None if self.source is None else self.source.read()
+        return None if frame is None else self.tracker.look(frame)
+
+    def command(self, dl: ArrayLike, ext: ArrayLike | None = None, *, stamp: float | None = None) -> None:
+        """As `RobotLink.command`; `stamp` is when it was meant, by our clock [s]: one that is too old is refused.
+
+        Raises `RefusedError` for what is beyond a limit, not finite, too late, or has an extension; ignored while stopped.
+        """
+        if ext is not None and np.any(np.asarray(ext, dtype=np.float64) != 0.0):
+            raise RefusedError("ext is not zero; the prototype has no segment that can extend.")
+        if self.supervisor.state is State.STOPPED:
+            return
+        wanted = self.supervisor.check(dl, self.clock.now(), stamp=stamp)
+        with self._lock:
+            self._wanted, self._plan = wanted, None
+
+    def follow(self, plan: Plan, seconds: float) -> None:
+        """Set-points from `plan`, one a cycle, for so long; returns when they are done.
+
+        Raises `RefusedError` where the plan leads beyond a limit (the drives are stopped then), `DeviceError` where anything stopped
+        the robot on the way, each with its sentence.
+        """
+        with self._lock:
+            self._plan = plan, self.clock.now()
+        try:
+            self.wait(seconds)
+        finally:
+            with self._lock:
+                self._plan, self._wanted = None, self._set
+
+    def wait(self, seconds: float) -> None:
+        """So much time passes; with a `SteppedClock` this is what drives the robot. Raises `DeviceError` where it was stopped."""
+        end = self.clock.now() + seconds
+        while self.clock.now() < end - 1e-9:
+            if not self.clock.stepped:
+                self.clock.sleep_until(min(end, self.clock.now() + 0.02))
+            elif self._pacer is None:
+                raise DeviceError("the prototype is not started; call start first.")
+            else:
+                self._pacer.wait()
+                with self.supervisor.guard(self.clock):
+                    self._cycle()
+                self.look()
+            if self.supervisor.state is State.STOPPED:
+                raise DeviceError(self._why())
+
+    def read(self) -> Measurement:
+        """The newest sighting with the wires as they were then; without a camera the wires alone."""
+        with self._lock:
+            sighting, readings = self._sighting, self._readings
+        problem = self._why() if self.supervisor.state is State.STOPPED else ""
+        if sighting is not None and self.source is not None:
+            return self._measured(sighting, problem)
+        n = self.robot.n_tendons
+        dl, tension = (np.full(n, np.nan),) * 2 if readings is None else (readings.dl, readings.tension)
+        return Measurement(
+            t=self.elapsed, dl=dl, ext=np.zeros(self.robot.n_segments), tip_position=np.full(3, np.nan),
+            tip_quaternion=np.full(4, np.nan), tension=tension, problem=problem,
+        )  # fmt: skip
+
+    def stop(self) -> None:
+        """Emergency stop: the drives ramp down at once and stay off until `release`."""
+        self.supervisor.emergency_stop(self.clock.now())
+
+    def release(self) -> None:
+        """A person says that it may move again: faults are reset, the drives enabled where they stand. Where the cause is still there it
+        stays stopped, and `read().problem` says why."""
+        self._jobs.put(self._release)
+        if self.clock.stepped:
+            self._do_jobs()
+
+    def record(self, recorder: Recorder | None) -> None:
+        """Every sighting from now on is a row of `recorder`, which has begun; None: none is."""
+        with self._looking:
+            self.recorder = recorder
+
+    def recorder_for(self, path: str, *, overwrite: bool = False) -> Recorder:
+        """A recorder with the columns of a prototype: currents and how well the marker was seen."""
+        currents = [f"current_{k}" for k in range(1, self.robot.n_tendons + 1)]
+        return Recorder(self.robot, path, overwrite=overwrite, extra=(*EXTRA, *currents))
+
+    def close(self) -> None:
+        """Stop, disable, let go of bus and camera. A recording goes on existing: it is whoever began it that ends it."""
+        self._closed.set()
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(timeout=2.0)
+        self._threads = []
+        self.drives.quick_stop()
+        self.drives.close()
+        if self.source is not None:
+            self.source.close()
+        self.journal.close()
+
+    def _enable(self) -> None:
+        self.drives.enable("csp")
+        newest = self.drives.newest
+        with self._lock:
+            self._set = self._wanted = self.transmission.dl(newest.position)
+            self._plan = None
+            self._past.clear()
+        self._trusted, self._alike = self.clock.now(), 0
+        self.tracker.reset()
+        self.supervisor.enabled(self.clock.now())
+
+    def _release(self) -> None:
+        try:
+            self.supervisor.acknowledge(self.clock.now())
+        except RefusedError:
+            return  # the status says why
+        try:
+            self.drives.acknowledge()
+            self.drives.reset_faults()
+            self._enable()
+        except FastrodError as error:
+            self.supervisor.exception(self.clock.now(), error)
+
+    def _do_jobs(self) -> None:
+        while True:
+            try:
+                job = self._jobs.get_nowait()
+            except queue.Empty:
+                return
+            job()
+
+    def _cycle(self) -> None:
+        """One set-point to every drive, what they answer, and whether all is well."""
+        now, dt = self.clock.now(), 1.0 / self.hardware.rate
+        self._do_jobs()
+        moving = self.supervisor.state in (State.READY, State.RUNNING)
+        with self._lock:
+            if moving and self._plan is not None:
+                plan, began = self._plan
+                self._wanted = self.supervisor.check(plan(now - began), now)
+            before, wanted = self._set, self._wanted
+        target = limited(before, wanted, self.hardware.limits.rate, dt) if moving else None
+        feedback = self.drives.exchange(None if target is None else self.transmission.counts(target))
+        readings = self.transmission.readings(feedback)
+        with self._lock:
+            if target is not None:
+                self._set = target
+            self._readings = readings
+            self._past.append((readings.t, readings.dl, self._set))
+        wall = None if self.clock.stepped else time.time()
+        now = self.clock.now()
+        self.supervisor.watch(now, wall, readings, self._camera_watch(now))
+
+    def _camera_watch(self, now: float) -> CameraWatch | None:
+        return None if self.source is None else CameraWatch(age=now - self._trusted, frozen=self._alike >= _FROZEN)
+
+    def _on_stop(self, fault: Fault) -> None:
+        self.drives.quick_stop()
+        self.journal.write(fault.t, fault.kind, fault.sentence)
+
+    def look(self) -> None:
+        """Take in the newest frame, if there is one."""
+        with self._looking:
+            frame = None if self.source is None else self.source.read()
+            if frame is None:
+                return
+            dl, commanded = self._wires_at(frame.t)
+            sighting = self.tracker.look(frame, self._expectation.pose(dl, self.payload, self.base_quaternion))
+            self._alike = self._alike + 1 if sighting.flag == "frozen" else 0
+            if sighting.ok:
+                self._trusted = max(self._trusted, frame.t)
+            with self._lock:
+                self._sighting = sighting
+            recorder = self.recorder
+            if recorder is None or not recorder.recording:
+                return
+            readings = self._readings
+            extra = {
+                "marker_error": sighting.error, "marker_size": sighting.size_px, "marker_flag": float(FLAGS.index(sighting.flag)),
+                **dict(zip(("seen_x", "seen_y", "seen_z"), sighting.position.tolist(), strict=True)),
+            }  # fmt: skip
+            if readings is not None:
+                extra |= {f"current_{k}": value for k, value in enumerate(readings.current.tolist(), 1)}
+            recorder.add(
+                self._measured(sighting, ""),
+                payload=self.payload,
+                commanded_dl=commanded,
+                extra=extra,
+                base_quaternion=self.base_quaternion,
+            )
+
+    def _measured(self, sighting: Sighting, problem: str) -> Measurement:
+        readings = self._readings
+        trusted = sighting.ok
+        return Measurement(
+            t=sighting.t - self._zero, dl=self._wires_at(sighting.t)[0], ext=np.zeros(self.robot.n_segments),
+            tip_position=sighting.position if trusted else np.full(3, np.nan),
+            tip_quaternion=sighting.quaternion if trusted else np.full(4, np.nan),
+            tension=np.full(self.robot.n_tendons, np.nan) if readings is None else readings.tension, problem=problem,
+        )  # fmt: skip
+
+    def _wires_at(self, t: float) -> tuple[Floats, Floats]:
+        """(n_tendons,) what the encoders said at `t`, between two cycles by a straight line, and the set-points then [m]."""
+        with self._lock:
+            past = list(self._past)
+        if not past:
+            return np.full(self.robot.n_tendons, np.nan), self._set
+        k = next((k for k in range(len(past) - 1, -1, -1) if past[k][0] <= t), 0)
+        if k == len(past) - 1 or t <= past[0][0]:
+            return past[k][1], past[k][2]
+        (t0, dl0, set0), (t1, dl1, set1) = past[k], past[k + 1]
+        part = (t - t0) / (t1 - t0)
+        return dl0 + part * (dl1 - dl0), set0 + part * (set1 - set0)
+
+    def _why(self) -> str:
+        return self.supervisor.status
+
+    def _drive_forever(self) -> None:
+        assert self._pacer is not None
+        while not self._closed.is_set():
+            self._pacer.wait()
+            try:
+                with self.supervisor.guard(self.clock):
+                    self._cycle()
+            except Exception as error:  # whatever it is, the drives are stopped and stay so; the page says what it was
+                self.broken = error
+
+    def _look_forever(self) -> None:
+        while not self._closed.wait(_POLL):
+            try:
+                self.look()
+            except Exception as error:
+                self.broken = error
+                self.supervisor.exception(self.clock.now(), error)

@@ -1,0 +1,79 @@
+"""What drives say in one cycle, in their units and in ours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from fastrod.types import Floats, Ints
+
+
+@dataclass(frozen=True)
+class Emergency:
+    """An EMCY message (CiA 301)."""
+
+    drive: int
+    """Index of the drive, from 0."""
+    code: int
+    """Error code."""
+    register: int
+    """Error register, object 0x1001."""
+    t: float
+    """When it came [s]."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Feedback:
+    """The newest words of all drives, in the drives' units; drive axis first."""
+
+    t: float
+    """When they were gathered [s]."""
+    position: Ints
+    """(n_drives,) object 0x6064 [counts]."""
+    velocity: Ints
+    """(n_drives,) object 0x606C [counts/s]."""
+    torque: Ints
+    """(n_drives,) object 0x6077 [thousandths of the rated torque]."""
+    following_error: Ints
+    """(n_drives,) object 0x60F4, target minus actual position [counts]."""
+    statusword: Ints
+    """(n_drives,) object 0x6041."""
+    age: Floats
+    """(n_drives,) since the last process data [s]; inf before the first."""
+    heartbeat_age: Floats
+    """(n_drives,) since the last heartbeat [s]; inf before the first."""
+    nmt: Ints
+    """(n_drives,) NMT state of the last heartbeat: 0 booting, 4 stopped, 5 operational, 127 pre-operational, -1 none yet."""
+    emergencies: tuple[Emergency, ...]
+    """That came since the last feedback."""
+    lost: str
+    """Why the bus carries nothing, one sentence; empty while it does."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Readings:
+    """The same in SI units; drive axis first."""
+
+    t: float
+    """[s]."""
+    dl: Floats
+    """(n_drives,) change of wire length [m], negative = pulled."""
+    rate: Floats
+    """(n_drives,) of it [m/s]."""
+    tension: Floats
+    """(n_drives,) from the motors' torque [N]."""
+    current: Floats
+    """(n_drives,) of the motors [A]."""
+    following_error: Floats
+    """(n_drives,) told minus done [m]."""
+    statusword: Ints
+    """(n_drives,) object 0x6041."""
+    age: Floats
+    """(n_drives,) since the last process data [s]."""
+    heartbeat_age: Floats
+    """(n_drives,) since the last heartbeat [s]."""
+    nmt: Ints
+    """(n_drives,) NMT state of the last heartbeat."""
+    emergencies: tuple[Emergency, ...]
+    """That came since the last cycle."""
+    lost: str
+    """Why the bus carries nothing; empty while it does."""

@@ -1,0 +1,70 @@
+"""A bench to work at: the prototype on a real bus, or its emulator, with hands for what motors cannot do."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from fastrod.errors import InputError
+from fastrod_device.camera import FrameSource, VideoCamera
+from fastrod_device.clock import SteppedClock, WallClock
+from fastrod_device.emulator import Emulator
+from fastrod_device.experiment import AskingHands, Hands
+from fastrod_device.hardware import Hardware
+from fastrod_device.journal import Journal
+from fastrod_device.prototype import Prototype
+from fastrod_device.seal import seal
+
+_SCATTER = 0.08
+"""How far the stiffnesses of an emulated body may be from the robot file's, as a part."""
+_COUNT = itertools.count(1)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Bench:
+    """A prototype and who helps it."""
+
+    prototype: Prototype
+    hands: Hands
+    emulator: Emulator | None
+    """None where the prototype is real."""
+
+
+@contextmanager
+def emulated(
+    hardware: Hardware, *, seed: int | None = None, effect: str | None = None, stepped: bool = True, bus: str | None = None,
+    journal: str | Path | None = None, home: bool = True,
+) -> Iterator[Bench]:  # fmt: skip
+    """The emulator, started, with a sealed plant: `seed` draws what is hidden (None: nobody knows), `effect` names it for those who test.
+
+    `stepped` runs as fast as the machine computes; otherwise in real time. `bus`: None is a virtual one of its own.
+    """
+    clock = SteppedClock() if stepped else WallClock()
+    name = bus or f"virtual:fastrod-{next(_COUNT)}"
+    emulator = Emulator(hardware, name, clock=clock, seal=seal(seed, effect, scatter=_SCATTER), seed=0 if seed is None else seed)
+    try:
+        with Prototype(hardware, name, emulator, clock=clock, journal=Journal(journal)) as prototype:
+            prototype.start(home=home)
+            yield Bench(prototype=prototype, hands=emulator, emulator=emulator)
+    finally:
+        emulator.close()
+
+
+@contextmanager
+def real(
+    hardware: Hardware, bus: str, *, camera: int | str | None = 0, eds: str | Path | None = None, journal: str | Path | None = None,
+    home: bool = True,
+) -> Iterator[Bench]:  # fmt: skip
+    """The prototype on `bus` ("socketcan:can0"), with the video device `camera` (None: without), started, a person's hands beside it.
+
+    Raises `DeviceError`, one sentence, for what is not there or does not answer.
+    """
+    if ":" not in bus:
+        raise InputError(f"--bus is {bus!r}; give INTERFACE:CHANNEL, such as socketcan:can0.")
+    source: FrameSource | None = None if camera is None else VideoCamera(camera, hardware.camera)
+    with Prototype(hardware, bus, source, eds=eds, journal=Journal(journal)) as prototype:
+        prototype.start(home=home)
+        yield Bench(prototype=prototype, hands=AskingHands(), emulator=None)

@@ -1,0 +1,500 @@
+"""Both ends of a virtual CAN bus: the controller's drives, from finding them to moving them, and what happens when something fails."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fastrod.errors import InputError, UnknownNameError
+from fastrod.types import Floats
+from fastrod_device.bus import open_bus
+from fastrod_device.clock import SteppedClock, WallClock
+from fastrod_device.dictionary import object_dictionary
+from fastrod_device.drive import DriveBus
+from fastrod_device.errors import DeviceError
+from fastrod_device.faultcodes import CODES, STATUS_BITS, in_words, state_in_words
+from fastrod_device.nodes import EmulatedDrives
+from fastrod_device.pacer import Pacer
+from fastrod_device.readings import Feedback
+from fastrod_device.units import DriveSpec, Transmission
+
+pytest.importorskip("canopen")
+
+SPECS = [DriveSpec(node=k + 1, drum_radius=0.008, direction=(1, -1)[k % 2]) for k in range(4)]
+SLACK = np.array([1e-3, 2e-3, 0.5e-3, 1.5e-3])  # m
+STIFFNESS = 2000.0  # N/m
+_names = itertools.count()
+
+
+class Springs:
+    """Slack wires, then springs."""
+
+    def move(self, t: float, pulled: Floats) -> Floats:
+        return np.maximum(0.0, STIFFNESS * (pulled - SLACK))
+
+
+class Bench:
+    """Both ends on one bus."""
+
+    def __init__(self, clock: SteppedClock | WallClock | None = None, rate: float = 100.0) -> None:
+        self.name = f"virtual:drives-{next(_names)}"
+        self.clock = SteppedClock() if clock is None else clock
+        self.nodes = EmulatedDrives(SPECS, self.name, clock=self.clock, wires=Springs())
+        self.bus = DriveBus(SPECS, self.name, clock=self.clock, rate=rate)
+        self.rate = rate
+
+    def run(self, cycles: int, target: object = None) -> list[Feedback]:
+        pacer, seen = Pacer(self.clock, self.rate), []
+        for _ in range(cycles):
+            seen.append(self.bus.exchange(target))  # type: ignore[arg-type]
+            pacer.wait()
+        return seen
+
+    def __enter__(self) -> Bench:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.bus.close()
+        self.nodes.close()
+
+
+@pytest.fixture
+def ready():
+    """Connected and enabled."""
+    with Bench() as bench:
+        bench.bus.connect()
+        bench.bus.enable()
+        yield bench
+
+
+def states(feedback: Feedback) -> list[str]:
+    return [state_in_words(int(word)) for word in feedback.statusword]
+
+
+# the whole story
+
+
+def test_connect_leaves_the_drives_operational_and_switched_off():
+    with Bench() as bench:
+        bench.bus.connect()
+        assert bench.bus.newest.nmt.tolist() == [5] * 4
+        assert states(bench.bus.newest) == ["switch on disabled"] * 4
+        assert bench.bus.newest.lost == ""
+
+
+def test_enabling_does_not_move_a_drive(ready):
+    before = ready.nodes.true_pulled
+    seen = ready.run(20)
+    assert states(seen[-1]) == ["operation enabled"] * 4
+    np.testing.assert_array_equal(ready.nodes.true_pulled, before)
+
+
+def test_a_ramp_of_set_points_is_followed_with_a_lag(ready):
+    speed = 5000  # counts/s
+    seen = [ready.run(1, np.full(4, round(speed * k / ready.rate)))[0] for k in range(100)]
+    assert np.ptp([f.velocity for f in seen[50:]]) <= 0.02 * speed
+    assert seen[-1].velocity == pytest.approx(np.full(4, speed), rel=0.01)
+    # the drive interpolates over one period; its position loop lags by 3 ms, less the substep of 1 ms that it has looked ahead
+    assert seen[-1].following_error == pytest.approx(np.full(4, speed * 2e-3), abs=1)
+    last = ready.run(10)[-1]
+    np.testing.assert_array_equal(last.position, np.full(4, round(speed * 99 / ready.rate)))
+
+
+def test_counts_are_wire_by_the_drums_and_their_directions(ready):
+    dl = np.array([-0.5e-3, 0.3e-3, -0.2e-3, 0.1e-3])
+    transmission = Transmission(SPECS)
+    ready.run(30, transmission.counts(dl))
+    # negative change of length = pulled in
+    np.testing.assert_allclose(ready.nodes.true_pulled, -dl, atol=1e-6)
+
+
+def test_no_sdo_in_the_loop_and_no_set_point_is_missed(ready):
+    asked, served = ready.bus.sdo_requests, ready.nodes.sdo_served
+    ready.bus.reset_statistics()
+    ready.run(300, np.zeros(4, dtype=int))
+    assert asked > 100  # setting up took some
+    assert ready.bus.sdo_requests == asked
+    assert ready.nodes.sdo_served == served
+    assert ready.nodes.missed_setpoints == 0
+    assert ready.bus.missed == 0
+
+
+def test_homing_ends_where_each_wire_is_taut(ready):
+    threshold = Transmission(SPECS).torque(np.full(4, 2.0))
+    end = ready.bus.homing(np.abs(threshold), 4000, rounds=1)
+    np.testing.assert_array_equal(end.position, np.zeros(4))
+    tension = STIFFNESS * (ready.nodes.true_pulled - SLACK)
+    # the torque is looked at once a cycle: 4000 counts/s x 584 nm x 2000 N/m x 10 ms
+    assert np.all(tension > 1.8)
+    assert np.all(tension < 2.0 + 4000 * SPECS[0].metres_per_count * STIFFNESS * 0.01 + 0.2)
+    assert states(end) == ["operation enabled"] * 4
+    told = Transmission(SPECS).tension(end.torque)
+    np.testing.assert_allclose(told, tension, atol=4 * 1.2e-4 * SPECS[0].newtons_per_torque)  # noise of thousandths
+
+
+def test_homing_then_goes_to_its_offset(ready):
+    offset = np.array([-300, 300, -200, 100])  # lets out where growing counts pull
+    end = ready.bus.homing(np.full(4, 100), 4000, offset=offset, rounds=1, order=[2, 0, 3, 1])
+    np.testing.assert_allclose(end.position, offset, atol=1)
+
+
+def test_homing_of_a_wire_that_never_gets_taut_stops_the_drives(ready):
+    with pytest.raises(DeviceError, match=r"find the wire of node 1 taut within 0\.5 s"):
+        ready.bus.homing(np.full(4, 900), 1000, time_limit=0.5)
+    assert ready.bus.stop_reason == "homing did not end"
+    assert states(ready.run(5)[-1]) == ["quick stop active"] * 4
+
+
+def test_a_profile_move_arrives_and_takes_its_time():
+    with Bench() as bench:
+        bench.bus.connect()
+        bench.bus.enable("ppm")
+        goal = np.array([4000, -4000, 2000, 0])
+        began = bench.clock.now()
+        end = bench.bus.profile_move(goal, velocity=10_000.0, acceleration=100_000.0)
+        # trapezoid: distance / velocity + velocity / acceleration = 0.5 s
+        assert bench.clock.now() - began == pytest.approx(0.5, abs=0.1)
+        np.testing.assert_allclose(end.position, goal, atol=2)
+        again = bench.bus.profile_move(np.zeros(4, dtype=int), velocity=20_000.0, acceleration=100_000.0)
+        np.testing.assert_allclose(again.position, 0, atol=2)
+
+
+def test_close_leaves_the_drives_off_and_says_no_emergency():
+    with Bench() as bench:
+        bench.bus.connect()
+        bench.bus.enable()
+        bench.bus.close()
+        assert bench.nodes.states == ("switch on disabled",) * 4
+        assert bench.bus.emergency_log == ()
+
+
+def test_the_same_story_in_real_time():
+    with Bench(WallClock(), rate=100.0) as bench:
+        bench.bus.connect()
+        bench.bus.enable()
+        seen = bench.run(30, np.full(4, 200))
+        assert states(seen[-1]) == ["operation enabled"] * 4
+        np.testing.assert_allclose(seen[-1].position, 200, atol=2)
+        bench.bus.quick_stop()
+        assert states(bench.run(10)[-1]) == ["quick stop active"] * 4
+        assert bench.bus.jitter.n > 20
+
+
+# stopping
+
+
+def test_quick_stop_stays_latched_until_it_is_acknowledged(ready):
+    ready.run(20, np.full(4, 100))
+    ready.bus.quick_stop("somebody pressed the button")
+    stopped = ready.run(30, np.full(4, 5000))
+    assert states(stopped[-1]) == ["quick stop active"] * 4
+    assert np.all(np.abs(stopped[-1].position - 100) < 50)
+    with pytest.raises(DeviceError, match="somebody pressed the button"):
+        ready.bus.enable()
+    ready.bus.acknowledge()
+    assert states(ready.run(5)[-1]) == ["quick stop active"] * 4  # acknowledging alone moves nothing
+    ready.bus.enable()
+    before = ready.bus.newest.position
+    assert ready.bus.stop_reason == ""
+    np.testing.assert_array_equal(ready.run(20)[-1].position, before)  # the old target is forgotten
+
+
+def test_a_quick_stop_brakes_along_its_ramp():
+    with Bench() as bench:
+        bench.bus.connect(deceleration=200_000)
+        bench.bus.enable()
+        speed = 20_000
+        for k in range(60):
+            bench.run(1, np.full(4, round(speed * k / bench.rate)))
+        at, moving = bench.bus.newest.position, bench.nodes.moving
+        bench.bus.quick_stop()
+        end = bench.run(40)[-1]
+        assert moving.all()
+        assert not bench.nodes.moving.any()
+        # speed^2 / (2 deceleration) = 1000 counts, and one cycle until it is told
+        assert np.all((end.position - at > 950) & (end.position - at < 1000 + 1.5 * speed / bench.rate))
+
+
+def test_quick_stop_from_another_thread_interrupts_a_move():
+    with Bench(WallClock()) as bench:
+        bench.bus.connect()
+        bench.bus.enable("ppm")
+        timer = threading.Timer(0.2, bench.bus.quick_stop)
+        timer.start()
+        with pytest.raises(DeviceError, match=r"were stopped \(quick stop was asked for\)"):
+            bench.bus.profile_move(np.full(4, 100_000), velocity=10_000.0, acceleration=100_000.0)
+        timer.join()
+        bench.run(10)
+        assert not bench.nodes.moving.any()
+        assert np.all(bench.nodes.true_pulled < 20_000 * SPECS[0].metres_per_count)
+
+
+def test_quick_stop_raises_nothing_on_a_bus_that_is_gone(ready):
+    ready.bus.close()
+    ready.bus.quick_stop()
+    assert ready.bus.stop_reason == "quick stop was asked for"
+
+
+def test_a_controller_that_pauses_finds_its_drives_stopped_and_leaves_them_so(ready):
+    ready.run(10, np.zeros(4, dtype=int))
+    ready.clock.sleep_until(ready.clock.now() + 0.5)
+    seen = ready.run(10, np.full(4, 300))
+    assert ready.bus.stop_reason.startswith("the controller paused for 0.5")
+    assert states(seen[-1]) == ["quick stop active"] * 4
+    assert {e.code for f in seen for e in f.emergencies} == {0x8130}
+    np.testing.assert_array_equal(seen[-1].position, np.zeros(4))
+
+
+# faults, each as the controller sees it
+
+
+def test_a_lost_heartbeat_ages(ready):
+    ready.nodes.lose_heartbeat(2)
+    last = ready.run(30)[-1]
+    assert last.heartbeat_age[2] > 0.2
+    assert np.all(np.delete(last.heartbeat_age, 2) < 0.06)
+    assert np.all(last.age < 0.02)
+
+
+def test_an_emergency_names_its_drive_and_code_once(ready):
+    ready.nodes.emergency(1, 0x3210)
+    seen = ready.run(5)
+    assert [(e.drive, e.code) for f in seen for e in f.emergencies] == [(1, 0x3210)]
+    assert states(seen[-1]) == ["operation enabled", "fault", "operation enabled", "operation enabled"]
+
+
+def test_a_blocked_shaft_is_a_following_error(ready):
+    ready.nodes.block(0)
+    seen = [ready.run(1, np.full(4, 100 * k))[0] for k in range(60)]
+    assert max(f.following_error[0] for f in seen) > 1800
+    assert [(e.drive, e.code) for f in seen for e in f.emergencies] == [(0, 0x8611)]
+    assert states(seen[-1])[0] == "fault"
+    assert seen[-1].position[0] == 0
+
+
+def test_a_bus_that_is_off_says_so_and_stops_the_drives(ready):
+    ready.nodes.bus_off()
+    last = ready.run(20, np.zeros(4, dtype=int))[-1]
+    assert "no drive has said anything" in last.lost
+    assert np.all(last.age > 0.1)
+    ready.nodes.restore()
+    back = ready.run(20, np.zeros(4, dtype=int))
+    assert back[-1].lost == ""
+    assert states(back[-1]) == ["quick stop active"] * 4  # by themselves, for want of a heartbeat
+
+
+def test_a_bus_that_cannot_send_is_lost_without_an_exception(ready):
+    ready.bus._line.bus.shutdown()
+    last = ready.run(1)[0]
+    assert last.lost.startswith("nothing can be sent: ")
+
+
+def test_a_reboot_never_enables_again(ready):
+    ready.run(10, np.full(4, 500))
+    ready.nodes.reboot(3)
+    last = ready.run(60, np.full(4, 500))[-1]
+    assert last.nmt[3] == 0
+    assert last.age[3] > 0.5
+    assert ready.nodes.states[3] == "switch on disabled"
+    with pytest.raises(DeviceError, match=r"nodes \[4\] are not connected, or have rebooted"):
+        ready.bus.enable()
+    ready.bus.connect()
+    ready.bus.enable()
+    again = ready.run(5)[-1]
+    assert states(again) == ["operation enabled"] * 4
+    assert again.position[3] == 0  # its counter began anew
+    assert again.position[0] == 500
+
+
+def test_an_encoder_jump_is_seen_and_the_drive_moves_the_wire_by_it(ready):
+    before = ready.run(5)[-1].position
+    ready.nodes.encoder_jump(2, 1500)
+    after = ready.run(1)[0].position
+    assert 1000 < (after - before)[2] < 1500  # its position loop is at work already
+    assert not np.delete(after - before, 2).any()
+    last = ready.run(30)[-1]
+    np.testing.assert_allclose(last.position, before, atol=1)
+    np.testing.assert_allclose(ready.nodes.true_pulled, [0, 0, -1500 * SPECS[2].metres_per_count, 0], atol=1e-6)
+
+
+def test_an_encoder_jump_beyond_the_window_is_a_following_error(ready):
+    ready.nodes.encoder_jump(1, -5000)
+    seen = ready.run(3)
+    assert [(e.drive, e.code) for f in seen for e in f.emergencies] == [(1, 0x8611)]
+    assert states(seen[-1])[1] == "fault"
+
+
+def test_a_silent_drive_ages_and_is_heard_again(ready):
+    ready.bus.reset_statistics()
+    ready.nodes.silent(1)
+    last = ready.run(10)[-1]
+    assert ready.bus.missed == 10
+    assert last.age[1] > 0.08
+    assert np.all(np.delete(last.age, 1) < 0.02)
+    assert last.lost == ""
+    ready.nodes.restore()
+    assert np.all(ready.run(4)[-1].age < 0.02)
+
+
+def test_faults_are_reset_only_when_asked_and_nothing_is_enabled_by_it(ready):
+    ready.nodes.emergency(0, 0x2310)
+    ready.nodes.emergency(2, 0x4210, lasting=True)
+    assert states(ready.run(20)[-1])[::2] == ["fault", "fault"]
+    with pytest.raises(DeviceError, match="node 1 is in fault: over-current"):
+        ready.bus.enable()
+    with pytest.raises(DeviceError, match=r"node 3 stays in fault: power stage too hot \(0x4210\)"):
+        ready.bus.reset_faults()
+    assert ready.nodes.states[0] == "switch on disabled"
+    ready.nodes.restore()
+    ready.bus.reset_faults()
+    last = ready.run(20)[-1]
+    assert states(last)[::2] == ["switch on disabled", "switch on disabled"]
+    ready.bus.enable()
+    assert states(ready.run(1)[0]) == ["operation enabled"] * 4
+
+
+# what cannot be
+
+
+def test_a_drive_that_is_not_there_is_named():
+    name = f"virtual:drives-{next(_names)}"
+    clock = SteppedClock()
+    with EmulatedDrives(SPECS[:1], name, clock=clock, wires=Springs()) as _, DriveBus(SPECS[:2], name, clock=clock) as bus:
+        with pytest.raises(DeviceError, match="the drive at node 2 does not answer"):
+            bus.connect()
+        with pytest.raises(DeviceError, match="not connected"):
+            bus.enable()
+
+
+def test_a_motor_of_another_rated_torque_is_refused():
+    name = f"virtual:drives-{next(_names)}"
+    clock, other = SteppedClock(), [DriveSpec(node=1, drum_radius=0.008, rated_torque=0.1)]
+    with (
+        EmulatedDrives(SPECS[:1], name, clock=clock, wires=Springs()),
+        DriveBus(other, name, clock=clock) as bus,
+        pytest.raises(DeviceError, match=r"rated torque is 0\.054 N m"),
+    ):
+        bus.connect()
+
+
+@pytest.mark.parametrize(
+    ("target", "says"),
+    [
+        (np.zeros(3, dtype=int), r"must be \(4,\) whole counts"),
+        (np.zeros(4), r"must be \(4,\) whole counts"),
+        (np.full(4, 2**40), "32 bits"),
+    ],
+)
+def test_a_target_that_is_none(ready, target, says):
+    with pytest.raises(InputError, match=says):
+        ready.bus.exchange(target)
+
+
+def test_moves_that_cannot_be(ready):
+    with pytest.raises(InputError, match=r"velocity is 0\.0"):
+        ready.bus.profile_move(np.zeros(4, dtype=int), velocity=0.0, acceleration=1.0)
+    with pytest.raises(InputError, match="each drive from 0 to 3 once"):
+        ready.bus.homing(np.full(4, 100), 100, order=[0, 0, 1, 2])
+    with pytest.raises(InputError, match="positive thousandths"):
+        ready.bus.homing(np.zeros(4), 100)
+    with pytest.raises(UnknownNameError, match="did you mean 'csp'"):
+        ready.bus.enable("cps")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="position_limit"):
+        ready.bus.connect(position_limit=np.array([1, 2]))
+
+
+@pytest.mark.parametrize("rate", [0.0, 300.0, -100.0, float("nan"), 2000.0])
+def test_a_rate_that_is_no_whole_number_of_milliseconds(rate):
+    with pytest.raises(InputError, match="whole number of ms"):
+        DriveBus(SPECS, "virtual:none", clock=SteppedClock(), rate=rate)
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("virtul:a", "did you mean 'virtual'"),
+        ("virtual", "lacks its channel"),
+        ("socketcan:no-such-can", "cannot be opened"),
+        ("udp_multicast:239.74.163.2:many", "port 'many'"),
+        ("udp_multicast:239.74.163.2:99999", "port '99999'"),
+    ],
+)
+def test_a_bus_that_is_not_there(name, says):
+    with pytest.raises(DeviceError, match=says):
+        open_bus(name)
+
+
+def test_an_own_dictionary_must_be_one(tmp_path: Path):
+    with pytest.raises(DeviceError, match="does not exist"):
+        object_dictionary(tmp_path / "none.eds")
+    bad = tmp_path / "bad.eds"
+    bad.write_text("no dictionary")
+    with pytest.raises(DeviceError, match="cannot be read"):
+        object_dictionary(bad)
+
+
+def test_an_own_dictionary_takes_the_place_of_ours(tmp_path: Path):
+    canopen = pytest.importorskip("canopen")
+    own, poor = tmp_path / "own.eds", tmp_path / "poor.eds"
+    dictionary = object_dictionary()
+    canopen.export_od(dictionary, str(own))
+    assert len(object_dictionary(own)) == len(dictionary)
+    del dictionary[0x6502]
+    canopen.export_od(dictionary, str(poor))
+    with pytest.raises(DeviceError, match="has no object 0x6502:00"):
+        object_dictionary(poor)
+
+
+# words and units
+
+
+@pytest.mark.parametrize("state", STATUS_BITS)
+def test_states_and_their_statuswords(state):
+    assert state_in_words(STATUS_BITS[state]) == state
+    assert state_in_words(STATUS_BITS[state] | 0x9610) == state  # voltage, remote, target reached, ...
+
+
+def test_codes_in_words():
+    assert all(in_words(code).startswith(words) for code, words in CODES.items())
+    assert in_words(0x8199) == "communication (0x8199)"
+    assert in_words(0xEE00) == "unknown error (0xEE00)"
+
+
+def test_counts_and_torques_go_round():
+    transmission = Transmission(SPECS)
+    dl, tension = np.array([-3e-3, 2e-3, 0.0, 1e-3]), np.array([0.5, 1.0, 2.0, 5.0])
+    np.testing.assert_allclose(transmission.dl(transmission.counts(dl)), dl, atol=0.5 * SPECS[0].metres_per_count)
+    one = 1e-3 * SPECS[0].rated_torque * SPECS[0].newtons_per_torque
+    np.testing.assert_allclose(transmission.tension(transmission.torque(tension)), tension, atol=0.5 * one)
+    # one turn of the drum: gear x counts, and its circumference
+    turn = transmission.dl(np.array([21 * 4096, -21 * 4096, 0, 0]))
+    np.testing.assert_allclose(turn[:2], [-2 * np.pi * 0.008, -2 * np.pi * 0.008], rtol=1e-12)
+
+
+@pytest.mark.parametrize("given", [{"node": 0}, {"node": 200}, {"direction": 0}, {"drum_radius": 8.0}, {"gear": -1.0}, {"efficiency": 1.5}])
+def test_a_drive_that_cannot_be(given):
+    with pytest.raises(InputError):
+        DriveSpec(**({"node": 1, "drum_radius": 0.008} | given))
+
+
+# the pacer
+
+
+def test_a_pacer_keeps_to_multiples_and_skips_what_is_past():
+    clock = SteppedClock()
+    pacer = Pacer(clock, 100.0)
+    times = []
+    for k in range(5):
+        assert pacer.wait() == 0.0
+        times.append(clock.now())
+        if k == 2:
+            clock.sleep_until(clock.now() + 0.034)
+            assert pacer.wait() == pytest.approx(0.004)  # at once
+    assert times == pytest.approx([0.01, 0.02, 0.03, 0.07, 0.08])
+    assert pacer.slipped == 2
+    with pytest.raises(InputError, match="must be positive"):
+        Pacer(clock, 0.0)

@@ -1,0 +1,320 @@
+"""The eye and the tracker: pixels where OpenCV has them, exact coverage, no bias, no flips; what is doubtful is flagged; camera files."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from fastrod.errors import InputError, UnknownNameError
+from fastrod.rotation import product, quaternion_from_vector
+from fastrod_device import camera as camera_module
+from fastrod_device.camera import Camera, Frame, Marker, VideoCamera, compose, inverse, load_camera, rotation, save_camera
+from fastrod_device.drawing import Eye, Scene, draw, project
+from fastrod_device.errors import DeviceError
+from fastrod_device.tracker import MarkerTracker
+
+CAMERA = Camera(matrix=((800.0, 0.0, 319.5), (0.0, 800.0, 239.5), (0.0, 0.0, 1.0)), size=(640, 480))
+BENT = replace(CAMERA, distortion=(-0.2, 0.08, 0.001, -0.0005, 0.0))
+MARKER = Marker(size=0.015, id=7)
+SHARP = Scene(blur=0.0, noise=0.0, gradient=(0.0, 0.0), vignetting=0.0)
+SQUARE = 0.0075 * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
+FACING = np.array([0.0, 1.0, 0.0, 0.0])  # the marker's z toward the camera
+
+
+def pose(distance, tilt, azimuth, roll, x=0.0, y=0.0):
+    lean = quaternion_from_vector(tilt * np.array([np.cos(azimuth), np.sin(azimuth), 0.0]))
+    return np.array([x, y, distance]), product(lean, product(FACING, quaternion_from_vector(np.array([0.0, 0.0, roll]))))
+
+
+def angle(a, b):
+    return 2.0 * math.acos(min(1.0, abs(float(a @ b))))
+
+
+def frames(camera, poses, scene=None, seed=0, rate=15.0):
+    rng = np.random.default_rng(seed)
+    return [Frame(image=draw(camera, MARKER, *p, rng=rng, scene=scene), t=k / rate, number=k + 1) for k, p in enumerate(poses)]
+
+
+def test_projection_is_opencvs():
+    points = np.random.default_rng(0).uniform((-0.05, -0.04, 0.1), (0.05, 0.04, 0.3), (50, 3))
+    theirs, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), BENT.intrinsics, BENT.lens)
+    assert_allclose(project(BENT, points), theirs.reshape(-1, 2), atol=1e-9)
+
+
+def test_a_pixel_is_covered_by_its_area():
+    # edges at thirds of a pixel, parallel to the rows: 15 mm at 0.1 m are 120 px, pixel (0, 0) reaches from -0.5 to 0.5
+    camera = replace(CAMERA, matrix=((800.0, 0.0, 319.5 + 1.0 / 3.0), (0.0, 800.0, 239.5), (0.0, 0.0, 1.0)))
+    image = draw(camera, MARKER, *pose(0.1, 0.0, 0.0, 0.0), rng=np.random.default_rng(0), scene=replace(SHARP, white=240.0, black=0.0))
+    # black from 319.833 - 60 = 259.833 on: of pixel 260 (259.5 to 260.5) a third is white
+    assert image[240, 258:263].tolist() == [240, 240, 80, 0, 0]
+    assert image[178:182, 262].tolist() == [240, 240, 0, 0]
+
+
+def test_drawing_is_a_slow_obvious_twin():
+    position, quaternion = pose(0.12, 0.6, 0.4, 0.3)
+    image = draw(BENT, MARKER, position, quaternion, rng=np.random.default_rng(0), scene=SHARP)
+    n, some = 12, np.s_[200:215, 265:380]
+    rows, columns = np.mgrid[some]
+    offset = (np.arange(n) + 0.5) / n - 0.5
+    fine = np.stack(np.broadcast_arrays(columns[..., None, None] + offset, rows[..., None, None] + offset[:, None]), -1).reshape(-1, 1, 2)
+    many = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-12)
+    rays = cv2.undistortPoints(fine.astype(np.float64), BENT.intrinsics, BENT.lens, criteria=many).reshape(-1, 2)
+    R = rotation(quaternion)
+    rays = np.column_stack([rays, np.ones(len(rays))])
+    on = (rays * (R[:, 2] @ position / (rays @ R[:, 2]))[:, None] - position) @ R[:, :2]
+    cell = MARKER.size / 6.0
+    i, j = np.floor((on[:, 0] + 4.0 * cell) / cell).astype(int), np.floor((4.0 * cell - on[:, 1]) / cell).astype(int)
+    texture = np.pad(cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 7, 6), 1, constant_values=255)
+    inside = (i >= 0) & (i < 8) & (j >= 0) & (j < 8)
+    level = np.where(texture[np.clip(j, 0, 7), np.clip(i, 0, 7)] > 0, SHARP.white, SHARP.black)
+    slow = np.where(inside, level, SHARP.background).reshape(*rows.shape, n * n).mean(-1)
+    assert np.ptp(slow) > 150.0
+    assert np.abs(slow - image[some]).max() < 0.6 + 170.0 / n / 2.0
+    assert np.abs(slow - image[some]).mean() < 0.6
+
+
+def test_what_cannot_be_seen_is_not_drawn():
+    empty = Eye(CAMERA, MARKER, scene=SHARP).draw(*pose(0.1, 0.0, 0.0, 0.0), marker=False)
+    assert (empty == 110).all()
+    away = np.array([1.0, 0.0, 0.0, 0.0])
+    for position, quaternion in (((0.0, 0.0, 0.1), away), ((0.0, 0.0, -0.1), FACING), ((0.0, 0.0, 0.1), pose(0.1, math.pi, 0, 0)[1])):
+        assert_array_equal(Eye(CAMERA, MARKER, scene=SHARP).draw(np.array(position), quaternion), empty)
+    outside = Eye(CAMERA, MARKER, scene=SHARP).draw(*pose(0.1, 0.2, 0.0, 0.3, x=0.2))
+    assert_array_equal(outside, empty)
+
+
+def test_a_marker_across_the_border_is_the_same_picture_cut():
+    wide = replace(CAMERA, size=(800, 480))
+    blurred = replace(SHARP, blur=1.0)
+    there = pose(0.1, 0.4, 0.3, 0.2, x=0.04)
+    small, large = (Eye(camera, MARKER, scene=blurred).draw(*there) for camera in (CAMERA, wide))
+    assert np.ptp(small[:, -1].astype(int)) > 50
+    assert_array_equal(small, large[:, :640])
+
+
+def test_eye_repeats_by_its_seed():
+    there = pose(0.15, 0.3, 0.2, 0.1)
+    first, same, other = (Eye(CAMERA, MARKER, seed=seed).draw(*there) for seed in (1, 1, 2))
+    assert_array_equal(first, same)
+    assert (first != other).mean() > 0.5
+    clean = Eye(CAMERA, MARKER, scene=Scene(noise=0.0)).draw(*there)
+    assert (first.astype(float) - clean).std() == pytest.approx(2.0, rel=0.05)
+
+
+@pytest.mark.parametrize("camera", [CAMERA, BENT], ids=["straight", "bent"])
+@pytest.mark.parametrize("tilt", [0.0, 30.0, 60.0])
+def test_clean_pictures_have_no_bias(camera, tilt):
+    rng = np.random.default_rng(int(tilt))
+    tracker, corner, moved = MarkerTracker(camera, MARKER), [], []
+    scene = replace(SHARP, blur=0.7)
+    for k in range(25):
+        there = pose(0.15, math.radians(tilt), *rng.uniform(0.0, 6.28, 2), *rng.uniform(-0.015, 0.015, 2))
+        tracker.reset()
+        seen = tracker.look(Frame(image=draw(camera, MARKER, *there, rng=rng, scene=scene), t=0.0, number=k), there)
+        assert seen.flag in ("", "ambiguous")
+        corner.append(seen.corners - project(camera, SQUARE @ rotation(there[1]).T + there[0]))
+        moved.append(seen.position - there[0])
+    assert np.abs(np.mean(corner, axis=0)).max() < 0.02
+    assert np.std(corner) < 0.03
+    assert np.abs(np.mean(moved, axis=0)).max() < 3e-5
+    assert np.abs(moved)[:, :2].max() < 3e-5
+    assert np.abs(moved)[:, 2].max() < 2e-4
+
+
+@pytest.mark.parametrize(("distance", "largest"), [(0.10, 0.2e-3), (0.20, 0.9e-3), (0.40, 3e-3)])
+def test_error_of_noisy_pictures(distance, largest):
+    rng = np.random.default_rng(2)
+    tracker, error = MarkerTracker(BENT, MARKER), []
+    for k in range(30):
+        there = pose(distance, rng.uniform(0.0, 0.8), *rng.uniform(0.0, 6.28, 2), *rng.uniform(-0.1, 0.1, 2) * distance)
+        tracker.reset()
+        image = draw(BENT, MARKER, *there, rng=rng, scene=Scene(noise=3.0, blur=0.9))
+        error.append(tracker.look(Frame(image=image, t=0.0, number=k), there).position - there[0])
+    assert np.isfinite(error).all()
+    assert math.sqrt((np.array(error) ** 2).sum(1).mean()) < 0.5 * largest
+
+
+def test_smooth_motion_through_the_frontal_pose_does_not_flip():
+    t = np.arange(60) / 15.0
+    poses = [pose(0.2, 0.35 * math.sin(1.1 * s), 0.6, 0.1, x=0.01 * math.sin(s)) for s in t]
+    tracker = MarkerTracker(CAMERA, MARKER)
+    seen = [tracker.look(frame) for frame in frames(CAMERA, poses, Scene(noise=3.0))]
+    ok = np.array([s.ok for s in seen])
+    assert ok.mean() > 0.9
+    assert max(angle(s.quaternion, q) for s, (_, q) in zip(seen, poses, strict=True) if s.ok) < math.radians(5.0)
+    assert np.std([s.position[0] - p[0] for s, (p, _) in zip(seen, poses, strict=True) if s.ok]) < 2e-5
+
+
+def test_the_expected_pose_tells_the_solutions_apart():
+    there = pose(0.6, math.radians(25.0), 0.5, 0.2)  # 20 px: the picture hardly tells
+    frame = frames(CAMERA, [there], Scene(noise=2.0))[0]
+    alone = MarkerTracker(CAMERA, MARKER, sigma=0.5).look(frame)
+    assert alone.flag == "ambiguous"
+    assert not alone.ok
+    assert np.isfinite([*alone.position, *alone.other_position, alone.other_error]).all()
+    for expected in ((alone.position, alone.quaternion), (alone.other_position, alone.other_quaternion)):
+        told = MarkerTracker(CAMERA, MARKER, sigma=0.5).look(frame, expected)
+        assert told.flag == ""
+        assert angle(told.quaternion, expected[1]) < 0.02
+
+
+def test_place_of_camera_and_marker():
+    camera = replace(CAMERA, position=(0.04, 0.0, 0.215), quaternion=tuple(quaternion_from_vector(np.array([0.3, 2.7, 0.1]))))
+    marker = replace(MARKER, position=(0.001, -0.002, 0.003), quaternion=tuple(quaternion_from_vector(np.array([0.05, 0.1, 0.7]))))
+    base_from_tip = compose(compose(camera.base_from_camera, pose(0.13, 0.3, 0.3, 0.4)), inverse(marker.tip_from_marker))
+    image = Eye(camera, marker).draw(*base_from_tip)
+    seen = MarkerTracker(camera, marker).look(Frame(image=image, t=1.0, number=4))
+    assert (seen.flag, seen.t, seen.number) == ("", 1.0, 4)
+    assert_allclose(seen.position, base_from_tip[0], atol=5e-5)
+    assert angle(seen.quaternion, base_from_tip[1]) < 2e-3
+    assert seen.size_px == pytest.approx(800.0 * 0.015 / 0.13, rel=0.05)
+
+
+def test_doubtful_frames_are_flagged_and_forgotten():
+    near, far = pose(0.15, 0.4, 0.0, 0.0), pose(0.15, 0.4, 0.0, 0.0, x=0.03)
+    images = [f.image for f in frames(CAMERA, [near, near, near, far, near, far])]
+    tracker = MarkerTracker(CAMERA, MARKER, gate=0.5, slack=0.002)
+    assert tracker.look(Frame(image=images[0], t=0.0, number=1)).ok
+    assert tracker.look(Frame(image=images[1], t=0.03, number=1)).flag == "frozen"
+    again = tracker.look(Frame(image=images[0], t=0.03, number=2))
+    assert again.flag == "frozen"
+    assert np.isnan([*again.position, *again.quaternion, again.error, *again.corners.ravel()]).all()
+    none = tracker.look(Frame(image=np.full((480, 640), 100, dtype=np.uint8), t=0.03, number=3))
+    assert none.flag == "no marker"
+    assert np.isnan(none.position).all()
+    jump = tracker.look(Frame(image=images[3], t=0.04, number=4))  # 30 mm in 40 ms
+    assert jump.flag == "outlier"
+    assert jump.position[0] == pytest.approx(0.03, abs=1e-4)
+    assert tracker.look(Frame(image=images[4], t=0.05, number=5)).ok
+    assert tracker.look(Frame(image=images[5], t=0.12, number=6)).ok  # 0.5 m/s for 70 ms is 35 mm
+    tracker.reset()
+    assert tracker.look(Frame(image=images[0], t=0.121, number=7)).ok
+
+
+def test_a_covered_side_is_an_outlier():
+    image = frames(CAMERA, [pose(0.15, 0.2, 0.0, 0.0)])[0].image.copy()
+    whole = MarkerTracker(CAMERA, MARKER).look(Frame(image=image, t=0.0, number=1))
+    left, top = whole.corners[0]
+    image[int(top) - 8 : int(top) + 70, int(left) + 5 : int(left) - 20 : -1] = 40  # a wire as dark as the ink along the left side
+    seen = MarkerTracker(CAMERA, MARKER).look(Frame(image=image, t=0.0, number=1))
+    assert whole.ok
+    assert seen.flag in ("outlier", "no marker")
+
+
+def test_other_markers_are_not_taken():
+    image = Eye(CAMERA, replace(MARKER, id=3)).draw(*pose(0.15, 0.2, 0.0, 0.0))
+    assert MarkerTracker(CAMERA, MARKER).look(Frame(image=image, t=0.0, number=1)).flag == "no marker"
+    apriltag = Marker(size=0.015, id=5, dictionary="DICT_APRILTAG_16h5")
+    there = pose(0.12, 0.3, 0.0, 0.0)
+    seen = MarkerTracker(CAMERA, apriltag).look(Frame(image=Eye(CAMERA, apriltag).draw(*there), t=0.0, number=1))
+    assert seen.ok
+    assert_allclose(seen.position, there[0], atol=1e-4)
+
+
+def test_camera_file_round_trip(tmp_path):
+    camera = replace(BENT, position=(0.1, 0.2, 0.3), quaternion=(0.6, 0.0, 0.8, 0.0), rate=15.0, latency=0.03)
+    save_camera(camera, tmp_path / "camera.toml")
+    assert load_camera(tmp_path / "camera.toml") == camera
+    with pytest.raises(InputError, match=r"does not end in \.toml"):
+        save_camera(camera, tmp_path / "camera.json")
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "sentence"),
+    [
+        ("latncy = 0.1", UnknownNameError, r"unknown key 'latncy'; did you mean 'latency'\?"),
+        ("latency = 30", InputError, "it must be 0 to 10. Was it given in ms"),
+        ("quaternion = [1.0, 1.0, 0.0, 0.0]", InputError, "must have norm 1, not 1.41421"),
+        ("position = [1.0, 0.0]", InputError, "position"),
+        ("rate = 0", InputError, "Camera.rate is 0.* must be a positive number"),
+        ("=", InputError, "is not TOML"),
+    ],
+)
+def test_bad_camera_files(tmp_path, text, kind, sentence):
+    path = tmp_path / "camera.toml"
+    path.write_text(f"{text}\nmatrix = [[800, 0, 320], [0, 800, 240], [0, 0, 1]]\nsize = [640, 480]\n")
+    with pytest.raises(kind, match=sentence):
+        load_camera(path)
+    with pytest.raises(InputError, match="cannot be read: No such file"):
+        load_camera(tmp_path / "none.toml")
+
+
+def test_bad_input():
+    with pytest.raises(InputError, match=r"Camera\.matrix is .*fx and fy positive"):
+        replace(CAMERA, matrix=((0.0, 0.0, 1.0), (0.0, 1.0, 1.0), (0.0, 0.0, 1.0)))
+    with pytest.raises(InputError, match=r"Camera\.size"):
+        replace(CAMERA, size=(640, 0))
+    with pytest.raises(InputError, match="was it given in mm"):
+        Marker(size=15.0)
+    with pytest.raises(InputError, match="has the numbers 0 to 49"):
+        Marker(size=0.015, id=50)
+    with pytest.raises(UnknownNameError, match="did you mean 'DICT_4X4_50'"):
+        Marker(size=0.015, dictionary="DICT_4X4_5O")
+    with pytest.raises(InputError, match="gate is 0"):
+        MarkerTracker(CAMERA, MARKER, gate=0.0)
+    with pytest.raises(InputError, match=r"must be uint8 of \(480, 640\)"):
+        MarkerTracker(CAMERA, MARKER).look(Frame(image=np.zeros((10, 10), dtype=np.uint8), t=0.0, number=1))
+    with pytest.raises(InputError, match="0 <= black < white <= 255"):
+        Scene(black=200.0, white=100.0)
+
+
+class Capture:
+    """OpenCV's capture of a camera that gives five pictures, then none."""
+
+    def __init__(self, opened=True, shape=(480, 640, 3)):
+        self.opened, self.shape, self.given, self.released = opened, shape, 0, False
+
+    def isOpened(self):
+        return self.opened
+
+    def set(self, _key, _value):
+        return True
+
+    def read(self):
+        self.given += 1
+        return (True, np.full(self.shape, self.given, dtype=np.uint8)) if self.given <= 5 else (False, None)
+
+    def release(self):
+        self.released = True
+
+
+class Still:
+    """A clock at 7 s."""
+
+    stepped = False
+
+    def now(self):
+        return 7.0
+
+    def sleep_until(self, _t):
+        pass
+
+
+def test_video_camera(monkeypatch):
+    capture = Capture()
+    monkeypatch.setattr(cv2, "VideoCapture", lambda _: capture)
+    monkeypatch.setattr(camera_module, "_STILL", 3)
+    source = VideoCamera(replace(CAMERA, latency=0.25), 0, clock=Still())
+    source._thread.join(5.0)
+    frame = source.read()
+    assert (frame.number, frame.t, frame.image.shape) == (5, 6.75, (480, 640))
+    assert (frame.image == 5).all()
+    with pytest.raises(DeviceError, match="no picture 3 times in a row"):
+        source.read()
+    source.close()
+    source.close()
+    assert capture.released
+
+
+def test_video_camera_that_is_not_there(monkeypatch):
+    monkeypatch.setattr(cv2, "VideoCapture", lambda _: Capture(opened=False))
+    with pytest.raises(DeviceError, match="camera 3 cannot be opened"):
+        VideoCamera(CAMERA, 3)
+    monkeypatch.setattr(cv2, "VideoCapture", lambda _: Capture(shape=(100, 200, 3)))
+    with pytest.raises(DeviceError, match="gives pictures of 200 x 100 px; it must give 640 x 480 px"):
+        VideoCamera(CAMERA, 3)
