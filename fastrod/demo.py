@@ -1,4 +1,8 @@
-"""The main job on an embedded default, start to end: a batch of robots, then a log and what the model lacks to explain it."""
+"""The main job on an embedded default, start to end: a batch of robots, then a robot that is excited, identified and driven anew.
+
+The robot is the emulated prototype with an effect that nobody has declared. Without the packages of the device wing, a log that ships with
+fastrod takes its place.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +10,14 @@ import sys
 import time
 from contextlib import AbstractContextManager, nullcontext
 from importlib.resources import as_file, files
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
+from fastrod.errors import InputError
 from fastrod.robot import Robot
 from fastrod.robotfile import load_robot
 from fastrod.types import Floats
@@ -25,12 +32,16 @@ DT = 0.01  # s
 _BEND = 1.0  # rad, largest bend of a random robot
 _FORCE = 0.2  # N, largest random tip load
 _SEED = 7
+_DEVICE = {"canopen": "canopen", "python-can": "can", "opencv-python-headless": "cv2"}
+"""Packages that the emulated prototype stands on, and their modules."""
 
 
-def run(out: Path | None = None) -> None:
-    """Print a batch of random prototypes and what the shipped log tells; the report goes to the folder `out` if given.
+def run(out: Path | None = None, *, seed: int | None = None, view: bool = True) -> None:
+    """Print a batch of random prototypes, then the whole loop on an emulated one: logs, report and identified robot go to the folder `out`
+    if given. `seed` draws what the emulator hides (None: nobody knows). With `view`, where somebody looks on, the viewer is served at the
+    end until Ctrl+C.
 
-    Raises `InputError`, before the work, where that folder cannot be written.
+    Raises `InputError`, before the work, where that folder cannot be written or is not empty.
     """
     from rich.console import Console
 
@@ -38,10 +49,18 @@ def run(out: Path | None = None) -> None:
 
     if out is not None:
         make_folder(out)
+        if any(out.iterdir()):
+            raise InputError(f"folder {str(out)!r} is not empty; give --out a new one, so that nothing is written over.")
     console = Console()
     robot = load_robot("prototype")
     _batch(robot, console)
-    _identified(robot, console, out)
+    if missing := [name for name, module in _DEVICE.items() if find_spec(module) is None]:
+        _identified(robot, console, out)
+        said = f"the whole loop, on an emulated prototype, needs {', '.join(missing)}: pip install fastrod[device,viewer]"
+        console.print(said, markup=False, soft_wrap=True, highlight=False)
+        return
+    with TemporaryDirectory() as folder:
+        _looped(console, Path(folder) if out is None else out, seed, keep=out is not None, view=view)
 
 
 def random_bend(rng: np.random.Generator, robot: Robot, n_robots: int) -> Floats:
@@ -94,6 +113,79 @@ def _waiting(why: str) -> AbstractContextManager[object]:
     from rich.console import Console
 
     return Console(stderr=True).status(why) if sys.stderr.isatty() else nullcontext()
+
+
+def _looped(console: Console, out: Path, seed: int | None, *, keep: bool, view: bool) -> None:
+    from fastrod_device import loop_report
+    from fastrod_device.hardware import load_hardware
+    from fastrod_device.loop import close_loop
+    from fastrod_device.workbench import emulated
+
+    console.print(
+        "\n[bold]An emulated prototype[/]: four CiA 402 drives on a virtual CAN bus, a camera whose frames are drawn, a robot with\n"
+        "stiffnesses and an effect that nobody has declared. It is excited, identified, and its tip driven along three paths."
+    )
+    stages = Stages(console)
+    with stages, emulated(load_hardware(), seed=seed) as bench:
+        loop = close_loop(bench.prototype, bench.hands, out, progress=stages)
+        assert bench.emulator is not None
+        sealed = bench.emulator.seal.open()
+    written = loop_report.write(loop, out, sealed)
+    console.print()
+    loop_report.show(loop, console, sealed)
+    command = f"fastrod view {out / 'excite.csv'} --robot {out / 'identified.toml'}"
+    if keep:
+        for path in written:
+            console.print(f"wrote {path}", soft_wrap=True, highlight=False)
+    if view and sys.stdout.isatty() and find_spec("viser") is not None:
+        from fastrod_viewer.app import view as serve
+
+        serve(out / "excite.csv", robot=out / "identified.toml")
+    elif keep:
+        console.print(f"the run beside both models, at http://localhost:8080: {command}", soft_wrap=True, highlight=False)
+    else:
+        console.print(
+            "logs, report and the identified robot: fastrod demo --out DIR; then fastrod view DIR/excite.csv --robot DIR/identified.toml "
+            "serves the run\nbeside both models at http://localhost:8080",
+            soft_wrap=True, highlight=False,
+        )  # fmt: skip
+    console.print("next: fastrod drive --emulate drives it by hand; --bus socketcan:can0 the real one", highlight=False)
+
+
+@final
+class Stages:
+    """A progress callback (what, done, total) that says each stage once it is over, with the seconds that it took."""
+
+    def __init__(self, console: Console) -> None:
+        from rich.console import Console
+
+        self._console = console
+        self._status = Console(stderr=True).status("") if sys.stderr.isatty() else None
+        self._what, self._began = "homing", time.perf_counter()
+
+    def __enter__(self) -> Stages:
+        if self._status is not None:
+            self._status.start()
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        if self._status is not None:
+            self._status.stop()
+        if kind is None:
+            self.begin("")
+
+    def __call__(self, what: str, done: int, total: int) -> None:
+        if self._status is not None:
+            self._status.update(f"{what}: {done} of {total}")
+        if (stage := what.partition(":")[0]) != self._what:
+            self.begin(stage)
+
+    def begin(self, stage: str) -> None:
+        """The last stage is over, and `stage` begins; "" for none."""
+        now = time.perf_counter()
+        if self._what:
+            self._console.print(f"  {self._what:15} {now - self._began:5.1f} s", highlight=False)
+        self._what, self._began = stage, now
 
 
 def _identified(robot: Robot, console: Console, out: Path | None) -> None:

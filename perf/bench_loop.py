@@ -44,7 +44,7 @@ def _measure(options: argparse.Namespace) -> list[Section]:
     rows = []
     for k, seed in enumerate(seeds):
         rows.append(_one(seed, options.effect, load=not options.no_load))
-        note_progress("loop", k + 1, len(seeds))
+        note_progress(f"{k + 1} of {len(seeds)}: {rows[-1]}")
     right = sum(row["right"] is True for row in rows)
     near = sum(_number(row, "over") <= FLOOR_TARGET for row in rows)
     followed = sum(_number(row, "track_after") <= 1e3 * BEYOND_TARGET for row in rows)
@@ -82,11 +82,17 @@ def _one(seed: int, effect: str | None, *, load: bool) -> Row:
         "sealed": ", ".join(sealed) or "none",
         "verdict": result.verdict,
         "found": said,
-        "right": _right(result.verdict, names, classes, list(sealed)), "floor": 1e3 * result.noise.floor, "before": 1e3 * result.test.before,
+        "right": _right(result.verdict, names, classes, list(sealed)),
+        "floor": 1e3 * result.noise.floor,
+        "before": 1e3 * result.test.before,
         "after": 1e3 * result.test.after,
-        "over": result.test.after / result.noise.floor, "track_before": 1e3 * before,
-        "track_after": 1e3 * after, "axis": 1e3 * worst, "E": ratio[0], "G": ratio[1],
-    }  # fmt: skip
+        "over": result.test.after / result.noise.floor,
+        "track_before": 1e3 * before,
+        "track_after": 1e3 * after,
+        "axis": 1e3 * worst,
+        "E": ratio[0],
+        "G": ratio[1],
+    }
 
 
 def _right(verdict: str, names: list[str], classes: dict[str, list[str]], sealed: list[str]) -> bool:

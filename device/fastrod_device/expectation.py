@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
@@ -29,7 +29,7 @@ class Expectation:
             return None
         base = np.array(self._robot.base_quaternion) if base_quaternion is None else base_quaternion
         lengths = self._robot.rest_tendon_length + dl
-        inputs = {"base_pose": np.concatenate([np.zeros(3), base]), "tip_force": payload * np.array(self._robot.gravity)}
+        inputs: dict[str, Any] = {"base_pose": np.concatenate([np.zeros(3), base]), "tip_force": payload * np.array(self._robot.gravity)}
         state = self._simulator.settle(lengths, **inputs) if self._cold else self._simulator.step(lengths, **inputs)
         self._cold = not bool(state.ok[0])
         if self._cold:

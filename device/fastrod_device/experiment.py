@@ -11,7 +11,7 @@ import numpy as np
 
 from fastrod.control.inverse import Plan
 from fastrod.identification.excite import Excitation
-from fastrod.runlog import RunLog
+from fastrod.runlog import RunLog, numbers
 from fastrod.types import Flags, Floats
 from fastrod_device.prototype import Prototype
 
@@ -124,8 +124,23 @@ class Tracking:
         return np.asarray(np.sqrt(np.mean((self.log.tip_position - wanted)[rows] ** 2, axis=0)))
 
 
-def follow(prototype: Prototype, plan: Plan, path: str | Path, *, law: Law | None = None, dt: float = 0.05) -> RunLog:
-    """Drive a plan, or what `law` commands every `dt` [s] of the plan's time in its place, and record it to `path`; t = 0 is the plan's.
+def drive_lag(log: RunLog) -> float:
+    """[s] by which the drives of a recorded run followed their set-points; 0 where it has none."""
+    from scipy.optimize import minimize_scalar
+
+    names = [f"cmd_dl_{k}" for k in range(1, log.dl.shape[1] + 1)]
+    if any(name not in log.extra for name in names):
+        return 0.0
+    told = np.stack([numbers(dict(log.extra), name, log.name) for name in names], axis=1)
+    good = np.isfinite(told).all(axis=1) & np.isfinite(log.dl).all(axis=1)
+    t, told, done = log.t[good], told[good], log.dl[good]
+    found = minimize_scalar(lambda lag: float(np.mean((_between(t - lag, t, told) - done) ** 2)), bounds=(0.0, 0.2), method="bounded")
+    return float(found.x)
+
+
+def follow(prototype: Prototype, plan: Plan, path: str | Path, *, law: Law | None = None, dt: float = 0.05, lead: float = 0.0) -> RunLog:
+    """Drive a plan, sent `lead` [s] early for drives that lag, or what `law` commands every `dt` [s] of the plan's time in its place, and
+    record it to `path`; t = 0 is the plan's.
 
     Raises what `Prototype.follow` raises; what was recorded until then is on disk.
     """
@@ -137,7 +152,7 @@ def follow(prototype: Prototype, plan: Plan, path: str | Path, *, law: Law | Non
     seconds = float(plan.t[-1])
     try:
         if law is None:
-            prototype.follow(lambda s: _between(s, plan.t, plan.dl), seconds)
+            prototype.follow(lambda s: _between(s + lead, plan.t, plan.dl), seconds)
         else:
             for step in range(round(seconds / dt)):
                 prototype.command(law(prototype.read().tip_position, step * dt))

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import final
 
 import numpy as np
 
 from fastrod.control import Trajectory, circle, square, triangle
-from fastrod.control.inverse import plan
+from fastrod.control.inverse import Plan, plan
 from fastrod.identification.attribution import identify
 from fastrod.identification.excite import excitation
 from fastrod.identification.result import Result
 from fastrod.robot import Robot
-from fastrod_device.experiment import Hands, Progress, Tracking, excite, follow, tracking
+from fastrod.runlog import RunLog
+from fastrod_device.experiment import Hands, Progress, Tracking, drive_lag, excite, follow, tracking
 from fastrod_device.prototype import Prototype
 
 PERIOD = 9.0
@@ -62,12 +63,23 @@ def close_loop(
     run = excitation(robot, payload=payload, turn=turn, rate=prototype.hardware.camera.rate)
     log = excite(prototype, run, hands, out / "excite.csv", progress=tell)
     _rest(prototype, hands)
-    before = [_track(prototype, name, path, robot, out / f"{name}_before.csv", tell) for name, path in paths(robot.length).items()]
-    result = identify(log, robot, progress=tell)
-    after = [
-        _track(prototype, name, path, result.identified, out / f"{name}_after.csv", tell) for name, path in paths(robot.length).items()
+    known, lag = paths(robot.length), drive_lag(log)
+    before = [
+        _track(prototype, path, robot, lag, out / f"{name}_before.csv", f"tracking before: {name}", tell) for name, path in known.items()
     ]
-    return Loop(result=result, before=before, after=after)
+    result = identify(log, robot, progress=lambda what, done, total: tell(f"identification: {what}", done, total))
+    better = result.identified
+    after = [
+        _track(prototype, path, better, lag, out / f"{name}_after.csv", f"tracking after: {name}", tell) for name, path in known.items()
+    ]
+    return Loop(
+        result=result,
+        # what is in reach is for the better model to say, in both
+        before=[
+            tracking(name, run, replace(old, nearest=new.nearest)) for name, (run, old), (_, new) in zip(known, before, after, strict=True)
+        ],
+        after=[tracking(name, run, new) for name, (run, new) in zip(known, after, strict=True)],
+    )
 
 
 def _rest(prototype: Prototype, hands: Hands) -> None:
@@ -78,8 +90,8 @@ def _rest(prototype: Prototype, hands: Hands) -> None:
     prototype.payload, prototype.base_quaternion = 0.0, own
 
 
-def _track(prototype: Prototype, name: str, path: Trajectory, model: Robot, out: Path, tell: Progress) -> Tracking:
-    tell(f"{name}: planning by the model", 0, 1)
+def _track(prototype: Prototype, path: Trajectory, model: Robot, lag: float, out: Path, stage: str, tell: Progress) -> tuple[RunLog, Plan]:
+    tell(f"{stage}, planning", 0, 2)
     made = plan(model, path.position(np.arange(0.0, PERIOD, 1.0 / RATE)), RATE, approach=APPROACH)
-    tell(f"{name}: tracking", 0, 1)
-    return tracking(name, follow(prototype, made, out), made)
+    tell(stage, 1, 2)
+    return follow(prototype, made, out, lead=lag), made
