@@ -24,6 +24,8 @@ from fastrod_device.pacer import Pacer
 from fastrod_device.tracker import Sighting
 from fastrod_device.units import Transmission
 
+ZERO_SD = 2e-5
+"""How sure the wires' zeros are, homed by camera: 0.1 mm at the tip, a fifth of it in the wires [m]."""
 _TIGHTENED = 6.0  # s in which the wires come to one tension
 _YIELD = 0.03  # of what would mend the tensions, in a cycle
 _STIFFEST = 1e-4  # m/N that a wire is taken to give at least
@@ -64,13 +66,14 @@ def home(drives: DriveBus, hardware: Hardware, clock: Clock, look: Callable[[], 
 
 
 def tightened(robot: Robot, tension: Floats) -> Robot:
-    """The robot whose wires pull with `tension` (n_tendons,) [N] where their change of length is zero. Its pretension adds to the stiffness
-    in torsion, so a model that does not know it finds another shear modulus."""
+    """The robot whose wires pull with `tension` (n_tendons,) [N] where their change of length is zero, and whose zeros are no surer than
+    homing makes them. Its pretension adds to the stiffness in torsion: a model that does not know it finds another shear modulus."""
     left = iter(tension.tolist())
     segments = tuple(
         replace(segment, tendons=tuple(replace(tendon, pretension=next(left)) for tendon in segment.tendons)) for segment in robot.segments
     )
-    return replace(robot, segments=segments)
+    fit = {"tendon.*.zero": {"sd": ZERO_SD}, **robot.fit}
+    return replace(robot, segments=segments, fit=fit)
 
 
 def softness(robot: Robot) -> Floats:

@@ -9,6 +9,7 @@ import numpy as np
 from fastrod.effect import get_effect
 from fastrod.identification.forward import Samples
 from fastrod.identification.noise import at_rest
+from fastrod.robot import Robot
 from fastrod.types import Floats
 
 _SEPARATES: dict[frozenset[str], str] = {
@@ -58,11 +59,17 @@ def look_at(pattern: str) -> str:
     return f"look at the robot: {pattern}; mend it, or register an effect of your own for it, and run again"
 
 
-def why_unknown(name: str, samples: Samples) -> str:
+def loaded(samples: Samples, robot: Robot) -> bool:
+    """A load is known: in the log, or the robot's own weight in its file."""
+    log = samples.log
+    weight = any(segment.line_density > 0.0 for segment in robot.segments) and bool(np.any(np.array(robot.gravity) != 0.0))
+    return weight or any(a is not None and bool(np.any(np.nan_to_num(a) != 0.0)) for a in (log.tip_force, log.payload))
+
+
+def why_unknown(name: str, samples: Samples, robot: Robot) -> str:
     """Why this log says nothing about a parameter of the robot."""
     log = samples.log
-    loaded = any(a is not None and np.any(np.nan_to_num(a) != 0.0) for a in (log.tip_force, log.payload))
-    if "stiffness" in name and not loaded:
+    if "stiffness" in name and not loaded(samples, robot):
         return "no known load in this log: with prescribed lengths the shape is geometry, whatever the stiffness"
     if "stiffness" in name:
         return "the known loads in this log bend the robot too little to show it"

@@ -99,7 +99,8 @@ class Base:
         return search.refined(search.refined(state))
 
     def _unseen(self, local: Local) -> dict[str, Estimate]:
-        """Base parameters whose prior this log does not narrow: Fisher information at the noise, others free."""
+        """Base parameters whose prior this log does not narrow: Fisher information at the noise, others free. And stiffnesses that nobody
+        put into `[fit]`, where no load is known: what the wires' give would show of them, any gain of the drives shows as well."""
         model = self.model
         r = local.residual(model, model.start)
         J = local.slopes(model, model.start, r)
@@ -109,13 +110,14 @@ class Base:
         fixed = {}
         posterior = np.sqrt(np.maximum(np.diag(np.linalg.pinv(H)), 0.0)) if len(sd) else sd
         for u, narrowed, prior in zip(model.unknowns, posterior, sd, strict=True):
-            if narrowed > SEEN * prior:
+            blind = "stiffness" in u.name and u.name not in model.robot.fit and not advice.loaded(self.samples, model.robot)
+            if blind or narrowed > SEEN * prior:
                 fixed[u.name] = Estimate(
                     value=u.start if u.place[0] == "robot" else u.mean,
                     stderr=float(prior),
                     unit=u.unit,
                     identifiable=False,
-                    why=advice.why_unknown(u.name, self.samples),
+                    why=advice.why_unknown(u.name, self.samples, model.robot),
                     prior_sd=float(prior),
                 )
         return fixed
