@@ -6,8 +6,28 @@ import argparse
 from pathlib import Path
 from typing import NoReturn
 
-ACTIONS = ("teleop", "excite", "track", "loop", "calibrate", "register")
-"""What `fastrod drive` can do."""
+from fastrod.errors import UnknownNameError, nearest
+
+ACTIONS = {
+    "teleop": "by hand, in the browser",
+    "excite": "the run that separates effects, recorded for `fastrod identify`",
+    "track": "one turn of a path, by the model or by a policy, recorded",
+    "loop": "excite, identify, plan anew, track; the error before and after",
+    "calibrate": "the camera's lens, from pictures of a charuco board that is waved; no drives needed",
+    "register": "where the camera stands, from pictures of a board at known places; no drives needed",
+    "latency": "how late the camera is, from a motion of some seconds",
+}
+"""What `fastrod drive` can do, and what that is."""
+BOARD_ACTIONS = ("calibrate", "register")
+"""Those that need a camera and a board, and no drives."""
+_MOVING = tuple(name for name in ACTIONS if name not in BOARD_ACTIONS)
+_OF: dict[str, tuple[str, ...]] = {
+    "eds": _MOVING, "no_home": _MOVING, "path": ("track",),
+    "policy": ("track",), "payload": ("excite", "loop"), "views": BOARD_ACTIONS, "board": BOARD_ACTIONS, "square": BOARD_ACTIONS,
+    "board_marker": BOARD_ACTIONS, "dictionary": BOARD_ACTIONS, "at": ("register",), "port": ("teleop",), "no_open": ("teleop",),
+    "out": tuple(name for name in ACTIONS if name != "teleop"), "bus": _MOVING,
+}  # fmt: skip
+"""Options of `fastrod drive` that are not of every action."""
 
 
 class UsageError(Exception):
@@ -74,24 +94,16 @@ def build() -> tuple[argparse.ArgumentParser, list[str]]:
     view.add_argument("--host", default="127.0.0.1", metavar="H", help="address to listen on (default: 127.0.0.1, this machine alone)")
     view.add_argument("--no-open", action="store_true", help="do not open a browser")
 
-    drive = commands.add_parser("drive", help="the prototype, or its emulator: by hand, through a run, along a path, or the whole loop")
-    drive.add_argument("action", nargs="?", default="teleop", metavar="ACTION", help=f"{', '.join(ACTIONS)} (default: teleop)")
-    drive.add_argument("--bus", metavar="INTERFACE:CHANNEL", help="of the drives, such as socketcan:can0")
-    drive.add_argument("--emulate", action="store_true", help="the emulator in place of drives and camera")
-    drive.add_argument("--hardware", type=Path, metavar="FILE", help="drives, limits, camera and marker (default: the paper's prototype)")
-    drive.add_argument("--robot", metavar="R", help="its model in place of the hardware file's; an identified.toml, say")
-    drive.add_argument("--eds", type=Path, metavar="FILE", help="the drives' object dictionary (default: built in)")
-    drive.add_argument("--camera", default="0", metavar="DEVICE", help="number or path of the video device, or none (default: 0)")
-    drive.add_argument("--seed", type=int, metavar="S", help="of what the emulator hides (default: nobody knows it)")
-    drive.add_argument("--real-time", action="store_true", help="an emulator as slow as a robot, where nobody watches either")
-    drive.add_argument("--path", metavar="P", help="track: triangle, square or circle (default: circle)")
-    drive.add_argument("--policy", metavar="POLICY", help="track: by a policy of Track, a folder or `shipped` (default: by the model)")
-    drive.add_argument("--payload", type=float, metavar="KG", help="known mass of excite and loop (default: one that suits)")
-    drive.add_argument("--views", type=int, default=25, metavar="N", help="calibrate, register: pictures of the board (default: 25)")
-    drive.add_argument("--out", type=Path, metavar="OUT", help="file that excite and track record to, folder of loop")
-    drive.add_argument("--port", type=int, metavar="P", help="teleop: default the first free one from 8080 on")
-    drive.add_argument("--no-open", action="store_true", help="teleop: do not open a browser")
-    drive.add_argument("--no-home", action="store_true", help="the wires are taut and zero where they should be; do not wind them")
+    _add_drive(
+        commands.add_parser(
+            "drive", help="the prototype, or its emulator: by hand, through a run, along a path, or the whole loop",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            description="The prototype on its bus, or its emulator.\n\nactions:\n"
+            + "\n".join(f"  {name:<11}{what}" for name, what in ACTIONS.items()),
+            epilog="exit code:\n  0  done\n  1  the bench does not answer, was stopped on the way, or what it measured does not tell;\n"
+            "     what was recorded until then is kept\n  2  the words or a file are wrong, and nothing has moved",
+        )
+    )  # fmt: skip
 
     envs = commands.add_parser("envs", help="the environments; of one, its task, observation, action and options")
     envs.add_argument("env", nargs="?", metavar="ENV", help="a task, such as Reach or fastrod/Reach-v0 (default: a line for each)")
@@ -126,6 +138,79 @@ def build() -> tuple[argparse.ArgumentParser, list[str]]:
     bench.add_argument("name", nargs="?", metavar="NAME", help="one benchmark (default: all)")
     bench.add_argument("--json", action="store_true", help="print JSON to stdout and nothing else")
     return parser, list(commands.choices)
+
+
+def check_drive(arguments: argparse.Namespace) -> None:
+    """Raises `UnknownNameError` for an action that there is not, `UsageError` for options of `fastrod drive` that do not go together."""
+    action = arguments.action
+    if action not in ACTIONS:
+        raise UnknownNameError(f"no action {action!r} of fastrod drive; {nearest(action, ACTIONS)}")
+
+    def given(name: str) -> bool:
+        return getattr(arguments, name) not in (None, False)
+
+    for name, actions in _OF.items():
+        if given(name) and action not in actions:
+            flag = f"--{name.replace('_', '-')}"
+            raise UsageError(f"{flag} is not for {action}, but for {', '.join(actions)}; `fastrod drive --help` says how it is used.")
+    if action in _MOVING and arguments.emulate == given("bus"):
+        raise UsageError("give --bus INTERFACE:CHANNEL or --emulate, and not both; `fastrod drive --help` says how it is used.")
+    for name, emulated in (("camera", False), ("eds", False), ("seed", True), ("real_time", True)):
+        if given(name) and arguments.emulate != emulated:
+            where = "with --emulate only" if emulated else "for a real bench, not with --emulate"
+            raise UsageError(f"--{name.replace('_', '-')} is {where}; `fastrod drive --help` says how it is used.")
+    if arguments.camera == "none" and action != "teleop":
+        raise UsageError(f"--camera none is for teleop alone; {action} needs a camera.")
+
+
+def _add_drive(drive: argparse.ArgumentParser) -> None:
+    drive.add_argument("action", nargs="?", default="teleop", metavar="ACTION", help="one of those above (default: teleop)")
+    files = "file that excite and track record to, folder of loop, camera file of calibrate, register and latency"
+    drive.add_argument("--out", type=Path, metavar="OUT", help=f"{files}; never one that is there already")
+
+    bench = drive.add_argument_group("the bench")
+    bench.add_argument("--bus", metavar="INTERFACE:CHANNEL", help="of the drives, such as socketcan:can0")
+    bench.add_argument("--emulate", action="store_true", help="the emulator in place of drives and camera")
+    bench.add_argument("--hardware", type=Path, metavar="FILE", help="drives, limits, camera and marker (default: the paper's prototype)")
+    bench.add_argument("--robot", metavar="R", help="its model in place of the hardware file's; an identified.toml, say")
+    bench.add_argument("--no-home", action="store_true", help="the wires are taut and zero where they should be; do not wind them")
+
+    real = drive.add_argument_group("a real bench")
+    real.add_argument("--camera", metavar="DEVICE", help="number or path of the video device; for teleop also none (default: 0)")
+    real.add_argument("--eds", type=Path, metavar="FILE", help="the drives' object dictionary (default: built in)")
+
+    emulator = drive.add_argument_group("the emulator")
+    emulator.add_argument("--seed", type=int, metavar="S", help="of what it hides (default: nobody knows it)")
+    emulator.add_argument("--real-time", action="store_true", help="as slow as a robot, where nobody watches either; teleop always is")
+
+    runs = drive.add_argument_group("track, excite, loop")
+    runs.add_argument("--path", metavar="P", help="track: triangle, square or circle (default: circle)")
+    runs.add_argument("--policy", metavar="POLICY", help="track: by a policy of Track, a folder or `shipped` (default: by the model)")
+    runs.add_argument("--payload", type=float, metavar="KG", help="excite, loop: known mass at the tip (default: one that suits)")
+
+    board = drive.add_argument_group("calibrate, register")
+    board.add_argument("--views", type=int, metavar="N", help="pictures of the board (default: 25)")
+    board.add_argument("--board", type=_grid, metavar="CxR", help="squares side by side, and one below the other (default: 7x5)")
+    board.add_argument("--square", type=float, metavar="M", help="side of a square, as measured on the print (default: 0.02 m)")
+    board.add_argument("--board-marker", type=float, metavar="M", help="side of a marker in it (default: 0.75 of a square)")
+    board.add_argument("--dictionary", metavar="NAME", help="OpenCV's name of its markers (default: DICT_5X5_100)")
+    board.add_argument(
+        "--at", type=float, nargs=7, action="append", metavar=("X", "Y", "Z", "QW", "QX", "QY", "QZ"),
+        help="register: where the board is, base_from_board [m] and quaternion; its origin is the outer corner at the print's top left, "
+        "x right, y down, z into the paper. Several times: it is put there in turn",
+    )  # fmt: skip
+
+    page = drive.add_argument_group("teleop")
+    page.add_argument("--port", type=int, metavar="P", help="default: the first free one from 8080 on")
+    page.add_argument("--no-open", action="store_true", help="do not open a browser")
+
+
+def _grid(word: str) -> tuple[int, int]:
+    """7x5 as columns and rows."""
+    columns, _, rows = word.partition("x")
+    if not (columns.isdigit() and rows.isdigit()):
+        raise argparse.ArgumentTypeError(f"{word!r} is not COLUMNSxROWS, such as 7x5")
+    return int(columns), int(rows)
 
 
 def _add_options(command: argparse.ArgumentParser) -> None:

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fastrod.arguments import ACTIONS, UsageError, build
+from fastrod.arguments import BOARD_ACTIONS, UsageError, build, check_drive
 from fastrod.errors import FastrodError, InputError, UnknownNameError, nearest
 
 if TYPE_CHECKING:
@@ -176,16 +176,20 @@ def _view(arguments: argparse.Namespace) -> int:
 
 
 def _drive(arguments: argparse.Namespace) -> int:
-    if arguments.action not in ACTIONS:
-        raise UnknownNameError(f"no action {arguments.action!r} of fastrod drive; {nearest(arguments.action, ACTIONS)}")
-    if arguments.emulate == (arguments.bus is not None):
-        raise UsageError("give --bus INTERFACE:CHANNEL or --emulate, and not both; `fastrod drive --help` says how it is used.")
-    for module in ("can", "canopen", "cv2"):
+    """A bench that does not answer or is stopped on the way, a plan that it refused, measurements that do not tell: all that failed."""
+    check_drive(arguments)
+    for module in ("cv2",) if arguments.action in BOARD_ACTIONS else ("can", "canopen", "cv2"):
         _need(module, "drive", "device")
     from fastrod import driving
+    from fastrod_device.errors import CalibrationError, DeviceError, RefusedError
 
     with _progress() as bar:
-        return driving.ACTIONS[arguments.action](arguments, bar)
+        try:
+            return driving.ACTIONS[arguments.action](arguments, bar)
+        except (DeviceError, CalibrationError, RefusedError) as error:
+            return _refuse(str(error), FAILED)
+        except EOFError:
+            return _refuse("nobody answers; give it a terminal, as it asks for loads and boards.", FAILED)
 
 
 def _envs(arguments: argparse.Namespace) -> int:

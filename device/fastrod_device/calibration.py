@@ -70,6 +70,44 @@ class CharucoBoard:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class BoardView:
+    """Corners of a board in one picture."""
+
+    points: Floats
+    """(n, 3) on the board [m]."""
+    pixels: Floats
+    """(n, 2) in the picture [px]."""
+    why: str
+    """Why it cannot be used; empty where it can."""
+
+
+@final
+class BoardFinder:
+    """Finds the inner corners of a board."""
+
+    def __init__(self, board: CharucoBoard) -> None:
+        import cv2
+
+        self.board = board
+        shape = board.opencv()
+        self._places: Floats = np.asarray(shape.getChessboardCorners(), dtype=np.float64)
+        self._detector = cv2.aruco.CharucoDetector(shape)
+
+    def find(self, image: Picture) -> BoardView:
+        """What a picture (h, w) shows of it; the board may stick out of it."""
+        corners, ids, _, _ = self._detector.detectBoard(image)
+        numbers = np.ravel(ids).astype(int) if ids is not None else np.zeros(0, dtype=int)
+        points, n = self._places[numbers], len(numbers)
+        if n < _LEAST_CORNERS:
+            why = f"{n} corners seen, {_LEAST_CORNERS} are needed" if n else "no board seen"
+            return BoardView(points=points, pixels=np.asarray(corners if n else [], dtype=np.float64).reshape(-1, 2), why=why)
+        pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+        if min(np.ptp(points[:, 0]), np.ptp(points[:, 1])) < 0.5 * self.board.square:
+            return BoardView(points=points, pixels=pixels, why="its corners lie on one line")
+        return BoardView(points=points, pixels=_sharpened(image, pixels, self.board), why="")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class CameraCalibration:
     """Intrinsics of a camera, and how well they are known."""
 
@@ -214,26 +252,11 @@ def _size(images: Sequence[Picture]) -> tuple[int, int]:
 
 def _corners(images: Sequence[Picture], board: CharucoBoard) -> tuple[list[int], list[tuple[int, str]], list[Floats], list[Floats]]:
     """Index of each good view, each other one and why; corners on the board (n, 3) [m] and in the picture (n, 2) [px] of the good ones."""
-    import cv2
-
-    shape = board.opencv()
-    detector = cv2.aruco.CharucoDetector(shape)
-    used, refused, points, pixels = [], [], [], []
-    for k, image in enumerate(images):
-        corners, ids, _, _ = detector.detectBoard(image)
-        n = 0 if ids is None else len(ids)
-        numbers = np.ravel(ids).astype(int) if n else np.zeros(0, dtype=int)
-        if n < _LEAST_CORNERS:
-            refused.append((k, f"{n} corners seen, {_LEAST_CORNERS} are needed" if n else "no board seen"))
-            continue
-        place = np.asarray(shape.getChessboardCorners(), dtype=np.float64)[numbers]
-        if min(np.ptp(place[:, 0]), np.ptp(place[:, 1])) < 0.5 * board.square:
-            refused.append((k, "its corners lie on one line"))
-            continue
-        used.append(k)
-        points.append(place)
-        pixels.append(_sharpened(image, np.asarray(corners, dtype=np.float64).reshape(-1, 2), board))
-    return used, refused, points, pixels
+    finder = BoardFinder(board)
+    views = [finder.find(image) for image in images]
+    used = [k for k, view in enumerate(views) if not view.why]
+    refused = [(k, view.why) for k, view in enumerate(views) if view.why]
+    return used, refused, [views[k].points for k in used], [views[k].pixels for k in used]
 
 
 def _sharpened(image: Picture, corners: Floats, board: CharucoBoard) -> Floats:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import threading
 import tomllib
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, TypeAlias, final
+from typing import TYPE_CHECKING, Protocol, TypeAlias, TypeVar, final
 
 import msgspec
 import numpy as np
@@ -22,11 +22,13 @@ from fastrod_device.errors import DeviceError
 
 if TYPE_CHECKING:
     import cv2
+    from _typeshed import DataclassInstance
 
 Picture: TypeAlias = NDArray[np.uint8]
 """(h, w) grey levels."""
 Pose: TypeAlias = tuple[Floats, Floats]
 """a_from_b: position (3,) of b in a [m], and quaternion (4,) w x y z."""
+Described = TypeVar("Described", bound="DataclassInstance")
 Row: TypeAlias = tuple[float, float, float]
 """Three numbers."""
 
@@ -142,15 +144,30 @@ def load_camera(path: str | Path) -> Camera:
         raise InputError(f"{where} cannot be read: {getattr(error, 'strerror', None) or error}.") from error
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{where} is not TOML: {error}.") from error
-    known = [f.name for f in fields(Camera)]
-    for key in data:
+    return from_table(Camera, data, where)
+
+
+def from_table(kind: type[Described], table: object, where: str) -> Described:
+    """A dataclass of a TOML file's table; `where`, file and table, begins every sentence.
+
+    Raises `InputError` for what is no such table, `UnknownNameError` for a key or a name in it that is not known.
+    """
+    if not isinstance(table, dict):
+        raise InputError(f"{where} is {table!r}; it must be a table.")
+    known = {f.name: f.default is MISSING for f in fields(kind)}
+    for key in table:
         if key not in known:
             raise UnknownNameError(f"{where} has an unknown key {key!r}; {nearest(key, known)}")
+    if missing := [name for name, needed in known.items() if needed and name not in table]:
+        raise InputError(f"{where} lacks {', '.join(missing)}.")
     try:
-        return msgspec.convert(data, Camera)
+        return msgspec.convert(table, kind)
+    except UnknownNameError as error:
+        raise UnknownNameError(f"{where}: {error}") from error
     except msgspec.ValidationError as error:
-        sentence = str(error).replace("`", "'")
-        raise InputError(f"{where}: {sentence}{'' if sentence.endswith(('.', '?')) else '.'}") from error
+        sentence, _, place = str(error).replace("`", "'").partition(" - at '$")
+        key = place.rstrip("'").lstrip(".")
+        raise InputError(f"{where}: {f'{key}: ' if key else ''}{sentence}{'' if sentence.endswith(('.', '?')) else '.'}") from error
 
 
 def save_camera(camera: Camera, path: str | Path) -> None:

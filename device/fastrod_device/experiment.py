@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,9 @@ from typing import Protocol, final
 import numpy as np
 
 from fastrod.control.inverse import Plan
+from fastrod.errors import InputError
 from fastrod.identification.excite import Excitation
+from fastrod.recording import Recorder
 from fastrod.runlog import RunLog, numbers
 from fastrod.types import Flags, Floats
 from fastrod_device.prototype import Prototype
@@ -73,12 +76,13 @@ def excite(prototype: Prototype, run: Excitation, hands: Hands, path: str | Path
             t, dl = log.t[start : end + 1] - log.t[start], log.dl[start : end + 1]
             for piece in _pieces(t[-1] if end < len(log) else t[-1] + np.diff(log.t[-2:])[0]):
                 prototype.follow(lambda s, t=t, dl=dl, began=piece[0]: _between(began + s, t, dl), piece[1])  # type: ignore[misc]
-                tell("excitation", start + int((piece[0] + piece[1]) / t[-1] * (end - start)), len(log))
+                tell("excitation", min(start + int((piece[0] + piece[1]) / t[-1] * (end - start)), end), len(log))
             prototype.record(None)
-    finally:
-        prototype.record(None)
-        made = recorder.stop()
-    return made
+    except BaseException:
+        _saved(prototype, recorder)
+        raise
+    prototype.record(None)
+    return recorder.stop()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -158,10 +162,18 @@ def follow(prototype: Prototype, plan: Plan, path: str | Path, *, law: Law | Non
                 prototype.command(law(prototype.read().tip_position, step * dt))
                 prototype.wait(dt)
         prototype.wait(2.0 / prototype.hardware.camera.rate + prototype.hardware.camera.latency)
-    finally:
-        prototype.record(None)
-        made = recorder.stop()
-    return made
+    except BaseException:
+        _saved(prototype, recorder)
+        raise
+    prototype.record(None)
+    return recorder.stop()
+
+
+def _saved(prototype: Prototype, recorder: Recorder) -> None:
+    """Write what was recorded until it broke off; nothing may hide why it did."""
+    prototype.record(None)
+    with contextlib.suppress(InputError):
+        recorder.stop()
 
 
 def tracking(name: str, log: RunLog, plan: Plan) -> Tracking:

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
-from fastrod.errors import InputError, nearest
+from fastrod.errors import InputError, UnknownNameError, nearest
 from fastrod.robot import Robot
 from fastrod.robotfile import load_robot
-from fastrod_device.camera import Camera, Marker
+from fastrod_device.camera import Camera, Marker, from_table, load_camera
 from fastrod_device.safety import Limits
 from fastrod_device.units import DriveSpec
 
+SHIPPED = Path(str(files("fastrod_device") / "prototype.toml"))
+"""The hardware file that ships: the paper's prototype."""
+_NEEDED = ("robot", "camera", "marker", "drive")
+_NUMBERS = ("rate", "pretension", "homing_speed")
 _SLOWEST, _QUICKEST = 50.0, 500.0  # Hz
 
 
@@ -39,8 +41,11 @@ class Hardware:
     """Of a wire [m/s]."""
 
     def __post_init__(self) -> None:
-        if len(self.drives) != self.robot.n_tendons:
-            raise InputError(f"there are {len(self.drives)} drives and robot {self.robot.name!r} has {self.robot.n_tendons} tendons.")
+        nodes = [spec.node for spec in self.drives]
+        if len(nodes) != self.robot.n_tendons:
+            raise InputError(f"there are {len(nodes)} drives and robot {self.robot.name!r} has {self.robot.n_tendons} tendons.")
+        if len(set(nodes)) != len(nodes):
+            raise InputError(f"the drives have node ids {nodes}; each must be there once.")
         for name, low, high, unit in (
             ("rate", _SLOWEST, _QUICKEST, "Hz"), ("pretension", 0.01, self.limits.tension, "N"), ("homing_speed", 1e-4, 0.1, "m/s"),
         ):  # fmt: skip
@@ -50,44 +55,56 @@ class Hardware:
 
 
 def load_hardware(path: str | Path | None = None, robot: Robot | None = None) -> Hardware:
-    """The hardware in a .toml, by default the one that ships: the paper's prototype. `robot` takes the place of the file's model, as
-    `identify` has made it. Raises `InputError` with the key that is wrong, `RobotError` for its robot."""
-    where = "prototype.toml" if path is None else str(path)
-    try:
-        text = (files("fastrod_device") / "prototype.toml" if path is None else Path(path)).read_text(encoding="utf-8")
-        data = tomllib.loads(text)
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"hardware file {where!r} cannot be read: {getattr(error, 'strerror', None) or error}.") from error
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"hardware file {where!r} is not TOML: {error}.") from error
-    known = {"robot": str, "drive": list[DriveSpec], "limits": Limits, "camera": Camera, "marker": Marker}
-    known |= dict.fromkeys(("rate", "pretension", "homing_speed"), float)
-    made: dict[str, Any] = {}
-    for key, value in data.items():
+    """The hardware in a .toml, by default the one that ships, `SHIPPED`.
+
+    `camera` is a table, or the name of a camera file beside the hardware file; `robot` a shipped one's name, or a file beside it. The
+    argument `robot` takes the place of the file's model, as `identify` has made it. Raises, with file, table and key, `InputError` for what
+    is wrong, `UnknownNameError` for what is not known, `RobotError` for the robot.
+    """
+    source = SHIPPED if path is None else Path(path)
+    where = f"hardware file {(source.name if path is None else str(path))!r}"
+    data = _read(source, where)
+    known = (*_NEEDED, "limits", *_NUMBERS)
+    for key in data:
         if key not in known:
-            raise InputError(f"hardware file {where!r} has an unknown key {key!r}; {nearest(key, known)}")
-        made[key] = _made(key, value, known[key], where)
-    if missing := [name for name in ("robot", "drive", "camera", "marker") if name not in made]:
-        raise InputError(f"hardware file {where!r} lacks {missing[0]!r}.")
-    own = made.pop("robot")
-    model = load_robot(own if path is None or not (beside := Path(path).parent / own).is_file() else beside) if robot is None else robot
-    return Hardware(robot=model, drives=tuple(made.pop("drive")), limits=made.pop("limits", Limits()), **made)
-
-
-def _made(key: str, value: Any, kind: Any, where: str) -> Any:
-    tables = value if isinstance(value, list) else [value]
-    for table in tables if key != "robot" else []:
-        if isinstance(table, dict) and (bad := [name for name in table if name not in {f.name for f in fields(_class(kind))}]):
-            raise InputError(f"hardware file {where!r}: {key} has an unknown key {bad[0]!r}; {nearest(bad[0], _names(kind))}")
+            raise UnknownNameError(f"{where} has an unknown key {key!r}; {nearest(key, known)}")
+    if missing := [name for name in _NEEDED if name not in data]:
+        raise InputError(f"{where} lacks {', '.join(missing)}.")
+    if not isinstance(data["drive"], list):
+        raise InputError(f"{where}: drive is one table; write [[drive]], in double brackets, one for each wire.")
+    drives = tuple(from_table(DriveSpec, table, f"{where}: drive {k}") for k, table in enumerate(data["drive"], 1))
+    limits = from_table(Limits, data.get("limits", {}), f"{where}: [limits]")
+    marker = from_table(Marker, data["marker"], f"{where}: [marker]")
+    camera = _camera(data["camera"], source, where)
+    model = _robot(data["robot"], source, where) if robot is None else robot
+    numbers = {name: data[name] for name in _NUMBERS if name in data}
     try:
-        return msgspec.convert(value, kind)
-    except msgspec.ValidationError as error:
-        raise InputError(f"hardware file {where!r}: {key}: {error}") from error
+        return Hardware(robot=model, drives=drives, limits=limits, camera=camera, marker=marker, **numbers)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
 
 
-def _class(kind: Any) -> Any:
-    return kind.__args__[0] if hasattr(kind, "__args__") else kind
+def _read(path: Path, where: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{where} cannot be read: {getattr(error, 'strerror', None) or error}.") from error
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{where} is not TOML: {error}.") from error
 
 
-def _names(kind: Any) -> list[str]:
-    return [f.name for f in fields(_class(kind))]
+def _camera(given: object, hardware_file: Path, where: str) -> Camera:
+    """Of a table, or of a file that is named in its place."""
+    if not isinstance(given, str):
+        return from_table(Camera, given, f"{where}: [camera]")
+    if not (beside := hardware_file.parent / given).is_file():
+        raise InputError(f"{where}: camera is {given!r}, and there is no file {str(beside)!r}; give a camera file, or a table [camera].")
+    return load_camera(beside)
+
+
+def _robot(given: object, hardware_file: Path, where: str) -> Robot:
+    """Of a file beside the hardware file, or one that ships."""
+    if not isinstance(given, str):
+        raise InputError(f"{where}: robot is {given!r}; give a shipped robot's name, or a robot file's in quotes.")
+    beside = hardware_file.parent / given
+    return load_robot(beside if beside.is_file() else given)

@@ -10,13 +10,20 @@ import numpy as np
 
 from fastrod.errors import InputError
 from fastrod.types import Floats
+from fastrod.wiring import wire
 from fastrod_device.errors import CalibrationError
+from fastrod_device.hardware import Hardware
+from fastrod_device.prototype import Prototype
 
 _EARLY = 0.25  # a camera may also be said to be later than it is: searched before zero, as a part of `longest`
 _STEP = 0.004  # of the coarse search [s]
 _LEAST_ROWS = 30
 _LEAST_EXPLAINED = 0.5  # of the positions' variance
 _LARGEST_ERROR = 0.1  # standard error, as a part of `longest`
+_SWEEP, _RAMP = 15.0, 1.5  # s that the robot moves, and in which the motion grows and fades
+_BEND, _WAVES = 0.6, (0.45, 0.31)  # rad at most, and Hz to either side: never the same twice
+_PART = 0.5  # of what the limits allow
+_PLAYS = (0.05, 0.15)  # half widths of lost motion, as parts of the largest motion
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,6 +98,62 @@ def estimate_latency(t_motion: Floats, motion: Floats, t_camera: Floats, positio
     if not stderr < _LARGEST_ERROR * longest:
         raise CalibrationError(f"the delay is uncertain by {1e3 * stderr:.0f} ms; move the tip farther and faster, to and fro.")
     return Latency(delay=delay, stderr=stderr)
+
+
+def measure_latency(prototype: Prototype) -> Latency:
+    """Move the robot to and fro for some seconds, within half of its limits, and compare encoders with sightings.
+
+    The delay is beyond `Camera.latency` of its hardware: sightings are stamped by that. Friction and backlash make the tip late, too, the
+    more the slower it moves; so the tip is fitted with the wires and with what a play of two widths would leave of them, and the sweep has
+    two frequencies. A sixth of what they would count for may remain. It ends where it began. Raises what a stopped prototype raises, and
+    `CalibrationError` where the sightings do not tell.
+    """
+    start, began = prototype.commanded, prototype.clock.now()
+    dt = 1.0 / prototype.hardware.rate
+    motion: list[tuple[float, Floats]] = []
+    seen: list[tuple[float, Floats]] = []
+    while (t := prototype.clock.now() - began) < _SWEEP:
+        prototype.command(start + sweep(prototype.hardware, np.array([t]))[0])
+        prototype.wait(dt)
+        readings, sighting = prototype.readings, prototype.sighting
+        if readings is not None and (not motion or readings.t > motion[-1][0]):
+            motion.append((readings.t, readings.dl))
+        if sighting is not None and sighting.ok and sighting.t >= began and (not seen or sighting.t > seen[-1][0]):
+            seen.append((sighting.t, sighting.position))
+    if not motion or not seen:
+        raise CalibrationError(f"the camera saw the marker {len(seen)} times in {_SWEEP:g} s; {_LEAST_ROWS} times or more are needed.")
+    (t_motion, dl), (t_camera, position) = ((np.array([t for t, _ in rows]), np.stack([row for _, row in rows])) for rows in (motion, seen))
+    largest = float(np.abs(dl - dl[0]).max())
+    return estimate_latency(t_motion, np.concatenate([dl, *(play(dl, part * largest) for part in _PLAYS)], axis=1), t_camera, position)
+
+
+def play(motion: Floats, half_width: float) -> Floats:
+    """(m, k) what follows a motion (m, k) through a gap: it stays until the motion is `half_width` away, and is dragged then."""
+    at, followed = motion[0], np.empty_like(motion)
+    for k, row in enumerate(motion):
+        at = np.clip(at, row - half_width, row + half_width)
+        followed[k] = at
+    return followed
+
+
+def sweep(hardware: Hardware, t: Floats) -> Floats:
+    """(n, n_tendons) changes of wire length [m] at times (n,) [s] of `measure_latency`'s motion: all segments bend alike, to and fro."""
+    wiring, limits = wire(hardware.robot), hardware.limits
+    whole = np.arange(0.0, _SWEEP, 1.0 / hardware.rate)
+
+    def wires(times: Floats) -> Floats:
+        grown = np.clip(np.minimum(times, _SWEEP - times) / _RAMP, 0.0, 1.0)
+        bend = _BEND / wiring.n_segments * grown[:, None] * np.sin(2.0 * np.pi * np.outer(times, _WAVES))
+        return wiring.wires(np.repeat(bend[:, None], wiring.n_segments, axis=1))
+
+    way = wires(whole)
+    bends = _BEND * math.sqrt(2.0) / wiring.n_segments
+    asked = (
+        float(np.abs(np.diff(way, axis=0)).max()) * hardware.rate / limits.rate,
+        float(np.abs(way).max()) / limits.displacement,
+        bends / float(wiring.length.min()) / limits.curvature,
+    )
+    return wires(t) * min(1.0, _PART / max(asked))
 
 
 def _directions(motion: Floats) -> Floats:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import itertools
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from fastrod.errors import InputError
-from fastrod_device.camera import FrameSource, VideoCamera
-from fastrod_device.clock import SteppedClock, WallClock
+from fastrod_device.boards import AskingBoardHands, BoardEye, BoardHands, bent, moved
+from fastrod_device.calibration import CharucoBoard
+from fastrod_device.camera import Camera, FrameSource, VideoCamera
+from fastrod_device.clock import Clock, SteppedClock, WallClock
 from fastrod_device.emulator import Emulator
 from fastrod_device.experiment import AskingHands, Hands
 from fastrod_device.hardware import Hardware
@@ -33,6 +36,17 @@ class Bench:
     """None where the prototype is real."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BoardBench:
+    """A camera and who shows a board to it."""
+
+    source: FrameSource
+    hands: BoardHands
+    clock: Clock
+    truth: Camera | None
+    """What an emulated camera is and where it stands; None where it is real."""
+
+
 @contextmanager
 def emulated(
     hardware: Hardware, *, seed: int | None = None, effect: str | None = None, stepped: bool = True, bus: str | None = None,
@@ -40,11 +54,12 @@ def emulated(
 ) -> Iterator[Bench]:  # fmt: skip
     """The emulator, started, with a sealed plant: `seed` draws what is hidden (None: nobody knows), `effect` names it for those who test.
 
-    `stepped` runs as fast as the machine computes; otherwise in real time. `bus`: None is a virtual one of its own.
+    `stepped` runs as fast as the machine computes; otherwise in real time. `bus`: None is a virtual one of its own. Without `home` the
+    wires are taut from the start.
     """
     clock = SteppedClock() if stepped else WallClock()
     name = bus or f"virtual:fastrod-{next(_COUNT)}"
-    emulator = Emulator(hardware, name, clock=clock, seal=seal(seed, effect, scatter=_SCATTER), seed=0 if seed is None else seed)
+    emulator = Emulator(hardware, name, clock=clock, seal=seal(seed, effect, scatter=_SCATTER), seed=seed or 0, taut=not home)
     try:
         with Prototype(hardware, name, emulator, clock=clock, journal=Journal(journal)) as prototype:
             prototype.start(home=home)
@@ -64,7 +79,36 @@ def real(
     """
     if ":" not in bus:
         raise InputError(f"--bus is {bus!r}; give INTERFACE:CHANNEL, such as socketcan:can0.")
-    source: FrameSource | None = None if camera is None else VideoCamera(camera, hardware.camera)
-    with Prototype(hardware, bus, source, eds=eds, journal=Journal(journal)) as prototype:
-        prototype.start(home=home)
-        yield Bench(prototype=prototype, hands=AskingHands(), emulator=None)
+    source: FrameSource | None = None if camera is None else VideoCamera(hardware.camera, camera)
+    try:
+        with Prototype(hardware, bus, source, eds=eds, journal=Journal(journal)) as prototype:
+            prototype.start(home=home)
+            yield Bench(prototype=prototype, hands=AskingHands(), emulator=None)
+    finally:
+        if source is not None:
+            source.close()
+
+
+@contextmanager
+def emulated_board(
+    camera: Camera, board: CharucoBoard, *, lens: bool, seed: int | None = None, stepped: bool = True
+) -> Iterator[BoardBench]:
+    """A camera whose frames are drawn: with another lens than `camera` has, or, without `lens`, at another place; `seed` draws which (None:
+    nobody knows). Raises `InputError` for a seed that is none."""
+    clock: Clock = SteppedClock() if stepped else WallClock()
+    drawn = secrets.randbits(63) if seed is None else seed
+    if drawn < 0:
+        raise InputError(f"seed is {seed!r}; it must be a whole number from 0.")
+    truth = bent(camera, drawn) if lens else moved(camera, drawn)
+    eye = BoardEye(truth, board, clock=clock, seed=drawn)
+    yield BoardBench(source=eye, hands=eye, clock=clock, truth=truth)
+
+
+@contextmanager
+def real_board(camera: Camera, device: int | str) -> Iterator[BoardBench]:
+    """The video device as `camera`, and a person who holds the board. Raises `DeviceError` where it cannot be opened."""
+    source = VideoCamera(camera, device)
+    try:
+        yield BoardBench(source=source, hands=AskingBoardHands(), clock=WallClock(), truth=None)
+    finally:
+        source.close()
