@@ -37,7 +37,9 @@ def _teleop(arguments: argparse.Namespace, _: Progress | None) -> int:
     import io
     import signal
     import sys
+    import webbrowser
 
+    from fastrod_device.pacer import ordinary, urgent
     from fastrod_viewer.app import view
     from fastrod_viewer.server import serve
     from fastrod_viewer.worlds import FreeWorld
@@ -47,6 +49,7 @@ def _teleop(arguments: argparse.Namespace, _: Progress | None) -> int:
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # homing, too, ends with the drives switched off
     hardware = _hardware(arguments)
+    urgent(1)  # all threads of the page, too: one that waits for its turn holds up those of the drives
     server = serve(port=arguments.port)  # a port that is taken is no news for after the homing
     say("Preparing the model ...")
     FreeWorld(hardware.robot).jacobian()  # compiled or loaded now: nothing may hold up the drives later
@@ -57,9 +60,14 @@ def _teleop(arguments: argparse.Namespace, _: Progress | None) -> int:
         with _bench(arguments, hardware, stepped=False) as bench:
             say(f"Ready. {bench.prototype.supervisor.status}")
             model = FreeWorld(bench.prototype.robot)
-            view(model, link=bench.prototype, server=server, open_browser=not arguments.no_open)
+            if not arguments.no_open:
+                ordinary()  # a browser must not come before other programs
+                webbrowser.open(f"http://localhost:{server.get_port()}")
+                urgent(1)
+            view(model, link=bench.prototype, server=server, open_browser=False)
         say("The drives are switched off.")
     finally:
+        ordinary()
         sys.setswitchinterval(switches)
         with contextlib.redirect_stdout(io.StringIO()):  # it says goodbye
             server.stop()

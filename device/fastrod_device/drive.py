@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal, final
 import numpy as np
 
 from fastrod.errors import InputError, UnknownNameError, nearest
-from fastrod.types import Ints
+from fastrod.types import Floats, Ints
 from fastrod_device.bus import Line
 from fastrod_device.clock import Clock
 from fastrod_device.configuring import Configurator, DriveLimits
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 Mode = Literal["csp", "ppm"]
 _MODES = {"csp": 8, "ppm": 1}
-_ENABLING = 2.0  # s
+_ENABLING, _RAMP = 2.0, 0.2  # s
 _REACHED, _ACKNOWLEDGED, _ERROR = 0x0400, 0x1000, 0x2000  # bits of the statusword; homing: attained, error
 
 
@@ -274,7 +274,7 @@ class DriveBus:
         return feedback
 
     def homing(
-        self, threshold: Ints, speed: Ints | float, *, acceleration: float = 20_000.0, offset: Ints | None = None,
+        self, threshold: Ints, speed: Floats | Ints | float, *, acceleration: float = 20_000.0, offset: Ints | None = None,
         order: Sequence[int] | None = None, rounds: int = 2, time_limit: float = 30.0,
     ) -> Feedback:  # fmt: skip
         """Pull the wires in, one after another, until each is taut; the counts there become 0.
@@ -332,12 +332,16 @@ class DriveBus:
         self._cycle.until(0.5, _once, "be homed", running=True)
 
     def close(self) -> None:
-        """Switch the drives off, leave them pre-operational, and leave the bus. Raises nothing for drives that do not answer."""
+        """Stop the drives, switch them off, leave them pre-operational, and leave the bus. Raises nothing for drives that do not answer."""
         if self._closed:
             return
         self._closed = True
         with contextlib.suppress(DeviceError):
             if any(self._cycle.configured):
+                if any(self._cycle.enabled):
+                    self.quick_stop()
+                with contextlib.suppress(DeviceError):  # down the ramp: without voltage a shaft would run on
+                    self._cycle.until(_RAMP, lambda now: not np.any(now.velocity), "come to rest", stoppable=False)
                 self.disable()
                 for i in range(self.n_drives):
                     self._configurator.watch(i, on=False)

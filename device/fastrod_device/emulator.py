@@ -36,15 +36,15 @@ _KEPT = 8  # frames that nobody has fetched
 class Emulator:
     """Drives, wires, plant and camera. It is the `Wires` of its drives and the `FrameSource` of whoever looks."""
 
-    def __init__(self, hardware: Hardware, bus: str | BusABC, *, clock: Clock, seal: Seal, seed: int = 0) -> None:
-        """On `bus` ("virtual:NAME", say), behind the effects of `seal`; `seed` draws slack and noise. Raises `DeviceError` where the bus
-        cannot be opened."""
+    def __init__(self, hardware: Hardware, bus: str | BusABC, *, clock: Clock, seal: Seal, seed: int = 0, taut: bool = False) -> None:
+        """On `bus` ("virtual:NAME", say), behind the effects of `seal`; `seed` draws slack and noise. `taut`: the wires have their
+        pretension at power-on, as if somebody had homed them. Raises `DeviceError` where the bus cannot be opened."""
         self.hardware, self.clock = hardware, clock
         self.seal, self.plant = seal, Plant(seal)
         rng = np.random.default_rng(seed)
         n = len(hardware.drives)
-        self._slack = rng.uniform(0.1, 1.0, n) * _SLACK
-        self._taut = False
+        self._slack = rng.uniform(0.1, 1.0, n) * (0.0 if taut else _SLACK)
+        self._taut = taut
         self._lock = threading.Lock()
         self._rng = rng
         self._eye = Eye(hardware.camera, hardware.marker, seed=seed, scene=_SCENE)

@@ -47,6 +47,8 @@ class Motor:
         """Codes and registers that wait to be sent."""
         self.stopped_at = math.nan
         """When the shaft came to rest last [s]; kept by who advances it."""
+        self.rested = 0.0
+        """When it came to rest in the last `advance`, from its beginning [s]."""
         live = objects.live
         live[(0x6041, 0)], live[(0x6064, 0)] = self.statusword, self.position
         live[(0x606C, 0)], live[(0x6077, 0)] = self.velocity, self.told_torque
@@ -233,7 +235,8 @@ class Motor:
         n = max(1, math.ceil(dt / SUBSTEP - 1e-6))
         h = dt / n
         fastest = self.objects.values[(0x607F, 0)] * self._rate_unit()
-        for _ in range(n):
+        for k in range(n):
+            before = self.v
             if self.powered:
                 self._command(h)
                 self._follow(h, fastest)
@@ -243,6 +246,8 @@ class Motor:
                 self.command = self.goal = self.measured
             if self.blocked:
                 self.v = 0.0
+            if self.v == 0.0 and before != 0.0:
+                self.rested = (k + 1) * h
             self._settle(h)
 
     def _resting(self) -> bool:

@@ -41,6 +41,8 @@ class Node:
         self.received: dict[int, tuple[ProcessData, bytes]] = {}
         self.rpdos: dict[int, ProcessData] = {}
         self.tpdos: list[tuple[ProcessData, list[Callable[[], int]]]] = []
+        self.missed_at = np.nan
+        """When it missed one last [s]."""
         self.syncs = 0
         self.fresh = False
         self.no_heartbeat = self.silent = False

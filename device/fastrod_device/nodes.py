@@ -20,6 +20,7 @@ from fastrod_device.faultcodes import ENABLED
 from fastrod_device.motor import CYCLIC
 from fastrod_device.node import BOOT, LIFE, OPERATIONAL, PRE_OPERATIONAL, STOPPED, Node
 from fastrod_device.objects import Key
+from fastrod_device.pacer import urgently
 from fastrod_device.units import DriveSpec, Transmission
 
 if TYPE_CHECKING:
@@ -74,13 +75,14 @@ class EmulatedDrives:
         self._line = Line(bus)
         self._done = threading.Event()
         self._subscribe()
-        self._line.start()
-        with self._lock:
-            for node in self._nodes:
-                self._boot(node)
         self._thread = None if clock.stepped else threading.Thread(target=self._keep_time, name="emulated drives", daemon=True)
-        if self._thread is not None:
-            self._thread.start()
+        with urgently(self._thread is not None):  # a drive has a processor of its own
+            self._line.start()
+            with self._lock:
+                for node in self._nodes:
+                    self._boot(node)
+            if self._thread is not None:
+                self._thread.start()
 
     # what a test may know
 
@@ -106,6 +108,12 @@ class EmulatedDrives:
         """(n,) when each shaft came to rest last [s]; nan while it turns and before it ever did."""
         with self._lock:
             return np.array([motor.stopped_at for motor in self._motors])
+
+    @property
+    def missed_at(self) -> Floats:
+        """(n,) when each drive missed the heartbeat of its master last [s]; nan where it never did."""
+        with self._lock:
+            return np.array([node.missed_at for node in self._nodes])
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -206,10 +214,13 @@ class EmulatedDrives:
 
         def receive(cob_id: int, data: bytearray, timestamp: float) -> None:  # noqa: ARG001
             with self._lock:
-                if self._off or self._done.is_set():
+                if self._wrong is not None or self._done.is_set():
                     return
                 try:
-                    handle(cob_id, bytes(data))
+                    if not self._off:
+                        handle(cob_id, bytes(data))
+                    elif self._clock.stepped:  # deaf, but alive
+                        self._advance(self._clock.now())
                 except Exception as error:  # of the wires; canopen would only log it
                     self._wrong, self._off = error, True
 
@@ -308,7 +319,8 @@ class EmulatedDrives:
         if not keep_position:
             node.motor.offset = -node.motor.x
         node.objects.reset()
-        node.motor.v = 0.0
+        if node.motor.v != 0.0:
+            node.motor.v, node.motor.stopped_at = 0.0, self._t
         node.motor.restart()
         node.rpdos, node.tpdos, node.received, node.watched = {}, [], {}, {}
         node.beat_due = np.inf
@@ -318,10 +330,15 @@ class EmulatedDrives:
     # time
 
     def _keep_time(self) -> None:
+        last = self._clock.now()
         while not self._done.wait(_TICK):
             with self._lock:
                 try:
                     now = self._clock.now()
+                    if now - last > 4.0 * _TICK:  # it is this machine that paused, and no drive would have
+                        for node in self._nodes:
+                            node.watched = {who: t + now - last for who, t in node.watched.items()}
+                    last = now
                     if now - self._synced > 2.0 * _TICK or any(now > node.deadline() for node in self._nodes):
                         self._advance(now)
                     self._speak(now)
@@ -345,7 +362,7 @@ class EmulatedDrives:
                 if motor.v != 0.0:
                     motor.stopped_at = np.nan
                 elif turned:
-                    motor.stopped_at = to
+                    motor.stopped_at = self._t + motor.rested
             self._t = to
             torque = self._wires.move(to, self._pulled()) * self._per_newton
             for motor, value in zip(self._motors, torque, strict=True):
@@ -356,6 +373,7 @@ class EmulatedDrives:
 
     def _miss(self, node: Node) -> None:
         """The master's heartbeat did not come: as object 0x6007 says."""
+        node.missed_at = self._t
         option = node.objects.values[(0x6007, 0)]
         if option == 1:
             node.motor.fault(LIFE)

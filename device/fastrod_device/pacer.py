@@ -8,6 +8,8 @@ import math
 import os
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import TracebackType
 from typing import final
 
@@ -36,6 +38,21 @@ def ordinary() -> None:
     if sys.platform == "linux":
         with contextlib.suppress(OSError):
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
+@contextmanager
+def urgently(wanted: bool = True) -> Iterator[None]:
+    """Threads that are started in this block are `urgent`; the thread that starts them is what it was again. Nothing unless `wanted`."""
+    if not (wanted and sys.platform == "linux"):
+        yield
+        return
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
+    urgent()
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, *before)
 
 
 @final

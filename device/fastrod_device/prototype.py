@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import queue
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import final
@@ -13,7 +13,7 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fastrod.errors import FastrodError
+from fastrod.errors import FastrodError, InputError
 from fastrod.link import Measurement
 from fastrod.recording import Recorder
 from fastrod.robot import Robot
@@ -26,8 +26,8 @@ from fastrod_device.expectation import Expectation
 from fastrod_device.faultcodes import in_words
 from fastrod_device.hardware import Hardware
 from fastrod_device.homing import home
-from fastrod_device.journal import Journal
-from fastrod_device.pacer import Pacer
+from fastrod_device.journal import Journal, Trace
+from fastrod_device.pacer import Pacer, urgent, urgently
 from fastrod_device.readings import Readings
 from fastrod_device.safety import CameraWatch, Fault, State, Supervisor, limited
 from fastrod_device.tracker import MarkerTracker, Sighting
@@ -45,29 +45,34 @@ _FROZEN = 3  # frames alike: a camera at 15 Hz never draws the same noise twice
 _MARGIN = 1.5  # of our limits: where the drives refuse by themselves
 _STOPS = 0.015  # s from the fastest to rest
 _POLL = 0.002  # s between two looks for a frame
+_WATCHED = 0.005  # s between two looks at the thread that drives
 
 
 @final
 class Prototype:
     """Commands become set-points of the drives, one a cycle, within limits; frames become tip poses; a supervisor watches both.
 
-    With a `WallClock` two threads do it, one for the drives and one for the camera; with a `SteppedClock` `wait` does. `start` it, or
-    use it as a context. It is `real`: it stops when nobody watches, and after any stop moves again only after `release`, a person's act.
+    With a `WallClock` threads do it, one for the drives, one for the camera and one that watches the first; with a `SteppedClock` `wait`
+    does. `start` it, or use it as a context. It is `real`: it stops when nobody watches, and after any stop moves again only after
+    `release`, a person's act.
     """
 
     real = True
 
     def __init__(
         self, hardware: Hardware, bus: str, source: FrameSource | None, *, clock: Clock | None = None, eds: str | Path | None = None,
-        journal: Journal | None = None,
+        journal: Journal | None = None, wall: Callable[[], float] | None = None,
     ) -> None:  # fmt: skip
-        """Drives on `bus` ("socketcan:can0"), pictures from `source` (None: no camera). Raises `DeviceError` where there is no such bus."""
+        """Drives on `bus` ("socketcan:can0"), pictures from `source` (None: no camera). `wall` tells the time of day [s], by default the
+        machine's, and nothing where time is stepped; it must run as the clock does. Raises `DeviceError` where there is no such bus."""
         self.hardware, self.source = hardware, source
         self._robot = hardware.robot
         self.clock: Clock = WallClock() if clock is None else clock
         self.journal = Journal(None) if journal is None else journal
         self.transmission = Transmission(hardware.drives)
-        self.drives = DriveBus(hardware.drives, bus, clock=self.clock, rate=hardware.rate, eds=eds)
+        self._wall = time.time if wall is None and not self.clock.stepped else wall
+        with urgently(not self.clock.stepped):  # for the bus's thread
+            self.drives = DriveBus(hardware.drives, bus, clock=self.clock, rate=hardware.rate, eds=eds)
         nodes = [spec.node for spec in hardware.drives]
         self.supervisor = Supervisor(hardware.robot, hardware.limits, on_stop=self._on_stop, nodes=nodes, words=in_words)
         self.tracker = MarkerTracker(hardware.camera, hardware.marker)
@@ -86,7 +91,7 @@ class Prototype:
         n = hardware.robot.n_tendons
         self._wanted: Floats = np.zeros(n)
         self._set: Floats = np.zeros(n)
-        self._past: deque[tuple[float, Floats, Floats]] = deque(maxlen=int(_REMEMBERED * hardware.rate))
+        self._past = Trace(n, int(_REMEMBERED * hardware.rate))
         self._readings: Readings | None = None
         self._sighting: Sighting | None = None
         self._trusted, self._alike = self.clock.now(), 0
@@ -134,6 +139,11 @@ class Prototype:
         """
         hw, limits = self.hardware, self.hardware.limits
         try:
+            for _ in range(2):  # its first rest and its next step: compiled now, as that takes seconds
+                self._expectation.pose(np.zeros(self.robot.n_tendons), 0.0, None)
+            if not self.clock.stepped:
+                gc.collect()
+                gc.freeze()  # what is there now is looked through no more, which would take longer than a cycle
             per = 1.0 / np.abs(self.transmission.wound(np.ones(len(hw.drives), dtype=np.int64)))  # counts in a metre
             self.drives.connect(
                 position_limit=np.rint(_MARGIN * limits.displacement * per).astype(np.int64),
@@ -144,15 +154,14 @@ class Prototype:
             if home:
                 self.home()
             self._enable()
+            self._pacer = Pacer(self.clock, hw.rate)
+            jobs = {"drives": self._drive_forever, "camera": self._look_forever, "watchdog": self._watch_forever}
+            for name, job in () if self.clock.stepped else jobs.items():
+                self._threads.append(threading.Thread(target=job, name=name, daemon=True))
+                self._threads[-1].start()
         except BaseException:
             self.close()
             raise
-        self._pacer = Pacer(self.clock, hw.rate)
-        if not self.clock.stepped:
-            for name, job in (("drives", self._drive_forever), ("camera", self._look_forever)):
-                thread = threading.Thread(target=job, name=name, daemon=True)
-                self._threads.append(thread)
-                thread.start()
 
     def home(self) -> None:
         """Find where the robot is straight, as `homing.home` says; zero is there. Raises `DeviceError`."""
@@ -169,11 +178,10 @@ class Prototype:
         """
         if ext is not None and np.any(np.asarray(ext, dtype=np.float64) != 0.0):
             raise RefusedError("ext is not zero; the prototype has no segment that can extend.")
-        if self.supervisor.state is State.STOPPED:
-            return
-        wanted = self.supervisor.check(dl, self.clock.now(), stamp=stamp)
-        with self._lock:
-            self._wanted, self._plan = wanted, None
+        with self._lock:  # checked and taken in one: nothing is left to move by after a stop and a release
+            if self.supervisor.state is State.STOPPED:
+                return
+            self._wanted, self._plan = self.supervisor.check(dl, self.clock.now(), stamp=stamp), None
 
     def follow(self, plan: Plan, seconds: float) -> None:
         """Set-points from `plan`, one a cycle, for so long; returns when they are done.
@@ -181,10 +189,15 @@ class Prototype:
         Raises `RefusedError` where the plan leads beyond a limit (the drives are stopped then), `DeviceError` where anything stopped
         the robot on the way, each with its sentence.
         """
+        before = self.broken
         with self._lock:
             self._plan = plan, self.clock.now()
         try:
             self.wait(seconds)
+        except DeviceError:
+            if isinstance(self.broken, RefusedError) and self.broken is not before:
+                raise self.broken from None
+            raise
         finally:
             with self._lock:
                 self._plan, self._wanted = None, self._set
@@ -201,15 +214,15 @@ class Prototype:
                 self._pacer.wait()
                 with self.supervisor.guard(self.clock):
                     self._cycle()
-                self.look()
+                    self.look()
             if self.supervisor.state is State.STOPPED:
-                raise DeviceError(self._why())
+                raise DeviceError(self.supervisor.status)
 
     def read(self) -> Measurement:
         """The newest sighting with the wires as they were then; without a camera the wires alone."""
         with self._lock:
             sighting, readings = self._sighting, self._readings
-        problem = self._why() if self.supervisor.state is State.STOPPED else ""
+        problem = self.supervisor.status if self.supervisor.state is State.STOPPED else ""
         if sighting is not None and self.source is not None:
             return self._measured(sighting, problem)
         n = self.robot.n_tendons
@@ -228,20 +241,23 @@ class Prototype:
         stays stopped, and `read().problem` says why."""
         self._jobs.put(self._release)
         if self.clock.stepped:
-            self._do_jobs()
+            with self.supervisor.guard(self.clock):
+                self._do_jobs()
 
     def record(self, recorder: Recorder | None) -> None:
         """Every sighting from now on is a row of `recorder`, which has begun; None: none is."""
         with self._looking:
             self.recorder = recorder
 
-    def recorder_for(self, path: str, *, overwrite: bool = False) -> Recorder:
+    def recorder_for(self, path: str | Path, *, overwrite: bool = False) -> Recorder:
         """A recorder with the columns of a prototype: currents and how well the marker was seen."""
         currents = [f"current_{k}" for k in range(1, self.robot.n_tendons + 1)]
         return Recorder(self.robot, path, overwrite=overwrite, extra=(*EXTRA, *currents))
 
     def close(self) -> None:
         """Stop, disable, let go of bus and camera. A recording goes on existing: it is whoever began it that ends it."""
+        if not self._closed.is_set() and not self.clock.stepped:
+            gc.unfreeze()
         self._closed.set()
         for thread in self._threads:
             if thread is not threading.current_thread():
@@ -260,8 +276,9 @@ class Prototype:
             self._set = self._wanted = self.transmission.dl(newest.position)
             self._plan = None
             self._past.clear()
-        self._trusted, self._alike = self.clock.now(), 0
-        self.tracker.reset()
+        with self._looking:
+            self._trusted, self._alike = self.clock.now(), 0
+            self.tracker.reset()
         self.supervisor.enabled(self.clock.now())
 
     def _release(self) -> None:
@@ -269,6 +286,7 @@ class Prototype:
             self.supervisor.acknowledge(self.clock.now())
         except RefusedError:
             return  # the status says why
+        self.journal.write(self.clock.now(), "release", "a person released the robot.")
         try:
             self.drives.acknowledge()
             self.drives.reset_faults()
@@ -277,22 +295,19 @@ class Prototype:
             self.supervisor.exception(self.clock.now(), error)
 
     def _do_jobs(self) -> None:
-        while True:
-            try:
-                job = self._jobs.get_nowait()
-            except queue.Empty:
-                return
-            job()
+        while not self._jobs.empty():  # one thread alone takes from it
+            self._jobs.get()()
 
     def _cycle(self) -> None:
         """One set-point to every drive, what they answer, and whether all is well."""
-        now, dt = self.clock.now(), 1.0 / self.hardware.rate
         self._do_jobs()
-        moving = self.supervisor.state in (State.READY, State.RUNNING)
+        now, dt = self.clock.now(), 1.0 / self.hardware.rate
+        planned = self._plan if self.supervisor.state in (State.READY, State.RUNNING) else None
+        told = None if planned is None else planned[0](now - planned[1])  # unlocked: nobody knows how long it takes
         with self._lock:
-            if moving and self._plan is not None:
-                plan, began = self._plan
-                self._wanted = self.supervisor.check(plan(now - began), now)
+            moving = self.supervisor.state in (State.READY, State.RUNNING)  # a stop may have come meanwhile
+            if moving and told is not None and self._plan is planned:
+                self._wanted = self.supervisor.check(told, now)
             before, wanted = self._set, self._wanted
         target = limited(before, wanted, self.hardware.limits.rate, dt) if moving else None
         feedback = self.drives.exchange(None if target is None else self.transmission.counts(target))
@@ -301,13 +316,12 @@ class Prototype:
             if target is not None:
                 self._set = target
             self._readings = readings
-            self._past.append((readings.t, readings.dl, self._set))
-        wall = None if self.clock.stepped else time.time()
-        now = self.clock.now()
-        self.supervisor.watch(now, wall, readings, self._camera_watch(now))
-
-    def _camera_watch(self, now: float) -> CameraWatch | None:
-        return None if self.source is None else CameraWatch(age=now - self._trusted, frozen=self._alike >= _FROZEN)
+            self._past.add(readings.t, readings.dl, self._set)
+        now, known = self.clock.now(), len(self.supervisor.faults)
+        camera = None if self.source is None else CameraWatch(age=now - self._trusted, frozen=self._alike >= _FROZEN)
+        self.supervisor.watch(now, None if self._wall is None else self._wall(), readings, camera)
+        for fault in self.supervisor.faults[max(known, 1) :]:
+            self.journal.write(fault.t, fault.kind, fault.sentence)
 
     def _on_stop(self, fault: Fault) -> None:
         self.drives.quick_stop()
@@ -336,13 +350,12 @@ class Prototype:
             }  # fmt: skip
             if readings is not None:
                 extra |= {f"current_{k}": value for k, value in enumerate(readings.current.tolist(), 1)}
-            recorder.add(
-                self._measured(sighting, ""),
-                payload=self.payload,
-                commanded_dl=commanded,
-                extra=extra,
-                base_quaternion=self.base_quaternion,
-            )
+            row = self._measured(sighting, "")
+            try:
+                recorder.add(row, payload=self.payload, commanded_dl=commanded, extra=extra, base_quaternion=self.base_quaternion)
+            except InputError:
+                if recorder.recording:  # otherwise somebody has just ended it
+                    raise
 
     def _measured(self, sighting: Sighting, problem: str) -> Measurement:
         readings = self._readings
@@ -357,21 +370,11 @@ class Prototype:
     def _wires_at(self, t: float) -> tuple[Floats, Floats]:
         """(n_tendons,) what the encoders said at `t`, between two cycles by a straight line, and the set-points then [m]."""
         with self._lock:
-            past = list(self._past)
-        if not past:
-            return np.full(self.robot.n_tendons, np.nan), self._set
-        k = next((k for k in range(len(past) - 1, -1, -1) if past[k][0] <= t), 0)
-        if k == len(past) - 1 or t <= past[0][0]:
-            return past[k][1], past[k][2]
-        (t0, dl0, set0), (t1, dl1, set1) = past[k], past[k + 1]
-        part = (t - t0) / (t1 - t0)
-        return dl0 + part * (dl1 - dl0), set0 + part * (set1 - set0)
-
-    def _why(self) -> str:
-        return self.supervisor.status
+            return self._past.at(t)
 
     def _drive_forever(self) -> None:
         assert self._pacer is not None
+        urgent()
         while not self._closed.is_set():
             self._pacer.wait()
             try:
@@ -381,9 +384,16 @@ class Prototype:
                 self.broken = error
 
     def _look_forever(self) -> None:
+        urgent(1)  # a thread that waits for its turn holds up all of this interpreter's
         while not self._closed.wait(_POLL):
             try:
                 self.look()
             except Exception as error:
                 self.broken = error
                 self.supervisor.exception(self.clock.now(), error)
+
+    def _watch_forever(self) -> None:
+        """The drives' thread may hang, in a plan, say: it is this one that stops them then."""
+        urgent()
+        while not self._closed.wait(_WATCHED):
+            self.supervisor.stalled(self.clock.now())

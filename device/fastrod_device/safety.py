@@ -203,6 +203,15 @@ class Supervisor:
         self._send(fault)
         return fault
 
+    def stalled(self, now: float) -> Fault | None:
+        """For another thread than the control loop's: the fault where drives are enabled and nobody has looked at them for `cycle`."""
+        with self._lock:
+            if self._looked is None or self.state not in (State.READY, State.RUNNING) or now - self._looked <= self.limits.cycle:
+                return None
+            new = self._latch([self._inspector.stalled(now, now - self._looked)])
+        self._send(new)
+        return new
+
     def client_lost(self, now: float) -> Fault | None:
         """Nobody watches any more: a stop where drives are enabled, which is returned where it is the first; else None."""
         with self._lock:
@@ -234,7 +243,8 @@ class Supervisor:
         """A person has seen why the robot stopped, and releases it: STOPPED becomes OFF, and nothing moves by that.
 
         Raises `RefusedError` where it is not stopped, the stop could not be sent, nobody has looked at the drives lately, or a cause is
-        still there. A drive's own fault is no such cause: a drive keeps it until it is reset, which is what follows.
+        still there. A drive's own fault is no such cause: a drive keeps it until it is reset, which is what follows. An encoder that has
+        jumped stays one: only a new start, which homes, finds the wire again.
         """
         with self._lock:
             if self.state is not State.STOPPED:
@@ -250,6 +260,9 @@ class Supervisor:
             return f"the stop could not be sent: {self._unsent}."
         if self._looked is not None and not now - self._looked <= self.limits.command_age:
             return f"the drives were last looked at {1e3 * (now - self._looked):.4g} ms ago, and may be in any state."
+        jumped = next((fault for fault in self._faults if fault.kind == "encoder jump"), None)
+        if jumped is not None:
+            return f"{jumped.sentence.rstrip('.')}; where its wire is may be lost: start anew, and home it."
         return self._lasting[0].sentence if self._lasting else ""
 
     def _step(self, event: str, now: float, why: str) -> None:

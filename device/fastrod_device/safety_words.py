@@ -20,11 +20,11 @@ KINDS = (
     "controller stalled",
     "bus off",
     "node reboot",
+    "encoder jump",
     "emergency message",
     "drive fault",
     "heartbeat lost",
     "feedback stale",
-    "encoder jump",
     "following error",
     "tension",
     "displacement",
@@ -127,6 +127,8 @@ class Inspector:
         limits, old = self._limits, max(now - readings.t, 0.0)  # readings may be looked at twice: they have aged since
         if readings.lost:
             yield Fault(kind="bus off", sentence=f"the bus carries nothing: {readings.lost.rstrip('.')}.", t=now)
+        else:
+            yield from self._silent(now, readings.age + old)
         away = (readings.nmt != NMT_OPERATIONAL) & (readings.nmt != NMT_NONE)
         for k in _first(away):
             state = int(readings.nmt[k])
@@ -183,8 +185,12 @@ class Inspector:
             sentence = f"the wall clock jumped by {_ms(wall - last_wall - gap)} against the monotonic one; {limit}."
             yield Fault(kind="clock jump", sentence=sentence, t=now)
         if not gap <= self._limits.cycle:
-            sentence = f"the controller stood still for {_ms(gap)}; the limit is {_ms(self._limits.cycle)}."
-            yield Fault(kind="controller stalled", sentence=sentence, t=now)
+            yield self.stalled(now, gap)
+
+    def stalled(self, now: float, gap: float) -> Fault:
+        """A control loop that has not looked for `gap` [s]."""
+        sentence = f"the controller stood still for {_ms(gap)}; the limit is {_ms(self._limits.cycle)}."
+        return Fault(kind="controller stalled", sentence=sentence, t=now)
 
     def command(self, now: float, readings: Readings, meant: float) -> Iterator[Fault]:
         """A robot that moves on a command from `meant` [s] that nobody renews."""
@@ -193,6 +199,13 @@ class Inspector:
             limit = f"it must be renewed every {_ms(self._limits.command_age)}"
             sentence = f"the robot moves at {1e3 * fastest:.3g} mm/s on a command that is {_ms(now - meant)} old; {limit}."
             yield Fault(kind="command stale", sentence=sentence, t=now)
+
+    def _silent(self, now: float, age: Floats) -> Iterator[Fault]:
+        """All drives at once: that is the bus, and no drive."""
+        limit = self._limits.feedback_age
+        if self._n > 1 and not (age <= limit).any():
+            sentence = f"the bus carries nothing: no drive has sent process data for {_ms(float(np.min(age)))}; the limit is {_ms(limit)}."
+            yield Fault(kind="bus off", sentence=sentence, t=now)
 
     def _state(self, bad: np.ndarray[tuple[int, ...], np.dtype[np.bool_]], statusword: Ints, now: float) -> Iterator[Fault]:
         for k in _first(bad):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import os
+import sys
 import threading
 from pathlib import Path
 
@@ -18,7 +20,7 @@ from fastrod_device.drive import DriveBus
 from fastrod_device.errors import DeviceError
 from fastrod_device.faultcodes import CODES, STATUS_BITS, in_words, state_in_words
 from fastrod_device.nodes import EmulatedDrives
-from fastrod_device.pacer import Pacer
+from fastrod_device.pacer import Pacer, urgently
 from fastrod_device.readings import Feedback
 from fastrod_device.units import DriveSpec, Transmission
 
@@ -498,3 +500,21 @@ def test_a_pacer_keeps_to_multiples_and_skips_what_is_past():
     assert pacer.slipped == 2
     with pytest.raises(InputError, match="must be positive"):
         Pacer(clock, 0.0)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="urgency is Linux's")
+def test_only_what_is_started_urgently_is_urgent():
+    def policy() -> None:
+        seen.append(os.sched_getscheduler(0))
+
+    seen: list[int] = []
+    before = os.sched_getscheduler(0)
+    with urgently():
+        inside = threading.Thread(target=policy)
+        inside.start()
+        inside.join()
+    assert os.sched_getscheduler(0) == before
+    with urgently(False):
+        policy()
+    assert seen[0] in (os.SCHED_FIFO, before)  # granted, or not
+    assert seen[1] == before

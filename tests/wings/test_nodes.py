@@ -226,6 +226,7 @@ def test_without_heartbeats_it_stops_at_the_moment_it_must(wire):
     assert wire.write(0x6007, 0, 3, 2) == 0
     assert wire.write(0x605A, 0, 6, 2) == 0
     assert wire.write(0x1016, 1, 127 << 16 | 150, 4) == 0
+    assert wire.write(0x60C2, 1, 10, 1) == 0  # ms: the shaft turns all the time
     wire.send(0x77F, b"\x05")
     wire.enable()
     for k in range(12):

@@ -14,8 +14,9 @@ from fastrod.link import Measurement, RobotLink
 from fastrod.recording import Recorder
 from fastrod.simulated import SimulatedRobot
 from fastrod_viewer.knobs import drive_knobs, largest_force, load_knobs, nice
+from fastrod_viewer.measuring import measure
 from fastrod_viewer.pilot import LARGEST_BEND, Pilot, Speeds
-from fastrod_viewer.session import Session, measure
+from fastrod_viewer.session import Session
 from fastrod_viewer.world import Hand
 from fastrod_viewer.worlds import FreeWorld
 

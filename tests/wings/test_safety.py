@@ -159,7 +159,38 @@ def test_readings_that_are_looked_at_again_grow_old() -> None:
     same = healthy(bench.now)
     found = [bench.supervisor.watch(bench.now + k * DT, None, same, None) for k in range(1, 5)]
     assert found[1] is None
-    assert [fault.kind for fault in bench.stops] == ["feedback stale"]
+    assert [fault.kind for fault in bench.supervisor.faults] == ["bus off", "feedback stale"]
+
+
+def test_all_drives_silent_is_the_bus_and_one_of_them_a_drive() -> None:
+    bench, other = Bench(), Bench()
+    found, one = bench.watch(age=np.array([0.05, 0.04, 0.06, 0.05])), other.watch(age=(2, 0.04))
+    assert found is not None
+    assert one is not None
+    assert (found.kind, found.drive) == ("bus off", None)
+    assert "no drive has sent process data for 40 ms; the limit is 30 ms" in found.sentence
+    assert (one.kind, one.drive) == ("feedback stale", 2)
+
+
+def test_an_encoder_jump_is_the_cause_of_a_drives_following_error() -> None:
+    bench = Bench()
+    found = bench.watch(dl=(1, 0.003), emergencies=EMCY, statusword=(1, 0x0238))
+    assert found is not None
+    assert [fault.kind for fault in bench.supervisor.faults] == ["encoder jump", "emergency message", "drive fault"]
+
+
+def test_a_watchdog_stops_a_loop_that_does_not_look_any_more() -> None:
+    bench = Bench()
+    assert bench.supervisor.stalled(bench.now + 0.05) is None
+    found = bench.supervisor.stalled(bench.now + 0.07)
+    assert found is not None
+    assert (found.kind, bench.stops) == ("controller stalled", [found])
+    assert "70 ms" in found.sentence
+    assert "50 ms" in found.sentence
+    assert bench.supervisor.stalled(bench.now + 9.0) is None  # it is stopped
+    bench.watch()
+    bench.supervisor.acknowledge(bench.now)
+    assert bench.supervisor.stalled(bench.now + 9.0) is None  # it is off
 
 
 def test_a_robot_that_stands_needs_no_command_and_one_that_is_steered_none_too_many() -> None:
@@ -385,6 +416,15 @@ def test_a_release_is_refused_while_the_cause_is_there(still: dict[str, Any]) ->
         bench.supervisor.acknowledge(bench.now)
     with pytest.raises(RefusedError, match="drives are off"):
         bench.supervisor.check(BENT, bench.now)
+
+
+def test_an_encoder_that_has_jumped_is_no_more_to_be_trusted() -> None:
+    bench = Bench()
+    assert bench.watch(dl=(1, 0.003)) is not None
+    for _ in range(10):
+        bench.watch(dl=(1, 0.003))
+    with pytest.raises(RefusedError, match=r"drive 2 \(node 5\) moved its wire .* start anew, and home it"):
+        bench.supervisor.acknowledge(bench.now)
 
 
 def test_a_drives_own_fault_is_reset_after_the_release() -> None:

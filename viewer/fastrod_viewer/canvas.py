@@ -40,6 +40,11 @@ class Canvas:
             scene.add_light_directional(f"/lights/{name}", position=place, intensity=intensity)
         scene.world_axes.visible = False
 
+    @property
+    def names(self) -> frozenset[str]:
+        """Of the batches that are drawn now."""
+        return frozenset(self._batches)
+
     def clear(self) -> None:
         """Take everything away."""
         for handle in [*(batch for batch, _ in self._batches.values()), *self._bodies, *self._fixed, *(n[0] for n in self._notes.values())]:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import viser
 
 _KEY_STEP = math.radians(5.0)  # of a segment's bend, by a press
+_FASTEST = 360  # °/s
 _SETTLED = 0.3  # s after a change in which a control is left alone: it may be under a finger
 
 
@@ -73,9 +74,16 @@ class Controls:
         for group in [group for group in groups if group.title and not group.title.startswith("Segment")]:
             self._add(group)
         if world.robot.n_tendons:
-            now = max(5, round(math.degrees(self.pilot.speeds.bend)))
-            speed = gui.add_slider("Speed [°/s]", 5, 360, 5, now, hint="Largest rate at which a segment bends; wires and base in step.")
+            most = self._fastest()
+            now = min(most, max(5, 5 * round(math.degrees(self.pilot.speeds.bend) / 5)))
+            speed = gui.add_slider("Speed [°/s]", 5, most, 5, now, hint="Largest rate at which a segment bends; wires and base in step.")
             self._listen(speed, self._set_speed, take_over=False)
+
+    def _fastest(self) -> int:
+        """Largest speed that is offered [°/s]: a linked robot's wires do not follow every one."""
+        if self.pilot.actions is None or not math.isfinite(self.pilot.reach.rate):
+            return _FASTEST
+        return min(_FASTEST, max(10, 5 * int(math.degrees(self.pilot.reach.rate / self.pilot.actions.offset.max()) / 5)))
 
     def _set_speed(self, degrees: float) -> None:
         usual = Speeds()

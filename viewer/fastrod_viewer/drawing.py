@@ -2,40 +2,45 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import final
 
 import numpy as np
 
-from fastrod.rotation import matrix_from_quaternion
+from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_matrix
 from fastrod.types import Floats
-from fastrod_viewer.arrows import Trail
+from fastrod_viewer.arrows import Trail, frames
 from fastrod_viewer.canvas import Canvas
-from fastrod_viewer.legend import legend
+from fastrod_viewer.legend import Entry, legend
 from fastrod_viewer.options import FINE, Options
 from fastrod_viewer.palette import MEASURED, TRAIL
 from fastrod_viewer.picture import Picture
 from fastrod_viewer.scene_graph import bounds
 from fastrod_viewer.session import Frame
-from fastrod_viewer.shapes import ball
+from fastrod_viewer.shapes import Instances, instances
 from fastrod_viewer.world import World
 
 _TRAIL = 100  # pieces
 _GLASS = 0.3  # opacity of what the tip is inside of
+
+_WIDE, _THIN = 1.15, 0.2  # of the body's radius: the plate that stands for a measured tip
 
 
 @final
 class Drawing:
     """Robots, surroundings, loads, the tip's trail, and what was measured beside them."""
 
-    def __init__(self, canvas: Canvas, world: World, options: Options, *, trail: bool = True) -> None:
+    def __init__(self, canvas: Canvas, world: World, options: Options, *, trail: bool = True, measured: bool = False) -> None:
+        """`measured`: frames will tell where the tip was measured, and the legend says what that looks like."""
         self.canvas, self.world = canvas, world
-        self.options, self.trail = options, trail
+        self.options, self.trail, self._tips = options, trail, measured
         rods = world.rods[0]
         self.middle, self.size = bounds(rods, world.bodies, world.poses())
         self.radius = max(rods.radius)
         """Of the robot's body [m]."""
         self._pictures = [Picture(r, options) for r in world.rods]
         self._trails = self._new_trails()
+        self._track = Trail(_TRAIL, 0.3 * self.radius)
         self._ends: Floats = np.array([[b.vertices.min(axis=0), b.vertices.max(axis=0)] for b in world.bodies]).reshape(-1, 2, 3)
         canvas.clear()
         canvas.add_bodies(world.bodies, world.poses())
@@ -52,11 +57,14 @@ class Drawing:
     def forget(self) -> None:
         """The trail begins anew."""
         self._trails = self._new_trails()
+        self._track.clear()
 
     @property
     def legend(self) -> str:
         """HTML of what the colours mean."""
-        return legend(self.world.rods[0], self.options, self._pictures[0]).html()
+        made = legend(self.world.rods[0], self.options, self._pictures[0])
+        tips = (Entry("of the model", TRAIL), Entry("as measured", MEASURED)) if self._tips else ()
+        return replace(made, tips=tips).html()
 
     def tip(self) -> Floats:
         """(3,) where the tip of the robot that hands drive is drawn [m]."""
@@ -95,15 +103,30 @@ class Drawing:
             self.canvas.fade(k, min(body.opacity, _GLASS) if within[k] else body.opacity)
 
     def _measured(self, frame: Frame) -> None:
-        """The tip that the robot itself tells."""
-        if frame.measured is None or not np.isfinite(frame.measured.tip_position).all():
-            self.canvas.show("measured", None)
-            return
-        state = self.world.rods[0].state
-        place = state.position[0, 0] + state.rotation[0, 0] @ frame.measured.tip_position + self.world.rods[0].place[0]
-        self.canvas.show("measured", ball(place, 0.6 * self.radius, MEASURED))
+        """The tip that the robot itself tells: a plate with axes, and where it was."""
+        now = frame.measured
+        seen = now is not None and bool(np.isfinite(now.tip_position).all())
+        if now is None or not seen:
+            for name in ("measured", "measured axes"):
+                self.canvas.show(name, None)
+        else:
+            rods = self.world.rods[0]
+            base = rods.state.rotation[0, 0]
+            place = rods.state.position[0, 0] + base @ now.tip_position + rods.place[0]
+            self._track.add(place)
+            upright = not np.isfinite(now.tip_quaternion).all()
+            own = np.array([1.0, 0.0, 0.0, 0.0]) if upright else now.tip_quaternion
+            turn = product(quaternion_from_matrix(base[None])[0], own)
+            self.canvas.show("measured", _plate(place, turn, self.radius))
+            self.canvas.show("measured axes", None if upright else frames(place[None], turn[None], 1.7 * self.radius))
+        self.canvas.show("measured trail", self._track.instances(0.12 * self.radius, MEASURED) if self.trail and len(self._track) else None)
 
     def _new_trails(self) -> list[list[Trail]]:
         """Of each robot, where they are few."""
         counts = [len(rods.state.tip_position) for rods in self.world.rods]
         return [[Trail(_TRAIL, 0.6 * self.radius) for _ in range(n if n <= FINE else 0)] for n in counts]
+
+
+def _plate(place: Floats, turn: Floats, radius: float) -> Instances:
+    """A disc at `place` (3,), turned by `turn` (4,), as large as the tip of a body of `radius` [m], and then some."""
+    return instances("disc", place, turn, radius * np.array([_WIDE, _WIDE, _THIN]), MEASURED)

@@ -10,14 +10,16 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 from numpy.typing import NDArray
 
-from fastrod.link import RobotLink
-from fastrod.recording import Recorder, free_path
+from fastrod.errors import InputError
+from fastrod.link import Measurement, RobotLink
+from fastrod.recording import free_path
 from fastrod.runlog import RunLog
 from fastrod_viewer.canvas import Canvas
 from fastrod_viewer.controls import Controls
 from fastrod_viewer.drawing import Drawing
 from fastrod_viewer.export import wrap
 from fastrod_viewer.grip import Grip
+from fastrod_viewer.linked import Linked
 from fastrod_viewer.options import FINE, Options
 from fastrod_viewer.page import Page, Sight, facts, picture, save_name, send, stand_back, tell
 from fastrod_viewer.pilot import Pilot, Speeds
@@ -28,10 +30,13 @@ if TYPE_CHECKING:
     import viser
 
 _GENTLE = 1.0 / 6.0  # of the usual speeds, among obstacles
+_REAL = 0.25  # of the usual speeds, where motion may do harm
 _TOLD = 0.2  # s between two changes of figures and sliders
 _WIDE = 320  # pixels of the window for a camera in hand
 _LOOKS = 0.15  # s between two pictures of a camera in hand
 _LONG = 1.5  # s of one step
+_FARTHER = 1.35  # away from a robot beside whose picture there is one of a camera
+_NOTHING = np.full((240, 320, 3), 230, dtype=np.uint8)  # before the first picture
 _COMPILING = "Computing … The first use of contact compiles for a minute or two, once on this machine; tight contact takes its time, too."
 _COLORS = {"segment": "segment", "curvature": "curvature", "surface strain": "strain", "wire tension": "tension"}
 _PARTS = {"spacers": "Spacers", "tendons": "Wires", "contacts": "Contact forces", "loads": "Loads", "frames": "Tip frame"}
@@ -50,10 +55,12 @@ class DrivePage(Page):
         self.server, self.world, self.title = server, world, world.name
         self._folder, self._replay, self._echo = folder, replay, echo
         touches = world.rods[0].state.contacts is not None
-        self.pilot = Pilot(world, Speeds().times(_GENTLE) if touches else None)
+        far = None if link is None else Linked(link)
+        gentle = _GENTLE if touches else _REAL if link is not None and link.real else 1.0
+        self.pilot = Pilot(world, Speeds().times(gentle), reach=None if far is None else far.reach)
         many = len(world.rods[0].state.ok) > FINE
-        self.drawing = Drawing(canvas, world, Options(body="skin" if touches or many else "backbone"))
-        self.sight = Sight(self.drawing.middle, self.drawing.size)
+        self.drawing = Drawing(canvas, world, Options(body="skin" if touches or many else "backbone"), measured=link is not None)
+        self.sight = Sight(self.drawing.middle, self.drawing.size * (1.0 if far is None or not far.sees else _FARTHER))
         self.session = Session(world, self.pilot, draw=self._draw, link=link, script=script)
         self.grip = (
             Grip(server, self.session, min(1.25 * self.drawing.radius, 0.1 * world.robot.length), world.rods[0].place[0])
@@ -115,7 +122,7 @@ class DrivePage(Page):
             self.figures = gui.add_html("")
             self.stop = gui.add_button("STOP", color="red", icon=viser.Icon.HAND_STOP, hint="Everything stands still at once. Key: Esc")
             self.stop.on_click(lambda _: session.release() if session.stopped else session.stop())
-            self.run = gui.add_button_group("Run", ("Pause", "Step", "Reset"))
+            self.run = gui.add_button_group("Run", self._runs())
             self.run.on_click(self._run)
             tabs = gui.add_tab_group()
             drive, loads = tabs.add_tab("Drive", viser.Icon.ADJUSTMENTS), tabs.add_tab("Loads", viser.Icon.WEIGHT)
@@ -130,12 +137,21 @@ class DrivePage(Page):
             self.legend = gui.add_html(self.drawing.legend)
         self.aside.float(x=-15, y=-15, width=230)
         self.camera: tuple[Any, Any] | None = None
-        seen = self.world.picture()
-        if seen is not None:
+        far = session.far
+        seen = self._seen()
+        if seen is not None or (far is not None and far.sees):
             window = gui.add_panel()
-            with window.add_tab("Camera in hand", viser.Icon.CAMERA):
-                self.camera = window, gui.add_image(enlarged(seen), format="jpeg")
-            window.float(x=-15, y=15, width=340)
+            with window.add_tab("Camera in hand" if far is None else "Camera", viser.Icon.CAMERA):
+                self.camera = window, gui.add_image(fitted(_NOTHING if seen is None else seen), format="jpeg")
+            window.float(x=-15, y=15, width=340 if far is None else 290)
+
+    def _seen(self) -> NDArray[np.uint8] | None:
+        far = self.session.far
+        return self.world.picture() if far is None else far.picture()
+
+    def _runs(self) -> tuple[str, ...]:
+        steps = ("Step",) if self.session.link is None else ()
+        return ("Go on" if self.session.paused else "Pause", *steps, "Reset")
 
     def _keys(self) -> str:
         keys = "<kbd>Space</kbd> pause · <kbd>Esc</kbd> stop · <kbd>R</kbd> reset"
@@ -189,23 +205,23 @@ class DrivePage(Page):
     def _toggle_record(self, client: Any) -> None:
         """In the session's thread."""
         session = self.session
-        if session.recorder is not None:
-            recorder, session.recorder = session.recorder, None
-            n = len(recorder)
-            if n == 0:
-                self.record.label = "Record a run log"
-                return
-            self._last = recorder.stop()
-            self.record.label, self.again.disabled = "Record a run log", False
-            self.recorded.content = f"Saved {n} samples in `{save_name(self._path)}`."
-            tell(client, "Saved", f"{n} samples in {save_name(self._path)}")
+        if session.recorder is None:
+            self._path = free_path(self._folder / f"{self.world.robot.name}-session.csv")
+            session.record(self._path)
+            self.record.label = "Stop and save"
+            self.recorded.content = f"Recording to `{save_name(self._path)}` …"
             return
-        self._path = free_path(self._folder / f"{self.world.robot.name}-session.csv")
-        recorder = Recorder(self.world.robot, self._path)
-        recorder.start(self.world.t, "by script" if session.scripted else "by hand")
-        session.recorder = recorder
-        self.record.label = "Stop and save"
-        self.recorded.content = f"Recording to `{save_name(self._path)}` …"
+        self.record.label = "Record a run log"
+        try:
+            log = session.end_recording()
+        except InputError as error:
+            self.recorded.content = str(error)
+            tell(client, "Nothing was saved", str(error), failed=True)
+            return
+        if log is not None:
+            self._last, self.again.disabled = log, session.link is not None
+            self.recorded.content = f"Saved {len(log)} samples in `{save_name(self._path)}`."
+            tell(client, "Saved", f"{len(log)} samples in {save_name(self._path)}")
 
     def _run(self, event: Any) -> None:
         session = self.session
@@ -235,44 +251,67 @@ class DrivePage(Page):
             self._tell(frame)
         if self.camera is not None and began - self._looked > _LOOKS:
             self._looked = began
-            seen = self.world.picture()
+            seen = self._seen()
             if seen is not None:
-                self.camera[1].image = enlarged(seen)
+                self.camera[1].image = fitted(seen)
 
     def _tell(self, frame: Frame) -> None:
         rows = [("Tip", self._tip())]
+        session = self.session
         if frame.measured is not None and np.isfinite(frame.measured.tip_position).all():
             state = self.world.rods[0].state
             model = state.rotation[0, 0].T @ (state.tip_position[0] - state.position[0, 0])
+            x, y, z = (1e3 * frame.measured.tip_position).tolist()
+            rows.append(("Measured tip", f"{x:.1f}, {y:.1f}, {z:.1f} mm"))
             rows.append(("Measured − model", f"{1e3 * np.linalg.norm(frame.measured.tip_position - model):.2f} mm"))
-        rows.append(("Time", f"{self.world.t:.1f} s" + (f", {frame.pace:.0%} of real time" if frame.pace < 0.95 else "")))
+        if session.far is not None and frame.measured is not None:
+            rows += far_rows(session.far, frame.measured)
+        t = self.world.t if frame.measured is None else frame.measured.t
+        rows.append(("Time", f"{t:.1f} s" + (f", {frame.pace:.0%} of real time" if frame.pace < 0.95 else "")))
         if self._latency == self._latency:
             echo = self._echo()
             drawn = f" + {1e3 * echo:.0f} browser" if echo == echo else ""
             rows.append(("Latency", f"{1e3 * self._latency:.0f}{drawn} ms"))
-        session = self.session
-        state_now = (
-            "Stopped. Press the green button to go on." if session.stopped else frame.problem and f"{frame.problem} Reset begins anew."
-        )
-        content = facts(rows, state_now)
+        problem, news = self._state(frame)
+        content = facts(rows, problem, news=news)
         if content != self.figures.content:
             self.figures.content = content
-        label = "GO ON" if session.stopped else "STOP"
+        label = "STOP" if not session.stopped else "RELEASING …" if session.releasing else "GO ON"
         if self.stop.label != label:
-            self.stop.label, self.stop.color = label, "green" if session.stopped else "red"
-        options = ("Go on" if session.paused else "Pause", "Step", "Reset")
+            self.stop.label, self.stop.color = label, "green" if label == "GO ON" else "red"
+        options = self._runs()
         if tuple(self.run.options) != options:
             self.run.options = options
         self.controls.follow()
         if self.drawing.options.color_by != "segment" and (legend := self.drawing.legend) != self.legend.content:
             self.legend.content = legend
 
+    def _state(self, frame: Frame) -> tuple[str, str]:
+        """What is wrong, and what is worth knowing."""
+        session = self.session
+        status = "" if session.far is None else session.far.status
+        if session.releasing:
+            return "", f"Releasing. {status}"
+        if session.stopped:
+            return f"{status or 'Stopped.'} Press the green button to go on.", ""
+        if session.link is not None:
+            return frame.problem, status
+        return frame.problem and f"{frame.problem} Reset begins anew.", ""
+
     def _tip(self) -> str:
         x, y, z = (1e3 * self.world.rods[0].state.tip_position[0]).tolist()
         return f"{x:.1f}, {y:.1f}, {z:.1f} mm"
 
 
-def enlarged(seen: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(height, width, 3) a picture as wide as its window, pixel by pixel."""
+def fitted(seen: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(height, width, 3) a picture about as wide as its window: of a small one every pixel many times, of a large one not every pixel."""
+    apart = max(1, seen.shape[1] // _WIDE)
     times = max(1, round(_WIDE / seen.shape[1]))
-    return np.repeat(np.repeat(seen, times, axis=0), times, axis=1)
+    return np.repeat(np.repeat(seen[::apart, ::apart], times, axis=0), times, axis=1)
+
+
+def far_rows(far: Linked, measured: Measurement) -> list[tuple[str, str]]:
+    """What a robot at the other end of a link tells of itself."""
+    tension = far.tension(measured)
+    rows = [("Wires pull", " · ".join(f"{value:.2f}" for value in tension.tolist()) + " N")] if np.isfinite(tension).all() else []
+    return rows + ([("Camera", camera)] if (camera := far.camera()) else [])

@@ -75,7 +75,7 @@ def drive_knobs(world: World, pilot: Pilot) -> list[Group]:
         groups += [Group(f"Segment {k + 1}", _segment(robot, pilot, k), n <= 2) for k in range(n)]
     if robot.n_tendons:
         groups.append(Group("Wires", tuple(_wire(robot, pilot, i) for i in range(robot.n_tendons)), pilot.actions is None))
-    if world.base_moves:
+    if world.base_moves and not pilot.linked:
         title = "Flange of the host" if world.host else "Base"
         groups.append(Group(title, tuple(_base(robot, pilot, axis) for axis in range(6)), open=False))
     return groups
@@ -110,7 +110,7 @@ def _all_bend(pilot: Pilot, n: int, axis: int) -> Knob:
 
 
 def _segment(robot: Robot, pilot: Pilot, k: int) -> tuple[Knob, ...]:
-    most = LARGEST_BEND / _DEGREE
+    most = min(LARGEST_BEND / _DEGREE, _whole(pilot.reach.displacement, _arm(pilot, k) * _DEGREE))
     bends = tuple(
         Knob(
             label=f"Bend {name} [°]", low=-most, high=most, step=1.0, hint=f"Bends the segment toward {name} of its base.",
@@ -129,6 +129,16 @@ def _segment(robot: Robot, pilot: Pilot, k: int) -> tuple[Knob, ...]:
     return (*bends, extend)
 
 
+def _arm(pilot: Pilot, k: int) -> float:
+    """Of a segment's bend on its wires [m]."""
+    return math.inf if pilot.actions is None else float(pilot.actions.offset[k])
+
+
+def _whole(most: float, step: float) -> float:
+    """The largest whole number of steps within `most`."""
+    return float(math.floor(most / step)) if math.isfinite(most) else most
+
+
 def _bend(pilot: Pilot, k: int, axis: int, degrees: float) -> None:
     bends = list(pilot.bent(k))
     bends[axis] = degrees * _DEGREE
@@ -144,7 +154,10 @@ def _wire(robot: Robot, pilot: Pilot, i: int) -> Knob:
             label=f"{name} [N]", low=0.0, high=LARGEST_TENSION, step=0.05, hint="Tension of the wire.",
             get=lambda: float(pilot.goals.tension[i]), put=lambda v: pilot.pull_with(i, v),
         )  # fmt: skip
-    most = nice(LARGEST_BEND * sum(math.hypot(*place) for place in robot.tendons[i].position(k + 1)) / _MM)
+    most = min(
+        nice(LARGEST_BEND * sum(math.hypot(*place) for place in robot.tendons[i].position(k + 1)) / _MM),
+        0.05 * _whole(pilot.reach.displacement / _MM - 1e-3, 0.05),
+    )
     return Knob(
         label=f"{name} [mm]", low=-most, high=most, step=0.05, hint="Positive pulls the wire, negative lets it out.",
         get=lambda: -float(pilot.change[i]) / _MM, put=lambda v: pilot.wire(i, -v * _MM),

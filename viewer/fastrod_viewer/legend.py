@@ -50,6 +50,8 @@ class Legend:
     bar: tuple[Color, ...] = ()
     """Evenly spaced colours of the bar, more than there are ticks."""
     wires: tuple[Entry, ...] = ()
+    tips: tuple[Entry, ...] = ()
+    """And their trails."""
 
     def html(self) -> str:
         """A snippet that needs nothing but itself, for a white background."""
@@ -66,6 +68,8 @@ class Legend:
             )
         if self.wires:
             parts.append('<div style="font-weight:600;margin:6px 0 4px">Tendons</div>' + _swatches(self.wires, "4px"))
+        if self.tips:
+            parts.append('<div style="font-weight:600;margin:6px 0 4px">Tip, and its trail</div>' + _swatches(self.tips, "4px"))
         return f'<div style="font:12px/1.4 system-ui,sans-serif;color:#223;padding:4px 2px">{"".join(parts)}</div>'
 
 

@@ -15,12 +15,14 @@ from fastrod.robot import Robot
 from fastrod.segments import SegmentActions
 from fastrod.types import Floats
 from fastrod_viewer.drag import drag_rates
+from fastrod_viewer.linked import Reach
 from fastrod_viewer.world import Hand, World
 
 LARGEST_BEND = math.pi / 2.0
 """Of a segment toward either side [rad]."""
 LARGEST_TENSION = 20.0
 """Of a wire that is driven by tension [N]."""
+_INSIDE = 0.999  # of a limit: sums of floats must not be beyond it
 _NOTHING = 1e-6  # m of a wire, below which a robot is bent by its segments alone
 
 
@@ -78,14 +80,16 @@ class Pilot:
     True
     """
 
-    def __init__(self, world: World, speeds: Speeds | None = None) -> None:
+    def __init__(self, world: World, speeds: Speeds | None = None, *, reach: Reach | None = None) -> None:
+        """`reach`: what the wires of the robot that is driven may do; they keep to its rate whatever the speeds are."""
+        self.linked, self.reach = reach is not None, reach or Reach()
         self.robot: Robot = world.robot
         self.actions: SegmentActions | None = world.actions
         self._world = world
         self._lock = threading.RLock()
         self._zero = Goals.zero(0 if self.actions is None else self.actions.n_actions, self.robot.n_tendons)
         self._speeds = speeds or Speeds()
-        self._lower, self._upper = _limits(self.robot, self.actions)
+        self._lower, self._upper = _limits(self.robot, self.actions, self.reach)
         self._offset = _arm(self.robot)
         self.reset()
 
@@ -248,12 +252,22 @@ class Pilot:
             base = np.concatenate([
                 _toward(now.base[:3], goals.base[:3], speeds.base * dt), _toward(now.base[3:], goals.base[3:], 5.0 * speeds.base * dt)
             ])  # fmt: skip
-            self._before, self._now = now, Goals(action, wire, tension, base)
-            extension = np.zeros(self.robot.n_segments) if self.actions is None else action[::3]
+            self._before, self._now = now, self._within_rate(now, Goals(action, wire, tension, base), dt)
+            there = self._now
+            extension = np.zeros(self.robot.n_segments) if self.actions is None else there.action[::3]
             return Hand(
-                tendon_length=self.robot.rest_tendon_length + self._change(self._now), extension=extension, tension=tension, base=base,
-                base_rate=rate, tip_force=self._tip_force, payload=self._payload, gravity=self._gravity, freeze=self._freeze,
+                tendon_length=self.robot.rest_tendon_length + self._change(there), extension=extension, tension=there.tension,
+                base=there.base, base_rate=rate, tip_force=self._tip_force, payload=self._payload, gravity=self._gravity,
+                freeze=self._freeze,
             )  # fmt: skip
+
+    def _within_rate(self, now: Goals, then: Goals, dt: float) -> Goals:
+        """As far from `now` toward `then` as no wire is faster than it may be; straight there."""
+        largest = float(np.abs(self._change(then) - self._change(now)).max(initial=0.0))
+        if largest <= self.reach.rate * dt:
+            return then
+        part = self.reach.rate * dt / largest
+        return Goals(*(a + part * (b - a) for a, b in zip(_arrays(now), _arrays(then), strict=True)))
 
     def _act(self, segment: int, which: int, value: float) -> None:
         with self._lock:
@@ -313,11 +327,11 @@ def _arm(robot: Robot) -> float:
     return max((math.hypot(*t.position(k + 1)[k]) for k, s in enumerate(robot.segments) for t in s.tendons), default=0.0)
 
 
-def _limits(robot: Robot, actions: SegmentActions | None) -> tuple[Floats, Floats]:
+def _limits(robot: Robot, actions: SegmentActions | None, reach: Reach) -> tuple[Floats, Floats]:
     """(3 n_segments,) least and largest action [m]."""
     if actions is None:
         return np.zeros(0), np.zeros(0)
-    upper = np.repeat(LARGEST_BEND * actions.offset, 3)
+    upper = np.repeat(np.minimum(LARGEST_BEND * actions.offset, _INSIDE * reach.displacement), 3)
     lower = -upper
     lower[::3], upper[::3] = (np.array([segment.extension[i] for segment in robot.segments]) for i in (0, 1))
     return lower, upper

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import final
 
 import numpy as np
 
-from fastrod.errors import FastrodError
+from fastrod.errors import FastrodError, InputError
 from fastrod.link import Measurement, RobotLink
 from fastrod.recording import Recorder
-from fastrod.rotation import quaternion_from_matrix
-from fastrod.types import Floats
+from fastrod.runlog import RunLog
+from fastrod_viewer.linked import Linked
+from fastrod_viewer.measuring import measure
 from fastrod_viewer.pilot import Pilot
 from fastrod_viewer.world import Hand, World
 
@@ -25,6 +28,8 @@ _BEHIND = 0.25  # s: a world that falls farther behind runs slower than real tim
 _REST = 12  # pictures after the last motion, in which an observer comes to rest
 _SAID = 4.0  # s for which a problem stays on the page
 _QUICKEST = 0.008  # s between two pictures, when hands are quick
+_SPREAD = 1.25  # of a step, over which a robot spreads it: the next one may come late
+_RELEASED = 3.0  # s in which a robot must be ready after a release, or stays stopped
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,13 +54,16 @@ class Session:
     """Advances a world and hands a `Frame` to `draw` when something has changed. Every method may be called from any thread.
 
     With a `link`, hands drive that robot, the world is its model and gets the same commands, and `Frame.measured` is what the robot
-    says. A real robot stops when `nobody` watches.
+    says. A real robot stops when `nobody` watches. Where it has stopped, by whatever it was, the session is stopped too, and the model
+    stands as the robot's encoders say, until `release`.
     """
 
     def __init__(
         self, world: World, pilot: Pilot, *, draw: Callable[[Frame], None], link: RobotLink | None = None, script: bool = False
     ) -> None:
         self.world, self.pilot, self.link = world, pilot, link
+        self.far = None if link is None else Linked(link)
+        """The link, asked for what it can do."""
         self.recorder: Recorder | None = None
         self._draw = draw
         self._jobs: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
@@ -63,6 +71,10 @@ class Session:
         self._closed = threading.Event()
         self._scripted = script and link is None and world.scripted
         self._paused = self._stopped = False
+        self._gate = threading.Lock()
+        self._released = -np.inf
+        self._fed = False
+        self._moved = time.perf_counter()
         self._steps = 0
         self._since: float | None = None
         self._asked = 0.0
@@ -112,8 +124,13 @@ class Session:
 
     @property
     def stopped(self) -> bool:
-        """`stop` was called, and `release` not yet."""
+        """`stop` was called, or the robot has stopped, and `release` not yet."""
         return self._stopped
+
+    @property
+    def releasing(self) -> bool:
+        """A release was asked for, and the robot at the other end of the link has not said yet that it is ready."""
+        return self._stopped and time.perf_counter() - self._released < _RELEASED
 
     def touch(self) -> None:
         """Hands have moved something: answer at once."""
@@ -133,25 +150,30 @@ class Session:
 
     def stop(self) -> None:
         """Everything stands still, at once; commands wait for `release`."""
-        self._stopped = True
-        if self.link is not None:
-            self.link.stop()
+        self._halt(nobody=False)
+
+    def _halt(self, *, nobody: bool) -> None:
+        with self._gate:
+            self._stopped, self._released = True, -np.inf
+        if self.far is not None:
+            self.far.stop(nobody=nobody)
         self.pilot.hold()
         self.touch()
 
     def release(self) -> None:
-        """Take commands again, from where the robot stands."""
+        """Take commands again, from where the robot stands. A linked robot may take a while until it is ready, or refuse."""
         self.pilot.hold()
-        if self.link is not None:
-            self._adopt()
-            self.link.release()
-        self._stopped = False
+        if self.far is None:
+            self._stopped = False
+        else:
+            self.far.link.release()
+            self._released = time.perf_counter()
         self.touch()
 
     def nobody(self) -> None:
         """Nobody watches any more: what was on its way stops; a real robot is stopped as by `stop`."""
         if self.link is not None and self.link.real:
-            self.stop()
+            self._halt(nobody=True)
         else:
             self.pilot.hold()
 
@@ -177,9 +199,27 @@ class Session:
 
     def _adopt(self) -> None:
         """The controls stand where the robot is: that at the other end of the link, where there is one."""
-        now = measure(self.world, None) if self.link is None else self.link.read()
-        if np.isfinite(now.dl).all():
-            self.pilot.adopt(now.dl, np.nan_to_num(now.ext))
+        if self.far is None:
+            now = measure(self.world, None)
+            dl, ext = now.dl, now.ext
+        else:
+            dl, ext = self.far.told()
+        if np.isfinite(dl).all():
+            self.pilot.adopt(dl, np.nan_to_num(ext))
+
+    def _keep_stopped(self, far: Linked) -> None:
+        """As the robot is at the other end of the link: it may have stopped by itself, or be ready again."""
+        with self._gate:  # a stop that is pressed meanwhile must not be forgotten
+            if far.stopped and not self._stopped:
+                self._stopped, self._released = True, -np.inf
+            if self.releasing and not far.stopped and far.ready:
+                self._adopt()
+                self._stopped, self._problem = False, ""
+            if not self._stopped:
+                return
+        dl, ext = far.standing()
+        if np.isfinite(dl).all():
+            self.pilot.adopt(dl, np.nan_to_num(ext))
 
     def _run(self) -> None:
         due = time.perf_counter()
@@ -203,7 +243,7 @@ class Session:
     def _measure_pace(self, moves: bool) -> None:
         before, t = self._last
         now = time.perf_counter()
-        if not moves or self._paused or self.world.t < t:
+        if not moves or self._paused or self.far is not None or self.world.t < t:
             self._pace, self._last = 1.0, (now, self.world.t)
         elif now - before > 1.0:
             self._pace, self._last = (self.world.t - t) / (now - before), (now, self.world.t)
@@ -220,21 +260,20 @@ class Session:
 
     def _moves(self) -> bool:
         """Something is to be computed for the next picture."""
+        if self.far is not None:  # it must be looked at, whatever hands do
+            return True
         if self._stopped or (self._paused and not self._steps):
-            return self.link is not None and not self._paused
-        if (
-            self._steps
-            or self._scripted
-            or self.link is not None
-            or self.world.host
-            or self.world.robot.effects
-            or self.recorder is not None
-        ):
+            return False
+        if self._steps or self._scripted or self.world.host or self.world.robot.effects or self.recorder is not None:
             return True
         return not self.pilot.arrived or time.perf_counter() - self._asked < _REST / RATE
 
     def _advance(self, due: float, began: float, *, at_once: bool) -> float:
         """Steps of the world up to now, one at least where hands wait for it; when the next one is due."""
+        if self.far is not None:
+            self._try(min(max(began - self._moved, _QUICKEST), 1.0 / RATE))  # late, it is slower: nothing is made up for
+            self._moved, self._steps = began, 0
+            return began
         dt = self.world.dt
         steps = int((began - due) / dt + 1e-6)
         if self._steps:
@@ -243,18 +282,23 @@ class Session:
         elif at_once and steps == 0:
             steps, due = 1, began - dt
         for _ in range(steps):
-            try:
-                self._one(dt)
-            except FastrodError as error:
-                self._problem, self._said = str(error), time.perf_counter()
-                if not self._scripted:
-                    self.pilot.retreat()
-                due = began
-                break
+            if not self._try(dt):
+                return began
             if time.perf_counter() - began > _BEHIND:
                 return time.perf_counter()
             due += dt
         return due
+
+    def _try(self, dt: float) -> bool:
+        """One step; whether it could be done. Otherwise the problem is kept, and hands are where they were before."""
+        try:
+            self._one(dt)
+        except FastrodError as error:
+            self._problem, self._said = str(error), time.perf_counter()
+            if not self._scripted:
+                self.pilot.retreat()
+            return False
+        return True
 
     @property
     def waiting(self) -> float:
@@ -273,17 +317,40 @@ class Session:
         if self._scripted:
             self._hand = None
             self.world.play()
+        elif self.far is None:
+            self._hand = self.pilot.step(dt) if not self._stopped or self._hand is None else self._hand
+            self.world.drive(self._hand)
         else:
-            self._hand = hand = self.pilot.step(dt) if not self._stopped or self._hand is None else self._hand
-            if self.link is not None:
-                self.link.command(hand.tendon_length - self.world.robot.rest_tendon_length, hand.extension)
+            self._keep_stopped(self.far)
+            still = self._hand if self._paused and not self._stopped else None
+            hand = self.pilot.step(dt) if still is None else still
+            if not self._stopped:
+                self.far.command(hand.tendon_length - self.world.robot.rest_tendon_length, hand.extension, _SPREAD * dt)
+            self._hand = hand
             self.world.drive(hand)
         if time.perf_counter() - self._said > _SAID:
             self._problem = self.pilot.problem
         if self.recorder is None:
             self._recorded = -np.inf
-        elif self.recorder.recording:
+        elif self.recorder.recording and not self._fed:
             self._record(self.recorder)
+
+    def record(self, path: Path) -> None:
+        """Record to `path` from now on; in the session's thread. A link that can fills the log by itself, reading by reading.
+        Raises `InputError`."""
+        if self.far is not None:
+            self.recorder, self._fed = self.far.recorder(path)
+            return
+        recorder = Recorder(self.world.robot, path)
+        recorder.start(self.world.t, "by script" if self._scripted else "by hand")
+        self.recorder, self._fed = recorder, False
+
+    def end_recording(self) -> RunLog | None:
+        """End it; the log, None where nothing is recorded; in the session's thread. Raises `InputError`."""
+        recorder, self.recorder = self.recorder, None
+        if self.far is not None and self._fed:
+            self.far.end_recording()
+        return recorder.stop() if recorder is not None and recorder.recording else None
 
     def _record(self, recorder: Recorder) -> None:
         hand = self._hand
@@ -309,38 +376,12 @@ class Session:
         self._draw(Frame(self.world, self._hand, measured, latency, self._pace, problem))
 
     def _let_go(self) -> None:
-        if self.recorder is not None and self.recorder.recording:
-            self.recorder.stop()
         if self.link is not None:
-            self.link.close()
-        self.world.close()
-
-
-def measure(world: World, hand: Hand | None) -> Measurement:
-    """What a perfect encoder and camera say of the world's first robot now; t is the world's, frames those of a run log."""
-    state = world.rods[0].state
-    base, rotation = state.position[0, 0], state.rotation[0, 0]
-    tip = rotation.T @ state.tip_rotation[0]
-    if hand is not None:
-        change, extension = hand.tendon_length - world.robot.rest_tendon_length, hand.extension
-    else:
-        change = state.path_length[0] - _stretch(world) - world.robot.rest_tendon_length
-        extension = np.diff(_ends(world), prepend=0.0) - [segment.length for segment in world.robot.segments]
-    return Measurement(
-        t=world.t, dl=change, ext=extension, tip_position=rotation.T @ (state.tip_position[0] - base),
-        tip_quaternion=quaternion_from_matrix(tip[None])[0], tension=state.tension[0],
-    )  # fmt: skip
-
-
-def _stretch(world: World) -> Floats:
-    """(n_tendons,) by which each wire is longer than it was told to be: compliance (T - pretension) [m]."""
-    tendons = [tendon for segment in world.robot.segments for tendon in segment.tendons]
-    compliance, pretension = (np.array([getattr(tendon, name) for tendon in tendons]) for name in ("compliance", "pretension"))
-    return np.asarray(compliance * (world.rods[0].state.tension[0] - pretension), dtype=np.float64)
-
-
-def _ends(world: World) -> Floats:
-    """(n_segments,) arclength of each segment's end [m]."""
-    arclength = world.rods[0].state.arclength[0]
-    n = world.robot.n_segments
-    return np.asarray(arclength[(len(arclength) - 1) // n :: (len(arclength) - 1) // n], dtype=np.float64)
+            self.link.stop()  # before a long log is written
+        try:
+            with contextlib.suppress(InputError):  # no reading, or no room: nobody is left to be told, and rows are in PATH.part
+                self.end_recording()
+        finally:
+            if self.link is not None:
+                self.link.close()
+            self.world.close()

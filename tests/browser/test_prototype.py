@@ -1,0 +1,272 @@
+"""The emulated prototype in a real browser: driven, stopped, released, left alone, recorded."""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike, NDArray
+from windows import Window
+
+from fastrod.link import Measurement
+from fastrod.recording import Recorder
+from fastrod.runlog import read_log
+from fastrod_device.errors import DeviceError
+from fastrod_device.hardware import load_hardware
+from fastrod_device.workbench import Bench, emulated
+from fastrod_viewer.app import App
+from fastrod_viewer.drive_page import DrivePage
+from fastrod_viewer.worlds import FreeWorld
+
+Windows = Callable[..., Window]
+CYCLE = 0.01
+STANDS = 2e-5  # m of a wire: what noise of the plant and the drives' regulators leave
+
+
+class Paced:
+    """The emulated prototype in stepped time, a cycle every 10 ms at most: however busy the machine is, no cycle of its own is late."""
+
+    real = True
+
+    def __init__(self, bench: Bench) -> None:
+        self.prototype = bench.prototype
+        self.robot, self.supervisor, self.clock = bench.prototype.robot, bench.prototype.supervisor, bench.prototype.clock
+        self.source = bench.prototype.source
+        self.asked: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self.ended = threading.Event()
+        self.thread = threading.Thread(target=self._run, daemon=True)
+        self.thread.start()
+
+    commanded = property(lambda self: self.prototype.commanded)
+    readings = property(lambda self: self.prototype.readings)
+    sighting = property(lambda self: self.prototype.sighting)
+    elapsed = property(lambda self: self.prototype.elapsed)
+
+    def command(self, dl: ArrayLike, ext: ArrayLike | None = None) -> None:
+        self.prototype.command(dl, ext)
+
+    def read(self) -> Measurement:
+        return self.prototype.read()
+
+    def stop(self) -> None:
+        self.prototype.stop()
+
+    def release(self) -> None:
+        self.asked.put(self.prototype.release)
+
+    def recorder_for(self, path: str) -> Recorder:
+        return self.prototype.recorder_for(path)
+
+    def record(self, recorder: Recorder | None) -> None:
+        self.prototype.record(recorder)
+
+    def picture(self) -> NDArray[np.uint8] | None:
+        return np.full((480, 640, 3), (20, 200, 40), dtype=np.uint8)
+
+    def close(self) -> None:
+        self.ended.set()
+        if self.thread is not threading.current_thread():
+            self.thread.join(timeout=10.0)
+        self.prototype.close()
+
+    def _run(self) -> None:
+        while not self.ended.is_set():
+            began = time.perf_counter()
+            with contextlib.suppress(queue.Empty):
+                self.asked.get_nowait()()
+            with contextlib.suppress(DeviceError):  # it has stopped; its page says so
+                self.prototype.wait(CYCLE)
+            self.ended.wait(max(CYCLE - (time.perf_counter() - began), 0.0))
+
+    def wires(self) -> np.ndarray:
+        """(4,) where the drives say they are [m]."""
+        assert self.readings is not None
+        return np.array(self.readings.dl)
+
+
+class Bed:
+    """A prototype, its page, and a window."""
+
+    def __init__(self, bench: Bench, app: App) -> None:
+        assert bench.emulator is not None
+        self.app, self.emulator, self.link = app, bench.emulator, Paced(bench)
+        app.open(FreeWorld(bench.prototype.robot), link=self.link)
+        assert isinstance(app.page, DrivePage)
+        self.page = app.page
+
+    def bend(self, seen: Window, key: str, label: str = "Bend x [°]") -> None:
+        thumb = seen.slider(label)
+        thumb.focus()
+        thumb.press(key)
+
+    def slowly(self, seen: Window) -> None:
+        """At 5 degrees a second, so that it is under way for long."""
+        self.bend(seen, "Home", "Speed [°/s]")
+
+    def stands(self, seen: Window) -> bool:
+        """The drives stand, for so many cycles."""
+        until = self.link.elapsed + 0.2
+        assert seen.until(lambda: self.link.elapsed > until)  # a ramp has ended
+        before, until = self.link.wires(), self.link.elapsed + 0.5
+        assert seen.until(lambda: self.link.elapsed > until)
+        return bool(np.abs(self.link.wires() - before).max() < STANDS)
+
+    def says(self, seen: Window, words: str) -> bool:
+        return seen.until(lambda: seen.page.get_by_text(re.compile(words)).count() > 0)
+
+
+@pytest.fixture
+def bed(app: App) -> Iterator[Bed]:
+    with emulated(load_hardware(), seed=3, effect="none", home=False) as bench:
+        made = Bed(bench, app)
+        yield made
+        app.close()
+
+
+def test_hands_drive_it_and_the_page_shows_what_it_says(bed: Bed, window: Windows) -> None:
+    seen = window(bed.app.address)
+    bed.bend(seen, "End")
+    assert seen.until(lambda: bed.page.pilot.arrived and bool(bed.link.wires()[0] < -7.9e-3))
+    # 61 degrees are the most whole ones that 8 mm of wire are good for, at 7.5 mm from the backbone
+    np.testing.assert_allclose(bed.link.wires(), 0.0075 * np.radians([-61.0, 0.0, 61.0, 0.0]), atol=1e-4)
+    for words in ("The robot follows commands.", "marker seen", "Wires pull", "Measured tip", "as measured"):
+        assert bed.says(seen, words), words
+    measured = bed.link.read().tip_position
+    assert seen.until(lambda: "measured" in bed.page.drawing.canvas.names)
+    assert measured[0] > 0.025  # (1 - cos a) l / a is 34 mm; friction and stretched wires take some of it
+    green = (np.abs(seen.pixels().astype(int) - (20, 200, 40)).max(axis=2) < 25)[:400, 800:].sum()
+    assert green > 10_000  # the camera's picture
+    assert seen.errors == []
+
+
+def test_what_is_beyond_a_limit_is_said_and_not_done(app: App, window: Windows) -> None:
+    hardware = load_hardware()
+    tight = replace(hardware, limits=replace(hardware.limits, curvature=8.0))  # 0.56 rad; the slider goes to 61 degrees by its wires
+    with emulated(tight, seed=3, effect="none", home=False) as bench:
+        bed = Bed(bench, app)
+        seen = window(app.address)
+        bed.bend(seen, "End")
+        assert bed.says(seen, "segment 1 was told to bend with 8.* 1/m; this robot's limit is 8 1/m.")
+        assert 0.52 < bed.page.pilot.bent(0)[0] <= 8.0 * 0.07
+        assert bed.stands(seen)
+        assert not bed.page.session.stopped
+        bed.bend(seen, "Home")
+        assert seen.until(lambda: bool(bed.link.wires()[0] > 1e-3))
+        assert seen.errors == []
+        app.close()
+
+
+def test_stop_stands_at_once_and_go_on_moves_nothing(bed: Bed, window: Windows) -> None:
+    seen = window(bed.app.address)
+    bed.slowly(seen)
+    bed.bend(seen, "End")
+    assert seen.until(lambda: bool(bed.link.wires()[0] < -3e-4))
+    seen.page.get_by_role("button", name="STOP", exact=True).click()
+    assert seen.until(lambda: bed.page.session.stopped)
+    assert bed.stands(seen)
+    there = bed.link.wires()
+    bed.bend(seen, "End")
+    assert bed.stands(seen)
+    assert bed.says(seen, "emergency stop was pressed")
+    seen.page.get_by_role("button", name="GO ON").click()
+    assert seen.until(lambda: not bed.page.session.stopped)
+    assert bed.stands(seen)
+    np.testing.assert_allclose(bed.link.wires(), there, atol=5e-5)
+    assert bed.page.pilot.bent(0)[0] == pytest.approx(-there[0] / 0.0075, abs=0.01)
+    bed.bend(seen, "Home")
+    assert seen.until(lambda: bool(bed.link.wires()[0] > there[0] + 2e-4))
+
+
+def test_after_a_fault_the_page_says_why_and_releases_when_the_cause_is_gone(bed: Bed, window: Windows) -> None:
+    seen = window(bed.app.address)
+    assert bed.says(seen, "marker seen")
+    bed.emulator.hidden = True
+    assert bed.says(seen, "the marker was last seen")
+    assert bed.page.session.stopped
+    assert bed.says(seen, "no marker")
+    seen.page.get_by_role("button", name="GO ON").click()
+    assert bed.says(seen, "not released, as")
+    bed.emulator.hidden = False
+    assert bed.says(seen, "marker seen")
+    assert seen.until(lambda: not bed.page.session.releasing)
+    seen.page.get_by_role("button", name="GO ON").click()
+    assert seen.until(lambda: not bed.page.session.stopped)
+    assert bed.says(seen, "The robot follows commands.")
+
+
+@pytest.mark.parametrize("how", ["closed", "frozen"])
+def test_nothing_moves_when_nobody_watches(bed: Bed, window: Windows, how: str) -> None:
+    seen, other = window(bed.app.address), window()
+    bed.slowly(seen)
+    bed.bend(seen, "End")
+    assert seen.until(lambda: bool(bed.link.wires()[0] < -3e-4))
+    if how == "closed":
+        seen.close()
+    else:
+        seen.page.evaluate("() => { setTimeout(() => { const end = Date.now() + 9000; while (Date.now() < end); }, 0); }")
+    assert other.until(lambda: bed.link.prototype.supervisor.first is not None)
+    assert bed.stands(other)
+    there = bed.link.wires()
+    assert there[0] > 0.0075 * np.radians(-60.0)  # it had not arrived
+    other.go(bed.app.address)
+    assert bed.says(other, "nobody watches the robot any more")
+    bed.bend(other, "End")
+    assert bed.stands(other)
+    np.testing.assert_allclose(bed.link.wires(), there, atol=STANDS)
+    other.page.get_by_role("button", name="GO ON").click()
+    assert other.until(lambda: not bed.page.session.stopped)
+
+
+def test_a_recording_has_the_cameras_sightings_by_the_robots_clock(bed: Bed, window: Windows, tmp_path: Path) -> None:
+    seen = window(bed.app.address)
+    seen.page.get_by_role("tab", name="Save").click()
+    seen.page.get_by_role("button", name="Record a run log").click()
+    assert seen.until(lambda: bed.page.session.recorder is not None)
+    for _ in range(4):
+        seen.page.keyboard.press("l")
+    assert seen.until(lambda: bool(bed.link.wires()[0] < -0.0075 * np.radians(19.0)))
+    until = bed.link.elapsed + 0.5
+    assert seen.until(lambda: bed.link.elapsed > until)
+    seen.page.get_by_role("button", name="Stop and save").click()
+    path = tmp_path / "prototype-session.csv"
+    assert seen.until(path.is_file)
+    log = read_log(path, bed.link.robot)
+    rate = load_hardware().camera.rate
+    assert len(log) > 8
+    np.testing.assert_allclose(np.diff(log.t), 1.0 / rate, atol=0.011)  # each frame once, by the clock that cycles count
+    assert 0.0 <= log.t[0] < 0.2
+    assert log.dl[-1, 0] == pytest.approx(-0.0075 * np.radians(20.0), abs=1e-4)
+    assert 0.008 < log.tip_position[-1, 0] < 0.014  # an arc of 20 degrees and 70 mm ends 12 mm beside its base
+    assert {"marker_flag", "marker_error", "current_1", "cmd_dl_1"} <= set(log.extra)
+    assert seen.errors == []
+
+
+def test_sigterm_saves_the_recording_and_switches_off(tmp_path: Path, window: Windows) -> None:
+    command = [sys.executable, "-m", "fastrod.cli", "drive", "--emulate", "--seed", "3", "--no-home", "--no-open", "--port", "0"]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        assert "http://127.0.0.1:" in line, process.communicate()
+        seen = window(line.split()[1])
+        seen.page.get_by_role("tab", name="Save").click()
+        seen.page.get_by_role("button", name="Record a run log").click()
+        assert seen.until(lambda: any(p.stat().st_size > 2000 for p in tmp_path.glob("*.part")))
+        process.send_signal(signal.SIGTERM)
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == 0, said
+    assert "The drives are switched off." in said
+    assert "Traceback" not in said
+    log = read_log(tmp_path / "prototype-session.csv", load_hardware().robot)
+    assert len(log) > 3
+    assert np.isfinite(log.tip_position).any()

@@ -1,0 +1,435 @@
+"""The prototype as a robot link: what it is told, what it records, what homing finds, how it starts and ends."""
+
+from __future__ import annotations
+
+import itertools
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fastrod.errors import InputError
+from fastrod.link import RobotLink
+from fastrod.runlog import read_log
+from fastrod.types import Floats
+from fastrod_device.clock import Clock, SteppedClock, WallClock
+from fastrod_device.emulator import Emulator
+from fastrod_device.errors import DeviceError, RefusedError
+from fastrod_device.hardware import load_hardware
+from fastrod_device.journal import Journal, Trace
+from fastrod_device.prototype import EXTRA, Prototype
+from fastrod_device.safety import State
+from fastrod_device.seal import seal
+from fastrod_device.workbench import emulated
+
+pytest.importorskip("canopen")
+pytest.importorskip("cv2")
+
+HARDWARE = load_hardware()
+# in real time a busy machine is no fault
+_YOUNG = {"feedback_age": 5.0, "heartbeat_age": 9.0, "cycle": 5.0, "command_age": 9.0, "clock_jump": 9.0, "sighting_age": None}
+PATIENT = replace(HARDWARE, limits=replace(HARDWARE.limits, encoder_jump=0.05, **_YOUNG))
+BENT = np.array([-0.002, 0.001, 0.002, -0.001])
+_names = itertools.count()
+
+
+@contextmanager
+def bench(clock: Clock | None = None, *, camera: bool = True, hardware: Any = HARDWARE) -> Iterator[tuple[Prototype, Emulator]]:
+    """Started, with wires that have their pretension at power-on."""
+    clock, bus = SteppedClock() if clock is None else clock, f"virtual:prototype-{next(_names)}"
+    with pytest.MonkeyPatch.context() as patch:
+        if not clock.stepped:  # drives that bear a busy machine, too
+            patch.setattr("fastrod_device.configuring.PATIENCE", 8.0)
+            patch.setattr("fastrod_device.cycle._PAUSE", 7.0)
+        emulator = Emulator(hardware, bus, clock=clock, seal=seal(5, "none"), seed=5, taut=True)
+        try:
+            with Prototype(hardware, bus, emulator if camera else None, clock=clock) as prototype:
+                try:
+                    prototype.start(home=False)
+                    yield prototype, emulator
+                finally:
+                    if prototype.recorder is not None and prototype.recorder.recording:
+                        with suppress(InputError):
+                            prototype.recorder.stop()
+        finally:
+            emulator.close()
+
+
+@contextmanager
+def overheard(prototype: Prototype, emulator: Emulator) -> Iterator[list[tuple[int, ...]]]:
+    """Targets [counts] as they pass on the bus, a row for each cycle."""
+    rows: list[tuple[int, ...]] = []
+    lock, row = threading.Lock(), [0] * 4
+    network = emulator.drives._line.network
+
+    def hear(cob_id: int, data: bytearray, _: float) -> None:
+        with lock:
+            row[cob_id - 0x201] = struct.unpack("<Hi", data)[1]
+            if cob_id == 0x204:
+                rows.append(tuple(row))
+
+    for cob_id in range(0x201, 0x205):
+        network.subscribe(cob_id, hear)
+    yield rows
+    for cob_id in range(0x201, 0x205):
+        network.unsubscribe(cob_id, hear)
+    assert prototype.drives.n_drives == 4
+
+
+# a link
+
+
+def test_it_is_a_robot_link_and_goes_where_it_is_told() -> None:
+    with bench() as (prototype, _):
+        assert isinstance(prototype, RobotLink)
+        assert prototype.real
+        prototype.command(BENT)
+        prototype.wait(0.5)
+        np.testing.assert_allclose(prototype.read().dl, BENT, atol=2e-6)
+        np.testing.assert_allclose(prototype.commanded, BENT, atol=1e-12)
+        assert prototype.read().problem == ""
+        assert np.linalg.norm(prototype.read().tip_position) > 0.06
+
+
+def test_stop_holds_it_and_release_lets_it_go_on_from_where_it_stands() -> None:
+    with bench() as (prototype, emulator):
+        prototype.command(BENT)
+        prototype.wait(0.03)
+        prototype.stop()
+        prototype.stop()
+        for _ in range(30):
+            with pytest.raises(DeviceError, match="emergency stop"):
+                prototype.wait(0.01)
+        where = emulator.drives.true_pulled
+        prototype.command(np.zeros(4))  # ignored
+        assert "emergency stop" in prototype.read().problem
+        prototype.release()
+        prototype.wait(0.3)
+        np.testing.assert_allclose(emulator.drives.true_pulled, where, atol=2e-6)
+        prototype.command(BENT)
+        prototype.wait(0.4)
+        np.testing.assert_allclose(-emulator.drives.true_pulled, BENT, atol=3e-6)
+
+
+def test_a_release_of_what_is_not_stopped_does_nothing() -> None:
+    with bench() as (prototype, _):
+        prototype.release()
+        assert prototype.supervisor.state is State.READY
+
+
+# what it refuses
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        ({"dl": [-0.0081, 0.0, 0.0081, 0.0]}, "the limit is|limit is 8 mm"),
+        ({"dl": [0.0, np.nan, 0.0, 0.0]}, "wire 2 was told nan m"),
+        ({"dl": [0.0, 0.0, np.inf, 0.0]}, "wire 3 was told inf m"),
+        ({"dl": [0.0, 0.0, 0.0]}, "shape"),
+        ({"dl": ["a", 0.0, 0.0, 0.0]}, "4 numbers"),
+        ({"dl": BENT, "ext": [0.001]}, "extend"),
+        ({"dl": BENT, "age": 0.6}, "meant 600 ms ago"),
+        ({"dl": BENT, "age": -0.6}, "meant -600 ms ago"),
+    ],
+)
+def test_what_is_refused_never_reaches_the_bus(told: dict[str, Any], words: str) -> None:
+    with bench() as (prototype, emulator):
+        prototype.wait(0.1)
+        stamp = prototype.clock.now() - told["age"] if "age" in told else None
+        with overheard(prototype, emulator) as rows:
+            with pytest.raises(RefusedError, match=words):
+                prototype.command(told["dl"], told.get("ext"), stamp=stamp)
+            prototype.wait(0.2)
+        assert len(rows) >= 20
+        assert len(set(rows)) == 1
+        assert prototype.supervisor.state is State.READY  # and it does not stop by it
+
+
+def test_set_points_keep_to_the_rate_however_far_the_command_is() -> None:
+    with bench() as (prototype, emulator), overheard(prototype, emulator) as rows:
+        prototype.command([-0.007, 0.0, 0.007, 0.0])
+        prototype.wait(0.4)
+        steps = np.abs(np.diff(np.array(rows), axis=0)) * HARDWARE.drives[0].metres_per_count
+        assert steps.max() <= HARDWARE.limits.rate / HARDWARE.rate + 1e-6
+        assert steps.max() > 0.99 * HARDWARE.limits.rate / HARDWARE.rate
+
+
+def test_a_command_that_nobody_renews_while_the_robot_moves_stops_it() -> None:
+    slow = replace(HARDWARE, limits=replace(HARDWARE.limits, rate=0.01, command_age=0.2))
+    with bench(hardware=slow) as (prototype, _):
+        prototype.command([-0.006, 0.0, 0.006, 0.0])
+        with pytest.raises(DeviceError, match=r"command that is 2\d\d ms old"):
+            prototype.wait(1.0)
+
+
+# plans
+
+
+def test_an_exception_in_a_plan_stops_the_drives() -> None:
+    def plan(t: float) -> Floats:
+        if t > 0.2:
+            raise KeyError("no such place")
+        return 4.0 * t * BENT
+
+    with bench() as (prototype, emulator):
+        with pytest.raises(KeyError):
+            prototype.follow(plan, 1.0)
+        assert prototype.supervisor.state is State.STOPPED
+        for _ in range(30):
+            with pytest.raises(DeviceError, match="KeyError"):
+                prototype.wait(0.01)
+        assert not emulator.drives.moving.any()
+        assert prototype.journal.lines[0][1] == "exception"
+
+
+def test_a_plan_that_leads_beyond_a_limit_is_refused_and_stops_the_drives() -> None:
+    with bench() as (prototype, _):
+        with pytest.raises(RefusedError, match="limit is 8 mm"):
+            prototype.follow(lambda t: np.array([-0.02, 0.0, 0.02, 0.0]) * t, 1.0)
+        assert prototype.supervisor.state is State.STOPPED
+        assert np.abs(prototype.commanded).max() <= 0.008
+
+
+def test_a_recording_that_cannot_go_on_stops_the_drives_in_stepped_time_too(tmp_path: Any) -> None:
+    with bench() as (prototype, _):
+        recorder = prototype.recorder_for(tmp_path / "log.csv")
+        recorder.start(prototype.elapsed)
+        prototype.record(recorder)
+        prototype.payload = np.ones(2)  # type: ignore[assignment]  # no number: the row cannot be made
+        with pytest.raises((InputError, ValueError)):
+            prototype.wait(1.0)
+        assert prototype.supervisor.state is State.STOPPED
+
+
+# what it records
+
+
+def test_rows_have_the_wires_of_the_moment_of_exposure(tmp_path: Any) -> None:
+    with bench() as (prototype, emulator):
+        true: list[tuple[float, Floats]] = []
+        recorder = prototype.recorder_for(tmp_path / "log.csv")
+        recorder.start(prototype.elapsed)
+        prototype.record(recorder)
+        prototype.payload = 0.01
+        began = prototype.clock.now()
+        while prototype.clock.now() < began + 2.0:
+            angle = 3.0 * (prototype.clock.now() - began)
+            prototype.command(0.003 * np.sin(angle) * np.array([1.0, -0.5, -1.0, 0.5]))
+            prototype.wait(0.01)
+            assert prototype.readings is not None
+            true.append((prototype.readings.t - prototype._zero, -emulator.drives.true_pulled))
+        prototype.record(None)
+        rows = len(recorder)
+        log = recorder.stop()
+        times, wires = np.array([t for t, _ in true]), np.array([dl for _, dl in true])
+        offset = began - prototype._zero
+        expected = np.stack([np.interp(log.t + offset, times, wires[:, k]) for k in range(4)], axis=1)
+        late = log.t > 0.1
+        # the plant lives between two cycles by the same straight lines; a count is 0.6 um, a cycle of lag would be 90 um
+        np.testing.assert_allclose(log.dl[late], expected[late], atol=4e-6)
+        assert rows == len(log.t) >= 28
+        assert {*EXTRA, "current_1", "current_4"} <= set(log.extra)
+        assert {"cmd_dl_1", "tension_4"} <= set(log.extra)
+        np.testing.assert_array_equal(log.extra["marker_flag"], 0.0)
+        assert log.payload is not None
+        np.testing.assert_array_equal(log.payload, 0.01)
+        np.testing.assert_array_equal(log.extra["seen_z"], log.tip_position[:, 2])
+        again = read_log(tmp_path / "log.csv", prototype.robot)
+        np.testing.assert_array_equal(again.dl, log.dl)
+
+
+def test_a_covered_marker_is_recorded_as_such_and_not_as_a_tip(tmp_path: Any) -> None:
+    with bench() as (prototype, emulator):
+        prototype.wait(0.3)
+        emulator.hidden = True
+        recorder = prototype.recorder_for(tmp_path / "log.csv")
+        recorder.start(prototype.elapsed)
+        prototype.record(recorder)
+        prototype.wait(0.3)
+        assert np.isnan(prototype.read().tip_position).all()
+        log = recorder.stop()
+        assert log.extra["marker_flag"][-1] == 1.0
+        assert np.isnan(log.tip_position[-1]).all()
+
+
+def test_a_recording_that_is_ended_while_frames_come_stops_nothing(tmp_path: Any) -> None:
+    with bench() as (prototype, _):
+        recorder = prototype.recorder_for(tmp_path / "log.csv")
+        recorder.start(prototype.elapsed)
+        prototype.record(recorder)
+        prototype.wait(0.3)
+        recorder.stop()
+        prototype.wait(0.3)
+        assert prototype.supervisor.state is State.READY
+
+
+def test_a_trace_goes_straight_between_its_points() -> None:
+    trace = Trace(2, 3)
+    assert np.isnan(trace.at(1.0)[0]).all()
+    for t in range(5):  # the oldest two are forgotten
+        trace.add(float(t), np.array([t, 2.0 * t]), np.array([-t, 0.0]))
+    np.testing.assert_allclose(trace.at(2.5), [[2.5, 5.0], [-2.5, 0.0]])
+    np.testing.assert_allclose(trace.at(0.0)[0], [2.0, 4.0])  # before the first: the first
+    np.testing.assert_allclose(trace.at(9.0)[0], [4.0, 8.0])
+    trace.clear()
+    assert np.isnan(trace.at(3.0)[1]).all()
+
+
+def test_a_journal_writes_its_lines_at_once(tmp_path: Any) -> None:
+    journal = Journal(tmp_path / "events.csv")
+    journal.write(1.5, "tension", 'drive 1 says "too much", and more.')
+    assert (tmp_path / "events.csv").read_text() == '1.5000,tension,"drive 1 says ""too much"", and more."\n'
+    journal.close()
+    journal.close()
+    with pytest.raises(InputError, match="cannot be written"):
+        Journal(tmp_path / "nowhere" / "events.csv")
+
+
+# starting and ending
+
+
+@pytest.mark.parametrize("effect", ["none", "friction"])
+def test_homing_finds_where_the_robot_is_straight(effect: str) -> None:
+    with emulated(HARDWARE, seed=2, effect=effect) as made:
+        prototype, emulator = made.prototype, made.emulator
+        assert emulator is not None
+        true = -(emulator.drives.true_pulled - emulator._slack)  # wire beyond the slack
+        bending = 0.5 * (true[:2] - true[2:])
+        assert np.abs(bending).max() < 3e-5  # m
+        assert (true < 0.0).all()  # every wire is pulled
+        assert np.abs(prototype.readings.dl if prototype.readings is not None else np.zeros(4)).max() < 1e-6
+        assert [tendon.pretension for tendon in prototype.robot.segments[0].tendons] == pytest.approx([1.0] * 4, abs=0.35)
+
+
+def test_it_works_without_a_camera() -> None:
+    with bench(camera=False) as (prototype, _):
+        prototype.command(BENT)
+        prototype.wait(1.0)
+        reading = prototype.read()
+        np.testing.assert_allclose(reading.dl, BENT, atol=2e-6)
+        assert np.isnan(reading.tip_position).all()
+        assert np.isfinite(reading.tension).all()
+
+
+@pytest.mark.parametrize("stepped", [True, False])
+def test_drives_that_are_not_there_are_one_sentence(stepped: bool) -> None:
+    with Prototype(HARDWARE, "virtual:nobody", None, clock=SteppedClock() if stepped else WallClock()) as prototype:
+        with pytest.raises(DeviceError, match="node 1 does not answer") as error:
+            prototype.start()
+        assert "\n" not in str(error.value)
+        with pytest.raises(DeviceError, match="call start first"):
+            Prototype(HARDWARE, "virtual:nobody", None, clock=SteppedClock()).wait(1.0)
+
+
+def test_a_bus_that_is_not_there_is_one_sentence() -> None:
+    with pytest.raises(DeviceError, match="no CAN interface 'soketcan'"):
+        Prototype(HARDWARE, "soketcan:can0", None)
+
+
+def test_close_is_idempotent_and_switches_the_drives_off() -> None:
+    with bench(camera=False) as (prototype, emulator):
+        prototype.command(BENT)
+        prototype.wait(0.05)
+        prototype.close()
+        prototype.close()
+        assert set(emulator.drives.states) == {"switch on disabled"}
+        assert not emulator.drives.moving.any()
+        prototype.stop()  # never raises
+
+
+def test_an_error_in_the_block_closes_it() -> None:
+    def fails() -> None:
+        with bench(camera=False) as (prototype, emulator):
+            made.append(emulator)
+            prototype.command(BENT)
+            prototype.wait(0.05)
+            raise ZeroDivisionError
+
+    made: list[Emulator] = []
+    with pytest.raises(ZeroDivisionError):
+        fails()
+    (emulator,) = made
+    assert set(emulator.drives.states) == {"switch on disabled"}
+
+
+# in real time
+
+
+def _until(true: Any, seconds: float = 20.0) -> bool:
+    end = time.monotonic() + seconds
+    while not true() and time.monotonic() < end:
+        time.sleep(0.01)
+    return bool(true())
+
+
+def test_a_story_in_real_time(tmp_path: Any) -> None:
+    before = threading.active_count()
+    with bench(WallClock(), hardware=PATIENT) as (prototype, emulator):
+        recorder = prototype.recorder_for(tmp_path / "log.csv")
+        recorder.start(prototype.elapsed)
+        prototype.record(recorder)
+        prototype.command(BENT)
+        reached = _until(lambda: np.allclose(prototype.read().dl, BENT, atol=5e-6) and len(recorder) > 3)
+        assert reached, prototype.supervisor.status
+        prototype.follow(lambda t: BENT * np.cos(2.0 * t), 0.5)
+        prototype.stop()
+        with pytest.raises(DeviceError, match="emergency stop was pressed"):
+            prototype.wait(1.0)
+        assert _until(lambda: not emulator.drives.moving.any())
+        prototype.command(np.zeros(4))  # ignored
+        prototype.release()
+        assert _until(lambda: prototype.supervisor.state is State.READY)
+        prototype.command(np.zeros(4))
+        assert _until(lambda: np.allclose(prototype.read().dl, 0.0, atol=5e-6))
+        assert prototype.broken is None
+        prototype.record(None)
+        assert len(recorder.stop().t) > 3
+        kinds = [line[1] for line in prototype.journal.lines]
+        assert (kinds[0], kinds[-1]) == ("emergency stop", "release")
+    assert _until(lambda: threading.active_count() <= before)
+
+
+def test_follow_in_real_time_tells_what_stopped_it() -> None:
+    with bench(WallClock(), hardware=PATIENT) as (prototype, emulator):
+        with pytest.raises(RefusedError, match="limit is 8 mm"):
+            prototype.follow(lambda t: np.array([-0.1, 0.0, 0.1, 0.0]) * t, 30.0)
+        prototype.release()
+        assert _until(lambda: prototype.supervisor.state is State.READY)
+        with pytest.raises(DeviceError, match="ZeroDivisionError"):
+            prototype.follow(lambda t: np.zeros(4) / (0 if t > 0.1 else 1) if t < 0.1 else 1 // 0, 30.0)  # type: ignore[arg-type,return-value]
+        prototype.release()
+        assert _until(lambda: prototype.supervisor.state is State.READY)
+        threading.Timer(0.2, lambda: emulator.drives.emergency(1, 0x3210)).start()
+        with pytest.raises(DeviceError, match=r"node 2.*0x3210"):
+            prototype.follow(lambda t: BENT * np.sin(t), 30.0)
+        assert _until(lambda: not emulator.drives.moving.any())
+
+
+def test_a_plan_that_hangs_is_found_by_the_watchdog_and_the_drives_stop() -> None:
+    over, quick = threading.Event(), replace(PATIENT, limits=replace(PATIENT.limits, cycle=0.4))
+
+    def plan(t: float) -> Floats:
+        if t > 0.1:
+            over.wait(20.0)
+        return BENT * np.sin(t)
+
+    with bench(WallClock(), hardware=quick) as (prototype, emulator):
+        with pytest.raises(DeviceError, match="the controller stood still for"):
+            prototype.follow(plan, 30.0)
+        assert not over.is_set()  # the thread that drives still hangs
+        assert prototype.journal.lines[0][1] == "controller stalled"
+        assert _until(lambda: set(emulator.drives.states) == {"quick stop active"})
+        with suppress(RefusedError):
+            prototype.command(BENT)
+        prototype.read()
+        over.set()
+        assert _until(lambda: not emulator.drives.moving.any())
+        assert prototype.supervisor.state is State.STOPPED
+        assert set(emulator.drives.states) == {"quick stop active"}
