@@ -43,7 +43,7 @@ def home(drives: DriveBus, hardware: Hardware, clock: Clock, look: Callable[[], 
     """
     transmission, n = Transmission(hardware.drives), len(hardware.drives)
     per = 1.0 / np.abs(transmission.wound(np.ones(n, dtype=np.int64)))  # counts in a metre
-    drives.homing(np.abs(transmission.torque(np.full(n, hardware.pretension))), hardware.homing_speed * per)
+    drives.homing(np.abs(transmission.torque(np.full(n, hardware.pretension))), np.rint(hardware.homing_speed * per).astype(np.int64))
     pacer = Pacer(clock, hardware.rate)
     at = transmission.dl(drives.newest.position)
 

@@ -1,17 +1,13 @@
-"""`Journal`: what happened, a line each, on disk at once; `Trace`: where the wires were lately, for frames that come late."""
+"""`Journal`: what happened, a line each, on disk at once."""
 
 from __future__ import annotations
 
 import csv
 import threading
-from collections import deque
 from pathlib import Path
 from typing import TextIO, final
 
-import numpy as np
-
 from fastrod.errors import InputError
-from fastrod.types import Floats
 
 
 @final
@@ -46,33 +42,3 @@ class Journal:
             if self._file is not None:
                 self._file.close()
                 self._file = None
-
-
-@final
-class Trace:
-    """What encoders said and what was told, of the newest cycles. Its caller has a lock."""
-
-    def __init__(self, n_wires: int, n_cycles: int) -> None:
-        """Empty."""
-        self._nowhere: Floats = np.full(n_wires, np.nan)
-        self._past: deque[tuple[float, Floats, Floats]] = deque(maxlen=n_cycles)
-
-    def add(self, t: float, dl: Floats, told: Floats) -> None:
-        """(n_wires,) by the encoders at `t` [s], and the set-points then [m]."""
-        self._past.append((t, dl, told))
-
-    def clear(self) -> None:
-        """Forget all of it."""
-        self._past.clear()
-
-    def at(self, t: float) -> tuple[Floats, Floats]:
-        """(n_wires,) and (n_wires,) [m] at `t` [s], by a straight line between two cycles; nan where nothing is known."""
-        past = self._past
-        if not past:
-            return self._nowhere, self._nowhere
-        k = next((k for k in range(len(past) - 1, -1, -1) if past[k][0] <= t), 0)
-        if k == len(past) - 1 or t <= past[0][0]:
-            return past[k][1], past[k][2]
-        (t0, dl0, told0), (t1, dl1, told1) = past[k], past[k + 1]
-        part = (t - t0) / (t1 - t0)
-        return dl0 + part * (dl1 - dl0), told0 + part * (told1 - told0)

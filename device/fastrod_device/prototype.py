@@ -11,14 +11,15 @@ from pathlib import Path
 from typing import final
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from fastrod.errors import FastrodError, InputError
 from fastrod.link import Measurement
 from fastrod.recording import Recorder
 from fastrod.robot import Robot
 from fastrod.types import Floats
-from fastrod_device.camera import FrameSource
+from fastrod_device import columns
+from fastrod_device.camera import Frame, FrameSource
 from fastrod_device.clock import Clock, WallClock
 from fastrod_device.drive import DriveBus
 from fastrod_device.errors import DeviceError, RefusedError
@@ -26,20 +27,18 @@ from fastrod_device.expectation import Expectation
 from fastrod_device.faultcodes import in_words
 from fastrod_device.hardware import Hardware
 from fastrod_device.homing import home
-from fastrod_device.journal import Journal, Trace
+from fastrod_device.journal import Journal
 from fastrod_device.pacer import Pacer, urgent, urgently
 from fastrod_device.readings import Readings
 from fastrod_device.safety import CameraWatch, Fault, State, Supervisor, limited
-from fastrod_device.tracker import MarkerTracker, Sighting
+from fastrod_device.trace import Trace
+from fastrod_device.tracker import MarkerTracker, Sighting, outlined
 from fastrod_device.units import Transmission
 
 Plan = Callable[[float], Floats]
 """Seconds since it began -> (n_tendons,) changes of wire length [m], negative = pulled."""
 
-FLAGS = ("", "no marker", "outlier", "ambiguous", "frozen")
-EXTRA = ("marker_error", "marker_size", "marker_flag", "seen_x", "seen_y", "seen_z")
-"""Further columns of a recording: reprojection error [px], size of the marker in the picture [px], place of the sighting's flag in `FLAGS`
-(0: trusted), and where the tip was seen, trusted or not [m]; then current_1 ... [A]."""
+_SLOWEST = 1e-6  # m/s of a glide
 _REMEMBERED = 3.0  # s of wire lengths, for frames that come late
 _FROZEN = 3  # frames alike: a camera at 15 Hz never draws the same noise twice
 _MARGIN = 1.5  # of our limits: where the drives refuse by themselves
@@ -92,8 +91,12 @@ class Prototype:
         self._wanted: Floats = np.zeros(n)
         self._set: Floats = np.zeros(n)
         self._past = Trace(n, int(_REMEMBERED * hardware.rate))
-        self._readings: Readings | None = None
-        self._sighting: Sighting | None = None
+        self.readings: Readings | None = None
+        """Of the newest cycle."""
+        self.sighting: Sighting | None = None
+        """The newest, trusted or not."""
+        self._frame: Frame | None = None
+        self._pace = hardware.limits.rate
         self._trusted, self._alike = self.clock.now(), 0
         self._zero = self.clock.now()
         self._pacer: Pacer | None = None
@@ -115,16 +118,6 @@ class Prototype:
         """(n_tendons,) the set-point now [m]."""
         with self._lock:
             return self._set.copy()
-
-    @property
-    def sighting(self) -> Sighting | None:
-        """The newest, trusted or not."""
-        return self._sighting
-
-    @property
-    def readings(self) -> Readings | None:
-        """Of the newest cycle."""
-        return self._readings
 
     def __enter__(self) -> Prototype:
         return self
@@ -182,6 +175,20 @@ class Prototype:
             if self.supervisor.state is State.STOPPED:
                 return
             self._wanted, self._plan = self.supervisor.check(dl, self.clock.now(), stamp=stamp), None
+            self._pace = self.hardware.limits.rate
+
+    def glide(self, dl: ArrayLike, seconds: float) -> None:
+        """As `command`, spread evenly over so long [s]: commands that come ten times slower than cycles then make no jerks."""
+        if not (np.isfinite(seconds) and seconds > 0.0):
+            raise RefusedError(f"seconds is {seconds!r}; a glide takes a positive time.")
+        with self._lock:
+            self.command(dl)
+            self._pace = max(float(np.abs(self._wanted - self._set).max()) / seconds, _SLOWEST)
+
+    def picture(self) -> NDArray[np.uint8] | None:
+        """(h, w, 3) red, green, blue: the newest frame with the marker outlined, green where it is trusted; None before the first."""
+        frame, sighting = self._frame, self.sighting
+        return None if frame is None or sighting is None else outlined(frame.image, sighting)
 
     def follow(self, plan: Plan, seconds: float) -> None:
         """Set-points from `plan`, one a cycle, for so long; returns when they are done.
@@ -221,7 +228,7 @@ class Prototype:
     def read(self) -> Measurement:
         """The newest sighting with the wires as they were then; without a camera the wires alone."""
         with self._lock:
-            sighting, readings = self._sighting, self._readings
+            sighting, readings = self.sighting, self.readings
         problem = self.supervisor.status if self.supervisor.state is State.STOPPED else ""
         if sighting is not None and self.source is not None:
             return self._measured(sighting, problem)
@@ -251,8 +258,7 @@ class Prototype:
 
     def recorder_for(self, path: str | Path, *, overwrite: bool = False) -> Recorder:
         """A recorder with the columns of a prototype: currents and how well the marker was seen."""
-        currents = [f"current_{k}" for k in range(1, self.robot.n_tendons + 1)]
-        return Recorder(self.robot, path, overwrite=overwrite, extra=(*EXTRA, *currents))
+        return Recorder(self.robot, path, overwrite=overwrite, extra=columns.names(self.robot.n_tendons))
 
     def close(self) -> None:
         """Stop, disable, let go of bus and camera. A recording goes on existing: it is whoever began it that ends it."""
@@ -309,13 +315,14 @@ class Prototype:
             if moving and told is not None and self._plan is planned:
                 self._wanted = self.supervisor.check(told, now)
             before, wanted = self._set, self._wanted
-        target = limited(before, wanted, self.hardware.limits.rate, dt) if moving else None
+            pace = self._pace if self._plan is None else self.hardware.limits.rate
+        target = limited(before, wanted, min(pace, self.hardware.limits.rate), dt) if moving else None
         feedback = self.drives.exchange(None if target is None else self.transmission.counts(target))
         readings = self.transmission.readings(feedback)
         with self._lock:
             if target is not None:
                 self._set = target
-            self._readings = readings
+            self.readings = readings
             self._past.add(readings.t, readings.dl, self._set)
         now, known = self.clock.now(), len(self.supervisor.faults)
         camera = None if self.source is None else CameraWatch(age=now - self._trusted, frozen=self._alike >= _FROZEN)
@@ -339,18 +346,11 @@ class Prototype:
             if sighting.ok:
                 self._trusted = max(self._trusted, frame.t)
             with self._lock:
-                self._sighting = sighting
+                self._frame, self.sighting = frame, sighting
             recorder = self.recorder
             if recorder is None or not recorder.recording:
                 return
-            readings = self._readings
-            extra = {
-                "marker_error": sighting.error, "marker_size": sighting.size_px, "marker_flag": float(FLAGS.index(sighting.flag)),
-                **dict(zip(("seen_x", "seen_y", "seen_z"), sighting.position.tolist(), strict=True)),
-            }  # fmt: skip
-            if readings is not None:
-                extra |= {f"current_{k}": value for k, value in enumerate(readings.current.tolist(), 1)}
-            row = self._measured(sighting, "")
+            row, extra = self._measured(sighting, ""), columns.values(sighting, self.readings)
             try:
                 recorder.add(row, payload=self.payload, commanded_dl=commanded, extra=extra, base_quaternion=self.base_quaternion)
             except InputError:
@@ -358,7 +358,7 @@ class Prototype:
                     raise
 
     def _measured(self, sighting: Sighting, problem: str) -> Measurement:
-        readings = self._readings
+        readings = self.readings
         trusted = sighting.ok
         return Measurement(
             t=sighting.t - self._zero, dl=self._wires_at(sighting.t)[0], ext=np.zeros(self.robot.n_segments),

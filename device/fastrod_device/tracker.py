@@ -289,3 +289,14 @@ def _nothing(frame: Frame, flag: str) -> Sighting:
         other_position=np.full(3, np.nan), other_quaternion=np.full(4, np.nan), error=math.nan, other_error=math.nan,
         size_px=math.nan, corners=np.full((4, 2), np.nan),
     )  # fmt: skip
+
+
+def outlined(image: Picture, sighting: Sighting) -> Picture:
+    """(h, w, 3) red, green, blue: a frame with the marker's sides, green where the sighting is trusted, red where it is not."""
+    import cv2
+
+    shown = np.repeat(image[:, :, None], 3, axis=2)
+    if np.isfinite(sighting.corners).all():
+        corners = np.rint(16.0 * sighting.corners).astype(np.int32)
+        cv2.polylines(shown, [corners.reshape(-1, 1, 2)], True, (30, 170, 80) if sighting.ok else (220, 50, 40), 2, cv2.LINE_AA, 4)
+    return shown

@@ -203,8 +203,8 @@ def test_a_release_waits_for_the_end_of_the_cause(name: str, tmp_path: Path) -> 
 def test_the_stop_is_in_time_at_the_largest_rate_too(tmp_path: Path) -> None:
     with moving(tmp_path, 0.3, rate=0.03, following_error=1e-3) as rig:
         limits = rig.prototype.hardware.limits
-        rig.radius = 0.006
-        rig.prototype.command(np.array([0.006, 0.006, -0.006, -0.006]))
+        rig.radius = 0.0058
+        rig.prototype.command(np.array([0.0058, 0.0058, -0.0058, -0.0058]))
         rig.prototype.wait(0.1)
         assert rig.prototype.readings is not None
         assert np.abs(rig.prototype.readings.rate).max() > 0.98 * limits.rate

@@ -19,13 +19,15 @@ from fastrod.link import RobotLink
 from fastrod.runlog import read_log
 from fastrod.types import Floats
 from fastrod_device.clock import Clock, SteppedClock, WallClock
+from fastrod_device.columns import EXTRA
 from fastrod_device.emulator import Emulator
 from fastrod_device.errors import DeviceError, RefusedError
 from fastrod_device.hardware import load_hardware
-from fastrod_device.journal import Journal, Trace
-from fastrod_device.prototype import EXTRA, Prototype
+from fastrod_device.journal import Journal
+from fastrod_device.prototype import Prototype
 from fastrod_device.safety import State
 from fastrod_device.seal import seal
+from fastrod_device.trace import Trace
 from fastrod_device.workbench import emulated
 
 pytest.importorskip("canopen")
@@ -433,3 +435,33 @@ def test_a_plan_that_hangs_is_found_by_the_watchdog_and_the_drives_stop() -> Non
         assert _until(lambda: not emulator.drives.moving.any())
         assert prototype.supervisor.state is State.STOPPED
         assert set(emulator.drives.states) == {"quick stop active"}
+
+
+def test_a_glide_spreads_a_command_evenly() -> None:
+    with bench() as (robot, _):
+        robot.glide(BENT, 0.4)
+        told = []
+        for _ in range(60):
+            robot.wait(0.01)
+            told.append(robot.commanded)
+        steps = np.abs(np.diff(told, axis=0)).max(axis=1)
+        even = np.abs(BENT).max() / 0.4 * 0.01
+        np.testing.assert_allclose(steps[:38], even, rtol=1e-6)
+        np.testing.assert_allclose(told[-1], BENT, rtol=0, atol=1e-9)
+        with pytest.raises(RefusedError, match="positive time"):
+            robot.glide(np.zeros(4), 0.0)
+
+
+def test_the_picture_shows_the_marker_in_its_outline() -> None:
+    with bench() as (robot, _):
+        assert robot.picture() is None
+        robot.wait(0.5)
+        shown = robot.picture()
+        assert shown is not None
+        assert shown.shape == (*HARDWARE.camera.size[::-1], 3)
+        red, green, blue = (shown[:, :, k].astype(int) for k in range(3))
+        outline = (green > red + 60) & (green > blue + 40)
+        assert robot.sighting is not None
+        where = np.argwhere(outline)[:, ::-1]
+        np.testing.assert_allclose(where.min(axis=0), robot.sighting.corners.min(axis=0), atol=3.0)
+        np.testing.assert_allclose(where.max(axis=0), robot.sighting.corners.max(axis=0), atol=3.0)

@@ -1,0 +1,23 @@
+"""Columns of a recording that only a prototype has: motor currents, and how well the marker was seen."""
+
+from __future__ import annotations
+
+from fastrod_device.readings import Readings
+from fastrod_device.tracker import Sighting
+
+FLAGS = ("", "no marker", "outlier", "ambiguous", "frozen")
+EXTRA = ("marker_error", "marker_size", "marker_flag", "seen_x", "seen_y", "seen_z")
+"""Further columns of a recording: reprojection error [px], size of the marker in the picture [px], place of the sighting's flag in `FLAGS`
+(0: trusted), and where the tip was seen, trusted or not [m]; then current_1 ... [A]."""
+
+
+def names(n_tendons: int) -> tuple[str, ...]:
+    """All of them."""
+    return (*EXTRA, *(f"current_{k}" for k in range(1, n_tendons + 1)))
+
+
+def values(sighting: Sighting, readings: Readings | None) -> dict[str, float]:
+    """Of one row; currents are left out where none are known."""
+    made = {"marker_error": sighting.error, "marker_size": sighting.size_px, "marker_flag": float(FLAGS.index(sighting.flag))}
+    made |= dict(zip(("seen_x", "seen_y", "seen_z"), sighting.position.tolist(), strict=True))
+    return made if readings is None else made | {f"current_{k}": value for k, value in enumerate(readings.current.tolist(), 1)}
