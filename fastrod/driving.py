@@ -92,18 +92,18 @@ def _track(arguments: argparse.Namespace, _: Progress | None) -> int:
     """One turn of a path, by the model or by a policy, recorded."""
     from rich.console import Console
 
-    from fastrod.control.inverse import plan
+    from fastrod.control import references
     from fastrod_device.experiment import follow, tracking
-    from fastrod_device.loop import APPROACH, PERIOD, RATE, paths
+    from fastrod_device.loop import APPROACH, planned
     from fastrod_device.loop_report import tracking_table
 
     hardware, name = _hardware(arguments), arguments.path or "circle"
-    known = paths(hardware.robot.length)
+    known = references(hardware.robot.length)
     if name not in known:
         raise UnknownNameError(f"no path {name!r}; {nearest(name, known)}")
     out = _recorded(arguments.out or Path(f"{name}.csv"), hardware)
     law = None if arguments.policy is None else _policy(arguments.policy, name, APPROACH, hardware.robot)
-    made = plan(hardware.robot, known[name].position(np.arange(0.0, PERIOD, 1.0 / RATE)), RATE, approach=APPROACH)
+    made = planned(hardware.robot, known[name])
     with _kept(out), _bench(arguments, hardware, journal=out) as bench:
         log = follow(bench.prototype, made, out, law=law)
     Console().print(tracking_table([(("policy" if law else "model"), tracking(name, log, made))]))

@@ -9,7 +9,7 @@ from typing import final
 
 import numpy as np
 
-from fastrod.control import Trajectory, circle, square, triangle
+from fastrod.control import Trajectory, references
 from fastrod.control.inverse import Plan, plan
 from fastrod.identification.attribution import identify
 from fastrod.identification.excite import excitation
@@ -19,22 +19,15 @@ from fastrod.runlog import RunLog
 from fastrod_device.experiment import Hands, Progress, Tracking, drive_lag, excite, follow, tracking
 from fastrod_device.prototype import Prototype
 
-PERIOD = 9.0
-"""Of a turn of a path [s]."""
 APPROACH = 2.0
 """From straight to the path [s]."""
 RATE = 20.0
 """Of the plans [Hz]."""
 
 
-def paths(height: float) -> dict[str, Trajectory]:
-    """The paper's three references, in the plane of the straight robot's tip, which stands at `height` [m]."""
-    center = (0.0, 0.0, height)
-    return {
-        "triangle": triangle(side=0.04, period=PERIOD, center=center),
-        "square": square(side=0.025, period=PERIOD, center=center),
-        "circle": circle(radius=0.02, period=PERIOD, center=center),
-    }
+def planned(model: Robot, path: Trajectory) -> Plan:
+    """One turn of a path by a model, from straight."""
+    return plan(model, path.position(np.arange(0.0, path.period, 1.0 / RATE)), RATE, approach=APPROACH)
 
 
 @final
@@ -63,7 +56,7 @@ def close_loop(
     run = excitation(robot, payload=payload, turn=turn, rate=prototype.hardware.camera.rate)
     log = excite(prototype, run, hands, out / "excite.csv", progress=tell)
     _rest(prototype, hands)
-    known, lag = paths(robot.length), drive_lag(log)
+    known, lag = references(robot.length), drive_lag(log)
     before = [
         _track(prototype, path, robot, lag, out / f"{name}_before.csv", f"tracking before: {name}", tell) for name, path in known.items()
     ]
@@ -92,6 +85,6 @@ def _rest(prototype: Prototype, hands: Hands) -> None:
 
 def _track(prototype: Prototype, path: Trajectory, model: Robot, lag: float, out: Path, stage: str, tell: Progress) -> tuple[RunLog, Plan]:
     tell(f"{stage}, planning", 0, 2)
-    made = plan(model, path.position(np.arange(0.0, PERIOD, 1.0 / RATE)), RATE, approach=APPROACH)
+    made = planned(model, path)
     tell(stage, 1, 2)
     return follow(prototype, made, out, lead=lag), made

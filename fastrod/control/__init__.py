@@ -2,9 +2,20 @@
 
 from fastrod.control.kinematics import Arm, Base, FixedBase, MovingBase, SoftTip
 from fastrod.control.resolved_rate import ResolvedRate
-from fastrod.control.trajectories import Trajectory, circle, figure_eight, helix, names, square, square_helix, trajectory, triangle
+from fastrod.control.trajectories import (
+    Trajectory,
+    circle,
+    figure_eight,
+    helix,
+    names,
+    references,
+    square,
+    square_helix,
+    trajectory,
+    triangle,
+)
 
 __all__ = [
-    "Arm", "Base", "FixedBase", "MovingBase", "ResolvedRate", "SoftTip", "Trajectory", "circle", "figure_eight", "helix", "names", "square",
-    "square_helix", "trajectory", "triangle",
+    "Arm", "Base", "FixedBase", "MovingBase", "ResolvedRate", "SoftTip", "Trajectory", "circle", "figure_eight", "helix", "names",
+    "references", "square", "square_helix", "trajectory", "triangle",
 ]  # fmt: skip

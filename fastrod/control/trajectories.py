@@ -117,6 +117,17 @@ _KNOWN: dict[str, tuple[Callable[..., Trajectory], tuple[str, ...]]] = {
 }
 
 
+def references(height: float, period: float = 9.0) -> dict[str, Trajectory]:
+    """The references of the paper's real prototype (SoftManiSim, CoRL 2024, appendix H) by name: a triangle and a square of 40 and 25 mm
+    and a circle of 20 mm radius, one turn in `period` [s], in the plane `height` [m] above the base. Raises `InputError`."""
+    center = (0.0, 0.0, height)
+    return {
+        "triangle": triangle(side=0.04, period=period, center=center),
+        "square": square(side=0.025, period=period, center=center),
+        "circle": circle(radius=0.02, period=period, center=center),
+    }
+
+
 def names() -> tuple[str, ...]:
     """The names that `trajectory` knows."""
     return tuple(_KNOWN)

@@ -8,7 +8,7 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fastrod.control import Trajectory
+from fastrod.control import Trajectory, references
 from fastrod.errors import InputError, UnknownNameError, nearest
 from fastrod.robot import Robot
 from fastrod.robotfile import load_robot
@@ -18,7 +18,7 @@ from fastrod_envs.policies import Policy
 from fastrod_envs.registration import name_of
 from fastrod_envs.surface import ReachableSurface
 from fastrod_envs.task import bounds
-from fastrod_envs.tasks.track import DRIVEN, DT, LIMIT, RADIUS, RATE, Sight, coming, fields, paths
+from fastrod_envs.tasks.track import DRIVEN, DT, LIMIT, PERIOD, RADIUS, RATE, Sight, coming, fields
 
 _EARLY = 1e-6  # of a step: a clock that is this much short of it has reached it
 
@@ -59,7 +59,7 @@ class TrackPilot:
         if self.robot.n_segments != 1:
             raise InputError(f"robot {self.robot.name!r} has {self.robot.n_segments} segments; a policy of Track drives one.")
         self._matrix: Floats = SegmentActions(self.robot).matrix[: self.robot.n_tendons, DRIVEN]
-        known = paths(self.robot.length)
+        known = references(self.robot.length, PERIOD)
         if isinstance(path, str) and path not in known:
             raise UnknownNameError(f"no path {path!r}; {nearest(path, known)}")
         if not isinstance(path, (str, Trajectory)):

@@ -11,7 +11,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from fastrod import Simulator, load_robot
-from fastrod.control.inverse import Plan, plan
+from fastrod.control import references
+from fastrod.control.inverse import Plan
 from fastrod.identification.excite import Excitation
 from fastrod.runlog import RunLog, read_log
 from fastrod.types import Floats
@@ -20,7 +21,7 @@ from fastrod_device.errors import DeviceError, RefusedError
 from fastrod_device.experiment import excite, follow, tracking
 from fastrod_device.hardware import load_hardware
 from fastrod_device.latency import play, sweep
-from fastrod_device.loop import APPROACH, PERIOD, RATE, paths
+from fastrod_device.loop import APPROACH, planned
 from fastrod_device.prototype import Prototype
 from fastrod_device.workbench import Bench, emulated
 
@@ -80,7 +81,7 @@ def short_run() -> Excitation:
 
 
 def circle_plan() -> Plan:
-    return plan(ROBOT, paths(ROBOT.length)["circle"].position(np.arange(0.0, PERIOD, 1.0 / RATE)), RATE, approach=APPROACH)
+    return planned(ROBOT, references(ROBOT.length)["circle"])
 
 
 # ---------------------------------------------------------------- excite
@@ -157,7 +158,7 @@ def test_a_plan_is_followed_by_the_model_and_by_the_policy(bench: Bench, tmp_pat
     policy = tracking("circle", law, made)
     for found in (model, policy):
         on_path = np.isfinite(found.path).all(axis=1)
-        assert on_path.sum() == pytest.approx(PERIOD * 15.0, abs=4)
+        assert on_path.sum() == pytest.approx(references(ROBOT.length)["circle"].period * 15.0, abs=4)
         assert found.log.measured[on_path].mean() > 0.9
     # 20 mm of circle by a body that is some per cent stiffer or softer than the model's: the wires decide, to some tenths of a millimetre;
     # the policy sees the tip, a frame and a latency late: its own residual is about a millimetre

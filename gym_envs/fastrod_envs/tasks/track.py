@@ -8,7 +8,7 @@ from typing import ClassVar, Literal, final, get_args
 
 import numpy as np
 
-from fastrod.control import Trajectory, circle, square, triangle
+from fastrod.control import references
 from fastrod.errors import InputError
 from fastrod.robot import Robot
 from fastrod.robotfile import load_robot
@@ -51,16 +51,6 @@ class TrackOptions(Options):
             raise InputError(f"path is {self.path!r}; it must be 'any', {' or '.join(map(repr, get_args(Shape)))}.")
         if self.reward not in get_args(Reward):
             raise InputError(f"reward is {self.reward!r}; it must be {' or '.join(map(repr, get_args(Reward)))}.")
-
-
-def paths(height: float) -> dict[str, Trajectory]:
-    """The paper's three references, in the plane of the straight robot's tip [m]."""
-    center = (0.0, 0.0, height)
-    return {
-        "triangle": triangle(side=0.04, period=PERIOD, center=center),
-        "square": square(side=0.025, period=PERIOD, center=center),
-        "circle": circle(radius=0.02, period=PERIOD, center=center),
-    }
 
 
 def fields(robot: Robot) -> tuple[tuple[Field, ...], tuple[Field, ...]]:
@@ -139,7 +129,7 @@ class Track(RodTask):
     def __init__(self, n_envs: int, options: Options) -> None:
         super().__init__(n_envs, options, load_robot("prototype"), driven=DRIVEN, limit=LIMIT, rate=RATE)
         assert isinstance(options, TrackOptions)
-        self._known = paths(self.base_robot.length)
+        self._known = references(self.base_robot.length, PERIOD)
         self._names = [options.path] if options.path != "any" else list(get_args(Shape))
         self._sharp = options.reward == "precise"
         self._surface = ReachableSurface(self.base_robot, height=self.base_robot.length, radius=RADIUS)
