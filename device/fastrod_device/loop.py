@@ -27,7 +27,7 @@ RATE = 20.0
 
 def planned(model: Robot, path: Trajectory) -> Plan:
     """One turn of a path by a model, from straight."""
-    return plan(model, path.position(np.arange(0.0, path.period, 1.0 / RATE)), RATE, approach=APPROACH)
+    return plan(model, path.position(np.arange(round(path.period * RATE) + 1) / RATE), RATE, approach=APPROACH)
 
 
 @final

@@ -87,16 +87,17 @@ def draw(loop: Loop) -> Any:
     """The paths from above: wanted, in reach, measured before and after."""
     from matplotlib import pyplot as plt
 
-    figure, panels = plt.subplots(1, len(loop.after), figsize=(4.2 * len(loop.after), 4.4), layout="constrained", squeeze=False)
+    figure, panels = plt.subplots(1, len(loop.after), figsize=(4.2 * len(loop.after), 4.7), layout="constrained", squeeze=False)
     for panel, before, after in zip(panels[0], loop.before, loop.after, strict=True):
-        panel.plot(*_flat(after.path), color="0.2", linewidth=1.0, linestyle=(0, (4, 2)), label="path")
-        panel.plot(*_flat(before.seen), color="#dc2626", linewidth=1.0, alpha=0.8, label="measured, model before")
-        panel.plot(*_flat(after.seen), color="#2563eb", linewidth=1.2, label="measured, model after")
-        panel.set_title(f"{after.name}: {1e3 * before.distance:.2f} to {1e3 * after.distance:.2f} mm from reach", fontsize=10)
+        panel.plot(*_flat(after.path), color="0.35", linewidth=1.0, linestyle=(0, (4, 2)), label="path")
+        panel.plot(*_flat(after.nearest), color="0.6", linewidth=3.0, label="nearest in reach")
+        panel.plot(*_flat(before.seen), color="#dc2626", linewidth=1.0, label="measured, planned by the model before")
+        panel.plot(*_flat(after.seen), color="#2563eb", linewidth=1.2, label="measured, planned by the identified model")
+        panel.set_title(f"{after.name}: {1e3 * before.distance:.2f} to {1e3 * after.distance:.2f} mm off reach, rms", fontsize=10)
         panel.set_aspect("equal")
         panel.set_xlabel("x mm")
         panel.set_ylabel("y mm")
-    panels[0][0].legend(fontsize=8, loc="lower left")
+    figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=9, frameon=False)
     return figure
 
 
