@@ -51,10 +51,13 @@ def run(out: Path | None = None, *, seed: int | None = None, view: bool = True) 
         make_folder(out)
         if any(out.iterdir()):
             raise InputError(f"folder {str(out)!r} is not empty; give --out a new one, so that nothing is written over.")
+    missing = [name for name, module in _DEVICE.items() if find_spec(module) is None]
+    if seed is not None and seed < 0:
+        raise InputError(f"seed is {seed}; it must be a whole number from 0.")
     console = Console()
     robot = load_robot("prototype")
     _batch(robot, console)
-    if missing := [name for name, module in _DEVICE.items() if find_spec(module) is None]:
+    if missing:
         _identified(robot, console, out)
         said = f"the whole loop, on an emulated prototype, needs {', '.join(missing)}: pip install fastrod[device,viewer]"
         console.print(said, markup=False, soft_wrap=True, highlight=False)

@@ -32,9 +32,10 @@ _EVENTS = "events.csv"
 
 
 def _teleop(arguments: argparse.Namespace, _: Progress | None) -> int:
-    """Hands drive in the browser; nothing moves when nobody watches."""
+    """Hands drive in the browser; nothing moves when nobody watches. Stops and their reasons are kept in a file."""
     import contextlib
     import io
+    import itertools
     import signal
     import sys
     import webbrowser
@@ -47,6 +48,8 @@ def _teleop(arguments: argparse.Namespace, _: Progress | None) -> int:
     def say(sentence: str) -> None:
         print(sentence, file=sys.stderr, flush=True)
 
+    if arguments.bus is not None and ":" not in arguments.bus:
+        raise InputError(f"--bus is {arguments.bus!r}; give INTERFACE:CHANNEL, such as socketcan:can0.")
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # homing, too, ends with the drives switched off
     hardware = _hardware(arguments)
     urgent(1)  # all threads of the page, too: one that waits for its turn holds up those of the drives
@@ -54,10 +57,13 @@ def _teleop(arguments: argparse.Namespace, _: Progress | None) -> int:
     say("Preparing the model ...")
     FreeWorld(hardware.robot).jacobian()  # compiled or loaded now: nothing may hold up the drives later
     say("Finding the drives ..." if arguments.no_home else "Finding the drives, winding the wires, looking for the marker: about 25 s ...")
+    names = itertools.chain(["drive.csv"], (f"drive-{k}.csv" for k in itertools.count(2)))
+    journal = next(path for name in names if not (path := Path(name)).with_suffix(".events.csv").exists())
+    events = journal.with_suffix(".events.csv")
     switches = sys.getswitchinterval()
     sys.setswitchinterval(_SWITCHES)
     try:
-        with _bench(arguments, hardware, stepped=False) as bench:
+        with _bench(arguments, hardware, stepped=False, journal=journal) as bench:
             say(f"Ready. {bench.prototype.supervisor.status}")
             model = FreeWorld(bench.prototype.robot)
             if not arguments.no_open:
@@ -67,6 +73,9 @@ def _teleop(arguments: argparse.Namespace, _: Progress | None) -> int:
             view(model, link=bench.prototype, server=server, open_browser=False)
         say("The drives are switched off.")
     finally:
+        with contextlib.suppress(OSError):
+            if not events.stat().st_size:
+                events.unlink()
         ordinary()
         sys.setswitchinterval(switches)
         with contextlib.redirect_stdout(io.StringIO()):  # it says goodbye
@@ -272,7 +281,7 @@ def _kept(out: Path) -> Iterator[None]:
     try:
         yield
     except (DeviceError, RefusedError, KeyboardInterrupt):
-        if out.exists():
+        if out.is_file() or (out.is_dir() and any(out.glob("*.csv"))):
             print(f"what was recorded until then is in {out}")
         raise
 

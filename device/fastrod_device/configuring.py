@@ -29,7 +29,8 @@ _MAPPING = {
     0x1A00: (0x6041_0010, 0x6064_0020, 0x6077_0010),
     0x1A01: (0x606C_0020, 0x60F4_0020),
 }
-_INVALID = 0x8000_0000
+_UNUSED = (0x1401, 0x1402, 0x1403, 0x1802, 0x1803)  # PDOs that a drive may have kept from somebody else
+_INVALID, _NO_RTR = 0x8000_0000, 0x4000_0000  # bits of a COB-ID; some drives refuse a TPDO that could be asked for by RTR
 _NO_SUCH_OBJECT = (0x06020000, 0x06090011)
 _MODES = {1: "profile position", 6: "homing", 8: "cyclic synchronous position"}
 
@@ -46,6 +47,8 @@ class DriveLimits:
     """Beyond it a drive faults [counts]."""
     deceleration: Ints | int
     """Of a quick stop [counts/s2]."""
+    torque_limit: Ints | int
+    """Greatest torque, either way [thousandths of the rated one]."""
     hold: bool
     """After a quick stop the motor holds the wire; otherwise it is switched off."""
 
@@ -55,8 +58,9 @@ class DriveLimits:
         if given.shape not in ((), (n_drives,)) or given.dtype.kind not in "iu":
             raise InputError(f"{name} is {getattr(self, name)!r}; it must be a whole number, or one for each of {n_drives} drives.")
         values = [int(value) for value in np.broadcast_to(given, (n_drives,))]
-        if not all(0 < value < 2**31 for value in values):
-            raise InputError(f"{name} is {values}; it must be positive, and a drive counts in 32 bits.")
+        bits = 16 if name == "torque_limit" else 31
+        if not all(0 < value < 2**bits for value in values):
+            raise InputError(f"{name} is {values}; it must be positive and below 2^{bits}, the most that a drive counts to.")
         return values
 
 
@@ -147,6 +151,7 @@ class Configurator:
         self.write(drive, 0x607D, 2, own("position_limit"))
         self.write(drive, 0x6065, 0, own("following_error"))
         self.write(drive, 0x6066, 0, 0, optional=True)
+        self.write(drive, 0x6072, 0, own("torque_limit"))
         self.write(drive, 0x605A, 0, 6 if limits.hold else 2)
         self.write(drive, 0x6007, 0, 3)  # connection lost: quick stop
         self.write(drive, 0x60C2, 1, round(1e3 / rate))
@@ -157,7 +162,7 @@ class Configurator:
         node = self._specs[drive].node
         for mapping, entries in _MAPPING.items():
             communication = mapping - 0x200
-            cob_id = {0x1600: COMMAND, 0x1A00: STATUS, 0x1A01: MOTION}[mapping] + node
+            cob_id = {0x1600: COMMAND, 0x1A00: STATUS | _NO_RTR, 0x1A01: MOTION | _NO_RTR}[mapping] + node
             self.write(drive, communication, 1, cob_id | _INVALID)
             self.write(drive, communication, 2, 1)
             self.write(drive, mapping, 0, 0)
@@ -165,6 +170,12 @@ class Configurator:
                 self.write(drive, mapping, sub, entry)
             self.write(drive, mapping, 0, len(entries))
             self.write(drive, communication, 1, cob_id)
+        for index in _UNUSED:
+            if self._dictionary.get_variable(index, 1) is None:
+                continue
+            if held := self._ask(drive, index, 1, None, optional=True):
+                bits = _INVALID | (_NO_RTR if index >= 0x1800 else 0)
+                self.write(drive, index, 1, int(self._variable(index, 1).decode_raw(held)) | bits)
 
     def watch(self, drive: int, on: bool) -> None:
         """Heartbeats of the drive, and the controller's watched by it, on or off."""

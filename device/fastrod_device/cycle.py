@@ -89,19 +89,25 @@ class Cycle:
         self._let_go(feedback)
         return feedback
 
-    def quick_stop(self, reason: str = "quick stop was asked for") -> None:
+    def quick_stop(self, reason: str = "quick stop was asked for") -> str:
         """As `DriveBus.quick_stop`."""
         self.latch(reason)
+        unsent = ""
         held = self.line.lock.acquire(timeout=0.02)  # rather two frames out of order than none
         try:
             for i, node in enumerate(self.ids):
-                with contextlib.suppress(Exception):
+                try:
                     self.line.send(COMMAND + node, _COMMAND.pack(STOP, self.hold[i]))
-            with contextlib.suppress(Exception):
+                except Exception as error:  # the others must hear of it all the same
+                    unsent = unsent or f"{type(error).__name__}: {error}"
+            try:
                 self._sync()
+            except Exception as error:
+                unsent = unsent or f"{type(error).__name__}: {error}"
         finally:
             if held:
                 self.line.lock.release()
+        return unsent
 
     def until(
         self, seconds: float, done: Callable[[Feedback], bool], what: str, *, stoppable: bool = True, running: bool = False

@@ -78,7 +78,7 @@ _RECORDS: dict[int, tuple[str, tuple[tuple[str, int, str, int, bool], ...]]] = {
 }  # fmt: skip
 _NEEDED = (
     (0x1000, 0), (0x1016, 1), (0x1017, 0), (0x1018, 1), (0x6007, 0), (0x6040, 0), (0x6041, 0), (0x605A, 0), (0x6060, 0), (0x6061, 0),
-    (0x6064, 0), (0x6065, 0), (0x606C, 0), (0x6076, 0), (0x6077, 0), (0x607A, 0), (0x607D, 1), (0x607D, 2), (0x607F, 0), (0x6081, 0),
+    (0x6064, 0), (0x6065, 0), (0x606C, 0), (0x6072, 0), (0x6076, 0), (0x6077, 0), (0x607A, 0), (0x607D, 1), (0x607D, 2), (0x607F, 0), (0x6081, 0),
     (0x6083, 0), (0x6084, 0), (0x6085, 0), (0x6098, 0), (0x6099, 1), (0x609A, 0), (0x60A9, 0), (0x60C2, 1), (0x60F4, 0), (0x6502, 0),
     (0x30B0, 0), (0x30B1, 0), (0x30B2, 0), (0x1400, 1), (0x1600, 1), (0x1800, 1), (0x1801, 1), (0x1A00, 1), (0x1A01, 1),
 )  # fmt: skip
@@ -98,7 +98,7 @@ def object_dictionary(eds: str | Path | None = None) -> canopen.ObjectDictionary
         _add_record(od, index, name, members)
     for k in range(4):
         _add_record(od, 0x1400 + k, f"RPDO {k + 1} parameter", _communication(0x8000_0000 + 0x200 + 0x100 * k))
-        _add_record(od, 0x1800 + k, f"TPDO {k + 1} parameter", _communication(0x8000_0000 + 0x180 + 0x100 * k))
+        _add_record(od, 0x1800 + k, f"TPDO {k + 1} parameter", _communication(0xC000_0000 + 0x180 + 0x100 * k))
         for base, word in ((0x1600, "RPDO"), (0x1A00, "TPDO")):
             objects = tuple((f"Mapped object {n}", U32, "rw", 0, False) for n in range(1, 9))
             _add_record(od, base + k, f"{word} {k + 1} mapping", objects, count_access="rw", count=0)

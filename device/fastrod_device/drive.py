@@ -123,13 +123,13 @@ class DriveBus:
 
     def connect(
         self, *, position_limit: Ints | int = 2**31 - 1, velocity_limit: Ints | int = 500_000, following_error: Ints | int = 2000,
-        deceleration: Ints | int = 2_000_000, hold: bool = True,
+        deceleration: Ints | int = 2_000_000, torque_limit: Ints | int = 3000, hold: bool = True,
     ) -> None:  # fmt: skip
         """Find the drives, tell them their limits and process data, and make them operational; they stay switched off.
 
         What drives refuse by themselves, one number or (n_drives,): targets beyond +-`position_limit` [counts], speeds beyond
-        `velocity_limit` [counts/s], a fault beyond `following_error` [counts]. A quick stop is by `deceleration` [counts/s2]; then the
-        motors `hold` the wires or are switched off. Call it again after a drive has rebooted.
+        `velocity_limit` [counts/s], a fault beyond `following_error` [counts]; they pull with `torque_limit` [thousandths of the rated
+        torque] at most. A quick stop is by `deceleration` [counts/s2]; then the motors `hold` the wires or are switched off. Call it again after a drive has rebooted.
         Raises `InputError`, or `DeviceError`: the first drive that does not answer, is another device, or refuses.
         """
         setup, n = self._configurator, self.n_drives
@@ -138,9 +138,10 @@ class DriveBus:
             velocity_limit=velocity_limit,
             following_error=following_error,
             deceleration=deceleration,
+            torque_limit=torque_limit,
             hold=hold,
         )
-        for name in ("position_limit", "velocity_limit", "following_error", "deceleration"):
+        for name in ("position_limit", "velocity_limit", "following_error", "deceleration", "torque_limit"):
             limits.of(name, n)
         self._cycle.words, self._cycle.enabled, self._cycle.configured = [OFF] * n, [False] * n, [False] * n
         for i in range(n):
@@ -236,9 +237,10 @@ class DriveBus:
         """
         return self._cycle.exchange(target)
 
-    def quick_stop(self, reason: str = "quick stop was asked for") -> None:
-        """Stop all drives at once, from any thread; they stay stopped until `acknowledge` and `enable`. Raises nothing."""
-        self._cycle.quick_stop(reason)
+    def quick_stop(self, reason: str = "quick stop was asked for") -> str:
+        """Stop all drives at once, from any thread; they stay stopped until `acknowledge` and `enable`. Raises nothing: it says why a word
+        could not be sent, or "". Drives that no longer hear of their controller stop by themselves."""
+        return self._cycle.quick_stop(reason)
 
     # moves that cycle by themselves
 

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 _SHAKE = 1e-4  # m per axis, of the marker against the camera: a bench is not still
 _SCENE = Scene(blur=1.0, noise=5.0)
+_HANDS = 1.0  # s for which hands that hang a load cover the marker
 _SLACK = 1e-3  # m, of a wire before it is homed, at most
 _KEPT = 8  # frames that nobody has fetched
 
@@ -51,6 +52,7 @@ class Emulator:
         self._due: deque[tuple[int, float, Floats, Floats]] = deque(maxlen=_KEPT)
         self._number, self._next = 0, 0.0
         self._last: Frame | None = None
+        self._covered = -np.inf
         self.frozen = self.hidden = False
         """The camera repeats its last frame; the marker is covered."""
         self.drives = EmulatedDrives(hardware.drives, bus, clock=clock, wires=self)
@@ -92,18 +94,22 @@ class Emulator:
         if self.frozen and self._last is not None:
             self._last = Frame(image=self._last.image, t=t, number=number)
         else:
-            self._last = Frame(image=self._eye.draw(position, quaternion, marker=not self.hidden), t=t, number=number)
+            self._last = Frame(
+                image=self._eye.draw(position, quaternion, marker=not self.hidden and t >= self._covered), t=t, number=number
+            )
         return self._last
 
     def hang(self, mass: float) -> None:
         """Hang a known load [kg] on the tip."""
         with self._lock:
             self.plant.hang(mass)
+            self._covered = self.clock.now() + _HANDS
 
     def turn(self, quaternion: Floats) -> None:
         """Turn the whole bench: world_from_base."""
         with self._lock:
             self.plant.turn(quaternion)
+            self._covered = self.clock.now() + _HANDS
 
     def close(self) -> None:
         """Switch it off."""

@@ -59,19 +59,22 @@ def excite(prototype: Prototype, run: Excitation, hands: Hands, path: str | Path
     assert log.base_quaternion is not None
     known = np.column_stack([log.payload, log.base_quaternion])
     starts = [0, *(np.flatnonzero(np.any(np.diff(known, axis=0) != 0.0, axis=1)) + 1).tolist()]
+    within(prototype, log.dl)
     recorder = prototype.recorder_for(path)
     recorder.start(prototype.elapsed)
     try:
         for number, (start, end) in enumerate(zip(starts, [*starts[1:], len(log)], strict=True)):
             tell("excitation", start, len(log))
-            if number == 0 or log.payload[start] != log.payload[start - 1]:
-                if number or log.payload[start]:
-                    hands.hang(float(log.payload[start]))
-                prototype.payload = float(log.payload[start])
-            if number == 0 or (log.base_quaternion[start] != log.base_quaternion[start - 1]).any():
-                if number:
-                    hands.turn(log.base_quaternion[start])
-                prototype.base_quaternion = log.base_quaternion[start]
+            load, base = float(log.payload[start]), log.base_quaternion[start]
+            hang = load != (log.payload[start - 1] if number else 0.0)
+            turn = number > 0 and (base != log.base_quaternion[start - 1]).any()
+            if hang or turn:
+                with prototype.resting():
+                    if hang:
+                        hands.hang(load)
+                    if turn:
+                        hands.turn(base)
+            prototype.payload, prototype.base_quaternion = load, base
             prototype.record(recorder)
             t, dl = log.t[start : end + 1] - log.t[start], log.dl[start : end + 1]
             for piece in _pieces(t[-1] if end < len(log) else t[-1] + np.diff(log.t[-2:])[0]):
@@ -128,6 +131,12 @@ class Tracking:
         return np.asarray(np.sqrt(np.mean((self.log.tip_position - wanted)[rows] ** 2, axis=0)))
 
 
+def within(prototype: Prototype, dl: Floats) -> None:
+    """Raises `RefusedError` where a row of a run (n, n_tendons) [m] is beyond the robot's limits: before it moves, and not half way."""
+    for row in dl:
+        prototype.supervisor.within(row)
+
+
 def drive_lag(log: RunLog) -> float:
     """[s] by which the drives of a recorded run followed their set-points; 0 where it has none."""
     from scipy.optimize import minimize_scalar
@@ -148,6 +157,7 @@ def follow(prototype: Prototype, plan: Plan, path: str | Path, *, law: Law | Non
 
     Raises what `Prototype.follow` raises; what was recorded until then is on disk.
     """
+    within(prototype, plan.dl)
     start = prototype.commanded
     prototype.follow(lambda s: start + min(s / _SETTLE, 1.0) * (plan.dl[0] - start), _SETTLE)
     recorder = prototype.recorder_for(path)
@@ -159,7 +169,7 @@ def follow(prototype: Prototype, plan: Plan, path: str | Path, *, law: Law | Non
             prototype.follow(lambda s: _between(s + lead, plan.t, plan.dl), seconds)
         else:
             for step in range(round(seconds / dt)):
-                prototype.command(law(prototype.read().tip_position, step * dt))
+                prototype.glide(law(prototype.read().tip_position, step * dt), dt)
                 prototype.wait(dt)
         prototype.wait(2.0 / prototype.hardware.camera.rate + prototype.hardware.camera.latency)
     except BaseException:

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from fastrod.errors import InputError, UnknownNameError, nearest
 from fastrod.robot import Robot
 from fastrod.robotfile import load_robot
 from fastrod_device.camera import Camera, Marker, from_table, load_camera
 from fastrod_device.safety import Limits
-from fastrod_device.units import DriveSpec
+from fastrod_device.units import DriveSpec, Transmission
 
 SHIPPED = Path(str(files("fastrod_device") / "prototype.toml"))
 """The hardware file that ships: the paper's prototype."""
@@ -52,6 +55,13 @@ class Hardware:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
                 raise InputError(f"{name} is {value!r}; it must be from {low:g} to {high:g} {unit}.")
+        steps = np.abs(Transmission(self.drives).tension(np.ones(len(nodes), dtype=np.int64)))
+        if self.pretension < (1.0 - 1e-9) * steps.max():
+            k, least = int(steps.argmax()), math.ceil(1e3 * steps.max()) / 1e3
+            raise InputError(
+                f"pretension is {self.pretension!r} N; the drive at node {nodes[k]} tells torque in steps of {steps[k]:.3g} N of its wire, so "
+                f"it must be at least {least:g} N."
+            )
 
 
 def load_hardware(path: str | Path | None = None, robot: Robot | None = None) -> Hardware:

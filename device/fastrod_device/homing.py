@@ -4,6 +4,8 @@ One wire after another is wound in until it is taut; that leaves the robot bent,
 together until they pull alike. By tension alone the robot stands straight no better than friction and the motors' torque let it, where
 0.1 N is half a millimetre at the tip; the camera does the rest. Before it looks, the robot circles in smaller and smaller turns: friction
 and backlash then forget from where they came, and zero lies in the middle of their loops.
+
+The supervisor does not watch yet, so every cycle is looked at here, and what is wrong stops the drives at once.
 """
 
 from __future__ import annotations
@@ -19,8 +21,10 @@ from fastrod.wiring import wire
 from fastrod_device.clock import Clock
 from fastrod_device.drive import DriveBus
 from fastrod_device.errors import DeviceError
+from fastrod_device.faultcodes import ENABLED, in_words, state_in_words
 from fastrod_device.hardware import Hardware
 from fastrod_device.pacer import Pacer
+from fastrod_device.readings import Feedback
 from fastrod_device.tracker import Sighting
 from fastrod_device.units import Transmission
 
@@ -32,37 +36,78 @@ _STIFFEST = 1e-4  # m/N that a wire is taken to give at least
 _SMOOTH = 0.2  # of what the motors' torque says in a cycle
 _UNEVEN = 0.3  # of the pretension
 _ROUNDS, _LOOKING, _LEAST = 2, 1.5, 8  # times that the tip is looked at, for how long [s], sightings that it takes
+_FAR, _NEAR = 1e-3, 5e-5  # m of wire: a greater correction means a wrong camera, a smaller one is none
+_MEASURED = 0.3  # s for which the tensions are taken in the end
+_OLD = 5  # cycles without a drive's process data
+_PULL, _LEAST_PULL = 5.0, 3.0  # pretensions, N: no wire pulls more while it is homed
 _BEND, _TURNS, _TURN = 0.45, 4, 1.4  # rad at first, turns of the spiral, s each
 
 
 def home(drives: DriveBus, hardware: Hardware, clock: Clock, look: Callable[[], Sighting | None] | None) -> tuple[Transmission, Robot]:
     """Do it; wires as drives with their zero, and the robot with the tensions that its wires have there.
 
-    `look` gives the newest sighting that was not given yet; None: there is no camera, and tension alone decides. Raises `DeviceError` where
-    a wire does not come to its pretension, or the marker is not seen.
+    `look` gives the newest sighting that was not given yet; None: there is no camera, and tension alone decides. Raises `DeviceError`, with
+    the drives stopped, where one of them does not do as it is told, a wire does not come to its pretension or pulls far more, the marker is
+    not seen, or it is seen where the robot cannot be.
     """
     transmission, n = Transmission(hardware.drives), len(hardware.drives)
     per = 1.0 / np.abs(transmission.wound(np.ones(n, dtype=np.int64)))  # counts in a metre
     drives.homing(np.abs(transmission.torque(np.full(n, hardware.pretension))), np.rint(hardware.homing_speed * per).astype(np.int64))
     pacer = Pacer(clock, hardware.rate)
-    at = transmission.dl(drives.newest.position)
 
     def cycle(at: Floats) -> Floats:
         """(n_drives,) tensions with the wires at `at` [N]."""
         pacer.wait()
-        return transmission.tension(drives.exchange(transmission.counts(at)).torque)
+        feedback = drives.exchange(transmission.counts(at))
+        if wrong := trouble(feedback, hardware):
+            raise DeviceError(f"{wrong}; homing was stopped.")
+        return transmission.tension(feedback.torque)
 
-    at, tension = _tightened(cycle, at, hardware)
-    off = np.abs(tension - hardware.pretension)
-    if (off > _UNEVEN * hardware.pretension).any():
-        k = int(off.argmax())
-        raise DeviceError(
-            f"the wire of node {hardware.drives[k].node} pulls with {tension[k]:.2f} N after homing; {hardware.pretension:g} N were asked "
-            "for. Is it caught, or a direction wrong?"
-        )
-    if look is not None:
-        at = _straightened(cycle, look, at, hardware, clock)
+    try:
+        at = _tightened(cycle, transmission.dl(drives.newest.position), hardware)
+        tension = _measured(cycle, at, hardware)
+        off = np.abs(tension - hardware.pretension)
+        if (off > _UNEVEN * hardware.pretension).any():
+            k = int(off.argmax())
+            raise DeviceError(
+                f"the wire of node {hardware.drives[k].node} pulls with {tension[k]:.2f} N after homing; {hardware.pretension:g} N were "
+                "asked for. Is it caught, or a direction wrong?"
+            )
+        if look is not None:
+            at = _straightened(cycle, look, at, hardware, clock)
+            tension = _measured(cycle, at, hardware)
+            if (tension <= 0.0).any():
+                k = int(tension.argmin())
+                raise DeviceError(
+                    f"the wire of node {hardware.drives[k].node} is slack where the camera sees the robot straight ({tension[k]:.2f} N). "
+                    "Is the camera registered? `fastrod drive register` does it."
+                )
+    except BaseException:
+        drives.quick_stop("homing did not end")
+        raise
     return Transmission(hardware.drives, zero=transmission.counts(at)), tightened(hardware.robot, tension)
+
+
+def trouble(feedback: Feedback, hardware: Hardware) -> str:
+    """What is wrong with drives that are homed: one sentence without its full stop, of the first that is found; empty where all is well."""
+    nodes = [spec.node for spec in hardware.drives]
+    if feedback.lost:
+        return f"the bus carries nothing: {feedback.lost.rstrip('.')}"
+    for message in feedback.emergencies:
+        if message.code:  # 0: an error is gone
+            return f"the drive at node {nodes[message.drive]} sent an emergency: {in_words(message.code)}"
+    oldest = max(_OLD / hardware.rate, hardware.limits.feedback_age)
+    tension = Transmission(hardware.drives).tension(feedback.torque)
+    most = min(hardware.limits.tension, max(_PULL * hardware.pretension, _LEAST_PULL))
+    for k, node in enumerate(nodes):
+        if not feedback.age[k] <= oldest:
+            return f"the drive at node {node} was last heard {1e3 * feedback.age[k]:.0f} ms ago; {1e3 * oldest:.0f} ms are allowed"
+        if (state := state_in_words(int(feedback.statusword[k]))) != ENABLED:
+            return f"the drive at node {node} went to the state {state!r} (statusword 0x{int(feedback.statusword[k]):04X})"
+    if (np.abs(tension) > most).any():
+        k = int(np.abs(tension).argmax())
+        return f"the wire of node {nodes[k]} pulls with {tension[k]:.2f} N; {most:g} N are allowed"
+    return ""
 
 
 def tightened(robot: Robot, tension: Floats) -> Robot:
@@ -95,20 +140,26 @@ def lean(robot: Robot, tip: Floats) -> Floats:
     return wiring.wires(bend.reshape(robot.n_segments, 2))
 
 
-def _tightened(cycle: Callable[[Floats], Floats], at: Floats, hardware: Hardware) -> tuple[Floats, Floats]:
-    """(n_drives,) where the wires pull alike [m], and their tensions there [N]."""
+def _tightened(cycle: Callable[[Floats], Floats], at: Floats, hardware: Hardware) -> Floats:
+    """(n_drives,) where the wires pull alike [m]."""
     tension, give = cycle(at), softness(hardware.robot)
     for _ in range(round(_TIGHTENED * hardware.rate)):
         step = _YIELD * (give @ (tension - hardware.pretension))
         at = at + step * min(1.0, hardware.homing_speed / hardware.rate / max(np.abs(step).max(), 1e-12))
         tension = tension + _SMOOTH * (cycle(at) - tension)
-    return at, tension
+    return at
+
+
+def _measured(cycle: Callable[[Floats], Floats], at: Floats, hardware: Hardware) -> Floats:
+    """(n_drives,) tensions of wires that are held [N], a mean of some cycles."""
+    return np.asarray(np.mean([cycle(at) for _ in range(round(_MEASURED * hardware.rate))], axis=0))
 
 
 def _straightened(
     cycle: Callable[[Floats], Floats], look: Callable[[], Sighting | None], at: Floats, hardware: Hardware, clock: Clock
 ) -> Floats:
-    """(n_drives,) where the wires are when the tip is seen on the axis [m]."""
+    """(n_drives,) where the wires are when the tip is seen on the axis [m]. Raises `DeviceError` where the camera cannot be believed."""
+    before = np.inf
     for _ in range(_ROUNDS):
         for away in _spiral(hardware):
             cycle(at + away)
@@ -120,8 +171,17 @@ def _straightened(
                 seen.append(sighting.position)
         if len(seen) < _LEAST:
             raise DeviceError(f"the camera saw the marker {len(seen)} times in {_LOOKING:g} s of homing; it must see it {_LEAST} times.")
-        way = -lean(hardware.robot, np.mean(seen, axis=0))
-        steps = max(round(np.abs(way).max() / hardware.homing_speed * hardware.rate), round(0.5 * hardware.rate))
+        tip = np.mean(seen, axis=0)
+        way = -lean(hardware.robot, tip)
+        far = float(np.abs(way).max())
+        if far > _FAR or (far > _NEAR and far >= before):
+            why = f"by {1e3 * _FAR:g} mm at most" if far > _FAR else f"and {1e3 * before:.2f} mm before did not bring it nearer"
+            raise DeviceError(
+                f"the tip is seen {1e3 * float(np.hypot(tip[0], tip[1])):.2g} mm beside the axis; the wires would move by {1e3 * far:.2f} mm, "
+                f"{why}; is the camera registered? `fastrod drive register` does it."
+            )
+        before = far
+        steps = max(round(far / hardware.homing_speed * hardware.rate), round(0.5 * hardware.rate))
         for _ in range(steps):
             at = at + way / steps
             cycle(at)

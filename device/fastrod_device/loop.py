@@ -77,9 +77,10 @@ def close_loop(
 
 def _rest(prototype: Prototype, hands: Hands) -> None:
     """Load off, base as in the robot's file."""
-    hands.hang(0.0)
     own = np.array(prototype.robot.base_quaternion)
-    hands.turn(own)
+    with prototype.resting():
+        hands.hang(0.0)
+        hands.turn(own)
     prototype.payload, prototype.base_quaternion = 0.0, own
 
 

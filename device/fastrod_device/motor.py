@@ -24,7 +24,7 @@ class Motor:
     """One axis. Positions in counts; growing counts pull the wire where the spec's direction is +1.
 
     A shaft without current is held by the friction of its gear. The current is that of the wire's tension; the motor's own inertia and
-    friction are left out.
+    friction are left out. Where the wire pulls with the greatest torque (object 0x6072) or more, the shaft turns no further against it.
     """
 
     def __init__(self, spec: DriveSpec, objects: Objects) -> None:
@@ -101,7 +101,9 @@ class Motor:
 
     def told_torque(self) -> int:
         """Object 0x6077; 0 without current."""
-        return max(-32768, min(32767, round(self.torque + self.noise))) if self.powered else 0
+        most = self.objects.values[(0x6072, 0)]
+        carried = max(-most, min(most, self.torque))
+        return max(-32768, min(32767, round(carried + self.noise))) if self.powered else 0
 
     def following_error(self) -> int:
         """Object 0x60F4 [counts]."""
@@ -318,6 +320,8 @@ class Motor:
         change = _ACCELERATION * h
         self.v += max(-change, min(change, math.copysign(wanted, error) - self.v))
         if abs(error) < 0.5 and self.command_rate == 0.0 and abs(self.v) <= change:
+            self.v = 0.0
+        if self.v * self.torque > 0.0 and abs(self.torque) >= self.objects.values[(0x6072, 0)]:
             self.v = 0.0
         if not self.blocked:
             self.x += self.v * h

@@ -13,7 +13,7 @@ from fastrod_device.dictionary import I8, I16, I32, U8, U16, U32
 _CODES = {U8: "B", U16: "H", U32: "I", I8: "b", I16: "h", I32: "i"}
 _NO_OBJECT, _NOT_MAPPABLE, _TOO_LONG = 0x06020000, 0x06040041, 0x06040042
 _READ_ONLY, _WRONG_LENGTH, _NO_SUB, _BAD_VALUE, _WRONG_STATE = 0x06010002, 0x06070010, 0x06090011, 0x06090030, 0x08000022
-_INVALID = 0x8000_0000  # bit of a COB-ID: this PDO does not exist
+_INVALID, _NO_RTR = 0x8000_0000, 0x4000_0000  # bits of a COB-ID: this PDO does not exist, cannot be asked for
 
 Key = tuple[int, int]
 """Index and subindex."""
@@ -109,6 +109,8 @@ class Objects:
             known = value >= 254 or (1 <= value <= 240) or (value == 0 and base == 0x1400)
             if not known:
                 raise self._abort(_BAD_VALUE)
+        if base == 0x1800 and sub == 1 and not value & _NO_RTR:
+            raise self._abort(_BAD_VALUE)  # as drives do that answer no RTR
         if base not in (0x1600, 0x1A00):
             return
         if not self.values[(index - 0x200, 1)] & _INVALID:

@@ -6,7 +6,8 @@ import gc
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import final
 
@@ -38,6 +39,7 @@ from fastrod_device.units import Transmission
 Plan = Callable[[float], Floats]
 """Seconds since it began -> (n_tendons,) changes of wire length [m], negative = pulled."""
 
+_COVERED = 20.0  # s that the marker may stay covered after hands are done
 _SLOWEST = 1e-6  # m/s of a glide
 _REMEMBERED = 3.0  # s of wire lengths, for frames that come late
 _FROZEN = 3  # frames alike: a camera at 15 Hz never draws the same noise twice
@@ -99,6 +101,8 @@ class Prototype:
         self._pace = hardware.limits.rate
         self._trusted, self._alike = self.clock.now(), 0
         self._zero = self.clock.now()
+        self._stops = 0
+        self._resting = False
         self._pacer: Pacer | None = None
         self.broken: Exception | None = None
         """What went wrong in a thread of ours, if anything did."""
@@ -145,7 +149,7 @@ class Prototype:
                 deceleration=np.rint(limits.rate / _STOPS * per).astype(np.int64),
             )
             if home:
-                self.home()
+                self._home()
             self._enable()
             self._pacer = Pacer(self.clock, hw.rate)
             jobs = {"drives": self._drive_forever, "camera": self._look_forever, "watchdog": self._watch_forever}
@@ -156,8 +160,7 @@ class Prototype:
             self.close()
             raise
 
-    def home(self) -> None:
-        """Find where the robot is straight, as `homing.home` says; zero is there. Raises `DeviceError`."""
+    def _home(self) -> None:
         self.transmission, self._robot = home(self.drives, self.hardware, self.clock, None if self.source is None else self._see)
 
     def _see(self) -> Sighting | None:
@@ -179,8 +182,9 @@ class Prototype:
 
     def glide(self, dl: ArrayLike, seconds: float) -> None:
         """As `command`, spread evenly over so long [s]: commands that come ten times slower than cycles then make no jerks."""
-        if not (np.isfinite(seconds) and seconds > 0.0):
-            raise RefusedError(f"seconds is {seconds!r}; a glide takes a positive time.")
+        longest = self.hardware.limits.command_age
+        if not 0.0 < seconds <= longest:
+            raise RefusedError(f"seconds is {seconds!r}; a glide takes a positive time of {longest:g} s at most: a longer one is renewed.")
         with self._lock:
             self.command(dl)
             self._pace = max(float(np.abs(self._wanted - self._set).max()) / seconds, _SLOWEST)
@@ -225,6 +229,23 @@ class Prototype:
             if self.supervisor.state is State.STOPPED:
                 raise DeviceError(self.supervisor.status)
 
+    @contextmanager
+    def resting(self) -> Iterator[None]:
+        """The robot holds while hands work at it and may cover the marker: the camera's faults do not count until they are done. On leaving
+        it waits for the marker. Raises `DeviceError` where that is not seen, or anything else stopped the robot."""
+        with self._lock:
+            self._plan, self._wanted = None, self._set
+        self._resting = True
+        try:
+            yield
+            done = self.clock.now()
+            while self.source is not None and self._trusted <= done:
+                if self.clock.now() > done + _COVERED:
+                    raise DeviceError(f"the marker was not seen for {_COVERED:g} s after hands had worked at the robot; is it free?")
+                self.wait(0.05)
+        finally:
+            self._resting = False
+
     def read(self) -> Measurement:
         """The newest sighting with the wires as they were then; without a camera the wires alone."""
         with self._lock:
@@ -246,7 +267,8 @@ class Prototype:
     def release(self) -> None:
         """A person says that it may move again: faults are reset, the drives enabled where they stand. Where the cause is still there it
         stays stopped, and `read().problem` says why."""
-        self._jobs.put(self._release)
+        stops = self._stops
+        self._jobs.put(lambda: self._release(stops))
         if self.clock.stepped:
             with self.supervisor.guard(self.clock):
                 self._do_jobs()
@@ -287,14 +309,16 @@ class Prototype:
             self.tracker.reset()
         self.supervisor.enabled(self.clock.now())
 
-    def _release(self) -> None:
+    def _release(self, stops: int) -> None:
+        if stops != self._stops:
+            return  # somebody has stopped it since: that counts for more
+        self.drives.acknowledge()  # a stop from here on latches them again, whatever the supervisor takes back
         try:
             self.supervisor.acknowledge(self.clock.now())
         except RefusedError:
             return  # the status says why
         self.journal.write(self.clock.now(), "release", "a person released the robot.")
         try:
-            self.drives.acknowledge()
             self.drives.reset_faults()
             self._enable()
         except FastrodError as error:
@@ -325,14 +349,17 @@ class Prototype:
             self.readings = readings
             self._past.add(readings.t, readings.dl, self._set)
         now, known = self.clock.now(), len(self.supervisor.faults)
-        camera = None if self.source is None else CameraWatch(age=now - self._trusted, frozen=self._alike >= _FROZEN)
+        camera = None if self.source is None or self._resting else CameraWatch(age=now - self._trusted, frozen=self._alike >= _FROZEN)
         self.supervisor.watch(now, None if self._wall is None else self._wall(), readings, camera)
         for fault in self.supervisor.faults[max(known, 1) :]:
             self.journal.write(fault.t, fault.kind, fault.sentence)
 
     def _on_stop(self, fault: Fault) -> None:
-        self.drives.quick_stop()
+        self._stops += 1
+        unsent = self.drives.quick_stop()
         self.journal.write(fault.t, fault.kind, fault.sentence)
+        if unsent:  # the supervisor says so, and sends it again
+            raise DeviceError(f"{unsent}; drives that hear nothing stop by themselves.")
 
     def look(self) -> None:
         """Take in the newest frame, if there is one."""

@@ -164,7 +164,7 @@ class Supervisor:
                 raise RefusedError(f"the robot is stopped: {self._faults[0].sentence.rstrip('.')}; a person must release it first.")
             if self.state is State.OFF:
                 raise RefusedError("the drives are off; enable them first.")
-            wanted = self._within(dl)
+            wanted = self.within(dl)
             meant = now if stamp is None else stamp
             if not (math.isfinite(now) and abs(now - meant) <= self.limits.command_age):
                 age, limit = 1e3 * (now - meant), 1e3 * self.limits.command_age
@@ -317,7 +317,8 @@ class Supervisor:
             found += inspector.command(now, readings, self._meant)
         return found
 
-    def _within(self, dl: ArrayLike) -> Floats:
+    def within(self, dl: ArrayLike) -> Floats:
+        """(n_tendons,) the same, where it is a command within displacement and curvature. Raises `RefusedError` where it is not."""
         try:
             wanted = np.array(dl, dtype=np.float64)
         except (TypeError, ValueError) as error:

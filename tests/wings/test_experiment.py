@@ -91,7 +91,11 @@ def test_hands_are_asked_in_the_order_of_the_run(bench: Bench, tmp_path: Path) -
     hands, run, told = Noting(bench), short_run(), []
     log = excite(bench.prototype, run, hands, tmp_path / "run.csv", progress=lambda what, done, total: told.append((what, done, total)))
     assert hands.asked == [("hang", MASS), ("turn", TILTED[1]), ("hang", 0.0), ("turn", 0.0)]
-    assert_allclose(np.diff(hands.at), [SECONDS, SECONDS, 0.0], atol=0.1)
+    first, second, third = np.diff(hands.at)
+    # after each, the robot waits until hands have left the marker free
+    assert min(first, second) >= SECONDS
+    assert max(first, second) < SECONDS + 1.5
+    assert third == pytest.approx(0.0, abs=0.1)
     # a row for each frame, at 15 Hz, and nearly all with the tip
     assert len(log) == pytest.approx(4.0 * SECONDS * 15.0, abs=6)
     assert log.measured.mean() > 0.9
@@ -110,6 +114,7 @@ def test_hands_are_asked_in_the_order_of_the_run(bench: Bench, tmp_path: Path) -
 def test_the_wires_go_where_the_run_says(bench: Bench, tmp_path: Path) -> None:
     run = short_run()
     log = excite(bench.prototype, run, bench.hands, tmp_path / "run.csv")
+    log = log.rows(log.t < SECONDS)  # later, hands have taken their time
     asked = np.stack([np.interp(log.t, run.log.t, column) for column in run.log.dl.T], axis=1)
     # a drive follows its set-point a cycle or two late: 0.02 s of the quickest wire
     quickest = np.abs(np.diff(run.log.dl, axis=0)).max() * 15.0

@@ -465,3 +465,53 @@ def test_the_picture_shows_the_marker_in_its_outline() -> None:
         where = np.argwhere(outline)[:, ::-1]
         np.testing.assert_allclose(where.min(axis=0), robot.sighting.corners.min(axis=0), atol=3.0)
         np.testing.assert_allclose(where.max(axis=0), robot.sighting.corners.max(axis=0), atol=3.0)
+
+
+def test_a_release_that_is_older_than_a_stop_releases_nothing() -> None:
+    with bench() as (robot, emulator):
+        robot.stop()
+        with suppress(DeviceError):
+            robot.wait(0.1)
+        robot._jobs.put(lambda stops=robot._stops: robot._release(stops))  # as by release(), in a thread that comes to it late
+        robot.stop()
+        with suppress(DeviceError):
+            robot.wait(0.1)
+        assert robot.supervisor.state is State.STOPPED
+        assert not emulator.drives.moving.any()
+        robot.release()
+        robot.wait(0.05)
+        assert robot.supervisor.state is State.READY
+
+
+def test_hands_may_cover_the_marker_while_it_rests() -> None:
+    with bench() as (robot, emulator):
+        robot.wait(0.5)
+        with robot.resting():
+            emulator.hidden = True
+            robot.wait(2.0)  # four times as long as a marker may be lost in motion
+            emulator.hidden = False
+        assert robot.supervisor.state in (State.READY, State.RUNNING)
+        assert robot.sighting is not None
+        assert robot.sighting.ok
+
+
+def test_a_marker_that_stays_covered_stops_the_robot() -> None:
+    with bench() as (robot, emulator):
+        robot.wait(0.5)
+        with pytest.raises(DeviceError, match="was not seen for 20 s"), robot.resting():
+            emulator.hidden = True
+        with pytest.raises(DeviceError, match="marker lost"):
+            robot.wait(1.0)
+
+
+def test_a_stop_that_cannot_be_sent_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    with bench() as (robot, _):
+
+        def broken(*_: object) -> None:
+            raise OSError("the adapter is gone")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(robot.drives._line, "send", broken)
+            robot.stop()
+        assert "THE STOP COULD NOT BE SENT" in robot.supervisor.status
+        assert "the adapter is gone" in robot.supervisor.status
