@@ -74,7 +74,9 @@ def _teleop(arguments: argparse.Namespace, _: Progress | None) -> int:
         say("The drives are switched off.")
     finally:
         with contextlib.suppress(OSError):
-            if not events.stat().st_size:
+            if events.stat().st_size:
+                say(f"What stopped the drives is in {events}.")
+            else:
                 events.unlink()
         ordinary()
         sys.setswitchinterval(switches)

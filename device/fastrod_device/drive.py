@@ -129,7 +129,8 @@ class DriveBus:
 
         What drives refuse by themselves, one number or (n_drives,): targets beyond +-`position_limit` [counts], speeds beyond
         `velocity_limit` [counts/s], a fault beyond `following_error` [counts]; they pull with `torque_limit` [thousandths of the rated
-        torque] at most. A quick stop is by `deceleration` [counts/s2]; then the motors `hold` the wires or are switched off. Call it again after a drive has rebooted.
+        torque] at most. A quick stop is by `deceleration` [counts/s2]; then the motors `hold` the wires or are switched off.
+        Call it again after a drive has rebooted.
         Raises `InputError`, or `DeviceError`: the first drive that does not answer, is another device, or refuses.
         """
         setup, n = self._configurator, self.n_drives

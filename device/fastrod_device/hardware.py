@@ -59,8 +59,8 @@ class Hardware:
         if self.pretension < (1.0 - 1e-9) * steps.max():
             k, least = int(steps.argmax()), math.ceil(1e3 * steps.max()) / 1e3
             raise InputError(
-                f"pretension is {self.pretension!r} N; the drive at node {nodes[k]} tells torque in steps of {steps[k]:.3g} N of its wire, so "
-                f"it must be at least {least:g} N."
+                f"pretension is {self.pretension!r} N; the drive at node {nodes[k]} tells torque in steps of {steps[k]:.3g} N of its wire, "
+                f"so it must be at least {least:g} N."
             )
 
 

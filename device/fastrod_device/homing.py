@@ -38,6 +38,7 @@ _UNEVEN = 0.3  # of the pretension
 _ROUNDS, _LOOKING, _LEAST = 2, 1.5, 8  # times that the tip is looked at, for how long [s], sightings that it takes
 _FAR, _NEAR = 1e-3, 5e-5  # m of wire: a greater correction means a wrong camera, a smaller one is none
 _MEASURED = 0.3  # s for which the tensions are taken in the end
+_BEHIND = 0.25  # of the limits' following error, for a drive that hardly moves; at the full rate all of it
 _OLD = 5  # cycles without a drive's process data
 _PULL, _LEAST_PULL = 5.0, 3.0  # pretensions, N: no wire pulls more while it is homed
 _BEND, _TURNS, _TURN = 0.45, 4, 1.4  # rad at first, turns of the spiral, s each
@@ -53,18 +54,21 @@ def home(drives: DriveBus, hardware: Hardware, clock: Clock, look: Callable[[], 
     transmission, n = Transmission(hardware.drives), len(hardware.drives)
     per = 1.0 / np.abs(transmission.wound(np.ones(n, dtype=np.int64)))  # counts in a metre
     drives.homing(np.abs(transmission.torque(np.full(n, hardware.pretension))), np.rint(hardware.homing_speed * per).astype(np.int64))
-    pacer = Pacer(clock, hardware.rate)
+    pacer, last, speed = Pacer(clock, hardware.rate), transmission.dl(drives.newest.position), 0.0
 
     def cycle(at: Floats) -> Floats:
         """(n_drives,) tensions with the wires at `at` [N]."""
+        nonlocal last, speed
         pacer.wait()
         feedback = drives.exchange(transmission.counts(at))
-        if wrong := trouble(feedback, hardware):
-            raise DeviceError(f"{wrong}; homing was stopped.")
+        speed, last = max(0.5 * speed, float(np.abs(at - last).max()) * hardware.rate), at  # a drive lags by a moment
+        if wrong := trouble(feedback, hardware, speed=speed):
+            why = f" ({drives.stop_reason})" if drives.stop_reason else ""
+            raise DeviceError(f"{wrong}{why}; homing was stopped.")
         return transmission.tension(feedback.torque)
 
     try:
-        at = _tightened(cycle, transmission.dl(drives.newest.position), hardware)
+        at = _tightened(cycle, last, hardware)
         tension = _measured(cycle, at, hardware)
         off = np.abs(tension - hardware.pretension)
         if (off > _UNEVEN * hardware.pretension).any():
@@ -88,25 +92,34 @@ def home(drives: DriveBus, hardware: Hardware, clock: Clock, look: Callable[[], 
     return Transmission(hardware.drives, zero=transmission.counts(at)), tightened(hardware.robot, tension)
 
 
-def trouble(feedback: Feedback, hardware: Hardware) -> str:
-    """What is wrong with drives that are homed: one sentence without its full stop, of the first that is found; empty where all is well."""
+def trouble(feedback: Feedback, hardware: Hardware, *, speed: float = 0.0) -> str:
+    """What is wrong with drives that are homed: one sentence without its full stop, of the first that is found; empty where all is well.
+
+    `speed` of the quickest wire [m/s]: a drive that moves may be further behind where it was told to be.
+    """
     nodes = [spec.node for spec in hardware.drives]
     if feedback.lost:
         return f"the bus carries nothing: {feedback.lost.rstrip('.')}"
     for message in feedback.emergencies:
-        if message.code:  # 0: an error is gone
+        if message.code & 0xFF00:  # 00xx: an error is gone
             return f"the drive at node {nodes[message.drive]} sent an emergency: {in_words(message.code)}"
     oldest = max(_OLD / hardware.rate, hardware.limits.feedback_age)
-    tension = Transmission(hardware.drives).tension(feedback.torque)
+    transmission, limits = Transmission(hardware.drives), hardware.limits
+    tension, behind = transmission.tension(feedback.torque), np.abs(transmission.wound(feedback.following_error))
+    late = limits.following_error * min(1.0, _BEHIND + speed / limits.rate)
     most = min(hardware.limits.tension, max(_PULL * hardware.pretension, _LEAST_PULL))
     for k, node in enumerate(nodes):
         if not feedback.age[k] <= oldest:
             return f"the drive at node {node} was last heard {1e3 * feedback.age[k]:.0f} ms ago; {1e3 * oldest:.0f} ms are allowed"
         if (state := state_in_words(int(feedback.statusword[k]))) != ENABLED:
             return f"the drive at node {node} went to the state {state!r} (statusword 0x{int(feedback.statusword[k]):04X})"
-    if (np.abs(tension) > most).any():
-        k = int(np.abs(tension).argmax())
-        return f"the wire of node {nodes[k]} pulls with {tension[k]:.2f} N; {most:g} N are allowed"
+    k, b = int(np.abs(tension).argmax()), int(behind.argmax())
+    slow = f"the drive at node {nodes[b]} is {1e3 * behind[b]:.2g} mm from where it was told to be"
+    if behind[b] > late:
+        return f"{slow}; {1e3 * late:.2g} mm are allowed"
+    if abs(tension[k]) > most:
+        also = f", and {slow}" if behind[b] > _BEHIND * limits.following_error else ""
+        return f"the wire of node {nodes[k]} pulls with {tension[k]:.2f} N; {most:g} N are allowed{also}"
     return ""
 
 
@@ -177,8 +190,8 @@ def _straightened(
         if far > _FAR or (far > _NEAR and far >= before):
             why = f"by {1e3 * _FAR:g} mm at most" if far > _FAR else f"and {1e3 * before:.2f} mm before did not bring it nearer"
             raise DeviceError(
-                f"the tip is seen {1e3 * float(np.hypot(tip[0], tip[1])):.2g} mm beside the axis; the wires would move by {1e3 * far:.2f} mm, "
-                f"{why}; is the camera registered? `fastrod drive register` does it."
+                f"the tip is seen {1e3 * float(np.hypot(tip[0], tip[1])):.2g} mm beside the axis; the wires would move by {1e3 * far:.2f} "
+                f"mm, {why}; is the camera registered? `fastrod drive register` does it."
             )
         before = far
         steps = max(round(far / hardware.homing_speed * hardware.rate), round(0.5 * hardware.rate))

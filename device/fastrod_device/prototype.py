@@ -147,6 +147,7 @@ class Prototype:
                 velocity_limit=np.rint(_MARGIN * limits.rate * per).astype(np.int64),
                 following_error=np.rint(limits.following_error * per).astype(np.int64),
                 deceleration=np.rint(limits.rate / _STOPS * per).astype(np.int64),
+                torque_limit=np.clip(np.abs(self.transmission.torque(np.full(len(per), _MARGIN * limits.tension))), 1, 3000),
             )
             if home:
                 self._home()

@@ -95,6 +95,10 @@ def test_keys_bend_pause_reset_and_stop(app: App, window: Windows) -> None:
     page.pilot.bend(0, 0.5, 0.0)
     seen.page.wait_for_timeout(300)
     assert abs(page.pilot.now.action[1]) < 1e-12
+    keys.press("Escape")
+    seen.page.get_by_role("button", name="STOP", exact=True).dblclick()
+    seen.page.wait_for_timeout(300)
+    assert page.session.stopped
     seen.page.get_by_role("button", name="GO ON").click()
     assert seen.until(lambda: not page.session.stopped)
     keys.press("r")
@@ -159,6 +163,7 @@ def test_closing_the_page_stops_a_real_robot(app: App, window: Windows) -> None:
     assert np.array_equal(link.read().dl, there)
     assert there.min() > -0.0075 * np.pi / 2.0 + 1e-3  # it had not arrived
     other.go(app.address)
+    other.page.wait_for_timeout(1100)  # sooner it is ignored
     other.page.get_by_role("button", name="GO ON").click()
     assert other.until(lambda: not link.stopped)
 

@@ -122,6 +122,11 @@ class Bed:
         assert seen.until(lambda: self.link.elapsed > until)
         return bool(np.abs(self.link.wires() - before).max() < STANDS)
 
+    def go_on(self, seen: Window) -> None:
+        """When a person has had time to see why it stopped."""
+        seen.page.wait_for_timeout(1100)
+        seen.page.get_by_role("button", name="GO ON").click()
+
     def says(self, seen: Window, words: str) -> bool:
         return seen.until(lambda: seen.page.get_by_text(re.compile(words)).count() > 0)
 
@@ -179,13 +184,40 @@ def test_stop_stands_at_once_and_go_on_moves_nothing(bed: Bed, window: Windows) 
     bed.bend(seen, "End")
     assert bed.stands(seen)
     assert bed.says(seen, "emergency stop was pressed")
-    seen.page.get_by_role("button", name="GO ON").click()
+    bed.go_on(seen)
     assert seen.until(lambda: not bed.page.session.stopped)
     assert bed.stands(seen)
     np.testing.assert_allclose(bed.link.wires(), there, atol=5e-5)
     assert bed.page.pilot.bent(0)[0] == pytest.approx(-there[0] / 0.0075, abs=0.01)
     bed.bend(seen, "Home")
     assert seen.until(lambda: bool(bed.link.wires()[0] > there[0] + 2e-4))
+
+
+def test_stop_only_stops_however_often_it_is_pressed(bed: Bed, window: Windows, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fastrod_viewer.session._HASTY", 60.0)  # a browser without a GPU may need a second for a click
+    seen, other = window(bed.app.address), window(bed.app.address)
+    for each in (seen, other):
+        assert each.page.get_by_role("button", name="GO ON").is_disabled()
+    bed.slowly(seen)
+    bed.bend(seen, "End")
+    assert seen.until(lambda: bool(bed.link.wires()[0] < -3e-4))
+    seen.page.get_by_role("button", name="STOP", exact=True).dblclick()
+    assert seen.until(lambda: bed.page.session.stopped)
+    seen.page.get_by_role("button", name="GO ON").click()
+    assert bed.says(seen, "GO ON within a second of a stop is ignored; press it again.")
+    assert bed.stands(seen)
+    monkeypatch.undo()
+    for press in (lambda: other.page.get_by_role("button", name="STOP", exact=True).click(), lambda: other.page.keyboard.press("Escape")):
+        press()
+        other.page.wait_for_timeout(1100)
+        assert bed.page.session.stopped
+        assert bed.link.prototype.supervisor.first is not None
+        assert bed.stands(other)
+    bed.go_on(other)
+    assert other.until(lambda: not bed.page.session.stopped)
+    for each in (seen, other):
+        assert each.until(lambda each=each: each.page.get_by_role("button", name="GO ON").is_disabled())  # type: ignore[misc]
+        assert each.errors == []
 
 
 def test_after_a_fault_the_page_says_why_and_releases_when_the_cause_is_gone(bed: Bed, window: Windows) -> None:
@@ -195,12 +227,12 @@ def test_after_a_fault_the_page_says_why_and_releases_when_the_cause_is_gone(bed
     assert bed.says(seen, "the marker was last seen")
     assert bed.page.session.stopped
     assert bed.says(seen, "no marker")
-    seen.page.get_by_role("button", name="GO ON").click()
+    bed.go_on(seen)
     assert bed.says(seen, "not released, as")
     bed.emulator.hidden = False
     assert bed.says(seen, "marker seen")
     assert seen.until(lambda: not bed.page.session.releasing)
-    seen.page.get_by_role("button", name="GO ON").click()
+    bed.go_on(seen)
     assert seen.until(lambda: not bed.page.session.stopped)
     assert bed.says(seen, "The robot follows commands.")
 
@@ -224,7 +256,7 @@ def test_nothing_moves_when_nobody_watches(bed: Bed, window: Windows, how: str) 
     bed.bend(other, "End")
     assert bed.stands(other)
     np.testing.assert_allclose(bed.link.wires(), there, atol=STANDS)
-    other.page.get_by_role("button", name="GO ON").click()
+    bed.go_on(other)
     assert other.until(lambda: not bed.page.session.stopped)
 
 
@@ -270,3 +302,4 @@ def test_sigterm_saves_the_recording_and_switches_off(tmp_path: Path, window: Wi
     log = read_log(tmp_path / "prototype-session.csv", load_hardware().robot)
     assert len(log) > 3
     assert np.isfinite(log.tip_position).any()
+    assert "emergency stop" in (tmp_path / "drive.events.csv").read_text()  # closing is a stop, too

@@ -88,6 +88,58 @@ def test_connect_leaves_the_drives_operational_and_switched_off():
         assert bench.bus.newest.lost == ""
 
 
+def test_the_greatest_torque_is_told_and_kept():
+    limit = np.array([150, 300, 200, 250])
+    with Bench() as bench:
+        bench.bus.connect(torque_limit=limit)
+        told = [node.objects.values[(0x6072, 0)] for node in bench.nodes._nodes]
+        assert told == limit.tolist()
+        bench.bus.connect()
+        assert [node.objects.values[(0x6072, 0)] for node in bench.nodes._nodes] == [3000] * 4
+        with pytest.raises(InputError, match=r"torque_limit is \[70000, .*below 2\^16"):
+            bench.bus.connect(torque_limit=70_000)
+
+
+def test_a_wire_is_pulled_no_harder_than_the_greatest_torque_allows():
+    with Bench() as bench:
+        bench.bus.connect(torque_limit=60, following_error=200_000)
+        bench.bus.enable()
+        for k in range(150):
+            seen = bench.run(1, np.array([100, -100, 100, -100]) * k)[0]
+        most = Transmission(SPECS).tension(np.array([60, -60, 60, -60]))  # N
+        tension = STIFFNESS * (bench.nodes.true_pulled - SLACK)
+        assert np.all(np.abs(seen.following_error) > 5000)
+        # it is known once in a cycle: 10,000 counts/s x 584 nm x 2000 N/m x 10 ms
+        assert np.all((tension >= most) & (tension < most + 0.13))
+        assert np.all(np.abs(seen.torque) < 65)  # with its noise
+
+
+def test_process_data_cannot_be_asked_for_and_what_is_unused_is_invalid():
+    with Bench() as bench:
+        for node in bench.nodes._nodes:  # somebody had stored PDOs of his own
+            for index in (0x1401, 0x1403, 0x1802):
+                node.objects.values[(index, 1)] &= 0x3FFF_FFFF
+        bench.bus.connect()
+        for k, node in enumerate(bench.nodes._nodes, 1):
+            held = {index: node.objects.values[(index, 1)] for base in (0x1400, 0x1800) for index in range(base, base + 4)}
+            assert (held[0x1400], held[0x1800], held[0x1801]) == (0x200 + k, 0x4000_0180 + k, 0x4000_0280 + k)
+            assert [held[index] >> 30 for index in (0x1401, 0x1402, 0x1403, 0x1802, 0x1803)] == [0b10, 0b10, 0b10, 0b11, 0b11]
+            assert [held[index] & 0x7FF for index in (0x1401, 0x1802)] == [0x300 + k, 0x380 + k]
+
+
+def test_pdos_that_the_dictionary_lacks_are_left_alone(tmp_path: Path):
+    canopen = pytest.importorskip("canopen")
+    dictionary, own = object_dictionary(), tmp_path / "own.eds"
+    for index in (0x1402, 0x1403, 0x1803):
+        del dictionary[index]
+    canopen.export_od(dictionary, str(own))
+    clock, name = SteppedClock(), f"virtual:drives-{next(_names)}"
+    with EmulatedDrives(SPECS, name, clock=clock, wires=Springs()) as nodes, DriveBus(SPECS, name, clock=clock, rate=100.0, eds=own) as bus:
+        bus.connect()
+        assert bus.newest.nmt.tolist() == [5] * 4
+        assert nodes.states == ("switch on disabled",) * 4
+
+
 def test_enabling_does_not_move_a_drive(ready):
     before = ready.nodes.true_pulled
     seen = ready.run(20)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from fastrod import load_robot
@@ -13,6 +14,7 @@ from fastrod.robotfile import save_robot
 from fastrod_device.camera import save_camera
 from fastrod_device.hardware import SHIPPED, load_hardware
 from fastrod_device.limits import Limits
+from fastrod_device.units import Transmission
 
 TEXT = SHIPPED.read_text(encoding="utf-8")
 
@@ -76,6 +78,16 @@ MISTAKES = {
     "a word for a number": ("size = 0.018", 'size = "18 mm"', "[marker]: size: Expected 'float', got 'str'."),
     "one number of many": ("size = [640, 480]", 'size = [640, "480"]', "[camera]: size[1]: Expected 'int', got 'str'."),
     "a word for the rate": ("rate = 100.0 ", 'rate = "fast" ', "rate is 'fast'; it must be from 50 to 500 Hz."),
+    "pretension that no drive can tell": (
+        "pretension = 1.0 ",
+        "pretension = 0.1 ",
+        "pretension is 0.1 N; the drive at node 1 tells torque in steps of 0.113 N of its wire, so it must be at least 0.114 N.",
+    ),
+    "a coarser drive": (
+        "node = 3\ndrum_radius = 0.008",
+        "node = 3\ndrum_radius = 0.0008",
+        "node 3 tells torque in steps of 1.13 N of its wire, so it must",
+    ),
     "rate out of range": ("rate = 100.0 ", "rate = 5.0 ", "rate is 5.0; it must be from 50 to 500 Hz."),
     "drum in mm": ("drum_radius = 0.008     # m", "drum_radius = 8", "drive 1: DriveSpec.drum_radius of node 1 is 8"),
     "dictionary": ("DICT_4X4_50", "DICT_4X4_5", "[marker]: no marker dictionary 'DICT_4X4_5'; did you mean 'DICT_4X4_50'?"),
@@ -98,6 +110,12 @@ def test_a_mistake_is_one_sentence(name: str, tmp_path: Path) -> None:
     assert "\n" not in told
     assert "`" not in told
     assert told.startswith("no robot") or repr(str(path)) in told  # a robot's name is a robot's mistake
+
+
+def test_the_least_pretension_that_is_told_is_taken(tmp_path: Path) -> None:
+    hardware = load_hardware(written(tmp_path, "pretension = 1.0 ", "pretension = 0.114 "))
+    assert hardware.pretension == 0.114
+    assert np.abs(Transmission(hardware.drives).torque(np.full(4, hardware.pretension))).tolist() == [1] * 4
 
 
 def test_tables_that_are_none(tmp_path: Path) -> None:

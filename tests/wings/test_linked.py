@@ -165,6 +165,7 @@ def test_a_fault_stops_the_session_which_waits_until_the_link_is_ready() -> None
     n = len(link.glides)
     session.pilot.bend(0, 0.6, 0.0)
     assert until(lambda: session.pilot.bent(0)[0] == pytest.approx(0.001 / 0.0075))  # the model stands as the encoders say
+    time.sleep(1.1)  # sooner it is ignored
     session.release()
     assert link.asked == 1
     time.sleep(0.2)
@@ -175,6 +176,43 @@ def test_a_fault_stops_the_session_which_waits_until_the_link_is_ready() -> None
     assert until(lambda: not session.stopped)
     assert until(lambda: len(link.glides) > n)
     np.testing.assert_allclose(link.glides[n][0], [-0.001, 0.0, 0.001, 0.0], atol=1e-9)
+    session.close()
+
+
+def test_a_real_robot_is_not_released_within_a_second_of_a_stop() -> None:
+    link = Watched()
+    session = driven(link)
+    session.release()
+    assert link.asked == 0  # nothing is stopped
+    session.stop()
+    for _ in range(2):
+        session.release()
+    assert (session.stopped, session.releasing, session.hasty, link.asked) == (True, False, True, 0)
+    time.sleep(0.9)
+    session.stop()
+    time.sleep(0.2)
+    session.release()
+    assert link.asked == 0  # it counts from the last stop
+    time.sleep(0.9)
+    session.release()
+    session.release()
+    assert (session.releasing, session.hasty, link.asked) == (True, False, 1)  # one release at a time
+    session.stop()
+    assert (session.stopped, session.releasing) == (True, False)
+    session.close()
+
+
+def test_a_simulated_robot_is_released_at_once() -> None:
+    link = SimulatedRobot(fastrod.load_robot("prototype"))
+    session = driven(link)
+    session.start()
+    session.stop()
+    session.stop()
+    assert session.stopped
+    assert link.stopped
+    session.release()
+    assert until(lambda: not session.stopped)
+    assert not link.stopped
     session.close()
 
 

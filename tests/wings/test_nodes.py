@@ -75,7 +75,7 @@ class Wire:
 
     def map(self, kind: int = 1) -> None:
         """Controlword and target in, statusword and position out; operational."""
-        for communication, cob_id, entries in ((0x1400, 0x205, (0x60400010, 0x607A0020)), (0x1800, 0x185, (0x60410010, 0x60640020))):
+        for communication, cob_id, entries in ((0x1400, 0x205, (0x60400010, 0x607A0020)), (0x1800, 0x40000185, (0x60410010, 0x60640020))):
             assert self.write(communication, 1, cob_id | 0x80000000, 4) == 0
             assert self.write(communication, 2, kind, 1) == 0
             assert self.write(communication + 0x200, 0, 0, 1) == 0
@@ -135,6 +135,10 @@ def test_it_says_who_it_is(wire):
         (0x1A00, 1, 0x60650020, 4, 0x06040041),  # cannot be mapped
         (0x1600, 1, 0x60410010, 4, 0x06040041),  # read only into an RPDO
         (0x1800, 2, 250, 1, 0x06090030),  # reserved transmission type
+        (0x1800, 1, 0x185, 4, 0x06090030),  # a TPDO that could be asked for by RTR, existing
+        (0x1801, 1, 0x80000285, 4, 0x06090030),  # and invalid
+        (0x1801, 1, 0xC0000285, 4, 0),
+        (0x1400, 1, 0x205, 4, 0),  # an RPDO has no such bit
     ],
 )
 def test_sdo_refuses_what_cannot_be(wire, index, sub, value, size, abort):
@@ -146,7 +150,7 @@ def test_a_mapping_is_refused_while_its_pdo_exists_and_when_it_is_too_long(wire)
         assert wire.write(0x1A00, sub, 0x60640020, 4) == 0
     assert wire.write(0x1A00, 0, 3, 1) == 0x06040042  # 12 bytes
     assert wire.write(0x1A00, 0, 2, 1) == 0
-    assert wire.write(0x1800, 1, 0x185, 4) == 0
+    assert wire.write(0x1800, 1, 0x40000185, 4) == 0
     assert wire.write(0x1A00, 0, 0, 1) == 0x08000022
 
 
@@ -206,6 +210,34 @@ def test_only_a_drive_that_holds_after_a_quick_stop_goes_on_from_it(option, afte
     motor.advance(0.01)
     motor.control(0x0F)
     assert motor.state == after
+
+
+@pytest.mark.parametrize("way", [1, -1])
+def test_a_motor_pulls_no_harder_than_its_greatest_torque(way):
+    def pulled(most: int) -> Motor:
+        motor = Motor(SPEC, Objects(object_dictionary(), 5))
+        motor.objects.values[(0x6072, 0)] = most
+        for word in (0x06, 0x0F):
+            motor.control(word)
+        motor.written((0x6060, 0), 8)
+        for k in range(60):
+            motor.written((0x607A, 0), way * 20 * k)
+            motor.setpoint()
+            motor.advance(0.01)
+            motor.torque = 0.5 * motor.x  # a wire as a spring
+        return motor
+
+    free, held = pulled(3000), pulled(200)
+    assert free.told_torque() == pytest.approx(way * 0.5 * 20 * 59, abs=12)
+    assert held.told_torque() == way * 200
+    assert 400 <= way * held.x < 425  # 200 / 0.5, and one step until the torque is known
+    assert way * held.following_error() > 700
+    held.written((0x607A, 0), 0)
+    for _ in range(20):  # the other way it goes
+        held.setpoint()
+        held.advance(0.01)
+        held.torque = 0.5 * held.x
+    assert abs(held.x) < 1.0
 
 
 def test_a_fault_is_reset_by_the_edge_of_bit_7_only():

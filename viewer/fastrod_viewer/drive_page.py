@@ -38,6 +38,7 @@ _LONG = 1.5  # s of one step
 _FARTHER = 1.35  # away from a robot beside whose picture there is one of a camera
 _NOTHING = np.full((240, 320, 3), 230, dtype=np.uint8)  # before the first picture
 _COMPILING = "Computing … The first use of contact compiles for a minute or two, once on this machine; tight contact takes its time, too."
+_GO_ON = "After a stop: commands are taken again, from where the robot stands."
 _COLORS = {"segment": "segment", "curvature": "curvature", "surface strain": "strain", "wire tension": "tension"}
 _PARTS = {"spacers": "Spacers", "tendons": "Wires", "contacts": "Contact forces", "loads": "Loads", "frames": "Tip frame"}
 _BODIES = {"backbone and wires": "backbone", "skin": "skin"}
@@ -119,9 +120,11 @@ class DrivePage(Page):
         gui, session = self.server.gui, self.session
         self.panel = gui.add_folder(None)
         with self.panel:
-            self.figures = gui.add_html("")
             self.stop = gui.add_button("STOP", color="red", icon=viser.Icon.HAND_STOP, hint="Everything stands still at once. Key: Esc")
-            self.stop.on_click(lambda _: session.release() if session.stopped else session.stop())
+            self.stop.on_click(lambda _: session.stop())
+            self.go_on = gui.add_button("GO ON", color="green", icon=viser.Icon.PLAYER_PLAY, disabled=True, hint=_GO_ON)
+            self.go_on.on_click(lambda _: session.release())
+            self.figures = gui.add_html("")  # below: as it grows and shrinks, it must not move GO ON to where STOP was
             self.run = gui.add_button_group("Run", self._runs())
             self.run.on_click(self._run)
             tabs = gui.add_tab_group()
@@ -151,7 +154,7 @@ class DrivePage(Page):
 
     def _runs(self) -> tuple[str, ...]:
         steps = ("Step",) if self.session.link is None else ()
-        return ("Go on" if self.session.paused else "Pause", *steps, "Reset")
+        return ("Resume" if self.session.paused else "Pause", *steps, "Reset")
 
     def _keys(self) -> str:
         keys = "<kbd>Space</kbd> pause · <kbd>Esc</kbd> stop · <kbd>R</kbd> reset"
@@ -226,7 +229,7 @@ class DrivePage(Page):
     def _run(self, event: Any) -> None:
         session = self.session
         match event.target.value:
-            case "Pause" | "Go on":
+            case "Pause" | "Resume":
                 session.paused = not session.paused
             case "Step":
                 session.step()
@@ -276,9 +279,12 @@ class DrivePage(Page):
         content = facts(rows, problem, news=news)
         if content != self.figures.content:
             self.figures.content = content
-        label = "STOP" if not session.stopped else "RELEASING …" if session.releasing else "GO ON"
-        if self.stop.label != label:
-            self.stop.label, self.stop.color = label, "green" if label == "GO ON" else "red"
+        releasing = session.releasing
+        label, off = "RELEASING …" if releasing else "GO ON", releasing or not session.stopped
+        if self.go_on.label != label:
+            self.go_on.label = label
+        if self.go_on.disabled != off:  # it stays in its place: what comes and goes would slip under a click
+            self.go_on.disabled = off
         options = self._runs()
         if tuple(self.run.options) != options:
             self.run.options = options
@@ -293,7 +299,8 @@ class DrivePage(Page):
         if session.releasing:
             return "", f"Releasing. {status}"
         if session.stopped:
-            return f"{status or 'Stopped.'} Press the green button to go on.", ""
+            how = "GO ON within a second of a stop is ignored; press it again." if session.hasty else "Press the green button to go on."
+            return f"{status or 'Stopped.'} {how}", ""
         if session.link is not None:
             return frame.problem, status
         return frame.problem and f"{frame.problem} Reset begins anew.", ""

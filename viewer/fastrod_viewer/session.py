@@ -30,6 +30,7 @@ _SAID = 4.0  # s for which a problem stays on the page
 _QUICKEST = 0.008  # s between two pictures, when hands are quick
 _SPREAD = 1.25  # of a step, over which a robot spreads it: the next one may come late
 _RELEASED = 3.0  # s in which a robot must be ready after a release, or stays stopped
+_HASTY = 1.0  # s after a stop in which a real robot is not released: that was a click too many, or one meant for something else
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +73,7 @@ class Session:
         self._scripted = script and link is None and world.scripted
         self._paused = self._stopped = False
         self._gate = threading.Lock()
-        self._released = -np.inf
+        self._released = self._halted = self._hasty = -np.inf
         self._fed = False
         self._moved = time.perf_counter()
         self._steps = 0
@@ -132,6 +133,11 @@ class Session:
         """A release was asked for, and the robot at the other end of the link has not said yet that it is ready."""
         return self._stopped and time.perf_counter() - self._released < _RELEASED
 
+    @property
+    def hasty(self) -> bool:
+        """The last release came so soon after a stop that it was ignored; True for some seconds, while it is stopped."""
+        return self._stopped and not self.releasing and time.perf_counter() - self._hasty < _SAID
+
     def touch(self) -> None:
         """Hands have moved something: answer at once."""
         if self._since is None:
@@ -149,25 +155,33 @@ class Session:
         self.touch()
 
     def stop(self) -> None:
-        """Everything stands still, at once; commands wait for `release`."""
+        """Everything stands still, at once; commands wait for `release`. While stopped it is a stop again, and ends a release under way."""
         self._halt(nobody=False)
 
     def _halt(self, *, nobody: bool) -> None:
         with self._gate:
-            self._stopped, self._released = True, -np.inf
+            self._stopped, self._released, self._halted = True, -np.inf, time.perf_counter()
         if self.far is not None:
             self.far.stop(nobody=nobody)
         self.pilot.hold()
         self.touch()
 
     def release(self) -> None:
-        """Take commands again, from where the robot stands. A linked robot may take a while until it is ready, or refuse."""
-        self.pilot.hold()
-        if self.far is None:
-            self._stopped = False
-        else:
-            self.far.link.release()
-            self._released = time.perf_counter()
+        """Take commands again, from where the robot stands. A linked robot may take a while until it is ready, or refuse. Ignored while
+        nothing is stopped or a release is under way, and, where the robot is real, within a second of the last stop.
+        """
+        with self._gate:  # a stop that is pressed meanwhile comes after it
+            now = time.perf_counter()
+            if not self._stopped or self.releasing:
+                return
+            self.pilot.hold()
+            if self.far is None:
+                self._stopped = False
+            elif self.far.link.real and now - self._halted < _HASTY:
+                self._hasty = now
+            else:
+                self.far.link.release()
+                self._released = now
         self.touch()
 
     def nobody(self) -> None:
@@ -211,7 +225,7 @@ class Session:
         """As the robot is at the other end of the link: it may have stopped by itself, or be ready again."""
         with self._gate:  # a stop that is pressed meanwhile must not be forgotten
             if far.stopped and not self._stopped:
-                self._stopped, self._released = True, -np.inf
+                self._stopped, self._released, self._halted = True, -np.inf, time.perf_counter()
             if self.releasing and not far.stopped and far.ready:
                 self._adopt()
                 self._stopped, self._problem = False, ""
@@ -367,9 +381,7 @@ class Session:
         recorder.add(measurement, tip_force=rotation.T @ hand.tip_force, payload=hand.payload, commanded_dl=change)
 
     def _show(self, since: float | None) -> None:
-        measured = None
-        if self.link is not None:
-            measured = self.link.read()
+        measured = None if self.link is None else self.link.read()
         problem = self._problem or (measured.problem if measured is not None else "")
         now = time.perf_counter()
         latency = float("nan") if since is None else now - since
