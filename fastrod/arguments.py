@@ -155,6 +155,8 @@ def check_drive(arguments: argparse.Namespace) -> None:
             raise UsageError(f"{flag} is not for {action}, but for {', '.join(actions)}; `fastrod drive --help` says how it is used.")
     if action in _MOVING and arguments.emulate == given("bus"):
         raise UsageError("give --bus INTERFACE:CHANNEL or --emulate, and not both; `fastrod drive --help` says how it is used.")
+    if given("bus") and ":" not in arguments.bus:
+        raise UsageError(f"--bus is {arguments.bus!r}; give INTERFACE:CHANNEL, such as socketcan:can0.")
     for name, emulated in (("camera", False), ("eds", False), ("seed", True), ("real_time", True)):
         if given(name) and arguments.emulate != emulated:
             where = "with --emulate only" if emulated else "for a real bench, not with --emulate"

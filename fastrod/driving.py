@@ -48,8 +48,6 @@ def _teleop(arguments: argparse.Namespace, _: Progress | None) -> int:
     def say(sentence: str) -> None:
         print(sentence, file=sys.stderr, flush=True)
 
-    if arguments.bus is not None and ":" not in arguments.bus:
-        raise InputError(f"--bus is {arguments.bus!r}; give INTERFACE:CHANNEL, such as socketcan:can0.")
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # homing, too, ends with the drives switched off
     hardware = _hardware(arguments)
     urgent(1)  # all threads of the page, too: one that waits for its turn holds up those of the drives

@@ -77,8 +77,6 @@ def real(
 
     Raises `DeviceError`, one sentence, for what is not there or does not answer.
     """
-    if ":" not in bus:
-        raise InputError(f"--bus is {bus!r}; give INTERFACE:CHANNEL, such as socketcan:can0.")
     source: FrameSource | None = None if camera is None else VideoCamera(hardware.camera, camera)
     try:
         with Prototype(hardware, bus, source, eds=eds, journal=Journal(journal)) as prototype:
