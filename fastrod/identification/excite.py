@@ -124,10 +124,9 @@ def excitation(
     loaded.append(np.zeros(rest, bool))
     own = np.array(robot.base_quaternion)
     down = matrix_from_quaternion(own).T @ np.array(robot.gravity)
+    # about the base's x, or y where x is the steeper: gravity must change
     quarter = np.zeros(4)
-    quarter[[0, 1 + int(abs(down[1]) < abs(down[0]))]] = np.sqrt(
-        0.5
-    )  # about the base's x, or y where x is the steeper: gravity must change
+    quarter[[0, 1 + int(abs(down[1]) < abs(down[0]))]] = np.sqrt(0.5)
     other_way = product(own, quarter) if turn else own
     log = RunLog(
         name=f"{robot.name}_excitation",
