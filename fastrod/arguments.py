@@ -134,6 +134,14 @@ def build() -> tuple[argparse.ArgumentParser, list[str]]:
     evaluate.add_argument("--out", type=Path, metavar="DIR", help="write evaluation.json and evaluation.png there")
     evaluate.add_argument("--json", action="store_true", help="print the figures to stdout and nothing else")
 
+    _add_generate(
+        commands.add_parser(
+            "generate", help="data sets in Parquet shards: shapes, rollouts, identification sweeps; here or on Ray",
+            description="Data sets of any size in Parquet shards, on the cores here or on a Ray cluster. A run that was killed is "
+            "finished by the same command; a larger --count lets a data set grow.",
+        )
+    )  # fmt: skip
+
     bench = commands.add_parser("bench", help="the figures of perf/ as ratios")
     bench.add_argument("name", nargs="?", metavar="NAME", help="one benchmark (default: all)")
     bench.add_argument("--json", action="store_true", help="print JSON to stdout and nothing else")
@@ -205,6 +213,51 @@ def _add_drive(drive: argparse.ArgumentParser) -> None:
     page = drive.add_argument_group("teleop")
     page.add_argument("--port", type=int, metavar="P", help="default: the first free one from 8080 on")
     page.add_argument("--no-open", action="store_true", help="do not open a browser")
+
+
+def _add_generate(generate: argparse.ArgumentParser) -> None:
+    kinds = generate.add_subparsers(dest="kind", required=True, metavar="WHAT", parser_class=_Parser)
+    shapes = kinds.add_parser("shapes", help="a robot at rest under random commands and tip forces")
+    rollouts = kinds.add_parser("rollouts", help="episodes of an environment, or a robot's own motion with effects drawn anew")
+    sweep = kinds.add_parser("sweep", help="robots with a sealed effect, their logs simulated and identified")
+    for kind, unit in ((shapes, "rows"), (rollouts, "episodes"), (sweep, "rows")):
+        kind.add_argument("--count", type=int, required=True, metavar="N", help=f"{unit} in all")
+        kind.add_argument(
+            "--out", type=Path, required=True, metavar="DIR", help="folder of plan.json and shards; with what is there it goes on"
+        )
+        kind.add_argument("--robot", required=kind is not rollouts, metavar="R", help="a shipped robot's name or a path to a .toml")
+        where = kind.add_argument_group("where it runs")
+        where.add_argument("--workers", type=int, metavar="N", help="processes, or tasks under way on Ray (default: one for each core)")
+        where.add_argument(
+            "--ray",
+            metavar="ADDRESS",
+            help="as tasks of this Ray cluster; `auto` for the one here, `local` to start one (needs fastrod[ray])",
+        )
+        where.add_argument("--shard-rows", type=int, metavar="N", help=f"{unit} of a file and task (default: some seconds of work)")
+        where.add_argument("--json", action="store_true", help="print the summary to stdout and nothing else")
+        kind.add_argument("--seed", type=int, default=0, metavar="S", help="of all that is drawn (default: 0)")
+    shapes.add_argument("--bend", type=float, metavar="RAD", help="largest bend of a segment, drawn evenly from a disc (default: 1)")
+    shapes.add_argument("--force", type=float, metavar="N", help="radius of the ball of tip forces (default: 2 EI/l^2 of the robot)")
+    shapes.add_argument("--line-density", type=float, metavar="KG/M", help="mass per length, for the self-weight (default: the robot's)")
+    shapes.add_argument("--tolerance", type=float, metavar="M", help="largest boundary residual (default: 1e-6)")
+    shapes.add_argument("--points", type=int, metavar="K", help="backbone positions in a row besides the tip (default: none)")
+    shapes.add_argument("--points-per-segment", type=int, metavar="N", help="integration steps of a segment (default: 6)")
+    shapes.add_argument(
+        "--chain", type=int, metavar="N", help="neighbouring rows that are solved one from the other; 1: none (default: 64)"
+    )
+    rollouts.add_argument("--env", metavar="ENV", help="a task, such as Reach; not with --robot")
+    rollouts.add_argument("--policy", metavar="P", help="who acts: shipped, baseline or random (default: random)")
+    _add_options(rollouts)
+    rollouts.add_argument("--steps", type=int, metavar="N", help="robot: of an episode (default: 200)")
+    rollouts.add_argument("--dt", type=float, metavar="S", help="robot: time step (default: 0.02)")
+    rollouts.add_argument("--bend", type=float, metavar="RAD", help="robot: largest bend of a segment (default: 0.9)")
+    rollouts.add_argument("--speed", type=float, metavar="RAD/S", help="robot: largest rate of a bend (default: 1)")
+    rollouts.add_argument("--force", type=float, metavar="N", help="robot: radius of the ball of tip forces (default: 0)")
+    sweep.add_argument("--noise", type=float, metavar="M", help="of each coordinate of the measured tip (default: 0.0003)")
+    sweep.add_argument("--rate", type=float, metavar="HZ", help="samples a second (default: 15)")
+    sweep.add_argument("--bend", type=float, metavar="RAD", help="largest bend of a segment (default: 0.9)")
+    rollouts.add_argument("--effect", nargs="+", action="extend", default=[], metavar="NAME", help="robot: drawn for each episode")
+    sweep.add_argument("--effect", nargs="+", action="extend", default=[], metavar="NAME", help="sealed in turn (default: backlash)")
 
 
 def _grid(word: str) -> tuple[int, int]:

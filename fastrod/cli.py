@@ -252,6 +252,25 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     return DONE
 
 
+def _generate(arguments: argparse.Namespace) -> int:
+    _need("pyarrow", "generate", "parquet")
+    if arguments.ray is not None:
+        _need("ray", "generate --ray", "ray")
+    if arguments.kind == "rollouts" and arguments.env is not None:
+        _need("gymnasium", "generate rollouts --env", "envs")
+    from rich.console import Console
+
+    from fastrod.generation import command
+
+    with _progress() as bar:
+        summary = command.run(arguments, _pairs(getattr(arguments, "option", ()), "--option"), bar)
+    if arguments.json:
+        print(json.dumps(command.figures(summary), indent=1))
+        return DONE
+    Console().print(command.table(summary))
+    return DONE
+
+
 def _pairs(given: Sequence[str], flag: str) -> dict[str, object]:
     """NAME=VALUE as names and numbers, lists, true, false, none, or words."""
     told: dict[str, object] = {}
@@ -311,7 +330,7 @@ def _script(path: Path, argv: list[str]) -> int:
 
 _RUN: dict[str, Callable[[argparse.Namespace], int]] = {
     "demo": _demo, "replay": _replay, "identify": _identify, "excite": _excite, "view": _view, "drive": _drive, "envs": _envs,
-    "train": _train, "evaluate": _evaluate, "bench": _bench,
+    "train": _train, "evaluate": _evaluate, "generate": _generate, "bench": _bench,
 }  # fmt: skip
 """What each command does."""
 

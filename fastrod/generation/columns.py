@@ -1,0 +1,67 @@
+"""Columns of a shard: values, with their unit and meaning."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fastrod.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Column:
+    """One column of a shard."""
+
+    name: str
+    values: NDArray[Any] | Sequence[str]
+    """(n_rows,)."""
+    unit: str
+    """SI; empty for what has none."""
+    about: str
+    """What it is, in a few words."""
+
+
+class Work(Protocol):
+    """What a shard holds, and how it is made. A frozen dataclass of plain numbers and words, so that it can be written and compared."""
+
+    @property
+    def index(self) -> str:
+        """The column that counts from 0 over the whole data set: `row`, or `episode` where one has several rows."""
+        ...
+
+    @property
+    def usual(self) -> int:
+        """Rows (or episodes) of a shard by default: some seconds of work."""
+        ...
+
+    def make(self, first: int, count: int, seed: Sequence[int]) -> list[Column]:
+        """The columns of the `count` rows (or episodes) from `first` on. `seed` is the shard's own; the same call makes the same bits."""
+        ...
+
+    def failed(self, columns: Sequence[Column]) -> int:
+        """How many rows (or episodes) did not succeed; they are kept, and marked."""
+        ...
+
+
+def several(names: Sequence[str], values: NDArray[Any], unit: str, about: str) -> list[Column]:
+    """A column for each of the last axis of `values` (n_rows, len(names))."""
+    return [Column(name, np.ascontiguousarray(values[:, k]), unit, about) for k, name in enumerate(names)]
+
+
+def numbered(prefix: str, values: NDArray[Any], unit: str, about: str) -> list[Column]:
+    """The same, named prefix_1, prefix_2, ..."""
+    return several([f"{prefix}_{k}" for k in range(1, values.shape[1] + 1)], values, unit, about)
+
+
+def within(name: str, value: object, low: float, high: float, unit: str = "", *, whole: bool = False, open_low: bool = False) -> None:
+    """Raises `InputError` where `value` is no number from `low` to `high`; `open_low`: `low` itself is out."""
+    kinds = (int, np.integer) if whole else (int, float, np.integer, np.floating)
+    good = isinstance(value, kinds) and not isinstance(value, bool)
+    if not good or not (low < value if open_low else low <= value) or not value <= high:  # type: ignore[operator]
+        what = "a whole number" if whole else "a number"
+        ends = f"{'above' if open_low else 'at least'} {low:g}" + ("" if high == float("inf") else f" and at most {high:g}")
+        raise InputError(f"{name} is {value!r}{' ' + unit if unit else ''}; it must be {what} {ends}.")

@@ -1,0 +1,54 @@
+"""What a data set draws of its robots: parameters of effects, of the size that is seen on real robots."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from fastrod.chain import named_effects
+from fastrod.effect import canonical_name, effect_names, get_effect
+from fastrod.robot import Robot
+from fastrod.types import Floats
+from fastrod.wiring import wire
+
+_SPREAD = (0.5, 1.5)
+"""Of the typical size."""
+
+
+def named(effects: Sequence[str]) -> tuple[str, ...]:
+    """Their canonical names, in the order in which they act. Raises `UnknownNameError` with the nearest."""
+    given = {canonical_name(effect) for effect in effects}
+    return tuple(name for name in effect_names() if name in given)
+
+
+def with_effects(robot: Robot, effects: Sequence[str], rng: np.random.Generator) -> tuple[Robot, dict[str, float]]:
+    """The robot with these effects, and their values by `effect.parameter` (with _1, _2 ... where there is one per segment or drive).
+
+    Every number is drawn evenly from half to one and a half of its typical size, with either sign where both can be, within its bounds.
+    """
+    wiring = wire(robot)
+    tables: dict[str, dict[str, Any]] = {name: dict(table) for name, table in named_effects(robot).items()}
+    told: dict[str, float] = {}
+    for effect in effects:
+        table: dict[str, Any] = {}
+        for parameter in (p.on(wiring) for p in get_effect(effect).parameters):
+            count = wiring.count(parameter.per)
+            size = parameter.scale * rng.uniform(*_SPREAD, count)
+            if parameter.bounds[0] < 0.0 and not parameter.shape:
+                size *= rng.choice((-1.0, 1.0), count)
+            centre = 0.0 if parameter.shape else parameter.neutral
+            values = np.clip(centre + size, *parameter.bounds)
+            table[parameter.name] = float(values[0]) if count == 1 else values.tolist()
+            names = [parameter.name] if count == 1 else [f"{parameter.name}_{k}" for k in range(1, count + 1)]
+            told |= {f"{effect}.{name}": float(value) for name, value in zip(names, values, strict=True)}
+        tables[effect] = table
+    return replace(robot, effects=tuple({"name": name, **table} for name, table in tables.items())), told
+
+
+def in_ball(rng: np.random.Generator, n: int, dimension: int) -> Floats:
+    """(n, dimension) even in the unit ball."""
+    v = rng.normal(size=(n, dimension + 2))
+    return np.asarray((v / np.linalg.norm(v, axis=1, keepdims=True))[:, :dimension])

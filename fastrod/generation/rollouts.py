@@ -1,0 +1,111 @@
+"""Rollouts of an environment: what a policy, the scripted baseline or chance does in it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+
+from fastrod.errors import InputError, nearest
+from fastrod.generation.columns import Column, numbered
+
+POLICIES = ("shipped", "baseline", "random")
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class Rollouts:
+    """Episodes of an environment, each from a seed of its own, which `gymnasium.make(...).reset(seed=...)` takes as well."""
+
+    env: str
+    """A task's name or id."""
+    policy: str = "random"
+    """Who acts: one of `POLICIES`."""
+    options: tuple[tuple[str, Any], ...] = ()
+    """Of the environment, name and value."""
+
+    def __post_init__(self) -> None:
+        from fastrod_envs.policies import find
+        from fastrod_envs.registration import name_of, task_class
+
+        object.__setattr__(self, "env", name_of(self.env))
+        object.__setattr__(self, "options", tuple((str(name), value) for name, value in self.options))
+        if self.policy not in POLICIES:
+            raise InputError(f"no policy {self.policy!r} to roll out; {nearest(self.policy, POLICIES)}")
+        if self.policy == "shipped":
+            find(self.env, self.policy)
+        task_class(self.env).options_class.read(dict(self.options))
+
+    @property
+    def index(self) -> str:
+        """Episodes are counted."""
+        return "episode"
+
+    @property
+    def usual(self) -> int:
+        """Episodes of a shard."""
+        from fastrod_envs.registration import task_class
+
+        return 8 if task_class(self.env).hosted else 256
+
+    def make(self, first: int, count: int, seed: Sequence[int]) -> list[Column]:
+        """Every episode with one row more than steps: the last holds the final observation, and no action."""
+        from fastrod_envs.policies import Policy, find
+        from fastrod_envs.vector import BatchEnv
+
+        rng = np.random.default_rng(seed)
+        seeds = [int(np.random.SeedSequence((seed[0], first + i)).generate_state(1)[0]) for i in range(count)]
+        policy = Policy(find(self.env, self.policy)) if self.policy == "shipped" else None
+        options = {**({} if policy is None else policy.options), "threads": 1, **dict(self.options)}
+        env = BatchEnv(self.env, num_envs=count, **options)
+        try:
+            if policy is not None:
+                policy.check(env)
+            return self._run(env, policy, first, seeds, rng)
+        finally:
+            env.close()
+
+    def _run(self, env: Any, policy: Any, first: int, seeds: Sequence[int], rng: np.random.Generator) -> list[Column]:
+        n, n_steps, n_actions = env.num_envs, env.n_steps, env.task.n_actions
+        seen = np.full((n, n_steps + 1, env.single_observation_space.shape[0]), np.nan, np.float32)
+        done = np.full((n, n_steps + 1, n_actions), np.nan, np.float32)
+        reward, distance = np.full((n, n_steps + 1), np.nan), np.full((n, n_steps + 1), np.nan)
+        flags = {name: np.zeros((n, n_steps + 1), bool) for name in ("terminated", "truncated", "success", "lost")}
+        length = np.zeros(n, np.int64)
+        observation, _ = env.reset(seed=list(seeds))
+        open_ = np.ones(n, bool)
+        for step in range(n_steps):
+            drawn = rng.uniform(-1.0, 1.0, (n, n_actions))
+            act = policy.act(observation) if policy is not None else env.baseline() if self.policy == "baseline" else drawn
+            act = np.clip(np.asarray(act, np.float32), -1.0, 1.0)
+            seen[open_, step], done[open_, step] = observation[open_], act[open_]
+            observation, gained, terminated, truncated, told = env.step(act)
+            reward[open_, step], distance[open_, step] = gained[open_], told["distance"][open_]
+            for name, values in {**told, "terminated": terminated, "truncated": truncated}.items():
+                if name in flags:
+                    flags[name][open_, step] = values[open_]
+            ended = np.flatnonzero((terminated | truncated) & open_)
+            for i in ended:
+                seen[i, step + 1], length[i] = told["final_obs"][i], step + 1
+            open_[ended] = False
+            if not open_.any():
+                break
+        used = np.arange(n_steps + 1) <= length[:, None]
+        episode, place = np.nonzero(used)
+        columns = [
+            Column("episode", episode + first, "", "counts over the whole data set"),
+            Column("step", place, "", "of the episode; the last has the final observation and no action"),
+            Column("seed", np.asarray(seeds, np.int64)[episode], "", "of the episode, for reset(seed=...)"),
+        ]
+        columns += numbered("obs", seen[used], "", "observation before the step, as the environment scales it")
+        columns += numbered("action", done[used], "", "from -1 to 1; nan in the last row")
+        columns.append(Column("reward", reward[used], "", "of the step; nan in the last row"))
+        columns.append(Column("distance", distance[used], "m", "from the goal, after the step; nan in the last row"))
+        columns += [Column(name, values[used], "", "after the step") for name, values in flags.items()]
+        return columns
+
+    def failed(self, columns: Sequence[Column]) -> int:
+        """Episodes whose robot was lost."""
+        return sum(int(np.asarray(column.values).sum()) for column in columns if column.name == "lost")

@@ -1,0 +1,127 @@
+"""`generate`: a plan into a folder of shards; begins, goes on, or finds everything there."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import final
+
+from fastrod.errors import InputError
+from fastrod.generation.columns import within
+from fastrod.generation.here import run_here
+from fastrod.generation.on_ray import run_on_ray
+from fastrod.generation.plan import Plan, settle_plan
+from fastrod.generation.shards import counted, found, sweep_parts
+from fastrod.generation.tasks import missing
+
+_LOCK = ".lock"
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class Summary:
+    """What a folder holds now, and what this run had to do with it."""
+
+    folder: str
+    kind: str
+    count: int
+    """Rows or episodes of the plan; each occurs exactly once."""
+    rows: int
+    """Lines of all shards together."""
+    failed: int
+    """Rows or episodes that did not succeed; they are there, and marked."""
+    shards: int
+    made: int
+    """Of these, by this run."""
+    made_count: int
+    """Rows or episodes of those."""
+    seconds: float
+    """Of this run, start and check included."""
+    bytes: int
+
+    @property
+    def rate(self) -> float:
+        """Rows or episodes a second that this run made; 0 where it made none."""
+        return self.made_count / self.seconds if self.made else 0.0
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+
+
+def generate(
+    plan: Plan,
+    folder: str | Path,
+    *,
+    workers: int | None = None,
+    ray: str | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Summary:
+    """Make all shards of `plan` that are not in `folder` yet, and check that every row is there once.
+
+    `workers` processes here, one for each core by default; with `ray` the tasks of a cluster (`run_on_ray`), by default as many as it
+    has cores for. A run that was killed, whole or in part, is finished by the same call: a shard is there whole or not at all, and is
+    the same whoever makes it. Call it below `if __name__ == "__main__":`, as with every program that starts processes.
+
+    Raises `InputError` where the folder holds another plan, where another run writes into it, or cannot be written; `HostError` where
+    workers or cluster are lost; `OSError` where the disk is full.
+    """
+    start = time.perf_counter()
+    if workers is not None:
+        within("workers", workers, 1, 4096, whole=True)
+    for module, extra in (("pyarrow", "parquet"), *((("ray", "ray"),) if ray is not None else ())):
+        if find_spec(module) is None:
+            raise InputError(f"fastrod generate needs {module}: pip install fastrod[{extra}].")
+    folder = Path(folder).absolute()
+    with _own(folder):
+        settle_plan(plan, folder)
+        sweep_parts(folder)
+        whole = found(plan, folder)
+        todo = missing(plan, whole)
+        done, made = sum(shard.units for shard in whole.values()), 0
+        if progress is not None:
+            progress(plan.kind, done, plan.count)
+        if todo:
+            run = run_here(plan, folder, todo, workers or cores()) if ray is None else run_on_ray(plan, folder, todo, ray, workers)
+            try:
+                for shard in run:
+                    whole[shard.number] = shard
+                    made += shard.units
+                    if progress is not None:
+                        progress(plan.kind, done + made, plan.count)
+            finally:
+                run.close()
+                sweep_parts(folder)
+        rows = counted(plan, folder)
+        return Summary(
+            folder=str(folder), kind=plan.kind, count=plan.count, rows=rows, failed=sum(shard.failed for shard in whole.values()),
+            shards=plan.n_shards, made=len(todo), made_count=made, seconds=time.perf_counter() - start,
+            bytes=sum(path.stat().st_size for path in folder.iterdir() if path.suffix == ".parquet"),
+        )  # fmt: skip
+
+
+@contextmanager
+def _own(folder: Path) -> Iterator[None]:
+    """The folder, made where it is not there, for this process alone. Raises `InputError`."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = (folder / _LOCK).open("w")
+    except OSError as error:
+        why = "it is a file" if folder.is_file() else error.strerror or str(error)
+        raise InputError(f"folder {str(folder)!r} cannot be written: {why}.") from error
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InputError(f"another fastrod generate writes into {str(folder)!r}; wait for it, or give --out another folder.") from error
+        except OSError:
+            pass  # a file system without locks
+        yield

@@ -1,0 +1,25 @@
+"""One task: a shard, made by a pure function of plan and index, and written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fastrod.generation.columns import Column
+from fastrod.generation.plan import Plan
+from fastrod.generation.shards import Shard, write
+
+
+def columns_of(plan: Plan, index: int) -> list[Column]:
+    """The columns of a shard: the same whoever makes it, and however often."""
+    rows = plan.rows(index)
+    return plan.work.make(rows.start, len(rows), (plan.seed, index))
+
+
+def make_shard(plan: Plan, folder: str, index: int) -> Shard:
+    """Make a shard and write it; only what it is called and how much it holds goes back."""
+    return write(plan, Path(folder), index, columns_of(plan, index))
+
+
+def missing(plan: Plan, whole: dict[int, Shard]) -> list[int]:
+    """Indices of the shards that are not there yet."""
+    return [index for index in range(plan.n_shards) if index not in whole]
