@@ -61,7 +61,7 @@ def within(name: str, value: object, low: float, high: float, unit: str = "", *,
     """Raises `InputError` where `value` is no number from `low` to `high`; `open_low`: `low` itself is out."""
     kinds = (int, np.integer) if whole else (int, float, np.integer, np.floating)
     good = isinstance(value, kinds) and not isinstance(value, bool)
-    if not good or not (low < value if open_low else low <= value) or not value <= high:  # type: ignore[operator]
+    if not good or not (low < value if open_low else low <= value) or not value <= high or value == np.inf:  # type: ignore[operator]
         what = "a whole number" if whole else "a number"
-        ends = f"{'above' if open_low else 'at least'} {low:g}" + ("" if high == float("inf") else f" and at most {high:g}")
+        ends = f"{'above' if open_low else 'at least'} {low:g}" + (" and finite" if high == np.inf else f" and at most {high:g}")
         raise InputError(f"{name} is {value!r}{' ' + unit if unit else ''}; it must be {what} {ends}.")

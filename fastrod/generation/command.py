@@ -49,7 +49,9 @@ def table(summary: Summary) -> Table:
     grid.add_row("without success", f"{summary.failed:,}, kept and marked")
     made = f"{summary.made:,} made now" if summary.made < summary.shards else "all made now"
     grid.add_row("shards", f"{summary.shards:,}, {made if summary.made else 'all were there'}; {summary.bytes / 1e6:,.1f} MB")
-    grid.add_row("seconds", f"{summary.seconds:.1f}" + (f"; {summary.rate:,.0f} {unit}/s" if summary.made else ""))
+    grid.add_row(
+        "seconds", f"{summary.seconds:.1f}" + (f"; {summary.rate:,.{0 if summary.rate >= 10.0 else 2}f} {unit}/s" if summary.made else "")
+    )
     return grid
 
 

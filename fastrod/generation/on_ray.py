@@ -91,7 +91,7 @@ def _probe(ray: Any, folder: Path) -> None:
     asked = {}
     for node in ray.nodes():
         if node["Alive"] and node["Resources"].get("CPU"):
-            path = folder / f"probe-{uuid.uuid4().hex[:12]}.part"
+            path = folder / f".probe-{uuid.uuid4().hex[:12]}.part"
             where = NodeAffinitySchedulingStrategy(node_id=node["NodeID"], soft=False)
             asked[node["NodeName"]] = path, ray.remote(num_cpus=0, scheduling_strategy=where)(_touch).remote(str(path))
     for name, (path, reference) in asked.items():

@@ -18,6 +18,8 @@ from fastrod.generation.sweep import Sweep
 from fastrod.generation.trajectories import Trajectories
 
 PLAN = "plan.json"
+SHARDS = "shards"
+"""The folder beside it that holds nothing but shards, so that readers of Parquet take it whole."""
 Kind: TypeAlias = Shapes | Rollouts | Trajectories | Sweep
 KINDS: dict[str, type[Kind]] = {"shapes": Shapes, "rollouts": Rollouts, "trajectories": Trajectories, "sweep": Sweep}
 
@@ -94,7 +96,7 @@ def settle_plan(plan: Plan, folder: Path) -> None:
     """
     before = read_plan(folder)
     if before is None:
-        if any(path.suffix == ".parquet" for path in folder.iterdir()):
+        if any(path.suffix == ".parquet" for path in (*folder.glob("*"), *folder.glob(f"{SHARDS}/*"))):
             raise InputError(f"folder {str(folder)!r} holds Parquet files and no {PLAN}; give --out a folder of its own.")
     elif before.hash != plan.hash or before.count > plan.count:
         raise InputError(f"folder {str(folder)!r} holds another plan: {_difference(before, plan)}; give --out another folder.")

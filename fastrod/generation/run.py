@@ -17,7 +17,7 @@ from fastrod.errors import InputError
 from fastrod.generation.columns import within
 from fastrod.generation.here import run_here
 from fastrod.generation.on_ray import run_on_ray
-from fastrod.generation.plan import Plan, settle_plan
+from fastrod.generation.plan import SHARDS, Plan, settle_plan
 from fastrod.generation.shards import counted, found, sweep_parts
 from fastrod.generation.tasks import missing
 
@@ -83,14 +83,16 @@ def generate(
     folder = Path(folder).absolute()
     with _own(folder):
         settle_plan(plan, folder)
-        sweep_parts(folder)
-        whole = found(plan, folder)
+        files = folder / SHARDS
+        files.mkdir(exist_ok=True)
+        sweep_parts(files)
+        whole = found(plan, files)
         todo = missing(plan, whole)
         done, made = sum(shard.units for shard in whole.values()), 0
         if progress is not None:
             progress(plan.kind, done, plan.count)
         if todo:
-            run = run_here(plan, folder, todo, workers or cores()) if ray is None else run_on_ray(plan, folder, todo, ray, workers)
+            run = run_here(plan, files, todo, workers or cores()) if ray is None else run_on_ray(plan, files, todo, ray, workers)
             try:
                 for shard in run:
                     whole[shard.number] = shard
@@ -99,12 +101,12 @@ def generate(
                         progress(plan.kind, done + made, plan.count)
             finally:
                 run.close()
-                sweep_parts(folder)
-        rows = counted(plan, folder)
+                sweep_parts(files)
+        rows = counted(plan, files)
         return Summary(
             folder=str(folder), kind=plan.kind, count=plan.count, rows=rows, failed=sum(shard.failed for shard in whole.values()),
             shards=plan.n_shards, made=len(todo), made_count=made, seconds=time.perf_counter() - start,
-            bytes=sum(path.stat().st_size for path in folder.iterdir() if path.suffix == ".parquet"),
+            bytes=sum(path.stat().st_size for path in files.iterdir() if path.suffix == ".parquet"),
         )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import re
 import uuid
@@ -53,13 +54,15 @@ def write(plan: Plan, folder: Path, index: int, columns: Sequence[Column]) -> Sh
     about = {_HASH: plan.hash, _INDEX: str(index), _FAILED: str(made.failed), _UNITS: str(made.units)}
     table = arrow.Table.from_arrays(arrays, schema=arrow.schema(kinds, metadata=about))
     path = path_of(plan, folder, index)
-    part = path.with_name(f"{path.stem}.{uuid.uuid4().hex[:12]}.part")
+    part = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:12]}.part")
     try:
         with part.open("wb") as file:
             parquet.write_table(table, file, compression="zstd", compression_level=_LEVEL, use_dictionary=False)
             file.flush()
             os.fsync(file.fileno())
         os.replace(part, path)  # noqa: PTH105
+    except OSError as error:
+        raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(path)) from error
     finally:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)

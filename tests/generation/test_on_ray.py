@@ -1,0 +1,114 @@
+"""The same data set as Ray tasks, on a cluster of this machine's own."""
+
+from __future__ import annotations
+
+import signal
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+from generation_folders import bits, rows_of, small
+
+from fastrod.errors import HostError, InputError
+from fastrod.generation import generate
+
+ray = pytest.importorskip("ray", reason="needs fastrod[ray]")
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:Tip. In future versions of Ray:FutureWarning"),
+    pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning"),
+    pytest.mark.filterwarnings("ignore:subprocess .* is still running:ResourceWarning"),
+]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _cluster() -> Iterator[None]:
+    """One for the module: its start is most of the time."""
+    import warnings
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="error")
+    yield
+    ray.shutdown()
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small plan, made here by one process."""
+    folder = tmp_path_factory.mktemp("whole")
+    generate(small(), folder, workers=1)
+    return folder
+
+
+def test_a_killed_ray_worker_loses_and_doubles_nothing(whole: Path, tmp_path: Path) -> None:
+    killed: list[int] = []
+
+    def kill_one(_: str, done: int, __: int) -> None:
+        if done >= 100 and not killed:
+            at_work = [p for p in psutil.process_iter(["cmdline"]) if any("ray::_make" in word for word in p.info["cmdline"] or ())]
+            for process in at_work[:1]:
+                process.send_signal(signal.SIGKILL)
+                killed.append(process.pid)
+
+    summary = generate(small(), tmp_path, ray="auto", progress=kill_one)
+    assert killed
+    assert (summary.rows, summary.made) == (600, 12)
+    assert rows_of(tmp_path) == list(range(600))
+    assert bits(tmp_path) == bits(whole)
+    assert ray.is_initialized()
+
+
+def test_ray_goes_on_with_what_processes_began(whole: Path, tmp_path: Path) -> None:
+    generate(small(count=200), tmp_path, workers=1)
+    summary = generate(small(), tmp_path, ray="auto", workers=1)
+    assert (summary.made, summary.rows) == (8, 600)
+    assert bits(tmp_path) == bits(whole)
+
+
+def test_an_error_on_a_worker_is_the_drivers(tmp_path: Path) -> None:
+    def gone(_: str, done: int, __: int) -> None:
+        if done == 50:
+            (tmp_path / "shards").rename(tmp_path / "away")
+
+    with pytest.raises(OSError, match="No such file or directory"):
+        generate(small(), tmp_path, ray="auto", workers=1, progress=gone)
+    assert not list(tmp_path.glob("*/.*.part"))
+
+
+def test_a_machine_that_does_not_see_the_folder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from fastrod.generation import on_ray
+
+    elsewhere = str(tmp_path / "elsewhere")
+
+    def touch(path: str) -> str:
+        return "" if elsewhere else path
+
+    monkeypatch.setattr(on_ray, "_touch", touch)
+    with pytest.raises(InputError, match=r"machine .* does not see folder .*shards'; give --out a folder that all machines share\."):
+        generate(small(), tmp_path, ray="auto")
+    assert bits(tmp_path) == {}
+
+
+def test_a_folder_that_a_machine_cannot_write_is_named(tmp_path: Path) -> None:
+    from fastrod.generation.on_ray import _touch
+
+    assert _touch(str(tmp_path / "probe")) == ""
+    assert _touch(str(tmp_path / "missing" / "probe")) == "No such file or directory"
+    assert stat.S_ISREG((tmp_path / "probe").stat().st_mode)
+
+
+def test_a_cluster_that_does_not_answer_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(**_: object) -> None:
+        raise ConnectionError("Could not find any running Ray instance.\nPlease specify the one to connect to.")
+
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    monkeypatch.setattr(ray, "init", refuse)
+    with pytest.raises(HostError) as error:
+        generate(small(), tmp_path, ray="10.0.0.1:6379")
+    assert str(error.value) == (
+        "no Ray cluster answers at '10.0.0.1:6379': Please specify the one to connect to. "
+        "Start one with `ray start --head`, or give --ray local."
+    )
+    assert bits(tmp_path) == {}

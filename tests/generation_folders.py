@@ -1,0 +1,28 @@
+"""What the tests of data sets share: a small plan, and the bits of a folder."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as parquet
+
+import fastrod
+from fastrod.generation import Plan, Shapes
+from fastrod.robotfile import dumps
+
+
+def small(count: int = 600, shard_rows: int = 50, seed: int = 3, **words: Any) -> Plan:
+    """Shapes of the prototype in tiny shards."""
+    return Plan(work=Shapes(robot=dumps(fastrod.load_robot("prototype")), **words), count=count, shard_rows=shard_rows, seed=seed)
+
+
+def bits(folder: Path) -> dict[str, str]:
+    """Digest of each file in the folder of shards, hidden ones too."""
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted((folder / "shards").iterdir())}
+
+
+def rows_of(folder: Path, column: str = "row") -> list[int]:
+    """The values of a column over all shards, sorted."""
+    return sorted(parquet.read_table(folder / "shards", columns=[column]).column(column).to_pylist())
