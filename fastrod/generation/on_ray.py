@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import socket
 import uuid
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
@@ -15,6 +17,8 @@ from fastrod.generation.shards import Shard
 
 _RETRIES = 20  # of a task whose worker or machine is lost
 _AHEAD = 2  # tasks for every core of the cluster
+_ANSWER = 5.0  # s for the head to take a connection
+_NO_CLUSTER = "no Ray cluster answers at {!r}: {} Start one with `ray start --head`, or give --ray local."
 _PATIENCE = 120.0  # s until every machine has shown that it sees the folder
 
 
@@ -69,6 +73,11 @@ def _cluster(address: str, workers: int | None) -> Iterator[Any]:
     if ray.is_initialized():
         yield ray
         return
+    if match := re.fullmatch(r"(\S+):(\d{1,5})", address):  # Ray itself would try for two minutes
+        try:
+            socket.create_connection((match[1], int(match[2])), timeout=_ANSWER).close()
+        except (OSError, OverflowError) as error:
+            raise HostError(_NO_CLUSTER.format(address, _one_line(error))) from error
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
     try:
         if address == "local":
@@ -76,8 +85,7 @@ def _cluster(address: str, workers: int | None) -> Iterator[Any]:
         else:
             ray.init(address=address, **quiet)
     except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
-        why = _one_line(error)
-        raise HostError(f"no Ray cluster answers at {address!r}: {why} Start one with `ray start --head`, or give --ray local.") from error
+        raise HostError(_NO_CLUSTER.format(address, _one_line(error))) from error
     try:
         yield ray
     finally:

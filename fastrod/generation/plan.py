@@ -92,13 +92,13 @@ def read_plan(folder: str | Path) -> Plan | None:
 def settle_plan(plan: Plan, folder: Path) -> None:
     """Write the plan into the folder, or find it there; a larger count lets the data set grow.
 
-    Raises `InputError` where the folder holds another plan, or files and none.
+    Raises `InputError` where the folder holds shards of another plan, or of none.
     """
-    before = read_plan(folder)
+    before, any_there = read_plan(folder), any((*folder.glob("*.parquet"), *folder.glob(f"{SHARDS}/*.parquet")))
     if before is None:
-        if any(path.suffix == ".parquet" for path in (*folder.glob("*"), *folder.glob(f"{SHARDS}/*"))):
+        if any_there:
             raise InputError(f"folder {str(folder)!r} holds Parquet files and no {PLAN}; give --out a folder of its own.")
-    elif before.hash != plan.hash or before.count > plan.count:
+    elif any_there and (before.hash != plan.hash or before.count > plan.count):
         raise InputError(f"folder {str(folder)!r} holds another plan: {_difference(before, plan)}; give --out another folder.")
     if before != plan:
         part = folder / f"{PLAN}.{os.getpid()}.part"

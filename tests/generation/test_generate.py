@@ -139,6 +139,13 @@ def test_a_folder_of_another_plan_is_refused(whole: Path, plan: Callable[[], Pla
     assert bits(whole) == before
 
 
+def test_a_plan_without_shards_gives_way(tmp_path: Path) -> None:
+    generate(small(count=50), tmp_path, workers=1)
+    (tmp_path / "shards" / "shapes-000000.parquet").unlink()
+    assert generate(small(count=40, seed=8), tmp_path, workers=1).rows == 40
+    assert read_plan(tmp_path) == small(count=40, seed=8)
+
+
 def test_strange_files_are_refused(whole: Path, tmp_path: Path) -> None:
     def refused(name: str) -> str:
         with pytest.raises(InputError) as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import socket
 import stat
 from collections.abc import Iterator
 from pathlib import Path
@@ -106,9 +107,13 @@ def test_a_cluster_that_does_not_answer_is_one_sentence(tmp_path: Path, monkeypa
     monkeypatch.setattr(ray, "is_initialized", lambda: False)
     monkeypatch.setattr(ray, "init", refuse)
     with pytest.raises(HostError) as error:
-        generate(small(), tmp_path, ray="10.0.0.1:6379")
+        generate(small(), tmp_path, ray="auto")
     assert str(error.value) == (
-        "no Ray cluster answers at '10.0.0.1:6379': Please specify the one to connect to. "
-        "Start one with `ray start --head`, or give --ray local."
+        "no Ray cluster answers at 'auto': Please specify the one to connect to. Start one with `ray start --head`, or give --ray local."
     )
     assert bits(tmp_path) == {}
+    with socket.socket() as taken:  # bound, and nobody listens
+        taken.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(HostError, match=rf"no Ray cluster answers at '{address}': .*refused\. Start one"):
+            generate(small(), tmp_path, ray=address)

@@ -117,7 +117,7 @@ def test_neighbours_are_near_and_chains_are_told() -> None:
     draw = Draw(work, robot, 50, np.random.default_rng(2))
     one, other = (wire(robot).bend(draw.at(step).dl) for step in (7, 8))
     assert np.linalg.norm(one - other, axis=-1).max() <= 2.0 * np.sin(0.5 * STRIDE) + 1e-12
-    assert LONGEST_CHAIN * STRIDE < 2.0 * np.pi
+    assert 2.0 * np.pi > LONGEST_CHAIN * STRIDE
     chains = [made(robot, 128, shard)["chain"] for shard in (0, 1)]
     assert all(np.unique(chain, return_counts=True)[1].tolist() == [64, 64] for chain in chains)
     assert not set(chains[0]) & set(chains[1])

@@ -1,0 +1,171 @@
+"""Rollouts, trajectories and sweeps: rows that anybody can make again from what they say."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fastrod
+from fastrod import cli
+from fastrod.effect import get_effect
+from fastrod.errors import InputError, UnknownNameError
+from fastrod.generation import Plan, Rollouts, Sweep, Trajectories
+from fastrod.generation.draws import in_ball, with_effects
+from fastrod.generation.plan import Kind
+from fastrod.generation.tasks import columns_of
+from fastrod.robotfile import dumps
+from fastrod.wiring import wire
+from fastrod_envs.vector import BatchEnv
+
+
+def made(work: Kind, count: int) -> dict[str, np.ndarray]:
+    return {column.name: np.asarray(column.values) for column in columns_of(Plan(work=work, count=count), 0)}
+
+
+def group(table: dict[str, np.ndarray], prefix: str) -> np.ndarray:
+    names = [name for name in table if name.startswith(f"{prefix}_") and name.removeprefix(f"{prefix}_").isdigit()]
+    return np.stack([table[name] for name in names], axis=1)
+
+
+@pytest.mark.parametrize("policy", ["random", "baseline", "shipped"])
+def test_an_episode_is_played_again_from_its_seed(policy: str) -> None:
+    table = made(Rollouts(env="Reach", policy=policy, options=(("n_steps", 6),)), 3)
+    observed, acted = group(table, "obs"), group(table, "action")
+    for episode in range(3):
+        rows = np.flatnonzero(table["episode"] == episode)
+        assert table["step"][rows].tolist() == list(range(len(rows)))
+        env = BatchEnv("Reach", num_envs=1, n_steps=6)
+        observation, _ = env.reset(seed=int(table["seed"][rows[0]]))
+        for row in rows[:-1]:
+            np.testing.assert_array_equal(observed[row], observation[0])
+            observation, reward, terminated, truncated, told = env.step(acted[row : row + 1])
+            assert table["reward"][row] == reward[0]
+            assert table["distance"][row] == told["distance"][0]
+            assert (table["terminated"][row], table["truncated"][row]) == (terminated[0], truncated[0])
+        assert table["terminated"][rows[-2]] or table["truncated"][rows[-2]]
+        np.testing.assert_array_equal(observed[rows[-1]], told["final_obs"][0])
+        assert np.isnan(acted[rows[-1]]).all()
+        assert np.isnan(table["reward"][rows[-1]])
+        env.close()
+    assert len(set(table["seed"])) == 3
+
+
+def test_a_robots_own_motion_keeps_its_limits() -> None:
+    robot = fastrod.load_robot("five_segment_reacher")
+    work = Trajectories(robot=dumps(robot), steps=120, dt=0.05, bend=0.7, speed=0.8, force=0.01)
+    table = made(work, 6)
+    ext = group(table, "ext").reshape(6, 120, 5)
+    dl = group(table, "dl") - np.cumsum(group(table, "ext"), axis=1)[:, robot.tendon_segment]
+    bend = wire(robot).bend(dl).reshape(6, 120, 5, 2)
+    assert np.linalg.norm(bend, axis=-1).max() <= 0.7 + 1e-9
+    assert np.linalg.norm(np.diff(bend, axis=1), axis=-1).max() <= 0.8 * 0.05 + 1e-9
+    assert np.linalg.norm(np.diff(bend, axis=1), axis=-1).max() > 0.9 * 0.8 * 0.05
+    assert ext.min() >= 0.0
+    assert ext.max() <= 0.05
+    assert np.ptp(ext[..., 4], axis=1).min() > 0.0
+    force = np.stack([table[name] for name in ("tip_fx", "tip_fy", "tip_fz")], axis=1).reshape(6, 120, 3)
+    assert (force == force[:, :1]).all()
+    assert 0.0 < np.linalg.norm(force, axis=2).max() <= 0.01
+    assert table["ok"].all()
+    np.testing.assert_allclose(table["t"], 0.05 * table["step"])
+
+
+def test_the_measured_tip_is_that_of_the_effects_that_are_told() -> None:
+    plain = fastrod.load_robot("prototype")
+    table = made(Trajectories(robot=dumps(plain), effects=("backlash", "gravity"), steps=40), 3)
+    for episode in range(3):
+        rows = table["episode"] == episode
+        told = {name: float(table[name][rows][0]) for name in table if "." in name}
+        effects: dict[str, dict[str, Any]] = {}
+        for name, value in told.items():
+            effects.setdefault(name.partition(".")[0], {})[name.partition(".")[2]] = value
+        robot = fastrod.Robot(name="one", segments=plain.segments, effects=tuple({"name": n, **v} for n, v in effects.items()))
+        sim = fastrod.Simulator(robot, 1, dt=0.02, points_per_segment=8, threads=1)
+        for step, dl in enumerate(group(table, "dl")[rows]):
+            (sim.step if step else sim.settle)(plain.rest_tendon_length + dl)
+            seen = sim.measure().tip_position[0]
+            np.testing.assert_allclose([table[f"tip_{a}"][rows][step] for a in "xyz"], seen, atol=1e-9)
+
+
+def test_values_of_effects_are_of_their_typical_size() -> None:
+    robot = fastrod.load_robot("prototype")
+    rng = np.random.default_rng(5)
+    drawn = [with_effects(robot, ["backlash", "frame_misalignment"], rng) for _ in range(50)]
+    for made_robot, told in drawn:
+        assert [table["name"] for table in made_robot.effects] == ["backlash", "frame_misalignment"]
+        for name, value in told.items():
+            effect, _, key = name.partition(".")
+            parameter = next(p.on(wire(robot)) for p in get_effect(effect).parameters if p.name == key)
+            assert parameter.bounds[0] <= value <= parameter.bounds[1]
+            assert 0.49 * parameter.scale <= abs(value) <= 1.51 * parameter.scale
+    assert len({told["backlash.half_width"] for _, told in drawn}) == 50
+    ball = np.linalg.norm(in_ball(rng, 20000, 3), axis=1)
+    assert np.mean(ball**3) == pytest.approx(0.5, abs=0.01)
+
+
+def test_a_sweep_names_what_it_sealed() -> None:
+    table = made(Sweep(robot=dumps(fastrod.load_robot("prototype")), effects=("backlash",), rate=4.0), 1)
+    sealed, found = json.loads(table["sealed"][0]), json.loads(table["found"][0])
+    assert table["problem"][0] == ""
+    assert table["named"][0].split()[0] == "backlash"
+    assert table["first"][0]
+    assert found["backlash.half_width"] == pytest.approx(sealed["backlash.half_width"], rel=0.2)
+    assert table["after"][0] < 0.7 * table["before"][0]
+    assert table["floor"][0] == pytest.approx(3e-4 * np.sqrt(3.0), rel=0.3)
+
+
+def test_effects_take_turns_and_a_log_that_tells_nothing_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nothing(*_: Any, **__: Any) -> None:
+        raise InputError("the log tells nothing.")
+
+    monkeypatch.setattr("fastrod.identification.attribution.identify", nothing)
+    work = Sweep(robot=dumps(fastrod.load_robot("prototype")), effects=("creep", "backlash"), rate=1.0)
+    columns = columns_of(Plan(work=work, count=3), 0)
+    table = {column.name: list(column.values) for column in columns}
+    assert table["effect"] == ["backlash", "creep", "backlash"]
+    assert table["problem"] == ["the log tells nothing."] * 3
+    assert work.failed(columns) == 3
+    assert len({json.dumps(sealed) for sealed in table["sealed"]}) == 3
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("rollouts",), "rollouts are of an environment or of a robot's own motion; give --env ENV or --robot R.\n"),
+        (
+            ("rollouts", "--env", "Reach", "--robot", "prototype"),
+            "rollouts are of an environment or of a robot's own motion; give --env ENV or --robot R.\n",
+        ),
+        (
+            ("rollouts", "--robot", "prototype", "--policy", "random"),
+            "--policy and --option are of an environment; with --robot the commands are random.\n",
+        ),
+        (
+            ("rollouts", "--env", "Reach", "--steps", "3"),
+            "--steps is of a robot's own motion; with --env give --option NAME=VALUE, such as n_steps=100.\n",
+        ),
+        (("rollouts", "--env", "Reech"), "no environment 'Reech'; did you mean 'Reach'?\n"),
+        (("rollouts", "--env", "Reach", "--policy", "shiped"), "no policy 'shiped' to roll out; did you mean 'shipped'?\n"),
+        (("rollouts", "--env", "Reach", "--option", "n_stepz=3"), "no option 'n_stepz'; did you mean 'n_steps'?\n"),
+        (("rollouts", "--robot", "prototype", "--effect", "backlsh"), "no effect 'backlsh'; did you mean 'backlash'?\n"),
+        (("sweep", "--robot", "prototype", "--noise", "2"), "noise is 2.0 m; it must be a number at least 0 and at most 1.\n"),
+    ],
+)
+def test_wrong_words_are_one_sentence(words: tuple[str, ...], sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["generate", *words, "--count", "1", "--out", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr() == ("", sentence)
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_a_sweep_cannot_seal() -> None:
+    robot = fastrod.load_robot("prototype")
+    with pytest.raises(InputError, match="a sweep has no effects; name one, such as backlash"):
+        Sweep(robot=dumps(robot), effects=())
+    with pytest.raises(UnknownNameError, match="no effect 'frction'; did you mean 'friction'"):
+        Sweep(robot=dumps(robot), effects=("frction",))
+    with pytest.raises(InputError, match="has effects already; a sweep seals its own into a plain robot"):
+        Sweep(robot=dumps(fastrod.Robot(name="worn", segments=robot.segments, effects=({"name": "backlash", "half_width": 1e-4},))))
