@@ -48,7 +48,7 @@ def run_here(plan: Plan, folder: Path, todo: Sequence[int], workers: int) -> Gen
 
 def _pool(plan: Plan, folder: Path, todo: Sequence[int], workers: int) -> Iterator[Shard]:
     """The shards of one pool. Raises `BrokenProcessPool` where a worker is killed; what was whole before has been handed out."""
-    with _one_thread():
+    with one_thread():
         pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_begin)
         try:
             coming = iter(todo)
@@ -87,7 +87,7 @@ def _leave_with(sentinel: int) -> None:
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
+def one_thread() -> Iterator[None]:
     """What processes that are started meanwhile find in their environment."""
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(ONE_THREAD)

@@ -39,11 +39,12 @@ class Settled(NamedTuple):
 class ChainSolver:
     """A batch of one robot, without effects and contact, that goes along `n` chains side by side."""
 
-    def __init__(self, robot: Robot, n: int, points_per_segment: int) -> None:
-        """`points_per_segment` as for `Simulator`. Runs on one thread."""
+    def __init__(self, robot: Robot, n: int, points_per_segment: int, threads: int = 1) -> None:
+        """`points_per_segment` as for `Simulator`. With `threads` more than one a process of its own is the better use of a core
+        (perf/bench_generate.py)."""
         self.layout, self.params, rest = compile_robots((robot,), points_per_segment)
         self._reader = Reader(self.layout, self.params, rest, n)
-        self._passes = Passes(self.layout, self.params, n, 1, carry=False)
+        self._passes = Passes(self.layout, self.params, n, threads, carry=False)
         self._rows = np.arange(n)
         self._past: list[Floats] = []
         self._near = _NEAR * float(self.params.reach[0])
