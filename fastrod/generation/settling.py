@@ -2,7 +2,7 @@
 
 The boundary unknowns x of a robot whose inputs move along a smooth curve are a smooth function of the place on it. A polynomial
 through the last four solutions is then so good a guess that one Newton pass, and one more with the gain of the first, which is a
-third of the work, bring the residual below the tolerance. Where they do not, `fastrod.settle` does, from the same guess or cold.
+quarter of the work, bring the residual below the tolerance. Where they do not, `fastrod.settle` does, from the same guess or cold.
 """
 
 from __future__ import annotations

@@ -20,10 +20,10 @@ from fastrod.rotation import matrix_from_quaternion, quaternion_from_matrix
 from fastrod.segments import SegmentActions
 from fastrod.types import Floats
 
-STRIDE = 0.075
+STRIDE = 0.0625
 """Rad on each great circle between neighbours of a chain."""
-LONGEST_CHAIN = 80
-"""Rows: so that no circle closes, 80 * 0.075 rad < 2 pi."""
+LONGEST_CHAIN = 100
+"""Rows: so that no circle closes, 100 * 0.0625 rad < 2 pi."""
 _LOAD = 2.0  # tip force by default, in EI/l^2: bends every robot well, and has one equilibrium
 
 
