@@ -240,7 +240,7 @@ def _add_generate(generate: argparse.ArgumentParser) -> None:
     shapes.add_argument("--force", type=float, metavar="N", help="radius of the ball of tip forces (default: 2 EI/l^2 of the robot)")
     shapes.add_argument("--line-density", type=float, metavar="KG/M", help="mass per length, for the self-weight (default: the robot's)")
     shapes.add_argument("--tolerance", type=float, metavar="M", help="largest boundary residual (default: 1e-6)")
-    shapes.add_argument("--points", type=int, metavar="K", help="backbone positions in a row besides the tip (default: none)")
+    shapes.add_argument("--points", type=int, metavar="K", help="backbone positions in a row, the last at the tip (default: none)")
     shapes.add_argument("--points-per-segment", type=int, metavar="N", help="integration steps of a segment (default: 6)")
     shapes.add_argument(
         "--chain", type=int, metavar="N", help="neighbouring rows that are solved one from the other; 1: none (default: 64)"
