@@ -7,10 +7,14 @@ from fastrod.robotfile import load_robot, robot_names, save_robot
 
 if TYPE_CHECKING:
     from fastrod import reference
+    from fastrod.hosts.rod import Rod
     from fastrod.simulator import Simulator
     from fastrod.state import Observer, Pose, State
 
-__all__ = ["Observer", "Pose", "Robot", "Segment", "Simulator", "State", "Tendon", "load_robot", "reference", "robot_names", "save_robot"]
+__all__ = [
+    "Observer", "Pose", "Robot", "Rod", "Segment", "Simulator", "State", "Tendon", "load_robot", "reference", "robot_names", "save_robot",
+]  # fmt: skip
+_HOME = {"Observer": "state", "Pose": "state", "Rod": "hosts.rod", "Simulator": "simulator", "State": "state"}
 
 
 def __getattr__(name: str) -> Any:
@@ -19,8 +23,8 @@ def __getattr__(name: str) -> Any:
 
     if name == "reference":
         return importlib.import_module("fastrod.reference")
-    if name in __all__:
-        return getattr(importlib.import_module("fastrod.simulator" if name == "Simulator" else "fastrod.state"), name)
+    if name in _HOME:
+        return getattr(importlib.import_module(f"fastrod.{_HOME[name]}"), name)
     from fastrod.errors import nearest
 
     raise AttributeError(f"module 'fastrod' has no {name!r}; {nearest(name, __all__)}")

@@ -1,6 +1,7 @@
 """Rigid hosts: other physics engines that carry a rod, feel its weight, and whose bodies it touches.
 
-PyBullet (`pip install fastrod[hosts]`) is imported on first use.
+`Rod` knows no engine; README.md beside this file says how any engine carries one. PyBullet (`pip install fastrod[hosts]`) and MuJoCo
+(`pip install fastrod[mujoco]`) are imported on first use.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -13,16 +14,21 @@ if TYPE_CHECKING:
     from fastrod.hosts.bullet import Bullet, connect
     from fastrod.hosts.camera import Camera
     from fastrod.hosts.link import BulletLink
+    from fastrod.hosts.capsules import Capsules
     from fastrod.hosts.mounted import MountedRod
+    from fastrod.hosts.mujoco import MujocoBody, MujocoRod, add_capsules
+    from fastrod.hosts.rod import Rod
     from fastrod.hosts.softmanisim import SoftManiSim
     from fastrod.hosts.visuals import Visuals
 
 __all__ = [
-    "Bullet", "BulletArm", "BulletLink", "Camera", "Host", "Motion", "MountedRod", "RodBodies", "SoftManiSim", "Visuals", "connect",
+    "Bullet", "BulletArm", "BulletLink", "Camera", "Capsules", "Host", "Motion", "MountedRod", "MujocoBody", "MujocoRod", "Rod",
+    "RodBodies", "SoftManiSim", "Visuals", "add_capsules", "connect",
 ]  # fmt: skip
 _HOME = {
-    "Bullet": "bullet", "BulletArm": "arm", "BulletLink": "link", "Camera": "camera", "MountedRod": "mounted", "RodBodies": "bodies",
-    "SoftManiSim": "softmanisim", "Visuals": "visuals", "connect": "bullet",
+    "Bullet": "bullet", "BulletArm": "arm", "BulletLink": "link", "Camera": "camera", "Capsules": "capsules", "MountedRod": "mounted",
+    "MujocoBody": "mujoco", "MujocoRod": "mujoco", "Rod": "rod", "RodBodies": "bodies", "SoftManiSim": "softmanisim",
+    "Visuals": "visuals", "add_capsules": "mujoco", "connect": "bullet",
 }  # fmt: skip
 
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from fastrod.errors import HostError
 from fastrod.hosts.bullet import Bullet
+from fastrod.hosts.capsules import chords, turn_between
 from fastrod.hosts.link import to_xyzw
-from fastrod.rotation import product, quaternion_from_matrix
 from fastrod.types import Floats
 
 
@@ -50,7 +50,7 @@ class RodBodies:
 
     def place(self, position: Floats, rotation: Floats) -> None:
         """Stand at rest along the nodes: `position` (n_capsules + 1, 3) world [m], `rotation` (n_capsules + 1, 3, 3)."""
-        self._position, self._quaternion = _chords(position, rotation)
+        self._position, self._quaternion = chords(position, rotation)
         for own, p, q in zip(self.ids, self._position.tolist(), to_xyzw(self._quaternion).tolist(), strict=True):
             self.bullet.resetBasePositionAndOrientation(own, p, q)
             self.bullet.resetBaseVelocity(own, [0.0] * 3, [0.0] * 3)
@@ -58,7 +58,7 @@ class RodBodies:
     def head_for(self, position: Floats, rotation: Floats, dt: float) -> None:
         """Move toward these nodes so that the next step of `dt` [s] ends there: what is in the way feels the velocity. `place` them
         afterwards, or they go on."""
-        to, turned = _chords(position, rotation)
+        to, turned = chords(position, rotation)
         linear = (to - self._position) / dt
         angular = turn_between(self._quaternion, turned) / dt
         for own, v, w in zip(self.ids, linear.tolist(), angular.tolist(), strict=True):
@@ -68,23 +68,3 @@ class RodBodies:
         """Take the capsules out of the world."""
         while self.ids:
             self.bullet.removeBody(self.ids.pop())
-
-
-def _chords(position: Floats, rotation: Floats) -> tuple[Floats, Floats]:
-    """Middle and quaternion w x y z of each capsule: z along the chord, x as near as can be to the material's d1."""
-    chord = np.diff(position, axis=0)
-    z = chord / np.linalg.norm(chord, axis=1, keepdims=True)
-    x = 0.5 * (rotation[:-1, :, 0] + rotation[1:, :, 0])
-    x = x - np.einsum("ij,ij->i", x, z)[:, None] * z
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    frames = np.stack([x, np.cross(z, x), z], axis=-1)
-    return 0.5 * (position[:-1] + position[1:]), quaternion_from_matrix(frames)
-
-
-def turn_between(before: Floats, after: Floats) -> Floats:
-    """(n, 3) rotation vector, world, from one set of quaternions to the next."""
-    turn = product(after, before * [1.0, -1.0, -1.0, -1.0])
-    turn = np.where(turn[:, :1] < 0.0, -turn, turn)
-    size = np.linalg.norm(turn[:, 1:], axis=1, keepdims=True)
-    angle = 2.0 * np.arctan2(size, turn[:, :1])
-    return np.asarray(np.where(size > 1e-12, angle / np.maximum(size, 1e-12), 2.0) * turn[:, 1:])

@@ -9,7 +9,7 @@ from fastrod.types import Floats
 
 
 class Motion(NamedTuple):
-    """How a frame moves, world."""
+    """How a frame moves, world; several frames have an axis before."""
 
     pose: Floats
     """(7,) position [m] and quaternion w x y z, world_from_frame."""
@@ -19,8 +19,8 @@ class Motion(NamedTuple):
     def after(self, time: float) -> Floats:
         """(7,) pose after this time [s] at constant velocity."""
         pose = self.pose.copy()
-        pose[:3] += time * self.velocity[:3]
-        pose[3:] = product(quaternion_from_vector(time * self.velocity[3:]), pose[3:])
+        pose[..., :3] += time * self.velocity[..., :3]
+        pose[..., 3:] = product(quaternion_from_vector(time * self.velocity[..., 3:]), pose[..., 3:])
         return pose
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fastrod.errors import InputError
-from fastrod.hosts.bodies import turn_between
+from fastrod.hosts.capsules import turn_between
 from fastrod.hosts.bullet import pybullet
 from fastrod.hosts.link import from_xyzw
 from fastrod.robot import Robot, Segment, Tendon

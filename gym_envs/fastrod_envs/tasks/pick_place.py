@@ -10,7 +10,8 @@ import numpy as np
 
 from fastrod.errors import InputError
 from fastrod.hosts import Bullet, BulletArm, BulletLink, Camera, connect
-from fastrod.hosts.bodies import RodBodies, turn_between
+from fastrod.hosts.bodies import RodBodies
+from fastrod.hosts.capsules import turn_between
 from fastrod.hosts.gripper import Gripper
 from fastrod.hosts.link import from_xyzw, to_xyzw
 from fastrod.robot import Robot

@@ -1,0 +1,179 @@
+"""`CarriedRod`: a rod on a host, step by step with the host's engine, whichever that is."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any, final
+
+import numpy as np
+
+from fastrod.contact import ContactScene
+from fastrod.errors import HostError, InputError, nearest
+from fastrod.hosts.host import Host
+from fastrod.hosts.rod import INPUTS, Rod
+from fastrod.hosts.touching import Touching
+from fastrod.robot import Robot
+from fastrod.simulator import Simulator
+from fastrod.state import State
+from fastrod.types import Floats
+
+
+class CarriedRod(ABC):
+    """One rod on one body of an engine, both ways: the body's motion moves the rod's base, the body feels the base's wrench.
+
+    Bodies that the rod touches are its obstacles: contact bends the rod, its host feels the force, and the body is pushed with it. Any
+    other body meets the rod's capsules.
+
+    A step is `rod.step(...)`, or for several rods in one world `begin` each, one step of the engine, `end` each.
+    """
+
+    touched: Sequence[Touching]
+    rod: Rod
+    """The rod itself, without the engine."""
+
+    def __init__(self, host: Host, dt: float) -> None:
+        self._host, self.dt = host, dt
+        self.state: State | None = None
+        """After the last step."""
+        self.wrench: Floats = np.zeros(6)
+        """Force [N] and moment about the base point [N m] that the host felt in the last step, world."""
+
+    @abstractmethod
+    def _look(self) -> None:
+        """Before a step: `HostError` where the engine's time step is no longer `dt`."""
+
+    @abstractmethod
+    def _shapes(self) -> Sequence[int]:
+        """The engine's numbers of the capsules."""
+
+    @abstractmethod
+    def _place(self) -> None:
+        """Capsules stand where the rod is."""
+
+    @abstractmethod
+    def _head_for(self) -> None:
+        """Capsules are to be where the rod is at the end of the engine's step, as far as the engine lets them."""
+
+    @abstractmethod
+    def _step_engine(self) -> None:
+        """One step of the engine."""
+
+    @abstractmethod
+    def _loads(self, inputs: dict[str, Any]) -> dict[str, Any]:
+        """`inputs` with what the engine's own contacts add to them."""
+
+    @abstractmethod
+    def _arrived(self) -> None:
+        """After the engine's step."""
+
+    @final
+    @property
+    def simulator(self) -> Simulator:
+        """Of the rod."""
+        return self.rod.simulator
+
+    @final
+    def settle(self, **inputs: Any) -> State:
+        """Bring the rod to rest where its host is now; inputs as for `step`. The host feels nothing yet."""
+        inputs = _checked(inputs)
+        self.state = self.rod.settle(self._host.motion().pose, **self._scene(), **self._loads(inputs))
+        self._place()
+        return self.state
+
+    @final
+    def step(self, **inputs: Any) -> State:
+        """One step of rod and world together.
+
+        Inputs as for `Simulator.step`, but base and obstacles, which the world gives; what is not given stays as it was commanded last,
+        and the wires are those of the straight robot until then.
+        """
+        state = self.begin(**inputs)
+        self._step_engine()
+        self.end()
+        return state
+
+    @final
+    def begin(self, **inputs: Any) -> State:
+        """Where the rod will be at the end of the next step; its wrench goes to the host, its pushes to what it touches.
+
+        A step that cannot be solved (`state.ok` is false, and `state.problems` says why) leaves the rod where it came to, with half the
+        forces of the step before; after a few in a row, without contact at once, the rod settles anew. Raises `InputError` as
+        `Simulator.step`, `HostError` where the rod is lost, where 25 steps in a row cannot be solved, or where the world's time step has
+        changed.
+        """
+        self._look()
+        inputs = _checked(inputs)
+        if self.state is None:
+            self.settle(**inputs)
+        motion = self._host.motion()
+        state = self.state = self.rod.advance(motion.pose, motion.velocity, self.dt, **self._scene(), **self._loads(inputs))
+        if state.ok[0]:
+            self.wrench = state.base_wrench[0].copy()
+            for touched in self.touched:
+                more, point = touched.push(state)
+                self.wrench[:3] -= more[:3]
+                self.wrench[3:] -= more[3:] + np.cross(point - self.rod.base[:3], more[:3])
+        else:
+            self.wrench = 0.5 * self.wrench
+            for touched in self.touched:
+                touched.push_half()
+        self._host.exert(self.wrench)
+        self._head_for()
+        return state
+
+    @final
+    def end(self) -> None:
+        """After the world's step: the capsules stand where the rod is."""
+        if self.state is None:
+            raise HostError("end() comes after begin() and the world's step.")
+        self._arrived()
+        self._place()
+
+    @final
+    def reset(self) -> None:
+        """Forget the rod's shape and its contacts, but not its inputs: after the host or a body was put somewhere else. The next step
+        settles where the host then is."""
+        self.rod.reset()
+        self.state = None
+        for touched in self.touched:
+            touched.forget()
+
+    def _scene(self) -> dict[str, Any]:
+        """What the simulator is told of the bodies around."""
+        if not self.touched:
+            return {}
+        poses: dict[str, Floats] = {}
+        velocities: dict[str, Floats] = {}
+        for k, touched in enumerate(self.touched):
+            p, v = touched.expected(self._shapes())
+            for name in touched.names:
+                self.simulator.set_free(name, *touched.give(), body=k)
+            poses |= p
+            velocities |= v
+        return {"obstacle_pose": poses, "obstacle_velocity": velocities}
+
+
+def rod_of(
+    robot: Robot, touched: Sequence[Touching], *, dt: float, max_contacts: int, points_per_segment: int, capsules_per_segment: int
+) -> Rod:
+    """The rod of a `CarriedRod` that feels what it touches. Raises `InputError`, `RobotError`."""
+    scene = None
+    if touched:
+        scene = ContactScene(obstacles=[part.obstacle for body in touched for part in body.parts], max_contacts=max_contacts)
+    return Rod(robot, dt=dt, contact=scene, points_per_segment=points_per_segment, capsules_per_segment=capsules_per_segment)
+
+
+def check_contact(relaxation: float, friction: float) -> None:
+    """Raises `InputError` for what is no relaxation [s], no friction coefficient."""
+    for name, value, unit in (("relaxation", relaxation, " s"), ("friction", friction, "")):
+        if not isinstance(value, (int, float, np.floating)) or not 0.0 <= value < np.inf:
+            raise InputError(f"{name} is {value!r}{unit}; it must be a number, zero or positive.")
+
+
+def _checked(inputs: dict[str, Any]) -> dict[str, Any]:
+    for name in inputs:
+        if name not in INPUTS:
+            why = "the host gives it" if name == "base_pose" else nearest(name, INPUTS)
+            raise InputError(f"a mounted rod has no input {name!r}; {why}")
+    return inputs

@@ -1,0 +1,278 @@
+"""`Rod`: rods for any physics engine: the base's motion in, capsules and the wrench on the base out. It knows no engine."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple, final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fastrod.contact import ContactScene
+from fastrod.contact.frames import between
+from fastrod.errors import HostError, InputError, nearest
+from fastrod.hosts.capsules import Capsules, along, moved
+from fastrod.hosts.host import Motion
+from fastrod.robot import Robot
+from fastrod.simulator import Simulator
+from fastrod.state import Snapshot, State
+from fastrod.types import Floats
+
+INPUTS = ("tendon_length", "tension", "extension", "tip_force", "tip_moment", "line_force", "point_force", "follower_tip_force")
+"""What an engine may tell a rod beside its base: keyword arguments of `Simulator.step`."""
+OBSTACLES = ("obstacle_pose", "obstacle_velocity")
+"""The same of rods with a contact scene."""
+_PATIENCE = 2  # steps that fail before a rod in contact settles anew
+_MOST_FAILED = 25
+_MOST_SUBSTEPS = 100_000
+
+
+class RodSnapshot(NamedTuple):
+    """Everything that a later `Rod.advance` depends on."""
+
+    simulator: Snapshot
+    time: float
+    state: State | None
+    wrench: Floats
+    base: Floats
+    inputs: dict[str, Any]
+    obstacles: dict[str, Floats]
+    capsules: Capsules | None
+    failed: int
+
+
+@final
+class Rod:
+    """A robot on a base that another engine moves, or several on a base each.
+
+    With `n_robots` every array has a robot axis first; without it there is one rod and no such axis, but in `state`, which always has
+    one. Inputs that are not given stay as they were given last; the wires are those of the straight robot until then.
+
+    >>> import fastrod
+    >>> rod = fastrod.Rod(fastrod.load_robot("prototype"), dt=0.01)
+    >>> state = rod.advance((0, 0, 0, 1, 0, 0, 0), (0, 0, 0, 0, 0, 0), 0.004, tip_force=(0.0, 0.1, 0.0))
+    >>> rod.time, rod.wrench.round(6).tolist()[:3]
+    (0.004, [0.0, 0.1, 0.0])
+    """
+
+    def __init__(
+        self, robot: Robot, *, dt: float = 0.01, n_robots: int | None = None, contact: ContactScene | None = None,
+        points_per_segment: int = 10, capsules_per_segment: int = 10, threads: int | None = 1,
+    ) -> None:  # fmt: skip
+        """`dt`: the rod's longest step [s]; an engine's step that is longer is done in equal parts. `contact`: what the rod feels.
+        Capsules are as thick as contact has the rod. Raises `InputError`, `RobotError`."""
+        if (
+            not isinstance(capsules_per_segment, (int, np.integer))
+            or capsules_per_segment < 1
+            or (isinstance(points_per_segment, (int, np.integer)) and points_per_segment % capsules_per_segment)
+        ):
+            raise InputError(f"{capsules_per_segment} capsules for {points_per_segment} points of a segment; give a divisor of the points.")
+        if contact is not None and contact.worlds is not None:
+            raise InputError("ContactScene.worlds puts several rods into one world; a Rod is alone in its own: leave worlds out.")
+        self.simulator = Simulator(
+            robot, 1 if n_robots is None else n_robots, dt, points_per_segment, threads=threads, contact=contact,
+        )  # fmt: skip
+        """Its `jacobian`, `compliance`, `shape` are those of the last state."""
+        self.dt = self.simulator.dt
+        """Longest step of the rod [s]."""
+        self.robot = self.simulator.robots[0]
+        self.n_robots = n_robots
+        self._stride = points_per_segment // capsules_per_segment
+        radius = (contact or ContactScene()).radius_of(robot)
+        self.radius: Floats = np.repeat(radius, capsules_per_segment)
+        """(n_capsules,) [m]."""
+        self.time = 0.0
+        """The rod's clock: the sum of the engine's steps [s]."""
+        wires = any(segment.mode in ("tendon_length", "paper") for segment in robot.segments)
+        self._inputs: dict[str, Any] = {"tendon_length": robot.rest_tendon_length} if wires else {}
+        self._home: Floats = np.array([*robot.base_position, *robot.base_quaternion], float)
+        self._obstacles: dict[str, Floats] = {}
+        self._state: State | None = None
+        self._capsules: Capsules | None = None
+        self._wrench: Floats = np.zeros((self.simulator.n_robots, 6))
+        self._base: Floats = np.tile(self._home, (self.simulator.n_robots, 1))
+        self._failed = 0
+
+    @property
+    def state(self) -> State:
+        """After the last step. Raises `InputError` before the first."""
+        return self._there(self._state)
+
+    @property
+    def capsules(self) -> Capsules:
+        """The body after the last step. Raises `InputError` before the first."""
+        found = self._there(self._capsules)
+        return found if self.n_robots is not None else Capsules(*(a[0] for a in found))
+
+    @property
+    def wrench(self) -> Floats:
+        """(6,) force [N], then moment about the base point [N m], that the rod exerts on its base, world; zero before the first step."""
+        return self._one(self._wrench)
+
+    @property
+    def base(self) -> Floats:
+        """(7,) pose of the base that shape and wrench belong to: where the engine's step was expected to end."""
+        return self._one(self._base)
+
+    @property
+    def failed(self) -> int:
+        """Steps in a row that could not be solved; 0 after one that could."""
+        return self._failed
+
+    def settle(self, base_pose: ArrayLike | None = None, **inputs: Any) -> State:
+        """At rest on a base at rest, (7,) position [m] and quaternion w x y z, world; the robot file's own if left out. Inputs as for
+        `advance`; the clock stands still. Raises `InputError`, and `HostError` where nothing finite is found."""
+        given, around = self._sorted(inputs)
+        return self._settled(self._home if base_pose is None else self._poses(base_pose), given, around)
+
+    def advance(self, base_pose: ArrayLike, base_twist: ArrayLike, time_step: float, **inputs: Any) -> State:
+        """The rod at the end of the engine's next step of `time_step` [s].
+
+        `base_pose` (7,) where the base is before the step, position [m] and quaternion w x y z, world; `base_twist` (6,) velocity of
+        its origin [m/s] and angular velocity [rad/s], world, at which it is taken to go on. Inputs as for `Simulator.step`: `INPUTS`,
+        and `obstacle_pose` and `obstacle_velocity` at the end of the step where there is a contact scene. Base and obstacles are led
+        there in the rod's own steps.
+
+        A step that cannot be solved (`state.ok` is false, and `state.problems` says why) leaves the rod where it came to, with half the
+        wrench of the step before; after a few in a row, without contact at once, the rod settles anew. Raises `InputError` for
+        unusable input, and then nothing has moved; `HostError` where the rod is lost, or 25 steps in a row cannot be solved.
+        """
+        motion, n = self._motion(base_pose, base_twist), self._substeps(time_step)
+        given, around = self._sorted(inputs)
+        if self._state is None:
+            self._settled(motion.pose, given, around)
+        self.simulator.dt = h = time_step / n
+        for k in range(n):
+            state = self._solved(motion.after((k + 1) * h), given, self._part_way(around, n - k) if n > 1 else around)
+        before, self._capsules = self._capsules, self._along(state)
+        if before is not None:
+            self._capsules = moved(before, self._capsules, time_step)
+        self.time += time_step
+        return state
+
+    def reset(self) -> None:
+        """Forget the rod's shape and its contacts, but not its inputs nor its clock: after the base was put somewhere else. The next step
+        settles where the base then is."""
+        self.simulator.reset()
+        self._state = self._capsules = None
+        self._wrench, self._failed = np.zeros_like(self._wrench), 0
+
+    def snapshot(self) -> RodSnapshot:
+        """A copy of everything that a later step depends on."""
+        return RodSnapshot(
+            self.simulator.snapshot(), self.time, self._state, self._wrench.copy(), self._base.copy(), dict(self._inputs),
+            dict(self._obstacles), self._capsules, self._failed,
+        )  # fmt: skip
+
+    def restore(self, snapshot: RodSnapshot) -> None:
+        """Go back to a `snapshot` of this rod. Raises `InputError` for that of another."""
+        if not isinstance(snapshot, RodSnapshot):
+            raise InputError(f"the snapshot is a {type(snapshot).__name__}; give what Rod.snapshot() returned.")
+        self.simulator.restore(snapshot.simulator)
+        self.time, self._state, self._capsules, self._failed = snapshot.time, snapshot.state, snapshot.capsules, snapshot.failed
+        self._wrench, self._base = snapshot.wrench.copy(), snapshot.base.copy()
+        self._inputs, self._obstacles = dict(snapshot.inputs), dict(snapshot.obstacles)
+
+    def _settled(self, base: Floats, given: dict[str, Any], around: dict[str, Any]) -> State:
+        state = self.simulator.settle(base_pose=base, **around, **given)
+        self._keep(state, given, around, base)
+        self._capsules = self._along(state)
+        return state
+
+    def _solved(self, base: Floats, given: dict[str, Any], around: dict[str, Any]) -> State:
+        """One step of the rod itself."""
+        state = self.simulator.step(base_pose=base, **around, **given)
+        if not state.ok.all() and (self.simulator.contact is None or self._failed >= _PATIENCE):
+            self.simulator.reset(~state.ok)
+            state = self.simulator.settle(base_pose=base, **around, **given)
+        self._keep(state, given, around, base)
+        self._failed = 0 if state.ok.all() else self._failed + 1
+        if self._failed > _MOST_FAILED:
+            raise HostError(
+                f"{self._failed} steps in a row could not be solved, the last: {next(iter(state.problems.values()), 'no reason is known.')} "
+                "Move host, bodies and inputs by less in a step, or after a jump call reset()."
+            )
+        return state
+
+    def _keep(self, state: State, given: dict[str, Any], around: Mapping[str, Any], base: Floats) -> None:
+        if not np.isfinite(state.tip_position).all() or not np.isfinite(state.base_wrench).all():
+            raise HostError(f"the rod is lost: {next(iter(state.problems.values()), 'its shape is not finite')}")
+        self._state, self._inputs = state, given
+        self._obstacles |= {name: np.atleast_2d(np.asarray(pose, float)) for name, pose in (around.get("obstacle_pose") or {}).items()}
+        self._wrench = np.where(state.ok[:, None], state.base_wrench, 0.5 * self._wrench)
+        self._base = np.tile(np.atleast_2d(base), (self.simulator.n_robots if np.ndim(base) == 1 or len(base) == 1 else 1, 1))
+
+    def _sorted(self, inputs: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Inputs of the rod with those it has already, and what is around it."""
+        known = INPUTS if self.simulator.contact is None else (*INPUTS, *OBSTACLES)
+        for name in inputs:
+            if name not in known:
+                why = "it needs a contact scene: Rod(robot, contact=...)." if name in OBSTACLES else nearest(name, known)
+                raise InputError(f"a rod has no input {name!r}; {why}")
+        around = {name: inputs[name] for name in OBSTACLES if name in inputs}
+        return self._inputs | {name: value for name, value in inputs.items() if name not in OBSTACLES}, around
+
+    def _part_way(self, around: dict[str, Any], steps: int) -> dict[str, Any]:
+        """Obstacles after the first of the `steps` that lead to where they are told to be."""
+        scene = self.simulator.contact
+        if scene is None or not around.get("obstacle_pose"):
+            return around
+        rest = scene.rest_poses()
+        end = scene.moved(rest, around["obstacle_pose"], self.simulator.n_robots)  # refuses what is no pose
+        poses = {}
+        for name in around["obstacle_pose"]:
+            k = scene.index(name)
+            poses[name] = between(self._obstacles.get(name, rest[:, k]), end[:, k], np.array([1.0 / steps]))
+        return around | {"obstacle_pose": poses}
+
+    def _along(self, state: State) -> Capsules:
+        return along(state.position[:, :: self._stride], state.rotation[:, :: self._stride], self.radius)
+
+    def _substeps(self, time_step: float) -> int:
+        if isinstance(time_step, bool) or not isinstance(time_step, (int, float, np.floating, np.integer)):
+            raise InputError(f"time_step is {time_step!r}; give the length of the engine's step, a positive number [s].")
+        if not (math.isfinite(time_step) and time_step > 0.0):
+            raise InputError(f"time_step is {time_step!r} s; the length of the engine's step must be positive and finite.")
+        n = max(1, math.ceil(time_step / self.dt - 1e-9))
+        if n > _MOST_SUBSTEPS:
+            raise InputError(f"time_step is {time_step:g} s, {n} of the rod's steps of {self.dt:g} s; was it given in ms?")
+        return n
+
+    def _motion(self, base_pose: ArrayLike, base_twist: ArrayLike) -> Motion:
+        """(1 or n_robots, 7 and 6)"""
+        pose, twist = np.atleast_2d(self._poses(base_pose)), np.atleast_2d(self._twists(base_twist))
+        n = max(len(pose), len(twist))
+        return Motion(np.broadcast_to(pose, (n, 7)), np.broadcast_to(twist, (n, 6)))
+
+    def _poses(self, base_pose: ArrayLike) -> Floats:
+        pose = self._rows("base_pose", base_pose, 7, "position [m] and quaternion w x y z")
+        norm = np.linalg.norm(pose[..., 3:], axis=-1, keepdims=True)
+        if (off := np.abs(norm - 1.0)).max() > 1e-3:
+            raise InputError(f"base_pose has a quaternion of norm {norm.ravel()[off.argmax()]:.4g}; it must be 1, as w x y z.")
+        return np.concatenate([pose[..., :3], pose[..., 3:] / norm], axis=-1)
+
+    def _twists(self, base_twist: ArrayLike) -> Floats:
+        return self._rows("base_twist", base_twist, 6, "velocity [m/s] and angular velocity [rad/s]")
+
+    def _rows(self, name: str, value: ArrayLike, width: int, what: str) -> Floats:
+        """(width,), or (n_robots, width)."""
+        shapes = f"({width},)" if self.n_robots is None else f"({width},) or ({self.n_robots}, {width})"
+        try:
+            a = np.array(value, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{name} is not an array of numbers; give {shapes}, {what}, world.") from error
+        if a.shape != (width,) and (self.n_robots is None or a.shape != (self.n_robots, width)):
+            raise InputError(f"{name} has shape {a.shape}; it must be {shapes}, {what}, world.")
+        if not np.isfinite(a).all():
+            raise InputError(f"{name} holds a value that is not finite: {a.ravel()[: 2 * width].tolist()}.")
+        return a
+
+    def _one(self, a: Floats) -> Floats:
+        return a.copy() if self.n_robots is not None else a[0].copy()
+
+    def _there(self, what: Any) -> Any:
+        if what is None:
+            raise InputError("the rod has no state yet; call advance or settle first.")
+        return what
+

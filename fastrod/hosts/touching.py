@@ -1,0 +1,144 @@
+"""`Touching`: a body of another engine as an obstacle of a rod, pushed by it."""
+
+from __future__ import annotations
+
+import dataclasses
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import NamedTuple, final
+
+import numpy as np
+
+from fastrod.contact import Obstacle
+from fastrod.hosts.host import Motion
+from fastrod.rotation import matrix_from_quaternion, product
+from fastrod.state import State
+from fastrod.types import Floats
+
+_LEFT = 0.8  # of an overlap after a step
+
+
+class Part(NamedTuple):
+    """One collision shape of a body."""
+
+    obstacle: Obstacle
+    position: Floats
+    """(3,) in the frame of the body's centre of mass [m]."""
+    quaternion: Floats
+    """(4,) w x y z, com_from_obstacle."""
+
+
+class Touching(ABC):
+    """A body that a rod touches, and what the rod does to it.
+
+    A step is implicit in the body's inertia: to the rod it is where it would be at the step's end without the rod, and gives way by
+    F dt^2 / m and M dt^2 / I. A contact that lasts gives no more momentum than stops the body at the rod, at any time step.
+
+    The rod answers a changing load with tau dF/dt more (Kelvin and Voigt): a rod without mass and damping would swing with what it
+    pushes for ever. That is implicit too: dt^2 becomes dt^2 + tau dt, and the body is expected where tau dF of the last force has
+    been taken off.
+    """
+
+    def __init__(
+        self, parts: Sequence[Part], mass: float, inertia: Floats, *, dt: float, relaxation: float, friction: float
+    ) -> None:
+        """`inertia` (3,) about the axes of the centre of mass' frame [kg m^2]; `relaxation` tau [s]; `friction` of rod on the body."""
+        self.dt, self.relaxation = dt, relaxation
+        self.mass = mass
+        """0: it does not move for the rod [kg]."""
+        self._inertia: Floats = np.maximum(inertia, 1e-12)
+        self.parts = [part._replace(obstacle=dataclasses.replace(part.obstacle, friction=friction)) for part in parts]
+        self.names = tuple(part.obstacle.name for part in self.parts)
+        self.exerted: Floats = np.zeros(6)
+        """Force [N] and moment about its centre of mass [N m] that the rod exerted on it in the last step, world."""
+        self._before: Floats = np.zeros(6)
+
+    @abstractmethod
+    def com(self) -> Motion:
+        """Of the centre of mass' frame now."""
+
+    @abstractmethod
+    def overlap(self, capsules: Sequence[int]) -> Floats:
+        """(3,) the way out of what it overlaps most of these bodies or geoms of its engine, world [m]; zero where it overlaps none."""
+
+    @abstractmethod
+    def apply(self, wrench: Floats) -> None:
+        """Feel (6,) force [N] and moment about the centre of mass [N m], world, during the engine's next step."""
+
+    @final
+    def give(self) -> tuple[float, Floats, Floats]:
+        """How far it moves per force [m/N] and turns per moment (3, 3) [rad/(N m)] in the next step, and its centre of mass (3,)."""
+        pose = self.com().pose
+        if self.mass == 0.0:
+            return 0.0, np.zeros((3, 3)), pose[:3]
+        turn, square = matrix_from_quaternion(pose[None, 3:])[0], self.dt**2 + self.relaxation * self.dt
+        return square / self.mass, square * turn @ (turn.T / self._inertia[:, None]), pose[:3]
+
+    @final
+    def expected(self, capsules: Sequence[int]) -> tuple[dict[str, Floats], dict[str, Floats]]:
+        """Pose (7,) and velocity (6,) of each part at the end of the next step, were it not for the rod.
+
+        What overlaps the rod's `capsules` already (a contact that was lost for a step) is expected most of the way outside: out at once
+        it would leave at overlap / dt.
+        """
+        motion = self.com()
+        if self.mass > 0.0:
+            back = self.relaxation / (self.dt**2 + self.relaxation * self.dt)  # per step: tau dt of the force before, as a velocity
+            by_force, by_moment, _ = self.give()
+            change = np.concatenate([by_force * self._before[:3], by_moment @ self._before[3:]])
+            motion = motion._replace(velocity=motion.velocity - back * change)
+        pose = motion.after(self.dt)
+        if self.mass > 0.0:
+            pose[:3] += _LEFT * self.overlap(capsules)
+        turn = matrix_from_quaternion(pose[None, 3:])[0]
+        poses, velocities = {}, {}
+        for part in self.parts:
+            arm = turn @ part.position
+            poses[part.obstacle.name] = np.concatenate([pose[:3] + arm, product(pose[3:], part.quaternion)])
+            linear = motion.velocity[:3] + np.cross(motion.velocity[3:], arm)
+            velocities[part.obstacle.name] = np.concatenate([linear, motion.velocity[3:]])
+        return poses, velocities
+
+    @final
+    def push(self, state: State) -> tuple[Floats, Floats]:
+        """Exert the forces of the rod in its contacts with this body.
+
+        Returns what was exerted beyond these forces, (6,) with its moment about a point, and that point (3,): the rod's host takes
+        its opposite.
+        """
+        com = self.com().pose[:3]
+        if self.mass == 0.0:
+            return np.zeros(6), com
+        points, forces = _pushes(state, self.names)
+        wrench = np.concatenate([forces.sum(0), np.cross(points - com, forces).sum(0)])
+        more = self.relaxation / self.dt * (wrench - self._before)
+        along = wrench[:3] if wrench[:3].any() else self._before[:3]
+        if (wrench + more)[:3] @ along <= 0.0:
+            more = -wrench  # contact pushes, it does not hold
+        self._before, self.exerted = wrench, wrench + more
+        self._exert()
+        return more, com
+
+    @final
+    def push_half(self) -> None:
+        """Exert half of the last forces: for a step in which the rod's are not known."""
+        self._before, self.exerted = 0.5 * self._before, 0.5 * self.exerted
+        self._exert()
+
+    @final
+    def forget(self) -> None:
+        """The body was put somewhere else: no force carries over."""
+        self._before, self.exerted = np.zeros(6), np.zeros(6)
+
+    def _exert(self) -> None:
+        if self.exerted.any():
+            self.apply(self.exerted)
+
+
+def _pushes(state: State, names: Sequence[str]) -> tuple[Floats, Floats]:
+    """Points and forces of the rod (n, 3) in the contacts with the obstacles of these names."""
+    contacts = state.contacts
+    if contacts is None:
+        return np.empty((0, 3)), np.empty((0, 3))
+    mine = np.isin(contacts.obstacle[0], [contacts.names.index(name) for name in names])
+    return contacts.point[0][mine], -contacts.force[0][mine]
