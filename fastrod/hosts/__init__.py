@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from fastrod.hosts.bodies import RodBodies
     from fastrod.hosts.bullet import Bullet, connect
     from fastrod.hosts.camera import Camera
-    from fastrod.hosts.link import BulletLink
     from fastrod.hosts.capsules import Capsules
+    from fastrod.hosts.link import BulletLink
     from fastrod.hosts.mounted import MountedRod
     from fastrod.hosts.mujoco import MujocoBody, MujocoRod, add_capsules
     from fastrod.hosts.rod import Rod

@@ -67,6 +67,10 @@ class CarriedRod(ABC):
     def _arrived(self) -> None:
         """After the engine's step."""
 
+    @abstractmethod
+    def _forget(self) -> None:
+        """What the engine still has of the rod's forces is gone."""
+
     @final
     @property
     def simulator(self) -> Simulator:
@@ -136,6 +140,7 @@ class CarriedRod(ABC):
         settles where the host then is."""
         self.rod.reset()
         self.state = None
+        self._forget()
         for touched in self.touched:
             touched.forget()
 

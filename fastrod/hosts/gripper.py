@@ -8,8 +8,8 @@ from typing import Any, final
 import numpy as np
 
 from fastrod.errors import HostError
-from fastrod.hosts.capsules import turn_between
 from fastrod.hosts.bullet import Bullet
+from fastrod.hosts.capsules import turn_between
 from fastrod.hosts.link import to_xyzw
 from fastrod.types import Floats
 

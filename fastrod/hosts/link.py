@@ -41,7 +41,7 @@ class BulletLink:
         self.body = body
         self.link = self.bullet.link_named(body, link) if isinstance(link, str) else int(link)
         self.bullet.check(body, self.link)
-        self._position, self._quaternion = _pose(position, quaternion)
+        self._position, self._quaternion = mount_pose(position, quaternion)
 
     def motion(self) -> Motion:
         """Of the rod's base."""
@@ -78,7 +78,8 @@ def exert(bullet: Bullet, body: int, link: int, wrench: Floats, point: Floats) -
     bullet.applyExternalTorque(body, link, wrench[3:].tolist(), bullet.WORLD_FRAME)
 
 
-def _pose(position: ArrayLike, quaternion: ArrayLike) -> tuple[Floats, Floats]:
+def mount_pose(position: ArrayLike, quaternion: ArrayLike) -> tuple[Floats, Floats]:
+    """Position (3,) [m] and quaternion (4,) w x y z of a mount; `HostError` for what is none."""
     p, q = np.asarray(position, float), np.asarray(quaternion, float)
     if p.shape != (3,) or q.shape != (4,) or not np.isfinite([*p, *q]).all():
         raise HostError(f"the mount is {position!r}, {quaternion!r}; give a position (3,) [m] and a quaternion (4,) w x y z.")

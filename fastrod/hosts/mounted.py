@@ -76,6 +76,9 @@ class MountedRod(CarriedRod):
     def _arrived(self) -> None:
         """PyBullet forgets its external forces by itself."""
 
+    def _forget(self) -> None:
+        """As above."""
+
     def _nodes(self) -> tuple[Floats, Floats]:
         state = self.rod.state
         return state.position[0, :: self._stride], state.rotation[0, :: self._stride]

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fastrod.errors import InputError
-from fastrod.hosts.capsules import turn_between
 from fastrod.hosts.bullet import pybullet
+from fastrod.hosts.capsules import turn_between
 from fastrod.hosts.link import from_xyzw
 from fastrod.robot import Robot, Segment, Tendon
 from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_matrix, quaternion_from_vector

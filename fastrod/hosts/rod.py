@@ -97,12 +97,13 @@ class Rod:
     @property
     def state(self) -> State:
         """After the last step. Raises `InputError` before the first."""
-        return self._there(self._state)
+        found: State = self._there(self._state)
+        return found
 
     @property
     def capsules(self) -> Capsules:
         """The body after the last step. Raises `InputError` before the first."""
-        found = self._there(self._capsules)
+        found: Capsules = self._there(self._capsules)
         return found if self.n_robots is not None else Capsules(*(a[0] for a in found))
 
     @property
@@ -189,8 +190,9 @@ class Rod:
         self._keep(state, given, around, base)
         self._failed = 0 if state.ok.all() else self._failed + 1
         if self._failed > _MOST_FAILED:
+            why = next(iter(state.problems.values()), "no reason is known.")
             raise HostError(
-                f"{self._failed} steps in a row could not be solved, the last: {next(iter(state.problems.values()), 'no reason is known.')} "
+                f"{self._failed} steps in a row could not be solved, the last: {why} "
                 "Move host, bodies and inputs by less in a step, or after a jump call reset()."
             )
         return state
@@ -275,4 +277,3 @@ class Rod:
         if what is None:
             raise InputError("the rod has no state yet; call advance or settle first.")
         return what
-

@@ -39,9 +39,7 @@ class Touching(ABC):
     been taken off.
     """
 
-    def __init__(
-        self, parts: Sequence[Part], mass: float, inertia: Floats, *, dt: float, relaxation: float, friction: float
-    ) -> None:
+    def __init__(self, parts: Sequence[Part], mass: float, inertia: Floats, *, dt: float, relaxation: float, friction: float) -> None:
         """`inertia` (3,) about the axes of the centre of mass' frame [kg m^2]; `relaxation` tau [s]; `friction` of rod on the body."""
         self.dt, self.relaxation = dt, relaxation
         self.mass = mass

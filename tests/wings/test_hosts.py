@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from bullets import carrier, carry, cube, empty_world, kuka, soft_robot
+from bullets import carrier, cube, empty_world, kuka, soft_robot
 
 from fastrod.errors import HostError, InputError
 from fastrod.hosts import Bullet, BulletLink, MountedRod, RodBodies, connect
@@ -64,22 +64,6 @@ def test_free_body_feels_force_and_moment(inertial):
     np.testing.assert_allclose(angular, np.linalg.solve(inertia, moment) * world.dt, rtol=1e-5)
 
 
-def test_hanging_rod_weighs_on_its_base():
-    world = empty_world(gravity=9.81)
-    robot = soft_robot(line_density=0.8)
-    link = carrier(world, "-z")
-    rod = MountedRod(robot, link)
-    rod.step(tendon_length=robot.rest_tendon_length)
-    np.testing.assert_allclose(rod.wrench, [0, 0, -0.8 * robot.length * 9.81, 0, 0, 0], atol=1e-9)
-    sideways = MountedRod(robot, carrier(world, "x"))
-    state = sideways.settle(tendon_length=robot.rest_tendon_length)
-    sideways.step()
-    # the moment of the weight is that of the mass where it hangs: integral of x rho g ds
-    s, x = state.arclength[0], state.position[0, :, 0]
-    lever = 0.8 * 9.81 * np.trapezoid(x, s)
-    assert sideways.wrench[4] == pytest.approx(lever, rel=1e-4)  # trapezoid of 21 nodes on a curve: (h / L)^2
-
-
 @pytest.mark.parametrize("seed", [3, 4])
 def test_motion_of_the_base_is_the_derivative_of_its_pose(seed):
     world = empty_world()
@@ -139,22 +123,6 @@ def test_capsules_lie_along_the_backbone_and_turn_with_it():
         _, _, kind, size = world.getCollisionShapeData(body, -1)[0][:4]
         assert kind == world.GEOM_CAPSULE
         assert size[:2] == pytest.approx((0.02, 0.012))
-
-
-@pytest.mark.parametrize("dt", [0.001, 0.002, 0.005, 0.01])
-def test_body_without_a_word_to_the_rod_gets_the_speed_of_the_capsule(dt):
-    world = empty_world(dt)
-    link, robot = carrier(world, "x"), soft_robot()
-    rod = MountedRod(robot, link)
-    box = cube(world, 0.04, 0.1, [0.2, 0.012 + 0.001 + 0.02, 0.0])
-    rod.settle(tendon_length=robot.rest_tendon_length)
-    speeds = []
-    for k in range(round(0.3 / dt)):
-        carry(link, [0.0, 0.1 * k * dt, 0.0], [0.0, 0.1, 0.0])
-        rod.step()
-        speeds.append(world.getBaseVelocity(box)[0][1])
-    assert speeds[-1] == pytest.approx(0.1, rel=0.02)
-    assert max(speeds) < 0.11
 
 
 def test_worlds_do_not_disturb_each_other():

@@ -1,0 +1,210 @@
+"""`MujocoRod`: a rod on a body of a MuJoCo model; `add_capsules` puts its capsules into the model before it is compiled."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fastrod.contact import ContactScene
+from fastrod.errors import HostError, InputError, nearest
+from fastrod.hosts.carried import CarriedRod, check_contact, rod_of
+from fastrod.hosts.mujoco_body import MujocoBody, body_number, mujoco
+from fastrod.hosts.mujoco_contacts import Feedback, Felt, read
+from fastrod.hosts.mujoco_touched import TouchedBody
+from fastrod.robot import Robot
+from fastrod.types import Floats
+
+__all__ = ["MujocoBody", "MujocoRod", "add_capsules"]
+
+
+def add_capsules(
+    spec: Any, robot: Robot, host: str, *, touch: Sequence[str] = (), name: str = "rod", capsules_per_segment: int = 10,
+    friction: float = 0.5, color: Sequence[float] = (0.5, 0.0, 0.6, 1.0), head_color: Sequence[float] | None = None,
+) -> tuple[str, ...]:  # fmt: skip
+    """Add a rod's body to a `mujoco.MjSpec`: mocap bodies `name 0`, `name 1`, ... with a capsule each, base first; returns their names.
+
+    They pass through the bodies of the host's kinematic tree, and through those named in `touch`, which the rod itself will touch: give
+    both here as to `MujocoRod`. `friction` against all others; colours RGBA. Bodies of the tree that have no name get one, since
+    MuJoCo's exclusions go by name. Raises `HostError`, `InputError`.
+    """
+    lib = mujoco()
+    if not isinstance(spec, lib.MjSpec):
+        raise HostError(f"spec is a {type(spec).__name__}; give a mujoco.MjSpec, for example mujoco.MjSpec.from_file(path).")
+    if capsules_per_segment < 1:
+        raise InputError(f"{capsules_per_segment} capsules a segment; give at least one.")
+    passed = list(_tree(_spec_body(spec, host)))
+    for other in touch:
+        if (body := _spec_body(spec, other)).name not in [b.name for b in passed]:
+            passed.append(body)
+    for k, body in enumerate(passed):
+        if not body.name:
+            body.name = f"{name} passes {k}"
+    names = tuple(f"{name} {k}" for k in range(robot.n_segments * capsules_per_segment))
+    if any(b.name in names for b in spec.bodies):
+        raise HostError(f"the model has a body {names[0]!r} already; give each rod a name of its own: add_capsules(..., name='left').")
+    radii = np.repeat(ContactScene().radius_of(robot), capsules_per_segment)
+    lengths = np.repeat([segment.length for segment in robot.segments], capsules_per_segment) / capsules_per_segment
+    middles = np.cumsum(lengths) - 0.5 * lengths
+    for k, own in enumerate(names):
+        body = spec.worldbody.add_body(name=own, mocap=True, pos=[0.0, 0.0, middles[k]])
+        rgba = head_color if head_color is not None and k == len(names) - 1 else color
+        body.add_geom(
+            name=own, type=lib.mjtGeom.mjGEOM_CAPSULE, size=[radii[k], 0.5 * lengths[k], 0.0], rgba=list(rgba),
+            friction=[friction, 0.005, 0.0001],
+        )  # fmt: skip
+        for other in passed:
+            spec.add_exclude(bodyname1=own, bodyname2=other.name)
+    return names
+
+
+@final
+class MujocoRod(CarriedRod):
+    """One rod on a body of a MuJoCo model (`CarriedRod`).
+
+    The rod's capsules are mocap bodies (`add_capsules`). MuJoCo puts them where it is told, but its contacts take them to be at rest: a
+    body in their way is pushed by how deep they have come, follows them at their speed some hundredths of a second behind, and is
+    held by friction as if by a thing that stands still. What the rod feels, and pushes at the right speed, are bodies in `touch`.
+
+    Bodies that are not in `touch` meet the capsules, and `felt` tells how hard. With `feel` these forces bend the rod too.
+    """
+
+    def __init__(
+        self, robot: Robot, model: Any, data: Any, body: int | str, *,
+        position: ArrayLike = (0.0, 0.0, 0.0), quaternion: ArrayLike = (1.0, 0.0, 0.0, 0.0),
+        touch: Sequence[int | str] = (), friction: float = 0.3, relaxation: float = 0.1, feel: bool = False,
+        name: str = "rod", points_per_segment: int = 10, max_contacts: int = 16,
+    ) -> None:  # fmt: skip
+        """`body`: name or number of what carries the rod, with the mount `position` (3,) [m] and `quaternion` (4,) w x y z, body_from_base.
+        `touch`: names or numbers of bodies; `friction` of the rod on them; `relaxation` [s] of the rod against a changing contact
+        force (`Touching`). `feel`: MuJoCo's contacts of the capsules bend the rod (`Feedback`). `name` as given to `add_capsules`.
+        The time step is the model's. Raises `HostError`, `InputError`."""
+        host = MujocoBody(model, data, body, position=position, quaternion=quaternion)
+        super().__init__(host, float(model.opt.timestep))
+        self.host, self.model, self.data = host, model, data
+        check_contact(relaxation, friction)
+        touched = [body_number(model, other) for other in touch]
+        self.capsule_bodies: list[int] = _capsule_bodies(model, name, robot)
+        """Number of each capsule's body, base first."""
+        self._mocap = model.body_mocapid[self.capsule_bodies]
+        self._geoms: list[int] = model.body_geomadr[self.capsule_bodies].tolist()
+        for other in touched:
+            self._check_excluded(other, name)
+        self._bodies = [TouchedBody(model, data, b, dt=self.dt, relaxation=relaxation, friction=friction) for b in touched]
+        self.touched = self._bodies
+        per_segment = len(self._geoms) // robot.n_segments
+        self.rod = rod_of(
+            robot, self.touched, dt=self.dt, max_contacts=max_contacts,
+            points_per_segment=points_per_segment, capsules_per_segment=per_segment,
+        )  # fmt: skip
+        self._capsule_of = {geom: k for k, geom in enumerate(self._geoms)}
+        self._width: Floats = np.repeat([segment.length for segment in robot.segments], per_segment) / per_segment
+        self._feedback = Feedback(robot.n_segments, per_segment, self._width) if feel else None
+        self._line_force: Any = None
+
+    @property
+    def felt(self) -> Felt:
+        """MuJoCo's contacts of the capsules in the last step."""
+        return read(self.model, self.data, self._capsule_of, self._width)
+
+    @property
+    def contact_force(self) -> Floats:
+        """(n_capsules, 3) MuJoCo's contact force on each capsule in the last step, world [N]."""
+        felt, force = self.felt, np.zeros((len(self._geoms), 3))
+        np.add.at(force, felt.capsule, felt.force)
+        return force
+
+    def remove(self) -> None:
+        """Take the rod out: its capsules are seen and touched by nothing any more, and its forces are gone."""
+        self._release()
+        self.model.geom_contype[self._geoms] = self.model.geom_conaffinity[self._geoms] = 0
+        self.model.geom_rgba[self._geoms, 3] = 0.0
+
+    def _look(self) -> None:
+        if float(self.model.opt.timestep) != self.dt:
+            raise HostError(
+                f"the model's time step is now {self.model.opt.timestep:g} s, and the rod was mounted for {self.dt:g} s; mount it anew."
+            )
+
+    def _shapes(self) -> Sequence[int]:
+        return self._geoms
+
+    def _place(self) -> None:
+        capsules = self.rod.capsules
+        self.data.mocap_pos[self._mocap] = capsules.center
+        self.data.mocap_quat[self._mocap] = capsules.quaternion
+
+    def _head_for(self) -> None:
+        self._place()  # contact is looked for at once, where the rod will be
+
+    def _step_engine(self) -> None:
+        mujoco().mj_step(self.model, self.data)
+
+    def _loads(self, inputs: dict[str, Any]) -> dict[str, Any]:
+        if self._feedback is None:
+            return inputs
+        own = self._feedback.line_force()
+        given = inputs.get("line_force", self._line_force)
+        if given is not None and np.shape(given) not in ((3,), own.shape):
+            raise InputError(f"line_force has shape {np.shape(given)}; with feel=True give (3,) or {own.shape} [N/m].")
+        self._line_force = given
+        return inputs | {"line_force": own if given is None else own + np.asarray(given, float)}
+
+    def _arrived(self) -> None:
+        if self._feedback is not None:
+            self._feedback.take(self.felt, self.simulator)
+        self._release()
+
+    def _forget(self) -> None:
+        self._release()
+        if self._feedback is not None:
+            self._feedback.forget()
+
+    def _release(self) -> None:
+        self.host.release()
+        for touched in self._bodies:
+            touched.release()
+
+    def _check_excluded(self, body: int, name: str) -> None:
+        """Two contacts of one pair, the rod's and MuJoCo's, would push twice."""
+        if self.model.body_weldid[body] == 0 or not len(self._geoms):
+            return
+        own = self.capsule_bodies[0]
+        if (min(own, body) << 16) + max(own, body) not in self.model.exclude_signature:
+            raise HostError(
+                f"the capsules of {name!r} collide with {self.model.body(body).name!r}, which the rod is to touch itself; "
+                "name it in add_capsules(..., touch=[...]) too."
+            )
+
+
+def _spec_body(spec: Any, name: object) -> Any:
+    body = spec.body(name) if isinstance(name, str) else None
+    if body is None:
+        raise HostError(f"the spec has no body {name!r}; {nearest(str(name), [b.name for b in spec.bodies if b.name])}")
+    return body
+
+
+def _tree(body: Any) -> Iterator[Any]:
+    """All bodies of its kinematic tree; none of the world's own."""
+    if body.name == "world":
+        return
+    while body.parent.name != "world":
+        body = body.parent
+    waiting = [body]
+    while waiting:
+        yield (one := waiting.pop())
+        waiting.extend(one.bodies)
+
+
+def _capsule_bodies(model: Any, name: str, robot: Robot) -> list[int]:
+    numbers = {model.body(i).name: i for i in range(model.nbody)}
+    found: list[int] = []
+    while (own := f"{name} {len(found)}") in numbers:
+        found.append(numbers[own])
+    if not found or any(model.body_mocapid[i] < 0 for i in found):
+        raise HostError(f"the model has no capsules of a rod {name!r}; call add_capsules(..., name={name!r}) on its spec before compile().")
+    if len(found) % robot.n_segments:
+        raise HostError(f"the {len(found)} capsules of {name!r} do not fit {robot.n_segments} segments; they were added for another robot.")
+    return found

@@ -1,0 +1,137 @@
+"""`MujocoBody`: any body of any MuJoCo model as the host of a rod."""
+
+from __future__ import annotations
+
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fastrod.errors import HostError, nearest
+from fastrod.hosts.host import Motion
+from fastrod.hosts.link import mount_pose
+from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_matrix
+from fastrod.types import Floats
+
+
+def mujoco() -> Any:
+    """The module, imported on first use; `HostError` says how to get it."""
+    try:
+        import mujoco as module
+    except ImportError as error:
+        raise HostError("MuJoCo is not installed; pip install 'fastrod[mujoco]' brings it.") from error
+    return module
+
+
+def check_world(model: object, data: object) -> None:
+    """`HostError` for what is no model, or data of another one."""
+    lib = mujoco()
+    if not isinstance(model, lib.MjModel) or not isinstance(data, lib.MjData):
+        raise HostError(f"model and data are {type(model).__name__} and {type(data).__name__}; give a mujoco.MjModel and its MjData.")
+    if data.xpos.shape[0] != model.nbody or data.qpos.shape[0] != model.nq:
+        raise HostError(f"the data are of another model: {data.xpos.shape[0]} bodies, where this one has {model.nbody}.")
+
+
+def body_number(model: Any, body: object) -> int:
+    """Number of a body that is given by name or number; `HostError` with the nearest name."""
+    lib = mujoco()
+    if isinstance(body, str):
+        number = int(lib.mj_name2id(model, lib.mjtObj.mjOBJ_BODY, body))
+        if number < 0:
+            names = [model.body(i).name for i in range(model.nbody)]
+            raise HostError(f"the model has no body {body!r}; {nearest(body, [n for n in names if n])}")
+        return number
+    if isinstance(body, bool) or not isinstance(body, (int, np.integer)) or not 0 <= body < model.nbody:
+        raise HostError(f"body is {body!r}; give the name of a body, or its number from 0 (the world) to {model.nbody - 1}.")
+    return int(body)
+
+
+def refresh(model: Any, data: Any) -> None:
+    """Poses and velocities of all bodies from the joints as they are now: mj_step leaves those of the step's start."""
+    lib = mujoco()
+    lib.mj_kinematics(model, data)
+    lib.mj_comPos(model, data)
+    lib.mj_comVel(model, data)
+
+
+def velocity_of(model: Any, data: Any, body: int, *, com: bool) -> Floats:
+    """(6,) linear [m/s], then angular velocity [rad/s], world, of a body's centre of mass or of its frame's origin."""
+    lib = mujoco()
+    found = np.zeros(6)
+    lib.mj_objectVelocity(model, data, lib.mjtObj.mjOBJ_BODY if com else lib.mjtObj.mjOBJ_XBODY, body, found, 0)
+    return np.concatenate([found[3:], found[:3]])  # MuJoCo has the angular one first
+
+
+def com_motion(model: Any, data: Any, body: int) -> Motion:
+    """Of the frame of a body's centre of mass, as `data` have it."""
+    turn = quaternion_from_matrix(data.ximat[body].reshape(1, 3, 3))[0]
+    return Motion(np.concatenate([data.xipos[body], turn]), velocity_of(model, data, body, com=True))
+
+
+@final
+class Applied:
+    """One rod's share of what `data.xfrc_applied` has for a body.
+
+    MuJoCo keeps these forces until somebody clears them, and others may have put their own there: this adds its own, and takes just
+    that away again.
+    """
+
+    def __init__(self, data: Any, body: int) -> None:
+        self._data, self._body = data, body
+        self._before: Floats = np.zeros(6)
+        self._left: Floats | None = None
+
+    def put(self, wrench: Floats) -> None:
+        """(6,) force [N] and moment about the centre of mass [N m], world, in place of what was put before."""
+        self.take()
+        there = self._data.xfrc_applied[self._body]
+        self._before = there.copy()
+        there += wrench
+        self._left = there.copy()
+
+    def take(self) -> None:
+        """Leave the forces as they were, and what others added since. Who has cleared them meanwhile is not contradicted."""
+        left, self._left = self._left, None
+        there = self._data.xfrc_applied[self._body]
+        if left is None or not there.any():
+            return
+        there[:] = self._before if np.array_equal(there, left) else there - (left - self._before)
+
+
+@final
+class MujocoBody:
+    """A rod's base, fixed to a body (0: the world). `fastrod.hosts.Host` says what the methods do.
+
+    The mount is given in the body's frame, the one of `data.xpos`, not in that of its centre of mass.
+    """
+
+    def __init__(
+        self, model: Any, data: Any, body: int | str, *,
+        position: ArrayLike = (0.0, 0.0, 0.0), quaternion: ArrayLike = (1.0, 0.0, 0.0, 0.0),
+    ) -> None:  # fmt: skip
+        """`body`: number or name; `position` (3,) [m] and `quaternion` (4,) w x y z, body_from_base. Raises `HostError`."""
+        check_world(model, data)
+        self.model, self.data = model, data
+        self.body = body_number(model, body)
+        self._position, self._quaternion = mount_pose(position, quaternion)
+        self._applied = Applied(data, self.body)
+        self.mocap_velocity: Floats = np.zeros(6)
+        """Of the body's frame, linear [m/s] and angular [rad/s], world: for a mocap body, which MuJoCo itself takes to be at rest."""
+
+    def motion(self) -> Motion:
+        """Of the rod's base, with the joints as they are now."""
+        refresh(self.model, self.data)
+        pose = np.concatenate([self.data.xpos[self.body], self.data.xquat[self.body]])
+        velocity = velocity_of(self.model, self.data, self.body, com=False) + self.mocap_velocity
+        arm = matrix_from_quaternion(pose[None, 3:])[0] @ self._position
+        velocity[:3] += np.cross(velocity[3:], arm)
+        return Motion(np.concatenate([pose[:3] + arm, product(pose[3:], self._quaternion)]), velocity)
+
+    def exert(self, wrench: Floats) -> None:
+        """Force and moment about the base point, world, during the next mj_step, and until `release`."""
+        arm = self.motion().pose[:3] - self.data.xipos[self.body]
+        self._applied.put(np.concatenate([wrench[:3], wrench[3:] + np.cross(arm, wrench[:3])]))
+
+    def release(self) -> None:
+        """Feel no more of it."""
+        self._applied.take()

@@ -1,0 +1,95 @@
+"""Bodies of a MuJoCo model as obstacles of a rod, pushed by it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, final
+
+import numpy as np
+
+from fastrod.contact import Obstacle, box, capsule, cylinder, mesh, plane, sphere
+from fastrod.errors import HostError
+from fastrod.hosts.host import Motion
+from fastrod.hosts.mujoco_body import Applied, com_motion, mujoco
+from fastrod.hosts.touching import Part, Touching
+from fastrod.rotation import matrix_from_quaternion, product
+from fastrod.types import Floats
+
+_INVERSE = np.array([1.0, -1.0, -1.0, -1.0])  # of a unit quaternion w x y z
+
+
+@final
+class TouchedBody(Touching):
+    """A body that a rod touches, and what the rod does to it (`Touching`). Poses and velocities are as `data` have them:
+    `MujocoBody.motion` has brought them up to date."""
+
+    def __init__(self, model: Any, data: Any, body: int, *, dt: float, relaxation: float, friction: float) -> None:
+        """`relaxation` tau [s]; `friction` of rod on the body. Raises `HostError` where nothing of the body can be touched."""
+        self.model, self.data, self.body = model, data, body
+        solid = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+        self.geoms: list[int] = np.flatnonzero(solid & (model.geom_bodyid == body)).tolist()
+        if not self.geoms:
+            raise HostError(f"body {model.body(body).name!r} has no geom that collides, so nothing can touch it.")
+        still = model.body_weldid[body] == 0 or model.body_mocapid[model.body_weldid[body]] >= 0
+        mass = 0.0 if still else float(model.body_mass[body])
+        parts = _parts(model, body, self.geoms)
+        self._applied = Applied(data, body)
+        super().__init__(parts, mass, model.body_inertia[body].copy(), dt=dt, relaxation=relaxation, friction=friction)
+
+    def com(self) -> Motion:
+        return com_motion(self.model, self.data, self.body)
+
+    def overlap(self, capsules: Sequence[int]) -> Floats:
+        lib = mujoco()
+        deepest, way, ends = 0.0, np.zeros(3), np.zeros(6)
+        for own in capsules:
+            for geom in self.geoms:
+                if (gap := lib.mj_geomDistance(self.model, self.data, own, geom, 0.0, ends)) < deepest:
+                    deepest, way = gap, ends[:3] - ends[3:]
+        return way
+
+    def apply(self, wrench: Floats) -> None:
+        self._applied.put(wrench)
+
+    def release(self) -> None:
+        """Feel no more of it."""
+        self._applied.take()
+
+
+def _parts(model: Any, body: int, geoms: Sequence[int]) -> list[Part]:
+    """The geoms of a body."""
+    label = model.body(body).name or f"body {body}"
+    turn = matrix_from_quaternion(model.body_iquat[body][None])[0].T
+    parts = []
+    for i, geom in enumerate(geoms):
+        made = _obstacle(model, geom, label + (f" part {i}" if i else ""))
+        position = turn @ (model.geom_pos[geom] - model.body_ipos[body])
+        parts.append(Part(made, position, product(model.body_iquat[body] * _INVERSE, model.geom_quat[geom])))
+    return parts
+
+
+def _obstacle(model: Any, geom: int, name: str) -> Obstacle:
+    kinds = mujoco().mjtGeom
+    kind, (a, b, c) = model.geom_type[geom], model.geom_size[geom].tolist()
+    if kind == kinds.mjGEOM_BOX:
+        return box((2.0 * a, 2.0 * b, 2.0 * c), name=name)
+    if kind == kinds.mjGEOM_SPHERE:
+        return sphere(a, name=name)
+    if kind == kinds.mjGEOM_CYLINDER:
+        return cylinder(a, 2.0 * b, name=name)
+    if kind == kinds.mjGEOM_CAPSULE:
+        return capsule(a, 2.0 * b, name=name)
+    if kind == kinds.mjGEOM_PLANE:
+        return plane(point=(0.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0), name=name)
+    if kind == kinds.mjGEOM_MESH:
+        return _hull(model, int(model.geom_dataid[geom]), name)
+    word = str(kinds(int(kind))).rsplit("_", 1)[-1].lower()
+    raise HostError(f"geom {geom} of {name!r} is of the kind {word}, which a rod cannot touch; give it a mesh, or a simple shape.")
+
+
+def _hull(model: Any, number: int, name: str) -> Obstacle:
+    """MuJoCo takes the convex hull of a geom's mesh, and so does the rod."""
+    import trimesh
+
+    first, n = model.mesh_vertadr[number], model.mesh_vertnum[number]
+    return mesh(trimesh.convex.convex_hull(np.asarray(model.mesh_vert[first : first + n], float)), name=name)

@@ -1,0 +1,116 @@
+"""The same world in PyBullet and in MuJoCo: a rod on a body that is moved by hand, cubes, a floor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from bullets import carrier, carry, cube, empty_world
+
+from fastrod.hosts import MountedRod, MujocoRod, add_capsules
+from fastrod.robot import Robot
+
+HALF = np.sqrt(0.5)
+TURN = {"z": (1.0, 0.0, 0.0, 0.0), "x": (HALF, 0.0, HALF, 0.0), "-z": (0.0, 1.0, 0.0, 0.0)}
+
+
+class Cube(NamedTuple):
+    size: float
+    mass: float
+    position: Sequence[float]
+    friction: float = 0.5
+
+
+class BulletStage:
+    """`touch`: the cubes are obstacles of the rod; those without mass stand still."""
+
+    hop = 1.05
+    """Largest speed of a cube that is pushed over the floor, over that of the push."""
+
+    def __init__(self, robot: Robot, *, dt=0.005, gravity=0.0, axis="x", cubes=(), floor=None, touch=True, **options: Any) -> None:
+        self.world = empty_world(dt, gravity)
+        self.dt = dt
+        if floor is not None:
+            shape = self.world.createCollisionShape(self.world.GEOM_BOX, halfExtents=[5.0, 5.0, 0.5])
+            self.world.changeDynamics(self.world.createMultiBody(0.0, shape, -1, [0.0, 0.0, floor - 0.5]), -1, lateralFriction=0.5)
+        self.cubes = [cube(self.world, c.size, c.mass, c.position, friction=c.friction) for c in cubes]
+        self.link = carrier(self.world, axis)
+        self.rod = MountedRod(robot, self.link, touch=self.cubes if touch else [], **options)
+
+    def carry(self, position, velocity) -> None:
+        carry(self.link, position, velocity)
+
+    def velocity(self, k=0):
+        """(6,) of a cube's centre of mass."""
+        return np.concatenate(self.world.getBaseVelocity(self.cubes[k]))
+
+    def position(self, k=0):
+        return np.array(self.world.getBasePositionAndOrientation(self.cubes[k])[0])
+
+    def put(self, k, position) -> None:
+        self.world.resetBasePositionAndOrientation(self.cubes[k], list(position), [0, 0, 0, 1])
+        self.world.resetBaseVelocity(self.cubes[k], [0.0] * 3, [0.0] * 3)
+
+    def set_dt(self, dt) -> None:
+        self.world.setTimeStep(dt)
+
+
+class MujocoStage:
+    """As `BulletStage`."""
+
+    # a body that slides lifts off at friction times its speed: MuJoCo's friction cone is convex in force and velocity together
+    hop = 1.35
+
+    def __init__(self, robot: Robot, *, dt=0.005, gravity=0.0, axis="x", cubes=(), floor=None, touch=True, **options: Any) -> None:
+        import mujoco
+
+        self.lib, self.dt = mujoco, dt
+        spec = mujoco.MjSpec()
+        spec.option.timestep, spec.option.gravity = dt, [0.0, 0.0, -gravity]
+        # MuJoCo's default contact creeps under friction
+        spec.option.impratio, spec.option.cone = 100.0, mujoco.mjtCone.mjCONE_ELLIPTIC
+        box = mujoco.mjtGeom.mjGEOM_BOX
+        if floor is not None:
+            spec.worldbody.add_geom(type=box, size=[5, 5, 0.5], pos=[0, 0, floor - 0.5], friction=[0.25, 0.005, 0.0001])
+        self.names = [f"cube {k}" for k in range(len(cubes))]
+        for name, c in zip(self.names, cubes, strict=True):
+            body = spec.worldbody.add_body(name=name, pos=list(c.position))
+            if c.mass > 0.0:
+                body.add_freejoint()
+            # MuJoCo takes the larger friction of a pair, PyBullet the product
+            body.add_geom(type=box, size=[c.size / 2] * 3, mass=c.mass, friction=[0.5 * c.friction, 0.005, 0.0001])
+        spec.worldbody.add_body(name="post", mocap=True)
+        touched = self.names if touch else []
+        add_capsules(spec, robot, "post", touch=touched, capsules_per_segment=options.pop("capsules_per_segment", 10))
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+        self.rod = MujocoRod(robot, self.model, self.data, "post", quaternion=TURN[axis], touch=touched, **options)
+        self.post = self.model.body("post").mocapid[0]
+
+    def carry(self, position, velocity) -> None:
+        self.data.mocap_pos[self.post] = position
+        self.rod.host.mocap_velocity[:3] = velocity
+
+    def _joint(self, k):
+        joint = self.model.joint(self.model.body(self.names[k]).jntadr[0])
+        return joint.qposadr[0], joint.dofadr[0]
+
+    def velocity(self, k=0):
+        v = self._joint(k)[1]
+        return self.data.qvel[v : v + 6].copy()
+
+    def position(self, k=0):
+        q = self._joint(k)[0]
+        return self.data.qpos[q : q + 3].copy()
+
+    def put(self, k, position) -> None:
+        q, v = self._joint(k)
+        self.data.qpos[q : q + 7] = [*position, 1, 0, 0, 0]
+        self.data.qvel[v : v + 6] = 0.0
+
+    def set_dt(self, dt) -> None:
+        self.model.opt.timestep = dt
+
+
+ENGINES = {"pybullet": BulletStage, "mujoco": MujocoStage}

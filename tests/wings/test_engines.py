@@ -1,0 +1,166 @@
+"""The same rod, host and cubes in PyBullet and in MuJoCo keep to the same physics."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bullets import soft_robot
+from engines import ENGINES, Cube
+
+from fastrod.contact import ContactScene, plane
+from fastrod.errors import HostError, InputError
+from fastrod.rotation import matrix_from_quaternion
+from fastrod.simulator import Simulator
+
+SPEED, RADIUS, SIZE, MASS = 0.1, 0.012, 0.08, 0.1
+END = {"axial": [0.2 + RADIUS + 0.002 + SIZE / 2, 0.0, 0.0], "side": [0.18, RADIUS + 0.002 + SIZE / 2, 0.0]}
+WAY = {"axial": np.array([1.0, 0.0, 0.0]), "side": np.array([0.0, 1.0, 0.0])}
+
+
+@pytest.fixture(params=list(ENGINES))
+def stage(request):
+    """Builds a stage of each engine in turn."""
+    return ENGINES[request.param]
+
+
+def test_hanging_rod_weighs_on_its_base(stage):
+    robot = soft_robot(line_density=0.8)
+    down = stage(robot, axis="-z", gravity=9.81)
+    down.rod.step()
+    np.testing.assert_allclose(down.rod.wrench, [0, 0, -0.8 * robot.length * 9.81, 0, 0, 0], atol=1e-9)
+    sideways = stage(robot, axis="x", gravity=9.81)
+    sideways.rod.settle()
+    state = sideways.rod.step()
+    # the moment of the weight is that of the mass where it hangs: integral of x rho g ds
+    lever = 0.8 * 9.81 * np.trapezoid(state.position[0, :, 0], state.arclength[0])
+    assert sideways.rod.wrench[4] == pytest.approx(lever, rel=1e-4)  # trapezoid of 21 nodes on a curve: (h / L)^2
+
+
+def test_rod_follows_a_host_that_moves(stage):
+    # a base that moves at a constant velocity is where the rod expects it: the shape is that at rest, carried along
+    robot = soft_robot()
+    s = stage(robot)
+    pulled = robot.rest_tendon_length + np.array([-3, 0, 3, 0, -6, 2, 6, -2]) * 1e-3
+    rest = s.rod.settle(tendon_length=pulled).tip_position[0]
+    for k in range(20):
+        s.carry([0.2 * k * s.dt, 0.0, 0.1 * k * s.dt], [0.2, 0.0, 0.1])
+        state = s.rod.step()
+    np.testing.assert_allclose(state.tip_position[0], rest + 20 * s.dt * np.array([0.2, 0.0, 0.1]), atol=1e-6)
+
+
+def test_still_wall_is_felt_by_the_host_as_the_simulator_has_it(stage):
+    robot = soft_robot()
+    s = stage(robot, axis="z", cubes=[Cube(0.4, 0.0, [0.07 + 0.2, 0.0, 0.1])], friction=0.0)
+    s.rod.settle()
+    scene = ContactScene(obstacles=[plane(point=(0.07, 0, 0), normal=(-1, 0, 0), name="w")])
+    alone = Simulator(robot, dt=s.dt, points_per_segment=10, contact=scene)
+    for k in range(40):
+        pull = robot.rest_tendon_length + 0.0002 * k * np.array([-1, 0, 1, 0, -2, 0, 2, 0])
+        state, expected = s.rod.step(tendon_length=pull), alone.step(pull)
+    assert state.ok[0]
+    assert s.rod.wrench[0] < -0.1
+    np.testing.assert_allclose(s.rod.wrench, expected.base_wrench[0], atol=1e-6)
+    np.testing.assert_allclose(state.tip_position, expected.tip_position, atol=1e-6)
+
+
+def test_touched_body_may_be_put_somewhere_else(stage):
+    s = stage(soft_robot(), cubes=[Cube(SIZE, MASS, END["axial"])])
+    s.rod.settle()
+    for k in range(20):
+        s.carry([SPEED * k * s.dt, 0.0, 0.0], [SPEED, 0.0, 0.0])
+        s.rod.step()
+    assert np.linalg.norm(s.velocity()[:3]) > 0.9 * SPEED
+    s.put(0, [2.0, 0.0, 0.0])
+    s.rod.reset()
+    s.rod.step()
+    assert np.abs(s.rod.wrench).max() < 1e-9
+    assert np.abs(s.velocity()).max() == 0.0
+
+
+def test_step_that_cannot_be_solved_keeps_action_and_reaction(stage, monkeypatch):
+    s = stage(soft_robot(), cubes=[Cube(SIZE, MASS, END["axial"])])
+    s.rod.settle()
+    impulse, solved = np.zeros(3), s.rod.simulator.step
+    for k in range(30):
+        s.carry([SPEED * k * s.dt, 0.0, 0.0], [SPEED, 0.0, 0.0])
+        if k == 8:  # while it presses
+            monkeypatch.setattr(s.rod.simulator, "step", lambda *a, **b: replace(solved(*a, **b), ok=np.array([False])))
+        elif k == 10:
+            monkeypatch.undo()
+        s.rod.step()
+        impulse += s.dt * s.rod.wrench[:3]
+    assert np.linalg.norm(impulse) > 0.5 * MASS * SPEED
+    np.testing.assert_allclose(MASS * s.velocity()[:3], -impulse, atol=1e-9)
+
+
+def test_capsules_push_what_the_rod_does_not_touch_itself_and_nothing_twice(stage):
+    gap = Cube(SIZE, MASS, [END["axial"][0] - 0.01, 0.0, 0.0])  # 8 mm in the capsules, and nobody moves
+    alone, touched = stage(soft_robot(), cubes=[gap], touch=False), stage(soft_robot(), cubes=[gap])
+    pushed = np.zeros(3)
+    for _ in range(3):
+        alone.rod.step()
+        touched.rod.step()
+        pushed += touched.dt * touched.rod.wrench[:3]
+    assert alone.velocity()[0] > 0.0
+    assert np.abs(alone.rod.wrench).max() < 1e-9
+    np.testing.assert_allclose(MASS * touched.velocity()[:3], -pushed, atol=1e-9)
+
+
+def test_time_step_that_changes_is_a_sentence(stage):
+    s = stage(soft_robot())
+    s.rod.step()
+    s.set_dt(0.002)
+    with pytest.raises(HostError, match=r"time step is now 0.002 s, and the rod was mounted for 0.005 s; .*mount it anew\."):
+        s.rod.step()
+
+
+def test_bad_input_is_not_kept(stage):
+    s = stage(soft_robot())
+    s.rod.step(tip_force=(0.01, 0.0, 0.0))
+    with pytest.raises(InputError, match="tip_force holds a value that is not finite"):
+        s.rod.step(tip_force=(0.0, 0.0, float("nan")))
+    with pytest.raises(InputError, match=r"^a mounted rod has no input 'base_pose'; the host gives it$"):
+        s.rod.step(base_pose=(0, 0, 0, 1, 0, 0, 0))
+    with pytest.raises(InputError, match=r"^a mounted rod has no input 'tendon_lenght'; did you mean 'tendon_length'\?$"):
+        s.rod.step(tendon_lenght=0)
+    s.rod.step()
+    np.testing.assert_allclose(s.rod.wrench[:3], [0.01, 0.0, 0.0], atol=1e-9)
+
+
+def test_rod_that_stays_lost_is_told(stage, monkeypatch):
+    s = stage(soft_robot(), cubes=[Cube(SIZE, MASS, [1.0, 0.0, 0.0])])
+    lost = replace(s.rod.step(), ok=np.array([False]), problems={0: "contact: it stands."})
+    for way in ("step", "settle"):
+        monkeypatch.setattr(s.rod.simulator, way, lambda *a, **b: lost)
+    for _ in range(25):
+        assert not s.rod.step().ok[0]
+    with pytest.raises(HostError, match=r"^26 steps in a row could not be solved, the last: contact: it stands\. Move .*call reset\(\)\.$"):
+        s.rod.step()
+
+
+@pytest.mark.parametrize("option", [{"relaxation": -1}, {"friction": float("nan")}])
+def test_contact_options_are_checked(stage, option):
+    with pytest.raises(InputError, match=r"it must be a number, zero or positive\."):
+        stage(soft_robot(), **option)
+
+
+def test_end_before_begin_is_a_sentence(stage):
+    with pytest.raises(HostError, match=r"^end\(\) comes after begin\(\)"):
+        stage(soft_robot()).rod.end()
+
+
+def test_capsules_lie_along_the_backbone(stage):
+    robot = soft_robot()
+    s = stage(robot, axis="z", capsules_per_segment=5)
+    s.rod.settle(tendon_length=robot.rest_tendon_length + np.array([-8, 0, 8, 0, -8, -5, 8, 5]) * 1e-3)
+    capsules, nodes = s.rod.rod.capsules, s.rod.state.position[0, ::2]
+    np.testing.assert_allclose(capsules.ends, np.stack([nodes[:-1], nodes[1:]], axis=1), atol=1e-12)
+    if s.__class__ is ENGINES["mujoco"]:
+        pose = s.data.mocap_pos[s.rod._mocap], s.data.mocap_quat[s.rod._mocap]
+    else:
+        found = [s.world.getBasePositionAndOrientation(body) for body in s.rod.bodies.ids]
+        pose = np.array([p for p, _ in found]), np.roll([q for _, q in found], 1, axis=1)
+    np.testing.assert_allclose(pose[0], capsules.center, atol=1e-7)
+    np.testing.assert_allclose(matrix_from_quaternion(pose[1]), matrix_from_quaternion(capsules.quaternion), atol=1e-6)
