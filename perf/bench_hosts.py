@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 import report
+import two_engines
 from report import Column, Row, Section, note_progress
 
 DT = 0.005
@@ -89,6 +90,21 @@ def paper(steps: int) -> list[Row]:
     return rows
 
 
+def engines(steps: int) -> list[Row]:
+    """The same rod on the same UR5 in both engines."""
+    rows: list[Row] = []
+    for case in two_engines.CASES:
+        note_progress(f"two engines, {case}")
+        found = {engine: two_engines.at_rest(engine, case, max(steps, 100)) for engine in two_engines.ENGINES}
+        taken = {engine: timed(f"{engine}, {case}", lambda _, r=r: r.step(), steps, lambda: False) for engine, r in found.items()}
+        apart = two_engines.apart(found["PyBullet"], found["MuJoCo"])
+        rows.append(
+            {"what": case, **{name: 100.0 * value for name, value in apart.items()},
+             "pybullet_ms": taken["PyBullet"]["median_ms"], "mujoco_ms": taken["MuJoCo"]["median_ms"]}
+        )  # fmt: skip
+    return rows
+
+
 def measure(options: argparse.Namespace) -> list[Section]:
     """All rows."""
     steps = 10 if options.quick else 200
@@ -102,7 +118,20 @@ def measure(options: argparse.Namespace) -> list[Section]:
         Column("steps", "steps", "d"),
     ]
     notes = [f"One thread, world steps of {1e3 * DT:g} ms, ten points a segment; the step of PyBullet's world is in it. Warm."]
-    return [Section("hosts", "Rods on rigid hosts", columns, rods(steps) + paper(steps), notes)]
+    pair = [
+        Column("what", "UR5 and rod,\nat rest"),
+        Column("tip", "tips apart\n% of length", ".4f"),
+        Column("force", "forces apart\n%", ".4f"),
+        Column("moment", "moments apart\n%", ".4f"),
+        Column("pybullet_ms", "PyBullet\nms a step", ".2f"),
+        Column("mujoco_ms", "MuJoCo\nms a step", ".2f"),
+    ]
+    alike = [
+        f"Tip of the rod and wrench on the flange, world, after {max(steps, 100)} steps; PyBullet's motors hold the arm rigidly, "
+        "MuJoCo's servos give way by some 1e-5 rad."
+    ]
+    both = Section("engines", "The same rod and host in PyBullet and in MuJoCo", pair, engines(steps), alike)
+    return [Section("hosts", "Rods on rigid hosts", columns, rods(steps) + paper(steps), notes), both]
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -62,13 +62,14 @@ def _parts(model: Any, body: int, geoms: Sequence[int]) -> list[Part]:
     turn = matrix_from_quaternion(model.body_iquat[body][None])[0].T
     parts = []
     for i, geom in enumerate(geoms):
-        made = _obstacle(model, geom, label + (f" part {i}" if i else ""))
+        made = obstacle_of(model, geom, label + (f" part {i}" if i else ""))
         position = turn @ (model.geom_pos[geom] - model.body_ipos[body])
         parts.append(Part(made, position, product(model.body_iquat[body] * _INVERSE, model.geom_quat[geom])))
     return parts
 
 
-def _obstacle(model: Any, geom: int, name: str) -> Obstacle:
+def obstacle_of(model: Any, geom: int, name: str) -> Obstacle:
+    """A geom as an obstacle, in its own frame. Raises `HostError` for height fields and other shapes that a rod cannot touch."""
     kinds = mujoco().mjtGeom
     kind, (a, b, c) = model.geom_type[geom], model.geom_size[geom].tolist()
     if kind == kinds.mjGEOM_BOX:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, final
 from fastrod.errors import FastrodError, UnknownNameError, nearest
 
 if TYPE_CHECKING:
-    from fastrod.hosts import Bullet, BulletArm, MountedRod
+    from fastrod.hosts import Bullet, BulletArm, MountedRod, MujocoRod
     from fastrod.hosts.camera import Image
     from fastrod.robot import Robot
     from fastrod.simulator import Simulator
@@ -33,6 +33,7 @@ _SCENES: Mapping[str, str] = {
     "track_helix": "fastrod_scenes.ur5.tracking:TrackHelix",
     "track_square": "fastrod_scenes.ur5.tracking:TrackSquare",
     "track_square_helix": "fastrod_scenes.ur5.tracking:TrackSquareHelix",
+    "ur5_mujoco": "fastrod_scenes.ur5.pressing:UR5Mujoco",
     "wall": "fastrod_scenes.contact.wall:Wall",
 }
 
@@ -181,6 +182,40 @@ class HostedScene(Scene):
                 yield (k + 1) * self.dt
         finally:
             stage.close()
+
+
+class MujocoStage(ABC):
+    """A MuJoCo model with a rod on one of its bodies, as a scene has set it up."""
+
+    model: Any
+    data: Any
+    rod: MujocoRod
+
+    @abstractmethod
+    def advance(self, t: float) -> None:
+        """Command and simulate the step that begins at time t [s]."""
+
+
+class MujocoScene(Scene):
+    """A rod on a rigid robot of a MuJoCo model (`pip install fastrod[mujoco]`)."""
+
+    @abstractmethod
+    def stage(self) -> MujocoStage:
+        """A new model and its data, before their first step."""
+
+    @final
+    def run(self) -> Iterator[tuple[float, State]]:
+        """(t [s], state of the rod) of each step."""
+        stage = self.stage()
+        for t in self.play(stage):
+            yield t, stage.rod.rod.state
+
+    @final
+    def play(self, stage: MujocoStage) -> Iterator[float]:
+        """Advance to the end of the run, t [s] by t."""
+        for k in range(round(self.duration / self.dt)):
+            stage.advance(k * self.dt)
+            yield (k + 1) * self.dt
 
 
 def names() -> tuple[str, ...]:

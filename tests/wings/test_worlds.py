@@ -11,7 +11,7 @@ from fastrod import Robot, Segment, Tendon, load_robot, robot_names, save_robot
 from fastrod.errors import HostError, InputError, RobotError, UnknownNameError
 from fastrod.rotation import matrix_from_quaternion, quaternion_from_vector
 from fastrod_scenes import load, names
-from fastrod_viewer.catalogue import HOSTED_SCENES, ROD_SCENES, about, catalogue, open_world
+from fastrod_viewer.catalogue import HOSTED_SCENES, MUJOCO_SCENES, ROD_SCENES, about, catalogue, open_world
 from fastrod_viewer.hosted import HostedView
 from fastrod_viewer.world import Hand
 from fastrod_viewer.worlds import FreeWorld, SceneWorld, sway
@@ -44,7 +44,7 @@ def rest(world, hand, steps=8):
     return tip(world)
 
 
-@pytest.mark.parametrize("name", [*robot_names(), *ROD_SCENES, *HOSTED])
+@pytest.mark.parametrize("name", [*robot_names(), *ROD_SCENES, *HOSTED, *MUJOCO_SCENES])
 def test_world_plays_and_obeys(name):
     world = open_world(name)
     try:
@@ -64,6 +64,20 @@ def test_world_plays_and_obeys(name):
         assert all(body.faces.max() < len(body.vertices) for body in world.bodies)
     finally:
         world.close()
+
+
+def test_scene_in_mujoco_is_played_and_no_hand_drives_it():
+    world, scene = open_world("ur5_mujoco"), load("ur5_mujoco")
+    for t, state in zip(range(5), scene.run(), strict=False):
+        world.play()
+        assert world.t == pytest.approx((t + 1) * scene.dt)
+        assert_allclose(tip(world), state[1].tip_position[0], atol=1e-12)
+    assert not world.by_hand
+    for refused in (lambda: world.drive(still(world)), world.jacobian):
+        with pytest.raises(InputError, match=r"^scene 'ur5_mujoco' has a script that moves its robots; no hand can drive them\.$"):
+            refused()
+    world.reset()
+    assert world.t == 0.0
 
 
 def test_scene_is_played_as_it_runs():

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from fastrod.errors import UnknownNameError, nearest
 from fastrod.robot import Robot
 from fastrod.robotfile import load_robot, robot_names
-from fastrod_scenes.scene import HostedScene, RodScene, load, names
+from fastrod_scenes.scene import HostedScene, MujocoScene, RodScene, load, names
 
 if TYPE_CHECKING:
     from fastrod_viewer.world import World
@@ -37,6 +37,10 @@ HOSTED_SCENES: Mapping[str, str] = {
     "track_square_helix": "The tip of a soft robot on a UR5 follows a helix with the corners of a square.",
 }
 """Scenes in a PyBullet world (`pip install fastrod[hosts]`), likewise."""
+MUJOCO_SCENES: Mapping[str, str] = {
+    "ur5_mujoco": "A UR5 in MuJoCo carries a soft robot that bends and presses a sprung plate aside, and feels the spring in its joints.",
+}
+"""Scenes in a MuJoCo model (`pip install fastrod[mujoco]`), likewise."""
 _DRIVES = {
     "tendon_length": "driven by the lengths of its tendons",
     "tendon_tension": "driven by the tensions of its tendons",
@@ -59,14 +63,14 @@ def about(robot: Robot) -> str:
 
 def catalogue() -> dict[str, str]:
     """Name -> one sentence on it, for `open_world`: robots first, then scenes of rods alone, then those with a host."""
-    return {**{name: about(load_robot(name)) for name in robot_names()}, **ROD_SCENES, **HOSTED_SCENES}
+    return {**{name: about(load_robot(name)) for name in robot_names()}, **ROD_SCENES, **HOSTED_SCENES, **MUJOCO_SCENES}
 
 
 def open_world(name: str | Path | Robot) -> World:
     """The world of a scene's name; or a robot free in space, of a shipped name, of the path of a .toml, or as it is.
 
     Raises `UnknownNameError` with the nearest name, `RobotError` for a file that is no robot, `HostError` where a scene needs PyBullet
-    and it is not installed.
+    or MuJoCo and it is not installed.
     """
     from fastrod_viewer.worlds import FreeWorld, SceneWorld
 
@@ -77,6 +81,10 @@ def open_world(name: str | Path | Robot) -> World:
         scene = load(text)
         if isinstance(scene, RodScene):
             return SceneWorld(scene)
+        if isinstance(scene, MujocoScene):
+            from fastrod_viewer.mujoco_view import MujocoView
+
+            return MujocoView(scene)
         assert isinstance(scene, HostedScene)
         from fastrod_viewer.hosted import HostedView
 

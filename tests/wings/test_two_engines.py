@@ -1,0 +1,34 @@
+"""The same UR5 carries the same rod in PyBullet and in MuJoCo: what both engines find agrees."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+
+@pytest.fixture(autouse=True)
+def _perf_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "perf"))
+
+
+@pytest.mark.parametrize("case", ["hanging", "pulled by 0.3 N", "on a fixed block", "on a sprung block"])
+def test_tip_and_base_wrench_agree_within_one_percent(case: str) -> None:
+    from two_engines import CASES, DAMPER, DT, SPRING, apart, at_rest, carried
+
+    assert case in CASES
+    assert DAMPER / SPRING < 100 * DT  # so the block has come to rest
+    found = [at_rest(engine, case, 200) for engine in ("PyBullet", "MuJoCo")]
+    parts = apart(*found)
+    assert max(parts.values()) < 0.01, parts
+    # nothing agrees by being nothing: the weight hangs on the flange, and what pushes is felt
+    weight = np.array([0.0, 0.0, -0.1 * carried()[0].length * 9.81])
+    for result in found:
+        beside = result.wrench[:3] - weight
+        expected = {"hanging": 0.0, "pulled by 0.3 N": 0.3}.get(case)
+        if expected is None:
+            assert np.linalg.norm(beside) > 0.1
+        else:
+            assert np.linalg.norm(beside) == pytest.approx(expected, abs=1e-6)
+        assert np.linalg.norm(result.wrench[3:]) > 0.003
