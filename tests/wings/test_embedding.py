@@ -1,0 +1,119 @@
+"""The page on embedding runs as it stands, and its recipe keeps to physics on an engine with conventions of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bullets import soft_robot
+
+import fastrod.hosts
+from fastrod.hosts import Rod
+from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_vector
+
+PAGE = (Path(fastrod.hosts.__file__).parent / "README.md").read_text(encoding="utf-8")
+EXAMPLES = re.findall(r"```python\n(.*?)```\n\n```\n(.*?)```", PAGE, flags=re.S)
+RECIPE = next(block for block in re.findall(r"```python\n(.*?)```", PAGE, flags=re.S) if "def embedded_step" in block)
+
+
+class TinyEngine:
+    """One rigid body on a spring: x y z w, forces at the centre of mass, torque and inertia in the body frame, semi-implicit Euler."""
+
+    def __init__(self, mass=1.0, inertia=(0.1, 0.2, 0.15), spring=0.0, twist=0.0, damping=0.0, gravity=0.0) -> None:
+        self.mass, self.inertia, self.spring, self.twist, self.damping = mass, np.array(inertia), spring, twist, damping
+        self.gravity = np.array([0.0, 0.0, -gravity])
+        self.position, self.orientation = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
+        self.velocity, self.spin = np.zeros(3), np.zeros(3)
+        self._force, self._torque = np.zeros(3), np.zeros(3)
+
+    def apply(self, force, torque) -> None:
+        self._force, self._torque = np.array(force), np.array(torque)
+
+    def vector(self):
+        """Rotation vector, world, for small turns."""
+        return 2.0 * np.array(self.orientation[:3]) * np.sign(self.orientation[3])
+
+    def step(self, dt) -> None:
+        turn = matrix_from_quaternion(np.roll(self.orientation, 1)[None])[0]
+        force = self._force + self.mass * self.gravity - self.spring * np.array(self.position) - self.damping * self.velocity
+        inertia = turn @ np.diag(self.inertia) @ turn.T
+        moment = turn @ self._torque - self.twist * self.vector() - 0.05 * self.damping * self.spin
+        self.velocity = self.velocity + dt * force / self.mass
+        self.spin = self.spin + dt * np.linalg.solve(inertia, moment - np.cross(self.spin, inertia @ self.spin))
+        self.position = (np.array(self.position) + dt * self.velocity).tolist()
+        turned = product(quaternion_from_vector(dt * self.spin), np.roll(self.orientation, 1))
+        self.orientation = np.roll(turned / np.linalg.norm(turned), -1).tolist()
+        self._force, self._torque = np.zeros(3), np.zeros(3)
+
+
+@pytest.fixture
+def embedded_step() -> Any:
+    found: dict[str, Any] = {}
+    exec(compile(RECIPE, "README.md", "exec"), found)
+    return found["embedded_step"]
+
+
+@pytest.mark.parametrize(("code", "output"), EXAMPLES, ids=["an engine of one body", "mujoco"])
+def test_the_example_prints_its_output(code: str, output: str) -> None:
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        exec(compile(code, "README.md", "exec"), {})
+    assert printed.getvalue() == output
+
+
+@pytest.mark.parametrize("dt", [0.003, 0.025])
+def test_rod_hangs_on_the_spring_with_its_weight_and_turns_it_with_its_moment(embedded_step, dt) -> None:
+    # at rest: k z = -(m g + w), and the torsion spring holds the weight's moment about the centre of mass, kappa phi = arm x w
+    robot = soft_robot(line_density=0.5)
+    body = TinyEngine(spring=200.0, twist=40.0, damping=20.0, gravity=9.81)
+    rod, offset = Rod(robot, dt=0.01), np.array([0.1, 0.0, 0.05])
+    for _ in range(round(2.0 / dt)):
+        embedded_step(rod, body, offset, dt)
+    weight = 0.5 * robot.length * 9.81
+    assert body.position[2] == pytest.approx(-(9.81 + weight) / 200.0, rel=1e-6)
+    # where the rod's mass is: the mean of its curve, by the trapezoid of its 21 nodes
+    state = rod.state
+    middle = np.trapezoid(state.position[0], state.arclength[0], axis=0) / robot.length - body.position
+    expected = np.cross(middle, [0.0, 0.0, -weight]) / 40.0
+    np.testing.assert_allclose(2.0 * np.arcsin(0.5 * body.vector()), expected, rtol=2e-3, atol=1e-6)
+    assert rod.time == pytest.approx(round(2.0 / dt) * dt)
+
+
+def test_impulse_of_the_tip_force_is_the_bodys_momentum(embedded_step) -> None:
+    # the rod has no mass: what pulls at its tip moves the body, at once and by all of it
+    body, rod = TinyEngine(), Rod(soft_robot(), dt=0.01)
+    force = np.array([0.02, 0.01, -0.03])
+    for _ in range(100):
+        embedded_step(rod, body, np.array([0.0, 0.02, 0.03]), 0.005, tip_force=force)
+    np.testing.assert_allclose(body.mass * body.velocity, 0.5 * force, rtol=1e-6)
+    assert np.linalg.norm(body.spin) > 0.01  # and turns it
+
+
+def test_bounce_keeps_its_energy(embedded_step) -> None:
+    # straight up and down: 1/2 m v^2 + 1/2 k z^2 + w z is constant; semi-implicit Euler lets it swing by omega dt / 2
+    robot = soft_robot(line_density=0.5)
+    body, rod, energy, dt = TinyEngine(spring=100.0), Rod(robot, dt=0.01), [], 0.002
+    weight = 0.5 * robot.length * 9.81
+    for _ in range(round(2.6 / dt)):
+        embedded_step(rod, body, np.array([0.0, 0.0, 0.03]), dt)
+        energy.append(0.5 * body.velocity[2] ** 2 + 50.0 * body.position[2] ** 2 + weight * body.position[2])
+    swing = weight**2 / (2.0 * 100.0)  # from the top to rest
+    assert np.abs(energy).max() < 0.02 * swing * 2.0
+    assert abs(np.mean(energy[-314:]) - np.mean(energy[:314])) < 1e-3 * swing  # 314 steps of 2 ms are a period of 2 pi / 10 s
+
+
+def test_tilted_body_feels_the_torque_in_its_own_frame(embedded_step) -> None:
+    # one step from rest: I dw = R^T (M + arm x F) dt, in the body frame
+    half = np.sqrt(0.5)
+    body, rod, offset = TinyEngine(), Rod(soft_robot(line_density=0.5), dt=0.01), np.array([0.1, 0.0, 0.05])
+    body.orientation = [half, 0.0, 0.0, half]
+    turn = matrix_from_quaternion(np.array([[half, half, 0.0, 0.0]]))[0]
+    embedded_step(rod, body, offset, 0.001)
+    moment = turn.T @ (rod.wrench[3:] + np.cross(turn @ offset, rod.wrench[:3]))
+    np.testing.assert_allclose(turn.T @ body.spin, 0.001 * moment / body.inertia, rtol=1e-9, atol=1e-15)
+    assert np.abs(moment).max() > 0.05
