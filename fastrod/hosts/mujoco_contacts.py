@@ -11,6 +11,7 @@ from fastrod.hosts.mujoco_body import mujoco
 from fastrod.simulator import Simulator
 from fastrod.types import Floats, Ints
 
+_SLOWLY = 1.01  # that the part grows in a step: one that is larger without contact than with it would take over too little on average
 _SHALLOW = 1e-5  # m: less is not taken for the depth that a force belongs to
 
 
@@ -80,7 +81,7 @@ class Feedback:
             np.add.at(wanted[:, 1], felt.capsule, share[:, None] * felt.force)
             stiffness = np.linalg.norm(felt.force, axis=1) / np.maximum(felt.depth, _SHALLOW)
             give = np.linalg.norm(simulator.compliance()[0, :3], 2) * (felt.arclength / starts[-1]) ** 3
-            self._part = 1.0 / (1.0 + float(stiffness @ give))
+            self._part = min(_SLOWLY * self._part, 1.0 / (1.0 + float(stiffness @ give)))
         self.force += self._part * (wanted - self.force)
 
     def line_force(self) -> Floats:

@@ -42,7 +42,7 @@ class TinyEngine:
         turn = matrix_from_quaternion(np.roll(self.orientation, 1)[None])[0]
         force = self._force + self.mass * self.gravity - self.spring * np.array(self.position) - self.damping * self.velocity
         inertia = turn @ np.diag(self.inertia) @ turn.T
-        moment = turn @ self._torque - self.twist * self.vector() - 0.05 * self.damping * self.spin
+        moment = turn @ self._torque - self.twist * self.vector() - 0.2 * self.damping * self.spin
         self.velocity = self.velocity + dt * force / self.mass
         self.spin = self.spin + dt * np.linalg.solve(inertia, moment - np.cross(self.spin, inertia @ self.spin))
         self.position = (np.array(self.position) + dt * self.velocity).tolist()

@@ -1,0 +1,277 @@
+"""A MuJoCo body carries a rod: what its joints feel, whose forces are whose, what the capsules meet."""
+
+from __future__ import annotations
+
+import sys
+
+import mujoco
+import numpy as np
+import pytest
+from bullets import soft_robot
+
+import fastrod.hosts
+from fastrod.contact import ContactScene
+from fastrod.errors import HostError, InputError
+from fastrod.hosts import MujocoBody, MujocoRod, add_capsules
+from fastrod.hosts.mujoco_body import com_motion, refresh
+from fastrod.hosts.mujoco_touched import TouchedBody
+from fastrod.rotation import matrix_from_quaternion
+from fastrod.simulator import Simulator
+from fastrod_scenes.ur5.mujoco_arm import JOINTS, MujocoArm, arm_spec
+
+MOUNT = {"position": (0.02, 0.01, 0.05), "quaternion": (0.5, 0.5, -0.5, 0.5)}
+BALL = '<body name="ball" pos="0.024 0 0.15"><freejoint/><geom type="sphere" size="0.02" mass="0.05"/></body>'
+SLIDING = BALL.replace("0.024 0 0.15", "0.033 0 0.15").replace("<freejoint/>", '<joint type="slide" axis="1 0 0"/>')
+POST = '<body name="post" pos="0 0 0"><geom type="box" size=".01 .01 .01" contype="0" conaffinity="0"/></body>'
+
+
+def spec_of(inside, gravity=0.0, dt=0.005):
+    return mujoco.MjSpec.from_string(f'<mujoco><option timestep="{dt}" gravity="0 0 {-gravity}"/><worldbody>{inside}</worldbody></mujoco>')
+
+
+def moving_arm(seed, dt=0.001):
+    """A UR5 without servos in motion, with capsules for a rod on its flange."""
+    spec = arm_spec(dt)
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION | mujoco.mjtDisableBit.mjDSBL_DAMPER
+    robot = soft_robot(line_density=0.8)
+    add_capsules(spec, robot, "tool0")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(seed)
+    data.qpos[:], data.qvel[:] = rng.uniform(-1.0, 1.0, 6), 0.3 * rng.normal(size=6)
+    return robot, model, data
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_joints_feel_the_wrench_through_the_transposed_jacobian(seed):
+    # M dq'/dt with the rod, less that without it, is J^T F about the base point
+    robot, model, data = moving_arm(seed)
+    free = mujoco.MjData(model)
+    free.qpos[:], free.qvel[:] = data.qpos, data.qvel
+    mujoco.mj_step(model, free)
+    start = data.qvel.copy()
+    rod = MujocoRod(robot, model, data, "tool0", **MOUNT)
+    rod.settle(tendon_length=robot.rest_tendon_length + np.array([-2, 1, 2, -1, 1, 0, -1, 0]) * 1e-3)
+    point = rod.host.motion().pose[:3]
+    rod.begin(tip_force=(0.5, 0.2, -0.3), tip_moment=(0.01, 0.02, -0.01))
+    mujoco.mj_forward(model, data)
+    mass, by_point, by_turn = np.zeros((6, 6)), np.zeros((3, 6)), np.zeros((3, 6))
+    mujoco.mj_fullM(model, data, mass)
+    mujoco.mj_jac(model, data, by_point, by_turn, point, rod.host.body)
+    mujoco.mj_step(model, data)
+    felt = mass @ (data.qvel - free.qvel) / rod.dt
+    expected = np.concatenate([by_point, by_turn]).T @ rod.wrench
+    assert np.abs(data.qvel - start).max() > 0.0
+    assert np.abs(expected).max() > 0.1
+    np.testing.assert_allclose(felt, expected, atol=1e-8 * np.abs(expected).max())
+
+
+def test_motion_of_the_base_is_the_derivative_of_its_pose():
+    _, model, data = moving_arm(3)
+    link, h, q, rate = MujocoBody(model, data, "tool0", **MOUNT), 1e-5, data.qpos.copy(), data.qvel.copy()
+
+    def pose(t):
+        data.qpos[:] = q + t * rate
+        return link.motion().pose
+
+    after, before, now = pose(h), pose(-h), (pose(0.0), link.motion())[1]
+    np.testing.assert_allclose((after - before)[:3] / (2 * h), now.velocity[:3], atol=1e-8)
+    turn = matrix_from_quaternion(after[None, 3:])[0] @ matrix_from_quaternion(before[None, 3:])[0].T
+    spin = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / (2 * h)
+    np.testing.assert_allclose(spin, now.velocity[3:], atol=1e-8)
+
+
+def test_motion_is_that_of_the_joints_now_and_not_of_the_last_steps_start():
+    spec = spec_of('<body name="cart"><joint type="slide" axis="1 0 0"/><geom size="0.1" mass="1"/></body>')
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qvel[0] = 2.0
+    mujoco.mj_step(model, data)
+    assert data.xpos[1, 0] == 0.0
+    np.testing.assert_allclose(MujocoBody(model, data, "cart").motion().pose[:3], [0.01, 0.0, 0.0])
+
+
+def test_forces_of_others_stay_and_the_rods_own_go():
+    spec = spec_of('<body name="cart"><freejoint/><geom size="0.1" mass="1"/></body>')
+    robot = soft_robot()
+    for name in ("left", "right"):
+        add_capsules(spec, robot, "cart", name=name)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    cart = model.body("cart").id
+    others = np.array([0.3, -0.2, 0.1, 0.01, 0.02, -0.03])
+    data.xfrc_applied[cart] = others
+    rods = [MujocoRod(robot, model, data, "cart", name=name) for name in ("left", "right")]
+    before = data.qvel[:3].copy()
+    for rod, force in zip(rods, ((1.0, 0.0, 0.0), (0.0, 2.0, 0.0)), strict=True):
+        rod.begin(tip_force=force)
+    np.testing.assert_allclose(data.xfrc_applied[cart, :3], others[:3] + [1.0, 2.0, 0.0], atol=1e-7)
+    mujoco.mj_step(model, data)
+    for rod in rods:
+        rod.end()
+    np.testing.assert_allclose(data.qvel[:3] - before, 0.005 * (others[:3] + [1.0, 2.0, 0.0]), atol=1e-9)
+    np.testing.assert_allclose(data.xfrc_applied[cart], others, atol=1e-15)
+    rods[0].step()
+    rods[0].step()
+    np.testing.assert_allclose(data.xfrc_applied[cart], others, atol=1e-15)
+    rods[0].begin()
+    data.xfrc_applied[:] = 0.0  # somebody clears everything
+    rods[0].end()
+    assert not data.xfrc_applied.any()
+
+
+def test_every_geom_is_an_obstacle_where_it_is():
+    hull = np.random.default_rng(8).normal(size=(40, 3)) * 0.03
+    spec = spec_of('<body name="probe" mocap="true" pos="0.15 0.1 0.12"><geom name="probe" size="0.001"/></body>')
+    spec.add_mesh(name="hull", uservert=hull.ravel())
+    kinds = mujoco.mjtGeom
+    shapes = {
+        "box": (kinds.mjGEOM_BOX, [0.01, 0.02, 0.03]), "sphere": (kinds.mjGEOM_SPHERE, [0.03, 0, 0]),
+        "cylinder": (kinds.mjGEOM_CYLINDER, [0.02, 0.025, 0]), "capsule": (kinds.mjGEOM_CAPSULE, [0.02, 0.025, 0]),
+        "mesh": (kinds.mjGEOM_MESH, [0, 0, 0]),
+    }  # fmt: skip
+    for name, (kind, size) in shapes.items():
+        body = spec.worldbody.add_body(name=name, pos=[0.1, 0.2, 0.3], quat=[0.9, 0.1, -0.3, 0.3])
+        body.add_freejoint()
+        body.add_geom(size=[0.005, 0, 0], pos=[0.0, 0.03, 0.0], mass=0.3, contype=0, conaffinity=0)  # moves the centre of mass
+        own = body.add_geom(name=name, type=kind, size=size, pos=[0.01, 0.0, 0.0], quat=[0.8, 0.6, 0.0, 0.0], mass=0.2)
+        if name == "mesh":
+            own.meshname = "hull"
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    refresh(model, data)
+    for name in shapes:
+        touched = TouchedBody(model, data, model.body(name).id, dt=0.005, relaxation=0.1, friction=0.3)
+        assert [part.obstacle.shape for part in touched.parts] == [name]
+        pose = touched.expected([])[0][name]
+        robot = soft_robot(1)
+        sim = Simulator(robot, contact=ContactScene(obstacles=[touched.parts[0].obstacle], rod_radius=0.001, mounting=0.0))
+        # the rod's base is where the probe is, and its tip beside it: both must be as far from the body
+        state = sim.settle(robot.rest_tendon_length, base_pose=(0.15, 0.1, 0.12, 1, 0, 0, 0), obstacle_pose={name: pose})
+        ends = []
+        for point in state.position[0, [0, -1]]:
+            data.mocap_pos[0] = point
+            refresh(model, data)
+            ends.append(mujoco.mj_geomDistance(model, data, model.geom("probe").id, model.geom(name).id, 1.0, None))
+        assert min(ends) > 0.0
+        assert 0.0 < sim.clearance()[0] <= min(ends) + 1e-5
+        np.testing.assert_allclose(touched.com().pose[:3], com_motion(model, data, model.body(name).id).pose[:3])
+
+
+def stand(ball=BALL, **options):
+    """A straight rod on a post, and a ball that its capsules may meet."""
+    spec, robot = spec_of(POST + ball), soft_robot()
+    add_capsules(spec, robot, "post", touch=options.get("touch", ()))
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    return MujocoRod(robot, model, data, "post", **options), model, data
+
+
+def test_contacts_of_the_capsules_are_read_back():
+    rod, model, data = stand(SLIDING)
+    data.xfrc_applied[model.body("ball").id, 0] = -0.05  # presses the ball on the rod
+    for _ in range(600):
+        rod.step()
+    felt = rod.felt
+    assert set(felt.body) == {model.body("ball").id}
+    # the ball rests, so the rod bears what presses it; at the height of its middle, on the rod's surface
+    np.testing.assert_allclose(felt.force.sum(0), [-0.05, 0.0, 0.0], atol=1e-4)
+    np.testing.assert_allclose(rod.contact_force.sum(0), felt.force.sum(0))
+    np.testing.assert_allclose(felt.arclength, 0.15, atol=2e-3)
+    np.testing.assert_allclose(felt.point[:, 0], 0.012, atol=1e-3)
+    assert (np.abs(rod.wrench) < 1e-9).all()  # the rod itself knows nothing of it
+
+
+def test_contacts_that_are_felt_bend_the_rod_and_stay_calm():
+    # k C is far above 1 here: the force taken over at once would throw the rod from side to side
+    rod, model, data = stand(SLIDING, feel=True)
+    data.xfrc_applied[model.body("ball").id, 0] = -0.05
+    tips = [rod.step().tip_position[0, 0] for _ in range(1000)]
+    late = np.array(tips[-100:])
+    expected = Simulator(soft_robot(), dt=0.005, points_per_segment=10)
+    still = expected.settle(soft_robot().rest_tendon_length, point_force=[(0.15, (-0.05, 0.0, 0.0))])
+    assert rod.wrench[0] == pytest.approx(-0.05, rel=0.01)
+    assert np.ptp(late) < 0.01 * abs(late.mean())
+    assert late.mean() == pytest.approx(still.tip_position[0, 0], rel=0.02)
+    assert np.abs(data.qvel).max() < 1e-3
+    given = rod.step(line_force=(0.1, 0.0, 0.0))
+    assert given.ok[0]
+    with pytest.raises(InputError, match=r"^line_force has shape \(2, 3, 3\); with feel=True give \(3,\) or \(2, 11, 3\) \[N/m\]\.$"):
+        rod.step(line_force=np.zeros((2, 3, 3)))
+    rod.reset()
+    rod.step(line_force=(0.0, 0.0, 0.0))
+
+
+def test_rod_can_be_taken_out_of_the_model():
+    rod, model, data = stand()
+    rod.step()
+    rod.remove()
+    data.xfrc_applied[model.body("ball").id, 0] = -0.05
+    for _ in range(200):
+        mujoco.mj_step(model, data)
+    assert data.body("ball").xpos[0] < -0.1
+
+
+def test_rod_stands_on_the_world_too():
+    spec, robot = spec_of(""), soft_robot(line_density=0.5)
+    add_capsules(spec, robot, "world")
+    model = spec.compile()
+    rod = MujocoRod(robot, model, mujoco.MjData(model), 0, position=(0.1, 0.2, 0.3))
+    np.testing.assert_allclose(rod.step().position[0, 0], [0.1, 0.2, 0.3])
+    assert rod.wrench[2] == pytest.approx(-0.5 * 0.2 * 9.81)
+
+
+def test_servos_hold_the_arm_where_it_is_told():
+    spec = arm_spec(0.005)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    arm, q = MujocoArm(model, data), np.array([0.1, -1.2, 1.4, -1.7, -1.5, 0.3])
+    arm.place(q)
+    for _ in range(50):
+        mujoco.mj_step(model, data)
+    np.testing.assert_allclose(arm.position(), q, atol=1e-9)  # its weight is balanced
+    assert np.abs(arm.torque()).max() < 1e-4
+    with pytest.raises(InputError, match=rf"^q is \[0, 0\]; give 6 finite numbers, one for each of {JOINTS[0]}"):
+        arm.drive([0, 0])
+
+
+def test_what_is_not_there_is_a_sentence(monkeypatch):
+    robot = soft_robot()
+    spec = spec_of(POST + BALL + '<body name="ghost"><freejoint/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>')
+    with pytest.raises(HostError, match=r"^spec is a str; give a mujoco.MjSpec"):
+        add_capsules("arm.xml", robot, "post")
+    with pytest.raises(HostError, match=r"^the spec has no body 'pst'; did you mean 'post'\?"):
+        add_capsules(spec, robot, "pst")
+    with pytest.raises(InputError, match=r"^0 capsules a segment; give at least one\.$"):
+        add_capsules(spec, robot, "post", capsules_per_segment=0)
+    bare = spec_of(POST).compile()
+    with pytest.raises(HostError, match=r"^the model has no capsules of a rod 'rod'; call add_capsules\(\.\.\., name='rod'\) on its spec"):
+        MujocoRod(robot, bare, mujoco.MjData(bare), "post")
+    add_capsules(spec, robot, "post")
+    with pytest.raises(HostError, match=r"^the model has a body 'rod 0' already; give each rod a name of its own"):
+        add_capsules(spec, robot, "post")
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    for options, sentence in (
+        ({"body": "pots"}, r"^the model has no body 'pots'; did you mean 'post'\?"),
+        ({"body": 99}, r"^body is 99; give the name of a body, or its number from 0 \(the world\) to 23\.$"),
+        (
+            {"touch": ["ball"]},
+            r"^the capsules of 'rod' collide with 'ball', .*; name it in add_capsules\(\.\.\., touch=\[\.\.\.\]\) too\.$",
+        ),
+        ({"quaternion": (1, 1, 0, 0)}, r"^the mount's quaternion \[1.0, 1.0, 0.0, 0.0\] has norm 1.41421; it must be 1"),
+        ({"robot": soft_robot(3)}, r"^the 20 capsules of 'rod' do not fit 3 segments; they were added for another robot\.$"),
+        ({"data": mujoco.MjData(bare)}, r"^the data are of another model: 2 bodies, where this one has 24\.$"),
+        ({"model": "model"}, r"^model and data are str and MjData; give a mujoco.MjModel and its MjData\.$"),
+    ):
+        with pytest.raises(HostError, match=sentence):
+            MujocoRod(**{"robot": robot, "model": model, "data": data, "body": "post"} | options)
+    with pytest.raises(HostError, match=r"^body 'ghost' has no geom that collides, so nothing can touch it\.$"):
+        TouchedBody(model, data, model.body("ghost").id, dt=0.005, relaxation=0.1, friction=0.3)
+    round_one = spec_of('<body name="egg"><freejoint/><geom type="ellipsoid" size=".01 .02 .03"/></body>').compile()
+    with pytest.raises(HostError, match=r"^geom 0 of 'egg' is of the kind ellipsoid, which a rod cannot touch"):
+        TouchedBody(round_one, mujoco.MjData(round_one), 1, dt=0.005, relaxation=0.1, friction=0.3)
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(HostError, match=r"^MuJoCo is not installed; pip install 'fastrod\[mujoco\]' brings it\.$"):
+        fastrod.hosts.add_capsules(spec, robot, "post")
