@@ -15,8 +15,8 @@ from fastrod.rotation import matrix_from_quaternion
 from fastrod.simulator import Simulator
 
 SPEED, RADIUS, SIZE, MASS = 0.1, 0.012, 0.08, 0.1
-END = {"axial": [0.2 + RADIUS + 0.002 + SIZE / 2, 0.0, 0.0], "side": [0.18, RADIUS + 0.002 + SIZE / 2, 0.0]}
-WAY = {"axial": np.array([1.0, 0.0, 0.0]), "side": np.array([0.0, 1.0, 0.0])}
+BEYOND = 0.2 + RADIUS + 0.002 + SIZE / 2
+"""x of a cube 2 mm beyond the tip [m]."""
 
 
 @pytest.fixture(params=list(ENGINES))
@@ -66,7 +66,7 @@ def test_still_wall_is_felt_by_the_host_as_the_simulator_has_it(stage):
 
 
 def test_touched_body_may_be_put_somewhere_else(stage):
-    s = stage(soft_robot(), cubes=[Cube(SIZE, MASS, END["axial"])])
+    s = stage(soft_robot(), cubes=[Cube(SIZE, MASS, [BEYOND, 0.0, 0.0])])
     s.rod.settle()
     for k in range(20):
         s.carry([SPEED * k * s.dt, 0.0, 0.0], [SPEED, 0.0, 0.0])
@@ -80,7 +80,7 @@ def test_touched_body_may_be_put_somewhere_else(stage):
 
 
 def test_step_that_cannot_be_solved_keeps_action_and_reaction(stage, monkeypatch):
-    s = stage(soft_robot(), cubes=[Cube(SIZE, MASS, END["axial"])])
+    s = stage(soft_robot(), cubes=[Cube(SIZE, MASS, [BEYOND, 0.0, 0.0])])
     s.rod.settle()
     impulse, solved = np.zeros(3), s.rod.simulator.step
     for k in range(30):
@@ -96,7 +96,7 @@ def test_step_that_cannot_be_solved_keeps_action_and_reaction(stage, monkeypatch
 
 
 def test_capsules_push_what_the_rod_does_not_touch_itself_and_nothing_twice(stage):
-    gap = Cube(SIZE, MASS, [END["axial"][0] - 0.01, 0.0, 0.0])  # 8 mm in the capsules, and nobody moves
+    gap = Cube(SIZE, MASS, [BEYOND - 0.01, 0.0, 0.0])  # 8 mm in the capsules, and nobody moves
     alone, touched = stage(soft_robot(), cubes=[gap], touch=False), stage(soft_robot(), cubes=[gap])
     pushed = np.zeros(3)
     for _ in range(3):
