@@ -13,6 +13,7 @@ import pytest
 from bullets import soft_robot
 
 import fastrod.hosts
+from fastrod.contact import ContactScene, plane
 from fastrod.hosts import Rod
 from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_vector
 
@@ -117,3 +118,28 @@ def test_tilted_body_feels_the_torque_in_its_own_frame(embedded_step) -> None:
     moment = turn.T @ (rod.wrench[3:] + np.cross(turn @ offset, rod.wrench[:3]))
     np.testing.assert_allclose(turn.T @ body.spin, 0.001 * moment / body.inertia, rtol=1e-9, atol=1e-15)
     assert np.abs(moment).max() > 0.05
+
+
+@pytest.mark.parametrize(("part", "calm"), [(0.9, True), (1.1, False)])
+def test_limit_of_the_time_step_is_where_the_page_has_it(part: float, calm: bool) -> None:
+    # x' = x + dt v', v' = v - dt K / m (x + dt v): eigenvalues leave the unit circle where dt^2 K / m is 4/3
+    robot, dt, turn = soft_robot(), 0.01, (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)
+    scene = ContactScene(obstacles=[plane(point=(0, 0, -0.005), normal=(0, 0, 1), name="floor", stiffness=4.0)])
+    rod = Rod(robot, dt=dt, contact=scene)
+    start = 0.006
+
+    def press(z: float) -> float:
+        rod.settle((0.0, 0.0, z, *turn))
+        return float(rod.wrench[2])
+
+    stiffness = -(press(start + 1e-4) - press(start - 1e-4)) / 2e-4
+    mass = stiffness * dt**2 / (4.0 / 3.0 * part)
+    z, v, rest = start + 1e-6, 0.0, press(start)
+    ways = []
+    for _ in range(60):
+        rod.advance((0.0, 0.0, z, *turn), (0.0, 0.0, v, 0.0, 0.0, 0.0), dt)
+        v += dt / mass * (rod.wrench[2] - rest)
+        z += dt * v
+        ways.append(abs(z - start))
+    assert stiffness > 0.1
+    assert (max(ways[-5:]) < 1e-7) == calm

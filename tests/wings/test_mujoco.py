@@ -106,11 +106,11 @@ def test_forces_of_others_stay_and_the_rods_own_go():
     before = data.qvel[:3].copy()
     for rod, force in zip(rods, ((1.0, 0.0, 0.0), (0.0, 2.0, 0.0)), strict=True):
         rod.begin(tip_force=force)
-    np.testing.assert_allclose(data.xfrc_applied[cart, :3], [*others[:3], 1.0, 2.0, 0.0], atol=1e-7)
+    np.testing.assert_allclose(data.xfrc_applied[cart, :3], others[:3] + np.array([1.0, 2.0, 0.0]), atol=1e-7)
     mujoco.mj_step(model, data)
     for rod in rods:
         rod.end()
-    np.testing.assert_allclose(data.qvel[:3] - before, 0.005 * ([*others[:3], 1.0, 2.0, 0.0]), atol=1e-9)
+    np.testing.assert_allclose(data.qvel[:3] - before, 0.005 * (others[:3] + np.array([1.0, 2.0, 0.0])), atol=1e-9)
     np.testing.assert_allclose(data.xfrc_applied[cart], others, atol=1e-15)
     rods[0].step()
     rods[0].step()
