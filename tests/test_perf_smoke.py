@@ -230,12 +230,14 @@ def test_the_hosts_bench_runs_and_its_states_are_what_they_say(capsys: pytest.Ca
     import bench_hosts
 
     assert bench_hosts.main(["--quick", "--json"]) == 0
-    (section,) = json.loads(capsys.readouterr().out)["sections"].values()
-    rows = {row["what"]: row for row in section["rows"]}
+    sections = json.loads(capsys.readouterr().out)["sections"]
+    rows = {row["what"]: row for row in sections["hosts"]["rows"]}
     assert len(rows) == 7
     assert rows["prototype, pushes a free cube"]["touching"] > 0.0
     assert rows["prototype, free"]["touching"] == 0.0
     assert all(row["failed"] == 0 for row in rows.values())
+    assert len(sections["engines"]["rows"]) == 4
+    assert all(max(row["tip"], row["force"], row["moment"]) < 1.0 for row in sections["engines"]["rows"])  # per cent
 
 
 def test_the_envs_bench_runs_over_every_task(capsys: pytest.CaptureFixture[str]) -> None:

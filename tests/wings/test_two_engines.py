@@ -15,10 +15,9 @@ def _perf_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("case", ["hanging", "pulled by 0.3 N", "on a fixed block", "on a sprung block"])
 def test_tip_and_base_wrench_agree_within_one_percent(case: str) -> None:
-    from two_engines import CASES, DAMPER, DT, SPRING, apart, at_rest, carried
+    from two_engines import CASES, apart, at_rest, carried
 
     assert case in CASES
-    assert DAMPER / SPRING < 100 * DT  # so the block has come to rest
     found = [at_rest(engine, case, 200) for engine in ("PyBullet", "MuJoCo")]
     parts = apart(*found)
     assert max(parts.values()) < 0.01, parts
