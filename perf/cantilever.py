@@ -1,120 +1,45 @@
-"""A passive cantilever (the paper's Appendix J) by PyElastica's dynamic relaxation, beside one `settle` of fastrod."""
+"""A passive cantilever (the paper's Appendix J) by PyElastica's dynamic relaxation, beside one `settle` of fastrod.
+
+`fastrod bench peers` has the other peers, and error against time.
+"""
 
 from __future__ import annotations
 
 import importlib.util
 import math
 import time
-from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+import appendix_j
 import cases
-from fastrod import Robot, Simulator, load_robot
+from appendix_j import Array
+from fastrod import Simulator
+from peer_elastica import Relaxation, Stand
 from report import Column, Row, Section, best, note_progress
 
 FORCE = 0.2
 """Tip force across the rod [N]."""
 WITHIN = 1e-3
 """Allowed tip error as a part of the tip's deflection."""
-_RADIUS, _DENSITY = 4e-3, 1e3  # m, kg/m^3: they scale time, not the answer
 _CHECK = 20  # steps between two looks at the tip
-
-
-@dataclass(frozen=True)
-class Relaxation:
-    """How PyElastica is set."""
-
-    elements: int
-    shear: float
-    """Shear and stretch stiffness [N]: as soft as the answer allows, because its waves limit the time step."""
-    damping: float
-    """Of the first bending mode, as a part of the critical one."""
-    step: float = 0.6
-    """Time step as a part of the stability limit of the shear waves."""
-
-
 _TRIED = [Relaxation(n, shear, damping) for n, shear in ((12, 1000.0), (14, 1500.0), (16, 2000.0)) for damping in (0.8, 0.9, 1.0)]
 
 
-def cantilever() -> Robot:
-    """The prototype's rod without tendons."""
-    robot = load_robot("prototype")
-    return replace(robot, segments=(replace(robot.segments[0], tendons=(), mode="passive"),))
-
-
-def answer() -> NDArray[np.float64]:
-    """(2,) tip across and along the straight rod under `FORCE` [m]: the truth file, or the elastica."""
-    file = cases.TRUTH / "appJ_truth.csv"
-    if file.exists():
-        table = np.genfromtxt(file, delimiter=",", names=True)
-        row = table[np.argmin(np.abs(table["Fy_N"] - FORCE))]
-        return np.array([row["tip_y_m"], row["tip_z_m"]])
-    from scipy.integrate import solve_ivp
-    from scipy.optimize import brentq
-
-    (segment,) = cantilever().segments
-    stiffness, length = segment.bending_stiffness[0], segment.length
-
-    def tip(moment: float) -> NDArray[np.float64]:
-        """Angle, its slope, across, along at the tip, for a base moment [N m]: EI angle'' = -F cos angle."""
-        found: Any = solve_ivp(
-            lambda s, y: (y[1], -FORCE / stiffness * math.cos(y[0]), math.sin(y[0]), math.cos(y[0])),  # noqa: ARG005
-            (0.0, length),
-            (0.0, moment / stiffness, 0.0, 0.0),
-            rtol=1e-11,
-            atol=1e-13,
-        )
-        return np.asarray(found.y[:, -1])
-
-    base: Any = brentq(lambda moment: float(tip(moment)[1]), 0.0, 1.1 * FORCE * length, xtol=1e-14)
-    return tip(float(base))[2:]
-
-
-def relax(setting: Relaxation, goal: NDArray[np.float64], patience: float = 12.0) -> tuple[float, int, float]:
+def relax(setting: Relaxation, goal: Array, patience: float = 12.0) -> tuple[float, int, float]:
     """Wall time [s] and steps until the tip has come within `WITHIN` for good, and its error in the end [m].
 
-    The clamp of PyElastica holds the first element's director, so the rod begins half an element before the wall: clamped
-    where its examples do it, at the first node, it would be half an element short, an error of 10 % with 14 elements.
     `patience` is the simulated time in units of the first mode's 1/omega; time is infinite if the tip does not stay.
     """
-    ea: Any = importlib.import_module("elastica")
-    bench: Any = type("Bench", (ea.BaseSystemCollection, ea.Constraints, ea.Forcing, ea.Damping), {})
-    (segment,) = cantilever().segments
-    bending, torsion = segment.bending_stiffness[0], segment.torsional_stiffness
-    n, h = setting.elements, segment.length / (setting.elements - 0.5)
-    area, second = math.pi * _RADIUS**2, 0.25 * math.pi * _RADIUS**4
-    mass = _DENSITY * area * h
-    omega = 3.516 / segment.length**2 * math.sqrt(bending / (_DENSITY * area))
-    dt = np.float64(setting.step * math.sqrt(h * mass / setting.shear))
-    sim = bench()
-    rod: Any = ea.CosseratRod.straight_rod(
-        n, np.array([0.0, 0.0, -0.5 * h]), np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]), n * h, _RADIUS, _DENSITY,
-        youngs_modulus=bending / second, shear_modulus=torsion / (2.0 * second),
-    )  # fmt: skip
-    eye = np.eye(3)[:, :, None]
-    inertia = 0.25 * h * h * mass  # its waves are then as fast as those of shear
-    rod.shear_matrix[...] = setting.shear * eye
-    rod.mass_second_moment_of_inertia[...] = inertia * eye
-    rod.inv_mass_second_moment_of_inertia[...] = eye / inertia
-    sim.append(rod)
-    sim.constrain(rod).using(ea.OneEndFixedBC, constrained_position_idx=(0,), constrained_director_idx=(0,))
-    sim.add_forcing_to(rod).using(ea.EndpointForces, np.zeros(3), np.array([0.0, FORCE, 0.0]), ramp_up_time=1e-12)
-    sim.dampen(rod).using(ea.AnalyticalLinearDamper, uniform_damping_constant=2.0 * setting.damping * omega, time_step=dt)
-    sim.finalize()
-
-    stepper, now, steps = ea.PositionVerlet(), np.float64(0.0), 0
+    stand = Stand(setting)
+    stand.load(FORCE)
     allowed = WITHIN * _deflection(goal)
-    reached, error = (math.inf, 0), math.inf
+    reached, error, steps = (math.inf, 0), math.inf, 0
     start = time.perf_counter()
-    while now * omega < patience and not math.isnan(error):
-        for _ in range(_CHECK):
-            now = stepper.step(sim, now, dt)
+    while steps * stand.dt * stand.omega < patience and not math.isnan(error):
+        error = float(np.linalg.norm(stand.run(_CHECK) - goal))
         steps += _CHECK
-        error = float(np.linalg.norm(rod.position_collection[1:, -1] - goal))
         if not error <= allowed:
             reached = (math.inf, 0)
         elif not reached[1]:
@@ -122,15 +47,15 @@ def relax(setting: Relaxation, goal: NDArray[np.float64], patience: float = 12.0
     return *reached, error
 
 
-def _deflection(goal: NDArray[np.float64]) -> float:
-    return float(np.linalg.norm(goal - [0.0, cantilever().length]))
+def _deflection(goal: Array) -> float:
+    return float(np.linalg.norm(goal - [0.0, appendix_j.length()]))
 
 
-def _fastrod(goal: NDArray[np.float64]) -> Row:
+def _fastrod(goal: Array) -> Row:
     """One robot from the cold guess: with the fewest steps that `cases.TIP_ERROR` allows."""
     tip = np.array([0.0, *goal])
     for points in range(2, 41):
-        sim = Simulator(cantilever(), 1, points_per_segment=points, outputs="tip", threads=1)
+        sim = Simulator(appendix_j.robot(), 1, points_per_segment=points, outputs="tip", threads=1)
         run = partial(sim.settle, tip_force=(0.0, FORCE, 0.0))
         error = float(np.linalg.norm(run().tip_position[0] - tip))
         if error <= cases.TIP_ERROR:
@@ -154,7 +79,7 @@ def _fastrod(goal: NDArray[np.float64]) -> Row:
 
 def section(quick: bool) -> Section:
     note_progress("cantilever")
-    goal = answer()
+    goal = appendix_j.tips(np.array([FORCE]))[0]
     rows = [_fastrod(goal)]
     notes = [
         f"Passive rod of 0.07 m, tip force {FORCE} N across it; until the tip is within {WITHIN:.1%} of its deflection, "
@@ -179,7 +104,7 @@ def section(quick: bool) -> Section:
     return Section("cantilever", "A passive cantilever (Appendix J) beside PyElastica", columns, rows, notes)
 
 
-def _elastica(goal: NDArray[np.float64], quick: bool, fastrod: Row) -> Row:
+def _elastica(goal: Array, quick: bool, fastrod: Row) -> Row:
     relax(_TRIED[0], goal, patience=0.1)  # compiles
     tried = _TRIED[4:5] if quick else _TRIED
     runs = [(relax(setting, goal), setting) for setting in tried]

@@ -1,0 +1,108 @@
+"""scipy on the rod of Appendix J: shooting with the lean slope of `peers`, and collocation by `solve_bvp`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+import appendix_j
+import peers
+from appendix_j import Array
+from peer import Peer, Rung, Solve
+
+_NO_TENDON = ((0.0, 0.0, 0.0),)  # one without tension: the compiled slope cannot go over none
+
+
+@contextmanager
+def _shoot(method: str, rtol: float) -> Iterator[Solve]:
+    """Three unknown curvatures at the base, three moments at the tip that must vanish; the rod in space."""
+    from scipy.integrate import solve_ivp
+    from scipy.optimize import root
+
+    length, bending = appendix_j.length(), appendix_j.bending()
+    rod = (length, bending, bending, appendix_j.torsion())
+    slope = peers.compiled_slope()
+    size = 15 + len(_NO_TENDON)
+    tolerance = 0.1 * rtol * length / length ** np.repeat([0, 1, 2, 0], [3, 9, 3, 1])
+
+    def march(x: Array, load: tuple[float, ...]) -> Array:
+        """State at the tip for curvatures x/l at the base."""
+        state = np.zeros(size)
+        state[[3, 7, 11]] = 1.0
+        state[12:15] = x / length
+        found: Any = solve_ivp(
+            lambda s, y: slope(s, y, load, rod, _NO_TENDON, np.empty(size)),
+            (0.0, length), state, method=method, rtol=rtol, atol=tolerance,
+        )  # fmt: skip
+        return np.asarray(found.y[:, -1])
+
+    def solve(force: Array) -> Array:
+        tips = np.empty((len(force), 2))
+        for i, across in enumerate(force.tolist()):
+            load = (0.0, across, 0.0, 0.0, 0.0, 0.0)
+            found = root(lambda x: length * march(x, load)[12:15], np.zeros(3), tol=0.1 * rtol)  # noqa: B023
+            tips[i] = march(found.x, load)[1:3]
+        return tips
+
+    yield solve
+
+
+@contextmanager
+def _collocate(tol: float) -> Iterator[Solve]:
+    """The plane problem: angle, curvature, across, along over s/l, four states."""
+    from scipy.integrate import solve_bvp
+
+    length, bending = appendix_j.length(), appendix_j.bending()
+    mesh = np.linspace(0.0, 1.0, 5)
+    straight = np.array([np.zeros(5), np.zeros(5), np.zeros(5), mesh])
+
+    def ends(a: Array, b: Array) -> Array:
+        return np.array([a[0], b[1], a[2], a[3]])
+
+    def solve(force: Array) -> Array:
+        tips = np.empty((len(force), 2))
+        for i, across in enumerate(force.tolist()):
+            load = across * length**2 / bending
+
+            def fun(_: Array, y: Array) -> Array:
+                cos = np.cos(y[0])
+                return np.array([y[1], -load * cos, np.sin(y[0]), cos])  # noqa: B023
+
+            found: Any = solve_bvp(fun, ends, mesh, straight, tol=tol)
+            tips[i] = length * found.y[2:, -1]
+        return tips
+
+    yield solve
+
+
+def _shoot_rungs() -> Sequence[Rung]:
+    settings = (("RK23", 1e-2), ("RK23", 1e-3), ("RK45", 1e-4), ("DOP853", 1e-6), ("DOP853", 1e-9))
+    return [Rung(f"{method}, rtol {rtol:.0e}", partial(_shoot, method, rtol)) for method, rtol in settings]
+
+
+def _collocate_rungs() -> Sequence[Rung]:
+    return [Rung(f"tol {tol:.0e}", partial(_collocate, tol)) for tol in (1e-1, 1e-2, 1e-3, 1e-5, 1e-7)]
+
+
+SHOOT = Peer(
+    name="scipy shooting",
+    modules=("scipy",),
+    packages=("scipy",),
+    same="the rod in space by solve_ivp and root, its slope compiled by numba, so that the time is scipy's own.",
+    also="any equations: it is a solver, not a simulator.",
+    rungs=_shoot_rungs,
+    family="scipy",
+)
+COLLOCATE = Peer(
+    name="scipy solve_bvp",
+    modules=("scipy",),
+    packages=("scipy",),
+    same="the rod in its plane, four states of numpy expressions; the plane is told to it, which fastrod finds by itself.",
+    also="any equations, and a mesh that refines itself.",
+    rungs=_collocate_rungs,
+    family="scipy",
+)
