@@ -113,7 +113,7 @@ PEER = Peer(
     modules=("elastica",),
     packages=("pyelastica",),
     same="its Cosserat rod begun half an element before the wall; shear and stretch cannot be left out, so they are made stiff, the more "
-    "the finer, which takes off some of the elements' own error; rotary inertia chosen for large stable steps, the first mode critically damped, a fixed time.",
+    "the finer, which takes off some of the elements' own error; rotary inertia for large stable steps, the first mode critically damped.",
     also="dynamics, shear and stretch, contact between rods, muscles, many rods joined.",
     rungs=_rungs,
     family="PyElastica",

@@ -82,7 +82,7 @@ def _rungs(half_ends: bool) -> Sequence[Rung]:
     return [Rung(f"{n} links", partial(_chain, n, half_ends)) for n in (2, 4, 8, 16)]
 
 
-_ALSO = "dynamics, its own contact with friction between all bodies, every other robot in the same world."
+_ALSO = "dynamics, its own contact with friction between all bodies, any other robot in the same world."
 EQUAL = Peer(
     name="PyBullet chain, equal links",
     modules=("pybullet",),

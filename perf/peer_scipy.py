@@ -80,7 +80,7 @@ def _collocate(tol: float) -> Iterator[Solve]:
 
 
 def _shoot_rungs() -> Sequence[Rung]:
-    settings = (("RK23", 1e-2), ("RK23", 1e-3), ("RK45", 1e-4), ("DOP853", 1e-6), ("DOP853", 1e-9))
+    settings = (("RK23", 1e-2), ("RK45", 1e-3), ("RK45", 1e-5), ("DOP853", 1e-6), ("DOP853", 1e-9))
     return [Rung(f"{method}, rtol {rtol:.0e}", partial(_shoot, method, rtol)) for method, rtol in settings]
 
 

@@ -170,8 +170,11 @@ def test_the_bench_runs_and_what_is_missing_is_a_sentence(
     assert {row["peer"] for row in sections["peers"]["rows"]} == {"fastrod, settle", "scipy solve_bvp"}
     (summary,) = sections["peers_summary"]["rows"]
     assert summary["peer"] == "scipy solve_bvp"
-    own, other = sections["peers_batch"]["rows"]
-    assert own["how"] == "one call"
-    assert other["extrapolated"]
-    assert own["error_m"] < bench_peers.BATCH_ERROR
+    coarse = sections["peers_batch_1e-04"]["rows"]
+    assert [row["peer"] for row in coarse] == ["fastrod, settle", "scipy solve_bvp"]
+    assert coarse[0]["how"] == "one call"
+    assert all(row["error_m"] < 1e-4 and row["measured"] == 64 for row in coarse)
+    fine = sections["peers_batch_1e-06"]  # the two settings of a quick run are not that good
+    assert fine["rows"] == []
+    assert fine["notes"][1].startswith("Not that accurate at any measured setting: fastrod, settle (")
     assert file.read_bytes()[:4] == b"\x89PNG"
