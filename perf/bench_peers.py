@@ -37,7 +37,7 @@ _SEED = 10
 _ENOUGH = 0.3  # s: a solve is repeated for about so long, and its best time counts
 _MOST = 20
 _SAMPLE = 1.0  # s: about so long is one solve after the other measured, for the time of the batch
-_CALL = 4.0  # s: a batch of all that would take longer, solved one by one, is measured with fewer
+_CALL = 7.0  # s: a batch of all that would take longer, solved one by one, is measured with fewer
 _FEWEST = 256  # but not with fewer than these
 
 
