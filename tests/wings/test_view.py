@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import os
 import signal
 import socket
@@ -19,7 +21,7 @@ from fastrod.robotfile import load_robot
 from fastrod.simulated import SimulatedRobot
 from fastrod_viewer.app import DEMO_LOG, App, found
 from fastrod_viewer.playback import Playback
-from fastrod_viewer.server import free_port, is_loopback
+from fastrod_viewer.server import free_port, is_loopback, serve
 from fastrod_viewer.worlds import FreeWorld, SceneWorld
 
 
@@ -61,6 +63,34 @@ def test_a_port_in_use_names_a_free_one() -> None:
         with pytest.raises(InputError, match=f"port {port} is in use on 127.0.0.1; "):
             free_port("127.0.0.1", port)
     assert free_port("127.0.0.1", 0) == 0
+
+
+class _Changing(asyncio.Event):
+    """Its waiters change while another thread wakes them, once."""
+
+    raised = False
+
+    def set(self) -> None:
+        super().set()
+        if not self.raised:
+            self.raised = True
+            raise RuntimeError("deque mutated during iteration")
+
+
+def test_a_message_is_sent_although_a_client_began_to_wait_in_that_moment() -> None:
+    serve(port=0).stop()
+    from viser._messages import ResetGuiMessage
+    from viser.infra._async_message_buffer import AsyncMessageBuffer
+
+    event = _Changing()
+    with contextlib.closing(asyncio.new_event_loop()) as loop:
+        buffer = AsyncMessageBuffer(loop, persistent_messages=True, message_event=event)
+        buffer.push(ResetGuiMessage())
+        assert event.raised
+        assert len(buffer.message_from_id) == 1
+        event.clear()
+        loop.run_until_complete(asyncio.sleep(0))  # what was left to do in the loop's own thread
+        assert event.is_set()
 
 
 def test_loopback_is_told_from_the_rest() -> None:

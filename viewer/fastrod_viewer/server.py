@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
 import io
 import ipaddress
 import socket
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fastrod.errors import InputError
 
@@ -26,8 +27,29 @@ def serve(host: str = "127.0.0.1", port: int | None = None) -> viser.ViserServer
         import viser
     except ImportError as error:
         raise InputError("viser is not installed; pip install 'fastrod[viewer]' brings it.") from error
+    _push_from_any_thread()
     with contextlib.redirect_stdout(io.StringIO()):  # it greets with a box
         return viser.ViserServer(host=host, port=free_port(host, port), verbose=False)
+
+
+@functools.cache
+def _push_from_any_thread() -> None:
+    """viser 1.1 wakes its senders from the thread that draws, while its own thread may be changing the queue of those who wait: once in
+    some hours of motion that raises in the middle of a picture. By then the message is in the buffer; only the waking is left to do."""
+    from viser.infra._async_message_buffer import AsyncMessageBuffer
+
+    plain: Any = AsyncMessageBuffer.push
+
+    @functools.wraps(plain)
+    def push(self: Any, message: Any) -> None:
+        try:
+            plain(self, message)
+        except RuntimeError as error:
+            if "mutated during iteration" not in str(error):
+                raise
+            self.event_loop.call_soon_threadsafe(self.message_event.set)
+
+    setattr(AsyncMessageBuffer, "push", push)  # noqa: B010 - mypy forbids assigning to a method
 
 
 def free_port(host: str, port: int | None) -> int:
