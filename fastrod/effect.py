@@ -16,11 +16,12 @@ from enum import Enum
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
+from sys import float_info
 from typing import Any, ClassVar, Literal, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
-from fastrod.errors import EffectError, UnknownNameError, nearest
+from fastrod.errors import EffectError, UnknownNameError, nearest, shown
 from fastrod.ports import EffectPorts
 from fastrod.types import Floats
 from fastrod.wiring import Wiring
@@ -256,9 +257,13 @@ def read_values(name: str, given: Mapping[str, object], wiring: Wiring, where: s
             )
         for number in listed:
             low, high = parameter.bounds
-            if isinstance(number, bool) or not isinstance(number, (int, float)) or not low <= number <= high:
+            if (
+                isinstance(number, bool)
+                or not isinstance(number, (int, float))
+                or not (low <= number <= high and abs(number) <= float_info.max)
+            ):
                 raise EffectError(
-                    f"{where}: {parameter.name} of effect {name!r} is {number!r} {parameter.unit}; "
+                    f"{where}: {parameter.name} of effect {name!r} is {shown(number)} {parameter.unit}; "
                     f"it must be a number from {low:g} to {high:g}."
                 )
             values.append(float(number))

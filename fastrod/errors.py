@@ -46,3 +46,14 @@ def nearest(name: str, known: Iterable[str]) -> str:
     names = sorted(known)
     close = difflib.get_close_matches(name, names, n=1)
     return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names) or 'none'}."
+
+
+def shown(value: object, longest: int = 200) -> str:
+    """What was given, as an error sentence quotes it: its repr, cut in the middle where it is long.
+
+    >>> shown("a" * 30, 20)
+    "'aaaaaaa ... aaaaaa'"
+    """
+    text = repr(value)
+    half = (longest - 5) // 2
+    return text if len(text) <= longest else f"{text[: longest - 5 - half]} ... {text[-half:]}"

@@ -14,7 +14,7 @@ from typing import Any, TypedDict
 import msgspec
 import tomli_w
 
-from fastrod.errors import RobotError, UnknownNameError, nearest
+from fastrod.errors import RobotError, UnknownNameError, nearest, shown
 from fastrod.robot import MODES, Robot, Segment, Tendon
 
 _MODULI = ("youngs_modulus", "shear_modulus", "second_moment", "polar_moment")
@@ -38,12 +38,12 @@ def load_robot(source: str | Path) -> Robot:
     if text in robot_names():
         return loads(files("fastrod").joinpath("robots").joinpath(f"{text}.toml").read_text(encoding="utf-8"), text)
     path = Path(source)
-    if path.suffix != ".toml" and not path.is_file():
-        raise UnknownNameError(f"no robot {text!r}; {nearest(text, robot_names())} A path must end in .toml.")
     try:
-        content = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise RobotError(f"robot file {text!r} cannot be read: {getattr(error, 'strerror', None) or error}.") from error
+        if path.suffix != ".toml" and not path.is_file():
+            raise UnknownNameError(f"no robot {shown(text)}; {nearest(text, robot_names())} A path must end in .toml.")
+        content = path.read_text(encoding="utf-8-sig")
+    except (OSError, ValueError) as error:  # ValueError: bytes that are no text, or a path that no file can have
+        raise RobotError(f"robot file {shown(text)} cannot be read: {getattr(error, 'strerror', None) or error}.") from error
     return loads(content, text)
 
 
@@ -53,6 +53,10 @@ def loads(text: str, where: str = "robot file") -> Robot:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise RobotError(f"{where} is not TOML: {error}.") from error
+    except RecursionError as error:
+        raise RobotError(f"{where} is not a robot: its tables stand too deep in one another.") from error
+    except ValueError as error:  # of a whole number of thousands of digits
+        raise RobotError(f"{where} holds a number that nothing has: {str(error).partition(';')[0]}.") from error
     _check_keys(data, ("name", "segment", "base", "world", "effect", "log", "fit", "sensor"), where)
     segments = data.get("segment", [])
     if not isinstance(segments, list):
@@ -106,8 +110,11 @@ def save_robot(robot: Robot, path: str | Path) -> None:
         raise RobotError(f"{str(path)!r} does not end in .toml; a robot file does.")
     part = target.with_suffix(".toml.part")
     try:
-        part.write_text(dumps(robot), encoding="utf-8")
+        text = dumps(robot).encode()
+        part.write_bytes(text)
         part.replace(target)
+    except ValueError as error:  # a name that is no text, or a path that no file can have
+        raise RobotError(f"{str(path)!r} cannot be written: {error}.") from error
     except OSError as error:
         part.unlink(missing_ok=True)
         raise RobotError(f"{str(path)!r} cannot be written: {error.strerror}.") from error
@@ -187,7 +194,7 @@ def _convert(value: Any, key: str, where: str, kind: Any = None) -> Any:
 
 def _check_keys(table: Any, known: Iterable[str], where: str) -> None:
     if not isinstance(table, Mapping):
-        raise RobotError(f"{where} is {table!r}; it must be a table.")
+        raise RobotError(f"{where} is {shown(table)}; it must be a table.")
     names = list(known)
     for key in table:
         if key not in names:
@@ -201,8 +208,8 @@ def _check_needed(table: Mapping[str, Any], needed: Iterable[str], where: str) -
 
 def _plain(error: msgspec.ValidationError) -> str:
     """One of our own sentences as it is; one of msgspec's with the place in front."""
-    sentence, _, place = str(error).replace("`", "'").partition(" - at '$.")
-    place = place.rstrip("'")
-    numbered = re.sub(r"\[(\d+)\]", lambda m: f" {int(m[1]) + 1}", place)  # robot files count from 1
+    sentence, _, place = str(error).replace("`", "'").partition(" - at '$")
+    place = place.rstrip("'").replace("[...]", "").removeprefix(".")
+    numbered = re.sub(r"\[(\d+)\]", lambda m: f" {int(m[1]) + 1}", place).strip()  # robot files count from 1
     end = "" if sentence.endswith((".", "?")) else "."
     return f"{numbered}: {sentence}{end}" if numbered else sentence + end
