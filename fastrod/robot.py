@@ -19,14 +19,23 @@ MODES: tuple[str, ...] = get_args(Mode)
 _LONGEST = 10.0  # m; a longer segment was given in mm
 
 
-def _positive(where: str, value: float, unit: str) -> None:
+_SHORTEST = 1e-6  # m
+_STIFF = (1e-20, 1e15)  # N m^2
+_MOST = 1e9  # of any other number, in its unit: beyond it products of a few numbers leave what a float can hold
+
+
+def _positive(where: str, value: float, unit: str, low: float = 0.0, high: float = math.inf) -> None:
     if not (math.isfinite(value) and value > 0.0):
         raise RobotError(f"{where} is {value!r} {unit}; it must be positive and finite.")
+    if not low <= value <= high:
+        raise RobotError(f"{where} is {value!r} {unit}; it must be between {low:g} and {high:g} {unit}.")
 
 
 def _finite(where: str, values: tuple[float, ...], count: int, unit: str) -> None:
     if len(values) != count or not all(math.isfinite(v) for v in values):
         raise RobotError(f"{where} is {list(values)!r}; it must be {count} finite numbers [{unit}].")
+    if any(abs(v) > _MOST for v in values):
+        raise RobotError(f"{where} is {list(values)!r}; its numbers must be between {-_MOST:g} and {_MOST:g} {unit}.")
 
 
 def _per_segment(value: float | tuple[float, ...], n_crossed: int, where: str) -> tuple[float, ...]:
@@ -67,14 +76,14 @@ class Tendon:
             if isinstance(getattr(self, name), list):
                 object.__setattr__(self, name, tuple(getattr(self, name)))
         for offset in self.offset if isinstance(self.offset, tuple) else (self.offset,):
-            _positive("Tendon.offset", offset, "m")
+            _positive("Tendon.offset", offset, "m", _SHORTEST, _LONGEST)
         angles = self.angle if isinstance(self.angle, tuple) else (self.angle,)
         _finite("Tendon.angle", angles, len(angles), "rad")
         if any(abs(a) > 2.0 * math.pi + 1e-6 for a in angles):
             raise RobotError(f"Tendon.angle is {self.angle!r} rad; more than a turn. Was it given in degrees?")
-        if not (math.isfinite(self.compliance) and self.compliance >= 0.0):
+        if not 0.0 <= self.compliance <= _MOST:
             raise RobotError(f"Tendon.compliance is {self.compliance!r} m/N; it must be zero or positive, for example 1e-5.")
-        if not math.isfinite(self.pretension) or (self.unilateral and self.pretension < 0.0):
+        if not abs(self.pretension) <= _MOST or (self.unilateral and self.pretension < 0.0):
             raise RobotError(
                 f"Tendon.pretension is {self.pretension!r} N; it must be finite, and not negative for a wire that can go slack."
             )
@@ -111,11 +120,12 @@ class Segment:
         _positive("Segment.length", self.length, "m")
         if self.length > _LONGEST:
             raise RobotError(f"Segment.length is {self.length!r} m; more than {_LONGEST:g} m. Was it given in mm?")
+        _positive("Segment.length", self.length, "m", _SHORTEST)
         if not isinstance(self.bending_stiffness, (tuple, list)) or len(self.bending_stiffness) != 2:
             raise RobotError(f"Segment.bending_stiffness is {self.bending_stiffness!r}; give two values, EI_x and EI_y [N m^2].")
         for value in self.bending_stiffness:
-            _positive("Segment.bending_stiffness", value, "N m^2")
-        _positive("Segment.torsional_stiffness", self.torsional_stiffness, "N m^2")
+            _positive("Segment.bending_stiffness", value, "N m^2", *_STIFF)
+        _positive("Segment.torsional_stiffness", self.torsional_stiffness, "N m^2", *_STIFF)
         _finite("Segment.precurvature", self.precurvature, 3, "1/m")
         _finite("Segment.extension", self.extension, 2, "m")
         low, high = self.extension
@@ -124,7 +134,7 @@ class Segment:
                 f"Segment.extension is {list(self.extension)!r} m; "
                 f"give [smallest, largest] change of the {self.length:g} m length, around 0."
             )
-        if not (math.isfinite(self.line_density) and self.line_density >= 0.0):
+        if not 0.0 <= self.line_density <= _MOST:
             raise RobotError(f"Segment.line_density is {self.line_density!r} kg/m; it must be zero or positive.")
         if self.mode not in MODES:
             raise RobotError(f"Segment.mode is {self.mode!r}; {nearest(str(self.mode), MODES)}")
@@ -172,6 +182,7 @@ class Robot:
             norm = math.hypot(*self.base_quaternion)
             raise RobotError(f"Robot.base_quaternion {list(self.base_quaternion)!r} has norm {norm:.6g}; it must be 1.")
         _finite("Robot.gravity", self.gravity, 3, "m/s^2")
+        self._check_sensor()
         paper = [segment.mode == "paper" for segment in self.segments]
         if any(paper) and not all(paper):
             raise RobotError(
@@ -194,6 +205,17 @@ class Robot:
         total = sum(segment.length for segment in self.segments)
         if any(not 0.0 <= s <= total for s in self.log_points):
             raise RobotError(f"[log] points is {list(self.log_points)!r}; each must be an arclength between 0 and {total:g} m.")
+
+    def _check_sensor(self) -> None:
+        for key, value in self.sensor.items():
+            most = {"registration_sd": 2, "noise": 3}.get(key, 1)
+            numbers = value if isinstance(value, (list, tuple)) else (value,)
+            if not 1 <= len(numbers) <= most or (key == "registration_sd" and isinstance(value, (list, tuple)) and len(value) != 2):
+                raise RobotError(f"[sensor] {key} has {len(numbers)} numbers; give one{', or two: m and rad' if most == 2 else ''}.")
+            if most == 1 and isinstance(value, (list, tuple)):
+                raise RobotError(f"[sensor] {key} is {list(value)!r}; give one number.")
+            if not all(0.0 <= number <= _MOST for number in numbers):
+                raise RobotError(f"[sensor] {key} is {value!r}; it must be zero or positive, and finite.")
 
     @property
     def n_segments(self) -> int:
