@@ -16,6 +16,9 @@ from fastrod.types import Floats, Layout, Params, Ports
 PointForces: TypeAlias = Sequence[tuple[ArrayLike, ArrayLike]]
 
 
+_MOST = 1e12  # of any unit; products of a few such numbers still are floats
+
+
 class Inputs(NamedTuple):
     """What a caller may give at one step; shapes, units and frames as in `Simulator.step`."""
 
@@ -80,10 +83,10 @@ class Reader:
         """(1 or n_robots, *shape), finite but for rows that are noted as problems."""
         try:
             a = np.asarray(value)
-            if np.iscomplexobj(a):
+            if a.dtype.kind in "cmM":
                 raise TypeError
             a = a.astype(np.float64)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise InputError(f"{name} is not an array of numbers; give (n_robots, {', '.join(map(str, shape))}) [{unit}].") from error
         if a.shape == shape:
             a = a[None]
@@ -91,9 +94,11 @@ class Reader:
             wanted = ", ".join(map(str, shape))
             raise InputError(f"{name} has shape {np.shape(value)}; it must be ({self.n_robots}, {wanted}) or ({wanted},) [{unit}].")
         a = np.array(a, order="C")  # a copy: the caller may write into his own before the next step asks what has changed
-        if not np.isfinite(a.sum()):
-            bad = ~np.isfinite(a.reshape(len(a), -1)).all(1)
-            self._note(bad, lambda i: f"{name} holds a value that is not finite: {a[i].ravel()[:6]}.")
+        if not np.vdot(a, a) < _MOST**2:
+            finite, small = (np.asarray(good.reshape(len(a), -1).all(1)) for good in (np.isfinite(a), np.abs(a) < _MOST))
+            self._note(~finite, lambda i: f"{name} holds a value that is not finite: {_line(a[i].ravel()[:6])}.")
+            self._note(~small, lambda i: f"{name} holds a value beyond {_MOST:g} {unit}: {_line(a[i].ravel()[:6])}.")
+            a[~(np.abs(a) < _MOST)] = np.nan  # these rows are left out; nan passes through without a warning, inf does not
         return a
 
     def _optional(self, name: str, value: ArrayLike | None, shape: tuple[int, ...], unit: str) -> Floats:
@@ -115,7 +120,7 @@ class Reader:
         if bad.any():
 
             def sentence(i: int) -> str:
-                given, least, most = (np.array2string(a[min(i, len(a) - 1)], precision=6) for a in (stretch, low, high))
+                given, least, most = (_line(a[min(i, len(a) - 1)], 6) for a in (stretch, low, high))
                 return f"extension {given} m lies outside the range of the segments, {least} to {most} m."
 
             self._note(bad, sentence)
@@ -135,7 +140,7 @@ class Reader:
         slack, rows = self._slack, layout.row_tendon
         with np.errstate(invalid="ignore"):
             longer = lengths - ends
-            if lengths.min() > 0.0 and (np.abs(longer) <= slack).all():
+            if lengths.min(initial=np.inf) > 0.0 and (np.abs(longer) <= slack).all():
                 return lengths
             long = (longer > slack) & ~params.unilateral  # a wire that can go slack may hang as loose as it likes
             bad = ((lengths <= 0.0) | (-longer > slack) | long | (lengths > 20.0 * ends))[:, rows].any(1)
@@ -168,8 +173,7 @@ class Reader:
         bad = np.abs(norm - 1.0) > 1e-3
         if bad.any():
             self._note(bad, lambda i: f"base_pose has a quaternion of norm {norm[min(i, len(norm) - 1)]:.4g}; it must be 1, as w x y z.")
-            norm[~(norm > 0.0)] = 1.0
-        pose[:, 3:] /= norm[:, None]
+        pose[:, 3:] /= np.where(bad, 1.0, norm)[:, None]
         return pose
 
     def point_forces(self, point_force: PointForces | None, stretch: Floats) -> tuple[Floats, Floats]:
@@ -177,12 +181,14 @@ class Reader:
         layout, params = self.layout, self.params
         n_segments, n_steps = len(layout.first_tendon), layout.n_steps
         self.loads = np.zeros((1, 0)), np.zeros((1, 0, 3))
-        if point_force is None or (isinstance(point_force, (list, tuple)) and not point_force):
+        if point_force is None:
             return np.zeros((0, n_segments, n_steps + 1)), np.zeros((0, n_segments * n_steps + 1, 3))
         try:
             pairs = [(np.atleast_1d(np.asarray(s, float))[:, None], f) for s, f in point_force]
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise InputError("point_force must be (arclength [m], force [N]) pairs, for example [(0.03, (0, 0.1, 0))].") from error
+        if not pairs:
+            return self.point_forces(None, stretch)
         at = [self._array("arclength of a point_force", s, (1,), "m")[:, 0] for s, _ in pairs]
         forces = [self._array("point_force", f, (3,), "N") for _, f in pairs]
         ends = np.cumsum(params.length + stretch, axis=1)
@@ -192,7 +198,7 @@ class Reader:
         total = starts[:, -1:]
         self._note(
             ((s < 0.0) | (s > total * (1.0 + 1e-9))).any(1),
-            lambda i: f"point_force at arclength {s[i]} m; the rod runs from 0 to {total[i, 0]:.6g} m.",
+            lambda i: f"point_force at arclength {_line(s[i])} m; the rod runs from 0 to {total[i, 0]:.6g} m.",
         )
         grid, node = np.empty((n, n_segments, n_steps + 1)), np.empty(s.shape, np.int64)
         if (crowded := place_all(np.ascontiguousarray(s), np.ascontiguousarray(starts), n_steps, grid, node)) >= 0:
@@ -236,6 +242,11 @@ def _per_step(sampled: Floats, nodes: Floats) -> Floats:
     rise = 12.0 * (np.diff(M, axis=2) - middle * np.diff(F, axis=2)) / width**2
     pairs = np.stack([mean - 0.5 * rise, mean + 0.5 * rise], axis=3)
     return np.asarray(pairs.reshape(n, f.shape[1], -1, 3))
+
+
+def _line(a: Floats, precision: int | None = None) -> str:
+    """Numbers of an error sentence, in one line however many they are."""
+    return np.array2string(a, precision=precision, max_line_width=10**6)
 
 
 def _length_sentence(lengths: Floats, ends: Floats) -> str:

@@ -96,7 +96,7 @@ class EffectPorts:
         n_k = 2 * self.n_steps + 1
         for name in ("stiffness", "precurvature"):
             port = getattr(self, name)
-            setattr(self, name, np.array(np.broadcast_to(port, (*port.shape[:2], n_k, 3))))
+            setattr(self, name, np.array(np.broadcast_to(port, (*port.shape[:2], n_k, 3)), order="C"))
 
     @property
     def fraction(self) -> Floats:

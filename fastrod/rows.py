@@ -21,7 +21,7 @@ def taken(now: Any, then: Any, rows: Flags) -> Any:
         return now
     if len(now) == 1 and len(then) == 1 and np.array_equal(now, then, equal_nan=now.dtype.kind == "f"):
         return now
-    merged = np.array(np.broadcast_to(now, (len(rows), *now.shape[1:])))
+    merged = np.array(np.broadcast_to(now, (len(rows), *now.shape[1:])), order="C")  # kernels are compiled anew for any other order
     merged[rows] = np.broadcast_to(then, merged.shape)[rows]
     return merged
 

@@ -7,7 +7,7 @@ from typing import TypedDict
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fastrod.errors import InputError, RobotError
+from fastrod.errors import InputError, RobotError, shown
 from fastrod.robot import Robot
 from fastrod.types import Floats
 from fastrod.wiring import wire
@@ -70,15 +70,15 @@ class SegmentActions:
         """Wire lengths and extensions of an action (..., 3 n_segments) [m]. Raises `InputError` where it is not one."""
         try:
             a = np.asarray(action, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise InputError(f"action is {action!r}; give {self.n_actions} numbers [m].") from error
+        except (TypeError, ValueError, OverflowError) as error:
+            raise InputError(f"action is {shown(action)}; give {self.n_actions} numbers [m].") from error
         if a.ndim == 0 or a.shape[-1] != self.n_actions:
             raise InputError(
                 f"action has shape {a.shape}; it must be (..., {self.n_actions}): extension and two displacements for each of "
                 f"{self.robot.n_segments} segments, base first [m]."
             )
         if not np.isfinite(a).all():
-            raise InputError(f"action holds a value that is not finite: {a.ravel()[:9]}.")
+            raise InputError(f"action holds a value that is not finite: {a.ravel()[:9].tolist()}.")
         change = a @ self.matrix.T
         return WireInputs(
             tendon_length=self.robot.rest_tendon_length + change[..., : self.robot.n_tendons],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from sys import float_info
 from typing import Any, Literal
 
 import numba
@@ -16,7 +17,7 @@ from fastrod.contact.engine import Engine
 from fastrod.contact.frames import blended
 from fastrod.contact.scene import ContactScene
 from fastrod.contact.step import COLD_PASSES, Ways, contact_step
-from fastrod.errors import InputError, RobotError
+from fastrod.errors import InputError, RobotError, shown
 from fastrod.guess import cold_start
 from fastrod.inputs import Inputs, PointForces, Reader
 from fastrod.kernels.dense import between_nodes
@@ -72,7 +73,7 @@ class Simulator:
         """
         robots = [robot] if isinstance(robot, Robot) else list(robot) if isinstance(robot, (list, tuple)) else []
         if not robots or not all(isinstance(r, Robot) for r in robots):
-            raise RobotError(f"robot is {robot!r}; give a Robot, for example fastrod.load_robot('prototype'), or a list of them.")
+            raise RobotError(f"robot is {shown(robot)}; give a Robot, for example fastrod.load_robot('prototype'), or a list of them.")
         if n_robots is None:
             n_robots = len(robots)
         if not isinstance(n_robots, (int, np.integer)) or n_robots < 1:
@@ -88,7 +89,7 @@ class Simulator:
             raise InputError(f"observer is {observer!r}; give fastrod.Observer(...) or None.")
         if threads is not None and (not isinstance(threads, int) or not 1 <= threads <= _config.NUMBA_NUM_THREADS):
             raise InputError(f"threads is {threads!r}; it must be a whole number from 1 to {_config.NUMBA_NUM_THREADS} here.")
-        if not isinstance(hold_gain, (int, float, np.floating)) or not 0.0 <= hold_gain < np.inf:
+        if not isinstance(hold_gain, (int, float, np.floating)) or not 0.0 <= hold_gain <= float_info.max:
             raise InputError(f"hold_gain is {hold_gain!r} m; it must be a number, zero or positive.")
         self.hold_gain = float(hold_gain)
         self.robots = tuple(robots)
@@ -171,9 +172,10 @@ class Simulator:
         given = Inputs(tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force, follower_tip_force, base_pose)
         if self._felt is not None:
             return self._touch(self._felt, given, obstacle_pose, obstacle_velocity, None)
-        self._move_obstacles(obstacle_pose, obstacle_velocity)
+        moved = self._moved_obstacles(obstacle_pose, obstacle_velocity)
         tracked = len(self._passes.memory.force_before) > 0
         ports, rows = self._read(given)
+        self._move_obstacles(moved)
         process, noise = self.observer.process_noise * self.dt, self.observer.measurement_noise / self.dt
         before = self._ports
         learns = before is not None and not tracked and len(self._passes.memory.force_before) > 0
@@ -235,9 +237,10 @@ class Simulator:
             if rows is not None:
                 raise InputError("settle with rows is for simulators without a contact scene; settle all, or restore a snapshot's rows.")
             return self._touch(self._felt, given, obstacle_pose, obstacle_velocity, tolerance)
-        self._move_obstacles(obstacle_pose, obstacle_velocity)
+        moved = self._moved_obstacles(obstacle_pose, obstacle_velocity)
         only = None if rows is None else self._mask(rows)
         ports, read = self._read(given, only)
+        self._move_obstacles(moved)
         return self._settle(ports, read, tolerance, only)
 
     def _touch(
@@ -335,8 +338,8 @@ class Simulator:
         state, ports = self._full("shape"), self._last("shape")[1]
         try:
             s = np.asarray(arclength, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise InputError(f"arclength is {arclength!r}; give numbers [m], (n_queries,) or (n_robots, n_queries).") from error
+        except (TypeError, ValueError, OverflowError) as error:
+            raise InputError(f"arclength is {shown(arclength)}; give numbers [m], (n_queries,) or (n_robots, n_queries).") from error
         s = np.broadcast_to(s, (self.n_robots, s.shape[1])) if s.ndim == 2 and len(s) == 1 else s
         s = np.broadcast_to(np.atleast_1d(s), (self.n_robots, s.shape[-1] if s.ndim else 1)) if s.ndim <= 1 else s
         if s.ndim != 2 or len(s) != self.n_robots:
@@ -399,10 +402,13 @@ class Simulator:
         """
         engine = self._contact("set_free")
         k = engine.scene.index(obstacle)
-        numbers = np.concatenate([np.ravel(translation), np.ravel(rotation), np.ravel(center)]).astype(float)
+        try:
+            numbers = np.concatenate([np.ravel(translation), np.ravel(rotation), np.ravel(center)]).astype(float)
+        except (TypeError, ValueError, OverflowError):
+            numbers = np.full(0, np.nan)
         if numbers.shape != (13,) or not np.isfinite(numbers).all() or not numbers[0] >= 0.0:
             raise InputError(
-                f"the mobility of {obstacle!r} is {numbers}; give [m/N], (3, 3) [rad/(N m)] and (3,) [m], finite, none negative."
+                f"the mobility of {obstacle!r} is {numbers.tolist()}; give [m/N], (3, 3) [rad/(N m)] and (3,) [m], finite, none negative."
             )
         engine.surfaces.give[k] = numbers
         engine.surfaces.body[k] = k if body is None else len(engine.surfaces.body) + body
@@ -427,15 +433,19 @@ class Simulator:
         to `longest` [m]. Raises `InputError` without a contact scene, on a wrong shape or a direction of length 0."""
         return queries.ray_cast(self._contact("ray_cast"), origin, direction, longest)
 
-    def _move_obstacles(self, pose: Mapping[str, ArrayLike] | None, velocity: Mapping[str, ArrayLike] | None) -> None:
-        """Obstacles that no rod feels."""
+    def _moved_obstacles(self, pose: Mapping[str, ArrayLike] | None, velocity: Mapping[str, ArrayLike] | None) -> tuple[Any, Any] | None:
+        """Where obstacles that no rod feels will be, and their velocities, checked; they move once all other inputs are, too."""
         if self._engine is None:
             if pose or velocity:
                 raise InputError("obstacles were given to a simulator without a contact scene; give it one: Simulator(robot, contact=...).")
-            return
+            return None
         scene = self._engine.scene
-        self._engine.poses_before = self._engine.poses
-        self._engine.move(scene.moved(self._engine.poses, pose, self.n_robots), scene.velocities(velocity, self.n_robots), self.dt)
+        return scene.moved(self._engine.poses, pose, self.n_robots), scene.velocities(velocity, self.n_robots)
+
+    def _move_obstacles(self, moved: tuple[Any, Any] | None) -> None:
+        if self._engine is not None and moved is not None:
+            self._engine.poses_before = self._engine.poses
+            self._engine.move(*moved, self.dt)
 
     def _contact(self, what: str) -> Engine:
         if self._engine is None:
@@ -466,12 +476,9 @@ class Simulator:
 
     def reset(self, rows: ArrayLike | None = None) -> None:
         """Forget the boundary of these robots (all by default): their next step begins from the cold guess, their effects at rest."""
-        try:
-            which = slice(None) if rows is None else np.asarray(rows)
-            self._warm[which], self._derived = False, None
-            self._chain.reset(which)
-        except IndexError as error:
-            raise InputError(f"rows is {rows!r}; give indices of robots from 0 to {self.n_robots - 1}, or a mask.") from error
+        which = slice(None) if rows is None else self._mask(rows)
+        self._warm[which], self._derived = False, None
+        self._chain.reset(which)
 
     def snapshot(self) -> Snapshot:
         """A copy of everything that a later step depends on."""
@@ -549,19 +556,21 @@ class Simulator:
         """Other robots in these rows (indices, one robot each): their numbers and the values of their effects. They begin cold, their
         effects at rest. Raises `RobotError` where counts, modes or effects differ from those here, and with effects or a contact
         scene where segments or wires are elsewhere; `InputError` where rows and robots do not match."""
+        if not isinstance(robots, (list, tuple)) or not all(isinstance(robot, Robot) for robot in robots):
+            raise RobotError(f"robots is {shown(robots)}; give a list of Robot, one for each row.")
+        mask = self._mask(rows)
         which = np.asarray(rows)
-        if which.ndim != 1 or which.dtype.kind not in "iu" or len(which) != len(robots):
+        if which.ndim != 1 or which.dtype.kind == "b" or len(which) != len(robots):
             raise InputError(f"rows has shape {which.shape} for {len(robots)} robots; give the index of each.")
         if not len(which):
             return
-        mask = self._mask(which)
         _, params, rest = compile_robots([self.robots[0], *robots], self._layout.n_steps)
         chain = Chain([self.robots[0], *robots], len(robots) + 1)
         if self._engine is not None and not np.array_equal(params.length[1:], np.broadcast_to(params.length[:1], params.length[1:].shape)):
             raise RobotError("a robot has segments of another length; with a contact scene these must agree.")
 
         def put(now: Any, new: Any) -> Any:
-            full = np.array(np.broadcast_to(now, (self.n_robots, *now.shape[1:])))
+            full = np.array(np.broadcast_to(now, (self.n_robots, *now.shape[1:])), order="C")
             full[which] = new[1:]
             return full
 
@@ -583,9 +592,13 @@ class Simulator:
         """(n_robots,) of indices or a mask."""
         mask = np.zeros(self.n_robots, bool)
         try:
-            mask[np.asarray(rows)] = True
-        except IndexError as error:
-            raise InputError(f"rows is {rows!r}; give indices of robots from 0 to {self.n_robots - 1}, or a mask.") from error
+            which = np.asarray(rows)
+            if which.ndim > 1 or (which.dtype.kind == "b" and which.shape != mask.shape):
+                raise IndexError
+            if which.size:
+                mask[which] = True
+        except (IndexError, TypeError, ValueError, OverflowError) as error:
+            raise InputError(f"rows is {shown(rows)}; give indices of robots from 0 to {self.n_robots - 1}, or a mask.") from error
         return mask
 
     def _read(self, given: Inputs, only: Flags | None = None) -> tuple[Ports, Ints]:
@@ -604,8 +617,13 @@ class Simulator:
             if only is not None and bare is not None:
                 self._bare = taken_each(self._bare, bare, ~only)
                 self._passes.params = taken_each(self._passes.params, params, ~only)
-        if some_out and self._ports is not None:  # who is left out stays as extended as its boundary is
-            ports = ports._replace(extension=np.where(out[:, None], self._ports.extension, ports.extension))
+        if some_out:  # who is left out stays where it was, as extended as its boundary is, and its force does not move
+            if (then := self._ports) is None:
+                kept: dict[str, Any] = {"extension": 0.0, "tip_force": 0.0, "base_pose": self._reader.rest.base_pose}
+            else:
+                kept = {name: getattr(then, name) for name in ("extension", "tip_force", "base_pose")}
+            merged = {name: np.where(out[:, None], value, getattr(ports, name)) for name, value in kept.items()}
+            ports = ports._replace(**{name: np.ascontiguousarray(a) for name, a in merged.items()})
         track_force = len(self._passes.memory.force_before) > 0 or self._force_moves(ports.tip_force)
         self._passes.remember(len(ports.follower_force) > 0, track_force, None if self._ports is None else self._ports.tip_force)
         return ports, rows
@@ -664,8 +682,8 @@ class Simulator:
 
 
 def _check_positive(name: str, value: float, unit: str) -> None:
-    if not isinstance(value, (int, float, np.floating, np.integer)) or not (np.isfinite(value) and value > 0.0):
-        raise InputError(f"{name} is {value!r} {unit}; it must be a number, positive and finite.")
+    if not isinstance(value, (int, float, np.floating, np.integer)) or not 0.0 < value <= float_info.max:
+        raise InputError(f"{name} is {shown(value)} {unit}; it must be a number, positive and finite.")
 
 
 def _as_shape(state: State) -> Shape:

@@ -118,7 +118,7 @@ class ContactScene:
             ]
         try:
             given = np.broadcast_to(np.asarray(self.rod_radius, float), (robot.n_segments,))
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise InputError(
                 f"ContactScene.rod_radius is {self.rod_radius!r}; give one radius or {robot.n_segments}, one a segment [m]."
             ) from error
@@ -156,7 +156,7 @@ class ContactScene:
 def _rows(name: str, value: ArrayLike, width: int, n_robots: int, unit: str) -> Floats:
     try:
         a = np.atleast_2d(np.asarray(value, float))
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{name} is not an array of numbers; give ({width},) or ({n_robots}, {width}) [{unit}].") from error
     if a.ndim != 2 or a.shape[1] != width or len(a) not in (1, n_robots):
         raise InputError(f"{name} has shape {np.shape(value)}; it must be ({width},) or ({n_robots}, {width}) [{unit}].")
