@@ -25,6 +25,8 @@ _TIP = ("tip_x", "tip_y", "tip_z")
 _TIP_QUATERNION = ("tip_qw", "tip_qx", "tip_qy", "tip_qz")
 _TIP_FORCE = ("tip_fx", "tip_fy", "tip_fz")
 _BASE_QUATERNION = ("base_qw", "base_qx", "base_qy", "base_qz")
+_ALWAYS = ("t", "run", *_TIP, *_TIP_QUATERNION, *_TIP_FORCE, "payload", *_BASE_QUATERNION)
+"""Columns of every recording."""
 _KNOWN = r"t|run|payload|tip_(q?[xyz]|qw|f[xyz])|base_q[wxyz]|(dl|ext|cmd_dl|tension)_\d+|p\d+_[xyz]"
 """Names of columns that are a recorder's own, or a run log's."""
 _QUATERNION_SLACK = 1e-2  # what `read_log` allows
@@ -127,7 +129,7 @@ class Recorder:
         for name, given, size in groups:
             try:
                 row = np.asarray(given, dtype=np.float64)
-            except (TypeError, ValueError) as error:
+            except (TypeError, ValueError, OverflowError) as error:
                 raise InputError(f"{name} of the reading is {given!r}; it must be numbers.") from error
             if row.shape != (size,):
                 raise InputError(f"{name} of the reading has shape {row.shape}; robot {self.robot.name!r} needs ({size},).")
@@ -206,10 +208,10 @@ def recover(path: str | Path) -> RunLog:
         raise LogError(f"{str(part)!r} cannot be recovered: {getattr(error, 'strerror', None) or error}.") from error
     whole = lines if lines and lines[-1].endswith("\n") else lines[:-1]
     table = read_table(_rewritten(part, whole)) if len(whole) != len(lines) else read_table(part)
-    if missing := [name for name in ("t", "run", *_TIP) if name not in table]:
-        raise LogError(f"{part.name} is no recording: it lacks column {missing[0]}.")
-    if not len(table["t"]):
+    if not table.get("t", ("",)):
         raise LogError(f"{part.name} has no whole row; there is nothing to recover.")
+    if missing := [name for name in _ALWAYS if name not in table]:
+        raise LogError(f"{part.name} is no recording: it lacks column {missing[0]}.")
     names = list(table)
     rows = np.stack([numbers(table, name, part.name) for name in names if name != "run"], axis=1)
     log = _log(names, [str(label) for label in table["run"]], rows, target.stem)

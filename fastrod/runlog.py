@@ -195,7 +195,9 @@ def read_table(path: str | Path) -> Table:
     path = Path(path)
     try:
         return _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except LogError:
+        raise
+    except (OSError, ValueError, csv.Error) as error:  # ValueError: bytes that are no text, or a path that no file can have
         why = "it is not text" if isinstance(error, UnicodeDecodeError) else getattr(error, "strerror", None) or str(error)
         raise LogError(f"log {str(path)!r} cannot be read: {why}.") from error
 
@@ -246,14 +248,26 @@ def _read_parquet(path: Path) -> Table:
     _check_header(content.column_names, path.name)
     table: Table = {}
     for name in content.column_names:
-        cells = content.column(name).to_pylist()
-        if any(isinstance(cell, str) for cell in cells):
-            table[name] = ["" if cell is None else str(cell) for cell in cells]
-        else:
-            table[name] = np.array([np.nan if cell is None else cell for cell in cells], dtype=np.float64)
+        try:
+            cells = content.column(name).to_pylist()
+        except ValueError:  # times finer than Python's
+            cells = content.column(name).cast("string").to_pylist()
+        table[name] = _cells(cells)
     if not table:
         raise LogError(f"{path.name} has no columns.")
     return table
+
+
+def _cells(cells: Sequence[Any]) -> Sequence[str] | Floats:
+    """A column as numbers; as texts, where it holds anything else, such as texts, times or lists."""
+    try:
+        if not any(isinstance(cell, (str, bytes)) for cell in cells):
+            values = np.array([np.nan if cell is None else cell for cell in cells], dtype=np.float64)
+            if values.shape == (len(cells),):
+                return values
+    except (TypeError, ValueError, OverflowError):
+        pass
+    return ["" if cell is None else str(cell) for cell in cells]
 
 
 def _pyarrow(name: str) -> Any:
