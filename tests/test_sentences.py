@@ -15,6 +15,7 @@ from fastrod import Robot, Segment, Simulator, Tendon
 from fastrod.contact import ContactScene, sphere
 from fastrod.effect import Parameter, Seam, Static, effect, unregister
 from fastrod.errors import EffectError, InputError, LogError, RobotError, UnknownNameError, shown
+from fastrod.identification.excite import excitation
 from fastrod.recording import recover
 from fastrod.robotfile import dumps, load_robot, loads, save_robot
 from fastrod.rows import taken
@@ -249,3 +250,9 @@ def test_a_parquet_column_of_something_else(tmp_path: Path, kind: str) -> None:
 def test_what_is_shown_is_short() -> None:
     assert shown([1, 2]) == "[1, 2]"
     assert len(shown("x" * 10_000)) == 200
+
+
+@pytest.mark.parametrize(("name", "value"), [("bend", 1e-300), ("rate", 1e9), ("rate", 1e-9), ("speed", 1e-9), ("speed", 1e9)])
+def test_a_run_of_no_rows_or_of_too_many_is_not_made(name: str, value: float) -> None:
+    with pytest.raises(InputError, match=f"{name} is {value!r} .*; it must be between"):
+        excitation(load_robot("prototype"), **{name: value})

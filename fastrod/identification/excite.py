@@ -24,6 +24,8 @@ _PAUSE = 1.5  # s, for turning the base and hanging the load
 _HOLD = 4.0  # s
 _RANDOM = 10.0  # s
 _REPEAT = 20.0  # s of the first block, at the end
+_RANGES = {"bend": (0.01, 3.0), "rate": (0.5, 1000.0), "speed": (0.01, 100.0)}
+"""What makes a run of some rows and of less than a gigabyte [rad], [Hz], [rad/s]."""
 _LADDER = (1.0, 0.6, 0.28)  # of the largest bend: triangles of decreasing amplitude
 
 
@@ -77,12 +79,15 @@ def excitation(
     for name, value, unit in (("bend", bend, "rad"), ("rate", rate, "Hz"), ("speed", speed, "rad/s")):
         if not (np.isfinite(value) and value > 0.0):
             raise InputError(f"{name} is {value!r} {unit}; it must be positive.")
+        low, high = _RANGES[name]
+        if value < low or (value > high and name != "bend"):
+            raise InputError(f"{name} is {value!r} {unit}; it must be between {low:g} and {high:g} {unit}.")
     if payload is None:
         softest = min(min(segment.bending_stiffness) for segment in robot.segments)
         payload = round(softest / robot.length**2 / 9.81, 3)
     if not 0.0 <= payload <= 10.0:
         raise InputError(f"payload is {payload!r} kg; it must be between 0 and 10 kg.")
-    if bend > 3.0:
+    if bend > _RANGES["bend"][1]:
         raise InputError(f"bend is {bend!r} rad; a segment bends by 3 rad at most. Was it given in degrees?")
     wiring = wire(robot)
     rng = np.random.default_rng(seed)

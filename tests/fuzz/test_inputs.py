@@ -135,7 +135,7 @@ def tried_call(sim: Simulator, call: str, given: dict[str, Any]) -> State | None
     return state
 
 
-@tried(150)
+@tried(80)
 @given(given_=inputs(), call=st.sampled_from(["step", "settle"]), kind=st.sampled_from(["plain", "effects"]), warm=st.booleans())
 def test_odd_inputs_are_a_state_or_a_sentence_that_changes_nothing(given_: dict[str, Any], call: str, kind: str, warm: bool) -> None:
     sim, twin = simulator(kind), simulator(kind)
@@ -184,7 +184,7 @@ odd_rows = st.one_of(
 )  # fmt: skip
 
 
-@tried(120)
+@tried(80)
 @given(
     rows=odd_rows,
     what=st.sampled_from(["reset", "settle", "restore", "replace", "shape", "tolerance", "inverse"]),

@@ -232,7 +232,7 @@ def test_an_odd_parquet_is_a_log_or_a_sentence(folder: Path, data: st.DataObject
     assert read(path) is None
 
 
-@tried(12)
+@tried(8)
 @given(text=texts())
 def test_replay_of_an_odd_log_answers(folder: Path, text: str) -> None:
     path, out = folder / "replayed.csv", folder / "replayed"

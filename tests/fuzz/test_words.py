@@ -83,7 +83,7 @@ def test_logs_that_are_not_there_are_refused(elsewhere: Path, command: str, rest
 
 @tried(40)
 @given(
-    bend=st.sampled_from(["nan", "inf", "-1", "0", "50", "1e400", "1e-300", "x", "0.5"]),
+    bend=st.sampled_from(["nan", "inf", "-1", "0", "50", "1e400", "1e-300", "x"]),
     rate=st.sampled_from(["nan", "inf", "-1", "0", "1e9", "1e-9", "x"]),
     other=st.sampled_from(
         [[], ["--payload", "nan"], ["--payload", "-1"], ["--payload", "inf"], ["--payload", "1e9"], ["--speed", "0"], ["--speed", "nan"]]
