@@ -78,7 +78,7 @@ class SegmentActions:
                 f"{self.robot.n_segments} segments, base first [m]."
             )
         if not np.isfinite(a).all():
-            raise InputError(f"action holds a value that is not finite: {a.ravel()[:9].tolist()}.")
+            raise InputError(f"action holds a value that is not finite: {np.array2string(a.ravel()[:9], max_line_width=1000)}.")
         change = a @ self.matrix.T
         return WireInputs(
             tendon_length=self.robot.rest_tendon_length + change[..., : self.robot.n_tendons],

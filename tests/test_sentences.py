@@ -256,3 +256,28 @@ def test_what_is_shown_is_short() -> None:
 def test_a_run_of_no_rows_or_of_too_many_is_not_made(name: str, value: float) -> None:
     with pytest.raises(InputError, match=f"{name} is {value!r} .*; it must be between"):
         excitation(load_robot("prototype"), **{name: value})
+
+
+def test_modes_say_what_they_take() -> None:
+    lengths = rod().rest_tendon_length
+    with pytest.raises(InputError, match="follower_tip_force was given, but mode paper has dead loads only"):
+        Simulator(rod("paper")).step(lengths, follower_tip_force=(0.0, 0.0, 0.1))
+    with pytest.raises(InputError, match="tension is missing; segments in mode tendon_tension need tension"):
+        Simulator(rod("tendon_tension")).step()
+    with pytest.raises(RobotError, match="A segment in mode 'paper' needs tendons; give some, or mode 'passive'"):
+        rod("paper", 0)
+    tip = Simulator(rod(), outputs="tip")
+    tip.settle(lengths)
+    with pytest.raises(InputError, match=r"shape needs Simulator\(..., outputs='full'\); this one keeps the tip only"):
+        tip.shape(0.01)
+
+
+def test_a_snapshot_belongs_to_its_simulator() -> None:
+    sim, _, lengths = pair()
+    sim.settle(lengths)
+    with pytest.raises(InputError, match="another simulator; its robots, tendons or their number differ"):
+        Simulator(rod(), 2).restore(sim.snapshot())
+    with pytest.raises(InputError, match="another simulator; its effects differ"):
+        Simulator(replace(rod(), effects=({"name": "creep", "share": 0.1},)), 3).restore(sim.snapshot())
+    with pytest.raises(InputError, match=r"rows has shape \(2,\) for 1 robots; give the index of each"):
+        sim.replace([0, 1], [sim.robots[0]])
