@@ -201,7 +201,7 @@ class Reader:
             lambda i: f"point_force at arclength {_line(s[i])} m; the rod runs from 0 to {total[i, 0]:.6g} m.",
         )
         grid, node = np.empty((n, n_segments, n_steps + 1)), np.empty(s.shape, np.int64)
-        if (crowded := place_all(np.ascontiguousarray(s), np.ascontiguousarray(starts), n_steps, grid, node)) >= 0:
+        if (crowded := place_all(np.array(s, order="C"), np.array(starts, order="C"), n_steps, grid, node)) >= 0:
             raise InputError(
                 f"the point forces on one segment of robot {crowded} are more than its {n_steps} steps have nodes for; "
                 f"give Simulator more points_per_segment, up to {s.shape[1] + 1}."

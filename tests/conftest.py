@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
+import numba
 import pytest
 from rods import Table
 from truthfiles import rows
@@ -12,3 +13,17 @@ from truthfiles import rows
 @pytest.fixture(scope="session")
 def truth() -> Callable[[str], Table]:
     return lambda name: Table(rows(name))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_compilation() -> Iterator[None]:
+    """Whatever the tests did, the big kernels were compiled once: an array of another layout, or a read-only one, costs a user half a
+    minute more."""
+    yield
+    if numba.config.DISABLE_JIT:
+        return
+    from fastrod.kernels import batch
+
+    big = ("pass_serial", "pass_parallel", "iterate_serial", "iterate_parallel", "look_serial", "look_parallel", "move_to_inputs")
+    counts = {name: len(getattr(batch, name).signatures) for name in big}
+    assert {name: n for name, n in counts.items() if n > 1} == {}

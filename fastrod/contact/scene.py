@@ -101,7 +101,7 @@ class ContactScene:
         spacing = np.array([min(s.length for s in robot.segments) for robot in robots]) / layout.n_steps
 
         def each(a: Floats) -> Floats:
-            return np.ascontiguousarray(np.broadcast_to(a, (n_robots, *a.shape[1:])), dtype=float)
+            return np.array(np.broadcast_to(a, (n_robots, *a.shape[1:])), dtype=float, order="C")  # writable: kernels are compiled for each layout
 
         return Rods(
             each(radius), each(first), each(spacing), each(reach), each(params.moment_scale), each(params.tension_scale),
