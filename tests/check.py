@@ -19,7 +19,8 @@ CHECKS: list[tuple[str, list[str], dict[str, str]]] = [
     ("format", ["ruff", "format", "--check", "."], {}),
     ("types", ["mypy"], {}),
     ("imports", ["lint-imports"], {}),
-    ("tests", ["pytest"], {}),
+    # Threads that spin while they wait for each other take the core from those they wait for: ten times slower on two busy cores.
+    ("tests", ["pytest", "-n", "2", "--dist", "loadfile"], {"OMP_WAIT_POLICY": "passive"}),
     # The kernels once more as plain Python: what the compiler might hide, and the lines that it hides from coverage.
     ("plain python", ["pytest", "tests/plain"], {"NUMBA_DISABLE_JIT": "1"}),
     # And with every index checked: a compiled kernel does not notice that it reads beyond its scratch.

@@ -16,17 +16,14 @@ import sys
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from plant_rod import EI, GJ, GRAVITY, LENGTH, NODES, OFFSET, Array, Rod, angles, pairs, routing, wires
 from scipy.interpolate import CubicSpline, PchipInterpolator
 from scipy.signal import bilinear, lfilter, lfilter_zi
 from scipy.spatial.transform import Rotation, Slerp
 from scipy.special import expit
-
-sys.path.insert(0, str(Path(__file__).parent))
-from plant_rod import EI, GJ, GRAVITY, LENGTH, NODES, OFFSET, Array, Rod, angles, pairs, routing, wires
 
 Size = Literal["small", "typical", "large"] | float
 

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import math
-import sys
 from functools import cache
-from pathlib import Path
 from typing import Any
 
+import contact_cases
+import contact_energy
+import contact_shapes
+import energy
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 import fastrod
-
-sys.path.insert(0, str(Path(__file__).parent))
-import contact_cases
-import contact_energy
-import contact_shapes
-import energy
 
 CASES = contact_cases.cases()
 WALL = contact_shapes.HalfSpace([0.012, 0.0, 0.0], [-1.0, 0.0, 0.0])

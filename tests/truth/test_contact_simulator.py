@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
 from typing import Any
 
+import contact_cases
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -13,9 +12,6 @@ from numpy.testing import assert_allclose
 import fastrod
 from fastrod.contact import ContactScene, Obstacle, box, cylinder, mesh, plane, sphere
 from fastrod.robot import Robot, Segment, Tendon
-
-sys.path.insert(0, str(Path(__file__).parent))
-import contact_cases
 
 CASES = contact_cases.cases()
 

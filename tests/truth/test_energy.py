@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
+import energy
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from truthfiles import numbers, rows
-
-sys.path.insert(0, str(Path(__file__).parent))
-import energy
 
 
 def ring(n: int, offset: float) -> np.ndarray:

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
-import numpy as np
-import pytest
-from numpy.testing import assert_allclose
-
-sys.path.insert(0, str(Path(__file__).parent))
 import energy
+import numpy as np
 import plant
 import plant_rod
+import pytest
+from numpy.testing import assert_allclose
 from plant_rod import COMPLIANCE, EI, GJ, GRAVITY, LENGTH, OFFSET
 
 SIDEWAYS = [np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0]
