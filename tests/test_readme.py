@@ -1,4 +1,4 @@
-"""The README's first screen does what it says."""
+"""The pages do what they say: README.md and those in the folders."""
 
 from __future__ import annotations
 
@@ -9,22 +9,52 @@ from pathlib import Path
 
 import pytest
 
-README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+import fastrod_scenes
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted(path for path in ROOT.glob("**/README.md") if not any(part.startswith(".") for part in path.relative_to(ROOT).parts))
+PAGES += [ROOT / "CONTRIBUTING.md"]
+EXAMPLES = [
+    pytest.param(code, output, id=f"{page.relative_to(ROOT).parent}-{k}")
+    for page in PAGES
+    for k, (code, output) in enumerate(re.findall(r"```python\n(.*?)```\n\n```\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.S))
+]
 
 
-EXAMPLES = re.findall(r"```python\n(.*?)```\n\n```\n(.*?)```", README, flags=re.S)
-
-
-@pytest.mark.parametrize(("code", "output"), EXAMPLES, ids=["first screen", "contact", "host", "gymnasium"])
+@pytest.mark.parametrize(("code", "output"), EXAMPLES)
 def test_the_example_prints_its_output(code: str, output: str) -> None:
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
-        exec(compile(code, "README.md", "exec"), {})
+        exec(compile(code, "README.md", "exec"), {"__name__": "readme"})
     assert printed.getvalue() == output
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_link_to_a_file_leads_somewhere(page: Path) -> None:
+    links = [link.partition("#")[0] for link in re.findall(r"\]\(([^)]*)\)", page.read_text(encoding="utf-8"))]
+    assert [link for link in links if link and "://" not in link and not (page.parent / link).exists()] == []
+
+
 def test_ci_runs_the_test_line() -> None:
-    lines = re.findall(r"^python3 -m venv.*$", README, flags=re.M)
+    lines = re.findall(r"^python3 -m venv.*$", (ROOT / "README.md").read_text(encoding="utf-8"), flags=re.M)
     assert len(lines) == 2
-    ci = (Path(__file__).parents[1] / ".ci" / "run").read_text(encoding="utf-8")
+    ci = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
     assert lines[1].replace("pip install", "pip install -q") in ci
+
+
+def test_the_page_of_scenes_has_them_all() -> None:
+    rows = re.findall(r"^\| `(\w+)` \| (.*) \| ([\d.]+) s \|$", (ROOT / "scenes" / "README.md").read_text(encoding="utf-8"), flags=re.M)
+    scenes = [fastrod_scenes.load(name) for name in fastrod_scenes.names()]
+    assert rows == [(scene.name, scene.about, f"{scene.duration:.1f}") for scene in scenes]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_command_on_a_page_is_one(page: Path) -> None:
+    """Its words are understood; nothing of it is done."""
+    from fastrod.arguments import build
+
+    parser, _ = build()
+    blocks = re.findall(r"```\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.S)
+    lines = [line.partition("#")[0].split()[1:] for block in blocks for line in block.splitlines() if line.startswith("fastrod ")]
+    unknown = [words for words in lines if parser.parse_known_args(words)[1]]
+    assert unknown == []
