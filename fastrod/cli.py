@@ -73,15 +73,8 @@ def _replay(arguments: argparse.Namespace) -> int:
     if arguments.run is not None:
         log = log.only(arguments.run)
     out = arguments.out or Path(f"{path.stem}_replay")
-    fresh = not out.exists()
-    room.make_folder(out)
-    try:
-        with _progress() as bar:
-            result = room.replay(log, robot, progress=None if bar is None else partial(bar, "replay"))
-    except FastrodError:
-        if fresh:
-            out.rmdir()
-        raise
+    with _folder(out), _progress() as bar:
+        result = room.replay(log, robot, progress=None if bar is None else partial(bar, "replay"))
     console = Console()
     console.print(room.table(result))
     if not result.compared.any():
@@ -102,7 +95,6 @@ def _identify(arguments: argparse.Namespace) -> int:
 
     from fastrod.identification import report
     from fastrod.identification.attribution import identify
-    from fastrod.identification.replay import make_folder
     from fastrod.robotfile import load_robot
 
     # `--held-out RUN LOG`: no run is named like a file that is there.
@@ -115,9 +107,7 @@ def _identify(arguments: argparse.Namespace) -> int:
     if any(robot != robots[0] for robot in robots):
         raise InputError("these files bring different robots; name one with --robot, or identify each alone.")
     out = arguments.out or (None if arguments.json else Path(f"{paths[0].stem}_identified"))
-    if out is not None:
-        make_folder(out)
-    with _progress() as bar:
+    with _folder(out), _progress() as bar:
         result = identify(
             logs, robots[0], held_out=[word for word in arguments.held_out if word not in swallowed],
             max_effects=arguments.max_effects, free_camera=arguments.free_camera,
@@ -333,6 +323,22 @@ _RUN: dict[str, Callable[[argparse.Namespace], int]] = {
     "train": _train, "evaluate": _evaluate, "generate": _generate, "bench": _bench,
 }  # fmt: skip
 """What each command does."""
+
+
+@contextmanager
+def _folder(out: Path | None) -> Iterator[None]:
+    """Of what is about to be computed, made before rather than after; gone again where nothing comes of it."""
+    from fastrod.identification.replay import make_folder
+
+    fresh = out is not None and not out.exists()
+    if out is not None:
+        make_folder(out)
+    try:
+        yield
+    except FastrodError:
+        if out is not None and fresh:
+            out.rmdir()
+        raise
 
 
 @contextmanager

@@ -157,7 +157,7 @@ def test_identify_takes_several_logs_and_the_default_folder(measured: Path, tmp_
     seen: dict[str, Any] = {}
 
     def stand_in(logs: Any, robot: Robot, **given: Any) -> Any:
-        seen.update(given, names=[log.name for log in logs])
+        seen.update(given, names=[log.name for log in logs], folder=Path("small_identified").is_dir())
         raise InputError("seen enough.")
 
     monkeypatch.setattr("fastrod.identification.attribution.identify", stand_in)
@@ -167,7 +167,8 @@ def test_identify_takes_several_logs_and_the_default_folder(measured: Path, tmp_
     assert cli.main(["identify", str(measured), "--robot", "prototype", str(other), "--free-camera", "--max-effects", "2"]) == 2
     assert seen["names"] == ["small", "other"]
     assert (seen["held_out"], seen["max_effects"], seen["free_camera"], seen["progress"]) == ([], 2, True, None)
-    assert (tmp_path / "small_identified").is_dir()
+    assert seen["folder"]  # made before the long work, and gone where nothing came of it
+    assert not (tmp_path / "small_identified").exists()
 
 
 def test_excite_writes_a_run_to_be_driven(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
