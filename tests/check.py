@@ -19,7 +19,7 @@ CHECKS: list[tuple[str, list[str], dict[str, str]]] = [
     ("format", ["ruff", "format", "--check", "."], {}),
     ("types", ["mypy"], {}),
     ("imports", ["lint-imports"], {}),
-    # Threads that spin while they wait for each other take the core from those they wait for: a training takes eight times as long on two busy cores.
+    # Threads that spin while they wait take the core from those they wait for: a training takes eight times as long on two busy cores.
     ("tests", ["pytest", "-n", "2", "--dist", "loadfile"], {"OMP_WAIT_POLICY": "passive"}),
     # The kernels once more as plain Python: what the compiler might hide, and the lines that it hides from coverage.
     ("plain python", ["pytest", "tests/plain"], {"NUMBA_DISABLE_JIT": "1"}),

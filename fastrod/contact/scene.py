@@ -101,7 +101,8 @@ class ContactScene:
         spacing = np.array([min(s.length for s in robot.segments) for robot in robots]) / layout.n_steps
 
         def each(a: Floats) -> Floats:
-            return np.array(np.broadcast_to(a, (n_robots, *a.shape[1:])), dtype=float, order="C")  # writable: kernels are compiled for each layout
+            # writable, as a kernel would be compiled anew for a read-only one
+            return np.array(np.broadcast_to(a, (n_robots, *a.shape[1:])), dtype=float, order="C")
 
         return Rods(
             each(radius), each(first), each(spacing), each(reach), each(params.moment_scale), each(params.tension_scale),
