@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from fastrod.errors import UnknownNameError, nearest
+from fastrod.overview import overview
 
 ACTIONS = {
     "teleop": "by hand, in the browser",
@@ -39,6 +40,16 @@ class _Parser(argparse.ArgumentParser):
         raise UsageError(f"{message}; `{self.prog} --help` says how it is used.")
 
 
+class _Front(_Parser):
+    """Its help has the commands in the order of what one wants to do, not of the alphabet."""
+
+    commands: dict[str, str]
+    """What each does, in a line."""
+
+    def format_help(self) -> str:
+        return overview(self.commands)
+
+
 class _Version(argparse.Action):
     """Prints the version; looked up only then, so that no other command waits for it."""
 
@@ -51,7 +62,7 @@ class _Version(argparse.Action):
 
 def build() -> tuple[argparse.ArgumentParser, list[str]]:
     """The parser, and the names of its commands."""
-    parser = _Parser(prog="fastrod", description="Tendon-driven continuum robots, simulated in batches and met with measured data.")
+    parser = _Front(prog="fastrod")
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
 
@@ -145,6 +156,7 @@ def build() -> tuple[argparse.ArgumentParser, list[str]]:
     bench = commands.add_parser("bench", help="the figures of perf/ as ratios")
     bench.add_argument("name", nargs="?", metavar="NAME", help="one benchmark (default: all)")
     bench.add_argument("--json", action="store_true", help="print JSON to stdout and nothing else")
+    parser.commands = {action.dest: action.help or "" for action in commands._get_subactions()}
     return parser, list(commands.choices)
 
 

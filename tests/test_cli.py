@@ -268,6 +268,21 @@ def test_run_of_a_log_without_runs(log: Path, capsys: pytest.CaptureFixture[str]
     assert sentence == "no run 'zz'; log 'log' names no runs.\n"
 
 
+def test_help_has_every_command_once(capsys: pytest.CaptureFixture[str]) -> None:
+    from fastrod.arguments import build
+
+    with pytest.raises(SystemExit) as end:
+        cli.main(["--help"])
+    assert not end.value.code
+    said = capsys.readouterr().out
+    parser, names = build()
+    lines = [line.split()[0] for line in said.partition("examples:")[0].splitlines() if line.startswith("  ")]
+    assert sorted(lines) == sorted(names)
+    assert max(map(len, said.splitlines())) <= 120
+    for example in [line.strip().split("  ")[0] for line in said.partition("examples:")[2].splitlines() if line.startswith("  ")]:
+        assert parser.parse_known_args(example.split()[1:])[1] == []
+
+
 def test_help_does_not_load_numba() -> None:
     code = "import sys; from fastrod.cli import main\ntry: main(['--help'])\nexcept SystemExit as end: assert not end.code\n"
     done = subprocess.run([sys.executable, "-c", code + "assert 'numba' not in sys.modules"], capture_output=True, text=True, check=False)

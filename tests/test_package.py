@@ -32,6 +32,8 @@ ALSO = {
     "viewer": "from fastrod_viewer.server import serve; server = serve(port=0); server.stop()",
     "device": "import can, canopen, cv2; from fastrod_device.hardware import load_hardware; assert load_hardware().robot.n_tendons == 4",
     "hosts": "from fastrod.hosts import connect; world = connect(dt=0.01); world.stepSimulation()",
+    "mujoco": "import mujoco; from fastrod.hosts import MujocoRod, add_capsules",
+    "ray": "import ray, pyarrow; from fastrod.generation.plan import Plan",
     "network": "from fastrod.identification import network; import sklearn",
 }
 """What its extra is for, in one line."""
