@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,6 +28,7 @@ PEERS: Sequence[Peer] = (
     peer_fastrod.SETTLE, peer_fastrod.STEP, peer_scipy.SHOOT, peer_scipy.COLLOCATE, peer_soromox.PCS, peer_soromox.GVS,
     peer_mujoco.FLEX, peer_mujoco.BALLS, peer_mujoco.HINGES, peer_pybullet.EQUAL, peer_pybullet.HALVES, peer_elastica.PEER,
 )  # fmt: skip
+IN_ONE_CALL = ", all loads in one call"
 GOAL = 100.0
 """Smaller error at equal time, or times faster at equal error."""
 BATCH = 4096
@@ -132,7 +133,7 @@ def error_ratio(error: float, used: float, own: Sequence[tuple[float, float]]) -
 
 
 def curve_section(points: Sequence[Point], force: Array, left_out: Sequence[str]) -> Section:
-    own = front([point for point in points if point.peer is peer_fastrod.SETTLE])
+    own = front([point for point in points if point.peer.name.startswith(peer_fastrod.SETTLE.name)])
     rows: list[Row] = []
     for point in points:
         row: Row = {
@@ -161,10 +162,11 @@ def curve_section(points: Sequence[Point], force: Array, left_out: Sequence[str]
         "true tips by elliptic integrals. Every solve begins at the straight rod (fastrod, step: where the case before ended). CPU "
         "time of all threads, the process on one core, warm, mean over the cases, best of several runs; building and compiling are apart, "
         "in wall time.",
-        "Ratios to `fastrod, settle`, by lines between its measured settings and never beyond: `>=` where fastrod's coarsest is the more "
-        "accurate already, or its finest the faster; `-` where fastrod was not measured that accurate, or not that fast. Below 1 the peer "
-        "is the better.",
-        "A single `settle` hardly gets faster towards coarse settings: most of it is Python around the kernels, which a batch shares.",
+        "Who has a call for many rods is measured both ways, load by load and all of them in one call.",
+        "Ratios to `fastrod, settle`, the better of both ways, by lines between its measured settings and never beyond: `>=` where "
+        "fastrod's coarsest is the more accurate already, or its finest the faster; `-` where fastrod was not measured that accurate, or "
+        "not that fast. Below 1 the peer is the better.",
+        "A `settle` of one rod hardly gets faster towards coarse settings: most of it is Python around the kernels, which a batch shares.",
         *left_out,
     ]
     return Section("peers", "Appendix J: error against time", columns, rows, notes)
@@ -177,11 +179,12 @@ def best_of(*ratios: Ratio) -> float:
 
 def kinds_section(points: Sequence[Point]) -> Section:
     """One row a peer: the least and the largest of its ratios, and what else there is to know of it."""
-    own = front([point for point in points if point.peer is peer_fastrod.SETTLE])
+    own = front([point for point in points if point.peer.name.startswith(peer_fastrod.SETTLE.name)])
     rows: list[Row] = []
     notes: list[str] = []
     for peer in dict.fromkeys(point.peer for point in points):
-        notes.append(f"{peer.name} ({peer.versions()}): {peer.same} Besides: {peer.also}")
+        if peer in PEERS:
+            notes.append(f"{peer.name} ({peer.versions()}): {peer.same} Besides: {peer.also}")
         mine = [point for point in points if point.peer is peer]
         if peer.family == "fastrod":
             continue
@@ -217,7 +220,7 @@ def batch_section(points: Sequence[Point], n: int, within: float) -> Section:
     force = np.random.default_rng(_SEED).uniform(appendix_j.FORCES[0], appendix_j.FORCES[-1], n)
     rows: list[Row] = []
     failed: list[str] = []
-    for peer in dict.fromkeys(point.peer for point in points if point.peer is not peer_fastrod.STEP):
+    for peer in dict.fromkeys(point.peer for point in points if point.peer in PEERS and point.peer is not peer_fastrod.STEP):
         note_progress(f"{n} robots, {peer.name}")
         mine = [point for point in points if point.peer is peer]
         for point in mine:
@@ -283,7 +286,8 @@ def plot(points: Sequence[Point], file: str) -> None:
             turn = drawn[peer.family] = drawn.get(peer.family, -1) + 1
             own = peer.family == "fastrod"
             axes.loglog(
-                *zip(*mine, strict=True), label=peer.name, color=COLOURS[peer.family], marker="os^"[turn], linestyle=("-", "--", ":")[turn],
+                *zip(*mine, strict=True), label=peer.name, color=COLOURS[peer.family], marker="os^Dvp"[turn],
+                linestyle=("-", "--", ":", "-.")[turn % 4],
                 linewidth=2.5 if own else 1.3, markersize=6 if own else 5, zorder=3 if own else 2,
             )  # fmt: skip
         axes.set_xlabel("time of one solve [µs], one core, warm")
@@ -312,13 +316,19 @@ def sections(options: argparse.Namespace) -> list[Section]:
             if options.quick and peer.family == "soromox":
                 left_out.append(f"{peer.name} is left out of a quick run: it takes half a minute to build and to compile.")
                 continue
-            for rung in peer.rungs()[: 2 if options.quick else None]:
+            for rung in _measured(peer, options.quick):
                 note_progress(f"{peer.name}, {rung.label}")
                 points.append(measure(peer, rung, force))
+            many = replace(peer, name=peer.name + IN_ONE_CALL)
+            points += [measure(many, rung, force, rung.together) for rung in _measured(peer, options.quick) if rung.together]
         batches = [batch_section(points, 64 if options.quick else BATCH, within) for within in WITHIN]
     if options.plot:
         plot(points, options.plot)
     return [curve_section(points, force, left_out), kinds_section(points), *batches]
+
+
+def _measured(peer: Peer, quick: bool) -> Sequence[Rung]:
+    return peer.rungs()[: 2 if quick else None]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
