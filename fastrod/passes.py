@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numba
 import numpy as np
 
-from fastrod.kernels.batch import pass_parallel, pass_serial
+from fastrod.gpu.device import Device
+from fastrod.kernels.batch import move_to_inputs, pass_parallel, pass_serial
 from fastrod.kernels.chunk import scratch_size
 from fastrod.kernels.jit import LANES
-from fastrod.types import Floats, Ints, Layout, Memory, Params, Ports, Probes, Response, Shape
+from fastrod.types import Flags, Floats, Ints, Layout, Memory, Params, Ports, Probes, Response, Shape
+
+if TYPE_CHECKING:
+    from fastrod.gpu.resident import Resident
+    from fastrod.gpu.runner import Runner
 
 _config: Any = numba.config
 _SMALL = 4 * LANES  # robots below which starting threads costs more than it saves
@@ -18,11 +23,73 @@ NO_PROBES = Probes(np.empty((0, 0), np.int64), np.empty((0, 0, 3)), np.empty((0,
 
 
 class Passes:
-    """Robots of one layout. `params` is replaced where effects change a robot's numbers."""
+    """Robots of one layout. `params` is replaced where effects change a robot's numbers, and never written into.
 
-    def __init__(self, layout: Layout, params: Params, n_robots: int, threads: int, carry: bool) -> None:
+    On a GPU the memory stays there from pass to pass; `memory`, `x` and `peek` fetch it where the device has a newer one.
+    """
+
+    def __init__(self, layout: Layout, params: Params, n_robots: int, threads: int, carry: bool, device: Device = "cpu") -> None:
         self.layout, self.params, self.n_robots, self.threads, self.carry = layout, params, n_robots, threads, carry
-        self.memory = self._new_memory(follower=False, track_force=False)
+        self.device: Device = device
+        self._memory: Memory = self._new_memory(follower=False, track_force=False)
+        self._resident: Resident | None = None
+        self._runner: Runner | None = None
+        if device == "cuda":
+            from fastrod.gpu.runner import Runner
+
+            self._runner = Runner()
+        self.memory = self._memory
+
+    @property
+    def memory(self) -> Memory:
+        """What the observer carries on, to read and to write."""
+        return self._memory if self._resident is None else self._resident.write()
+
+    @memory.setter
+    def memory(self, memory: Memory) -> None:
+        self._memory = memory
+        if self._runner is not None:
+            from fastrod.gpu.resident import Resident
+
+            self._resident = Resident(memory)
+
+    @property
+    def x(self) -> Floats:
+        """(n_robots, n_x) of the memory, to read and to write."""
+        return self._memory.x if self._resident is None else self._resident.write(("x",)).x
+
+    def peek(self) -> Memory:
+        """The memory, to read only."""
+        return self._memory if self._resident is None else self._resident.read()
+
+    def put(self, rows: Ints, memory: Memory) -> None:
+        """Take these robots' rows from another memory of the same shape."""
+        if self._resident is not None:
+            self._resident.put(rows, memory)
+            return
+        own: Any
+        new: Any
+        for own, new in zip(self._memory, memory, strict=True):
+            if len(own):
+                own[rows] = new[rows]
+
+    def twin(self, n_robots: int, params: Params, memory: Memory) -> Passes:
+        """Other robots of the same layout, on the same device."""
+        twin = Passes(self.layout, params, n_robots, self.threads, self.carry, self.device)
+        twin.memory = memory
+        return twin
+
+    @property
+    def tracks_force(self) -> bool:
+        """The memory knows how x answers a tip force."""
+        return len(self._memory.force_before) > 0
+
+    @property
+    def finite(self) -> Flags:
+        """(n_robots,) the boundary is a number."""
+        if self._runner is not None and self._resident is not None:
+            return self._runner.finite(self._resident)
+        return np.asarray(np.isfinite(self._memory.x.sum(1)))
 
     @property
     def n_points(self) -> int:
@@ -32,7 +99,7 @@ class Passes:
     @property
     def n_x(self) -> int:
         """Boundary unknowns of a robot."""
-        return int(self.memory.x.shape[1])
+        return int(self._memory.x.shape[1])
 
     def n_residuals(self, ports: Ports) -> int:
         """Boundary residuals of a robot."""
@@ -40,38 +107,42 @@ class Passes:
 
     def n_columns(self, ports: Ports) -> int:
         """Columns of sensitivities that a pass carries without contact."""
-        return self.n_x + (3 if len(self.memory.force_before) and not len(ports.follower_force) else 0)
+        return self.n_x + (3 if self.tracks_force and not len(ports.follower_force) else 0)
 
-    def _new_memory(self, follower: bool, track_force: bool) -> Memory:
+    def _fields(self, follower: bool, track_force: bool) -> list[tuple[int, ...]]:
+        """Shapes of the memory's arrays."""
         layout, n = self.layout, self.n_robots
         n_rows = len(layout.row_tendon)
         n_e = n_rows + (0 if layout.paper else 3) + (3 if follower else 0)
         n_x = 2 * len(layout.first_tendon) if layout.paper else 3 + len(layout.free_tendon)
         n_x += 3 if follower else 0
-        return Memory(
-            x=np.zeros((n, n_x)),
-            covariance=np.zeros((n if self.carry else 0, n_x * (n_x + 1) // 2), np.float32),
-            gain=np.zeros((n, n_x, n_e + (3 if track_force else 0)), np.float32),
-            move=np.zeros((n, n_x), np.float32),
-            defect=np.zeros((n, n_x), np.float32),
-            length_before=np.zeros((n, n_rows)),
-            force_before=np.zeros((n if track_force else 0, 3)),
-            curvature_guess=np.zeros((n, 3)),
-        )
+        return [
+            (n, n_x), (n if self.carry else 0, n_x * (n_x + 1) // 2), (n, n_x, n_e + (3 if track_force else 0)), (n, n_x), (n, n_x),
+            (n, n_rows), (n if track_force else 0, 3), (n, 3),
+        ]  # fmt: skip
+
+    def _new_memory(self, follower: bool, track_force: bool) -> Memory:
+        single = ("covariance", "gain", "move", "defect")
+        fields: dict[str, Any] = {
+            name: np.zeros(shape, np.float32 if name in single else np.float64)
+            for name, shape in zip(Memory._fields, self._fields(follower, track_force), strict=True)
+        }
+        return Memory(**fields)
 
     def remember(self, follower: bool, track_force: bool, force: Floats | None) -> None:
         """Widen or narrow the memory when a follower force or a moving tip force comes or goes; x of the rod itself is kept.
         `force` is the tip force that x belongs to."""
-        self.memory = self._refitted(self.memory, follower, track_force, force)
+        if self._fields(follower, track_force) != [a.shape for a in self._memory]:
+            self.memory = self._refitted(self.peek(), follower, track_force, force)
 
     def refit(self, memory: Memory, follower: bool, force: Floats | None) -> Memory:
         """Another memory of these robots, widened or narrowed to what is remembered now."""
-        return self._refitted(memory, follower, len(self.memory.force_before) > 0, force)
+        return self._refitted(memory, follower, self.tracks_force, force)
 
     def _refitted(self, old: Memory, follower: bool, track_force: bool, force: Floats | None) -> Memory:
-        new = self._new_memory(follower, track_force)
-        if [a.shape for a in new] == [a.shape for a in old]:
+        if self._fields(follower, track_force) == [a.shape for a in old]:
             return old
+        new = self._new_memory(follower, track_force)
         kept = min(old.x.shape[1], new.x.shape[1])
         new.x[:, :kept] = old.x[:, :kept]
         tracked = len(old.force_before) > 0
@@ -91,10 +162,11 @@ class Passes:
         """These robots were brought to these inputs by another way than a step: the next one moves from there."""
         rows_of = self.layout.row_tendon
         lengths = np.broadcast_to(ports.tendon_length, (self.n_robots, ports.tendon_length.shape[1]))
-        self.memory.length_before[rows] = lengths[rows][:, rows_of]
-        if len(self.memory.force_before):
-            self.memory.force_before[rows] = np.broadcast_to(ports.tip_force, (self.n_robots, 3))[rows]
-        self.memory.move[rows], self.memory.defect[rows] = 0.0, 0.0
+        memory = self.memory
+        memory.length_before[rows] = lengths[rows][:, rows_of]
+        if len(memory.force_before):
+            memory.force_before[rows] = np.broadcast_to(ports.tip_force, (self.n_robots, 3))[rows]
+        memory.move[rows], memory.defect[rows] = 0.0, 0.0
 
     def new_shape(self, outputs: Literal["full", "tip"], holes: bool) -> Shape:
         """Room for what a pass writes; `holes`: nan where it will not write."""
@@ -124,18 +196,38 @@ class Passes:
         noise: float = 1.0,
         n_col: int | None = None,
         probes: Probes = NO_PROBES,
+        only: str | None = None,
     ) -> None:
-        """One forward pass of these robots (`kernels.batch`)."""
+        """One forward pass of these robots (`kernels.batch`). A GPU brings back `only` this field of the shape; `collect` the others."""
         n_probes = probes.node.shape[1]
         if n_col is None:
             n_col = self.n_x + 3 * n_probes if n_probes else self.n_columns(ports)
+        if response is None:
+            response = Response(np.empty((0, 0, 0)), np.empty((0, 0, 0)), np.empty((0, 0)))
+        if self._runner is not None and self._resident is not None:
+            self._runner.run(
+                rows, self.params, ports, self.layout, self._resident, shape, response, n_col, self.n_residuals(ports),
+                feed, carry, update, process, noise,
+            )  # fmt: skip
+            self._runner.collect(shape, only)
+            return
         parts = 1 if len(rows) <= _SMALL else min(self.threads, -(-len(rows) // LANES))
         size = scratch_size(len(self.layout.tendon_segment), self.n_x, n_col, self.n_residuals(ports), n_probes)
         scratch = np.empty((parts, size))
-        if response is None:
-            response = Response(np.empty((0, 0, 0)), np.empty((0, 0, 0)), np.empty((0, 0)))
         body = pass_serial if parts == 1 else pass_parallel
         body(
-            rows, self.params, ports, self.layout, self.memory, shape, response, probes, scratch,
+            rows, self.params, ports, self.layout, self._memory, shape, response, probes, scratch,
             n_col, feed, carry, update, process, noise,
         )  # fmt: skip
+
+    def collect(self, shape: Shape) -> None:
+        """All that the passes wrote into this shape is there."""
+        if self._runner is not None:
+            self._runner.collect(shape)
+
+    def move_to_inputs(self, rows: Ints, ports: Ports) -> None:
+        """Move x to first order to these inputs, without a pass."""
+        if self._runner is not None and self._resident is not None:
+            self._runner.move_to_inputs(rows, self.params, ports, self.layout, self._resident)
+        else:
+            move_to_inputs(rows, ports, self.params, self._memory, self.layout)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from copy import copy
 from typing import Any, Literal
 
 import numpy as np
@@ -156,10 +155,8 @@ class Linear:
         ports = Ports(
             *(moved[name] if name in moved else a if len(a) == 1 else copied(a) for name, a in zip(Ports._fields, self.ports, strict=True))
         )
-        twin = copy(passes)
-        twin.n_robots = k * n
         params: tuple[Any, ...] = passes.params
-        twin.memory, twin.params = Memory(*map(copied, passes.memory)), Params(*(a if len(a) == 1 else copied(a) for a in params))
+        twin = passes.twin(k * n, Params(*(a if len(a) == 1 else copied(a) for a in params)), Memory(*map(copied, passes.peek())))
         probes = Probes(*map(copied, self.probes)) if self.probes.node.shape[1] else self.probes
         rows = (self.rows + n * np.arange(k)[:, None]).ravel()
         return Linear(twin, rows, ports, probes)

@@ -8,8 +8,8 @@ from typing import TypeAlias
 import numpy as np
 
 from fastrod.guess import cold_start
-from fastrod.kernels.batch import move_to_inputs
-from fastrod.types import Flags, Floats, Ints, Layout, Memory, Params, Ports
+from fastrod.passes import Passes
+from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports
 
 Pass: TypeAlias = Callable[[Ints, Ports], Floats]
 """(robots, ports) -> residual of these robots at the x before the update [m]."""
@@ -23,26 +23,27 @@ _SMALLEST_STEP = 1.0 / 64.0
 _SMALLEST_LOAD_STEP = 1.0 / 256.0
 
 
-def settle(rows: Ints, warm: Flags, layout: Layout, params: Params, ports: Ports, memory: Memory, tolerance: float, run: Pass) -> Ints:
+def settle(rows: Ints, warm: Flags, boundary: Passes, ports: Ports, tolerance: float, run: Pass) -> Ints:
     """Bring the robots `rows` to rest on `ports`; the passes that each took, and -1 where none of three ways converged.
 
     Warm robots start from their last x, moved to first order to the new inputs; others, and warm ones that fail, from a
     cold guess; what still fails is led there by its loads, from none to all.
     """
-    passes = np.zeros(memory.x.shape[0], np.int64)
+    layout, params = boundary.layout, boundary.params
+    passes = np.zeros(boundary.n_robots, np.int64)
     left = rows[warm[rows]]
     if len(left):
-        move_to_inputs(left, ports, params, memory, layout)
-        left = _newton(left, params, layout, ports, memory, tolerance, run, passes)
+        boundary.move_to_inputs(left, ports)
+        left = _newton(left, boundary, ports, tolerance, run, passes)
     left = np.sort(np.concatenate([left, rows[~warm[rows]]]))
     steep = left[_load_parameter(left, params, ports) > _STEEP]
     left = np.setdiff1d(left, steep)
     if len(left):
-        cold_start(left, layout, params, ports, memory)
-        left = _newton(left, params, layout, ports, memory, tolerance, run, passes)
+        cold_start(left, layout, params, ports, boundary.memory)
+        left = _newton(left, boundary, ports, tolerance, run, passes)
     left = np.sort(np.concatenate([left, steep]))
     if len(left):
-        left = _continuation(left, params, layout, ports, memory, tolerance, run, passes)
+        left = _continuation(left, boundary, ports, tolerance, run, passes)
     passes[left] = -1
     return passes
 
@@ -62,20 +63,21 @@ def _load_parameter(rows: Ints, params: Params, ports: Ports) -> Floats:
     return np.broadcast_to(force * of(params.reach) / of(params.moment_scale), len(rows))
 
 
-def _newton(rows: Ints, params: Params, layout: Layout, ports: Ports, memory: Memory, tolerance: float, run: Pass, passes: Ints) -> Ints:
+def _newton(rows: Ints, boundary: Passes, ports: Ports, tolerance: float, run: Pass, passes: Ints) -> Ints:
     """Newton with step halving; the robots that did not converge."""
+    layout, params = boundary.layout, boundary.params
     failed: list[Ints] = []
-    x_at = memory.x[rows]
+    x_at = boundary.x[rows]
     step = np.zeros_like(x_at)
     best = np.full(len(rows), np.inf)
     damping = np.ones(len(rows))
     patience = np.full(len(rows), _PATIENCE)
-    one_sided = np.broadcast_to(params.unilateral.any(1), len(memory.x))[rows]
+    one_sided = np.broadcast_to(params.unilateral.any(1), boundary.n_robots)[rows]
     for count in range(_MAX_PASSES):
-        x_tried = memory.x[rows]
+        x_tried = boundary.x[rows]
         residual = run(rows, ports)
         passes[rows] += 1
-        after = memory.x[rows]
+        after = boundary.x[rows]
         # in paper mode the wires may contradict each other: at the least-squares boundary the residual stays
         better = residual <= 2.0 * best if layout.paper else residual < best
         if count < _FREE_PASSES:
@@ -94,7 +96,7 @@ def _newton(rows: Ints, params: Params, layout: Layout, ports: Ports, memory: Me
             best = np.where(better, residual, best)
             damping = np.where(better, 1.0, 0.5 * damping)
             # a robot's bits do not depend on whether another one is damped
-            memory.x[rows] = np.where(better[:, None], after, x_at + damping[:, None] * step)
+            boundary.x[rows] = np.where(better[:, None], after, x_at + damping[:, None] * step)
         # only a pass that was accepted can end it: what it wrote is what the caller gets
         closed = better & (np.isfinite(residual) if layout.paper else residual <= tolerance)
         patience -= closed
@@ -140,27 +142,26 @@ def _still(step: Floats, rows: Ints, layout: Layout, params: Params, small: Floa
     return np.asarray(np.abs(step[:, 3 : 3 + n_free]).max(1) <= 1e-6 * of(params.tension_scale))
 
 
-def _continuation(
-    rows: Ints, params: Params, layout: Layout, ports: Ports, memory: Memory, tolerance: float, run: Pass, passes: Ints
-) -> Ints:
+def _continuation(rows: Ints, boundary: Passes, ports: Ports, tolerance: float, run: Pass, passes: Ints) -> Ints:
     """From the unloaded robot to the loaded one, in load steps that grow with success; the robots that did not arrive."""
-    part = np.zeros(len(memory.x))
-    longest = np.full(len(memory.x), 0.25)  # a longer stride than a load parameter of three could land on another equilibrium
+    layout, params = boundary.layout, boundary.params
+    part = np.zeros(boundary.n_robots)
+    longest = np.full(boundary.n_robots, 0.25)  # a longer stride than a load parameter of three could land on another equilibrium
     longest[rows] = np.minimum(0.25, 0.5 * _STEEP / np.maximum(_load_parameter(rows, params, ports), 1e-9))
     stride = longest.copy()
     unloaded = _loaded(ports, part)
-    cold_start(rows, layout, params, unloaded, memory)
-    lost = _newton(rows, params, layout, unloaded, memory, tolerance, run, passes)
+    cold_start(rows, layout, params, unloaded, boundary.memory)
+    lost = _newton(rows, boundary, unloaded, tolerance, run, passes)
     rows = np.setdiff1d(rows, lost)
-    held = memory.x.copy()
+    held = boundary.x.copy()
     while len(rows):
         aim = np.minimum(part + stride, 1.0)
-        missed = _newton(rows, params, layout, _loaded(ports, aim), memory, tolerance, run, passes)
+        missed = _newton(rows, boundary, _loaded(ports, aim), tolerance, run, passes)
         arrived = np.setdiff1d(rows, missed)
         part[arrived] = aim[arrived]
-        held[arrived] = memory.x[arrived]
+        held[arrived] = boundary.x[arrived]
         stride[arrived] = np.minimum(2.0 * stride[arrived], longest[arrived])
-        memory.x[missed] = held[missed]
+        boundary.x[missed] = held[missed]
         stride[missed] *= 0.5
         lost = np.concatenate([lost, missed[stride[missed] < _SMALLEST_LOAD_STEP]])
         rows = np.setdiff1d(rows[part[rows] < 1.0], lost)

@@ -18,6 +18,7 @@ from fastrod.contact.frames import blended
 from fastrod.contact.scene import ContactScene
 from fastrod.contact.step import COLD_PASSES, Ways, contact_step
 from fastrod.errors import InputError, RobotError, shown
+from fastrod.gpu import device as devices
 from fastrod.guess import cold_start
 from fastrod.inputs import Inputs, PointForces, Reader
 from fastrod.kernels.dense import between_nodes
@@ -60,6 +61,7 @@ class Simulator:
         contact: ContactScene | None = None,
         hold_gain: float = 0.0,
         feel_contact: bool = True,
+        device: devices.Device = "cpu",
     ) -> None:
         """Compile `robot` (one for all, or a list with one each) for `n_robots` and a time step `dt` [s].
 
@@ -69,7 +71,11 @@ class Simulator:
         through everything. Without `feel_contact` they do so all the same, and the scene is for `clearance`, `swept_clearance` and
         `ray_cast` alone. While a robot's last residual is below `hold_gain` [m] (and it feels no contact) a step corrects the
         boundary by the gain that it has, without new sensitivities: a third of the time, and the observer lags by about so much.
-        Raises `InputError`, `RobotError`.
+
+        With `device="cuda"` the passes run on an NVIDIA GPU, one thread a robot, from the same source: numbers agree to rounding. The
+        memory of the observer stays there; a step sends the inputs that changed and brings back what `outputs` asks for, so for
+        large batches ask for "tip". Everything else is done on the CPU, as are the Newton steps of `settle`. Rods that feel
+        contact need the CPU. Raises `InputError` (also where there is no GPU), `RobotError`, `UnknownNameError`.
         """
         robots = [robot] if isinstance(robot, Robot) else list(robot) if isinstance(robot, (list, tuple)) else []
         if not robots or not all(isinstance(r, Robot) for r in robots):
@@ -91,6 +97,10 @@ class Simulator:
             raise InputError(f"threads is {threads!r}; it must be a whole number from 1 to {_config.NUMBA_NUM_THREADS} here.")
         if not isinstance(hold_gain, (int, float, np.floating)) or not 0.0 <= hold_gain <= float_info.max:
             raise InputError(f"hold_gain is {hold_gain!r} m; it must be a number, zero or positive.")
+        self.device = devices.checked(device)
+        """Where the passes run."""
+        if self.device == "cuda" and contact is not None and feel_contact:
+            raise InputError("contact was given with device 'cuda', where rods feel none; take device='cpu', or feel_contact=False.")
         self.hold_gain = float(hold_gain)
         self.robots = tuple(robots)
         self.n_robots = int(n_robots)
@@ -99,7 +109,7 @@ class Simulator:
         self.outputs = outputs
         self._layout, self._plain, rest = compile_robots(self.robots, int(points_per_segment))
         threads = threads or numba.get_num_threads()
-        self._passes = Passes(self._layout, self._plain, self.n_robots, threads, carry=observer is not None)
+        self._passes = Passes(self._layout, self._plain, self.n_robots, threads, carry=observer is not None, device=self.device)
         self._reader = Reader(self._layout, self._plain, rest, self.n_robots)
         self._chain = Chain(self.robots, self.n_robots)
         # the last ports before effects; _plain is the robot before them
@@ -173,19 +183,20 @@ class Simulator:
         if self._felt is not None:
             return self._touch(self._felt, given, obstacle_pose, obstacle_velocity, None)
         moved = self._moved_obstacles(obstacle_pose, obstacle_velocity)
-        tracked = len(self._passes.memory.force_before) > 0
+        tracked = self._passes.tracks_force
         ports, rows = self._read(given)
         self._move_obstacles(moved)
         process, noise = self.observer.process_noise * self.dt, self.observer.measurement_noise / self.dt
         before = self._ports
-        learns = before is not None and not tracked and len(self._passes.memory.force_before) > 0
+        learns = before is not None and not tracked and self._passes.tracks_force
         if before is not None and learns and bool(len(before.follower_force)) == bool(len(ports.follower_force)):
             self._passes.run(
                 rows[self._warm[rows]], before, self._passes.new_shape("tip", True), carry=self._passes.carry, process=process, noise=noise
             )
         if before is not None:
             stretch(self._passes, rows, ports.extension - before.extension)
-        cold_start(rows[~self._warm[rows]], self._layout, self._passes.params, ports, self._passes.memory)
+        if len(cold := rows[~self._warm[rows]]):
+            cold_start(cold, self._layout, self._passes.params, ports, self._passes.memory)
         linear = Linear(self._passes, rows, ports)
         if derive and self._bare is None and len(rows) == self.n_robots and linear.fits(turning=True):
             relocate = self._relocated if given.point_force else None
@@ -197,8 +208,7 @@ class Simulator:
                 self._passes.run(rows[held], ports, shape, feed=True, n_col=0)
             if not held.all():
                 self._passes.run(rows[~held], ports, shape, feed=True, carry=self._passes.carry, process=process, noise=noise)
-        finite = np.isfinite(self._passes.memory.x.sum(1))
-        ok = finite & (shape.residual < _LOST * self._passes.params.reach)
+        ok = self._passes.finite & (shape.residual < _LOST * self._passes.params.reach)
         passes = np.broadcast_to(np.int64(1 + learns), self.n_robots)
         if len(rows) < self.n_robots:
             read = np.isin(self._all, rows)
@@ -272,7 +282,7 @@ class Simulator:
             process, noise = self.observer.process_noise * self.dt, self.observer.measurement_noise / self.dt
             self._passes.run(which, at, into, feed=True, carry=self._passes.carry, process=process, noise=noise)
             passes[which] += 1
-            well = np.isfinite(self._passes.memory.x.sum(1)) & (into.residual < _LOST * self._passes.params.reach)
+            well = self._passes.finite & (into.residual < _LOST * self._passes.params.reach)
             return np.asarray(well & np.isin(self._all, which))
 
         def bring_to_rest(which: Ints, at: Ports, into: Shape) -> Flags:
@@ -280,7 +290,7 @@ class Simulator:
                 self._passes.run(some, there, into, noise=1e-10 if self._layout.paper else 1e-20)
                 return into.residual[some]
 
-            used = settle(which, self._warm, self._layout, self._passes.params, at, self._passes.memory, tolerance or 1e-9, once)
+            used = settle(which, self._warm, self._passes, at, tolerance or 1e-9, once)
             passes[which] += np.abs(used[which])
             return np.asarray(used > 0)
 
@@ -320,10 +330,11 @@ class Simulator:
         shape = self._passes.new_shape(self.outputs, len(rows) < self.n_robots)
 
         def run(which: Ints, at: Ports) -> Floats:
-            self._passes.run(which, at, shape, feed=False, carry=False, process=1.0, noise=1e-10 if self._layout.paper else 1e-20)
+            self._passes.run(which, at, shape, noise=1e-10 if self._layout.paper else 1e-20, only="residual")
             return shape.residual[which]
 
-        passes = settle(rows, self._warm, self._layout, self._passes.params, ports, self._passes.memory, tolerance, run)
+        passes = settle(rows, self._warm, self._passes, ports, tolerance, run)
+        self._passes.collect(shape)
         if self._passes.carry:
             self._passes.memory.covariance[rows] = 0.0
         ok = np.zeros(self.n_robots, bool)
@@ -485,7 +496,7 @@ class Simulator:
         effects = [link.memory.copy() for link in self._chain.links]
         return Snapshot(
             self.robots,
-            _copied(self._passes.memory),
+            _copied(self._passes.peek()),
             self._warm.copy(),
             self._given,
             self._ports,
@@ -501,7 +512,7 @@ class Simulator:
         """Go back to a `snapshot` of this simulator, or only these robots: indices or a mask. Robots that were replaced since keep their
         numbers, and take over the boundary alone; a whole simulator of which some were replaced is refused. Raises `InputError`
         then, and for a snapshot of another simulator."""
-        if snapshot.memory.x.shape[0] != self.n_robots or snapshot.memory.length_before.shape != self._passes.memory.length_before.shape:
+        if snapshot.memory.x.shape[0] != self.n_robots or snapshot.memory.length_before.shape[1] != len(self._layout.row_tendon):
             raise InputError("the snapshot is of another simulator; its robots, tendons or their number differ.")
         if [memory.shape for memory in snapshot.effects] != [link.memory.shape for link in self._chain.links]:
             raise InputError("the snapshot is of another simulator; its effects differ.")
@@ -526,18 +537,14 @@ class Simulator:
             self.reset(rows)
             return
         then = self._passes.refit(snapshot.memory, len(ports.follower_force) > 0, snapshot.ports.tip_force)
-        a: Any
-        b: Any
-        for a, b in zip(self._passes.memory, then, strict=True):
-            if len(a):
-                a[rows] = b[rows]
+        self._passes.put(np.flatnonzero(rows), then)
         self._warm, self._derived = np.where(rows, snapshot.warm, self._warm), None
         self._ports = taken_each(ports, snapshot.ports, rows)
         if self._bare is not None and snapshot.bare is not None:
             self._bare = taken_each(self._bare, snapshot.bare, rows)
             self._passes.params = taken_each(self._passes.params, snapshot.params, rows)
         alike = bool(len(ports.follower_force)) == bool(len(snapshot.ports.follower_force))
-        if self._engine is None and alike and len(self._passes.memory.force_before) > len(snapshot.memory.force_before):
+        if self._engine is None and alike and self._passes.tracks_force and not len(snapshot.memory.force_before):
             # their gain knows no tip force yet, which moves by now: learned as `step` does
             process, noise = self.observer.process_noise * self.dt, self.observer.measurement_noise / self.dt
             learning, apart = np.flatnonzero(rows & snapshot.warm), self._passes.new_shape("tip", True)
@@ -624,7 +631,7 @@ class Simulator:
                 kept = {name: getattr(then, name) for name in ("extension", "tip_force", "base_pose")}
             merged = {name: np.where(out[:, None], value, getattr(ports, name)) for name, value in kept.items()}
             ports = ports._replace(**{name: np.ascontiguousarray(a) for name, a in merged.items()})
-        track_force = len(self._passes.memory.force_before) > 0 or self._force_moves(ports.tip_force)
+        track_force = self._passes.tracks_force or self._force_moves(ports.tip_force)
         self._passes.remember(len(ports.follower_force) > 0, track_force, None if self._ports is None else self._ports.tip_force)
         return ports, rows
 

@@ -8,17 +8,6 @@ from types import FunctionType
 import numpy as np
 from numba import prange
 
-from fastrod.kernels.bvh import STACK
-from fastrod.kernels.chunk import pass_chunk
-from fastrod.kernels.forces import Scenery
-from fastrod.kernels.gather import feed_forward
-from fastrod.kernels.jit import LANES, entry, parallel_entry
-from fastrod.kernels.placing import place_nodes
-from fastrod.kernels.shape import Lanes
-from fastrod.kernels.slots import T_ARM, T_FORCE, T_N, T_S
-from fastrod.kernels.strands import search_rods
-from fastrod.kernels.surface import ray_hit
-from fastrod.kernels.touch import iterate_world, look_at
 from fastrod.types import (
     Clearance,
     Flags,
@@ -35,6 +24,18 @@ from fastrod.types import (
     Surfaces,
     Touching,
 )  # fmt: skip
+
+from .bvh import STACK
+from .chunk import pass_chunk
+from .forces import Scenery
+from .gather import feed_forward
+from .jit import LANES, entry, parallel_entry
+from .placing import place_nodes
+from .shape import Lanes
+from .slots import T_ARM, T_FORCE, T_N, T_S
+from .strands import search_rods
+from .surface import ray_hit
+from .touch import iterate_world, look_at
 
 
 @entry

@@ -5,14 +5,15 @@ Residuals are lengths in metres: tendon lengths as they are, moments times l^2/E
 
 from __future__ import annotations
 
-from fastrod.kernels import columns as col
-from fastrod.kernels import shape as sh
-from fastrod.kernels.gather import pick, unknown_unit
-from fastrod.kernels.jit import LANES, inline, kernel
-from fastrod.kernels.observer import BLOCK, gain
-from fastrod.kernels.shape import Lanes
-from fastrod.kernels.vec import cross, mul, mul_t, sub
 from fastrod.types import Layout, Memory, Params, Ports
+
+from . import columns as col
+from . import shape as sh
+from .gather import pick, unknown_unit
+from .jit import LANES, inline, kernel
+from .observer import BLOCK, gain
+from .shape import Lanes
+from .vec import cross, mul, mul_t, sub
 
 W = LANES
 

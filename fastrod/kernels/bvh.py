@@ -10,9 +10,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from fastrod.kernels.jit import inline, kernel
-from fastrod.kernels.vec import Vec, axpy, cross, dot, sub
 from fastrod.types import Floats, Surfaces
+
+from .jit import inline, kernel
+from .vec import Vec, axpy, cross, dot, sub
 
 LEAF_CODE = 8
 STACK = 64  # links that wait: one for each level of the hierarchy

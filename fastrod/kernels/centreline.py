@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from fastrod.kernels.jit import inline, kernel
-from fastrod.kernels.vec import Mat, Vec
 from fastrod.types import Floats, Shape
+
+from .jit import inline, kernel
+from .vec import Mat, Vec
 
 
 class Curve(NamedTuple):

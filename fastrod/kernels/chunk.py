@@ -8,16 +8,17 @@ there, and the residuals are the lengths alone (the paper's eqs. 2b and 3b).
 
 from __future__ import annotations
 
-from fastrod.kernels import columns as col
-from fastrod.kernels import shape as sh
-from fastrod.kernels.boundary import close_lengths, close_tip, form_gain, hold_boundary, loosen, padded, update_boundary
-from fastrod.kernels.gather import feed_forward, gather_base, gather_segment, gather_step, pick, scatter_node
-from fastrod.kernels.jit import LANES, kernel
-from fastrod.kernels.observer import BLOCK
-from fastrod.kernels.probes import arrive, leave, load_base, load_column, respond
-from fastrod.kernels.shape import Lanes
-from fastrod.kernels.vec import mul
 from fastrod.types import Layout, Memory, Params, Ports, Probes, Response, Shape
+
+from . import columns as col
+from . import shape as sh
+from .boundary import close_lengths, close_tip, form_gain, hold_boundary, loosen, padded, update_boundary
+from .gather import feed_forward, gather_base, gather_segment, gather_step, pick, scatter_node
+from .jit import LANES, kernel
+from .observer import BLOCK
+from .probes import arrive, leave, load_base, load_column, respond
+from .shape import Lanes
+from .vec import mul
 
 W = LANES
 CUTS = 2  # Newton steps on u at each stage; the guess is of second order, so little is left after the second

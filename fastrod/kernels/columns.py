@@ -7,8 +7,8 @@ moment in the material frame, and the change of position in the world frame. The
 
 from __future__ import annotations
 
-from fastrod.kernels.jit import inline, kernel
-from fastrod.kernels.shape import (
+from .jit import inline, kernel
+from .shape import (
     GROUP,
     N_H,
     N_R,
@@ -30,7 +30,7 @@ from fastrod.kernels.shape import (
     get_mat,
     put,
 )
-from fastrod.kernels.vec import Mat, Vec, add, axpy, cross, dot, exp_map_variation, mul, mul_t, scale, sub, sym_mul
+from .vec import Mat, Vec, add, axpy, cross, dot, exp_map_variation, mul, mul_t, scale, sub, sym_mul
 
 C_PHI, C_M, C_POS, COLUMN = 0, 3, 6, 27
 C_U, C_PHI_BEFORE, C_TANGENT = 9, 21, 24  # of the last step: weighted changes of u at the stages, phi at its start, of the tangents

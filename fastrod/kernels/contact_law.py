@@ -14,9 +14,10 @@ from __future__ import annotations
 
 import math
 
-from fastrod.kernels.bvh import Numbers
-from fastrod.kernels.jit import kernel
 from fastrod.types import Floats
+
+from .bvh import Numbers
+from .jit import kernel
 
 _ROUNDS = 40
 _SWEEPS = 400

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from fastrod.kernels import shape as sh
-from fastrod.kernels.chunk import FIRST_CUTS, solve_section
-from fastrod.kernels.gather import pick
-from fastrod.kernels.jit import LANES, entry, kernel
-from fastrod.kernels.shape import Lanes
 from fastrod.types import Floats, Layout, Params, Ports, Shape
+
+from . import shape as sh
+from .chunk import FIRST_CUTS, solve_section
+from .gather import pick
+from .jit import LANES, entry, kernel
+from .shape import Lanes
 
 W = LANES
 

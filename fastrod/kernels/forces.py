@@ -11,14 +11,16 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from fastrod.kernels.bvh import STACK, Numbers
-from fastrod.kernels.centreline import curve_of, interval_of, point_at, rotation_at
-from fastrod.kernels.contact_law import contact_forces, law_size, solve_dense
-from fastrod.kernels.gather import pick
-from fastrod.kernels.jit import inline, kernel
-from fastrod.kernels.mobile import add_mobility, axis_of
-from fastrod.kernels.search import carried
-from fastrod.kernels.slots import (
+from fastrod.types import Flags, Floats, Ints, Probes, Rods, Shape, Surfaces, Touching
+
+from .bvh import STACK, Numbers
+from .centreline import curve_of, interval_of, point_at, rotation_at
+from .contact_law import contact_forces, law_size, solve_dense
+from .gather import pick
+from .jit import inline, kernel
+from .mobile import add_mobility, axis_of
+from .search import carried
+from .slots import (
     T_GAP,
     T_N,
     T_OBSTACLE,
@@ -29,10 +31,9 @@ from fastrod.kernels.slots import (
     slot_normal,
     wall_at,
 )  # fmt: skip
-from fastrod.kernels.strands import twin_of
-from fastrod.kernels.surface import surface_curvature
-from fastrod.kernels.vec import Vec, add, axpy, cross, dot, mul, scale, sub
-from fastrod.types import Flags, Floats, Ints, Probes, Rods, Shape, Surfaces, Touching
+from .strands import twin_of
+from .surface import surface_curvature
+from .vec import Vec, add, axpy, cross, dot, mul, scale, sub
 
 
 class Scenery(NamedTuple):

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from fastrod.kernels import shape as sh
-from fastrod.kernels.jit import LANES, inline, kernel
-from fastrod.kernels.shape import Lanes
 from fastrod.types import Layout, Memory, Params, Ports, Shape
+
+from . import shape as sh
+from .jit import LANES, inline, kernel
+from .shape import Lanes
 
 W = LANES
 

@@ -48,7 +48,8 @@ def _cache_dir() -> str | None:
     return None
 
 
-_CACHE_DIR = _cache_dir()
+CACHE_DIR = _cache_dir()
+"""Where compiled kernels are kept, or None."""
 
 
 def kernel(function: _Function) -> _Function:
@@ -80,9 +81,9 @@ def inline(function: _Function) -> _Function:
 
 def _compile(function: _Function, **options: bool) -> _Function:
     before = _config.CACHE_DIR
-    _config.CACHE_DIR = _CACHE_DIR or before
+    _config.CACHE_DIR = CACHE_DIR or before
     try:
-        made = _njit(cache=_CACHE_DIR is not None, error_model="numpy", fastmath=_FAST, nogil=True, **options)(function)
+        made = _njit(cache=CACHE_DIR is not None, error_model="numpy", fastmath=_FAST, nogil=True, **options)(function)
     finally:
         _config.CACHE_DIR = before
     return cast(_Function, made)

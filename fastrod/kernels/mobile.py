@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from fastrod.kernels.bvh import Numbers
-from fastrod.kernels.jit import inline, kernel
-from fastrod.kernels.vec import Vec, axpy, cross, dot, scale, sub
 from fastrod.types import Floats, Ints
+
+from .bvh import Numbers
+from .jit import inline, kernel
+from .vec import Vec, axpy, cross, dot, scale, sub
 
 
 @inline

@@ -12,8 +12,8 @@ multiply-adds.
 
 from __future__ import annotations
 
-from fastrod.kernels.jit import LANES, kernel
-from fastrod.kernels.shape import Lanes
+from .jit import LANES, kernel
+from .shape import Lanes
 
 W = LANES
 BLOCK = 4

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from fastrod.kernels.jit import entry
+from .jit import entry
 
 Floats = NDArray[np.float64]
 

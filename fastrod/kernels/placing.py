@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from fastrod.kernels.jit import kernel
 from fastrod.types import Floats, Ints
+
+from .jit import kernel
 
 _END = 1e-9  # of a segment: a load nearer to its end than this is on it
 

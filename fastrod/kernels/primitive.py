@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 
-from fastrod.kernels.bvh import FAR
-from fastrod.kernels.jit import inline, kernel
-from fastrod.kernels.vec import Vec, axpy, dot, scale
+from .bvh import FAR
+from .jit import inline, kernel
+from .vec import Vec, axpy, dot, scale
 
 MESH, SPHERE, BOX, CYLINDER, CAPSULE, PLANE = range(6)
 

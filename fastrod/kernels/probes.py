@@ -6,13 +6,14 @@ carries them, what is beyond does not. Each probe brings three columns, a unit f
 
 from __future__ import annotations
 
-from fastrod.kernels import columns as col
-from fastrod.kernels import shape as sh
-from fastrod.kernels.gather import pick
-from fastrod.kernels.jit import LANES, inline, kernel
-from fastrod.kernels.shape import Lanes
-from fastrod.kernels.vec import Vec, add, cross, mul, mul_t, sub
 from fastrod.types import Layout, Memory, Params, Probes
+
+from . import columns as col
+from . import shape as sh
+from .gather import pick
+from .jit import LANES, inline, kernel
+from .shape import Lanes
+from .vec import Vec, add, cross, mul, mul_t, sub
 
 W = LANES
 

@@ -16,8 +16,8 @@ from __future__ import annotations
 
 import math
 
-from fastrod.kernels.jit import inline
-from fastrod.kernels.vec import Sym, Vec, sub, sym_inv, sym_mul
+from .jit import inline
+from .vec import Sym, Vec, sub, sym_inv, sym_mul
 
 
 @inline

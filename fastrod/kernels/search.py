@@ -11,12 +11,13 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from fastrod.kernels.bvh import FAR, Numbers
-from fastrod.kernels.centreline import Curve, interval_of, point_at, tangent_at
-from fastrod.kernels.jit import inline, kernel
-from fastrod.kernels.surface import ray_hit, signed_distance
-from fastrod.kernels.vec import Vec, axpy, dot, sub
 from fastrod.types import Floats, Surfaces
+
+from .bvh import FAR, Numbers
+from .centreline import Curve, interval_of, point_at, tangent_at
+from .jit import inline, kernel
+from .surface import ray_hit, signed_distance
+from .vec import Vec, axpy, dot, sub
 
 CANDIDATE = 6  # numbers of one: obstacle, arclength, gap, normal
 _ITERATIONS = 40

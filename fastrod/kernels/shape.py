@@ -12,9 +12,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from fastrod.kernels.jit import LANES, inline, kernel
-from fastrod.kernels.rod import curvature_correction, tendon_path, tendon_stiffness
-from fastrod.kernels.vec import Mat, Vec, add, axpy, cross, exp_map, matmul, mul, mul_t, scale, sym_mul
+from .jit import LANES, inline, kernel
+from .rod import curvature_correction, tendon_path, tendon_stiffness
+from .vec import Mat, Vec, add, axpy, cross, exp_map, matmul, mul, mul_t, scale, sym_mul
 
 W = LANES
 Lanes = Any  # a one-dimensional float64 array; numba's types are not mypy's

@@ -7,11 +7,12 @@ come where the gap is violated (an exchange method for the constraint gap(s) >= 
 
 from __future__ import annotations
 
-from fastrod.kernels.bvh import FAR, Numbers
-from fastrod.kernels.jit import inline, kernel
-from fastrod.kernels.surface import ray_hit, signed_distance, walls
-from fastrod.kernels.vec import Vec, dot, scale
 from fastrod.types import Floats, Surfaces
+
+from .bvh import FAR, Numbers
+from .jit import inline, kernel
+from .surface import ray_hit, signed_distance, walls
+from .vec import Vec, dot, scale
 
 T_OBSTACLE, T_S, T_TWIN, T_N, T_GAP, T_FORCE, T_RADIUS, T_ARM, T_TAKEN, T_SHIFT, SLOT = 0, 1, 2, 3, 6, 7, 10, 11, 12, 13, 14
 """Obstacle (from n_obstacles on: rods), arclength, number that links both sides of a contact between rods or -1, normal

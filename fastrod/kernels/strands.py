@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 
-from fastrod.kernels.bvh import FAR
-from fastrod.kernels.centreline import Curve, curve_of, interval_of, point_at, tangent_at
-from fastrod.kernels.jit import inline, kernel
-from fastrod.kernels.slots import T_GAP, T_OBSTACLE, T_S, T_TWIN, open_slot, segment_at
-from fastrod.kernels.vec import Vec, axpy, dot, scale, sub
 from fastrod.types import Floats, Ints, Rods, Shape, Touching
+
+from .bvh import FAR
+from .centreline import Curve, curve_of, interval_of, point_at, tangent_at
+from .jit import inline, kernel
+from .slots import T_GAP, T_OBSTACLE, T_S, T_TWIN, open_slot, segment_at
+from .vec import Vec, axpy, dot, scale, sub
 
 _ROUNDS = 12
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 
-from fastrod.kernels.bvh import FAR, Numbers, corner, facing_planes, first_hit, nearest_triangle, signed_triangle
-from fastrod.kernels.jit import inline, kernel
-from fastrod.kernels.primitive import BOX, CAPSULE, MESH, PLANE, SPHERE, ray_primitive, signed_primitive
-from fastrod.kernels.vec import Mat, Vec, dot, mul, mul_t, sub
 from fastrod.types import Surfaces
+
+from .bvh import FAR, Numbers, corner, facing_planes, first_hit, nearest_triangle, signed_triangle
+from .jit import inline, kernel
+from .primitive import BOX, CAPSULE, MESH, PLANE, SPHERE, ray_primitive, signed_primitive
+from .vec import Mat, Vec, dot, mul, mul_t, sub
 
 MOST_PLANES = 4
 

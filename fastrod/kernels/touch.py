@@ -9,15 +9,16 @@ from __future__ import annotations
 
 import math
 
-from fastrod.kernels.bvh import STACK, Numbers
-from fastrod.kernels.centreline import Curve, curve_of, interval_of, point_at
-from fastrod.kernels.forces import Scenery, apply_law, forces_size
-from fastrod.kernels.gather import pick
-from fastrod.kernels.jit import inline, kernel
-from fastrod.kernels.search import CANDIDATE, Sweep, crosses, search_obstacles
-from fastrod.kernels.slots import T_FORCE, T_OBSTACLE, T_S, add_walls, choose, merge, pressed_only, violation
-from fastrod.kernels.strands import search_rods
 from fastrod.types import Clearance, Floats, Ints, Memory, Probes, Touching
+
+from .bvh import STACK, Numbers
+from .centreline import Curve, curve_of, interval_of, point_at
+from .forces import Scenery, apply_law, forces_size
+from .gather import pick
+from .jit import inline, kernel
+from .search import CANDIDATE, Sweep, crosses, search_obstacles
+from .slots import T_FORCE, T_OBSTACLE, T_S, add_walls, choose, merge, pressed_only, violation
+from .strands import search_rods
 
 GOES_ON, AT_REST, LOST = 0, 1, 2
 _MOST_FOUND = 64

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TypeAlias
 
-from fastrod.kernels.jit import inline
+from .jit import inline
 
 Vec: TypeAlias = tuple[float, float, float]
 Sym: TypeAlias = tuple[float, float, float, float, float, float]

@@ -1,0 +1,26 @@
+"""Whether there is a GPU to work on."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, TypeAlias, cast
+
+from fastrod.errors import InputError, UnknownNameError, nearest
+
+Device: TypeAlias = Literal["cpu", "cuda"]
+DEVICES = ("cpu", "cuda")
+_HELP = "install NVIDIA's driver and fastrod[cuda], or leave device='cpu'."
+
+
+def checked(name: object) -> Device:
+    """The device of this name, which is there. Raises `UnknownNameError`, and `InputError` where there is no GPU."""
+    if name not in DEVICES:
+        raise UnknownNameError(f"no device {name!r}; {nearest(str(name), DEVICES)}")
+    if name == "cuda":
+        try:
+            from numba import cuda as found
+        except ImportError as error:
+            raise InputError(f"device is 'cuda', but numba has no numba.cuda here; {_HELP}") from error
+        cuda: Any = found
+        if not cuda.is_available():
+            raise InputError(f"device is 'cuda', but numba finds no CUDA GPU here; {_HELP}")
+    return cast(Device, name)
