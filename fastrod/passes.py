@@ -196,9 +196,8 @@ class Passes:
         noise: float = 1.0,
         n_col: int | None = None,
         probes: Probes = NO_PROBES,
-        only: str | None = None,
     ) -> None:
-        """One forward pass of these robots (`kernels.batch`). A GPU brings back `only` this field of the shape; `collect` the others."""
+        """One forward pass of these robots (`kernels.batch`). What it writes into the shape is there after `collect`."""
         n_probes = probes.node.shape[1]
         if n_col is None:
             n_col = self.n_x + 3 * n_probes if n_probes else self.n_columns(ports)
@@ -209,7 +208,6 @@ class Passes:
                 rows, self.params, ports, self.layout, self._resident, shape, response, n_col, self.n_residuals(ports),
                 feed, carry, update, process, noise,
             )  # fmt: skip
-            self._runner.collect(shape, only)
             return
         parts = 1 if len(rows) <= _SMALL else min(self.threads, -(-len(rows) // LANES))
         size = scratch_size(len(self.layout.tendon_segment), self.n_x, n_col, self.n_residuals(ports), n_probes)
@@ -220,10 +218,11 @@ class Passes:
             n_col, feed, carry, update, process, noise,
         )  # fmt: skip
 
-    def collect(self, shape: Shape) -> None:
-        """All that the passes wrote into this shape is there."""
+    def collect(self, shape: Shape, only: str | None = None) -> Shape:
+        """The shape with what the passes wrote into it, or into one field: on a GPU that is still there."""
         if self._runner is not None:
-            self._runner.collect(shape)
+            self._runner.collect(shape, only)
+        return shape
 
     def move_to_inputs(self, rows: Ints, ports: Ports) -> None:
         """Move x to first order to these inputs, without a pass."""

@@ -43,7 +43,7 @@ class Linear:
                 a.fill(np.nan)
         shape = passes.new_shape("tip", holes)
         passes.run(self.rows, ports, shape, response=response, update=False, noise=1e-20, n_col=n_col, probes=self.probes)
-        return response, shape
+        return response, passes.collect(shape)
 
     def jacobian(self, relocate: Relocate | None = None, turning: bool = False) -> Floats:
         """(n, 6, n_tendons + n_segments) change of the tip by tendons (length, or tension where that is the mode), then by extensions;
@@ -90,6 +90,7 @@ class Linear:
         response = Response(np.empty((k * n, n_e, n_col)), np.empty((k * n, 6, n_col)), np.empty((k * n, n_e)))
         shape = twin.passes.new_shape(outputs, False)
         twin.passes.run(twin.rows, twin.ports, shape, response=response, feed=True, carry=passes.carry, process=process, noise=noise)
+        twin.passes.collect(shape)
         own: Any
         a: Any
         for own, a in zip(passes.memory, twin.passes.memory, strict=True):

@@ -208,6 +208,7 @@ class Simulator:
                 self._passes.run(rows[held], ports, shape, feed=True, n_col=0)
             if not held.all():
                 self._passes.run(rows[~held], ports, shape, feed=True, carry=self._passes.carry, process=process, noise=noise)
+            self._passes.collect(shape)
         ok = self._passes.finite & (shape.residual < _LOST * self._passes.params.reach)
         passes = np.broadcast_to(np.int64(1 + learns), self.n_robots)
         if len(rows) < self.n_robots:
@@ -330,8 +331,8 @@ class Simulator:
         shape = self._passes.new_shape(self.outputs, len(rows) < self.n_robots)
 
         def run(which: Ints, at: Ports) -> Floats:
-            self._passes.run(which, at, shape, noise=1e-10 if self._layout.paper else 1e-20, only="residual")
-            return shape.residual[which]
+            self._passes.run(which, at, shape, noise=1e-10 if self._layout.paper else 1e-20)
+            return self._passes.collect(shape, "residual").residual[which]
 
         passes = settle(rows, self._warm, self._passes, ports, tolerance, run)
         self._passes.collect(shape)

@@ -11,11 +11,17 @@ DEVICES = ("cpu", "cuda")
 _HELP = "install NVIDIA's driver and fastrod[cuda], or leave device='cpu'."
 
 
+def checked_name(name: object) -> Device:
+    """The device of this name. Raises `UnknownNameError` with the nearest."""
+    if not isinstance(name, str) or name not in DEVICES:
+        raise UnknownNameError(f"no device {name!r}; {nearest(str(name).lower().replace('gpu', 'cuda'), DEVICES)}")
+    return cast(Device, name)
+
+
 def checked(name: object) -> Device:
     """The device of this name, which is there. Raises `UnknownNameError`, and `InputError` where there is no GPU."""
-    if name not in DEVICES:
-        raise UnknownNameError(f"no device {name!r}; {nearest(str(name), DEVICES)}")
-    if name == "cuda":
+    device = checked_name(name)
+    if device == "cuda":
         try:
             from numba import cuda as found
         except ImportError as error:
@@ -23,4 +29,4 @@ def checked(name: object) -> Device:
         cuda: Any = found
         if not cuda.is_available():
             raise InputError(f"device is 'cuda', but numba finds no CUDA GPU here; {_HELP}")
-    return cast(Device, name)
+    return device

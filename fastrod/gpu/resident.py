@@ -14,6 +14,12 @@ _cuda: Any = cuda
 FIELDS = Memory._fields
 
 
+def fill(device: Any, array: Any) -> None:
+    """Copy into an array on the device that is as large: as rows of numbers, for the simulator stumbles over axes of length 1."""
+    if device.size:
+        device.reshape(-1).copy_to_device(np.ascontiguousarray(array).reshape(-1))
+
+
 class Resident:
     """The two copies of a `Memory`. A field is stale on the device after the host was let write to it, and the other way round."""
 
@@ -43,11 +49,11 @@ class Resident:
     def there(self) -> Memory:
         """The arrays on the device, up to date."""
         for name in self._stale_there:
-            array = np.ascontiguousarray(getattr(self._host, name))
+            array = getattr(self._host, name)
             if name in self._device:
-                self._device[name].copy_to_device(array)
+                fill(self._device[name], array)
             else:
-                self._device[name] = _cuda.to_device(array)
+                self._device[name] = _cuda.to_device(np.ascontiguousarray(array))
         self._stale_there.clear()
         return Memory(**self._device)
 

@@ -8,7 +8,7 @@ import numpy as np
 from numba import cuda
 
 from fastrod.gpu.batch import all_finite, launch, move_to_inputs, pass_robots, room
-from fastrod.gpu.resident import Resident
+from fastrod.gpu.resident import Resident, fill
 from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports, Response, Shape
 
 _cuda: Any = cuda
@@ -119,7 +119,7 @@ class Runner:
         if before is not None and (np.array_equal(before, array) and before.dtype == array.dtype if small else before is array):
             return device
         if device is not None and device.shape == array.shape and device.dtype == array.dtype and array.size:
-            device.copy_to_device(np.ascontiguousarray(array))
+            fill(device, array)
         else:
             device = _cuda.to_device(np.ascontiguousarray(array))
         self.sent_bytes += array.nbytes

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
 from fastrod.errors import InputError, nearest
+from fastrod.gpu.device import Device, checked_name
 from fastrod.robot import Robot
 from fastrod_envs.randomisation import Randomisation
 
@@ -34,6 +35,8 @@ class Options:
     """From 0, all goals are the easiest, to 1, the whole task; `set_difficulty` changes it between episodes (curriculum)."""
     threads: int | None = None
     """Of the simulator; None is numba's number."""
+    device: Device = "cpu"
+    """Of the simulator, `cpu` or `cuda`; tasks in which rods feel contact or hold a host's bodies have the CPU alone."""
 
     def __post_init__(self) -> None:
         if self.n_steps is not None and (not isinstance(self.n_steps, Integral) or isinstance(self.n_steps, bool) or self.n_steps < 1):
@@ -42,6 +45,7 @@ class Options:
             if getattr(self, name) not in kinds:
                 raise InputError(f"{name} is {getattr(self, name)!r}; it must be {' or '.join(map(repr, kinds))}.")
         checked_difficulty(self.difficulty)
+        checked_name(self.device)
 
     @classmethod
     def read(cls: type[Made], given: Mapping[str, Any]) -> Made:

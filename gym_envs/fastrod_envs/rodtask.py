@@ -34,6 +34,7 @@ class RodTask(Task):
     """`Simulator(hold_gain=...)` [m]."""
     loaded: ClassVar[bool] = False
     """An episode brings loads of its own: robots settle under them when it begins."""
+    on_gpu: ClassVar[bool] = True
 
     def __init__(
         self, n_envs: int, options: Options, robot: Robot, *, driven: ArrayLike, limit: ArrayLike, rate: ArrayLike,
@@ -66,7 +67,7 @@ class RodTask(Task):
         self.simulator = Simulator(
             robots if self._varies else self.base_robot, n_robots=n_envs, dt=self.dt, points_per_segment=self.points_per_segment,
             outputs=self.outputs, threads=options.threads, contact=contact, hold_gain=self.hold_gain,
-            feel_contact=feel_contact,
+            feel_contact=feel_contact, device=options.device,
         )  # fmt: skip
         self._turn = matrix_from_quaternion(np.array([self.base_robot.base_quaternion]))[0]
         self._foot = np.array(self.base_robot.base_position)
@@ -145,7 +146,9 @@ class RodTask(Task):
             return self.simulator
         if self._model is None:
             plain = replace(self.base_robot, effects=())
-            self._model = Simulator(plain, n_robots=self.n_envs, points_per_segment=self.points_per_segment, outputs="tip")
+            self._model = Simulator(
+                plain, n_robots=self.n_envs, points_per_segment=self.points_per_segment, outputs="tip", device=self.options.device
+            )
         self._model.settle(**self._inputs(), tolerance=1e-6)
         return self._model
 

@@ -8,6 +8,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from fastrod.errors import InputError
 from fastrod.types import Flags, Floats, Ints
 from fastrod_envs.options import Options, checked_difficulty
 
@@ -115,6 +116,8 @@ class Task(ABC):
     """Its options."""
     hosted: ClassVar[bool] = False
     """Needs PyBullet (`pip install fastrod[hosts]`)."""
+    on_gpu: ClassVar[bool] = False
+    """Its simulator can work on a GPU (`device="cuda"`)."""
 
     dt: float
     """Time of a step [s]."""
@@ -126,6 +129,8 @@ class Task(ABC):
     """Parts of an observation of the goal, in the order of `goal()`."""
 
     def __init__(self, n_envs: int, options: Options) -> None:
+        if options.device != "cpu" and not self.on_gpu:
+            raise InputError(f"device is {options.device!r}; {self.name} has contact or a host's bodies, which need device 'cpu'.")
         self.n_envs, self.options = n_envs, options
         self.difficulty = options.difficulty
         self.total_draws = self.n_draws

@@ -1,0 +1,107 @@
+"""Which device a simulator may ask for, and that the real CUDA compiler takes the kernels."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from importlib.util import find_spec
+from typing import Any
+
+import pytest
+from numba import cuda
+from rods import rod
+
+from fastrod import Simulator
+from fastrod.errors import InputError, UnknownNameError
+from fastrod_envs.vector import BatchEnv
+
+
+def test_an_unknown_device_is_answered_with_the_near_one() -> None:
+    with pytest.raises(UnknownNameError, match="no device 'coda'; did you mean 'cuda'"):
+        Simulator(rod(), device="coda")  # type: ignore[arg-type]
+    with pytest.raises(UnknownNameError, match="no device 'GPU'; did you mean 'cuda'"):
+        BatchEnv("Reach", 2, device="GPU")
+
+
+def test_a_machine_without_a_gpu_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cuda, "is_available", lambda: False)
+    with pytest.raises(InputError, match="device is 'cuda', but numba finds no CUDA GPU here; install"):
+        Simulator(rod(), device="cuda")
+    with pytest.raises(InputError, match="finds no CUDA GPU"):
+        BatchEnv("Reach", 2, device="cuda")
+
+
+def test_a_numba_without_cuda_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "numba.cuda", None)
+    monkeypatch.delattr("numba.cuda", raising=False)
+    with pytest.raises(InputError, match=r"numba has no numba\.cuda here; install NVIDIA's driver and fastrod\[cuda\]"):
+        Simulator(rod(), device="cuda")
+
+
+@pytest.mark.parametrize("name", ["TubeInsert", "Push"])
+def test_tasks_with_contact_need_the_cpu(name: str) -> None:
+    with pytest.raises(InputError, match=f"device is 'cuda'; {name} has contact or a host's bodies, which need device 'cpu'"):
+        BatchEnv(name, 2, device="cuda")
+
+
+COMPILE = """
+from types import SimpleNamespace
+import numba
+import numba.cuda.dispatcher
+from numba import cuda
+numba.cuda.dispatcher.get_current_device = lambda: SimpleNamespace(compute_capability=(9, 0))  # no GPU: say which one is meant
+import numpy as np
+from fastrod import Simulator, load_robot
+from fastrod.gpu import batch
+from fastrod.inputs import Inputs
+from fastrod.types import Response
+robot = load_robot("prototype")
+sim = Simulator(robot, outputs="tip")
+passes = sim._passes
+ports, rows = sim._reader.ports(Inputs(robot.rest_tendon_length)), np.arange(1)
+none = Response(np.empty((0, 0, 0)), np.empty((0, 0, 0)), np.empty((0, 0)))
+arguments = (rows, passes.params, ports, passes.layout, passes.memory, passes.new_shape("tip", False), none, 7, True, False, True, 1.0, 1.0)
+size = batch.room(4, passes.n_x, 7, passes.n_residuals(ports))
+for kernel, given in (
+    (batch.pass_robots(size), arguments),
+    (batch.move_to_inputs, (rows, ports, passes.params, passes.memory, passes.layout)),
+    (batch.all_finite, (passes.memory.x, np.ones(1, bool))),
+    (batch.put_rows, (rows, passes.memory.gain.reshape(1, -1), passes.memory.gain.reshape(1, -1))),
+):
+    ptx, _ = cuda.compile_ptx(kernel.py_func, tuple(numba.typeof(a) for a in given), cc=(9, 0))
+    assert ".entry" in ptx and "call" not in ptx
+    print(kernel.py_func.__name__)
+"""
+
+
+@pytest.mark.skipif(find_spec("numba_cuda") is None, reason="the CUDA compiler is not here: pip install fastrod[cuda]")
+def test_the_cuda_compiler_takes_the_kernels() -> None:
+    done = subprocess.run([sys.executable, "-c", COMPILE], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == [
+        "run",
+        "True",
+        "False",
+        "_move",
+        "True",
+        "False",
+        "_all_finite",
+        "True",
+        "False",
+        "_put_rows",
+        "True",
+        "False",
+    ]
+
+
+def test_the_second_name_is_the_same_source() -> None:
+    from importlib import import_module
+
+    import fastrod.kernels.chunk
+    import fastrod.kernels.jit
+
+    twin: Any = import_module("fastrod.gpu.kernels.chunk")
+    assert twin.__file__ == fastrod.kernels.chunk.__file__
+    assert twin.W == 1
+    assert fastrod.kernels.chunk.W == fastrod.kernels.jit.LANES
+    assert twin.sh.__name__ == "fastrod.gpu.kernels.shape"
