@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
+import numba
 import pytest
 from numba import cuda
 from rods import rod
@@ -29,6 +32,14 @@ def test_a_machine_without_a_gpu_says_so(monkeypatch: pytest.MonkeyPatch) -> Non
         Simulator(rod(), device="cuda")
     with pytest.raises(InputError, match="finds no CUDA GPU"):
         BatchEnv("Reach", 2, device="cuda")
+
+
+def test_numbas_own_cuda_is_not_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cuda, "is_available", lambda: True)
+    monkeypatch.setattr(cuda, "implementation", "Built-in")
+    monkeypatch.setattr(numba.config, "ENABLE_CUDASIM", 0)
+    with pytest.raises(InputError, match=r"the numba\.cuda within numba cannot compile the kernels; install .* fastrod\[cuda\]"):
+        Simulator(rod(), device="cuda")
 
 
 def test_a_numba_without_cuda_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,6 +103,18 @@ def test_the_cuda_compiler_takes_the_kernels() -> None:
         "True",
         "False",
     ]
+
+
+def test_the_benchmark_says_what_it_can(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cuda, "is_available", lambda: False)
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "perf"))
+    import bench_cuda
+
+    assert bench_cuda.main(["--quick", "--json"]) == 0
+    table = json.loads(capsys.readouterr().out)["sections"]["work"]
+    assert "No time was measured: device is 'cuda', but numba finds no CUDA GPU here" in table["notes"][0]
+    assert [row["robot"] for row in table["rows"]] == ["prototype", "reacher"]
+    assert all(row["moved_bytes"] > 500.0 and row["operations"] > 1e4 for row in table["rows"])
 
 
 def test_the_second_name_is_the_same_source() -> None:

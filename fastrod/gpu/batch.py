@@ -10,6 +10,7 @@ from functools import cache
 from importlib import import_module
 from typing import Any
 
+import numba
 import numpy as np
 from numba import cuda
 
@@ -17,6 +18,7 @@ from fastrod.gpu.kernels.jit import SIMULATED, launched
 from fastrod.types import Floats, Ints, Layout, Memory, Params, Ports, Probes, Response, Shape
 
 _cuda: Any = cuda
+_config: Any = numba.config
 # the same files as fastrod.kernels.chunk and gather, for the other machine: no type checker would find them there
 _chunk, _gather = import_module("fastrod.gpu.kernels.chunk"), import_module("fastrod.gpu.kernels.gather")
 pass_chunk, scratch_size, feed_forward = _chunk.pass_chunk, _chunk.scratch_size, _gather.feed_forward
@@ -24,7 +26,8 @@ pass_chunk, scratch_size, feed_forward = _chunk.pass_chunk, _chunk.scratch_size,
 BLOCK = 64
 """Threads of a block."""
 BLOCKS = 2
-"""Blocks that a multiprocessor is given: a thread's scratch is some kilobytes, and what does not fit into the caches comes from far."""
+"""Blocks that a multiprocessor is given: a warp for each of its four schedulers. A thread's scratch is 8 to 25 kB, and what more threads
+have does not fit into the caches."""
 _SCRATCH = 256  # numbers by which the room for a pass grows: each size is a compilation
 
 
@@ -105,4 +108,10 @@ def launch(kernel: Any, n: int, *arguments: Any) -> None:
         kernel[2, 2](*arguments)
         return
     most = BLOCKS * _cuda.get_current_device().MULTIPROCESSOR_COUNT
-    kernel[min(-(-n // BLOCK), most), BLOCK](*arguments)
+    before = _config.CUDA_LOW_OCCUPANCY_WARNINGS
+    _config.CUDA_LOW_OCCUPANCY_WARNINGS = 0  # a small batch is no mistake
+    try:
+        configured = kernel[min(-(-n // BLOCK), most), BLOCK]
+    finally:
+        _config.CUDA_LOW_OCCUPANCY_WARNINGS = before
+    configured(*arguments)

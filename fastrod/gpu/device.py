@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from typing import Any, Literal, TypeAlias, cast
 
+import numba
+
 from fastrod.errors import InputError, UnknownNameError, nearest
 
 Device: TypeAlias = Literal["cpu", "cuda"]
+_config: Any = numba.config
 DEVICES = ("cpu", "cuda")
 _HELP = "install NVIDIA's driver and fastrod[cuda], or leave device='cpu'."
 
@@ -29,4 +32,6 @@ def checked(name: object) -> Device:
         cuda: Any = found
         if not cuda.is_available():
             raise InputError(f"device is 'cuda', but numba finds no CUDA GPU here; {_HELP}")
+        if cuda.implementation == "Built-in" and not _config.ENABLE_CUDASIM:
+            raise InputError(f"device is 'cuda', but the numba.cuda within numba cannot compile the kernels; {_HELP}")
     return device
