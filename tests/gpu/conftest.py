@@ -9,4 +9,4 @@ from numba import cuda
 @pytest.fixture(autouse=True)
 def _device() -> None:
     if not cuda.is_available():
-        pytest.skip("no CUDA GPU here; NUMBA_ENABLE_CUDASIM=1 (python tests/check.py cuda) simulates one")
+        pytest.skip("no CUDA GPU here; NUMBA_ENABLE_CUDASIM=1 (python tests/check.py gpu) simulates one")

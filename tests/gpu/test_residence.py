@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cuda.test_parity import assert_same, assert_same_memory, chain, inputs, pair
+from gpu.pairs import assert_same, assert_same_memory, chain, inputs, pair
 from numpy.testing import assert_allclose, assert_array_equal
 from rods import rod
 
