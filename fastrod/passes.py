@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from typing import TYPE_CHECKING, Any, Literal
 
 import numba
@@ -75,7 +76,10 @@ class Passes:
 
     def twin(self, n_robots: int, params: Params, memory: Memory) -> Passes:
         """Other robots of the same layout, on the same device."""
-        twin = Passes(self.layout, params, n_robots, self.threads, self.carry, self.device)
+        twin = copy(self)
+        twin.n_robots, twin.params = n_robots, params
+        if self._runner is not None:
+            twin._runner = type(self._runner)()
         twin.memory = memory
         return twin
 

@@ -144,10 +144,10 @@ def time_section(rows: list[Row]) -> Section:
         Column("difference_m", "tip differs\n[m]", ".1e"), Column("ok", "ok", ".2%"),
     ]  # fmt: skip
     notes = [
-        'Step: `Simulator.step`, outputs="tip", tendon lengths that move; pass: its kernel alone, on inputs that are there. On a GPU a step '
-        "besides sends the lengths and fetches the tips; on both it checks its inputs, on one thread of the CPU.",
-        "Faster: than two threads of the CPU (the first row); the target is for the pass. Tip differs, most: from the first row's after the "
-        "same steps from the same boundary.",
+        'Step: `Simulator.step`, outputs="tip", tendon lengths that move; pass: its kernel alone, on inputs that are there. On a GPU a '
+        "step besides sends the lengths and fetches the tips; on both it checks its inputs, on one thread of the CPU.",
+        "Faster: than two threads of the CPU (the first row); the target is for the pass. Tip differs, most: from the first row's after "
+        "the same steps from the same boundary.",
     ]
     return Section("cuda", "One step of a large batch", columns, rows, notes)
 
