@@ -21,6 +21,8 @@ CHECKS: list[tuple[str, list[str], dict[str, str]]] = [
     ("imports", ["lint-imports"], {}),
     # Threads that spin while they wait take the core from those they wait for: a training takes eight times as long on two busy cores.
     ("tests", ["pytest", "-n", "2", "--dist", "loadfile"], {"OMP_WAIT_POLICY": "passive"}),
+    # The kernels as a GPU would run them, one thread a robot, on numba's simulator of one.
+    ("gpu", ["pytest", "tests/gpu"], {"NUMBA_ENABLE_CUDASIM": "1"}),
     # The kernels once more as plain Python: what the compiler might hide, and the lines that it hides from coverage.
     ("plain python", ["pytest", "tests/plain"], {"NUMBA_DISABLE_JIT": "1"}),
     # And with every index checked: a compiled kernel does not notice that it reads beyond its scratch.

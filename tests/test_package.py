@@ -34,6 +34,7 @@ ALSO = {
     "hosts": "from fastrod.hosts import connect; world = connect(dt=0.01); world.stepSimulation()",
     "mujoco": "import mujoco; from fastrod.hosts import MujocoRod, add_capsules",
     "ray": "import ray, pyarrow; from fastrod.generation.plan import Plan",
+    "cuda": "from fastrod.gpu import device",
     "network": "from fastrod.identification import network; import sklearn",
 }
 """What its extra is for, in one line."""

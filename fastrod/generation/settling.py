@@ -65,7 +65,7 @@ class ChainSolver:
                 return np.asarray(shape.residual[which])
 
             warm = np.full(len(self._rows), bool(self._past))
-            used = settle(left, warm, self.layout, self.params, ports, self._passes.memory, tolerance, run)
+            used = settle(left, warm, self._passes, ports, tolerance, run)
             ok[left] = used[left] > 0
         ok &= shape.residual <= tolerance
         self._past = [self._passes.memory.x.copy(), *self._past[: len(_EXTRAPOLATION) - 1]]
