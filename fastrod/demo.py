@@ -178,6 +178,7 @@ class Stages:
             self.begin("")
 
     def __call__(self, what: str, done: int, total: int) -> None:
+        """What is being done, "stage" or "stage: detail", and how far it is; another stage ends the one before."""
         if self._status is not None:
             self._status.update(f"{what}: {done} of {total}")
         if (stage := what.partition(":")[0]) != self._what:

@@ -219,6 +219,7 @@ class Robot:
 
     @property
     def n_segments(self) -> int:
+        """Length of every (n_segments,) axis, base first."""
         return len(self.segments)
 
     @property
@@ -228,6 +229,7 @@ class Robot:
 
     @property
     def n_tendons(self) -> int:
+        """Length of every (n_tendons,) axis: those of all segments."""
         return len(self.tendons)
 
     @property

@@ -32,10 +32,12 @@ class Wiring:
 
     @property
     def n_tendons(self) -> int:
+        """Wires of all segments."""
         return len(self.tendon_segment)
 
     @property
     def n_drives(self) -> int:
+        """Drives that pull them; an antagonistic pair of wires has one."""
         return int(self.drive.max()) + 1 if len(self.drive) else 0
 
     def count(self, per: str) -> int:

@@ -37,9 +37,11 @@ class TouchedBody(Touching):
         super().__init__(parts, mass, model.body_inertia[body].copy(), dt=dt, relaxation=relaxation, friction=friction)
 
     def com(self) -> Motion:
+        """Of the inertial frame (`data.xipos`, `data.ximat`), whose axes are those of the body's inertia."""
         return com_motion(self.model, self.data, self.body)
 
     def overlap(self, capsules: Sequence[int]) -> Floats:
+        """(3,) the body's way out of the deepest overlap of one of its geoms with one of these, world [m]; its length is the depth."""
         lib = mujoco()
         deepest, way, ends = 0.0, np.zeros(3), np.zeros(6)
         for own in capsules:
@@ -49,6 +51,7 @@ class TouchedBody(Touching):
         return way
 
     def apply(self, wrench: Floats) -> None:
+        """(6,) force [N] and moment about the centre of mass [N m], world, in place of the last; it acts until `release`."""
         self._applied.put(wrench)
 
     def release(self) -> None:

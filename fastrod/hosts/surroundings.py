@@ -32,9 +32,11 @@ class Touched(Touching):
         super().__init__(shapes, mass, np.asarray(inertia), dt=dt, relaxation=relaxation, friction=friction)
 
     def com(self) -> Motion:
+        """Of the centre of mass' frame, not of the link's URDF frame."""
         return _com_motion(self.bullet, self.body, self.link)
 
     def overlap(self, capsules: Sequence[int]) -> Floats:
+        """(3,) the link's way out of its deepest overlap with one of these bodies, world [m]; its length is the depth."""
         found = [p for own in capsules for p in self.bullet.getClosestPoints(own, self.body, 0.0, -1, self.link)]
         if not found:
             return np.zeros(3)
@@ -42,6 +44,7 @@ class Touched(Touching):
         return np.asarray(min(deepest[8], 0.0) * np.array(deepest[7]))  # its normal points from the link to the capsule
 
     def apply(self, wrench: Floats) -> None:
+        """(6,) force [N] and moment about the centre of mass [N m], world, for one `stepSimulation`: then PyBullet forgets it."""
         exert(self.bullet, self.body, self.link, wrench, self.com().pose[:3])
 
 

@@ -34,6 +34,7 @@ class State:
 
     @property
     def theta(self) -> Floats:
+        """(p,) fitted numbers of the model's unknowns, without the foils' amplitudes."""
         return self.fit.theta[: len(self.model.unknowns)]
 
     @property
@@ -62,6 +63,7 @@ class Candidate:
 
     @property
     def passes(self) -> bool:
+        """It was fitted, and nothing speaks against it."""
         return self.state is not None and not self.why
 
 
@@ -97,6 +99,7 @@ def advantage(one: Candidate, other: Candidate) -> float:
 
 
 def best_of(candidates: Sequence[Candidate]) -> Candidate | None:
+    """The winner by `advantage`, compared one after the other; of equals the first, None of none. All must have been fitted."""
     best: Candidate | None = None
     for candidate in candidates:
         if best is None or advantage(candidate, best) > 0.0:

@@ -77,10 +77,12 @@ class Model:
 
     @property
     def start(self) -> Floats:
+        """(p,) fitted numbers where a fit begins; of `log` unknowns the logarithms."""
         return np.array([u.outside(u.start) for u in self.unknowns])
 
     @property
     def limits(self) -> tuple[Floats, Floats]:
+        """(p,) least and (p,) largest fitted numbers; of `log` unknowns the logarithms."""
         pairs = np.array([u.limits for u in self.unknowns]).reshape(-1, 2)
         return pairs[:, 0], pairs[:, 1]
 

@@ -20,6 +20,7 @@ W = LANES
 
 @inline
 def padded(n: int, block: int) -> int:
+    """n rounded up to a multiple of `block`."""
     return block * ((n + block - 1) // block)
 
 

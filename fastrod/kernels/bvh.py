@@ -23,6 +23,7 @@ Numbers = Any  # one-dimensional float64 scratch; numba's types are not mypy's
 
 @inline
 def corner(surfaces: Surfaces, t: int, c: int) -> Vec:
+    """Corner c (0 to 2: a, b, c) of triangle t, mesh frame [m]."""
     row = surfaces.corner[t]
     return row[3 * c], row[3 * c + 1], row[3 * c + 2]
 

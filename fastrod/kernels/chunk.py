@@ -172,6 +172,8 @@ def write_summary(
 def write_response(
     robots: Lanes, count: int, node: Lanes, columns: Lanes, error: Lanes, gamma: Lanes, n_col: int, n_e: int, response: Response
 ) -> None:
+    """Residuals, and the change of residuals and tip by each column; a column has the tip's turn in the tip's frame, `response` in the
+    world's."""
     for w in range(count):
         i = robots[w]
         rotation = sh.get_mat(node, sh.N_R, w)

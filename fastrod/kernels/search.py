@@ -47,6 +47,7 @@ def node_point(curve: Curve, j: int, start: int, part: float) -> Vec:
 
 @inline
 def node_tangent(curve: Curve, j: int, start: int, part: float) -> Vec:
+    """dr/ds at node j; for the first one at the point where contact begins."""
     return tangent_at(curve, j, part if j == start else 0.0) if j < len(curve.arclength) - 1 else tangent_at(curve, j - 1, 1.0)
 
 

@@ -36,11 +36,13 @@ GROUP = 4  # tendons that one loop takes together: fewer loads and stores of the
 
 @inline
 def get(a: Lanes, field: int, w: int) -> Vec:
+    """The vector of lane w that begins at a field."""
     return a[field * W + w], a[(field + 1) * W + w], a[(field + 2) * W + w]
 
 
 @inline
 def put(a: Lanes, field: int, w: int, v: Vec) -> None:
+    """a[field : field + 3] = v in lane w."""
     a[field * W + w] = v[0]
     a[(field + 1) * W + w] = v[1]
     a[(field + 2) * W + w] = v[2]
@@ -48,12 +50,14 @@ def put(a: Lanes, field: int, w: int, v: Vec) -> None:
 
 @inline
 def get_mat(a: Lanes, field: int, w: int) -> Mat:
+    """The matrix of lane w that begins at a field, row by row."""
     x, y, z = get(a, field, w), get(a, field + 3, w), get(a, field + 6, w)
     return x[0], x[1], x[2], y[0], y[1], y[2], z[0], z[1], z[2]
 
 
 @inline
 def put_mat(a: Lanes, field: int, w: int, m: Mat) -> None:
+    """a[field : field + 9] = M in lane w, row by row."""
     put(a, field, w, (m[0], m[1], m[2]))
     put(a, field + 3, w, (m[3], m[4], m[5]))
     put(a, field + 6, w, (m[6], m[7], m[8]))
@@ -104,6 +108,7 @@ def _enter(stages: Lanes, k: int, w: int, o: Vec, moment: Vec, torsion: float, g
 
 @kernel
 def second_stage(node: Lanes, stages: Lanes) -> None:
+    """Stage 2, half a step on: o = h/2 u1 and M = M1 + h/2 M1'; u is guessed by its slope, A u' = -u x m - e3 x n."""
     for w in range(W):
         h = node[N_H * W + w]
         u1, m = get(stages, S_U, w), get(stages, S_M, w)
@@ -125,6 +130,7 @@ def second_stage(node: Lanes, stages: Lanes) -> None:
 
 @kernel
 def third_stage(node: Lanes, stages: Lanes) -> None:
+    """Stage 3, half a step on: o = h/2 u2 + h^2/8 u1 x u2 and M = M1 + h/2 M2'; u is guessed as u2."""
     for w in range(W):
         h = node[N_H * W + w]
         u1, u2 = get(stages, S_U, w), get(stages, STAGE + S_U, w)
@@ -135,6 +141,7 @@ def third_stage(node: Lanes, stages: Lanes) -> None:
 
 @kernel
 def fourth_stage(node: Lanes, stages: Lanes) -> None:
+    """Stage 4, a step on: o = h u3 and M = M1 + h M3'; u is guessed by the parabola through u1, its slope, and u3: 4 u3 - 3 u1 - h u1'."""
     for w in range(W):
         h = node[N_H * W + w]
         u1, u3 = get(stages, S_U, w), get(stages, 2 * STAGE + S_U, w)
@@ -189,6 +196,7 @@ def curvature_without_tendons(stage: Lanes, stiffness: Lanes, rest: Lanes) -> No
 
 @kernel
 def clear_sums(stage: Lanes) -> None:
+    """Zero for the moment (3) and the Hessian (6) that `tendon_sums` adds up."""
     for i in range(S_SUM * W, (S_SUM + 9) * W):
         stage[i] = 0.0
 

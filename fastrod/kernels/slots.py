@@ -25,22 +25,26 @@ _CLOSE = 1e-3  # of a step: the least that two contacts of one obstacle are apar
 
 @inline
 def slot_normal(slot: Numbers) -> Vec:
+    """Unit vector toward the rod, world."""
     return slot[T_N], slot[T_N + 1], slot[T_N + 2]
 
 
 @inline
 def slot_force(slot: Numbers) -> Vec:
+    """On the rod, world [N]."""
     return slot[T_FORCE], slot[T_FORCE + 1], slot[T_FORCE + 2]
 
 
 @inline
 def carries(slot: Numbers) -> bool:
+    """F . F > 0: the contact presses."""
     f = slot_force(slot)
     return dot(f, f) > 0.0
 
 
 @inline
 def open_slot(slot: Numbers, obstacle: int, s: float, twin: int, n: Vec, gap: float, radius: float, friction: float) -> None:
+    """Write a contact that carries nothing yet: normal n, world, `gap` and `radius` [m]. Only friction gives its force an arm."""
     slot[T_OBSTACLE], slot[T_S], slot[T_TWIN], slot[T_GAP], slot[T_RADIUS] = float(obstacle), s, float(twin), gap, radius
     slot[T_N], slot[T_N + 1], slot[T_N + 2] = n
     slot[T_ARM], slot[T_SHIFT] = radius if friction > 0.0 else 0.0, FAR
@@ -90,6 +94,7 @@ def violation(n_found: int, found: Floats, count: int, slot: Floats, spacing: fl
 
 @inline
 def segment_at(arclength: Floats, n_steps: int, s: float) -> int:
+    """Segment of the arclength s, `n_steps` intervals each: at a joint the distal one, beyond the tip the last."""
     n_segments = (len(arclength) - 1) // n_steps
     k = 0
     while k < n_segments - 1 and arclength[(k + 1) * n_steps] <= s:

@@ -22,11 +22,13 @@ def turn_of(frame: Numbers) -> Mat:
 
 @inline
 def to_obstacle(frame: Numbers, p: Vec) -> Vec:
+    """R^T (p - o): the world point p in the obstacle's frame."""
     return mul_t(turn_of(frame), (p[0] - frame[9], p[1] - frame[10], p[2] - frame[11]))
 
 
 @inline
 def to_world(frame: Numbers, p: Vec) -> Vec:
+    """R p + o: the point p of the obstacle's frame in the world."""
     q = mul(turn_of(frame), p)
     return q[0] + frame[9], q[1] + frame[10], q[2] + frame[11]
 

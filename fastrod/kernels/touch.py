@@ -79,6 +79,7 @@ def _press(r: int, i: int, scenery: Scenery, touching: Touching, probes: Probes,
 
 @inline
 def sweep_of(i: int, scenery: Scenery, margin: float) -> Sweep:
+    """How robot i is searched; `margin` is a part of its length, and candidates nearer than a twentieth of an integration step are one."""
     rods = scenery.rods
     return Sweep(rods.radius[i], rods.n_steps, rods.first[i], margin * rods.reach[i], 0.05 * rods.spacing[i])
 

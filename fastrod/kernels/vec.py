@@ -16,16 +16,19 @@ Mat: TypeAlias = tuple[float, float, float, float, float, float, float, float, f
 
 @inline
 def add(a: Vec, b: Vec) -> Vec:
+    """a + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 @inline
 def sub(a: Vec, b: Vec) -> Vec:
+    """a - b."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 @inline
 def scale(k: float, a: Vec) -> Vec:
+    """k a."""
     return k * a[0], k * a[1], k * a[2]
 
 
@@ -37,11 +40,13 @@ def axpy(k: float, a: Vec, b: Vec) -> Vec:
 
 @inline
 def dot(a: Vec, b: Vec) -> float:
+    """a . b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @inline
 def cross(a: Vec, b: Vec) -> Vec:
+    """a x b."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 

@@ -102,6 +102,7 @@ class Problem:
 
     @property
     def length(self) -> float:
+        """Arclength of the tip, extensions included [m]."""
         return float(self.segment_end[-1])
 
     @property
@@ -116,10 +117,12 @@ class Problem:
 
     @property
     def compliance(self) -> Array:
+        """(n_tendons,) stretch per tension [m/N]."""
         return np.array([tendon.compliance for tendon in self.robot.tendons])
 
     @property
     def pretension(self) -> Array:
+        """(n_tendons,) tension at which a tendon has its commanded length [N]."""
         return np.array([tendon.pretension for tendon in self.robot.tendons])
 
     def scaled(self, fraction: float) -> Problem:

@@ -100,6 +100,7 @@ class HostedTask(Task):
         """A new environment."""
 
     def begin(self, rows: Ints, draws: Floats) -> None:
+        """As `Task.begin`, cell by cell. A cell that raises `HostError` is closed and made anew; if it raises again, so does this."""
         for i, row in zip(rows, draws, strict=True):
             robot = None
             if self._random is not None and self._random.n_draws:
@@ -115,6 +116,8 @@ class HostedTask(Task):
             self._sane[i] = self.cells[i].result()
 
     def act(self, action: Floats) -> None:
+        """As `Task.act`. A cell that raises `HostError`, or whose state is not finite, is lost until its next episode, and shows its last
+        good step."""
         for i, cell in enumerate(self.cells):
             try:
                 cell.act(action[i], self.dt)
@@ -126,6 +129,7 @@ class HostedTask(Task):
                 self._lost[i] = True
 
     def outcome(self) -> Outcome:
+        """Of each cell's last good step; one that is lost has not succeeded."""
         results = [result for result in self._sane if result is not None]
 
         def each(values: list[Any]) -> Any:
@@ -140,21 +144,27 @@ class HostedTask(Task):
         )  # fmt: skip
 
     def state(self) -> Floats:
+        """(n_envs, size of `states`) after each cell's last good step; a copy."""
         return self._seen.copy()
 
     def goal(self) -> Floats:
+        """(n_envs, size of `goals`), as the cells have them now."""
         return np.array([cell.goal() for cell in self.cells])
 
     def baseline(self) -> Floats:
+        """(n_envs, n_actions) of the cells' own baselines, clipped to -1 and 1."""
         return np.asarray(np.clip(np.array([cell.baseline() for cell in self.cells]), -1.0, 1.0))
 
     def scenery(self, i: int) -> Scenery:
+        """As cell i gives it."""
         return self.cells[i].scenery()
 
     def picture(self, i: int, width: int, height: int) -> np.ndarray | None:
+        """(height, width, 3) uint8 by PyBullet's camera; never None."""
         return self.cells[i].picture(width, height)
 
     def close(self) -> None:
+        """Disconnect the worlds of all cells; the task cannot be used afterwards."""
         for cell in self.cells:
             cell.close()
         self.cells = []

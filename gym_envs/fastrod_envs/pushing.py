@@ -84,6 +84,8 @@ class PushCell(Cell):
         """The robot met the cube in this episode."""
 
     def begin(self, draws: Floats, difficulty: float, robot: Robot | None) -> None:
+        """`draws` (5,): the goal's x and y, the cube's shift in x and y, its turn. With `difficulty` 0 the goal is in the middle of the
+        course's rectangle. Raises `HostError` where a randomised robot does not come to rest."""
         course = self.course
         least, largest = np.array(course.least), np.array(course.largest)
         self.desired = 0.5 * (least + largest) + difficulty * (draws[:2] - 0.5) * (largest - least)
@@ -97,6 +99,8 @@ class PushCell(Cell):
         self._build(np.array(course.place) + _SHIFT * (2.0 * draws[2:4] - 1.0), _TURN * (2.0 * draws[4] - 1.0))
 
     def act(self, action: Floats, duration: float) -> None:
+        """Move the numbers of `Drive` by their rates, or toward their places no faster than these, within their ranges and with the bar
+        off the floor: in equal parts of at most 0.1 s, at rest in each. Raises `HostError` where the rod is lost."""
         drive = self.drive
         if self.options.action == "rate":
             there = self.q + duration * drive.rate * action
@@ -108,6 +112,7 @@ class PushCell(Cell):
             self._move(self._settled())
 
     def result(self) -> Result:
+        """`distance` is from the cube's middle to its goal in the plane [m]; terms exp(-k d^2), and 0.5 once the cube was touched."""
         position = self._cube()[0]
         desired = np.array([*self.desired, 0.5 * self.course.size])
         d = float(np.hypot(*(position - desired)[:2]))
@@ -115,6 +120,7 @@ class PushCell(Cell):
         return Result(terms, d, d < ACCURACY, position, desired, facts={"touched": float(self.touched)})
 
     def state(self) -> Floats:
+        """(17,) in the order of `PushTask.states`."""
         position, rotation = self._cube()
         turn = 4.0 * math.atan2(rotation[1, 0], rotation[0, 0])
         cube, tip = position[:2], self.tip
@@ -124,6 +130,7 @@ class PushCell(Cell):
         )
 
     def goal(self) -> Floats:
+        """(2,) where the cube's middle is to be, x and y, world [m]."""
         return self.desired
 
     def baseline(self) -> Floats:
@@ -138,6 +145,7 @@ class PushCell(Cell):
         return drive.posture(self.q + self._n * self._dt * drive.rate * rates)
 
     def scenery(self) -> Scenery:
+        """Rod and bar as tubes, the cube, and its goal as a ball; seen from the course's right."""
         position, rotation = self._cube()
         vertices, faces = box_mesh([self.course.size] * 3, position.tolist(), rotation)
         points = self.simulator.state.position[0]
@@ -151,6 +159,7 @@ class PushCell(Cell):
         )  # fmt: skip
 
     def picture(self, width: int, height: int) -> np.ndarray:
+        """(height, width, 3) uint8, from the course's right, of a second world that is made for pictures when the first is asked for."""
         course = self.course
         if self._studio is None:
             self._studio = self._backdrop()
@@ -173,6 +182,7 @@ class PushCell(Cell):
         return picture
 
     def close(self) -> None:
+        """Disconnect both worlds; once more does nothing."""
         for world in (self.world, self._studio):
             if world is not None and world.isConnected():
                 world.disconnect()
@@ -299,6 +309,7 @@ class PushTask(HostedTask):
         """A world for pictures, without robot and cube."""
 
     def cell(self) -> Cell:
+        """A `PushCell` with this course, these options, and the robot as it is before it is randomised."""
         options = self.options
         assert isinstance(options, PushOptions)
         return PushCell(self.course, self.base_robot, options, self.dt, self.backdrop)

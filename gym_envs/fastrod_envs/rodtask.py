@@ -103,6 +103,7 @@ class RodTask(Task):
         self._keep(state.tip_position, state.tip_rotation[:, :, 2], state.ok, rows)
 
     def act(self, action: Floats) -> None:
+        """Rates move the displacements within their range, in one step; displacements are settled to 1e-7 m. Then comes `moved`."""
         if self.options.action == "rate":
             self.displacement = np.clip(self.displacement + self.dt * self._rate * action, self._low, self._high)
             state = self.simulator.step(**self._inputs())

@@ -62,6 +62,7 @@ class Grid(RodScene):
         """(64,) of each robot behind one at the middle [rad]."""
 
     def simulator(self) -> Simulator:
+        """64 robots, 10 points a segment, without contact."""
         return Simulator(self.actions.robot, n_robots=len(self.bases), dt=self.dt, points_per_segment=10)
 
     def action(self, t: float) -> Floats:
@@ -74,9 +75,11 @@ class Grid(RodScene):
         return np.stack([extension, bend * np.sin(angle), TWIST * bend * np.cos(angle)], axis=2).reshape(len(angle), 3 * n)
 
     def inputs(self, t: float) -> dict[str, Any]:
+        """`action` at time t [s], and the robots' places as `base_pose`."""
         return {**self.actions.inputs(self.action(t)), "base_pose": self.bases}
 
     def check(self) -> dict[str, float]:
+        """The waves must be solved to `RESIDUAL`, move every tip by `WAY`, differ between neighbours, and come back after a period."""
         tips: list[Floats] = []
         residual = 0.0
         for t, state in self.run():

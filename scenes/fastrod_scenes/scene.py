@@ -90,6 +90,7 @@ class RodScene(Scene):
 
     @final
     def run(self) -> Iterator[tuple[float, State]]:
+        """(t [s], state) of a new simulator's steps; the first has the inputs of t = 0, the last those of `duration`."""
         simulator = self.simulator()
         for k in range(round(self.duration / self.dt) + 1):
             yield k * self.dt, simulator.step(**self.inputs(k * self.dt))

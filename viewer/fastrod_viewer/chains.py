@@ -64,6 +64,7 @@ class Sampler:
         self.n_steps, self.segment, self.fraction = n_steps, segment, fraction
 
     def __call__(self, rods: Nodes) -> Samples:
+        """(n_robots, m, ...) at the m cross-sections of these rods."""
         n, m = len(rods.position), len(self.segment)
         found = Samples(np.empty((n, m, 3)), np.empty((n, m, 4)), np.empty((n, m), np.int64), np.empty((n, m)))
         kernels.sample(

@@ -79,6 +79,7 @@ class DrivePage(Page):
         self.session.start()
 
     def close(self) -> None:
+        """End the session, which saves what is recorded, and take controls and drawing away."""
         self._closing = True
         self.session.close()
         self.controls.close()
@@ -91,19 +92,23 @@ class DrivePage(Page):
         self.drawing.canvas.clear()
 
     def rest(self, on: bool) -> None:
+        """Pause the session, or let it go on."""
         self.session.paused = on
 
     def tick(self) -> None:
+        """Say why nothing moves while one step takes longer than `_LONG`."""
         if self.session.waiting > _LONG:
             self.figures.content = facts([("Tip", self._tip())], news=_COMPILING)
 
     def lost(self, client: int, left: int) -> None:
+        """The client's hand lets go of the grip; with nobody left, what was on its way stops (`Session.nobody`)."""
         if self.grip is not None:
             self.grip.lost(client)
         if left == 0:
             self.session.nobody()
 
     def export(self) -> str:
+        """The robot as it stands now, with its legend, time and tip; nothing moves in it."""
         serializer = self.server.get_scene_serializer()
         shown: list[tuple[str, str]] = [("robot", self.world.robot.name), ("t", f"{self.world.t:.2f} s"), ("tip", self._tip())]
         return wrap(

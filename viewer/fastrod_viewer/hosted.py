@@ -54,18 +54,22 @@ class HostedView(World):
 
     @property
     def t(self) -> float:
+        """Steps since the last reset, by hand or by script, times dt [s]."""
         return self._steps * self.dt
 
     @property
     def rods(self) -> tuple[Rods, ...]:
+        """The stage's soft robots, where they are in the world: none is drawn elsewhere."""
         still = np.zeros((1, 3))
         return tuple(Rods((soft.robot,), soft.state, still, radius) for soft, radius in zip(self._soft, self._radius, strict=True))
 
     @property
     def bodies(self) -> tuple[Body, ...]:
+        """Visual shapes of the first stage, the soft robots' capsules left out; a reset brings the same again."""
         return self._bodies
 
     def poses(self) -> Floats:
+        """(n_bodies, 7) of their links' URDF frames, world."""
         return self._visuals.poses()
 
     def play(self) -> None:
@@ -137,6 +141,7 @@ class HostedView(World):
         return jacobian
 
     def picture(self) -> NDArray[np.uint8] | None:
+        """(height, width, 3) of the stage's own camera, where it has one."""
         image = self._stage.picture()
         return None if image is None else image.rgb
 

@@ -1,4 +1,4 @@
-"""`MujocoView`: a scene in a MuJoCo model, played: its soft robot, and the shapes that collide."""
+"""`MujocoView`: a scene in a MuJoCo model, played: its soft robot, and the geoms of everything else."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class MujocoView(World):
     loads = False
 
     def __init__(self, scene: MujocoScene) -> None:
-        """Raises `HostError` where MuJoCo is missing."""
+        """Raises `HostError` where MuJoCo is missing, and for a geom that `obstacle_of` refuses."""
         self.scene = scene
         self.name, self.about, self.dt, self.duration = scene.name, scene.about, scene.dt, scene.duration
         self.reset()
@@ -42,22 +42,27 @@ class MujocoView(World):
 
     @property
     def t(self) -> float:
+        """Steps since the last reset times dt [s]."""
         return self._steps * self.dt
 
     @property
     def rods(self) -> tuple[Rods, ...]:
+        """The stage's one rod."""
         return (Rods((self.robot,), self._stage.rod.rod.state, np.zeros((1, 3)), self._radius),)
 
     @property
     def bodies(self) -> tuple[Body, ...]:
+        """The model's geoms, the rod's capsules left out, each in its own frame."""
         return self._bodies
 
     def poses(self) -> Floats:
+        """(n_bodies, 7) of the geoms' frames, world."""
         data = self._stage.data
         turn = quaternion_from_matrix(data.geom_xmat[self._geoms].reshape(-1, 3, 3))
         return np.concatenate([data.geom_xpos[self._geoms], turn], axis=1)
 
     def play(self) -> None:
+        """One step of the script, or from its end back to its beginning. Raises `HostError` where the rod is lost, after a reset."""
         if self._steps >= round(self.duration / self.dt):
             self.reset()
             return
@@ -69,12 +74,15 @@ class MujocoView(World):
         self._steps += 1
 
     def drive(self, hand: Hand) -> NoReturn:  # noqa: ARG002
+        """Raises `InputError`: only the script moves this world."""
         self._refuse()
 
     def jacobian(self) -> NoReturn:
+        """Raises `InputError`: only the script moves this world."""
         self._refuse()
 
     def reset(self) -> None:
+        """A new model and data, as the scene sets them up."""
         self._stage = self.scene.stage()
         self._steps = 0
 

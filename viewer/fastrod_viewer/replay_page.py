@@ -51,6 +51,7 @@ class ReplayPage(Page):
         self._thread.start()
 
     def close(self) -> None:
+        """End the thread that plays, and clear the canvas."""
         self._closed.set()
         self._wake.set()
         self._thread.join(timeout=10.0)
@@ -64,6 +65,7 @@ class ReplayPage(Page):
         """Nothing to do."""
 
     def lost(self, client: int, left: int) -> None:
+        """With nobody left it plays no further."""
         del client
         if left == 0:
             self._playing = False

@@ -76,21 +76,25 @@ class SimulatedWorld(World):
     @property
     @final
     def t(self) -> float:
+        """Simulated since the last reset [s]; a step that failed does not count."""
         return self._t
 
     @property
     @final
     def rods(self) -> tuple[Rods, ...]:
+        """All robots of the simulator."""
         return (Rods(self.simulator.robots, self._state, self._place, self._radius),)
 
     @final
     def reset(self) -> None:
+        """The simulator as it was at first, brought to the script's inputs of t = 0. Raises `InputError`."""
         self.simulator.restore(self._start)
         self._clock, self._t = 0.0, -self.dt
         self._advance(self.inputs(0.0))
 
     @final
     def play(self) -> None:
+        """One step of the script, or from its end back to its beginning. Raises `InputError`; the script has then gone on all the same."""
         clock = self._clock + self.dt
         if clock > self.duration + 1e-9 and not self.endless:
             self.reset()
@@ -113,6 +117,7 @@ class SimulatedWorld(World):
 
     @final
     def jacobian(self) -> Floats:
+        """(3, n_actions) of the first robot. Raises `InputError` where it is not driven by tendon lengths, or is not ok."""
         if self.actions is None:
             raise InputError(f"robot {self.robot.name!r} is not driven by tendon lengths, so no drag can move its tip.")
         simulator, state = self.simulator, self._state
@@ -186,6 +191,7 @@ class FreeWorld(SimulatedWorld):
         return ()
 
     def poses(self) -> Floats:
+        """(0, 7)."""
         return np.zeros((0, 7))
 
 
@@ -229,6 +235,7 @@ class SceneWorld(SimulatedWorld):
         return self._bodies
 
     def poses(self) -> Floats:
+        """(n_obstacles, 7) as they were told last, or as they are built."""
         return np.array(list(self._poses.values())).reshape(-1, 7)
 
 

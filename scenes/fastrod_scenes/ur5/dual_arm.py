@@ -103,6 +103,7 @@ class DualArm(Stage):
         return np.concatenate([np.array(FLANGE[:3]) + part * np.array(WAY), product(turn, np.array(FLANGE[3:]))])
 
     def advance(self, t: float) -> None:
+        """The soft robots go to `opposite` at the step's end; the UR5, from `STILL` on, to `flange` there."""
         end = t + self.dt
         if end > STILL:
             self.q = self.arm.solve(self.flange(end), self.q)
@@ -117,6 +118,7 @@ class DualArm(Stage):
         self.carry()
 
     def carry(self) -> None:
+        """Put the fork where the flange is."""
         self.bracket.follow()
 
     def begin(self, t: float) -> None:
@@ -199,9 +201,12 @@ class DualArms(HostedScene):
     duration = STILL + MOVE
 
     def stage(self) -> DualArm:
+        """A new world, the soft robots settled and carried by the motors."""
         return DualArm(self.dt)
 
     def check(self) -> dict[str, float]:
+        """Bases must be on their mounts, the UR5 must feel the weight of both robots and J^T F of their wrenches, the tips' paths must be
+        mirror images, and nothing may come near anything else."""
         stage = self.stage()
         tips: list[Floats] = []
         off = weight = torque = error = 0.0

@@ -119,6 +119,8 @@ class Exploration(Stage):
         return posture.ravel()
 
     def advance(self, t: float) -> None:
+        """What the operator does at time t [s]: approach, enter, bend toward and aim at each corner in turn, straighten, leave. After
+        each aim a picture of the corner goes into `looks`."""
         end = t + self.dt
         corner, over = divmod(round((t - INSIDE) / self.dt), round((BEND + AIM) / self.dt))
         looking = 0 <= corner < len(CORNERS)
@@ -144,6 +146,7 @@ class Exploration(Stage):
             self.looks[corner] = self.look(corner)
 
     def carry(self) -> None:
+        """Put the bracket where the flange is."""
         self.bracket.follow()
 
     def _go(self, to: Floats, begins: bool, part: float) -> None:

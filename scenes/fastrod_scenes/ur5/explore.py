@@ -41,9 +41,11 @@ class Explore(HostedScene):
         self.seed, self.runs, self.box = seed, runs, box or Box()
 
     def stage(self) -> Exploration:
+        """A new world whose robots start as the seed has it."""
         return Exploration(self.box, self.seed, self.dt)
 
     def check(self) -> dict[str, float]:
+        """The worst of each figure of `measure` over all `runs`, of seeds one after the other."""
         every = [Explore(seed=self.seed + k, box=self.box).measure() for k in range(self.runs)]
         smallest = ("corners seen", "pixels of a cube, least", "distance of the UR5 from the box, m", "clearance of the soft robot, m")
         return {name: (min if name in smallest else max)(run[name] for run in every) for name in every[0]}

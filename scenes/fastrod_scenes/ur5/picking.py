@@ -186,6 +186,8 @@ class Picking(HostedWorld):
         return float(min(near, default=within))
 
     def advance(self, t: float) -> None:
+        """Tip and bend go from one phase's end to the next one's, at rest at both; the head takes hold as `grasp` begins, and lets go as
+        `release` does."""
         end = t + self.dt
         k = min(int(np.searchsorted(self._ends, end - 1e-9)), len(self.script) - 1)
         phase, before = self.script[k], self.script[k - 1] if k else self._before

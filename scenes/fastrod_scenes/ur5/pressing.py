@@ -79,9 +79,12 @@ class UR5Mujoco(MujocoScene):
     duration = 4.0
 
     def stage(self) -> Pressing:
+        """A new model: the arm at `START`, the soft robot settled, the plate `_GAP` beside it."""
         return Pressing(self.dt)
 
     def check(self) -> dict[str, float]:
+        """At the end the plate's spring, the rod's base force and the first servo's torque must agree to 2 %, and the swing must have moved
+        the plate on."""
         stage = self.stage()
         pressed, most, lost = 0.0, 0.0, 0
         for t in self.play(stage):

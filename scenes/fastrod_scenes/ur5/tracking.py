@@ -89,12 +89,14 @@ class Tracking(Stage):
         """Goal, tip, way, way by the soft robot, way by the arm and q of each step."""
 
     def advance(self, t: float) -> None:
+        """The tip makes up for its error at t [s] and goes with the goal; what it did is added to `steps`."""
         goal = self.path.position(t + self.dt)
         step = self.robot.advance(self.path.position(t) - self.tip, self.feedforward(t))
         self.steps.append((goal, step.tip, step.tip - self.tip, step.by_soft, step.by_arm, self.robot.q()))
         self.tip = step.tip
 
     def carry(self) -> None:
+        """Put the bracket where the flange is."""
         self.robot.bracket.follow()
 
     def feedforward(self, t: float) -> Floats:
@@ -126,6 +128,7 @@ class Track(HostedScene):
 
     @final
     def stage(self) -> Tracking:
+        """A new world, its tip at the path's center."""
         return Tracking(self.path(), dt=self.dt)
 
     @final
@@ -135,6 +138,7 @@ class Track(HostedScene):
 
     @final
     def check(self) -> dict[str, float]:
+        """The tip's error, the soft robot's share, room to the limits, clearance and lag must be within the bounds of this module."""
         stage = self.stage()
         lower, upper = stage.robot.lower, stage.robot.upper
         run = self.record(stage)
