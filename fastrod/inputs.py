@@ -149,7 +149,8 @@ class Reader:
         return lengths
 
     def line_force(self, line_force: ArrayLike | None, grid: Floats) -> Floats:
-        """Self-weight plus the given line force: uniform, or linear over each step with the true force and moment of that step."""
+        """`Ports.line_force`: self-weight plus what is given, uniform, or linear over each step with the true force and moment of that
+        step. `grid` as in `Ports`."""
         weight = self.rest.weight
         if line_force is None:
             return weight
@@ -177,7 +178,8 @@ class Reader:
         return pose
 
     def point_forces(self, point_force: PointForces | None, stretch: Floats) -> tuple[Floats, Floats]:
-        """The grid with a node at each point force, and the forces on the nodes."""
+        """`Ports.grid` with a node at each point force, and `Ports.node_force`; `stretch` (1 or n_robots, n_segments) is the extension [m].
+        Raises `InputError` where a segment has more point forces than nodes to put them on."""
         layout, params = self.layout, self.params
         n_segments, n_steps = len(layout.first_tendon), layout.n_steps
         self.loads = np.zeros((1, 0)), np.zeros((1, 0, 3))

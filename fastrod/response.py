@@ -191,7 +191,7 @@ def _differences(response: Response, p: Floats, r: Floats, delta: Floats) -> tup
 
 
 def inverse(a: Floats) -> Floats:
-    """Least-squares inverse of the matrices without nan, and nan for the others."""
+    """(n, b, a) least-squares inverses of matrices (n, a, b); nan for those with a number that is not finite."""
     found = np.full((len(a), a.shape[2], a.shape[1]), np.nan)
     good = np.isfinite(a).all((1, 2))
     if a.shape[1] == a.shape[2]:

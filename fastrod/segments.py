@@ -34,7 +34,7 @@ class SegmentActions:
     """
 
     def __init__(self, robot: Robot, offset: float | None = None) -> None:
-        """`offset`: displacement per bend [m]; by default the distance of each segment's first wire from the backbone. Raises
+        """`offset`: displacement per bend [m/rad]; by default the distance of each segment's first wire from the backbone. Raises
         `RobotError` where a segment is not driven by the lengths of two or more wires around it."""
         wiring = wire(robot)
         n = robot.n_segments

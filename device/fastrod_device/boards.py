@@ -81,7 +81,7 @@ class BoardEye:
         self._places = [self._somewhere()]
 
     def place(self, position: Floats, quaternion: Floats) -> None:
-        """The board is at base_from_board."""
+        """The board is at base_from_board, position (3,) [m] and quaternion (4,) w x y z, until `wave`."""
         self._still = position, quaternion
 
     def read(self) -> Frame | None:

@@ -106,7 +106,7 @@ class Emulator:
             self._covered = self.clock.now() + _HANDS
 
     def turn(self, quaternion: Floats) -> None:
-        """Turn the whole bench: world_from_base."""
+        """Turn the whole bench to the quaternion world_from_base (4,) w x y z; hands cover the marker meanwhile."""
         with self._lock:
             self.plant.turn(quaternion)
             self._covered = self.clock.now() + _HANDS

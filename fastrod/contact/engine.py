@@ -74,7 +74,8 @@ class Engine:
         """Point forces that the caller gave: (n_robots, m) [m] and (n_robots, m, 3) world [N]."""
 
     def move(self, poses: Floats, velocities: dict[int, Floats], dt: float) -> None:
-        """The obstacles of this step; those with a velocity slip by it, the others by how far their pose has moved."""
+        """`poses` (1 or n_robots, n_obstacles, 7) of the obstacles in this step, world. Those with a velocity, by index (1 or n_robots, 6)
+        [m/s, rad/s], slip by it, the others by how far their pose has moved."""
         self.at_last_step = (self.before, self.poses_before)
         self.poses, self.velocities, self.dt = poses, velocities, dt
         self.clearance.distance[:] -= longest_move(self.poses_before, poses, self.surfaces.sphere)[:, None]
@@ -106,7 +107,7 @@ class Engine:
         self.poses, self.poses_before, self.at_last_step = snapshot.poses, snapshot.poses_before, snapshot.at_last_step
 
     def in_worlds(self, rows: Ints) -> tuple[Ints, Ints]:
-        """`rows` world by world, and where each world begins, with the end at last."""
+        """`rows` (n,) world by world, and (n_worlds + 1,) where in them each world begins, with the end at last."""
         ordered = rows[np.argsort(self.world[rows], kind="stable")]
         return ordered, np.append(np.flatnonzero(np.diff(self.world[ordered], prepend=-1)), len(ordered))
 
@@ -208,7 +209,7 @@ class Engine:
         self.tracked[rows] = True
 
     def end_step(self, done: Floats) -> None:
-        """The obstacles are where they were to go; for a robot that did not arrive, where it met them."""
+        """The obstacles are where they were to go; for a robot that came only the part `done` (n_robots,) of the way, where it met them."""
         self.poses_before = self.poses if (done >= 1.0).all() else between(self.poses_before, self.poses, done)
 
     def held(self, rows: Ints, ports: Ports, n_x: int) -> tuple[Ports, Probes]:

@@ -53,7 +53,7 @@ def several(names: Sequence[str], values: NDArray[Any], unit: str, about: str) -
 
 
 def numbered(prefix: str, values: NDArray[Any], unit: str, about: str) -> list[Column]:
-    """The same, named prefix_1, prefix_2, ..."""
+    """As `several`, of `values` (n_rows, m) named prefix_1 to prefix_m."""
     return several([f"{prefix}_{k}" for k in range(1, values.shape[1] + 1)], values, unit, about)
 
 

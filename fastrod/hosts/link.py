@@ -15,12 +15,12 @@ from fastrod.types import Floats
 
 
 def from_xyzw(quaternion: ArrayLike) -> Floats:
-    """w x y z of PyBullet's x y z w."""
+    """(..., 4) quaternion w x y z of PyBullet's x y z w (..., 4)."""
     return np.roll(np.asarray(quaternion, float), 1, axis=-1)
 
 
 def to_xyzw(quaternion: ArrayLike) -> Floats:
-    """PyBullet's x y z w of w x y z."""
+    """(..., 4) PyBullet's x y z w of a quaternion w x y z (..., 4)."""
     return np.roll(np.asarray(quaternion, float), -1, axis=-1)
 
 
@@ -51,7 +51,7 @@ class BulletLink:
         return Motion(np.concatenate([pose[:3] + arm, product(pose[3:], self._quaternion)]), velocity)
 
     def exert(self, wrench: Floats) -> None:
-        """Force and moment about the base point, world, during the next stepSimulation."""
+        """(6,) force [N] and moment about the base point [N m], world, during the next stepSimulation."""
         point = self.motion().pose[:3]
         exert(self.bullet, self.body, self.link, wrench, point)
 

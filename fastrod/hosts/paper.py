@@ -116,7 +116,7 @@ def turn_of(name: str, turn: ArrayLike) -> Floats:
 
 
 def numbers(name: str, value: ArrayLike, *lengths: int) -> Floats:
-    """A vector of one of these lengths, columns and rows too. Raises `InputError`."""
+    """(n,) finite numbers, n one of `lengths`; columns and rows are taken too. Raises `InputError` that calls it `name`."""
     try:
         v = np.atleast_1d(np.squeeze(np.array(value, dtype=float)))
     except (TypeError, ValueError):

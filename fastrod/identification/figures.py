@@ -207,7 +207,7 @@ def left_over_time(result: Result, signals: Signals) -> str:
 
 
 def correlations(names: list[str], matrix: Floats) -> str:
-    """Correlations of the fitted numbers."""
+    """`matrix` (p, p) of correlations of the fitted numbers, from -1 to 1."""
     from matplotlib.colors import LinearSegmentedColormap
 
     n = len(names)

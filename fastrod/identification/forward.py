@@ -207,7 +207,7 @@ class Bench:
         return close_ports(opened, self.ports, self.params)
 
     def see(self, pose: Pose, chain: list[tuple[Effect, Floats]], opened: EffectPorts | None = None) -> Pose:
-        """The pose as the camera sees it."""
+        """The pose as the camera sees it, by the effects of sensing in `chain`; `opened`: ports that the others have changed."""
         links = [link for link in chain if link[0].seam is Seam.SENSING]
         if not links:
             return pose

@@ -186,7 +186,7 @@ class Local:
         return change
 
     def seen(self, model: Model, theta: Floats, change: Floats) -> Pose:
-        """What the camera sees after a change of the true pose."""
+        """What the camera sees after a change (n, 6 + 3k) of the true pose: tip [m], rotation vector [rad], points [m], base frame."""
         rotation = self.pose.rotation
         links = [link for link in chain_of(model, theta) if link[0].seam is Seam.SENSING]
         if links or self.target.rotation is not None:
@@ -221,7 +221,7 @@ class Local:
         return J
 
     def fit(self, model: Model, start: Floats, iterations: int) -> Fit:
-        """The best parameters near here."""
+        """The best parameters near here, from `start` (p,) on, within the model's limits and under its priors."""
         mean, sd = model.prior
         return minimise(
             lambda theta: self.residual(model, theta),

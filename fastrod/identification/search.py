@@ -64,7 +64,7 @@ class Search:
     report: Callable[[str], None] = field(default=lambda _: None)
 
     def start(self, model: Model, theta: Floats, iterations: int = 6) -> State:
-        """The state of a model without anything found, linearised twice."""
+        """The state of a model without anything found, linearised twice: at `theta` (p,), and where the fit from there ends."""
         local = Local(model, theta, self.samples, self.rod, self.target)
         fit = self._fit(local, model, theta, np.zeros((0,)), (), iterations)
         return self.refined(self._state(model, local, fit, ()))

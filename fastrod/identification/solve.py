@@ -154,7 +154,8 @@ def held_out_losses(residual: Floats, slopes: Floats, precision: Floats, block: 
 
 
 def paired(before: Floats, after: Floats) -> float:
-    """z of the gain over blocks: of its mean, or of the mean logarithm of the ratio where a few blocks hold most of the loss."""
+    """z of the gain from losses `before` to those `after`, both (n_blocks,): of its mean, or of the mean logarithm of the ratio where a
+    few blocks hold most of the loss."""
     scores = []
     for gain in (before - after, np.log(np.maximum(before, 1e-12)) - np.log(np.maximum(after, 1e-12))):
         spread = float(gain.std(ddof=1)) if len(gain) > 1 else 0.0

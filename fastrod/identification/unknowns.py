@@ -103,7 +103,7 @@ class Model:
         return replace(self, effects=tuple(e for e in self.effects if e != name), unknowns=kept)
 
     def values(self, theta: Floats) -> dict[str, Floats]:
-        """Effect name -> (n_columns,) values."""
+        """Effect name -> (n_columns,) values at the fitted numbers `theta` (p,); what is not unknown, as the robot has it or neutral."""
         known = named_effects(self.robot)
         values = {name: read_values(name, known.get(name, {}), self.wiring, "robot") for name in self.effects}
         for unknown, number in zip(self.unknowns, theta, strict=True):
@@ -112,7 +112,7 @@ class Model:
         return values
 
     def robot_at(self, theta: Floats) -> Robot:
-        """The robot without its effects."""
+        """The robot with the fitted numbers `theta` (p,), without its effects."""
         robot = replace(self.robot, effects=())
         for unknown, number in zip(self.unknowns, theta, strict=True):
             if unknown.place[0] == "robot":

@@ -134,7 +134,7 @@ class PushCell(Cell):
         return self.desired
 
     def baseline(self) -> Floats:
-        """Straight along the way that the cube has to go, slower as it comes near; the cube stays on the bar. The bar keeps its height."""
+        """(3,) straight along the way that the cube has to go, slower when near; the cube stays on the bar, which keeps its height."""
         drive, way = self.drive, self.desired - self._cube()[0][:2]
         d = float(np.hypot(*way))
         velocity = np.array([*(way * min(SPEED / max(d, 1e-9), 1.0 / TIME)), (self.course.height - self.tip[2]) / TIME])

@@ -188,7 +188,7 @@ def size(parts: tuple[Field, ...]) -> int:
 
 
 def bounds(parts: tuple[Field, ...]) -> tuple[Floats, Floats]:
-    """Least and largest value of every number."""
+    """(n,) least and (n,) largest value of every number of these parts, each in its unit."""
     return np.concatenate([np.array(p.low, float) for p in parts]), np.concatenate([np.array(p.high, float) for p in parts])
 
 

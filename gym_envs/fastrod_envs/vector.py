@@ -107,7 +107,10 @@ class BatchEnv(VectorEnv[Singles, Any, Any]):
         return list(seed)
 
     def step(self, actions: ArrayLike) -> tuple[Singles, Floats, Flags, Flags, dict[str, Any]]:
-        """One step of all environments. Raises `InputError` on a wrong shape and on what is not finite; then nothing was simulated."""
+        """One step of all environments: `actions` (n, n_actions); observations (n, size), rewards, terminated and truncated (n,), infos.
+
+        Raises `InputError` on a wrong shape and on what is not finite; then nothing was simulated.
+        """
         moment = self._episodes.advance(actions)
         told = self._episodes.info(moment)
         infos = _masked(told, self._every)

@@ -120,7 +120,8 @@ class HostedView(World):
         self._see()
 
     def jacobian(self) -> Floats:
-        """The arm's joints, then the actions; the columns of an arm that is frozen are zero."""
+        """(3, n_joints + n_actions): the arm's joints, then the actions; the columns of an arm that is frozen are zero. Raises `InputError`
+        where there is none."""
         if not isinstance(self._stage, Stage):
             raise InputError(f"scene {self.name!r} has a script that moves its robots; there is no Jacobian for a drag.")
         if self.actions is None:

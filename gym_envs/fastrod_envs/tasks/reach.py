@@ -85,7 +85,7 @@ class ReachTask(RodTask):
         return self.desired
 
     def rewards(self, distance: Floats) -> dict[str, Floats]:
-        """The terms of both tasks."""
+        """The terms of both tasks, each (n_envs,), by the distances (n_envs,) from tip to goal [m]."""
         z = self.tip[:, 2]
         terms = {"reach": np.exp(-50.0 * distance**2), "height": np.where((z < LOWEST) | (z > HIGHEST), -0.5, 0.0)}
         if getattr(self.options, "reward", "paper") == "precise":
@@ -126,7 +126,8 @@ class Reach(ReachTask):
 
 
 def drives() -> tuple[Ints, Floats, Floats]:
-    """Which of the reacher's fifteen numbers are driven, their ranges [m] and largest rates [m/s]: all bends, and the last extension."""
+    """Which (11,) of the reacher's fifteen numbers are driven, all bends and the last extension; their ranges (11, 2) [m] and largest
+    rates (11,) [m/s]."""
     driven = np.array([k for k in range(15) if k % 3 or k == 12])
     bend, extension = (-0.012, 0.012), (0.0, 0.05)
     limit = np.array([extension if k == 12 else bend for k in driven])
