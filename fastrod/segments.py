@@ -17,7 +17,9 @@ class WireInputs(TypedDict):
     """Keyword arguments of `Simulator.step`."""
 
     tendon_length: Floats
+    """(..., n_tendons) absolute [m]."""
     extension: Floats
+    """(..., n_segments) [m]."""
 
 
 class SegmentActions:

@@ -95,11 +95,14 @@ class Snapshot(NamedTuple):
     robots: tuple[Robot, ...]
     memory: Memory
     warm: Flags
+    """(n_robots,) the boundary is that of an earlier step."""
     given: Inputs
     ports: Ports | None
     state: State | None
     params: Params
     bare: Ports | None
     effects: list[Floats]
+    """The memory of each effect, in their order."""
     time: Floats
+    """(n_robots,) as effects count it [s]; nan before the first step."""
     contact: ContactSnapshot | None

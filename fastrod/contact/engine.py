@@ -43,11 +43,17 @@ class Snapshot(NamedTuple):
     touching: Touching
     clearance: Clearance
     before: Shape | None
+    """Shapes at the last step."""
     tracked: Flags
+    """(n_robots,) `before` holds where the robot was."""
     gap: Floats
+    """(n_robots,) smallest to anything [m]."""
     poses: Floats
+    """(1 or n_robots, n_obstacles, 7) world."""
     poses_before: Floats
+    """The same at the last step."""
     at_last_step: tuple[Shape | None, Floats]
+    """Shapes and obstacles before the last step."""
 
 
 class Engine:

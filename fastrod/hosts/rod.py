@@ -35,9 +35,12 @@ class RodSnapshot(NamedTuple):
     time: float
     state: State | None
     wrench: Floats
+    """(n_robots, 6) on the base, world [N, N m]."""
     base: Floats
+    """(n_robots, 7) pose of the base, world."""
     inputs: dict[str, Any]
     obstacles: dict[str, Floats]
+    """Name -> (1 or n_robots, 7) pose as it was told last, world."""
     capsules: Capsules | None
     failed: int
 

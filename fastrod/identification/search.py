@@ -60,6 +60,7 @@ class Search:
     rod: Rod
     target: Target
     block: Ints
+    """(n,) number of each row's block, 0 to N_BLOCKS - 1; one block at a time is held out."""
     excluded: frozenset[str] = frozenset()
     report: Callable[[str], None] = field(default=lambda _: None)
 

@@ -28,10 +28,13 @@ class View:
     """A residual before and after against a signal, at `rows`."""
 
     rows: Ints
+    """(n,) of the log."""
     signal: Floats
+    """(n,) in the unit that `signal_label` names."""
     before: Floats
-    """Component of the residual [m]."""
+    """(n,) component of the residual [m]."""
     after: Floats
+    """(n,) [m]"""
     signal_label: str
     residual_label: str
     connected: bool = False

@@ -14,7 +14,8 @@ from .vec import Mat, Vec
 
 
 class Curve(NamedTuple):
-    """Position (n_points, 3), rotation (n_points, 3, 3), curvature (n_points, 3), arclength (n_points,)."""
+    """One robot's nodes: position (n_points, 3) world [m], rotation (n_points, 3, 3) world_from_material, curvature (n_points, 3) material
+    [1/m], arclength (n_points,) [m]."""
 
     position: Floats
     rotation: Floats

@@ -21,8 +21,11 @@ class Moment(NamedTuple):
 
     outcome: Outcome
     reward: Floats
+    """(n,) sum of the outcome's terms."""
     terminated: Flags
+    """(n,) the episode ended before its time; those that are lost too."""
     truncated: Flags
+    """(n,) its steps are over."""
 
 
 class Episodes:

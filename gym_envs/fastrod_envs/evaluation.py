@@ -33,8 +33,11 @@ class Trial(NamedTuple):
     distance: Floats
     """(n,) [m]"""
     success: Flags
+    """(n,) the criterion held at the end."""
     contact: Flags
+    """(n,) at the end something was touched that should not be."""
     lost: Flags
+    """(n,) the simulation did not find the shape."""
     position: Floats
     """(n, 3) [m]"""
     desired: Floats

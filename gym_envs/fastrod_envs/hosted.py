@@ -24,7 +24,9 @@ class Result(NamedTuple):
     distance: float
     success: bool
     position: Floats
+    """(3,) world [m]."""
     desired: Floats
+    """(3,) world [m]."""
     terminated: bool = False
     contact: bool = False
     facts: Mapping[str, float] = MappingProxyType({})

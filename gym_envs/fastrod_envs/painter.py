@@ -53,6 +53,7 @@ class Camera(NamedTuple):
     """Where the eye is, and what of the world a pixel is."""
 
     eye: Floats
+    """(3,) world [m]."""
     axes: Floats
     """(3, 3) rows right, down, forward."""
     width: int

@@ -88,7 +88,9 @@ class Encoders(Protocol):
     """What drives say."""
 
     dl: Floats
+    """(n_tendons,) as `Measurement.dl` [m]."""
     tension: Floats
+    """(n_tendons,) [N]."""
 
 
 @runtime_checkable
