@@ -22,8 +22,9 @@ def one_compilation() -> Iterator[None]:
     yield
     if numba.config.DISABLE_JIT:
         return
-    from fastrod.kernels import batch
+    from fastrod.kernels import batch, cold
 
     big = ("pass_serial", "pass_parallel", "iterate_serial", "iterate_parallel", "look_serial", "look_parallel", "move_to_inputs")
     counts = {name: len(getattr(batch, name).signatures) for name in big}
+    counts["begin"] = len(cold.begin.signatures)
     assert {name: n for name, n in counts.items() if n > 1} == {}

@@ -7,6 +7,7 @@ from fastrod.types import Layout, Memory, Params, Ports, Shape
 from . import shape as sh
 from .jit import LANES, inline, kernel
 from .shape import Lanes
+from .vec import from_quaternion
 
 W = LANES
 
@@ -76,13 +77,7 @@ def gather_base(robots: Lanes, ports: Ports, params: Params, memory: Memory, lay
     for w in range(W):
         i = robots[w]
         p = ports.base_pose[pick(i, len(ports.base_pose))]
-        qw, qx, qy, qz = p[3], p[4], p[5], p[6]
-        rotation = (
-            1.0 - 2.0 * (qy * qy + qz * qz), 2.0 * (qx * qy - qw * qz), 2.0 * (qx * qz + qw * qy),
-            2.0 * (qx * qy + qw * qz), 1.0 - 2.0 * (qx * qx + qz * qz), 2.0 * (qy * qz - qw * qx),
-            2.0 * (qx * qz - qw * qy), 2.0 * (qy * qz + qw * qx), 1.0 - 2.0 * (qx * qx + qy * qy),
-        )  # fmt: skip
-        sh.put_mat(node, sh.N_R, w, rotation)
+        sh.put_mat(node, sh.N_R, w, from_quaternion((p[3], p[4], p[5], p[6])))
         force = ports.tip_force[pick(i, len(ports.tip_force))]
         line = ports.line_force[pick(i, len(ports.line_force))]
         length = params.length[pick(i, len(params.length))]

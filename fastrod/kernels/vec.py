@@ -87,6 +87,17 @@ def matmul(m: Mat, k: Mat) -> Mat:
 
 
 @inline
+def from_quaternion(q: tuple[float, float, float, float]) -> Mat:
+    """Rotation of a unit quaternion w x y z."""
+    w, x, y, z = q
+    return (
+        1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y),
+    )  # fmt: skip
+
+
+@inline
 def sym_mul(s: Sym, a: Vec) -> Vec:
     """S a for symmetric S."""
     return (
