@@ -38,6 +38,8 @@ class Work(NamedTuple):
     """(n_tendons,) [N]."""
     curvature: Floats
     """(n_segments, 3) [1/m]."""
+    elastic: Floats
+    """(n_segments, 3) K (u - u*) [N m]."""
     place: Floats
     """(n_samples, 3) from the base, world axes [m]."""
     turn: Floats
@@ -66,8 +68,8 @@ def _mat(a: Floats, row: int) -> Mat:
 
 
 @inline
-def _column(m: Mat) -> Vec:
-    """The tangent d3 of a frame."""
+def _tangent(m: Mat) -> Vec:
+    """d3 of a frame."""
     return m[2], m[5], m[8]
 
 
@@ -131,7 +133,7 @@ def _principal(offset: Floats, first: int, last: int) -> Axes:
 
 @kernel
 def _bend(i: int, layout: Layout, params: Params, ports: Ports, work: Work) -> None:
-    """Constant curvature of each segment; its own where no length is prescribed."""
+    """Constant curvature of each segment, its own where no length is prescribed, and the moment that it takes."""
     n_tendons = len(layout.tendon_segment)
     rest = ports.precurvature[pick(i, len(ports.precurvature))]
     offsets = params.offset[pick(i, len(params.offset))]
@@ -150,7 +152,9 @@ def _bend(i: int, layout: Layout, params: Params, ports: Ports, work: Work) -> N
                 a += axes[3] * p * longer
                 b += axes[4] * q * longer
             u = (axes[0] * a - axes[1] * b, axes[1] * a + axes[0] * b, u[2])
+        stiffness, bent = _vec(ports.stiffness[pick(i, len(ports.stiffness)), k], 0), sub(u, _vec(rest[k], 0))
         _put(work.curvature, k, u)
+        _put(work.elastic, k, (stiffness[0] * bent[0], stiffness[1] * bent[1], stiffness[2] * bent[2]))
         for t in range(first, n_tendons):
             work.left[t] -= length * (1.0 + u[0] * offset[t, 1] - u[1] * offset[t, 0])
 
@@ -165,7 +169,9 @@ def _sample(i: int, layout: Layout, params: Params, ports: Ports, work: Work) ->
     for k in range(n_segments):
         length = params.length[pick(i, len(params.length)), k] + ports.extension[pick(i, len(ports.extension)), k]
         h = length / SAMPLES
-        step, half = _exp(scale(h, _vec(work.curvature, k))), _exp(scale(0.5 * h, _vec(work.curvature, k)))
+        u = _vec(work.curvature, k)
+        half, whole = _exp(scale(0.5 * h, u)), _exp(scale(h, u))
+        chord = scale(h / 6.0, add((0.0, 0.0, 1.0), axpy(4.0, _tangent(half), _tangent(whole))))
         for j in range(SAMPLES + 1):
             at = k * (SAMPLES + 1) + j
             _put(work.place, at, place)
@@ -173,9 +179,7 @@ def _sample(i: int, layout: Layout, params: Params, ports: Ports, work: Work) ->
                 work.turn[at, a] = turn[a]
             _put(work.load, at, scale(length * _share(j), _vec(line[k], round(j * (n_f - 1) / SAMPLES))))
             if j < SAMPLES:
-                end = matmul(turn, step)
-                chord = axpy(4.0, _column(matmul(turn, half)), add(_column(turn), _column(end)))
-                turn, place = end, axpy(h / 6.0, chord, place)
+                place, turn = add(place, mul(turn, chord)), matmul(turn, whole)
     if len(ports.node_force) > 0:
         force = ports.node_force[pick(i, len(ports.node_force))]
         for j in range(n_segments * n_steps + 1):
@@ -202,14 +206,6 @@ def _balance(i: int, layout: Layout, ports: Ports, follower: Vec, work: Work) ->
         _put(work.mean, k, mean)
 
 
-@inline
-def _elastic(i: int, k: int, ports: Ports, work: Work) -> Vec:
-    """K (u - u*) of segment k."""
-    stiffness = _vec(ports.stiffness[pick(i, len(ports.stiffness)), k], 0)
-    bent = sub(_vec(work.curvature, k), _vec(ports.precurvature[pick(i, len(ports.precurvature)), k], 0))
-    return stiffness[0] * bent[0], stiffness[1] * bent[1], stiffness[2] * bent[2]
-
-
 @kernel
 def _pull(i: int, layout: Layout, params: Params, ports: Ports, work: Work) -> None:
     """Tensions that give each segment the mean moment that its arc wants."""
@@ -222,7 +218,7 @@ def _pull(i: int, layout: Layout, params: Params, ports: Ports, work: Work) -> N
         offset, first, last = offsets[k], layout.first_tendon[k], _last(k, layout)
         if first == last or not work.free[first]:
             continue
-        missing = sub(_vec(work.mean, k), _elastic(i, k, ports, work))
+        missing = sub(_vec(work.mean, k), _vec(work.elastic, k))
         x, y = missing[0], missing[1]
         for t in range(first, n_tendons):
             x -= offset[t, 1] * tension[t]
@@ -235,7 +231,7 @@ def _pull(i: int, layout: Layout, params: Params, ports: Ports, work: Work) -> N
     # A wire that can go slack starts taut: from there Newton finds which ones let go; from slack it would not see them.
     taut = 0.01 * params.tension_scale[pick(i, len(params.tension_scale))]
     for t in range(n_tendons):
-        if work.free[t] and params.unilateral[pick(i, len(params.unilateral)), t]:
+        if params.unilateral[pick(i, len(params.unilateral)), t]:
             tension[t] = max(tension[t], taut)
 
 
@@ -247,7 +243,7 @@ def _keep(i: int, layout: Layout, ports: Ports, follower: Vec, memory: Memory, w
         memory.curvature_guess[i, a] = work.curvature[0, a]
     if layout.paper:
         for k in range(len(layout.first_tendon)):  # the tip couple makes the mean curvature the arc's
-            moment = add(_elastic(i, k, ports, work), sub(_vec(work.at_base, k), _vec(work.mean, k)))
+            moment = add(_vec(work.elastic, k), sub(_vec(work.at_base, k), _vec(work.mean, k)))
             x[2 * k], x[2 * k + 1] = moment[0], moment[1]
     else:
         for a in range(3):
@@ -275,8 +271,8 @@ def begin(rows: Ints, layout: Layout, params: Params, ports: Ports, memory: Memo
     for j in range(len(layout.free_tendon)):
         free[layout.free_tendon[j]] = True
     work = Work(
-        free, np.empty(n_tendons), np.empty(n_tendons), np.empty((n_segments, 3)), np.empty((n, 3)), np.empty((n, 9)), np.empty((n, 3)),
-        np.empty((n_segments, 3)), np.empty((n_segments, 3)),
+        free, np.empty(n_tendons), np.empty(n_tendons), np.empty((n_segments, 3)), np.empty((n_segments, 3)),
+        np.empty((n, 3)), np.empty((n, 9)), np.empty((n, 3)), np.empty((n_segments, 3)), np.empty((n_segments, 3)),
     )  # fmt: skip
     for r in range(len(rows)):
         i = rows[r]
