@@ -14,10 +14,11 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from fastrod.kernels.gather import pick
-from fastrod.kernels.jit import entry, inline, kernel
-from fastrod.kernels.vec import Mat, Vec, add, axpy, cross, dot, from_quaternion, matmul, mul, mul_t, scale, sub
 from fastrod.types import Flags, Floats, Ints, Layout, Memory, Params, Ports
+
+from .gather import pick
+from .jit import entry, inline, kernel
+from .vec import Mat, Vec, add, axpy, cross, dot, from_quaternion, matmul, mul, mul_t, scale, sub
 
 SAMPLES = 8
 """Steps in which a segment's arc is sampled; the guess needs no more."""
