@@ -27,13 +27,6 @@ def to_obstacle(frame: Numbers, p: Vec) -> Vec:
 
 
 @inline
-def to_world(frame: Numbers, p: Vec) -> Vec:
-    """R p + o: the point p of the obstacle's frame in the world."""
-    q = mul(turn_of(frame), p)
-    return q[0] + frame[9], q[1] + frame[10], q[2] + frame[11]
-
-
-@inline
 def _size(k: int, surfaces: Surfaces) -> Vec:
     row = surfaces.size[k]
     return row[0], row[1], row[2]
