@@ -23,7 +23,9 @@ from .vec import Mat, Vec, add, axpy, cross, dot, from_quaternion, matmul, mul, 
 SAMPLES = 8
 """Steps in which a segment's arc is sampled; the guess needs no more."""
 
-_RANK = 1e-15  # of the larger singular value: a smaller one counts as none, as for numpy's pinv
+_RANK = 1e-3
+"""Part of the larger singular value below which the smaller counts as none: wires that leave a plane by less, as two at 0 and 3.1416 do,
+say nothing about the bend across it, and a micrometre of their lengths would ask for curvatures beyond all bounds."""
 
 Axes: TypeAlias = tuple[float, float, float, float, float]
 

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from fastrod.types import Layout, Params, Ports
 
 SAMPLES = 8
+RANK = 1e-3  # singular values below this part of the largest are left out
 
 
 def guess(i: int, layout: Layout, params: Params, ports: Ports) -> tuple[np.ndarray, np.ndarray]:
@@ -56,7 +57,7 @@ def curvature(layout: Layout, length: np.ndarray, offset: np.ndarray, ports: Por
     for k, l_k in enumerate(length):
         ends = np.flatnonzero(layout.tendon_segment == k)
         if len(ends) and np.isin(ends, layout.row_tendon).all():
-            u[k, :2] = np.linalg.pinv(l_k * arms(offset[k, ends])) @ (left[ends] - l_k)
+            u[k, :2] = np.linalg.pinv(l_k * arms(offset[k, ends]), rcond=RANK) @ (left[ends] - l_k)
         crossing = layout.tendon_segment >= k
         left[crossing] -= l_k * (1.0 + arms(offset[k]) @ u[k, :2])[crossing]
     return u
@@ -96,5 +97,5 @@ def tensions(layout: Layout, params: Params, ports: Ports, wanted: np.ndarray) -
         ends = np.flatnonzero((layout.tendon_segment == k) & free)
         if len(ends):
             missing = wanted[k, :2] - tension @ arms(params.offset[k])
-            tension[ends] += np.linalg.pinv(arms(params.offset[k, ends]).T) @ missing
+            tension[ends] += np.linalg.pinv(arms(params.offset[k, ends]).T, rcond=RANK) @ missing
     return np.where(params.unilateral & free, np.maximum(tension, 0.01 * params.tension_scale), tension)

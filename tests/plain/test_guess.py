@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from plain.naive_guess import arms, guess
 from rods import bend, rod
 
-from fastrod import Robot, Segment, Tendon, load_robot, robot_names
+from fastrod import Robot, Segment, Simulator, Tendon, load_robot, robot_names
 from fastrod.compile import compile_robots
 from fastrod.guess import cold_start
 from fastrod.inputs import Inputs, Reader
@@ -174,7 +174,23 @@ def test_wires_that_leave_a_direction_free(name: str) -> None:
     assert_as_the_twin((layout, params._replace(offset=np.array(wires[None, None])), ports), 2)
 
 
-@pytest.mark.parametrize("ratio", [1e-3, 1e-6, 1e-9, 1e-12])
+@pytest.mark.parametrize("off", [0.0, 1e-12, 1e-9, 1e-6, 1e-3])
+def test_wires_nearly_in_a_plane_say_nothing_about_the_bend_across_it(off: float) -> None:
+    """Opposite wires, written with a few digits of pi, and lengths that do not quite agree."""
+    robot = rod(n_tendons=2)
+    first, last = robot.segments[0].tendons
+    robot = replace(robot, segments=(replace(robot.segments[0], tendons=(first, replace(last, angle=np.pi - off))),))
+    lengths = robot.rest_tendon_length + np.array([0.003, -0.003]) + 1e-6
+    state = Simulator(robot, points_per_segment=3).settle(lengths, tip_force=(0.05, 0.05, 0.0))
+    assert state.ok.all()
+    assert state.passes[0] <= 4
+    layout, params, rest = compile_robots([robot], N_STEPS)
+    bend_y = -0.003 / 0.0075 / 0.07
+    memory = fill((layout, params, Reader(layout, params, rest, 1).ports(Inputs(lengths))), 1)
+    assert_allclose(memory.curvature_guess[0], [0.0, bend_y, 0.0], atol=1e-3 * abs(bend_y))
+
+
+@pytest.mark.parametrize("ratio", [2e-3, 1e-2, 0.1])
 def test_wires_nearly_in_a_plane_bend_and_pull_as_asked(ratio: float) -> None:
     """Curvature and tensions out of the plane are as large as rounding over the ratio of singular values makes them, in the twin too.
     What stands is what they are for: the curvature uses up the lengths, and the tensions give the moment."""
