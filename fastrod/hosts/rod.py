@@ -17,7 +17,7 @@ from fastrod.hosts.host import Motion
 from fastrod.robot import Robot
 from fastrod.simulator import Simulator
 from fastrod.state import Snapshot, State
-from fastrod.types import Floats
+from fastrod.types import Flags, Floats
 
 INPUTS = ("tendon_length", "tension", "extension", "tip_force", "tip_moment", "line_force", "point_force", "follower_tip_force")
 """What an engine may tell a rod beside its base: keyword arguments of `Simulator.step`."""
@@ -188,8 +188,7 @@ class Rod:
         """One step of the rod itself."""
         state = self.simulator.step(base_pose=base, **around, **given)
         if not state.ok.all() and (self.simulator.contact is None or self._failed >= _PATIENCE):
-            self.simulator.reset(~state.ok)
-            state = self.simulator.settle(base_pose=base, **around, **given)
+            state = self._anew(~state.ok, base, given, around)
         self._keep(state, given, around, base)
         self._failed = 0 if state.ok.all() else self._failed + 1
         if self._failed > _MOST_FAILED:
@@ -199,6 +198,20 @@ class Rod:
                 "Move host, bodies and inputs by less in a step, or after a jump call reset()."
             )
         return state
+
+    def _anew(self, rows: Flags, base: Floats, given: dict[str, Any], around: dict[str, Any]) -> State:
+        """These rods at rest, from the straight rod; the others, memories and clocks of their effects too, stay as they are."""
+        sim = self.simulator
+        if sim.contact is None:
+            sim.reset(rows)
+            return sim.settle(base_pose=base, rows=rows, **around, **given)
+        before = sim.snapshot()
+        sim.reset(rows)
+        state = sim.settle(base_pose=base, **around, **given)
+        if rows.all():
+            return state
+        sim.restore(before, ~rows)
+        return sim.state
 
     def _keep(self, state: State, given: dict[str, Any], around: Mapping[str, Any], base: Floats) -> None:
         if not np.isfinite(state.tip_position).all() or not np.isfinite(state.base_wrench).all():

@@ -160,6 +160,37 @@ def test_many_rods_are_as_many_single_ones():
         assert_allclose(many.capsules.velocity[k], one.capsules.velocity, atol=1e-9)
 
 
+@pytest.mark.parametrize("walled", [False, True])
+def test_rod_that_fails_leaves_its_neighbour_alone(monkeypatch, walled):
+    # what the wires of row 0 remember has moved once a step, as in a lone rod, whatever becomes of row 1
+    robot = replace(soft_robot(1), effects=({"name": "dynamics", "period": 0.1, "damping": 0.7},))
+    scene = ContactScene(obstacles=[plane(point=(0.01, 0, 0), normal=(-1, 0, 0), name="wall")]) if walled else None
+    pair, lone = Rod(robot, n_robots=2, contact=scene), Rod(robot, contact=scene)
+    step = pair.simulator.step
+    settled = []
+    anew = pair.simulator.settle
+
+    def fails(*a, **b):
+        return replace(step(*a, **b), ok=np.array([True, False]), problems={1: "contact: it stands."})
+
+    def counted(*a, **b):
+        settled.append(1)
+        return anew(*a, **b)
+
+    for rod in (pair, lone):
+        rod.settle(HOME)
+    monkeypatch.setattr(pair.simulator, "step", fails)
+    monkeypatch.setattr(pair.simulator, "settle", counted)
+    wires = robot.rest_tendon_length + PULL[:4]
+    for k in range(6):
+        both = pair.advance(HOME, STILL, 0.01, tendon_length=wires, tip_force=(0.02 * k, 0.0, 0.0))
+        one = lone.advance(HOME, STILL, 0.01, tendon_length=wires, tip_force=(0.02 * k, 0.0, 0.0))
+        assert_array_equal(both.position[0], one.position[0])
+        assert_array_equal(pair.wrench[0], lone.wrench)
+    assert settled
+    assert not walled or one.contacts.count[0] > 0
+
+
 def test_snapshot_goes_back_and_reset_keeps_inputs_and_clock():
     robot = soft_robot()
     rod = Rod(robot)
