@@ -153,9 +153,9 @@ class MujocoRod(CarriedRod):
         return inputs | {"line_force": own if given is None else own + np.asarray(given, float)}
 
     def _arrived(self) -> None:
+        self._release()
         if self._feedback is not None:
             self._feedback.take(self.felt, self.simulator)
-        self._release()
 
     def _forget(self) -> None:
         self._release()

@@ -72,7 +72,9 @@ class Feedback:
         self._part = 1.0
 
     def take(self, felt: Felt, simulator: Simulator) -> None:
-        """Go toward the forces of the last step."""
+        """Go toward the forces of the last step; stay where the rod could not be solved, whose compliance nobody knows."""
+        if not simulator.state.ok[0]:
+            return
         wanted = np.zeros_like(self.force)
         if len(felt.capsule):
             starts = np.concatenate([[0.0], np.cumsum(self._width)])

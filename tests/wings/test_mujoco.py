@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 
 import mujoco
@@ -201,6 +202,28 @@ def test_contacts_that_are_felt_bend_the_rod_and_stay_calm():
         rod.step(line_force=np.zeros((2, 3, 3)))
     rod.reset()
     rod.step(line_force=(0.0, 0.0, 0.0))
+
+
+def test_step_that_fails_in_contact_leaves_the_felt_force_and_nothing_of_its_own(monkeypatch):
+    rod, model, data = stand(SLIDING, feel=True)
+    ball, post = model.body("ball").id, model.body("post").id
+    data.xfrc_applied[ball, 0] = -0.05
+    for _ in range(100):
+        rod.step()
+    assert len(rod.felt.capsule) > 0
+    last, force = rod.rod.simulator.state, rod._feedback.force.copy()
+    assert np.abs(force).max() > 0.0
+    lost = dataclasses.replace(last, ok=np.array([False]), problems={0: "it stands."})
+    with monkeypatch.context() as patch:
+        for way in ("step", "settle"):
+            patch.setattr(rod.simulator, way, lambda *a, **b: lost)
+        patch.setattr(rod.simulator, "_state", lost)
+        patch.setattr(rod.simulator, "_warm", np.array([False]))
+        rod.step()
+    np.testing.assert_array_equal(rod._feedback.force, force)
+    assert not data.xfrc_applied[post].any()
+    np.testing.assert_array_equal(data.xfrc_applied[ball], [-0.05, 0, 0, 0, 0, 0])
+    assert rod.step().ok[0]
 
 
 def test_rod_can_be_taken_out_of_the_model():
