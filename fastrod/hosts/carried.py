@@ -64,6 +64,10 @@ class CarriedRod(ABC):
         """`inputs` with what the engine's own contacts add to them."""
 
     @abstractmethod
+    def _accepted(self, inputs: dict[str, Any]) -> None:
+        """`inputs` of a call that was not refused: from now on they are those that stay."""
+
+    @abstractmethod
     def _arrived(self) -> None:
         """After the engine's step."""
 
@@ -82,6 +86,7 @@ class CarriedRod(ABC):
         """Bring the rod to rest where its host is now; inputs as for `step`. The host feels nothing yet."""
         inputs = _checked(inputs)
         self.state = self.rod.settle(self._host.motion().pose, **self._scene(), **self._loads(inputs))
+        self._accepted(inputs)
         self._place()
         return self.state
 
@@ -112,6 +117,7 @@ class CarriedRod(ABC):
             self.settle(**inputs)
         motion = self._host.motion()
         state = self.state = self.rod.advance(motion.pose, motion.velocity, self.dt, **self._scene(), **self._loads(inputs))
+        self._accepted(inputs)
         if state.ok[0]:
             self.wrench = state.base_wrench[0].copy()
             for touched in self.touched:

@@ -73,6 +73,9 @@ class MountedRod(CarriedRod):
     def _loads(self, inputs: dict[str, Any]) -> dict[str, Any]:
         return inputs
 
+    def _accepted(self, inputs: dict[str, Any]) -> None:
+        """The rod keeps them itself."""
+
     def _arrived(self) -> None:
         """PyBullet forgets its external forces by itself."""
 

@@ -45,8 +45,7 @@ def add_capsules(
     names = tuple(f"{name} {k}" for k in range(robot.n_segments * capsules_per_segment))
     if any(b.name in names for b in spec.bodies):
         raise HostError(f"the model has a body {names[0]!r} already; give each rod a name of its own: add_capsules(..., name='left').")
-    radii = np.repeat(ContactScene().radius_of(robot), capsules_per_segment)
-    lengths = np.repeat([segment.length for segment in robot.segments], capsules_per_segment) / capsules_per_segment
+    radii, lengths = _sizes(robot, capsules_per_segment)
     middles = np.cumsum(lengths) - 0.5 * lengths
     for k, own in enumerate(names):
         body = spec.worldbody.add_body(name=own, mocap=True, pos=[0.0, 0.0, middles[k]])
@@ -90,6 +89,7 @@ class MujocoRod(CarriedRod):
         """Number of each capsule's body, base first."""
         self._mocap = model.body_mocapid[self.capsule_bodies]
         self._geoms: list[int] = model.body_geomadr[self.capsule_bodies].tolist()
+        _check_fit(model.geom_size[self._geoms], robot, name)
         for other in touched:
             self._check_excluded(other, name)
         self._bodies = [TouchedBody(model, data, b, dt=self.dt, relaxation=relaxation, friction=friction) for b in touched]
@@ -100,9 +100,9 @@ class MujocoRod(CarriedRod):
             points_per_segment=points_per_segment, capsules_per_segment=per_segment,
         )  # fmt: skip
         self._capsule_of = {geom: k for k, geom in enumerate(self._geoms)}
-        self._width: Floats = np.repeat([segment.length for segment in robot.segments], per_segment) / per_segment
+        self._width = _sizes(robot, per_segment)[1]
         self._feedback = Feedback(robot.n_segments, per_segment, self._width) if feel else None
-        self._line_force: Any = None
+        self._line_force: Floats | None = None
 
     @property
     def felt(self) -> Felt:
@@ -146,11 +146,26 @@ class MujocoRod(CarriedRod):
         if self._feedback is None:
             return inputs
         own = self._feedback.line_force()
+        given = self._distributed(inputs)
+        return inputs | {"line_force": own if given is None else own + given}
+
+    def _accepted(self, inputs: dict[str, Any]) -> None:
+        if self._feedback is not None:
+            self._line_force = self._distributed(inputs)
+
+    def _distributed(self, inputs: dict[str, Any]) -> Floats | None:
+        """The line force that is commanded, without what is felt; a copy [N/m]."""
         given = inputs.get("line_force", self._line_force)
-        if given is not None and np.shape(given) not in ((3,), own.shape):
-            raise InputError(f"line_force has shape {np.shape(given)}; with feel=True give (3,) or {own.shape} [N/m].")
-        self._line_force = given
-        return inputs | {"line_force": own if given is None else own + np.asarray(given, float)}
+        if given is None:
+            return None
+        shape = (self.rod.robot.n_segments, len(self._geoms) // self.rod.robot.n_segments + 1, 3)
+        try:
+            force = np.array(given, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"line_force is not an array of numbers; with feel=True give (3,) or {shape} [N/m].") from error
+        if force.shape not in ((3,), shape):
+            raise InputError(f"line_force has shape {force.shape}; with feel=True give (3,) or {shape} [N/m].")
+        return force
 
     def _arrived(self) -> None:
         self._release()
@@ -196,6 +211,23 @@ def _tree(body: Any) -> Iterator[Any]:
     while waiting:
         yield (one := waiting.pop())
         waiting.extend(one.bodies)
+
+
+def _sizes(robot: Robot, per_segment: int) -> tuple[Floats, Floats]:
+    """Radius and length (n_capsules,) of a robot's capsules [m]."""
+    lengths: Floats = np.repeat([segment.length for segment in robot.segments], per_segment) / per_segment
+    return np.repeat(ContactScene().radius_of(robot), per_segment), lengths
+
+
+def _check_fit(size: Floats, robot: Robot, name: str) -> None:
+    """`HostError` where capsules of this `size` (n, 3), MuJoCo's, are not this robot's."""
+    radii, lengths = _sizes(robot, len(size) // robot.n_segments)
+    for k, (is_, be) in enumerate(zip(size[:, :2], np.stack([radii, 0.5 * lengths], axis=1), strict=True)):
+        if not np.allclose(is_, be, rtol=1e-6, atol=0.0):
+            raise HostError(
+                f"capsule {k} of {name!r} has radius {is_[0]:.4g} m and half length {is_[1]:.4g} m, where this robot has {be[0]:.4g} m "
+                f"and {be[1]:.4g} m; they were added for another robot."
+            )
 
 
 def _capsule_bodies(model: Any, name: str, robot: Robot) -> list[int]:

@@ -226,6 +226,36 @@ def test_step_that_fails_in_contact_leaves_the_felt_force_and_nothing_of_its_own
     assert rod.step().ok[0]
 
 
+def test_line_force_of_a_call_that_is_refused_is_not_kept():
+    rod, _, _ = stand("", feel=True)
+    given = np.array([0.1, 0.0, 0.0])
+    rod.step(line_force=given)
+    given[:] = 9.0  # the caller's own array
+    for bad, sentence in (
+        ({"line_force": (np.nan, 0, 0)}, "^line_force holds a value that is not finite"),
+        ({"line_force": ("a", "b", "c")}, r"^line_force is not an array of numbers; with feel=True give \(3,\) or \(2, 11, 3\) \[N/m\]\.$"),
+        ({"line_force": (5.0, 0.0, 0.0), "tip_force": (np.nan, 0.0, 0.0)}, "^tip_force holds a value that is not finite"),
+    ):
+        for call in (rod.step, rod.settle):
+            with pytest.raises(InputError, match=sentence):
+                call(**bad)
+    rod.settle()
+    assert rod.rod.wrench[0] == pytest.approx(0.1 * 0.2, rel=1e-6)
+    rod.step()
+    assert rod.wrench[0] == pytest.approx(0.1 * 0.2, rel=1e-6)
+
+
+def test_capsules_of_another_robot_are_refused():
+    spec, robot = spec_of(POST), soft_robot(1)
+    add_capsules(spec, robot, "post")
+    model = spec.compile()
+    longer = dataclasses.replace(robot, segments=tuple(dataclasses.replace(s, length=1.5 * s.length) for s in robot.segments))
+    sentence = r"^capsule 0 of 'rod' has radius 0.012 m and half length 0.005 m, where this robot has 0.012 m and 0.0075 m; they were added"
+    with pytest.raises(HostError, match=sentence):
+        MujocoRod(longer, model, mujoco.MjData(model), "post")
+    assert MujocoRod(robot, model, mujoco.MjData(model), "post").step().ok[0]
+
+
 def test_rod_can_be_taken_out_of_the_model():
     rod, model, data = stand()
     rod.step()
