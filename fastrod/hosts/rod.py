@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple, final
 
 import numpy as np
@@ -15,9 +17,10 @@ from fastrod.errors import HostError, InputError, nearest
 from fastrod.hosts.capsules import Capsules, along, moved
 from fastrod.hosts.host import Motion
 from fastrod.robot import Robot
+from fastrod.rows import taken_shape
 from fastrod.simulator import Simulator
 from fastrod.state import Snapshot, State
-from fastrod.types import Flags, Floats
+from fastrod.types import Flags, Floats, Ints, Shape
 
 INPUTS = ("tendon_length", "tension", "extension", "tip_force", "tip_moment", "line_force", "point_force", "follower_tip_force")
 """What an engine may tell a rod beside its base: keyword arguments of `Simulator.step`."""
@@ -42,7 +45,10 @@ class RodSnapshot(NamedTuple):
     obstacles: dict[str, Floats]
     """Name -> (1 or n_robots, 7) pose as it was told last, world."""
     capsules: Capsules | None
-    failed: int
+    failed: Ints
+    """(n_robots,) the rod's own steps in a row that could not be solved."""
+    fresh: Flags
+    """(n_robots,) who settles before the next step."""
 
 
 @final
@@ -88,14 +94,15 @@ class Rod:
         self.time = 0.0
         """The rod's clock: the sum of the engine's steps [s]."""
         wires = any(segment.mode in ("tendon_length", "paper") for segment in robot.segments)
-        self._inputs: dict[str, Any] = {"tendon_length": robot.rest_tendon_length} if wires else {}
+        self._inputs: dict[str, Any] = {"tendon_length": np.array(robot.rest_tendon_length)} if wires else {}
         self._home: Floats = np.array([*robot.base_position, *robot.base_quaternion], float)
         self._obstacles: dict[str, Floats] = {}
         self._state: State | None = None
         self._capsules: Capsules | None = None
         self._wrench: Floats = np.zeros((self.simulator.n_robots, 6))
         self._base: Floats = np.tile(self._home, (self.simulator.n_robots, 1))
-        self._failed = 0
+        self._failed: Ints = np.zeros(self.simulator.n_robots, np.int64)
+        self._fresh: Flags = np.zeros(self.simulator.n_robots, bool)
 
     @property
     def state(self) -> State:
@@ -107,7 +114,7 @@ class Rod:
     def capsules(self) -> Capsules:
         """The body after the last step. Raises `InputError` before the first."""
         found: Capsules = self._there(self._capsules)
-        return found if self.n_robots is not None else Capsules(*(a[0] for a in found))
+        return Capsules(*(self._one(a) for a in found))
 
     @property
     def wrench(self) -> Floats:
@@ -121,14 +128,25 @@ class Rod:
 
     @property
     def failed(self) -> int:
-        """Steps in a row that could not be solved; 0 after one that could."""
-        return self._failed
+        """The rod's own steps in a row that could not be solved; 0 after one that could. Of several rods the most."""
+        return int(self._failed.max())
+
+    @property
+    def failures(self) -> Ints:
+        """(n_robots,) `failed` of each rod, n_robots 1 where there is one."""
+        return self._failed.copy()
 
     def settle(self, base_pose: ArrayLike | None = None, **inputs: Any) -> State:
         """At rest on a base at rest, (7,) position [m] and quaternion w x y z, world; the robot file's own if left out. Inputs as for
-        `advance`; the clock stands still. Raises `InputError`, and `HostError` where nothing finite is found."""
+        `advance`; the clock stands still. Raises `InputError`, and `HostError` where nothing finite is found; then nothing has changed."""
         given, around = self._sorted(inputs)
-        return self._settled(self._home if base_pose is None else self._poses(base_pose), given, around)
+        base = self._home if base_pose is None else self._poses(base_pose)
+        before = self.snapshot()
+        try:
+            return self._settled(base, given, around)
+        except Exception:
+            self.restore(before)
+            raise
 
     def advance(self, base_pose: ArrayLike, base_twist: ArrayLike, time_step: float, **inputs: Any) -> State:
         """The rod at the end of the engine's next step of `time_step` [s].
@@ -139,34 +157,56 @@ class Rod:
         there in the rod's own steps.
 
         A step that cannot be solved (`state.ok` is false, and `state.problems` says why) leaves the rod where it came to, with half the
-        wrench of the step before; after a few in a row, without contact at once, the rod settles anew. Raises `InputError` for
-        unusable input, and then nothing has moved; `HostError` where the rod is lost, or 25 steps in a row cannot be solved.
+        wrench of the engine's step before; after a few in a row, without contact at once, the rod settles anew. Of several rods, each
+        fails alone: one whose input cannot be used, or that is lost, keeps shape, capsules and base as well. Raises `InputError` for
+        unusable input, `HostError` where all rods are lost, one was lost before it had a shape, or 25 steps in a row could not be solved
+        of any rod; then nothing has moved.
         """
         motion, n = self._motion(base_pose, base_twist), self._substeps(time_step)
         given, around = self._sorted(inputs)
+        start, dt = self.snapshot(), self.simulator.dt
+        try:
+            return self._advanced(motion, given, around, time_step, n)
+        except Exception:
+            self.restore(start)
+            self.simulator.dt = dt
+            raise
+
+    def _advanced(self, motion: Motion, given: dict[str, Any], around: dict[str, Any], time_step: float, n: int) -> State:
         if self._state is None:
             self._settled(motion.pose, given, around)
+        elif self._fresh.any():
+            self._settled_again(motion.pose, given, around)
         self.simulator.dt = h = time_step / n
+        wrench = self._wrench
         for k in range(n):
-            state = self._solved(motion.after((k + 1) * h), given, self._part_way(around, n - k) if n > 1 else around)
-        before, self._capsules = self._capsules, self._along(state)
+            self._solved(motion.after((k + 1) * h), given, self._part_way(around, n - k) if n > 1 else around, 0.5 * wrench)
+        before, self._capsules = self._capsules, self._along(self.state)
         if before is not None:
             self._capsules = moved(before, self._capsules, time_step)
         self.time += time_step
-        return state
+        return self.state
 
-    def reset(self) -> None:
+    def reset(self, rows: ArrayLike | None = None) -> None:
         """Forget the rod's shape and its contacts, but not its inputs nor its clock: after the base was put somewhere else. The next step
-        settles where the base then is."""
-        self.simulator.reset()
-        self._state = self._capsules = None
-        self._wrench, self._failed = np.zeros_like(self._wrench), 0
+        settles where the base then is. `rows`: indices or a mask of the rods that are reset, all without it; the others go on, and
+        shapes and capsules of these are shown as they were until then. Raises `InputError` for what is no rows."""
+        which = np.ones(self.simulator.n_robots, bool)
+        self.simulator.reset(rows)
+        if rows is not None:
+            index, which = np.asarray(rows), ~which
+            if index.size:
+                which[index] = True
+        if which.all():
+            self._state = self._capsules = None
+        self._fresh = self._fresh | which
+        self._wrench, self._failed = np.where(which[:, None], 0.0, self._wrench), np.where(which, 0, self._failed)
 
     def snapshot(self) -> RodSnapshot:
         """A copy of everything that a later step depends on."""
         return RodSnapshot(
             self.simulator.snapshot(), self.time, self._state, self._wrench.copy(), self._base.copy(), dict(self._inputs),
-            dict(self._obstacles), self._capsules, self._failed,
+            dict(self._obstacles), self._capsules, self._failed.copy(), self._fresh.copy(),
         )  # fmt: skip
 
     def restore(self, snapshot: RodSnapshot) -> None:
@@ -174,30 +214,41 @@ class Rod:
         if not isinstance(snapshot, RodSnapshot):
             raise InputError(f"the snapshot is a {type(snapshot).__name__}; give what Rod.snapshot() returned.")
         self.simulator.restore(snapshot.simulator)
-        self.time, self._state, self._capsules, self._failed = snapshot.time, snapshot.state, snapshot.capsules, snapshot.failed
+        self.time, self._state, self._capsules = snapshot.time, snapshot.state, snapshot.capsules
+        self._failed, self._fresh = snapshot.failed.copy(), snapshot.fresh.copy()
         self._wrench, self._base = snapshot.wrench.copy(), snapshot.base.copy()
         self._inputs, self._obstacles = dict(snapshot.inputs), dict(snapshot.obstacles)
 
     def _settled(self, base: Floats, given: dict[str, Any], around: dict[str, Any]) -> State:
-        state = self.simulator.settle(base_pose=base, **around, **given)
-        self._keep(state, given, around, base)
-        self._capsules = self._along(state)
-        return state
+        self._keep(self.simulator.settle(base_pose=base, **around, **given), given, around, base, 0.5 * self._wrench)
+        self._fresh[:] = False
+        self._capsules = self._along(self.state)
+        return self.state
 
-    def _solved(self, base: Floats, given: dict[str, Any], around: dict[str, Any]) -> State:
-        """One step of the rod itself."""
+    def _settled_again(self, base: Floats, given: dict[str, Any], around: dict[str, Any]) -> None:
+        """Rods that were reset, while the others are on their way."""
+        rows, going = self._fresh, self._wrench
+        self._keep(self._anew(rows, base, given, around), given, around, base, going)
+        self._wrench = np.where(rows[:, None], self._wrench, going)
+        now = self._along(self.state)
+        before = now if self._capsules is None else self._capsules
+        self._capsules = Capsules(*(np.where(rows.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(now, before, strict=True)))
+        self._fresh = rows & ~self.state.ok
+
+    def _solved(self, base: Floats, given: dict[str, Any], around: dict[str, Any], half: Floats) -> None:
+        """One step of the rod itself; `half` (n_robots, 6) the wrench of those that fail."""
         state = self.simulator.step(base_pose=base, **around, **given)
-        if not state.ok.all() and (self.simulator.contact is None or self._failed >= _PATIENCE):
-            state = self._anew(~state.ok, base, given, around)
-        self._keep(state, given, around, base)
-        self._failed = 0 if state.ok.all() else self._failed + 1
-        if self._failed > _MOST_FAILED:
+        again = ~state.ok & (state.passes != 0) & ((self._failed >= _PATIENCE) | (self.simulator.contact is None))
+        if again.any():
+            state = self._anew(again, base, given, around)
+        self._keep(state, given, around, base, half)
+        self._failed = np.where(state.ok, 0, self._failed + 1)
+        if (self._failed > _MOST_FAILED).all():
             why = next(iter(state.problems.values()), "no reason is known.")
             raise HostError(
-                f"{self._failed} steps in a row could not be solved, the last: {why} "
+                f"{self._failed.min()} steps in a row could not be solved, the last: {why} "
                 "Move host, bodies and inputs by less in a step, or after a jump call reset()."
             )
-        return state
 
     def _anew(self, rows: Flags, base: Floats, given: dict[str, Any], around: dict[str, Any]) -> State:
         """These rods at rest, from the straight rod; the others, memories and clocks of their effects too, stay as they are."""
@@ -213,13 +264,22 @@ class Rod:
         sim.restore(before, ~rows)
         return sim.state
 
-    def _keep(self, state: State, given: dict[str, Any], around: Mapping[str, Any], base: Floats) -> None:
-        if not np.isfinite(state.tip_position).all() or not np.isfinite(state.base_wrench).all():
-            raise HostError(f"the rod is lost: {next(iter(state.problems.values()), 'its shape is not finite')}")
+    def _keep(self, state: State, given: dict[str, Any], around: Mapping[str, Any], base: Floats, half: Floats) -> None:
+        """Take a state over. Rods that are lost in it stay as they were; those that are not ok have the wrench `half` (n_robots, 6)."""
+        found = [np.isfinite(a).reshape(len(a), -1).all(axis=1) for a in (state.position, state.tip_position, state.base_wrench)]
+        lost: Flags = ~np.logical_and.reduce(found)
+        if lost.any():
+            i, before = int(lost.argmax()), self._state
+            if lost.all() or before is None:
+                which = "the rod" if len(lost) == 1 else f"rod {i} of {len(lost)}"
+                raise HostError(f"{which} is lost: {state.problems.get(i, 'its shape is not finite')}")
+            unknown = {int(i): "its shape is not finite." for i in np.flatnonzero(lost)}
+            shape = taken_shape(Shape(*(getattr(state, name) for name in Shape._fields)), before, lost)
+            state = replace(state, **shape._asdict(), ok=state.ok & ~lost, problems=unknown | dict(state.problems))
         self._state, self._inputs = state, given
-        self._obstacles |= {name: np.atleast_2d(np.asarray(pose, float)) for name, pose in (around.get("obstacle_pose") or {}).items()}
-        self._wrench = np.where(state.ok[:, None], state.base_wrench, 0.5 * self._wrench)
-        self._base = np.tile(np.atleast_2d(base), (self.simulator.n_robots if np.ndim(base) == 1 or len(base) == 1 else 1, 1))
+        self._obstacles |= {name: np.array(np.atleast_2d(pose), float) for name, pose in (around.get("obstacle_pose") or {}).items()}
+        self._wrench = np.where(state.ok[:, None], state.base_wrench, half)
+        self._base = np.where(lost[:, None], self._base, np.broadcast_to(base, self._base.shape))
 
     def _sorted(self, inputs: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
         """Inputs of the rod with those it has already, and what is around it."""
@@ -228,6 +288,7 @@ class Rod:
             if name not in known:
                 why = "it needs a contact scene: Rod(robot, contact=...)." if name in OBSTACLES else nearest(name, known)
                 raise InputError(f"a rod has no input {name!r}; {why}")
+        inputs = {name: _copied(value) for name, value in inputs.items()}
         around = {name: inputs[name] for name in OBSTACLES if name in inputs}
         return self._inputs | {name: value for name, value in inputs.items() if name not in OBSTACLES}, around
 
@@ -293,3 +354,11 @@ class Rod:
         if what is None:
             raise InputError("the rod has no state yet; call advance or settle first.")
         return what
+
+
+def _copied(value: Any) -> Any:
+    """The caller may write into its own; what no copy can be made of is refused by who reads it."""
+    try:
+        return np.array(value) if isinstance(value, np.ndarray) else copy.deepcopy(value)
+    except Exception:
+        return value

@@ -191,6 +191,95 @@ def test_rod_that_fails_leaves_its_neighbour_alone(monkeypatch, walled):
     assert not walled or one.contacts.count[0] > 0
 
 
+@pytest.mark.parametrize("walled", [False, True])
+def test_bad_input_of_one_rod_is_told_and_the_others_go_on(walled):
+    robot = replace(soft_robot(1), effects=({"name": "dynamics", "period": 0.1, "damping": 0.7},))
+    scene = ContactScene(obstacles=[plane(point=(0.01, 0, 0), normal=(-1, 0, 0), name="wall")]) if walled else None
+    pair, lone = Rod(robot, n_robots=2, contact=scene), Rod(robot, contact=scene)
+    wires, force = robot.rest_tendon_length + PULL[:4], np.array([0.02, 0.01, 0.0])
+    for rod in (pair, lone):
+        for _ in range(3):
+            rod.advance(HOME, STILL, 0.015, tendon_length=wires, tip_force=force)
+    shape, wrench, capsules = pair.state.position[1], pair.wrench[1], pair.capsules.center[1]
+    for k in range(4):
+        both = pair.advance(HOME, (0.1, 0, 0, 0, 0, 0), 0.015, tip_force=[force, [np.nan, 0.0, 0.0]])
+        one = lone.advance(HOME, (0.1, 0, 0, 0, 0, 0), 0.015, tip_force=force)
+        assert_array_equal(both.position[0], one.position[0])
+        assert_array_equal(pair.wrench[0], lone.wrench)
+        assert both.ok.tolist() == [True, False]
+        assert "tip_force" in both.problems[1]
+        assert_array_equal(both.position[1], shape)
+        assert_array_equal(pair.capsules.center[1], capsules)
+        assert_array_equal(pair.base[1], HOME)
+        assert_allclose(pair.wrench[1], 0.5 ** (k + 1) * wrench, rtol=1e-14)  # a step of the engine halves it once, not each part
+    assert pair.failures.tolist() == [0, 8]
+    assert pair.failed == 8
+    assert pair.time == lone.time
+    back = pair.advance(HOME, STILL, 0.015, tip_force=force)
+    assert back.ok.all()
+    assert pair.failures.tolist() == [0, 0]
+
+
+def test_rod_that_is_reset_settles_and_the_others_go_on():
+    robot = replace(soft_robot(1), effects=({"name": "dynamics", "period": 0.1, "damping": 0.7},))
+    pair, going, again = Rod(robot, n_robots=2), Rod(robot), Rod(robot)
+    wires = robot.rest_tendon_length + PULL[:4]
+    for k in range(5):
+        if k == 3:
+            pair.reset(rows=[1])
+            again.reset()
+            assert not pair.wrench[1].any()
+        for rod in (pair, going, again):
+            rod.advance(HOME, STILL, 0.01, tendon_length=wires if k else robot.rest_tendon_length, tip_force=(0.0, 0.02, 0.0))
+        assert_array_equal(pair.state.position[0], going.state.position[0])
+        assert_allclose(pair.state.position[1], again.state.position[0], atol=1e-12)
+        assert_allclose(pair.wrench, [going.wrench, again.wrench], atol=1e-10)
+        assert_allclose(pair.capsules.velocity[1], again.capsules.velocity, atol=1e-9)
+    with pytest.raises(InputError, match=r"^rows is \[5\]; give indices of robots from 0 to 1, or a mask\.$"):
+        pair.reset(rows=[5])
+
+
+def test_what_the_caller_writes_into_its_own_arrays_changes_nothing():
+    robot = soft_robot()
+    wires, force, where = robot.rest_tendon_length + PULL, np.array([0.02, 0.0, 0.0]), [(0.13, np.array([0.0, 0.05, 0.0]))]
+    rod, twin = Rod(robot), Rod(robot)
+    rod.advance(HOME, STILL, 0.01, tendon_length=wires, tip_force=force, point_force=where)
+    twin.advance(HOME, STILL, 0.01, tendon_length=wires.copy(), tip_force=force.copy(), point_force=[(0.13, (0.0, 0.05, 0.0))])
+    then = rod.snapshot()
+    wires[:], force[:] = 0.0, 7.0
+    where[0][1][:] = -3.0
+    rod.capsules.center[:] = 0.0
+    for _ in range(2):
+        assert_array_equal(rod.advance(HOME, STILL, 0.01).position, twin.advance(HOME, STILL, 0.01).position)
+        assert_array_equal(rod.capsules.velocity, twin.capsules.velocity)
+    rod.restore(then)
+    twin.restore(then)
+    assert_array_equal(rod.advance(HOME, STILL, 0.01).position, twin.advance(HOME, STILL, 0.01).position)
+
+
+def test_rod_that_is_lost_is_refused_and_nothing_has_moved(monkeypatch):
+    rods = Rod(soft_robot(), n_robots=2)
+    with pytest.raises(HostError, match=r"^rod 1 of 2 is lost: .*tip_force"):
+        rods.advance(HOME, STILL, 0.01, tip_force=[[0, 0, 0], [np.nan, 0, 0]])
+    good = rods.advance(HOME, STILL, 0.01)
+    then, step, calls = rods.snapshot(), rods.simulator.step, []
+
+    def lost_at_last(*a, **b):
+        calls.append(1)
+        return step(*a, **b) if len(calls) < 3 else replace(good, tip_position=np.full((2, 3), np.nan))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(rods.simulator, "step", lost_at_last)
+        with pytest.raises(HostError, match=r"^rod 0 of 2 is lost: its shape is not finite$"):
+            rods.advance(HOME, (0.5, 0, 0, 0, 0, 0), 0.03, tip_force=(0.05, 0.0, 0.0))
+    assert len(calls) == 3
+    assert rods.state is good
+    assert rods.time == 0.01
+    after = rods.advance(HOME, STILL, 0.02)
+    rods.restore(then)
+    assert_array_equal(rods.advance(HOME, STILL, 0.02).position, after.position)
+
+
 def test_snapshot_goes_back_and_reset_keeps_inputs_and_clock():
     robot = soft_robot()
     rod = Rod(robot)
