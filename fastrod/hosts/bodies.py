@@ -22,22 +22,26 @@ class RodBodies:
     """
 
     def __init__(
-        self, bullet: Any, length: float, radius: float | Sequence[float], n_capsules: int = 16, *,
+        self, bullet: Any, length: float | Sequence[float], radius: float | Sequence[float], n_capsules: int = 16, *,
         color: Sequence[float] = (0.5, 0.0, 0.6, 1.0), head_color: Sequence[float] | None = None, friction: float = 0.5,
     ) -> None:  # fmt: skip
-        """`length` of the backbone [m], split evenly; `radius` one, or one for each capsule [m]; colours RGBA. Raises `HostError`."""
-        if n_capsules < 1 or not length > 0.0:
-            raise HostError(f"{n_capsules} capsules for {length:g} m; give at least one, and a positive length.")
+        """`length` of the backbone, split evenly, or of each capsule [m]; `radius` one, or one for each capsule [m]; colours RGBA.
+        Raises `HostError`."""
+        if n_capsules < 1 or not np.all(np.asarray(length) > 0.0) or np.shape(length) not in ((), (n_capsules,)):
+            raise HostError(
+                f"{n_capsules} capsules for {length} m; give at least one, and a positive length, of the whole or one for each."
+            )
         self.bullet = b = Bullet(bullet)
         radii = np.broadcast_to(np.asarray(radius, float), n_capsules)
         if not (radii > 0.0).all():
             raise HostError(f"radius is {radius!r} m; it must be positive.")
+        lengths = np.broadcast_to(np.asarray(length, float) / (n_capsules if np.ndim(length) == 0 else 1), n_capsules).tolist()
         self.ids: list[int] = []
         """Body of each capsule, base first."""
-        for i, r in enumerate(radii.tolist()):
+        for i, (r, own) in enumerate(zip(radii.tolist(), lengths, strict=True)):
             rgba = head_color if head_color is not None and i == n_capsules - 1 else color
-            shape = b.createCollisionShape(b.GEOM_CAPSULE, radius=r, height=length / n_capsules)
-            visual = b.createVisualShape(b.GEOM_CAPSULE, radius=r, length=length / n_capsules, rgbaColor=list(rgba))
+            shape = b.createCollisionShape(b.GEOM_CAPSULE, radius=r, height=own)
+            visual = b.createVisualShape(b.GEOM_CAPSULE, radius=r, length=own, rgbaColor=list(rgba))
             self.ids.append(b.createMultiBody(0.0, shape, visual))
             b.changeDynamics(self.ids[-1], -1, lateralFriction=friction, restitution=0.0)
         self._position, self._quaternion = np.zeros((n_capsules, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (n_capsules, 1))

@@ -145,7 +145,7 @@ class CarriedRod(ABC):
         """Forget the rod's shape and its contacts, but not its inputs: after the host or a body was put somewhere else. The next step
         settles where the host then is."""
         self.rod.reset()
-        self.state = None
+        self.state, self.wrench = None, np.zeros(6)
         self._forget()
         for touched in self.touched:
             touched.forget()
@@ -173,6 +173,12 @@ def rod_of(
     if touched:
         scene = ContactScene(obstacles=[part.obstacle for body in touched for part in body.parts], max_contacts=max_contacts)
     return Rod(robot, dt=dt, contact=scene, points_per_segment=points_per_segment, capsules_per_segment=capsules_per_segment)
+
+
+def check_touch(touch: object) -> None:
+    """Raises `HostError` for a name, which would be read letter by letter, and for what is no sequence."""
+    if not isinstance(touch, (list, tuple, set, frozenset, range, np.ndarray)):
+        raise HostError(f"touch is {touch!r}; give a list of bodies, as touch=[{touch!r}].")
 
 
 def check_contact(relaxation: float, friction: float) -> None:

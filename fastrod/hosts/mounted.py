@@ -9,7 +9,7 @@ import numpy as np
 
 from fastrod.errors import HostError
 from fastrod.hosts.bodies import RodBodies
-from fastrod.hosts.carried import CarriedRod, check_contact, rod_of
+from fastrod.hosts.carried import CarriedRod, check_contact, check_touch, rod_of
 from fastrod.hosts.link import BulletLink
 from fastrod.hosts.surroundings import Touched
 from fastrod.robot import Robot
@@ -35,6 +35,7 @@ class MountedRod(CarriedRod):
         super().__init__(host, host.bullet.dt)
         self.host, self.bullet = host, host.bullet
         check_contact(relaxation, friction)
+        check_touch(touch)
         links = [_link_of(t) for t in touch]
         self.touched = [Touched(self.bullet, body, link, dt=self.dt, relaxation=relaxation, friction=friction) for body, link in links]
         self.rod = rod_of(
@@ -43,7 +44,8 @@ class MountedRod(CarriedRod):
         )  # fmt: skip
         self._stride = points_per_segment // capsules_per_segment
         radii = self.rod.radius.tolist()
-        self.bodies = RodBodies(self.bullet, robot.length, radii, len(radii), color=color, head_color=head_color)
+        lengths = np.repeat([segment.length for segment in robot.segments], capsules_per_segment) / capsules_per_segment
+        self.bodies = RodBodies(self.bullet, lengths.tolist(), radii, len(radii), color=color, head_color=head_color)
         for body in {host.body, *(body for body, _ in links)}:
             self.bodies.ignore(body)
 

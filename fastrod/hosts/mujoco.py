@@ -10,10 +10,11 @@ from numpy.typing import ArrayLike
 
 from fastrod.contact import ContactScene
 from fastrod.errors import HostError, InputError, nearest
-from fastrod.hosts.carried import CarriedRod, check_contact, rod_of
+from fastrod.hosts.carried import CarriedRod, check_contact, check_touch, rod_of
 from fastrod.hosts.mujoco_body import MujocoBody, body_number, mujoco
 from fastrod.hosts.mujoco_contacts import Feedback, Felt, read
 from fastrod.hosts.mujoco_touched import TouchedBody
+from fastrod.hosts.rod import check_robot
 from fastrod.robot import Robot
 from fastrod.types import Floats
 
@@ -33,8 +34,13 @@ def add_capsules(
     lib = mujoco()
     if not isinstance(spec, lib.MjSpec):
         raise HostError(f"spec is a {type(spec).__name__}; give a mujoco.MjSpec, for example mujoco.MjSpec.from_file(path).")
-    if capsules_per_segment < 1:
-        raise InputError(f"{capsules_per_segment} capsules a segment; give at least one.")
+    check_robot(robot)
+    check_touch(touch)
+    check_contact(0.0, friction)
+    if isinstance(capsules_per_segment, bool) or not isinstance(capsules_per_segment, (int, np.integer)) or capsules_per_segment < 1:
+        raise InputError(f"{capsules_per_segment!r} capsules a segment; give at least one, a whole number.")
+    color = _rgba("color", color)
+    head_color = None if head_color is None else _rgba("head_color", head_color)
     passed = list(_tree(_spec_body(spec, host)))
     for other in touch:
         if (body := _spec_body(spec, other)).name not in [b.name for b in passed]:
@@ -80,10 +86,12 @@ class MujocoRod(CarriedRod):
         `touch`: names or numbers of bodies; `friction` of the rod on them; `relaxation` [s] of the rod against a changing contact
         force (`Touching`). `feel`: MuJoCo's contacts of the capsules bend the rod (`Feedback`). `name` as given to `add_capsules`.
         The time step is the model's. Raises `HostError`, `InputError`."""
+        check_robot(robot)
         host = MujocoBody(model, data, body, position=position, quaternion=quaternion)
         super().__init__(host, float(model.opt.timestep))
         self.host, self.model, self.data = host, model, data
         check_contact(relaxation, friction)
+        check_touch(touch)
         touched = [body_number(model, other) for other in touch]
         self.capsule_bodies: list[int] = _capsule_bodies(model, name, robot)
         """Number of each capsule's body, base first."""
@@ -211,6 +219,16 @@ def _tree(body: Any) -> Iterator[Any]:
     while waiting:
         yield (one := waiting.pop())
         waiting.extend(one.bodies)
+
+
+def _rgba(name: str, value: Sequence[float]) -> list[float]:
+    try:
+        rgba = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        rgba = np.empty(0)
+    if rgba.shape != (4,) or not np.isfinite(rgba).all():
+        raise InputError(f"{name} is {value!r}; give red, green, blue and opacity, four numbers from 0 to 1.")
+    return [float(part) for part in rgba]
 
 
 def _sizes(robot: Robot, per_segment: int) -> tuple[Floats, Floats]:

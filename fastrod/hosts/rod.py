@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from fastrod.contact import ContactScene
 from fastrod.contact.frames import between
-from fastrod.errors import HostError, InputError, nearest
+from fastrod.errors import HostError, InputError, RobotError, nearest, shown
 from fastrod.hosts.capsules import Capsules, along, moved
 from fastrod.hosts.host import Motion
 from fastrod.robot import Robot
@@ -71,6 +71,11 @@ class Rod:
     ) -> None:  # fmt: skip
         """`dt`: the rod's longest step [s]; an engine's step that is longer is done in equal parts. `contact`: what the rod feels.
         Capsules are as thick as contact has the rod. Raises `InputError`, `RobotError`."""
+        check_robot(robot)
+        if isinstance(n_robots, bool):
+            raise InputError(f"n_robots is {n_robots}; give how many rods there are, or None for one without a robot axis.")
+        if contact is not None and not isinstance(contact, ContactScene):
+            raise InputError(f"contact is {shown(contact)}; give fastrod.contact.ContactScene(obstacles=[...]) or None.")
         if (
             not isinstance(capsules_per_segment, (int, np.integer))
             or capsules_per_segment < 1
@@ -362,3 +367,9 @@ def _copied(value: Any) -> Any:
         return np.array(value) if isinstance(value, np.ndarray) else copy.deepcopy(value)
     except Exception:
         return value
+
+
+def check_robot(robot: object) -> None:
+    """Raises `RobotError` for what is not one robot."""
+    if not isinstance(robot, Robot):
+        raise RobotError(f"robot is {shown(robot)}; give one Robot, for example fastrod.load_robot('prototype').")

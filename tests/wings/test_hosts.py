@@ -1,5 +1,7 @@
 """A PyBullet body carries a rod: where the base is, how it moves, and what the joints feel."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from bullets import carrier, cube, empty_world, kuka, soft_robot
@@ -238,3 +240,17 @@ def test_rod_bodies_stand_for_what_the_simulator_has():
     colours = [world.getVisualShapeData(b)[0][7] for b in bodies.ids]
     assert set(colours[:-1]) == {(1.0, 0.0, 0.0, 1.0)}
     assert colours[-1] == (0.0, 1.0, 0.0, 1.0)
+
+
+def test_capsules_of_unequal_segments_have_their_own_length():
+    world = empty_world(dt=0.005)
+    robot = soft_robot()
+    short, long = robot.segments
+    robot = replace(robot, segments=(replace(short, length=0.06), replace(long, length=0.14)))
+    rod = MountedRod(robot, carrier(world))
+    rod.step(tip_force=(0.05, 0.0, 0.0))
+    heights = [world.getCollisionShapeData(own, -1)[0][3][0] for own in rod.bodies.ids]
+    np.testing.assert_allclose(heights, [0.006] * 10 + [0.014] * 10)
+    assert rod.wrench.any()
+    rod.reset()
+    assert not rod.wrench.any()

@@ -12,7 +12,7 @@ from bullets import soft_robot
 
 import fastrod.hosts
 from fastrod.contact import ContactScene
-from fastrod.errors import HostError, InputError
+from fastrod.errors import HostError, InputError, RobotError
 from fastrod.hosts import MujocoBody, MujocoRod, add_capsules
 from fastrod.hosts.mujoco_body import com_motion, refresh
 from fastrod.hosts.mujoco_touched import TouchedBody
@@ -289,6 +289,39 @@ def test_servos_hold_the_arm_where_it_is_told():
         arm.drive([0, 0])
 
 
+@pytest.mark.parametrize(
+    ("options", "error", "sentence"),
+    [
+        ({"robot": "prototype"}, RobotError, r"^robot is 'prototype'; give one Robot, for example fastrod.load_robot\('prototype'\)\.$"),
+        ({"capsules_per_segment": "a"}, InputError, r"^'a' capsules a segment; give at least one, a whole number\.$"),
+        ({"capsules_per_segment": 2.5}, InputError, r"^2.5 capsules a segment; give at least one"),
+        ({"capsules_per_segment": True}, InputError, r"^True capsules a segment; give at least one"),
+        ({"color": (1, 2)}, InputError, r"^color is \(1, 2\); give red, green, blue and opacity, four numbers from 0 to 1\.$"),
+        ({"head_color": "red"}, InputError, r"^head_color is 'red'; give red, green, blue and opacity"),
+        ({"friction": np.nan}, InputError, r"^friction is nan; it must be a number, zero or positive\.$"),
+        ({"friction": -1}, InputError, r"^friction is -1; it must be a number, zero or positive\.$"),
+        ({"touch": "ball"}, HostError, r"^touch is 'ball'; give a list of bodies, as touch=\['ball'\]\.$"),
+    ],
+)
+def test_capsules_that_no_model_can_have_are_a_sentence(options, error, sentence):
+    spec = spec_of(POST + BALL)
+    with pytest.raises(error, match=sentence):
+        add_capsules(**{"spec": spec, "robot": soft_robot(1), "host": "post"} | options)
+    assert len(spec.bodies) == 3  # world, post, ball: nothing was added
+
+
+def test_rod_of_a_model_asks_for_a_robot_and_a_list():
+    rod, model, data = stand()
+    with pytest.raises(RobotError, match=r"^robot is 'prototype'; give one Robot"):
+        MujocoRod("prototype", model, data, "post")
+    with pytest.raises(HostError, match=r"^touch is 'ball'; give a list of bodies"):
+        MujocoRod(soft_robot(), model, data, "post", touch="ball")
+    rod.step(tip_force=(0.1, 0.0, 0.0))
+    assert rod.wrench.any()
+    rod.reset()
+    assert not rod.wrench.any()
+
+
 def test_what_is_not_there_is_a_sentence(monkeypatch):
     robot = soft_robot()
     spec = spec_of(POST + BALL + '<body name="ghost"><freejoint/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>')
@@ -296,7 +329,7 @@ def test_what_is_not_there_is_a_sentence(monkeypatch):
         add_capsules("arm.xml", robot, "post")
     with pytest.raises(HostError, match=r"^the spec has no body 'pst'; did you mean 'post'\?"):
         add_capsules(spec, robot, "pst")
-    with pytest.raises(InputError, match=r"^0 capsules a segment; give at least one\.$"):
+    with pytest.raises(InputError, match=r"^0 capsules a segment; give at least one, a whole number\.$"):
         add_capsules(spec, robot, "post", capsules_per_segment=0)
     bare = spec_of(POST).compile()
     with pytest.raises(HostError, match=r"^the model has no capsules of a rod 'rod'; call add_capsules\(\.\.\., name='rod'\) on its spec"):

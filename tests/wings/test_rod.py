@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import fastrod
 from fastrod.contact import ContactScene, box, plane
-from fastrod.errors import HostError, InputError
+from fastrod.errors import HostError, InputError, RobotError
 from fastrod.hosts import Motion, Rod
 from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_vector
 from fastrod.simulator import Simulator
@@ -332,6 +332,13 @@ def test_what_no_rod_can_be_is_a_sentence():
         _ = Rod(robot).capsules
     with pytest.raises(InputError, match=r"^3 capsules for 10 points of a segment; give a divisor of the points\.$"):
         Rod(robot, capsules_per_segment=3)
+    for bad in ([robot, robot], "prototype"):
+        with pytest.raises(RobotError, match=r"^robot is .*; give one Robot, for example fastrod.load_robot\('prototype'\)\.$"):
+            Rod(bad, n_robots=2)
+    with pytest.raises(InputError, match=r"^contact is 'x'; give fastrod.contact.ContactScene\(obstacles=\[\.\.\.\]\) or None\.$"):
+        Rod(robot, contact="x")
+    with pytest.raises(InputError, match=r"^n_robots is True; give how many rods there are, or None for one without a robot axis\.$"):
+        Rod(robot, n_robots=True)
     with pytest.raises(InputError, match=r"^dt is 0 s; it must be a number, positive and finite\.$"):
         Rod(robot, dt=0)
     with pytest.raises(InputError, match=r"^ContactScene.worlds puts several rods into one world"):
