@@ -39,7 +39,7 @@ def begun(n_robots: int | None) -> tuple[Rod, RodSnapshot]:
     step=st.one_of(st.just(0.02), st.sampled_from([0.0, -1.0, np.nan, "dt", None, True])),
     settles=st.booleans(),
 )
-@tried(15)
+@tried(60)
 def test_call_that_is_refused_changes_nothing(n_robots, inputs, base, twist, step, settles):
     body, then = begun(n_robots)
     body.restore(then)
