@@ -59,7 +59,7 @@ def embedded_step() -> Any:
     return found["embedded_step"]
 
 
-@pytest.mark.parametrize(("code", "output"), EXAMPLES, ids=["an engine of one body", "mujoco"])
+@pytest.mark.parametrize(("code", "output"), EXAMPLES, ids=["an engine of one body", "pybullet", "mujoco"])
 def test_the_example_prints_its_output(code: str, output: str) -> None:
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
