@@ -10,7 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeAlias, final
 
-from fastrod.errors import FastrodError, InputError
+from fastrod.errors import FastrodError, InputError, shown
 from fastrod.generation.columns import within
 from fastrod.generation.rollouts import Rollouts
 from fastrod.generation.shapes import Shapes
@@ -116,7 +116,7 @@ def _difference(before: Plan, now: Plan) -> str:
     for field in fields(before.work):
         there, here = getattr(before.work, field.name), getattr(now.work, field.name)
         if there != here:
-            return "another robot" if field.name == "robot" else f"its {field.name} is {there!r}, not {here!r}"
+            return "another robot" if field.name == "robot" else f"its {field.name} is {shown(there)}, not {shown(here)}"
     for name in ("seed", "shard_rows", "version", "count"):
         if getattr(before, name) != getattr(now, name):
             return f"its {name} is {getattr(before, name)!r}, not {getattr(now, name)!r}"

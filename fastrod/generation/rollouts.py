@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any, final
 
 import numpy as np
 
-from fastrod.errors import InputError, nearest
+from fastrod.errors import InputError, nearest, shown
 from fastrod.generation.columns import Column, numbered
+from fastrod.robot import Robot
+from fastrod.robotfile import dumps, load_robot, loads
 
 POLICIES = ("shipped", "baseline", "random")
 
@@ -24,19 +28,26 @@ class Rollouts:
     policy: str = "random"
     """Who acts: one of `POLICIES`."""
     options: tuple[tuple[str, Any], ...] = ()
-    """Of the environment, name and value."""
+    """Of the environment, name and value, as JSON has it. A robot, or a robot file's name, becomes the file's text, so that the data set
+    hangs on no file that may change."""
 
     def __post_init__(self) -> None:
         from fastrod_envs.policies import find
+        from fastrod_envs.randomisation import Randomisation
         from fastrod_envs.registration import name_of, task_class
 
         object.__setattr__(self, "env", name_of(self.env))
-        object.__setattr__(self, "options", tuple((str(name), value) for name, value in self.options))
+        pairs = self.options if isinstance(self.options, (tuple, list)) else (self.options,)
+        if not all(isinstance(pair, (tuple, list)) and len(pair) == 2 and isinstance(pair[0], str) for pair in pairs):
+            raise InputError(f"options are {shown(self.options)}; give pairs of name and value, such as (('n_steps', 100),).")
+        object.__setattr__(self, "options", tuple((name, _written(name, value)) for name, value in pairs))
         if self.policy not in POLICIES:
-            raise InputError(f"no policy {self.policy!r} to roll out; {nearest(self.policy, POLICIES)}")
+            raise InputError(f"no policy {self.policy!r} to roll out; {nearest(str(self.policy), POLICIES)}")
         if self.policy == "shipped":
             find(self.env, self.policy)
-        task_class(self.env).options_class.read(dict(self.options))
+        given = self._given()
+        task_class(self.env).options_class.read(given)
+        Randomisation.of(given.get("randomise"))
 
     @property
     def index(self) -> str:
@@ -58,7 +69,7 @@ class Rollouts:
         rng = np.random.default_rng(seed)
         seeds = [int(np.random.SeedSequence((seed[0], first + i)).generate_state(1)[0]) for i in range(count)]
         policy = Policy(find(self.env, self.policy)) if self.policy == "shipped" else None
-        options = {**({} if policy is None else policy.options), "threads": 1, **dict(self.options)}
+        options = {**({} if policy is None else policy.options), "threads": 1, **self._given()}
         env = BatchEnv(self.env, num_envs=count, **options)
         try:
             if policy is not None:
@@ -66,6 +77,16 @@ class Rollouts:
             return self._run(env, policy, first, seeds, rng)
         finally:
             env.close()
+
+    def _given(self) -> dict[str, Any]:
+        """The options, with robots for the texts of robot files."""
+        given = dict(self.options)
+        randomise = given.get("randomise")
+        if isinstance(randomise, str):
+            given["randomise"] = loads(randomise, "the plan's robot")
+        elif isinstance(randomise, Mapping) and isinstance(text := randomise.get("robot"), str):
+            given["randomise"] = {**randomise, "robot": loads(text, "the plan's robot")}
+        return given
 
     def _run(self, env: Any, policy: Any, first: int, seeds: Sequence[int], rng: np.random.Generator) -> list[Column]:
         n, n_steps, n_actions = env.num_envs, env.n_steps, env.task.n_actions
@@ -109,3 +130,29 @@ class Rollouts:
     def failed(self, columns: Sequence[Column]) -> int:
         """Episodes whose robot was lost."""
         return sum(int(np.asarray(column.values).sum()) for column in columns if column.name == "lost")
+
+
+def _written(name: str, value: object) -> Any:
+    """An option as a plan holds it. Raises `InputError` for what JSON has no words for, and what `load_robot` raises."""
+    from fastrod_envs.randomisation import Randomisation
+
+    told = value
+    if name == "randomise":
+        if isinstance(told, Randomisation):
+            told = {field.name: getattr(told, field.name) for field in fields(told)}
+        if isinstance(told, Mapping):
+            told = {**told, **({"robot": _text(told["robot"])} if "robot" in told else {})}
+            told = {key: dict(part) if isinstance(part, Mapping) else part for key, part in told.items()}
+        else:
+            told = _text(told)
+    try:
+        return json.loads(json.dumps(told, allow_nan=False))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"option {name!r} is {shown(value)}; a plan holds finite numbers, words, and lists and mappings of them.") from error
+
+
+def _text(robot: object) -> object:
+    """The text of a robot file; what is neither robot nor file stays."""
+    if isinstance(robot, (str, Path)) and "\n" not in str(robot):
+        robot = load_robot(robot)
+    return dumps(robot) if isinstance(robot, Robot) else robot

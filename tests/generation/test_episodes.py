@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,13 @@ import fastrod
 from fastrod import cli
 from fastrod.effect import get_effect
 from fastrod.errors import InputError, UnknownNameError
-from fastrod.generation import Plan, Rollouts, Sweep, Trajectories
+from fastrod.generation import Plan, Rollouts, Sweep, Trajectories, read_plan
 from fastrod.generation.draws import in_ball, with_effects
 from fastrod.generation.plan import Kind
 from fastrod.generation.tasks import columns_of
 from fastrod.robotfile import dumps
 from fastrod.wiring import wire
+from fastrod_envs.randomisation import Randomisation
 from fastrod_envs.vector import BatchEnv
 
 
@@ -130,6 +132,43 @@ def test_effects_take_turns_and_a_log_that_tells_nothing_is_kept(monkeypatch: py
     assert table["problem"] == ["the log tells nothing."] * 3
     assert work.failed(columns) == 3
     assert len({json.dumps(sealed) for sealed in table["sealed"]}) == 3
+
+
+def test_a_robot_file_named_by_an_option_is_in_the_plan(tmp_path: Path) -> None:
+    mine = tmp_path / "mine.toml"
+    robot = fastrod.load_robot("five_segment_reacher")
+    words = ("generate", "rollouts", "--env", "Reach", "--option", f"randomise={mine}", "--option", "n_steps=3", "--shard-rows", "2")
+    mine.write_text(dumps(replace(robot, effects=({"name": "backlash", "half_width": 1e-4},))))
+    out = tmp_path / "out"
+    assert cli.main([*words, "--count", "2", "--out", str(out), "--workers", "1"]) == 0
+    plan = read_plan(out)
+    assert plan is not None
+    assert str(mine) not in (out / "plan.json").read_text()
+    before = columns_of(plan, 0)
+    assert plan.work._given()["randomise"].effects[0]["half_width"] == 1e-4  # type: ignore[union-attr]
+    mine.write_text(dumps(replace(robot, effects=({"name": "backlash", "half_width": 2e-4},))))
+    after = columns_of(plan, 0)
+    for one, other in zip(before, after, strict=True):
+        np.testing.assert_array_equal(np.asarray(one.values), np.asarray(other.values))
+    assert cli.main([*words, "--count", "4", "--out", str(out), "--workers", "1"]) == 2
+    mine.unlink()
+    assert read_plan(out) == plan
+
+
+def test_all_ways_to_say_a_robot_make_one_plan(tmp_path: Path) -> None:
+    mine = tmp_path / "mine.toml"
+    robot = fastrod.load_robot("five_segment_reacher")
+    mine.write_text(dumps(robot))
+    ways: list[Any] = [str(mine), mine, robot, dumps(robot)]
+    plans = [Plan(work=Rollouts(env="Reach", options=(("randomise", way),)), count=1) for way in ways]
+    assert len({plan.hash for plan in plans}) == 1
+    ways = [{"robot": way, "spread": 0.1, "bending_stiffness": (0.9, 1.1)} for way in ways]
+    plans = [Plan(work=Rollouts(env="Reach", options=(("randomise", way),)), count=1) for way in ways]
+    assert len({plan.hash for plan in plans}) == 1
+    whole = Randomisation(robot=robot, spread=0.1, parameters={"bending_stiffness": (0.9, 1.1)})
+    assert Rollouts(env="Reach", options=(("randomise", whole),))._given()["randomise"]["robot"] == robot
+    with pytest.raises(InputError, match=r"^option 'n_steps' is \{1\}; a plan holds finite numbers, words, and lists and mappings of them\.$"):
+        Rollouts(env="Reach", options=(("n_steps", {1}),))
 
 
 @pytest.mark.parametrize(
