@@ -70,8 +70,8 @@ def write(plan: Plan, folder: Path, index: int, columns: Sequence[Column]) -> Sh
 
 
 def found(plan: Plan, folder: Path) -> dict[int, Shard]:
-    """The whole shards of this plan in the folder. A torn one, and one that is too short for a count that has grown, is left out and
-    will be written again. Raises `InputError` for a shard of another plan, and for one beyond the count."""
+    """The whole shards of this plan in the folder. One that is torn, whose index cannot be read, or that is too short for a count that
+    has grown, is left out and will be written again. Raises `InputError` for a shard of another plan, and for one beyond the count."""
     shards: dict[int, Shard] = {}
     for path in sorted(folder.iterdir()):
         match = _NAME.fullmatch(path.name)
@@ -85,7 +85,7 @@ def found(plan: Plan, folder: Path) -> dict[int, Shard]:
             continue
         if told.get(_HASH, b"").decode() != plan.hash or path != path_of(plan, folder, index) or index >= plan.n_shards:
             raise InputError(f"{str(path)!r} is a shard of another plan; give --out a folder of its own.")
-        if int(told[_INDEX]) == index and int(told[_UNITS]) == len(plan.rows(index)):
+        if int(told[_INDEX]) == index and int(told[_UNITS]) == len(plan.rows(index)) and _index(plan, path) is not None:
             shards[index] = Shard(index, int(told[_UNITS]), int(told[b"rows"]), int(told[_FAILED]))
     return shards
 
@@ -102,6 +102,20 @@ def _told(path: Path) -> dict[bytes, bytes] | None:
         return None
 
 
+def _index(plan: Plan, path: Path) -> Any:
+    """The table of a file's index columns, or None where a page of them is broken."""
+    import pyarrow as arrow
+    import pyarrow.parquet as parquet
+
+    names = [name] if (name := plan.work.index) == "row" else [name, "step"]
+    try:
+        with parquet.ParquetFile(path) as file:
+            table = file.read(columns=names)
+    except (arrow.ArrowException, OSError):
+        return None
+    return table if table.column_names == names else None
+
+
 def sweep_parts(folder: Path) -> int:
     """Remove what killed writers left half done; how many that were."""
     parts = [path for path in folder.iterdir() if path.suffix == ".part"]
@@ -112,15 +126,13 @@ def sweep_parts(folder: Path) -> int:
 
 def counted(plan: Plan, folder: Path) -> int:
     """Rows of all shards, after reading their index column: every index occurs, each in its own shard, once (an episode: with steps from
-    0 on, each once). Raises `InputError` where one is lost or doubled."""
-    import pyarrow.parquet as parquet
-
+    0 on, each once). Raises `InputError` where one is lost or doubled, or a file cannot be read."""
     total, name = 0, plan.work.index
     for shard in range(plan.n_shards):
         path = path_of(plan, folder, shard)
-        names = [name] if name == "row" else [name, "step"]
-        with parquet.ParquetFile(path) as file:
-            table = file.read(columns=names)
+        table = _index(plan, path)
+        if table is None:
+            raise InputError(f"{str(path)!r} cannot be read; remove it, and generate again.")
         unit: Any = table.column(name).to_numpy()
         wanted = np.arange(plan.rows(shard).start, plan.rows(shard).stop)
         if name == "row":

@@ -111,6 +111,18 @@ def test_torn_and_half_written_files_are_made_again(whole: Path, tmp_path: Path)
     assert bits(tmp_path) == bits(whole)
 
 
+def test_a_shard_with_a_broken_page_is_made_again(whole: Path, tmp_path: Path) -> None:
+    shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
+    broken = tmp_path / "shards" / "shapes-000004.parquet"
+    good = broken.read_bytes()
+    broken.write_bytes(good[:4] + b"\xff" * 60 + good[64:])  # the first pages; the footer stays
+    assert parquet.read_metadata(broken).num_rows == 50
+    with pytest.raises(InputError, match=r"shapes-000004.parquet' cannot be read; remove it, and generate again\.$"):
+        shards.counted(small(), tmp_path / "shards")
+    assert generate(small(), tmp_path, workers=1).made == 1
+    assert bits(tmp_path) == bits(whole)
+
+
 def test_a_data_set_grows_with_its_count(whole: Path, tmp_path: Path) -> None:
     assert generate(small(count=575), tmp_path, workers=1).made == 12
     summary = generate(small(count=600), tmp_path, workers=1)
