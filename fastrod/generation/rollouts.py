@@ -67,7 +67,7 @@ class Rollouts:
         from fastrod_envs.vector import BatchEnv
 
         rng = np.random.default_rng(seed)
-        seeds = [int(np.random.SeedSequence((seed[0], first + i)).generate_state(1)[0]) for i in range(count)]
+        seeds = [int(np.random.SeedSequence((seed[0], first + i)).generate_state(1, np.uint64)[0] >> np.uint64(1)) for i in range(count)]
         policy = Policy(find(self.env, self.policy)) if self.policy == "shipped" else None
         options = {**({} if policy is None else policy.options), "threads": 1, **self._given()}
         env = BatchEnv(self.env, num_envs=count, **options)

@@ -54,6 +54,8 @@ def test_an_episode_is_played_again_from_its_seed(policy: str) -> None:
         assert np.isnan(table["reward"][rows[-1]])
         env.close()
     assert len(set(table["seed"])) == 3
+    assert table["seed"].min() >= 0
+    assert table["seed"].max() > 2**40  # 32 bits would hold doubles from some ten thousand episodes on
 
 
 def test_a_robots_own_motion_keeps_its_limits() -> None:
