@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from fastrod.generation.columns import Column
 from fastrod.generation.plan import Plan
@@ -10,9 +13,17 @@ from fastrod.generation.shards import Shard, write
 
 
 def columns_of(plan: Plan, index: int) -> list[Column]:
-    """The columns of a shard: the same whoever makes it, and however often."""
+    """The columns of a shard: the same whoever makes it, and however often.
+
+    It is drawn at full length and cut, so that a row stays what it is when the data set grows.
+    """
     rows = plan.rows(index)
-    return plan.work.make(rows.start, len(rows), (plan.seed, index))
+    columns = plan.work.make(rows.start, plan.shard_rows, (plan.seed, index))
+    if len(rows) == plan.shard_rows:
+        return columns
+    units = next(np.asarray(column.values) for column in columns if column.name == plan.work.index)
+    stays = np.flatnonzero(units < rows.stop)
+    return [replace(one, values=[one.values[i] for i in stays] if isinstance(one.values, list) else one.values[stays]) for one in columns]
 
 
 def make_shard(plan: Plan, folder: str, index: int) -> Shard:

@@ -25,7 +25,7 @@ from fastrod_envs.vector import BatchEnv
 
 
 def made(work: Kind, count: int) -> dict[str, np.ndarray]:
-    return {column.name: np.asarray(column.values) for column in columns_of(Plan(work=work, count=count), 0)}
+    return {column.name: np.asarray(column.values) for column in columns_of(Plan(work=work, count=count, shard_rows=count), 0)}
 
 
 def group(table: dict[str, np.ndarray], prefix: str) -> np.ndarray:
@@ -56,6 +56,27 @@ def test_an_episode_is_played_again_from_its_seed(policy: str) -> None:
     assert len(set(table["seed"])) == 3
     assert table["seed"].min() >= 0
     assert table["seed"].max() > 2**40  # 32 bits would hold doubles from some ten thousand episodes on
+
+
+@pytest.mark.parametrize(
+    "work",
+    [
+        Rollouts(env="Reach", options=(("n_steps", 3),)),
+        Trajectories(robot=dumps(fastrod.load_robot("prototype")), effects=("backlash",), steps=3, force=0.01),
+        Sweep(robot=dumps(fastrod.load_robot("prototype")), rate=1.0),
+    ],
+    ids=lambda work: type(work).__name__,
+)
+def test_a_row_does_not_hang_on_the_count(work: Kind, monkeypatch: pytest.MonkeyPatch) -> None:
+    def nothing(*_: Any, **__: Any) -> None:
+        raise InputError("the log tells nothing.")
+
+    monkeypatch.setattr("fastrod.identification.attribution.identify", nothing)
+    few, many = (columns_of(Plan(work=work, count=count, shard_rows=3), 0) for count in (1, 3))
+    assert set(np.asarray(few[0].values)) == {0}
+    for one, other in zip(few, many, strict=True):
+        assert len(one.values) < len(other.values)
+        np.testing.assert_array_equal(np.asarray(one.values), np.asarray(other.values)[: len(one.values)])
 
 
 def test_a_robots_own_motion_keeps_its_limits() -> None:

@@ -125,6 +125,9 @@ def test_a_shard_with_a_broken_page_is_made_again(whole: Path, tmp_path: Path) -
 
 def test_a_data_set_grows_with_its_count(whole: Path, tmp_path: Path) -> None:
     assert generate(small(count=575), tmp_path, workers=1).made == 12
+    for name in ("row", "chain", "dl_1", "tip_x"):  # rows that are there stay what they are
+        values = [parquet.read_table(folder / "shards", columns=[name]).column(name).to_pylist() for folder in (tmp_path, whole)]
+        assert values[0] == values[1][:575]
     summary = generate(small(count=600), tmp_path, workers=1)
     assert summary.made == 1  # the last one was short
     assert bits(tmp_path) == bits(whole)
