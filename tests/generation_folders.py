@@ -19,8 +19,8 @@ def small(count: int = 600, shard_rows: int = 50, seed: int = 3, **words: Any) -
 
 
 def bits(folder: Path) -> dict[str, str]:
-    """Digest of each file in the folder of shards, hidden ones too."""
-    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted((folder / "shards").iterdir())}
+    """Digest of each file in the folder of shards, hidden ones too; none where there is no such folder."""
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted((folder / "shards").glob("*"))}
 
 
 def rows_of(folder: Path, column: str = "row") -> list[int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
 import sys
@@ -11,13 +12,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import final
+from typing import NamedTuple, final
 
 from fastrod.errors import InputError
 from fastrod.generation.columns import within
 from fastrod.generation.here import run_here
 from fastrod.generation.on_ray import run_on_ray
-from fastrod.generation.plan import SHARDS, Plan, settle_plan
+from fastrod.generation.plan import PLAN, SHARDS, Plan, settle_plan
 from fastrod.generation.shards import counted, found, sweep_parts
 from fastrod.generation.tasks import missing
 
@@ -81,7 +82,7 @@ def generate(
         if find_spec(module) is None:
             raise InputError(f"fastrod generate needs {module}: pip install fastrod[{extra}].")
     folder = Path(folder).absolute()
-    with _own(folder):
+    with _own(folder) as keep:
         settle_plan(plan, folder)
         files = folder / SHARDS
         files.mkdir(exist_ok=True)
@@ -95,6 +96,7 @@ def generate(
             run = run_here(plan, files, todo, workers or cores()) if ray is None else run_on_ray(plan, files, todo, ray, workers)
             try:
                 for shard in run:
+                    keep()
                     whole[shard.number] = shard
                     made += shard.units
                     if progress is not None:
@@ -111,11 +113,15 @@ def generate(
 
 
 @contextmanager
-def _own(folder: Path) -> Iterator[None]:
-    """The folder, made where it is not there, for this process alone. Raises `InputError`."""
+def _own(folder: Path) -> Iterator[Callable[[], None]]:
+    """The folder, made where it is not there, for this process alone. What comes is called once there is something to keep: an error
+    before leaves the folder as it was. Raises `InputError`."""
+    fresh = [path for path in (folder, *folder.parents) if not path.exists()]
+    name = folder / _LOCK
+    locked_before = name.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        lock = (folder / _LOCK).open("w")
+        lock = name.open("w")
     except OSError as error:
         why = "it is a file" if folder.is_file() else error.strerror or str(error)
         raise InputError(f"folder {str(folder)!r} cannot be written: {why}.") from error
@@ -126,4 +132,42 @@ def _own(folder: Path) -> Iterator[None]:
             raise InputError(f"another fastrod generate writes into {str(folder)!r}; wait for it, or give --out another folder.") from error
         except OSError:
             pass  # a file system without locks
-        yield
+        before, kept = _State.of(folder), list[bool]()
+        try:
+            yield lambda: kept.append(True)
+        except BaseException:
+            if not kept and before.put_back(folder):
+                if not locked_before:
+                    name.unlink(missing_ok=True)
+                with contextlib.suppress(OSError):  # what is not empty stays
+                    for path in fresh:
+                        path.rmdir()
+            raise
+
+
+class _State(NamedTuple):
+    """What a folder held before."""
+
+    plan: bytes | None
+    files: frozenset[str] | None
+    """In its folder of shards, or None where it has none."""
+
+    @classmethod
+    def of(cls, folder: Path) -> _State:
+        plan, files = folder / PLAN, folder / SHARDS
+        return cls(
+            plan.read_bytes() if plan.is_file() else None, frozenset(path.name for path in files.iterdir()) if files.is_dir() else None
+        )
+
+    def put_back(self, folder: Path) -> bool:
+        """Whether nothing was made; the plan is then as before."""
+        now = _State.of(folder)
+        if (now.files or frozenset()) - (self.files or frozenset()):
+            return False
+        if self.plan is None:
+            (folder / PLAN).unlink(missing_ok=True)
+        elif self.plan != now.plan:
+            (folder / PLAN).write_bytes(self.plan)
+        if self.files is None and now.files is not None:
+            (folder / SHARDS).rmdir()
+        return True

@@ -45,6 +45,8 @@ class Sweep:
             raise InputError("a sweep has no effects; name one, such as backlash.")
         object.__setattr__(self, "effects", named(self.effects))
         robot = _robot(self.robot)
+        if not robot.n_tendons:
+            raise InputError(f"robot {robot.name!r} has no tendons; there is nothing to excite.")
         if robot.effects:
             raise InputError(f"robot {robot.name!r} has effects already; a sweep seals its own into a plain robot.")
 

@@ -214,6 +214,7 @@ def test_all_ways_to_say_a_robot_make_one_plan(tmp_path: Path) -> None:
         (("rollouts", "--env", "Reach", "--policy", "shiped"), "no policy 'shiped' to roll out; did you mean 'shipped'?\n"),
         (("rollouts", "--env", "Reach", "--option", "n_stepz=3"), "no option 'n_stepz'; did you mean 'n_steps'?\n"),
         (("rollouts", "--robot", "prototype", "--effect", "backlsh"), "no effect 'backlsh'; did you mean 'backlash'?\n"),
+        (("sweep", "--robot", "ethz_beam"), "robot 'ethz_beam' has no tendons; there is nothing to excite.\n"),
         (("sweep", "--robot", "prototype", "--noise", "2"), "noise is 2.0 m; it must be a number at least 0 and at most 1.\n"),
     ],
 )

@@ -271,7 +271,27 @@ def test_an_error_of_a_task_is_the_commands(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr("fastrod.generation.tasks.write", wrong)
     with pytest.raises(InputError, match=r"no such shape\."):
         generate(small(), tmp_path, workers=1)
-    assert bits(tmp_path) == {}
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_run_that_makes_nothing_leaves_the_folder_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def wrong(*_: Any) -> Any:
+        raise InputError("no such shape.")
+
+    def state(folder: Path) -> dict[str, bytes]:
+        return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b"" for path in folder.rglob("*")}
+
+    grown = tmp_path / "grown"
+    generate(small(count=100), grown, workers=1)
+    before = state(grown)
+    monkeypatch.setattr("fastrod.generation.tasks.write", wrong)
+    for folder in (tmp_path / "new" / "deep", grown):
+        with pytest.raises(InputError, match=r"no such shape\."):
+            generate(small(count=200), folder, workers=1)
+    assert not (tmp_path / "new").exists()
+    assert state(grown) == before
+    monkeypatch.undo()
+    assert generate(small(count=100), grown, workers=1).made == 0
 
 
 @pytest.mark.parametrize(

@@ -102,9 +102,10 @@ def test_a_cluster_that_does_not_answer_is_one_sentence(tmp_path: Path, monkeypa
     assert str(error.value) == (
         "no Ray cluster answers at 'auto': Please specify the one to connect to. Start one with `ray start --head`, or give --ray local."
     )
-    assert bits(tmp_path) == {}
+    assert not list(tmp_path.iterdir())
     with socket.socket() as taken:  # bound, and nobody listens
         taken.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{taken.getsockname()[1]}"
         with pytest.raises(HostError, match=rf"no Ray cluster answers at '{address}': .*refused\. Start one"):
-            generate(small(), tmp_path, ray=address)
+            generate(small(), tmp_path / "new", ray=address)
+    assert not list(tmp_path.iterdir())
