@@ -26,7 +26,7 @@ _AHEAD = 2  # tasks a worker has before it, so that it never waits for the drive
 def run_here(plan: Plan, folder: Path, todo: Sequence[int], workers: int) -> Generator[Shard, None, None]:
     """Make the shards `todo` with so many processes, in any order. Killed workers are replaced, and their shards made again.
 
-    An interrupt lets the shards under way be finished. Raises what a task raises, and `HostError` where every worker dies.
+    An interrupt lets the shards under way of several processes be finished; the one of a single process, this one, is dropped. Raises what a task raises, and `HostError` where every worker dies.
     """
     if workers == 1:
         for index in todo:
@@ -40,7 +40,7 @@ def run_here(plan: Plan, folder: Path, todo: Sequence[int], workers: int) -> Gen
                 done.add(shard.number)
                 yield shard
         except BrokenProcessPool as error:
-            deaths = 1 if done else deaths + 1
+            deaths = 0 if done else deaths + 1
             if deaths >= MOST_DEATHS:
                 raise HostError(f"the workers died {deaths} times without a shard; is there memory enough for {workers}?") from error
         left = [index for index in left if index not in done]

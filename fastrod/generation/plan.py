@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -72,7 +73,7 @@ class Plan:
 
 
 def read_plan(folder: str | Path) -> Plan | None:
-    """The plan of a folder, or None where it has none. Raises `InputError` for a file that is no plan."""
+    """The plan of a folder, or None where it has none, or an empty file that a lost machine left. Raises `InputError` for a file that is no plan."""
     path = Path(folder) / PLAN
     try:
         text = path.read_text(encoding="utf-8")
@@ -80,6 +81,8 @@ def read_plan(folder: str | Path) -> Plan | None:
         return None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{str(path)!r} cannot be read: {getattr(error, 'strerror', None) or error}.") from error
+    if not text.strip("\0 \n"):
+        return None
     try:
         told = json.loads(text)
         kind: Any = KINDS[told.pop("kind")]
@@ -94,17 +97,24 @@ def settle_plan(plan: Plan, folder: Path) -> None:
 
     Raises `InputError` where the folder holds shards of another plan, or of none.
     """
+    for left in folder.glob(f"{PLAN}.*.part"):  # of a killed run; the folder is locked
+        left.unlink(missing_ok=True)
     before, any_there = read_plan(folder), any((*folder.glob("*.parquet"), *folder.glob(f"{SHARDS}/*.parquet")))
     if before is None:
-        if any_there:
+        if any_there and not (folder / PLAN).exists():  # of an empty one, the shards themselves tell whose they are
             raise InputError(f"folder {str(folder)!r} holds Parquet files and no {PLAN}; give --out a folder of its own.")
     elif any_there and (before.hash != plan.hash or before.count > plan.count):
         raise InputError(f"folder {str(folder)!r} holds another plan: {_difference(before, plan)}; give --out another folder.")
     if before != plan:
         part = folder / f"{PLAN}.{os.getpid()}.part"
         try:
-            part.write_text(json.dumps(plan.told(), indent=1) + "\n", encoding="utf-8")
+            with part.open("w", encoding="utf-8") as file:
+                file.write(json.dumps(plan.told(), indent=1) + "\n")
+                file.flush()
+                os.fsync(file.fileno())
             part.replace(folder / PLAN)
+        except OSError as error:
+            raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(folder / PLAN)) from error
         finally:
             part.unlink(missing_ok=True)
 

@@ -222,7 +222,7 @@ def test_a_full_disk_leaves_nothing_half(
 
     def full(descriptor: int) -> None:
         calls.append(descriptor)
-        if len(calls) > 2:
+        if len(calls) > 3:  # the plan and two shards
             raise OSError(errno.ENOSPC, "No space left on device")
         flushed(descriptor)
 
@@ -272,6 +272,43 @@ def test_an_error_of_a_task_is_the_commands(tmp_path: Path, monkeypatch: pytest.
     with pytest.raises(InputError, match=r"no such shape\."):
         generate(small(), tmp_path, workers=1)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_disk_that_is_full_for_the_plan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    assert cli.main([*WORDS, "--out", str(tmp_path / "out"), "--workers", "1"]) == 1
+    assert capsys.readouterr().err == f"{tmp_path / 'out' / PLAN}: No space left on device.\n"
+    assert not list(tmp_path.iterdir())
+
+
+def test_leftovers_of_a_plan_are_no_hindrance(whole: Path, tmp_path: Path) -> None:
+    shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
+    (tmp_path / f"{PLAN}.12.part").write_text("{")
+    (tmp_path / PLAN).write_bytes(b"")
+    assert read_plan(tmp_path) is None
+    with pytest.raises(InputError, match="is a shard of another plan"):
+        generate(small(seed=9), tmp_path, workers=1)
+    assert generate(small(), tmp_path, workers=1).made == 0
+    assert read_plan(tmp_path) == small()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".lock", PLAN, "shards"]
+
+
+def test_deaths_are_counted_from_the_last_shard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pools: list[int] = []
+
+    def dying(_: Plan, __: Path, todo: list[int], ___: int) -> Any:
+        pools.append(len(todo))
+        if len(pools) <= 2:
+            yield shards.Shard(todo[0], 50, 50, 0)
+        raise BrokenProcessPool
+
+    monkeypatch.setattr(here, "_pool", dying)
+    with pytest.raises(HostError, match="died 3 times without a shard"):
+        list(here.run_here(small(), tmp_path, range(12), 2))
+    assert pools == [12, 11, 10, 10, 10]
 
 
 def test_a_run_that_makes_nothing_leaves_the_folder_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
