@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
 
 from fastrod.chain import named_effects
 from fastrod.effect import canonical_name, effect_names, get_effect
+from fastrod.errors import InputError, shown
 from fastrod.robot import Robot
+from fastrod.robotfile import loads
 from fastrod.types import Floats
 from fastrod.wiring import wire
 
@@ -18,8 +21,23 @@ _SPREAD = (0.5, 1.5)
 """Of the typical size."""
 
 
+def robot_of(text: object) -> Robot:
+    """The robot of a robot file's text. Raises `InputError` for what is no text, and what `loads` raises."""
+    if not isinstance(text, str):
+        raise InputError(f"robot is {shown(text, 60)}; give the text of a robot file, such as fastrod.robotfile.dumps(robot).")
+    return _loaded(text)
+
+
+@cache
+def _loaded(text: str) -> Robot:
+    return loads(text, "the plan's robot")
+
+
 def named(effects: Sequence[str]) -> tuple[str, ...]:
-    """Their canonical names, in the order in which they act. Raises `UnknownNameError` with the nearest."""
+    """Their canonical names, in the order in which they act. Raises `InputError` for what are no names, `UnknownNameError` with the
+    nearest."""
+    if not isinstance(effects, (tuple, list)) or not all(isinstance(effect, str) for effect in effects):
+        raise InputError(f"effects are {shown(effects)}; give a tuple of names, such as ('backlash',).")
     given = {canonical_name(effect) for effect in effects}
     return tuple(name for name in effect_names() if name in given)
 

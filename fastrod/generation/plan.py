@@ -39,6 +39,8 @@ class Plan:
     """Of fastrod; empty stands for this one."""
 
     def __post_init__(self) -> None:
+        if not isinstance(self.work, tuple(KINDS.values())):
+            raise InputError(f"work is {shown(self.work)}; give {', '.join(kind.__name__ for kind in KINDS.values())}.")
         within("count", self.count, 1, 10**12, whole=True)
         within("seed", self.seed, 0, 2**63, whole=True)
         if self.shard_rows == 0:

@@ -12,8 +12,9 @@ import numpy as np
 
 from fastrod.errors import InputError, nearest, shown
 from fastrod.generation.columns import Column, numbered
+from fastrod.generation.draws import robot_of
 from fastrod.robot import Robot
-from fastrod.robotfile import dumps, load_robot, loads
+from fastrod.robotfile import dumps, load_robot
 
 POLICIES = ("shipped", "baseline", "random")
 
@@ -36,6 +37,8 @@ class Rollouts:
         from fastrod_envs.randomisation import Randomisation
         from fastrod_envs.registration import name_of, task_class
 
+        if not isinstance(self.env, str):
+            raise InputError(f"env is {shown(self.env)}; give a task's name, such as 'Reach'.")
         object.__setattr__(self, "env", name_of(self.env))
         pairs = self.options if isinstance(self.options, (tuple, list)) else (self.options,)
         if not all(isinstance(pair, (tuple, list)) and len(pair) == 2 and isinstance(pair[0], str) for pair in pairs):
@@ -83,9 +86,9 @@ class Rollouts:
         given = dict(self.options)
         randomise = given.get("randomise")
         if isinstance(randomise, str):
-            given["randomise"] = loads(randomise, "the plan's robot")
+            given["randomise"] = robot_of(randomise)
         elif isinstance(randomise, Mapping) and isinstance(text := randomise.get("robot"), str):
-            given["randomise"] = {**randomise, "robot": loads(text, "the plan's robot")}
+            given["randomise"] = {**randomise, "robot": robot_of(text)}
         return given
 
     def _run(self, env: Any, policy: Any, first: int, seeds: Sequence[int], rng: np.random.Generator) -> list[Column]:
@@ -148,7 +151,7 @@ def _written(name: str, value: object) -> Any:
     try:
         return json.loads(json.dumps(told, allow_nan=False))
     except (TypeError, ValueError) as error:
-        raise InputError(f"option {name!r} is {shown(value)}; a plan holds finite numbers, words, and lists and mappings of them.") from error
+        raise InputError(f"option {name!r} is {shown(value)}; a plan holds finite numbers, words, lists and mappings.") from error
 
 
 def _text(robot: object) -> object:

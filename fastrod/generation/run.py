@@ -14,7 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple, final
 
-from fastrod.errors import InputError
+from fastrod.errors import InputError, shown
 from fastrod.generation.columns import within
 from fastrod.generation.here import run_here
 from fastrod.generation.on_ray import run_on_ray
@@ -76,6 +76,12 @@ def generate(
     workers or cluster are lost; `OSError` where the disk is full.
     """
     start = time.perf_counter()
+    if not isinstance(plan, Plan):
+        raise InputError(f"plan is {shown(plan)}; give a fastrod.generation.Plan.")
+    if not isinstance(folder, (str, os.PathLike)):
+        raise InputError(f"folder is {shown(folder)}; give a path.")
+    if ray is not None and not isinstance(ray, str):
+        raise InputError(f"ray is {shown(ray)}; give the address of a cluster, 'auto' for the one here, or 'local' to start one.")
     if workers is not None:
         within("workers", workers, 1, 4096, whole=True)
     for module, extra in (("pyarrow", "parquet"), *((("ray", "ray"),) if ray is not None else ())):
@@ -83,8 +89,10 @@ def generate(
             raise InputError(f"fastrod generate needs {module}: pip install fastrod[{extra}].")
     folder = Path(folder).absolute()
     with _own(folder) as keep:
-        settle_plan(plan, folder)
         files = folder / SHARDS
+        if files.exists() and not files.is_dir():
+            raise InputError(f"{str(files)!r} is a file; it must be a folder: remove it, or give --out another folder.")
+        settle_plan(plan, folder)
         files.mkdir(exist_ok=True)
         sweep_parts(files)
         whole = found(plan, files)

@@ -5,17 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from typing import NamedTuple, final
 
 import numpy as np
 
 from fastrod.errors import InputError
 from fastrod.generation.columns import Column, numbered, several, within
+from fastrod.generation.draws import robot_of
 from fastrod.generation.settling import ChainSolver, Settled
 from fastrod.inputs import Inputs
 from fastrod.robot import Robot
-from fastrod.robotfile import loads
 from fastrod.rotation import matrix_from_quaternion, quaternion_from_matrix
 from fastrod.segments import SegmentActions
 from fastrod.types import Floats
@@ -57,7 +56,7 @@ class Shapes:
         within("tolerance", self.tolerance, 1e-12, 1e-2, "m")
         within("points_per_segment", self.points_per_segment, 2, 200, whole=True)
         within("chain", self.chain, 1, LONGEST_CHAIN, whole=True)
-        robot = _robot(self.robot)
+        robot = robot_of(self.robot)
         if robot.effects:
             raise InputError(
                 f"robot {robot.name!r} has effects; a shape is that of the plain rod: take them out, or generate rollouts, which have them."
@@ -86,7 +85,7 @@ class Shapes:
     def make(self, first: int, count: int, seed: Sequence[int]) -> list[Column]:
         """`count` shapes, those of a chain scattered over the shard."""
         rng = np.random.default_rng(seed)
-        robot = _robot(self.robot)
+        robot = robot_of(self.robot)
         lanes = -(-count // self.chain)
         draw = Draw(self, robot, lanes, rng)
         solver = ChainSolver(robot, lanes, self.points_per_segment)
@@ -187,8 +186,3 @@ def _circle(rng: np.random.Generator, shape: tuple[int, ...]) -> tuple[Floats, F
 
 def _on(circle: tuple[Floats, Floats], step: int) -> Floats:
     return np.asarray(math.cos(step * STRIDE) * circle[0] + math.sin(step * STRIDE) * circle[1])
-
-
-@cache
-def _robot(text: str) -> Robot:
-    return loads(text, "the plan's robot")

@@ -5,16 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
 from typing import Any, final
 
 import numpy as np
 
 from fastrod.errors import FastrodError, InputError
 from fastrod.generation.columns import Column, within
-from fastrod.generation.draws import named, with_effects
+from fastrod.generation.draws import named, robot_of, with_effects
 from fastrod.robot import Robot
-from fastrod.robotfile import loads
 
 _POINTS = 8  # steps of a segment of the sealed robot; identification has six
 _TOLERANCE = 1e-8  # m
@@ -44,7 +42,7 @@ class Sweep:
         if not self.effects:
             raise InputError("a sweep has no effects; name one, such as backlash.")
         object.__setattr__(self, "effects", named(self.effects))
-        robot = _robot(self.robot)
+        robot = robot_of(self.robot)
         if not robot.n_tendons:
             raise InputError(f"robot {robot.name!r} has no tendons; there is nothing to excite.")
         if robot.effects:
@@ -66,7 +64,7 @@ class Sweep:
         from fastrod.identification.excite import excitation
 
         rng = np.random.default_rng(seed)
-        plain = _robot(self.robot)
+        plain = robot_of(self.robot)
         log = excitation(plain, rate=self.rate, bend=self.bend).log
         effects = [self.effects[row % len(self.effects)] for row in range(first, first + count)]
         sealed = [with_effects(plain, [effect], rng) for effect in effects]
@@ -129,8 +127,3 @@ def _simulated(robots: list[Robot], log: Any, dt: float) -> np.ndarray:
         state = simulator.settle(**{name: values[i] for name, values in given.items()}, tolerance=_TOLERANCE)
         tips[:, i] = np.where(state.ok[:, None], simulator.measure().tip_position, np.nan)
     return tips
-
-
-@cache
-def _robot(text: str) -> Robot:
-    return loads(text, "the plan's robot")

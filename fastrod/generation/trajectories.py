@@ -5,15 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from typing import final
 
 import numpy as np
 
 from fastrod.generation.columns import Column, numbered, several, within
-from fastrod.generation.draws import in_ball, named, with_effects
-from fastrod.robot import Robot
-from fastrod.robotfile import loads
+from fastrod.generation.draws import in_ball, named, robot_of, with_effects
 from fastrod.rotation import matrix_from_quaternion, quaternion_from_matrix
 from fastrod.segments import SegmentActions
 from fastrod.simulator import Simulator
@@ -53,7 +50,7 @@ class Trajectories:
         within("speed", self.speed, 0.0, 1e3, "rad/s", open_low=True)
         within("force", self.force, 0.0, math.inf, "N")
         object.__setattr__(self, "effects", named(self.effects))
-        SegmentActions(_robot(self.robot))
+        SegmentActions(robot_of(self.robot))
 
     @property
     def index(self) -> str:
@@ -68,7 +65,7 @@ class Trajectories:
     def make(self, first: int, count: int, seed: Sequence[int]) -> list[Column]:
         """`steps` rows for each of `count` episodes, one after the other."""
         rng = np.random.default_rng(seed)
-        plain = _robot(self.robot)
+        plain = robot_of(self.robot)
         robots, drawn = zip(*(with_effects(plain, self.effects, rng) for _ in range(count)), strict=True)
         turn = matrix_from_quaternion(np.array(plain.base_quaternion))
         force = self.force * in_ball(rng, count, 3)
@@ -123,8 +120,3 @@ class Trajectories:
         """Episodes in which the observer diverged."""
         values = {column.name: np.asarray(column.values) for column in columns}
         return len(np.unique(values["episode"][~values["ok"]]))
-
-
-@cache
-def _robot(text: str) -> Robot:
-    return loads(text, "the plan's robot")

@@ -190,7 +190,7 @@ def test_all_ways_to_say_a_robot_make_one_plan(tmp_path: Path) -> None:
     assert len({plan.hash for plan in plans}) == 1
     whole = Randomisation(robot=robot, spread=0.1, parameters={"bending_stiffness": (0.9, 1.1)})
     assert Rollouts(env="Reach", options=(("randomise", whole),))._given()["randomise"]["robot"] == robot
-    with pytest.raises(InputError, match=r"^option 'n_steps' is \{1\}; a plan holds finite numbers, words, and lists and mappings of them\.$"):
+    with pytest.raises(InputError, match=r"^option 'n_steps' is \{1\}; a plan holds finite numbers, words, lists and mappings\.$"):
         Rollouts(env="Reach", options=(("n_steps", {1}),))
 
 
@@ -222,6 +222,23 @@ def test_wrong_words_are_one_sentence(words: tuple[str, ...], sentence: str, tmp
     assert cli.main(["generate", *words, "--count", "1", "--out", str(tmp_path / "out")]) == 2
     assert capsys.readouterr() == ("", sentence)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ({"options": {"n_steps": 5}}, "options are {'n_steps': 5}; give pairs of name and value, such as (('n_steps', 100),)."),
+        ({"options": ("a",)}, "options are ('a',); give pairs of name and value, such as (('n_steps', 100),)."),
+        ({"options": 3}, "options are 3; give pairs of name and value, such as (('n_steps', 100),)."),
+        ({"policy": None}, "no policy None to roll out; known: baseline, random, shipped."),
+        ({"env": None}, "env is None; give a task's name, such as 'Reach'."),
+        ({"options": (("randomise", 5),)}, "randomise is 5; give a Randomisation, a robot file, or a mapping of names to ranges."),
+    ],
+)
+def test_wrong_rollouts_are_one_sentence(words: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError) as error:
+        Rollouts(**{"env": "Reach", **words})
+    assert str(error.value) == sentence
 
 
 def test_what_a_sweep_cannot_seal() -> None:

@@ -22,9 +22,9 @@ import pyarrow.parquet as parquet
 import pytest
 from generation_folders import bits, rows_of, small
 
-from fastrod import cli
+from fastrod import cli, load_robot
 from fastrod.errors import HostError, InputError
-from fastrod.generation import Plan, generate, here, read_plan, shards
+from fastrod.generation import Plan, Shapes, Sweep, Trajectories, generate, here, read_plan, shards
 from fastrod.generation.plan import PLAN
 
 WORDS = ("generate", "shapes", "--robot", "prototype", "--count", "600", "--shard-rows", "50", "--seed", "3")
@@ -346,6 +346,34 @@ def test_wrong_words_are_one_sentence(words: tuple[str, ...], sentence: str, tmp
     assert cli.main([*WORDS, "--out", str(tmp_path / "out"), *words]) == 2
     assert capsys.readouterr() == ("", sentence)
     assert not list(tmp_path.glob("out/shards/*"))
+
+
+@pytest.mark.parametrize(
+    ("call", "sentence"),
+    [
+        (lambda _: Plan(work=3, count=1), "work is 3; give Shapes, Rollouts, Trajectories, Sweep."),  # type: ignore[arg-type]
+        (lambda _: Shapes(robot=5), "robot is 5; give the text of a robot file, such as fastrod.robotfile.dumps(robot)."),  # type: ignore[arg-type]
+        (lambda _: Shapes(robot=load_robot("prototype")), "robot is Robot("),  # type: ignore[arg-type]
+        (lambda _: Sweep(robot=small().work.robot, effects="backlash"), "effects are 'backlash'; give a tuple of names, such as ("),  # type: ignore[union-attr, arg-type]
+        (lambda _: Trajectories(robot=small().work.robot, effects=(3,)), "effects are (3,); give a tuple of names, such as ("),  # type: ignore[union-attr, arg-type]
+        (lambda path: generate(3, path), "plan is 3; give a fastrod.generation.Plan."),  # type: ignore[arg-type]
+        (lambda _: generate(small(), None), "folder is None; give a path."),  # type: ignore[arg-type]
+        (lambda path: generate(small(), path, ray=True), "ray is True; give the address of a cluster, 'auto' for the one here, or"),  # type: ignore[arg-type]
+    ],
+)
+def test_wrong_things_are_one_sentence(call: Callable[[Path], Any], sentence: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError) as error:
+        call(tmp_path / "out")
+    assert str(error.value).startswith(sentence)
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_shards_that_are_a_file_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "shards").write_text("")
+    with pytest.raises(InputError, match=r"shards' is a file; it must be a folder: remove it, or give --out another folder\.$"):
+        generate(small(), tmp_path, workers=1)
+    assert [path.name for path in tmp_path.iterdir()] == ["shards"]
 
 
 def test_what_is_not_installed_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
