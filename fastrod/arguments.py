@@ -21,6 +21,8 @@ ACTIONS = {
 """What `fastrod drive` can do, and what that is."""
 BOARD_ACTIONS = ("calibrate", "register")
 """Those that need a camera and a board, and no drives."""
+DATA_SETS = ("shapes", "rollouts", "sweep")
+"""What `fastrod generate` makes."""
 _MOVING = tuple(name for name in ACTIONS if name not in BOARD_ACTIONS)
 _OF: dict[str, tuple[str, ...]] = {
     "eds": _MOVING, "no_home": _MOVING, "path": ("track",),
@@ -233,7 +235,7 @@ def _add_generate(generate: argparse.ArgumentParser) -> None:
     rollouts = kinds.add_parser("rollouts", help="episodes of an environment, or a robot's own motion with effects drawn anew")
     sweep = kinds.add_parser("sweep", help="robots with a sealed effect, their logs simulated and identified")
     for kind, unit in ((shapes, "rows"), (rollouts, "episodes"), (sweep, "rows")):
-        kind.add_argument("--count", type=int, required=True, metavar="N", help=f"{unit} in all")
+        kind.add_argument("--count", type=_whole, required=True, metavar="N", help=f"{unit} in all, such as 10000 or 1e6; a larger one later lets the data set grow")
         kind.add_argument(
             "--out", type=Path, required=True, metavar="DIR", help="folder of plan.json and shards; with what is there it goes on"
         )
@@ -270,6 +272,21 @@ def _add_generate(generate: argparse.ArgumentParser) -> None:
     sweep.add_argument("--bend", type=float, metavar="RAD", help="largest bend of a segment (default: 0.9)")
     rollouts.add_argument("--effect", nargs="+", action="extend", default=[], metavar="NAME", help="robot: drawn for each episode")
     sweep.add_argument("--effect", nargs="+", action="extend", default=[], metavar="NAME", help="sealed in turn (default: backlash)")
+
+
+def _whole(word: str) -> int:
+    """1000000, or 1e6."""
+    try:
+        return int(word)
+    except ValueError:
+        pass
+    try:
+        value = float(word)
+        if value == int(value):
+            return int(value)
+    except (ValueError, OverflowError):
+        pass
+    raise argparse.ArgumentTypeError(f"{word!r} is not a whole number, such as 1000000 or 1e6")
 
 
 def _grid(word: str) -> tuple[int, int]:

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fastrod.arguments import BOARD_ACTIONS, UsageError, build, check_drive
+from fastrod.arguments import BOARD_ACTIONS, DATA_SETS, UsageError, build, check_drive
 from fastrod.errors import FastrodError, InputError, UnknownNameError, nearest
 
 if TYPE_CHECKING:
@@ -29,15 +29,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     if words and not words[0].startswith("-") and words[0] not in commands:
         return _refuse(f"no command {words[0]!r}; {nearest(words[0], commands)}")
+    if words[:1] == ["generate"] and len(words) > 1 and not words[1].startswith("-") and words[1] not in DATA_SETS:
+        return _refuse(f"no data set {words[1]!r} to generate; {nearest(words[1], DATA_SETS)}")
     try:
         arguments, rest = parser.parse_known_args(words)
         if hasattr(arguments, "logs"):  # more of them after an option
             arguments.logs += [Path(word) for word in rest if not word.startswith("-")]
             rest = [word for word in rest if word.startswith("-")]
         if rest:
-            return _refuse(
-                f"{parser.prog} {arguments.command} does not know {rest[0]!r}; `{parser.prog} {arguments.command} --help` tells."
-            )
+            what = " ".join([parser.prog, arguments.command, *([arguments.kind] if arguments.command == "generate" else [])])
+            return _refuse(f"{what} does not know {rest[0]!r}; `{what} --help` tells.")
         return _RUN[arguments.command](arguments)
     except UsageError as error:
         return _refuse(str(error))
@@ -280,7 +281,7 @@ def _need(module: str, command: str, extra: str) -> None:
     from importlib.util import find_spec
 
     if find_spec(module) is None:
-        raise InputError(f"fastrod {command} needs {module.replace('_', '-')}: pip install fastrod[{extra}].")
+        raise InputError(f"fastrod {command} needs {module.replace('_', '-')}: pip install 'fastrod[{extra}]'.")
 
 
 def _bench(arguments: argparse.Namespace) -> int:

@@ -59,7 +59,7 @@ def run(out: Path | None = None, *, seed: int | None = None, view: bool = True) 
     _batch(robot, console)
     if missing:
         _identified(robot, console, out)
-        said = f"the whole loop, on an emulated prototype, needs {', '.join(missing)}: pip install fastrod[device,viewer]"
+        said = f"the whole loop, on an emulated prototype, needs {', '.join(missing)}: pip install 'fastrod[device,viewer]'"
         console.print(said, markup=False, soft_wrap=True, highlight=False)
         return
     with TemporaryDirectory() as folder:

@@ -126,7 +126,7 @@ def _policy(given: str, path: str, begins: float, robot: Robot) -> Law:
         from fastrod_envs.pilot import TrackPilot
         from fastrod_envs.policies import Policy, find
     except ImportError as error:
-        raise InputError("--policy needs gymnasium: pip install fastrod[envs].") from error
+        raise InputError("--policy needs gymnasium: pip install 'fastrod[envs]'.") from error
     pilot = TrackPilot(Policy(find("Track", given)), path, robot)
     return lambda tip, t: pilot.command(tip, t - begins)
 

@@ -387,7 +387,7 @@ def test_demo_without_the_device_wing_takes_the_shipped_log_and_writes_nothing(
     assert cli.main(["demo"]) == 0
     printed = capsys.readouterr().out
     assert "a result" in printed
-    assert "pip install fastrod[device,viewer]" in printed
+    assert "pip install 'fastrod[device,viewer]'" in printed
     assert "wrote" not in printed
     assert seen[0] > 2000
     assert not list(tmp_path.iterdir())

@@ -86,7 +86,7 @@ def generate(
         within("workers", workers, 1, 4096, whole=True)
     for module, extra in (("pyarrow", "parquet"), *((("ray", "ray"),) if ray is not None else ())):
         if find_spec(module) is None:
-            raise InputError(f"fastrod generate needs {module}: pip install fastrod[{extra}].")
+            raise InputError(f"fastrod generate needs {module}: pip install 'fastrod[{extra}]'.")
     folder = Path(folder).absolute()
     with _own(folder) as keep:
         files = folder / SHARDS

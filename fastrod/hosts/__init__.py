@@ -1,7 +1,7 @@
 """Rigid hosts: other physics engines that carry a rod, feel its weight, and whose bodies it touches.
 
-`Rod` knows no engine; README.md beside this file says how any engine carries one. PyBullet (`pip install fastrod[hosts]`) and MuJoCo
-(`pip install fastrod[mujoco]`) are imported on first use.
+`Rod` knows no engine; README.md beside this file says how any engine carries one. PyBullet (`pip install 'fastrod[hosts]'`) and MuJoCo
+(`pip install 'fastrod[mujoco]'`) are imported on first use.
 """
 
 from typing import TYPE_CHECKING, Any

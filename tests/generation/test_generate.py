@@ -334,6 +334,16 @@ def test_a_run_that_makes_nothing_leaves_the_folder_as_it_was(tmp_path: Path, mo
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
+        (
+            ("--count", "1e6.5"),
+            "argument --count: '1e6.5' is not a whole number, such as 1000000 or 1e6; "
+            "`fastrod generate shapes --help` says how it is used.\n",
+        ),
+        (
+            ("--count", "0.5"),
+            "argument --count: '0.5' is not a whole number, such as 1000000 or 1e6; `fastrod generate shapes --help` says how it is used.\n",
+        ),
+        (("--foo",), "fastrod generate shapes does not know '--foo'; `fastrod generate shapes --help` tells.\n"),
         (("--count", "0"), "count is 0; it must be a whole number at least 1 and at most 1e+12.\n"),
         (("--seed", "-1"), "seed is -1; it must be a whole number at least 0 and at most 9.22337e+18.\n"),
         (("--shard-rows", "0"), "--shard-rows is 0; it must be at least 1.\n"),
@@ -346,6 +356,18 @@ def test_wrong_words_are_one_sentence(words: tuple[str, ...], sentence: str, tmp
     assert cli.main([*WORDS, "--out", str(tmp_path / "out"), *words]) == 2
     assert capsys.readouterr() == ("", sentence)
     assert not list(tmp_path.glob("out/shards/*"))
+
+
+def test_a_kind_that_is_none_is_answered_with_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["generate", "shape", *WORDS[2:]]) == 2
+    assert capsys.readouterr() == ("", "no data set 'shape' to generate; did you mean 'shapes'?\n")
+    assert cli.main(["generate", "xyz"]) == 2
+    assert capsys.readouterr() == ("", "no data set 'xyz' to generate; known: rollouts, shapes, sweep.\n")
+
+
+def test_a_count_may_have_an_exponent(tmp_path: Path) -> None:
+    assert cli.main([*WORDS, "--out", str(tmp_path / "out"), "--workers", "1", "--count", "1.5e2"]) == 0
+    assert rows_of(tmp_path / "out") == list(range(150))
 
 
 @pytest.mark.parametrize(
@@ -381,8 +403,8 @@ def test_what_is_not_installed_is_named(tmp_path: Path, monkeypatch: pytest.Monk
 
     find = util.find_spec
     for missing, words, sentence in (
-        ("pyarrow", (), "fastrod generate needs pyarrow: pip install fastrod[parquet].\n"),
-        ("ray", ("--ray", "local"), "fastrod generate --ray needs ray: pip install fastrod[ray].\n"),
+        ("pyarrow", (), "fastrod generate needs pyarrow: pip install 'fastrod[parquet]'.\n"),
+        ("ray", ("--ray", "local"), "fastrod generate --ray needs ray: pip install 'fastrod[ray]'.\n"),
     ):
         monkeypatch.setattr(util, "find_spec", lambda name, missing=missing: None if name == missing else find(name))
         assert cli.main([*WORDS, "--out", str(tmp_path / "out"), *words]) == 2
