@@ -26,7 +26,8 @@ _AHEAD = 2  # tasks a worker has before it, so that it never waits for the drive
 def run_here(plan: Plan, folder: Path, todo: Sequence[int], workers: int) -> Generator[Shard, None, None]:
     """Make the shards `todo` with so many processes, in any order. Killed workers are replaced, and their shards made again.
 
-    An interrupt lets the shards under way of several processes be finished; the one of a single process, this one, is dropped. Raises what a task raises, and `HostError` where every worker dies.
+    An interrupt lets the shards under way of several processes be finished; the one of a single process, this one, is dropped.
+    Raises what a task raises, and `HostError` where every worker dies.
     """
     if workers == 1:
         for index in todo:

@@ -75,7 +75,10 @@ class Plan:
 
 
 def read_plan(folder: str | Path) -> Plan | None:
-    """The plan of a folder, or None where it has none, or an empty file that a lost machine left. Raises `InputError` for a file that is no plan."""
+    """The plan of a folder, or None where it has none, or an empty file that a lost machine left.
+
+    Raises `InputError` for a file that is no plan.
+    """
     path = Path(folder) / PLAN
     try:
         text = path.read_text(encoding="utf-8")

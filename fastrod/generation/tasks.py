@@ -23,7 +23,7 @@ def columns_of(plan: Plan, index: int) -> list[Column]:
         return columns
     units = next(np.asarray(column.values) for column in columns if column.name == plan.work.index)
     stays = np.flatnonzero(units < rows.stop)
-    return [replace(one, values=[one.values[i] for i in stays] if isinstance(one.values, list) else one.values[stays]) for one in columns]
+    return [replace(one, values=np.asarray(one.values)[stays]) for one in columns]
 
 
 def make_shard(plan: Plan, folder: str, index: int) -> Shard:

@@ -341,7 +341,8 @@ def test_a_run_that_makes_nothing_leaves_the_folder_as_it_was(tmp_path: Path, mo
         ),
         (
             ("--count", "0.5"),
-            "argument --count: '0.5' is not a whole number, such as 1000000 or 1e6; `fastrod generate shapes --help` says how it is used.\n",
+            "argument --count: '0.5' is not a whole number, such as 1000000 or 1e6; "
+            "`fastrod generate shapes --help` says how it is used.\n",
         ),
         (("--foo",), "fastrod generate shapes does not know '--foo'; `fastrod generate shapes --help` tells.\n"),
         (("--count", "0"), "count is 0; it must be a whole number at least 1 and at most 1e+12.\n"),
