@@ -235,7 +235,7 @@ def _add_generate(generate: argparse.ArgumentParser) -> None:
     rollouts = kinds.add_parser("rollouts", help="episodes of an environment, or a robot's own motion with effects drawn anew")
     sweep = kinds.add_parser("sweep", help="robots with a sealed effect, their logs simulated and identified")
     for kind, unit in ((shapes, "rows"), (rollouts, "episodes"), (sweep, "rows")):
-        kind.add_argument("--count", type=_whole, required=True, metavar="N", help=f"{unit} in all, such as 1e6; a larger one later lets it grow")
+        kind.add_argument("--count", type=_whole, required=True, metavar="N", help=f"{unit} in all, such as 1e6; it may grow")
         kind.add_argument(
             "--out", type=Path, required=True, metavar="DIR", help="folder of plan.json and shards; with what is there it goes on"
         )
