@@ -155,7 +155,7 @@ def build() -> tuple[argparse.ArgumentParser, list[str]]:
         )
     )  # fmt: skip
 
-    bench = commands.add_parser("bench", help="the figures of perf/ as ratios")
+    bench = commands.add_parser("bench", help="how fast, how accurate, beside what")
     bench.add_argument("name", nargs="?", metavar="NAME", help="one benchmark (default: all)")
     bench.add_argument("--json", action="store_true", help="print JSON to stdout and nothing else")
     parser.commands = {action.dest: action.help or "" for action in commands._get_subactions()}

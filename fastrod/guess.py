@@ -1,6 +1,6 @@
 """Where a cold start begins: arcs from the tendon lengths, and on them the moments and tensions that statics asks for.
 
-From here Newton's method takes four to six passes; from zero it diverges (model.md).
+From here Newton's method takes four to six passes; from zero it diverges.
 """
 
 from __future__ import annotations

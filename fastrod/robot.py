@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fastrod.errors import RobotError, nearest
 
 Mode: TypeAlias = Literal["tendon_length", "tendon_tension", "passive", "paper"]
-"""Boundary mode of a segment: what is prescribed at its end (model.md, four boundary modes)."""
+"""Boundary mode of a segment: what is prescribed at its end (Rucker and Webster 2011; `paper`: SoftManiSim, eqs. 2b and 3b)."""
 
 MODES: tuple[str, ...] = get_args(Mode)
 _LONGEST = 10.0  # m; a longer segment was given in mm

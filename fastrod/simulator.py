@@ -38,7 +38,7 @@ _LOST = 0.1  # of the robot's length: a residual beyond it is no shape of this r
 
 
 class Simulator:
-    """Many tendon-driven continuum robots at once (contracts.md).
+    """Many tendon-driven continuum robots at once.
 
     >>> import fastrod
     >>> robot = fastrod.load_robot("prototype")
@@ -373,7 +373,7 @@ class Simulator:
         held: a point force at its arclength. With effects, the inputs are those commanded, and the effects stay where they
         are in their loops; what only follows in time (latency, dynamics) answers nothing at once: its columns are zero.
         A slack wire's column is zero, a robot's that is not ok nan. Columns of
-        lengths come from the sensitivities of the pass (model.md); those of tensions and extensions from central
+        lengths come from the sensitivities of the pass; those of tensions and extensions from central
         differences of the pass, closed by the same sensitivities. Contact forces are held as they are.
 
         With `turning`, three columns more: by the rotation vector of the base about its origin, world [rad]. World loads keep their

@@ -17,7 +17,7 @@ from fastrod.types import Flags, Floats, Ints, Memory, Params, Ports
 
 @dataclass(frozen=True, kw_only=True)
 class Observer:
-    """Gains of the boundary observer (the paper's Q and V; model.md, "The observer"), on unknowns scaled to about one.
+    """Gains of the boundary observer (the paper's Q and V, eqs. 5 and 12), on unknowns scaled to about one.
 
     A simulator without an observer of its own takes the gains so high that a step is a Gauss-Newton step; the variance
     that is then left over is far below the process noise, and is not carried. More `measurement_noise` smooths the boundary

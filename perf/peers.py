@@ -29,7 +29,7 @@ N_STATE = 15 + N_TENDONS  # position, rotation row by row, curvature, path lengt
 
 
 def rod_slope(s: float, y: Any, load: Any, rod: Any, tendons: Any, out: Any) -> Any:
-    """d state / ds of one cross-section (model.md, "Equations"); with tensions of zero it is the paper's reduced model.
+    """d state / ds of one cross-section (Rucker and Webster 2011); with tensions of zero it is the paper's reduced model.
 
     `load` tip force [N] and uniform line force [N/m], world (6); `rod` length [m], EI_x, EI_y, GJ [N m^2]; `tendons`
     (4, 3) position d_x, d_y [m] and tension [N].

@@ -448,7 +448,7 @@ def test_wires_and_bends_belong_together() -> None:
 
 
 class Weight:
-    """Self-weight of the backbone, as style.md has it.
+    """Self-weight of the backbone, written by a user.
 
     Equation: f(s) -= w e_z, world frame
     Source: Rucker and Webster 2011, distributed load of the rod equations

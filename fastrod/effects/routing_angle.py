@@ -16,7 +16,7 @@ class RoutingAngle(Static):
     """Wires sit at other angles around the backbone than drawn.
 
     Equation: d_i -> rotation by beta_i about the tangent
-    Source: definition; model.md, d_i = offset (cos b_i, sin b_i)
+    Source: definition; d_i = offset (cos b_i, sin b_i)
     Residual signature: across the bend, in proportion to it
     """
 

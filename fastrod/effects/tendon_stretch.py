@@ -14,7 +14,7 @@ class TendonStretch(Static):
     """Wires stretch under tension.
 
     Equation: l_i = L_i + (c_i + c) T_i
-    Source: model.md; Oliver-Butler, Till and Rucker 2019
+    Source: Oliver-Butler, Till and Rucker 2019
     Residual signature: loss of gain, in proportion to the moment; the tip turns under load
     """
 

@@ -1,4 +1,4 @@
-"""The observer: gain and boundary update, LANES robots side by side (model.md, "The observer"; the paper's eqs. 5 and 12 corrected).
+"""The observer: gain and boundary update, LANES robots side by side (the paper's eqs. 5 and 12 corrected).
 
     P- = P + Q dt;  G = P- Gamma^T (Gamma P- Gamma^T + V^-1/dt)^-1;  x -= G e;  P = (I - G Gamma) P-
 

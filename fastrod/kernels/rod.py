@@ -1,6 +1,6 @@
 """The rod's equations, one cross-section at a time.
 
-Key (model.md; Rucker and Webster 2011, IEEE T-RO 27(6), with the paper's letters):
+Key (Rucker and Webster 2011, IEEE T-RO 27(6), with the paper's letters):
   u  curvature, material frame [1/m]          m  total internal moment of rod and tendons, material frame [N m]
   K  diag(EI_x, EI_y, GJ) [N m^2]             u* precurvature [1/m]
   d  tendon position (d_x, d_y) [m]           T  tendon tension [N], positive pulls

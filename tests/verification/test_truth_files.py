@@ -1,4 +1,4 @@
-"""The shared reference answers (model.md, "Truth files"), computed to 1e-12 by others."""
+"""The shared reference answers computed to 1e-12 by others."""
 
 from __future__ import annotations
 
