@@ -69,9 +69,10 @@ def fill(case: Case, n: int, rows: list[int] | None = None) -> Memory:
     return passes.memory
 
 
-def assert_as_the_twin(case: Case, n: int) -> None:
+def off_the_twin(case: Case, n: int) -> float:
+    """Largest difference of a number in its natural size, or in its own where that is larger."""
     layout, params, _ = case
-    memory = fill(case, n)
+    memory, largest = fill(case, n), 0.0
     n_base = 2 * len(layout.first_tendon) if layout.paper else 3
     n_free = len(layout.free_tendon)
     for i in range(n):
@@ -80,8 +81,9 @@ def assert_as_the_twin(case: Case, n: int) -> None:
         moment, tension = params.moment_scale[s], params.tension_scale[s]
         units = np.repeat([moment, tension, moment / params.reach[s]], [n_base, n_free, len(x) - n_base - n_free])
         assert memory.x.shape[1] == len(x)
-        assert_allclose(memory.x[i] / units, x / units, rtol=CLOSE, atol=CLOSE)
-        assert_allclose(memory.curvature_guess[i] * params.reach[s], u * params.reach[s], rtol=CLOSE, atol=CLOSE)
+        for got, wanted in ((memory.x[i] / units, x / units), (memory.curvature_guess[i] * params.reach[s], u * params.reach[s])):
+            largest = max(largest, float((np.abs(got - wanted) / (1.0 + np.abs(wanted))).max(initial=0.0)))
+    return largest
 
 
 def in_mode(robot: Robot, mode: str) -> Robot:
@@ -115,7 +117,7 @@ def varied(robot: Robot, rng: np.random.Generator) -> Robot:
 def test_shipped_robots_in_every_mode(name: str, mode: str) -> None:
     rng = np.random.default_rng(3)
     robots = [varied(in_mode(load_robot(name), mode), rng) for _ in range(3)]
-    assert_as_the_twin(case(robots, 3, seed=4), 3)
+    assert off_the_twin(case(robots, 3, seed=4), 3) < CLOSE
 
 
 def chain(n_segments: int, rng: np.random.Generator) -> Robot:
@@ -141,14 +143,14 @@ def test_chains_by_chance(seed: int) -> None:
     offset = params.offset * rng.uniform(0.9, 1.1, (2, *params.offset.shape[1:]))
     many = np.linspace(1.0, 1.5, 2 * N_STEPS + 1)[:, None]
     ports = ports._replace(stiffness=ports.stiffness * many, precurvature=ports.precurvature * many)
-    assert_as_the_twin((layout, params._replace(offset=offset), ports), 2)
+    assert off_the_twin((layout, params._replace(offset=offset), ports), 2) < CLOSE
 
 
 @pytest.mark.parametrize("kind", ["tip_force", "tip_moment", "line_force", "point_force", "follower_tip_force", "base_pose", "extension"])
 def test_each_kind_of_load_alone(kind: str) -> None:
     kinds = ("tip_force", "tip_moment", "line_force", "point_force", "follower_tip_force", "base_pose", "extension")
     robot = varied(load_robot("tdcr_b"), np.random.default_rng(1))
-    assert_as_the_twin(case([robot], 2, seed=2, skip=tuple(k for k in kinds if k != kind)), 2)
+    assert off_the_twin(case([robot], 2, seed=2, skip=tuple(k for k in kinds if k != kind)), 2) < CLOSE
 
 
 def in_plane(angle: float, n: int) -> np.ndarray:
@@ -171,7 +173,7 @@ FLAT: dict[str, Callable[[], np.ndarray]] = {
 def test_wires_that_leave_a_direction_free(name: str) -> None:
     wires = 0.0075 * FLAT[name]()
     layout, params, ports = case([varied(rod(n_tendons=len(wires)), np.random.default_rng(5))], 2, seed=6)
-    assert_as_the_twin((layout, params._replace(offset=np.array(wires[None, None])), ports), 2)
+    assert off_the_twin((layout, params._replace(offset=np.array(wires[None, None])), ports), 2) < CLOSE
 
 
 @pytest.mark.parametrize("off", [0.0, 1e-12, 1e-9, 1e-6, 1e-3])
