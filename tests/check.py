@@ -19,8 +19,11 @@ CHECKS: list[tuple[str, list[str], dict[str, str]]] = [
     ("format", ["ruff", "format", "--check", "."], {}),
     ("types", ["mypy"], {}),
     ("imports", ["lint-imports"], {}),
+    # Once, and side by side: otherwise every process of the tests compiles the same kernels.
+    ("kernels", ["python", "tests/kernels.py"], {}),
     # Threads that spin while they wait take the core from those they wait for: a training takes eight times as long on two busy cores.
-    ("tests", ["pytest", "-n", "2", "--dist", "loadfile"], {"OMP_WAIT_POLICY": "passive"}),
+    ("tests", ["pytest", "-n", "2", "--dist", "loadfile", "-m", "not real_time"], {"OMP_WAIT_POLICY": "passive"}),
+    ("real time", ["pytest", "-m", "real_time"], {"OMP_WAIT_POLICY": "passive"}),
     # The kernels as a GPU would run them, one thread a robot, on numba's simulator of one.
     ("gpu", ["pytest", "tests/gpu"], {"NUMBA_ENABLE_CUDASIM": "1"}),
     # The kernels once more as plain Python: what the compiler might hide, and the lines that it hides from coverage.

@@ -226,6 +226,7 @@ def test_close_leaves_the_drives_off_and_says_no_emergency():
         assert bench.bus.emergency_log == ()
 
 
+@pytest.mark.real_time
 def test_the_same_story_in_real_time():
     with Bench(WallClock(), rate=100.0) as bench:
         bench.bus.connect()
@@ -273,6 +274,7 @@ def test_a_quick_stop_brakes_along_its_ramp():
         assert np.all((end.position - at > 950) & (end.position - at < 1000 + 1.5 * speed / bench.rate))
 
 
+@pytest.mark.real_time
 def test_quick_stop_from_another_thread_interrupts_a_move():
     with Bench(WallClock()) as bench:
         bench.bus.connect()

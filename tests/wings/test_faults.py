@@ -304,6 +304,7 @@ with Prototype(hardware, sys.argv[1], Still()) as prototype:
 """
 
 
+@pytest.mark.real_time
 def test_a_killed_process_leaves_its_drives_stopped_and_its_rows_on_disk(tmp_path: Path) -> None:
     bus, log = "udp_multicast:239.74.163.7:43183", tmp_path / "log.csv"
     emulator = Emulator(load_hardware(), bus, clock=WallClock(), seal=seal(1, "none"), seed=1, taut=True)

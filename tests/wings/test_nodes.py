@@ -318,6 +318,7 @@ def test_a_reboot_forgets_its_mapping_and_may_keep_its_counter(wire):
     assert wire.nodes.true_pulled[0] > 50 * SPEC.metres_per_count
 
 
+@pytest.mark.real_time
 def test_in_real_time_heartbeats_come_without_sync():
     with Wire(WallClock()) as wire:
         assert wire.hear(0x705) == b"\x00"

@@ -134,6 +134,7 @@ def test_speeds_are_positive() -> None:
         Speeds(bend=0.0)
 
 
+@pytest.mark.real_time
 def test_a_session_moves_in_real_time_and_stops_at_once() -> None:
     world, pilot = piloted("prototype")
     drawn: list[float] = []

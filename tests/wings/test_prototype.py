@@ -371,6 +371,7 @@ def _until(true: Any, seconds: float = 20.0) -> bool:
     return bool(true())
 
 
+@pytest.mark.real_time
 def test_a_story_in_real_time(tmp_path: Any) -> None:
     before = threading.active_count()
     with bench(WallClock(), hardware=PATIENT) as (prototype, emulator):
@@ -398,6 +399,7 @@ def test_a_story_in_real_time(tmp_path: Any) -> None:
     assert _until(lambda: threading.active_count() <= before)
 
 
+@pytest.mark.real_time
 def test_follow_in_real_time_tells_what_stopped_it() -> None:
     with bench(WallClock(), hardware=PATIENT) as (prototype, emulator):
         with pytest.raises(RefusedError, match="limit is 8 mm"):
@@ -414,6 +416,7 @@ def test_follow_in_real_time_tells_what_stopped_it() -> None:
         assert _until(lambda: not emulator.drives.moving.any())
 
 
+@pytest.mark.real_time
 def test_a_plan_that_hangs_is_found_by_the_watchdog_and_the_drives_stop() -> None:
     over, quick = threading.Event(), replace(PATIENT, limits=replace(PATIENT.limits, cycle=0.4))
 

@@ -242,7 +242,7 @@ def view(
     """
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with App(host=host, port=port, server=server) as app:
+    with contextlib.suppress(KeyboardInterrupt), App(host=host, port=port, server=server) as app:
         shown = found(what, robot, n_robots)
         if open_browser:
             import webbrowser

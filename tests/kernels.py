@@ -1,0 +1,50 @@
+"""Compile the large kernels into the cache, two processes at a time: a free rod on one thread and on two, then a rod in contact."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+
+MANY = 128
+"""Robots from which on a pass is spread over threads."""
+
+
+def free(n: int) -> None:
+    import fastrod
+
+    robot = fastrod.load_robot("prototype")
+    sim = fastrod.Simulator(robot, n, points_per_segment=2)
+    sim.settle(robot.rest_tendon_length)
+    sim.step(robot.rest_tendon_length, tip_force=(0.0, 0.01, 0.0))
+
+
+def touching(n: int) -> None:
+    import fastrod
+    from fastrod.contact import ContactScene, cylinder
+
+    robot = fastrod.load_robot("prototype")
+    bar = cylinder(0.01, 0.2, name="bar", position=(0.018, 0, 0.05), quaternion=(0.5**0.5, 0.5**0.5, 0, 0))
+    sim = fastrod.Simulator(robot, n, points_per_segment=5, contact=ContactScene(obstacles=[bar], rod_radius=0.003))
+    for pull in np.linspace(0.0, 0.006, 20):
+        state = sim.step(robot.rest_tendon_length + np.array([-pull, 0.0, pull, 0.0]))
+    assert state.contacts is not None
+    assert state.contacts.in_contact().all()
+
+
+def main() -> int:
+    """The exit code."""
+    if len(sys.argv) > 1:
+        {"free": free, "touching": touching}[sys.argv[1]](int(sys.argv[2]))
+        return 0
+    for what in ("free", "touching"):
+        both = [subprocess.Popen([sys.executable, __file__, what, str(n)]) for n in (1, MANY)]
+        codes = [process.wait() for process in both]
+        if any(codes):
+            return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
