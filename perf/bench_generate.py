@@ -102,10 +102,11 @@ def one_worker(folder: Path, rows: int, repeats: int) -> tuple[float, Section]:
         size = sum(path.stat().st_size for path in folder.iterdir())
     few = min(rows, 2048)
     lanes = max(rows // 64, 8)
+    cold = Plan(work=loaded(chain=1), count=few, shard_rows=few)
     table: list[Row] = [
         {"what": "shapes along chains of 64, one thread", "rate": rows / min(made), "us": 1e6 * min(made) / rows},
         {"what": "the same, written to Parquet", "rate": rows / (min(made) + min(written)), "us": 1e6 * (min(made) + min(written)) / rows},
-        {"what": "each row settled cold (chain 1), one thread", **rate(few, lambda: columns_of(Plan(work=loaded(chain=1), count=few, shard_rows=few), 0))},
+        {"what": "each row settled cold (chain 1), one thread", **rate(few, lambda: columns_of(cold, 0))},
         {"what": "one batch, solver alone, one thread", **rate(32 * lanes, lambda: solved(lanes, 1))},
     ]
     if cores() > 1:
