@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 import tomllib
@@ -116,7 +117,8 @@ def save_robot(robot: Robot, path: str | Path) -> None:
     except ValueError as error:  # a name that is no text, or a path that no file can have
         raise RobotError(f"{str(path)!r} cannot be written: {error}.") from error
     except OSError as error:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
         raise RobotError(f"{str(path)!r} cannot be written: {error.strerror}.") from error
 
 
