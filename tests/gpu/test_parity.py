@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gpu.pairs import assert_same, assert_same_memory, chain, inputs, pair
+from gpu.pairs import PAPER_STEP, assert_same, assert_same_memory, chain, inputs, pair
 from numpy.testing import assert_allclose, assert_array_equal
 from rods import bend, rod
 
@@ -23,7 +23,7 @@ def test_a_rollout_is_the_same_in_every_mode(robot: Robot) -> None:
     for k in range(1, 4):
         a, b = here.step(**inputs(robot, k)), there.step(**inputs(robot, k))
         assert a.ok.all()
-        assert_same(a, b)
+        assert_same(a, b, only=PAPER_STEP if robot.name == "paper" else None)
     assert_same_memory(here, there)
     assert_allclose(there.jacobian(turning=True), here.jacobian(turning=True), rtol=1e-6, atol=1e-7)
     assert_allclose(there.compliance(), here.compliance(), rtol=1e-9, atol=1e-9)
