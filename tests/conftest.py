@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 
 import numba
 import pytest
 from rods import Table
 from truthfiles import rows
+
+os.environ.setdefault("FASTROD_QUIET", "1")  # commands that tests run compile at any time, and their stderr is read
 
 
 @pytest.fixture(scope="session")

@@ -26,11 +26,25 @@ def random_lengths(n: int, seed: int, reach: float = 1.0) -> np.ndarray:
     return np.stack([bend(robot, *a) for a in angle])
 
 
-def test_threads_change_no_bit() -> None:
-    lengths = random_lengths(200, 3)
-    one, two = (Simulator(load_robot("prototype"), n_robots=200, points_per_segment=6, threads=t) for t in (1, 2))
-    assert_array_equal(one.settle(lengths).position, two.settle(lengths).position)
-    assert_array_equal(one.step(1.001 * lengths).curvature, two.step(1.001 * lengths).curvature)
+THREADS = """
+import sys
+import numpy as np
+from fastrod import Simulator, load_robot
+lengths = np.load(sys.argv[1])
+for name, threads in (("one", 1), ("two", 2)):
+    sim = Simulator(load_robot("prototype"), n_robots=200, points_per_segment=6, threads=threads)
+    np.savez(sys.argv[2] + name, settled=sim.settle(lengths).position, stepped=sim.step(1.001 * lengths).curvature)
+"""
+
+
+def test_threads_change_no_bit(tmp_path: Path) -> None:
+    """In a process of its own, which has two threads wherever this one has one."""
+    np.save(tmp_path / "lengths.npy", random_lengths(200, 3))
+    words = [sys.executable, "-c", THREADS, str(tmp_path / "lengths.npy"), f"{tmp_path}/"]
+    subprocess.run(words, check=True, env={**os.environ, "NUMBA_NUM_THREADS": "2"})
+    one, two = (np.load(tmp_path / f"{name}.npz") for name in ("one", "two"))
+    for key in ("settled", "stepped"):
+        assert_array_equal(one[key], two[key])
 
 
 def test_hot_loops_are_simd_code() -> None:

@@ -15,6 +15,8 @@ from typing import Any, TypeVar, cast
 
 import numba
 
+from .notice import announce
+
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 _config: Any = numba.config
 _njit: Any = numba.njit  # its type does not know _nrt
@@ -50,6 +52,7 @@ def _cache_dir() -> str | None:
 
 CACHE_DIR = _cache_dir()
 """Where compiled kernels are kept, or None."""
+announce(cached=CACHE_DIR is not None)
 
 
 def kernel(function: _Function) -> _Function:

@@ -9,7 +9,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
@@ -78,23 +77,39 @@ def test_a_killed_worker_loses_and_doubles_nothing(whole: Path, tmp_path: Path) 
     assert bits(tmp_path) == bits(whole)
 
 
+KILLED = """
+import os, signal, sys
+import psutil
+from generation_folders import small
+from fastrod.generation import generate
+
+def die(_, done, __):
+    if done >= 100:
+        print(*(child.pid for child in psutil.Process().children(recursive=True)), flush=True)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+generate(small(), sys.argv[1], workers=2, progress=die)
+"""
+"""A command that is killed after its second shard, however fast its workers are: it lets them run no more than a few shards ahead."""
+
+
 def test_a_killed_command_is_finished_by_the_same_command(whole: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "fastrod.cli", *WORDS, "--out", str(out), "--workers", "2"]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
-        while not list(out.glob("shards/*.parquet")):
-            assert process.poll() is None
-            time.sleep(0.01)
-        workers = psutil.Process(process.pid).children(recursive=True)
-        process.kill()
-    left = psutil.wait_procs(workers, timeout=10.0)[1]
-    assert not left, "workers outlive the command"
+    paths = os.pathsep.join(filter(None, [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH")]))
+    words = [sys.executable, "-c", KILLED, str(out)]
+    first = subprocess.run(words, check=False, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": paths})
+    assert first.returncode == -signal.SIGKILL
+    workers = [int(pid) for pid in first.stdout.split()]
+    assert len(workers) >= 2
+    alive = [psutil.Process(pid) for pid in workers if psutil.pid_exists(pid)]
+    assert not psutil.wait_procs(alive, timeout=60.0)[1], "workers outlive the command"
     before = set(bits(out))
-    assert len([name for name in before if name.endswith(".parquet")]) < 12
+    assert 2 <= len([name for name in before if name.endswith(".parquet")]) < 12
+    command = [sys.executable, "-m", "fastrod.cli", *WORDS, "--out", str(out), "--workers", "2"]
     second = subprocess.run([*command, "--json"], check=True, capture_output=True, text=True)
-    told = json.loads(second.stdout)
-    assert 0 < told["made"] < 12
-    assert told["rows"] == 600
+    report = json.loads(second.stdout)
+    assert 0 < report["made"] < 12
+    assert report["rows"] == 600
     assert rows_of(out) == list(range(600))
     assert bits(out) == bits(whole)
 

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
 import stat
 from collections.abc import Iterator
 from pathlib import Path
 
-import psutil
 import pytest
 from generation_folders import bits, rows_of, small
 
 from fastrod.errors import HostError, InputError
-from fastrod.generation import generate
+from fastrod.generation import Plan, generate
+from fastrod.generation.tasks import make_shard
 
 ray = pytest.importorskip("ray", reason="needs fastrod[ray]")
 
@@ -34,21 +35,26 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_killed_ray_worker_loses_and_doubles_nothing(whole: Path, tmp_path: Path) -> None:
-    killed: list[int] = []
+@pytest.mark.parametrize("written", [False, True])
+def test_a_killed_ray_worker_loses_and_doubles_nothing(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: bool) -> None:
+    """A worker that kills itself in its sixth shard, before or after writing it: none has to be caught at work."""
+    from fastrod.generation import on_ray
 
-    def kill_one(_: str, done: int, __: int) -> None:
-        if done >= 100 and not killed:
-            at_work = [p for p in psutil.process_iter(["cmdline"]) if any("ray::_make" in word for word in p.info["cmdline"] or ())]
-            for process in at_work[:1]:
-                process.send_signal(signal.SIGKILL)
-                killed.append(process.pid)
+    mark = tmp_path / "killed"
 
-    summary = generate(small(), tmp_path, ray="auto", progress=kill_one)
-    assert killed
+    def die_once(plan: Plan, folder: str, index: int) -> tuple[int, ...]:
+        made = make_shard(plan, folder, index) if written else None
+        if index == 5 and not mark.exists():
+            mark.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return tuple(made or make_shard(plan, folder, index))
+
+    monkeypatch.setattr(on_ray, "_make", die_once)
+    summary = generate(small(), tmp_path / "out", ray="auto")
+    assert mark.exists()
     assert (summary.rows, summary.made) == (600, 12)
-    assert rows_of(tmp_path) == list(range(600))
-    assert bits(tmp_path) == bits(whole)
+    assert rows_of(tmp_path / "out") == list(range(600))
+    assert bits(tmp_path / "out") == bits(whole)
     assert ray.is_initialized()
 
 

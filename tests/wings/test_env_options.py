@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import sys
-import time
 import urllib.request
 from dataclasses import replace
 from pathlib import Path
@@ -263,17 +262,10 @@ def test_pictures_of_every_environment(name: str) -> None:
     env.close()
 
 
-def test_a_picture_takes_some_milliseconds() -> None:
+def test_a_picture_of_the_same_state_is_the_same() -> None:
     env = SingleEnv("Reach", threads=1, render_mode="rgb_array")
     env.reset(seed=0)
-    first = env.render()
-    took = []
-    for _ in range(5):
-        start = time.perf_counter()
-        again = env.render()
-        took.append(time.perf_counter() - start)
-    assert_array_equal(again, first)
-    assert min(took) < 0.15  # some 20 ms, on a machine with nothing else to do
+    assert_array_equal(env.render(), env.render())
 
 
 def test_a_page_shows_the_environments_and_goes_away(capsys: pytest.CaptureFixture[str]) -> None:
