@@ -8,10 +8,11 @@ from typing import Any
 
 from numba.core import event
 
+_register: Any = event.register  # it has no types
 _CONTACT = ("iterate_serial", "iterate_parallel", "look_serial", "look_parallel")
 
 
-class _Notice(event.Listener):  # type: ignore[misc] # numba has no types
+class _Notice(event.Listener):
     """Print one line when the first kernel of a process is compiled, and one for the first of contact."""
 
     def __init__(self, cached: bool) -> None:
@@ -36,4 +37,4 @@ class _Notice(event.Listener):  # type: ignore[misc] # numba has no types
 
 def announce(cached: bool) -> None:
     """Print a line on stderr before kernels are compiled in this process, `cached` for later ones or not."""
-    event.register("numba:compile", _Notice(cached))
+    _register("numba:compile", _Notice(cached))
