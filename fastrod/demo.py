@@ -145,11 +145,11 @@ def _looped(console: Console, out: Path, seed: int | None, *, keep: bool, view: 
 
         serve(out / "excite.csv", robot=out / "identified.toml")
     elif keep:
-        console.print(f"the run beside both models, at http://localhost:8080: {command}", soft_wrap=True, highlight=False)
+        console.print(f"the run beside both models, in a browser: {command}", soft_wrap=True, highlight=False)
     else:
         console.print(
             "logs, report and the identified robot: fastrod demo --out DIR; then fastrod view DIR/excite.csv --robot DIR/identified.toml "
-            "serves the run\nbeside both models at http://localhost:8080",
+            "shows the run\nbeside both models in a browser",
             soft_wrap=True, highlight=False,
         )  # fmt: skip
     console.print("next: fastrod drive --emulate drives it by hand; --bus socketcan:can0 the real one", highlight=False)

@@ -34,7 +34,6 @@ _EVENTS = "events.csv"
 def _teleop(arguments: argparse.Namespace, _: Progress | None) -> int:
     """Hands drive in the browser; nothing moves when nobody watches. Stops and their reasons are kept in a file."""
     import contextlib
-    import io
     import itertools
     import signal
     import sys
@@ -66,7 +65,7 @@ def _teleop(arguments: argparse.Namespace, _: Progress | None) -> int:
             model = FreeWorld(bench.prototype.robot)
             if not arguments.no_open:
                 ordinary()  # a browser must not come before other programs
-                webbrowser.open(f"http://localhost:{server.get_port()}")
+                webbrowser.open(server.address)
                 urgent(1)
             view(model, link=bench.prototype, server=server, open_browser=False)
         say("The drives are switched off.")
@@ -78,8 +77,7 @@ def _teleop(arguments: argparse.Namespace, _: Progress | None) -> int:
                 events.unlink()
         ordinary()
         sys.setswitchinterval(switches)
-        with contextlib.redirect_stdout(io.StringIO()):  # it says goodbye
-            server.stop()
+        server.stop()
     return DONE
 
 

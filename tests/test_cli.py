@@ -314,7 +314,7 @@ def test_demo_names_what_was_sealed_into_its_emulator(demo: tuple[Path, str]) ->
     assert "1000 of 1000 converged" in printed
     assert sealed.replace("_", " ") in printed
     assert printed.index("what the model lacked") < printed.index("the seal, opened now")
-    assert "http://localhost:8080" in printed
+    assert "the run beside both models, in a browser: fastrod view" in printed
 
 
 def test_demo_leaves_what_it_says(demo: tuple[Path, str]) -> None:

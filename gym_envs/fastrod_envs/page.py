@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import math
 import socket
 import sys
+from importlib.util import find_spec
 from typing import Any, final
 
 import numpy as np
 
+from fastrod.access import serve_guarded
 from fastrod.errors import InputError
 from fastrod.types import Floats
 from fastrod_envs.painter import ball_mesh, tube_mesh
@@ -25,18 +26,14 @@ _LAMPS = (("key", (1.0, -1.6, 2.2), 1.5), ("fill", (-1.8, 0.8, 0.9), 0.6))
 
 @final
 class Page:
-    """A viser server on 127.0.0.1, on the first free port from 8080 on; its address goes to stderr once."""
+    """A viser server on 127.0.0.1, on the first free port from 8080 on; its address goes to stderr once, with the key that the page needs."""
 
     def __init__(self, task: Task) -> None:
         """Raises `InputError` where viser is missing, or no port is free."""
-        try:
-            import viser
-        except ImportError as error:
-            raise InputError("render_mode 'viser' needs viser; pip install fastrod[viewer] brings it.") from error
-        with contextlib.redirect_stdout(io.StringIO()):  # it greets with a box
-            self._server = viser.ViserServer(host=_HOST, port=_free_port(), label=f"fastrod {task.name}", verbose=False)
-        self.address = f"http://{_HOST}:{self._server.get_port()}"
-        """Of the page."""
+        if find_spec("viser") is None:
+            raise InputError("render_mode 'viser' needs viser; pip install fastrod[viewer] brings it.")
+        self._served = serve_guarded(_HOST, _free_port(), label=f"fastrod {task.name}")
+        self._server, self.address = self._served.viser, self._served.address
         self._drawn: dict[str, tuple[Any, Floats]] = {}
         first = task.scenery(0)
         self._places = _places(min(task.n_envs, SHOWN), _extent(first))
@@ -55,8 +52,7 @@ class Page:
 
     def close(self) -> None:
         """Stop the server."""
-        with contextlib.redirect_stdout(io.StringIO()):
-            self._server.stop()
+        self._served.stop()
 
     def _furnish(self, scenery: Scenery) -> None:
         """Light, a floor, a frame for every environment, and from where one looks."""

@@ -274,7 +274,7 @@ def test_a_page_shows_the_environments_and_goes_away(capsys: pytest.CaptureFixtu
     env.reset(seed=0)
     assert env.render() is None
     told = capsys.readouterr()
-    address = re.search(r"http://127\.0\.0\.1:\d+", told.err)
+    address = re.search(r"http://127\.0\.0\.1:\d+/\S{40,}/", told.err)
     assert address
     assert told.out == ""
     page = urllib.request.urlopen(address.group(), timeout=10).read()

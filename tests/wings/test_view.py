@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -15,13 +16,14 @@ from pathlib import Path
 
 import pytest
 
+from fastrod.access import is_loopback
 from fastrod.cli import main
 from fastrod.errors import InputError, UnknownNameError
 from fastrod.robotfile import load_robot
 from fastrod.simulated import SimulatedRobot
 from fastrod_viewer.app import DEMO_LOG, App, found
 from fastrod_viewer.playback import Playback
-from fastrod_viewer.server import free_port, is_loopback, serve
+from fastrod_viewer.server import free_port, serve
 from fastrod_viewer.worlds import FreeWorld, SceneWorld
 
 
@@ -141,8 +143,9 @@ def test_it_serves_this_machine_alone_and_ends_at_once(end: signal.Signals) -> N
         try:
             assert process.stdout is not None
             assert process.stderr is not None
-            assert process.stdout.readline().strip() == f"prototype: http://127.0.0.1:{port} (Ctrl+C ends it)"
-            with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=5) as page:
+            line = re.fullmatch(rf"prototype: (http://127\.0\.0\.1:{port}/\S+/) \(Ctrl\+C ends it\)\n", process.stdout.readline())
+            assert line is not None
+            with urllib.request.urlopen(line[1], timeout=5) as page:
                 assert b"<html" in page.read(2000).lower()
             with socket.socket() as other:
                 other.settimeout(1.0)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import signal
 import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, final
+from typing import Any, final
 
+from fastrod.access import Served, is_loopback
 from fastrod.errors import FastrodError, InputError
 from fastrod.link import RobotLink
 from fastrod.robot import Robot
@@ -20,16 +20,15 @@ from fastrod_scenes.scene import names
 from fastrod_viewer.canvas import Canvas
 from fastrod_viewer.catalogue import catalogue, open_world
 from fastrod_viewer.drive_page import DrivePage
+from fastrod_viewer.holder import Holder
+from fastrod_viewer.holder_panel import HolderPanels
 from fastrod_viewer.page import Page, is_upright, tell
 from fastrod_viewer.playback import Playback, load
 from fastrod_viewer.replay_page import ReplayPage
-from fastrod_viewer.server import is_loopback, serve
+from fastrod_viewer.server import serve
 from fastrod_viewer.watch import Watch
 from fastrod_viewer.world import World
 from fastrod_viewer.worlds import FreeWorld
-
-if TYPE_CHECKING:
-    import viser
 
 FIRST = "five_segment_reacher"
 """What is shown where nothing is named."""
@@ -43,15 +42,15 @@ class App:
     """One page at a time on one server, for every browser that is connected. `close` it, or use it as a context."""
 
     def __init__(
-        self, *, host: str = "127.0.0.1", port: int | None = None, folder: Path | None = None, server: viser.ViserServer | None = None,
+        self, *, host: str = "127.0.0.1", port: int | None = None, folder: Path | None = None, server: Served | None = None,
         say: Callable[[str], None] = lambda sentence: print(sentence, file=sys.stderr, flush=True),
     ) -> None:  # fmt: skip
         """`port` None takes the first free one from 8080 on, 0 any; `server` is one that `serve` has started already; `folder` takes what
         is recorded (default: where one stands); `say` hears what a person should know. Raises `InputError` where viser is missing, or the
         host or port cannot be had."""
-        self.host, self.folder, self.say = host, folder or Path.cwd(), say
-        self.server = server or serve(host, port)
-        self.port = self.server.get_port()
+        self.folder, self.say = folder or Path.cwd(), say
+        self.served = server or serve(host, port)
+        self.server = self.served.viser
         self.page: Page | None = None
         self._lock = threading.Lock()
         gui = self.server.gui
@@ -61,8 +60,10 @@ class App:
         self.canvas = Canvas(self.server)
         self._known = catalogue()
         self._picker: Any = None
-        self.server.on_client_connect(self._came)
+        self.holder = Holder(lambda: self.watch.present(), changed=self._show_holder, moved=self._passed_on)
+        self._panels = HolderPanels(self.server, self.holder)
         self.watch = Watch(self.server, lost=self._lost, tick=self._tick)
+        self.server.on_client_connect(self._came)
 
     def __enter__(self) -> App:
         return self
@@ -72,9 +73,8 @@ class App:
 
     @property
     def address(self) -> str:
-        """Where a browser finds it."""
-        host = "localhost" if self.host in ("0.0.0.0", "::") else f"[{self.host}]" if ":" in self.host else self.host
-        return f"http://{host}:{self.port}"
+        """Where a browser finds it, with the key that the page and its websocket need."""
+        return self.served.address
 
     def open(self, what: str | Path | World | Robot | Playback, *, link: RobotLink | None = None, script: bool = False) -> None:
         """Show a scene or robot by name or file, a world, a robot, or a log with what models say to it. With a `link`, hands drive that
@@ -90,8 +90,9 @@ class App:
             else:
                 script = script or not isinstance(new, FreeWorld)
                 self.page = DrivePage(
-                    self.server, self.canvas, new, folder=self.folder, replay=self._replay, echo=self._echo, link=link, script=script
-                )
+                    self.server, self.canvas, new, folder=self.folder, replay=self._replay, echo=self._echo, may=self._panels.may,
+                    link=link, script=script,
+                )  # fmt: skip
             self._show_picker(str(what) if isinstance(what, str) and not is_log(what) else self.page.title)
             self._picker.disabled = link is not None  # another scene would let go of the robot
 
@@ -107,8 +108,7 @@ class App:
             if self.page is not None:
                 self.page.close()
                 self.page = None
-        with contextlib.redirect_stdout(io.StringIO()):
-            self.server.stop()
+        self.served.stop()
 
     def _found(self, what: str | Path | World | Robot | Playback) -> World | Playback:
         page = self.page
@@ -137,6 +137,9 @@ class App:
             return
         name = event.target.value
         before = self.page.title if self.page is not None else name
+        if not self._panels.may(event):
+            self._picker.value = before
+            return
         note = event.client.add_notification(f"Opening {name}", "", loading=True, with_close_button=False)
         try:
             self.open(name)
@@ -160,18 +163,30 @@ class App:
         threading.Thread(target=job, name="replay", daemon=True).start()
 
     def _came(self, client: Any) -> None:
+        self._panels.show()
         if self.page is not None and is_upright(client):
             self.page.sight.show(client.camera, upright=True)
 
     def _echo(self) -> float:
         return self.watch.echo
 
+    def _show_holder(self) -> None:
+        self._panels.show()
+
+    def _passed_on(self) -> None:
+        page = self.page
+        if page is not None:
+            page.passed_on()
+
     def _tick(self) -> None:
+        self.holder.tick()
         page = self.page
         if page is not None:
             page.tick()
 
     def _lost(self, client: int, left: int) -> None:
+        self.holder.tick()
+        self._panels.show()
         page = self.page
         if page is not None:
             page.lost(client, left)
@@ -233,11 +248,11 @@ def is_log(what: str | Path) -> bool:
 def view(
     what: str | Path | World | Robot | Playback = FIRST, *, host: str = "127.0.0.1", port: int | None = None, open_browser: bool = True,
     robot: str | Path | None = None, n_robots: int = 1, link: RobotLink | None = None, script: bool = False,
-    server: viser.ViserServer | None = None,
+    server: Served | None = None,
 ) -> None:  # fmt: skip
     """Show something in the browser until Ctrl+C: a scene or robot by name, a robot's file, a log with what models say to it.
 
-    `server` is one that `serve` has started on that host. SIGTERM ends it as Ctrl+C does: robots are stopped, recordings saved. Raises
+    `server` is one that `serve` has started. SIGTERM ends it as Ctrl+C does: robots are stopped, recordings saved. Raises
     `FastrodError`, one sentence, for what cannot be shown.
     """
     if threading.current_thread() is threading.main_thread():
@@ -249,7 +264,10 @@ def view(
 
             webbrowser.open(app.address)
         app.open(shown, link=link, script=script)
-        if not is_loopback(host):
-            app.say(f"Warning: everyone who reaches {host} on port {app.port} can drive this robot; there is no password.")
+        if app.served.elsewhere:
+            app.say(
+                f"Other machines reach this page, too: {app.served.elsewhere} - whoever has this address can drive and nobody else; "
+                "it is the key, it travels unencrypted, and it lasts until Ctrl+C."
+            )
         print(f"{app.page.title if app.page else what}: {app.address} (Ctrl+C ends it)", flush=True)
         app.wait()

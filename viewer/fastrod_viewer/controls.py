@@ -26,8 +26,11 @@ _SETTLED = 0.3  # s after a change in which a control is left alone: it may be u
 class Controls:
     """Handles of one robot's controls, made inside the tabs `drive` and `loads`; they follow the pilot, whoever moves it."""
 
-    def __init__(self, server: viser.ViserServer, session: Session, drive: Any, loads: Any) -> None:
-        self.server, self.session, self.pilot = server, session, session.pilot
+    def __init__(
+        self, server: viser.ViserServer, session: Session, drive: Any, loads: Any, *, may: Callable[[Any], bool]
+    ) -> None:
+        """`may` says of an event whether the page it comes from may act."""
+        self.server, self.session, self.pilot, self._may = server, session, session.pilot, may
         self.chosen = 0
         """Segment that keys bend."""
         self._followers: list[tuple[Any, Callable[[], Any]]] = []
@@ -105,7 +108,9 @@ class Controls:
                 self._followers.append((handle, partial(getattr, knob, "value")))
 
     def _button(self, label: str, do: Callable[[], None]) -> None:
-        def press(_: object) -> None:
+        def press(event: Any) -> None:
+            if not self._may(event):
+                return
             self.session.take_over()
             do()
             self.session.touch()
@@ -113,11 +118,17 @@ class Controls:
         self.server.gui.add_button(label, color="gray").on_click(press)
 
     def _listen(self, handle: Any, put: Callable[[Any], None], *, take_over: bool = True) -> None:
-        """What a person changes goes to `put`; what `follow` shows does not."""
+        """What a person changes goes to `put`; what `follow` shows does not. On a page that may not act it goes back."""
+        kept = handle.value
 
         def changed(event: Any) -> None:
+            nonlocal kept
             if event.client_id is None:
                 return
+            if not self._may(event):
+                handle.value = next((value() for one, value in self._followers if one is handle), kept)
+                return
+            kept = event.target.value
             if take_over:
                 self.session.take_over()
             put(event.target.value)
@@ -127,8 +138,8 @@ class Controls:
 
     def _keys(self) -> None:
         session = self.session
-        self._key("Stop", "escape", session.stop)
-        self._key("Pause, or go on", "space", self._pause)
+        self._command("Stop", "escape").on_trigger(stops(session))
+        self._command("Pause, or go on", "space").on_trigger(self._pause)
         self._key("Reset", "R", session.reset)
         if self.pilot.actions is None or not session.world.by_hand:
             return
@@ -139,12 +150,19 @@ class Controls:
             self._key(f"Keys bend segment {k + 1}", str(k + 1), lambda k=k: setattr(self, "chosen", k))  # type: ignore[misc]
 
     def _key(self, label: str, key: Any, do: Callable[[], None]) -> None:
-        command = self.server.gui.add_command(label, hotkey=key)
-        command.on_trigger(lambda _: do())
-        self._commands.append(command)
+        self._command(label, key).on_trigger(lambda event: do() if self._may(event) else None)
 
-    def _pause(self) -> None:
-        self.session.paused = not self.session.paused
+    def _command(self, label: str, key: Any) -> Any:
+        command = self.server.gui.add_command(label, hotkey=key)
+        self._commands.append(command)
+        return command
+
+    def _pause(self, event: Any) -> None:
+        """Every page may pause; to go on is for the one that has the controls."""
+        if not self.session.paused:
+            self.session.paused = True
+        elif self._may(event):
+            self.session.paused = False
 
     def _bend(self, axis: int, sign: int) -> None:
         self.session.take_over()
@@ -152,3 +170,13 @@ class Controls:
         bends[axis] += sign * _KEY_STEP
         self.pilot.bend(self.chosen, *bends)
         self.session.touch()
+
+
+def stops(session: Session) -> Callable[[Any], Any]:
+    """Return what a STOP calls, on every page: it runs in viser's own loop, before what is sent later and whatever else pages have
+    asked for."""
+
+    async def stop(_: object) -> None:
+        session.stop()
+
+    return stop

@@ -15,7 +15,7 @@ from fastrod.link import Measurement, RobotLink
 from fastrod.recording import free_path
 from fastrod.runlog import RunLog
 from fastrod_viewer.canvas import Canvas
-from fastrod_viewer.controls import Controls
+from fastrod_viewer.controls import Controls, stops
 from fastrod_viewer.drawing import Drawing
 from fastrod_viewer.export import wrap
 from fastrod_viewer.grip import Grip
@@ -50,10 +50,11 @@ class DrivePage(Page):
 
     def __init__(
         self, server: viser.ViserServer, canvas: Canvas, world: World, *, folder: Path, replay: Callable[[RunLog, World], None],
-        echo: Callable[[], float], link: RobotLink | None = None, script: bool = False,
+        echo: Callable[[], float], may: Callable[[Any], bool], link: RobotLink | None = None, script: bool = False,
     ) -> None:  # fmt: skip
-        """`folder` takes recordings; `replay` shows one; `echo` is the time that pages take to draw [s]."""
-        self.server, self.world, self.title = server, world, world.name
+        """`folder` takes recordings; `replay` shows one; `echo` is the time that pages take to draw [s]; `may` says of an event
+        whether the page it comes from may act."""
+        self.server, self.world, self.title, self._may = server, world, world.name, may
         self._folder, self._replay, self._echo = folder, replay, echo
         touches = world.rods[0].state.contacts is not None
         far = None if link is None else Linked(link)
@@ -64,7 +65,7 @@ class DrivePage(Page):
         self.sight = Sight(self.drawing.middle, self.drawing.size * (1.0 if far is None or not far.sees else _FARTHER))
         self.session = Session(world, self.pilot, draw=self._draw, link=link, script=script)
         self.grip = (
-            Grip(server, self.session, min(1.25 * self.drawing.radius, 0.1 * world.robot.length), world.rods[0].place[0])
+            Grip(server, self.session, min(1.25 * self.drawing.radius, 0.1 * world.robot.length), world.rods[0].place[0], may=may)
             if self._can_drag()
             else None
         )
@@ -107,6 +108,11 @@ class DrivePage(Page):
         if left == 0:
             self.session.nobody()
 
+    def passed_on(self) -> None:
+        """What was on its way stops: whoever sent it there has the controls no longer."""
+        self.session.pilot.hold()
+        self.session.touch()
+
     def export(self) -> str:
         """The robot as it stands now, with its legend, time and tip; nothing moves in it."""
         serializer = self.server.get_scene_serializer()
@@ -126,15 +132,15 @@ class DrivePage(Page):
         self.panel = gui.add_folder(None)
         with self.panel:
             self.stop = gui.add_button("STOP", color="red", icon=viser.Icon.HAND_STOP, hint="Everything stands still at once. Key: Esc")
-            self.stop.on_click(lambda _: session.stop())
+            self.stop.on_click(stops(session))
             self.go_on = gui.add_button("GO ON", color="green", icon=viser.Icon.PLAYER_PLAY, disabled=True, hint=_GO_ON)
-            self.go_on.on_click(lambda _: session.release())
+            self.go_on.on_click(lambda event: session.release() if self._may(event) else None)
             self.figures = gui.add_html("")  # below: as it grows and shrinks, it must not move GO ON to where STOP was
             self.run = gui.add_button_group("Run", self._runs())
             self.run.on_click(self._run)
             tabs = gui.add_tab_group()
             drive, loads = tabs.add_tab("Drive", viser.Icon.ADJUSTMENTS), tabs.add_tab("Loads", viser.Icon.WEIGHT)
-            self.controls = Controls(self.server, session, drive, loads)
+            self.controls = Controls(self.server, session, drive, loads, may=self._may)
             with tabs.add_tab("View", viser.Icon.EYE):
                 self._view()
             with tabs.add_tab("Save", viser.Icon.FILE_EXPORT):
@@ -197,14 +203,18 @@ class DrivePage(Page):
 
         gui = self.server.gui
         self.record = gui.add_button("Record a run log", icon=viser.Icon.PLAYER_RECORD, color="red")
-        self.record.on_click(lambda event: self.session.ask(lambda: self._toggle_record(event.client)))
+        self.record.on_click(self._recording)
         self.recorded = gui.add_markdown("Inputs, tip and tensions at every step, as a CSV that `fastrod identify` reads.")
         self.again = gui.add_button("Replay the recording", color="gray", disabled=True)
-        self.again.on_click(lambda _: self._play_back())
+        self.again.on_click(lambda event: self._play_back() if self._may(event) else None)
         page = gui.add_button("Export as a web page", color="gray", hint="One HTML file; it opens without a server and without a network.")
         page.on_click(lambda event: send(event.client, f"{self.title}.html", lambda: self.export().encode()))
         png = gui.add_button("Save a picture (PNG)", color="gray")
         png.on_click(lambda event: send(event.client, f"{self.title}.png", lambda: picture(event.client)))
+
+    def _recording(self, event: Any) -> None:
+        if self._may(event):
+            self.session.ask(lambda: self._toggle_record(event.client))
 
     def _play_back(self) -> None:
         if self._last is not None:
@@ -232,10 +242,12 @@ class DrivePage(Page):
             tell(client, "Saved", f"{len(log)} samples in {save_name(self._path)}")
 
     def _run(self, event: Any) -> None:
-        session = self.session
-        match event.target.value:
+        session, what = self.session, event.target.value
+        if what != "Pause" and not self._may(event):  # every page may pause
+            return
+        match what:
             case "Pause" | "Resume":
-                session.paused = not session.paused
+                session.paused = what == "Pause"
             case "Step":
                 session.step()
             case "Reset":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
@@ -21,9 +22,12 @@ _HINT = "drag me"
 class Grip:
     """Follows the tip, or the hand that has got hold of it; the pilot then takes the tip there by inverse kinematics."""
 
-    def __init__(self, server: viser.ViserServer, session: Session, radius: float, place: Floats) -> None:
-        """`radius` of the ball [m]; `place` (3,) is where the world's origin is drawn for the robot that hands drive [m]."""
-        self.session, self._place = session, place
+    def __init__(
+        self, server: viser.ViserServer, session: Session, radius: float, place: Floats, *, may: Callable[[Any], bool]
+    ) -> None:
+        """`radius` of the ball [m]; `place` (3,) is where the world's origin is drawn for the robot that hands drive [m]; `may` says
+        of an event whether the page it comes from may act."""
+        self.session, self._place, self._may = session, place, may
         self._held_by: int | None = None
         self._ball: Any = server.scene.add_icosphere(
             "/grip", radius, color=ACCENT, opacity=0.55, subdivisions=3, cast_shadow=False, receive_shadow=False
@@ -39,7 +43,7 @@ class Grip:
             self._ball.position = at
 
     def lost(self, client: int) -> None:
-        """A client is gone; its hand lets go."""
+        """A client is gone, or its hand lets go."""
         if self._held_by == client:
             self._held_by = None
             self.session.pilot.drag(None)
@@ -51,9 +55,8 @@ class Grip:
     def _dragged(self, event: Any) -> None:
         session = self.session
         if event.phase == "end":
-            self._held_by = None
-            session.pilot.drag(None)
-        elif session.stopped:
+            self.lost(event.client_id)
+        elif session.stopped or not np.isfinite(event.end_position).all() or not self._may(event):
             return
         else:
             if self._hint is not None:

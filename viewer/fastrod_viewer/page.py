@@ -40,6 +40,10 @@ class Page(ABC):
         """A client is gone, `left` remain."""
 
     @abstractmethod
+    def passed_on(self) -> None:
+        """The page that had the controls has left, or handed them over."""
+
+    @abstractmethod
     def rest(self, on: bool) -> None:
         """Compute nothing while another page is being made, or go on after all."""
 

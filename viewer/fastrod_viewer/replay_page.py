@@ -70,6 +70,9 @@ class ReplayPage(Page):
         if left == 0:
             self._playing = False
 
+    def passed_on(self) -> None:
+        """It drives nothing."""
+
     def export(self) -> str:
         """With the motion in it, in at most 240 frames."""
         playback = self.playback

@@ -2,34 +2,27 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import functools
-import io
-import ipaddress
 import socket
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from fastrod.access import Served, serve_guarded
 from fastrod.errors import InputError
-
-if TYPE_CHECKING:
-    import viser
+from fastrod_viewer.inbox import heed_sense
 
 PORT = 8080
 """The first that is tried."""
 _TRIES = 20
 
 
-def serve(host: str = "127.0.0.1", port: int | None = None) -> viser.ViserServer:
-    """A new server; `port` None takes the first free one from 8080 on, 0 any. Raises `InputError` where viser is missing, or host or port
-    cannot be had."""
-    try:
-        import viser
-    except ImportError as error:
-        raise InputError("viser is not installed; pip install 'fastrod[viewer]' brings it.") from error
+def serve(host: str = "127.0.0.1", port: int | None = None) -> Served:
+    """A new server; `port` None takes the first free one from 8080 on, 0 any. Raises `InputError` where viser is missing, or host
+    or port cannot be had."""
+    served = serve_guarded(host, free_port(host, port))
     _push_from_any_thread()
-    with contextlib.redirect_stdout(io.StringIO()):  # it greets with a box
-        return viser.ViserServer(host=host, port=free_port(host, port), verbose=False)
+    heed_sense(served)
+    return served
 
 
 @functools.cache
@@ -83,11 +76,3 @@ def _free(host: str, port: int) -> bool:
                 ) from error
             return False
     return True
-
-
-def is_loopback(host: str) -> bool:
-    """Only this machine reaches it."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"

@@ -1,0 +1,217 @@
+"""`Access`: who may load a page that viser serves, and open its websocket."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import io
+import ipaddress
+import logging
+import secrets
+import socket
+import sys
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from http import HTTPStatus
+from typing import TYPE_CHECKING, Any, final
+
+from fastrod.errors import InputError
+
+if TYPE_CHECKING:
+    import viser
+    from websockets.asyncio.server import ServerConnection
+    from websockets.datastructures import Headers
+    from websockets.http11 import Request, Response
+
+MOST_PAGES = 32
+"""Open at once on one server: as many as viser has threads for what they send."""
+_LOCAL = ("127.0.0.1", "localhost", "[::1]")
+_HTTP_PORT = 80  # a browser leaves it out of Host and Origin
+_NO_KEY = "This address lacks the key to the page: open the address that was printed in the terminal."
+_WRONG_HOST = (
+    "This page is not served under this name or port: open the address that was printed in the terminal, "
+    "and through a tunnel forward the same port."
+)
+_WRONG_ORIGIN = "Another site asks for this page: open the address that was printed in the terminal by itself."
+_FULL = f"{MOST_PAGES} pages are open, which is the most: close one and load this again."
+_SENSELESS = "A page sent a message that makes no sense; it is ignored, and so are further ones, without a word."
+_KINDS = 20  # of sentences about pages: a page that sends nonsense for hours fills no terminal
+_patching = threading.Lock()
+
+
+@final
+class Access:
+    """The key of one server, and the check of every request against it.
+
+    Loopback keeps no web page out: a websocket has no same-origin rule, so whatever page a browser shows may open one to
+    this machine, and a name of a stranger's may resolve to 127.0.0.1 (DNS rebinding). A request is answered only where its path
+    begins with the key, its Host is an address that is served, and its Origin, where a browser gives one, is that same address.
+    """
+
+    def __init__(self, host: str) -> None:
+        """`host` as the server is bound to it."""
+        self.key = secrets.token_urlsafe()
+        """First part of the path; new with every server. Part of the path and not a cookie: browsers send those to every port."""
+        self._names = () if _every(host) else (f"[{host}]" if ":" in host else host.lower(),)
+
+    def refusal(self, path: str, headers: Headers, arrived: tuple[str, int]) -> str | None:
+        """Return one sentence that says why this request is refused, or None; `arrived` is the address and port of this machine
+        that it came to."""
+        address, port = arrived
+        hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
+        if len(hosts) != 1 or hosts[0].lower() not in self._served(address, port):
+            return _WRONG_HOST
+        if origins and origins != [f"http://{hosts[0].lower()}"]:
+            return _WRONG_ORIGIN
+        given = path.partition("?")[0].split("/")[1:2]
+        if not given or not secrets.compare_digest(given[0].encode("utf-8", "surrogateescape"), self.key.encode()):
+            return _NO_KEY
+        return None
+
+    def _served(self, address: str, port: int) -> set[str]:
+        """What Host may be: this machine's own names for itself, the name that was bound, and the address that was reached."""
+        names = {*_LOCAL, *self._names, f"[{address}]" if ":" in address else address}
+        return {f"{name}:{port}" for name in names} | (names if port == _HTTP_PORT else set())
+
+    def guard(self, plain: Callable[[ServerConnection, Request], Response | None]) -> Callable[..., Response | None]:
+        """Return a check of every request before `plain`, viser's own answer, sees it without its key."""
+        from websockets.datastructures import Headers
+        from websockets.http11 import Response
+
+        def answer(connection: ServerConnection, request: Request) -> Response | None:
+            status, why = HTTPStatus.FORBIDDEN, self.refusal(request.path, request.headers, connection.local_address[:2])
+            if why is None and len(connection.server.connections) >= MOST_PAGES:
+                status, why = HTTPStatus.SERVICE_UNAVAILABLE, _FULL
+            if why is not None:
+                body = f"<!doctype html><title>Refused</title><p>{why}</p>\n".encode()
+                kind = {"Content-Type": "text/html; charset=utf-8", "Content-Length": str(len(body)), "Cache-Control": "no-store"}
+                return Response(status, status.phrase, Headers(kind), body)
+            response = plain(connection, replace(request, path=request.path.removeprefix(f"/{self.key}") or "/"))
+            if response is not None:
+                response.headers["Referrer-Policy"] = "no-referrer"  # a link in the page must not tell its address
+                response.headers["X-Frame-Options"] = "DENY"
+            return response
+
+        return answer
+
+
+@final
+class Ignored:
+    """Says on stderr, once for each kind, that something a page sent came to nothing, in place of a traceback each time."""
+
+    def __init__(self) -> None:
+        self._said: set[str] = set()
+
+    def __call__(self, error: object = None, sentence: str = _SENSELESS) -> None:
+        """Mention it; `error` goes to the log of whoever debugs."""
+        logging.getLogger(__name__).debug(sentence, exc_info=error if isinstance(error, BaseException) else None)
+        if sentence not in self._said and len(self._said) < _KINDS:
+            self._said.add(sentence)
+            print(sentence, file=sys.stderr, flush=True)
+
+    def failed(self, error: Exception) -> None:
+        """Mention that what a page asked for could not be done."""
+        self(error, f"What a page asked for failed, and is left undone: {type(error).__name__}, {' '.join(str(error).split())}")
+
+    def of_loop(self, _: object, context: dict[str, Any]) -> None:
+        """Hear an event loop's complaint."""
+        self(context.get("exception"))
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class Served:
+    """A viser server that answers only those who have its address."""
+
+    viser: viser.ViserServer
+    host: str
+    """That it is bound to."""
+    key: str
+    """First part of every path."""
+    ignored: Ignored
+    """Hears of messages that make no sense."""
+
+    @property
+    def address(self) -> str:
+        """Of the page, key included: http://127.0.0.1:8080/KEY/ for instance."""
+        return self.at("localhost" if _every(self.host) else self.host)
+
+    def at(self, host: str) -> str:
+        """Return the address under which `host`, a name or an address of this machine, serves the page."""
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.viser.get_port()}/{self.key}/"
+
+    @property
+    def elsewhere(self) -> str:
+        """Address of the page for other machines; empty where this machine alone gets to it."""
+        if is_loopback(self.host):
+            return ""
+        return self.at(_outward(self.host) if _every(self.host) else self.host)
+
+    def stop(self) -> None:
+        """End it."""
+        with contextlib.redirect_stdout(io.StringIO()):  # it says goodbye
+            self.viser.stop()
+
+
+def serve_guarded(host: str, port: int, *, label: str | None = None) -> Served:
+    """Start a viser server whose page and websocket need the key in its address. Raises `InputError` where viser is missing, or
+    serves in a way that cannot be guarded."""
+    try:
+        import viser
+        from viser import _messages
+        from websockets.asyncio import server as web
+    except ImportError as error:
+        raise InputError("viser is not installed; pip install 'fastrod[viewer]' brings it.") from error
+    access, ignored, plain, guarded = Access(host), Ignored(), web.serve, threading.Event()
+
+    def serve(*arguments: Any, process_request: Any, **options: Any) -> Any:
+        asyncio.get_running_loop().set_exception_handler(ignored.of_loop)
+        answer = access.guard(process_request)
+        guarded.set()
+        return plain(*arguments, process_request=answer, logger=_silent(), **options)
+
+    # viser offers no place for a check, so that it finds this one where it looks for websockets' own server
+    with _patching, contextlib.redirect_stdout(io.StringIO()):  # it greets with a box
+        setattr(web, "serve", serve)  # noqa: B010 - mypy forbids assigning to a class
+        try:
+            server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
+        finally:
+            setattr(web, "serve", plain)  # noqa: B010
+    served = Served(viser=server, host=host, key=access.key, ignored=ignored)
+    if not guarded.is_set():
+        served.stop()
+        raise InputError(f"viser {viser.__version__} serves pages in a way that cannot be guarded; pip install 'viser==1.1.1'.")
+    for asked in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):  # no page opens a tunnel to elsewhere
+        server._websock_server.unregister_handler(asked)
+    return served
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether only this machine gets to it."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _every(host: str) -> bool:
+    """It stands for all addresses of this machine."""
+    return host in ("0.0.0.0", "::")
+
+
+def _outward(host: str) -> str:
+    """Return the address of this machine that others see, or its name where it has no route to them."""
+    family, away = (socket.AF_INET6, "2001:db8::1") if ":" in host else (socket.AF_INET, "192.0.2.1")
+    with socket.socket(family, socket.SOCK_DGRAM) as probe, contextlib.suppress(OSError):
+        probe.connect((away, 9))  # sends nothing; both addresses are for documents only
+        return str(probe.getsockname()[0])
+    return socket.gethostname()
+
+
+def _silent() -> logging.Logger:
+    """A logger that says nothing: requests hold the key, and strangers could fill a terminal with handshakes that fail."""
+    logger = logging.Logger("fastrod.access.silent", level=logging.CRITICAL + 1)
+    logger.addHandler(logging.NullHandler())
+    return logger
+

@@ -1,0 +1,84 @@
+"""`HolderPanels`: where more than one page is open, each says who has the controls, and offers to ask for them."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import TYPE_CHECKING, Any, final
+
+from fastrod_viewer.holder import AGAIN, PATIENCE, Holder, Standing
+from fastrod_viewer.page import tell
+
+if TYPE_CHECKING:
+    import viser
+
+_TEXTS: dict[Standing, str] = {
+    "free": "No page has the controls. The first that moves something gets them.",
+    "has": "This page has the controls. The others watch; STOP works on all of them.",
+    "asked": f"Another page asks for the controls, and gets them after {PATIENCE:g} s unless you keep them.",
+    "other": "Another page has the controls. This one watches; STOP works here, too.",
+    "asking": f"The other page is asked, and may refuse within {PATIENCE:g} s.",
+    "refused": f"The other page keeps the controls. Ask again {AGAIN:g} s after that.",
+}
+_QUIET = 3.0  # s between two notes on one page that it may not act
+
+
+@final
+class HolderPanels:
+    """A small window of its own on each page: it shifts no other button while somebody reaches for STOP."""
+
+    def __init__(self, server: viser.ViserServer, holder: Holder) -> None:
+        self.server, self.holder = server, holder
+        self._lock = threading.Lock()
+        self._panels: dict[int, _Panel] = {}
+        self._noted: dict[int, float] = {}
+
+    def may(self, event: Any) -> bool:
+        """Return whether the page that an event of viser comes from may act now; a page that may not reads why."""
+        if self.holder.acts(event.client_id):
+            return True
+        now = time.monotonic()
+        if now - self._noted.get(event.client_id, -_QUIET) >= _QUIET:
+            self._noted[event.client_id] = now
+            tell(event.client, "Not done", "Another page has the controls. Ask for them in the window Controls.", failed=True)
+        return False
+
+    def show(self) -> None:
+        """Have every page say how it stands; one page alone needs no such window."""
+        with self._lock:
+            clients = self.server.get_clients() if len(self.server.get_clients()) > 1 else {}
+            for gone in self._panels.keys() - clients.keys():
+                self._panels.pop(gone).remove()
+            for number, client in clients.items():
+                if number not in self._panels:
+                    self._panels[number] = _Panel(client, self.holder)
+                self._panels[number].show(self.holder.standing(number))
+
+
+@final
+class _Panel:
+    """Of one page."""
+
+    def __init__(self, client: Any, holder: Holder) -> None:
+        gui, page = client.gui, client.client_id
+        self._standing: Standing | None = None
+        self._panel: Any = gui.add_panel()
+        with self._panel.add_tab("Controls"):
+            self._text = gui.add_markdown("")
+            self._ask = gui.add_button("Ask for control", visible=False)
+            self._keep = gui.add_button("Keep control", visible=False)
+            self._hand_over = gui.add_button("Hand over", color="gray", visible=False)
+        self._panel.float(x=15, y=15, width=250)
+        self._ask.on_click(lambda _: holder.ask(page))
+        self._keep.on_click(lambda _: holder.keep(page))
+        self._hand_over.on_click(lambda _: holder.hand_over(page))
+
+    def show(self, standing: Standing) -> None:
+        if standing == self._standing:
+            return
+        self._standing, self._text.content = standing, _TEXTS[standing]
+        self._ask.visible = standing == "other"
+        self._keep.visible = self._hand_over.visible = standing == "asked"
+
+    def remove(self) -> None:
+        self._panel.remove()
