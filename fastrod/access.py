@@ -214,4 +214,3 @@ def _silent() -> logging.Logger:
     logger = logging.Logger("fastrod.access.silent", level=logging.CRITICAL + 1)
     logger.addHandler(logging.NullHandler())
     return logger
-

@@ -26,9 +26,7 @@ _SETTLED = 0.3  # s after a change in which a control is left alone: it may be u
 class Controls:
     """Handles of one robot's controls, made inside the tabs `drive` and `loads`; they follow the pilot, whoever moves it."""
 
-    def __init__(
-        self, server: viser.ViserServer, session: Session, drive: Any, loads: Any, *, may: Callable[[Any], bool]
-    ) -> None:
+    def __init__(self, server: viser.ViserServer, session: Session, drive: Any, loads: Any, *, may: Callable[[Any], bool]) -> None:
         """`may` says of an event whether the page it comes from may act."""
         self.server, self.session, self.pilot, self._may = server, session, session.pilot, may
         self.chosen = 0

@@ -22,9 +22,7 @@ _HINT = "drag me"
 class Grip:
     """Follows the tip, or the hand that has got hold of it; the pilot then takes the tip there by inverse kinematics."""
 
-    def __init__(
-        self, server: viser.ViserServer, session: Session, radius: float, place: Floats, *, may: Callable[[Any], bool]
-    ) -> None:
+    def __init__(self, server: viser.ViserServer, session: Session, radius: float, place: Floats, *, may: Callable[[Any], bool]) -> None:
         """`radius` of the ball [m]; `place` (3,) is where the world's origin is drawn for the robot that hands drive [m]; `may` says
         of an event whether the page it comes from may act."""
         self.session, self._place, self._may = session, place, may

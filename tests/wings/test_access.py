@@ -1,0 +1,438 @@
+"""Who may load a page, open its websocket, and drive: strangers, nonsense, too many, and two at once."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("viser")
+
+from pages import HANDSHAKE, PROTOCOL, RawPage, asked, slider, until
+from websockets.sync.client import connect
+
+from fastrod.access import MOST_PAGES, Access, serve_guarded
+from fastrod.errors import InputError
+from fastrod.robotfile import load_robot
+from fastrod.simulated import SimulatedRobot
+from fastrod_viewer.app import DEMO_LOG, App
+from fastrod_viewer.drive_page import DrivePage
+from fastrod_viewer.holder import AGAIN, IDLE, PATIENCE, Holder
+from fastrod_viewer.worlds import FreeWorld
+
+Headers = list[tuple[str, str]]
+
+
+@pytest.fixture(scope="module", params=["viewer", "replay", "drive", "environments"])
+def address(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Of each kind of page there is."""
+    folder = tmp_path_factory.mktemp("access")
+    if request.param == "drive":
+        command = [sys.executable, "-m", "fastrod.cli", "drive", "--emulate", "--seed", "3", "--no-home", "--no-open", "--port", "0"]
+        with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            found = re.search(r"http://\S+", line)
+            if found is None:
+                pytest.fail(f"{line!r} has no address: {process.communicate()[1]}")
+            yield found[0]
+            process.send_signal(signal.SIGTERM)
+            _, said = process.communicate(timeout=60)
+        key = found[0].split("/")[3]
+        assert process.returncode == 0, said
+        assert "Traceback" not in said
+        assert key not in said
+        assert not any(key in path.read_text(errors="replace") for path in folder.iterdir())  # the journal, for one
+    elif request.param == "environments":
+        served = serve_guarded("127.0.0.1", 0)
+        yield served.address
+        served.stop()
+    else:
+        with App(port=0, folder=folder, say=lambda _: None) as app:
+            app.open("prototype" if request.param == "viewer" else DEMO_LOG)
+            yield app.address
+
+
+STRANGERS: dict[str, tuple[Callable[[str], str], Callable[[str], Headers]]] = {
+    "another origin": (lambda key: f"/{key}/", lambda host: [("Host", host), ("Origin", "http://evil.example")]),
+    "another port's origin": (lambda key: f"/{key}/", lambda host: [("Host", host), ("Origin", "http://127.0.0.1:1")]),
+    "another name's origin": (
+        lambda key: f"/{key}/",
+        lambda host: [("Host", host), ("Origin", host.replace("127.0.0.1", "http://localhost"))],
+    ),
+    "an encrypted origin": (lambda key: f"/{key}/", lambda host: [("Host", host), ("Origin", f"https://{host}")]),
+    "an origin that is null": (lambda key: f"/{key}/", lambda host: [("Host", host), ("Origin", "null")]),
+    "an empty origin": (lambda key: f"/{key}/", lambda host: [("Host", host), ("Origin", "")]),
+    "two origins": (lambda key: f"/{key}/", lambda host: [("Host", host), ("Origin", f"http://{host}"), ("Origin", "http://evil.example")]),
+    "a rebound name": (lambda key: f"/{key}/", lambda host: [("Host", f"evil.example:{host.split(':')[1]}")]),
+    "a rebound name and its origin": (
+        lambda key: f"/{key}/",
+        lambda host: [("Host", f"evil.example:{host.split(':')[1]}"), ("Origin", f"http://evil.example:{host.split(':')[1]}")],
+    ),
+    "a name that begins alike": (lambda key: f"/{key}/", lambda host: [("Host", f"127.0.0.1.evil.example:{host.split(':')[1]}")]),
+    "another port": (lambda key: f"/{key}/", lambda host: [("Host", "127.0.0.1:1")]),
+    "no port": (lambda key: f"/{key}/", lambda host: [("Host", "127.0.0.1")]),
+    "all addresses": (lambda key: f"/{key}/", lambda host: [("Host", f"0.0.0.0:{host.split(':')[1]}")]),
+    "no host": (lambda key: f"/{key}/", lambda host: []),
+    "two hosts": (lambda key: f"/{key}/", lambda host: [("Host", host), ("Host", "evil.example")]),
+    "no key": (lambda key: "/", lambda host: [("Host", host)]),
+    "no key, its own origin": (lambda key: "/", lambda host: [("Host", host), ("Origin", f"http://{host}")]),
+    "a file without a key": (lambda key: "/index.html", lambda host: [("Host", host)]),
+    "another key": (lambda key: f"/{Access('127.0.0.1').key}/", lambda host: [("Host", host)]),
+    "a key cut short": (lambda key: f"/{key[:-1]}/", lambda host: [("Host", host)]),
+    "a key and more": (lambda key: f"/{key}A/", lambda host: [("Host", host)]),
+    "a key in capitals": (lambda key: f"/{key.swapcase()}/", lambda host: [("Host", host)]),
+    "a key in its query": (lambda key: f"/?{key}", lambda host: [("Host", host)]),
+    "a key further on": (lambda key: f"/x/{key}/", lambda host: [("Host", host)]),
+    "a key behind two strokes": (lambda key: f"//{key}/", lambda host: [("Host", host)]),
+    "a cookie": (lambda key: "/", lambda host: [("Host", host), ("Cookie", "key=1")]),
+}
+
+
+@pytest.mark.parametrize("how", ["page", "websocket"])
+@pytest.mark.parametrize("stranger", STRANGERS)
+def test_a_stranger_is_refused_in_a_sentence(address: str, stranger: str, how: str) -> None:
+    path, headers = STRANGERS[stranger]
+    _, _, host, key, _ = address.split("/")
+    sent = headers(host) + (list(HANDSHAKE.items()) if how == "websocket" else [])
+    connection, status, text = asked(address, path(key), sent)
+    connection.close()
+    assert status == 403
+    (said,) = re.findall(r"<p>(.*)</p>", text)
+    assert "open the address that was printed in the terminal" in said
+    assert key not in text
+
+
+@pytest.mark.parametrize("how", ["page", "websocket"])
+@pytest.mark.parametrize(
+    ("name", "origin", "path"),
+    [
+        ("127.0.0.1", "", "/"),
+        ("127.0.0.1", "", ""),
+        ("127.0.0.1", "http://127.0.0.1", "/?websocket=ws://127.0.0.1"),
+        ("localhost", "http://localhost", "/"),
+        ("LOCALHOST", "http://localhost", "/"),
+        ("[::1]", "http://[::1]", "/"),
+    ],
+)
+def test_whoever_has_the_address_is_let_in(address: str, name: str, origin: str, path: str, how: str) -> None:
+    _, _, host, key, _ = address.split("/")
+    port = host.split(":")[1]
+    sent = [("Host", f"{name}:{port}")] + ([("Origin", f"{origin}:{port}")] if origin else [])
+    connection, status, text = asked(address, f"/{key}{path}", sent + (list(HANDSHAKE.items()) if how == "websocket" else []))
+    connection.close()
+    assert status == (101 if how == "websocket" else 200)
+    assert ("<html" in text) == (how == "page")
+
+
+def test_a_client_without_a_browser_gets_what_the_page_shows(address: str) -> None:
+    with connect(address.replace("http", "ws", 1).rstrip("/"), subprotocols=[PROTOCOL], max_size=None) as socket:  # type: ignore[list-item]
+        assert len(socket.recv(timeout=60.0)) > 16
+
+
+@pytest.mark.parametrize(
+    ("bound", "reached", "host", "let_in"),
+    [
+        ("0.0.0.0", "192.168.1.5", "192.168.1.5:80", True),
+        ("0.0.0.0", "192.168.1.5", "192.168.1.5", True),  # a browser leaves out port 80
+        ("0.0.0.0", "192.168.1.5", "192.168.1.6:80", False),
+        ("0.0.0.0", "192.168.1.5", "evil.example:80", False),
+        ("0.0.0.0", "192.168.1.5", "0.0.0.0:80", False),
+        ("robot.lab", "192.168.1.5", "Robot.lab:80", True),
+        ("robot.lab", "192.168.1.5", "lab:80", False),
+        ("::", "fd00::5", "[fd00::5]:80", True),
+        ("::", "fd00::5", "[fd00::6]:80", False),
+    ],
+)
+def test_another_host_is_served_under_its_own_addresses_and_with_the_key(bound: str, reached: str, host: str, let_in: bool) -> None:
+    from websockets.datastructures import Headers as Given
+
+    access = Access(bound)
+    why = access.refusal(f"/{access.key}/", Given(Host=host), (reached, 80))
+    assert (why is None) == let_in
+    assert access.refusal("/", Given(Host=host), (reached, 80)) is not None
+
+
+def test_each_server_has_a_key_of_its_own_and_says_who_reaches_it(tmp_path: Path) -> None:
+    made = [serve_guarded(host, 0) for host in ("127.0.0.1", "127.0.0.1", "0.0.0.0")]
+    try:
+        assert len({served.key for served in made}) == 3
+        assert all(len(served.key) >= 40 for served in made)
+        assert [bool(served.elsewhere) for served in made] == [False, False, True]
+        every = made[2]
+        assert every.address == every.at("localhost")
+        assert every.elsewhere.endswith(f":{every.viser.get_port()}/{every.key}/")
+        connection, status, _ = asked(every.address, "/", [("Host", every.address.split("/")[2])])
+        connection.close()
+        assert status == 403
+    finally:
+        for served in made:
+            served.stop()
+
+
+def test_a_server_that_cannot_be_guarded_is_not_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    from viser.infra import _infra
+    from websockets.asyncio import server as web
+
+    class Elsewhere:
+        """websockets, from where a later viser might take it."""
+
+        class asyncio:  # noqa: N801
+            class server:  # noqa: N801
+                serve = web.serve
+
+        exceptions, datastructures = _infra.websockets.exceptions, _infra.websockets.datastructures
+
+    monkeypatch.setattr(_infra, "websockets", Elsewhere)
+    with pytest.raises(InputError, match="serves pages in a way that cannot be guarded"):
+        serve_guarded("127.0.0.1", 0)
+
+
+@pytest.fixture
+def app(tmp_path: Path) -> Iterator[App]:
+    with App(port=0, folder=tmp_path, say=lambda _: None) as served:
+        yield served
+
+
+def page_of(app: App) -> DrivePage:
+    assert isinstance(app.page, DrivePage)
+    return app.page
+
+
+def test_an_exported_page_and_a_log_hold_no_key(app: App, tmp_path: Path) -> None:
+    app.open("prototype")
+    page, key = page_of(app), app.served.key
+    assert key in app.address
+    page.session.ask(lambda: page.session.record(tmp_path / "log.csv"))
+    assert until(lambda: page.session.recorder is not None)
+    html = page.export()
+    page.session.ask(lambda: page.session.end_recording() and None)
+    assert until(lambda: (tmp_path / "log.csv").is_file())
+    assert key not in html + (tmp_path / "log.csv").read_text()
+    assert f":{app.server.get_port()}" not in html
+
+
+def encoded(message: object) -> bytes:
+    import msgspec.msgpack
+
+    return msgspec.msgpack.encode(message)
+
+
+NONSENSE: dict[str, Callable[[str], bytes | str]] = {
+    "text": lambda _: "hello",
+    "nothing": lambda _: b"",
+    "noise": lambda _: np.random.default_rng(5).bytes(4000),
+    "a number": lambda _: encoded(7),
+    "a list": lambda _: encoded([1, 2]),
+    "no kind": lambda _: encoded({"value": 1}),
+    "an unknown kind": lambda _: encoded({"type": "Launch"}),
+    "fields missing": lambda _: encoded({"type": "GuiUpdateMessage"}),
+    "fields too many": lambda uuid: encoded({"type": "GuiUpdateMessage", "uuid": uuid, "updates": {}, "more": 1}),
+    "updates that are a list": lambda uuid: encoded({"type": "GuiUpdateMessage", "uuid": uuid, "updates": [1]}),
+    "no such control": lambda _: encoded({"type": "GuiUpdateMessage", "uuid": "x", "updates": {"value": 1.0}}),
+    "a control that is a list": lambda _: encoded({"type": "GuiUpdateMessage", "uuid": [1], "updates": {"value": 1.0}}),
+    "not a number": lambda uuid: encoded({"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": float("nan")}}),
+    "a word for a number": lambda uuid: encoded({"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": "far"}}),
+    "far beyond": lambda uuid: encoded({"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": 1e9}}),
+    "an attribute": lambda uuid: encoded({"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"update_cb": []}}),
+    "an attribute that is none": lambda uuid: encoded({"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"nope": 1}}),
+    "a file for a slider": lambda uuid: encoded({
+        "type": "FileTransferStartUpload", "source_component_uuid": uuid, "transfer_uuid": "t", "filename": "f", "mime_type": "m",
+        "part_count": 0, "size_bytes": 0,
+    }),
+    "a tunnel": lambda _: encoded({"type": "ShareUrlRequest"}),
+    "a camera of words": lambda _: encoded({
+        "type": "ViewerCameraMessage", "wxyz": ["a"] * 4, "position": None, "fov": "wide", "near": [], "far": {}, "image_height": "x",
+        "image_width": "y", "look_at": 3, "up_direction": "up",
+    }),
+    "a drag to nowhere": lambda _: encoded({
+        "type": "SceneNodeDragMessage", "phase": "update", "name": "/grip", "instance_index": None, "start_position": [0.0] * 3,
+        "start_screen_pos": [0.0] * 2, "end_position": [float("nan")] * 3, "end_screen_pos": [0.0] * 2, "button": "left", "modifier": None,
+        "owner": "",
+    }),
+}  # fmt: skip
+
+
+def test_nonsense_ends_in_a_sentence_and_the_session_goes_on(app: App, capfd: pytest.CaptureFixture[str]) -> None:
+    app.open("prototype")
+    page, bend = page_of(app), slider(app, "Bend x [°]")
+    for what, made in NONSENSE.items():
+        sender = RawPage(app)
+        sender.send(made(bend._impl.uuid))
+        sender.close()
+        assert until(lambda: not app.server.get_clients()), what
+    for number, value in enumerate((12.0, 21.0)):  # page after page drives as before
+        hands = RawPage(app)
+        hands.put(bend, value)
+        assert until(lambda value=value: page.pilot.arrived and abs(page.pilot.bent(0)[0] - np.radians(value)) < 1e-6), number  # type: ignore[misc]
+        hands.press(page.stop)
+        assert until(lambda: page.session.stopped)
+        hands.press(page.go_on)
+        assert until(lambda: not page.session.stopped)
+        hands.close()
+        assert until(lambda: not app.server.get_clients())
+    said = capfd.readouterr()
+    assert "Traceback" not in said.out + said.err
+    assert said.err.count("A page sent a message that makes no sense") == 1
+    assert app.server._share_tunnel is None
+
+
+def test_of_many_pages_some_are_refused_in_a_sentence_and_any_other_stops(app: App) -> None:
+    app.open("prototype")
+    page, hands = page_of(app), RawPage(app)
+    sent = [("Host", app.address.split("/")[2]), *HANDSHAKE.items()]
+
+    def again() -> bool:
+        connection, status, _ = asked(app.address, f"/{app.served.key}/", sent[:1])
+        connection.close()
+        return status == 200
+
+    opened = [asked(app.address, f"/{app.served.key}", sent) for _ in range(200)]
+    assert [status for _, status, _ in opened] == [101] * (MOST_PAGES - 1) + [503] * (201 - MOST_PAGES)
+    assert all(f"{MOST_PAGES} pages are open, which is the most" in text for _, status, text in opened if status == 503)
+    hands.press(page.stop)
+    assert until(lambda: page.session.stopped)
+    opened[0][0].close()
+    assert until(again)
+    for connection, _, _ in opened[1:]:
+        connection.close()
+    hands.close()
+
+
+class Clock:
+    """Stands until it is told."""
+
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_one_page_has_the_controls_and_another_asks_for_them() -> None:
+    pages, clock, moved = {1, 2, 3}, Clock(), []
+    holder = Holder(lambda: pages, moved=lambda: moved.append(clock.now), clock=clock)
+    assert [holder.standing(page) for page in (1, 2)] == ["free", "free"]
+    assert holder.acts(1)  # the first that acts
+    assert not holder.acts(2)
+    assert [holder.standing(page) for page in (1, 2)] == ["has", "other"]
+    holder.ask(2)
+    holder.ask(3)  # waits its turn
+    assert [holder.standing(page) for page in (1, 2, 3)] == ["asked", "asking", "other"]
+    assert holder.acts(1)
+    clock.now += 0.9 * PATIENCE
+    holder.tick()
+    holder.keep(2)  # not its own to keep
+    holder.hand_over(3)
+    holder.keep(1)
+    assert [holder.standing(page) for page in (1, 2)] == ["has", "refused"]
+    holder.ask(2)  # too soon
+    assert holder.standing(1) == "has"
+    clock.now += 1.1 * AGAIN
+    holder.tick()
+    assert holder.standing(2) == "other"
+    assert holder.acts(1)
+    holder.ask(2)
+    assert moved == []
+    clock.now += 1.1 * PATIENCE
+    holder.tick()  # nobody refused
+    assert [holder.standing(page) for page in (1, 2)] == ["other", "has"]
+    assert moved == [clock.now]
+    assert not holder.acts(1)
+    holder.ask(1)
+    holder.hand_over(2)
+    assert holder.standing(1) == "has"
+    clock.now += 1.1 * IDLE
+    holder.ask(3)  # at once: page 1 did nothing for long
+    assert [holder.acts(page) for page in (1, 2, 3)] == [False, False, True]
+    pages.remove(3)  # it left
+    holder.tick()
+    assert holder.standing(2) == "free"
+    assert holder.acts(2)
+    pages.remove(2)
+    assert holder.acts(1)  # before anybody noticed
+    assert holder.acts(None)  # the program itself
+
+
+def test_two_pages_do_not_drive_at_once_and_either_stops(app: App, monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = load_robot("prototype")
+    link = SimulatedRobot(robot, real=True)
+    monkeypatch.setattr("fastrod_viewer.session._HASTY", 0.0)
+    app.open(FreeWorld(robot), link=link)
+    page, bend, other = page_of(app), slider(app, "Bend x [°]"), slider(app, "Bend y [°]")
+    one, two = RawPage(app), RawPage(app)
+
+    def answered(by: RawPage) -> None:
+        """All that this page has sent before was dealt with: a stop from it, and from the other, is what comes after."""
+        by.press(page.stop)
+        assert until(lambda: page.session.stopped)
+
+    one.put(bend, 20.0)
+    assert until(lambda: page.pilot.arrived and abs(page.pilot.bent(0)[0] - np.radians(20.0)) < 1e-6)
+    assert (app.holder.standing(one.number), app.holder.standing(two.number)) == ("has", "other")
+    before = link.read().dl
+    two.put(other, 30.0)
+    two.put(bend, -30.0)
+    two.key("Bend toward +x")
+    two.put(page.run, "Reset")
+    assert until(lambda: other.value == 0.0 and bend.value == 20.0)  # they go back
+    np.testing.assert_array_equal(link.read().dl, before)
+    answered(two)  # the one that may not drive stops
+    assert link.stopped
+    two.press(page.go_on)
+    assert until(lambda: two.number in app._panels._noted)
+    assert page.session.stopped
+    one.press(page.go_on)
+    assert until(lambda: not page.session.stopped)
+    two.key("Stop")
+    assert until(lambda: page.session.stopped)
+    one.press(page.go_on)
+    assert until(lambda: not page.session.stopped)
+    two.put(page.run, "Pause")
+    assert until(lambda: page.session.paused)
+    two.put(page.run, "Resume")
+    one.key("Pause, or go on")
+    assert until(lambda: not page.session.paused)
+
+    assert until(lambda: two.own("Ask for control").visible)
+    two.press(two.own("Ask for control"))
+    assert until(lambda: one.own("Keep control").visible)
+    one.press(one.own("Keep control"))
+    assert until(lambda: app.holder.standing(two.number) == "refused")
+    monkeypatch.setattr("fastrod_viewer.holder.AGAIN", 0.0)
+    monkeypatch.setattr("fastrod_viewer.holder.PATIENCE", 0.0)
+    assert until(lambda: two.own("Ask for control").visible)
+    two.press(two.own("Ask for control"))
+    assert until(lambda: app.holder.standing(two.number) == "has")
+    one.put(bend, -10.0)
+    two.put(other, 15.0)
+    assert until(lambda: page.pilot.arrived and abs(page.pilot.bent(0)[1] - np.radians(15.0)) < 1e-6)
+    assert page.pilot.bent(0)[0] == pytest.approx(np.radians(20.0), abs=1e-6)
+    one.close()
+    two.close()
+
+
+@pytest.mark.parametrize("watched", [False, True], ids=["alone", "watched"])
+def test_a_page_that_closes_in_motion_leaves_no_motion_behind(app: App, watched: bool) -> None:
+    robot = load_robot("prototype")
+    link = SimulatedRobot(robot, real=True)
+    app.open(FreeWorld(robot), link=link)
+    page, hands = page_of(app), RawPage(app)
+    watcher = RawPage(app) if watched else None
+    speed, bend = slider(app, "Speed [°/s]"), slider(app, "Bend x [°]")
+    hands.put(speed, 5)  # slow, so that it is still on its way
+    hands.put(bend, 85.0)
+    assert until(lambda: bool(link.read().dl.min() < -1e-5))
+    hands.close()
+    assert until(lambda: page.pilot.arrived)  # what it was sent to is given up
+    assert link.read().dl.min() > -0.0075 * np.radians(80.0)
+    assert until(lambda: link.stopped != watched)
+    if watcher is not None:
+        watcher.put(bend, 1.0)
+        assert until(lambda: page.pilot.arrived and abs(page.pilot.bent(0)[0] - np.radians(1.0)) < 1e-6)
+        watcher.close()
