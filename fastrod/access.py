@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from websockets.datastructures import Headers
     from websockets.http11 import Request, Response
 
+    Answer = Callable[[ServerConnection, Request], Response | None]
+
 MOST_PAGES = 32
 """Open at once on one server: as many as viser has threads for what they send."""
 _LOCAL = ("127.0.0.1", "localhost", "[::1]")
@@ -33,9 +35,9 @@ _WRONG_HOST = (
     "This page is not served under this name or port: open the address that was printed in the terminal, "
     "and through a tunnel forward the same port."
 )
-_WRONG_ORIGIN = "Another site asks for this page: open the address that was printed in the terminal by itself."
+_WRONG_ORIGIN = "Another site asks for this page: open the address that was printed in the terminal."
 _FULL = f"{MOST_PAGES} pages are open, which is the most: close one and load this again."
-_SENSELESS = "A page sent a message that makes no sense; it is ignored, and so are further ones, without a word."
+_SENSELESS = "A page sent a message that makes no sense; it is ignored, and so are further ones."
 _KINDS = 20  # of sentences about pages: a page that sends nonsense for hours fills no terminal
 _patching = threading.Lock()
 
@@ -44,52 +46,55 @@ _patching = threading.Lock()
 class Access:
     """The key of one server, and the check of every request against it.
 
-    Loopback keeps no web page out: a websocket has no same-origin rule, so whatever page a browser shows may open one to
-    this machine, and a name of a stranger's may resolve to 127.0.0.1 (DNS rebinding). A request is answered only where its path
-    begins with the key, its Host is an address that is served, and its Origin, where a browser gives one, is that same address.
+    Loopback keeps no web page out: a websocket has no same-origin rule, so whatever page a browser shows may open
+    one to this machine, and a stranger's name may resolve to 127.0.0.1 (DNS rebinding). A request is answered only
+    where its path begins with the key, its Host is an address that is served, and its Origin, where a browser gives
+    one, is that same address. The key is part of the path and no cookie: browsers send cookies to every port.
     """
 
     def __init__(self, host: str) -> None:
         """`host` as the server is bound to it."""
         self.key = secrets.token_urlsafe()
-        """First part of the path; new with every server. Part of the path and not a cookie: browsers send those to every port."""
+        """First part of the path; new with every server."""
         self._names = () if _every(host) else (f"[{host}]" if ":" in host else host.lower(),)
 
     def refusal(self, path: str, headers: Headers, arrived: tuple[str, int]) -> str | None:
-        """Return one sentence that says why this request is refused, or None; `arrived` is the address and port of this machine
-        that it came to."""
+        """Return one sentence that says why this request is refused, or None; `arrived` is the address and port of
+        this machine that it came to."""
         address, port = arrived
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or hosts[0].lower() not in self._served(address, port):
             return _WRONG_HOST
         if origins and origins != [f"http://{hosts[0].lower()}"]:
             return _WRONG_ORIGIN
-        given = path.partition("?")[0].split("/")[1:2]
-        if not given or not secrets.compare_digest(given[0].encode("utf-8", "surrogateescape"), self.key.encode()):
+        given = "".join(path.partition("?")[0].split("/")[1:2]).encode("utf-8", "surrogateescape")
+        if not secrets.compare_digest(given, self.key.encode()):
             return _NO_KEY
         return None
 
     def _served(self, address: str, port: int) -> set[str]:
-        """What Host may be: this machine's own names for itself, the name that was bound, and the address that was reached."""
+        """What Host may be: this machine's names for itself, the name that was bound, the address that was reached."""
         names = {*_LOCAL, *self._names, f"[{address}]" if ":" in address else address}
         return {f"{name}:{port}" for name in names} | (names if port == _HTTP_PORT else set())
 
-    def guard(self, plain: Callable[[ServerConnection, Request], Response | None]) -> Callable[..., Response | None]:
+    def guard(self, plain: Answer) -> Answer:
         """Return a check of every request before `plain`, viser's own answer, sees it without its key."""
         from websockets.datastructures import Headers
         from websockets.http11 import Response
 
         def answer(connection: ServerConnection, request: Request) -> Response | None:
-            status, why = HTTPStatus.FORBIDDEN, self.refusal(request.path, request.headers, connection.local_address[:2])
+            status, arrived = HTTPStatus.FORBIDDEN, connection.local_address[:2]
+            why = self.refusal(request.path, request.headers, arrived)
             if why is None and len(connection.server.connections) >= MOST_PAGES:
                 status, why = HTTPStatus.SERVICE_UNAVAILABLE, _FULL
             if why is not None:
                 body = f"<!doctype html><title>Refused</title><p>{why}</p>\n".encode()
-                kind = {"Content-Type": "text/html; charset=utf-8", "Content-Length": str(len(body)), "Cache-Control": "no-store"}
+                kind = {"Content-Type": "text/html; charset=utf-8", "Content-Length": str(len(body))}
                 return Response(status, status.phrase, Headers(kind), body)
-            response = plain(connection, replace(request, path=request.path.removeprefix(f"/{self.key}") or "/"))
+            without = request.path.removeprefix(f"/{self.key}") or "/"
+            response = plain(connection, replace(request, path=without))
             if response is not None:
-                response.headers["Referrer-Policy"] = "no-referrer"  # a link in the page must not tell its address
+                response.headers["Referrer-Policy"] = "no-referrer"  # a link must not tell the page's address
                 response.headers["X-Frame-Options"] = "DENY"
             return response
 
@@ -98,21 +103,23 @@ class Access:
 
 @final
 class Ignored:
-    """Says on stderr, once for each kind, that something a page sent came to nothing, in place of a traceback each time."""
+    """Says on stderr, once for each kind, that what a page sent came to nothing, in place of a traceback each time."""
 
     def __init__(self) -> None:
         self._said: set[str] = set()
 
     def __call__(self, error: object = None, sentence: str = _SENSELESS) -> None:
         """Mention it; `error` goes to the log of whoever debugs."""
-        logging.getLogger(__name__).debug(sentence, exc_info=error if isinstance(error, BaseException) else None)
+        cause = error if isinstance(error, BaseException) else None
+        logging.getLogger(__name__).debug(sentence, exc_info=cause)
         if sentence not in self._said and len(self._said) < _KINDS:
             self._said.add(sentence)
             print(sentence, file=sys.stderr, flush=True)
 
     def failed(self, error: Exception) -> None:
         """Mention that what a page asked for could not be done."""
-        self(error, f"What a page asked for failed, and is left undone: {type(error).__name__}, {' '.join(str(error).split())}")
+        why = " ".join(str(error).split())
+        self(error, f"What a page asked for failed, and is left undone: {type(error).__name__}, {why}")
 
     def of_loop(self, _: object, context: dict[str, Any]) -> None:
         """Hear an event loop's complaint."""
@@ -155,8 +162,8 @@ class Served:
 
 
 def serve_guarded(host: str, port: int, *, label: str | None = None) -> Served:
-    """Start a viser server whose page and websocket need the key in its address. Raises `InputError` where viser is missing, or
-    serves in a way that cannot be guarded."""
+    """Start a viser server whose page and websocket need the key in its address. Raises `InputError` where viser is
+    missing, or serves in a way that cannot be guarded."""
     try:
         import viser
         from viser import _messages
@@ -181,8 +188,9 @@ def serve_guarded(host: str, port: int, *, label: str | None = None) -> Served:
     served = Served(viser=server, host=host, key=access.key, ignored=ignored)
     if not guarded.is_set():
         served.stop()
-        raise InputError(f"viser {viser.__version__} serves pages in a way that cannot be guarded; pip install 'viser==1.1.1'.")
-    for asked in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):  # no page opens a tunnel to elsewhere
+        found = viser.__version__
+        raise InputError(f"viser {found} serves pages in a way that cannot be guarded; pip install 'viser==1.1.1'.")
+    for asked in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):  # no page opens a tunnel
         server._websock_server.unregister_handler(asked)
     return served
 
@@ -210,7 +218,7 @@ def _outward(host: str) -> str:
 
 
 def _silent() -> logging.Logger:
-    """A logger that says nothing: requests hold the key, and strangers could fill a terminal with handshakes that fail."""
+    """A logger that says nothing: requests hold the key, and strangers could fill a terminal with failures."""
     logger = logging.Logger("fastrod.access.silent", level=logging.CRITICAL + 1)
     logger.addHandler(logging.NullHandler())
     return logger

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from pages import PROTOCOL
 from windows import Window
 
 import fastrod
@@ -140,6 +141,55 @@ def test_two_pages_show_the_same_and_closing_one_changes_nothing(app: App, windo
     thumb.focus()
     thumb.press("ArrowRight")
     assert second.until(lambda: abs(page_of(app).pilot.bent(0)[0] - np.radians(21.0)) < 1e-6)
+
+
+def test_of_two_pages_one_drives_and_the_other_may_ask(app: App, window: Windows, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fastrod_viewer.holder.PATIENCE", 600.0)  # a browser without a GPU may need seconds for a click
+    monkeypatch.setattr("fastrod_viewer.holder.IDLE", 600.0)
+    monkeypatch.setattr("fastrod_viewer.holder.AGAIN", 0.0)
+    app.open("prototype")
+    first, second = window(app.address), window(app.address)
+    pilot = page_of(app).pilot
+    assert first.until(lambda: first.page.get_by_text("No page has the controls.").count() == 1)
+    first.page.keyboard.press("l")
+    assert first.until(lambda: first.page.get_by_text("This page has the controls.").count() == 1)
+    assert second.until(lambda: second.page.get_by_text("Another page has the controls. This one watches").count() == 1)
+    bent = pilot.bent(0)[0]
+    assert bent > 0.05
+    thumb = second.slider("Bend x [°]")
+    thumb.focus()
+    thumb.press("End")
+    assert second.until(lambda: second.page.get_by_text("Ask for them in the window Controls").count() == 1)
+    assert second.until(lambda: thumb.get_attribute("aria-valuenow") == "5")  # it goes back
+    assert pilot.bent(0)[0] == bent
+    for answer in ("Keep control", "Hand over"):
+        second.page.get_by_role("button", name="Ask for control").click()
+        first.page.get_by_role("button", name=answer).click()
+    assert second.until(lambda: second.page.get_by_text("This page has the controls.").count() == 1)
+    thumb.focus()
+    thumb.press("ArrowRight")
+    assert second.until(lambda: pilot.bent(0)[0] > bent + 0.01)
+    first.page.keyboard.press("Escape")
+    assert first.until(lambda: page_of(app).session.stopped)
+    assert first.errors == second.errors == []
+
+
+@pytest.mark.parametrize(("page", "let_in"), [("about:blank", False), ("another site", False), ("", True)])
+def test_a_websocket_opens_from_the_page_itself_alone(app: App, window: Windows, page: str, let_in: bool) -> None:
+    app.open("prototype")
+    seen = window()
+    with App(port=0, folder=app.folder, say=lambda _: None) as other:  # another port is another site
+        seen.page.goto({"": app.address, "another site": other.address}.get(page, page))
+        address = app.address.replace("http", "ws", 1).rstrip("/")
+        opened = seen.page.evaluate(
+            """([address, protocol]) => new Promise(done => {
+                const socket = new WebSocket(address, [protocol]);
+                socket.onopen = () => done(true);
+                socket.onerror = () => done(false);
+            })""",
+            [address, PROTOCOL],
+        )
+    assert opened == let_in
 
 
 def test_closing_the_page_stops_a_real_robot(app: App, window: Windows) -> None:

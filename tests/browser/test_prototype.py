@@ -213,7 +213,10 @@ def test_stop_only_stops_however_often_it_is_pressed(bed: Bed, window: Windows, 
         assert bed.page.session.stopped
         assert bed.link.prototype.supervisor.first is not None
         assert bed.stands(other)
-    bed.go_on(other)
+    bed.go_on(other)  # not for the page that only watches
+    assert bed.says(other, "Another page has the controls. Ask for them")
+    assert bed.page.session.stopped
+    bed.go_on(seen)
     assert other.until(lambda: not bed.page.session.stopped)
     for each in (seen, other):
         assert each.until(lambda each=each: each.page.get_by_role("button", name="GO ON").is_disabled())  # type: ignore[misc]

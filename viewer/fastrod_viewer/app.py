@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, final
 
-from fastrod.access import Served, is_loopback
+from fastrod.access import Served
 from fastrod.errors import FastrodError, InputError
 from fastrod.link import RobotLink
 from fastrod.robot import Robot
@@ -42,7 +42,8 @@ class App:
     """One page at a time on one server, for every browser that is connected. `close` it, or use it as a context."""
 
     def __init__(
-        self, *, host: str = "127.0.0.1", port: int | None = None, folder: Path | None = None, server: Served | None = None,
+        self, *, host: str = "127.0.0.1", port: int | None = None, folder: Path | None = None,
+        server: Served | None = None,
         say: Callable[[str], None] = lambda sentence: print(sentence, file=sys.stderr, flush=True),
     ) -> None:  # fmt: skip
         """`port` None takes the first free one from 8080 on, 0 any; `server` is one that `serve` has started already; `folder` takes what
@@ -90,8 +91,8 @@ class App:
             else:
                 script = script or not isinstance(new, FreeWorld)
                 self.page = DrivePage(
-                    self.server, self.canvas, new, folder=self.folder, replay=self._replay, echo=self._echo, may=self._panels.may,
-                    link=link, script=script,
+                    self.server, self.canvas, new, folder=self.folder, replay=self._replay, echo=self._echo,
+                    may=self._panels.may, link=link, script=script,
                 )  # fmt: skip
             self._show_picker(str(what) if isinstance(what, str) and not is_log(what) else self.page.title)
             self._picker.disabled = link is not None  # another scene would let go of the robot
@@ -252,8 +253,8 @@ def view(
 ) -> None:  # fmt: skip
     """Show something in the browser until Ctrl+C: a scene or robot by name, a robot's file, a log with what models say to it.
 
-    `server` is one that `serve` has started. SIGTERM ends it as Ctrl+C does: robots are stopped, recordings saved. Raises
-    `FastrodError`, one sentence, for what cannot be shown.
+    `server` is one that `serve` has started. SIGTERM ends it as Ctrl+C does: robots are stopped, recordings saved.
+    Raises `FastrodError`, one sentence, for what cannot be shown.
     """
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -266,8 +267,8 @@ def view(
         app.open(shown, link=link, script=script)
         if app.served.elsewhere:
             app.say(
-                f"Other machines reach this page, too: {app.served.elsewhere} - whoever has this address can drive and nobody else; "
-                "it is the key, it travels unencrypted, and it lasts until Ctrl+C."
+                f"Other machines reach this page, too, at {app.served.elsewhere} and whoever has this address can drive: "
+                "it is the key, nobody gets in without it, it travels unencrypted, and it is good until Ctrl+C."
             )
         print(f"{app.page.title if app.page else what}: {app.address} (Ctrl+C ends it)", flush=True)
         app.wait()

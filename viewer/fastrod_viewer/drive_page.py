@@ -49,11 +49,12 @@ class DrivePage(Page):
     """Controls on one side, the robot, a legend, and what its camera sees."""
 
     def __init__(
-        self, server: viser.ViserServer, canvas: Canvas, world: World, *, folder: Path, replay: Callable[[RunLog, World], None],
-        echo: Callable[[], float], may: Callable[[Any], bool], link: RobotLink | None = None, script: bool = False,
+        self, server: viser.ViserServer, canvas: Canvas, world: World, *, folder: Path,
+        replay: Callable[[RunLog, World], None], echo: Callable[[], float], may: Callable[[Any], bool],
+        link: RobotLink | None = None, script: bool = False,
     ) -> None:  # fmt: skip
-        """`folder` takes recordings; `replay` shows one; `echo` is the time that pages take to draw [s]; `may` says of an event
-        whether the page it comes from may act."""
+        """`folder` takes recordings; `replay` shows one; `echo` is the time that pages take to draw [s]; `may` says of
+        an event whether the page it comes from may act."""
         self.server, self.world, self.title, self._may = server, world, world.name, may
         self._folder, self._replay, self._echo = folder, replay, echo
         touches = world.rods[0].state.contacts is not None
@@ -64,11 +65,8 @@ class DrivePage(Page):
         self.drawing = Drawing(canvas, world, Options(body="skin" if touches or many else "backbone"), measured=link is not None)
         self.sight = Sight(self.drawing.middle, self.drawing.size * (1.0 if far is None or not far.sees else _FARTHER))
         self.session = Session(world, self.pilot, draw=self._draw, link=link, script=script)
-        self.grip = (
-            Grip(server, self.session, min(1.25 * self.drawing.radius, 0.1 * world.robot.length), world.rods[0].place[0], may=may)
-            if self._can_drag()
-            else None
-        )
+        ball = min(1.25 * self.drawing.radius, 0.1 * world.robot.length)
+        self.grip = Grip(server, self.session, ball, world.rods[0].place[0], may=may) if self._can_drag() else None
         self._latency = float("nan")
         self._told = self._looked = 0.0
         self._last: RunLog | None = None

@@ -7,7 +7,6 @@ import time
 from typing import TYPE_CHECKING, Any, final
 
 from fastrod_viewer.holder import AGAIN, PATIENCE, Holder, Standing
-from fastrod_viewer.page import tell
 
 if TYPE_CHECKING:
     import viser
@@ -40,7 +39,8 @@ class HolderPanels:
         now = time.monotonic()
         if now - self._noted.get(event.client_id, -_QUIET) >= _QUIET:
             self._noted[event.client_id] = now
-            tell(event.client, "Not done", "Another page has the controls. Ask for them in the window Controls.", failed=True)
+            why = "Another page has the controls. Ask for them in the window Controls."
+            event.client.add_notification("Not done", why, auto_close_seconds=5.0, color="yellow")
         return False
 
     def show(self) -> None:
@@ -68,7 +68,7 @@ class _Panel:
             self._ask = gui.add_button("Ask for control", visible=False)
             self._keep = gui.add_button("Keep control", visible=False)
             self._hand_over = gui.add_button("Hand over", color="gray", visible=False)
-        self._panel.float(x=15, y=15, width=250)
+        self._panel.float(x=15, y=-260, width=250)  # below viser's notes, above the plot of a log
         self._ask.on_click(lambda _: holder.ask(page))
         self._keep.on_click(lambda _: holder.keep(page))
         self._hand_over.on_click(lambda _: holder.hand_over(page))

@@ -1,4 +1,4 @@
-"""What a page may send: a value that the control can have, for a control that is there. All else ends here, without a traceback."""
+"""What a page may send: a value that a control can have. All else ends here, without a traceback."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from fastrod.access import Ignored, Served
 def heed_sense(served: Served) -> None:
     """Have a server drop what its own pages never send, and survive callbacks that fail on it.
 
-    viser sets any attribute of a control that a message names, takes files for a slider, and prints the traceback of each callback.
+    viser sets any attribute of a control that a message names, takes a file for a slider's value, and prints the
+    traceback of every callback that fails.
     """
     from viser import _messages
 
@@ -22,7 +23,8 @@ def heed_sense(served: Served) -> None:
     for kind in (_messages.FileTransferStartUpload, _messages.FileTransferPart):  # there is nothing to upload
         handlers.pop(kind, None)
     known: Any = handlers[_messages.GuiUpdateMessage]
-    handlers[_messages.GuiUpdateMessage] = [_checked(handler, server.gui, served.ignored) for handler in known]
+    checked = [_checked(handler, server.gui, served.ignored) for handler in known]
+    handlers[_messages.GuiUpdateMessage] = checked
     pool: Any = server._thread_executor
     plain = pool.submit
 
@@ -46,7 +48,7 @@ def fits(handle: Any, updates: object) -> bool:
     if isinstance(now, (int, float)):
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             return False
-        step = float(getattr(handle, "step", 0.0) or 0.0)  # a page rounds to steps, and may pass an end by part of one
+        step = float(getattr(handle, "step", 0.0) or 0.0)  # a page rounds to steps, past an end by part of one
         return bool(handle.min - step <= value <= handle.max + step)
     return type(value) is type(now)
 

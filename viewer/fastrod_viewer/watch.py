@@ -19,8 +19,8 @@ _KEY = "fastrod-echo"
 class Watch:
     """Asks every page for an answer every second, and tells who came and went, `lost(client, clients left)` for the latter.
 
-    A page that does not answer within three seconds counts as gone until it answers again. Each is asked in a thread of its own,
-    so that those which do not answer hide no other.
+    A page that does not answer within three seconds counts as gone until it answers again. Each is asked in a thread of
+    its own, so that those which do not answer hide no other.
     """
 
     def __init__(self, server: viser.ViserServer, *, lost: Callable[[int, int], None], tick: Callable[[], None] = lambda: None) -> None:
@@ -52,7 +52,8 @@ class Watch:
         return len(self.present())
 
     def _came(self, client: Any) -> None:
-        threading.Thread(target=self._ask, args=(client,), name=f"watch {client.client_id}", daemon=True).start()
+        name = f"watch {client.client_id}"
+        threading.Thread(target=self._ask, args=(client,), name=name, daemon=True).start()
 
     def _gone(self, client: int) -> None:
         self._silent.discard(client)
