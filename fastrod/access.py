@@ -46,10 +46,11 @@ _patching = threading.Lock()
 class Access:
     """The key of one server, and the check of every request against it.
 
-    Loopback keeps no web page out: a websocket has no same-origin rule, so whatever page a browser shows may open
-    one to this machine, and a stranger's name may resolve to 127.0.0.1 (DNS rebinding). A request is answered only
-    where its path begins with the key, its Host is an address that is served, and its Origin, where a browser gives
-    one, is that same address. The key is part of the path and no cookie: browsers send cookies to every port.
+    Loopback keeps no web page out: a websocket has no same-origin rule, so whatever page a browser shows may
+    open one to this machine, and a stranger's name may resolve to 127.0.0.1 (DNS rebinding). A request is
+    answered only where its path begins with the key, its Host is an address that is served, and its Origin,
+    where a browser gives one, is that same address. The key is part of the path and no cookie: browsers send
+    cookies to every port.
     """
 
     def __init__(self, host: str) -> None:
@@ -59,8 +60,8 @@ class Access:
         self._names = () if _every(host) else (f"[{host}]" if ":" in host else host.lower(),)
 
     def refusal(self, path: str, headers: Headers, arrived: tuple[str, int]) -> str | None:
-        """Return one sentence that says why this request is refused, or None; `arrived` is the address and port of
-        this machine that it came to."""
+        """Return one sentence that says why this request is refused, or None; `arrived` is the address and
+        port of this machine that it came to."""
         address, port = arrived
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or hosts[0].lower() not in self._served(address, port):
@@ -73,7 +74,8 @@ class Access:
         return None
 
     def _served(self, address: str, port: int) -> set[str]:
-        """What Host may be: this machine's names for itself, the name that was bound, the address that was reached."""
+        """What Host may be: this machine's names for itself, the name that was bound, the address that was
+        reached."""
         names = {*_LOCAL, *self._names, f"[{address}]" if ":" in address else address}
         return {f"{name}:{port}" for name in names} | (names if port == _HTTP_PORT else set())
 
@@ -103,7 +105,8 @@ class Access:
 
 @final
 class Ignored:
-    """Says on stderr, once for each kind, that what a page sent came to nothing, in place of a traceback each time."""
+    """Says on stderr, once for each kind, that what a page sent came to nothing, in place of a traceback each
+    time."""
 
     def __init__(self) -> None:
         self._said: set[str] = set()
@@ -162,8 +165,8 @@ class Served:
 
 
 def serve_guarded(host: str, port: int, *, label: str | None = None) -> Served:
-    """Start a viser server whose page and websocket need the key in its address. Raises `InputError` where viser is
-    missing, or serves in a way that cannot be guarded."""
+    """Start a viser server whose page and websocket need the key in its address. Raises `InputError` where
+    viser is missing, or serves in a way that cannot be guarded."""
     try:
         import viser
         from viser import _messages
@@ -189,7 +192,8 @@ def serve_guarded(host: str, port: int, *, label: str | None = None) -> Served:
     if not guarded.is_set():
         served.stop()
         found = viser.__version__
-        raise InputError(f"viser {found} serves pages in a way that cannot be guarded; pip install 'viser==1.1.1'.")
+        why = "serves pages in a way that cannot be guarded"
+        raise InputError(f"viser {found} {why}; pip install 'viser==1.1.1'.")
     for asked in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):  # no page opens a tunnel
         server._websock_server.unregister_handler(asked)
     return served
@@ -218,7 +222,8 @@ def _outward(host: str) -> str:
 
 
 def _silent() -> logging.Logger:
-    """A logger that says nothing: requests hold the key, and strangers could fill a terminal with failures."""
+    """A logger that says nothing: requests hold the key, and strangers could fill a terminal with
+    failures."""
     logger = logging.Logger("fastrod.access.silent", level=logging.CRITICAL + 1)
     logger.addHandler(logging.NullHandler())
     return logger

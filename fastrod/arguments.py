@@ -104,7 +104,10 @@ def build() -> tuple[argparse.ArgumentParser, list[str]]:
     view.add_argument("--robots", type=int, default=1, metavar="N", help="so many of the robot, in a grid, driven alike (default: 1)")
     view.add_argument("--play", action="store_true", help="begin with the robot's demo motion; scenes always begin with their script")
     view.add_argument("--port", type=int, metavar="P", help="default: the first free one from 8080 on")
-    view.add_argument("--host", default="127.0.0.1", metavar="H", help="address to listen on (default: 127.0.0.1, this machine alone)")
+    view.add_argument(
+        "--host", default="127.0.0.1", metavar="H",
+        help="address to listen on (default: 127.0.0.1, this machine alone); the printed address is the key",
+    )  # fmt: skip
     view.add_argument("--no-open", action="store_true", help="do not open a browser")
 
     _add_drive(

@@ -51,20 +51,23 @@ def browser() -> Iterator[Any]:
 
 
 @contextmanager
-def serving(*words: str, port: int) -> Iterator[Any]:
-    """`fastrod view` in a process of its own."""
+def serving(*words: str, port: int) -> Iterator[tuple[Any, str]]:
+    """`fastrod view` in a process of its own, and the address that it would open a browser with."""
     import psutil
 
-    process = subprocess.Popen(
-        [sys.executable, "-m", "fastrod.cli", "view", *words, "--no-open", "--port", str(port)],
-        stdout=subprocess.DEVNULL,
+    with subprocess.Popen(
+        [sys.executable, "-m", "fastrod.cli", "view", *words, "--port", str(port)],
+        stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
-    )
-    try:
-        yield psutil.Process(process.pid)
-    finally:
-        process.terminate()
-        process.wait(timeout=20)
+        text=True,
+        env={**os.environ, "BROWSER": "echo"},  # prints the address when a browser is opened
+    ) as process:
+        try:
+            assert process.stdout is not None
+            yield psutil.Process(process.pid), process.stdout.readline().strip()
+        finally:
+            process.terminate()
+            process.communicate(timeout=20)
 
 
 def reached(page: Any, address: str, ready: Callable[[], bool], seconds: float = 120.0) -> None:
@@ -136,9 +139,9 @@ def load(what: str, seconds: float, port: int) -> Row:
     from windows import Window
 
     note_progress(f"load, {what}")
-    with browser() as chromium, serving(what, "--play", port=port) as process:
+    with browser() as chromium, serving(what, "--play", port=port) as (process, address):
         window = Window(chromium)
-        reached(window.page, f"http://127.0.0.1:{port}", lambda: window.page.get_by_role("button", name="STOP").count() > 0)
+        reached(window.page, address, lambda: window.page.get_by_role("button", name="STOP").count() > 0)
         time.sleep(4.0)
         before, began = process.cpu_times(), time.perf_counter()
         time.sleep(seconds)
@@ -155,9 +158,9 @@ def start(port: int) -> float:
     with browser() as chromium:
         window = Window(chromium)
         began = time.perf_counter()
-        with serving("five_segment_reacher", port=port):
+        with serving("five_segment_reacher", port=port) as (_, address):
             reached(
-                window.page, f"http://127.0.0.1:{port}",
+                window.page, address,
                 lambda: window.page.get_by_role("button", name="STOP").count() > 0 and window.page.locator("canvas").count() > 0,
             )  # fmt: skip
             taken = time.perf_counter() - began
@@ -170,9 +173,9 @@ def memory(minutes: float, port: int) -> list[Row]:
     from windows import Window
 
     rows: list[Row] = []
-    with browser() as chromium, serving("five_segment_reacher", "--play", port=port) as process:
+    with browser() as chromium, serving("five_segment_reacher", "--play", port=port) as (process, address):
         first = Window(chromium)
-        reached(first.page, f"http://127.0.0.1:{port}", lambda: first.page.get_by_role("button", name="STOP").count() > 0)
+        reached(first.page, address, lambda: first.page.get_by_role("button", name="STOP").count() > 0)
         windows = [first]
         began = time.monotonic()
         next_row = 0.0
@@ -181,7 +184,7 @@ def memory(minutes: float, port: int) -> list[Row]:
             if len(windows) >= PAGES:
                 windows.pop(0).close()
             window = Window(chromium, 640, 400)
-            window.page.goto(f"http://127.0.0.1:{port}")
+            window.page.goto(address)
             windows.append(window)
             turn += 1
             if gone >= next_row:

@@ -1,11 +1,12 @@
-"""`RawPage`: a page of the viewer without a browser, which sends what a page of viser sends, or anything else."""
+"""`RawPage`: a page of the viewer without a browser, which sends what a page of viser sends, or anything
+else."""
 
 from __future__ import annotations
 
-import http.client
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from http.client import HTTPConnection
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -14,26 +15,34 @@ import viser
 import zstandard
 from viser import _messages
 from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Subprotocol
 
 from fastrod_viewer.app import App
 
 CAMERA = _messages.ViewerCameraMessage(
-    wxyz=(1.0, 0.0, 0.0, 0.0), position=(1.0, 0.0, 0.0), fov=0.75, near=0.01, far=10.0, image_height=600, image_width=800,
-    look_at=(0.0, 0.0, 0.0), up_direction=(0.0, 0.0, 1.0),
+    wxyz=(1.0, 0.0, 0.0, 0.0), position=(1.0, 0.0, 0.0), fov=0.75, near=0.01, far=10.0, image_height=600,
+    image_width=800, look_at=(0.0, 0.0, 0.0), up_direction=(0.0, 0.0, 1.0),
 )  # fmt: skip
 PROTOCOL = f"viser-v{viser.__version__}"
 HANDSHAKE = {
-    "Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==", "Sec-WebSocket-Version": "13",
-    "Sec-WebSocket-Protocol": PROTOCOL,
+    "Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
+    "Sec-WebSocket-Version": "13", "Sec-WebSocket-Protocol": PROTOCOL,
 }  # fmt: skip
 
 
-def asked(address: str, path: str, headers: list[tuple[str, str]]) -> tuple[http.client.HTTPConnection, int, str]:
-    """Send one request exactly as it is given: the open connection, the status, and the text of the answer unless it is a websocket."""
+def websocket(address: str) -> ClientConnection:
+    """Open the websocket of a page."""
+    at = address.replace("http", "ws", 1).rstrip("/")
+    return connect(at, subprotocols=[Subprotocol(PROTOCOL)], max_size=None)
+
+
+def asked(address: str, path: str, headers: Iterable[tuple[str, ...]]) -> tuple[HTTPConnection, int, str]:
+    """Send one request exactly as it is given: the open connection, the status, and the text of the answer
+    unless it is a websocket."""
     at = urlsplit(address)
     assert at.hostname is not None
-    connection = http.client.HTTPConnection(at.hostname, at.port, timeout=60.0)
+    connection = HTTPConnection(at.hostname, at.port, timeout=60.0)
     connection.putrequest("GET", path, skip_host=True, skip_accept_encoding=True)
     for name, value in headers:
         connection.putheader(name, value)
@@ -48,9 +57,7 @@ class RawPage:
     def __init__(self, app: App) -> None:
         before = set(app.server.get_clients())
         self.app = app
-        self.socket = connect(app.address.replace("http", "ws", 1).rstrip("/"), subprotocols=[PROTOCOL], max_size=None)  # type: ignore[list-item]
-        self.gui: dict[str, dict[str, Any]] = {}
-        """Props of the controls that this page alone has, by id."""
+        self.socket = websocket(app.address)
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
         self.send(CAMERA)
@@ -59,8 +66,8 @@ class RawPage:
 
     def send(self, message: Any) -> None:
         """A message of viser's, or bytes or text as they are."""
-        raw = message if isinstance(message, (bytes, str)) else msgspec.msgpack.encode(message.as_serializable_dict())
-        self.socket.send(raw)
+        ready = isinstance(message, (bytes, str))
+        self.socket.send(message if ready else msgspec.msgpack.encode(message.as_serializable_dict()))
 
     def put(self, handle: Any, value: Any) -> None:
         """Move a control, or press a button."""
@@ -72,7 +79,8 @@ class RawPage:
     def key(self, label: str) -> None:
         """Press a key that stands for a command."""
         known = self.app.server.gui._command_handle_from_uuid
-        self.send(_messages.CommandTriggerMessage(next(k for k, command in known.items() if command.label == label)))
+        (uuid,) = (uuid for uuid, command in known.items() if command.label == label)
+        self.send(_messages.CommandTriggerMessage(uuid))
 
     def own(self, label: str) -> Any:
         """A button that this page alone has."""
@@ -90,7 +98,8 @@ class RawPage:
                 inner = zstandard.ZstdDecompressor().decompress(raw[16 : 16 + packed], max_output_size=size)
                 for message in msgspec.msgpack.decode(inner)["messages"]:
                     if message["type"] == "LocalStorageGetItemRequestMessage":
-                        self.send(_messages.LocalStorageGetItemResponseMessage(None, None, message["request_uuid"]))
+                        asked_by = message["request_uuid"]
+                        self.send(_messages.LocalStorageGetItemResponseMessage(None, None, asked_by))
         except ConnectionClosed:
             return
 
@@ -105,4 +114,5 @@ def until(holds: Callable[[], bool], seconds: float = 60.0) -> bool:
 
 def slider(app: App, label: str) -> Any:
     """A control of the page, by its label."""
-    return next(handle for handle in app.server.gui._gui_input_handle_from_uuid.values() if handle.label == label)
+    handles = app.server.gui._gui_input_handle_from_uuid.values()
+    return next(handle for handle in handles if handle.label == label)

@@ -26,8 +26,8 @@ _LAMPS = (("key", (1.0, -1.6, 2.2), 1.5), ("fill", (-1.8, 0.8, 0.9), 0.6))
 
 @final
 class Page:
-    """A viser server on 127.0.0.1, on the first free port from 8080 on; its address, without which the page cannot be
-    loaded, goes to stderr once."""
+    """A viser server on 127.0.0.1, on the first free port from 8080 on; its address, without which the page
+    cannot be loaded, goes to stderr once."""
 
     def __init__(self, task: Task) -> None:
         """Raises `InputError` where viser is missing, or no port is free."""

@@ -143,7 +143,8 @@ def test_it_serves_this_machine_alone_and_ends_at_once(end: signal.Signals) -> N
         try:
             assert process.stdout is not None
             assert process.stderr is not None
-            line = re.fullmatch(rf"prototype: (http://127\.0\.0\.1:{port}/\S+/) \(Ctrl\+C ends it\)\n", process.stdout.readline())
+            printed = rf"prototype: (http://127\.0\.0\.1:{port}/\S+/) \(Ctrl\+C ends it\)\n"
+            line = re.fullmatch(printed, process.stdout.readline())
             assert line is not None
             with urllib.request.urlopen(line[1], timeout=5) as page:
                 assert b"<html" in page.read(2000).lower()

@@ -253,8 +253,8 @@ def view(
 ) -> None:  # fmt: skip
     """Show something in the browser until Ctrl+C: a scene or robot by name, a robot's file, a log with what models say to it.
 
-    `server` is one that `serve` has started. SIGTERM ends it as Ctrl+C does: robots are stopped, recordings saved.
-    Raises `FastrodError`, one sentence, for what cannot be shown.
+    `server` is one that `serve` has started. SIGTERM ends it as Ctrl+C does: robots are stopped, recordings
+    saved. Raises `FastrodError`, one sentence, for what cannot be shown.
     """
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -267,8 +267,8 @@ def view(
         app.open(shown, link=link, script=script)
         if app.served.elsewhere:
             app.say(
-                f"Other machines reach this page, too, at {app.served.elsewhere} and whoever has this address can drive: "
-                "it is the key, nobody gets in without it, it travels unencrypted, and it is good until Ctrl+C."
+                f"Other machines reach this page, too, at {app.served.elsewhere} and whoever has this address "
+                "can drive: it is the key, nobody gets in without it, and it travels unencrypted."
             )
         print(f"{app.page.title if app.page else what}: {app.address} (Ctrl+C ends it)", flush=True)
         app.wait()

@@ -27,7 +27,8 @@ class Controls:
     """Handles of one robot's controls, made inside the tabs `drive` and `loads`; they follow the pilot, whoever moves it."""
 
     def __init__(
-        self, server: viser.ViserServer, session: Session, drive: Any, loads: Any, *, may: Callable[[Any], bool]
+        self, server: viser.ViserServer, session: Session, drive: Any, loads: Any, *,
+        may: Callable[[Any], bool],
     ) -> None:  # fmt: skip
         """`may` says of an event whether the page it comes from may act."""
         self.server, self.session, self.pilot, self._may = server, session, session.pilot, may
@@ -118,7 +119,8 @@ class Controls:
         self.server.gui.add_button(label, color="gray").on_click(press)
 
     def _listen(self, handle: Any, put: Callable[[Any], None], *, take_over: bool = True) -> None:
-        """What a person changes goes to `put`; what `follow` shows does not. Where the page may not act it goes back."""
+        """What a person changes goes to `put`; what `follow` shows does not. Where the page may not act it
+        goes back."""
         kept = handle.value
 
         def changed(event: Any) -> None:
@@ -173,8 +175,8 @@ class Controls:
 
 
 def stops(session: Session) -> Callable[[Any], Any]:
-    """Return what a STOP calls, on every page: it runs in viser's own loop, before what is sent later and whatever else
-    pages have asked for."""
+    """Return what a STOP calls, on every page: it runs in viser's own loop, before what is sent later and
+    whatever else pages have asked for."""
 
     async def stop(_: object) -> None:
         session.stop()

@@ -53,8 +53,8 @@ class DrivePage(Page):
         replay: Callable[[RunLog, World], None], echo: Callable[[], float], may: Callable[[Any], bool],
         link: RobotLink | None = None, script: bool = False,
     ) -> None:  # fmt: skip
-        """`folder` takes recordings; `replay` shows one; `echo` is the time that pages take to draw [s]; `may` says of
-        an event whether the page it comes from may act."""
+        """`folder` takes recordings; `replay` shows one; `echo` is the time that pages take to draw [s];
+        `may` says of an event whether the page it comes from may act."""
         self.server, self.world, self.title, self._may = server, world, world.name, may
         self._folder, self._replay, self._echo = folder, replay, echo
         touches = world.rods[0].state.contacts is not None
@@ -66,7 +66,8 @@ class DrivePage(Page):
         self.sight = Sight(self.drawing.middle, self.drawing.size * (1.0 if far is None or not far.sees else _FARTHER))
         self.session = Session(world, self.pilot, draw=self._draw, link=link, script=script)
         ball = min(1.25 * self.drawing.radius, 0.1 * world.robot.length)
-        self.grip = Grip(server, self.session, ball, world.rods[0].place[0], may=may) if self._can_drag() else None
+        middle, can = world.rods[0].place[0], self._can_drag()
+        self.grip = Grip(server, self.session, ball, middle, may=may) if can else None
         self._latency = float("nan")
         self._told = self._looked = 0.0
         self._last: RunLog | None = None

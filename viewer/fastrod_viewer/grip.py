@@ -23,10 +23,11 @@ class Grip:
     """Follows the tip, or the hand that has got hold of it; the pilot then takes the tip there by inverse kinematics."""
 
     def __init__(
-        self, server: viser.ViserServer, session: Session, radius: float, place: Floats, *, may: Callable[[Any], bool]
+        self, server: viser.ViserServer, session: Session, radius: float, place: Floats, *,
+        may: Callable[[Any], bool],
     ) -> None:  # fmt: skip
-        """`radius` of the ball [m]; `place` (3,) is where the world's origin is drawn for the robot that hands drive
-        [m]; `may` says of an event whether the page it comes from may act."""
+        """`radius` of the ball [m]; `place` (3,) is where the world's origin is drawn for the robot that
+        hands drive [m]; `may` says of an event whether the page it comes from may act."""
         self.session, self._place, self._may = session, place, may
         self._held_by: int | None = None
         self._ball: Any = server.scene.add_icosphere(

@@ -8,29 +8,33 @@ from collections.abc import Callable, Collection
 from typing import Literal, final
 
 IDLE = 30.0
-"""s without an action, after which the page that has the controls is not asked: the first that asks gets them."""
+"""s without an action, after which the page that has the controls is not asked: the first that asks gets
+them."""
 PATIENCE = 5.0
 """s in which the page that is asked may keep them; after that they go to the page that asked."""
 AGAIN = 10.0
 """s after a refusal in which the same page does not ask again."""
 
 Standing = Literal["free", "has", "asked", "other", "asking", "refused"]
-"""Of one page: the controls are free; it has them; it is asked for them; another has them; it asks; it was refused."""
+"""Of one page: the controls are free; it has them; it is asked for them; another has them; it asks; it was
+refused."""
 
 
 @final
 class Holder:
-    """One page drives at a time: the first that acts, until it leaves, hands over, or does not refuse a page that asks.
+    """One page drives at a time: the first that acts, until it leaves, hands over, or does not refuse a page
+    that asks.
 
-    A page is a number. Every method may be called from any thread. Any page may stop the robot, and needs none of this.
+    A page is a number. Every method may be called from any thread. Any page may stop the robot, and needs
+    none of this.
     """
 
     def __init__(
         self, pages: Callable[[], Collection[int]], *, changed: Callable[[], None] = lambda: None,
         moved: Callable[[], None] = lambda: None, clock: Callable[[], float] = time.monotonic,
     ) -> None:  # fmt: skip
-        """`pages` are those that are open and answer; `changed` hears when a standing has changed, and `moved` when the
-        controls have left a page: what is on its way stops then."""
+        """`pages` are those that are open and answer; `changed` hears when a standing has changed, and
+        `moved` when the controls have left a page: what is on its way stops then."""
         self._pages, self._changed, self._moved, self._clock = pages, changed, moved, clock
         self._lock = threading.RLock()
         self._has: int | None = None
@@ -39,8 +43,8 @@ class Holder:
         self._refused: dict[int, float] = {}
 
     def acts(self, page: int | None) -> bool:
-        """Return whether this page may act now; it takes controls that are free. None stands for the program itself,
-        which may."""
+        """Return whether this page may act now; it takes controls that are free. None stands for the program
+        itself, which may."""
         if page is None:
             return True
         with self._lock:
@@ -58,8 +62,8 @@ class Holder:
         return may
 
     def ask(self, page: int) -> None:
-        """This page would have the controls: at once where nobody holds on to them, else if it is not refused in time.
-        Nothing comes of it while a third is asking."""
+        """This page would have the controls: at once where nobody holds on to them, else if it is not refused
+        in time. Nothing comes of it while a third is asking."""
         with self._lock:
             now = self._clock()
             if self._has == page or now - self._refused.get(page, -AGAIN) < AGAIN:

@@ -1,4 +1,5 @@
-"""`HolderPanels`: where more than one page is open, each says who has the controls, and offers to ask for them."""
+"""`HolderPanels`: where more than one page is open, each says who has the controls, and offers to ask for
+them."""
 
 from __future__ import annotations
 
@@ -33,7 +34,8 @@ class HolderPanels:
         self._noted: dict[int, float] = {}
 
     def may(self, event: Any) -> bool:
-        """Return whether the page that an event of viser comes from may act now; a page that may not reads why."""
+        """Return whether the page that an event of viser comes from may act now; a page that may not reads
+        why."""
         if self.holder.acts(event.client_id):
             return True
         now = time.monotonic()

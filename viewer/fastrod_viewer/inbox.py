@@ -13,8 +13,8 @@ from fastrod.access import Ignored, Served
 def heed_sense(served: Served) -> None:
     """Have a server drop what its own pages never send, and survive callbacks that fail on it.
 
-    viser sets any attribute of a control that a message names, takes a file for a slider's value, and prints the
-    traceback of every callback that fails.
+    viser sets any attribute of a control that a message names, takes a file for a slider's value, and prints
+    the traceback of every callback that fails.
     """
     from viser import _messages
 
@@ -48,7 +48,7 @@ def fits(handle: Any, updates: object) -> bool:
     if isinstance(now, (int, float)):
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             return False
-        step = float(getattr(handle, "step", 0.0) or 0.0)  # a page rounds to steps, past an end by part of one
+        step = float(getattr(handle, "step", 0.0) or 0.0)  # a page rounds to steps, past an end
         return bool(handle.min - step <= value <= handle.max + step)
     return type(value) is type(now)
 

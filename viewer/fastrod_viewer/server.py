@@ -17,8 +17,8 @@ _TRIES = 20
 
 
 def serve(host: str = "127.0.0.1", port: int | None = None) -> Served:
-    """Start a server; `port` None takes the first free one from 8080 on, 0 any. Raises `InputError` where viser is
-    missing, or host or port cannot be had."""
+    """Start a server; `port` None takes the first free one from 8080 on, 0 any. Raises `InputError` where
+    viser is missing, or host or port cannot be had."""
     served = serve_guarded(host, free_port(host, port))
     _push_from_any_thread()
     heed_sense(served)
