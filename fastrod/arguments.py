@@ -26,7 +26,7 @@ DATA_SETS = ("shapes", "rollouts", "sweep")
 _MOVING = tuple(name for name in ACTIONS if name not in BOARD_ACTIONS)
 _OF: dict[str, tuple[str, ...]] = {
     "eds": _MOVING, "no_home": _MOVING, "path": ("track",),
-    "policy": ("track",), "payload": ("excite", "loop"), "views": BOARD_ACTIONS, "board": BOARD_ACTIONS, "square": BOARD_ACTIONS,
+    "policy": ("track",), "trust": ("track",), "payload": ("excite", "loop"), "views": BOARD_ACTIONS, "board": BOARD_ACTIONS, "square": BOARD_ACTIONS,
     "board_marker": BOARD_ACTIONS, "dictionary": BOARD_ACTIONS, "at": ("register",), "port": ("teleop",), "no_open": ("teleop",),
     "out": tuple(name for name in ACTIONS if name != "teleop"), "bus": _MOVING,
 }  # fmt: skip
@@ -139,10 +139,12 @@ def build() -> tuple[argparse.ArgumentParser, list[str]]:
     )
     train.add_argument("--out", type=Path, metavar="DIR", help="policy, configuration, checkpoints, curves (default: NAME_ALGO_SEED)")
     train.add_argument("--resume", action="store_true", help="go on with the training in --out, after a kill or to more --steps")
+    _add_trust(train, "--resume: ")
 
     evaluate = commands.add_parser("evaluate", help="a policy beside the baselines: success, distance, contacts")
     evaluate.add_argument("env", metavar="ENV", help="a task, such as Reach or fastrod/Reach-v0")
     evaluate.add_argument("policy", metavar="POLICY", help="a folder of `fastrod train`, `shipped`, or `none` for the baselines alone")
+    _add_trust(evaluate)
     evaluate.add_argument("--episodes", type=int, default=100, metavar="N", help="one for each seed (default: 100)")
     evaluate.add_argument("--seed", type=int, default=1000, metavar="S", help="of the first episode (default: 1000)")
     evaluate.add_argument("--no-baselines", action="store_true", help="the policy alone")
@@ -190,6 +192,13 @@ def check_drive(arguments: argparse.Namespace) -> None:
         raise UsageError(f"--camera none is for teleop alone; {action} needs a camera.")
 
 
+def _add_trust(parser: argparse._ActionsContainer, of: str = "") -> None:
+    parser.add_argument(
+        "--trust", action="store_true",
+        help=f"{of}where the folder has no file of our own, read that of stable-baselines3: this runs code of whoever made it",
+    )  # fmt: skip
+
+
 def _add_drive(drive: argparse.ArgumentParser) -> None:
     drive.add_argument("action", nargs="?", default="teleop", metavar="ACTION", help="one of those above (default: teleop)")
     files = "file that excite and track record to, folder of loop, camera file of calibrate, register and latency"
@@ -213,6 +222,7 @@ def _add_drive(drive: argparse.ArgumentParser) -> None:
     runs = drive.add_argument_group("track, excite, loop")
     runs.add_argument("--path", metavar="P", help="track: triangle, square or circle (default: circle)")
     runs.add_argument("--policy", metavar="POLICY", help="track: by a policy of Track, a folder or `shipped` (default: by the model)")
+    _add_trust(runs, "track: ")
     runs.add_argument("--payload", type=float, metavar="KG", help="excite, loop: known mass at the tip (default: one that suits)")
 
     board = drive.add_argument_group("calibrate, register")

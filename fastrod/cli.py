@@ -201,7 +201,7 @@ def _train(arguments: argparse.Namespace) -> int:
             raise InputError("--resume needs --out DIR, the folder of the training to go on with.")
         plan = read_config(out)[0]
         with _progress() as bar:
-            path = resume(out, arguments.steps, bar)
+            path = resume(out, arguments.steps, bar, trust=arguments.trust)
     else:
         if arguments.env is None:
             raise UsageError("the following arguments are required: ENV; `fastrod train --help` says how it is used.")
@@ -225,7 +225,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     from fastrod_envs.policies import Policy, find
 
     options = _pairs(arguments.option, "--option")
-    policy = None if arguments.policy == "none" else Policy(find(arguments.env, arguments.policy))
+    policy = None if arguments.policy == "none" else Policy(find(arguments.env, arguments.policy), trust=arguments.trust)
     with _progress() as bar:
         result = evaluation.evaluate(
             arguments.env, policy, episodes=arguments.episodes, seed=arguments.seed, options=options,

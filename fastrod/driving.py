@@ -109,7 +109,7 @@ def _track(arguments: argparse.Namespace, _: Progress | None) -> int:
     if name not in known:
         raise UnknownNameError(f"no path {name!r}; {nearest(name, known)}")
     out = _recorded(arguments.out or Path(f"{name}.csv"), hardware)
-    law = None if arguments.policy is None else _policy(arguments.policy, name, APPROACH, hardware.robot)
+    law = None if arguments.policy is None else _policy(arguments.policy, name, APPROACH, hardware.robot, arguments.trust)
     made = planned(hardware.robot, known[name])
     with _kept(out), _bench(arguments, hardware, journal=out) as bench:
         log = follow(bench.prototype, made, out, law=law)
@@ -118,14 +118,14 @@ def _track(arguments: argparse.Namespace, _: Progress | None) -> int:
     return DONE
 
 
-def _policy(given: str, path: str, begins: float, robot: Robot) -> Law:
+def _policy(given: str, path: str, begins: float, robot: Robot, trust: bool) -> Law:
     """A policy of Track as a law; the path begins so many seconds into the plan."""
     try:
         from fastrod_envs.pilot import TrackPilot
         from fastrod_envs.policies import Policy, find
     except ImportError as error:
         raise InputError("--policy needs gymnasium: pip install 'fastrod[envs]'.") from error
-    pilot = TrackPilot(Policy(find("Track", given)), path, robot)
+    pilot = TrackPilot(Policy(find("Track", given), trust=trust), path, robot)
     return lambda tip, t: pilot.command(tip, t - begins)
 
 

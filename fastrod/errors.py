@@ -7,7 +7,13 @@ from collections.abc import Iterable
 
 
 class FastrodError(Exception):
-    """Base of every error that a user can cause and mend; the command line exits with 2 on it."""
+    """Base of every error that a user can cause and mend; the command line exits with 2 on it.
+
+    Its text is one line, whatever it quotes of a file or a library: what cannot be printed, line breaks and escapes too, is a space.
+    """
+
+    def __str__(self) -> str:
+        return "".join(c if c.isprintable() else " " for c in str(self.args[0])) if self.args else ""
 
 
 class RobotError(FastrodError, ValueError):
@@ -32,9 +38,6 @@ class EffectError(FastrodError, ValueError):
 
 class UnknownNameError(FastrodError, KeyError):
     """A name that is not known, answered with the near ones."""
-
-    def __str__(self) -> str:
-        return str(self.args[0])
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -8,8 +8,9 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from fastrod.errors import InputError
+from fastrod.errors import InputError, shown
 from fastrod.types import Floats
+from fastrod_envs.arrays import read_arrays, write_arrays
 
 Activation = Literal["tanh", "relu"]
 Singles = NDArray[np.float32]
@@ -45,24 +46,39 @@ class Actor(NamedTuple):
         held: dict[str, Any] = {f"weight_{k}": w for k, w in enumerate(self.weights)}
         held |= {f"bias_{k}": b for k, b in enumerate(self.biases)}
         held |= {"middle": self.middle, "reach": self.reach, "activation": self.activation, "squashed": self.squashed}
-        with path.open("wb") as file:
-            np.savez_compressed(file, **held)
+        write_arrays(path, held, compress=True)
 
 
 def load_actor(path: Path) -> Actor:
-    """The actor in a .npz file. Raises `InputError`."""
-    try:
-        with np.load(path, allow_pickle=False) as held:
-            n = sum(name.startswith("weight_") for name in held.files)
-            activation = str(held["activation"])
-            if not n or activation not in get_args(Activation):
-                raise KeyError(activation)
-            return Actor(
-                tuple(held[f"weight_{k}"] for k in range(n)), tuple(held[f"bias_{k}"] for k in range(n)), held["middle"], held["reach"],
-                "tanh" if activation == "tanh" else "relu", bool(held["squashed"]),
-            )  # fmt: skip
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"{str(path)!r} is no actor that `fastrod train` wrote: {error}.") from error
+    """The actor in a .npz file. Raises `InputError` for one that is damaged, or whose layers do not fit together."""
+    held = read_arrays(path, "no actor that `fastrod train` wrote")
+    n = sum(name.startswith("weight_") for name in held)
+    names = ("middle", "reach", "activation", "squashed", *(f"{kind}_{k}" for k in range(n) for kind in ("weight", "bias")))
+    if wrong := set(names) ^ held.keys():
+        raise InputError(f"{str(path)!r} is no actor that `fastrod train` wrote: {sorted(wrong)[0]!r} is missing or too much.")
+    weights, biases = [held[f"weight_{k}"] for k in range(n)], [held[f"bias_{k}"] for k in range(n)]
+    activation, squashed, middle, reach = str(held["activation"]), held["squashed"], held["middle"], held["reach"]
+    why = _misfit(weights, biases, middle, reach)
+    if activation not in get_args(Activation) or squashed.shape != () or squashed.dtype != np.bool_:
+        why = f"its activation is {shown(activation, 40)} and squashed {shown(squashed.tolist(), 40)}"
+    if why:
+        raise InputError(f"{str(path)!r} is no actor that `fastrod train` wrote: {why}.")
+    return Actor(tuple(weights), tuple(biases), middle, reach, "tanh" if activation == "tanh" else "relu", bool(squashed))
+
+
+def _misfit(weights: list[np.ndarray], biases: list[np.ndarray], middle: np.ndarray, reach: np.ndarray) -> str:
+    """What hinders the layers to be one network of finite numbers, or nothing."""
+    arrays = (middle, reach, *weights, *biases)
+    if not weights or any(a.dtype != np.float32 for a in arrays):
+        return "its layers are not numbers of single precision"
+    if any(not np.isfinite(a).all() for a in arrays):
+        return "it holds a number that is not finite"
+    ends = [*(w.shape for w in weights), *(b.shape for b in biases), middle.shape, reach.shape]
+    widths = [middle.size, *(b.size for b in biases)]
+    fitting = [*zip(widths[1:], widths[:-1], strict=True), *((size,) for size in widths[1:]), (widths[0],), (widths[0],)]
+    if ends != fitting or not all(widths):
+        return f"its layers of shapes {shown([*ends])} do not fit together"
+    return "" if (reach > 0.0).all() else "its observations have bounds without a distance between them"
 
 
 def actor_of(model: Any) -> Actor:

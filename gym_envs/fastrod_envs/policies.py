@@ -12,7 +12,7 @@ from fastrod.errors import InputError
 from fastrod.types import Floats
 from fastrod_envs.actor import Actor, actor_of, load_actor
 from fastrod_envs.registration import name_of
-from fastrod_envs.training import ACTOR, CHECKPOINT, CONFIG, POLICY, Plan, algorithm_class, read_config
+from fastrod_envs.training import ACTOR, CONFIG, FOREIGN, Plan, load_foreign, read_config
 from fastrod_envs.vector import BatchEnv
 
 SHIPPED = "shipped"
@@ -43,19 +43,21 @@ def find(env: str, given: str) -> Path:
 class Policy:
     """A trained policy without its noise."""
 
-    def __init__(self, folder: Path) -> None:
-        """From actor.npz, or while a training is under way from its checkpoint. Raises `InputError` where the folder holds neither."""
+    def __init__(self, folder: Path, *, trust: bool = False) -> None:
+        """From actor.npz, which a training has from its first checkpoint on. A folder that has a file of stable-baselines3 in its place is
+        read with `trust` alone, as that runs code of whoever made it. Raises `InputError` where the folder holds neither."""
         self.plan: Plan = read_config(folder)[0]
         if (folder / ACTOR).is_file():
             self._actor: Actor = load_actor(folder / ACTOR)
             return
-        path = next((folder / name for name in (POLICY, CHECKPOINT) if (folder / name).is_file()), None)
+        path = next((folder / name for name in FOREIGN if (folder / name).is_file()), None)
         if path is None:
             raise InputError(f"{str(folder)!r} holds no {ACTOR}; the training has not written one yet.")
+        model = load_foreign(path, self.plan.algorithm, trust=trust)
         try:
-            self._actor = actor_of(algorithm_class(self.plan.algorithm).load(path, device="cpu"))
-        except (ValueError, KeyError, OSError, RuntimeError) as error:
-            raise InputError(f"{str(path)!r} is no policy of stable-baselines3 that can be read: {error}") from error
+            self._actor = actor_of(model)
+        except Exception as error:  # of a network that is built in another way
+            raise InputError(f"the network in {str(path)!r} is not built as `fastrod train` builds one: {error!r}.") from error
 
     @property
     def options(self) -> dict[str, Any]:

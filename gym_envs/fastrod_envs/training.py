@@ -6,18 +6,26 @@ import json
 import os
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
-from fastrod.errors import InputError, nearest
+import msgspec
+
+from fastrod.errors import InputError, UnknownNameError, nearest, shown
+from fastrod_envs.actor import actor_of
+from fastrod_envs.checkpoints import load_checkpoint, load_replay, save_checkpoint, save_replay
 from fastrod_envs.presets import ALGORITHMS, NETWORK, preset_of, settings_of
 from fastrod_envs.registration import NAMESPACE, VERSION, name_of
 
 Progress = Callable[[str, int, int], None]
-CONFIG, POLICY, ACTOR, CHECKPOINT, REPLAY = "config.json", "policy.zip", "actor.npz", "checkpoint.zip", "replay.pkl"
+CONFIG, POLICY, ACTOR, CHECKPOINT, REPLAY = "config.json", "policy.zip", "actor.npz", "checkpoint.npz", "replay.npz"
+FOREIGN = ("checkpoint.zip", POLICY)
+"""Files of stable-baselines3: to read one runs code of whoever made it."""
 _EVERY = 20  # checkpoints of a training
+_LARGEST = 1_000_000  # bytes of a config.json; those that ship have a thousand
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +48,24 @@ class Plan:
     curriculum: float
     """Difficulty at the start; it rises evenly to 1 over the first half."""
 
+    def __post_init__(self) -> None:
+        name_of(self.env)
+        if self.algorithm not in ALGORITHMS:
+            raise UnknownNameError(f"no algorithm {self.algorithm!r}; {nearest(self.algorithm, ALGORITHMS)}")
+        for what, least, most in (("steps", 0, 10**15), ("n_envs", 1, 10**6), ("seed", 0, 2**32 - 1), ("imitate", 0, 10**15)):
+            value = getattr(self, what)
+            if not isinstance(value, int) or not least <= value <= most:
+                raise InputError(f"{what} is {shown(value)}; it must be a whole number from {least} to {most}.")
+        if not 0.0 <= self.curriculum <= 1.0:
+            raise InputError(f"curriculum is {self.curriculum!r}; it must be the difficulty at the start, from 0 to 1.")
+
+
+class _State(TypedDict):
+    """How far a training is."""
+
+    steps_done: int
+    seconds: float
+
 
 def make_plan(
     env: str, *, algorithm: str | None = None, steps: int | None = None, n_envs: int | None = None, seed: int = 0,
@@ -50,11 +76,8 @@ def make_plan(
     from fastrod_envs.registration import task_class
 
     preset = preset_of(env)
-    for what, value, least in (("steps", steps, 0), ("n_envs", n_envs, 1), ("seed", seed, 0), ("imitate", imitate, 0)):
-        if value is not None and (not isinstance(value, int) or value < least):
-            raise InputError(f"{what} is {value!r}; it must be a whole number, at least {least}.")
-    if not 0.0 <= curriculum <= 1.0:
-        raise InputError(f"curriculum is {curriculum!r}; it must be the difficulty at the start, from 0 to 1.")
+    if n_envs is not None and (not isinstance(n_envs, int) or n_envs < 1):  # before rollouts are divided among them
+        raise InputError(f"n_envs is {n_envs!r}; it must be a whole number, at least 1.")
     kind = task_class(env)
     chosen = algorithm or preset.algorithm
     own = dict(preset.settings) if chosen == preset.algorithm else {}
@@ -71,8 +94,9 @@ def make_plan(
 def train(plan: Plan, out: Path, progress: Progress | None = None) -> Path:
     """Train into the folder `out`; the path of its policy.zip.
 
-    The folder holds config.json (the plan, versions, steps and seconds done), checkpoint.zip (with replay.pkl for SAC and TD3), tensorboard
-    curves, and at the end policy.zip, and actor.npz with its network alone. Raises `InputError` where the folder holds a training already.
+    The folder holds config.json (the plan, versions, steps and seconds done), checkpoint.npz (with replay.npz for SAC and TD3, until the
+    end), actor.npz with the network alone, tensorboard curves, and at the end policy.zip, for stable-baselines3 itself. Raises
+    `InputError` where the folder holds a training already.
     """
     if (out / CONFIG).exists():
         raise InputError(f"{str(out)!r} holds a training; go on with it by --resume, or name another folder.")
@@ -81,23 +105,38 @@ def train(plan: Plan, out: Path, progress: Progress | None = None) -> Path:
     return _run(plan, out, progress)
 
 
-def resume(out: Path, steps: int | None = None, progress: Progress | None = None) -> Path:
-    """Go on with the training in `out` from its last checkpoint, or where it has ended from its policy (SAC and TD3 then begin with an
-    empty replay buffer), to its own number of steps or to `steps`. Raises `InputError`."""
+def resume(out: Path, steps: int | None = None, progress: Progress | None = None, *, trust: bool = False) -> Path:
+    """Go on with the training in `out` from its last checkpoint (SAC and TD3 with an empty replay buffer where it had ended), to its own
+    number of steps or to `steps`.
+
+    A folder that has a file of stable-baselines3 in place of checkpoint.npz is refused without `trust`: to read that file runs code of
+    whoever made it. Raises `InputError`.
+    """
     plan, _ = read_config(out)
     if steps is not None:
         plan = replace(plan, steps=steps)
-    return _run(plan, out, progress)
+    return _run(plan, out, progress, trust)
 
 
 def read_config(out: Path) -> tuple[Plan, dict[str, Any]]:
-    """Plan and state of the training in a folder. Raises `InputError`."""
+    """Plan and state of the training in a folder. Raises `InputError`, `UnknownNameError`."""
     path = out / CONFIG
     try:
+        if path.stat().st_size > _LARGEST:
+            raise ValueError(f"it has more than {_LARGEST} bytes")
         held = json.loads(path.read_text(encoding="utf-8"))
-        return Plan(**held["plan"]), held["state"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{str(path)!r} is no configuration of a training; `fastrod train ENV --out DIR` writes one.") from error
+        plan = msgspec.convert(held["plan"], Plan)
+        if unknown := held["plan"].keys() - {field.name for field in fields(Plan)}:
+            raise ValueError(f"it has an unknown key {min(unknown)!r}; {nearest(min(unknown), [field.name for field in fields(Plan)])}")
+        state = {**msgspec.convert(held["state"], dict[str, Any]), **msgspec.convert(held["state"], _State)}
+        if not 0.0 <= state["seconds"] < float("inf"):
+            raise ValueError(f"it says that {state['seconds']} s are done")
+    except UnknownNameError as error:
+        raise UnknownNameError(f"{str(path)!r}: {error}") from error
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        why = f"it lacks {error}" if isinstance(error, KeyError) else getattr(error, "strerror", None) or str(error).rstrip(".")
+        raise InputError(f"{str(path)!r} is no configuration of a training ({why}); `fastrod train ENV --out DIR` writes one.") from error
+    return plan, state
 
 
 def algorithm_class(name: str) -> Any:
@@ -109,12 +148,25 @@ def algorithm_class(name: str) -> Any:
     return getattr(stable_baselines3, name.upper())
 
 
-def _run(plan: Plan, out: Path, progress: Progress | None) -> Path:
+def load_foreign(path: Path, algorithm: str, env: Any = None, *, trust: bool) -> Any:
+    """A model from a file of stable-baselines3, which is a pickle: reading it runs code of whoever made it. Raises `InputError`, without
+    `trust` before the file is opened."""
+    if not trust:
+        raise InputError(
+            f"{str(path)!r} is a file of stable-baselines3, and to read it runs code of whoever made it; if you trust them, "
+            "add --trust (in Python trust=True), or give a folder with a checkpoint.npz or actor.npz of `fastrod train`."
+        )
+    try:
+        return algorithm_class(algorithm).load(path, env=env, device="cpu")
+    except Exception as error:  # whatever a stranger's file raises
+        raise InputError(f"{str(path)!r} cannot be read as a model of stable-baselines3: {error!r}.") from error
+
+
+def _run(plan: Plan, out: Path, progress: Progress | None, trust: bool = False) -> Path:
     import torch
 
-    from fastrod_envs.actor import actor_of
     from fastrod_envs.imitation import imitate
-    from fastrod_envs.sb3 import BatchVecEnv, ScaledFeatures
+    from fastrod_envs.sb3 import BatchVecEnv
     from fastrod_envs.vector import BatchEnv
 
     _, state = read_config(out)
@@ -122,23 +174,21 @@ def _run(plan: Plan, out: Path, progress: Progress | None) -> Path:
     try:
         env.reset(seed=plan.seed)  # kernels start their threads now, and set those of torch
         torch.set_num_threads(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
-        vec, kind = BatchVecEnv(env), algorithm_class(plan.algorithm)
+        vec = BatchVecEnv(env)
         started, before = time.monotonic(), float(state["seconds"])
-        held = next((out / name for name in (CHECKPOINT, POLICY) if (out / name).exists()), None)
-        if held is not None:
-            model = kind.load(held, env=vec, device="cpu")
-            if (out / REPLAY).exists():
-                model.load_replay_buffer(out / REPLAY)
+        foreign = None if (out / CHECKPOINT).exists() else next((out / name for name in FOREIGN if (out / name).exists()), None)
+        if foreign is not None:
+            model = load_foreign(foreign, plan.algorithm, vec, trust=trust)
+        else:
+            model = _fresh(plan, vec, str(out / "tensorboard") if _has_tensorboard() else None)
+            if (out / CHECKPOINT).exists():
+                load_checkpoint(model, out / CHECKPOINT)
+                if (out / REPLAY).exists():
+                    load_replay(model, out / REPLAY)
+        if foreign is not None or (out / CHECKPOINT).exists():
             vec.seed(plan.seed + 1_000_003 * (1 + model.num_timesteps))
         else:
             vec.seed(plan.seed)
-            policy: dict[str, Any] = {"net_arch": list(NETWORK), "features_extractor_class": ScaledFeatures}
-            if plan.algorithm == "ppo":
-                policy |= {"activation_fn": torch.nn.Tanh, "log_std_init": -2.0 if plan.imitate else -1.0}
-            settings = dict(plan.settings)
-            policy |= settings.pop("policy_kwargs", {})
-            board = str(out / "tensorboard") if _has_tensorboard() else None
-            model = kind("MlpPolicy", vec, seed=plan.seed, device="cpu", verbose=0, tensorboard_log=board, policy_kwargs=policy, **settings)
             if plan.imitate:
                 lessons = BatchEnv(name_of(plan.env), num_envs=plan.n_envs, **plan.options)
                 try:
@@ -156,13 +206,30 @@ def _run(plan: Plan, out: Path, progress: Progress | None) -> Path:
         if left > 0:
             model.learn(left, callback=_callback(plan, note, progress), reset_num_timesteps=False, tb_log_name=plan.algorithm)
         note()
-        _atomically(out / ACTOR, actor_of(model).save)
         _atomically(out / POLICY, model.save)
         (out / REPLAY).unlink(missing_ok=True)
-        (out / CHECKPOINT).unlink(missing_ok=True)
         return out / POLICY
     finally:
         env.close()
+
+
+def _fresh(plan: Plan, vec: Any, board: str | None) -> Any:
+    """The model of a plan before its first step. Raises `InputError` for settings that its algorithm does not take."""
+    import torch
+
+    from fastrod_envs.sb3 import ScaledFeatures
+
+    policy: dict[str, Any] = {"net_arch": list(NETWORK), "features_extractor_class": ScaledFeatures}
+    if plan.algorithm == "ppo":
+        policy |= {"activation_fn": torch.nn.Tanh, "log_std_init": -2.0 if plan.imitate else -1.0}
+    settings = dict(plan.settings)
+    kind, own = algorithm_class(plan.algorithm), settings.pop("policy_kwargs", {})
+    try:
+        return kind(
+            "MlpPolicy", vec, seed=plan.seed, device="cpu", verbose=0, tensorboard_log=board, policy_kwargs={**policy, **own}, **settings
+        )
+    except (TypeError, ValueError, AssertionError, MemoryError) as error:  # of stable-baselines3 and torch
+        raise InputError(f"{plan.algorithm} cannot be set up with the settings {shown(settings)}: {str(error).rstrip('.')}.") from error
 
 
 def _callback(plan: Plan, note: Callable[[], None], progress: Progress | None) -> Any:
@@ -208,10 +275,11 @@ def _callback(plan: Plan, note: Callable[[], None], progress: Progress | None) -
 
 
 def _save(model: Any, out: Path) -> None:
-    """The checkpoint, whole or not at all."""
+    """The checkpoint, whole or not at all, and the network alone."""
     if hasattr(model, "save_replay_buffer") and model.replay_buffer is not None and model.replay_buffer.size():
-        _atomically(out / REPLAY, model.save_replay_buffer)
-    _atomically(out / CHECKPOINT, model.save)
+        _atomically(out / REPLAY, partial(save_replay, model))
+    _atomically(out / CHECKPOINT, partial(save_checkpoint, model))
+    _atomically(out / ACTOR, actor_of(model).save)
 
 
 def _atomically(path: Path, write: Callable[[Path], Any]) -> None:
