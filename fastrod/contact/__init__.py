@@ -5,6 +5,7 @@
 
 from fastrod.contact.contacts import Contacts
 from fastrod.contact.geometry import Obstacle, box, capsule, cylinder, mesh, plane, sphere
+from fastrod.contact.meshfile import MeshLimits
 from fastrod.contact.scene import ContactScene
 
-__all__ = ["ContactScene", "Contacts", "Obstacle", "box", "capsule", "cylinder", "mesh", "plane", "sphere"]
+__all__ = ["ContactScene", "Contacts", "MeshLimits", "Obstacle", "box", "capsule", "cylinder", "mesh", "plane", "sphere"]

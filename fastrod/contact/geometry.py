@@ -19,6 +19,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from fastrod.contact.meshfile import FORMATS, MeshLimits, read_mesh
 from fastrod.errors import InputError, nearest
 from fastrod.types import Floats, Ints
 
@@ -31,8 +32,10 @@ Quadruple: TypeAlias = tuple[float, float, float, float]
 
 _SIZES = {"mesh": 0, "sphere": 1, "box": 3, "cylinder": 2, "capsule": 2, "plane": 0}
 _LARGEST = 10.0  # m; a larger obstacle was given in mm
+_FARTHEST = 1e6  # m; of any vertex, used or not: beyond it squares and products leave what a float can hold
 _SMALLEST = 1e-4  # m; a smaller one was scaled twice
 _SLIVER = 1e-7  # height of a face over its longest edge; a float32 file cannot say which way a flatter one points
+_MOST_SLIVERS = 100_000  # a mesh of more was not made to be a solid, and joining them takes a minute
 _USUAL_FRICTION, _LARGEST_FRICTION = 5.0, 10.0
 
 
@@ -216,25 +219,29 @@ def mesh(
     friction: float = 0.0,
     stiffness: float = math.inf,
     open_surface: bool = False,
+    limits: MeshLimits | None = None,
 ) -> Obstacle:
-    """A triangle mesh: a file that trimesh loads, a trimesh.Trimesh (left untouched) or a pair (vertices, faces).
+    """A triangle mesh: a file (.stl, .obj, .ply, .off, .glb), a trimesh.Trimesh (left untouched) or a pair (vertices, faces).
 
     Vertices times `scale` are metres in the obstacle frame. A file of several bodies becomes one mesh. Duplicate vertices are
     merged and degenerate faces dropped. The mesh must be watertight with its faces counter-clockwise seen from outside; an
     inverted body inside another is a cavity. `open_surface` takes a surface with open edges, or a closed one that faces inwards,
-    as one-sided: the solid lies behind its normals.
+    as one-sided: the solid lies behind its normals. `limits`, by default those of `MeshLimits()`, are what reading a file may cost;
+    materials and whatever else a file refers to are not opened.
 
-    Raises `InputError` where there is no such mesh, or where it is empty, broken, open, inverted or of a wrong scale.
+    Raises `InputError` where there is no such mesh, or where it is empty, broken, open, inverted, of a wrong scale or beyond `limits`.
     """
-    given, corners, triangles = _read(source)
+    given, corners, triangles = _read(source, MeshLimits() if limits is None else limits)
     name = name or given or "mesh"
     where = f"mesh {name!r}"
     vertices, faces = _arrays(where, corners, triangles)
     factor = _number(f"scale of {where}", scale, "1")
     if not (math.isfinite(factor) and factor > 0.0):
         raise InputError(f"scale of {where} is {factor!r}; it must be positive and finite, for example 0.001 for a file in mm.")
+    if len(vertices) and (far := float(np.abs(vertices).max()) * factor) > _FARTHEST:
+        raise InputError(f"{where} has a vertex {far:.6g} m from its origin; more than {_FARTHEST:g} m. Was it given in mm? scale=0.001 mends that.")
     vertices, faces = _merged(vertices * factor, faces)
-    faces = _without_slivers(vertices, faces)
+    faces = _without_slivers(where, vertices, faces)
     if not len(faces) or not (_heights(vertices, faces)[0] > 1e-14).any():
         raise InputError(f"{where} is empty: it has {len(triangles)} faces and none with an area; give a surface of triangles.")
     _check_extent(where, float(np.ptp(vertices, axis=0).max()), "scale")
@@ -253,22 +260,14 @@ def _trimesh() -> Any:
     return trimesh
 
 
-def _read(source: object) -> tuple[str | None, Any, Any]:
+def _read(source: object, limits: MeshLimits) -> tuple[str | None, Any, Any]:
     """A name where the source has one, its vertices and its faces."""
     if isinstance(source, (str, os.PathLike)):
         path = Path(source)
-        known = sorted(_trimesh().available_formats())
         if not path.is_file():
-            near = [p.name for p in path.parent.iterdir() if p.suffix[1:].lower() in known] if path.parent.is_dir() else []
+            near = [p.name for p in path.parent.iterdir() if p.suffix[1:].lower() in FORMATS] if path.parent.is_dir() else []
             raise InputError(f"there is no mesh file {str(path)!r}; {nearest(path.name, near)}")
-        suffix = path.suffix[1:].lower()
-        if suffix not in known:
-            raise InputError(f"mesh file {path.name!r} has the unknown suffix {path.suffix!r}; {nearest(suffix, known)}")
-        try:
-            loaded = _trimesh().load_scene(path).to_mesh()
-        except Exception as error:  # every loader of trimesh raises its own
-            raise InputError(f"mesh file {path.name!r} cannot be read as {suffix}: {error!r}; is it whole, and of that format?") from error
-        return path.stem, np.array(loaded.vertices), np.array(loaded.faces)
+        return path.stem, *read_mesh(path, limits)
     if isinstance(source, (tuple, list)) and len(source) == 2:
         return None, source[0], source[1]
     lib = None if isinstance(source, (tuple, list)) else _trimesh()
@@ -323,33 +322,47 @@ def _heights(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
     return area / np.maximum(square.max(axis=1), 1e-300), square.argmax(axis=1)
 
 
-def _without_slivers(vertices: Floats, faces: Ints) -> Ints:
+def _without_slivers(where: str, vertices: Floats, faces: Ints) -> Ints:
     """Faces without area joined into the neighbour at their longest edge, so that the surface stays closed."""
+    n = len(vertices)
     for _ in range(20):
         height, longest = _heights(vertices, faces)
         flat = np.flatnonzero(height < _SLIVER)
         if not len(flat) or len(flat) == len(faces):
             break
-        rows = faces.tolist()
-        owner = {(t[j], t[(j + 1) % 3]): i for i, t in enumerate(rows) for j in range(3)}
+        if len(flat) > _MOST_SLIVERS:
+            raise InputError(f"{where} has {len(flat)} faces without area, of {len(faces)}; mend it first, in the program that made it.")
+        keys = faces.ravel() * n + np.roll(faces, -1, axis=1).ravel()  # one for each directed edge
+        order = np.argsort(keys, kind="stable")
+        ordered = keys[order]
+
+        def owner(start: Ints, end: Ints, order: Ints = order, ordered: Ints = ordered) -> Ints:
+            """The last face that has each edge; -1 where none has."""
+            found = np.searchsorted(ordered, start * n + end, side="right") - 1
+            return np.where((found >= 0) & (ordered[found] == start * n + end), order[found] // 3, -1)
+
+        p, q, r = (faces[flat, (longest[flat] + m) % 3] for m in range(3))
+        beside = owner(q, p)
+        d = faces[beside].sum(axis=1) - p - q
+        taken = (owner(r, d) >= 0) | (owner(d, r) >= 0)
         touched: set[int] = set()
+        made: set[tuple[int, int]] = set()
         gone = []
-        for i in flat.tolist():
-            j = int(longest[i])
-            p, q, r = (rows[i][(j + m) % 3] for m in range(3))
-            k = owner.get((q, p))
-            if k is None:  # at an open edge: nothing is lost with it
+        for i, k, *corners, is_taken in zip(*(a.tolist() for a in (flat, beside, p, q, r, d, taken)), strict=True):
+            if i in touched:
+                continue
+            if k < 0:  # at an open edge: nothing is lost with it
                 gone.append(i)
                 continue
-            d = sum(rows[k]) - p - q
-            if i in touched or k in touched or (r, d) in owner or (d, r) in owner:
+            a, b, c, e = corners
+            if k in touched or is_taken or (min(c, e), max(c, e)) in made:
                 continue
-            rows[i], rows[k] = [r, p, d], [d, q, r]
-            owner[d, r], owner[r, d] = i, k
+            faces[i], faces[k] = (c, a, e), (e, b, c)
+            made.add((min(c, e), max(c, e)))
             touched |= {i, k}
         if not touched and not gone:
             break
-        faces = np.delete(np.array(rows, dtype=np.int64), gone, axis=0)
+        faces = np.delete(faces, gone, axis=0)
     return faces
 
 

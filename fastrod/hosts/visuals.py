@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from pathlib import Path
 from typing import Any, NamedTuple, final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fastrod.contact.meshfile import MeshLimits, read_mesh
+from fastrod.errors import InputError
 from fastrod.hosts.bullet import Bullet
 from fastrod.hosts.link import from_xyzw
 from fastrod.rotation import matrix_from_quaternion
@@ -36,7 +39,7 @@ class Shape(NamedTuple):
 class Visuals:
     """The visual shapes of all bodies that a PyBullet world has now, and where they are from step to step.
 
-    Mesh files that trimesh cannot read, and meshes without a file, become the box around their link's collision shape.
+    Mesh files that `fastrod.contact.mesh` does not read (`fastrod.contact.meshfile.FORMATS`, within `MeshLimits()`), and meshes without a file, become the box around their link's collision shape.
     """
 
     def __init__(self, bullet: Any, ignore: Collection[int] = ()) -> None:
@@ -135,12 +138,13 @@ def _read(path: str, scale: Any) -> Any:
     if not path:
         return None
     try:
-        mesh = trimesh.load_scene(path, process=False, skip_materials=True).to_mesh()
-    except Exception:  # every loader of trimesh raises its own
+        vertices, faces = read_mesh(Path(path), MeshLimits())
+    except InputError:
         return None
-    if not len(mesh.faces):
+    if not len(faces) or not np.isfinite(vertices).all() or not 0 <= faces.min() <= faces.max() < len(vertices):
         return None
-    mesh.merge_vertices(merge_norm=True, merge_tex=True)  # files have one for each normal: a fifth of them is enough
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    mesh.merge_vertices()  # files have one for each normal: a fifth of them is enough
     mesh.apply_scale(np.asarray(scale, float))
     extents = np.ptp(np.asarray(mesh.vertices), axis=0)
     return _ground() if extents[2] < 1e-6 and extents.max() > _ENDLESS else mesh

@@ -1,0 +1,81 @@
+"""Read a mesh file by trimesh, here or as a program of its own that its caller can end: it needs nothing else of the package."""
+
+from __future__ import annotations
+
+import io
+import logging
+import re
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def read(path: str, kind: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Vertices (n, 3) and triangles (m, 3) of all bodies of a file of the format `kind`; no other file is opened, whatever it refers to.
+
+    Raises what trimesh raises: each of its loaders has its own.
+    """
+    import trimesh
+
+    data = _PLAIN.get(kind, bytes)(Path(path).read_bytes())
+    with _silent("trimesh"):  # a stream has no folder in which materials, textures or buffers would be looked for
+        made = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False, skip_materials=True).to_mesh()
+    return np.array(made.vertices, dtype=np.float64).reshape(-1, 3), np.array(made.faces, dtype=np.int64).reshape(-1, 3)
+
+
+def _plain_obj(data: bytes) -> bytes:
+    """Positions and faces alone, as one body: trimesh takes a time that grows with the square of the number of materials."""
+    lines = re.findall(rb"^[ \t]*[vf][ \t][^\r\n]*", data.replace(b"\\\n", b"").replace(b"\r", b"\n"), re.MULTILINE)
+    return re.sub(rb"/[^\s]*", b"", b"\n".join(line.strip() for line in lines)) + b"\n"
+
+
+def _plain_stl(data: bytes) -> bytes:
+    """All solids of a text as one, for the same reason; a binary file as it is."""
+    if len(data) >= 84 and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little"):
+        return data
+    return b"solid\n" + re.sub(rb"^[ \t]*(end)?solid\b[^\r\n]*", b"", data, flags=re.IGNORECASE | re.MULTILINE) + b"\nendsolid\n"
+
+
+_PLAIN: dict[str, Callable[[bytes], bytes]] = {"obj": _plain_obj, "stl": _plain_stl}
+
+
+@contextmanager
+def _silent(name: str) -> Iterator[None]:
+    """A logger writes nothing from this thread: trimesh logs the tracebacks of exceptions that it goes on from."""
+    logger, thread = logging.getLogger(name), threading.get_ident()
+
+    def drop(record: logging.LogRecord) -> bool:
+        return record.thread != thread
+
+    logger.addFilter(drop)
+    try:
+        yield
+    finally:
+        logger.removeFilter(drop)
+
+
+def _main(path: str, kind: str, memory: str) -> int:
+    """Write both arrays to stdout as .npy, or the reason to stderr; the exit code."""
+    with suppress(ImportError, ValueError, OSError):  # Windows has no such limit, and another may be lower already
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_AS, (int(memory), int(memory)))
+    try:
+        for array in read(path, kind):
+            np.save(sys.stdout.buffer, array, allow_pickle=False)
+    except MemoryError:
+        print("memory", file=sys.stderr)
+        return 3
+    except Exception as error:  # every loader of trimesh raises its own
+        print(repr(error), file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(_main(*sys.argv[1:]))
