@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import math
 import re
-import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from importlib.resources import files
@@ -17,6 +16,7 @@ import tomli_w
 
 from fastrod.errors import RobotError, UnknownNameError, nearest, shown
 from fastrod.robot import MODES, Robot, Segment, Tendon
+from fastrod.tomlfile import parse, read_text
 
 _MODULI = ("youngs_modulus", "shear_modulus", "second_moment", "polar_moment")
 _SENSOR = ("noise", "registration_sd", "marker_offset_sd", "latency_sd")
@@ -40,24 +40,18 @@ def load_robot(source: str | Path) -> Robot:
         return loads(files("fastrod").joinpath("robots").joinpath(f"{text}.toml").read_text(encoding="utf-8"), text)
     path = Path(source)
     try:
-        if path.suffix != ".toml" and not path.is_file():
-            raise UnknownNameError(f"no robot {shown(text)}; {nearest(text, robot_names())} A path must end in .toml.")
-        content = path.read_text(encoding="utf-8-sig")
-    except (OSError, ValueError) as error:  # ValueError: bytes that are no text, or a path that no file can have
+        unknown = path.suffix != ".toml" and not path.is_file()
+    except (OSError, ValueError) as error:  # ValueError: a path that no file can have
         raise RobotError(f"robot file {shown(text)} cannot be read: {getattr(error, 'strerror', None) or error}.") from error
+    if unknown:
+        raise UnknownNameError(f"no robot {shown(text)}; {nearest(text, robot_names())} A path must end in .toml.")
+    content = read_text(path, f"robot file {shown(text)}", RobotError)
     return loads(content, text)
 
 
 def loads(text: str, where: str = "robot file") -> Robot:
     """The robot of a TOML text; `where` names it in errors."""
-    try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise RobotError(f"{where} is not TOML: {error}.") from error
-    except RecursionError as error:
-        raise RobotError(f"{where} is not a robot: its tables stand too deep in one another.") from error
-    except ValueError as error:  # of a whole number of thousands of digits
-        raise RobotError(f"{where} holds a number that nothing has: {str(error).partition(';')[0]}.") from error
+    data = parse(text, where, RobotError, "robot")
     _check_keys(data, ("name", "segment", "base", "world", "effect", "log", "fit", "sensor"), where)
     segments = data.get("segment", [])
     if not isinstance(segments, list):

@@ -25,6 +25,7 @@ _TIP_QUATERNION = ("tip_qw", "tip_qx", "tip_qy", "tip_qz")
 _TIP_FORCE = ("tip_fx", "tip_fy", "tip_fz")
 _BASE_QUATERNION = ("base_qw", "base_qx", "base_qy", "base_qz")
 _REACH = 3.0  # robot lengths; nothing on the robot is further from its base, so the unit is wrong
+_MOST_VALUES, _MOST_BYTES = 30_000_000, 500_000_000  # of a Parquet file unpacked: 1.5 GB while they become numbers
 _HEAVIEST = 10.0  # kg; a heavier payload was given in g
 _QUATERNION_SLACK = 1e-2  # trackers write three or four digits
 
@@ -240,22 +241,50 @@ def _check_header(header: list[str], where: str) -> None:
 
 
 def _read_parquet(path: Path) -> Table:
-    parquet = _pyarrow("pyarrow.parquet")
-    try:
-        content = parquet.read_table(path)
-    except _pyarrow("pyarrow").ArrowException as error:
-        raise LogError(f"{path.name} is not a Parquet file: {str(error).splitlines()[0].rstrip('.')}.") from error
-    _check_header(content.column_names, path.name)
+    parquet, arrow = _pyarrow("pyarrow.parquet"), _pyarrow("pyarrow")
     table: Table = {}
-    for name in content.column_names:
-        try:
-            cells = content.column(name).to_pylist()
-        except ValueError:  # times finer than Python's
-            cells = content.column(name).cast("string").to_pylist()
-        table[name] = _cells(cells)
+    try:
+        with parquet.ParquetFile(path) as file:
+            _check_declared(file.metadata, path.name)
+            words = [column.path for column in file.metadata.schema if column.physical_type == "BYTE_ARRAY"]
+        content = parquet.read_table(path, read_dictionary=words)  # a word that a million rows repeat is held once
+        _check_header(content.column_names, path.name)
+        for name in content.column_names:
+            column = content.column(name)
+            _check_words(column, path.name)
+            try:
+                cells = column.to_pylist()
+            except ValueError:  # times finer than Python's
+                cells = column.cast("string").to_pylist()
+            table[name] = _cells(cells)
+    except arrow.ArrowException as error:
+        raise LogError(f"{path.name} is not a Parquet file: {str(error).splitlines()[0].rstrip('.')}.") from error
     if not table:
         raise LogError(f"{path.name} has no columns.")
     return table
+
+
+def _check_declared(metadata: Any, where: str) -> None:
+    """Raises `LogError` where a file unpacks to more than a run log has; a few kB may declare any number of rows."""
+    chunks = [
+        metadata.row_group(k).column(j) for k in range(metadata.num_row_groups) for j in range(metadata.row_group(k).num_columns)
+    ]
+    n_values = max(metadata.num_rows * metadata.num_columns, sum(chunk.num_values for chunk in chunks))
+    n_bytes = sum(chunk.total_uncompressed_size for chunk in chunks)
+    if n_values > _MOST_VALUES or n_bytes > _MOST_BYTES:
+        raise LogError(
+            f"{where} declares {n_values} values of {n_bytes} bytes; a log may have {_MOST_VALUES} of {_MOST_BYTES} bytes. Cut it in parts."
+        )
+
+
+def _check_words(column: Any, where: str) -> None:
+    """Raises `LogError` where words that are held once would be too much as cells."""
+    compute, n_bytes = _pyarrow("pyarrow.compute"), 0
+    for chunk in column.chunks:
+        if hasattr(chunk, "dictionary") and len(chunk):
+            n_bytes += compute.sum(compute.take(compute.binary_length(chunk.dictionary), chunk.indices)).as_py() or 0
+    if n_bytes > _MOST_BYTES:
+        raise LogError(f"{where} declares a column of {n_bytes} bytes of text; a log may have {_MOST_BYTES}. Cut it in parts.")
 
 
 def _cells(cells: Sequence[Any]) -> Sequence[str] | Floats:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import threading
-import tomllib
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, TypeAlias, TypeVar, final
@@ -14,8 +13,9 @@ import numpy as np
 import tomli_w
 from numpy.typing import ArrayLike, NDArray
 
-from fastrod.errors import InputError, UnknownNameError, nearest
+from fastrod.errors import InputError, UnknownNameError, nearest, shown
 from fastrod.rotation import matrix_from_quaternion, product
+from fastrod.tomlfile import parse, read_text
 from fastrod.types import Floats
 from fastrod_device.clock import Clock, WallClock
 from fastrod_device.errors import DeviceError
@@ -32,6 +32,8 @@ Described = TypeVar("Described", bound="DataclassInstance")
 Row: TypeAlias = tuple[float, float, float]
 """Three numbers."""
 
+_MOST = 1e6  # of any number of a camera or marker; squares and products of such still fit a float
+_PIXELS = (16, 20_000)
 _STILL = 100  # failed reads in a row after which a camera is lost
 
 
@@ -55,10 +57,12 @@ def _numbers(value: ArrayLike, name: str, shape: tuple[int, ...]) -> Floats:
     """Finite numbers."""
     try:
         array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name} is {value!r}; it must be numbers of shape {shape}.") from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{name} is {shown(value)}; it must be numbers of shape {shape}.") from error
     if array.shape != shape or not np.isfinite(array).all():
-        raise InputError(f"{name} is {np.asarray(value).tolist()!r}; it must be finite numbers of shape {shape}.")
+        raise InputError(f"{name} is {shown(np.asarray(value).tolist())}; it must be finite numbers of shape {shape}.")
+    if (np.abs(array) > _MOST).any():
+        raise InputError(f"{name} is {shown(array.tolist())}; its numbers must be between {-_MOST:g} and {_MOST:g}.")
     return array
 
 
@@ -75,9 +79,11 @@ def _unit(value: ArrayLike, name: str) -> tuple[float, ...]:
     return tuple((array if abs(norm - 1.0) < 1e-12 else array / norm).tolist())
 
 
-def _positive(value: float, name: str, unit: str) -> None:
-    if isinstance(value, bool) or not (isinstance(value, (int, float)) and math.isfinite(value) and value > 0.0):
-        raise InputError(f"{name} is {value!r} {unit}; it must be a positive number.")
+def _positive(value: float, name: str, unit: str, low: float, high: float) -> None:
+    if isinstance(value, bool) or not (isinstance(value, (int, float)) and 0.0 < value < math.inf):
+        raise InputError(f"{name} is {shown(value)} {unit}; it must be a positive number.")
+    if not low <= value <= high:
+        raise InputError(f"{name} is {shown(value)} {unit}; it must be from {low:g} to {high:g} {unit}.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,13 +115,14 @@ class Camera:
         put(self, "distortion", _tuple(self.distortion, "Camera.distortion", 5))
         put(self, "position", _tuple(self.position, "Camera.position", 3))
         put(self, "quaternion", _unit(self.quaternion, "Camera.quaternion"))
-        if not (m[0, 0] > 0.0 and m[1, 1] > 0.0) or m[0, 1] != 0.0 or m[1, 0] != 0.0 or m[2].tolist() != [0.0, 0.0, 1.0]:
-            raise InputError(f"Camera.matrix is {m.tolist()!r}; it must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], fx and fy positive.")
+        if not (m[0, 0] >= 1e-3 and m[1, 1] >= 1e-3) or m[0, 1] != 0.0 or m[1, 0] != 0.0 or m[2].tolist() != [0.0, 0.0, 1.0]:
+            raise InputError(f"Camera.matrix is {m.tolist()!r}; it must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], fx and fy positive, from 0.001.")
         size = tuple(self.size)
-        if len(size) != 2 or any(isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 16 for n in size):
-            raise InputError(f"Camera.size is {self.size!r}; it must be width and height, whole numbers from 16 [px].")
+        low, high = _PIXELS
+        if len(size) != 2 or any(isinstance(n, bool) or not isinstance(n, (int, np.integer)) or not low <= n <= high for n in size):
+            raise InputError(f"Camera.size is {shown(self.size)}; it must be width and height, whole numbers from {low} to {high} [px].")
         put(self, "size", (int(size[0]), int(size[1])))
-        _positive(self.rate, "Camera.rate", "Hz")
+        _positive(self.rate, "Camera.rate", "Hz", 0.01, 1e5)
         if isinstance(self.latency, bool) or not isinstance(self.latency, (int, float)) or not 0.0 <= self.latency < 10.0:
             raise InputError(f"Camera.latency is {self.latency!r} s; it must be 0 to 10. Was it given in ms?")
 
@@ -138,12 +145,7 @@ class Camera:
 def load_camera(path: str | Path) -> Camera:
     """The camera of a .toml file. Raises `InputError` for a file that is not one, `UnknownNameError` for a field that no camera has."""
     where = f"camera file {str(path)!r}"
-    try:
-        data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{where} cannot be read: {getattr(error, 'strerror', None) or error}.") from error
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{where} is not TOML: {error}.") from error
+    data = parse(read_text(Path(path), where, InputError), where, InputError, "camera")
     return from_table(Camera, data, where)
 
 
@@ -153,7 +155,7 @@ def from_table(kind: type[Described], table: object, where: str) -> Described:
     Raises `InputError` for what is no such table, `UnknownNameError` for a key or a name in it that is not known.
     """
     if not isinstance(table, dict):
-        raise InputError(f"{where} is {table!r}; it must be a table.")
+        raise InputError(f"{where} is {shown(table)}; it must be a table.")
     known = {f.name: f.default is MISSING for f in fields(kind)}
     for key in table:
         if key not in known:
@@ -214,9 +216,9 @@ class Marker:
     """(4,) of tip_from_marker, w x y z."""
 
     def __post_init__(self) -> None:
-        _positive(self.size, "Marker.size", "m")
-        if self.size > 1.0:
-            raise InputError(f"Marker.size is {self.size!r} m; was it given in mm?")
+        if isinstance(self.size, (int, float)) and self.size > 1.0:
+            raise InputError(f"Marker.size is {shown(self.size)} m; was it given in mm?")
+        _positive(self.size, "Marker.size", "m", 1e-4, 1.0)
         n = len(dictionary_named(self.dictionary).bytesList)
         if isinstance(self.id, bool) or not isinstance(self.id, int) or not 0 <= self.id < n:
             raise InputError(f"Marker.id is {self.id!r}; {self.dictionary} has the numbers 0 to {n - 1}.")

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from fastrod.errors import InputError, UnknownNameError, nearest
+from fastrod.errors import InputError, UnknownNameError, nearest, shown
 from fastrod.robot import Robot
 from fastrod.robotfile import load_robot
+from fastrod.tomlfile import parse, read_text
 from fastrod_device.camera import Camera, Marker, from_table, load_camera
 from fastrod_device.safety import Limits
 from fastrod_device.units import DriveSpec, Transmission
@@ -54,7 +53,7 @@ class Hardware:
         ):  # fmt: skip
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-                raise InputError(f"{name} is {value!r}; it must be from {low:g} to {high:g} {unit}.")
+                raise InputError(f"{name} is {shown(value)}; it must be from {low:g} to {high:g} {unit}.")
         steps = np.abs(Transmission(self.drives).tension(np.ones(len(nodes), dtype=np.int64)))
         if self.pretension < (1.0 - 1e-9) * steps.max():
             k, least = int(steps.argmax()), math.ceil(1e3 * steps.max()) / 1e3
@@ -73,7 +72,7 @@ def load_hardware(path: str | Path | None = None, robot: Robot | None = None) ->
     """
     source = SHIPPED if path is None else Path(path)
     where = f"hardware file {(source.name if path is None else str(path))!r}"
-    data = _read(source, where)
+    data = parse(read_text(source, where, InputError), where, InputError, "hardware file")
     known = (*_NEEDED, "limits", *_NUMBERS)
     for key in data:
         if key not in known:
@@ -92,15 +91,6 @@ def load_hardware(path: str | Path | None = None, robot: Robot | None = None) ->
         return Hardware(robot=model, drives=drives, limits=limits, camera=camera, marker=marker, **numbers)
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
-
-
-def _read(path: Path, where: str) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{where} cannot be read: {getattr(error, 'strerror', None) or error}.") from error
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{where} is not TOML: {error}.") from error
 
 
 def _camera(given: object, hardware_file: Path, where: str) -> Camera:

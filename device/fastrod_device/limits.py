@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fastrod.errors import InputError
+from fastrod.errors import InputError, shown
 from fastrod.types import Floats
 
 _LARGEST = {"m": (0.5, "mm"), "m/s": (1.0, "mm/s"), "s": (60.0, "ms")}  # beyond this it was given in the other unit
+_LEAST, _MOST = 1e-9, 1e9  # of any limit in its unit
 
 
 def _unit(name: str) -> str:
@@ -58,11 +59,14 @@ class Limits:
             value, unit = getattr(self, name), _unit(name)
             if value is None and name in ("slack", "sighting_age"):
                 continue
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not (math.isfinite(value) and value > 0.0):
-                raise InputError(f"Limits.{name} is {value!r}; it must be a positive number [{unit}].")
-            largest, other = _LARGEST.get(unit, (math.inf, ""))
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value < math.inf:
+                raise InputError(f"Limits.{name} is {shown(value)}; it must be a positive number [{unit}].")
+            largest, other = _LARGEST.get(unit, (_MOST, ""))
             if value > largest:
-                raise InputError(f"Limits.{name} is {value!r} {unit}; more than {largest:g} {unit}. Was it given in {other}?")
+                hint = f" Was it given in {other}?" if other else ""
+                raise InputError(f"Limits.{name} is {shown(value)} {unit}; more than {largest:g} {unit}.{hint}")
+            if value < _LEAST:
+                raise InputError(f"Limits.{name} is {shown(value)} {unit}; less than {_LEAST:g} {unit}, which nothing can keep.")
         if self.slack is not None and self.slack >= self.tension:
             raise InputError(f"Limits.slack is {self.slack!r} N and tension {self.tension!r} N; the least must be below the largest.")
 

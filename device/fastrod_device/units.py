@@ -9,9 +9,16 @@ from typing import final
 
 import numpy as np
 
-from fastrod.errors import InputError
+from fastrod.errors import InputError, shown
 from fastrod.types import Floats, Ints
 from fastrod_device.readings import Feedback, Readings
+
+
+_RANGE = {
+    "drum_radius": (1e-4, 0.1), "gear": (1e-3, 1e6), "counts_per_turn": (1, 1e9), "torque_constant": (1e-6, 1e3),
+    "rated_torque": (1e-6, 1e4), "efficiency": (1e-3, 1.0),
+}  # fmt: skip
+"""Of a `DriveSpec`'s numbers: wide of every drive, and narrow enough that their products are numbers of counts and newtons."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,14 +51,13 @@ class DriveSpec:
             raise InputError(f"DriveSpec.node is {self.node!r}; a CANopen node id is a whole number from 1 to 126.")
         if self.direction not in (1, -1):
             raise InputError(f"DriveSpec.direction is {self.direction!r}; it must be 1 (growing counts pull) or -1.")
-        for name in ("drum_radius", "gear", "counts_per_turn", "torque_constant", "rated_torque", "efficiency"):
+        for name, (low, high) in _RANGE.items():
             value = getattr(self, name)
-            if not (isinstance(value, (int, float)) and math.isfinite(value) and value > 0.0):
-                raise InputError(f"DriveSpec.{name} of node {self.node} is {value!r}; it must be a positive number.")
-        if self.drum_radius > 0.1:
-            raise InputError(f"DriveSpec.drum_radius of node {self.node} is {self.drum_radius!r} m; was it given in mm?")
-        if self.efficiency > 1.0:
-            raise InputError(f"DriveSpec.efficiency of node {self.node} is {self.efficiency!r}; it is at most 1.")
+            if isinstance(value, bool) or not (isinstance(value, (int, float)) and value > 0.0):
+                raise InputError(f"DriveSpec.{name} of node {self.node} is {shown(value)}; it must be a positive number.")
+            if not low <= value <= high:
+                hint = " Was it given in mm?" if name == "drum_radius" and value > high else ""
+                raise InputError(f"DriveSpec.{name} of node {self.node} is {shown(value)}; it must be from {low:g} to {high:g}.{hint}")
 
     @property
     def metres_per_count(self) -> float:

@@ -1,0 +1,35 @@
+"""TOML files from anywhere: read whole within a size, and one sentence for whatever is wrong with one."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from fastrod.errors import FastrodError
+
+_LARGEST = 1_000_000  # bytes; a robot of five segments has two thousand
+
+
+def read_text(path: Path, where: str, error: type[FastrodError]) -> str:
+    """The text of a TOML file, with or without a byte order mark. Raises `error`; `where` names the file."""
+    try:
+        with path.open("rb") as file:
+            content = file.read(_LARGEST + 1)
+        if len(content) > _LARGEST:
+            raise ValueError(f"it has more than {_LARGEST} bytes")
+        return content.decode("utf-8-sig")
+    except (OSError, ValueError) as why:  # ValueError: bytes that are no text, or a path that no file can have
+        raise error(f"{where} cannot be read: {getattr(why, 'strerror', None) or why}.") from why
+
+
+def parse(text: str, where: str, error: type[FastrodError], what: str) -> dict[str, Any]:
+    """The tables of a TOML text. Raises `error`; `where` names the text, and `what` is what it should be."""
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as why:
+        raise error(f"{where} is not TOML: {why}.") from why
+    except RecursionError as why:
+        raise error(f"{where} is not a {what}: its tables stand too deep in one another.") from why
+    except ValueError as why:  # of a whole number of thousands of digits
+        raise error(f"{where} holds a number that nothing has: {str(why).partition(';')[0]}.") from why
