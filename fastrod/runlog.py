@@ -266,9 +266,7 @@ def _read_parquet(path: Path) -> Table:
 
 def _check_declared(metadata: Any, where: str) -> None:
     """Raises `LogError` where a file unpacks to more than a run log has; a few kB may declare any number of rows."""
-    chunks = [
-        metadata.row_group(k).column(j) for k in range(metadata.num_row_groups) for j in range(metadata.row_group(k).num_columns)
-    ]
+    chunks = [metadata.row_group(k).column(j) for k in range(metadata.num_row_groups) for j in range(metadata.row_group(k).num_columns)]
     n_values = max(metadata.num_rows * metadata.num_columns, sum(chunk.num_values for chunk in chunks))
     n_bytes = sum(chunk.total_uncompressed_size for chunk in chunks)
     if n_values > _MOST_VALUES or n_bytes > _MOST_BYTES:
@@ -382,7 +380,8 @@ def _unit(quaternion: Floats | None, names: Sequence[str], where: str) -> Floats
     """`quaternion` (n, 4) scaled to norm 1, after a check that it was near."""
     if quaternion is None:
         return None
-    norm = np.linalg.norm(quaternion, axis=1)
+    with np.errstate(over="ignore"):
+        norm = np.linalg.norm(quaternion, axis=1)
     if (off := np.abs(norm - 1.0) > _QUATERNION_SLACK).any():
         row = int(np.argmax(off))
         columns = f"columns {names[0]} to {names[-1]}"
@@ -412,12 +411,16 @@ def _check_units(log: RunLog, robot: Robot, where: str) -> None:
             row = int(np.argmax(bad))
             raise LogError(f"{where} row {row + 1}, {column} is {value[row]:.6g} {unit}; {why}")
 
+    def norm(points: Floats) -> Floats:
+        with np.errstate(over="ignore"):  # of 1e300, which is too far then
+            return np.asarray(np.linalg.norm(points, axis=1))
+
     far = f"more than {_REACH:g} lengths of robot {robot.name!r} ({robot.length:g} m). Was it given in mm?"
-    tip = np.linalg.norm(log.tip_position, axis=1)
+    tip = norm(log.tip_position)
     refuse(tip > _REACH * length, "the tip's distance from the base", tip, "m", far)
     for k in range(0 if log.points is None else log.points.shape[1]):
         assert log.points is not None
-        point = np.linalg.norm(log.points[:, k], axis=1)
+        point = norm(log.points[:, k])
         refuse(point > _REACH * length, f"the distance of point p{k + 1} from the base", point, "m", far)
     for k in range(log.dl.shape[1]):
         long = f"more than robot {robot.name!r} is long ({robot.length:g} m). Was it given in mm?"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 from fastrod.errors import FastrodError
 
 _LARGEST = 1_000_000  # bytes; a robot of five segments has two thousand
+_DEEPEST = 50  # parts of a dotted key
 
 
 def read_text(path: Path, where: str, error: type[FastrodError]) -> str:
@@ -25,6 +27,8 @@ def read_text(path: Path, where: str, error: type[FastrodError]) -> str:
 
 def parse(text: str, where: str, error: type[FastrodError], what: str) -> dict[str, Any]:
     """The tables of a TOML text. Raises `error`; `where` names the text, and `what` is what it should be."""
+    if any(piece.count(".") > _DEEPEST and all(map(str.strip, piece.split("."))) for piece in re.split(r"[\n,=]", text)):
+        raise error(f"{where} is not a {what}: it has a key of more than {_DEEPEST} parts.")  # tomllib takes the square of their number
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as why:

@@ -100,24 +100,52 @@ class Originals:
         """An array file of 200 MB that a zip holds in 200 kB."""
         return npz({"weight_0": np.zeros(50_000_000, np.float32)}, compress=True)
 
+    @cached_property
+    def rows(self) -> bytes:
+        """Parquet: eight columns of 20 million equal numbers, in a few kB."""
+        return _many_rows()
+
+    @cached_property
+    def words(self) -> bytes:
+        """Parquet: a word of 1 MB in 100,000 rows."""
+        return _long_words()
+
+
+def write_fine(kind: str, path: Path, originals: Originals) -> Path:
+    """Write a file, or of a policy a folder, that is whole, at `path` and a suffix; where it is."""
+    if kind == "policy":
+        path.mkdir()
+        for name, data in zip(("actor.npz", "config.json"), originals.policy, strict=True):
+            (path / name).write_bytes(data)
+        return path
+    target = _target(kind, path)
+    target.write_bytes(_original(kind, 0, originals))
+    return target
+
+
+def _original(kind: str, number: int, originals: Originals) -> bytes:
+    if kind in originals.tables:
+        return originals.tables[kind][number % len(originals.tables[kind])]
+    return originals.meshes[kind] if kind in originals.meshes else originals.log[kind == "log parquet"]
+
+
+def _target(kind: str, path: Path) -> Path:
+    return path.with_suffix("." + _SUFFIX.get(kind, kind.removesuffix(" text").rpartition(" ")[2]))
+
 
 def write_case(kind: str, rng: Rng, path: Path, canary: Path, originals: Originals) -> tuple[Path, str]:
     """Write one file, or of a policy a folder, at `path` and a suffix; where it is, and how it was spoilt. Code in it makes `canary`."""
     if kind == "policy":
         return path, _policy(rng, path, canary, originals)
-    if kind in originals.tables:
-        given = originals.tables[kind]
-        data = given[rng.integers(len(given))]
-    else:
-        data = originals.meshes[kind] if kind in originals.meshes else originals.log[kind == "log parquet"]
-    hostile = _hostile(kind, data, canary)
+    data = _original(kind, int(rng.integers(1000)), originals)
+    hostile = _hostile(kind, data, canary, originals)
     own = sorted(hostile)
     if rng.random() < 0.1:
         attack = own[rng.integers(len(own))]
         data = hostile[attack]()
     else:
         data, attack = spoilt(data, rng, text=kind not in ("log parquet", "mesh stl", "mesh ply", "mesh glb"))
-    target = path.with_suffix("." + _SUFFIX.get(kind, kind.removesuffix(" text").rpartition(" ")[2]))
+    target = _target(kind, path)
     target.write_bytes(data)
     return target, attack
 
@@ -127,7 +155,7 @@ def spoilt(data: bytes, rng: Rng, *, text: bool) -> tuple[bytes, str]:
     if rng.random() < 0.02:
         return data, "nothing"
     ways: dict[str, Spoil] = _TEXT if text or rng.random() < 0.2 else _BYTES
-    names = [sorted(ways)[rng.integers(len(ways))] for _ in range(rng.integers(1, 4))]
+    names = [sorted(ways)[rng.integers(len(ways))] for _ in range(1 + int(rng.integers(6) // 4))]
     for name in names:
         data = ways[name](data, rng)
     return data, ", ".join(names)
@@ -144,7 +172,7 @@ def _truncate(data: bytes, rng: Rng) -> bytes:
 
 def _flip(data: bytes, rng: Rng) -> bytes:
     made = bytearray(data)
-    for place in rng.integers(max(1, len(made)), size=rng.integers(1, 17)).tolist() if made else ():
+    for place in rng.integers(max(1, len(made)), size=2 ** rng.integers(5)).tolist() if made else ():
         made[place] ^= 1 << int(rng.integers(8))
     return bytes(made)
 
@@ -253,7 +281,7 @@ def npz(arrays: Mapping[str, Any], *, compress: bool = False) -> bytes:
 def foreign(canary: Path) -> bytes:
     """A file of stable-baselines3 whose pickles make `canary`."""
     word = {":type:": "<class 'x'>", ":serialized:": base64.b64encode(pickle.dumps(_Code(canary))).decode()}
-    data = json.dumps({name: word for name in ("policy_class", "observation_space", "action_space", "policy_kwargs")})
+    data = json.dumps(dict.fromkeys(("policy_class", "observation_space", "action_space", "policy_kwargs"), word))
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
         archive.writestr("data", data)
@@ -261,7 +289,7 @@ def foreign(canary: Path) -> bytes:
     return out.getvalue()
 
 
-def _hostile(kind: str, data: bytes, canary: Path) -> dict[str, Callable[[], bytes]]:
+def _hostile(kind: str, data: bytes, canary: Path, originals: Originals) -> dict[str, Callable[[], bytes]]:
     """Files that are made to harm, by name."""
     made: dict[str, Callable[[], bytes]] = {
         "empty": lambda: b"", "pickle": lambda: pickle.dumps(_Code(canary)), "pickled arrays": lambda: npz({"t": np.array([_Code(canary)])}),
@@ -269,7 +297,7 @@ def _hostile(kind: str, data: bytes, canary: Path) -> dict[str, Callable[[], byt
         "archive": lambda: npz({"a": np.zeros(10)}),
     }  # fmt: skip
     if kind == "log parquet":
-        made |= {"many rows": _many_rows, "long words": _long_words}
+        made |= {"many rows": lambda: originals.rows, "long words": lambda: originals.words}
     if kind == "mesh glb":
         made |= {name: partial(_glb, data, change) for name, change in _GLB.items()}
     if kind.startswith("mesh"):
@@ -327,23 +355,21 @@ _GLB: Mapping[str, Callable[[dict[str, Any]], None]] = {
 
 
 def _many_rows() -> bytes:
-    """Ten columns of 20 million equal numbers, which a Parquet file holds in a few kB."""
     import pyarrow
     import pyarrow.parquet
 
     one, out = pyarrow.array(np.zeros(20_000_000, np.int8)), io.BytesIO()
-    pyarrow.parquet.write_table(pyarrow.table({name: one for name in ("t", "tip_x", "tip_y", "tip_z", "dl_1", "dl_2", "dl_3", "dl_4")}), out)
+    pyarrow.parquet.write_table(pyarrow.table(dict.fromkeys(("t", "tip_x", "tip_y", "tip_z", "dl_1", "dl_2", "dl_3", "dl_4"), one)), out)
     return out.getvalue()
 
 
 def _long_words() -> bytes:
-    """A word of 1 MB, in 100,000 rows."""
     import pyarrow
     import pyarrow.parquet
 
     word = pyarrow.DictionaryArray.from_arrays(pyarrow.array(np.zeros(100_000, np.int32)), pyarrow.array(["x" * 1_000_000]))
     zeros, out = pyarrow.array(np.zeros(100_000, np.int8)), io.BytesIO()
-    pyarrow.parquet.write_table(pyarrow.table({"run": word, **{name: zeros for name in ("t", "tip_x", "tip_y", "tip_z")}}), out)
+    pyarrow.parquet.write_table(pyarrow.table({"run": word, **dict.fromkeys(("t", "tip_x", "tip_y", "tip_z"), zeros)}), out)
     return out.getvalue()
 
 

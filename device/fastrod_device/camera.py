@@ -116,7 +116,9 @@ class Camera:
         put(self, "position", _tuple(self.position, "Camera.position", 3))
         put(self, "quaternion", _unit(self.quaternion, "Camera.quaternion"))
         if not (m[0, 0] >= 1e-3 and m[1, 1] >= 1e-3) or m[0, 1] != 0.0 or m[1, 0] != 0.0 or m[2].tolist() != [0.0, 0.0, 1.0]:
-            raise InputError(f"Camera.matrix is {m.tolist()!r}; it must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], fx and fy positive, from 0.001.")
+            raise InputError(
+                f"Camera.matrix is {m.tolist()!r}; it must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], fx and fy positive, from 0.001."
+            )
         size = tuple(self.size)
         low, high = _PIXELS
         if len(size) != 2 or any(isinstance(n, bool) or not isinstance(n, (int, np.integer)) or not low <= n <= high for n in size):

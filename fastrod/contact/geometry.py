@@ -239,7 +239,9 @@ def mesh(
     if not (math.isfinite(factor) and factor > 0.0):
         raise InputError(f"scale of {where} is {factor!r}; it must be positive and finite, for example 0.001 for a file in mm.")
     if len(vertices) and (far := float(np.abs(vertices).max()) * factor) > _FARTHEST:
-        raise InputError(f"{where} has a vertex {far:.6g} m from its origin; more than {_FARTHEST:g} m. Was it given in mm? scale=0.001 mends that.")
+        raise InputError(
+            f"{where} has a vertex {far:.6g} m from its origin; more than {_FARTHEST:g} m. Was it given in mm? scale=0.001 mends that."
+        )
     vertices, faces = _merged(vertices * factor, faces)
     faces = _without_slivers(where, vertices, faces)
     if not len(faces) or not (_heights(vertices, faces)[0] > 1e-14).any():

@@ -23,6 +23,7 @@ from fastrod.types import Floats, Ints
 
 _SMALL, _FEW = 4_000_000, 100  # bytes and bodies up to which a file is read in this process: a second or two at worst
 _DESCRIPTION = 16_000_000  # bytes of the JSON of a .glb
+_LINE = 10_000  # bytes of a line of an .obj or .off
 _HEADER = 65_536  # bytes in which the header of a .ply or .off ends
 
 
@@ -106,7 +107,11 @@ def _here(where: str, path: Path, kind: str, _: MeshLimits) -> tuple[Floats, Int
 def _apart(where: str, path: Path, kind: str, limits: MeshLimits) -> tuple[Floats, Ints]:
     """In a process of its own, which ends at the limits."""
     command = [sys.executable, "-P", trimesh_reader.__file__, str(path.absolute()), kind, str(int(limits.memory))]
-    own = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "OPENBLAS_NUM_THREADS": "1"}  # each thread of it reserves memory
+    own = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
+        "OPENBLAS_NUM_THREADS": "1",
+    }  # each thread of it reserves memory
     try:
         done = subprocess.run(command, env=own, capture_output=True, timeout=limits.seconds, check=False, stdin=subprocess.DEVNULL)
     except subprocess.TimeoutExpired as error:
@@ -141,7 +146,16 @@ def _stl(file: int, size: int) -> _Declared:
 
 def _obj(file: int, _: int) -> _Declared:
     with _mapped(file) as data:
+        _check_lines(data)
         return _Declared(_count(data, rb"^[ \t]*f[ \t]"), _count(data, rb"^[ \t]*v[ \t]"), 1)
+
+
+def _check_lines(data: mmap.mmap) -> None:
+    """Raises `ValueError` for a line that only a face of thousands of corners has: it would be cut into as many triangles."""
+    ends = np.flatnonzero(np.frombuffer(data[:], np.uint8) == ord("\n"))
+    longest = int(np.diff(ends, prepend=-1, append=len(data)).max()) - 1
+    if longest > _LINE:
+        raise ValueError(f"it has a line of {longest} bytes, more than {_LINE}, so a face with too many corners")
 
 
 def _count(data: mmap.mmap, pattern: bytes) -> int:
@@ -150,6 +164,7 @@ def _count(data: mmap.mmap, pattern: bytes) -> int:
 
 def _off(file: int, size: int) -> _Declared:
     with _mapped(file) as data:
+        _check_lines(data)
         head = re.sub(rb"#[^\n]*", b" ", data[:_HEADER]).split(maxsplit=4)
     if not head or head[0].upper() != b"OFF":
         raise ValueError("it does not begin with OFF")

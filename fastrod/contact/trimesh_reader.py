@@ -23,7 +23,7 @@ def read(path: str, kind: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     import trimesh
 
     data = _PLAIN.get(kind, bytes)(Path(path).read_bytes())
-    with _silent("trimesh"):  # a stream has no folder in which materials, textures or buffers would be looked for
+    with _silent("trimesh", "trimesh.util"):  # a stream has no folder in which materials, textures or buffers would be looked for
         made = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False, skip_materials=True).to_mesh()
     return np.array(made.vertices, dtype=np.float64).reshape(-1, 3), np.array(made.faces, dtype=np.int64).reshape(-1, 3)
 
@@ -45,18 +45,20 @@ _PLAIN: dict[str, Callable[[bytes], bytes]] = {"obj": _plain_obj, "stl": _plain_
 
 
 @contextmanager
-def _silent(name: str) -> Iterator[None]:
-    """A logger writes nothing from this thread: trimesh logs the tracebacks of exceptions that it goes on from."""
-    logger, thread = logging.getLogger(name), threading.get_ident()
+def _silent(*names: str) -> Iterator[None]:
+    """These loggers write nothing from this thread: trimesh logs the tracebacks of exceptions that it goes on from."""
+    loggers, thread = [logging.getLogger(name) for name in names], threading.get_ident()
 
     def drop(record: logging.LogRecord) -> bool:
         return record.thread != thread
 
-    logger.addFilter(drop)
+    for logger in loggers:
+        logger.addFilter(drop)
     try:
         yield
     finally:
-        logger.removeFilter(drop)
+        for logger in loggers:
+            logger.removeFilter(drop)
 
 
 def _main(path: str, kind: str, memory: str) -> int:

@@ -14,6 +14,7 @@ from fastrod_envs.arrays import read_arrays, write_arrays
 
 Activation = Literal["tanh", "relu"]
 Singles = NDArray[np.float32]
+_MOST, _LEAST = 1e5, 1e-7  # of a weight or bound, and of `reach`: products of three layers fit single precision
 
 
 class Actor(NamedTuple):
@@ -78,7 +79,9 @@ def _misfit(weights: list[np.ndarray], biases: list[np.ndarray], middle: np.ndar
     fitting = [*zip(widths[1:], widths[:-1], strict=True), *((size,) for size in widths[1:]), (widths[0],), (widths[0],)]
     if ends != fitting or not all(widths):
         return f"its layers of shapes {shown([*ends])} do not fit together"
-    return "" if (reach > 0.0).all() else "its observations have bounds without a distance between them"
+    if any(np.abs(a).max() > _MOST for a in arrays):
+        return f"it holds a number beyond {_MOST:g}, which no training comes to"
+    return "" if (reach >= _LEAST).all() else "its observations have bounds without a distance between them"
 
 
 def actor_of(model: Any) -> Actor:

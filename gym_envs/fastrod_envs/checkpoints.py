@@ -67,7 +67,9 @@ def load_replay(model: Any, path: Path) -> None:
     buffer = model.replay_buffer
     into = {name: getattr(buffer, name) for name in _REPLAY}
     held = read_arrays(path, "a replay buffer of `fastrod train`", LARGEST + sum(a.nbytes for a in into.values()))
-    misfit = InputError(f"{str(path)!r} is no replay buffer of the plan beside it; without that file the training goes on with an empty one.")
+    misfit = InputError(
+        f"{str(path)!r} is no replay buffer of the plan beside it; without that file the training goes on with an empty one."
+    )
     if set(held) != {*_REPLAY, "pos", "full"} or any(held[name].shape != () for name in ("pos", "full")):
         raise misfit
     pos, full = int(held["pos"]), bool(held["full"])
