@@ -12,6 +12,7 @@ import numpy as np
 from fastrod.errors import InputError
 from fastrod.types import Ints
 from fastrod_device.bus import Line, guest
+from fastrod_device.dictionary import find, titled
 from fastrod_device.errors import DeviceError
 from fastrod_device.units import DriveSpec
 
@@ -32,7 +33,24 @@ _MAPPING = {
 _UNUSED = (0x1401, 0x1402, 0x1403, 0x1802, 0x1803)  # PDOs that a drive may have kept from somebody else
 _INVALID, _NO_RTR = 0x8000_0000, 0x4000_0000  # bits of a COB-ID; some drives refuse a TPDO that could be asked for by RTR
 _NO_SUCH_OBJECT = (0x06020000, 0x06090011)
-_MODES = {1: "profile position", 6: "homing", 8: "cyclic synchronous position"}
+_MODES = {
+    1: "profile position", 2: "velocity", 3: "profile velocity", 4: "profile torque", 6: "homing", 7: "interpolated position",
+    8: "cyclic synchronous position", 9: "cyclic synchronous velocity", 10: "cyclic synchronous torque",
+}  # fmt: skip
+"""Bits of object 0x6502, counted from 1, in words."""
+_CYCLIC = 8
+_WITHOUT = {
+    0x3001: "the current of its motor is not limited",
+    0x605A: "after a quick stop it does what it was set to do before",
+    0x6065: "the following error is not limited by the drive",
+    0x6076: "its rated torque is not compared with DriveSpec.rated_torque",
+    0x607D: "the target position is not limited by the drive",
+    0x607F: "the profile velocity is not limited",
+    0x6080: "the speed of its motor is not limited by the drive",
+    0x6085: "the deceleration of a quick stop is the drive's own",
+    0x60C2: "the period over which it interpolates set-points is the drive's own",
+}
+"""What follows where a drive lacks an object."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -81,20 +99,65 @@ class Configurator:
         self._error = line.error
         self.requests = 0
         """SDO requests so far."""
+        self.notices: list[str] = []
+        """What the drives do not limit, for want of an object: a sentence each."""
         self._modes = [0] * len(specs)
 
     def read(self, drive: int, index: int, sub: int = 0) -> int:
-        """A number. Raises `DeviceError`: no answer, or refused."""
-        return int(self._variable(index, sub).decode_raw(self._ask(drive, index, sub, None)))
+        """A number. Raises `DeviceError`: no answer, no such object, or refused."""
+        value = self._read(drive, index, sub)
+        if value is None:
+            raise self._lacks(drive, index, sub)
+        return value
 
-    def write(self, drive: int, index: int, sub: int, value: int, *, optional: bool = False) -> None:
-        """Write a number. An optional object may be absent. Raises `DeviceError`: no answer, or refused."""
-        self._ask(drive, index, sub, self._variable(index, sub).encode_raw(value), optional=optional)
+    def write(self, drive: int, index: int, sub: int, value: int) -> None:
+        """Write a number. Raises `DeviceError`: no answer, no such object, or refused."""
+        if not self._write(drive, index, sub, value):
+            raise self._lacks(drive, index, sub)
 
-    def _variable(self, index: int, sub: int) -> Any:
-        return self._dictionary.get_variable(index, sub)
+    def offer(self, drive: int, index: int, sub: int, value: int) -> None:
+        """Write a number to an object that the drive may lack; `notices` then has what follows. Raises `DeviceError` as `write` does."""
+        if not self._write(drive, index, sub, value):
+            self._note(drive, index, sub)
 
-    def _ask(self, drive: int, index: int, sub: int, data: bytes | None, *, optional: bool = False) -> bytes:
+    def _note(self, drive: int, index: int, sub: int) -> None:
+        number = f"0x{index:04X}:{sub:02X}" if sub else f"0x{index:04X}"
+        sentence = f"Node {self._specs[drive].node} has no object {number}: {_WITHOUT[index]}."
+        if sentence not in self.notices:
+            self.notices.append(sentence)
+
+    def _lacks(self, drive: int, index: int, sub: int) -> DeviceError:
+        return DeviceError(f"the drive at node {self._specs[drive].node} has no object {titled(index, sub)}, which is needed.")
+
+    def _read(self, drive: int, index: int, sub: int) -> int | None:
+        """None where there is no such object, in the dictionary or in the drive."""
+        var = find(self._dictionary, index, sub)
+        data = None if var is None else self._ask(drive, index, sub, None)
+        if var is None or data is None:
+            return None
+        if 8 * len(data) != len(var):
+            raise DeviceError(
+                f"the drive at node {self._specs[drive].node} answers {len(data)} bytes for object {titled(index, sub)}; its dictionary"
+                f" says {len(var) // 8}. Is the EDS file that of this drive?"
+            )
+        return int(var.decode_raw(data))
+
+    def _write(self, drive: int, index: int, sub: int, value: int) -> bool:
+        """Whether there is such an object."""
+        var = find(self._dictionary, index, sub)
+        if var is None:
+            return False
+        try:
+            data = bytes(var.encode_raw(value))
+        except (ValueError, TypeError) as error:  # an EDS file may give it another type
+            raise DeviceError(
+                f"{value} does not fit object {titled(index, sub)} of the drive at node {self._specs[drive].node}, whose data type is"
+                f" 0x{var.data_type:02X} in its dictionary."
+            ) from error
+        return self._ask(drive, index, sub, data) is not None
+
+    def _ask(self, drive: int, index: int, sub: int, data: bytes | None) -> bytes | None:
+        """What was read, or nothing after a write; None where the drive has no such object."""
         node, what = self._specs[drive].node, f"0x{index:04X}:{sub:02X}"
         self._beat()
         self.requests += 1
@@ -103,8 +166,9 @@ class Configurator:
                 return bytes(self._clients[drive].upload(index, sub))
             self._clients[drive].download(index, sub, data)
         except self._sdo.SdoAbortedError as error:
-            if not (optional and error.code in _NO_SUCH_OBJECT):
-                raise DeviceError(f"the drive at node {node} refuses object {what}: {error}.") from error
+            if error.code in _NO_SUCH_OBJECT:
+                return None
+            raise DeviceError(f"the drive at node {node} refuses object {what}: {error}.") from error
         except self._sdo.SdoCommunicationError as error:
             raise DeviceError(
                 f"the drive at node {node} does not answer (object {what}); are its power, its node id and the bit rate right?"
@@ -114,14 +178,23 @@ class Configurator:
         return b""
 
     def identify(self, drive: int) -> None:
-        """It must be a drive of CiA 402 with our modes, and of the motor that the spec names. Raises `DeviceError` otherwise."""
+        """It must be a drive of CiA 402 with the cyclic mode, and of the motor that the spec names. Raises `DeviceError` otherwise."""
         spec = self._specs[drive]
         kind = self.read(drive, 0x1000)
         if kind & 0xFFFF != 402:
             raise DeviceError(f"node {spec.node} is no drive: its device type is {kind & 0xFFFF}, that of CiA 402 is 402.")
-        self.read(drive, 0x1018, 1)
         self._modes[drive] = self.read(drive, 0x6502)
-        rated = 1e-6 * self.read(drive, 0x6076)
+        if not self._modes[drive] >> (_CYCLIC - 1) & 1:
+            has = [words for mode, words in _MODES.items() if self._modes[drive] >> (mode - 1) & 1]
+            raise DeviceError(
+                f"the drive at node {spec.node} has no {_MODES[_CYCLIC]} mode, which is needed; it supports {', '.join(has) or 'none'}"
+                f" (object 0x6502 is 0x{self._modes[drive]:X})."
+            )
+        measured = self._read(drive, 0x6076, 0)
+        if measured is None:
+            self._note(drive, 0x6076, 0)
+            return
+        rated = 1e-6 * measured
         if not math.isclose(rated, spec.rated_torque, rel_tol=0.02):
             raise DeviceError(
                 f"the drive at node {spec.node} says its motor's rated torque is {rated:.4g} N m, DriveSpec.rated_torque is"
@@ -145,17 +218,19 @@ class Configurator:
             return limits.of(name, n)[drive]
 
         self.write(drive, 0x60A9, 0, _MILLI_RPM)
-        self.write(drive, 0x607F, 0, self.speed(drive, own("velocity_limit")))
-        self.write(drive, 0x6085, 0, self.acceleration(drive, own("deceleration")))
-        self.write(drive, 0x607D, 1, -own("position_limit"))
-        self.write(drive, 0x607D, 2, own("position_limit"))
-        self.write(drive, 0x6065, 0, own("following_error"))
-        self.write(drive, 0x6066, 0, 0, optional=True)
-        self.write(drive, 0x6072, 0, own("torque_limit"))
-        self.write(drive, 0x605A, 0, 6 if limits.hold else 2)
+        fastest = self.speed(drive, own("velocity_limit"))
+        self.offer(drive, 0x6080, 0, fastest)  # in every mode; its stored value would now be read in the new unit, too
+        self.offer(drive, 0x607F, 0, fastest)  # perhaps only in modes whose way the drive plans
+        self.offer(drive, 0x6085, 0, self.acceleration(drive, own("deceleration")))
+        self.offer(drive, 0x607D, 1, -own("position_limit"))
+        self.offer(drive, 0x607D, 2, own("position_limit"))
+        self.offer(drive, 0x6065, 0, own("following_error"))
+        self._write(drive, 0x6066, 0, 0)
+        self.offer(drive, 0x3001, 2, self.current(drive, own("torque_limit")))
+        self.offer(drive, 0x605A, 0, 6 if limits.hold else 2)
         self.write(drive, 0x6007, 0, 3)  # connection lost: quick stop
-        self.write(drive, 0x60C2, 1, round(1e3 / rate))
-        self.write(drive, 0x60C2, 2, -3, optional=True)
+        self.offer(drive, 0x60C2, 1, round(1e3 / rate))
+        self._write(drive, 0x60C2, 2, -3)
 
     def map(self, drive: int) -> None:
         """Process data: what is exchanged with every SYNC. The node must be pre-operational."""
@@ -171,11 +246,9 @@ class Configurator:
             self.write(drive, mapping, 0, len(entries))
             self.write(drive, communication, 1, cob_id)
         for index in _UNUSED:
-            if self._dictionary.get_variable(index, 1) is None:
-                continue
-            if held := self._ask(drive, index, 1, None, optional=True):
-                bits = _INVALID | (_NO_RTR if index >= 0x1800 else 0)
-                self.write(drive, index, 1, int(self._variable(index, 1).decode_raw(held)) | bits)
+            held = self._read(drive, index, 1)
+            if held is not None:
+                self.write(drive, index, 1, held | _INVALID | (_NO_RTR if index >= 0x1800 else 0))
 
     def watch(self, drive: int, on: bool) -> None:
         """Heartbeats of the drive, and the controller's watched by it, on or off."""
@@ -185,6 +258,11 @@ class Configurator:
     def speed(self, drive: int, counts: float) -> int:
         """Counts/s in the drive's unit of velocity."""
         return max(1, round(counts * 60_000.0 / self._specs[drive].counts_per_turn))
+
+    def current(self, drive: int, torque: float) -> int:
+        """Milliamperes of the motor that give thousandths of its rated torque."""
+        spec = self._specs[drive]
+        return max(1, round(torque * spec.rated_torque / spec.torque_constant))
 
     def acceleration(self, drive: int, counts: float) -> int:
         """Counts/s2 in the drive's unit of acceleration, rpm/s."""

@@ -119,6 +119,11 @@ class DriveBus:
         self._cycle.syncs.clear()
         self._cycle.inbox.missed = 0
 
+    @property
+    def notices(self) -> tuple[str, ...]:
+        """What the drives do not limit for want of an object, a sentence each; known after `connect`."""
+        return tuple(self._configurator.notices)
+
     # setting up
 
     def connect(
@@ -128,8 +133,8 @@ class DriveBus:
         """Find the drives, tell them their limits and process data, and make them operational; they stay switched off.
 
         What drives refuse by themselves, one number or (n_drives,): targets beyond +-`position_limit` [counts], speeds beyond
-        `velocity_limit` [counts/s], a fault beyond `following_error` [counts]; they pull with `torque_limit` [thousandths of the rated
-        torque] at most. A quick stop is by `deceleration` [counts/s2]; then the motors `hold` the wires or are switched off.
+        `velocity_limit` [counts/s], a fault beyond `following_error` [counts]; their motors carry the current of `torque_limit`
+        [thousandths of the rated torque] at most. A limit whose object a drive lacks is left out, and said in `notices`. A quick stop is by `deceleration` [counts/s2]; then the motors `hold` the wires or are switched off.
         Call it again after a drive has rebooted.
         Raises `InputError`, or `DeviceError`: the first drive that does not answer, is another device, or refuses.
         """
@@ -145,6 +150,7 @@ class DriveBus:
         for name in ("position_limit", "velocity_limit", "following_error", "deceleration", "torque_limit"):
             limits.of(name, n)
         self._cycle.words, self._cycle.enabled, self._cycle.configured = [OFF] * n, [False] * n, [False] * n
+        setup.notices.clear()
         for i in range(n):
             setup.identify(i)
         for i in range(n):
@@ -300,23 +306,21 @@ class DriveBus:
             raise InputError(f"order is {order!r}; it must name each drive from 0 to {n - 1} once.")
         self.enable("csp")
         for i in drives * int(rounds):
-            spec = self._specs[i]
-            current = 1e-3 * float(torque[i]) * spec.rated_torque / spec.torque_constant
             try:
-                self._home(i, current, float(np.broadcast_to(speeds, (n,))[i]), acceleration, away[i], time_limit)
+                self._home(i, self._configurator.current(i, float(torque[i])), float(np.broadcast_to(speeds, (n,))[i]), acceleration, away[i], time_limit)
             except DeviceError:
                 self.quick_stop("homing did not end")
                 raise
         return self._cycle.newest
 
-    def _home(self, i: int, current: float, speed: float, acceleration: float, away: int, limit: float) -> None:
+    def _home(self, i: int, current: int, speed: float, acceleration: float, away: int, limit: float) -> None:
         setup, spec = self._configurator, self._specs[i]
         setup.write(i, 0x6098, 0, -3 if spec.direction > 0 else -4)
         setup.write(i, 0x6099, 1, setup.speed(i, speed))
         setup.write(i, 0x609A, 0, setup.acceleration(i, acceleration))
         setup.write(i, 0x30B1, 0, away)
         setup.write(i, 0x30B0, 0, away)  # the count where the move ends: 0 is where the wire was taut
-        setup.write(i, 0x30B2, 0, max(1, round(1e3 * current)))
+        setup.write(i, 0x30B2, 0, current)  # mA
         setup.set_mode(i, 6)
 
         def attained(now: Feedback) -> bool:

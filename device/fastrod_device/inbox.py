@@ -47,6 +47,8 @@ class Inbox:
         """Emergency messages that were gathered."""
         self.missed = 0
         """SYNCs that not every drive answered in time."""
+        self._foreign = 0
+        line.network.subscribe(0x080, self._on_sync)  # a bus does not hear itself: it is another node's
         for node in self._index:
             line.network.subscribe(STATUS + node, self._on_status)
             line.network.subscribe(MOTION + node, self._on_motion)
@@ -55,13 +57,22 @@ class Inbox:
 
     def expect(self) -> None:
         """A SYNC is about to be sent."""
-        first, second = self._pending
         with self._lock:
-            for i in range(len(first)):
-                first[i] += 1
-                second[i] += 1
-            self._waiting = sum(first[i] + second[i] for i, live in enumerate(self._live) if live)
-            self._all_in.clear()
+            self._expect()
+
+    def _expect(self) -> None:
+        first, second = self._pending
+        for i in range(len(first)):
+            first[i] += 1
+            second[i] += 1
+        self._waiting = sum(first[i] + second[i] for i, live in enumerate(self._live) if live)
+        self._all_in.clear()
+
+    def _on_sync(self, cob_id: int, data: bytearray, timestamp: float) -> None:  # noqa: ARG002
+        """The drives answer another node's SYNC as well: its answers must not pass for those to ours."""
+        with self._lock:
+            self._foreign += 1
+            self._expect()
 
     def wait(self, bound: float) -> None:
         """Until all have answered what was expected, `bound` [s] at most; those that were silent before get little time."""
@@ -83,6 +94,7 @@ class Inbox:
         now = self._clock.now()
         with self._lock:
             mail, self._mail = tuple(self._mail), []
+            foreign, self._foreign = self._foreign, 0
             if any(self._live):
                 self._line.trouble = ""
             silence = now - max(self._t)
@@ -94,6 +106,7 @@ class Inbox:
                 torque=np.array(self._torque, dtype=np.int64), following_error=np.array(self._error, dtype=np.int64),
                 statusword=np.array(self.status, dtype=np.int64), age=now - np.array(self._t), heartbeat_age=now - np.array(self._t_beat),
                 nmt=np.array(self._nmt, dtype=np.int64), emergencies=mail, lost=lost,
+                foreign_syncs=foreign,
             )  # fmt: skip
         self.log.extend(mail)
         return feedback

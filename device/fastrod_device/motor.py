@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from typing import final
 
+from fastrod_device.dictionary import Key
 from fastrod_device.faultcodes import ENABLED, FAULT, QUICK_STOP, REACTION, READY, STATUS_BITS, SWITCH_ON_DISABLED, SWITCHED_ON
-from fastrod_device.objects import Key, Objects
+from fastrod_device.objects import Objects
 from fastrod_device.units import DriveSpec
 
 PROFILE, HOMING, CYCLIC = 1, 6, 8
@@ -24,7 +25,8 @@ class Motor:
     """One axis. Positions in counts; growing counts pull the wire where the spec's direction is +1.
 
     A shaft without current is held by the friction of its gear. The current is that of the wire's tension; the motor's own inertia and
-    friction are left out. Where the wire pulls with the greatest torque (object 0x6072) or more, the shaft turns no further against it.
+    friction are left out. Where the tendon pulls with what the greatest current (object 0x3001:02) gives or more, the shaft turns no
+    further against it. What its dictionary lacks limits nothing; other absent objects have the shipped dictionary's value.
     """
 
     def __init__(self, spec: DriveSpec, objects: Objects) -> None:
@@ -54,7 +56,8 @@ class Motor:
         live[(0x606C, 0)], live[(0x6077, 0)] = self.velocity, self.told_torque
         live[(0x60F4, 0)], live[(0x6061, 0)] = self.following_error, lambda: self.mode
         live[(0x1001, 0)], live[(0x603F, 0)] = lambda: self.register, lambda: self.code
-        live[(0x30D1, 1)] = self.told_torque
+        live[(0x30D1, 1)] = live[(0x30D1, 2)] = self.current
+        live[(0x30D2, 1)] = self.told_torque
         self.restart()
 
     def restart(self) -> None:
@@ -101,9 +104,13 @@ class Motor:
 
     def told_torque(self) -> int:
         """Object 0x6077; 0 without current."""
-        most = self.objects.values[(0x6072, 0)]
+        most = self._greatest_torque()
         carried = max(-most, min(most, self.torque))
         return max(-32768, min(32767, round(carried + self.noise))) if self.powered else 0
+
+    def current(self) -> int:
+        """Object 0x30D1 [mA]."""
+        return round(self.told_torque() / self._per_milliampere())
 
     def following_error(self) -> int:
         """Object 0x60F4 [counts]."""
@@ -114,7 +121,7 @@ class Motor:
     def written(self, key: Key, value: int) -> None:
         """An object is about to be written. Raises an SDO abort for what cannot be."""
         if key == (0x6060, 0):
-            if value not in (PROFILE, HOMING, CYCLIC):
+            if value not in (PROFILE, HOMING, CYCLIC) or not self.objects.get(0x6502) >> (value - 1) & 1:
                 raise self.objects.refuse()
             if value != self.mode:
                 self.mode, self.homing, self.reached, self.acknowledged = value, "", False, False
@@ -152,14 +159,14 @@ class Motor:
                 self._to(SWITCHED_ON)
         elif word & 0x0F == 0x0F:
             # EPOS4 goes on from "quick stop active" as well, where it holds there: transition 16
-            if self.state in (READY, SWITCHED_ON) or (self.state == QUICK_STOP and self.objects.values[(0x605A, 0)] == 6):
+            if self.state in (READY, SWITCHED_ON) or (self.state == QUICK_STOP and self.objects.get(0x605A) == 6):
                 self._to(ENABLED)
             if self.state == ENABLED:
                 self._start(word, rising)
 
     def set_target(self, target: int) -> None:
         """A target position came [counts]."""
-        low, high = self.objects.values[(0x607D, 1)], self.objects.values[(0x607D, 2)]
+        low, high = self.objects.get(0x607D, 1), self.objects.get(0x607D, 2)
         clipped = max(low, min(high, target)) if low < high else target
         self.limited = clipped != target
         self._target = float(clipped)
@@ -167,7 +174,7 @@ class Motor:
     def setpoint(self) -> None:
         """A SYNC with a new set-point, in the cyclic mode: go there in one interpolation period."""
         if self.state == ENABLED and self.mode == CYCLIC:
-            period = max(SUBSTEP, self.objects.values[(0x60C2, 1)] * 10.0 ** self.objects.values[(0x60C2, 2)])
+            period = max(SUBSTEP, self.objects.get(0x60C2, 1) * 10.0 ** self.objects.get(0x60C2, 2))
             self.goal, self._left = self._target, period
             self.command_rate = (self.goal - self.command) / period
 
@@ -181,7 +188,8 @@ class Motor:
         self.code = code
         self.register |= 0x01 | (0x10 if code >> 8 in (0x81, 0x82) else _REGISTER.get(code >> 12, 0x20 if code >> 8 == 0x86 else 0))
         self.emergencies.append((code, self.register))
-        self.objects.values[(0x1003, 1)] = code
+        if (0x1003, 1) in self.objects.values:
+            self.objects.values[(0x1003, 1)] = code
 
     def fault(self, code: int) -> None:
         """Tell an error, stop and switch off."""
@@ -206,7 +214,7 @@ class Motor:
         elif self.mode == HOMING:
             if rising & 0x10:
                 self.homing, self.reached = "search", False
-                if self.objects.values[(0x6098, 0)] == 37:
+                if self.objects.get(0x6098) == 37:
                     self._referenced()
             elif not word & 0x10 and self.homing in ("search", "away"):
                 self.homing = ""
@@ -236,7 +244,7 @@ class Motor:
             return
         n = max(1, math.ceil(dt / SUBSTEP - 1e-6))
         h = dt / n
-        fastest = self.objects.values[(0x607F, 0)] * self._rate_unit()
+        fastest = self._fastest()
         for k in range(n):
             before = self.v
             if self.powered:
@@ -260,14 +268,14 @@ class Motor:
             return True
         still = self.command_rate == 0.0 and self._left == 0.0 and self.goal == self.command and abs(self.command - self.measured) < 0.5
         if self.state == QUICK_STOP:
-            return still and self.objects.values[(0x605A, 0)] != 2
+            return still and self.objects.get(0x605A) != 2
         return still and self.homing not in ("search", "away") and (self.reached or self.mode != PROFILE)
 
     def _command(self, h: float) -> None:
         """The command by the mode's generator."""
-        values = self.objects.values
+        get = self.objects.get
         if self.state != ENABLED:
-            change = values[(0x6085, 0)] * self._per_rpm() * h
+            change = get(0x6085) * self._per_rpm() * h
             self.command_rate -= math.copysign(min(abs(self.command_rate), change), self.command_rate)
             self.command += self.command_rate * h
             self.goal = self.command
@@ -279,26 +287,25 @@ class Motor:
                 self.command, self.command_rate, self._left = self.goal, 0.0, 0.0
         elif self.mode == PROFILE:
             unit = self._rate_unit()
-            self._profile(h, values[(0x6081, 0)] * unit, values[(0x6083, 0)] * self._per_rpm(), values[(0x6084, 0)] * self._per_rpm())
+            self._profile(h, get(0x6081) * unit, get(0x6083) * self._per_rpm(), get(0x6084) * self._per_rpm())
         elif self.homing in ("search", "away"):
-            speed, rate = values[(0x6099, 1)] * self._rate_unit(), values[(0x609A, 0)] * self._per_rpm()
+            speed, rate = get(0x6099, 1) * self._rate_unit(), get(0x609A) * self._per_rpm()
             if self.homing == "away":
                 self._profile(h, speed, rate, rate)
                 if self.reached:
                     self.homing, self.referenced = "attained", True
                 return
-            wanted = math.copysign(speed, 1.0 if values[(0x6098, 0)] == -3 else -1.0)
+            wanted = math.copysign(speed, 1.0 if get(0x6098) == -3 else -1.0)
             self.command_rate += max(-rate * h, min(rate * h, wanted - self.command_rate))
             self.command += self.command_rate * h
             self.goal = self.command
-            current = 1e3 * abs(self.torque) * 1e-3 * self.spec.rated_torque / self.spec.torque_constant
-            if current >= values[(0x30B2, 0)]:
+            if abs(self.torque) >= get(0x30B2) * self._per_milliampere():
                 self._referenced()
 
     def _referenced(self) -> None:
         """The counter takes its value of the home position; then away from there by the distance that was asked for."""
-        home = self.objects.values[(0x30B0, 0)]
-        self.offset = home - self.objects.values[(0x30B1, 0)] - self.x
+        home = self.objects.get(0x30B0)
+        self.offset = home - self.objects.get(0x30B1) - self.x
         self._hold()
         self.v, self.homing, self.goal, self.reached = 0.0, "away", float(home), False
 
@@ -321,7 +328,7 @@ class Motor:
         self.v += max(-change, min(change, math.copysign(wanted, error) - self.v))
         if abs(error) < 0.5 and self.command_rate == 0.0 and abs(self.v) <= change:
             self.v = 0.0
-        if self.v * self.torque > 0.0 and abs(self.torque) >= self.objects.values[(0x6072, 0)]:
+        if self.v * self.torque > 0.0 and abs(self.torque) >= self._greatest_torque():
             self.v = 0.0
         if not self.blocked:
             self.x += self.v * h
@@ -329,16 +336,16 @@ class Motor:
     def _settle(self, h: float) -> None:
         """What follows from where it is: following error, end of a ramp."""
         if self.state == ENABLED:
-            window = self.objects.values[(0x6065, 0)]
+            window = self.objects.values.get((0x6065, 0), 0)
             if window not in (0, 0xFFFFFFFF) and abs(self.command - self.measured) > window:
                 self._exceeded += h
-                if self._exceeded * 1e3 >= self.objects.values[(0x6066, 0)]:
+                if self._exceeded * 1e3 >= self.objects.get(0x6066):
                     self.fault(0x8611)
             else:
                 self._exceeded = 0.0
         elif self.state == REACTION and self.command_rate == 0.0 and (self.v == 0.0 or self.blocked):
             self._to(FAULT)
-        elif self.state == QUICK_STOP and self.command_rate == 0.0 and self.v == 0.0 and self.objects.values[(0x605A, 0)] == 2:
+        elif self.state == QUICK_STOP and self.command_rate == 0.0 and self.v == 0.0 and self.objects.get(0x605A) == 2:
             self._to(SWITCH_ON_DISABLED)
 
     def _per_rpm(self) -> float:
@@ -346,7 +353,21 @@ class Motor:
 
     def _rate_unit(self) -> float:
         """Counts/s of one unit of velocity."""
-        return float(self._per_rpm() * 10.0 ** _exponent(self.objects.values[(0x60A9, 0)]))
+        return float(self._per_rpm() * 10.0 ** _exponent(self.objects.get(0x60A9)))
+
+    def _fastest(self) -> float:
+        """Counts/s: object 0x6080 limits every mode, 0x607F those whose way the drive plans."""
+        keys = [(0x6080, 0)] if self.mode == CYCLIC else [(0x6080, 0), (0x607F, 0)]
+        limits = [self.objects.values[key] for key in keys if key in self.objects.values]
+        return min(limits, default=math.inf) * self._rate_unit()
+
+    def _per_milliampere(self) -> float:
+        """Thousandths of the rated torque of one milliampere."""
+        return self.spec.torque_constant / self.spec.rated_torque
+
+    def _greatest_torque(self) -> float:
+        """Thousandths of the rated torque."""
+        return self.objects.values.get((0x3001, 2), math.inf) * self._per_milliampere()
 
 
 def _exponent(unit: int) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, final
 
 import numpy as np
@@ -23,13 +24,14 @@ LIFE, LENGTH = 0x8130, 0x8210
 class Node:
     """What the bus sees of one drive."""
 
-    def __init__(self, spec: DriveSpec, period: float) -> None:
-        """`period` [s] of set-points, until the master tells it."""
+    def __init__(self, spec: DriveSpec, period: float, eds: str | Path | None = None) -> None:
+        """`period` [s] of set-points, until the master sets another; `eds`: its dictionary, by default the one that ships."""
         self.id = spec.node
-        self.objects = Objects(object_dictionary(), spec.node)
+        self.objects = Objects(object_dictionary(eds), spec.node)
         self.objects.preset = {
-            (0x6076, 0): round(1e6 * spec.rated_torque), (0x6075, 0): round(1e3 * spec.rated_torque / spec.torque_constant),
-            (0x60C2, 1): max(1, min(255, round(1e3 * period))), (0x1018, 4): 1000 + spec.node,
+            (0x1018, 4): 1000 + spec.node, (0x3001, 1): round(1e3 * spec.rated_torque / spec.torque_constant),
+            (0x3001, 5): round(1e6 * spec.torque_constant), (0x6076, 0): round(1e6 * spec.rated_torque),
+            (0x60C2, 1): max(1, min(255, round(1e3 * period))),
         }  # fmt: skip
         self.objects.reset()
         self.motor = Motor(spec, self.objects)
@@ -49,10 +51,11 @@ class Node:
 
     def map(self) -> None:
         """Process data as mapped now."""
-        values, live = self.objects.values, self.objects.live
+        self.objects.remapped = False
+        get, live = self.objects.get, self.objects.live
         self.rpdos = {pdo.cob_id: pdo for pdo in self.objects.process_data(0x1400)}
         self.tpdos = [
-            (pdo, [live[key] if key in live else (lambda key=key: values[key]) for key in pdo.keys])  # type: ignore[misc]
+            (pdo, [live[key] if key in live else (lambda key=key: get(*key)) for key in pdo.keys])  # type: ignore[misc]
             for pdo in self.objects.process_data(0x1800)
         ]
 
@@ -72,7 +75,7 @@ class Node:
 
     def _patience(self, who: int) -> float:
         for sub in (1, 2):
-            value = self.objects.values[(0x1016, sub)]
+            value = self.objects.get(0x1016, sub)
             if (value >> 16) & 0x7F == who and value & 0xFFFF:
                 return 1e-3 * (value & 0xFFFF)
         return float(np.inf)

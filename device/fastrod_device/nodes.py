@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import threading
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Protocol, final
 
@@ -15,17 +16,19 @@ from fastrod.errors import InputError
 from fastrod.types import Floats
 from fastrod_device.bus import Line
 from fastrod_device.clock import Clock
+from fastrod_device.dictionary import Key
 from fastrod_device.errors import DeviceError
 from fastrod_device.faultcodes import ENABLED
 from fastrod_device.motor import CYCLIC
 from fastrod_device.node import BOOT, LIFE, OPERATIONAL, PRE_OPERATIONAL, STOPPED, Node
-from fastrod_device.objects import Key
 from fastrod_device.pacer import urgently
 from fastrod_device.units import DriveSpec, Transmission
 
 if TYPE_CHECKING:
     import can
 
+_NMT, _SDO = 2, 8
+"""Bytes of a frame of each service; a drive hears no other."""
 _TICK = 5e-3  # s, of the thread that keeps time where nobody steps it
 _CHUNK = 0.02  # s; longer gaps are gone through in pieces
 
@@ -49,18 +52,19 @@ class EmulatedDrives:
 
     def __init__(
         self, specs: Sequence[DriveSpec], bus: str | can.BusABC, *, clock: Clock, wires: Wires, rate: float = 200.0, seed: int = 0,
-        torque_noise: float = 1.0,
+        torque_noise: float = 1.0, eds: str | Path | None = None,
     ) -> None:  # fmt: skip
-        """`rate` [1/s]: of the set-points until the master tells it; `torque_noise` [thousandths of the rated torque], 1 sigma.
+        """`rate` [1/s]: of the set-points until the master sets another; `torque_noise` [thousandths of the rated torque], 1 sigma; `eds`:
+        the file that lists their objects, by default an EPOS4's as they ship.
 
-        Raises `InputError` for drives that cannot be, `DeviceError` for the bus.
+        Raises `InputError` for drives that cannot be, `DeviceError` for the bus or the file.
         """
         if not (np.isfinite(rate) and rate > 0.0):
             raise InputError(f"EmulatedDrives.rate is {rate!r} 1/s; it must be positive.")
         self._transmission = Transmission(specs)
         self._clock, self._wires = clock, wires
         self._rng, self._noise = np.random.default_rng(seed), torque_noise
-        self._nodes = [Node(spec, 1.0 / rate) for spec in specs]
+        self._nodes = [Node(spec, 1.0 / rate, eds) for spec in specs]
         self._motors = [node.motor for node in self._nodes]
         self._wind: Floats = np.array([spec.direction * spec.metres_per_count for spec in specs])
         self._per_newton: Floats = np.array([spec.direction / spec.newtons_per_torque / (1e-3 * spec.rated_torque) for spec in specs])
@@ -156,6 +160,11 @@ class EmulatedDrives:
         """It sends no process data any more."""
         self._node(drive).silent = True
 
+    def drop(self, drive: int, index: int) -> None:
+        """It lacks an object that its dictionary lists, as other firmware may."""
+        with self._lock:
+            self._node(drive).objects.drop(index)
+
     def restore(self) -> None:
         """The causes of all faults are gone; what they did to the drives stays."""
         with self._lock:
@@ -232,10 +241,13 @@ class EmulatedDrives:
 
     def _on_sdo(self, cob_id: int, data: bytes) -> None:
         node = next(node for node in self._nodes if node.id == cob_id - 0x600)
-        if node.nmt != STOPPED:
-            self.sdo_served += 1
-            self._advance(self._clock.now())
-            node.server.on_request(cob_id, bytearray(data), 0.0)
+        if node.nmt == STOPPED or len(data) != _SDO:
+            return
+        self.sdo_served += 1
+        self._advance(self._clock.now())
+        node.server.on_request(cob_id, bytearray(data), 0.0)
+        if node.nmt == OPERATIONAL and node.objects.remapped:
+            node.map()
 
     def _written(self, node: Node) -> Callable[[Key, int], None]:
         def written(key: Key, value: int) -> None:
@@ -251,11 +263,13 @@ class EmulatedDrives:
         who, now = cob_id - 0x700, self._clock.now()
         self._advance(now)
         for node in self._nodes:
-            if any((node.objects.values[(0x1016, sub)] >> 16) & 0x7F == who for sub in (1, 2)):
+            if any((node.objects.get(0x1016, sub) >> 16) & 0x7F == who for sub in (1, 2)):
                 node.watched[who] = now
 
     def _on_nmt(self, cob_id: int, data: bytes) -> None:  # noqa: ARG002
-        command, who = data[0], data[1]
+        if len(data) != _NMT:
+            return
+        command, who = data
         for node in [node for node in self._nodes if who in (0, node.id)]:
             if command in (129, 130):
                 self._boot(node, keep_position=True)
@@ -310,7 +324,7 @@ class EmulatedDrives:
                 self._send(0x80 + node.id, struct.pack("<HB5x", code, register))
             node.motor.emergencies.clear()
             if now >= node.beat_due:
-                period = 1e-3 * node.objects.values[(0x1017, 0)]
+                period = 1e-3 * node.objects.get(0x1017)
                 node.beat_due = max(node.beat_due + period, now + 0.5 * period) if period else np.inf
                 if period and not node.no_heartbeat:
                     self._send(0x700 + node.id, bytes([node.nmt]))
@@ -374,7 +388,7 @@ class EmulatedDrives:
     def _miss(self, node: Node) -> None:
         """The master's heartbeat did not come: as object 0x6007 says."""
         node.missed_at = self._t
-        option = node.objects.values[(0x6007, 0)]
+        option = node.objects.get(0x6007)
         if option == 1:
             node.motor.fault(LIFE)
             return

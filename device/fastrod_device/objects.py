@@ -1,22 +1,26 @@
-"""The objects inside an emulated node: read and written by SDO, mapped into process data as the master wrote."""
+"""The objects inside an emulated node, as its dictionary lists them: read and written by SDO, mapped into process data by the master."""
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, final
 
 from fastrod_device.bus import guest
-from fastrod_device.dictionary import I8, I16, I32, U8, U16, U32
+from fastrod_device.dictionary import Key, at_power_on, find
 
-_CODES = {U8: "B", U16: "H", U32: "I", I8: "b", I16: "h", I32: "i"}
+_CODES = {0x01: "?", 0x02: "b", 0x03: "h", 0x04: "i", 0x05: "B", 0x06: "H", 0x07: "I", 0x15: "q", 0x1B: "Q"}
+"""Layouts of the whole numbers of CiA 301 that a drive has."""
 _NO_OBJECT, _NOT_MAPPABLE, _TOO_LONG = 0x06020000, 0x06040041, 0x06040042
-_READ_ONLY, _WRONG_LENGTH, _NO_SUB, _BAD_VALUE, _WRONG_STATE = 0x06010002, 0x06070010, 0x06090011, 0x06090030, 0x08000022
+_WRITE_ONLY, _READ_ONLY, _WRONG_LENGTH = 0x06010001, 0x06010002, 0x06070010
+_NO_SUB, _BAD_VALUE, _WRONG_STATE = 0x06090011, 0x06090030, 0x08000022
 _INVALID, _NO_RTR = 0x8000_0000, 0x4000_0000  # bits of a COB-ID: this PDO does not exist, cannot be asked for
 
-Key = tuple[int, int]
-"""Index and subindex."""
+_COB_IDS = (0x1014, *range(0x1400, 0x1404), *range(0x1800, 0x1804))
+"""Objects that hold a COB-ID; its low seven bits are the node id."""
+_NODE, _ENTRIES = 0x7F, 8
+"""Bits of a node id in a COB-ID; the most objects in a PDO."""
 
 
 @dataclass(frozen=True)
@@ -49,30 +53,46 @@ class Objects:
         self.preset: dict[Key, int] = {}
         """Values at power-on that differ from the dictionary's."""
         self.values: dict[Key, int] = {}
-        self._texts: dict[Key, str] = {}
+        """Of the objects that the dictionary has."""
+        self.remapped = False
+        """Process data was mapped anew since somebody set this back."""
+        self._bytes: dict[Key, bytes] = {}
         self._abort: Any = guest("canopen").SdoAbortedError
         self.reset()
 
     def reset(self) -> None:
         """Values of power-on."""
-        self.values, self._texts = {}, {}
-        for index in self.object_dictionary:
-            entry = self.object_dictionary[index]
-            for var in entry.values() if isinstance(entry, Mapping) else (entry,):
-                key = (index, var.subindex)
-                if isinstance(var.default, str):
-                    self._texts[key] = var.default
-                else:
-                    follows = index == 0x1014 or ((index & 0xFC00) in (0x1400, 0x1800) and index & 0x200 == 0 and var.subindex == 1)
-                    self.values[key] = int(var.default or 0) + (self.node if follows else 0)
-        self.values.update(self.preset)
+        self.values, self._bytes = {}, {}
+        for index, entry in self.object_dictionary.indices.items():
+            for sub, var in getattr(entry, "subindices", {0: entry}).items():
+                key = (index, sub)
+                if var.data_type not in _CODES:
+                    self._bytes[key] = str(var.default or "").encode("ascii", "replace")
+                    continue
+                value = self.preset.get(key, at_power_on().get(key, 0) if var.default is None else int(var.default))
+                relative = index in _COB_IDS and sub == (0 if index == 0x1014 else 1)
+                self.values[key] = value & ~_NODE | self.node if relative else value
+
+    def drop(self, index: int) -> None:
+        """The drive has this object no more."""
+        entry = self.object_dictionary.indices.pop(index)
+        self.object_dictionary.names.pop(entry.name, None)
+        for key in [key for key in self.values if key[0] == index]:
+            del self.values[key]
+
+    def get(self, index: int, sub: int = 0) -> int:
+        """A value as it is stored; where the dictionary lacks the object, that of the shipped one at power-on."""
+        key = (index, sub)
+        return self.values[key] if key in self.values else at_power_on().get(key, 0)
 
     def get_data(self, index: int, subindex: int, check_readable: bool = False) -> bytes:  # noqa: ARG002
-        """What an SDO upload returns. Raises an SDO abort where there is no such object."""
+        """What an SDO upload returns. Raises an SDO abort where there is no such object, or it can only be written."""
         var = self._find(index, subindex)
+        if not var.readable:
+            raise self._abort(_WRITE_ONLY)
         key = (index, subindex)
-        if key in self._texts:
-            return self._texts[key].encode()
+        if key in self._bytes:
+            return self._bytes[key]
         value = self.live[key]() if key in self.live else self.values[key]
         return bytes(var.encode_raw(value))
 
@@ -81,13 +101,17 @@ class Objects:
         var = self._find(index, subindex)
         if not var.writable:
             raise self._abort(_READ_ONLY)
+        key = (index, subindex)
+        if key in self._bytes:
+            self._bytes[key] = bytes(data)
+            return
         if 8 * len(data) != len(var):
             raise self._abort(_WRONG_LENGTH)
         value = int(var.decode_raw(bytes(data)))
-        key = (index, subindex)
         self._check_pdo(key, value)
         self.written(key, value)
         self.values[key] = value
+        self.remapped |= 0x1400 <= index < 0x1C00
 
     def refuse(self, code: int = _BAD_VALUE) -> Exception:
         """An SDO abort to be raised."""
@@ -95,9 +119,9 @@ class Objects:
         return abort
 
     def _find(self, index: int, sub: int) -> Any:
-        if index not in self.object_dictionary:
+        if index not in self.object_dictionary.indices:
             raise self._abort(_NO_OBJECT)
-        var = self.object_dictionary.get_variable(index, sub)
+        var = find(self.object_dictionary, index, sub)
         if var is None:
             raise self._abort(_NO_SUB)
         return var
@@ -113,22 +137,22 @@ class Objects:
             raise self._abort(_BAD_VALUE)  # as drives do that answer no RTR
         if base not in (0x1600, 0x1A00):
             return
-        if not self.values[(index - 0x200, 1)] & _INVALID:
+        if not self.get(index - 0x200, 1) & _INVALID:
             raise self._abort(_WRONG_STATE)  # its PDO must be invalid while it is mapped
         if sub == 0:
-            entries = [self.values[(index, n)] for n in range(1, value + 1)] if value <= 8 else []
-            if value > 8 or sum(entry & 0xFF for entry in entries) > 64:
+            entries = [self.get(index, n) for n in range(1, value + 1)] if value <= _ENTRIES else []
+            if value > _ENTRIES or sum(entry & 0xFF for entry in entries) > 64:
                 raise self._abort(_TOO_LONG)
             for entry in entries:
                 self._mappable(entry, into="w" if base == 0x1600 else "r")
         else:
-            if self.values[(index, 0)] != 0:
+            if self.get(index) != 0:
                 raise self._abort(_WRONG_STATE)
             if value:
                 self._mappable(value, into="w" if base == 0x1600 else "r")
 
     def _mappable(self, entry: int, into: str) -> Any:
-        var = self.object_dictionary.get_variable(entry >> 16, (entry >> 8) & 0xFF)
+        var = find(self.object_dictionary, entry >> 16, (entry >> 8) & 0xFF)
         if var is None or not var.pdo_mappable or len(var) != entry & 0xFF or var.data_type not in _CODES or into not in var.access_type:
             raise self._abort(_NOT_MAPPABLE)
         return var
@@ -137,13 +161,15 @@ class Objects:
         """PDOs that exist: RPDOs of base 0x1400, TPDOs of base 0x1800."""
         found = []
         for k in range(4):
-            cob_id, n = self.values[(base + k, 1)], self.values[(base + k + 0x200, 0)]
-            if cob_id & _INVALID or n == 0:
-                continue
-            entries = [self.values[(base + k + 0x200, m)] for m in range(1, n + 1)]
+            cob_id, kind = self.values.get((base + k, 1), _INVALID), self.values.get((base + k, 2), 255)
+            n = min(self.values.get((base + k + 0x200, 0), 0), _ENTRIES)
+            entries = [self.values.get((base + k + 0x200, m), 0) for m in range(1, n + 1)]
             keys = tuple((entry >> 16, (entry >> 8) & 0xFF) for entry in entries)
-            codes = "".join(_CODES[self.object_dictionary.get_variable(*key).data_type] for key in keys)
-            found.append(ProcessData(cob_id & 0x7FF, self.values[(base + k, 2)], struct.Struct("<" + codes), keys))
+            objects = [find(self.object_dictionary, *key) for key in keys]
+            if cob_id & _INVALID or not objects or not all(var is not None and var.data_type in _CODES for var in objects):
+                continue
+            codes = "".join(_CODES[var.data_type] for var in objects)
+            found.append(ProcessData(cob_id & 0x7FF, kind, struct.Struct("<" + codes), keys))
         return found
 
 

@@ -47,6 +47,8 @@ class Feedback:
     """That came since the last feedback."""
     lost: str
     """Why the bus carries nothing, one sentence; empty while it does."""
+    foreign_syncs: int = 0
+    """SYNCs of other nodes that came since the last feedback."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -77,3 +79,5 @@ class Readings:
     """That came since the last cycle."""
     lost: str
     """Why the bus carries nothing; empty while it does."""
+    foreign_syncs: int = 0
+    """SYNCs of other nodes that came since the last cycle."""

@@ -18,6 +18,7 @@ KINDS = (
     "emergency stop",
     "clock jump",
     "controller stalled",
+    "foreign SYNC",
     "bus off",
     "node reboot",
     "encoder jump",
@@ -125,6 +126,9 @@ class Inspector:
     def lasting(self, now: float, readings: Readings, camera: CameraWatch | None) -> Iterator[Fault]:
         """What is wrong for as long as it is: only its end makes the robot fit to move again."""
         limits, old = self._limits, max(now - readings.t, 0.0)  # readings may be looked at twice: they have aged since
+        if readings.foreign_syncs:
+            text = f"another node sends SYNC ({readings.foreign_syncs} since the last cycle), so set-points come at wrong times"
+            yield Fault(kind="foreign SYNC", sentence=f"{text}; the controller alone may.", t=now)
         if readings.lost:
             yield Fault(kind="bus off", sentence=f"the bus carries nothing: {readings.lost.rstrip('.')}.", t=now)
         else:

@@ -122,4 +122,5 @@ class Transmission:
             t=feedback.t, dl=self.dl(feedback.position), rate=self.wound(feedback.velocity), tension=self.tension(feedback.torque),
             current=self.current(feedback.torque), following_error=self.wound(feedback.following_error), statusword=feedback.statusword,
             age=feedback.age, heartbeat_age=feedback.heartbeat_age, nmt=feedback.nmt, emergencies=feedback.emergencies, lost=feedback.lost,
+            foreign_syncs=feedback.foreign_syncs,
         )  # fmt: skip
