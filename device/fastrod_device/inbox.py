@@ -39,6 +39,7 @@ class Inbox:
         """Statuswords."""
         self._position, self._torque, self._velocity, self._error = [0] * n, [0] * n, [0] * n, [0] * n
         self._t, self._t_beat, self._nmt = [-math.inf] * n, [-math.inf] * n, [-1] * n
+        # answers that are expected; below 0 where one is heard before the SYNC of another node that it answers
         self._pending, self._live, self._answered = ([0] * n, [0] * n), [False] * n, [False] * n
         self._waiting = 0
         self._all_in = threading.Event()
@@ -58,14 +59,15 @@ class Inbox:
     def expect(self) -> None:
         """A SYNC is about to be sent."""
         with self._lock:
+            for pending in self._pending:
+                pending[:] = [max(n, 0) for n in pending]  # what was not expected came late, from a cycle that waits no more
             self._expect()
 
     def _expect(self) -> None:
-        first, second = self._pending
-        for i in range(len(first)):
-            first[i] += 1
-            second[i] += 1
-        self._waiting = sum(first[i] + second[i] for i, live in enumerate(self._live) if live)
+        """One answer more of each kind from every drive."""
+        for pending in self._pending:
+            pending[:] = [n + 1 for n in pending]
+        self._waiting = sum(max(n, 0) for pending in self._pending for n, live in zip(pending, self._live, strict=True) if live)
         self._all_in.clear()
 
     def _on_sync(self, cob_id: int, data: bytearray, timestamp: float) -> None:  # noqa: ARG002
@@ -81,11 +83,11 @@ class Inbox:
         if not all(self._live):
             time.sleep(_GRACE)
         with self._lock:
-            first, second = self._pending
-            self.missed += any(first) or any(second)
-            for i in range(len(first)):
-                self._live[i] = self._answered[i] if first[i] or second[i] else True
-                first[i] = second[i] = 0
+            missing = [max(pair) > 0 for pair in zip(*self._pending, strict=True)]
+            self.missed += any(missing)
+            for i, lacks in enumerate(missing):
+                self._live[i] = self._answered[i] or not lacks
+                self._pending[0][i] = self._pending[1][i] = 0
                 self._answered[i] = False
             self._waiting = 0
 
@@ -135,12 +137,11 @@ class Inbox:
             self._arrived(1, i)
 
     def _arrived(self, which: int, i: int) -> None:
-        if self._pending[which][i]:
-            self._pending[which][i] -= 1
-            if self._live[i]:
-                self._waiting -= 1
-                if self._waiting == 0:
-                    self._all_in.set()
+        self._pending[which][i] -= 1
+        if self._live[i] and self._pending[which][i] >= 0:
+            self._waiting -= 1
+            if self._waiting == 0:
+                self._all_in.set()
 
     def _on_heartbeat(self, cob_id: int, data: bytearray, timestamp: float) -> None:  # noqa: ARG002
         if not data:

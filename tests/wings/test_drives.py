@@ -88,14 +88,14 @@ def test_connect_leaves_the_drives_operational_and_switched_off():
         assert bench.bus.newest.lost == ""
 
 
-def test_the_greatest_torque_is_told_and_kept():
+def test_the_greatest_torque_is_written_as_a_current_and_kept():
     limit = np.array([150, 300, 200, 250])
     with Bench() as bench:
         bench.bus.connect(torque_limit=limit)
-        told = [node.objects.values[(0x6072, 0)] for node in bench.nodes._nodes]
-        assert told == limit.tolist()
+        # thousandths of 54 mN m by 25.1 mN m/A [mA]
+        assert [node.objects.values[(0x3001, 2)] for node in bench.nodes._nodes] == [323, 645, 430, 538]
         bench.bus.connect()
-        assert [node.objects.values[(0x6072, 0)] for node in bench.nodes._nodes] == [3000] * 4
+        assert [node.objects.values[(0x3001, 2)] for node in bench.nodes._nodes] == [6454] * 4
         with pytest.raises(InputError, match=r"torque_limit is \[70000, .*below 2\^16"):
             bench.bus.connect(torque_limit=70_000)
 
@@ -106,7 +106,8 @@ def test_a_wire_is_pulled_no_harder_than_the_greatest_torque_allows():
         bench.bus.enable()
         for k in range(150):
             seen = bench.run(1, np.array([100, -100, 100, -100]) * k)[0]
-        most = Transmission(SPECS).tension(np.array([60, -60, 60, -60]))  # N
+        # 60 thousandths are 129.08 mA, which are written as 129 [N]
+        most = 129.0 / 129.08 * Transmission(SPECS).tension(np.array([60, -60, 60, -60]))
         tension = STIFFNESS * (bench.nodes.true_pulled - SLACK)
         assert np.all(np.abs(seen.following_error) > 5000)
         # it is known once in a cycle: 10,000 counts/s x 584 nm x 2000 N/m x 10 ms
@@ -382,6 +383,22 @@ def test_an_encoder_jump_beyond_the_window_is_a_following_error(ready):
     seen = ready.run(3)
     assert [(e.drive, e.code) for f in seen for e in f.emergencies] == [(1, 0x8611)]
     assert states(seen[-1])[1] == "fault"
+
+
+@pytest.mark.parametrize("foreign", [1, 5, 40])
+def test_answers_to_another_nodes_sync_do_not_pass_for_those_to_ours(ready, foreign):
+    import can
+
+    other = open_bus(ready.name)
+    for k in range(20):  # a loop that ran ahead of its drives would have them where they were told to be long ago
+        for _ in range(foreign):
+            other.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+        seen = ready.run(1, np.full(4, 50 * k))[0]
+        assert seen.foreign_syncs == foreign
+        assert ready.nodes._line.bus.queue.qsize() == 0
+    other.shutdown()
+    assert np.all(seen.position > 850)
+    assert ready.run(1)[0].foreign_syncs == 0
 
 
 def test_a_silent_drive_ages_and_is_heard_again(ready):

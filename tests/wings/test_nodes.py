@@ -129,10 +129,24 @@ def test_it_says_who_it_is(wire):
         (0x607D, 9, 1, 4, 0x06090011),  # no such subindex
         (0x6041, 0, 1, 2, 0x06010002),  # read only
         (0x6040, 0, 1, 4, 0x06070010),  # another length
+        (0x6072, 0, 1000, 2, 0x06020000),  # an EPOS4 limits the current instead
+        (0x3001, 2, 1000, 4, 0),
+        (0x3001, 2, 1000, 2, 0x06070010),  # [mA], 32 bits
+        (0x6080, 0, 1000, 4, 0),
+        (0x605D, 0, 1, 2, 0x06020000),
+        (0x6073, 0, 1000, 2, 0x06020000),
+        (0x6075, 0, 1000, 4, 0x06020000),
+        (0x607C, 0, 0, 4, 0x06020000),
+        (0x1005, 0, 0x81, 4, 0x06010002),  # a constant
+        (0x1014, 0, 0x86, 4, 0x06010002),
+        (0x30D1, 1, 0, 4, 0x06010002),
+        (0x30D2, 1, 0, 2, 0x06010002),
+        (0x607A, 1, 0, 4, 0x06090011),  # it has no subindices
+        (0x60E4, 4, 0, 4, 0x06090011),  # an array of three
         (0x6060, 0, 4, 1, 0x06090030),  # no such mode
         (0x1A00, 1, 0x60410010, 4, 0),  # while the PDO is invalid
         (0x1A00, 1, 0x60400010 + 1, 4, 0x06040041),  # another length than the object's
-        (0x1A00, 1, 0x60650020, 4, 0x06040041),  # cannot be mapped
+        (0x1A00, 1, 0x60760020, 4, 0x06040041),  # cannot be mapped
         (0x1600, 1, 0x60410010, 4, 0x06040041),  # read only into an RPDO
         (0x1800, 2, 250, 1, 0x06090030),  # reserved transmission type
         (0x1800, 1, 0x185, 4, 0x06090030),  # a TPDO that could be asked for by RTR, existing
@@ -142,10 +156,14 @@ def test_it_says_who_it_is(wire):
     ],
 )
 def test_sdo_refuses_what_cannot_be(wire, index, sub, value, size, abort):
+    assert wire.write(0x1400, 1, 0x80000205, 4) == wire.write(0x1800, 1, 0xC0000185, 4) == wire.write(0x1600, 0, 0, 1) == 0
+    assert wire.write(0x1A00, 0, 0, 1) == 0
     assert wire.write(index, sub, value, size) == abort
 
 
 def test_a_mapping_is_refused_while_its_pdo_exists_and_when_it_is_too_long(wire):
+    assert wire.write(0x1A00, 0, 0, 1) == 0x08000022
+    assert wire.write(0x1800, 1, 0xC0000185, 4) == wire.write(0x1A00, 0, 0, 1) == 0
     for sub in (1, 2, 3):
         assert wire.write(0x1A00, sub, 0x60640020, 4) == 0
     assert wire.write(0x1A00, 0, 3, 1) == 0x06040042  # 12 bytes
@@ -216,7 +234,7 @@ def test_only_a_drive_that_holds_after_a_quick_stop_goes_on_from_it(option, afte
 def test_a_motor_pulls_no_harder_than_its_greatest_torque(way):
     def pulled(most: int) -> Motor:
         motor = Motor(SPEC, Objects(object_dictionary(), 5))
-        motor.objects.values[(0x6072, 0)] = most
+        motor.objects.values[(0x3001, 2)] = round(most * SPEC.rated_torque / SPEC.torque_constant)  # mA
         for word in (0x06, 0x0F):
             motor.control(word)
         motor.written((0x6060, 0), 8)
@@ -251,6 +269,80 @@ def test_a_fault_is_reset_by_the_edge_of_bit_7_only():
     motor.control(0x80)
     assert motor.state == "switch on disabled"
     assert motor.emergencies == [(0x2310, 0x03), (0, 0)]
+
+
+def test_currents_are_in_milliamperes_and_torques_in_thousandths_of_the_rated_one(wire):
+    wire.map()
+    wire.enable()
+    wire.nodes._nodes[0].motor.torque = 400.0
+    # 0.4 x 54 mN m / 25.1 mN m/A
+    assert wire.ask(0x30D1, 1)[:1] + wire.ask(0x30D1, 1)[4:] == b"\x43" + struct.pack("<i", 861)
+    assert wire.ask(0x30D2, 1)[:1] + wire.ask(0x30D2, 1)[4:6] == b"\x4b" + struct.pack("<h", 400)
+    assert struct.unpack_from("<I", wire.ask(0x3001, 1), 4)[0] == 2151
+    assert struct.unpack_from("<I", wire.ask(0x3001, 5), 4)[0] == 25_100
+
+
+@pytest.mark.parametrize(("mode", "fastest"), [(8, 20_000), (1, 10_000)])
+def test_the_motors_speed_is_limited_in_every_mode_the_profiles_where_the_drive_plans(mode, fastest):
+    motor = Motor(SPEC, Objects(object_dictionary(), 5))
+    per_rpm = SPEC.counts_per_turn / 60
+    motor.objects.values |= {(0x6080, 0): round(20_000 / per_rpm), (0x607F, 0): round(10_000 / per_rpm), (0x6081, 0): 50_000}
+    motor.objects.values[(0x6065, 0)] = 0xFFFFFFFF
+    motor.written((0x6060, 0), mode)
+    for word in (0x06, 0x0F):
+        motor.control(word)
+    motor.written((0x607A, 0), 100_000)
+    motor.control(0x1F)
+    motor.setpoint()
+    motor.advance(0.2)
+    assert motor.v == pytest.approx(fastest, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    "index",
+    [0x1003, 0x1016, 0x1017, 0x3001, 0x605A, 0x6065, 0x6066, 0x607D, 0x607F, 0x6080, 0x6081, 0x6085, 0x60A9, 0x60C2, 0x6502],
+)
+def test_a_motor_runs_without_an_object_that_its_drive_lacks(wire, index):
+    wire.nodes.drop(0, index)
+    wire.map()
+    wire.enable()
+    for k in range(20):
+        status, position = wire.cycle(0x0F, 20 * k)
+    assert (status & 0x6F, position > 200) == (0x27, True)
+    wire.nodes.emergency(0, 0x2310)
+    wire.sync()
+    assert struct.unpack_from("<H", wire.hear(0x085))[0] == 0x2310
+    assert struct.unpack_from("<I", wire.ask(index), 4)[0] == 0x06020000
+
+
+def test_what_can_only_be_written_is_not_read(wire):
+    assert struct.unpack_from("<I", wire.ask(0x1F50, 1), 4)[0] == 0x06010001
+
+
+def test_process_data_mapped_by_sdo_counts_at_once(wire):
+    wire.map()
+    assert wire.cycle(0x00) == (0x0250, 0)
+    assert wire.write(0x1800, 1, 0xC0000185, 4) == 0  # away with it, while it is operational
+    wire.sync()
+    assert wire.hear(0x185, 0.05) == b""
+    assert wire.write(0x1A00, 0, 0, 1) == wire.write(0x1A00, 1, 0x60640020, 4) == wire.write(0x1A00, 0, 1, 1) == 0
+    assert wire.write(0x1800, 1, 0x40000185, 4) == 0
+    wire.sync()
+    assert wire.hear(0x185) == bytes(4)
+    assert wire.write(0x1400, 1, 0x80000205, 4) == 0
+    wire.send(0x205, struct.pack("<Hi", 0x06, 0))
+    wire.sync()
+    assert wire.nodes.states == ("switch on disabled",)
+
+
+@pytest.mark.parametrize("cob_id", [0x000, 0x080, 0x205, 0x605, 0x77F, 0x705])
+@pytest.mark.parametrize("length", range(9))
+def test_frames_of_any_length_harm_nothing(wire, cob_id, length):
+    wire.map()
+    wire.enable()
+    wire.send(cob_id, bytes([0x81, 0x05, 0x60, 0x00, 0xFF, 0xFF, 0xFF, 0xFF][:length]))
+    assert struct.unpack_from("<I", wire.ask(0x6502), 4)[0] == 0x3A5
+    assert wire.nodes._wrong is None
 
 
 def test_without_heartbeats_it_stops_at_the_moment_it_must(wire):

@@ -87,6 +87,7 @@ CASES: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
     ("emergency message", {"emergencies": EMCY}, ("drive 2 (node 5)", "0x8611", "code 8611", "0x21")),
     ("drive fault", {"statusword": (1, 0x0238)}, ("drive 2 (node 5)", "in fault", "0x0238")),
     ("drive fault", {"statusword": (2, 0x0250)}, ("drive 3 (node 6)", "switch on disabled", "0x0250")),
+    ("foreign SYNC", {"foreign_syncs": 3}, ("another node sends SYNC (3 since the last cycle)",)),
     ("drive fault", {"statusword": (0, 0x0217)}, ("drive 1 (node 4)", "quick stop")),
     ("heartbeat lost", {"heartbeat_age": (1, 0.16)}, ("drive 2 (node 5)", "160 ms", "150 ms")),
     ("heartbeat lost", {"heartbeat_age": (1, INF), "nmt": (1, -1)}, ("drive 2 (node 5)", "inf")),
