@@ -184,7 +184,7 @@ def check_drive(arguments: argparse.Namespace) -> None:
         raise UsageError("give --bus INTERFACE:CHANNEL or --emulate, and not both; `fastrod drive --help` says how it is used.")
     if given("bus") and ":" not in arguments.bus:
         raise UsageError(f"--bus is {arguments.bus!r}; give INTERFACE:CHANNEL, such as socketcan:can0.")
-    for name, emulated in (("camera", False), ("eds", False), ("seed", True), ("real_time", True)):
+    for name, emulated in (("camera", False), ("seed", True), ("real_time", True)):
         if given(name) and arguments.emulate != emulated:
             where = "with --emulate only" if emulated else "for a real bench, not with --emulate"
             raise UsageError(f"--{name.replace('_', '-')} is {where}; `fastrod drive --help` says how it is used.")
@@ -211,9 +211,10 @@ def _add_drive(drive: argparse.ArgumentParser) -> None:
     bench.add_argument("--robot", metavar="R", help="its model in place of the hardware file's; an identified.toml, say")
     bench.add_argument("--no-home", action="store_true", help="the wires are taut and zero where they should be; do not wind them")
 
+    bench.add_argument("--eds", type=Path, metavar="FILE", help="EDS or DCF of the drives (default: EPOS4)")
+
     real = drive.add_argument_group("a real bench")
     real.add_argument("--camera", metavar="DEVICE", help="number or path of the video device; for teleop also none (default: 0)")
-    real.add_argument("--eds", type=Path, metavar="FILE", help="the drives' object dictionary (default: built in)")
 
     emulator = drive.add_argument_group("the emulator")
     emulator.add_argument("--seed", type=int, metavar="S", help="of what it hides (default: nobody knows it)")

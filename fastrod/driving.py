@@ -72,7 +72,7 @@ def _teleop(arguments: argparse.Namespace, _: Progress | None) -> int:
     finally:
         with contextlib.suppress(OSError):
             if events.stat().st_size:
-                say(f"What stopped the drives is in {events}.")
+                say(f"What happened to the drives is in {events}.")
             else:
                 events.unlink()
         ordinary()
@@ -242,17 +242,33 @@ def _hardware(arguments: argparse.Namespace) -> Hardware:
 
 @contextmanager
 def _bench(arguments: argparse.Namespace, hardware: Hardware, *, stepped: bool = True, journal: Path | None = None) -> Iterator[Bench]:
+    import sys
+
     from fastrod_device import workbench
 
     events = None if journal is None else journal if journal.name == _EVENTS else journal.with_suffix(".events.csv")
     home = not arguments.no_home
     if arguments.emulate:
-        with workbench.emulated(
-            hardware, seed=arguments.seed, stepped=stepped and not arguments.real_time, journal=events, home=home
-        ) as bench:
-            yield bench
-        return
-    with workbench.real(hardware, arguments.bus, camera=_device(arguments), eds=arguments.eds, journal=events, home=home) as bench:
+        made = workbench.emulated(
+            hardware,
+            seed=arguments.seed,
+            stepped=stepped and not arguments.real_time,
+            journal=events,
+            home=home,
+            eds=arguments.eds,
+        )
+    else:
+        made = workbench.real(
+            hardware,
+            arguments.bus,
+            camera=_device(arguments),
+            eds=arguments.eds,
+            journal=events,
+            home=home,
+        )
+    with made as bench:
+        for sentence in bench.prototype.drives.notices:
+            print(sentence, file=sys.stderr, flush=True)
         yield bench
 
 

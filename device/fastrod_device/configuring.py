@@ -34,9 +34,16 @@ _UNUSED = (0x1401, 0x1402, 0x1403, 0x1802, 0x1803)  # PDOs that a drive may have
 _INVALID, _NO_RTR = 0x8000_0000, 0x4000_0000  # bits of a COB-ID; some drives refuse a TPDO that could be asked for by RTR
 _NO_SUCH_OBJECT = (0x06020000, 0x06090011)
 _MODES = {
-    1: "profile position", 2: "velocity", 3: "profile velocity", 4: "profile torque", 6: "homing", 7: "interpolated position",
-    8: "cyclic synchronous position", 9: "cyclic synchronous velocity", 10: "cyclic synchronous torque",
-}  # fmt: skip
+    1: "profile position",
+    2: "velocity",
+    3: "profile velocity",
+    4: "profile torque",
+    6: "homing",
+    7: "interpolated position",
+    8: "cyclic synchronous position",
+    9: "cyclic synchronous velocity",
+    10: "cyclic synchronous torque",
+}
 """Bits of object 0x6502, counted from 1, in words."""
 _CYCLIC = 8
 _WITHOUT = {
@@ -48,7 +55,7 @@ _WITHOUT = {
     0x607F: "the profile velocity is not limited",
     0x6080: "the speed of its motor is not limited by the drive",
     0x6085: "the deceleration of a quick stop is the drive's own",
-    0x60C2: "the period over which it interpolates set-points is the drive's own",
+    0x60C2: "how long it interpolates set-points is the drive's own",
 }
 """What follows where a drive lacks an object."""
 
@@ -116,7 +123,10 @@ class Configurator:
             raise self._lacks(drive, index, sub)
 
     def offer(self, drive: int, index: int, sub: int, value: int) -> None:
-        """Write a number to an object that the drive may lack; `notices` then has what follows. Raises `DeviceError` as `write` does."""
+        """Write a number to an object that the drive may lack; `notices` then has what follows.
+
+        Raises `DeviceError`: no answer, or refused.
+        """
         if not self._write(drive, index, sub, value):
             self._note(drive, index, sub)
 
@@ -127,7 +137,8 @@ class Configurator:
             self.notices.append(sentence)
 
     def _lacks(self, drive: int, index: int, sub: int) -> DeviceError:
-        return DeviceError(f"the drive at node {self._specs[drive].node} has no object {titled(index, sub)}, which is needed.")
+        node = self._specs[drive].node
+        return DeviceError(f"the drive at node {node} has no object {titled(index, sub)}, which is needed.")
 
     def _read(self, drive: int, index: int, sub: int) -> int | None:
         """None where there is no such object, in the dictionary or in the drive."""
@@ -137,8 +148,8 @@ class Configurator:
             return None
         if 8 * len(data) != len(var):
             raise DeviceError(
-                f"the drive at node {self._specs[drive].node} answers {len(data)} bytes for object {titled(index, sub)}; its dictionary"
-                f" says {len(var) // 8}. Is the EDS file that of this drive?"
+                f"node {self._specs[drive].node} answers {len(data)} bytes for object {titled(index, sub)};"
+                f" its dictionary says {len(var) // 8}. Is the EDS file that of this drive?"
             )
         return int(var.decode_raw(data))
 
@@ -151,8 +162,8 @@ class Configurator:
             data = bytes(var.encode_raw(value))
         except (ValueError, TypeError) as error:  # an EDS file may give it another type
             raise DeviceError(
-                f"{value} does not fit object {titled(index, sub)} of the drive at node {self._specs[drive].node}, whose data type is"
-                f" 0x{var.data_type:02X} in its dictionary."
+                f"{value} does not fit object {titled(index, sub)} of node {self._specs[drive].node},"
+                f" whose data type is 0x{var.data_type:02X} in its dictionary."
             ) from error
         return self._ask(drive, index, sub, data) is not None
 
@@ -178,7 +189,7 @@ class Configurator:
         return b""
 
     def identify(self, drive: int) -> None:
-        """It must be a drive of CiA 402 with the cyclic mode, and of the motor that the spec names. Raises `DeviceError` otherwise."""
+        """Raise `DeviceError` unless it is a CiA 402 drive with the cyclic mode and the motor of the spec."""
         spec = self._specs[drive]
         kind = self.read(drive, 0x1000)
         if kind & 0xFFFF != 402:
@@ -187,8 +198,8 @@ class Configurator:
         if not self._modes[drive] >> (_CYCLIC - 1) & 1:
             has = [words for mode, words in _MODES.items() if self._modes[drive] >> (mode - 1) & 1]
             raise DeviceError(
-                f"the drive at node {spec.node} has no {_MODES[_CYCLIC]} mode, which is needed; it supports {', '.join(has) or 'none'}"
-                f" (object 0x6502 is 0x{self._modes[drive]:X})."
+                f"the drive at node {spec.node} has no {_MODES[_CYCLIC]} mode, which is needed;"
+                f" it supports {', '.join(has) or 'none'} (object 0x6502 is 0x{self._modes[drive]:X})."
             )
         measured = self._read(drive, 0x6076, 0)
         if measured is None:
@@ -219,7 +230,7 @@ class Configurator:
 
         self.write(drive, 0x60A9, 0, _MILLI_RPM)
         fastest = self.speed(drive, own("velocity_limit"))
-        self.offer(drive, 0x6080, 0, fastest)  # in every mode; its stored value would now be read in the new unit, too
+        self.offer(drive, 0x6080, 0, fastest)  # in every mode; what it held was in another unit
         self.offer(drive, 0x607F, 0, fastest)  # perhaps only in modes whose way the drive plans
         self.offer(drive, 0x6085, 0, self.acceleration(drive, own("deceleration")))
         self.offer(drive, 0x607D, 1, -own("position_limit"))

@@ -1,6 +1,6 @@
-"""Object dictionaries of drives (CiA 301, CiA 402): the one that ships, a table of facts about an EPOS4, or a maker's EDS or DCF file.
+"""Object dictionaries of drives (CiA 301, CiA 402): a table of facts about an EPOS4, or a maker's file.
 
-The maker's file is not free, so none ships; `object_dictionary` reads yours.
+The maker's EDS or DCF file is not free, so none ships; `object_dictionary` reads yours.
 """
 
 from __future__ import annotations
@@ -22,17 +22,21 @@ if TYPE_CHECKING:
 
 Key = tuple[int, int]
 """Index and subindex."""
-_KINDS = {"bool": 0x01, "i8": 0x02, "i16": 0x03, "i32": 0x04, "u8": 0x05, "u16": 0x06, "u32": 0x07, "text": 0x09, "bytes": 0x0A, "u64": 0x1B}
+_NUMBERS = {"bool": 1, "i8": 2, "i16": 3, "i32": 4, "u8": 5, "u16": 6, "u32": 7, "u64": 27}
+_KINDS = {**_NUMBERS, "text": 9, "bytes": 10}
+"""Data types (CiA 301) by the table's words."""
 NEEDED: tuple[Key, ...] = (
-    (0x1000, 0), (0x1016, 1), (0x1017, 0), (0x6007, 0), (0x6040, 0), (0x6041, 0), (0x6060, 0), (0x6061, 0), (0x6064, 0), (0x606C, 0),
-    (0x6077, 0), (0x607A, 0), (0x60A9, 0), (0x60F4, 0), (0x6502, 0), (0x1400, 1), (0x1400, 2), (0x1600, 0), (0x1600, 1), (0x1600, 2),
-    (0x1800, 1), (0x1800, 2), (0x1801, 1), (0x1801, 2), (0x1A00, 0), (0x1A00, 1), (0x1A00, 2), (0x1A00, 3), (0x1A01, 0), (0x1A01, 1),
-    (0x1A01, 2),
-)  # fmt: skip
-"""Objects without which a drive is not driven: its state, its process data, and what stops it when its controller dies."""
+    *((index, 0) for index in (0x1000, 0x1017, 0x6007, 0x6040, 0x6041, 0x6060, 0x6061, 0x6064, 0x606C)),
+    *((index, 0) for index in (0x6077, 0x607A, 0x60A9, 0x60F4, 0x6502)),
+    *((index, sub) for index in (0x1400, 0x1800, 0x1801) for sub in (1, 2)),
+    *((index, sub) for index in (0x1600, 0x1A00, 0x1A01) for sub in (0, 1, 2)),
+    (0x1016, 1),
+    (0x1A00, 3),
+)
+"""Objects without which a drive is not driven: state, PDOs, and what stops it when its controller dies."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Row:
     """One line of the table that ships."""
 
@@ -55,10 +59,11 @@ def object_dictionary(eds: str | Path | None = None) -> canopen.ObjectDictionary
     """
     if eds is None:
         return _assembled(_table())
-    dictionary = read_eds(Path(eds))
+    dictionary: canopen.ObjectDictionary = read_eds(Path(eds))
     for index, sub in NEEDED:
         if find(dictionary, index, sub) is None:
-            raise DeviceError(f"the EDS file {eds} has no object {titled(index, sub)}; is it that of a CiA 402 drive (EPOS4)?")
+            lacks = f"the EDS file {eds} has no object {titled(index, sub)}"
+            raise DeviceError(f"{lacks}; is it that of a CiA 402 drive (EPOS4)?")
     return dictionary
 
 
@@ -77,29 +82,36 @@ def titled(index: int, sub: int = 0) -> str:
     >>> titled(0x3001, 2)
     '0x3001:02 (output current limit [mA])'
     """
-    number = f"0x{index:04X}:{sub:02X}"
-    names = {row.index: row.name for row in _table() if not row.sub}
-    name = next((row.name for row in _table() if (row.index, row.sub or 0) == (index, sub)), "") or names.get(index, "")
+    number, names = f"0x{index:04X}:{sub:02X}", {(row.index, row.sub or 0): row.name for row in _table()}
+    name = names.get((index, sub)) or names.get((index, 0))
     return f"{number} ({name})" if name else number
 
 
 @cache
 def at_power_on() -> Mapping[Key, int]:
-    """Values of the shipped table's numbers: what an emulated drive takes for an object that its own file gives no value, or lacks."""
+    """Values of the shipped table's numbers: an emulated drive's where its own file says nothing."""
     return {(row.index, row.sub or 0): row.value for row in _table() if isinstance(row.value, int)}
 
 
 @cache
 def _table() -> tuple[Row, ...]:
     text = (files("fastrod_device") / "epos4.csv").read_text(encoding="utf-8")
-    rows: list[Row] = []
-    for line in csv.DictReader(text.splitlines()):
-        kind, value = _KINDS[line["type"]], line["value"]
-        number = (int(value, 0) if kind != _KINDS["text"] else value) if value else None
-        for index in _spread(line["index"]):
-            for sub in _spread(line["sub"]) if line["sub"] else (None,):
-                rows.append(Row(index, sub, kind, line["access"], line["mappable"] == "x", number, line["name"]))
-    return tuple(rows)
+    return tuple(row for line in csv.DictReader(text.splitlines()) for row in _rows(line))
+
+
+def _rows(line: Mapping[str, str]) -> Iterable[Row]:
+    value = None if not line["value"] else line["value"] if line["type"] == "text" else int(line["value"], 0)
+    for index in _spread(line["index"]):
+        for sub in _spread(line["sub"]) if line["sub"] else (None,):
+            yield Row(
+                index=index,
+                sub=sub,
+                kind=_KINDS[line["type"]],
+                access=line["access"],
+                mappable=line["mappable"] == "x",
+                value=value,
+                name=line["name"],
+            )
 
 
 def _spread(text: str) -> range:
@@ -108,9 +120,9 @@ def _spread(text: str) -> range:
     return range(int(first, 0), int(last or first, 0) + 1)
 
 
-def _assembled(rows: Iterable[Row]) -> Any:
+def _assembled(rows: Iterable[Row]) -> canopen.ObjectDictionary:
     library = guest("canopen.objectdictionary")
-    od = library.ObjectDictionary()
+    od: canopen.ObjectDictionary = library.ObjectDictionary()
     for row in rows:
         own = row.name if row.name and row.name not in od.names else f"{row.name} 0x{row.index:04X}".strip()
         if row.sub is None:
@@ -122,5 +134,6 @@ def _assembled(rows: Iterable[Row]) -> Any:
             name = "number of entries" if row.sub == 0 else row.name or f"entry {row.sub}"
             var = library.ODVariable(name, row.index, row.sub)
             od.indices[row.index].add_member(var)
-        var.data_type, var.access_type, var.default, var.pdo_mappable = row.kind, row.access, row.value, row.mappable
+        var.data_type, var.access_type = row.kind, row.access
+        var.default, var.pdo_mappable = row.value, row.mappable
     return od

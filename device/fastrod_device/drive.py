@@ -133,8 +133,10 @@ class DriveBus:
         """Find the drives, tell them their limits and process data, and make them operational; they stay switched off.
 
         What drives refuse by themselves, one number or (n_drives,): targets beyond +-`position_limit` [counts], speeds beyond
-        `velocity_limit` [counts/s], a fault beyond `following_error` [counts]; their motors carry the current of `torque_limit`
-        [thousandths of the rated torque] at most. A limit whose object a drive lacks is left out, and said in `notices`. A quick stop is by `deceleration` [counts/s2]; then the motors `hold` the wires or are switched off.
+        `velocity_limit` [counts/s], a fault beyond `following_error` [counts]; their motors carry the current
+        of `torque_limit` [thousandths of the rated torque] at most. A quick stop is by `deceleration`
+        [counts/s2]; then the motors `hold` the tendons or are switched off. A limit whose object a drive
+        lacks is left out, as `notices` says.
         Call it again after a drive has rebooted.
         Raises `InputError`, or `DeviceError`: the first drive that does not answer, is another device, or refuses.
         """
@@ -307,7 +309,8 @@ class DriveBus:
         self.enable("csp")
         for i in drives * int(rounds):
             try:
-                self._home(i, self._configurator.current(i, float(torque[i])), float(np.broadcast_to(speeds, (n,))[i]), acceleration, away[i], time_limit)
+                current = self._configurator.current(i, float(torque[i]))
+                self._home(i, current, float(np.broadcast_to(speeds, (n,))[i]), acceleration, away[i], time_limit)
             except DeviceError:
                 self.quick_stop("homing did not end")
                 raise

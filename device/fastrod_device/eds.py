@@ -1,7 +1,7 @@
-"""EDS and DCF files (CiA 306) as their makers write them: any line end, any encoding, sections and keys missing or twice.
+"""EDS and DCF files (CiA 306) as makers write them: any line end or encoding, sections missing or twice.
 
-canopen's own reader ends in a traceback at a byte that is not the system's encoding, at a missing section and at an empty figure, so the
-files are read by the standard library's reader of such files, and only the objects are canopen's.
+canopen's own reader ends in a traceback at a byte that is not of the system's encoding, at a missing section
+and at an empty figure. So the standard library's reader reads the files; only the objects are canopen's.
 """
 
 from __future__ import annotations
@@ -23,42 +23,49 @@ _SIGNED = (0x02, 0x03, 0x10, 0x04, 0x15)
 _TEXTS = (0x09, 0x0B)
 _BYTES = 0x0F
 """DOMAIN: the type of what has none that is known."""
+_MEMBERS = 254
+"""Most subindices of an object, beside 0."""
 _LARGEST = 16 * 2**20
 """Bytes of a file that can be an EDS; EPOS4's have about 10^5."""
 
 
 def read_eds(path: Path) -> Any:
-    """The canopen object dictionary of a file. A value with `$NODEID` is kept without it; a DCF's own values take the place of defaults.
+    """The canopen object dictionary of a file.
 
+    A value with `$NODEID` is kept without it; a DCF's own values take the place of defaults.
     Raises `DeviceError` in a sentence: no such file, no EDS, or without objects.
     """
+    where = f"the EDS file {path}"
     if not path.is_file():
-        raise DeviceError(f"the EDS file {path} does not exist; give the path of the drive's .eds file, or none.")
+        raise DeviceError(f"{where} does not exist; give the path of the drive's .eds file, or none.")
     try:
         if path.stat().st_size > _LARGEST:
-            raise DeviceError(f"the EDS file {path} cannot be read: it is larger than {_LARGEST // 2**20} MiB.")
+            raise DeviceError(f"{where} cannot be read: it is larger than {_LARGEST // 2**20} MiB.")
         sections = _sections(_text(path.read_bytes()))
     except OSError as error:
-        raise DeviceError(f"the EDS file {path} cannot be read: {error.strerror or error}.") from error
+        raise DeviceError(f"{where} cannot be read: {error.strerror or error}.") from error
     except Error as error:
-        raise DeviceError(f"the EDS file {path} cannot be read: it is no EDS ({' '.join(str(error).split())}).") from error
+        why = " ".join(str(error).split())
+        raise DeviceError(f"{where} cannot be read: it is no EDS ({why}).") from error
     if not sections:
-        raise DeviceError(f"the EDS file {path} cannot be read: it describes no object; an EDS has sections such as [6040].")
+        raise DeviceError(f"{where} describes no object; an EDS has sections such as [6040].")
     library = guest("canopen.objectdictionary")
     od = library.ObjectDictionary()
     parents = {index for index, sub in sections if sub is not None}
-    for (index, sub), options in sorted(sections.items(), key=lambda item: (item[0][0], -1 if item[0][1] is None else item[0][1])):
-        name = options.get("parametername") or f"object 0x{index:04X}"
-        compact = min(_number(options.get("compactsubobj", "")) or 0, 254)
+    for (index, sub), options in sections.items():
+        name = options.get("parametername") or "object"
+        own = f"{name} 0x{index:04X}" if name in od.names or name == "object" else name
+        compact = max(0, min(_number(options.get("compactsubobj", "")) or 0, _MEMBERS))
         if index not in od.indices and (index in parents or compact):
-            od.add_object(library.ODRecord(name if name not in od.names else f"{name} 0x{index:04X}", index))
-        if sub is None and compact:
-            for member in range(compact + 1):
-                od.indices[index].add_member(_variable(library, index, member, options if member else {"datatype": "5"}, str(member)))
-        elif sub is not None:
+            od.add_object(library.ODRecord(own, index))
+        if sub is not None:
             od.indices[index].add_member(_variable(library, index, sub, options, name))
+        elif compact:
+            od.indices[index].add_member(_variable(library, index, 0, {"datatype": "5"}, "number of entries"))
+            for member in range(1, compact + 1):
+                od.indices[index].add_member(_variable(library, index, member, options, f"{name} {member}"))
         elif index not in parents:
-            od.add_object(_variable(library, index, 0, options, name if name not in od.names else f"{name} 0x{index:04X}"))
+            od.add_object(_variable(library, index, 0, options, own))
     return od
 
 
@@ -73,9 +80,15 @@ def _text(data: bytes) -> str:
 
 
 def _sections(text: str) -> dict[tuple[int, int | None], dict[str, str]]:
-    """Options of objects by index and subindex; keys in small letters. The last of two sections of one name adds to the first."""
-    parser = RawConfigParser(strict=False, allow_no_value=True, delimiters=("=",), comment_prefixes=(";", "#"), default_section="")
-    lines = (line.replace("\0", "").strip() for line in text.splitlines())  # an indented line is none that goes on
+    """Options of objects by index and subindex; keys in small letters. A section that comes twice adds up."""
+    parser = RawConfigParser(
+        strict=False,
+        allow_no_value=True,
+        delimiters=("=",),
+        comment_prefixes=(";", "#"),
+        default_section="",
+    )
+    lines = (line.replace("\0", "").strip() for line in text.splitlines())  # an indent continues nothing
     parser.read_string("\n".join(line for line in lines if not line.startswith("=")))
     found: dict[tuple[int, int | None], dict[str, str]] = {}
     for name in parser.sections():

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from pathlib import Path
 from typing import TYPE_CHECKING, final
 
 import numpy as np
@@ -37,9 +38,22 @@ _KEPT = 8  # frames that nobody has fetched
 class Emulator:
     """Drives, wires, plant and camera. It is the `Wires` of its drives and the `FrameSource` of whoever looks."""
 
-    def __init__(self, hardware: Hardware, bus: str | BusABC, *, clock: Clock, seal: Seal, seed: int = 0, taut: bool = False) -> None:
-        """On `bus` ("virtual:NAME", say), behind the effects of `seal`; `seed` draws slack and noise. `taut`: the wires have their
-        pretension at power-on, as if somebody had homed them. Raises `DeviceError` where the bus cannot be opened."""
+    def __init__(
+        self,
+        hardware: Hardware,
+        bus: str | BusABC,
+        *,
+        clock: Clock,
+        seal: Seal,
+        seed: int = 0,
+        taut: bool = False,
+        eds: str | Path | None = None,
+    ) -> None:
+        """On `bus` ("virtual:NAME", say), behind the effects of `seal`; `seed` draws slack and noise.
+
+        `taut`: the tendons have their pretension at power-on, as if somebody had homed them. `eds`: the file
+        that lists the drives' objects, by default an EPOS4's. Raises `DeviceError` for the bus or the file.
+        """
         self.hardware, self.clock = hardware, clock
         self.seal, self.plant = seal, Plant(seal)
         rng = np.random.default_rng(seed)
@@ -55,7 +69,7 @@ class Emulator:
         self._covered = -np.inf
         self.frozen = self.hidden = False
         """The camera repeats its last frame; the marker is covered."""
-        self.drives = EmulatedDrives(hardware.drives, bus, clock=clock, wires=self)
+        self.drives = EmulatedDrives(hardware.drives, bus, clock=clock, wires=self, eds=eds)
 
     def move(self, t: float, pulled: Floats) -> Floats:
         """Wires wound by (n_drives,) [m] since power-on: their tensions [N]. The rod stands straight until every wire is taut."""

@@ -101,7 +101,7 @@ def trouble(feedback: Feedback, hardware: Hardware, *, speed: float = 0.0) -> st
     if feedback.lost:
         return f"the bus carries nothing: {feedback.lost.rstrip('.')}"
     if feedback.foreign_syncs:
-        return "another node sends SYNC, so set-points come at wrong times"
+        return "another node sends SYNC; the controller alone may"
     for message in feedback.emergencies:
         if message.code & 0xFF00:  # 00xx: an error is gone
             return f"the drive at node {nodes[message.drive]} sent an emergency: {in_words(message.code)}"

@@ -39,7 +39,7 @@ class Inbox:
         """Statuswords."""
         self._position, self._torque, self._velocity, self._error = [0] * n, [0] * n, [0] * n, [0] * n
         self._t, self._t_beat, self._nmt = [-math.inf] * n, [-math.inf] * n, [-1] * n
-        # answers that are expected; below 0 where one is heard before the SYNC of another node that it answers
+        # answers that are expected; below 0 where one is heard before another node's SYNC that it answers
         self._pending, self._live, self._answered = ([0] * n, [0] * n), [False] * n, [False] * n
         self._waiting = 0
         self._all_in = threading.Event()
@@ -60,14 +60,15 @@ class Inbox:
         """A SYNC is about to be sent."""
         with self._lock:
             for pending in self._pending:
-                pending[:] = [max(n, 0) for n in pending]  # what was not expected came late, from a cycle that waits no more
+                pending[:] = [max(n, 0) for n in pending]  # others came late, from a cycle that is over
             self._expect()
 
     def _expect(self) -> None:
         """One answer more of each kind from every drive."""
         for pending in self._pending:
             pending[:] = [n + 1 for n in pending]
-        self._waiting = sum(max(n, 0) for pending in self._pending for n, live in zip(pending, self._live, strict=True) if live)
+        answers = zip(*self._pending, self._live, strict=True)
+        self._waiting = sum(max(first, 0) + max(second, 0) for first, second, live in answers if live)
         self._all_in.clear()
 
     def _on_sync(self, cob_id: int, data: bytearray, timestamp: float) -> None:  # noqa: ARG002

@@ -25,8 +25,9 @@ class Motor:
     """One axis. Positions in counts; growing counts pull the wire where the spec's direction is +1.
 
     A shaft without current is held by the friction of its gear. The current is that of the wire's tension; the motor's own inertia and
-    friction are left out. Where the tendon pulls with what the greatest current (object 0x3001:02) gives or more, the shaft turns no
-    further against it. What its dictionary lacks limits nothing; other absent objects have the shipped dictionary's value.
+    friction are left out. Where the tendon pulls with what the greatest current (object 0x3001:02) gives or
+    more, the shaft turns no further against it. A limit that its dictionary lacks limits nothing; any other
+    absent object has the shipped dictionary's value.
     """
 
     def __init__(self, spec: DriveSpec, objects: Objects) -> None:
@@ -159,7 +160,7 @@ class Motor:
                 self._to(SWITCHED_ON)
         elif word & 0x0F == 0x0F:
             # EPOS4 goes on from "quick stop active" as well, where it holds there: transition 16
-            if self.state in (READY, SWITCHED_ON) or (self.state == QUICK_STOP and self.objects.get(0x605A) == 6):
+            if self.state in (READY, SWITCHED_ON) or (self.state == QUICK_STOP and self._holds()):
                 self._to(ENABLED)
             if self.state == ENABLED:
                 self._start(word, rising)
@@ -268,7 +269,7 @@ class Motor:
             return True
         still = self.command_rate == 0.0 and self._left == 0.0 and self.goal == self.command and abs(self.command - self.measured) < 0.5
         if self.state == QUICK_STOP:
-            return still and self.objects.get(0x605A) != 2
+            return still and self._holds()
         return still and self.homing not in ("search", "away") and (self.reached or self.mode != PROFILE)
 
     def _command(self, h: float) -> None:
@@ -345,8 +346,12 @@ class Motor:
                 self._exceeded = 0.0
         elif self.state == REACTION and self.command_rate == 0.0 and (self.v == 0.0 or self.blocked):
             self._to(FAULT)
-        elif self.state == QUICK_STOP and self.command_rate == 0.0 and self.v == 0.0 and self.objects.get(0x605A) == 2:
+        elif self.state == QUICK_STOP and self.command_rate == 0.0 and self.v == 0.0 and not self._holds():
             self._to(SWITCH_ON_DISABLED)
+
+    def _holds(self) -> bool:
+        """After a quick stop, as object 0x605A says."""
+        return self.objects.get(0x605A) == 6
 
     def _per_rpm(self) -> float:
         return self.spec.counts_per_turn / 60.0

@@ -9,7 +9,7 @@ from typing import Any, final
 import numpy as np
 
 from fastrod_device.bus import guest
-from fastrod_device.dictionary import object_dictionary
+from fastrod_device.dictionary import Key, object_dictionary
 from fastrod_device.motor import Motor
 from fastrod_device.objects import Objects, ProcessData
 from fastrod_device.units import DriveSpec
@@ -25,7 +25,7 @@ class Node:
     """What the bus sees of one drive."""
 
     def __init__(self, spec: DriveSpec, period: float, eds: str | Path | None = None) -> None:
-        """`period` [s] of set-points, until the master sets another; `eds`: its dictionary, by default the one that ships."""
+        """`period` [s] of set-points until the master sets another; `eds`: its dictionary's file."""
         self.id = spec.node
         self.objects = Objects(object_dictionary(eds), spec.node)
         self.objects.preset = {
@@ -53,11 +53,12 @@ class Node:
         """Process data as mapped now."""
         self.objects.remapped = False
         get, live = self.objects.get, self.objects.live
+
+        def source(key: Key) -> Callable[[], int]:
+            return live[key] if key in live else lambda: get(*key)
+
         self.rpdos = {pdo.cob_id: pdo for pdo in self.objects.process_data(0x1400)}
-        self.tpdos = [
-            (pdo, [live[key] if key in live else (lambda key=key: get(*key)) for key in pdo.keys])  # type: ignore[misc]
-            for pdo in self.objects.process_data(0x1800)
-        ]
+        self.tpdos = [(pdo, [source(key) for key in pdo.keys]) for pdo in self.objects.process_data(0x1800)]
 
     def take(self, pdo: ProcessData, data: bytes) -> None:
         """Set the objects of an RPDO."""

@@ -54,8 +54,8 @@ class EmulatedDrives:
         self, specs: Sequence[DriveSpec], bus: str | can.BusABC, *, clock: Clock, wires: Wires, rate: float = 200.0, seed: int = 0,
         torque_noise: float = 1.0, eds: str | Path | None = None,
     ) -> None:  # fmt: skip
-        """`rate` [1/s]: of the set-points until the master sets another; `torque_noise` [thousandths of the rated torque], 1 sigma; `eds`:
-        the file that lists their objects, by default an EPOS4's as they ship.
+        """`rate` [1/s]: of the set-points until the master sets another; `torque_noise` [thousandths of the
+        rated torque], 1 sigma; `eds`: the file that lists their objects, by default an EPOS4's.
 
         Raises `InputError` for drives that cannot be, `DeviceError` for the bus or the file.
         """

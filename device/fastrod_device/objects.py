@@ -1,4 +1,4 @@
-"""The objects inside an emulated node, as its dictionary lists them: read and written by SDO, mapped into process data by the master."""
+"""The objects inside an emulated node, as its dictionary lists them: read and written by SDO, put in PDOs."""
 
 from __future__ import annotations
 
@@ -69,7 +69,8 @@ class Objects:
                 if var.data_type not in _CODES:
                     self._bytes[key] = str(var.default or "").encode("ascii", "replace")
                     continue
-                value = self.preset.get(key, at_power_on().get(key, 0) if var.default is None else int(var.default))
+                default = at_power_on().get(key, 0) if var.default is None else int(var.default)
+                value = self.preset.get(key, default)
                 relative = index in _COB_IDS and sub == (0 if index == 0x1014 else 1)
                 self.values[key] = value & ~_NODE | self.node if relative else value
 
@@ -81,12 +82,12 @@ class Objects:
             del self.values[key]
 
     def get(self, index: int, sub: int = 0) -> int:
-        """A value as it is stored; where the dictionary lacks the object, that of the shipped one at power-on."""
+        """A value as it is stored; for an object that the dictionary lacks, the shipped one's at power-on."""
         key = (index, sub)
         return self.values[key] if key in self.values else at_power_on().get(key, 0)
 
     def get_data(self, index: int, subindex: int, check_readable: bool = False) -> bytes:  # noqa: ARG002
-        """What an SDO upload returns. Raises an SDO abort where there is no such object, or it can only be written."""
+        """What an SDO upload returns. Raises an SDO abort: no such object, or write only."""
         var = self._find(index, subindex)
         if not var.readable:
             raise self._abort(_WRITE_ONLY)
@@ -166,10 +167,10 @@ class Objects:
             entries = [self.values.get((base + k + 0x200, m), 0) for m in range(1, n + 1)]
             keys = tuple((entry >> 16, (entry >> 8) & 0xFF) for entry in entries)
             objects = [find(self.object_dictionary, *key) for key in keys]
-            if cob_id & _INVALID or not objects or not all(var is not None and var.data_type in _CODES for var in objects):
+            codes = [_CODES.get(var.data_type, "") for var in objects if var is not None]
+            if cob_id & _INVALID or not keys or len(codes) < len(keys) or not all(codes):
                 continue
-            codes = "".join(_CODES[var.data_type] for var in objects)
-            found.append(ProcessData(cob_id & 0x7FF, kind, struct.Struct("<" + codes), keys))
+            found.append(ProcessData(cob_id & 0x7FF, kind, struct.Struct("<" + "".join(codes)), keys))
         return found
 
 

@@ -149,6 +149,8 @@ class Prototype:
                 deceleration=np.rint(limits.rate / _STOPS * per).astype(np.int64),
                 torque_limit=np.clip(np.abs(self.transmission.torque(np.full(len(per), _MARGIN * limits.tension))), 1, 3000),
             )
+            for sentence in self.drives.notices:
+                self.journal.write(self.clock.now(), "not limited", sentence)
             if home:
                 self._home()
             self._enable()

@@ -127,7 +127,7 @@ class Inspector:
         """What is wrong for as long as it is: only its end makes the robot fit to move again."""
         limits, old = self._limits, max(now - readings.t, 0.0)  # readings may be looked at twice: they have aged since
         if readings.foreign_syncs:
-            text = f"another node sends SYNC ({readings.foreign_syncs} since the last cycle), so set-points come at wrong times"
+            text = f"another node sends SYNC ({readings.foreign_syncs} since the last cycle)"
             yield Fault(kind="foreign SYNC", sentence=f"{text}; the controller alone may.", t=now)
         if readings.lost:
             yield Fault(kind="bus off", sentence=f"the bus carries nothing: {readings.lost.rstrip('.')}.", t=now)

@@ -50,18 +50,19 @@ class BoardBench:
 @contextmanager
 def emulated(
     hardware: Hardware, *, seed: int | None = None, effect: str | None = None, stepped: bool = True, bus: str | None = None,
-    journal: str | Path | None = None, home: bool = True,
+    journal: str | Path | None = None, home: bool = True, eds: str | Path | None = None,
 ) -> Iterator[Bench]:  # fmt: skip
     """The emulator, started, with a sealed plant: `seed` draws what is hidden (None: nobody knows), `effect` names it for those who test.
 
     `stepped` runs as fast as the machine computes; otherwise in real time. `bus`: None is a virtual one of its own. Without `home` the
-    wires are taut from the start.
+    tendons are taut from the start. `eds`: the file that lists the drives' objects, for both ends.
     """
     clock = SteppedClock() if stepped else WallClock()
     name = bus or f"virtual:fastrod-{next(_COUNT)}"
-    emulator = Emulator(hardware, name, clock=clock, seal=seal(seed, effect, scatter=_SCATTER), seed=seed or 0, taut=not home)
+    hidden = seal(seed, effect, scatter=_SCATTER)
+    emulator = Emulator(hardware, name, clock=clock, seal=hidden, seed=seed or 0, taut=not home, eds=eds)
     try:
-        with Prototype(hardware, name, emulator, clock=clock, journal=Journal(journal)) as prototype:
+        with Prototype(hardware, name, emulator, clock=clock, eds=eds, journal=Journal(journal)) as prototype:
             prototype.start(home=home)
             yield Bench(prototype=prototype, hands=emulator, emulator=emulator)
     finally:

@@ -390,7 +390,7 @@ def test_answers_to_another_nodes_sync_do_not_pass_for_those_to_ours(ready, fore
     import can
 
     other = open_bus(ready.name)
-    for k in range(20):  # a loop that ran ahead of its drives would have them where they were told to be long ago
+    for k in range(20):  # a loop that ran ahead of its drives would leave frames behind
         for _ in range(foreign):
             other.send(can.Message(arbitration_id=0x80, is_extended_id=False))
         seen = ready.run(1, np.full(4, 50 * k))[0]
