@@ -1,4 +1,7 @@
-"""Faults put into a moving prototype, does it stop: `python perf/bench_faults.py`; `--json` for programs, `--quick` for one of each.
+"""A prototype that runs, and faults put into one that moves: `python perf/bench_faults.py`; `--quick` for one of each.
+
+First the whole way: connect to drives that have an EPOS4's objects (or those of `--eds FILE`) and no others, home, and
+move for a minute at 200 Hz.
 
 The emulated prototype goes round in a circle by commands at 30 Hz that go on whatever happens, and records. At a moment that a seed draws
 something fails. Detection is when the supervisor finds it (a killed process has none: there it is when the drives miss its heartbeat),
@@ -25,8 +28,10 @@ import numpy as np
 from fastrod.errors import FastrodError
 from fastrod.recording import Recorder, recover
 from fastrod.types import Floats
+from fastrod_device.bus import Line
 from fastrod_device.camera import Frame
 from fastrod_device.clock import SteppedClock, WallClock
+from fastrod_device.dictionary import object_dictionary
 from fastrod_device.drawing import Eye
 from fastrod_device.emulator import Emulator
 from fastrod_device.errors import DeviceError, RefusedError
@@ -37,6 +42,7 @@ from fastrod_device.pacer import urgent
 from fastrod_device.prototype import Prototype
 from fastrod_device.safety import State
 from fastrod_device.seal import seal
+from fastrod_device.workbench import emulated
 from report import Column, Row, Section, command, note_progress
 
 RADIUS, TURN = 0.0025, 1.0  # m of wire, s
@@ -46,6 +52,19 @@ SAFE = 0.05  # s from detection to standstill
 AFTER = 1.0  # s in which nothing may start again
 PATIENCE = 3.0  # s in which a fault must be found
 UDP = "udp_multicast:239.74.163.5:43179"
+LOOP = 200.0  # Hz
+STORMS = (1, 2, 5, 10)  # SYNCs in a cycle; with four drives' answers a bus of 1 Mbit/s carries ten in 10 ms
+RUN = (
+    Column("objects", "objects\nof a drive", "d"),
+    Column("notices", "not\nlimited", "d"),
+    Column("ready", "connected and\nhomed after [s]", ".1f"),
+    Column("seconds", "moved\nfor [s]", ".1f"),
+    Column("rate", "cycles\na second", ".1f"),
+    Column("missed", "set-points\nmissed", "d"),
+    Column("unanswered", "cycles not\nanswered", "d"),
+    Column("sdo", "SDO in\nthe loop", "d"),
+    Column("stopped", "stopped by"),
+)
 COLUMNS = (
     Column("kind", "injected"), Column("n", "n", "d"), Column("safe", "stopped\nwithin 50 ms", "d"), Column("named", "named", "d"),
     Column("found", "injected to\nfound, worst [ms]", ".0f"), Column("rest", "found to\nrest, worst [ms]", ".1f"),
@@ -72,17 +91,19 @@ class Trial:
 class Rig:
     """An emulated prototype in motion."""
 
-    def __init__(self, folder: Path, seed: int, *, stepped: bool) -> None:
+    def __init__(self, folder: Path, seed: int, *, stepped: bool, eds: Path | None) -> None:
         self.clock = SteppedClock() if stepped else WallClock()
-        self.jump = 0.0
+        self.jump, self.storm = 0.0, 0
         hardware, bus = load_hardware(), f"virtual:faults-{time.monotonic_ns()}"
         hardware = replace(hardware, limits=replace(hardware.limits, following_error=FOLLOWING))
-        self.emulator = Emulator(hardware, bus, clock=self.clock, seal=seal(seed, "none"), seed=seed, taut=True)
+        self.emulator = Emulator(hardware, bus, clock=self.clock, seal=seal(seed, "none"), seed=seed, taut=True, eds=eds)
         self.journal = folder / f"{seed}-{time.monotonic_ns()}.journal.csv"
         self.part = self.journal.with_suffix(".log.csv")
         day = time.time() - self.clock.now()
         wall: Callable[[], float] = lambda: self.clock.now() + day + self.jump  # noqa: E731
-        self.prototype = Prototype(hardware, bus, self.emulator, clock=self.clock, journal=Journal(self.journal), wall=wall)
+        journal = Journal(self.journal)
+        self.prototype = Prototype(hardware, bus, self.emulator, clock=self.clock, eds=eds, journal=journal, wall=wall)
+        self._other = Line(bus)
         self.prototype.start(home=False)
         self.recorder: Recorder = self.prototype.recorder_for(str(self.part))
         self.recorder.start(self.prototype.elapsed)
@@ -101,6 +122,20 @@ class Rig:
         while not self._over.wait(1.0 / COMMANDS):
             self.command()
 
+    def sync(self) -> None:
+        """Another node's SYNC."""
+        self._other.send(0x080, b"")
+
+    def _sync_on(self) -> None:
+        while not self._over.wait(1e-3 / self.storm * max(STORMS)):
+            self.sync()
+
+    def storm_on(self, syncs: int) -> None:
+        """From now on so many SYNCs of another node in every 10 ms."""
+        self.storm = syncs
+        if not self.clock.stepped:
+            threading.Thread(target=self._sync_on, daemon=True).start()
+
     def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
         """So much time passes, stopped or not, with commands; whether `until` came true."""
         end, due = self.clock.now() + seconds, -math.inf
@@ -111,6 +146,8 @@ class Rig:
                 if self.clock.now() >= due:
                     due = self.clock.now() + 1.0 / COMMANDS
                     self.command()
+                for _ in range(self.storm):
+                    self.sync()
                 with suppress(DeviceError):
                     self.prototype.wait(1.0 / self.prototype.hardware.rate)
             if until():
@@ -124,13 +161,14 @@ class Rig:
             self._thread.join(2.0)
         self.emulator.drives.restore()
         self.prototype.close()
+        self._other.close()
         self.emulator.close()
 
 
 @contextmanager
-def rig(folder: Path, seed: int, *, stepped: bool) -> Iterator[Rig]:
+def rig(folder: Path, seed: int, *, stepped: bool, eds: Path | None) -> Iterator[Rig]:
     """One, closed at the end."""
-    made = Rig(folder, seed, stepped=stepped)
+    made = Rig(folder, seed, stepped=stepped, eds=eds)
     try:
         yield made
     finally:
@@ -172,15 +210,41 @@ INJECTIONS: dict[str, tuple[Callable[[Rig, int], None], str]] = {
     "marker lost": (_hide, "the marker was last seen"),
     "clock jump": (_jump, "the wall clock jumped"),
     "encoder jump": (lambda rig, k: rig.emulator.drives.encoder_jump(k % 4, (2000, -2000, 4000, -4000)[k % 4]), "moved its wire by"),
+    "SYNC storm": (lambda rig, k: rig.storm_on(STORMS[k % 4]), "another node sends SYNC"),
 }
 """How each is done to the k-th trial, and what its sentence must say."""
 
 
-def fail(kind: str, k: int, folder: Path, *, stepped: bool) -> Trial:
+def run(seconds: float, *, stepped: bool, eds: Path | None) -> Row:
+    """Connect, home, and go round for so long at 200 Hz."""
+    hardware = replace(load_hardware(), rate=LOOP)
+    with emulated(hardware, seed=1, effect="none", stepped=stepped, eds=eds) as bench:
+        assert bench.emulator is not None
+        prototype, nodes = bench.prototype, bench.emulator.drives
+        bus, ready = prototype.drives, prototype.elapsed
+        bus.reset_statistics()
+        asked, missed, began = bus.sdo_requests, nodes.missed_setpoints, prototype.clock.now()
+        with suppress(DeviceError):
+            prototype.follow(circle, seconds)
+        passed, cycles, fault = prototype.clock.now() - began, bus.jitter.n, prototype.supervisor.first
+        return {
+            "objects": len(object_dictionary(eds)),
+            "notices": len(bus.notices),
+            "ready": ready,
+            "seconds": passed,
+            "rate": cycles / passed,
+            "missed": nodes.missed_setpoints - missed,
+            "unanswered": bus.missed,
+            "sdo": bus.sdo_requests - asked,
+            "stopped": "nothing" if fault is None else fault.sentence,
+        }
+
+
+def fail(kind: str, k: int, folder: Path, *, stepped: bool, eds: Path | None) -> Trial:
     """One trial."""
     rng = np.random.default_rng([k, list(INJECTIONS).index(kind)])
     inject, words = INJECTIONS[kind]
-    with rig(folder, k, stepped=stepped) as bench:
+    with rig(folder, k, stepped=stepped, eds=eds) as bench:
         supervisor, drives = bench.prototype.supervisor, bench.emulator.drives
         bench.wait(0.7 + float(rng.uniform(0.0, 1.0)), lambda: supervisor.state is State.STOPPED)
         injected = bench.clock.now()
@@ -305,12 +369,16 @@ def measure(options: argparse.Namespace) -> Sequence[Section]:
     """All kinds."""
     times = 1 if options.quick else options.times
     urgent()  # before other programs, where that is granted
-    rows = []
+    rows, whole = [], []
+    if options.only is None:
+        note_progress("connect, home, move")
+        whole.append(run(2.0 if options.quick else options.seconds, stepped=options.stepped, eds=options.eds))
     with tempfile.TemporaryDirectory() as name:
         for kind in INJECTIONS:
             if options.only in (None, kind):
                 note_progress(kind)
-                rows.append(_row(kind, [fail(kind, k, Path(name), stepped=options.stepped) for k in range(times)]))
+                trials = [fail(kind, k, Path(name), stepped=options.stepped, eds=options.eds) for k in range(times)]
+                rows.append(_row(kind, trials))
         if options.only in (None, "killed process"):
             note_progress("killed process")
             rows.append(_row("killed process", [kill(k, Path(name)) for k in range(times)]))
@@ -320,7 +388,9 @@ def measure(options: argparse.Namespace) -> Sequence[Section]:
         "'found to rest' is 0 where set-points that do not come any more had stopped the shafts before: bus off, killed process.",
         "A killed process: SIGKILL, drives in another process on udp_multicast, always in real time; rows are those that it had reported.",
     ]
-    return [Section("faults", "faults injected into a moving prototype" + (", stepped" if options.stepped else ""), COLUMNS, rows, notes)]
+    how = ", stepped" if options.stepped else ""
+    found = [Section("faults", f"faults injected into a moving prototype{how}", COLUMNS, rows, notes)]
+    return [Section("run", f"connect, home and move at {LOOP:g} Hz{how}", RUN, whole, []), *found] if whole else found
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -331,6 +401,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="bench_faults", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--times", type=int, default=20, help="of each kind (default: 20)")
     parser.add_argument("--only", choices=[*INJECTIONS, "killed process"], help="this kind alone")
+    parser.add_argument("--seconds", type=float, default=60.0, help="of the loop at 200 Hz (default: 60)")
+    parser.add_argument("--eds", type=Path, metavar="FILE", help="objects of the drives (default: an EPOS4's)")
     parser.add_argument("--stepped", action="store_true", help="as fast as the machine computes, not in real time")
     try:
         return command(parser, given, measure)

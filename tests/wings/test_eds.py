@@ -55,7 +55,7 @@ def shipped() -> Facts:
 
 
 def module_50_15() -> Facts:
-    """The other drive: greater currents, another access of the controlword, a DCF's COB-IDs of its own node."""
+    """The other drive: greater currents, another access of the controlword, COB-IDs of a DCF's own node."""
     facts = shipped()
     del facts[(0x2200, 2)]
     facts[(0x3001, 1)], facts[(0x3001, 2)] = Fact(7, "rww", True, 15_000), Fact(7, "rww", True, 30_000)
@@ -127,7 +127,7 @@ def eds(facts: Facts, *, value: str = "DefaultValue", node: str = "") -> list[st
 
 
 def untidy(lines: list[str]) -> list[str]:
-    """Small letters, indents, comments, lines without a key, a section that comes again, a parent that is missing."""
+    """Small letters, indents, comments, lines without a key, a section twice, a parent that is missing."""
     out = [
         "; made by hand",
         *(line.lower() if line.startswith("[") else f"  {line} ; note" if line else "" for line in lines),
@@ -306,7 +306,7 @@ def test_what_is_needed_is_demanded_by_name(index: int, sub: int, tmp_path: Path
     [
         (
             0x225,
-            r"it supports profile position, profile velocity, homing, cyclic synchronous torque \(object .* 0x225\)\.$",
+            r"it supports profile position, profile velocity, homing, cyclic synchronous torque \(.* 0x225\)\.$",
         ),
         (0x10000, r"it supports none \(object 0x6502 is 0x10000\)\.$"),
     ],
