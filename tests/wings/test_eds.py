@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import itertools
 import os
+from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -12,11 +13,13 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from fastrod.driving import _bench
 from fastrod.types import Floats
 from fastrod_device.clock import SteppedClock
 from fastrod_device.dictionary import NEEDED, find, object_dictionary
 from fastrod_device.drive import DriveBus
 from fastrod_device.errors import DeviceError
+from fastrod_device.hardware import load_hardware
 from fastrod_device.nodes import EmulatedDrives
 from fastrod_device.units import DriveSpec
 
@@ -367,3 +370,15 @@ def test_what_is_no_such_file_is_one_sentence(data: bytes, says: str, tmp_path: 
         object_dictionary(path)
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_what_is_not_limited_is_printed_and_in_the_journal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("cv2")
+    path, events = tmp_path / "poor.eds", tmp_path / "run.csv"
+    path.write_bytes(WRITTEN["Windows"](eds(without(0x607F))))
+    options = Namespace(emulate=True, no_home=True, seed=1, real_time=False, eds=path, bus=None, camera=None)
+    with _bench(options, load_hardware(), journal=events) as bench:
+        says = [f"Node {node} has no object 0x607F: the profile velocity is not limited." for node in range(1, 5)]
+        assert capsys.readouterr().err.splitlines() == says
+        assert [line[1:] for line in bench.prototype.journal.lines] == [("not limited", sentence) for sentence in says]
+        assert [len(node.objects.object_dictionary) for node in bench.emulator.drives._nodes] == [163] * 4

@@ -17,6 +17,7 @@ import pytest
 
 from fastrod.recording import recover
 from fastrod.types import Floats
+from fastrod_device.bus import Line
 from fastrod_device.clock import SteppedClock, WallClock
 from fastrod_device.emulator import Emulator
 from fastrod_device.errors import DeviceError, RefusedError
@@ -54,7 +55,8 @@ class Rig:
         self.recorder = self.prototype.recorder_for(self.log)
         self.recorder.start(self.prototype.elapsed)
         self.prototype.record(self.recorder)
-        self._due = 0.0
+        self._due, self.storm = 0.0, 0
+        self.other = Line(self.bus)
         self.began = self.clock.now()
 
     def circle(self) -> Floats:
@@ -71,6 +73,8 @@ class Rig:
                 self._due = self.clock.now() + 1.0 / 30.0
                 with suppress(RefusedError):
                     self.prototype.command(self.circle())
+            for _ in range(self.storm):
+                self.other.send(0x080, b"")
             with suppress(DeviceError):
                 self.prototype.wait(0.01)
 
@@ -85,6 +89,7 @@ class Rig:
     def mend(self) -> None:
         self.drives.restore()
         self.emulator.frozen = self.emulator.hidden = False
+        self.storm = 0
 
 
 @contextmanager
@@ -101,6 +106,7 @@ def moving(folder: Path, moment: float, *, rate: float = 0.02, following_error: 
         if rig.recorder.recording:
             rig.recorder.stop()
         rig.prototype.close()
+        rig.other.close()
         rig.emulator.close()
 
 
@@ -122,6 +128,10 @@ def jump(rig: Rig) -> None:
     rig.jump += 3600.0
 
 
+def storm(rig: Rig) -> None:
+    rig.storm = 5
+
+
 FAULTS: dict[str, tuple[Callable[[Rig], None], tuple[str, ...]]] = {
     "heartbeat lost": (lambda rig: rig.drives.lose_heartbeat(1), ("drive 2 (node 2)", "sent its last heartbeat")),
     "emergency message": (lambda rig: rig.drives.emergency(2, 0x2310, lasting=True), ("drive 3 (node 3)", "0x2310", "over-current")),
@@ -132,6 +142,7 @@ FAULTS: dict[str, tuple[Callable[[Rig], None], tuple[str, ...]]] = {
     "marker lost": (hide, ("the marker was last seen", "the limit is 500 ms")),
     "clock jump": (jump, ("the wall clock jumped by 3.6e+06 ms",)),
     "encoder jump": (lambda rig: rig.drives.encoder_jump(0, 2500), ("drive 1 (node 1)", "moved its wire by -1.")),
+    "foreign SYNC": (storm, ("another node sends SYNC (5 since the last cycle)",)),
 }
 ONCE = ("following error", "clock jump")  # nothing tells that they are still there
 
