@@ -5,8 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
 from io import FileIO
 from pathlib import Path
 from threading import Lock
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fastrod.errors import InputError, LogError, nearest
+from fastrod.linefile import append_lines, is_at, made_again
 from fastrod.link import Measurement
 from fastrod.robot import Robot
 from fastrod.runlog import RunLog, numbers, read_table, write_log
@@ -39,13 +40,17 @@ class Recorder:
 
     Each row goes to PATH.part at once, in one write to the operating system: a process that is killed loses none. Rows are not forced
     onto the disk itself (fsync), so a machine that loses power may lose the last seconds. `stop` writes the finished log to PATH and
-    takes the part away; what a killed session leaves, `recover` turns into a log. Rows without a measured tip are kept. Commands
+    takes the part away; what a killed session leaves, `recover` turns into a log. Where PATH.part is removed or renamed, or its folder
+    is, the next row notices: all rows are written again at PATH, or, where that cannot be, in the system's temporary folder. Rows without a measured tip are kept. Commands
     (cmd_dl_1 ...), tensions (tension_1 ...) and `extra` are kept as further columns. May be used from several threads.
     """
 
-    def __init__(self, robot: Robot, path: str | Path | None = None, *, overwrite: bool = False, extra: Sequence[str] = ()) -> None:
+    def __init__(
+        self, robot: Robot, path: str | Path | None = None, *, overwrite: bool = False, extra: Sequence[str] = (),
+        on_move: Callable[[str], None] | None = None,
+    ) -> None:  # fmt: skip
         """Record `robot` to the .csv or .parquet at `path`, or, where it is None, in memory alone; `extra` names further columns of
-        numbers.
+        numbers. `on_move` is called with a sentence where rows had to be written again: where they are, and how many.
 
         Raises `InputError` where the path cannot be one, or, but for `overwrite`, where a file or a left-over part is there; where a
         name of `extra` is taken, given twice, or none.
@@ -54,6 +59,10 @@ class Recorder:
         self.extra = _names(extra)
         """Names of the further columns."""
         self.path = None if path is None else _checked(Path(path), overwrite)
+        """Where the log will be; another than was given where that could not be kept."""
+        self.moved = ""
+        """Why rows were written again, and where they are, one sentence; empty where all are where they were."""
+        self._on_move = on_move
         n = range(1, robot.n_tendons + 1)
         extends = any(segment.extension != (0.0, 0.0) for segment in robot.segments)
         self._ext = robot.n_segments if extends else 0
@@ -65,6 +74,7 @@ class Recorder:
         self._labels: list[str] = []
         self._lock = Lock()
         self._file: FileIO | None = None
+        self._on_disk = 0
         self._run = ""
         self._runs: list[str] = []
         self._start = self._last = 0.0
@@ -151,28 +161,35 @@ class Recorder:
             self._labels.append(self._run)
             if self._file is not None and self.path is not None:
                 try:
-                    _write(self._file, _line([_text(t), self._run, *map(_text, self._rows[-1][1:])]))
+                    append_lines(self._file, self._row(-1))
+                    self._on_disk += 1
                 except OSError as error:
-                    raise InputError(f"{self.path.name}.part cannot be written: {error.strerror or error}.") from error
+                    if is_at(self._file, _part(self.path)):
+                        raise InputError(f"{self.path.name}.part cannot be written: {error.strerror or error}; {self._kept()}.") from error
+                self._stay()
             return True
 
     def stop(self) -> RunLog:
         """End the recording: the log, written to the path where there is one.
 
-        Raises `InputError` where nothing is recorded, or where the log cannot be written; the rows are then still in PATH.part.
+        Raises `InputError` where nothing is recorded, or where the log cannot be written; it says how many rows are in PATH.part then.
         """
         with self._lock:
             if not self._recording:
                 raise InputError("nothing is being recorded; start first.")
             self._recording = False
-            self._close()
+            try:
+                self._stay()
+                kept = self._kept()
+            finally:
+                self._close()
             if not self._rows:
                 if self.path is not None:
                     _part(self.path).unlink(missing_ok=True)
                 raise InputError("no reading came in while recording; there is nothing to keep.")
             log = _log(self._columns, self._labels, np.array(self._rows), "session" if self.path is None else self.path.stem)
             if self.path is not None:
-                _finish(log, self.path, f"Recorded on robot {self.robot.name}.")
+                _finish(log, self.path, f"Recorded on robot {self.robot.name}.", kept)
                 self._done = True
             return log
 
@@ -181,9 +198,44 @@ class Recorder:
             return
         try:
             self._file = _part(self.path).open("wb", buffering=0)
-            _write(self._file, f"# Recorded on robot {' '.join(self.robot.name.split())}.\n" + _line(self._columns))
+            append_lines(self._file, self._head())
         except OSError as error:
             raise InputError(f"{str(self.path)!r} cannot be written: {error.strerror or error}.") from error
+        self._on_disk = 0
+
+    def _head(self) -> str:
+        return f"# Recorded on robot {' '.join(self.robot.name.split())}.\n" + _line(self._columns)
+
+    def _row(self, k: int) -> str:
+        return _line([_text(self._rows[k][0]), self._labels[k], *map(_text, self._rows[k][1:])])
+
+    def _stay(self) -> None:
+        """Write all rows again where the file is no longer at its path. Raises `InputError` where no place takes them."""
+        if not self._rows or self._file is None or self.path is None or is_at(self._file, _part(self.path)):
+            return
+        lost, why = f"{self.path.name}.part was removed or renamed while it was recorded", ""
+        for path in (self.path, Path(tempfile.gettempdir()) / self.path.name):
+            try:
+                target = free_path(path) if _part(path).exists() or path is not self.path else path
+                file = made_again(_part(target), self._head() + "".join(map(self._row, range(len(self._rows)))))
+            except OSError as error:
+                why = why or f"{str(path)!r} cannot be written: {error.strerror or error}"
+                continue
+            self._file.close()
+            self._file, self.path, self._on_disk = file, target, len(self._rows)
+            self.moved = f"{lost}; all {len(self._rows)} rows are in {str(_part(target))!r} now, and more go there."
+            if self._on_move is not None:
+                self._on_move(self.moved)
+            return
+        self._on_disk = 0
+        raise InputError(f"{lost}, and {why}; {self._kept()}.")
+
+    def _kept(self) -> str:
+        """Where the rows are, without a full stop."""
+        if self.path is None or self._file is None or not is_at(self._file, _part(self.path)):
+            return f"its {len(self._rows)} rows are in no file"
+        which = f"its {len(self._rows)}" if self._on_disk == len(self._rows) else f"{self._on_disk} of its {len(self._rows)}"
+        return f"{which} rows are in {_part(self.path).name}"
 
     def _close(self) -> None:
         if self._file is not None:
@@ -215,7 +267,7 @@ def recover(path: str | Path) -> RunLog:
     names = list(table)
     rows = np.stack([numbers(table, name, part.name) for name in names if name != "run"], axis=1)
     log = _log(names, [str(label) for label in table["run"]], rows, target.stem)
-    _finish(log, target, "Recovered from a session that did not end.")
+    _finish(log, target, "Recovered from a session that did not end.", f"its rows are in {part.name}")
     return log
 
 
@@ -256,19 +308,6 @@ def _names(extra: Sequence[str]) -> tuple[str, ...]:
     return names
 
 
-def _write(file: FileIO, line: str) -> None:
-    """The line in one write; where it does not fit, no part of it stays, as the next would go on from there."""
-    data, end = line.encode(), file.tell()
-    try:
-        while data:
-            data = data[file.write(data) :]
-    except OSError:
-        with suppress(OSError):
-            file.seek(end)
-            file.truncate()
-        raise
-
-
 def _part(path: Path) -> Path:
     return path.with_name(path.name + ".part")
 
@@ -280,17 +319,19 @@ def _rewritten(part: Path, lines: Sequence[str]) -> Path:
     return beside.replace(part)
 
 
-def _finish(log: RunLog, path: Path, comment: str) -> None:
-    """Write `log` to `path` and take the part away. `write_log` would begin by emptying PATH.part, which still holds the only copy."""
+def _finish(log: RunLog, path: Path, comment: str, kept: str) -> None:
+    """Write `log` to `path` and take the part away. `write_log` would begin by emptying PATH.part, which still holds the only copy.
+
+    `kept` says where the rows are if that fails.
+    """
     beside = path.with_name(f"{path.stem}.whole{path.suffix}")
     try:
         write_log(log, beside, comment=comment)
         beside.replace(path)
         _part(path).unlink(missing_ok=True)
     except OSError as error:
-        raise InputError(
-            f"{str(path)!r} cannot be written: {error.strerror or error}; its rows are in {_part(path).name}, see `recover`."
-        ) from error
+        beside.unlink(missing_ok=True)
+        raise InputError(f"{str(path)!r} cannot be written: {error.strerror or error}; {kept}, see `recover`.") from error
 
 
 def _log(names: Sequence[str], labels: Sequence[str], rows: Floats, name: str) -> RunLog:

@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from importlib import import_module
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -176,16 +177,24 @@ def write_log(log: RunLog, path: str | Path, *, comment: str = "") -> None:
     path = Path(path)
     columns = _columns(log)
     part = path.with_name(path.name + ".part")
+    table = None
     if path.suffix == ".parquet":
-        parquet, arrow = _pyarrow("pyarrow.parquet"), _pyarrow("pyarrow")
-        parquet.write_table(arrow.table({name: np.asarray(cells) for name, cells in columns.items()}), part)
-    else:
-        with part.open("w", encoding="utf-8", newline="") as file:
-            file.writelines(f"# {line}\n" for line in comment.splitlines())
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(columns)
-            writer.writerows(zip(*(_texts(cells) for cells in columns.values()), strict=True))
-    part.replace(path)
+        table = _pyarrow("pyarrow").table({name: np.asarray(cells) for name, cells in columns.items()})
+        write_table = _pyarrow("pyarrow.parquet").write_table
+    file = part.open("wb")
+    try:
+        with file, TextIOWrapper(file, encoding="utf-8", newline="") as text:
+            if table is not None:
+                write_table(table, file)
+            else:
+                text.writelines(f"# {line}\n" for line in comment.splitlines())
+                writer = csv.writer(text, lineterminator="\n")
+                writer.writerow(columns)
+                writer.writerows(zip(*(_texts(cells) for cells in columns.values()), strict=True))
+        part.replace(path)
+    except BaseException:
+        part.unlink(missing_ok=True)  # it takes room on a disk that is full
+        raise
 
 
 def read_table(path: str | Path) -> Table:

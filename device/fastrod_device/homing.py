@@ -10,6 +10,7 @@ The supervisor does not watch yet, so every cycle is looked at here, and what is
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -178,14 +179,20 @@ def _straightened(
     for _ in range(_ROUNDS):
         for away in _spiral(hardware):
             cycle(at + away)
-        seen, end = [], clock.now() + _LOOKING
+        seen, flags, end = [], Counter[str](), clock.now() + _LOOKING
         while clock.now() < end:
             cycle(at)
             sighting = look()
-            if sighting is not None and sighting.ok and sighting.t > end - _LOOKING:
-                seen.append(sighting.position)
+            if sighting is not None and sighting.t > end - _LOOKING:
+                flags[sighting.flag] += 1
+                if sighting.ok:
+                    seen.append(sighting.position)
         if len(seen) < _LEAST:
-            raise DeviceError(f"the camera saw the marker {len(seen)} times in {_LOOKING:g} s of homing; it must see it {_LEAST} times.")
+            del flags[""]
+            why = "".join(f"; {n} pictures are flagged {flag!r}" for flag, n in flags.most_common(1))
+            raise DeviceError(
+                f"the camera saw the marker {len(seen)} times in {_LOOKING:g} s of homing; it must see it {_LEAST} times{why}."
+            )
         tip = np.mean(seen, axis=0)
         way = -lean(hardware.robot, tip)
         far = float(np.abs(way).max())

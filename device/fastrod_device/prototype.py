@@ -26,12 +26,14 @@ from fastrod_device.drive import DriveBus
 from fastrod_device.errors import DeviceError, RefusedError
 from fastrod_device.expectation import Expectation
 from fastrod_device.faultcodes import in_words
+from fastrod_device.gates import FROZEN, REPEATED, Workspace
 from fastrod_device.hardware import Hardware
 from fastrod_device.homing import home
 from fastrod_device.journal import Journal
 from fastrod_device.pacer import Pacer, urgent, urgently
 from fastrod_device.readings import Readings
 from fastrod_device.safety import CameraWatch, Fault, State, Supervisor, limited
+from fastrod_device.safety_words import of_exception
 from fastrod_device.trace import Trace
 from fastrod_device.tracker import MarkerTracker, Sighting, outlined
 from fastrod_device.units import Transmission
@@ -76,7 +78,8 @@ class Prototype:
             self.drives = DriveBus(hardware.drives, bus, clock=self.clock, rate=hardware.rate, eds=eds)
         nodes = [spec.node for spec in hardware.drives]
         self.supervisor = Supervisor(hardware.robot, hardware.limits, on_stop=self._on_stop, nodes=nodes, words=in_words)
-        self.tracker = MarkerTracker(hardware.camera, hardware.marker)
+        workspace = Workspace.of(hardware.robot, hardware.limits.curvature)
+        self.tracker = MarkerTracker(hardware.camera, hardware.marker, workspace=workspace)
         self.recorder: Recorder | None = None
         self.payload = 0.0
         """Known mass on the tip [kg]; whoever hangs it says so."""
@@ -168,7 +171,7 @@ class Prototype:
 
     def _see(self) -> Sighting | None:
         frame = None if self.source is None else self.source.read()
-        return None if frame is None else self.tracker.look(frame)
+        return None if frame is None else self.tracker.look(frame, now=self.clock.now())
 
     def command(self, dl: ArrayLike, ext: ArrayLike | None = None, *, stamp: float | None = None) -> None:
         """As `RobotLink.command`; `stamp` is when it was meant, by our clock [s]: one that is too old is refused.
@@ -282,11 +285,15 @@ class Prototype:
             self.recorder = recorder
 
     def recorder_for(self, path: str | Path, *, overwrite: bool = False) -> Recorder:
-        """A recorder with the columns of a prototype: currents and how well the marker was seen."""
-        return Recorder(self.robot, path, overwrite=overwrite, extra=columns.names(self.robot.n_tendons))
+        """A recorder with the columns of a prototype: currents and how well the marker was seen; the journal has where its rows moved."""
+        moved = lambda sentence: self.journal.write(self.clock.now(), "recording", sentence)  # noqa: E731
+        return Recorder(self.robot, path, overwrite=overwrite, extra=columns.names(self.robot.n_tendons), on_move=moved)
 
     def close(self) -> None:
-        """Stop, disable, let go of bus and camera. A recording goes on existing: it is whoever began it that ends it."""
+        """Stop, disable, let go of bus and camera. A recording goes on existing: it is whoever began it that ends it.
+
+        Never raises: what an adapter raises is in the journal, and in `broken`.
+        """
         if not self._closed.is_set() and not self.clock.stepped:
             gc.unfreeze()
         self._closed.set()
@@ -294,10 +301,12 @@ class Prototype:
             if thread is not threading.current_thread():
                 thread.join(timeout=2.0)
         self._threads = []
-        self.drives.quick_stop()
-        self.drives.close()
-        if self.source is not None:
-            self.source.close()
+        for end in (self.drives.quick_stop, self.drives.close, *(() if self.source is None else (self.source.close,))):
+            try:
+                end()
+            except Exception as error:  # adapters raise what they like; the others are closed all the same
+                self.broken = error
+                self.journal.write(self.clock.now(), "exception", f"closing failed: {of_exception(error)}.")
         self.journal.close()
 
     def _enable(self) -> None:
@@ -352,10 +361,14 @@ class Prototype:
             self.readings = readings
             self._past.add(readings.t, readings.dl, self._set)
         now, known = self.clock.now(), len(self.supervisor.faults)
-        camera = None if self.source is None or self._resting else CameraWatch(age=now - self._trusted, frozen=self._alike >= _FROZEN)
+        camera = None if self.source is None or self._resting else self._camera_watch(now)
         self.supervisor.watch(now, None if self._wall is None else self._wall(), readings, camera)
         for fault in self.supervisor.faults[max(known, 1) :]:
             self.journal.write(fault.t, fault.kind, fault.sentence)
+
+    def _camera_watch(self, now: float) -> CameraWatch:
+        flag = "" if self.sighting is None else self.sighting.flag
+        return CameraWatch(age=now - self._trusted, frozen=self._alike >= _FROZEN, flag=flag)
 
     def _on_stop(self, fault: Fault) -> None:
         self._stops += 1
@@ -370,17 +383,17 @@ class Prototype:
             frame = None if self.source is None else self.source.read()
             if frame is None:
                 return
-            dl, commanded = self._wires_at(frame.t)
-            sighting = self.tracker.look(frame, self._expectation.pose(dl, self.payload, self.base_quaternion))
-            self._alike = self._alike + 1 if sighting.flag == "frozen" else 0
+            now, dl = self.clock.now(), self._wires_at(frame.t)[0]
+            sighting = self.tracker.look(frame, self._expectation.pose(dl, self.payload, self.base_quaternion), now=now)
+            self._alike = self._alike + 1 if sighting.flag in (FROZEN, REPEATED) else 0
             if sighting.ok:
-                self._trusted = max(self._trusted, frame.t)
+                self._trusted = max(self._trusted, min(sighting.t, now))
             with self._lock:
                 self._frame, self.sighting = frame, sighting
             recorder = self.recorder
             if recorder is None or not recorder.recording:
                 return
-            row, extra = self._measured(sighting, ""), columns.values(sighting, self.readings)
+            row, extra, commanded = self._measured(sighting, ""), columns.values(sighting, self.readings), self._wires_at(sighting.t)[1]
             try:
                 recorder.add(row, payload=self.payload, commanded_dl=commanded, extra=extra, base_quaternion=self.base_quaternion)
             except InputError:

@@ -82,6 +82,8 @@ class CameraWatch:
     """Of the newest good sighting [s]; inf before the first."""
     frozen: bool
     """The source repeats its frames."""
+    flag: str = ""
+    """Of the newest sighting, where it is not trusted."""
 
 
 def in_hex(code: int) -> str:
@@ -151,8 +153,9 @@ class Inspector:
             yield Fault(
                 kind="camera frozen", sentence=f"the camera repeats its frames; the newest sighting is {_ms(camera.age)} old.", t=now
             )
-        if not camera.age <= limits.sighting_age:
-            sentence = f"the marker was last seen {_ms(camera.age)} ago; the limit is {_ms(limits.sighting_age)}."
+        if not -limits.cycle <= camera.age <= limits.sighting_age:  # a sighting of the future says nothing about now
+            why = f"; the newest picture is flagged {camera.flag!r}" if camera.flag else ""
+            sentence = f"the marker was last seen {_ms(camera.age)} ago; the limit is {_ms(limits.sighting_age)}{why}."
             yield Fault(kind="marker lost", sentence=sentence, t=now)
 
     def drives(self, now: float, readings: Readings) -> Iterator[Fault]:
