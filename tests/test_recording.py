@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -236,7 +240,8 @@ for k in range(10):
 def test_a_disk_that_was_full_leaves_whole_rows(tmp_path: Path) -> None:
     path = tmp_path / "session.csv"
     told = subprocess.run([sys.executable, "-c", FULL, str(path)], capture_output=True, text=True, check=True).stdout
-    assert told.splitlines() == ["session.csv.part cannot be written: File too large."] * 2
+    rows = ("4 of its 5 rows", "4 of its 6 rows")
+    assert told.splitlines() == [f"session.csv.part cannot be written: File too large; {n} are in session.csv.part." for n in rows]
     assert recover(path).t.tolist() == [0.0, 1.0, 2.0, 3.0, 6.0, 7.0, 8.0, 9.0]
 
 
@@ -328,10 +333,123 @@ def test_a_failed_end_keeps_the_part(tmp_path: Path) -> None:
     path = tmp_path / "session.csv"
     recorder = filled(Recorder(ROBOT, path), n=5)
     path.mkdir()  # somebody takes the name meanwhile
-    with pytest.raises(InputError, match=r"its rows are in session.csv.part"):
+    with pytest.raises(InputError, match=r"its 10 rows are in session.csv.part"):
         recorder.stop()
     path.rmdir()
     assert len(recover(path)) == 10
+
+
+def leave(folder: Path) -> None:
+    shutil.rmtree(folder)
+
+
+def rename(folder: Path) -> None:
+    folder.rename(folder.with_name("renamed"))
+
+
+def unlink(folder: Path) -> None:
+    (folder / "session.csv.part").unlink()
+
+
+def replace_part(folder: Path) -> None:
+    unlink(folder)
+    (folder / "session.csv.part").write_text("another's\n")
+
+
+def block(folder: Path) -> None:
+    leave(folder)
+    folder.write_text("a file has its name now")
+
+
+@pytest.mark.parametrize("at_the_end", [False, True], ids=["while rows come", "before the end"])
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        (leave, "logs/session.csv"),
+        (rename, "logs/session.csv"),
+        (unlink, "logs/session.csv"),
+        (replace_part, "logs/session-2.csv"),
+        (block, "temporary/session.csv"),
+    ],
+)
+def test_a_log_that_was_removed_or_renamed_is_written_again_with_every_row(
+    change: Callable[[Path], None], name: str, at_the_end: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, said = tmp_path / "logs", []
+    for made in (folder, tmp_path / "temporary"):
+        made.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    rng = np.random.default_rng(1)
+    recorder = Recorder(ROBOT, folder / "session.csv", on_move=said.append)
+    recorder.start(0.0, "one")
+    for k in range(20):
+        recorder.add(reading(0.1 * k, rng))
+    change(folder)
+    if not at_the_end:
+        recorder.add(reading(2.0, rng))  # the first row after it notices
+        part = tmp_path / f"{name}.part"
+        assert recorder.path == tmp_path / name
+        assert said == [recorder.moved]
+        assert "was removed or renamed while it was recorded; all 21 rows are in" in said[0]
+        assert repr(str(part)) in said[0]
+        assert part.read_text().count("\n") == 23  # with comment and header
+        recorder.add(reading(2.1, rng))
+        assert part.read_text().count("\n") == 24
+        assert len(said) == 1
+    log = recorder.stop()
+    assert len(log) == (20 if at_the_end else 22)
+    assert_same(read_log(tmp_path / name, ROBOT), log)
+    assert len(said) == 1
+    assert not (tmp_path / f"{name}.part").exists()
+    if change is replace_part:
+        assert (folder / "session.csv.part").read_text() == "another's\n"
+
+
+def test_rows_that_no_place_takes_are_said_to_be_nowhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder / "none"))
+    rng = np.random.default_rng(1)
+    recorder = Recorder(ROBOT, folder / "session.csv")
+    recorder.start(0.0)
+    recorder.add(reading(0.0, rng))
+    block(folder)
+    for k in (1, 2):
+        with pytest.raises(InputError, match=rf"was removed or renamed .* cannot be written: .*; its {k + 1} rows are in no file\."):
+            recorder.add(reading(float(k), rng))
+    with pytest.raises(InputError, match=r"its 3 rows are in no file\."):
+        recorder.stop()
+    assert not recorder.recording
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_a_full_disk_keeps_what_it_took_and_nothing_half_written(small_disk: Path, suffix: str) -> None:
+    path = small_disk / f"session{suffix}"
+    rng = np.random.default_rng(2)
+    recorder = Recorder(ROBOT, path)
+    recorder.start(0.0)
+    recorder.add(reading(0.0, rng))
+    fill(small_disk, leave=20_000)
+    with pytest.raises(InputError, match="No space left on device") as refused:  # noqa: PT012 - how many fit is found out
+        for k in range(1, 1000):
+            recorder.add(reading(0.1 * k, rng))
+    n = len(recorder)
+    assert 10 < n < 100
+    sentence = f"; {n - 1} of its {n} rows are in session{suffix}.part"
+    assert f"{sentence}." in str(refused.value)
+    with pytest.raises(InputError, match=f"No space left on device{sentence}, see `recover`"):
+        recorder.stop()
+    assert sorted(file.name for file in small_disk.iterdir()) == ["filler", f"session{suffix}.part"]
+    (small_disk / "filler").unlink()
+    assert len(recover(path)) == n - 1
+
+
+def fill(disk: Path, leave: int) -> None:
+    """Take all room but about so many bytes."""
+    with (disk / "filler").open("wb", buffering=0) as file, suppress(OSError):
+        while True:
+            file.write(bytes(4096))
+    os.truncate(disk / "filler", (disk / "filler").stat().st_size - leave)
 
 
 def test_without_a_path_rows_stay_in_memory(tmp_path: Path) -> None:

@@ -11,11 +11,14 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from fastrod.errors import InputError, UnknownNameError
+from fastrod.robot import Segment
+from fastrod.robotfile import load_robot
 from fastrod.rotation import product, quaternion_from_vector
 from fastrod_device import camera as camera_module
 from fastrod_device.camera import Camera, Frame, Marker, VideoCamera, compose, inverse, load_camera, rotation, save_camera
 from fastrod_device.drawing import Eye, Scene, draw, project
 from fastrod_device.errors import DeviceError
+from fastrod_device.gates import FrameOrder, Workspace
 from fastrod_device.tracker import MarkerTracker
 
 CAMERA = Camera(matrix=((800.0, 0.0, 319.5), (0.0, 800.0, 239.5), (0.0, 0.0, 1.0)), size=(640, 480))
@@ -188,12 +191,133 @@ def test_doubtful_frames_are_flagged_and_forgotten():
     assert none.flag == "no marker"
     assert np.isnan(none.position).all()
     jump = tracker.look(Frame(image=images[3], t=0.04, number=4))  # 30 mm in 40 ms
-    assert jump.flag == "outlier"
+    assert jump.flag == "too fast"
     assert jump.position[0] == pytest.approx(0.03, abs=1e-4)
     assert tracker.look(Frame(image=images[4], t=0.05, number=5)).ok
     assert tracker.look(Frame(image=images[5], t=0.12, number=6)).ok  # 0.5 m/s for 70 ms is 35 mm
     tracker.reset()
     assert tracker.look(Frame(image=images[0], t=0.121, number=7)).ok
+
+
+ROBOT = load_robot("prototype")  # one segment of 70 mm
+SEGMENT = ROBOT.segments[0]
+TELESCOPE = replace(ROBOT, segments=(replace(SEGMENT, extension=(-0.01, 0.03)),))
+CURVED = replace(ROBOT, segments=(replace(SEGMENT, precurvature=(0.0, 40.0, 0.0)),))
+HANGING = Segment(length=0.1, bending_stiffness=(0.002, 0.002), torsional_stiffness=0.001, mode="passive")
+LIMP = replace(ROBOT, segments=(SEGMENT, HANGING))
+
+
+@pytest.mark.parametrize(
+    ("robot", "position", "expected", "flag"),
+    [
+        (ROBOT, (0.0, 0.0, 0.07), None, ""),  # straight
+        (ROBOT, (0.0, 0.0, 0.0734), None, ""),  # 5 % for lens and registration
+        (ROBOT, (0.0, 0.0, 0.0736), None, "outside the workspace"),
+        (ROBOT, (0.074, -0.058, -0.008), (0.074, -0.058, -0.008), "outside the workspace"),  # in the picture's corner
+        (ROBOT, (0.05, 0.0, 0.0), None, "outside the workspace"),  # level with the plate: it would have to turn by pi / 2 and more
+        (ROBOT, (0.0, 0.0, -0.05), None, "outside the workspace"),
+        (ROBOT, (0.03, 0.0, 0.06), (0.03, 0.034, 0.06), ""),
+        (ROBOT, (0.03, 0.0, 0.06), (0.03, -0.036, 0.06), "far from the model"),
+        (ROBOT, (0.0, 0.0, 0.08), (0.0, 0.0, 0.01), "outside the workspace"),  # both: the workspace is asked first
+        (TELESCOPE, (0.0, 0.0, 0.104), None, ""),
+        (TELESCOPE, (0.0, 0.0, 0.106), None, "outside the workspace"),
+        (CURVED, (0.05, 0.0, -0.004), None, ""),
+        (LIMP, (0.0, 0.0, -0.16), None, ""),  # what hangs from a base that stands on its head
+        (LIMP, (0.0, 0.0, -0.18), None, "outside the workspace"),
+    ],
+)
+def test_the_workspace_is_the_robots(robot, position, expected, flag):
+    workspace = Workspace.of(robot, 16.0)
+    assert workspace.refusal(np.array(position), None if expected is None else np.array(expected)) == flag
+
+
+def test_no_curve_that_bends_within_the_limit_is_outside_the_workspace():
+    rng = np.random.default_rng(0)
+    for robot, bent in ((ROBOT, 32.0), (CURVED, 72.0), (LIMP, 200.0)):
+        workspace, n = Workspace.of(robot, 16.0), 200
+        ds, lowest = robot.length / n, math.inf
+        for k in range(40):
+            frame, tip = np.eye(3), np.zeros(3)
+            axis = rng.normal(size=(1 if k % 2 else n, 3)) * (1.0, 1.0, 0.0)  # a circle, or wild
+            turn = np.broadcast_to(bent * axis / np.linalg.norm(axis, axis=1)[:, None], (n, 3))
+            for u in turn:
+                frame = frame @ rotation(quaternion_from_vector(0.5 * ds * u))
+                tip = tip + ds * frame[:, 2]
+                frame = frame @ rotation(quaternion_from_vector(0.5 * ds * u))
+            assert workspace.refusal(tip, tip) == ""
+            lowest = min(lowest, float(tip[2]))
+        if robot is ROBOT:  # and the bound is no wider than a circle of that curvature and the slack
+            assert lowest - workspace.height < 1.01 * 0.05 * robot.length
+
+
+BASE = replace(CAMERA, position=(0.02, 0.0, 0.24), quaternion=(-0.057847298, 0.0, 0.998325443, 0.0))
+
+
+def seen_at(tips, marker=MARKER, scene=SHARP):
+    """Pictures of the tip at these places over the base, or of several tips in one picture."""
+    eye, empty = Eye(BASE, marker, scene=scene), Eye(BASE, marker, scene=scene).draw(np.zeros(3), np.array([1.0, 0, 0, 0]), marker=False)
+    pictures = []
+    for places in tips:
+        picture = empty.copy()
+        for place in np.atleast_2d(places):
+            one = eye.draw(np.asarray(place, dtype=float), np.array([1.0, 0.0, 0.0, 0.0]))
+            picture[one != empty] = one[one != empty]
+        pictures.append(picture)
+    return pictures
+
+
+TRUE, CORNER, NEAR_IT = (0.0, 0.0, 0.068), (0.07, -0.05, -0.008), (0.02, 0.0, 0.06)
+
+
+@pytest.mark.parametrize(
+    ("places", "expected", "flags"),
+    [
+        ([TRUE, CORNER, TRUE, CORNER], TRUE, ["", "outside the workspace", "", "outside the workspace"]),
+        ([TRUE, *[CORNER] * 9, TRUE], None, ["", *["outside the workspace"] * 9, ""]),  # time opens the gate on speed no further
+        ([TRUE, (-0.045, 0.0, 0.045), TRUE], TRUE, ["", "far from the model", ""]),
+        ([TRUE, (-0.045, 0.0, 0.045), (-0.045, 0.0, 0.045)], None, ["", "too fast", ""]),  # 51 mm in 33 ms; in 67 ms it may be
+        ([TRUE, [TRUE, CORNER], [CORNER, CORNER], TRUE], TRUE, ["", "two markers", "outside the workspace", ""]),
+        ([[TRUE, NEAR_IT], [TRUE, NEAR_IT]], TRUE, ["two markers", "two markers"]),
+    ],
+    ids=["corner", "corner for long", "off the model", "fast", "two", "two near"],
+)
+def test_a_marker_of_the_right_number_need_not_be_the_robots(places, expected, flags):
+    tracker = MarkerTracker(BASE, MARKER, workspace=Workspace.of(ROBOT, 16.0))
+    rng = np.random.default_rng(0)
+    shaken = [np.atleast_2d(place) + 1e-4 * rng.normal(size=3) for place in places]
+    pose_there = None if expected is None else (np.array(expected), np.array([1.0, 0.0, 0.0, 0.0]))
+    frames = [Frame(image=image, t=k / 30.0, number=k) for k, image in enumerate(seen_at(shaken))]
+    seen = [tracker.look(frame, pose_there, now=frame.t + 0.03) for frame in frames]
+    assert [s.flag for s in seen] == flags
+    for sighting, place in zip(seen, shaken, strict=True):
+        if sighting.flag != "two markers":
+            assert_allclose(sighting.position, place[0], atol=1e-3)  # the place that was refused is in the log
+    assert all(np.isnan(s.position).all() for s in seen if s.flag == "two markers")
+
+
+@pytest.mark.parametrize(
+    ("frames", "flags"),
+    [
+        # (picture, stamp [s], number); looked at 30 ms after the frame before it is due
+        ([(0, 0.0, 1), (1, 0.1, 2), (0, 0.2, 3), (2, 0.3, 4), (1, 0.4, 5)], ["", "", "repeated", "", "repeated"]),
+        ([(0, 0.0, 1), (1, 0.1, 2), (0, 0.2, 3), (1, 0.3, 4), (0, 0.4, 5)], ["", "", "repeated", "repeated", "repeated"]),
+        ([(0, 0.0, 1), (1, 0.1, 2), (2, 0.05, 3), (3, 0.2, 4), (4, 0.0, 5)], ["", "", "out of order", "", "out of order"]),
+        ([(0, 0.0, 4), (1, 0.1, 5), (2, 0.2, 2), (3, 0.3, 6), (4, 0.4, 3)], ["", "", "out of order", "", "out of order"]),
+        ([(0, 0.0, 1), (1, 1e3, 2), (2, 0.2, 3), (3, math.inf, 4), (4, 0.4, 5)], ["", *["from the future", ""] * 2]),
+        ([(0, 1e3, 1), (1, 0.1, 2), (2, math.nan, 3), (3, 0.3, 4)], ["from the future", "", "from the future", ""]),
+        ([(0, 0.0, 1), (1, 0.1, 2), (1, 0.2, 3), (1, 0.3, 4), (2, 0.4, 5)], ["", "", "frozen", "frozen", ""]),
+        ([(0, 0.0, 1), (1, 0.1, 2), (2, 0.05, 3), (3, 0.06, 4), (4, 0.07, 5), (5, 0.2, 6)], ["", "", *["out of order"] * 3, ""]),
+    ],
+    ids=["new and old", "two in turn", "stamps", "numbers", "future", "future first", "frozen", "back for long"],
+)
+def test_old_and_misdated_frames_are_flagged_and_leave_nothing_behind(frames, flags):
+    pictures = np.random.default_rng(0).integers(0, 255, (6, 4, 4), dtype=np.uint8)
+    order = FrameOrder(10.0)
+    found = [order.check(Frame(image=pictures[i], t=t, number=n), 0.1 * k + 0.03) for k, (i, t, n) in enumerate(frames)]
+    assert [flag for _, flag in found] == flags
+    times = [t for t, _ in found]
+    assert (np.diff(times) > 0.0).all()  # rows of a log stay in order
+    assert all(t == frame[1] for (t, flag), frame in zip(found, frames, strict=True) if flag in ("", "frozen", "repeated"))
 
 
 def test_a_covered_side_is_an_outlier():
