@@ -32,7 +32,10 @@ class Workspace:
     arclength s, so its tip is at least the integral of cos(min(k s, pi)) high above the base plate: behind the plate only where it can
     turn that far. A passive segment bends without limit, and its robot reaches as far down as up.
 
-    `python perf/bench_camera.py` sets the figures (its table "gates"): EXPERIMENT
+    `python perf/bench_camera.py` set the figures (its table "gates"): emulators of the 70 mm prototype behind every kind of sealed effect
+    were driven to random bends at the full rate, with and without 30 g. In 5,397 frames the tip was at most 1.005 lengths from the base
+    (1.05 are allowed), at least 55 mm high (21 mm), and 0.33 lengths from the model's (0.5): that by a camera 150 ms late, 0.08 by
+    anything else.
     """
 
     length: float
@@ -44,10 +47,11 @@ class Workspace:
 
     @classmethod
     def of(cls, robot: Robot, curvature: float) -> Workspace:
-        """Bounds of `robot`, whose tendons may ask for `curvature` [1/m]."""
+        """Bounds of `robot`, whose tendons may ask for `curvature` [1/m] in any segment."""
         length = [robot.length + sum(segment.extension[end] for segment in robot.segments) for end in (0, 1)]
         bent = max(
-            math.inf if segment.mode == "passive" else math.hypot(*segment.precurvature[:2]) + _BENT * curvature for segment in robot.segments
+            math.inf if segment.mode == "passive" else math.hypot(*segment.precurvature[:2]) + _BENT * curvature
+            for segment in robot.segments
         )
         slack = _STRETCH * length[1]
         return cls(length=length[1] + slack, height=min(_height(bent, each) for each in length) - slack, astray=_ASTRAY * length[1])

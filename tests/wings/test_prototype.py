@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 import itertools
+import shutil
 import struct
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any
@@ -16,10 +18,13 @@ import pytest
 
 from fastrod.errors import InputError
 from fastrod.link import RobotLink
+from fastrod.recording import recover
 from fastrod.runlog import read_log
 from fastrod.types import Floats
+from fastrod_device.camera import Frame, Picture
 from fastrod_device.clock import Clock, SteppedClock, WallClock
-from fastrod_device.columns import EXTRA
+from fastrod_device.columns import EXTRA, FLAGS
+from fastrod_device.drawing import Eye, Scene
 from fastrod_device.emulator import Emulator
 from fastrod_device.errors import DeviceError, RefusedError
 from fastrod_device.hardware import load_hardware
@@ -41,9 +46,26 @@ BENT = np.array([-0.002, 0.001, 0.002, -0.001])
 _names = itertools.count()
 
 
+class Changed:
+    """The emulator's camera, with something done to each of its frames."""
+
+    def __init__(self, emulator: Emulator, change: Callable[[Frame], Frame]) -> None:
+        self.emulator, self.change = emulator, change
+
+    def read(self) -> Frame | None:
+        frame = self.emulator.read()
+        return None if frame is None else self.change(frame)
+
+    def close(self) -> None:
+        pass
+
+
 @contextmanager
-def bench(clock: Clock | None = None, *, camera: bool = True, hardware: Any = HARDWARE) -> Iterator[tuple[Prototype, Emulator]]:
-    """Started, with wires that have their pretension at power-on."""
+def bench(
+    clock: Clock | None = None, *, camera: bool = True, hardware: Any = HARDWARE, change: Callable[[Frame], Frame] | None = None,
+    journal: Journal | None = None,
+) -> Iterator[tuple[Prototype, Emulator]]:  # fmt: skip
+    """Started, with wires that have their pretension at power-on; `change` is made to each frame of the camera."""
     clock, bus = SteppedClock() if clock is None else clock, f"virtual:prototype-{next(_names)}"
     with pytest.MonkeyPatch.context() as patch:
         if not clock.stepped:  # drives that bear a busy machine, too
@@ -51,7 +73,8 @@ def bench(clock: Clock | None = None, *, camera: bool = True, hardware: Any = HA
             patch.setattr("fastrod_device.cycle._PAUSE", 7.0)
         emulator = Emulator(hardware, bus, clock=clock, seal=seal(5, "none"), seed=5, taut=True)
         try:
-            with Prototype(hardware, bus, emulator if camera else None, clock=clock) as prototype:
+            source = None if not camera else emulator if change is None else Changed(emulator, change)
+            with Prototype(hardware, bus, source, clock=clock, journal=journal) as prototype:
                 try:
                     prototype.start(home=False)
                     yield prototype, emulator
@@ -292,6 +315,237 @@ def test_a_journal_writes_its_lines_at_once(tmp_path: Any) -> None:
     journal.close()
     with pytest.raises(InputError, match="cannot be written"):
         Journal(tmp_path / "nowhere" / "events.csv")
+
+
+# what its camera may do to it
+
+
+class Attack:
+    """Does nothing to frames until it is `on`; then keeps them, and changes each."""
+
+    def __init__(self) -> None:
+        self.eye = Eye(HARDWARE.camera, HARDWARE.marker, seed=1, scene=Scene(blur=1.0, noise=5.0))
+        self.on, self.n, self.bad, self.frames = False, 0, 0, list[Frame]()
+
+    def __call__(self, frame: Frame) -> Frame:
+        self.frames.append(frame)
+        self.n += self.on
+        made = self.changed(frame) if self.on else frame
+        self.bad += made is not frame
+        return made
+
+    def changed(self, frame: Frame) -> Frame:
+        return frame
+
+    def old(self) -> Frame:
+        """From when the robot stood elsewhere."""
+        return self.frames[self.n // 2]
+
+    def corner(self) -> Picture:
+        return self.eye.draw(np.array([0.07, -0.05, -0.008]), np.array([1.0, 0.0, 0.0, 0.0]))
+
+
+class Corner(Attack):
+    """The marker is covered; one of its number lies in the picture's corner, 114 mm off."""
+
+    def changed(self, frame: Frame) -> Frame:
+        return replace(frame, image=self.corner())
+
+
+class Two(Attack):
+    """Both are seen."""
+
+    def changed(self, frame: Frame) -> Frame:
+        other = self.corner()
+        return replace(frame, image=np.where(np.arange(other.shape[1]) < 180, other, frame.image))
+
+
+class Alternating(Attack):
+    """Every second frame is an old picture, stamped anew."""
+
+    def changed(self, frame: Frame) -> Frame:
+        return replace(frame, image=self.old().image) if self.n % 2 else frame
+
+
+class Back(Attack):
+    """Every second frame is an old one."""
+
+    def changed(self, frame: Frame) -> Frame:
+        return replace(self.old(), number=frame.number) if self.n % 2 else frame
+
+
+class Future(Attack):
+    """One frame is stamped in the future."""
+
+    def changed(self, frame: Frame) -> Frame:
+        return replace(frame, t=frame.t + 1e3) if self.n == 1 else frame
+
+
+@pytest.mark.parametrize("recorded", [True, False])
+@pytest.mark.parametrize(
+    ("attack", "flag", "goes_on"),
+    [
+        (Corner, "outside the workspace", False),
+        (Two, "two markers", False),
+        (Alternating, "repeated", True),
+        (Back, "out of order", True),
+        (Future, "from the future", True),
+    ],
+)
+def test_a_camera_that_cannot_be_believed_is_flagged_and_marker_lost_stays_armed(
+    attack: type[Attack], flag: str, goes_on: bool, recorded: bool, tmp_path: Any
+) -> None:
+    made = attack()
+    with bench(change=made) as (prototype, emulator):
+        recorder = prototype.recorder_for(tmp_path / "log.csv")
+        if recorded:
+            recorder.start(prototype.elapsed)
+            prototype.record(recorder)
+        prototype.command(BENT)
+        prototype.wait(1.0)
+        prototype.command(-BENT)
+        prototype.wait(0.5)
+        made.on = True
+        with suppress(DeviceError):
+            prototype.wait(2.0)
+        assert (prototype.supervisor.state is not State.STOPPED) == goes_on, prototype.supervisor.status
+        emulator.hidden = True
+        hidden = prototype.clock.now()
+        with pytest.raises(DeviceError):
+            prototype.wait(1.0)
+        fault = prototype.supervisor.first
+        assert fault is not None
+        assert (fault.kind, fault.t - hidden < HARDWARE.limits.sighting_age + 0.02) == ("marker lost", True)
+        assert goes_on or f"the newest picture is flagged {flag!r}" in fault.sentence
+        if not recorded:
+            return
+        rows = len(recorder)
+        log = recorder.stop()
+        flags = np.array([FLAGS[int(value)] for value in log.extra["marker_flag"]])
+        assert rows == len(log) == len(made.frames) - 1  # a row for each frame, but for one from before the start
+        assert set(flags) <= {"", flag, "no marker", "ambiguous"}
+        assert (flags == flag).sum() == made.bad >= (1 if attack is Future else 7)
+        assert np.isnan(log.tip_position[flags != ""]).all()
+        seen = np.stack([log.extra[f"seen_{axis}"] for axis in "xyz"], axis=1)
+        if flag == "outside the workspace":  # what was refused is in the log
+            assert np.linalg.norm(seen[flags == flag] - (0.07, -0.05, -0.008), axis=1).max() < 3e-3
+        assert np.linalg.norm(log.tip_position[flags == ""], axis=1).max() < 0.0705
+
+
+@pytest.mark.parametrize("raising", ["quick_stop", "close", "camera"])
+def test_an_adapter_that_raises_as_it_is_closed_keeps_nothing_open(raising: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise ValueError("the handle\nis invalid")
+
+    closed = []
+    with bench(change=lambda frame: frame) as (prototype, _):
+        assert prototype.source is not None
+        monkeypatch.setattr(prototype.source, "close", broken if raising == "camera" else lambda: closed.append("camera"))
+        if raising != "camera":
+            ends = getattr(prototype.drives, raising)
+            monkeypatch.setattr(prototype.drives, raising, broken)
+        prototype.close()
+        assert prototype.journal.lines[-1][1:] == ("exception", "closing failed: ValueError: the handle is invalid.")
+        assert isinstance(prototype.broken, ValueError)
+        assert closed == ([] if raising == "camera" else ["camera"])
+        if raising != "camera":
+            ends()
+
+
+# what happens to its logs
+
+
+@pytest.mark.parametrize("renamed", [False, True])
+def test_logs_whose_folder_goes_away_go_on_in_a_new_one(renamed: bool, tmp_path: Any) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    with bench(journal=Journal(folder / "events.csv")) as (prototype, _):
+        prototype.journal.write(0.0, "release", "a person released the robot.")
+        recorder = prototype.recorder_for(folder / "log.csv")
+        recorder.start(prototype.elapsed)
+        prototype.record(recorder)
+        prototype.wait(0.5)
+        if renamed:
+            folder.rename(tmp_path / "elsewhere")
+        else:
+            shutil.rmtree(folder)
+        gone, rows = prototype.clock.now(), len(recorder)
+        prototype.wait(0.5)
+        assert prototype.supervisor.state is State.READY
+        (t, kind, sentence) = prototype.journal.lines[-1]
+        assert kind == "recording"
+        assert t - gone < 0.1  # with the next frame
+        assert f"all {rows + 1} rows are in {str(folder / 'log.csv.part')!r} now" in sentence
+        with (folder / "events.csv").open(newline="") as file:
+            assert [line[1] for line in csv.reader(file)] == ["release", "recording"]
+        prototype.record(None)
+        rows = len(recorder)
+        log = recorder.stop()
+        assert rows == len(log) == len(read_log(folder / "log.csv", prototype.robot))
+
+
+def test_a_full_disk_stops_the_robot_and_both_logs_say_so(small_disk: Any) -> None:
+    log, events = small_disk / "log.csv", small_disk / "events.csv"
+    with bench(journal=Journal(events)) as (prototype, _):
+        recorder = prototype.recorder_for(log)
+        recorder.start(prototype.elapsed)
+        prototype.record(recorder)
+        prototype.wait(0.5)
+        with (small_disk / "filler").open("wb", buffering=0) as filler, suppress(OSError):
+            while True:
+                filler.write(bytes(512))
+        with pytest.raises(InputError, match="No space left on device"):
+            prototype.wait(5.0)
+        assert prototype.supervisor.state is State.STOPPED
+        n = len(recorder)
+        words = f"log.csv.part cannot be written: No space left on device; {n - 1} of its {n} rows are in log.csv.part."
+        with events.open(newline="") as file:
+            assert [line[1:] for line in csv.reader(file)] == [["exception", f"the program failed: {words}"]]
+        prototype.record(None)
+        with pytest.raises(InputError, match="No space left on device"):
+            recorder.stop()
+    (small_disk / "filler").unlink()
+    assert len(recover(log)) == n - 1
+
+
+@pytest.mark.parametrize("unseen", [True, False], ids=["behind the file's end", "spare file"])
+def test_a_journals_room_is_reserved_unseen_and_given_back(unseen: bool, small_disk: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not unseen:
+        monkeypatch.setattr("fastrod_device.journal._reserved", lambda *_: False)
+    path = small_disk / "events.csv"
+    journal = Journal(path)
+    assert path.read_bytes() == b""
+    with (small_disk / "filler").open("wb", buffering=0) as filler:
+        with suppress(OSError):
+            while True:
+                filler.write(bytes(512))
+        for k in range(100):
+            journal.write(float(k), "exception", f"line {k} of a disk that is full.")
+            with suppress(OSError):  # another program wants the room too
+                filler.write(bytes(64))
+    text = "".join(f"{k}.0000,exception,line {k} of a disk that is full.\n" for k in range(100))
+    assert path.read_text() == text
+    journal.close()
+    assert path.read_text() == text
+    assert sorted(file.name for file in small_disk.iterdir()) == ["events.csv", "filler"]
+    assert path.stat().st_blocks * 512 - len(text) < 4096
+    with (small_disk / "filler").open("ab", buffering=0) as filler, suppress(OSError):
+        while True:
+            filler.write(bytes(512))
+    with pytest.raises(InputError, match="No space left on device"):  # no session begins on a disk that is full
+        Journal(small_disk / "more.csv")
+    assert sorted(file.name for file in small_disk.iterdir()) == ["events.csv", "filler"]
+
+
+def test_a_journal_that_an_editor_has_replaced_is_added_to(tmp_path: Any) -> None:
+    path = tmp_path / "events.csv"
+    journal = Journal(path)
+    journal.write(1.0, "tension", "a.")
+    (tmp_path / "saved").write_text("1.0000,tension,a.  # my note\n")
+    (tmp_path / "saved").replace(path)
+    journal.write(2.0, "release", "b.")
+    journal.close()
+    assert path.read_text() == "1.0000,tension,a.  # my note\n2.0000,release,b.\n"
 
 
 # starting and ending
