@@ -1,4 +1,4 @@
-"""Files that grow line by line while a session runs: whole lines, and whether the file is still where it was opened."""
+"""Files that grow line by line while a session runs: by whole lines, at the place where they were opened."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 def append_lines(file: FileIO, lines: str) -> None:
-    """Write the lines at once; where they do not fit, no part of them stays, as the next would go on from there. Raises `OSError`."""
+    """Write the lines at once. Raises `OSError`: no part stays then, as the next would go on from there."""
     data, end = lines.encode(), file.tell()
     try:
         while data:
@@ -23,8 +23,11 @@ def append_lines(file: FileIO, lines: str) -> None:
 
 
 def is_at(file: FileIO, path: Path) -> bool:
-    """Whether `path` still names the open file. What was removed takes lines all the same, and they are nowhere; what was renamed, or
-    whose folder was, takes them where nobody looks."""
+    """Whether `path` still names the open file.
+
+    What was removed takes lines all the same, and they are nowhere; what was renamed, or whose folder was,
+    takes them where nobody looks.
+    """
     try:
         return os.path.samestat(os.fstat(file.fileno()), path.stat())
     except OSError:

@@ -40,17 +40,24 @@ class Recorder:
 
     Each row goes to PATH.part at once, in one write to the operating system: a process that is killed loses none. Rows are not forced
     onto the disk itself (fsync), so a machine that loses power may lose the last seconds. `stop` writes the finished log to PATH and
-    takes the part away; what a killed session leaves, `recover` turns into a log. Where PATH.part is removed or renamed, or its folder
-    is, the next row notices: all rows are written again at PATH, or, where that cannot be, in the system's temporary folder. Rows without a measured tip are kept. Commands
+    takes the part away; what a killed session leaves, `recover` turns into a log. Where PATH.part is removed
+    or renamed, or its folder is, the next row notices: all rows are written again at PATH, or, where that
+    cannot be, in the system's temporary folder. Rows without a measured tip are kept. Commands
     (cmd_dl_1 ...), tensions (tension_1 ...) and `extra` are kept as further columns. May be used from several threads.
     """
 
     def __init__(
-        self, robot: Robot, path: str | Path | None = None, *, overwrite: bool = False, extra: Sequence[str] = (),
+        self,
+        robot: Robot,
+        path: str | Path | None = None,
+        *,
+        overwrite: bool = False,
+        extra: Sequence[str] = (),
         on_move: Callable[[str], None] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Record `robot` to the .csv or .parquet at `path`, or, where it is None, in memory alone; `extra` names further columns of
-        numbers. `on_move` is called with a sentence where rows had to be written again: where they are, and how many.
+        numbers. `on_move` is called where rows had to be written again, with a sentence: where they are, how
+        many.
 
         Raises `InputError` where the path cannot be one, or, but for `overwrite`, where a file or a left-over part is there; where a
         name of `extra` is taken, given twice, or none.
@@ -61,7 +68,7 @@ class Recorder:
         self.path = None if path is None else _checked(Path(path), overwrite)
         """Where the log will be; another than was given where that could not be kept."""
         self.moved = ""
-        """Why rows were written again, and where they are, one sentence; empty where all are where they were."""
+        """Why rows were written again, and where they are, one sentence; empty where that was not needed."""
         self._on_move = on_move
         n = range(1, robot.n_tendons + 1)
         extends = any(segment.extension != (0.0, 0.0) for segment in robot.segments)
@@ -165,14 +172,16 @@ class Recorder:
                     self._on_disk += 1
                 except OSError as error:
                     if is_at(self._file, _part(self.path)):
-                        raise InputError(f"{self.path.name}.part cannot be written: {error.strerror or error}; {self._kept()}.") from error
+                        why = f"{self.path.name}.part cannot be written: {error.strerror or error}"
+                        raise InputError(f"{why}; {self._kept()}.") from error
                 self._stay()
             return True
 
     def stop(self) -> RunLog:
         """End the recording: the log, written to the path where there is one.
 
-        Raises `InputError` where nothing is recorded, or where the log cannot be written; it says how many rows are in PATH.part then.
+        Raises `InputError` where nothing is recorded, or where the log cannot be written; it says how many
+        rows are in PATH.part then.
         """
         with self._lock:
             if not self._recording:
@@ -210,20 +219,22 @@ class Recorder:
         return _line([_text(self._rows[k][0]), self._labels[k], *map(_text, self._rows[k][1:])])
 
     def _stay(self) -> None:
-        """Write all rows again where the file is no longer at its path. Raises `InputError` where no place takes them."""
+        """Write all rows again if the file is no longer at its path. Raises `InputError`."""
         if not self._rows or self._file is None or self.path is None or is_at(self._file, _part(self.path)):
             return
         lost, why = f"{self.path.name}.part was removed or renamed while it was recorded", ""
         for path in (self.path, Path(tempfile.gettempdir()) / self.path.name):
             try:
                 target = free_path(path) if _part(path).exists() or path is not self.path else path
-                file = made_again(_part(target), self._head() + "".join(map(self._row, range(len(self._rows)))))
+                rows = "".join(map(self._row, range(len(self._rows))))
+                file = made_again(_part(target), self._head() + rows)
             except OSError as error:
                 why = why or f"{str(path)!r} cannot be written: {error.strerror or error}"
                 continue
             self._file.close()
             self._file, self.path, self._on_disk = file, target, len(self._rows)
-            self.moved = f"{lost}; all {len(self._rows)} rows are in {str(_part(target))!r} now, and more go there."
+            where = f"all {len(self._rows)} rows are in {str(_part(target))!r} now"
+            self.moved = f"{lost}; {where}, and more go there."
             if self._on_move is not None:
                 self._on_move(self.moved)
             return
@@ -234,8 +245,8 @@ class Recorder:
         """Where the rows are, without a full stop."""
         if self.path is None or self._file is None or not is_at(self._file, _part(self.path)):
             return f"its {len(self._rows)} rows are in no file"
-        which = f"its {len(self._rows)}" if self._on_disk == len(self._rows) else f"{self._on_disk} of its {len(self._rows)}"
-        return f"{which} rows are in {_part(self.path).name}"
+        some = "" if self._on_disk == len(self._rows) else f"{self._on_disk} of "
+        return f"{some}its {len(self._rows)} rows are in {_part(self.path).name}"
 
     def _close(self) -> None:
         if self._file is not None:
@@ -320,9 +331,9 @@ def _rewritten(part: Path, lines: Sequence[str]) -> Path:
 
 
 def _finish(log: RunLog, path: Path, comment: str, kept: str) -> None:
-    """Write `log` to `path` and take the part away. `write_log` would begin by emptying PATH.part, which still holds the only copy.
+    """Write `log` to `path` and take the part away; `kept` says where the rows are if that fails.
 
-    `kept` says where the rows are if that fails.
+    `write_log` would begin by emptying PATH.part, which still holds the only copy.
     """
     beside = path.with_name(f"{path.stem}.whole{path.suffix}")
     try:
@@ -331,7 +342,8 @@ def _finish(log: RunLog, path: Path, comment: str, kept: str) -> None:
         _part(path).unlink(missing_ok=True)
     except OSError as error:
         beside.unlink(missing_ok=True)
-        raise InputError(f"{str(path)!r} cannot be written: {error.strerror or error}; {kept}, see `recover`.") from error
+        why = f"{str(path)!r} cannot be written: {error.strerror or error}"
+        raise InputError(f"{why}; {kept}, see `recover`.") from error
 
 
 def _log(names: Sequence[str], labels: Sequence[str], rows: Floats, name: str) -> RunLog:

@@ -28,7 +28,8 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         pytest.skip("a disk that runs full is mounted for this test, which takes Linux and root")
     disk = tmp_path / "disk"
     disk.mkdir()
-    made = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", disk], capture_output=True, text=True)
+    command = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", disk]
+    made = subprocess.run(command, capture_output=True, text=True)
     if made.returncode:
         pytest.skip(f"a disk that runs full cannot be mounted here: {made.stderr.strip()}")
     try:

@@ -6,7 +6,8 @@ from fastrod_device.gates import AHEAD, ASTRAY, BACK, FROZEN, OUTSIDE, REPEATED,
 from fastrod_device.readings import Readings
 from fastrod_device.tracker import Sighting
 
-FLAGS = ("", "no marker", "outlier", "ambiguous", FROZEN, OUTSIDE, ASTRAY, TOO_FAST, TWICE, REPEATED, BACK, AHEAD)
+_REFUSED = (FROZEN, OUTSIDE, ASTRAY, TOO_FAST, TWICE, REPEATED, BACK, AHEAD)
+FLAGS = ("", "no marker", "outlier", "ambiguous", *_REFUSED)
 """What may be wrong with a sighting; a log has the place in this list, so new ones go to its end."""
 EXTRA = ("marker_error", "marker_size", "marker_flag", "seen_x", "seen_y", "seen_z")
 """Further columns of a recording: reprojection error [px], size of the marker in the picture [px], place of the sighting's flag in `FLAGS`

@@ -1,4 +1,4 @@
-"""`Workspace`: where the tip of a robot can be, whatever a picture says; `FrameOrder`: which frames are new, and which stamps are times."""
+"""`Workspace`: where the tip of a robot can be, by length and model; `FrameOrder`: which frames are new."""
 
 from __future__ import annotations
 
@@ -26,16 +26,17 @@ _KEPT = 20_000  # pictures that are known again: twenty minutes at 15 Hz
 @final
 @dataclass(frozen=True, kw_only=True)
 class Workspace:
-    """Bounds of a tip's position in the base frame that hold for every shape of the robot, and for where its model has the tip.
+    """Bounds of a tip's position in the base frame, for every shape of the robot, and by its model.
 
-    No shape is farther from the base than the backbone is long. A backbone whose curvature is at most k has turned by at most k s at
-    arclength s, so its tip is at least the integral of cos(min(k s, pi)) high above the base plate: behind the plate only where it can
-    turn that far. A passive segment bends without limit, and its robot reaches as far down as up.
+    No shape is farther from the base than the backbone is long. A backbone whose curvature is at most k has
+    turned by at most k s at arclength s, so its tip is at least the integral of cos(min(k s, pi)) high above
+    the base plate: behind the plate only where it can turn that far. A passive segment bends without limit,
+    and its robot comes as far down as up.
 
-    `python perf/bench_camera.py` set the figures (its table "gates"): emulators of the 70 mm prototype behind every kind of sealed effect
-    were driven to random bends at the full rate, with and without 30 g. In 5,397 frames the tip was at most 1.005 lengths from the base
-    (1.05 are allowed), at least 55 mm high (21 mm), and 0.33 lengths from the model's (0.5): that by a camera 150 ms late, 0.08 by
-    anything else.
+    `python perf/bench_camera.py` set the figures (its table "gates"): emulators of the 70 mm prototype behind
+    every kind of sealed effect were driven to random bends at the full rate, with and without 30 g. In 5,397
+    frames the tip was at most 1.005 lengths from the base (1.05 are allowed), at least 55 mm high (21 mm),
+    and at most 0.33 lengths from the model's (0.5): that by a camera 150 ms late, 0.08 by anything else.
     """
 
     length: float
@@ -49,15 +50,16 @@ class Workspace:
     def of(cls, robot: Robot, curvature: float) -> Workspace:
         """Bounds of `robot`, whose tendons may ask for `curvature` [1/m] in any segment."""
         length = [robot.length + sum(segment.extension[end] for segment in robot.segments) for end in (0, 1)]
-        bent = max(
-            math.inf if segment.mode == "passive" else math.hypot(*segment.precurvature[:2]) + _BENT * curvature
-            for segment in robot.segments
-        )
+        bent = 0.0
+        for segment in robot.segments:
+            own = math.inf if segment.mode == "passive" else math.hypot(*segment.precurvature[:2])
+            bent = max(bent, own + _BENT * curvature)
         slack = _STRETCH * length[1]
-        return cls(length=length[1] + slack, height=min(_height(bent, each) for each in length) - slack, astray=_ASTRAY * length[1])
+        height = min(_height(bent, each) for each in length) - slack
+        return cls(length=length[1] + slack, height=height, astray=_ASTRAY * length[1])
 
     def refusal(self, position: Floats, expected: Floats | None) -> str:
-        """Flag of a tip (3,) that cannot be there [m], with the model's tip (3,), or None where no model has it; "" where it can."""
+        """Flag of a tip (3,) that cannot be there [m]; "" where it can. `expected`: the model's, or None."""
         if not (float(np.linalg.norm(position)) <= self.length and position[2] >= self.height):
             return OUTSIDE
         if expected is not None and not float(np.linalg.norm(position - expected)) <= self.astray:
@@ -66,7 +68,7 @@ class Workspace:
 
 
 def _height(curvature: float, length: float) -> float:
-    """Least height of the end of a curve that leaves the plate upright [m]: an arc, then straight down once it has turned by pi."""
+    """Least height of the end of a curve that leaves the plate upright [m]: an arc, then straight down."""
     if curvature * length <= 0.0:
         return length
     arc = min(length, math.pi / curvature)
@@ -77,9 +79,10 @@ def _height(curvature: float, length: float) -> float:
 class FrameOrder:
     """Separates new frames from repeated, late and misdated ones.
 
-    A camera draws no picture twice, so one that was there before is repeated, however it is stamped. A stamp must not run back, nor lie
-    in the future. A frame whose stamp is not believed gets a time between the frame before and the one that is due, so that rows of a
-    log stay in order and no later frame is refused by it.
+    A camera draws no picture twice, so one that was there before is repeated, however it is stamped. A stamp
+    must not run back, nor lie in the future. A frame whose stamp is not believed gets a time between the
+    frame before and the one that is due, so that rows of a log stay in order and no later frame is refused by
+    it.
     """
 
     def __init__(self, rate: float) -> None:
@@ -95,7 +98,7 @@ class FrameOrder:
         self._last = self._given = -math.inf
 
     def check(self, frame: Frame, now: float | None) -> tuple[float, str]:
-        """Time of the frame [s] and its flag, "" where it is new. `now`: the clock [s], None where nobody asks for the future."""
+        """Time of the frame [s] and its flag, "" where it is new. `now`: the clock [s], or None."""
         picture = hash(frame.image.tobytes())
         t, stamp = self._time(frame, now)
         frozen = self._number is not None and (frame.number == self._number or picture == self._picture)

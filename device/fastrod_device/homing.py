@@ -190,9 +190,8 @@ def _straightened(
         if len(seen) < _LEAST:
             del flags[""]
             why = "".join(f"; {n} pictures are flagged {flag!r}" for flag, n in flags.most_common(1))
-            raise DeviceError(
-                f"the camera saw the marker {len(seen)} times in {_LOOKING:g} s of homing; it must see it {_LEAST} times{why}."
-            )
+            times = f"{len(seen)} times in {_LOOKING:g} s of homing"
+            raise DeviceError(f"the camera saw the marker {times}; it must see it {_LEAST} times{why}.")
         tip = np.mean(seen, axis=0)
         way = -lean(hardware.robot, tip)
         far = float(np.abs(way).max())

@@ -27,9 +27,10 @@ class Journal:
     """Stops and what led to them as a CSV of t [s], kind and sentence; a line is the system's before `write` returns, so a killed process
     loses none. Its lines are in `lines` too.
 
-    Room on the disk is reserved at the start, so the line that says that the disk is full has its place: behind the file's end where
-    the system can (Linux), else by a spare file PATH.spare, which gives up a block for each line that does not fit. A journal that was
-    removed or renamed is written again, with all lines of this session.
+    Room on the disk is reserved at the start, so the line that says that the disk is full has its place:
+    behind the file's end where the system can (Linux), else by a spare file PATH.spare, which gives up a
+    block for each line that does not fit. A journal that was removed or renamed is written again, with all
+    lines of this session.
     """
 
     def __init__(self, path: str | Path | None) -> None:
@@ -120,7 +121,10 @@ def _line(t: float, kind: str, sentence: str) -> str:
 
 
 def _reserved(file: FileIO, room: int) -> bool:
-    """Whether the file's next `room` bytes have their place on the disk now; its size stays. A file system may not know how."""
+    """Whether the file's next `room` bytes have their place on the disk now; its size stays.
+
+    Not every system, nor every file system, can do that.
+    """
     if not sys.platform.startswith("linux"):
         return False
     fallocate = getattr(ctypes.CDLL(None), "fallocate64", None)

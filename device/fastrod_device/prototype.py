@@ -285,12 +285,19 @@ class Prototype:
             self.recorder = recorder
 
     def recorder_for(self, path: str | Path, *, overwrite: bool = False) -> Recorder:
-        """A recorder with the columns of a prototype: currents and how well the marker was seen; the journal has where its rows moved."""
-        moved = lambda sentence: self.journal.write(self.clock.now(), "recording", sentence)  # noqa: E731
-        return Recorder(self.robot, path, overwrite=overwrite, extra=columns.names(self.robot.n_tendons), on_move=moved)
+        """A recorder with the columns of a prototype: currents and how well the marker was seen.
+
+        Where its rows have to move, the journal has a line of kind "recording".
+        """
+        extra = columns.names(self.robot.n_tendons)
+
+        def moved(sentence: str) -> None:
+            self.journal.write(self.clock.now(), "recording", sentence)
+
+        return Recorder(self.robot, path, overwrite=overwrite, extra=extra, on_move=moved)
 
     def close(self) -> None:
-        """Stop, disable, let go of bus and camera. A recording goes on existing: it is whoever began it that ends it.
+        """Stop, disable, let go of bus and camera. A recording goes on existing: whoever began it ends it.
 
         Never raises: what an adapter raises is in the journal, and in `broken`.
         """
@@ -301,7 +308,8 @@ class Prototype:
             if thread is not threading.current_thread():
                 thread.join(timeout=2.0)
         self._threads = []
-        for end in (self.drives.quick_stop, self.drives.close, *(() if self.source is None else (self.source.close,))):
+        camera = [] if self.source is None else [self.source.close]
+        for end in (self.drives.quick_stop, self.drives.close, *camera):
             try:
                 end()
             except Exception as error:  # adapters raise what they like; the others are closed all the same
@@ -384,7 +392,8 @@ class Prototype:
             if frame is None:
                 return
             now, dl = self.clock.now(), self._wires_at(frame.t)[0]
-            sighting = self.tracker.look(frame, self._expectation.pose(dl, self.payload, self.base_quaternion), now=now)
+            expected = self._expectation.pose(dl, self.payload, self.base_quaternion)
+            sighting = self.tracker.look(frame, expected, now=now)
             self._alike = self._alike + 1 if sighting.flag in (FROZEN, REPEATED) else 0
             if sighting.ok:
                 self._trusted = max(self._trusted, min(sighting.t, now))
@@ -393,7 +402,8 @@ class Prototype:
             recorder = self.recorder
             if recorder is None or not recorder.recording:
                 return
-            row, extra, commanded = self._measured(sighting, ""), columns.values(sighting, self.readings), self._wires_at(sighting.t)[1]
+            row, extra = self._measured(sighting, ""), columns.values(sighting, self.readings)
+            commanded = self._wires_at(sighting.t)[1]
             try:
                 recorder.add(row, payload=self.payload, commanded_dl=commanded, extra=extra, base_quaternion=self.base_quaternion)
             except InputError:

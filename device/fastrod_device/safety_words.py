@@ -153,9 +153,10 @@ class Inspector:
             yield Fault(
                 kind="camera frozen", sentence=f"the camera repeats its frames; the newest sighting is {_ms(camera.age)} old.", t=now
             )
-        if not -limits.cycle <= camera.age <= limits.sighting_age:  # a sighting of the future says nothing about now
+        if not -limits.cycle <= camera.age <= limits.sighting_age:  # one of the future says nothing about now
+            limit = f"the limit is {_ms(limits.sighting_age)}"
             why = f"; the newest picture is flagged {camera.flag!r}" if camera.flag else ""
-            sentence = f"the marker was last seen {_ms(camera.age)} ago; the limit is {_ms(limits.sighting_age)}{why}."
+            sentence = f"the marker was last seen {_ms(camera.age)} ago; {limit}{why}."
             yield Fault(kind="marker lost", sentence=sentence, t=now)
 
     def drives(self, now: float, readings: Readings) -> Iterator[Fault]:

@@ -4,12 +4,13 @@ Which of both: each solution costs (misfit of the sides / `sigma`)^2, the square
 plus (angle to the last accepted sighting / its sigma)^2, plus (angle to the expected pose / its sigma)^2 where one is given. The angle
 terms end at `_CAP`, so that no belief outweighs a picture that says otherwise for long. The cheaper one is taken. A sighting is
 "ambiguous" where the costs differ by less than `_TELL`, the solutions by more than `_ALIKE`: then nothing tells them apart. It is an
-"outlier" where its corners do not fit a square, or where a side could not be fitted: covered, cut off, or too small, and then off by
-millimetres.
+"outlier" where its corners do not fit a square, or where a side could not be fitted: covered, cut off, or too
+small, and then off by millimetres.
 
-A marker of the right number need not be the robot's. Its tip is refused where the robot's cannot be ("outside the workspace"), where it
-is "far from the model", and where it cannot have come since the last accepted one ("too fast"), in this order; of "two markers" in one
-picture neither is believed. What is refused leaves nothing behind: the next frame is looked at as if it had not been there.
+A marker of the right number need not be the robot's. Its tip is refused where the robot's cannot be ("outside
+the workspace"), where it is "far from the model", and where it cannot have come since the last accepted one
+("too fast"), in this order; of "two markers" in one picture neither is believed. What is refused leaves
+nothing behind: the next frame is looked at as if it had not been there.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class Sighting:
     """What one frame says about the tip; nan where it says nothing."""
 
     t: float
-    """The frame's [s]; where its stamp is not believed, a time between the frame before and the one that is due."""
+    """The frame's [s]; where its stamp is not believed, a time between those of its neighbours."""
     number: int
     """The frame's."""
     flag: str
@@ -76,10 +77,18 @@ class MarkerTracker:
     """Follows one marker through the frames of one camera. Nothing is smoothed: a doubtful sighting is flagged, and forgotten."""
 
     def __init__(
-        self, camera: Camera, marker: Marker, *, workspace: Workspace | None = None, gate: float = 1.0, slack: float = 0.004,
-        limit: float = 1.0, sigma: float = 0.05,
-    ) -> None:  # fmt: skip
-        """`workspace`: where the tip can be, None: anywhere; `gate`: fastest that the tip can move [m/s]; `slack`: what it may jump besides [m]; `limit`: largest `error` of a sighting [px];
+        self,
+        camera: Camera,
+        marker: Marker,
+        *,
+        workspace: Workspace | None = None,
+        gate: float = 1.0,
+        slack: float = 0.004,
+        limit: float = 1.0,
+        sigma: float = 0.05,
+    ) -> None:
+        """`workspace`: where the tip can be, None: anywhere; `gate`: fastest that it can move [m/s]; `slack`:
+        what it may jump besides [m]; `limit`: largest `error` of a sighting [px];
 
         `sigma`: how far a side that was seen is off [px]: noise, and what the lens model leaves. Raises `InputError`.
         """
@@ -88,7 +97,8 @@ class MarkerTracker:
                 raise InputError(f"{name} is {value!r}; it must be positive.")
         self.camera, self.marker = camera, marker
         self._matrix, self._base_from_camera = camera.intrinsics, camera.base_from_camera
-        self._workspace, self._gate, self._slack, self._limit, self._sigma = workspace, gate, slack, limit, sigma
+        self._workspace, self._gate, self._slack = workspace, gate, slack
+        self._limit, self._sigma = limit, sigma
         self._fit, self._detector, self._order = SideFit(camera), _detector(marker), FrameOrder(camera.rate)
         self._cells = dictionary_named(marker.dictionary).markerSize + 2
         half = marker.size / 2.0
@@ -105,12 +115,13 @@ class MarkerTracker:
         self._order.reset()
 
     def look(self, frame: Frame, expected: Pose | None = None, *, now: float | None = None) -> Sighting:
-        """What the frame says. `expected`: base_from_tip by a model, position (3,) [m] and quaternion (4,), by which both solutions are
-        judged; `now`: the time of whoever asks [s], None where frames may have any stamp.
+        """What the frame says. `expected`: base_from_tip by a model, position (3,) [m] and quaternion (4,),
+        by which both solutions are judged; `now`: the clock [s], None where frames may have any stamp.
 
-        A frame is "frozen" where its number or its whole image is that of the frame before, "repeated" where its image is an older one's,
-        "out of order" where its stamp or number runs back, and "from the future" where its stamp is after `now`. Raises `InputError` for
-        a picture that is not (h, w) grey levels of the camera's size.
+        A frame is "frozen" where its number or its whole image is that of the frame before, "repeated" where
+        its image is an older one's, "out of order" where its stamp or number runs back, and "from the future"
+        where its stamp is after `now`. Raises `InputError` for a picture that is not (h, w) grey levels of
+        the camera's size.
         """
         image = frame.image
         if image.dtype != np.uint8 or image.shape != self.camera.size[::-1]:
@@ -148,15 +159,16 @@ class MarkerTracker:
     def _find(self, image: Picture) -> list[Floats]:
         """(4, 2) corners of each marker of its number in the picture, about, the largest first.
 
-        The whole picture is searched each time: a second marker may be anywhere. Smoothed first, as noise makes contours, and each takes
-        time: 1.8 ms of a core in place of 5.9 ms where it is strong.
+        The whole picture is searched each time: a second marker may be anywhere. Smoothed first, as noise
+        makes contours, and each takes time: 1.8 ms of a core in place of 5.9 ms where noise is strong.
         """
         import cv2
 
         for picture in (cv2.blur(image, (3, 3)), image):
             corners, ids, _ = self._detector.detectMarkers(picture)
             quads = [np.asarray(quad, dtype=np.float64).reshape(4, 2) for quad in corners]
-            mine = [quad for quad, number in zip(quads, () if ids is None else np.ravel(ids), strict=True) if number == self.marker.id]
+            known = () if ids is None else np.ravel(ids)
+            mine = [quad for quad, number in zip(quads, known, strict=True) if number == self.marker.id]
             if mine:
                 return _apart(sorted(mine, key=_area, reverse=True))
         return []
@@ -242,7 +254,8 @@ class MarkerTracker:
 
     def _refusal(self, t: float, position: Floats, expected: Pose | None) -> str:
         """Flag of a tip that is not the robot's; "" where it may be."""
-        flag = "" if self._workspace is None else self._workspace.refusal(position, None if expected is None else expected[0])
+        there = None if expected is None else expected[0]
+        flag = "" if self._workspace is None else self._workspace.refusal(position, there)
         if flag or self._last is None:
             return flag
         far = float(np.linalg.norm(position - self._last.position))
@@ -269,7 +282,8 @@ def _apart(quads: list[Floats]) -> list[Floats]:
     """Those that lie in no larger one before them: a detector may give the two edges of one black frame."""
     kept: list[Floats] = []
     for quad in quads:
-        if all(np.linalg.norm(quad.mean(0) - other.mean(0)) > 0.5 * math.sqrt(0.5 * _area(other)) for other in kept):
+        away = [float(np.linalg.norm(quad.mean(0) - other.mean(0))) for other in kept]
+        if all(far > 0.5 * math.sqrt(0.5 * _area(other)) for far, other in zip(away, kept, strict=True)):
             kept.append(quad)
     return kept
 

@@ -62,10 +62,14 @@ class Changed:
 
 @contextmanager
 def bench(
-    clock: Clock | None = None, *, camera: bool = True, hardware: Any = HARDWARE, change: Callable[[Frame], Frame] | None = None,
+    clock: Clock | None = None,
+    *,
+    camera: bool = True,
+    hardware: Any = HARDWARE,
+    change: Callable[[Frame], Frame] | None = None,
     journal: Journal | None = None,
-) -> Iterator[tuple[Prototype, Emulator]]:  # fmt: skip
-    """Started, with wires that have their pretension at power-on; `change` is made to each frame of the camera."""
+) -> Iterator[tuple[Prototype, Emulator]]:
+    """Started, with wires that have their pretension at power-on; `change` is made to each frame."""
     clock, bus = SteppedClock() if clock is None else clock, f"virtual:prototype-{next(_names)}"
     with pytest.MonkeyPatch.context() as patch:
         if not clock.stepped:  # drives that bear a busy machine, too
@@ -422,7 +426,7 @@ def test_a_camera_that_cannot_be_believed_is_flagged_and_marker_lost_stays_armed
         rows = len(recorder)
         log = recorder.stop()
         flags = np.array([FLAGS[int(value)] for value in log.extra["marker_flag"]])
-        assert rows == len(log) == len(made.frames) - 1  # a row for each frame, but for one from before the start
+        assert rows == len(log) == len(made.frames) - 1  # a row for each frame; one was from before the start
         assert set(flags) <= {"", flag, "no marker", "ambiguous"}
         assert (flags == flag).sum() == made.bad >= (1 if attack is Future else 7)
         assert np.isnan(log.tip_position[flags != ""]).all()
@@ -433,19 +437,24 @@ def test_a_camera_that_cannot_be_believed_is_flagged_and_marker_lost_stays_armed
 
 
 @pytest.mark.parametrize("raising", ["quick_stop", "close", "camera"])
-def test_an_adapter_that_raises_as_it_is_closed_keeps_nothing_open(raising: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_adapter_that_raises_as_it_closes_keeps_nothing_open(
+    raising: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def broken(*_: object) -> None:
         raise ValueError("the handle\nis invalid")
 
     closed = []
     with bench(change=lambda frame: frame) as (prototype, _):
         assert prototype.source is not None
-        monkeypatch.setattr(prototype.source, "close", broken if raising == "camera" else lambda: closed.append("camera"))
+        shut = broken if raising == "camera" else lambda: closed.append("camera")
+        monkeypatch.setattr(prototype.source, "close", shut)
         if raising != "camera":
             ends = getattr(prototype.drives, raising)
             monkeypatch.setattr(prototype.drives, raising, broken)
         prototype.close()
-        assert prototype.journal.lines[-1][1:] == ("exception", "closing failed: ValueError: the handle is invalid.")
+        sentence = "closing failed: ValueError: the handle is invalid."
+        assert prototype.journal.lines[-1][1:] == ("exception", sentence)
         assert isinstance(prototype.broken, ValueError)
         assert closed == ([] if raising == "camera" else ["camera"])
         if raising != "camera":
@@ -498,7 +507,8 @@ def test_a_full_disk_stops_the_robot_and_both_logs_say_so(small_disk: Any) -> No
             prototype.wait(5.0)
         assert prototype.supervisor.state is State.STOPPED
         n = len(recorder)
-        words = f"log.csv.part cannot be written: No space left on device; {n - 1} of its {n} rows are in log.csv.part."
+        why = "log.csv.part cannot be written: No space left on device"
+        words = f"{why}; {n - 1} of its {n} rows are in log.csv.part."
         with events.open(newline="") as file:
             assert [line[1:] for line in csv.reader(file)] == [["exception", f"the program failed: {words}"]]
         prototype.record(None)
@@ -509,7 +519,11 @@ def test_a_full_disk_stops_the_robot_and_both_logs_say_so(small_disk: Any) -> No
 
 
 @pytest.mark.parametrize("unseen", [True, False], ids=["behind the file's end", "spare file"])
-def test_a_journals_room_is_reserved_unseen_and_given_back(unseen: bool, small_disk: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_journals_room_is_reserved_unseen_and_given_back(
+    unseen: bool,
+    small_disk: Any,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     if not unseen:
         monkeypatch.setattr("fastrod_device.journal._reserved", lambda *_: False)
     path = small_disk / "events.csv"
@@ -532,7 +546,7 @@ def test_a_journals_room_is_reserved_unseen_and_given_back(unseen: bool, small_d
     with (small_disk / "filler").open("ab", buffering=0) as filler, suppress(OSError):
         while True:
             filler.write(bytes(512))
-    with pytest.raises(InputError, match="No space left on device"):  # no session begins on a disk that is full
+    with pytest.raises(InputError, match="No space left on device"):  # no session begins on a full disk
         Journal(small_disk / "more.csv")
     assert sorted(file.name for file in small_disk.iterdir()) == ["events.csv", "filler"]
 

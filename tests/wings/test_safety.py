@@ -104,7 +104,7 @@ CASES: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
     ("marker lost", {"camera": CameraWatch(age=0.6, frozen=False)}, ("600 ms", "500 ms")),
     ("marker lost", {"camera": CameraWatch(age=INF, frozen=False)}, ("inf",)),
     ("marker lost", {"camera": CameraWatch(age=-5.0, frozen=False)}, ("-5000 ms", "500 ms")),
-    ("marker lost", {"camera": CameraWatch(age=0.6, frozen=False, flag="two markers")}, ("600 ms", "flagged 'two markers'")),
+    ("marker lost", {"camera": CameraWatch(age=0.6, frozen=False, flag="outlier")}, ("flagged 'outlier'",)),
     ("command stale", {"dt": 0.6, "rate": (1, 0.02), "limits": Limits(cycle=1.0)}, ("20 mm/s", "600 ms", "500 ms")),
 ]  # fmt: skip
 
