@@ -15,13 +15,14 @@ import numpy as np
 from fastrod.contact.contacts import TOUCHES, Contacts
 from fastrod.contact.frames import back_by, between, blended, frames_of, longest_move
 from fastrod.contact.scene import ContactScene
+from fastrod.contact.trouble import NO_CONTACT_LEFT, NO_NODE_LEFT, sentence
 from fastrod.contact.tree import pack
 from fastrod.kernels.batch import arrange, iterate_parallel, iterate_serial, look_at_rods, look_parallel, look_serial
 from fastrod.kernels.bvh import STACK
 from fastrod.kernels.forces import Scenery
 from fastrod.kernels.search import CANDIDATE
 from fastrod.kernels.slots import SLOT, T_FORCE, T_GAP, T_N, T_OBSTACLE, T_RADIUS, T_S
-from fastrod.kernels.touch import AT_REST, LOST, world_size
+from fastrod.kernels.touch import AT_REST, GOES_ON, INSIDE, LOST, MOVES, NOTHING, TROUBLE, UNSOLVED, world_size
 from fastrod.types import Clearance, Flags, Floats, Ints, Memory, Ports, Probes, Rods, Shape, Touching
 
 Pass = Callable[[Ints, Ports, Shape, Probes], None]
@@ -30,10 +31,12 @@ Pass = Callable[[Ints, Ports, Shape, Probes], None]
 MOST_FOUND = 64
 """Candidates of one robot that a look notes."""
 _BLOCK = 2048  # robots whose linear models are held at once
-_MOST_PASSES = 16
+_MOST_PASSES, _NEARLY = 16, 1e-4  # twice as many for a robot that moves by less than this part of its length
+_MOST_INSIDE = 8  # passes in a row with the centreline inside of an obstacle: the step led too far
 _SMALLEST_PART = 1.0 / 64.0
 _HARD = 1.0 / 4.0  # part of the way below which a failure is taken for the loss of the equilibrium, not for too long a step
-_DAMPING, _MOST_DAMPED = 1.5, 60
+_DAMPING, _MOST_DAMPED, _DAMPED_TRIES = 1.5, 60, 3
+_UNSOLVED = 6  # passes in a row without forces that obey the law: the hold is lost, and plain passes do not bring it back
 _FEW = 64  # robots below which starting threads costs more than it saves
 
 
@@ -74,6 +77,8 @@ class Engine:
         self.before: Shape | None = None
         self.tracked, self.slides = np.zeros(n, bool), np.ones(n, bool)
         self.gap = np.full(n, np.inf)
+        self.trouble = np.zeros((n, TROUBLE))
+        """What kept each robot from rest in its last pass (kernels.touch)."""
         self.led = np.zeros(n, bool)
         """Robots that contact brought to the inputs of the last step."""
         self.given_arclength, self.given_force = np.zeros((1, 0)), np.zeros((1, 0, 3))
@@ -175,17 +180,20 @@ class Engine:
         n = len(self.gap)
         done, stride, arrived = np.zeros(n), np.ones(n), np.zeros(n, bool)
         x, count, slot = memory.x.copy(), self.touching.used.copy(), self.touching.slot.copy()
-        way, begun = rows, passes.copy()
+        way, begun, tries = rows, passes.copy(), np.zeros(n, np.int64)
+        trouble = np.zeros_like(self.trouble)  # of the last try that failed
         while len(way):
             aim = np.minimum(done + stride, 1.0)
             ports = end if start is None or (aim[way] >= 1.0).all() else blended(start, end, aim)
-            rest = self._settle(way, ports, memory, shape, run, self._scenery(shape, tolerance, done, aim), passes, _MOST_PASSES)
-            hard = way[~rest[way] & (stride[way] <= _HARD)]
+            rest, unheld = self._settle(way, ports, memory, shape, run, self._scenery(shape, tolerance, done, aim), passes, _MOST_PASSES)
+            hard = way[~rest[way] & ((stride[way] <= _HARD) | unheld[way]) & (tries[way] < _DAMPED_TRIES)]
             if len(hard):  # no equilibrium near: let it go to the next one, downhill
+                tries[hard] += 1
                 memory.x[hard], self.touching.used[hard], self.touching.slot[hard] = x[hard], count[hard], slot[hard]
                 damped = self._scenery(shape, tolerance, done, aim, _DAMPING)
-                rest |= self._settle(hard, ports, memory, shape, run, damped, passes, _MOST_DAMPED)
+                rest |= self._settle(hard, ports, memory, shape, run, damped, passes, _MOST_DAMPED)[0]
             good, bad = way[rest[way]], way[~rest[way]]
+            trouble[bad] = self.trouble[bad]
             done[good] = aim[good]
             arrived[good] = done[good] >= 1.0
             between_steps = good[~arrived[good]]
@@ -198,6 +206,7 @@ class Engine:
             if start is None:
                 break
             way = way[~arrived[way] & (stride[way] >= _SMALLEST_PART) & (passes[way] - begun[way] < most)]
+        self.trouble[rows] = trouble[rows]
         lost = rows[~arrived[rows] & self.tracked[rows]]
         if len(lost) and self.before is not None:
             for now, last in zip(shape, self.before, strict=True):
@@ -227,12 +236,12 @@ class Engine:
         return ports, probes
 
     def why(self, i: int, done: float) -> str:
-        """What stopped robot i."""
-        if done > 0.0 or self.tracked[i]:
-            return f"contact: the rod stands where it could be solved, at {100.0 * done:.3g} % of the way to these inputs."
-        if self.gap[i] < 0.0:
-            return f"contact: the rod overlaps an obstacle by {-self.gap[i]:.3g} m, and no way out of it was found."
-        return "contact: neither the rod's rest shape nor these inputs could be solved."
+        """What stopped robot i, which came the part `done` of its step."""
+        if self.trouble[i, 0] == NOTHING:
+            if self.gap[i] < 0.0:
+                return f"contact: the rod overlaps an obstacle by {-self.gap[i]:.3g} m, and no way out of it was found."
+            return "contact: neither the rod's rest shape nor these inputs could be solved."
+        return sentence(self.trouble[i], self.scene, self.rods.n_steps, self.length[i if len(self.length) > 1 else 0], done)
 
     def contacts(self, shape: Shape, ok: Flags) -> Contacts:
         """What touches what now."""
@@ -266,17 +275,37 @@ class Engine:
 
     def _settle(
         self, rows: Ints, ports: Ports, memory: Memory, shape: Shape, run: Pass, scenery: Scenery, passes: Ints, most: int
-    ) -> Flags:
-        """Pass and law in turn on these inputs; (n_robots,) which came to rest."""
+    ) -> tuple[Flags, Flags]:
+        """Pass and law in turn on these inputs; (n_robots,) which came to rest, and which were given up as no forces hold them."""
         rest = np.zeros(len(self.gap), bool)
-        for _ in range(most):
-            status = self._iterate(rows, ports, memory, shape, run, scenery)
-            passes[rows] += 1
-            rest[rows[status == AT_REST]] = True
-            rows = rows[(status != AT_REST) & (status != LOST)]
-            if not len(rows):
+        unsolved, inside = np.zeros(len(rest), np.int64), np.zeros(len(rest), np.int64)
+        still, plain = rows, scenery.damping == 0.0
+        for count in range(2 * most if plain else most):
+            status = self._iterate(still, ports, memory, shape, run, scenery)
+            passes[still] += 1
+            rest[still[status == AT_REST]] = True
+            unsolved[still] = np.where(self.trouble[still, 0] == UNSOLVED, unsolved[still] + 1, 0)
+            deep = self.tracked[still] & (self.gap[still] < -self.rods.radius[still].max(1) - 1e-6)
+            inside[still] = np.where(deep, inside[still] + 1, 0)
+            hopeless = (inside >= (_MOST_INSIDE if plain else 3 * _MOST_INSIDE)) | (plain & (unsolved >= _UNSOLVED))
+            if count >= most - 1 and plain:
+                hopeless |= ~((self.trouble[:, 3] < _NEARLY * self.rods.reach) & np.isin(self.trouble[:, 0], (MOVES, INSIDE)))
+            still = still[(status != AT_REST) & (status != LOST) & ~self.whole_worlds(hopeless)[still]]
+            if not len(still):
                 break
-        return rest
+        self._count_contacts(rows[~rest[rows]], ports)
+        return rest, unsolved >= _UNSOLVED
+
+    def _count_contacts(self, rows: Ints, ports: Ports) -> None:
+        """Say of robots that stay inside of something whether they lack contacts, or nodes to put them on."""
+        for i in rows[self.trouble[rows, 0] == INSIDE]:
+            ends = np.cumsum(self.length[i if len(self.length) > 1 else 0] + ports.extension[i if len(ports.extension) > 1 else 0])
+            used = self.touching.slot[i, : self.touching.used[i], T_S]
+            here = np.searchsorted(ends[:-1], self.trouble[i, 2], side="right")
+            if (np.searchsorted(ends[:-1], used, side="right") == here).sum() >= self.rods.n_steps - 1:
+                self.trouble[i, 0] = NO_NODE_LEFT
+            elif len(used) >= self.touching.slot.shape[1]:
+                self.trouble[i, 0] = NO_CONTACT_LEFT
 
     def _iterate(self, rows: Ints, ports: Ports, memory: Memory, shape: Shape, run: Pass, scenery: Scenery) -> Ints:
         """One pass and one round of the law for the worlds of `rows`; their status. Worlds with as many contacts go together."""
@@ -304,7 +333,15 @@ class Engine:
         scratch = np.empty((parts, world_size(int(np.diff(worlds).max()), n_slots, self.touching.slot.shape[1], shape.arclength.shape[1])))
         body = iterate_serial if parts == 1 else iterate_parallel
         proposed, unknown = np.zeros((n, n_slots, 3)), np.zeros((n, n_x))
-        body(worlds, rows, *scenery, self.touching, self.clearance, probes, memory, proposed, unknown, self.gap, status, scratch)
+        used, slot = self.touching.used[rows], self.touching.slot[rows, :n_slots]
+        homeless = (probes.node < 0) & (np.arange(n_slots) < used[:, None])
+        held = self.touching, self.clearance, probes, memory, proposed, unknown
+        body(worlds, rows, *scenery, *held, self.gap, self.trouble, status, scratch)
+        if homeless.any():  # more contacts than nodes: what has no node has not been felt
+            for r in np.flatnonzero(homeless.any(1)):
+                q = homeless[r].argmax()
+                self.trouble[rows[r]] = NO_NODE_LEFT, slot[r, q, T_OBSTACLE], slot[r, q, T_S], 0.0
+                status[r] = LOST if status[r] == LOST else GOES_ON
         return status
 
     def _arranged(self, rows: Ints, ports: Ports, probes: Probes) -> Ports:

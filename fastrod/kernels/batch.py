@@ -102,6 +102,7 @@ def _iterate(
     proposed: Floats,
     unknown: Floats,
     gap: Floats,
+    trouble: Floats,
     status: Ints,
     scratch: Floats,
 ) -> None:
@@ -116,8 +117,9 @@ def _iterate(
                 rods, surfaces, frames, frames_before, frames_slip, shape, before, tracked, slides, tolerance, margin, damping
             )
             iterate_world(
-                worlds[k], worlds[k + 1], rows, scenery, touching, clearance, probes, memory, proposed, unknown, gap, status, scratch[part]
-            )
+                worlds[k], worlds[k + 1], rows, scenery, touching, clearance, probes, memory, proposed, unknown, gap, trouble, status,
+                scratch[part],
+            )  # fmt: skip
 
 
 @entry

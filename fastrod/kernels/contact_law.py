@@ -16,11 +16,12 @@ import math
 
 from fastrod.types import Floats
 
-from .bvh import Numbers
+from .bvh import FAR, Numbers
 from .jit import kernel
 
 _ROUNDS = 40
 _SWEEPS = 400
+_LOOK = 50
 _AGREE = 1e-10
 _HOLDS = 1e-9
 OPEN, STICK, SLIP = 0.0, 1.0, 2.0
@@ -209,9 +210,13 @@ def contact_forces(m: int, W: Floats, b: Numbers, friction: Numbers, compliance:
         return True
     for i in range(n):
         force[i] = best[i] if best[i] == best[i] else 0.0
-    left = 1.0
-    for _ in range(_SWEEPS):
+    left, last = 1.0, FAR
+    for count in range(_SWEEPS):
         left = _sweep(m, W, b, friction, compliance, force)
         if left < _AGREE:
             break
+        if count % _LOOK == _LOOK - 1:  # at this rate the rounds that are left would not do
+            if not left * (left / last) ** ((_SWEEPS - count) // _LOOK) < _AGREE:
+                break
+            last = left
     return left < _AGREE and _obeys(m, W, b, friction, compliance, force)

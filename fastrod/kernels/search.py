@@ -4,6 +4,9 @@ phi(s) is the signed distance of the centreline, with slope n . r'. It changes b
 measured once rules out whole stretches, along the rod and over time (`Clearance`). Where phi may fall below the rod's
 radius and the margin, its minimum in an interval is found on the slope; every minimum is a candidate for contact:
 obstacle, arclength, gap and normal.
+
+An interval can hold several minima. It is halved until no part of it can hide a dip below the rod's radius that is deeper than
+`UNSEEN` (`_may_hide`), so that the whole rod is searched and not its nodes.
 """
 
 from __future__ import annotations
@@ -13,14 +16,19 @@ from typing import NamedTuple
 
 from fastrod.types import Floats, Surfaces
 
-from .bvh import FAR, Numbers
+from .bvh import FAR, STACK, Numbers
 from .centreline import Curve, interval_of, point_at, tangent_at
 from .jit import inline, kernel
 from .surface import ray_hit, signed_distance
 from .vec import Vec, axpy, dot, sub
 
 CANDIDATE = 6  # numbers of one: obstacle, arclength, gap, normal
+UNSEEN = 1e-5
+"""A dip below the rod's radius that is shallower may stay unseen [m]: a tenth of the depth at which a rest is none."""
 _ITERATIONS = 40
+_STEEP = 1.01  # |dr/ds| of the interpolated curve is below it: 1 at the nodes, and to fourth order between them
+_DEEPEST = 20  # halvings of an interval
+_COARSE = 1.0 / 16.0  # of an interval: no finer where the rod is deep already, for there all that matters is known
 _FLAT = 1e-9  # a slope below it is none
 _RELAY = 0.25  # of the rod's length: how far beyond what is needed a first look goes, so that later ones are spared
 
@@ -37,6 +45,8 @@ class Sweep(NamedTuple):
     """Gap below which a minimum is a candidate [m]."""
     spacing: float
     """Two candidates of one obstacle nearer than this are one [m]."""
+    nearest: bool
+    """Not every dip below the rod's radius is asked for, but the smallest gap, wherever it is."""
 
 
 @inline
@@ -99,6 +109,76 @@ def _note(k: int, s: float, gap: float, n: Vec, spacing: float, found: Floats, n
 
 
 @kernel
+def _may_hide(f0: float, f1: float, length: float, curvature: float, level: float) -> bool:
+    """Whether phi may fall below `level` in a stretch of this length with phi = f0 and f1 at its ends.
+
+    The square of the distance to a fixed point has a second derivative of at most 2 (r' . r' + phi |r''|) along the curve; so phi^2,
+    the least of them, lies above the parabola of that second derivative through the ends. It falls by length^2 / 8 phi, where phi by
+    itself might fall by length / 2. Without a radius, or inside of an obstacle, that slope is all that is known.
+    """
+    level = min(level, min(f0, f1) - UNSEEN)
+    if level <= 0.0:
+        return 0.5 * (f0 + f1 - _STEEP * length) < level
+    fall = (_STEEP * _STEEP + max(f0, f1) * curvature) * length * length
+    a, b = f0 * f0, f1 * f1
+    if abs(b - a) >= fall:
+        return False
+    return 0.5 * (a + b) - 0.25 * fall - 0.25 * (b - a) * (b - a) / fall < level * level
+
+
+@inline
+def _bend(curve: Curve, j: int) -> float:
+    """Curvature at node j [1/m]."""
+    u = curve.curvature[j]
+    return math.sqrt(u[0] * u[0] + u[1] * u[1])
+
+
+@kernel
+def _search_interval(
+    k: int, frame: Floats, curve: Curve, j: int, low: float, ends: Numbers, sweep: Sweep, smallest: float, surfaces: Surfaces,
+    stack: Numbers, found: Floats, n_found: int,
+) -> tuple[int, float]:  # fmt: skip
+    """Minima of the interval after node j from its fraction `low` on; returns how many candidates there are, and the smallest gap.
+
+    `ends` begins with phi and slope at `low`, then fraction, phi and slope at the end; there is room for `_DEEPEST` more of these.
+    """
+    h = curve.arclength[j + 1] - curve.arclength[j]
+    rho, curvature = radius_after(sweep, j), 1.1 * max(_bend(curve, j), _bend(curve, j + 1))
+    x0, f0, g0, m = low, ends[0], ends[1], 1
+    smallest = min(smallest, min(f0, ends[3]) - rho)
+    while m > 0:
+        o = 3 * m - 1
+        x1, f1, g1 = ends[o], ends[o + 1], ends[o + 2]
+        length = (x1 - x0) * h
+        least = 0.5 * (f0 + f1 - _STEEP * length) - rho
+        if least <= sweep.margin:
+            deep = min(f0, f1) < rho - 2.0 * UNSEEN
+            fine = length > 2.0 * UNSEEN and m <= _DEEPEST and (x1 - x0 > _COARSE or not deep)
+            level = rho + (smallest if sweep.nearest else 0.0) - UNSEEN
+            if fine and least < level - rho and _may_hide(f0, f1, length, curvature, level):
+                x = 0.5 * (x0 + x1)
+                ends[o + 3] = x
+                ends[o + 4], normal, _ = signed_distance(k, frame, point_at(curve, j, x), FAR, surfaces, stack)
+                ends[o + 5] = dot(normal, tangent_at(curve, j, x))
+                smallest = min(smallest, ends[o + 4] - rho)
+                m += 1
+                continue
+            falls, rises = g0 < _FLAT, g1 > -_FLAT
+            place, d, normal = -1.0, FAR, (0.0, 0.0, 1.0)
+            if falls and rises and (abs(g0) < _FLAT or abs(g1) < _FLAT):
+                place = x0 if f0 <= f1 else x1  # an end is the minimum, or the rod lies along the surface
+                d, normal, _ = signed_distance(k, frame, point_at(curve, j, place), FAR, surfaces, stack)
+            elif (falls and (rises or f1 > f0)) or (rises and f0 > f1):
+                place, d, normal = minimum(k, frame, curve, j, x0, x1, max(f0, f1), surfaces, stack)
+            smallest = min(smallest, d - rho)
+            if d - rho < sweep.margin:
+                s = max(sweep.first, curve.arclength[j] + place * h)
+                n_found = _note(k, s, d - rho, normal, sweep.spacing, found, n_found)
+        x0, f0, g0, m = x1, f1, g1, m - 1
+    return n_found, smallest
+
+
+@kernel
 def search_obstacles(
     curve: Curve, sweep: Sweep, surfaces: Surfaces, frames: Floats, distance: Floats, position: Floats, work: Numbers, found: Floats
 ) -> tuple[int, float]:
@@ -106,11 +186,11 @@ def search_obstacles(
     beyond the margin).
 
     `distance` (n_points,) and `position` (n_points, 3) are the robot's rows of `Clearance`, kept up to date; `work` holds
-    4 n_points + 2 STACK numbers.
+    4 n_points + 4 STACK numbers.
     """
     n, n_obstacles = len(curve.arclength), len(frames)
     phi, slope, least, known = work[:n], work[n : 2 * n], work[2 * n : 3 * n], work[3 * n : 4 * n]
-    stack = work[4 * n :]
+    stack, ends = work[4 * n : 4 * n + 2 * STACK], work[4 * n + 2 * STACK :]
     start = 0
     while start < n - 2 and curve.arclength[start + 1] <= sweep.first:
         start += 1
@@ -135,6 +215,8 @@ def search_obstacles(
             phi[j], normal, near = signed_distance(k, frame, p, bound, surfaces, stack)
             slope[j] = dot(normal, node_tangent(curve, j, start, part)) if near else 0.0
             least[j] = min(least[j], phi[j])
+            if near and j > start:
+                smallest = min(smallest, phi[j] - radius_after(sweep, j - 1))
             if near and j == start and slope[j] > 0.0 and phi[j] - radius_after(sweep, j) < sweep.margin:
                 n_found = _note(
                     k, max(sweep.first, curve.arclength[j]), phi[j] - radius_after(sweep, j), normal, sweep.spacing, found, n_found
@@ -143,24 +225,10 @@ def search_obstacles(
                 n_found = _note(k, curve.arclength[j], phi[j] - radius_after(sweep, j - 1), normal, sweep.spacing, found, n_found)
         for j in range(start, n - 1):
             low = part if j == start else 0.0
-            rho = radius_after(sweep, j)
-            h = curve.arclength[j + 1] - curve.arclength[j]
-            smallest = min(smallest, min(phi[j], phi[j + 1]) - rho)
-            if 0.5 * (phi[j] + phi[j + 1] - h) - rho > sweep.margin:
-                continue
-            falls, rises = slope[j] < _FLAT, slope[j + 1] > -_FLAT
-            if falls and rises and (abs(slope[j]) < _FLAT or abs(slope[j + 1]) < _FLAT):
-                at = j if phi[j] <= phi[j + 1] else j + 1  # a node is the minimum, or the rod lies along the surface
-                d, normal, near = signed_distance(k, frame, node_point(curve, at, start, part), FAR, surfaces, stack)
-                where = curve.arclength[at] if at > start else max(sweep.first, curve.arclength[at])
-            elif (falls and (rises or phi[j + 1] > phi[j])) or (rises and phi[j] > phi[j + 1]):
-                place, d, normal = minimum(k, frame, curve, j, low, 1.0, max(phi[j], phi[j + 1]), surfaces, stack)
-                where = curve.arclength[j] + place * h
-            else:
-                continue
-            smallest = min(smallest, d - rho)
-            if d - rho < sweep.margin:
-                n_found = _note(k, where, d - rho, normal, sweep.spacing, found, n_found)
+            ends[0], ends[1], ends[2], ends[3], ends[4] = phi[j], slope[j], 1.0, phi[j + 1], slope[j + 1]
+            n_found, smallest = _search_interval(
+                k, frame, curve, j, low, ends, sweep, smallest, surfaces, stack, found, n_found
+            )  # fmt: skip
     for j in range(start, n):
         if least[j] < FAR:
             distance[j] = least[j]
@@ -169,8 +237,11 @@ def search_obstacles(
 
 
 @kernel
-def crosses(before: Curve, after: Curve, frames_before: Floats, frames: Floats, sweep: Sweep, surfaces: Surfaces, stack: Numbers) -> bool:
-    """A node went through an obstacle on its straight way from `before` to `after`, seen from the obstacle.
+def crosses(
+    before: Curve, after: Curve, frames_before: Floats, frames: Floats, sweep: Sweep, surfaces: Surfaces, stack: Numbers
+) -> tuple[int, float]:
+    """The obstacle that a node went through on its straight way from `before` to `after`, seen from the obstacle, and the node's
+    arclength; -1 where there is none.
 
     Both ends are outside, and the way between enters: through a body if the surfaces at both ends face different ways or
     the way runs deep; sliding along a convex surface is neither.
@@ -201,11 +272,31 @@ def crosses(before: Curve, after: Curve, frames_before: Floats, frames: Floats, 
             if end < 0.0:
                 continue
             if dot(n_p, n_q) < 0.2:
-                return True
+                return k, s
             middle = signed_distance(k, frames[k], axpy(0.5 * (t + length), direction, p), FAR, surfaces, stack)[0]
             if middle < -deep:
-                return True
-    return False
+                return k, s
+    return -1, 0.0
+
+
+@kernel
+def entered(
+    k: int, before: Curve, after: Curve, s: float, frame_before: Floats, frame: Floats, surfaces: Surfaces, stack: Numbers
+) -> tuple[float, Vec]:
+    """Signed distance of the centreline at s to the side of obstacle k by which it came in since `before`, and that side's normal; FAR
+    where it came in by none. The nearest side of a thin plate may be the other one."""
+    i, share = interval_of(before, s, 0)
+    j, part = interval_of(after, s, 0)
+    p, q = carried(frame_before, frame, point_at(before, i, share)), point_at(after, j, part)
+    way = sub(q, p)
+    length = math.sqrt(dot(way, way))
+    nothing = (0.0, 0.0, 0.0)
+    if length < 1e-9 or signed_distance(k, frame, p, FAR, surfaces, stack)[0] <= 0.0:
+        return FAR, nothing
+    t, n = ray_hit(k, frame, p, (way[0] / length, way[1] / length, way[2] / length), length, surfaces, stack)
+    if t >= length or dot(way, n) >= 0.0:
+        return FAR, nothing
+    return dot(way, n) * (1.0 - t / length), n
 
 
 @inline

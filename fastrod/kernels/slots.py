@@ -80,16 +80,19 @@ def wall_at(
 
 
 @kernel
-def violation(n_found: int, found: Floats, count: int, slot: Floats, spacing: float) -> float:
-    """How far the gap falls below what the contacts that there are can mend [m]."""
-    worst = 0.0
+def violation(n_found: int, found: Floats, count: int, slot: Floats, spacing: float, surfaces: Surfaces) -> tuple[float, int]:
+    """How far the gap falls below what the contacts that there are can mend [m], and the candidate where it falls deepest. Only where
+    an obstacle gives way may a contact be deep."""
+    worst, where = 0.0, -1
     for f in range(n_found):
-        level = 0.0
-        for c in range(count):
-            if int(slot[c, T_OBSTACLE]) == int(found[f, 0]) and abs(slot[c, T_S] - found[f, 1]) < spacing:
+        level, k = 0.0, int(found[f, 0])
+        gives = surfaces.compliance[k] > 0.0 or surfaces.give[k, 0] > 0.0
+        for c in range(count if gives else 0):
+            if int(slot[c, T_OBSTACLE]) == k and abs(slot[c, T_S] - found[f, 1]) < spacing:
                 level = min(level, slot[c, T_GAP])
-        worst = max(worst, level - found[f, 2])
-    return worst
+        if level - found[f, 2] > worst:
+            worst, where = level - found[f, 2], f
+    return worst, where
 
 
 @inline
@@ -110,6 +113,13 @@ def _segment_is_full(s: float, count: int, slot: Floats, arclength: Floats, n_st
     for c in range(count):
         members += segment_at(arclength, n_steps, slot[c, T_S]) == k
     return members >= n_steps - 1
+
+
+@inline
+def _other_wall(slot: Numbers, gap: float, away: float, tolerance: float) -> bool:
+    """The contact holds another wall than the one with this gap, so far away along the rod: the gap to one changes by at most 1 per
+    metre. To move it there would mend nothing."""
+    return slot[T_GAP] - gap > away + tolerance
 
 
 @kernel
@@ -148,7 +158,7 @@ def choose(
             away = abs(slot[c, T_S] - s)
             if int(slot[c, T_OBSTACLE]) != k:
                 continue
-            free = slot[c, T_TAKEN] == 0.0 and dot(slot_normal(slot[c]), normal) > 0.5
+            free = slot[c, T_TAKEN] == 0.0 and dot(slot_normal(slot[c]), normal) > 0.5 and not _other_wall(slot[c], gap, away, tolerance)
             if free and away < spacing and away < nearest:
                 near, nearest = c, away
         if gap < -tolerance:
@@ -164,8 +174,9 @@ def choose(
             lonely = _CLOSE * spacing
         crowded = n >= len(slot) or _segment_is_full(s, n, slot, arclength, n_steps)
         for c in range(n):
-            if int(slot[c, T_OBSTACLE]) == k and abs(slot[c, T_S] - s) < lonely and dot(slot_normal(slot[c]), normal) > 0.5:
-                crowded = True
+            away = abs(slot[c, T_S] - s)
+            if int(slot[c, T_OBSTACLE]) == k and away < lonely and dot(slot_normal(slot[c]), normal) > 0.5:
+                crowded = crowded or not _other_wall(slot[c], gap, away, tolerance)
         if not crowded:
             open_slot(slot[n], k, s, -1, normal, gap, radius[segment_at(arclength, n_steps, s)], friction[k])
             slot[n, T_TAKEN] = 1.0

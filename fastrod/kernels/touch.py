@@ -11,16 +11,21 @@ import math
 
 from fastrod.types import Clearance, Floats, Ints, Memory, Probes, Touching
 
-from .bvh import STACK, Numbers
+from .bvh import FAR, STACK, Numbers
 from .centreline import Curve, curve_of, interval_of, point_at
 from .forces import Scenery, apply_law, forces_size
 from .gather import pick
 from .jit import inline, kernel
-from .search import CANDIDATE, Sweep, crosses, search_obstacles
-from .slots import T_FORCE, T_OBSTACLE, T_S, add_walls, choose, merge, pressed_only, violation
+from .search import CANDIDATE, Sweep, crosses, entered, search_obstacles
+from .slots import T_FORCE, T_OBSTACLE, T_S, add_walls, choose, merge, pressed_only, segment_at, slot_force, violation
 from .strands import search_rods
+from .vec import dot
 
 GOES_ON, AT_REST, LOST = 0, 1, 2
+NOTHING, MOVES, UNSOLVED, INSIDE, THROUGH, DIVERGED = 0, 1, 2, 3, 4, 5
+"""What keeps a robot from rest: it still moves, its forces do not obey the law, the rod is inside of something, it went through
+something, its numbers are no numbers."""
+TROUBLE = 4  # numbers of one: which of these, obstacle (from n_obstacles on: rods; -1: none), arclength, size [m]
 _MOST_FOUND = 64
 _LONGEST_TURN = 0.5  # of EI/l in the base moment, about radians of bend: farther the linear model does not reach
 _LONGEST_MOVE = 0.05  # of the rod's length, of a contact point
@@ -81,15 +86,15 @@ def _press(r: int, i: int, scenery: Scenery, touching: Touching, probes: Probes,
 def sweep_of(i: int, scenery: Scenery, margin: float) -> Sweep:
     """How robot i is searched; `margin` is a part of its length, and candidates nearer than a twentieth of an integration step are one."""
     rods = scenery.rods
-    return Sweep(rods.radius[i], rods.n_steps, rods.first[i], margin * rods.reach[i], 0.05 * rods.spacing[i])
+    return Sweep(rods.radius[i], rods.n_steps, rods.first[i], margin * rods.reach[i], 0.05 * rods.spacing[i], margin > 1.0)
 
 
 @kernel
-def went_through(i: int, scenery: Scenery, clearance: Clearance, close: bool, work: Numbers) -> bool:
-    """Robot i has gone through an obstacle since the last step; unless `close` asked only where some node has moved farther
-    than it was away from all."""
+def went_through(i: int, scenery: Scenery, clearance: Clearance, close: bool, work: Numbers) -> tuple[int, float]:
+    """The obstacle that robot i has gone through since the last step, and where on the rod; -1 where there is none. Unless `close`
+    asked only where some node has moved farther than it was away from all."""
     if not scenery.tracked[i]:
-        return False
+        return -1, 0.0
     shape = scenery.shape
     frames_before = scenery.frames_before[pick(i, len(scenery.frames_before))]
     frames = scenery.frames[pick(i, len(scenery.frames))]
@@ -97,15 +102,15 @@ def went_through(i: int, scenery: Scenery, clearance: Clearance, close: bool, wo
         p, q = shape.position[i, j], clearance.position[i, j]
         close = close or not clearance.distance[i, j] > math.sqrt((p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2)
     if not close:
-        return False
+        return -1, 0.0
     sweep = sweep_of(i, scenery, scenery.margin)
-    return bool(crosses(curve_of(scenery.before, i), curve_of(shape, i), frames_before, frames, sweep, scenery.surfaces, work))
+    return crosses(curve_of(scenery.before, i), curve_of(shape, i), frames_before, frames, sweep, scenery.surfaces, work)
 
 
 @kernel
 def look_at(i: int, scenery: Scenery, clearance: Clearance, found: Floats, work: Numbers) -> tuple[int, float]:
     """Number of candidates of robot i and its smallest gap; -1 where it has gone through an obstacle since the last step."""
-    if went_through(i, scenery, clearance, False, work):
+    if went_through(i, scenery, clearance, False, work)[0] >= 0:
         return -1, 0.0
     return search_obstacles(
         curve_of(scenery.shape, i), sweep_of(i, scenery, scenery.margin), scenery.surfaces, scenery.frames[pick(i, len(scenery.frames))],
@@ -126,11 +131,12 @@ def iterate_world(
     proposed: Floats,
     unknown: Floats,
     gap: Floats,
+    trouble: Floats,
     status: Ints,
     work: Numbers,
 ) -> None:
-    """Rows `first` to `last` of one pass. Writes the smallest gap of each row and its status; a world that is not at rest
-    gets its next forces, unknowns and contacts."""
+    """Rows `first` to `last` of one pass. Writes the smallest gap of each row, its status and what keeps it from rest (`trouble`
+    (n_robots, TROUBLE)); a world that is not at rest gets its next forces, unknowns and contacts."""
     n_slots, n_obstacles, n_x = touching.slot.shape[1], len(scenery.surfaces.kind), probes.unknown.shape[1]
     solved = apply_law(first, last, rows, scenery, touching, probes, proposed, work)
     farthest, part = 0.0, 1.0
@@ -141,9 +147,11 @@ def iterate_world(
         if not (math.isfinite(move) and math.isfinite(residual)):
             for lost in range(first, last):
                 status[lost] = LOST
+                _say(trouble[rows[lost]], DIVERGED, -1, 0.0, 0.0)
             return
         move = max(move, _press(r, i, scenery, touching, probes, proposed))
         farthest, part = max(farthest, max(move, residual)), min(part, most)
+        _name_hardest(trouble[i], MOVES if solved else UNSOLVED, max(move, residual), touching.used[i], touching.slot[i])
     o, size, worst = 0, _MOST_FOUND * CANDIDATE, 0.0
     n_found, o = work[o : o + last - first], o + last - first
     points, o = work[o : o + 3 * n_slots].reshape((n_slots, 3)), o + 3 * n_slots
@@ -158,12 +166,17 @@ def iterate_world(
             clearance.distance[i], clearance.position[i], scratch, found,
         )  # fmt: skip
         n_found[r - first] = float(count)
-        worst = max(worst, violation(count, found, touching.used[i], touching.slot[i], scenery.rods.spacing[i]))
+        deep, where = violation(count, found, touching.used[i], touching.slot[i], scenery.rods.spacing[i], scenery.surfaces)
+        worst = max(worst, deep)
+        if deep > scenery.tolerance:
+            _say(trouble[i], INSIDE, int(found[where, 0]), found[where, 1], deep)
     worst = max(worst, search_rods(first, last, rows, scenery.shape, scenery.rods, touching, n_obstacles, scenery.margin, gap, False))
     rest = solved and farthest <= scenery.tolerance and worst <= scenery.tolerance
     through = False
     for r in range(first, last if rest else first):
-        through = through or went_through(rows[r], scenery, clearance, True, scratch)
+        crossed, where_s = went_through(rows[r], scenery, clearance, True, scratch)
+        through = through or crossed >= 0
+        _say(trouble[rows[r]], THROUGH if crossed >= 0 else NOTHING, crossed, where_s, 0.0)
     for r in range(first, last):
         status[r] = LOST if through else AT_REST if rest else GOES_ON
     if rest:
@@ -185,6 +198,48 @@ def iterate_world(
     search_rods(first, last, rows, scenery.shape, scenery.rods, touching, n_obstacles, scenery.margin, gap, True)
 
 
+@inline
+def _say(trouble: Numbers, what: int, obstacle: int, s: float, size: float) -> None:
+    """Write what keeps a robot from rest."""
+    trouble[0], trouble[1], trouble[2], trouble[3] = float(what), float(obstacle), s, size
+
+
+@kernel
+def _name_hardest(trouble: Numbers, what: int, size: float, count: int, slot: Floats) -> None:
+    """Write trouble of this size at the contact that presses hardest."""
+    hardest, at = 0.0, -1
+    for c in range(count):
+        f = slot_force(slot[c])
+        if dot(f, f) >= hardest:
+            hardest, at = dot(f, f), c
+    _say(trouble, what, int(slot[at, T_OBSTACLE]) if at >= 0 else -1, slot[at, T_S] if at >= 0 else 0.0, size)
+
+
+@kernel
+def _face(i: int, n_found: int, found: Floats, scenery: Scenery, stack: Numbers) -> None:
+    """Candidates whose centreline is inside an obstacle face the side by which it came in."""
+    if not scenery.tracked[i]:
+        return
+    before, curve, rods = curve_of(scenery.before, i), curve_of(scenery.shape, i), scenery.rods
+    frames_before, frames = scenery.frames_before[pick(i, len(scenery.frames_before))], scenery.frames[pick(i, len(scenery.frames))]
+    seen = False
+    for f in range(n_found):
+        s, k = found[f, 1], int(found[f, 0])
+        radius = rods.radius[i, segment_at(curve.arclength, rods.n_steps, s)]
+        if found[f, 2] + radius >= 0.0:
+            continue
+        d, n = entered(k, before, curve, s, frames_before[k], frames[k], scenery.surfaces, stack)
+        for j in range(0 if seen else len(curve.arclength)):  # across a thin plate the nearest side says nothing: the deepest node does
+            if curve.arclength[j] > rods.first[i]:
+                d_j, n_j = entered(k, before, curve, curve.arclength[j], frames_before[k], frames[k], scenery.surfaces, stack)
+                if d_j < FAR and (d_j < d or d == FAR):
+                    d, n, s = d_j, n_j, curve.arclength[j]
+        seen = True
+        if d < FAR:
+            radius = rods.radius[i, segment_at(curve.arclength, rods.n_steps, s)]
+            found[f, 1], found[f, 2], found[f, 3], found[f, 4], found[f, 5] = s, d - radius, n[0], n[1], n[2]
+
+
 @kernel
 def _renew(
     i: int,
@@ -200,6 +255,7 @@ def _renew(
     slot, rods, frames = touching.slot[i], scenery.rods, scenery.frames[pick(i, len(scenery.frames))]
     spacing = rods.spacing[i]
     margin = scenery.margin * rods.reach[i]
+    _face(i, n_found, found, scenery, scratch)
     count = choose(
         n_found, found, touching.used[i], slot, len(frames), rods.radius[i], scenery.surfaces.friction, rods.n_steps,
         curve.arclength, spacing, scenery.tolerance, 0.2 * margin,
