@@ -36,7 +36,7 @@ def settle(rows: Ints, warm: Flags, boundary: Passes, ports: Ports, tolerance: f
         boundary.move_to_inputs(left, ports)
         left = _newton(left, boundary, ports, tolerance, run, passes)
     left = np.sort(np.concatenate([left, rows[~warm[rows]]]))
-    steep = left[_load_parameter(left, params, ports) > _STEEP]
+    steep = left[load_parameter(left, params, ports) > _STEEP]
     left = np.setdiff1d(left, steep)
     if len(left):
         cold_start(left, layout, params, ports, boundary.memory)
@@ -48,7 +48,7 @@ def settle(rows: Ints, warm: Flags, boundary: Passes, ports: Ports, tolerance: f
     return passes
 
 
-def _load_parameter(rows: Ints, params: Params, ports: Ports) -> Floats:
+def load_parameter(rows: Ints, params: Params, ports: Ports) -> Floats:
     """F l^2/EI of all forces together: beyond about six a rod has equilibria that no growing load would lead to."""
 
     def of(a: Floats) -> Floats:
@@ -147,7 +147,7 @@ def _continuation(rows: Ints, boundary: Passes, ports: Ports, tolerance: float, 
     layout, params = boundary.layout, boundary.params
     part = np.zeros(boundary.n_robots)
     longest = np.full(boundary.n_robots, 0.25)  # a longer stride than a load parameter of three could land on another equilibrium
-    longest[rows] = np.minimum(0.25, 0.5 * _STEEP / np.maximum(_load_parameter(rows, params, ports), 1e-9))
+    longest[rows] = np.minimum(0.25, 0.5 * _STEEP / np.maximum(load_parameter(rows, params, ports), 1e-9))
     stride = longest.copy()
     unloaded = _loaded(ports, part)
     cold_start(rows, layout, params, unloaded, boundary.memory)

@@ -23,6 +23,7 @@ from fastrod.guess import cold_start
 from fastrod.inputs import Inputs, PointForces, Reader
 from fastrod.kernels.dense import between_nodes
 from fastrod.passes import Passes
+from fastrod.recovery import Boundary, what_to_do
 from fastrod.response import Linear, stretch
 from fastrod.robot import Robot
 from fastrod.rotation import matrix_from_quaternion
@@ -35,6 +36,7 @@ _config: Any = numba.config
 _AT_REST = 1e-6  # m: contact and boundary of a step, where `settle` has a tolerance of its own
 _ALONG = ("position", "rotation", "curvature", "arclength", "moment", "force", "tension", "path_length", "base_wrench")
 _LOST = 0.1  # of the robot's length: a residual beyond it is no shape of this robot
+_DIVERGED = "the observer diverged, and settling on the same inputs found no shape either"
 
 
 class Simulator:
@@ -186,6 +188,7 @@ class Simulator:
         tracked = self._passes.tracks_force
         ports, rows = self._read(given)
         self._move_obstacles(moved)
+        boundary = Boundary(self._passes)
         process, noise = self.observer.process_noise * self.dt, self.observer.measurement_noise / self.dt
         before = self._ports
         learns = before is not None and not tracked and self._passes.tracks_force
@@ -214,7 +217,13 @@ class Simulator:
         if len(rows) < self.n_robots:
             read = np.isin(self._all, rows)
             ok, passes = ok & read, np.where(read, passes, 0)
-        return self._finish(ports, shape, ok, passes, "the observer diverged; use settle, or smaller changes of input")
+        if not ok[rows].all():
+            lost, self._derived = rows[~ok[rows]], None
+            used = boundary.recover(lost, self._warm, ports, lambda which, at: self._pass_at_rest(which, at, shape))
+            self._passes.collect(shape)
+            ok |= (used > 0) & (shape.residual < _LOST * self._passes.params.reach)
+            passes = np.where(used < 0, -1, passes + used)
+        return self._finish(ports, shape, ok, passes, _DIVERGED, rows[~ok[rows]])
 
     def settle(
         self,
@@ -271,6 +280,7 @@ class Simulator:
             stretch(self._passes, rows, ports.extension - start.extension)
         engine.given_arclength, engine.given_force = self._reader.loads
         engine.move(poses, velocities, self.dt)
+        boundary = Boundary(self._passes)
         shape = self._passes.new_shape("full", True)
         passes = np.zeros(self.n_robots, np.int64)
 
@@ -283,13 +293,16 @@ class Simulator:
             process, noise = self.observer.process_noise * self.dt, self.observer.measurement_noise / self.dt
             self._passes.run(which, at, into, feed=True, carry=self._passes.carry, process=process, noise=noise)
             passes[which] += 1
-            well = self._passes.finite & (into.residual < _LOST * self._passes.params.reach)
-            return np.asarray(well & np.isin(self._all, which))
+            well = self._passes.finite & (into.residual < _LOST * self._passes.params.reach) & np.isin(self._all, which)
+            if len(lost := which[~well[which]]):
+                used = boundary.recover(lost, self._warm, at, lambda some, there: self._pass_at_rest(some, there, into))
+                passes[lost] += np.abs(used[lost])
+                well[lost] = used[lost] > 0
+            return np.asarray(well)
 
         def bring_to_rest(which: Ints, at: Ports, into: Shape) -> Flags:
             def once(some: Ints, there: Ports) -> Floats:
-                self._passes.run(some, there, into, noise=1e-10 if self._layout.paper else 1e-20)
-                return into.residual[some]
+                return self._pass_at_rest(some, there, into)
 
             used = settle(which, self._warm, self._passes, at, tolerance or 1e-9, once)
             passes[which] += np.abs(used[which])
@@ -300,13 +313,15 @@ class Simulator:
             tolerance or _AT_REST, passes, engine.scene.max_passes if tolerance is None else COLD_PASSES,
         )  # fmt: skip
         for i in rows[~ok[rows]]:
-            self._reader.problems.setdefault(int(i), engine.why(int(i), float(done[i])))
+            why = engine.why(int(i), float(done[i])) if engine.led[i] else self._sentence(_DIVERGED, ports, shape, int(i))
+            self._reader.problems.setdefault(int(i), why)
         # a cold robot has no last inputs to go on from: it begins anew
-        held = np.isin(self._all, rows) & ~ok & engine.tracked & ~engine.whole_worlds(~self._warm)
+        gone = np.isin(self._all, rows) & ~ok
+        held = gone & engine.tracked & ~engine.whole_worlds(~self._warm)
         if held.any() and start is not None:
             ports = blended(start, ports, done)
         self._passes.arrive_at(np.flatnonzero(held | (ok & engine.led)), ports)
-        state = self._finish(ports, shape, ok, np.where(ok, passes, -1), "contact")
+        state = self._finish(ports, shape, ok, np.where(ok, passes, -1), "contact", np.flatnonzero(gone & ~(held & engine.led)))
         self._warm[held] = True  # it stands where it came to, and goes on from there
         return state
 
@@ -330,17 +345,18 @@ class Simulator:
     def _settle(self, ports: Ports, rows: Ints, tolerance: float, only: Flags | None = None) -> State:
         shape = self._passes.new_shape(self.outputs, len(rows) < self.n_robots)
 
-        def run(which: Ints, at: Ports) -> Floats:
-            self._passes.run(which, at, shape, noise=1e-10 if self._layout.paper else 1e-20)
-            return self._passes.collect(shape, "residual").residual[which]
-
-        passes = settle(rows, self._warm, self._passes, ports, tolerance, run)
+        passes = settle(rows, self._warm, self._passes, ports, tolerance, lambda which, at: self._pass_at_rest(which, at, shape))
         self._passes.collect(shape)
         if self._passes.carry:
             self._passes.memory.covariance[rows] = 0.0
         ok = np.zeros(self.n_robots, bool)
         ok[rows] = passes[rows] > 0
-        return self._finish(ports, shape, ok, passes, f"settle did not bring the boundary residual below {tolerance:g} m", only)
+        return self._finish(ports, shape, ok, passes, f"settle did not bring the boundary residual below {tolerance:g} m", rows[~ok[rows]], only)
+
+    def _pass_at_rest(self, rows: Ints, ports: Ports, shape: Shape) -> Floats:
+        """A pass on frozen inputs; the residual of these robots [m]."""
+        self._passes.run(rows, ports, shape, noise=1e-10 if self._layout.paper else 1e-20)
+        return self._passes.collect(shape, "residual").residual[rows]
 
     def shape(self, arclength: ArrayLike) -> Pose:
         """Pose and curvature of the last state at any arclength [m]: (n_queries,), or (n_robots, n_queries).
@@ -650,11 +666,19 @@ class Simulator:
         same = force.shape == before.shape and np.array_equal(force, before, equal_nan=True)
         return not same and bool((force != before)[self._warm if max(len(force), len(before)) > 1 else slice(None)].any())
 
-    def _finish(self, ports: Ports, shape: Shape, ok: Flags, passes: Ints, reason: str, only: Flags | None = None) -> State:
-        """Note who is lost, so that nothing continues on NaN, and hand out the state."""
+    def _sentence(self, reason: str, ports: Ports, shape: Shape, i: int) -> str:
+        return f"{reason}; residual {shape.residual[i]:.3g} m; {what_to_do(self._passes, ports, i)}."
+
+    def _finish(
+        self, ports: Ports, shape: Shape, ok: Flags, passes: Ints, reason: str, lost: Ints, only: Flags | None = None
+    ) -> State:
+        """Note who is not ok, so that nothing continues on NaN, and hand out the state. What a pass wrote of the robots `lost` is no
+        shape of theirs: they keep the one before."""
         problems = dict(self._reader.problems)
         for i in np.flatnonzero(~ok):
-            problems.setdefault(int(i), f"{reason}; residual {shape.residual[i]:.3g} m.")
+            problems.setdefault(int(i), self._sentence(reason, ports, shape, int(i)))
+        if len(lost):
+            shape, ports = self._kept(shape, ports, np.isin(self._all, lost))
         if self._reader.problems or only is not None:  # no pass touched these: they keep the boundary they had
             unread = np.zeros(self.n_robots, bool) if only is None else ~only
             unread[list(self._reader.problems)] = True
@@ -673,6 +697,15 @@ class Simulator:
                 ports = taken_each(ports, self._ports, ~only)
         self._ports = ports
         return self._hand_out(shape, ok, passes, problems)
+
+    def _kept(self, shape: Shape, ports: Ports, lost: Flags) -> tuple[Shape, Ports]:
+        """`lost` robots as in the state before, nan without one; `residual` stays that of what was tried."""
+        if self._state is None or self._ports is None:
+            gone = Shape(*(np.array(a) for a in shape))
+            for a in gone:
+                a[lost if len(a) else slice(0)] = np.nan
+            return gone._replace(residual=shape.residual), ports
+        return taken_shape(shape, self._state, lost)._replace(residual=shape.residual), taken_each(ports, self._ports, lost)
 
     def _hand_out(self, shape: Shape, ok: Flags, passes: Ints, problems: dict[int, str]) -> State:
         contacts = None if self._felt is None else self._felt.contacts(shape, ok)

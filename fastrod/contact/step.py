@@ -43,6 +43,7 @@ def contact_step(
     warm_free, cold_rows = rows[~cold[rows] & ~pressed[rows]], rows[cold[rows]]
     if len(warm_free):
         ok |= ways.free(warm_free, end, shape)
+        done[warm_free[~ok[warm_free]]] = 0.0
     if len(cold_rows):
         ok |= ways.settle(cold_rows, end, shape)
     touched = engine.touches(rows[ok[rows]], shape)

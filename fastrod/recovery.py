@@ -1,0 +1,56 @@
+"""Robots whose observer pass diverged: brought to rest on the same inputs, while the others keep every bit."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fastrod.passes import Passes
+from fastrod.settle import Pass, load_parameter, settle
+from fastrod.types import Flags, Floats, Ints, Ports
+
+TOLERANCE = 1e-9  # m: that of `Simulator.settle`
+_HOPELESS = 50.0  # of F l^2/EI: a rod with its far end free winds up before
+
+
+class Boundary:
+    """The boundary before a step, kept until it is known that nobody diverged in it: 21 numbers of a five-segment robot."""
+
+    def __init__(self, passes: Passes) -> None:
+        self._passes = passes
+        # on a GPU a copy would have to come here at every step; its robots begin from the cold guess instead
+        self._kept = None if passes.device == "cuda" else (passes.x.copy(), passes.memory.curvature_guess.copy())
+
+    def put_back(self, rows: Ints, ports: Ports) -> None:
+        """These robots stand where they stood before the step, on the inputs `ports`, and what a diverged pass learned is forgotten."""
+        memory = self._passes.memory
+        if self._kept is not None:
+            memory.x[rows], memory.curvature_guess[rows] = self._kept[0][rows], self._kept[1][rows]
+        memory.gain[rows] = 0.0
+        if len(memory.covariance):
+            memory.covariance[rows] = 0.0
+        self._passes.arrive_at(rows, ports)
+
+    def recover(self, lost: Ints, warm: Flags, ports: Ports, run: Pass) -> Ints:
+        """`settle` these robots on `ports`: from where they stood before the step, then from the cold guess, then by their loads. (n_robots,)
+        passes that each took, -1 where none of these ways ended below `TOLERANCE`; those that did not arrive stand where they stood."""
+        self.put_back(lost, ports)
+        known = warm if self._kept is not None else np.zeros_like(warm)
+        used = settle(lost, known, self._passes, ports, TOLERANCE, run)
+        if len(failed := lost[used[lost] < 0]):
+            self.put_back(failed, ports)
+        if len(self._passes.memory.covariance):
+            self._passes.memory.covariance[lost] = 0.0
+        return used
+
+
+def what_to_do(passes: Passes, ports: Ports, row: int) -> str:
+    """The end of a sentence about a robot without a shape: what to change."""
+    size = float(load_parameter(np.array([row]), passes.params, ports)[0])
+    if size > _HOPELESS:
+        force = _of(passes.params.moment_scale, row) / _of(passes.params.reach, row)
+        return f"its loads are {size:.3g} times what bends it, EI/l^2 = {force:.3g} N: give less load"
+    return "give inputs that a rod of this length can follow, or come there in smaller changes"
+
+
+def _of(a: Floats, row: int) -> float:
+    return float(a[row if len(a) > 1 else 0])
