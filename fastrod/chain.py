@@ -79,6 +79,7 @@ class Chain:
         self.n_robots = n_robots
         self.rest_length = robots[0].rest_tendon_length
         self.gravity = np.array([robot.gravity for robot in robots])
+        self._felt = self.gravity  # at the last step
         self._pulled = np.array([robots[0].segments[end].mode == "tendon_tension" for end in robots[0].tendon_segment], dtype=bool)
         self.links: list[Link] = []
         for name in tables[0]:
@@ -101,8 +102,12 @@ class Chain:
             link.memory[rows] = self._fresh(link.effect)[rows]
         self.time[rows] = np.nan
 
-    def act(self, ports: Ports, params: Params, state: Any, dt: float, n_steps: int, skip: Flags) -> tuple[Ports, Params]:
-        """What the kernel reads at this step; memories move on, but for the robots `skip`, whose inputs cannot be used."""
+    def act(
+        self, ports: Ports, params: Params, state: Any, dt: float, n_steps: int, skip: Flags, gravity: Floats | None = None
+    ) -> tuple[Ports, Params]:
+        """What the kernel reads at this step; memories move on, but for the robots `skip`, whose inputs cannot be used. `gravity` (1 or
+        n_robots, 3) [m/s^2] is that of the world at this step, the robots' own if left out."""
+        self._felt = self.gravity if gravity is None else gravity
         first = np.isnan(self.time)
         self.time = np.where(skip, self.time, np.where(first, 0.0, self.time + dt))
         before = [link.memory.copy() for link in self.links] if skip.any() else []
@@ -149,7 +154,7 @@ class Chain:
 
     def _open(self, ports: Ports, params: Params, n_steps: int) -> EffectPorts:
         opened = open_ports(
-            ports, params, self.wiring, n=self.n_robots, rest_length=self.rest_length, gravity=self.gravity,
+            ports, params, self.wiring, n=self.n_robots, rest_length=self.rest_length, gravity=self._felt,
             base_rotation=matrix_from_quaternion(ports.base_pose[:, 3:]), time=np.nan_to_num(self.time), n_steps=n_steps,
         )  # fmt: skip
         opened.tendon_length[:, self._pulled] = self.rest_length[self._pulled]  # these are not commanded: nothing to act on

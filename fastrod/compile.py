@@ -23,6 +23,8 @@ class Rest(NamedTuple):
     """(n_robots, n_segments, 1, 3) [1/m]."""
     weight: Floats
     """(n_robots, n_segments, 1, 3) self-weight as line force, world [N/m]."""
+    line_density: Floats
+    """(n_robots, n_segments) [kg/m]."""
     base_pose: Floats
     """(n_robots, 7) [m], w x y z."""
     extension_range: Floats
@@ -89,6 +91,7 @@ def _rest(robots: Sequence[Robot]) -> Rest:
         stiffness=stiffness[:, :, None, :],
         precurvature=precurvature[:, :, None, :].astype(float),
         weight=weight[:, :, None, :].astype(float),
+        line_density=np.array([[s.line_density for s in robot.segments] for robot in robots], dtype=float),
         base_pose=np.array([(*robot.base_position, *robot.base_quaternion) for robot in robots], dtype=float),
         extension_range=np.array([[s.extension for s in robot.segments] for robot in robots], dtype=float),
     )

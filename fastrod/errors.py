@@ -60,3 +60,12 @@ def shown(value: object, longest: int = 200) -> str:
     text = repr(value)
     half = (longest - 5) // 2
     return text if len(text) <= longest else f"{text[: longest - 5 - half]} ... {text[-half:]}"
+
+
+def refuse_masked(name: str, value: object) -> None:
+    """Raise `InputError` for a masked array, or a list of such, that hides entries: numpy would hand out what is behind the mask."""
+    import numpy as np
+
+    for a in value if isinstance(value, (list, tuple)) else (value,):
+        if isinstance(a, np.ma.MaskedArray) and (hidden := int(np.ma.getmaskarray(a).sum())):
+            raise InputError(f"{name} is a masked array that hides {hidden} of {a.size} entries; give all, as with filled(0.0).")

@@ -2,21 +2,40 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, ParamSpec, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fastrod.compile import Rest
-from fastrod.errors import InputError
+from fastrod.errors import InputError, nearest, refuse_masked
 from fastrod.kernels.batch import place_all
 from fastrod.types import Floats, Layout, Params, Ports
 
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 PointForces: TypeAlias = Sequence[tuple[ArrayLike, ArrayLike]]
 
 
 _MOST = 1e12  # of any unit; products of a few such numbers still are floats
+
+
+def named_inputs(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """The same method; `InputError` with the nearest name for a keyword that it lacks, where Python's own error knows none."""
+    known = {name for name in inspect.signature(function).parameters if name != "self"}
+
+    @functools.wraps(function)
+    def checked(*args: _P.args, **inputs: _P.kwargs) -> _R:
+        for name in inputs:
+            if name not in known:
+                why = "the time step is given once: Simulator(robot, dt=...)." if name == "dt" else nearest(name, known)
+                raise InputError(f"{function.__name__} has no input {name!r}; {why}")
+        return function(*args, **inputs)
+
+    return checked
 
 
 class Inputs(NamedTuple):
@@ -31,6 +50,7 @@ class Inputs(NamedTuple):
     point_force: PointForces | None = None
     follower_tip_force: ArrayLike | None = None
     base_pose: ArrayLike | None = None
+    gravity: ArrayLike | None = None
 
 
 class Reader:
@@ -43,6 +63,9 @@ class Reader:
         self.problems: dict[int, str] = {}
         self.loads: tuple[Floats, Floats] = (np.zeros((1, 0)), np.zeros((1, 0, 3)))
         """Point forces of the last ports: arclength (n, m) [m] and force (n, m, 3) world [N]."""
+        self.gravity: Floats | None = None
+        """(1 or n_robots, 3) of the last ports, world [m/s^2]; None is that of the robots."""
+        self._weight = rest.weight
 
     def ports(self, given: Inputs) -> Ports:
         """The ports of one step; `problems` then names the robots whose inputs are not usable."""
@@ -53,6 +76,10 @@ class Reader:
         given_tension[layout.row_tendon] = False  # those of tendon_tension segments remain
         stretch = self._optional("extension", given.extension, (n_segments,), "m")
         self._check_extension(stretch)
+        self.gravity, self._weight = None, rest.weight
+        if given.gravity is not None:
+            self.gravity = self._array("gravity", given.gravity, (3,), "m/s^2")
+            self._weight = rest.line_density[:, :, None, None] * self.gravity[:, None, None, :]
         lengths = self._lengths(given.tendon_length, stretch)
         if given.tension is not None and not given_tension.any():
             raise InputError("tension was given, but no segment of this robot is in mode tendon_tension.")
@@ -81,6 +108,7 @@ class Reader:
 
     def _array(self, name: str, value: ArrayLike, shape: tuple[int, ...], unit: str) -> Floats:
         """(1 or n_robots, *shape), finite but for rows that are noted as problems."""
+        refuse_masked(name, value)
         try:
             a = np.asarray(value)
             if a.dtype.kind in "cmM":
@@ -151,7 +179,7 @@ class Reader:
     def line_force(self, line_force: ArrayLike | None, grid: Floats) -> Floats:
         """`Ports.line_force`: self-weight plus what is given, uniform, or linear over each step with the true force and moment of that
         step. `grid` as in `Ports`."""
-        weight = self.rest.weight
+        weight = self._weight
         if line_force is None:
             return weight
         try:
@@ -191,6 +219,8 @@ class Reader:
             raise InputError("point_force must be (arclength [m], force [N]) pairs, for example [(0.03, (0, 0.1, 0))].") from error
         if not pairs:
             return self.point_forces(None, stretch)
+        for s, _ in point_force:
+            refuse_masked("arclength of a point_force", s)
         at = [self._array("arclength of a point_force", s, (1,), "m")[:, 0] for s, _ in pairs]
         forces = [self._array("point_force", f, (3,), "N") for _, f in pairs]
         ends = np.cumsum(params.length + stretch, axis=1)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from copy import copy
 from typing import TYPE_CHECKING, Any, Literal
 
 import numba
 import numpy as np
 
+from fastrod.errors import InputError
 from fastrod.gpu.device import Device
 from fastrod.kernels.batch import move_to_inputs, pass_parallel, pass_serial
 from fastrod.kernels.chunk import scratch_size
@@ -21,6 +23,28 @@ if TYPE_CHECKING:
 _config: Any = numba.config
 _SMALL = 4 * LANES  # robots below which starting threads costs more than it saves
 NO_PROBES = Probes(np.empty((0, 0), np.int64), np.empty((0, 0, 3)), np.empty((0, 0, 3)), np.empty((0, 0, 0)), np.empty((0, 0, 0)))
+
+
+def check_size(layout: Layout, n_robots: int, outputs: Literal["full", "tip"]) -> None:
+    """`InputError` where so many robots, or points, are more than this machine's memory: what the observer remembers, and one shape."""
+    n_tendons = len(layout.tendon_segment)
+    n_x = max(3 + len(layout.free_tendon), 2 * len(layout.first_tendon))
+    points = len(layout.first_tendon) * layout.n_steps + 1
+    each = 4 * n_x * (len(layout.row_tendon) + 8) + 8 * (n_x + 3 * n_tendons + 24) + (8 * 22 * points if outputs == "full" else 0)
+    if (needed := each * n_robots) > (most := _physical_memory()):
+        less = "take fewer, or outputs='tip'" if outputs == "full" else "take fewer"
+        raise InputError(
+            f"n_robots {n_robots:.6g} with {points:.6g} points each would take {needed / 2**30:.3g} GiB, and this machine has "
+            f"{most / 2**30:.3g} GiB; {less}."
+        )
+
+
+def _physical_memory() -> int:
+    """Bytes; where the system does not say, more than any machine has that this runs on."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return 2**42
 
 
 class Passes:

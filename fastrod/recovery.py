@@ -31,8 +31,10 @@ class Boundary:
         self._passes.arrive_at(rows, ports)
 
     def recover(self, lost: Ints, warm: Flags, ports: Ports, run: Pass) -> Ints:
-        """`settle` these robots on `ports`: from where they stood before the step, then from the cold guess, then by their loads. (n_robots,)
-        passes that each took, -1 where none of these ways ended below `TOLERANCE`; those that did not arrive stand where they stood."""
+        """`settle` these robots on `ports`: from where they stood before the step, then from the cold guess, then by their loads.
+
+        (n_robots,) passes that each took, -1 where none of these ways ended below `TOLERANCE`: they stand where they stood.
+        """
         self.put_back(lost, ports)
         known = warm if self._kept is not None else np.zeros_like(warm)
         used = settle(lost, known, self._passes, ports, TOLERANCE, run)

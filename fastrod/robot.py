@@ -21,6 +21,7 @@ _LONGEST = 10.0  # m; a longer segment was given in mm
 
 _SHORTEST = 1e-6  # m
 _STIFF = (1e-20, 1e15)  # N m^2
+_GRAVITY = (0.0, 0.0, -9.81)  # m/s^2
 _MOST = 1e9  # of any other number, in its unit: beyond it products of a few numbers leave what a float can hold
 
 
@@ -162,8 +163,11 @@ class Robot:
     """World frame [m]."""
     base_quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     """world_from_base, w x y z; d3 of the base is the rod's first tangent."""
-    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
-    """World frame [m/s^2]."""
+    gravity: tuple[float, float, float] = _GRAVITY
+    """World frame [m/s^2], of a robot that stands free. One that is mounted on a host feels the host's."""
+    states_gravity: bool = False
+    """The robot says itself which gravity it feels: a robot file with `[world] gravity`, or any other than the usual. A host in whose
+    world it is another then refuses it."""
     log_points: tuple[float, ...] = ()
     """Arclengths of the further measured points p1 ... pk of a run log [m]."""
     effects: tuple[Mapping[str, Any], ...] = ()
@@ -182,6 +186,8 @@ class Robot:
             norm = math.hypot(*self.base_quaternion)
             raise RobotError(f"Robot.base_quaternion {list(self.base_quaternion)!r} has norm {norm:.6g}; it must be 1.")
         _finite("Robot.gravity", self.gravity, 3, "m/s^2")
+        if tuple(self.gravity) != _GRAVITY:
+            object.__setattr__(self, "states_gravity", True)
         self._check_sensor()
         paper = [segment.mode == "paper" for segment in self.segments]
         if any(paper) and not all(paper):

@@ -63,6 +63,7 @@ def loads(text: str, where: str = "robot file") -> Robot:
         "base_position": base.get("position"),
         "base_quaternion": base.get("quaternion"),
         "gravity": world.get("gravity"),
+        "states_gravity": True if "gravity" in world else None,
         "log_points": log.get("points"),
         "effects": data.get("effect"),
         "fit": data.get("fit"),
@@ -87,7 +88,8 @@ def dumps(robot: Robot) -> str:
     data: dict[str, Any] = {"name": robot.name}
     data["segment"] = [_written(segment) for segment in robot.segments]
     data["base"] = {"position": list(robot.base_position), "quaternion": list(robot.base_quaternion)}
-    data["world"] = {"gravity": list(robot.gravity)}
+    if robot.states_gravity:
+        data["world"] = {"gravity": list(robot.gravity)}
     if robot.effects:
         data["effect"] = [dict(effect) for effect in robot.effects]
     if robot.log_points:
@@ -169,6 +171,7 @@ _TYPES: dict[str, Any] = {
     "base_position": tuple[float, float, float],
     "base_quaternion": tuple[float, float, float, float],
     "gravity": tuple[float, float, float],
+    "states_gravity": bool,
     "log_points": tuple[float, ...],
     "fit": dict[str, dict[str, float | bool]],
     "sensor": dict[str, float | tuple[float, ...]],

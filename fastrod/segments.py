@@ -7,7 +7,7 @@ from typing import TypedDict
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fastrod.errors import InputError, RobotError, shown
+from fastrod.errors import InputError, RobotError, refuse_masked, shown
 from fastrod.robot import Robot
 from fastrod.types import Floats
 from fastrod.wiring import wire
@@ -70,6 +70,7 @@ class SegmentActions:
 
     def inputs(self, action: ArrayLike) -> WireInputs:
         """Wire lengths and extensions of an action (..., 3 n_segments) [m]. Raises `InputError` where it is not one."""
+        refuse_masked("action", action)
         try:
             a = np.asarray(action, dtype=np.float64)
         except (TypeError, ValueError, OverflowError) as error:

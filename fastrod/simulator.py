@@ -17,12 +17,12 @@ from fastrod.contact.engine import Engine
 from fastrod.contact.frames import blended
 from fastrod.contact.scene import ContactScene
 from fastrod.contact.step import COLD_PASSES, Ways, contact_step
-from fastrod.errors import InputError, RobotError, shown
+from fastrod.errors import InputError, RobotError, refuse_masked, shown
 from fastrod.gpu import device as devices
 from fastrod.guess import cold_start
-from fastrod.inputs import Inputs, PointForces, Reader
+from fastrod.inputs import Inputs, PointForces, Reader, named_inputs
 from fastrod.kernels.dense import between_nodes
-from fastrod.passes import Passes
+from fastrod.passes import Passes, check_size
 from fastrod.recovery import Boundary, what_to_do
 from fastrod.response import Linear, stretch
 from fastrod.robot import Robot
@@ -36,7 +36,7 @@ _config: Any = numba.config
 _AT_REST = 1e-6  # m: contact and boundary of a step, where `settle` has a tolerance of its own
 _ALONG = ("position", "rotation", "curvature", "arclength", "moment", "force", "tension", "path_length", "base_wrench")
 _LOST = 0.1  # of the robot's length: a residual beyond it is no shape of this robot
-_DIVERGED = "the observer diverged, and settling on the same inputs found no shape either"
+_DIVERGED = "the observer diverged, and no shape was found on these inputs"
 
 
 class Simulator:
@@ -64,6 +64,7 @@ class Simulator:
         hold_gain: float = 0.0,
         feel_contact: bool = True,
         device: devices.Device = "cpu",
+        recover: bool = True,
     ) -> None:
         """Compile `robot` (one for all, or a list with one each) for `n_robots` and a time step `dt` [s].
 
@@ -73,6 +74,8 @@ class Simulator:
         through everything. Without `feel_contact` they do so all the same, and the scene is for `clearance`, `swept_clearance` and
         `ray_cast` alone. While a robot's last residual is below `hold_gain` [m] (and it feels no contact) a step corrects the
         boundary by the gain that it has, without new sensitivities: a third of the time, and the observer lags by about so much.
+        Without `recover` a robot whose pass diverges in a step is lost at once: a step then ends after its one pass, where
+        the search for a shape that does not exist takes some thousand.
 
         With `device="cuda"` the passes run on an NVIDIA GPU, one thread a robot, from the same source: numbers agree to rounding. The
         memory of the observer stays there; a step sends the inputs that changed and brings back what `outputs` asks for, so for
@@ -104,12 +107,14 @@ class Simulator:
         if self.device == "cuda" and contact is not None and feel_contact:
             raise InputError("contact was given with device 'cuda', where rods feel none; take device='cpu', or feel_contact=False.")
         self.hold_gain = float(hold_gain)
+        self.recover = bool(recover)
         self.robots = tuple(robots)
         self.n_robots = int(n_robots)
         self.dt = float(dt)
         self.observer = observer or Observer()
         self.outputs = outputs
         self._layout, self._plain, rest = compile_robots(self.robots, int(points_per_segment))
+        check_size(self._layout, int(n_robots), outputs)
         threads = threads or numba.get_num_threads()
         self._passes = Passes(self._layout, self._plain, self.n_robots, threads, carry=observer is not None, device=self.device)
         self._reader = Reader(self._layout, self._plain, rest, self.n_robots)
@@ -132,6 +137,13 @@ class Simulator:
             self._engine = Engine(contact, rods, self._plain.length, self.n_points, threads)
         self._felt = self._engine if feel_contact else None  # the engine, where contact bends the rods
 
+    def __repr__(self) -> str:
+        contact = "" if self.contact is None else f", contact with {', '.join(self.contact.names) or 'rods alone'}"
+        device = "" if self.device == "cpu" else f", device={self.device!r}"
+        others = " and others" if any(robot is not self.robots[0] for robot in self.robots) else ""
+        numbers = f"n_robots={self.n_robots}, dt={self.dt:g} s, n_points={self.n_points}"
+        return f"Simulator({self.robots[0].name!r}{others}, {numbers}{contact}{device})"
+
     @property
     def n_points(self) -> int:
         """Nodes along the whole robot."""
@@ -142,6 +154,7 @@ class Simulator:
         """The last state. Raises `InputError` before the first step."""
         return self._last("state")[0]
 
+    @named_inputs
     def step(
         self,
         tendon_length: ArrayLike | None = None,
@@ -154,6 +167,7 @@ class Simulator:
         point_force: PointForces | None = None,
         follower_tip_force: ArrayLike | None = None,
         base_pose: ArrayLike | None = None,
+        gravity: ArrayLike | None = None,
         obstacle_pose: Mapping[str, ArrayLike] | None = None,
         obstacle_velocity: Mapping[str, ArrayLike] | None = None,
         derive: bool = False,
@@ -165,11 +179,14 @@ class Simulator:
         tendon_tension segments [N]; `extension` (n_segments,) [m]; `tip_force` [N], `tip_moment` [N m], `line_force`
         [N/m], each (3,) world, the last also (n_segments, points, 3), linear between evenly spaced points, on top of the
         self-weight; `point_force` (arclength [m], force (3,) world [N]) pairs; `follower_tip_force` (3,) material frame of
-        the tip [N]; `base_pose` (7,) position [m] and quaternion w x y z.
+        the tip [N]; `base_pose` (7,) position [m] and quaternion w x y z; `gravity` (3,) world [m/s^2], of the world that the
+        robot stands in at this step where that is another than its own.
 
         The state belongs to the boundary that the last pass predicts for these tendon lengths and tip forces; what other
         inputs change is corrected with the next pass, and shows as `residual`; wires that only grow along with an extension
-        count as unchanged. When the tip force of running robots first
+        count as unchanged. Robots whose pass diverges are settled on these inputs, from where they stood, then from
+        nothing (on a GPU from nothing at once), and `passes` counts what that took; the others keep every bit. When the
+        tip force of running robots first
         moves, one pass more learns the gain for it (`passes` is 2). Raises `InputError` on a wrong shape, or where no
         robot's input is usable; a single bad row only clears that robot's `ok`.
 
@@ -181,14 +198,16 @@ class Simulator:
         `derive` says that `jacobian(turning=True)` will be asked for: a robot or two without contact and effects then get it from the
         same pass, at the shape of the state, at little cost.
         """
-        given = Inputs(tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force, follower_tip_force, base_pose)
+        given = Inputs(
+            tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force, follower_tip_force, base_pose, gravity
+        )  # fmt: skip
         if self._felt is not None:
             return self._touch(self._felt, given, obstacle_pose, obstacle_velocity, None)
         moved = self._moved_obstacles(obstacle_pose, obstacle_velocity)
         tracked = self._passes.tracks_force
         ports, rows = self._read(given)
         self._move_obstacles(moved)
-        boundary = Boundary(self._passes)
+        boundary = Boundary(self._passes) if self.recover else None
         process, noise = self.observer.process_noise * self.dt, self.observer.measurement_noise / self.dt
         before = self._ports
         learns = before is not None and not tracked and self._passes.tracks_force
@@ -217,7 +236,7 @@ class Simulator:
         if len(rows) < self.n_robots:
             read = np.isin(self._all, rows)
             ok, passes = ok & read, np.where(read, passes, 0)
-        if not ok[rows].all():
+        if boundary is not None and not ok[rows].all():
             lost, self._derived = rows[~ok[rows]], None
             used = boundary.recover(lost, self._warm, ports, lambda which, at: self._pass_at_rest(which, at, shape))
             self._passes.collect(shape)
@@ -225,6 +244,7 @@ class Simulator:
             passes = np.where(used < 0, -1, passes + used)
         return self._finish(ports, shape, ok, passes, _DIVERGED, rows[~ok[rows]])
 
+    @named_inputs
     def settle(
         self,
         tendon_length: ArrayLike | None = None,
@@ -237,6 +257,7 @@ class Simulator:
         point_force: PointForces | None = None,
         follower_tip_force: ArrayLike | None = None,
         base_pose: ArrayLike | None = None,
+        gravity: ArrayLike | None = None,
         obstacle_pose: Mapping[str, ArrayLike] | None = None,
         obstacle_velocity: Mapping[str, ArrayLike] | None = None,
         tolerance: float = 1e-9,
@@ -252,7 +273,9 @@ class Simulator:
         a contact scene.
         """
         _check_positive("tolerance", tolerance, "m")
-        given = Inputs(tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force, follower_tip_force, base_pose)
+        given = Inputs(
+            tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force, follower_tip_force, base_pose, gravity
+        )  # fmt: skip
         if self._felt is not None:
             if rows is not None:
                 raise InputError("settle with rows is for simulators without a contact scene; settle all, or restore a snapshot's rows.")
@@ -280,7 +303,7 @@ class Simulator:
             stretch(self._passes, rows, ports.extension - start.extension)
         engine.given_arclength, engine.given_force = self._reader.loads
         engine.move(poses, velocities, self.dt)
-        boundary = Boundary(self._passes)
+        boundary = Boundary(self._passes)  # in contact a robot that is lost stands where it stood, recovered or not
         shape = self._passes.new_shape("full", True)
         passes = np.zeros(self.n_robots, np.int64)
 
@@ -294,7 +317,10 @@ class Simulator:
             self._passes.run(which, at, into, feed=True, carry=self._passes.carry, process=process, noise=noise)
             passes[which] += 1
             well = self._passes.finite & (into.residual < _LOST * self._passes.params.reach) & np.isin(self._all, which)
-            if len(lost := which[~well[which]]):
+            lost = which[~well[which]]
+            if len(lost) and not self.recover:
+                boundary.put_back(lost, at)
+            elif len(lost):
                 used = boundary.recover(lost, self._warm, at, lambda some, there: self._pass_at_rest(some, there, into))
                 passes[lost] += np.abs(used[lost])
                 well[lost] = used[lost] > 0
@@ -351,7 +377,8 @@ class Simulator:
             self._passes.memory.covariance[rows] = 0.0
         ok = np.zeros(self.n_robots, bool)
         ok[rows] = passes[rows] > 0
-        return self._finish(ports, shape, ok, passes, f"settle did not bring the boundary residual below {tolerance:g} m", rows[~ok[rows]], only)
+        reason = f"settle did not bring the boundary residual below {tolerance:g} m"
+        return self._finish(ports, shape, ok, passes, reason, rows[~ok[rows]], only)
 
     def _pass_at_rest(self, rows: Ints, ports: Ports, shape: Shape) -> Floats:
         """A pass on frozen inputs; the residual of these robots [m]."""
@@ -364,6 +391,7 @@ class Simulator:
         Between nodes the rod is integrated from the node before, so the answer has the integrator's order everywhere.
         """
         state, ports = self._full("shape"), self._last("shape")[1]
+        refuse_masked("arclength", arclength)
         try:
             s = np.asarray(arclength, dtype=np.float64)
         except (TypeError, ValueError, OverflowError) as error:
@@ -430,6 +458,8 @@ class Simulator:
         """
         engine = self._contact("set_free")
         k = engine.scene.index(obstacle)
+        for name, given in (("translation", translation), ("rotation", rotation), ("center", center)):
+            refuse_masked(name, given)
         try:
             numbers = np.concatenate([np.ravel(translation), np.ravel(rotation), np.ravel(center)]).astype(float)
         except (TypeError, ValueError, OverflowError):
@@ -529,6 +559,8 @@ class Simulator:
         """Go back to a `snapshot` of this simulator, or only these robots: indices or a mask. Robots that were replaced since keep their
         numbers, and take over the boundary alone; a whole simulator of which some were replaced is refused. Raises `InputError`
         then, and for a snapshot of another simulator."""
+        if not isinstance(snapshot, Snapshot):
+            raise InputError(f"the snapshot is {shown(snapshot)}; give what Simulator.snapshot() returned.")
         if snapshot.memory.x.shape[0] != self.n_robots or snapshot.memory.length_before.shape[1] != len(self._layout.row_tendon):
             raise InputError("the snapshot is of another simulator; its robots, tendons or their number differ.")
         if [memory.shape for memory in snapshot.effects] != [link.memory.shape for link in self._chain.links]:
@@ -615,6 +647,7 @@ class Simulator:
     def _mask(self, rows: ArrayLike) -> Flags:
         """(n_robots,) of indices or a mask."""
         mask = np.zeros(self.n_robots, bool)
+        refuse_masked("rows", rows)
         try:
             which = np.asarray(rows)
             if which.ndim > 1 or (which.dtype.kind == "b" and which.shape != mask.shape):
@@ -637,7 +670,9 @@ class Simulator:
         if self._chain:
             bare, params = self._bare, self._passes.params
             self._bare = ports
-            ports, self._passes.params = self._chain.act(ports, self._plain, self._state, self.dt, self._layout.n_steps, out)
+            ports, self._passes.params = self._chain.act(
+                ports, self._plain, self._state, self.dt, self._layout.n_steps, out, gravity=self._reader.gravity,
+            )  # fmt: skip
             if only is not None and bare is not None:
                 self._bare = taken_each(self._bare, bare, ~only)
                 self._passes.params = taken_each(self._passes.params, params, ~only)
@@ -669,9 +704,7 @@ class Simulator:
     def _sentence(self, reason: str, ports: Ports, shape: Shape, i: int) -> str:
         return f"{reason}; residual {shape.residual[i]:.3g} m; {what_to_do(self._passes, ports, i)}."
 
-    def _finish(
-        self, ports: Ports, shape: Shape, ok: Flags, passes: Ints, reason: str, lost: Ints, only: Flags | None = None
-    ) -> State:
+    def _finish(self, ports: Ports, shape: Shape, ok: Flags, passes: Ints, reason: str, lost: Ints, only: Flags | None = None) -> State:
         """Note who is not ok, so that nothing continues on NaN, and hand out the state. What a pass wrote of the robots `lost` is no
         shape of theirs: they keep the one before."""
         problems = dict(self._reader.problems)

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
+
 from fastrod.contact.contacts import Contacts
 from fastrod.contact.engine import Snapshot as ContactSnapshot
 from fastrod.errors import InputError
@@ -36,7 +38,7 @@ class Observer:
                 raise InputError(f"Observer.{name} is {value!r}; it must be positive and finite.")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class State:
     """The robots after a step: new arrays, robot axis first, world frame. With outputs="tip", those along the rod are empty.
 
@@ -67,15 +69,30 @@ class State:
     base_wrench: Floats
     """(n_robots, 6) force [N], then moment about the base point [N m], that the robot exerts on its host."""
     residual: Floats
-    """(n_robots,) largest boundary residual [m]: lengths as they are, moments times l^2/EI, forces times l^3/EI."""
+    """(n_robots,) largest boundary residual [m]: lengths as they are, moments times l^2/EI, forces times l^3/EI. That of what was tried,
+    where that is not ok."""
     ok: Flags
-    """(n_robots,) after `settle`: it converged. After `step`: it did not diverge; `residual` says how far the observer is behind."""
+    """(n_robots,) after `settle`: it converged. After `step`: it did not diverge; `residual` says how far the observer is behind. A robot
+    that is not ok has the last shape that was solved, nan where there is none or its input cannot be used."""
     passes: Ints
-    """(n_robots,) forward passes that were spent; -1 where `settle` did not converge, 0 where bad input left it nothing to do."""
+    """(n_robots,) forward passes that were spent: after `step` 1, or more where it settled a robot whose pass diverged; -1 where no shape
+    was found, 0 where bad input left nothing to do."""
     problems: Mapping[int, str]
     """Robot index -> what is wrong with it, for the robots that are not ok."""
     contacts: Contacts | None = None
     """What touches what; None without a contact scene."""
+
+    def __repr__(self) -> str:
+        n = len(self.ok)
+        along = f"n_points={self.position.shape[1]}" if len(self.position) else "tip only"
+        residual = np.max(self.residual, where=self.ok, initial=0.0)
+        text = f"State(n_robots={n}, {along}, ok={int(self.ok.sum())} of {n}, residual<={residual:.3g} m"
+        if self.contacts is not None:
+            text += f", contacts={int(self.contacts.count.sum())}"
+        if self.problems:
+            i = min(self.problems)
+            text += f", robot {i}: {self.problems[i]!r}"
+        return text + ")"
 
 
 class Pose(NamedTuple):

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from fastrod.contact.engine import MOST_FOUND, Engine
 from fastrod.contact.frames import between, frames_of
-from fastrod.errors import InputError
+from fastrod.errors import InputError, refuse_masked
 from fastrod.kernels.batch import cast_rays, look_at_rods, look_serial
 from fastrod.kernels.bvh import STACK
 from fastrod.kernels.forces import Scenery
@@ -105,6 +105,8 @@ def _obstacles_move(engine: Engine, poses_before: Floats) -> Floats:
 def ray_cast(engine: Engine, origin: ArrayLike, direction: ArrayLike, longest: float) -> Hits:
     """Rays (n_robots, n_rays, 3) or (n_rays, 3), world, against the obstacles where they are now; directions need not be unit."""
     n = len(engine.gap)
+    refuse_masked("origin", origin)
+    refuse_masked("direction", direction)
     try:
         o, v = (np.asarray(a, dtype=np.float64) for a in (origin, direction))
         o, v = (np.broadcast_to(a, (n, a.shape[-2] if a.ndim > 1 else 1, 3)) for a in (o, v))

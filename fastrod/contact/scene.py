@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fastrod.contact.geometry import Obstacle
-from fastrod.errors import InputError, UnknownNameError, nearest
+from fastrod.errors import InputError, UnknownNameError, nearest, refuse_masked
 from fastrod.robot import Robot
 from fastrod.types import Floats, Ints, Layout, Params, Rods
 
@@ -155,6 +155,7 @@ class ContactScene:
 
 
 def _rows(name: str, value: ArrayLike, width: int, n_robots: int, unit: str) -> Floats:
+    refuse_masked(name, value)
     try:
         a = np.atleast_2d(np.asarray(value, float))
     except (TypeError, ValueError, OverflowError) as error:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from fastrod.errors import HostError, InputError, nearest
+from fastrod.types import Floats
 
 
 def pybullet() -> Any:
@@ -71,6 +72,12 @@ class Bullet:
     def dt(self) -> float:
         """Time step of this world [s]."""
         return float(self.getPhysicsEngineParameters()["fixedTimeStep"])
+
+    @property
+    def gravity(self) -> Floats:
+        """(3,) of this world [m/s^2]."""
+        now = self.getPhysicsEngineParameters()
+        return np.array([now[f"gravityAcceleration{axis}"] for axis in "XYZ"])
 
     def check(self, body: int, link: int = -1) -> None:
         """`HostError` where this world has no such body, or the body no such link."""

@@ -23,7 +23,7 @@ class CarriedRod(ABC):
     """One rod on one body of an engine, both ways: the body's motion moves the rod's base, the body feels the base's wrench.
 
     Bodies that the rod touches are its obstacles: contact bends the rod, its host feels the force, and the body is pushed with it. Any
-    other body meets the rod's capsules.
+    other body meets the rod's capsules. The rod's weight is that in the gravity of the world, as it is at each step.
 
     A step is `rod.step(...)`, or for several rods in one world `begin` each, one step of the engine, `end` each.
     """
@@ -42,6 +42,10 @@ class CarriedRod(ABC):
     @abstractmethod
     def _look(self) -> None:
         """Before a step: `HostError` where the engine's time step is no longer `dt`."""
+
+    @abstractmethod
+    def _gravity(self) -> Floats:
+        """(3,) of the engine's world as it is now [m/s^2]."""
 
     @abstractmethod
     def _shapes(self) -> Sequence[int]:
@@ -107,7 +111,7 @@ class CarriedRod(ABC):
         """Where the rod will be at the end of the next step; its wrench goes to the host, its pushes to what it touches.
 
         A step that cannot be solved (`state.ok` is false, and `state.problems` says why) leaves the rod where it came to, with half the
-        forces of the step before; after a few in a row, without contact at once, the rod settles anew. Raises `InputError` as
+        forces of the step before; after a few in a row a rod in contact settles anew. Raises `InputError` as
         `Simulator.step`, `HostError` where the rod is lost, where 25 steps in a row cannot be solved, or where the world's time step has
         changed.
         """
@@ -151,9 +155,10 @@ class CarriedRod(ABC):
             touched.forget()
 
     def _scene(self) -> dict[str, Any]:
-        """What the simulator is told of the bodies around."""
+        """What the rod is told of the world: its gravity, and the bodies around."""
+        told: dict[str, Any] = {"gravity": self._gravity()}
         if not self.touched:
-            return {}
+            return told
         poses: dict[str, Floats] = {}
         velocities: dict[str, Floats] = {}
         for k, touched in enumerate(self.touched):
@@ -162,7 +167,7 @@ class CarriedRod(ABC):
                 self.simulator.set_free(name, *touched.give(), body=k)
             poses |= p
             velocities |= v
-        return {"obstacle_pose": poses, "obstacle_velocity": velocities}
+        return told | {"obstacle_pose": poses, "obstacle_velocity": velocities}
 
 
 def rod_of(
@@ -173,6 +178,17 @@ def rod_of(
     if touched:
         scene = ContactScene(obstacles=[part.obstacle for body in touched for part in body.parts], max_contacts=max_contacts)
     return Rod(robot, dt=dt, contact=scene, points_per_segment=points_per_segment, capsules_per_segment=capsules_per_segment)
+
+
+def check_gravity(robot: Robot, gravity: Floats, how: str) -> None:
+    """Raises `HostError` where a robot with weight says itself that it feels another gravity than this (3,) of its host's world;
+    `how` says how that is changed."""
+    weighs = bool(robot.effects) or any(segment.line_density > 0.0 for segment in robot.segments)
+    if robot.states_gravity and weighs and not np.allclose(robot.gravity, gravity, rtol=1e-6, atol=1e-6):
+        raise HostError(
+            f"robot {robot.name!r} states gravity {[float(g) for g in robot.gravity]} m/s^2, and the world of its host has "
+            f"{gravity.round(6).tolist()}; a mounted rod feels its host's: leave [world] gravity out of the robot file, or {how}."
+        )
 
 
 def check_touch(touch: object) -> None:
@@ -189,8 +205,9 @@ def check_contact(relaxation: float, friction: float) -> None:
 
 
 def _checked(inputs: dict[str, Any]) -> dict[str, Any]:
+    own = [name for name in INPUTS if name != "gravity"]
     for name in inputs:
-        if name not in INPUTS:
-            why = "the host gives it" if name == "base_pose" else nearest(name, INPUTS)
+        if name not in own:
+            why = "the host's world gives it" if name in ("base_pose", "gravity") else nearest(name, own)
             raise InputError(f"a mounted rod has no input {name!r}; {why}")
     return inputs

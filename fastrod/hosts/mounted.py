@@ -9,8 +9,9 @@ import numpy as np
 
 from fastrod.errors import HostError
 from fastrod.hosts.bodies import RodBodies
-from fastrod.hosts.carried import CarriedRod, check_contact, check_touch, rod_of
+from fastrod.hosts.carried import CarriedRod, check_contact, check_gravity, check_touch, rod_of
 from fastrod.hosts.link import BulletLink
+from fastrod.hosts.rod import check_robot
 from fastrod.hosts.surroundings import Touched
 from fastrod.robot import Robot
 from fastrod.types import Floats
@@ -34,6 +35,8 @@ class MountedRod(CarriedRod):
             raise HostError(f"host is {host!r}; give BulletLink(world, body, link), the link that carries the rod.")
         super().__init__(host, host.bullet.dt)
         self.host, self.bullet = host, host.bullet
+        check_robot(robot)
+        check_gravity(robot, self._gravity(), "setGravity() in the world")
         check_contact(relaxation, friction)
         check_touch(touch)
         links = [_link_of(t) for t in touch]
@@ -59,6 +62,9 @@ class MountedRod(CarriedRod):
                 f"the world's time step is now {self.bullet.dt:g} s, and the rod was mounted for {self.dt:g} s; "
                 "remove() it and mount it anew."
             )
+
+    def _gravity(self) -> Floats:
+        return self.bullet.gravity
 
     def _shapes(self) -> Sequence[int]:
         return self.bodies.ids

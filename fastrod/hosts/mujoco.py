@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from fastrod.contact import ContactScene
 from fastrod.errors import HostError, InputError, nearest
-from fastrod.hosts.carried import CarriedRod, check_contact, check_touch, rod_of
+from fastrod.hosts.carried import CarriedRod, check_contact, check_gravity, check_touch, rod_of
 from fastrod.hosts.mujoco_body import MujocoBody, body_number, mujoco
 from fastrod.hosts.mujoco_contacts import Feedback, Felt, read
 from fastrod.hosts.mujoco_touched import TouchedBody
@@ -90,6 +90,7 @@ class MujocoRod(CarriedRod):
         host = MujocoBody(model, data, body, position=position, quaternion=quaternion)
         super().__init__(host, float(model.opt.timestep))
         self.host, self.model, self.data = host, model, data
+        check_gravity(robot, self._gravity(), "set model.opt.gravity")
         check_contact(relaxation, friction)
         check_touch(touch)
         touched = [body_number(model, other) for other in touch]
@@ -135,6 +136,10 @@ class MujocoRod(CarriedRod):
             raise HostError(
                 f"the model's time step is now {self.model.opt.timestep:g} s, and the rod was mounted for {self.dt:g} s; mount it anew."
             )
+
+    def _gravity(self) -> Floats:
+        off = self.model.opt.disableflags & int(mujoco().mjtDisableBit.mjDSBL_GRAVITY)
+        return np.zeros(3) if off else np.array(self.model.opt.gravity)
 
     def _shapes(self) -> Sequence[int]:
         return self._geoms

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from fastrod.contact import ContactScene
 from fastrod.contact.frames import between
-from fastrod.errors import HostError, InputError, RobotError, nearest, shown
+from fastrod.errors import HostError, InputError, RobotError, nearest, refuse_masked, shown
 from fastrod.hosts.capsules import Capsules, along, moved
 from fastrod.hosts.host import Motion
 from fastrod.robot import Robot
@@ -22,7 +22,9 @@ from fastrod.simulator import Simulator
 from fastrod.state import Snapshot, State
 from fastrod.types import Flags, Floats, Ints, Shape
 
-INPUTS = ("tendon_length", "tension", "extension", "tip_force", "tip_moment", "line_force", "point_force", "follower_tip_force")
+INPUTS = (
+    "tendon_length", "tension", "extension", "tip_force", "tip_moment", "line_force", "point_force", "follower_tip_force", "gravity",
+)  # fmt: skip
 """What an engine may tell a rod beside its base: keyword arguments of `Simulator.step`."""
 OBSTACLES = ("obstacle_pose", "obstacle_velocity")
 """The same of rods with a contact scene."""
@@ -54,6 +56,8 @@ class RodSnapshot(NamedTuple):
 @final
 class Rod:
     """A robot on a base that another engine moves, or several on a base each.
+
+    The rod's weight is that in the `gravity` (3,) that the engine gives, world [m/s^2]; until it gives one, in the robot's own.
 
     With `n_robots` every array has a robot axis first; without it there is one rod and no such axis, but in `state`, which always has
     one. Inputs that are not given stay as they were given last; the wires are those of the straight robot until then.
@@ -162,7 +166,7 @@ class Rod:
         there in the rod's own steps.
 
         A step that cannot be solved (`state.ok` is false, and `state.problems` says why) leaves the rod where it came to, with half the
-        wrench of the engine's step before; after a few in a row, without contact at once, the rod settles anew. Of several rods, each
+        wrench of the engine's step before; after a few in a row a rod in contact settles anew. Of several rods, each
         fails alone: one whose input cannot be used, or that is lost, keeps shape, capsules and base as well. Raises `InputError` for
         unusable input, `HostError` where all rods are lost, one was lost before it had a shape, or 25 steps in a row could not be solved
         of any rod; then nothing has moved.
@@ -243,8 +247,8 @@ class Rod:
     def _solved(self, base: Floats, given: dict[str, Any], around: dict[str, Any], half: Floats) -> None:
         """One step of the rod itself; `half` (n_robots, 6) the wrench of those that fail."""
         state = self.simulator.step(base_pose=base, **around, **given)
-        again = ~state.ok & (state.passes != 0) & ((self._failed >= _PATIENCE) | (self.simulator.contact is None))
-        if again.any():
+        again = ~state.ok & (state.passes != 0) & (self._failed >= _PATIENCE)
+        if again.any() and self.simulator.contact is not None:  # without contact the step itself has settled
             state = self._anew(again, base, given, around)
         self._keep(state, given, around, base, half)
         self._failed = np.where(state.ok, 0, self._failed + 1)
@@ -293,6 +297,8 @@ class Rod:
             if name not in known:
                 why = "it needs a contact scene: Rod(robot, contact=...)." if name in OBSTACLES else nearest(name, known)
                 raise InputError(f"a rod has no input {name!r}; {why}")
+        for name, value in inputs.items():
+            refuse_masked(name, value)
         inputs = {name: _copied(value) for name, value in inputs.items()}
         around = {name: inputs[name] for name in OBSTACLES if name in inputs}
         return self._inputs | {name: value for name, value in inputs.items() if name not in OBSTACLES}, around
@@ -341,6 +347,7 @@ class Rod:
 
     def _rows(self, name: str, value: ArrayLike, width: int, what: str) -> Floats:
         """(width,), or (n_robots, width)."""
+        refuse_masked(name, value)
         shapes = f"({width},)" if self.n_robots is None else f"({width},) or ({self.n_robots}, {width})"
         try:
             a = np.array(value, dtype=float)

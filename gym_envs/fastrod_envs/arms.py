@@ -82,10 +82,7 @@ class SoftArm:
         self.action = np.clip(action, self.lower, self.upper)
         self.base = self.base if base is None else base
         given: dict[str, Any] = {"base_pose": self.base, **self.actions.inputs(self.action)}
-        state = self.simulator.step(**given)
-        if not state.ok[0]:
-            state = self.simulator.settle(**given)
-        self._keep(state)
+        self._keep(self.simulator.step(**given))
 
     def settle(self, action: Floats) -> None:
         """Come to rest where an action, cut to its range, has it. Raises `HostError` where it is lost."""

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fastrod.errors import InputError
+from fastrod.errors import InputError, refuse_masked
 from fastrod.types import Flags, Floats, Ints
 from fastrod_envs.streams import Streams
 from fastrod_envs.task import Outcome, Task, bounds
@@ -61,6 +61,7 @@ class Episodes:
 
     def checked(self, actions: ArrayLike) -> Floats:
         """(n, n_actions) within -1 and 1. Raises `InputError` on a wrong shape and on what is not finite."""
+        refuse_masked("action", actions)
         try:
             a = np.asarray(actions, dtype=np.float64)
         except (TypeError, ValueError) as error:

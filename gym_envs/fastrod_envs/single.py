@@ -52,7 +52,7 @@ class SingleEnv(gymnasium.Env[Singles, Any]):
 
     def step(self, action: ArrayLike) -> tuple[Singles, float, bool, bool, dict[str, Any]]:
         """One step. Raises `InputError` on a wrong shape and on what is not finite; then nothing was simulated."""
-        moment = self._episodes.advance(np.asarray(action)[None])
+        moment = self._episodes.advance(np.asanyarray(action)[None])
         return (
             self._episodes.observation()[0], float(moment.reward[0]), bool(moment.terminated[0]), bool(moment.truncated[0]),
             _first(self._episodes.info(moment)),
