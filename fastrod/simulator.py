@@ -123,6 +123,7 @@ class Simulator:
         self._bare: Ports | None = None
         self._all = np.arange(self.n_robots)
         self._warm = np.zeros(self.n_robots, bool)
+        self._shaped = np.zeros(self.n_robots, bool)  # whose state holds a shape that was solved, of this very robot
         self._ports: Ports | None = None
         self._given = Inputs()
         self._state: State | None = None
@@ -303,7 +304,7 @@ class Simulator:
             stretch(self._passes, rows, ports.extension - start.extension)
         engine.given_arclength, engine.given_force = self._reader.loads
         engine.move(poses, velocities, self.dt)
-        boundary = Boundary(self._passes)  # in contact a robot that is lost stands where it stood, recovered or not
+        boundary = Boundary(self._passes) if self.recover else None
         shape = self._passes.new_shape("full", True)
         passes = np.zeros(self.n_robots, np.int64)
 
@@ -318,9 +319,7 @@ class Simulator:
             passes[which] += 1
             well = self._passes.finite & (into.residual < _LOST * self._passes.params.reach) & np.isin(self._all, which)
             lost = which[~well[which]]
-            if len(lost) and not self.recover:
-                boundary.put_back(lost, at)
-            elif len(lost):
+            if boundary is not None and len(lost):
                 used = boundary.recover(lost, self._warm, at, lambda some, there: self._pass_at_rest(some, there, into))
                 passes[lost] += np.abs(used[lost])
                 well[lost] = used[lost] > 0
@@ -343,7 +342,7 @@ class Simulator:
             self._reader.problems.setdefault(int(i), why)
         # a cold robot has no last inputs to go on from: it begins anew
         gone = np.isin(self._all, rows) & ~ok
-        held = gone & engine.tracked & ~engine.whole_worlds(~self._warm)
+        held = gone & (engine.led | self.recover) & engine.tracked & ~engine.whole_worlds(~self._warm)
         if held.any() and start is not None:
             ports = blended(start, ports, done)
         self._passes.arrive_at(np.flatnonzero(held | (ok & engine.led)), ports)
@@ -567,6 +566,7 @@ class Simulator:
             raise InputError("the snapshot is of another simulator; its effects differ.")
         if (snapshot.contact is None) != (self._engine is None):
             raise InputError("the snapshot is of another simulator; only one of them has a contact scene.")
+        self._shaped[slice(None) if rows is None else self._mask(rows)] = True
         if rows is not None and self._state is not None and self._ports is not None:
             self._restore_rows(snapshot, self._mask(rows), self._state, self._ports)
             return
@@ -643,6 +643,7 @@ class Simulator:
             every[i] = robot
         self.robots = tuple(every)
         self.reset(mask)
+        self._shaped[which] = False
 
     def _mask(self, rows: ArrayLike) -> Flags:
         """(n_robots,) of indices or a mask."""
@@ -712,6 +713,7 @@ class Simulator:
             problems.setdefault(int(i), self._sentence(reason, ports, shape, int(i)))
         if len(lost):
             shape, ports = self._kept(shape, ports, np.isin(self._all, lost))
+        self._shaped |= ok
         if self._reader.problems or only is not None:  # no pass touched these: they keep the boundary they had
             unread = np.zeros(self.n_robots, bool) if only is None else ~only
             unread[list(self._reader.problems)] = True
@@ -732,13 +734,13 @@ class Simulator:
         return self._hand_out(shape, ok, passes, problems)
 
     def _kept(self, shape: Shape, ports: Ports, lost: Flags) -> tuple[Shape, Ports]:
-        """`lost` robots as in the state before, nan without one; `residual` stays that of what was tried."""
-        if self._state is None or self._ports is None:
-            gone = Shape(*(np.array(a) for a in shape))
-            for a in gone:
-                a[lost if len(a) else slice(0)] = np.nan
-            return gone._replace(residual=shape.residual), ports
-        return taken_shape(shape, self._state, lost)._replace(residual=shape.residual), taken_each(ports, self._ports, lost)
+        """`lost` robots as in the state before, nan where that holds no shape of theirs; `residual` stays that of what was tried."""
+        kept = Shape(*(np.array(a) for a in shape))
+        for a in kept:
+            a[lost if len(a) else slice(0)] = np.nan
+        if (have := lost & self._shaped).any() and self._state is not None and self._ports is not None:
+            kept, ports = taken_shape(kept, self._state, have), taken_each(ports, self._ports, have)
+        return kept._replace(residual=shape.residual), ports
 
     def _hand_out(self, shape: Shape, ok: Flags, passes: Ints, problems: dict[int, str]) -> State:
         contacts = None if self._felt is None else self._felt.contacts(shape, ok)

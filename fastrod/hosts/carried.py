@@ -111,7 +111,7 @@ class CarriedRod(ABC):
         """Where the rod will be at the end of the next step; its wrench goes to the host, its pushes to what it touches.
 
         A step that cannot be solved (`state.ok` is false, and `state.problems` says why) leaves the rod where it came to, with half the
-        forces of the step before; after a few in a row a rod in contact settles anew. Raises `InputError` as
+        forces of the step before; after a few in a row the rod settles anew. Raises `InputError` as
         `Simulator.step`, `HostError` where the rod is lost, where 25 steps in a row cannot be solved, or where the world's time step has
         changed.
         """
@@ -208,6 +208,6 @@ def _checked(inputs: dict[str, Any]) -> dict[str, Any]:
     own = [name for name in INPUTS if name != "gravity"]
     for name in inputs:
         if name not in own:
-            why = "the host's world gives it" if name in ("base_pose", "gravity") else nearest(name, own)
+            why = "the host gives it" if name in ("base_pose", "gravity") else nearest(name, own)
             raise InputError(f"a mounted rod has no input {name!r}; {why}")
     return inputs

@@ -166,7 +166,7 @@ class Rod:
         there in the rod's own steps.
 
         A step that cannot be solved (`state.ok` is false, and `state.problems` says why) leaves the rod where it came to, with half the
-        wrench of the engine's step before; after a few in a row a rod in contact settles anew. Of several rods, each
+        wrench of the engine's step before; after a few in a row the rod settles anew. Of several rods, each
         fails alone: one whose input cannot be used, or that is lost, keeps shape, capsules and base as well. Raises `InputError` for
         unusable input, `HostError` where all rods are lost, one was lost before it had a shape, or 25 steps in a row could not be solved
         of any rod; then nothing has moved.
@@ -248,7 +248,7 @@ class Rod:
         """One step of the rod itself; `half` (n_robots, 6) the wrench of those that fail."""
         state = self.simulator.step(base_pose=base, **around, **given)
         again = ~state.ok & (state.passes != 0) & (self._failed >= _PATIENCE)
-        if again.any() and self.simulator.contact is not None:  # without contact the step itself has settled
+        if again.any():
             state = self._anew(again, base, given, around)
         self._keep(state, given, around, base, half)
         self._failed = np.where(state.ok, 0, self._failed + 1)
