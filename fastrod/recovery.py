@@ -45,10 +45,15 @@ class Boundary:
         return used
 
 
+def overloaded(passes: Passes, ports: Ports, row: int) -> float:
+    """F l^2/EI of a robot's loads where that is beyond what a rod can hold, else 0."""
+    size = float(load_parameter(np.array([row]), passes.params, ports)[0])
+    return size if size > _HOPELESS else 0.0
+
+
 def what_to_do(passes: Passes, ports: Ports, row: int) -> str:
     """The end of a sentence about a robot without a shape: what to change."""
-    size = float(load_parameter(np.array([row]), passes.params, ports)[0])
-    if size > _HOPELESS:
+    if size := overloaded(passes, ports, row):
         force = _of(passes.params.moment_scale, row) / _of(passes.params.reach, row)
         return f"its loads are {size:.3g} times what bends it, EI/l^2 = {force:.3g} N: give less load"
     return "give inputs that a rod of this length can follow, or come there in smaller changes"

@@ -23,7 +23,7 @@ from fastrod.guess import cold_start
 from fastrod.inputs import Inputs, PointForces, Reader, named_inputs
 from fastrod.kernels.dense import between_nodes
 from fastrod.passes import Passes, check_size
-from fastrod.recovery import Boundary, what_to_do
+from fastrod.recovery import Boundary, overloaded, what_to_do
 from fastrod.response import Linear, stretch
 from fastrod.robot import Robot
 from fastrod.rotation import matrix_from_quaternion
@@ -338,7 +338,10 @@ class Simulator:
             tolerance or _AT_REST, passes, engine.scene.max_passes if tolerance is None else COLD_PASSES,
         )  # fmt: skip
         for i in rows[~ok[rows]]:
-            why = engine.why(int(i), float(done[i])) if engine.led[i] else self._sentence(_DIVERGED, ports, shape, int(i))
+            if engine.led[i] and not overloaded(self._passes, ports, int(i)):
+                why = engine.why(int(i), float(done[i]))
+            else:
+                why = self._sentence(_DIVERGED, ports, shape, int(i))
             self._reader.problems.setdefault(int(i), why)
         # a cold robot has no last inputs to go on from: it begins anew
         gone = np.isin(self._all, rows) & ~ok

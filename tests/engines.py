@@ -55,6 +55,9 @@ class BulletStage:
     def set_dt(self, dt) -> None:
         self.world.setTimeStep(dt)
 
+    def set_gravity(self, gravity) -> None:
+        self.world.setGravity(*gravity)
+
 
 class MujocoStage:
     """As `BulletStage`."""
@@ -111,6 +114,9 @@ class MujocoStage:
 
     def set_dt(self, dt) -> None:
         self.model.opt.timestep = dt
+
+    def set_gravity(self, gravity) -> None:
+        self.model.opt.gravity = gravity
 
 
 ENGINES = {"pybullet": BulletStage, "mujoco": MujocoStage}

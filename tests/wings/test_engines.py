@@ -9,8 +9,10 @@ import pytest
 from bullets import soft_robot
 from engines import ENGINES, Cube
 
+import fastrod
 from fastrod.contact import ContactScene, plane
 from fastrod.errors import HostError, InputError
+from fastrod.robotfile import dumps, loads
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.simulator import Simulator
 
@@ -36,6 +38,51 @@ def test_hanging_rod_weighs_on_its_base(stage):
     # the moment of the weight is that of the mass where it hangs: integral of x rho g ds
     lever = 0.8 * 9.81 * np.trapezoid(state.position[0, :, 0], state.arclength[0])
     assert sideways.rod.wrench[4] == pytest.approx(lever, rel=1e-4)  # trapezoid of 21 nodes on a curve: (h / L)^2
+
+
+def test_weight_is_that_of_the_world_as_it_is_now(stage):
+    robot = soft_robot(line_density=0.8)
+    mass = 0.8 * robot.length
+    s = stage(robot, axis="-z")
+    s.rod.step()
+    np.testing.assert_allclose(s.rod.wrench, 0.0, atol=1e-12)  # the robot's own gravity is for robots that stand free
+    for gravity in ((0.0, 0.0, -1.62), (0.3, -0.2, -9.81), (0.0, 0.0, 0.0)):
+        s.set_gravity(gravity)
+        s.rod.step()
+        np.testing.assert_allclose(s.rod.wrench[:3], mass * np.array(gravity), atol=1e-9)
+    with pytest.raises(InputError, match=r"^a mounted rod has no input 'gravity'; the host gives it$"):
+        s.rod.step(gravity=(0.0, 0.0, -9.81))
+
+
+def stating(gravity, line_density=0.8):
+    """A robot whose file states its gravity."""
+    text = dumps(soft_robot(line_density=line_density))
+    return loads(f"{text}\n[world]\ngravity = {list(gravity)}\n")
+
+
+@pytest.mark.parametrize("gravity", [(0.0, 0.0, -9.81), (0.0, -3.0, 0.0)])
+def test_a_robot_that_states_another_gravity_is_not_mounted(stage, gravity):
+    with pytest.raises(HostError) as caught:
+        stage(stating(gravity), gravity=1.62)
+    said = str(caught.value)
+    assert f"'soft' states gravity {list(gravity)} m/s^2, and the world of its host has [0.0, 0.0, -1.62]" in said.replace("-0.0", "0.0")
+    assert "leave [world] gravity out of the robot file, or set" in said
+    assert stage(stating(gravity, line_density=0.0), gravity=1.62).rod.step().ok[0]  # it weighs nothing
+    assert stage(stating((0.0, 0.0, -1.62)), gravity=1.62).rod.step().ok[0]
+
+
+def test_a_load_that_no_rod_holds_leaves_the_shape(stage):
+    robot = fastrod.load_robot("five_segment_reacher")
+    s = stage(robot, axis="x", cubes=[Cube(0.05, 0.1, [0.0, 0.5, 0.5])])
+    rest = s.rod.step()
+    for _ in range(4):
+        state = s.rod.step(tip_force=(0.0, 0.0, -500.0))
+        assert not state.ok[0]
+        assert "give less load" in state.problems[0]
+        assert (state.path_length < 1.01 * robot.length).all()
+        np.testing.assert_allclose(state.position, rest.position, atol=1e-6)
+    np.testing.assert_allclose(s.rod.wrench, 0.0, atol=1e-6)
+    assert s.rod.step(tip_force=(0.0, 0.0, 0.0)).ok[0]
 
 
 def test_rod_follows_a_host_that_moves(stage):

@@ -267,12 +267,15 @@ def test_rod_can_be_taken_out_of_the_model():
 
 
 def test_rod_stands_on_the_world_too():
-    spec, robot = spec_of(""), soft_robot(line_density=0.5)
+    spec, robot = spec_of("", gravity=9.81), soft_robot(line_density=0.5)
     add_capsules(spec, robot, "world")
     model = spec.compile()
     rod = MujocoRod(robot, model, mujoco.MjData(model), 0, position=(0.1, 0.2, 0.3))
     np.testing.assert_allclose(rod.step().position[0, 0], [0.1, 0.2, 0.3])
     assert rod.wrench[2] == pytest.approx(-0.5 * 0.2 * 9.81)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_GRAVITY
+    rod.step()
+    assert rod.wrench[2] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_servos_hold_the_arm_where_it_is_told():

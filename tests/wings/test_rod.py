@@ -87,6 +87,19 @@ def test_substeps_are_those_of_a_simulator_on_the_same_way():
     assert_array_equal(rod.wrench, expected.base_wrench[0])
 
 
+def test_weight_is_that_in_the_gravity_that_the_engine_gives():
+    robot = soft_robot(line_density=0.3)
+    for n, given in ((None, (0.1, 0.0, -1.62)), (2, [(0.1, 0.0, -1.62), (0.0, 0.0, 3.0)])):
+        rod = Rod(robot, n_robots=n)
+        rod.settle(HOME)
+        assert_allclose(rod.wrench[..., 2], -9.81 * 0.3 * robot.length, rtol=1e-9)  # its own, until one is given
+        for more in ({"gravity": given}, {}):  # it stays as it was given
+            rod.advance(HOME, STILL, 0.01, **more)
+            assert_allclose(rod.wrench[..., :3], 0.3 * robot.length * np.array(given), atol=1e-9)
+    with pytest.raises(InputError, match="gravity is a masked array"):
+        rod.advance(HOME, STILL, 0.01, gravity=np.ma.array(given[0], mask=[1, 0, 0]))
+
+
 def test_memory_of_the_wires_runs_on_the_engines_clock():
     # a second-order lag of the wires: what it has done after 60 ms is the same in steps of any length, to the order of the steps
     robot = soft_robot(1)
