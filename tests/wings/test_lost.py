@@ -19,6 +19,7 @@ LIGHT, HEAVY = {"gravity.line_density": (0.05, 0.051)}, {"gravity.line_density":
     ("task", "seed", "randomise"),
     [
         *(("Catch", seed, None) for seed in (50110, 50971, 50990)),
+        *(("TubeInsert", seed, None) for seed in (50081, 50129)),
         *(("Reach", seed, LIGHT) for seed in (5000, 5001, 5004, 5006, 5010)),
         *(("Reach", seed, HEAVY) for seed in (5000, 5005, 5009)),
     ],

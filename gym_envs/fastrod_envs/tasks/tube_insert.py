@@ -49,6 +49,7 @@ NEAR = 0.05
 """Errors are observed up to this length [m]."""
 PATIENCE = 5
 """Steps in a row without a solution after which a robot is lost."""
+_ANEW = 2  # steps in a row without one after which it settles anew, where that leaves it in the tube
 SUBSTEPS = 16
 """Steps of the simulator on the way to a displacement."""
 _BENDS = (1, 2, 4, 5)
@@ -88,7 +89,7 @@ class TubeInsert(Task):
     Reward a step: exp(-d / 0.02 m), d the tip's distance from the goal [m]; -(F - 0.3 N) / 0.3 N, at most -1, where F is beyond
     0.3 N; -10 where it is beyond 0.6 N, which ends the episode, failed. Success: d below 5 mm, and F never beyond 0.3 N in the
     episode. An episode has 50 steps of 100 ms, and may end before by force, or when a robot's shape was not found 5 times in a
-    row (until then it stays where it was). With difficulty 0 the goal is 30 mm deep, the rod is in the middle and not rolled.
+    row (it stays where it was; from the third time on it settles anew, if it is in the tube then). With difficulty 0 the goal is 30 mm deep, the rod is in the middle and not rolled.
     `action="displacement"` goes there in 16 equal parts, one after the other. Baseline: each segment bent as the tube is at its
     place, the outer one also against the tip's distance from the middle; constant feed that slows down over the last 10 mm.
     """
@@ -204,6 +205,8 @@ class TubeInsert(Task):
         """One step of the simulator; who does not come there stays."""
         before, self.displacement = self.displacement, there
         state = self.simulator.step(**self._inputs())
+        if (stuck := ~state.ok & (state.passes != 0) & (self._in_a_row >= _ANEW)).any():
+            state = self._settled_anew(stuck)
         with np.errstate(invalid="ignore"):
             ok = state.ok & (np.abs(state.tip_position) < 1.0).all(1)
         each = ok[:, None]
@@ -215,6 +218,19 @@ class TubeInsert(Task):
         self.largest = np.maximum(self.largest, self.force)
         self.failed = self.failed + ~ok
         self._in_a_row = np.where(ok, 0, self._in_a_row + 1)
+
+    def _settled_anew(self, stuck: Flags) -> State:
+        """These robots at rest on their inputs, wherever they stood: a rod that snaps over from one wall to the other. One that would not
+        be in the tube then stays where it was, as all others do."""
+        sim = self.simulator
+        before = sim.snapshot()
+        sim.reset(stuck)
+        state = sim.settle(**self._inputs())
+        station, out, across = (a.reshape(self.n_envs, -1) for a in place(state.position.reshape(-1, 3)))
+        within = (station > 0.0) & (station < STRAIGHT + TURN * ANGLE)
+        beside = within & ~(np.hypot(out, across) < LUMEN)
+        sim.restore(before, ~(stuck & state.ok & ~beside.any(1)))
+        return sim.state
 
     @property
     def lost(self) -> Flags:
