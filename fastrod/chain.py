@@ -103,10 +103,20 @@ class Chain:
         self.time[rows] = np.nan
 
     def act(
-        self, ports: Ports, params: Params, state: Any, dt: float, n_steps: int, skip: Flags, gravity: Floats | None = None
+        self,
+        ports: Ports,
+        params: Params,
+        state: Any,
+        dt: float,
+        n_steps: int,
+        skip: Flags,
+        gravity: Floats | None = None,
     ) -> tuple[Ports, Params]:
-        """What the kernel reads at this step; memories move on, but for the robots `skip`, whose inputs cannot be used. `gravity` (1 or
-        n_robots, 3) [m/s^2] is that of the world at this step, the robots' own if left out."""
+        """What the kernel reads at this step; memories move on, but for the robots `skip`, whose inputs
+        cannot be used.
+
+        `gravity` (1 or n_robots, 3) [m/s^2] is that of the world at this step, the robots' own if left out.
+        """
         self._felt = self.gravity if gravity is None else gravity
         first = np.isnan(self.time)
         self.time = np.where(skip, self.time, np.where(first, 0.0, self.time + dt))

@@ -63,9 +63,11 @@ def shown(value: object, longest: int = 200) -> str:
 
 
 def refuse_masked(name: str, value: object) -> None:
-    """Raise `InputError` for a masked array, or a list of such, that hides entries: numpy would hand out what is behind the mask."""
+    """Raise `InputError` for a masked array, or a list of such, that hides entries: numpy would hand out what
+    it hides."""
     import numpy as np
 
     for a in value if isinstance(value, (list, tuple)) else (value,):
         if isinstance(a, np.ma.MaskedArray) and (hidden := int(np.ma.getmaskarray(a).sum())):
-            raise InputError(f"{name} is a masked array that hides {hidden} of {a.size} entries; give all, as with filled(0.0).")
+            count = f"{hidden} of {a.size} entries"
+            raise InputError(f"{name} is a masked array that hides {count}; give all, as with filled(0.0).")

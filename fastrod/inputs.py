@@ -24,14 +24,15 @@ _MOST = 1e12  # of any unit; products of a few such numbers still are floats
 
 
 def named_inputs(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """The same method; `InputError` with the nearest name for a keyword that it lacks, where Python's own error knows none."""
+    """The same method; a keyword that it lacks raises `InputError` with the nearest name."""
     known = {name for name in inspect.signature(function).parameters if name != "self"}
 
     @functools.wraps(function)
     def checked(*args: _P.args, **inputs: _P.kwargs) -> _R:
         for name in inputs:
             if name not in known:
-                why = "the time step is given once: Simulator(robot, dt=...)." if name == "dt" else nearest(name, known)
+                once = "the time step is given once: Simulator(robot, dt=...)."
+                why = once if name == "dt" else nearest(name, known)
                 raise InputError(f"{function.__name__} has no input {name!r}; {why}")
         return function(*args, **inputs)
 

@@ -26,16 +26,18 @@ NO_PROBES = Probes(np.empty((0, 0), np.int64), np.empty((0, 0, 3)), np.empty((0,
 
 
 def check_size(layout: Layout, n_robots: int, outputs: Literal["full", "tip"]) -> None:
-    """`InputError` where so many robots, or points, are more than this machine's memory: what the observer remembers, and one shape."""
+    """`InputError` where what the observer remembers of so many robots, and one shape, is more than this
+    machine's memory."""
     n_tendons = len(layout.tendon_segment)
     n_x = max(3 + len(layout.free_tendon), 2 * len(layout.first_tendon))
     points = len(layout.first_tendon) * layout.n_steps + 1
-    each = 4 * n_x * (len(layout.row_tendon) + 8) + 8 * (n_x + 3 * n_tendons + 24) + (8 * 22 * points if outputs == "full" else 0)
+    each = 4 * n_x * (len(layout.row_tendon) + 8) + 8 * (n_x + 3 * n_tendons + 24)
+    each += 8 * 22 * points if outputs == "full" else 0
     if (needed := each * n_robots) > (most := _physical_memory()):
         less = "take fewer, or outputs='tip'" if outputs == "full" else "take fewer"
         raise InputError(
-            f"n_robots {n_robots:.6g} with {points:.6g} points each would take {needed / 2**30:.3g} GiB, and this machine has "
-            f"{most / 2**30:.3g} GiB; {less}."
+            f"n_robots {n_robots:.6g} with {points:.6g} points each would take {needed / 2**30:.3g} GiB, "
+            f"and this machine has {most / 2**30:.3g} GiB; {less}."
         )
 
 

@@ -1,4 +1,4 @@
-"""Robots whose observer pass diverged: brought to rest on the same inputs, while the others keep every bit."""
+"""Robots whose observer pass diverged are settled on the same inputs; the others keep every bit."""
 
 from __future__ import annotations
 
@@ -9,19 +9,24 @@ from fastrod.settle import Pass, load_parameter, settle
 from fastrod.types import Flags, Floats, Ints, Ports
 
 TOLERANCE = 1e-9  # m: that of `Simulator.settle`
-_HOPELESS = 50.0  # of F l^2/EI: a rod with its far end free winds up before
+# of F l^2/EI: on three shipped robots `settle` solves all of 180 random tip forces of 20, 8 to 100 % of those of
+# 50, and at most 2 % of those of 200
+_HOPELESS = 30.0
 
 
 class Boundary:
-    """The boundary before a step, kept until it is known that nobody diverged in it: 21 numbers of a five-segment robot."""
+    """The boundary before a step, kept until it is known that nobody diverged: 21 numbers of a five-segment
+    robot."""
 
     def __init__(self, passes: Passes) -> None:
         self._passes = passes
         # on a GPU a copy would have to come here at every step; its robots begin from the cold guess instead
-        self._kept = None if passes.device == "cuda" else (passes.x.copy(), passes.memory.curvature_guess.copy())
+        on_gpu = passes.device == "cuda"
+        self._kept = None if on_gpu else (passes.x.copy(), passes.memory.curvature_guess.copy())
 
     def put_back(self, rows: Ints, ports: Ports) -> None:
-        """These robots stand where they stood before the step, on the inputs `ports`, and what a diverged pass learned is forgotten."""
+        """These robots stand where they stood before the step, on the inputs `ports`; what the pass learned
+        is forgotten."""
         memory = self._passes.memory
         if self._kept is not None:
             memory.x[rows], memory.curvature_guess[rows] = self._kept[0][rows], self._kept[1][rows]
@@ -31,9 +36,11 @@ class Boundary:
         self._passes.arrive_at(rows, ports)
 
     def recover(self, lost: Ints, warm: Flags, ports: Ports, run: Pass) -> Ints:
-        """`settle` these robots on `ports`: from where they stood before the step, then from the cold guess, then by their loads.
+        """`settle` these robots on `ports`: from where they stood, then from the cold guess, then by their
+        loads.
 
-        (n_robots,) passes that each took, -1 where none of these ways ended below `TOLERANCE`: they stand where they stood.
+        (n_robots,) passes that each took, -1 where none of these ended below `TOLERANCE`: they stand where
+        they stood.
         """
         self.put_back(lost, ports)
         known = warm if self._kept is not None else np.zeros_like(warm)

@@ -166,8 +166,8 @@ class Robot:
     gravity: tuple[float, float, float] = _GRAVITY
     """World frame [m/s^2], of a robot that stands free. One that is mounted on a host feels the host's."""
     states_gravity: bool = False
-    """The robot says itself which gravity it feels: a robot file with `[world] gravity`, or any other than the usual. A host in whose
-    world it is another then refuses it."""
+    """The robot says itself which gravity it feels: a robot file with `[world] gravity`, or any other than
+    the usual. A host in whose world it is another refuses it."""
     log_points: tuple[float, ...] = ()
     """Arclengths of the further measured points p1 ... pk of a run log [m]."""
     effects: tuple[Mapping[str, Any], ...] = ()

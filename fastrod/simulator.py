@@ -23,12 +23,12 @@ from fastrod.guess import cold_start
 from fastrod.inputs import Inputs, PointForces, Reader, named_inputs
 from fastrod.kernels.dense import between_nodes
 from fastrod.passes import Passes, check_size
-from fastrod.recovery import Boundary, overloaded, what_to_do
+from fastrod.recovery import TOLERANCE, Boundary, overloaded, what_to_do
 from fastrod.response import Linear, stretch
 from fastrod.robot import Robot
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.rows import restore_contact, taken_each, taken_shape
-from fastrod.settle import settle
+from fastrod.settle import Pass, settle
 from fastrod.state import Observer, Pose, Snapshot, State
 from fastrod.types import Flags, Floats, Ints, Memory, Params, Ports, Probes, Shape
 
@@ -74,8 +74,8 @@ class Simulator:
         through everything. Without `feel_contact` they do so all the same, and the scene is for `clearance`, `swept_clearance` and
         `ray_cast` alone. While a robot's last residual is below `hold_gain` [m] (and it feels no contact) a step corrects the
         boundary by the gain that it has, without new sensitivities: a third of the time, and the observer lags by about so much.
-        Without `recover` a robot whose pass diverges in a step is lost at once: a step then ends after its one pass, where
-        the search for a shape that does not exist takes some thousand.
+        Without `recover` a robot whose pass diverges in a step is lost at once: a step then ends after its
+        one pass, where the search for a shape that does not exist takes some thousand.
 
         With `device="cuda"` the passes run on an NVIDIA GPU, one thread a robot, from the same source: numbers agree to rounding. The
         memory of the observer stays there; a step sends the inputs that changed and brings back what `outputs` asks for, so for
@@ -123,7 +123,7 @@ class Simulator:
         self._bare: Ports | None = None
         self._all = np.arange(self.n_robots)
         self._warm = np.zeros(self.n_robots, bool)
-        self._shaped = np.zeros(self.n_robots, bool)  # whose state holds a shape that was solved, of this very robot
+        self._shaped = np.zeros(self.n_robots, bool)  # whose state holds a solved shape, of this very robot
         self._ports: Ports | None = None
         self._given = Inputs()
         self._state: State | None = None
@@ -139,7 +139,8 @@ class Simulator:
         self._felt = self._engine if feel_contact else None  # the engine, where contact bends the rods
 
     def __repr__(self) -> str:
-        contact = "" if self.contact is None else f", contact with {', '.join(self.contact.names) or 'rods alone'}"
+        touched = "" if self.contact is None else ", ".join(self.contact.names) or "rods alone"
+        contact = f", contact with {touched}" if touched else ""
         device = "" if self.device == "cpu" else f", device={self.device!r}"
         others = " and others" if any(robot is not self.robots[0] for robot in self.robots) else ""
         numbers = f"n_robots={self.n_robots}, dt={self.dt:g} s, n_points={self.n_points}"
@@ -180,16 +181,16 @@ class Simulator:
         tendon_tension segments [N]; `extension` (n_segments,) [m]; `tip_force` [N], `tip_moment` [N m], `line_force`
         [N/m], each (3,) world, the last also (n_segments, points, 3), linear between evenly spaced points, on top of the
         self-weight; `point_force` (arclength [m], force (3,) world [N]) pairs; `follower_tip_force` (3,) material frame of
-        the tip [N]; `base_pose` (7,) position [m] and quaternion w x y z; `gravity` (3,) world [m/s^2], of the world that the
-        robot stands in at this step where that is another than its own.
+        the tip [N]; `base_pose` (7,) position [m] and quaternion w x y z; `gravity` (3,) world [m/s^2], where
+        that is another at this step than the robot's own.
 
         The state belongs to the boundary that the last pass predicts for these tendon lengths and tip forces; what other
         inputs change is corrected with the next pass, and shows as `residual`; wires that only grow along with an extension
-        count as unchanged. Robots whose pass diverges are settled on these inputs, from where they stood, then from
-        nothing (on a GPU from nothing at once), and `passes` counts what that took; the others keep every bit. When the
-        tip force of running robots first
-        moves, one pass more learns the gain for it (`passes` is 2). Raises `InputError` on a wrong shape, or where no
-        robot's input is usable; a single bad row only clears that robot's `ok`.
+        count as unchanged. Robots whose pass diverges are settled on these inputs, from where they stood,
+        then from nothing (on a GPU from nothing at once), and `passes` counts what that took; the others keep
+        every bit. When the tip force of running robots first moves, one pass more learns the gain for it
+        (`passes` is 2). Raises `InputError` on a wrong shape, or where no robot's input is usable; a single
+        bad row only clears that robot's `ok`.
 
         With a contact scene: `obstacle_pose` name -> (7,) or (n_robots, 7) position and quaternion, world; what is not given
         stays where it was. `obstacle_velocity` name -> (6,) or (n_robots, 6) linear [m/s] and angular [rad/s] velocity of the
@@ -200,7 +201,8 @@ class Simulator:
         same pass, at the shape of the state, at little cost.
         """
         given = Inputs(
-            tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force, follower_tip_force, base_pose, gravity
+            tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force,
+            follower_tip_force, base_pose, gravity,
         )  # fmt: skip
         if self._felt is not None:
             return self._touch(self._felt, given, obstacle_pose, obstacle_velocity, None)
@@ -239,7 +241,7 @@ class Simulator:
             ok, passes = ok & read, np.where(read, passes, 0)
         if boundary is not None and not ok[rows].all():
             lost, self._derived = rows[~ok[rows]], None
-            used = boundary.recover(lost, self._warm, ports, lambda which, at: self._pass_at_rest(which, at, shape))
+            used = boundary.recover(lost, self._warm, ports, self._into(shape))
             self._passes.collect(shape)
             ok |= (used > 0) & (shape.residual < _LOST * self._passes.params.reach)
             passes = np.where(used < 0, -1, passes + used)
@@ -275,7 +277,8 @@ class Simulator:
         """
         _check_positive("tolerance", tolerance, "m")
         given = Inputs(
-            tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force, follower_tip_force, base_pose, gravity
+            tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force,
+            follower_tip_force, base_pose, gravity,
         )  # fmt: skip
         if self._felt is not None:
             if rows is not None:
@@ -317,19 +320,17 @@ class Simulator:
             process, noise = self.observer.process_noise * self.dt, self.observer.measurement_noise / self.dt
             self._passes.run(which, at, into, feed=True, carry=self._passes.carry, process=process, noise=noise)
             passes[which] += 1
-            well = self._passes.finite & (into.residual < _LOST * self._passes.params.reach) & np.isin(self._all, which)
+            well = self._passes.finite & (into.residual < _LOST * self._passes.params.reach)
+            well &= np.isin(self._all, which)
             lost = which[~well[which]]
             if boundary is not None and len(lost):
-                used = boundary.recover(lost, self._warm, at, lambda some, there: self._pass_at_rest(some, there, into))
+                used = boundary.recover(lost, self._warm, at, self._into(into))
                 passes[lost] += np.abs(used[lost])
                 well[lost] = used[lost] > 0
             return np.asarray(well)
 
         def bring_to_rest(which: Ints, at: Ports, into: Shape) -> Flags:
-            def once(some: Ints, there: Ports) -> Floats:
-                return self._pass_at_rest(some, there, into)
-
-            used = settle(which, self._warm, self._passes, at, tolerance or 1e-9, once)
+            used = settle(which, self._warm, self._passes, at, tolerance or TOLERANCE, self._into(into))
             passes[which] += np.abs(used[which])
             return np.asarray(used > 0)
 
@@ -349,7 +350,8 @@ class Simulator:
         if held.any() and start is not None:
             ports = blended(start, ports, done)
         self._passes.arrive_at(np.flatnonzero(held | (ok & engine.led)), ports)
-        state = self._finish(ports, shape, ok, np.where(ok, passes, -1), "contact", np.flatnonzero(gone & ~(held & engine.led)))
+        lost = np.flatnonzero(gone & ~(held & engine.led))
+        state = self._finish(ports, shape, ok, np.where(ok, passes, -1), "contact", lost)
         self._warm[held] = True  # it stands where it came to, and goes on from there
         return state
 
@@ -373,7 +375,7 @@ class Simulator:
     def _settle(self, ports: Ports, rows: Ints, tolerance: float, only: Flags | None = None) -> State:
         shape = self._passes.new_shape(self.outputs, len(rows) < self.n_robots)
 
-        passes = settle(rows, self._warm, self._passes, ports, tolerance, lambda which, at: self._pass_at_rest(which, at, shape))
+        passes = settle(rows, self._warm, self._passes, ports, tolerance, self._into(shape))
         self._passes.collect(shape)
         if self._passes.carry:
             self._passes.memory.covariance[rows] = 0.0
@@ -382,10 +384,14 @@ class Simulator:
         reason = f"settle did not bring the boundary residual below {tolerance:g} m"
         return self._finish(ports, shape, ok, passes, reason, rows[~ok[rows]], only)
 
-    def _pass_at_rest(self, rows: Ints, ports: Ports, shape: Shape) -> Floats:
-        """A pass on frozen inputs; the residual of these robots [m]."""
-        self._passes.run(rows, ports, shape, noise=1e-10 if self._layout.paper else 1e-20)
-        return self._passes.collect(shape, "residual").residual[rows]
+    def _into(self, shape: Shape) -> Pass:
+        """Passes on frozen inputs that write into `shape`."""
+
+        def run(rows: Ints, ports: Ports) -> Floats:
+            self._passes.run(rows, ports, shape, noise=1e-10 if self._layout.paper else 1e-20)
+            return self._passes.collect(shape, "residual").residual[rows]
+
+        return run
 
     def shape(self, arclength: ArrayLike) -> Pose:
         """Pose and curvature of the last state at any arclength [m]: (n_queries,), or (n_robots, n_queries).
@@ -675,7 +681,7 @@ class Simulator:
             bare, params = self._bare, self._passes.params
             self._bare = ports
             ports, self._passes.params = self._chain.act(
-                ports, self._plain, self._state, self.dt, self._layout.n_steps, out, gravity=self._reader.gravity,
+                ports, self._plain, self._state, self.dt, self._layout.n_steps, out, self._reader.gravity,
             )  # fmt: skip
             if only is not None and bare is not None:
                 self._bare = taken_each(self._bare, bare, ~only)
@@ -708,9 +714,18 @@ class Simulator:
     def _sentence(self, reason: str, ports: Ports, shape: Shape, i: int) -> str:
         return f"{reason}; residual {shape.residual[i]:.3g} m; {what_to_do(self._passes, ports, i)}."
 
-    def _finish(self, ports: Ports, shape: Shape, ok: Flags, passes: Ints, reason: str, lost: Ints, only: Flags | None = None) -> State:
-        """Note who is not ok, so that nothing continues on NaN, and hand out the state. What a pass wrote of the robots `lost` is no
-        shape of theirs: they keep the one before."""
+    def _finish(
+        self,
+        ports: Ports,
+        shape: Shape,
+        ok: Flags,
+        passes: Ints,
+        reason: str,
+        lost: Ints,
+        only: Flags | None = None,
+    ) -> State:
+        """Note who is not ok, so that nothing continues on NaN, and hand out the state. What a pass wrote of
+        the robots `lost` is no shape of theirs: they keep the one before."""
         problems = dict(self._reader.problems)
         for i in np.flatnonzero(~ok):
             problems.setdefault(int(i), self._sentence(reason, ports, shape, int(i)))
@@ -737,7 +752,8 @@ class Simulator:
         return self._hand_out(shape, ok, passes, problems)
 
     def _kept(self, shape: Shape, ports: Ports, lost: Flags) -> tuple[Shape, Ports]:
-        """`lost` robots as in the state before, nan where that holds no shape of theirs; `residual` stays that of what was tried."""
+        """`lost` robots as in the state before, nan where that holds no shape of theirs; `residual` is of
+        what was tried."""
         kept = Shape(*(np.array(a) for a in shape))
         for a in kept:
             a[lost if len(a) else slice(0)] = np.nan

@@ -69,14 +69,15 @@ class State:
     base_wrench: Floats
     """(n_robots, 6) force [N], then moment about the base point [N m], that the robot exerts on its host."""
     residual: Floats
-    """(n_robots,) largest boundary residual [m]: lengths as they are, moments times l^2/EI, forces times l^3/EI. That of what was tried,
-    where that is not ok."""
+    """(n_robots,) largest boundary residual [m]: lengths as they are, moments times l^2/EI, forces times
+    l^3/EI. Of a robot that is not ok it is that of what was tried."""
     ok: Flags
-    """(n_robots,) after `settle`: it converged. After `step`: it did not diverge; `residual` says how far the observer is behind. A robot
-    that is not ok has the last shape that was solved, nan where there is none or its input cannot be used."""
+    """(n_robots,) after `settle`: it converged. After `step`: it did not diverge; `residual` says how far the
+    observer is behind. A robot that is not ok has the last shape that was solved, nan where there is none or
+    its input cannot be used."""
     passes: Ints
-    """(n_robots,) forward passes that were spent: after `step` 1, or more where it settled a robot whose pass diverged; -1 where no shape
-    was found, 0 where bad input left nothing to do."""
+    """(n_robots,) forward passes that were spent: after `step` 1, or more where it settled a robot whose pass
+    diverged; -1 where no shape was found, 0 where bad input left nothing to do."""
     problems: Mapping[int, str]
     """Robot index -> what is wrong with it, for the robots that are not ok."""
     contacts: Contacts | None = None

@@ -1,4 +1,5 @@
-"""Random steps over all tasks: is a robot lost that `settle` can solve? This file as a script; `--steps`, `--tasks`, `--json`."""
+"""Random steps over all tasks: is a robot lost that `settle` can solve? A script; `--steps`, `--tasks`,
+`--json`."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ from fastrod_envs.registration import task_class
 from fastrod_envs.vector import BatchEnv
 
 HEAVY = {"gravity.line_density": (0.02, 0.1)}
-"""Weight [kg/m] that half of the steps draw on top: at the upper end most passes of the reacher diverge in the first steps."""
+"""Weight [kg/m] that half of the steps draw on top: at the upper end most passes of the reacher diverge at
+first."""
 _TOLERANCE = 1e-9
 
 
@@ -32,7 +34,8 @@ class Count:
     robots: int = 0
     """Robot-steps of all simulators."""
     settled: int = 0
-    """Robot-steps without contact that took more than the passes of a step: the pass diverged and `step` settled."""
+    """Robot-steps without contact that took more than a step's passes: the pass diverged and `step`
+    settled."""
     lost: int = 0
     """Robot-steps that were not ok, though their input could be used."""
     solvable: int = 0
@@ -96,7 +99,8 @@ def _settled(simulator: Simulator, i: int, ports: Ports) -> bool:
 
 def _settled_in_contact(simulator: Simulator, i: int, named: dict[str, Any]) -> bool:
     n, layout = simulator.n_robots, simulator._layout
-    fresh = Simulator(_robot(simulator, i), points_per_segment=layout.n_steps, threads=1, contact=simulator.contact)
+    robot, scene = _robot(simulator, i), simulator.contact
+    fresh = Simulator(robot, points_per_segment=layout.n_steps, threads=1, contact=scene)
 
     def one(value: Any) -> Any:
         if isinstance(value, dict):
@@ -118,10 +122,10 @@ def drive(task: str, steps: int, seed: int = 0, **options: Any) -> Count:
                 # a direction that stays for a while, so that robots get somewhere
                 held = rng.uniform(-1.0, 1.0, env.action_space.shape)
                 for _ in range(5):
-                    told = env.step(np.clip(held + 0.3 * rng.normal(size=held.shape), -1.0, 1.0))[4]
+                    info = env.step(np.clip(held + 0.3 * rng.normal(size=held.shape), -1.0, 1.0))[4]
                     count.steps += env.num_envs
-                    if "final_info" in told:
-                        count.ended += int(np.sum(told["final_info"]["lost"] & told["_final_info"]))
+                    if "final_info" in info:
+                        count.ended += int(np.sum(info["final_info"]["lost"] & info["_final_info"]))
                     if count.steps >= steps:
                         break
     finally:
@@ -132,7 +136,7 @@ def drive(task: str, steps: int, seed: int = 0, **options: Any) -> Count:
 def main(argv: Sequence[str] | None = None) -> int:
     """1 where a robot was lost that settles."""
     parser = argparse.ArgumentParser(prog="bench_lost", description=__doc__)
-    parser.add_argument("--steps", type=int, default=10_000, help="of environments, over all tasks (%(default)s)")
+    parser.add_argument("--steps", type=int, default=10_000, help="over all tasks (%(default)s)")
     parser.add_argument("--tasks", nargs="*", default=fastrod_envs.names(), metavar="TASK")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", action="store_true")
@@ -145,7 +149,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         rows[f"{task}, heavy"] = heavy
         for name in (task, f"{task}, heavy"):
             if not given.json:
-                print(f"{name:24}", *(f"{key} {value:6}" for key, value in vars(rows[name]).items()), sep="  ", flush=True)
+                figures = (f"{key} {value:6}" for key, value in vars(rows[name]).items())
+                print(f"{name:24}", *figures, sep="  ", flush=True)
     if given.json:
         print(json.dumps({name: vars(count) for name, count in rows.items()}))
     total = {key: sum(vars(count)[key] for count in rows.values()) for key in vars(Count())}

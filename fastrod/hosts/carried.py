@@ -23,7 +23,7 @@ class CarriedRod(ABC):
     """One rod on one body of an engine, both ways: the body's motion moves the rod's base, the body feels the base's wrench.
 
     Bodies that the rod touches are its obstacles: contact bends the rod, its host feels the force, and the body is pushed with it. Any
-    other body meets the rod's capsules. The rod's weight is that in the gravity of the world, as it is at each step.
+    other body meets the rod's capsules. The rod's weight is that in the gravity of the world at each step.
 
     A step is `rod.step(...)`, or for several rods in one world `begin` each, one step of the engine, `end` each.
     """
@@ -156,9 +156,9 @@ class CarriedRod(ABC):
 
     def _scene(self) -> dict[str, Any]:
         """What the rod is told of the world: its gravity, and the bodies around."""
-        told: dict[str, Any] = {"gravity": self._gravity()}
+        world: dict[str, Any] = {"gravity": self._gravity()}
         if not self.touched:
-            return told
+            return world
         poses: dict[str, Floats] = {}
         velocities: dict[str, Floats] = {}
         for k, touched in enumerate(self.touched):
@@ -167,7 +167,7 @@ class CarriedRod(ABC):
                 self.simulator.set_free(name, *touched.give(), body=k)
             poses |= p
             velocities |= v
-        return told | {"obstacle_pose": poses, "obstacle_velocity": velocities}
+        return world | {"obstacle_pose": poses, "obstacle_velocity": velocities}
 
 
 def rod_of(
@@ -181,13 +181,14 @@ def rod_of(
 
 
 def check_gravity(robot: Robot, gravity: Floats, how: str) -> None:
-    """Raises `HostError` where a robot with weight says itself that it feels another gravity than this (3,) of its host's world;
+    """Raises `HostError` where a robot with weight states another gravity than this (3,) of its host's world;
     `how` says how that is changed."""
     weighs = bool(robot.effects) or any(segment.line_density > 0.0 for segment in robot.segments)
     if robot.states_gravity and weighs and not np.allclose(robot.gravity, gravity, rtol=1e-6, atol=1e-6):
+        own, there = [float(g) for g in robot.gravity], gravity.round(6).tolist()
         raise HostError(
-            f"robot {robot.name!r} states gravity {[float(g) for g in robot.gravity]} m/s^2, and the world of its host has "
-            f"{gravity.round(6).tolist()}; a mounted rod feels its host's: leave [world] gravity out of the robot file, or {how}."
+            f"robot {robot.name!r} states gravity {own} m/s^2, and the world of its host has {there}; "
+            f"a mounted rod feels its host's: leave [world] gravity out of the robot file, or {how}."
         )
 
 

@@ -23,7 +23,8 @@ from fastrod.state import Snapshot, State
 from fastrod.types import Flags, Floats, Ints, Shape
 
 INPUTS = (
-    "tendon_length", "tension", "extension", "tip_force", "tip_moment", "line_force", "point_force", "follower_tip_force", "gravity",
+    "tendon_length", "tension", "extension", "tip_force", "tip_moment", "line_force", "point_force",
+    "follower_tip_force", "gravity",
 )  # fmt: skip
 """What an engine may tell a rod beside its base: keyword arguments of `Simulator.step`."""
 OBSTACLES = ("obstacle_pose", "obstacle_velocity")
@@ -57,7 +58,8 @@ class RodSnapshot(NamedTuple):
 class Rod:
     """A robot on a base that another engine moves, or several on a base each.
 
-    The rod's weight is that in the `gravity` (3,) that the engine gives, world [m/s^2]; until it gives one, in the robot's own.
+    The rod's weight is that in the `gravity` (3,) that the engine gives, world [m/s^2]; in the robot's own
+    until then.
 
     With `n_robots` every array has a robot axis first; without it there is one rod and no such axis, but in `state`, which always has
     one. Inputs that are not given stay as they were given last; the wires are those of the straight robot until then.

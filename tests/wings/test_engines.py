@@ -45,7 +45,7 @@ def test_weight_is_that_of_the_world_as_it_is_now(stage):
     mass = 0.8 * robot.length
     s = stage(robot, axis="-z")
     s.rod.step()
-    np.testing.assert_allclose(s.rod.wrench, 0.0, atol=1e-12)  # the robot's own gravity is for robots that stand free
+    np.testing.assert_allclose(s.rod.wrench, 0.0, atol=1e-12)  # the robot's own is for robots that stand free
     for gravity in ((0.0, 0.0, -1.62), (0.3, -0.2, -9.81), (0.0, 0.0, 0.0)):
         s.set_gravity(gravity)
         s.rod.step()
@@ -64,8 +64,9 @@ def stating(gravity, line_density=0.8):
 def test_a_robot_that_states_another_gravity_is_not_mounted(stage, gravity):
     with pytest.raises(HostError) as caught:
         stage(stating(gravity), gravity=1.62)
-    said = str(caught.value)
-    assert f"'soft' states gravity {list(gravity)} m/s^2, and the world of its host has [0.0, 0.0, -1.62]" in said.replace("-0.0", "0.0")
+    said = str(caught.value).replace("-0.0", "0.0")
+    assert f"'soft' states gravity {list(gravity)} m/s^2" in said
+    assert "the world of its host has [0.0, 0.0, -1.62]" in said
     assert "leave [world] gravity out of the robot file, or set" in said
     assert stage(stating(gravity, line_density=0.0), gravity=1.62).rod.step().ok[0]  # it weighs nothing
     assert stage(stating((0.0, 0.0, -1.62)), gravity=1.62).rod.step().ok[0]

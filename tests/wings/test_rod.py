@@ -92,7 +92,7 @@ def test_weight_is_that_in_the_gravity_that_the_engine_gives():
     for n, given in ((None, (0.1, 0.0, -1.62)), (2, [(0.1, 0.0, -1.62), (0.0, 0.0, 3.0)])):
         rod = Rod(robot, n_robots=n)
         rod.settle(HOME)
-        assert_allclose(rod.wrench[..., 2], -9.81 * 0.3 * robot.length, rtol=1e-9)  # its own, until one is given
+        assert_allclose(rod.wrench[..., 2], -9.81 * 0.3 * robot.length, rtol=1e-9)  # its own until then
         for more in ({"gravity": given}, {}):  # it stays as it was given
             rod.advance(HOME, STILL, 0.01, **more)
             assert_allclose(rod.wrench[..., :3], 0.3 * robot.length * np.array(given), atol=1e-9)

@@ -89,7 +89,8 @@ class TubeInsert(Task):
     Reward a step: exp(-d / 0.02 m), d the tip's distance from the goal [m]; -(F - 0.3 N) / 0.3 N, at most -1, where F is beyond
     0.3 N; -10 where it is beyond 0.6 N, which ends the episode, failed. Success: d below 5 mm, and F never beyond 0.3 N in the
     episode. An episode has 50 steps of 100 ms, and may end before by force, or when a robot's shape was not found 5 times in a
-    row (it stays where it was; from the third time on it settles anew, if it is in the tube then). With difficulty 0 the goal is 30 mm deep, the rod is in the middle and not rolled.
+    row (it stays where it was; from the third time on it settles anew, if it is in the tube then). With
+    difficulty 0 the goal is 30 mm deep, the rod is in the middle and not rolled.
     `action="displacement"` goes there in 16 equal parts, one after the other. Baseline: each segment bent as the tube is at its
     place, the outer one also against the tip's distance from the middle; constant feed that slows down over the last 10 mm.
     """
@@ -220,8 +221,8 @@ class TubeInsert(Task):
         self._in_a_row = np.where(ok, 0, self._in_a_row + 1)
 
     def _settled_anew(self, stuck: Flags) -> State:
-        """These robots at rest on their inputs, wherever they stood: a rod that snaps over from one wall to the other. One that would not
-        be in the tube then stays where it was, as all others do."""
+        """These robots at rest on their inputs, wherever they stood: a rod snaps over from one wall to the
+        other. One that would not be in the tube then stays where it was, as all others do."""
         sim = self.simulator
         before = sim.snapshot()
         sim.reset(stuck)
