@@ -364,13 +364,13 @@ class Simulator:
         }
         return ports._replace(tendon_length=np.ascontiguousarray(ends), **zeros)
 
-    def settle_ports(self, ports: Ports, params: Params, tolerance: float = 1e-9) -> State:
+    def settle_ports(self, ports: Ports, params: Params, tolerance: float = 1e-9, rows: Ints | None = None) -> State:
         """`settle` on what the kernel reads, with effects already in it: for those who carry effects over a whole log
-        themselves. `params` may have a row for each robot."""
+        themselves. `params` may have a row for each robot. Robots that are not in `rows` are not solved, and not `ok`."""
         self._reader.problems, self._derived = {}, None
         self._passes.params, self._bare = params, None
         self._passes.remember(False, False, None)
-        return self._settle(ports, self._all, tolerance)
+        return self._settle(ports, self._all if rows is None else rows, tolerance)
 
     def _settle(self, ports: Ports, rows: Ints, tolerance: float, only: Flags | None = None) -> State:
         shape = self._passes.new_shape(self.outputs, len(rows) < self.n_robots)

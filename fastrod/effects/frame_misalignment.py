@@ -11,6 +11,9 @@ from fastrod.ports import EffectPorts
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.types import Floats
 
+_TURN = 2.0 * np.pi  # rad: any rotation, and a fit may pass half a turn
+_FAR = 30.0  # robot lengths: as far as a run log's tips may be
+
 
 @effect
 class FrameMisalignment(Static):
@@ -24,12 +27,12 @@ class FrameMisalignment(Static):
     seam = Seam.SENSING
     order = 20.0
     parameters = (
-        Parameter("rotation_x", "rad", bounds=(-1.6, 1.6), typical=0.03, starts=(0.01,)),
-        Parameter("rotation_y", "rad", bounds=(-1.6, 1.6), typical=0.03, starts=(0.01,)),
-        Parameter("rotation_z", "rad", bounds=(-1.6, 1.6), typical=0.03, starts=(0.01,)),
-        Parameter("shift_x", "m", bounds=(-1.0, 1.0), typical=0.03, starts=(0.01,), of="length"),
-        Parameter("shift_y", "m", bounds=(-1.0, 1.0), typical=0.03, starts=(0.01,), of="length"),
-        Parameter("shift_z", "m", bounds=(-1.0, 1.0), typical=0.03, starts=(0.01,), of="length"),
+        Parameter("rotation_x", "rad", bounds=(-_TURN, _TURN), typical=0.03, starts=(0.01,)),
+        Parameter("rotation_y", "rad", bounds=(-_TURN, _TURN), typical=0.03, starts=(0.01,)),
+        Parameter("rotation_z", "rad", bounds=(-_TURN, _TURN), typical=0.03, starts=(0.01,)),
+        Parameter("shift_x", "m", bounds=(-_FAR, _FAR), typical=0.03, starts=(0.01,), of="length"),
+        Parameter("shift_y", "m", bounds=(-_FAR, _FAR), typical=0.03, starts=(0.01,), of="length"),
+        Parameter("shift_z", "m", bounds=(-_FAR, _FAR), typical=0.03, starts=(0.01,), of="length"),
     )
     excited_by = "the whole workspace; a calibration of its own"
     confounded_with = ("precurvature", "encoder_offset", "gravity")

@@ -17,6 +17,7 @@ from fastrod.identification.base import LEAST_ROWS, Base, check_log, check_motio
 from fastrod.identification.evidence import Candidate, State, Step
 from fastrod.identification.forward import sample
 from fastrod.identification.network import check_network, residual_network
+from fastrod.identification.questions import read
 from fastrod.identification.result import Result
 from fastrod.identification.search import Search
 from fastrod.identification.split import held_out_rows, merged
@@ -66,13 +67,20 @@ def identify(
     train = samples.rows[~tested[samples.rows]]
     if len(train) < LEAST_ROWS:
         raise LogError(f"log {log.name!r} leaves {len(train)} rows to fit once {', '.join(labels)} are held out; it needs {LEAST_ROWS}.")
-    model = base_model(robot, free_camera=free_camera)
+    base_model(robot, free_camera=free_camera)  # refuses a wrong [fit] before anything is solved
     chosen = _thinned(train, _SEARCH_ROWS)
+    tell("registration", 0, max_effects + _SPARE + 2)
+    reading = read(samples.on(chosen), robot, threads=threads)
+    if reading.refusal:
+        raise LogError(reading.refusal)
+    placed = robot if reading.registration is None else reading.registration.on(robot)
+    model = base_model(placed, free_camera=free_camera, registered=placed is not robot)
     tell("base fit", 0, max_effects + _SPARE + 2)
     base = Base(samples.on(chosen), train, model, robot, threads)
+    base.notes += reading.questions
     search = Search(base.samples, base.rod, base.target, base.block, frozenset(exclude))
     start, fixed = base.fit(search)
-    check_motion(base, start)
+    check_motion(base, start, reading.guess)
     found, last, steps = _found(search, base, start, max_effects + _SPARE if max_effects else 0, tell)
     last_sigma = base.weights[-1]
     state, found = _library(search, base, start, last, found, max_effects, steps) if found else (start, found)

@@ -10,6 +10,7 @@ from fastrod.identification.evidence import State
 from fastrod.identification.forward import Rod, Samples, predict
 from fastrod.identification.local import Local, Target
 from fastrod.identification.noise import ENOUGH, Noise, at_rest, keep, read_noise
+from fastrod.identification.questions import further_than_still
 from fastrod.identification.result import Estimate
 from fastrod.identification.search import N_BLOCKS, Search
 from fastrod.identification.unknowns import Model
@@ -123,8 +124,9 @@ class Base:
         return fixed
 
 
-def check_motion(base: Base, state: State) -> None:
-    """A model that follows the measurement worse than a robot that stands still is of another robot, or in other units."""
+def check_motion(base: Base, state: State, guess: str) -> None:
+    """Refuse a log that the fitted model follows worse than a robot that stands still: it is of another robot, or in other units, as
+    the sentence `guess` may say. Raises `LogError`."""
     good = (base.target.weight > 0.0) & state.local.pose.ok
     measured, predicted = (
         base.target.tip[good],
@@ -132,13 +134,10 @@ def check_motion(base: Base, state: State) -> None:
     )
     measured, predicted = measured - measured.mean(0), predicted - predicted.mean(0)
     moves = float((measured**2).sum())
-    name, robot = base.samples.log.name, base.robot.name
+    name = base.samples.log.name
     if float(((measured - predicted) ** 2).sum()) > moves:
         scale = float((measured * predicted).sum() / max((predicted**2).sum(), 1e-30))
-        raise LogError(
-            f"log {name!r} is further from robot {robot!r} than from a robot that stands still: it moves {scale:.2g} times as predicted. "
-            "Are the units, the signs (negative = pulled) and the order of the dl_ columns right, and is it this robot?"
-        )
+        raise LogError(further_than_still(base.samples, base.robot, scale, guess))
     if base.noise.floor > _RESTLESS * np.sqrt(moves / max(len(measured), 1)) and base.noise.floor > 0.01 * base.robot.length:
         raise LogError(
             f"in log {name!r} the measured tip jumps by {1e3 * base.noise.floor:.3g} mm from sample to sample while the inputs rest, "

@@ -91,9 +91,9 @@ class Local:
         if force is not None:
             opened.tip_force = force
         self.rod.back(self._kept)
-        pose = self.rod.solve(*self.bench.kernel(opened), self.robot)
+        pose = self.rod.solve(*self.bench.kernel(opened), self.robot, self.pose.ok)
         opened.tendon_length, opened.tip_force = before
-        return self._difference(pose)
+        return np.where(self.pose.ok[:, None], self._difference(pose), 0.0)
 
     @cached_property
     def by_bend(self) -> Floats:
@@ -159,7 +159,7 @@ class Local:
             robot = model.robot_at(moved)
             place = self.bench if unknown.place[0] == "effect" else bench(self.samples, robot, model.wiring)
             self.rod.back(self._kept)
-            pose = self.rod.solve(*place.kernel(place.drive(chain_of(model, moved))), robot)
+            pose = self.rod.solve(*place.kernel(place.drive(chain_of(model, moved))), robot, self.pose.ok)
             self._columns[unknown.place] = np.where(pose.ok[:, None], self._difference(pose) / step, 0.0)
         return self._columns[unknown.place]
 

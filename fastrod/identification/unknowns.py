@@ -25,6 +25,8 @@ STIFFNESS_SD = 0.3
 """Relative prior of EI and GJ where the robot file says nothing."""
 FREE_CAMERA = {"registration_sd": (0.01, 0.05), "marker_offset_sd": 0.02, "latency_sd": 0.15}
 """Priors of a camera that nobody calibrated: m and rad, m, s."""
+ROUGH = (0.1, 0.2)
+"""Prior of a rough registration: robot lengths, rad. Backlash of a tenth of the motion moves one by a quarter of this."""
 _WIDE = 5.0  # typical sizes: width of the prior of an effect's size
 
 
@@ -139,10 +141,10 @@ def known_model(robot: Robot) -> Model:
     return Model(robot, wire(robot), tuple(named_effects(robot)), ())
 
 
-def base_model(robot: Robot, *, free_camera: bool = False) -> Model:
+def base_model(robot: Robot, *, free_camera: bool = False, registered: bool = False) -> Model:
     """The model before anything is found: the robot's `[fit]` and `[sensor]`, and its stiffness.
 
-    Raises `RobotError` for a target that is none, naming the nearest.
+    `registered`: the camera's place in `robot` comes from a rough registration, and is fitted. Raises `RobotError` for a target that is none, naming the nearest.
     """
     wiring = wire(robot)
     unknowns: list[Unknown] = []
@@ -155,7 +157,9 @@ def base_model(robot: Robot, *, free_camera: bool = False) -> Model:
             numbers = tuple(str(k) for k in range(robot.n_segments))
             unknowns.append(Unknown(name, "x nominal", 1.0, 1.0, STIFFNESS_SD, (0.05, 20.0), 0.05, ("robot", kind, *numbers), log=True))
     sensor = dict(robot.sensor) | (FREE_CAMERA if free_camera else {})
-    unknowns += _camera(sensor, wiring)
+    if registered:
+        sensor["registration_sd"] = _wider(sensor.get("registration_sd", 0.0), (ROUGH[0] * robot.length, ROUGH[1]))
+    unknowns += _camera(sensor, robot, wiring)
     effects += [u.place[1] for u in unknowns if u.place[0] == "effect"]
     return Model(robot, wiring, tuple(name for name in effect_names() if name in effects), tuple(unknowns))
 
@@ -244,22 +248,38 @@ def _drive_unknowns(wiring: Wiring, kind: str, which: list[int], sd: float, shar
     ]  # fmt: skip
 
 
-def _camera(sensor: Mapping[str, Any], wiring: Wiring) -> list[Unknown]:
+def _pair(registration: Any) -> tuple[float, float]:
+    """Shift [m] and rotation [rad] of `registration_sd`; one number stands for both."""
+    shift, turn = registration if isinstance(registration, (tuple, list)) else (registration, registration)
+    return float(shift), float(turn)
+
+
+def _wider(given: Any, least: tuple[float, float]) -> tuple[float, float]:
+    shift, turn = _pair(given)
+    return max(shift, least[0]), max(turn, least[1])
+
+
+def _camera(sensor: Mapping[str, Any], robot: Robot, wiring: Wiring) -> list[Unknown]:
+    """The camera's unknowns, about where the effects of the robot file have it."""
     made: list[Unknown] = []
-    registration = sensor.get("registration_sd", (0.0, 0.0))
-    shift, turn = registration if isinstance(registration, (tuple, list)) else (float(registration), float(registration))
+    known = named_effects(robot)
+    shift, turn = _pair(sensor.get("registration_sd", 0.0))
     for names, sd, effect_name in (
-        ([f"rotation_{a}" for a in "xyz"], float(turn), "frame_misalignment"),
-        ([f"shift_{a}" for a in "xyz"], float(shift), "frame_misalignment"),
+        ([f"rotation_{a}" for a in "xyz"], turn, "frame_misalignment"),
+        ([f"shift_{a}" for a in "xyz"], shift, "frame_misalignment"),
         (["x", "y", "z"], float(sensor.get("marker_offset_sd", 0.0)), "marker_offset"),
         (["delay"], float(sensor.get("latency_sd", 0.0)), "latency"),
     ):
         every = columns(get_effect(effect_name), wiring)
         unit = next(p.unit for p in get_effect(effect_name).parameters if p.name == names[0])
+        table = known.get(effect_name, {})
         for label in names if sd > 0.0 else []:
-            low, start = (0.0, min(0.5 * sd, 0.05)) if effect_name == "latency" else (-10.0 * sd, 0.0)
+            mean = float(table.get(label, 0.0))
+            low, start = mean - 10.0 * sd, mean
+            if effect_name == "latency":
+                low, start = 0.0, mean or min(0.5 * sd, 0.05)
             place = ("effect", effect_name, str(every.index(label)))
-            made.append(Unknown(f"{effect_name}.{label}", unit, start, 0.0, sd, (low, 10.0 * sd), 0.1 * sd, place))
+            made.append(Unknown(f"{effect_name}.{label}", unit, start, mean, sd, (low, mean + 10.0 * sd), 0.1 * sd, place))
     return made
 
 
