@@ -2,8 +2,9 @@
 
 from typing import TYPE_CHECKING, Any
 
+from fastrod.loading import load_robot
 from fastrod.robot import Robot, Segment, Tendon
-from fastrod.robotfile import load_robot, robot_names, save_robot
+from fastrod.robotfile import robot_names, save_robot
 
 if TYPE_CHECKING:
     from fastrod import reference

@@ -67,7 +67,7 @@ def _replay(arguments: argparse.Namespace) -> int:
     from rich.console import Console
 
     from fastrod.identification import replay as room
-    from fastrod.robotfile import load_robot
+    from fastrod.loading import load_robot
 
     path: Path = arguments.log
     log, robot = _read(path, None if arguments.robot is None else load_robot(arguments.robot))
@@ -96,7 +96,7 @@ def _identify(arguments: argparse.Namespace) -> int:
 
     from fastrod.identification import report
     from fastrod.identification.attribution import identify
-    from fastrod.robotfile import load_robot
+    from fastrod.loading import load_robot
 
     # `--held-out RUN LOG`: no run is named like a file that is there.
     swallowed = [word for word in arguments.held_out if Path(word).suffix and Path(word).is_file()]
@@ -131,7 +131,7 @@ def _excite(arguments: argparse.Namespace) -> int:
     from rich.table import Table
 
     from fastrod.identification.excite import excitation
-    from fastrod.robotfile import load_robot
+    from fastrod.loading import load_robot
     from fastrod.runlog import write_log
 
     robot = load_robot(arguments.robot)

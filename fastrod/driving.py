@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fastrod.errors import InputError, UnknownNameError, nearest
+from fastrod.loading import load_robot
 from fastrod.robot import Robot
-from fastrod.robotfile import load_robot
 from fastrod.types import Floats
 
 if TYPE_CHECKING:

@@ -14,7 +14,8 @@ from fastrod.generation.run import Summary, generate
 from fastrod.generation.shapes import Shapes
 from fastrod.generation.sweep import Sweep
 from fastrod.generation.trajectories import Trajectories
-from fastrod.robotfile import dumps, load_robot
+from fastrod.loading import load_robot
+from fastrod.robotfile import dumps
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -13,8 +13,9 @@ import numpy as np
 from fastrod.errors import InputError, nearest, shown
 from fastrod.generation.columns import Column, numbered
 from fastrod.generation.draws import robot_of
+from fastrod.loading import load_robot
 from fastrod.robot import Robot
-from fastrod.robotfile import dumps, load_robot
+from fastrod.robotfile import dumps
 
 POLICIES = ("shipped", "baseline", "random")
 

@@ -75,9 +75,7 @@ def between(file: Robot, found: Robot) -> Registration:
     return Registration(rotation=rotation, shift=two.shift - rotation @ one.shift, left=float("nan"))
 
 
-def align(
-    measured: Floats, predicted: Floats, *, turns: Floats | None = None, lever: float = 0.0, mirrored: bool = False
-) -> Registration:
+def align(measured: Floats, predicted: Floats, *, turns: Floats | None = None, lever: float = 0.0, mirrored: bool = False) -> Registration:
     """The rigid motion from `predicted` to `measured` points (n, 3) [m], robustly (Kabsch 1976, Cauchy weights by distance).
 
     `turns` (m, 3, 3) are measured rotations times the transposes of predicted ones; each counts as points at `lever` [m]. What the

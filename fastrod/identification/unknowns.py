@@ -144,7 +144,8 @@ def known_model(robot: Robot) -> Model:
 def base_model(robot: Robot, *, free_camera: bool = False, registered: bool = False) -> Model:
     """The model before anything is found: the robot's `[fit]` and `[sensor]`, and its stiffness.
 
-    `registered`: the camera's place in `robot` comes from a rough registration, and is fitted. Raises `RobotError` for a target that is none, naming the nearest.
+    `registered`: the camera's place in `robot` comes from a rough registration, and is fitted.
+    Raises `RobotError` for a target that is none, naming the nearest.
     """
     wiring = wire(robot)
     unknowns: list[Unknown] = []

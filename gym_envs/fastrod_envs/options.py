@@ -71,9 +71,10 @@ def checked_mapping(given: object) -> dict[str, Any]:
     return dict(given or {})
 
 
-def with_steps(options: Mapping[str, Any], max_episode_steps: int | None) -> dict[str, Any]:
-    """Options with Gymnasium's name of n_steps as ours. Raises `InputError` where both are given and differ."""
-    if max_episode_steps is None:
+def with_steps(options: Mapping[str, Any], max_episode_steps: int | None, n_steps: int) -> dict[str, Any]:
+    """Options with Gymnasium's name of n_steps as ours; the task's own `n_steps`, which `make_vec` gives where nobody else does, yields to
+    an option. Raises `InputError` where both are given and differ."""
+    if max_episode_steps is None or (options.get("n_steps") is not None and max_episode_steps == n_steps):
         return dict(options)
     if options.get("n_steps", max_episode_steps) != max_episode_steps:
         raise InputError(f"n_steps is {options['n_steps']!r} and max_episode_steps {max_episode_steps!r}; give one of them.")

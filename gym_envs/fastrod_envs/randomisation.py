@@ -13,8 +13,8 @@ import numpy as np
 from fastrod.chain import named_effects
 from fastrod.effect import canonical_name, get_effect, read_values
 from fastrod.errors import InputError, nearest
+from fastrod.loading import load_robot
 from fastrod.robot import Robot
-from fastrod.robotfile import load_robot
 from fastrod.types import Floats
 from fastrod.wiring import wire
 

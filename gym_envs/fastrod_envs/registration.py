@@ -22,6 +22,12 @@ _TASKS: Mapping[str, str] = {
     "ReachObstacle": "fastrod_envs.tasks.reach_obstacle:ReachObstacle",
     "Track": "fastrod_envs.tasks.track:Track",
 }
+N_STEPS: Mapping[str, int] = {
+    "BoxExplore": 40, "Catch": 40, "DualArm": 40, "PickPlace": 60, "Push": 40, "QuadrupedPush": 40, "Reach": 40, "TubeInsert": 50,
+    "ReachObstacle": 40, "Track": 200,
+}  # fmt: skip
+"""`n_steps` of each task's class, for Gymnasium: the tasks themselves, which import numba, are imported when one is made."""
+SOLVED: Mapping[str, float] = {}
 NAMESPACE = "fastrod"
 VERSION = "v0"
 
@@ -65,7 +71,7 @@ def register_all() -> None:
         if id_ not in registry:
             register(
                 id=id_, entry_point="fastrod_envs.single:SingleEnv", vector_entry_point="fastrod_envs.vector:BatchEnv",
-                kwargs={"task": name},
+                kwargs={"task": name}, max_episode_steps=N_STEPS[name], reward_threshold=SOLVED.get(name),
             )  # fmt: skip
 
 

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import sys
+import warnings
 from typing import Any, ClassVar, final
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import ArrayLike
 
 from fastrod.errors import InputError
 from fastrod_envs.episodes import Episodes, Singles
 from fastrod_envs.options import checked_difficulty, checked_mapping, with_steps
-from fastrod_envs.registration import make_task
+from fastrod_envs.registration import make_task, task_class
 from fastrod_envs.rendering import Renderer
 from fastrod_envs.vector import action_space
 
@@ -30,13 +33,26 @@ class SingleEnv(gymnasium.Env[Singles, Any]):
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "viser"], "render_fps": 25}  # type: ignore[misc]
 
     def __init__(self, task: str, *, max_episode_steps: int | None = None, render_mode: str | None = None, **options: Any) -> None:
-        """As `BatchEnv`, with one environment."""
+        """As `BatchEnv`, with one environment. One that `gymnasium.make` makes without n_steps leaves the end of an episode to it."""
+        self._spec: EnvSpec | None = None
+        self._own_steps = max_episode_steps is not None or options.get("n_steps") is not None
         self.render_mode = render_mode
         self._renderer = Renderer(render_mode)
-        self.task = make_task(task, 1, with_steps(options, max_episode_steps))
+        self.task = make_task(task, 1, with_steps(options, max_episode_steps, task_class(task).n_steps))
         self._episodes = Episodes(self.task)
         self.observation_space = gymnasium.spaces.Box(self._episodes.low, self._episodes.high, dtype=np.float32)
         self.action_space = action_space(self.task)
+
+    @property
+    def spec(self) -> EnvSpec | None:  # type: ignore[override]
+        """What `gymnasium.make` made it from; None where nobody did."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, made: EnvSpec | None) -> None:
+        self._spec = made
+        if made is not None and not self._own_steps:
+            self._episodes.n_steps = sys.maxsize  # its TimeLimit counts, to max_episode_steps of gymnasium.make or of the registry
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Singles, dict[str, Any]]:
         """Begin an episode; `options={"difficulty": level}` sets the curriculum's level. Raises `InputError`."""
@@ -45,6 +61,7 @@ class SingleEnv(gymnasium.Env[Singles, Any]):
         level = checked_difficulty(options.pop("difficulty", self.task.difficulty))
         if options:
             raise InputError(f"reset has no option {next(iter(options))!r}; known: difficulty.")
+        self._warn_of_limit()
         self._episodes.seed([seed])
         self.task.set_difficulty(level)
         self._episodes.begin(np.array([0]))
@@ -57,6 +74,15 @@ class SingleEnv(gymnasium.Env[Singles, Any]):
             self._episodes.observation()[0], float(moment.reward[0]), bool(moment.terminated[0]), bool(moment.truncated[0]),
             _first(self._episodes.info(moment)),
         )  # fmt: skip
+
+    def _warn_of_limit(self) -> None:
+        """Say that the TimeLimit of `gymnasium.make` has ended an episode before its n_steps; nobody else resets at this very step."""
+        usual, own = self.task.n_steps, self._episodes.n_steps
+        if self._spec is not None and self._own_steps and own > usual == self._episodes.elapsed[0]:
+            warnings.warn(
+                f"n_steps is {own}, but gymnasium.make ended the episode after {usual} steps; give max_episode_steps={own} as well.",
+                stacklevel=3,
+            )
 
     def baseline(self) -> Singles:
         """(n_actions,) what the task's scripted baseline does now."""

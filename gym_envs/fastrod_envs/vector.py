@@ -15,7 +15,7 @@ from fastrod.errors import InputError
 from fastrod.types import Flags, Floats
 from fastrod_envs.episodes import Episodes, Singles
 from fastrod_envs.options import checked_difficulty, checked_mapping, with_steps
-from fastrod_envs.registration import make_task
+from fastrod_envs.registration import make_task, task_class
 from fastrod_envs.rendering import Renderer
 from fastrod_envs.task import Task
 
@@ -54,7 +54,7 @@ class BatchEnv(VectorEnv[Singles, Any, Any]):
             raise InputError(f"num_envs is {num_envs!r}; it must be a whole number, at least 1.")
         self.render_mode = render_mode
         self._renderer = Renderer(render_mode)
-        self.task = make_task(task, int(num_envs), with_steps(options, max_episode_steps))
+        self.task = make_task(task, int(num_envs), with_steps(options, max_episode_steps, task_class(task).n_steps))
         self.num_envs = int(num_envs)
         self._episodes = Episodes(self.task)
         self.single_observation_space = gymnasium.spaces.Box(self._episodes.low, self._episodes.high, dtype=np.float32)

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -18,7 +19,7 @@ from fastrod import save_robot
 from fastrod.errors import EffectError, InputError, UnknownNameError
 from fastrod_envs.painter import ball_mesh, paint, tube_mesh
 from fastrod_envs.randomisation import Randomisation
-from fastrod_envs.registration import task_class
+from fastrod_envs.registration import SOLVED, task_class
 from fastrod_envs.rodtask import RodTask
 from fastrod_envs.single import SingleEnv
 from fastrod_envs.task import Ball, Line, Scenery, Solid, Tube
@@ -122,6 +123,45 @@ def test_steps_and_options_of_the_wrong_kind_are_refused() -> None:
 def test_max_episode_steps_is_another_name() -> None:
     assert made("Reach", max_episode_steps=7).n_steps == 7
     assert made("Reach").n_steps == task_class("Reach").n_steps
+
+
+def ended(env: gymnasium.Env[Any, Any]) -> int:
+    """Steps of an episode at rest."""
+    env.reset(seed=0)
+    for n in range(1, 400):
+        _, _, terminated, truncated, _ = env.step(np.zeros(env.action_space.shape or (), np.float32))
+        if terminated or truncated:
+            return n
+    return 0
+
+
+@pytest.mark.parametrize(
+    ("options", "steps"),
+    [
+        ({}, 40), ({"max_episode_steps": 80}, 80), ({"max_episode_steps": 10}, 10), ({"n_steps": 7}, 7),
+        ({"n_steps": 80, "max_episode_steps": 80}, 80), ({"n_steps": 80, "max_episode_steps": -1}, 80),
+    ],
+)  # fmt: skip
+def test_make_ends_an_episode_where_it_is_told(options: dict[str, int], steps: int) -> None:
+    env = gymnasium.make("fastrod/Reach-v0", threads=1, **options)  # type: ignore[arg-type]
+    assert [ended(env), ended(env)] == [steps, steps]
+    assert ended(SingleEnv("Reach", threads=1, n_steps=options.get("n_steps"))) == options.get("n_steps", 40)
+    if "max_episode_steps" in options and "n_steps" not in options:
+        assert gymnasium.make_vec("fastrod/Reach-v0", num_envs=2, threads=1, **options).n_steps == steps  # type: ignore[attr-defined]
+
+
+def test_a_number_of_steps_beyond_the_limit_of_make_is_not_cut_in_silence() -> None:
+    env = gymnasium.make("fastrod/Reach-v0", threads=1, n_steps=80)
+    assert ended(env) == 40
+    with pytest.warns(UserWarning, match="n_steps is 80, but gymnasium.make ended the episode after 40 steps; give max_episode_steps=80"):
+        env.reset()
+
+
+@pytest.mark.parametrize("name", fastrod_envs.names())
+def test_gymnasium_knows_the_length_of_an_episode(name: str) -> None:
+    spec = gymnasium.spec(f"fastrod/{name}-v0")
+    assert spec.max_episode_steps == task_class(name).n_steps
+    assert (spec.reward_threshold is None) == (name not in SOLVED)
 
 
 def test_the_precise_reward_adds_a_term() -> None:

@@ -13,8 +13,8 @@ from typing import Any, final
 from fastrod.access import Served
 from fastrod.errors import FastrodError, InputError
 from fastrod.link import RobotLink
+from fastrod.loading import load_robot
 from fastrod.robot import Robot
-from fastrod.robotfile import load_robot
 from fastrod.runlog import RunLog
 from fastrod_scenes.scene import names
 from fastrod_viewer.canvas import Canvas

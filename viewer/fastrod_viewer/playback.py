@@ -13,8 +13,8 @@ import numpy as np
 
 from fastrod.errors import FastrodError, InputError, LogError
 from fastrod.identification.replay import replay
+from fastrod.loading import load_robot
 from fastrod.robot import Robot
-from fastrod.robotfile import load_robot
 from fastrod.runlog import RunLog
 from fastrod.types import Flags, Floats, Ints
 from fastrod_scenes.measured import detect, read

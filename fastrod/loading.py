@@ -1,0 +1,36 @@
+"""Robot files with their effects checked: what `fastrod.load_robot` is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fastrod import robotfile
+from fastrod.errors import EffectError, UnknownNameError, shown
+from fastrod.robot import Robot
+
+
+def load_robot(source: str | Path) -> Robot:
+    """The robot of a shipped name, or of a path to a .toml, with every [[effect]] known and its parameters within their bounds.
+
+    Raises `UnknownNameError` for a name or an effect that is not there, `RobotError` for a file that is not a robot, `EffectError` for an
+    effect's parameter that cannot be.
+    """
+    robot = robotfile.load_robot(source)
+    if robot.effects:
+        check_effects(robot, f"robot file {shown(str(source))}")
+    return robot
+
+
+def check_effects(robot: Robot, where: str) -> None:
+    """Look up the effects of `robot` in the library; `where` names it in errors. Raises `UnknownNameError`, `EffectError`."""
+    from fastrod.chain import named_effects  # the library imports numba, which a robot without effects does not need
+    from fastrod.effect import read_values
+    from fastrod.wiring import wire
+
+    try:
+        tables = named_effects(robot)
+    except (EffectError, UnknownNameError) as error:
+        raise type(error)(f"{where}: {error}") from error
+    wiring = wire(robot)
+    for name, table in tables.items():
+        read_values(name, table, wiring, where)
