@@ -82,6 +82,8 @@ def _replay(arguments: argparse.Namespace) -> int:
         return _refuse(f"the model converged on none of the {len(log)} rows.", FAILED)
     for written in room.write(result, out):
         console.print(f"wrote {written}", soft_wrap=True, highlight=False)
+    for question in result.questions:  # it has shown what it was asked for: to ask is not to refuse
+        _refuse(question, DONE)
     return DONE
 
 

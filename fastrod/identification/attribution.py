@@ -18,8 +18,9 @@ from fastrod.identification.evidence import Candidate, State, Step
 from fastrod.identification.forward import sample
 from fastrod.identification.network import check_network, residual_network
 from fastrod.identification.questions import read
+from fastrod.identification.registration import between
 from fastrod.identification.result import Result
-from fastrod.identification.search import Search
+from fastrod.identification.search import MOST_PASSES, Search
 from fastrod.identification.split import held_out_rows, merged
 from fastrod.identification.unknowns import base_model
 from fastrod.robot import Robot
@@ -84,11 +85,19 @@ def identify(
     found, last, steps = _found(search, base, start, max_effects + _SPARE if max_effects else 0, tell)
     last_sigma = base.weights[-1]
     state, found = _library(search, base, start, last, found, max_effects, steps) if found else (start, found)
+    if search.spent:
+        base.notes.append(
+            f"the search stopped early: the model hardly converges, and has taken {MOST_PASSES:.0f} passes for each row; more may be missing"
+        )
     tell("prediction on all samples", max_effects + _SPARE + 1, max_effects + _SPARE + 2)
     result = assemble(
         samples=samples, rows=_thinned(train, ALL_AT_ONCE), tested=tested, labels=labels, base=base, search=search, start=start, last=last,
         last_sigma=last_sigma, state=state, found=found, steps=steps, fixed=fixed, threads=threads,
     )  # fmt: skip
+    if placed is not robot:
+        at = between(robot, result.identified)
+        sentence = f"{at.sentence().capitalize()}; all errors are given with it registered there."
+        result = replace(result, registration=at, summary=f"{result.summary} {sentence}")
     return replace(result, network=residual_network(samples, model.wiring, result)) if network else result
 
 

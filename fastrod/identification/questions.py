@@ -30,7 +30,6 @@ _SCALES = {
     1e-3: "mm to m", 1e-2: "cm to m", 0.1: "mm to cm", 0.0254: "inches to m", np.pi / 180.0: "degrees to radians",
     0.5: "a diameter for a radius", 2.0: "a radius for a diameter", 10.0: "cm to mm", 1e3: "converted twice",
 }  # fmt: skip
-_NEAR = 0.12  # relative distance of a scale from one of these
 _AS_GOOD = 1.3  # times what a moved camera leaves
 _RIGHT = "Are the units, the signs (negative = pulled) and the order of the dl_ columns right, and is it this robot?"
 _PACE = 1.0  # s from row to row; a dense log that takes longer has its time in another unit
@@ -67,13 +66,14 @@ def read(samples: Samples, robot: Robot, *, threads: int | None = None) -> Readi
     asked = [late] if late else []
     look = _Look(samples, robot, threads)
     nothing = Reading(registration=None, questions=tuple(asked), refusal="", guess="")
-    as_it_is, frame = look.as_it_is, look.frame
+    frame, far = look.frame, look.frame.is_large(robot.length)
+    as_it_is = look.as_it_is if far else min(look.as_it_is, frame.left)  # a small misalignment is for the search to name
     if look.motion < _STILL * robot.length or not (look.solved or robot.n_tendons):
         return nothing
-    if as_it_is < _FOLLOWS * look.motion and not frame.is_large(robot.length):
+    if as_it_is < _FOLLOWS * look.motion and not far:
         return nothing
     enough = min(_FOLLOWS * look.motion, _BETTER * as_it_is)
-    moved = frame.is_large(robot.length) and frame.left < enough
+    moved = far and frame.left < enough
     tried = [(look.with_inputs(dl), words) for dl, words in _other_inputs(samples, robot, look.scale)]
     left, words = min(tried, default=(np.inf, ""))
     mixed_up = left < enough
@@ -88,6 +88,9 @@ def read(samples: Samples, robot: Robot, *, threads: int | None = None) -> Readi
     elif mixed_up:
         times = f" {as_it_is / left:.0f} times as closely" if np.isfinite(as_it_is) else ""
         guess = f"The model would follow{times} with {words}."
+        if moved:
+            turn = f"{np.degrees(frame.angle):.0f} deg"
+            guess += f" A camera turned by {turn} would look the same: if yours is, give [sensor] registration_sd in the robot file."
     further = look.centred > _FURTHER * look.motion and not (moved and not guess)
     name = samples.log.name
     refusal = ""
@@ -200,7 +203,8 @@ def _other_inputs(samples: Samples, robot: Robot, scale: float) -> Iterator[tupl
         if columns != tuple(range(n)):
             yield dl[:, list(columns)], words
     for factor, words in _SCALES.items():
-        if not np.isfinite(scale) or abs(abs(scale) / factor - 1.0) < _NEAR or abs(scale) < 0.05 or abs(scale) > 20.0:
+        fewer = not np.isfinite(scale) or scale < 1.0  # a rod that bends far moves less than in proportion: not the very factor
+        if (factor < 1.0) == fewer and factor * float(np.abs(dl).max()) < robot.length:
             yield factor * dl, f"every dl_ times {factor:.4g} ({words})"
 
 

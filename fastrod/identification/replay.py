@@ -50,6 +50,8 @@ class Replay:
     """(n,) rows that the model solved."""
     points: Floats | None = None
     """(n, k, 3) predicted further points at the robot's `log_points` [m], where the log measured some."""
+    questions: tuple[str, ...] = ()
+    """What the log makes one ask about its units, signs, order, frame and time, a sentence each."""
 
     @property
     def compared(self) -> Mask:
@@ -113,18 +115,22 @@ def replay(log: RunLog, robot: Robot, *, simulator: Callable[..., Any] | None = 
     """The model's answer to every row of `log`, each row one robot of a batch.
 
     Effects of the robot are carried over the whole log, memories, clocks and camera included; each run begins at rest. The
-    measured frame is taken as the robot's base frame: nothing is registered and nothing is fitted. `simulator` is
-    `fastrod.Simulator` or a stand-in; `progress` is called with the rows done and the rows in all.
+    measured frame is taken as the robot's base frame: nothing is registered and nothing is fitted. Where another reading of the log
+    would follow far better, `questions` of the answer ask for it. `simulator` stands in for `fastrod.Simulator`, and leaves the
+    questions out; `progress` is called with the rows done and the rows in all.
     Raises `LogError` where no row of the log can be compared, `InputError` for a robot that lengths do not drive.
     """
     _check_driven_by_lengths(robot)
     if not log.measured.any():
         raise LogError(f"log {log.name!r} has no row in which every input and the tip are there; there is nothing to compare.")
-    if robot.effects and simulator is None:
-        return _with_effects(log, robot, progress)
+    asked: tuple[str, ...] = ()
     if simulator is None:
-        from fastrod.simulator import Simulator  # it loads numba, which no other command line word needs
+        from fastrod.identification.questions import questions  # these load numba, which no other command line word needs
+        from fastrod.simulator import Simulator
 
+        asked = questions(log, robot)
+        if robot.effects:
+            return _with_effects(log, robot, progress, asked)
         simulator = Simulator
     n_points = 0 if log.points is None else len(robot.log_points)
     tip, points, converged = np.full((len(log), 3), np.nan), np.full((len(log), n_points, 3), np.nan), np.zeros(len(log), dtype=np.bool_)
@@ -135,10 +141,10 @@ def replay(log: RunLog, robot: Robot, *, simulator: Callable[..., Any] | None = 
         if progress is not None:
             progress(start + len(chunk), len(rows))
     tip[~converged], points[~converged] = np.nan, np.nan
-    return Replay(log=log, robot=robot, tip_position=tip, converged=converged, points=points if n_points else None)
+    return Replay(log=log, robot=robot, tip_position=tip, converged=converged, points=points if n_points else None, questions=asked)
 
 
-def _with_effects(log: RunLog, robot: Robot, progress: Progress | None) -> Replay:
+def _with_effects(log: RunLog, robot: Robot, progress: Progress | None, asked: tuple[str, ...]) -> Replay:
     from fastrod.identification.forward import Rod, predict, sample  # they load numba
     from fastrod.identification.unknowns import known_model
 
@@ -152,7 +158,7 @@ def _with_effects(log: RunLog, robot: Robot, progress: Progress | None) -> Repla
         tip[rows], points[rows], converged[rows] = pose.position[pose.ok], pose.points[pose.ok], True
         if progress is not None:
             progress(part.rows[-1] + 1, len(samples.log))
-    return Replay(log=log, robot=robot, tip_position=tip, converged=converged, points=points if n_points else None)
+    return Replay(log=log, robot=robot, tip_position=tip, converged=converged, points=points if n_points else None, questions=asked)
 
 
 def make_folder(path: str | Path) -> Path:

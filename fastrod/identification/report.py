@@ -13,6 +13,7 @@ import numpy as np
 from fastrod.identification.headline import explained
 from fastrod.identification.page import page
 from fastrod.identification.replay import make_folder
+from fastrod.identification.registration import Registration
 from fastrod.identification.result import Error, Estimate, Result
 from fastrod.identification.wording import VERDICTS, millimetres, percent, plain_name, with_error, words
 from fastrod.robotfile import save_robot
@@ -50,6 +51,7 @@ def to_json(result: Result) -> dict[str, Any]:
             for found in result.effects
         ],
         "base_parameters": _estimates(result.base_parameters),
+        "registration": _registration(result.registration),
         "correlation": {"names": list(names), "matrix": matrix},
         "remaining": {
             "structured_fraction": result.remaining_share,
@@ -153,6 +155,13 @@ def table(result: Result) -> Group:
 
 def _error(error: Error) -> dict[str, float]:
     return {"before_rms_m": error.before, "after_rms_m": error.after}
+
+
+def _registration(camera: Registration | None) -> dict[str, Any] | None:
+    """Where a camera stands that was far from where the robot file says; None where it was not."""
+    if camera is None:
+        return None
+    return {"angle_rad": camera.angle, "distance_m": camera.distance, "rotation": camera.rotation, "shift_m": camera.shift}
 
 
 def _estimates(every: Mapping[str, Estimate]) -> dict[str, Any]:

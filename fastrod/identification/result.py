@@ -11,6 +11,7 @@ import numpy as np
 from fastrod.identification.audit import Audit
 from fastrod.identification.evidence import Bound
 from fastrod.identification.noise import Noise
+from fastrod.identification.registration import Registration
 from fastrod.robot import Robot
 from fastrod.runlog import RunLog
 from fastrod.types import Flags, Floats
@@ -134,6 +135,8 @@ class Result:
     """What is odd about this log."""
     solves: int
     """Batches of the rod that the search took."""
+    registration: Registration | None = None
+    """Where the camera stands from where the robot file says, fitted; None where it stood near enough for the search."""
     network: Mapping[str, float] = field(default_factory=dict)
     """Held-out rms with a network on what is left, where one was asked for."""
 

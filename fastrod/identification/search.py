@@ -43,6 +43,8 @@ from fastrod.identification.unknowns import Model
 from fastrod.types import Floats, Ints
 
 N_BLOCKS = 20
+MOST_PASSES = 10_000.0
+"""Of each row, on the average, after which nothing new is tried. A log with two effects takes some hundreds."""
 _STARTS = 8
 _SCREEN = 0.003  # of the loss: a candidate whose slopes promise less is not fitted
 _FEW, _MANY = 3, 12  # iterations of a start, and of the best of them
@@ -112,10 +114,17 @@ class Search:
             np.concatenate([sd, wide]), (np.concatenate([low, -free]), np.concatenate([high, free])), iterations,
         )  # fmt: skip
 
+    @property
+    def spent(self) -> bool:
+        """Whether the rod was solved so often that nothing new is to be tried."""
+        return self.rod.cost > MOST_PASSES
+
     # ------------------------------------------------------------ candidates
 
     def candidate(self, state: State, name: str) -> Candidate:
-        """An effect fitted beside a state, from each of its starts."""
+        """An effect fitted beside a state, from each of its starts; not fitted once the search has `spent` its passes."""
+        if self.spent:
+            return Candidate(name, None, 0.0, 0.0, 0.0, 0, "not tried: the model hardly converges on this log")
         drop = self._unseen(state, name)
         every = state.model.with_effect(name)
         added = every.unknowns[len(state.model.unknowns) :]

@@ -44,7 +44,7 @@ class SingleEnv(gymnasium.Env[Singles, Any]):
         self.action_space = action_space(self.task)
 
     @property
-    def spec(self) -> EnvSpec | None:  # type: ignore[override]
+    def spec(self) -> EnvSpec | None:
         """What `gymnasium.make` made it from; None where nobody did."""
         return self._spec
 
