@@ -10,7 +10,7 @@ import numpy as np
 
 from fastrod.robot import Robot
 from fastrod.types import Floats
-from fastrod_device.camera import Frame
+from fastrod_device.camera import Camera, Frame
 
 OUTSIDE, ASTRAY, TOO_FAST, TWICE = "outside the workspace", "far from the model", "too fast", "two markers"
 """Flags of sightings that are refused."""
@@ -85,9 +85,9 @@ class FrameOrder:
     it.
     """
 
-    def __init__(self, rate: float) -> None:
-        """`rate`: frames a second [Hz]."""
-        self._period = 1.0 / rate
+    def __init__(self, camera: Camera) -> None:
+        """No frame was seen yet."""
+        self._period, self._latency = 1.0 / camera.rate, camera.latency
         self.reset()
 
     def reset(self) -> None:
@@ -124,7 +124,7 @@ class FrameOrder:
             self._last = self._given = frame.t
             return frame.t, ""
         if not math.isfinite(self._given):  # the first of all
-            self._last = self._given = frame.t if now is None else now
+            self._last = self._given = frame.t if now is None else now - self._latency
         else:
             self._given += 0.5 * (self._last + self._period - self._given)
         return self._given, flag

@@ -308,8 +308,8 @@ class Prototype:
             if thread is not threading.current_thread():
                 thread.join(timeout=2.0)
         self._threads = []
-        camera = [] if self.source is None else [self.source.close]
-        for end in (self.drives.quick_stop, self.drives.close, *camera):
+        ends: list[Callable[[], object]] = [self.drives.quick_stop, self.drives.close]
+        for end in ends if self.source is None else [*ends, self.source.close]:
             try:
                 end()
             except Exception as error:  # adapters raise what they like; the others are closed all the same

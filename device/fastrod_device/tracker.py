@@ -99,7 +99,7 @@ class MarkerTracker:
         self._matrix, self._base_from_camera = camera.intrinsics, camera.base_from_camera
         self._workspace, self._gate, self._slack = workspace, gate, slack
         self._limit, self._sigma = limit, sigma
-        self._fit, self._detector, self._order = SideFit(camera), _detector(marker), FrameOrder(camera.rate)
+        self._fit, self._detector, self._order = SideFit(camera), _detector(marker), FrameOrder(camera)
         self._cells = dictionary_named(marker.dictionary).markerSize + 2
         half = marker.size / 2.0
         self._corners = half * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
