@@ -32,9 +32,9 @@ def address(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     """Of each kind of page there is."""
     folder = tmp_path_factory.mktemp("access")
     if request.param == "drive":
-        words = "-m fastrod.cli drive --emulate --seed 3 --no-home --no-open --port 0".split()
-        pipe = subprocess.PIPE
-        with subprocess.Popen([sys.executable, *words], cwd=folder, stdout=pipe, stderr=pipe, text=True) as process:
+        words = ["fastrod.cli", "drive", "--emulate", "--seed", "3", "--no-home", "--no-open", "--port", "0"]
+        command, pipe = [sys.executable, "-m", *words], subprocess.PIPE
+        with subprocess.Popen(command, cwd=folder, stdout=pipe, stderr=pipe, text=True) as process:
             assert process.stdout is not None
             line = process.stdout.readline()
             found = re.search(r"http://\S+", line)
@@ -70,7 +70,7 @@ STRANGERS = {
     "an empty origin": ("/{key}/", OWN, ORIGIN),
     "two origins": ("/{key}/", OWN, ORIGIN + "http://{host}", ORIGIN + "http://evil.example"),
     "a rebound name": ("/{key}/", "Host: evil.example:{port}"),
-    "a rebound name, its origin": ("/{key}/", "Host: evil.example:{port}", ORIGIN + "http://evil.example:{port}"),
+    "a rebound origin": ("/{key}/", "Host: evil.example:{port}", ORIGIN + "http://evil.example:{port}"),
     "a name that begins alike": ("/{key}/", "Host: 127.0.0.1.evil.example:{port}"),
     "another port": ("/{key}/", "Host: 127.0.0.1:1"),
     "no port": ("/{key}/", "Host: 127.0.0.1"),

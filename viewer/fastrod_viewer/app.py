@@ -267,8 +267,8 @@ def view(
         app.open(shown, link=link, script=script)
         if app.served.elsewhere:
             app.say(
-                f"Other machines reach this page, too, at {app.served.elsewhere} and whoever has this address "
-                "can drive: it is the key, nobody gets in without it, and it travels unencrypted."
+                f"Other machines reach this page, too, at {app.served.elsewhere} and whoever has this "
+                "address can drive: it is the key, nobody gets in without it, and it travels unencrypted."
             )
         print(f"{app.page.title if app.page else what}: {app.address} (Ctrl+C ends it)", flush=True)
         app.wait()
