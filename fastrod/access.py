@@ -11,6 +11,7 @@ import secrets
 import socket
 import sys
 import threading
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from http import HTTPStatus
@@ -179,8 +180,9 @@ def serve_guarded(host: str, port: int, *, label: str | None = None) -> Served:
         asyncio.get_running_loop().set_exception_handler(ignored.of_loop)
         answer = access.guard(process_request)
         guarded.set()
-        return plain(*arguments, process_request=answer, logger=_silent(), **options)
+        return plain(*arguments, process_request=answer, logger=_silent(ignored), **options)
 
+    warnings.filterwarnings("ignore", r"\[viser\] .* does not match annotation")  # of what a page has sent
     # viser offers no place for a check, so that it finds this one where it looks for websockets' own server
     with _patching, contextlib.redirect_stdout(io.StringIO()):  # it greets with a box
         setattr(web, "serve", serve)  # noqa: B010 - mypy forbids assigning to a class
@@ -221,9 +223,21 @@ def _outward(host: str) -> str:
     return socket.gethostname()
 
 
-def _silent() -> logging.Logger:
-    """A logger that says nothing: requests hold the key, and strangers could fill a terminal with
-    failures."""
-    logger = logging.Logger("fastrod.access.silent", level=logging.CRITICAL + 1)
-    logger.addHandler(logging.NullHandler())
+@final
+class _Failures(logging.Handler):
+    """Hears what websockets logs, and tells `ignored` of messages that ended their own connection."""
+
+    def __init__(self, ignored: Ignored) -> None:
+        super().__init__(logging.ERROR)
+        self._ignored = ignored
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.exc_info and record.getMessage() == "connection handler failed":
+            self._ignored(record.exc_info[1])
+
+
+def _silent(ignored: Ignored) -> logging.Logger:
+    """Return a logger that prints nothing: requests hold the key, and strangers could fill a terminal."""
+    logger = logging.Logger("fastrod.access", level=logging.ERROR)  # on its own, below no other
+    logger.addHandler(_Failures(ignored))
     return logger

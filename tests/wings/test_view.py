@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 import urllib.request
+import webbrowser
 from pathlib import Path
 
 import pytest
@@ -21,7 +22,7 @@ from fastrod.cli import main
 from fastrod.errors import InputError, UnknownNameError
 from fastrod.robotfile import load_robot
 from fastrod.simulated import SimulatedRobot
-from fastrod_viewer.app import DEMO_LOG, App, found
+from fastrod_viewer.app import DEMO_LOG, App, found, view
 from fastrod_viewer.playback import Playback
 from fastrod_viewer.server import free_port, serve
 from fastrod_viewer.worlds import FreeWorld, SceneWorld
@@ -164,3 +165,23 @@ def _address() -> str:
     """Of this machine as others see it, or a loopback address that nobody serves."""
     address = socket.gethostbyname(socket.gethostname())
     return "127.0.0.2" if address.startswith("127.") else address
+
+
+@pytest.mark.parametrize(("host", "told"), [("127.0.0.1", False), ("0.0.0.0", True)])
+def test_the_address_is_the_key(
+    host: str, told: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:  # fmt: skip
+    opened: list[str] = []
+    monkeypatch.setattr(App, "wait", lambda app: opened.append(app.served.key))
+    monkeypatch.setattr(webbrowser, "open", opened.append)
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        view("prototype", host=host, port=0)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    said = capsys.readouterr()
+    address, key = opened
+    assert address.endswith(f"/{key}/")
+    assert f"prototype: {address} (Ctrl+C ends it)" in said.out
+    assert ("Other machines reach this page, too, at http://" in said.err) == told
+    assert (f"/{key}/ and whoever has this address can drive: it is the key" in said.err) == told
