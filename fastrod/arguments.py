@@ -26,7 +26,8 @@ DATA_SETS = ("shapes", "rollouts", "sweep")
 _MOVING = tuple(name for name in ACTIONS if name not in BOARD_ACTIONS)
 _OF: dict[str, tuple[str, ...]] = {
     "eds": _MOVING, "no_home": _MOVING, "path": ("track",),
-    "policy": ("track",), "trust": ("track",), "payload": ("excite", "loop"), "views": BOARD_ACTIONS, "board": BOARD_ACTIONS, "square": BOARD_ACTIONS,
+    "policy": ("track",), "trust": ("track",), "payload": ("excite", "loop"),
+    "views": BOARD_ACTIONS, "board": BOARD_ACTIONS, "square": BOARD_ACTIONS,
     "board_marker": BOARD_ACTIONS, "dictionary": BOARD_ACTIONS, "at": ("register",), "port": ("teleop",), "no_open": ("teleop",),
     "out": tuple(name for name in ACTIONS if name != "teleop"), "bus": _MOVING,
 }  # fmt: skip
@@ -195,7 +196,8 @@ def check_drive(arguments: argparse.Namespace) -> None:
 def _add_trust(parser: argparse._ActionsContainer, of: str = "") -> None:
     parser.add_argument(
         "--trust", action="store_true",
-        help=f"{of}where the folder has no file of our own, read that of stable-baselines3: this runs code of whoever made it",
+        help=f"{of}read a file of stable-baselines3 where the folder has none of our own; "
+        "this runs code of whoever made the file",
     )  # fmt: skip
 
 

@@ -26,7 +26,7 @@ _TIP_QUATERNION = ("tip_qw", "tip_qx", "tip_qy", "tip_qz")
 _TIP_FORCE = ("tip_fx", "tip_fy", "tip_fz")
 _BASE_QUATERNION = ("base_qw", "base_qx", "base_qy", "base_qz")
 _REACH = 3.0  # robot lengths; nothing on the robot is further from its base, so the unit is wrong
-_MOST_VALUES, _MOST_BYTES = 30_000_000, 500_000_000  # of a Parquet file unpacked: 1.5 GB while they become numbers
+_MOST_VALUES, _MOST_BYTES = 30_000_000, 500_000_000  # of a Parquet file unpacked: 1.5 GB at its peak
 _HEAVIEST = 10.0  # kg; a heavier payload was given in g
 _QUATERNION_SLACK = 1e-2  # trackers write three or four digits
 
@@ -256,7 +256,7 @@ def _read_parquet(path: Path) -> Table:
         with parquet.ParquetFile(path) as file:
             _check_declared(file.metadata, path.name)
             words = [column.path for column in file.metadata.schema if column.physical_type == "BYTE_ARRAY"]
-        content = parquet.read_table(path, read_dictionary=words)  # a word that a million rows repeat is held once
+        content = parquet.read_table(path, read_dictionary=words)  # a word of a million rows is held once
         _check_header(content.column_names, path.name)
         for name in content.column_names:
             column = content.column(name)
@@ -274,7 +274,7 @@ def _read_parquet(path: Path) -> Table:
 
 
 def _check_declared(metadata: Any, where: str) -> None:
-    """Raises `LogError` where a file unpacks to more than a run log has; a few kB may declare any number of rows."""
+    """Raise `LogError` where a file unpacks to more than a run log has; a few kB may declare any number of rows."""
     chunks = [metadata.row_group(k).column(j) for k in range(metadata.num_row_groups) for j in range(metadata.row_group(k).num_columns)]
     n_values = max(metadata.num_rows * metadata.num_columns, sum(chunk.num_values for chunk in chunks))
     n_bytes = sum(chunk.total_uncompressed_size for chunk in chunks)
@@ -285,7 +285,7 @@ def _check_declared(metadata: Any, where: str) -> None:
 
 
 def _check_words(column: Any, where: str) -> None:
-    """Raises `LogError` where words that are held once would be too much as cells."""
+    """Raise `LogError` where words that are held once would be too much as cells."""
     compute, n_bytes = _pyarrow("pyarrow.compute"), 0
     for chunk in column.chunks:
         if hasattr(chunk, "dictionary") and len(chunk):

@@ -28,7 +28,8 @@ def read_text(path: Path, where: str, error: type[FastrodError]) -> str:
 def parse(text: str, where: str, error: type[FastrodError], what: str) -> dict[str, Any]:
     """The tables of a TOML text. Raises `error`; `where` names the text, and `what` is what it should be."""
     if any(piece.count(".") > _DEEPEST and all(map(str.strip, piece.split("."))) for piece in re.split(r"[\n,=]", text)):
-        raise error(f"{where} is not a {what}: it has a key of more than {_DEEPEST} parts.")  # tomllib takes the square of their number
+        # tomllib takes a time that grows with the square of their number
+        raise error(f"{where} is not a {what}: it has a key of more than {_DEEPEST} parts.")
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as why:

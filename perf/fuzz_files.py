@@ -252,15 +252,15 @@ def _lost(index: int, verdict: str, said: str, seconds: float) -> Iterator[Outco
 def figures(outcomes: Sequence[Outcome]) -> dict[str, dict[str, float]]:
     """Counts, longest time [s] and largest memory [bytes] by kind, and of all."""
     groups = {kind: [o for o in outcomes if o.kind == kind] for kind in KINDS} | {"all": list(outcomes)}
-    told = {}
+    found = {}
     for kind, group in groups.items():
         counts = Counter(o.verdict for o in group)
-        told[kind] = {"files": len(group), **{verdict: counts[verdict] for verdict in (*FINE, *WRONG)}}
-        told[kind] |= {
+        found[kind] = {"files": len(group), **{verdict: counts[verdict] for verdict in (*FINE, *WRONG)}}
+        found[kind] |= {
             "longest s": max((o.seconds for o in group), default=0.0),
             "largest GB": max((o.memory for o in group), default=0) / 1e9,
         }
-    return told
+    return found
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -280,13 +280,13 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f"file {outcome.index}, {outcome.kind}, {outcome.attack}: {outcome.verdict}: {said}", file=sys.stderr, flush=True)
         if len(outcomes) % 500 == 0:
             print(f"{len(outcomes)} files", file=sys.stderr, flush=True)
-    told = figures(outcomes)
+    found = figures(outcomes)
     if arguments.json:
-        print(json.dumps(told, indent=1))
+        print(json.dumps(found, indent=1))
     else:
-        names = [name for name in told["all"] if name in ("files", *FINE, "longest s", "largest GB") or told["all"][name]]
+        names = [name for name in found["all"] if name in ("files", *FINE, "longest s", "largest GB") or found["all"][name]]
         print("  ".join(["kind".ljust(14), *(name.rjust(max(8, len(name))) for name in names)]))
-        for kind, row in told.items():
+        for kind, row in found.items():
             cells = [f"{row[name]:.2f}" if isinstance(row[name], float) else str(row[name]) for name in names]
             print("  ".join([kind.ljust(14), *(cell.rjust(max(8, len(name))) for name, cell in zip(names, cells, strict=True))]))
     return 0 if all(o.verdict in FINE for o in outcomes) else 1

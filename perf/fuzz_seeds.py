@@ -218,10 +218,10 @@ def _lines(data: bytes, rng: Rng) -> bytes:
     """Two lines change places, or one goes, or comes twice."""
     lines = data.split(b"\n")
     i, j = rng.integers(len(lines), size=2).tolist()
-    way = rng.integers(3)
-    if way == 0:
+    choice = rng.integers(3)
+    if choice == 0:
         lines[i], lines[j] = lines[j], lines[i]
-    elif way == 1:
+    elif choice == 1:
         del lines[i]
     else:
         lines.insert(j, lines[i])
@@ -292,7 +292,8 @@ def foreign(canary: Path) -> bytes:
 def _hostile(kind: str, data: bytes, canary: Path, originals: Originals) -> dict[str, Callable[[], bytes]]:
     """Files that are made to harm, by name."""
     made: dict[str, Callable[[], bytes]] = {
-        "empty": lambda: b"", "pickle": lambda: pickle.dumps(_Code(canary)), "pickled arrays": lambda: npz({"t": np.array([_Code(canary)])}),
+        "empty": lambda: b"", "pickle": lambda: pickle.dumps(_Code(canary)),
+        "pickled arrays": lambda: npz({"t": np.array([_Code(canary)])}),
         "zeros": lambda: bytes(100_000), "deep": lambda: b"x = " + b"[" * 100_000, "deep tables": lambda: b"[" + b"a." * 20_000 + b"a]",
         "archive": lambda: npz({"a": np.zeros(10)}),
     }  # fmt: skip
@@ -313,7 +314,8 @@ _BOMBS: Mapping[str, Mapping[str, str]] = {
         "other file": "mtllib ../../secret.mtl\n" + _CORNERS + "f 1 2 3\n",
     },
     "stl": {
-        "many solids": "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 0.1 0 0\nvertex 0 0.1 0\nendloop\nendfacet\nendsolid\n" * 5000,
+        "many solids": "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 0.1 0 0\nvertex 0 0.1 0\n"
+        "endloop\nendfacet\nendsolid\n" * 5000,
         "half a facet": "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0\n",
     },
     "ply": {
@@ -321,7 +323,10 @@ _BOMBS: Mapping[str, Mapping[str, str]] = {
         "declares faces": "ply\n" + _HEAD.format(3, 10**9) + "property list uchar int vertex_indices\nend_header\n0 0 0\n",
         "odd list": "ply\n" + _HEAD.format(3, 1) + "property list double double x\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n",
     },
-    "off": {"declares much": "OFF\n999999999999 999999999999 0\n", "one polygon": "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n600000 " + "0 1 2 " * 200_000},
+    "off": {
+        "declares much": "OFF\n999999999999 999999999999 0\n",
+        "one polygon": "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n600000 " + "0 1 2 " * 200_000,
+    },
 }  # fmt: skip
 
 
@@ -376,18 +381,18 @@ def _long_words() -> bytes:
 def _policy(rng: Rng, path: Path, canary: Path, originals: Originals) -> str:
     """A folder of a policy with actor.npz or config.json spoilt; how."""
     actor, config = originals.policy
-    way = rng.random()
-    if way < 0.4:
+    choice = rng.random()
+    if choice < 0.4:
         actor, attack = spoilt(actor, rng, text=False)
         attack = f"actor: {attack}"
-    elif way < 0.6:
+    elif choice < 0.6:
         config, attack = spoilt(config, rng, text=True)
         attack = f"config: {attack}"
-    elif way < 0.7:
+    elif choice < 0.7:
         names = sorted(_CONFIGS)
         attack = names[rng.integers(len(names))]
         config = _CONFIGS[attack](config)
-    elif way < 0.95:
+    elif choice < 0.95:
         arrays: dict[str, Any] = dict(originals.actor)
         names = sorted(_ARRAYS)
         attack = names[rng.integers(len(names))]
@@ -474,8 +479,10 @@ _ARRAYS: Mapping[str, Callable[[dict[str, Any], Rng, Path], bytes | None]] = {
     "shape": lambda arrays, rng, _: _spoil_array(arrays, rng, lambda a: a[:-1]),
     "turned": lambda arrays, rng, _: _spoil_array(arrays, rng, lambda a: a.T[None]),
     "no width": lambda arrays, rng, _: _spoil_array(arrays, rng, lambda a: a[:0]),
-    "one more": lambda arrays, _, __: arrays.update(weight_9=np.zeros(3)), "activation": lambda arrays, _, __: arrays.update(activation="x\ny"),
+    "one more": lambda arrays, _, __: arrays.update(weight_9=np.zeros(3)),
+    "activation": lambda arrays, _, __: arrays.update(activation="x\ny"),
     "squashed": lambda arrays, _, __: arrays.update(squashed=np.zeros((2, 2))), "bomb": lambda *_: None,
     "no reach": lambda arrays, _, __: arrays.update(reach=np.zeros_like(arrays["reach"])),
-    "many": lambda arrays, _, __: arrays.update({f"a{k}": np.zeros(1) for k in range(1100)}), "pickle": lambda _, __, canary: pickle.dumps(_Code(canary)),
+    "many": lambda arrays, _, __: arrays.update({f"a{k}": np.zeros(1) for k in range(1100)}),
+    "pickle": lambda _, __, canary: pickle.dumps(_Code(canary)),
 }  # fmt: skip

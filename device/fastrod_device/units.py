@@ -14,10 +14,10 @@ from fastrod.types import Floats, Ints
 from fastrod_device.readings import Feedback, Readings
 
 _RANGE = {
-    "drum_radius": (1e-4, 0.1), "gear": (1e-3, 1e6), "counts_per_turn": (1, 1e9), "torque_constant": (1e-6, 1e3),
-    "rated_torque": (1e-6, 1e4), "efficiency": (1e-3, 1.0),
+    "drum_radius": (1e-4, 0.1), "gear": (1e-3, 1e6), "counts_per_turn": (1, 1e9),
+    "torque_constant": (1e-6, 1e3), "rated_torque": (1e-6, 1e4), "efficiency": (1e-3, 1.0),
 }  # fmt: skip
-"""Of a `DriveSpec`'s numbers: wide of every drive, and narrow enough that their products are numbers of counts and newtons."""
+"""Of a `DriveSpec`'s numbers: wide of every drive, and their products still are counts and newtons."""
 
 
 @dataclass(frozen=True, kw_only=True)

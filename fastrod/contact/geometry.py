@@ -221,15 +221,16 @@ def mesh(
     open_surface: bool = False,
     limits: MeshLimits | None = None,
 ) -> Obstacle:
-    """A triangle mesh: a file (.stl, .obj, .ply, .off, .glb), a trimesh.Trimesh (left untouched) or a pair (vertices, faces).
+    """A triangle mesh: a file (.stl, .obj, .ply, .off, .glb), a trimesh.Trimesh (left untouched), or (vertices, faces).
 
     Vertices times `scale` are metres in the obstacle frame. A file of several bodies becomes one mesh. Duplicate vertices are
     merged and degenerate faces dropped. The mesh must be watertight with its faces counter-clockwise seen from outside; an
     inverted body inside another is a cavity. `open_surface` takes a surface with open edges, or a closed one that faces inwards,
-    as one-sided: the solid lies behind its normals. `limits`, by default those of `MeshLimits()`, are what reading a file may cost;
-    materials and whatever else a file refers to are not opened.
+    as one-sided: the solid lies behind its normals. `limits`, by default those of `MeshLimits()`, are what reading a
+    file may cost; materials and whatever else a file refers to are not opened.
 
-    Raises `InputError` where there is no such mesh, or where it is empty, broken, open, inverted, of a wrong scale or beyond `limits`.
+    Raises `InputError` where there is no such mesh, or where it is empty, broken, open, inverted, of a wrong scale or
+    beyond `limits`.
     """
     given, corners, triangles = _read(source, MeshLimits() if limits is None else limits)
     name = name or given or "mesh"
@@ -240,7 +241,7 @@ def mesh(
         raise InputError(f"scale of {where} is {factor!r}; it must be positive and finite, for example 0.001 for a file in mm.")
     if len(vertices) and (far := float(np.abs(vertices).max()) * factor) > _FARTHEST:
         raise InputError(
-            f"{where} has a vertex {far:.6g} m from its origin; more than {_FARTHEST:g} m. Was it given in mm? scale=0.001 mends that."
+            f"{where} has a vertex {far:.6g} m from its origin; more than {_FARTHEST:g} m. Was it given in mm? scale=0.001 fixes that."
         )
     vertices, faces = _merged(vertices * factor, faces)
     faces = _without_slivers(where, vertices, faces)
@@ -346,18 +347,18 @@ def _without_slivers(where: str, vertices: Floats, faces: Ints) -> Ints:
         p, q, r = (faces[flat, (longest[flat] + m) % 3] for m in range(3))
         beside = owner(q, p)
         d = faces[beside].sum(axis=1) - p - q
-        taken = (owner(r, d) >= 0) | (owner(d, r) >= 0)
+        there = (owner(r, d) >= 0) | (owner(d, r) >= 0)
         touched: set[int] = set()
         made: set[tuple[int, int]] = set()
         gone = []
-        for i, k, *corners, is_taken in zip(*(a.tolist() for a in (flat, beside, p, q, r, d, taken)), strict=True):
+        for i, k, *corners, is_there in zip(*(a.tolist() for a in (flat, beside, p, q, r, d, there)), strict=True):
             if i in touched:
                 continue
             if k < 0:  # at an open edge: nothing is lost with it
                 gone.append(i)
                 continue
             a, b, c, e = corners
-            if k in touched or is_taken or (min(c, e), max(c, e)) in made:
+            if k in touched or is_there or (min(c, e), max(c, e)) in made:
                 continue
             faces[i], faces[k] = (c, a, e), (e, b, c)
             made.add((min(c, e), max(c, e)))

@@ -1,4 +1,4 @@
-"""Mesh files from anywhere: `MeshLimits`, what a file declares looked at before it is read, and the reading within time and memory."""
+"""Mesh files from anywhere: `MeshLimits`, what a file declares, and its reading within time and memory."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from fastrod.contact import trimesh_reader
 from fastrod.errors import InputError, nearest, shown
 from fastrod.types import Floats, Ints
 
-_SMALL, _FEW = 4_000_000, 100  # bytes and bodies up to which a file is read in this process: a second or two at worst
+_SMALL, _FEW = 4_000_000, 100  # bytes and bodies up to which a file is read in this process: at worst 2 s
 _DESCRIPTION = 16_000_000  # bytes of the JSON of a .glb
 _LINE = 10_000  # bytes of a line of an .obj or .off
 _HEADER = 65_536  # bytes in which the header of a .ply or .off ends
@@ -29,7 +29,7 @@ _HEADER = 65_536  # bytes in which the header of a .ply or .off ends
 
 @dataclass(frozen=True, kw_only=True)
 class MeshLimits:
-    """What reading a mesh file may cost, for `fastrod.contact.mesh`. Raises `InputError` for a limit that is not positive.
+    """What reading a mesh file may cost, for `fastrod.contact.mesh`. Raises `InputError` for one that is not positive.
 
     >>> MeshLimits(n_faces=5_000_000, seconds=60.0).n_bytes
     256000000
@@ -40,7 +40,7 @@ class MeshLimits:
     n_faces: int = 1_000_000
     """Triangles of all its bodies, with each instance counted."""
     seconds: float = 10.0
-    """Until a file of more than 4 MB, or of more than 100 bodies, must be read; smaller ones take less than that."""
+    """Until a file of more than 4 MB, or of more than 100 bodies, must be read; smaller ones take less."""
     memory: int = 2_000_000_000
     """Of the process that reads such a file [bytes]."""
 
@@ -62,13 +62,13 @@ class _Declared(NamedTuple):
 def read_mesh(path: Path, limits: MeshLimits) -> tuple[Floats, Ints]:
     """Vertices (n, 3) and triangles (m, 3) of all bodies of a mesh file of one of `FORMATS`, untouched.
 
-    Nothing but the file itself is opened. Raises `InputError` where it is no such file, or larger than `limits` allows.
+    Nothing but the file itself is opened. Raises `InputError` where it is no such file, or beyond `limits`.
     """
     where, kind = f"mesh file {path.name!r}", path.suffix[1:].lower()
     if kind not in FORMATS:
         raise InputError(
-            f"{where} has the unknown suffix {path.suffix!r}; {nearest(kind, FORMATS)} An archive, or a scene that refers to other files, "
-            "is not read: save it as one of these."
+            f"{where} has the unknown suffix {path.suffix!r}; {nearest(kind, FORMATS)} "
+            "An archive, or a scene that refers to other files, is not read: save it as one of these."
         )
     try:
         size = path.stat().st_size
@@ -110,8 +110,8 @@ def _apart(where: str, path: Path, kind: str, limits: MeshLimits) -> tuple[Float
     own = {
         **os.environ,
         "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
-        "OPENBLAS_NUM_THREADS": "1",
-    }  # each thread of it reserves memory
+        "OPENBLAS_NUM_THREADS": "1",  # each reserves memory, which the limit counts
+    }
     try:
         done = subprocess.run(command, env=own, capture_output=True, timeout=limits.seconds, check=False, stdin=subprocess.DEVNULL)
     except subprocess.TimeoutExpired as error:
@@ -259,7 +259,7 @@ def _accessor(tree: Mapping[str, Any], accessor: Mapping[str, Any]) -> int:
 
 def _index(number: object, into: list[Any]) -> int:
     if not isinstance(number, int) or not 0 <= number < len(into):
-        raise ValueError(f"it refers to part {shown(number, 40)} of {len(into)}")
+        raise ValueError(f"it refers to number {shown(number, 40)} of {len(into)}")
     return number
 
 

@@ -1,4 +1,7 @@
-"""Read a mesh file by trimesh, here or as a program of its own that its caller can end: it needs nothing else of the package."""
+"""Read a mesh file by trimesh, here or as a program of its own that its caller can end.
+
+It needs nothing else of the package.
+"""
 
 from __future__ import annotations
 
@@ -16,20 +19,20 @@ from numpy.typing import NDArray
 
 
 def read(path: str, kind: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Vertices (n, 3) and triangles (m, 3) of all bodies of a file of the format `kind`; no other file is opened, whatever it refers to.
+    """Vertices (n, 3) and triangles (m, 3) of all bodies of a file of the format `kind`.
 
-    Raises what trimesh raises: each of its loaders has its own.
+    No other file is opened, whatever it refers to. Raises what trimesh raises: each of its loaders has its own.
     """
     import trimesh
 
     data = _PLAIN.get(kind, bytes)(Path(path).read_bytes())
-    with _silent("trimesh", "trimesh.util"):  # a stream has no folder in which materials, textures or buffers would be looked for
+    with _silent("trimesh", "trimesh.util"):  # a stream has no folder in which materials or buffers would be looked for
         made = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False, skip_materials=True).to_mesh()
     return np.array(made.vertices, dtype=np.float64).reshape(-1, 3), np.array(made.faces, dtype=np.int64).reshape(-1, 3)
 
 
 def _plain_obj(data: bytes) -> bytes:
-    """Positions and faces alone, as one body: trimesh takes a time that grows with the square of the number of materials."""
+    """Positions and faces alone, as one body: the time that trimesh takes grows with the square of their number."""
     lines = re.findall(rb"^[ \t]*[vf][ \t][^\r\n]*", data.replace(b"\\\n", b"").replace(b"\r", b"\n"), re.MULTILINE)
     return re.sub(rb"/[^\s]*", b"", b"\n".join(line.strip() for line in lines)) + b"\n"
 
@@ -46,7 +49,7 @@ _PLAIN: dict[str, Callable[[bytes], bytes]] = {"obj": _plain_obj, "stl": _plain_
 
 @contextmanager
 def _silent(*names: str) -> Iterator[None]:
-    """These loggers write nothing from this thread: trimesh logs the tracebacks of exceptions that it goes on from."""
+    """Let these loggers write nothing from this thread: trimesh logs tracebacks of exceptions that it handles."""
     loggers, thread = [logging.getLogger(name) for name in names], threading.get_ident()
 
     def drop(record: logging.LogRecord) -> bool:
@@ -63,7 +66,7 @@ def _silent(*names: str) -> Iterator[None]:
 
 def _main(path: str, kind: str, memory: str) -> int:
     """Write both arrays to stdout as .npy, or the reason to stderr; the exit code."""
-    with suppress(ImportError, ValueError, OSError):  # Windows has no such limit, and another may be lower already
+    with suppress(ImportError, ValueError, OSError):  # Windows has none, another may be lower
         import resource
 
         resource.setrlimit(resource.RLIMIT_AS, (int(memory), int(memory)))

@@ -93,7 +93,7 @@ def read_plan(folder: str | Path) -> Plan | None:
         kind: Any = KINDS[told.pop("kind")]
         work = {name: tuple(value) if isinstance(value, list) else value for name, value in told.pop("work").items()}
         return Plan(work=kind(**work), **told)
-    except (ValueError, KeyError, TypeError, AttributeError, FastrodError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError, FastrodError) as error:
         raise InputError(f"{str(path)!r} is no plan of fastrod generate; give --out another folder.") from error
 
 

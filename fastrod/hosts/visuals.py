@@ -39,7 +39,8 @@ class Shape(NamedTuple):
 class Visuals:
     """The visual shapes of all bodies that a PyBullet world has now, and where they are from step to step.
 
-    Mesh files that `fastrod.contact.mesh` does not read (`fastrod.contact.meshfile.FORMATS`, within `MeshLimits()`), and meshes without a file, become the box around their link's collision shape.
+    Mesh files are read as `fastrod.contact.mesh` reads them, within `MeshLimits()`; those that are not, and meshes
+    without a file, become the box around their link's collision shape.
     """
 
     def __init__(self, bullet: Any, ignore: Collection[int] = ()) -> None:
@@ -143,7 +144,7 @@ def _read(path: str, scale: Any) -> Any:
         return None
     if not len(faces) or not np.isfinite(vertices).all() or not 0 <= faces.min() <= faces.max() < len(vertices):
         return None
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    mesh: Any = trimesh.Trimesh(vertices, faces, process=False)
     mesh.merge_vertices()  # files have one for each normal: a fifth of them is enough
     mesh.apply_scale(np.asarray(scale, float))
     extents = np.ptp(np.asarray(mesh.vertices), axis=0)

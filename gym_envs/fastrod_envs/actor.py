@@ -51,7 +51,7 @@ class Actor(NamedTuple):
 
 
 def load_actor(path: Path) -> Actor:
-    """The actor in a .npz file. Raises `InputError` for one that is damaged, or whose layers do not fit together."""
+    """The actor in a .npz file. Raises `InputError` where it is damaged, or its layers do not fit together."""
     held = read_arrays(path, "no actor that `fastrod train` wrote")
     n = sum(name.startswith("weight_") for name in held)
     names = ("middle", "reach", "activation", "squashed", *(f"{kind}_{k}" for k in range(n) for kind in ("weight", "bias")))

@@ -1,4 +1,4 @@
-"""Plain arrays in a .npz from anywhere: sizes are looked at before anything is read, and nothing in it is unpickled."""
+"""Plain arrays in a .npz from anywhere: sizes are looked at first, and nothing in it is unpickled."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from numpy.lib import format as npy
 from fastrod.errors import InputError
 
 LARGEST = 64_000_000
-"""Bytes that the arrays of one file may have unpacked, unless `read_arrays` is given another number; a shipped actor has 0.3 million."""
+"""Bytes that the arrays of a file may have, unless `read_arrays` is given another number; a shipped actor has 0.3 million."""
 _MOST = 1000  # arrays of a file
 _KINDS = "fiubU"  # numbers, flags and words: no objects, which are pickles
 
 
 def read_arrays(path: Path, what: str, largest: int = LARGEST) -> dict[str, np.ndarray]:
-    """Arrays of a .npz by name. `what` names the file in the sentence of the `InputError` that a damaged, too large or foreign one raises."""
+    """Arrays of a .npz by name. Raises `InputError` for a damaged, too large or foreign file, which is no `what`."""
     try:
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()
@@ -29,7 +29,7 @@ def read_arrays(path: Path, what: str, largest: int = LARGEST) -> dict[str, np.n
             if len(members) > _MOST or total > largest:
                 raise ValueError(f"it declares {len(members)} arrays of {total} bytes, more than {_MOST} or {largest}")
             return {member.filename.removesuffix(".npy"): _array(archive, member) for member in members}
-    except Exception as error:  # zipfile, zlib and numpy's reader of headers each raise their own, from BadZipFile to TokenError
+    except Exception as error:  # zipfile, zlib, numpy's headers: from BadZipFile to TokenError
         why = getattr(error, "strerror", None) or str(error).rstrip(".") or type(error).__name__
         raise InputError(f"{str(path)!r} is {what}, and it cannot be read: {why}; is it whole?") from error
 
@@ -43,7 +43,7 @@ def write_arrays(path: Path, arrays: Mapping[str, Any], *, compress: bool = Fals
 def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
     """The array of a member, whose header must declare as many bytes as it has. Raises `ValueError`."""
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise ValueError(f"{member.filename!r} is packed in a way that numpy does not use")
+        raise ValueError(f"{member.filename!r} is packed as numpy never packs")
     data = archive.read(member)
     held = io.BytesIO(data)
     if npy.read_magic(held) != (1, 0):

@@ -1,4 +1,4 @@
-"""A training between two steps as plain arrays: weights, optimizers, counters and replay buffer, without a pickle."""
+"""A training between two steps as plain arrays: weights, optimizers, counters, replay buffer; no pickle."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "
 
 
 def save_checkpoint(model: Any, path: Path) -> None:
-    """Write the weights, the optimizers' memory and the counters of a model of stable-baselines3 to a .npz."""
+    """Write weights, the optimizers' memory and counters of a model of stable-baselines3 to a .npz."""
     held: dict[str, Any] = {}
     for name, state in model.get_parameters().items():
         held |= {f"{name}/{key}": value for key, value in _flat(state).items()}
@@ -25,7 +25,7 @@ def save_checkpoint(model: Any, path: Path) -> None:
 
 
 def load_checkpoint(model: Any, path: Path) -> None:
-    """Put what `save_checkpoint` wrote into a fresh model of the same plan. Raises `InputError` where it is of another one, or damaged."""
+    """Put what `save_checkpoint` wrote into a fresh model of its plan. Raises `InputError` for another or damaged file."""
     import torch
 
     held = read_arrays(path, "a checkpoint of `fastrod train`", LARGEST + 4 * _size(model))
@@ -63,7 +63,7 @@ def save_replay(model: Any, path: Path) -> None:
 
 
 def load_replay(model: Any, path: Path) -> None:
-    """Put what `save_replay` wrote into the buffer of a fresh model. Raises `InputError` where it is of another plan, or damaged."""
+    """Put what `save_replay` wrote into the buffer of a fresh model. Raises `InputError` for another or damaged file."""
     buffer = model.replay_buffer
     into = {name: getattr(buffer, name) for name in _REPLAY}
     held = read_arrays(path, "a replay buffer of `fastrod train`", LARGEST + sum(a.nbytes for a in into.values()))
@@ -111,10 +111,10 @@ def _tensor(held: dict[str, np.ndarray], name: str) -> Any:
 
 
 def _check_memory(model: Any, name: str, memory: dict[int, dict[str, Any]]) -> None:
-    """Moments as large as the parameters that they are of; torch itself looks at that in its first step only."""
+    """Raise `ValueError` for moments that do not fit their parameters; torch notices in its first step only."""
     whole: Any = model
-    for part in name.split("."):
-        whole = getattr(whole, part)
+    for attribute in name.split("."):
+        whole = getattr(whole, attribute)
     parameters = [p for group in whole.param_groups for p in group["params"]]
     for number, fields in memory.items():
         shape = parameters[number].shape if 0 <= number < len(parameters) else None

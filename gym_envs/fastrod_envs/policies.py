@@ -44,8 +44,11 @@ class Policy:
     """A trained policy without its noise."""
 
     def __init__(self, folder: Path, *, trust: bool = False) -> None:
-        """From actor.npz, which a training has from its first checkpoint on. A folder that has a file of stable-baselines3 in its place is
-        read with `trust` alone, as that runs code of whoever made it. Raises `InputError` where the folder holds neither."""
+        """Read actor.npz, which a training has from its first checkpoint on.
+
+        A folder that has a file of stable-baselines3 in its place is read with `trust` alone, as that runs code of
+        whoever made it. Raises `InputError` where the folder holds neither.
+        """
         self.plan: Plan = read_config(folder)[0]
         if (folder / ACTOR).is_file():
             self._actor: Actor = load_actor(folder / ACTOR)
@@ -56,7 +59,7 @@ class Policy:
         model = load_foreign(path, self.plan.algorithm, trust=trust)
         try:
             self._actor = actor_of(model)
-        except Exception as error:  # of a network that is built in another way
+        except Exception as error:  # of a network that is built otherwise
             raise InputError(f"the network in {str(path)!r} is not built as `fastrod train` builds one: {error!r}.") from error
 
     @property

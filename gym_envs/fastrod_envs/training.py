@@ -94,9 +94,9 @@ def make_plan(
 def train(plan: Plan, out: Path, progress: Progress | None = None) -> Path:
     """Train into the folder `out`; the path of its policy.zip.
 
-    The folder holds config.json (the plan, versions, steps and seconds done), checkpoint.npz (with replay.npz for SAC and TD3, until the
-    end), actor.npz with the network alone, tensorboard curves, and at the end policy.zip, for stable-baselines3 itself. Raises
-    `InputError` where the folder holds a training already.
+    The folder holds config.json (the plan, versions, steps and seconds done), checkpoint.npz (with replay.npz for SAC
+    and TD3, until the end), actor.npz with the network alone, tensorboard curves, and at the end policy.zip, for
+    stable-baselines3 itself. Raises `InputError` where the folder holds a training already.
     """
     if (out / CONFIG).exists():
         raise InputError(f"{str(out)!r} holds a training; go on with it by --resume, or name another folder.")
@@ -106,11 +106,10 @@ def train(plan: Plan, out: Path, progress: Progress | None = None) -> Path:
 
 
 def resume(out: Path, steps: int | None = None, progress: Progress | None = None, *, trust: bool = False) -> Path:
-    """Go on with the training in `out` from its last checkpoint (SAC and TD3 with an empty replay buffer where it had ended), to its own
-    number of steps or to `steps`.
+    """Go on with the training in `out` from its last checkpoint, to its own number of steps or to `steps`.
 
-    A folder that has a file of stable-baselines3 in place of checkpoint.npz is refused without `trust`: to read that file runs code of
-    whoever made it. Raises `InputError`.
+    SAC and TD3 have an empty replay buffer where it had ended. A folder that has a file of stable-baselines3 in place
+    of checkpoint.npz is refused without `trust`: to read that file runs code of whoever made it. Raises `InputError`.
     """
     plan, _ = read_config(out)
     if steps is not None:
@@ -149,12 +148,14 @@ def algorithm_class(name: str) -> Any:
 
 
 def load_foreign(path: Path, algorithm: str, env: Any = None, *, trust: bool) -> Any:
-    """A model from a file of stable-baselines3, which is a pickle: reading it runs code of whoever made it. Raises `InputError`, without
-    `trust` before the file is opened."""
+    """A model from a file of stable-baselines3, which is a pickle: reading it runs code of whoever made it.
+
+    Raises `InputError`, without `trust` before the file is opened.
+    """
     if not trust:
         raise InputError(
-            f"{str(path)!r} is a file of stable-baselines3, and to read it runs code of whoever made it; if you trust them, "
-            "add --trust (in Python trust=True), or give a folder with a checkpoint.npz or actor.npz of `fastrod train`."
+            f"{str(path)!r} is a file of stable-baselines3, and to read it runs code of whoever made it; if you trust "
+            "them, add --trust (in Python trust=True), or give a folder with a checkpoint.npz or actor.npz of `fastrod train`."
         )
     try:
         return algorithm_class(algorithm).load(path, env=env, device="cpu")
@@ -214,7 +215,7 @@ def _run(plan: Plan, out: Path, progress: Progress | None, trust: bool = False) 
 
 
 def _fresh(plan: Plan, vec: Any, board: str | None) -> Any:
-    """The model of a plan before its first step. Raises `InputError` for settings that its algorithm does not take."""
+    """The model of a plan before its first step. Raises `InputError` for settings that its algorithm refuses."""
     import torch
 
     from fastrod_envs.sb3 import ScaledFeatures

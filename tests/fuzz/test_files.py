@@ -14,12 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-for _module in ("gymnasium", "pyarrow", "can"):
-    pytest.importorskip(_module, reason=f"{_module} is not installed (pip install 'fastrod[test]')")
+pytest.importorskip("gymnasium", reason="gymnasium is not installed (pip install 'fastrod[envs]')")
+pytest.importorskip("pyarrow", reason="pyarrow is not installed (pip install 'fastrod[parquet]')")
+pytest.importorskip("can", reason="python-can is not installed (pip install 'fastrod[device]')")
 sys.path.insert(0, str(Path(__file__).parents[2] / "perf"))
-
-from fuzz_files import FINE, try_file, warm
-from fuzz_seeds import KINDS, Originals, foreign, npz
 
 from fastrod.cli import main
 from fastrod.contact import MeshLimits, mesh
@@ -28,6 +26,8 @@ from fastrod.robotfile import load_robot
 from fastrod.runlog import read_log
 from fastrod_device.hardware import SHIPPED, load_hardware
 from fastrod_envs.policies import Policy, find
+from fuzz_files import FINE, try_file, warm
+from fuzz_seeds import KINDS, Originals, foreign, npz
 
 
 @pytest.fixture(scope="module")
@@ -95,10 +95,10 @@ def test_code_in_a_folder_runs_with_trust_alone(
     path = policy(tmp_path / "theirs", originals, actor=b"", config=json.dumps(config).encode(), **theirs)
     words = [str(path) if word == "FOLDER" else word for word in FOREIGN[name]]
     assert main([*words, *(["--trust"] if trust else [])]) == 2  # with trust their code has run, and what it made is no model
-    told = capsys.readouterr().err
+    said = capsys.readouterr().err
     assert canary.exists() == trust
-    assert ("runs code of whoever made it" in told) != trust
-    assert len(told.splitlines()) == 1
+    assert ("runs code of whoever made it" in said) != trust
+    assert len(said.splitlines()) == 1
 
 
 def test_trust_is_of_files_of_others_alone(tmp_path: Path, originals: Originals) -> None:
@@ -134,10 +134,10 @@ def test_a_damaged_actor_is_one_sentence(name: str, tmp_path: Path, originals: O
     make, words = ACTORS[name]
     path = policy(tmp_path / "p", originals, actor=make(originals))
     assert main(["evaluate", "Reach", str(path), "--episodes", "1", "--no-baselines", "--option", "n_steps=2"]) == 2
-    told = capsys.readouterr().err
-    assert words.replace("\\\\", "\\") in told
-    assert len(told.splitlines()) == 1
-    assert "Traceback" not in told
+    said = capsys.readouterr().err
+    assert words.replace("\\\\", "\\") in said
+    assert len(said.splitlines()) == 1
+    assert "Traceback" not in said
 
 
 CONFIGS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
@@ -246,10 +246,12 @@ def test_a_refusal_quotes_libraries_in_one_line(tmp_path: Path, originals: Origi
     data = originals.log[1]
     for k in range(0, len(data), 97):  # pyarrow's sentences hold line breaks
         (tmp_path / "log.parquet").write_bytes(data[:k] + b"\x00\xff" + data[k + 2 :])
+        said = ""
         try:
             read_log(tmp_path / "log.parquet", load_robot("prototype"))
         except FastrodError as error:
-            assert str(error).isprintable()
+            said = str(error)
+        assert said.isprintable()
     assert str(InputError("a\nb\x1b[2J\u2028c")) == "a b [2J c"
     assert str(UnknownNameError("no\nsuch")) == "no such"
 

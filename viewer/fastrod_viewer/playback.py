@@ -284,7 +284,7 @@ def _report(folder: Path, path: Path) -> _Found | None:
             held_out_rms=tuple(nan if errors[key] is None else float(errors[key]) for key in ("before_rms_m", "after_rms_m")),  # type: ignore[arg-type]
         )  # fmt: skip
         named = data["log"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"{str(report)!r} is not a report of fastrod identify: {error or type(error).__name__}.") from error
     return _Found(load_robot(robot), findings) if named == path.stem else None
 
