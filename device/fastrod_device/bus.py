@@ -92,6 +92,8 @@ class Line:
         self.error: type[Exception] = library.CanError
         self._message: Any = library.Message
         self.trouble = ""
+        self.echoes: bool = getattr(self.bus, "receive_own_messages", "udp_multicast" in type(self.bus).__module__)
+        """It hears its own frames, as udp_multicast does."""
         line = self
 
         class Errors(library.Listener):  # type: ignore[misc,name-defined]

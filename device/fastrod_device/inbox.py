@@ -48,8 +48,8 @@ class Inbox:
         """Emergency messages that were gathered."""
         self.missed = 0
         """SYNCs that not every drive answered in time."""
-        self._foreign = 0
-        line.network.subscribe(0x080, self._on_sync)  # a bus does not hear itself: it is another node's
+        self._foreign = self._echoes = 0
+        line.network.subscribe(0x080, self._on_sync)
         for node in self._index:
             line.network.subscribe(STATUS + node, self._on_status)
             line.network.subscribe(MOTION + node, self._on_motion)
@@ -59,6 +59,7 @@ class Inbox:
     def expect(self) -> None:
         """A SYNC is about to be sent."""
         with self._lock:
+            self._echoes += self._line.echoes
             for pending in self._pending:
                 pending[:] = [max(n, 0) for n in pending]  # others came late, from a cycle that is over
             self._expect()
@@ -74,6 +75,9 @@ class Inbox:
     def _on_sync(self, cob_id: int, data: bytearray, timestamp: float) -> None:  # noqa: ARG002
         """The drives answer another node's SYNC as well: its answers must not pass for those to ours."""
         with self._lock:
+            if self._echoes:
+                self._echoes -= 1
+                return
             self._foreign += 1
             self._expect()
 

@@ -401,6 +401,23 @@ def test_answers_to_another_nodes_sync_do_not_pass_for_those_to_ours(ready, fore
     assert ready.run(1)[0].foreign_syncs == 0
 
 
+def test_a_bus_that_hears_itself_takes_its_own_sync_for_nobody_elses():
+    import can
+
+    name, clock = f"drives-{next(_names)}", SteppedClock()
+    with (
+        can.Bus(interface="virtual", channel=name, receive_own_messages=True) as echoing,
+        open_bus(f"virtual:{name}") as other,
+        EmulatedDrives(SPECS, f"virtual:{name}", clock=clock, wires=Springs()),
+        DriveBus(SPECS, echoing, clock=clock, rate=100.0) as bus,
+    ):
+        bus.connect()
+        assert sum(bus.exchange().foreign_syncs for _ in range(20)) == 0
+        for _ in range(3):
+            other.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+        assert sum(bus.exchange().foreign_syncs for _ in range(5)) == 3
+
+
 def test_a_silent_drive_ages_and_is_heard_again(ready):
     ready.bus.reset_statistics()
     ready.nodes.silent(1)
