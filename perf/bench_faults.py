@@ -1,7 +1,7 @@
-"""A prototype that runs, and faults put into one that moves: `python perf/bench_faults.py`; `--quick` for one of each.
+"""A prototype that runs, and faults put into one that moves: `python perf/bench_faults.py`; `--quick`: one of each.
 
-First the whole way: connect to drives that have an EPOS4's objects (or those of `--eds FILE`) and no others, home, and
-move for a minute at 200 Hz.
+First the whole way: connect to drives that have an EPOS4's objects (or those of `--eds FILE`) and no others, home,
+and move for a minute at 200 Hz.
 
 The emulated prototype goes round in a circle by commands at 30 Hz that go on whatever happens, and records. At a moment that a seed draws
 something fails. Detection is when the supervisor finds it (a killed process has none: there it is when the drives miss its heartbeat),
@@ -96,13 +96,22 @@ class Rig:
         self.jump, self.storm = 0.0, 0
         hardware, bus = load_hardware(), f"virtual:faults-{time.monotonic_ns()}"
         hardware = replace(hardware, limits=replace(hardware.limits, following_error=FOLLOWING))
-        self.emulator = Emulator(hardware, bus, clock=self.clock, seal=seal(seed, "none"), seed=seed, taut=True, eds=eds)
+        hidden = seal(seed, "none")
+        self.emulator = Emulator(hardware, bus, clock=self.clock, seal=hidden, seed=seed, taut=True, eds=eds)
         self.journal = folder / f"{seed}-{time.monotonic_ns()}.journal.csv"
         self.part = self.journal.with_suffix(".log.csv")
         day = time.time() - self.clock.now()
         wall: Callable[[], float] = lambda: self.clock.now() + day + self.jump  # noqa: E731
         journal = Journal(self.journal)
-        self.prototype = Prototype(hardware, bus, self.emulator, clock=self.clock, eds=eds, journal=journal, wall=wall)
+        self.prototype = Prototype(
+            hardware,
+            bus,
+            self.emulator,
+            clock=self.clock,
+            eds=eds,
+            journal=journal,
+            wall=wall,
+        )
         self._other = Line(bus)
         self.prototype.start(home=False)
         self.recorder: Recorder = self.prototype.recorder_for(str(self.part))
@@ -377,8 +386,8 @@ def measure(options: argparse.Namespace) -> Sequence[Section]:
         for kind in INJECTIONS:
             if options.only in (None, kind):
                 note_progress(kind)
-                trials = [fail(kind, k, Path(name), stepped=options.stepped, eds=options.eds) for k in range(times)]
-                rows.append(_row(kind, trials))
+                how, folder = {"stepped": options.stepped, "eds": options.eds}, Path(name)
+                rows.append(_row(kind, [fail(kind, k, folder, **how) for k in range(times)]))
         if options.only in (None, "killed process"):
             note_progress("killed process")
             rows.append(_row("killed process", [kill(k, Path(name)) for k in range(times)]))
@@ -388,9 +397,11 @@ def measure(options: argparse.Namespace) -> Sequence[Section]:
         "'found to rest' is 0 where set-points that do not come any more had stopped the shafts before: bus off, killed process.",
         "A killed process: SIGKILL, drives in another process on udp_multicast, always in real time; rows are those that it had reported.",
     ]
-    how = ", stepped" if options.stepped else ""
-    found = [Section("faults", f"faults injected into a moving prototype{how}", COLUMNS, rows, notes)]
-    return [Section("run", f"connect, home and move at {LOOP:g} Hz{how}", RUN, whole, []), *found] if whole else found
+    time_is = ", stepped" if options.stepped else ""
+    found = [Section("faults", f"faults injected into a moving prototype{time_is}", COLUMNS, rows, notes)]
+    if whole:
+        found.insert(0, Section("run", f"connect, home and move at {LOOP:g} Hz{time_is}", RUN, whole, []))
+    return found
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -402,7 +413,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--times", type=int, default=20, help="of each kind (default: 20)")
     parser.add_argument("--only", choices=[*INJECTIONS, "killed process"], help="this kind alone")
     parser.add_argument("--seconds", type=float, default=60.0, help="of the loop at 200 Hz (default: 60)")
-    parser.add_argument("--eds", type=Path, metavar="FILE", help="objects of the drives (default: an EPOS4's)")
+    parser.add_argument("--eds", type=Path, metavar="FILE", help="of the drives (default: an EPOS4's objects)")
     parser.add_argument("--stepped", action="store_true", help="as fast as the machine computes, not in real time")
     try:
         return command(parser, given, measure)

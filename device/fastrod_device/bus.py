@@ -92,7 +92,8 @@ class Line:
         self.error: type[Exception] = library.CanError
         self._message: Any = library.Message
         self.trouble = ""
-        self.echoes: bool = getattr(self.bus, "receive_own_messages", "udp_multicast" in type(self.bus).__module__)
+        multicast = "udp_multicast" in type(self.bus).__module__
+        self.echoes: bool = getattr(self.bus, "receive_own_messages", multicast)
         """It hears its own frames, as udp_multicast does."""
         line = self
 
