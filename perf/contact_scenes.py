@@ -218,18 +218,11 @@ def _poses(robot: Robot, solid: Obstacle, radius: float, lengths: Array, there: 
             if inside:
                 turn = _along(free[0][1][i, at, :, 2])
             deep = rng.uniform(0.0, 0.08) * robot.length
-
-            def gap(distance: float, nodes: Array, at: int = at, out: Array = out, turn: Array = turn) -> float:
-                centre = (first if inside else last)[at] + distance * out
-                return float(distances(solid, np.concatenate([centre, turn]), nodes).min()) - radius
-
-            start = 0.0 if inside else _clear(gap, first, 2e-3)
-            end = 0.0 if inside else _clear(gap, last, -deep)
-            if inside:
-                start, end = 0.0, deep if moves else 0.0
-            elif not moves:
-                start = end = max(start, end)
             centre = (first if inside else last)[at]
+            start, end = 0.0, deep if moves else 0.0
+            if not inside:
+                start, end = (_away(solid, centre, out, turn, nodes, radius + gap) for nodes, gap in ((first, 2e-3), (last, -deep)))
+                start, end = (start, end) if moves else (max(start, end),) * 2
             way = centre + (start + there[:, None] * (end - start)) * out
             ends = [np.concatenate([c, turn]) for c in (way[0], way[-1])]
             clear = distances(solid, ends[0], first).min() > radius + 1e-3
@@ -248,15 +241,18 @@ def _along(z: Array) -> Array:
     return np.asarray(q / np.linalg.norm(q)) if z[2] > -0.999 else np.array([0.0, 1.0, 0.0, 0.0])
 
 
-def _clear(gap: Callable[[float, Array], float], nodes: Array, wanted: float) -> float:
-    """Distance along `out` at which the obstacle leaves the gap `wanted` to these nodes, coming from outside."""
-    far = 0.4
-    near = far
-    while near > 0.0 and gap(near, nodes) > wanted:
+def _away(solid: Obstacle, centre: Array, out: Array, turn: Array, nodes: Array, wanted: float) -> float:
+    """How far from `centre` along `out` the obstacle is `wanted` away from these nodes, coming from outside."""
+
+    def clear(way: float) -> bool:
+        return bool(distances(solid, np.concatenate([centre + way * out, turn]), nodes).min() > wanted)
+
+    near = far = 0.4
+    while near > 0.0 and clear(near):
         far, near = near, near - 0.004
     for _ in range(20):
         middle = 0.5 * (near + far)
-        near, far = (near, middle) if gap(middle, nodes) > wanted else (middle, far)
+        near, far = (near, middle) if clear(middle) else (middle, far)
     return far
 
 
@@ -272,7 +268,7 @@ class Played:
     depth: Array
     """(N_STEPS + 1, n) of the sampled rod in the obstacle, negative where it is clear [m]; nan where there is no shape."""
     seconds: Array
-    """(N_STEPS + 1,) of one call."""
+    """(N_STEPS + 1,) of the processor, one call."""
     passes: Any
     sentences: list[str] = field(default_factory=list)
 
@@ -285,9 +281,9 @@ def play(batch: Batch, rows: list[int] | None = None, **options: Any) -> Played:
     ok, touching, passes = (np.zeros((N_STEPS + 1, n), kind) for kind in (bool, bool, int))
     played = Played(batch.kind, ok, touching, np.full((N_STEPS + 1, n), np.nan), np.zeros(N_STEPS + 1), passes)
     for k in range(N_STEPS + 1):
-        begin = time.perf_counter()
+        begin = time.process_time()
         state = sim.step(batch.tendon_length[k][some], obstacle_pose={name: batch.pose[k][some]})
-        played.seconds[k] = time.perf_counter() - begin
+        played.seconds[k] = time.process_time() - begin
         assert state.contacts is not None
         played.ok[k], played.touching[k], played.passes[k] = state.ok, state.contacts.in_contact(), state.passes
         played.sentences += list(state.problems.values())
@@ -358,7 +354,7 @@ def sections(count: int, seed: int, first: int) -> list[Section]:
         Column("sentence", "most frequent sentence"),
     ]
     notes = [
-        f"A step of {TOGETHER} robots takes {1e3 * float(np.median(taken)):.2f} ms at the median and {slowest:.2f} s at most ({where}).",
+        f"A step of {TOGETHER} robots takes, in seconds of the processor, {1e3 * float(np.median(taken)):.2f} ms at the median and {slowest:.2f} s at most ({where}).",
         *silent,
     ]
     return [Section("contact_scenes", f"Random contact scenes, seed {seed}", columns, rows, notes)]

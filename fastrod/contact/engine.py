@@ -31,7 +31,7 @@ Pass = Callable[[Ints, Ports, Shape, Probes], None]
 MOST_FOUND = 64
 """Candidates of one robot that a look notes."""
 _BLOCK = 2048  # robots whose linear models are held at once
-_MOST_PASSES, _NEARLY = 16, 1e-4  # twice as many for a robot that moves by less than this part of its length
+_MOST_PASSES, _NEARLY = 16, 1e-4  # and twice as many for a robot that moves by less than this part of its length
 _MOST_INSIDE = 8  # passes in a row with the centreline inside of an obstacle: the step led too far
 _SMALLEST_PART = 1.0 / 64.0
 _HARD = 1.0 / 4.0  # part of the way below which a failure is taken for the loss of the equilibrium, not for too long a step
@@ -280,15 +280,15 @@ class Engine:
         rest = np.zeros(len(self.gap), bool)
         unsolved, inside = np.zeros(len(rest), np.int64), np.zeros(len(rest), np.int64)
         still, plain = rows, scenery.damping == 0.0
-        for count in range(2 * most if plain else most):
+        for count in range(2 * most):
             status = self._iterate(still, ports, memory, shape, run, scenery)
             passes[still] += 1
             rest[still[status == AT_REST]] = True
             unsolved[still] = np.where(self.trouble[still, 0] == UNSOLVED, unsolved[still] + 1, 0)
-            deep = self.tracked[still] & (self.gap[still] < -self.rods.radius[still].max(1) - 1e-6)
+            deep = self.tracked[still] & (self.gap[still] < -self.rods.radius[still].max(1) - _NEARLY * self.rods.reach[still])
             inside[still] = np.where(deep, inside[still] + 1, 0)
             hopeless = (inside >= (_MOST_INSIDE if plain else 3 * _MOST_INSIDE)) | (plain & (unsolved >= _UNSOLVED))
-            if count >= most - 1 and plain:
+            if count >= most - 1:  # go on with what has nearly come to rest
                 hopeless |= ~((self.trouble[:, 3] < _NEARLY * self.rods.reach) & np.isin(self.trouble[:, 0], (MOVES, INSIDE)))
             still = still[(status != AT_REST) & (status != LOST) & ~self.whole_worlds(hopeless)[still]]
             if not len(still):

@@ -1,0 +1,105 @@
+"""No touch hides between two nodes: the search along a rod against a dense sampling, and steps against a signed distance of their own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from contact.robots import bent, prototype
+from numba import njit
+
+import fastrod
+from fastrod.contact import ContactScene, box, mesh, plane, sphere
+from fastrod.contact.frames import frames_of
+from fastrod.contact.tree import pack
+from fastrod.kernels.bvh import STACK
+from fastrod.kernels.centreline import Curve
+from fastrod.kernels.search import CANDIDATE, UNSEEN, Sweep, search_obstacles
+
+
+@pytest.fixture
+def scenes(monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "perf"))
+    import contact_scenes
+
+    return contact_scenes
+
+
+@njit()
+def _search(curve, sweep, surfaces, frames, found):
+    n = len(curve.arclength)
+    distance, position, work = np.full(n, -np.inf), np.zeros((n, 3)), np.empty(4 * n + 4 * STACK)
+    return search_obstacles(curve, sweep, surfaces, frames, distance, position, work, found)
+
+
+@pytest.mark.parametrize("nearest", [False, True])
+@pytest.mark.parametrize("radius", [0.0, 0.002, 0.012])
+def test_every_dip_of_an_interval_is_found(scenes, radius, nearest):
+    """Several balls of one mesh beside three nodes that are 30 mm apart: every ball that the rod enters has a candidate, and the
+    smallest gap is the sampled one."""
+    rng, dense = np.random.default_rng(11), np.linspace(0.0, 0.06, 24001)
+    line = np.stack([0.0 * dense, 0.0 * dense, dense], axis=1)
+    s = np.array([0.0, 0.03, 0.06])
+    curve = Curve(np.stack([0.0 * s, 0.0 * s, s], axis=1), np.tile(np.eye(3), (3, 1, 1)), np.zeros((3, 3)), s)
+    hidden = 0
+    for _ in range(20):
+        at = 0.004 + 0.007 * np.flatnonzero(rng.random(8) < 0.6) + rng.uniform(-5e-4, 5e-4)
+        at = at if len(at) else np.array([0.01, 0.02])
+        depth = rng.uniform(-3e-4, 3e-4, len(at))
+        balls = [trimesh.creation.icosphere(subdivisions=2, radius=0.002) for _ in at]
+        for ball, z, d in zip(balls, at, depth, strict=True):
+            ball.apply_translation([radius + 0.002 - d, 0.0, z])
+        obstacle = mesh(trimesh.util.concatenate(balls))
+        phi = scenes.distances(obstacle, np.array([0.0, 0, 0, 1, 0, 0, 0]), line)
+        found = np.zeros((64, CANDIDATE))
+        sweep = Sweep(np.array([radius]), 2, 0.0, 1e-3, 1e-3, nearest)
+        count, gap = _search(curve, sweep, pack([obstacle]), frames_of(np.array([[[0.0, 0, 0, 1, 0, 0, 0]]]))[0], found)
+        assert gap <= phi.min() - radius + UNSEEN
+        dips = 1 + np.flatnonzero((phi[1:-1] < phi[:-2]) & (phi[1:-1] <= phi[2:]) & (phi[1:-1] < radius - UNSEEN))
+        for k in dips if not nearest else []:
+            near = np.abs(found[:count, 1] - dense[k]) < 1e-3
+            assert near.any(), (at, depth, dense[k])
+            assert found[:count, 2][near].min() <= phi[k] - radius + 1e-8
+        hidden += len(dips)
+    assert hidden > 20
+
+
+def test_the_curve_of_contact_is_the_shape():
+    """At 6 steps a segment the curve that contact searches and `shape` agree between the nodes, in contact too."""
+    scene = ContactScene(obstacles=[sphere(0.02, name="ball", position=(0.035, 0.004, 0.05))], rod_radius=0.004)
+    sim = fastrod.Simulator(prototype(1e-5), points_per_segment=6, contact=scene)
+    for part in np.linspace(0.0, 1.0, 6):
+        state = sim.step(bent(12.0 * part, 4.0 * part))
+    assert state.ok.all()
+    assert state.contacts.in_contact("ball").all()
+    s, p, t = state.arclength[0], state.position[0], state.rotation[0, :, :, 2]
+    x = np.linspace(0.0, 1.0, 33)[1:-1, None, None]
+    h = np.diff(s)[:, None]
+    hermite = (1 + 2 * x) * (1 - x) ** 2 * p[:-1] + h * x * (1 - x) ** 2 * t[:-1] + x**2 * (3 - 2 * x) * p[1:] - h * x**2 * (1 - x) * t[1:]
+    at = (s[:-1] + x[:, :, 0] * np.diff(s)).reshape(1, -1)
+    assert np.linalg.norm(sim.shape(at).position[0] - hermite.reshape(-1, 3), axis=1).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("obstacle", "points", "words"),
+    [
+        (box((0.2, 0.2, 0.02), name="press", position=(0, 0, 0.2)), 20, "'press' at arclength 0.0"),
+        (plane(point=(0, 0, 0.2), normal=(0, 0, -1), name="lid"), 6, "'lid' at arclength 0.07"),
+    ],
+)
+def test_what_is_stuck_is_said(obstacle, points, words):
+    """An obstacle comes down on the rod's end until nothing holds: one sentence says what, where, and what to do."""
+    scene = ContactScene(obstacles=[obstacle], rod_radius=0.004, max_passes=60)
+    sim = fastrod.Simulator(prototype(1e-5), points_per_segment=points, contact=scene)
+    sim.step(bent(1.0))
+    q = obstacle.quaternion
+    state = sim.step(bent(1.0), obstacle_pose={obstacle.name: [0, 0, -0.05, *q]})
+    assert not state.ok[0]
+    (said,) = state.problems.values()
+    assert words in said
+    assert "smaller steps" in said or "points_per_segment" in said or "max_" in said
+    assert "100 %" not in said
+    assert said.count("\n") == 0
+    assert state.passes[0] == -1
