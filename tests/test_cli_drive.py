@@ -22,7 +22,7 @@ from fastrod_device.emulator import Emulator
 from fastrod_device.errors import CalibrationError
 from fastrod_device.hardware import SHIPPED, load_hardware
 
-pytest.importorskip("gymnasium")
+pytest.importorskip("gymnasium", reason="gymnasium is not installed: pip install 'fastrod[envs]'")
 EASY, LATE, TAUT = "3", "7", "--no-home"  # seeds: gravity is hidden; a latency is
 CAMERA = load_hardware().camera
 Run = Callable[..., tuple[int, str, str]]

@@ -47,7 +47,7 @@ def built(target: Path, source: Path) -> list[Path]:
 
 @pytest.fixture(scope="module")
 def artifacts(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    pytest.importorskip("hatchling")
+    pytest.importorskip("hatchling", reason="hatchling is not installed: pip install 'fastrod[test]'")
     return built(tmp_path_factory.mktemp("dist"), ROOT)
 
 

@@ -135,7 +135,7 @@ def test_files_that_cannot_be_what_they_should_be(tmp_path: Path) -> None:
 
 
 def test_hosts_say_what_cannot_be_carried() -> None:
-    pytest.importorskip("pybullet")
+    pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'fastrod[hosts]'")
     from fastrod.hosts import BulletLink, RodBodies, SoftManiSim, connect
 
     world = connect(dt=0.01)

@@ -167,7 +167,6 @@ def test_tension_robot_is_refused(prototype: Robot) -> None:
 
 
 def test_files_are_whole(prototype: Robot, tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
     result = replay(small_log(), prototype, simulator=Arc)
     paths = write(result, tmp_path / "deep" / "out")
     assert sorted(p.name for p in (tmp_path / "deep" / "out").iterdir()) == ["replay.png", "residuals.csv"] == sorted(p.name for p in paths)
@@ -180,7 +179,6 @@ def test_files_are_whole(prototype: Robot, tmp_path: Path) -> None:
 
 def axes_of(result: Replay) -> list[Any]:
     """The panels: x, y, z and distance over time, the two paths, the histogram."""
-    pytest.importorskip("matplotlib")
     figure = draw(result)
     figure.draw_without_rendering()
     return [axes for half in figure.subfigs for axes in half.axes]
@@ -256,7 +254,6 @@ def test_shipped_log_does_not_say_what_is_in_it() -> None:
 
 def test_right_model_leaves_nothing_and_the_nominal_one_its_difference() -> None:
     """A log by another solver: the robot that it was made on leaves the solvers' steps, with loads and without."""
-    pytest.importorskip("fastrod.simulator")
     log = log_of_the_other()
     nominal = replay(log, load_robot("prototype"))
     assert nominal.converged.all()
@@ -267,7 +264,8 @@ def test_right_model_leaves_nothing_and_the_nominal_one_its_difference() -> None
 
 @pytest.mark.parametrize("orientation", [(1.0, 0.0, 0.0, 0.0), UPSIDE_DOWN, (0.5, 0.5, 0.5, 0.5)])
 def test_replay_of_the_simulators_own_run_leaves_nothing(prototype: Robot, orientation: tuple[float, ...]) -> None:
-    simulator = pytest.importorskip("fastrod.simulator")
+    from fastrod import simulator
+
     rod = changed(prototype.segments[0], line_density=0.2)
     heavy = changed(prototype, segments=(rod,), base_position=(0.1, 0.2, 0.3), log_points=(0.02, 0.05))
     log = small_log(8, base_quaternion=np.tile(orientation, (8, 1)), payload=np.full(8, 0.005), points=np.zeros((8, 2, 3)))
@@ -285,7 +283,6 @@ def test_replay_of_the_simulators_own_run_leaves_nothing(prototype: Robot, orien
 
 
 def test_points_of_the_straight_robot_lie_on_its_axis(prototype: Robot) -> None:
-    pytest.importorskip("fastrod.simulator")
     marked = changed(prototype, log_points=(0.02, 0.05))
     straight = changed(small_log(2, points=np.zeros((2, 2, 3))), dl=np.zeros((2, 4)))
     result = replay(straight, marked)

@@ -63,7 +63,7 @@ def test_unknown_columns_are_kept_and_ignored(tmp_path: Path, robot: Robot) -> N
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_log_comes_back_bit_for_bit(tmp_path: Path, robot: Robot, suffix: str) -> None:
     if suffix == ".parquet":
-        pytest.importorskip("pyarrow")
+        pytest.importorskip("pyarrow", reason="pyarrow is not installed: pip install 'fastrod[parquet]'")
     rng = np.random.default_rng(3)
     full = replace(robot, log_points=(0.02, 0.05))
     q = rng.normal(size=(5, 4))

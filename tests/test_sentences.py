@@ -233,7 +233,8 @@ def test_a_part_without_a_recorders_columns_is_no_recording(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("kind", ["list", "span", "bytes", "struct"])
 def test_a_parquet_column_of_something_else(tmp_path: Path, kind: str) -> None:
-    arrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    why = "pyarrow is not installed: pip install 'fastrod[parquet]'"
+    arrow, parquet = (pytest.importorskip(name, reason=why) for name in ("pyarrow", "pyarrow.parquet"))
     cells = {
         "list": arrow.array([[1.0, 2.0]]), "span": arrow.array([5], arrow.duration("s")), "bytes": arrow.array([b"\xff"]),
         "struct": arrow.array([{"a": 1}]),

@@ -15,8 +15,8 @@ import numpy as np
 from fastrod.contact.contacts import TOUCHES, Contacts
 from fastrod.contact.frames import back_by, between, blended, frames_of, longest_move
 from fastrod.contact.scene import ContactScene
-from fastrod.contact.trouble import NO_CONTACT_LEFT, NO_NODE_LEFT, sentence
 from fastrod.contact.tree import pack
+from fastrod.contact.trouble import NO_CONTACT_LEFT, NO_NODE_LEFT, sentence
 from fastrod.kernels.batch import arrange, iterate_parallel, iterate_serial, look_at_rods, look_parallel, look_serial
 from fastrod.kernels.bvh import STACK
 from fastrod.kernels.forces import Scenery

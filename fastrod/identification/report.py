@@ -12,8 +12,8 @@ import numpy as np
 
 from fastrod.identification.headline import explained
 from fastrod.identification.page import page
-from fastrod.identification.replay import make_folder
 from fastrod.identification.registration import Registration
+from fastrod.identification.replay import make_folder
 from fastrod.identification.result import Error, Estimate, Result
 from fastrod.identification.wording import VERDICTS, millimetres, percent, plain_name, with_error, words
 from fastrod.robotfile import save_robot

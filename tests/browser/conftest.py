@@ -26,8 +26,8 @@ def _missing() -> str:
         import playwright  # noqa: F401
         import viser  # noqa: F401
     except ImportError as error:
-        return f"{error.name} is not installed"
-    return "" if shutil.which("chromium") else "chromium is not installed (apt-get install chromium)"
+        return f"{error.name} is not installed: pip install 'fastrod[test]'"
+    return "" if shutil.which("chromium") else "chromium is not installed: apt-get install chromium"
 
 
 @pytest.fixture(scope="session")

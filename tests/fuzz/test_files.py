@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("gymnasium", reason="gymnasium is not installed (pip install 'fastrod[envs]')")
-pytest.importorskip("pyarrow", reason="pyarrow is not installed (pip install 'fastrod[parquet]')")
+pytest.importorskip("gymnasium", reason="gymnasium is not installed: pip install 'fastrod[envs]'")
+pytest.importorskip("pyarrow", reason="pyarrow is not installed: pip install 'fastrod[parquet]'")
 pytest.importorskip("can", reason="python-can is not installed (pip install 'fastrod[device]')")
 sys.path.insert(0, str(Path(__file__).parents[2] / "perf"))
 
@@ -85,7 +85,7 @@ FOREIGN: dict[str, list[str]] = {
 def test_code_in_a_folder_runs_with_trust_alone(
     name: str, trust: bool, tmp_path: Path, originals: Originals, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed (pip install 'fastrod[rl]')")
+    pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed: pip install 'fastrod[rl]'")
     monkeypatch.chdir(tmp_path)
     canary = tmp_path / "canary"
     given = originals.policy[1].replace(b"fastrod/Reach-v0", b"fastrod/Track-v0") if name == "drive" else originals.policy[1]

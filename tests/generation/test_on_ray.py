@@ -16,7 +16,7 @@ from fastrod.errors import HostError, InputError
 from fastrod.generation import Plan, generate
 from fastrod.generation.tasks import make_shard
 
-ray = pytest.importorskip("ray", reason="needs fastrod[ray]")
+ray = pytest.importorskip("ray", reason="ray is not installed: pip install 'fastrod[ray]'")
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -13,7 +13,7 @@ import msgspec.msgpack
 import numpy as np
 import pytest
 
-pytest.importorskip("viser")
+pytest.importorskip("viser", reason="viser is not installed: pip install 'fastrod[viewer]'")
 
 from pages import HANDSHAKE, RawPage, asked, slider, until, websocket
 

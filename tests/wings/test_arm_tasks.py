@@ -10,8 +10,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from fastrod.errors import InputError
 
-pytest.importorskip("pybullet")
-pytest.importorskip("gymnasium")
+pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'fastrod[hosts]'")
+pytest.importorskip("gymnasium", reason="gymnasium is not installed: pip install 'fastrod[envs]'")
 
 from fastrod_envs.single import SingleEnv
 from fastrod_envs.task import size

@@ -11,7 +11,7 @@ import pytest
 from fastrod.errors import InputError
 from fastrod.hosts import Bullet, Camera, connect
 
-pytest.importorskip("pybullet")
+pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'fastrod[hosts]'")
 
 
 @pytest.fixture

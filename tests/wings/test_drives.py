@@ -24,7 +24,7 @@ from fastrod_device.pacer import Pacer, urgently
 from fastrod_device.readings import Feedback
 from fastrod_device.units import DriveSpec, Transmission
 
-pytest.importorskip("canopen")
+pytest.importorskip("canopen", reason="canopen is not installed: pip install 'fastrod[device]'")
 
 SPECS = [DriveSpec(node=k + 1, drum_radius=0.008, direction=(1, -1)[k % 2]) for k in range(4)]
 SLACK = np.array([1e-3, 2e-3, 0.5e-3, 1.5e-3])  # m
@@ -129,7 +129,7 @@ def test_process_data_cannot_be_asked_for_and_what_is_unused_is_invalid():
 
 
 def test_pdos_that_the_dictionary_lacks_are_left_alone(tmp_path: Path):
-    canopen = pytest.importorskip("canopen")
+    canopen = pytest.importorskip("canopen", reason="canopen is not installed: pip install 'fastrod[device]'")
     dictionary, own = object_dictionary(), tmp_path / "own.eds"
     for index in (0x1402, 0x1403, 0x1803):
         del dictionary[index]
@@ -528,7 +528,7 @@ def test_an_own_dictionary_must_be_one(tmp_path: Path):
 
 
 def test_an_own_dictionary_takes_the_place_of_ours(tmp_path: Path):
-    canopen = pytest.importorskip("canopen")
+    canopen = pytest.importorskip("canopen", reason="canopen is not installed: pip install 'fastrod[device]'")
     own, poor = tmp_path / "own.eds", tmp_path / "poor.eds"
     dictionary = object_dictionary()
     canopen.export_od(dictionary, str(own))

@@ -23,7 +23,7 @@ from fastrod_device.hardware import load_hardware
 from fastrod_device.nodes import EmulatedDrives
 from fastrod_device.units import DriveSpec
 
-pytest.importorskip("canopen")
+pytest.importorskip("canopen", reason="canopen is not installed: pip install 'fastrod[device]'")
 
 FOLDER = Path(os.environ.get("FASTROD_DATA", Path(__file__).parents[3] / "shared" / "data"))
 DATA = FOLDER / "epos4_objects.csv"
@@ -373,7 +373,7 @@ def test_what_is_no_such_file_is_one_sentence(data: bytes, says: str, tmp_path: 
 
 
 def test_what_is_not_limited_is_printed_and_in_the_journal(tmp_path: Path, capsys: Any) -> None:
-    pytest.importorskip("cv2")
+    pytest.importorskip("cv2", reason="opencv-python-headless is not installed: pip install 'fastrod[device]'")
     path, events = tmp_path / "poor.eds", tmp_path / "run.csv"
     path.write_bytes(WRITTEN["Windows"](eds(without(0x607F))))
     options = Namespace(emulate=True, no_home=True, seed=1, real_time=False, eds=path, bus=None, camera=None)

@@ -32,7 +32,7 @@ BACKLASH = {"bending_stiffness": (0.8, 1.2), "backlash.half_width": (0.0, 3e-4)}
 
 def made(name: str, n: int = 2, **options: Any) -> BatchEnv:
     if task_class(name).hosted:
-        pytest.importorskip("pybullet")
+        pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'fastrod[hosts]'")
     return BatchEnv(name, n, threads=1, **options)
 
 
@@ -309,7 +309,7 @@ def test_a_picture_of_the_same_state_is_the_same() -> None:
 
 
 def test_a_page_shows_the_environments_and_goes_away(capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("viser")
+    pytest.importorskip("viser", reason="viser is not installed: pip install 'fastrod[viewer]'")
     env = made("Reach", 20, render_mode="viser")
     env.reset(seed=0)
     assert env.render() is None

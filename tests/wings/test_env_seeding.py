@@ -81,7 +81,7 @@ def assert_same(one: Rollout, other: Rollout) -> None:
 def test_an_environment_does_not_know_its_neighbours(name: str) -> None:
     hosted = task_class(name).hosted
     if hosted:
-        pytest.importorskip("pybullet")
+        pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'fastrod[hosts]'")
     n, steps, options = (2, 4, {"n_steps": 2}) if hosted else (3, 12, {"n_steps": 4})  # worlds of rigid bodies take their time
     options["threads"] = 1
     env = BatchEnv(name, n, **options)

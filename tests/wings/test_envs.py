@@ -25,7 +25,7 @@ KEYS = {"distance", "success", "contact", "lost", "position", "desired", "reward
 def needed(name: str) -> None:
     """Skip where the task's host is not installed."""
     if task_class(name).hosted:
-        pytest.importorskip("pybullet")
+        pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'fastrod[hosts]'")
 
 
 def single(name: str, **options: Any) -> gymnasium.Env[Any, Any]:
@@ -75,7 +75,9 @@ def task_length(env: gymnasium.Env[Any, Any]) -> int:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_stable_baselines_checker_has_nothing_to_say(name: str) -> None:
-    checker = pytest.importorskip("stable_baselines3.common.env_checker")
+    checker = pytest.importorskip(
+        "stable_baselines3.common.env_checker", reason="stable-baselines3 is not installed: pip install 'fastrod[rl]'"
+    )
     env = single(name)
     checker.check_env(env.unwrapped, warn=True)
     assert (env.unwrapped.task.actions[0].unit or "") == env.unwrapped.task.actions[0].unit  # type: ignore[attr-defined]

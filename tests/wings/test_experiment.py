@@ -151,7 +151,7 @@ def test_a_stop_half_way_keeps_the_rows(bench: Bench, tmp_path: Path) -> None:
 
 
 def test_a_plan_is_followed_by_the_model_and_by_the_policy(bench: Bench, tmp_path: Path) -> None:
-    pytest.importorskip("gymnasium")
+    pytest.importorskip("gymnasium", reason="gymnasium is not installed: pip install 'fastrod[envs]'")
     from fastrod_envs.pilot import TrackPilot
     from fastrod_envs.policies import Policy, find
 

@@ -100,7 +100,7 @@ def test_a_page_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
 
 @pytest.fixture
 def viser_page() -> str:
-    viser = pytest.importorskip("viser", reason="viser is not installed")
+    viser = pytest.importorskip("viser", reason="viser is not installed: pip install 'fastrod[viewer]'")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]

@@ -28,8 +28,8 @@ from fastrod_device.prototype import Prototype
 from fastrod_device.safety import State
 from fastrod_device.seal import seal
 
-pytest.importorskip("canopen")
-pytest.importorskip("cv2")
+pytest.importorskip("canopen", reason="canopen is not installed: pip install 'fastrod[device]'")
+pytest.importorskip("cv2", reason="opencv-python-headless is not installed: pip install 'fastrod[device]'")
 
 SAFE = 0.05  # s
 RADIUS, TURN = 0.0025, 1.0  # m of wire, s

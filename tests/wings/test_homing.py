@@ -23,8 +23,8 @@ from fastrod_device.seal import seal
 from fastrod_device.tracker import MarkerTracker, Sighting
 from fastrod_device.units import Transmission
 
-pytest.importorskip("canopen")
-pytest.importorskip("cv2")
+pytest.importorskip("canopen", reason="canopen is not installed: pip install 'fastrod[device]'")
+pytest.importorskip("cv2", reason="opencv-python-headless is not installed: pip install 'fastrod[device]'")
 
 HARDWARE = load_hardware()
 TRANSMISSION = Transmission(HARDWARE.drives)

@@ -42,7 +42,7 @@ def test_an_episode_of_the_shipped_policy_is_not_lost(task: str, seed: int, rand
 def test_random_steps_lose_no_robot_that_settles(task: str) -> None:
     hosted = task_class(task).hosted
     if hosted:
-        pytest.importorskip("pybullet")
+        pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'fastrod[hosts]'")
     options: dict[str, Any] = {} if hosted else {"randomise": bench_lost.HEAVY}
     count = bench_lost.drive(task, 8 if hosted else 160, seed=3, **options)
     assert count.steps >= (8 if hosted else 160)

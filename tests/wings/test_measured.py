@@ -170,7 +170,6 @@ def test_ethz_beam_drops_as_published() -> None:
 
 @needs_data
 def test_nominal_replay_of_the_beam_is_an_unshearable_rod() -> None:
-    pytest.importorskip("fastrod.simulator")
     from fastrod.identification.replay import replay
 
     log, robot = ethz_beam(DATA / "ethz_beam.csv")

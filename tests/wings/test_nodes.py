@@ -20,7 +20,7 @@ from fastrod_device.nodes import EmulatedDrives
 from fastrod_device.objects import Objects
 from fastrod_device.units import DriveSpec
 
-pytest.importorskip("canopen")
+pytest.importorskip("canopen", reason="canopen is not installed: pip install 'fastrod[device]'")
 
 SPEC = DriveSpec(node=5, drum_radius=0.008)
 _names = itertools.count()

@@ -35,8 +35,8 @@ from fastrod_device.seal import seal
 from fastrod_device.trace import Trace
 from fastrod_device.workbench import emulated
 
-pytest.importorskip("canopen")
-pytest.importorskip("cv2")
+pytest.importorskip("canopen", reason="canopen is not installed: pip install 'fastrod[device]'")
+pytest.importorskip("cv2", reason="opencv-python-headless is not installed: pip install 'fastrod[device]'")
 
 HARDWARE = load_hardware()
 # in real time a busy machine is no fault

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("pybullet")
+pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'fastrod[hosts]'")
 
 from fastrod.errors import InputError
 from fastrod_envs.push_course import PushOptions

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("stable_baselines3")
+pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed: pip install 'fastrod[rl]'")
 
 from fastrod.cli import main
 from fastrod_envs.presets import _SETTINGS, ALGORITHMS, settings_of

@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from fastrod.hosts import Bullet, Camera, SoftManiSim, connect
 from fastrod.hosts.camera import View
 
-pybullet = pytest.importorskip("pybullet")
+pybullet = pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'fastrod[hosts]'")
 
 OFFSET = 0.0075
 DOWN = (-math.pi / 2.0, 0.0, 0.0)  # turns +y to -z

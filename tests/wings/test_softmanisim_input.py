@@ -11,7 +11,7 @@ import pytest
 from fastrod.errors import HostError, InputError
 from fastrod.hosts import SoftManiSim
 
-pytest.importorskip("pybullet")
+pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'fastrod[hosts]'")
 
 WRONG: list[tuple[str, Callable[[SoftManiSim], Any], type[Exception], str]] = [
     ("length", lambda s: s.move_robot_ori([0.0] * 8), InputError, "action is .* it must be 9 numbers"),

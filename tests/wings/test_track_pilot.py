@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-pytest.importorskip("gymnasium", reason="gymnasium is not installed (pip install fastrod[envs])")
+pytest.importorskip("gymnasium", reason="gymnasium is not installed: pip install 'fastrod[envs]'")
 
 import fastrod
 from fastrod.control import Trajectory, circle, helix

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed (pip install fastrod[rl])")
+pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed: pip install 'fastrod[rl]'")
 
 from fastrod.errors import FastrodError, InputError, UnknownNameError
 from fastrod_envs.imitation import imitate
