@@ -1,7 +1,7 @@
-"""A prototype that runs, and faults put into one that moves: `python perf/bench_faults.py`; `--quick`: one of each.
+"""A prototype that runs, and faults put into one that moves: `python perf/bench_faults.py`; or `--quick`.
 
-First the whole way: connect to drives that have an EPOS4's objects (or those of `--eds FILE`) and no others, home,
-and move for a minute at 200 Hz.
+First the whole way: connect to drives that have an EPOS4's objects (or those of `--eds FILE`) and no others,
+home, and move for a minute at 200 Hz.
 
 The emulated prototype goes round in a circle by commands at 30 Hz that go on whatever happens, and records. At a moment that a seed draws
 something fails. Detection is when the supervisor finds it (a killed process has none: there it is when the drives miss its heartbeat),
@@ -413,7 +413,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--times", type=int, default=20, help="of each kind (default: 20)")
     parser.add_argument("--only", choices=[*INJECTIONS, "killed process"], help="this kind alone")
     parser.add_argument("--seconds", type=float, default=60.0, help="of the loop at 200 Hz (default: 60)")
-    parser.add_argument("--eds", type=Path, metavar="FILE", help="of the drives (default: an EPOS4's objects)")
+    parser.add_argument("--eds", type=Path, metavar="FILE", help="of the drives (default: an EPOS4's)")
     parser.add_argument("--stepped", action="store_true", help="as fast as the machine computes, not in real time")
     try:
         return command(parser, given, measure)
