@@ -196,8 +196,8 @@ def serve_guarded(host: str, port: int, *, label: str | None = None) -> Served:
         found = viser.__version__
         why = "serves pages in a way that cannot be guarded"
         raise InputError(f"viser {found} {why}; pip install 'viser==1.1.1'.")
-    for asked in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):  # no page opens a tunnel
-        server._websock_server.unregister_handler(asked)
+    for kind in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):  # no page opens a tunnel
+        server._websock_server.unregister_handler(kind)
     return served
 
 

@@ -37,7 +37,7 @@ def websocket(address: str) -> ClientConnection:
     return connect(at, subprotocols=[Subprotocol(PROTOCOL)], max_size=None)
 
 
-def asked(address: str, path: str, headers: Iterable[tuple[str, ...]]) -> tuple[HTTPConnection, int, str]:
+def request(address: str, path: str, headers: Iterable[tuple[str, ...]]) -> tuple[HTTPConnection, int, str]:
     """Send one request exactly as it is given: the open connection, the status, and the text of the answer
     unless it is a websocket."""
     at = urlsplit(address)
@@ -98,8 +98,8 @@ class RawPage:
                 inner = zstandard.ZstdDecompressor().decompress(raw[16 : 16 + packed], max_output_size=size)
                 for message in msgspec.msgpack.decode(inner)["messages"]:
                     if message["type"] == "LocalStorageGetItemRequestMessage":
-                        asked_by = message["request_uuid"]
-                        self.send(_messages.LocalStorageGetItemResponseMessage(None, None, asked_by))
+                        uuid = message["request_uuid"]
+                        self.send(_messages.LocalStorageGetItemResponseMessage(None, None, uuid))
         except ConnectionClosed:
             return
 

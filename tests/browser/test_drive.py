@@ -162,7 +162,7 @@ def test_of_two_pages_one_drives(app: App, window: Windows, monkeypatch: pytest.
     assert second.until(lambda: second.page.get_by_text("Ask for them in the window Controls").count() == 1)
     assert second.until(lambda: thumb.get_attribute("aria-valuenow") == "5")  # it goes back
     assert pilot.bent(0)[0] == bent
-    for answer in ("Keep control", "Hand over"):
+    for answer in ("Keep control", "Yield control"):
         second.page.get_by_role("button", name="Ask for control").click()
         first.page.get_by_role("button", name=answer).click()
     assert second.until(lambda: second.page.get_by_text("This page has the controls.").count() == 1)

@@ -15,7 +15,7 @@ import pytest
 
 pytest.importorskip("viser", reason="viser is not installed: pip install 'fastrod[viewer]'")
 
-from pages import HANDSHAKE, RawPage, asked, slider, until, websocket
+from pages import HANDSHAKE, RawPage, request, slider, until, websocket
 
 from fastrod.access import MOST_PAGES, Access, serve_guarded
 from fastrod.errors import InputError
@@ -97,10 +97,10 @@ def test_a_stranger_is_refused_in_a_sentence(address: str, stranger: str, how: s
     _, _, host, key, _ = address.split("/")
     port, swapped = host.split(":")[1], key.swapcase()
     names = {"host": host, "port": port, "key": key, "short": key[:-1], "swapped": swapped}
-    path, *lines = (part.format(**names) for part in STRANGERS[stranger])
+    path, *lines = (line.format(**names) for line in STRANGERS[stranger])
     headers = [tuple(line.split(": ", 1)) for line in lines]
     headers += list(HANDSHAKE.items()) if how == "websocket" else []
-    connection, status, text = asked(address, path, headers)
+    connection, status, text = request(address, path, headers)
     connection.close()
     assert status == 403
     (said,) = re.findall(r"<p>(.*)</p>", text)
@@ -125,7 +125,7 @@ def test_whoever_has_the_address_is_let_in(address: str, name: str, origin: str,
     port = host.split(":")[1]
     sent = [("Host", f"{name}:{port}")] + ([("Origin", f"{origin}:{port}")] if origin else [])
     sent += list(HANDSHAKE.items()) if how == "websocket" else []
-    connection, status, text = asked(address, f"/{key}{path}", sent)
+    connection, status, text = request(address, f"/{key}{path}", sent)
     connection.close()
     assert status == (101 if how == "websocket" else 200)
     assert ("<html" in text) == (how == "page")
@@ -168,7 +168,7 @@ def test_each_server_has_a_key_of_its_own_and_says_who_reaches_it(tmp_path: Path
         every = made[2]
         assert every.address == every.at("localhost")
         assert every.elsewhere.endswith(f":{every.viser.get_port()}/{every.key}/")
-        connection, status, _ = asked(every.address, "/", [("Host", every.address.split("/")[2])])
+        connection, status, _ = request(every.address, "/", [("Host", every.address.split("/")[2])])
         connection.close()
         assert status == 403
     finally:
@@ -273,14 +273,14 @@ def test_nonsense_ends_in_a_sentence(app: App, capfd: pytest.CaptureFixture[str]
         sender.close()
         assert until(lambda: not app.server.get_clients()), what
     for number, value in enumerate((12.0, 21.0)):  # page after page drives as before
-        hands = RawPage(app)
-        hands.put(bend, value)
+        driver = RawPage(app)
+        driver.put(bend, value)
         assert arrived(page, value), number
-        hands.press(page.stop)
+        driver.press(page.stop)
         assert until(lambda: page.session.stopped)
-        hands.press(page.go_on)
+        driver.press(page.go_on)
         assert until(lambda: not page.session.stopped)
-        hands.close()
+        driver.close()
         assert until(lambda: not app.server.get_clients())
     said = capfd.readouterr()
     assert "Traceback" not in said.out + said.err
@@ -290,25 +290,25 @@ def test_nonsense_ends_in_a_sentence(app: App, capfd: pytest.CaptureFixture[str]
 
 def test_of_many_pages_some_are_refused_in_a_sentence_and_any_other_stops(app: App) -> None:
     app.open("prototype")
-    page, hands = page_of(app), RawPage(app)
+    page, driver = page_of(app), RawPage(app)
     sent = [("Host", app.address.split("/")[2]), *HANDSHAKE.items()]
 
     def again() -> bool:
-        connection, status, _ = asked(app.address, f"/{app.served.key}/", sent[:1])
+        connection, status, _ = request(app.address, f"/{app.served.key}/", sent[:1])
         connection.close()
         return status == 200
 
-    opened = [asked(app.address, f"/{app.served.key}", sent) for _ in range(200)]
+    opened = [request(app.address, f"/{app.served.key}", sent) for _ in range(200)]
     assert [status for _, status, _ in opened] == [101] * (MOST_PAGES - 1) + [503] * (201 - MOST_PAGES)
     said = f"{MOST_PAGES} pages are open, which is the most"
     assert all(said in text for _, status, text in opened if status == 503)
-    hands.press(page.stop)
+    driver.press(page.stop)
     assert until(lambda: page.session.stopped)
     opened[0][0].close()
     assert until(again)
     for connection, _, _ in opened[1:]:
         connection.close()
-    hands.close()
+    driver.close()
 
 
 class Clock:
@@ -329,12 +329,12 @@ def test_one_page_has_the_controls_and_another_asks_for_them() -> None:
     assert [holder.standing(page) for page in (1, 2)] == ["has", "other"]
     holder.ask(2)
     holder.ask(3)  # waits its turn
-    assert [holder.standing(page) for page in (1, 2, 3)] == ["asked", "asking", "other"]
+    assert [holder.standing(page) for page in (1, 2, 3)] == ["requested", "asking", "other"]
     assert holder.acts(1)
     clock.now += 0.9 * PATIENCE
     holder.tick()
     holder.keep(2)  # not its own to keep
-    holder.hand_over(3)
+    holder.grant(3)
     holder.keep(1)
     assert [holder.standing(page) for page in (1, 2)] == ["has", "refused"]
     holder.ask(2)  # too soon
@@ -351,7 +351,7 @@ def test_one_page_has_the_controls_and_another_asks_for_them() -> None:
     assert moved == [clock.now]
     assert not holder.acts(1)
     holder.ask(1)
-    holder.hand_over(2)
+    holder.grant(2)
     assert holder.standing(1) == "has"
     clock.now += 1.1 * IDLE
     holder.ask(3)  # at once: page 1 did nothing for long
@@ -429,13 +429,13 @@ def test_a_page_that_closes_in_motion_leaves_no_motion_behind(app: App, watched:
     robot = load_robot("prototype")
     link = SimulatedRobot(robot, real=True)
     app.open(FreeWorld(robot), link=link)
-    page, hands = page_of(app), RawPage(app)
+    page, driver = page_of(app), RawPage(app)
     watcher = RawPage(app) if watched else None
     speed, bend = slider(app, "Speed [°/s]"), slider(app, "Bend x [°]")
-    hands.put(speed, 5)  # slow, so that it is still on its way
-    hands.put(bend, 85.0)
+    driver.put(speed, 5)  # slow, so that it is still on its way
+    driver.put(bend, 85.0)
     assert until(lambda: bool(link.read().dl.min() < -1e-5))
-    hands.close()
+    driver.close()
     assert until(lambda: page.pilot.arrived)  # what it was sent to is given up
     assert link.read().dl.min() > -0.0075 * np.radians(80.0)
     assert until(lambda: link.stopped != watched)

@@ -167,9 +167,9 @@ def _address() -> str:
     return "127.0.0.2" if address.startswith("127.") else address
 
 
-@pytest.mark.parametrize(("host", "told"), [("127.0.0.1", False), ("0.0.0.0", True)])
+@pytest.mark.parametrize(("host", "announced"), [("127.0.0.1", False), ("0.0.0.0", True)])
 def test_the_address_is_the_key(
-    host: str, told: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    host: str, announced: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:  # fmt: skip
     opened: list[str] = []
     monkeypatch.setattr(App, "wait", lambda app: opened.append(app.served.key))
@@ -183,5 +183,5 @@ def test_the_address_is_the_key(
     address, key = opened
     assert address.endswith(f"/{key}/")
     assert f"prototype: {address} (Ctrl+C ends it)" in said.out
-    assert ("Other machines reach this page, too, at http://" in said.err) == told
-    assert (f"/{key}/ and whoever has this address can drive: it is the key" in said.err) == told
+    assert ("Other machines reach this page, too, at http://" in said.err) == announced
+    assert (f"/{key}/ and whoever has this address can drive: it is the key" in said.err) == announced

@@ -15,7 +15,7 @@ PATIENCE = 5.0
 AGAIN = 10.0
 """s after a refusal in which the same page does not ask again."""
 
-Standing = Literal["free", "has", "asked", "other", "asking", "refused"]
+Standing = Literal["free", "has", "requested", "other", "asking", "refused"]
 """Of one page: the controls are free; it has them; it is asked for them; another has them; it asks; it was
 refused."""
 
@@ -70,7 +70,7 @@ class Holder:
                 return
             waits = self._asks is not None and self._asks != page and self._asks in self._pages()
             if self._has is None or self._has not in self._pages() or now - self._acted > IDLE:
-                self._give(page)
+                self._assign(page)
             elif not waits and self._asks != page:
                 self._asks, self._since = page, now
         self._changed()
@@ -83,12 +83,12 @@ class Holder:
             self._refused[self._asks], self._asks, self._acted = self._clock(), None, self._clock()
         self._changed()
 
-    def hand_over(self, page: int) -> None:
+    def grant(self, page: int) -> None:
         """The page that is asked agrees."""
         with self._lock:
             if page != self._has or self._asks is None:
                 return
-            self._give(self._asks)
+            self._assign(self._asks)
         self._changed()
 
     def tick(self) -> None:
@@ -100,7 +100,7 @@ class Holder:
                 self._asks = None
             left = self._has is not None and self._has not in pages
             if left or (self._asks is not None and now - self._since >= PATIENCE):
-                self._give(self._asks)
+                self._assign(self._asks)
             same = before == (self._has, self._asks, len(self._refused))
         if not same:
             self._changed()
@@ -111,11 +111,11 @@ class Holder:
             if self._has is None:
                 return "free"
             if self._has == page:
-                return "has" if self._asks is None else "asked"
+                return "has" if self._asks is None else "requested"
             if self._asks == page:
                 return "asking"
             return "refused" if page in self._refused else "other"
 
-    def _give(self, page: int | None) -> None:
+    def _assign(self, page: int | None) -> None:
         self._has, self._asks, self._acted = page, None, self._clock()
         self._moved()

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 _TEXTS: dict[Standing, str] = {
     "free": "No page has the controls. The first that moves something gets them.",
     "has": "This page has the controls. The others watch; STOP works on all of them.",
-    "asked": f"Another page asks for the controls, and gets them after {PATIENCE:g} s unless you keep them.",
+    "requested": f"Another page asks for control and gets them after {PATIENCE:g} s, unless you keep them.",
     "other": "Another page has the controls. This one watches; STOP works here, too.",
     "asking": f"The other page is asked, and may refuse within {PATIENCE:g} s.",
     "refused": f"The other page keeps the controls. Ask again {AGAIN:g} s after that.",
@@ -69,18 +69,18 @@ class _Panel:
             self._text = gui.add_markdown("")
             self._ask = gui.add_button("Ask for control", visible=False)
             self._keep = gui.add_button("Keep control", visible=False)
-            self._hand_over = gui.add_button("Hand over", color="gray", visible=False)
+            self._grant = gui.add_button("Yield control", color="gray", visible=False)
         self._panel.float(x=15, y=-260, width=250)  # below viser's notes, above the plot of a log
         self._ask.on_click(lambda _: holder.ask(page))
         self._keep.on_click(lambda _: holder.keep(page))
-        self._hand_over.on_click(lambda _: holder.hand_over(page))
+        self._grant.on_click(lambda _: holder.grant(page))
 
     def show(self, standing: Standing) -> None:
         if standing == self._standing:
             return
         self._standing, self._text.content = standing, _TEXTS[standing]
         self._ask.visible = standing == "other"
-        self._keep.visible = self._hand_over.visible = standing == "asked"
+        self._keep.visible = self._grant.visible = standing == "requested"
 
     def remove(self) -> None:
         self._panel.remove()
