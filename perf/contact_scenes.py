@@ -1,8 +1,9 @@
 """Random contact scenes beside a dense sampling: `python perf/contact_scenes.py --count 10000 --seed 1`.
 
-Shipped robots with 6 to 40 integration steps a segment, tendons that move in small and in coarse steps, and obstacles beside them or
-pushed into them. After every step the whole rod is sampled (`Simulator.shape`) and held against a signed distance that shares
-no code with fastrod: closed forms, or every triangle of a mesh. A step that says ok and is deeper than 0.1 mm is silent.
+Shipped robots with 6 to 40 integration steps a segment, tendons that move in small and in coarse steps, and
+obstacles beside them or pushed into them. After every step the whole rod is sampled (`Simulator.shape`) and compared
+with a signed distance that shares no code with fastrod: closed forms, or every triangle of a mesh. A step that says ok
+and is deeper than 0.1 mm is silent.
 """
 
 from __future__ import annotations
@@ -354,7 +355,8 @@ def sections(count: int, seed: int, first: int) -> list[Section]:
         Column("sentence", "most frequent sentence"),
     ]
     notes = [
-        f"A step of {TOGETHER} robots takes, in seconds of the processor, {1e3 * float(np.median(taken)):.2f} ms at the median and {slowest:.2f} s at most ({where}).",
+        f"A step of {TOGETHER} robots takes {1e3 * float(np.median(taken)):.2f} ms of the processor at the median and "
+        f"{slowest:.2f} s at most ({where}).",
         *silent,
     ]
     return [Section("contact_scenes", f"Random contact scenes, seed {seed}", columns, rows, notes)]

@@ -115,6 +115,28 @@ def _segment_is_full(s: float, count: int, slot: Floats, arclength: Floats, n_st
     return members >= n_steps - 1
 
 
+@kernel
+def _spare(c: int, count: int, slot: Floats, spacing: float, tolerance: float) -> bool:
+    """An idle contact, open and beside one that presses: it is not wanted next, and its node is better spread out."""
+    if slot[c, T_GAP] < 10.0 * tolerance:
+        return False
+    for e in range(count):
+        if slot[e, T_OBSTACLE] == slot[c, T_OBSTACLE] and abs(slot[e, T_S] - slot[c, T_S]) < spacing and carries(slot[e]):
+            return True
+    return False
+
+
+@kernel
+def _least_wanted(s: float, gap: float, count: int, slot: Floats, arclength: Floats, n_steps: int, anywhere: bool) -> int:
+    """Of the idle contacts on the segment of s, or `anywhere`, the one with the widest gap, if it is wider than `gap`; -1 if none is."""
+    k, widest, at = segment_at(arclength, n_steps, s), gap, -1
+    for c in range(count):
+        here = anywhere or segment_at(arclength, n_steps, slot[c, T_S]) == k
+        if here and slot[c, T_TWIN] < 0.0 and slot[c, T_GAP] > widest and not carries(slot[c]):
+            widest, at = slot[c, T_GAP], c
+    return at
+
+
 @inline
 def _other_wall(slot: Numbers, gap: float, away: float, tolerance: float) -> bool:
     """The contact holds another wall than the one with this gap, so far away along the rod: the gap to one changes by at most 1 per
@@ -144,7 +166,7 @@ def choose(
     room = count <= len(slot) - 4
     for c in range(count):
         idle = slot[c, T_GAP] < (keep if int(slot[c, T_OBSTACLE]) < n_obstacles else 0.0)
-        if carries(slot[c]) or (idle and room):
+        if carries(slot[c]) or (idle and room and not _spare(c, count, slot, spacing, tolerance)):
             if n != c:
                 for a in range(SLOT):
                     slot[n, a] = slot[c, a]
@@ -172,16 +194,30 @@ def choose(
                 slot[near, T_S], slot[near, T_SHIFT] = s, nearest if carries(slot[near]) else FAR
                 continue
             lonely = _CLOSE * spacing
-        crowded = n >= len(slot) or _segment_is_full(s, n, slot, arclength, n_steps)
+        crowded, full = False, n >= len(slot) or _segment_is_full(s, n, slot, arclength, n_steps)
         for c in range(n):
             away = abs(slot[c, T_S] - s)
             if int(slot[c, T_OBSTACLE]) == k and away < lonely and dot(slot_normal(slot[c]), normal) > 0.5:
                 crowded = crowded or not _other_wall(slot[c], gap, away, tolerance)
-        if not crowded:
-            open_slot(slot[n], k, s, -1, normal, gap, radius[segment_at(arclength, n_steps, s)], friction[k])
-            slot[n, T_TAKEN] = 1.0
-            n += 1
+        at = n
+        if full and not crowded and gap < -tolerance:
+            at = _least_wanted(s, gap, n, slot, arclength, n_steps, not _segment_is_full(s, n, slot, arclength, n_steps))
+        if not crowded and (not full or at >= 0) and at < len(slot):
+            open_slot(slot[at], k, s, -1, normal, gap, radius[segment_at(arclength, n_steps, s)], friction[k])
+            slot[at, T_TAKEN] = 1.0
+            n = max(n, at + 1)
     return n
+
+
+@kernel
+def stands(count: int, slot: Floats, tolerance: float) -> bool:
+    """Contacts without friction that the law need not be asked about: none is deeper than `tolerance`, none presses that is open by
+    more, none pulls."""
+    for c in range(count):
+        press = dot(slot_force(slot[c]), slot_normal(slot[c]))
+        if slot[c, T_ARM] > 0.0 or slot[c, T_GAP] < -tolerance or press < 0.0 or (carries(slot[c]) and slot[c, T_GAP] > tolerance):
+            return False
+    return True
 
 
 @kernel

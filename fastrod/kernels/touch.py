@@ -17,7 +17,7 @@ from .forces import Scenery, apply_law, forces_size
 from .gather import pick
 from .jit import inline, kernel
 from .search import CANDIDATE, Sweep, crosses, entered, search_obstacles
-from .slots import T_FORCE, T_OBSTACLE, T_S, add_walls, choose, merge, pressed_only, segment_at, slot_force, violation
+from .slots import T_FORCE, T_OBSTACLE, T_S, add_walls, choose, merge, pressed_only, segment_at, slot_force, stands, violation
 from .strands import search_rods
 from .vec import dot
 
@@ -171,6 +171,10 @@ def iterate_world(
         if deep > scenery.tolerance:
             _say(trouble[i], INSIDE, int(found[where, 0]), found[where, 1], deep)
     worst = max(worst, search_rods(first, last, rows, scenery.shape, scenery.rods, touching, n_obstacles, scenery.margin, gap, False))
+    if not solved and farthest <= scenery.tolerance:
+        solved = True
+        for r in range(first, last):
+            solved = solved and stands(touching.used[rows[r]], touching.slot[rows[r]], scenery.tolerance)
     rest = solved and farthest <= scenery.tolerance and worst <= scenery.tolerance
     through = False
     for r in range(first, last if rest else first):
