@@ -203,7 +203,7 @@ def effect_names() -> list[str]:
 def canonical_name(name: str) -> str:
     """The one name of an effect that goes by several. Raises `UnknownNameError` with the nearest."""
     load_library()
-    name = _SYNONYMS.get(name, name)
+    name = _SYNONYMS.get(name, str(name))
     if name not in _REGISTRY:
         raise UnknownNameError(f"no effect {name!r}; {nearest(name, [*_REGISTRY, *_SYNONYMS])}")
     return name

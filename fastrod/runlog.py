@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from importlib import import_module
 from io import TextIOWrapper
@@ -25,7 +25,9 @@ _TIP = ("tip_x", "tip_y", "tip_z")
 _TIP_QUATERNION = ("tip_qw", "tip_qx", "tip_qy", "tip_qz")
 _TIP_FORCE = ("tip_fx", "tip_fy", "tip_fz")
 _BASE_QUATERNION = ("base_qw", "base_qx", "base_qy", "base_qz")
-_REACH = 3.0  # robot lengths; nothing on the robot is further from its base, so the unit is wrong
+_REACH = 3.0  # robot lengths; nothing on the robot moves further, so the unit is wrong
+_FAR = 30.0  # robot lengths; no camera that sees the robot is further off
+_LIKE_REST = 0.2  # of the rest length: tendon lengths that stay so near to it are no changes
 _MOST_VALUES, _MOST_BYTES = 30_000_000, 500_000_000  # of a Parquet file unpacked: 1.5 GB at its peak
 _HEAVIEST = 10.0  # kg; a heavier payload was given in g
 _QUATERNION_SLACK = 1e-2  # trackers write three or four digits
@@ -114,6 +116,7 @@ class RunLog:
 
     def only(self, run: str) -> RunLog:
         """The samples of one run. Raises `UnknownNameError` with the nearest label, or saying that the log names none."""
+        run = str(run)  # numpy's words quote as np.str_(...)
         if run not in self.runs:
             if not (named := [" ".join(label.split()) for label in self.runs if label]):
                 raise UnknownNameError(f"no run {run!r}; log {self.name!r} names no runs.")
@@ -425,12 +428,14 @@ def _check_units(log: RunLog, robot: Robot, where: str) -> None:
             return np.asarray(np.linalg.norm(points, axis=1))
 
     far = f"more than {_REACH:g} lengths of robot {robot.name!r} ({robot.length:g} m). Was it given in mm?"
-    tip = norm(log.tip_position)
-    refuse(tip > _REACH * length, "the tip's distance from the base", tip, "m", far)
-    for k in range(0 if log.points is None else log.points.shape[1]):
-        assert log.points is not None
-        point = norm(log.points[:, k])
-        refuse(point > _REACH * length, f"the distance of point p{k + 1} from the base", point, "m", far)
+    for name, places in _measured(log):
+        away = norm(places)
+        refuse(away > _FAR * length, f"{name} from the base", away, "m", far)
+        if not np.isfinite(away).any():
+            continue
+        moved = norm(places - np.nanmedian(places, axis=0))  # wherever the camera stands
+        refuse((moved > _REACH * length) & (away > _REACH * length), f"{name} from the base", away, "m", far)
+    _check_changes(log, robot, where)
     for k in range(log.dl.shape[1]):
         long = f"more than robot {robot.name!r} is long ({robot.length:g} m). Was it given in mm?"
         refuse(np.abs(log.dl[:, k]) > length, f"column dl_{k + 1}", log.dl[:, k], "m", long)
@@ -444,6 +449,28 @@ def _check_units(log: RunLog, robot: Robot, where: str) -> None:
     if log.payload is not None:
         refuse(log.payload < 0.0, "column payload", log.payload, "kg", "a mass is not negative.")
         refuse(log.payload > _HEAVIEST, "column payload", log.payload, "kg", f"more than {_HEAVIEST:g} kg. Was it given in g?")
+
+
+def _measured(log: RunLog) -> Iterator[tuple[str, Floats]]:
+    """The measured places (n, 3) [m], and what their distance from the base is called."""
+    yield "the tip's distance", log.tip_position
+    for k in range(0 if log.points is None else log.points.shape[1]):
+        assert log.points is not None
+        yield f"the distance of point p{k + 1}", log.points[:, k]
+
+
+def _check_changes(log: RunLog, robot: Robot, where: str) -> None:
+    """Refuse absolute tendon lengths in place of their changes: every one about as long as at rest, on a robot that cannot grow so far."""
+    rest = np.asarray(robot.rest_tendon_length)
+    if not rest.size or not np.isfinite(log.dl).all(axis=1).any():
+        return
+    usual = np.nanmedian(log.dl, axis=0)
+    grows = sum(segment.extension[1] for segment in robot.segments)
+    if (np.abs(usual - rest) < _LIKE_REST * rest).all() and grows < 0.5 * robot.length:
+        raise LogError(
+            f"{where} has a median of {usual[0]:.4g} m in column dl_1, where robot {robot.name!r} has a tendon of {rest[0]:.4g} m at rest: "
+            "these look like absolute lengths. The log takes changes against the straight robot, negative = pulled."
+        )
 
 
 def _columns(log: RunLog) -> Table:

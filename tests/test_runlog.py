@@ -110,6 +110,10 @@ BAD = {
     "semicolons": (GOOD.replace(",", ";"), "separated by semicolons"),
     "time back": (GOOD.replace("0.0,b", "0.0,a"), "row 3, column t is 0 s after 0.1 s inside run 'a'; time must not run back"),
     "tip in mm": (GOOD.replace("0.069", "69"), r"row 2, the tip's distance from the base is 69 m; more than 3 lengths .* in mm\?"),
+    "absolute lengths": (
+        GOOD.replace(",0,0,0,0,", ",0.07,0.07,0.07,0.07,").replace("-0.001,0,0.001,0", "0.069,0.07,0.071,0.07"),
+        r"median of 0\.07\d* m in column dl_1, .* 0\.07 m at rest: these look like absolute lengths\. The log takes changes",
+    ),
     "dl in mm": (GOOD.replace("-0.001", "-1.0"), r"row 2, column dl_1 is -1 m; .* Was it given in mm\?"),
     "points": (GOOD.replace("run", "p1_x"), "has points p1 to p1; robot 'prototype' names the arclengths of 0"),
     "ext": (GOOD.replace("run", "ext_2"), "has column 'ext_2'; robot 'prototype' has 1 segments"),

@@ -27,8 +27,7 @@ def sentence(trouble: Floats, scene: ContactScene, n_steps: int, length: Floats,
         f"than {n_steps} points_per_segment",
         THROUGH: f"the rod would go through {at}; take smaller steps, or lead it around",
         DIVERGED: f"the rod's shape diverged, last held by {at}; take smaller steps",
-        NO_NODE_LEFT: f"segment {segment} has no node left for a contact with {at}; take more than {n_steps} "
-        "points_per_segment",
+        NO_NODE_LEFT: f"segment {segment} has no node left for a contact with {at}; take more than {n_steps} points_per_segment",
         NO_CONTACT_LEFT: f"the rod is {size:.2g} m inside {at} and has no contact left; raise ContactScene.max_contacts above "
         f"{scene.max_contacts}",
     }[what]

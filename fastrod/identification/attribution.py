@@ -87,7 +87,8 @@ def identify(
     state, found = _library(search, base, start, last, found, max_effects, steps) if found else (start, found)
     if search.spent:
         base.notes.append(
-            f"the search stopped early: the model hardly converges, and has taken {MOST_PASSES:.0f} passes for each row; more may be missing"
+            f"the search stopped early: the model hardly converges, and has taken {MOST_PASSES:.0f} passes for each row; "
+            "more effects may be missing"
         )
     tell("prediction on all samples", max_effects + _SPARE + 1, max_effects + _SPARE + 2)
     result = assemble(

@@ -99,7 +99,7 @@ def _when(local: Local, at: float) -> str:
     """A moment of `_log_time` in the log's own time, with its run where there are several."""
     samples = local.samples
     row = int(samples.rows[int(np.argmax(_log_time(local) > at))])
-    run = f" of run {samples.log.run[row]!r}" if len(samples.runs) > 1 else ""
+    run = f" of run {str(samples.log.run[row])!r}" if len(samples.runs) > 1 else ""
     return f"{samples.log.t[row]:.1f} s{run}"
 
 

@@ -27,8 +27,8 @@ _LEVER = 0.3  # robot lengths: what a measured rotation counts beside positions
 _STILL = 0.01  # robot lengths: a log that moves less says nothing
 _FURTHER = 1.1  # times the motion: what is left of a model that moves otherwise
 _SCALES = {
-    1e-3: "mm to m", 1e-2: "cm to m", 0.1: "mm to cm", 0.0254: "inches to m", np.pi / 180.0: "degrees to radians",
-    0.5: "a diameter for a radius", 2.0: "a radius for a diameter", 10.0: "cm to mm", 1e3: "converted twice",
+    1e-3: "mm to m", 1e-2: "cm to m", 0.1: "a decimal place", 0.0254: "inches to m", np.pi / 180.0: "degrees to radians",
+    0.5: "a diameter for a radius", 2.0: "a radius for a diameter", 10.0: "a decimal place", 1e3: "converted twice",
 }  # fmt: skip
 _AS_GOOD = 1.3  # times what a moved camera leaves
 _RIGHT = "Are the units, the signs (negative = pulled) and the order of the dl_ columns right, and is it this robot?"
@@ -144,7 +144,7 @@ class _Look:
         self.motion = size(self.tip - np.median(self.tip, axis=0))
         """[m]."""
         pose = self._pose(np.asarray(samples.log.dl))
-        self.solved = int(pose.ok.sum()) >= _LEAST
+        self.solved = int(pose.ok.sum()) >= max(_LEAST, len(rows) // 2)  # of inputs in another unit the rests are solved
         self.as_it_is = self.centred = np.inf
         """Distance that the model leaves as it is, and with both motions about their middles [m]."""
         self.scale = np.nan

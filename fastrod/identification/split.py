@@ -68,7 +68,7 @@ def held_out_rows(samples: Samples, held_out: Sequence[str]) -> tuple[Flags, lis
             n = part.stop - part.start
             mask[part] = (np.arange(n) * _STRETCHES // n) % 4 == 2
         return mask, [f"every fourth of {_STRETCHES} stretches of each run"]
-    for text in held_out:
+    for text in map(str, held_out):  # numpy's words quote as np.str_(...)
         label, _, window = text.partition("@")
         if label and label not in log.runs:
             named = [run for run in log.runs if run]
@@ -87,4 +87,4 @@ def held_out_rows(samples: Samples, held_out: Sequence[str]) -> tuple[Flags, lis
         mask |= rows
     if mask[samples.rows].all():
         raise LogError(f"everything in log {log.name!r} is held out; leave something to fit.")
-    return mask, list(held_out)
+    return mask, list(map(str, held_out))
