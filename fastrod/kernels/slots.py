@@ -141,7 +141,7 @@ def _least_wanted(s: float, gap: float, count: int, slot: Floats, arclength: Flo
 def _other_wall(slot: Numbers, gap: float, away: float, tolerance: float) -> bool:
     """The contact holds another wall than the one with this gap, so far away along the rod: the gap to one changes by at most 1 per
     metre. To move it there would mend nothing."""
-    return slot[T_GAP] - gap > away + tolerance
+    return bool(slot[T_GAP] - gap > away + tolerance)
 
 
 @kernel
