@@ -35,7 +35,8 @@ _MOST_PASSES, _NEARLY = 16, 1e-4  # and twice as many for a robot that moves by 
 _MOST_INSIDE = 8  # passes in a row with the centreline inside of an obstacle: the step led too far
 _SMALLEST_PART = 1.0 / 64.0
 _HARD = 1.0 / 4.0  # part of the way below which a failure is taken for the loss of the equilibrium, not for too long a step
-_DAMPING, _MOST_DAMPED, _DAMPED_TRIES = 1.5, 60, 3
+_DAMPING, _MOST_DAMPED, _DAMPED_TRIES = 1.5, 60, 6
+_WANDERS = 1e-2  # of the length: a robot that moves by less goes around a place where it may come to rest
 _UNSOLVED = 6  # passes in a row without forces that obey the law: the hold is lost, and plain passes do not bring it back
 _FEW = 64  # robots below which starting threads costs more than it saves
 
@@ -186,7 +187,9 @@ class Engine:
             aim = np.minimum(done + stride, 1.0)
             ports = end if start is None or (aim[way] >= 1.0).all() else blended(start, end, aim)
             rest, unheld = self._settle(way, ports, memory, shape, run, self._scenery(shape, tolerance, done, aim), passes, _MOST_PASSES)
-            hard = way[~rest[way] & ((stride[way] <= _HARD) | unheld[way]) & (tries[way] < _DAMPED_TRIES)]
+            wanders = (self.trouble[:, 0] == MOVES) & (self.trouble[:, 3] < _WANDERS * self.rods.reach)
+            given_up = (stride <= _HARD) | unheld | self.whole_worlds(wanders)
+            hard = way[(~rest & given_up & (tries < _DAMPED_TRIES))[way]]
             if len(hard):  # no equilibrium near: let it go to the next one, downhill
                 tries[hard] += 1
                 memory.x[hard], self.touching.used[hard], self.touching.slot[hard] = x[hard], count[hard], slot[hard]
@@ -280,7 +283,7 @@ class Engine:
         rest = np.zeros(len(self.gap), bool)
         unsolved, inside = np.zeros(len(rest), np.int64), np.zeros(len(rest), np.int64)
         still, plain = rows, scenery.damping == 0.0
-        for count in range(2 * most):
+        for count in range(2 * most if plain else 3 * most):
             status = self._iterate(still, ports, memory, shape, run, scenery)
             passes[still] += 1
             rest[still[status == AT_REST]] = True
