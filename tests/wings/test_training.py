@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed: pip install 'fastrod[rl]'")
 
 from fastrod.errors import FastrodError, InputError, UnknownNameError
+from fastrod_envs.arrays import read_arrays, write_arrays
 from fastrod_envs.imitation import imitate
 from fastrod_envs.policies import Policy, find, shipped
 from fastrod_envs.sb3 import BatchVecEnv
@@ -88,6 +89,31 @@ def test_resume_takes_more_steps(tmp_path: Path) -> None:
     resume(tmp_path / "run", 640)
     assert read_config(tmp_path / "run")[1]["steps_done"] == 640
     assert read_config(tmp_path / "run")[0].steps == 640
+
+
+def test_a_damaged_checkpoint_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    settings = {"n_steps": 10, "n_epochs": 1}
+    train(make_plan("Reach", steps=160, n_envs=16, options={"n_steps": 10}, settings=settings), tmp_path / "run")
+    path = tmp_path / "run" / CHECKPOINT
+    whole, held = path.read_bytes(), read_arrays(path, "checkpoint")
+    weight, moment = "policy/action_net.weight", "policy.optimizer/0/exp_avg"
+    for change, words in (
+        ({weight: np.full_like(held[weight], np.nan)}, "action_net.weight holds a number that is not finite"),
+        ({weight: held[weight][:-1]}, "no checkpoint of the plan beside it"),
+        ({moment: np.zeros(1, np.float32)}, "has not the shapes that Adam keeps"),
+        ({"counter/num_timesteps": np.int64(-1)}, "num_timesteps is"),
+    ):
+        write_arrays(path, held | change)
+        with pytest.raises(InputError, match=words) as caught:
+            resume(tmp_path / "run", 320)
+        assert str(caught.value).isprintable()
+    path.write_bytes(whole[:-500])
+    with pytest.raises(InputError, match="is it whole"):
+        resume(tmp_path / "run", 320)
+    path.write_bytes(whole)
+    (tmp_path / "run" / POLICY).write_bytes(b"nothing that is read")
+    resume(tmp_path / "run", 320)
+    assert read_config(tmp_path / "run")[1]["steps_done"] == 320
 
 
 def test_lessons_bring_the_policy_to_the_baseline() -> None:
