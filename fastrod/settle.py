@@ -149,12 +149,12 @@ def _continuation(rows: Ints, boundary: Passes, ports: Ports, tolerance: float, 
     longest = np.full(boundary.n_robots, 0.25)  # a longer stride than a load parameter of three could land on another equilibrium
     longest[rows] = np.minimum(0.25, 0.5 * _STEEP / np.maximum(load_parameter(rows, params, ports), 1e-9))
     stride = longest.copy()
-    heavy = rows[longest[rows] < _SMALLEST_LOAD_STEP]  # hundreds of times what bends a rod by a radian: no number of steps is enough
-    rows = np.setdiff1d(rows, heavy)
+    heavy = rows[longest[rows] < _SMALLEST_LOAD_STEP]  # hundreds of times what bends a rod by a radian: steps without end
     unloaded = _loaded(ports, part)
     cold_start(rows, layout, params, unloaded, boundary.memory)
     lost = _newton(rows, boundary, unloaded, tolerance, run, passes)
-    rows, lost = np.setdiff1d(rows, lost), np.concatenate([heavy, lost])
+    lost = np.union1d(heavy, lost)
+    rows = np.setdiff1d(rows, lost)
     held = boundary.x.copy()
     while len(rows):
         aim = np.minimum(part + stride, 1.0)

@@ -14,8 +14,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from rods import bend, rod
 from verification.test_derivatives import difference
 
+import fastrod
 import fastrod.effect as registry
 from fastrod import Robot, Simulator, load_robot, save_robot
+from fastrod.cli import main
 from fastrod.effect import Operator, Parameter, Seam, columns, effect, effect_names, get_effect, has_memory, unregister
 from fastrod.errors import EffectError, InputError, RobotError, UnknownNameError
 from fastrod.kernels.operators import BUFFER
@@ -359,6 +361,28 @@ def test_bad_tables_get_one_sentence(tables: list[Table], kind: type[Exception],
     with pytest.raises(kind, match=sentence) as caught:
         Simulator(having(two_segments(), *tables))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("table", "kind", "sentence"),
+    [
+        ('name = "backlsh"', UnknownNameError, "no effect 'backlsh'; did you mean 'backlash'"),
+        ('name = "backlash"\nhalf_widht = 1e-4', EffectError, "has no parameter 'half_widht'; did you mean 'half_width'"),
+        ('name = "backlash"\nhalf_width = 1.0', EffectError, "half_width of effect 'backlash' is 1.0 m; it must be a number from 0"),
+        ('name = "play"\n[[effect]]\nname = "backlash"', EffectError, "has effect 'backlash' twice"),
+    ],
+)
+def test_a_robot_file_with_an_effect_that_is_none_is_refused_when_it_is_loaded(
+    table: str, kind: type[Exception], sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(dumps(load_robot("prototype")) + f"[[effect]]\n{table}\n")
+    with pytest.raises(kind, match=sentence) as caught:
+        fastrod.load_robot(path)
+    assert "mine.toml" in str(caught.value)
+    assert main(["excite", "--robot", str(path), "--out", str(tmp_path / "run.csv")]) == 2
+    assert str(caught.value) in capsys.readouterr().err
+    assert not (tmp_path / "run.csv").exists()
 
 
 def test_robots_of_a_batch_name_the_same_effects_and_share_their_wiring() -> None:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ import fastrod
 from fastrod import Observer, Simulator, load_robot
 from fastrod.errors import InputError, RobotError, UnknownNameError
 from fastrod.kernels.columns import step_column
+from fastrod.passes import Passes
 from fastrod.robotfile import dumps, loads
 
 
@@ -55,6 +57,24 @@ def test_hot_loops_are_simd_code() -> None:
         step_column(a.copy(), a.copy(), a.copy(), a.copy(), a.copy())
     assembly = step_column.inspect_asm(step_column.signatures[0])
     assert assembly.count("zmm") + assembly.count("ymm") > 200
+
+
+def test_a_load_that_no_number_of_steps_would_bring_on_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Steps are in proportion to one over the load: 10 kN on a rod of 2 N mm^2 would take thousands, each of several passes."""
+    sim, ran = Simulator(rod(), n_robots=2, points_per_segment=6), 0
+    run = Passes.run
+
+    def counted(*args: Any, **keywords: Any) -> None:
+        nonlocal ran
+        ran += 1
+        run(*args, **keywords)
+
+    monkeypatch.setattr(Passes, "run", counted)
+    state = sim.settle(rod().rest_tendon_length, tip_force=[[0.0, 0.0, 0.0], [1e4, 0.0, 0.0]])
+    assert ran < 100
+    assert state.ok.tolist() == [True, False]
+    assert "settle did not bring" in state.problems[1]
+    assert np.isfinite(state.position).all()
 
 
 def test_one_bad_robot_leaves_its_neighbours_alone() -> None:

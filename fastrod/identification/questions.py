@@ -52,7 +52,7 @@ class Reading:
 
 def questions(log: RunLog, robot: Robot, *, threads: int | None = None) -> tuple[str, ...]:
     """What `log` makes one ask about its units, signs, order, frame and time; nothing where it fits `robot`."""
-    if not log.measured.any():
+    if int(log.measured.sum()) < _LEAST:
         return ()
     samples = sample(log)
     reading = read(samples, robot, threads=threads)

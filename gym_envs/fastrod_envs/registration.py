@@ -27,7 +27,12 @@ N_STEPS: Mapping[str, int] = {
     "ReachObstacle": 40, "Track": 200,
 }  # fmt: skip
 """`n_steps` of each task's class, for Gymnasium: the tasks themselves, which import numba, are imported when one is made."""
-SOLVED: Mapping[str, float] = {}
+SOLVED: Mapping[str, float] = {
+    "BoxExplore": 34.0, "Catch": 5.0, "PickPlace": 67.0, "Push": 49.0, "QuadrupedPush": 43.0, "Reach": 31.0, "ReachObstacle": 31.0,
+    "Track": 196.0,
+}  # fmt: skip
+"""Mean return from which a task counts as solved, for Gymnasium: nine tenths of the way from a robot at rest to the shipped policy, with
+the task's own options (100 episodes from seed 100, of hosted tasks 4)."""
 NAMESPACE = "fastrod"
 VERSION = "v0"
 

@@ -17,7 +17,7 @@ from reportlog import GAP, backlash_log
 from truth import plant
 
 from fastrod.errors import LogError
-from fastrod.identification import report
+from fastrod.identification import report, search
 from fastrod.identification.attribution import identify
 from fastrod.identification.excite import excitation
 from fastrod.identification.replay import replay
@@ -257,3 +257,11 @@ def test_neighbouring_columns_that_are_swapped_explain_nothing() -> None:
 def test_too_much_held_out_is_refused() -> None:
     with pytest.raises(LogError, match=r"leaves \d+ rows to fit once two, three, one@2: are held out; it needs 40"):
         identify(backlash_log(), robot(), held_out=["two", "three", "one@2:"], threads=1)
+
+
+def test_a_search_that_would_not_end_stops_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(search, "MOST_PASSES", 1.0)
+    result = identify(backlash_log(), robot(), threads=1)
+    assert list(result.effects) == []
+    assert {c.why for c in result.tried if c.kind == "effect"} == {"not tried: the model hardly converges on this log"}
+    assert any(note.startswith("the search stopped early: the model hardly converges") for note in result.notes)
