@@ -183,8 +183,12 @@ class Engine:
         x, count, slot = memory.x.copy(), self.touching.used.copy(), self.touching.slot.copy()
         way, begun, tries = rows, passes.copy(), np.zeros(n, np.int64)
         trouble = np.zeros_like(self.trouble)  # of the last try that failed
+        moved = np.broadcast_to(longest_move(self.poses_before, self.poses, self.surfaces.sphere), n)
+        aim = np.ones(n)
         while len(way):
-            aim = np.minimum(done + stride, 1.0)
+            last, aim = aim, np.minimum(done + stride, 1.0)
+            elsewhere = way[(aim != last)[way]]  # what was clear of the obstacles was so where they were in the try before
+            self.clearance.distance[elsewhere] -= moved[elsewhere, None]
             ports = end if start is None or (aim[way] >= 1.0).all() else blended(start, end, aim)
             rest, unheld = self._settle(way, ports, memory, shape, run, self._scenery(shape, tolerance, done, aim), passes, _MOST_PASSES)
             wanders = (self.trouble[:, 0] == MOVES) & (self.trouble[:, 3] < _WANDERS * self.rods.reach)
@@ -210,6 +214,8 @@ class Engine:
                 break
             way = way[~arrived[way] & (stride[way] >= _SMALLEST_PART) & (passes[way] - begun[way] < most)]
         self.trouble[rows] = trouble[rows]
+        short = rows[~arrived[rows]]
+        self.clearance.distance[short] -= moved[short, None]
         lost = rows[~arrived[rows] & self.tracked[rows]]
         if len(lost) and self.before is not None:
             for now, last in zip(shape, self.before, strict=True):

@@ -22,6 +22,7 @@ from .mobile import add_mobility, axis_of
 from .search import carried
 from .slots import (
     T_GAP,
+    T_HOLD,
     T_N,
     T_OBSTACLE,
     T_RADIUS,
@@ -34,6 +35,8 @@ from .slots import (
 from .strands import twin_of
 from .surface import surface_curvature
 from .vec import Vec, add, axpy, cross, dot, mul, scale, sub
+
+_FORGETS, _PART_KEPT = 0.5, 0.3  # of a hold: what is left after one pass, and what damps where nothing is curved
 
 
 class Scenery(NamedTuple):
@@ -265,6 +268,23 @@ def _bend_model(n: int, m: int, points: Numbers, bends: Floats, stiff: Numbers, 
 
 
 @kernel
+def _keep_hold(first: int, last: int, rows: Ints, m: int, touching: Touching, stiff: Numbers) -> None:
+    """Where no contact is curved any more, damp by a part of what was stiff some passes ago: a contact that goes to and fro between
+    an edge and a face would not come to rest, as the face by itself is not damped."""
+    most, kept = 0.0, 0.0
+    for c in range(m):
+        most = max(most, stiff[c])
+    for r in range(first, last):
+        for q in range(touching.used[rows[r]]):
+            kept = max(kept, _FORGETS * touching.slot[rows[r], q, T_HOLD])
+    for c in range(m if most == 0.0 else 0):
+        stiff[c] = _PART_KEPT * kept
+    for r in range(first, last):
+        for q in range(touching.used[rows[r]]):
+            touching.slot[rows[r], q, T_HOLD] = max(most, kept)
+
+
+@kernel
 def _moved(n: int, model: Floats, a: int, change: Numbers) -> float:
     """Motion along axis a % 3 of point a // 3 when the boundary closes and the forces change."""
     value = model[a, 0]
@@ -366,6 +386,8 @@ def apply_law(
             m += 1
     if m == 0:
         return True
+    if scenery.damping > 0.0:
+        _keep_hold(first, last, rows, m, touching, stiff)
     if bent:
         _bend_model(n, m, points, bends, stiff, scenery.damping, model, scratch)
     for g in range(3 * n):

@@ -291,7 +291,9 @@ def entered(
     way = sub(q, p)
     length = math.sqrt(dot(way, way))
     nothing = (0.0, 0.0, 0.0)
-    if length < 1e-9 or signed_distance(k, frame, p, FAR, surfaces, stack)[0] <= 0.0:
+    if length < 1e-9 or signed_distance(k, frame, q, FAR, surfaces, stack)[0] >= 0.0:
+        return FAR, nothing
+    if signed_distance(k, frame, p, FAR, surfaces, stack)[0] <= 0.0:
         return FAR, nothing
     t, n = ray_hit(k, frame, p, (way[0] / length, way[1] / length, way[2] / length), length, surfaces, stack)
     if t >= length or dot(way, n) >= 0.0:

@@ -14,11 +14,11 @@ from .jit import inline, kernel
 from .surface import ray_hit, signed_distance, walls
 from .vec import Vec, dot, scale
 
-T_OBSTACLE, T_S, T_TWIN, T_N, T_GAP, T_FORCE, T_RADIUS, T_ARM, T_TAKEN, T_SHIFT, SLOT = 0, 1, 2, 3, 6, 7, 10, 11, 12, 13, 14
+T_OBSTACLE, T_S, T_TWIN, T_N, T_GAP, T_FORCE, T_RADIUS, T_ARM, T_TAKEN, T_SHIFT, T_HOLD, SLOT = 0, 1, 2, 3, 6, 7, 10, 11, 12, 13, 14, 15
 """Obstacle (from n_obstacles on: rods), arclength, number that links both sides of a contact between rods or -1, normal
 toward the rod, gap, force on the rod (world), radius of the rod there; arm: how far below the centreline the force acts, the
 radius where there is friction, else 0, for a normal force has no moment; taken: scratch of `choose`; shift: how far it moved
-along the rod the last time."""
+along the rod the last time; hold: stiffness that damping took last [N/m]."""
 _SAME_WALL = 0.99999
 _CLOSE = 1e-3  # of a step: the least that two contacts of one obstacle are apart
 
@@ -47,7 +47,7 @@ def open_slot(slot: Numbers, obstacle: int, s: float, twin: int, n: Vec, gap: fl
     """Write a contact that carries nothing yet: normal n, world, `gap` and `radius` [m]. Only friction gives its force an arm."""
     slot[T_OBSTACLE], slot[T_S], slot[T_TWIN], slot[T_GAP], slot[T_RADIUS] = float(obstacle), s, float(twin), gap, radius
     slot[T_N], slot[T_N + 1], slot[T_N + 2] = n
-    slot[T_ARM], slot[T_SHIFT] = radius if friction > 0.0 else 0.0, FAR
+    slot[T_ARM], slot[T_SHIFT], slot[T_HOLD] = radius if friction > 0.0 else 0.0, FAR, 0.0
     slot[T_FORCE], slot[T_FORCE + 1], slot[T_FORCE + 2], slot[T_TAKEN] = 0.0, 0.0, 0.0, 0.0
 
 
