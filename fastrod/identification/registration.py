@@ -15,7 +15,7 @@ from fastrod.types import Floats
 EFFECT = "frame_misalignment"
 _ROTATION = ("rotation_x", "rotation_y", "rotation_z")
 _SHIFT = ("shift_x", "shift_y", "shift_z")
-_LARGE_ROTATION = 0.25  # rad; the search finds a smaller one as the effect that it is (tried: 0.09 and 0.2 rad)
+_LARGE_ROTATION = 0.25  # rad; a smaller one is left to the search, as the effect that it is
 _LARGE_SHIFT = 0.3  # robot lengths
 _PULL = 1e-3  # of the cloud's largest spread: a rotation that moves the points by less stays as the robot file has it
 _ROUNDS = 20  # of reweighting

@@ -44,7 +44,7 @@ from fastrod.types import Floats, Ints
 
 N_BLOCKS = 20
 MOST_PASSES = 4000.0
-"""Of each row, on the average, after which nothing new is tried. A log with two effects takes 390 (measured), twice that where it is long."""
+"""Of each row, on the average, after which nothing new is tried. A log with two effects took 390."""
 _STARTS = 8
 _SCREEN = 0.003  # of the loss: a candidate whose slopes promise less is not fitted
 _FEW, _MANY = 3, 12  # iterations of a start, and of the best of them

@@ -26,7 +26,7 @@ STIFFNESS_SD = 0.3
 FREE_CAMERA = {"registration_sd": (0.01, 0.05), "marker_offset_sd": 0.02, "latency_sd": 0.15}
 """Priors of a camera that nobody calibrated: m and rad, m, s."""
 ROUGH = (0.1, 0.2)
-"""Prior of a rough registration: robot lengths, rad. Backlash of a tenth of the motion moves one by a quarter of this."""
+"""Prior of a rough registration: robot lengths, rad. With 0.55 mm of backlash one was 0.003 rad and 1.3 mm off."""
 _WIDE = 5.0  # typical sizes: width of the prior of an effect's size
 
 
