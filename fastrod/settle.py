@@ -152,8 +152,10 @@ def _continuation(rows: Ints, boundary: Passes, ports: Ports, tolerance: float, 
     heavy = rows[longest[rows] < _SMALLEST_LOAD_STEP]  # hundreds of times what bends a rod by a radian: steps without end
     unloaded = _loaded(ports, part)
     cold_start(rows, layout, params, unloaded, boundary.memory)
-    lost = _newton(rows, boundary, unloaded, tolerance, run, passes)
-    lost = np.union1d(heavy, lost)
+    if len(heavy):
+        run(heavy, ports)  # once: their residual is that of these loads, and not of none
+        cold_start(heavy, layout, params, unloaded, boundary.memory)
+    lost = np.union1d(heavy, _newton(np.setdiff1d(rows, heavy), boundary, unloaded, tolerance, run, passes))
     rows = np.setdiff1d(rows, lost)
     held = boundary.x.copy()
     while len(rows):
