@@ -41,7 +41,7 @@ pytest.importorskip("cv2", reason="opencv-python-headless is not installed: pip 
 HARDWARE = load_hardware()
 # in real time a busy machine is no fault
 _YOUNG = {"feedback_age": 5.0, "heartbeat_age": 9.0, "cycle": 5.0, "command_age": 9.0, "clock_jump": 9.0, "sighting_age": None}
-PATIENT = replace(HARDWARE, limits=replace(HARDWARE.limits, encoder_jump=0.05, **_YOUNG))
+PATIENT = replace(HARDWARE, limits=replace(HARDWARE.limits, encoder_jump=0.05, following_error=0.05, **_YOUNG))
 BENT = np.array([-0.002, 0.001, 0.002, -0.001])
 _names = itertools.count()
 
