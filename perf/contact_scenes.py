@@ -295,22 +295,25 @@ def play(batch: Batch, rows: list[int] | None = None, **options: Any) -> Played:
     return played
 
 
-def measure(count: int, seed: int, first: int = 0) -> Iterator[tuple[int, Batch, Played]]:
-    """Batches from index `first` on, until `count` scenes are played."""
+def measure(count: int, seed: int, first: int = 0, minutes: float = np.inf) -> Iterator[tuple[int, Batch, Played]]:
+    """Batches from index `first` on, until `count` scenes are played or the time is over."""
+    end = time.monotonic() + 60.0 * minutes
     for index in range(first, first + -(-count // TOGETHER)):
+        if time.monotonic() > end:
+            return
         report.note_progress(f"batch {index}")
         batch = make_batch(seed, index)
         yield index, batch, play(batch)
 
 
-def sections(count: int, seed: int, first: int) -> list[Section]:
+def sections(count: int, seed: int, first: int, minutes: float) -> list[Section]:
     """The table by kind, and the sentences."""
     found: dict[str, list[Played]] = {kind: [] for kind in KINDS}
     said: dict[str, Counter[str]] = {kind: Counter() for kind in KINDS}
     silent: list[str] = []
     slowest, where = 0.0, ""
     taken: list[float] = []
-    for index, batch, played in measure(count, seed, first):
+    for index, batch, played in measure(count, seed, first, minutes):
         found[batch.kind].append(played)
         said[batch.kind].update(re.sub(r"-?\d[\d.e+-]*", "#", sentence) for sentence in played.sentences)
         for k, i in np.argwhere(played.ok & (played.depth > SILENT)):
@@ -367,7 +370,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--count", type=int, default=10_000, help="scenes")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--first", type=int, default=0, help="batch to begin with")
-    return report.command(parser, argv, lambda o: sections(TOGETHER if o.quick else o.count, o.seed, o.first))
+    parser.add_argument("--minutes", type=float, default=np.inf, help="stop after so long")
+    return report.command(parser, argv, lambda o: sections(TOGETHER if o.quick else o.count, o.seed, o.first, o.minutes))
 
 
 if __name__ == "__main__":

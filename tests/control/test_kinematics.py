@@ -167,7 +167,7 @@ def test_moving_in_the_null_space_leaves_the_tip() -> None:
 @pytest.mark.parametrize(
     ("make", "sentence"),
     [
-        (lambda: SoftTip(Simulator(two_segments(), n_robots=2)), r"^simulator is <.*>; give a Simulator of one robot\.$"),
+        (lambda: SoftTip(Simulator(two_segments(), n_robots=2)), r"^simulator is Simulator\(.*\); give a Simulator of one robot\.$"),
         (lambda: FixedBase((0.0, 0.0, 0.0)), r"^FixedBase\.pose is \(0\.0, 0\.0, 0\.0\); give seven finite numbers, position \[m\] and "),
         (lambda: MovingBase((0, 0, 0, 2, 0, 0, 0)), r"^MovingBase\.pose has a quaternion of norm 2; it must be 1, as w x y z\.$"),
         (lambda: soft_tip(FixedBase(), flange_from_base=[np.nan] * 7), r"^flange_from_base is \[nan.*\]; give seven finite numbers, "),
