@@ -41,7 +41,7 @@ def test_a_jacobian_of_lengths_is_the_same_to_rounding() -> None:
 
 def test_every_input_is_the_same() -> None:
     robot = chain()
-    here, there = pair(robot)
+    here, there = pair(robot, recover=False)  # the last step diverges, and what settles it begins elsewhere on a GPU
     lengths = bend(robot, 0.3, 0.1) + np.where(robot.tendon_segment == 1, 0.01, 0.0)
     lengths[5] += 0.004
     given: dict[str, Any] = {
