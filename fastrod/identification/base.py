@@ -132,6 +132,8 @@ def check_motion(base: Base, state: State, guess: str) -> None:
         base.target.tip[good],
         state.local.seen(state.model, state.theta, state.local.solved(state.model, state.theta)).position[good],
     )
+    if 2 * state.local.pose.ok.sum() < state.local.pose.ok.size or not np.isfinite(predicted).all():
+        raise LogError(further_than_still(base.samples, base.robot, np.nan, guess))
     measured, predicted = measured - measured.mean(0), predicted - predicted.mean(0)
     moves = float((measured**2).sum())
     name = base.samples.log.name

@@ -238,7 +238,8 @@ class Search:
         """The best foil of each family beside a state, linear in everything."""
         made = []
         for foil in foils(state.local, state.fit.slopes, state.fit.residual):
-            slopes = np.concatenate([state.fit.slopes, foil.columns], axis=-1)
+            columns = np.where(np.isfinite(foil.columns), foil.columns, 0.0)  # a row without a shape tells nothing
+            slopes = np.concatenate([state.fit.slopes, columns], axis=-1)
             flat = slopes.reshape(-1, slopes.shape[-1])
             precision = np.concatenate([state.fit.precision, np.full(foil.columns.shape[-1], 1e-9)])
             H = flat.T @ flat + np.diag(precision)

@@ -231,7 +231,7 @@ BAD = {
     "columns reversed": (lambda: other([3, 2, 1, 0]), "further from robot 'prototype' than from a robot that stands still"),
     "millimetres": (
         lambda: replace(backlash_log(), dl=1e3 * backlash_log().dl),
-        "in log 'small' the measured tip jumps|times as predicted",
+        "than from a robot that stands still: (the model cannot be solved|it moves .* times as predicted).*units",
     ),
     "two markers": (two_markers, "jumps by .* mm from sample to sample while the inputs rest.*two robots or two markers mixed"),
     "two robots": (two_robots, "jumps by .* mm from sample to sample while the inputs rest.*two robots or two markers mixed"),
