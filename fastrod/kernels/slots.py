@@ -79,17 +79,30 @@ def wall_at(
     return d, n
 
 
+@inline
+def gives_way(k: int, surfaces: Surfaces) -> bool:
+    """A rod may be deep in obstacle k: it is soft, or free to move."""
+    return bool(surfaces.compliance[k] > 0.0 or surfaces.give[k, 0] > 0.0)
+
+
+@kernel
+def _held_depth(k: int, s: float, count: int, slot: Floats, spacing: float) -> float:
+    """The smallest gap of the contacts with obstacle k beside arclength s, at most 0 [m]."""
+    level = 0.0
+    for c in range(count):
+        if int(slot[c, T_OBSTACLE]) == k and abs(slot[c, T_S] - s) < spacing:
+            level = min(level, slot[c, T_GAP])
+    return level
+
+
 @kernel
 def violation(n_found: int, found: Floats, count: int, slot: Floats, spacing: float, surfaces: Surfaces) -> tuple[float, int]:
     """How far the gap falls below what the contacts that there are can mend [m], and the candidate where it falls deepest. Only where
     an obstacle gives way may a contact be deep."""
     worst, where = 0.0, -1
     for f in range(n_found):
-        level, k = 0.0, int(found[f, 0])
-        gives = surfaces.compliance[k] > 0.0 or surfaces.give[k, 0] > 0.0
-        for c in range(count if gives else 0):
-            if int(slot[c, T_OBSTACLE]) == k and abs(slot[c, T_S] - found[f, 1]) < spacing:
-                level = min(level, slot[c, T_GAP])
+        k = int(found[f, 0])
+        level = _held_depth(k, found[f, 1], count, slot, spacing) if gives_way(k, surfaces) else 0.0
         if level - found[f, 2] > worst:
             worst, where = level - found[f, 2], f
     return worst, where
@@ -152,7 +165,7 @@ def choose(
     slot: Floats,
     n_obstacles: int,
     radius: Floats,
-    friction: Floats,
+    surfaces: Surfaces,
     n_steps: int,
     arclength: Floats,
     spacing: float,
@@ -194,6 +207,8 @@ def choose(
                 slot[near, T_S], slot[near, T_SHIFT] = s, nearest if carries(slot[near]) else FAR
                 continue
             lonely = _CLOSE * spacing
+        if k < n_obstacles and gives_way(k, surfaces) and gap >= _held_depth(k, s, n, slot, spacing) - tolerance:
+            continue  # a contact more would only stiffen the obstacle
         crowded, full = False, n >= len(slot) or _segment_is_full(s, n, slot, arclength, n_steps)
         for c in range(n):
             away = abs(slot[c, T_S] - s)
@@ -203,7 +218,7 @@ def choose(
         if full and not crowded and gap < -tolerance:
             at = _least_wanted(s, gap, n, slot, arclength, n_steps, not _segment_is_full(s, n, slot, arclength, n_steps))
         if not crowded and (not full or at >= 0) and at < len(slot):
-            open_slot(slot[at], k, s, -1, normal, gap, radius[segment_at(arclength, n_steps, s)], friction[k])
+            open_slot(slot[at], k, s, -1, normal, gap, radius[segment_at(arclength, n_steps, s)], surfaces.friction[k])
             slot[at, T_TAKEN] = 1.0
             n = max(n, at + 1)
     return n

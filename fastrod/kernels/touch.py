@@ -261,7 +261,7 @@ def _renew(
     margin = scenery.margin * rods.reach[i]
     _face(i, n_found, found, scenery, scratch)
     count = choose(
-        n_found, found, touching.used[i], slot, len(frames), rods.radius[i], scenery.surfaces.friction, rods.n_steps,
+        n_found, found, touching.used[i], slot, len(frames), rods.radius[i], scenery.surfaces, rods.n_steps,
         curve.arclength, spacing, scenery.tolerance, 0.2 * margin,
     )  # fmt: skip
     count = merge(count, slot, spacing)

@@ -64,6 +64,21 @@ def test_soft_walls_approach_the_rigid_one():
     assert force[-1] == pytest.approx(-rigid.contacts.force[0, 0, 0], rel=1e-2)
 
 
+@pytest.mark.parametrize("stiffness", [4.0, 100.0])
+def test_rod_that_lies_on_a_soft_floor_needs_no_contact_at_every_place(stiffness):
+    """A contact more is a spring more: there are no more of them than hold the rod, however many it might have."""
+    robot, press, half = passive(0.2, 0.0022, 0.0), [], np.sqrt(0.5)
+    for most in (16, 32):
+        floor = plane(point=(0, 0, -0.005), normal=(0, 0, 1), name="floor", stiffness=stiffness)
+        sim = fastrod.Simulator(robot, contact=ContactScene(obstacles=[floor], rod_radius=0.012, max_contacts=most))
+        state = sim.settle(base_pose=[0.0, 0.0, 0.006, half, 0.0, half, 0.0])
+        assert state.ok.all(), state.problems
+        press.append(state.contacts.total_force[0, 2])
+        assert state.contacts.count[0] < 16
+    assert press[0] == pytest.approx(press[1], rel=1e-9)
+    assert press[0] > 0.5e-3 * stiffness  # the rod is clamped 1 mm inside, and its first contact hardly moves
+
+
 @pytest.mark.parametrize("dt", [1e-3, 5e-2])
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 def test_at_rest_nothing_chatters(dt, friction):
