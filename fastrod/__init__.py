@@ -3,19 +3,22 @@
 from typing import TYPE_CHECKING, Any
 
 from fastrod.loading import load_robot
-from fastrod.robot import Robot, Segment, Tendon
-from fastrod.robotfile import robot_names, save_robot
+from fastrod.model.robot import Robot, Segment, Tendon
+from fastrod.model.robotfile import robot_names, save_robot
+from fastrod.moved import refuse_old_names
 
 if TYPE_CHECKING:
     from fastrod import reference
     from fastrod.hosts.rod import Rod
     from fastrod.simulator import Simulator
-    from fastrod.state import Observer, Pose, State
+    from fastrod.solver.state import Observer, Pose, State
 
 __all__ = [
     "Observer", "Pose", "Robot", "Rod", "Segment", "Simulator", "State", "Tendon", "load_robot", "reference", "robot_names", "save_robot",
 ]  # fmt: skip
-_HOME = {"Observer": "state", "Pose": "state", "Rod": "hosts.rod", "Simulator": "simulator", "State": "state"}
+_HOME = {"Observer": "solver.state", "Pose": "solver.state", "Rod": "hosts.rod", "Simulator": "simulator", "State": "solver.state"}
+
+refuse_old_names()
 
 
 def __getattr__(name: str) -> Any:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fastrod import robotfile
 from fastrod.errors import EffectError, UnknownNameError, shown
-from fastrod.robot import Robot
+from fastrod.model import robotfile
+from fastrod.model.robot import Robot
 
 
 def load_robot(source: str | Path) -> Robot:
@@ -23,9 +23,9 @@ def load_robot(source: str | Path) -> Robot:
 
 def check_effects(robot: Robot, where: str) -> None:
     """Look up the effects of `robot` in the library; `where` names it in errors. Raises `UnknownNameError`, `EffectError`."""
-    from fastrod.chain import named_effects  # the library imports numba, which a robot without effects does not need
-    from fastrod.effect import read_values
-    from fastrod.wiring import wire
+    from fastrod.effects.base import read_values
+    from fastrod.effects.pipeline import named_effects  # the library imports numba, which a robot without effects does not need
+    from fastrod.model.routing import wire
 
     try:
         tables = named_effects(robot)

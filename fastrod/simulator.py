@@ -10,26 +10,26 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fastrod.chain import Chain, Measurement
-from fastrod.compile import compile_robots
 from fastrod.contact import queries
 from fastrod.contact.engine import Engine
 from fastrod.contact.frames import blended
 from fastrod.contact.scene import ContactScene
 from fastrod.contact.step import COLD_PASSES, Ways, contact_step
+from fastrod.effects.pipeline import Chain, Measurement
 from fastrod.errors import InputError, RobotError, refuse_masked, shown
-from fastrod.gpu import device as devices
-from fastrod.guess import cold_start
-from fastrod.inputs import Inputs, PointForces, Reader, named_inputs
-from fastrod.kernels.dense import between_nodes
-from fastrod.passes import Passes, check_size
-from fastrod.recovery import TOLERANCE, Boundary, overloaded, what_to_do
-from fastrod.response import Linear, stretch
-from fastrod.robot import Robot
+from fastrod.kernels.rod.dense import between_nodes
+from fastrod.model.compile import compile_robots
+from fastrod.model.robot import Robot
 from fastrod.rotation import matrix_from_quaternion
-from fastrod.rows import restore_contact, taken_each, taken_shape
-from fastrod.settle import Pass, settle
-from fastrod.state import Observer, Pose, Snapshot, State
+from fastrod.solver.boundary import Passes, check_size
+from fastrod.solver.gpu import device as devices
+from fastrod.solver.guess import cold_start
+from fastrod.solver.inputs import Inputs, PointForces, Reader, named_inputs
+from fastrod.solver.merge import restore_contact, taken_each, taken_shape
+from fastrod.solver.recovery import TOLERANCE, Boundary, overloaded, what_to_do
+from fastrod.solver.response import Linear, stretch
+from fastrod.solver.settle import Pass, settle
+from fastrod.solver.state import Observer, Pose, Snapshot, State
 from fastrod.types import Flags, Floats, Ints, Memory, Params, Ports, Probes, Shape
 
 _config: Any = numba.config

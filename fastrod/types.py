@@ -108,7 +108,7 @@ class Memory(NamedTuple):
 
 
 class Shape(NamedTuple):
-    """What a pass writes: shapes, units and frames as in `fastrod.state.State`; arrays that are not wanted have length 0."""
+    """What a pass writes: shapes, units and frames as in `fastrod.solver.state.State`; arrays that are not wanted have length 0."""
 
     position: Floats
     rotation: Floats

@@ -65,7 +65,7 @@ def run(case: Case) -> dict[str, Any]:
     import fastrod
     from fastrod.identification.attribution import identify
     from fastrod.identification.excite import excitation
-    from fastrod.runlog import RunLog
+    from fastrod.logs.runlog import RunLog
 
     segments = 2 if case.kind == "segments" else 1
     robot = fastrod.load_robot("prototype") if segments == 1 else two_segments()

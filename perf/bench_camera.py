@@ -150,7 +150,7 @@ def latency(rate: float, delay: float, seeds: int) -> Row:
 def gates(kind: str, seeds: Sequence[int], moves: int) -> Row:
     """An honest marker against the gates: an emulator with a sealed effect, driven to random bends at the
     full rate, with a load for the second half."""
-    from fastrod.wiring import wire
+    from fastrod.model.routing import wire
     from fastrod_device.columns import FLAGS
     from fastrod_device.errors import RefusedError
     from fastrod_device.gates import ASTRAY, OUTSIDE, TOO_FAST

@@ -16,7 +16,7 @@ import report
 from cases import Case
 from fastrod import Simulator, State
 from fastrod.errors import InputError
-from fastrod.gpu.device import checked
+from fastrod.solver.gpu.device import checked
 from fastrod.types import Ports
 from report import Column, Row, Section, note_progress, seconds
 
@@ -154,8 +154,8 @@ def time_section(rows: list[Row]) -> Section:
 
 def work_row(key: str, n_robots: int, points: int, operations: float) -> Row:
     """What a pass of one robot must move and reckon, from the arrays that it is given."""
-    from fastrod.kernels.chunk import scratch_size
     from fastrod.kernels.jit import LANES
+    from fastrod.kernels.rod.chunk import scratch_size
 
     n = 64
     (small,) = (case for case in cases.cases(n) if case.key == key)
@@ -185,7 +185,7 @@ def device_limits() -> tuple[float, float, str]:
         return *_H100, "H100 SXM, data sheet"
     from numba import cuda
 
-    from fastrod.gpu.kernels.jit import SIMULATED
+    from fastrod.solver.gpu.kernels.jit import SIMULATED
 
     if SIMULATED:
         return *_H100, "simulated"

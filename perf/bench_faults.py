@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from fastrod.errors import FastrodError
-from fastrod.recording import Recorder, recover
+from fastrod.logs.recording import Recorder, recover
 from fastrod.types import Floats
 from fastrod_device.bus import Line
 from fastrod_device.camera import Frame

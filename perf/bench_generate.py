@@ -32,8 +32,8 @@ from fastrod.generation.settling import ChainSolver
 from fastrod.generation.shapes import Draw
 from fastrod.generation.shards import counted, found, write
 from fastrod.generation.tasks import columns_of
-from fastrod.inputs import Inputs
-from fastrod.robotfile import dumps
+from fastrod.model.robotfile import dumps
+from fastrod.solver.inputs import Inputs
 from report import Column, Row, Section, command, note_progress
 
 DENSITY = 0.005  # kg/m: the weight bends the rod as much as a tip force of EI/l^2
@@ -127,7 +127,7 @@ def rate(rows: int, run: Callable[[], object]) -> Row:
 def solved(lanes: int, threads: int) -> None:
     """32 rows of each lane, nothing kept."""
     work = loaded()
-    robot = fastrod.robotfile.loads(work.robot)
+    robot = fastrod.model.robotfile.loads(work.robot)
     draw, solver = Draw(work, robot, lanes, np.random.default_rng(0)), ChainSolver(robot, lanes, work.points_per_segment, threads)
     for step in range(32):
         drawn = draw.at(step)

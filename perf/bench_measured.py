@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 
 from fastrod.identification.attribution import identify
-from fastrod.identification.forward import Rod, predict, sample
-from fastrod.identification.result import Result
-from fastrod.identification.unknowns import base_model
-from fastrod.robot import Robot
-from fastrod.runlog import RunLog
+from fastrod.identification.log.forward import Rod, predict, sample
+from fastrod.identification.log.unknowns import base_model
+from fastrod.identification.report.result import Result
+from fastrod.logs.runlog import RunLog
+from fastrod.model.robot import Robot
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scenes"))
 from fastrod_scenes.measured import armlab_tdcr, asl_trunk, ethz_beam

@@ -56,7 +56,7 @@ def serving(*words: str, port: int) -> Iterator[tuple[Any, str]]:
     import psutil
 
     with subprocess.Popen(
-        [sys.executable, "-m", "fastrod.cli", "view", *words, "--port", str(port)],
+        [sys.executable, "-m", "fastrod.commands.cli", "view", *words, "--port", str(port)],
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,

@@ -180,7 +180,7 @@ def _instrument() -> dict[str, Tally]:
 
     jit.LANES = 1
     import fastrod.kernels as package
-    from fastrod import passes
+    from fastrod.solver import boundary as passes
     from fastrod.types import Memory, Shape
 
     modules = [importlib.import_module(f"fastrod.kernels.{info.name}") for info in pkgutil.iter_modules(package.__path__)]

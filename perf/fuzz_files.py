@@ -102,7 +102,7 @@ def _read(kind: str, path: Path) -> tuple[str, str]:
 
 
 def _policy(path: Path) -> tuple[str, str]:
-    from fastrod.cli import main
+    from fastrod.commands.cli import main
 
     words = ["evaluate", "Reach", str(path), "--episodes", "1", "--no-baselines", "--json", "--option", "n_steps=2"]
     code = main(words)
@@ -114,7 +114,7 @@ def _policy(path: Path) -> tuple[str, str]:
 
 def _robot(path: Path) -> tuple[str, str]:
     from fastrod import Simulator
-    from fastrod.robotfile import load_robot
+    from fastrod.model.robotfile import load_robot
 
     robot = load_robot(path)
     inputs = {"tendon_length": robot.rest_tendon_length}
@@ -135,7 +135,7 @@ def _hardware(path: Path) -> tuple[str, str]:
 
 
 def _log(path: Path) -> tuple[str, str]:
-    from fastrod.robotfile import load_robot
+    from fastrod.model.robotfile import load_robot
     from fastrod_scenes.measured import read
 
     log = read(path, load_robot("prototype"))[0]

@@ -71,7 +71,7 @@ class Originals:
     @cached_property
     def tables(self) -> Mapping[str, tuple[bytes, ...]]:
         """TOML texts by kind."""
-        from fastrod.robotfile import robot_names
+        from fastrod.model.robotfile import robot_names
 
         folder = files("fastrod") / "robots"
         full = (folder / "prototype.toml").read_text(encoding="utf-8") + (

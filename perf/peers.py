@@ -17,7 +17,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
 
 Array: TypeAlias = NDArray[np.float64]
 Tendons: TypeAlias = tuple[tuple[float, float, float], ...]

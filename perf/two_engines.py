@@ -28,7 +28,7 @@ class Result(NamedTuple):
 
 def carried() -> tuple[Any, dict[str, Any]]:
     """The rod, and its wires as they bend it toward the block."""
-    from fastrod.segments import SegmentActions
+    from fastrod.model.segment_actions import SegmentActions
     from fastrod_scenes.ur5.carried import OFFSET, soft_robot
 
     robot = soft_robot("carried", 2)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from fastrod.hosts import BulletLink, connect
-from fastrod.robot import Robot, Segment, Tendon
+from fastrod.model.robot import Robot, Segment, Tendon
 
 
 def soft_robot(n_segments=2, line_density=0.0, extension=(0.0, 0.0)):

@@ -45,7 +45,8 @@ def one_compilation() -> Iterator[None]:
     yield
     if numba.config.DISABLE_JIT:
         return
-    from fastrod.kernels import batch, cold
+    from fastrod.kernels import batch
+    from fastrod.kernels.rod import cold
 
     big = ("pass_serial", "pass_parallel", "iterate_serial", "iterate_parallel", "look_serial", "look_parallel", "move_to_inputs")
     counts = {name: len(getattr(batch, name).signatures) for name in big}

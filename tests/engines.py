@@ -9,7 +9,7 @@ import numpy as np
 from bullets import carrier, carry, cube, empty_world
 
 from fastrod.hosts import MountedRod, MujocoRod, add_capsules
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
 
 HALF = np.sqrt(0.5)
 TURN = {"z": (1.0, 0.0, 0.0, 0.0), "x": (HALF, 0.0, HALF, 0.0), "-z": (0.0, 1.0, 0.0, 0.0)}

@@ -10,7 +10,7 @@ import pyarrow.parquet as parquet
 
 import fastrod
 from fastrod.generation import Plan, Shapes
-from fastrod.robotfile import dumps
+from fastrod.model.robotfile import dumps
 
 
 def small(count: int = 600, shard_rows: int = 50, seed: int = 3, **words: Any) -> Plan:

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from fastrod.identification.replay import replay
-from fastrod.robotfile import load_robot
-from fastrod.runlog import RunLog
-from fastrod.wiring import wire
+from fastrod.identification.log.replay import replay
+from fastrod.logs.runlog import RunLog
+from fastrod.model.robotfile import load_robot
+from fastrod.model.routing import wire
 
 GAP = 3e-4
 """Half width of the play [m]."""

@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 from reportlog import backlash_log
 
-from fastrod import cli
+from fastrod.commands import cli
 from fastrod.errors import InputError
-from fastrod.robot import Robot
-from fastrod.robotfile import load_robot
-from fastrod.runlog import read_log, write_log
+from fastrod.logs.runlog import read_log, write_log
+from fastrod.model.robot import Robot
+from fastrod.model.robotfile import load_robot
 
 HEADER = "t,run,dl_1,dl_2,dl_3,dl_4,tip_x,tip_y,tip_z\n"
 LOG = HEADER + "0,a,0,0,0,0,0,0,0.07\n0.1,a,0,0,0,0,0.001,0,0.07\n0,b,0,0,0,0,0,0,0.07\n"
@@ -105,8 +105,8 @@ def test_folder_that_cannot_be_written_is_refused_before_the_work(
     def work(*args: Any, **given: Any) -> None:
         raise AssertionError("the work began")
 
-    monkeypatch.setattr("fastrod.identification.replay.replay", work)
-    monkeypatch.setattr("fastrod.demo._batch", work)
+    monkeypatch.setattr("fastrod.identification.log.replay.replay", work)
+    monkeypatch.setattr("fastrod.commands.demo._batch", work)
     for command in (("replay", str(log), "--robot", "prototype"), ("demo",)):
         assert refused(capsys, *command, "--out", str(log)) == f"folder {str(log)!r} cannot be written: it is a file.\n"
         below = log / "below"
@@ -269,7 +269,7 @@ def test_run_of_a_log_without_runs(log: Path, capsys: pytest.CaptureFixture[str]
 
 
 def test_help_has_every_command_once(capsys: pytest.CaptureFixture[str]) -> None:
-    from fastrod.arguments import build
+    from fastrod.commands.arguments import build
 
     with pytest.raises(SystemExit) as end:
         cli.main(["--help"])
@@ -284,7 +284,7 @@ def test_help_has_every_command_once(capsys: pytest.CaptureFixture[str]) -> None
 
 
 def test_help_does_not_load_numba() -> None:
-    code = "import sys; from fastrod.cli import main\ntry: main(['--help'])\nexcept SystemExit as end: assert not end.code\n"
+    code = "import sys; from fastrod.commands.cli import main\ntry: main(['--help'])\nexcept SystemExit as end: assert not end.code\n"
     done = subprocess.run([sys.executable, "-c", code + "assert 'numba' not in sys.modules"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "replay" in done.stdout
@@ -347,7 +347,7 @@ def test_tracking_is_nearer_to_the_path_with_what_was_found(demo: tuple[Path, st
 def test_demo_refuses_a_folder_that_is_not_empty(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("fastrod.demo._batch", lambda *args: pytest.fail("the work began"))
+    monkeypatch.setattr("fastrod.commands.demo._batch", lambda *args: pytest.fail("the work began"))
     (tmp_path / "mine.csv").write_text("t\n")
     assert "is not empty" in refused(capsys, "demo", "--out", str(tmp_path))
     assert (tmp_path / "mine.csv").read_text() == "t\n"
@@ -356,8 +356,8 @@ def test_demo_refuses_a_folder_that_is_not_empty(
 def test_demo_without_the_device_wing_names_what_was_sealed_into_its_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("fastrod.demo._batch", lambda *args: None)
-    monkeypatch.setattr("fastrod.demo.find_spec", lambda name: None)
+    monkeypatch.setattr("fastrod.commands.demo._batch", lambda *args: None)
+    monkeypatch.setattr("fastrod.commands.demo.find_spec", lambda name: None)
     assert cli.main(["demo", "--out", str(tmp_path / "out")]) == 0
     printed, err = capsys.readouterr()
     assert err == ""
@@ -379,10 +379,10 @@ def test_demo_without_the_device_wing_takes_the_shipped_log_and_writes_nothing(
         seen.append(len(log))
         return "a result"
 
-    monkeypatch.setattr("fastrod.demo._batch", lambda *args: None)
-    monkeypatch.setattr("fastrod.demo.find_spec", lambda name: None)
+    monkeypatch.setattr("fastrod.commands.demo._batch", lambda *args: None)
+    monkeypatch.setattr("fastrod.commands.demo.find_spec", lambda name: None)
     monkeypatch.setattr("fastrod.identification.attribution.identify", stand_in)
-    monkeypatch.setattr("fastrod.identification.report.table", str)
+    monkeypatch.setattr("fastrod.identification.report.report.table", str)
     monkeypatch.chdir(tmp_path)
     assert cli.main(["demo"]) == 0
     printed = capsys.readouterr().out

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from fastrod import load_robot
-from fastrod.arguments import ACTIONS
-from fastrod.cli import main
-from fastrod.runlog import read_log
+from fastrod.commands.arguments import ACTIONS
+from fastrod.commands.cli import main
+from fastrod.logs.runlog import read_log
 from fastrod_device import boards, workbench
 from fastrod_device.calibration import CharucoBoard
 from fastrod_device.camera import Frame, load_camera

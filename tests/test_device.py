@@ -63,8 +63,8 @@ from numba import cuda
 numba.cuda.dispatcher.get_current_device = lambda: SimpleNamespace(compute_capability=(9, 0))  # no GPU: say which one is meant
 import numpy as np
 from fastrod import Simulator, load_robot
-from fastrod.gpu import batch
-from fastrod.inputs import Inputs
+from fastrod.solver.gpu import batch
+from fastrod.solver.inputs import Inputs
 from fastrod.types import Response
 robot = load_robot("prototype")
 sim = Simulator(robot, outputs="tip")
@@ -107,11 +107,11 @@ def test_the_benchmark_says_what_it_can(capsys: pytest.CaptureFixture[str], monk
 def test_the_second_name_is_the_same_source() -> None:
     from importlib import import_module
 
-    import fastrod.kernels.chunk
     import fastrod.kernels.jit
+    import fastrod.kernels.rod.chunk
 
-    twin: Any = import_module("fastrod.gpu.kernels.chunk")
-    assert twin.__file__ == fastrod.kernels.chunk.__file__
+    twin: Any = import_module("fastrod.solver.gpu.kernels.rod.chunk")
+    assert twin.__file__ == fastrod.kernels.rod.chunk.__file__
     assert twin.W == 1
-    assert fastrod.kernels.chunk.W == fastrod.kernels.jit.LANES
-    assert twin.sh.__name__ == "fastrod.gpu.kernels.shape"
+    assert fastrod.kernels.rod.chunk.W == fastrod.kernels.jit.LANES
+    assert twin.sh.__name__ == "fastrod.solver.gpu.kernels.rod.shape"

@@ -15,16 +15,16 @@ from rods import bend, rod
 from verification.test_derivatives import difference
 
 import fastrod
-import fastrod.effect as registry
+import fastrod.effects.base as registry
 from fastrod import Robot, Simulator, load_robot, save_robot
-from fastrod.cli import main
-from fastrod.effect import Operator, Parameter, Seam, columns, effect, effect_names, get_effect, has_memory, unregister
+from fastrod.commands.cli import main
+from fastrod.effects.base import Operator, Parameter, Seam, columns, effect, effect_names, get_effect, has_memory, unregister
+from fastrod.effects.ports import EffectPorts
 from fastrod.errors import EffectError, InputError, RobotError, UnknownNameError
 from fastrod.kernels.operators import BUFFER
-from fastrod.ports import EffectPorts
-from fastrod.robotfile import dumps, loads
+from fastrod.model.robotfile import dumps, loads
+from fastrod.model.routing import wire
 from fastrod.types import Floats
-from fastrod.wiring import wire
 
 NAMES = effect_names()
 OPERATORS = [name for name in NAMES if isinstance(get_effect(name), Operator)]
@@ -537,7 +537,7 @@ def variant(name: str = "Weight", **changes: Any) -> type:
         (variant(seam=3), "has seam 3; give one of"),
         (variant(parameters=()), "at least one"),
         (variant(parameters=("weight",)), "give a tuple of Parameter"),
-        (variant("Backlash"), "'backlash' is already registered by fastrod.effects.backlash"),
+        (variant("Backlash"), "'backlash' is already registered by fastrod.effects.laws.backlash"),
         (variant("GearPlay"), "'gear_play' is already .*backlash"),
         (variant(synonyms=("backlash",)), "'backlash' is already .*backlash"),
         (variant(synonyms=("gear_play",)), "'gear_play' is already .*backlash"),
@@ -564,7 +564,7 @@ def test_a_parameter_has_its_neutral_value_in_its_bounds() -> None:
 @pytest.mark.usefixtures("clean_registry")
 def test_installed_packages_bring_effects_by_entry_point(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     source = '''
-from fastrod.effect import Parameter, Seam, Static, effect
+from fastrod.effects.base import Parameter, Seam, Static, effect
 
 @effect
 class Wind(Static):

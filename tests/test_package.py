@@ -19,7 +19,7 @@ SMOKE = """
 import fastrod, fastrod_scenes, fastrod_viewer, fastrod_device
 assert fastrod.robot_names() == ["ethz_beam", "five_segment_reacher", "prototype", "tdcr_a", "tdcr_b"]
 assert fastrod.load_robot("prototype").n_tendons == 4
-from fastrod.runlog import read_log, write_log
+from fastrod.logs.runlog import read_log, write_log
 from importlib.resources import files
 log = read_log(files("fastrod") / "data" / "demo_log.csv", fastrod.load_robot("prototype"))
 """
@@ -34,7 +34,7 @@ ALSO = {
     "hosts": "from fastrod.hosts import connect; world = connect(dt=0.01); world.stepSimulation()",
     "mujoco": "import mujoco; from fastrod.hosts import MujocoRod, add_capsules",
     "ray": "import ray, pyarrow; from fastrod.generation.plan import Plan",
-    "cuda": "from fastrod.gpu import device",
+    "cuda": "from fastrod.solver.gpu import device",
     "network": "from fastrod.identification import network; import sklearn",
 }
 """What its extra is for, in one line."""

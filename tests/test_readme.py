@@ -51,7 +51,7 @@ def test_the_page_of_scenes_has_them_all() -> None:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_every_command_on_a_page_is_one(page: Path) -> None:
     """Its words are understood; nothing of it is done."""
-    from fastrod.arguments import build
+    from fastrod.commands.arguments import build
 
     parser, _ = build()
     blocks = re.findall(r"```\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.S)

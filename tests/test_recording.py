@@ -18,10 +18,10 @@ from numpy.testing import assert_array_equal
 
 import fastrod
 from fastrod.errors import InputError, LogError
-from fastrod.link import Measurement
-from fastrod.recording import Recorder, free_path, recover
-from fastrod.robot import Robot
-from fastrod.runlog import RunLog, read_log
+from fastrod.logs.link import Measurement
+from fastrod.logs.recording import Recorder, free_path, recover
+from fastrod.logs.runlog import RunLog, read_log
+from fastrod.model.robot import Robot
 from fastrod.types import Floats
 
 ROBOT = fastrod.load_robot("prototype")
@@ -146,8 +146,8 @@ import sys
 from pathlib import Path
 import numpy as np
 import fastrod
-from fastrod.link import Measurement
-from fastrod.recording import Recorder
+from fastrod.logs.link import Measurement
+from fastrod.logs.recording import Recorder
 
 recorder = Recorder(fastrod.load_robot("prototype"), Path(sys.argv[1]), extra=["current_1"])
 recorder.start(0.0, "killed")
@@ -215,8 +215,8 @@ import resource, sys
 from pathlib import Path
 import fastrod
 from fastrod.errors import InputError
-from fastrod.link import Measurement
-from fastrod.recording import Recorder
+from fastrod.logs.link import Measurement
+from fastrod.logs.recording import Recorder
 
 recorder = Recorder(fastrod.load_robot("prototype"), Path(sys.argv[1]))
 recorder.start(0.0)

@@ -14,15 +14,15 @@ from rods import rod
 
 import fastrod.reference as reference
 from fastrod import Observer, Robot, Segment, Simulator, Tendon, load_robot
+from fastrod.commands.demo import run as demo
 from fastrod.contact import ContactScene, sphere
 from fastrod.control.inverse import plan
-from fastrod.demo import run as demo
 from fastrod.errors import FastrodError
-from fastrod.link import Measurement
-from fastrod.recording import Recorder
-from fastrod.robotfile import loads, save_robot
-from fastrod.runlog import RunLog, read_log
-from fastrod.simulated import SimulatedRobot
+from fastrod.logs.link import Measurement
+from fastrod.logs.recording import Recorder
+from fastrod.logs.runlog import RunLog, read_log
+from fastrod.logs.simulated import SimulatedRobot
+from fastrod.model.robotfile import loads, save_robot
 
 REST = rod().rest_tendon_length
 BALL = sphere(0.01, name="ball", position=(0.1, 0.0, 0.1))

@@ -15,11 +15,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from truth import plant
 
 from fastrod.errors import InputError, LogError
-from fastrod.identification.inputs import inputs, tendon_length
-from fastrod.identification.replay import DENSE, Replay, draw, replay, table, write
-from fastrod.robot import Robot
-from fastrod.robotfile import load_robot
-from fastrod.runlog import RunLog, read_log, write_log
+from fastrod.identification.log.inputs import inputs, tendon_length
+from fastrod.identification.log.replay import DENSE, Replay, draw, replay, table, write
+from fastrod.logs.runlog import RunLog, read_log, write_log
+from fastrod.model.robot import Robot
+from fastrod.model.robotfile import load_robot
 
 DEMO_LOG = Path(__file__).parents[1] / "fastrod" / "data" / "demo_log.csv"
 DEMO_COMMENT = """\

@@ -17,15 +17,16 @@ import pytest
 from numpy.testing import assert_allclose
 from reportlog import backlash_log
 
-from fastrod.identification import report
 from fastrod.identification.attribution import identify
-from fastrod.identification.audit import Audit
-from fastrod.identification.evidence import Bound
-from fastrod.identification.page import page
-from fastrod.identification.result import Estimate, Found, Result
-from fastrod.identification.signals import Signals
-from fastrod.identification.wording import VERDICTS, amount, bound_sentence, law, percent, plain_name, with_error
-from fastrod.robotfile import load_robot
+from fastrod.identification.report import report
+from fastrod.identification.report.page import page
+from fastrod.identification.report.result import Found, Result
+from fastrod.identification.report.signals import Signals
+from fastrod.identification.report.wording import VERDICTS, amount, bound_sentence, law, percent, plain_name, with_error
+from fastrod.identification.search.model_selection import Bound
+from fastrod.identification.search.residual_test import Audit
+from fastrod.identification.search.solve import Estimate
+from fastrod.model.robotfile import load_robot
 from fastrod.simulator import Simulator
 
 NAN = float("nan")

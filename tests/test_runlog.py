@@ -11,9 +11,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from fastrod.errors import LogError, UnknownNameError
-from fastrod.robot import Robot
-from fastrod.robotfile import load_robot
-from fastrod.runlog import RunLog, read_log, write_log
+from fastrod.logs.runlog import RunLog, read_log, write_log
+from fastrod.model.robot import Robot
+from fastrod.model.robotfile import load_robot
 
 GOOD = """t,run,dl_1,dl_2,dl_3,dl_4,tip_x,tip_y,tip_z
 0.0,a,0,0,0,0,0,0,0.07

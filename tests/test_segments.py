@@ -12,8 +12,8 @@ from rods import rod
 
 from fastrod import Robot, Segment, Simulator, Tendon, load_robot
 from fastrod.errors import InputError, RobotError
+from fastrod.model.segment_actions import SegmentActions
 from fastrod.reference import constant_curvature
-from fastrod.segments import SegmentActions
 
 
 def stiff_wires(n_segments: int = 2, n_tendons: int = 4, offset: float = 0.008) -> Robot:

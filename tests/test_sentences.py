@@ -13,14 +13,14 @@ from rods import rod
 
 from fastrod import Robot, Segment, Simulator, Tendon
 from fastrod.contact import ContactScene, sphere
-from fastrod.effect import Parameter, Seam, Static, effect, unregister
+from fastrod.effects.base import Parameter, Seam, Static, effect, unregister
 from fastrod.errors import EffectError, InputError, LogError, RobotError, UnknownNameError, shown
 from fastrod.identification.excite import excitation
-from fastrod.recording import recover
-from fastrod.robotfile import dumps, load_robot, loads, save_robot
-from fastrod.rows import taken
-from fastrod.runlog import read_log
-from fastrod.segments import SegmentActions
+from fastrod.logs.recording import recover
+from fastrod.logs.runlog import read_log
+from fastrod.model.robotfile import dumps, load_robot, loads, save_robot
+from fastrod.model.segment_actions import SegmentActions
+from fastrod.solver.merge import taken
 
 PROTOTYPE = dumps(load_robot("prototype"))
 LONG = "a" * 5000

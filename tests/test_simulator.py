@@ -17,9 +17,9 @@ from rods import bend, rod
 import fastrod
 from fastrod import Observer, Simulator, load_robot
 from fastrod.errors import InputError, RobotError, UnknownNameError
-from fastrod.kernels.columns import step_column
-from fastrod.passes import Passes
-from fastrod.robotfile import dumps, loads
+from fastrod.kernels.rod.columns import step_column
+from fastrod.model.robotfile import dumps, loads
+from fastrod.solver.boundary import Passes
 
 
 def random_lengths(n: int, seed: int, reach: float = 1.0) -> np.ndarray:

@@ -16,7 +16,7 @@ from rods import bend, rod
 from fastrod import Robot, Simulator, State, load_robot
 from fastrod.contact import ContactScene, plane
 from fastrod.errors import InputError, RobotError
-from fastrod.segments import SegmentActions
+from fastrod.model.segment_actions import SegmentActions
 
 N, ROWS, OTHERS = 5, np.array([1, 3]), np.array([0, 2, 4])
 FIELDS = ("position", "rotation", "curvature", "tip_position", "tip_rotation", "tension", "base_wrench", "residual", "ok", "passes")

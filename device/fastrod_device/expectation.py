@@ -7,7 +7,7 @@ from typing import Any, final
 
 import numpy as np
 
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
 from fastrod.rotation import matrix_from_quaternion, quaternion_from_matrix
 from fastrod.simulator import Simulator
 from fastrod.types import Floats

@@ -13,8 +13,8 @@ import numpy as np
 from fastrod.control.inverse import Plan
 from fastrod.errors import InputError
 from fastrod.identification.excite import Excitation
-from fastrod.recording import Recorder
-from fastrod.runlog import RunLog, numbers
+from fastrod.logs.recording import Recorder
+from fastrod.logs.runlog import RunLog, numbers
 from fastrod.types import Flags, Floats
 from fastrod_device.prototype import Prototype
 

@@ -8,7 +8,7 @@ from typing import final
 
 import numpy as np
 
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
 from fastrod.types import Floats
 from fastrod_device.camera import Camera, Frame
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from fastrod.errors import InputError, UnknownNameError, nearest, shown
 from fastrod.loading import load_robot
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
 from fastrod.tomlfile import parse, read_text
 from fastrod_device.camera import Camera, Marker, from_table, load_camera
 from fastrod_device.safety import Limits

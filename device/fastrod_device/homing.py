@@ -16,9 +16,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
+from fastrod.model.routing import wire
 from fastrod.types import Floats
-from fastrod.wiring import wire
 from fastrod_device.clock import Clock
 from fastrod_device.drive import DriveBus
 from fastrod_device.errors import DeviceError

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import final
 
 from fastrod.errors import InputError
-from fastrod.linefile import append_lines, is_at, made_again
+from fastrod.logs.linefile import append_lines, is_at, made_again
 
 _ROOM = 65536
 """Bytes that are always free for what comes next: some hundred lines."""

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fastrod.errors import InputError
+from fastrod.model.routing import wire
 from fastrod.types import Floats
-from fastrod.wiring import wire
 from fastrod_device.errors import CalibrationError
 from fastrod_device.hardware import Hardware
 from fastrod_device.prototype import Prototype

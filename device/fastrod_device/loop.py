@@ -13,9 +13,9 @@ from fastrod.control import Trajectory, references
 from fastrod.control.inverse import Plan, plan
 from fastrod.identification.attribution import identify
 from fastrod.identification.excite import excitation
-from fastrod.identification.result import Result
-from fastrod.robot import Robot
-from fastrod.runlog import RunLog
+from fastrod.identification.report.result import Result
+from fastrod.logs.runlog import RunLog
+from fastrod.model.robot import Robot
 from fastrod_device.experiment import Hands, Progress, Tracking, drive_lag, excite, follow, tracking
 from fastrod_device.prototype import Prototype
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fastrod.identification import report
+from fastrod.identification.report import report
 from fastrod_device.experiment import Tracking
 from fastrod_device.loop import Loop
 

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fastrod.errors import FastrodError, InputError
-from fastrod.link import Measurement
-from fastrod.recording import Recorder
-from fastrod.robot import Robot
+from fastrod.logs.link import Measurement
+from fastrod.logs.recording import Recorder
+from fastrod.model.robot import Robot
 from fastrod.types import Floats
 from fastrod_device import columns
 from fastrod_device.camera import Frame, FrameSource

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fastrod.errors import InputError
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
+from fastrod.model.routing import wire
 from fastrod.types import Floats
-from fastrod.wiring import wire
 from fastrod_device.clock import Clock
 from fastrod_device.errors import RefusedError
 from fastrod_device.limits import Limits, limited

@@ -18,11 +18,11 @@ from fastrod.contact.scene import ContactScene
 from fastrod.contact.tree import pack
 from fastrod.contact.trouble import NO_CONTACT_LEFT, NO_NODE_LEFT, sentence
 from fastrod.kernels.batch import arrange, iterate_parallel, iterate_serial, look_at_rods, look_parallel, look_serial
-from fastrod.kernels.bvh import STACK
-from fastrod.kernels.forces import Scenery
-from fastrod.kernels.search import CANDIDATE
-from fastrod.kernels.slots import SLOT, T_FORCE, T_GAP, T_N, T_OBSTACLE, T_RADIUS, T_S
-from fastrod.kernels.touch import AT_REST, GOES_ON, INSIDE, LOST, MOVES, NOTHING, TROUBLE, UNSOLVED, world_size
+from fastrod.kernels.contact.bvh import STACK
+from fastrod.kernels.contact.contact_set import SLOT, T_FORCE, T_GAP, T_N, T_OBSTACLE, T_RADIUS, T_S
+from fastrod.kernels.contact.iteration import AT_REST, GOES_ON, INSIDE, LOST, MOVES, NOTHING, TROUBLE, UNSOLVED, world_size
+from fastrod.kernels.contact.problem import Scenery
+from fastrod.kernels.contact.proximity import CANDIDATE
 from fastrod.types import Clearance, Flags, Floats, Ints, Memory, Ports, Probes, Rods, Shape, Touching
 
 Pass = Callable[[Ints, Ports, Shape, Probes], None]

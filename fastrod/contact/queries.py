@@ -11,9 +11,9 @@ from fastrod.contact.engine import MOST_FOUND, Engine
 from fastrod.contact.frames import between, frames_of
 from fastrod.errors import InputError, refuse_masked
 from fastrod.kernels.batch import cast_rays, look_at_rods, look_serial
-from fastrod.kernels.bvh import STACK
-from fastrod.kernels.forces import Scenery
-from fastrod.kernels.search import CANDIDATE
+from fastrod.kernels.contact.bvh import STACK
+from fastrod.kernels.contact.problem import Scenery
+from fastrod.kernels.contact.proximity import CANDIDATE
 from fastrod.types import Clearance, Flags, Floats, Ints, Shape
 
 _EVERYTHING = 1e6  # of the rod's length: a margin within which all is near

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from fastrod.contact.geometry import Obstacle
 from fastrod.errors import InputError, UnknownNameError, nearest, refuse_masked
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
 from fastrod.types import Floats, Ints, Layout, Params, Rods
 
 _BEYOND_TENDONS = 1.1  # a body radius of 0 stands for just beyond the outermost tendon (Segment.body_radius)

@@ -10,8 +10,8 @@ import numpy as np
 
 from fastrod.contact.geometry import Obstacle
 from fastrod.contact.normals import pseudonormals
-from fastrod.kernels.bvh import LEAF_CODE
-from fastrod.kernels.primitive import BOX, CAPSULE, CYLINDER, MESH, PLANE, SPHERE
+from fastrod.kernels.contact.bvh import LEAF_CODE
+from fastrod.kernels.contact.primitive import BOX, CAPSULE, CYLINDER, MESH, PLANE, SPHERE
 from fastrod.types import Floats, Ints, Surfaces
 
 _KIND = {"mesh": MESH, "sphere": SPHERE, "box": BOX, "cylinder": CYLINDER, "capsule": CAPSULE, "plane": PLANE}

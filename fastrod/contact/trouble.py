@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fastrod.contact.scene import ContactScene
-from fastrod.kernels.touch import DIVERGED, INSIDE, MOVES, THROUGH, UNSOLVED
+from fastrod.kernels.contact.iteration import DIVERGED, INSIDE, MOVES, THROUGH, UNSOLVED
 from fastrod.types import Floats
 
 NO_NODE_LEFT, NO_CONTACT_LEFT = 10, 11

@@ -8,12 +8,12 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fastrod.chain import named_effects
-from fastrod.effect import Seam, get_effect
+from fastrod.effects.base import Seam, get_effect
+from fastrod.effects.pipeline import named_effects
 from fastrod.errors import InputError
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
+from fastrod.model.segment_actions import SegmentActions
 from fastrod.rotation import matrix_from_quaternion
-from fastrod.segments import SegmentActions
 from fastrod.simulator import Simulator
 from fastrod.types import Flags, Floats
 

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fastrod.errors import InputError
+from fastrod.model.segment_actions import SegmentActions
 from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_vector
-from fastrod.segments import SegmentActions
 from fastrod.simulator import Simulator
-from fastrod.state import State
+from fastrod.solver.state import State
 from fastrod.types import Floats
 
 _STRAIGHT: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from fastrod.chain import named_effects
-from fastrod.effect import canonical_name, effect_names, get_effect
+from fastrod.effects.base import canonical_name, effect_names, get_effect
+from fastrod.effects.pipeline import named_effects
 from fastrod.errors import InputError, shown
-from fastrod.robot import Robot
-from fastrod.robotfile import loads
+from fastrod.model.robot import Robot
+from fastrod.model.robotfile import loads
+from fastrod.model.routing import wire
 from fastrod.types import Floats
-from fastrod.wiring import wire
 
 _SPREAD = (0.5, 1.5)
 """Of the typical size."""
@@ -24,7 +24,7 @@ _SPREAD = (0.5, 1.5)
 def robot_of(text: object) -> Robot:
     """The robot of a robot file's text. Raises `InputError` for what is no text, and what `loads` raises."""
     if not isinstance(text, str):
-        raise InputError(f"robot is {shown(text, 60)}; give the text of a robot file, such as fastrod.robotfile.dumps(robot).")
+        raise InputError(f"robot is {shown(text, 60)}; give the text of a robot file, such as fastrod.model.robotfile.dumps(robot).")
     return _loaded(text)
 
 

@@ -14,8 +14,8 @@ from fastrod.errors import InputError, nearest, shown
 from fastrod.generation.columns import Column, numbered
 from fastrod.generation.draws import robot_of
 from fastrod.loading import load_robot
-from fastrod.robot import Robot
-from fastrod.robotfile import dumps
+from fastrod.model.robot import Robot
+from fastrod.model.robotfile import dumps
 
 POLICIES = ("shipped", "baseline", "random")
 

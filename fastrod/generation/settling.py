@@ -2,7 +2,7 @@
 
 The boundary unknowns x of a robot whose inputs move along a smooth curve are a smooth function of the place on it. A polynomial
 through the last four solutions is then so good a guess that one Newton pass, and one more with the gain of the first, which is a
-quarter of the work, bring the residual below the tolerance. Where they do not, `fastrod.settle` does, from the same guess or cold.
+quarter of the work, bring the residual below the tolerance. Where they do not, `fastrod.solver.settle` does, from the same guess or cold.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from typing import NamedTuple, final
 
 import numpy as np
 
-from fastrod.compile import compile_robots
-from fastrod.inputs import Inputs, Reader
-from fastrod.passes import Passes
-from fastrod.robot import Robot
-from fastrod.settle import settle
+from fastrod.model.compile import compile_robots
+from fastrod.model.robot import Robot
+from fastrod.solver.boundary import Passes
+from fastrod.solver.inputs import Inputs, Reader
+from fastrod.solver.settle import settle
 from fastrod.types import Flags, Floats, Ints, Ports, Shape
 
 _EXTRAPOLATION = ((1.0,), (2.0, -1.0), (3.0, -3.0, 1.0), (4.0, -6.0, 4.0, -1.0))

@@ -13,10 +13,10 @@ from fastrod.errors import InputError
 from fastrod.generation.columns import Column, numbered, several, within
 from fastrod.generation.draws import robot_of
 from fastrod.generation.settling import ChainSolver, Settled
-from fastrod.inputs import Inputs
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
+from fastrod.model.segment_actions import SegmentActions
 from fastrod.rotation import matrix_from_quaternion, quaternion_from_matrix
-from fastrod.segments import SegmentActions
+from fastrod.solver.inputs import Inputs
 from fastrod.types import Floats
 
 STRIDE = 0.0625

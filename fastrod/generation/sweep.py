@@ -12,7 +12,7 @@ import numpy as np
 from fastrod.errors import FastrodError, InputError
 from fastrod.generation.columns import Column, within
 from fastrod.generation.draws import named, robot_of, with_effects
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
 
 _POINTS = 8  # steps of a segment of the sealed robot; identification has six
 _TOLERANCE = 1e-8  # m
@@ -117,7 +117,7 @@ _ABOUT = {
 
 def _simulated(robots: list[Robot], log: Any, dt: float) -> np.ndarray:
     """(n_robots, n_rows, 3) measured tips of robots that follow a log at rest, effects with a memory included."""
-    from fastrod.identification.inputs import inputs
+    from fastrod.identification.log.inputs import inputs
     from fastrod.simulator import Simulator
 
     simulator = Simulator(robots, dt=dt, points_per_segment=_POINTS, outputs="tip", threads=1)

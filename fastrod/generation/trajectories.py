@@ -11,8 +11,8 @@ import numpy as np
 
 from fastrod.generation.columns import Column, numbered, several, within
 from fastrod.generation.draws import in_ball, named, robot_of, with_effects
+from fastrod.model.segment_actions import SegmentActions
 from fastrod.rotation import matrix_from_quaternion, quaternion_from_matrix
-from fastrod.segments import SegmentActions
 from fastrod.simulator import Simulator
 from fastrod.types import Flags, Floats
 

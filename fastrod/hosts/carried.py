@@ -13,9 +13,9 @@ from fastrod.errors import HostError, InputError, nearest
 from fastrod.hosts.host import Host
 from fastrod.hosts.rod import INPUTS, Rod
 from fastrod.hosts.touching import Touching
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
 from fastrod.simulator import Simulator
-from fastrod.state import State
+from fastrod.solver.state import State
 from fastrod.types import Floats
 
 

@@ -13,7 +13,7 @@ from fastrod.hosts.carried import CarriedRod, check_contact, check_gravity, chec
 from fastrod.hosts.link import BulletLink
 from fastrod.hosts.rod import check_robot
 from fastrod.hosts.surroundings import Touched
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
 from fastrod.types import Floats
 
 

@@ -15,7 +15,7 @@ from fastrod.hosts.mujoco_body import MujocoBody, body_number, mujoco
 from fastrod.hosts.mujoco_contacts import Feedback, Felt, read
 from fastrod.hosts.mujoco_touched import TouchedBody
 from fastrod.hosts.rod import check_robot
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
 from fastrod.types import Floats
 
 __all__ = ["MujocoBody", "MujocoRod", "add_capsules"]

@@ -12,9 +12,9 @@ from fastrod.errors import InputError
 from fastrod.hosts.bullet import pybullet
 from fastrod.hosts.capsules import turn_between
 from fastrod.hosts.link import from_xyzw
-from fastrod.robot import Robot, Segment, Tendon
+from fastrod.model.robot import Robot, Segment, Tendon
+from fastrod.model.segment_actions import SegmentActions
 from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_matrix, quaternion_from_vector
-from fastrod.segments import SegmentActions
 from fastrod.simulator import Simulator
 from fastrod.types import Floats
 

@@ -16,10 +16,10 @@ from fastrod.contact.frames import between
 from fastrod.errors import HostError, InputError, RobotError, nearest, refuse_masked, shown
 from fastrod.hosts.capsules import Capsules, along, moved
 from fastrod.hosts.host import Motion
-from fastrod.robot import Robot
-from fastrod.rows import taken_shape
+from fastrod.model.robot import Robot
 from fastrod.simulator import Simulator
-from fastrod.state import Snapshot, State
+from fastrod.solver.merge import taken_shape
+from fastrod.solver.state import Snapshot, State
 from fastrod.types import Flags, Floats, Ints, Shape
 
 INPUTS = (

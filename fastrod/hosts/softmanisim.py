@@ -17,7 +17,7 @@ from fastrod.hosts.camera import Camera, Image, View
 from fastrod.hosts.gripper import TOUCH, Gripper
 from fastrod.hosts.link import to_xyzw
 from fastrod.hosts.paper import Shape, Shapes, between, numbers, paper_robot, turn_of
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
 from fastrod.types import Floats
 
 _log = logging.getLogger(__name__)

@@ -12,7 +12,7 @@ import numpy as np
 from fastrod.contact import Obstacle
 from fastrod.hosts.host import Motion
 from fastrod.rotation import matrix_from_quaternion, product
-from fastrod.state import State
+from fastrod.solver.state import State
 from fastrod.types import Floats
 
 _LEFT = 0.8  # of an overlap after a step

@@ -12,19 +12,19 @@ from dataclasses import replace
 import numpy as np
 
 from fastrod.errors import InputError, LogError
-from fastrod.identification.assemble import ALL_AT_ONCE, assemble
-from fastrod.identification.base import LEAST_ROWS, Base, check_log, check_motion
-from fastrod.identification.evidence import Candidate, State, Step
-from fastrod.identification.forward import sample
-from fastrod.identification.network import check_network, residual_network
-from fastrod.identification.questions import read
-from fastrod.identification.registration import between
-from fastrod.identification.result import Result
-from fastrod.identification.search import MOST_PASSES, Search
-from fastrod.identification.split import held_out_rows, merged
-from fastrod.identification.unknowns import base_model
-from fastrod.robot import Robot
-from fastrod.runlog import RunLog
+from fastrod.identification.learned.network import check_network, residual_network
+from fastrod.identification.log.forward import sample
+from fastrod.identification.log.questions import read
+from fastrod.identification.log.registration import between
+from fastrod.identification.log.split import held_out_rows, merged
+from fastrod.identification.log.unknowns import base_model
+from fastrod.identification.report.assemble import ALL_AT_ONCE, assemble
+from fastrod.identification.report.result import Result
+from fastrod.identification.search.base import LEAST_ROWS, Base, check_log, check_motion
+from fastrod.identification.search.model_selection import Candidate, State, Step
+from fastrod.identification.search.search import MOST_PASSES, Search
+from fastrod.logs.runlog import RunLog
+from fastrod.model.robot import Robot
 from fastrod.types import Ints
 
 MAX_EFFECTS = 4

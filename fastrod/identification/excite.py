@@ -13,11 +13,11 @@ from itertools import pairwise
 import numpy as np
 
 from fastrod.errors import InputError
-from fastrod.robot import Robot
+from fastrod.logs.runlog import RunLog
+from fastrod.model.robot import Robot
+from fastrod.model.routing import Wiring, wire
 from fastrod.rotation import matrix_from_quaternion, product
-from fastrod.runlog import RunLog
 from fastrod.types import Floats
-from fastrod.wiring import Wiring, wire
 
 REST = 12.0  # s
 _PAUSE = 1.5  # s, for turning the base and hanging the load

@@ -25,17 +25,17 @@ from fastrod.types import (
     Touching,
 )  # fmt: skip
 
-from .bvh import STACK
-from .chunk import pass_chunk
-from .forces import Scenery
-from .gather import feed_forward
+from .contact.bvh import STACK
+from .contact.contact_set import T_ARM, T_FORCE, T_N, T_S
+from .contact.iteration import iterate_world, look_at
+from .contact.node_placement import place_nodes
+from .contact.problem import Scenery
+from .contact.rod_proximity import search_rods
+from .contact.surface import ray_hit
 from .jit import LANES, entry, parallel_entry
-from .placing import place_nodes
-from .shape import Lanes
-from .slots import T_ARM, T_FORCE, T_N, T_S
-from .strands import search_rods
-from .surface import ray_hit
-from .touch import iterate_world, look_at
+from .rod.chunk import pass_chunk
+from .rod.gather import feed_forward
+from .rod.shape import Lanes
 
 
 @entry

@@ -33,7 +33,7 @@ def _cache_dir() -> str | None:
     """A writable folder for compiled kernels, or None."""
     digest = hashlib.sha256(numba.__version__.encode())
     here = Path(__file__).parent
-    for source in (*sorted(here.glob("*.py")), here.parent / "types.py"):
+    for source in (*sorted(here.rglob("*.py")), here.parent / "types.py"):
         digest.update(source.name.encode() + source.read_bytes())
     name = digest.hexdigest()[:16]
     homes = [os.environ.get("FASTROD_CACHE_DIR"), os.environ.get("XDG_CACHE_HOME"), Path.home() / ".cache", tempfile.gettempdir()]

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fastrod.errors import InputError
+from fastrod.model.robot import Robot
 from fastrod.reference.inputs import segment_length, tendon_offset
 from fastrod.reference.rod import (
     CURVATURE,
@@ -27,7 +28,6 @@ from fastrod.reference.rod import (
     span_moment,
     turn,
 )
-from fastrod.robot import Robot
 
 _ROUNDS = 20  # of the guess, at most
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fastrod.errors import InputError
+from fastrod.model.robot import Robot
 from fastrod.reference.arcs import arc_states, first_guess
 from fastrod.reference.inputs import PointForce, make_problem
 from fastrod.reference.rod import (
@@ -23,7 +24,6 @@ from fastrod.reference.rod import (
     span_moment,
     tip_residual,
 )
-from fastrod.robot import Robot
 
 
 def solve_bvp(

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fastrod.errors import InputError
+from fastrod.model.robot import Robot
 from fastrod.reference.rod import Array, Problem, Span
-from fastrod.robot import Robot
 
 PointForce: TypeAlias = Sequence[tuple[float, ArrayLike]]
 """Pairs of arclength along the backbone as it is [m] and force (3,), world [N]."""

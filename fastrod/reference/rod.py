@@ -13,7 +13,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
 
 Array: TypeAlias = NDArray[np.float64]
 

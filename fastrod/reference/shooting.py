@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fastrod.errors import InputError, nearest
+from fastrod.model.robot import Robot
 from fastrod.reference.arcs import first_guess
 from fastrod.reference.inputs import PointForce, make_problem
 from fastrod.reference.rod import (
@@ -29,7 +30,6 @@ from fastrod.reference.rod import (
     span_moment,
     tip_residual,
 )
-from fastrod.robot import Robot
 
 Method: TypeAlias = Literal["lm", "slsqp", "trust-constr"]
 Residual: TypeAlias = Callable[[Array], Array]

@@ -9,10 +9,10 @@ from numpy.typing import ArrayLike
 
 from fastrod.errors import HostError
 from fastrod.hosts import BulletArm
-from fastrod.robot import Robot
-from fastrod.segments import SegmentActions
+from fastrod.model.robot import Robot
+from fastrod.model.segment_actions import SegmentActions
 from fastrod.simulator import Simulator
-from fastrod.state import State
+from fastrod.solver.state import State
 from fastrod.types import Floats
 from fastrod_envs.task import Solid, Tube
 

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from fastrod.errors import HostError
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
 from fastrod.types import Floats, Ints
 from fastrod_envs.options import Options
 from fastrod_envs.randomisation import Randomisation

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
 from fastrod.errors import InputError, nearest
-from fastrod.gpu.device import Device, checked_name
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
+from fastrod.solver.gpu.device import Device, checked_name
 from fastrod_envs.randomisation import Randomisation
 
 Observation = Literal["state", "goal"]

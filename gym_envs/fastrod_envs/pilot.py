@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike
 
 from fastrod.control import Trajectory, references
 from fastrod.errors import InputError, UnknownNameError, nearest
-from fastrod.robot import Robot
-from fastrod.robotfile import load_robot
-from fastrod.segments import SegmentActions
+from fastrod.model.robot import Robot
+from fastrod.model.robotfile import load_robot
+from fastrod.model.segment_actions import SegmentActions
 from fastrod.types import Floats
 from fastrod_envs.policies import Policy
 from fastrod_envs.registration import name_of

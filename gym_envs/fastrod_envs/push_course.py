@@ -8,8 +8,8 @@ from typing import Any, final
 import numpy as np
 
 from fastrod.errors import InputError
-from fastrod.robot import Robot
-from fastrod.segments import SegmentActions
+from fastrod.model.robot import Robot
+from fastrod.model.segment_actions import SegmentActions
 from fastrod.simulator import Simulator
 from fastrod.types import Floats
 from fastrod_envs.options import Options

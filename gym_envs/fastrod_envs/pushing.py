@@ -14,10 +14,10 @@ from fastrod.hosts.bodies import RodBodies
 from fastrod.hosts.bullet import Bullet, connect
 from fastrod.hosts.camera import Camera
 from fastrod.hosts.link import from_xyzw
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.simulator import Simulator
-from fastrod.state import State
+from fastrod.solver.state import State
 from fastrod.types import Floats
 from fastrod_envs.hosted import Cell, HostedTask, Result
 from fastrod_envs.options import Options

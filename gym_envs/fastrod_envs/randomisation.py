@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from fastrod.chain import named_effects
-from fastrod.effect import canonical_name, get_effect, read_values
+from fastrod.effects.base import canonical_name, get_effect, read_values
+from fastrod.effects.pipeline import named_effects
 from fastrod.errors import InputError, nearest
 from fastrod.loading import load_robot
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
+from fastrod.model.routing import wire
 from fastrod.types import Floats
-from fastrod.wiring import wire
 
 _FACTORS = ("bending_stiffness", "torsional_stiffness", "line_density", "compliance", "offset")
 _SPREAD = 0.2

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fastrod.contact import ContactScene
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
+from fastrod.model.segment_actions import SegmentActions
 from fastrod.rotation import matrix_from_quaternion
-from fastrod.segments import SegmentActions
 from fastrod.simulator import Simulator
 from fastrod.types import Flags, Floats, Ints
 from fastrod_envs.options import Options

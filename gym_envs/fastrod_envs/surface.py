@@ -7,10 +7,10 @@ from typing import final
 
 import numpy as np
 
-from fastrod.chain import named_effects
-from fastrod.effect import Seam, get_effect
-from fastrod.robot import Robot
-from fastrod.segments import SegmentActions
+from fastrod.effects.base import Seam, get_effect
+from fastrod.effects.pipeline import named_effects
+from fastrod.model.robot import Robot
+from fastrod.model.segment_actions import SegmentActions
 from fastrod.simulator import Simulator
 from fastrod.types import Floats
 

@@ -7,8 +7,8 @@ from typing import Any, final
 
 import numpy as np
 
-from fastrod.robotfile import load_robot
-from fastrod.segments import SegmentActions
+from fastrod.model.robotfile import load_robot
+from fastrod.model.segment_actions import SegmentActions
 from fastrod.simulator import Simulator
 from fastrod.types import Floats
 from fastrod_scenes.scene import RodScene

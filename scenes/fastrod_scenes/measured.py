@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fastrod.errors import InputError, LogError, nearest
-from fastrod.robot import Robot, Segment, Tendon
-from fastrod.robotfile import load_robot
-from fastrod.runlog import RunLog, Table, numbers, read_log, read_table
+from fastrod.logs.runlog import RunLog, Table, numbers, read_log, read_table
+from fastrod.model.robot import Robot, Segment, Tendon
+from fastrod.model.robotfile import load_robot
 
 _UPSIDE_DOWN = (0.0, 1.0, 0.0, 0.0)
 """world_from_base of a robot that hangs: half a turn about x, so that z of the base points down."""

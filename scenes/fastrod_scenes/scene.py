@@ -12,9 +12,9 @@ from fastrod.errors import FastrodError, UnknownNameError, nearest
 if TYPE_CHECKING:
     from fastrod.hosts import Bullet, BulletArm, MountedRod, MujocoRod
     from fastrod.hosts.camera import Image
-    from fastrod.robot import Robot
+    from fastrod.model.robot import Robot
     from fastrod.simulator import Simulator
-    from fastrod.state import State
+    from fastrod.solver.state import State
 
 _SCENES: Mapping[str, str] = {
     "airway": "fastrod_scenes.contact.airway:Airway",

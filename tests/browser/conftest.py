@@ -14,8 +14,8 @@ from windows import ARGUMENTS, Window
 
 import fastrod
 from fastrod.identification.attribution import identify
-from fastrod.identification.report import write
-from fastrod.runlog import read_log
+from fastrod.identification.report.report import write
+from fastrod.logs.runlog import read_log
 from fastrod_viewer.app import App
 
 REQUIRED = bool(os.environ.get("FASTROD_REQUIRE_BROWSER"))

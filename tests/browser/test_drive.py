@@ -10,7 +10,7 @@ from pages import PROTOCOL
 from windows import Window
 
 import fastrod
-from fastrod.simulated import SimulatedRobot
+from fastrod.logs.simulated import SimulatedRobot
 from fastrod_viewer.app import App
 from fastrod_viewer.drive_page import DrivePage
 from fastrod_viewer.worlds import FreeWorld

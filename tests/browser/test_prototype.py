@@ -19,9 +19,9 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 from windows import Window
 
-from fastrod.link import Measurement
-from fastrod.recording import Recorder
-from fastrod.runlog import read_log
+from fastrod.logs.link import Measurement
+from fastrod.logs.recording import Recorder
+from fastrod.logs.runlog import read_log
 from fastrod_device.errors import DeviceError
 from fastrod_device.hardware import load_hardware
 from fastrod_device.workbench import Bench, emulated
@@ -288,7 +288,7 @@ def test_a_recording_has_the_cameras_sightings_by_the_robots_clock(bed: Bed, win
 
 
 def test_sigterm_saves_the_recording_and_switches_off(tmp_path: Path, window: Windows) -> None:
-    command = [sys.executable, "-m", "fastrod.cli", "drive", "--emulate", "--seed", "3", "--no-home", "--no-open", "--port", "0"]
+    command = [sys.executable, "-m", "fastrod.commands.cli", "drive", "--emulate", "--seed", "3", "--no-home", "--no-open", "--port", "0"]
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         line = process.stdout.readline()

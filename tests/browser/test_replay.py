@@ -10,8 +10,8 @@ import pytest
 from windows import Window
 
 import fastrod
-from fastrod.identification.replay import replay
-from fastrod.runlog import read_log
+from fastrod.identification.log.replay import replay
+from fastrod.logs.runlog import read_log
 from fastrod_viewer.app import DEMO_LOG, App
 from fastrod_viewer.drive_page import DrivePage
 from fastrod_viewer.export import external_references

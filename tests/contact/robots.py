@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fastrod.robot import Robot, Segment, Tendon
+from fastrod.model.robot import Robot, Segment, Tendon
 from fastrod.types import Floats
 
 OFFSET, LENGTH = 0.0075, 0.07

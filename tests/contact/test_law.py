@@ -9,7 +9,7 @@ import pytest
 from numba import njit
 from numpy.testing import assert_allclose
 
-from fastrod.kernels.contact_law import contact_forces, law_size
+from fastrod.kernels.contact.contact_law import contact_forces, law_size
 
 GOOD = 5e-9
 """m; the law is solved to 1e-10 m in its own measure, motions of some mm; conditions add up several of these."""

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from fastrod.contact import ContactScene, box, plane
-from fastrod.kernels.mobile import add_mobility
-from fastrod.robotfile import load_robot
+from fastrod.kernels.contact.mobility import add_mobility
+from fastrod.model.robotfile import load_robot
 from fastrod.simulator import Simulator
 
 PULL = np.array([-0.009, 0.0, 0.009, 0.0])

@@ -14,9 +14,9 @@ import fastrod
 from fastrod.contact import ContactScene, box, mesh, plane, sphere
 from fastrod.contact.frames import frames_of
 from fastrod.contact.tree import pack
-from fastrod.kernels.bvh import STACK
-from fastrod.kernels.centreline import Curve
-from fastrod.kernels.search import CANDIDATE, UNSEEN, Sweep, search_obstacles
+from fastrod.kernels.contact.bvh import STACK
+from fastrod.kernels.contact.centreline import Curve
+from fastrod.kernels.contact.proximity import CANDIDATE, UNSEEN, Sweep, search_obstacles
 
 
 @pytest.fixture

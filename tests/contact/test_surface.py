@@ -14,8 +14,8 @@ from fastrod.contact.direct import DirectScene
 from fastrod.contact.frames import frames_of
 from fastrod.contact.geometry import Obstacle, box, capsule, cylinder, mesh, plane, sphere
 from fastrod.contact.tree import pack
-from fastrod.kernels.bvh import FAR, LEAF_CODE, STACK
-from fastrod.kernels.surface import MOST_PLANES, ray_hit, signed_distance, surface_curvature, walls
+from fastrod.kernels.contact.bvh import FAR, LEAF_CODE, STACK
+from fastrod.kernels.contact.surface import MOST_PLANES, ray_hit, signed_distance, surface_curvature, walls
 
 SAME = 1e-9  # m; two paths in double precision on 0.1 m
 SOLIDS = {

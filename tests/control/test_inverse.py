@@ -14,8 +14,8 @@ import fastrod
 from fastrod.control import circle, triangle
 from fastrod.control.inverse import Plan, plan
 from fastrod.errors import InputError, RobotError
-from fastrod.robot import Robot
-from fastrod.segments import SegmentActions
+from fastrod.model.robot import Robot
+from fastrod.model.segment_actions import SegmentActions
 from fastrod.simulator import Simulator
 from fastrod.types import Floats
 

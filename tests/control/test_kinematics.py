@@ -9,7 +9,7 @@ import pytest
 from control.arms import DhArm
 from numpy.testing import assert_allclose, assert_array_equal
 
-import fastrod.response
+import fastrod.solver.response
 from fastrod import Robot, Segment, Simulator, Tendon, load_robot
 from fastrod.control import FixedBase, MovingBase, ResolvedRate, SoftTip
 from fastrod.errors import InputError, RobotError
@@ -210,7 +210,7 @@ def test_steps_that_extend_keep_up_with_the_rod() -> None:
 @pytest.mark.parametrize("rows", [1024, 3], ids=["at once", "one input after another"])
 @pytest.mark.parametrize("loaded", [False, True])
 def test_many_robots_have_the_jacobians_of_one(rows: int, loaded: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fastrod.response, "_ROWS", rows)
+    monkeypatch.setattr(fastrod.solver.response, "_ROWS", rows)
     robot, n = two_segments(), 9
     actions = SoftTip(Simulator(robot)).actions.inputs(0.5 * np.array(ACTION) + np.random.default_rng(1).uniform(0.0, 3e-3, (n, 6)))
     force = np.random.default_rng(2).uniform(-0.1, 0.1, (n, 3))

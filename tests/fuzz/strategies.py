@@ -11,7 +11,7 @@ import tomli_w
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
-from fastrod.robotfile import dumps, load_robot, robot_names
+from fastrod.model.robotfile import dumps, load_robot, robot_names
 
 SLOW = [HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.data_too_large, HealthCheck.function_scoped_fixture]
 

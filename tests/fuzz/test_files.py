@@ -19,11 +19,11 @@ pytest.importorskip("pyarrow", reason="pyarrow is not installed: pip install 'fa
 pytest.importorskip("can", reason="python-can is not installed (pip install 'fastrod[device]')")
 sys.path.insert(0, str(Path(__file__).parents[2] / "perf"))
 
-from fastrod.cli import main
+from fastrod.commands.cli import main
 from fastrod.contact import MeshLimits, mesh
 from fastrod.errors import FastrodError, InputError, LogError, RobotError, UnknownNameError
-from fastrod.robotfile import load_robot
-from fastrod.runlog import read_log
+from fastrod.logs.runlog import read_log
+from fastrod.model.robotfile import load_robot
 from fastrod_device.hardware import SHIPPED, load_hardware
 from fastrod_envs.policies import Policy, find
 from fuzz_files import FINE, try_file, warm

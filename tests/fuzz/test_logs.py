@@ -13,11 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
-from fastrod import cli
+from fastrod.commands import cli
 from fastrod.errors import FastrodError
-from fastrod.recording import recover
-from fastrod.robotfile import load_robot
-from fastrod.runlog import RunLog, read_log, write_log
+from fastrod.logs.recording import recover
+from fastrod.logs.runlog import RunLog, read_log, write_log
+from fastrod.model.robotfile import load_robot
 
 ROBOT = load_robot("prototype")
 INPUTS = ["dl_1", "dl_2", "dl_3", "dl_4"]

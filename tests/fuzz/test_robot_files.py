@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from fastrod import Robot, Simulator
 from fastrod.errors import FastrodError
-from fastrod.robotfile import dumps, load_robot, save_robot
+from fastrod.model.robotfile import dumps, load_robot, save_robot
 
 
 def loaded(path: Path) -> Robot | None:

@@ -12,8 +12,8 @@ from fuzz.strategies import odd_words, tried
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fastrod import cli
-from fastrod.arguments import ACTIONS
+from fastrod.commands import cli
+from fastrod.commands.arguments import ACTIONS
 
 COMMANDS = ("demo", "replay", "identify", "excite", "view", "drive", "envs", "train", "evaluate", "bench")
 OPTIONS = (
@@ -100,7 +100,7 @@ def test_a_run_that_nobody_could_drive_is_refused(elsewhere: Path, bend: str, ra
 @given(rest=st.lists(words, max_size=5), action=st.sampled_from(sorted(ACTIONS)) | odd_words)
 def test_a_bench_that_is_not_there_is_refused(rest: list[str], action: str) -> None:
     """`fastrod drive`, up to where a bench would be looked for."""
-    from fastrod import driving
+    from fastrod.commands import drive as driving
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(driving, "ACTIONS", dict.fromkeys(ACTIONS, begin))

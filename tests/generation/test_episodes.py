@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 import fastrod
-from fastrod import cli
-from fastrod.effect import get_effect
+from fastrod.commands import cli
+from fastrod.effects.base import get_effect
 from fastrod.errors import InputError, UnknownNameError
 from fastrod.generation import Plan, Rollouts, Sweep, Trajectories, read_plan
 from fastrod.generation.draws import in_ball, with_effects
 from fastrod.generation.plan import Kind
 from fastrod.generation.tasks import columns_of
-from fastrod.robotfile import dumps
-from fastrod.wiring import wire
+from fastrod.model.robotfile import dumps
+from fastrod.model.routing import wire
 from fastrod_envs.randomisation import Randomisation
 from fastrod_envs.vector import BatchEnv
 

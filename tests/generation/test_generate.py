@@ -21,7 +21,8 @@ import pyarrow.parquet as parquet
 import pytest
 from generation_folders import bits, rows_of, small
 
-from fastrod import cli, load_robot
+from fastrod import load_robot
+from fastrod.commands import cli
 from fastrod.errors import HostError, InputError
 from fastrod.generation import Plan, Shapes, Sweep, Trajectories, generate, here, read_plan, shards
 from fastrod.generation.plan import PLAN
@@ -105,7 +106,7 @@ def test_a_killed_command_is_finished_by_the_same_command(whole: Path, tmp_path:
     assert not psutil.wait_procs(alive, timeout=60.0)[1], "workers outlive the command"
     before = set(bits(out))
     assert 2 <= len([name for name in before if name.endswith(".parquet")]) < 12
-    command = [sys.executable, "-m", "fastrod.cli", *WORDS, "--out", str(out), "--workers", "2"]
+    command = [sys.executable, "-m", "fastrod.commands.cli", *WORDS, "--out", str(out), "--workers", "2"]
     second = subprocess.run([*command, "--json"], check=True, capture_output=True, text=True)
     report = json.loads(second.stdout)
     assert 0 < report["made"] < 12
@@ -390,7 +391,7 @@ def test_a_count_may_have_an_exponent(tmp_path: Path) -> None:
     ("call", "sentence"),
     [
         (lambda _: Plan(work=3, count=1), "work is 3; give Shapes, Rollouts, Trajectories, Sweep."),  # type: ignore[arg-type]
-        (lambda _: Shapes(robot=5), "robot is 5; give the text of a robot file, such as fastrod.robotfile.dumps(robot)."),  # type: ignore[arg-type]
+        (lambda _: Shapes(robot=5), "robot is 5; give the text of a robot file, such as fastrod.model.robotfile.dumps(robot)."),  # type: ignore[arg-type]
         (lambda _: Shapes(robot=load_robot("prototype")), "robot is Robot("),  # type: ignore[arg-type]
         (lambda _: Sweep(robot=small().work.robot, effects="backlash"), "effects are 'backlash'; give a tuple of names, such as ("),  # type: ignore[union-attr, arg-type]
         (lambda _: Trajectories(robot=small().work.robot, effects=(3,)), "effects are (3,); give a tuple of names, such as ("),  # type: ignore[union-attr, arg-type]

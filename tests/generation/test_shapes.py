@@ -15,10 +15,10 @@ from fastrod.generation import Plan, Shapes
 from fastrod.generation.settling import ChainSolver
 from fastrod.generation.shapes import LONGEST_CHAIN, STRIDE, Draw
 from fastrod.generation.tasks import columns_of
-from fastrod.inputs import Inputs
-from fastrod.robot import Robot
-from fastrod.robotfile import dumps
-from fastrod.wiring import wire
+from fastrod.model.robot import Robot
+from fastrod.model.robotfile import dumps
+from fastrod.model.routing import wire
+from fastrod.solver.inputs import Inputs
 
 DENSITY = 0.004  # kg/m
 

@@ -13,11 +13,11 @@ from rods import rod
 from fastrod import Simulator
 from fastrod.contact import ContactScene, sphere
 from fastrod.errors import InputError
-from fastrod.gpu.resident import FIELDS, Resident
+from fastrod.solver.gpu.resident import FIELDS, Resident
 
 
 def test_a_steady_step_fetches_no_memory_and_sends_what_changed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fastrod.gpu.runner._SMALL", 64)  # as if the batch were large
+    monkeypatch.setattr("fastrod.solver.gpu.runner._SMALL", 64)  # as if the batch were large
     sim = Simulator(rod(), n_robots=3, points_per_segment=2, outputs="tip", device="cuda")
     lengths = np.tile(rod().rest_tendon_length, (3, 1))
     sim.step(lengths)

@@ -9,8 +9,8 @@ import numpy as np
 from rods import rod
 
 from fastrod import Robot
-from fastrod.runlog import RunLog
-from fastrod.wiring import wire
+from fastrod.logs.runlog import RunLog
+from fastrod.model.routing import wire
 
 
 def one_segment(**changes: Any) -> Robot:

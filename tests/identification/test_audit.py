@@ -11,10 +11,10 @@ from identification.logs import log_of, one_segment
 from numpy.testing import assert_allclose
 from rods import rod
 
-from fastrod.identification.audit import Audit, audit
 from fastrod.identification.excite import excitation
-from fastrod.identification.forward import Samples, sample
-from fastrod.wiring import wire
+from fastrod.identification.log.forward import Samples, sample
+from fastrod.identification.search.residual_test import Audit, audit
+from fastrod.model.routing import wire
 
 RATE, SIZE = 8.0, 0.9
 

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from fastrod import Robot, load_robot
 from fastrod.errors import InputError
 from fastrod.identification.excite import REST, Excitation, excitation
-from fastrod.runlog import read_log, write_log
-from fastrod.wiring import wire
+from fastrod.logs.runlog import read_log, write_log
+from fastrod.model.routing import wire
 
 ROBOTS = pytest.mark.parametrize("robot", [one_segment(), two_segments(), load_robot("tdcr_b")], ids=lambda robot: robot.name)
 RATE, BEND, SPEED = 15.0, 0.8, 1.0

@@ -11,11 +11,11 @@ from numpy.testing import assert_allclose
 from truth import plant
 
 from fastrod.identification.excite import excitation
-from fastrod.identification.foils import Foil, foils
-from fastrod.identification.forward import Rod, sample
-from fastrod.identification.local import Local, Target
-from fastrod.identification.unknowns import base_model
-from fastrod.robotfile import load_robot
+from fastrod.identification.log.forward import Rod, sample
+from fastrod.identification.log.unknowns import base_model
+from fastrod.identification.search.alternatives import Foil, foils
+from fastrod.identification.search.linearised import Local, Target
+from fastrod.model.robotfile import load_robot
 
 NOISE = 3e-4  # m
 FAMILIES = {"bump", "slip", "sway", "ripple", "contact", "attraction", "patch"}

@@ -12,15 +12,15 @@ from identification.logs import log_of, one_segment, two_segments, wave
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
-import fastrod.effect as registry
+import fastrod.effects.base as registry
 from fastrod import Robot, Simulator
-from fastrod.effect import Parameter, Seam, effect, get_effect, has_memory
-from fastrod.identification.forward import N_STEPS, Pose, Rod, predict, sample
-from fastrod.identification.unknowns import base_model
-from fastrod.ports import EffectPorts
-from fastrod.runlog import RunLog
+from fastrod.effects.base import Parameter, Seam, effect, get_effect, has_memory
+from fastrod.effects.ports import EffectPorts
+from fastrod.identification.log.forward import N_STEPS, Pose, Rod, predict, sample
+from fastrod.identification.log.unknowns import base_model
+from fastrod.logs.runlog import RunLog
+from fastrod.model.routing import wire
 from fastrod.types import Floats
-from fastrod.wiring import wire
 
 N = 30
 TABLES: dict[str, dict[str, Any]] = {

@@ -10,8 +10,8 @@ from identification.logs import log_of, one_segment
 from rods import rod
 
 from fastrod import load_robot
-from fastrod.identification.forward import Samples, sample
-from fastrod.identification.limits import limits
+from fastrod.identification.log.forward import Samples, sample
+from fastrod.identification.log.limits import limits
 
 
 def moving(rate: float) -> Samples:

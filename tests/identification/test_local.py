@@ -12,9 +12,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from fastrod import Robot
-from fastrod.identification.forward import Rod, Samples, predict, sample
-from fastrod.identification.local import Local, Target, exact_residual
-from fastrod.identification.unknowns import Model, base_model
+from fastrod.identification.log.forward import Rod, Samples, predict, sample
+from fastrod.identification.log.unknowns import Model, base_model
+from fastrod.identification.search.linearised import Local, Target, exact_residual
 
 N = 40
 SIGMA = np.array([2e-4, 3e-4, 4e-4])

@@ -16,11 +16,11 @@ from reportlog import backlash_log
 from fastrod.errors import InputError
 from fastrod.identification.attribution import identify
 from fastrod.identification.excite import excitation
-from fastrod.identification.forward import Samples, sample
-from fastrod.identification.network import residual_network
-from fastrod.identification.split import held_out_rows
-from fastrod.robotfile import load_robot
-from fastrod.wiring import wire
+from fastrod.identification.learned.network import residual_network
+from fastrod.identification.log.forward import Samples, sample
+from fastrod.identification.log.split import held_out_rows
+from fastrod.model.robotfile import load_robot
+from fastrod.model.routing import wire
 
 NOISE = 3e-4
 

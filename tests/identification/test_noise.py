@@ -9,8 +9,8 @@ import pytest
 from identification.logs import log_of, one_segment, wires
 from numpy.testing import assert_allclose
 
-from fastrod.identification.forward import Samples, sample
-from fastrod.identification.noise import Noise, at_rest, keep, read_noise
+from fastrod.identification.log.forward import Samples, sample
+from fastrod.identification.log.noise import Noise, at_rest, keep, read_noise
 
 SIGMA = np.array([2e-4, 3e-4, 5e-4])
 RATE = 15.0

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from fastrod import Robot, Simulator, load_robot
 from fastrod.identification.attribution import identify
 from fastrod.identification.excite import excitation
+from fastrod.logs.runlog import RunLog
 from fastrod.rotation import quaternion_from_matrix
-from fastrod.runlog import RunLog
 
 NOISE, TURN, LATE = 1e-4, 3e-3, 2  # m, rad, samples
 

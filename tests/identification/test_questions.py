@@ -15,17 +15,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fastrod import load_robot
-from fastrod.cli import main
+from fastrod.commands.cli import main
 from fastrod.errors import LogError
-from fastrod.identification import report
 from fastrod.identification.attribution import identify
-from fastrod.identification.questions import questions
-from fastrod.identification.registration import align, between
-from fastrod.identification.replay import replay
-from fastrod.identification.result import Result
-from fastrod.robotfile import loads
+from fastrod.identification.log.questions import questions
+from fastrod.identification.log.registration import align, between
+from fastrod.identification.log.replay import replay
+from fastrod.identification.report import report
+from fastrod.identification.report.result import Result
+from fastrod.logs.runlog import RunLog, read_log
+from fastrod.model.robotfile import loads
 from fastrod.rotation import quaternion_from_matrix
-from fastrod.runlog import RunLog, read_log
 
 ROBOT = loads(farlog.TOML)
 TURN, SHIFT = farlog.camera(0.6, 0.34)
@@ -249,7 +249,7 @@ PROVOKED: dict[str, Callable[[], object]] = {
 
 
 def load_effect(name: str) -> object:
-    from fastrod.effect import get_effect
+    from fastrod.effects.base import get_effect
 
     return get_effect(name)
 

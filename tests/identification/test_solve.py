@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import norm
 
-from fastrod.identification.solve import Fit, bic, covariance, effective_size, held_out_losses, minimise, paired
+from fastrod.identification.search.solve import Fit, bic, covariance, effective_size, held_out_losses, minimise, paired
 
 Model = Callable[[np.ndarray, np.ndarray], np.ndarray]
 

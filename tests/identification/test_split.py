@@ -10,9 +10,9 @@ from identification.logs import log_of, one_segment
 from numpy.testing import assert_array_equal
 
 from fastrod.errors import LogError, UnknownNameError
-from fastrod.identification.forward import Samples, sample
-from fastrod.identification.split import held_out_rows, merged
-from fastrod.runlog import RunLog
+from fastrod.identification.log.forward import Samples, sample
+from fastrod.identification.log.split import held_out_rows, merged
+from fastrod.logs.runlog import RunLog
 
 
 def log(name: str = "log", labels: tuple[str, ...] = ("a", "b"), n: int = 40, begin: float = 5.0) -> RunLog:

@@ -13,13 +13,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 from rods import rod
 
 from fastrod import Robot
-from fastrod.effect import columns, effect_names, get_effect
+from fastrod.effects.base import columns, effect_names, get_effect
 from fastrod.errors import RobotError
-from fastrod.identification.forward import Rod, predict, sample
-from fastrod.identification.replay import replay
-from fastrod.identification.unknowns import FREE_CAMERA, STIFFNESS_SD, Model, base_model, effect_unknowns
-from fastrod.robotfile import dumps, loads
-from fastrod.wiring import wire
+from fastrod.identification.log.forward import Rod, predict, sample
+from fastrod.identification.log.replay import replay
+from fastrod.identification.log.unknowns import FREE_CAMERA, STIFFNESS_SD, Model, base_model, effect_unknowns
+from fastrod.model.robotfile import dumps, loads
+from fastrod.model.routing import wire
 
 
 def fitted(robot: Robot, **targets: Any) -> Model:

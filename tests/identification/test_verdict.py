@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from fastrod.identification.audit import Audit
-from fastrod.identification.evidence import Candidate, Step
-from fastrod.identification.foils import Foil
-from fastrod.identification.result import Verdict
-from fastrod.identification.verdict import _EXPLAINED, _FOREIGN, _PARTLY, _UNCERTAIN, Opinion, judge
+from fastrod.identification.report.result import Verdict
+from fastrod.identification.report.verdict import _EXPLAINED, _FOREIGN, _PARTLY, _UNCERTAIN, Opinion, judge
+from fastrod.identification.search.alternatives import Foil
+from fastrod.identification.search.model_selection import Candidate, Step
+from fastrod.identification.search.residual_test import Audit
 
 BASE, FLOOR = 1.1, 0.1  # the error above the noise is 1
 CLEAN = Audit(0.0, 0.0, 0.0, 0.0, 0.0)

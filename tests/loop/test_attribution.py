@@ -17,14 +17,15 @@ from reportlog import GAP, backlash_log
 from truth import plant
 
 from fastrod.errors import LogError
-from fastrod.identification import report, search
 from fastrod.identification.attribution import identify
 from fastrod.identification.excite import excitation
-from fastrod.identification.replay import replay
-from fastrod.identification.result import Result
-from fastrod.robot import Robot
-from fastrod.robotfile import load_robot
-from fastrod.runlog import RunLog
+from fastrod.identification.log.replay import replay
+from fastrod.identification.report import report
+from fastrod.identification.report.result import Result
+from fastrod.identification.search import search
+from fastrod.logs.runlog import RunLog
+from fastrod.model.robot import Robot
+from fastrod.model.robotfile import load_robot
 
 SEED = 1000
 

@@ -11,9 +11,9 @@ from numpy.testing import assert_allclose
 from truthfiles import numbers, rows
 
 from fastrod.errors import InputError
+from fastrod.model.robot import Mode, Robot, Segment, Tendon
+from fastrod.model.robotfile import load_robot
 from fastrod.reference import constant_curvature, shoot, solve_bvp
-from fastrod.robot import Mode, Robot, Segment, Tendon
-from fastrod.robotfile import load_robot
 
 EI, LENGTH = 0.0022, 0.07
 

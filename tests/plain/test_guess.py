@@ -13,10 +13,10 @@ from plain.naive_guess import arms, guess
 from rods import bend, rod
 
 from fastrod import Robot, Segment, Simulator, Tendon, load_robot, robot_names
-from fastrod.compile import compile_robots
-from fastrod.guess import cold_start
-from fastrod.inputs import Inputs, Reader
-from fastrod.passes import Passes
+from fastrod.model.compile import compile_robots
+from fastrod.solver.boundary import Passes
+from fastrod.solver.guess import cold_start
+from fastrod.solver.inputs import Inputs, Reader
 from fastrod.types import Layout, Memory, Params, Ports
 
 N_STEPS = 6  # not a divisor of the guess's eight samples

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 import fastrod
 from fastrod.contact import ContactScene, Obstacle, box, cylinder, mesh, plane, sphere
-from fastrod.robot import Robot, Segment, Tendon
+from fastrod.model.robot import Robot, Segment, Tendon
 
 CASES = contact_cases.cases()
 

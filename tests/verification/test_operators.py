@@ -15,11 +15,11 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from fastrod import Robot, Segment, Simulator, load_robot
-from fastrod.chain import Measurement
-from fastrod.effect import get_effect
+from fastrod.effects.base import get_effect
+from fastrod.effects.pipeline import Measurement
 from fastrod.kernels.operators import BUFFER, SLIDERS, delay, elastoplastic, play, relaxation, second_order, yielding
-from fastrod.state import State
-from fastrod.wiring import wire
+from fastrod.model.routing import wire
+from fastrod.solver.state import State
 
 ROUNDING = 1e-13  # of numbers of size one, after some hundred operations
 Law = Callable[[np.ndarray], np.ndarray]

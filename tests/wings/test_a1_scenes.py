@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fastrod.segments import SegmentActions
+from fastrod.model.segment_actions import SegmentActions
 from fastrod_scenes.a1 import look, push
 from fastrod_scenes.a1.quadruped import MOUNT, neck, standing
 from fastrod_scenes.scene import SceneError

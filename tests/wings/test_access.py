@@ -19,8 +19,8 @@ from pages import HANDSHAKE, RawPage, request, slider, until, websocket
 
 from fastrod.access import MOST_PAGES, Access, serve_guarded
 from fastrod.errors import InputError
-from fastrod.robotfile import load_robot
-from fastrod.simulated import SimulatedRobot
+from fastrod.logs.simulated import SimulatedRobot
+from fastrod.model.robotfile import load_robot
 from fastrod_viewer.app import DEMO_LOG, App
 from fastrod_viewer.drive_page import DrivePage
 from fastrod_viewer.holder import AGAIN, IDLE, PATIENCE, Holder
@@ -32,7 +32,7 @@ def address(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     """Of each kind of page there is."""
     folder = tmp_path_factory.mktemp("access")
     if request.param == "drive":
-        words = ["fastrod.cli", "drive", "--emulate", "--seed", "3", "--no-home", "--no-open", "--port", "0"]
+        words = ["fastrod.commands.cli", "drive", "--emulate", "--seed", "3", "--no-home", "--no-open", "--port", "0"]
         command, pipe = [sys.executable, "-m", *words], subprocess.PIPE
         with subprocess.Popen(command, cwd=folder, stdout=pipe, stderr=pipe, text=True) as process:
             assert process.stdout is not None

@@ -10,8 +10,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import fastrod
 from fastrod.errors import InputError
-from fastrod.robot import Robot
-from fastrod.segments import SegmentActions
+from fastrod.model.robot import Robot
+from fastrod.model.segment_actions import SegmentActions
 from fastrod_envs.single import SingleEnv
 from fastrod_envs.tasks import catch
 from fastrod_envs.tasks.catch import Catch, arcs_jacobian, arcs_tip, directions, standing_robot

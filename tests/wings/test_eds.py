@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from fastrod.driving import _bench
+from fastrod.commands.drive import _bench
 from fastrod.types import Floats
 from fastrod_device.clock import SteppedClock
 from fastrod_device.dictionary import NEEDED, find, object_dictionary

@@ -12,7 +12,7 @@ from engines import ENGINES, Cube
 import fastrod
 from fastrod.contact import ContactScene, plane
 from fastrod.errors import HostError, InputError
-from fastrod.robotfile import dumps, loads
+from fastrod.model.robotfile import dumps, loads
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.simulator import Simulator
 

@@ -13,7 +13,7 @@ pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not instal
 
 from rich.console import Console
 
-from fastrod.cli import main
+from fastrod.commands.cli import main
 from fastrod.errors import InputError
 from fastrod_envs.describe import describe, summary
 from fastrod_envs.evaluation import Trial, correlation, evaluate, figures, table, write

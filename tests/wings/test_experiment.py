@@ -14,9 +14,9 @@ from fastrod import Simulator, load_robot
 from fastrod.control import references
 from fastrod.control.inverse import Plan
 from fastrod.identification.excite import Excitation
-from fastrod.runlog import RunLog, read_log
+from fastrod.logs.runlog import RunLog, read_log
+from fastrod.model.routing import wire
 from fastrod.types import Floats
-from fastrod.wiring import wire
 from fastrod_device.errors import DeviceError, RefusedError
 from fastrod_device.experiment import excite, follow, tracking
 from fastrod_device.hardware import load_hardware

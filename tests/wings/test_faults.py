@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fastrod.recording import recover
+from fastrod.logs.recording import recover
 from fastrod.types import Floats
 from fastrod_device.bus import Line
 from fastrod_device.clock import SteppedClock, WallClock

@@ -10,7 +10,7 @@ import pytest
 
 from fastrod import load_robot
 from fastrod.errors import FastrodError, InputError, UnknownNameError
-from fastrod.robotfile import save_robot
+from fastrod.model.robotfile import save_robot
 from fastrod_device.camera import save_camera
 from fastrod_device.hardware import SHIPPED, load_hardware
 from fastrod_device.limits import Limits

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike
 
 import fastrod
 from fastrod.errors import InputError
-from fastrod.recording import Recorder
-from fastrod.runlog import read_log
-from fastrod.simulated import SimulatedRobot
+from fastrod.logs.recording import Recorder
+from fastrod.logs.runlog import read_log
+from fastrod.logs.simulated import SimulatedRobot
 from fastrod_viewer.drive_page import far_rows, fitted
 from fastrod_viewer.knobs import drive_knobs
 from fastrod_viewer.linked import Linked, Reach

@@ -52,7 +52,7 @@ def test_random_steps_lose_no_robot_that_settles(task: str) -> None:
 
 
 def test_the_driver_notices_a_robot_that_settles(monkeypatch: pytest.MonkeyPatch) -> None:
-    from fastrod import recovery
+    from fastrod.solver import recovery
 
     monkeypatch.setattr(recovery.Boundary, "recover", lambda *given: 0 * given[2] - 1)  # no robot arrives
     count = bench_lost.drive("Reach", 64, seed=3, randomise=bench_lost.HEAVY)

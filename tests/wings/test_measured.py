@@ -11,9 +11,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from fastrod.errors import LogError, UnknownNameError
-from fastrod.identification.unknowns import base_model
-from fastrod.robotfile import dumps, loads
-from fastrod.runlog import read_log, write_log
+from fastrod.identification.log.unknowns import base_model
+from fastrod.logs.runlog import read_log, write_log
+from fastrod.model.robotfile import dumps, loads
 from fastrod_scenes import measured
 from fastrod_scenes.measured import armlab_tdcr, asl_trunk, detect, ethz_beam
 
@@ -170,7 +170,7 @@ def test_ethz_beam_drops_as_published() -> None:
 
 @needs_data
 def test_nominal_replay_of_the_beam_is_an_unshearable_rod() -> None:
-    from fastrod.identification.replay import replay
+    from fastrod.identification.log.replay import replay
 
     log, robot = ethz_beam(DATA / "ethz_beam.csv")
     result = replay(log, robot)

@@ -10,9 +10,9 @@ import pytest
 
 import fastrod
 from fastrod.errors import InputError
-from fastrod.link import Measurement, RobotLink
-from fastrod.recording import Recorder
-from fastrod.simulated import SimulatedRobot
+from fastrod.logs.link import Measurement, RobotLink
+from fastrod.logs.recording import Recorder
+from fastrod.logs.simulated import SimulatedRobot
 from fastrod_viewer.knobs import drive_knobs, largest_force, load_knobs, nice
 from fastrod_viewer.measuring import measure
 from fastrod_viewer.pilot import LARGEST_BEND, Pilot, Speeds

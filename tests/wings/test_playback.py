@@ -13,11 +13,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import fastrod
 from fastrod.errors import InputError, LogError
-from fastrod.identification.replay import replay
-from fastrod.robot import Robot
-from fastrod.robotfile import save_robot
+from fastrod.identification.log.replay import replay
+from fastrod.logs.runlog import RunLog, read_log, write_log
+from fastrod.model.robot import Robot
+from fastrod.model.robotfile import save_robot
 from fastrod.rotation import matrix_from_quaternion
-from fastrod.runlog import RunLog, read_log, write_log
 from fastrod_viewer.playback import BEFORE, POINTS_PER_SEGMENT, SWITCHED_OFF, Playback, identify, load
 from fastrod_viewer.residual_plot import curves, svg
 

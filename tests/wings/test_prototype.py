@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 
 from fastrod.errors import InputError
-from fastrod.link import RobotLink
-from fastrod.recording import recover
-from fastrod.runlog import read_log
+from fastrod.logs.link import RobotLink
+from fastrod.logs.recording import recover
+from fastrod.logs.runlog import read_log
 from fastrod.types import Floats
 from fastrod_device.camera import Frame, Picture
 from fastrod_device.clock import Clock, SteppedClock, WallClock

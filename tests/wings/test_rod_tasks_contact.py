@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from fastrod.errors import InputError
-from fastrod.robotfile import load_robot
+from fastrod.model.robotfile import load_robot
 from fastrod_envs.single import SingleEnv
 from fastrod_envs.tasks import tube_insert
 from fastrod_envs.tasks.tube_insert import TubeInsert, middle, place, thin_robot, tube_mesh

@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from fastrod import Robot, Segment, Tendon
 from fastrod.errors import InputError, UnknownNameError
-from fastrod.robotfile import load_robot
+from fastrod.model.robotfile import load_robot
 from fastrod_device.clock import SteppedClock
 from fastrod_device.errors import RefusedError
 from fastrod_device.limits import Limits, limited

@@ -10,7 +10,7 @@ from rods import bend, rod
 
 import fastrod
 from fastrod.errors import InputError
-from fastrod.segments import SegmentActions
+from fastrod.model.segment_actions import SegmentActions
 from fastrod_scenes import load
 from fastrod_viewer import palette
 from fastrod_viewer.chains import tangents

@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed: pip install 'fastrod[rl]'")
 
-from fastrod.cli import main
+from fastrod.commands.cli import main
 from fastrod_envs.presets import _SETTINGS, ALGORITHMS, settings_of
 from fastrod_envs.training import algorithm_class
 

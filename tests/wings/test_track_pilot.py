@@ -16,8 +16,8 @@ pytest.importorskip("gymnasium", reason="gymnasium is not installed: pip install
 import fastrod
 from fastrod.control import Trajectory, circle, helix
 from fastrod.errors import InputError, UnknownNameError
-from fastrod.robot import Robot
-from fastrod.simulated import SimulatedRobot
+from fastrod.logs.simulated import SimulatedRobot
+from fastrod.model.robot import Robot
 from fastrod.simulator import Simulator
 from fastrod.types import Floats
 from fastrod_envs.pilot import TrackPilot

@@ -11,8 +11,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from fastrod.errors import InputError, UnknownNameError
-from fastrod.robot import Segment
-from fastrod.robotfile import load_robot
+from fastrod.model.robot import Segment
+from fastrod.model.robotfile import load_robot
 from fastrod.rotation import product, quaternion_from_vector
 from fastrod_device import camera as camera_module
 from fastrod_device.camera import Camera, Frame, Marker, VideoCamera, compose, inverse, load_camera, rotation, save_camera

@@ -18,10 +18,10 @@ from pathlib import Path
 import pytest
 
 from fastrod.access import is_loopback
-from fastrod.cli import main
+from fastrod.commands.cli import main
 from fastrod.errors import InputError, UnknownNameError
-from fastrod.robotfile import load_robot
-from fastrod.simulated import SimulatedRobot
+from fastrod.logs.simulated import SimulatedRobot
+from fastrod.model.robotfile import load_robot
 from fastrod_viewer.app import DEMO_LOG, App, found, view
 from fastrod_viewer.playback import Playback
 from fastrod_viewer.server import free_port, serve
@@ -133,7 +133,7 @@ def test_it_serves_this_machine_alone_and_ends_at_once(end: signal.Signals) -> N
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    words = [sys.executable, "-m", "fastrod.cli", "view", "prototype", "--no-open", "--port", str(port)]
+    words = [sys.executable, "-m", "fastrod.commands.cli", "view", "prototype", "--no-open", "--port", str(port)]
 
     def heed() -> None:
         """Background jobs of a shell ignore SIGINT; this one does not."""

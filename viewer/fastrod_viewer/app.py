@@ -12,10 +12,10 @@ from typing import Any, final
 
 from fastrod.access import Served
 from fastrod.errors import FastrodError, InputError
-from fastrod.link import RobotLink
 from fastrod.loading import load_robot
-from fastrod.robot import Robot
-from fastrod.runlog import RunLog
+from fastrod.logs.link import RobotLink
+from fastrod.logs.runlog import RunLog
+from fastrod.model.robot import Robot
 from fastrod_scenes.scene import names
 from fastrod_viewer.canvas import Canvas
 from fastrod_viewer.catalogue import catalogue, open_world

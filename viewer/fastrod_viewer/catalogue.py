@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fastrod.errors import UnknownNameError, nearest
-from fastrod.robot import Robot
-from fastrod.robotfile import load_robot, robot_names
+from fastrod.model.robot import Robot
+from fastrod.model.robotfile import load_robot, robot_names
 from fastrod_scenes.scene import HostedScene, MujocoScene, RodScene, load, names
 
 if TYPE_CHECKING:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fastrod.robot import Robot
-from fastrod.segments import SegmentActions
+from fastrod.model.robot import Robot
+from fastrod.model.segment_actions import SegmentActions
 from fastrod.types import Floats
 
 GAIN = 8.0

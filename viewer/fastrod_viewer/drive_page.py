@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fastrod.errors import InputError
-from fastrod.link import Measurement, RobotLink
-from fastrod.recording import free_path
-from fastrod.runlog import RunLog
+from fastrod.logs.link import Measurement, RobotLink
+from fastrod.logs.recording import free_path
+from fastrod.logs.runlog import RunLog
 from fastrod_viewer.canvas import Canvas
 from fastrod_viewer.controls import Controls, stops
 from fastrod_viewer.drawing import Drawing

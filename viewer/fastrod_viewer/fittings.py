@@ -6,7 +6,7 @@ from typing import final
 
 import numpy as np
 
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
 from fastrod.types import Flags, Floats, Params
 from fastrod_viewer import palette
 from fastrod_viewer.chains import Nodes, Sampler, pieces

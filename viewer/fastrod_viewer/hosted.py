@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fastrod.control import SoftTip
 from fastrod.errors import HostError, InputError
 from fastrod.hosts import BulletArm, MountedRod, Visuals
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
 from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_vector
 from fastrod.types import Floats
 from fastrod_scenes.scene import HostedScene, HostedWorld, SoftBody, Stage

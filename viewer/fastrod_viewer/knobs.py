@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
 from fastrod_viewer.pilot import LARGEST_BEND, LARGEST_TENSION, Pilot
 from fastrod_viewer.world import World
 

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fastrod.errors import InputError
-from fastrod.link import Measurement, RobotLink
-from fastrod.recording import Recorder
+from fastrod.logs.link import Measurement, RobotLink
+from fastrod.logs.recording import Recorder
 from fastrod.types import Floats
 
 _MAY_MOVE = ("ready", "running")

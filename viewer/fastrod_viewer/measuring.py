@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fastrod.link import Measurement
+from fastrod.logs.link import Measurement
 from fastrod.rotation import quaternion_from_matrix
 from fastrod.types import Floats
 from fastrod_viewer.world import Hand, World

@@ -8,7 +8,7 @@ import numpy as np
 
 from fastrod.errors import HostError, InputError
 from fastrod.hosts.mujoco_touched import obstacle_of
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
 from fastrod.rotation import quaternion_from_matrix
 from fastrod.types import Floats
 from fastrod_scenes.scene import MujocoScene

@@ -6,11 +6,11 @@ from typing import NamedTuple, final
 
 import numpy as np
 
-from fastrod.compile import compile_robots
 from fastrod.contact.contacts import Contacts
 from fastrod.errors import InputError
+from fastrod.model.compile import compile_robots
 from fastrod.rotation import matrix_from_quaternion
-from fastrod.state import State
+from fastrod.solver.state import State
 from fastrod.types import Flags, Floats
 from fastrod_viewer import palette
 from fastrod_viewer.arrows import arrows, frames

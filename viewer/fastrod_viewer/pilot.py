@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fastrod.errors import FastrodError, InputError
-from fastrod.robot import Robot
-from fastrod.segments import SegmentActions
+from fastrod.model.robot import Robot
+from fastrod.model.segment_actions import SegmentActions
 from fastrod.types import Floats
 from fastrod_viewer.drag import drag_rates
 from fastrod_viewer.linked import Reach

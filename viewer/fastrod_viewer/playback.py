@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fastrod.errors import FastrodError, InputError, LogError
-from fastrod.identification.replay import replay
+from fastrod.identification.log.replay import replay
 from fastrod.loading import load_robot
-from fastrod.robot import Robot
-from fastrod.runlog import RunLog
+from fastrod.logs.runlog import RunLog
+from fastrod.model.robot import Robot
 from fastrod.types import Flags, Floats, Ints
 from fastrod_scenes.measured import detect, read
 
@@ -301,7 +301,7 @@ def _read(path: Path, given: Robot | None, found: _Found | None) -> tuple[RunLog
 
 
 def _samples(log: RunLog) -> Any:
-    from fastrod.identification.forward import sample  # loads numba
+    from fastrod.identification.log.forward import sample  # loads numba
 
     if not log.measured.any():
         raise LogError(f"log {log.name!r} has no row in which every input and the tip are there; there is nothing to compare.")
@@ -312,7 +312,7 @@ def _tested(samples: Any, findings: Findings | None) -> Flags | None:
     """(n,) rows that no fit saw, by the words of a report; None where they do not fit the log."""
     if findings is None:
         return None
-    from fastrod.identification.split import held_out_rows
+    from fastrod.identification.log.split import held_out_rows
 
     words = [] if len(findings.held_out) == 1 and findings.held_out[0].startswith(_EVERY_FOURTH) else list(findings.held_out)
     try:
@@ -342,9 +342,9 @@ def _track(log: RunLog, robot: Robot, frames: Ints, label: str, tell: Progress) 
 
 def _shapes(log: RunLog, robot: Robot, frames: Ints) -> Shapes:
     """The rod that `replay` solves, whole: with effects, the one of `forward.predict`, and its camera sees the backbone too."""
-    from fastrod.identification import forward
-    from fastrod.identification.inputs import base_of, inputs
-    from fastrod.identification.unknowns import known_model
+    from fastrod.identification.log import forward
+    from fastrod.identification.log.inputs import base_of, inputs
+    from fastrod.identification.log.unknowns import known_model
     from fastrod.simulator import Simulator
 
     bare, cut = replace(robot, effects=()), log.rows(frames)

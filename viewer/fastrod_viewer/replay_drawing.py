@@ -6,9 +6,9 @@ from typing import final
 
 import numpy as np
 
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
 from fastrod.rotation import matrix_from_quaternion
-from fastrod.state import State
+from fastrod.solver.state import State
 from fastrod.types import Floats
 from fastrod_viewer.arrows import Trail, arrows, ghost
 from fastrod_viewer.canvas import Canvas

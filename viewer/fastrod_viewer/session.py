@@ -14,9 +14,9 @@ from typing import final
 import numpy as np
 
 from fastrod.errors import FastrodError, InputError
-from fastrod.link import Measurement, RobotLink
-from fastrod.recording import Recorder
-from fastrod.runlog import RunLog
+from fastrod.logs.link import Measurement, RobotLink
+from fastrod.logs.recording import Recorder
+from fastrod.logs.runlog import RunLog
 from fastrod_viewer.linked import Linked
 from fastrod_viewer.measuring import measure
 from fastrod_viewer.pilot import Pilot

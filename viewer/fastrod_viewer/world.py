@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fastrod.robot import Robot
-from fastrod.segments import SegmentActions
-from fastrod.state import State
+from fastrod.model.robot import Robot
+from fastrod.model.segment_actions import SegmentActions
+from fastrod.solver.state import State
 from fastrod.types import Floats
 
 

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from fastrod.contact import ContactScene, Obstacle
 from fastrod.errors import InputError, RobotError
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
+from fastrod.model.segment_actions import SegmentActions
 from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_vector
-from fastrod.segments import SegmentActions
 from fastrod.simulator import Simulator
-from fastrod.state import State
+from fastrod.solver.state import State
 from fastrod.types import Floats
 from fastrod_scenes.scene import RodScene
 from fastrod_viewer.catalogue import about, catalogue, open_world

@@ -13,7 +13,7 @@ from fastrod.errors import InputError
 from fastrod.hosts import BulletArm, BulletLink, Camera, connect
 from fastrod.hosts.bodies import RodBodies
 from fastrod.hosts.camera import Image
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
 from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_vector
 from fastrod.types import Floats
 from fastrod_envs.arms import SoftArm, arm_tube, solid_box

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, final
 
 import numpy as np
 
-from fastrod.robot import Robot, Segment, Tendon
+from fastrod.model.robot import Robot, Segment, Tendon
 from fastrod.types import Floats, Ints
 from fastrod_envs.options import Options
 from fastrod_envs.rodtask import RodTask

@@ -11,7 +11,7 @@ from fastrod.errors import HostError
 from fastrod.hosts import Bullet, Camera, connect
 from fastrod.hosts.bodies import RodBodies
 from fastrod.hosts.gripper import Gripper
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
 from fastrod.rotation import quaternion_from_matrix
 from fastrod.types import Floats
 from fastrod_envs.arms import SoftArm, short, solid_box

@@ -14,7 +14,7 @@ from fastrod.hosts.bodies import RodBodies
 from fastrod.hosts.capsules import turn_between
 from fastrod.hosts.gripper import Gripper
 from fastrod.hosts.link import from_xyzw, to_xyzw
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
 from fastrod.rotation import matrix_from_quaternion, quaternion_from_matrix
 from fastrod.types import Floats
 from fastrod_envs.arms import SoftArm, arm_tube, short, solid_box

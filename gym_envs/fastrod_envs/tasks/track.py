@@ -10,8 +10,8 @@ import numpy as np
 
 from fastrod.control import references
 from fastrod.errors import InputError
-from fastrod.robot import Robot
-from fastrod.robotfile import load_robot
+from fastrod.model.robot import Robot
+from fastrod.model.robotfile import load_robot
 from fastrod.types import Floats, Ints
 from fastrod_envs.options import Options
 from fastrod_envs.rodtask import RodTask

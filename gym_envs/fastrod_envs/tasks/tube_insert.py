@@ -10,10 +10,10 @@ import numpy as np
 
 from fastrod.contact import ContactScene, mesh
 from fastrod.errors import InputError
-from fastrod.robot import Robot, Segment, Tendon
-from fastrod.segments import SegmentActions
+from fastrod.model.robot import Robot, Segment, Tendon
+from fastrod.model.segment_actions import SegmentActions
 from fastrod.simulator import Simulator
-from fastrod.state import State
+from fastrod.solver.state import State
 from fastrod.types import Flags, Floats, Ints
 from fastrod_envs.options import Options
 from fastrod_envs.randomisation import Randomisation

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fastrod.hosts import Bullet, Camera, MountedRod
 from fastrod.hosts.camera import Image
-from fastrod.segments import SegmentActions, WireInputs
+from fastrod.model.segment_actions import SegmentActions, WireInputs
 from fastrod_scenes.a1.quadruped import RADIUS, neck, standing
 from fastrod_scenes.scene import HostedScene, Stage
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fastrod.hosts import Bullet, MountedRod
-from fastrod.segments import SegmentActions, WireInputs
+from fastrod.model.segment_actions import SegmentActions, WireInputs
 from fastrod_scenes.a1.quadruped import neck, standing
 from fastrod_scenes.scene import HostedScene, Stage
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from fastrod.hosts import Bullet, BulletLink, connect
-from fastrod.robot import Robot, Segment, Tendon
+from fastrod.model.robot import Robot, Segment, Tendon
 from fastrod.rotation import quaternion_from_matrix
 
 OFFSET = 0.012

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fastrod.contact import ContactScene, mesh
-from fastrod.robot import Robot, Segment, Tendon
+from fastrod.model.robot import Robot, Segment, Tendon
 from fastrod.simulator import Simulator
-from fastrod.state import State
+from fastrod.solver.state import State
 from fastrod_scenes.contact.airway_mesh import BRANCHES, RADIUS, airway, heading, lumen_distance, middle
 from fastrod_scenes.contact.balance import FORCE, Worst, contacts_of, watch, worst
 from fastrod_scenes.scene import RodScene

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fastrod.contact import Contacts
-from fastrod.state import State
+from fastrod.solver.state import State
 from fastrod_scenes.scene import Scene
 
 FORCE = 1e-6

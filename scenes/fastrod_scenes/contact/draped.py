@@ -13,7 +13,7 @@ from typing import Any, final
 import numpy as np
 
 from fastrod.contact import ContactScene, cylinder
-from fastrod.robot import Robot, Segment
+from fastrod.model.robot import Robot, Segment
 from fastrod.simulator import Simulator
 from fastrod_scenes.contact.balance import DEPTH, FORCE, contacts_of, force_error, rises
 from fastrod_scenes.scene import RodScene

@@ -7,7 +7,7 @@ from typing import Any, final
 import numpy as np
 
 from fastrod.contact import ContactScene, plane
-from fastrod.robotfile import load_robot
+from fastrod.model.robotfile import load_robot
 from fastrod.simulator import Simulator
 from fastrod_scenes.contact.balance import FORCE, Worst, contacts_of, rises, watch, worst
 from fastrod_scenes.scene import RodScene

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from fastrod.hosts import BulletLink
 from fastrod.hosts.link import to_xyzw
-from fastrod.robot import Robot, Segment, Tendon
+from fastrod.model.robot import Robot, Segment, Tendon
 from fastrod.types import Floats
 
 OFFSET = 0.0075

@@ -8,8 +8,8 @@ from typing import final
 import numpy as np
 
 from fastrod.hosts import BulletArm, BulletLink, MountedRod, connect
+from fastrod.model.segment_actions import SegmentActions
 from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_vector
-from fastrod.segments import SegmentActions
 from fastrod.types import Floats
 from fastrod_scenes.robots import ur5_path
 from fastrod_scenes.scene import HostedScene, Stage

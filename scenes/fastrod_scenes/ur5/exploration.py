@@ -9,8 +9,8 @@ import numpy as np
 from fastrod.control import ResolvedRate, SoftTip
 from fastrod.hosts import BulletArm, BulletLink, Camera, MountedRod, connect
 from fastrod.hosts.camera import Image
+from fastrod.model.segment_actions import SegmentActions
 from fastrod.rotation import product, quaternion_from_vector
-from fastrod.segments import SegmentActions
 from fastrod.types import Floats
 from fastrod_scenes.robots import ur5_path
 from fastrod_scenes.scene import Stage

@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike
 from fastrod.hosts import BulletArm, BulletLink, SoftManiSim, connect
 from fastrod.hosts.link import from_xyzw, to_xyzw
 from fastrod.hosts.paper import paper_robot
+from fastrod.model.segment_actions import SegmentActions
 from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_matrix
-from fastrod.segments import SegmentActions
 from fastrod.simulator import Simulator
-from fastrod.state import State
+from fastrod.solver.state import State
 from fastrod.types import Floats
 from fastrod_scenes.robots import ur5_path
 from fastrod_scenes.scene import HostedWorld, SoftBody

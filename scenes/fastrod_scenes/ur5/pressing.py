@@ -9,7 +9,7 @@ import numpy as np
 
 from fastrod.hosts.mujoco import MujocoRod, add_capsules
 from fastrod.hosts.mujoco_body import mujoco
-from fastrod.segments import SegmentActions
+from fastrod.model.segment_actions import SegmentActions
 from fastrod.types import Floats
 from fastrod_scenes.scene import MujocoScene, MujocoStage
 from fastrod_scenes.ur5.carried import OFFSET, eased, soft_robot

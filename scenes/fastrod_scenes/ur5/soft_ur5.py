@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike
 
 from fastrod.control import ResolvedRate, SoftTip
 from fastrod.hosts import BulletArm, BulletLink, MountedRod, connect
-from fastrod.robot import Robot
+from fastrod.model.robot import Robot
 from fastrod.rotation import matrix_from_quaternion, quaternion_from_matrix
-from fastrod.state import State
+from fastrod.solver.state import State
 from fastrod.types import Floats
 from fastrod_scenes.robots import ur5_path
 from fastrod_scenes.ur5.carried import OFFSET, Bracket, soft_robot

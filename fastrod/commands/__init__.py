@@ -1,0 +1,1 @@
+"""The `fastrod` command. Nothing imports it."""

@@ -1,0 +1,270 @@
+"""What an effect is: a physical law that the rod lacks, applied at a seam of the model; and the registry of effects.
+
+An effect is a frozen class with `seam`, `parameters`, `memory` and `apply`, and a docstring that gives its *Equation*,
+*Source* and *Residual signature*. `@effect` checks that and registers it under the snake_case of its name: the library's
+own in `fastrod.effects`, and a user's from the user's package, which then works wherever the library's do.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
+from sys import float_info
+from typing import Any, ClassVar, Literal, Protocol, TypeVar, runtime_checkable
+
+import numpy as np
+
+from fastrod.effects.ports import EffectPorts
+from fastrod.errors import EffectError, UnknownNameError, nearest, shown
+from fastrod.model.routing import Wiring
+from fastrod.types import Floats
+
+Per = Literal["robot", "segment", "drive"]
+
+
+class Seam(Enum):
+    """Where an effect enters, from motor to camera; effects act in this order."""
+
+    ACTUATION = 1
+    """Between the commanded wires and those that the rod feels: `tendon_length`, `extension`, `offset`, `compliance`."""
+    MATERIAL = 2
+    """The rod itself: `stiffness`, `precurvature`."""
+    LOAD = 3
+    """What pushes it: `tip_force`, `tip_moment`, `line_force`."""
+    SENSING = 4
+    """Between the true tip and the measured one: `tip_position`, `tip_rotation`, `points`."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of an effect, or one per segment or per drive.
+
+    >>> Parameter("half_width", "m", bounds=(0.0, 2e-3), typical=2e-4).neutral
+    0.0
+    """
+
+    name: str
+    unit: str
+    neutral: float = 0.0
+    """Value at which the effect changes nothing, whatever the effect's other parameters are, or beside them."""
+    bounds: tuple[float, float] = (-math.inf, math.inf)
+    """Beyond them the value is not physical."""
+    typical: float | None = None
+    """Size seen on real robots; scale of the prior and of finite differences. A tenth of the bounds where not given."""
+    starts: tuple[float, ...] = ()
+    """Values that a fit starts from; `typical` where not given."""
+    per: Per = "robot"
+    """One value for the robot, for each segment, or for each drive (a wire, or an antagonistic pair of wires)."""
+    of: Literal["", "reach", "length"] = ""
+    """Bounds, typical size and starts are multiples of this: the wires' mean distance from the backbone, or the robot's length."""
+    shape: bool = False
+    """True: it shapes an effect whose size another parameter gives (a time constant, a width); no size of its own."""
+
+    def __post_init__(self) -> None:
+        low, high = self.bounds
+        if not low <= self.neutral <= high:
+            raise EffectError(f"parameter {self.name!r} has neutral value {self.neutral}; it must lie in its bounds {low} to {high}.")
+        if self.typical is None:
+            span = 0.1 * (high - low)
+            object.__setattr__(self, "typical", span if math.isfinite(span) and span > 0.0 else 1.0)
+        if not self.starts:
+            assert self.typical is not None
+            object.__setattr__(self, "starts", (self.neutral + self.typical,) if not self.shape else (self.typical,))
+
+    def on(self, wiring: Wiring) -> Parameter:
+        """This parameter in its unit, for one robot."""
+        if not self.of:
+            return self
+        size = float(wiring.length.sum()) if self.of == "length" or not wiring.n_tendons else float(wiring.reach.mean())
+        assert self.typical is not None
+        return Parameter(
+            self.name, self.unit, self.neutral * size, (self.bounds[0] * size, self.bounds[1] * size), self.typical * size,
+            tuple(start * size for start in self.starts), self.per, "", self.shape,
+        )  # fmt: skip
+
+    @property
+    def scale(self) -> float:
+        """`typical` as a float: the size that counts as one."""
+        assert self.typical is not None
+        return abs(self.typical)
+
+
+@runtime_checkable
+class Effect(Protocol):
+    """What `@effect` asks of a class. Optional: `order`, `excited_by`, `confounded_with`, `synonyms`, and `sweep` (see `Operator`)."""
+
+    seam: ClassVar[Seam]
+    parameters: ClassVar[tuple[Parameter, ...]]
+
+    def memory(self, n_robots: int, n_tendons: int) -> Floats:
+        """Hidden state at the start, (n_robots, anything); of size 0 for an effect without memory, nan for one that begins
+        at the first input."""
+        ...
+
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
+        """Change `ports` (and `memory`) in place. `values` (n_robots, n_columns): the parameters in order, each as many columns
+        as `per` says. `state` is the simulator's last `State`, or None; `dt` the time since then [s]."""
+        ...
+
+
+class Static:
+    """Base of the library's effects without memory."""
+
+    excited_by: ClassVar[str] = ""
+    confounded_with: ClassVar[tuple[str, ...]] = ()
+    synonyms: ClassVar[tuple[str, ...]] = ()
+    order: ClassVar[float] = 50.0
+    """Place among the effects of the same seam, from the motor to the camera."""
+
+    def memory(self, n_robots: int, n_tendons: int) -> Floats:  # noqa: ARG002
+        """None."""
+        return np.empty((n_robots, 0))
+
+
+class Operator(ABC):
+    """Base of the library's effects with a memory: operators on the wires' lengths over time.
+
+    `sweep` is the law, over many steps at once: a simulator calls it with one step, identification with a whole log.
+    """
+
+    excited_by: ClassVar[str] = ""
+    confounded_with: ClassVar[tuple[str, ...]] = ()
+    synonyms: ClassVar[tuple[str, ...]] = ()
+    order: ClassVar[float] = 50.0
+
+    @abstractmethod
+    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Wiring) -> Floats:
+        """(n_robots, n_steps, n_tendons) what the wires end up at, from `dl` commanded [m] and `dt` (n_steps,) before each step [s].
+
+        `memory` (n_robots, m) is changed in place; nan in it means that the wires begin at rest at the first step.
+        """
+        ...
+
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+        """One step of `sweep`."""
+        dl = ports.tendon_length - ports.rest_length
+        ports.shift_wires(self.sweep(values, memory, dl[:, None], np.array([dt]), ports.wiring)[:, 0] - dl)
+
+
+_REGISTRY: dict[str, Effect] = {}
+_SYNONYMS: dict[str, str] = {}
+_SECTIONS = ("Equation", "Source", "Residual signature")
+_Class = TypeVar("_Class", bound=type)
+
+
+def effect(cls: _Class) -> _Class:
+    """Register an effect class under its name in snake_case; the class itself is handed back.
+
+    Raises `EffectError` where a part is missing or the name is taken by another class.
+    """
+    name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
+    for section in _SECTIONS:
+        if f"{section}:" not in (cls.__doc__ or ""):
+            raise EffectError(f"effect {name!r} does not say its {section}; its docstring needs a line '{section}: ...'.")
+    for part in ("seam", "parameters", "memory", "apply"):
+        if not hasattr(cls, part):
+            raise EffectError(f"effect {name!r} has no {part}; an effect has seam, parameters, memory(...) and apply(...).")
+    made: Any = cls()
+    if not isinstance(made.seam, Seam):
+        raise EffectError(f"effect {name!r} has seam {made.seam!r}; give one of {', '.join(map(str, Seam))}.")
+    if not made.parameters or not all(isinstance(p, Parameter) for p in made.parameters):
+        raise EffectError(f"effect {name!r} has parameters {made.parameters!r}; give a tuple of Parameter, at least one.")
+    synonyms = tuple(getattr(cls, "synonyms", ()))
+    for word in (name, *synonyms):
+        taken = _REGISTRY.get(_SYNONYMS.get(word, word))
+        if taken is not None and type(taken).__qualname__ + type(taken).__module__ != cls.__qualname__ + cls.__module__:
+            raise EffectError(f"an effect named {word!r} is already registered by {type(taken).__module__}.")
+    _REGISTRY[name] = made
+    _SYNONYMS.update(dict.fromkeys(synonyms, name))
+    return cls
+
+
+def unregister(name: str) -> None:
+    """Take an effect out of the registry, for a library without it."""
+    name = canonical_name(name)
+    del _REGISTRY[name]
+    for synonym in [synonym for synonym, meant in _SYNONYMS.items() if meant == name]:
+        del _SYNONYMS[synonym]
+
+
+def effect_names() -> list[str]:
+    """Names of all registered effects, from the motor to the camera."""
+    load_library()
+    return sorted(_REGISTRY, key=lambda name: (_REGISTRY[name].seam.value, getattr(_REGISTRY[name], "order", 50.0), name))
+
+
+def canonical_name(name: str) -> str:
+    """The one name of an effect that goes by several. Raises `UnknownNameError` with the nearest."""
+    load_library()
+    name = _SYNONYMS.get(name, str(name))
+    if name not in _REGISTRY:
+        raise UnknownNameError(f"no effect {name!r}; {nearest(name, [*_REGISTRY, *_SYNONYMS])}")
+    return name
+
+
+def get_effect(name: str) -> Effect:
+    """The registered effect of this name or synonym. Raises `UnknownNameError` with the nearest."""
+    return _REGISTRY[canonical_name(name)]
+
+
+def has_memory(what: Effect) -> bool:
+    """Whether an effect carries a hidden state."""
+    return what.memory(1, 1).size > 0
+
+
+@cache
+def load_library() -> None:
+    """Register the library, and the modules that installed packages name as entry points of the group `fastrod.effects`."""
+    import_module("fastrod.effects.laws")
+    for plug_in in entry_points(group="fastrod.effects"):
+        plug_in.load()
+
+
+def columns(what: Effect, wiring: Wiring) -> list[str]:
+    """Names of the value columns of an effect on this robot: half_width, or half_width_1, half_width_2 ..."""
+    names = []
+    for parameter in what.parameters:
+        count = wiring.count(parameter.per)
+        names += [parameter.name] if count == 1 else [f"{parameter.name}_{k}" for k in range(1, count + 1)]
+    return names
+
+
+def read_values(name: str, given: Mapping[str, object], wiring: Wiring, where: str) -> Floats:
+    """(n_columns,) values of an effect from its table in a robot file; a parameter that is not given is neutral.
+
+    A number stands for all segments or drives, a list for each. Raises `EffectError` for what cannot be.
+    """
+    what = get_effect(name)
+    known = [p.name for p in what.parameters]
+    for key in given:
+        if key not in known and key != "name":
+            raise EffectError(f"{where}: effect {name!r} has no parameter {key!r}; {nearest(str(key), known)}")
+    values: list[float] = []
+    for parameter in (p.on(wiring) for p in what.parameters):
+        value = given.get(parameter.name, parameter.neutral)
+        count = wiring.count(parameter.per)
+        listed: Sequence[object] = value if isinstance(value, (list, tuple)) else (value,) * count
+        if len(listed) != count:
+            raise EffectError(
+                f"{where}: {parameter.name} of effect {name!r} has {len(listed)} values; give one, or {count}, one per {parameter.per}."
+            )
+        for number in listed:
+            low, high = parameter.bounds
+            if (
+                isinstance(number, bool)
+                or not isinstance(number, (int, float))
+                or not (low <= number <= high and abs(number) <= float_info.max)
+            ):
+                raise EffectError(
+                    f"{where}: {parameter.name} of effect {name!r} is {shown(number)} {parameter.unit}; "
+                    f"it must be a number from {low:g} to {high:g}."
+                )
+            values.append(float(number))
+    return np.array(values)

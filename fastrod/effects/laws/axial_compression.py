@@ -1,0 +1,40 @@
+"""The backbone shortens under the pull of its wires."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from fastrod.effects.base import Parameter, Seam, Static, effect
+from fastrod.effects.ports import EffectPorts
+from fastrod.types import Floats
+
+
+@effect
+class AxialCompression(Static):
+    """The backbone shortens under the pull of its wires.
+
+    Equation: l_k -> l_k (1 - e |theta_k|) + p c_k, with c_k what the wires of segment k pull in common, and p the body's share of it
+    Source: v_z = 1 - sum T / EA, Rucker and Webster 2011, with T from wires that pull only
+    Residual signature: along the tangent of the tip, even in the bend; in proportion to common pull
+    """
+
+    seam = Seam.ACTUATION
+    order = 90.0
+    parameters = (
+        Parameter("per_bend", "1/rad", bounds=(0.0, 0.5), typical=0.03, starts=(0.02,), per="segment"),
+        Parameter("common_share", "", bounds=(0.0, 1.5), typical=0.5, starts=(0.5,), per="segment"),
+    )
+    excited_by = "large bends; all wires pulled together"
+    confounded_with = ("marker_offset", "stiffening")
+    synonyms = ("backbone_compression",)
+
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+        wiring = ports.wiring
+        n = wiring.n_segments
+        bend = np.linalg.norm(ports.bend(), axis=-1)
+        pulled = -wiring.length * values[:, :n] * bend
+        ports.extension += pulled + values[:, n:] * ports.common()
+        # The wires follow what the bend takes from the body; of a common pull they keep what the body does not follow.
+        ports.tendon_length += np.cumsum(pulled, axis=1)[:, wiring.tendon_segment]

@@ -1,0 +1,39 @@
+"""Viscoelastic body or wires: part of the bend comes late."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fastrod.effects.base import Operator, Parameter, Seam, effect
+from fastrod.kernels.operators import relaxation
+from fastrod.model.routing import Wiring
+from fastrod.types import Floats
+
+
+@effect
+class Creep(Operator):
+    """Viscoelastic body or wires: part of the bend comes late.
+
+    Equation: l -> l - c (l - x), tau x' = l - x
+    Source: standard linear solid (Zener); creep of polymer wires and silicone bodies
+    Residual signature: after a step it decays with time whatever the direction; loops that depend on speed
+    """
+
+    seam = Seam.ACTUATION
+    order = 55.0
+    parameters = (
+        Parameter("share", "", bounds=(0.0, 1.0), typical=0.08, starts=(0.08,)),
+        Parameter("time_constant", "s", neutral=5.0, bounds=(0.05, 300.0), typical=5.0, starts=(0.5, 3.0, 15.0, 60.0), shape=True),
+    )
+    excited_by = "steps and holds of several time constants, the same path at two speeds"
+    confounded_with = ("friction", "time_drift", "dynamics")
+    synonyms = ("relaxation", "viscoelasticity")
+
+    def memory(self, n_robots: int, n_tendons: int) -> Floats:
+        return np.full((n_robots, 2 * n_tendons), np.nan)
+
+    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Wiring) -> Floats:
+        out = dl.copy()
+        share, tau = (np.repeat(values[:, k : k + 1], wiring.n_tendons, axis=1) for k in (0, 1))
+        relaxation(out, memory, share, tau, dt)
+        return out

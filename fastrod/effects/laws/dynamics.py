@@ -1,0 +1,39 @@
+"""Inertia: the bend follows its wires as a damped oscillator."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fastrod.effects.base import Operator, Parameter, Seam, effect
+from fastrod.kernels.operators import second_order
+from fastrod.model.routing import Wiring
+from fastrod.types import Floats
+
+
+@effect
+class Dynamics(Operator):
+    """Inertia: the bend follows its wires as a damped oscillator.
+
+    Equation: T^2 y'' + 2 z T y' + y = theta
+    Source: first bending mode of a cantilever, f = 0.56 sqrt(EI / (m l^3))
+    Residual signature: ringing after stops, lag that grows with speed
+    """
+
+    seam = Seam.ACTUATION
+    order = 70.0
+    parameters = (
+        Parameter("period", "s", bounds=(0.0, 1.0), typical=0.08, starts=(0.03, 0.08, 0.16)),
+        Parameter("damping", "", neutral=0.3, bounds=(0.02, 0.98), typical=0.3, starts=(0.1, 0.6), shape=True),
+    )
+    excited_by = "steps and fast reversals, sampled at ten times the frequency"
+    confounded_with = ("latency", "creep")
+    synonyms = ("inertia", "oscillation")
+
+    def memory(self, n_robots: int, n_tendons: int) -> Floats:
+        return np.full((n_robots, 3 * n_tendons), np.nan)
+
+    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Wiring) -> Floats:
+        out = dl.copy()
+        period, damping = (np.repeat(values[:, k : k + 1], wiring.n_tendons, axis=1) for k in (0, 1))
+        second_order(out, memory, period, damping, dt)
+        return out

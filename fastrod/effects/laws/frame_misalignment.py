@@ -1,0 +1,51 @@
+"""The camera's frame is not the base's."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from fastrod.effects.base import Parameter, Seam, Static, effect
+from fastrod.effects.ports import EffectPorts
+from fastrod.rotation import matrix_from_quaternion
+from fastrod.types import Floats
+
+_TURN = 2.0 * np.pi  # rad: any rotation, and a fit may pass half a turn
+_FAR = 30.0  # robot lengths: as far as a run log's tips may be
+
+
+@effect
+class FrameMisalignment(Static):
+    """The camera's frame is not the base's.
+
+    Equation: y = exp[w] r + t
+    Source: rigid registration (Horn 1987)
+    Residual signature: affine in the measured position; the same for every load and orientation
+    """
+
+    seam = Seam.SENSING
+    order = 20.0
+    parameters = (
+        Parameter("rotation_x", "rad", bounds=(-_TURN, _TURN), typical=0.03, starts=(0.01,)),
+        Parameter("rotation_y", "rad", bounds=(-_TURN, _TURN), typical=0.03, starts=(0.01,)),
+        Parameter("rotation_z", "rad", bounds=(-_TURN, _TURN), typical=0.03, starts=(0.01,)),
+        Parameter("shift_x", "m", bounds=(-_FAR, _FAR), typical=0.03, starts=(0.01,), of="length"),
+        Parameter("shift_y", "m", bounds=(-_FAR, _FAR), typical=0.03, starts=(0.01,), of="length"),
+        Parameter("shift_z", "m", bounds=(-_FAR, _FAR), typical=0.03, starts=(0.01,), of="length"),
+    )
+    excited_by = "the whole workspace; a calibration of its own"
+    confounded_with = ("precurvature", "encoder_offset", "gravity")
+    synonyms = ("registration",)
+
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+        turn = _turn(values[:, :3])
+        ports.tip_position[:] = np.einsum("nij,nj->ni", turn, ports.tip_position) + values[:, 3:]
+        ports.tip_rotation[:] = turn @ ports.tip_rotation
+        ports.points[:] = np.einsum("nij,nkj->nki", turn, ports.points) + values[:, None, 3:]
+
+
+def _turn(vector: Floats) -> Floats:
+    """(n, 3, 3) rotation by a rotation vector (n, 3) [rad]."""
+    half = 0.5 * np.linalg.norm(vector, axis=1)
+    return matrix_from_quaternion(np.column_stack([np.cos(half), 0.5 * np.sinc(half / np.pi)[:, None] * vector]))

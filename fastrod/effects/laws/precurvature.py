@@ -1,0 +1,38 @@
+"""The body is not straight without moments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastrod.effects.base import Parameter, Seam, Static, effect
+from fastrod.effects.ports import EffectPorts
+from fastrod.types import Floats
+
+
+@effect
+class Precurvature(Static):
+    """The body is not straight without moments.
+
+    Equation: u*(s) -> u*(s) + b (1 - 2 s / l) + u_0: a bow, which stiff wires do not straighten, and a uniform part, which they do
+    Source: paper eq. 1c, m = K (u - u*)
+    Residual signature: constant in the body frame: the tip moves and does not turn
+    """
+
+    seam = Seam.MATERIAL
+    order = 30.0
+    parameters = (
+        Parameter("bow_x", "1/m", bounds=(-30.0, 30.0), typical=2.0, starts=(1.0,), per="segment"),
+        Parameter("bow_y", "1/m", bounds=(-30.0, 30.0), typical=2.0, starts=(1.0,), per="segment"),
+        Parameter("uniform_x", "1/m", bounds=(-30.0, 30.0), typical=2.0, starts=(0.0,), per="segment"),
+        Parameter("uniform_y", "1/m", bounds=(-30.0, 30.0), typical=2.0, starts=(0.0,), per="segment"),
+    )
+    excited_by = "wide bends with tip orientation; the free shape with slack wires"
+    confounded_with = ("frame_misalignment", "encoder_offset", "marker_offset")
+    synonyms = ("pre_curvature", "initial_curvature")
+
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+        n = ports.wiring.n_segments
+        ports.resolve()
+        for axis in (0, 1):
+            bow, uniform = values[:, axis * n : (axis + 1) * n], values[:, (2 + axis) * n : (3 + axis) * n]
+            ports.precurvature[..., axis] += bow[..., None] * (1.0 - 2.0 * ports.fraction) + uniform[..., None]

@@ -1,0 +1,29 @@
+"""Wires stretch under tension."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastrod.effects.base import Parameter, Seam, Static, effect
+from fastrod.effects.ports import EffectPorts
+from fastrod.types import Floats
+
+
+@effect
+class TendonStretch(Static):
+    """Wires stretch under tension.
+
+    Equation: l_i = L_i + (c_i + c) T_i
+    Source: Oliver-Butler, Till and Rucker 2019
+    Residual signature: loss of gain, in proportion to the moment; the tip turns under load
+    """
+
+    seam = Seam.ACTUATION
+    order = 85.0
+    parameters = (Parameter("compliance", "m/N", bounds=(0.0, 0.02), typical=3e-4, starts=(2e-4,), per="segment"),)
+    excited_by = "a known load of 50 to 100 g on and off"
+    confounded_with = ("drum_gain", "stiffness_taper")
+    synonyms = ("tendon_compliance", "wire_stretch")
+
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+        ports.compliance += ports.wiring.by_end(values)

@@ -1,0 +1,178 @@
+"""The effects of a batch of robots, in the order of their seams: what a command becomes, and what a measurement sees."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fastrod.effects.base import Effect, Seam, canonical_name, effect_names, get_effect, read_values
+from fastrod.effects.ports import EffectPorts, close_ports, open_ports
+from fastrod.errors import EffectError, RobotError, nearest
+from fastrod.model.robot import Robot
+from fastrod.model.routing import Wiring, wire
+from fastrod.rotation import matrix_from_quaternion
+from fastrod.types import Flags, Floats, Params, Ports
+
+
+class Measurement(NamedTuple):
+    """What a camera on the base sees of the tip, effects of sensing included; base frame."""
+
+    tip_position: Floats
+    """(n_robots, 3) [m]."""
+    tip_rotation: Floats
+    """(n_robots, 3, 3) base_from_tip."""
+    points: Floats
+    """(n_robots, k, 3) at the robot's `log_points` [m]; k is 0 with outputs="tip"."""
+
+
+class Link(NamedTuple):
+    """One effect of the batch."""
+
+    name: str
+    effect: Effect
+    values: Floats
+    """(n_robots, n_columns)."""
+    memory: Floats
+    """(n_robots, m)."""
+
+
+def named_effects(robot: Robot) -> dict[str, dict[str, Any]]:
+    """Tables of a robot's effects by canonical name, in the order in which they act. Raises for a name that is not known."""
+    tables: dict[str, dict[str, Any]] = {}
+    for table in robot.effects:
+        if "name" not in table:
+            raise EffectError(f"robot {robot.name!r}: effect {dict(table)!r} has no name; {nearest('', effect_names())}")
+        name = canonical_name(str(table["name"]))
+        if name in tables:
+            raise EffectError(f"robot {robot.name!r} has effect {name!r} twice; each effect stands once.")
+        tables[name] = {key: value for key, value in table.items() if key != "name"}
+    if not tables:
+        return {}
+    return {name: tables[name] for name in effect_names() if name in tables}
+
+
+def _alike(one: Wiring, other: Wiring) -> bool:
+    """Whether wires and segments are the same to a part in a million million."""
+    return bool(np.allclose(one.arms, other.arms, rtol=1e-12, atol=0.0) and np.allclose(one.length, other.length, rtol=1e-12, atol=0.0))
+
+
+class Chain:
+    """The effects that a batch of robots has, with their memories."""
+
+    def __init__(self, robots: Sequence[Robot], n_robots: int) -> None:
+        """Raises `EffectError`, `UnknownNameError` for effects that are not, `RobotError` where robots name different ones."""
+        self.wiring = wire(robots[0])
+        tables = [named_effects(robot) for robot in robots]
+        for i, named in enumerate(tables):
+            if list(named) != list(tables[0]):
+                raise RobotError(
+                    f"robot {i} of the batch has effects {', '.join(named) or 'none'}, robot 0 has {', '.join(tables[0]) or 'none'}; "
+                    "name the same effects in each, with neutral values where one has none."
+                )
+            if named and robots[i] is not robots[0] and not _alike(wire(robots[i]), self.wiring):
+                raise RobotError(
+                    f"robot {i} of the batch has segments of other lengths or wires at other places than robot 0; "
+                    "with effects these must agree: give robots that differ there a simulator each."
+                )
+        self.n_robots = n_robots
+        self.rest_length = robots[0].rest_tendon_length
+        self.gravity = np.array([robot.gravity for robot in robots])
+        self._felt = self.gravity  # at the last step
+        self._pulled = np.array([robots[0].segments[end].mode == "tendon_tension" for end in robots[0].tendon_segment], dtype=bool)
+        self.links: list[Link] = []
+        for name in tables[0]:
+            rows = [read_values(name, named[name], self.wiring, f"robot {r.name!r}") for named, r in zip(tables, robots, strict=True)]
+            values = np.broadcast_to(np.array(rows), (n_robots, len(rows[0]))).copy()
+            self.links.append(Link(name, get_effect(name), values, self._fresh(get_effect(name))))
+        self.time = np.full(n_robots, np.nan)
+        """(n_robots,) since the first step [s]; nan before it."""
+
+    def __bool__(self) -> bool:
+        return bool(self.links)
+
+    def _fresh(self, what: Effect) -> Floats:
+        memory = what.memory(self.n_robots, self.wiring.n_tendons)
+        return np.empty((self.n_robots, 0)) if memory.size == 0 else memory
+
+    def reset(self, rows: Any) -> None:
+        """Let these robots begin at rest again."""
+        for link in self.links:
+            link.memory[rows] = self._fresh(link.effect)[rows]
+        self.time[rows] = np.nan
+
+    def act(
+        self,
+        ports: Ports,
+        params: Params,
+        state: Any,
+        dt: float,
+        n_steps: int,
+        skip: Flags,
+        gravity: Floats | None = None,
+    ) -> tuple[Ports, Params]:
+        """What the kernel reads at this step; memories move on, but for the robots `skip`, whose inputs
+        cannot be used.
+
+        `gravity` (1 or n_robots, 3) [m/s^2] is that of the world at this step, the robots' own if left out.
+        """
+        self._felt = self.gravity if gravity is None else gravity
+        first = np.isnan(self.time)
+        self.time = np.where(skip, self.time, np.where(first, 0.0, self.time + dt))
+        before = [link.memory.copy() for link in self.links] if skip.any() else []
+        opened = self._open(ports, params, n_steps)
+        self._apply(opened, state, dt, self.links)
+        for link, old in zip(self.links, before, strict=bool(before)):
+            link.memory[skip] = old[skip]
+        return close_ports(opened, ports, params)
+
+    def slopes(self, ports: Ports, params: Params, state: Any, dt: float, n_steps: int) -> Floats:
+        """(n_robots, n, n) d(what the rod feels) / d(what is commanded), of tendon lengths [m] then extensions [m], where the
+        robots stand; memories stay. `ports` are those before the effects."""
+
+        def felt(length: Floats, extension: Floats) -> Floats:
+            links = [link._replace(memory=link.memory.copy()) for link in self.links]
+            opened = self._open(ports._replace(tendon_length=length, extension=extension), params, n_steps)
+            self._apply(opened, state, 0.0 * dt, links)
+            return np.concatenate([opened.tendon_length, opened.extension], axis=1)
+
+        n_tendons = self.wiring.n_tendons
+        delta = 1e-7 * float(self.wiring.length.sum())
+        inputs = np.concatenate([np.broadcast_to(a, (self.n_robots, a.shape[1])) for a in (ports.tendon_length, ports.extension)], axis=1)
+        slopes = np.empty((self.n_robots, inputs.shape[1], inputs.shape[1]))
+        for j in range(inputs.shape[1]):
+            if j < n_tendons and self._pulled[j]:  # a tension: no effect changes it
+                slopes[:, :, j] = np.arange(inputs.shape[1]) == j
+                continue
+            ends = []
+            for sign in (1.0, -1.0):
+                moved = inputs.copy()
+                moved[:, j] += sign * delta
+                ends.append(felt(moved[:, :n_tendons], moved[:, n_tendons:]))
+            slopes[:, :, j] = (ends[0] - ends[1]) / (2.0 * delta)
+        return slopes
+
+    def sense(self, measurement: Measurement, ports: Ports, params: Params, dt: float, n_steps: int) -> Measurement:
+        """The measurement with the effects of sensing."""
+        opened = self._open(ports, params, n_steps)
+        opened.tip_position, opened.tip_rotation, opened.points = (a.copy() for a in measurement)
+        for link in self.links:
+            if link.effect.seam is Seam.SENSING:
+                link.effect.apply(link.values, link.memory, opened, None, dt)
+        return Measurement(opened.tip_position, opened.tip_rotation, opened.points)
+
+    def _open(self, ports: Ports, params: Params, n_steps: int) -> EffectPorts:
+        opened = open_ports(
+            ports, params, self.wiring, n=self.n_robots, rest_length=self.rest_length, gravity=self._felt,
+            base_rotation=matrix_from_quaternion(ports.base_pose[:, 3:]), time=np.nan_to_num(self.time), n_steps=n_steps,
+        )  # fmt: skip
+        opened.tendon_length[:, self._pulled] = self.rest_length[self._pulled]  # these are not commanded: nothing to act on
+        for given in (opened.tendon_length, opened.extension, opened.tip_force, opened.tip_moment, opened.line_force):
+            given[np.isinf(given)] = np.nan  # a bad input: nan passes through an effect without a warning, inf does not
+        return opened
+
+    def _apply(self, opened: EffectPorts, state: Any, dt: float, links: Sequence[Link]) -> None:
+        for link in links:
+            if link.effect.seam is not Seam.SENSING:
+                link.effect.apply(link.values, link.memory, opened, state, dt)

@@ -1,0 +1,160 @@
+"""`EffectPorts`: what an effect may read and change, a row for each robot (or for each sample of a log)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fastrod.model.routing import Wiring
+from fastrod.types import Floats, Params, Ports
+
+
+def _none() -> Floats:
+    return np.empty((0, 0, 3))
+
+
+@dataclass
+class EffectPorts:
+    """The ports of a step with the robot's own numbers beside them; every array has its row axis expanded and may be
+    changed in place, unless "read" is said. World frame unless said otherwise."""
+
+    wiring: Wiring
+    """Read: how wires and bends hang together."""
+    rest_length: Floats
+    """Read: (n_tendons,) lengths of the straight rest robot [m]."""
+    gravity: Floats
+    """Read: (n, 3) [m/s^2]."""
+    base_rotation: Floats
+    """Read: (n, 3, 3) world_from_base."""
+    time: Floats
+    """Read: (n,) since the start of the run [s]."""
+    tendon_length: Floats
+    """(n, n_tendons) absolute [m]; change it through `shift_wires`, `shift_bend`."""
+    extension: Floats
+    """(n, n_segments) [m]."""
+    offset: Floats
+    """(n, n_segments, n_tendons, 2) wire positions in the material frame [m]."""
+    compliance: Floats
+    """(n, n_tendons) [m/N]."""
+    stiffness: Floats
+    """(n, n_segments, n_k, 3) diag K, n_k 1 or 2 n_steps + 1 [N m^2]; see `resolve`."""
+    precurvature: Floats
+    """(n, n_segments, n_k, 3) u*, material frame [1/m]."""
+    tip_force: Floats
+    """(n, 3) [N]."""
+    tip_moment: Floats
+    """(n, 3) [N m]."""
+    line_force: Floats
+    """(n, n_segments, n_f, 3) [N/m]."""
+    n_steps: int
+    """Read: integration steps of a segment."""
+    tip_position: Floats = field(default_factory=_none)
+    """SENSING only: (n, 3) base frame [m]."""
+    tip_rotation: Floats = field(default_factory=_none)
+    """SENSING only: (n, 3, 3) base_from_tip."""
+    points: Floats = field(default_factory=_none)
+    """SENSING only: (n, k, 3) further measured points, base frame [m]."""
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def dl(self) -> Floats:
+        """(n, n_tendons) wire lengths against the straight rest robot [m], a new array."""
+        return self.tendon_length - self.rest_length
+
+    def bend(self) -> Floats:
+        """(n, n_segments, 2) bend about d1 and d2 that the wires ask for now [rad], a new array."""
+        return self.wiring.bend(self.dl)
+
+    def common(self) -> Floats:
+        """(n, n_segments) change of length that the wires of a segment share, beyond that of the segment before [m]."""
+        odd = self.dl - self.wiring.wires(self.bend())
+        ends = np.zeros((len(odd), self.wiring.n_segments))
+        for k in range(self.wiring.n_segments):
+            if (own := self.wiring.tendon_segment == k).any():
+                ends[:, k] = odd[:, own].mean(1)
+            elif k:
+                ends[:, k] = ends[:, k - 1]
+        return np.diff(ends, axis=1, prepend=0.0)
+
+    def shift_bend(self, change: Floats) -> None:
+        """Let the wires ask for another bend: (n, n_segments, 2) [rad] more."""
+        self.tendon_length += self.wiring.wires(change)
+
+    def shift_wires(self, change: Floats) -> None:
+        """Change wire lengths by (n, n_tendons) [m], the part of it that bends.
+
+        A change that all wires of a segment share would be taken up by tendons and backbone; between stiff wires and an
+        incompressible rod it would only be tension without bound.
+        """
+        self.shift_bend(self.wiring.bend(change))
+
+    def resolve(self) -> None:
+        """Give `stiffness` and `precurvature` a value at every half step, n_k = 2 n_steps + 1: the kernel wants both alike."""
+        n_k = 2 * self.n_steps + 1
+        for name in ("stiffness", "precurvature"):
+            port = getattr(self, name)
+            setattr(self, name, np.array(np.broadcast_to(port, (*port.shape[:2], n_k, 3)), order="C"))
+
+    @property
+    def fraction(self) -> Floats:
+        """(2 n_steps + 1,) s / l at every half step."""
+        return np.linspace(0.0, 1.0, 2 * self.n_steps + 1)
+
+    def add_line_force(self, force: Floats) -> None:
+        """Add (n, n_segments, 3) [N/m], uniform over each segment."""
+        self.line_force += force[:, :, None, :]
+
+
+def _rows(a: Floats, n: int) -> Floats:
+    return np.array(np.broadcast_to(a, (n, *a.shape[1:])), order="C")
+
+
+def open_ports(
+    ports: Ports,
+    params: Params,
+    wiring: Wiring,
+    *,
+    n: int,
+    rest_length: Floats,
+    gravity: Floats,
+    base_rotation: Floats,
+    time: Floats,
+    n_steps: int,
+) -> EffectPorts:
+    """The ports of a step with a row for each of `n` robots, ready to be changed."""
+    return EffectPorts(
+        wiring=wiring,
+        rest_length=rest_length,
+        gravity=np.broadcast_to(gravity, (n, 3)),
+        base_rotation=np.broadcast_to(base_rotation, (n, 3, 3)),
+        time=np.broadcast_to(time, (n,)),
+        tendon_length=_rows(ports.tendon_length, n),
+        extension=_rows(ports.extension, n),
+        offset=_rows(params.offset, n),
+        compliance=_rows(params.compliance, n),
+        stiffness=_rows(ports.stiffness, n),
+        precurvature=_rows(ports.precurvature, n),
+        tip_force=_rows(ports.tip_force, n),
+        tip_moment=_rows(ports.tip_moment, n),
+        line_force=_rows(ports.line_force, n),
+        n_steps=n_steps,
+    )
+
+
+def close_ports(opened: EffectPorts, ports: Ports, params: Params) -> tuple[Ports, Params]:
+    """What the kernel reads, from ports that effects have changed."""
+    return (
+        ports._replace(
+            tendon_length=opened.tendon_length,
+            extension=opened.extension,
+            stiffness=np.ascontiguousarray(opened.stiffness),
+            precurvature=np.ascontiguousarray(opened.precurvature),
+            tip_force=opened.tip_force,
+            tip_moment=opened.tip_moment,
+            line_force=np.ascontiguousarray(opened.line_force),
+        ),
+        params._replace(offset=opened.offset, compliance=opened.compliance),
+    )

@@ -1,0 +1,1 @@
+"""What no library has: learned from a residual, and kept apart."""

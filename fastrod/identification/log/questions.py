@@ -1,0 +1,230 @@
+"""Is this a log of this robot? What a user who mixed up units, signs, order, frame or time should be asked, before any fit.
+
+The model as the robot file has it is laid beside some hundred rows: as it is, seen by a camera that stands elsewhere, seen in a
+left-handed frame, and with other inputs. Where another reading follows the measurement far better, that is the question.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fastrod.identification.log.forward import Pose, Rod, Samples, predict, sample
+from fastrod.identification.log.registration import Registration, align, size
+from fastrod.identification.log.unknowns import known_model
+from fastrod.logs.runlog import RunLog
+from fastrod.model.robot import Robot
+from fastrod.rotation import matrix_from_quaternion
+from fastrod.types import Floats, Ints
+
+_ROWS = 300  # rows that are looked at
+_LEAST = 12  # of them solved; fewer say nothing
+_FOLLOWS = 0.45  # of the motion: a reading that leaves less follows it; 0.55 mm of backlash left 0.18
+_BETTER = 0.6  # of what is left otherwise: less is another reading's merit
+_LEVER = 0.3  # robot lengths: what a measured rotation counts beside positions
+_STILL = 0.01  # robot lengths: a log that moves less says nothing
+_FURTHER = 1.1  # times the motion: what is left of a model that moves otherwise
+_SCALES = {
+    1e-3: "mm to m", 1e-2: "cm to m", 0.1: "a decimal place", 0.0254: "inches to m", np.pi / 180.0: "degrees to radians",
+    0.5: "a diameter for a radius", 2.0: "a radius for a diameter", 10.0: "a decimal place", 1e3: "converted twice",
+}  # fmt: skip
+_AS_GOOD = 1.3  # times what a moved camera leaves
+_RIGHT = "Are the units, the signs (negative = pulled) and the order of the dl_ columns right, and is it this robot?"
+_PACE = 1.0  # s from row to row; a dense log that takes longer has its time in another unit
+_DENSE = 0.1  # of the motion from row to row
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """What a first look says of a log."""
+
+    registration: Registration | None
+    """Of a camera that stands far from where the robot file says; None where it does not, or where nothing would follow from it."""
+    questions: tuple[str, ...]
+    """What to ask the user, a sentence each."""
+    refusal: str
+    """Why nothing can be identified, in a sentence; empty where it may."""
+    guess: str
+    """Which other reading the model would follow, in a sentence; empty where none."""
+
+
+def questions(log: RunLog, robot: Robot, *, threads: int | None = None) -> tuple[str, ...]:
+    """What `log` makes one ask about its units, signs, order, frame and time; nothing where it fits `robot`."""
+    if int(log.measured.sum()) < _LEAST:
+        return ()
+    samples = sample(log)
+    reading = read(samples, robot, threads=threads)
+    moved = () if reading.registration is None else (f"{reading.registration.sentence()}; fastrod identify takes it from there.",)
+    return (*moved, *reading.questions)
+
+
+def read(samples: Samples, robot: Robot, *, threads: int | None = None) -> Reading:
+    """Look at the rows of `samples`; nothing is fitted but where the camera stands."""
+    late = time_question(samples)
+    asked = [late] if late else []
+    look = _Look(samples, robot, threads)
+    nothing = Reading(registration=None, questions=tuple(asked), refusal="", guess="")
+    frame, far = look.frame, look.frame.is_large(robot.length)
+    as_it_is = look.as_it_is if far else min(look.as_it_is, frame.left)  # a small misalignment is for the search to name
+    if look.motion < _STILL * robot.length or not (look.solved or robot.n_tendons):
+        return nothing
+    if as_it_is < _FOLLOWS * look.motion and not far:
+        return nothing
+    enough = min(_FOLLOWS * look.motion, _BETTER * as_it_is)
+    moved = far and frame.left < enough
+    tried = [(look.with_inputs(dl), words) for dl, words in _other_inputs(samples, robot, look.scale)]
+    left, words = min(tried, default=(np.inf, ""))
+    mixed_up = left < enough
+    if mixed_up and moved:  # a rotation about the base's axis looks like other signs or another order: then the columns are asked for
+        mixed_up = left < _AS_GOOD * frame.left and not _declared(robot, frame)
+    mirrored = look.mirrored.left < min(enough, _BETTER * frame.left)
+    if mirrored and mixed_up:
+        mirrored = look.mirrored.left < _BETTER * left
+    guess = ""
+    if mirrored:
+        guess = "In a left-handed frame the model would follow: is an axis of the camera reversed, or are two of them exchanged?"
+    elif mixed_up:
+        times = f" {as_it_is / left:.0f} times as closely" if np.isfinite(as_it_is) else ""
+        guess = f"The model would follow{times} with {words}."
+        if moved:
+            turn = f"{np.degrees(frame.angle):.0f} deg"
+            guess += f" A camera turned by {turn} would look the same: if yours is, give [sensor] registration_sd in the robot file."
+    further = look.centred > _FURTHER * look.motion and not (moved and not guess)
+    name = samples.log.name
+    refusal = ""
+    if further:
+        asked.append(further_than_still(samples, robot, look.scale, guess))
+    elif guess:
+        asked.append(f"log {name!r} fits robot {robot.name!r} badly. {guess}" + ("" if mirrored else f" {_RIGHT}"))
+    if mirrored or (guess and further and "times" not in words):
+        refusal = asked[-1]
+    return Reading(registration=frame if moved and not guess else None, questions=tuple(asked), refusal=refusal, guess=guess)
+
+
+def further_than_still(samples: Samples, robot: Robot, scale: float, guess: str = "") -> str:
+    """The question to a user whose model moves otherwise than the measurement, `scale` times as predicted along with it."""
+    moves = f"it moves {scale:.2g} times as predicted" if np.isfinite(scale) else "the model cannot be solved for its inputs"
+    return (
+        f"log {samples.log.name!r} is further from robot {robot.name!r} than from a robot that stands still: {moves}. {_RIGHT}"
+        f"{' ' if guess else ''}{guess}"
+    )
+
+
+def time_question(samples: Samples) -> str:
+    """Whether the time of a dense log is in another unit; empty where it is not."""
+    steps = samples.dt[samples.dt > 0.0]
+    tip = np.asarray(samples.log.tip_position)[samples.rows]
+    if len(steps) < _LEAST or len(tip) < _LEAST:
+        return ""
+    pace = float(np.median(steps))
+    motion = size(tip - np.median(tip, axis=0))
+    if pace < _PACE or size(np.diff(tip, axis=0)) > _DENSE * motion:
+        return ""
+    name, last = samples.log.name, float(samples.time.max())
+    return f"log {name!r} has a row every {pace:.3g} s and lasts {last:.3g} s; is column t in ms? It takes seconds."
+
+
+class _Look:
+    """The model as the robot file has it beside some rows of a log."""
+
+    def __init__(self, samples: Samples, robot: Robot, threads: int | None) -> None:
+        rows = samples.rows
+        if len(rows) > _ROWS:
+            rows = rows[np.linspace(0, len(rows) - 1, _ROWS).round().astype(int)]
+        log = samples.log.rows(rows)
+        with_points = log.points is not None and len(robot.log_points) > 0
+        self.samples, self.robot, self.model = samples.on(rows), robot, known_model(robot)
+        self.rod = Rod(self.samples, robot, points=with_points, threads=threads)
+        self.tip = np.asarray(log.tip_position)
+        self.points = log.points if with_points and log.points is not None else np.zeros((len(rows), 0, 3))
+        self.turned = np.zeros(len(rows), bool) if log.tip_quaternion is None else np.isfinite(log.tip_quaternion).all(1)
+        self.turn = np.eye(3)[None] if log.tip_quaternion is None else matrix_from_quaternion(np.nan_to_num(log.tip_quaternion, nan=0.5))
+        self.motion = size(self.tip - np.median(self.tip, axis=0))
+        """[m]."""
+        pose = self._pose(np.asarray(samples.log.dl))
+        self.solved = int(pose.ok.sum()) >= max(_LEAST, len(rows) // 2)  # of inputs in another unit the rests are solved
+        self.as_it_is = self.centred = np.inf
+        """Distance that the model leaves as it is, and with both motions about their middles [m]."""
+        self.scale = np.nan
+        """How much of the predicted motion is measured."""
+        self.frame = self.mirrored = Registration(rotation=np.eye(3), shift=np.zeros(3), left=np.inf)
+        if self.solved:
+            seen, made = self.tip[pose.ok], pose.position[pose.ok]
+            self.as_it_is = size(seen - made)
+            moves, moved = seen - np.median(seen, axis=0), made - np.median(made, axis=0)
+            self.centred = size(moves - moved)
+            self.scale = float((moves * moved).sum() / max(float((moved**2).sum()), 1e-30))
+            self.frame, self.mirrored = (self._aligned(pose, mirrored=mirrored) for mirrored in (False, True))
+
+    def with_inputs(self, dl: Floats) -> float:
+        """Distance that other inputs would leave [m], with a camera that may stand where the search still finds it."""
+        pose = self._pose(dl)
+        if int(pose.ok.sum()) < max(_LEAST, len(pose.ok) // 2):
+            return float("inf")
+        frame = self._aligned(pose)
+        return frame.left if not frame.is_large(self.robot.length) else size((self.tip - pose.position)[pose.ok])
+
+    def _pose(self, dl: Floats) -> Pose:
+        samples = replace(self.samples, log=replace(self.samples.log, dl=dl))
+        return predict(self.model, self.model.start, samples, self.rod)
+
+    def _aligned(self, pose: Pose, *, mirrored: bool = False) -> Registration:
+        """The camera that lays a prediction on what was measured; its `left` is that of the tips."""
+        both = pose.ok & np.isfinite(self.points).all((1, 2))
+        seen = np.concatenate([self.tip[pose.ok], self.points[both].reshape(-1, 3)])
+        made = np.concatenate([pose.position[pose.ok], pose.points[both].reshape(-1, 3)])
+        rows = pose.ok & self.turned
+        turns = self.turn[rows] @ np.swapaxes(pose.rotation[rows], 1, 2) if rows.any() and not mirrored else None
+        found = align(seen, made, turns=turns, lever=_LEVER * self.robot.length, mirrored=mirrored)
+        return replace(found, left=size((self.tip - pose.position @ found.rotation.T - found.shift)[pose.ok]))
+
+
+def _declared(robot: Robot, found: Registration) -> bool:
+    """Whether the robot file's [sensor] allows for a camera that is turned so far."""
+    given = robot.sensor.get("registration_sd", 0.0)
+    turn = float(given[1]) if isinstance(given, (tuple, list)) else float(given)
+    return found.angle < 3.0 * turn
+
+
+def _other_inputs(samples: Samples, robot: Robot, scale: float) -> Iterator[tuple[Floats, str]]:
+    """Tendon lengths (n, n_tendons) as they may have been meant, and how in words."""
+    dl = np.asarray(samples.log.dl)
+    n = dl.shape[1]
+    if not n or not np.ptp(dl, axis=0).any():
+        return
+    yield -dl, "the sign of every dl_ reversed"
+    groups = [np.flatnonzero(np.asarray(robot.tendon_segment) == k) for k in range(robot.n_segments)]
+    orders: dict[tuple[int, ...], str] = {}
+    for order, words in _orders(n, groups):
+        orders.setdefault(tuple(order), words)
+    for columns, words in orders.items():
+        if columns != tuple(range(n)):
+            yield dl[:, list(columns)], words
+    for factor, words in _SCALES.items():
+        fewer = not np.isfinite(scale) or scale < 1.0  # a rod that bends far moves less than in proportion: not the very factor
+        if (factor < 1.0) == fewer and factor * float(np.abs(dl).max()) < robot.length:
+            yield factor * dl, f"every dl_ times {factor:.4g} ({words})"
+
+
+def _orders(n: int, groups: list[Ints]) -> Iterator[tuple[list[int], str]]:
+    """Orders of the dl_ columns that people mix up, and how in words."""
+    for i in range(n - 1):
+        order = list(range(n))
+        order[i], order[i + 1] = i + 1, i
+        yield order, f"dl_{i + 1} and dl_{i + 2} exchanged"
+    for group in groups:
+        if len(group) == 4:  # antagonists
+            for i, j in ((group[0], group[2]), (group[1], group[3])):
+                order = list(range(n))
+                order[i], order[j] = int(j), int(i)
+                yield order, f"dl_{i + 1} and dl_{j + 1} exchanged"
+    sizes = [len(group) for group in groups if len(group)]
+    for step in range(1, max(sizes, default=1)):
+        order = [int(group[(k + step) % len(group)]) for group in groups for k in range(len(group))]
+        yield order, f"the dl_ columns of each segment moved on by {step}"
+    yield [int(i) for group in groups for i in group[::-1]], "the dl_ columns of each segment in reverse"
+    yield list(range(n))[::-1], "the dl_ columns in reverse"
+    if len(sizes) > 1 and len(set(sizes)) == 1:
+        yield [int(i) for group in groups[::-1] for i in group], "the segments in reverse"

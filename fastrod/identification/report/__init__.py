@@ -1,0 +1,1 @@
+"""What is said: verdict, figures, page, files."""

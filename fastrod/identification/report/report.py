@@ -1,0 +1,197 @@
+"""What `identify` found, for machines, for the browser and for the terminal: report.json, report.html, identified.toml, a table."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fastrod.identification.log.registration import Registration
+from fastrod.identification.log.replay import make_folder
+from fastrod.identification.report.headline import explained
+from fastrod.identification.report.page import page
+from fastrod.identification.report.result import Error, Result
+from fastrod.identification.report.wording import VERDICTS, millimetres, percent, plain_name, with_error, words
+from fastrod.identification.search.solve import Estimate
+from fastrod.model.robotfile import save_robot
+
+if TYPE_CHECKING:
+    from rich.console import Group
+
+
+def to_json(result: Result) -> dict[str, Any]:
+    """The result as plain data, SI units; what is not a number is None."""
+    audit = result.remaining
+    names, matrix = result.correlation
+    made: dict[str, Any] = {
+        "log": result.log.name,
+        "robot": result.robot.name,
+        "n_samples": int(result.measured.sum()),
+        "held_out": list(result.held_out),
+        "noise_floor_m": result.noise.floor,
+        "noise": {"sigma_m": result.noise.sigma, "lag1": result.noise.lag1, "how": result.noise.how},
+        "error": {
+            "train": _error(result.train),
+            "held_out": {**_error(result.test), "interval_m": list(result.test.interval)},
+        },
+        "verdict": result.verdict,
+        "summary": result.summary,
+        "effects": [
+            {
+                "name": found.name,
+                "title": found.title,
+                "parameters": _estimates(found.parameters),
+                "held_out_gain": found.held_out_gain,
+                "evidence": dict(found.evidence),
+                "cannot_be_told_from": list(found.cannot_be_told_from),
+            }
+            for found in result.effects
+        ],
+        "base_parameters": _estimates(result.base_parameters),
+        "registration": _registration(result.registration),
+        "correlation": {"names": list(names), "matrix": matrix},
+        "remaining": {
+            "structured_fraction": result.remaining_share,
+            "kind": result.remaining_kind,
+            "patterns": list(result.patterns),
+            "shares": {key: getattr(audit, key) for key in ("static", "memory", "drift", "exogenous")},
+        },
+        "patterns": list(result.patterns),
+        "path": [{"name": s.name, "train_rms_m": s.train, "held_out_rms_m": s.held_out} for s in result.path],
+        "candidates": [
+            {
+                "name": t.name,
+                "kind": t.kind,
+                "held_out_rms_m": t.held_out_rms,
+                "score": t.score,
+                "bic_gain": t.bic_gain,
+                "kept": t.kept,
+                "why": t.why,
+            }
+            for t in result.tried
+        ],
+        "bounds": [{"name": b.name, "parameter": b.parameter, "unit": b.unit, "value": b.value} for b in result.bounds],
+        "advice": list(result.advice),
+        "notes": list(result.notes),
+        "solves": result.solves,
+    }
+    if result.network:
+        made["network"] = dict(result.network)
+    plain: dict[str, Any] = _plain(made)
+    return plain
+
+
+def text(result: Result) -> str:
+    """report.json."""
+    return json.dumps(to_json(result), indent=1, ensure_ascii=False, allow_nan=False)
+
+
+def write(result: Result, out_dir: str | Path) -> list[Path]:
+    """Write report.json, report.html and identified.toml into `out_dir`, each whole or not at all; the paths written."""
+    out = make_folder(out_dir)
+    written = []
+    for name, make in (("report.json", text), ("report.html", page)):
+        path = out / name
+        part = path.with_name(f"{name}.part")
+        content = make(result) + "\n"
+        try:
+            part.write_text(content, encoding="utf-8")
+            part.replace(path)
+        except OSError:
+            if part.is_file():
+                part.unlink()
+            raise
+        written.append(path)
+    save_robot(result.identified, out / "identified.toml")
+    return [*written, out / "identified.toml"]
+
+
+def table(result: Result) -> Group:
+    """Verdict, errors, effects and advice for the terminal, 80 columns wide at most."""
+    from rich import box
+    from rich.console import Group
+    from rich.markup import escape
+    from rich.table import Table
+    from rich.text import Text
+
+    colour = {"none": "green", "explained": "green", "not_in_library": "red"}.get(result.verdict, "yellow")
+    title = Text.assemble((f" {VERDICTS[result.verdict]} ", f"bold reverse {colour}"), f" {result.log.name} on {result.robot.name}")
+    errors = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 2, 0, 0), title=escape("tip error, rms [mm]"), title_justify="left")
+    for name in ("", "before", "after", "95 % interval", "noise floor"):
+        errors.add_column(name, justify="right" if name else "left")
+    floor = millimetres(result.noise.floor)
+    low, high = (millimetres(v) for v in result.test.interval)
+    errors.add_row("train", millimetres(result.train.before), millimetres(result.train.after), "", floor)
+    errors.add_row("held out", millimetres(result.test.before), millimetres(result.test.after), f"{low} to {high}", floor, style="bold")
+    parts: list[Any] = [title, Text(result.summary), Text(), errors]
+    if result.effects:
+        grid = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 2, 0, 0), title="what the model lacked", title_justify="left")
+        for name in ("effect", "parameter", "estimate", "note"):
+            grid.add_column(name, overflow="fold")
+        for found in result.effects:
+            label = words(found.name)
+            for name, e in found.parameters.items():
+                note = " ".join(filter(None, ("at bound" if e.at_bound else "", e.why)))
+                grid.add_row(escape(label), escape(words(name)), escape(with_error(e.value, e.stderr, e.unit)), escape(note))
+                label = ""
+        share = explained(result)
+        if math.isfinite(share):
+            grid.caption = f"{percent(max(share, 0.0))} of the held-out error above the noise is explained"
+            grid.caption_justify = "left"
+        parts.append(grid)
+    lines = [
+        f"{words(f.name)} cannot be told from {', '.join(map(words, f.cannot_be_told_from))} on this log"
+        for f in result.effects
+        if f.cannot_be_told_from
+    ]
+    lines += [f"not identifiable: {plain_name(name)}, {e.why}" for name, e in result.base_parameters.items() if not e.identifiable]
+    lines += [f"remains: {pattern}" for pattern in result.patterns if result.effects]
+    lines += [f"note: {note}" for note in result.notes] + [f"run next: {line}" for line in result.advice]
+    return Group(*parts, *(Text(f"- {line}") for line in lines))
+
+
+def _error(error: Error) -> dict[str, float]:
+    return {"before_rms_m": error.before, "after_rms_m": error.after}
+
+
+def _registration(camera: Registration | None) -> dict[str, Any] | None:
+    """Where a camera stands that was far from where the robot file says; None where it was not."""
+    if camera is None:
+        return None
+    return {"angle_rad": camera.angle, "distance_m": camera.distance, "rotation": camera.rotation, "shift_m": camera.shift}
+
+
+def _estimates(every: Mapping[str, Estimate]) -> dict[str, Any]:
+    return {
+        name: {
+            "value": e.value,
+            "stderr": e.stderr,
+            "unit": e.unit,
+            "identifiable": e.identifiable,
+            "why": e.why,
+            "prior_sd": e.prior_sd,
+            "at_bound": e.at_bound,
+        }
+        for name, e in every.items()
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Dicts, lists, strings, numbers, and None for what is not finite."""
+    if isinstance(value, dict):
+        return {str(key): _plain(inner) for key, inner in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [_plain(inner) for inner in value]
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else None
+    return value

@@ -1,0 +1,136 @@
+"""What identification found, as data: every table and figure of the report is drawn from a `Result`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from fastrod.identification.log.noise import Noise
+from fastrod.identification.log.registration import Registration
+from fastrod.identification.search.model_selection import Bound
+from fastrod.identification.search.residual_test import Audit
+from fastrod.identification.search.solve import Estimate
+from fastrod.logs.runlog import RunLog
+from fastrod.model.robot import Robot
+from fastrod.types import Flags, Floats
+
+Verdict = Literal["none", "explained", "partly_explained", "ambiguous", "not_in_library"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Found:
+    """An effect that the model lacked."""
+
+    name: str
+    title: str
+    parameters: Mapping[str, Estimate]
+    held_out_gain: float
+    """Share of the held-out error (mean square above the noise) that goes with it: what is lost when it is taken out again."""
+    evidence: Mapping[str, float]
+    """z over held-out blocks, BIC, share of the loss, when it was added."""
+    cannot_be_told_from: Sequence[str]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tried:
+    """A candidate of the first stage."""
+
+    name: str
+    held_out_rms: float
+    """Cross-validated on blocks of the training data, distance [m]; nan where it was not fitted."""
+    score: float
+    """z over those blocks."""
+    bic_gain: float
+    kept: bool
+    why: str
+    kind: str
+    """`effect`, or the kind of a foil."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Error:
+    """Distance between measured and predicted tip, root mean square [m]."""
+
+    before: float
+    after: float
+    interval: tuple[float, float]
+    """95 % interval of `after`, from blocks."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """One point of the path from before to after."""
+
+    name: str
+    """Of the effect that was added; `base` for the first."""
+    train: float
+    held_out: float
+    """Distance rms [m]."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Result:
+    """Everything that `identify` found. Lengths in metres, base frame."""
+
+    log: RunLog
+    """The driven samples in order of time."""
+    robot: Robot
+    """Nominal."""
+    identified: Robot
+    """With the fitted parameters and the found effects."""
+    held_out: Sequence[str]
+    """What was held out, in words."""
+    noise: Noise
+    measured: Flags
+    """(n,) samples with a measured tip."""
+    used: Flags
+    """(n,) samples that were fitted."""
+    tested: Flags
+    """(n,) samples that were held out."""
+    outlier: Flags
+    """(n,)."""
+    before: Floats
+    """(n, 3) tip of the base model with its own parameters fitted."""
+    after: Floats
+    """(n, 3) tip of the identified model."""
+    train: Error
+    test: Error
+    verdict: Verdict
+    summary: str
+    """The verdict in a sentence or two."""
+    effects: Sequence[Found]
+    base_parameters: Mapping[str, Estimate]
+    correlation: tuple[Sequence[str], Floats]
+    """Names and (p, p) correlations of all fitted numbers."""
+    remaining: Audit
+    remaining_kind: str
+    """none | static | memory | drift | unknown."""
+    remaining_share: float
+    """Of the mean square error above the noise that the base model left."""
+    patterns: Sequence[str]
+    """What the remaining structure looks like, where a pattern outside the library fits it."""
+    tried: Sequence[Tried]
+    path: Sequence[Stage]
+    bounds: Sequence[Bound]
+    advice: Sequence[str]
+    notes: Sequence[str]
+    """What is odd about this log."""
+    solves: int
+    """Batches of the rod that the search took."""
+    registration: Registration | None = None
+    """Where the camera stands from where the robot file says, fitted; None where it stood near enough for the search."""
+    network: Mapping[str, float] = field(default_factory=dict)
+    """Held-out rms with a network on what is left, where one was asked for."""
+
+    @property
+    def residual_before(self) -> Floats:
+        """(n, 3) measured - predicted [m]; nan where nothing was measured."""
+        return np.asarray(self.log.tip_position - self.before)
+
+    @property
+    def residual_after(self) -> Floats:
+        """(n, 3) measured - predicted [m]."""
+        return np.asarray(self.log.tip_position - self.after)

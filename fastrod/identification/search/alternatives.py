@@ -1,0 +1,214 @@
+"""What no effect of the library is: patterns that a residual may have for reasons outside the model.
+
+Each foil is a few linear columns, some of them found by a scan. They compete with the effects on the same terms; where one
+wins, the verdict is that the cause is not in the library, and of which kind it is. They are never part of "after".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from fastrod.identification.search.linearised import Local
+from fastrod.types import Floats
+
+_LONG = 20.0  # s, of a run in which something can happen
+_TIMES = 48  # change points tried
+_FREQUENCIES = (0.08, 3.0)  # Hz, of a line
+_NARROW = 4.0  # lines tried per 1 / duration
+
+
+@dataclass(frozen=True, eq=False)
+class Foil:
+    """A pattern, fitted by its columns."""
+
+    name: str
+    kind: str
+    """static, memory, drift or exogenous."""
+    what: str
+    """A sentence on what it looks like."""
+    columns: Floats
+    """(n, n_out, k) over sigma."""
+    n_hidden: int
+    """Parameters that a scan has chosen, beside the k amplitudes."""
+
+
+def foils(local: Local, tangent: Floats, residual: Floats) -> list[Foil]:
+    """The best of each family for a residual (n, n_out) that `tangent` (n, n_out, p) can absorb part of."""
+    solver = _Projected(tangent, residual)
+    found = []
+    families = [_ripple(local), _contact(local), _attraction(local), _patch(local)]
+    if all(local.samples.time[part].max() > _LONG for part in local.samples.runs):  # short runs have no history of their own
+        families += [_bump(local), _slip(local), _sway(local, residual)]
+    for family in families:
+        best: tuple[float, Foil] | None = None
+        for foil in family:
+            loss = solver.loss(foil.columns)
+            if best is None or loss < best[0]:
+                best = loss, foil
+        if best is not None:
+            found.append(best[1])
+    return found
+
+
+class _Projected:
+    """Least-squares losses of many column sets beside one tangent space."""
+
+    def __init__(self, tangent: Floats, residual: Floats) -> None:
+        flat = tangent.reshape(residual.size, tangent.shape[-1])
+        self._q = np.linalg.qr(flat)[0] if flat.shape[1] else np.zeros((residual.size, 0))
+        r = residual.ravel()
+        self._r = r - self._q @ (self._q.T @ r)
+        self.start = float(self._r @ self._r)
+
+    def loss(self, columns: Floats) -> float:
+        C = columns.reshape(len(self._r), -1)
+        C = C - self._q @ (self._q.T @ C)
+        gram = C.T @ C
+        b = C.T @ self._r
+        ridge = 1e-9 * np.trace(gram) + 1e-12
+        return self.start - float(b @ np.linalg.solve(gram + ridge * np.eye(len(gram)), b))
+
+
+def _sensed(local: Local, change: Floats) -> Floats:
+    """(n, n_out, k) weighted columns of changes of the seen tip (n, 3, k) [m]."""
+    return _weighted(local, np.concatenate([change, np.zeros((len(change), 3 + 3 * local.pose.points.shape[1], change.shape[2]))], axis=1))
+
+
+def _weighted(local: Local, change: Floats) -> Floats:
+    """(n, n_out, k) weighted from changes of the pose (n, 6 + 3k', k)."""
+    target = local.target
+    parts = [change[:, :3] / target.sigma[:, None]]
+    if target.rotation is not None:
+        parts.append(change[:, 3:6] / target.rotation_sigma)
+    if target.points.shape[1]:
+        parts.append(change[:, 6:] / np.tile(target.sigma, target.points.shape[1])[:, None])
+    return np.asarray(np.concatenate(parts, axis=1) * (target.weight > 0.0)[:, None, None])
+
+
+def _log_time(local: Local) -> Floats:
+    """(n_rows,) time, runs one after the other [s]."""
+    samples = local.samples
+    return np.cumsum(samples.dt)[samples.rows]
+
+
+def _when(local: Local, at: float) -> str:
+    """A moment of `_log_time` in the log's own time, with its run where there are several."""
+    samples = local.samples
+    row = int(samples.rows[int(np.argmax(_log_time(local) > at))])
+    run = f" of run {str(samples.log.run[row])!r}" if len(samples.runs) > 1 else ""
+    return f"{samples.log.t[row]:.1f} s{run}"
+
+
+def _bump(local: Local) -> Iterator[Foil]:
+    t = _log_time(local)
+    for at in np.quantile(t, np.linspace(0.03, 0.97, _TIMES)):
+        step = (t > at).astype(float)
+        columns = _sensed(local, step[:, None, None] * np.eye(3)[None])
+        yield Foil("bump", "drift", f"the measured tip jumps at {_when(local, at)} and stays: base or camera was moved", columns, 1)
+
+
+def _slip(local: Local) -> Iterator[Foil]:
+    if not local.model.wiring.n_tendons:
+        return
+    t = _log_time(local)
+    wiring = local.model.wiring
+    for at in np.quantile(t, np.linspace(0.03, 0.97, _TIMES)):
+        step = (t > at).astype(float)
+        for drive in range(wiring.n_drives):
+            pull = np.where(wiring.drive == drive, wiring.drive_sign, 0.0)
+            columns = _weighted(local, (local.by_bend @ wiring.bend(pull).ravel() * step[:, None])[..., None])
+            yield Foil("slip", "drift", f"the zero of drive {drive + 1} jumps at {_when(local, at)}: its wire slipped", columns, 2)
+
+
+def _sway(local: Local, residual: Floats) -> Iterator[Foil]:
+    t = _log_time(local)
+    duration = float(np.ptp(t))
+    if duration < 4.0 or len(t) < 32:
+        return
+    step = float(np.median(np.diff(t)))
+    top = min(_FREQUENCIES[1], 0.45 / max(step, 1e-9))
+    frequencies = np.arange(_FREQUENCIES[0], top, 1.0 / (_NARROW * duration))
+    if not len(frequencies):
+        return
+    wave = np.exp(-2j * np.pi * frequencies[:, None] * t[None])
+    power = (np.abs(wave @ residual[:, :3]) ** 2).sum(1)
+    for f in frequencies[np.argsort(power)[::-1][:3]]:
+        for fine in f + np.array([-0.5, 0.0, 0.5]) / (_NARROW * duration):
+            angle = 2.0 * np.pi * fine * t
+            both = np.stack([np.sin(angle), np.cos(angle)], axis=1)
+            columns = _sensed(local, (both[:, None, :, None] * np.eye(3)[None, :, None, :]).reshape(len(t), 3, 6))
+            yield Foil("sway", "exogenous", f"a line at {fine:.3f} Hz that no input has: the base or the camera sways", columns, 1)
+
+
+def _ripple(local: Local) -> Iterator[Foil]:
+    wiring = local.model.wiring
+    if not local.model.wiring.n_tendons:
+        return
+    dl = local.bench.dl[local.samples.rows]
+    span = float(np.ptp(dl, axis=0).max())
+    if span <= 0.0:
+        return
+    for wavelength in span / np.arange(0.75, 16.0, 0.25):
+        parts = []
+        for drive in range(wiring.n_drives):
+            pull = np.where(wiring.drive == drive, wiring.drive_sign, 0.0)
+            angle = 2.0 * np.pi * dl[:, int(np.flatnonzero(wiring.drive == drive)[0])] / wavelength
+            response = local.by_bend @ wiring.bend(pull).ravel()
+            parts += [response * np.sin(angle)[:, None], response * np.cos(angle)[:, None]]
+        yield Foil(
+            "ripple", "static", f"periodic in the wires with {1e3 * wavelength:.2f} mm: an eccentric drum or a gear",
+            _weighted(local, np.stack(parts, axis=-1)), 1,
+        )  # fmt: skip
+
+
+def _contact(local: Local) -> Iterator[Foil]:
+    """One-sided push along n where the tip goes beyond a plane n . x = c."""
+    tip = local.pose.position
+    angle = np.arange(24) * np.pi / 12.0
+    directions = [np.array([np.cos(a) * c, np.sin(a) * c, z]) for a, (c, z) in product(angle, ((1.0, 0.0), (0.8, -0.6)))]
+    for n in directions:
+        along = tip @ n
+        for share in (0.5, 0.65, 0.75, 0.85, 0.93):
+            beyond = np.maximum(along - np.quantile(along, share), 0.0)
+            if beyond.max() <= 0.0:
+                continue
+            columns = _sensed(local, (beyond[:, None] * n)[..., None])
+            yield Foil(
+                "contact",
+                "static",
+                f"one-sided, where the tip goes beyond a plane towards {np.round(n, 2).tolist()}: it touches something",
+                columns,
+                3,
+            )
+
+
+def _attraction(local: Local) -> Iterator[Foil]:
+    """A force towards a fixed point, as a magnet's."""
+    tip = local.pose.position
+    reach = float(np.quantile(np.linalg.norm(tip - tip.mean(0), axis=1), 0.98)) + 1e-9
+    base = local.bench.base_rotation
+    for a, far, height in product(np.arange(12) * np.pi / 6.0, (1.2, 1.6, 2.2), (-0.4, 0.2)):
+        place = tip.mean(0) + reach * np.array([far * np.cos(a), far * np.sin(a), height])
+        way = place - tip
+        d2 = (way**2).sum(1) + (0.3 * reach) ** 2
+        force = way / d2[:, None] ** 1.5 * reach**2
+        world = np.einsum("nij,nj->ni", np.broadcast_to(base, (len(tip), 3, 3)), force)
+        columns = _weighted(local, np.einsum("nij,nj->ni", local.by_force, world)[..., None])
+        yield Foil(
+            "attraction", "static", f"a pull towards a point near {np.round(1e3 * place).tolist()} mm: a magnet or a spring", columns, 4
+        )
+
+
+def _patch(local: Local) -> Iterator[Foil]:
+    """Something in one corner of the workspace only."""
+    tip = local.pose.position[:, :2]
+    reach = float(np.quantile(np.linalg.norm(tip - tip.mean(0), axis=1), 0.98)) + 1e-9
+    for a, far, width in product(np.arange(12) * np.pi / 6.0, (0.5, 1.0), (0.35, 0.6)):
+        place = tip.mean(0) + reach * far * np.array([np.cos(a), np.sin(a)])
+        near = np.exp(-0.5 * ((tip - place) ** 2).sum(1) / (width * reach) ** 2)
+        columns = _sensed(local, near[:, None, None] * np.eye(3)[None])
+        yield Foil("patch", "static", f"confined to the workspace around {np.round(1e3 * place).tolist()} mm", columns, 3)

@@ -1,0 +1,242 @@
+"""The model near one parameter vector: wires, loads and camera exactly, the rod by its slopes.
+
+A candidate effect changes the rod's inputs by little. So the rod is solved once at a reference, and once for each
+direction that its inputs can take; after that a candidate costs no rod at all. What is accepted is solved exactly.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from fastrod.effects.base import Seam, get_effect, has_memory
+from fastrod.identification.log.forward import Pose, Rod, Samples, bench, chain_of
+from fastrod.identification.log.unknowns import Model, Unknown, effect_unknowns
+from fastrod.identification.search.solve import Fit, minimise
+from fastrod.rotation import matrix_from_quaternion
+from fastrod.types import Flags, Floats
+
+_BEND = 2e-3  # rad, step of the slopes by bend
+_FORCE = 2e-3  # of EI / l^2, step of the slopes by tip force
+
+
+class Target:
+    """What was measured at the rows, and how much each number counts."""
+
+    def __init__(self, samples: Samples, sigma: Floats, *, rotation_sigma: float, points: bool) -> None:
+        log = samples.log.rows(samples.rows)
+        self.tip = np.asarray(log.tip_position)
+        quaternion = log.tip_quaternion
+        self.rotation = None if quaternion is None or not np.isfinite(quaternion).all() else matrix_from_quaternion(quaternion)
+        self.points = log.points if points and log.points is not None else np.zeros((len(log), 0, 3))
+        self.seen = np.isfinite(self.points)
+        self.sigma, self.rotation_sigma = sigma, rotation_sigma
+        self.weight = np.ones(len(log))
+        """(n,) 0 for outliers."""
+
+    def residual(self, pose: Pose) -> Floats:
+        """(n, n_out) measured - predicted over sigma: tip, rotation vector, points; 0 for rows that do not count."""
+        parts = [(self.tip - pose.position) / self.sigma]
+        if self.rotation is not None:
+            turn = self.rotation @ np.swapaxes(pose.rotation, 1, 2)
+            parts.append(_vector(turn) / self.rotation_sigma)
+        if self.points.shape[1]:
+            parts.append((np.where(self.seen, self.points - pose.points, 0.0) / self.sigma).reshape(len(self.tip), -1))
+        every = np.concatenate(parts, axis=1)
+        return np.asarray(np.where((self.weight > 0.0)[:, None] & pose.ok[:, None], every, 0.0))
+
+
+def _vector(turn: Floats) -> Floats:
+    """(n, 3) rotation vector of rotations that are small (exact to third order)."""
+    skew = 0.5 * np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=1)
+    sine = np.linalg.norm(skew, axis=1, keepdims=True)
+    angle = np.arctan2(sine, 0.5 * (np.trace(turn, axis1=1, axis2=2)[:, None] - 1.0))
+    return np.asarray(skew * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-9), 1.0))
+
+
+def _turned(rotation: Floats, vector: Floats) -> Floats:
+    half = 0.5 * np.linalg.norm(vector, axis=1)
+    quaternion = np.column_stack([np.cos(half), 0.5 * np.sinc(half / np.pi)[:, None] * vector])
+    return matrix_from_quaternion(quaternion) @ rotation
+
+
+class Local:
+    """The model `model` at `theta`, and all models near it."""
+
+    def __init__(self, model: Model, theta: Floats, samples: Samples, rod: Rod, target: Target) -> None:
+        self.model, self.theta, self.samples, self.rod, self.target = model, theta.copy(), samples, rod, target
+        self.robot = model.robot_at(theta)
+        self.bench = bench(samples, self.robot, model.wiring)
+        self.chain = chain_of(model, theta)
+        self.opened = self.bench.drive(self.chain)
+        self.pose = rod.solve(*self.bench.kernel(self.opened), self.robot)
+        self._kept = rod.keep()
+        self._columns: dict[tuple[str, ...], Floats] = {}
+        light = [link for link, name in zip(self.chain, model.effects, strict=True) if self.is_light(name)]
+        at = self.bench.drive(light)
+        self._length, self._force = at.tendon_length.copy(), at.tip_force.copy()
+
+    def _difference(self, pose: Pose) -> Floats:
+        """(n, 6 + 3k) from the reference: tip, rotation vector, points."""
+        turn = pose.rotation @ np.swapaxes(self.pose.rotation, 1, 2)
+        points = (pose.points - self.pose.points).reshape(len(turn), -1)
+        return np.concatenate([pose.position - self.pose.position, _vector(turn), points], axis=1)
+
+    def _solved(self, length: Floats | None = None, force: Floats | None = None) -> Floats:
+        opened = self.opened
+        before = opened.tendon_length, opened.tip_force
+        if length is not None:
+            opened.tendon_length = length
+        if force is not None:
+            opened.tip_force = force
+        self.rod.back(self._kept)
+        pose = self.rod.solve(*self.bench.kernel(opened), self.robot, self.pose.ok)
+        opened.tendon_length, opened.tip_force = before
+        return np.where(self.pose.ok[:, None], self._difference(pose), 0.0)
+
+    @cached_property
+    def by_bend(self) -> Floats:
+        """(n, 6 + 3k, 2 n_segments) per rad."""
+        wiring = self.model.wiring
+        every = []
+        for j in range(2 * wiring.n_segments if wiring.n_tendons else 0):
+            change = np.zeros((1, wiring.n_segments, 2))
+            change.reshape(-1)[j] = _BEND
+            every.append(self._solved(length=self.opened.tendon_length + wiring.wires(change)) / _BEND)
+        return np.stack(every, axis=-1) if every else np.zeros((len(self.samples.rows), 6 + 3 * self.pose.points.shape[1], 0))
+
+    @cached_property
+    def by_force(self) -> Floats:
+        """(n, 6 + 3k, 3) per N, world."""
+        step = _FORCE * min(min(s.bending_stiffness) for s in self.robot.segments) / self.robot.length**2
+        return np.stack([self._solved(force=self.opened.tip_force + step * np.eye(3)[j]) / step for j in range(3)], axis=-1)
+
+    def is_light(self, name: str) -> bool:
+        """Whether an effect changes only wire lengths, the tip force or the camera: then no rod need be solved for it."""
+        what = get_effect(name)
+        if has_memory(what) or what.seam is Seam.SENSING:
+            return True
+        key = ("light", name)
+        if key not in self._columns_kind:
+            self._columns_kind[key] = self._probe(name)
+        return self._columns_kind[key]
+
+    _columns_kind: dict[tuple[str, str], bool] = {}  # noqa: RUF012  # a fact about each effect, not about this object
+
+    def _probe(self, name: str) -> bool:
+        what, opened = get_effect(name), self.bench.open()
+        unknowns = effect_unknowns(name, self.model.wiring)
+        values = Model(self.model.robot, self.model.wiring, (name,), unknowns).values(np.array([u.outside(u.start) for u in unknowns]))[
+            name
+        ]
+        before = {
+            key: getattr(opened, key).copy()
+            for key in ("extension", "offset", "compliance", "stiffness", "precurvature", "tip_moment", "line_force")
+        }
+        what.apply(np.broadcast_to(values, (len(opened), len(values))), np.empty((len(opened), 0)), opened, None, 0.0)
+        return all(np.array_equal(getattr(opened, key), old) for key, old in before.items())
+
+    def _is_light(self, unknown: Unknown) -> bool:
+        return unknown.place[0] == "effect" and self.is_light(unknown.place[1])
+
+    def column(self, unknown: Unknown) -> Floats:
+        """(n, 6 + 3k) change of the true pose per unit of an unknown that needs the rod, one-sided difference at the reference."""
+        if unknown.place not in self._columns:
+            step = unknown.scale
+            model, theta = self.model, self.theta
+            if unknown.place[0] == "effect" and unknown.place[1] not in model.effects:
+                model = model.with_effect(unknown.place[1])
+                model = Model(model.robot, model.wiring, model.effects, (*self.model.unknowns, unknown))
+                theta = np.append(theta, unknown.mean)
+            names = [u.place for u in model.unknowns]
+            j = names.index(unknown.place)
+            moved = theta.copy()
+            here = unknown.inside(float(theta[j]))
+            if here + step > unknown.bounds[1]:
+                step = -step
+            moved[j] = unknown.outside(here + step)
+            robot = model.robot_at(moved)
+            place = self.bench if unknown.place[0] == "effect" else bench(self.samples, robot, model.wiring)
+            self.rod.back(self._kept)
+            pose = self.rod.solve(*place.kernel(place.drive(chain_of(model, moved))), robot, self.pose.ok)
+            self._columns[unknown.place] = np.where(pose.ok[:, None], self._difference(pose) / step, 0.0)
+        return self._columns[unknown.place]
+
+    def driven(self, model: Model, theta: Floats) -> Floats:
+        """(n, 6 + 3k) change of the true pose by wires and tip forces."""
+        light = [link for link, name in zip(chain_of(model, theta), model.effects, strict=True) if self.is_light(name)]
+        opened = self.bench.drive(light)
+        change = np.zeros((len(opened), 6 + 3 * self.pose.points.shape[1]))
+        moved = opened.tendon_length - self._length
+        if moved.any():
+            change += np.einsum("nij,nj->ni", self.by_bend, self.model.wiring.bend(moved).reshape(len(opened), -1))
+        force = opened.tip_force - self._force
+        if force.any():
+            change += np.einsum("nij,nj->ni", self.by_force, force)
+        return change
+
+    def solved(self, model: Model, theta: Floats) -> Floats:
+        """(n, 6 + 3k) change of the true pose by what needs the rod."""
+        at = {u.place: u.inside(float(v)) for u, v in zip(self.model.unknowns, self.theta, strict=True)}
+        change = np.zeros((len(self.samples.rows), 6 + 3 * self.pose.points.shape[1]))
+        for unknown, number in zip(model.unknowns, theta, strict=True):
+            if not self._is_light(unknown):
+                change += self.column(unknown) * (unknown.inside(float(number)) - at.get(unknown.place, unknown.mean))
+        return change
+
+    def seen(self, model: Model, theta: Floats, change: Floats) -> Pose:
+        """What the camera sees after a change (n, 6 + 3k) of the true pose: tip [m], rotation vector [rad], points [m], base frame."""
+        rotation = self.pose.rotation
+        links = [link for link in chain_of(model, theta) if link[0].seam is Seam.SENSING]
+        if links or self.target.rotation is not None:
+            rotation = _turned(rotation, change[:, 3:6])
+        points = self.pose.points + change[:, 6:].reshape(self.pose.points.shape)
+        return self.bench.see(Pose(self.pose.position + change[:, :3], rotation, points, self.pose.ok), links)
+
+    def residual(self, model: Model, theta: Floats) -> Floats:
+        """(n, n_out) weighted."""
+        return self.target.residual(self.seen(model, theta, self.driven(model, theta) + self.solved(model, theta)))
+
+    def slopes(self, model: Model, theta: Floats, residual: Floats) -> Floats:
+        """(n, n_out, p) of the prediction, by differences that run only what an unknown moves."""
+        driven, solved = self.driven(model, theta), self.solved(model, theta)
+        J = np.empty((*residual.shape, len(theta)))
+        low, high = model.limits
+        for j, unknown in enumerate(model.unknowns):
+            step = 1e-4 if unknown.log else 1e-3 * unknown.scale
+            if unknown.shape or (unknown.place[0] == "effect" and has_memory(get_effect(unknown.place[1]))):
+                step *= 20.0  # operators have corners: look over them
+            if theta[j] + step > high[j]:
+                step = -step
+            moved = theta.copy()
+            moved[j] += step
+            change = driven + solved
+            if not self._is_light(unknown):
+                change = change + self.column(unknown) * (unknown.inside(float(moved[j])) - unknown.inside(float(theta[j])))
+            elif get_effect(unknown.place[1]).seam is not Seam.SENSING:
+                change = self.driven(model, moved) + solved
+            J[..., j] = (residual - self.target.residual(self.seen(model, moved, change))) / step
+        assert low.shape == high.shape
+        return J
+
+    def fit(self, model: Model, start: Floats, iterations: int) -> Fit:
+        """The best parameters near here, from `start` (p,) on, within the model's limits and under its priors."""
+        mean, sd = model.prior
+        return minimise(
+            lambda theta: self.residual(model, theta),
+            lambda theta, r: self.slopes(model, theta, r),
+            start,
+            mean,
+            sd,
+            model.limits,
+            iterations,
+        )
+
+
+def exact_residual(model: Model, theta: Floats, samples: Samples, rod: Rod, target: Target) -> tuple[Floats, Flags]:
+    """(n, n_out) weighted residual with the rod solved, and (n,) which rows converged."""
+    from fastrod.identification.log.forward import predict
+
+    pose = predict(model, theta, samples, rod)
+    return target.residual(pose), pose.ok

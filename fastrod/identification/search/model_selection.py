@@ -1,0 +1,127 @@
+"""What speaks for a candidate: the states that the search compares, and the rules by which one is taken, a rival, or needless."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fastrod.identification.log.unknowns import Model
+from fastrod.identification.search.alternatives import Foil
+from fastrod.identification.search.linearised import Local
+from fastrod.identification.search.solve import Fit, bic, effective_size, paired
+from fastrod.types import Floats
+
+Z_ACCEPT, BIC_ACCEPT, SHARE_ACCEPT = 3.0, 10.0, 0.006
+Z_STRONG, BIC_STRONG = 1.7, 60.0  # an effect that shows in a few blocks only, but there beyond doubt
+Z_BLOCKS, SHARE_BLOCKS = 3.5, 0.03  # or one that block after block confirms, where a smooth residual is worth few samples
+Z_RIVAL, BIC_RIVAL = 2.0, 10.0
+Z_KEEP, BIC_KEEP, SHARE_KEEP = 2.0, 6.0, 0.015
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """A model with its fit: what is accepted so far."""
+
+    model: Model
+    local: Local
+    fit: Fit
+    """Of the unknowns, then of the accepted foils' amplitudes."""
+    losses: Floats
+    """(N_BLOCKS,) held out."""
+    foils: tuple[Foil, ...] = ()
+
+    @property
+    def theta(self) -> Floats:
+        """(p,) fitted numbers of the model's unknowns, without the foils' amplitudes."""
+        return self.fit.theta[: len(self.model.unknowns)]
+
+    @property
+    def columns(self) -> Floats:
+        """(n, n_out, k) of the accepted foils."""
+        shape = (*self.fit.residual.shape, 0)
+        return np.concatenate([np.zeros(shape), *(f.columns for f in self.foils)], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """An effect, or a foil, beside a state."""
+
+    name: str
+    state: State | None
+    """With the candidate accepted; None where it was not fitted."""
+    z: float
+    """Of the gain over held-out blocks."""
+    bic_gain: float
+    share: float
+    """Of the loss that it takes away."""
+    n_parameters: int
+    why: str
+    """Why it is not the one, in a sentence."""
+    foil: Foil | None = None
+
+    @property
+    def passes(self) -> bool:
+        """It was fitted, and nothing speaks against it."""
+        return self.state is not None and not self.why
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One stage of the search: who ran, who was taken."""
+
+    before: State
+    candidates: tuple[Candidate, ...]
+    taken: Candidate | None
+    rivals: tuple[str, ...] = ()
+    """Effects that explain this stage as well as the one that was taken."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bound:
+    """The size from which an effect would have shown."""
+
+    name: str
+    parameter: str
+    unit: str
+    value: float
+    """nan: no size shows in this log."""
+
+
+def advantage(one: Candidate, other: Candidate) -> float:
+    """BIC by which one candidate is better than the other, with the effective samples of the one that leaves less."""
+    assert one.state is not None
+    assert other.state is not None
+    losses = one.state.fit.loss, other.state.fit.loss
+    size = effective_size((one if losses[0] <= losses[1] else other).state.fit.residual)  # type: ignore[union-attr]
+    return bic(losses[1], other.n_parameters, size) - bic(losses[0], one.n_parameters, size)
+
+
+def best_of(candidates: Sequence[Candidate]) -> Candidate | None:
+    """The winner by `advantage`, compared one after the other; of equals the first, None of none. All must have been fitted."""
+    best: Candidate | None = None
+    for candidate in candidates:
+        if best is None or advantage(candidate, best) > 0.0:
+            best = candidate
+    return best
+
+
+def z_between(one: Candidate, other: Candidate) -> float:
+    """z over held-out blocks of one candidate's gain on the other."""
+    assert one.state is not None
+    assert other.state is not None
+    return paired(other.state.losses, one.state.losses)
+
+
+def unphysical(state: State, name: str) -> str:
+    """Why an effect's parameters cannot be, or nothing."""
+    sizes = []
+    for unknown, number, at_bound in zip(state.model.unknowns, state.fit.theta, state.fit.at_bound, strict=False):
+        if unknown.place[:2] != ("effect", name) or unknown.shape:
+            continue
+        value = unknown.inside(float(number))
+        sizes.append(abs(value - unknown.mean))
+        if at_bound and value != unknown.mean:
+            return f"its {unknown.name.partition('.')[2]} would be {value:.3g} {unknown.unit}, at the bound of what is physical"
+    return "" if any(size > 0.0 for size in sizes) else "its best size is zero"

@@ -1,0 +1,144 @@
+"""What of a residual follows from anything that is known: inputs now, inputs before, or time; without naming a cause.
+
+Ridge regression on general features, judged on blocks that it has not seen. The shares are increments: static features
+first, then those with memory, then time. What follows from none of them and is still not noise is a signal from outside.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fastrod.identification.log.forward import Samples
+from fastrod.identification.search.solve import paired
+from fastrod.model.routing import Wiring
+from fastrod.types import Floats, Ints
+
+_RANDOM = 60  # Fourier features
+_PLAYS = (0.03, 0.1, 0.25, 0.5)  # of the largest bend
+_LAGS = (0.3, 1.5, 6.0, 25.0)  # s
+_PIECES = 60  # blocks that the folds take in turn
+_RIDGES = (1.0, 30.0, 1000.0)
+
+
+@dataclass(frozen=True)
+class Audit:
+    """Shares of the residual's variance that held-out blocks confirm."""
+
+    static: float
+    memory: float
+    drift: float
+    exogenous: float
+    """Autocorrelation that no input, memory or time explains, as a share of the variance."""
+    z: float
+    """How sure it is that there is any structure, over blocks."""
+
+    @property
+    def structured(self) -> float:
+        """Share of the variance that is no noise."""
+        return min(1.0, self.static + self.memory + self.drift + self.exogenous)
+
+    @property
+    def kind(self) -> str:
+        """The largest share; `none` where there is no structure."""
+        parts = {"static": self.static, "memory": self.memory, "drift": self.drift, "unknown": self.exogenous}
+        name = max(parts, key=lambda key: parts[key])
+        return name if self.structured > 0.0 and parts[name] > 0.0 else "none"
+
+
+def audit(samples: Samples, wiring: Wiring, residual: Floats, noise_lag1: float = 0.0, n_blocks: int = 10) -> Audit:
+    """Audit a residual (n_rows, n_out) in order of time, on `n_blocks` folds of short blocks."""
+    variance = float((residual**2).sum())
+    block = np.arange(len(residual)) * _PIECES // max(len(residual), 1) % n_blocks
+    if variance <= 0.0 or n_blocks < 3:
+        return Audit(0.0, 0.0, 0.0, 0.0, 0.0)
+    static, memory, drift = features(samples, wiring)
+    losses: list[Floats] = [np.asarray(np.bincount(block, weights=(residual**2).sum(1), minlength=n_blocks), dtype=np.float64)]
+    columns = np.zeros((len(residual), 0))
+    left = residual
+    shares = []
+    for more in (static, memory, drift):
+        columns = np.concatenate([columns, more], axis=1)
+        loss, rest = _ridge(columns, residual, block, n_blocks)
+        gain = losses[-1] - loss
+        if gain.sum() > 0.0 and paired(losses[-1], loss) > 2.5:
+            shares.append(float(gain.sum()) / variance)
+            losses.append(loss)
+            left = rest
+        else:
+            shares.append(0.0)
+    order = np.diff(samples.rows) <= max(1.0, 1.5 * float(np.median(np.diff(samples.rows))) if len(samples.rows) > 1 else 1.0)
+    pair = float((left[1:] * left[:-1])[order].sum()) / max(float((left**2).sum()), 1e-300)
+    beyond = max(0.0, pair - max(noise_lag1, 0.0)) if len(left) > 50 else 0.0
+    exogenous = beyond * float((left**2).sum()) / variance if beyond > 4.0 / np.sqrt(max(left.size, 1)) + 0.02 else 0.0
+    z = paired(losses[0], losses[-1]) if len(losses) > 1 else 0.0
+    return Audit(shares[0], shares[1], shares[2], exogenous, float(max(z, beyond * np.sqrt(left.size))))
+
+
+def _ridge(features: Floats, residual: Floats, block: Ints, n_blocks: int) -> tuple[Floats, Floats]:
+    """Held-out loss of each block, and the held-out rest, at the best of a few ridges."""
+    X = np.column_stack([np.ones(len(features)), features])
+    gram, moment = X.T @ X, X.T @ residual
+    own = [(X[block == k], residual[block == k]) for k in range(n_blocks)]
+    best: tuple[float, Floats, Floats] | None = None
+    for ridge in _RIDGES:
+        losses, rest = np.zeros(n_blocks), residual.copy()
+        for k, (x, r) in enumerate(own):
+            if not len(x):
+                continue
+            weights = np.linalg.solve(gram - x.T @ x + ridge * np.eye(len(gram)), moment - x.T @ r)
+            left = r - x @ weights
+            losses[k] = float((left**2).sum())
+            rest[block == k] = left
+        if best is None or losses.sum() < best[0]:
+            best = float(losses.sum()), losses, rest
+    assert best is not None
+    return best[1], best[2]
+
+
+def features(samples: Samples, wiring: Wiring) -> tuple[Floats, Floats, Floats]:
+    """Static, memory and time features (n_rows, any), each of about unit size."""
+    log, rows = samples.log, samples.rows
+    bend = wiring.bend(np.asarray(log.dl)).reshape(len(log), -1) if wiring.n_tendons else np.zeros((len(log), 0))
+    top = max(float(np.abs(bend).max(initial=0.0)), 1e-9)
+    b = bend / top
+    others = [np.asarray(a).reshape(len(log), -1) for a in (log.ext, log.tip_force, log.payload, log.base_quaternion) if a is not None]
+    more = np.concatenate(others, axis=1) if others else np.zeros((len(log), 0))
+    more = (more - more.mean(0)) / np.maximum(more.std(0), 1e-9) * (np.ptp(more, axis=0) > 1e-9)
+    more = more[:, np.ptp(more, axis=0) > 0.0]
+    rng = np.random.default_rng(0)
+    static = [b, more]
+    now = np.concatenate([b, 0.5 * more], axis=1)
+    for i in range(now.shape[1]):
+        static += [now[:, i : i + 1] * now[:, i:]]
+    static += [b[:, i : i + 1] * b[:, j : j + 1] * b[:, j:] for i in range(b.shape[1]) for j in range(i, b.shape[1])]
+    if now.shape[1]:
+        for width in (1.5, 5.0):
+            direction = width * rng.normal(size=(now.shape[1], _RANDOM // 2))
+            static.append(np.cos(now @ direction + rng.uniform(0.0, 2.0 * np.pi, _RANDOM // 2)))
+    memory = [_memory(b[part], samples.dt[part]) for part in samples.runs]
+    t = np.cumsum(samples.dt)
+    t = t / max(float(t[-1]), 1e-9)
+    drift = np.stack([f(np.pi * k * t) for k in range(1, 7) for f in (np.sin, np.cos)] + [t, t**2], axis=1)
+    return np.concatenate(static, axis=1)[rows], np.concatenate(memory)[rows], drift[rows]
+
+
+def _memory(b: Floats, dt: Floats) -> Floats:
+    """Plays of four widths, low-passes of four time constants, velocity, its sign, acceleration of bends (n, 2 n_segments)."""
+    from fastrod.kernels.operators import play, relaxation
+
+    if not b.shape[1]:
+        return np.zeros((len(b), 0))
+    found = []
+    for width in _PLAYS:
+        x = b[None].copy()
+        play(x, np.full((1, 3 * b.shape[1]), np.nan), np.full((1, b.shape[1]), width), np.zeros((1, b.shape[1])))
+        found.append((b - x[0]) / width)
+    for lag in _LAGS:
+        x = b[None].copy()
+        relaxation(x, np.full((1, 2 * b.shape[1]), np.nan), np.ones((1, b.shape[1])), np.full((1, b.shape[1]), lag), dt)
+        found.append(2.0 * (b - x[0]))
+    velocity = np.diff(b, axis=0, prepend=b[:1]) / np.maximum(dt, 1e-3)[:, None]
+    found += [velocity, np.tanh(velocity / 0.05), np.diff(velocity, axis=0, prepend=velocity[:1])]
+    return np.concatenate(found, axis=1)

@@ -1,0 +1,392 @@
+"""The search for what the model lacks: fit every candidate beside what is known, judge it on blocks it has not seen, keep the
+best, ask again.
+
+Every candidate starts from the same reference, weights and outlier mask. Foils (`foils`) compete on the same terms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import product
+
+import numpy as np
+
+from fastrod.effects.base import effect_names, get_effect
+from fastrod.identification.log.forward import Rod, Samples
+from fastrod.identification.log.unknowns import Model
+from fastrod.identification.search.alternatives import Foil, foils
+from fastrod.identification.search.linearised import Local, Target
+from fastrod.identification.search.model_selection import (
+    BIC_ACCEPT,
+    BIC_KEEP,
+    BIC_RIVAL,
+    BIC_STRONG,
+    SHARE_ACCEPT,
+    SHARE_BLOCKS,
+    SHARE_KEEP,
+    Z_ACCEPT,
+    Z_BLOCKS,
+    Z_KEEP,
+    Z_RIVAL,
+    Z_STRONG,
+    Bound,
+    Candidate,
+    State,
+    Step,
+    advantage,
+    best_of,
+    unphysical,
+    z_between,
+)  # fmt: skip
+from fastrod.identification.search.solve import Fit, bic, effective_size, held_out_losses, minimise, paired
+from fastrod.types import Floats, Ints
+
+N_BLOCKS = 20
+MOST_PASSES = 4000.0
+"""Of each row, on the average, after which nothing new is tried. A log with two effects took 390."""
+_STARTS = 8
+_SCREEN = 0.003  # of the loss: a candidate whose slopes promise less is not fitted
+_FEW, _MANY = 3, 12  # iterations of a start, and of the best of them
+_REFINED = 6  # candidates that are solved exactly at each stage
+_NEAR = 3.0  # times what the best leaves, or less than it takes: others are not worth an exact solution
+_CLOSE = 200.0  # BIC to the best within which a candidate is solved once more
+_FOIL_SD = 30.0  # of a foil's amplitude, in units of its own columns' size that would explain all
+
+
+@dataclass
+class Search:
+    """Samples, weights and blocks that all candidates share."""
+
+    samples: Samples
+    rod: Rod
+    target: Target
+    block: Ints
+    """(n,) number of each row's block, 0 to N_BLOCKS - 1; one block at a time is held out."""
+    excluded: frozenset[str] = frozenset()
+    report: Callable[[str], None] = field(default=lambda _: None)
+
+    def start(self, model: Model, theta: Floats, iterations: int = 6) -> State:
+        """The state of a model without anything found, linearised twice: at `theta` (p,), and where the fit from there ends."""
+        local = Local(model, theta, self.samples, self.rod, self.target)
+        fit = self._fit(local, model, theta, np.zeros((0,)), (), iterations)
+        return self.refined(self._state(model, local, fit, ()))
+
+    def refined(self, state: State, iterations: int = 4) -> State:
+        """The same with the rod solved at the state's own parameters."""
+        local = Local(state.model, state.theta, self.samples, self.rod, self.target)
+        fit = self._fit(local, state.model, state.theta, state.fit.theta[len(state.theta) :], state.foils, iterations)
+        if not np.isfinite(fit.loss):
+            return state
+        return self._state(state.model, local, fit, state.foils)
+
+    def again(self, state: State) -> State:
+        """A state of other samples, fitted to these; foils, which belong to their samples, are left behind."""
+        local = Local(state.model, state.theta, self.samples, self.rod, self.target)
+        return self.refined(self._state(state.model, local, self._fit(local, state.model, state.theta, np.zeros(0), (), 6), ()))
+
+    def _state(self, model: Model, local: Local, fit: Fit, found: tuple[Foil, ...]) -> State:
+        losses = held_out_losses(fit.residual, fit.slopes, fit.precision, self.block, N_BLOCKS)
+        return State(model, local, fit, losses, found)
+
+    def _fit(self, local: Local, model: Model, theta: Floats, amplitudes: Floats, found: Sequence[Foil], iterations: int) -> Fit:
+        """The best parameters near `local`, with the amplitudes of foils as further linear unknowns."""
+        n = len(model.unknowns)
+        mean, sd = model.prior
+        low, high = model.limits
+        if not found:
+            return local.fit(model, theta, iterations)
+        columns = np.concatenate([f.columns for f in found], axis=-1)
+        size = np.sqrt((columns**2).sum((0, 1)))
+        wide = _FOIL_SD * np.sqrt(local.residual(model, theta).size) / np.maximum(size, 1e-12)
+        k = columns.shape[-1]
+        free = np.full(k, np.inf)
+
+        def residual(both: Floats) -> Floats:
+            return local.residual(model, both[:n]) - columns @ both[n:]
+
+        def slopes(both: Floats, at: Floats) -> Floats:
+            own = local.slopes(model, both[:n], at + columns @ both[n:])
+            return np.concatenate([own, columns], axis=-1)
+
+        return minimise(
+            residual, slopes, np.concatenate([theta, amplitudes]), np.concatenate([mean, np.zeros(k)]),
+            np.concatenate([sd, wide]), (np.concatenate([low, -free]), np.concatenate([high, free])), iterations,
+        )  # fmt: skip
+
+    @property
+    def spent(self) -> bool:
+        """Whether the rod was solved so often that nothing new is to be tried."""
+        return self.rod.cost > MOST_PASSES
+
+    # ------------------------------------------------------------ candidates
+
+    def candidate(self, state: State, name: str) -> Candidate:
+        """An effect fitted beside a state, from each of its starts; not fitted once the search has `spent` its passes."""
+        if self.spent:
+            return Candidate(name, None, 0.0, 0.0, 0.0, 0, "not tried: the model hardly converges on this log")
+        drop = self._unseen(state, name)
+        every = state.model.with_effect(name)
+        added = every.unknowns[len(state.model.unknowns) :]
+        labels = [u.name.partition(".")[2] for u in added]
+        sizes = [label for label, u in zip(labels, added, strict=True) if not u.shape]
+        if all(label in drop for label in sizes):
+            return Candidate(
+                name,
+                None,
+                0.0,
+                0.0,
+                0.0,
+                0,
+                "this log does not excite it: " + (getattr(get_effect(name), "excited_by", "") or "no response"),
+            )
+        model = state.model.with_effect(name, drop=drop)
+        fits = self._from_starts(state, model, name)
+        if fits is None:
+            return Candidate(name, None, 0.0, 0.0, 0.0, len(model.unknowns) - len(state.model.unknowns), "its slopes promise nothing")
+        return self.judged(state, self._state(model, state.local, fits, state.foils), name)
+
+    def _unseen(self, state: State, name: str) -> list[str]:
+        """Size parameters of an effect that this log does not move at all: left at neutral."""
+        model = state.model.with_effect(name)
+        n = len(state.model.unknowns)
+        theta = np.concatenate([state.theta, model.start[n:]])
+        at_zero = theta.copy()
+        for j, u in enumerate(model.unknowns[n:], n):
+            if not u.shape:
+                at_zero[j] = u.mean
+        base = state.local.residual(model, at_zero)
+        unseen = []
+        for j, u in enumerate(model.unknowns[n:], n):
+            if u.shape:
+                continue
+            moved = at_zero.copy()
+            moved[j] = np.clip(u.mean + u.scale, *u.limits)
+            if float(((state.local.residual(model, moved) - base) ** 2).sum()) < 4.0:
+                unseen.append(u.name.partition(".")[2])
+        return unseen
+
+    def _from_starts(self, state: State, model: Model, name: str) -> Fit | None:
+        local, n = state.local, len(state.model.unknowns)
+        added = model.unknowns[n:]
+        starts = {p.name: p.on(model.wiring).starts for p in get_effect(name).parameters}
+        # per-segment and per-drive columns share their parameter's starts
+        own = [
+            starts[next(key for key in sorted(starts, key=len, reverse=True) if u.name.partition(".")[2].startswith(key))] for u in added
+        ]
+        grouped = list(dict.fromkeys(tuple(s) for s in own))
+        combos = list(product(*grouped))[: 2 * _STARTS]
+        combos = combos if len(combos) <= _STARTS else combos[:: -(-len(combos) // _STARTS)]
+        amplitudes = state.fit.theta[n:]
+        best: Fit | None = None
+        promising = []
+        for combo in combos:
+            pick = dict(zip(grouped, combo, strict=True))
+            theta = np.concatenate(
+                [state.theta, [u.outside(float(np.clip(pick[tuple(s)], *u.bounds))) for u, s in zip(added, own, strict=True)]]
+            )
+            promise = self._promise(state, model, theta)
+            promising.append((promise, theta))
+        promising.sort(key=lambda pair: -pair[0])
+        if promising[0][0] < _SCREEN * state.fit.loss:
+            return None
+        for _, theta in promising[:3]:
+            fit = self._fit(local, model, theta, amplitudes, state.foils, _FEW)
+            if best is None or fit.loss < best.loss:
+                best = fit
+        assert best is not None
+        return self._fit(local, model, best.theta[: len(model.unknowns)], best.theta[len(model.unknowns) :], state.foils, _MANY)
+
+    def _promise(self, state: State, model: Model, theta: Floats) -> float:
+        """Loss that the response to the new parameters could take away at best, beside what the others can absorb."""
+        n = len(state.model.unknowns)
+        at = state.local.residual(model, theta) - (state.columns @ state.fit.theta[n:] if state.foils else 0.0)
+        shift = (state.fit.residual - at).reshape(-1, 1)  # the response at the start itself: operators have no slope at neutral
+        base = state.fit.slopes.reshape(shift.shape[0], state.fit.slopes.shape[-1])
+        J = np.concatenate([base, shift], axis=1)
+        sizes = [j for j, u in enumerate(model.unknowns) if j >= n and not u.shape]
+        if len(sizes) > 1:
+            neutral = theta.copy()
+            columns = []
+            for j in sizes:
+                moved = neutral.copy()
+                moved[j] = model.unknowns[j].mean
+                columns.append(
+                    (state.local.residual(model, moved) - (state.columns @ state.fit.theta[n:] if state.foils else 0.0) - at).ravel()
+                )
+            J = np.concatenate([J, np.stack(columns, axis=1)], axis=1)
+        r = state.fit.residual.ravel()
+        gram = J.T @ J + np.diag(np.concatenate([state.fit.precision, np.full(J.shape[1] - base.shape[1], 1e-9)]))
+        b = J.T @ r
+        b[: base.shape[1]] = np.minimum(np.abs(b[: base.shape[1]]), 0.0)  # the base is at its minimum, priors and all
+        return float(b @ np.linalg.lstsq(gram, b, rcond=1e-12)[0])
+
+    def judged(self, state: State, with_it: State, name: str, foil: Foil | None = None) -> Candidate:
+        """A candidate's evidence against the state without it."""
+        k = len(with_it.fit.theta) - len(state.fit.theta) + (foil.n_hidden if foil else 0)
+        size = effective_size(with_it.fit.residual)
+        gain = bic(state.fit.loss, 0, size) - bic(with_it.fit.loss, k, size)
+        z = paired(state.losses, with_it.losses)
+        share = 1.0 - with_it.fit.loss / state.fit.loss
+        why = "" if foil else unphysical(with_it, name)
+        evident = (z > Z_ACCEPT and gain > BIC_ACCEPT) or (z > Z_STRONG and gain > BIC_STRONG) or (z > Z_BLOCKS and share > SHARE_BLOCKS)
+        if not why and not (share > SHARE_ACCEPT and evident):
+            why = f"no gain on held-out blocks (z {z:.1f}, BIC {gain:.0f}, {100 * share:.1f} % of the loss)"
+        return Candidate(name, with_it, z, gain, share, k, why, foil)
+
+    def foil_candidates(self, state: State) -> list[Candidate]:
+        """The best foil of each family beside a state, linear in everything."""
+        made = []
+        for foil in foils(state.local, state.fit.slopes, state.fit.residual):
+            columns = np.where(np.isfinite(foil.columns), foil.columns, 0.0)  # a row without a shape tells nothing
+            slopes = np.concatenate([state.fit.slopes, columns], axis=-1)
+            flat = slopes.reshape(-1, slopes.shape[-1])
+            precision = np.concatenate([state.fit.precision, np.full(foil.columns.shape[-1], 1e-9)])
+            H = flat.T @ flat + np.diag(precision)
+            b = flat.T @ state.fit.residual.ravel()
+            b[: len(state.fit.theta)] = 0.0
+            step = np.linalg.lstsq(H, b, rcond=1e-12)[0]
+            residual = state.fit.residual - slopes @ step
+            theta = np.concatenate([state.fit.theta, np.zeros(foil.columns.shape[-1])]) + step
+            fit = Fit(theta, residual, slopes, precision, (*state.fit.at_bound, *(False,) * foil.columns.shape[-1]))
+            with_it = State(
+                state.model, state.local, fit, held_out_losses(residual, slopes, precision, self.block, N_BLOCKS), (*state.foils, foil)
+            )
+            made.append(self.judged(state, with_it, foil.name, foil))
+        return made
+
+    # ------------------------------------------------------------ stages
+
+    def names(self, state: State) -> list[str]:
+        """Effects that may be tried."""
+        single = state.model.wiring.n_segments < 2
+        driven = state.model.wiring.n_tendons > 0
+        return [
+            name for name in effect_names()
+            if name not in state.model.effects and name not in self.excluded and not (name == "coupling" and single)
+            and (driven or get_effect(name).seam.name != "ACTUATION")
+        ]  # fmt: skip
+
+    def stage(self, state: State, *, with_foils: bool = True) -> Step:
+        """Try everything beside `state`; take the best, if any passes."""
+        tried = []
+        for name in self.names(state):
+            self.report(name)
+            tried.append(self.candidate(state, name))
+        return self.choose(state, tried, with_foils=with_foils)
+
+    def choose(self, state: State, tried: list[Candidate], *, with_foils: bool) -> Step:
+        """Solve the promising ones exactly, then take the best by evidence; foils only where they beat it clearly."""
+        fitted = sorted((c for c in tried if c.state is not None and c.z > 1.0 and c.share > SHARE_ACCEPT), key=lambda c: -c.share)
+        most = fitted[0].share if fitted else 0.0
+        near = [c for c in fitted if 1.0 - c.share < _NEAR * (1.0 - most) and c.share > most / _NEAR][:_REFINED]
+        heavy = [c for c in fitted if not state.local.is_light(c.name) and c.share > 0.6 * most]  # of these even the fit so far is linear
+        exact = {}
+        for candidate in dict.fromkeys([*near, *heavy]):
+            assert candidate.state is not None
+            exact[candidate.name] = self.judged(state, self.refined(candidate.state), candidate.name)
+        best = best_of([c for c in exact.values() if c.state is not None and c.share > SHARE_ACCEPT])
+        for name, candidate in exact.items():
+            if best is not None and candidate.state is not None and advantage(best, candidate) < _CLOSE:
+                exact[name] = self.judged(state, self.refined(candidate.state), name)
+        tried = [exact.get(c.name, c) for c in tried]
+        passing = [c for c in tried if c.passes]
+        best = best_of(passing)
+        foil = None
+        if with_foils:
+            others = self.foil_candidates(state)
+            tried += others
+            foil = best_of([c for c in others if c.passes])
+        if foil is not None and (best is None or (advantage(foil, best) > BIC_RIVAL and z_between(foil, best) > Z_RIVAL)):
+            return Step(state, tuple(tried), foil)
+        if best is None:
+            return Step(state, tuple(tried), None)
+        sure = [c for c in passing if c is not best and c.share > best.share and z_between(c, best) > Z_ACCEPT]
+        best = max(sure, key=lambda c: c.share) if sure else best  # blocks that no fit has seen overrule the count of parameters
+        rivals = [c for c in tried if c.foil is None and c.name != best.name and self._rival(best, c)]
+        fewer = best_of([c for c in rivals if c.passes and c.n_parameters < best.n_parameters and advantage(best, c) < BIC_RIVAL])
+        if fewer is not None:
+            rivals = [best, *(c for c in rivals if c is not fewer)]
+            best = fewer
+        return Step(state, tuple(tried), best, tuple(c.name for c in rivals))
+
+    def _rival(self, best: Candidate, other: Candidate) -> bool:
+        if other.state is None or other.share < SHARE_ACCEPT or unphysical(other.state, other.name):
+            return False
+        return advantage(best, other) < BIC_RIVAL or z_between(best, other) < Z_RIVAL
+
+    def bare(self, state: State) -> State:
+        """`state` without its foils, fitted again: what the library alone explains."""
+        local = Local(state.model, state.theta, self.samples, self.rod, self.target)
+        fit = self._fit(local, state.model, state.theta, np.zeros(0), (), 8)
+        return self._state(state.model, local, fit, ())
+
+    def without(self, state: State, name: str) -> State:
+        """`state` without one of its effects, fitted again."""
+        model = state.model.without(name)
+        kept = [j for j, u in enumerate(state.model.unknowns) if u.place[:2] != ("effect", name)]
+        theta = state.theta[kept]
+        local = Local(model, theta, self.samples, self.rod, self.target)
+        fit = self._fit(local, model, theta, state.fit.theta[len(state.model.unknowns) :], state.foils, 8)
+        return self._state(model, local, fit, state.foils)
+
+    def eliminated(self, state: State, found: Sequence[str], least: float, noise: float) -> tuple[State, list[str]]:
+        """Drop effects that what came later has made needless, and those that bring less than `least` where what is left
+        is of the size of the `noise` [both m^2 summed over the residual]: beside a dominant effect they only mend its form.
+        The state, and who is left."""
+        left = list(found)
+        while len(left) > 1:
+            weakest: tuple[float, str, State] | None = None
+            for name in left:
+                fewer = self.without(state, name)
+                verdict = self.judged(fewer, state, name)
+                needed = verdict.z > Z_KEEP and (verdict.bic_gain > BIC_KEEP or verdict.share > SHARE_KEEP)
+                needless = not needed and not (verdict.z > Z_STRONG and verdict.bic_gain > BIC_STRONG)
+                variance = float((self.target.sigma**2).mean())
+                small = (fewer.fit.loss - state.fit.loss) * variance < least and fewer.fit.loss * variance < 2.0 * noise
+                if (needless or small) and (weakest is None or verdict.bic_gain < weakest[0]):
+                    weakest = verdict.bic_gain, name, fewer
+            if weakest is None:
+                break
+            state, left = weakest[2], [name for name in left if name != weakest[1]]
+        return state, left
+
+    def bounds(self, state: State) -> list[Bound]:
+        """For every effect that is not in the model, the size from which it would have shown: three standard errors beyond its
+        estimate, at the typical shape."""
+        inflate = np.sqrt(max(1.0, state.fit.loss / state.fit.residual.size) * state.fit.residual.size / effective_size(state.fit.residual))
+        flat = state.fit.slopes.reshape(state.fit.residual.size, state.fit.slopes.shape[-1])
+        base = flat.T @ flat + np.diag(state.fit.precision)
+        made = []
+        for name in self.names(state):
+            model = state.model.with_effect(name)
+            n = len(state.model.unknowns)
+            theta = np.concatenate([state.theta, model.start[n:]])
+            for j, u in enumerate(model.unknowns[n:], n):
+                if not u.shape:
+                    theta[j] = u.mean
+            at = state.local.residual(model, theta)
+            worst: dict[str, float] = {}
+            units: dict[str, str] = {}
+            sizes = [j for j, u in enumerate(model.unknowns) if j >= n and not u.shape]
+            for j in sizes:
+                u = model.unknowns[j]
+                moved = theta.copy()
+                step = u.scale if u.mean + u.scale <= u.bounds[1] else -u.scale
+                moved[j] = u.mean + step
+                column = (at - state.local.residual(model, moved)).ravel() / step
+                cross = flat.T @ column
+                power = float(column @ column - cross @ np.linalg.lstsq(base, cross, rcond=1e-12)[0])
+                # x, y, z of one kind, and drives, are one size; a bound in another unit is a bound of its own
+                kind = next(p.name for p in get_effect(name).parameters if u.name.partition(".")[2].startswith(p.name))
+                key = kind if kind[-2:] not in ("_x", "_y", "_z") and kind not in ("x", "y", "z") else kind[:-1].rstrip("_")
+                if power <= 1e-6 * float(column @ column) or power * u.scale**2 < 1e-2:
+                    worst[key] = np.inf
+                    continue
+                estimate = float(column @ state.fit.residual.ravel()) / power
+                worst[key] = max(worst.get(key, 0.0), abs(estimate) + 3.0 * inflate / np.sqrt(power))
+                units[key] = u.unit
+            made += [
+                Bound(name, key or "size", units.get(key, ""), size if np.isfinite(size) else float("nan")) for key, size in worst.items()
+            ]
+        return made

@@ -1,0 +1,179 @@
+"""Least squares with priors, and what may be said of it: standard errors, held-out blocks without refits, evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.linalg import LinAlgError
+from scipy.linalg import cho_factor, cho_solve
+
+from fastrod.types import Floats, Ints
+
+Residual = Callable[[Floats], Floats]
+"""theta (p,) -> weighted residual (n, n_out), measured - predicted over sigma."""
+Slopes = Callable[[Floats, Floats], Floats]
+"""theta (p,), residual there -> d(predicted)/d(theta) over sigma, (n, n_out, p)."""
+
+_SMALL_STEP = 1e-3  # of a standard error: below it a fit has arrived
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """A fitted number."""
+
+    value: float
+    stderr: float
+    unit: str
+    identifiable: bool
+    """Whether this log says more about it than its prior."""
+    why: str = ""
+    """Why not, or what to note."""
+    prior_sd: float = float("nan")
+    """nan: none."""
+    at_bound: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A minimum of the loss."""
+
+    theta: Floats
+    """(p,)."""
+    residual: Floats
+    """(n, n_out) weighted."""
+    slopes: Floats
+    """(n, n_out, p) weighted."""
+    precision: Floats
+    """(p,) of the priors, 1 / sd^2."""
+    at_bound: tuple[bool, ...]
+    """(p,)."""
+
+    @property
+    def loss(self) -> float:
+        """Sum of squares of the data."""
+        return float((self.residual**2).sum())
+
+    @property
+    def hessian(self) -> Floats:
+        """(p, p) Gauss-Newton, priors included."""
+        flat = self.slopes.reshape(self.residual.size, self.slopes.shape[-1])
+        return np.asarray(flat.T @ flat + np.diag(self.precision))
+
+
+def minimise(
+    residual: Residual,
+    slopes: Slopes,
+    start: Floats,
+    mean: Floats,
+    sd: Floats,
+    limits: tuple[Floats, Floats],
+    iterations: int,
+) -> Fit:
+    """Levenberg-Marquardt inside `limits`, with normal priors. A step that leads to nan counts as worse."""
+    low, high = limits
+    precision = 1.0 / sd**2
+    theta = np.clip(start, low, high)
+    r = residual(theta)
+    J = slopes(theta, r)
+
+    def cost(at: Floats, of: Floats) -> float:
+        total = float((of**2).sum() + (precision * (at - mean) ** 2).sum())
+        return total if np.isfinite(total) else np.inf
+
+    best, damping = cost(theta, r), 1e-4
+    for _ in range(iterations):
+        if not len(theta):
+            break
+        flat = J.reshape(-1, J.shape[-1])
+        gradient = flat.T @ r.ravel() - precision * (theta - mean)
+        H = flat.T @ flat + np.diag(precision)
+        held = ((theta <= low) & (gradient < 0.0)) | ((theta >= high) & (gradient > 0.0))
+        free = ~held
+        moved = False
+        for _ in range(6):
+            step = np.zeros_like(theta)
+            step[free] = _solve(H[np.ix_(free, free)] + damping * np.diag(np.diag(H)[free]), gradient[free])
+            tried = np.clip(theta + step, low, high)
+            r_tried = residual(tried)
+            now = cost(tried, r_tried)
+            if now < best:
+                moved = True
+                break
+            damping = max(damping, 1e-3) * 10.0
+        if not moved:
+            break
+        gain = best - now
+        step = tried - theta
+        theta, r, best, damping = tried, r_tried, now, max(0.1 * damping, 1e-9)
+        J = slopes(theta, r)
+        if gain < 1e-4 * best or np.abs(step * np.sqrt(np.diag(H))).max() < _SMALL_STEP:
+            break
+    edge = 1e-6 * (np.where(np.isfinite(high - low), high - low, 1.0))
+    at = tuple(bool(b) for b in (theta <= low + edge) | (theta >= high - edge))
+    return Fit(theta, r, J, precision, at)
+
+
+def _solve(A: Floats, b: Floats) -> Floats:
+    try:
+        return np.asarray(cho_solve(cho_factor(A, check_finite=False), b, check_finite=False))
+    except LinAlgError:
+        return np.asarray(np.linalg.lstsq(A, b, rcond=None)[0])
+
+
+def covariance(fit: Fit) -> Floats:
+    """(p, p) of the fitted numbers: priors and data, the data's variance as the residual shows it, correlated samples counted less."""
+    if not len(fit.theta):
+        return np.zeros((0, 0))
+    inflate = max(1.0, fit.loss / max(fit.residual.size - len(fit.theta), 1)) * fit.residual.size / effective_size(fit.residual)
+    flat = fit.slopes.reshape(-1, fit.slopes.shape[-1])
+    return np.asarray(np.linalg.pinv(flat.T @ flat / inflate + np.diag(fit.precision)))
+
+
+def effective_size(residual: Floats) -> float:
+    """Samples that a residual (n, n_out) in order of time is worth, N (1 - rho) / (1 + rho)."""
+    if len(residual) < 3:
+        return float(residual.size)
+    power = float((residual**2).sum())
+    rho = float((residual[1:] * residual[:-1]).sum()) / power if power > 0.0 else 0.0
+    rho = min(max(rho, 0.0), 0.999)
+    return max(residual.size * (1.0 - rho) / (1.0 + rho), 4.0)
+
+
+def bic(loss: float, n_parameters: int, size: float) -> float:
+    """Bayesian information criterion with the error's size unknown, for `size` effective samples."""
+    return size * float(np.log(max(loss, 1e-300))) + n_parameters * float(np.log(size))
+
+
+def held_out_losses(residual: Floats, slopes: Floats, precision: Floats, block: Ints, n_blocks: int) -> Floats:
+    """(n_blocks,) loss of each block predicted from the others, by one Newton step from the fit to all.
+
+    theta_-k = theta - (H - H_k)^-1 J_k^T r_k.
+    """
+    n_out, p = slopes.shape[1], slopes.shape[2]
+    losses = np.zeros(n_blocks)
+    if not p:
+        return np.asarray(np.bincount(block, weights=(residual**2).sum(1), minlength=n_blocks), dtype=np.float64)
+    flat = slopes.reshape(-1, p)
+    H = flat.T @ flat + np.diag(precision)
+    for k in range(n_blocks):
+        rows = block == k
+        r, J = residual[rows].ravel(), slopes[rows].reshape(-1, p)
+        if not len(r):
+            continue
+        rest = H - J.T @ J
+        step = _solve(rest + 1e-9 * np.diag(np.diag(H)), J.T @ r)
+        losses[k] = float(((r + J @ step) ** 2).sum())
+    assert n_out >= 1
+    return losses
+
+
+def paired(before: Floats, after: Floats) -> float:
+    """z of the gain from losses `before` to those `after`, both (n_blocks,): of its mean, or of the mean logarithm of the ratio where a
+    few blocks hold most of the loss."""
+    scores = []
+    for gain in (before - after, np.log(np.maximum(before, 1e-12)) - np.log(np.maximum(after, 1e-12))):
+        spread = float(gain.std(ddof=1)) if len(gain) > 1 else 0.0
+        scores.append(float(gain.mean()) / spread * np.sqrt(len(gain)) if spread > 0.0 else 0.0)
+    return float(max(scores)) if scores[0] > 0.0 else float(scores[0])

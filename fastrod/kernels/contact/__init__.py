@@ -1,0 +1,1 @@
+"""Proximity, contact set, contact law, and one contact iteration."""

@@ -1,0 +1,222 @@
+"""Contact forces of one world from the compliance of its contact points: Signorini's law with Coulomb friction.
+
+The motion of contact c in its own frame (normal, two tangents) is u = b + W lambda; W is the compliance between contacts
+(symmetric), b the motion without contact forces: the gap along the normal, the slip since the last step along the tangents.
+Normal:   0 <= lambda_n,  0 <= u_n + compliance lambda_n,  their product 0.
+Friction: |lambda_t| <= mu lambda_n; where it slips, lambda_t = -mu lambda_n u_t / |u_t|.
+
+First an active set: each contact is open, sticks or slips; the equations of these states are solved together, the states
+corrected until they agree (a semi-smooth Newton method; Alart and Curnier 1991). Where they do not come to rest, contact by
+contact (nonlinear Gauss-Seidel; Jean 1999), which converges for every symmetric W that is positive.
+"""
+
+from __future__ import annotations
+
+import math
+
+from fastrod.types import Floats
+
+from ..jit import kernel
+from .bvh import FAR, Numbers
+
+_ROUNDS = 40
+_SWEEPS = 400
+_LOOK = 50
+_AGREE = 1e-10
+_HOLDS = 1e-9
+OPEN, STICK, SLIP = 0.0, 1.0, 2.0
+
+
+def law_size(m: int) -> int:
+    """Numbers of scratch that `contact_forces` needs for m contacts."""
+    return 3 * m * (3 * m + 1) + 9 * m
+
+
+@kernel
+def solve_dense(a: Numbers, n: int, stride: int) -> bool:
+    """Gauss elimination with partial pivoting of n equations in `a`, rows `stride` apart, with stride - n right-hand sides; the
+    solutions replace those. False where the matrix is singular."""
+    for c in range(n):
+        pivot = c
+        for r in range(c + 1, n):
+            if abs(a[r * stride + c]) > abs(a[pivot * stride + c]):
+                pivot = r
+        if not abs(a[pivot * stride + c]) > 0.0:
+            return False
+        if pivot != c:
+            for i in range(c, stride):
+                a[c * stride + i], a[pivot * stride + i] = a[pivot * stride + i], a[c * stride + i]
+        inverse = 1.0 / a[c * stride + c]
+        for r in range(c + 1, n):
+            factor = a[r * stride + c] * inverse
+            if factor != 0.0:
+                for i in range(c + 1, stride):
+                    a[r * stride + i] -= factor * a[c * stride + i]
+    for c in range(n - 1, -1, -1):
+        inverse = 1.0 / a[c * stride + c]
+        for i in range(n, stride):
+            value = a[c * stride + i]
+            for q in range(c + 1, n):
+                value -= a[c * stride + q] * a[q * stride + i]
+            a[c * stride + i] = value * inverse
+    return True
+
+
+@kernel
+def _motion(W: Floats, b: Numbers, force: Numbers, row: int, n: int) -> float:
+    u = b[row]
+    for i in range(n):
+        u += W[row, i] * force[i]
+    return float(u)
+
+
+@kernel
+def _sweep(m: int, W: Floats, b: Numbers, friction: Numbers, compliance: Numbers, force: Numbers) -> float:
+    """One round of Gauss-Seidel over the contacts; the largest change of force times compliance."""
+    largest = 0.0
+    for c in range(m):
+        o = 3 * c
+        stiff = W[o, o] + compliance[c]
+        if not stiff > 0.0:
+            continue
+        un = _motion(W, b, force, o, 3 * m) + compliance[c] * force[o]
+        new = max(0.0, force[o] - un / stiff)
+        largest = max(largest, abs(new - force[o]) * stiff)
+        force[o] = new
+        if friction[c] <= 0.0:
+            continue
+        step = 1.0 / max(W[o + 1, o + 1] + W[o + 2, o + 2], 1e-300)  # the larger eigenvalue of the tangential block is below the sum
+        for _ in range(4):
+            t1 = force[o + 1] - step * _motion(W, b, force, o + 1, 3 * m)
+            t2 = force[o + 2] - step * _motion(W, b, force, o + 2, 3 * m)
+            size, most = math.sqrt(t1 * t1 + t2 * t2), friction[c] * new
+            keep = 1.0 if size <= most else most / size
+            change = max(abs(keep * t1 - force[o + 1]), abs(keep * t2 - force[o + 2]))
+            force[o + 1], force[o + 2] = keep * t1, keep * t2
+            largest = max(largest, change / step)
+            if change / step < _AGREE:
+                break
+    return largest
+
+
+@kernel
+def _row_of_state(
+    c: int, i: int, m: int, W: Floats, b: Numbers, compliance: Numbers, friction: Numbers, state: Numbers, along: Numbers, a: Numbers
+) -> None:
+    """Equation i (normal, tangents) of contact c in its state, as a row of the linear system."""
+    n = 3 * m
+    row = a[(3 * c + i) * (n + 1) :]
+    kind = state[c]
+    for q in range(n + 1):
+        row[q] = 0.0
+    if kind == OPEN or (i > 0 and friction[c] <= 0.0):
+        row[3 * c + i] = 1.0
+    elif i == 0 or kind == STICK:
+        for q in range(n):
+            row[q] = W[3 * c + i, q]
+        row[3 * c + i] += compliance[c] if i == 0 else 0.0
+        row[3 * c + i] *= 1.0 + 1e-12  # two contacts that say the same leave a singular system otherwise
+        row[n] = -b[3 * c + i]
+    else:  # slip: lambda_t = mu lambda_n along
+        row[3 * c + i] = 1.0
+        row[3 * c] = -friction[c] * along[2 * c + i - 1]
+
+
+@kernel
+def _correct_states(
+    m: int, W: Floats, b: Numbers, friction: Numbers, compliance: Numbers, force: Numbers, state: Numbers, along: Numbers
+) -> float:
+    """States that these forces ask for; how far they are from agreement, as a motion [m]."""
+    wrong = 0.0
+    for c in range(m):
+        o = 3 * c
+        stiff = max(W[o, o] + compliance[c], 1e-300)
+        un = _motion(W, b, force, o, 3 * m) + compliance[c] * force[o]
+        if force[o] * stiff - un <= 0.0:
+            if state[c] != OPEN:
+                wrong = max(wrong, abs(force[o]) * stiff + max(-un, 0.0))
+            state[c] = OPEN
+            continue
+        if state[c] == OPEN:
+            wrong = max(wrong, max(-un, 0.0) + abs(force[o]) * stiff)
+        if friction[c] <= 0.0:
+            state[c] = STICK
+            continue
+        soft = max(W[o + 1, o + 1], W[o + 2, o + 2], 1e-300)
+        t1 = force[o + 1] - _motion(W, b, force, o + 1, 3 * m) / soft
+        t2 = force[o + 2] - _motion(W, b, force, o + 2, 3 * m) / soft
+        size = math.sqrt(t1 * t1 + t2 * t2)
+        if size <= friction[c] * force[o] * (1.0 + 1e-9) or size == 0.0:
+            if state[c] != STICK:
+                wrong = max(wrong, soft * abs(size - friction[c] * force[o]) + _AGREE * 2.0 * (state[c] == OPEN))
+            state[c] = STICK
+        else:
+            turn = abs(along[2 * c] - t1 / size) + abs(along[2 * c + 1] - t2 / size)
+            if state[c] != SLIP:
+                wrong = max(wrong, soft * (size - friction[c] * force[o]))
+            wrong = max(wrong, soft * friction[c] * force[o] * turn)
+            state[c], along[2 * c], along[2 * c + 1] = SLIP, t1 / size, t2 / size
+    return wrong
+
+
+@kernel
+def _obeys(m: int, W: Floats, b: Numbers, friction: Numbers, compliance: Numbers, force: Numbers) -> bool:
+    """The forces obey the law to 1e-9 m: a singular system can have a solution that does not."""
+    for c in range(m):
+        o = 3 * c
+        un = _motion(W, b, force, o, 3 * m) + compliance[c] * force[o]
+        closed = abs(un) <= _HOLDS or force[o] == 0.0
+        if not (force[o] >= 0.0 and un >= -_HOLDS and closed):
+            return False
+        u1, u2 = _motion(W, b, force, o + 1, 3 * m), _motion(W, b, force, o + 2, 3 * m)
+        most, size = friction[c] * force[o], math.sqrt(force[o + 1] ** 2 + force[o + 2] ** 2)
+        slip = math.sqrt(u1 * u1 + u2 * u2)
+        if not size <= most * (1.0 + 1e-6) + 1e-12:
+            return False
+        # what slips does so against a force at the edge of the cone
+        if most > 0.0 and slip > 10.0 * _HOLDS and not -(u1 * force[o + 1] + u2 * force[o + 2]) >= 0.999 * slip * most:
+            return False
+    return True
+
+
+@kernel
+def contact_forces(m: int, W: Floats, b: Numbers, friction: Numbers, compliance: Numbers, force: Numbers, work: Numbers) -> bool:
+    """Forces (3 m: normal and two tangents of each contact), from the given ones as a start; whether they obey the law."""
+    n = 3 * m
+    a, o = work[: n * (n + 1)], n * (n + 1)
+    state, along, best = work[o : o + m], work[o + m : o + 3 * m], work[o + 3 * m : o + 6 * m]
+    for i in range(n):
+        best[i] = force[i]
+    for c in range(m):
+        state[c] = OPEN if force[3 * c] <= 0.0 else STICK
+        size = math.sqrt(force[3 * c + 1] ** 2 + force[3 * c + 2] ** 2)
+        slips = friction[c] > 0.0 and state[c] == STICK and size >= friction[c] * force[3 * c] * (1.0 - 1e-6) and size > 0.0
+        along[2 * c], along[2 * c + 1] = (force[3 * c + 1] / size, force[3 * c + 2] / size) if slips else (0.0, 0.0)
+        state[c] = SLIP if slips else state[c]
+    agreed = False
+    for count in range(_ROUNDS):
+        wrong = _correct_states(m, W, b, friction, compliance, force, state, along)
+        agreed = wrong <= _AGREE and count > 0
+        if agreed:
+            break
+        for c in range(m):
+            for i in range(3):
+                _row_of_state(c, i, m, W, b, compliance, friction, state, along, a)
+        if not solve_dense(a, n, n + 1):
+            break
+        for i in range(n):
+            force[i] = a[i * (n + 1) + n]
+    if agreed and _obeys(m, W, b, friction, compliance, force):
+        return True
+    for i in range(n):
+        force[i] = best[i] if best[i] == best[i] else 0.0
+    left, last = 1.0, FAR
+    for count in range(_SWEEPS):
+        left = _sweep(m, W, b, friction, compliance, force)
+        if left < _AGREE:
+            break
+        if count % _LOOK == _LOOK - 1:  # at this rate the rounds that are left would not do
+            if not left * (left / last) ** ((_SWEEPS - count) // _LOOK) < _AGREE:
+                break
+            last = left
+    return left < _AGREE and _obeys(m, W, b, friction, compliance, force)

@@ -1,0 +1,86 @@
+"""The observer: gain and boundary update, LANES robots side by side (the paper's eqs. 5 and 12 corrected).
+
+    P- = P + Q dt;  G = P- Gamma^T (Gamma P- Gamma^T + V^-1/dt)^-1;  x -= G e;  P = (I - G Gamma) P-
+
+The rows of Gamma are taken one after the other, as a Kalman filter takes measurements with independent noise: the same
+G and P to rounding, with divisions by a number in place of a matrix, and sound where Gamma has more rows than rank
+(four wires on two unknowns in paper mode) or a nearly singular direction (tendons that hardly stretch).
+
+Vectors over unknowns are padded with zeros to a multiple of BLOCK entries, so that one loop over lanes does BLOCK
+multiply-adds.
+"""
+
+from __future__ import annotations
+
+from ..jit import LANES, kernel
+from .shape import Lanes
+
+W = LANES
+BLOCK = 4
+
+
+@kernel
+def dot_block(out: Lanes, a: Lanes, b: Lanes) -> None:
+    """out += a . b over one block."""
+    for w in range(W):
+        out[w] += a[w] * b[w] + a[W + w] * b[W + w] + a[2 * W + w] * b[2 * W + w] + a[3 * W + w] * b[3 * W + w]
+
+
+@kernel
+def subtract_block(a: Lanes, b: Lanes, k: Lanes) -> None:
+    """a -= b k over one block; k is a number for each lane."""
+    for w in range(W):
+        a[w] -= b[w] * k[w]
+        a[W + w] -= b[W + w] * k[w]
+        a[2 * W + w] -= b[2 * W + w] * k[w]
+        a[3 * W + w] -= b[3 * W + w] * k[w]
+
+
+@kernel
+def scale_block(a: Lanes, b: Lanes, k: Lanes) -> None:
+    """a = b k over one block."""
+    for w in range(W):
+        a[w] = b[w] * k[w]
+        a[W + w] = b[W + w] * k[w]
+        a[2 * W + w] = b[2 * W + w] * k[w]
+        a[3 * W + w] = b[3 * W + w] * k[w]
+
+
+@kernel
+def gain(P: Lanes, G: Lanes, gamma: Lanes, work: Lanes, n_x: int, n_e: int, noise: float) -> None:
+    """P- to P in place, and G, from the rows of Gamma and the variance V^-1/dt of one residual.
+
+    P[a * n_pad + b], G[i * n_pad + a] (transposed), gamma[i * n_pad + a], each times W; work holds n_pad + 2 numbers a lane.
+    """
+    n_pad = BLOCK * ((n_x + BLOCK - 1) // BLOCK)
+    row, block = n_pad * W, BLOCK * W
+    number = work[row : row + W]
+    inverse = work[row + W : row + 2 * W]
+    for i in range(n_e):
+        g_i = gamma[i * row : (i + 1) * row]
+        for a in range(n_x):
+            out = work[a * W : (a + 1) * W]
+            for w in range(W):
+                out[w] = 0.0
+            for b in range(0, row, block):
+                dot_block(out, P[a * row + b : a * row + b + block], g_i[b : b + block])
+        for w in range(W):
+            number[w] = noise
+        for b in range(0, row, block):
+            dot_block(number, work[b : b + block], g_i[b : b + block])
+        for w in range(W):
+            inverse[w] = 1.0 / max(number[w], noise)  # rounding may take P a little below zero where nothing is left to learn
+        k_i = G[i * row : (i + 1) * row]
+        for b in range(0, row, block):
+            scale_block(k_i[b : b + block], work[b : b + block], inverse)
+        for a in range(n_x):
+            for b in range(0, row, block):
+                subtract_block(P[a * row + b : a * row + b + block], work[b : b + block], k_i[a * W : (a + 1) * W])
+        for j in range(i):
+            k_j = G[j * row : (j + 1) * row]
+            for w in range(W):
+                number[w] = 0.0
+            for b in range(0, row, block):
+                dot_block(number, k_j[b : b + block], g_i[b : b + block])
+            for b in range(0, row, block):
+                subtract_block(k_j[b : b + block], k_i[b : b + block], number)

@@ -1,0 +1,505 @@
+"""Run logs: the one format of measured and simulated runs, read from and written to CSV or Parquet."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from importlib import import_module
+from io import TextIOWrapper
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fastrod.errors import LogError, UnknownNameError, nearest
+from fastrod.model.robot import Robot
+from fastrod.model.robotfile import load_robot, robot_names
+from fastrod.types import Floats
+
+Table: TypeAlias = dict[str, Sequence[str] | Floats]
+
+_TIP = ("tip_x", "tip_y", "tip_z")
+_TIP_QUATERNION = ("tip_qw", "tip_qx", "tip_qy", "tip_qz")
+_TIP_FORCE = ("tip_fx", "tip_fy", "tip_fz")
+_BASE_QUATERNION = ("base_qw", "base_qx", "base_qy", "base_qz")
+_REACH = 3.0  # robot lengths; nothing on the robot moves further, so the unit is wrong
+_FAR = 30.0  # robot lengths; no camera that sees the robot is further off
+_LIKE_REST = 0.2  # of the rest length: tendon lengths that stay so near to it are no changes
+_MOST_VALUES, _MOST_BYTES = 30_000_000, 500_000_000  # of a Parquet file unpacked: 1.5 GB at its peak
+_HEAVIEST = 10.0  # kg; a heavier payload was given in g
+_QUATERNION_SLACK = 1e-2  # trackers write three or four digits
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RunLog:
+    """Samples of one or more runs of a robot: what was commanded, and what was measured.
+
+    The sample axis comes first. A missing value is nan; the arrays are read-only.
+    """
+
+    name: str
+    """What the log is called in tables: its file's name without suffix."""
+    t: Floats
+    """(n,) time [s], non-decreasing inside a run."""
+    run: NDArray[np.str_]
+    """(n,) label of the run that the sample belongs to; '' where the log names none."""
+    dl: Floats
+    """(n, n_tendons) change of each tendon's length against the straight rest robot [m], negative = pulled."""
+    tip_position: Floats
+    """(n, 3) measured tip, base frame [m]."""
+    ext: Floats | None = None
+    """(n, n_segments) change of each segment's backbone length [m]."""
+    tip_quaternion: Floats | None = None
+    """(n, 4) measured base_from_tip, w x y z."""
+    points: Floats | None = None
+    """(n, k, 3) further measured points at the robot's `log_points`, base frame [m]."""
+    tip_force: Floats | None = None
+    """(n, 3) known force on the tip, base frame [N]."""
+    payload: Floats | None = None
+    """(n,) known mass at the tip [kg]."""
+    base_quaternion: Floats | None = None
+    """(n, 4) world_from_base, w x y z: which way gravity points."""
+    extra: Mapping[str, Sequence[str] | Floats] = field(default_factory=dict)
+    """Columns that fastrod does not know, kept as they were read."""
+
+    def __post_init__(self) -> None:
+        n = len(self.t)
+        shapes: dict[str, tuple[int | None, ...]] = {
+            "t": (n,), "run": (n,), "dl": (n, None), "tip_position": (n, 3), "ext": (n, None), "tip_quaternion": (n, 4),
+            "points": (n, None, 3), "tip_force": (n, 3), "payload": (n,), "base_quaternion": (n, 4),
+        }  # fmt: skip
+        for name, shape in shapes.items():
+            if (value := getattr(self, name)) is None:
+                continue
+            array = np.array(value, dtype=np.str_ if name == "run" else np.float64)
+            if array.ndim != len(shape) or any(want not in (None, got) for want, got in zip(shape, array.shape, strict=True)):
+                wanted = ", ".join("any" if size is None else str(size) for size in shape)
+                raise LogError(f"RunLog.{name} has shape {array.shape}; it must be ({wanted}).")
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        if n == 0:
+            raise LogError(f"log {self.name!r} has no rows.")
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    @property
+    def runs(self) -> list[str]:
+        """Labels of the runs, in the order of their first sample."""
+        return list(dict.fromkeys(self.run.tolist()))
+
+    @property
+    def driven(self) -> NDArray[np.bool_]:
+        """(n,) rows whose inputs are all there: actuation, known loads, base orientation."""
+        rows = np.isfinite(self.dl).all(axis=1)
+        for value in (self.ext, self.tip_force, self.payload, self.base_quaternion):
+            if value is not None:
+                rows &= np.isfinite(value.reshape(len(self), -1)).all(axis=1)
+        return np.asarray(rows, dtype=np.bool_)
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """(n,) rows that a model can be compared with: time, every input and the tip are there."""
+        return np.asarray(self.driven & np.isfinite(self.t) & np.isfinite(self.tip_position).all(axis=1), dtype=np.bool_)
+
+    def rows(self, which: NDArray[np.bool_] | NDArray[np.int64] | slice) -> RunLog:
+        """The samples `which`: a mask (n,), indices or a slice."""
+        index = np.arange(len(self))[which]
+        cut = {
+            f.name: value[index] for f in fields(self) if f.name not in ("name", "extra") and (value := getattr(self, f.name)) is not None
+        }
+        extra = {key: _taken(value, index) for key, value in self.extra.items()}
+        return replace(self, extra=extra, **cut)
+
+    def only(self, run: str) -> RunLog:
+        """The samples of one run. Raises `UnknownNameError` with the nearest label, or saying that the log names none."""
+        run = str(run)  # numpy's words quote as np.str_(...)
+        if run not in self.runs:
+            if not (named := [" ".join(label.split()) for label in self.runs if label]):
+                raise UnknownNameError(f"no run {run!r}; log {self.name!r} names no runs.")
+            raise UnknownNameError(f"no run {run!r} in log {self.name!r}; {nearest(run, named)}")
+        return self.rows(self.run == run)
+
+
+def read_log(path: str | Path, robot: Robot) -> RunLog:
+    """The run log at `path` (.csv or .parquet) for `robot`, checked against it.
+
+    Lines of a CSV that start with # are comments. Rows count from 1 after the header.
+    Raises `LogError`, one sentence with row and column, for a file that cannot be read or that does not fit the robot.
+    """
+    path = Path(path)
+    table = read_table(path)
+    where = path.name
+    n = len(next(iter(table.values())))
+    if n == 0:
+        raise LogError(f"{where} has a header but no rows.")
+    known: set[str] = set()
+
+    def group(names: Sequence[str]) -> Floats | None:
+        """(n, len(names)) columns that come together, or None where the log has none of them."""
+        given = [name for name in names if name in table]
+        if not given:
+            return None
+        _need(table, names, where, f"to go with {given[0]!r}")
+        known.update(names)
+        return np.stack([numbers(table, name, where) for name in names], axis=1)
+
+    _need(table, ("t", *_TIP), where, "that every run log has")
+    t, tip = group(("t",)), group(_TIP)
+    assert t is not None
+    assert tip is not None
+    dl = group(_dl_columns(table, robot, where))
+    payload = group(("payload",))
+    log = RunLog(
+        name=path.stem,
+        t=t[:, 0],
+        run=_labels(table, n),
+        dl=np.zeros((n, 0)) if dl is None else dl,
+        tip_position=tip,
+        ext=_extension(table, robot, where, known),
+        tip_quaternion=_unit(group(_TIP_QUATERNION), _TIP_QUATERNION, where),
+        points=_points(table, robot, where, group),
+        tip_force=group(_TIP_FORCE),
+        payload=None if payload is None else payload[:, 0],
+        base_quaternion=_unit(group(_BASE_QUATERNION), _BASE_QUATERNION, where),
+        extra={name: cells for name, cells in table.items() if name not in known | {"run"}},
+    )
+    _check_time(log, where)
+    _check_units(log, robot, where)
+    return log
+
+
+def write_log(log: RunLog, path: str | Path, *, comment: str = "") -> None:
+    """Write `log` to a .csv or .parquet, whole or not at all; `comment` heads a CSV, each line behind a #.
+
+    `read_log` of the file gives the same numbers, bit for bit.
+    """
+    path = Path(path)
+    columns = _columns(log)
+    part = path.with_name(path.name + ".part")
+    table = None
+    if path.suffix == ".parquet":
+        table = _pyarrow("pyarrow").table({name: np.asarray(cells) for name, cells in columns.items()})
+        write_table = _pyarrow("pyarrow.parquet").write_table
+    file = part.open("wb")
+    try:
+        with file, TextIOWrapper(file, encoding="utf-8", newline="") as text:
+            if table is not None:
+                write_table(table, file)
+            else:
+                text.writelines(f"# {line}\n" for line in comment.splitlines())
+                writer = csv.writer(text, lineterminator="\n")
+                writer.writerow(columns)
+                writer.writerows(zip(*(_texts(cells) for cells in columns.values()), strict=True))
+        part.replace(path)
+    except BaseException:
+        part.unlink(missing_ok=True)  # it takes room on a disk that is full
+        raise
+
+
+def read_table(path: str | Path) -> Table:
+    """The columns of a .csv or .parquet by name, not interpreted: texts of a CSV, numbers of a Parquet file.
+
+    Raises `LogError` for a file that is not there, is empty, or whose rows do not fit its header.
+    """
+    path = Path(path)
+    try:
+        return _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path)
+    except LogError:
+        raise
+    except (OSError, ValueError, csv.Error) as error:  # ValueError: bytes that are no text, or a path that no file can have
+        why = "it is not text" if isinstance(error, UnicodeDecodeError) else getattr(error, "strerror", None) or str(error)
+        raise LogError(f"log {str(path)!r} cannot be read: {why}.") from error
+
+
+def numbers(table: Table, name: str, where: str) -> Floats:
+    """(n,) floats of the column `name`; an empty cell is nan. `where` names the file in errors (`LogError`)."""
+    cells = table[name]
+    if isinstance(cells, np.ndarray):
+        values = cells
+    else:
+        try:
+            values = np.array([float(cell or "nan") for cell in cells])
+        except ValueError:
+            values = np.array([_number(cell, row, name, where) for row, cell in enumerate(cells, 1)])
+    if np.isinf(values).any():
+        row = int(np.argmax(np.isinf(values)))
+        raise LogError(f"{where} row {row + 1}, column {name} is {values[row]}; it must be finite, or empty where it is missing.")
+    return values
+
+
+def _read_csv(path: Path) -> Table:
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        rows = [row for row in csv.reader(line for line in file if not line.startswith("#")) if row]
+    if not rows:
+        raise LogError(f"{path.name} is empty; a run log starts with a header such as t,dl_1,tip_x,tip_y,tip_z.")
+    header = [name.strip() for name in rows[0]]
+    if len(header) == 1 and ";" in header[0]:
+        raise LogError(f"{path.name} is separated by semicolons; a run log is separated by commas, with decimal points.")
+    _check_header(header, path.name)
+    for number, row in enumerate(rows[1:], 1):
+        if len(row) != len(header):
+            raise LogError(f"{path.name} row {number} has {len(row)} values; the header names {len(header)} columns.")
+    return dict(zip(header, zip(*rows[1:], strict=True) if len(rows) > 1 else ((),) * len(header), strict=True))
+
+
+def _check_header(header: list[str], where: str) -> None:
+    twice = sorted({name for name in header if header.count(name) > 1})
+    if twice:
+        raise LogError(f"{where} has column {twice[0]!r} more than once; each name stands for one column.")
+
+
+def _read_parquet(path: Path) -> Table:
+    parquet, arrow = _pyarrow("pyarrow.parquet"), _pyarrow("pyarrow")
+    table: Table = {}
+    try:
+        with parquet.ParquetFile(path) as file:
+            _check_declared(file.metadata, path.name)
+            words = [column.path for column in file.metadata.schema if column.physical_type == "BYTE_ARRAY"]
+        content = parquet.read_table(path, read_dictionary=words)  # a word of a million rows is held once
+        _check_header(content.column_names, path.name)
+        for name in content.column_names:
+            column = content.column(name)
+            _check_words(column, path.name)
+            try:
+                cells = column.to_pylist()
+            except ValueError:  # times finer than Python's
+                cells = column.cast("string").to_pylist()
+            table[name] = _cells(cells)
+    except arrow.ArrowException as error:
+        raise LogError(f"{path.name} is not a Parquet file: {str(error).splitlines()[0].rstrip('.')}.") from error
+    if not table:
+        raise LogError(f"{path.name} has no columns.")
+    return table
+
+
+def _check_declared(metadata: Any, where: str) -> None:
+    """Raise `LogError` where a file unpacks to more than a run log has; a few kB may declare any number of rows."""
+    chunks = [metadata.row_group(k).column(j) for k in range(metadata.num_row_groups) for j in range(metadata.row_group(k).num_columns)]
+    n_values = max(metadata.num_rows * metadata.num_columns, sum(chunk.num_values for chunk in chunks))
+    n_bytes = sum(chunk.total_uncompressed_size for chunk in chunks)
+    if n_values > _MOST_VALUES or n_bytes > _MOST_BYTES:
+        raise LogError(
+            f"{where} declares {n_values} values of {n_bytes} bytes; a log may have {_MOST_VALUES} of {_MOST_BYTES} bytes. Cut it in parts."
+        )
+
+
+def _check_words(column: Any, where: str) -> None:
+    """Raise `LogError` where words that are held once would be too much as cells."""
+    compute, n_bytes = _pyarrow("pyarrow.compute"), 0
+    for chunk in column.chunks:
+        if hasattr(chunk, "dictionary") and len(chunk):
+            n_bytes += compute.sum(compute.take(compute.binary_length(chunk.dictionary), chunk.indices)).as_py() or 0
+    if n_bytes > _MOST_BYTES:
+        raise LogError(f"{where} declares a column of {n_bytes} bytes of text; a log may have {_MOST_BYTES}. Cut it in parts.")
+
+
+def _cells(cells: Sequence[Any]) -> Sequence[str] | Floats:
+    """A column as numbers; as texts, where it holds anything else, such as texts, times or lists."""
+    try:
+        if not any(isinstance(cell, (str, bytes)) for cell in cells):
+            values = np.array([np.nan if cell is None else cell for cell in cells], dtype=np.float64)
+            if values.shape == (len(cells),):
+                return values
+    except (TypeError, ValueError, OverflowError):
+        pass
+    return ["" if cell is None else str(cell) for cell in cells]
+
+
+def _pyarrow(name: str) -> Any:
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise LogError("a .parquet log needs the package pyarrow, which is not installed; install it, or give the log as .csv.") from error
+
+
+def _need(table: Table, names: Sequence[str], where: str, why: str) -> None:
+    missing = [name for name in names if name not in table]
+    if missing:
+        plural = "columns" if len(missing) > 1 else "column"
+        raise LogError(f"{where} lacks {plural} {', '.join(missing)} {why}; {_nearest_column(missing[0], table)}")
+
+
+def _nearest_column(name: str, table: Table) -> str:
+    if same := [column for column in table if column.lower() == name.lower()]:
+        return f"did you mean {same[0]!r}?"
+    near = nearest(name, table)
+    return near if near.startswith("did") else f"its columns are {', '.join(' '.join(column.split()) for column in table)}."
+
+
+def _dl_columns(table: Table, robot: Robot, where: str) -> list[str]:
+    """dl_1 ... dl_n of the robot, after a check that the log has these and no others."""
+    names = [f"dl_{k}" for k in range(1, robot.n_tendons + 1)]
+    given = [name for name in table if re.fullmatch(r"dl_\d+", name)]
+    too_many = [name for name in given if name not in names]
+    if too_many or (len(given) < len(names) and given):
+        twins = [name for name in robot_names() if load_robot(name).n_tendons == len(given)]
+        hint = f" Shipped robots with {len(given)}: {', '.join(twins)}." if twins else ""
+        raise LogError(
+            f"{where} has {len(given)} dl_ columns ({given[0]} to {given[-1]}); robot {robot.name!r} has {robot.n_tendons} tendons "
+            f"and needs {f'dl_1 to dl_{robot.n_tendons}' if names else 'none'}.{hint}"
+        )
+    _need(table, names, where, f"that robot {robot.name!r} needs for its {robot.n_tendons} tendons")
+    return names
+
+
+def _extension(table: Table, robot: Robot, where: str, known: set[str]) -> Floats | None:
+    """(n, n_segments) from the ext_ columns that the log has; a segment without one keeps its length."""
+    given = [name for name in table if re.fullmatch(r"ext_\d+", name)]
+    if not given:
+        return None
+    names = [f"ext_{k}" for k in range(1, robot.n_segments + 1)]
+    if wrong := [name for name in given if name not in names]:
+        raise LogError(f"{where} has column {wrong[0]!r}; robot {robot.name!r} has {robot.n_segments} segments, ext_1 to {names[-1]}.")
+    known.update(given)
+    n = len(table[given[0]])
+    return np.stack([numbers(table, name, where) if name in given else np.zeros(n) for name in names], axis=1)
+
+
+def _points(table: Table, robot: Robot, where: str, group: Callable[[Sequence[str]], Floats | None]) -> Floats | None:
+    """(n, k, 3) of p1_x ... pk_z, where k is the number of the robot's [log] points."""
+    numbers = {int(m[1]) for name in table if (m := re.fullmatch(r"p(\d+)_[xyz]", name))}
+    if not numbers:
+        return None
+    k = len(robot.log_points)
+    if numbers != set(range(1, k + 1)):
+        raise LogError(
+            f"{where} has points p{min(numbers)} to p{max(numbers)}; robot {robot.name!r} names the arclengths of {k}. "
+            "Give one arclength for each in its robot file: [log] points = [...]."
+        )
+    columns = group([f"p{i}_{axis}" for i in range(1, k + 1) for axis in "xyz"])
+    return None if columns is None else columns.reshape(-1, k, 3)
+
+
+def _labels(table: Table, n: int) -> NDArray[np.str_]:
+    cells = table.get("run", [""] * n)
+    if isinstance(cells, np.ndarray):
+        cells = [f"{cell:g}" for cell in cells]  # runs that a Parquet file numbers
+    return np.array([str(cell).strip() for cell in cells])
+
+
+def _number(cell: str, row: int, name: str, where: str) -> float:
+    try:
+        return float(cell.strip() or "nan")
+    except ValueError:
+        raise LogError(f"{where} row {row}, column {name} is {cell!r}; it must be a number, or empty where it is missing.") from None
+
+
+def _unit(quaternion: Floats | None, names: Sequence[str], where: str) -> Floats | None:
+    """`quaternion` (n, 4) scaled to norm 1, after a check that it was near."""
+    if quaternion is None:
+        return None
+    with np.errstate(over="ignore"):
+        norm = np.linalg.norm(quaternion, axis=1)
+    if (off := np.abs(norm - 1.0) > _QUATERNION_SLACK).any():
+        row = int(np.argmax(off))
+        columns = f"columns {names[0]} to {names[-1]}"
+        raise LogError(f"{where} row {row + 1}, {columns} have norm {norm[row]:.6g}; a quaternion w x y z has norm 1.")
+    return np.asarray(quaternion / norm[:, None], dtype=np.float64)
+
+
+def _check_time(log: RunLog, where: str) -> None:
+    for label in log.runs:
+        rows = np.flatnonzero((log.run == label) & np.isfinite(log.t))
+        back = np.flatnonzero(np.diff(log.t[rows]) < 0.0)
+        if back.size:
+            row, before = rows[back[0] + 1], rows[back[0]]
+            inside = f" inside run {label!r}" if label else ""
+            raise LogError(
+                f"{where} row {row + 1}, column t is {log.t[row]:g} s after {log.t[before]:g} s{inside}; time must not run back. "
+                "Name several runs in a column run."
+            )
+
+
+def _check_units(log: RunLog, robot: Robot, where: str) -> None:
+    """Lengths in mm and masses in g: values that no robot of this size can have."""
+    length = robot.length + float(sum(segment.extension[1] for segment in robot.segments))
+
+    def refuse(bad: NDArray[np.bool_], column: str, value: NDArray[np.floating], unit: str, why: str) -> None:
+        if bad.any():
+            row = int(np.argmax(bad))
+            raise LogError(f"{where} row {row + 1}, {column} is {value[row]:.6g} {unit}; {why}")
+
+    def norm(points: Floats) -> Floats:
+        with np.errstate(over="ignore"):  # of 1e300, which is too far then
+            return np.asarray(np.linalg.norm(points, axis=1))
+
+    far = f"more than {_REACH:g} lengths of robot {robot.name!r} ({robot.length:g} m). Was it given in mm?"
+    for name, places in _measured(log):
+        away = norm(places)
+        refuse(away > _FAR * length, f"{name} from the base", away, "m", far)
+        if not np.isfinite(away).any():
+            continue
+        moved = norm(places - np.nanmedian(places, axis=0))  # wherever the camera stands
+        refuse((moved > _REACH * length) & (away > _REACH * length), f"{name} from the base", away, "m", far)
+    _check_changes(log, robot, where)
+    for k in range(log.dl.shape[1]):
+        long = f"more than robot {robot.name!r} is long ({robot.length:g} m). Was it given in mm?"
+        refuse(np.abs(log.dl[:, k]) > length, f"column dl_{k + 1}", log.dl[:, k], "m", long)
+    for k in range(0 if log.ext is None else log.ext.shape[1]):
+        assert log.ext is not None
+        low, high = robot.segments[k].extension
+        slack = 0.05 * (high - low) + 1e-9  # a measured extension overshoots a little
+        outside = (log.ext[:, k] < low - slack) | (log.ext[:, k] > high + slack)
+        why = f"segment {k + 1} of robot {robot.name!r} allows {low:g} to {high:g} m. Was it given in mm?"
+        refuse(outside, f"column ext_{k + 1}", log.ext[:, k], "m", why)
+    if log.payload is not None:
+        refuse(log.payload < 0.0, "column payload", log.payload, "kg", "a mass is not negative.")
+        refuse(log.payload > _HEAVIEST, "column payload", log.payload, "kg", f"more than {_HEAVIEST:g} kg. Was it given in g?")
+
+
+def _measured(log: RunLog) -> Iterator[tuple[str, Floats]]:
+    """The measured places (n, 3) [m], and what their distance from the base is called."""
+    yield "the tip's distance", log.tip_position
+    for k in range(0 if log.points is None else log.points.shape[1]):
+        assert log.points is not None
+        yield f"the distance of point p{k + 1}", log.points[:, k]
+
+
+def _check_changes(log: RunLog, robot: Robot, where: str) -> None:
+    """Refuse absolute tendon lengths in place of their changes: every one about as long as at rest, on a robot that cannot grow so far."""
+    rest = np.asarray(robot.rest_tendon_length)
+    if not rest.size or not np.isfinite(log.dl).all(axis=1).any():
+        return
+    usual = np.nanmedian(log.dl, axis=0)
+    grows = sum(segment.extension[1] for segment in robot.segments)
+    if (np.abs(usual - rest) < _LIKE_REST * rest).all() and grows < 0.5 * robot.length:
+        raise LogError(
+            f"{where} has a median of {usual[0]:.4g} m in column dl_1, where robot {robot.name!r} has a tendon of {rest[0]:.4g} m at rest: "
+            "these look like absolute lengths. The log takes changes against the straight robot, negative = pulled."
+        )
+
+
+def _columns(log: RunLog) -> Table:
+    columns: Table = {"t": log.t}
+    if log.runs != [""]:
+        columns["run"] = log.run.tolist()
+    points = np.zeros((len(log), 0, 3)) if log.points is None else log.points
+    point_names = [f"p{k}_{axis}" for k in range(1, points.shape[1] + 1) for axis in "xyz"]
+    groups: list[tuple[Sequence[str], Floats | None]] = [
+        ([f"dl_{k}" for k in range(1, log.dl.shape[1] + 1)], log.dl),
+        ([f"ext_{k}" for k in range(1, 1 + (0 if log.ext is None else log.ext.shape[1]))], log.ext),
+        (_TIP, log.tip_position),
+        (_TIP_QUATERNION, log.tip_quaternion),
+        (point_names, points.reshape(len(log), len(point_names))),
+        (_TIP_FORCE, log.tip_force),
+        (("payload",), None if log.payload is None else log.payload[:, None]),
+        (_BASE_QUATERNION, log.base_quaternion),
+    ]
+    for names, values in groups:
+        if values is not None:
+            columns |= {name: values[:, k] for k, name in enumerate(names)}
+    return columns | dict(log.extra)
+
+
+def _texts(cells: Sequence[str] | Floats) -> Sequence[str]:
+    if isinstance(cells, np.ndarray):
+        return ["" if value != value else repr(value) for value in cells.tolist()]
+    return cells
+
+
+def _taken(cells: Sequence[str] | Floats, index: NDArray[np.int64]) -> Sequence[str] | Floats:
+    return cells[index] if isinstance(cells, np.ndarray) else [cells[i] for i in index]

@@ -1,0 +1,101 @@
+"""`SimulatedRobot`: a simulator as a `RobotLink`, for those who would drive a robot and have none."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fastrod.errors import InputError
+from fastrod.logs.link import Measurement
+from fastrod.model.robot import Robot
+from fastrod.rotation import quaternion_from_matrix
+from fastrod.simulator import Simulator
+from fastrod.types import Floats
+
+
+@final
+class SimulatedRobot:
+    """A robot that moves at once to what it is told, effects of its file included, and measures without noise.
+
+    >>> import fastrod
+    >>> link = SimulatedRobot(fastrod.load_robot("prototype"))
+    >>> link.command([-0.004, 0.0, 0.004, 0.0])
+    >>> link.read().tip_position.round(4).tolist()
+    [0.0182, 0.0, 0.0667]
+    """
+
+    def __init__(self, robot: Robot, *, dt: float = 1.0 / 30.0, real: bool = False, clock: Callable[[], float] = time.monotonic) -> None:
+        """`dt` [s] between two readings, as effects with a memory count time; `real` asks to be treated like a robot that can do harm;
+        `clock` gives its time [s]."""
+        self._robot, self._real, self._clock = robot, real, clock
+        self._simulator = Simulator(robot, dt=dt, points_per_segment=10, threads=1)
+        self._lock = threading.Lock()
+        self._began = clock()
+        self._change: Floats = np.zeros(robot.n_tendons)
+        self._extension: Floats = np.zeros(robot.n_segments)
+        self._cold = True
+        self.stopped = False
+        """It ignores commands."""
+
+    @property
+    def robot(self) -> Robot:
+        """What is simulated."""
+        return self._robot
+
+    @property
+    def real(self) -> bool:
+        """As it was made."""
+        return self._real
+
+    def command(self, dl: ArrayLike, ext: ArrayLike | None = None) -> None:
+        """As `RobotLink.command`. Raises `InputError` on wrong shapes and on what is not finite."""
+        change = _numbers("dl", dl, self._robot.n_tendons)
+        extension = np.zeros(self._robot.n_segments) if ext is None else _numbers("ext", ext, self._robot.n_segments)
+        with self._lock:
+            if not self.stopped:
+                self._change, self._extension = change, extension
+
+    def read(self) -> Measurement:
+        """One step of the simulator, which settles first, and what it then measures."""
+        with self._lock:
+            change, extension = self._change, self._extension
+            lengths = self._robot.rest_tendon_length + change
+            first, self._cold = self._cold, False
+            state = None if first else self._simulator.step(lengths, extension=extension)
+            if state is None or not state.ok[0]:
+                state = self._simulator.settle(lengths, extension=extension)
+        base, rotation = state.position[0, 0], state.rotation[0, 0]
+        turn = rotation.T @ state.tip_rotation[0]
+        return Measurement(
+            t=self._clock() - self._began, dl=change, ext=extension, tip_position=rotation.T @ (state.tip_position[0] - base),
+            tip_quaternion=quaternion_from_matrix(turn[None])[0], tension=state.tension[0], problem=state.problems.get(0, ""),
+        )  # fmt: skip
+
+    def stop(self) -> None:
+        """Stay where it was told to be last."""
+        with self._lock:
+            self.stopped = True
+
+    def release(self) -> None:
+        """Take commands again."""
+        with self._lock:
+            self.stopped = False
+
+    def close(self) -> None:
+        """Stop."""
+        self.stop()
+
+
+def _numbers(name: str, values: ArrayLike, n: int) -> Floats:
+    try:
+        found = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} is {values!r}; give {n} numbers [m].") from error
+    if found.shape != (n,) or not np.isfinite(found).all():
+        raise InputError(f"{name} is {values!r}; give {n} finite numbers [m], one each.")
+    return found

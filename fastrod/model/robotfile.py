@@ -1,0 +1,214 @@
+"""Robot files: TOML to `Robot` and back, and the robots that ship with the package."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import fields
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, TypedDict
+
+import msgspec
+import tomli_w
+
+from fastrod.errors import RobotError, UnknownNameError, nearest, shown
+from fastrod.model.robot import MODES, Robot, Segment, Tendon
+from fastrod.tomlfile import parse, read_text
+
+_MODULI = ("youngs_modulus", "shear_modulus", "second_moment", "polar_moment")
+_SENSOR = ("noise", "registration_sd", "marker_offset_sd", "latency_sd")
+
+
+def robot_names() -> list[str]:
+    """Names of the robots that ship with the package, for `load_robot`."""
+    names = [entry.name for entry in files("fastrod").joinpath("robots").iterdir()]
+    return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
+
+
+def load_robot(source: str | Path) -> Robot:
+    """The robot of a shipped name, or of a path to a .toml (contracts: robot file).
+
+    Raises `UnknownNameError` for a name that is not shipped, `RobotError` for a file that is not a robot.
+    """
+    if not isinstance(source, (str, Path)):
+        raise UnknownNameError(f"robot is {source!r}; give the name of a shipped robot or the path of a .toml.")
+    text = str(source)
+    if text in robot_names():
+        return loads(files("fastrod").joinpath("robots").joinpath(f"{text}.toml").read_text(encoding="utf-8"), text)
+    path = Path(source)
+    try:
+        unknown = path.suffix != ".toml" and not path.is_file()
+    except (OSError, ValueError) as error:  # ValueError: a path that no file can have
+        raise RobotError(f"robot file {shown(text)} cannot be read: {getattr(error, 'strerror', None) or error}.") from error
+    if unknown:
+        raise UnknownNameError(f"no robot {shown(text)}; {nearest(text, robot_names())} A path must end in .toml.")
+    content = read_text(path, f"robot file {shown(text)}", RobotError)
+    return loads(content, text)
+
+
+def loads(text: str, where: str = "robot file") -> Robot:
+    """The robot of a TOML text; `where` names it in errors."""
+    data = parse(text, where, RobotError, "robot")
+    _check_keys(data, ("name", "segment", "base", "world", "effect", "log", "fit", "sensor"), where)
+    segments = data.get("segment", [])
+    if not isinstance(segments, list):
+        raise RobotError(f"{where}: segment is one table; write [[segment]], in double brackets.")
+    base = _section(data, "base", ("position", "quaternion"), where)
+    world = _section(data, "world", ("gravity",), where)
+    log = _section(data, "log", ("points",), where)
+    optional = {
+        "base_position": base.get("position"),
+        "base_quaternion": base.get("quaternion"),
+        "gravity": world.get("gravity"),
+        "states_gravity": True if "gravity" in world else None,
+        "log_points": log.get("points"),
+        "effects": data.get("effect"),
+        "fit": data.get("fit"),
+        "sensor": _section(data, "sensor", _SENSOR, where) or None,
+    }
+    if "name" not in data:
+        raise RobotError(f'{where} has no name; add name = "...".')
+    try:
+        return Robot(
+            name=msgspec.convert(data["name"], str),
+            segments=tuple(_segment(table, f"{where}: segment {k}") for k, table in enumerate(segments, 1)),
+            **{key: _convert(value, key, where) for key, value in optional.items() if value is not None},
+        )
+    except msgspec.ValidationError as error:
+        raise RobotError(f"{where}: {_plain(error)}") from error
+    except RobotError as error:
+        raise error if str(error).startswith(where) else RobotError(f"{where}: {error}") from error
+
+
+def dumps(robot: Robot) -> str:
+    """The TOML text of `robot`; `loads` of it gives an equal robot."""
+    data: dict[str, Any] = {"name": robot.name}
+    data["segment"] = [_written(segment) for segment in robot.segments]
+    data["base"] = {"position": list(robot.base_position), "quaternion": list(robot.base_quaternion)}
+    if robot.states_gravity:
+        data["world"] = {"gravity": list(robot.gravity)}
+    if robot.effects:
+        data["effect"] = [dict(effect) for effect in robot.effects]
+    if robot.log_points:
+        data["log"] = {"points": list(robot.log_points)}
+    for section in ("fit", "sensor"):
+        if content := getattr(robot, section):
+            data[section] = {key: dict(value) if isinstance(value, Mapping) else value for key, value in content.items()}
+    return tomli_w.dumps(data)
+
+
+def save_robot(robot: Robot, path: str | Path) -> None:
+    """Write `robot` to a .toml, whole or not at all. Raises `RobotError` where it cannot be written."""
+    target = Path(path)
+    if target.suffix != ".toml":
+        raise RobotError(f"{str(path)!r} does not end in .toml; a robot file does.")
+    part = target.with_suffix(".toml.part")
+    try:
+        text = dumps(robot).encode()
+        part.write_bytes(text)
+        part.replace(target)
+    except ValueError as error:  # a name that is no text, or a path that no file can have
+        raise RobotError(f"{str(path)!r} cannot be written: {error}.") from error
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise RobotError(f"{str(path)!r} cannot be written: {error.strerror}.") from error
+
+
+def _segment(table: Any, where: str) -> Segment:
+    known = [f.name for f in fields(Segment)]
+    _check_keys(table, (*known, *_MODULI), where)
+    table = dict(table)
+    given = [key for key in _MODULI if key in table]
+    if given:
+        stiff = [key for key in ("bending_stiffness", "torsional_stiffness") if key in table]
+        missing = [key for key in _MODULI if key not in table]
+        if stiff or missing:
+            raise RobotError(
+                f"{where}: give bending_stiffness and torsional_stiffness, or all of {', '.join(_MODULI)}; "
+                f"it has {', '.join(given + stiff)}."
+            )
+        e, g, i, j = (_convert(table.pop(key), key, where, float) for key in _MODULI)
+        table |= {"bending_stiffness": [e * i, e * i], "torsional_stiffness": g * j}
+    tendons = table.get("tendons", [])
+    if not isinstance(tendons, list):
+        raise RobotError(f"{where}: tendons must be a list of tables, [ {{offset = ..., angle = ...}}, ... ].")
+    _check_needed(table, ("length", "bending_stiffness", "torsional_stiffness"), where)
+    if table.get("mode", MODES[0]) not in MODES:
+        raise RobotError(f"{where}: mode is {table['mode']!r}; {nearest(str(table['mode']), MODES)}")
+    for k, tendon in enumerate(tendons, 1):
+        _check_keys(tendon, [f.name for f in fields(Tendon)], f"{where}, tendon {k}")
+        _check_needed(tendon, ("offset", "angle"), f"{where}, tendon {k}")
+    try:
+        return msgspec.convert(table, Segment)
+    except msgspec.ValidationError as error:
+        raise RobotError(f"{where}: {_plain(error)}") from error
+
+
+def _written(segment: Segment) -> dict[str, Any]:
+    data = {f.name: getattr(segment, f.name) for f in fields(Segment) if f.name != "tendons"}
+    data = {key: list(value) if isinstance(value, tuple) else value for key, value in data.items()}
+    if segment.tendons:
+        plain = [{f.name: getattr(tendon, f.name) for f in fields(Tendon)} for tendon in segment.tendons]
+        data["tendons"] = [{key: list(v) if isinstance(v, tuple) else v for key, v in tendon.items()} for tendon in plain]
+    return data
+
+
+def _section(data: Mapping[str, Any], name: str, known: Iterable[str], where: str) -> dict[str, Any]:
+    table = data.get(name, {})
+    _check_keys(table, known, f"{where}: [{name}]")
+    return dict(table)
+
+
+class _Effect(TypedDict):
+    name: str
+
+
+_TYPES: dict[str, Any] = {
+    "base_position": tuple[float, float, float],
+    "base_quaternion": tuple[float, float, float, float],
+    "gravity": tuple[float, float, float],
+    "states_gravity": bool,
+    "log_points": tuple[float, ...],
+    "fit": dict[str, dict[str, float | bool]],
+    "sensor": dict[str, float | tuple[float, ...]],
+}
+
+
+def _convert(value: Any, key: str, where: str, kind: Any = None) -> Any:
+    try:
+        if key == "effects":
+            msgspec.convert(value, list[_Effect])
+            return tuple(value)
+        made = msgspec.convert(value, kind or _TYPES[key])
+    except msgspec.ValidationError as error:
+        raise RobotError(f"{where}: {key}: {_plain(error)}") from error
+    if isinstance(made, float) and not math.isfinite(made):
+        raise RobotError(f"{where}: {key} is {made}; it must be finite.")
+    return made
+
+
+def _check_keys(table: Any, known: Iterable[str], where: str) -> None:
+    if not isinstance(table, Mapping):
+        raise RobotError(f"{where} is {shown(table)}; it must be a table.")
+    names = list(known)
+    for key in table:
+        if key not in names:
+            raise RobotError(f"{where} has an unknown key {key!r}; {nearest(key, names)}")
+
+
+def _check_needed(table: Mapping[str, Any], needed: Iterable[str], where: str) -> None:
+    if missing := [name for name in needed if name not in table]:
+        raise RobotError(f"{where} lacks {', '.join(missing)}.")
+
+
+def _plain(error: msgspec.ValidationError) -> str:
+    """One of our own sentences as it is; one of msgspec's with the place in front."""
+    sentence, _, place = str(error).replace("`", "'").partition(" - at '$")
+    place = place.rstrip("'").replace("[...]", "").removeprefix(".")
+    numbered = re.sub(r"\[(\d+)\]", lambda m: f" {int(m[1]) + 1}", place).strip()  # robot files count from 1
+    end = "" if sentence.endswith((".", "?")) else "."
+    return f"{numbered}: {sentence}{end}" if numbered else sentence + end

@@ -1,0 +1,101 @@
+"""How wires and bends hang together: the linear map between the bend of the segments and the lengths of the wires."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fastrod.model.robot import Robot
+from fastrod.types import Floats, Ints
+
+
+@dataclass(frozen=True)
+class Wiring:
+    """Routing of one robot's wires; the same for every robot of a batch."""
+
+    n_segments: int
+    tendon_segment: Ints
+    """(n_tendons,) segment at whose end the wire ends."""
+    arms: Floats
+    """(n_tendons, 2 n_segments) d(wire length)/d(bend x, bend y of each segment) [m/rad], bend about d1 and d2."""
+    bend_from_wires: Floats
+    """(2 n_segments, n_tendons) least-squares inverse of `arms` [rad/m]."""
+    drive: Ints
+    """(n_tendons,) the drive of each wire: opposite wires of a segment are one antagonistic drive."""
+    drive_sign: Floats
+    """(n_tendons,) +1 for the first wire of its drive, -1 for its antagonist."""
+    reach: Floats
+    """(n_tendons,) distance of the wire from the backbone in its last segment [m]."""
+    length: Floats
+    """(n_segments,) of the robot [m]."""
+
+    @property
+    def n_tendons(self) -> int:
+        """Wires of all segments."""
+        return len(self.tendon_segment)
+
+    @property
+    def n_drives(self) -> int:
+        """Drives that pull them; an antagonistic pair of wires has one."""
+        return int(self.drive.max()) + 1 if len(self.drive) else 0
+
+    def count(self, per: str) -> int:
+        """Columns of a parameter that is one per robot, segment or drive."""
+        return {"robot": 1, "segment": self.n_segments, "drive": self.n_drives}[per]
+
+    def by_tendon(self, per_drive: Floats) -> Floats:
+        """(..., n_tendons) from (..., n_drives), unsigned."""
+        return np.ascontiguousarray(per_drive[..., self.drive])
+
+    def by_end(self, per_segment: Floats) -> Floats:
+        """(..., n_tendons) from (..., n_segments): the value of the segment at whose end the wire ends."""
+        return np.ascontiguousarray(per_segment[..., self.tendon_segment])
+
+    def bend(self, dl: Floats) -> Floats:
+        """(..., n_segments, 2) bend about d1 and d2 [rad] that these wire lengths (..., n_tendons) ask for."""
+        return _times(dl, self.bend_from_wires.T).reshape(*dl.shape[:-1], self.n_segments, 2)
+
+    def wires(self, bend: Floats) -> Floats:
+        """(..., n_tendons) change of wire length [m] that goes with a bend (..., n_segments, 2) [rad]."""
+        return _times(bend.reshape(*bend.shape[:-2], 2 * self.n_segments), self.arms.T)
+
+
+def _times(a: Floats, matrix: Floats) -> Floats:
+    """a @ matrix, summed in one order: BLAS takes another one with the number of rows, and a batch must be its robots bit by bit."""
+    out = np.zeros((*a.shape[:-1], matrix.shape[1]))
+    for i, row in enumerate(matrix):
+        out += a[..., i, None] * row
+    return out
+
+
+def wire(robot: Robot) -> Wiring:
+    """The wiring of a robot: l_i = l + sum_k (bend_x y_ik - bend_y x_ik), constant curvature in each segment."""
+    ends = robot.tendon_segment
+    positions = [tendon.position(int(end) + 1) for tendon, end in zip(robot.tendons, ends, strict=True)]
+    arms = np.zeros((robot.n_tendons, 2 * robot.n_segments))
+    for t, places in enumerate(positions):
+        for k, (x, y) in enumerate(places):
+            arms[t, 2 * k : 2 * k + 2] = y, -x
+    drive, sign = np.full(robot.n_tendons, -1), np.ones(robot.n_tendons)
+    count = 0
+    for t in range(robot.n_tendons):
+        if drive[t] >= 0:
+            continue
+        drive[t] = count
+        size = float(np.abs(arms[t]).max())
+        for other in range(t + 1, robot.n_tendons):
+            if drive[other] < 0 and ends[other] == ends[t] and np.abs(arms[t] + arms[other]).max() < 1e-3 * size:
+                drive[other], sign[other] = count, -1.0
+                break
+        count += 1
+    return Wiring(
+        n_segments=robot.n_segments,
+        tendon_segment=ends,
+        arms=arms,
+        bend_from_wires=np.asarray(np.linalg.pinv(arms), dtype=np.float64) if robot.n_tendons else arms.T.copy(),
+        drive=drive.astype(np.int64),
+        drive_sign=sign,
+        reach=np.array([float(np.hypot(*places[-1])) for places in positions]),
+        length=np.array([segment.length for segment in robot.segments]),
+    )

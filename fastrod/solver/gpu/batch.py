@@ -1,0 +1,117 @@
+"""What is launched on a GPU: a thread takes one robot after the other, with the scratch of a pass in its local memory.
+
+Local memory is laid out by the machine so that the same field of neighbouring threads lies side by side, it is written
+back through the first cache, and its addresses are constants: a strided scratch in global memory has only the first.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib import import_module
+from typing import Any
+
+import numba
+import numpy as np
+from numba import cuda
+
+from fastrod.solver.gpu.kernels.jit import SIMULATED, launched
+from fastrod.types import Floats, Ints, Layout, Memory, Params, Ports, Probes, Response, Shape
+
+_cuda: Any = cuda
+_config: Any = numba.config
+# the same files as fastrod.kernels.rod.chunk and gather, for the other machine: no type checker would find them there
+_chunk, _gather = import_module("fastrod.solver.gpu.kernels.rod.chunk"), import_module("fastrod.solver.gpu.kernels.rod.gather")
+pass_chunk, scratch_size, feed_forward = _chunk.pass_chunk, _chunk.scratch_size, _gather.feed_forward
+
+BLOCK = 64
+"""Threads of a block."""
+BLOCKS = 2
+"""Blocks that a multiprocessor is given: a warp for each of its four schedulers. A thread's scratch is 8 to 25 kB, and what more threads
+have does not fit into the caches."""
+_SCRATCH = 256  # numbers by which the room for a pass grows: each size is a compilation
+
+
+@cache
+def pass_robots(size: int) -> Any:
+    """The kernel of one forward pass (`pass_chunk`) of the robots `rows`, with room for `size` numbers a thread."""
+
+    def run(
+        rows: Ints,
+        params: Params,
+        ports: Ports,
+        layout: Layout,
+        memory: Memory,
+        shape: Shape,
+        response: Response,
+        n_col: int,
+        feed: bool,
+        carry: bool,
+        update: bool,
+        process: float,
+        noise: float,
+    ) -> None:
+        scratch = _cuda.local.array(size, np.float64)
+        robots = _cuda.local.array(1, np.int64)
+        # slices of length 0 of what the compiler then leaves out, and with it all that contact would do
+        none = _cuda.local.array((1, 1), np.int64)[:, :0]
+        nothing = _cuda.local.array((1, 1, 1), np.float64)[:, :0]
+        probes = Probes(none, nothing, nothing, nothing, nothing)
+        for r in range(_cuda.grid(1), len(rows), _cuda.gridsize(1)):
+            robots[0] = rows[r]
+            pass_chunk(
+                robots, 1, params, ports, layout, memory, shape, response, probes, 0, scratch,
+                n_col, feed, carry, update, process, noise,
+            )  # fmt: skip
+
+    return launched(run)
+
+
+def _move(rows: Ints, ports: Ports, params: Params, memory: Memory, layout: Layout) -> None:
+    """`feed_forward` of these robots, without a pass."""
+    robots = _cuda.local.array(1, np.int64)
+    for r in range(_cuda.grid(1), len(rows), _cuda.gridsize(1)):
+        robots[0] = rows[r]
+        feed_forward(robots, 1, ports, params, memory, layout)
+
+
+def _all_finite(x: Floats, finite: Any) -> None:
+    """Whether a robot's boundary is one."""
+    for i in range(_cuda.grid(1), len(x), _cuda.gridsize(1)):
+        total = 0.0
+        for a in range(x.shape[1]):
+            total += x[i, a]
+        finite[i] = total - total == 0.0
+
+
+def _put_rows(rows: Ints, new: Any, into: Any) -> None:
+    """into[rows] = new, of arrays (n, m)."""
+    for r in range(_cuda.grid(1), len(rows), _cuda.gridsize(1)):
+        for a in range(new.shape[1]):
+            into[rows[r], a] = new[r, a]
+
+
+move_to_inputs = launched(_move)
+all_finite = launched(_all_finite)
+put_rows = launched(_put_rows)
+
+
+def room(n_tendons: int, n_x: int, n_col: int, n_e: int) -> int:
+    """Numbers of scratch that a thread is compiled for."""
+    return _SCRATCH * -(-int(scratch_size(n_tendons, n_x, n_col, n_e)) // _SCRATCH)
+
+
+def launch(kernel: Any, n: int, *arguments: Any) -> None:
+    """Run `kernel` for n robots: at most `BLOCKS` blocks for each multiprocessor, whose threads come back for more."""
+    if n == 0:
+        return
+    if SIMULATED:
+        kernel[2, 2](*arguments)
+        return
+    most = BLOCKS * _cuda.get_current_device().MULTIPROCESSOR_COUNT
+    before = _config.CUDA_LOW_OCCUPANCY_WARNINGS
+    _config.CUDA_LOW_OCCUPANCY_WARNINGS = 0  # a small batch is no mistake
+    try:
+        configured = kernel[min(-(-n // BLOCK), most), BLOCK]
+    finally:
+        _config.CUDA_LOW_OCCUPANCY_WARNINGS = before
+    configured(*arguments)

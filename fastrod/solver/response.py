@@ -1,0 +1,216 @@
+"""Linear response of robots at rest: how the tip answers inputs and forces, contact forces held."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, Literal
+
+import numpy as np
+
+from fastrod.kernels.jit import LANES
+from fastrod.solver.boundary import NO_PROBES, Passes
+from fastrod.types import Floats, Ints, Memory, Params, Ports, Probes, Response, Shape
+
+_ROWS = 1024  # of one pass: robots times copies of them
+_HALF = 0.5e-4 * np.repeat(np.eye(3), 2, axis=0) * np.array([[1.0], [-1.0]] * 3)
+_TURNS: Floats = np.array([[[1.0, -x, -y, -z], [x, 1.0, -z, y], [y, z, 1.0, -x], [z, -y, x, 1.0]] for x, y, z in _HALF])[:, None]
+"""(6, 1, 4, 4) what turns a quaternion forward and back by 1e-4 rad about each axis of the world."""
+Relocate = Callable[[Floats], Mapping[str, Floats]]
+"""Extensions -> the ports that change with them."""
+
+
+class Linear:
+    """Passes that change nothing, at the present boundary of `rows`, with their linear response.
+
+    `probes` are the contact forces that act on each row of `rows`. The last one is at the tip and carries none: its columns
+    are those of a tip force.
+    """
+
+    def __init__(self, passes: Passes, rows: Ints, ports: Ports, probes: Probes = NO_PROBES) -> None:
+        self.passes, self.rows, self.ports, self.probes = passes, rows, ports, probes
+
+    def respond(self, columns: bool = True) -> tuple[Response, Shape]:
+        """Residuals, tip and their derivatives by the unknowns and, last, by a tip force; rows that are not asked are nan."""
+        passes, ports = self.passes, self.ports
+        n, n_e, n_probes = passes.n_robots, passes.n_residuals(ports), self.probes.node.shape[1]
+        extra = 3 * n_probes if n_probes else 0 if len(ports.follower_force) else 3
+        n_col = passes.n_x + extra if columns or n_probes else 0
+        holes = len(self.rows) < n
+        response = Response(np.empty((n, n_e, n_col)), np.empty((n, 6, n_col)), np.empty((n, n_e)))
+        if holes:
+            for a in response:
+                a.fill(np.nan)
+        shape = passes.new_shape("tip", holes)
+        passes.run(self.rows, ports, shape, response=response, update=False, noise=1e-20, n_col=n_col, probes=self.probes)
+        return response, passes.collect(shape)
+
+    def jacobian(self, relocate: Relocate | None = None, turning: bool = False) -> Floats:
+        """(n, 6, n_tendons + n_segments) change of the tip by tendons (length, or tension where that is the mode), then by extensions;
+        with `turning` three columns more, by the rotation vector of the base, world.
+
+        All but those of lengths come from central differences of the pass at fixed unknowns, as rows of one batch. `relocate` tells
+        what an extension moves besides itself.
+        """
+        moved, delta, pulled = self._spread(turning)
+        (m, n), n_rows = delta.shape, len(self.rows)
+
+        def respond(copies: slice, columns: bool) -> tuple[Response, Shape]:
+            twin, k = self._copies({name: a[copies] for name, a in moved.items()}, relocate), len(moved["extension"][copies])
+            response, shape = twin.respond(columns)
+            return Response(*(_split(a, k) for a in response)), Shape(*(_split(a, k) for a in shape))
+
+        if n_rows * (1 + 2 * m) <= LANES:  # as fast as without the differences
+            return self._combine(*respond(slice(None), True), delta, pulled)
+        by_residual = self._close(self.respond()[0])
+        by_input, error = np.empty((m, n, 6)), np.empty((m, n, by_residual.shape[2]))
+        per = m if 2 * m * n_rows <= _ROWS else 1
+        for j in range(0, m, per):
+            response, shape = respond(slice(1 + 2 * j, 1 + 2 * (j + per)), False)
+            some = slice(j, j + per)
+            by_input[some], error[some] = _differences(response, shape.tip_position, shape.tip_rotation, delta[some])
+        return self._arrange(by_residual, by_input, error, pulled)
+
+    def fits(self, turning: bool) -> bool:
+        """`step` is one pass with all its differences."""
+        layout = self.passes.layout
+        m = len(layout.tendon_segment) - len(layout.row_tendon) + len(layout.first_tendon) + (3 if turning else 0)
+        return 0 < len(self.rows) * (1 + 2 * m) <= LANES
+
+    def step(
+        self, relocate: Relocate | None, turning: bool, outputs: Literal["full", "tip"], process: float, noise: float
+    ) -> tuple[Shape, Floats]:
+        """An observer pass of all robots that updates them, and the Jacobian at the shape that it hands out, in one: the differences
+        ride in the lanes that a few robots leave empty."""
+        passes = self.passes
+        moved, delta, pulled = self._spread(turning)
+        k, n = 1 + 2 * len(delta), passes.n_robots
+        twin = self._copies(moved, relocate)
+        n_e, n_col = passes.n_residuals(self.ports), passes.n_columns(self.ports)
+        response = Response(np.empty((k * n, n_e, n_col)), np.empty((k * n, 6, n_col)), np.empty((k * n, n_e)))
+        shape = twin.passes.new_shape(outputs, False)
+        twin.passes.run(twin.rows, twin.ports, shape, response=response, feed=True, carry=passes.carry, process=process, noise=noise)
+        twin.passes.collect(shape)
+        own: Any
+        a: Any
+        for own, a in zip(passes.memory, twin.passes.memory, strict=True):
+            own[:] = a[: len(own)]
+        jacobian = self._combine(Response(*(_split(a, k) for a in response)), Shape(*(_split(a, k) for a in shape)), delta, pulled)
+        return Shape(*(a[: len(a) // k] for a in shape)), jacobian
+
+    def _spread(self, turning: bool) -> tuple[dict[str, Floats], Floats, list[int]]:
+        """Ports of 1 + 2 m copies, as they are and then forward and back by each input (1 + 2 m, n, ...), by how much (m, n), and the
+        tendons whose input is a tension."""
+        layout, params, ports, n = self.passes.layout, self.passes.params, self.ports, self.passes.n_robots
+        n_tendons, n_segments = len(layout.tendon_segment), len(layout.first_tendon)
+        held = layout.row_tendon.tolist()
+        pulled = [] if len(held) == n_tendons else [t for t in range(n_tendons) if t not in held]
+        n_inputs = len(pulled) + n_segments
+        m = n_inputs + (3 if turning else 0)
+        delta = np.full((m, n), 1e-4)
+        delta[: len(pulled)] *= params.tension_scale
+        delta[len(pulled) : n_inputs] *= params.reach
+        moved = {name: np.empty((1 + 2 * m, n, getattr(ports, name).shape[1])) for name in ("tension", "extension", "base_pose")}
+        for name, a in moved.items():
+            a[:] = getattr(ports, name)
+        for j in range(n_inputs):
+            a, i = (moved["tension"], pulled[j]) if j < len(pulled) else (moved["extension"], j - len(pulled))
+            a[1 + 2 * j, :, i] += delta[j]
+            a[2 + 2 * j, :, i] -= delta[j]
+        if turning:
+            turns = moved["base_pose"][1 + 2 * n_inputs :, :, 3:]
+            turns[:] = (_TURNS @ turns[..., None])[..., 0] / math.sqrt(1.0 + 0.25e-8)
+        return moved, delta, pulled
+
+    def _combine(self, response: Response, shape: Shape, delta: Floats, pulled: list[int]) -> Floats:
+        """The Jacobian from the copies of `_spread`."""
+        by_residual = self._close(Response(*(a[0] for a in response)))
+        differences = _differences(Response(*(a[1:] for a in response)), shape.tip_position[1:], shape.tip_rotation[1:], delta)
+        return self._arrange(by_residual, *differences, pulled)
+
+    def _arrange(self, by_residual: Floats, by_input: Floats, error: Floats, pulled: list[int]) -> Floats:
+        layout, (m, n) = self.passes.layout, by_input.shape[:2]
+        n_tendons, n_held = len(layout.tendon_segment), len(layout.row_tendon)
+        jacobian = np.empty((n, 6, n_tendons + m - len(pulled)))
+        jacobian[:, :, layout.row_tendon] = by_residual[:, :, :n_held]
+        closed = (by_input - np.matmul(by_residual, error[..., None])[..., 0]).transpose(1, 2, 0)
+        jacobian[:, :, pulled], jacobian[:, :, n_tendons:] = closed[:, :, : len(pulled)], closed[:, :, len(pulled) :]
+        return jacobian
+
+    def _close(self, response: Response) -> Floats:
+        """(n, 6, n_e) change of the tip per residual closed: tendon lengths first."""
+        n_x = self.passes.n_x
+        return np.asarray(response.tip[:, :, :n_x] @ inverse(response.residual[:, :, :n_x]))
+
+    def _copies(self, moved: dict[str, Floats], relocate: Relocate | None) -> Linear:
+        """k copies as rows of one pass, each with its own ports `moved` (k, n, ...)."""
+        passes, (k, n) = self.passes, moved["extension"].shape[:2]
+
+        def copied(a: Any) -> Any:
+            return np.concatenate([a] * k) if len(a) else a
+
+        if relocate is not None:
+            each = [relocate(one) for one in moved["extension"]]
+            moved |= {name: np.stack([np.broadcast_to(one[name], (n, *one[name].shape[1:])) for one in each]) for name in each[0]}
+        moved = {name: a.reshape(k * n, *a.shape[2:]) for name, a in moved.items()}
+        ports = Ports(
+            *(moved[name] if name in moved else a if len(a) == 1 else copied(a) for name, a in zip(Ports._fields, self.ports, strict=True))
+        )
+        params: tuple[Any, ...] = passes.params
+        twin = passes.twin(k * n, Params(*(a if len(a) == 1 else copied(a) for a in params)), Memory(*map(copied, passes.peek())))
+        probes = Probes(*map(copied, self.probes)) if self.probes.node.shape[1] else self.probes
+        rows = (self.rows + n * np.arange(k)[:, None]).ravel()
+        return Linear(twin, rows, ports, probes)
+
+    def by_force(self) -> Floats:
+        """(n, 6, 3) change of the tip per tip force."""
+        response, _ = self.respond()
+        n_x, params = self.passes.n_x, self.passes.params
+        free, load = response.residual[:, :, :n_x], response.residual[:, :, -3:]
+        if len(self.ports.follower_force) and not self.probes.node.shape[1]:
+            # the follower force is an unknown; a dead force enters as its column, but not its own row
+            load = load.copy()
+            load[:, -3:] -= (params.reach**2 / params.moment_scale)[:, None, None] * np.eye(3)
+        return np.asarray(response.tip[:, :, -3:] - response.tip[:, :, :n_x] @ (inverse(free) @ load))
+
+
+def _split(a: Any, k: int) -> Any:
+    """(k, n, ...) of (k n, ...)."""
+    return a.reshape(k, len(a) // k, *a.shape[1:])
+
+
+def _differences(response: Response, p: Floats, r: Floats, delta: Floats) -> tuple[Floats, Floats]:
+    """(m, n, 6) and (m, n, n_e): central differences of tip pose (2 m, n, ...) and residuals, forward and back by turns."""
+    e, turn = response.error, r[::2] @ np.swapaxes(r[1::2], 2, 3)
+    change = np.empty((*delta.shape, 6))
+    change[..., :3] = p[::2] - p[1::2]
+    for a, (i, j) in enumerate(((2, 1), (0, 2), (1, 0))):
+        change[..., 3 + a] = 0.5 * (turn[..., i, j] - turn[..., j, i])
+    width = 2.0 * delta[..., None]
+    return change / width, (e[::2] - e[1::2]) / width
+
+
+def inverse(a: Floats) -> Floats:
+    """(n, b, a) least-squares inverses of matrices (n, a, b); nan for those with a number that is not finite."""
+    found = np.full((len(a), a.shape[2], a.shape[1]), np.nan)
+    good = np.isfinite(a).all((1, 2))
+    if a.shape[1] == a.shape[2]:
+        try:
+            found[good] = np.linalg.inv(a[good])
+            return found
+        except np.linalg.LinAlgError:
+            pass
+    found[good] = np.linalg.pinv(a[good])
+    return found
+
+
+def stretch(passes: Passes, rows: Ints, change: Floats) -> None:
+    """These robots' extensions are about to change by this much (1 or n_robots, n_segments) [m]: the wires that grow along with
+    their segments are, for the boundary, as they were. The gain knows of wires alone; it would pull at every wire."""
+    if not change.any():
+        return
+    layout = passes.layout
+    grown = np.cumsum(change, axis=1)[:, layout.tendon_segment[layout.row_tendon]]
+    if not np.isfinite(grown).all():
+        grown = np.where(np.isfinite(grown), grown, 0.0)
+    passes.memory.length_before[rows] += grown if len(grown) == 1 else grown[rows]

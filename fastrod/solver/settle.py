@@ -1,0 +1,187 @@
+"""Repeat the observer's pass on frozen inputs until every boundary residual is small: damped Newton, then load continuation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+import numpy as np
+
+from fastrod.solver.boundary import Passes
+from fastrod.solver.guess import cold_start
+from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports
+
+Pass: TypeAlias = Callable[[Ints, Ports], Floats]
+"""(robots, ports) -> residual of these robots at the x before the update [m]."""
+
+_MAX_PASSES = 40
+_FREE_PASSES = 20  # robots with wires that can go slack: semi-smooth Newton first, monotone only after that
+_STEEP = 6.0
+_PATIENCE = 4  # passes within tolerance after which tensions that still wander are let go: nothing determines them
+_LONGEST_STEP = 1.5  # in EI/l, about radians of bend: a longer Newton step lands on another equilibrium, if on any
+_SMALLEST_STEP = 1.0 / 64.0
+_SMALLEST_LOAD_STEP = 1.0 / 256.0
+
+
+def settle(rows: Ints, warm: Flags, boundary: Passes, ports: Ports, tolerance: float, run: Pass) -> Ints:
+    """Bring the robots `rows` to rest on `ports`; the passes that each took, and -1 where none of three ways converged.
+
+    Warm robots start from their last x, moved to first order to the new inputs; others, and warm ones that fail, from a
+    cold guess; what still fails is led there by its loads, from none to all.
+    """
+    layout, params = boundary.layout, boundary.params
+    passes = np.zeros(boundary.n_robots, np.int64)
+    left = rows[warm[rows]]
+    if len(left):
+        boundary.move_to_inputs(left, ports)
+        left = _newton(left, boundary, ports, tolerance, run, passes)
+    left = np.sort(np.concatenate([left, rows[~warm[rows]]]))
+    steep = left[load_parameter(left, params, ports) > _STEEP]
+    left = np.setdiff1d(left, steep)
+    if len(left):
+        cold_start(left, layout, params, ports, boundary.memory)
+        left = _newton(left, boundary, ports, tolerance, run, passes)
+    left = np.sort(np.concatenate([left, steep]))
+    if len(left):
+        left = _continuation(left, boundary, ports, tolerance, run, passes)
+    passes[left] = -1
+    return passes
+
+
+def load_parameter(rows: Ints, params: Params, ports: Ports) -> Floats:
+    """F l^2/EI of all forces together: beyond about six a rod has equilibria that no growing load would lead to."""
+
+    def of(a: Floats) -> Floats:
+        return a if len(a) == 1 else a[rows]
+
+    length = params.length + ports.extension
+    force = np.linalg.norm(of(ports.tip_force), axis=1) + np.linalg.norm(of(ports.tip_moment), axis=1) / of(params.reach)
+    force = force + (of(length) * np.linalg.norm(of(ports.line_force), axis=-1).max(-1)).sum(1)
+    for extra in (ports.follower_force[:, None], ports.node_force):
+        if len(extra):
+            force = force + np.linalg.norm(of(extra), axis=-1).sum(1)
+    return np.broadcast_to(force * of(params.reach) / of(params.moment_scale), len(rows))
+
+
+def _newton(rows: Ints, boundary: Passes, ports: Ports, tolerance: float, run: Pass, passes: Ints) -> Ints:
+    """Newton with step halving; the robots that did not converge."""
+    layout, params = boundary.layout, boundary.params
+    failed: list[Ints] = []
+    x_at = boundary.x[rows]
+    step = np.zeros_like(x_at)
+    best = np.full(len(rows), np.inf)
+    damping = np.ones(len(rows))
+    patience = np.full(len(rows), _PATIENCE)
+    one_sided = np.broadcast_to(params.unilateral.any(1), boundary.n_robots)[rows]
+    for count in range(_MAX_PASSES):
+        x_tried = boundary.x[rows]
+        residual = run(rows, ports)
+        passes[rows] += 1
+        after = boundary.x[rows]
+        # in paper mode the wires may contradict each other: at the least-squares boundary the residual stays
+        better = residual <= 2.0 * best if layout.paper else residual < best
+        if count < _FREE_PASSES:
+            # a wire that goes slack or taut puts a corner into the residuals: over it they rise before they fall
+            better |= one_sided & np.isfinite(residual)
+        shorter = _within_reach(after - x_tried, rows, layout, params)
+        if better.all() and shorter is None:
+            x_at, step, best = x_tried, after - x_tried, residual
+            damping[:] = 1.0
+        else:
+            if shorter is not None:
+                with np.errstate(invalid="ignore"):  # a robot that is lost has no step to shorten
+                    after = np.where(shorter[:, None] < 1.0, x_tried + shorter[:, None] * (after - x_tried), after)
+            x_at = np.where(better[:, None], x_tried, x_at)
+            step = np.where(better[:, None], after - x_tried, step)
+            best = np.where(better, residual, best)
+            damping = np.where(better, 1.0, 0.5 * damping)
+            # a robot's bits do not depend on whether another one is damped
+            boundary.x[rows] = np.where(better[:, None], after, x_at + damping[:, None] * step)
+        # only a pass that was accepted can end it: what it wrote is what the caller gets
+        closed = better & (np.isfinite(residual) if layout.paper else residual <= tolerance)
+        patience -= closed
+        done = closed & (_still(step, rows, layout, params, tolerance + 1e-6 * residual) | ((patience <= 0) & (residual <= tolerance)))
+        lost = ~done & ((damping < _SMALLEST_STEP) | ~np.isfinite(step).all(1))
+        failed.append(rows[lost])
+        keep = ~(done | lost)
+        if not keep.any():
+            rows = rows[:0]
+            break
+        if not keep.all():
+            rows, x_at, step = rows[keep], x_at[keep], step[keep]
+            best, damping, patience, one_sided = best[keep], damping[keep], patience[keep], one_sided[keep]
+    return np.sort(np.concatenate([rows, *failed]))
+
+
+def _within_reach(step: Floats, rows: Ints, layout: Layout, params: Params) -> Floats | None:
+    """Factors that keep the base moment from changing by more than `_LONGEST_STEP` EI/l in a pass; None where all do."""
+    n_base = 2 * len(layout.first_tendon) if layout.paper else 3
+    moment = params.moment_scale if len(params.moment_scale) == 1 else params.moment_scale[rows]
+    turn = np.abs(step[:, :n_base]).max(1) / moment
+    if not (turn > _LONGEST_STEP).any():
+        return None
+    return np.asarray(np.minimum(1.0, _LONGEST_STEP / np.maximum(turn, 1e-300)))
+
+
+def _still(step: Floats, rows: Ints, layout: Layout, params: Params, small: Floats) -> Flags:
+    """The unknowns no longer move.
+
+    A small residual says little about tensions where tendons hardly stretch, and in paper mode the wires may disagree:
+    then the least-squares boundary is the answer, and the residual says by how much they do.
+    """
+
+    def of(a: Floats) -> Floats:
+        return a if len(a) == 1 else a[rows]
+
+    if layout.paper:
+        bend = np.abs(step).max(1) / of(params.moment_scale)
+        return np.asarray(bend * of(params.reach) <= small)
+    n_free = len(layout.free_tendon)
+    if not n_free:
+        return np.ones(len(step), bool)
+    return np.asarray(np.abs(step[:, 3 : 3 + n_free]).max(1) <= 1e-6 * of(params.tension_scale))
+
+
+def _continuation(rows: Ints, boundary: Passes, ports: Ports, tolerance: float, run: Pass, passes: Ints) -> Ints:
+    """From the unloaded robot to the loaded one, in load steps that grow with success; the robots that did not arrive."""
+    layout, params = boundary.layout, boundary.params
+    part = np.zeros(boundary.n_robots)
+    longest = np.full(boundary.n_robots, 0.25)  # a longer stride than a load parameter of three could land on another equilibrium
+    longest[rows] = np.minimum(0.25, 0.5 * _STEEP / np.maximum(load_parameter(rows, params, ports), 1e-9))
+    stride = longest.copy()
+    heavy = rows[longest[rows] < _SMALLEST_LOAD_STEP]  # hundreds of times what bends a rod by a radian: steps without end
+    unloaded = _loaded(ports, part)
+    cold_start(rows, layout, params, unloaded, boundary.memory)
+    if len(heavy):
+        run(heavy, ports)  # once: their residual is that of these loads, and not of none
+        cold_start(heavy, layout, params, unloaded, boundary.memory)
+    lost = np.union1d(heavy, _newton(np.setdiff1d(rows, heavy), boundary, unloaded, tolerance, run, passes))
+    rows = np.setdiff1d(rows, lost)
+    held = boundary.x.copy()
+    while len(rows):
+        aim = np.minimum(part + stride, 1.0)
+        missed = _newton(rows, boundary, _loaded(ports, aim), tolerance, run, passes)
+        arrived = np.setdiff1d(rows, missed)
+        part[arrived] = aim[arrived]
+        held[arrived] = boundary.x[arrived]
+        stride[arrived] = np.minimum(2.0 * stride[arrived], longest[arrived])
+        boundary.x[missed] = held[missed]
+        stride[missed] *= 0.5
+        lost = np.concatenate([lost, missed[stride[missed] < _SMALLEST_LOAD_STEP]])
+        rows = np.setdiff1d(rows[part[rows] < 1.0], lost)
+    return np.sort(lost)
+
+
+def _loaded(ports: Ports, part: Floats) -> Ports:
+    """The ports with each robot's loads scaled."""
+
+    def scaled(a: Floats) -> Floats:
+        return a if not len(a) else np.ascontiguousarray(part.reshape(-1, *[1] * (a.ndim - 1)) * a)
+
+    return ports._replace(
+        tip_force=scaled(ports.tip_force),
+        tip_moment=scaled(ports.tip_moment),
+        line_force=scaled(ports.line_force),
+        node_force=scaled(ports.node_force),
+        follower_force=scaled(ports.follower_force),
+    )

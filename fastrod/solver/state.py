@@ -1,0 +1,126 @@
+"""What a `Simulator` takes besides inputs, and what it hands out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from fastrod.contact.contacts import Contacts
+from fastrod.contact.engine import Snapshot as ContactSnapshot
+from fastrod.errors import InputError
+from fastrod.model.robot import Robot
+from fastrod.solver.inputs import Inputs
+from fastrod.types import Flags, Floats, Ints, Memory, Params, Ports
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observer:
+    """Gains of the boundary observer (the paper's Q and V, eqs. 5 and 12), on unknowns scaled to about one.
+
+    A simulator without an observer of its own takes the gains so high that a step is a Gauss-Newton step; the variance
+    that is then left over is far below the process noise, and is not carried. More `measurement_noise` smooths the boundary
+    over time.
+    """
+
+    process_noise: float = 100.0
+    """Q, growth of the variance of the scaled unknowns (moment by EI/l, tension by EI/(d l)) [1/s]."""
+    measurement_noise: float = 1e-20
+    """V^-1, variance of a boundary residual times time [m^2 s]."""
+
+    def __post_init__(self) -> None:
+        for name in ("process_noise", "measurement_noise"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise InputError(f"Observer.{name} is {value!r}; it must be positive and finite.")
+
+
+@dataclass(frozen=True, repr=False)
+class State:
+    """The robots after a step: new arrays, robot axis first, world frame. With outputs="tip", those along the rod are empty.
+
+    A node is shared by two segments at a joint; its curvature is that of the distal one. Read, do not write: `shape` goes by
+    these arrays.
+    """
+
+    position: Floats
+    """(n_robots, n_points, 3) backbone [m]."""
+    rotation: Floats
+    """(n_robots, n_points, 3, 3) world_from_material."""
+    curvature: Floats
+    """(n_robots, n_points, 3) material frame [1/m]."""
+    arclength: Floats
+    """(n_robots, n_points) [m]."""
+    moment: Floats
+    """(n_robots, n_points, 3) total internal moment of rod and tendons, material frame [N m]."""
+    force: Floats
+    """(n_robots, n_points, 3) total internal force: the loads beyond the node [N]."""
+    tip_position: Floats
+    """(n_robots, 3) [m]."""
+    tip_rotation: Floats
+    """(n_robots, 3, 3) world_from_material."""
+    tension: Floats
+    """(n_robots, n_tendons) positive pulls; in paper mode, which has no tensions, 0 [N]."""
+    path_length: Floats
+    """(n_robots, n_tendons) length of the tendon's path along the bent rod, without its stretch [m]."""
+    base_wrench: Floats
+    """(n_robots, 6) force [N], then moment about the base point [N m], that the robot exerts on its host."""
+    residual: Floats
+    """(n_robots,) largest boundary residual [m]: lengths as they are, moments times l^2/EI, forces times
+    l^3/EI. Of a robot that is not ok it is that of what was tried."""
+    ok: Flags
+    """(n_robots,) after `settle`: it converged. After `step`: it did not diverge; `residual` says how far the
+    observer is behind. A robot that is not ok has the last shape that was solved, nan where there is none or
+    its input cannot be used."""
+    passes: Ints
+    """(n_robots,) forward passes that were spent: after `step` 1, or more where it settled a robot whose pass
+    diverged; -1 where no shape was found, 0 where bad input left nothing to do."""
+    problems: Mapping[int, str]
+    """Robot index -> what is wrong with it, for the robots that are not ok."""
+    contacts: Contacts | None = None
+    """What touches what; None without a contact scene."""
+
+    def __repr__(self) -> str:
+        n = len(self.ok)
+        along = f"n_points={self.position.shape[1]}" if len(self.position) else "tip only"
+        residual = np.max(self.residual, where=self.ok, initial=0.0)
+        text = f"State(n_robots={n}, {along}, ok={int(self.ok.sum())} of {n}, residual<={residual:.3g} m"
+        if self.contacts is not None:
+            text += f", contacts={int(self.contacts.count.sum())}"
+        if self.problems:
+            i = min(self.problems)
+            text += f", robot {i}: {self.problems[i]!r}"
+        return text + ")"
+
+
+class Pose(NamedTuple):
+    """Cross-sections at given arclengths."""
+
+    position: Floats
+    """(n_robots, n_queries, 3) world [m]."""
+    rotation: Floats
+    """(n_robots, n_queries, 3, 3) world_from_material."""
+    curvature: Floats
+    """(n_robots, n_queries, 3) material frame [1/m]."""
+
+
+class Snapshot(NamedTuple):
+    """Everything that a later step depends on."""
+
+    robots: tuple[Robot, ...]
+    memory: Memory
+    warm: Flags
+    """(n_robots,) the boundary is that of an earlier step."""
+    given: Inputs
+    ports: Ports | None
+    state: State | None
+    params: Params
+    bare: Ports | None
+    effects: list[Floats]
+    """The memory of each effect, in their order."""
+    time: Floats
+    """(n_robots,) as effects count it [s]; nan before the first step."""
+    contact: ContactSnapshot | None
