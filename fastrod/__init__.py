@@ -14,15 +14,33 @@ if TYPE_CHECKING:
     from fastrod.solver.state import Observer, Pose, State
 
 __all__ = [
-    "Observer", "Pose", "Robot", "Rod", "Segment", "Simulator", "State", "Tendon", "load_robot", "reference", "robot_names", "save_robot",
-]  # fmt: skip
-_HOME = {"Observer": "solver.state", "Pose": "solver.state", "Rod": "hosts.rod", "Simulator": "simulator", "State": "solver.state"}
+    "Observer",
+    "Pose",
+    "Robot",
+    "Rod",
+    "Segment",
+    "Simulator",
+    "State",
+    "Tendon",
+    "load_robot",
+    "reference",
+    "robot_names",
+    "save_robot",
+]
+_HOME = {
+    "Observer": "solver.state",
+    "Pose": "solver.state",
+    "Rod": "hosts.rod",
+    "Simulator": "simulator",
+    "State": "solver.state",
+}
 
 refuse_old_names()
 
 
 def __getattr__(name: str) -> Any:
-    """The simulator and the twins on first use: numba and scipy take half a second that a robot file does not need."""
+    """The simulator and the twins on first use: numba and scipy take half a second that a robot file does not
+    need."""
     import importlib
 
     if name == "reference":

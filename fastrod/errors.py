@@ -1,4 +1,5 @@
-"""Every exception that fastrod raises on purpose: what was given, what would be right, the nearest known name."""
+"""Every exception that fastrod raises on purpose: what was given, what would be right, the nearest known
+name."""
 
 from __future__ import annotations
 
@@ -9,8 +10,8 @@ from collections.abc import Iterable
 class FastrodError(Exception):
     """Base of every error that a user can cause and mend; the command line exits with 2 on it.
 
-    Its text is one line, whatever it quotes of a file or a library: what cannot be printed, line breaks and escapes
-    too, is a space.
+    Its text is one line, whatever it quotes of a file or a library: what cannot be printed, line breaks and
+    escapes too, is a space.
     """
 
     def __str__(self) -> str:

@@ -10,10 +10,11 @@ from fastrod.model.robot import Robot
 
 
 def load_robot(source: str | Path) -> Robot:
-    """The robot of a shipped name, or of a path to a .toml, with every [[effect]] known and its parameters within their bounds.
+    """The robot of a shipped name, or of a path to a .toml, with every [[effect]] known and its parameters
+    within their bounds.
 
-    Raises `UnknownNameError` for a name or an effect that is not there, `RobotError` for a file that is not a robot, `EffectError` for an
-    effect's parameter that cannot be.
+    Raises `UnknownNameError` for a name or an effect that is not there, `RobotError` for a file that is not a
+    robot, `EffectError` for an effect's parameter that cannot be.
     """
     robot = robotfile.load_robot(source)
     if robot.effects:
@@ -22,9 +23,12 @@ def load_robot(source: str | Path) -> Robot:
 
 
 def check_effects(robot: Robot, where: str) -> None:
-    """Look up the effects of `robot` in the library; `where` names it in errors. Raises `UnknownNameError`, `EffectError`."""
+    """Look up the effects of `robot` in the library; `where` names it in errors. Raises `UnknownNameError`,
+    `EffectError`."""
     from fastrod.effects.base import read_values
-    from fastrod.effects.pipeline import named_effects  # the library imports numba, which a robot without effects does not need
+
+    # the library imports numba, which a robot without effects does not need
+    from fastrod.effects.pipeline import named_effects
     from fastrod.model.routing import wire
 
     try:

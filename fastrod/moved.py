@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec
-from types import ModuleType
 
 _NOW = {
     "chain": "effects.pipeline",
@@ -40,7 +38,7 @@ _NOW = {
 class _Moved(MetaPathFinder):
     """Comes last, so that it is asked only for what is not there."""
 
-    def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
+    def find_spec(self, fullname: str, *_: object) -> ModuleSpec | None:
         now = _NOW.get(fullname.removeprefix("fastrod."))
         if now is None or not fullname.startswith("fastrod."):
             return None

@@ -40,9 +40,16 @@ def quaternion_from_matrix(rotation: Floats) -> Floats:
     a, b, c = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
     d, e, f = r[..., 0, 1] + r[..., 1, 0], r[..., 0, 2] + r[..., 2, 0], r[..., 1, 2] + r[..., 2, 1]
     w, x, y, z = np.moveaxis(sums, -1, 0)
-    # four times the quaternion's largest component times the quaternion (Shepperd 1978): never a small divisor
+    # four times the quaternion's largest component times the quaternion (Shepperd 1978): never a small
+    # divisor
     rows = np.stack(
-        [np.stack([w, a, b, c], -1), np.stack([a, x, d, e], -1), np.stack([b, d, y, f], -1), np.stack([c, e, f, z], -1)], axis=-2
+        [
+            np.stack([w, a, b, c], -1),
+            np.stack([a, x, d, e], -1),
+            np.stack([b, d, y, f], -1),
+            np.stack([c, e, f, z], -1),
+        ],
+        axis=-2,
     )
     found = np.take_along_axis(rows, sums.argmax(-1)[..., None, None], axis=-2)[..., 0, :]
     found = found / np.linalg.norm(found, axis=-1, keepdims=True)

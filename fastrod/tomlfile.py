@@ -21,13 +21,17 @@ def read_text(path: Path, where: str, error: type[FastrodError]) -> str:
         if len(content) > _LARGEST:
             raise ValueError(f"it has more than {_LARGEST} bytes")
         return content.decode("utf-8-sig")
-    except (OSError, ValueError) as why:  # ValueError: bytes that are no text, or a path that no file can have
+    # ValueError: bytes that are no text, or a path that no file can have
+    except (OSError, ValueError) as why:
         raise error(f"{where} cannot be read: {getattr(why, 'strerror', None) or why}.") from why
 
 
 def parse(text: str, where: str, error: type[FastrodError], what: str) -> dict[str, Any]:
     """The tables of a TOML text. Raises `error`; `where` names the text, and `what` is what it should be."""
-    if any(piece.count(".") > _DEEPEST and all(map(str.strip, piece.split("."))) for piece in re.split(r"[\n,=]", text)):
+    if any(
+        piece.count(".") > _DEEPEST and all(map(str.strip, piece.split(".")))
+        for piece in re.split(r"[\n,=]", text)
+    ):
         # tomllib takes a time that grows with the square of their number
         raise error(f"{where} is not a {what}: it has a key of more than {_DEEPEST} parts.")
     try:

@@ -1,7 +1,7 @@
 """The arrays by name: what the kernels read, keep and write.
 
-The robot axis comes first. An array that is the same for all robots may have length 1 on it; one that is not used has
-length 0. Frames: world unless "material" is said.
+The robot axis comes first. An array that is the same for all robots may have length 1 on it; one that is not
+used has length 0. Frames: world unless "material" is said.
 """
 
 from __future__ import annotations
@@ -75,7 +75,8 @@ class Ports(NamedTuple):
     follower_force: Floats
     """(n_robots, 3) at the tip, material; length 0 if there is none [N]."""
     line_force: Floats
-    """(n_robots, n_segments, n_f, 3); n_f is 1, or 2 n_steps: at the start and the end of every step, linear between [N/m]."""
+    """(n_robots, n_segments, n_f, 3); n_f is 1, or 2 n_steps: at the start and the end of every step, linear
+    between [N/m]."""
     node_force: Floats
     """(n_robots, n_points, 3) point forces on nodes; length 0 if there are none [N]."""
     grid: Floats
@@ -88,17 +89,19 @@ class Memory(NamedTuple):
     """What the observer carries from one step to the next."""
 
     x: Floats
-    """(n_robots, n_x) boundary unknowns: base moment, material [N m]; tensions of the free tendons [N]; with a follower
-    force its world value [N]. Paper mode: m_x and m_y at the base of each segment."""
+    """(n_robots, n_x) boundary unknowns: base moment, material [N m]; tensions of the free tendons [N]; with
+    a follower force its world value [N]. Paper mode: m_x and m_y at the base of each segment."""
     covariance: Singles
-    """(n_robots, n_x (n_x + 1) / 2) P of the scaled unknowns, lower triangle row by row; length 0 where it is not carried."""
+    """(n_robots, n_x (n_x + 1) / 2) P of the scaled unknowns, lower triangle row by row; length 0 where it is
+    not carried."""
     gain: Singles
-    """(n_robots, n_x, n_e) change of x per boundary residual, tendon lengths first, which is also that per commanded length; where
-    tracked, three columns more for the tip force."""
+    """(n_robots, n_x, n_e) change of x per boundary residual, tendon lengths first, which is also that per
+    commanded length; where tracked, three columns more for the tip force."""
     move: Singles
     """(n_robots, n_x) first-order change of the scaled unknowns at the last change of inputs."""
     defect: Singles
-    """(n_robots, n_x) second-order change of the scaled unknowns at that change: what was foreseen and what the pass added."""
+    """(n_robots, n_x) second-order change of the scaled unknowns at that change: what was foreseen and what
+    the pass added."""
     length_before: Floats
     """(n_robots, n_rows) tendon lengths that x belongs to [m]."""
     force_before: Floats
@@ -108,7 +111,8 @@ class Memory(NamedTuple):
 
 
 class Shape(NamedTuple):
-    """What a pass writes: shapes, units and frames as in `fastrod.solver.state.State`; arrays that are not wanted have length 0."""
+    """What a pass writes: shapes, units and frames as in `fastrod.solver.state.State`; arrays that are not
+    wanted have length 0."""
 
     position: Floats
     rotation: Floats
@@ -138,14 +142,16 @@ class Response(NamedTuple):
 
 
 class Surfaces(NamedTuple):
-    """The obstacles of a contact scene, each in its own frame; triangles of all meshes stand in the order of their hierarchies' leaves."""
+    """The obstacles of a contact scene, each in its own frame; triangles of all meshes stand in the order of
+    their hierarchies' leaves."""
 
     kind: Ints
     """(n_obstacles,) mesh, sphere, box, ...: the codes of `kernels.primitive`."""
     size: Floats
     """(n_obstacles, 3) of a simple shape [m]."""
     sphere: Floats
-    """(n_obstacles, 4) centre and radius of a ball that holds the obstacle; radius infinite for a plane [m]."""
+    """(n_obstacles, 4) centre and radius of a ball that holds the obstacle; radius infinite for a plane
+    [m]."""
     friction: Floats
     """(n_obstacles,) Coulomb coefficient against the rod."""
     compliance: Floats
@@ -153,8 +159,9 @@ class Surfaces(NamedTuple):
     body: Ints
     """(n_obstacles,) number of the rigid body that it is part of."""
     give: Floats
-    """(n_obstacles, 13) how far that body moves within a step under a unit force at its centre of mass [m/N], and turns under a unit
-    moment [rad/(N m)], (3, 3) row by row, world; the centre of mass, world [m]. Zero: it goes where it is told."""
+    """(n_obstacles, 13) how far that body moves within a step under a unit force at its centre of mass [m/N],
+    and turns under a unit moment [rad/(N m)], (3, 3) row by row, world; the centre of mass, world [m]. Zero:
+    it goes where it is told."""
     root: Ints
     """(n_obstacles,) link to the top of a mesh's hierarchy."""
     box: Floats
@@ -168,7 +175,8 @@ class Surfaces(NamedTuple):
 
 
 class Probes(NamedTuple):
-    """Contact points of the robots of one pass, in the order of its rows: loads in, linear response out. Length 0 if none."""
+    """Contact points of the robots of one pass, in the order of its rows: loads in, linear response out.
+    Length 0 if none."""
 
     node: Ints
     """(n_rows, n_probes) node that the contact is on; -1 where there is none."""
@@ -177,8 +185,8 @@ class Probes(NamedTuple):
     arm: Floats
     """(n_rows, n_probes, 3) from the centreline to the point of contact, world [m]."""
     motion: Floats
-    """(n_rows, 3 n_probes, 1 + 3 n_probes) motion of the contact points, world: first what closing the boundary does at these
-    forces [m], then the compliance [m/N]."""
+    """(n_rows, 3 n_probes, 1 + 3 n_probes) motion of the contact points, world: first what closing the
+    boundary does at these forces [m], then the compliance [m/N]."""
     unknown: Floats
     """(n_rows, n_x, 1 + 3 n_probes) the same of the boundary unknowns."""
 
@@ -219,9 +227,11 @@ class Touching(NamedTuple):
 
 
 class Clearance(NamedTuple):
-    """What is known about how far each node is from all obstacles: while it moves less, it need not be asked again."""
+    """What is known about how far each node is from all obstacles: while it moves less, it need not be asked
+    again."""
 
     distance: Floats
-    """(n_robots, n_points) lower bound of the signed distance of the centreline; -inf where nothing is known [m]."""
+    """(n_robots, n_points) lower bound of the signed distance of the centreline; -inf where nothing is known
+    [m]."""
     position: Floats
     """(n_robots, n_points, 3) where that was, world [m]."""

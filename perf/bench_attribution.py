@@ -1,4 +1,5 @@
-"""How often the missing effect is named: sealed logs of a plant that shares no code with the model, opened after the verdict.
+"""How often the missing effect is named: sealed logs of a plant that shares no code with the model, opened
+after the verdict.
 
 fastrod bench attribution                      all cases, about half an hour on two cores
 python perf/bench_attribution.py --share 0.1   a tenth of them; --only single,none
@@ -22,7 +23,17 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "truth"))
 
 NOISE = 3e-4  # m
 FIRST_SEED = 1000  # rules were set while looking at these; other seeds are a fairer test
-COUNTS = {"single": 200, "none": 100, "outside": 60, "two": 60, "dominant": 40, "deleted": 60, "operator": 50, "noise": 24, "segments": 26}
+COUNTS = {
+    "single": 200,
+    "none": 100,
+    "outside": 60,
+    "two": 60,
+    "dominant": 40,
+    "deleted": 60,
+    "operator": 50,
+    "noise": 24,
+    "segments": 26,
+}
 GOALS = {
     "single": ">= 95 % right effect first; held-out <= 1.15 x floor",
     "none": ">= 98 % verdict none",
@@ -52,9 +63,15 @@ def cases(share: float, only: Iterable[str], first_seed: int = FIRST_SEED) -> li
         if only and kind not in only:
             continue
         names = {
-            "outside": plant.OUTSIDE, "none": ("none",), "two": ("two",), "dominant": ("dominant",), "segments": plant.library(2),
-        }.get(kind, plant.library(1))  # fmt: skip
-        made += [Case(kind, first_seed + i, names[i % len(names)]) for i in range(max(1, round(share * count)))]
+            "outside": plant.OUTSIDE,
+            "none": ("none",),
+            "two": ("two",),
+            "dominant": ("dominant",),
+            "segments": plant.library(2),
+        }.get(kind, plant.library(1))
+        made += [
+            Case(kind, first_seed + i, names[i % len(names)]) for i in range(max(1, round(share * count)))
+        ]
     return sorted(made, key=lambda case: (case.seed, case.kind))  # a run that is stopped has some of each
 
 
@@ -74,7 +91,9 @@ def run(case: Case) -> dict[str, Any]:
 
         inputs = plant.operator_inputs(np.random.default_rng(case.seed), segments)
         n = len(inputs.t)
-        log = RunLog(name="operator", t=inputs.t, run=np.full(n, ""), dl=inputs.dl, tip_position=np.zeros((n, 3)))
+        log = RunLog(
+            name="operator", t=inputs.t, run=np.full(n, ""), dl=inputs.dl, tip_position=np.zeros((n, 3))
+        )
     else:
         log = excitation(robot, seed=case.seed).log
         inputs = plant.Inputs(log.t, log.dl, log.payload, log.base_quaternion)
@@ -90,11 +109,21 @@ def run(case: Case) -> dict[str, Any]:
     clock = time.perf_counter()
     result = identify(log, robot, exclude=exclude, free_camera=case.kind == "operator", threads=1)
     return {
-        "case": case.kind, "seed": case.seed, "true": list(seal.effects), "verdict": result.verdict, "kind": result.remaining_kind,
-        "named": [e.name for e in result.effects], "classes": [list(e.cannot_be_told_from) for e in result.effects],
-        "before": result.test.before, "after": result.test.after, "floor": result.noise.floor, "bounds": len(result.bounds),
-        "left": result.remaining_share, "seconds": time.perf_counter() - clock, "rows": len(log),
-    }  # fmt: skip
+        "case": case.kind,
+        "seed": case.seed,
+        "true": list(seal.effects),
+        "verdict": result.verdict,
+        "kind": result.remaining_kind,
+        "named": [e.name for e in result.effects],
+        "classes": [list(e.cannot_be_told_from) for e in result.effects],
+        "before": result.test.before,
+        "after": result.test.after,
+        "floor": result.noise.floor,
+        "bounds": len(result.bounds),
+        "left": result.remaining_share,
+        "seconds": time.perf_counter() - clock,
+        "rows": len(log),
+    }
 
 
 def two_segments() -> Any:
@@ -112,7 +141,12 @@ def _safely(case: Case) -> dict[str, Any]:
     try:
         return run(case)
     except Exception as error:  # a crash is a wrong answer, and must not stop the others
-        return {"case": case.kind, "seed": case.seed, "true": [case.what], "error": f"{type(error).__name__}: {error}"}
+        return {
+            "case": case.kind,
+            "seed": case.seed,
+            "true": [case.what],
+            "error": f"{type(error).__name__}: {error}",
+        }
 
 
 def first_right(row: dict[str, Any]) -> bool:
@@ -158,20 +192,27 @@ def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
             continue
         whole = [r for r in own if "error" not in r]
         ratio = [r["after"] / r["floor"] for r in whole if r["named"]]
-        table.append({
-            "case": kind, "logs": len(own), "as_wanted": sum(score(kind, r) for r in own) / len(own), "goal": GOALS[kind],
-            "crashed": len(own) - len(whole), "verdicts": dict(Counter(r["verdict"] for r in whole)),
-            "after_over_floor_median": float(np.median(ratio)) if ratio else None,
-            "after_within_1.15": float(np.mean(np.array(ratio) <= 1.15)) if ratio else None,
-            "before_mm_median": float(np.median([1e3 * r["before"] for r in whole])) if whole else None,
-            "after_mm_median": float(np.median([1e3 * r["after"] for r in whole])) if whole else None,
-            "seconds_median": float(np.median([r["seconds"] for r in whole])) if whole else None,
-        })  # fmt: skip
+        table.append(
+            {
+                "case": kind,
+                "logs": len(own),
+                "as_wanted": sum(score(kind, r) for r in own) / len(own),
+                "goal": GOALS[kind],
+                "crashed": len(own) - len(whole),
+                "verdicts": dict(Counter(r["verdict"] for r in whole)),
+                "after_over_floor_median": float(np.median(ratio)) if ratio else None,
+                "after_within_1.15": float(np.mean(np.array(ratio) <= 1.15)) if ratio else None,
+                "before_mm_median": float(np.median([1e3 * r["before"] for r in whole])) if whole else None,
+                "after_mm_median": float(np.median([1e3 * r["after"] for r in whole])) if whole else None,
+                "seconds_median": float(np.median([r["seconds"] for r in whole])) if whole else None,
+            }
+        )
     return table
 
 
 def confusion(rows: list[dict[str, Any]]) -> dict[str, dict[str, int]]:
-    """True effect -> what was named first (or the verdict where nothing was) -> logs, of the single, noise and outside cases."""
+    """True effect -> what was named first (or the verdict where nothing was) -> logs, of the single, noise
+    and outside cases."""
     table: dict[str, Counter[str]] = {}
     for row in rows:
         if row["case"] in ("single", "outside", "none", "noise") and "error" not in row:
@@ -181,7 +222,9 @@ def confusion(rows: list[dict[str, Any]]) -> dict[str, dict[str, int]]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--share", type=float, default=1.0, help="of each case's count")
     parser.add_argument("--only", default="", help="cases, separated by commas")
@@ -212,19 +255,32 @@ def show(rows: list[dict[str, Any]], table: list[dict[str, Any]], processes: int
     print(f"sealed logs, noise {1e3 * NOISE:g} mm unless said, {processes} processes of one thread")
     for line in table:
         ratio = line["after_over_floor_median"]
-        more = "" if ratio is None else f"; after/floor median {ratio:.2f}, within 1.15: {100 * line['after_within_1.15']:.0f} %"
-        print(f"\n{line['case']}: {100 * line['as_wanted']:.1f} % of {line['logs']} as wanted ({line['goal']})")
-        print(f"  held-out {line['before_mm_median']:.2f} -> {line['after_mm_median']:.2f} mm{more}; {line['seconds_median']:.1f} s a log")
+        more = (
+            ""
+            if ratio is None
+            else (f"; after/floor median {ratio:.2f}, within 1.15: {100 * line['after_within_1.15']:.0f} %")
+        )
+        print(
+            f"\n{line['case']}: {100 * line['as_wanted']:.1f} % of {line['logs']} as wanted ({line['goal']})"
+        )
+        print(
+            f"  held-out {line['before_mm_median']:.2f} -> {line['after_mm_median']:.2f} mm{more}; "
+            f"{line['seconds_median']:.1f} s a log"
+        )
         print(f"  verdicts {line['verdicts']}" + (f", crashed {line['crashed']}" if line["crashed"] else ""))
         for row in [r for r in rows if r["case"] == line["case"] and not score(line["case"], r)][:40]:
             what = (
                 row.get("error")
-                or f"{row['verdict']} {row['named']} {row['classes']} {1e3 * row['before']:.2f} -> {1e3 * row['after']:.2f} mm"
+                or f"{row['verdict']} {row['named']} {row['classes']} {1e3 * row['before']:.2f} -> "
+                f"{1e3 * row['after']:.2f} mm"
             )
             print(f"    {row['seed']} {'+'.join(row['true'][:2]) or 'none'}: {what}")
     print("\nconfusion (true: named first x logs)")
     for true, counts in sorted(confusion(rows).items()):
-        print(f"  {true:22s} " + ", ".join(f"{name} x {n}" for name, n in sorted(counts.items(), key=lambda kv: -kv[1])))
+        print(
+            f"  {true:22s} "
+            + ", ".join(f"{name} x {n}" for name, n in sorted(counts.items(), key=lambda kv: -kv[1]))
+        )
 
 
 if __name__ == "__main__":

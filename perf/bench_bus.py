@@ -1,7 +1,8 @@
 """The drives' bus in real time: `python perf/bench_bus.py`; `--json` for programs, `--quick` for a smoke run.
 
-Both ends on this machine: the controller's loop, four emulated drives, and the bus between them. What a set-point costs, how even the SYNCs
-are, and whether a drive ever lacks a set-point. Another process plays the drives where the bus is udp_multicast.
+Both ends on this machine: the controller's loop, four emulated drives, and the bus between them. What a
+set-point costs, how even the SYNCs are, and whether a drive ever lacks a set-point. Another process plays the
+drives where the bus is udp_multicast.
 """
 
 from __future__ import annotations
@@ -28,12 +29,20 @@ SPECS = [DriveSpec(node=k + 1, drum_radius=0.008, direction=(1, -1)[k % 2]) for 
 AMPLITUDE, TURN = 1500.0, 2.0  # counts, s
 UDP = "udp_multicast:239.74.163.2:43174"
 COLUMNS = (
-    Column("bus", "bus"), Column("rate", "rate [Hz]", ".0f"), Column("cycles", "cycles", "d"), Column("missed", "set-points\nmissed", "d"),
-    Column("unanswered", "cycles not\nanswered", "d"), Column("late", "cycles\nleft out", "d"),
-    Column("jitter_p50", "SYNC off\np50 [us]", ".0f"), Column("jitter_p99", "p99 [us]", ".0f"), Column("jitter_max", "max [us]", ".0f"),
-    Column("exchange_p50", "exchange\np50 [us]", ".0f"), Column("exchange_p99", "p99 [us]", ".0f"),
-    Column("sdo", "SDO in\nthe loop", "d"), Column("cpu", "CPU\n[cores]", ".2f"),
-)  # fmt: skip
+    Column("bus", "bus"),
+    Column("rate", "rate [Hz]", ".0f"),
+    Column("cycles", "cycles", "d"),
+    Column("missed", "set-points\nmissed", "d"),
+    Column("unanswered", "cycles not\nanswered", "d"),
+    Column("late", "cycles\nleft out", "d"),
+    Column("jitter_p50", "SYNC off\np50 [us]", ".0f"),
+    Column("jitter_p99", "p99 [us]", ".0f"),
+    Column("jitter_max", "max [us]", ".0f"),
+    Column("exchange_p50", "exchange\np50 [us]", ".0f"),
+    Column("exchange_p99", "p99 [us]", ".0f"),
+    Column("sdo", "SDO in\nthe loop", "d"),
+    Column("cpu", "CPU\n[cores]", ".2f"),
+)
 
 
 class Springs:
@@ -47,7 +56,9 @@ class Springs:
 def elsewhere(bus: str) -> Iterator[list[int]]:
     """The drives in another process; the list has the set-points that they missed, once it has ended."""
     missed: list[int] = []
-    process = subprocess.Popen([sys.executable, __file__, "--drives", bus], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    process = subprocess.Popen(
+        [sys.executable, __file__, "--drives", bus], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
     try:
         assert process.stdout is not None
         process.stdout.readline()  # they are there
@@ -66,8 +77,17 @@ def play_drives(bus: str) -> int:
     return 0
 
 
-def loop(bus_name: str, rate: float, seconds: float, *, calm: bool = True, stepped: bool = False, first: bool = False) -> Row:
-    """One loop: connect, enable, sines for so long. `calm`: without the collector of garbage; `first`: before other programs."""
+def loop(
+    bus_name: str,
+    rate: float,
+    seconds: float,
+    *,
+    calm: bool = True,
+    stepped: bool = False,
+    first: bool = False,
+) -> Row:
+    """One loop: connect, enable, sines for so long. `calm`: without the collector of garbage; `first`: before
+    other programs."""
     granted = first and urgent()
     try:
         return _loop(bus_name, rate, seconds, calm=calm, stepped=stepped, note=", first" if granted else "")
@@ -79,14 +99,20 @@ def _loop(bus_name: str, rate: float, seconds: float, *, calm: bool, stepped: bo
     clock = SteppedClock() if stepped else WallClock()
     local = bus_name.startswith("virtual")
     with ExitStack() as stack:
-        drives = stack.enter_context(EmulatedDrives(SPECS, bus_name, clock=clock, wires=Springs())) if local else None
+        drives = (
+            stack.enter_context(EmulatedDrives(SPECS, bus_name, clock=clock, wires=Springs()))
+            if local
+            else None
+        )
         told = [] if local else stack.enter_context(elsewhere(bus_name))
         bus = stack.enter_context(DriveBus(SPECS, bus_name, clock=clock, rate=rate))
         bus.connect()
         bus.enable()
         n = round(seconds * rate)
         start = bus.newest.position
-        targets = start + np.rint(AMPLITUDE * np.sin(2.0 * np.pi * np.arange(n) / (rate * TURN)))[:, None].astype(np.int64)
+        targets = start + np.rint(AMPLITUDE * np.sin(2.0 * np.pi * np.arange(n) / (rate * TURN)))[
+            :, None
+        ].astype(np.int64)
         spent, asked = np.empty(n), bus.sdo_requests
         missed = drives.missed_setpoints if drives is not None else 0
         bus.reset_statistics()
@@ -107,12 +133,20 @@ def _loop(bus_name: str, rate: float, seconds: float, *, calm: bool, stepped: bo
     micro = 1e6 * np.array([jitter.p50, jitter.p99, jitter.max, *np.quantile(spent, (0.5, 0.99))])
     name = bus_name.split(":")[0] + (", stepped" if stepped else note if calm else ", collector on")
     return {
-        "bus": name, "rate": rate if not stepped else n / wall, "cycles": n, "missed": missed, "unanswered": unanswered,
+        "bus": name,
+        "rate": rate if not stepped else n / wall,
+        "cycles": n,
+        "missed": missed,
+        "unanswered": unanswered,
         "late": pacer.slipped,
-        "jitter_p50": None if stepped else float(micro[0]), "jitter_p99": None if stepped else float(micro[1]),
-        "jitter_max": None if stepped else float(micro[2]), "exchange_p50": float(micro[3]), "exchange_p99": float(micro[4]),
-        "sdo": asked, "cpu": cpu / wall,
-    }  # fmt: skip
+        "jitter_p50": None if stepped else float(micro[0]),
+        "jitter_p99": None if stepped else float(micro[1]),
+        "jitter_max": None if stepped else float(micro[2]),
+        "exchange_p50": float(micro[3]),
+        "exchange_p99": float(micro[4]),
+        "sdo": asked,
+        "cpu": cpu / wall,
+    }
 
 
 def measure(options: argparse.Namespace) -> Sequence[Section]:
@@ -131,10 +165,14 @@ def measure(options: argparse.Namespace) -> Sequence[Section]:
         note_progress(name)
         rows.append(run())
     notes = [
-        "A set-point is missed where a drive, operation enabled, got a SYNC and no new target; a cycle is not answered where a drive's",
-        "process data did not come within 0.6 of it. 'stepped': no waiting at all, the rate is what the machine computes.",
-        "'first': before other programs, where the machine grants that; 'collector on': garbage is collected in the loop.",
-        f"Both ends share the interpreter on 'virtual', and {os.cpu_count()} cores; with udp_multicast the drives are another process.",
+        "A set-point is missed where a drive, operation enabled, got a SYNC and no new target; a cycle is "
+        "not answered where a drive's",
+        "process data did not come within 0.6 of it. 'stepped': no waiting at all, the rate is what the "
+        "machine computes.",
+        "'first': before other programs, where the machine grants that; 'collector on': garbage is "
+        "collected in the loop.",
+        f"Both ends share the interpreter on 'virtual', and {os.cpu_count()} cores; with udp_multicast the "
+        "drives are another process.",
     ]
     return [Section("bus", "four drives on one bus", COLUMNS, rows, notes)]
 
@@ -144,7 +182,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     given = sys.argv[1:] if argv is None else list(argv)
     if given[:1] == ["--drives"]:
         return play_drives(given[1])
-    parser = argparse.ArgumentParser(prog="bench_bus", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        prog="bench_bus", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seconds", type=float, default=60.0, help="of the loop at 200 Hz (default: 60)")
     return command(parser, given, measure)
 

@@ -1,4 +1,5 @@
-"""The camera on drawn frames: errors, flips, latency, time. This file as a script; `--json` for programs, `--quick` for a smoke run."""
+"""The camera on drawn frames: errors, flips, latency, time. This file as a script; `--json` for programs,
+`--quick` for a smoke run."""
 
 from __future__ import annotations
 
@@ -35,10 +36,14 @@ def camera_and_marker() -> tuple[Camera, Marker]:
     from fastrod_device.camera import Camera, Marker
 
     matrix = ((FOCAL, 0.0, 319.5), (0.0, FOCAL, 239.5), (0.0, 0.0, 1.0))
-    return Camera(matrix=matrix, size=PICTURE, distortion=(-0.12, 0.05, 0.0005, -0.0003, 0.0)), Marker(size=SIZE, id=7)
+    return Camera(matrix=matrix, size=PICTURE, distortion=(-0.12, 0.05, 0.0005, -0.0003, 0.0)), Marker(
+        size=SIZE, id=7
+    )
 
 
-def pose(distance: float, tilt: float, azimuth: float, roll: float, x: float = 0.0, y: float = 0.0) -> tuple[Any, Any]:
+def pose(
+    distance: float, tilt: float, azimuth: float, roll: float, x: float = 0.0, y: float = 0.0
+) -> tuple[Any, Any]:
     """Tip in front of the camera, its marker turned away by `tilt` from facing the camera's axis [rad]."""
     from fastrod.rotation import product, quaternion_from_vector
 
@@ -53,7 +58,8 @@ def angle(a: Any, b: Any) -> float:
 
 
 def errors(distance: float, tilt: float | None, n: int) -> Row:
-    """Single frames at one distance; tilts up to 50 deg where none is given. The model expects the tip's orientation within 3 deg."""
+    """Single frames at one distance; tilts up to 50 deg where none is given. The model expects the tip's
+    orientation within 3 deg."""
     from fastrod.rotation import product, quaternion_from_vector
     from fastrod_device.camera import Frame
     from fastrod_device.drawing import draw
@@ -65,24 +71,36 @@ def errors(distance: float, tilt: float | None, n: int) -> Row:
     tracker, off, flags = MarkerTracker(camera, marker), [], []
     for k in range(n):
         lean = rng.uniform(0.0, math.radians(50.0)) if tilt is None else math.radians(tilt)
-        position, quaternion = pose(distance, lean, *rng.uniform(0.0, 2.0 * np.pi, 2), *rng.uniform(-0.12, 0.12, 2) * distance)
+        position, quaternion = pose(
+            distance, lean, *rng.uniform(0.0, 2.0 * np.pi, 2), *rng.uniform(-0.12, 0.12, 2) * distance
+        )
         expected = position, product(quaternion, quaternion_from_vector(0.03 * rng.standard_normal(3)))
         tracker.reset()
-        seen = tracker.look(Frame(image=draw(camera, marker, position, quaternion, rng=rng), t=0.0, number=k), expected)
+        seen = tracker.look(
+            Frame(image=draw(camera, marker, position, quaternion, rng=rng), t=0.0, number=k), expected
+        )
         flags.append(seen.flag)
         if seen.ok:
             off.append(seen.position - position)
     um = 1e6 * np.array(off)
     return {
-        "distance": 100.0 * distance, "tilt": "0 to 50" if tilt is None else f"{tilt:g}", "frames": n, "ok": 100.0 * len(off) / n,
-        "rms": float(np.sqrt((um**2).sum(1).mean())) / 1e3, "target": 1e3 * ERROR_TARGETS[distance] if tilt is None else None,
-        "bias_x": float(um[:, 0].mean()), "bias_y": float(um[:, 1].mean()), "noise_xy": float(um[:, :2].std()),
-        "bias_z": float(um[:, 2].mean()), "noise_z": float(um[:, 2].std()),
-    }  # fmt: skip
+        "distance": 100.0 * distance,
+        "tilt": "0 to 50" if tilt is None else f"{tilt:g}",
+        "frames": n,
+        "ok": 100.0 * len(off) / n,
+        "rms": float(np.sqrt((um**2).sum(1).mean())) / 1e3,
+        "target": 1e3 * ERROR_TARGETS[distance] if tilt is None else None,
+        "bias_x": float(um[:, 0].mean()),
+        "bias_y": float(um[:, 1].mean()),
+        "noise_xy": float(um[:, :2].std()),
+        "bias_z": float(um[:, 2].mean()),
+        "noise_z": float(um[:, 2].std()),
+    }
 
 
 def flips(distance: float, swing: float, n: int) -> Row:
-    """Smooth motion through the frontal pose: OpenCV's first solution from its own corners, and the tracker without a model."""
+    """Smooth motion through the frontal pose: OpenCV's first solution from its own corners, and the tracker
+    without a model."""
     import cv2
 
     from fastrod.rotation import quaternion_from_matrix
@@ -102,7 +120,14 @@ def flips(distance: float, swing: float, n: int) -> Row:
     for k in range(n):
         t = k / 15.0
         tilt, azimuth = math.radians(swing) * math.sin(1.3 * t), 0.4 + 0.5 * math.sin(0.37 * t)
-        position, quaternion = pose(distance, tilt, azimuth, 0.2, 0.1 * distance * math.sin(0.9 * t), 0.1 * distance * math.cos(0.7 * t))
+        position, quaternion = pose(
+            distance,
+            tilt,
+            azimuth,
+            0.2,
+            0.1 * distance * math.sin(0.9 * t),
+            0.1 * distance * math.cos(0.7 * t),
+        )
         image = draw(camera, marker, position, quaternion, rng=rng)
         sighting = tracker.look(Frame(image=image, t=t, number=k))
         seen_after += sighting.ok
@@ -110,18 +135,33 @@ def flips(distance: float, swing: float, n: int) -> Row:
         found, _, _ = detector.detectMarkers(image)
         if len(found):
             _, turns, _, _ = cv2.solvePnPGeneric(
-                corners, found[0].reshape(4, 2), camera.intrinsics, camera.lens, flags=cv2.SOLVEPNP_IPPE_SQUARE
+                corners,
+                found[0].reshape(4, 2),
+                camera.intrinsics,
+                camera.lens,
+                flags=cv2.SOLVEPNP_IPPE_SQUARE,
             )
             seen_before += 1
-            before += angle(quaternion_from_matrix(np.asarray(cv2.Rodrigues(turns[0])[0], dtype=np.float64)), quaternion) > FLIP
+            before += (
+                angle(
+                    quaternion_from_matrix(np.asarray(cv2.Rodrigues(turns[0])[0], dtype=np.float64)),
+                    quaternion,
+                )
+                > FLIP
+            )
     return {
-        "distance": 100.0 * distance, "swing": swing, "frames": n, "ok": 100.0 * seen_after / n,
-        "before": 100.0 * before / max(seen_before, 1), "after": 100.0 * after / max(seen_after, 1),
-    }  # fmt: skip
+        "distance": 100.0 * distance,
+        "swing": swing,
+        "frames": n,
+        "ok": 100.0 * seen_after / n,
+        "before": 100.0 * before / max(seen_before, 1),
+        "after": 100.0 * after / max(seen_after, 1),
+    }
 
 
 def latency(rate: float, delay: float, seeds: int) -> Row:
-    """Four wires that bend a 70 mm arc for 20 s, its tip seen late, with 0.3 mm of noise and one frame in ten lost."""
+    """Four wires that bend a 70 mm arc for 20 s, its tip seen late, with 0.3 mm of noise and one frame in ten
+    lost."""
     from fastrod_device.latency import estimate_latency
 
     note_progress(f"latency {delay} s")
@@ -135,16 +175,24 @@ def latency(rate: float, delay: float, seeds: int) -> Row:
         a, b = (np.interp(seen - delay, t, w) / 0.008 for w in (x, y))
         bend = np.hypot(a, b) + 1e-9
         across = 0.07 * (1.0 - np.cos(bend)) / bend**2
-        tip = np.stack([across * a, across * b, 0.07 * np.sin(bend) / bend], axis=1) + 3e-4 * rng.standard_normal((len(seen), 3))
+        tip = np.stack(
+            [across * a, across * b, 0.07 * np.sin(bend) / bend], axis=1
+        ) + 3e-4 * rng.standard_normal((len(seen), 3))
         tip[rng.random(len(seen)) < 0.1] = np.nan
         found = estimate_latency(t, np.stack([x, y, -x, -y], axis=1), seen, tip)
         off.append(found.delay - delay)
         spread.append(found.stderr)
     ms = 1e3 * np.array(off)
     return {
-        "rate": rate, "delay": 1e3 * delay, "seeds": seeds, "mean": float(ms.mean()), "rms": float(np.sqrt((ms**2).mean())),
-        "largest": float(np.abs(ms).max()), "target": 1e3 * LATENCY_TARGET, "stderr": float(1e3 * np.mean(spread)),
-    }  # fmt: skip
+        "rate": rate,
+        "delay": 1e3 * delay,
+        "seeds": seeds,
+        "mean": float(ms.mean()),
+        "rms": float(np.sqrt((ms**2).mean())),
+        "largest": float(np.abs(ms).max()),
+        "target": 1e3 * LATENCY_TARGET,
+        "stderr": float(1e3 * np.mean(spread)),
+    }
 
 
 def gates(kind: str, seeds: Sequence[int], moves: int) -> Row:
@@ -197,9 +245,15 @@ def gates(kind: str, seeds: Sequence[int], moves: int) -> Row:
                     prototype.wait(0.1)
     refused = sum(flags[flag] for flag in (OUTSIDE, ASTRAY, TOO_FAST))
     return {
-        "kind": kind, "seeds": len(seeds), "frames": sum(flags.values()), "refused": refused,
-        "off": 1e3 * max(off), "part": max(off) / length, "far": max(far) / length, "high": 1e3 * min(high),
-    }  # fmt: skip
+        "kind": kind,
+        "seeds": len(seeds),
+        "frames": sum(flags.values()),
+        "refused": refused,
+        "off": 1e3 * max(off),
+        "part": max(off) / length,
+        "far": max(far) / length,
+        "high": 1e3 * min(high),
+    }
 
 
 def times(distance: float, repeats: int) -> Row:
@@ -220,9 +274,12 @@ def times(distance: float, repeats: int) -> Row:
         drawn.append(seconds)
         looked.append(report.seconds(lambda frame=frame: tracker.look(frame))[0])  # type: ignore[misc]
     return {
-        "distance": 100.0 * distance, "look": 1e3 * float(np.median(looked)), "best": 1e3 * min(looked), "target": 1e3 * TIME_TARGET,
+        "distance": 100.0 * distance,
+        "look": 1e3 * float(np.median(looked)),
+        "best": 1e3 * min(looked),
+        "target": 1e3 * TIME_TARGET,
         "draw": 1e3 * float(np.median(drawn)),
-    }  # fmt: skip
+    }
 
 
 def measure(options: argparse.Namespace) -> Sequence[Section]:
@@ -242,7 +299,11 @@ def measure(options: argparse.Namespace) -> Sequence[Section]:
     look += [Column("noise_xy", "noise x, y\num", ".1f"), Column("noise_z", "noise z\num", ".1f")]
     rows = [errors(distance, None, n) for distance in ERROR_TARGETS]
     rows += [errors(distance, tilt, n) for distance in (0.10, 0.20) for tilt in TILTS]
-    turned = [Column("distance", "distance\ncm", ".0f"), Column("swing", "swing\n+- deg", ".0f"), Column("frames", "frames")]
+    turned = [
+        Column("distance", "distance\ncm", ".0f"),
+        Column("swing", "swing\n+- deg", ".0f"),
+        Column("frames", "frames"),
+    ]
     turned += [
         Column("ok", "trusted\n%", ".1f"),
         Column("before", "flips, first of IPPE\n%", ".1f"),
@@ -254,9 +315,17 @@ def measure(options: argparse.Namespace) -> Sequence[Section]:
         Column("seeds", "seeds"),
         Column("mean", "mean error\nms", ".2f"),
     ]
-    late += [Column("rms", "rms error\nms", ".2f"), Column("largest", "largest\nms", ".2f"), Column("target", "target\nms", ".0f")]
+    late += [
+        Column("rms", "rms error\nms", ".2f"),
+        Column("largest", "largest\nms", ".2f"),
+        Column("target", "target\nms", ".0f"),
+    ]
     late += [Column("stderr", "standard error\nms", ".2f")]
-    took = [Column("distance", "distance\ncm", ".0f"), Column("look", "look\nms", ".2f"), Column("best", "look, best\nms", ".2f")]
+    took = [
+        Column("distance", "distance\ncm", ".0f"),
+        Column("look", "look\nms", ".2f"),
+        Column("best", "look, best\nms", ".2f"),
+    ]
     took += [Column("target", "target\nms", ".0f"), Column("draw", "drawing\nms", ".2f")]
     allowed = [
         Column("kind", "sealed"),
@@ -272,7 +341,8 @@ def measure(options: argparse.Namespace) -> Sequence[Section]:
     tried = [(kind, range(1, 8 if kind == "latency" else 3), 16) for kind in kinds]
     tried = [("none", range(1, 2), 4)] if options.quick else tried
     note = (
-        f"A marker of {1e3 * SIZE:.0f} mm, f = {FOCAL:.0f} px, pictures of {PICTURE[0]} x {PICTURE[1]}; blur 0.7 px, noise 2 grey levels."
+        f"A marker of {1e3 * SIZE:.0f} mm, f = {FOCAL:.0f} px, pictures of {PICTURE[0]} x {PICTURE[1]}; "
+        "blur 0.7 px, noise 2 grey levels."
     )
     return [
         Section(
@@ -288,9 +358,16 @@ def measure(options: argparse.Namespace) -> Sequence[Section]:
             turned,
             [flips(d, s, many) for d in ERROR_TARGETS for s in (12.0, 40.0)],
         ),
-        Section("latency", "Latency", late, [latency(rate, delay, seeds) for rate in (15.0, 30.0) for delay in (0.03, 0.15)]),
+        Section(
+            "latency",
+            "Latency",
+            late,
+            [latency(rate, delay, seeds) for rate in (15.0, 30.0) for delay in (0.03, 0.15)],
+        ),
         Section("gates", "An honest marker against the gates", allowed, [gates(*row) for row in tried]),
-        Section("times", "Time, one thread", took, [times(distance, max(n, 20)) for distance in ERROR_TARGETS]),
+        Section(
+            "times", "Time, one thread", took, [times(distance, max(n, 20)) for distance in ERROR_TARGETS]
+        ),
     ]
 
 

@@ -1,4 +1,5 @@
-"""Contact with a mesh: `fastrod bench contact`, or this file as a script; `--json` for programs, `--quick` for a smoke run."""
+"""Contact with a mesh: `fastrod bench contact`, or this file as a script; `--json` for programs, `--quick`
+for a smoke run."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ import report
 from report import Column, Row, Section, note_progress, thread_counts
 
 FREE_TARGET, TOUCHING_TARGET, FCL_TARGET = 20_000.0, 5_000.0, 50.0
-"""Robot-steps a second on two threads, free or grazing and in contact; how many times as fast as FCL, capsule by capsule."""
+"""Robot-steps a second on two threads, free or grazing and in contact; how many times as fast as FCL, capsule
+by capsule."""
 
 
 @dataclass
@@ -30,7 +32,9 @@ class Case:
     """Robots that FCL was asked about."""
 
 
-def measure(n_robots: int, subdivisions: Sequence[int], budget: float, sample: int) -> tuple[Any, list[Case], tuple[Any, Any]]:
+def measure(
+    n_robots: int, subdivisions: Sequence[int], budget: float, sample: int
+) -> tuple[Any, list[Case], tuple[Any, Any]]:
     """The batch, every state with every mesh, and the same robots without a scene."""
     import touching as t
 
@@ -94,11 +98,15 @@ def step_section(batch: Any, cases: list[Case], bare: tuple[Any, Any]) -> Sectio
         Column("met", "met"),
     ]
     notes = [
-        f"{n} five-segment robots of 30 intervals, each bent its own way, its mesh in a place of its own; the free tip goes "
-        f"{1e3 * batch.travel:.2f} mm a step. Mean over the steps of a swing, each the best of its rounds where time allowed several.",
-        "Grazing: the ball around the mesh leaves 2 mm to the free rod. In contact: it is 3 mm too near. In contact is the share of "
+        f"{n} five-segment robots of 30 intervals, each bent its own way, its mesh in a place of its own; "
+        "the free tip goes "
+        f"{1e3 * batch.travel:.2f} mm a step. Mean over the steps of a swing, each the best of its rounds "
+        "where time allowed several.",
+        "Grazing: the ball around the mesh leaves 2 mm to the free rod. In contact: it is 3 mm too near. In "
+        "contact is the share of "
         "robot-steps; not ok counts robot-steps of both runs, the mesh's approach included.",
-        "Steps/s: robot-steps a second. Contact: what a step takes more than that of the same robots without a scene.",
+        "Steps/s: robot-steps a second. Contact: what a step takes more than that of the same robots "
+        "without a scene.",
     ]
     return Section("contact_steps", "One step with a mesh beside every robot", columns, table, notes)
 
@@ -142,11 +150,15 @@ def query_section(n: int, cases: list[Case]) -> Section:
         Column("met", "met"),
     ]
     notes = [
-        f"FCL: one fcl.distance(mesh, capsule of radius 1e-6 m) from Python for each of a robot's 30 intervals, {cases[0].asked} robots, "
-        "on one thread: it holds the interpreter's lock. Capsules and poses are made beforehand; the calls alone are timed.",
-        "Search: candidates and smallest gap of every robot, tessellation and minima along the curve included. Cold: nothing is known; "
+        "FCL: one fcl.distance(mesh, capsule of radius 1e-6 m) from Python for each of a robot's 30 "
+        f"intervals, {cases[0].asked} robots, "
+        "on one thread: it holds the interpreter's lock. Capsules and poses are made beforehand; the calls "
+        "alone are timed.",
+        "Search: candidates and smallest gap of every robot, tessellation and minima along the curve "
+        "included. Cold: nothing is known; "
         "warm: from the step before. Met: the warm search, one thread against one.",
-        "Step: FCL's queries alone against the whole step, its passes and forces included. A step with FCL would ask once a pass.",
+        "Step: FCL's queries alone against the whole step, its passes and forces included. A step with FCL "
+        "would ask once a pass.",
     ]
     return Section("contact_query", "The search against FCL, capsule by capsule", columns, table, notes)
 
@@ -161,9 +173,21 @@ def growth_section(counts: Sequence[int], subdivisions: int, budget: float) -> S
         note_progress(f"{n} robots")
         batch = t.make_batch(n)
         timed, bare = t.run(batch, obstacle, t.FAR, many, budget), t.run(batch, None, 0.0, many, budget)
-        row: Row = {"robots": n, "rate": n / timed.step_s, "us": 1e6 * timed.step_s / n, "bare_us": 1e6 * bare.step_s / n}
-        table.append({**row, "ratio": timed.step_s / bare.step_s, "not_ok": timed.not_ok + bare.not_ok, "target": FREE_TARGET,
-                      "met": n / timed.step_s >= FREE_TARGET})  # fmt: skip
+        row: Row = {
+            "robots": n,
+            "rate": n / timed.step_s,
+            "us": 1e6 * timed.step_s / n,
+            "bare_us": 1e6 * bare.step_s / n,
+        }
+        table.append(
+            {
+                **row,
+                "ratio": timed.step_s / bare.step_s,
+                "not_ok": timed.not_ok + bare.not_ok,
+                "target": FREE_TARGET,
+                "met": n / timed.step_s >= FREE_TARGET,
+            }
+        )
     columns = [
         Column("robots", "robots", ",d"),
         Column("rate", f"robot-steps/s\n{many} threads", ",.0f"),
@@ -180,11 +204,15 @@ def growth_section(counts: Sequence[int], subdivisions: int, budget: float) -> S
 def sections(options: argparse.Namespace) -> list[Section]:
     """All of it."""
     n_robots, budget = options.robots or (8 if options.quick else 128), 0.0 if options.quick else 0.6
-    batch, cases, bare = measure(n_robots, (2, 3) if options.quick else (3, 5, 6), budget, 2 if options.quick else 24)
+    batch, cases, bare = measure(
+        n_robots, (2, 3) if options.quick else (3, 5, 6), budget, 2 if options.quick else 24
+    )
     return [
         step_section(batch, cases, bare),
         query_section(n_robots, cases),
-        growth_section((4, n_robots) if options.quick else (64, 1024, 8192), 2 if options.quick else 5, budget),
+        growth_section(
+            (4, n_robots) if options.quick else (64, 1024, 8192), 2 if options.quick else 5, budget
+        ),
     ]
 
 

@@ -1,4 +1,5 @@
-"""Control of a soft tip on an arm: `fastrod bench control`, or this file as a script; `--json` for programs, `--quick` for a smoke run."""
+"""Control of a soft tip on an arm: `fastrod bench control`, or this file as a script; `--json` for programs,
+`--quick` for a smoke run."""
 
 from __future__ import annotations
 
@@ -18,7 +19,14 @@ from report import Column, Row, Section, note_progress
 RATE_TARGET, RATIO_TARGET = 1000.0, 20.0
 """Control steps a second, and how many times as fast as with finite differences; one thread."""
 DT = 0.01
-UR5 = [(0.0, 0.089159, 1.0), (-0.425, 0.0, 0.0), (-0.39225, 0.0, 0.0), (0.0, 0.10915, 1.0), (0.0, 0.09465, -1.0), (0.0, 0.0823, 0.0)]
+UR5 = [
+    (0.0, 0.089159, 1.0),
+    (-0.425, 0.0, 0.0),
+    (-0.39225, 0.0, 0.0),
+    (0.0, 0.10915, 1.0),
+    (0.0, 0.09465, -1.0),
+    (0.0, 0.0823, 0.0),
+]
 """a [m], d [m], alpha [quarter turns] of each joint (Denavit and Hartenberg), as the maker prints them."""
 _A, _D, _SA = np.array(UR5).T
 _CA = 1.0 - np.abs(_SA)
@@ -31,7 +39,12 @@ class SerialArm:
 
     def __init__(self) -> None:
         self._q, self._frames, self._links = np.full(6, np.nan), np.zeros((7, 4, 4)), np.zeros((6, 4, 4))
-        self._links[:, 2, 1], self._links[:, 2, 2], self._links[:, 2, 3], self._links[:, 3, 3] = _SA, _CA, _D, 1.0
+        self._links[:, 2, 1], self._links[:, 2, 2], self._links[:, 2, 3], self._links[:, 3, 3] = (
+            _SA,
+            _CA,
+            _D,
+            1.0,
+        )
 
     def _chain(self, q: Any) -> Any:
         """(7, 4, 4) world from each joint's frame."""
@@ -53,9 +66,11 @@ class SerialArm:
         (a, b, c), (d, e, f), (g, h, i) = end[:3, :3].tolist()
         # four times the largest component times the quaternion (Shepperd 1978)
         rows = (
-            (1 + a + e + i, h - f, c - g, d - b), (h - f, 1 + a - e - i, b + d, c + g), (c - g, b + d, 1 - a + e - i, f + h),
+            (1 + a + e + i, h - f, c - g, d - b),
+            (h - f, 1 + a - e - i, b + d, c + g),
+            (c - g, b + d, 1 - a + e - i, f + h),
             (d - b, c + g, f + h, 1 - a - e + i),
-        )  # fmt: skip
+        )
         found = rows[max(range(4), key=lambda k: rows[k][k])]
         size = math.hypot(*found)
         return np.array([*end[:3, 3].tolist(), *(x / size for x in found)])
@@ -76,17 +91,24 @@ class Loop:
 
         wires = tuple(Tendon(offset=0.0075, angle=k * np.pi / 2) for k in range(4))
         segment = Segment(
-            length=0.1, bending_stiffness=(0.0022, 0.0022), torsional_stiffness=0.001, extension=(0.0, 0.03), line_density=0.1,
+            length=0.1,
+            bending_stiffness=(0.0022, 0.0022),
+            torsional_stiffness=0.001,
+            extension=(0.0, 0.03),
+            line_density=0.1,
             tendons=wires,
-        )  # fmt: skip
+        )
         robot = Robot(name="two", segments=(segment, segment))
         self.tip = SoftTip(Simulator(robot, dt=DT, points_per_segment=6, threads=1), SerialArm())
         self.q = np.array([0.3, -1.2, 1.4, -0.9, -1.1, 0.4, 0.015, 0.002, -0.001, 0.015, -0.001, 0.002])
         low, high = self.tip.limits()
         self.control = ResolvedRate(
-            gain=5.0, weight=[1.0] * 6 + [25.0] * 6, rate=[2.0] * 6 + [0.05] * 6, lower=[-6.3] * 6 + low.tolist(),
+            gain=5.0,
+            weight=[1.0] * 6 + [25.0] * 6,
+            rate=[2.0] * 6 + [0.05] * 6,
+            lower=[-6.3] * 6 + low.tolist(),
             upper=[6.3] * 6 + high.tolist(),
-        )  # fmt: skip
+        )
         start = self.tip.place(self.q, settle=True).tip_position[0]
         self.path = circle(radius=0.05, center=start - [0.05, 0.0, 0.0])
         self.t = 0.0
@@ -114,9 +136,14 @@ def follow(loop: Loop, jacobian: Callable[[], Any], steps: int) -> Row:
     place, derive, rates, error = (statistics.median(column) for column in zip(*parts, strict=True))
     total = statistics.median(a + b + c for a, b, c, _ in parts)
     return {
-        "rate": 1.0 / total, "total_us": 1e6 * total, "place_us": 1e6 * place, "jacobian_us": 1e6 * derive, "rates_us": 1e6 * rates,
-        "error_m": error, "steps": steps,
-    }  # fmt: skip
+        "rate": 1.0 / total,
+        "total_us": 1e6 * total,
+        "place_us": 1e6 * place,
+        "jacobian_us": 1e6 * derive,
+        "rates_us": 1e6 * rates,
+        "error_m": error,
+        "steps": steps,
+    }
 
 
 def control_section(quick: bool) -> Section:
@@ -128,10 +155,17 @@ def control_section(quick: bool) -> Section:
     slow = follow(twin, lambda: twin.tip.finite_differences(twin.q), 5 if quick else 100)
     ratio = float(slow["total_us"] or 0.0) / float(exact["total_us"] or 1.0)
     table: list[Row] = [
-        {"way": "analytic", **exact, "rate_target": RATE_TARGET, "rate_met": float(exact["rate"] or 0.0) >= RATE_TARGET, "ratio": ratio,
-         "ratio_target": RATIO_TARGET, "ratio_met": ratio >= RATIO_TARGET},
+        {
+            "way": "analytic",
+            **exact,
+            "rate_target": RATE_TARGET,
+            "rate_met": float(exact["rate"] or 0.0) >= RATE_TARGET,
+            "ratio": ratio,
+            "ratio_target": RATIO_TARGET,
+            "ratio_met": ratio >= RATIO_TARGET,
+        },
         {"way": "finite differences", **slow},
-    ]  # fmt: skip
+    ]
     columns = [
         Column("way", "Jacobian"),
         Column("rate", "control steps/s\n1 thread", ",.0f"),
@@ -148,9 +182,11 @@ def control_section(quick: bool) -> Section:
         Column("steps", "steps", "d"),
     ]
     notes = [
-        "A tip on six joints and two segments (100 mm, four wires, extension) follows a circle of 50 mm in 20 s, 100 control steps a "
+        "A tip on six joints and two segments (100 mm, four wires, extension) follows a circle of 50 mm in "
+        "20 s, 100 control steps a "
         "second of its time. Medians, warm.",
-        "Place: the arm's frame, wire lengths of the action and one step of the rod. Differences: central, 24 settled tips, from the "
+        "Place: the arm's frame, wire lengths of the action and one step of the rod. Differences: central, "
+        "24 settled tips, from the "
         "same snapshot.",
     ]
     return Section("control_step", "One control step", columns, table, notes)

@@ -1,5 +1,6 @@
-"""A large batch on a GPU beside the CPU: `fastrod bench cuda`, or this file as a script; `--json` for programs, `--quick` for a smoke
-run, `--robots` for another size. Without a GPU: what a pass reads, writes and reckons, and one sentence."""
+"""A large batch on a GPU beside the CPU: `fastrod bench cuda`, or this file as a script; `--json` for
+programs, `--quick` for a smoke run, `--robots` for another size. Without a GPU: what a pass reads, writes and
+reckons, and one sentence."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ from report import Column, Row, Section, note_progress, seconds
 _STEPS = 6
 _TARGET = 50.0  # times two threads of the CPU
 _H100 = 3.35e12, 33.5e12  # bytes and operations a second of an H100 SXM, from NVIDIA's data sheet
-_FMA = {(6, 0): 32, (7, 0): 32, (8, 0): 32, (9, 0): 64, (10, 0): 64}  # double precision, of a multiprocessor and cycle
+# double precision, of a multiprocessor and cycle
+_FMA = {(6, 0): 32, (7, 0): 32, (8, 0): 32, (9, 0): 64, (10, 0): 64}
 
 
 def sections(n_robots: int, quick: bool) -> list[Section]:
@@ -77,7 +79,8 @@ class Timed:
         return (0, 0) if runner is None else (runner.sent_bytes, runner.fetched_bytes)
 
     def _parts(self) -> None:
-        """The pass alone, on ports that are there already; then what it costs more on new ones, and to bring its shape back."""
+        """The pass alone, on ports that are there already; then what it costs more on new ones, and to bring
+        its shape back."""
         sim, passes = self.sim, self.sim._passes
         ports = sim._ports
         assert ports is not None
@@ -114,7 +117,9 @@ def time_rows(case: Case, n: int, points: int) -> list[Row]:
     two: Timed | None = None
     states: list[State] = []
     for device, threads in [("cpu", t) for t in sorted({min(2, most), most})] + [("cuda", None)]:
-        sim = Simulator(case.robot, n, points_per_segment=points, outputs="tip", threads=threads, device=device)
+        sim = Simulator(
+            case.robot, n, points_per_segment=points, outputs="tip", threads=threads, device=device
+        )
         sim.restore(start)
         timed = Timed(sim, case)
         two = two or timed
@@ -122,31 +127,53 @@ def time_rows(case: Case, n: int, points: int) -> list[Row]:
         error = np.abs(states[-1].tip_position - states[0].tip_position)[states[0].ok]
         rows.append(
             {
-                "robot": case.key, "robots": n, "points": points, "device": device if threads is None else f"{device} {threads}",
-                "step_ms": 1e3 * timed.step, "kernel_ms": 1e3 * timed.kernel, "send_ms": 1e3 * timed.send, "fetch_ms": 1e3 * timed.fetch,
-                "sent_bytes": timed.sent / n, "fetched_bytes": timed.fetched / n, "step_ratio": two.step / timed.step,
-                "kernel_ratio": two.kernel / timed.kernel, "target": _TARGET if device == "cuda" else None,
+                "robot": case.key,
+                "robots": n,
+                "points": points,
+                "device": device if threads is None else f"{device} {threads}",
+                "step_ms": 1e3 * timed.step,
+                "kernel_ms": 1e3 * timed.kernel,
+                "send_ms": 1e3 * timed.send,
+                "fetch_ms": 1e3 * timed.fetch,
+                "sent_bytes": timed.sent / n,
+                "fetched_bytes": timed.fetched / n,
+                "step_ratio": two.step / timed.step,
+                "kernel_ratio": two.kernel / timed.kernel,
+                "target": _TARGET if device == "cuda" else None,
                 "met": two.kernel / timed.kernel >= _TARGET if device == "cuda" else None,
-                "difference_m": float(error.max(initial=0.0)), "ok": float(timed.state.ok.mean()),
+                "difference_m": float(error.max(initial=0.0)),
+                "ok": float(timed.state.ok.mean()),
             }
-        )  # fmt: skip
+        )
     return rows
 
 
 def time_section(rows: list[Row]) -> Section:
     columns = [
-        Column("robot", "robot"), Column("robots", "robots", ",d"), Column("points", "points", "d"),
+        Column("robot", "robot"),
+        Column("robots", "robots", ",d"),
+        Column("points", "points", "d"),
         Column("device", "device,\nthreads"),
-        Column("step_ms", "step\n[ms]", ".1f"), Column("kernel_ms", "pass\n[ms]", ".2f"), Column("send_ms", "send\n[ms]", ".2f"),
-        Column("fetch_ms", "fetch\n[ms]", ".2f"), Column("sent_bytes", "sent\nB / robot", ".0f"),
-        Column("fetched_bytes", "fetched\nB / robot", ".0f"), Column("step_ratio", "step:\nfaster", ".1f"),
-        Column("kernel_ratio", "pass:\nfaster", ".1f"), Column("target", "target", ".0f"), Column("met", "met"),
-        Column("difference_m", "tip differs\n[m]", ".1e"), Column("ok", "ok", ".2%"),
-    ]  # fmt: skip
+        Column("step_ms", "step\n[ms]", ".1f"),
+        Column("kernel_ms", "pass\n[ms]", ".2f"),
+        Column("send_ms", "send\n[ms]", ".2f"),
+        Column("fetch_ms", "fetch\n[ms]", ".2f"),
+        Column("sent_bytes", "sent\nB / robot", ".0f"),
+        Column("fetched_bytes", "fetched\nB / robot", ".0f"),
+        Column("step_ratio", "step:\nfaster", ".1f"),
+        Column("kernel_ratio", "pass:\nfaster", ".1f"),
+        Column("target", "target", ".0f"),
+        Column("met", "met"),
+        Column("difference_m", "tip differs\n[m]", ".1e"),
+        Column("ok", "ok", ".2%"),
+    ]
     notes = [
-        'Step: `Simulator.step`, outputs="tip", tendon lengths that move; pass: its kernel alone, on inputs that are there. On a GPU a '
-        "step besides sends the lengths and fetches the tips; on both it checks its inputs, on one thread of the CPU.",
-        "Faster: than two threads of the CPU (the first row); the target is for the pass. Tip differs, most: from the first row's after "
+        'Step: `Simulator.step`, outputs="tip", tendon lengths that move; pass: its kernel alone, on inputs '
+        "that are there. On a GPU a "
+        "step besides sends the lengths and fetches the tips; on both it checks its inputs, on one thread "
+        "of the CPU.",
+        "Faster: than two threads of the CPU (the first row); the target is for the pass. Tip differs, "
+        "most: from the first row's after "
         "the same steps from the same boundary.",
     ]
     return Section("cuda", "One step of a large batch", columns, rows, notes)
@@ -169,12 +196,24 @@ def work_row(key: str, n_robots: int, points: int, operations: float) -> Row:
         return sum(a.nbytes for a in arrays if isinstance(a, np.ndarray) and len(a) == n > 1) / n
 
     moved = each(ports) + each(passes.params) + 2.0 * each(memory) + each(shape) + 8.0
-    scratch = 8 * scratch_size(len(passes.layout.tendon_segment), passes.n_x, passes.n_columns(ports), passes.n_residuals(ports)) / LANES
+    scratch = (
+        8
+        * scratch_size(
+            len(passes.layout.tendon_segment), passes.n_x, passes.n_columns(ports), passes.n_residuals(ports)
+        )
+        / LANES
+    )
     bandwidth, peak, name = device_limits()
     return {
-        "robot": key, "robots": n_robots, "moved_bytes": moved, "scratch_bytes": scratch, "operations": operations, "device": name,
-        "memory_floor_ms": 1e3 * moved * n_robots / bandwidth, "arithmetic_floor_ms": 1e3 * operations * n_robots / peak,
-    }  # fmt: skip
+        "robot": key,
+        "robots": n_robots,
+        "moved_bytes": moved,
+        "scratch_bytes": scratch,
+        "operations": operations,
+        "device": name,
+        "memory_floor_ms": 1e3 * moved * n_robots / bandwidth,
+        "arithmetic_floor_ms": 1e3 * operations * n_robots / peak,
+    }
 
 
 def device_limits() -> tuple[float, float, str]:
@@ -200,20 +239,34 @@ def device_limits() -> tuple[float, float, str]:
     copy()
     fma = _FMA.get(tuple(device.compute_capability), 2)
     peak = 2.0 * fma * device.MULTIPROCESSOR_COUNT * 1e3 * device.CLOCK_RATE
-    return 2.0 * a.nbytes / report.best(copy, 10), peak, str(device.name.decode() if isinstance(device.name, bytes) else device.name)
+    return (
+        2.0 * a.nbytes / report.best(copy, 10),
+        peak,
+        str(device.name.decode() if isinstance(device.name, bytes) else device.name),
+    )
 
 
 def work_section(rows: list[Row], absent: str) -> Section:
     columns = [
-        Column("robot", "robot"), Column("robots", "robots", ",d"), Column("moved_bytes", "read and written\nbytes / robot", ",.0f"),
-        Column("scratch_bytes", "scratch\nbytes / thread", ",.0f"), Column("operations", "flop\n/ pass", ",.0f"),
+        Column("robot", "robot"),
+        Column("robots", "robots", ",d"),
+        Column("moved_bytes", "read and written\nbytes / robot", ",.0f"),
+        Column("scratch_bytes", "scratch\nbytes / thread", ",.0f"),
+        Column("operations", "flop\n/ pass", ",.0f"),
         Column("device", "device"),
-        Column("memory_floor_ms", "memory floor\n[ms]", ".2f"), Column("arithmetic_floor_ms", "arithmetic floor\n[ms]", ".2f"),
-    ]  # fmt: skip
-    limits = "an H100's data sheet" if absent or rows[0]["device"] == "simulated" else "a copy measured here, and the clock's multiply-adds"
+        Column("memory_floor_ms", "memory floor\n[ms]", ".2f"),
+        Column("arithmetic_floor_ms", "arithmetic floor\n[ms]", ".2f"),
+    ]
+    limits = (
+        "an H100's data sheet"
+        if absent or rows[0]["device"] == "simulated"
+        else "a copy measured here, and the clock's multiply-adds"
+    )
     notes = [
-        f"Memory floor: inputs, robot, memory of the observer (read and written) and tip once over the bandwidth; limits from {limits}. "
-        "The scratch of a thread stays on the device and is used again by its next robot; what of it falls out of the caches comes on top.",
+        "Memory floor: inputs, robot, memory of the observer (read and written) and tip once over the "
+        f"bandwidth; limits from {limits}. "
+        "The scratch of a thread stays on the device and is used again by its next robot; what of it falls "
+        "out of the caches comes on top."
     ]
     if absent:
         notes.insert(0, f"No time was measured: {absent}")
@@ -223,8 +276,17 @@ def work_section(rows: list[Row], absent: str) -> Section:
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure and print; the exit code."""
     parser = argparse.ArgumentParser(prog="bench_cuda", description=__doc__)
-    parser.add_argument("--robots", type=int, default=None, help="prototypes; reachers are a fifth as many (1000000; 64 with --quick)")
-    return report.command(parser, argv, lambda options: sections(options.robots or (64 if options.quick else 1_000_000), options.quick))
+    parser.add_argument(
+        "--robots",
+        type=int,
+        default=None,
+        help="prototypes; reachers are a fifth as many (1000000; 64 with --quick)",
+    )
+    return report.command(
+        parser,
+        argv,
+        lambda options: sections(options.robots or (64 if options.quick else 1_000_000), options.quick),
+    )
 
 
 if __name__ == "__main__":

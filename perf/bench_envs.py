@@ -1,4 +1,5 @@
-"""Environments, steps a second: `fastrod bench envs`, or this file as a script; `--json` for programs, `--quick` for a smoke run."""
+"""Environments, steps a second: `fastrod bench envs`, or this file as a script; `--json` for programs,
+`--quick` for a smoke run."""
 
 from __future__ import annotations
 
@@ -14,7 +15,10 @@ import numpy as np
 import report
 from report import Column, Row, Section, note_progress
 
-PAPER = "For information, measured elsewhere: the paper's public reacher takes 240 to 390 env steps/s in one process, 686 on 64 workers."
+PAPER = (
+    "For information, measured elsewhere: the paper's public reacher takes 240 to 390 env steps/s in "
+    "one process, 686 on 64 workers."
+)
 SEED = 0
 
 
@@ -38,7 +42,8 @@ def step_seconds(env: Any, n: int, repeats: int) -> float:
 
 
 def simulator_share(env: Any, n: int) -> float | None:
-    """Part of a step's time that the simulator takes, its settling and putting back of robots included; None where rigid bodies move."""
+    """Part of a step's time that the simulator takes, its settling and putting back of robots included; None
+    where rigid bodies move."""
     simulator = getattr(env.task, "simulator", None)
     if simulator is None:
         return None
@@ -84,7 +89,9 @@ def reach_section(quick: bool) -> Section:
     rows: list[Row] = []
     for n in (1, 4) if quick else (1, 64):
         note_progress(f"SyncVectorEnv of {n}")
-        env = SyncVectorEnv([lambda: SingleEnv("Reach", threads=1)] * n, autoreset_mode=AutoresetMode.SAME_STEP)
+        env = SyncVectorEnv(
+            [lambda: SingleEnv("Reach", threads=1)] * n, autoreset_mode=AutoresetMode.SAME_STEP
+        )
         sync[n] = step_seconds(env, steps_for(40 * n, quick), repeats)
         env.close()
         rows.append(row("SyncVectorEnv", n, 1, sync[n]))
@@ -95,7 +102,8 @@ def reach_section(quick: bool) -> Section:
             took = step_seconds(batch, steps_for(n, quick), repeats)
             least = sync.get(n, sync[max(sync)] * n / max(sync))
             rows.append(
-                row("native batch", n, threads, took) | {"ratio": least / took, "share": simulator_share(batch, steps_for(n, quick))}
+                row("native batch", n, threads, took)
+                | {"ratio": least / took, "share": simulator_share(batch, steps_for(n, quick))}
             )
             batch.close()
     columns = [
@@ -108,9 +116,11 @@ def reach_section(quick: bool) -> Section:
         Column("share", "simulator's share\nof a step", ".0%"),
     ]
     notes = [
-        "Random actions, drawn beforehand; episodes of 40 steps end and begin in between. Warm, best of several runs. A step: action to "
+        "Random actions, drawn beforehand; episodes of 40 steps end and begin in between. Warm, best of "
+        "several runs. A step: action to "
         "tendon lengths, one observer pass, reward, observation, info, and new episodes where one has ended.",
-        "SyncVectorEnv holds our own single environments, in this process; their simulators have one thread. Beyond "
+        "SyncVectorEnv holds our own single environments, in this process; their simulators have one "
+        "thread. Beyond "
         f"N = {max(sync)} the ratio is to its time an environment at N = {max(sync)}.",
         PAPER,
     ]
@@ -119,7 +129,15 @@ def reach_section(quick: bool) -> Section:
 
 def row(way: str, n: int, threads: int, seconds: float) -> Row:
     """What every row has; `seconds` a step of the whole batch."""
-    return {"way": way, "n": n, "threads": threads, "rate": n / seconds, "step_us": 1e6 * seconds / n, "ratio": None, "share": None}
+    return {
+        "way": way,
+        "n": n,
+        "threads": threads,
+        "rate": n / seconds,
+        "step_us": 1e6 * seconds / n,
+        "ratio": None,
+        "share": None,
+    }
 
 
 def task_section(quick: bool) -> Section:
@@ -158,7 +176,10 @@ def task_section(quick: bool) -> Section:
         Column("hosted", "rigid bodies"),
         Column("steps", "steps", "d"),
     ]
-    notes = ["Random actions as above, one thread. With rigid bodies every environment is a PyBullet world of its own."]
+    notes = [
+        "Random actions as above, one thread. With rigid bodies every environment is a PyBullet world "
+        "of its own."
+    ]
     return Section("tasks", "The other tasks", columns, rows, notes)
 
 
@@ -185,14 +206,30 @@ def endurance_section(total: int, quick: bool) -> Section:
         rng, finite, within, lost, ended, start = np.random.default_rng(SEED), True, True, 0, 0, 0
         space = env.single_observation_space
         for k in range(steps):
-            observation, reward, terminated, truncated, told = env.step(rng.uniform(-1.0, 1.0, (n, env.task.n_actions)))
-            finite &= bool(np.isfinite(observation).all() and np.isfinite(reward).all() and np.isfinite(told["distance"]).all())
+            observation, reward, terminated, truncated, told = env.step(
+                rng.uniform(-1.0, 1.0, (n, env.task.n_actions))
+            )
+            finite &= bool(
+                np.isfinite(observation).all()
+                and np.isfinite(reward).all()
+                and np.isfinite(told["distance"]).all()
+            )
             within &= bool(((observation >= space.low) & (observation <= space.high)).all())
             lost, ended = lost + int(told["lost"].sum()), ended + int((terminated | truncated).sum())
             if k == steps // 4:
                 start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - start) / 1024.0
-        rows.append({"way": name, "steps": n * steps, "finite": finite, "within": within, "ended": ended, "lost": lost, "grown": grown})
+        rows.append(
+            {
+                "way": name,
+                "steps": n * steps,
+                "finite": finite,
+                "within": within,
+                "ended": ended,
+                "lost": lost,
+                "grown": grown,
+            }
+        )
         env.close()
     columns = [
         Column("way", "task"),
@@ -204,14 +241,24 @@ def endurance_section(total: int, quick: bool) -> Section:
         Column("grown", "peak memory grown after\na quarter of them, MiB", ".1f"),
     ]
     return Section(
-        "endurance", "Random steps over all tasks", columns, rows, [f"{sum(int(r['steps'] or 0) for r in rows):,d} steps in all."]
+        "endurance",
+        "Random steps over all tasks",
+        columns,
+        rows,
+        [f"{sum(int(r['steps'] or 0) for r in rows):,d} steps in all."],
     )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure and print; the exit code."""
     parser = argparse.ArgumentParser(prog="bench_envs", description=__doc__)
-    parser.add_argument("--endurance", type=int, default=0, metavar="N", help="only this: so many random steps over all tasks, 1000000 say")
+    parser.add_argument(
+        "--endurance",
+        type=int,
+        default=0,
+        metavar="N",
+        help="only this: so many random steps over all tasks, 1000000 say",
+    )
 
     def measure(options: argparse.Namespace) -> list[Section]:
         if options.endurance:

@@ -3,9 +3,10 @@
 First the whole way: connect to drives that have an EPOS4's objects (or those of `--eds FILE`) and no others,
 home, and move for a minute at 200 Hz.
 
-The emulated prototype goes round in a circle by commands at 30 Hz that go on whatever happens, and records. At a moment that a seed draws
-something fails. Detection is when the supervisor finds it (a killed process has none: there it is when the drives miss its heartbeat),
-standstill when the last shaft comes to rest, as the emulator knows it and no controller does.
+The emulated prototype goes round in a circle by commands at 30 Hz that go on whatever happens, and records.
+At a moment that a seed draws something fails. Detection is when the supervisor finds it (a killed process has
+none: there it is when the drives miss its heartbeat), standstill when the last shaft comes to rest, as the
+emulator knows it and no controller does.
 """
 
 from __future__ import annotations
@@ -66,11 +67,18 @@ RUN = (
     Column("stopped", "stopped by"),
 )
 COLUMNS = (
-    Column("kind", "injected"), Column("n", "n", "d"), Column("safe", "stopped\nwithin 50 ms", "d"), Column("named", "named", "d"),
-    Column("found", "injected to\nfound, worst [ms]", ".0f"), Column("rest", "found to\nrest, worst [ms]", ".1f"),
-    Column("all", "injected to\nrest, worst [ms]", ".0f"), Column("rows", "rows", "d"), Column("lost", "rows\nlost", "d"),
-    Column("lines", "journal's\nlines lost", "d"), Column("again", "enabled\nagain", "d"),
-)  # fmt: skip
+    Column("kind", "injected"),
+    Column("n", "n", "d"),
+    Column("safe", "stopped\nwithin 50 ms", "d"),
+    Column("named", "named", "d"),
+    Column("found", "injected to\nfound, worst [ms]", ".0f"),
+    Column("rest", "found to\nrest, worst [ms]", ".1f"),
+    Column("all", "injected to\nrest, worst [ms]", ".0f"),
+    Column("rows", "rows", "d"),
+    Column("lost", "rows\nlost", "d"),
+    Column("lines", "journal's\nlines lost", "d"),
+    Column("again", "enabled\nagain", "d"),
+)
 
 
 @dataclass
@@ -104,13 +112,7 @@ class Rig:
         wall: Callable[[], float] = lambda: self.clock.now() + day + self.jump  # noqa: E731
         journal = Journal(self.journal)
         self.prototype = Prototype(
-            hardware,
-            bus,
-            self.emulator,
-            clock=self.clock,
-            eds=eds,
-            journal=journal,
-            wall=wall,
+            hardware, bus, self.emulator, clock=self.clock, eds=eds, journal=journal, wall=wall
         )
         self._other = Line(bus)
         self.prototype.start(home=False)
@@ -200,7 +202,8 @@ def _hide(rig: Rig, _: int) -> None:
 
 
 def _block(rig: Rig, _: int) -> None:
-    """The drive that pulls most: one that lets wire out is found by its tension before, as the others pull against it."""
+    """The drive that pulls most: one that lets wire out is found by its tension before, as the others pull
+    against it."""
     readings = rig.prototype.readings
     rig.emulator.drives.block(0 if readings is None else int(np.argmin(readings.rate)))
 
@@ -211,14 +214,20 @@ def _jump(rig: Rig, k: int) -> None:
 
 INJECTIONS: dict[str, tuple[Callable[[Rig, int], None], str]] = {
     "heartbeat lost": (lambda rig, k: rig.emulator.drives.lose_heartbeat(k % 4), "sent its last heartbeat"),
-    "emergency message": (lambda rig, k: rig.emulator.drives.emergency(k % 4, (0x2310, 0x3210, 0x4310)[k % 3]), "sent an emergency: 0x"),
+    "emergency message": (
+        lambda rig, k: rig.emulator.drives.emergency(k % 4, (0x2310, 0x3210, 0x4310)[k % 3]),
+        "sent an emergency: 0x",
+    ),
     "following error": (_block, "ollowing error"),
     "bus off": (lambda rig, _: rig.emulator.drives.bus_off(), "the bus carries nothing"),
     "node reboot": (lambda rig, k: rig.emulator.drives.reboot(k % 4), "NMT state is 0 (booting)"),
     "camera frozen": (_freeze, "the camera repeats its frames"),
     "marker lost": (_hide, "the marker was last seen"),
     "clock jump": (_jump, "the wall clock jumped"),
-    "encoder jump": (lambda rig, k: rig.emulator.drives.encoder_jump(k % 4, (2000, -2000, 4000, -4000)[k % 4]), "moved its wire by"),
+    "encoder jump": (
+        lambda rig, k: rig.emulator.drives.encoder_jump(k % 4, (2000, -2000, 4000, -4000)[k % 4]),
+        "moved its wire by",
+    ),
     "SYNC storm": (lambda rig, k: rig.storm_on(STORMS[k % 4]), "another node sends SYNC"),
 }
 """How each is done to the k-th trial, and what its sentence must say."""
@@ -261,7 +270,9 @@ def fail(kind: str, k: int, folder: Path, *, stepped: bool, eds: Path | None) ->
         bench.wait(PATIENCE, lambda: supervisor.state is State.STOPPED)
         fault = supervisor.first
         if fault is None:
-            return Trial(math.inf, math.inf, math.inf, False, len(bench.recorder), 0, 1, False, "nothing was found")
+            return Trial(
+                math.inf, math.inf, math.inf, False, len(bench.recorder), 0, 1, False, "nothing was found"
+            )
         on = np.ones(drives.n_drives, dtype=np.bool_)
         again = False
 
@@ -278,10 +289,23 @@ def fail(kind: str, k: int, folder: Path, *, stepped: bool, eds: Path | None) ->
         bench.prototype.record(None)
         rows = len(bench.recorder)
         kept = bench.part.with_name(bench.part.name + ".part").read_text(encoding="utf-8").count("\n") - 2
-        lost = sum(line[2] not in bench.journal.read_text(encoding="utf-8").replace('""', '"') for line in bench.prototype.journal.lines)
+        lost = sum(
+            line[2] not in bench.journal.read_text(encoding="utf-8").replace('""', '"')
+            for line in bench.prototype.journal.lines
+        )
         lines = lost + (not bench.prototype.journal.lines)
         rest = max(at - fault.t, 0.0)
-        return Trial(fault.t - injected, rest, at - injected, words in fault.sentence, rows, rows - kept, lines, again, fault.sentence)
+        return Trial(
+            fault.t - injected,
+            rest,
+            at - injected,
+            words in fault.sentence,
+            rows,
+            rows - kept,
+            lines,
+            again,
+            fault.sentence,
+        )
 
 
 class Still:
@@ -309,7 +333,8 @@ def be_killed(folder: str) -> int:
     """The process that is killed: it tells how many rows it has recorded."""
     urgent()
     hardware = load_hardware()
-    blind = replace(hardware, limits=replace(hardware.limits, sighting_age=None))  # its marker stands where the model says it moves
+    # its marker stands where the model says it moves
+    blind = replace(hardware, limits=replace(hardware.limits, sighting_age=None))
     with Prototype(blind, UDP, Still()) as prototype:
         prototype.start(home=False)
         recorder = prototype.recorder_for(str(Path(folder) / "killed.csv"))
@@ -326,13 +351,19 @@ def kill(k: int, folder: Path) -> Trial:
     """One trial with the controller in a process of its own."""
     rng, log = np.random.default_rng([k, 99]), folder / "killed.csv"
     emulator = Emulator(load_hardware(), UDP, clock=WallClock(), seal=seal(k, "none"), seed=k, taut=True)
-    child = subprocess.Popen([sys.executable, __file__, "--be-killed", str(folder)], stdout=subprocess.PIPE, text=True)
+    child = subprocess.Popen(
+        [sys.executable, __file__, "--be-killed", str(folder)], stdout=subprocess.PIPE, text=True
+    )
     try:
         assert child.stdout is not None
         told, end = "", math.inf
         for line in child.stdout:
             told = line
-            end = min(end, time.monotonic() + 1.0 + float(rng.uniform(0.0, 1.0))) if int(line.split()[0]) else end
+            end = (
+                min(end, time.monotonic() + 1.0 + float(rng.uniform(0.0, 1.0)))
+                if int(line.split()[0])
+                else end
+            )
             if time.monotonic() > end:
                 break
         end = time.monotonic() + 0.2  # between two commands it may stand
@@ -340,7 +371,9 @@ def kill(k: int, folder: Path) -> Trial:
             time.sleep(1e-3)
         injected = time.monotonic()
         child.send_signal(signal.SIGKILL)
-        rows = int((told + "".join(line for line in child.stdout if line.endswith("\n"))).split("\n")[-2].split()[0])
+        rows = int(
+            (told + "".join(line for line in child.stdout if line.endswith("\n"))).split("\n")[-2].split()[0]
+        )
         child.wait()
         on, again, after = np.ones(4, dtype=np.bool_), False, injected + 0.3 + AFTER
         while time.monotonic() < after:
@@ -354,9 +387,23 @@ def kill(k: int, folder: Path) -> Trial:
         kept = len(recover(log).t)
         log.unlink()
         named = bool(np.isfinite(emulator.drives.missed_at).all())
-        sentence = "the controller's heartbeat is missed by every drive (emergency 0x8130)" if named else "a drive did not miss it"
+        sentence = (
+            "the controller's heartbeat is missed by every drive (emergency 0x8130)"
+            if named
+            else "a drive did not miss it"
+        )
         sentence = sentence if moved else f"nothing moved before it was killed; it was {told.split()[-1]}"
-        return Trial(found - injected, max(at - found, 0.0), at - injected, named, rows, max(rows - kept, 0), 0, again, sentence)
+        return Trial(
+            found - injected,
+            max(at - found, 0.0),
+            at - injected,
+            named,
+            rows,
+            max(rows - kept, 0),
+            0,
+            again,
+            sentence,
+        )
     finally:
         child.kill()
         child.wait()
@@ -366,12 +413,19 @@ def kill(k: int, folder: Path) -> Trial:
 def _row(kind: str, trials: Sequence[Trial]) -> Row:
     """Of one kind."""
     return {
-        "kind": kind, "n": len(trials), "safe": sum(trial.rest <= SAFE for trial in trials), "named": sum(trial.named for trial in trials),
-        "found": 1e3 * max(trial.found for trial in trials), "rest": 1e3 * max(trial.rest for trial in trials),
-        "all": 1e3 * max(trial.whole for trial in trials), "rows": sum(trial.rows for trial in trials),
-        "lost": sum(trial.lost for trial in trials), "lines": sum(trial.lines for trial in trials),
-        "again": sum(trial.again for trial in trials), "sentence": next((t.sentence for t in trials if not t.named), trials[0].sentence),
-    }  # fmt: skip
+        "kind": kind,
+        "n": len(trials),
+        "safe": sum(trial.rest <= SAFE for trial in trials),
+        "named": sum(trial.named for trial in trials),
+        "found": 1e3 * max(trial.found for trial in trials),
+        "rest": 1e3 * max(trial.rest for trial in trials),
+        "all": 1e3 * max(trial.whole for trial in trials),
+        "rows": sum(trial.rows for trial in trials),
+        "lost": sum(trial.lost for trial in trials),
+        "lines": sum(trial.lines for trial in trials),
+        "again": sum(trial.again for trial in trials),
+        "sentence": next((t.sentence for t in trials if not t.named), trials[0].sentence),
+    }
 
 
 def measure(options: argparse.Namespace) -> Sequence[Section]:
@@ -394,8 +448,10 @@ def measure(options: argparse.Namespace) -> Sequence[Section]:
     notes = [
         "A sentence of each kind, of a trial that was not named as it should where there is one:",
         *(f"  {row['kind']}: {row['sentence']}" for row in rows),
-        "'found to rest' is 0 where set-points that do not come any more had stopped the shafts before: bus off, killed process.",
-        "A killed process: SIGKILL, drives in another process on udp_multicast, always in real time; rows are those that it had reported.",
+        "'found to rest' is 0 where set-points that do not come any more had stopped the shafts before: bus "
+        "off, killed process.",
+        "A killed process: SIGKILL, drives in another process on udp_multicast, always in real time; rows "
+        "are those that it had reported.",
     ]
     time_is = ", stepped" if options.stepped else ""
     found = [Section("faults", f"faults injected into a moving prototype{time_is}", COLUMNS, rows, notes)]
@@ -409,12 +465,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     given = sys.argv[1:] if argv is None else list(argv)
     if given[:1] == ["--be-killed"]:
         return be_killed(given[1])
-    parser = argparse.ArgumentParser(prog="bench_faults", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        prog="bench_faults", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--times", type=int, default=20, help="of each kind (default: 20)")
     parser.add_argument("--only", choices=[*INJECTIONS, "killed process"], help="this kind alone")
     parser.add_argument("--seconds", type=float, default=60.0, help="of the loop at 200 Hz (default: 60)")
     parser.add_argument("--eds", type=Path, metavar="FILE", help="of the drives (default: an EPOS4's)")
-    parser.add_argument("--stepped", action="store_true", help="as fast as the machine computes, not in real time")
+    parser.add_argument(
+        "--stepped", action="store_true", help="as fast as the machine computes, not in real time"
+    )
     try:
         return command(parser, given, measure)
     except FastrodError as error:

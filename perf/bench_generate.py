@@ -1,7 +1,8 @@
-"""What data sets cost: one worker, two, Ray tasks, start and dispatch; and from these what N machines would give.
+"""What data sets cost: one worker, two, Ray tasks, start and dispatch; and from these what N machines would
+give.
 
-fastrod bench generate                     a million loaded five-segment shapes among them: some minutes on two quiet cores
-python perf/bench_generate.py --quick      does it run?
+fastrod bench generate                     a million loaded five-segment shapes among them: some minutes on
+two quiet cores python perf/bench_generate.py --quick      does it run?
 python perf/bench_generate.py --cores 64   machines of so many cores in the table of N machines
 """
 
@@ -60,7 +61,9 @@ class Costs:
 def loaded(**words: Any) -> Shapes:
     """The five-segment reacher with a weight, tip forces as by default."""
     robot = fastrod.load_robot("five_segment_reacher")
-    robot = replace(robot, segments=tuple(replace(segment, line_density=DENSITY) for segment in robot.segments))
+    robot = replace(
+        robot, segments=tuple(replace(segment, line_density=DENSITY) for segment in robot.segments)
+    )
     return Shapes(robot=dumps(robot), **words)
 
 
@@ -104,15 +107,32 @@ def one_worker(folder: Path, rows: int, repeats: int) -> tuple[float, Section]:
     lanes = max(rows // 64, 8)
     cold = Plan(work=loaded(chain=1), count=few, shard_rows=few)
     table: list[Row] = [
-        {"what": "shapes along chains of 64, one thread", "rate": rows / min(made), "us": 1e6 * min(made) / rows},
-        {"what": "the same, written to Parquet", "rate": rows / (min(made) + min(written)), "us": 1e6 * (min(made) + min(written)) / rows},
+        {
+            "what": "shapes along chains of 64, one thread",
+            "rate": rows / min(made),
+            "us": 1e6 * min(made) / rows,
+        },
+        {
+            "what": "the same, written to Parquet",
+            "rate": rows / (min(made) + min(written)),
+            "us": 1e6 * (min(made) + min(written)) / rows,
+        },
         {"what": "each row settled cold (chain 1), one thread", **rate(few, lambda: columns_of(cold, 0))},
         {"what": "one batch, solver alone, one thread", **rate(32 * lanes, lambda: solved(lanes, 1))},
     ]
     if cores() > 1:
-        table.append({"what": "one batch, solver alone, two threads", **rate(32 * lanes, lambda: solved(lanes, 2))})
-    note = "A row: five bends, extension, tip force to 2 EI/l^2, self-weight; boundary within 1e-6 m, six steps a segment; no points."
-    columns_ = [Column("what", "one process"), Column("rate", "rows/s", ",.0f"), Column("us", "us a row", ".1f")]
+        table.append(
+            {"what": "one batch, solver alone, two threads", **rate(32 * lanes, lambda: solved(lanes, 2))}
+        )
+    note = (
+        "A row: five bends, extension, tip force to 2 EI/l^2, self-weight; boundary within 1e-6 m, six "
+        "steps a segment; no points."
+    )
+    columns_ = [
+        Column("what", "one process"),
+        Column("rate", "rows/s", ",.0f"),
+        Column("us", "us a row", ".1f"),
+    ]
     return size / rows, Section("worker", "One worker", columns_, table, [note])
 
 
@@ -128,10 +148,17 @@ def solved(lanes: int, threads: int) -> None:
     """32 rows of each lane, nothing kept."""
     work = loaded()
     robot = fastrod.model.robotfile.loads(work.robot)
-    draw, solver = Draw(work, robot, lanes, np.random.default_rng(0)), ChainSolver(robot, lanes, work.points_per_segment, threads)
+    draw, solver = (
+        Draw(work, robot, lanes, np.random.default_rng(0)),
+        ChainSolver(robot, lanes, work.points_per_segment, threads),
+    )
     for step in range(32):
         drawn = draw.at(step)
-        given = Inputs(tendon_length=robot.rest_tendon_length + drawn.dl, extension=drawn.extension, tip_force=drawn.force)
+        given = Inputs(
+            tendon_length=robot.rest_tendon_length + drawn.dl,
+            extension=drawn.extension,
+            tip_force=drawn.force,
+        )
         solver.settle(given, work.tolerance)
 
 
@@ -145,25 +172,49 @@ def whole_runs(place: Path, rows: int, shards: int, *, ray: bool) -> Section:
         ticks: list[tuple[float, int]] = []
         begin = time.perf_counter()
         summary = generate(
-            plan, place / f"runs-{number}", workers=workers, ray=address,
-            progress=lambda _, done, __, ticks=ticks, begin=begin: ticks.append((time.perf_counter() - begin, done)),  # type: ignore[misc]
-        )  # fmt: skip
+            plan,
+            place / f"runs-{number}",
+            workers=workers,
+            ray=address,
+            progress=lambda _, done, __, ticks=ticks, begin=begin: ticks.append(
+                (time.perf_counter() - begin, done)
+            ),  # type: ignore[misc]
+        )
         first, last = ticks[1], ticks[-1]
         between = (last[1] - first[1]) / (last[0] - first[0])
-        table.append({
-            "what": what, "workers": workers, "rows": summary.rows, "seconds": summary.seconds, "rate": summary.rate, "between": between,
-            "first": first[0], "after": summary.seconds - last[0],
-        })  # fmt: skip
+        table.append(
+            {
+                "what": what,
+                "workers": workers,
+                "rows": summary.rows,
+                "seconds": summary.seconds,
+                "rate": summary.rate,
+                "between": between,
+                "first": first[0],
+                "after": summary.seconds - last[0],
+            }
+        )
     for row in table:
         alone = next(r for r in table if r["what"] == row["what"])
         row["gain"] = float(row["between"] or 0.0) / float(alone["between"] or 1.0)
     columns = [
-        Column("what", "way"), Column("workers", "workers"), Column("rows", "rows", ",d"), Column("seconds", "s in all", ".1f"),
-        Column("rate", "rows/s\nin all", ",.0f"), Column("between", "rows/s from first\nto last shard", ",.0f"),
-        Column("gain", "of one\nworker", ".2f"), Column("first", "s to the\nfirst shard", ".1f"),
+        Column("what", "way"),
+        Column("workers", "workers"),
+        Column("rows", "rows", ",d"),
+        Column("seconds", "s in all", ".1f"),
+        Column("rate", "rows/s\nin all", ",.0f"),
+        Column("between", "rows/s from first\nto last shard", ",.0f"),
+        Column("gain", "of one\nworker", ".2f"),
+        Column("first", "s to the\nfirst shard", ".1f"),
         Column("after", "s to close\nand check", ".2f"),
-    ]  # fmt: skip
-    return Section("runs", f"{shards} shards of {rows:,} rows", columns, table, ["The first shard comes after start and one task."])
+    ]
+    return Section(
+        "runs",
+        f"{shards} shards of {rows:,} rows",
+        columns,
+        table,
+        ["The first shard comes after start and one task."],
+    )
 
 
 def nothing(number: int) -> tuple[int, int, int, int]:
@@ -185,14 +236,27 @@ def dispatch_costs(tasks: int, *, ray: bool) -> tuple[float, float, Section]:
     if ray:
         begin = time.perf_counter()
         started, each = _ray_costs(tasks)
-        table.append({"what": "Ray, first worker on a cluster that is there", "start": started, "dispatch": 1e3 * each})
-        table.append({"what": "Ray, with a local cluster", "start": time.perf_counter() - begin - tasks * each, "dispatch": 1e3 * each})
-    columns = [Column("what", "driver"), Column("start", "s to the first\nresult", ".2f"), Column("dispatch", "ms a task", ".3f")]
+        table.append(
+            {"what": "Ray, first worker on a cluster that is there", "start": started, "dispatch": 1e3 * each}
+        )
+        table.append(
+            {
+                "what": "Ray, with a local cluster",
+                "start": time.perf_counter() - begin - tasks * each,
+                "dispatch": 1e3 * each,
+            }
+        )
+    columns = [
+        Column("what", "driver"),
+        Column("start", "s to the first\nresult", ".2f"),
+        Column("dispatch", "ms a task", ".3f"),
+    ]
     return each, started, Section("dispatch", f"Start and dispatch, {tasks} tasks of no work", columns, table)
 
 
 def _ray_costs(tasks: int) -> tuple[float, float]:
-    """Seconds to the first result and of each task, one worker: submit, wait, get, as `fastrod generate` does it."""
+    """Seconds to the first result and of each task, one worker: submit, wait, get, as `fastrod generate` does
+    it."""
     import ray
 
     ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level="error")
@@ -240,24 +304,42 @@ def machines(costs: Costs, rows: int, per_machine: int) -> Section:
             working, handing = -(-tasks // (n * per_machine)) * costs.task, tasks * costs.dispatch
             seconds = costs.start + max(working, handing) + count * costs.check
             alone = seconds if n == MACHINES[0] else alone
-            table.append({
-                "count": f"{count:,}", "machines": n, "cores": n * per_machine, "tasks": tasks, "seconds": seconds, "rate": count / seconds,
-                "efficiency": alone / seconds / n, "written": 1e-6 * costs.bytes * count / seconds,
-                "bound": _bound(working, handing, count * costs.check),
-            })  # fmt: skip
+            table.append(
+                {
+                    "count": f"{count:,}",
+                    "machines": n,
+                    "cores": n * per_machine,
+                    "tasks": tasks,
+                    "seconds": seconds,
+                    "rate": count / seconds,
+                    "efficiency": alone / seconds / n,
+                    "written": 1e-6 * costs.bytes * count / seconds,
+                    "bound": _bound(working, handing, count * costs.check),
+                }
+            )
     most = costs.task / costs.dispatch
     notes = [
-        "Model: T = start + max(ceil(tasks / (N c)) task, tasks dispatch) + rows check; besides, only the folder is shared, at MB/s.",
-        f"Measured here: task {costs.task:.2f} s of {rows:,} rows, two workers at work, start {costs.start:.2f} s, "
-        f"dispatch {1e3 * costs.dispatch:.2f} ms, check {1e9 * costs.check:.0f} ns a row, {costs.bytes:.0f} bytes a row.",
-        f"The driver saturates at task / dispatch = {most:,.0f} cores; longer shards move that up in proportion.",
+        "Model: T = start + max(ceil(tasks / (N c)) task, tasks dispatch) + rows check; besides, only the "
+        "folder is shared, at MB/s.",
+        f"Measured here: task {costs.task:.2f} s of {rows:,} rows, two workers at work, start "
+        f"{costs.start:.2f} s, "
+        f"dispatch {1e3 * costs.dispatch:.2f} ms, check {1e9 * costs.check:.0f} ns a row, {costs.bytes:.0f} "
+        "bytes a row.",
+        f"The driver saturates at task / dispatch = {most:,.0f} cores; longer shards move that up in "
+        "proportion.",
         "These are computed, not run: no network, no shared disk and no second machine was measured.",
     ]
     columns = [
-        Column("count", "rows"), Column("machines", "machines"), Column("cores", "cores", ",d"), Column("tasks", "tasks", ",d"),
-        Column("seconds", "s", ",.1f"), Column("rate", "rows/s", ",.0f"), Column("efficiency", "of N times one", ".2f"),
-        Column("written", "MB/s written", ",.0f"), Column("bound", "most of it"),
-    ]  # fmt: skip
+        Column("count", "rows"),
+        Column("machines", "machines"),
+        Column("cores", "cores", ",d"),
+        Column("tasks", "tasks", ",d"),
+        Column("seconds", "s", ",.1f"),
+        Column("rate", "rows/s", ",.0f"),
+        Column("efficiency", "of N times one", ".2f"),
+        Column("written", "MB/s written", ",.0f"),
+        Column("bound", "most of it"),
+    ]
     return Section("machines", f"N machines of {per_machine} cores, computed", columns, table, notes)
 
 
@@ -270,21 +352,38 @@ def million(folder: Path) -> Section:
     """The acceptance: a million loaded five-segment shapes on two cores."""
     summary = generate(Plan(work=loaded(), count=10**6), folder, workers=2)
     row: Row = {
-        "rows": summary.rows, "failed": summary.failed, "seconds": summary.seconds, "rate": summary.rate, "mb": 1e-6 * summary.bytes,
-        "target": TARGET, "met": summary.seconds <= TARGET,
-    }  # fmt: skip
+        "rows": summary.rows,
+        "failed": summary.failed,
+        "seconds": summary.seconds,
+        "rate": summary.rate,
+        "mb": 1e-6 * summary.bytes,
+        "target": TARGET,
+        "met": summary.seconds <= TARGET,
+    }
     columns = [
-        Column("rows", "rows", ",d"), Column("failed", "not ok", ",d"), Column("seconds", "s", ".1f"), Column("rate", "rows/s", ",.0f"),
-        Column("mb", "MB", ",.0f"), Column("target", "target s", ".0f"), Column("met", "met"),
-    ]  # fmt: skip
-    note = "From the call to the end of the check, start of the processes included; each row index is there once."
+        Column("rows", "rows", ",d"),
+        Column("failed", "not ok", ",d"),
+        Column("seconds", "s", ".1f"),
+        Column("rate", "rows/s", ",.0f"),
+        Column("mb", "MB", ",.0f"),
+        Column("target", "target s", ".0f"),
+        Column("met", "met"),
+    ]
+    note = (
+        "From the call to the end of the check, start of the processes included; each row index is there "
+        "once."
+    )
     return Section("million", "A million loaded five-segment shapes, two workers", columns, [row], [note])
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """As a script and for `fastrod bench generate`."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cores", type=int, default=16, help="of a machine, in the table of N machines (default: 16)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--cores", type=int, default=16, help="of a machine, in the table of N machines (default: 16)"
+    )
     return command(parser, argv, measure)
 
 

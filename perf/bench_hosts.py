@@ -1,5 +1,5 @@
-"""Rods on rigid hosts, a step of rod and world: `fastrod bench hosts`, or this file as a script; `--json` for programs, `--quick` for a
-smoke run."""
+"""Rods on rigid hosts, a step of rod and world: `fastrod bench hosts`, or this file as a script; `--json` for
+programs, `--quick` for a smoke run."""
 
 from __future__ import annotations
 
@@ -27,7 +27,9 @@ def mounted(robot: str, mass: float, place: Sequence[float], gravity: float, tou
 
     world = connect(dt=DT, gravity=(0.0, 0.0, -gravity))
     post = world.createMultiBody(0.0, -1, -1, [0.0, 0.0, 0.0])
-    cube = world.createMultiBody(mass, world.createCollisionShape(world.GEOM_BOX, halfExtents=[SIZE / 2] * 3), -1, list(place))
+    cube = world.createMultiBody(
+        mass, world.createCollisionShape(world.GEOM_BOX, halfExtents=[SIZE / 2] * 3), -1, list(place)
+    )
     world.changeDynamics(cube, -1, linearDamping=0.0, angularDamping=0.0)
     along_x = BulletLink(world, post, quaternion=(0.5**0.5, 0.0, 0.5**0.5, 0.0))
     return MountedRod(fastrod.load_robot(robot), along_x, touch=[cube] if touch else []), cube
@@ -45,9 +47,14 @@ def timed(what: str, step: Callable[[int], Any], steps: int, touching: Callable[
         touched += touching()
         failed += state is not None and not bool(state.ok[0])
     return {
-        "what": what, "median_ms": statistics.median(taken), "p95_ms": float(np.quantile(taken, 0.95)), "longest_ms": max(taken),
-        "touching": touched / steps, "failed": failed, "steps": steps,
-    }  # fmt: skip
+        "what": what,
+        "median_ms": statistics.median(taken),
+        "p95_ms": float(np.quantile(taken, 0.95)),
+        "longest_ms": max(taken),
+        "touching": touched / steps,
+        "failed": failed,
+        "steps": steps,
+    }
 
 
 def rods(steps: int) -> list[Row]:
@@ -56,7 +63,12 @@ def rods(steps: int) -> list[Row]:
     for robot in ("prototype", "five_segment_reacher"):
         rod, _ = mounted(robot, 0.1, (5.0, 0.0, 0.0), 0.0, touch=False)
         rows.append(
-            timed(f"{robot}, free", lambda k, rod=rod: rod.step(tip_force=(0.0, 0.0, 1e-4 * np.sin(0.1 * k))), steps, lambda: False)
+            timed(
+                f"{robot}, free",
+                lambda k, rod=rod: rod.step(tip_force=(0.0, 0.0, 1e-4 * np.sin(0.1 * k))),
+                steps,
+                lambda: False,
+            )
         )
     rod, _ = mounted("prototype", 0.1, (0.1 + 0.5 * SIZE - 0.017, 0.0, 0.0), 0.0, touch=True)
     rest, world = rod.simulator.robots[0].rest_tendon_length, rod.bullet
@@ -66,9 +78,18 @@ def rods(steps: int) -> list[Row]:
         world.resetBaseVelocity(rod.host.body, [0.1, 0.0, 0.0], [0.0, 0.0, 0.0])
         return rod.step(tendon_length=rest)
 
-    rows.append(timed("prototype, pushes a free cube", push, steps, lambda: bool(rod.state.contacts.count[0])))
+    rows.append(
+        timed("prototype, pushes a free cube", push, steps, lambda: bool(rod.state.contacts.count[0]))
+    )
     long, _ = mounted("five_segment_reacher", 0.02, (0.15, 0.0, 0.1), 9.81, touch=True)
-    rows.append(timed("five_segment_reacher, 20 g fall on it", lambda _: long.step(), steps, lambda: bool(long.state.contacts.count[0])))
+    rows.append(
+        timed(
+            "five_segment_reacher, 20 g fall on it",
+            lambda _: long.step(),
+            steps,
+            lambda: bool(long.state.contacts.count[0]),
+        )
+    )
     return rows
 
 
@@ -81,10 +102,23 @@ def paper(steps: int) -> list[Row]:
     wave = np.array([0.0, 0.002, 0.001] * 3)
     rows = [
         timed(
-            "SoftManiSim, 3 segments: move_robot_ori", lambda k: soft.move_robot_ori(wave * np.sin(0.02 * k)) and None, steps, lambda: False
+            "SoftManiSim, 3 segments: move_robot_ori",
+            lambda k: soft.move_robot_ori(wave * np.sin(0.02 * k)) and None,
+            steps,
+            lambda: False,
         ),
-        timed("calc_tip_pos", lambda k: soft.calc_tip_pos(wave * np.sin(0.02 * k)) and None, steps, lambda: False),
-        timed("capture_image, 640 x 480", lambda _: soft.capture_image() and None, max(3, steps // 20), lambda: False),
+        timed(
+            "calc_tip_pos",
+            lambda k: soft.calc_tip_pos(wave * np.sin(0.02 * k)) and None,
+            steps,
+            lambda: False,
+        ),
+        timed(
+            "capture_image, 640 x 480",
+            lambda _: soft.capture_image() and None,
+            max(3, steps // 20),
+            lambda: False,
+        ),
     ]
     soft.close()
     return rows
@@ -96,12 +130,19 @@ def engines(steps: int) -> list[Row]:
     for case in two_engines.CASES:
         note_progress(f"two engines, {case}")
         found = {engine: two_engines.at_rest(engine, case, max(steps, 100)) for engine in two_engines.ENGINES}
-        taken = {engine: timed(f"{engine}, {case}", lambda _, r=r: r.step(), steps, lambda: False) for engine, r in found.items()}
+        taken = {
+            engine: timed(f"{engine}, {case}", lambda _, r=r: r.step(), steps, lambda: False)
+            for engine, r in found.items()
+        }
         apart = two_engines.apart(found["PyBullet"], found["MuJoCo"])
         rows.append(
-            {"what": case, **{name: 100.0 * value for name, value in apart.items()},
-             "pybullet_ms": taken["PyBullet"]["median_ms"], "mujoco_ms": taken["MuJoCo"]["median_ms"]}
-        )  # fmt: skip
+            {
+                "what": case,
+                **{name: 100.0 * value for name, value in apart.items()},
+                "pybullet_ms": taken["PyBullet"]["median_ms"],
+                "mujoco_ms": taken["MuJoCo"]["median_ms"],
+            }
+        )
     return rows
 
 
@@ -117,7 +158,10 @@ def measure(options: argparse.Namespace) -> list[Section]:
         Column("failed", "not ok", "d"),
         Column("steps", "steps", "d"),
     ]
-    notes = [f"One thread, world steps of {1e3 * DT:g} ms, ten points a segment; the step of PyBullet's world is in it. Warm."]
+    notes = [
+        f"One thread, world steps of {1e3 * DT:g} ms, ten points a segment; the step of PyBullet's "
+        "world is in it. Warm."
+    ]
     pair = [
         Column("what", "UR5 and rod,\nat rest"),
         Column("tip", "tips apart\n% of length", ".4f"),
@@ -127,7 +171,8 @@ def measure(options: argparse.Namespace) -> list[Section]:
         Column("mujoco_ms", "MuJoCo\nms a step", ".2f"),
     ]
     alike = [
-        f"Tip of the rod and wrench on the flange, world, after {max(steps, 100)} steps; PyBullet's motors hold the arm rigidly, "
+        f"Tip of the rod and wrench on the flange, world, after {max(steps, 100)} steps; PyBullet's motors "
+        "hold the arm rigidly, "
         "MuJoCo's servos give way by some 1e-5 rad."
     ]
     both = Section("engines", "The same rod and host in PyBullet and in MuJoCo", pair, engines(steps), alike)

@@ -32,27 +32,43 @@ TRUNK_EFFECTS = 8
 
 def row(name: str, result: Result) -> dict[str, Any]:
     return {
-        "log": name, "held_out": list(result.held_out), "rows": int(result.measured.sum()), "verdict": result.verdict,
-        "train_before_mm": 1e3 * result.train.before, "train_after_mm": 1e3 * result.train.after, "before_mm": 1e3 * result.test.before,
-        "after_mm": 1e3 * result.test.after, "floor_mm": 1e3 * result.noise.floor, "summary": result.summary,
+        "log": name,
+        "held_out": list(result.held_out),
+        "rows": int(result.measured.sum()),
+        "verdict": result.verdict,
+        "train_before_mm": 1e3 * result.train.before,
+        "train_after_mm": 1e3 * result.train.after,
+        "before_mm": 1e3 * result.test.before,
+        "after_mm": 1e3 * result.test.after,
+        "floor_mm": 1e3 * result.noise.floor,
+        "summary": result.summary,
         "path": [(s.name, round(1e3 * s.train, 2), round(1e3 * s.held_out, 2)) for s in result.path],
-        "effects": {e.name: {k: (float(f"{v.value:.3g}"), v.unit) for k, v in e.parameters.items()} for e in result.effects},
-        "classes": {e.name: list(e.cannot_be_told_from) for e in result.effects}, "remaining": result.remaining_kind,
-    }  # fmt: skip
+        "effects": {
+            e.name: {k: (float(f"{v.value:.3g}"), v.unit) for k, v in e.parameters.items()}
+            for e in result.effects
+        },
+        "classes": {e.name: list(e.cannot_be_told_from) for e in result.effects},
+        "remaining": result.remaining_kind,
+    }
 
 
 def trunk() -> list[dict[str, Any]]:
-    """0 g: found on 90 s, held out 60 s. 100 g: the same robot, its stiffness the one parameter. Strokes and steps by themselves."""
+    """0 g: found on 90 s, held out 60 s. 100 g: the same robot, its stiffness the one parameter. Strokes and
+    steps by themselves."""
     log, robot = asl_trunk(DATA / "asl_trunk.csv")
     log = replace(log, points=None)  # the tip is what is judged, so the tip alone is fitted
     light = identify(log.only("perlin_0g"), robot, held_out=["perlin_0g@90:"], max_effects=TRUNK_EFFECTS)
     rows = [row("trunk, 0 g", light)]
     rows.append(heavier(log.only("perlin_100g"), light.identified, light.test.after))
-    return rows + [row(f"trunk, {run}", identify(log.only(run), robot, max_effects=3)) for run in ("strokes_out_back", "step_motor2")]
+    return rows + [
+        row(f"trunk, {run}", identify(log.only(run), robot, max_effects=3))
+        for run in ("strokes_out_back", "step_motor2")
+    ]
 
 
 def stiffer(robot: Robot, factor: float) -> Robot:
-    """The same robot stiffer, its wires as much: without loads nothing changes, under loads it gives way less."""
+    """The same robot stiffer, its wires as much: without loads nothing changes, under loads it gives way
+    less."""
     segments = tuple(
         replace(
             s,
@@ -61,9 +77,14 @@ def stiffer(robot: Robot, factor: float) -> Robot:
             tendons=tuple(replace(t, compliance=t.compliance / factor) for t in s.tendons),
         )
         for s in robot.segments
-    )  # fmt: skip
+    )
     effects = tuple(
-        {**e, "compliance": [c / factor for c in e["compliance"]] if isinstance(e["compliance"], list) else e["compliance"] / factor}
+        {
+            **e,
+            "compliance": [c / factor for c in e["compliance"]]
+            if isinstance(e["compliance"], list)
+            else e["compliance"] / factor,
+        }
         if e["name"] == "tendon_stretch"
         else e
         for e in robot.effects
@@ -91,10 +112,13 @@ def heavier(log: RunLog, robot: Robot, light: float) -> dict[str, Any]:
     found = float(fine[int(np.argmin([tip_rms(log, stiffer(robot, f), 0.0, 90.0) for f in fine]))])
     unloaded = replace(log, payload=np.zeros(len(log)))
     return {
-        "log": "trunk, 100 g", "stiffness_factor": found, "without_payload_mm": 1e3 * tip_rms(unloaded, robot, 90.0, 1e9),
-        "after_mm": 1e3 * tip_rms(log, stiffer(robot, found), 90.0, 1e9), "light_mm": 1e3 * light,
+        "log": "trunk, 100 g",
+        "stiffness_factor": found,
+        "without_payload_mm": 1e3 * tip_rms(unloaded, robot, 90.0, 1e9),
+        "after_mm": 1e3 * tip_rms(log, stiffer(robot, found), 90.0, 1e9),
+        "light_mm": 1e3 * light,
         "ratio": tip_rms(log, stiffer(robot, found), 90.0, 1e9) / light,
-    }  # fmt: skip
+    }
 
 
 def armlab() -> list[dict[str, Any]]:
@@ -110,7 +134,9 @@ def beam() -> list[dict[str, Any]]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--only", choices=("trunk", "armlab", "beam"))
     given = parser.parse_args(argv)

@@ -1,4 +1,5 @@
-"""fastrod beside its peers on the rod of Appendix J, error against time: `fastrod bench peers`, or this file as a script."""
+"""fastrod beside its peers on the rod of Appendix J, error against time: `fastrod bench peers`, or this file
+as a script."""
 
 from __future__ import annotations
 
@@ -25,9 +26,19 @@ from peer import Build, Peer, Rung
 from report import Column, Row, Section, command, note_progress, seconds
 
 PEERS: Sequence[Peer] = (
-    peer_fastrod.SETTLE, peer_fastrod.STEP, peer_scipy.SHOOT, peer_scipy.COLLOCATE, peer_soromox.PCS, peer_soromox.GVS,
-    peer_mujoco.FLEX, peer_mujoco.BALLS, peer_mujoco.HINGES, peer_pybullet.EQUAL, peer_pybullet.HALVES, peer_elastica.PEER,
-)  # fmt: skip
+    peer_fastrod.SETTLE,
+    peer_fastrod.STEP,
+    peer_scipy.SHOOT,
+    peer_scipy.COLLOCATE,
+    peer_soromox.PCS,
+    peer_soromox.GVS,
+    peer_mujoco.FLEX,
+    peer_mujoco.BALLS,
+    peer_mujoco.HINGES,
+    peer_pybullet.EQUAL,
+    peer_pybullet.HALVES,
+    peer_elastica.PEER,
+)
 IN_ONE_CALL = ", all loads in one call"
 GOAL = 100.0
 """Smaller error at equal time, or times faster at equal error."""
@@ -51,7 +62,8 @@ class Point:
     error: float
     """Root mean square over the load cases of the distance from the true tip [m]."""
     time: float
-    """CPU time of one solve, all threads, the mean over the load cases [s]: on an idle core it is wall time."""
+    """CPU time of one solve, all threads, the mean over the load cases [s]: on an idle core it is wall
+    time."""
     ready: float
     """Wall time of building and of the first solve, compilation included [s]."""
 
@@ -105,7 +117,8 @@ def between(x: float, known: Sequence[float], value: Sequence[float]) -> float:
 
 @dataclass(frozen=True)
 class Ratio:
-    """How many times better fastrod is; `least`: it is at least this, for the peer lies beyond fastrod's measured settings."""
+    """How many times better fastrod is; `least`: it is at least this, for the peer lies beyond fastrod's
+    measured settings."""
 
     value: float
     least: bool = False
@@ -117,7 +130,8 @@ class Ratio:
 
 
 def time_ratio(error: float, used: float, own: Sequence[tuple[float, float]]) -> Ratio:
-    """Time over that of fastrod at the same error, never beyond fastrod's settings; nan where the peer is the more accurate."""
+    """Time over that of fastrod at the same error, never beyond fastrod's settings; nan where the peer is the
+    more accurate."""
     if error >= own[0][1]:
         return Ratio(used / own[0][0], least=True)
     times, errors = zip(*reversed(own), strict=True)
@@ -137,15 +151,27 @@ def curve_section(points: Sequence[Point], force: Array, left_out: Sequence[str]
     rows: list[Row] = []
     for point in points:
         row: Row = {
-            "peer": point.peer.name, "setting": point.rung.label, "error_m": point.error, "us": 1e6 * point.time, "ready_s": point.ready,
-        }  # fmt: skip
+            "peer": point.peer.name,
+            "setting": point.rung.label,
+            "error_m": point.error,
+            "us": 1e6 * point.time,
+            "ready_s": point.ready,
+        }
         if point.peer.family != "fastrod":
-            faster, closer = time_ratio(point.error, point.time, own), error_ratio(point.error, point.time, own)
+            faster, closer = (
+                time_ratio(point.error, point.time, own),
+                error_ratio(point.error, point.time, own),
+            )
             row |= {
-                "time_ratio": faster.value, "time_ratio_is_least": faster.least, "time_text": str(faster),
-                "error_ratio": closer.value, "error_ratio_is_least": closer.least, "error_text": str(closer),
-                "better": best_of(faster, closer), "met": best_of(faster, closer) >= GOAL,
-            }  # fmt: skip
+                "time_ratio": faster.value,
+                "time_ratio_is_least": faster.least,
+                "time_text": str(faster),
+                "error_ratio": closer.value,
+                "error_ratio_is_least": closer.least,
+                "error_text": str(closer),
+                "better": best_of(faster, closer),
+                "met": best_of(faster, closer) >= GOAL,
+            }
         rows.append(row)
     columns = [
         Column("peer", "peer"),
@@ -158,15 +184,21 @@ def curve_section(points: Sequence[Point], force: Array, left_out: Sequence[str]
         Column("met", f"one of them\n>= {GOAL:.0f}"),
     ]
     notes = [
-        f"Static tip of one passive rod under a dead force across it, {len(force)} cases from {force[0]:g} to {force[-1]:g} N, "
-        "true tips by elliptic integrals. Every solve begins at the straight rod (fastrod, step: where the case before ended). CPU "
-        "time of all threads, the process on one core, warm, mean over the cases, best of several runs; building and compiling are apart, "
+        f"Static tip of one passive rod under a dead force across it, {len(force)} cases from {force[0]:g} "
+        f"to {force[-1]:g} N, "
+        "true tips by elliptic integrals. Every solve begins at the straight rod (fastrod, step: where the "
+        "case before ended). CPU "
+        "time of all threads, the process on one core, warm, mean over the cases, best of several runs; "
+        "building and compiling are apart, "
         "in wall time.",
         "Who has a call for many rods is measured both ways, load by load and all of them in one call.",
-        "Ratios to `fastrod, settle`, the better of both ways, by lines between its measured settings and never beyond: `>=` where "
-        "fastrod's coarsest is the more accurate already, or its finest the faster; `-` where fastrod was not measured that accurate, or "
+        "Ratios to `fastrod, settle`, the better of both ways, by lines between its measured settings and "
+        "never beyond: `>=` where "
+        "fastrod's coarsest is the more accurate already, or its finest the faster; `-` where fastrod was "
+        "not measured that accurate, or "
         "not that fast. Below 1 the peer is the better.",
-        "A `settle` of one rod hardly gets faster towards coarse settings: most of it is Python around the kernels, which a batch shares.",
+        "A `settle` of one rod hardly gets faster towards coarse settings: most of it is Python around the "
+        "kernels, which a batch shares.",
         *left_out,
     ]
     return Section("peers", "Appendix J: error against time", columns, rows, notes)
@@ -191,11 +223,18 @@ def kinds_section(points: Sequence[Point]) -> Section:
         faster = [time_ratio(point.error, point.time, own) for point in mine]
         closer = [error_ratio(point.error, point.time, own) for point in mine]
         reached = [best_of(*pair) for pair in zip(faster, closer, strict=True)]
-        rows.append({
-            "peer": peer.name, "settings": len(mine), "error_m": min(point.error for point in mine),
-            "faster": _range(faster), "closer": _range(closer), "met": sum(value >= GOAL for value in reached),
-            "least": min(reached), "all_met": min(reached) >= GOAL,
-        })  # fmt: skip
+        rows.append(
+            {
+                "peer": peer.name,
+                "settings": len(mine),
+                "error_m": min(point.error for point in mine),
+                "faster": _range(faster),
+                "closer": _range(closer),
+                "met": sum(value >= GOAL for value in reached),
+                "least": min(reached),
+                "all_met": min(reached) >= GOAL,
+            }
+        )
     columns = [
         Column("peer", "peer"),
         Column("settings", "settings", "d"),
@@ -216,11 +255,14 @@ def _range(ratios: Sequence[Ratio]) -> str:
 
 
 def batch_section(points: Sequence[Point], n: int, within: float) -> Section:
-    """Each peer at its coarsest setting that is good enough; those that have none are left out by a sentence."""
+    """Each peer at its coarsest setting that is good enough; those that have none are left out by a
+    sentence."""
     force = np.random.default_rng(_SEED).uniform(appendix_j.FORCES[0], appendix_j.FORCES[-1], n)
     rows: list[Row] = []
     failed: list[str] = []
-    for peer in dict.fromkeys(point.peer for point in points if point.peer in PEERS and point.peer is not peer_fastrod.STEP):
+    for peer in dict.fromkeys(
+        point.peer for point in points if point.peer in PEERS and point.peer is not peer_fastrod.STEP
+    ):
         note_progress(f"{n} robots, {peer.name}")
         mine = [point for point in points if point.peer is peer]
         for point in mine:
@@ -232,7 +274,11 @@ def batch_section(points: Sequence[Point], n: int, within: float) -> Section:
             failed.append(f"{peer.name} ({closest.error:.1e} m in {1e6 * closest.time:,.0f} us)")
     own = next((row["us"] for row in rows if row["peer"] == peer_fastrod.SETTLE.name), None)
     for row in rows:
-        if isinstance(own, float) and isinstance(row["us"], float) and row["peer"] != peer_fastrod.SETTLE.name:
+        if (
+            isinstance(own, float)
+            and isinstance(row["us"], float)
+            and row["peer"] != peer_fastrod.SETTLE.name
+        ):
             row["ratio"] = row["us"] / own
     columns = [
         Column("peer", "peer"),
@@ -244,9 +290,11 @@ def batch_section(points: Sequence[Point], n: int, within: float) -> Section:
         Column("ratio", "ratio to\nfastrod", ",.1f"),
     ]
     notes = [
-        f"{n} rods, each with a force of its own (uniform, seed {_SEED}), at rest, from the straight rod. Each peer at its coarsest "
-        f"setting of the first table that is within {within:.0e} m rms, by its own batch (one call) or one by one, whichever is faster. "
-        "`times`: so many were measured, and the time for all is that, extrapolated linearly.",
+        f"{n} rods, each with a force of its own (uniform, seed {_SEED}), at rest, from the straight rod. "
+        "Each peer at its coarsest "
+        f"setting of the first table that is within {within:.0e} m rms, by its own batch (one call) or one "
+        "by one, whichever is faster. "
+        "`times`: so many were measured, and the time for all is that, extrapolated linearly."
     ]
     if failed:
         notes.append(f"Not that accurate at any measured setting: {', '.join(failed)}.")
@@ -267,9 +315,14 @@ def _batch_row(point: Point, force: Array) -> Row:
         ways.append((measure(point.peer, rung, force[:sample], rung.together), sample, "one call"))
     least, sample, how = min(ways, key=lambda way: way[0].time)
     return {
-        "peer": point.peer.name, "setting": rung.label, "how": how if sample == n else f"{sample:,} {how}, times {n / sample:,.1f}",
-        "measured": sample, "seconds": least.time * n, "us": 1e6 * least.time, "error_m": least.error,
-    }  # fmt: skip
+        "peer": point.peer.name,
+        "setting": rung.label,
+        "how": how if sample == n else f"{sample:,} {how}, times {n / sample:,.1f}",
+        "measured": sample,
+        "seconds": least.time * n,
+        "us": 1e6 * least.time,
+        "error_m": least.error,
+    }
 
 
 def plot(points: Sequence[Point], file: str) -> None:
@@ -286,21 +339,34 @@ def plot(points: Sequence[Point], file: str) -> None:
             turn = drawn[peer.family] = drawn.get(peer.family, -1) + 1
             own = peer.family == "fastrod"
             axes.loglog(
-                *zip(*mine, strict=True), label=peer.name, color=COLOURS[peer.family], marker="os^Dvp"[turn],
+                *zip(*mine, strict=True),
+                label=peer.name,
+                color=COLOURS[peer.family],
+                marker="os^Dvp"[turn],
                 linestyle=("-", "--", ":", "-.")[turn % 4],
-                linewidth=2.5 if own else 1.3, markersize=6 if own else 5, zorder=3 if own else 2,
-            )  # fmt: skip
+                linewidth=2.5 if own else 1.3,
+                markersize=6 if own else 5,
+                zorder=3 if own else 2,
+            )
         axes.set_xlabel("time of one solve [µs], one core, warm")
         axes.set_ylabel("tip error, rms over the load cases [m]")
-        axes.set_title("Passive rod of Appendix J under a tip force, at rest: further down and left is better", fontsize=10)
+        axes.set_title(
+            "Passive rod of Appendix J under a tip force, at rest: further down and left is better",
+            fontsize=10,
+        )
         axes.grid(which="major", color="0.88")
         axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False)
         figure.savefig(file, dpi=150)
 
 
 COLOURS: Mapping[str, str] = {
-    "fastrod": "#000000", "scipy": "#0072b2", "soromox": "#cc79a7", "MuJoCo": "#d55e00", "PyBullet": "#009e73", "PyElastica": "#e69f00",
-}  # fmt: skip
+    "fastrod": "#000000",
+    "scipy": "#0072b2",
+    "soromox": "#cc79a7",
+    "MuJoCo": "#d55e00",
+    "PyBullet": "#009e73",
+    "PyElastica": "#e69f00",
+}
 """Of Okabe and Ito: told apart by the colour-blind; markers and dashes tell the peers of a family apart."""
 
 
@@ -314,13 +380,19 @@ def sections(options: argparse.Namespace) -> list[Section]:
             if peer.missing():
                 continue
             if options.quick and peer.family == "soromox":
-                left_out.append(f"{peer.name} is left out of a quick run: it takes half a minute to build and to compile.")
+                left_out.append(
+                    f"{peer.name} is left out of a quick run: it takes half a minute to build and to compile."
+                )
                 continue
             for rung in _measured(peer, options.quick):
                 note_progress(f"{peer.name}, {rung.label}")
                 points.append(measure(peer, rung, force))
             many = replace(peer, name=peer.name + IN_ONE_CALL)
-            points += [measure(many, rung, force, rung.together) for rung in _measured(peer, options.quick) if rung.together]
+            points += [
+                measure(many, rung, force, rung.together)
+                for rung in _measured(peer, options.quick)
+                if rung.together
+            ]
         batches = [batch_section(points, 64 if options.quick else BATCH, within) for within in WITHIN]
     if options.plot:
         plot(points, options.plot)

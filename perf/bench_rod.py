@@ -1,4 +1,5 @@
-"""The rod solver's figures: `fastrod bench rod`, or this file as a script; `--json` for programs, `--quick` for a smoke run."""
+"""The rod solver's figures: `fastrod bench rod`, or this file as a script; `--json` for programs, `--quick`
+for a smoke run."""
 
 from __future__ import annotations
 
@@ -10,7 +11,8 @@ import report
 
 
 def sections(quick: bool) -> list[report.Section]:
-    """All tables, measured one after the other in this process (memory and start: in processes of their own)."""
+    """All tables, measured one after the other in this process (memory and start: in processes of their
+    own)."""
     import cantilever
     import fresh
     import integrators
@@ -35,7 +37,11 @@ def sections(quick: bool) -> list[report.Section]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure and print; the exit code."""
-    return report.command(argparse.ArgumentParser(prog="bench_rod", description=__doc__), argv, lambda options: sections(options.quick))
+    return report.command(
+        argparse.ArgumentParser(prog="bench_rod", description=__doc__),
+        argv,
+        lambda options: sections(options.quick),
+    )
 
 
 if __name__ == "__main__":

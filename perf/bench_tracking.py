@@ -1,4 +1,5 @@
-"""A UR5's soft tip on five paths: `fastrod bench tracking`, or this file as a script; `--json` for programs, `--quick` for a smoke run."""
+"""A UR5's soft tip on five paths: `fastrod bench tracking`, or this file as a script; `--json` for programs,
+`--quick` for a smoke run."""
 
 from __future__ import annotations
 
@@ -41,7 +42,9 @@ class Reach:
         self.low, self.high = self.tip.limits(LARGEST_BEND)
         # in the same metric as the tracks: extension by its range, bends by a radian
         weight = [1.0 / self.high[0] ** 2, 1.0 / OFFSET**2, 1.0 / OFFSET**2] * 2
-        self.control = ResolvedRate(gain=1.0, lower=self.low, upper=self.high, weight=weight, error_limit=0.02, damping=1e-3)
+        self.control = ResolvedRate(
+            gain=1.0, lower=self.low, upper=self.high, weight=weight, error_limit=0.02, damping=1e-3
+        )
         self.straight, self.bend = np.array(STRAIGHT), 1.5 * OFFSET
 
     def solve(self, goal: Any, q: Any) -> Any:
@@ -56,13 +59,16 @@ class Reach:
                     return None
                 if np.linalg.norm(goal - self.tip.position) < NEAR:
                     return q
-            q = np.clip(q + self.control.rates(q, self.tip.jacobian(), error, np.zeros(3), 1.0), self.low, self.high)
+            q = np.clip(
+                q + self.control.rates(q, self.tip.jacobian(), error, np.zeros(3), 1.0), self.low, self.high
+            )
             if not self.tip.place(q).ok[0]:
                 return None
         return None
 
     def points(self, path: Trajectory, depth: float, whole: bool) -> float:
-        """Part of the path's points that are in reach; where the `whole` path is asked for, 0 after the first that is not."""
+        """Part of the path's points that are in reach; where the `whole` path is asked for, 0 after the first
+        that is not."""
         start = np.array(path.center) + np.array([0.0, 0.0, depth])
         goals = path.position(np.arange(POINTS + 1) * path.period / POINTS) - start
         found, last = 0, None
@@ -70,7 +76,8 @@ class Reach:
             away = float(np.hypot(*goal[:2]))
             x, y = goal[:2] / away if away > 1e-6 else (1.0, 0.0)
             bent = np.array([self.high[0], self.bend * x, -self.bend * y, self.high[0], 0.0, 0.0])
-            folded = self.bend * np.array([0.0, 0.6 * x, -0.6 * y, 0.0, -1.2 * x, 1.2 * y])  # short, its tip near the axis
+            # short, its tip near the axis
+            folded = self.bend * np.array([0.0, 0.6 * x, -0.6 * y, 0.0, -1.2 * x, 1.2 * y])
             starts = [bent, folded, self.straight] if last is None else [last, bent, folded, self.straight]
             q = next((q for q in (self.solve(goal, start) for start in starts) if q is not None), None)
             found, last = found + (q is not None), q if q is not None else last
@@ -79,7 +86,8 @@ class Reach:
         return found / len(goals)
 
     def best(self, scene: Track) -> tuple[float, float, float]:
-        """Largest part of the path in reach from one place of the base; the largest scale at which all of it is; a depth for that."""
+        """Largest part of the path in reach from one place of the base; the largest scale at which all of it
+        is; a depth for that."""
         part = max(self.points(scene.path(), depth, False) for depth in DEPTHS[::2])
         for scale in SCALES:
             depths = [depth for depth in DEPTHS if self.points(scene.path(scale), depth, True) == 1.0]
@@ -106,7 +114,8 @@ def figures(name: str, run: Record) -> Row:
 
 
 def row(name: str, reach: Reach | None, dt: float | None, seconds: float | None) -> Row:
-    """One path by both, by the arm alone and by the soft robot alone; without `reach` the last as far as it needs no search."""
+    """One path by both, by the arm alone and by the soft robot alone; without `reach` the last as far as it
+    needs no search."""
     from fastrod_scenes import load
     from fastrod_scenes.ur5.soft_ur5 import DEPTH
     from fastrod_scenes.ur5.tracking import APPROACH, Track, Tracking, record
@@ -119,15 +128,28 @@ def row(name: str, reach: Reach | None, dt: float | None, seconds: float | None)
     by_soft, by_arm = both.lengths(APPROACH)
     after, part = both.mean_square(APPROACH), both.soft_share(APPROACH)
     found: Row = {
-        "path": scene.shape, "paper": scene.paper, **figures("both", both), "error_target": ERROR_TARGET,
-        "error_met": after <= ERROR_TARGET, "share": part, "share_target": SHARE_TARGET, "share_met": part >= SHARE_TARGET,
-        "by_soft": by_soft, "by_arm": by_arm, "lag": both.lag, "clearance": both.clearance,
-    }  # fmt: skip
+        "path": scene.shape,
+        "paper": scene.paper,
+        **figures("both", both),
+        "error_target": ERROR_TARGET,
+        "error_met": after <= ERROR_TARGET,
+        "share": part,
+        "share_target": SHARE_TARGET,
+        "share_met": part >= SHARE_TARGET,
+        "by_soft": by_soft,
+        "by_arm": by_arm,
+        "lag": both.lag,
+        "clearance": both.clearance,
+    }
     note_progress(f"{name}: the arm alone")
-    found |= figures("arm", record(stage := Tracking(scene.path(), dt=dt, movers="arm"), steps(stage, seconds)))
+    found |= figures(
+        "arm", record(stage := Tracking(scene.path(), dt=dt, movers="arm"), steps(stage, seconds))
+    )
     note_progress(f"{name}: the soft robot alone")
     reached, scale, depth = reach.best(scene) if reach else (1.0, 0.5, DEPTH)
-    alone = record(stage := Tracking(scene.path(scale), dt=dt, movers="soft", depth=depth), steps(stage, seconds))
+    alone = record(
+        stage := Tracking(scene.path(scale), dt=dt, movers="soft", depth=depth), steps(stage, seconds)
+    )
     found |= {"reach": reached, "scale": scale, "depth": depth, **figures("soft", alone)}
     return found
 
@@ -162,19 +184,37 @@ def tracking_sections(quick: bool, dt: float | None) -> list[Section]:
         Column("clearance", "clearance\nm", ".3f"),
     ]
     return [
-        Section("tracking", "Mean squared error of the tip over time and x, y, z", errors, rows, [
-            "A period is 20 s. The goal is on the path from t = 0 on, the tip rests at the path's center (soft alone: straight below its "
-            "base). With the approach: the first 20 s from the jump on; after it: 20 s from t = 2 s on.",
-            "Soft alone: the UR5's joints are held, the base is above the center. In reach: part of the full-size path that inverse "
-            "kinematics finds from the best height; then the largest scale at which it finds all, in steps of 0.05.",
-            "The paper moves both; its figures are those of SoftManiSim (CoRL 2024).",
-        ]),
-        Section("motion", "Who moves the tip, after the approach", shares, rows, [
-            "Share: sum over the steps of way by the soft robot . way of the tip, over that of the way squared. Lengths: of the ways by "
-            "each alone. Off rest: largest distance of a step's tip from the rod at rest with the same inputs. Clearance: soft robot to "
-            "the arm's links.",
-        ]),
-    ]  # fmt: skip
+        Section(
+            "tracking",
+            "Mean squared error of the tip over time and x, y, z",
+            errors,
+            rows,
+            [
+                "A period is 20 s. The goal is on the path from t = 0 on, the tip rests at the path's center "
+                "(soft alone: straight below its "
+                "base). With the approach: the first 20 s from the jump on; after it: 20 s from t = 2 s on.",
+                "Soft alone: the UR5's joints are held, the base is above the center. In reach: part of the "
+                "full-size path that inverse "
+                "kinematics finds from the best height; then the largest scale at which it finds all, in "
+                "steps "
+                "of 0.05.",
+                "The paper moves both; its figures are those of SoftManiSim (CoRL 2024).",
+            ],
+        ),
+        Section(
+            "motion",
+            "Who moves the tip, after the approach",
+            shares,
+            rows,
+            [
+                "Share: sum over the steps of way by the soft robot . way of the tip, over that of the way "
+                "squared. Lengths: of the ways by "
+                "each alone. Off rest: largest distance of a step's tip from the rod at rest with the same "
+                "inputs. Clearance: soft robot to "
+                "the arm's links."
+            ],
+        ),
+    ]
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,6 +1,8 @@
-"""The viewer in a real browser: answer to a slider, load of the server, start, memory: `fastrod bench viewer`, or this file as a script.
+"""The viewer in a real browser: answer to a slider, load of the server, start, memory: `fastrod bench
+viewer`, or this file as a script.
 
-Needs Debian's chromium and playwright. `--minutes` of motion with pages that come and go, for memory (10 for the whole check).
+Needs Debian's chromium and playwright. `--minutes` of motion with pages that come and go, for memory (10 for
+the whole check).
 """
 
 from __future__ import annotations
@@ -86,7 +88,8 @@ def reached(page: Any, address: str, ready: Callable[[], bool], seconds: float =
 
 
 def answers(presses: int) -> list[float]:
-    """From a key on a slider to the change of the simulator's state, each [s]; browser and server in one machine, one page."""
+    """From a key on a slider to the change of the simulator's state, each [s]; browser and server in one
+    machine, one page."""
     from windows import Window
 
     from fastrod_viewer.app import App
@@ -160,9 +163,13 @@ def start(port: int) -> float:
         began = time.perf_counter()
         with serving("five_segment_reacher", port=port) as (_, address):
             reached(
-                window.page, address,
-                lambda: window.page.get_by_role("button", name="STOP").count() > 0 and window.page.locator("canvas").count() > 0,
-            )  # fmt: skip
+                window.page,
+                address,
+                lambda: (
+                    window.page.get_by_role("button", name="STOP").count() > 0
+                    and window.page.locator("canvas").count() > 0
+                ),
+            )
             taken = time.perf_counter() - began
         window.close()
     return taken
@@ -189,10 +196,18 @@ def memory(minutes: float, port: int) -> list[Row]:
             turn += 1
             if gone >= next_row:
                 note_progress(f"memory, minute {gone / 60.0:.1f}")
-                rows.append({"what": f"after {gone / 60.0:.1f} min", "value": process.memory_info().rss / 2**20, "pages": turn})
+                rows.append(
+                    {
+                        "what": f"after {gone / 60.0:.1f} min",
+                        "value": process.memory_info().rss / 2**20,
+                        "pages": turn,
+                    }
+                )
                 next_row += 60.0
             time.sleep(STAY / PAGES)
-        rows.append({"what": f"after {minutes:g} min", "value": process.memory_info().rss / 2**20, "pages": turn})
+        rows.append(
+            {"what": f"after {minutes:g} min", "value": process.memory_info().rss / 2**20, "pages": turn}
+        )
         for window in windows:
             window.close()
     return rows
@@ -218,20 +233,30 @@ def measure(options: argparse.Namespace) -> list[Section]:
         _row("page ready from `fastrod view`", start(port), "s", 5.0),
     ]
     seconds = 3.0 if options.quick else 20.0
-    for what, target, words in (("five_segment_reacher", 10.0, "one five-segment robot"), ("grid", 60.0, "64 five-segment robots")):
-        rows.append(_row(f"server, {words} at 30 Hz", float(load(what, seconds, port)["value"]), "% of a core", target))  # type: ignore[arg-type]
+    for what, target, words in (
+        ("five_segment_reacher", 10.0, "one five-segment robot"),
+        ("grid", 60.0, "64 five-segment robots"),
+    ):
+        rows.append(
+            _row(
+                f"server, {words} at 30 Hz", float(load(what, seconds, port)["value"]), "% of a core", target
+            )
+        )
     sections = [
         Section(
             "viewer",
             "The viewer, one page",
             columns,
             rows,
-            [f"{len(taken)} key presses on a slider. Chromium draws in software beside the server, on {os.cpu_count()} cores."],
+            [
+                f"{len(taken)} key presses on a slider. Chromium draws in software beside the server, on "
+                f"{os.cpu_count()} cores."
+            ],
         )
     ]
     minutes = 0.2 if options.quick else options.minutes
     found = memory(minutes, port)
-    settled = [float(row["value"]) for row in found[1:]] or [float(found[0]["value"])]  # type: ignore[arg-type]
+    settled = [float(row["value"]) for row in found[1:]] or [float(found[0]["value"])]
     growth = 100.0 * (settled[-1] / settled[0] - 1.0)
     notes = [
         f"{PAGES} pages of {STAY:g} s each, one opened every {STAY / PAGES:g} s.",

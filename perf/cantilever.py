@@ -1,4 +1,5 @@
-"""A passive cantilever (the paper's Appendix J) by PyElastica's dynamic relaxation, beside one `settle` of fastrod.
+"""A passive cantilever (the paper's Appendix J) by PyElastica's dynamic relaxation, beside one `settle` of
+fastrod.
 
 `fastrod bench peers` has the other peers, and error against time.
 """
@@ -24,13 +25,18 @@ FORCE = 0.2
 WITHIN = 1e-3
 """Allowed tip error as a part of the tip's deflection."""
 _CHECK = 20  # steps between two looks at the tip
-_TRIED = [Relaxation(n, shear, damping) for n, shear in ((12, 1000.0), (14, 1500.0), (16, 2000.0)) for damping in (0.8, 0.9, 1.0)]
+_TRIED = [
+    Relaxation(n, shear, damping)
+    for n, shear in ((12, 1000.0), (14, 1500.0), (16, 2000.0))
+    for damping in (0.8, 0.9, 1.0)
+]
 
 
 def relax(setting: Relaxation, goal: Array, patience: float = 12.0) -> tuple[float, int, float]:
     """Wall time [s] and steps until the tip has come within `WITHIN` for good, and its error in the end [m].
 
-    `patience` is the simulated time in units of the first mode's 1/omega; time is infinite if the tip does not stay.
+    `patience` is the simulated time in units of the first mode's 1/omega; time is infinite if the tip does
+    not stay.
     """
     stand = Stand(setting)
     stand.load(FORCE)
@@ -82,16 +88,20 @@ def section(quick: bool) -> Section:
     goal = appendix_j.tips(np.array([FORCE]))[0]
     rows = [_fastrod(goal)]
     notes = [
-        f"Passive rod of 0.07 m, tip force {FORCE} N across it; until the tip is within {WITHIN:.1%} of its deflection, "
-        f"{WITHIN * _deflection(goal):.1e} m. One rod, 1 thread, wall time, warm (PyElastica's kernels compiled). Target: none.",
+        f"Passive rod of 0.07 m, tip force {FORCE} N across it; until the tip is within {WITHIN:.1%} of its "
+        "deflection, "
+        f"{WITHIN * _deflection(goal):.1e} m. One rod, 1 thread, wall time, warm (PyElastica's kernels "
+        "compiled). Target: none."
     ]
     if importlib.util.find_spec("elastica") is None:
         notes.append("PyElastica is not installed, so its row is left out: pip install fastrod[peers].")
     else:
         rows.append(_elastica(goal, quick, rows[0]))
         notes.append(
-            f"PyElastica: the fastest of {len(_TRIED)} settings (12 to 16 elements, damping 0.8 to 1 of critical), shear stiffness and "
-            "rotary inertia chosen for large stable steps, and the rod begun half an element before the wall for second order."
+            f"PyElastica: the fastest of {len(_TRIED)} settings (12 to 16 elements, damping 0.8 to 1 of "
+            "critical), shear stiffness and "
+            "rotary inertia chosen for large stable steps, and the rod begun half an element before the "
+            "wall for second order."
         )
     columns = [
         Column("solver", "solver"),
@@ -114,4 +124,11 @@ def _elastica(goal: Array, quick: bool, fastrod: Row) -> Row:
     own = fastrod["ms"]
     assert isinstance(own, float)
     text = f"{setting.elements} elements, damping {setting.damping:g} of critical, shear {setting.shear:g} N"
-    return {"solver": "PyElastica", "setting": text, "ms": 1e3 * used, "steps": steps, "error_m": error, "ratio": 1e3 * used / own}
+    return {
+        "solver": "PyElastica",
+        "setting": text,
+        "ms": 1e3 * used,
+        "steps": steps,
+        "error_m": error,
+        "ratio": 1e3 * used / own,
+    }

@@ -67,15 +67,22 @@ class Case:
 
     def words(self, pose: Pose) -> Words:
         """Keyword arguments of `Simulator.step` and `settle`."""
-        return {"tendon_length": pose.tendon_length, "tip_force": pose.tip_force, "line_force": self.line_force}
+        return {
+            "tendon_length": pose.tendon_length,
+            "tip_force": pose.tip_force,
+            "line_force": self.line_force,
+        }
 
 
 def appendix_b_robot(paper: bool) -> Robot:
-    """The prototype with its tendons at 0.01 m, as in Appendix B, in paper mode or with the full tendon model."""
+    """The prototype with its tendons at 0.01 m, as in Appendix B, in paper mode or with the full tendon
+    model."""
     robot = load_robot("prototype")
     (segment,) = robot.segments
     tendons = tuple(replace(tendon, offset=0.01) for tendon in segment.tendons)
-    return replace(robot, segments=(replace(segment, tendons=tendons, mode="paper" if paper else "tendon_length"),))
+    return replace(
+        robot, segments=(replace(segment, tendons=tendons, mode="paper" if paper else "tendon_length"),)
+    )
 
 
 def appendix_b() -> tuple[Pose, str]:
@@ -84,26 +91,33 @@ def appendix_b() -> tuple[Pose, str]:
     if file.exists():
         table = np.genfromtxt(file, delimiter=",", names=True)
         lengths = np.column_stack([table[f"L{i}"] for i in range(1, 5)])
-        return Pose(lengths, np.column_stack([table[name] for name in ("Fx", "Fy", "Fz")])), "the cases of Appendix B"
+        return Pose(
+            lengths, np.column_stack([table[name] for name in ("Fx", "Fy", "Fz")])
+        ), "the cases of Appendix B"
     rng = np.random.default_rng(7)
     bend = rng.uniform(-0.9, 0.9, (100, 1, 2))
-    return Pose(arc_lengths(appendix_b_robot(True), bend), ball(rng, 100, 2.0)), "seeded cases in the ranges of Appendix B"
+    return Pose(
+        arc_lengths(appendix_b_robot(True), bend), ball(rng, 100, 2.0)
+    ), "seeded cases in the ranges of Appendix B"
 
 
 def path() -> Pose:
-    """The 500 points of Appendix B: from each case to the next in `STEPS_PER_CASE` steps, and from the last to the first."""
+    """The 500 points of Appendix B: from each case to the next in `STEPS_PER_CASE` steps, and from the last
+    to the first."""
     cases, _ = appendix_b()
     n = len(cases.tip_force)
     index = np.arange(n * STEPS_PER_CASE)
     case, part = index // STEPS_PER_CASE, (index % STEPS_PER_CASE / STEPS_PER_CASE)[:, None]
     here, there = cases.take(case), cases.take((case + 1) % n)
     return Pose(
-        here.tendon_length + part * (there.tendon_length - here.tendon_length), here.tip_force + part * (there.tip_force - here.tip_force)
+        here.tendon_length + part * (there.tendon_length - here.tendon_length),
+        here.tip_force + part * (there.tip_force - here.tip_force),
     )
 
 
 def arc_lengths(robot: Robot, bend: Array) -> Array:
-    """(n, n_tendons) lengths of a chain of arcs with `bend` (n, n_segments, 2) about d1 and d2 [rad]; exact for arcs."""
+    """(n, n_tendons) lengths of a chain of arcs with `bend` (n, n_segments, 2) about d1 and d2 [rad]; exact
+    for arcs."""
     lengths = np.zeros((len(bend), robot.n_tendons))
     for t, (tendon, last) in enumerate(zip(robot.tendons, robot.tendon_segment, strict=True)):
         for k, (x, y) in enumerate(tendon.position(int(last) + 1)):
@@ -135,11 +149,22 @@ def cases(n: int) -> list[Case]:
 
     return [
         paper,
-        Case("prototype", "prototype, full tendon model, bends to 1.4 rad, tip force to 0.3 N",
-             prototype, bent(prototype, True, 1.4, 0.3), bent(prototype, True, 1.4, 0.3)),
-        Case("reacher", "five_segment_reacher, full tendon model, bends to 0.5 rad a segment and axis, tip force to 0.05 N",
-             reacher, bent(reacher, False, 0.5, 0.05), bent(reacher, False, 0.5, 0.05)),
-    ]  # fmt: skip
+        Case(
+            "prototype",
+            "prototype, full tendon model, bends to 1.4 rad, tip force to 0.3 N",
+            prototype,
+            bent(prototype, True, 1.4, 0.3),
+            bent(prototype, True, 1.4, 0.3),
+        ),
+        Case(
+            "reacher",
+            "five_segment_reacher, full tendon model, bends to 0.5 rad a segment and axis, tip "
+            "force to 0.05 N",
+            reacher,
+            bent(reacher, False, 0.5, 0.05),
+            bent(reacher, False, 0.5, 0.05),
+        ),
+    ]
 
 
 @dataclass(frozen=True)
@@ -155,7 +180,11 @@ class Error:
 def tip_error(state: State, fine: State) -> Error:
     ok = state.ok & fine.ok
     error = np.linalg.norm(state.tip_position - fine.tip_position, axis=1)[ok]
-    return Error(float(error.max(initial=0.0)), float(np.median(error)) if len(error) else float("nan"), float(ok.mean()))
+    return Error(
+        float(error.max(initial=0.0)),
+        float(np.median(error)) if len(error) else float("nan"),
+        float(ok.mean()),
+    )
 
 
 def fine_solution(case: Case, pose: Pose, outputs: Literal["full", "tip"] = "tip") -> tuple[Simulator, State]:
@@ -164,9 +193,14 @@ def fine_solution(case: Case, pose: Pose, outputs: Literal["full", "tip"] = "tip
     return sim, sim.settle(**case.words(pose), tolerance=1e-10)
 
 
-def settled(case: Case, pose: Pose, points: int, fine: Simulator, threads: int | None = None) -> tuple[Simulator, State]:
-    """A simulator with `points` per segment, settled from the boundary of a fine one, so on the same branch."""
-    sim = Simulator(case.robot, len(pose.tip_force), points_per_segment=points, outputs="tip", threads=threads)
+def settled(
+    case: Case, pose: Pose, points: int, fine: Simulator, threads: int | None = None
+) -> tuple[Simulator, State]:
+    """A simulator with `points` per segment, settled from the boundary of a fine one, so on the same
+    branch."""
+    sim = Simulator(
+        case.robot, len(pose.tip_force), points_per_segment=points, outputs="tip", threads=threads
+    )
     sim.restore(fine.snapshot())
     return sim, sim.settle(**case.words(pose), tolerance=1e-10)
 

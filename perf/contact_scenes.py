@@ -1,9 +1,9 @@
 """Random contact scenes beside a dense sampling: `python perf/contact_scenes.py --count 10000 --seed 1`.
 
 Shipped robots with 6 to 40 integration steps a segment, tendons that move in small and in coarse steps, and
-obstacles beside them or pushed into them. After every step the whole rod is sampled (`Simulator.shape`) and compared
-with a signed distance that shares no code with fastrod: closed forms, or every triangle of a mesh. A step that says ok
-and is deeper than 0.1 mm is silent.
+obstacles beside them or pushed into them. After every step the whole rod is sampled (`Simulator.shape`) and
+compared with a signed distance that shares no code with fastrod: closed forms, or every triangle of a mesh. A
+step that says ok and is deeper than 0.1 mm is silent.
 """
 
 from __future__ import annotations
@@ -32,13 +32,15 @@ TOGETHER = 8
 """Scenes of one batch: one robot, one geometry, each its own poses and motion."""
 N_STEPS = 10
 _SAMPLE = 5e-4
-"""Distance of the samples along a rod [m]; between two the depth changes by less than 0.02 mm on a rod of 2 mm radius."""
+"""Distance of the samples along a rod [m]; between two the depth changes by less than 0.02 mm on a rod of 2
+mm radius."""
 _POINTS = (6, 8, 10, 12, 16, 20, 30, 40)
 
 
 @njit()
 def _mesh_distances(points, corners, out):  # type: ignore[no-untyped-def]
-    """Unsigned distance of each point to the nearest triangle: its plane where the point is above it, else its three edges."""
+    """Unsigned distance of each point to the nearest triangle: its plane where the point is above it, else
+    its three edges."""
     for i in range(len(points)):
         best = 1e300
         for t in range(len(corners)):
@@ -65,7 +67,8 @@ def _mesh_distances(points, corners, out):  # type: ignore[no-untyped-def]
 
 
 def _encloses(point: Array, corners: Array) -> bool:
-    """Whether a closed mesh holds the point, by the solid angle of its triangles (Van Oosterom and Strackee 1983)."""
+    """Whether a closed mesh holds the point, by the solid angle of its triangles (Van Oosterom and Strackee
+    1983)."""
     a, b, c = (corners[:, k] - point for k in range(3))
     x, y, z = (np.linalg.norm(v, axis=1) for v in (a, b, c))
     dots = (a * b).sum(1) * z + (b * c).sum(1) * x + (c * a).sum(1) * y
@@ -100,7 +103,8 @@ def distances(obstacle: Obstacle, pose: Array, points: Array) -> Array:
         return np.asarray(np.linalg.norm(np.maximum(over, 0.0), axis=1) + np.minimum(over.max(1), 0.0))
     corners, d = np.ascontiguousarray(obstacle.vertices[obstacle.faces]), np.empty(len(p))
     _mesh_distances(np.ascontiguousarray(p), corners, d)
-    # the sign changes only where the distance passes through zero: one point of each stretch that keeps away from it decides
+    # the sign changes only where the distance passes through zero: one point of each stretch that keeps away
+    # from it decides
     apart = np.flatnonzero((d[1:] + d[:-1]) < 1.01 * np.linalg.norm(np.diff(p, axis=0), axis=1)) + 1
     for first, last in zip([0, *apart], [*apart, len(d)], strict=True):
         if _encloses(p[first + d[first:last].argmax()], corners):
@@ -126,12 +130,16 @@ def _made(kind: str, rng: np.random.Generator, size: float) -> Any:
     if kind == "block":
         return make.box(extents=size * r(0.3, 1.0, 3))
     if kind == "bar":
-        return make.cylinder(radius=size * r(0.1, 0.4), height=size * r(0.5, 2.0), sections=int(rng.integers(8, 48)))
+        return make.cylinder(
+            radius=size * r(0.1, 0.4), height=size * r(0.5, 2.0), sections=int(rng.integers(8, 48))
+        )
     if kind == "pill":
         return make.capsule(radius=size * r(0.15, 0.4), height=size * r(0.3, 1.0), count=[12, 12])
     if kind == "annulus":
         inner = size * r(0.2, 0.4)
-        return make.annulus(inner, inner + size * r(0.05, 0.3), size * r(0.2, 0.8), sections=int(rng.integers(12, 40)))
+        return make.annulus(
+            inner, inner + size * r(0.05, 0.3), size * r(0.2, 0.8), sections=int(rng.integers(12, 40))
+        )
     if kind == "torus":
         return make.torus(size * r(0.3, 0.5), size * r(0.08, 0.2), major_sections=20, minor_sections=10)
     if kind == "cone":
@@ -145,9 +153,15 @@ MESHES = ("ball", "block", "bar", "pill", "annulus", "torus", "cone", "noisy sph
 PRIMITIVES: dict[str, Callable[[np.random.Generator, float], Obstacle]] = {
     "sphere": lambda rng, size: sphere(size * rng.uniform(0.2, 0.6), name="sphere"),
     "box": lambda rng, size: box(size * rng.uniform(0.2, 1.0, 3), name="box"),
-    "cylinder": lambda rng, size: cylinder(size * rng.uniform(0.1, 0.4), size * rng.uniform(0.3, 2.0), name="cylinder"),
-    "capsule": lambda rng, size: capsule(size * rng.uniform(0.1, 0.4), size * rng.uniform(0.3, 1.5), name="capsule"),
-    "thin box": lambda rng, size: box(size * rng.uniform((0.01, 0.8, 0.8), (0.05, 2.0, 2.0)), name="thin box"),
+    "cylinder": lambda rng, size: cylinder(
+        size * rng.uniform(0.1, 0.4), size * rng.uniform(0.3, 2.0), name="cylinder"
+    ),
+    "capsule": lambda rng, size: capsule(
+        size * rng.uniform(0.1, 0.4), size * rng.uniform(0.3, 1.5), name="capsule"
+    ),
+    "thin box": lambda rng, size: box(
+        size * rng.uniform((0.01, 0.8, 0.8), (0.05, 2.0, 2.0)), name="thin box"
+    ),
 }
 KINDS = (*MESHES, *PRIMITIVES)
 
@@ -179,7 +193,8 @@ class Batch:
 
 
 def make_batch(seed: int, index: int, n: int = TOGETHER) -> Batch:
-    """Batch `index` of a seed: a robot and an obstacle drawn at random; each scene has its poses and its motion."""
+    """Batch `index` of a seed: a robot and an obstacle drawn at random; each scene has its poses and its
+    motion."""
     rng = np.random.default_rng((seed, index))
     robot = load_robot(robot_names()[int(rng.integers(len(robot_names())))])
     points, kind = int(rng.choice(_POINTS)), KINDS[int(rng.integers(len(KINDS)))]
@@ -196,9 +211,11 @@ def make_batch(seed: int, index: int, n: int = TOGETHER) -> Batch:
     return Batch(robot, points, kind, solid, radius, lengths, pose)
 
 
-def _poses(robot: Robot, solid: Obstacle, radius: float, lengths: Array, there: Array, rng: np.random.Generator) -> Array:
-    """Where the obstacle is at each step: clear of the free rod at first, in its way at last; half of them stand still. None comes
-    near the mounting, where nothing can give way."""
+def _poses(
+    robot: Robot, solid: Obstacle, radius: float, lengths: Array, there: Array, rng: np.random.Generator
+) -> Array:
+    """Where the obstacle is at each step: clear of the free rod at first, in its way at last; half of them
+    stand still. None comes near the mounting, where nothing can give way."""
     n, free = lengths.shape[1], []
     sim = Simulator(robot, n, points_per_segment=20)
     for length in lengths:
@@ -222,12 +239,21 @@ def _poses(robot: Robot, solid: Obstacle, radius: float, lengths: Array, there: 
             centre = (first if inside else last)[at]
             start, end = 0.0, deep if moves else 0.0
             if not inside:
-                start, end = (_away(solid, centre, out, turn, nodes, radius + gap) for nodes, gap in ((first, 2e-3), (last, -deep)))
+                start, end = (
+                    _away(solid, centre, out, turn, nodes, radius + gap)
+                    for nodes, gap in ((first, 2e-3), (last, -deep))
+                )
                 start, end = (start, end) if moves else (max(start, end),) * 2
             way = centre + (start + there[:, None] * (end - start)) * out
             ends = [np.concatenate([c, turn]) for c in (way[0], way[-1])]
             clear = distances(solid, ends[0], first).min() > radius + 1e-3
-            mounted = min(distances(solid, e, nodes[fixed]).min() for e, nodes in zip(ends, (first, last), strict=True)) > radius + 2e-3
+            mounted = (
+                min(
+                    distances(solid, e, nodes[fixed]).min()
+                    for e, nodes in zip(ends, (first, last), strict=True)
+                )
+                > radius + 2e-3
+            )
             if clear and mounted:
                 break
         else:
@@ -243,7 +269,8 @@ def _along(z: Array) -> Array:
 
 
 def _away(solid: Obstacle, centre: Array, out: Array, turn: Array, nodes: Array, wanted: float) -> float:
-    """How far from `centre` along `out` the obstacle is `wanted` away from these nodes, coming from outside."""
+    """How far from `centre` along `out` the obstacle is `wanted` away from these nodes, coming from
+    outside."""
 
     def clear(way: float) -> bool:
         return bool(distances(solid, np.concatenate([centre + way * out, turn]), nodes).min() > wanted)
@@ -267,7 +294,8 @@ class Played:
     touching: Any
     """(N_STEPS + 1, n)"""
     depth: Array
-    """(N_STEPS + 1, n) of the sampled rod in the obstacle, negative where it is clear [m]; nan where there is no shape."""
+    """(N_STEPS + 1, n) of the sampled rod in the obstacle, negative where it is clear [m]; nan where there is
+    no shape."""
     seconds: Array
     """(N_STEPS + 1,) of the processor, one call."""
     passes: Any
@@ -278,24 +306,36 @@ def play(batch: Batch, rows: list[int] | None = None, **options: Any) -> Played:
     """Step a batch, or some of its scenes, and sample every rod after every step."""
     some = list(range(batch.pose.shape[1])) if rows is None else rows
     n, name = len(some), batch.obstacle.name
-    sim = Simulator(batch.robot, n, points_per_segment=batch.points, threads=1, contact=batch.scene(**options))
+    sim = Simulator(
+        batch.robot, n, points_per_segment=batch.points, threads=1, contact=batch.scene(**options)
+    )
     ok, touching, passes = (np.zeros((N_STEPS + 1, n), kind) for kind in (bool, bool, int))
-    played = Played(batch.kind, ok, touching, np.full((N_STEPS + 1, n), np.nan), np.zeros(N_STEPS + 1), passes)
+    played = Played(
+        batch.kind, ok, touching, np.full((N_STEPS + 1, n), np.nan), np.zeros(N_STEPS + 1), passes
+    )
     for k in range(N_STEPS + 1):
         begin = time.process_time()
         state = sim.step(batch.tendon_length[k][some], obstacle_pose={name: batch.pose[k][some]})
         played.seconds[k] = time.process_time() - begin
         assert state.contacts is not None
-        played.ok[k], played.touching[k], played.passes[k] = state.ok, state.contacts.in_contact(), state.passes
+        played.ok[k], played.touching[k], played.passes[k] = (
+            state.ok,
+            state.contacts.in_contact(),
+            state.passes,
+        )
         played.sentences += list(state.problems.values())
         _, points = batch.sample(sim)
         for i in range(n):
             if np.isfinite(points[i]).all():
-                played.depth[k, i] = batch.rod_radius - distances(batch.obstacle, batch.pose[k][some[i]], points[i]).min()
+                played.depth[k, i] = (
+                    batch.rod_radius - distances(batch.obstacle, batch.pose[k][some[i]], points[i]).min()
+                )
     return played
 
 
-def measure(count: int, seed: int, first: int = 0, minutes: float = np.inf) -> Iterator[tuple[int, Batch, Played]]:
+def measure(
+    count: int, seed: int, first: int = 0, minutes: float = np.inf
+) -> Iterator[tuple[int, Batch, Played]]:
     """Batches from index `first` on, until `count` scenes are played or the time is over."""
     end = time.monotonic() + 60.0 * minutes
     for index in range(first, first + -(-count // TOGETHER)):
@@ -317,12 +357,18 @@ def sections(count: int, seed: int, first: int, minutes: float) -> list[Section]
         found[batch.kind].append(played)
         said.update(re.sub(r"-?\d[\d.e+-]*", "#", sentence) for sentence in played.sentences)
         for k, i in np.argwhere(played.ok & (played.depth > SILENT)):
-            silent.append(f"seed {seed} batch {index} scene {i} step {k}: {1e3 * played.depth[k, i]:.3f} mm, {batch.robot.name}, "
-                          f"{batch.points} steps a segment, {batch.kind}")  # fmt: skip
+            silent.append(
+                f"seed {seed} batch {index} scene {i} step {k}: {1e3 * played.depth[k, i]:.3f} "
+                f"mm, {batch.robot.name}, "
+                f"{batch.points} steps a segment, {batch.kind}"
+            )
         each = played.seconds[1:]
         taken += list(each)
         if each.max() > slowest:
-            slowest, where = float(each.max()), f"batch {index}, {batch.robot.name}, {batch.points} steps a segment, {batch.kind}"
+            slowest, where = (
+                float(each.max()),
+                (f"batch {index}, {batch.robot.name}, {batch.points} steps a segment, {batch.kind}"),
+            )
         if not played.ok.all() and sys.stderr.isatty():
             print(f"batch {index}: not ok {np.argwhere(~played.ok).tolist()}", file=sys.stderr)
     rows: list[Row] = []
@@ -355,7 +401,8 @@ def sections(count: int, seed: int, first: int, minutes: float) -> list[Section]
         Column("share", "not ok", ".2%"),
     ]
     notes = [
-        f"A step of {TOGETHER} robots takes {1e3 * float(np.median(taken)):.2f} ms of the processor at the median and "
+        f"A step of {TOGETHER} robots takes {1e3 * float(np.median(taken)):.2f} ms of the processor at the "
+        "median and "
         f"{slowest:.2f} s at most ({where}).",
         *(f"{times} x {words}" for words, times in said.most_common(8)),
         *silent,
@@ -369,7 +416,9 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--first", type=int, default=0, help="batch to begin with")
     parser.add_argument("--minutes", type=float, default=np.inf, help="stop after so long")
-    return report.command(parser, argv, lambda o: sections(TOGETHER if o.quick else o.count, o.seed, o.first, o.minutes))
+    return report.command(
+        parser, argv, lambda o: sections(TOGETHER if o.quick else o.count, o.seed, o.first, o.minutes)
+    )
 
 
 if __name__ == "__main__":

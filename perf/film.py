@@ -1,7 +1,8 @@
 """The README's moving picture: scenes of the viewer, drawn by a browser, frame by frame.
 
 python perf/film.py viewer/film.gif              needs Debian's chromium, playwright and Pillow
-python perf/film.py FILE.gif --scene airway:4    other scenes, each with the seconds that it is shown for, how near, how fast
+python perf/film.py FILE.gif --scene airway:4    other scenes, each with the seconds that it is shown for, how
+near, how fast
 """
 
 from __future__ import annotations
@@ -39,11 +40,17 @@ def frames(browser: Any, scene: str, seconds: float, closer: float, speed: float
     window = Window(browser, *SIZE)
     try:
         many = len(world.rods[0].state.ok) > FINE
-        drawing = Drawing(Canvas(server), world, Options(body="skin" if many or world.rods[0].state.contacts is not None else "backbone"))
+        drawing = Drawing(
+            Canvas(server),
+            world,
+            Options(body="skin" if many or world.rods[0].state.contacts is not None else "backbone"),
+        )
         sight = Sight(drawing.middle, closer * drawing.size)
         window.go(f"http://127.0.0.1:{server.get_port()}")
         window.close_toast()
-        window.page.add_style_tag(content=".mantine-Paper-root, .mantine-Notifications-root { display: none !important; }")
+        window.page.add_style_tag(
+            content=".mantine-Paper-root, .mantine-Notifications-root { display: none !important; }"
+        )
         window.until(lambda: bool(server.get_clients()))
         stand_back(server, sight)
         window.page.wait_for_timeout(2000)
@@ -74,10 +81,15 @@ def reduced(shots: Sequence[Any]) -> list[Any]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Film and write; the exit code."""
-    parser = argparse.ArgumentParser(prog="film", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        prog="film", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("out", type=Path, metavar="FILE.gif")
     parser.add_argument(
-        "--scene", action="append", metavar="NAME[:SECONDS[:NEARNESS[:SPEED]]]", help=f"again for more; default {' '.join(SCENES)}"
+        "--scene",
+        action="append",
+        metavar="NAME[:SECONDS[:NEARNESS[:SPEED]]]",
+        help=f"again for more; default {' '.join(SCENES)}",
     )
     options = parser.parse_args(argv)
     from playwright.sync_api import sync_playwright
@@ -91,7 +103,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             seconds, closer, speed = (*map(float, numbers), *(3.0, 0.8, 1.0)[len(numbers) :])
             few += reduced(list(frames(browser, name, seconds, closer, speed)))
         browser.close()
-    few[0].save(options.out, save_all=True, append_images=few[1:], duration=round(1000.0 / RATE), loop=0, optimize=True)
+    few[0].save(
+        options.out,
+        save_all=True,
+        append_images=few[1:],
+        duration=round(1000.0 / RATE),
+        loop=0,
+        optimize=True,
+    )
     print(f"wrote {options.out}: {len(few)} frames, {options.out.stat().st_size / 1e6:.1f} MB")
     return 0
 

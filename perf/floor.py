@@ -12,12 +12,22 @@ from report import best
 
 W = LANES
 CHAINS, LINKS = 8, 16
-"""Independent sums of a lane, enough to hide the latency of an addition, and multiply-adds between load and store."""
+"""Independent sums of a lane, enough to hide the latency of an addition, and multiply-adds between load and
+store."""
 
 
 @inline
 def _link(a: Any, b: Any, x: Any) -> Any:
-    return a * x[0] + b, a * x[1] + b, a * x[2] + b, a * x[3] + b, a * x[4] + b, a * x[5] + b, a * x[6] + b, a * x[7] + b
+    return (
+        a * x[0] + b,
+        a * x[1] + b,
+        a * x[2] + b,
+        a * x[3] + b,
+        a * x[4] + b,
+        a * x[5] + b,
+        a * x[6] + b,
+        a * x[7] + b,
+    )
 
 
 @inline
@@ -30,7 +40,16 @@ def _multiply_add(y: Any, repeats: int) -> None:
     for _ in range(repeats):
         for w in range(W):
             a, b = y[8 * W + w], y[9 * W + w]
-            x = (y[w], y[W + w], y[2 * W + w], y[3 * W + w], y[4 * W + w], y[5 * W + w], y[6 * W + w], y[7 * W + w])
+            x = (
+                y[w],
+                y[W + w],
+                y[2 * W + w],
+                y[3 * W + w],
+                y[4 * W + w],
+                y[5 * W + w],
+                y[6 * W + w],
+                y[7 * W + w],
+            )
             x = _four(a, b, _four(a, b, _four(a, b, _four(a, b, x))))
             y[w], y[W + w], y[2 * W + w], y[3 * W + w] = x[0], x[1], x[2], x[3]
             y[4 * W + w], y[5 * W + w], y[6 * W + w], y[7 * W + w] = x[4], x[5], x[6], x[7]
@@ -46,7 +65,16 @@ def _divide(y: Any, repeats: int) -> None:
     for _ in range(repeats):
         for w in range(W):
             a = y[8 * W + w]
-            x = (y[w], y[W + w], y[2 * W + w], y[3 * W + w], y[4 * W + w], y[5 * W + w], y[6 * W + w], y[7 * W + w])
+            x = (
+                y[w],
+                y[W + w],
+                y[2 * W + w],
+                y[3 * W + w],
+                y[4 * W + w],
+                y[5 * W + w],
+                y[6 * W + w],
+                y[7 * W + w],
+            )
             x = _over(a, _over(a, x))
             y[w], y[W + w], y[2 * W + w], y[3 * W + w] = x[0], x[1], x[2], x[3]
             y[4 * W + w], y[5 * W + w], y[6 * W + w], y[7 * W + w] = x[4], x[5], x[6], x[7]

@@ -1,12 +1,14 @@
 """How much arithmetic an observer pass is.
 
-The count comes from the kernels themselves: a child process runs them as plain Python, one lane wide, on numbers that
-count what is done with them. Each integration step costs the same, so with N steps a segment (N >= 2)
+The count comes from the kernels themselves: a child process runs them as plain Python, one lane wide, on
+numbers that count what is done with them. Each integration step costs the same, so with N steps a segment (N
+>= 2)
 
     operations(N) = operations(2) + (N - 2) (operations(3) - operations(2))
 
-is exact; tendons and columns (unknowns, and three for a moving tip force) enter through the robot whose pass is counted.
-What the compiler saves by common subexpressions is not taken off, index arithmetic is not counted, negation is free.
+is exact; tendons and columns (unknowns, and three for a moving tip force) enter through the robot whose pass
+is counted. What the compiler saves by common subexpressions is not taken off, index arithmetic is not
+counted, negation is free.
 
 Run as a script this module is that child: it reads what to count from stdin and prints the counts.
 """
@@ -133,10 +135,12 @@ class _Math:
 
 
 def count(wanted: dict[str, int], forces: bool) -> dict[str, dict[str, Tally]]:
-    """Robot key -> {kernel file: operations} of one pass with that many points per segment; `forces`: the tip force moves."""
+    """Robot key -> {kernel file: operations} of one pass with that many points per segment; `forces`: the tip
+    force moves."""
     two, three = counted(list(wanted), forces, (2, 3))
     return {
-        key: {name: two[key][name] * (3 - points) + three[key][name] * (points - 2) for name in two[key]} for key, points in wanted.items()
+        key: {name: two[key][name] * (3 - points) + three[key][name] * (points - 2) for name in two[key]}
+        for key, points in wanted.items()
     }
 
 
@@ -144,9 +148,19 @@ def counted(robots: Sequence[str], forces: bool, points: Sequence[int]) -> list[
     """As `count`, without the formula: for each number of points, the operations of every robot."""
     words = json.dumps({"robots": robots, "forces": forces, "points": points})
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
-    done = subprocess.run([sys.executable, __file__], input=words, stdout=subprocess.PIPE, text=True, check=True, env=environment)
+    done = subprocess.run(
+        [sys.executable, __file__],
+        input=words,
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+        env=environment,
+    )
     found: list[dict[str, dict[str, dict[str, float]]]] = json.loads(done.stdout)
-    return [{key: {name: Tally(**tally) for name, tally in parts.items()} for key, parts in one.items()} for one in found]
+    return [
+        {key: {name: Tally(**tally) for name, tally in parts.items()} for key, parts in one.items()}
+        for one in found
+    ]
 
 
 def _child() -> None:
@@ -155,11 +169,16 @@ def _child() -> None:
     import cases
 
     chosen = [case for case in cases.cases(1) if case.key in asked["robots"]]
-    found = [{case.key: _counted_pass(case, points, asked["forces"], sections) for case in chosen} for points in asked["points"]]
+    found = [
+        {case.key: _counted_pass(case, points, asked["forces"], sections) for case in chosen}
+        for points in asked["points"]
+    ]
     print(json.dumps(found))
 
 
-def _counted_pass(case: Any, points: int, forces: bool, sections: dict[str, Tally]) -> dict[str, dict[str, float]]:
+def _counted_pass(
+    case: Any, points: int, forces: bool, sections: dict[str, Tally]
+) -> dict[str, dict[str, float]]:
     """Operations by kernel file of the third step: by then a moving force has its columns."""
     from fastrod import Simulator
 
@@ -183,7 +202,10 @@ def _instrument() -> dict[str, Tally]:
     from fastrod.solver import boundary as passes
     from fastrod.types import Memory, Shape
 
-    modules = [importlib.import_module(f"fastrod.kernels.{info.name}") for info in pkgutil.iter_modules(package.__path__)]
+    modules = [
+        importlib.import_module(f"fastrod.kernels.{info.name}")
+        for info in pkgutil.iter_modules(package.__path__)
+    ]
     sections = {_short(module): Tally() for module in modules}
     helpers = ("jit", "vec", "rod", "batch")  # their arithmetic belongs to the kernel that calls
     wrapped: dict[int, Callable[..., Any]] = {}
@@ -191,7 +213,11 @@ def _instrument() -> dict[str, Tally]:
         if _short(module) in helpers:
             continue
         for value in vars(module).values():
-            if callable(value) and getattr(value, "__module__", "") == module.__name__ and not isinstance(value, type):
+            if (
+                callable(value)
+                and getattr(value, "__module__", "") == module.__name__
+                and not isinstance(value, type)
+            ):
                 wrapped[id(value)] = _attributed(value, _short(module), sections)
     for module in modules:
         names = vars(module)
@@ -204,10 +230,13 @@ def _instrument() -> dict[str, Tally]:
     body = vars(passes)["pass_serial"]
 
     def counting(*arguments: Any) -> None:
-        counted: list[Any] = [argument if isinstance(argument, Shape) else _countable(argument) for argument in arguments]
+        counted: list[Any] = [
+            argument if isinstance(argument, Shape) else _countable(argument) for argument in arguments
+        ]
         body(*counted)
         (memory,) = (i for i, argument in enumerate(arguments) if isinstance(argument, Memory))
-        for kept, new in zip(arguments[memory], counted[memory], strict=True):  # what the next step begins from
+        # what the next step begins from
+        for kept, new in zip(arguments[memory], counted[memory], strict=True):
             kept[...] = new.astype(float)
 
     vars(passes)["pass_serial"] = counting

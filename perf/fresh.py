@@ -26,7 +26,11 @@ MEMORY_TARGET = 2000.0
 def _run(*words: str, **environment: str) -> dict[str, float]:
     """What this module prints as a script."""
     done = subprocess.run(
-        [sys.executable, __file__, *words], stdout=subprocess.PIPE, text=True, check=True, env={**os.environ, **environment}
+        [sys.executable, __file__, *words],
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+        env={**os.environ, **environment},
     )
     found: dict[str, float] = json.loads(done.stdout)
     return found
@@ -40,12 +44,22 @@ def memory_section(n_robots: int) -> Section:
         _memory_row("observer's memory", found["memory"] / n_robots),
         _memory_row("state that a step returns", found["state"] / n_robots),
         _memory_row("both, sum of nbytes", (found["memory"] + found["state"]) / n_robots, MEMORY_TARGET),
-        _memory_row("process after ten steps, beside the inputs", found["resident"] / n_robots, MEMORY_TARGET),
+        _memory_row(
+            "process after ten steps, beside the inputs", found["resident"] / n_robots, MEMORY_TARGET
+        ),
         _memory_row("its peak in a cold start", found["peak"] / n_robots),
         _memory_row("the inputs themselves", found["inputs"] / n_robots),
     ]
-    columns = [Column("what", "what"), Column("bytes", "bytes / robot", ",.0f"), Column("target", "target", ",.0f"), Column("met", "met")]
-    notes = [f"{n_robots} robots five_segment_reacher, outputs='tip', f64, {many} threads, in a process of its own."]
+    columns = [
+        Column("what", "what"),
+        Column("bytes", "bytes / robot", ",.0f"),
+        Column("target", "target", ",.0f"),
+        Column("met", "met"),
+    ]
+    notes = [
+        f"{n_robots} robots five_segment_reacher, outputs='tip', f64, {many} threads, in a process of "
+        "its own."
+    ]
     return Section("memory", "Memory", columns, rows, notes)
 
 
@@ -101,7 +115,12 @@ def start_section(quick: bool) -> Section:
         environment = {} if quick else {"FASTROD_CACHE_DIR": folder}
         again = [_run("start", **environment) for _ in range(1 if quick else 4)]
     rows += _start_rows("cached", {key: min(run[key] for run in again) for key in again[0]})
-    columns = [Column("cache", "kernels"), Column("what", "what"), Column("seconds", "s", ".3f"), Column("threads", "threads")]
+    columns = [
+        Column("cache", "kernels"),
+        Column("what", "what"),
+        Column("seconds", "s", ".3f"),
+        Column("threads", "threads"),
+    ]
     notes = [
         "Each in a fresh process, wall time"
         + (", one run; the empty cache is left out." if quick else "; cached: best of four.")
@@ -119,7 +138,10 @@ def _start_rows(cache: str, found: dict[str, float]) -> list[Row]:
         ("parallel", f"then the first step on {many} threads, 256 robots", str(many)),
         ("settle", "then the first settle", str(many)),
     ]
-    return [{"cache": cache, "what": what, "seconds": found[key], "threads": threads} for key, what, threads in named]
+    return [
+        {"cache": cache, "what": what, "seconds": found[key], "threads": threads}
+        for key, what, threads in named
+    ]
 
 
 def _start() -> dict[str, float]:

@@ -1,9 +1,11 @@
-"""Files from strangers by the thousand: each damaged, hostile or fine, and given to what reads it; a table of what came of them.
+"""Files from strangers by the thousand: each damaged, hostile or fine, and given to what reads it; a table of
+what came of them.
 
     python perf/fuzz_files.py --count 20000 --seed 1
 
-File number k is the same for the same seed (`fuzz_seeds.py` makes it). It is read right, or refused in one sentence with exit code 2;
-anything else is counted in a column of its own and listed by number, which `--only K` reads again.
+File number k is the same for the same seed (`fuzz_seeds.py` makes it). It is read right, or refused in one
+sentence with exit code 2; anything else is counted in a column of its own and listed by number, which `--only
+K` reads again.
 """
 
 from __future__ import annotations
@@ -81,12 +83,17 @@ def try_file(index: int, seed: int, folder: Path, originals: Originals) -> Outco
     if verdict in FINE and noise:
         verdict, said = "printed beside", noise
     if verdict in FINE and (seconds > SECONDS or memory > BYTES):
-        verdict, said = "over time" if seconds > SECONDS else "over memory", f"{seconds:.1f} s, {memory / 1e9:.2f} GB; {said}"
+        verdict, said = (
+            "over time" if seconds > SECONDS else "over memory",
+            f"{seconds:.1f} s, {memory / 1e9:.2f} GB; {said}",
+        )
     if canary.exists():
         verdict = "code run"
         canary.rmdir()
     _remove(path)
-    return Outcome(index=index, kind=kind, attack=attack, verdict=verdict, said=said, seconds=seconds, memory=memory)
+    return Outcome(
+        index=index, kind=kind, attack=attack, verdict=verdict, said=said, seconds=seconds, memory=memory
+    )
 
 
 def _read(kind: str, path: Path) -> tuple[str, str]:
@@ -104,7 +111,17 @@ def _read(kind: str, path: Path) -> tuple[str, str]:
 def _policy(path: Path) -> tuple[str, str]:
     from fastrod.commands.cli import main
 
-    words = ["evaluate", "Reach", str(path), "--episodes", "1", "--no-baselines", "--json", "--option", "n_steps=2"]
+    words = [
+        "evaluate",
+        "Reach",
+        str(path),
+        "--episodes",
+        "1",
+        "--no-baselines",
+        "--json",
+        "--option",
+        "n_steps=2",
+    ]
     code = main(words)
     said = sys.stderr.getvalue().removesuffix("\n") if isinstance(sys.stderr, io.StringIO) else ""
     if code == 0:
@@ -122,7 +139,11 @@ def _robot(path: Path) -> tuple[str, str]:
         inputs["tension"] = np.full(robot.n_tendons, 0.1)
     state = Simulator(robot, points_per_segment=4).settle(**inputs)
     finite = np.isfinite(state.tip_position[state.ok]).all()
-    return ("right" if finite and set(state.problems) == set(np.flatnonzero(~state.ok).tolist()) else "wrong values"), ""
+    return (
+        "right"
+        if finite and set(state.problems) == set(np.flatnonzero(~state.ok).tolist())
+        else "wrong values"
+    ), ""
 
 
 def _hardware(path: Path) -> tuple[str, str]:
@@ -131,7 +152,11 @@ def _hardware(path: Path) -> tuple[str, str]:
 
     drives = Transmission(load_hardware(path).drives)
     there = drives.counts(np.full(drives.n_drives, 0.001))
-    return ("right" if np.isfinite(drives.dl(there)).all() and np.isfinite(drives.tension(there)).all() else "wrong values"), ""
+    return (
+        "right"
+        if np.isfinite(drives.dl(there)).all() and np.isfinite(drives.tension(there)).all()
+        else "wrong values"
+    ), ""
 
 
 def _log(path: Path) -> tuple[str, str]:
@@ -139,7 +164,11 @@ def _log(path: Path) -> tuple[str, str]:
     from fastrod_scenes.measured import read
 
     log = read(path, load_robot("prototype"))[0]
-    return ("right" if len(log) and not np.isinf(log.dl).any() and not np.isinf(log.tip_position).any() else "wrong values"), ""
+    return (
+        "right"
+        if len(log) and not np.isinf(log.dl).any() and not np.isinf(log.tip_position).any()
+        else "wrong values"
+    ), ""
 
 
 def _mesh(path: Path) -> tuple[str, str]:
@@ -151,8 +180,12 @@ def _mesh(path: Path) -> tuple[str, str]:
 
 
 _READERS: dict[str, Callable[[Path], tuple[str, str]]] = {
-    "policy": _policy, "robot": _robot, "hardware": _hardware, "log": _log, "mesh": _mesh,
-}  # fmt: skip
+    "policy": _policy,
+    "robot": _robot,
+    "hardware": _hardware,
+    "log": _log,
+    "mesh": _mesh,
+}
 
 
 def _forget_peak() -> None:
@@ -182,7 +215,8 @@ def _remove(path: Path) -> None:
 
 
 def warm(folder: Path, originals: Originals) -> None:
-    """Import what reads, and load the kernels: no file's time. Raises `AssertionError` where a fine file is not read."""
+    """Import what reads, and load the kernels: no file's time. Raises `AssertionError` where a fine file is
+    not read."""
     for kind in KINDS:
         path = write_fine(kind, folder / "fine", originals)
         with redirect_stdout(io.StringIO()):
@@ -204,7 +238,8 @@ def _work(indices: Sequence[int], seed: int, ends: Connection) -> None:
 
 
 def run(indices: Sequence[int], seed: int, workers: int) -> Iterator[Outcome]:
-    """Outcomes of these files, as they come, from so many processes; one that is stuck or dies is counted, and another goes on."""
+    """Outcomes of these files, as they come, from so many processes; one that is stuck or dies is counted,
+    and another goes on."""
     context = multiprocessing.get_context("spawn")  # numba's threads do not survive a fork
     todo = [list(indices[k::workers]) for k in range(workers)]
 
@@ -246,7 +281,15 @@ def run(indices: Sequence[int], seed: int, workers: int) -> Iterator[Outcome]:
 
 
 def _lost(index: int, verdict: str, said: str, seconds: float) -> Iterator[Outcome]:
-    yield Outcome(index=index, kind=KINDS[index % len(KINDS)], attack="?", verdict=verdict, said=said, seconds=seconds, memory=0)
+    yield Outcome(
+        index=index,
+        kind=KINDS[index % len(KINDS)],
+        attack="?",
+        verdict=verdict,
+        said=said,
+        seconds=seconds,
+        memory=0,
+    )
 
 
 def figures(outcomes: Sequence[Outcome]) -> dict[str, dict[str, float]]:
@@ -269,7 +312,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--count", type=int, default=2000, metavar="N", help="files (default: 2000)")
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="of all files (default: 1)")
     parser.add_argument("--workers", type=int, default=2, metavar="W", help="processes (default: 2)")
-    parser.add_argument("--only", type=int, nargs="+", metavar="K", help="these files alone, by number, each with what was said")
+    parser.add_argument(
+        "--only",
+        type=int,
+        nargs="+",
+        metavar="K",
+        help="these files alone, by number, each with what was said",
+    )
     parser.add_argument("--json", action="store_true", help="print the figures to stdout and nothing else")
     arguments = parser.parse_args(argv)
     outcomes = []
@@ -277,18 +326,33 @@ def main(argv: Sequence[str] | None = None) -> int:
         outcomes.append(outcome)
         if outcome.verdict not in FINE or arguments.only:
             said = outcome.said.strip()[-2000:]
-            print(f"file {outcome.index}, {outcome.kind}, {outcome.attack}: {outcome.verdict}: {said}", file=sys.stderr, flush=True)
+            print(
+                f"file {outcome.index}, {outcome.kind}, {outcome.attack}: {outcome.verdict}: {said}",
+                file=sys.stderr,
+                flush=True,
+            )
         if len(outcomes) % 500 == 0:
             print(f"{len(outcomes)} files", file=sys.stderr, flush=True)
     found = figures(outcomes)
     if arguments.json:
         print(json.dumps(found, indent=1))
     else:
-        names = [name for name in found["all"] if name in ("files", *FINE, "longest s", "largest GB") or found["all"][name]]
+        names = [
+            name
+            for name in found["all"]
+            if name in ("files", *FINE, "longest s", "largest GB") or found["all"][name]
+        ]
         print("  ".join(["kind".ljust(14), *(name.rjust(max(8, len(name))) for name in names)]))
         for kind, row in found.items():
             cells = [f"{row[name]:.2f}" if isinstance(row[name], float) else str(row[name]) for name in names]
-            print("  ".join([kind.ljust(14), *(cell.rjust(max(8, len(name))) for name, cell in zip(names, cells, strict=True))]))
+            print(
+                "  ".join(
+                    [
+                        kind.ljust(14),
+                        *(cell.rjust(max(8, len(name))) for name, cell in zip(names, cells, strict=True)),
+                    ]
+                )
+            )
     return 0 if all(o.verdict in FINE for o in outcomes) else 1
 
 

@@ -19,18 +19,52 @@ from typing import Any
 import numpy as np
 
 KINDS = (
-    "policy", "robot", "hardware", "log csv", "log parquet", "mesh stl", "mesh stl text", "mesh obj", "mesh ply", "mesh ply text",
-    "mesh off", "mesh glb",
-)  # fmt: skip
+    "policy",
+    "robot",
+    "hardware",
+    "log csv",
+    "log parquet",
+    "mesh stl",
+    "mesh stl text",
+    "mesh obj",
+    "mesh ply",
+    "mesh ply text",
+    "mesh off",
+    "mesh glb",
+)
 """What reads a file, and its format: file number k is of kind k modulo their number."""
 _SUFFIX = {"robot": "toml", "hardware": "toml"}
 Rng = np.random.Generator
 Spoil = Callable[[bytes, Rng], bytes]
 
 _ODD = (
-    "nan", "inf", "-inf", "1e400", "1e308", "-1e308", "1e-320", "0", "-0.0", "-1", "1e9", "2147483648", "-9223372036854775809", "9" * 40,
-    "9" * 5000, "true", '""', '"x\\ny"', "[]", "{}", "[[1]]", "''", "0x1p3", "1_0", "7.5", "null",
-)  # fmt: skip
+    "nan",
+    "inf",
+    "-inf",
+    "1e400",
+    "1e308",
+    "-1e308",
+    "1e-320",
+    "0",
+    "-0.0",
+    "-1",
+    "1e9",
+    "2147483648",
+    "-9223372036854775809",
+    "9" * 40,
+    "9" * 5000,
+    "true",
+    '""',
+    '"x\\ny"',
+    "[]",
+    "{}",
+    "[[1]]",
+    "''",
+    "0x1p3",
+    "1_0",
+    "7.5",
+    "null",
+)
 """What may stand in place of a number."""
 
 
@@ -45,7 +79,14 @@ class Originals:
 
         names = ["t", "run", *(f"dl_{k}" for k in range(1, 5)), "tip_x", "tip_y", "tip_z", "payload"]
         t = np.arange(40) * 0.05
-        numbers = [t, *(0.002 * np.sin(t + k) for k in range(4)), 0.01 * np.sin(t), 0.01 * np.cos(t), 0.068 + 0 * t, 0 * t + 0.005]
+        numbers = [
+            t,
+            *(0.002 * np.sin(t + k) for k in range(4)),
+            0.01 * np.sin(t),
+            0.01 * np.cos(t),
+            0.068 + 0 * t,
+            0 * t + 0.005,
+        ]
         columns: dict[str, Any] = dict(zip([name for name in names if name != "run"], numbers, strict=True))
         columns["run"] = ["a"] * 20 + ["b"] * 20
         rows = "\n".join(",".join(str(columns[name][i]) for name in names) for i in range(len(t)))
@@ -59,13 +100,18 @@ class Originals:
         import trimesh
 
         ball = trimesh.creation.icosphere(subdivisions=2, radius=0.02)
-        two = trimesh.Scene([ball, trimesh.creation.box(extents=(0.01, 0.01, 0.01)).apply_translation((0.1, 0.0, 0.0))])
+        two = trimesh.Scene(
+            [ball, trimesh.creation.box(extents=(0.01, 0.01, 0.01)).apply_translation((0.1, 0.0, 0.0))]
+        )
         made = {
-            "mesh stl": ball.export(file_type="stl"), "mesh stl text": ball.export(file_type="stl_ascii"),
-            "mesh obj": ball.export(file_type="obj"), "mesh ply": ball.export(file_type="ply"),
-            "mesh ply text": ball.export(file_type="ply", encoding="ascii"), "mesh off": ball.export(file_type="off"),
+            "mesh stl": ball.export(file_type="stl"),
+            "mesh stl text": ball.export(file_type="stl_ascii"),
+            "mesh obj": ball.export(file_type="obj"),
+            "mesh ply": ball.export(file_type="ply"),
+            "mesh ply text": ball.export(file_type="ply", encoding="ascii"),
+            "mesh off": ball.export(file_type="off"),
             "mesh glb": two.export(file_type="glb"),
-        }  # fmt: skip
+        }
         return {kind: data if isinstance(data, bytes) else data.encode() for kind, data in made.items()}
 
     @cached_property
@@ -75,11 +121,15 @@ class Originals:
 
         folder = files("fastrod") / "robots"
         full = (folder / "prototype.toml").read_text(encoding="utf-8") + (
-            '\n[[effect]]\nname = "backlash"\nhalf_width = 0.0002\n[fit]\n"tendon.*.offset" = { sd = 0.001, shared = true }\n'
+            '\n[[effect]]\nname = "backlash"\nhalf_width = 0.0002\n[fit]\n"tendon.*.offset" = { sd = 0.001, '
+            "shared = true }\n"
             "[sensor]\nnoise = [0.001, 0.001, 0.001]\n"
         )
         hardware = (files("fastrod_device") / "prototype.toml").read_bytes()
-        wide = b"gear = 21.0\ncounts_per_turn = 4096\ntorque_constant = 0.0251\nrated_torque = 0.054\nefficiency = 0.8\n"
+        wide = (
+            b"gear = 21.0\ncounts_per_turn = 4096\ntorque_constant = 0.0251\nrated_torque = "
+            b"0.054\nefficiency = 0.8\n"
+        )
         shipped = tuple((folder / f"{name}.toml").read_bytes() for name in robot_names())
         return {"robot": (*shipped, full.encode()), "hardware": (hardware, hardware + wide)}
 
@@ -134,7 +184,8 @@ def _target(kind: str, path: Path) -> Path:
 
 
 def write_case(kind: str, rng: Rng, path: Path, canary: Path, originals: Originals) -> tuple[Path, str]:
-    """Write one file, or of a policy a folder, at `path` and a suffix; where it is, and how it was spoilt. Code in it makes `canary`."""
+    """Write one file, or of a policy a folder, at `path` and a suffix; where it is, and how it was spoilt.
+    Code in it makes `canary`."""
     if kind == "policy":
         return path, _policy(rng, path, canary, originals)
     data = _original(kind, int(rng.integers(1000)), originals)
@@ -200,7 +251,14 @@ def _double(data: bytes, rng: Rng) -> bytes:
 def _large(data: bytes, rng: Rng) -> bytes:
     """Four or eight bytes become the largest or the most negative number there is."""
     start, _ = _span(data, rng)
-    most = (b"\xff" * 4, b"\xff\xff\xff\x7f", b"\x00\x00\x00\x80", b"\xff" * 8, b"\x00\x00\xc0\x7f", b"\x00\x00\x80\x7f")
+    most = (
+        b"\xff" * 4,
+        b"\xff\xff\xff\x7f",
+        b"\x00\x00\x00\x80",
+        b"\xff" * 8,
+        b"\x00\x00\xc0\x7f",
+        b"\x00\x00\x80\x7f",
+    )
     piece = most[rng.integers(len(most))]
     return data[:start] + piece + data[start + len(piece) :]
 
@@ -252,13 +310,23 @@ def _swap(data: bytes, rng: Rng) -> bytes:
 
 
 _BYTES: dict[str, Spoil] = {
-    "truncated": _truncate, "flipped bits": _flip, "flipped header": _flip_early, "inserted bytes": _insert, "cut bytes": _cut,
-    "doubled bytes": _double, "largest numbers": _large, "swapped bytes": _swap,
-}  # fmt: skip
+    "truncated": _truncate,
+    "flipped bits": _flip,
+    "flipped header": _flip_early,
+    "inserted bytes": _insert,
+    "cut bytes": _cut,
+    "doubled bytes": _double,
+    "largest numbers": _large,
+    "swapped bytes": _swap,
+}
 _TEXT: dict[str, Spoil] = {
-    **_BYTES, "odd number": _number, "odd numbers": lambda data, rng: _number(_number(data, rng), rng), "lines": _lines, "fields": _fields,
+    **_BYTES,
+    "odd number": _number,
+    "odd numbers": lambda data, rng: _number(_number(data, rng), rng),
+    "lines": _lines,
+    "fields": _fields,
     "line breaks": _breaks,
-}  # fmt: skip
+}
 
 
 class _Code:
@@ -281,7 +349,9 @@ def npz(arrays: Mapping[str, Any], *, compress: bool = False) -> bytes:
 def foreign(canary: Path) -> bytes:
     """A file of stable-baselines3 whose pickles make `canary`."""
     word = {":type:": "<class 'x'>", ":serialized:": base64.b64encode(pickle.dumps(_Code(canary))).decode()}
-    data = json.dumps(dict.fromkeys(("policy_class", "observation_space", "action_space", "policy_kwargs"), word))
+    data = json.dumps(
+        dict.fromkeys(("policy_class", "observation_space", "action_space", "policy_kwargs"), word)
+    )
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
         archive.writestr("data", data)
@@ -292,42 +362,56 @@ def foreign(canary: Path) -> bytes:
 def _hostile(kind: str, data: bytes, canary: Path, originals: Originals) -> dict[str, Callable[[], bytes]]:
     """Files that are made to harm, by name."""
     made: dict[str, Callable[[], bytes]] = {
-        "empty": lambda: b"", "pickle": lambda: pickle.dumps(_Code(canary)),
+        "empty": lambda: b"",
+        "pickle": lambda: pickle.dumps(_Code(canary)),
         "pickled arrays": lambda: npz({"t": np.array([_Code(canary)])}),
-        "zeros": lambda: bytes(100_000), "deep": lambda: b"x = " + b"[" * 100_000, "deep tables": lambda: b"[" + b"a." * 20_000 + b"a]",
+        "zeros": lambda: bytes(100_000),
+        "deep": lambda: b"x = " + b"[" * 100_000,
+        "deep tables": lambda: b"[" + b"a." * 20_000 + b"a]",
         "archive": lambda: npz({"a": np.zeros(10)}),
-    }  # fmt: skip
+    }
     if kind == "log parquet":
         made |= {"many rows": lambda: originals.rows, "long words": lambda: originals.words}
     if kind == "mesh glb":
         made |= {name: partial(_glb, data, change) for name, change in _GLB.items()}
     if kind.startswith("mesh"):
-        made |= {name: partial(text.encode) for name, text in _BOMBS.get(kind.removeprefix("mesh ").removesuffix(" text"), {}).items()}
+        made |= {
+            name: partial(text.encode)
+            for name, text in _BOMBS.get(kind.removeprefix("mesh ").removesuffix(" text"), {}).items()
+        }
     return made
 
 
 _CORNERS = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\n"
-_HEAD = "format ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nelement face {}\n"
+_HEAD = (
+    "format ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nelement "
+    "face {}\n"
+)
 _BOMBS: Mapping[str, Mapping[str, str]] = {
     "obj": {
-        "one polygon": _CORNERS + "f " + "1 2 3 " * 300_000, "many materials": _CORNERS + "usemtl a\no b\ng c\nf 1 2 3\n" * 20_000,
+        "one polygon": _CORNERS + "f " + "1 2 3 " * 300_000,
+        "many materials": _CORNERS + "usemtl a\no b\ng c\nf 1 2 3\n" * 20_000,
         "other file": "mtllib ../../secret.mtl\n" + _CORNERS + "f 1 2 3\n",
     },
     "stl": {
-        "many solids": "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 0.1 0 0\nvertex 0 0.1 0\n"
+        "many solids": "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 0.1 0 0\nvertex 0 0.1 "
+        "0\n"
         "endloop\nendfacet\nendsolid\n" * 5000,
         "half a facet": "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0\n",
     },
     "ply": {
-        "declares much": "ply\n" + _HEAD.format(10**12, 1) + "property list uchar int vertex_indices\nend_header\n0 0 0\n",
-        "declares faces": "ply\n" + _HEAD.format(3, 10**9) + "property list uchar int vertex_indices\nend_header\n0 0 0\n",
-        "odd list": "ply\n" + _HEAD.format(3, 1) + "property list double double x\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n",
+        "declares much": "ply\n" + _HEAD.format(10**12, 1) + "property list uchar int "
+        "vertex_indices\nend_header\n0 0 0\n",
+        "declares faces": "ply\n" + _HEAD.format(3, 10**9) + "property list uchar int "
+        "vertex_indices\nend_header\n0 0 0\n",
+        "odd list": "ply\n" + _HEAD.format(3, 1) + "property list double double x\nend_header\n0 0 0\n1 0 "
+        "0\n0 1 0\n3 0 1 2\n",
     },
     "off": {
         "declares much": "OFF\n999999999999 999999999999 0\n",
         "one polygon": "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n600000 " + "0 1 2 " * 200_000,
     },
-}  # fmt: skip
+}
 
 
 def _glb(data: bytes, change: Callable[[dict[str, Any]], None]) -> bytes:
@@ -351,12 +435,17 @@ def _cycle(tree: dict[str, Any]) -> None:
 
 
 _GLB: Mapping[str, Callable[[dict[str, Any]], None]] = {
-    "many instances": _many_nodes, "cycle of nodes": _cycle,
+    "many instances": _many_nodes,
+    "cycle of nodes": _cycle,
     "outside buffer": lambda tree: tree["buffers"][0].update(uri="../../secret.bin"),
     "huge accessor": lambda tree: tree["accessors"][0].update(count=10**12),
-    "no numbers": lambda tree: [tree["accessors"][0].pop("bufferView"), tree["accessors"][0].update(count=10**9)],
-    "wrong type": lambda tree: tree.update(nodes=7), "packed": lambda tree: tree.update(extensionsRequired=["KHR_draco_mesh_compression"]),
-}  # fmt: skip
+    "no numbers": lambda tree: [
+        tree["accessors"][0].pop("bufferView"),
+        tree["accessors"][0].update(count=10**9),
+    ],
+    "wrong type": lambda tree: tree.update(nodes=7),
+    "packed": lambda tree: tree.update(extensionsRequired=["KHR_draco_mesh_compression"]),
+}
 
 
 def _many_rows() -> bytes:
@@ -364,7 +453,10 @@ def _many_rows() -> bytes:
     import pyarrow.parquet
 
     one, out = pyarrow.array(np.zeros(20_000_000, np.int8)), io.BytesIO()
-    pyarrow.parquet.write_table(pyarrow.table(dict.fromkeys(("t", "tip_x", "tip_y", "tip_z", "dl_1", "dl_2", "dl_3", "dl_4"), one)), out)
+    pyarrow.parquet.write_table(
+        pyarrow.table(dict.fromkeys(("t", "tip_x", "tip_y", "tip_z", "dl_1", "dl_2", "dl_3", "dl_4"), one)),
+        out,
+    )
     return out.getvalue()
 
 
@@ -372,9 +464,13 @@ def _long_words() -> bytes:
     import pyarrow
     import pyarrow.parquet
 
-    word = pyarrow.DictionaryArray.from_arrays(pyarrow.array(np.zeros(100_000, np.int32)), pyarrow.array(["x" * 1_000_000]))
+    word = pyarrow.DictionaryArray.from_arrays(
+        pyarrow.array(np.zeros(100_000, np.int32)), pyarrow.array(["x" * 1_000_000])
+    )
     zeros, out = pyarrow.array(np.zeros(100_000, np.int8)), io.BytesIO()
-    pyarrow.parquet.write_table(pyarrow.table({"run": word, **dict.fromkeys(("t", "tip_x", "tip_y", "tip_z"), zeros)}), out)
+    pyarrow.parquet.write_table(
+        pyarrow.table({"run": word, **dict.fromkeys(("t", "tip_x", "tip_y", "tip_z"), zeros)}), out
+    )
     return out.getvalue()
 
 
@@ -421,16 +517,21 @@ def _plan(change: Callable[[dict[str, Any]], Any]) -> Callable[[bytes], bytes]:
 
 
 _CONFIGS: Mapping[str, Callable[[bytes], bytes]] = {
-    "config: empty": lambda _: b"", "config: deep": lambda _: b"[" * 200_000, "config: a list": lambda _: b"[]",
-    "config: digits": lambda _: b'{"plan": ' + b"9" * 100_000 + b"}", "config: large": lambda _: b" " * 3_000_000,
-    "plan: env is a list": _plan(lambda plan: plan.update(env=[1])), "plan: unknown task": _plan(lambda plan: plan.update(env="Reech")),
+    "config: empty": lambda _: b"",
+    "config: deep": lambda _: b"[" * 200_000,
+    "config: a list": lambda _: b"[]",
+    "config: digits": lambda _: b'{"plan": ' + b"9" * 100_000 + b"}",
+    "config: large": lambda _: b" " * 3_000_000,
+    "plan: env is a list": _plan(lambda plan: plan.update(env=[1])),
+    "plan: unknown task": _plan(lambda plan: plan.update(env="Reech")),
     "plan: options is none": _plan(lambda plan: plan.update(options=None)),
     "plan: odd observation": _plan(lambda plan: plan["options"].update(observation="x\ny")),
     "plan: other observation": _plan(lambda plan: plan["options"].update(observation="goal")),
     "plan: odd action": _plan(lambda plan: plan["options"].update(action={"a": 1})),
-    "plan: n_envs": _plan(lambda plan: plan.update(n_envs=10**30)), "plan: one more": _plan(lambda plan: plan.update(more=1)),
+    "plan: n_envs": _plan(lambda plan: plan.update(n_envs=10**30)),
+    "plan: one more": _plan(lambda plan: plan.update(more=1)),
     "plan: one less": _plan(lambda plan: plan.pop("seed")),
-}  # fmt: skip
+}
 
 
 def _spoil_array(arrays: dict[str, Any], rng: Rng, change: Callable[[np.ndarray], Any]) -> None:
@@ -458,7 +559,9 @@ def _header(arrays: dict[str, Any], rng: Rng, _: Path) -> bytes:
             held = io.BytesIO()
             np.save(held, a)
             data = held.getvalue()
-            archive.writestr(f"{name}.npy", _TEXT[sorted(_TEXT)[rng.integers(len(_TEXT))]](data[:128], rng) + data[128:])
+            archive.writestr(
+                f"{name}.npy", _TEXT[sorted(_TEXT)[rng.integers(len(_TEXT))]](data[:128], rng) + data[128:]
+            )
     return out.getvalue()
 
 
@@ -472,8 +575,15 @@ def _drop(arrays: dict[str, Any], rng: Rng, _: Path) -> None:
 
 
 _ARRAYS: Mapping[str, Callable[[dict[str, Any], Rng, Path], bytes | None]] = {
-    "nan": _with(float("nan")), "inf": _with(float("inf")), "large": _with(3e38), "header": _header, "huge shape": _huge, "missing": _drop,
-    "objects": lambda arrays, rng, canary: _spoil_array(arrays, rng, lambda _: np.array([_Code(canary)], dtype=object)),
+    "nan": _with(float("nan")),
+    "inf": _with(float("inf")),
+    "large": _with(3e38),
+    "header": _header,
+    "huge shape": _huge,
+    "missing": _drop,
+    "objects": lambda arrays, rng, canary: _spoil_array(
+        arrays, rng, lambda _: np.array([_Code(canary)], dtype=object)
+    ),
     "doubles": lambda arrays, rng, _: _spoil_array(arrays, rng, lambda a: a.astype(float)),
     "words": lambda arrays, rng, _: _spoil_array(arrays, rng, lambda a: a.astype(str)),
     "shape": lambda arrays, rng, _: _spoil_array(arrays, rng, lambda a: a[:-1]),
@@ -481,8 +591,9 @@ _ARRAYS: Mapping[str, Callable[[dict[str, Any], Rng, Path], bytes | None]] = {
     "no width": lambda arrays, rng, _: _spoil_array(arrays, rng, lambda a: a[:0]),
     "one more": lambda arrays, _, __: arrays.update(weight_9=np.zeros(3)),
     "activation": lambda arrays, _, __: arrays.update(activation="x\ny"),
-    "squashed": lambda arrays, _, __: arrays.update(squashed=np.zeros((2, 2))), "bomb": lambda *_: None,
+    "squashed": lambda arrays, _, __: arrays.update(squashed=np.zeros((2, 2))),
+    "bomb": lambda *_: None,
     "no reach": lambda arrays, _, __: arrays.update(reach=np.zeros_like(arrays["reach"])),
     "many": lambda arrays, _, __: arrays.update({f"a{k}": np.zeros(1) for k in range(1100)}),
     "pickle": lambda _, __, canary: pickle.dumps(_Code(canary)),
-}  # fmt: skip
+}

@@ -1,4 +1,5 @@
-"""One forward pass of the paper's rod: fastrod's fixed steps beside the ODE methods of scipy, at one accuracy."""
+"""One forward pass of the paper's rod: fastrod's fixed steps beside the ODE methods of scipy, at one
+accuracy."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ class Problem:
 
 
 def section(n_robots: int, quick: bool) -> Section:
-    """Forward passes of the paper's rod from known base curvatures: the ODE choices of the paper's Figure 11."""
+    """Forward passes of the paper's rod from known base curvatures: the ODE choices of the paper's Figure
+    11."""
     note_progress("integrators")
     pose, _ = cases.appendix_b()
     case = Case("paper", "", cases.appendix_b_robot(True), pose, pose, cases.LINE)
@@ -54,16 +56,23 @@ def section(n_robots: int, quick: bool) -> Section:
         Column("ratio", "ratio to\nfastrod", ",.0f"),
     ]
     notes = [
-        "The paper's rod from a given base (Appendix B; the question of its Figure 11), with the fewest steps or the loosest tolerance "
-        "whose largest tip error is within the target. fastrod: wall time, and its pass includes the sensitivities and the correction; "
-        "scipy: CPU time, scalar Python slope, the integration alone. Ratio: time over that of fastrod's batch. Target of the ratio: none.",
-        "LSODA begins with Adams and may change to BDF; odeint is the same code without Python between the steps. Radau and BDF are "
-        "implicit and stand in for the Rosenbrock type, which scipy lacks; the slopes of their difference Jacobian are not counted.",
+        "The paper's rod from a given base (Appendix B; the question of its Figure 11), with the fewest "
+        "steps or the loosest tolerance "
+        "whose largest tip error is within the target. fastrod: wall time, and its pass includes the "
+        "sensitivities and the correction; "
+        "scipy: CPU time, scalar Python slope, the integration alone. Ratio: time over that of fastrod's "
+        "batch. Target of the ratio: none.",
+        "LSODA begins with Adams and may change to BDF; odeint is the same code without Python between the "
+        "steps. Radau and BDF are "
+        "implicit and stand in for the Rosenbrock type, which scipy lacks; the slopes of their difference "
+        "Jacobian are not counted.",
     ]
     return Section("integrators", "One forward pass: ODE methods at one accuracy", columns, rows, notes)
 
 
-def _row(method: str, setting: str, used: float, ratio: float, largest: float, median: float, slopes: float) -> Row:
+def _row(
+    method: str, setting: str, used: float, ratio: float, largest: float, median: float, slopes: float
+) -> Row:
     return {
         "method": method,
         "how": setting,
@@ -121,4 +130,12 @@ def _scipy_row(problem: Problem, name: str, sample: int, rounds: int, fastrod: f
         start = time.process_time()
         tips(peer)
         used = min(used, (time.process_time() - start) / sample)
-    return _row(f"scipy {name}", f"rtol {rtol:.0e}", used, used / fastrod, float(error.max()), float(np.median(error)), slopes)
+    return _row(
+        f"scipy {name}",
+        f"rtol {rtol:.0e}",
+        used,
+        used / fastrod,
+        float(error.max()),
+        float(np.median(error)),
+        slopes,
+    )

@@ -58,7 +58,8 @@ def _timed(case: Case, forces: bool, fine: Simulator, rounds: int) -> Timed:
     for _ in range(rounds):
         for i, threads in enumerate(thread_counts()):
             sim, _ = cases.settled(case, poses[0], points, fine, threads)
-            last = sim.step(**case.words(poses[1]))  # a force that begins to move has no columns for it yet: not timed
+            # a force that begins to move has no columns for it yet: not timed
+            last = sim.step(**case.words(poses[1]))
             for pose in poses[2:]:
                 before = last
                 used, last = seconds(partial(sim.step, **case.words(pose)))
@@ -105,9 +106,11 @@ def time_section(rows: list[Timed], n_robots: int) -> Section:
     ]
     notes = [f"{row.case.key}: {row.case.title}." for row in rows[::2]]
     notes += [
-        f'Time: `step` of {n_robots} robots, f64, outputs="tip", warm, best of {_STEPS - 1} steps in each of several rounds. '
+        f'Time: `step` of {n_robots} robots, f64, outputs="tip", warm, best of {_STEPS - 1} steps in each '
+        "of several rounds. "
         "Target of the times: none. Moving: tendon lengths, or lengths and tip force.",
-        f"Tip error: against {cases.N_FINE} points a segment, both settled on the inputs of the last timed step; points / segment is the "
+        f"Tip error: against {cases.N_FINE} points a segment, both settled on the inputs of the last timed "
+        "step; points / segment is the "
         "fewest within the target.",
     ]
     return Section("observer_pass", "One observer pass: time and accuracy", columns, table, notes)
@@ -137,8 +140,9 @@ def lag_section(rows: list[Timed]) -> Section:
         Column("compared", "robots ok", ".2%"),
     ]
     notes = [
-        "The tip that the last timed pass itself gave, whose boundary was predicted before the pass; any number of threads gives the same. "
-        "The inputs swing by 5 % of the way to other random inputs, 200 steps a cycle. Target: none.",
+        "The tip that the last timed pass itself gave, whose boundary was predicted before the pass; any "
+        "number of threads gives the same. "
+        "The inputs swing by 5 % of the way to other random inputs, 200 steps a cycle. Target: none."
     ]
     return Section("lag", "The same passes: accuracy in motion", columns, table, notes)
 
@@ -189,10 +193,13 @@ def arithmetic_section(rows: list[Timed], n_robots: int) -> Section:
         Column("share_many", f"floor / time\n{many} threads", ".0%"),
     ]
     notes = [
-        f"Peak: {2e-9 * fma:.1f} GFLOP/s of fused multiply-adds in registers, measured here on {one} thread, and so much for each thread. "
+        f"Peak: {2e-9 * fma:.1f} GFLOP/s of fused multiply-adds in registers, measured here on {one} "
+        "thread, and so much for each thread. "
         f"A division takes the time of {fma / divide:.1f} of them. Target: none.",
-        "Operations fused: a product and a sum that can fuse are one. Floor: these at the rate of multiply-adds, divisions and square "
-        "roots at that of divisions: the time a robot if nothing was loaded, stored or waited for, and Python took none.",
+        "Operations fused: a product and a sum that can fuse are one. Floor: these at the rate of "
+        "multiply-adds, divisions and square "
+        "roots at that of divisions: the time a robot if nothing was loaded, stored or waited for, and "
+        "Python took none.",
     ]
     return Section("arithmetic", "The same passes: arithmetic", columns, table, notes)
 

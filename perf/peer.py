@@ -51,7 +51,9 @@ class Peer:
         absent = [name for name in self.modules if importlib.util.find_spec(name) is None]
         if not absent:
             return None
-        return f"{self.name} is left out: {' and '.join(absent)} is not installed (pip install -e '.[peers]')."
+        return (
+            f"{self.name} is left out: {' and '.join(absent)} is not installed (pip install -e '.[peers]')."
+        )
 
     def versions(self) -> str:
         return ", ".join(f"{name} {version(name)}" for name in self.packages)

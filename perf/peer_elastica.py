@@ -25,7 +25,8 @@ class Relaxation:
 
     elements: int
     shear: float
-    """Shear and stretch stiffness [N]: as soft as the answer allows, because its waves limit the time step."""
+    """Shear and stretch stiffness [N]: as soft as the answer allows, because its waves limit the time
+    step."""
     damping: float = 1.0
     """Of the first bending mode, as a part of the critical one."""
     step: float = 0.6
@@ -35,8 +36,9 @@ class Relaxation:
 class Stand:
     """The clamped rod in PyElastica.
 
-    The clamp holds the first element's director, so the rod begins half an element before the wall: clamped where
-    PyElastica's examples do it, at the first node, it would be half an element short, an error of 10 % with 14 elements.
+    The clamp holds the first element's director, so the rod begins half an element before the wall: clamped
+    where PyElastica's examples do it, at the first node, it would be half an element short, an error of 10 %
+    with 14 elements.
     """
 
     def __init__(self, setting: Relaxation) -> None:
@@ -50,9 +52,16 @@ class Stand:
         """Of the first bending mode [rad/s]."""
         self.dt = np.float64(setting.step * math.sqrt(h * mass / setting.shear))
         self.rod: Any = ea.CosseratRod.straight_rod(
-            n, np.array([0.0, 0.0, -0.5 * h]), np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]), n * h, _RADIUS, _DENSITY,
-            youngs_modulus=bending / second, shear_modulus=appendix_j.torsion() / (2.0 * second),
-        )  # fmt: skip
+            n,
+            np.array([0.0, 0.0, -0.5 * h]),
+            np.array([0.0, 0.0, 1.0]),
+            np.array([1.0, 0.0, 0.0]),
+            n * h,
+            _RADIUS,
+            _DENSITY,
+            youngs_modulus=bending / second,
+            shear_modulus=appendix_j.torsion() / (2.0 * second),
+        )
         eye = np.eye(3)[:, :, None]
         inertia = 0.25 * h * h * mass  # its waves are then as fast as those of shear
         self.rod.shear_matrix[...] = setting.shear * eye
@@ -61,13 +70,22 @@ class Stand:
         self._force = np.zeros(3)
         self._system = sim = bench()
         sim.append(self.rod)
-        sim.constrain(self.rod).using(ea.OneEndFixedBC, constrained_position_idx=(0,), constrained_director_idx=(0,))
+        sim.constrain(self.rod).using(
+            ea.OneEndFixedBC, constrained_position_idx=(0,), constrained_director_idx=(0,)
+        )
         sim.add_forcing_to(self.rod).using(ea.EndpointForces, np.zeros(3), self._force, ramp_up_time=1e-12)
         damping = 2.0 * setting.damping * self.omega
-        sim.dampen(self.rod).using(ea.AnalyticalLinearDamper, uniform_damping_constant=damping, time_step=self.dt)
+        sim.dampen(self.rod).using(
+            ea.AnalyticalLinearDamper, uniform_damping_constant=damping, time_step=self.dt
+        )
         sim.finalize()
         self._stepper, self._now = ea.PositionVerlet(), np.float64(0.0)
-        self._moving = ("position_collection", "director_collection", "velocity_collection", "omega_collection")
+        self._moving = (
+            "position_collection",
+            "director_collection",
+            "velocity_collection",
+            "omega_collection",
+        )
         self._straight = [getattr(self.rod, name).copy() for name in self._moving]
 
     def load(self, force: float) -> None:
@@ -100,8 +118,9 @@ def _relax(setting: Relaxation, patience: float) -> Iterator[Solve]:
 
 
 def _rungs() -> Sequence[Rung]:
-    """Shear stiffer as the elements get finer. At 7 n^2 N what it gives takes off most of the elements' own error, which is as much in its
-    favour as a stiffness can be: ten times stiffer, with steps a third as long, the error at 8 elements is four times as large."""
+    """Shear stiffer as the elements get finer. At 7 n^2 N what it gives takes off most of the elements' own
+    error, which is as much in its favour as a stiffness can be: ten times stiffer, with steps a third as
+    long, the error at 8 elements is four times as large."""
     return [
         Rung(f"{n} elements, {patience:g} / omega", partial(_relax, Relaxation(n, 7.0 * n * n), patience))
         for n, patience in ((4, 8.0), (8, 11.0), (14, 13.0), (24, 15.0))
@@ -112,8 +131,10 @@ PEER = Peer(
     name="PyElastica",
     modules=("elastica",),
     packages=("pyelastica",),
-    same="its Cosserat rod begun half an element before the wall; shear and stretch cannot be left out, so they are made stiff, the more "
-    "the finer, which takes off some of the elements' own error; rotary inertia for large stable steps, the first mode critically damped.",
+    same="its Cosserat rod begun half an element before the wall; shear and stretch cannot be left out, so "
+    "they are made stiff, the more "
+    "the finer, which takes off some of the elements' own error; rotary inertia for large stable steps, the "
+    "first mode critically damped.",
     also="dynamics, shear and stretch, contact between rods, muscles, many rods joined.",
     rungs=_rungs,
     family="PyElastica",

@@ -1,4 +1,5 @@
-"""fastrod on the rod of Appendix J: `settle` from the straight rod, and single passes along a path of loads."""
+"""fastrod on the rod of Appendix J: `settle` from the straight rod, and single passes along a path of
+loads."""
 
 from __future__ import annotations
 
@@ -69,8 +70,21 @@ def _step(points: int, passes: int) -> Iterator[Solve]:
 
 
 def _settle_rungs() -> Sequence[Rung]:
-    settings = ((2, 1e-9), (3, 1e-9), (4, 1e-9), (6, 1e-9), (10, 1e-9), (20, 1e-9), (40, 1e-10), (80, 1e-11), (160, 1e-12))
-    return [Rung(f"{n} points, to {to:.0e} m", partial(_settle, n, to), partial(_together, n, to)) for n, to in settings]
+    settings = (
+        (2, 1e-9),
+        (3, 1e-9),
+        (4, 1e-9),
+        (6, 1e-9),
+        (10, 1e-9),
+        (20, 1e-9),
+        (40, 1e-10),
+        (80, 1e-11),
+        (160, 1e-12),
+    )
+    return [
+        Rung(f"{n} points, to {to:.0e} m", partial(_settle, n, to), partial(_together, n, to))
+        for n, to in settings
+    ]
 
 
 def _step_rungs() -> Sequence[Rung]:
@@ -82,7 +96,8 @@ SETTLE = Peer(
     name="fastrod, settle",
     modules=("fastrod",),
     packages=("fastrod", "numba"),
-    same="the rod in space, each load from the cold guess until every boundary residual is below the tolerance (1e-9 m is the default).",
+    same="the rod in space, each load from the cold guess until every boundary residual is below the "
+    "tolerance (1e-9 m is the default).",
     also="it is what the others are compared with.",
     rungs=_settle_rungs,
     family="fastrod",
@@ -91,7 +106,8 @@ STEP = Peer(
     name="fastrod, step",
     modules=("fastrod",),
     packages=("fastrod", "numba"),
-    same="the same rod along the path of loads, 0.05 N between two: each begins where the one before ended, and its passes lag.",
+    same="the same rod along the path of loads, 0.05 N between two: each begins where the one before ended, "
+    "and its passes lag.",
     also="nothing that settle does not.",
     rungs=_step_rungs,
     family="fastrod",

@@ -1,4 +1,5 @@
-"""MuJoCo on the rod of Appendix J: its own rods (1D flexcomp), and chains of bodies with springs in ball joints and hinges."""
+"""MuJoCo on the rod of Appendix J: its own rods (1D flexcomp), and chains of bodies with springs in ball
+joints and hinges."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ _RADIUS = 3e-4  # m: only EI and GJ count, and a flexcomp wants elements longer 
 
 @dataclass(frozen=True)
 class Setting:
-    """Steps so long that the implicit integrator is close to Newton's method, and as many as bring the rod to rest."""
+    """Steps so long that the implicit integrator is close to Newton's method, and as many as bring the rod to
+    rest."""
 
     links: int
     dt: float
@@ -44,20 +46,25 @@ def model(kind: Kind, setting: Setting) -> mujoco.MjModel:
 
     body = _flex(setting) if kind == "flex" else _chain(kind, setting)
     return mujoco.MjModel.from_xml_string(
-        f'<mujoco><compiler angle="radian"/><option timestep="{setting.dt}" integrator="discrete" gravity="0 0 0">'
+        f'<mujoco><compiler angle="radian"/><option timestep="{setting.dt}" integrator="discrete" '
+        'gravity="0 0 0">'
         f'<flag contact="disable"/></option><worldbody>{body}</worldbody></mujoco>'
     )
 
 
 def _flex(setting: Setting) -> str:
-    """A clamped edge half behind the wall, so that the clamp is at the wall for a curvature that lives at the vertices."""
+    """A clamped edge half behind the wall, so that the clamp is at the wall for a curvature that lives at the
+    vertices."""
     n, length = setting.links, appendix_j.length()
     h = length / (n - 0.5)
     second = 0.25 * math.pi * _RADIUS**4
     return (
-        f'<flexcomp name="rod" type="grid" dim="1" count="{n + 1} 1 1" spacing="{h} 1 1" pos="{0.5 * n * h - 0.5 * h} 0 0" '
-        f'radius="{_RADIUS}" mass="{_MASS}"><pin id="0 1"/><edge equality="true" solref="1e-4 1" solimp="0.9999 0.9999 0.001"/>'
-        f'<elasticity young="{appendix_j.bending() / second}" shear="{appendix_j.torsion() / (2.0 * second)}" damping="{setting.damping}"/>'
+        f'<flexcomp name="rod" type="grid" dim="1" count="{n + 1} 1 1" spacing="{h} 1 1" '
+        f'pos="{0.5 * n * h - 0.5 * h} 0 0" '
+        f'radius="{_RADIUS}" mass="{_MASS}"><pin id="0 1"/><edge equality="true" solref="1e-4 1" '
+        'solimp="0.9999 0.9999 0.001"/>'
+        f'<elasticity young="{appendix_j.bending() / second}" '
+        f'shear="{appendix_j.torsion() / (2.0 * second)}" damping="{setting.damping}"/>'
         '<contact contype="0" conaffinity="0" selfcollide="none"/></flexcomp>'
     )
 
@@ -73,7 +80,10 @@ def _chain(kind: Kind, setting: Setting) -> str:
         link = h if i + 1 < n else 0.5 * h
         mass = _MASS * link / length
         turning = mass * h * h / 12.0
-        body += f'<body pos="{at} 0 0">{joint}<inertial pos="{link} 0 0" mass="{mass}" diaginertia="{turning} {turning} {turning}"/>'
+        body += (
+            f'<body pos="{at} 0 0">{joint}<inertial pos="{link} 0 0" mass="{mass}" '
+            f'diaginertia="{turning} {turning} {turning}"/>'
+        )
         at = link
     return body + "</body>" * n
 
@@ -125,28 +135,42 @@ def _tip(kind: Kind, made: mujoco.MjModel) -> int:
     if kind != "flex":
         return int(made.nbody) - 1
     names = [mujoco.mj_id2name(made, mujoco.mjtObj.mjOBJ_BODY, i) or "" for i in range(made.nbody)]
-    return max((int(name[4:]), i) for i, name in enumerate(names) if name[:4] == "rod_" and name[4:].isdecimal())[1]
+    return max(
+        (int(name[4:]), i) for i, name in enumerate(names) if name[:4] == "rod_" and name[4:].isdecimal()
+    )[1]
 
 
 def _rungs(kind: Kind) -> Sequence[Rung]:
     settings = {
         "flex": (
-            Setting(3, 0.2, 8, 0.1), Setting(6, 0.2, 8, 0.1), Setting(8, 0.2, 10, 0.1), Setting(12, 0.1, 16, 0.2),
-            Setting(16, 0.05, 30, 0.2), Setting(24, 0.03, 45, 0.2), Setting(32, 0.02, 70, 0.2),
+            Setting(3, 0.2, 8, 0.1),
+            Setting(6, 0.2, 8, 0.1),
+            Setting(8, 0.2, 10, 0.1),
+            Setting(12, 0.1, 16, 0.2),
+            Setting(16, 0.05, 30, 0.2),
+            Setting(24, 0.03, 45, 0.2),
+            Setting(32, 0.02, 70, 0.2),
         ),
         "ball": tuple(Setting(n, 1.0, 6 + n // 16) for n in (2, 4, 8, 16, 32, 64)),
         "hinge": tuple(Setting(n, 1.0, 6 + n // 16) for n in (2, 4, 8, 16, 32, 64, 128)),
-    }[kind]  # fmt: skip
-    return [Rung(str(one), partial(_one_by_one, kind, one), partial(_together, kind, one)) for one in settings]
+    }[kind]
+    return [
+        Rung(str(one), partial(_one_by_one, kind, one), partial(_together, kind, one)) for one in settings
+    ]
 
 
-_ALSO = "dynamics, joints and motors, its own contact with friction between all bodies, GPU by MJX and Warp, inverse dynamics."
+_ALSO = (
+    "dynamics, joints and motors, its own contact with friction between all bodies, GPU by MJX and "
+    "Warp, inverse dynamics."
+)
 FLEX = Peer(
     name="MuJoCo rod (flexcomp)",
     modules=("mujoco",),
     packages=("mujoco",),
-    same="a discrete elastic rod with EI and GJ as they are, begun half an edge before the wall; its edges are held by constraints that "
-    "give a little, the less the shorter the step; brought to rest by long implicit steps (integrator discrete).",
+    same="a discrete elastic rod with EI and GJ as they are, begun half an edge before the wall; its edges "
+    "are held by constraints that "
+    "give a little, the less the shorter the step; brought to rest by long implicit steps (integrator "
+    "discrete).",
     also=_ALSO,
     rungs=partial(_rungs, "flex"),
     family="MuJoCo",
@@ -155,7 +179,8 @@ BALLS = Peer(
     name="MuJoCo chain, ball joints",
     modules=("mujoco",),
     packages=("mujoco",),
-    same="links with a spring EI/h in each ball joint, half a link at both ends. Twist gets EI too, for a ball has one stiffness: "
+    same="links with a spring EI/h in each ball joint, half a link at both ends. Twist gets EI too, for a "
+    "ball has one stiffness: "
     "it is not loaded here.",
     also=_ALSO,
     rungs=partial(_rungs, "ball"),

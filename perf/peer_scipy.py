@@ -36,8 +36,12 @@ def _shoot(method: str, rtol: float) -> Iterator[Solve]:
         state[12:15] = x / length
         found: Any = solve_ivp(
             lambda s, y: slope(s, y, load, rod, _NO_TENDON, np.empty(size)),
-            (0.0, length), state, method=method, rtol=rtol, atol=tolerance,
-        )  # fmt: skip
+            (0.0, length),
+            state,
+            method=method,
+            rtol=rtol,
+            atol=tolerance,
+        )
         return np.asarray(found.y[:, -1])
 
     def solve(force: Array) -> Array:
@@ -92,7 +96,8 @@ SHOOT = Peer(
     name="scipy shooting",
     modules=("scipy",),
     packages=("scipy",),
-    same="the rod in space by solve_ivp and root, its slope compiled by numba, so that the time is scipy's own.",
+    same="the rod in space by solve_ivp and root, its slope compiled by numba, so that the time is scipy's "
+    "own.",
     also="any equations: it is a solver, not a simulator.",
     rungs=_shoot_rungs,
     family="scipy",
@@ -101,7 +106,8 @@ COLLOCATE = Peer(
     name="scipy solve_bvp",
     modules=("scipy",),
     packages=("scipy",),
-    same="the rod in its plane, four states of numpy expressions; the plane is told to it, which fastrod finds by itself.",
+    same="the rod in its plane, four states of numpy expressions; the plane is told to it, which fastrod "
+    "finds by itself.",
     also="any equations, and a mesh that refines itself.",
     rungs=_collocate_rungs,
     family="scipy",

@@ -1,7 +1,8 @@
-"""soromox on the rod of Appendix J: piecewise constant and geometric variable strain in JAX, with bending alone left free.
+"""soromox on the rod of Appendix J: piecewise constant and geometric variable strain in JAX, with bending
+alone left free.
 
-It has dynamics, forces and Jacobians, but no solver for rest: that is Newton's method on its stiffness matrix and its
-forward kinematics, differentiated and compiled by JAX as one would write it.
+It has dynamics, forces and Jacobians, but no solver for rest: that is Newton's method on its stiffness matrix
+and its forward kinematics, differentiated and compiled by JAX as one would write it.
 """
 
 from __future__ import annotations
@@ -29,7 +30,12 @@ def _link(segments: int, straight: Sequence[float]) -> Any:
     young = appendix_j.bending() / (0.25 * math.pi * _RADIUS**4)
     length = appendix_j.length() / segments
     return LinkSpec.circular(
-        length=length, radius=_RADIUS, density=_DENSITY, reference_strain=list(straight), young_modulus=young, shear_modulus=young / 3.0
+        length=length,
+        radius=_RADIUS,
+        density=_DENSITY,
+        reference_strain=list(straight),
+        young_modulus=young,
+        shear_modulus=young / 3.0,
     )
 
 
@@ -38,14 +44,17 @@ def _pcs(segments: int) -> tuple[Any, int, Callable[[Any], Any]]:
     import jax.numpy as jnp
     from soromox.systems.pcs import PlanarPCS, PlanarPCSStructure
 
-    bending_only = PlanarPCSStructure(num_gauss_points=5, strain_selector=jnp.array([True, False, False] * segments))
+    bending_only = PlanarPCSStructure(
+        num_gauss_points=5, strain_selector=jnp.array([True, False, False] * segments)
+    )
     links = [_link(segments, (0.0, 1.0, 0.0)) for _ in range(segments)]
     robot = PlanarPCS.from_links(links, structure=bending_only, gravity=jnp.zeros(2), base_pose=jnp.zeros(3))
     return robot, segments, lambda q: robot.forward_kinematics_tips(q)[-1][1:]
 
 
 def _gvs(order: int, points: int) -> tuple[Any, int, Callable[[Any], Any]]:
-    """One segment whose curvature in the plane is a Legendre series of this order, integrated over so many Gauss points."""
+    """One segment whose curvature in the plane is a Legendre series of this order, integrated over so many
+    Gauss points."""
     import jax.numpy as jnp
     from soromox.systems.components import JointSpec
     from soromox.systems.gvs import GVS, GVSSegment, StrainBasisSpec
@@ -53,7 +62,9 @@ def _gvs(order: int, points: int) -> tuple[Any, int, Callable[[Any], Any]]:
     basis = StrainBasisSpec(type="legendre", strain_selector=("kappa_z",), basis_order=order)
     link = _link(1, (0.0, 0.0, 0.0, 1.0, 0.0, 0.0))
     segment = GVSSegment(link=link, joint=JointSpec(type="fixed"), basis=basis, num_gauss_points=points)
-    robot = GVS.from_segments([segment], gravity=jnp.zeros(3), base_pose=jnp.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))
+    robot = GVS.from_segments(
+        [segment], gravity=jnp.zeros(3), base_pose=jnp.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    )
     return robot, order + 1, lambda q: robot.forward_kinematics_tips(q)[-1][:2, 3]
 
 
@@ -100,11 +111,17 @@ def _pcs_rungs() -> Sequence[Rung]:
 
 
 def _gvs_rungs() -> Sequence[Rung]:
-    settings = ((0, 5), (1, 6), (3, 12))  # 5 points are its least; each setting takes long to build and to compile
-    return [Rung(f"order {order}, {points} points", *_both(partial(_gvs, order, points))) for order, points in settings]
+    # 5 points are its least; each setting takes long to build and to compile
+    settings = ((0, 5), (1, 6), (3, 12))
+    return [
+        Rung(f"order {order}, {points} points", *_both(partial(_gvs, order, points)))
+        for order, points in settings
+    ]
 
 
-_ALSO = "dynamics, shear and stretch by choice of strains, derivatives of everything by JAX, GPU, controllers."
+_ALSO = (
+    "dynamics, shear and stretch by choice of strains, derivatives of everything by JAX, GPU, controllers."
+)
 PCS = Peer(
     name="soromox PCS",
     modules=("soromox", "jax"),

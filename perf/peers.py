@@ -1,7 +1,7 @@
 """scipy as a peer of fastrod: one segment with four tendons, solved by shooting, as lean as scipy lets it be.
 
-The slope of the rod comes in three kinds: written with numpy, as most people would; in plain scalar Python, which is
-several times as fast; and that function compiled by numba, which leaves scipy's own time.
+The slope of the rod comes in three kinds: written with numpy, as most people would; in plain scalar Python,
+which is several times as fast; and that function compiled by numba, which leaves scipy's own time.
 """
 
 from __future__ import annotations
@@ -29,10 +29,11 @@ N_STATE = 15 + N_TENDONS  # position, rotation row by row, curvature, path lengt
 
 
 def rod_slope(s: float, y: Any, load: Any, rod: Any, tendons: Any, out: Any) -> Any:
-    """d state / ds of one cross-section (Rucker and Webster 2011); with tensions of zero it is the paper's reduced model.
+    """d state / ds of one cross-section (Rucker and Webster 2011); with tensions of zero it is the paper's
+    reduced model.
 
-    `load` tip force [N] and uniform line force [N/m], world (6); `rod` length [m], EI_x, EI_y, GJ [N m^2]; `tendons`
-    (4, 3) position d_x, d_y [m] and tension [N].
+    `load` tip force [N] and uniform line force [N/m], world (6); `rod` length [m], EI_x, EI_y, GJ [N m^2];
+    `tendons` (4, 3) position d_x, d_y [m] and tension [N].
     """
     length, kx, ky, kz = rod
     left = length - s
@@ -48,7 +49,8 @@ def rod_slope(s: float, y: Any, load: Any, rod: Any, tendons: Any, out: Any) -> 
         q = math.sqrt(p * p + b * uz * uz)
         out[i] = q
         i += 1
-        if tension != 0.0:  # c = d|q|/du, and T/|q| (|d|^2 I - d d^T - c c^T) is the tendon's share of the stiffness
+        # c = d|q|/du, and T/|q| (|d|^2 I - d d^T - c c^T) is the tendon's share of the stiffness
+        if tension != 0.0:
             cx, cy, cz = dy * p / q, -dx * p / q, b * uz / q
             k = tension / q
             mx, my, mz = mx + tension * cx, my + tension * cy, mz + tension * cz
@@ -82,12 +84,19 @@ def array_slope(s: float, y: Array, load: Array, rod: Array, tendons: Array) -> 
         c = np.stack([dy * p, -dx * p, square * u[2]]) / q
         d = np.stack([dx, dy, np.zeros(N_TENDONS)])
         m = m + c @ tension
-        stiffness = stiffness + (tension / q * square).sum() * np.eye(3) - (d * (tension / q)) @ d.T - (c * (tension / q)) @ c.T
+        stiffness = (
+            stiffness
+            + (tension / q * square).sum() * np.eye(3)
+            - (d * (tension / q)) @ d.T
+            - (c * (tension / q)) @ c.T
+        )
     turning = turn @ m
     load_here = rotation.T @ n
     turning[0] -= load_here[1]
     turning[1] += load_here[0]
-    return np.concatenate([rotation[:, 2], (rotation @ turn).ravel(), -np.linalg.solve(stiffness, turning), q])
+    return np.concatenate(
+        [rotation[:, 2], (rotation @ turn).ravel(), -np.linalg.solve(stiffness, turning), q]
+    )
 
 
 @functools.cache
@@ -104,7 +113,8 @@ Slope: TypeAlias = Literal["arrays", "scalars", "compiled"]
 
 @dataclass
 class Peer:
-    """One robot of one segment and four tendons, solved by shooting with scipy; warm after the first solve."""
+    """One robot of one segment and four tendons, solved by shooting with scipy; warm after the first
+    solve."""
 
     robot: Robot
     slope: Slope
@@ -115,7 +125,8 @@ class Peer:
     ftol: float = 1e-8
     """Where the search ends, ftol and xtol of least_squares."""
     stop: float = 0.0
-    """Largest boundary residual at which the search ends at once [m]; 0: only where least_squares itself ends."""
+    """Largest boundary residual at which the search ends at once [m]; 0: only where least_squares itself
+    ends."""
 
     def __post_init__(self) -> None:
         (segment,) = self.robot.segments
@@ -125,7 +136,11 @@ class Peer:
         self.compliance = np.array([tendon.compliance for tendon in segment.tendons])
         length, stiffness = self.rod[:2]
         tension = stiffness / (length * math.hypot(*self.places[0]))
-        self.unit = np.full(2, 1.0 / length) if self.paper else np.array([stiffness / length] * 3 + [tension] * N_TENDONS)
+        self.unit = (
+            np.full(2, 1.0 / length)
+            if self.paper
+            else np.array([stiffness / length] * 3 + [tension] * N_TENDONS)
+        )
         self.tolerance = self.atol / length ** np.repeat([0, 1, 2, 0], [3, 9, 3, N_TENDONS])
         self.x = np.zeros(len(self.unit))
         self.passes = self.slopes = 0
@@ -199,7 +214,9 @@ class Peer:
             return np.asarray(tip[15:] - length)
         tension = x[3:] * self.unit[3:]
         moment, _ = self.moment(tip[12:15].tolist(), self.start(x)[1])
-        return np.concatenate([tip[15:] - length - self.compliance * tension, self.rod[0] ** 2 / self.rod[1] * moment])
+        return np.concatenate(
+            [tip[15:] - length - self.compliance * tension, self.rod[0] ** 2 / self.rod[1] * moment]
+        )
 
     def solve(self, length: Array, load: Sequence[float]) -> tuple[Array, float]:
         """Tip position (3,) [m] and the largest residual [m], from the solution before."""
@@ -219,7 +236,9 @@ class Peer:
 
         with contextlib.suppress(_EnoughError):
             # the difference step lies well above the integrator's own noise
-            least_squares(fun, self.x, method="lm", ftol=self.ftol, xtol=self.ftol, gtol=1e-12, diff_step=[1e-4])
+            least_squares(
+                fun, self.x, method="lm", ftol=self.ftol, xtol=self.ftol, gtol=1e-12, diff_step=[1e-4]
+            )
         self.x = best["x"]
         return best["tip"][:3], best["largest"]
 
@@ -240,7 +259,8 @@ class Run:
 
 
 def follow(peer: Peer, stretches: Sequence[tuple[Array, Points]], rounds: int) -> Run:
-    """Solve the points of each stretch one after the other, warm from its first unknowns, `rounds` times over."""
+    """Solve the points of each stretch one after the other, warm from its first unknowns, `rounds` times
+    over."""
     n_points = sum(len(points) for _, points in stretches)
     least = math.inf
     for _ in range(rounds):

@@ -94,11 +94,16 @@ def machine() -> dict[str, str]:
     model = platform.processor() or platform.machine()
     try:
         with open("/proc/cpuinfo") as lines:  # noqa: PTH123
-            model = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), model)
+            model = next(
+                (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), model
+            )
     except OSError:
         pass
-    versions = f"Python {platform.python_version()}, numpy {numpy.__version__}, numba {numba.__version__}, scipy {scipy.__version__}"
-    return {"cpu": model, "cores": str(numba.config.NUMBA_NUM_THREADS), "versions": versions}  # type: ignore[attr-defined]
+    versions = (
+        f"Python {platform.python_version()}, numpy {numpy.__version__}, numba {numba.__version__}, "
+        f"scipy {scipy.__version__}"
+    )
+    return {"cpu": model, "cores": str(numba.config.NUMBA_NUM_THREADS), "versions": versions}
 
 
 def thread_counts() -> tuple[int, int]:
@@ -109,8 +114,11 @@ def thread_counts() -> tuple[int, int]:
     return 1, min(2, int(getattr(config, "NUMBA_NUM_THREADS", 1)))
 
 
-def seconds(run: Callable[[], Result], clock: Callable[[], float] = time.perf_counter) -> tuple[float, Result]:
-    """Time of one call by `clock` [s], wall time by default, without the collector of garbage, and what it returned."""
+def seconds(
+    run: Callable[[], Result], clock: Callable[[], float] = time.perf_counter
+) -> tuple[float, Result]:
+    """Time of one call by `clock` [s], wall time by default, without the collector of garbage, and what it
+    returned."""
     gc.disable()
     try:
         start = clock()
@@ -125,12 +133,20 @@ def best(run: Callable[[], object], repeats: int) -> float:
     return min((seconds(run)[0] for _ in range(repeats)), default=math.nan)
 
 
-def command(parser: argparse.ArgumentParser, argv: Sequence[str] | None, measure: Callable[[argparse.Namespace], Sequence[Section]]) -> int:
-    """A benchmark's command line: `--json`, `--quick` and what `parser` has besides; measure, print, and the exit code."""
+def command(
+    parser: argparse.ArgumentParser,
+    argv: Sequence[str] | None,
+    measure: Callable[[argparse.Namespace], Sequence[Section]],
+) -> int:
+    """A benchmark's command line: `--json`, `--quick` and what `parser` has besides; measure, print, and the
+    exit code."""
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    parser.add_argument("--quick", action="store_true", help="little of everything: does it run? Its figures mean little")
+    parser.add_argument(
+        "--quick", action="store_true", help="little of everything: does it run? Its figures mean little"
+    )
     options = parser.parse_args(argv)
-    start, load = time.perf_counter(), os.getloadavg()[0]  # other work on the machine spoils figures, of two threads first
+    # other work on the machine spoils figures, of two threads first
+    start, load = time.perf_counter(), os.getloadavg()[0]
     measured = measure(options)
     head = {
         **machine(),
@@ -140,7 +156,11 @@ def command(parser: argparse.ArgumentParser, argv: Sequence[str] | None, measure
         "quick": str(options.quick).lower(),
     }
     if options.json:
-        print(json.dumps({"machine": head, "sections": {section.key: section.as_json() for section in measured}}))
+        print(
+            json.dumps(
+                {"machine": head, "sections": {section.key: section.as_json() for section in measured}}
+            )
+        )
     else:
         show(measured, ", ".join(f"{key} {value}" for key, value in head.items()))
     return 0

@@ -59,7 +59,9 @@ def batch(path: Path, n_robots: int, tolerance: float, steps: int) -> Solved:
     taken, errors, passes = [math.inf, math.inf], [], []
     for _ in range(2):
         for i, threads in enumerate(thread_counts()):
-            sim = Simulator(path.case.robot, n_robots, points_per_segment=path.points, outputs="tip", threads=threads)
+            sim = Simulator(
+                path.case.robot, n_robots, points_per_segment=path.points, outputs="tip", threads=threads
+            )
             for step in range(steps + 1):
                 at = (phase + step) % len(path.case.here.tip_force)
                 words = path.case.words(path.case.here.take(at))
@@ -68,7 +70,11 @@ def batch(path: Path, n_robots: int, tolerance: float, steps: int) -> Solved:
                     taken[i] = min(taken[i], used)
                     errors.append(_error(state, path.truth.tip_position[at]))
                     passes.append(float(state.passes[state.ok].mean()))
-    worst = Error(max(e.largest for e in errors), float(np.median([e.median for e in errors])), min(e.compared for e in errors))
+    worst = Error(
+        max(e.largest for e in errors),
+        float(np.median([e.median for e in errors])),
+        min(e.compared for e in errors),
+    )
     return Solved(tolerance, (taken[0], taken[1]), float(np.mean(passes)), worst)
 
 
@@ -78,7 +84,8 @@ def _error(state: State, tip: Array) -> Error:
 
 
 def batches(path: Path, n_robots: int, steps: int) -> list[Solved]:
-    """With a residual tolerance of `GOAL`, and where that leaves the tip further off, the loosest that brings it within."""
+    """With a residual tolerance of `GOAL`, and where that leaves the tip further off, the loosest that brings
+    it within."""
     found = [batch(path, n_robots, GOAL, steps)]
     for part in (0.5, 0.2, 0.1, 0.05):
         if found[-1].error.largest <= GOAL:
@@ -88,14 +95,22 @@ def batches(path: Path, n_robots: int, steps: int) -> list[Solved]:
 
 
 def stretches(path: Path, count: int) -> list[tuple[Array, Points]]:
-    """`count` runs of one case each, evenly over the path, that begin from the fine solution of the point before."""
+    """`count` runs of one case each, evenly over the path, that begin from the fine solution of the point
+    before."""
     unit = Peer(path.case.robot, "scalars").unit
-    unknowns = path.truth.curvature[:, 0, :2] if path.model == "paper" else np.hstack([path.truth.moment[:, 0], path.truth.tension])
+    unknowns = (
+        path.truth.curvature[:, 0, :2]
+        if path.model == "paper"
+        else np.hstack([path.truth.moment[:, 0], path.truth.tension])
+    )
     pose = path.case.here
     made: list[tuple[Array, Points]] = []
     for first in np.linspace(0, len(pose.tip_force), count, endpoint=False).astype(int):
         at = range(first, first + cases.STEPS_PER_CASE)
-        points = [(pose.tendon_length[j], (*pose.tip_force[j].tolist(), *cases.LINE), path.truth.tip_position[j]) for j in at]
+        points = [
+            (pose.tendon_length[j], (*pose.tip_force[j].tolist(), *cases.LINE), path.truth.tip_position[j])
+            for j in at
+        ]
         made.append((unknowns[first - 1] / unit, points))
     return made
 
@@ -119,7 +134,10 @@ def solve_section(paths: Sequence[Path], n_robots: int, quick: bool) -> Section:
         solved = batches(path, n_robots, 3 if quick else 8)
         table += [_fastrod_row(path, one_of, n_robots) for one_of in solved]
         fastrod = [t / n_robots for t in solved[-1].seconds]
-        table += [_peer_row(path, peer, run, fastrod) for peer, run in _peers(path, stretches(path, 2 if quick else 8))]
+        table += [
+            _peer_row(path, peer, run, fastrod)
+            for peer, run in _peers(path, stretches(path, 2 if quick else 8))
+        ]
     columns = [
         Column("model", "model"),
         Column("solver", "solver"),
@@ -136,13 +154,19 @@ def solve_section(paths: Sequence[Path], n_robots: int, quick: bool) -> Section:
         Column("met", "met by\nthem"),
     ]
     notes = [
-        f'fastrod: `settle` of {n_robots} robots, warm, f64, outputs="tip", wall time, best step; the robots stand at all of the '
-        f"{_n_points(paths)} points of a path through Appendix B, {cases.STEPS_PER_CASE} steps a case, lengths and force both moving. "
+        f'fastrod: `settle` of {n_robots} robots, warm, f64, outputs="tip", wall time, best step; the '
+        "robots stand at all of the "
+        f"{_n_points(paths)} points of a path through Appendix B, {cases.STEPS_PER_CASE} steps a case, "
+        "lengths and force both moving. "
         f"Its points a segment keep the integration's own tip error within {cases.TIP_ERROR:g} m.",
-        "scipy: least_squares(method='lm') over solve_ivp('RK23'), warm from the point before, CPU time, 1 thread. arrays: the slope as "
-        "one writes it with numpy, scipy's default tolerances. scalars, compiled: the slope in plain scalars, and that compiled by numba; "
-        "the loosest of several tolerances that bring every tip within 1e-4 m, and the search ends at the residual `stop`.",
-        "Ratio: scipy's time over fastrod's in the last fastrod row of the model, both with every tip within 1e-4 m. The targets were set "
+        "scipy: least_squares(method='lm') over solve_ivp('RK23'), warm from the point before, CPU time, 1 "
+        "thread. arrays: the slope as "
+        "one writes it with numpy, scipy's default tolerances. scalars, compiled: the slope in plain "
+        "scalars, and that compiled by numba; "
+        "the loosest of several tolerances that bring every tip within 1e-4 m, and the search ends at the "
+        "residual `stop`.",
+        "Ratio: scipy's time over fastrod's in the last fastrod row of the model, both with every tip "
+        "within 1e-4 m. The targets were set "
         "with a scipy solve of about 25 ms in mind.",
     ]
     return Section("full_solve", "Full solve to 1e-4 m from the solution before", columns, table, notes)
@@ -207,7 +231,9 @@ def path_section(paths: Sequence[Path], steps: int) -> Section:
             state = sim.step(**path.case.words(path.case.here.take(at)))
             if step > 5:  # by then nothing of the settled start is left
                 residuals.append(state.residual[state.ok])
-                errors.append(np.linalg.norm(state.tip_position - path.truth.tip_position[at], axis=1)[state.ok])
+                errors.append(
+                    np.linalg.norm(state.tip_position - path.truth.tip_position[at], axis=1)[state.ok]
+                )
                 lost += int((~state.ok).sum())
         residual, error = np.concatenate(residuals), np.concatenate(errors)
         table.append(
@@ -237,7 +263,8 @@ def path_section(paths: Sequence[Path], steps: int) -> Section:
         Column("lost", "steps not\nok", ".2%"),
     ]
     notes = [
-        "One `step` a point, lengths and tip force both moving; residual: of the boundary that the step predicted, before it corrects "
-        "it. The paper reports 5e-4 m. Any number of threads gives the same numbers.",
+        "One `step` a point, lengths and tip force both moving; residual: of the boundary that the step "
+        "predicted, before it corrects "
+        "it. The paper reports 5e-4 m. Any number of threads gives the same numbers."
     ]
     return Section("path", "The 500 points with one pass a step", columns, table, notes)

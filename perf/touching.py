@@ -1,4 +1,5 @@
-"""Robots beside, along and against a mesh: the inputs of the contact benchmark, and FCL's answer for the same rods, capsule by capsule."""
+"""Robots beside, along and against a mesh: the inputs of the contact benchmark, and FCL's answer for the same
+rods, capsule by capsule."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ N_CYCLE = 12
 SWING = 1.5e-3
 """Bend that each segment gains and loses in a cycle, either side [rad]: the tip goes about 1 mm a step."""
 FAR, GRAZING, PRESSED = 0.4, 2e-3, -3e-3
-"""Smallest gap between mesh and free rod over a cycle, the overlap that the mesh then prevents where it is negative [m]."""
+"""Smallest gap between mesh and free rod over a cycle, the overlap that the mesh then prevents where it is
+negative [m]."""
 _APPROACH = 8
 """Steps in which the mesh comes to where it stays."""
 _AWAY = 0.03
@@ -71,7 +73,8 @@ def make_batch(n: int) -> Batch:
         state = sim.settle(lengths[-1]) if k == 0 else sim.step(lengths[-1])
         nodes.append(state.position)
     node = np.stack(nodes)
-    beside, tangent = state.position[:, 4 * POINTS], state.rotation[:, 4 * POINTS, :, 2]  # the end of the fourth segment
+    # the end of the fourth segment
+    beside, tangent = state.position[:, 4 * POINTS], state.rotation[:, 4 * POINTS, :, 2]
     out = np.cross(tangent, rng.normal(size=(n, 3)))
     out /= np.linalg.norm(out, axis=1, keepdims=True)
     return Batch(np.stack(lengths), node, beside, out, robot.segments[0].body_radius)
@@ -86,7 +89,8 @@ def make_mesh(subdivisions: int) -> Obstacle:
 
 
 def places(batch: Batch, gap: float) -> Array:
-    """(n_robots, 7) poses of the mesh whose ball leaves `gap` to the free rods of the whole cycle; by bisection."""
+    """(n_robots, 7) poses of the mesh whose ball leaves `gap` to the free rods of the whole cycle; by
+    bisection."""
     near, far = np.full(len(batch.out), -0.1), np.full(len(batch.out), 0.5 + gap)
     wanted = gap + batch.rod_radius + RADIUS
     for _ in range(50):
@@ -122,8 +126,8 @@ class Timed:
 
 
 def run(batch: Batch, obstacle: Obstacle | None, gap: float, threads: int, budget: float) -> Timed:
-    """Bring the mesh to the robots, let them swing a little, then time steps: one cycle after the other while the `budget` of
-    seconds lasts, three steps at least."""
+    """Bring the mesh to the robots, let them swing a little, then time steps: one cycle after the other while
+    the `budget` of seconds lasts, three steps at least."""
     n = batch.tendon_length.shape[1]
     scene = None if obstacle is None else ContactScene(obstacles=[obstacle])
     sim = Simulator(load_robot(ROBOT), n, points_per_segment=POINTS, threads=threads, contact=scene)
@@ -135,7 +139,9 @@ def run(batch: Batch, obstacle: Obstacle | None, gap: float, threads: int, budge
         away[:, :3] = _AWAY * batch.out
         states = [sim.settle(batch.tendon_length[0], obstacle_pose={"ball": pose + away})]
         for k in range(1, _APPROACH + 1):
-            states.append(sim.step(batch.tendon_length[0], obstacle_pose={"ball": pose + (1.0 - k / _APPROACH) * away}))
+            states.append(
+                sim.step(batch.tendon_length[0], obstacle_pose={"ball": pose + (1.0 - k / _APPROACH) * away})
+            )
     states += [sim.step(batch.tendon_length[k]) for k in range(1, _WARM + 1)]
     not_ok = sum(int((~state.ok).sum()) for state in states)
     state = states[-1]
@@ -143,7 +149,9 @@ def run(batch: Batch, obstacle: Obstacle | None, gap: float, threads: int, budge
     touching, contacts, passes, spent, k, earlier = [], [], [], 0.0, _WARM, ()
     while spent < budget or k < _WARM + 3:
         k += 1
-        earlier = () if sim._engine is None else (sim._engine.before, *(a.copy() for a in sim._engine.clearance))
+        earlier = (
+            () if sim._engine is None else (sim._engine.before, *(a.copy() for a in sim._engine.clearance))
+        )
         used, state = seconds(partial(sim.step, batch.tendon_length[k % N_CYCLE]))
         spent += used
         taken[k % N_CYCLE] = np.fmin(taken[k % N_CYCLE], used)
@@ -157,16 +165,30 @@ def run(batch: Batch, obstacle: Obstacle | None, gap: float, threads: int, budge
     each = np.concatenate(passes)
     n_faces = 0 if obstacle is None else len(obstacle.faces)
     return Timed(
-        n_faces, float(np.nanmean(taken)), share, mean, float(each.mean()), int(each.max()), nearest, not_ok, sim, state, earlier
-    )  # fmt: skip
+        n_faces,
+        float(np.nanmean(taken)),
+        share,
+        mean,
+        float(each.mean()),
+        int(each.max()),
+        nearest,
+        not_ok,
+        sim,
+        state,
+        earlier,
+    )
 
 
 def query(timed: Timed, repeats: int) -> tuple[float, float]:
-    """Seconds of one search of all robots against their meshes: with nothing known, and from what the step before knew."""
+    """Seconds of one search of all robots against their meshes: with nothing known, and from what the step
+    before knew."""
     engine: Any = timed.sim._engine
     before, distance, position = timed.earlier
     shape = before._replace(**{name: getattr(timed.last, name) for name in before._fields})
-    rows, kept = np.arange(timed.sim.n_robots), (engine.before, engine.gap.copy(), *(a.copy() for a in engine.clearance))
+    rows, kept = (
+        np.arange(timed.sim.n_robots),
+        (engine.before, engine.gap.copy(), *(a.copy() for a in engine.clearance)),
+    )
     engine.before, found = before, []
     for cold in (True, False):
         least = math.inf
@@ -181,7 +203,8 @@ def query(timed: Timed, repeats: int) -> tuple[float, float]:
 
 
 def questions(timed: Timed, obstacle: Obstacle, pose: Array, rows: Iterable[int]) -> list[tuple[Any, ...]]:
-    """What to ask FCL about these robots: the mesh, a capsule of radius 1e-6 m on each chord between nodes, request and result."""
+    """What to ask FCL about these robots: the mesh, a capsule of radius 1e-6 m on each chord between nodes,
+    request and result."""
     import fcl
 
     model = fcl.BVHModel()
@@ -192,7 +215,14 @@ def questions(timed: Timed, obstacle: Obstacle, pose: Array, rows: Iterable[int]
     for i in rows:
         ball = fcl.CollisionObject(model, fcl.Transform(pose[i, 3:], pose[i, :3]))
         for a, b in pairwise(timed.last.position[i]):
-            asked.append((ball, _capsule(fcl, a, b), fcl.DistanceRequest(enable_nearest_points=True), fcl.DistanceResult()))
+            asked.append(
+                (
+                    ball,
+                    _capsule(fcl, a, b),
+                    fcl.DistanceRequest(enable_nearest_points=True),
+                    fcl.DistanceResult(),
+                )
+            )
     return asked
 
 
@@ -217,4 +247,6 @@ def _capsule(fcl: Any, a: Array, b: Array) -> Any:
     z = (b - a) / length
     x = np.cross(z, (1.0, 0.0, 0.0) if abs(z[0]) < 0.6 else (0.0, 1.0, 0.0))
     x /= np.linalg.norm(x)
-    return fcl.CollisionObject(fcl.Capsule(1e-6, length), fcl.Transform(np.column_stack([x, np.cross(z, x), z]), 0.5 * (a + b)))
+    return fcl.CollisionObject(
+        fcl.Capsule(1e-6, length), fcl.Transform(np.column_stack([x, np.cross(z, x), z]), 0.5 * (a + b))
+    )

@@ -1,4 +1,5 @@
-"""One rod on one UR5 in PyBullet and in MuJoCo: where its tip is and what the flange feels, at rest, hanging and pushed."""
+"""One rod on one UR5 in PyBullet and in MuJoCo: where its tip is and what the flange feels, at rest, hanging
+and pushed."""
 
 from __future__ import annotations
 
@@ -69,13 +70,28 @@ def in_pybullet(case: str) -> tuple[Any, Callable[[], Any]]:
         shape = world.createCollisionShape(world.GEOM_BOX, halfExtents=list(HALF))
         still = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
         block = world.createMultiBody(
-            0.0, -1, -1, block_at().tolist(), linkMasses=[MASS if case == CASES[3] else 0.0], linkCollisionShapeIndices=[shape],
-            linkVisualShapeIndices=[-1], linkPositions=[still[0]], linkOrientations=[still[1]], linkInertialFramePositions=[still[0]],
-            linkInertialFrameOrientations=[still[1]], linkParentIndices=[0], linkJointAxis=[[0, 1, 0]],
+            0.0,
+            -1,
+            -1,
+            block_at().tolist(),
+            linkMasses=[MASS if case == CASES[3] else 0.0],
+            linkCollisionShapeIndices=[shape],
+            linkVisualShapeIndices=[-1],
+            linkPositions=[still[0]],
+            linkOrientations=[still[1]],
+            linkInertialFramePositions=[still[0]],
+            linkInertialFrameOrientations=[still[1]],
+            linkParentIndices=[0],
+            linkJointAxis=[[0, 1, 0]],
             linkJointTypes=[world.JOINT_PRISMATIC if case == CASES[3] else world.JOINT_FIXED],
-        )  # fmt: skip
+        )
         touch = [(block, 0)]
-    rod = MountedRod(carried()[0], BulletLink(world, arm.body, arm.tip, position=(0.0, 0.0, ADAPTER)), touch=touch, friction=0.0)
+    rod = MountedRod(
+        carried()[0],
+        BulletLink(world, arm.body, arm.tip, position=(0.0, 0.0, ADAPTER)),
+        touch=touch,
+        friction=0.0,
+    )
     given = inputs(case)
     if case == CASES[3]:
         world.setJointMotorControl2(block, 0, world.VELOCITY_CONTROL, force=0.0)
@@ -102,7 +118,9 @@ def in_mujoco(case: str) -> tuple[Any, Callable[[], Any]]:
     if case in CASES[2:]:
         block = spec.worldbody.add_body(name="block", pos=block_at().tolist(), gravcomp=1.0)
         if case == CASES[3]:
-            block.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 1, 0], stiffness=SPRING, damping=DAMPER)
+            block.add_joint(
+                type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 1, 0], stiffness=SPRING, damping=DAMPER
+            )
         block.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=list(HALF), mass=MASS)
         touch = ["block"]
     robot = carried()[0]
@@ -135,5 +153,6 @@ def apart(a: Result, b: Result) -> dict[str, float]:
 
     return {
         "tip": float(np.linalg.norm(a.tip - b.tip)) / robot.length,
-        "force": part(a.wrench[:3], b.wrench[:3]), "moment": part(a.wrench[3:], b.wrench[3:]),
-    }  # fmt: skip
+        "force": part(a.wrench[:3], b.wrench[:3]),
+        "moment": part(a.wrench[3:], b.wrench[3:]),
+    }

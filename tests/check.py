@@ -22,12 +22,18 @@ CHECKS: list[tuple[str, list[str], dict[str, str]]] = [
     ("imports", ["lint-imports"], {}),
     # Once, and side by side: otherwise every process of the tests compiles the same kernels.
     ("kernels", ["python", "tests/kernels.py"], {}),
-    # Threads that spin while they wait take the core from those they wait for: a training takes eight times as long on two busy cores.
-    ("tests", ["pytest", "-n", "2", "--dist", "loadfile", "-m", "not real_time"], {"OMP_WAIT_POLICY": "passive"}),
+    # Threads that spin while they wait take the core from those they wait for: a training takes eight times
+    # as long on two busy cores.
+    (
+        "tests",
+        ["pytest", "-n", "2", "--dist", "loadfile", "-m", "not real_time"],
+        {"OMP_WAIT_POLICY": "passive"},
+    ),
     ("real time", ["pytest", "-m", "real_time"], {"OMP_WAIT_POLICY": "passive"}),
     # The kernels as a GPU would run them, one thread a robot, on numba's simulator of one.
     ("gpu", ["pytest", "tests/gpu"], {"NUMBA_ENABLE_CUDASIM": "1"}),
-    # The kernels once more as plain Python: what the compiler might hide, and the lines that it hides from coverage.
+    # The kernels once more as plain Python: what the compiler might hide, and the lines that it hides from
+    # coverage.
     ("plain python", ["pytest", "tests/plain"], {"NUMBA_DISABLE_JIT": "1"}),
     # And with every index checked: a compiled kernel does not notice that it reads beyond its scratch.
     (
@@ -45,7 +51,7 @@ ASIDE = ("gpu", "plain python", "bounds")
 def run(command: list[str], extra: dict[str, str], *, quiet: bool = False) -> tuple[int, str]:
     """Exit code, and with `quiet` what was printed."""
     kept = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True} if quiet else {}
-    done = subprocess.run([BIN / command[0], *command[1:]], cwd=ROOT, env={**os.environ, **extra}, **kept)  # type: ignore[call-overload]
+    done = subprocess.run([BIN / command[0], *command[1:]], cwd=ROOT, env={**os.environ, **extra}, **kept)
     return done.returncode, done.stdout or ""
 
 

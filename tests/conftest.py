@@ -13,7 +13,8 @@ import pytest
 from rods import Table
 from truthfiles import rows
 
-os.environ.setdefault("FASTROD_QUIET", "1")  # commands that tests run compile at any time, and their stderr is read
+# commands that tests run compile at any time, and their stderr is read
+os.environ.setdefault("FASTROD_QUIET", "1")
 
 
 @pytest.fixture(scope="session")
@@ -40,15 +41,23 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.fixture(scope="session", autouse=True)
 def one_compilation() -> Iterator[None]:
-    """Whatever the tests did, the big kernels were compiled once: an array of another layout, or a read-only one, costs a user half a
-    minute more."""
+    """Whatever the tests did, the big kernels were compiled once: an array of another layout, or a read-only
+    one, costs a user half a minute more."""
     yield
     if numba.config.DISABLE_JIT:
         return
     from fastrod.kernels import batch
     from fastrod.kernels.rod import cold
 
-    big = ("pass_serial", "pass_parallel", "iterate_serial", "iterate_parallel", "look_serial", "look_parallel", "move_to_inputs")
+    big = (
+        "pass_serial",
+        "pass_parallel",
+        "iterate_serial",
+        "iterate_parallel",
+        "look_serial",
+        "look_parallel",
+        "move_to_inputs",
+    )
     counts = {name: len(getattr(batch, name).signatures) for name in big}
     counts["begin"] = len(cold.begin.signatures)
     assert {name: n for name, n in counts.items() if n > 1} == {}

@@ -28,12 +28,25 @@ class BulletStage:
     hop = 1.05
     """Largest speed of a cube that is pushed over the floor, over that of the push."""
 
-    def __init__(self, robot: Robot, *, dt=0.005, gravity=0.0, axis="x", cubes=(), floor=None, touch=True, **options: Any) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        dt=0.005,
+        gravity=0.0,
+        axis="x",
+        cubes=(),
+        floor=None,
+        touch=True,
+        **options: Any,
+    ) -> None:
         self.world = empty_world(dt, gravity)
         self.dt = dt
         if floor is not None:
             shape = self.world.createCollisionShape(self.world.GEOM_BOX, halfExtents=[5.0, 5.0, 0.5])
-            self.world.changeDynamics(self.world.createMultiBody(0.0, shape, -1, [0.0, 0.0, floor - 0.5]), -1, lateralFriction=0.5)
+            self.world.changeDynamics(
+                self.world.createMultiBody(0.0, shape, -1, [0.0, 0.0, floor - 0.5]), -1, lateralFriction=0.5
+            )
         self.cubes = [cube(self.world, c.size, c.mass, c.position, friction=c.friction) for c in cubes]
         self.link = carrier(self.world, axis)
         self.rod = MountedRod(robot, self.link, touch=self.cubes if touch else [], **options)
@@ -62,10 +75,22 @@ class BulletStage:
 class MujocoStage:
     """As `BulletStage`."""
 
-    # a body that slides lifts off at friction times its speed: MuJoCo's friction cone is convex in force and velocity together
+    # a body that slides lifts off at friction times its speed: MuJoCo's friction cone is convex in force and
+    # velocity together
     hop = 1.35
 
-    def __init__(self, robot: Robot, *, dt=0.005, gravity=0.0, axis="x", cubes=(), floor=None, touch=True, **options: Any) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        dt=0.005,
+        gravity=0.0,
+        axis="x",
+        cubes=(),
+        floor=None,
+        touch=True,
+        **options: Any,
+    ) -> None:
         import mujoco
 
         self.lib, self.dt = mujoco, dt
@@ -75,20 +100,28 @@ class MujocoStage:
         spec.option.impratio, spec.option.cone = 100.0, mujoco.mjtCone.mjCONE_ELLIPTIC
         box = mujoco.mjtGeom.mjGEOM_BOX
         if floor is not None:
-            spec.worldbody.add_geom(type=box, size=[5, 5, 0.5], pos=[0, 0, floor - 0.5], friction=[0.25, 0.005, 0.0001])
+            spec.worldbody.add_geom(
+                type=box, size=[5, 5, 0.5], pos=[0, 0, floor - 0.5], friction=[0.25, 0.005, 0.0001]
+            )
         self.names = [f"cube {k}" for k in range(len(cubes))]
         for name, c in zip(self.names, cubes, strict=True):
             body = spec.worldbody.add_body(name=name, pos=list(c.position))
             if c.mass > 0.0:
                 body.add_freejoint()
             # MuJoCo takes the larger friction of a pair, PyBullet the product
-            body.add_geom(type=box, size=[c.size / 2] * 3, mass=c.mass, friction=[0.5 * c.friction, 0.005, 0.0001])
+            body.add_geom(
+                type=box, size=[c.size / 2] * 3, mass=c.mass, friction=[0.5 * c.friction, 0.005, 0.0001]
+            )
         spec.worldbody.add_body(name="post", mocap=True)
         touched = self.names if touch else []
-        add_capsules(spec, robot, "post", touch=touched, capsules_per_segment=options.pop("capsules_per_segment", 10))
+        add_capsules(
+            spec, robot, "post", touch=touched, capsules_per_segment=options.pop("capsules_per_segment", 10)
+        )
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
-        self.rod = MujocoRod(robot, self.model, self.data, "post", quaternion=TURN[axis], touch=touched, **options)
+        self.rod = MujocoRod(
+            robot, self.model, self.data, "post", quaternion=TURN[axis], touch=touched, **options
+        )
         self.post = self.model.body("post").mocapid[0]
 
     def carry(self, position, velocity) -> None:

@@ -1,6 +1,8 @@
-"""A log of a robot of two segments and six tendons, by constant curvature: numpy and scipy only, nothing shared with the package.
+"""A log of a robot of two segments and six tendons, by constant curvature: numpy and scipy only, nothing
+shared with the package.
 
-Every tendon has play, the marker has noise, and the camera stands where it likes. `log(...)` is the measured run, `TOML` the robot.
+Every tendon has play, the marker has noise, and the camera stands where it likes. `log(...)` is the measured
+run, `TOML` the robot.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ PLAY, NOISE = 0.55e-3, 0.4e-3
 """Half width of the play, standard deviation of the noise on each axis [m]."""
 
 TOML = "name = 'mine'\n" + "".join(
-    f"[[segment]]\nlength = {length}\nbending_stiffness = [0.02, 0.02]\ntorsional_stiffness = 0.015\ntendons = [\n"
+    f"[[segment]]\nlength = {length}\nbending_stiffness = [0.02, 0.02]\ntorsional_stiffness = "
+    "0.015\ntendons = [\n"
     + "".join(f"  {{offset = {OFFSET}, angle = {float(angle)}}},\n" for angle in angles)
     + "]\n"
     for length, angles in zip(LENGTHS, (ANGLES[:3], ANGLES[3:]), strict=True)
@@ -38,8 +41,16 @@ class Run(NamedTuple):
     """(n, 3, 3) orientation of the tip as the camera sees it."""
 
 
-def log(n: int = 1800, rate: float = 20.0, *, rotation: np.ndarray | None = None, shift: np.ndarray | None = None, seed: int = 7) -> Run:
-    """A run of waves at several amplitudes with rests; the camera's frame is `rotation` (3, 3) p + `shift` (3,) [m] of the base's."""
+def log(
+    n: int = 1800,
+    rate: float = 20.0,
+    *,
+    rotation: np.ndarray | None = None,
+    shift: np.ndarray | None = None,
+    seed: int = 7,
+) -> Run:
+    """A run of waves at several amplitudes with rests; the camera's frame is `rotation` (3, 3) p + `shift`
+    (3,) [m] of the base's."""
     t = np.arange(n) / rate
     phase = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, (2, 2))
     slow = np.array([[0.55, 0.83], [0.71, 0.47]])
@@ -62,7 +73,9 @@ def log(n: int = 1800, rate: float = 20.0, *, rotation: np.ndarray | None = None
 def camera(angle: float, distance: float, seed: int = 3) -> tuple[np.ndarray, np.ndarray]:
     """A rotation by `angle` [rad] about a random axis, a shift by `distance` [m] in a random direction."""
     axis, way = np.random.default_rng(seed).normal(size=(2, 3))
-    return Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix(), distance * way / np.linalg.norm(way)
+    return Rotation.from_rotvec(
+        angle * axis / np.linalg.norm(axis)
+    ).as_matrix(), distance * way / np.linalg.norm(way)
 
 
 def csv(run: Run) -> str:
@@ -73,7 +86,8 @@ def csv(run: Run) -> str:
 
 
 def _routing() -> np.ndarray:
-    """(6, 4) change of tendon length per bend about x and y of each segment: a tendon on the inner side is shorter."""
+    """(6, 4) change of tendon length per bend about x and y of each segment: a tendon on the inner side is
+    shorter."""
     one = OFFSET * np.stack([np.sin(ANGLES), -np.cos(ANGLES)], axis=1)
     made = np.zeros((6, 4))
     made[:, :2], made[3:, 2:] = one, one[3:]

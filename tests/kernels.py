@@ -1,4 +1,5 @@
-"""Compile the large kernels into the cache, two processes at a time: a free rod on one thread and on two, then a rod in contact."""
+"""Compile the large kernels into the cache, two processes at a time: a free rod on one thread and on two,
+then a rod in contact."""
 
 from __future__ import annotations
 
@@ -26,7 +27,9 @@ def touching(n: int) -> None:
 
     robot = fastrod.load_robot("prototype")
     bar = cylinder(0.01, 0.2, name="bar", position=(0.018, 0, 0.05), quaternion=(0.5**0.5, 0.5**0.5, 0, 0))
-    sim = fastrod.Simulator(robot, n, points_per_segment=5, contact=ContactScene(obstacles=[bar], rod_radius=0.003))
+    sim = fastrod.Simulator(
+        robot, n, points_per_segment=5, contact=ContactScene(obstacles=[bar], rod_radius=0.003)
+    )
     for pull in np.linspace(0.0, 0.006, 20):
         state = sim.step(robot.rest_tendon_length + np.array([-pull, 0.0, pull, 0.0]))
     assert state.contacts is not None

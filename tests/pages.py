@@ -21,14 +21,24 @@ from websockets.typing import Subprotocol
 from fastrod_viewer.app import App
 
 CAMERA = _messages.ViewerCameraMessage(
-    wxyz=(1.0, 0.0, 0.0, 0.0), position=(1.0, 0.0, 0.0), fov=0.75, near=0.01, far=10.0, image_height=600,
-    image_width=800, look_at=(0.0, 0.0, 0.0), up_direction=(0.0, 0.0, 1.0),
-)  # fmt: skip
+    wxyz=(1.0, 0.0, 0.0, 0.0),
+    position=(1.0, 0.0, 0.0),
+    fov=0.75,
+    near=0.01,
+    far=10.0,
+    image_height=600,
+    image_width=800,
+    look_at=(0.0, 0.0, 0.0),
+    up_direction=(0.0, 0.0, 1.0),
+)
 PROTOCOL = f"viser-v{viser.__version__}"
 HANDSHAKE = {
-    "Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
-    "Sec-WebSocket-Version": "13", "Sec-WebSocket-Protocol": PROTOCOL,
-}  # fmt: skip
+    "Upgrade": "websocket",
+    "Connection": "Upgrade",
+    "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
+    "Sec-WebSocket-Version": "13",
+    "Sec-WebSocket-Protocol": PROTOCOL,
+}
 
 
 def websocket(address: str) -> ClientConnection:

@@ -22,14 +22,21 @@ class Table:
         return Table([row for row in self.rows if row[name] == value])
 
 
-def rod(mode: str = "tendon_length", n_tendons: int = 4, *, offset: float = 0.0075, compliance: float = 1e-5, **segment: object) -> Robot:
+def rod(
+    mode: str = "tendon_length",
+    n_tendons: int = 4,
+    *,
+    offset: float = 0.0075,
+    compliance: float = 1e-5,
+    **segment: object,
+) -> Robot:
     """One segment like the paper's robot, with what a test wants different."""
     tendons = tuple(
         Tendon(offset=offset, angle=2.0 * np.pi * i / n_tendons, compliance=compliance)
         for i in range(0 if mode == "passive" else n_tendons)
     )
     given = {"length": 0.07, "bending_stiffness": (0.0022, 0.0022), "torsional_stiffness": 0.001} | segment
-    return Robot(name=mode, segments=(Segment(mode=mode, tendons=tendons, **given),))  # type: ignore[arg-type]
+    return Robot(name=mode, segments=(Segment(mode=mode, tendons=tendons, **given),))
 
 
 def bend(robot: Robot, angle_x: float, angle_y: float, segment: int = 0) -> np.ndarray:

@@ -35,7 +35,8 @@ def log(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def straight(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A simulator whose robots stay straight, so that the words of the command line are tested without the model."""
+    """A simulator whose robots stay straight, so that the words of the command line are tested without the
+    model."""
 
     class Straight:
         def __init__(self, robot: Robot, n_robots: int) -> None:
@@ -59,7 +60,9 @@ def refused(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
 
 
 @pytest.mark.usefixtures("straight")
-def test_replay_prints_the_table_and_names_its_files(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_replay_prints_the_table_and_names_its_files(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "out"
     assert cli.main(["replay", str(log), "--robot", "prototype", "--out", str(out)]) == 0
     printed, err = capsys.readouterr()
@@ -71,19 +74,28 @@ def test_replay_prints_the_table_and_names_its_files(log: Path, tmp_path: Path, 
 
 
 @pytest.mark.usefixtures("straight")
-def test_replay_of_one_run_into_the_default_folder(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_replay_of_one_run_into_the_default_folder(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     assert cli.main(["replay", str(log), "--robot", "prototype", "--run", "b"]) == 0
     assert len((tmp_path / "log_replay" / "residuals.csv").read_text().splitlines()) == 2
 
 
 @pytest.mark.usefixtures("straight")
-def test_replay_knows_a_measured_set_by_its_header(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_replay_knows_a_measured_set_by_its_header(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "raw.csv"
-    path.write_text("row,l1_mm,l2_mm,l3_mm,x_mm,y_mm,z_mm,glitch,after_jump\n0,0,0,0.1,-43,-144,276,0,0\n1,0,4,0,-42,-136,305,0,0\n")
+    path.write_text(
+        "row,l1_mm,l2_mm,l3_mm,x_mm,y_mm,z_mm,glitch,after_jump\n"
+        "0,0,0,0.1,-43,-144,276,0,0\n1,0,4,0,-42,-136,305,0,0\n"
+    )
     assert cli.main(["replay", str(path), "--out", str(tmp_path / "out")]) == 0
     assert "armlab_tdcr" in capsys.readouterr().out
-    assert "robot 'prototype' has 4 tendons, the one of raw.csv has 3" in refused(capsys, "replay", str(path), "--robot", "prototype")
+    assert "robot 'prototype' has 4 tendons, the one of raw.csv has 3" in refused(
+        capsys, "replay", str(path), "--robot", "prototype"
+    )
 
 
 @pytest.mark.usefixtures("straight")
@@ -108,13 +120,19 @@ def test_folder_that_cannot_be_written_is_refused_before_the_work(
     monkeypatch.setattr("fastrod.identification.log.replay.replay", work)
     monkeypatch.setattr("fastrod.commands.demo._batch", work)
     for command in (("replay", str(log), "--robot", "prototype"), ("demo",)):
-        assert refused(capsys, *command, "--out", str(log)) == f"folder {str(log)!r} cannot be written: it is a file.\n"
+        assert refused(capsys, *command, "--out", str(log)) == (
+            f"folder {str(log)!r} cannot be written: it is a file.\n"
+        )
         below = log / "below"
-        assert refused(capsys, *command, "--out", str(below)) == f"folder {str(below)!r} cannot be written: Not a directory.\n"
+        assert refused(capsys, *command, "--out", str(below)) == (
+            f"folder {str(below)!r} cannot be written: Not a directory.\n"
+        )
 
 
 @pytest.mark.usefixtures("straight")
-def test_file_that_cannot_be_written_has_failed(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_file_that_cannot_be_written_has_failed(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "out" / "residuals.csv.part").mkdir(parents=True)
     assert cli.main(["replay", str(log), "--robot", "prototype", "--out", str(tmp_path / "out")]) == 1
     assert capsys.readouterr().err == f"{tmp_path / 'out' / 'residuals.csv.part'}: Is a directory.\n"
@@ -128,14 +146,34 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_identify_prints_the_verdict_and_names_its_files(measured: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_identify_prints_the_verdict_and_names_its_files(
+    measured: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "out"
     # A log behind --held-out is a log all the same.
-    words = ["identify", "--robot", "prototype", "--max-effects", "1", "--out", str(out), "--held-out", "two", str(measured)]
+    words = [
+        "identify",
+        "--robot",
+        "prototype",
+        "--max-effects",
+        "1",
+        "--out",
+        str(out),
+        "--held-out",
+        "two",
+        str(measured),
+    ]
     assert cli.main(words) == 0
     printed, err = capsys.readouterr()
     assert err == ""
-    for word in ("backlash", "half width", "noise floor", "held out", str(out / "report.html"), str(out / "identified.toml")):
+    for word in (
+        "backlash",
+        "half width",
+        "noise floor",
+        "held out",
+        str(out / "report.html"),
+        str(out / "identified.toml"),
+    ):
         assert word in printed
     assert json.loads((out / "report.json").read_text())["held_out"] == ["two"]
 
@@ -145,7 +183,21 @@ def test_identify_json_prints_json_and_nothing_else(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert (
-        cli.main(["identify", str(measured), "--robot", "prototype", "--held-out", "two", "three@8:", "--max-effects", "0", "--json"]) == 0
+        cli.main(
+            [
+                "identify",
+                str(measured),
+                "--robot",
+                "prototype",
+                "--held-out",
+                "two",
+                "three@8:",
+                "--max-effects",
+                "0",
+                "--json",
+            ]
+        )
+        == 0
     )
     printed, err = capsys.readouterr()
     assert json.loads(printed)["held_out"] == ["two", "three@8:"]
@@ -153,7 +205,9 @@ def test_identify_json_prints_json_and_nothing_else(
     assert not list(tmp_path.iterdir())
 
 
-def test_identify_takes_several_logs_and_the_default_folder(measured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_identify_takes_several_logs_and_the_default_folder(
+    measured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     seen: dict[str, Any] = {}
 
     def stand_in(logs: Any, robot: Robot, **given: Any) -> Any:
@@ -164,14 +218,35 @@ def test_identify_takes_several_logs_and_the_default_folder(measured: Path, tmp_
     monkeypatch.chdir(tmp_path)
     other = tmp_path / "other.csv"
     other.write_bytes(measured.read_bytes())
-    assert cli.main(["identify", str(measured), "--robot", "prototype", str(other), "--free-camera", "--max-effects", "2"]) == 2
+    assert (
+        cli.main(
+            [
+                "identify",
+                str(measured),
+                "--robot",
+                "prototype",
+                str(other),
+                "--free-camera",
+                "--max-effects",
+                "2",
+            ]
+        )
+        == 2
+    )
     assert seen["names"] == ["small", "other"]
-    assert (seen["held_out"], seen["max_effects"], seen["free_camera"], seen["progress"]) == ([], 2, True, None)
+    assert (seen["held_out"], seen["max_effects"], seen["free_camera"], seen["progress"]) == (
+        [],
+        2,
+        True,
+        None,
+    )
     assert seen["folder"]  # made before the long work, and gone where nothing came of it
     assert not (tmp_path / "small_identified").exists()
 
 
-def test_excite_writes_a_run_to_be_driven(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_excite_writes_a_run_to_be_driven(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     assert cli.main(["excite", "--robot", "prototype", "--bend", "0.5", "--rate", "10"]) == 0
     assert "step and hold" in capsys.readouterr().out
@@ -195,28 +270,66 @@ WRONG = {
     "unknown command": (["repaly"], "no command 'repaly'; did you mean 'replay'?"),
     "unknown option": (["demo", "--speed"], "fastrod demo does not know '--speed'"),
     "no log": (["replay"], "the following arguments are required: LOG"),
-    "log not there": (["replay", "none.csv", "--robot", "prototype"], "log 'none.csv' cannot be read: No such file or directory."),
-    "unknown robot": (["replay", "LOG", "--robot", "prototpye"], "no robot 'prototpye'; did you mean 'prototype'?"),
-    "no robot": (["replay", "LOG"], "log.csv is a run log and does not say whose; name its robot with --robot."),
-    "unknown run": (["replay", "LOG", "--robot", "prototype", "--run", "c"], "no run 'c' in log 'log'; known: a, b."),
-    "other robot": (["replay", "LOG", "--robot", "tdcr_a"], "has 4 dl_ columns (dl_1 to dl_4); robot 'tdcr_a' has 6 tendons"),
+    "log not there": (
+        ["replay", "none.csv", "--robot", "prototype"],
+        "log 'none.csv' cannot be read: No such file or directory.",
+    ),
+    "unknown robot": (
+        ["replay", "LOG", "--robot", "prototpye"],
+        "no robot 'prototpye'; did you mean 'prototype'?",
+    ),
+    "no robot": (
+        ["replay", "LOG"],
+        "log.csv is a run log and does not say whose; name its robot with --robot.",
+    ),
+    "unknown run": (
+        ["replay", "LOG", "--robot", "prototype", "--run", "c"],
+        "no run 'c' in log 'log'; known: a, b.",
+    ),
+    "other robot": (
+        ["replay", "LOG", "--robot", "tdcr_a"],
+        "has 4 dl_ columns (dl_1 to dl_4); robot 'tdcr_a' has 6 tendons",
+    ),
     "identify: no log": (["identify", "--robot", "prototype"], "the following arguments are required: LOG"),
-    "identify: no robot": (["identify", "LOG"], "log.csv is a run log and does not say whose; name its robot with --robot."),
-    "identify: unknown option": (["identify", "LOG", "--robot", "prototype", "--jsn"], "fastrod identify does not know '--jsn'"),
-    "identify: short log": (["identify", "LOG", "--robot", "prototype", "--json"], "has 3 measured rows; identification needs 40"),
-    "identify: the same log twice": (["identify", "LOG", "LOG", "--robot", "prototype", "--json"], "two logs are named 'log'"),
-    "identify: effects": (["identify", "LOG", "--robot", "prototype", "--json", "--max-effects", "-1"], "max_effects is -1"),
-    "identify: folder": (["identify", "LOG", "--robot", "prototype", "--out", "LOG"], "cannot be written: it is a file."),
+    "identify: no robot": (
+        ["identify", "LOG"],
+        "log.csv is a run log and does not say whose; name its robot with --robot.",
+    ),
+    "identify: unknown option": (
+        ["identify", "LOG", "--robot", "prototype", "--jsn"],
+        "fastrod identify does not know '--jsn'",
+    ),
+    "identify: short log": (
+        ["identify", "LOG", "--robot", "prototype", "--json"],
+        "has 3 measured rows; identification needs 40",
+    ),
+    "identify: the same log twice": (
+        ["identify", "LOG", "LOG", "--robot", "prototype", "--json"],
+        "two logs are named 'log'",
+    ),
+    "identify: effects": (
+        ["identify", "LOG", "--robot", "prototype", "--json", "--max-effects", "-1"],
+        "max_effects is -1",
+    ),
+    "identify: folder": (
+        ["identify", "LOG", "--robot", "prototype", "--out", "LOG"],
+        "cannot be written: it is a file.",
+    ),
     "excite: no robot": (["excite"], "the following arguments are required: --robot"),
     "excite: bend": (["excite", "--robot", "prototype", "--bend", "50"], "Was it given in degrees?"),
     "excite: text": (["excite", "--robot", "prototype", "--rate", "fast"], "invalid float value: 'fast'"),
-    "excite: suffix": (["excite", "--robot", "prototype", "--out", "run.txt"], "'run.txt' does not end in .csv or .parquet"),
+    "excite: suffix": (
+        ["excite", "--robot", "prototype", "--out", "run.txt"],
+        "'run.txt' does not end in .csv or .parquet",
+    ),
     "bench option": (["bench", "--jsno"], "fastrod bench does not know '--jsno'"),
 }
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_wrong_input_is_one_sentence_and_code_2(log: Path, capsys: pytest.CaptureFixture[str], case: str) -> None:
+def test_wrong_input_is_one_sentence_and_code_2(
+    log: Path, capsys: pytest.CaptureFixture[str], case: str
+) -> None:
     argv, sentence = WRONG[case]
     assert sentence in refused(capsys, *(str(log) if word == "LOG" else word for word in argv))
 
@@ -240,15 +353,22 @@ def test_bad_log_is_one_sentence_and_code_2(log: Path, capsys: pytest.CaptureFix
     assert sentence in refused(capsys, "replay", str(log), "--robot", "prototype")
 
 
-def test_bad_robot_file_is_one_sentence_and_code_2(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_robot_file_is_one_sentence_and_code_2(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     robot = tmp_path / "robot.toml"
     robot.write_text('name = "x"\n[[segmnt]]\n')
     assert "did you mean 'segment'?" in refused(capsys, "replay", str(log), "--robot", str(robot))
 
 
-def test_bench_runs_the_scripts_of_perf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bench_runs_the_scripts_of_perf(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     for name, figure in (("step", 1), ("settle", 2)):
-        text = f"def main(argv):\n    print('{{\"ratio\": {figure}}}' if argv == ['--json'] else 'ratio {figure}')\n    return 0\n"
+        text = (
+            f"def main(argv):\n    print('{{\"ratio\": {figure}}}' if argv == ['--json'] else 'ratio "
+            f"{figure}')\n    return 0\n"
+        )
         (tmp_path / f"bench_{name}.py").write_text(text)
     monkeypatch.setattr(cli, "_PERF", tmp_path)
     assert cli.main(["bench", "step"]) == 0
@@ -279,13 +399,25 @@ def test_help_has_every_command_once(capsys: pytest.CaptureFixture[str]) -> None
     lines = [line.split()[0] for line in said.partition("examples:")[0].splitlines() if line.startswith("  ")]
     assert sorted(lines) == sorted(names)
     assert max(map(len, said.splitlines())) <= 120
-    for example in [line.strip().split("  ")[0] for line in said.partition("examples:")[2].splitlines() if line.startswith("  ")]:
+    for example in [
+        line.strip().split("  ")[0]
+        for line in said.partition("examples:")[2].splitlines()
+        if line.startswith("  ")
+    ]:
         assert parser.parse_known_args(example.split()[1:])[1] == []
 
 
 def test_help_does_not_load_numba() -> None:
-    code = "import sys; from fastrod.commands.cli import main\ntry: main(['--help'])\nexcept SystemExit as end: assert not end.code\n"
-    done = subprocess.run([sys.executable, "-c", code + "assert 'numba' not in sys.modules"], capture_output=True, text=True, check=False)
+    code = (
+        "import sys; from fastrod.commands.cli import main\ntry: main(['--help'])\nexcept SystemExit as "
+        "end: assert not end.code\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code + "assert 'numba' not in sys.modules"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     assert "replay" in done.stdout
 
@@ -327,7 +459,12 @@ def test_demo_leaves_what_it_says(demo: tuple[Path, str]) -> None:
     # beside them the zeros of the wires, which homing does not know better than it says
     assert {table["name"] for table in found.effects} == {*named, "encoder_offset"}
     runs = sorted(path.stem for path in out.glob("*.csv"))
-    assert runs == sorted(["excite", *(f"{path}_{when}" for path in ("triangle", "square", "circle") for when in ("before", "after"))])
+    assert runs == sorted(
+        [
+            "excite",
+            *(f"{path}_{when}" for path in ("triangle", "square", "circle") for when in ("before", "after")),
+        ]
+    )
     assert not list(out.glob("*.part"))
     assert read_log(out / "excite.csv", found).measured.mean() > 0.98
 
@@ -339,7 +476,9 @@ def test_tracking_is_nearer_to_the_path_with_what_was_found(demo: tuple[Path, st
     noise = loop["noise_floor_m"]
     for runs in loop["tracking"].values():
         # what is left when the camera's noise is taken off, and what there was
-        left, was = (np.sqrt(max(runs[when]["distance_rms_m"] ** 2 - noise**2, 0.0)) for when in ("after", "before"))
+        left, was = (
+            np.sqrt(max(runs[when]["distance_rms_m"] ** 2 - noise**2, 0.0)) for when in ("after", "before")
+        )
         assert left <= 0.5 * was
         assert np.all(np.array(runs["after"]["rms_m"]) <= np.array(runs["after"]["floor_rms_m"]) + 7e-4)
 

@@ -1,4 +1,5 @@
-"""`fastrod drive` through its words: the emulated bench in stepped time, and one sentence for each wrong use."""
+"""`fastrod drive` through its words: the emulated bench in stepped time, and one sentence for each wrong
+use."""
 
 from __future__ import annotations
 
@@ -58,7 +59,9 @@ def rows(text: str) -> dict[str, list[float]]:
     for line in text.splitlines():
         cells = re.split(r"\s{2,}", line.strip())
         if len(cells) > 3 and re.fullmatch(r"-?[\d.]+", cells[1]):
-            found[cells[0]] = [float("nan") if re.search("[a-z]", cell) else float(cell) for cell in cells[1:]]
+            found[cells[0]] = [
+                float("nan") if re.search("[a-z]", cell) else float(cell) for cell in cells[1:]
+            ]
     return found
 
 
@@ -74,7 +77,19 @@ def test_track_by_the_model_and_by_the_policy(run: Run, tmp_path: Path) -> None:
     assert len(log) > 11.0 * 15.0 - 5
     radius = np.hypot(*log.tip_position[log.measured & (log.t > 3.0) & (log.t < 10.5), :2].T)
     assert np.abs(radius - 0.02).max() < 0.006
-    code, out, err = run("track", "--emulate", "--seed", EASY, TAUT, "--path", "square", "--policy", "shipped", "--out", "by_policy.csv")
+    code, out, err = run(
+        "track",
+        "--emulate",
+        "--seed",
+        EASY,
+        TAUT,
+        "--path",
+        "square",
+        "--policy",
+        "shipped",
+        "--out",
+        "by_policy.csv",
+    )
     assert (code, err) == (0, "")
     assert "policy" in out
     assert len(read_log(tmp_path / "by_policy.csv", load_robot("prototype"))) > 11.0 * 15.0 - 5
@@ -107,14 +122,16 @@ def test_calibrate_finds_the_hidden_lens(run: Run, tmp_path: Path) -> None:
     for name in ("fx, px", "fy, px", "cx, px", "cy, px", "k1", "k2", "p1", "p2"):
         found, stderr, _, true = told[name]
         assert off(found, true, stderr) < 4.0
-    assert off(told["fx, px"][2], told["fx, px"][3], told["fx, px"][1]) > 3.0  # the file's are those of another lens
+    # the file's are those of another lens
+    assert off(told["fx, px"][2], told["fx, px"][3], told["fx, px"][1]) > 3.0
     assert off(told["k1"][2], told["k1"][3], told["k1"][1]) > 8.0
     assert "12 views used, reprojection error 0." in out
     assert "not at rest" in out
     assert 'camera = "camera.toml"' in out
     camera = load_camera(tmp_path / "camera.toml")
     assert camera.matrix[0][0] == pytest.approx(told["fx, px"][0], abs=0.006)
-    assert replace(camera, matrix=CAMERA.matrix, distortion=CAMERA.distortion) == CAMERA  # all but the lens stays
+    # all but the lens stays
+    assert replace(camera, matrix=CAMERA.matrix, distortion=CAMERA.distortion) == CAMERA
     # and the line that it says does it
     text = SHIPPED.read_text(encoding="utf-8")
     text = text[: text.index("[camera]")] + text[text.index("[[drive]]") :]
@@ -130,7 +147,12 @@ def test_register_finds_the_hidden_place(run: Run, tmp_path: Path) -> None:
     code, out, err = run("register", "--emulate", "--seed", "4", "--views", "16")
     assert (code, err) == (0, "")
     told = rows(out)
-    assert list(told) == ["x, mm", "y, mm", "z, mm", *(f"turned about the camera's {axis}, deg" for axis in "xyz")]
+    assert list(told) == [
+        "x, mm",
+        "y, mm",
+        "z, mm",
+        *(f"turned about the camera's {axis}, deg" for axis in "xyz"),
+    ]
     for found, stderr, _, true in told.values():
         assert off(found, true, stderr) < 4.0
     assert max(off(file, true, stderr) for _, stderr, file, true in told.values()) > 10.0
@@ -148,9 +170,15 @@ def test_register_at_places_that_are_given(run: Run) -> None:
     assert (code, err) == (0, "")
     assert "5 views used" in out
     # a board that nobody can see there
-    code, out, err = run("register", "--emulate", "--out", "none.toml", "--at", "2", "2", "2", "1", "0", "0", "0")
+    code, out, err = run(
+        "register", "--emulate", "--out", "none.toml", "--at", "2", "2", "2", "1", "0", "0", "0"
+    )
     assert code == 1
-    assert re.fullmatch(r"no picture of the board could be taken in 60 s; frames passed over: \d+ no board seen\.\n", err)
+    assert re.fullmatch(
+        r"no picture of the board could be taken in 60 s; frames passed over: \d+ no board "
+        r"seen\.\n",
+        err,
+    )
 
 
 def test_register_with_a_real_camera_asks_for_each_place(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -159,7 +187,9 @@ def test_register_with_a_real_camera_asks_for_each_place(run: Run, monkeypatch: 
     eye = boards.BoardEye(truth, board, clock=WallClock(), seed=1)
     eye.place(*boards.fixtures(CAMERA, board)[1])
     opened, asked = [], []
-    monkeypatch.setattr(workbench, "VideoCamera", lambda camera, device: opened.append((camera, device)) or eye)
+    monkeypatch.setattr(
+        workbench, "VideoCamera", lambda camera, device: opened.append((camera, device)) or eye
+    )
     monkeypatch.setattr("builtins.input", asked.append)
     place = [f"{number:.6f}" for part in boards.fixtures(CAMERA, board)[1] for number in part]
     code, out, err = run("register", "--camera", "2", "--views", "2", "--at", *place)
@@ -174,7 +204,9 @@ def test_register_with_a_real_camera_asks_for_each_place(run: Run, monkeypatch: 
 def test_latency(run: Run, tmp_path: Path, seed: str) -> None:
     code, out, err = run("latency", "--emulate", "--seed", seed, TAUT, "--out", "camera.toml")
     assert (code, err) == (0, "")
-    found, stderr, hidden = (number(rf"{words} (-?[\d.]+)", out) for words in ("seen", "standard error", "hidden in the emulator:"))
+    found, stderr, hidden = (
+        number(rf"{words} (-?[\d.]+)", out) for words in ("seen", "standard error", "hidden in the emulator:")
+    )
     assert abs(found - hidden) < 4.0 * stderr + 5.0
     assert load_camera(tmp_path / "camera.toml").latency == pytest.approx(0.03 + 1e-3 * found, abs=2e-4)
 
@@ -196,8 +228,18 @@ def test_pictures_that_are_collected_differ() -> None:
     waved = boards.collect(eye, board, 4, clock, progress=lambda _, done, total: told.append(done))
     assert told == [1, 2, 3, 4]
     assert waved.passed["not at rest"] > 4
-    with pytest.raises(CalibrationError, match=r"no picture of the board could be taken in 0\.5 s; frames passed over: .* no board seen"):
-        boards.collect(eye, CharucoBoard(columns=7, rows=5, square=0.02, marker=0.015, dictionary="DICT_7X7_50"), 1, clock, patience=0.5)
+    with pytest.raises(
+        CalibrationError,
+        match=r"no picture of the board could be taken in 0\.5 s; frames "
+        r"passed over: .* no board seen",
+    ):
+        boards.collect(
+            eye,
+            CharucoBoard(columns=7, rows=5, square=0.02, marker=0.015, dictionary="DICT_7X7_50"),
+            1,
+            clock,
+            patience=0.5,
+        )
 
 
 # ---------------------------------------------------------------- wrong uses
@@ -255,7 +297,9 @@ def test_a_bench_that_is_not_there_failed(run: Run, tmp_path: Path) -> None:
     assert "cannot be opened; is it plugged in" in err.splitlines()[-1]
 
 
-def test_what_was_recorded_before_a_stop_is_told(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_recorded_before_a_stop_is_told(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     look = Emulator.read
 
     def covered(emulator: Emulator) -> Frame | None:

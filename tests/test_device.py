@@ -21,7 +21,7 @@ from fastrod_envs.vector import BatchEnv
 
 def test_an_unknown_device_is_answered_with_the_near_one() -> None:
     with pytest.raises(UnknownNameError, match="no device 'coda'; did you mean 'cuda'"):
-        Simulator(rod(), device="coda")  # type: ignore[arg-type]
+        Simulator(rod(), device="coda")
     with pytest.raises(UnknownNameError, match="no device 'GPU'; did you mean 'cuda'"):
         BatchEnv("Reach", 2, device="GPU")
 
@@ -38,20 +38,30 @@ def test_numbas_own_cuda_is_not_enough(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cuda, "is_available", lambda: True)
     monkeypatch.setattr(cuda, "implementation", "Built-in")
     monkeypatch.setattr(numba.config, "ENABLE_CUDASIM", 0)
-    with pytest.raises(InputError, match=r"the numba\.cuda within numba cannot compile the kernels; install .* fastrod\[cuda\]"):
+    with pytest.raises(
+        InputError,
+        match=r"the numba\.cuda within numba cannot compile the kernels; install "
+        r".* fastrod\[cuda\]",
+    ):
         Simulator(rod(), device="cuda")
 
 
 def test_a_numba_without_cuda_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "numba.cuda", None)
     monkeypatch.delattr("numba.cuda", raising=False)
-    with pytest.raises(InputError, match=r"numba has no numba\.cuda here; install NVIDIA's driver and fastrod\[cuda\]"):
+    with pytest.raises(
+        InputError,
+        match=r"numba has no numba\.cuda here; install NVIDIA's driver and "
+        r"fastrod\[cuda\]",
+    ):
         Simulator(rod(), device="cuda")
 
 
 @pytest.mark.parametrize("name", ["TubeInsert", "Push"])
 def test_tasks_with_contact_need_the_cpu(name: str) -> None:
-    with pytest.raises(InputError, match=f"device is 'cuda'; {name} has contact or a host's bodies, which need device 'cpu'"):
+    with pytest.raises(
+        InputError, match=f"device is 'cuda'; {name} has contact or a host's bodies, which need device 'cpu'"
+    ):
         BatchEnv(name, 2, device="cuda")
 
 
@@ -60,7 +70,7 @@ from types import SimpleNamespace
 import numba
 import numba.cuda.dispatcher
 from numba import cuda
-numba.cuda.dispatcher.get_current_device = lambda: SimpleNamespace(compute_capability=(9, 0))  # no GPU: say which one is meant
+numba.cuda.dispatcher.get_current_device = lambda: SimpleNamespace(compute_capability=(9, 0))
 import numpy as np
 from fastrod import Simulator, load_robot
 from fastrod.solver.gpu import batch
@@ -71,7 +81,9 @@ sim = Simulator(robot, outputs="tip")
 passes = sim._passes
 ports, rows = sim._reader.ports(Inputs(robot.rest_tendon_length)), np.arange(1)
 none = Response(np.empty((0, 0, 0)), np.empty((0, 0, 0)), np.empty((0, 0)))
-arguments = (rows, passes.params, ports, passes.layout, passes.memory, passes.new_shape("tip", False), none, 7, True, False, True, 1.0, 1.0)
+shape = passes.new_shape("tip", False)
+held = passes.layout, passes.memory, shape, none
+arguments = (rows, passes.params, ports, *held, 7, True, False, True, 1.0, 1.0)
 size = batch.room(4, passes.n_x, 7, passes.n_residuals(ports))
 for kernel, given in (
     (batch.pass_robots(size), arguments),
@@ -85,14 +97,18 @@ for kernel, given in (
 """
 
 
-@pytest.mark.skipif(find_spec("numba_cuda") is None, reason="the CUDA compiler is not here: pip install fastrod[cuda]")
+@pytest.mark.skipif(
+    find_spec("numba_cuda") is None, reason="the CUDA compiler is not here: pip install fastrod[cuda]"
+)
 def test_the_cuda_compiler_takes_the_kernels() -> None:
     done = subprocess.run([sys.executable, "-c", COMPILE], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == ["run", "_move", "_all_finite", "_put_rows"]
 
 
-def test_the_benchmark_says_what_it_can(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_benchmark_says_what_it_can(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(cuda, "is_available", lambda: False)
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "perf"))
     import bench_cuda

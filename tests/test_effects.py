@@ -1,4 +1,5 @@
-"""Laws over the whole registry of effects, so that a new one is tested the day it is written; robot files; a user's own effect."""
+"""Laws over the whole registry of effects, so that a new one is tested the day it is written; robot files; a
+user's own effect."""
 
 from __future__ import annotations
 
@@ -18,7 +19,17 @@ import fastrod
 import fastrod.effects.base as registry
 from fastrod import Robot, Simulator, load_robot, save_robot
 from fastrod.commands.cli import main
-from fastrod.effects.base import Operator, Parameter, Seam, columns, effect, effect_names, get_effect, has_memory, unregister
+from fastrod.effects.base import (
+    Operator,
+    Parameter,
+    Seam,
+    columns,
+    effect,
+    effect_names,
+    get_effect,
+    has_memory,
+    unregister,
+)
 from fastrod.effects.ports import EffectPorts
 from fastrod.errors import EffectError, InputError, RobotError, UnknownNameError
 from fastrod.kernels.operators import BUFFER
@@ -29,7 +40,17 @@ from fastrod.types import Floats
 NAMES = effect_names()
 OPERATORS = [name for name in NAMES if isinstance(get_effect(name), Operator)]
 N_STEPS, N_ROBOTS, DT = 15, 3, 0.05
-STATE = ("position", "rotation", "curvature", "arclength", "tension", "path_length", "base_wrench", "residual", "passes")
+STATE = (
+    "position",
+    "rotation",
+    "curvature",
+    "arclength",
+    "tension",
+    "path_length",
+    "base_wrench",
+    "residual",
+    "passes",
+)
 Table = dict[str, Any]
 Seen = dict[str, np.ndarray]
 
@@ -41,7 +62,7 @@ def one_segment() -> Robot:
 def two_segments() -> Robot:
     """Antagonistic wires, those of the far segment at places of their own in the near one."""
     (near,) = one_segment().segments
-    wires = tuple(replace(t, offset=(0.006, 0.005), angle=(t.angle + 0.7, t.angle)) for t in near.tendons)  # type: ignore[operator]
+    wires = tuple(replace(t, offset=(0.006, 0.005), angle=(t.angle + 0.7, t.angle)) for t in near.tendons)
     far = replace(near, length=0.06, bending_stiffness=(0.0015, 0.002), tendons=wires)
     return Robot(name="two", segments=(near, far), log_points=(0.05, 0.1))
 
@@ -62,18 +83,25 @@ def at_neutral(name: str, robot: Robot, *, shaped: bool = False) -> Table:
 def at_typical(name: str, robot: Robot, times: float = 1.0) -> Table:
     """The effect's table with typical sizes, or a multiple of them; what shapes it is neutral."""
     parameters = [p.on(wire(robot)) for p in get_effect(name).parameters]
-    sizes = {p.name: float(np.clip(p.neutral + times * (p.typical or 0.0), *p.bounds)) for p in parameters if not p.shape}
+    sizes = {
+        p.name: float(np.clip(p.neutral + times * (p.typical or 0.0), *p.bounds))
+        for p in parameters
+        if not p.shape
+    }
     return {"name": name} | sizes
 
 
 def commands(robot: Robot, n_steps: int = N_STEPS) -> np.ndarray:
-    """(n_steps, N_ROBOTS, n_tendons) bends there and back, up to about 1.2 rad in all, with a little common pull; robots out of step."""
+    """(n_steps, N_ROBOTS, n_tendons) bends there and back, up to about 1.2 rad in all, with a little common
+    pull; robots out of step."""
     t = np.linspace(0.0, 1.0, n_steps)[:, None] + 0.1 * np.arange(N_ROBOTS)
     lengths = np.zeros((n_steps, N_ROBOTS, robot.n_tendons))
     for k in range(robot.n_segments):
         size = 1.2 / robot.n_segments
         x, y = size * np.sin(7.0 * t + k), 0.6 * size * np.cos(5.0 * t - 2 * k)
-        unit_x, unit_y = (bend(robot, *a, segment=k) - robot.rest_tendon_length for a in ((1.0, 0.0), (0.0, 1.0)))
+        unit_x, unit_y = (
+            bend(robot, *a, segment=k) - robot.rest_tendon_length for a in ((1.0, 0.0), (0.0, 1.0))
+        )
         lengths += x[..., None] * unit_x + y[..., None] * unit_y
     return np.asarray(lengths + robot.rest_tendon_length * (1.0 - 1e-4 * t[..., None]))
 
@@ -82,21 +110,34 @@ def given(robot: Robot, step: int, moving: bool) -> dict[str, np.ndarray]:
     """Every kind of load and another base for each robot; `moving`: the tip force changes while they run."""
     tip = np.outer(np.arange(N_ROBOTS), [0.02, -0.03, 0.01]) * (1.0 + 0.1 * step * moving)
     half = 0.3 * np.arange(N_ROBOTS)
-    pose = np.column_stack([np.outer(np.arange(N_ROBOTS), [0.1, 0.2, 0.3]), np.cos(half), np.sin(half), 0.0 * half, 0.0 * half])
+    pose = np.column_stack(
+        [np.outer(np.arange(N_ROBOTS), [0.1, 0.2, 0.3]), np.cos(half), np.sin(half), 0.0 * half, 0.0 * half]
+    )
     line = np.full((robot.n_segments, 4, 3), 0.05) * np.arange(4)[:, None]
-    return {"tip_force": tip, "base_pose": pose, "line_force": line, "tip_moment": np.array([1e-4, 0.0, 2e-4])}
+    return {
+        "tip_force": tip,
+        "base_pose": pose,
+        "line_force": line,
+        "tip_moment": np.array([1e-4, 0.0, 2e-4]),
+    }
 
 
 def simulator(robot: Robot | list[Robot], n_robots: int = N_ROBOTS) -> Simulator:
     return Simulator(robot, n_robots=n_robots, dt=DT, points_per_segment=3)
 
 
-def run(sim: Simulator, lengths: np.ndarray, *, moving: bool = False, first: int = 0, rows: Any = slice(None)) -> Seen:
-    """Everything that is seen of a simulator while it steps along `lengths`; `rows`: which of the N_ROBOTS it has."""
+def run(
+    sim: Simulator, lengths: np.ndarray, *, moving: bool = False, first: int = 0, rows: Any = slice(None)
+) -> Seen:
+    """Everything that is seen of a simulator while it steps along `lengths`; `rows`: which of the N_ROBOTS it
+    has."""
     seen: dict[str, list[np.ndarray]] = {}
     for i, here in enumerate(lengths, first):
-        loads = {k: v[rows] if k in ("tip_force", "base_pose") else v for k, v in given(sim.robots[0], i, moving).items()}
-        state = sim.step(here[rows], **loads)  # type: ignore[arg-type]
+        loads = {
+            k: v[rows] if k in ("tip_force", "base_pose") else v
+            for k, v in given(sim.robots[0], i, moving).items()
+        }
+        state = sim.step(here[rows], **loads)
         for name in STATE:
             seen.setdefault(name, []).append(getattr(state, name))
         for name, value in sim.measure()._asdict().items():
@@ -125,7 +166,10 @@ def test_a_neutral_effect_is_the_base_model_bit_for_bit(name: str, robot: Robot)
 def test_the_whole_library_at_once_at_neutral_is_the_base_model() -> None:
     robot = two_segments()
     everything = having(robot, *(at_neutral(name, robot) for name in reversed(NAMES)))
-    assert_same(run(simulator(robot), commands(robot), moving=True), run(simulator(everything), commands(robot), moving=True))
+    assert_same(
+        run(simulator(robot), commands(robot), moving=True),
+        run(simulator(everything), commands(robot), moving=True),
+    )
 
 
 @ROBOTS
@@ -140,7 +184,8 @@ def test_a_typical_effect_is_seen_where_the_robot_can_show_it(name: str, robot: 
     if name == "coupling" and robot.n_segments == 1:
         assert (moved == 0.0).all()
     else:
-        assert (moved > 1e-6).all()  # a camera sees a tenth of a millimetre, a short run shows only a part of a slow effect
+        # a camera sees a tenth of a millimetre, a short run shows only a part of a slow effect
+        assert (moved > 1e-6).all()
     if get_effect(name).seam is Seam.SENSING:
         assert_array_equal(seen["position"], base["position"])
     assert_array_equal(seen["measured points"].shape, (N_STEPS, N_ROBOTS, len(robot.log_points), 3))
@@ -192,13 +237,18 @@ def test_a_bad_input_spoils_no_memory(name: str) -> None:
     assert_same(clean, seen, [0, 2], [0, 2])
     assert np.isnan(seen["position"][5:7, 1]).all()
     alone = run(simulator(robot, 1), np.delete(lengths, [5, 6], axis=0), rows=[1])
-    state = sim.settle(broken[6], **given(robot, 6, False))  # type: ignore[arg-type]
+    state = sim.settle(broken[6], **given(robot, 6, False))
     assert state.ok.tolist() == [True, False, True]
     assert np.isfinite(sim.jacobian()).all((1, 2)).tolist() == [True, False, True]
     assert_same(alone, {key: np.delete(a, [5, 6], axis=0) for key, a in seen.items()}, [0], [1])
     late = lengths.copy()
     late[0, 1] = np.nan  # and a robot whose first input is bad begins with its second
-    assert_same(run(simulator(robot, 1), lengths[1:], rows=[1]), {key: a[1:] for key, a in run(simulator(robot), late).items()}, [0], [1])
+    assert_same(
+        run(simulator(robot, 1), lengths[1:], rows=[1]),
+        {key: a[1:] for key, a in run(simulator(robot), late).items()},
+        [0],
+        [1],
+    )
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -209,9 +259,12 @@ def test_robots_without_wires_or_with_tensions_take_every_effect(name: str) -> N
         (rod("tendon_tension", 3, extension=(-0.01, 0.01)), {"tension": [0.3, 0.0, 0.1]}),
     ):
         table = at_typical(name, robot)
-        base, sim = Simulator(robot, points_per_segment=3), Simulator(having(robot, table), points_per_segment=3)
+        base, sim = (
+            Simulator(robot, points_per_segment=3),
+            Simulator(having(robot, table), points_per_segment=3),
+        )
         for _ in range(2):
-            one, two = base.step(**inputs), sim.step(**inputs)  # type: ignore[arg-type]
+            one, two = base.step(**inputs), sim.step(**inputs)
         assert two.ok.all()
         what = get_effect(name)
         if what.seam is Seam.ACTUATION and name not in ("tendon_stretch", "routing_angle"):
@@ -227,7 +280,8 @@ def test_a_sweep_over_a_log_is_its_steps_one_by_one(name: str) -> None:
     rng = np.random.default_rng(11)
     table = [at_typical(name, robot, times) for times in (1.0, 2.0)]
     values = np.array([registry.read_values(name, row, wiring, "test") for row in table])
-    dl = 0.01 * np.cumsum(rng.uniform(-0.2, 0.2, (2, 300, robot.n_tendons)), axis=1)  # beyond the buffer of a delay
+    # beyond the buffer of a delay
+    dl = 0.01 * np.cumsum(rng.uniform(-0.2, 0.2, (2, 300, robot.n_tendons)), axis=1)
     dt = rng.uniform(0.0, 0.04, 300) * (rng.random(300) > 0.1)  # irregular, and some at once
     kept = dl.copy()
     whole_memory, parts_memory = (what.memory(2, robot.n_tendons) for _ in range(2))
@@ -242,7 +296,8 @@ def test_a_sweep_over_a_log_is_its_steps_one_by_one(name: str) -> None:
 
 
 def test_memories_are_as_wide_as_their_operators_need() -> None:
-    """What a sweep leaves behind: numbers in every column that a wire, a bend or a past step has, and no column beside the memory."""
+    """What a sweep leaves behind: numbers in every column that a wire, a bend or a past step has, and no
+    column beside the memory."""
     wires = {"backlash": 3, "friction": 6, "creep": 2, "dynamics": 3}
     assert set(OPERATORS) == {*wires, "latency", "plastic_set"}
     robot = two_segments()
@@ -251,7 +306,13 @@ def test_memories_are_as_wide_as_their_operators_need() -> None:
     for name in OPERATORS:
         what: Any = get_effect(name)
         memory = what.memory(1, n)
-        what.sweep(np.array([registry.read_values(name, at_typical(name, robot), wiring, "test")]), memory, dl, np.full(20, 0.1), wiring)
+        what.sweep(
+            np.array([registry.read_values(name, at_typical(name, robot), wiring, "test")]),
+            memory,
+            dl,
+            np.full(20, 0.1),
+            wiring,
+        )
         if name == "latency":
             assert memory.shape[1] == 1 + BUFFER * (1 + n)
             used = 1 + 20 * (1 + n)
@@ -263,11 +324,13 @@ def test_memories_are_as_wide_as_their_operators_need() -> None:
 
 
 def test_a_set_needs_no_memory_where_no_wire_ends() -> None:
-    """More segments than wires: a passive one, then one with two wires. What no wire commands keeps no set, and nothing is written
-    beside the memory."""
+    """More segments than wires: a passive one, then one with two wires. What no wire commands keeps no set,
+    and nothing is written beside the memory."""
     (near,) = one_segment().segments
     chain = (replace(near, mode="passive", tendons=()),) * 2 + (replace(near, tendons=near.tendons[:2]),)
-    robot = having(Robot(name="few wires", segments=chain), {"name": "plastic_set", "share": 0.2, "yield_at": 0.1})
+    robot = having(
+        Robot(name="few wires", segments=chain), {"name": "plastic_set", "share": 0.2, "yield_at": 0.1}
+    )
     wiring = wire(robot)
     what: Any = get_effect("plastic_set")
     memory = what.memory(1, 2)
@@ -291,16 +354,23 @@ JACOBIANS: list[Table] = [
 ]
 
 
-@pytest.mark.parametrize("tables", [*([table] for table in JACOBIANS), JACOBIANS], ids=[*(t["name"] for t in JACOBIANS), "all"])
+@pytest.mark.parametrize(
+    "tables", [*([table] for table in JACOBIANS), JACOBIANS], ids=[*(t["name"] for t in JACOBIANS), "all"]
+)
 def test_the_jacobian_is_by_what_is_commanded(tables: list[Table]) -> None:
     robot = having(two_segments(), *tables)
     lengths = bend(robot, 0.4, -0.3) + bend(robot, -0.3, 0.5, 1) - robot.rest_tendon_length - 1e-5
-    base = {"tendon_length": lengths, "tip_force": np.array([0.05, 0.02, -0.03]), "extension": np.array([0.001, -0.002])}
+    base = {
+        "tendon_length": lengths,
+        "tip_force": np.array([0.05, 0.02, -0.03]),
+        "extension": np.array([0.001, -0.002]),
+    }
     sim = Simulator(robot, points_per_segment=4)
-    assert sim.settle(**base, tolerance=1e-13).ok.all()  # type: ignore[arg-type]
+    assert sim.settle(**base, tolerance=1e-13).ok.all()
     jacobian = sim.jacobian()[0]
     columns = [("tendon_length", i, 1e-6, 1e-6) for i in range(8)]
-    # wires that hold a body that stretches twist it, steeply: the step of 1e-4 of the length that `jacobian` takes is then too
+    # wires that hold a body that stretches twist it, steeply: the step of 1e-4 of the length that `jacobian`
+    # takes is then too
     # long by its square; twice what is left
     columns += [("extension", k, 1e-6, 5e-6) for k in range(2)]
     for j, (name, i, delta, tolerance) in enumerate(columns):
@@ -321,7 +391,10 @@ def test_the_jacobian_of_an_effect_with_memory_stays_in_its_loop() -> None:
 
 
 def test_effects_of_a_robot_file_come_back_and_act(tmp_path: Path) -> None:
-    tables = ({"name": "drum_gain", "gain": [0.1, 0.0, -0.1, 0.2]}, {"name": "creep", "share": 0.1, "time_constant": 2.0})
+    tables = (
+        {"name": "drum_gain", "gain": [0.1, 0.0, -0.1, 0.2]},
+        {"name": "creep", "share": 0.1, "time_constant": 2.0},
+    )
     robot = having(two_segments(), *tables)
     save_robot(robot, tmp_path / "mine.toml")
     again = load_robot(tmp_path / "mine.toml")
@@ -339,9 +412,23 @@ def test_effects_of_a_robot_file_come_back_and_act(tmp_path: Path) -> None:
     [
         ([{"name": "backlsh"}], UnknownNameError, "no effect 'backlsh'; did you mean 'backlash'"),
         ([{"name": "gear_ply"}], UnknownNameError, "did you mean 'gear_play'"),
-        ([{"name": "backlash", "half_widht": 1e-4}], EffectError, "robot 'two': .* no parameter 'half_widht'; did you mean 'half_width'"),
-        ([{"name": "backlash", "half_width": -1e-4}], EffectError, r"is -0.0001 m; it must be a number from 0 to"),
-        ([{"name": "backlash", "half_width": 1.0}], EffectError, r"is 1.0 m; it must be a number from 0 to 0.00"),
+        (
+            [{"name": "backlash", "half_widht": 1e-4}],
+            EffectError,
+            "robot 'two': .* no parameter 'half_widht'; did you mean 'half_width'",
+        ),
+        (
+            [{"name": "backlash", "half_width": -1e-4}],
+            EffectError,
+            r"is -0.0001 m; it must be a number from "
+            r"0 to",
+        ),
+        (
+            [{"name": "backlash", "half_width": 1.0}],
+            EffectError,
+            r"is 1.0 m; it must be a number from 0 to "
+            r"0.00",
+        ),
         ([{"name": "creep", "share": "a"}], EffectError, "share of effect 'creep' is 'a'"),
         ([{"name": "creep", "share": True}], EffectError, "is True"),
         ([{"name": "creep", "share": float("nan")}], EffectError, "is nan"),
@@ -367,8 +454,16 @@ def test_bad_tables_get_one_sentence(tables: list[Table], kind: type[Exception],
     ("table", "kind", "sentence"),
     [
         ('name = "backlsh"', UnknownNameError, "no effect 'backlsh'; did you mean 'backlash'"),
-        ('name = "backlash"\nhalf_widht = 1e-4', EffectError, "has no parameter 'half_widht'; did you mean 'half_width'"),
-        ('name = "backlash"\nhalf_width = 1.0', EffectError, "half_width of effect 'backlash' is 1.0 m; it must be a number from 0"),
+        (
+            'name = "backlash"\nhalf_widht = 1e-4',
+            EffectError,
+            "has no parameter 'half_widht'; did you mean 'half_width'",
+        ),
+        (
+            'name = "backlash"\nhalf_width = 1.0',
+            EffectError,
+            "half_width of effect 'backlash' is 1.0 m; it must be a number from 0",
+        ),
         ('name = "play"\n[[effect]]\nname = "backlash"', EffectError, "has effect 'backlash' twice"),
     ],
 )
@@ -389,7 +484,9 @@ def test_robots_of_a_batch_name_the_same_effects_and_share_their_wiring() -> Non
     plain, heavy = rod(), having(rod(), {"name": "gravity", "line_density": 0.1})
     with pytest.raises(RobotError, match="robot 1 of the batch has effects gravity, robot 0 has none"):
         Simulator([plain, heavy])
-    with pytest.raises(RobotError, match="robot 1 of the batch has segments of other lengths or wires at other places"):
+    with pytest.raises(
+        RobotError, match="robot 1 of the batch has segments of other lengths or wires at other places"
+    ):
         Simulator([heavy, having(rod(offset=0.008), *heavy.effects)])
     Simulator([plain, rod(offset=0.008)])  # which robots without effects may
     stiff = having(rod(bending_stiffness=(0.003, 0.003)), *heavy.effects)
@@ -446,8 +543,14 @@ def test_an_effect_says_what_it_is(name: str) -> None:
 def test_effects_act_from_the_motor_to_the_camera() -> None:
     seams = [get_effect(name).seam.value for name in NAMES]
     assert seams == sorted(seams)
-    contracted = "gravity payload tip_force friction backlash tendon_stretch creep latency frame_misalignment marker_offset drum_gain "
-    contracted += "encoder_offset precurvature routing_angle coupling stiffness_anisotropy stiffness_taper stiffening axial_compression "
+    contracted = (
+        "gravity payload tip_force friction backlash tendon_stretch creep latency "
+        "frame_misalignment marker_offset drum_gain "
+    )
+    contracted += (
+        "encoder_offset precurvature routing_angle coupling stiffness_anisotropy stiffness_taper "
+        "stiffening axial_compression "
+    )
     assert set(contracted.split()) | {"time_drift"} <= set(NAMES)
 
 
@@ -495,7 +598,7 @@ def clean_registry() -> Iterator[None]:
     yield
     for kept, then in ((registry._REGISTRY, before), (registry._SYNONYMS, synonyms)):
         kept.clear()
-        kept.update(then)  # type: ignore[arg-type]
+        kept.update(then)
 
 
 @pytest.mark.usefixtures("clean_registry")
@@ -508,7 +611,10 @@ def test_a_users_effect_works_where_the_librarys_do() -> None:
     there = Simulator(rod(line_density=0.1)).settle(bend(robot, 0.5, 0.0))
     assert_allclose(here.position, there.position, atol=1e-14)
     base = run(simulator(two_segments()), commands(two_segments()), moving=True)
-    assert_same(base, run(simulator(having(two_segments(), {"name": "weight"})), commands(two_segments()), moving=True))
+    assert_same(
+        base,
+        run(simulator(having(two_segments(), {"name": "weight"})), commands(two_segments()), moving=True),
+    )
     unregister("weight")
     with pytest.raises(UnknownNameError, match="no effect 'weight'"):
         Simulator(robot)
@@ -531,7 +637,10 @@ def variant(name: str = "Weight", **changes: Any) -> type:
 @pytest.mark.parametrize(
     ("made", "sentence"),
     [
-        (variant(__doc__="Equation: x\nSource: y"), "'weight' does not say its Residual signature; its docstring needs a line"),
+        (
+            variant(__doc__="Equation: x\nSource: y"),
+            "'weight' does not say its Residual signature; its docstring needs a line",
+        ),
         (variant(__doc__=None), "does not say its Equation"),
         (type("Bare", (), {"__doc__": Weight.__doc__}), "'bare' has no seam"),
         (variant(seam=3), "has seam 3; give one of"),
@@ -553,16 +662,26 @@ def test_a_class_that_is_no_effect_is_refused(made: type, sentence: str) -> None
 
 
 def test_a_parameter_has_its_neutral_value_in_its_bounds() -> None:
-    with pytest.raises(EffectError, match=r"'size' has neutral value 0\.0; it must lie in its bounds 1\.0 to 2\.0"):
+    with pytest.raises(
+        EffectError,
+        match=r"'size' has neutral value 0\.0; it must lie in its bounds 1\.0 "
+        r"to 2\.0",
+    ):
         Parameter("size", "m", bounds=(1.0, 2.0))
     assert Parameter("size", "m", bounds=(0.0, 2.0)).scale == pytest.approx(0.2)
     assert Parameter("size", "m").starts == (1.0,)
     scaled = Parameter("size", "m", bounds=(0.0, 2.0), typical=0.5, of="length").on(wire(two_segments()))
-    assert (scaled.bounds, scaled.typical, scaled.of) == ((0.0, pytest.approx(0.26)), pytest.approx(0.065), "")
+    assert (scaled.bounds, scaled.typical, scaled.of) == (
+        (0.0, pytest.approx(0.26)),
+        pytest.approx(0.065),
+        "",
+    )
 
 
 @pytest.mark.usefixtures("clean_registry")
-def test_installed_packages_bring_effects_by_entry_point(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_installed_packages_bring_effects_by_entry_point(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     source = '''
 from fastrod.effects.base import Parameter, Seam, Static, effect
 
@@ -582,9 +701,14 @@ class Wind(Static):
     (tmp_path / "breezy_effects.py").write_text(source)
     monkeypatch.syspath_prepend(tmp_path)
     plug_in = EntryPoint("breezy", "breezy_effects", "fastrod.effects")
-    monkeypatch.setattr(registry, "entry_points", lambda group: [plug_in] if group == "fastrod.effects" else [])
+    monkeypatch.setattr(
+        registry, "entry_points", lambda group: [plug_in] if group == "fastrod.effects" else []
+    )
     registry.load_library.cache_clear()
     assert "wind" in effect_names()
     robot = having(rod(), {"name": "wind", "force": 0.1})
-    here, there = Simulator(robot).settle(bend(robot, 0.3, 0.1)), Simulator(rod()).settle(bend(robot, 0.3, 0.1), tip_force=(0.1, 0.0, 0.0))
+    here, there = (
+        Simulator(robot).settle(bend(robot, 0.3, 0.1)),
+        Simulator(rod()).settle(bend(robot, 0.3, 0.1), tip_force=(0.1, 0.0, 0.0)),
+    )
     assert_array_equal(here.position, there.position)

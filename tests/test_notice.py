@@ -1,4 +1,5 @@
-"""The line on stderr before kernels are compiled: in scripts too, once a process, and not where they are cached."""
+"""The line on stderr before kernels are compiled: in scripts too, once a process, and not where they are
+cached."""
 
 from __future__ import annotations
 
@@ -27,7 +28,9 @@ def said(folder: Path | str, **environment: str) -> str:
     """Stderr of the script with its cache in `folder`."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("FASTROD_", "XDG_"))}
     there = {"FASTROD_CACHE_DIR": str(folder), **environment}
-    done = subprocess.run([sys.executable, "-c", SCRIPT], env=kept | there, check=True, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT], env=kept | there, check=True, capture_output=True, text=True
+    )
     assert done.stdout == "done\n"
     return done.stderr
 
@@ -51,7 +54,10 @@ class Compilation:
 
 @pytest.mark.parametrize(
     ("cached", "how_often"),
-    [(True, "once"), (False, "in each process, for no cache folder can be written (FASTROD_CACHE_DIR names one)")],
+    [
+        (True, "once"),
+        (False, "in each process, for no cache folder can be written (FASTROD_CACHE_DIR names one)"),
+    ],
 )
 def test_the_kernels_of_contact_have_a_line_of_their_own(
     cached: bool, how_often: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

@@ -1,4 +1,5 @@
-"""What is built is what was meant: one wheel with five import names, an sdist that builds the same, and extras that stand alone."""
+"""What is built is what was meant: one wheel with five import names, an sdist that builds the same, and
+extras that stand alone."""
 
 from __future__ import annotations
 
@@ -26,11 +27,14 @@ log = read_log(files("fastrod") / "data" / "demo_log.csv", fastrod.load_robot("p
 """What every installation does."""
 ALSO = {
     "": "import numba, scipy, fcl, trimesh, rich, matplotlib",
-    "parquet": "write_log(log, 'log.parquet'); assert len(read_log('log.parquet', fastrod.load_robot('prototype'))) == len(log)",
+    "parquet": "write_log(log, 'log.parquet'); assert len(read_log('log.parquet', "
+    "fastrod.load_robot('prototype'))) == len(log)",
     "envs": "import gymnasium, fastrod_envs; assert gymnasium.spec('fastrod/Reach-v0').vector_entry_point",
-    "rl": "import torch, stable_baselines3; from fastrod_envs.policies import Policy, find; assert Policy(find('Reach', 'shipped'))",
+    "rl": "import torch, stable_baselines3; from fastrod_envs.policies import Policy, find; assert "
+    "Policy(find('Reach', 'shipped'))",
     "viewer": "from fastrod_viewer.server import serve; server = serve(port=0); server.stop()",
-    "device": "import can, canopen, cv2; from fastrod_device.hardware import load_hardware; assert load_hardware().robot.n_tendons == 4",
+    "device": "import can, canopen, cv2; from fastrod_device.hardware import load_hardware; assert "
+    "load_hardware().robot.n_tendons == 4",
     "hosts": "from fastrod.hosts import connect; world = connect(dt=0.01); world.stepSimulation()",
     "mujoco": "import mujoco; from fastrod.hosts import MujocoRod, add_capsules",
     "ray": "import ray, pyarrow; from fastrod.generation.plan import Plan",
@@ -41,7 +45,12 @@ ALSO = {
 
 
 def built(target: Path, source: Path) -> list[Path]:
-    subprocess.run([sys.executable, "-m", "hatchling", "build", "-d", str(target)], cwd=source, check=True, capture_output=True)
+    subprocess.run(
+        [sys.executable, "-m", "hatchling", "build", "-d", str(target)],
+        cwd=source,
+        check=True,
+        capture_output=True,
+    )
     return sorted(target.iterdir())
 
 
@@ -89,7 +98,9 @@ def test_it_works_in_an_empty_environment_with_one_extra(extra: str, wheel: Path
         pytest.skip("uv is not installed; pip install uv")
     # uv reads neither pip's settings nor its environment
     places = {"UV_FIND_LINKS": os.environ["PIP_FIND_LINKS"]} if "PIP_FIND_LINKS" in os.environ else {}
-    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")} | places
+    environment = {
+        name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")
+    } | places
     python = tmp_path / "venv" / "bin" / "python"
     wanted = f"{wheel}[{extra}]" if extra else str(wheel)
     for command in (
@@ -99,7 +110,15 @@ def test_it_works_in_an_empty_environment_with_one_extra(extra: str, wheel: Path
         done = subprocess.run(command, env=environment, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
     (tmp_path / "empty").mkdir()
-    done = subprocess.run([python, "-c", SMOKE + ALSO[extra]], cwd=tmp_path / "empty", env=environment, capture_output=True, text=True)
+    done = subprocess.run(
+        [python, "-c", SMOKE + ALSO[extra]],
+        cwd=tmp_path / "empty",
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stderr
-    told = subprocess.run([python.parent / "fastrod", "--version"], env=environment, capture_output=True, text=True, check=True).stdout
+    told = subprocess.run(
+        [python.parent / "fastrod", "--version"], env=environment, capture_output=True, text=True, check=True
+    ).stdout
     assert told.strip().endswith(wheel.name.split("-")[1])

@@ -1,4 +1,5 @@
-"""The peers of the benchmark: all solve the rod of Appendix J, the better the finer, and one that is missing is a sentence."""
+"""The peers of the benchmark: all solve the rod of Appendix J, the better the finer, and one that is missing
+is a sentence."""
 
 from __future__ import annotations
 
@@ -14,9 +15,17 @@ from numpy.testing import assert_allclose
 from truthfiles import numbers, rows
 
 NAMES = (
-    "fastrod, settle", "fastrod, step", "scipy shooting", "scipy solve_bvp", "MuJoCo rod (flexcomp)", "MuJoCo chain, ball joints",
-    "MuJoCo chain, hinges", "PyBullet chain, equal links", "PyBullet chain, half end links", "PyElastica",
-)  # fmt: skip
+    "fastrod, settle",
+    "fastrod, step",
+    "scipy shooting",
+    "scipy solve_bvp",
+    "MuJoCo rod (flexcomp)",
+    "MuJoCo chain, ball joints",
+    "MuJoCo chain, hinges",
+    "PyBullet chain, equal links",
+    "PyBullet chain, half end links",
+    "PyElastica",
+)
 COMPILED_LONG = ("soromox PCS", "soromox GVS")
 RELAXED = ("MuJoCo", "PyBullet", "PyElastica")
 SLOWEST = 3  # rungs that are tried here: the finer ones of the slow peers take seconds
@@ -79,7 +88,8 @@ def test_a_finer_setting_is_nearer_to_the_truth(name: str) -> None:
 
 @pytest.mark.parametrize("name", COMPILED_LONG)
 def test_the_coarsest_setting_that_takes_long_to_compile(name: str) -> None:
-    """One arc under a small load: EI l u = F l^2/2, so the tip goes u l^2/2 = F l^3/4EI, 3/4 of the rod's F l^3/3EI."""
+    """One arc under a small load: EI l u = F l^2/2, so the tip goes u l^2/2 = F l^3/4EI, 3/4 of the rod's F
+    l^3/3EI."""
     import appendix_j
 
     force = np.array([0.01])
@@ -127,13 +137,16 @@ def test_half_end_links_converge_at_second_order_and_equal_links_at_first() -> N
     assert order("MuJoCo chain, hinges") == pytest.approx(2.0, abs=0.1)
 
 
-@pytest.mark.parametrize("name", ["fastrod, settle", "MuJoCo rod (flexcomp)", "MuJoCo chain, ball joints", "MuJoCo chain, hinges"])
+@pytest.mark.parametrize(
+    "name", ["fastrod, settle", "MuJoCo rod (flexcomp)", "MuJoCo chain, ball joints", "MuJoCo chain, hinges"]
+)
 def test_all_in_one_call_is_one_after_the_other(name: str) -> None:
     force = np.array([0.65, 0.05, 0.3])
     rung = peer(name).rungs()[1]
     with rung.build() as one_by_one, rung.together() as together:
         assert_allclose(together(force), one_by_one(force), rtol=0, atol=1e-9)
-        assert_allclose(together(force[:2]), one_by_one(force[:2]), rtol=0, atol=1e-9)  # nothing is left of the call before
+        # nothing is left of the call before
+        assert_allclose(together(force[:2]), one_by_one(force[:2]), rtol=0, atol=1e-9)
 
 
 def test_ratios_are_read_between_the_measured_settings_and_never_beyond() -> None:
@@ -146,13 +159,20 @@ def test_ratios_are_read_between_the_measured_settings_and_never_beyond() -> Non
     assert error_ratio(1e-3, 1e-2, own) == Ratio(1e5, least=True)
     assert error_ratio(1e-3, 2e-3, own).value == pytest.approx(1e3)
     assert math.isnan(error_ratio(1e-3, 5e-4, own).value)
-    assert [str(Ratio(math.nan)), str(Ratio(1234.5, least=True)), str(Ratio(0.51))] == ["-", ">= 1,234", "0.51"]
+    assert [str(Ratio(math.nan)), str(Ratio(1234.5, least=True)), str(Ratio(0.51))] == [
+        "-",
+        ">= 1,234",
+        "0.51",
+    ]
 
 
 def test_only_points_that_none_beats_are_on_the_front() -> None:
     import bench_peers
 
-    made = [bench_peers.Point(None, None, error, time, 0.0) for error, time in ((1e-3, 1.0), (1e-4, 3.0), (1e-2, 2.0), (1e-5, 2.5))]
+    made = [
+        bench_peers.Point(None, None, error, time, 0.0)
+        for error, time in ((1e-3, 1.0), (1e-4, 3.0), (1e-2, 2.0), (1e-5, 2.5))
+    ]
     assert bench_peers.front(made) == [(1.0, 1e-3), (2.5, 1e-5)]
 
 
@@ -166,7 +186,10 @@ def test_the_bench_runs_and_what_is_missing_is_a_sentence(
     file = tmp_path / "peers.png"
     assert bench_peers.main(["--quick", "--json", "--plot", str(file)]) == 0
     sections = json.loads(capsys.readouterr().out)["sections"]
-    assert "Unheard is left out: unheard_of is not installed (pip install -e '.[peers]')." in sections["peers"]["notes"]
+    assert (
+        "Unheard is left out: unheard_of is not installed (pip install -e '.[peers]')."
+        in sections["peers"]["notes"]
+    )
     names = {"fastrod, settle", "fastrod, settle" + bench_peers.IN_ONE_CALL, "scipy solve_bvp"}
     assert {row["peer"] for row in sections["peers"]["rows"]} == names
     (summary,) = sections["peers_summary"]["rows"]

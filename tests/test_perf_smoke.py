@@ -1,4 +1,5 @@
-"""The benchmark's own instruments: its peers solve the same rod, its count of operations is exact, its rows become JSON."""
+"""The benchmark's own instruments: its peers solve the same rod, its count of operations is exact, its rows
+become JSON."""
 
 from __future__ import annotations
 
@@ -63,7 +64,12 @@ def test_the_count_of_operations_is_linear_in_the_steps() -> None:
 def test_rows_become_json_and_a_table(capsys: pytest.CaptureFixture[str]) -> None:
     from report import Column, Section, show
 
-    section = Section("key", "Title", [Column("a", "a [m]"), Column("b", "b", ".1f"), Column("c", "c")], [{"a": "x", "b": 1.25, "c": True}])
+    section = Section(
+        "key",
+        "Title",
+        [Column("a", "a [m]"), Column("b", "b", ".1f"), Column("c", "c")],
+        [{"a": "x", "b": 1.25, "c": True}],
+    )
     assert json.loads(json.dumps(section.as_json()))["rows"] == [{"a": "x", "b": 1.25, "c": True}]
     show([section], "head")
     out = capsys.readouterr().out
@@ -72,13 +78,31 @@ def test_rows_become_json_and_a_table(capsys: pytest.CaptureFixture[str]) -> Non
     assert "yes" in out
 
 
-def told(case: str, true: str, named: list[str], verdict: str, left: float = 0.0, classes: list[list[str]] | None = None) -> dict[str, Any]:
+def told(
+    case: str,
+    true: str,
+    named: list[str],
+    verdict: str,
+    left: float = 0.0,
+    classes: list[list[str]] | None = None,
+) -> dict[str, Any]:
     """A row of the attribution benchmark: `left` of the error above a floor of 0.5 mm, 2 mm before."""
     return {
-        "case": case, "seed": 1, "true": true.split(), "verdict": verdict, "kind": "none", "named": named,
-        "classes": classes or [[] for _ in named], "before": 2.5e-3, "after": 0.5e-3 + 2e-3 * left, "floor": 0.5e-3, "bounds": 3,
-        "left": left, "seconds": 1.0, "rows": 100,
-    }  # fmt: skip
+        "case": case,
+        "seed": 1,
+        "true": true.split(),
+        "verdict": verdict,
+        "kind": "none",
+        "named": named,
+        "classes": classes or [[] for _ in named],
+        "before": 2.5e-3,
+        "after": 0.5e-3 + 2e-3 * left,
+        "floor": 0.5e-3,
+        "bounds": 3,
+        "left": left,
+        "seconds": 1.0,
+        "rows": 100,
+    }
 
 
 WANTED = [
@@ -121,17 +145,22 @@ def test_verdicts_are_summed_up_by_case(capsys: pytest.CaptureFixture[str]) -> N
 
     rows = [row for _, row in WANTED]
     table = {line["case"]: line for line in summary(rows)}
-    assert {case: (line["logs"], round(line["as_wanted"] * line["logs"])) for case, line in table.items()} == {
-        case: (n, sum(wanted for wanted, row in WANTED if row["case"] == case)) for case, n in Counter(r["case"] for r in rows).items()
+    assert {
+        case: (line["logs"], round(line["as_wanted"] * line["logs"])) for case, line in table.items()
+    } == {
+        case: (n, sum(wanted for wanted, row in WANTED if row["case"] == case))
+        for case, n in Counter(r["case"] for r in rows).items()
     }
     assert table["segments"]["crashed"] == 1
     assert table["deleted"]["verdicts"] == {"explained": 2, "ambiguous": 1, "not_in_library": 2}
     assert table["single"]["after_over_floor_median"] == pytest.approx(1.0)  # of those that named something
     assert table["deleted"]["after_within_1.15"] == 0.0
     assert confusion(rows) == {
-        "creep": {"creep": 1, "friction": 1, "none": 1}, "none": {"none": 1, "lens": 1}, "bump": {"not_in_library": 1, "time_drift": 1},
+        "creep": {"creep": 1, "friction": 1, "none": 1},
+        "none": {"none": 1, "lens": 1},
+        "bump": {"not_in_library": 1, "time_drift": 1},
         "lens": {"lens": 1},
-    }  # fmt: skip
+    }
     assert json.loads(json.dumps(table))
     show(rows, list(table.values()), 2)
     out = capsys.readouterr().out
@@ -164,7 +193,11 @@ def test_a_robot_and_its_wires_stiffer_alike_change_under_loads_only() -> None:
     from bench_measured import stiffer
     from fastrod import Simulator
 
-    for effects in ((), ({"name": "tendon_stretch", "compliance": 2e-4},), ({"name": "drum_gain", "gain": [0.1, -0.05]},)):
+    for effects in (
+        (),
+        ({"name": "tendon_stretch", "compliance": 2e-4},),
+        ({"name": "drum_gain", "gain": [0.1, -0.05]},),
+    ):
         soft = replace(rod(compliance=1e-4), effects=effects)
         lengths = bend(soft, 0.6, -0.4)
         for factor in (0.5, 8.0):
@@ -173,9 +206,12 @@ def test_a_robot_and_its_wires_stiffer_alike_change_under_loads_only() -> None:
             assert one.ok.all()
             assert two.ok.all()
             np.testing.assert_allclose(two.tip_position, one.tip_position, rtol=0, atol=1e-9)
-            loaded = [Simulator(r).settle(lengths, tip_force=[0.1, 0.1, 0.0]).tip_position for r in (soft, hard)]
+            loaded = [
+                Simulator(r).settle(lengths, tip_force=[0.1, 0.1, 0.0]).tip_position for r in (soft, hard)
+            ]
             gives = [np.linalg.norm(tip - one.tip_position) for tip in loaded]
-            assert gives[1] * factor == pytest.approx(gives[0], rel=0.15)  # in proportion, but for the bend that it adds
+            # in proportion, but for the bend that it adds
+            assert gives[1] * factor == pytest.approx(gives[0], rel=0.15)
 
 
 def test_the_contact_bench_runs_and_its_states_are_what_they_say(capsys: pytest.CaptureFixture[str]) -> None:
@@ -184,7 +220,15 @@ def test_the_contact_bench_runs_and_its_states_are_what_they_say(capsys: pytest.
     assert bench_contact.main(["--quick", "--json", "--robots", "3"]) == 0
     sections = json.loads(capsys.readouterr().out)["sections"]
     steps = sections["contact_steps"]["rows"]
-    assert [row["state"] for row in steps] == ["no scene", "free", "free", "grazing", "grazing", "in contact", "in contact"]
+    assert [row["state"] for row in steps] == [
+        "no scene",
+        "free",
+        "free",
+        "grazing",
+        "grazing",
+        "in contact",
+        "in contact",
+    ]
     assert {row["not_ok"] for row in steps} == {0}
     assert {row["touching"] for row in steps if row["state"] != "in contact"} == {0.0}
     assert {row["touching"] for row in steps if row["state"] == "in contact"} == {1.0}
@@ -209,7 +253,8 @@ def test_fcl_is_asked_about_the_same_distances() -> None:
         nodes = timed.last.position[i]
         chords = min(scene.segment(0, a, b).distance for a, b in pairwise(nodes))
         assert timed.last.contacts is not None
-        assert timed.last.contacts.clearance[i] == pytest.approx(chords - batch.rod_radius, abs=2e-4)  # a curve and its chords
+        # a curve and its chords
+        assert timed.last.contacts.clearance[i] == pytest.approx(chords - batch.rod_radius, abs=2e-4)
         answer = touching.ask_fcl(touching.questions(timed, obstacle, pose, [i]))
         assert answer == pytest.approx(chords, abs=1e-4)  # capsules of 1e-6 m, and the iteration of libccd
     assert touching.fcl_seconds(timed, obstacle, pose, 2)[1] == 2
@@ -237,7 +282,8 @@ def test_the_hosts_bench_runs_and_its_states_are_what_they_say(capsys: pytest.Ca
     assert rows["prototype, free"]["touching"] == 0.0
     assert all(row["failed"] == 0 for row in rows.values())
     assert len(sections["engines"]["rows"]) == 4
-    assert all(max(row["tip"], row["force"], row["moment"]) < 1.0 for row in sections["engines"]["rows"])  # per cent
+    # per cent
+    assert all(max(row["tip"], row["force"], row["moment"]) < 1.0 for row in sections["engines"]["rows"])
 
 
 def test_the_envs_bench_runs_over_every_task(capsys: pytest.CaptureFixture[str]) -> None:

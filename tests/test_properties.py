@@ -37,7 +37,8 @@ def test_frames_are_rotations_and_nodes_a_step_apart(x: float, y: float, load: t
     R = state.rotation[0]
     assert_allclose(np.swapaxes(R, 1, 2) @ R, np.broadcast_to(np.eye(3), R.shape), atol=1e-13)
     chord = np.linalg.norm(np.diff(state.position[0], axis=0), axis=1)
-    assert (chord <= 0.007 * (1 + 1e-6)).all()  # the backbone does not stretch: a chord is never longer than its arc
+    # the backbone does not stretch: a chord is never longer than its arc
+    assert (chord <= 0.007 * (1 + 1e-6)).all()
 
 
 @same_every_time
@@ -54,7 +55,8 @@ def test_the_base_carries_the_tip_force_and_its_moment(x: float, y: float, load:
 @same_every_time
 @given(angle, angle, force)
 def test_a_mirror_image_bends_into_the_mirror_image(x: float, y: float, load: tuple[float, ...]) -> None:
-    """Reflected in the plane x = 0: forces turn their x, bends about d2 turn their sign; the wires at +x and -x change places."""
+    """Reflected in the plane x = 0: forces turn their x, bends about d2 turn their sign; the wires at +x and
+    -x change places."""
     sim, lengths = settled("tendon_length", x, y, load)
     one = sim.settle(lengths, tip_force=load, tolerance=1e-11)
     two = sim.settle(lengths[[2, 1, 0, 3]], tip_force=np.multiply(load, (-1, 1, 1)), tolerance=1e-11)
@@ -65,7 +67,8 @@ def test_a_mirror_image_bends_into_the_mirror_image(x: float, y: float, load: tu
 @same_every_time
 @given(angle, angle, force)
 def test_compliance_is_symmetric(x: float, y: float, load: tuple[float, ...]) -> None:
-    """Maxwell and Betti: with dead loads and held wires the tip gives as much to one force as to the other."""
+    """Maxwell and Betti: with dead loads and held wires the tip gives as much to one force as to the
+    other."""
     sim, lengths = settled("tendon_length", x, y, load)
     sim.settle(lengths, tip_force=load, tolerance=1e-11)
     compliance = sim.compliance()[0, :3]

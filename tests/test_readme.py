@@ -12,12 +12,18 @@ import pytest
 import fastrod_scenes
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted(path for path in ROOT.glob("**/README.md") if not any(part.startswith(".") for part in path.relative_to(ROOT).parts))
+PAGES = sorted(
+    path
+    for path in ROOT.glob("**/README.md")
+    if not any(part.startswith(".") for part in path.relative_to(ROOT).parts)
+)
 PAGES += [ROOT / "CONTRIBUTING.md"]
 EXAMPLES = [
     pytest.param(code, output, id=f"{page.relative_to(ROOT).parent}-{k}")
     for page in PAGES
-    for k, (code, output) in enumerate(re.findall(r"```python\n(.*?)```\n\n```\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.S))
+    for k, (code, output) in enumerate(
+        re.findall(r"```python\n(.*?)```\n\n```\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.S)
+    )
 ]
 
 
@@ -31,7 +37,9 @@ def test_the_example_prints_its_output(code: str, output: str) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_every_link_to_a_file_leads_somewhere(page: Path) -> None:
-    links = [link.partition("#")[0] for link in re.findall(r"\]\(([^)]*)\)", page.read_text(encoding="utf-8"))]
+    links = [
+        link.partition("#")[0] for link in re.findall(r"\]\(([^)]*)\)", page.read_text(encoding="utf-8"))
+    ]
     assert [link for link in links if link and "://" not in link and not (page.parent / link).exists()] == []
 
 
@@ -43,7 +51,11 @@ def test_ci_runs_the_test_line() -> None:
 
 
 def test_the_page_of_scenes_has_them_all() -> None:
-    rows = re.findall(r"^\| `(\w+)` \| (.*) \| ([\d.]+) s \|$", (ROOT / "scenes" / "README.md").read_text(encoding="utf-8"), flags=re.M)
+    rows = re.findall(
+        r"^\| `(\w+)` \| (.*) \| ([\d.]+) s \|$",
+        (ROOT / "scenes" / "README.md").read_text(encoding="utf-8"),
+        flags=re.M,
+    )
     scenes = [fastrod_scenes.load(name) for name in fastrod_scenes.names()]
     assert rows == [(scene.name, scene.about, f"{scene.duration:.1f}") for scene in scenes]
 
@@ -55,6 +67,11 @@ def test_every_command_on_a_page_is_one(page: Path) -> None:
 
     parser, _ = build()
     blocks = re.findall(r"```\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.S)
-    lines = [line.partition("#")[0].split()[1:] for block in blocks for line in block.splitlines() if line.startswith("fastrod ")]
+    lines = [
+        line.partition("#")[0].split()[1:]
+        for block in blocks
+        for line in block.splitlines()
+        if line.startswith("fastrod ")
+    ]
     unknown = [words for words in lines if parser.parse_known_args(words)[1]]
     assert unknown == []

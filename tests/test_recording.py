@@ -45,12 +45,27 @@ def filled(recorder: Recorder, n: int = 200, seed: int = 3) -> Recorder:
     for run, payload in (("free", 0.0), ("loaded", 0.02)):
         recorder.start(10.0, run)
         for k in range(n):
-            recorder.add(reading(10.0 + 0.02 * k, rng), payload=payload, commanded_dl=rng.uniform(-0.005, 0.005, ROBOT.n_tendons))
+            recorder.add(
+                reading(10.0 + 0.02 * k, rng),
+                payload=payload,
+                commanded_dl=rng.uniform(-0.005, 0.005, ROBOT.n_tendons),
+            )
     return recorder
 
 
 def assert_same(a: RunLog, b: RunLog) -> None:
-    for name in ("t", "run", "dl", "tip_position", "ext", "tip_quaternion", "points", "tip_force", "payload", "base_quaternion"):
+    for name in (
+        "t",
+        "run",
+        "dl",
+        "tip_position",
+        "ext",
+        "tip_quaternion",
+        "points",
+        "tip_force",
+        "payload",
+        "base_quaternion",
+    ):
         one, other = getattr(a, name), getattr(b, name)
         assert (one is None) == (other is None), name
         if one is not None:
@@ -62,7 +77,7 @@ def assert_same(a: RunLog, b: RunLog) -> None:
 
 def numbers(cells: object) -> Floats:
     """A column of numbers, or of what a CSV has in their place."""
-    return np.array([float(cell or "nan") if isinstance(cell, str) else cell for cell in cells])  # type: ignore[attr-defined]
+    return np.array([float(cell or "nan") if isinstance(cell, str) else cell for cell in cells])
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
@@ -92,7 +107,14 @@ def test_what_is_missing_stays_missing(tmp_path: Path) -> None:
     for k in range(3):
         tip = unknown if k == 1 else np.array([0.0, 0.0, 0.07])
         force = (0.1, 0.0, 0.0) if k == 2 else None
-        given = Measurement(t=k, dl=np.zeros(4), ext=np.zeros(1), tip_position=tip, tip_quaternion=np.full(4, np.nan), tension=[np.inf] * 4)
+        given = Measurement(
+            t=k,
+            dl=np.zeros(4),
+            ext=np.zeros(1),
+            tip_position=tip,
+            tip_quaternion=np.full(4, np.nan),
+            tension=[np.inf] * 4,
+        )
         recorder.add(given, tip_force=force)
     log = recorder.stop()
     assert_same(log, read_log(path, ROBOT))
@@ -107,11 +129,20 @@ def test_what_is_missing_stays_missing(tmp_path: Path) -> None:
 def test_a_robot_that_extends_has_its_extension_recorded(tmp_path: Path) -> None:
     from dataclasses import replace
 
-    longer = replace(ROBOT, segments=tuple(replace(segment, extension=(0.0, 0.02)) for segment in ROBOT.segments))
+    longer = replace(
+        ROBOT, segments=tuple(replace(segment, extension=(0.0, 0.02)) for segment in ROBOT.segments)
+    )
     recorder = Recorder(longer, tmp_path / "session.csv")
     recorder.start(0.0)
     recorder.add(
-        Measurement(t=0.0, dl=np.zeros(4), ext=[0.01], tip_position=[0, 0, 0.08], tip_quaternion=[1, 0, 0, 0], tension=np.zeros(4))
+        Measurement(
+            t=0.0,
+            dl=np.zeros(4),
+            ext=[0.01],
+            tip_position=[0, 0, 0.08],
+            tip_quaternion=[1, 0, 0, 0],
+            tension=np.zeros(4),
+        )
     )
     log = recorder.stop()
     assert log.ext is not None
@@ -123,7 +154,8 @@ def test_a_killed_session_is_recovered_row_by_row(tmp_path: Path) -> None:
     path, kept = tmp_path / "session.csv", tmp_path / "kept"
     kept.mkdir()
     recorder = filled(Recorder(ROBOT, path))
-    (kept / "session.csv.part").write_bytes((tmp_path / "session.csv.part").read_bytes())  # as it lies there while rows still come
+    # as it lies there while rows still come
+    (kept / "session.csv.part").write_bytes((tmp_path / "session.csv.part").read_bytes())
     whole = recorder.stop()
     log = recover(kept / "session.csv")
     assert_same(log, whole)
@@ -154,7 +186,9 @@ recorder.start(0.0, "killed")
 while True:
     k = len(recorder)
     tip = [np.nan] * 3 if k % 7 == 3 else [1e-6 * k, 0.0, 0.07]
-    seen = Measurement(t=0.02 * k, dl=[0.0] * 4, ext=[0.0], tip_position=tip, tip_quaternion=[1.0, 0.0, 0.0, 0.0], tension=[1.0] * 4)
+    turn = [1.0, 0.0, 0.0, 0.0]
+    moved = dict(dl=[0.0] * 4, ext=[0.0], tension=[1.0] * 4)
+    seen = Measurement(t=0.02 * k, tip_position=tip, tip_quaternion=turn, **moved)
     recorder.add(seen, extra={"current_1": float(k)})
     print(len(recorder), flush=True)
 """
@@ -183,7 +217,8 @@ def test_a_process_that_is_killed_loses_no_row(tmp_path: Path) -> None:
 
 def test_each_row_is_one_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(7)
-    recorder = Recorder(ROBOT, tmp_path / "session.csv", extra=[f"further_{k}" for k in range(900)])  # a row beyond any buffer
+    # a row beyond any buffer
+    recorder = Recorder(ROBOT, tmp_path / "session.csv", extra=[f"further_{k}" for k in range(900)])
     recorder.start(0.0)
     written: list[int] = []
 
@@ -198,7 +233,7 @@ def test_each_row_is_one_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
         def write(self, data: bytes) -> int:
             written.append(len(data))
-            return self.file.write(data)  # type: ignore[attr-defined,no-any-return]
+            return self.file.write(data)
 
     monkeypatch.setattr(recorder, "_file", Counted(recorder._file))
     for k in range(5):
@@ -221,7 +256,9 @@ from fastrod.logs.recording import Recorder
 recorder = Recorder(fastrod.load_robot("prototype"), Path(sys.argv[1]))
 recorder.start(0.0)
 def add(k):
-    recorder.add(Measurement(t=k, dl=[1e-3 / 3] * 4, ext=[0], tip_position=[0.1 / 3] * 3, tip_quaternion=[1, 0, 0, 0], tension=[1] * 4))
+    tip, turn = [0.1 / 3] * 3, [1, 0, 0, 0]
+    moved = dict(dl=[1e-3 / 3] * 4, ext=[0], tension=[1] * 4)
+    recorder.add(Measurement(t=k, tip_position=tip, tip_quaternion=turn, **moved))
 hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
 for k in range(10):
     if k in (4, 5):
@@ -239,7 +276,9 @@ for k in range(10):
 @pytest.mark.skipif(sys.platform == "win32", reason="resource limits")
 def test_a_disk_that_was_full_leaves_whole_rows(tmp_path: Path) -> None:
     path = tmp_path / "session.csv"
-    told = subprocess.run([sys.executable, "-c", FULL, str(path)], capture_output=True, text=True, check=True).stdout
+    told = subprocess.run(
+        [sys.executable, "-c", FULL, str(path)], capture_output=True, text=True, check=True
+    ).stdout
     why, where = "session.csv.part cannot be written: File too large", "are in session.csv.part."
     assert told.splitlines() == [f"{why}; {rows} {where}" for rows in ("4 of its 5 rows", "4 of its 6 rows")]
     assert recover(path).t.tolist() == [0.0, 1.0, 2.0, 3.0, 6.0, 7.0, 8.0, 9.0]
@@ -264,7 +303,9 @@ def test_further_columns_and_the_bases_orientation_are_kept(tmp_path: Path, suff
     assert_array_equal(numbers(log.extra["following error [m]"]), expected)
     assert np.isnan(numbers(log.extra["never"])).all()
     assert log.base_quaternion is not None
-    np.testing.assert_allclose(log.base_quaternion[[0, 1, 2, 4, 5]], bases[[0, 1, 2, 4, 5]], rtol=0.0, atol=1e-15)
+    np.testing.assert_allclose(
+        log.base_quaternion[[0, 1, 2, 4, 5]], bases[[0, 1, 2, 4, 5]], rtol=0.0, atol=1e-15
+    )
     assert np.isnan(log.base_quaternion[3]).all()
     assert_same(log, read_log(path, ROBOT))
     assert_same(recover(kept / path.name), log)
@@ -307,7 +348,7 @@ def test_a_number_that_cannot_be_kept_is_refused() -> None:
     with pytest.raises(InputError, match=r"no column 'curent_1' is recorded; did you mean 'current_1'\?"):
         recorder.add(reading(0.0, rng), extra={"curent_1": 1.0})
     with pytest.raises(InputError, match=r"extra of the reading is .*it must be numbers"):
-        recorder.add(reading(0.0, rng), extra={"current_1": "much"})  # type: ignore[dict-item]
+        recorder.add(reading(0.0, rng), extra={"current_1": "much"})
     with pytest.raises(InputError, match=r"base_quaternion of the reading has shape \(3,\)"):
         recorder.add(reading(0.0, rng), base_quaternion=(1.0, 0.0, 0.0))
     with pytest.raises(InputError, match="of norm 2; it must be 1"):
@@ -457,7 +498,9 @@ def fill(disk: Path, leave: int) -> None:
 
 
 def test_without_a_path_rows_stay_in_memory(tmp_path: Path) -> None:
-    first, second = (filled(recorder).stop() for recorder in (Recorder(ROBOT), Recorder(ROBOT, tmp_path / "session.csv")))
+    first, second = (
+        filled(recorder).stop() for recorder in (Recorder(ROBOT), Recorder(ROBOT, tmp_path / "session.csv"))
+    )
     assert_same(first, second)
     assert first.name == "session"
 
@@ -477,7 +520,10 @@ def test_no_file_is_overwritten_unasked(tmp_path: Path) -> None:
     assert len(read_log(path, ROBOT)) == 6
 
 
-@pytest.mark.parametrize(("name", "sentence"), [("a.txt", "does not end in .csv or .parquet"), ("none/a.csv", "is not there; make it")])
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [("a.txt", "does not end in .csv or .parquet"), ("none/a.csv", "is not there; make it")],
+)
 def test_a_path_that_cannot_be_one_is_refused(tmp_path: Path, name: str, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         Recorder(ROBOT, tmp_path / name)
@@ -507,8 +553,19 @@ def test_wrong_use_is_said_in_a_sentence(tmp_path: Path) -> None:
         recorder.start(0.0, "one")
     with pytest.raises(InputError, match="one line"):
         recorder.start(0.0, "a\nb")
-    with pytest.raises(InputError, match=r"dl of the reading has shape \(8,\); robot 'prototype' needs \(4,\)"):
-        recorder.add(Measurement(t=0, dl=np.zeros(8), ext=[0], tip_position=np.zeros(3), tip_quaternion=[1, 0, 0, 0], tension=np.zeros(8)))
+    with pytest.raises(
+        InputError, match=r"dl of the reading has shape \(8,\); robot 'prototype' needs \(4,\)"
+    ):
+        recorder.add(
+            Measurement(
+                t=0,
+                dl=np.zeros(8),
+                ext=[0],
+                tip_position=np.zeros(3),
+                tip_quaternion=[1, 0, 0, 0],
+                tension=np.zeros(8),
+            )
+        )
     with pytest.raises(InputError, match=r"tip_force of the reading has shape \(2,\)"):
         recorder.add(reading(0.0, rng), tip_force=(0.0, 0.0))
     with pytest.raises(InputError, match="no reading came in"):

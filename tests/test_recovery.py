@@ -181,7 +181,10 @@ FORCE = np.ma.array([0.0, 0.0, 0.1], mask=[False, False, True])
 @pytest.mark.parametrize(
     ("call", "sentence"),
     [
-        (lambda _: Simulator(REACHER, 10**12), r"n_robots 1e\+12 with 101 points each would take [\d.e+]+ GiB"),
+        (
+            lambda _: Simulator(REACHER, 10**12),
+            r"n_robots 1e\+12 with 101 points each would take [\d.e+]+ GiB",
+        ),
         (lambda _: Simulator(REACHER, 10**30), "would take"),
         (lambda _: Simulator(REACHER, 10**12, outputs="tip"), r"take fewer\.$"),
         (lambda _: Simulator(REACHER, 2, points_per_segment=10**12), r"n_robots 2 with 5e\+12 points each"),

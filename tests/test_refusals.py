@@ -40,7 +40,15 @@ def touching() -> Simulator:
 
 def segment(**given: Any) -> Segment:
     wires = (Tendon(offset=0.007, angle=0.0),)
-    return Segment(**{"length": 0.07, "bending_stiffness": (0.002, 0.002), "torsional_stiffness": 0.001, "tendons": wires} | given)
+    return Segment(
+        **{
+            "length": 0.07,
+            "bending_stiffness": (0.002, 0.002),
+            "torsional_stiffness": 0.001,
+            "tendons": wires,
+        }
+        | given
+    )
 
 
 def slack() -> Robot:
@@ -64,42 +72,84 @@ def of_another_shape() -> Any:
 
 SENTENCES: list[tuple[Callable[[], object], str]] = [
     (lambda: touching().ray_cast([1.0, 2.0], [[0.0, 0.0, 1.0]]), r"rays have origins of shape \(2,\)"),
-    (lambda: touching().ray_cast([[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0]]), "a ray has .* a direction of length 0"),
-    (lambda: touching().ray_cast([[0.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]], longest=0.0), "longest is 0.0 m; it must be positive"),
-    (lambda: touching().state.contacts.in_contact("bal"), "no obstacle 'bal'; did you mean 'ball'"),  # type: ignore[union-attr]
-    (lambda: touching().step(REST, obstacle_pose={"ball": "here"}), r"obstacle_pose\['ball'\] is not an array of numbers"),
-    (lambda: touching().step(REST, obstacle_pose={"ball": [math.nan] * 7}), "holds a value that is not finite"),
+    (
+        lambda: touching().ray_cast([[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0]]),
+        "a ray has .* a direction of length 0",
+    ),
+    (
+        lambda: touching().ray_cast([[0.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]], longest=0.0),
+        "longest is 0.0 m; it must be positive",
+    ),
+    (lambda: touching().state.contacts.in_contact("bal"), "no obstacle 'bal'; did you mean 'ball'"),
+    (
+        lambda: touching().step(REST, obstacle_pose={"ball": "here"}),
+        r"obstacle_pose\['ball'\] is not an "
+        r"array of numbers",
+    ),
+    (
+        lambda: touching().step(REST, obstacle_pose={"ball": [math.nan] * 7}),
+        "holds a value that is not finite",
+    ),
     (lambda: scene(rod_friction=-1.0), "rod_friction is -1.0; it must be zero or positive"),
     (lambda: scene(max_contacts=65), "max_contacts is 65; it must be a whole number from 1 to 64"),
     (lambda: scene(max_passes=3), "max_passes is 3; it must be a whole number, at least 20"),
     (lambda: scene(watch=0.5), "watch is 0.5; it is a part of the rod's length"),
     (lambda: scene(mounting=-0.1), "mounting is -0.1 m; it must be zero or positive"),
-    (lambda: Simulator(rod(), contact=scene(rod_radius=(1.0, 2.0))), "rod_radius is .*; give one radius or 1, one a segment"),
-    (lambda: plan(rod(), np.zeros((3, 3)), 0.1, start="there"), "start is 'there'; give 4 changes of wire length"),  # type: ignore[arg-type]
+    (
+        lambda: Simulator(rod(), contact=scene(rod_radius=(1.0, 2.0))),
+        "rod_radius is .*; give one radius or 1, one a segment",
+    ),
+    (
+        lambda: plan(rod(), np.zeros((3, 3)), 0.1, start="there"),
+        "start is 'there'; give 4 changes of wire length",
+    ),
     (lambda: demo(None, seed=-1), "seed is -1; it must be a whole number from 0"),
     (lambda: recorder(math.nan), "a recording begins at t = nan; it must be a finite time"),
     (lambda: recorder().add(reading(math.inf)), "the reading has t = inf; a row needs a finite time"),
-    (lambda: reference.constant_curvature(rod(), [0.07]), r"tendon_length has shape \(1,\); it must be \(4,\) finite lengths"),
+    (
+        lambda: reference.constant_curvature(rod(), [0.07]),
+        r"tendon_length has shape \(1,\); it must be "
+        r"\(4,\) finite lengths",
+    ),
     (lambda: reference.shoot(slack(), tension=[-1.0]), "a unilateral tendon cannot push"),
-    (lambda: reference.shoot(rod(), REST, point_force=[(0.01,)]), "each entry must be a pair of arclength"),  # type: ignore[list-item]
-    (lambda: reference.shoot(rod(), REST, points_per_segment=0), "points_per_segment is 0; it must be 1 or more"),
+    (lambda: reference.shoot(rod(), REST, point_force=[(0.01,)]), "each entry must be a pair of arclength"),
+    (
+        lambda: reference.shoot(rod(), REST, points_per_segment=0),
+        "points_per_segment is 0; it must be 1 or more",
+    ),
     (lambda: reference.shoot(rod(), REST, guess=of_another_shape()), "guess is the shape of another robot"),
     (lambda: segment(bending_stiffness=0.002), "bending_stiffness is 0.002; give two values, EI_x and EI_y"),
     (lambda: segment(precurvature=(1.0, 2.0)), r"precurvature is \[1.0, 2.0\]; it must be 3 finite numbers"),
-    (lambda: segment(extension=(-0.1, 0.0)), r"extension is \[-0.1, 0.0\] m; give \[smallest, largest\] change"),
+    (
+        lambda: segment(extension=(-0.1, 0.0)),
+        r"extension is \[-0.1, 0.0\] m; give \[smallest, largest\] "
+        r"change",
+    ),
     (lambda: segment(mode="tendon_lenght"), "mode is 'tendon_lenght'; did you mean 'tendon_length'"),
     (lambda: segment(mode="passive"), "A passive segment has no tendons; it was given 1"),
     (lambda: segment(body_radius=-1.0), "body_radius is -1.0 m; it must be between 0 and"),
-    (lambda: Robot(name="r", segments=(segment(length=0.005),)), "Tendon offset 0.007 m of segment 1 is larger than the length 0.005 m"),
-    (lambda: load_robot(3), "robot is 3; give the name of a shipped robot or the path of a .toml"),  # type: ignore[arg-type]
+    (
+        lambda: Robot(name="r", segments=(segment(length=0.005),)),
+        "Tendon offset 0.007 m of segment 1 is larger than the length 0.005 m",
+    ),
+    (lambda: load_robot(3), "robot is 3; give the name of a shipped robot or the path of a .toml"),
     (lambda: save_robot(rod(), "mine.json"), "'mine.json' does not end in .toml; a robot file does"),
     (lambda: loads("name = 'r'\n[[segment]]\ntendons = 3\n"), "tendons must be a list of tables"),
     (
-        lambda: RunLog(name="none", t=np.zeros(0), dl=np.zeros((0, 4)), tip_position=np.zeros((0, 3)), run=np.zeros(0, np.str_)),
+        lambda: RunLog(
+            name="none",
+            t=np.zeros(0),
+            dl=np.zeros((0, 4)),
+            tip_position=np.zeros((0, 3)),
+            run=np.zeros(0, np.str_),
+        ),
         "log 'none' has no rows",
     ),
     (lambda: SimulatedRobot(rod()).command("far"), "dl is 'far'; give 4 numbers"),
-    (lambda: Simulator([rod(), rod()], 3), "2 robots for n_robots 3; give one for all, or a list of n_robots"),
+    (
+        lambda: Simulator([rod(), rod()], 3),
+        "2 robots for n_robots 3; give one for all, or a list of n_robots",
+    ),
     (lambda: touching().shape(np.zeros((3, 4, 5))), r"arclength has shape \(3, 4, 5\); it must be"),
     (lambda: Observer(process_noise=0.0), "Observer.process_noise is 0.0; it must be positive and finite"),
 ]
@@ -147,5 +197,5 @@ def test_hosts_say_what_cannot_be_carried() -> None:
     with pytest.raises(AttributeError, match="PyBullet has no 'stepSimulaton'"):
         _ = world.stepSimulaton
     with pytest.raises(FastrodError, match="robot is 'ur5'; give a Robot"):
-        SoftManiSim(robot="ur5")  # type: ignore[arg-type]
+        SoftManiSim(robot="ur5")
     world.disconnect()

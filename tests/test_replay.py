@@ -23,14 +23,16 @@ from fastrod.model.robotfile import load_robot
 
 DEMO_LOG = Path(__file__).parents[1] / "fastrod" / "data" / "demo_log.csv"
 DEMO_COMMENT = """\
-A prototype moved by `fastrod excite`, simulated by another solver with an effect that this file does not name, and 0.3 mm of noise.
+A prototype moved by `fastrod excite`, simulated by another solver with an effect that this file does not \
+name, and 0.3 mm of noise.
 Written by tests/truth/plant.py, seed 2026."""
 DEMO_SEED = 2026
 UPSIDE_DOWN = (0.0, 1.0, 0.0, 0.0)
 
 
 def shipped_log() -> RunLog:
-    """The log that the package ships: the designed run of the prototype, its tip by the plant, with friction sealed into it."""
+    """The log that the package ships: the designed run of the prototype, its tip by the plant, with friction
+    sealed into it."""
     from fastrod.identification.excite import excitation
 
     log = excitation(load_robot("prototype")).log
@@ -44,12 +46,16 @@ def shipped_log() -> RunLog:
 def other_robot() -> Robot:
     """A prototype that is a little different from the shipped one."""
     robot = load_robot("prototype")
-    tendons = tuple(changed(tendon, offset=0.0078, angle=float(tendon.angle) + math.radians(2.0)) for tendon in robot.tendons)  # type: ignore[arg-type]
+    tendons = tuple(
+        changed(tendon, offset=0.0078, angle=float(tendon.angle) + math.radians(2.0))
+        for tendon in robot.tendons
+    )
     return changed(robot, segments=(changed(robot.segments[0], length=0.0706, tendons=tendons),))
 
 
 def log_of_the_other(n: int = 8) -> RunLog:
-    """What shooting makes of `other_robot`, without noise: two runs along a spiral of bends, the second one under a known load."""
+    """What shooting makes of `other_robot`, without noise: two runs along a spiral of bends, the second one
+    under a known load."""
     from fastrod.reference import shoot
 
     share = np.tile(np.arange(1, n + 1) / n, 2)
@@ -58,14 +64,23 @@ def log_of_the_other(n: int = 8) -> RunLog:
     places = np.array([tendon.position(1)[0] for tendon in nominal.tendons])
     dl = -np.stack([bend * np.cos(turn), bend * np.sin(turn)], axis=1) @ places.T
     force = np.where(np.arange(2 * n)[:, None] < n, 0.0, (0.1, -0.05, 0.05))
-    tips = [shoot(real, real.rest_tendon_length + d, tip_force=f).tip_position for d, f in zip(dl, force, strict=True)]
+    tips = [
+        shoot(real, real.rest_tendon_length + d, tip_force=f).tip_position
+        for d, f in zip(dl, force, strict=True)
+    ]
     return RunLog(
-        name="other", t=8.0 * share, run=np.repeat(["free", "loaded"], n), dl=dl, tip_position=np.array(tips), tip_force=force,
-    )  # fmt: skip
+        name="other",
+        t=8.0 * share,
+        run=np.repeat(["free", "loaded"], n),
+        dl=dl,
+        tip_position=np.array(tips),
+        tip_force=force,
+    )
 
 
 class Arc:
-    """A stand-in for the simulator: constant curvature of a one-segment robot, no loads; it remembers its inputs."""
+    """A stand-in for the simulator: constant curvature of a one-segment robot, no loads; it remembers its
+    inputs."""
 
     seen: dict[str, Any]
     refuse: tuple[int, ...] = ()
@@ -81,7 +96,9 @@ class Arc:
             places = np.array([tendon.position(1)[0] for tendon in self.robot.tendons])
             bend = -(given["tendon_length"] - self.robot.rest_tendon_length) @ np.linalg.pinv(places).T
             angle = np.linalg.norm(bend, axis=1)[:, None] + 1e-12
-            tip = self.robot.length * np.hstack([bend / angle * (1.0 - np.cos(angle)) / angle, np.sin(angle) / angle])
+            tip = self.robot.length * np.hstack(
+                [bend / angle * (1.0 - np.cos(angle)) / angle, np.sin(angle) / angle]
+            )
         ok = np.ones(self.n_robots, dtype=bool)
         ok[[row for row in self.refuse if row < self.n_robots]] = False
         return SimpleNamespace(tip_position=tip, ok=ok)
@@ -91,7 +108,14 @@ def small_log(n: int = 6, **more: Any) -> RunLog:
     dl = np.outer(np.linspace(-1.0, 1.0, n), (0.002, 0.0, -0.002, 0.0))
     tip = np.zeros((n, 3))
     tip[:, 2] = 0.07
-    return RunLog(name="small", t=np.arange(n) / 10.0, run=np.repeat(["a", "b"], n // 2), dl=dl, tip_position=tip, **more)
+    return RunLog(
+        name="small",
+        t=np.arange(n) / 10.0,
+        run=np.repeat(["a", "b"], n // 2),
+        dl=dl,
+        tip_position=tip,
+        **more,
+    )
 
 
 @pytest.fixture
@@ -134,7 +158,14 @@ def test_rows_that_miss_or_fail_are_left_out(prototype: Robot) -> None:
 def test_tendon_lengths_count_from_the_straight_rest_robot_whatever_the_extension() -> None:
     robot = load_robot("five_segment_reacher")
     ext = np.array([[0.0, 0.0, 0.0, 0.0, 0.02]])
-    log = RunLog(name="x", t=np.zeros(1), run=np.array([""]), dl=np.full((1, 15), -0.001), tip_position=np.zeros((1, 3)), ext=ext)
+    log = RunLog(
+        name="x",
+        t=np.zeros(1),
+        run=np.array([""]),
+        dl=np.full((1, 15), -0.001),
+        tip_position=np.zeros((1, 3)),
+        ext=ext,
+    )
     lengths = tendon_length(log, robot)
     assert lengths is not None
     assert_allclose(lengths[0] - robot.rest_tendon_length, -0.001)
@@ -152,7 +183,8 @@ def test_prediction_is_given_in_the_base_frame(prototype: Robot) -> None:
     class World(Arc):
         def settle(self, **given: Any) -> SimpleNamespace:
             state = super().settle(**given)
-            state.tip_position = state.tip_position * (1.0, -1.0, -1.0) + (1.0, 2.0, 3.0)  # hung up at (1, 2, 3)
+            # hung up at (1, 2, 3)
+            state.tip_position = state.tip_position * (1.0, -1.0, -1.0) + (1.0, 2.0, 3.0)
             return state
 
     hung = changed(prototype, base_position=(1.0, 2.0, 3.0), base_quaternion=UPSIDE_DOWN)
@@ -169,10 +201,16 @@ def test_tension_robot_is_refused(prototype: Robot) -> None:
 def test_files_are_whole(prototype: Robot, tmp_path: Path) -> None:
     result = replay(small_log(), prototype, simulator=Arc)
     paths = write(result, tmp_path / "deep" / "out")
-    assert sorted(p.name for p in (tmp_path / "deep" / "out").iterdir()) == ["replay.png", "residuals.csv"] == sorted(p.name for p in paths)
+    assert (
+        sorted(p.name for p in (tmp_path / "deep" / "out").iterdir())
+        == ["replay.png", "residuals.csv"]
+        == sorted(p.name for p in paths)
+    )
     rows = list(csv.DictReader((tmp_path / "deep" / "out" / "residuals.csv").read_text().splitlines()))
     assert len(rows) == 6
-    assert float(rows[0]["residual_norm"]) == pytest.approx(float(np.linalg.norm(result.residual[0])), rel=1e-8)
+    assert float(rows[0]["residual_norm"]) == pytest.approx(
+        float(np.linalg.norm(result.residual[0])), rel=1e-8
+    )
     assert rows[0]["run"] == "a"
     assert rows[0]["converged"] == "1"
 
@@ -187,7 +225,9 @@ def axes_of(result: Replay) -> list[Any]:
 def long_log(n: int) -> RunLog:
     """Rows at 10 Hz of a tip that swings 20 mm along x."""
     tip = np.stack([0.02 * np.sin(0.1 * np.arange(n)), np.zeros(n), np.full(n, 0.07)], axis=1)
-    return RunLog(name="long", t=np.arange(n) / 10.0, run=np.full(n, ""), dl=np.zeros((n, 4)), tip_position=tip)
+    return RunLog(
+        name="long", t=np.arange(n) / 10.0, run=np.full(n, ""), dl=np.zeros((n, 4)), tip_position=tip
+    )
 
 
 def test_picture_leaves_out_what_was_not_measured(prototype: Robot) -> None:
@@ -232,7 +272,11 @@ def test_table_shows_no_excursion_of_a_run_that_stands_still(prototype: Robot) -
     assert excursion[0] == "–"
     assert "measured - predicted" in str(grid.caption)
     assert "quasi-static" in str(grid.caption)
-    still = replay(changed(log, dl=np.zeros((6, 4)), tip_position=log.tip_position + np.array([0.0, 0.001, 0.0])), prototype, simulator=Arc)
+    still = replay(
+        changed(log, dl=np.zeros((6, 4)), tip_position=log.tip_position + np.array([0.0, 0.001, 0.0])),
+        prototype,
+        simulator=Arc,
+    )
     assert "excursion" not in draw(still).get_suptitle()
 
 
@@ -243,7 +287,8 @@ def test_shipped_log_is_what_the_plant_makes() -> None:
     assert_array_equal(made.dl, shipped.dl)
     assert_array_equal(made.payload, shipped.payload)
     assert_allclose(made.base_quaternion, shipped.base_quaternion, rtol=0, atol=1e-15)
-    assert_allclose(made.tip_position, shipped.tip_position, rtol=0, atol=1.01e-6)  # rounded to 1 um, which may fall either way
+    # rounded to 1 um, which may fall either way
+    assert_allclose(made.tip_position, shipped.tip_position, rtol=0, atol=1.01e-6)
 
 
 def test_shipped_log_does_not_say_what_is_in_it() -> None:
@@ -253,7 +298,8 @@ def test_shipped_log_does_not_say_what_is_in_it() -> None:
 
 
 def test_right_model_leaves_nothing_and_the_nominal_one_its_difference() -> None:
-    """A log by another solver: the robot that it was made on leaves the solvers' steps, with loads and without."""
+    """A log by another solver: the robot that it was made on leaves the solvers' steps, with loads and
+    without."""
     log = log_of_the_other()
     nominal = replay(log, load_robot("prototype"))
     assert nominal.converged.all()
@@ -263,23 +309,30 @@ def test_right_model_leaves_nothing_and_the_nominal_one_its_difference() -> None
 
 
 @pytest.mark.parametrize("orientation", [(1.0, 0.0, 0.0, 0.0), UPSIDE_DOWN, (0.5, 0.5, 0.5, 0.5)])
-def test_replay_of_the_simulators_own_run_leaves_nothing(prototype: Robot, orientation: tuple[float, ...]) -> None:
+def test_replay_of_the_simulators_own_run_leaves_nothing(
+    prototype: Robot, orientation: tuple[float, ...]
+) -> None:
     from fastrod import simulator
 
     rod = changed(prototype.segments[0], line_density=0.2)
     heavy = changed(prototype, segments=(rod,), base_position=(0.1, 0.2, 0.3), log_points=(0.02, 0.05))
-    log = small_log(8, base_quaternion=np.tile(orientation, (8, 1)), payload=np.full(8, 0.005), points=np.zeros((8, 2, 3)))
+    log = small_log(
+        8, base_quaternion=np.tile(orientation, (8, 1)), payload=np.full(8, 0.005), points=np.zeros((8, 2, 3))
+    )
     first = replay(log, heavy)
     assert first.converged.all()
     assert first.points is not None
     again = replay(changed(log, tip_position=first.tip_position, points=first.points), heavy)
     assert again.rms == 0.0
-    # hanging or standing, the base frame sees gravity turn: the upright and the hung robot differ only through weight
+    # hanging or standing, the base frame sees gravity turn: the upright and the hung robot differ only
+    # through weight
     one = simulator.Simulator(heavy, n_robots=1)
     pose = np.array([[0.0, 0.0, 0.0, *orientation]])
     weight = 0.005 * np.array([[0.0, 0.0, -9.81]])
     state = one.settle(heavy.rest_tendon_length + log.dl[:1], tip_force=weight, base_pose=pose)
-    assert np.linalg.norm(state.tip_position[0]) == pytest.approx(float(np.linalg.norm(first.tip_position[0])), abs=1e-9)
+    assert np.linalg.norm(state.tip_position[0]) == pytest.approx(
+        float(np.linalg.norm(first.tip_position[0])), abs=1e-9
+    )
 
 
 def test_points_of_the_straight_robot_lie_on_its_axis(prototype: Robot) -> None:

@@ -1,4 +1,5 @@
-"""The report of an identification: the contract's keys, one offline page, files whole or not at all, numbers in friendly units."""
+"""The report of an identification: the contract's keys, one offline page, files whole or not at all, numbers
+in friendly units."""
 
 from __future__ import annotations
 
@@ -22,7 +23,15 @@ from fastrod.identification.report import report
 from fastrod.identification.report.page import page
 from fastrod.identification.report.result import Found, Result
 from fastrod.identification.report.signals import Signals
-from fastrod.identification.report.wording import VERDICTS, amount, bound_sentence, law, percent, plain_name, with_error
+from fastrod.identification.report.wording import (
+    VERDICTS,
+    amount,
+    bound_sentence,
+    law,
+    percent,
+    plain_name,
+    with_error,
+)
 from fastrod.identification.search.model_selection import Bound
 from fastrod.identification.search.residual_test import Audit
 from fastrod.identification.search.solve import Estimate
@@ -47,27 +56,72 @@ def wild(result: Result) -> Result:
     delay = Estimate(value=0.043, stderr=0.002, unit="s", identifiable=True, prior_sd=0.1, at_bound=True)
     mass = Estimate(value=0.012, stderr=NAN, unit="kg", identifiable=True, prior_sd=NAN)
     more = [
-        Found(name="latency", title="Delay <b> & more", parameters={"delay": delay}, held_out_gain=0.04, evidence={"z": NAN},
-              cannot_be_told_from=["dynamics"]),
-        Found(name="payload", title="Mass", parameters={"mass": mass}, held_out_gain=0.2, evidence={}, cannot_be_told_from=[]),
-    ]  # fmt: skip
+        Found(
+            name="latency",
+            title="Delay <b> & more",
+            parameters={"delay": delay},
+            held_out_gain=0.04,
+            evidence={"z": NAN},
+            cannot_be_told_from=["dynamics"],
+        ),
+        Found(
+            name="payload",
+            title="Mass",
+            parameters={"mass": mass},
+            held_out_gain=0.2,
+            evidence={},
+            cannot_be_told_from=[],
+        ),
+    ]
     base = dict(result.base_parameters)
-    base["tendon.1.gain"] = Estimate(value=0.0, stderr=0.3, unit="", identifiable=False, why="no <load>", prior_sd=0.3)
+    base["tendon.1.gain"] = Estimate(
+        value=0.0, stderr=0.3, unit="", identifiable=False, why="no <load>", prior_sd=0.3
+    )
     return replace(
-        result, log=replace(result.log, name="a <script>alert(1)</script> & $x$"), effects=[*result.effects, *more], base_parameters=base,
-        remaining=Audit(0.1, 0.05, 0.02, 0.01, 3.0), remaining_kind="static", remaining_share=0.12, patterns=["it <jumps>"],
-        test=replace(result.test, interval=(NAN, NAN)), advice=["turn <it>"], notes=["odd & even"], verdict="partly_explained",
+        result,
+        log=replace(result.log, name="a <script>alert(1)</script> & $x$"),
+        effects=[*result.effects, *more],
+        base_parameters=base,
+        remaining=Audit(0.1, 0.05, 0.02, 0.01, 3.0),
+        remaining_kind="static",
+        remaining_share=0.12,
+        patterns=["it <jumps>"],
+        test=replace(result.test, interval=(NAN, NAN)),
+        advice=["turn <it>"],
+        notes=["odd & even"],
+        verdict="partly_explained",
         network={"held_out_rms_m": 0.0003, "inputs": 40.0},
-    )  # fmt: skip
+    )
 
 
 def test_json_has_the_keys_and_types_of_the_contract(result: Result) -> None:
     made = report.to_json(result)
     assert set(made) >= {
-        "log", "robot", "n_samples", "held_out", "noise_floor_m", "error", "verdict", "effects", "base_parameters", "remaining",
-        "candidates", "advice", "bounds", "path", "patterns", "summary", "notes", "correlation",
-    }  # fmt: skip
-    assert (made["log"], made["robot"], made["n_samples"], made["held_out"]) == ("small", "prototype", 420, ["two"])
+        "log",
+        "robot",
+        "n_samples",
+        "held_out",
+        "noise_floor_m",
+        "error",
+        "verdict",
+        "effects",
+        "base_parameters",
+        "remaining",
+        "candidates",
+        "advice",
+        "bounds",
+        "path",
+        "patterns",
+        "summary",
+        "notes",
+        "correlation",
+    }
+    assert (made["log"], made["robot"], made["n_samples"], made["held_out"]) == (
+        "small",
+        "prototype",
+        420,
+        ["two"],
+    )
     assert made["noise_floor_m"] == result.noise.floor
     assert set(made["error"]["train"]) == {"before_rms_m", "after_rms_m"}
     assert set(made["error"]["held_out"]) == {"before_rms_m", "after_rms_m", "interval_m"}
@@ -79,7 +133,9 @@ def test_json_has_the_keys_and_types_of_the_contract(result: Result) -> None:
     assert set(effect) >= {"name", "parameters", "held_out_gain", "evidence", "cannot_be_told_from"}
     assert set(effect["parameters"]["half_width"]) >= {"value", "stderr", "unit", "identifiable"}
     assert_allclose(effect["parameters"]["half_width"]["value"], 3e-4, atol=2e-5)
-    assert all(set(e) >= {"value", "stderr", "unit", "identifiable", "why"} for e in made["base_parameters"].values())
+    assert all(
+        set(e) >= {"value", "stderr", "unit", "identifiable", "why"} for e in made["base_parameters"].values()
+    )
     assert set(made["remaining"]) >= {"structured_fraction", "kind"}
     assert made["remaining"]["kind"] in ("none", "static", "memory", "drift", "unknown")
     assert all(set(c) >= {"name", "held_out_rms_m", "score", "kept", "why"} for c in made["candidates"])
@@ -118,7 +174,11 @@ class Reader(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.add(tag)
-        self.addresses += [value or "" for name, value in attrs if name in ("src", "href", "xlink:href", "srcset", "data", "action")]
+        self.addresses += [
+            value or ""
+            for name, value in attrs
+            if name in ("src", "href", "xlink:href", "srcset", "data", "action")
+        ]
         self.ids += [value or "" for name, value in attrs if name == "id"]
         if tag not in self.void:
             self.open.append(tag)
@@ -143,7 +203,9 @@ def test_page_is_one_offline_file(html: str) -> None:
     assert not re.search(r"https?:|@import|url\((?!#)", html)
     assert not read.tags & {"script", "link", "iframe", "object"}
     assert len(html) < 1_500_000
-    inside = {address[1:] for address in read.addresses if address.startswith("#")} | set(re.findall(r"url\(#([^)]*)\)", html))
+    inside = {address[1:] for address in read.addresses if address.startswith("#")} | set(
+        re.findall(r"url\(#([^)]*)\)", html)
+    )
     assert inside <= set(read.ids)  # no figure took another one's names
 
 
@@ -167,16 +229,36 @@ def test_page_escapes_what_others_wrote_and_takes_what_is_missing(result: Result
     assert read.open == []
     assert "script" not in read.tags
     assert escape("a <script>alert(1)</script> & $x$") in html
-    for text in ("Delay <b> & more", "it <jumps>", "turn <it>", "odd & even", "no <load>", "at bound", "dynamics", "43.0 ± 2.0 ms"):
+    for text in (
+        "Delay <b> & more",
+        "it <jumps>",
+        "turn <it>",
+        "odd & even",
+        "no <load>",
+        "at bound",
+        "dynamics",
+        "43.0 ± 2.0 ms",
+    ):
         assert text in read.words, text
-    assert "nan" not in unescape(re.sub(r"base64,[^\"]*|<style.*?</style>", "", html, flags=re.DOTALL)).lower()
+    assert (
+        "nan" not in unescape(re.sub(r"base64,[^\"]*|<style.*?</style>", "", html, flags=re.DOTALL)).lower()
+    )
 
 
 def test_page_without_effects_shows_the_base_model_alone(result: Result) -> None:
     bare = replace(
-        result, effects=[], path=result.path[:1], after=result.before, verdict="not_in_library", patterns=["the tip jumps"],
-        correlation=(["a"], np.ones((1, 1))), tried=[], bounds=[], advice=[], summary="No effect explains it.",
-    )  # fmt: skip
+        result,
+        effects=[],
+        path=result.path[:1],
+        after=result.before,
+        verdict="not_in_library",
+        patterns=["the tip jumps"],
+        correlation=(["a"], np.ones((1, 1))),
+        tried=[],
+        bounds=[],
+        advice=[],
+        summary="No effect explains it.",
+    )
     words = Reader(page(bare)).words
     assert "the tip jumps" in words
     assert "base model" in words
@@ -187,7 +269,11 @@ def test_page_without_effects_shows_the_base_model_alone(result: Result) -> None
 def test_files_are_written_whole(result: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     written = report.write(result, tmp_path / "out")
     assert [path.name for path in written] == ["report.json", "report.html", "identified.toml"]
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["identified.toml", "report.html", "report.json"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "identified.toml",
+        "report.html",
+        "report.json",
+    ]
     before = (tmp_path / "out" / "report.html").read_bytes()
     assert report.write(result, tmp_path / "out") == written
     assert (tmp_path / "out" / "report.html").read_bytes() == before  # deterministic
@@ -217,19 +303,41 @@ def test_terminal_table_fits_80_columns(result: Result) -> None:
     console.print(report.table(wild(result)))
     text = console.export_text()
     assert max(map(len, text.splitlines())) <= 80
-    for word in ("tip error, rms [mm]", "backlash", "half width", "latency cannot be told from dynamics", "run next: turn <it>"):
+    for word in (
+        "tip error, rms [mm]",
+        "backlash",
+        "half width",
+        "latency cannot be told from dynamics",
+        "run next: turn <it>",
+    ):
         assert word in text, word
 
 
 @pytest.mark.parametrize(
     "name",
-    ["friction", "creep", "latency", "gravity", "tip_force", "payload", "time_drift", "temperature", "marker_offset", "drum_gain",
-     "stiffness_anisotropy", "lens", "precurvature", "coupling"],
-)  # fmt: skip
+    [
+        "friction",
+        "creep",
+        "latency",
+        "gravity",
+        "tip_force",
+        "payload",
+        "time_drift",
+        "temperature",
+        "marker_offset",
+        "drum_gain",
+        "stiffness_anisotropy",
+        "lens",
+        "precurvature",
+        "coupling",
+    ],
+)
 def test_every_effect_has_a_signal(result: Result, name: str) -> None:
     value = Estimate(value=1.0, stderr=0.1, unit="", identifiable=True)
     given = dict.fromkeys(("x", "y", "time_constant"), value)
-    found = Found(name=name, title="", parameters=given, held_out_gain=1.0, evidence={}, cannot_be_told_from=[])
+    found = Found(
+        name=name, title="", parameters=given, held_out_gain=1.0, evidence={}, cannot_be_told_from=[]
+    )
     view = Signals(result).view(found)
     assert len(view.rows) == len(view.signal) == len(view.before) == len(view.after) > 0.2 * 420
     assert np.isfinite([view.signal, view.before, view.after]).all()
@@ -242,10 +350,22 @@ def test_backlash_is_drawn_as_loops_that_close(result: Result) -> None:
 
 
 FRIENDLY = {
-    (0.0048, "kg"): "4.8 g", (3.6e-6, "m"): "3.6 µm", (0.00034, "m"): "0.34 mm", (0.0023, "rad"): "0.13°", (0.00052, "s"): "0.52 ms",
-    (15.0, "s"): "15 s", (0.0014, ""): "0.14 %", (0.3, "N"): "0.30 N", (0.0068, "N"): "6.8 mN", (0.372, "kg/m"): "370 g/m",
-    (2.2e-7, "m/s"): "0.013 mm/min", (-0.01, "rad"): "−0.57°", (0.0, "m"): "0 µm", (NAN, "m"): "–", (2.0, "V"): "2.0 V",
-}  # fmt: skip
+    (0.0048, "kg"): "4.8 g",
+    (3.6e-6, "m"): "3.6 µm",
+    (0.00034, "m"): "0.34 mm",
+    (0.0023, "rad"): "0.13°",
+    (0.00052, "s"): "0.52 ms",
+    (15.0, "s"): "15 s",
+    (0.0014, ""): "0.14 %",
+    (0.3, "N"): "0.30 N",
+    (0.0068, "N"): "6.8 mN",
+    (0.372, "kg/m"): "370 g/m",
+    (2.2e-7, "m/s"): "0.013 mm/min",
+    (-0.01, "rad"): "−0.57°",
+    (0.0, "m"): "0 µm",
+    (NAN, "m"): "–",
+    (2.0, "V"): "2.0 V",
+}
 
 
 def test_numbers_are_said_in_friendly_units() -> None:
@@ -258,7 +378,16 @@ def test_numbers_are_said_in_friendly_units() -> None:
 
 
 def test_bounds_are_sentences() -> None:
-    assert bound_sentence(Bound("payload", "mass", "kg", 0.007)) == "payload: a mass above 7.0 g would have shown"
-    assert bound_sentence(Bound("encoder_offset", "offset_1", "m", 1e-4)) == "encoder offset: an offset above 0.10 mm would have shown"
-    assert bound_sentence(Bound("tip_force", "x", "N", 0.2)) == "tip force: a component along x above 0.20 N would have shown"
-    assert bound_sentence(Bound("axial_compression", "per_bend", "1/rad", NAN)).startswith("this log cannot show axial compression")
+    assert bound_sentence(Bound("payload", "mass", "kg", 0.007)) == (
+        "payload: a mass above 7.0 g would have shown"
+    )
+    assert (
+        bound_sentence(Bound("encoder_offset", "offset_1", "m", 1e-4))
+        == "encoder offset: an offset above 0.10 mm would have shown"
+    )
+    assert bound_sentence(Bound("tip_force", "x", "N", 0.2)) == (
+        "tip force: a component along x above 0.20 N would have shown"
+    )
+    assert bound_sentence(Bound("axial_compression", "per_bend", "1/rad", NAN)).startswith(
+        "this log cannot show axial compression"
+    )

@@ -71,11 +71,19 @@ def test_log_comes_back_bit_for_bit(tmp_path: Path, robot: Robot, suffix: str) -
     tip = rng.normal(0.0, 0.03, (5, 3))
     tip[2] = np.nan
     log = RunLog(
-        name="log", t=np.arange(5) / 3.0, run=np.array(list("aabbb")), dl=rng.normal(0.0, 1e-3, (5, 4)), tip_position=tip,
-        ext=np.zeros((5, 1)), tip_quaternion=q, points=rng.normal(0.0, 0.02, (5, 2, 3)), tip_force=rng.normal(size=(5, 3)),
-        payload=np.full(5, 0.01), base_quaternion=q,
+        name="log",
+        t=np.arange(5) / 3.0,
+        run=np.array(list("aabbb")),
+        dl=rng.normal(0.0, 1e-3, (5, 4)),
+        tip_position=tip,
+        ext=np.zeros((5, 1)),
+        tip_quaternion=q,
+        points=rng.normal(0.0, 0.02, (5, 2, 3)),
+        tip_force=rng.normal(size=(5, 3)),
+        payload=np.full(5, 0.01),
+        base_quaternion=q,
         extra={"note": list("vwxyz"), "current": rng.normal(size=5)},
-    )  # fmt: skip
+    )
     path = tmp_path / f"log{suffix}"
     write_log(log, path)
     back = read_log(path, full)
@@ -87,7 +95,9 @@ def test_log_comes_back_bit_for_bit(tmp_path: Path, robot: Robot, suffix: str) -
     assert not list(tmp_path.glob("*.part"))
 
 
-def test_parquet_without_pyarrow_says_so(tmp_path: Path, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parquet_without_pyarrow_says_so(
+    tmp_path: Path, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
     with pytest.raises(LogError, match="needs the package pyarrow"):
         read_log(tmp_path / "log.parquet", robot)
@@ -96,8 +106,14 @@ def test_parquet_without_pyarrow_says_so(tmp_path: Path, robot: Robot, monkeypat
 BAD = {
     "empty": ("", "log.csv is empty"),
     "no rows": (GOOD.split("\n")[0], "has a header but no rows"),
-    "no tip": (GOOD.replace("tip_z", "tip_Z"), "lacks column tip_z that every run log has; did you mean 'tip_Z'"),
-    "misspelt dl": (GOOD.replace("dl_", "dl"), "lacks columns dl_1, .* that robot 'prototype' needs for its 4 tendons; did you mean 'dl1'"),
+    "no tip": (
+        GOOD.replace("tip_z", "tip_Z"),
+        "lacks column tip_z that every run log has; did you mean 'tip_Z'",
+    ),
+    "misspelt dl": (
+        GOOD.replace("dl_", "dl"),
+        "lacks columns dl_1, .* that robot 'prototype' needs for its 4 tendons; did you mean 'dl1'",
+    ),
     "too few dl": (
         GOOD.replace("dl_4", "other"),
         r"3 dl_ columns \(dl_1 to dl_3\); robot 'prototype' has 4 tendons and needs dl_1 to dl_4",
@@ -108,14 +124,27 @@ BAD = {
     "short row": (GOOD.replace(",0.069", ""), "row 2 has 8 values; the header names 9 columns"),
     "column twice": (GOOD.replace("tip_y", "tip_x"), "has column 'tip_x' more than once"),
     "semicolons": (GOOD.replace(",", ";"), "separated by semicolons"),
-    "time back": (GOOD.replace("0.0,b", "0.0,a"), "row 3, column t is 0 s after 0.1 s inside run 'a'; time must not run back"),
-    "tip in mm": (GOOD.replace("0.069", "69"), r"row 2, the tip's distance from the base is 69 m; more than 3 lengths .* in mm\?"),
+    "time back": (
+        GOOD.replace("0.0,b", "0.0,a"),
+        "row 3, column t is 0 s after 0.1 s inside run 'a'; time must not run back",
+    ),
+    "tip in mm": (
+        GOOD.replace("0.069", "69"),
+        r"row 2, the tip's distance from the base is 69 m; more than "
+        r"3 lengths .* in mm\?",
+    ),
     "absolute lengths": (
-        GOOD.replace(",0,0,0,0,", ",0.07,0.07,0.07,0.07,").replace("-0.001,0,0.001,0", "0.069,0.07,0.071,0.07"),
-        r"median of 0\.07\d* m in column dl_1, .* 0\.07 m at rest: these look like absolute lengths\. The log takes changes",
+        GOOD.replace(",0,0,0,0,", ",0.07,0.07,0.07,0.07,").replace(
+            "-0.001,0,0.001,0", "0.069,0.07,0.071,0.07"
+        ),
+        r"median of 0\.07\d* m in column dl_1, .* 0\.07 m at rest: these look like absolute lengths\. The "
+        r"log takes changes",
     ),
     "dl in mm": (GOOD.replace("-0.001", "-1.0"), r"row 2, column dl_1 is -1 m; .* Was it given in mm\?"),
-    "points": (GOOD.replace("run", "p1_x"), "has points p1 to p1; robot 'prototype' names the arclengths of 0"),
+    "points": (
+        GOOD.replace("run", "p1_x"),
+        "has points p1 to p1; robot 'prototype' names the arclengths of 0",
+    ),
     "ext": (GOOD.replace("run", "ext_2"), "has column 'ext_2'; robot 'prototype' has 1 segments"),
 }
 
@@ -135,7 +164,9 @@ def with_column(name: str, values: list[str]) -> str:
 
 
 def test_mass_in_grams_and_negative_mass(tmp_path: Path, robot: Robot) -> None:
-    with pytest.raises(LogError, match=r"row 2, column payload is 50 kg; more than 10 kg. Was it given in g\?"):
+    with pytest.raises(
+        LogError, match=r"row 2, column payload is 50 kg; more than 10 kg. Was it given in g\?"
+    ):
         read(tmp_path, with_column("payload", ["0", "50", ""]), robot)
     with pytest.raises(LogError, match="row 1, column payload is -1 kg; a mass is not negative"):
         read(tmp_path, with_column("payload", ["-1", "0", ""]), robot)
@@ -182,4 +213,10 @@ def test_unknown_run_answers_with_the_nearest(tmp_path: Path, robot: Robot) -> N
 
 def test_shapes_are_checked_once() -> None:
     with pytest.raises(LogError, match=r"RunLog.tip_position has shape \(2, 2\); it must be \(2, 3\)"):
-        RunLog(name="x", t=np.zeros(2), run=np.array(["", ""]), dl=np.zeros((2, 4)), tip_position=np.zeros((2, 2)))
+        RunLog(
+            name="x",
+            t=np.zeros(2),
+            run=np.array(["", ""]),
+            dl=np.zeros((2, 4)),
+            tip_position=np.zeros((2, 2)),
+        )

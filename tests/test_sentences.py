@@ -52,15 +52,43 @@ def test_a_robot_file_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
 
 
 TEXTS = {
-    "too deep": ("x = " + "[" * 100_000, "robot file is not a robot: its tables stand too deep in one another"),
+    "too deep": (
+        "x = " + "[" * 100_000,
+        "robot file is not a robot: its tables stand too deep in one another",
+    ),
     "digits": ("x = " + "9" * 5000, "robot file holds a number that nothing has: Exceeds the limit"),
-    "place": (PROTOTYPE + '[fit]\n"segment.1.length" = {sd = ' + "9" * 400 + "}\n", r"robot file: fit: Number out of range\."),
-    "a long table": ("name = 'x'\nsegment = ['" + LONG + "']", r"robot file: segment 1 is 'aaa+ \.\.\. a+'; it must be a table"),
-    "sensor list": (PROTOTYPE + "[sensor]\nlatency_sd = [0.1, 0.1]\n", r"\[sensor\] latency_sd has 2 numbers; give one\."),
-    "sensor single": (PROTOTYPE + "[sensor]\nlatency_sd = [0.1]\n", r"\[sensor\] latency_sd is \[0.1\]; give one number\."),
-    "sensor pair": (PROTOTYPE + "[sensor]\nregistration_sd = [0.1]\n", r"registration_sd has 1 numbers; give one, or two: m and rad\."),
-    "sensor negative": (PROTOTYPE + "[sensor]\nnoise = -1e-3\n", r"\[sensor\] noise is -0.001; it must be zero or positive, and finite\."),
-    "sensor nan": (PROTOTYPE + "[sensor]\nnoise = nan\n", r"\[sensor\] noise is nan; it must be zero or positive"),
+    "place": (
+        PROTOTYPE + '[fit]\n"segment.1.length" = {sd = ' + "9" * 400 + "}\n",
+        r"robot file: fit: Number out of range\.",
+    ),
+    "a long table": (
+        "name = 'x'\nsegment = ['" + LONG + "']",
+        r"robot file: segment 1 is 'aaa+ \.\.\. a+'; "
+        r"it must be a table",
+    ),
+    "sensor list": (
+        PROTOTYPE + "[sensor]\nlatency_sd = [0.1, 0.1]\n",
+        r"\[sensor\] latency_sd has 2 numbers; give one\.",
+    ),
+    "sensor single": (
+        PROTOTYPE + "[sensor]\nlatency_sd = [0.1]\n",
+        r"\[sensor\] latency_sd is \[0.1\]; "
+        r"give one number\.",
+    ),
+    "sensor pair": (
+        PROTOTYPE + "[sensor]\nregistration_sd = [0.1]\n",
+        r"registration_sd has 1 numbers; give one, or two: m and rad\.",
+    ),
+    "sensor negative": (
+        PROTOTYPE + "[sensor]\nnoise = -1e-3\n",
+        r"\[sensor\] noise is -0.001; it must be "
+        r"zero or positive, and finite\.",
+    ),
+    "sensor nan": (
+        PROTOTYPE + "[sensor]\nnoise = nan\n",
+        r"\[sensor\] noise is nan; it must be zero or "
+        r"positive",
+    ),
 }
 
 
@@ -73,16 +101,32 @@ def test_texts_of_robots_that_are_none(case: str) -> None:
 
 
 NUMBERS: dict[str, tuple[Any, str]] = {
-    "stiffness": (lambda: rod(bending_stiffness=(1e-300, 1.0)), r"bending_stiffness is 1e-300 N m\^2; it must be between 1e-20 and 1e\+15"),
-    "torsion": (lambda: rod(torsional_stiffness=1e200), r"torsional_stiffness is 1e\+200 N m\^2; it must be between"),
+    "stiffness": (
+        lambda: rod(bending_stiffness=(1e-300, 1.0)),
+        r"bending_stiffness is 1e-300 N m\^2; it "
+        r"must be between 1e-20 and 1e\+15",
+    ),
+    "torsion": (
+        lambda: rod(torsional_stiffness=1e200),
+        r"torsional_stiffness is 1e\+200 N m\^2; it must be "
+        r"between",
+    ),
     "length": (lambda: rod(length=1e-300), r"Segment.length is 1e-300 m; it must be between 1e-06 and inf m"),
-    "offset": (lambda: Tendon(offset=5e-324, angle=0.0), r"Tendon.offset is 5e-324 m; it must be between 1e-06 and 10 m"),
+    "offset": (
+        lambda: Tendon(offset=5e-324, angle=0.0),
+        r"Tendon.offset is 5e-324 m; it must be between "
+        r"1e-06 and 10 m",
+    ),
     "compliance": (
         lambda: Tendon(offset=0.01, angle=0.0, compliance=1e300),
         "compliance is 1e.300 m/N; it must be zero or positive",
     ),
     "pretension": (lambda: Tendon(offset=0.01, angle=0.0, pretension=1e300), "Tendon.pretension is 1e.300 N"),
-    "gravity": (lambda: replace(rod(), gravity=(0.0, 0.0, 1e300)), r"Robot.gravity is \[0.0, 0.0, 1e\+300\]; its numbers must be between"),
+    "gravity": (
+        lambda: replace(rod(), gravity=(0.0, 0.0, 1e300)),
+        r"Robot.gravity is \[0.0, 0.0, "
+        r"1e\+300\]; its numbers must be between",
+    ),
     "line density": (lambda: rod(line_density=1e300), "Segment.line_density is 1e.300 kg/m"),
 }
 
@@ -112,7 +156,11 @@ def test_an_effect_without_bounds_still_needs_a_number_that_is_finite() -> None:
 
     try:
         for value in (np.inf, 10**400, "x"):
-            with pytest.raises(EffectError, match=r"size of effect 'boundless' is .* N; it must be a number from") as caught:
+            with pytest.raises(
+                EffectError,
+                match=r"size of effect 'boundless' is .* N; it must be a number "
+                r"from",
+            ) as caught:
                 Simulator(replace(rod(), effects=({"name": "boundless", "size": value},)))
             assert len(str(caught.value)) < 400
     finally:
@@ -130,7 +178,9 @@ def pair(**given: Any) -> tuple[Simulator, Simulator, np.ndarray]:
     """Two simulators that have settled, and lengths."""
     robot = rod(extension=(-0.005, 0.02))
     one, other = (Simulator(robot, 3, points_per_segment=5, **given) for _ in range(2))
-    lengths = robot.rest_tendon_length + np.array([[0.001, 0.0, -0.001, 0.0]]) * np.array([[1.0], [2.0], [-1.0]])
+    lengths = robot.rest_tendon_length + np.array([[0.001, 0.0, -0.001, 0.0]]) * np.array(
+        [[1.0], [2.0], [-1.0]]
+    )
     return one, other, lengths
 
 
@@ -139,7 +189,9 @@ def pair(**given: Any) -> tuple[Simulator, Simulator, np.ndarray]:
 @pytest.mark.parametrize("cold", [True, False])
 def test_a_bad_row_changes_no_bit_of_its_neighbours(name: str, value: float, cold: bool) -> None:
     sim, twin, lengths = pair()
-    usual = {"extension": np.zeros((3, 1)), "base_pose": np.tile([0.0, 0, 0, 1, 0, 0, 0], (3, 1))}.get(name, np.zeros((3, 3)))
+    usual = {"extension": np.zeros((3, 1)), "base_pose": np.tile([0.0, 0, 0, 1, 0, 0, 0], (3, 1))}.get(
+        name, np.zeros((3, 3))
+    )
     bad = usual.copy()
     bad[1, -1] = value
     if not cold:
@@ -155,7 +207,11 @@ def test_a_bad_row_changes_no_bit_of_its_neighbours(name: str, value: float, col
 
 def test_a_value_beyond_any_unit_is_refused() -> None:
     sim, _, lengths = pair()
-    with pytest.raises(InputError, match=r"tip_force holds a value beyond 1e\+12 N: \[0\.e\+00 0\.e\+00 1\.e\+13\]\."):
+    with pytest.raises(
+        InputError,
+        match=r"tip_force holds a value beyond 1e\+12 N: \[0\.e\+00 0\.e\+00 "
+        r"1\.e\+13\]\.",
+    ):
         sim.step(lengths, tip_force=(0.0, 0.0, 1e13))
     with pytest.raises(InputError, match="tip_force is not an array of numbers"):
         sim.step(lengths, tip_force=[10**400, 0, 0])
@@ -163,7 +219,7 @@ def test_a_value_beyond_any_unit_is_refused() -> None:
         sim.step(lengths, tip_force=np.zeros(3, "datetime64[s]"))
     with pytest.raises(InputError, match="point_force must be"):
         sim.step(lengths, point_force=[(10**400, (0, 0, 1))])
-    assert sim.step(lengths, point_force={}).ok.all()  # type: ignore[arg-type]
+    assert sim.step(lengths, point_force={}).ok.all()
 
 
 def test_a_refused_step_leaves_the_obstacles_where_they_were() -> None:
@@ -192,7 +248,7 @@ def test_rows_of_no_robot() -> None:
     assert sim.step(lengths).ok.all()
     for robots in (None, "x", [None]):
         with pytest.raises(RobotError, match=r"robots is .*; give a list of Robot, one for each row\."):
-            sim.replace([0], robots)  # type: ignore[arg-type]
+            sim.replace([0], robots)
     with pytest.raises(InputError, match=r"arclength is 1000.*; give numbers"):
         sim.shape(10**400)
     with pytest.raises(InputError, match=r"tolerance is 1000.* m; it must be a number"):
@@ -200,7 +256,8 @@ def test_rows_of_no_robot() -> None:
 
 
 def test_merged_rows_keep_the_order_that_kernels_are_compiled_for() -> None:
-    """Another order of axes in memory is another type to numba: a first call would wait for its compilation."""
+    """Another order of axes in memory is another type to numba: a first call would wait for its
+    compilation."""
     now, then = np.zeros((1, 2, 3, 4)), np.ones((3, 2, 3, 4))
     merged = taken(now, then, np.array([True, False, False]))
     assert merged.flags.c_contiguous
@@ -208,7 +265,12 @@ def test_merged_rows_keep_the_order_that_kernels_are_compiled_for() -> None:
 
 
 def test_sentences_about_many_numbers_are_one_line() -> None:
-    given: Any = {"length": 0.05, "bending_stiffness": (0.01, 0.01), "torsional_stiffness": 0.01, "extension": (-0.001, 0.001)}
+    given: Any = {
+        "length": 0.05,
+        "bending_stiffness": (0.01, 0.01),
+        "torsional_stiffness": 0.01,
+        "extension": (-0.001, 0.001),
+    }
     wires = (Tendon(offset=0.01, angle=0.0), Tendon(offset=0.01, angle=1.5))
     many = Robot(name="many", segments=tuple(Segment(tendons=wires, **given) for _ in range(30)))
     sim = Simulator(many)
@@ -236,9 +298,11 @@ def test_a_parquet_column_of_something_else(tmp_path: Path, kind: str) -> None:
     why = "pyarrow is not installed: pip install 'fastrod[parquet]'"
     arrow, parquet = (pytest.importorskip(name, reason=why) for name in ("pyarrow", "pyarrow.parquet"))
     cells = {
-        "list": arrow.array([[1.0, 2.0]]), "span": arrow.array([5], arrow.duration("s")), "bytes": arrow.array([b"\xff"]),
+        "list": arrow.array([[1.0, 2.0]]),
+        "span": arrow.array([5], arrow.duration("s")),
+        "bytes": arrow.array([b"\xff"]),
         "struct": arrow.array([{"a": 1}]),
-    }[kind]  # fmt: skip
+    }[kind]
     names = ("t", "dl_1", "dl_2", "dl_3", "dl_4", "tip_x", "tip_y", "tip_z")
     table = {name: arrow.array([0.0]) for name in names}
     parquet.write_table(arrow.table(table | {"note": cells}), tmp_path / "log.parquet")
@@ -253,7 +317,9 @@ def test_what_is_shown_is_short() -> None:
     assert len(shown("x" * 10_000)) == 200
 
 
-@pytest.mark.parametrize(("name", "value"), [("bend", 1e-300), ("rate", 1e9), ("rate", 1e-9), ("speed", 1e-9), ("speed", 1e9)])
+@pytest.mark.parametrize(
+    ("name", "value"), [("bend", 1e-300), ("rate", 1e9), ("rate", 1e-9), ("speed", 1e-9), ("speed", 1e9)]
+)
 def test_a_run_of_no_rows_or_of_too_many_is_not_made(name: str, value: float) -> None:
     with pytest.raises(InputError, match=f"{name} is {value!r} .*; it must be between"):
         excitation(load_robot("prototype"), **{name: value})
@@ -265,11 +331,17 @@ def test_modes_say_what_they_take() -> None:
         Simulator(rod("paper")).step(lengths, follower_tip_force=(0.0, 0.0, 0.1))
     with pytest.raises(InputError, match="tension is missing; segments in mode tendon_tension need tension"):
         Simulator(rod("tendon_tension")).step()
-    with pytest.raises(RobotError, match="A segment in mode 'paper' needs tendons; give some, or mode 'passive'"):
+    with pytest.raises(
+        RobotError, match="A segment in mode 'paper' needs tendons; give some, or mode 'passive'"
+    ):
         rod("paper", 0)
     tip = Simulator(rod(), outputs="tip")
     tip.settle(lengths)
-    with pytest.raises(InputError, match=r"shape needs Simulator\(..., outputs='full'\); this one keeps the tip only"):
+    with pytest.raises(
+        InputError,
+        match=r"shape needs Simulator\(..., outputs='full'\); this one keeps the "
+        r"tip only",
+    ):
         tip.shape(0.01)
 
 

@@ -35,7 +35,8 @@ from fastrod import Simulator, load_robot
 lengths = np.load(sys.argv[1])
 for name, threads in (("one", 1), ("two", 2)):
     sim = Simulator(load_robot("prototype"), n_robots=200, points_per_segment=6, threads=threads)
-    np.savez(sys.argv[2] + name, settled=sim.settle(lengths).position, stepped=sim.step(1.001 * lengths).curvature)
+    settled, stepped = sim.settle(lengths).position, sim.step(1.001 * lengths).curvature
+    np.savez(sys.argv[2] + name, settled=settled, stepped=stepped)
 """
 
 
@@ -60,7 +61,8 @@ def test_hot_loops_are_simd_code() -> None:
 
 
 def test_a_load_that_no_number_of_steps_would_bring_on_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Steps are in proportion to one over the load: 10 kN on a rod of 2 N mm^2 would take thousands, each of several passes."""
+    """Steps are in proportion to one over the load: 10 kN on a rod of 2 N mm^2 would take thousands, each of
+    several passes."""
     sim, ran = Simulator(rod(), n_robots=2, points_per_segment=6), 0
     run = Passes.run
 
@@ -137,7 +139,11 @@ def test_settled_means_that_the_state_handed_out_is_within_tolerance() -> None:
     robot = load_robot("prototype")
     sim = Simulator(robot, n_robots=200, points_per_segment=8)
     for _ in range(6):
-        state = sim.settle(random_lengths(200, int(rng.integers(1000)), 1.4), tip_force=rng.uniform(-1.5, 1.5, (200, 3)), tolerance=1e-4)
+        state = sim.settle(
+            random_lengths(200, int(rng.integers(1000)), 1.4),
+            tip_force=rng.uniform(-1.5, 1.5, (200, 3)),
+            tolerance=1e-4,
+        )
         assert (state.residual[state.ok] <= 1e-4).all()
         assert state.ok.mean() > 0.95
 
@@ -160,7 +166,9 @@ def test_a_buffer_that_its_owner_writes_into_is_a_new_input() -> None:
     two.settle(rest, tip_force=force)
     for k in range(1, 6):
         force[:] = [0.0, 0.01 * k, 0.0]
-        assert_array_equal(one.step(rest, tip_force=force).position, two.step(rest, tip_force=force.copy()).position)
+        assert_array_equal(
+            one.step(rest, tip_force=force).position, two.step(rest, tip_force=force.copy()).position
+        )
 
 
 def test_snapshot_restores_every_bit() -> None:
@@ -193,7 +201,15 @@ def test_tip_outputs_keep_little_memory() -> None:
     state = sim.settle(robot.rest_tendon_length)
     kept = sum(a.nbytes for a in sim._passes.memory) + state.residual.nbytes + state.ok.nbytes
     kept += sum(
-        a.nbytes for a in (state.position, state.rotation, state.tension, state.base_wrench, state.tip_position, state.tip_rotation)
+        a.nbytes
+        for a in (
+            state.position,
+            state.rotation,
+            state.tension,
+            state.base_wrench,
+            state.tip_position,
+            state.tip_rotation,
+        )
     )
     assert kept / 64 <= 2000
     with pytest.raises(InputError, match="outputs='full'"):
@@ -236,7 +252,7 @@ def test_robots_of_a_batch_may_differ_but_not_in_their_counts() -> None:
 def test_bad_input_gets_one_sentence(given: dict[str, object], sentence: str) -> None:
     sim = Simulator(rod(), n_robots=2)
     with pytest.raises(InputError, match=sentence) as caught:
-        sim.settle(**given)  # type: ignore[arg-type]
+        sim.settle(**given)
     assert "\n" not in str(caught.value)
 
 
@@ -256,13 +272,13 @@ def test_bad_input_gets_one_sentence(given: dict[str, object], sentence: str) ->
 )
 def test_a_simulator_that_cannot_be(given: dict[str, object], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
-        Simulator(rod(), **given)  # type: ignore[arg-type]
+        Simulator(rod(), **given)
 
 
 @pytest.mark.parametrize("robot", ["prototype", ["prototype"], None, []])
 def test_what_is_not_a_robot(robot: object) -> None:
     with pytest.raises(RobotError, match="load_robot"):
-        Simulator(robot)  # type: ignore[arg-type]
+        Simulator(robot)
 
 
 def test_queries_before_a_state() -> None:
@@ -295,9 +311,15 @@ SEGMENT = "[[segment]]\nlength = 0.07\nbending_stiffness = [0.002, 0.002]\ntorsi
         ('name = "a"\n' + SEGMENT.replace("0.07", "-0.07"), "must be positive"),
         ('name = "a"\n' + SEGMENT.replace("0.07", '"long"'), "length: Expected 'float'"),
         ('name = "a"\n' + SEGMENT + 'mode = "tendon_lenght"', "tendon_length"),
-        ('name = "a"\n' + SEGMENT + "tendons = [{offset = 0.01, angle = 0.0, colour = 1}]", "unknown key 'colour'"),
+        (
+            'name = "a"\n' + SEGMENT + "tendons = [{offset = 0.01, angle = 0.0, colour = 1}]",
+            "unknown key 'colour'",
+        ),
         ('name = "a"\n' + SEGMENT + "tendons = [{offset = 0.01, angle = 90.0}]", "degrees"),
-        ('name = "a"\n' + SEGMENT + "body_radius = 0.005\ntendons = [{offset = 0.01, angle = 0.0}]", "beyond the body radius"),
+        (
+            'name = "a"\n' + SEGMENT + "body_radius = 0.005\ntendons = [{offset = 0.01, angle = 0.0}]",
+            "beyond the body radius",
+        ),
         ('name = "a"\n' + SEGMENT + "youngs_modulus = 3e5", "all of youngs_modulus"),
         ('name = "a"\n' + SEGMENT + 'mode = "passive"\n[base]\nquaternion = [1, 1, 0, 0]', "it must be 1"),
         ("name = ", "not TOML"),
@@ -310,7 +332,10 @@ def test_bad_robot_files_get_one_sentence(text: str, sentence: str) -> None:
 
 
 def test_moduli_stand_for_stiffness() -> None:
-    moduli = "[[segment]]\nlength = 0.07\nyoungs_modulus = 3e5\nshear_modulus = 7e4\nsecond_moment = 7e-9\npolar_moment = 1.4e-8\n"
+    moduli = (
+        "[[segment]]\nlength = 0.07\nyoungs_modulus = 3e5\nshear_modulus = 7e4\nsecond_moment = "
+        "7e-9\npolar_moment = 1.4e-8\n"
+    )
     segment = loads('name = "a"\n' + moduli + 'mode = "passive"').segments[0]
     assert segment.bending_stiffness == pytest.approx((2.1e-3, 2.1e-3))
     assert segment.torsional_stiffness == pytest.approx(9.8e-4)
@@ -343,7 +368,12 @@ def test_an_edit_in_a_kernel_is_never_stale(tmp_path: Path) -> None:
 
     def folder() -> str:
         return subprocess.run(
-            [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True, cwd=tmp_path
+            [sys.executable, "-c", script],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=True,
+            cwd=tmp_path,
         ).stdout
 
     seen = [folder()]
@@ -374,6 +404,8 @@ def test_jacobian_that_comes_with_the_step_is_the_same(n_robots, force):
         plain.step(**inputs)
         derived.step(**inputs, derive=True)
     np.testing.assert_allclose(plain.jacobian(), derived.jacobian(), rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(plain.jacobian(turning=True), derived.jacobian(turning=True), rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(
+        plain.jacobian(turning=True), derived.jacobian(turning=True), rtol=1e-6, atol=1e-6
+    )
     derived.settle(**inputs)
     np.testing.assert_allclose(plain.jacobian(), derived.jacobian(), rtol=1e-6, atol=1e-6)

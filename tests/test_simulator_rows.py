@@ -1,4 +1,5 @@
-"""Robots of a batch held, put back, settled or replaced one by one: exact for them, and nothing to the others."""
+"""Robots of a batch held, put back, settled or replaced one by one: exact for them, and nothing to the
+others."""
 
 from __future__ import annotations
 
@@ -19,13 +20,25 @@ from fastrod.errors import InputError, RobotError
 from fastrod.model.segment_actions import SegmentActions
 
 N, ROWS, OTHERS = 5, np.array([1, 3]), np.array([0, 2, 4])
-FIELDS = ("position", "rotation", "curvature", "tip_position", "tip_rotation", "tension", "base_wrench", "residual", "ok", "passes")
+FIELDS = (
+    "position",
+    "rotation",
+    "curvature",
+    "tip_position",
+    "tip_rotation",
+    "tension",
+    "base_wrench",
+    "residual",
+    "ok",
+    "passes",
+)
 Inputs = dict[str, Any]
 Step = Callable[[int], Inputs]
 
 
 def reacher() -> tuple[Robot, Callable[[float], Inputs]]:
-    """The five-segment reacher on a slow path: all bends at some 10 mm/s, its last segment extending, as a function of time [s]."""
+    """The five-segment reacher on a slow path: all bends at some 10 mm/s, its last segment extending, as a
+    function of time [s]."""
     robot = load_robot("five_segment_reacher")
     matrix = SegmentActions(robot).matrix
 
@@ -41,7 +54,9 @@ def reacher() -> tuple[Robot, Callable[[float], Inputs]]:
 
 def test_a_held_gain_follows_a_slow_robot_as_closely_as_a_fresh_one() -> None:
     robot, at = reacher()
-    fresh, held, still = (Simulator(robot, dt=0.05, points_per_segment=2, threads=1, hold_gain=h) for h in (0.0, 5e-5, 0.0))
+    fresh, held, still = (
+        Simulator(robot, dt=0.05, points_per_segment=2, threads=1, hold_gain=h) for h in (0.0, 5e-5, 0.0)
+    )
     fresh.settle(**at(0.0))
     held.settle(**at(0.0))
     errors, residuals = [], []
@@ -60,7 +75,9 @@ def test_a_held_gain_follows_a_slow_robot_as_closely_as_a_fresh_one() -> None:
 
 def test_held_steps_come_to_rest_where_settle_does() -> None:
     robot, at = reacher()
-    sim, still = (Simulator(robot, dt=0.05, points_per_segment=2, threads=1, hold_gain=h) for h in (5e-5, 0.0))
+    sim, still = (
+        Simulator(robot, dt=0.05, points_per_segment=2, threads=1, hold_gain=h) for h in (5e-5, 0.0)
+    )
     sim.settle(**at(0.0))
     for k in range(1, 60):
         sim.step(**at(0.05 * k))
@@ -72,7 +89,9 @@ def test_held_steps_come_to_rest_where_settle_does() -> None:
 
 def test_a_gain_is_held_only_below_the_residual_that_is_allowed() -> None:
     robot, at = reacher()
-    plain, strict, loose = (Simulator(robot, dt=0.05, points_per_segment=2, threads=1, hold_gain=h) for h in (0.0, 1e-30, 1e-3))
+    plain, strict, loose = (
+        Simulator(robot, dt=0.05, points_per_segment=2, threads=1, hold_gain=h) for h in (0.0, 1e-30, 1e-3)
+    )
     tips = []
     for sim in (plain, strict, loose):
         sim.settle(**at(0.0))
@@ -100,7 +119,9 @@ def wiggled(robot: Robot, seed: int = 3) -> Step:
 
 def loaded(step: Step) -> Step:
     """With a tip force on every robot that begins to move at step 4."""
-    push = np.array([[0.0, 0.02, 0.01], [0.02, 0.0, 0.0], [0.01, 0.01, 0.0], [-0.02, 0.0, 0.01], [0.0, 0.0, 0.02]])
+    push = np.array(
+        [[0.0, 0.02, 0.01], [0.02, 0.0, 0.0], [0.01, 0.01, 0.0], [-0.02, 0.0, 0.01], [0.0, 0.0, 0.02]]
+    )
     return lambda k: {**step(k), "tip_force": push * max(k - 3, 0)}
 
 
@@ -110,7 +131,9 @@ def walled() -> Step:
     return lambda k: {"tendon_length": bent(toward * np.sin(0.2 * k), 2.0 * np.cos(0.3 * k) * np.ones(N))}
 
 
-WALL = ContactScene(obstacles=[plane(point=(0.012, 0, 0), normal=(-1, 0, 0), name="wall", friction=0.2)], rod_radius=0.0)
+WALL = ContactScene(
+    obstacles=[plane(point=(0.012, 0, 0), normal=(-1, 0, 0), name="wall", friction=0.2)], rod_radius=0.0
+)
 CASES: dict[str, tuple[Robot, Step, ContactScene | None, float]] = {
     "plain": (rod(), wiggled(rod()), None, 0.0),
     "held": (rod(), wiggled(rod()), None, 1e-3),
@@ -130,7 +153,10 @@ def made(case: str) -> tuple[Simulator, Inputs, Step]:
 
 def same(one: State, other: State, rows: Any = slice(None)) -> bool:
     """Whether these robots agree to the last bit."""
-    return all(np.array_equal(getattr(one, name)[rows], getattr(other, name)[rows], equal_nan=True) for name in FIELDS)
+    return all(
+        np.array_equal(getattr(one, name)[rows], getattr(other, name)[rows], equal_nan=True)
+        for name in FIELDS
+    )
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -155,7 +181,7 @@ def test_robots_put_back_begin_anew_and_the_others_notice_nothing(case: str) -> 
 
 def test_contact_and_backlash_matter_in_these_cases() -> None:
     sim, _, step = made("contact")
-    touched = np.array([sim.step(**step(k)).contacts.count for k in range(18)])  # type: ignore[union-attr]
+    touched = np.array([sim.step(**step(k)).contacts.count for k in range(18)])
     assert (touched[:8] > 0).any(0)[ROWS].all()
     assert (touched[8:] > 0).any(0)[ROWS].all()
     lash, _, step = made("effect with memory")
@@ -177,7 +203,8 @@ def test_robots_put_back_from_before_a_tip_force_moved() -> None:
     for k in range(8, 18):
         state, expected = sim.step(**step(k)), fresh.step(**step(k))
         assert same(state, alone.step(**step(k)), OTHERS)
-        assert_array_equal(state.position[ROWS], expected.position[ROWS])  # the fresh one takes a pass to learn its gain, those had it
+        # the fresh one takes a pass to learn its gain, those had it
+        assert_array_equal(state.position[ROWS], expected.position[ROWS])
         assert_array_equal(state.residual[ROWS], expected.residual[ROWS])
 
 
@@ -236,7 +263,9 @@ def test_some_robots_settle_and_the_others_stay(case: str) -> None:
     assert (sim.state.residual[ROWS] < 1e-9).all()
     assert sim.state.ok.all()
     if case != "effect with memory":  # where a robot settles depends on where its wires were
-        assert_allclose(sim.state.tip_position[ROWS], fresh.settle(**step(20)).tip_position[ROWS], rtol=0, atol=1e-8)
+        assert_allclose(
+            sim.state.tip_position[ROWS], fresh.settle(**step(20)).tip_position[ROWS], rtol=0, atol=1e-8
+        )
     for k in range(6, 14):
         assert same(sim.step(**step(k)), alone.step(**step(k)), OTHERS)
 

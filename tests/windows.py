@@ -14,9 +14,15 @@ from numpy.typing import NDArray
 from fastrod.rotation import matrix_from_quaternion
 
 ARGUMENTS = [
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync",
-]  # fmt: skip
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
 _LOCAL = ("127.0.0.1", "localhost")
 
 
@@ -24,7 +30,9 @@ class Window:
     """A browser window of its own, with what it asked for."""
 
     def __init__(self, browser: Any, width: int = 1280, height: int = 800, offline: bool = False) -> None:
-        self.context = browser.new_context(viewport={"width": width, "height": height}, offline=offline, accept_downloads=True)
+        self.context = browser.new_context(
+            viewport={"width": width, "height": height}, offline=offline, accept_downloads=True
+        )
         self.page = self.context.new_page()
         self.page.set_default_timeout(60_000)  # a browser without a graphics card on a busy machine is slow
         self.asked: list[str] = []
@@ -37,7 +45,9 @@ class Window:
     def strays(self) -> list[str]:
         """Requests that left the machine."""
         return [
-            url for url in self.asked if urlparse(url).scheme in ("http", "https", "ws", "wss") and urlparse(url).hostname not in _LOCAL
+            url
+            for url in self.asked
+            if urlparse(url).scheme in ("http", "https", "ws", "wss") and urlparse(url).hostname not in _LOCAL
         ]
 
     def go(self, address: str) -> None:

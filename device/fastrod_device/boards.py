@@ -1,4 +1,5 @@
-"""Boards before a camera: who waves them, which pictures are taken, and the numbers that come out as tables."""
+"""Boards before a camera: who waves them, which pictures are taken, and the numbers that come out as
+tables."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 APART = 0.06
-"""How far a corner of the board must be from where it was in every picture that was taken, as a part of the picture's diagonal."""
+"""How far a corner of the board must be from where it was in every picture that was taken, as a part of the
+picture's diagonal."""
 PATIENCE = 60.0
 """Time in which no picture can be taken, after which there will be no more [s]."""
 _STILL = 0.004  # of the diagonal: a corner that moves farther from frame to frame is blurred
@@ -53,7 +55,8 @@ class AskingBoardHands:
     def wave(self) -> None:
         """Say what to do."""
         print(
-            "Show the board to the camera, near and far, tilted by some 30 deg to all sides, also in the picture's corners; "
+            "Show the board to the camera, near and far, tilted by some 30 deg to all sides, also in the "
+            "picture's corners; "
             "hold it still for a moment at each place."
         )
 
@@ -104,7 +107,10 @@ class BoardEye:
         rng, camera = self._ways, self.camera
         azimuth, tilt, roll = rng.uniform(0.0, 2.0 * math.pi), rng.uniform(0.1, 0.65), rng.uniform(-0.5, 0.5)
         aside = rng.uniform(-0.2, 0.2, 2) * np.array(camera.size)
-        return compose(camera.base_from_camera, _before(camera, self.board, rng.uniform(0.35, 0.75), azimuth, tilt, roll, aside))
+        return compose(
+            camera.base_from_camera,
+            _before(camera, self.board, rng.uniform(0.35, 0.75), azimuth, tilt, roll, aside),
+        )
 
     def _waved(self, t: float) -> Pose:
         each = _ON_THE_WAY + _AT_REST
@@ -118,7 +124,8 @@ class BoardEye:
 
 
 def bent(camera: Camera, seed: int) -> Camera:
-    """What an emulated camera truly is, where a file says `camera`: another focal length by some per cent, and a bent lens."""
+    """What an emulated camera truly is, where a file says `camera`: another focal length by some per cent,
+    and a bent lens."""
     rng = np.random.default_rng([seed, 2])
     (fx, _, cx), (_, fy, cy), _ = camera.matrix
     scale = 1.0 + rng.uniform(0.01, _FOCUS) * rng.choice([-1.0, 1.0])
@@ -126,26 +133,34 @@ def bent(camera: Camera, seed: int) -> Camera:
     dx, dy = _CENTRE * max(camera.size) * rng.uniform(-1.0, 1.0, 2)
     k1, (p1, p2) = float(rng.uniform(*_BENT)), _TANGENT * rng.uniform(-1.0, 1.0, 2)
     matrix = ((fx * scale, 0.0, float(cx + dx)), (0.0, fy * scale * aspect, float(cy + dy)), (0.0, 0.0, 1.0))
-    return replace(camera, matrix=matrix, distortion=(k1, float(rng.uniform(0.02, 0.1)), float(p1), float(p2), 0.0))
+    return replace(
+        camera, matrix=matrix, distortion=(k1, float(rng.uniform(0.02, 0.1)), float(p1), float(p2), 0.0)
+    )
 
 
 def moved(camera: Camera, seed: int) -> Camera:
-    """Where an emulated camera truly stands, where a file says `camera`: off by some millimetres and degrees."""
+    """Where an emulated camera truly stands, where a file says `camera`: off by some millimetres and
+    degrees."""
     rng = np.random.default_rng([seed, 3])
     position = np.array(camera.position) + _MOVED * rng.uniform(-1.0, 1.0, 3)
-    quaternion = product(np.array(camera.quaternion), quaternion_from_vector(_TURNED * rng.uniform(-1.0, 1.0, 3)))
+    quaternion = product(
+        np.array(camera.quaternion), quaternion_from_vector(_TURNED * rng.uniform(-1.0, 1.0, 3))
+    )
     x, y, z = position.tolist()
     w, a, b, c = (quaternion / np.linalg.norm(quaternion)).tolist()
     return replace(camera, position=(x, y, z), quaternion=(w, a, b, c))
 
 
 def fixtures(camera: Camera, board: CharucoBoard) -> tuple[Pose, ...]:
-    """Four places base_from_board that `camera` sees well, tilted to four sides: where an emulated bench fixes the board."""
+    """Four places base_from_board that `camera` sees well, tilted to four sides: where an emulated bench
+    fixes the board."""
     turns = [_before(camera, board, 0.5, azimuth, 0.4, 0.0, np.zeros(2)) for azimuth in (0.0, 1.6, 3.1, 4.7)]
     return tuple(compose(camera.base_from_camera, there) for there in turns)
 
 
-def _before(camera: Camera, board: CharucoBoard, fill: float, azimuth: float, tilt: float, roll: float, aside: Floats) -> Pose:
+def _before(
+    camera: Camera, board: CharucoBoard, fill: float, azimuth: float, tilt: float, roll: float, aside: Floats
+) -> Pose:
     """Camera_from_board with its middle `aside` (2,) of the picture's [px], filling this part of it."""
     width, height = board.columns * board.square, board.rows * board.square
     m = camera.intrinsics
@@ -167,17 +182,27 @@ class Collected:
     @property
     def told(self) -> str:
         """The frames passed over, in words."""
-        return ", ".join(f"{n} {why}" for why, n in sorted(self.passed.items(), key=lambda item: -item[1])) or "none"
+        return (
+            ", ".join(f"{n} {why}" for why, n in sorted(self.passed.items(), key=lambda item: -item[1]))
+            or "none"
+        )
 
 
 def collect(
-    source: FrameSource, board: CharucoBoard, n: int, clock: Clock, *, apart: float = APART, patience: float = PATIENCE,
+    source: FrameSource,
+    board: CharucoBoard,
+    n: int,
+    clock: Clock,
+    *,
+    apart: float = APART,
+    patience: float = PATIENCE,
     progress: Callable[[str, int, int], None] | None = None,
-) -> Collected:  # fmt: skip
-    """Up to `n` pictures of a board at rest, each with a corner of the board `apart` (a part of the diagonal) from those taken before.
+) -> Collected:
+    """Up to `n` pictures of a board at rest, each with a corner of the board `apart` (a part of the diagonal)
+    from those taken before.
 
-    It ends earlier where none could be taken for `patience` [s]. Raises `CalibrationError` where there is then none at all, `InputError`
-    for a number of pictures that is none, and what the source raises.
+    It ends earlier where none could be taken for `patience` [s]. Raises `CalibrationError` where there is
+    then none at all, `InputError` for a number of pictures that is none, and what the source raises.
     """
     if isinstance(n, bool) or not isinstance(n, int) or n < 1:
         raise InputError(f"{n!r} pictures of the board are asked for; it must be a whole number from 1.")
@@ -211,7 +236,9 @@ def collect(
             tell("views", len(pictures), n)
     made = Collected(pictures=tuple(pictures), passed=dict(passed))
     if not pictures:
-        raise CalibrationError(f"no picture of the board could be taken in {patience:g} s; frames passed over: {made.told}.")
+        raise CalibrationError(
+            f"no picture of the board could be taken in {patience:g} s; frames passed over: {made.told}."
+        )
     return made
 
 
@@ -221,7 +248,10 @@ def _quad(view: BoardView, board: CharucoBoard) -> Floats:
 
     width, height = board.columns * board.square, board.rows * board.square
     to_pixels, _ = cv2.findHomography(view.points[:, :2], view.pixels)
-    outer = np.array([[0.0, 0.0, 1.0], [width, 0.0, 1.0], [width, height, 1.0], [0.0, height, 1.0]]) @ np.asarray(to_pixels).T
+    outer = (
+        np.array([[0.0, 0.0, 1.0], [width, 0.0, 1.0], [width, height, 1.0], [0.0, height, 1.0]])
+        @ np.asarray(to_pixels).T
+    )
     return np.asarray(outer[:, :2] / outer[:, 2:], dtype=np.float64)
 
 
@@ -233,7 +263,9 @@ def lens_table(found: CameraCalibration, file: Camera, truth: Camera | None) -> 
     """Intrinsics found, their standard errors, those of the file; and the true ones of an emulated camera."""
     table = _table("intrinsics", truth)
     cameras = (found.camera(), file) if truth is None else (found.camera(), file, truth)
-    numbers = [[c.matrix[0][0], c.matrix[1][1], c.matrix[0][2], c.matrix[1][2], *c.distortion] for c in cameras]
+    numbers = [
+        [c.matrix[0][0], c.matrix[1][1], c.matrix[0][2], c.matrix[1][2], *c.distortion] for c in cameras
+    ]
     names = ("fx, px", "fy, px", "cx, px", "cy, px", "k1", "k2", "p1", "p2", "k3")
     for k, name in enumerate(names):
         digits = 2 if k < 4 else 5
@@ -244,10 +276,16 @@ def lens_table(found: CameraCalibration, file: Camera, truth: Camera | None) -> 
 
 
 def place_table(found: Registration, file: Camera, truth: Camera | None) -> Table:
-    """Where the camera stands: position, and how it is turned from where the file has it, each with standard errors."""
+    """Where the camera stands: position, and how it is turned from where the file has it, each with standard
+    errors."""
     table = _table("base_from_camera", truth)
-    poses = [(found.position, found.quaternion), file.base_from_camera] + ([] if truth is None else [truth.base_from_camera])
-    rows = [np.concatenate([1e3 * position, np.degrees(_turn(file.quaternion, quaternion))]) for position, quaternion in poses]
+    poses = [(found.position, found.quaternion), file.base_from_camera] + (
+        [] if truth is None else [truth.base_from_camera]
+    )
+    rows = [
+        np.concatenate([1e3 * position, np.degrees(_turn(file.quaternion, quaternion))])
+        for position, quaternion in poses
+    ]
     errors = np.concatenate([1e3 * found.position_stderr, np.degrees(found.rotation_stderr)])
     names = [f"{axis}, mm" for axis in "xyz"] + [f"turned about the camera's {axis}, deg" for axis in "xyz"]
     for k, name in enumerate(names):

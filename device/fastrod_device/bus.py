@@ -25,13 +25,16 @@ def guest(name: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        raise DeviceError(f"the CAN bus needs {name.split('.')[0]}: pip install 'fastrod[device]' ({error}).") from error
+        raise DeviceError(
+            f"the CAN bus needs {name.split('.')[0]}: pip install 'fastrod[device]' ({error})."
+        ) from error
 
 
 def open_bus(name: str, bitrate: int = 1_000_000) -> can.BusABC:
     """A bus, opened.
 
-    `socketcan:can0`, `pcan:PCAN_USBBUS1`, `kvaser:0`, ...: adapters, at `bitrate` [bit/s]. `virtual:NAME`: inside this process.
+    `socketcan:can0`, `pcan:PCAN_USBBUS1`, `kvaser:0`, ...: adapters, at `bitrate` [bit/s]. `virtual:NAME`:
+    inside this process.
     `udp_multicast:239.74.163.2` or `udp_multicast:239.74.163.2:PORT`: between processes.
 
     Raises `DeviceError`: no such interface (with the nearest name), no channel, driver or adapter missing.
@@ -40,9 +43,13 @@ def open_bus(name: str, bitrate: int = 1_000_000) -> can.BusABC:
     interface, _, channel = name.partition(":") if isinstance(name, str) else ("", "", "")
     known = sorted(library.VALID_INTERFACES)
     if interface not in known:
-        raise DeviceError(f"no CAN interface {interface!r} in the bus name {name!r}; {nearest(interface, known)}")
+        raise DeviceError(
+            f"no CAN interface {interface!r} in the bus name {name!r}; {nearest(interface, known)}"
+        )
     if not channel:
-        raise DeviceError(f"the bus name {name!r} lacks its channel; write INTERFACE:CHANNEL, such as socketcan:can0.")
+        raise DeviceError(
+            f"the bus name {name!r} lacks its channel; write INTERFACE:CHANNEL, such as socketcan:can0."
+        )
     options: dict[str, Any] = {"channel": channel, "bitrate": bitrate}
     if interface == "virtual":
         options = {"channel": channel}
@@ -51,14 +58,27 @@ def open_bus(name: str, bitrate: int = 1_000_000) -> can.BusABC:
         options = {"channel": group, "fd": False}
         if port:
             if not port.isdecimal() or not 0 < int(port) < 65536:
-                raise DeviceError(f"the bus name {name!r} has the port {port!r}; it must be a whole number from 1 to 65535.")
+                raise DeviceError(
+                    f"the bus name {name!r} has the port {port!r}; it must be a whole number from 1 to 65535."
+                )
             options["port"] = int(port)
-    elif channel.isdecimal() and interface in ("kvaser", "ixxat", "vector", "neovi", "systec", "cantact", "canalystii", "iscan"):
+    elif channel.isdecimal() and interface in (
+        "kvaser",
+        "ixxat",
+        "vector",
+        "neovi",
+        "systec",
+        "cantact",
+        "canalystii",
+        "iscan",
+    ):
         options["channel"] = int(channel)
     try:
         bus: can.BusABC = library.Bus(interface=interface, ignore_config=True, **options)
     except library.CanInterfaceNotImplementedError as error:
-        raise DeviceError(f"the driver of the CAN interface {interface!r} is not installed: {_plain(error)}.") from error
+        raise DeviceError(
+            f"the driver of the CAN interface {interface!r} is not installed: {_plain(error)}."
+        ) from error
     except (
         library.CanError,
         OSError,
@@ -67,7 +87,10 @@ def open_bus(name: str, bitrate: int = 1_000_000) -> can.BusABC:
         NameError,
         AttributeError,
     ) as error:  # vendors' libraries raise what they like
-        raise DeviceError(f"the bus {name!r} cannot be opened: {_plain(error)}. Is the adapter plugged in and its channel up?") from error
+        raise DeviceError(
+            f"the bus {name!r} cannot be opened: {_plain(error)}. Is the adapter plugged in "
+            "and its channel up?"
+        ) from error
     return bus
 
 
@@ -79,14 +102,16 @@ def _plain(error: Exception) -> str:
 class Line:
     """One bus with the thread that listens to it: a canopen network whose frames are also sent raw.
 
-    Frames that come are handed to what was subscribed at `network`. A receiver that fails does not end: `trouble` says why.
+    Frames that come are handed to what was subscribed at `network`. A receiver that fails does not end:
+    `trouble` says why.
     """
 
     def __init__(self, bus: str | can.BusABC, bitrate: int = 1_000_000) -> None:
         """`bus`: a name, then opened here and shut by `close`, or a bus that stays the caller's."""
         library, canopen = guest("can"), guest("canopen")
         for name in ("can", "canopen"):
-            logging.getLogger(name).addHandler(logging.NullHandler())  # their complaints come as our exceptions
+            # their complaints come as our exceptions
+            logging.getLogger(name).addHandler(logging.NullHandler())
         self._own = isinstance(bus, str)
         self.bus: Any = open_bus(bus, bitrate) if isinstance(bus, str) else bus
         self.error: type[Exception] = library.CanError

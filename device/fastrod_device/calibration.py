@@ -27,7 +27,8 @@ _SCATTER_VIEWS = 4  # from so many views on their scatter says something
 @final
 @dataclass(frozen=True, kw_only=True)
 class CharucoBoard:
-    """A chessboard with a marker in every white square. Its axes: x right and y down on the print, z into it, origin at the top left.
+    """A chessboard with a marker in every white square. Its axes: x right and y down on the print, z into it,
+    origin at the top left.
 
     Raises `InputError` for what cannot be printed, `UnknownNameError` for the dictionary.
     """
@@ -45,10 +46,13 @@ class CharucoBoard:
 
     def __post_init__(self) -> None:
         if self.columns < 3 or self.rows < 3:
-            raise InputError(f"CharucoBoard has {self.columns} x {self.rows} squares; it must have 3 x 3 or more.")
+            raise InputError(
+                f"CharucoBoard has {self.columns} x {self.rows} squares; it must have 3 x 3 or more."
+            )
         if not 0.0 < self.marker < self.square <= 1.0:
             raise InputError(
-                f"CharucoBoard.marker is {self.marker!r} m, square {self.square!r} m; 0 < marker < square <= 1 would be right."
+                f"CharucoBoard.marker is {self.marker!r} m, square {self.square!r} m; 0 < marker < square "
+                "<= 1 would be right."
             )
         needed, there = self.columns * self.rows // 2, len(dictionary_named(self.dictionary).bytesList)
         if needed > there:
@@ -66,7 +70,9 @@ class CharucoBoard:
         """OpenCV's object of it."""
         import cv2
 
-        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker, dictionary_named(self.dictionary))
+        return cv2.aruco.CharucoBoard(
+            (self.columns, self.rows), self.square, self.marker, dictionary_named(self.dictionary)
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -100,7 +106,11 @@ class BoardFinder:
         points, n = self._places[numbers], len(numbers)
         if n < _LEAST_CORNERS:
             why = f"{n} corners seen, {_LEAST_CORNERS} are needed" if n else "no board seen"
-            return BoardView(points=points, pixels=np.asarray(corners if n else [], dtype=np.float64).reshape(-1, 2), why=why)
+            return BoardView(
+                points=points,
+                pixels=np.asarray(corners if n else [], dtype=np.float64).reshape(-1, 2),
+                why=why,
+            )
         pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
         if min(np.ptp(points[:, 0]), np.ptp(points[:, 1])) < 0.5 * self.board.square:
             return BoardView(points=points, pixels=pixels, why="its corners lie on one line")
@@ -131,7 +141,11 @@ class CameraCalibration:
         rows = (_three(row) for row in self.matrix)
         k1, k2, p1, p2, k3 = self.distortion.tolist()
         return Camera(
-            matrix=(next(rows), next(rows), next(rows)), distortion=(k1, k2, p1, p2, k3), size=self.size, rate=rate, latency=latency
+            matrix=(next(rows), next(rows), next(rows)),
+            distortion=(k1, k2, p1, p2, k3),
+            size=self.size,
+            rate=rate,
+            latency=latency,
         )
 
 
@@ -160,10 +174,14 @@ class Registration:
         return replace(camera, position=_three(self.position), quaternion=(w, x, y, z))
 
 
-def calibrate(images: Sequence[Picture], board: CharucoBoard, *, third_radial: bool = False) -> CameraCalibration:
-    """Intrinsics from pictures (h, w) of a board, near and far, tilted to all sides, also in the picture's corners.
+def calibrate(
+    images: Sequence[Picture], board: CharucoBoard, *, third_radial: bool = False
+) -> CameraCalibration:
+    """Intrinsics from pictures (h, w) of a board, near and far, tilted to all sides, also in the picture's
+    corners.
 
-    `third_radial`: fit k3 too; few lenses need it, and it is poorly determined. Raises `CalibrationError` where the views do not tell.
+    `third_radial`: fit k3 too; few lenses need it, and it is poorly determined. Raises `CalibrationError`
+    where the views do not tell.
     """
     import cv2
 
@@ -171,10 +189,13 @@ def calibrate(images: Sequence[Picture], board: CharucoBoard, *, third_radial: b
     used, refused, points, pixels = _corners(images, board)
     if len(used) < _LEAST_VIEWS:
         raise CalibrationError(
-            f"{len(used)} of {len(images)} views show the board well enough{_why(refused)}; {_LEAST_VIEWS} or more are needed."
+            f"{len(used)} of {len(images)} views show the board well enough{_why(refused)}; {_LEAST_VIEWS} "
+            "or more are needed."
         )
     flags = 0 if third_radial else cv2.CALIB_FIX_K3
-    start = np.array([[max(size), 0.0, (size[0] - 1) / 2.0], [0.0, max(size), (size[1] - 1) / 2.0], [0.0, 0.0, 1.0]])
+    start = np.array(
+        [[max(size), 0.0, (size[0] - 1) / 2.0], [0.0, max(size), (size[1] - 1) / 2.0], [0.0, 0.0, 1.0]]
+    )
     flags |= cv2.CALIB_USE_INTRINSIC_GUESS
     points_32, pixels_32 = [p.astype(np.float32) for p in points], [p.astype(np.float32) for p in pixels]
     try:
@@ -182,29 +203,43 @@ def calibrate(images: Sequence[Picture], board: CharucoBoard, *, third_radial: b
             points_32, pixels_32, size, start, np.zeros(5), flags=flags
         )
     except cv2.error as problem:
-        raise CalibrationError("the views do not determine a camera; show the board tilted to all sides, near and far.") from problem
+        raise CalibrationError(
+            "the views do not determine a camera; show the board tilted to all sides, near and far."
+        ) from problem
     normals = np.stack([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
     apart = float(np.arccos(np.clip(normals @ normals.T, -1.0, 1.0)).max())
     if apart < _LEAST_TILT:
         raise CalibrationError(
-            f"the views are all alike: their tilts differ by {math.degrees(apart):.0f} deg at most; tilt the board by 30 deg to all sides."
+            f"the views are all alike: their tilts differ by {math.degrees(apart):.0f} deg at most; tilt "
+            "the board by 30 deg to all sides."
         )
     stderr = np.ravel(spread)[:9]
     if not stderr[:2].max() < _LARGEST_SPREAD * matrix[0, 0]:
         known = f"{matrix[0, 0]:.0f} px uncertain by {stderr[:2].max():.0f} px"
-        raise CalibrationError(f"the views leave the focal length {known}; show the board tilted, near and far.")
+        raise CalibrationError(
+            f"the views leave the focal length {known}; show the board tilted, near and far."
+        )
     return CameraCalibration(
-        matrix=np.asarray(matrix, dtype=np.float64), distortion=np.ravel(distortion)[:5].astype(np.float64), size=size, error=float(error),
-        stderr=stderr.astype(np.float64), used=tuple(used), refused=tuple(refused),
-    )  # fmt: skip
+        matrix=np.asarray(matrix, dtype=np.float64),
+        distortion=np.ravel(distortion)[:5].astype(np.float64),
+        size=size,
+        error=float(error),
+        stderr=stderr.astype(np.float64),
+        used=tuple(used),
+        refused=tuple(refused),
+    )
 
 
-def register_base(images: Sequence[Picture], board: CharucoBoard, camera: Camera, *, position: Floats, quaternion: Floats) -> Registration:
-    """Where the camera stands, from pictures of a board at known places: base_from_board, one for all images or one each.
+def register_base(
+    images: Sequence[Picture], board: CharucoBoard, camera: Camera, *, position: Floats, quaternion: Floats
+) -> Registration:
+    """Where the camera stands, from pictures of a board at known places: base_from_board, one for all images
+    or one each.
 
-    `position` (3,) or (n, 3) [m], `quaternion` (4,) or (n, 4). Standard errors are the larger of two: from the corners' misfit, and from
-    the scatter of single views, where there are 4 or more; an error that all views share (a board that is fixed askew) is in neither.
-    Raises `CalibrationError` where no view tells, `InputError` for wrong shapes.
+    `position` (3,) or (n, 3) [m], `quaternion` (4,) or (n, 4). Standard errors are the larger of two: from
+    the corners' misfit, and from the scatter of single views, where there are 4 or more; an error that all
+    views share (a board that is fixed askew) is in neither. Raises `CalibrationError` where no view tells,
+    `InputError` for wrong shapes.
     """
     if _size(images) != camera.size:
         raise InputError(f"the pictures are {_size(images)} px; those of the camera are {camera.size} px.")
@@ -214,10 +249,13 @@ def register_base(images: Sequence[Picture], board: CharucoBoard, camera: Camera
     except ValueError as error:
         shapes = f"{np.shape(position)} and {np.shape(quaternion)}"
         raise InputError(
-            f"position and quaternion have shapes {shapes}; (3,) and (4,), or a row for each picture, would be right."
+            f"position and quaternion have shapes {shapes}; (3,) and (4,), or a row for each picture, would "
+            "be right."
         ) from error
     if not (np.isfinite(places).all() and np.allclose(np.linalg.norm(turns, axis=1), 1.0, atol=1e-4)):
-        raise InputError("a place of the board is not finite, or its quaternion not of norm 1 (order w x y z).")
+        raise InputError(
+            "a place of the board is not finite, or its quaternion not of norm 1 (order w x y z)."
+        )
     used, refused, points, pixels = _corners(images, board)
     if not used:
         raise CalibrationError(f"none of {len(images)} views shows the board well enough{_why(refused)}.")
@@ -228,12 +266,19 @@ def register_base(images: Sequence[Picture], board: CharucoBoard, camera: Camera
         singles.append(compose((places[k], turns[k]), inverse(camera_from_board)))
     found, misfit, spread = _stand(singles[0], np.concatenate(space), np.concatenate(pixels), camera)
     if len(used) >= _SCATTER_VIEWS:
-        one = [_stand(start, p, seen, camera)[0] for start, p, seen in zip(singles, space, pixels, strict=True)]
+        one = [
+            _stand(start, p, seen, camera)[0] for start, p, seen in zip(singles, space, pixels, strict=True)
+        ]
         spread = np.maximum(spread, _scatter(one, found))
     return Registration(
-        position=found[0], quaternion=found[1], position_stderr=spread[:3], rotation_stderr=spread[3:], error=misfit,
-        used=tuple(used), refused=tuple(refused),
-    )  # fmt: skip
+        position=found[0],
+        quaternion=found[1],
+        position_stderr=spread[:3],
+        rotation_stderr=spread[3:],
+        error=misfit,
+        used=tuple(used),
+        refused=tuple(refused),
+    )
 
 
 def _three(row: Floats) -> tuple[float, float, float]:
@@ -246,12 +291,17 @@ def _size(images: Sequence[Picture]) -> tuple[int, int]:
         raise CalibrationError("no pictures were given; some of the board would be right.")
     shapes = sorted({image.shape for image in images})
     if len(shapes) > 1 or len(shapes[0]) != 2 or any(image.dtype != np.uint8 for image in images):
-        raise InputError(f"the pictures have shapes {shapes}; all must be (h, w), one size, uint8 grey levels.")
+        raise InputError(
+            f"the pictures have shapes {shapes}; all must be (h, w), one size, uint8 grey levels."
+        )
     return int(shapes[0][1]), int(shapes[0][0])
 
 
-def _corners(images: Sequence[Picture], board: CharucoBoard) -> tuple[list[int], list[tuple[int, str]], list[Floats], list[Floats]]:
-    """Index of each good view, each other one and why; corners on the board (n, 3) [m] and in the picture (n, 2) [px] of the good ones."""
+def _corners(
+    images: Sequence[Picture], board: CharucoBoard
+) -> tuple[list[int], list[tuple[int, str]], list[Floats], list[Floats]]:
+    """Index of each good view, each other one and why; corners on the board (n, 3) [m] and in the picture (n,
+    2) [px] of the good ones."""
     finder = BoardFinder(board)
     views = [finder.find(image) for image in images]
     used = [k for k, view in enumerate(views) if not view.why]
@@ -260,14 +310,17 @@ def _corners(images: Sequence[Picture], board: CharucoBoard) -> tuple[list[int],
 
 
 def _sharpened(image: Picture, corners: Floats, board: CharucoBoard) -> Floats:
-    """(n, 2) the corners once more, in windows that reach to no marker: a quarter less scatter than OpenCV's own choice leaves."""
+    """(n, 2) the corners once more, in windows that reach to no marker: a quarter less scatter than OpenCV's
+    own choice leaves."""
     import cv2
 
     apart = np.linalg.norm(corners[:, None] - corners, axis=2)
     square = float((apart + 1e9 * np.eye(len(corners))).min())
     half = int(np.clip(0.4 * square * (1.0 - board.marker / board.square), 2, 5))
     until = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-4)
-    found = cv2.cornerSubPix(image, corners.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), until)
+    found = cv2.cornerSubPix(
+        image, corners.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), until
+    )
     return np.asarray(found, dtype=np.float64).reshape(-1, 2)
 
 
@@ -283,11 +336,14 @@ def _board_pose(points: Floats, pixels: Floats, camera: Camera) -> Pose:
     good, turn, shift = cv2.solvePnP(points, pixels, camera.intrinsics, camera.lens, flags=cv2.SOLVEPNP_IPPE)
     if not good:
         raise CalibrationError("a view of the board gives no pose; is the camera's matrix right?")
-    return np.ravel(shift).astype(np.float64), quaternion_from_matrix(np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64))
+    return np.ravel(shift).astype(np.float64), quaternion_from_matrix(
+        np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64)
+    )
 
 
 def _stand(start: Pose, points: Floats, pixels: Floats, camera: Camera) -> tuple[Pose, float, Floats]:
-    """Base_from_camera of least misfit to points (n, 3) of the base [m], rms misfit [px], standard errors (6,) [m, rad]."""
+    """Base_from_camera of least misfit to points (n, 3) of the base [m], rms misfit [px], standard errors
+    (6,) [m, rad]."""
     import cv2
 
     place, turn = start
@@ -313,5 +369,7 @@ def _scatter(ones: Sequence[Pose], mean: Pose) -> Floats:
     """(6,) standard errors [m, rad] of a mean from single values."""
     moved = np.stack([place - mean[0] for place, _ in ones])
     turn = matrix_from_quaternion(np.stack([product(inverse(mean)[1], quaternion) for _, quaternion in ones]))
-    turned = 0.5 * np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=1)
+    turned = 0.5 * np.stack(
+        [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=1
+    )
     return np.asarray(np.concatenate([moved, turned], axis=1).std(0, ddof=1) / math.sqrt(len(ones)))

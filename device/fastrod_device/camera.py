@@ -60,9 +60,13 @@ def _numbers(value: ArrayLike, name: str, shape: tuple[int, ...]) -> Floats:
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{name} is {shown(value)}; it must be numbers of shape {shape}.") from error
     if array.shape != shape or not np.isfinite(array).all():
-        raise InputError(f"{name} is {shown(np.asarray(value).tolist())}; it must be finite numbers of shape {shape}.")
+        raise InputError(
+            f"{name} is {shown(np.asarray(value).tolist())}; it must be finite numbers of shape {shape}."
+        )
     if (np.abs(array) > _MOST).any():
-        raise InputError(f"{name} is {shown(array.tolist())}; its numbers must be between {-_MOST:g} and {_MOST:g}.")
+        raise InputError(
+            f"{name} is {shown(array.tolist())}; its numbers must be between {-_MOST:g} and {_MOST:g}."
+        )
     return array
 
 
@@ -75,7 +79,9 @@ def _unit(value: ArrayLike, name: str) -> tuple[float, ...]:
     array = _numbers(value, name, (4,))
     norm = float(np.linalg.norm(array))
     if not math.isclose(norm, 1.0, abs_tol=1e-4):
-        raise InputError(f"{name} is {array.tolist()!r}; it must have norm 1, not {norm:.6g} (order w x y z).")
+        raise InputError(
+            f"{name} is {array.tolist()!r}; it must have norm 1, not {norm:.6g} (order w x y z)."
+        )
     return tuple((array if abs(norm - 1.0) < 1e-12 else array / norm).tolist())
 
 
@@ -115,17 +121,32 @@ class Camera:
         put(self, "distortion", _tuple(self.distortion, "Camera.distortion", 5))
         put(self, "position", _tuple(self.position, "Camera.position", 3))
         put(self, "quaternion", _unit(self.quaternion, "Camera.quaternion"))
-        if not (m[0, 0] >= 1e-3 and m[1, 1] >= 1e-3) or m[0, 1] != 0.0 or m[1, 0] != 0.0 or m[2].tolist() != [0.0, 0.0, 1.0]:
+        if (
+            not (m[0, 0] >= 1e-3 and m[1, 1] >= 1e-3)
+            or m[0, 1] != 0.0
+            or m[1, 0] != 0.0
+            or m[2].tolist() != [0.0, 0.0, 1.0]
+        ):
             raise InputError(
-                f"Camera.matrix is {m.tolist()!r}; it must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], fx and fy positive, from 0.001."
+                f"Camera.matrix is {m.tolist()!r}; it must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], fx and "
+                "fy positive, from 0.001."
             )
         size = tuple(self.size)
         low, high = _PIXELS
-        if len(size) != 2 or any(isinstance(n, bool) or not isinstance(n, (int, np.integer)) or not low <= n <= high for n in size):
-            raise InputError(f"Camera.size is {shown(self.size)}; it must be width and height, whole numbers from {low} to {high} [px].")
+        if len(size) != 2 or any(
+            isinstance(n, bool) or not isinstance(n, (int, np.integer)) or not low <= n <= high for n in size
+        ):
+            raise InputError(
+                f"Camera.size is {shown(self.size)}; it must be width and height, whole "
+                f"numbers from {low} to {high} [px]."
+            )
         put(self, "size", (int(size[0]), int(size[1])))
         _positive(self.rate, "Camera.rate", "Hz", 0.01, 1e5)
-        if isinstance(self.latency, bool) or not isinstance(self.latency, (int, float)) or not 0.0 <= self.latency < 10.0:
+        if (
+            isinstance(self.latency, bool)
+            or not isinstance(self.latency, (int, float))
+            or not 0.0 <= self.latency < 10.0
+        ):
             raise InputError(f"Camera.latency is {self.latency!r} s; it must be 0 to 10. Was it given in ms?")
 
     @property
@@ -145,7 +166,8 @@ class Camera:
 
 
 def load_camera(path: str | Path) -> Camera:
-    """The camera of a .toml file. Raises `InputError` for a file that is not one, `UnknownNameError` for a field that no camera has."""
+    """The camera of a .toml file. Raises `InputError` for a file that is not one, `UnknownNameError` for a
+    field that no camera has."""
     where = f"camera file {str(path)!r}"
     data = parse(read_text(Path(path), where, InputError), where, InputError, "camera")
     return from_table(Camera, data, where)
@@ -154,7 +176,8 @@ def load_camera(path: str | Path) -> Camera:
 def from_table(kind: type[Described], table: object, where: str) -> Described:
     """A dataclass of a TOML file's table; `where`, file and table, begins every sentence.
 
-    Raises `InputError` for what is no such table, `UnknownNameError` for a key or a name in it that is not known.
+    Raises `InputError` for what is no such table, `UnknownNameError` for a key or a name in it that is not
+    known.
     """
     if not isinstance(table, dict):
         raise InputError(f"{where} is {shown(table)}; it must be a table.")
@@ -171,11 +194,14 @@ def from_table(kind: type[Described], table: object, where: str) -> Described:
     except msgspec.ValidationError as error:
         sentence, _, place = str(error).replace("`", "'").partition(" - at '$")
         key = place.rstrip("'").lstrip(".")
-        raise InputError(f"{where}: {f'{key}: ' if key else ''}{sentence}{'' if sentence.endswith(('.', '?')) else '.'}") from error
+        raise InputError(
+            f"{where}: {f'{key}: ' if key else ''}{sentence}{'' if sentence.endswith(('.', '?')) else '.'}"
+        ) from error
 
 
 def save_camera(camera: Camera, path: str | Path) -> None:
-    """Write a .toml that `load_camera` reads, whole or not at all. Raises `InputError` where it cannot be written."""
+    """Write a .toml that `load_camera` reads, whole or not at all. Raises `InputError` where it cannot be
+    written."""
     target = Path(path)
     if target.suffix != ".toml":
         raise InputError(f"{str(path)!r} does not end in .toml; a camera file does.")
@@ -249,7 +275,8 @@ class FrameSource(Protocol):
     """Where frames come from: a camera, an emulator, a file."""
 
     def read(self) -> Frame | None:
-        """The newest frame that was not read yet, None where there is none; never waits. Raises `DeviceError` where the source is lost."""
+        """The newest frame that was not read yet, None where there is none; never waits. Raises `DeviceError`
+        where the source is lost."""
 
     def close(self) -> None:
         """Give the camera back. A second call does nothing."""
@@ -257,20 +284,27 @@ class FrameSource(Protocol):
 
 @final
 class VideoCamera:
-    """A camera that OpenCV can open, read in a thread of its own; frames are stamped on arrival, less the camera's latency."""
+    """A camera that OpenCV can open, read in a thread of its own; frames are stamped on arrival, less the
+    camera's latency."""
 
     def __init__(self, camera: Camera, device: int | str = 0, *, clock: Clock | None = None) -> None:
         """`device` is the system's number of the camera, or what else OpenCV opens: a path, an address.
 
-        Raises `DeviceError` where it cannot be opened, gives no picture, or pictures of another size than the camera's.
+        Raises `DeviceError` where it cannot be opened, gives no picture, or pictures of another size than the
+        camera's.
         """
         import cv2
 
         self.camera, self._clock = camera, clock or WallClock()
         self._capture = cv2.VideoCapture(device)
         if not self._capture.isOpened():
-            raise DeviceError(f"camera {device!r} cannot be opened; is it plugged in, and does nobody else use it?")
-        for key, value in ((cv2.CAP_PROP_FRAME_WIDTH, camera.size[0]), (cv2.CAP_PROP_FRAME_HEIGHT, camera.size[1])):
+            raise DeviceError(
+                f"camera {device!r} cannot be opened; is it plugged in, and does nobody else use it?"
+            )
+        for key, value in (
+            (cv2.CAP_PROP_FRAME_WIDTH, camera.size[0]),
+            (cv2.CAP_PROP_FRAME_HEIGHT, camera.size[1]),
+        ):
             self._capture.set(key, value)
         self._capture.set(cv2.CAP_PROP_FPS, camera.rate)
         self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
@@ -278,9 +312,15 @@ class VideoCamera:
         self._number = 0
         self._newest = self._grab()
         if self._newest is None or self._newest.image.shape != camera.size[::-1]:
-            got = "no picture" if self._newest is None else "pictures of {1} x {0} px".format(*self._newest.image.shape)
+            got = (
+                "no picture"
+                if self._newest is None
+                else "pictures of {1} x {0} px".format(*self._newest.image.shape)
+            )
             self._capture.release()
-            raise DeviceError(f"camera {device!r} gives {got}; it must give {camera.size[0]} x {camera.size[1]} px.")
+            raise DeviceError(
+                f"camera {device!r} gives {got}; it must give {camera.size[0]} x {camera.size[1]} px."
+            )
         self._thread = threading.Thread(target=self._run, name="fastrod camera", daemon=True)
         self._thread.start()
 

@@ -1,4 +1,5 @@
-"""Clocks: what the prototype takes for time; the machine's own, or one that an emulator steps as fast as the machine computes."""
+"""Clocks: what the prototype takes for time; the machine's own, or one that an emulator steps as fast as the
+machine computes."""
 
 from __future__ import annotations
 
@@ -40,7 +41,8 @@ class WallClock:
 
 @final
 class SteppedClock:
-    """Time that passes when somebody sleeps: an emulated robot then runs as fast as the machine computes. For one thread that sleeps."""
+    """Time that passes when somebody sleeps: an emulated robot then runs as fast as the machine computes. For
+    one thread that sleeps."""
 
     stepped = True
 

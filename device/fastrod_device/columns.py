@@ -10,8 +10,9 @@ _REFUSED = (FROZEN, OUTSIDE, ASTRAY, TOO_FAST, TWICE, REPEATED, BACK, AHEAD)
 FLAGS = ("", "no marker", "outlier", "ambiguous", *_REFUSED)
 """What may be wrong with a sighting; a log has the place in this list, so new ones go to its end."""
 EXTRA = ("marker_error", "marker_size", "marker_flag", "seen_x", "seen_y", "seen_z")
-"""Further columns of a recording: reprojection error [px], size of the marker in the picture [px], place of the sighting's flag in `FLAGS`
-(0: trusted), and where the tip was seen, trusted or not [m]; then current_1 ... [A]."""
+"""Further columns of a recording: reprojection error [px], size of the marker in the picture [px], place of
+the sighting's flag in `FLAGS` (0: trusted), and where the tip was seen, trusted or not [m]; then current_1
+... [A]."""
 
 
 def names(n_tendons: int) -> tuple[str, ...]:
@@ -21,6 +22,14 @@ def names(n_tendons: int) -> tuple[str, ...]:
 
 def values(sighting: Sighting, readings: Readings | None) -> dict[str, float]:
     """Of one row; currents are left out where none are known."""
-    made = {"marker_error": sighting.error, "marker_size": sighting.size_px, "marker_flag": float(FLAGS.index(sighting.flag))}
+    made = {
+        "marker_error": sighting.error,
+        "marker_size": sighting.size_px,
+        "marker_flag": float(FLAGS.index(sighting.flag)),
+    }
     made |= dict(zip(("seen_x", "seen_y", "seen_z"), sighting.position.tolist(), strict=True))
-    return made if readings is None else made | {f"current_{k}": value for k, value in enumerate(readings.current.tolist(), 1)}
+    return (
+        made
+        if readings is None
+        else made | {f"current_{k}": value for k, value in enumerate(readings.current.tolist(), 1)}
+    )

@@ -23,7 +23,8 @@ BEAT = 0.05
 PATIENCE = 0.15
 """Without the controller's heartbeat for so long, a drive stops by itself [s]."""
 STATUS, MOTION, COMMAND = 0x180, 0x280, 0x200
-"""COB-IDs, less the node id: TPDO 1 (statusword, position, torque), TPDO 2 (velocity, following error), RPDO 1 (controlword, target)."""
+"""COB-IDs, less the node id: TPDO 1 (statusword, position, torque), TPDO 2 (velocity, following error), RPDO
+1 (controlword, target)."""
 _MILLI_RPM = 0xFDB44700  # unit of velocity; whole rpm would be 70 counts/s
 _MAPPING = {
     0x1600: (0x6040_0010, 0x607A_0020),
@@ -31,7 +32,8 @@ _MAPPING = {
     0x1A01: (0x606C_0020, 0x60F4_0020),
 }
 _UNUSED = (0x1401, 0x1402, 0x1403, 0x1802, 0x1803)  # PDOs that a drive may have kept from somebody else
-_INVALID, _NO_RTR = 0x8000_0000, 0x4000_0000  # bits of a COB-ID; some drives refuse a TPDO that could be asked for by RTR
+# bits of a COB-ID; some drives refuse a TPDO that could be asked for by RTR
+_INVALID, _NO_RTR = 0x8000_0000, 0x4000_0000
 _NO_SUCH_OBJECT = (0x06020000, 0x06090011)
 _MODES = {
     1: "profile position",
@@ -81,19 +83,28 @@ class DriveLimits:
         """One of them for each drive. Raises `InputError` where it is of another shape or cannot be."""
         given = np.asarray(getattr(self, name))
         if given.shape not in ((), (n_drives,)) or given.dtype.kind not in "iu":
-            raise InputError(f"{name} is {getattr(self, name)!r}; it must be a whole number, or one for each of {n_drives} drives.")
+            raise InputError(
+                f"{name} is {getattr(self, name)!r}; it must be a whole number, or one for "
+                f"each of {n_drives} drives."
+            )
         values = [int(value) for value in np.broadcast_to(given, (n_drives,))]
         bits = 16 if name == "torque_limit" else 31
         if not all(0 < value < 2**bits for value in values):
-            raise InputError(f"{name} is {values}; it must be positive and below 2^{bits}, the most that a drive counts to.")
+            raise InputError(
+                f"{name} is {values}; it must be positive and below 2^{bits}, the most that a "
+                "drive counts to."
+            )
         return values
 
 
 @final
 class Configurator:
-    """Reads and writes objects of drives; never in the loop. `beat` is called with every request, as drives expect heartbeats meanwhile."""
+    """Reads and writes objects of drives; never in the loop. `beat` is called with every request, as drives
+    expect heartbeats meanwhile."""
 
-    def __init__(self, line: Line, dictionary: Any, specs: Sequence[DriveSpec], beat: Callable[[], None]) -> None:
+    def __init__(
+        self, line: Line, dictionary: Any, specs: Sequence[DriveSpec], beat: Callable[[], None]
+    ) -> None:
         """Subscribes to the answers."""
         self._dictionary, self._specs, self._beat = dictionary, specs, beat
         self._sdo = guest("canopen.sdo")
@@ -182,7 +193,8 @@ class Configurator:
             raise DeviceError(f"the drive at node {node} refuses object {what}: {error}.") from error
         except self._sdo.SdoCommunicationError as error:
             raise DeviceError(
-                f"the drive at node {node} does not answer (object {what}); are its power, its node id and the bit rate right?"
+                f"the drive at node {node} does not answer (object {what}); are its power, its node id and "
+                "the bit rate right?"
             ) from error
         except self._error as error:
             raise DeviceError(f"nothing can be sent to node {node}: {error}.") from error
@@ -193,7 +205,9 @@ class Configurator:
         spec = self._specs[drive]
         kind = self.read(drive, 0x1000)
         if kind & 0xFFFF != 402:
-            raise DeviceError(f"node {spec.node} is no drive: its device type is {kind & 0xFFFF}, that of CiA 402 is 402.")
+            raise DeviceError(
+                f"node {spec.node} is no drive: its device type is {kind & 0xFFFF}, that of CiA 402 is 402."
+            )
         self._modes[drive] = self.read(drive, 0x6502)
         if not self._modes[drive] >> (_CYCLIC - 1) & 1:
             has = [words for mode, words in _MODES.items() if self._modes[drive] >> (mode - 1) & 1]
@@ -208,7 +222,8 @@ class Configurator:
         rated = 1e-6 * measured
         if not math.isclose(rated, spec.rated_torque, rel_tol=0.02):
             raise DeviceError(
-                f"the drive at node {spec.node} says its motor's rated torque is {rated:.4g} N m, DriveSpec.rated_torque is"
+                f"the drive at node {spec.node} says its motor's rated torque is {rated:.4g} N m, "
+                "DriveSpec.rated_torque is"
                 f" {spec.rated_torque:.4g} N m; tensions would be wrong by that ratio."
             )
 
@@ -216,10 +231,15 @@ class Configurator:
         """Mode of operation, confirmed. Raises `DeviceError` where the drive does not have it."""
         node = self._specs[drive].node
         if not self._modes[drive] >> (mode - 1) & 1:
-            raise DeviceError(f"the drive at node {node} has no {_MODES[mode]} mode (object 0x6502 is 0x{self._modes[drive]:08X}).")
+            raise DeviceError(
+                f"the drive at node {node} has no {_MODES[mode]} mode (object 0x6502 is "
+                f"0x{self._modes[drive]:08X})."
+            )
         self.write(drive, 0x6060, 0, mode)
         if self.read(drive, 0x6061) != mode:
-            raise DeviceError(f"the drive at node {node} does not change to its {_MODES[mode]} mode; is it moving?")
+            raise DeviceError(
+                f"the drive at node {node} does not change to its {_MODES[mode]} mode; is it moving?"
+            )
 
     def limit(self, drive: int, limits: DriveLimits, rate: float) -> None:
         """Limits, units and what it does when the bus fails."""

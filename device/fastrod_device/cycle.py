@@ -1,4 +1,5 @@
-"""One cycle of the drives: a word to each, one SYNC, a word from each; and the latch that keeps them stopped."""
+"""One cycle of the drives: a word to each, one SYNC, a word from each; and the latch that keeps them
+stopped."""
 
 from __future__ import annotations
 
@@ -28,7 +29,8 @@ OFF, STOP, RUN, START, RESET = 0x0000, 0x0002, 0x000F, 0x001F, 0x0080
 """Controlwords: no voltage, quick stop, operation, operation with bit 4 (a move begins), fault reset."""
 _SHARE = 0.6  # of a cycle that is waited for answers
 _STEPPED_WAIT = 1.0  # s, the same where time is stepped
-_PAUSE = 0.8 * PATIENCE  # s; beyond it the drives may have stopped by themselves, and must not be told to go on
+# s; beyond it the drives may have stopped by themselves, and must not be told to go on
+_PAUSE = 0.8 * PATIENCE
 _COMMAND = struct.Struct("<Hi")
 
 
@@ -110,9 +112,16 @@ class Cycle:
         return unsent
 
     def until(
-        self, seconds: float, done: Callable[[Feedback], bool], what: str, *, stoppable: bool = True, running: bool = False
+        self,
+        seconds: float,
+        done: Callable[[Feedback], bool],
+        what: str,
+        *,
+        stoppable: bool = True,
+        running: bool = False,
     ) -> Feedback:
-        """Exchange in time until `done`; `what`: that the drives are waited for to do. `running`: all must stay enabled."""
+        """Exchange in time until `done`; `what`: that the drives are waited for to do. `running`: all must
+        stay enabled."""
         pacer = Pacer(self.clock, self.rate)
         end = self.clock.now() + seconds
         while True:
@@ -127,10 +136,13 @@ class Cycle:
                 return feedback
             if self.clock.now() >= end:
                 states = ", ".join(
-                    f"node {node}: {state_in_words(int(word)) if math.isfinite(age) and age < SILENCE else 'silent'}"
+                    f"node {node}: "
+                    f"{state_in_words(int(word)) if math.isfinite(age) and age < SILENCE else 'silent'}"
                     for node, word, age in zip(self.ids, feedback.statusword, feedback.age, strict=True)
                 )
-                raise DeviceError(f"the drives did not {what} within {seconds:g} s ({feedback.lost or states}).")
+                raise DeviceError(
+                    f"the drives did not {what} within {seconds:g} s ({feedback.lost or states})."
+                )
 
     def _sync(self) -> None:
         self.inbox.expect()
@@ -145,10 +157,13 @@ class Cycle:
         self.configured[i], self.enabled[i], self.words[i] = False, False, OFF
 
     def _let_go(self, now: Feedback) -> None:
-        """A drive that stopped by itself, or may have because the bus failed, is told to stay stopped when it hears us again."""
+        """A drive that stopped by itself, or may have because the bus failed, is told to stay stopped when it
+        hears us again."""
         deaf = {e.drive for e in now.emergencies if e.code >> 8 == 0x81}
         for i, word in enumerate(now.statusword):
-            if self.enabled[i] and (state_in_words(int(word)) != ENABLED or now.age[i] > SILENCE or i in deaf):
+            if self.enabled[i] and (
+                state_in_words(int(word)) != ENABLED or now.age[i] > SILENCE or i in deaf
+            ):
                 self.enabled[i], self.words[i] = False, STOP
 
     def latch(self, reason: str) -> None:
@@ -187,13 +202,18 @@ class Cycle:
         """Raises `DeviceError` otherwise."""
         missing = [node for node, known in zip(self.ids, self.configured, strict=True) if not known]
         if missing:
-            raise DeviceError(f"the drives at nodes {missing} are not connected, or have rebooted; connect() first.")
+            raise DeviceError(
+                f"the drives at nodes {missing} are not connected, or have rebooted; connect() first."
+            )
 
     def require_enabled(self) -> None:
         """Raises `DeviceError` otherwise."""
         for i, node in enumerate(self.ids):
             if not self.enabled[i]:
-                raise DeviceError(f"the drive at node {node} is not enabled but in the state {state_in_words(self.inbox.status[i])!r}.")
+                raise DeviceError(
+                    f"the drive at node {node} is not enabled but in the state "
+                    f"{state_in_words(self.inbox.status[i])!r}."
+                )
 
     def acknowledge(self) -> None:
         """Somebody has seen that they were stopped."""
@@ -213,5 +233,7 @@ def whole(n_drives: int, values: Ints, name: str) -> list[int]:
     if given.shape != (n_drives,) or given.dtype.kind not in "iu":
         raise InputError(f"{name} is {values!r}; it must be ({n_drives},) whole counts.")
     if not np.all((given >= -(2**31)) & (given < 2**31)):
-        raise InputError(f"{name} is {given.tolist()} counts; a drive counts in 32 bits. Was it given in another unit?")
+        raise InputError(
+            f"{name} is {given.tolist()} counts; a drive counts in 32 bits. Was it given in another unit?"
+        )
     return [int(value) for value in given]

@@ -1,7 +1,9 @@
-"""The emulator's eye: what a camera sees of a marker or a board, by exact area coverage of every pixel. It shares no code with the tracker.
+"""The emulator's eye: what a camera sees of a marker or a board, by exact area coverage of every pixel. It
+shares no code with the tracker.
 
-A print is rectangles in a plane. Each edge is projected, lens included, in pieces shorter than a pixel, and every piece adds the
-area between it and the picture's right end: a sum along the rows gives the part of each pixel that ink covers, without sampling.
+A print is rectangles in a plane. Each edge is projected, lens included, in pieces shorter than a pixel, and
+every piece adds the area between it and the picture's right end: a sum along the rows gives the part of each
+pixel that ink covers, without sampling.
 """
 
 from __future__ import annotations
@@ -42,7 +44,10 @@ class Scene:
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.black < self.white <= 255.0:
-            raise InputError(f"Scene.black is {self.black!r} and white {self.white!r}; 0 <= black < white <= 255 would be right.")
+            raise InputError(
+                f"Scene.black is {self.black!r} and white {self.white!r}; 0 <= black < white "
+                "<= 255 would be right."
+            )
         for name in ("blur", "noise", "vignetting"):
             if not 0.0 <= getattr(self, name) < 50.0:
                 raise InputError(f"Scene.{name} is {getattr(self, name)!r}; it must be 0 to 50.")
@@ -54,7 +59,8 @@ class _Print:
 
     box: Floats
     ink: Floats
-    """(n,) 1 where a rectangle is printed black, -1 where it is left white in a black one; 0 for the paper."""
+    """(n,) 1 where a rectangle is printed black, -1 where it is left white in a black one; 0 for the
+    paper."""
 
 
 def project(camera: Camera, points: Floats) -> Floats:
@@ -95,20 +101,42 @@ class Eye:
         self._rng = np.random.default_rng(seed)
 
     def draw(self, position: Floats, quaternion: Floats, *, marker: bool = True) -> Picture:
-        """(h, w) picture of the marker on a tip at base_from_tip, position (3,) [m] and quaternion (4,); without `marker` it is covered."""
+        """(h, w) picture of the marker on a tip at base_from_tip, position (3,) [m] and quaternion (4,);
+        without `marker` it is covered."""
         sheet = _marker_print(self.marker) if marker else None
-        return _picture(self.camera, sheet, _in_camera(self.camera, self.marker, position, quaternion), self._rng, self.scene)
+        return _picture(
+            self.camera,
+            sheet,
+            _in_camera(self.camera, self.marker, position, quaternion),
+            self._rng,
+            self.scene,
+        )
 
 
 def draw(
-    camera: Camera, marker: Marker, position: Floats, quaternion: Floats, *, rng: np.random.Generator, scene: Scene | None = None
+    camera: Camera,
+    marker: Marker,
+    position: Floats,
+    quaternion: Floats,
+    *,
+    rng: np.random.Generator,
+    scene: Scene | None = None,
 ) -> Picture:
-    """(h, w) picture of the marker on a tip at base_from_tip, position (3,) [m] and quaternion (4,); from behind it is not seen."""
-    return _picture(camera, _marker_print(marker), _in_camera(camera, marker, position, quaternion), rng, scene or PLAIN)
+    """(h, w) picture of the marker on a tip at base_from_tip, position (3,) [m] and quaternion (4,); from
+    behind it is not seen."""
+    return _picture(
+        camera, _marker_print(marker), _in_camera(camera, marker, position, quaternion), rng, scene or PLAIN
+    )
 
 
 def draw_board(
-    camera: Camera, board: CharucoBoard, position: Floats, quaternion: Floats, *, rng: np.random.Generator, scene: Scene | None = None
+    camera: Camera,
+    board: CharucoBoard,
+    position: Floats,
+    quaternion: Floats,
+    *,
+    rng: np.random.Generator,
+    scene: Scene | None = None,
 ) -> Picture:
     """(h, w) picture of a board at base_from_board, position (3,) [m] and quaternion (4,)."""
     camera_from_board = compose(inverse(camera.base_from_camera), (position, quaternion))
@@ -126,7 +154,10 @@ def _marker_print(marker: Marker) -> _Print:
     bits = _bits(marker.dictionary, marker.id)
     half, cell = marker.size / 2.0, marker.size / len(bits)
     boxes = [(-half - cell, half + cell, half + cell, -half - cell), (-half, half, half, -half)]
-    boxes += [(-half + cell * a, half - cell * j, -half + cell * b, half - cell * (j + 1)) for j, a, b in _runs(bits)]
+    boxes += [
+        (-half + cell * a, half - cell * j, -half + cell * b, half - cell * (j + 1))
+        for j, a, b in _runs(bits)
+    ]
     return _Print(np.array(boxes), np.array([0.0, 1.0] + [-1.0] * (len(boxes) - 2)))
 
 
@@ -149,7 +180,9 @@ def _board_print(board: CharucoBoard) -> _Print:
             left, top, cell = left + margin, top + margin, board.marker / len(bits)
             boxes.append((left, top, left + board.marker, top + board.marker))
             runs = _runs(bits)
-            boxes += [(left + cell * a, top + cell * k, left + cell * b, top + cell * (k + 1)) for k, a, b in runs]
+            boxes += [
+                (left + cell * a, top + cell * k, left + cell * b, top + cell * (k + 1)) for k, a, b in runs
+            ]
             ink += [1.0] + [-1.0] * len(runs)
     return _Print(np.array(boxes), np.array(ink))
 
@@ -173,19 +206,33 @@ def _runs(bits: Picture) -> list[tuple[int, int, int]]:
 
 @lru_cache(maxsize=4)
 def _backdrop(size: tuple[int, int], scene: Scene) -> tuple[Singles, Singles, list[Singles]]:
-    """Light (h, w), the lit background (h, w), and noise pictures that are a little larger; single precision, for speed."""
+    """Light (h, w), the lit background (h, w), and noise pictures that are a little larger; single precision,
+    for speed."""
     width, height = size
     x, y = np.linspace(-1.0, 1.0, width), np.linspace(-1.0, 1.0, height)[:, None]
-    light = 1.0 + 0.5 * (scene.gradient[0] * x + scene.gradient[1] * y) - scene.vignetting * 0.5 * (x * x + y * y)
+    light = (
+        1.0 + 0.5 * (scene.gradient[0] * x + scene.gradient[1] * y) - scene.vignetting * 0.5 * (x * x + y * y)
+    )
     background = np.asarray(scene.background, dtype=np.float64)
     if background.ndim and background.shape != (height, width):
-        raise InputError(f"Scene.background has shape {background.shape}; a picture of the camera has {(height, width)}.")
+        raise InputError(
+            f"Scene.background has shape {background.shape}; a picture of the camera has {(height, width)}."
+        )
     rng = np.random.default_rng(0)
-    pool = [scene.noise * rng.standard_normal((height + _SLACK, width + _SLACK), dtype=np.float32) for _ in range(_POOL)]
-    return light.astype(np.float32), (light * background).astype(np.float32), [noise.astype(np.float32) for noise in pool]
+    pool = [
+        scene.noise * rng.standard_normal((height + _SLACK, width + _SLACK), dtype=np.float32)
+        for _ in range(_POOL)
+    ]
+    return (
+        light.astype(np.float32),
+        (light * background).astype(np.float32),
+        [noise.astype(np.float32) for noise in pool],
+    )
 
 
-def _picture(camera: Camera, sheet: _Print | None, camera_from_print: Pose, rng: np.random.Generator, scene: Scene) -> Picture:
+def _picture(
+    camera: Camera, sheet: _Print | None, camera_from_print: Pose, rng: np.random.Generator, scene: Scene
+) -> Picture:
     import cv2
 
     light, backdrop, pool = _backdrop(camera.size, scene)
@@ -197,13 +244,18 @@ def _picture(camera: Camera, sheet: _Print | None, camera_from_print: Pose, rng:
         low = np.maximum(np.floor(start.min(0)).astype(int) - margin, -margin)
         high = np.minimum(np.ceil(start.max(0)).astype(int) + margin + 1, np.array(camera.size) + margin)
         if (high > low).all() and (high > 0).all() and (low < camera.size).all():
-            paper, ink = _cover(start - low, end - low, weight, (int(high[0] - low[0]), int(high[1] - low[1])))
+            paper, ink = _cover(
+                start - low, end - low, weight, (int(high[0] - low[0]), int(high[1] - low[1]))
+            )
             print_ = scene.white * paper - (scene.white - scene.black) * ink
             if scene.blur > 0.0:
                 n = 2 * margin + 1
                 paper, print_ = (_blurred(a, n, scene.blur) for a in (paper, print_))
             a, b = np.maximum(low, 0), np.minimum(high, camera.size)
-            seen, cut = np.s_[a[1] : b[1], a[0] : b[0]], np.s_[a[1] - low[1] : b[1] - low[1], a[0] - low[0] : b[0] - low[0]]
+            seen, cut = (
+                np.s_[a[1] : b[1], a[0] : b[0]],
+                np.s_[a[1] - low[1] : b[1] - low[1], a[0] - low[0] : b[0] - low[0]],
+            )
             picture[seen] = picture[seen] * (1.0 - paper[cut]) + light[seen] * print_[cut]
     which, down, right = rng.integers(0, (_POOL, _SLACK, _SLACK))
     height, width = picture.shape
@@ -215,16 +267,22 @@ def _blurred(part: Singles, n: int, sigma: float) -> Singles:
     """By a Gaussian of n x n pixels."""
     import cv2
 
-    return np.asarray(cv2.GaussianBlur(part, (n, n), sigma, borderType=cv2.BORDER_REPLICATE), dtype=np.float32)
+    return np.asarray(
+        cv2.GaussianBlur(part, (n, n), sigma, borderType=cv2.BORDER_REPLICATE), dtype=np.float32
+    )
 
 
 def _edges(camera: Camera, sheet: _Print, camera_from_print: Pose) -> tuple[Floats, Floats, Floats] | None:
-    """Pieces of all edges, each shorter than a pixel: start (n, 2), end (n, 2) [px], what is left of it (n, 2): paper and ink.
+    """Pieces of all edges, each shorter than a pixel: start (n, 2), end (n, 2) [px], what is left of it (n,
+    2): paper and ink.
 
     None where the print is seen from behind, or reaches behind the camera.
     """
     left, top, right, bottom = sheet.box.T
-    corner = np.stack([np.stack([left, right, right, left], 1), np.stack([top, top, bottom, bottom], 1)], axis=2)  # clockwise
+    # clockwise
+    corner = np.stack(
+        [np.stack([left, right, right, left], 1), np.stack([top, top, bottom, bottom], 1)], axis=2
+    )
     turn = rotation(camera_from_print[1])
     space = corner @ turn[:, :2].T + camera_from_print[0]  # (n, 4, 3)
     if space[..., 2].min() < _NEAR:
@@ -251,7 +309,8 @@ def _edges(camera: Camera, sheet: _Print, camera_from_print: Pose) -> tuple[Floa
 
 
 def _cover(start: Floats, end: Floats, weight: Floats, size: tuple[int, int]) -> tuple[Singles, Singles]:
-    """(h, w) parts of each pixel that paper and ink cover; a piece crosses at most one row and one column of pixels."""
+    """(h, w) parts of each pixel that paper and ink cover; a piece crosses at most one row and one column of
+    pixels."""
     width, height = size
     start, end = start + 0.5, end + 0.5  # the first pixel is 0 to 1
     a, b = np.floor(start), np.floor(end)
@@ -270,6 +329,8 @@ def _cover(start: Floats, end: Floats, weight: Floats, size: tuple[int, int]) ->
     for channel in range(2):
         moved = -weight[which, channel] * fall
         n = height * (width + 1)
-        area = np.bincount(place, moved * (1.0 - part), n)[:n] + np.bincount(place + 1, moved * part, n + 1)[:n]
+        area = (
+            np.bincount(place, moved * (1.0 - part), n)[:n] + np.bincount(place + 1, moved * part, n + 1)[:n]
+        )
         covers.append(area.reshape(height, width + 1).cumsum(1)[:, :width].astype(np.float32))
     return covers[0], covers[1]

@@ -1,4 +1,5 @@
-"""The drives of the prototype, from the controller's side: one bus, one SYNC, one word to and from each drive in every cycle."""
+"""The drives of the prototype, from the controller's side: one bus, one SYNC, one word to and from each drive
+in every cycle."""
 
 from __future__ import annotations
 
@@ -47,25 +48,36 @@ class Jitter:
 class DriveBus:
     """All drives of a robot on one CAN bus.
 
-    `connect`, then `enable`, then `exchange` once a cycle; its caller keeps the time (`Pacer`). `exchange` and the calls that cycle by
-    themselves (`enable`, `disable`, `reset_faults`, `profile_move`, `homing`) belong to one thread; `quick_stop` may come from any.
-    SDO is used in calls that set up, never in `exchange`.
+    `connect`, then `enable`, then `exchange` once a cycle; its caller keeps the time (`Pacer`). `exchange`
+    and the calls that cycle by themselves (`enable`, `disable`, `reset_faults`, `profile_move`, `homing`)
+    belong to one thread; `quick_stop` may come from any. SDO is used in calls that set up, never in
+    `exchange`.
 
-    A drive that left "operation enabled" by itself, or was not heard for 0.1 s, is told to stay stopped until `enable`. When the
-    controller paused for so long that the drives stopped by themselves, all are told to stay stopped (`stop_reason`).
+    A drive that left "operation enabled" by itself, or was not heard for 0.1 s, is told to stay stopped until
+    `enable`. When the controller paused for so long that the drives stopped by themselves, all are told to
+    stay stopped (`stop_reason`).
     """
 
     def __init__(
-        self, specs: Sequence[DriveSpec], bus: str | can.BusABC, *, clock: Clock, rate: float = 200.0,
+        self,
+        specs: Sequence[DriveSpec],
+        bus: str | can.BusABC,
+        *,
+        clock: Clock,
+        rate: float = 200.0,
         eds: str | Path | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """`rate` [1/s], of cycles; its period is a whole number of ms. `eds`: the drives' own dictionary.
 
         Raises `InputError`, or `DeviceError` for the bus and the EDS file.
         """
-        period = 1e3 / rate if isinstance(rate, (int, float)) and math.isfinite(rate) and rate > 0.0 else math.nan
+        period = (
+            1e3 / rate if isinstance(rate, (int, float)) and math.isfinite(rate) and rate > 0.0 else math.nan
+        )
         if not (1.0 <= period <= 40.0 and abs(period - round(period)) < 1e-6):
-            raise InputError(f"DriveBus.rate is {rate!r} 1/s; its period must be a whole number of ms from 1 to 40.")
+            raise InputError(
+                f"DriveBus.rate is {rate!r} 1/s; its period must be a whole number of ms from 1 to 40."
+            )
         self._specs = Transmission(specs).specs
         dictionary = object_dictionary(eds)
         self._line = Line(bus)
@@ -127,18 +139,27 @@ class DriveBus:
     # setting up
 
     def connect(
-        self, *, position_limit: Ints | int = 2**31 - 1, velocity_limit: Ints | int = 500_000, following_error: Ints | int = 2000,
-        deceleration: Ints | int = 2_000_000, torque_limit: Ints | int = 3000, hold: bool = True,
-    ) -> None:  # fmt: skip
-        """Find the drives, tell them their limits and process data, and make them operational; they stay switched off.
+        self,
+        *,
+        position_limit: Ints | int = 2**31 - 1,
+        velocity_limit: Ints | int = 500_000,
+        following_error: Ints | int = 2000,
+        deceleration: Ints | int = 2_000_000,
+        torque_limit: Ints | int = 3000,
+        hold: bool = True,
+    ) -> None:
+        """Find the drives, tell them their limits and process data, and make them operational; they stay
+        switched off.
 
-        What drives refuse by themselves, one number or (n_drives,): targets beyond +-`position_limit` [counts], speeds beyond
+        What drives refuse by themselves, one number or (n_drives,): targets beyond +-`position_limit`
+        [counts], speeds beyond
         `velocity_limit` [counts/s], a fault beyond `following_error` [counts]; their motors carry the current
         of `torque_limit` [thousandths of the rated torque] at most. A quick stop is by `deceleration`
         [counts/s2]; then the motors `hold` the tendons or are switched off. A limit whose object a drive
         lacks is left out, as `notices` says.
         Call it again after a drive has rebooted.
-        Raises `InputError`, or `DeviceError`: the first drive that does not answer, is another device, or refuses.
+        Raises `InputError`, or `DeviceError`: the first drive that does not answer, is another device, or
+        refuses.
         """
         setup, n = self._configurator, self.n_drives
         limits = DriveLimits(
@@ -165,23 +186,35 @@ class DriveBus:
         for node in self._cycle.ids:
             self._cycle.command(1, node)
         self._cycle.configured = [True] * n
-        self._cycle.until(1.0, lambda now: bool(np.all(now.nmt == 5) and np.all(now.age < 3.0 / self._cycle.rate)), "become operational")
+        self._cycle.until(
+            1.0,
+            lambda now: bool(np.all(now.nmt == 5) and np.all(now.age < 3.0 / self._cycle.rate)),
+            "become operational",
+        )
 
     def enable(self, mode: Mode = "csp") -> None:
         """Switch all drives on, each with the position that it has as its target.
 
-        Raises `DeviceError`: a drive is in fault, does not switch on in time, was not connected or has rebooted; or the drives were
-        stopped and nobody called `acknowledge`. `UnknownNameError` for the mode.
+        Raises `DeviceError`: a drive is in fault, does not switch on in time, was not connected or has
+        rebooted; or the drives were stopped and nobody called `acknowledge`. `UnknownNameError` for the mode.
         """
         if mode not in _MODES:
             raise UnknownNameError(f"no mode {mode!r}; {nearest(str(mode), _MODES)}")
         self._cycle.require_connected()
         if self._cycle.stopping and not self._cycle.acknowledged:
-            raise DeviceError(f"the drives were stopped ({self._cycle.reason}); acknowledge() before they are enabled again.")
+            raise DeviceError(
+                f"the drives were stopped ({self._cycle.reason}); acknowledge() before they "
+                "are enabled again."
+            )
         for i in range(self.n_drives):
             if not self._cycle.enabled[i]:
                 self._cycle.words[i] = OFF
-        fresh = self._cycle.until(1.0, lambda now: bool(np.all(now.age < 3.0 / self._cycle.rate)), "say where they are", stoppable=False)
+        fresh = self._cycle.until(
+            1.0,
+            lambda now: bool(np.all(now.age < 3.0 / self._cycle.rate)),
+            "say where they are",
+            stoppable=False,
+        )
         self._cycle.refuse_faults(fresh)
         for i in range(self.n_drives):
             self._configurator.set_mode(i, _MODES[mode])
@@ -222,11 +255,21 @@ class DriveBus:
         self._cycle.until(1.0, off, "be disabled", stoppable=False)
 
     def reset_faults(self) -> None:
-        """Reset the drives that are in fault; they stay switched off. Raises `DeviceError`: one stays in fault, or does not answer."""
+        """Reset the drives that are in fault; they stay switched off. Raises `DeviceError`: one stays in
+        fault, or does not answer."""
         self._cycle.require_connected()
-        self._cycle.until(1.0, lambda now: bool(np.all(now.age < 3.0 / self._cycle.rate)), "say how they are", stoppable=False)
+        self._cycle.until(
+            1.0,
+            lambda now: bool(np.all(now.age < 3.0 / self._cycle.rate)),
+            "say how they are",
+            stoppable=False,
+        )
         for _ in range(3):
-            faulty = [i for i, word in enumerate(self._cycle.newest.statusword) if state_in_words(int(word)) == FAULT]
+            faulty = [
+                i
+                for i, word in enumerate(self._cycle.newest.statusword)
+                if state_in_words(int(word)) == FAULT
+            ]
             if not faulty:
                 return
             for word in (OFF, RESET, OFF):  # the drive looks for the edge of bit 7
@@ -241,22 +284,26 @@ class DriveBus:
     def exchange(self, target: Ints | None = None) -> Feedback:
         """One cycle: `target` (n_drives,) [counts] to the drives, one SYNC, and what they say.
 
-        None keeps the last target. Returns when all drives have answered, after 0.6 of a cycle at most. A bus that fails raises nothing:
+        None keeps the last target. Returns when all drives have answered, after 0.6 of a cycle at most. A bus
+        that fails raises nothing:
         `Feedback.lost` says why. Raises `InputError` for a target of another shape or kind.
         """
         return self._cycle.exchange(target)
 
     def quick_stop(self, reason: str = "quick stop was asked for") -> str:
-        """Stop all drives at once, from any thread; they stay stopped until `acknowledge` and `enable`. Raises nothing: it says why a word
-        could not be sent, or "". Drives that no longer hear of their controller stop by themselves."""
+        """Stop all drives at once, from any thread; they stay stopped until `acknowledge` and `enable`.
+        Raises nothing: it says why a word could not be sent, or "". Drives that no longer hear of their
+        controller stop by themselves."""
         return self._cycle.quick_stop(reason)
 
     # moves that cycle by themselves
 
     def profile_move(self, target: Ints, velocity: float, acceleration: float) -> Feedback:
-        """Go to `target` (n_drives,) [counts] along trapezoids, in the mode "ppm"; returns when all have arrived.
+        """Go to `target` (n_drives,) [counts] along trapezoids, in the mode "ppm"; returns when all have
+        arrived.
 
-        `velocity` [counts/s] and `acceleration` [counts/s2], positive. Raises `DeviceError`: stopped, a fault, or not there in time.
+        `velocity` [counts/s] and `acceleration` [counts/s2], positive. Raises `DeviceError`: stopped, a
+        fault, or not there in time.
         """
         goal = whole(self.n_drives, target, "target")
         _positive(velocity=velocity, acceleration=acceleration)
@@ -285,22 +332,36 @@ class DriveBus:
         return feedback
 
     def homing(
-        self, threshold: Ints, speed: Floats | Ints | float, *, acceleration: float = 20_000.0, offset: Ints | None = None,
-        order: Sequence[int] | None = None, rounds: int = 2, time_limit: float = 30.0,
-    ) -> Feedback:  # fmt: skip
+        self,
+        threshold: Ints,
+        speed: Floats | Ints | float,
+        *,
+        acceleration: float = 20_000.0,
+        offset: Ints | None = None,
+        order: Sequence[int] | None = None,
+        rounds: int = 2,
+        time_limit: float = 30.0,
+    ) -> Feedback:
         """Pull the wires in, one after another, until each is taut; the counts there become 0.
 
-        `threshold` (n_drives,) [thousandths of the rated torque], at `speed` [counts/s], one number or (n_drives,), reached by
-        `acceleration` [counts/s2]; then to `offset` (n_drives,) [counts]. `order` of the drives; `rounds`: what one wire pulls the others
-        feel, so all are done more than once; `time_limit` [s] for each. The drives end enabled in the mode "csp".
-        Raises `InputError`, or `DeviceError`: stopped, a fault, or no end; the drives are then stopped.
+        `threshold` (n_drives,) [thousandths of the rated torque], at `speed` [counts/s], one number or
+        (n_drives,), reached by
+        `acceleration` [counts/s2]; then to `offset` (n_drives,) [counts]. `order` of the drives; `rounds`:
+        what one wire pulls the others feel, so all are done more than once; `time_limit` [s] for each. The
+        drives end enabled in the mode "csp". Raises `InputError`, or `DeviceError`: stopped, a fault, or no
+        end; the drives are then stopped.
         """
         n = self.n_drives
         torque, speeds = np.asarray(threshold, dtype=np.float64), np.asarray(speed, dtype=np.float64)
         if torque.shape != (n,) or not np.all((torque > 0.0) & (torque < 3e4)):
-            raise InputError(f"threshold is {threshold!r}; it must be ({n},) positive thousandths of the rated torque.")
+            raise InputError(
+                f"threshold is {threshold!r}; it must be ({n},) positive thousandths of the rated torque."
+            )
         if speeds.shape not in ((), (n,)) or not np.all((speeds > 0.0) & np.isfinite(speeds)):
-            raise InputError(f"speed is {speed!r}; it must be a positive number of counts/s, or one for each of {n} drives.")
+            raise InputError(
+                f"speed is {speed!r}; it must be a positive number of counts/s, or one for "
+                f"each of {n} drives."
+            )
         _positive(acceleration=acceleration, time_limit=time_limit, rounds=rounds)
         away = [0] * n if offset is None else whole(self.n_drives, offset, "offset")
         drives = list(range(n)) if order is None else [int(i) for i in order]
@@ -310,7 +371,9 @@ class DriveBus:
         for i in drives * int(rounds):
             try:
                 current = self._configurator.current(i, float(torque[i]))
-                self._home(i, current, float(np.broadcast_to(speeds, (n,))[i]), acceleration, away[i], time_limit)
+                self._home(
+                    i, current, float(np.broadcast_to(speeds, (n,))[i]), acceleration, away[i], time_limit
+                )
             except DeviceError:
                 self.quick_stop("homing did not end")
                 raise
@@ -328,7 +391,9 @@ class DriveBus:
 
         def attained(now: Feedback) -> bool:
             if now.statusword[i] & _ERROR:
-                raise DeviceError(f"the drive at node {spec.node} reports a homing error; is its wire on the drum?")
+                raise DeviceError(
+                    f"the drive at node {spec.node} reports a homing error; is its wire on the drum?"
+                )
             return bool(now.statusword[i] & _ACKNOWLEDGED and now.statusword[i] & _REACHED)
 
         self._cycle.until(0.5, _once, "be homed", running=True)
@@ -342,7 +407,8 @@ class DriveBus:
         self._cycle.until(0.5, _once, "be homed", running=True)
 
     def close(self) -> None:
-        """Stop the drives, switch them off, leave them pre-operational, and leave the bus. Raises nothing for drives that do not answer."""
+        """Stop the drives, switch them off, leave them pre-operational, and leave the bus. Raises nothing for
+        drives that do not answer."""
         if self._closed:
             return
         self._closed = True
@@ -351,7 +417,9 @@ class DriveBus:
                 if any(self._cycle.enabled):
                     self.quick_stop()
                 with contextlib.suppress(DeviceError):  # down the ramp: without voltage a shaft would run on
-                    self._cycle.until(_RAMP, lambda now: not np.any(now.velocity), "come to rest", stoppable=False)
+                    self._cycle.until(
+                        _RAMP, lambda now: not np.any(now.velocity), "come to rest", stoppable=False
+                    )
                 self.disable()
                 for i in range(self.n_drives):
                     self._configurator.watch(i, on=False)
@@ -363,7 +431,9 @@ class DriveBus:
     def __enter__(self) -> DriveBus:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self.close()
 
 

@@ -1,4 +1,5 @@
-"""The four sides of a marker in a picture, to a few hundredths of a pixel: a blurred step fitted to the grey levels along each."""
+"""The four sides of a marker in a picture, to a few hundredths of a pixel: a blurred step fitted to the grey
+levels along each."""
 
 from __future__ import annotations
 
@@ -14,7 +15,8 @@ _REACH = 3.0  # of the strip that is fitted, to either side of an edge [px]
 _LEAST_STEP = 15.0  # least contrast of a side [grey levels]
 _SHARP = 0.28  # of a picture without blur: the standard deviation of a pixel [px]
 _FARTHEST = 4.0  # that a fit may move a corner [px]
-_BLUR, _BLUR_WEIGHT, _LEVEL_WEIGHT = 0.8, 60.0, 0.1  # weak beliefs for tiny markers: blur [px], and how much it and the first levels weigh
+# weak beliefs for tiny markers: blur [px], and how much it and the first levels weigh
+_BLUR, _BLUR_WEIGHT, _LEVEL_WEIGHT = 0.8, 60.0, 0.1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -24,11 +26,13 @@ class Sides:
     corners: Floats
     """(4, 2) clockwise from the marker's top left [px]."""
     lines: Floats
-    """(4, 3) of line k, from corner k to the next: n_x, n_y, c with n . p = c; n is of length 1 and points outward."""
+    """(4, 3) of line k, from corner k to the next: n_x, n_y, c with n . p = c; n is of length 1 and points
+    outward."""
     weights: Floats
     """(4,) a longer side has more pixels: root of its part of the mean length."""
     fitted: bool
-    """False where a side could not be fitted (covered, cut off, tiny, without contrast): then these are the corners that were given."""
+    """False where a side could not be fitted (covered, cut off, tiny, without contrast): then these are the
+    corners that were given."""
 
 
 @final
@@ -41,17 +45,22 @@ class SideFit:
 
         self._camera, self._ndtr = camera, ndtr
         width, height = camera.size
-        grid = np.stack(np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64)), axis=-1)
+        grid = np.stack(
+            np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64)), axis=-1
+        )
         self._matrix, self._lens = camera.intrinsics, camera.lens
         self._straight = not self._lens.any()
         if not self._straight:
             many = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 20, 1e-9)
-            points = cv2.undistortPoints(grid.reshape(-1, 1, 2), self._matrix, self._lens, P=self._matrix, criteria=many)
+            points = cv2.undistortPoints(
+                grid.reshape(-1, 1, 2), self._matrix, self._lens, P=self._matrix, criteria=many
+            )
             grid = np.asarray(points, dtype=np.float64).reshape(height, width, 2)
         self._ideal = grid
 
     def __call__(self, image: Picture, corners: Floats, cells: int) -> Sides:
-        """Sides from corners (4, 2) in the picture that are right to about a pixel; `cells`: along a side, border and all."""
+        """Sides from corners (4, 2) in the picture that are right to about a pixel; `cells`: along a side,
+        border and all."""
         start = ideal = self.undistorted(corners)
         raw, lines = corners, _lines(start)
         shortest = float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).min())
@@ -74,7 +83,9 @@ class SideFit:
         if self._straight:
             return pixels
         many = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 20, 1e-9)
-        found = cv2.undistortPoints(pixels.reshape(-1, 1, 2), self._matrix, self._lens, P=self._matrix, criteria=many)
+        found = cv2.undistortPoints(
+            pixels.reshape(-1, 1, 2), self._matrix, self._lens, P=self._matrix, criteria=many
+        )
         return np.asarray(found, dtype=np.float64).reshape(-1, 2)
 
     def distorted(self, pixels: Floats) -> Floats:
@@ -85,10 +96,15 @@ class SideFit:
             return pixels
         k = self._matrix
         rays = np.column_stack([(pixels - k[:2, 2]) / (k[0, 0], k[1, 1]), np.ones(len(pixels))])
-        return np.asarray(cv2.projectPoints(rays, np.zeros(3), np.zeros(3), k, self._lens)[0], dtype=np.float64).reshape(-1, 2)
+        return np.asarray(
+            cv2.projectPoints(rays, np.zeros(3), np.zeros(3), k, self._lens)[0], dtype=np.float64
+        ).reshape(-1, 2)
 
-    def _lines(self, image: Picture, raw: Floats, ideal: Floats, cells: int, stride: int, enough: float) -> Floats | None:
-        """(4, 3) better lines, or None. Grey = b + (a - b) Phi(d / s): d distance outward, a outside, b inside, s the blur.
+    def _lines(
+        self, image: Picture, raw: Floats, ideal: Floats, cells: int, stride: int, enough: float
+    ) -> Floats | None:
+        """(4, 3) better lines, or None. Grey = b + (a - b) Phi(d / s): d distance outward, a outside, b
+        inside, s the blur.
 
         Every `stride`-th row of pixels across a side takes part, until it moves by less than `enough` [px].
         """
@@ -143,8 +159,11 @@ class SideFit:
         scale = np.linalg.norm(normal, axis=1)
         return np.column_stack([normal / scale[:, None], ((normal * middle).sum(1) + offset) / scale])
 
-    def _strips(self, raw: Floats, half: int, stride: int) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.int64]], ...]:
-        """Pixels along the four sides: columns and rows (4, n), and which of them count; a side is walked along its longer axis."""
+    def _strips(
+        self, raw: Floats, half: int, stride: int
+    ) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.int64]], ...]:
+        """Pixels along the four sides: columns and rows (4, n), and which of them count; a side is walked
+        along its longer axis."""
         ahead = np.roll(raw, -1, axis=0)
         width, height = self._camera.size
         way = ahead - raw
@@ -159,7 +178,10 @@ class SideFit:
         across = np.rint(crossed).astype(np.int64)[:, :, None] + np.arange(-half, half + 1)
         walked = np.broadcast_to(walked[:, :, None], across.shape)
         counts = np.broadcast_to((k <= n[:, None])[:, :, None], across.shape)
-        x, y = np.where(steep[:, None, None], across, walked).reshape(4, -1), np.where(steep[:, None, None], walked, across).reshape(4, -1)
+        x, y = (
+            np.where(steep[:, None, None], across, walked).reshape(4, -1),
+            np.where(steep[:, None, None], walked, across).reshape(4, -1),
+        )
         inside = counts.reshape(4, -1) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
         return np.clip(x, 0, width - 1), np.clip(y, 0, height - 1), inside  # type: ignore[return-value]
 
@@ -175,10 +197,15 @@ def _crossings(lines: Floats) -> Floats:
     """(4, 2) corners: of the line before with the own one."""
     before = np.roll(lines, 1, axis=0)
     return np.asarray(
-        np.linalg.solve(np.stack([before[:, :2], lines[:, :2]], axis=1), np.stack([before[:, 2], lines[:, 2]], axis=1)[..., None])[..., 0]
+        np.linalg.solve(
+            np.stack([before[:, :2], lines[:, :2]], axis=1),
+            np.stack([before[:, 2], lines[:, 2]], axis=1)[..., None],
+        )[..., 0]
     )
 
 
 def _sides(corners: Floats, lines: Floats, *, fitted: bool) -> Sides:
     length = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
-    return Sides(corners=corners, lines=lines, weights=np.asarray(np.sqrt(length / length.mean())), fitted=fitted)
+    return Sides(
+        corners=corners, lines=lines, weights=np.asarray(np.sqrt(length / length.mean())), fitted=fitted
+    )

@@ -82,11 +82,7 @@ def _text(data: bytes) -> str:
 def _sections(text: str) -> dict[tuple[int, int | None], dict[str, str]]:
     """Options of objects by index and subindex; keys in small letters. A section that comes twice adds up."""
     parser = RawConfigParser(
-        strict=False,
-        allow_no_value=True,
-        delimiters=("=",),
-        comment_prefixes=(";", "#"),
-        default_section="",
+        strict=False, allow_no_value=True, delimiters=("=",), comment_prefixes=(";", "#"), default_section=""
     )
     lines = (line.replace("\0", "").strip() for line in text.splitlines())  # an indent continues nothing
     parser.read_string("\n".join(line for line in lines if not line.startswith("=")))

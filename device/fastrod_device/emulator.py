@@ -1,7 +1,9 @@
-"""`Emulator`: the prototype without hardware; the same protocols through the same libraries, and a plant behind them that nothing reads.
+"""`Emulator`: the prototype without hardware; the same protocols through the same libraries, and a plant
+behind them that nothing reads.
 
-Drives on a CAN bus (`nodes`), a camera whose frames are drawn (`drawing`), wires that are slack until the robot is homed, and a sealed
-plant (`plant`). Hands that hang a load and turn the base are methods; so are faults.
+Drives on a CAN bus (`nodes`), a camera whose frames are drawn (`drawing`), wires that are slack until the
+robot is homed, and a sealed plant (`plant`). Hands that hang a load and turn the base are methods; so are
+faults.
 """
 
 from __future__ import annotations
@@ -36,7 +38,8 @@ _KEPT = 8  # frames that nobody has fetched
 
 @final
 class Emulator:
-    """Drives, wires, plant and camera. It is the `Wires` of its drives and the `FrameSource` of whoever looks."""
+    """Drives, wires, plant and camera. It is the `Wires` of its drives and the `FrameSource` of whoever
+    looks."""
 
     def __init__(
         self,
@@ -72,7 +75,8 @@ class Emulator:
         self.drives = EmulatedDrives(hardware.drives, bus, clock=clock, wires=self, eds=eds)
 
     def move(self, t: float, pulled: Floats) -> Floats:
-        """Wires wound by (n_drives,) [m] since power-on: their tensions [N]. The rod stands straight until every wire is taut."""
+        """Wires wound by (n_drives,) [m] since power-on: their tensions [N]. The rod stands straight until
+        every wire is taut."""
         with self._lock:
             in_hand = pulled - self._slack
             if not self._taut:
@@ -96,7 +100,8 @@ class Emulator:
         self._due.append((self._number, t, position, quaternion_from_matrix(rotation[None])[0]))
 
     def read(self) -> Frame | None:
-        """The newest frame that has arrived and was not read yet; drawn now, stamped with the time of its exposure."""
+        """The newest frame that has arrived and was not read yet; drawn now, stamped with the time of its
+        exposure."""
         arrived = self.clock.now() - self.hardware.camera.latency
         found = None
         with self._lock:
@@ -109,7 +114,9 @@ class Emulator:
             self._last = Frame(image=self._last.image, t=t, number=number)
         else:
             self._last = Frame(
-                image=self._eye.draw(position, quaternion, marker=not self.hidden and t >= self._covered), t=t, number=number
+                image=self._eye.draw(position, quaternion, marker=not self.hidden and t >= self._covered),
+                t=t,
+                number=number,
             )
         return self._last
 
@@ -120,7 +127,8 @@ class Emulator:
             self._covered = self.clock.now() + _HANDS
 
     def turn(self, quaternion: Floats) -> None:
-        """Turn the whole bench to the quaternion world_from_base (4,) w x y z; hands cover the marker meanwhile."""
+        """Turn the whole bench to the quaternion world_from_base (4,) w x y z; hands cover the marker
+        meanwhile."""
         with self._lock:
             self.plant.turn(quaternion)
             self._covered = self.clock.now() + _HANDS

@@ -14,4 +14,5 @@ class CalibrationError(FastrodError, ValueError):
 
 
 class RefusedError(InputError):
-    """A command that was refused before it reached the bus: beyond a limit, not finite, too late, or to a robot that is stopped."""
+    """A command that was refused before it reached the bus: beyond a limit, not finite, too late, or to a
+    robot that is stopped."""

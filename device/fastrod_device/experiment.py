@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Protocol, final
 
@@ -21,7 +22,8 @@ from fastrod_device.prototype import Prototype
 Progress = Callable[[str, int, int], None]
 """What is done, how far, of how much."""
 Law = Callable[[Floats, float], Floats]
-"""(3,) measured tip [m], nan where it is not known, and seconds since the path began -> (n_tendons,) changes of wire length [m]."""
+"""(3,) measured tip [m], nan where it is not known, and seconds since the path began -> (n_tendons,) changes
+of wire length [m]."""
 _SETTLE = 1.0  # s at rest before a path begins
 
 
@@ -46,11 +48,17 @@ class AskingHands:
 
     def turn(self, quaternion: Floats) -> None:
         """Ask for it, and wait for the Enter key."""
-        input(f"Please turn the base to world_from_base w x y z = {np.round(quaternion, 3).tolist()}, then press Enter: ")
+        input(
+            f"Please turn the base to world_from_base w x y z = {np.round(quaternion, 3).tolist()}, then "
+            "press Enter: "
+        )
 
 
-def excite(prototype: Prototype, run: Excitation, hands: Hands, path: str | Path, *, progress: Progress | None = None) -> RunLog:
-    """Drive `run`, hands doing what it asks, and record it to `path`: its inputs as the encoders had them, the known load, the base.
+def excite(
+    prototype: Prototype, run: Excitation, hands: Hands, path: str | Path, *, progress: Progress | None = None
+) -> RunLog:
+    """Drive `run`, hands doing what it asks, and record it to `path`: its inputs as the encoders had them,
+    the known load, the base.
 
     Raises what `Prototype.follow` raises; what was recorded until then is on disk all the same.
     """
@@ -78,8 +86,12 @@ def excite(prototype: Prototype, run: Excitation, hands: Hands, path: str | Path
             prototype.record(recorder)
             t, dl = log.t[start : end + 1] - log.t[start], log.dl[start : end + 1]
             for piece in _pieces(t[-1] if end < len(log) else t[-1] + np.diff(log.t[-2:])[0]):
-                prototype.follow(lambda s, t=t, dl=dl, began=piece[0]: _between(began + s, t, dl), piece[1])  # type: ignore[misc]
-                tell("excitation", min(start + int((piece[0] + piece[1]) / t[-1] * (end - start)), end), len(log))
+                prototype.follow(partial(_piece_of, t, dl, piece[0]), piece[1])
+                tell(
+                    "excitation",
+                    min(start + int((piece[0] + piece[1]) / t[-1] * (end - start)), end),
+                    len(log),
+                )
             prototype.record(None)
     except BaseException:
         _saved(prototype, recorder)
@@ -132,7 +144,8 @@ class Tracking:
 
 
 def within(prototype: Prototype, dl: Floats) -> None:
-    """Raises `RefusedError` where a row of a run (n, n_tendons) [m] is beyond the robot's limits: before it moves, and not half way."""
+    """Raises `RefusedError` where a row of a run (n, n_tendons) [m] is beyond the robot's limits: before it
+    moves, and not half way."""
     for row in dl:
         prototype.supervisor.within(row)
 
@@ -147,13 +160,25 @@ def drive_lag(log: RunLog) -> float:
     told = np.stack([numbers(dict(log.extra), name, log.name) for name in names], axis=1)
     good = np.isfinite(told).all(axis=1) & np.isfinite(log.dl).all(axis=1)
     t, told, done = log.t[good], told[good], log.dl[good]
-    found = minimize_scalar(lambda lag: float(np.mean((_between(t - lag, t, told) - done) ** 2)), bounds=(0.0, 0.2), method="bounded")
+    found = minimize_scalar(
+        lambda lag: float(np.mean((_between(t - lag, t, told) - done) ** 2)),
+        bounds=(0.0, 0.2),
+        method="bounded",
+    )
     return float(found.x)
 
 
-def follow(prototype: Prototype, plan: Plan, path: str | Path, *, law: Law | None = None, dt: float = 0.05, lead: float = 0.0) -> RunLog:
-    """Drive a plan, sent `lead` [s] early for drives that lag, or what `law` commands every `dt` [s] of the plan's time in its place, and
-    record it to `path`; t = 0 is the plan's.
+def follow(
+    prototype: Prototype,
+    plan: Plan,
+    path: str | Path,
+    *,
+    law: Law | None = None,
+    dt: float = 0.05,
+    lead: float = 0.0,
+) -> RunLog:
+    """Drive a plan, sent `lead` [s] early for drives that lag, or what `law` commands every `dt` [s] of the
+    plan's time in its place, and record it to `path`; t = 0 is the plan's.
 
     Raises what `Prototype.follow` raises; what was recorded until then is on disk.
     """
@@ -191,7 +216,8 @@ def tracking(name: str, log: RunLog, plan: Plan) -> Tracking:
     meant = log.t - plan.lead
     on = (meant >= plan.t[0]) & (meant <= plan.t[-1])
     path, nearest, predicted = (
-        np.where(on[:, None], _between(meant, plan.t, points), np.nan) for points in (plan.target, plan.nearest, plan.predicted)
+        np.where(on[:, None], _between(meant, plan.t, points), np.nan)
+        for points in (plan.target, plan.nearest, plan.predicted)
     )
     return Tracking(name=name, log=log, path=path, nearest=nearest, predicted=predicted)
 
@@ -200,6 +226,11 @@ def _pieces(seconds: float, most: float = 5.0) -> list[tuple[float, float]]:
     """(start, length) of the parts of a stretch, so that progress is seen."""
     n = max(1, round(seconds / most))
     return [(k * seconds / n, seconds / n) for k in range(n)]
+
+
+def _piece_of(times: Floats, rows: Floats, began: float, t: float) -> Floats:
+    """(n,) rows at `t` after `began`."""
+    return _between(began + t, times, rows)
 
 
 def _between(t: Floats | float, times: Floats, rows: Floats) -> Floats:

@@ -1,4 +1,5 @@
-"""What a drive's numbers mean: emergency codes (CiA 301, CiA 402 and those of an EPOS4) and states of the drive, in words."""
+"""What a drive's numbers mean: emergency codes (CiA 301, CiA 402 and those of an EPOS4) and states of the
+drive, in words."""
 
 from __future__ import annotations
 
@@ -62,14 +63,40 @@ CODES: dict[int, str] = {
 """Emergency codes in words."""
 
 _CLASSES = {
-    0x10: "generic error", 0x20: "current", 0x21: "current at the input", 0x22: "current inside the drive", 0x23: "current at the output",
-    0x30: "voltage", 0x31: "mains voltage", 0x32: "voltage inside the drive", 0x33: "output voltage", 0x40: "temperature",
-    0x41: "temperature around the drive", 0x42: "temperature of the drive", 0x43: "temperature of the motor", 0x50: "hardware of the drive",
-    0x51: "supply of the drive", 0x52: "hardware of the drive", 0x60: "software of the drive", 0x61: "software inside the drive",
-    0x62: "user software", 0x63: "parameters", 0x70: "additional modules", 0x73: "sensor", 0x80: "monitoring", 0x81: "communication",
-    0x82: "protocol", 0x83: "torque control", 0x84: "velocity control", 0x85: "position control", 0x86: "position control",
-    0x8A: "limits", 0x90: "external error", 0xF0: "additional functions", 0xFF: "of the maker's own",
-}  # fmt: skip
+    0x10: "generic error",
+    0x20: "current",
+    0x21: "current at the input",
+    0x22: "current inside the drive",
+    0x23: "current at the output",
+    0x30: "voltage",
+    0x31: "mains voltage",
+    0x32: "voltage inside the drive",
+    0x33: "output voltage",
+    0x40: "temperature",
+    0x41: "temperature around the drive",
+    0x42: "temperature of the drive",
+    0x43: "temperature of the motor",
+    0x50: "hardware of the drive",
+    0x51: "supply of the drive",
+    0x52: "hardware of the drive",
+    0x60: "software of the drive",
+    0x61: "software inside the drive",
+    0x62: "user software",
+    0x63: "parameters",
+    0x70: "additional modules",
+    0x73: "sensor",
+    0x80: "monitoring",
+    0x81: "communication",
+    0x82: "protocol",
+    0x83: "torque control",
+    0x84: "velocity control",
+    0x85: "position control",
+    0x86: "position control",
+    0x8A: "limits",
+    0x90: "external error",
+    0xF0: "additional functions",
+    0xFF: "of the maker's own",
+}
 
 
 def in_words(code: int) -> str:
@@ -94,8 +121,15 @@ REACTION = "fault reaction active"
 FAULT = "fault"
 
 STATUS_BITS = {
-    NOT_READY: 0x00, SWITCH_ON_DISABLED: 0x40, READY: 0x21, SWITCHED_ON: 0x23, ENABLED: 0x27, QUICK_STOP: 0x07, REACTION: 0x0F, FAULT: 0x08,
-}  # fmt: skip
+    NOT_READY: 0x00,
+    SWITCH_ON_DISABLED: 0x40,
+    READY: 0x21,
+    SWITCHED_ON: 0x23,
+    ENABLED: 0x27,
+    QUICK_STOP: 0x07,
+    REACTION: 0x0F,
+    FAULT: 0x08,
+}
 """Statusword of each state, bits 0 to 3, 5 and 6."""
 
 

@@ -1,4 +1,5 @@
-"""`Hardware`: what stands on the bench, as a TOML file: drives, limits, camera, marker, and the robot that they move."""
+"""`Hardware`: what stands on the bench, as a TOML file: drives, limits, camera, marker, and the robot that
+they move."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ _SLOWEST, _QUICKEST = 50.0, 500.0  # Hz
 
 @dataclass(frozen=True, kw_only=True)
 class Hardware:
-    """A robot, one drive for each of its wires in the robot file's order, and what watches it. Raises `InputError`."""
+    """A robot, one drive for each of its wires in the robot file's order, and what watches it. Raises
+    `InputError`."""
 
     robot: Robot
     """Its model."""
@@ -45,12 +47,17 @@ class Hardware:
     def __post_init__(self) -> None:
         nodes = [spec.node for spec in self.drives]
         if len(nodes) != self.robot.n_tendons:
-            raise InputError(f"there are {len(nodes)} drives and robot {self.robot.name!r} has {self.robot.n_tendons} tendons.")
+            raise InputError(
+                f"there are {len(nodes)} drives and robot {self.robot.name!r} has "
+                f"{self.robot.n_tendons} tendons."
+            )
         if len(set(nodes)) != len(nodes):
             raise InputError(f"the drives have node ids {nodes}; each must be there once.")
         for name, low, high, unit in (
-            ("rate", _SLOWEST, _QUICKEST, "Hz"), ("pretension", 0.01, self.limits.tension, "N"), ("homing_speed", 1e-4, 0.1, "m/s"),
-        ):  # fmt: skip
+            ("rate", _SLOWEST, _QUICKEST, "Hz"),
+            ("pretension", 0.01, self.limits.tension, "N"),
+            ("homing_speed", 1e-4, 0.1, "m/s"),
+        ):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
                 raise InputError(f"{name} is {shown(value)}; it must be from {low:g} to {high:g} {unit}.")
@@ -58,7 +65,8 @@ class Hardware:
         if self.pretension < (1.0 - 1e-9) * steps.max():
             k, least = int(steps.argmax()), math.ceil(1e3 * steps.max()) / 1e3
             raise InputError(
-                f"pretension is {self.pretension!r} N; the drive at node {nodes[k]} tells torque in steps of {steps[k]:.3g} N of its wire, "
+                f"pretension is {self.pretension!r} N; the drive at node {nodes[k]} tells torque in steps "
+                f"of {steps[k]:.3g} N of its wire, "
                 f"so it must be at least {least:g} N."
             )
 
@@ -66,9 +74,10 @@ class Hardware:
 def load_hardware(path: str | Path | None = None, robot: Robot | None = None) -> Hardware:
     """The hardware in a .toml, by default the one that ships, `SHIPPED`.
 
-    `camera` is a table, or the name of a camera file beside the hardware file; `robot` a shipped one's name, or a file beside it. The
-    argument `robot` takes the place of the file's model, as `identify` has made it. Raises, with file, table and key, `InputError` for what
-    is wrong, `UnknownNameError` for what is not known, `RobotError` for the robot.
+    `camera` is a table, or the name of a camera file beside the hardware file; `robot` a shipped one's name,
+    or a file beside it. The argument `robot` takes the place of the file's model, as `identify` has made it.
+    Raises, with file, table and key, `InputError` for what is wrong, `UnknownNameError` for what is not
+    known, `RobotError` for the robot.
     """
     source = SHIPPED if path is None else Path(path)
     where = f"hardware file {(source.name if path is None else str(path))!r}"
@@ -80,8 +89,12 @@ def load_hardware(path: str | Path | None = None, robot: Robot | None = None) ->
     if missing := [name for name in _NEEDED if name not in data]:
         raise InputError(f"{where} lacks {', '.join(missing)}.")
     if not isinstance(data["drive"], list):
-        raise InputError(f"{where}: drive is one table; write [[drive]], in double brackets, one for each wire.")
-    drives = tuple(from_table(DriveSpec, table, f"{where}: drive {k}") for k, table in enumerate(data["drive"], 1))
+        raise InputError(
+            f"{where}: drive is one table; write [[drive]], in double brackets, one for each wire."
+        )
+    drives = tuple(
+        from_table(DriveSpec, table, f"{where}: drive {k}") for k, table in enumerate(data["drive"], 1)
+    )
     limits = from_table(Limits, data.get("limits", {}), f"{where}: [limits]")
     marker = from_table(Marker, data["marker"], f"{where}: [marker]")
     camera = _camera(data["camera"], source, where)
@@ -98,13 +111,18 @@ def _camera(given: object, hardware_file: Path, where: str) -> Camera:
     if not isinstance(given, str):
         return from_table(Camera, given, f"{where}: [camera]")
     if not (beside := hardware_file.parent / given).is_file():
-        raise InputError(f"{where}: camera is {given!r}, and there is no file {str(beside)!r}; give a camera file, or a table [camera].")
+        raise InputError(
+            f"{where}: camera is {given!r}, and there is no file {str(beside)!r}; give a "
+            "camera file, or a table [camera]."
+        )
     return load_camera(beside)
 
 
 def _robot(given: object, hardware_file: Path, where: str) -> Robot:
     """Of a file beside the hardware file, or one that ships."""
     if not isinstance(given, str):
-        raise InputError(f"{where}: robot is {given!r}; give a shipped robot's name, or a robot file's in quotes.")
+        raise InputError(
+            f"{where}: robot is {given!r}; give a shipped robot's name, or a robot file's in quotes."
+        )
     beside = hardware_file.parent / given
     return load_robot(beside if beside.is_file() else given)

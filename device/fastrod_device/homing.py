@@ -1,11 +1,14 @@
 """Homing: where the robot is straight and every wire pulls with its pretension; zero is there.
 
-One wire after another is wound in until it is taut; that leaves the robot bent, as what one pulls the others feel. So all then move
-together until they pull alike. By tension alone the robot stands straight no better than friction and the motors' torque let it, where
-0.1 N is half a millimetre at the tip; the camera does the rest. Before it looks, the robot circles in smaller and smaller turns: friction
-and backlash then forget from where they came, and zero lies in the middle of their loops.
+One wire after another is wound in until it is taut; that leaves the robot bent, as what one pulls the others
+feel. So all then move together until they pull alike. By tension alone the robot stands straight no better
+than friction and the motors' torque let it, where
+0.1 N is half a millimetre at the tip; the camera does the rest. Before it looks, the robot circles in smaller
+and smaller turns: friction and backlash then forget from where they came, and zero lies in the middle of
+their loops.
 
-The supervisor does not watch yet, so every cycle is looked at here, and what is wrong stops the drives at once.
+The supervisor does not watch yet, so every cycle is looked at here, and what is wrong stops the drives at
+once.
 """
 
 from __future__ import annotations
@@ -36,7 +39,8 @@ _YIELD = 0.03  # of what would mend the tensions, in a cycle
 _STIFFEST = 1e-4  # m/N that a wire is taken to give at least
 _SMOOTH = 0.2  # of what the motors' torque says in a cycle
 _UNEVEN = 0.3  # of the pretension
-_ROUNDS, _LOOKING, _LEAST = 2, 1.5, 8  # times that the tip is looked at, for how long [s], sightings that it takes
+# times that the tip is looked at, for how long [s], sightings that it takes
+_ROUNDS, _LOOKING, _LEAST = 2, 1.5, 8
 _FAR, _NEAR = 1e-3, 5e-5  # m of wire: a greater correction means a wrong camera, a smaller one is none
 _MEASURED = 0.3  # s for which the tensions are taken in the end
 _BEHIND = 0.25  # of the limits' following error, for a drive that hardly moves; at the full rate all of it
@@ -45,16 +49,22 @@ _PULL, _LEAST_PULL = 5.0, 3.0  # pretensions, N: no wire pulls more while it is 
 _BEND, _TURNS, _TURN = 0.45, 4, 1.4  # rad at first, turns of the spiral, s each
 
 
-def home(drives: DriveBus, hardware: Hardware, clock: Clock, look: Callable[[], Sighting | None] | None) -> tuple[Transmission, Robot]:
+def home(
+    drives: DriveBus, hardware: Hardware, clock: Clock, look: Callable[[], Sighting | None] | None
+) -> tuple[Transmission, Robot]:
     """Do it; wires as drives with their zero, and the robot with the tensions that its wires have there.
 
-    `look` gives the newest sighting that was not given yet; None: there is no camera, and tension alone decides. Raises `DeviceError`, with
-    the drives stopped, where one of them does not do as it is told, a wire does not come to its pretension or pulls far more, the marker is
-    not seen, or it is seen where the robot cannot be.
+    `look` gives the newest sighting that was not given yet; None: there is no camera, and tension alone
+    decides. Raises `DeviceError`, with the drives stopped, where one of them does not do as it is told, a
+    wire does not come to its pretension or pulls far more, the marker is not seen, or it is seen where the
+    robot cannot be.
     """
     transmission, n = Transmission(hardware.drives), len(hardware.drives)
     per = 1.0 / np.abs(transmission.wound(np.ones(n, dtype=np.int64)))  # counts in a metre
-    drives.homing(np.abs(transmission.torque(np.full(n, hardware.pretension))), np.rint(hardware.homing_speed * per).astype(np.int64))
+    drives.homing(
+        np.abs(transmission.torque(np.full(n, hardware.pretension))),
+        np.rint(hardware.homing_speed * per).astype(np.int64),
+    )
     pacer, last, speed = Pacer(clock, hardware.rate), transmission.dl(drives.newest.position), 0.0
 
     def cycle(at: Floats) -> Floats:
@@ -62,7 +72,8 @@ def home(drives: DriveBus, hardware: Hardware, clock: Clock, look: Callable[[], 
         nonlocal last, speed
         pacer.wait()
         feedback = drives.exchange(transmission.counts(at))
-        speed, last = max(0.5 * speed, float(np.abs(at - last).max()) * hardware.rate), at  # a drive lags by a moment
+        # a drive lags by a moment
+        speed, last = max(0.5 * speed, float(np.abs(at - last).max()) * hardware.rate), at
         if wrong := trouble(feedback, hardware, speed=speed):
             why = f" ({drives.stop_reason})" if drives.stop_reason else ""
             raise DeviceError(f"{wrong}{why}; homing was stopped.")
@@ -75,7 +86,8 @@ def home(drives: DriveBus, hardware: Hardware, clock: Clock, look: Callable[[], 
         if (off > _UNEVEN * hardware.pretension).any():
             k = int(off.argmax())
             raise DeviceError(
-                f"the wire of node {hardware.drives[k].node} pulls with {tension[k]:.2f} N after homing; {hardware.pretension:g} N were "
+                f"the wire of node {hardware.drives[k].node} pulls with {tension[k]:.2f} N after homing; "
+                f"{hardware.pretension:g} N were "
                 "asked for. Is it caught, or a direction wrong?"
             )
         if look is not None:
@@ -84,7 +96,8 @@ def home(drives: DriveBus, hardware: Hardware, clock: Clock, look: Callable[[], 
             if (tension <= 0.0).any():
                 k = int(tension.argmin())
                 raise DeviceError(
-                    f"the wire of node {hardware.drives[k].node} is slack where the camera sees the robot straight ({tension[k]:.2f} N). "
+                    f"the wire of node {hardware.drives[k].node} is slack where the camera sees the robot "
+                    f"straight ({tension[k]:.2f} N). "
                     "Is the camera registered? `fastrod drive register` does it."
                 )
     except BaseException:
@@ -94,7 +107,8 @@ def home(drives: DriveBus, hardware: Hardware, clock: Clock, look: Callable[[], 
 
 
 def trouble(feedback: Feedback, hardware: Hardware, *, speed: float = 0.0) -> str:
-    """What is wrong with drives that are homed: one sentence without its full stop, of the first that is found; empty where all is well.
+    """What is wrong with drives that are homed: one sentence without its full stop, of the first that is
+    found; empty where all is well.
 
     `speed` of the quickest wire [m/s]: a drive that moves may be further behind where it was told to be.
     """
@@ -108,14 +122,23 @@ def trouble(feedback: Feedback, hardware: Hardware, *, speed: float = 0.0) -> st
             return f"the drive at node {nodes[message.drive]} sent an emergency: {in_words(message.code)}"
     oldest = max(_OLD / hardware.rate, hardware.limits.feedback_age)
     transmission, limits = Transmission(hardware.drives), hardware.limits
-    tension, behind = transmission.tension(feedback.torque), np.abs(transmission.wound(feedback.following_error))
+    tension, behind = (
+        transmission.tension(feedback.torque),
+        np.abs(transmission.wound(feedback.following_error)),
+    )
     late = limits.following_error * min(1.0, _BEHIND + speed / limits.rate)
     most = min(hardware.limits.tension, max(_PULL * hardware.pretension, _LEAST_PULL))
     for k, node in enumerate(nodes):
         if not feedback.age[k] <= oldest:
-            return f"the drive at node {node} was last heard {1e3 * feedback.age[k]:.0f} ms ago; {1e3 * oldest:.0f} ms are allowed"
+            return (
+                f"the drive at node {node} was last heard {1e3 * feedback.age[k]:.0f} ms ago; "
+                f"{1e3 * oldest:.0f} ms are allowed"
+            )
         if (state := state_in_words(int(feedback.statusword[k]))) != ENABLED:
-            return f"the drive at node {node} went to the state {state!r} (statusword 0x{int(feedback.statusword[k]):04X})"
+            return (
+                f"the drive at node {node} went to the state {state!r} (statusword "
+                f"0x{int(feedback.statusword[k]):04X})"
+            )
     k, b = int(np.abs(tension).argmax()), int(behind.argmax())
     slow = f"the drive at node {nodes[b]} is {1e3 * behind[b]:.2g} mm from where it was told to be"
     if behind[b] > late:
@@ -127,29 +150,35 @@ def trouble(feedback: Feedback, hardware: Hardware, *, speed: float = 0.0) -> st
 
 
 def tightened(robot: Robot, tension: Floats) -> Robot:
-    """The robot whose wires pull with `tension` (n_tendons,) [N] where their change of length is zero, and whose zeros are no surer than
-    homing makes them. Its pretension adds to the stiffness in torsion: a model that does not know it finds another shear modulus."""
+    """The robot whose wires pull with `tension` (n_tendons,) [N] where their change of length is zero, and
+    whose zeros are no surer than homing makes them. Its pretension adds to the stiffness in torsion: a model
+    that does not know it finds another shear modulus."""
     left = iter(tension.tolist())
     segments = tuple(
-        replace(segment, tendons=tuple(replace(tendon, pretension=next(left)) for tendon in segment.tendons)) for segment in robot.segments
+        replace(segment, tendons=tuple(replace(tendon, pretension=next(left)) for tendon in segment.tendons))
+        for segment in robot.segments
     )
     fit = {"tendon.*.zero": {"sd": ZERO_SD}, **robot.fit}
     return replace(robot, segments=segments, fit=fit)
 
 
 def softness(robot: Robot) -> Floats:
-    """(n_tendons, n_tendons) change of wire length by tension [m/N], straight and unloaded: what the wires give and the body bends."""
+    """(n_tendons, n_tendons) change of wire length by tension [m/N], straight and unloaded: what the wires
+    give and the body bends."""
     wiring = wire(robot)
     body = np.repeat([segment.length / min(segment.bending_stiffness) for segment in robot.segments], 2)
-    own = np.array([max(tendon.compliance, _STIFFEST) for segment in robot.segments for tendon in segment.tendons])
+    own = np.array(
+        [max(tendon.compliance, _STIFFEST) for segment in robot.segments for tendon in segment.tendons]
+    )
     return np.asarray(np.diag(own) + (wiring.arms * body) @ wiring.arms.T)
 
 
 def lean(robot: Robot, tip: Floats) -> Floats:
-    """(n_tendons,) wire lengths [m] that bend a straight robot so that its tip (3,) is beside the axis by as much as this one; the least
-    bends that do it."""
+    """(n_tendons,) wire lengths [m] that bend a straight robot so that its tip (3,) is beside the axis by as
+    much as this one; the least bends that do it."""
     wiring = wire(robot)
-    beyond = np.cumsum(wiring.length[::-1])[::-1] - 0.5 * wiring.length  # from the middle of a segment to the tip
+    # from the middle of a segment to the tip
+    beyond = np.cumsum(wiring.length[::-1])[::-1] - 0.5 * wiring.length
     by_bend = np.zeros((2, 2 * robot.n_segments))
     by_bend[0, 1::2], by_bend[1, 0::2] = beyond, -beyond
     bend = np.linalg.pinv(by_bend) @ tip[:2]
@@ -172,9 +201,14 @@ def _measured(cycle: Callable[[Floats], Floats], at: Floats, hardware: Hardware)
 
 
 def _straightened(
-    cycle: Callable[[Floats], Floats], look: Callable[[], Sighting | None], at: Floats, hardware: Hardware, clock: Clock
+    cycle: Callable[[Floats], Floats],
+    look: Callable[[], Sighting | None],
+    at: Floats,
+    hardware: Hardware,
+    clock: Clock,
 ) -> Floats:
-    """(n_drives,) where the wires are when the tip is seen on the axis [m]. Raises `DeviceError` where the camera cannot be believed."""
+    """(n_drives,) where the wires are when the tip is seen on the axis [m]. Raises `DeviceError` where the
+    camera cannot be believed."""
     before = np.inf
     for _ in range(_ROUNDS):
         for away in _spiral(hardware):
@@ -196,9 +230,14 @@ def _straightened(
         way = -lean(hardware.robot, tip)
         far = float(np.abs(way).max())
         if far > _FAR or (far > _NEAR and far >= before):
-            why = f"by {1e3 * _FAR:g} mm at most" if far > _FAR else f"and {1e3 * before:.2f} mm before did not bring it nearer"
+            why = (
+                f"by {1e3 * _FAR:g} mm at most"
+                if far > _FAR
+                else (f"and {1e3 * before:.2f} mm before did not bring it nearer")
+            )
             raise DeviceError(
-                f"the tip is seen {1e3 * float(np.hypot(tip[0], tip[1])):.2g} mm beside the axis; the wires would move by {1e3 * far:.2f} "
+                f"the tip is seen {1e3 * float(np.hypot(tip[0], tip[1])):.2g} mm beside the axis; the wires "
+                f"would move by {1e3 * far:.2f} "
                 f"mm, {why}; is the camera registered? `fastrod drive register` does it."
             )
         before = far
@@ -210,7 +249,8 @@ def _straightened(
 
 
 def _spiral(hardware: Hardware) -> Floats:
-    """(n, n_tendons) wire lengths [m] of a bend that circles and shrinks to nothing, all segments alike, at half of the rate at most."""
+    """(n, n_tendons) wire lengths [m] of a bend that circles and shrinks to nothing, all segments alike, at
+    half of the rate at most."""
     wiring, limits = wire(hardware.robot), hardware.limits
     n = round(_TURNS * _TURN * hardware.rate)
     angle = 2.0 * np.pi * _TURNS * np.arange(1, n + 1) / n
@@ -218,4 +258,12 @@ def _spiral(hardware: Hardware) -> Floats:
     way = np.stack([bend * np.cos(angle), bend * np.sin(angle)], axis=1)
     dl = wiring.wires(np.repeat(way[:, None], wiring.n_segments, axis=1))
     quickest = float(np.abs(np.diff(dl, axis=0, prepend=0.0)).max()) * hardware.rate
-    return _BEND * dl * min(1.0, 0.5 * limits.rate / (_BEND * quickest), 0.5 * limits.displacement / (_BEND * float(np.abs(dl).max())))
+    return (
+        _BEND
+        * dl
+        * min(
+            1.0,
+            0.5 * limits.rate / (_BEND * quickest),
+            0.5 * limits.displacement / (_BEND * float(np.abs(dl).max())),
+        )
+    )

@@ -28,8 +28,11 @@ _STATUS, _MOTION = struct.Struct("<Hih"), struct.Struct("<ii")
 class Inbox:
     """The newest words of all drives, and who has answered the last SYNC."""
 
-    def __init__(self, line: Line, specs: Sequence[DriveSpec], clock: Clock, booted: Callable[[int], None]) -> None:
-        """Subscribes; `booted` is called by the bus's thread with the index of a drive that says it has booted."""
+    def __init__(
+        self, line: Line, specs: Sequence[DriveSpec], clock: Clock, booted: Callable[[int], None]
+    ) -> None:
+        """Subscribes; `booted` is called by the bus's thread with the index of a drive that says it has
+        booted."""
         n = len(specs)
         self._line, self._clock, self._booted = line, clock, booted
         self._index = {spec.node: i for i, spec in enumerate(specs)}
@@ -82,7 +85,8 @@ class Inbox:
             self._expect()
 
     def wait(self, bound: float) -> None:
-        """Until all have answered what was expected, `bound` [s] at most; those that were silent before get little time."""
+        """Until all have answered what was expected, `bound` [s] at most; those that were silent before get
+        little time."""
         if self._waiting:
             self._all_in.wait(bound)
         if not all(self._live):
@@ -107,14 +111,24 @@ class Inbox:
             silence = now - max(self._t)
             lost = unsent or self._line.trouble
             if not lost and connected and silence > SILENCE:
-                lost = f"no drive has said anything for {silence:.2f} s; is the cable plugged in and the power on?"
+                lost = (
+                    f"no drive has said anything for {silence:.2f} s; is the cable plugged in and the "
+                    "power on?"
+                )
             feedback = Feedback(
-                t=now, position=np.array(self._position, dtype=np.int64), velocity=np.array(self._velocity, dtype=np.int64),
-                torque=np.array(self._torque, dtype=np.int64), following_error=np.array(self._error, dtype=np.int64),
-                statusword=np.array(self.status, dtype=np.int64), age=now - np.array(self._t), heartbeat_age=now - np.array(self._t_beat),
-                nmt=np.array(self._nmt, dtype=np.int64), emergencies=mail, lost=lost,
+                t=now,
+                position=np.array(self._position, dtype=np.int64),
+                velocity=np.array(self._velocity, dtype=np.int64),
+                torque=np.array(self._torque, dtype=np.int64),
+                following_error=np.array(self._error, dtype=np.int64),
+                statusword=np.array(self.status, dtype=np.int64),
+                age=now - np.array(self._t),
+                heartbeat_age=now - np.array(self._t_beat),
+                nmt=np.array(self._nmt, dtype=np.int64),
+                emergencies=mail,
+                lost=lost,
                 foreign_syncs=foreign,
-            )  # fmt: skip
+            )
         self.log.extend(mail)
         return feedback
 

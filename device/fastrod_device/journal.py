@@ -24,8 +24,8 @@ _KEEP_SIZE = 1  # FALLOC_FL_KEEP_SIZE: blocks beyond the file's end, which no re
 
 @final
 class Journal:
-    """Stops and what led to them as a CSV of t [s], kind and sentence; a line is the system's before `write` returns, so a killed process
-    loses none. Its lines are in `lines` too.
+    """Stops and what led to them as a CSV of t [s], kind and sentence; a line is the system's before `write`
+    returns, so a killed process loses none. Its lines are in `lines` too.
 
     Room on the disk is reserved at the start, so the line that says that the disk is full has its place:
     behind the file's end where the system can (Linux), else by a spare file PATH.spare, which gives up a

@@ -10,7 +10,8 @@ import numpy as np
 from fastrod.errors import InputError, shown
 from fastrod.types import Floats
 
-_LARGEST = {"m": (0.5, "mm"), "m/s": (1.0, "mm/s"), "s": (60.0, "ms")}  # beyond this it was given in the other unit
+# beyond this it was given in the other unit
+_LARGEST = {"m": (0.5, "mm"), "m/s": (1.0, "mm/s"), "s": (60.0, "ms")}
 _LEAST, _MOST = 1e-9, 1e9  # of any limit in its unit
 
 
@@ -21,7 +22,8 @@ def _unit(name: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """Of commands, of the robot, and of how old news may be; by default those of the 70 mm prototype. Raises `InputError`.
+    """Of commands, of the robot, and of how old news may be; by default those of the 70 mm prototype. Raises
+    `InputError`.
 
     >>> Limits(displacement=0.006).displacement
     0.006
@@ -38,7 +40,8 @@ class Limits:
     slack: float | None = None
     """Least tension of any wire while the drives are enabled [N]; None: a wire may hang."""
     command_age: float = 0.5
-    """A command that was meant longer ago is refused, and one must be renewed this often while the robot moves [s]."""
+    """A command that was meant longer ago is refused, and one must be renewed this often while the robot
+    moves [s]."""
     feedback_age: float = 0.03
     """Of a drive's process data [s]."""
     heartbeat_age: float = 0.15
@@ -64,26 +67,40 @@ class Limits:
             largest, other = _LARGEST.get(unit, (_MOST, ""))
             if value > largest:
                 hint = f" Was it given in {other}?" if other else ""
-                raise InputError(f"Limits.{name} is {shown(value)} {unit}; more than {largest:g} {unit}.{hint}")
+                raise InputError(
+                    f"Limits.{name} is {shown(value)} {unit}; more than {largest:g} {unit}.{hint}"
+                )
             if value < _LEAST:
-                raise InputError(f"Limits.{name} is {shown(value)} {unit}; less than {_LEAST:g} {unit}, which nothing can keep.")
+                raise InputError(
+                    f"Limits.{name} is {shown(value)} {unit}; less than {_LEAST:g} {unit}, "
+                    "which nothing can keep."
+                )
         if self.slack is not None and self.slack >= self.tension:
-            raise InputError(f"Limits.slack is {self.slack!r} N and tension {self.tension!r} N; the least must be below the largest.")
+            raise InputError(
+                f"Limits.slack is {self.slack!r} N and tension {self.tension!r} N; the least "
+                "must be below the largest."
+            )
 
 
 def limited(previous: Floats, wanted: Floats, rate: float, dt: float) -> Floats:
-    """Wire lengths (n_tendons,) [m] after `dt` [s], from `previous` straight toward `wanted`, no wire faster than `rate` [m/s].
+    """Wire lengths (n_tendons,) [m] after `dt` [s], from `previous` straight toward `wanted`, no wire faster
+    than `rate` [m/s].
 
-    All wires are scaled alike, so that the robot goes straight to where it was told, and a way between two shapes within the limits stays
-    within them. Raises `InputError` for figures that are not finite or run back.
+    All wires are scaled alike, so that the robot goes straight to where it was told, and a way between two
+    shapes within the limits stays within them. Raises `InputError` for figures that are not finite or run
+    back.
 
     >>> limited(np.zeros(2), np.array([0.004, -0.002]), 0.03, 0.1)
     array([ 0.003 , -0.0015])
     """
     if not (math.isfinite(rate) and rate > 0.0 and math.isfinite(dt) and dt >= 0.0):
-        raise InputError(f"rate is {rate!r} m/s and dt {dt!r} s; the rate must be positive and dt not negative.")
+        raise InputError(
+            f"rate is {rate!r} m/s and dt {dt!r} s; the rate must be positive and dt not negative."
+        )
     if not (np.isfinite(previous).all() and np.isfinite(wanted).all()):
-        raise InputError(f"the way from {previous.tolist()} to {wanted.tolist()} m is not finite; both ends must be.")
+        raise InputError(
+            f"the way from {previous.tolist()} to {wanted.tolist()} m is not finite; both ends must be."
+        )
     step = wanted - previous
     largest = float(np.abs(step).max(initial=0.0))
     if largest <= rate * dt:

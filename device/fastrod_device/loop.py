@@ -1,4 +1,5 @@
-"""The whole loop on one robot: excite, record, identify, name the effect, add it, plan anew, track; the error before and after."""
+"""The whole loop on one robot: excite, record, identify, name the effect, add it, plan anew, track; the error
+before and after."""
 
 from __future__ import annotations
 
@@ -27,7 +28,9 @@ RATE = 20.0
 
 def planned(model: Robot, path: Trajectory) -> Plan:
     """One turn of a path by a model, from straight."""
-    return plan(model, path.position(np.arange(round(path.period * RATE) + 1) / RATE), RATE, approach=APPROACH)
+    return plan(
+        model, path.position(np.arange(round(path.period * RATE) + 1) / RATE), RATE, approach=APPROACH
+    )
 
 
 @final
@@ -44,12 +47,20 @@ class Loop:
 
 
 def close_loop(
-    prototype: Prototype, hands: Hands, out: Path, *, payload: float | None = None, turn: bool = True, progress: Progress | None = None
+    prototype: Prototype,
+    hands: Hands,
+    out: Path,
+    *,
+    payload: float | None = None,
+    turn: bool = True,
+    progress: Progress | None = None,
 ) -> Loop:
-    """Run it on a prototype that is started; logs, plans and the identified robot go to the folder `out`, which is there and empty.
+    """Run it on a prototype that is started; logs, plans and the identified robot go to the folder `out`,
+    which is there and empty.
 
-    `payload`: known load of the excitation [kg], None: one that suits the robot, 0: none; `turn`: the base is turned for a part of it.
-    Raises what a stopped prototype raises, and `LogError` where a log cannot tell anything.
+    `payload`: known load of the excitation [kg], None: one that suits the robot, 0: none; `turn`: the base is
+    turned for a part of it. Raises what a stopped prototype raises, and `LogError` where a log cannot tell
+    anything.
     """
     tell = progress or (lambda *_: None)
     robot = prototype.robot
@@ -58,18 +69,23 @@ def close_loop(
     _rest(prototype, hands)
     known, lag = references(robot.length), drive_lag(log)
     before = [
-        _track(prototype, path, robot, lag, out / f"{name}_before.csv", f"tracking before: {name}", tell) for name, path in known.items()
+        _track(prototype, path, robot, lag, out / f"{name}_before.csv", f"tracking before: {name}", tell)
+        for name, path in known.items()
     ]
-    result = identify(log, robot, progress=lambda what, done, total: tell(f"identification: {what}", done, total))
+    result = identify(
+        log, robot, progress=lambda what, done, total: tell(f"identification: {what}", done, total)
+    )
     better = result.identified
     after = [
-        _track(prototype, path, better, lag, out / f"{name}_after.csv", f"tracking after: {name}", tell) for name, path in known.items()
+        _track(prototype, path, better, lag, out / f"{name}_after.csv", f"tracking after: {name}", tell)
+        for name, path in known.items()
     ]
     return Loop(
         result=result,
         # what is in reach is for the better model to say, in both
         before=[
-            tracking(name, run, replace(old, nearest=new.nearest)) for name, (run, old), (_, new) in zip(known, before, after, strict=True)
+            tracking(name, run, replace(old, nearest=new.nearest))
+            for name, (run, old), (_, new) in zip(known, before, after, strict=True)
         ],
         after=[tracking(name, run, new) for name, (run, new) in zip(known, after, strict=True)],
     )
@@ -84,7 +100,9 @@ def _rest(prototype: Prototype, hands: Hands) -> None:
     prototype.payload, prototype.base_quaternion = 0.0, own
 
 
-def _track(prototype: Prototype, path: Trajectory, model: Robot, lag: float, out: Path, stage: str, tell: Progress) -> tuple[RunLog, Plan]:
+def _track(
+    prototype: Prototype, path: Trajectory, model: Robot, lag: float, out: Path, stage: str, tell: Progress
+) -> tuple[RunLog, Plan]:
     tell(f"{stage}, planning", 0, 2)
     made = planned(model, path)
     tell(stage, 1, 2)

@@ -6,7 +6,16 @@ import math
 from typing import final
 
 from fastrod_device.dictionary import Key
-from fastrod_device.faultcodes import ENABLED, FAULT, QUICK_STOP, REACTION, READY, STATUS_BITS, SWITCH_ON_DISABLED, SWITCHED_ON
+from fastrod_device.faultcodes import (
+    ENABLED,
+    FAULT,
+    QUICK_STOP,
+    REACTION,
+    READY,
+    STATUS_BITS,
+    SWITCH_ON_DISABLED,
+    SWITCHED_ON,
+)
 from fastrod_device.objects import Objects
 from fastrod_device.units import DriveSpec
 
@@ -17,17 +26,18 @@ SUBSTEP = 1e-3
 _LAG = 3e-3  # s, of the position loop
 _ACCELERATION = 5e6  # counts/s2 that the motor can
 _COAST = 2e6  # counts/s2 by which friction of the gear stops a shaft without current
-_REGISTER = {0x2: 0x02, 0x3: 0x04, 0x4: 0x08}  # bits of the error register by the code's first digit; 0x81.. is communication
+# bits of the error register by the code's first digit; 0x81.. is communication
+_REGISTER = {0x2: 0x02, 0x3: 0x04, 0x4: 0x08}
 
 
 @final
 class Motor:
     """One axis. Positions in counts; growing counts pull the wire where the spec's direction is +1.
 
-    A shaft without current is held by the friction of its gear. The current is that of the wire's tension; the motor's own inertia and
-    friction are left out. Where the tendon pulls with what the greatest current (object 0x3001:02) gives or
-    more, the shaft turns no further against it. A limit that its dictionary lacks limits nothing; any other
-    absent object has the shipped dictionary's value.
+    A shaft without current is held by the friction of its gear. The current is that of the wire's tension;
+    the motor's own inertia and friction are left out. Where the tendon pulls with what the greatest current
+    (object 0x3001:02) gives or more, the shaft turns no further against it. A limit that its dictionary lacks
+    limits nothing; any other absent object has the shipped dictionary's value.
     """
 
     def __init__(self, spec: DriveSpec, objects: Objects) -> None:
@@ -132,7 +142,9 @@ class Motor:
         elif key == (0x60A9, 0):
             if value & 0xFFFFFF != 0xB44700 or not -6 <= _exponent(value) <= 0:
                 raise self.objects.refuse()
-        elif (key == (0x6098, 0) and value not in (-4, -3, 37)) or (key == (0x605A, 0) and value not in (2, 6)):
+        elif (key == (0x6098, 0) and value not in (-4, -3, 37)) or (
+            key == (0x605A, 0) and value not in (2, 6)
+        ):
             raise self.objects.refuse()
         elif key == (0x607A, 0):
             self.set_target(value)
@@ -187,7 +199,9 @@ class Motor:
     def emergency(self, code: int) -> None:
         """Tell an error that is no fault."""
         self.code = code
-        self.register |= 0x01 | (0x10 if code >> 8 in (0x81, 0x82) else _REGISTER.get(code >> 12, 0x20 if code >> 8 == 0x86 else 0))
+        self.register |= 0x01 | (
+            0x10 if code >> 8 in (0x81, 0x82) else _REGISTER.get(code >> 12, 0x20 if code >> 8 == 0x86 else 0)
+        )
         self.emergencies.append((code, self.register))
         if (0x1003, 1) in self.objects.values:
             self.objects.values[(0x1003, 1)] = code
@@ -267,7 +281,12 @@ class Motor:
         if not self.powered:
             self.command = self.goal = self.measured
             return True
-        still = self.command_rate == 0.0 and self._left == 0.0 and self.goal == self.command and abs(self.command - self.measured) < 0.5
+        still = (
+            self.command_rate == 0.0
+            and self._left == 0.0
+            and self.goal == self.command
+            and abs(self.command - self.measured) < 0.5
+        )
         if self.state == QUICK_STOP:
             return still and self._holds()
         return still and self.homing not in ("search", "away") and (self.reached or self.mode != PROFILE)
@@ -304,7 +323,8 @@ class Motor:
                 self._referenced()
 
     def _referenced(self) -> None:
-        """The counter takes its value of the home position; then away from there by the distance that was asked for."""
+        """The counter takes its value of the home position; then away from there by the distance that was
+        asked for."""
         home = self.objects.get(0x30B0)
         self.offset = home - self.objects.get(0x30B1) - self.x
         self._hold()

@@ -29,10 +29,12 @@ class Node:
         self.id = spec.node
         self.objects = Objects(object_dictionary(eds), spec.node)
         self.objects.preset = {
-            (0x1018, 4): 1000 + spec.node, (0x3001, 1): round(1e3 * spec.rated_torque / spec.torque_constant),
-            (0x3001, 5): round(1e6 * spec.torque_constant), (0x6076, 0): round(1e6 * spec.rated_torque),
+            (0x1018, 4): 1000 + spec.node,
+            (0x3001, 1): round(1e3 * spec.rated_torque / spec.torque_constant),
+            (0x3001, 5): round(1e6 * spec.torque_constant),
+            (0x6076, 0): round(1e6 * spec.rated_torque),
             (0x60C2, 1): max(1, min(255, round(1e3 * period))),
-        }  # fmt: skip
+        }
         self.objects.reset()
         self.motor = Motor(spec, self.objects)
         self.server: Any = guest("canopen.sdo").SdoServer(0x600 + spec.node, 0x580 + spec.node, self.objects)

@@ -37,23 +37,33 @@ class Wires(Protocol):
     """What the wires are fastened to: the emulated robot."""
 
     def move(self, t: float, pulled: Floats) -> Floats:
-        """(n,) tensions [N] at time `t` [s], when `pulled` (n,) [m] of each wire has been wound since power-on (+ = pulled)."""
+        """(n,) tensions [N] at time `t` [s], when `pulled` (n,) [m] of each wire has been wound since
+        power-on (+ = pulled)."""
 
 
 @final
 class EmulatedDrives:
     """Drives on a bus, alive from construction to `close`; also a context.
 
-    One network and one thread for all of them. Where time is stepped they live by the SYNCs that come; otherwise a thread of theirs keeps
-    time as well. Faults on demand: one method each, and `restore`. A drive holds its wire by friction while it is switched off.
+    One network and one thread for all of them. Where time is stepped they live by the SYNCs that come;
+    otherwise a thread of theirs keeps time as well. Faults on demand: one method each, and `restore`. A drive
+    holds its wire by friction while it is switched off.
 
     `moving`, `true_pulled` and `stopped_at` are what a test may know and a master never does.
     """
 
     def __init__(
-        self, specs: Sequence[DriveSpec], bus: str | can.BusABC, *, clock: Clock, wires: Wires, rate: float = 200.0, seed: int = 0,
-        torque_noise: float = 1.0, eds: str | Path | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        specs: Sequence[DriveSpec],
+        bus: str | can.BusABC,
+        *,
+        clock: Clock,
+        wires: Wires,
+        rate: float = 200.0,
+        seed: int = 0,
+        torque_noise: float = 1.0,
+        eds: str | Path | None = None,
+    ) -> None:
         """`rate` [1/s]: of the set-points until the master sets another; `torque_noise` [thousandths of the
         rated torque], 1 sigma; `eds`: the file that lists their objects, by default an EPOS4's.
 
@@ -67,7 +77,9 @@ class EmulatedDrives:
         self._nodes = [Node(spec, 1.0 / rate, eds) for spec in specs]
         self._motors = [node.motor for node in self._nodes]
         self._wind: Floats = np.array([spec.direction * spec.metres_per_count for spec in specs])
-        self._per_newton: Floats = np.array([spec.direction / spec.newtons_per_torque / (1e-3 * spec.rated_torque) for spec in specs])
+        self._per_newton: Floats = np.array(
+            [spec.direction / spec.newtons_per_torque / (1e-3 * spec.rated_torque) for spec in specs]
+        )
         self._lock = threading.RLock()
         self._t = self._synced = clock.now()
         self._off = False
@@ -79,7 +91,11 @@ class EmulatedDrives:
         self._line = Line(bus)
         self._done = threading.Event()
         self._subscribe()
-        self._thread = None if clock.stepped else threading.Thread(target=self._keep_time, name="emulated drives", daemon=True)
+        self._thread = (
+            None
+            if clock.stepped
+            else threading.Thread(target=self._keep_time, name="emulated drives", daemon=True)
+        )
         with urgently(self._thread is not None):  # a drive has a processor of its own
             self._line.start()
             with self._lock:
@@ -147,7 +163,8 @@ class EmulatedDrives:
         self._off = True
 
     def reboot(self, drive: int, *, keep_position: bool = False) -> None:
-        """It loses power for a moment: switched off, pre-operational, mapping and parameters of power-on, its counter at 0 or kept."""
+        """It loses power for a moment: switched off, pre-operational, mapping and parameters of power-on, its
+        counter at 0 or kept."""
         with self._lock:
             self._boot(self._node(drive), keep_position=keep_position)
 
@@ -194,12 +211,16 @@ class EmulatedDrives:
             self._thread.join(2.0)
         self._line.close()
         if self._wrong is not None:
-            raise DeviceError(f"the emulated drives had to stop: {type(self._wrong).__name__}: {self._wrong}") from self._wrong
+            raise DeviceError(
+                f"the emulated drives had to stop: {type(self._wrong).__name__}: {self._wrong}"
+            ) from self._wrong
 
     def __enter__(self) -> EmulatedDrives:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self.close()
 
     # the bus

@@ -41,7 +41,8 @@ class ProcessData:
 class Objects:
     """Values of one node's objects; an SDO server's node.
 
-    `live`: objects that are computed when read. `written`: called before a value is stored; it may raise an SDO abort.
+    `live`: objects that are computed when read. `written`: called before a value is stored; it may raise an
+    SDO abort.
     """
 
     def __init__(self, dictionary: Any, node: int) -> None:
@@ -97,8 +98,9 @@ class Objects:
         value = self.live[key]() if key in self.live else self.values[key]
         return bytes(var.encode_raw(value))
 
-    def set_data(self, index: int, subindex: int, data: bytes, check_writable: bool = False) -> None:  # noqa: ARG002
-        """What an SDO download does. Raises an SDO abort: no such object, read only, of another length, or not possible now."""
+    def set_data(self, index: int, subindex: int, data: bytes, *_: object, **__: object) -> None:
+        """What an SDO download does. Raises an SDO abort: no such object, read only, of another length, or
+        not possible now."""
         var = self._find(index, subindex)
         if not var.writable:
             raise self._abort(_READ_ONLY)
@@ -154,7 +156,13 @@ class Objects:
 
     def _mappable(self, entry: int, into: str) -> Any:
         var = find(self.object_dictionary, entry >> 16, (entry >> 8) & 0xFF)
-        if var is None or not var.pdo_mappable or len(var) != entry & 0xFF or var.data_type not in _CODES or into not in var.access_type:
+        if (
+            var is None
+            or not var.pdo_mappable
+            or len(var) != entry & 0xFF
+            or var.data_type not in _CODES
+            or into not in var.access_type
+        ):
             raise self._abort(_NOT_MAPPABLE)
         return var
 

@@ -20,9 +20,11 @@ _SPIN = 3e-4  # s before the moment that are waited awake: a sleeping thread is 
 
 
 def urgent(priority: int = 10) -> bool:
-    """Ask that this thread, and those that it starts from now on, come before other programs; whether that was granted.
+    """Ask that this thread, and those that it starts from now on, come before other programs; whether that
+    was granted.
 
-    It needs a right (CAP_SYS_NICE, or rtprio in limits.conf) and Linux. Ask before the bus is opened, so that its thread has it too.
+    It needs a right (CAP_SYS_NICE, or rtprio in limits.conf) and Linux. Ask before the bus is opened, so that
+    its thread has it too.
     """
     if sys.platform != "linux":
         return False
@@ -42,7 +44,8 @@ def ordinary() -> None:
 
 @contextmanager
 def urgently(wanted: bool = True) -> Iterator[None]:
-    """Threads that are started in this block are `urgent`; the thread that starts them is what it was again. Nothing unless `wanted`."""
+    """Threads that are started in this block are `urgent`; the thread that starts them is what it was again.
+    Nothing unless `wanted`."""
     if not (wanted and sys.platform == "linux"):
         yield
         return
@@ -59,8 +62,9 @@ def urgently(wanted: bool = True) -> Iterator[None]:
 class Pacer:
     """Waits for multiples of 1/rate since its first `wait`.
 
-    A cycle that comes late runs at once, and the next one at its multiple again; periods that passed whole are left out. As a context it
-    keeps the collector of garbage out of the loop (it may pause for tens of ms); the loop's own garbage is freed by reference counts.
+    A cycle that comes late runs at once, and the next one at its multiple again; periods that passed whole
+    are left out. As a context it keeps the collector of garbage out of the loop (it may pause for tens of
+    ms); the loop's own garbage is freed by reference counts.
     """
 
     def __init__(self, clock: Clock, rate: float) -> None:
@@ -106,7 +110,9 @@ class Pacer:
         self.restart()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
         if self._collected:
             gc.enable()
         gc.unfreeze()

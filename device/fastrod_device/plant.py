@@ -1,13 +1,15 @@
 """The emulated robot itself, which nobody can open: wires -> transmission -> rod -> tip.
 
-It shares no code with the simulator and its effects have other forms than the library's (gaps whose corners are exponential, friction after
-Dahl, creep after Eyring, wires whose strands settle), so what is found in its motion was understood and not recognised.
+It shares no code with the simulator and its effects have other forms than the library's (gaps whose corners
+are exponential, friction after Dahl, creep after Eyring, wires whose strands settle), so what is found in its
+motion was understood and not recognised.
 
     plant = Plant(seal())
     plant.advance(t, dl)                                # again and again
     position, rotation = plant.tip_seen(t)              # what a camera sees
 
-The pairs p = (half the difference of two opposite wires) carry the effects; what the two have in common passes through.
+The pairs p = (half the difference of two opposite wires) carry the effects; what the two have in common
+passes through.
 """
 
 from __future__ import annotations
@@ -89,7 +91,10 @@ class _Pair:
         before, self._taut = self._taut, p - self._gap * self._side
         if self._loss:
             moved = self._taut - before
-            self._strain = (_rub(self._strain[0], moved / self._travel[0]), _rub(self._strain[1], moved / self._travel[1]))
+            self._strain = (
+                _rub(self._strain[0], moved / self._travel[0]),
+                _rub(self._strain[1], moved / self._travel[1]),
+            )
         self.bend = self._taut / OFFSET
 
     def arrive(self, wrapped: float, h: float) -> float:
@@ -97,9 +102,16 @@ class _Pair:
         first, second = self._strain
         p = self._taut
         if self._loss:
-            p -= self._loss * math.exp(self._growth * wrapped) * (self._part * first + (1.0 - self._part) * second)
+            p -= (
+                self._loss
+                * math.exp(self._growth * wrapped)
+                * (self._part * first + (1.0 - self._part) * second)
+            )
         if self._share[0]:
-            self._behind = (self._relax(self._behind[0], p, h / self._tau[0]), self._relax(self._behind[1], p, h / self._tau[1]))
+            self._behind = (
+                self._relax(self._behind[0], p, h / self._tau[0]),
+                self._relax(self._behind[1], p, h / self._tau[1]),
+            )
             p -= self._share[0] * (p - self._behind[0]) + self._share[1] * (p - self._behind[1])
         return p
 
@@ -109,7 +121,8 @@ class _Pair:
 
 
 def _across(side: float, moved: float, sharp: float) -> float:
-    """Where in the gap one is after a move, in half widths: the flank takes over with the share exp(-k (1 - side)) of it."""
+    """Where in the gap one is after a move, in half widths: the flank takes over with the share exp(-k (1 -
+    side)) of it."""
     if moved == 0.0:
         return side
     way = 1.0 if moved > 0.0 else -1.0
@@ -125,7 +138,8 @@ def _rub(strain: float, moved: float) -> float:
 
 @final
 class Plant:
-    """One robot of one segment and four wires, with what the seal hides. Calls may come from several threads."""
+    """One robot of one segment and four wires, with what the seal hides. Calls may come from several
+    threads."""
 
     def __init__(self, seal: Seal) -> None:
         """Straight and at rest, its base upright: gravity along -z of the base, nothing on the tip.
@@ -133,17 +147,27 @@ class Plant:
         Raises `InputError` where `seal` is not a `Seal`.
         """
         if not isinstance(seal, Seal):
-            raise InputError(f"the plant was given a {type(seal).__name__}; it needs a Seal, as seal() makes it.")
+            raise InputError(
+                f"the plant was given a {type(seal).__name__}; it needs a Seal, as seal() makes it."
+            )
         inside = seal.open()
         stretch, body = inside.get("tendon_stretch", _NOTHING), inside.get("gravity", _NOTHING)
         self._rod = Rod(
-            compliance=COMPLIANCE + stretch.get("compliance", 0.0), settling=stretch.get("settling", 0.0), knee=stretch.get("knee", 1.0),
-            weight=body.get("weight", 0.0), slope=body.get("slope", 0.0), bulge=body.get("bulge", 0.0),
-            bending=seal.stiffness()[0], torsion=seal.stiffness()[1],
-        )  # fmt: skip
+            compliance=COMPLIANCE + stretch.get("compliance", 0.0),
+            settling=stretch.get("settling", 0.0),
+            knee=stretch.get("knee", 1.0),
+            weight=body.get("weight", 0.0),
+            slope=body.get("slope", 0.0),
+            bulge=body.get("bulge", 0.0),
+            bending=seal.stiffness()[0],
+            torsion=seal.stiffness()[1],
+        )
         self._pairs = (_Pair(inside, 0), _Pair(inside, 1))
         late, bump = inside.get("latency", _NOTHING), inside.get("bump", _NOTHING)
-        self._late = tuple(late.get(name, neutral) for name, neutral in (("delay", 0.0), ("wander", 0.0), ("period", 1.0), ("phase", 0.0)))
+        self._late = tuple(
+            late.get(name, neutral)
+            for name, neutral in (("delay", 0.0), ("wander", 0.0), ("period", 1.0), ("phase", 0.0))
+        )
         self._shift = np.array([bump.get(name, 0.0) for name in "xyz"])
         self._tilt = _turn(*(bump.get(f"about_{name}", 0.0) for name in "xyz"))
         self._bumped = bump.get("at", math.inf)
@@ -160,9 +184,11 @@ class Plant:
         return "Plant(sealed)"
 
     def advance(self, t: float, dl: Sequence[float] | Floats) -> None:
-        """The wires have gone straight to `dl` (4,) [m], negative = pulled, by the time `t` [s]; before the first call they were at 0.
+        """The wires have gone straight to `dl` (4,) [m], negative = pulled, by the time `t` [s]; before the
+        first call they were at 0.
 
-        Raises `InputError` for anything but four finite lengths of at most 0.05 m, and where `t` is before the last one.
+        Raises `InputError` for anything but four finite lengths of at most 0.05 m, and where `t` is before
+        the last one.
         """
         try:
             a, b, c, d = dl.tolist() if isinstance(dl, np.ndarray) else map(float, dl)
@@ -170,10 +196,15 @@ class Plant:
         except (TypeError, ValueError) as error:
             raise InputError(f"dl is {dl!r}; it must be four lengths of wire (4,) [m].") from error
         if not (most <= _MOST and math.isfinite(a + b + c + d)):
-            raise InputError(f"dl is {[a, b, c, d]} m; wires change by at most {_MOST} m. Was it given in mm?")
+            raise InputError(
+                f"dl is {[a, b, c, d]} m; wires change by at most {_MOST} m. Was it given in mm?"
+            )
         with self._lock:
             if not (math.isfinite(t) and t >= self._now.t):
-                raise InputError(f"t is {t!r} s; the plant is at {self._now.t} s, and time is finite and does not run back.")
+                raise InputError(
+                    f"t is {t!r} s; the plant is at {self._now.t} s, and time is finite and "
+                    "does not run back."
+                )
             if math.isnan(self._began):
                 self._began, h = t, 0.0
             else:
@@ -185,9 +216,14 @@ class Plant:
                 cuts = min(max(1, math.ceil(h / _STEP)), _CUTS)
                 wires, before, here = self._now.wires, self._told, self._told
                 for k in range(1, cuts + 1):
-                    self._move(here, 0.5 * h / cuts)  # half of the time before the move and half after: second order
+                    # half of the time before the move and half after: second order
+                    self._move(here, 0.5 * h / cuts)
                     x = k / cuts
-                    here = told if k == cuts else tuple(old + x * (new - old) for old, new in zip(before, told, strict=True))
+                    here = (
+                        told
+                        if k == cuts
+                        else tuple(old + x * (new - old) for old, new in zip(before, told, strict=True))
+                    )
                     wires = self._move(here, 0.5 * h / cuts)
                 self._told = told
             self._now = _Moment(float(t), wires, self._load)
@@ -214,14 +250,17 @@ class Plant:
             self._now = self._now._replace(load=self._load)
 
     def turn(self, quaternion: ArrayLike) -> None:
-        """The base stands so in the world, from now on: world_from_base (4,), w x y z; gravity is along -z of the world.
+        """The base stands so in the world, from now on: world_from_base (4,), w x y z; gravity is along -z of
+        the world.
 
         Raises `InputError` unless it is a rotation.
         """
         q = np.asarray(quaternion, dtype=np.float64)
         norm = float(np.sqrt(np.sum(q * q)))
         if q.shape != (4,) or not abs(norm - 1.0) < 1e-3:
-            raise InputError(f"quaternion is {np.asarray(quaternion).tolist()}; it must be a unit quaternion (4,) w x y z.")
+            raise InputError(
+                f"quaternion is {np.asarray(quaternion).tolist()}; it must be a unit quaternion (4,) w x y z."
+            )
         w, x, y, z = (q / norm).tolist()
         with self._lock:
             # the last row of the rotation, turned over
@@ -230,7 +269,8 @@ class Plant:
             self._now = self._now._replace(load=self._load)
 
     def tip(self, t: float | None = None) -> tuple[Floats, Floats]:
-        """Where the tip truly is at `t` [s], within the last half second, or now: position (3,) [m] and base_from_tip (3, 3), base frame.
+        """Where the tip truly is at `t` [s], within the last half second, or now: position (3,) [m] and
+        base_from_tip (3, 3), base frame.
 
         After the last `advance` nothing moves. Raises `DeviceError` where the load makes the robot snap.
         """
@@ -253,9 +293,14 @@ class Plant:
             return position, rotation
 
     def tension(self) -> Floats:
-        """(4,) of the wires now [N], pushing where negative; for up to a thirtieth of a second they go on linearly from the last shape."""
+        """(4,) of the wires now [N], pushing where negative; for up to a thirtieth of a second they go on
+        linearly from the last shape."""
         with self._lock:
-            if self._true is None or self._true[0].load != self._load or self._now.t - self._true[0].t >= _HELD:
+            if (
+                self._true is None
+                or self._true[0].load != self._load
+                or self._now.t - self._true[0].t >= _HELD
+            ):
                 self._true = self._solve(self._now, self._true)
             rest = self._true[1]
             return np.asarray(rest.tension + rest.slope @ (np.array(self._now.wires) - rest.dl))
@@ -270,7 +315,9 @@ class Plant:
         for moment in reversed(self._past):
             if moment.t <= t:
                 x = (t - moment.t) / (after.t - moment.t)
-                a, b, c, d = (old + x * (new - old) for old, new in zip(moment.wires, after.wires, strict=True))
+                a, b, c, d = (
+                    old + x * (new - old) for old, new in zip(moment.wires, after.wires, strict=True)
+                )
                 return _Moment(t, (a, b, c, d), moment.load)
             after = moment
         return after
@@ -284,11 +331,15 @@ class Plant:
         if last is not None and last[0].wires == moment.wires and last[0].load == moment.load:
             return moment, last[1]
         down = np.array(moment.load.down)
-        return moment, self._rod.rest(np.array(moment.wires), moment.load.mass * _G * down, down, None if last is None else last[1])
+        return moment, self._rod.rest(
+            np.array(moment.wires), moment.load.mass * _G * down, down, None if last is None else last[1]
+        )
 
 
 def _turn(x: float, y: float, z: float) -> Floats:
     """(3, 3) of a rotation vector [rad]."""
     angle = math.sqrt(x * x + y * y + z * z)
     hat = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * hat + 0.5 * np.sinc(0.5 * angle / np.pi) ** 2 * hat @ hat)
+    return np.asarray(
+        np.eye(3) + np.sinc(angle / np.pi) * hat + 0.5 * np.sinc(0.5 * angle / np.pi) ** 2 * hat @ hat
+    )

@@ -1,9 +1,12 @@
-"""The rod of the emulated robot: virtual work on Legendre curvatures, one robot at a time. numpy only, nothing shared with the models.
+"""The rod of the emulated robot: virtual work on Legendre curvatures, one robot at a time. numpy only,
+nothing shared with the models.
 
-One segment of LENGTH whose four wires sit OFFSET from the backbone at 0, 90, 180 and 270 degrees and end at the tip; they push and pull.
-r' = R e3, R' = R [u]x; the base is the origin, its frame the identity. The energy, per arclength s,
+One segment of LENGTH whose four wires sit OFFSET from the backbone at 0, 90, 180 and 270 degrees and end at
+the tip; they push and pull. r' = R e3, R' = R [u]x; the base is the origin, its frame the identity. The
+energy, per arclength s,
     integral u' K u / 2 ds  +  energy of the wires  -  integral N . R e3 ds,   N(s) the dead force beyond s,
-is at rest over u(s) = sum_m P_m(s) a_m, with the wires' tensions T as unknowns of their own: l_i(a) - L_i = extension(T_i).
+is at rest over u(s) = sum_m P_m(s) a_m, with the wires' tensions T as unknowns of their own: l_i(a) - L_i =
+extension(T_i).
 """
 
 from __future__ import annotations
@@ -27,8 +30,9 @@ _STRIDES = (1, 4, 16, 64)  # in how many parts loads and wires come on from the 
 
 
 def _tables() -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
-    """Lobatto nodes (n,) on [0, 1], their weights (n,) [m], integrals from 0 to each node (n, n) [m], modes at the nodes (n, modes), and at
-    both Gauss points of the steps between them (2 (n - 1), modes), and the steps (n - 1, 1) [m]."""
+    """Lobatto nodes (n,) on [0, 1], their weights (n,) [m], integrals from 0 to each node (n, n) [m], modes
+    at the nodes (n, modes), and at both Gauss points of the steps between them (2 (n - 1), modes), and the
+    steps (n - 1, 1) [m]."""
     n = _NODES
     x = np.concatenate([[-1.0], np.sort(legendre.legroots(legendre.legder(np.eye(n)[n - 1]))), [1.0]])
     whole = np.stack([legendre.legval(x, legendre.legint(row, lbnd=-1)) for row in np.eye(n)], axis=1)
@@ -36,17 +40,28 @@ def _tables() -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
     middle, half = 0.5 * (x[:-1] + x[1:]), 0.5 * np.diff(x)
     gauss = np.concatenate([middle - half / math.sqrt(3.0), middle + half / math.sqrt(3.0)])
     modes = legendre.legvander(x, _MODES - 1)
-    return 0.5 * (x + 1.0), upto[-1].copy(), upto, modes, legendre.legvander(gauss, _MODES - 1), (LENGTH * half)[:, None]
+    return (
+        0.5 * (x + 1.0),
+        upto[-1].copy(),
+        upto,
+        modes,
+        legendre.legvander(gauss, _MODES - 1),
+        (LENGTH * half)[:, None],
+    )
 
 
 _S, _WEIGHT, _UPTO, _MODE, _GAUSS, _STEP = _tables()
 _WEIGHTED = np.ascontiguousarray((_WEIGHT[:, None] * _MODE).T)  # (modes, n)
-_PRODUCTS = np.ascontiguousarray((_WEIGHT[:, None, None] * _MODE[:, :, None] * _MODE[:, None, :]).reshape(_NODES, -1).T)  # (modes^2, n)
+# (modes^2, n)
+_PRODUCTS = np.ascontiguousarray(
+    (_WEIGHT[:, None, None] * _MODE[:, :, None] * _MODE[:, None, :]).reshape(_NODES, -1).T
+)
 _LATER = np.ascontiguousarray((_WEIGHT[:, None] * _UPTO).T)  # what later nodes lay upon an earlier one
 _HAT = np.zeros((3, 9))
 _HAT[0, [5, 7]], _HAT[1, [2, 6]], _HAT[2, [1, 3]] = (-1.0, 1.0), (1.0, -1.0), (-1.0, 1.0)
 _EYE = np.eye(3)
-# d|q|/du is (b y, -b x, d^2 u_z) / |q| for a wire at (x, y), with q = e3 + u x d and b its component along the backbone
+# d|q|/du is (b y, -b x, d^2 u_z) / |q| for a wire at (x, y), with q = e3 + u x d and b its component along
+# the backbone
 _LEVER = OFFSET * np.array([[0.0, 1.0, 0.0, -1.0], [-1.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 0.0]])  # (3, wires)
 _TWIST = np.zeros((3, 4))
 _TWIST[2] = OFFSET**2
@@ -76,7 +91,8 @@ class Rest(NamedTuple):
 @final
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Rod:
-    """A rod and its wires. The extension of a wire by T is c ((1 - q) T + q T0 arcsinh(T / T0)): strands settle under load."""
+    """A rod and its wires. The extension of a wire by T is c ((1 - q) T + q T0 arcsinh(T / T0)): strands
+    settle under load."""
 
     compliance: float = COMPLIANCE
     """c, of a wire that is hardly pulled [m/N]."""
@@ -87,7 +103,8 @@ class Rod:
     weight: float = 0.0
     """Of the body, mean along it [N/m]."""
     slope: float = 0.0
-    """The line weight is weight (1 + slope (1 - 2 x) + bulge (6 x (1 - x) - 1)), x from 0 at the base to 1."""
+    """The line weight is weight (1 + slope (1 - 2 x) + bulge (6 x (1 - x) - 1)), x from 0 at the base to
+    1."""
     bulge: float = 0.0
     """See `slope`."""
     bending: float = EI
@@ -100,9 +117,11 @@ class Rod:
         return np.array([self.bending, self.bending, self.torsion])
 
     def rest(self, dl: Floats, tip_force: Floats, down: Floats, start: Rest | None = None) -> Rest:
-        """The shape for wires `dl` (4,) [m] under the dead load `tip_force` (3,) [N], with the unit vector `down` (3,), base frame.
+        """The shape for wires `dl` (4,) [m] under the dead load `tip_force` (3,) [N], with the unit vector
+        `down` (3,), base frame.
 
-        Quick from a `start` near by. Raises `DeviceError` where it finds none, as under a load that makes the robot snap.
+        Quick from a `start` near by. Raises `DeviceError` where it finds none, as under a load that makes the
+        robot snap.
         """
         line = self._beyond()[:, None] * down
         if start is not None:
@@ -111,14 +130,23 @@ class Rod:
                 return found
         for parts in _STRIDES:
             at: Rest | None = Rest(
-                np.zeros(3), _EYE, np.zeros(4), np.zeros((4, 4)), np.zeros((_MODES, 3)), np.zeros(4), np.zeros((_SIZE, 4))
+                np.zeros(3),
+                _EYE,
+                np.zeros(4),
+                np.zeros((4, 4)),
+                np.zeros((_MODES, 3)),
+                np.zeros(4),
+                np.zeros((_SIZE, 4)),
             )
             for k in range(parts + 1):
                 part = k / parts
                 at = None if at is None else self._from(at, part * dl, part * tip_force, part * line)
             if at is not None:
                 return at
-        raise DeviceError("the emulated robot finds no rest with these wires and loads; load it less, and let no two wires pull apart.")
+        raise DeviceError(
+            "the emulated robot finds no rest with these wires and loads; load it less, and "
+            "let no two wires pull apart."
+        )
 
     def _from(self, start: Rest, dl: Floats, tip_force: Floats, line: Floats) -> Rest | None:
         """Newton from a shape whose wires are moved to first order."""
@@ -130,9 +158,13 @@ class Rod:
         """(n,) weight beyond the nodes [N]."""
         x = 1.0 - _S
         # of what is left: 1 - s, then the integrals of both polynomials, which are zero over the whole
-        return np.asarray(LENGTH * self.weight * (x - self.slope * _S * x + self.bulge * (2.0 * _S**3 - 3.0 * _S**2 + _S)))
+        return np.asarray(
+            LENGTH * self.weight * (x - self.slope * _S * x + self.bulge * (2.0 * _S**3 - 3.0 * _S**2 + _S))
+        )
 
-    def _newton(self, dl: Floats, tip_force: Floats, line: Floats, modes: Floats, tension: Floats) -> Rest | None:
+    def _newton(
+        self, dl: Floats, tip_force: Floats, line: Floats, modes: Floats, tension: Floats
+    ) -> Rest | None:
         """Newton on modes and tensions together; None where it does not settle."""
         force, elastic = tip_force + line, self._stiffness  # (n, 3), (3,)
         system = np.empty((_SIZE + 4, _SIZE + 4))
@@ -146,7 +178,11 @@ class Rod:
             length = np.sqrt(along * along + (OFFSET * twist) ** 2)
             turn = (along[:, None] * _LEVER + twist[:, None] * _TWIST) / length[:, None]  # (n, 3, wires)
             pull = tension / length
-            curving = (pull @ _LOCK).reshape(_NODES, 3, 3) - (turn * pull[:, None]) @ turn.transpose(0, 2, 1) + np.diag(elastic)
+            curving = (
+                (pull @ _LOCK).reshape(_NODES, 3, 3)
+                - (turn * pull[:, None]) @ turn.transpose(0, 2, 1)
+                + np.diag(elastic)
+            )
             slope = (_WEIGHTED @ turn.reshape(_NODES, 12)).reshape(_SIZE, 4)
             # loads: d(R e3) = dtheta x R e3, and dtheta is the integral of R du
             tangent = frame[:, :, 2]
@@ -155,11 +191,19 @@ class Rod:
             moment = u * elastic - (laid[:, None] @ frame)[:, 0]
             turned = (frame[:, :, None] * _MODE[:, None, :, None]).reshape(_NODES, 3, _SIZE)
             swept = (_UPTO @ turned.reshape(_NODES, -1)).reshape(_NODES, 3, _SIZE)
-            lock = force[:, :, None] * tangent[:, None] - np.einsum("nx,nx->n", force, tangent)[:, None, None] * _EYE
+            lock = (
+                force[:, :, None] * tangent[:, None]
+                - np.einsum("nx,nx->n", force, tangent)[:, None, None] * _EYE
+            )
             # (laid x) as a matrix is the hat of laid; the turn nearer to the base is the outer one
             swing = lock @ swept - (laid @ _HAT).reshape(_NODES, 3, 3) @ turned
             load = swept.reshape(-1, _SIZE).T @ (_WEIGHT[:, None, None] * swing).reshape(-1, _SIZE)
-            bend = (_PRODUCTS @ curving.reshape(_NODES, 9)).reshape(_MODES, _MODES, 3, 3).transpose(0, 2, 1, 3).reshape(_SIZE, _SIZE)
+            bend = (
+                (_PRODUCTS @ curving.reshape(_NODES, 9))
+                .reshape(_MODES, _MODES, 3, 3)
+                .transpose(0, 2, 1, 3)
+                .reshape(_SIZE, _SIZE)
+            )
             system[:_SIZE, :_SIZE] = bend - 0.5 * (load + load.T)
             system[:_SIZE, _SIZE:] = slope
             system[_SIZE:, :_SIZE] = slope.T
@@ -167,7 +211,9 @@ class Rod:
             soft = self.compliance * (1.0 - self.settling + self.settling / np.sqrt(1.0 + ratio * ratio))
             system[_SIZE:, _SIZE:] = np.diag(-soft)
             wrong[:_SIZE] = (_WEIGHTED @ moment).ravel() + slope @ tension
-            extension = self.compliance * ((1.0 - self.settling) * tension + self.settling * self.knee * np.arcsinh(ratio))
+            extension = self.compliance * (
+                (1.0 - self.settling) * tension + self.settling * self.knee * np.arcsinh(ratio)
+            )
             wrong[_SIZE:] = _WEIGHT @ length - LENGTH - dl - extension
             try:
                 inverse = np.asarray(np.linalg.inv(system), dtype=np.float64)

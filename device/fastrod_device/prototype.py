@@ -1,4 +1,5 @@
-"""`Prototype`: four drives and a camera as a `RobotLink`; what teleop drives, what an experiment records, what a policy commands."""
+"""`Prototype`: four drives and a camera as a `RobotLink`; what teleop drives, what an experiment records,
+what a policy commands."""
 
 from __future__ import annotations
 
@@ -53,21 +54,31 @@ _WATCHED = 0.005  # s between two looks at the thread that drives
 
 @final
 class Prototype:
-    """Commands become set-points of the drives, one a cycle, within limits; frames become tip poses; a supervisor watches both.
+    """Commands become set-points of the drives, one a cycle, within limits; frames become tip poses; a
+    supervisor watches both.
 
-    With a `WallClock` threads do it, one for the drives, one for the camera and one that watches the first; with a `SteppedClock` `wait`
-    does. `start` it, or use it as a context. It is `real`: it stops when nobody watches, and after any stop moves again only after
+    With a `WallClock` threads do it, one for the drives, one for the camera and one that watches the first;
+    with a `SteppedClock` `wait` does. `start` it, or use it as a context. It is `real`: it stops when nobody
+    watches, and after any stop moves again only after
     `release`, a person's act.
     """
 
     real = True
 
     def __init__(
-        self, hardware: Hardware, bus: str, source: FrameSource | None, *, clock: Clock | None = None, eds: str | Path | None = None,
-        journal: Journal | None = None, wall: Callable[[], float] | None = None,
-    ) -> None:  # fmt: skip
-        """Drives on `bus` ("socketcan:can0"), pictures from `source` (None: no camera). `wall` tells the time of day [s], by default the
-        machine's, and nothing where time is stepped; it must run as the clock does. Raises `DeviceError` where there is no such bus."""
+        self,
+        hardware: Hardware,
+        bus: str,
+        source: FrameSource | None,
+        *,
+        clock: Clock | None = None,
+        eds: str | Path | None = None,
+        journal: Journal | None = None,
+        wall: Callable[[], float] | None = None,
+    ) -> None:
+        """Drives on `bus` ("socketcan:can0"), pictures from `source` (None: no camera). `wall` tells the time
+        of day [s], by default the machine's, and nothing where time is stepped; it must run as the clock
+        does. Raises `DeviceError` where there is no such bus."""
         self.hardware, self.source = hardware, source
         self._robot = hardware.robot
         self.clock: Clock = WallClock() if clock is None else clock
@@ -77,7 +88,9 @@ class Prototype:
         with urgently(not self.clock.stepped):  # for the bus's thread
             self.drives = DriveBus(hardware.drives, bus, clock=self.clock, rate=hardware.rate, eds=eds)
         nodes = [spec.node for spec in hardware.drives]
-        self.supervisor = Supervisor(hardware.robot, hardware.limits, on_stop=self._on_stop, nodes=nodes, words=in_words)
+        self.supervisor = Supervisor(
+            hardware.robot, hardware.limits, on_stop=self._on_stop, nodes=nodes, words=in_words
+        )
         workspace = Workspace.of(hardware.robot, hardware.limits.curvature)
         self.tracker = MarkerTracker(hardware.camera, hardware.marker, workspace=workspace)
         self.recorder: Recorder | None = None
@@ -112,7 +125,8 @@ class Prototype:
 
     @property
     def robot(self) -> Robot:
-        """What is driven: the hardware's model with the pretension that its wires had when they were homed."""
+        """What is driven: the hardware's model with the pretension that its wires had when they were
+        homed."""
         return self._robot
 
     @property
@@ -133,9 +147,11 @@ class Prototype:
         self.close()
 
     def start(self, *, home: bool = True) -> None:
-        """Find the drives, wind the wires until each has its pretension (`home`; where they are then is zero), and enable them.
+        """Find the drives, wind the wires until each has its pretension (`home`; where they are then is
+        zero), and enable them.
 
-        Raises `DeviceError`, one sentence, for what does not answer or will not move; nothing is enabled then.
+        Raises `DeviceError`, one sentence, for what does not answer or will not move; nothing is enabled
+        then.
         """
         hw, limits = self.hardware, self.hardware.limits
         try:
@@ -143,14 +159,18 @@ class Prototype:
                 self._expectation.pose(np.zeros(self.robot.n_tendons), 0.0, None)
             if not self.clock.stepped:
                 gc.collect()
-                gc.freeze()  # what is there now is looked through no more, which would take longer than a cycle
-            per = 1.0 / np.abs(self.transmission.wound(np.ones(len(hw.drives), dtype=np.int64)))  # counts in a metre
+                # what is there now is looked through no more, which would take longer than a cycle
+                gc.freeze()
+            # counts in a metre
+            per = 1.0 / np.abs(self.transmission.wound(np.ones(len(hw.drives), dtype=np.int64)))
             self.drives.connect(
                 position_limit=np.rint(_MARGIN * limits.displacement * per).astype(np.int64),
                 velocity_limit=np.rint(_MARGIN * limits.rate * per).astype(np.int64),
                 following_error=np.rint(limits.following_error * per).astype(np.int64),
                 deceleration=np.rint(limits.rate / _STOPS * per).astype(np.int64),
-                torque_limit=np.clip(np.abs(self.transmission.torque(np.full(len(per), _MARGIN * limits.tension))), 1, 3000),
+                torque_limit=np.clip(
+                    np.abs(self.transmission.torque(np.full(len(per), _MARGIN * limits.tension))), 1, 3000
+                ),
             )
             for sentence in self.drives.notices:
                 self.journal.write(self.clock.now(), "not limited", sentence)
@@ -158,7 +178,11 @@ class Prototype:
                 self._home()
             self._enable()
             self._pacer = Pacer(self.clock, hw.rate)
-            jobs = {"drives": self._drive_forever, "camera": self._look_forever, "watchdog": self._watch_forever}
+            jobs = {
+                "drives": self._drive_forever,
+                "camera": self._look_forever,
+                "watchdog": self._watch_forever,
+            }
             for name, job in () if self.clock.stepped else jobs.items():
                 self._threads.append(threading.Thread(target=job, name=name, daemon=True))
                 self._threads[-1].start()
@@ -167,16 +191,20 @@ class Prototype:
             raise
 
     def _home(self) -> None:
-        self.transmission, self._robot = home(self.drives, self.hardware, self.clock, None if self.source is None else self._see)
+        self.transmission, self._robot = home(
+            self.drives, self.hardware, self.clock, None if self.source is None else self._see
+        )
 
     def _see(self) -> Sighting | None:
         frame = None if self.source is None else self.source.read()
         return None if frame is None else self.tracker.look(frame, now=self.clock.now())
 
     def command(self, dl: ArrayLike, ext: ArrayLike | None = None, *, stamp: float | None = None) -> None:
-        """As `RobotLink.command`; `stamp` is when it was meant, by our clock [s]: one that is too old is refused.
+        """As `RobotLink.command`; `stamp` is when it was meant, by our clock [s]: one that is too old is
+        refused.
 
-        Raises `RefusedError` for what is beyond a limit, not finite, too late, or has an extension; ignored while stopped.
+        Raises `RefusedError` for what is beyond a limit, not finite, too late, or has an extension; ignored
+        while stopped.
         """
         if ext is not None and np.any(np.asarray(ext, dtype=np.float64) != 0.0):
             raise RefusedError("ext is not zero; the prototype has no segment that can extend.")
@@ -187,24 +215,29 @@ class Prototype:
             self._pace = self.hardware.limits.rate
 
     def glide(self, dl: ArrayLike, seconds: float) -> None:
-        """As `command`, spread evenly over so long [s]: commands that come ten times slower than cycles then make no jerks."""
+        """As `command`, spread evenly over so long [s]: commands that come ten times slower than cycles then
+        make no jerks."""
         longest = self.hardware.limits.command_age
         if not 0.0 < seconds <= longest:
-            raise RefusedError(f"seconds is {seconds!r}; a glide takes a positive time of {longest:g} s at most: a longer one is renewed.")
+            raise RefusedError(
+                f"seconds is {seconds!r}; a glide takes a positive time of {longest:g} s at "
+                "most: a longer one is renewed."
+            )
         with self._lock:
             self.command(dl)
             self._pace = max(float(np.abs(self._wanted - self._set).max()) / seconds, _SLOWEST)
 
     def picture(self) -> NDArray[np.uint8] | None:
-        """(h, w, 3) red, green, blue: the newest frame with the marker outlined, green where it is trusted; None before the first."""
+        """(h, w, 3) red, green, blue: the newest frame with the marker outlined, green where it is trusted;
+        None before the first."""
         frame, sighting = self._frame, self.sighting
         return None if frame is None or sighting is None else outlined(frame.image, sighting)
 
     def follow(self, plan: Plan, seconds: float) -> None:
         """Set-points from `plan`, one a cycle, for so long; returns when they are done.
 
-        Raises `RefusedError` where the plan leads beyond a limit (the drives are stopped then), `DeviceError` where anything stopped
-        the robot on the way, each with its sentence.
+        Raises `RefusedError` where the plan leads beyond a limit (the drives are stopped then), `DeviceError`
+        where anything stopped the robot on the way, each with its sentence.
         """
         before = self.broken
         with self._lock:
@@ -220,7 +253,8 @@ class Prototype:
                 self._plan, self._wanted = None, self._set
 
     def wait(self, seconds: float) -> None:
-        """So much time passes; with a `SteppedClock` this is what drives the robot. Raises `DeviceError` where it was stopped."""
+        """So much time passes; with a `SteppedClock` this is what drives the robot. Raises `DeviceError`
+        where it was stopped."""
         end = self.clock.now() + seconds
         while self.clock.now() < end - 1e-9:
             if not self.clock.stepped:
@@ -237,8 +271,9 @@ class Prototype:
 
     @contextmanager
     def resting(self) -> Iterator[None]:
-        """The robot holds while hands work at it and may cover the marker: the camera's faults do not count until they are done. On leaving
-        it waits for the marker. Raises `DeviceError` where that is not seen, or anything else stopped the robot."""
+        """The robot holds while hands work at it and may cover the marker: the camera's faults do not count
+        until they are done. On leaving it waits for the marker. Raises `DeviceError` where that is not seen,
+        or anything else stopped the robot."""
         with self._lock:
             self._plan, self._wanted = None, self._set
         self._resting = True
@@ -247,7 +282,10 @@ class Prototype:
             done = self.clock.now()
             while self.source is not None and self._trusted <= done:
                 if self.clock.now() > done + _COVERED:
-                    raise DeviceError(f"the marker was not seen for {_COVERED:g} s after hands had worked at the robot; is it free?")
+                    raise DeviceError(
+                        f"the marker was not seen for {_COVERED:g} s after hands had worked "
+                        "at the robot; is it free?"
+                    )
                 self.wait(0.05)
         finally:
             self._resting = False
@@ -262,17 +300,22 @@ class Prototype:
         n = self.robot.n_tendons
         dl, tension = (np.full(n, np.nan),) * 2 if readings is None else (readings.dl, readings.tension)
         return Measurement(
-            t=self.elapsed, dl=dl, ext=np.zeros(self.robot.n_segments), tip_position=np.full(3, np.nan),
-            tip_quaternion=np.full(4, np.nan), tension=tension, problem=problem,
-        )  # fmt: skip
+            t=self.elapsed,
+            dl=dl,
+            ext=np.zeros(self.robot.n_segments),
+            tip_position=np.full(3, np.nan),
+            tip_quaternion=np.full(4, np.nan),
+            tension=tension,
+            problem=problem,
+        )
 
     def stop(self) -> None:
         """Emergency stop: the drives ramp down at once and stay off until `release`."""
         self.supervisor.emergency_stop(self.clock.now())
 
     def release(self) -> None:
-        """A person says that it may move again: faults are reset, the drives enabled where they stand. Where the cause is still there it
-        stays stopped, and `read().problem` says why."""
+        """A person says that it may move again: faults are reset, the drives enabled where they stand. Where
+        the cause is still there it stays stopped, and `read().problem` says why."""
         stops = self._stops
         self._jobs.put(lambda: self._release(stops))
         if self.clock.stepped:
@@ -332,7 +375,8 @@ class Prototype:
     def _release(self, stops: int) -> None:
         if stops != self._stops:
             return  # somebody has stopped it since: that counts for more
-        self.drives.acknowledge()  # a stop from here on latches them again, whatever the supervisor takes back
+        # a stop from here on latches them again, whatever the supervisor takes back
+        self.drives.acknowledge()
         try:
             self.supervisor.acknowledge(self.clock.now())
         except RefusedError:
@@ -353,7 +397,8 @@ class Prototype:
         self._do_jobs()
         now, dt = self.clock.now(), 1.0 / self.hardware.rate
         planned = self._plan if self.supervisor.state in (State.READY, State.RUNNING) else None
-        told = None if planned is None else planned[0](now - planned[1])  # unlocked: nobody knows how long it takes
+        # unlocked: nobody knows how long it takes
+        told = None if planned is None else planned[0](now - planned[1])
         with self._lock:
             moving = self.supervisor.state in (State.READY, State.RUNNING)  # a stop may have come meanwhile
             if moving and told is not None and self._plan is planned:
@@ -405,7 +450,13 @@ class Prototype:
             row, extra = self._measured(sighting, ""), columns.values(sighting, self.readings)
             commanded = self._wires_at(sighting.t)[1]
             try:
-                recorder.add(row, payload=self.payload, commanded_dl=commanded, extra=extra, base_quaternion=self.base_quaternion)
+                recorder.add(
+                    row,
+                    payload=self.payload,
+                    commanded_dl=commanded,
+                    extra=extra,
+                    base_quaternion=self.base_quaternion,
+                )
             except InputError:
                 if recorder.recording:  # otherwise somebody has just ended it
                     raise
@@ -414,14 +465,18 @@ class Prototype:
         readings = self.readings
         trusted = sighting.ok
         return Measurement(
-            t=sighting.t - self._zero, dl=self._wires_at(sighting.t)[0], ext=np.zeros(self.robot.n_segments),
+            t=sighting.t - self._zero,
+            dl=self._wires_at(sighting.t)[0],
+            ext=np.zeros(self.robot.n_segments),
             tip_position=sighting.position if trusted else np.full(3, np.nan),
             tip_quaternion=sighting.quaternion if trusted else np.full(4, np.nan),
-            tension=np.full(self.robot.n_tendons, np.nan) if readings is None else readings.tension, problem=problem,
-        )  # fmt: skip
+            tension=np.full(self.robot.n_tendons, np.nan) if readings is None else readings.tension,
+            problem=problem,
+        )
 
     def _wires_at(self, t: float) -> tuple[Floats, Floats]:
-        """(n_tendons,) what the encoders said at `t`, between two cycles by a straight line, and the set-points then [m]."""
+        """(n_tendons,) what the encoders said at `t`, between two cycles by a straight line, and the
+        set-points then [m]."""
         with self._lock:
             return self._past.at(t)
 
@@ -433,7 +488,8 @@ class Prototype:
             try:
                 with self.supervisor.guard(self.clock):
                     self._cycle()
-            except Exception as error:  # whatever it is, the drives are stopped and stay so; the page says what it was
+            # whatever it is, the drives are stopped and stay so; the page says what it was
+            except Exception as error:
                 self.broken = error
 
     def _look_forever(self) -> None:

@@ -42,7 +42,8 @@ class Feedback:
     heartbeat_age: Floats
     """(n_drives,) since the last heartbeat [s]; inf before the first."""
     nmt: Ints
-    """(n_drives,) NMT state of the last heartbeat: 0 booting, 4 stopped, 5 operational, 127 pre-operational, -1 none yet."""
+    """(n_drives,) NMT state of the last heartbeat: 0 booting, 4 stopped, 5 operational, 127 pre-operational,
+    -1 none yet."""
     emergencies: tuple[Emergency, ...]
     """That came since the last feedback."""
     lost: str

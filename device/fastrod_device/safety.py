@@ -1,4 +1,5 @@
-"""`Supervisor`: refuses commands beyond the limits, watches drives, camera and clocks, and stops the robot at the first fault."""
+"""`Supervisor`: refuses commands beyond the limits, watches drives, camera and clocks, and stops the robot at
+the first fault."""
 
 from __future__ import annotations
 
@@ -22,7 +23,15 @@ from fastrod_device.clock import Clock
 from fastrod_device.errors import RefusedError
 from fastrod_device.limits import Limits, limited
 from fastrod_device.readings import Readings
-from fastrod_device.safety_words import KINDS, CameraWatch, Fault, Inspector, by_priority, in_hex, of_exception
+from fastrod_device.safety_words import (
+    KINDS,
+    CameraWatch,
+    Fault,
+    Inspector,
+    by_priority,
+    in_hex,
+    of_exception,
+)
 
 __all__ = ["KINDS", "TRANSITIONS", "CameraWatch", "Fault", "Limits", "State", "Supervisor", "limited"]
 
@@ -58,15 +67,18 @@ TRANSITIONS = MappingProxyType(
         (State.STOPPED, "fault"): State.STOPPED,
     }
 )
-"""(state, event) -> next state; what is not here is refused. Only a person's `acknowledge` leaves STOPPED, and it leads to OFF."""
+"""(state, event) -> next state; what is not here is refused. Only a person's `acknowledge` leaves STOPPED,
+and it leads to OFF."""
 
 
 @final
 class Supervisor:
-    """Stands between whoever commands and the bus. It does no input or output and keeps no time: it is told both. For any thread.
+    """Stands between whoever commands and the bus. It does no input or output and keeps no time: it is told
+    both. For any thread.
 
-    A stop is a value of its own, the list of faults: the robot is STOPPED for as long as it is not empty, whatever else was under way.
-    In OFF no drive is enabled, so only `emergency_stop` and `exception` stop; in READY and RUNNING every kind of fault does.
+    A stop is a value of its own, the list of faults: the robot is STOPPED for as long as it is not empty,
+    whatever else was under way. In OFF no drive is enabled, so only `emergency_stop` and `exception` stop; in
+    READY and RUNNING every kind of fault does.
     """
 
     def __init__(
@@ -78,7 +90,8 @@ class Supervisor:
         nodes: Sequence[int] = (),
         words: Callable[[int], str] = in_hex,
     ) -> None:
-        """`on_stop` sends the safe stop and must bear being called again; `nodes` are the drives' node ids, `words` tells emergency codes.
+        """`on_stop` sends the safe stop and must bear being called again; `nodes` are the drives' node ids,
+        `words` tells emergency codes.
 
         Raises `InputError` for a robot without wires or a wrong number of nodes.
         """
@@ -140,7 +153,8 @@ class Supervisor:
     def enabled(self, now: float) -> None:
         """The drives have been enabled: OFF becomes READY.
 
-        Raises `RefusedError` from any other state; where a stop came while they were being enabled, it is sent again first.
+        Raises `RefusedError` from any other state; where a stop came while they were being enabled, it is
+        sent again first.
         """
         if self.state is State.STOPPED:
             self._send(self.first)
@@ -154,14 +168,19 @@ class Supervisor:
             self._step("disabled", now, "the drives were switched off")
 
     def check(self, dl: ArrayLike, now: float, *, stamp: float | None = None) -> Floats:
-        """A command (n_tendons,) [m] as it was given, negative = pulled; READY becomes RUNNING. Nothing is clipped.
+        """A command (n_tendons,) [m] as it was given, negative = pulled; READY becomes RUNNING. Nothing is
+        clipped.
 
-        `stamp` is when it was meant [s], by default now. Raises `RefusedError` where it has a wrong shape, is not finite, is beyond
+        `stamp` is when it was meant [s], by default now. Raises `RefusedError` where it has a wrong shape, is
+        not finite, is beyond
         `displacement` or `curvature`, older than `command_age`, or where the robot is off or stopped.
         """
         with self._lock:
             if self.state is State.STOPPED:
-                raise RefusedError(f"the robot is stopped: {self._faults[0].sentence.rstrip('.')}; a person must release it first.")
+                raise RefusedError(
+                    f"the robot is stopped: {self._faults[0].sentence.rstrip('.')}; a person "
+                    "must release it first."
+                )
             if self.state is State.OFF:
                 raise RefusedError("the drives are off; enable them first.")
             wanted = self.within(dl)
@@ -174,15 +193,21 @@ class Supervisor:
             return wanted
 
     def limited(self, previous: Floats, wanted: Floats, dt: float) -> Floats:
-        """The next set-point (n_tendons,) [m], `dt` [s] on the way from `previous` to `wanted`; see `limits.limited`."""
+        """The next set-point (n_tendons,) [m], `dt` [s] on the way from `previous` to `wanted`; see
+        `limits.limited`."""
         return limited(previous, wanted, self.limits.rate, dt)
 
-    def watch(self, now: float, wall: float | None, readings: Readings, camera: CameraWatch | None = None) -> Fault | None:
-        """Once each control cycle: the fault that stopped the robot in this call, already sent by `on_stop`; else None.
+    def watch(
+        self, now: float, wall: float | None, readings: Readings, camera: CameraWatch | None = None
+    ) -> Fault | None:
+        """Once each control cycle: the fault that stopped the robot in this call, already sent by `on_stop`;
+        else None.
 
-        `wall` is the wall clock [s], None where time is stepped; `camera` is None while no camera is in use. Of several faults the first of
-        `KINDS` is it. Faults of a stopped robot are kept in `faults`; that it slows down, and how late cycles are then, is none. A stop
-        that could not be sent is sent again. What is raised while looking stops the robot too, and is raised.
+        `wall` is the wall clock [s], None where time is stepped; `camera` is None while no camera is in use.
+        Of several faults the first of
+        `KINDS` is it. Faults of a stopped robot are kept in `faults`; that it slows down, and how late cycles
+        are then, is none. A stop that could not be sent is sent again. What is raised while looking stops the
+        robot too, and is raised.
         """
         try:
             with self._lock:
@@ -195,7 +220,8 @@ class Supervisor:
         return new
 
     def emergency_stop(self, now: float, reason: str = "") -> Fault:
-        """Stop at once, from any state and thread; sent again when it is pressed again. Never raises what `on_stop` raises."""
+        """Stop at once, from any state and thread; sent again when it is pressed again. Never raises what
+        `on_stop` raises."""
         why = f": {reason}".rstrip(".") if reason else ""
         fault = Fault(kind="emergency stop", sentence=f"the emergency stop was pressed{why}.", t=now)
         with self._lock:
@@ -204,16 +230,22 @@ class Supervisor:
         return fault
 
     def stalled(self, now: float) -> Fault | None:
-        """For another thread than the control loop's: the fault where drives are enabled and nobody has looked at them for `cycle`."""
+        """For another thread than the control loop's: the fault where drives are enabled and nobody has
+        looked at them for `cycle`."""
         with self._lock:
-            if self._looked is None or self.state not in (State.READY, State.RUNNING) or now - self._looked <= self.limits.cycle:
+            if (
+                self._looked is None
+                or self.state not in (State.READY, State.RUNNING)
+                or now - self._looked <= self.limits.cycle
+            ):
                 return None
             new = self._latch([self._inspector.stalled(now, now - self._looked)])
         self._send(new)
         return new
 
     def client_lost(self, now: float) -> Fault | None:
-        """Nobody watches any more: a stop where drives are enabled, which is returned where it is the first; else None."""
+        """Nobody watches any more: a stop where drives are enabled, which is returned where it is the first;
+        else None."""
         with self._lock:
             if self.state not in (State.READY, State.RUNNING):
                 return None
@@ -232,7 +264,8 @@ class Supervisor:
 
     @contextmanager
     def guard(self, clock: Clock) -> Iterator[None]:
-        """Whatever leaves this block as an exception, Ctrl-C and exit too, stops the robot first and is raised then."""
+        """Whatever leaves this block as an exception, Ctrl-C and exit too, stops the robot first and is
+        raised then."""
         try:
             yield
         except BaseException as error:
@@ -240,15 +273,19 @@ class Supervisor:
             raise
 
     def acknowledge(self, now: float) -> None:
-        """A person has seen why the robot stopped, and releases it: STOPPED becomes OFF, and nothing moves by that.
+        """A person has seen why the robot stopped, and releases it: STOPPED becomes OFF, and nothing moves by
+        that.
 
-        Raises `RefusedError` where it is not stopped, the stop could not be sent, nobody has looked at the drives lately, or a cause is
-        still there. A drive's own fault is no such cause: a drive keeps it until it is reset, which is what follows. An encoder that has
-        jumped stays one: only a new start, which homes, finds the wire again.
+        Raises `RefusedError` where it is not stopped, the stop could not be sent, nobody has looked at the
+        drives lately, or a cause is still there. A drive's own fault is no such cause: a drive keeps it until
+        it is reset, which is what follows. An encoder that has jumped stays one: only a new start, which
+        homes, finds the wire again.
         """
         with self._lock:
             if self.state is not State.STOPPED:
-                raise RefusedError(f"the robot is {self.state.value}, not stopped; there is nothing to release.")
+                raise RefusedError(
+                    f"the robot is {self.state.value}, not stopped; there is nothing to release."
+                )
             self._refusal = self._why_not(now)
             if self._refusal:
                 raise RefusedError(f"the robot stays stopped: {self._refusal}")
@@ -259,7 +296,10 @@ class Supervisor:
         if self._unsent:
             return f"the stop could not be sent: {self._unsent}."
         if self._looked is not None and not now - self._looked <= self.limits.command_age:
-            return f"the drives were last looked at {1e3 * (now - self._looked):.4g} ms ago, and may be in any state."
+            return (
+                f"the drives were last looked at {1e3 * (now - self._looked):.4g} ms ago, and may be in "
+                "any state."
+            )
         jumped = next((fault for fault in self._faults if fault.kind == "encoder jump"), None)
         if jumped is not None:
             return f"{jumped.sentence.rstrip('.')}; where its wire is may be lost: start anew, and home it."
@@ -276,7 +316,8 @@ class Supervisor:
             self._history.append((now, after, why))
 
     def _latch(self, found: Sequence[Fault]) -> Fault | None:
-        """The first of `found` where it stops the robot; None where nothing was found or it was stopped before."""
+        """The first of `found` where it stops the robot; None where nothing was found or it was stopped
+        before."""
         known, was = {fault.kind for fault in self._faults}, bool(self._faults)
         new = [fault for fault in found if fault.kind not in known]
         self._faults.extend(new)
@@ -296,13 +337,23 @@ class Supervisor:
         except BaseException as error:
             self._unsent = of_exception(error)
             with self._lock:
-                self._latch([Fault(kind="exception", sentence=f"the stop could not be sent: {self._unsent}.", t=fault.t)])
+                self._latch(
+                    [
+                        Fault(
+                            kind="exception",
+                            sentence=f"the stop could not be sent: {self._unsent}.",
+                            t=fault.t,
+                        )
+                    ]
+                )
             if not isinstance(error, Exception):
                 raise
         else:
             self._unsent = ""
 
-    def _found(self, now: float, wall: float | None, readings: Readings, camera: CameraWatch | None) -> Iterable[Fault]:
+    def _found(
+        self, now: float, wall: float | None, readings: Readings, camera: CameraWatch | None
+    ) -> Iterable[Fault]:
         inspector, state = self._inspector, self.state
         inspector.require(readings)
         self._lasting = tuple(by_priority(inspector.lasting(now, readings, camera)))
@@ -318,13 +369,19 @@ class Supervisor:
         return found
 
     def within(self, dl: ArrayLike) -> Floats:
-        """(n_tendons,) the same, where it is a command within displacement and curvature. Raises `RefusedError` where it is not."""
+        """(n_tendons,) the same, where it is a command within displacement and curvature. Raises
+        `RefusedError` where it is not."""
         try:
             wanted = np.array(dl, dtype=np.float64)
         except (TypeError, ValueError) as error:
-            raise RefusedError(f"the command is {dl!r}; it must be {self._wiring.n_tendons} numbers [m].") from error
+            raise RefusedError(
+                f"the command is {dl!r}; it must be {self._wiring.n_tendons} numbers [m]."
+            ) from error
         if wanted.shape != (self._wiring.n_tendons,):
-            raise RefusedError(f"the command has shape {wanted.shape}; it must be ({self._wiring.n_tendons},), one [m] for each wire.")
+            raise RefusedError(
+                f"the command has shape {wanted.shape}; it must be "
+                f"({self._wiring.n_tendons},), one [m] for each wire."
+            )
         if not np.isfinite(wanted).all():
             k = int(np.argmin(np.isfinite(wanted)))
             raise RefusedError(f"wire {k + 1} was told {wanted[k]} m; it must be a finite number.")
@@ -336,5 +393,8 @@ class Supervisor:
         k = int(np.argmax(curvature))
         if curvature[k] > self.limits.curvature:
             asked, most = curvature[k], self.limits.curvature
-            raise RefusedError(f"segment {k + 1} was told to bend with {asked:.6g} 1/m; this robot's limit is {most:.6g} 1/m.")
+            raise RefusedError(
+                f"segment {k + 1} was told to bend with {asked:.6g} 1/m; this robot's limit "
+                f"is {most:.6g} 1/m."
+            )
         return wanted

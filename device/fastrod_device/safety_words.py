@@ -41,7 +41,8 @@ KINDS = (
 FAULT = 0x0008
 """Statusword (CiA 402) bit 3: the drive is in fault."""
 STATE_MASK = 0x006F
-"""Bits of the statusword that tell the drive's state; without voltage and quick stop it is `STATE_MASK_SHORT`."""
+"""Bits of the statusword that tell the drive's state; without voltage and quick stop it is
+`STATE_MASK_SHORT`."""
 STATE_MASK_SHORT = 0x004F
 """As above, for the states in which the quick-stop bit tells nothing."""
 OPERATION_ENABLED = 0x0027
@@ -50,8 +51,18 @@ NMT_OPERATIONAL = 5
 """NMT state (CiA 301) in which process data flows."""
 NMT_NONE = -1
 """No heartbeat yet."""
-_SHORT = {0x00: "not ready", 0x40: "switched off (switch on disabled)", 0x0F: "reacting to a fault", 0x08: "in fault"}
-_LONG = {0x21: "ready to switch on", 0x23: "switched on, not enabled", 0x27: "enabled", 0x07: "in a quick stop"}
+_SHORT = {
+    0x00: "not ready",
+    0x40: "switched off (switch on disabled)",
+    0x0F: "reacting to a fault",
+    0x08: "in fault",
+}
+_LONG = {
+    0x21: "ready to switch on",
+    0x23: "switched on, not enabled",
+    0x27: "enabled",
+    0x07: "in a quick stop",
+}
 _NMT = {-1: "none yet", 0: "booting", 4: "stopped", 5: "operational", 127: "pre-operational"}
 _MOVES = 0.1  # of the largest rate: a wire that is slower stands
 
@@ -107,17 +118,27 @@ def drive_state(statusword: int) -> str:
 
 @final
 class Inspector:
-    """Finds what is wrong in one cycle. It keeps nothing and decides nothing; what is not a number is beyond every limit."""
+    """Finds what is wrong in one cycle. It keeps nothing and decides nothing; what is not a number is beyond
+    every limit."""
 
-    def __init__(self, n_drives: int, limits: Limits, nodes: Sequence[int], words: Callable[[int], str]) -> None:
+    def __init__(
+        self, n_drives: int, limits: Limits, nodes: Sequence[int], words: Callable[[int], str]
+    ) -> None:
         """Raises `InputError` where `nodes` is neither empty nor one node id for each drive."""
         if nodes and len(nodes) != n_drives:
-            raise InputError(f"nodes has {len(nodes)} node ids and the robot {n_drives} wires; give one for each wire, or none.")
+            raise InputError(
+                f"nodes has {len(nodes)} node ids and the robot {n_drives} wires; give one for "
+                "each wire, or none."
+            )
         self._n, self._limits, self._nodes, self._words = n_drives, limits, tuple(nodes), words
 
     def name(self, drive: int) -> str:
         """As in `drive 2 (node 5)`, counted from 1; without the node where none is known."""
-        return f"drive {drive + 1} (node {self._nodes[drive]})" if self._nodes and 0 <= drive < self._n else f"drive {drive + 1}"
+        return (
+            f"drive {drive + 1} (node {self._nodes[drive]})"
+            if self._nodes and 0 <= drive < self._n
+            else f"drive {drive + 1}"
+        )
 
     def require(self, readings: Readings) -> None:
         """Raises `InputError` where the readings are not one of each for every drive."""
@@ -127,23 +148,40 @@ class Inspector:
 
     def lasting(self, now: float, readings: Readings, camera: CameraWatch | None) -> Iterator[Fault]:
         """What is wrong for as long as it is: only its end makes the robot fit to move again."""
-        limits, old = self._limits, max(now - readings.t, 0.0)  # readings may be looked at twice: they have aged since
+        # readings may be looked at twice: they have aged since
+        limits, old = self._limits, max(now - readings.t, 0.0)
         if readings.foreign_syncs:
             text = f"another node sends SYNC ({readings.foreign_syncs} since the last cycle)"
             yield Fault(kind="foreign SYNC", sentence=f"{text}; the controller alone may.", t=now)
         if readings.lost:
-            yield Fault(kind="bus off", sentence=f"the bus carries nothing: {readings.lost.rstrip('.')}.", t=now)
+            yield Fault(
+                kind="bus off", sentence=f"the bus carries nothing: {readings.lost.rstrip('.')}.", t=now
+            )
         else:
             yield from self._silent(now, readings.age + old)
         away = (readings.nmt != NMT_OPERATIONAL) & (readings.nmt != NMT_NONE)
         for k in _first(away):
             state = int(readings.nmt[k])
-            text = f"its NMT state is {state} ({_NMT.get(state, 'unknown')}), not 5 (operational); where its wire is may be lost"
+            text = (
+                f"its NMT state is {state} ({_NMT.get(state, 'unknown')}), not 5 (operational); where "
+                "its wire is may be lost"
+            )
             yield self._of("node reboot", k, f"was started anew or left operation: {text}", now)
         heart = np.where(readings.nmt == NMT_NONE, np.inf, readings.heartbeat_age + old)
-        yield from self._beyond("heartbeat lost", heart, limits.heartbeat_age, "sent its last heartbeat {} ago", "ms", now)
-        yield from self._beyond("feedback stale", readings.age + old, limits.feedback_age, "sent its last process data {} ago", "ms", now)
-        yield from self._beyond("tension", readings.tension, limits.tension, "pulls its wire with {}", "N", now)
+        yield from self._beyond(
+            "heartbeat lost", heart, limits.heartbeat_age, "sent its last heartbeat {} ago", "ms", now
+        )
+        yield from self._beyond(
+            "feedback stale",
+            readings.age + old,
+            limits.feedback_age,
+            "sent its last process data {} ago",
+            "ms",
+            now,
+        )
+        yield from self._beyond(
+            "tension", readings.tension, limits.tension, "pulls its wire with {}", "N", now
+        )
         reach = limits.displacement + limits.following_error
         where = "has its wire at {}, further than a command and its following error can lead"
         yield from self._beyond("displacement", readings.dl, reach, where, "mm", now)
@@ -151,7 +189,9 @@ class Inspector:
             return
         if camera.frozen:
             yield Fault(
-                kind="camera frozen", sentence=f"the camera repeats its frames; the newest sighting is {_ms(camera.age)} old.", t=now
+                kind="camera frozen",
+                sentence=f"the camera repeats its frames; the newest sighting is {_ms(camera.age)} old.",
+                t=now,
             )
         if not -limits.cycle <= camera.age <= limits.sighting_age:  # one of the future says nothing about now
             limit = f"the limit is {_ms(limits.sighting_age)}"
@@ -160,37 +200,60 @@ class Inspector:
             yield Fault(kind="marker lost", sentence=sentence, t=now)
 
     def drives(self, now: float, readings: Readings) -> Iterator[Fault]:
-        """What drives say of themselves: emergency messages and faults. A drive keeps its fault until it is reset."""
+        """What drives say of themselves: emergency messages and faults. A drive keeps its fault until it is
+        reset."""
         for message in readings.emergencies:
             if message.code & 0xFF00 == 0:
                 continue  # 00xx reports that an error is gone
             words, code = self._words(message.code), in_hex(message.code)
             text = code if words == code else f"{code}, {words.rstrip('.')}"
-            yield self._of("emergency message", message.drive, f"sent an emergency: {text} (error register 0x{message.register:02X})", now)
+            yield self._of(
+                "emergency message",
+                message.drive,
+                f"sent an emergency: {text} (error register 0x{message.register:02X})",
+                now,
+            )
             break
         yield from self._state((readings.statusword & FAULT) != 0, readings.statusword, now)
 
     def powered(self, now: float, readings: Readings, before: Readings | None) -> Iterator[Fault]:
         """What is wrong only while drives are enabled; `before` is the cycle before, None for the first."""
         limits = self._limits
-        yield from self._state((readings.statusword & STATE_MASK) != OPERATION_ENABLED, readings.statusword, now)
+        yield from self._state(
+            (readings.statusword & STATE_MASK) != OPERATION_ENABLED, readings.statusword, now
+        )
         if before is not None:
             yield from self._jump(now, readings, before)
         error = "is {} from where it was told to be"
-        yield from self._beyond("following error", readings.following_error, limits.following_error, error, "mm", now)
+        yield from self._beyond(
+            "following error", readings.following_error, limits.following_error, error, "mm", now
+        )
         if limits.slack is not None:
             for k in _first(~(readings.tension >= limits.slack)):
-                text = f"pulls its wire with {readings.tension[k]:.3g} N; a wire is slack below {limits.slack:g} N"
+                text = (
+                    f"pulls its wire with {readings.tension[k]:.3g} N; a wire is slack below "
+                    f"{limits.slack:g} N"
+                )
                 yield self._of("slack wire", k, text, now)
 
     def times(self, now: float, wall: float | None, last: float, last_wall: float | None) -> Iterator[Fault]:
         """Clocks that jump and a control loop that stood still, between the cycle `last` [s] and `now`."""
         gap = now - last
         if gap < 0.0:
-            yield Fault(kind="clock jump", sentence=f"the monotonic clock ran back by {_ms(-gap)}; it must never.", t=now)
-        elif wall is not None and last_wall is not None and not abs(wall - last_wall - gap) <= self._limits.clock_jump:
+            yield Fault(
+                kind="clock jump",
+                sentence=f"the monotonic clock ran back by {_ms(-gap)}; it must never.",
+                t=now,
+            )
+        elif (
+            wall is not None
+            and last_wall is not None
+            and not abs(wall - last_wall - gap) <= self._limits.clock_jump
+        ):
             limit = f"the limit is {_ms(self._limits.clock_jump)}"
-            sentence = f"the wall clock jumped by {_ms(wall - last_wall - gap)} against the monotonic one; {limit}."
+            sentence = (
+                f"the wall clock jumped by {_ms(wall - last_wall - gap)} against the monotonic one; {limit}."
+            )
             yield Fault(kind="clock jump", sentence=sentence, t=now)
         if not gap <= self._limits.cycle:
             yield self.stalled(now, gap)
@@ -205,20 +268,33 @@ class Inspector:
         fastest = float(np.max(np.abs(readings.rate)))
         if not now - meant <= self._limits.command_age and not fastest <= _MOVES * self._limits.rate:
             limit = f"it must be renewed every {_ms(self._limits.command_age)}"
-            sentence = f"the robot moves at {1e3 * fastest:.3g} mm/s on a command that is {_ms(now - meant)} old; {limit}."
+            sentence = (
+                f"the robot moves at {1e3 * fastest:.3g} mm/s on a command that is "
+                f"{_ms(now - meant)} old; {limit}."
+            )
             yield Fault(kind="command stale", sentence=sentence, t=now)
 
     def _silent(self, now: float, age: Floats) -> Iterator[Fault]:
         """All drives at once: that is the bus, and no drive."""
         limit = self._limits.feedback_age
         if self._n > 1 and not (age <= limit).any():
-            sentence = f"the bus carries nothing: no drive has sent process data for {_ms(float(np.min(age)))}; the limit is {_ms(limit)}."
+            sentence = (
+                "the bus carries nothing: no drive has sent process data for "
+                f"{_ms(float(np.min(age)))}; the limit is {_ms(limit)}."
+            )
             yield Fault(kind="bus off", sentence=sentence, t=now)
 
-    def _state(self, bad: np.ndarray[tuple[int, ...], np.dtype[np.bool_]], statusword: Ints, now: float) -> Iterator[Fault]:
+    def _state(
+        self, bad: np.ndarray[tuple[int, ...], np.dtype[np.bool_]], statusword: Ints, now: float
+    ) -> Iterator[Fault]:
         for k in _first(bad):
             word = int(statusword[k])
-            yield self._of("drive fault", k, f"is {drive_state(word)}, not enabled (statusword 0x{word & 0xFFFF:04X})", now)
+            yield self._of(
+                "drive fault",
+                k,
+                f"is {drive_state(word)}, not enabled (statusword 0x{word & 0xFFFF:04X})",
+                now,
+            )
 
     def _jump(self, now: float, readings: Readings, before: Readings) -> Iterator[Fault]:
         """Over the time between two samples of a drive, not two cycles: a late sample has gone further."""
@@ -228,10 +304,15 @@ class Inspector:
         change = readings.dl - before.dl
         allowed = self._limits.rate * dt + self._limits.encoder_jump
         for k in _first(known & ~(np.abs(change) <= allowed)):
-            text = f"moved its wire by {1e3 * change[k]:.3g} mm in {_ms(float(dt[k]))}; the limit is {1e3 * allowed[k]:.3g} mm"
+            text = (
+                f"moved its wire by {1e3 * change[k]:.3g} mm in {_ms(float(dt[k]))}; the limit is "
+                f"{1e3 * allowed[k]:.3g} mm"
+            )
             yield self._of("encoder jump", k, text, now)
 
-    def _beyond(self, kind: str, values: Floats, limit: float, text: str, unit: str, now: float) -> Iterator[Fault]:
+    def _beyond(
+        self, kind: str, values: Floats, limit: float, text: str, unit: str, now: float
+    ) -> Iterator[Fault]:
         """The drive that is furthest beyond a limit, either way."""
         size = np.where(np.isnan(values), np.inf, np.abs(values))
         k = int(np.argmax(size))

@@ -28,9 +28,11 @@ class Seal:
 
     __slots__ = ("__inside", "__stiffness")
 
-    def __init__(self, inside: dict[str, dict[str, float]], stiffness: tuple[float, float] = (EI, GJ)) -> None:
-        """`inside`: effect name -> number name -> value in SI units and radians; empty for a robot without effect. `stiffness`: of the body
-        in bending and torsion [N m^2]."""
+    def __init__(
+        self, inside: dict[str, dict[str, float]], stiffness: tuple[float, float] = (EI, GJ)
+    ) -> None:
+        """`inside`: effect name -> number name -> value in SI units and radians; empty for a robot without
+        effect. `stiffness`: of the body in bending and torsion [N m^2]."""
         self.__inside = {name: dict(numbers) for name, numbers in inside.items()}
         self.__stiffness = stiffness
 
@@ -41,7 +43,8 @@ class Seal:
         raise InputError("a seal cannot be copied into a file; keep its seed.")
 
     def open(self) -> dict[str, dict[str, float]]:
-        """Effect name -> number name -> value, SI units and radians. For the judge, when the verdict is in."""
+        """Effect name -> number name -> value, SI units and radians. For the judge, when the verdict is
+        in."""
         return {name: dict(numbers) for name, numbers in self.__inside.items()}
 
     def stiffness(self) -> tuple[float, float]:
@@ -89,21 +92,42 @@ def _numbers(name: str, rng: np.random.Generator) -> dict[str, float]:
     match name:
         case "backlash":  # m of wire; how sharp the corners of the gap are
             return {"half_width": uniform(1.5e-4, 4e-4), "sharpness": uniform(8.0, 14.0)}
-        case "friction":  # bend lost when straight [rad], its growth [1/rad], travel until it slides [rad], share of the quick part
+        # bend lost when straight [rad], its growth [1/rad], travel until it slides [rad], share of the quick
+        # part
+        case "friction":
             loss = {"loss": uniform(1.5, 4.5) * _DEGREE, "growth": uniform(0.2, 0.5)}
-            return loss | {"quick": uniform(1.5, 3.0) * _DEGREE, "late": uniform(4.0, 9.0) * _DEGREE, "share": uniform(0.4, 0.7)}
-        case "tendon_stretch":  # m/N beyond the wires' own; share that goes as strands settle; N; what a small bend loses
+            return loss | {
+                "quick": uniform(1.5, 3.0) * _DEGREE,
+                "late": uniform(4.0, 9.0) * _DEGREE,
+                "share": uniform(0.4, 0.7),
+            }
+        # m/N beyond the wires' own; share that goes as strands settle; N; what a small bend loses
+        case "tendon_stretch":
             lost = uniform(0.06, 0.20)
             compliance = 2.0 * OFFSET**2 * LENGTH / EI * lost / (1.0 - lost)
-            return {"compliance": compliance, "settling": uniform(0.15, 0.35), "knee": uniform(1.0, 2.5), "gain_loss": lost}
+            return {
+                "compliance": compliance,
+                "settling": uniform(0.15, 0.35),
+                "knee": uniform(1.0, 2.5),
+                "gain_loss": lost,
+            }
         case "creep":  # shares, s, rate of quickening with the strain [1/m]
             whole, split = uniform(0.06, 0.12), uniform(0.35, 0.65)
-            parts = {"share": whole * split, "time_constant": log(1.0, 5.0), "slow_share": whole * (1.0 - split)}
+            parts = {
+                "share": whole * split,
+                "time_constant": log(1.0, 5.0),
+                "slow_share": whole * (1.0 - split),
+            }
             return parts | {"slow_time_constant": log(10.0, 60.0), "activation": uniform(60.0, 160.0)}
         case "gravity":  # N/m, and how it is spread
             return {"weight": uniform(3.0, 6.0), "slope": uniform(-0.15, 0.15), "bulge": uniform(-0.25, 0.25)}
         case "latency":  # s; share by which it wanders, s, rad
-            return {"delay": log(0.04, 0.15), "wander": uniform(0.01, 0.04), "period": uniform(15.0, 50.0), "phase": turn()}
+            return {
+                "delay": log(0.04, 0.15),
+                "wander": uniform(0.01, 0.04),
+                "period": uniform(15.0, 50.0),
+                "phase": turn(),
+            }
         case "ripple":  # m of wire once in a drum's turn and once in a tooth; m; teeth
             sizes = {"amplitude": uniform(1e-4, 2.5e-4), "tooth_amplitude": uniform(0.8e-4, 1.6e-4)}
             drum = {"drum_radius": uniform(4e-3, 8e-3), "teeth": float(rng.integers(9, 20))}
@@ -112,5 +136,11 @@ def _numbers(name: str, rng: np.random.Generator) -> dict[str, float]:
             away, about = rng.normal(size=3), rng.normal(size=3)
             away *= uniform(1e-3, 3e-3) / np.linalg.norm(away)
             about *= uniform(0.3, 1.2) * _DEGREE / np.linalg.norm(about)
-            numbers = dict(zip(("x", "y", "z", "about_x", "about_y", "about_z"), [*away.tolist(), *about.tolist()], strict=True))
+            numbers = dict(
+                zip(
+                    ("x", "y", "z", "about_x", "about_y", "about_z"),
+                    [*away.tolist(), *about.tolist()],
+                    strict=True,
+                )
+            )
             return numbers | {"at": uniform(40.0, 110.0)}

@@ -28,7 +28,8 @@ class Trace:
         self._past.clear()
 
     def at(self, t: float) -> tuple[Floats, Floats]:
-        """(n_wires,) and (n_wires,) [m] at `t` [s], by a straight line between two cycles; nan where nothing is known."""
+        """(n_wires,) and (n_wires,) [m] at `t` [s], by a straight line between two cycles; nan where nothing
+        is known."""
         past = self._past
         if not past:
             return self._nowhere, self._nowhere

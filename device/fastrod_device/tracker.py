@@ -1,9 +1,11 @@
-"""The tip's pose from frames: a square marker, its sides fitted to parts of a pixel, both poses that a square allows, the likelier kept.
+"""The tip's pose from frames: a square marker, its sides fitted to parts of a pixel, both poses that a square
+allows, the likelier kept.
 
-Which of both: each solution costs (misfit of the sides / `sigma`)^2, the squared distances of its eight points from the sides seen,
-plus (angle to the last accepted sighting / its sigma)^2, plus (angle to the expected pose / its sigma)^2 where one is given. The angle
-terms end at `_CAP`, so that no belief outweighs a picture that says otherwise for long. The cheaper one is taken. A sighting is
-"ambiguous" where the costs differ by less than `_TELL`, the solutions by more than `_ALIKE`: then nothing tells them apart. It is an
+Which of both: each solution costs (misfit of the sides / `sigma`)^2, the squared distances of its eight
+points from the sides seen, plus (angle to the last accepted sighting / its sigma)^2, plus (angle to the
+expected pose / its sigma)^2 where one is given. The angle terms end at `_CAP`, so that no belief outweighs a
+picture that says otherwise for long. The cheaper one is taken. A sighting is "ambiguous" where the costs
+differ by less than `_TELL`, the solutions by more than `_ALIKE`: then nothing tells them apart. It is an
 "outlier" where its corners do not fit a square, or where a side could not be fitted: covered, cut off, or too
 small, and then off by millimetres.
 
@@ -74,7 +76,8 @@ class Sighting:
 
 @final
 class MarkerTracker:
-    """Follows one marker through the frames of one camera. Nothing is smoothed: a doubtful sighting is flagged, and forgotten."""
+    """Follows one marker through the frames of one camera. Nothing is smoothed: a doubtful sighting is
+    flagged, and forgotten."""
 
     def __init__(
         self,
@@ -90,7 +93,8 @@ class MarkerTracker:
         """`workspace`: where the tip can be, None: anywhere; `gate`: fastest that it can move [m/s]; `slack`:
         what it may jump besides [m]; `limit`: largest `error` of a sighting [px];
 
-        `sigma`: how far a side that was seen is off [px]: noise, and what the lens model leaves. Raises `InputError`.
+        `sigma`: how far a side that was seen is off [px]: noise, and what the lens model leaves. Raises
+        `InputError`.
         """
         for name, value in (("gate", gate), ("slack", slack), ("limit", limit), ("sigma", sigma)):
             if not value > 0.0:
@@ -102,10 +106,13 @@ class MarkerTracker:
         self._fit, self._detector, self._order = SideFit(camera), _detector(marker), FrameOrder(camera)
         self._cells = dictionary_named(marker.dictionary).markerSize + 2
         half = marker.size / 2.0
-        self._corners = half * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
+        self._corners = half * np.array(
+            [[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]]
+        )
         ahead = np.roll(self._corners, -1, axis=0)
         middle, along = 0.5 * (ahead + self._corners), 0.5 * (ahead - self._corners)
-        self._points = np.concatenate([middle - _GAUSS * along, middle + _GAUSS * along])  # (8, 3), side k is points k and k + 4
+        # (8, 3), side k is points k and k + 4
+        self._points = np.concatenate([middle - _GAUSS * along, middle + _GAUSS * along])
         self._marker_from_tip = inverse(marker.tip_from_marker)
         self.reset()
 
@@ -125,7 +132,10 @@ class MarkerTracker:
         """
         image = frame.image
         if image.dtype != np.uint8 or image.shape != self.camera.size[::-1]:
-            raise InputError(f"the frame is {image.dtype} of shape {image.shape}; it must be uint8 of {self.camera.size[::-1]}.")
+            raise InputError(
+                f"the frame is {image.dtype} of shape {image.shape}; it must be uint8 of "
+                f"{self.camera.size[::-1]}."
+            )
         t, flag = self._order.check(frame, now)
         found = [] if flag else self._find(image)
         if len(found) != 1:
@@ -146,12 +156,18 @@ class MarkerTracker:
             flag = "ambiguous"
         pixels = self._fit.distorted(sides.corners)
         sighting = Sighting(
-            t=t, number=frame.number, flag=flag, position=poses[best][0], quaternion=poses[best][1],
+            t=t,
+            number=frame.number,
+            flag=flag,
+            position=poses[best][0],
+            quaternion=poses[best][1],
             other_position=poses[other][0] if other != best else np.full(3, np.nan),
             other_quaternion=poses[other][1] if other != best else np.full(4, np.nan),
-            error=float(errors[best]), other_error=float(errors[other]) if other != best else math.nan,
-            size_px=float(np.linalg.norm(np.roll(pixels, -1, axis=0) - pixels, axis=1).mean()), corners=pixels,
-        )  # fmt: skip
+            error=float(errors[best]),
+            other_error=float(errors[other]) if other != best else math.nan,
+            size_px=float(np.linalg.norm(np.roll(pixels, -1, axis=0) - pixels, axis=1).mean()),
+            corners=pixels,
+        )
         if sighting.ok:
             self._last = sighting
         return sighting
@@ -174,28 +190,40 @@ class MarkerTracker:
         return []
 
     def _solve(self, sides: Sides) -> tuple[Floats, Floats, Floats]:
-        """Camera_from_marker by both solutions: rotations (n, 3, 3), positions (n, 3) [m], and squared misfit (n,) [px^2]."""
+        """Camera_from_marker by both solutions: rotations (n, 3, 3), positions (n, 3) [m], and squared misfit
+        (n,) [px^2]."""
         import cv2
 
-        _, turns, shifts, _ = cv2.solvePnPGeneric(self._corners, sides.corners, self._matrix, None, flags=cv2.SOLVEPNP_IPPE_SQUARE)
+        _, turns, shifts, _ = cv2.solvePnPGeneric(
+            self._corners, sides.corners, self._matrix, None, flags=cv2.SOLVEPNP_IPPE_SQUARE
+        )
         turn = np.stack([np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64) for turn in turns])
         shift = np.stack([np.asarray(np.ravel(shift), dtype=np.float64) for shift in shifts])
         targets = self._targets(sides)
         fine = self._refine(turn, shift, targets)
         if len(turn) > 1 and np.linalg.norm(fine[0][0] - fine[0][1]) < 0.01:
-            # both went to one minimum: the other solution is none of its own. It is told as it was, and never taken
-            return np.stack([fine[0][0], turn[1]]), np.stack([fine[1][0], shift[1]]), np.array([fine[2][0], np.inf])
+            # both went to one minimum: the other solution is none of its own. It is told as it was, and never
+            # taken
+            return (
+                np.stack([fine[0][0], turn[1]]),
+                np.stack([fine[1][0], shift[1]]),
+                np.array([fine[2][0], np.inf]),
+            )
         return fine
 
     def _targets(self, sides: Sides) -> Floats:
-        """(8, 3) of each of the eight points: weighted normal and offset of its side, for points that are divided by their depth [px]."""
+        """(8, 3) of each of the eight points: weighted normal and offset of its side, for points that are
+        divided by their depth [px]."""
         k = self._matrix
         lines = sides.lines
-        rows = np.column_stack([lines[:, 0] * k[0, 0], lines[:, 1] * k[1, 1], lines[:, :2] @ k[:2, 2] - lines[:, 2]])
+        rows = np.column_stack(
+            [lines[:, 0] * k[0, 0], lines[:, 1] * k[1, 1], lines[:, :2] @ k[:2, 2] - lines[:, 2]]
+        )
         return np.concatenate([sides.weights[:, None] * rows] * 2)
 
     def _misfit(self, arm: Floats, shift: Floats, targets: Floats) -> tuple[Floats, Floats]:
-        """Weighted distances (n, 8) of points arm + shift from their sides [px], and their derivatives (n, 8, 6) by rotation and shift."""
+        """Weighted distances (n, 8) of points arm + shift from their sides [px], and their derivatives (n, 8,
+        6) by rotation and shift."""
         y = arm + shift[:, None]
         ray = y / y[..., 2:]
         r = (ray * targets).sum(-1)
@@ -205,7 +233,8 @@ class MarkerTracker:
         return r, np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx, bx, by, bz], axis=-1)
 
     def _refine(self, turn: Floats, shift: Floats, targets: Floats) -> tuple[Floats, Floats, Floats]:
-        """Levenberg's descent from each solution to the nearest least misfit: rotations, positions [m], squared misfits [px^2]."""
+        """Levenberg's descent from each solution to the nearest least misfit: rotations, positions [m],
+        squared misfits [px^2]."""
         r, J = self._misfit(self._points @ turn.transpose(0, 2, 1), shift, targets)
         cost, damping = (r * r).sum(1), np.full(len(r), 1e-4)
         for _ in range(8):
@@ -224,14 +253,20 @@ class MarkerTracker:
             else:
                 each = better[:, None]
                 turn, J = np.where(each[..., None], new_turn, turn), np.where(each[..., None], new_J, J)
-                shift, r, cost = np.where(each, new_shift, shift), np.where(each, new_r, r), np.where(better, new_cost, cost)
+                shift, r, cost = (
+                    np.where(each, new_shift, shift),
+                    np.where(each, new_r, r),
+                    np.where(better, new_cost, cost),
+                )
             if done:
                 break
         return turn, shift, cost
 
     def _tip(self, turn: Floats, shift: Floats) -> Pose:
         """Base_from_tip, w not negative."""
-        position, quaternion = compose(compose(self._base_from_camera, (shift, quaternion_from_matrix(turn))), self._marker_from_tip)
+        position, quaternion = compose(
+            compose(self._base_from_camera, (shift, quaternion_from_matrix(turn))), self._marker_from_tip
+        )
         return position, -quaternion if quaternion[0] < 0.0 else quaternion
 
     def _belief(self, t: float, quaternion: Floats, expected: Pose | None) -> float:
@@ -269,7 +304,11 @@ def _detector(marker: Marker) -> cv2.aruco.ArucoDetector:
     options.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     options.minMarkerPerimeterRate = 0.06  # of the picture's longer side: noise has many small contours
     options.relativeCornerRefinmentWinSize = 0.4  # of a cell: the window must not reach the next
-    options.adaptiveThreshWinSizeMin, options.adaptiveThreshWinSizeMax, options.adaptiveThreshWinSizeStep = 9, 29, 20
+    options.adaptiveThreshWinSizeMin, options.adaptiveThreshWinSizeMax, options.adaptiveThreshWinSizeStep = (
+        9,
+        29,
+        20,
+    )
     return cv2.aruco.ArucoDetector(dictionary_named(marker.dictionary), options)
 
 
@@ -294,29 +333,49 @@ def _angle(a: Floats, b: Floats) -> float:
 
 
 def _turned(vector: Floats) -> Floats:
-    """(n, 3, 3) rotation by vectors (n, 3) [rad], Cayley's: right to second order, and a rotation to the last bit."""
+    """(n, 3, 3) rotation by vectors (n, 3) [rad], Cayley's: right to second order, and a rotation to the last
+    bit."""
     a = 0.5 * vector
     square = (a * a).sum(-1)[:, None, None]
     zero = np.zeros(len(a))
-    skew = np.stack([zero, -a[:, 2], a[:, 1], a[:, 2], zero, -a[:, 0], -a[:, 1], a[:, 0], zero], axis=-1).reshape(-1, 3, 3)
+    skew = np.stack(
+        [zero, -a[:, 2], a[:, 1], a[:, 2], zero, -a[:, 0], -a[:, 1], a[:, 0], zero], axis=-1
+    ).reshape(-1, 3, 3)
     return np.asarray(np.eye(3) + 2.0 / (1.0 + square) * (skew + skew @ skew))
 
 
 def _nothing(t: float, number: int, flag: str) -> Sighting:
     """A frame without a pose."""
     return Sighting(
-        t=t, number=number, flag=flag, position=np.full(3, np.nan), quaternion=np.full(4, np.nan),
-        other_position=np.full(3, np.nan), other_quaternion=np.full(4, np.nan), error=math.nan, other_error=math.nan,
-        size_px=math.nan, corners=np.full((4, 2), np.nan),
-    )  # fmt: skip
+        t=t,
+        number=number,
+        flag=flag,
+        position=np.full(3, np.nan),
+        quaternion=np.full(4, np.nan),
+        other_position=np.full(3, np.nan),
+        other_quaternion=np.full(4, np.nan),
+        error=math.nan,
+        other_error=math.nan,
+        size_px=math.nan,
+        corners=np.full((4, 2), np.nan),
+    )
 
 
 def outlined(image: Picture, sighting: Sighting) -> Picture:
-    """(h, w, 3) red, green, blue: a frame with the marker's sides, green where the sighting is trusted, red where it is not."""
+    """(h, w, 3) red, green, blue: a frame with the marker's sides, green where the sighting is trusted, red
+    where it is not."""
     import cv2
 
     shown = np.repeat(image[:, :, None], 3, axis=2)
     if np.isfinite(sighting.corners).all():
         corners = np.rint(16.0 * sighting.corners).astype(np.int32)
-        cv2.polylines(shown, [corners.reshape(-1, 1, 2)], True, (30, 170, 80) if sighting.ok else (220, 50, 40), 2, cv2.LINE_AA, 4)
+        cv2.polylines(
+            shown,
+            [corners.reshape(-1, 1, 2)],
+            True,
+            (30, 170, 80) if sighting.ok else (220, 50, 40),
+            2,
+            cv2.LINE_AA,
+            4,
+        )
     return shown

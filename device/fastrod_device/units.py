@@ -14,9 +14,13 @@ from fastrod.types import Floats, Ints
 from fastrod_device.readings import Feedback, Readings
 
 _RANGE = {
-    "drum_radius": (1e-4, 0.1), "gear": (1e-3, 1e6), "counts_per_turn": (1, 1e9),
-    "torque_constant": (1e-6, 1e3), "rated_torque": (1e-6, 1e4), "efficiency": (1e-3, 1.0),
-}  # fmt: skip
+    "drum_radius": (1e-4, 0.1),
+    "gear": (1e-3, 1e6),
+    "counts_per_turn": (1, 1e9),
+    "torque_constant": (1e-6, 1e3),
+    "rated_torque": (1e-6, 1e4),
+    "efficiency": (1e-3, 1.0),
+}
 """Of a `DriveSpec`'s numbers: wide of every drive, and their products still are counts and newtons."""
 
 
@@ -47,16 +51,25 @@ class DriveSpec:
 
     def __post_init__(self) -> None:
         if isinstance(self.node, bool) or not isinstance(self.node, int) or not 1 <= self.node <= 126:
-            raise InputError(f"DriveSpec.node is {self.node!r}; a CANopen node id is a whole number from 1 to 126.")
+            raise InputError(
+                f"DriveSpec.node is {self.node!r}; a CANopen node id is a whole number from 1 to 126."
+            )
         if self.direction not in (1, -1):
-            raise InputError(f"DriveSpec.direction is {self.direction!r}; it must be 1 (growing counts pull) or -1.")
+            raise InputError(
+                f"DriveSpec.direction is {self.direction!r}; it must be 1 (growing counts pull) or -1."
+            )
         for name, (low, high) in _RANGE.items():
             value = getattr(self, name)
             if isinstance(value, bool) or not (isinstance(value, (int, float)) and value > 0.0):
-                raise InputError(f"DriveSpec.{name} of node {self.node} is {shown(value)}; it must be a positive number.")
+                raise InputError(
+                    f"DriveSpec.{name} of node {self.node} is {shown(value)}; it must be a positive number."
+                )
             if not low <= value <= high:
                 hint = " Was it given in mm?" if name == "drum_radius" and value > high else ""
-                raise InputError(f"DriveSpec.{name} of node {self.node} is {shown(value)}; it must be from {low:g} to {high:g}.{hint}")
+                raise InputError(
+                    f"DriveSpec.{name} of node {self.node} is {shown(value)}; it must be from "
+                    f"{low:g} to {high:g}.{hint}"
+                )
 
     @property
     def metres_per_count(self) -> float:
@@ -71,16 +84,19 @@ class DriveSpec:
 
 @final
 class Transmission:
-    """Drives as wires: changes of wire length [m], negative = pulled, against the straight rest robot, where counts are `zero`."""
+    """Drives as wires: changes of wire length [m], negative = pulled, against the straight rest robot, where
+    counts are `zero`."""
 
     def __init__(self, specs: Sequence[DriveSpec], zero: Ints | None = None) -> None:
-        """`zero` (n_drives,) counts at which the robot is straight, 0 by default. Raises `InputError` where there is no drive, or two have
-        one node id."""
+        """`zero` (n_drives,) counts at which the robot is straight, 0 by default. Raises `InputError` where
+        there is no drive, or two have one node id."""
         self.specs = tuple(specs)
         nodes = [spec.node for spec in self.specs]
         if not nodes or len(set(nodes)) != len(nodes):
             raise InputError(f"the drives have node ids {nodes}; there must be one or more, each once.")
-        self.zero: Ints = np.zeros(len(nodes), dtype=np.int64) if zero is None else np.asarray(zero, dtype=np.int64)
+        self.zero: Ints = (
+            np.zeros(len(nodes), dtype=np.int64) if zero is None else np.asarray(zero, dtype=np.int64)
+        )
         """(n_drives,) counts of the straight robot."""
         self._metres: Floats = np.array([-spec.direction * spec.metres_per_count for spec in specs])
         self._newtons: Floats = np.array([spec.direction * spec.newtons_per_torque for spec in specs])
@@ -101,11 +117,13 @@ class Transmission:
         return np.asarray((counts - self.zero) * self._metres, dtype=np.float64)
 
     def wound(self, counts: Ints) -> Floats:
-        """(..., n_drives) lengths [m] of differences of counts: rates and errors, which have no zero; negative = pulled."""
+        """(..., n_drives) lengths [m] of differences of counts: rates and errors, which have no zero;
+        negative = pulled."""
         return np.asarray(counts * self._metres, dtype=np.float64)
 
     def tension(self, torque: Ints) -> Floats:
-        """(..., n_drives) [N] of torques in thousandths of the rated one: gear losses by a constant efficiency, no other friction."""
+        """(..., n_drives) [N] of torques in thousandths of the rated one: gear losses by a constant
+        efficiency, no other friction."""
         return np.asarray(torque * self._torque * self._newtons, dtype=np.float64)
 
     def torque(self, tension: Floats) -> Ints:
@@ -119,8 +137,17 @@ class Transmission:
     def readings(self, feedback: Feedback) -> Readings:
         """What drives say, in SI units."""
         return Readings(
-            t=feedback.t, dl=self.dl(feedback.position), rate=self.wound(feedback.velocity), tension=self.tension(feedback.torque),
-            current=self.current(feedback.torque), following_error=self.wound(feedback.following_error), statusword=feedback.statusword,
-            age=feedback.age, heartbeat_age=feedback.heartbeat_age, nmt=feedback.nmt, emergencies=feedback.emergencies, lost=feedback.lost,
+            t=feedback.t,
+            dl=self.dl(feedback.position),
+            rate=self.wound(feedback.velocity),
+            tension=self.tension(feedback.torque),
+            current=self.current(feedback.torque),
+            following_error=self.wound(feedback.following_error),
+            statusword=feedback.statusword,
+            age=feedback.age,
+            heartbeat_age=feedback.heartbeat_age,
+            nmt=feedback.nmt,
+            emergencies=feedback.emergencies,
+            lost=feedback.lost,
             foreign_syncs=feedback.foreign_syncs,
-        )  # fmt: skip
+        )

@@ -49,13 +49,22 @@ class BoardBench:
 
 @contextmanager
 def emulated(
-    hardware: Hardware, *, seed: int | None = None, effect: str | None = None, stepped: bool = True, bus: str | None = None,
-    journal: str | Path | None = None, home: bool = True, eds: str | Path | None = None,
-) -> Iterator[Bench]:  # fmt: skip
-    """The emulator, started, with a sealed plant: `seed` draws what is hidden (None: nobody knows), `effect` names it for those who test.
+    hardware: Hardware,
+    *,
+    seed: int | None = None,
+    effect: str | None = None,
+    stepped: bool = True,
+    bus: str | None = None,
+    journal: str | Path | None = None,
+    home: bool = True,
+    eds: str | Path | None = None,
+) -> Iterator[Bench]:
+    """The emulator, started, with a sealed plant: `seed` draws what is hidden (None: nobody knows), `effect`
+    names it for those who test.
 
-    `stepped` runs as fast as the machine computes; otherwise in real time. `bus`: None is a virtual one of its own. Without `home` the
-    tendons are taut from the start. `eds`: the file that lists the drives' objects, for both ends.
+    `stepped` runs as fast as the machine computes; otherwise in real time. `bus`: None is a virtual one of
+    its own. Without `home` the tendons are taut from the start. `eds`: the file that lists the drives'
+    objects, for both ends.
     """
     clock = SteppedClock() if stepped else WallClock()
     name = bus or f"virtual:fastrod-{next(_COUNT)}"
@@ -71,10 +80,16 @@ def emulated(
 
 @contextmanager
 def real(
-    hardware: Hardware, bus: str, *, camera: int | str | None = 0, eds: str | Path | None = None, journal: str | Path | None = None,
+    hardware: Hardware,
+    bus: str,
+    *,
+    camera: int | str | None = 0,
+    eds: str | Path | None = None,
+    journal: str | Path | None = None,
     home: bool = True,
-) -> Iterator[Bench]:  # fmt: skip
-    """The prototype on `bus` ("socketcan:can0"), with the video device `camera` (None: without), started, a person's hands beside it.
+) -> Iterator[Bench]:
+    """The prototype on `bus` ("socketcan:can0"), with the video device `camera` (None: without), started, a
+    person's hands beside it.
 
     Raises `DeviceError`, one sentence, for what is not there or does not answer.
     """
@@ -92,7 +107,8 @@ def real(
 def emulated_board(
     camera: Camera, board: CharucoBoard, *, lens: bool, seed: int | None = None, stepped: bool = True
 ) -> Iterator[BoardBench]:
-    """A camera whose frames are drawn: with another lens than `camera` has, or, without `lens`, at another place; `seed` draws which (None:
+    """A camera whose frames are drawn: with another lens than `camera` has, or, without `lens`, at another
+    place; `seed` draws which (None:
     nobody knows). Raises `InputError` for a seed that is none."""
     clock: Clock = SteppedClock() if stepped else WallClock()
     drawn = secrets.randbits(63) if seed is None else seed
@@ -105,7 +121,8 @@ def emulated_board(
 
 @contextmanager
 def real_board(camera: Camera, device: int | str) -> Iterator[BoardBench]:
-    """The video device as `camera`, and a person who holds the board. Raises `DeviceError` where it cannot be opened."""
+    """The video device as `camera`, and a person who holds the board. Raises `DeviceError` where it cannot be
+    opened."""
     source = VideoCamera(camera, device)
     try:
         yield BoardBench(source=source, hands=AskingBoardHands(), clock=WallClock(), truth=None)

@@ -24,12 +24,18 @@ DONE, FAILED, WRONG_INPUT = 0, 1, 2
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line `argv`; the exit code: 0 done, 2 the input is wrong (one sentence on stderr), 1 it failed."""
+    """Run the command line `argv`; the exit code: 0 done, 2 the input is wrong (one sentence on stderr), 1 it
+    failed."""
     parser, commands = build()
     words = list(sys.argv[1:] if argv is None else argv)
     if words and not words[0].startswith("-") and words[0] not in commands:
         return _refuse(f"no command {words[0]!r}; {nearest(words[0], commands)}")
-    if words[:1] == ["generate"] and len(words) > 1 and not words[1].startswith("-") and words[1] not in DATA_SETS:
+    if (
+        words[:1] == ["generate"]
+        and len(words) > 1
+        and not words[1].startswith("-")
+        and words[1] not in DATA_SETS
+    ):
         return _refuse(f"no data set {words[1]!r} to generate; {nearest(words[1], DATA_SETS)}")
     try:
         arguments, rest = parser.parse_known_args(words)
@@ -37,7 +43,13 @@ def main(argv: Sequence[str] | None = None) -> int:
             arguments.logs += [Path(word) for word in rest if not word.startswith("-")]
             rest = [word for word in rest if word.startswith("-")]
         if rest:
-            what = " ".join([parser.prog, arguments.command, *([arguments.kind] if arguments.command == "generate" else [])])
+            what = " ".join(
+                [
+                    parser.prog,
+                    arguments.command,
+                    *([arguments.kind] if arguments.command == "generate" else []),
+                ]
+            )
             return _refuse(f"{what} does not know {rest[0]!r}; `{what} --help` tells.")
         return _RUN[arguments.command](arguments)
     except UsageError as error:
@@ -104,7 +116,9 @@ def _identify(arguments: argparse.Namespace) -> int:
     swallowed = [word for word in arguments.held_out if Path(word).suffix and Path(word).is_file()]
     paths: list[Path] = arguments.logs + [Path(word) for word in swallowed]
     if not paths:
-        raise UsageError("the following arguments are required: LOG; `fastrod identify --help` says how it is used.")
+        raise UsageError(
+            "the following arguments are required: LOG; `fastrod identify --help` says how it is used."
+        )
     given = None if arguments.robot is None else load_robot(arguments.robot)
     logs, robots = zip(*(_read(path, given) for path in paths), strict=True)
     if any(robot != robots[0] for robot in robots):
@@ -112,10 +126,14 @@ def _identify(arguments: argparse.Namespace) -> int:
     out = arguments.out or (None if arguments.json else Path(f"{paths[0].stem}_identified"))
     with _folder(out), _progress() as bar:
         result = identify(
-            logs, robots[0], held_out=[word for word in arguments.held_out if word not in swallowed],
-            max_effects=arguments.max_effects, free_camera=arguments.free_camera,
-            network=arguments.network, progress=bar,
-        )  # fmt: skip
+            logs,
+            robots[0],
+            held_out=[word for word in arguments.held_out if word not in swallowed],
+            max_effects=arguments.max_effects,
+            free_camera=arguments.free_camera,
+            network=arguments.network,
+            progress=bar,
+        )
     written = [] if out is None else report.write(result, out)
     if arguments.json:
         print(report.text(result))
@@ -137,39 +155,61 @@ def _excite(arguments: argparse.Namespace) -> int:
     from fastrod.logs.runlog import write_log
 
     robot = load_robot(arguments.robot)
-    made = excitation(robot, bend=arguments.bend, payload=arguments.payload, rate=arguments.rate, speed=arguments.speed)
+    made = excitation(
+        robot, bend=arguments.bend, payload=arguments.payload, rate=arguments.rate, speed=arguments.speed
+    )
     path: Path = arguments.out or Path(f"{robot.name}_excitation.csv")
     if path.suffix not in (".csv", ".parquet"):
         raise InputError(f"{str(path)!r} does not end in .csv or .parquet; a run log does.")
     write_log(made.log, path, comment=made.comment)
     grid = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     for name in ("from", "to", "part", "tells"):
-        grid.add_column(f"{name} s" if name in ("from", "to") else name, justify="right" if name in ("from", "to") else "left")
+        grid.add_column(
+            f"{name} s" if name in ("from", "to") else name,
+            justify="right" if name in ("from", "to") else "left",
+        )
     said: set[str] = set()
     for part in made.parts:
-        grid.add_row(f"{part.start:.1f}", f"{part.end:.1f}", part.name, part.purpose if part.purpose not in said else "as above")
+        grid.add_row(
+            f"{part.start:.1f}",
+            f"{part.end:.1f}",
+            part.name,
+            part.purpose if part.purpose not in said else "as above",
+        )
         said.add(part.purpose)
     console = Console()
     console.print(grid)
-    console.print(f"wrote {path}: drive it, fill tip_x tip_y tip_z, then fastrod identify", soft_wrap=True, highlight=False, markup=False)
+    console.print(
+        f"wrote {path}: drive it, fill tip_x tip_y tip_z, then fastrod identify",
+        soft_wrap=True,
+        highlight=False,
+        markup=False,
+    )
     return DONE
 
 
 def _view(arguments: argparse.Namespace) -> int:
     from fastrod_viewer.server import serve
 
-    server = serve(arguments.host, arguments.port)  # first: a browser loads the page while the simulator is imported
+    # first: a browser loads the page while the simulator is imported
+    server = serve(arguments.host, arguments.port)
     from fastrod_viewer.app import FIRST, view
 
     view(
-        FIRST if arguments.what is None else arguments.what, robot=arguments.robot, n_robots=arguments.robots, host=arguments.host,
-        open_browser=not arguments.no_open, script=arguments.play, server=server,
-    )  # fmt: skip
+        FIRST if arguments.what is None else arguments.what,
+        robot=arguments.robot,
+        n_robots=arguments.robots,
+        host=arguments.host,
+        open_browser=not arguments.no_open,
+        script=arguments.play,
+        server=server,
+    )
     return DONE
 
 
 def _drive(arguments: argparse.Namespace) -> int:
-    """A bench that does not answer or is stopped on the way, a plan that it refused, measurements that do not tell: all that failed."""
+    """A bench that does not answer or is stopped on the way, a plan that it refused, measurements that do not
+    tell: all that failed."""
     check_drive(arguments)
     for module in ("cv2",) if arguments.action in BOARD_ACTIONS else ("can", "canopen", "cv2"):
         _need(module, "drive", "device")
@@ -189,7 +229,9 @@ def _envs(arguments: argparse.Namespace) -> int:
     _need("gymnasium", "envs", "envs")
     from fastrod_envs.describe import describe, summary
 
-    print(summary() if arguments.env is None else describe(arguments.env, _pairs(arguments.option, "--option")))
+    print(
+        summary() if arguments.env is None else describe(arguments.env, _pairs(arguments.option, "--option"))
+    )
     return DONE
 
 
@@ -206,12 +248,20 @@ def _train(arguments: argparse.Namespace) -> int:
             path = resume(out, arguments.steps, bar, trust=arguments.trust)
     else:
         if arguments.env is None:
-            raise UsageError("the following arguments are required: ENV; `fastrod train --help` says how it is used.")
+            raise UsageError(
+                "the following arguments are required: ENV; `fastrod train --help` says how it is used."
+            )
         plan = make_plan(
-            arguments.env, algorithm=arguments.algo, steps=arguments.steps, n_envs=arguments.envs, seed=arguments.seed,
-            imitate=arguments.imitate, options=_pairs(arguments.option, "--option"), settings=_pairs(arguments.set, "--set"),
+            arguments.env,
+            algorithm=arguments.algo,
+            steps=arguments.steps,
+            n_envs=arguments.envs,
+            seed=arguments.seed,
+            imitate=arguments.imitate,
+            options=_pairs(arguments.option, "--option"),
+            settings=_pairs(arguments.set, "--set"),
             curriculum=arguments.curriculum,
-        )  # fmt: skip
+        )
         out = out or Path(f"{plan.env.partition('/')[2]}_{plan.algorithm}_{plan.seed}")
         with _progress() as bar:
             path = train(plan, out, bar)
@@ -227,12 +277,21 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     from fastrod_envs.policies import Policy, find
 
     options = _pairs(arguments.option, "--option")
-    policy = None if arguments.policy == "none" else Policy(find(arguments.env, arguments.policy), trust=arguments.trust)
+    policy = (
+        None
+        if arguments.policy == "none"
+        else Policy(find(arguments.env, arguments.policy), trust=arguments.trust)
+    )
     with _progress() as bar:
         result = evaluation.evaluate(
-            arguments.env, policy, episodes=arguments.episodes, seed=arguments.seed, options=options,
-            baselines=not arguments.no_baselines, progress=bar,
-        )  # fmt: skip
+            arguments.env,
+            policy,
+            episodes=arguments.episodes,
+            seed=arguments.seed,
+            options=options,
+            baselines=not arguments.no_baselines,
+            progress=bar,
+        )
     written = [] if arguments.out is None else evaluation.write(result, arguments.out)
     if arguments.json:
         print(json.dumps(evaluation.figures(result), indent=1))
@@ -283,7 +342,9 @@ def _need(module: str, command: str, extra: str) -> None:
     from importlib.util import find_spec
 
     if find_spec(module) is None:
-        raise InputError(f"fastrod {command} needs {module.replace('_', '-')}: pip install 'fastrod[{extra}]'.")
+        raise InputError(
+            f"fastrod {command} needs {module.replace('_', '-')}: pip install 'fastrod[{extra}]'."
+        )
 
 
 def _bench(arguments: argparse.Namespace) -> int:
@@ -292,7 +353,10 @@ def _bench(arguments: argparse.Namespace) -> int:
     if not scripts and (_PERF.parent / "pyproject.toml").is_file():
         raise InputError(f"no benchmarks are in {str(_PERF)!r}; each is a bench_NAME.py there.")
     if not scripts:
-        raise InputError("fastrod bench needs the source checkout, whose folder perf/ holds the benchmarks; an installed package has none.")
+        raise InputError(
+            "fastrod bench needs the source checkout, whose folder perf/ holds the benchmarks; "
+            "an installed package has none."
+        )
     if arguments.name is not None and arguments.name not in scripts:
         raise UnknownNameError(f"no benchmark {arguments.name!r}; {nearest(arguments.name, scripts)}")
     chosen = scripts if arguments.name is None else {arguments.name: scripts[arguments.name]}
@@ -322,15 +386,25 @@ def _script(path: Path, argv: list[str]) -> int:
 
 
 _RUN: dict[str, Callable[[argparse.Namespace], int]] = {
-    "demo": _demo, "replay": _replay, "identify": _identify, "excite": _excite, "view": _view, "drive": _drive, "envs": _envs,
-    "train": _train, "evaluate": _evaluate, "generate": _generate, "bench": _bench,
-}  # fmt: skip
+    "demo": _demo,
+    "replay": _replay,
+    "identify": _identify,
+    "excite": _excite,
+    "view": _view,
+    "drive": _drive,
+    "envs": _envs,
+    "train": _train,
+    "evaluate": _evaluate,
+    "generate": _generate,
+    "bench": _bench,
+}
 """What each command does."""
 
 
 @contextmanager
 def _folder(out: Path | None) -> Iterator[None]:
-    """Of what is about to be computed, made before rather than after; gone again where nothing comes of it."""
+    """Of what is about to be computed, made before rather than after; gone again where nothing comes of
+    it."""
     from fastrod.identification.log.replay import make_folder
 
     fresh = out is not None and not out.exists()

@@ -1,7 +1,8 @@
-"""The main job on an embedded default, start to end: a batch of robots, then a robot that is excited, identified and driven anew.
+"""The main job on an embedded default, start to end: a batch of robots, then a robot that is excited,
+identified and driven anew.
 
-The robot is the emulated prototype with an effect that nobody has declared. Without the packages of the device wing, a log that ships with
-fastrod takes its place.
+The robot is the emulated prototype with an effect that nobody has declared. Without the packages of the
+device wing, a log that ships with fastrod takes its place.
 """
 
 from __future__ import annotations
@@ -37,9 +38,9 @@ _DEVICE = {"canopen": "canopen", "python-can": "can", "opencv-python-headless": 
 
 
 def run(out: Path | None = None, *, seed: int | None = None, view: bool = True) -> None:
-    """Print a batch of random prototypes, then the whole loop on an emulated one: logs, report and identified robot go to the folder `out`
-    if given. `seed` draws what the emulator hides (None: nobody knows). With `view`, where somebody looks on, the viewer is served at the
-    end until Ctrl+C.
+    """Print a batch of random prototypes, then the whole loop on an emulated one: logs, report and identified
+    robot go to the folder `out` if given. `seed` draws what the emulator hides (None: nobody knows). With
+    `view`, where somebody looks on, the viewer is served at the end until Ctrl+C.
 
     Raises `InputError`, before the work, where that folder cannot be written or is not empty.
     """
@@ -50,7 +51,9 @@ def run(out: Path | None = None, *, seed: int | None = None, view: bool = True) 
     if out is not None:
         make_folder(out)
         if any(out.iterdir()):
-            raise InputError(f"folder {str(out)!r} is not empty; give --out a new one, so that nothing is written over.")
+            raise InputError(
+                f"folder {str(out)!r} is not empty; give --out a new one, so that nothing is written over."
+            )
     missing = [name for name, module in _DEVICE.items() if find_spec(module) is None]
     if seed is not None and seed < 0:
         raise InputError(f"seed is {seed}; it must be a whole number from 0.")
@@ -59,7 +62,10 @@ def run(out: Path | None = None, *, seed: int | None = None, view: bool = True) 
     _batch(robot, console)
     if missing:
         _identified(robot, console, out)
-        said = f"the whole loop, on an emulated prototype, needs {', '.join(missing)}: pip install 'fastrod[device,viewer]'"
+        said = (
+            f"the whole loop, on an emulated prototype, needs {', '.join(missing)}: pip install "
+            "'fastrod[device,viewer]'"
+        )
         console.print(said, markup=False, soft_wrap=True, highlight=False)
         return
     with TemporaryDirectory() as folder:
@@ -67,7 +73,8 @@ def run(out: Path | None = None, *, seed: int | None = None, view: bool = True) 
 
 
 def random_bend(rng: np.random.Generator, robot: Robot, n_robots: int) -> Floats:
-    """(n_robots, n_tendons) absolute tendon lengths [m] of single-segment robots bent by a random angle in a random direction."""
+    """(n_robots, n_tendons) absolute tendon lengths [m] of single-segment robots bent by a random angle in a
+    random direction."""
     direction = rng.uniform(0.0, 2.0 * np.pi, n_robots)
     bend = _BEND * np.sqrt(rng.uniform(0.0, 1.0, n_robots))
     vector = bend[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
@@ -96,13 +103,15 @@ def _batch(robot: Robot, console: Console) -> None:
     )
     per_pass, residual = _steps(sim, start, end, force)
     console.print(
-        f"  step:   {N_STEPS} steps of {1e3 * DT:g} ms to other lengths, {1e6 * per_pass:.2f} us a robot and step\n"
+        f"  step:   {N_STEPS} steps of {1e3 * DT:g} ms to other lengths, {1e6 * per_pass:.2f} us a robot "
+        "and step\n"
         f"          median boundary residual at the end {1e6 * residual:.2g} um"
     )
 
 
 def _steps(sim: Any, start: Floats, end: Floats, force: Floats) -> tuple[float, float]:
-    """Seconds a robot and pass, and the median boundary residual at the end [m], on the way from `start` to `end`."""
+    """Seconds a robot and pass, and the median boundary residual at the end [m], on the way from `start` to
+    `end`."""
     commands = [start + (k + 1) / N_STEPS * (end - start) for k in range(N_STEPS)]
     clock = time.perf_counter()
     for command in commands:
@@ -125,8 +134,10 @@ def _looped(console: Console, out: Path, seed: int | None, *, keep: bool, view: 
     from fastrod_device.workbench import emulated
 
     console.print(
-        "\n[bold]An emulated prototype[/]: four CiA 402 drives on a virtual CAN bus, a camera whose frames are drawn, a robot with\n"
-        "stiffnesses and an effect that nobody has declared. It is excited, identified, and its tip driven along three paths."
+        "\n[bold]An emulated prototype[/]: four CiA 402 drives on a virtual CAN bus, a camera whose frames "
+        "are drawn, a robot with\n"
+        "stiffnesses and an effect that nobody has declared. It is excited, identified, and its tip driven "
+        "along three paths."
     )
     stages = Stages(console)
     with stages, emulated(load_hardware(), seed=seed) as bench:
@@ -148,16 +159,21 @@ def _looped(console: Console, out: Path, seed: int | None, *, keep: bool, view: 
         console.print(f"the run beside both models, in a browser: {command}", soft_wrap=True, highlight=False)
     else:
         console.print(
-            "logs, report and the identified robot: fastrod demo --out DIR; then fastrod view DIR/excite.csv --robot DIR/identified.toml "
+            "logs, report and the identified robot: fastrod demo --out DIR; then fastrod view "
+            "DIR/excite.csv --robot DIR/identified.toml "
             "shows the run\nbeside both models in a browser",
-            soft_wrap=True, highlight=False,
-        )  # fmt: skip
-    console.print("next: fastrod drive --emulate drives it by hand; --bus socketcan:can0 the real one", highlight=False)
+            soft_wrap=True,
+            highlight=False,
+        )
+    console.print(
+        "next: fastrod drive --emulate drives it by hand; --bus socketcan:can0 the real one", highlight=False
+    )
 
 
 @final
 class Stages:
-    """A progress callback (what, done, total) that says each stage once it is over, with the seconds that it took."""
+    """A progress callback (what, done, total) that says each stage once it is over, with the seconds that it
+    took."""
 
     def __init__(self, console: Console) -> None:
         from rich.console import Console
@@ -178,7 +194,8 @@ class Stages:
             self.begin("")
 
     def __call__(self, what: str, done: int, total: int) -> None:
-        """What is being done, "stage" or "stage: detail", and how far it is; another stage ends the one before."""
+        """What is being done, "stage" or "stage: detail", and how far it is; another stage ends the one
+        before."""
         if self._status is not None:
             self._status.update(f"{what}: {done} of {total}")
         if (stage := what.partition(":")[0]) != self._what:
@@ -197,7 +214,10 @@ def _identified(robot: Robot, console: Console, out: Path | None) -> None:
     from fastrod.identification.report import report
     from fastrod.logs.runlog import read_log
 
-    console.print("\n[bold]demo_log.csv[/], a prototype simulated by another solver, with noise and an effect that nobody declared")
+    console.print(
+        "\n[bold]demo_log.csv[/], a prototype simulated by another solver, with noise and an "
+        "effect that nobody declared"
+    )
     with as_file(files("fastrod").joinpath("data").joinpath("demo_log.csv")) as path:
         log = read_log(path, robot)
     with _waiting("looking for what the model lacks"):
@@ -205,4 +225,7 @@ def _identified(robot: Robot, console: Console, out: Path | None) -> None:
     console.print(report.table(result))
     for written in report.write(result, out) if out is not None else []:
         console.print(f"wrote {written}", soft_wrap=True, highlight=False)
-    console.print("next: fastrod identify LOG --robot R looks for it in your own log; --out DIR writes the report", highlight=False)
+    console.print(
+        "next: fastrod identify LOG --robot R looks for it in your own log; --out DIR writes the report",
+        highlight=False,
+    )

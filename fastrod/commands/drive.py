@@ -1,4 +1,5 @@
-"""`fastrod drive`: the prototype or its emulator, by hand, through a run, along a path, through the whole loop.
+"""`fastrod drive`: the prototype or its emulator, by hand, through a run, along a path, through the whole
+loop.
 
 What needs two wings at once is put together here: the viewer drives a link, a policy asks for commands.
 """
@@ -32,7 +33,8 @@ _EVENTS = "events.csv"
 
 
 def _teleop(arguments: argparse.Namespace, _: Progress | None) -> int:
-    """Hands drive in the browser; nothing moves when nobody watches. Stops and their reasons are kept in a file."""
+    """Hands drive in the browser; nothing moves when nobody watches. Stops and their reasons are kept in a
+    file."""
     import contextlib
     import itertools
     import signal
@@ -47,13 +49,18 @@ def _teleop(arguments: argparse.Namespace, _: Progress | None) -> int:
     def say(sentence: str) -> None:
         print(sentence, file=sys.stderr, flush=True)
 
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # homing, too, ends with the drives switched off
+    # homing, too, ends with the drives switched off
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     hardware = _hardware(arguments)
     urgent(1)  # all threads of the page, too: one that waits for its turn holds up those of the drives
     server = serve(port=arguments.port)  # a port that is taken is no news for after the homing
     say("Preparing the model ...")
     FreeWorld(hardware.robot).jacobian()  # compiled or loaded now: nothing may hold up the drives later
-    say("Finding the drives ..." if arguments.no_home else "Finding the drives, winding the wires, looking for the marker: about 25 s ...")
+    say(
+        "Finding the drives ..."
+        if arguments.no_home
+        else "Finding the drives, winding the wires, looking for the marker: about 25 s ..."
+    )
     names = itertools.chain(["drive.csv"], (f"drive-{k}.csv" for k in itertools.count(2)))
     journal = next(path for name in names if not (path := Path(name)).with_suffix(".events.csv").exists())
     events = journal.with_suffix(".events.csv")
@@ -91,7 +98,10 @@ def _excite(arguments: argparse.Namespace, progress: Progress | None) -> int:
     run = excitation(hardware.robot, payload=arguments.payload, rate=hardware.camera.rate)
     with _kept(out), _bench(arguments, hardware, journal=out) as bench:
         log = excite(bench.prototype, run, bench.hands, out, progress=progress)
-    print(f"wrote {out}: {len(log)} rows, {int(log.measured.sum())} with the tip; next: fastrod identify {out} --robot {_named(arguments)}")
+    print(
+        f"wrote {out}: {len(log)} rows, {int(log.measured.sum())} with the tip; next: fastrod identify "
+        f"{out} --robot {_named(arguments)}"
+    )
     return DONE
 
 
@@ -109,7 +119,11 @@ def _track(arguments: argparse.Namespace, _: Progress | None) -> int:
     if name not in known:
         raise UnknownNameError(f"no path {name!r}; {nearest(name, known)}")
     out = _recorded(arguments.out or Path(f"{name}.csv"), hardware)
-    law = None if arguments.policy is None else _policy(arguments.policy, name, APPROACH, hardware.robot, arguments.trust)
+    law = (
+        None
+        if arguments.policy is None
+        else _policy(arguments.policy, name, APPROACH, hardware.robot, arguments.trust)
+    )
     made = planned(hardware.robot, known[name])
     with _kept(out), _bench(arguments, hardware, journal=out) as bench:
         log = follow(bench.prototype, made, out, law=law)
@@ -139,7 +153,9 @@ def _loop(arguments: argparse.Namespace, progress: Progress | None) -> int:
 
     hardware, out = _hardware(arguments), arguments.out or Path("loop")
     if out.is_dir() and any(path.name != _EVENTS for path in out.iterdir()):
-        raise InputError(f"folder {str(out)!r} is not empty; give --out a new one, so that nothing is written over.")
+        raise InputError(
+            f"folder {str(out)!r} is not empty; give --out a new one, so that nothing is written over."
+        )
     make_folder(out)
     with _kept(out), _bench(arguments, hardware, journal=out / _EVENTS) as bench:
         loop = close_loop(bench.prototype, bench.hands, out, payload=arguments.payload, progress=progress)
@@ -159,7 +175,11 @@ def _calibrate(arguments: argparse.Namespace, progress: Progress | None) -> int:
     from fastrod_device.calibration import calibrate
     from fastrod_device.camera import save_camera
 
-    hardware, board, out = _hardware(arguments), _board(arguments), _camera_file(arguments.out or Path("camera.toml"))
+    hardware, board, out = (
+        _hardware(arguments),
+        _board(arguments),
+        _camera_file(arguments.out or Path("camera.toml")),
+    )
     before = hardware.camera
     with _board_bench(arguments, before, board, lens=True) as bench:
         bench.hands.wave()
@@ -180,10 +200,17 @@ def _register(arguments: argparse.Namespace, progress: Progress | None) -> int:
     from fastrod_device.calibration import register_base
     from fastrod_device.camera import save_camera
 
-    hardware, board, out = _hardware(arguments), _board(arguments), _camera_file(arguments.out or Path("camera_placed.toml"))
+    hardware, board, out = (
+        _hardware(arguments),
+        _board(arguments),
+        _camera_file(arguments.out or Path("camera_placed.toml")),
+    )
     before = hardware.camera
     if arguments.at is None and not arguments.emulate:
-        raise InputError("say where the board is, base_from_board: --at X Y Z QW QX QY QZ, in metres; once or several times.")
+        raise InputError(
+            "say where the board is, base_from_board: --at X Y Z QW QX QY QZ, in metres; once "
+            "or several times."
+        )
     places = [_place(row) for row in arguments.at] if arguments.at else fixtures(before, board)
     each = -(-_views(arguments) // len(places))
     with _board_bench(arguments, before, board, lens=False) as bench:
@@ -213,7 +240,8 @@ def _latency(arguments: argparse.Namespace, _: Progress | None) -> int:
         sealed = None if bench.emulator is None else bench.emulator.seal.open()
     told, now = hardware.camera.latency, max(0.0, round(hardware.camera.latency + found.delay, 4))
     print(
-        f"the tip is seen {1e3 * found.delay:.1f} ms late (standard error {1e3 * found.stderr:.1f} ms), beyond the {1e3 * told:g} ms "
+        f"the tip is seen {1e3 * found.delay:.1f} ms late (standard error {1e3 * found.stderr:.1f} ms), "
+        f"beyond the {1e3 * told:g} ms "
         "that the hardware file has; of strong friction or backlash some ms may count as late, too"
     )
     if sealed is not None:
@@ -228,9 +256,14 @@ def _latency(arguments: argparse.Namespace, _: Progress | None) -> int:
 
 
 ACTIONS: dict[str, Callable[[argparse.Namespace, Progress | None], int]] = {
-    "teleop": _teleop, "excite": _excite, "track": _track, "loop": _loop, "calibrate": _calibrate, "register": _register,
+    "teleop": _teleop,
+    "excite": _excite,
+    "track": _track,
+    "loop": _loop,
+    "calibrate": _calibrate,
+    "register": _register,
     "latency": _latency,
-}  # fmt: skip
+}
 """What each action does; the exit code."""
 
 
@@ -241,12 +274,20 @@ def _hardware(arguments: argparse.Namespace) -> Hardware:
 
 
 @contextmanager
-def _bench(arguments: argparse.Namespace, hardware: Hardware, *, stepped: bool = True, journal: Path | None = None) -> Iterator[Bench]:
+def _bench(
+    arguments: argparse.Namespace, hardware: Hardware, *, stepped: bool = True, journal: Path | None = None
+) -> Iterator[Bench]:
     import sys
 
     from fastrod_device import workbench
 
-    events = None if journal is None else journal if journal.name == _EVENTS else journal.with_suffix(".events.csv")
+    events = (
+        None
+        if journal is None
+        else journal
+        if journal.name == _EVENTS
+        else journal.with_suffix(".events.csv")
+    )
     home = not arguments.no_home
     if arguments.emulate:
         made = workbench.emulated(
@@ -259,12 +300,7 @@ def _bench(arguments: argparse.Namespace, hardware: Hardware, *, stepped: bool =
         )
     else:
         made = workbench.real(
-            hardware,
-            arguments.bus,
-            camera=_device(arguments),
-            eds=arguments.eds,
-            journal=events,
-            home=home,
+            hardware, arguments.bus, camera=_device(arguments), eds=arguments.eds, journal=events, home=home
         )
     with made as bench:
         for sentence in bench.prototype.drives.notices:
@@ -273,12 +309,16 @@ def _bench(arguments: argparse.Namespace, hardware: Hardware, *, stepped: bool =
 
 
 @contextmanager
-def _board_bench(arguments: argparse.Namespace, camera: Camera, board: CharucoBoard, *, lens: bool) -> Iterator[BoardBench]:
+def _board_bench(
+    arguments: argparse.Namespace, camera: Camera, board: CharucoBoard, *, lens: bool
+) -> Iterator[BoardBench]:
     """Emulated, what is hidden is the lens, or else where the camera stands."""
     from fastrod_device import workbench
 
     if arguments.emulate:
-        with workbench.emulated_board(camera, board, lens=lens, seed=arguments.seed, stepped=not arguments.real_time) as bench:
+        with workbench.emulated_board(
+            camera, board, lens=lens, seed=arguments.seed, stepped=not arguments.real_time
+        ) as bench:
             yield bench
         return
     device = _device(arguments)
@@ -312,7 +352,9 @@ def _camera_file(out: Path) -> Path:
     if out.suffix != ".toml":
         raise InputError(f"{str(out)!r} does not end in .toml; a camera file does.")
     if out.exists():
-        raise InputError(f"{str(out)!r} is there already; give --out another name, so that nothing is written over.")
+        raise InputError(
+            f"{str(out)!r} is there already; give --out another name, so that nothing is written over."
+        )
     if not out.parent.is_dir():
         raise InputError(f"folder {str(out.parent)!r} is not there; make it, or write somewhere else.")
     return out
@@ -321,8 +363,15 @@ def _camera_file(out: Path) -> Path:
 def _put_camera(out: Path, arguments: argparse.Namespace) -> str:
     from fastrod_device.hardware import SHIPPED
 
-    file = f"{arguments.hardware}" if arguments.hardware else f"a copy of {SHIPPED}, which --hardware then names"
-    return f'beside the hardware file it is used by the line camera = "{out.name}" above the first table, in place of [camera], in {file}'
+    file = (
+        f"{arguments.hardware}"
+        if arguments.hardware
+        else (f"a copy of {SHIPPED}, which --hardware then names")
+    )
+    return (
+        f'beside the hardware file it is used by the line camera = "{out.name}" above the first table, '
+        f"in place of [camera], in {file}"
+    )
 
 
 def _device(arguments: argparse.Namespace) -> int | str | None:
@@ -337,11 +386,20 @@ def _board(arguments: argparse.Namespace) -> CharucoBoard:
     columns, rows = arguments.board or (7, 5)
     square = 0.02 if arguments.square is None else arguments.square
     marker = 0.75 * square if arguments.board_marker is None else arguments.board_marker
-    return CharucoBoard(columns=columns, rows=rows, square=square, marker=marker, dictionary=arguments.dictionary or "DICT_5X5_100")
+    return CharucoBoard(
+        columns=columns,
+        rows=rows,
+        square=square,
+        marker=marker,
+        dictionary=arguments.dictionary or "DICT_5X5_100",
+    )
 
 
 def _views(arguments: argparse.Namespace) -> int:
-    least, views = 5 if arguments.action == "calibrate" else 1, 25 if arguments.views is None else arguments.views
+    least, views = (
+        5 if arguments.action == "calibrate" else 1,
+        25 if arguments.views is None else arguments.views,
+    )
     if views < least:
         raise InputError(f"--views is {views}; {arguments.action} needs {least} or more.")
     return int(views)
@@ -359,7 +417,10 @@ def _place(row: Sequence[float]) -> tuple[Floats, Floats]:
 
 
 def _tell_views(found: CameraCalibration | Registration, passed: str) -> None:
-    print(f"{len(found.used)} views used, reprojection error {found.error:.3f} px rms; {len(found.refused)} views refused")
+    print(
+        f"{len(found.used)} views used, reprojection error {found.error:.3f} px rms; {len(found.refused)} "
+        "views refused"
+    )
     for k, why in found.refused:
         print(f"  view {k + 1}: {why}")
     print(f"frames passed over: {passed}")

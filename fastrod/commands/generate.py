@@ -22,12 +22,17 @@ if TYPE_CHECKING:
 
 
 def plan_of(arguments: argparse.Namespace, options: Mapping[str, object]) -> Plan:
-    """The plan of a command line; `options` are those of an environment. Raises `InputError` and what a plan raises."""
+    """The plan of a command line; `options` are those of an environment. Raises `InputError` and what a plan
+    raises."""
     made = {"shapes": _shapes, "rollouts": _rollouts, "sweep": _sweep}[arguments.kind](arguments, options)
     return Plan(work=made, count=arguments.count, seed=arguments.seed, shard_rows=_shard_rows(arguments))
 
 
-def run(arguments: argparse.Namespace, options: Mapping[str, object], progress: Callable[[str, int, int], None] | None) -> Summary:
+def run(
+    arguments: argparse.Namespace,
+    options: Mapping[str, object],
+    progress: Callable[[str, int, int], None] | None,
+) -> Summary:
     """Make what the words ask for."""
     plan = plan_of(arguments, options)
     return generate(plan, arguments.out, workers=arguments.workers, ray=arguments.ray, progress=progress)
@@ -46,12 +51,21 @@ def table(summary: Summary) -> Table:
     unit = "rows" if summary.kind in ("shapes", "sweep") else "episodes"
     grid = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_header=False)
     grid.title, grid.title_justify = f"{summary.kind} in {summary.folder}", "left"
-    grid.add_row(unit, f"{summary.count:,}, each once" + (f"; {summary.rows:,} rows" if summary.rows != summary.count else ""))
+    grid.add_row(
+        unit,
+        f"{summary.count:,}, each once"
+        + (f"; {summary.rows:,} rows" if summary.rows != summary.count else ""),
+    )
     grid.add_row("without success", f"{summary.failed:,}, kept and marked")
     made = f"{summary.made:,} made now" if summary.made < summary.shards else "all made now"
-    grid.add_row("shards", f"{summary.shards:,}, {made if summary.made else 'all were there'}; {summary.bytes / 1e6:,.1f} MB")
     grid.add_row(
-        "seconds", f"{summary.seconds:.1f}" + (f"; {summary.rate:,.{0 if summary.rate >= 10.0 else 2}f} {unit}/s" if summary.made else "")
+        "shards",
+        f"{summary.shards:,}, {made if summary.made else 'all were there'}; {summary.bytes / 1e6:,.1f} MB",
+    )
+    grid.add_row(
+        "seconds",
+        f"{summary.seconds:.1f}"
+        + (f"; {summary.rate:,.{0 if summary.rate >= 10.0 else 2}f} {unit}/s" if summary.made else ""),
     )
     return grid
 
@@ -66,7 +80,9 @@ def _robot(arguments: argparse.Namespace, *, density: float | None = None) -> st
     """The robot as a text, so that the plan needs no other file."""
     robot = load_robot(arguments.robot)
     if density is not None:
-        robot = replace(robot, segments=tuple(replace(segment, line_density=density) for segment in robot.segments))
+        robot = replace(
+            robot, segments=tuple(replace(segment, line_density=density) for segment in robot.segments)
+        )
     return dumps(robot)
 
 
@@ -84,15 +100,21 @@ def _shapes(arguments: argparse.Namespace, _: Mapping[str, object]) -> Shapes:
 
 def _rollouts(arguments: argparse.Namespace, options: Mapping[str, object]) -> Rollouts | Trajectories:
     if (arguments.env is None) == (arguments.robot is None):
-        raise InputError("rollouts are of an environment or of a robot's own motion; give --env ENV or --robot R.")
+        raise InputError(
+            "rollouts are of an environment or of a robot's own motion; give --env ENV or --robot R."
+        )
     of_robot = _given(arguments, "steps", "dt", "bend", "speed", "force")
     if arguments.env is None:
         if options or arguments.policy is not None:
-            raise InputError("--policy and --option are of an environment; with --robot the commands are random.")
+            raise InputError(
+                "--policy and --option are of an environment; with --robot the commands are random."
+            )
         return Trajectories(robot=_robot(arguments), effects=tuple(arguments.effect), **of_robot)
     if of_robot or arguments.effect:
         wrong = f"--{next(iter(of_robot), 'effect')}"
-        raise InputError(f"{wrong} is of a robot's own motion; with --env give --option NAME=VALUE, such as n_steps=100.")
+        raise InputError(
+            f"{wrong} is of a robot's own motion; with --env give --option NAME=VALUE, such as n_steps=100."
+        )
     return Rollouts(env=arguments.env, options=tuple(options.items()), **_given(arguments, "policy"))
 
 

@@ -15,7 +15,8 @@ TOUCHES = 1e-9
 
 @dataclass(frozen=True)
 class Contacts:
-    """The contacts of a state, robot axis first, world frame. Rows are filled from the left; what is beyond `count` is nan, or
+    """The contacts of a state, robot axis first, world frame. Rows are filled from the left; what is beyond
+    `count` is nan, or
     -1 in `obstacle`. One touch may be held by several neighbouring contacts that share its force."""
 
     names: tuple[str, ...]
@@ -35,16 +36,19 @@ class Contacts:
     arclength: Floats
     """(n_robots, n) of the rod [m]."""
     wrench: Floats
-    """(n_robots, n_obstacles, 6) on each obstacle by each robot: force [N], moment about the obstacle's origin [N m]."""
+    """(n_robots, n_obstacles, 6) on each obstacle by each robot: force [N], moment about the obstacle's
+    origin [N m]."""
     clearance: Floats
     """(n_robots,) smallest gap to anything; a lower bound where nothing is near [m]."""
     deep: Flags
-    """(n_robots,) the centreline lies inside an obstacle: its surface was entered by more than the rod's radius."""
+    """(n_robots,) the centreline lies inside an obstacle: its surface was entered by more than the rod's
+    radius."""
     tip_arclength: Floats
     """(n_robots,) [m]."""
 
     def in_contact(self, name: str | None = None) -> Flags:
-        """(n_robots,) which robots touch the obstacle (or `rod 3`) of this name; None: anything. Raises `UnknownNameError`."""
+        """(n_robots,) which robots touch the obstacle (or `rod 3`) of this name; None: anything. Raises
+        `UnknownNameError`."""
         if name is None:
             return self.count > 0
         if name in self.names:

@@ -1,16 +1,19 @@
-"""Closest points by FCL and by closed forms: one query at a time, exact, and no search shared with the fast path.
+"""Closest points by FCL and by closed forms: one query at a time, exact, and no search shared with the fast
+path.
 
-FCL only names the closest face; distance and points then come from that face by a closed form. How FCL is asked follows from
-measurements against brute force (python-fcl 0.7):
+FCL only names the closest face; distance and points then come from that face by a closed form. How FCL is
+asked follows from measurements against brute force (python-fcl 0.7):
 
-- a point is a sphere of radius 0 against the mesh: face and distance right to 1e-17 m; 11-33 us a query, 12 to 20 000 faces;
-- a segment a-b is the one-triangle mesh (a, a, b), given first; 20-45 us a question. Where it is exactly parallel to a face
-  FCL's triangle distance misses by up to 6 mm: in 1 of 100 such cases with the obstacle first, 1 of 5000 with the segment first,
-  none of 10 000 once its end is moved by 1e-12 to 1e-9 of its length. So it is asked twice, as it is and with its end moved, and
-  the nearer face counts;
+- a point is a sphere of radius 0 against the mesh: face and distance right to 1e-17 m; 11-33 us a query, 12
+  to 20 000 faces;
+- a segment a-b is the one-triangle mesh (a, a, b), given first; 20-45 us a question. Where it is exactly
+  parallel to a face FCL's triangle distance misses by up to 6 mm: in 1 of 100 such cases with the obstacle
+  first, 1 of 5000 with the segment first, none of 10 000 once its end is moved by 1e-12 to 1e-9 of its
+  length. So it is asked twice, as it is and with its end moved, and the nearer face counts;
 - a capsule is never asked: libccd's iteration is off by up to 5e-5 m (radius 1e-6), and slower, 100-130 us;
-- FCL drops the inside of a triangle whose doubled area squared is below 1e-15, in its own unit, so that a mesh of 0.2 mm
-  triangles in metres is wrong by 0.02 mm: here the BVH is in units that are small enough, a power of two.
+- FCL drops the inside of a triangle whose doubled area squared is below 1e-15, in its own unit, so that a
+  mesh of 0.2 mm triangles in metres is wrong by 0.02 mm: here the BVH is in units that are small enough, a
+  power of two.
 """
 
 from __future__ import annotations
@@ -24,7 +27,16 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from fastrod.contact.geometry import Obstacle, Triple
-from fastrod.contact.normals import EDGE_AB, EDGE_BC, EDGE_CA, FACE, VERTEX_A, VERTEX_B, VERTEX_C, pseudonormals
+from fastrod.contact.normals import (
+    EDGE_AB,
+    EDGE_BC,
+    EDGE_CA,
+    FACE,
+    VERTEX_A,
+    VERTEX_B,
+    VERTEX_C,
+    pseudonormals,
+)
 from fastrod.errors import InputError
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.types import Floats
@@ -34,7 +46,8 @@ Signed: TypeAlias = tuple[float, Triple]
 
 _TOUCH = 1e-9  # m; nearer than this the direction from the surface is the feature's normal
 _NUDGE: Floats = 1e-11 * np.array([0.31, 0.57, 0.76])
-"""Per length, in a direction that no face is likely to have: takes a segment out of being exactly parallel to one."""
+"""Per length, in a direction that no face is likely to have: takes a segment out of being exactly parallel to
+one."""
 _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
 
@@ -55,7 +68,8 @@ class SegmentClosest(NamedTuple):
     """The closest points of an obstacle and a segment a-b."""
 
     distance: float
-    """A mesh: to its surface, unsigned, 0 where the segment crosses it. A primitive: the smallest signed distance along it [m]."""
+    """A mesh: to its surface, unsigned, 0 where the segment crosses it. A primitive: the smallest signed
+    distance along it [m]."""
     point: Floats
     """(3,) on the surface, world [m]; one of them where the segment crosses more than once."""
     on_segment: Floats
@@ -71,13 +85,17 @@ class _Mesh:
 
     def __init__(self, obstacle: Obstacle) -> None:
         corner = obstacle.vertices[obstacle.faces]
-        double_area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+        double_area = np.linalg.norm(
+            np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1
+        )
         extent = float(np.ptp(obstacle.vertices, axis=0).max())
         smallest = max(float(double_area.min()), 1e-18 * extent**2)
         # doubled area squared above 1e-9 in units of the BVH, and the mesh at least 1000 of them wide
         self.scale = 2.0 ** math.ceil(math.log2(max(1e3 / extent, math.sqrt(3.2e-5 / smallest))))
         self.body = _bvh(obstacle.vertices * self.scale, obstacle.faces)
-        self.corners: list[tuple[Triple, Triple, Triple]] = [(tuple(a), tuple(b), tuple(c)) for a, b, c in corner.tolist()]
+        self.corners: list[tuple[Triple, Triple, Triple]] = [
+            (tuple(a), tuple(b), tuple(c)) for a, b, c in corner.tolist()
+        ]
         self.normals = pseudonormals(obstacle.vertices, obstacle.faces)
 
     def face_near(self, p: Floats, q: Floats) -> int:
@@ -96,7 +114,9 @@ def _fcl() -> Any:
     try:
         return import_module("fcl")
     except ImportError as error:
-        raise InputError("the direct contact path needs the package python-fcl, which is not installed; install it.") from error
+        raise InputError(
+            "the direct contact path needs the package python-fcl, which is not installed; install it."
+        ) from error
 
 
 def _bvh(vertices: Floats, faces: Any) -> Any:
@@ -109,10 +129,11 @@ def _bvh(vertices: Floats, faces: Any) -> Any:
 
 
 class DirectScene:
-    """Closest points by FCL, one BVH per mesh (built once, shared between scenes of the same Obstacle object).
+    """Closest points by FCL, one BVH per mesh (built once, shared between scenes of the same Obstacle
+    object).
 
-    Obstacles stand at their rest pose until `place` moves them. `point` and `segment` raise `InputError` for an obstacle that the
-    scene does not have and for coordinates that are not three finite numbers.
+    Obstacles stand at their rest pose until `place` moves them. `point` and `segment` raise `InputError` for
+    an obstacle that the scene does not have and for coordinates that are not three finite numbers.
     """
 
     def __init__(self, obstacles: Sequence[Obstacle]) -> None:
@@ -127,17 +148,21 @@ class DirectScene:
             self.place(k, obstacle.position, obstacle.quaternion)
 
     def place(self, k: int, position: Sequence[float] | Floats, quaternion: Sequence[float] | Floats) -> None:
-        """Stand obstacle `k` at world_from_obstacle: position [m], quaternion w x y z, its norm 1 within 1e-6."""
+        """Stand obstacle `k` at world_from_obstacle: position [m], quaternion w x y z, its norm 1 within
+        1e-6."""
         self._check(k)
         at, turn = _finite("position", position, 3), _finite("quaternion", quaternion, 4)
         norm = float(np.linalg.norm(turn))
         if abs(norm - 1.0) > 1e-6:
-            raise InputError(f"quaternion of obstacle {self.obstacles[k].name!r} has norm {norm:.6g}; it must be 1.")
+            raise InputError(
+                f"quaternion of obstacle {self.obstacles[k].name!r} has norm {norm:.6g}; it must be 1."
+            )
         self._position[k] = at
         self._rotation[k] = matrix_from_quaternion(turn[None] / norm)[0]
 
     def point(self, k: int, p: Sequence[float] | Floats) -> Closest:
-        """Signed distance of the world point `p` (3,) [m] to the surface of obstacle `k`, and where that is."""
+        """Signed distance of the world point `p` (3,) [m] to the surface of obstacle `k`, and where that
+        is."""
         self._check(k)
         at, turn = self._position[k], self._rotation[k]
         world = _finite("point", p, 3)
@@ -161,7 +186,8 @@ class DirectScene:
         return Closest(distance, normal, turn @ np.array(nearest) + at, face)
 
     def segment(self, k: int, a: Sequence[float] | Floats, b: Sequence[float] | Floats) -> SegmentClosest:
-        """Distance of the world segment from `a` to `b`, each (3,) [m], to obstacle `k`, and where that is."""
+        """Distance of the world segment from `a` to `b`, each (3,) [m], to obstacle `k`, and where that
+        is."""
         self._check(k)
         at, turn = self._position[k], self._rotation[k]
         start, end = _finite("segment start", a, 3), _finite("segment end", b, 3)
@@ -173,17 +199,23 @@ class DirectScene:
             fraction = _lowest(obstacle, p, q)
             distance, gradient = signed(_triple(p + fraction * (q - p)), size)
             on_segment = start + fraction * (end - start)
-            return SegmentClosest(distance, on_segment - distance * (turn @ np.array(gradient)), on_segment, fraction, -1)
+            return SegmentClosest(
+                distance, on_segment - distance * (turn @ np.array(gradient)), on_segment, fraction, -1
+            )
         found = []
         for face in {mesh.face_near(p, q), mesh.face_near(p, q + math.dist(p, q) * _NUDGE)}:
             fraction, nearest = _segment_triangle(_triple(p), _triple(q), *mesh.corners[face])
             found.append((math.dist(p + fraction * (q - p), nearest), face, fraction, nearest))
         distance, face, fraction, nearest = min(found)
-        return SegmentClosest(distance, turn @ np.array(nearest) + at, start + fraction * (end - start), fraction, face)
+        return SegmentClosest(
+            distance, turn @ np.array(nearest) + at, start + fraction * (end - start), fraction, face
+        )
 
     def _check(self, k: int) -> None:
         if not 0 <= k < len(self.obstacles):
-            raise InputError(f"there is no obstacle {k!r}; the scene has {len(self.obstacles)}, numbered from 0.")
+            raise InputError(
+                f"there is no obstacle {k!r}; the scene has {len(self.obstacles)}, numbered from 0."
+            )
 
 
 def _finite(what: str, values: Sequence[float] | Floats, count: int) -> Floats:
@@ -217,7 +249,8 @@ def _along(a: Triple, d: Triple, t: float) -> Triple:
 def _on_triangle(p: Triple, a: Triple, b: Triple, c: Triple) -> tuple[Triple, int]:
     """The point of a triangle closest to p, and the feature that it lies on, counted as in `pseudonormals`.
 
-    The weights of the corners (barycentric coordinates) of p's projection tell the region (Ericson 2005, 5.1.5).
+    The weights of the corners (barycentric coordinates) of p's projection tell the region (Ericson 2005,
+    5.1.5).
     """
     ab, ac, ap = _sub(b, a), _sub(c, a), _sub(p, a)
     bp, cp = _sub(p, b), _sub(p, c)
@@ -256,7 +289,8 @@ def _on_segment(p: Triple, a: Triple, d: Triple) -> float:
 
 
 def _segments(a: Triple, d: Triple, b: Triple, e: Triple) -> tuple[float, float]:
-    """Fractions of the segments a, a + d and b, b + e that are closest to each other (Ericson 2005, 5.1.9)."""
+    """Fractions of the segments a, a + d and b, b + e that are closest to each other (Ericson 2005,
+    5.1.9)."""
     dd, de, ee, r = _dot(d, d), _dot(d, e), _dot(e, e), _sub(a, b)
     det = dd * ee - de * de
     s = min(max((de * _dot(e, r) - ee * _dot(d, r)) / det, 0.0), 1.0) if det > 0.0 else 0.0
@@ -265,7 +299,8 @@ def _segments(a: Triple, d: Triple, b: Triple, e: Triple) -> tuple[float, float]
 
 
 def _segment_triangle(p: Triple, q: Triple, a: Triple, b: Triple, c: Triple) -> tuple[float, Triple]:
-    """Fraction of the segment p-q and point of the triangle closest to each other; where it crosses, the crossing."""
+    """Fraction of the segment p-q and point of the triangle closest to each other; where it crosses, the
+    crossing."""
     d = _sub(q, p)
     n = _cross(_sub(b, a), _sub(c, a))
     hp, hq = _dot(n, _sub(p, a)), _dot(n, _sub(q, a))
@@ -296,7 +331,8 @@ def _capsule(p: Triple, size: Triple) -> Signed:
 
 
 def _corner(depth: tuple[float, ...], outward: tuple[Triple, ...]) -> Signed:
-    """Signed distance to a convex corner of walls at right angles, from that to each wall and the wall's outward normal."""
+    """Signed distance to a convex corner of walls at right angles, from that to each wall and the wall's
+    outward normal."""
     out = [max(v, 0.0) for v in depth]
     r = math.hypot(*out)
     if r <= 0.0:
@@ -332,7 +368,8 @@ _SIGNED: dict[str, Callable[[Triple, Triple], Signed]] = {
 
 
 def _lowest(obstacle: Obstacle, p: Floats, q: Floats) -> float:
-    """Fraction of the segment p-q, obstacle frame, where the signed distance to a primitive is least; it is convex along it."""
+    """Fraction of the segment p-q, obstacle frame, where the signed distance to a primitive is least; it is
+    convex along it."""
     a, d = _triple(p), _triple(q - p)
     if obstacle.shape == "plane":
         return 1.0 if d[2] < 0.0 else 0.0
@@ -341,7 +378,12 @@ def _lowest(obstacle: Obstacle, p: Floats, q: Floats) -> float:
     if obstacle.shape == "capsule":
         axis = (0.0, 0.0, obstacle.size[1])
         crossing = _segments(a, d, (0.0, 0.0, -0.5 * obstacle.size[1]), axis)[0]
-        near = [crossing, 0.0, 1.0, *(_on_segment((0.0, 0.0, z * obstacle.size[1]), a, d) for z in (-0.5, 0.5))]
+        near = [
+            crossing,
+            0.0,
+            1.0,
+            *(_on_segment((0.0, 0.0, z * obstacle.size[1]), a, d) for z in (-0.5, 0.5)),
+        ]
         return min(near, key=lambda t: _capsule(_along(a, d, t), obstacle.size)[0])
     signed, size = _SIGNED[obstacle.shape], obstacle.size
 

@@ -1,8 +1,9 @@
-"""Contact in the step loop: free robots by their own pass, touching ones by passes and the contact law in turn until at rest.
+"""Contact in the step loop: free robots by their own pass, touching ones by passes and the contact law in
+turn until at rest.
 
-Inputs that lead a world too far for one linear model are followed in parts, from the last step to this one: a world that
-does not come to rest, or a rod that would go through an obstacle, goes half as far. A rod never continues beyond what it
-could solve: it stays where it came to, and says so.
+Inputs that lead a world too far for one linear model are followed in parts, from the last step to this one: a
+world that does not come to rest, or a rod that would go through an obstacle, goes half as far. A rod never
+continues beyond what it could solve: it stays where it came to, and says so.
 """
 
 from __future__ import annotations
@@ -17,10 +18,27 @@ from fastrod.contact.frames import back_by, between, blended, frames_of, longest
 from fastrod.contact.scene import ContactScene
 from fastrod.contact.tree import pack
 from fastrod.contact.trouble import NO_CONTACT_LEFT, NO_NODE_LEFT, sentence
-from fastrod.kernels.batch import arrange, iterate_parallel, iterate_serial, look_at_rods, look_parallel, look_serial
+from fastrod.kernels.batch import (
+    arrange,
+    iterate_parallel,
+    iterate_serial,
+    look_at_rods,
+    look_parallel,
+    look_serial,
+)
 from fastrod.kernels.contact.bvh import STACK
 from fastrod.kernels.contact.contact_set import SLOT, T_FORCE, T_GAP, T_N, T_OBSTACLE, T_RADIUS, T_S
-from fastrod.kernels.contact.iteration import AT_REST, GOES_ON, INSIDE, LOST, MOVES, NOTHING, TROUBLE, UNSOLVED, world_size
+from fastrod.kernels.contact.iteration import (
+    AT_REST,
+    GOES_ON,
+    INSIDE,
+    LOST,
+    MOVES,
+    NOTHING,
+    TROUBLE,
+    UNSOLVED,
+    world_size,
+)
 from fastrod.kernels.contact.problem import Scenery
 from fastrod.kernels.contact.proximity import CANDIDATE
 from fastrod.types import Clearance, Flags, Floats, Ints, Memory, Ports, Probes, Rods, Shape, Touching
@@ -31,13 +49,16 @@ Pass = Callable[[Ints, Ports, Shape, Probes], None]
 MOST_FOUND = 64
 """Candidates of one robot that a look notes."""
 _BLOCK = 2048  # robots whose linear models are held at once
-_MOST_PASSES, _NEARLY = 16, 1e-4  # and twice as many for a robot that moves by less than this part of its length
+# and twice as many for a robot that moves by less than this part of its length
+_MOST_PASSES, _NEARLY = 16, 1e-4
 _MOST_INSIDE = 8  # passes in a row with the centreline inside of an obstacle: the step led too far
 _SMALLEST_PART = 1.0 / 64.0
-_HARD = 1.0 / 4.0  # part of the way below which a failure is taken for the loss of the equilibrium, not for too long a step
+# part of the way below which a failure is taken for the loss of the equilibrium, not for too long a step
+_HARD = 1.0 / 4.0
 _DAMPING, _MOST_DAMPED, _DAMPED_TRIES = 1.5, 60, 6
 _WANDERS = 1e-2  # of the length: a robot that moves by less goes around a place where it may come to rest
-_UNSOLVED = 6  # passes in a row without forces that obey the law: the hold is lost, and plain passes do not bring it back
+# passes in a row without forces that obey the law: the hold is lost, and plain passes do not bring it back
+_UNSOLVED = 6
 _FEW = 64  # robots below which starting threads costs more than it saves
 
 
@@ -61,7 +82,8 @@ class Snapshot(NamedTuple):
 
 
 class Engine:
-    """What contact remembers between steps, and how a step is done. Rows are robots' indices; arrays have the robot axis first."""
+    """What contact remembers between steps, and how a step is done. Rows are robots' indices; arrays have the
+    robot axis first."""
 
     def __init__(self, scene: ContactScene, rods: Rods, length: Floats, n_points: int, threads: int) -> None:
         n = len(rods.reach)
@@ -86,8 +108,9 @@ class Engine:
         """Point forces that the caller gave: (n_robots, m) [m] and (n_robots, m, 3) world [N]."""
 
     def move(self, poses: Floats, velocities: dict[int, Floats], dt: float) -> None:
-        """`poses` (1 or n_robots, n_obstacles, 7) of the obstacles in this step, world. Those with a velocity, by index (1 or n_robots, 6)
-        [m/s, rad/s], slip by it, the others by how far their pose has moved."""
+        """`poses` (1 or n_robots, n_obstacles, 7) of the obstacles in this step, world. Those with a
+        velocity, by index (1 or n_robots, 6) [m/s, rad/s], slip by it, the others by how far their pose has
+        moved."""
         self.at_last_step = (self.before, self.poses_before)
         self.poses, self.velocities, self.dt = poses, velocities, dt
         self.clearance.distance[:] -= longest_move(self.poses_before, poses, self.surfaces.sphere)[:, None]
@@ -96,7 +119,11 @@ class Engine:
         """For these robots the obstacles have not come from anywhere: they are where they are."""
         if rows.any() and self.poses is not self.poses_before:
             shape = (len(rows), *self.poses.shape[1:])
-            self.poses_before = np.where(rows[:, None, None], np.broadcast_to(self.poses, shape), np.broadcast_to(self.poses_before, shape))
+            self.poses_before = np.where(
+                rows[:, None, None],
+                np.broadcast_to(self.poses, shape),
+                np.broadcast_to(self.poses_before, shape),
+            )
 
     def forget(self, rows: Ints | Flags) -> None:
         """No contacts, no history."""
@@ -105,7 +132,8 @@ class Engine:
         self.tracked[rows] = False
 
     def snapshot(self) -> Snapshot:
-        """A copy of everything that a later step depends on; shapes are handed out once and not written again."""
+        """A copy of everything that a later step depends on; shapes are handed out once and not written
+        again."""
         touching = Touching(self.touching.used.copy(), self.touching.slot.copy())
         clearance = Clearance(self.clearance.distance.copy(), self.clearance.position.copy())
         poses = self.poses, self.poses_before, self.at_last_step
@@ -116,10 +144,15 @@ class Engine:
         self.touching = Touching(snapshot.touching.used.copy(), snapshot.touching.slot.copy())
         self.clearance = Clearance(snapshot.clearance.distance.copy(), snapshot.clearance.position.copy())
         self.before, self.tracked, self.gap = snapshot.before, snapshot.tracked.copy(), snapshot.gap.copy()
-        self.poses, self.poses_before, self.at_last_step = snapshot.poses, snapshot.poses_before, snapshot.at_last_step
+        self.poses, self.poses_before, self.at_last_step = (
+            snapshot.poses,
+            snapshot.poses_before,
+            snapshot.at_last_step,
+        )
 
     def in_worlds(self, rows: Ints) -> tuple[Ints, Ints]:
-        """`rows` (n,) world by world, and (n_worlds + 1,) where in them each world begins, with the end at last."""
+        """`rows` (n,) world by world, and (n_worlds + 1,) where in them each world begins, with the end at
+        last."""
         ordered = rows[np.argsort(self.world[rows], kind="stable")]
         return ordered, np.append(np.flatnonzero(np.diff(self.world[ordered], prepend=-1)), len(ordered))
 
@@ -131,7 +164,9 @@ class Engine:
     def pressed(self) -> Flags:
         """(n_robots,) in a world where some contact carries a force."""
         slots = np.arange(self.touching.slot.shape[1])
-        force = (self.touching.slot[:, :, T_FORCE : T_FORCE + 3] != 0.0).any(2) & (slots < self.touching.used[:, None])
+        force = (self.touching.slot[:, :, T_FORCE : T_FORCE + 3] != 0.0).any(2) & (
+            slots < self.touching.used[:, None]
+        )
         return self.whole_worlds(force.any(1))
 
     def whole_worlds(self, some: Flags) -> Flags:
@@ -143,7 +178,8 @@ class Engine:
         return np.asarray(worlds[self.world])
 
     def touches(self, rows: Ints, shape: Shape) -> Flags:
-        """(n_robots,) which of `rows`, free until now, overlap something in `shape` or have gone through it; with their worlds."""
+        """(n_robots,) which of `rows`, free until now, overlap something in `shape` or have gone through it;
+        with their worlds."""
         some = np.zeros(len(self.gap), bool)
         if not len(rows):
             return some
@@ -172,11 +208,12 @@ class Engine:
         passes: Ints,
         most: int,
     ) -> tuple[Flags, Floats]:
-        """Lead the worlds of `rows` from the inputs `start`, where they are at rest, to `end`, or settle them there at once, in about
+        """Lead the worlds of `rows` from the inputs `start`, where they are at rest, to `end`, or settle them
+        there at once, in about
         `most` passes.
 
-        (n_robots,) which arrived, and the part of the way that each came. Those that did not keep the last shape, boundary and
-        contacts in which they were at rest.
+        (n_robots,) which arrived, and the part of the way that each came. Those that did not keep the last
+        shape, boundary and contacts in which they were at rest.
         """
         n = len(self.gap)
         done, stride, arrived = np.zeros(n), np.ones(n), np.zeros(n, bool)
@@ -187,16 +224,30 @@ class Engine:
         aim = np.ones(n)
         while len(way):
             last, aim = aim, np.minimum(done + stride, 1.0)
-            elsewhere = way[(aim != last)[way]]  # what was clear of the obstacles was so where they were in the try before
+            # what was clear of the obstacles was so where they were in the try before
+            elsewhere = way[(aim != last)[way]]
             self.clearance.distance[elsewhere] -= moved[elsewhere, None]
             ports = end if start is None or (aim[way] >= 1.0).all() else blended(start, end, aim)
-            rest, unheld = self._settle(way, ports, memory, shape, run, self._scenery(shape, tolerance, done, aim), passes, _MOST_PASSES)
+            rest, unheld = self._settle(
+                way,
+                ports,
+                memory,
+                shape,
+                run,
+                self._scenery(shape, tolerance, done, aim),
+                passes,
+                _MOST_PASSES,
+            )
             wanders = (self.trouble[:, 0] == MOVES) & (self.trouble[:, 3] < _WANDERS * self.rods.reach)
             given_up = (stride <= _HARD) | unheld | self.whole_worlds(wanders)
             hard = way[(~rest & given_up & (tries < _DAMPED_TRIES))[way]]
             if len(hard):  # no equilibrium near: let it go to the next one, downhill
                 tries[hard] += 1
-                memory.x[hard], self.touching.used[hard], self.touching.slot[hard] = x[hard], count[hard], slot[hard]
+                memory.x[hard], self.touching.used[hard], self.touching.slot[hard] = (
+                    x[hard],
+                    count[hard],
+                    slot[hard],
+                )
                 damped = self._scenery(shape, tolerance, done, aim, _DAMPING)
                 rest |= self._settle(hard, ports, memory, shape, run, damped, passes, _MOST_DAMPED)[0]
             good, bad = way[rest[way]], way[~rest[way]]
@@ -206,7 +257,11 @@ class Engine:
             between_steps = good[~arrived[good]]
             if len(between_steps):
                 self.accept(between_steps, shape, on_the_way=True)
-            x[good], count[good], slot[good] = memory.x[good], self.touching.used[good], self.touching.slot[good]
+            x[good], count[good], slot[good] = (
+                memory.x[good],
+                self.touching.used[good],
+                self.touching.slot[good],
+            )
             memory.x[bad], self.touching.used[bad], self.touching.slot[bad] = x[bad], count[bad], slot[bad]
             stride[good] *= 2.0
             stride[bad] *= 0.5
@@ -223,7 +278,8 @@ class Engine:
         return arrived, done
 
     def accept(self, rows: Ints, shape: Shape, on_the_way: bool = False) -> None:
-        """These robots are at rest in `shape`: from there they slip and move. `on_the_way`: it will be written to again."""
+        """These robots are at rest in `shape`: from there they slip and move. `on_the_way`: it will be
+        written to again."""
         if len(rows) == len(self.gap) and not on_the_way:
             self.before = shape
         else:
@@ -233,24 +289,41 @@ class Engine:
         self.tracked[rows] = True
 
     def end_step(self, done: Floats) -> None:
-        """The obstacles are where they were to go; for a robot that came only the part `done` (n_robots,) of the way, where it met them."""
-        self.poses_before = self.poses if (done >= 1.0).all() else between(self.poses_before, self.poses, done)
+        """The obstacles are where they were to go; for a robot that came only the part `done` (n_robots,) of
+        the way, where it met them."""
+        self.poses_before = (
+            self.poses if (done >= 1.0).all() else between(self.poses_before, self.poses, done)
+        )
 
     def held(self, rows: Ints, ports: Ports, n_x: int) -> tuple[Ports, Probes]:
-        """The present contacts of these robots as loads of a pass, and a probe at the tip that carries none."""
+        """The present contacts of these robots as loads of a pass, and a probe at the tip that carries
+        none."""
         most = int(self.touching.used[rows].max(initial=0))
         probes = empty_probes(len(rows), most + 1, n_x)
         ports = self._arranged(rows, ports, probes)
-        probes.node[:, -1], probes.force[:, -1], probes.arm[:, -1] = self.clearance.distance.shape[1] - 1, 0.0, 0.0
+        probes.node[:, -1], probes.force[:, -1], probes.arm[:, -1] = (
+            self.clearance.distance.shape[1] - 1,
+            0.0,
+            0.0,
+        )
         return ports, probes
 
     def why(self, i: int, done: float) -> str:
         """What stopped robot i, which came the part `done` of its step."""
         if self.trouble[i, 0] == NOTHING:
             if self.gap[i] < 0.0:
-                return f"contact: the rod overlaps an obstacle by {-self.gap[i]:.3g} m, and no way out of it was found."
+                return (
+                    f"contact: the rod overlaps an obstacle by {-self.gap[i]:.3g} m, and no way out of "
+                    "it was found."
+                )
             return "contact: neither the rod's rest shape nor these inputs could be solved."
-        return sentence(self.trouble[i], self.scene, self.rods.n_steps, self.length[i if len(self.length) > 1 else 0], done)
+        return sentence(
+            self.trouble[i],
+            self.scene,
+            self.rods.n_steps,
+            self.length[i if len(self.length) > 1 else 0],
+            done,
+        )
 
     def contacts(self, shape: Shape, ok: Flags) -> Contacts:
         """What touches what now."""
@@ -263,29 +336,55 @@ class Engine:
         order = np.argsort(~live, axis=1, kind="stable")[:, :width]
         kept = np.take_along_axis(slot, order[:, :, None], axis=1)
         kept[np.arange(width) >= count[:, None]] = np.nan
-        obstacle, normal, force, s = kept[:, :, T_OBSTACLE], kept[:, :, T_N : T_N + 3], kept[:, :, T_FORCE : T_FORCE + 3], kept[:, :, T_S]
+        obstacle, normal, force, s = (
+            kept[:, :, T_OBSTACLE],
+            kept[:, :, T_N : T_N + 3],
+            kept[:, :, T_FORCE : T_FORCE + 3],
+            kept[:, :, T_S],
+        )
         nodes = np.abs(np.where(np.isfinite(s), s, 0.0)[:, :, None] - shape.arclength[:, None, :])
         at = np.where(np.isfinite(nodes), nodes, np.inf).argmin(2)  # every contact has a node of its own
-        point = np.take_along_axis(shape.position, at[:, :, None], axis=1) - kept[:, :, T_RADIUS, None] * normal
+        point = (
+            np.take_along_axis(shape.position, at[:, :, None], axis=1) - kept[:, :, T_RADIUS, None] * normal
+        )
         index = np.where(np.isfinite(obstacle), obstacle, -1).astype(np.int64)
         wrench = np.zeros((n, n_obstacles, 6))
         origin = np.broadcast_to(self.poses[:, :, :3], (n, n_obstacles, 3))
         for k in range(n_obstacles):
             on = np.where((index == k)[:, :, None], -force, 0.0)
             wrench[:, k, :3] = on.sum(1)
-            wrench[:, k, 3:] = np.cross(np.where((index == k)[:, :, None], point - origin[:, None, k], 0.0), on).sum(1)
+            wrench[:, k, 3:] = np.cross(
+                np.where((index == k)[:, :, None], point - origin[:, None, k], 0.0), on
+            ).sum(1)
         gap = np.where(ok, self.gap, np.nan)
         return Contacts(
-            names=self.scene.names, count=count, obstacle=index, point=point, normal=normal, gap=kept[:, :, T_GAP], force=force,
+            names=self.scene.names,
+            count=count,
+            obstacle=index,
+            point=point,
+            normal=normal,
+            gap=kept[:, :, T_GAP],
+            force=force,
             arclength=s,
-            wrench=wrench, clearance=gap, deep=ok & (self.gap < -np.maximum(self.rods.radius.min(1), 1e-6)),
+            wrench=wrench,
+            clearance=gap,
+            deep=ok & (self.gap < -np.maximum(self.rods.radius.min(1), 1e-6)),
             tip_arclength=shape.arclength[:, -1],
-        )  # fmt: skip
+        )
 
     def _settle(
-        self, rows: Ints, ports: Ports, memory: Memory, shape: Shape, run: Pass, scenery: Scenery, passes: Ints, most: int
+        self,
+        rows: Ints,
+        ports: Ports,
+        memory: Memory,
+        shape: Shape,
+        run: Pass,
+        scenery: Scenery,
+        passes: Ints,
+        most: int,
     ) -> tuple[Flags, Flags]:
-        """Pass and law in turn on these inputs; (n_robots,) which came to rest, and which were given up as no forces hold them."""
+        """Pass and law in turn on these inputs; (n_robots,) which came to rest, and which were given up as no
+        forces hold them."""
         rest = np.zeros(len(self.gap), bool)
         unsolved, inside = np.zeros(len(rest), np.int64), np.zeros(len(rest), np.int64)
         still, plain = rows, scenery.damping == 0.0
@@ -294,11 +393,18 @@ class Engine:
             passes[still] += 1
             rest[still[status == AT_REST]] = True
             unsolved[still] = np.where(self.trouble[still, 0] == UNSOLVED, unsolved[still] + 1, 0)
-            deep = self.tracked[still] & (self.gap[still] < -self.rods.radius[still].max(1) - _NEARLY * self.rods.reach[still])
+            deep = self.tracked[still] & (
+                self.gap[still] < -self.rods.radius[still].max(1) - _NEARLY * self.rods.reach[still]
+            )
             inside[still] = np.where(deep, inside[still] + 1, 0)
-            hopeless = (inside >= (_MOST_INSIDE if plain else 3 * _MOST_INSIDE)) | (plain & (unsolved >= _UNSOLVED))
+            hopeless = (inside >= (_MOST_INSIDE if plain else 3 * _MOST_INSIDE)) | (
+                plain & (unsolved >= _UNSOLVED)
+            )
             if count >= most - 1:  # go on with what has nearly come to rest
-                hopeless |= ~((self.trouble[:, 3] < _NEARLY * self.rods.reach) & np.isin(self.trouble[:, 0], (MOVES, INSIDE)))
+                hopeless |= ~(
+                    (self.trouble[:, 3] < _NEARLY * self.rods.reach)
+                    & np.isin(self.trouble[:, 0], (MOVES, INSIDE))
+                )
             still = still[(status != AT_REST) & (status != LOST) & ~self.whole_worlds(hopeless)[still]]
             if not len(still):
                 break
@@ -308,7 +414,10 @@ class Engine:
     def _count_contacts(self, rows: Ints, ports: Ports) -> None:
         """Say of robots that stay inside of something whether they lack contacts, or nodes to put them on."""
         for i in rows[self.trouble[rows, 0] == INSIDE]:
-            ends = np.cumsum(self.length[i if len(self.length) > 1 else 0] + ports.extension[i if len(ports.extension) > 1 else 0])
+            ends = np.cumsum(
+                self.length[i if len(self.length) > 1 else 0]
+                + ports.extension[i if len(ports.extension) > 1 else 0]
+            )
             used = self.touching.slot[i, : self.touching.used[i], T_S]
             here = np.searchsorted(ends[:-1], self.trouble[i, 2], side="right")
             if (np.searchsorted(ends[:-1], used, side="right") == here).sum() >= self.rods.n_steps - 1:
@@ -316,22 +425,39 @@ class Engine:
             elif len(used) >= self.touching.slot.shape[1]:
                 self.trouble[i, 0] = NO_CONTACT_LEFT
 
-    def _iterate(self, rows: Ints, ports: Ports, memory: Memory, shape: Shape, run: Pass, scenery: Scenery) -> Ints:
-        """One pass and one round of the law for the worlds of `rows`; their status. Worlds with as many contacts go together."""
+    def _iterate(
+        self, rows: Ints, ports: Ports, memory: Memory, shape: Shape, run: Pass, scenery: Scenery
+    ) -> Ints:
+        """One pass and one round of the law for the worlds of `rows`; their status. Worlds with as many
+        contacts go together."""
         status = np.zeros(len(rows), np.int64)
         most = np.zeros(self.world.max() + 1, np.int64)
         np.maximum.at(most, self.world[rows], self.touching.used[rows])
-        slots = np.minimum(2 ** np.ceil(np.log2(np.maximum(most[self.world[rows]], 1))).astype(np.int64), self.scene.max_contacts)
+        slots = np.minimum(
+            2 ** np.ceil(np.log2(np.maximum(most[self.world[rows]], 1))).astype(np.int64),
+            self.scene.max_contacts,
+        )
         for n_slots in np.unique(slots):
             members = np.flatnonzero(slots == n_slots)
             members = members[np.argsort(self.world[rows[members]], kind="stable")]
             starts = np.flatnonzero(np.diff(self.world[rows[members]], prepend=-1))
             cuts = np.unique(np.searchsorted(starts, np.arange(_BLOCK, len(members), _BLOCK)))
             for block in np.split(members, starts[cuts[cuts < len(starts)]]):
-                status[block] = self._iterate_block(rows[block], int(n_slots), ports, memory, shape, run, scenery)
+                status[block] = self._iterate_block(
+                    rows[block], int(n_slots), ports, memory, shape, run, scenery
+                )
         return status
 
-    def _iterate_block(self, rows: Ints, n_slots: int, ports: Ports, memory: Memory, shape: Shape, run: Pass, scenery: Scenery) -> Ints:
+    def _iterate_block(
+        self,
+        rows: Ints,
+        n_slots: int,
+        ports: Ports,
+        memory: Memory,
+        shape: Shape,
+        run: Pass,
+        scenery: Scenery,
+    ) -> Ints:
         n, n_x = len(rows), memory.x.shape[1]
         probes = empty_probes(n, n_slots, n_x)
         ports = self._arranged(rows, ports, probes)
@@ -339,7 +465,14 @@ class Engine:
         worlds = np.append(np.flatnonzero(np.diff(self.world[rows], prepend=-1)), n)
         status = np.zeros(n, np.int64)
         parts = self._parts(len(worlds) - 1)
-        scratch = np.empty((parts, world_size(int(np.diff(worlds).max()), n_slots, self.touching.slot.shape[1], shape.arclength.shape[1])))
+        scratch = np.empty(
+            (
+                parts,
+                world_size(
+                    int(np.diff(worlds).max()), n_slots, self.touching.slot.shape[1], shape.arclength.shape[1]
+                ),
+            )
+        )
         body = iterate_serial if parts == 1 else iterate_parallel
         proposed, unknown = np.zeros((n, n_slots, 3)), np.zeros((n, n_x))
         used, slot = self.touching.used[rows], self.touching.slot[rows, :n_slots]
@@ -375,7 +508,9 @@ class Engine:
     def _parts(self, n: int) -> int:
         return 1 if n <= _FEW else min(self.threads, n)
 
-    def _scenery(self, shape: Shape, tolerance: float, done: Floats, aim: Floats, damping: float = 0.0) -> Scenery:
+    def _scenery(
+        self, shape: Shape, tolerance: float, done: Floats, aim: Floats, damping: float = 0.0
+    ) -> Scenery:
         """The obstacles at the part `aim` of their way, and at the part `done` that is behind."""
         if self.poses is self.poses_before and not self.velocities:
             frames = before = slip = frames_of(self.poses)
@@ -408,4 +543,9 @@ def empty_probes(n_rows: int, n_probes: int, n_x: int) -> Probes:
     """Room for the contact points of a pass."""
     n_f = 3 * n_probes
     loads = np.zeros((n_rows, n_probes, 3)), np.zeros((n_rows, n_probes, 3))
-    return Probes(np.full((n_rows, n_probes), -1), *loads, np.zeros((n_rows, n_f, 1 + n_f)), np.zeros((n_rows, n_x, 1 + n_f)))
+    return Probes(
+        np.full((n_rows, n_probes), -1),
+        *loads,
+        np.zeros((n_rows, n_f, 1 + n_f)),
+        np.zeros((n_rows, n_x, 1 + n_f)),
+    )

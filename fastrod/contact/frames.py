@@ -9,13 +9,15 @@ from fastrod.types import Floats, Ports
 
 
 def frames_of(poses: Floats) -> Floats:
-    """(n, n_obstacles, 7) position and quaternion to (n, n_obstacles, 12): rotation row by row, then position."""
+    """(n, n_obstacles, 7) position and quaternion to (n, n_obstacles, 12): rotation row by row, then
+    position."""
     turn = matrix_from_quaternion(poses[..., 3:].reshape(-1, 4)).reshape(*poses.shape[:2], 9)
     return np.ascontiguousarray(np.concatenate([turn, poses[..., :3]], axis=-1))
 
 
 def between(start: Floats, end: Floats, part: Floats) -> Floats:
-    """Poses (..., 7) at the part (n,) of the way: positions in a straight line, quaternions along the shorter arc."""
+    """Poses (..., 7) at the part (n,) of the way: positions in a straight line, quaternions along the shorter
+    arc."""
     n = max(len(start), len(end), len(part))
     a, b = (np.broadcast_to(p, (n, *p.shape[1:])) for p in (start, end))
     t = part.reshape(-1, *[1] * (a.ndim - 1))
@@ -36,20 +38,25 @@ def back_by(poses: Floats, velocity: Floats, time: Floats) -> Floats:
 
 
 def longest_move(start: Floats, end: Floats, ball: Floats) -> Floats:
-    """(n,) how far a point of any obstacle has moved at most; `ball` (n_obstacles, 4) holds each. A plane that turns or moves
-    counts as unbounded."""
+    """(n,) how far a point of any obstacle has moved at most; `ball` (n_obstacles, 4) holds each. A plane
+    that turns or moves counts as unbounded."""
     if start.shape == end.shape and np.array_equal(start, end):
         return np.zeros(1)
     shift = np.linalg.norm(end[..., :3] - start[..., :3], axis=-1)
-    turn = np.minimum(np.linalg.norm(end[..., 3:] - start[..., 3:], axis=-1), np.linalg.norm(end[..., 3:] + start[..., 3:], axis=-1))
+    turn = np.minimum(
+        np.linalg.norm(end[..., 3:] - start[..., 3:], axis=-1),
+        np.linalg.norm(end[..., 3:] + start[..., 3:], axis=-1),
+    )
     radius = np.linalg.norm(ball[:, :3], axis=1) + ball[:, 3]
     with np.errstate(invalid="ignore"):
-        far = np.where(turn > 0.0, 2.0 * turn * radius, 0.0)  # |dq| is half the angle, to first order and from above
+        # |dq| is half the angle, to first order and from above
+        far = np.where(turn > 0.0, 2.0 * turn * radius, 0.0)
     return np.asarray((shift + far).max(-1, initial=0.0))
 
 
 def blended(start: Ports, end: Ports, part: Floats) -> Ports:
-    """The inputs at the part (n,) of the way from `start` to `end`; what has another number of points comes at once."""
+    """The inputs at the part (n,) of the way from `start` to `end`; what has another number of points comes
+    at once."""
     fields = {}
     for name in Ports._fields:
         a, b = getattr(start, name), getattr(end, name)

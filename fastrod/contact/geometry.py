@@ -34,7 +34,8 @@ _SIZES = {"mesh": 0, "sphere": 1, "box": 3, "cylinder": 2, "capsule": 2, "plane"
 _LARGEST = 10.0  # m; a larger obstacle was given in mm
 _FARTHEST = 1e6  # m; of any vertex, used or not: beyond it squares and products leave what a float can hold
 _SMALLEST = 1e-4  # m; a smaller one was scaled twice
-_SLIVER = 1e-7  # height of a face over its longest edge; a float32 file cannot say which way a flatter one points
+# height of a face over its longest edge; a float32 file cannot say which way a flatter one points
+_SLIVER = 1e-7
 _MOST_SLIVERS = 100_000  # a mesh of more was not made to be a solid, and joining them takes a minute
 _USUAL_FRICTION, _LARGEST_FRICTION = 5.0, 10.0
 
@@ -58,28 +59,36 @@ def _number(where: str, value: object, unit: str) -> float:
 
 def _check_extent(where: str, extent: float, mend: str) -> None:
     if extent > _LARGEST:
-        raise InputError(f"{where} is {extent:.6g} m wide; more than {_LARGEST:g} m. Was it given in mm? {mend}=0.001 mends that.")
+        raise InputError(
+            f"{where} is {extent:.6g} m wide; more than {_LARGEST:g} m. Was it given in mm? "
+            f"{mend}=0.001 mends that."
+        )
     if extent < _SMALLEST:
-        raise InputError(f"{where} is {extent:.3g} m wide; tiny, less than {_SMALLEST:g} m. Was it scaled from mm twice?")
+        raise InputError(
+            f"{where} is {extent:.3g} m wide; tiny, less than {_SMALLEST:g} m. Was it scaled from mm twice?"
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Obstacle:
     """A rigid or springy body that rods can touch, in its own frame, and where it stands at rest.
 
-    Make one with `mesh`, `box`, `sphere`, `cylinder`, `capsule` or `plane`. Two obstacles are equal only where they are the same
-    object. Raises `InputError` where a number is out of range.
+    Make one with `mesh`, `box`, `sphere`, `cylinder`, `capsule` or `plane`. Two obstacles are equal only
+    where they are the same object. Raises `InputError` where a number is out of range.
     """
 
     name: str
     shape: ObstacleShape
     size: Triple
-    """Sphere (radius, 0, 0); box: full edge lengths; cylinder (radius, length, 0) and capsule (radius, length of the straight part,
-    0), both centred, axis z; mesh and plane (0, 0, 0) [m]. A plane is the solid half-space z <= 0 of its own frame."""
+    """Sphere (radius, 0, 0); box: full edge lengths; cylinder (radius, length, 0) and capsule (radius, length
+    of the straight part,
+    0), both centred, axis z; mesh and plane (0, 0, 0) [m]. A plane is the solid half-space z <= 0 of its own
+    frame."""
     vertices: Floats
     """(n_vertices, 3) obstacle frame [m]; (0, 3) for anything but a mesh."""
     faces: Ints
-    """(n_faces, 3) vertices of each face, counter-clockwise seen from outside; (0, 3) for anything but a mesh."""
+    """(n_faces, 3) vertices of each face, counter-clockwise seen from outside; (0, 3) for anything but a
+    mesh."""
     position: Triple
     """world_from_obstacle at rest [m]."""
     quaternion: Quadruple
@@ -94,36 +103,59 @@ class Obstacle:
     def __post_init__(self) -> None:
         where = f"{self.shape} {self.name!r}"
         if self.shape not in get_args(ObstacleShape):
-            raise InputError(f"Obstacle.shape is {self.shape!r}; {nearest(str(self.shape), get_args(ObstacleShape))}")
+            raise InputError(
+                f"Obstacle.shape is {self.shape!r}; {nearest(str(self.shape), get_args(ObstacleShape))}"
+            )
         size = _numbers(f"size of {where}", self.size, 3, "m")
         used = _SIZES[self.shape]
         if any(v <= 0.0 for v in size[:used]) or any(size[used:]):
             need = f"{used} positive and {3 - used} zero" if used < 3 else "3 positive"
             raise InputError(f"size of {where} is {list(size)!r} m; a {self.shape} needs {need} numbers.")
         if used:
-            extent = {"sphere": 2.0 * size[0], "cylinder": max(2.0 * size[0], size[1]), "capsule": 2.0 * size[0] + size[1]}
+            extent = {
+                "sphere": 2.0 * size[0],
+                "cylinder": max(2.0 * size[0], size[1]),
+                "capsule": 2.0 * size[0] + size[1],
+            }
             _check_extent(where, extent.get(self.shape, max(size)), "a factor")
         vertices, faces = _arrays(where, self.vertices, self.faces)
         if (self.shape == "mesh") != (len(faces) > 0):
-            raise InputError(f"{where} has {len(faces)} faces; a mesh needs some, and any other shape has none.")
+            raise InputError(
+                f"{where} has {len(faces)} faces; a mesh needs some, and any other shape has none."
+            )
         position = _numbers(f"position of {where}", self.position, 3, "m")
         quaternion = _numbers(f"quaternion of {where}", self.quaternion, 4, "w x y z")
         if abs(math.hypot(*quaternion) - 1.0) > 1e-6:
-            raise InputError(f"quaternion of {where} is {list(quaternion)!r} with norm {math.hypot(*quaternion):.6g}; it must be 1.")
+            raise InputError(
+                f"quaternion of {where} is {list(quaternion)!r} with norm "
+                f"{math.hypot(*quaternion):.6g}; it must be 1."
+            )
         friction = _number(f"friction of {where}", self.friction, "1")
         if not 0.0 <= friction <= _LARGEST_FRICTION:
-            raise InputError(f"friction of {where} is {friction!r}; a Coulomb coefficient is between 0 and {_LARGEST_FRICTION:g}.")
+            raise InputError(
+                f"friction of {where} is {friction!r}; a Coulomb coefficient is between 0 and "
+                f"{_LARGEST_FRICTION:g}."
+            )
         if friction > _USUAL_FRICTION:
-            warnings.warn(f"friction of {where} is {friction!r}; unusual: most pairs have less than 1.", stacklevel=4)
+            warnings.warn(
+                f"friction of {where} is {friction!r}; unusual: most pairs have less than 1.", stacklevel=4
+            )
         stiffness = _number(f"stiffness of {where}", self.stiffness, "N/m")
         if not stiffness > 0.0:
-            raise InputError(f"stiffness of {where} is {stiffness!r} N/m; it must be positive, or inf for a rigid one.")
+            raise InputError(
+                f"stiffness of {where} is {stiffness!r} N/m; it must be positive, or inf for a rigid one."
+            )
         checked = (size, vertices, faces, position, quaternion, friction, stiffness)
-        for name, value in zip(("size", "vertices", "faces", "position", "quaternion", "friction", "stiffness"), checked, strict=True):
+        for name, value in zip(
+            ("size", "vertices", "faces", "position", "quaternion", "friction", "stiffness"),
+            checked,
+            strict=True,
+        ):
             object.__setattr__(self, name, value)
 
     def as_trimesh(self) -> trimesh.Trimesh:
-        """A new trimesh.Trimesh in the obstacle frame [m], for drawing; a plane is a square of 1 m. Needs trimesh."""
+        """A new trimesh.Trimesh in the obstacle frame [m], for drawing; a plane is a square of 1 m. Needs
+        trimesh."""
         lib = _trimesh()
         a, b, c = self.size
         if self.shape == "sphere":
@@ -153,16 +185,24 @@ class Placement(TypedDict, total=False):
 
 
 def _primitive(shape: ObstacleShape, size: Sequence[float], given: Placement) -> Obstacle:
-    options: dict[str, Any] = {"position": (0.0, 0.0, 0.0), "quaternion": (1.0, 0.0, 0.0, 0.0), "friction": 0.0, "stiffness": math.inf}
+    options: dict[str, Any] = {
+        "position": (0.0, 0.0, 0.0),
+        "quaternion": (1.0, 0.0, 0.0, 0.0),
+        "friction": 0.0,
+        "stiffness": math.inf,
+    }
     known = Placement.__annotations__
     for option, value in given.items():
         if option not in known:
             raise InputError(f"a {shape} has no option {option!r}; {nearest(option, known)}")
         options[option] = value
     options["name"] = options.get("name") or shape
-    full = _numbers(f"size of {shape} {options['name']!r}", size, _SIZES[shape], "m") + (0.0,) * (3 - _SIZES[shape])
+    full = _numbers(f"size of {shape} {options['name']!r}", size, _SIZES[shape], "m") + (0.0,) * (
+        3 - _SIZES[shape]
+    )
     none, nothing = np.empty((0, 3)), np.empty((0, 3), dtype=np.int64)
-    return Obstacle(shape=shape, size=full, vertices=none, faces=nothing, closed=True, **options)  # type: ignore[arg-type]
+    parts: dict[str, Any] = {"vertices": none, "faces": nothing, "closed": True}
+    return Obstacle(shape=shape, size=full, **parts, **options)
 
 
 def sphere(radius: float, **options: Unpack[Placement]) -> Obstacle:
@@ -171,17 +211,20 @@ def sphere(radius: float, **options: Unpack[Placement]) -> Obstacle:
 
 
 def box(size: Sequence[float], **options: Unpack[Placement]) -> Obstacle:
-    """A cuboid with full edge lengths `size` [m], centred; `Obstacle` says what the options are, and what raises `InputError`."""
+    """A cuboid with full edge lengths `size` [m], centred; `Obstacle` says what the options are, and what
+    raises `InputError`."""
     return _primitive("box", size, options)
 
 
 def cylinder(radius: float, length: float, **options: Unpack[Placement]) -> Obstacle:
-    """A solid cylinder with flat caps [m], centred, axis z; `Obstacle` says what the options are, and what raises `InputError`."""
+    """A solid cylinder with flat caps [m], centred, axis z; `Obstacle` says what the options are, and what
+    raises `InputError`."""
     return _primitive("cylinder", (radius, length), options)
 
 
 def capsule(radius: float, length: float, **options: Unpack[Placement]) -> Obstacle:
-    """A cylinder of `length` with round ends [m], centred, axis z; `Obstacle` says what the options are, and what raises `InputError`."""
+    """A cylinder of `length` with round ends [m], centred, axis z; `Obstacle` says what the options are, and
+    what raises `InputError`."""
     return _primitive("capsule", (radius, length), options)
 
 
@@ -193,7 +236,8 @@ def plane(
     friction: float = 0.0,
     stiffness: float = math.inf,
 ) -> Obstacle:
-    """The half-space behind `point` [m]: solid opposite to `normal` (any length), both world frame at rest; see `Obstacle`.
+    """The half-space behind `point` [m]: solid opposite to `normal` (any length), both world frame at rest;
+    see `Obstacle`.
 
     >>> plane(normal=(0.0, 0.0, -2.0)).quaternion
     (0.0, 1.0, 0.0, 0.0)
@@ -206,7 +250,11 @@ def plane(
     w = math.sqrt(max(0.0, (1.0 + z) / 2.0))
     turn = (w, -y / (2.0 * w), x / (2.0 * w), 0.0) if w > 1e-6 else (0.0, 1.0, 0.0, 0.0)
     at = _numbers("plane point", point, 3, "m")
-    return _primitive("plane", (), {"name": name, "position": at, "quaternion": turn, "friction": friction, "stiffness": stiffness})
+    return _primitive(
+        "plane",
+        (),
+        {"name": name, "position": at, "quaternion": turn, "friction": friction, "stiffness": stiffness},
+    )
 
 
 def mesh(
@@ -221,16 +269,18 @@ def mesh(
     open_surface: bool = False,
     limits: MeshLimits | None = None,
 ) -> Obstacle:
-    """A triangle mesh: a file (.stl, .obj, .ply, .off, .glb), a trimesh.Trimesh (left untouched), or (vertices, faces).
+    """A triangle mesh: a file (.stl, .obj, .ply, .off, .glb), a trimesh.Trimesh (left untouched), or
+    (vertices, faces).
 
-    Vertices times `scale` are metres in the obstacle frame. A file of several bodies becomes one mesh. Duplicate vertices are
-    merged and degenerate faces dropped. The mesh must be watertight with its faces counter-clockwise seen from outside; an
-    inverted body inside another is a cavity. `open_surface` takes a surface with open edges, or a closed one that faces inwards,
-    as one-sided: the solid lies behind its normals. `limits`, by default those of `MeshLimits()`, are what reading a
-    file may cost; materials and whatever else a file refers to are not opened.
+    Vertices times `scale` are metres in the obstacle frame. A file of several bodies becomes one mesh.
+    Duplicate vertices are merged and degenerate faces dropped. The mesh must be watertight with its faces
+    counter-clockwise seen from outside; an inverted body inside another is a cavity. `open_surface` takes a
+    surface with open edges, or a closed one that faces inwards, as one-sided: the solid lies behind its
+    normals. `limits`, by default those of `MeshLimits()`, are what reading a file may cost; materials and
+    whatever else a file refers to are not opened.
 
-    Raises `InputError` where there is no such mesh, or where it is empty, broken, open, inverted, of a wrong scale or
-    beyond `limits`.
+    Raises `InputError` where there is no such mesh, or where it is empty, broken, open, inverted, of a wrong
+    scale or beyond `limits`.
     """
     given, corners, triangles = _read(source, MeshLimits() if limits is None else limits)
     name = name or given or "mesh"
@@ -238,28 +288,45 @@ def mesh(
     vertices, faces = _arrays(where, corners, triangles)
     factor = _number(f"scale of {where}", scale, "1")
     if not (math.isfinite(factor) and factor > 0.0):
-        raise InputError(f"scale of {where} is {factor!r}; it must be positive and finite, for example 0.001 for a file in mm.")
+        raise InputError(
+            f"scale of {where} is {factor!r}; it must be positive and finite, for example "
+            "0.001 for a file in mm."
+        )
     if len(vertices) and (far := float(np.abs(vertices).max()) * factor) > _FARTHEST:
         raise InputError(
-            f"{where} has a vertex {far:.6g} m from its origin; more than {_FARTHEST:g} m. Was it given in mm? scale=0.001 fixes that."
+            f"{where} has a vertex {far:.6g} m from its origin; more than {_FARTHEST:g} m. Was it given in "
+            "mm? scale=0.001 fixes that."
         )
     vertices, faces = _merged(vertices * factor, faces)
     faces = _without_slivers(where, vertices, faces)
     if not len(faces) or not (_heights(vertices, faces)[0] > 1e-14).any():
-        raise InputError(f"{where} is empty: it has {len(triangles)} faces and none with an area; give a surface of triangles.")
+        raise InputError(
+            f"{where} is empty: it has {len(triangles)} faces and none with an area; give a "
+            "surface of triangles."
+        )
     _check_extent(where, float(np.ptp(vertices, axis=0).max()), "scale")
     closed = _check_surface(where, vertices, faces, open_surface)
     return Obstacle(
-        name=name, shape="mesh", size=(0.0, 0.0, 0.0), vertices=vertices, faces=faces, closed=closed, friction=friction,
-        position=position, quaternion=quaternion, stiffness=stiffness,  # type: ignore[arg-type]
-    )  # fmt: skip
+        name=name,
+        shape="mesh",
+        size=(0.0, 0.0, 0.0),
+        vertices=vertices,
+        faces=faces,
+        closed=closed,
+        friction=friction,
+        position=position,
+        quaternion=quaternion,
+        stiffness=stiffness,  # type: ignore[arg-type]
+    )
 
 
 def _trimesh() -> Any:
     try:
         import trimesh
     except ImportError as error:
-        raise InputError("meshes need the package trimesh, which is not installed; install it, or give (vertices, faces).") from error
+        raise InputError(
+            "meshes need the package trimesh, which is not installed; install it, or give (vertices, faces)."
+        ) from error
     return trimesh
 
 
@@ -268,7 +335,11 @@ def _read(source: object, limits: MeshLimits) -> tuple[str | None, Any, Any]:
     if isinstance(source, (str, os.PathLike)):
         path = Path(source)
         if not path.is_file():
-            near = [p.name for p in path.parent.iterdir() if p.suffix[1:].lower() in FORMATS] if path.parent.is_dir() else []
+            near = (
+                [p.name for p in path.parent.iterdir() if p.suffix[1:].lower() in FORMATS]
+                if path.parent.is_dir()
+                else []
+            )
             raise InputError(f"there is no mesh file {str(path)!r}; {nearest(path.name, near)}")
         return path.stem, *read_mesh(path, limits)
     if isinstance(source, (tuple, list)) and len(source) == 2:
@@ -276,7 +347,9 @@ def _read(source: object, limits: MeshLimits) -> tuple[str | None, Any, Any]:
     lib = None if isinstance(source, (tuple, list)) else _trimesh()
     if lib is not None and isinstance(source, lib.Trimesh):
         return None, np.array(source.vertices), np.array(source.faces)
-    raise InputError(f"mesh source is a {type(source).__name__}; give a file, a trimesh.Trimesh, or (vertices, faces).")
+    raise InputError(
+        f"mesh source is a {type(source).__name__}; give a file, a trimesh.Trimesh, or (vertices, faces)."
+    )
 
 
 def _arrays(where: str, vertices: Any, faces: Any) -> tuple[Floats, Ints]:
@@ -284,21 +357,33 @@ def _arrays(where: str, vertices: Any, faces: Any) -> tuple[Floats, Ints]:
     try:
         v, f = np.array(vertices, dtype=np.float64), np.array(faces)
     except (TypeError, ValueError):
-        raise InputError(f"{where} has vertices or faces that are no table of numbers; give (n, 3) positions and (m, 3) indices.") from None
+        raise InputError(
+            f"{where} has vertices or faces that are no table of numbers; give (n, 3) "
+            "positions and (m, 3) indices."
+        ) from None
     f = f.reshape(0, 3) if f.size == 0 else f
     v = v.reshape(0, 3) if v.size == 0 else v
     if v.ndim != 2 or v.shape[1] != 3:
         raise InputError(f"{where} has vertices of shape {v.shape}; they must be (n_vertices, 3).")
     if f.ndim != 2 or f.shape[1] != 3 or (f.size and not np.issubdtype(f.dtype, np.integer)):
-        raise InputError(f"{where} has faces of shape {f.shape} and type {f.dtype}; they must be (n_faces, 3) integers: triangles only.")
+        raise InputError(
+            f"{where} has faces of shape {f.shape} and type {f.dtype}; they must be (n_faces, "
+            "3) integers: triangles only."
+        )
     broken = np.flatnonzero(~np.isfinite(v).all(axis=1))
     if len(broken):
         row = broken[0]
-        raise InputError(f"vertex {row} of {where} is {v[row].tolist()!r}; all must be finite ({len(broken)} of {len(v)} are not).")
+        raise InputError(
+            f"vertex {row} of {where} is {v[row].tolist()!r}; all must be finite "
+            f"({len(broken)} of {len(v)} are not)."
+        )
     wrong = np.flatnonzero(((f < 0) | (f >= len(v))).any(axis=1))
     if len(wrong):
         row = wrong[0]
-        raise InputError(f"face {row} of {where} is {f[row].tolist()!r}; its numbers must be between 0 and {len(v) - 1}, the last vertex.")
+        raise InputError(
+            f"face {row} of {where} is {f[row].tolist()!r}; its numbers must be between 0 and "
+            f"{len(v) - 1}, the last vertex."
+        )
     return np.ascontiguousarray(v), np.ascontiguousarray(f, dtype=np.int64)
 
 
@@ -326,7 +411,8 @@ def _heights(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
 
 
 def _without_slivers(where: str, vertices: Floats, faces: Ints) -> Ints:
-    """Faces without area joined into the neighbour at their longest edge, so that the surface stays closed."""
+    """Faces without area joined into the neighbour at their longest edge, so that the surface stays
+    closed."""
     n = len(vertices)
     for _ in range(20):
         height, longest = _heights(vertices, faces)
@@ -334,7 +420,10 @@ def _without_slivers(where: str, vertices: Floats, faces: Ints) -> Ints:
         if not len(flat) or len(flat) == len(faces):
             break
         if len(flat) > _MOST_SLIVERS:
-            raise InputError(f"{where} has {len(flat)} faces without area, of {len(faces)}; mend it first, in the program that made it.")
+            raise InputError(
+                f"{where} has {len(flat)} faces without area, of {len(faces)}; mend it first, "
+                "in the program that made it."
+            )
         keys = faces.ravel() * n + np.roll(faces, -1, axis=1).ravel()  # one for each directed edge
         order = np.argsort(keys, kind="stable")
         ordered = keys[order]
@@ -351,7 +440,9 @@ def _without_slivers(where: str, vertices: Floats, faces: Ints) -> Ints:
         touched: set[int] = set()
         made: set[tuple[int, int]] = set()
         gone = []
-        for i, k, *corners, is_there in zip(*(a.tolist() for a in (flat, beside, p, q, r, d, there)), strict=True):
+        for i, k, *corners, is_there in zip(
+            *(a.tolist() for a in (flat, beside, p, q, r, d, there)), strict=True
+        ):
             if i in touched:
                 continue
             if k < 0:  # at an open edge: nothing is lost with it
@@ -370,41 +461,60 @@ def _without_slivers(where: str, vertices: Floats, faces: Ints) -> Ints:
 
 
 def _check_surface(where: str, vertices: Floats, faces: Ints, open_surface: bool) -> bool:
-    """True where no edge is open; raises where the winding is broken, the surface open against its word, or a body inside out."""
+    """True where no edge is open; raises where the winding is broken, the surface open against its word, or a
+    body inside out."""
     n = len(vertices)
     start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-    _, index, count = np.unique(np.minimum(start, end) * n + np.maximum(start, end), return_inverse=True, return_counts=True)
+    _, index, count = np.unique(
+        np.minimum(start, end) * n + np.maximum(start, end), return_inverse=True, return_counts=True
+    )
     net = np.abs(np.bincount(index, weights=np.where(start < end, 1.0, -1.0)))
     turned = int(((count == 2) & (net > 0)).sum())
     if turned:
-        raise InputError(f"{where} has {turned} edges whose two faces wind in opposite ways; mend it, e.g. by trimesh.repair.fix_winding.")
+        raise InputError(
+            f"{where} has {turned} edges whose two faces wind in opposite ways; mend it, e.g. "
+            "by trimesh.repair.fix_winding."
+        )
     n_open = int((count == 1).sum())
     if open_surface:
         return n_open == 0
     if n_open:
         raise InputError(
-            f"{where} is not watertight: it has {n_open} open edges; close it, or open_surface=True takes it as a one-sided "
+            f"{where} is not watertight: it has {n_open} open edges; close it, or open_surface=True takes "
+            "it as a one-sided "
             "surface whose solid lies behind its normals."
         )
     crowded = int((count > 2).sum())
     if crowded:
-        raise InputError(f"{where} has {crowded} edges with more than two faces, where bodies touch; unite the bodies, or set them apart.")
+        raise InputError(
+            f"{where} has {crowded} edges with more than two faces, where bodies touch; unite "
+            "the bodies, or set them apart."
+        )
     corner = vertices[faces] - vertices.mean(axis=0)
     volume = (corner[:, 0] * np.cross(corner[:, 1], corner[:, 2])).sum(axis=1) / 6.0
-    n_bodies, body = connected_components(coo_array((np.ones(len(start)), (start, end)), shape=(n, n)), directed=False)
+    n_bodies, body = connected_components(
+        coo_array((np.ones(len(start)), (start, end)), shape=(n, n)), directed=False
+    )
     each = np.bincount(body[faces[:, 0]], weights=volume, minlength=n_bodies)
     low, high = np.full((n_bodies, 3), np.inf), np.full((n_bodies, 3), -np.inf)
     np.minimum.at(low, body, vertices)
     np.maximum.at(high, body, vertices)
     total = float(each.sum())
     if abs(total) <= 1e-12 * float(np.ptp(vertices, axis=0).max()) ** 3:
-        raise InputError(f"{where} encloses no volume ({total:.3g} m^3); give a solid, or open_surface=True for a surface.")
+        raise InputError(
+            f"{where} encloses no volume ({total:.3g} m^3); give a solid, or open_surface=True for a surface."
+        )
     outer = [k for k in range(n_bodies) if each[k] > 0.0]
-    lost = [k for k in range(n_bodies) if each[k] < 0.0 and not any((low[m] <= low[k]).all() and (high[k] <= high[m]).all() for m in outer)]
+    lost = [
+        k
+        for k in range(n_bodies)
+        if each[k] < 0.0 and not any((low[m] <= low[k]).all() and (high[k] <= high[m]).all() for m in outer)
+    ]
     if total < 0.0 or lost:
         which = f"{len(lost)} of its {n_bodies} bodies have" if n_bodies > 1 else "it has"
         raise InputError(
-            f"{where} is inverted: {which} a negative volume, so faces point inwards; turn them, e.g. by mesh.invert() of trimesh, "
+            f"{where} is inverted: {which} a negative volume, so faces point inwards; turn them, e.g. by "
+            "mesh.invert() of trimesh, "
             "or open_surface=True if the rod moves inside of it."
         )
     return True

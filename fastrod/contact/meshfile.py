@@ -29,7 +29,8 @@ _HEADER = 65_536  # bytes in which the header of a .ply or .off ends
 
 @dataclass(frozen=True, kw_only=True)
 class MeshLimits:
-    """What reading a mesh file may cost, for `fastrod.contact.mesh`. Raises `InputError` for one that is not positive.
+    """What reading a mesh file may cost, for `fastrod.contact.mesh`. Raises `InputError` for one that is not
+    positive.
 
     >>> MeshLimits(n_faces=5_000_000, seconds=60.0).n_bytes
     256000000
@@ -47,7 +48,11 @@ class MeshLimits:
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not (math.isfinite(value) and value > 0):
+            if (
+                isinstance(value, bool)
+                or not isinstance(value, (int, float))
+                or not (math.isfinite(value) and value > 0)
+            ):
                 raise InputError(f"MeshLimits.{name} is {value!r}; it must be a positive number.")
 
 
@@ -78,20 +83,29 @@ def read_mesh(path: Path, limits: MeshLimits) -> tuple[Floats, Ints]:
     except InputError:
         raise
     except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError) as error:
-        why = getattr(error, "strerror", None) or (f"it lacks {error}" if isinstance(error, KeyError) else str(error).rstrip("."))
-        raise InputError(f"{where} cannot be read as {kind}: {why}; is it whole, and of that format?") from error
+        why = getattr(error, "strerror", None) or (
+            f"it lacks {error}" if isinstance(error, KeyError) else str(error).rstrip(".")
+        )
+        raise InputError(
+            f"{where} cannot be read as {kind}: {why}; is it whole, and of that format?"
+        ) from error
     if declared is None:
         raise InputError(f"{where} is empty: it has 0 bytes.")
     _within(where, "faces", declared.faces, "n_faces", limits.n_faces)
     _within(where, "vertices", declared.vertices, "n_faces", 3 * limits.n_faces)
-    vertices, faces = (_here if size <= _SMALL and declared.bodies <= _FEW else _apart)(where, path, kind, limits)
+    vertices, faces = (_here if size <= _SMALL and declared.bodies <= _FEW else _apart)(
+        where, path, kind, limits
+    )
     _within(where, "faces", len(faces), "n_faces", limits.n_faces)
     return vertices, faces
 
 
 def _within(where: str, what: str, number: int, name: str, most: float) -> None:
     if number > most:
-        raise InputError(f"{where} has {number} {what}, more than {most:.0f}; mesh(..., limits=MeshLimits({name}=...)) allows more.")
+        raise InputError(
+            f"{where} has {number} {what}, more than {most:.0f}; mesh(..., "
+            f"limits=MeshLimits({name}=...)) allows more."
+        )
 
 
 def _here(where: str, path: Path, kind: str, _: MeshLimits) -> tuple[Floats, Ints]:
@@ -99,31 +113,53 @@ def _here(where: str, path: Path, kind: str, _: MeshLimits) -> tuple[Floats, Int
         with np.errstate(all="ignore"):  # of numbers that a float cannot hold, which `mesh` refuses
             return trimesh_reader.read(str(path), kind)
     except ImportError as error:
-        raise InputError("meshes need the package trimesh, which is not installed; install it, or give (vertices, faces).") from error
+        raise InputError(
+            "meshes need the package trimesh, which is not installed; install it, or give (vertices, faces)."
+        ) from error
     except Exception as error:  # every loader of trimesh raises its own
-        raise InputError(f"{where} cannot be read as {kind}: {shown(error)}; is it whole, and of that format?") from error
+        raise InputError(
+            f"{where} cannot be read as {kind}: {shown(error)}; is it whole, and of that format?"
+        ) from error
 
 
 def _apart(where: str, path: Path, kind: str, limits: MeshLimits) -> tuple[Floats, Ints]:
     """In a process of its own, which ends at the limits."""
-    command = [sys.executable, "-P", trimesh_reader.__file__, str(path.absolute()), kind, str(int(limits.memory))]
+    command = [
+        sys.executable,
+        "-P",
+        trimesh_reader.__file__,
+        str(path.absolute()),
+        kind,
+        str(int(limits.memory)),
+    ]
     own = {
         **os.environ,
         "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
         "OPENBLAS_NUM_THREADS": "1",  # each reserves memory, which the limit counts
     }
     try:
-        done = subprocess.run(command, env=own, capture_output=True, timeout=limits.seconds, check=False, stdin=subprocess.DEVNULL)
+        done = subprocess.run(
+            command,
+            env=own,
+            capture_output=True,
+            timeout=limits.seconds,
+            check=False,
+            stdin=subprocess.DEVNULL,
+        )
     except subprocess.TimeoutExpired as error:
         raise InputError(
-            f"{where} was not read within {limits.seconds:g} s; mesh(..., limits=MeshLimits(seconds=...)) allows more."
+            f"{where} was not read within {limits.seconds:g} s; mesh(..., limits=MeshLimits(seconds=...)) "
+            "allows more."
         ) from error
     why = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
     if done.returncode == 2:
-        raise InputError(f"{where} cannot be read as {kind}: {shown(why)[1:-1]}; is it whole, and of that format?")
+        raise InputError(
+            f"{where} cannot be read as {kind}: {shown(why)[1:-1]}; is it whole, and of that format?"
+        )
     if done.returncode:
         raise InputError(
-            f"{where} needs more than {limits.memory:.0f} bytes of memory to be read; mesh(..., limits=MeshLimits(memory=...)) allows more."
+            f"{where} needs more than {limits.memory:.0f} bytes of memory to be read; mesh(..., "
+            "limits=MeshLimits(memory=...)) allows more."
         )
     out = io.BytesIO(done.stdout)
     return np.load(out, allow_pickle=False), np.load(out, allow_pickle=False)
@@ -139,7 +175,9 @@ def _stl(file: int, size: int) -> _Declared:
         if size >= 84 and size == 84 + 50 * n:
             return _Declared(n, 3 * n, 1)
         if not re.match(rb"\s*solid", data[:_HEADER], re.IGNORECASE):
-            raise ValueError(f"its header declares {n} faces, which take {84 + 50 * n} bytes, and it has {size}")
+            raise ValueError(
+                f"its header declares {n} faces, which take {84 + 50 * n} bytes, and it has {size}"
+            )
         corners = _count(data, rb"vertex")
         return _Declared(corners // 3, corners, 1)
 
@@ -151,11 +189,14 @@ def _obj(file: int, _: int) -> _Declared:
 
 
 def _check_lines(data: mmap.mmap) -> None:
-    """Raises `ValueError` for a line that only a face of thousands of corners has: it would be cut into as many triangles."""
+    """Raises `ValueError` for a line that only a face of thousands of corners has: it would be cut into as
+    many triangles."""
     ends = np.flatnonzero(np.frombuffer(data[:], np.uint8) == ord("\n"))
     longest = int(np.diff(ends, prepend=-1, append=len(data)).max()) - 1
     if longest > _LINE:
-        raise ValueError(f"it has a line of {longest} bytes, more than {_LINE}, so a face with too many corners")
+        raise ValueError(
+            f"it has a line of {longest} bytes, more than {_LINE}, so a face with too many corners"
+        )
 
 
 def _count(data: mmap.mmap, pattern: bytes) -> int:
@@ -181,10 +222,11 @@ def _whole(word: bytes) -> int:
 
 
 _WIDTH = {
-    **dict.fromkeys((b"char", b"uchar", b"int8", b"uint8"), 1), **dict.fromkeys((b"short", b"ushort", b"int16", b"uint16"), 2),
+    **dict.fromkeys((b"char", b"uchar", b"int8", b"uint8"), 1),
+    **dict.fromkeys((b"short", b"ushort", b"int16", b"uint16"), 2),
     **dict.fromkeys((b"int", b"uint", b"float", b"int32", b"uint32", b"float32"), 4),
     **dict.fromkeys((b"double", b"float64", b"int64", b"uint64"), 8),
-}  # fmt: skip
+}
 
 
 def _ply(file: int, size: int) -> _Declared:
@@ -207,7 +249,10 @@ def _ply(file: int, size: int) -> _Declared:
             width += 2 if text else _WIDTH[kind]  # of a list its length alone
     least += count * width
     if least > size - end or any(n > size for n in counts.values()):
-        raise ValueError(f"its header declares {sum(counts.values())} elements, which take {least} bytes, and {size - end} follow it")
+        raise ValueError(
+            f"its header declares {sum(counts.values())} elements, which take {least} bytes, "
+            f"and {size - end} follow it"
+        )
     return _Declared(counts.get(b"face", 0), counts.get(b"vertex", 0), 1)
 
 
@@ -222,14 +267,19 @@ def _glb(file: int, size: int) -> _Declared:
         if (length := int.from_bytes(data[12:16], "little")) > _DESCRIPTION:
             raise ValueError(f"its description takes {length} bytes, more than {_DESCRIPTION}")
         tree = json.loads(data[20 : 20 + length])
-    if packed := [name for name in tree.get("extensionsRequired", []) if "compression" in name or "meshopt" in name]:
+    if packed := [
+        name for name in tree.get("extensionsRequired", []) if "compression" in name or "meshopt" in name
+    ]:
         raise ValueError(f"it is packed by {shown(packed[0], 60)}, which is not read; save it without")
     if any("uri" in buffer for buffer in tree.get("buffers", [])):
         raise ValueError("it refers to another file for its numbers; save it as one file")
     accessors = [_accessor(tree, accessor) for accessor in tree.get("accessors", [])]
     faces, corners = [], []
     for mesh in tree.get("meshes", []):
-        used = [accessors[_index(p.get("indices", p["attributes"]["POSITION"]), accessors)] for p in mesh["primitives"]]
+        used = [
+            accessors[_index(p.get("indices", p["attributes"]["POSITION"]), accessors)]
+            for p in mesh["primitives"]
+        ]
         points = [accessors[_index(p["attributes"]["POSITION"], accessors)] for p in mesh["primitives"]]
         strips = [p.get("mode", 4) in (5, 6) for p in mesh["primitives"]]
         faces.append(sum(n if strip else n // 3 for n, strip in zip(used, strips, strict=True)))
@@ -253,7 +303,10 @@ def _accessor(tree: Mapping[str, Any], accessor: Mapping[str, Any]) -> int:
     views = tree["bufferViews"]
     length = views[_index(accessor["bufferView"], views)]["byteLength"]
     if count * width > length:
-        raise ValueError(f"an accessor of it declares {count} elements of {width} bytes, and its view has {shown(length, 40)}")
+        raise ValueError(
+            f"an accessor of it declares {count} elements of {width} bytes, and its view has "
+            f"{shown(length, 40)}"
+        )
     return count
 
 
@@ -263,6 +316,12 @@ def _index(number: object, into: list[Any]) -> int:
     return number
 
 
-_DECLARED: Mapping[str, Callable[[int, int], _Declared]] = {"glb": _glb, "obj": _obj, "off": _off, "ply": _ply, "stl": _stl}
+_DECLARED: Mapping[str, Callable[[int, int], _Declared]] = {
+    "glb": _glb,
+    "obj": _obj,
+    "off": _off,
+    "ply": _ply,
+    "stl": _stl,
+}
 FORMATS = tuple(_DECLARED)
 """Suffixes of the formats that are read: each is one file that refers to no other for its shape."""

@@ -20,13 +20,15 @@ def _unit(v: NDArray[Any], instead: NDArray[Any]) -> Floats:
 
 
 def pseudonormals(vertices: Floats, faces: Ints) -> Floats:
-    """(n_faces, 7, 3) outward unit normals of each face's features: the face, edges ab, bc, ca, vertices a, b, c.
+    """(n_faces, 7, 3) outward unit normals of each face's features: the face, edges ab, bc, ca, vertices a,
+    b, c.
 
-    `vertices` is (n_vertices, 3) in any frame and unit, the result in the same frame; `faces` is (n_faces, 3), counter-clockwise
-    seen from outside, and faces that touch share their vertices (merge duplicates first). With q the closest point of a closed
-    surface to p and n the normal of the feature that q lies on, p is outside where n . (p - q) > 0 (Baerentzen and Aanaes 2005):
-    an edge has the sum of its faces' normals, a vertex their sum weighted by the angle of each face there. A sum of zero becomes
-    the face's normal; a face without area takes the mean of its neighbours'.
+    `vertices` is (n_vertices, 3) in any frame and unit, the result in the same frame; `faces` is (n_faces,
+    3), counter-clockwise seen from outside, and faces that touch share their vertices (merge duplicates
+    first). With q the closest point of a closed surface to p and n the normal of the feature that q lies on,
+    p is outside where n . (p - q) > 0 (Baerentzen and Aanaes 2005):
+    an edge has the sum of its faces' normals, a vertex their sum weighted by the angle of each face there. A
+    sum of zero becomes the face's normal; a face without area takes the mean of its neighbours'.
     """
     n_vertices, n_faces = len(vertices), len(faces)
     corner = vertices[faces]
@@ -42,7 +44,9 @@ def pseudonormals(vertices: Floats, faces: Ints) -> Floats:
     _, edge_of = np.unique(key.ravel(), return_inverse=True)
     n_edges = int(edge_of.max()) + 1 if n_faces else 0
     each = np.repeat(face, 3, axis=0)
-    edge_sum = np.stack([np.bincount(edge_of, weights=w, minlength=n_edges) for w in each.T], axis=-1)[edge_of]
+    edge_sum = np.stack([np.bincount(edge_of, weights=w, minlength=n_edges) for w in each.T], axis=-1)[
+        edge_of
+    ]
     if flat.any():
         around = _unit(edge_sum.reshape(n_faces, 3, 3).sum(axis=1), np.array([[0.0, 0.0, 1.0]]))
         face = np.where(flat, around, face)
@@ -51,7 +55,9 @@ def pseudonormals(vertices: Floats, faces: Ints) -> Floats:
     turn = np.linalg.norm(np.cross(edge, back), axis=-1)
     angle = np.arctan2(turn, -(edge * back).sum(-1))
     weighted = (face[:, None, :] * angle[:, :, None]).reshape(-1, 3)
-    vertex_sum = np.stack([np.bincount(faces.ravel(), weights=w, minlength=n_vertices) for w in weighted.T], axis=-1)[faces.ravel()]
+    vertex_sum = np.stack(
+        [np.bincount(faces.ravel(), weights=w, minlength=n_vertices) for w in weighted.T], axis=-1
+    )[faces.ravel()]
 
     each = np.repeat(face, 3, axis=0)
     normals: Floats = np.empty((n_faces, 7, 3))

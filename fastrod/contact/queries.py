@@ -32,22 +32,33 @@ class Hits(NamedTuple):
 
 
 def clearance(engine: Engine, shape: Shape, name: str | None = None) -> Floats:
-    """(n_robots,) smallest gap between a robot's surface, mounting excepted, and the obstacle of this name, or all obstacles and,
-    where they may touch, rods [m]. Negative by the depth where they overlap; inf where there is nothing; nan where there is no shape.
+    """(n_robots,) smallest gap between a robot's surface, mounting excepted, and the obstacle of this name,
+    or all obstacles and, where they may touch, rods [m]. Negative by the depth where they overlap; inf where
+    there is nothing; nan where there is no shape.
     """
     return _gap(engine, shape, engine.poses, None if name is None else engine.scene.index(name))
 
 
-def _gap(engine: Engine, shape: Shape, poses: Floats, only: int | None = None, rows: Flags | None = None) -> Floats:
+def _gap(
+    engine: Engine, shape: Shape, poses: Floats, only: int | None = None, rows: Flags | None = None
+) -> Floats:
     n, n_points = shape.arclength.shape
     surfaces, which = engine.surfaces, slice(None) if only is None else [only]
     surfaces = surfaces._replace(
-        kind=surfaces.kind[which], size=surfaces.size[which], sphere=surfaces.sphere[which], friction=surfaces.friction[which],
-        compliance=surfaces.compliance[which], body=surfaces.body[which], give=surfaces.give[which], root=surfaces.root[which],
-    )  # fmt: skip
+        kind=surfaces.kind[which],
+        size=surfaces.size[which],
+        sphere=surfaces.sphere[which],
+        friction=surfaces.friction[which],
+        compliance=surfaces.compliance[which],
+        body=surfaces.body[which],
+        give=surfaces.give[which],
+        root=surfaces.root[which],
+    )
     frames = np.ascontiguousarray(frames_of(poses)[:, which])
     nobody = np.zeros(n, bool)
-    scenery = Scenery(engine.rods, surfaces, frames, frames, frames, shape, shape, nobody, nobody, 1e-9, _EVERYTHING, 0.0)
+    scenery = Scenery(
+        engine.rods, surfaces, frames, frames, frames, shape, shape, nobody, nobody, 1e-9, _EVERYTHING, 0.0
+    )
     finite = np.isfinite(shape.position).all((1, 2))
     gap, some = np.full(n, np.nan), np.flatnonzero(finite if rows is None else finite & rows)
     found, n_found = np.empty((len(some), MOST_FOUND, CANDIDATE)), np.zeros(len(some), np.int64)
@@ -62,24 +73,37 @@ def _gap(engine: Engine, shape: Shape, poses: Floats, only: int | None = None, r
 
 
 def swept_clearance(
-    engine: Engine, before: Shape, poses_before: Floats, after: Shape, tolerance: float, rows: Flags | None = None
+    engine: Engine,
+    before: Shape,
+    poses_before: Floats,
+    after: Shape,
+    tolerance: float,
+    rows: Flags | None = None,
 ) -> Floats:
-    """(n_robots,) smallest gap on the way from one shape to another, to `tolerance` [m]: robots and obstacles move in straight
-    lines at even speed. The gap changes by no more than they move, so intervals that cannot hold the minimum are left out. nan but for
+    """(n_robots,) smallest gap on the way from one shape to another, to `tolerance` [m]: robots and obstacles
+    move in straight lines at even speed. The gap changes by no more than they move, so intervals that cannot
+    hold the minimum are left out. nan but for
     `rows`, where they are given."""
     n = len(after.arclength)
-    moved = np.linalg.norm(after.position - before.position, axis=2).max(1) + _obstacles_move(engine, poses_before)
+    moved = np.linalg.norm(after.position - before.position, axis=2).max(1) + _obstacles_move(
+        engine, poses_before
+    )
 
     def gap_at(t: Floats, some: Flags) -> Floats:
         part = t[:, None, None]
         tangent = (1.0 - part[..., None]) * before.rotation + part[..., None] * after.rotation
-        there = after._replace(position=(1.0 - part) * before.position + part * after.position, rotation=tangent)
+        there = after._replace(
+            position=(1.0 - part) * before.position + part * after.position, rotation=tangent
+        )
         gap = _gap(engine, there, between(poses_before, engine.poses, t), rows=some)
         return np.where(np.isnan(gap), np.inf, gap)
 
     wanted = np.isfinite(after.position).all((1, 2)) & (np.ones(n, bool) if rows is None else rows)
     each = np.arange(n)
-    times, gaps = np.tile([0.0, 1.0], (n, 1)), np.stack([gap_at(np.zeros(n), wanted), gap_at(np.ones(n), wanted)], axis=1)
+    times, gaps = (
+        np.tile([0.0, 1.0], (n, 1)),
+        np.stack([gap_at(np.zeros(n), wanted), gap_at(np.ones(n), wanted)], axis=1),
+    )
     for _ in range(_MOST_LOOKS):
         bound = 0.5 * (gaps[:, 1:] + gaps[:, :-1] - np.nan_to_num(moved)[:, None] * np.diff(times, axis=1))
         worst = bound.argmin(1)
@@ -94,16 +118,20 @@ def swept_clearance(
 
 
 def _obstacles_move(engine: Engine, poses_before: Floats) -> Floats:
-    """(1 or n,) a bound of how far a point of an obstacle near the rods has moved; for a plane, of one within its robots' reach."""
+    """(1 or n,) a bound of how far a point of an obstacle near the rods has moved; for a plane, of one within
+    its robots' reach."""
     ball = engine.surfaces.sphere.copy()
     ball[~np.isfinite(ball[:, 3]), 3] = 10.0 * float(engine.rods.reach.max())
     shift = np.linalg.norm(engine.poses[..., :3] - poses_before[..., :3], axis=-1)
     turn = np.linalg.norm(np.abs(engine.poses[..., 3:]) - np.abs(poses_before[..., 3:]), axis=-1)
-    return np.asarray((shift + 2.0 * turn * (np.linalg.norm(ball[:, :3], axis=1) + ball[:, 3])).max(-1, initial=0.0))
+    return np.asarray(
+        (shift + 2.0 * turn * (np.linalg.norm(ball[:, :3], axis=1) + ball[:, 3])).max(-1, initial=0.0)
+    )
 
 
 def ray_cast(engine: Engine, origin: ArrayLike, direction: ArrayLike, longest: float) -> Hits:
-    """Rays (n_robots, n_rays, 3) or (n_rays, 3), world, against the obstacles where they are now; directions need not be unit."""
+    """Rays (n_robots, n_rays, 3) or (n_rays, 3), world, against the obstacles where they are now; directions
+    need not be unit."""
     n = len(engine.gap)
     refuse_masked("origin", origin)
     refuse_masked("direction", direction)

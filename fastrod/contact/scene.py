@@ -29,14 +29,15 @@ class ContactScene:
     obstacles: Sequence[Obstacle] = ()
     """Meshes and simple shapes, each with a name of its own, a friction coefficient and a stiffness."""
     rod_radius: float | Sequence[float] | None = None
-    """Radius of the rods, one or one for each segment [m]; None: body_radius of the robot file, and where that is 0 just
-    beyond the outermost tendon. The tip is a half sphere."""
+    """Radius of the rods, one or one for each segment [m]; None: body_radius of the robot file, and where
+    that is 0 just beyond the outermost tendon. The tip is a half sphere."""
     mounting: float | None = None
     """Arclength from the base that belongs to the mounting and touches nothing [m]; None: 1.5 radii."""
     self_contact: bool = False
     """A rod touches itself too."""
     worlds: Sequence[int] | None = None
-    """(n_robots,) number of the world that a robot is in; robots of one world touch each other. None: each has its own."""
+    """(n_robots,) number of the world that a robot is in; robots of one world touch each other. None: each
+    has its own."""
     rod_friction: float = 0.0
     """Coulomb coefficient of rod on rod."""
     rod_stiffness: float = math.inf
@@ -46,28 +47,45 @@ class ContactScene:
     watch: float = 0.01
     """Gap below which a contact is watched before it closes, as a part of the rod's length."""
     max_passes: int = 600
-    """Passes after which a step that cannot be solved is given up: fewer where many robots wait for one, as in training."""
+    """Passes after which a step that cannot be solved is given up: fewer where many robots wait for one, as
+    in training."""
 
     def __post_init__(self) -> None:
         obstacles = (self.obstacles,) if isinstance(self.obstacles, Obstacle) else tuple(self.obstacles)
         object.__setattr__(self, "obstacles", obstacles)
         for o in obstacles:
             if not isinstance(o, Obstacle):
-                raise InputError(f"ContactScene.obstacles holds {o!r}; give what fastrod.contact.mesh, box, sphere, ... return.")
+                raise InputError(
+                    f"ContactScene.obstacles holds {o!r}; give what fastrod.contact.mesh, box, "
+                    "sphere, ... return."
+                )
         names = [o.name for o in obstacles]
         if len(set(names)) < len(names):
             twice = next(n for n in names if names.count(n) > 1)
-            raise InputError(f"two obstacles are called {twice!r}; give each a name of its own, mesh(..., name='left').")
+            raise InputError(
+                f"two obstacles are called {twice!r}; give each a name of its own, mesh(..., name='left')."
+            )
         if not (math.isfinite(self.rod_friction) and self.rod_friction >= 0.0):
-            raise InputError(f"ContactScene.rod_friction is {self.rod_friction!r}; it must be zero or positive.")
+            raise InputError(
+                f"ContactScene.rod_friction is {self.rod_friction!r}; it must be zero or positive."
+            )
         if not self.rod_stiffness > 0.0:
-            raise InputError(f"ContactScene.rod_stiffness is {self.rod_stiffness!r} N/m; it must be positive, or inf for rigid.")
+            raise InputError(
+                f"ContactScene.rod_stiffness is {self.rod_stiffness!r} N/m; it must be "
+                "positive, or inf for rigid."
+            )
         if not isinstance(self.max_contacts, int) or not 1 <= self.max_contacts <= 64:
-            raise InputError(f"ContactScene.max_contacts is {self.max_contacts!r}; it must be a whole number from 1 to 64.")
+            raise InputError(
+                f"ContactScene.max_contacts is {self.max_contacts!r}; it must be a whole number from 1 to 64."
+            )
         if not isinstance(self.max_passes, int) or self.max_passes < 20:
-            raise InputError(f"ContactScene.max_passes is {self.max_passes!r}; it must be a whole number, at least 20.")
+            raise InputError(
+                f"ContactScene.max_passes is {self.max_passes!r}; it must be a whole number, at least 20."
+            )
         if not 0.0 < self.watch <= 0.2:
-            raise InputError(f"ContactScene.watch is {self.watch!r}; it is a part of the rod's length, between 0 and 0.2.")
+            raise InputError(
+                f"ContactScene.watch is {self.watch!r}; it is a part of the rod's length, between 0 and 0.2."
+            )
         if self.mounting is not None and not (math.isfinite(self.mounting) and self.mounting >= 0.0):
             raise InputError(f"ContactScene.mounting is {self.mounting!r} m; it must be zero or positive.")
 
@@ -88,7 +106,10 @@ class ContactScene:
             return np.arange(n_robots)
         worlds = np.asarray(self.worlds)
         if worlds.shape != (n_robots,):
-            raise InputError(f"ContactScene.worlds has shape {worlds.shape}; give the world of each of the {n_robots} robots.")
+            raise InputError(
+                f"ContactScene.worlds has shape {worlds.shape}; give the world of each of the "
+                f"{n_robots} robots."
+            )
         return np.asarray(np.unique(worlds, return_inverse=True)[1], dtype=np.int64)
 
     def rods(self, robots: Sequence[Robot], n_robots: int, layout: Layout, params: Params) -> Rods:
@@ -97,7 +118,10 @@ class ContactScene:
         reach = np.array([robot.length for robot in robots])
         first = 1.5 * radius[:, 0] if self.mounting is None else np.full(len(robots), self.mounting)
         if (first >= reach).any():
-            raise InputError(f"the mounting takes {first.max():.4g} m of a rod of {reach.min():.4g} m; give ContactScene(mounting=...).")
+            raise InputError(
+                f"the mounting takes {first.max():.4g} m of a rod of {reach.min():.4g} m; give "
+                "ContactScene(mounting=...)."
+            )
         spacing = np.array([min(s.length for s in robot.segments) for robot in robots]) / layout.n_steps
 
         def each(a: Floats) -> Floats:
@@ -105,27 +129,39 @@ class ContactScene:
             return np.array(np.broadcast_to(a, (n_robots, *a.shape[1:])), dtype=float, order="C")
 
         return Rods(
-            each(radius), each(first), each(spacing), each(reach), each(params.moment_scale), each(params.tension_scale),
-            len(layout.free_tendon), layout.n_steps, float(self.rod_friction),
-            1.0 / self.rod_stiffness, int(self.self_contact),
-        )  # fmt: skip
+            each(radius),
+            each(first),
+            each(spacing),
+            each(reach),
+            each(params.moment_scale),
+            each(params.tension_scale),
+            len(layout.free_tendon),
+            layout.n_steps,
+            float(self.rod_friction),
+            1.0 / self.rod_stiffness,
+            int(self.self_contact),
+        )
 
     def radius_of(self, robot: Robot) -> list[float]:
         """Of each segment of a robot in this scene [m]; `InputError` where `rod_radius` does not fit it."""
         if self.rod_radius is None:
             return [
-                segment.body_radius or _BEYOND_TENDONS * max([np.hypot(*t.position(k + 1)[k]) for t in segment.tendons], default=0.0)
+                segment.body_radius
+                or _BEYOND_TENDONS
+                * max([np.hypot(*t.position(k + 1)[k]) for t in segment.tendons], default=0.0)
                 for k, segment in enumerate(robot.segments)
             ]
         try:
             given = np.broadcast_to(np.asarray(self.rod_radius, float), (robot.n_segments,))
         except (TypeError, ValueError, OverflowError) as error:
             raise InputError(
-                f"ContactScene.rod_radius is {self.rod_radius!r}; give one radius or {robot.n_segments}, one a segment [m]."
+                f"ContactScene.rod_radius is {self.rod_radius!r}; give one radius or {robot.n_segments}, "
+                "one a segment [m]."
             ) from error
         if not ((given >= 0.0) & (given <= robot.length)).all():
             raise InputError(
-                f"ContactScene.rod_radius is {self.rod_radius!r} m; it must be between 0 and the rod's length. Was it given in mm?"
+                f"ContactScene.rod_radius is {self.rod_radius!r} m; it must be between 0 and the rod's "
+                "length. Was it given in mm?"
             )
         return list(map(float, given))
 
@@ -134,20 +170,24 @@ class ContactScene:
         return np.array([[*o.position, *o.quaternion] for o in self.obstacles], float).reshape(1, -1, 7)
 
     def moved(self, poses: Floats, given: Mapping[str, ArrayLike] | None, n_robots: int) -> Floats:
-        """`poses` with those that were given, each (7,) or (n_robots, 7); names are checked, quaternions made unit."""
+        """`poses` with those that were given, each (7,) or (n_robots, 7); names are checked, quaternions made
+        unit."""
         for name, value in (given or {}).items():
             k = self.index(name)
             pose = _rows(f"obstacle_pose[{name!r}]", value, 7, n_robots, "position m, quaternion w x y z")
             norm = np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
             if not (np.abs(norm - 1.0) < 1e-3).all():
                 worst = float(norm[np.abs(norm - 1.0).argmax(), 0])
-                raise InputError(f"obstacle_pose[{name!r}] has a quaternion of norm {worst:.4g}; it must be 1, as w x y z.")
+                raise InputError(
+                    f"obstacle_pose[{name!r}] has a quaternion of norm {worst:.4g}; it must be 1, as w x y z."
+                )
             poses = np.repeat(poses, len(pose), axis=0) if len(poses) < len(pose) else poses.copy()
             poses[:, k, :3], poses[:, k, 3:] = pose[:, :3], pose[:, 3:] / norm
         return poses
 
     def velocities(self, given: Mapping[str, ArrayLike] | None, n_robots: int) -> dict[int, Floats]:
-        """Obstacle index -> (1 or n_robots, 6) velocity of its origin [m/s] and angular velocity [rad/s], world."""
+        """Obstacle index -> (1 or n_robots, 6) velocity of its origin [m/s] and angular velocity [rad/s],
+        world."""
         return {
             self.index(name): _rows(f"obstacle_velocity[{name!r}]", value, 6, n_robots, "m/s, rad/s")
             for name, value in (given or {}).items()
@@ -159,9 +199,13 @@ def _rows(name: str, value: ArrayLike, width: int, n_robots: int, unit: str) -> 
     try:
         a = np.atleast_2d(np.asarray(value, float))
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{name} is not an array of numbers; give ({width},) or ({n_robots}, {width}) [{unit}].") from error
+        raise InputError(
+            f"{name} is not an array of numbers; give ({width},) or ({n_robots}, {width}) [{unit}]."
+        ) from error
     if a.ndim != 2 or a.shape[1] != width or len(a) not in (1, n_robots):
-        raise InputError(f"{name} has shape {np.shape(value)}; it must be ({width},) or ({n_robots}, {width}) [{unit}].")
+        raise InputError(
+            f"{name} has shape {np.shape(value)}; it must be ({width},) or ({n_robots}, {width}) [{unit}]."
+        )
     if not np.isfinite(a).all():
         raise InputError(f"{name} holds a value that is not finite.")
     return a

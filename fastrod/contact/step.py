@@ -24,14 +24,25 @@ class Ways(NamedTuple):
 
 
 def contact_step(
-    engine: Engine, ways: Ways, rows: Ints, warm: Flags, start: Ports | None, end: Ports, rest: Ports, memory: Memory, shape: Shape,
-    tolerance: float, passes: Ints, most: int,
-) -> tuple[Flags, Floats]:  # fmt: skip
-    """Bring `rows` from the inputs `start` of the last step to `end`, in `shape`; (n_robots,) who is well, and how far each came.
+    engine: Engine,
+    ways: Ways,
+    rows: Ints,
+    warm: Flags,
+    start: Ports | None,
+    end: Ports,
+    rest: Ports,
+    memory: Memory,
+    shape: Shape,
+    tolerance: float,
+    passes: Ints,
+    most: int,
+) -> tuple[Flags, Floats]:
+    """Bring `rows` from the inputs `start` of the last step to `end`, in `shape`; (n_robots,) who is well,
+    and how far each came.
 
-    `rest` are the inputs of the straight, unloaded robots: a cold robot that would overlap something is led from there, if it
-    is clear there; else it is pushed out of where it is. Without a last step there is no slip, and so no friction. `most` passes
-    are spent on a warm robot, about: a step ends.
+    `rest` are the inputs of the straight, unloaded robots: a cold robot that would overlap something is led
+    from there, if it is clear there; else it is pushed out of where it is. Without a last step there is no
+    slip, and so no friction. `most` passes are spent on a warm robot, about: a step ends.
     """
     n = len(warm)
     cold = engine.whole_worlds(np.isin(np.arange(n), rows) & ~warm)
@@ -67,9 +78,18 @@ def contact_step(
 
 
 def _begin(
-    engine: Engine, ways: Ways, rows: Ints, end: Ports, rest: Ports, memory: Memory, shape: Shape, tolerance: float, passes: Ints
+    engine: Engine,
+    ways: Ways,
+    rows: Ints,
+    end: Ports,
+    rest: Ports,
+    memory: Memory,
+    shape: Shape,
+    tolerance: float,
+    passes: Ints,
 ) -> Floats:
-    """Cold robots that would overlap something: led from their rest shape, or pushed out; how far each came."""
+    """Cold robots that would overlap something: led from their rest shape, or pushed out; how far each
+    came."""
     x = memory.x.copy()
     free_shape = Shape(*(a.copy() for a in shape))
     straight = ways.settle(rows, rest, shape)
@@ -83,5 +103,7 @@ def _begin(
         memory.x[stuck] = x[stuck]
         for now, then in zip(shape, free_shape, strict=True):
             now[stuck] = then[stuck]
-        done[stuck] = engine.follow(stuck, None, end, memory, shape, ways.run, tolerance, passes, COLD_PASSES)[1][stuck]
+        done[stuck] = engine.follow(
+            stuck, None, end, memory, shape, ways.run, tolerance, passes, COLD_PASSES
+        )[1][stuck]
     return done

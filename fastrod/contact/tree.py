@@ -1,4 +1,5 @@
-"""`[Obstacle] -> Surfaces`: every mesh's triangles in a bounding-volume hierarchy, every simple shape as its numbers."""
+"""`[Obstacle] -> Surfaces`: every mesh's triangles in a bounding-volume hierarchy, every simple shape as its
+numbers."""
 
 from __future__ import annotations
 
@@ -20,7 +21,13 @@ _LEAF = 4  # triangles at most
 
 def pack(obstacles: Sequence[Obstacle]) -> Surfaces:
     """The arrays that the kernels read; obstacle k of the list is row k."""
-    boxes, links, corners, normals, roots = [np.zeros((0, 12))], [np.zeros((0, 2), np.int64)], [np.zeros((0, 9))], [np.zeros((0, 7, 3))], []
+    boxes, links, corners, normals, roots = (
+        [np.zeros((0, 12))],
+        [np.zeros((0, 2), np.int64)],
+        [np.zeros((0, 9))],
+        [np.zeros((0, 7, 3))],
+        [],
+    )
     n_nodes = n_faces = 0
     for obstacle in obstacles:
         if obstacle.shape != "mesh":
@@ -57,7 +64,12 @@ def _ball(o: Obstacle) -> tuple[float, float, float, float]:
         centre = 0.5 * (low + high)
         return (*centre.tolist(), float(np.linalg.norm(o.vertices - centre, axis=1).max()))
     a, b, c = o.size
-    radius = {"sphere": a, "box": 0.5 * math.hypot(a, b, c), "cylinder": math.hypot(a, 0.5 * b), "capsule": a + 0.5 * b}
+    radius = {
+        "sphere": a,
+        "box": 0.5 * math.hypot(a, b, c),
+        "cylinder": math.hypot(a, 0.5 * b),
+        "capsule": a + 0.5 * b,
+    }
     return 0.0, 0.0, 0.0, radius.get(o.shape, math.inf)
 
 
@@ -88,7 +100,12 @@ def _hierarchy(obstacle: Obstacle) -> tuple[Floats, Ints, int, Floats, Floats]:
         middle = (starts + ends) // 2
         children = np.stack([starts, middle, middle, ends], axis=1).reshape(-1, 2)  # left and right of each
         begin, end = children[:, 0], children[:, 1]
-        box.append(np.concatenate([_reduce(np.minimum, low[order], begin, end), _reduce(np.maximum, high[order], begin, end)], axis=1))
+        box.append(
+            np.concatenate(
+                [_reduce(np.minimum, low[order], begin, end), _reduce(np.maximum, high[order], begin, end)],
+                axis=1,
+            )
+        )
         deeper = end - begin > _LEAF
         below = n_nodes + len(starts) + np.cumsum(deeper) - 1
         link.append(np.where(deeper, below, _leaf_link(begin, end)))
@@ -97,7 +114,13 @@ def _hierarchy(obstacle: Obstacle) -> tuple[Floats, Ints, int, Floats, Floats]:
     boxes = np.concatenate(box).reshape(-1, 12) if box else np.zeros((0, 12))
     links = np.concatenate(link).reshape(-1, 2) if link else np.zeros((0, 2), np.int64)
     normal = pseudonormals(obstacle.vertices, obstacle.faces)[order]
-    return boxes, links, int(root), np.ascontiguousarray(corner[order].reshape(-1, 9)), np.ascontiguousarray(normal)
+    return (
+        boxes,
+        links,
+        int(root),
+        np.ascontiguousarray(corner[order].reshape(-1, 9)),
+        np.ascontiguousarray(normal),
+    )
 
 
 def _leaf_link(begin: Ints, end: Ints) -> Ints:

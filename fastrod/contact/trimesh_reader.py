@@ -21,19 +21,28 @@ from numpy.typing import NDArray
 def read(path: str, kind: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Vertices (n, 3) and triangles (m, 3) of all bodies of a file of the format `kind`.
 
-    No other file is opened, whatever it refers to. Raises what trimesh raises: each of its loaders has its own.
+    No other file is opened, whatever it refers to. Raises what trimesh raises: each of its loaders has its
+    own.
     """
     import trimesh
 
     data = _PLAIN.get(kind, bytes)(Path(path).read_bytes())
-    with _silent("trimesh", "trimesh.util"):  # a stream has no folder in which materials or buffers would be looked for
-        made = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False, skip_materials=True).to_mesh()
-    return np.array(made.vertices, dtype=np.float64).reshape(-1, 3), np.array(made.faces, dtype=np.int64).reshape(-1, 3)
+    # a stream has no folder in which materials or buffers would be looked for
+    with _silent("trimesh", "trimesh.util"):
+        made = trimesh.load_scene(
+            io.BytesIO(data), file_type=kind, process=False, skip_materials=True
+        ).to_mesh()
+    return np.array(made.vertices, dtype=np.float64).reshape(-1, 3), np.array(
+        made.faces, dtype=np.int64
+    ).reshape(-1, 3)
 
 
 def _plain_obj(data: bytes) -> bytes:
-    """Positions and faces alone, as one body: the time that trimesh takes grows with the square of their number."""
-    lines = re.findall(rb"^[ \t]*[vf][ \t][^\r\n]*", data.replace(b"\\\n", b"").replace(b"\r", b"\n"), re.MULTILINE)
+    """Positions and faces alone, as one body: the time that trimesh takes grows with the square of their
+    number."""
+    lines = re.findall(
+        rb"^[ \t]*[vf][ \t][^\r\n]*", data.replace(b"\\\n", b"").replace(b"\r", b"\n"), re.MULTILINE
+    )
     return re.sub(rb"/[^\s]*", b"", b"\n".join(line.strip() for line in lines)) + b"\n"
 
 
@@ -41,7 +50,11 @@ def _plain_stl(data: bytes) -> bytes:
     """All solids of a text as one, for the same reason; a binary file as it is."""
     if len(data) >= 84 and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little"):
         return data
-    return b"solid\n" + re.sub(rb"^[ \t]*(end)?solid\b[^\r\n]*", b"", data, flags=re.IGNORECASE | re.MULTILINE) + b"\nendsolid\n"
+    return (
+        b"solid\n"
+        + re.sub(rb"^[ \t]*(end)?solid\b[^\r\n]*", b"", data, flags=re.IGNORECASE | re.MULTILINE)
+        + b"\nendsolid\n"
+    )
 
 
 _PLAIN: dict[str, Callable[[bytes], bytes]] = {"obj": _plain_obj, "stl": _plain_stl}
@@ -49,7 +62,8 @@ _PLAIN: dict[str, Callable[[bytes], bytes]] = {"obj": _plain_obj, "stl": _plain_
 
 @contextmanager
 def _silent(*names: str) -> Iterator[None]:
-    """Let these loggers write nothing from this thread: trimesh logs tracebacks of exceptions that it handles."""
+    """Let these loggers write nothing from this thread: trimesh logs tracebacks of exceptions that it
+    handles."""
     loggers, thread = [logging.getLogger(name) for name in names], threading.get_ident()
 
     def drop(record: logging.LogRecord) -> bool:

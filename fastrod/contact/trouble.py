@@ -9,26 +9,42 @@ from fastrod.kernels.contact.iteration import DIVERGED, INSIDE, MOVES, THROUGH, 
 from fastrod.types import Floats
 
 NO_NODE_LEFT, NO_CONTACT_LEFT = 10, 11
-"""A segment has as many contacts as nodes; the rod has as many as it may have. Beside what kernels.touch names."""
+"""A segment has as many contacts as nodes; the rod has as many as it may have. Beside what kernels.touch
+names."""
 
 
 def sentence(trouble: Floats, scene: ContactScene, n_steps: int, length: Floats, done: float) -> str:
-    """Say what is stuck, where, by how much, and what to do; `length` (n_segments,) [m], `done` is the part of the step
-    that was solved."""
+    """Say what is stuck, where, by how much, and what to do; `length` (n_segments,) [m], `done` is the part
+    of the step that was solved."""
     what, k, s, size = int(trouble[0]), int(trouble[1]), trouble[2], trouble[3]
-    name = repr(scene.names[k]) if 0 <= k < len(scene.names) else f"rod {k - len(scene.names)}" if k >= 0 else "an obstacle"
+    name = (
+        repr(scene.names[k])
+        if 0 <= k < len(scene.names)
+        else f"rod {k - len(scene.names)}"
+        if k >= 0
+        else "an obstacle"
+    )
     at = f"{name} at arclength {s:.4g} m"
     segment = int(np.searchsorted(np.cumsum(length)[:-1], s, side="right")) + 1
     words = {
-        MOVES: f"the rod still moves by {size:.2g} m a pass on {at}; take smaller steps, or raise ContactScene.max_passes above "
+        MOVES: f"the rod still moves by {size:.2g} m a pass on {at}; take smaller steps, or raise "
+        "ContactScene.max_passes above "
         f"{scene.max_passes}",
-        UNSOLVED: f"no forces were found that hold the rod on {at}, it moves by {size:.2g} m; take smaller steps",
-        INSIDE: f"no forces were found that push the rod out of {at}, {size:.2g} m deep; take smaller steps, or more "
+        UNSOLVED: f"no forces were found that hold the rod on {at}, it moves by {size:.2g} m; take smaller "
+        "steps",
+        INSIDE: f"no forces were found that push the rod out of {at}, {size:.2g} m deep; take smaller "
+        "steps, or more "
         f"than {n_steps} points_per_segment",
         THROUGH: f"the rod would go through {at}; take smaller steps, or lead it around",
         DIVERGED: f"the rod's shape diverged, last held by {at}; take smaller steps",
-        NO_NODE_LEFT: f"segment {segment} has no node left for a contact with {at}; take more than {n_steps} points_per_segment",
-        NO_CONTACT_LEFT: f"the rod is {size:.2g} m inside {at} and has no contact left; raise ContactScene.max_contacts above "
+        NO_NODE_LEFT: f"segment {segment} has no node left for a contact with {at}; take more than "
+        f"{n_steps} points_per_segment",
+        NO_CONTACT_LEFT: f"the rod is {size:.2g} m inside {at} and has no contact left; raise "
+        "ContactScene.max_contacts above "
         f"{scene.max_contacts}",
     }[what]
-    return f"contact: {words}." if not 0.005 < done < 0.995 else f"contact: after {100.0 * done:.0f} % of this step {words}."
+    return (
+        f"contact: {words}."
+        if not 0.005 < done < 0.995
+        else (f"contact: after {100.0 * done:.0f} % of this step {words}.")
+    )

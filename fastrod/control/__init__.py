@@ -16,6 +16,20 @@ from fastrod.control.trajectories import (
 )
 
 __all__ = [
-    "Arm", "Base", "FixedBase", "MovingBase", "ResolvedRate", "SoftTip", "Trajectory", "circle", "figure_eight", "helix", "names",
-    "references", "square", "square_helix", "trajectory", "triangle",
-]  # fmt: skip
+    "Arm",
+    "Base",
+    "FixedBase",
+    "MovingBase",
+    "ResolvedRate",
+    "SoftTip",
+    "Trajectory",
+    "circle",
+    "figure_eight",
+    "helix",
+    "names",
+    "references",
+    "square",
+    "square_helix",
+    "trajectory",
+    "triangle",
+]

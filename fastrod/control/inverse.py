@@ -1,4 +1,5 @@
-"""Inverse by learning: the wire lengths with which the tip, as it is measured through all effects of a robot, follows a path."""
+"""Inverse by learning: the wire lengths with which the tip, as it is measured through all effects of a robot,
+follows a path."""
 
 from __future__ import annotations
 
@@ -18,9 +19,12 @@ from fastrod.simulator import Simulator
 from fastrod.types import Flags, Floats
 
 _NODES = 8  # integration steps of a segment: the tip to a micrometre
-_STEP = 0.05  # rad of bend from one sample to the next: beyond it, one pass leaves more than some nanometres, and the rod settles
+# rad of bend from one sample to the next: beyond it, one pass leaves more than some nanometres, and the rod
+# settles
+_STEP = 0.05
 _SETTLED, _EXACT = 1e-8, 1e-10  # m, boundary residual of a rollout and of nearest points
-_NEWTON = 60  # steps toward the nearest points; each leaves about the distance from the path over the radius of the surface
+# steps toward the nearest points; each leaves about the distance from the path over the radius of the surface
+_NEWTON = 60
 _LARGEST = 0.4  # rad of bend in one of them
 _DIFFERENCE = 5e-3  # rad of bend, of the slopes: settling leaves 1e-5 of them, the difference as much
 _MOST = np.pi  # rad of bend, where no limit is given
@@ -30,7 +34,8 @@ _SMOOTHEST = 8  # averages over neighbours; a correction that makes it worse is 
 @final
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Plan:
-    """What to tell a robot, sample after sample, and where it then goes. The first `n_approach` rows lead to the path."""
+    """What to tell a robot, sample after sample, and where it then goes. The first `n_approach` rows lead to
+    the path."""
 
     robot: Robot
     """Whose plan it is."""
@@ -77,22 +82,26 @@ def plan(
     rollouts: int = 15,
     tolerance: float = 1e-6,
 ) -> Plan:
-    """The plan for a tip that is to be measured at `target` (n, 3), base frame [m], one row each 1 / `rate` [Hz].
+    """The plan for a tip that is to be measured at `target` (n, 3), base frame [m], one row each 1 / `rate`
+    [Hz].
 
-    Effects of the robot's file are all in: sensing decides where the tip is measured, memory (backlash, friction, creep ...) how the
-    wires lead it there; the robot begins at rest. A latency is led by sending earlier (`Plan.lead`). A robot with two coordinates
-    reaches a surface only; the tip then goes to the points of it that are nearest to the path.
+    Effects of the robot's file are all in: sensing decides where the tip is measured, memory (backlash,
+    friction, creep ...) how the wires lead it there; the robot begins at rest. A latency is led by sending
+    earlier (`Plan.lead`). A robot with two coordinates reaches a surface only; the tip then goes to the
+    points of it that are nearest to the path.
 
-    `start` (n_tendons,) wire lengths where the robot stands [m], None for straight; from there it takes `approach` seconds to the first
-    row of the path, at rest at both ends; with 0 s it begins on the path. `limit` [m] is the largest displacement
-    (`SegmentActions`), None for a bend of half a turn; extensions stay within each segment's range.
-    Method: the whole sequence is simulated; then every displacement is corrected by `gain` times what, on the robot without effects
-    of actuation, leads from the measured tip to the path, and so on, until no correction is above `tolerance` [m], for at most
-    `rollouts` simulations. A correction that made it worse (one that rings) is taken back, and made smoother in time; the best is
-    kept. What rings slowly (`dynamics` of a period of many samples) is mended in part only. Source: iterative learning control
-    (Arimoto, Kawamura and Miyazaki 1984), here on the model.
-    Raises `InputError` on what is not such a path or number, where the robot's shape is not found, and where a wire would move faster
-    than `rate_limit` [m/s]; `RobotError` where the robot is not one for `SegmentActions`.
+    `start` (n_tendons,) wire lengths where the robot stands [m], None for straight; from there it takes
+    `approach` seconds to the first row of the path, at rest at both ends; with 0 s it begins on the path.
+    `limit` [m] is the largest displacement (`SegmentActions`), None for a bend of half a turn; extensions
+    stay within each segment's range. Method: the whole sequence is simulated; then every displacement is
+    corrected by `gain` times what, on the robot without effects of actuation, leads from the measured tip to
+    the path, and so on, until no correction is above `tolerance` [m], for at most
+    `rollouts` simulations. A correction that made it worse (one that rings) is taken back, and made smoother
+    in time; the best is kept. What rings slowly (`dynamics` of a period of many samples) is mended in part
+    only. Source: iterative learning control (Arimoto, Kawamura and Miyazaki 1984), here on the model.
+    Raises `InputError` on what is not such a path or number, where the robot's shape is not found, and where
+    a wire would move faster than `rate_limit` [m/s]; `RobotError` where the robot is not one for
+    `SegmentActions`.
     """
     path = _path(target)
     for name, value, unit in (("rate", rate, "Hz"), ("gain", gain, ""), ("tolerance", tolerance, "m")):
@@ -137,16 +146,26 @@ def plan(
         _check_speed(dl, rate, rate_limit)
     lost = np.full((n_approach, 3), np.nan)
     return Plan(
-        robot=robot, t=_frozen(np.arange(len(whole)) / rate), dl=_frozen(dl), ext=_frozen(inputs[:, robot.n_tendons :]),
-        target=_frozen(np.concatenate([lost, path])), predicted=_frozen(seen), nearest=_frozen(np.concatenate([lost, nearest])), lead=lead,
-        n_approach=n_approach, rms_predicted=_rms(seen[n_approach:] - path), rms_nearest=_rms(nearest - path),
-        rms_distance=_rms(seen[n_approach:] - nearest), rollouts=spent,
-    )  # fmt: skip
+        robot=robot,
+        t=_frozen(np.arange(len(whole)) / rate),
+        dl=_frozen(dl),
+        ext=_frozen(inputs[:, robot.n_tendons :]),
+        target=_frozen(np.concatenate([lost, path])),
+        predicted=_frozen(seen),
+        nearest=_frozen(np.concatenate([lost, nearest])),
+        lead=lead,
+        n_approach=n_approach,
+        rms_predicted=_rms(seen[n_approach:] - path),
+        rms_nearest=_rms(nearest - path),
+        rms_distance=_rms(seen[n_approach:] - nearest),
+        rollouts=spent,
+    )
 
 
 @final
 class _Drive:
-    """The coordinates of a robot that are free: two displacements of each segment, and the extension of those that extend."""
+    """The coordinates of a robot that are free: two displacements of each segment, and the extension of those
+    that extend."""
 
     def __init__(self, robot: Robot, limit: float | None) -> None:
         self.robot = robot
@@ -166,7 +185,8 @@ class _Drive:
         """(n_tendons + n_segments, n_q) d(wire length, extension)/d(q)."""
 
     def inputs(self, q: Floats) -> Floats:
-        """(n, n_tendons + n_segments) changes of wire length and of segment length of coordinates (n, n_q) [m]."""
+        """(n, n_tendons + n_segments) changes of wire length and of segment length of coordinates (n, n_q)
+        [m]."""
         return np.asarray(q @ self.matrix.T)
 
     def coordinates(self, start: ArrayLike | None) -> Floats:
@@ -183,17 +203,25 @@ class _Drive:
         q: Floats = np.asarray(np.linalg.lstsq(self.matrix[:n], dl, rcond=None)[0], dtype=np.float64)
         left = np.abs(self.matrix[:n] @ q - dl).max()
         if left > 1e-5:
-            raise InputError(f"start asks the wires for {left:g} m that no bend gives; pull one wire as far as its opposite gives.")
+            raise InputError(
+                f"start asks the wires for {left:g} m that no bend gives; pull one wire as far "
+                "as its opposite gives."
+            )
         if ((q < self.low - 1e-9) | (q > self.high + 1e-9)).any():
-            raise InputError(f"start is a displacement of {np.abs(q).max():g} m; it must be within the limits.")
+            raise InputError(
+                f"start is a displacement of {np.abs(q).max():g} m; it must be within the limits."
+            )
         return q
 
 
 def _nearest(drive: _Drive, path: Floats) -> tuple[Floats, Floats, Floats]:
-    """(n, 3) points in reach that are nearest to `path`, (n, n_q) coordinates there of the robot without effects of actuation, and
-    (n, 3, n_q) slopes of the measured tip by them: Gauss-Newton steps, halved where they lead away."""
+    """(n, 3) points in reach that are nearest to `path`, (n, n_q) coordinates there of the robot without
+    effects of actuation, and (n, 3, n_q) slopes of the measured tip by them: Gauss-Newton steps, halved where
+    they lead away."""
     tables = named_effects(drive.robot)
-    plain = _with_effects(drive.robot, [name for name in tables if get_effect(name).seam is not Seam.ACTUATION])
+    plain = _with_effects(
+        drive.robot, [name for name in tables if get_effect(name).seam is not Seam.ACTUATION]
+    )
     simulator = Simulator(plain, n_robots=len(path), points_per_segment=_NODES, outputs="tip")
 
     def measured(q: Floats) -> Floats:
@@ -215,7 +243,11 @@ def _nearest(drive: _Drive, path: Floats) -> tuple[Floats, Floats, Floats]:
     for _ in range(_NEWTON):
         step = _held(drive, q, jacobian, _inverse(jacobian), path - seen)
         longest = np.abs(step / drive.unit).max(axis=1)
-        moved = np.clip(q + (share * np.minimum(1.0, _LARGEST / np.maximum(longest, _LARGEST)))[:, None] * step, drive.low, drive.high)
+        moved = np.clip(
+            q + (share * np.minimum(1.0, _LARGEST / np.maximum(longest, _LARGEST)))[:, None] * step,
+            drive.low,
+            drive.high,
+        )
         there = measured(moved)
         closer = _norm(path - there) <= _norm(path - seen) + 1e-12
         share = np.where(closer, np.minimum(1.0, 2.0 * share), 0.5 * share)
@@ -232,7 +264,8 @@ def _inverse(jacobian: Floats) -> Floats:
 
 
 def _held(drive: _Drive, q: Floats, jacobian: Floats, inverse: Floats, error: Floats) -> Floats:
-    """(n, n_q) least-squares steps toward an error (n, 3) of the tip; coordinates at a limit that would leave it stay."""
+    """(n, n_q) least-squares steps toward an error (n, 3) of the tip; coordinates at a limit that would leave
+    it stay."""
     step = (inverse @ error[:, :, None])[:, :, 0]
     stays = _leaves(drive, q, step)
     rows = stays.any(axis=1)
@@ -303,18 +336,29 @@ def _path(target: ArrayLike) -> Floats:
     try:
         path = np.array(target, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError("target is not an array of numbers; give (n, 3) positions, base frame [m].") from error
+        raise InputError(
+            "target is not an array of numbers; give (n, 3) positions, base frame [m]."
+        ) from error
     if path.ndim != 2 or path.shape[1] != 3 or len(path) < 2:
-        raise InputError(f"target has shape {path.shape}; it must be (n, 3), two or more positions in the base frame [m].")
+        raise InputError(
+            f"target has shape {path.shape}; it must be (n, 3), two or more positions in the base frame [m]."
+        )
     if not np.isfinite(path).all():
         raise InputError("target holds a position that is not finite; give all of the path.")
     return path
 
 
 def _check_number(name: str, value: object, unit: str, *, zero: bool) -> None:
-    number = float(value) if isinstance(value, (int, float, np.floating, np.integer)) and not isinstance(value, bool) else np.nan
+    number = (
+        float(value)
+        if isinstance(value, (int, float, np.floating, np.integer)) and not isinstance(value, bool)
+        else np.nan
+    )
     if not (np.isfinite(number) and (number > 0.0 or (zero and number == 0.0))):
-        raise InputError(f"{name} is {value!r}{' ' if unit else ''}{unit}; it must be a finite number, {'zero or ' * zero}positive.")
+        raise InputError(
+            f"{name} is {value!r}{' ' if unit else ''}{unit}; it must be a finite number, "
+            f"{'zero or ' * zero}positive."
+        )
 
 
 def _check_speed(dl: Floats, rate: float, rate_limit: float) -> None:
@@ -322,7 +366,8 @@ def _check_speed(dl: Floats, rate: float, rate_limit: float) -> None:
     if speed.max() > rate_limit:
         k, wire = np.unravel_index(int(np.argmax(speed)), speed.shape)
         raise InputError(
-            f"wire {wire + 1} would move at {speed.max():.3g} m/s at {k / rate:.3g} s, beyond rate_limit {rate_limit:g} m/s; "
+            f"wire {wire + 1} would move at {speed.max():.3g} m/s at {k / rate:.3g} s, beyond rate_limit "
+            f"{rate_limit:g} m/s; "
             "give a slower path, or a longer approach."
         )
 

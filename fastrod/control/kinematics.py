@@ -1,4 +1,5 @@
-"""`SoftTip`: the tip of a soft robot on an arm, on a moving base or on a fixed one, by one vector of coordinates."""
+"""`SoftTip`: the tip of a soft robot on an arm, on a moving base or on a fixed one, by one vector of
+coordinates."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ _STRAIGHT: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 
 class Base(Protocol):
-    """What carries a soft robot: a flange whose pose follows from coordinates of its own (`Arm` is the same by another name)."""
+    """What carries a soft robot: a flange whose pose follows from coordinates of its own (`Arm` is the same
+    by another name)."""
 
     @property
     def n_joints(self) -> int:
@@ -64,9 +66,11 @@ class FixedBase:
 @final
 @dataclass(frozen=True)
 class MovingBase:
-    """A flange that moves along the world's axes, and turns about them where `rotates`. Raises `InputError` where `pose` is none.
+    """A flange that moves along the world's axes, and turns about them where `rotates`. Raises `InputError`
+    where `pose` is none.
 
-    q is the displacement from `pose` (3,) [m], and then the rotation vector (3,) [rad], world, that turns it from there.
+    q is the displacement from `pose` (3,) [m], and then the rotation vector (3,) [rad], world, that turns it
+    from there.
     """
 
     pose: ArrayLike = _STRAIGHT
@@ -99,7 +103,8 @@ class MovingBase:
 
 @final
 class SoftTip:
-    """The tip of one simulated soft robot by q = (coordinates of its base, then three a segment: `SegmentActions`).
+    """The tip of one simulated soft robot by q = (coordinates of its base, then three a segment:
+    `SegmentActions`).
 
     >>> import fastrod
     >>> tip = SoftTip(fastrod.Simulator(fastrod.load_robot("prototype"), points_per_segment=6), MovingBase())
@@ -109,10 +114,16 @@ class SoftTip:
     """
 
     def __init__(
-        self, simulator: Simulator, base: Base | None = None, *, flange_from_base: ArrayLike = _STRAIGHT, offset: float | None = None
+        self,
+        simulator: Simulator,
+        base: Base | None = None,
+        *,
+        flange_from_base: ArrayLike = _STRAIGHT,
+        offset: float | None = None,
     ) -> None:
-        """`simulator` of one robot; `base` carries it, by default fixed where the robot says; `flange_from_base` (7,) is its mount,
-        position [m] and quaternion w x y z; `offset` as for `SegmentActions` [m]. Raises `InputError`, and `RobotError` as
+        """`simulator` of one robot; `base` carries it, by default fixed where the robot says;
+        `flange_from_base` (7,) is its mount, position [m] and quaternion w x y z; `offset` as for
+        `SegmentActions` [m]. Raises `InputError`, and `RobotError` as
         `SegmentActions`."""
         if not isinstance(simulator, Simulator) or simulator.n_robots != 1:
             raise InputError(f"simulator is {simulator!r}; give a Simulator of one robot.")
@@ -131,11 +142,14 @@ class SoftTip:
         self._base_pose: Floats = np.zeros(7)
         self._state: State | None = None
 
-    def place(self, q: ArrayLike, *, base_pose: ArrayLike | None = None, settle: bool = False, **loads: Any) -> State:
+    def place(
+        self, q: ArrayLike, *, base_pose: ArrayLike | None = None, settle: bool = False, **loads: Any
+    ) -> State:
         """Step the simulator once to q (n_q,) (`settle`: until it rests) and hand out its state.
 
-        `base_pose` (7,): the measured world_from_base, position [m] and quaternion w x y z, in the place of the one that follows
-        from q. `loads` are those of `Simulator.step`: tip_force, line_force, obstacle_pose, ... Raises `InputError`.
+        `base_pose` (7,): the measured world_from_base, position [m] and quaternion w x y z, in the place of
+        the one that follows from q. `loads` are those of `Simulator.step`: tip_force, line_force,
+        obstacle_pose, ... Raises `InputError`.
         """
         q = self._read(q)
         pose = self._carried(q) if base_pose is None else _pose("base_pose", base_pose)
@@ -144,22 +158,26 @@ class SoftTip:
         return state
 
     def follow(self, q: ArrayLike, state: State, base_pose: ArrayLike) -> None:
-        """Be where a step of the simulator that was taken elsewhere, as a host does, has left the robot: `state` is that of the
-        simulator's last step, q (n_q,) the coordinates that it belongs to, `base_pose` (7,) as for `place`. Raises `InputError`."""
+        """Be where a step of the simulator that was taken elsewhere, as a host does, has left the robot:
+        `state` is that of the simulator's last step, q (n_q,) the coordinates that it belongs to, `base_pose`
+        (7,) as for `place`. Raises `InputError`."""
         q, pose = self._read(q), _pose("base_pose", base_pose)
         self._q, self._base_pose, self._state = q, pose, state
 
     @property
     def position(self) -> Floats:
-        """(3,) of the tip, world [m], where it was placed last. Raises `InputError` before the first `place`."""
+        """(3,) of the tip, world [m], where it was placed last. Raises `InputError` before the first
+        `place`."""
         return np.asarray(self._placed("position")[1].tip_position[0])
 
     def jacobian(self, *, rotation: bool = False) -> Floats:
-        """(3, n_q) d(tip position [m]) / dq, world, where it was placed last; with `rotation` (6, n_q), rotation vector [rad] below.
+        """(3, n_q) d(tip position [m]) / dq, world, where it was placed last; with `rotation` (6, n_q),
+        rotation vector [rad] below.
 
-        Columns of the base: its twist moved to the tip, J_v + J_w x (tip - base), and by how much the rod bends as its base turns
-        under loads that keep their direction in the world, its weight included. Those of the actions: `Simulator.jacobian` by wires
-        and extensions, times these by actions. Raises `InputError` before the first `place`.
+        Columns of the base: its twist moved to the tip, J_v + J_w x (tip - base), and by how much the rod
+        bends as its base turns under loads that keep their direction in the world, its weight included. Those
+        of the actions: `Simulator.jacobian` by wires and extensions, times these by actions. Raises
+        `InputError` before the first `place`.
         """
         q, state = self._placed("jacobian")
         jacobian = np.empty((6, self.n_q))
@@ -180,10 +198,15 @@ class SoftTip:
         return jacobian if rotation else jacobian[:3]
 
     def limits(self, largest_bend: float = math.pi / 2.0) -> tuple[Floats, Floats]:
-        """Least and largest action (3 n_segments,) each [m]: each segment's range of extension, and displacements of both tendons
-        that bend it by no more than `largest_bend` [rad]. Limits of the base stand before these in q. Raises `InputError`."""
-        if not isinstance(largest_bend, (int, float, np.floating)) or not (math.isfinite(largest_bend) and largest_bend > 0.0):
-            raise InputError(f"largest_bend is {largest_bend!r} rad; it must be a number, positive and finite.")
+        """Least and largest action (3 n_segments,) each [m]: each segment's range of extension, and
+        displacements of both tendons that bend it by no more than `largest_bend` [rad]. Limits of the base
+        stand before these in q. Raises `InputError`."""
+        if not isinstance(largest_bend, (int, float, np.floating)) or not (
+            math.isfinite(largest_bend) and largest_bend > 0.0
+        ):
+            raise InputError(
+                f"largest_bend is {largest_bend!r} rad; it must be a number, positive and finite."
+            )
         low, high = (np.empty((len(self.actions.offset), 3)) for _ in range(2))
         for k, segment in enumerate(self.actions.robot.segments):
             low[k, 0], high[k, 0] = segment.extension
@@ -192,9 +215,10 @@ class SoftTip:
         return low.ravel(), high.ravel()
 
     def finite_differences(self, q: ArrayLike, step: float = 1e-4, **loads: Any) -> Floats:
-        """(3, n_q) the paper's way to the same (SoftManiSim, CoRL 2024): central differences of the settled tip, a column after the
-        other, by `step` [m or rad]; one-sided at an end of an extension's range, zero where there is no range. The simulator is left as it
-        was. Raises `InputError`, also where an end does not settle."""
+        """(3, n_q) the paper's way to the same (SoftManiSim, CoRL 2024): central differences of the settled
+        tip, a column after the other, by `step` [m or rad]; one-sided at an end of an extension's range, zero
+        where there is no range. The simulator is left as it was. Raises `InputError`, also where an end does
+        not settle."""
         q = self._read(q)
         if not isinstance(step, (int, float, np.floating)) or not (math.isfinite(step) and step > 0.0):
             raise InputError(f"step is {step!r}; it must be a number, positive and finite.")
@@ -221,7 +245,8 @@ class SoftTip:
         return jacobian
 
     def _move(self, q: Floats, pose: Floats, settle: bool, loads: dict[str, Any]) -> State:
-        inputs = self.actions.matrix @ q[self.n_base :] + self._rest  # `SegmentActions.inputs`, of what is known to be good
+        # `SegmentActions.inputs`, of what is known to be good
+        inputs = self.actions.matrix @ q[self.n_base :] + self._rest
         n = len(inputs) - len(self.actions.offset)
         if settle:
             return self.simulator.settle(inputs[:n], extension=inputs[n:], base_pose=pose, **loads)
@@ -250,7 +275,8 @@ class SoftTip:
             raise InputError(f"q is {q!r}; give {self.n_q} numbers.") from error
         if found.shape != (self.n_q,):
             raise InputError(
-                f"q has shape {found.shape}; it must be ({self.n_q},): {self.n_base} of the base, then extension and two displacements "
+                f"q has shape {found.shape}; it must be ({self.n_q},): {self.n_base} of the base, then "
+                "extension and two displacements "
                 f"for each of {len(self.actions.offset)} segments [m]."
             )
         if not np.isfinite(found).all():
@@ -269,11 +295,15 @@ def _cross(a: Floats, b: Floats) -> Floats:
 
 
 def _turn_by_vector(v: Floats) -> Floats:
-    """(3, 3) world rotation by the change of a rotation vector: I + (1 - cos a) / a^2 [v] + (a - sin a) / a^3 [v]^2, the left
-    Jacobian of SO(3)."""
+    """(3, 3) world rotation by the change of a rotation vector: I + (1 - cos a) / a^2 [v] + (a - sin a) / a^3
+    [v]^2, the left Jacobian of SO(3)."""
     a = float(np.linalg.norm(v))
     hat = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-    one, two = (0.5 - a * a / 24.0, 1.0 / 6.0 - a * a / 120.0) if a < 1e-3 else ((1.0 - math.cos(a)) / a**2, (a - math.sin(a)) / a**3)
+    one, two = (
+        (0.5 - a * a / 24.0, 1.0 / 6.0 - a * a / 120.0)
+        if a < 1e-3
+        else ((1.0 - math.cos(a)) / a**2, (a - math.sin(a)) / a**3)
+    )
     return np.asarray(np.eye(3) + one * hat + two * hat @ hat)
 
 
@@ -283,7 +313,9 @@ def _pose(name: str, pose: ArrayLike) -> Floats:
     except (TypeError, ValueError):
         found = np.empty(0)
     if found.shape != (7,) or not np.isfinite(found).all():
-        raise InputError(f"{name} is {pose!r}; give seven finite numbers, position [m] and quaternion w x y z.")
+        raise InputError(
+            f"{name} is {pose!r}; give seven finite numbers, position [m] and quaternion w x y z."
+        )
     if abs((norm := float(np.linalg.norm(found[3:]))) - 1.0) > 1e-6:
         raise InputError(f"{name} has a quaternion of norm {norm:.6g}; it must be 1, as w x y z.")
     return found

@@ -1,4 +1,5 @@
-"""Resolved-rate control: rates of the coordinates that move a tip toward its goal, within the limits of both."""
+"""Resolved-rate control: rates of the coordinates that move a tip toward its goal, within the limits of
+both."""
 
 from __future__ import annotations
 
@@ -21,10 +22,11 @@ _ROOM = 1e-12  # of a rate: nearer to its limit is at it
 class ResolvedRate:
     """q_dot = J# (v + gain error) + (1 - J# J) posture_gain (posture - q), held within limits (`rates`).
 
-    J# is the pseudo-inverse of least sum of weight q_dot^2. Near a singularity, where the smallest singular value s of the weighted
-    Jacobian is below `threshold`, it is damped by l^2 = (1 - (s / threshold)^2) damping^2: s / (s^2 + l^2) in the place of 1 / s.
-    Source: Whitney 1969 (resolved rates); Nakamura and Hanafusa 1986, Maciejewski and Klein 1988 (damping near a singularity
-    alone); Flacco, De Luca and Khatib 2012 (saturation in the null space).
+    J# is the pseudo-inverse of least sum of weight q_dot^2. Near a singularity, where the smallest singular
+    value s of the weighted Jacobian is below `threshold`, it is damped by l^2 = (1 - (s / threshold)^2)
+    damping^2: s / (s^2 + l^2) in the place of 1 / s. Source: Whitney 1969 (resolved rates); Nakamura and
+    Hanafusa 1986, Maciejewski and Klein 1988 (damping near a singularity alone); Flacco, De Luca and Khatib
+    2012 (saturation in the null space).
 
     >>> ResolvedRate(gain=2.0).rates([0.0, 0.0], [[1.0, 0.0]], [0.1], [0.0], 0.01).tolist()
     [0.2, 0.0]
@@ -43,7 +45,8 @@ class ResolvedRate:
     rate: ArrayLike | None = None
     """(n_q,) or one number, largest |q_dot| [1/s]; None: no limit."""
     weight: ArrayLike | None = None
-    """(n_q,) cost of each coordinate's rate squared, positive; None: 1 each. A coordinate of ten times the unit wants a hundredth."""
+    """(n_q,) cost of each coordinate's rate squared, positive; None: 1 each. A coordinate of ten times the
+    unit wants a hundredth."""
     error_limit: float | None = None
     """[m] a longer error is shortened to this before the gain; None: no limit."""
     posture: ArrayLike | None = None
@@ -60,11 +63,15 @@ class ResolvedRate:
         for name, unit in (("gain", "1/s"), ("posture_gain", "1/s"), ("damping", "m")):
             value = getattr(self, name)
             if not _is_number(value) or value < 0.0:
-                raise InputError(f"ResolvedRate.{name} is {value!r} {unit}; it must be a finite number, zero or positive.")
+                raise InputError(
+                    f"ResolvedRate.{name} is {value!r} {unit}; it must be a finite number, zero or positive."
+                )
         for name in ("threshold", "error_limit"):
             value = getattr(self, name)
             if value is not None and (not _is_number(value) or value <= 0.0):
-                raise InputError(f"ResolvedRate.{name} is {value!r} m; it must be a number, positive and finite, or None.")
+                raise InputError(
+                    f"ResolvedRate.{name} is {value!r} m; it must be a number, positive and finite, or None."
+                )
         sizes: dict[str, int] = {}
         for name in ("lower", "upper", "rate", "weight", "posture"):
             value = getattr(self, name)
@@ -86,31 +93,50 @@ class ResolvedRate:
                 sizes[name] = len(a)
         if len(set(sizes.values())) > 1:
             raise InputError(
-                f"ResolvedRate has {', '.join(f'{name} of {n}' for name, n in sizes.items())}; they must have one length, n_q."
+                f"ResolvedRate has {', '.join(f'{name} of {n}' for name, n in sizes.items())}; they must "
+                "have one length, n_q."
             )
         object.__setattr__(self, "_n_q", next(iter(sizes.values()), None))
         most = np.asarray(np.inf if self.rate is None else self.rate, dtype=np.float64)
-        object.__setattr__(self, "_most", most if self._n_q is None else np.broadcast_to(most, (self._n_q,)).copy())
+        object.__setattr__(
+            self, "_most", most if self._n_q is None else np.broadcast_to(most, (self._n_q,)).copy()
+        )
         if self.weight is not None:
             object.__setattr__(self, "_root", 1.0 / np.sqrt(np.asarray(self.weight)))
-        if self.lower is not None and self.upper is not None and (np.asarray(self.lower) > np.asarray(self.upper)).any():
+        if (
+            self.lower is not None
+            and self.upper is not None
+            and (np.asarray(self.lower) > np.asarray(self.upper)).any()
+        ):
             i = int(np.flatnonzero(np.asarray(self.lower) > np.asarray(self.upper))[0])
             least, most = np.asarray(self.lower)[i], np.asarray(self.upper)[i]
             raise InputError(f"ResolvedRate.lower[{i}] is {least:g}, above upper[{i}] {most:g}.")
 
-    def rates(self, q: ArrayLike, jacobian: ArrayLike, error: ArrayLike, feedforward: ArrayLike, dt: float) -> Floats:
+    def rates(
+        self, q: ArrayLike, jacobian: ArrayLike, error: ArrayLike, feedforward: ArrayLike, dt: float
+    ) -> Floats:
         """(n_q,) rates q_dot [1/s] for the next `dt` [s].
 
-        `q` (n_q,); `jacobian` (m, n_q) of the task by q; `error` (m,) goal minus task [m]; `feedforward` (m,) velocity of the goal
-        [m/s]. |q_dot| stays within `rate`, and q + dt q_dot within `lower` and `upper`; a q that is outside comes back, as fast as
-        its rate allows. A coordinate that would leave its limits is held at them and the others take over its part; where they
-        cannot, the task is scaled: its direction is kept, where any motion that way is left. The posture gives way first. Raises
+        `q` (n_q,); `jacobian` (m, n_q) of the task by q; `error` (m,) goal minus task [m]; `feedforward` (m,)
+        velocity of the goal [m/s]. |q_dot| stays within `rate`, and q + dt q_dot within `lower` and `upper`;
+        a q that is outside comes back, as fast as its rate allows. A coordinate that would leave its limits
+        is held at them and the others take over its part; where they cannot, the task is scaled: its
+        direction is kept, where any motion that way is left. The posture gives way first. Raises
         `InputError` on wrong shapes and on what is not finite.
         """
-        q, J, error, feedforward = (np.asarray(a, dtype=np.float64) for a in (q, jacobian, error, feedforward))
-        if not (q.ndim == 1 and J.ndim == 2 and J.shape[1] == len(q) and error.shape == feedforward.shape == J.shape[:1] and len(q)):
+        q, J, error, feedforward = (
+            np.asarray(a, dtype=np.float64) for a in (q, jacobian, error, feedforward)
+        )
+        if not (
+            q.ndim == 1
+            and J.ndim == 2
+            and J.shape[1] == len(q)
+            and error.shape == feedforward.shape == J.shape[:1]
+            and len(q)
+        ):
             raise InputError(
-                f"q {q.shape}, jacobian {J.shape}, error {error.shape} and feedforward {feedforward.shape} do not fit together; "
+                f"q {q.shape}, jacobian {J.shape}, error {error.shape} and feedforward {feedforward.shape} "
+                "do not fit together; "
                 "they must be (n_q,), (m, n_q), (m,) and (m,)."
             )
         if self._n_q is not None and len(q) != self._n_q:
@@ -137,13 +163,21 @@ class ResolvedRate:
     def _range(self, q: Floats, dt: float) -> tuple[Floats, Floats]:
         """(n_q,) least and largest rates."""
         most = self._most if self._most.shape == q.shape else np.broadcast_to(self._most, q.shape)
-        low = -most if self.lower is None else np.minimum(np.maximum((cast(Floats, self.lower) - q) / dt, -most), most)
-        high = most if self.upper is None else np.minimum(np.maximum((cast(Floats, self.upper) - q) / dt, -most), most)
+        low = (
+            -most
+            if self.lower is None
+            else np.minimum(np.maximum((cast(Floats, self.lower) - q) / dt, -most), most)
+        )
+        high = (
+            most
+            if self.upper is None
+            else np.minimum(np.maximum((cast(Floats, self.upper) - q) / dt, -most), most)
+        )
         return low, high
 
     def _inverse(self, J: Floats, active: Flags | None, projector: bool) -> tuple[Floats, Floats | None]:
-        """(n_q, m) weighted pseudo-inverse, damped, or undamped by the coordinates `active`; where asked for, (n_q, n_q) projector on
-        the null space."""
+        """(n_q, m) weighted pseudo-inverse, damped, or undamped by the coordinates `active`; where asked for,
+        (n_q, n_q) projector on the null space."""
         root = self._root if active is None else active * (1.0 if self._root is None else self._root)
         u, s, vt = np.linalg.svd(J if root is None else J * root, full_matrices=False)
         start, square = self.damping if self.threshold is None else self.threshold, 0.0
@@ -169,15 +203,18 @@ class ResolvedRate:
         return inverse, root[:, None] * free * back
 
     def _saturated(self, J: Floats, task: Floats, wish: Floats | None, low: Floats, high: Floats) -> Floats:
-        """The coordinate that limits the task most goes to its limit and leaves its part to the others, until all are within theirs;
-        failing that, the set that can do the largest share of the task (Flacco 2012, algorithm 1). Then the posture, the same way."""
+        """The coordinate that limits the task most goes to its limit and leaves its part to the others, until
+        all are within theirs; failing that, the set that can do the largest share of the task (Flacco 2012,
+        algorithm 1). Then the posture, the same way."""
         active, fixed = np.ones(len(low), dtype=bool), np.zeros(len(low))
         best_scale, best, best_active = -1.0, np.clip(0.0, low, high), ~active
         goal = np.linalg.norm(task)
         while active.any():
             inverse, _ = self._inverse(J, active, False)
             by_task, rest = inverse @ task, fixed - inverse @ (J @ fixed)
-            if np.linalg.norm(J @ by_task - task) > 1e-6 * goal or np.linalg.norm(J @ rest) > 1e-6 * np.linalg.norm(J @ fixed):
+            if np.linalg.norm(J @ by_task - task) > 1e-6 * goal or np.linalg.norm(
+                J @ rest
+            ) > 1e-6 * np.linalg.norm(J @ fixed):
                 break  # those that are left cannot
             scale, worst = _share(by_task, rest, low, high, active)
             if scale > best_scale:
@@ -197,8 +234,8 @@ class ResolvedRate:
 
 
 def _share(step: Floats, rest: Floats, low: Floats, high: Floats, active: Flags) -> tuple[float, int]:
-    """Largest share of the step, at most 1, with which rest + share step is within the limits, or -1, and the active coordinate
-    that limits it most, or -1."""
+    """Largest share of the step, at most 1, with which rest + share step is within the limits, or -1, and the
+    active coordinate that limits it most, or -1."""
     slack = _ROOM * np.maximum(1.0, np.abs(rest))
     still = np.abs(step) <= slack
     inside = (rest >= low - slack) & (rest <= high + slack)

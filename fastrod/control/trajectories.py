@@ -1,4 +1,5 @@
-"""Paths for a tip to follow: squares, circles and helices of the paper's tracking experiment (SoftManiSim, CoRL 2024)."""
+"""Paths for a tip to follow: squares, circles and helices of the paper's tracking experiment (SoftManiSim,
+CoRL 2024)."""
 
 from __future__ import annotations
 
@@ -40,7 +41,9 @@ class Trajectory:
         except (TypeError, ValueError):
             center = np.empty(0)
         if center.shape != (3,) or not np.isfinite(center).all():
-            raise InputError(f"center of {self.name} is {self.center!r}; give three finite numbers, world [m].")
+            raise InputError(
+                f"center of {self.name} is {self.center!r}; give three finite numbers, world [m]."
+            )
         object.__setattr__(self, "center", tuple(center.tolist()))
 
     def position(self, t: ArrayLike) -> Floats:
@@ -48,63 +51,101 @@ class Trajectory:
         return np.asarray(self.path(_times(t))[0] + np.array(self.center))
 
     def velocity(self, t: ArrayLike) -> Floats:
-        """(..., 3) world [m/s] at times (...,) [s]; at a corner that of the side that begins. Raises `InputError` as `position`."""
+        """(..., 3) world [m/s] at times (...,) [s]; at a corner that of the side that begins. Raises
+        `InputError` as `position`."""
         return self.path(_times(t))[1]
 
 
 def square(*, side: float = 0.4, period: float = 20.0, center: ArrayLike = (0.0, 0.0, 0.0)) -> Trajectory:
-    """A square of this side [m] about the center, counterclockwise from the corner at (-x, -y), at constant speed: a quarter of the
-    period [s] a side. Source: SoftManiSim, CoRL 2024, its tracking experiment. Raises `InputError`."""
+    """A square of this side [m] about the center, counterclockwise from the corner at (-x, -y), at constant
+    speed: a quarter of the period [s] a side. Source: SoftManiSim, CoRL 2024, its tracking experiment. Raises
+    `InputError`."""
     _check_positive("square", "side", side, "m")
-    return Trajectory(name="square", period=period, center=_center(center), path=lambda t: _square(t, side, period))
+    return Trajectory(
+        name="square", period=period, center=_center(center), path=lambda t: _square(t, side, period)
+    )
 
 
 def triangle(*, side: float = 0.04, period: float = 20.0, center: ArrayLike = (0.0, 0.0, 0.0)) -> Trajectory:
-    """An equilateral triangle of this side [m] about the center, counterclockwise from the corner at -y on the left, at constant speed:
-    a third of the period [s] a side. Source: SoftManiSim, CoRL 2024, its experiment with the prototype. Raises `InputError`."""
+    """An equilateral triangle of this side [m] about the center, counterclockwise from the corner at -y on
+    the left, at constant speed:
+    a third of the period [s] a side. Source: SoftManiSim, CoRL 2024, its experiment with the prototype.
+    Raises `InputError`."""
     _check_positive("triangle", "side", side, "m")
-    return Trajectory(name="triangle", period=period, center=_center(center), path=lambda t: _triangle(t, side, period))
+    return Trajectory(
+        name="triangle", period=period, center=_center(center), path=lambda t: _triangle(t, side, period)
+    )
 
 
 def circle(*, radius: float = 0.2, period: float = 20.0, center: ArrayLike = (0.0, 0.0, 0.0)) -> Trajectory:
-    """A circle of this radius [m] about the center, counterclockwise from (+x, 0), one turn a period [s]. Source: SoftManiSim, CoRL
+    """A circle of this radius [m] about the center, counterclockwise from (+x, 0), one turn a period [s].
+    Source: SoftManiSim, CoRL
     2024, its tracking experiment. Raises `InputError`."""
     _check_positive("circle", "radius", radius, "m")
-    return Trajectory(name="circle", period=period, center=_center(center), path=lambda t: _circle(t, radius, period))
+    return Trajectory(
+        name="circle", period=period, center=_center(center), path=lambda t: _circle(t, radius, period)
+    )
 
 
-def figure_eight(*, size: float = 0.2, period: float = 20.0, center: ArrayLike = (0.0, 0.0, 0.0)) -> Trajectory:
-    """x = size sin(2 w t), y = size sin(w t) [m] with w = 2 pi / period; by default the paper's x = 0.2 sin(2 pi t / 10),
-    y = 0.2 sin(pi t / 10), which is back after 20 s. Source: SoftManiSim, CoRL 2024, its tracking experiment. Raises `InputError`."""
+def figure_eight(
+    *, size: float = 0.2, period: float = 20.0, center: ArrayLike = (0.0, 0.0, 0.0)
+) -> Trajectory:
+    """x = size sin(2 w t), y = size sin(w t) [m] with w = 2 pi / period; by default the paper's x = 0.2 sin(2
+    pi t / 10), y = 0.2 sin(pi t / 10), which is back after 20 s. Source: SoftManiSim, CoRL 2024, its tracking
+    experiment. Raises `InputError`."""
     _check_positive("figure_eight", "size", size, "m")
 
     def path(t: Floats) -> tuple[Floats, Floats]:
         w = 2.0 * math.pi / period
         zero = np.zeros_like(t)
         position = np.stack([size * np.sin(2.0 * w * t), size * np.sin(w * t), zero], axis=-1)
-        return position, np.stack([2.0 * w * size * np.cos(2.0 * w * t), w * size * np.cos(w * t), zero], axis=-1)
+        return position, np.stack(
+            [2.0 * w * size * np.cos(2.0 * w * t), w * size * np.cos(w * t), zero], axis=-1
+        )
 
     return Trajectory(name="figure_eight", period=period, center=_center(center), path=path)
 
 
 def helix(
-    *, radius: float = 0.2, pitch: float = 0.1, downward: bool = True, period: float = 20.0, center: ArrayLike = (0.0, 0.0, 0.0)
+    *,
+    radius: float = 0.2,
+    pitch: float = 0.1,
+    downward: bool = True,
+    period: float = 20.0,
+    center: ArrayLike = (0.0, 0.0, 0.0),
 ) -> Trajectory:
-    """The circle that sinks (or, `downward` False, rises) by `pitch` [m] a turn, from the height of the center; a turn takes one
-    period [s]. Source: SoftManiSim, CoRL 2024, its tracking experiment. Raises `InputError`."""
+    """The circle that sinks (or, `downward` False, rises) by `pitch` [m] a turn, from the height of the
+    center; a turn takes one period [s]. Source: SoftManiSim, CoRL 2024, its tracking experiment. Raises
+    `InputError`."""
     _check_positive("helix", "radius", radius, "m")
     rise = _rise("helix", pitch, downward, period)
-    return Trajectory(name="helix", period=period, center=_center(center), path=lambda t: _lifted(_circle(t, radius, period), t, rise))
+    return Trajectory(
+        name="helix",
+        period=period,
+        center=_center(center),
+        path=lambda t: _lifted(_circle(t, radius, period), t, rise),
+    )
 
 
 def square_helix(
-    *, side: float = 0.2, pitch: float = 0.02, downward: bool = True, period: float = 20.0, center: ArrayLike = (0.0, 0.0, 0.0)
+    *,
+    side: float = 0.2,
+    pitch: float = 0.02,
+    downward: bool = True,
+    period: float = 20.0,
+    center: ArrayLike = (0.0, 0.0, 0.0),
 ) -> Trajectory:
-    """The square that sinks (or, `downward` False, rises) evenly by `pitch` [m] a turn, from the height of the center; a turn takes
-    one period [s]. Source: SoftManiSim, CoRL 2024, its tracking experiment. Raises `InputError`."""
+    """The square that sinks (or, `downward` False, rises) evenly by `pitch` [m] a turn, from the height of
+    the center; a turn takes one period [s]. Source: SoftManiSim, CoRL 2024, its tracking experiment. Raises
+    `InputError`."""
     _check_positive("square_helix", "side", side, "m")
     rise = _rise("square_helix", pitch, downward, period)
-    return Trajectory(name="square_helix", period=period, center=_center(center), path=lambda t: _lifted(_square(t, side, period), t, rise))
+    return Trajectory(
+        name="square_helix",
+        period=period,
+        center=_center(center),
+        path=lambda t: _lifted(_square(t, side, period), t, rise),
+    )
 
 
 _KNOWN: dict[str, tuple[Callable[..., Trajectory], tuple[str, ...]]] = {
@@ -118,8 +159,9 @@ _KNOWN: dict[str, tuple[Callable[..., Trajectory], tuple[str, ...]]] = {
 
 
 def references(height: float, period: float = 9.0) -> dict[str, Trajectory]:
-    """The references of the paper's real prototype (SoftManiSim, CoRL 2024, appendix H) by name: a triangle and a square of 40 and 25 mm
-    and a circle of 20 mm radius, one turn in `period` [s], in the plane `height` [m] above the base. Raises `InputError`."""
+    """The references of the paper's real prototype (SoftManiSim, CoRL 2024, appendix H) by name: a triangle
+    and a square of 40 and 25 mm and a circle of 20 mm radius, one turn in `period` [s], in the plane `height`
+    [m] above the base. Raises `InputError`."""
     center = (0.0, 0.0, height)
     return {
         "triangle": triangle(side=0.04, period=period, center=center),
@@ -134,7 +176,8 @@ def names() -> tuple[str, ...]:
 
 
 def trajectory(name: str, **options: Any) -> Trajectory:
-    """The trajectory of this name; options as for the function of that name. Raises `UnknownNameError`, `InputError`.
+    """The trajectory of this name; options as for the function of that name. Raises `UnknownNameError`,
+    `InputError`.
 
     >>> trajectory("helix", pitch=0.05).position(20.0).round(6).tolist()
     [0.2, -0.0, -0.05]
@@ -150,7 +193,13 @@ def trajectory(name: str, **options: Any) -> Trajectory:
 
 def _square(t: Floats, side: float, period: float) -> tuple[Floats, Floats]:
     corners = side * np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
-    return _polygon(t, corners, np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), side, period)
+    return _polygon(
+        t,
+        corners,
+        np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
+        side,
+        period,
+    )
 
 
 def _triangle(t: Floats, side: float, period: float) -> tuple[Floats, Floats]:
@@ -160,12 +209,15 @@ def _triangle(t: Floats, side: float, period: float) -> tuple[Floats, Floats]:
     return _polygon(t, corners, np.array([[1.0, 0.0, 0.0], [-c, s, 0.0], [-c, -s, 0.0]]), side, period)
 
 
-def _polygon(t: Floats, corners: Floats, directions: Floats, side: float, period: float) -> tuple[Floats, Floats]:
+def _polygon(
+    t: Floats, corners: Floats, directions: Floats, side: float, period: float
+) -> tuple[Floats, Floats]:
     """Along equal sides from corner to corner."""
     n = len(corners)
     turns = n * t / period
     k = np.floor(turns)
-    # a corner belongs to the side that begins, also where the division fell short of the whole number by its rounding
+    # a corner belongs to the side that begins, also where the division fell short of the whole number by its
+    # rounding
     k += turns - k > 1.0 - 4.0 * np.spacing(np.maximum(np.abs(turns), 1.0))
     part = np.maximum(turns - k, 0.0)[..., None]
     which = k.astype(np.int64) % n
@@ -209,5 +261,7 @@ def _times(t: ArrayLike) -> Floats:
 
 
 def _check_positive(name: str, what: str, value: float, unit: str) -> None:
-    if not isinstance(value, (int, float, np.floating, np.integer)) or not (math.isfinite(value) and value > 0.0):
+    if not isinstance(value, (int, float, np.floating, np.integer)) or not (
+        math.isfinite(value) and value > 0.0
+    ):
         raise InputError(f"{what} of {name} is {value!r} {unit}; it must be a number, positive and finite.")

@@ -1,8 +1,11 @@
-"""What an effect is: a physical law that the rod lacks, applied at a seam of the model; and the registry of effects.
+"""What an effect is: a physical law that the rod lacks, applied at a seam of the model; and the registry of
+effects.
 
-An effect is a frozen class with `seam`, `parameters`, `memory` and `apply`, and a docstring that gives its *Equation*,
-*Source* and *Residual signature*. `@effect` checks that and registers it under the snake_case of its name: the library's
-own in `fastrod.effects`, and a user's from the user's package, which then works wherever the library's do.
+An effect is a frozen class with `seam`, `parameters`, `memory` and `apply`, and a docstring that gives its
+*Equation*,
+*Source* and *Residual signature*. `@effect` checks that and registers it under the snake_case of its name:
+the library's own in `fastrod.effects`, and a user's from the user's package, which then works wherever the
+library's do.
 """
 
 from __future__ import annotations
@@ -33,7 +36,8 @@ class Seam(Enum):
     """Where an effect enters, from motor to camera; effects act in this order."""
 
     ACTUATION = 1
-    """Between the commanded wires and those that the rod feels: `tendon_length`, `extension`, `offset`, `compliance`."""
+    """Between the commanded wires and those that the rod feels: `tendon_length`, `extension`, `offset`,
+    `compliance`."""
     MATERIAL = 2
     """The rod itself: `stiffness`, `precurvature`."""
     LOAD = 3
@@ -53,41 +57,62 @@ class Parameter:
     name: str
     unit: str
     neutral: float = 0.0
-    """Value at which the effect changes nothing, whatever the effect's other parameters are, or beside them."""
+    """Value at which the effect changes nothing, whatever the effect's other parameters are, or beside
+    them."""
     bounds: tuple[float, float] = (-math.inf, math.inf)
     """Beyond them the value is not physical."""
     typical: float | None = None
-    """Size seen on real robots; scale of the prior and of finite differences. A tenth of the bounds where not given."""
+    """Size seen on real robots; scale of the prior and of finite differences. A tenth of the bounds where not
+    given."""
     starts: tuple[float, ...] = ()
     """Values that a fit starts from; `typical` where not given."""
     per: Per = "robot"
-    """One value for the robot, for each segment, or for each drive (a wire, or an antagonistic pair of wires)."""
+    """One value for the robot, for each segment, or for each drive (a wire, or an antagonistic pair of
+    wires)."""
     of: Literal["", "reach", "length"] = ""
-    """Bounds, typical size and starts are multiples of this: the wires' mean distance from the backbone, or the robot's length."""
+    """Bounds, typical size and starts are multiples of this: the wires' mean distance from the backbone, or
+    the robot's length."""
     shape: bool = False
-    """True: it shapes an effect whose size another parameter gives (a time constant, a width); no size of its own."""
+    """True: it shapes an effect whose size another parameter gives (a time constant, a width); no size of its
+    own."""
 
     def __post_init__(self) -> None:
         low, high = self.bounds
         if not low <= self.neutral <= high:
-            raise EffectError(f"parameter {self.name!r} has neutral value {self.neutral}; it must lie in its bounds {low} to {high}.")
+            raise EffectError(
+                f"parameter {self.name!r} has neutral value {self.neutral}; it must lie in "
+                f"its bounds {low} to {high}."
+            )
         if self.typical is None:
             span = 0.1 * (high - low)
             object.__setattr__(self, "typical", span if math.isfinite(span) and span > 0.0 else 1.0)
         if not self.starts:
             assert self.typical is not None
-            object.__setattr__(self, "starts", (self.neutral + self.typical,) if not self.shape else (self.typical,))
+            object.__setattr__(
+                self, "starts", (self.neutral + self.typical,) if not self.shape else (self.typical,)
+            )
 
     def on(self, wiring: Wiring) -> Parameter:
         """This parameter in its unit, for one robot."""
         if not self.of:
             return self
-        size = float(wiring.length.sum()) if self.of == "length" or not wiring.n_tendons else float(wiring.reach.mean())
+        size = (
+            float(wiring.length.sum())
+            if self.of == "length" or not wiring.n_tendons
+            else float(wiring.reach.mean())
+        )
         assert self.typical is not None
         return Parameter(
-            self.name, self.unit, self.neutral * size, (self.bounds[0] * size, self.bounds[1] * size), self.typical * size,
-            tuple(start * size for start in self.starts), self.per, "", self.shape,
-        )  # fmt: skip
+            self.name,
+            self.unit,
+            self.neutral * size,
+            (self.bounds[0] * size, self.bounds[1] * size),
+            self.typical * size,
+            tuple(start * size for start in self.starts),
+            self.per,
+            "",
+            self.shape,
+        )
 
     @property
     def scale(self) -> float:
@@ -98,19 +123,21 @@ class Parameter:
 
 @runtime_checkable
 class Effect(Protocol):
-    """What `@effect` asks of a class. Optional: `order`, `excited_by`, `confounded_with`, `synonyms`, and `sweep` (see `Operator`)."""
+    """What `@effect` asks of a class. Optional: `order`, `excited_by`, `confounded_with`, `synonyms`, and
+    `sweep` (see `Operator`)."""
 
     seam: ClassVar[Seam]
     parameters: ClassVar[tuple[Parameter, ...]]
 
     def memory(self, n_robots: int, n_tendons: int) -> Floats:
-        """Hidden state at the start, (n_robots, anything); of size 0 for an effect without memory, nan for one that begins
-        at the first input."""
+        """Hidden state at the start, (n_robots, anything); of size 0 for an effect without memory, nan for
+        one that begins at the first input."""
         ...
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
-        """Change `ports` (and `memory`) in place. `values` (n_robots, n_columns): the parameters in order, each as many columns
-        as `per` says. `state` is the simulator's last `State`, or None; `dt` the time since then [s]."""
+        """Change `ports` (and `memory`) in place. `values` (n_robots, n_columns): the parameters in order,
+        each as many columns as `per` says. `state` is the simulator's last `State`, or None; `dt` the time
+        since then [s]."""
         ...
 
 
@@ -123,7 +150,7 @@ class Static:
     order: ClassVar[float] = 50.0
     """Place among the effects of the same seam, from the motor to the camera."""
 
-    def memory(self, n_robots: int, n_tendons: int) -> Floats:  # noqa: ARG002
+    def memory(self, n_robots: int, n_tendons: int) -> Floats:
         """None."""
         return np.empty((n_robots, 0))
 
@@ -131,7 +158,8 @@ class Static:
 class Operator(ABC):
     """Base of the library's effects with a memory: operators on the wires' lengths over time.
 
-    `sweep` is the law, over many steps at once: a simulator calls it with one step, identification with a whole log.
+    `sweep` is the law, over many steps at once: a simulator calls it with one step, identification with a
+    whole log.
     """
 
     excited_by: ClassVar[str] = ""
@@ -141,13 +169,15 @@ class Operator(ABC):
 
     @abstractmethod
     def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Wiring) -> Floats:
-        """(n_robots, n_steps, n_tendons) what the wires end up at, from `dl` commanded [m] and `dt` (n_steps,) before each step [s].
+        """(n_robots, n_steps, n_tendons) what the wires end up at, from `dl` commanded [m] and `dt`
+        (n_steps,) before each step [s].
 
-        `memory` (n_robots, m) is changed in place; nan in it means that the wires begin at rest at the first step.
+        `memory` (n_robots, m) is changed in place; nan in it means that the wires begin at rest at the first
+        step.
         """
         ...
 
-    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         """One step of `sweep`."""
         dl = ports.tendon_length - ports.rest_length
         ports.shift_wires(self.sweep(values, memory, dl[:, None], np.array([dt]), ports.wiring)[:, 0] - dl)
@@ -167,19 +197,28 @@ def effect(cls: _Class) -> _Class:
     name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
     for section in _SECTIONS:
         if f"{section}:" not in (cls.__doc__ or ""):
-            raise EffectError(f"effect {name!r} does not say its {section}; its docstring needs a line '{section}: ...'.")
+            raise EffectError(
+                f"effect {name!r} does not say its {section}; its docstring needs a line '{section}: ...'."
+            )
     for part in ("seam", "parameters", "memory", "apply"):
         if not hasattr(cls, part):
-            raise EffectError(f"effect {name!r} has no {part}; an effect has seam, parameters, memory(...) and apply(...).")
+            raise EffectError(
+                f"effect {name!r} has no {part}; an effect has seam, parameters, memory(...) and apply(...)."
+            )
     made: Any = cls()
     if not isinstance(made.seam, Seam):
         raise EffectError(f"effect {name!r} has seam {made.seam!r}; give one of {', '.join(map(str, Seam))}.")
     if not made.parameters or not all(isinstance(p, Parameter) for p in made.parameters):
-        raise EffectError(f"effect {name!r} has parameters {made.parameters!r}; give a tuple of Parameter, at least one.")
+        raise EffectError(
+            f"effect {name!r} has parameters {made.parameters!r}; give a tuple of Parameter, at least one."
+        )
     synonyms = tuple(getattr(cls, "synonyms", ()))
     for word in (name, *synonyms):
         taken = _REGISTRY.get(_SYNONYMS.get(word, word))
-        if taken is not None and type(taken).__qualname__ + type(taken).__module__ != cls.__qualname__ + cls.__module__:
+        if (
+            taken is not None
+            and type(taken).__qualname__ + type(taken).__module__ != cls.__qualname__ + cls.__module__
+        ):
             raise EffectError(f"an effect named {word!r} is already registered by {type(taken).__module__}.")
     _REGISTRY[name] = made
     _SYNONYMS.update(dict.fromkeys(synonyms, name))
@@ -197,7 +236,10 @@ def unregister(name: str) -> None:
 def effect_names() -> list[str]:
     """Names of all registered effects, from the motor to the camera."""
     load_library()
-    return sorted(_REGISTRY, key=lambda name: (_REGISTRY[name].seam.value, getattr(_REGISTRY[name], "order", 50.0), name))
+    return sorted(
+        _REGISTRY,
+        key=lambda name: (_REGISTRY[name].seam.value, getattr(_REGISTRY[name], "order", 50.0), name),
+    )
 
 
 def canonical_name(name: str) -> str:
@@ -221,7 +263,8 @@ def has_memory(what: Effect) -> bool:
 
 @cache
 def load_library() -> None:
-    """Register the library, and the modules that installed packages name as entry points of the group `fastrod.effects`."""
+    """Register the library, and the modules that installed packages name as entry points of the group
+    `fastrod.effects`."""
     import_module("fastrod.effects.laws")
     for plug_in in entry_points(group="fastrod.effects"):
         plug_in.load()
@@ -237,7 +280,8 @@ def columns(what: Effect, wiring: Wiring) -> list[str]:
 
 
 def read_values(name: str, given: Mapping[str, object], wiring: Wiring, where: str) -> Floats:
-    """(n_columns,) values of an effect from its table in a robot file; a parameter that is not given is neutral.
+    """(n_columns,) values of an effect from its table in a robot file; a parameter that is not given is
+    neutral.
 
     A number stands for all segments or drives, a list for each. Raises `EffectError` for what cannot be.
     """
@@ -245,7 +289,9 @@ def read_values(name: str, given: Mapping[str, object], wiring: Wiring, where: s
     known = [p.name for p in what.parameters]
     for key in given:
         if key not in known and key != "name":
-            raise EffectError(f"{where}: effect {name!r} has no parameter {key!r}; {nearest(str(key), known)}")
+            raise EffectError(
+                f"{where}: effect {name!r} has no parameter {key!r}; {nearest(str(key), known)}"
+            )
     values: list[float] = []
     for parameter in (p.on(wiring) for p in what.parameters):
         value = given.get(parameter.name, parameter.neutral)
@@ -253,7 +299,8 @@ def read_values(name: str, given: Mapping[str, object], wiring: Wiring, where: s
         listed: Sequence[object] = value if isinstance(value, (list, tuple)) else (value,) * count
         if len(listed) != count:
             raise EffectError(
-                f"{where}: {parameter.name} of effect {name!r} has {len(listed)} values; give one, or {count}, one per {parameter.per}."
+                f"{where}: {parameter.name} of effect {name!r} has {len(listed)} values; give one, or "
+                f"{count}, one per {parameter.per}."
             )
         for number in listed:
             low, high = parameter.bounds

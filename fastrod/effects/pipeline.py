@@ -1,4 +1,5 @@
-"""The effects of a batch of robots, in the order of their seams: what a command becomes, and what a measurement sees."""
+"""The effects of a batch of robots, in the order of their seams: what a command becomes, and what a
+measurement sees."""
 
 from __future__ import annotations
 
@@ -39,11 +40,14 @@ class Link(NamedTuple):
 
 
 def named_effects(robot: Robot) -> dict[str, dict[str, Any]]:
-    """Tables of a robot's effects by canonical name, in the order in which they act. Raises for a name that is not known."""
+    """Tables of a robot's effects by canonical name, in the order in which they act. Raises for a name that
+    is not known."""
     tables: dict[str, dict[str, Any]] = {}
     for table in robot.effects:
         if "name" not in table:
-            raise EffectError(f"robot {robot.name!r}: effect {dict(table)!r} has no name; {nearest('', effect_names())}")
+            raise EffectError(
+                f"robot {robot.name!r}: effect {dict(table)!r} has no name; {nearest('', effect_names())}"
+            )
         name = canonical_name(str(table["name"]))
         if name in tables:
             raise EffectError(f"robot {robot.name!r} has effect {name!r} twice; each effect stands once.")
@@ -55,35 +59,46 @@ def named_effects(robot: Robot) -> dict[str, dict[str, Any]]:
 
 def _alike(one: Wiring, other: Wiring) -> bool:
     """Whether wires and segments are the same to a part in a million million."""
-    return bool(np.allclose(one.arms, other.arms, rtol=1e-12, atol=0.0) and np.allclose(one.length, other.length, rtol=1e-12, atol=0.0))
+    return bool(
+        np.allclose(one.arms, other.arms, rtol=1e-12, atol=0.0)
+        and np.allclose(one.length, other.length, rtol=1e-12, atol=0.0)
+    )
 
 
 class Chain:
     """The effects that a batch of robots has, with their memories."""
 
     def __init__(self, robots: Sequence[Robot], n_robots: int) -> None:
-        """Raises `EffectError`, `UnknownNameError` for effects that are not, `RobotError` where robots name different ones."""
+        """Raises `EffectError`, `UnknownNameError` for effects that are not, `RobotError` where robots name
+        different ones."""
         self.wiring = wire(robots[0])
         tables = [named_effects(robot) for robot in robots]
         for i, named in enumerate(tables):
             if list(named) != list(tables[0]):
                 raise RobotError(
-                    f"robot {i} of the batch has effects {', '.join(named) or 'none'}, robot 0 has {', '.join(tables[0]) or 'none'}; "
+                    f"robot {i} of the batch has effects {', '.join(named) or 'none'}, robot 0 has "
+                    f"{', '.join(tables[0]) or 'none'}; "
                     "name the same effects in each, with neutral values where one has none."
                 )
             if named and robots[i] is not robots[0] and not _alike(wire(robots[i]), self.wiring):
                 raise RobotError(
-                    f"robot {i} of the batch has segments of other lengths or wires at other places than robot 0; "
+                    f"robot {i} of the batch has segments of other lengths or wires at other places than "
+                    "robot 0; "
                     "with effects these must agree: give robots that differ there a simulator each."
                 )
         self.n_robots = n_robots
         self.rest_length = robots[0].rest_tendon_length
         self.gravity = np.array([robot.gravity for robot in robots])
         self._felt = self.gravity  # at the last step
-        self._pulled = np.array([robots[0].segments[end].mode == "tendon_tension" for end in robots[0].tendon_segment], dtype=bool)
+        self._pulled = np.array(
+            [robots[0].segments[end].mode == "tendon_tension" for end in robots[0].tendon_segment], dtype=bool
+        )
         self.links: list[Link] = []
         for name in tables[0]:
-            rows = [read_values(name, named[name], self.wiring, f"robot {r.name!r}") for named, r in zip(tables, robots, strict=True)]
+            rows = [
+                read_values(name, named[name], self.wiring, f"robot {r.name!r}")
+                for named, r in zip(tables, robots, strict=True)
+            ]
             values = np.broadcast_to(np.array(rows), (n_robots, len(rows[0]))).copy()
             self.links.append(Link(name, get_effect(name), values, self._fresh(get_effect(name))))
         self.time = np.full(n_robots, np.nan)
@@ -128,8 +143,8 @@ class Chain:
         return close_ports(opened, ports, params)
 
     def slopes(self, ports: Ports, params: Params, state: Any, dt: float, n_steps: int) -> Floats:
-        """(n_robots, n, n) d(what the rod feels) / d(what is commanded), of tendon lengths [m] then extensions [m], where the
-        robots stand; memories stay. `ports` are those before the effects."""
+        """(n_robots, n, n) d(what the rod feels) / d(what is commanded), of tendon lengths [m] then
+        extensions [m], where the robots stand; memories stay. `ports` are those before the effects."""
 
         def felt(length: Floats, extension: Floats) -> Floats:
             links = [link._replace(memory=link.memory.copy()) for link in self.links]
@@ -139,7 +154,10 @@ class Chain:
 
         n_tendons = self.wiring.n_tendons
         delta = 1e-7 * float(self.wiring.length.sum())
-        inputs = np.concatenate([np.broadcast_to(a, (self.n_robots, a.shape[1])) for a in (ports.tendon_length, ports.extension)], axis=1)
+        inputs = np.concatenate(
+            [np.broadcast_to(a, (self.n_robots, a.shape[1])) for a in (ports.tendon_length, ports.extension)],
+            axis=1,
+        )
         slopes = np.empty((self.n_robots, inputs.shape[1], inputs.shape[1]))
         for j in range(inputs.shape[1]):
             if j < n_tendons and self._pulled[j]:  # a tension: no effect changes it
@@ -153,7 +171,9 @@ class Chain:
             slopes[:, :, j] = (ends[0] - ends[1]) / (2.0 * delta)
         return slopes
 
-    def sense(self, measurement: Measurement, ports: Ports, params: Params, dt: float, n_steps: int) -> Measurement:
+    def sense(
+        self, measurement: Measurement, ports: Ports, params: Params, dt: float, n_steps: int
+    ) -> Measurement:
         """The measurement with the effects of sensing."""
         opened = self._open(ports, params, n_steps)
         opened.tip_position, opened.tip_rotation, opened.points = (a.copy() for a in measurement)
@@ -164,12 +184,27 @@ class Chain:
 
     def _open(self, ports: Ports, params: Params, n_steps: int) -> EffectPorts:
         opened = open_ports(
-            ports, params, self.wiring, n=self.n_robots, rest_length=self.rest_length, gravity=self._felt,
-            base_rotation=matrix_from_quaternion(ports.base_pose[:, 3:]), time=np.nan_to_num(self.time), n_steps=n_steps,
-        )  # fmt: skip
-        opened.tendon_length[:, self._pulled] = self.rest_length[self._pulled]  # these are not commanded: nothing to act on
-        for given in (opened.tendon_length, opened.extension, opened.tip_force, opened.tip_moment, opened.line_force):
-            given[np.isinf(given)] = np.nan  # a bad input: nan passes through an effect without a warning, inf does not
+            ports,
+            params,
+            self.wiring,
+            n=self.n_robots,
+            rest_length=self.rest_length,
+            gravity=self._felt,
+            base_rotation=matrix_from_quaternion(ports.base_pose[:, 3:]),
+            time=np.nan_to_num(self.time),
+            n_steps=n_steps,
+        )
+        # these are not commanded: nothing to act on
+        opened.tendon_length[:, self._pulled] = self.rest_length[self._pulled]
+        for given in (
+            opened.tendon_length,
+            opened.extension,
+            opened.tip_force,
+            opened.tip_moment,
+            opened.line_force,
+        ):
+            # a bad input: nan passes through an effect without a warning, inf does not
+            given[np.isinf(given)] = np.nan
         return opened
 
     def _apply(self, opened: EffectPorts, state: Any, dt: float, links: Sequence[Link]) -> None:

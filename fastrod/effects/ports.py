@@ -16,8 +16,8 @@ def _none() -> Floats:
 
 @dataclass
 class EffectPorts:
-    """The ports of a step with the robot's own numbers beside them; every array has its row axis expanded and may be
-    changed in place, unless "read" is said. World frame unless said otherwise."""
+    """The ports of a step with the robot's own numbers beside them; every array has its row axis expanded and
+    may be changed in place, unless "read" is said. World frame unless said otherwise."""
 
     wiring: Wiring
     """Read: how wires and bends hang together."""
@@ -69,7 +69,8 @@ class EffectPorts:
         return self.wiring.bend(self.dl)
 
     def common(self) -> Floats:
-        """(n, n_segments) change of length that the wires of a segment share, beyond that of the segment before [m]."""
+        """(n, n_segments) change of length that the wires of a segment share, beyond that of the segment
+        before [m]."""
         odd = self.dl - self.wiring.wires(self.bend())
         ends = np.zeros((len(odd), self.wiring.n_segments))
         for k in range(self.wiring.n_segments):
@@ -86,13 +87,14 @@ class EffectPorts:
     def shift_wires(self, change: Floats) -> None:
         """Change wire lengths by (n, n_tendons) [m], the part of it that bends.
 
-        A change that all wires of a segment share would be taken up by tendons and backbone; between stiff wires and an
-        incompressible rod it would only be tension without bound.
+        A change that all wires of a segment share would be taken up by tendons and backbone; between stiff
+        wires and an incompressible rod it would only be tension without bound.
         """
         self.shift_bend(self.wiring.bend(change))
 
     def resolve(self) -> None:
-        """Give `stiffness` and `precurvature` a value at every half step, n_k = 2 n_steps + 1: the kernel wants both alike."""
+        """Give `stiffness` and `precurvature` a value at every half step, n_k = 2 n_steps + 1: the kernel
+        wants both alike."""
         n_k = 2 * self.n_steps + 1
         for name in ("stiffness", "precurvature"):
             port = getattr(self, name)

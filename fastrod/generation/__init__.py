@@ -1,4 +1,5 @@
-"""Data sets in shards: shapes, rollouts and identification sweeps, on the cores here or on a Ray cluster; see README.md here."""
+"""Data sets in shards: shapes, rollouts and identification sweeps, on the cores here or on a Ray cluster; see
+README.md here."""
 
 from __future__ import annotations
 

@@ -26,11 +26,13 @@ class Column:
 
 
 class Work(Protocol):
-    """What a shard holds, and how it is made. A frozen dataclass of plain numbers and words, so that it can be written and compared."""
+    """What a shard holds, and how it is made. A frozen dataclass of plain numbers and words, so that it can
+    be written and compared."""
 
     @property
     def index(self) -> str:
-        """The column that counts from 0 over the whole data set: `row`, or `episode` where one has several rows."""
+        """The column that counts from 0 over the whole data set: `row`, or `episode` where one has several
+        rows."""
         ...
 
     @property
@@ -39,7 +41,8 @@ class Work(Protocol):
         ...
 
     def make(self, first: int, count: int, seed: Sequence[int]) -> list[Column]:
-        """The columns of the `count` rows (or episodes) from `first` on. `seed` is the shard's own; the same call makes the same bits."""
+        """The columns of the `count` rows (or episodes) from `first` on. `seed` is the shard's own; the same
+        call makes the same bits."""
         ...
 
     def failed(self, columns: Sequence[Column]) -> int:
@@ -57,11 +60,25 @@ def numbered(prefix: str, values: NDArray[Any], unit: str, about: str) -> list[C
     return several([f"{prefix}_{k}" for k in range(1, values.shape[1] + 1)], values, unit, about)
 
 
-def within(name: str, value: object, low: float, high: float, unit: str = "", *, whole: bool = False, open_low: bool = False) -> None:
-    """Raises `InputError` where `value` is no number from `low` to `high`; `open_low`: `low` itself is out."""
+def within(
+    name: str,
+    value: object,
+    low: float,
+    high: float,
+    unit: str = "",
+    *,
+    whole: bool = False,
+    open_low: bool = False,
+) -> None:
+    """Raises `InputError` where `value` is no number from `low` to `high`; `open_low`: `low` itself is
+    out."""
     kinds = (int, np.integer) if whole else (int, float, np.integer, np.floating)
     good = isinstance(value, kinds) and not isinstance(value, bool)
-    if not good or not (low < value if open_low else low <= value) or not value <= high or value == np.inf:  # type: ignore[operator]
+    number: Any = value
+    enough = good and (low < number if open_low else low <= number)
+    if not (enough and number <= high and number != np.inf):
         what = "a whole number" if whole else "a number"
-        ends = f"{'above' if open_low else 'at least'} {low:g}" + (" and finite" if high == np.inf else f" and at most {high:g}")
+        ends = f"{'above' if open_low else 'at least'} {low:g}" + (
+            " and finite" if high == np.inf else f" and at most {high:g}"
+        )
         raise InputError(f"{name} is {value!r}{' ' + unit if unit else ''}; it must be {what} {ends}.")

@@ -24,7 +24,10 @@ _SPREAD = (0.5, 1.5)
 def robot_of(text: object) -> Robot:
     """The robot of a robot file's text. Raises `InputError` for what is no text, and what `loads` raises."""
     if not isinstance(text, str):
-        raise InputError(f"robot is {shown(text, 60)}; give the text of a robot file, such as fastrod.model.robotfile.dumps(robot).")
+        raise InputError(
+            f"robot is {shown(text, 60)}; give the text of a robot file, such as "
+            "fastrod.model.robotfile.dumps(robot)."
+        )
     return _loaded(text)
 
 
@@ -34,18 +37,22 @@ def _loaded(text: str) -> Robot:
 
 
 def named(effects: Sequence[str]) -> tuple[str, ...]:
-    """Their canonical names, in the order in which they act. Raises `InputError` for what are no names, `UnknownNameError` with the
-    nearest."""
+    """Their canonical names, in the order in which they act. Raises `InputError` for what are no names,
+    `UnknownNameError` with the nearest."""
     if not isinstance(effects, (tuple, list)) or not all(isinstance(effect, str) for effect in effects):
         raise InputError(f"effects are {shown(effects)}; give a tuple of names, such as ('backlash',).")
     given = {canonical_name(effect) for effect in effects}
     return tuple(name for name in effect_names() if name in given)
 
 
-def with_effects(robot: Robot, effects: Sequence[str], rng: np.random.Generator) -> tuple[Robot, dict[str, float]]:
-    """The robot with these effects, and their values by `effect.parameter` (with _1, _2 ... where there is one per segment or drive).
+def with_effects(
+    robot: Robot, effects: Sequence[str], rng: np.random.Generator
+) -> tuple[Robot, dict[str, float]]:
+    """The robot with these effects, and their values by `effect.parameter` (with _1, _2 ... where there is
+    one per segment or drive).
 
-    Every number is drawn evenly from half to one and a half of its typical size, with either sign where both can be, within its bounds.
+    Every number is drawn evenly from half to one and a half of its typical size, with either sign where both
+    can be, within its bounds.
     """
     wiring = wire(robot)
     tables: dict[str, dict[str, Any]] = {name: dict(table) for name, table in named_effects(robot).items()}

@@ -19,15 +19,18 @@ from fastrod.generation.tasks import make_shard
 
 MOST_DEATHS = 3
 """Pools in a row that die without a single shard: then the work itself kills them, and not somebody."""
-ONE_THREAD = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+ONE_THREAD = dict.fromkeys(
+    ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"
+)
 _AHEAD = 2  # tasks a worker has before it, so that it never waits for the driver
 
 
 def run_here(plan: Plan, folder: Path, todo: Sequence[int], workers: int) -> Generator[Shard, None, None]:
-    """Make the shards `todo` with so many processes, in any order. Killed workers are replaced, and their shards made again.
+    """Make the shards `todo` with so many processes, in any order. Killed workers are replaced, and their
+    shards made again.
 
-    An interrupt lets the shards under way of several processes be finished; the one of a single process, this one, is dropped.
-    Raises what a task raises, and `HostError` where every worker dies.
+    An interrupt lets the shards under way of several processes be finished; the one of a single process, this
+    one, is dropped. Raises what a task raises, and `HostError` where every worker dies.
     """
     if workers == 1:
         for index in todo:
@@ -43,12 +46,15 @@ def run_here(plan: Plan, folder: Path, todo: Sequence[int], workers: int) -> Gen
         except BrokenProcessPool as error:
             deaths = 0 if done else deaths + 1
             if deaths >= MOST_DEATHS:
-                raise HostError(f"the workers died {deaths} times without a shard; is there memory enough for {workers}?") from error
+                raise HostError(
+                    f"the workers died {deaths} times without a shard; is there memory enough for {workers}?"
+                ) from error
         left = [index for index in left if index not in done]
 
 
 def _pool(plan: Plan, folder: Path, todo: Sequence[int], workers: int) -> Iterator[Shard]:
-    """The shards of one pool. Raises `BrokenProcessPool` where a worker is killed; what was whole before has been handed out."""
+    """The shards of one pool. Raises `BrokenProcessPool` where a worker is killed; what was whole before has
+    been handed out."""
     with one_thread():
         pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_begin)
         try:

@@ -1,4 +1,5 @@
-"""Shards as Ray tasks: each holds one native batch, writes its file itself, and tells the driver only what it is called."""
+"""Shards as Ray tasks: each holds one native batch, writes its file itself, and tells the driver only what it
+is called."""
 
 from __future__ import annotations
 
@@ -22,12 +23,16 @@ _NO_CLUSTER = "no Ray cluster answers at {!r}: {} Start one with `ray start --he
 _PATIENCE = 120.0  # s until every machine has shown that it sees the folder
 
 
-def run_on_ray(plan: Plan, folder: Path, todo: Sequence[int], address: str, workers: int | None) -> Generator[Shard, None, None]:
-    """Make the shards `todo` on a cluster, in any order: `address` of its head, `auto` for the one here, `local` for a new one here of
+def run_on_ray(
+    plan: Plan, folder: Path, todo: Sequence[int], address: str, workers: int | None
+) -> Generator[Shard, None, None]:
+    """Make the shards `todo` on a cluster, in any order: `address` of its head, `auto` for the one here,
+    `local` for a new one here of
     `workers` cores. A Ray that is initialised already is used as it is, and left running.
 
-    `workers` bounds the tasks under way. A machine that is lost is no matter: its tasks go elsewhere. Raises `HostError` where the
-    cluster does not answer, `InputError` where a machine does not see the folder, and what a task raises.
+    `workers` bounds the tasks under way. A machine that is lost is no matter: its tasks go elsewhere. Raises
+    `HostError` where the cluster does not answer, `InputError` where a machine does not see the folder, and
+    what a task raises.
     """
     with _cluster(address, workers) as ray:
         _probe(ray, folder)
@@ -101,17 +106,23 @@ def _probe(ray: Any, folder: Path) -> None:
         if node["Alive"] and node["Resources"].get("CPU"):
             path = folder / f".probe-{uuid.uuid4().hex[:12]}.part"
             where = NodeAffinitySchedulingStrategy(node_id=node["NodeID"], soft=False)
-            asked[node["NodeName"]] = path, ray.remote(num_cpus=0, scheduling_strategy=where)(_touch).remote(str(path))
+            asked[node["NodeName"]] = (
+                path,
+                ray.remote(num_cpus=0, scheduling_strategy=where)(_touch).remote(str(path)),
+            )
     for name, (path, reference) in asked.items():
         try:
             why = ray.get(reference, timeout=_PATIENCE)
         except ray.exceptions.RayError as error:
-            raise HostError(f"machine {name} of the cluster cannot run fastrod's tasks: {_one_line(error)}") from error
+            raise HostError(
+                f"machine {name} of the cluster cannot run fastrod's tasks: {_one_line(error)}"
+            ) from error
         seen = path.is_file()
         path.unlink(missing_ok=True)
         if why or not seen:
             raise InputError(
-                f"machine {name} of the cluster does not see folder {str(folder)!r}{f' ({why})' if why else ''}; "
+                f"machine {name} of the cluster does not see folder "
+                f"{str(folder)!r}{f' ({why})' if why else ''}; "
                 "give --out a folder that all machines share."
             )
 

@@ -1,4 +1,5 @@
-"""`Plan`: what a data set is, in words and numbers; written beside its shards, and known by its hash in each of them."""
+"""`Plan`: what a data set is, in words and numbers; written beside its shards, and known by its hash in each
+of them."""
 
 from __future__ import annotations
 
@@ -22,13 +23,19 @@ PLAN = "plan.json"
 SHARDS = "shards"
 """The folder beside it that holds nothing but shards, so that readers of Parquet take it whole."""
 Kind: TypeAlias = Shapes | Rollouts | Trajectories | Sweep
-KINDS: dict[str, type[Kind]] = {"shapes": Shapes, "rollouts": Rollouts, "trajectories": Trajectories, "sweep": Sweep}
+KINDS: dict[str, type[Kind]] = {
+    "shapes": Shapes,
+    "rollouts": Rollouts,
+    "trajectories": Trajectories,
+    "sweep": Sweep,
+}
 
 
 @final
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """A data set: `count` rows (or episodes) of `work`, in shards of `shard_rows`. Raises `InputError` where a number cannot be."""
+    """A data set: `count` rows (or episodes) of `work`, in shards of `shard_rows`. Raises `InputError` where
+    a number cannot be."""
 
     work: Kind
     count: int
@@ -40,7 +47,9 @@ class Plan:
 
     def __post_init__(self) -> None:
         if not isinstance(self.work, tuple(KINDS.values())):
-            raise InputError(f"work is {shown(self.work)}; give {', '.join(kind.__name__ for kind in KINDS.values())}.")
+            raise InputError(
+                f"work is {shown(self.work)}; give {', '.join(kind.__name__ for kind in KINDS.values())}."
+            )
         within("count", self.count, 1, 10**12, whole=True)
         within("seed", self.seed, 0, 2**63, whole=True)
         if self.shard_rows == 0:
@@ -85,16 +94,23 @@ def read_plan(folder: str | Path) -> Plan | None:
     except FileNotFoundError:
         return None
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{str(path)!r} cannot be read: {getattr(error, 'strerror', None) or error}.") from error
+        raise InputError(
+            f"{str(path)!r} cannot be read: {getattr(error, 'strerror', None) or error}."
+        ) from error
     if not text.strip("\0 \n"):
         return None
     try:
         told = json.loads(text)
         kind: Any = KINDS[told.pop("kind")]
-        work = {name: tuple(value) if isinstance(value, list) else value for name, value in told.pop("work").items()}
+        work = {
+            name: tuple(value) if isinstance(value, list) else value
+            for name, value in told.pop("work").items()
+        }
         return Plan(work=kind(**work), **told)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError, FastrodError) as error:
-        raise InputError(f"{str(path)!r} is no plan of fastrod generate; give --out another folder.") from error
+        raise InputError(
+            f"{str(path)!r} is no plan of fastrod generate; give --out another folder."
+        ) from error
 
 
 def settle_plan(plan: Plan, folder: Path) -> None:
@@ -104,12 +120,21 @@ def settle_plan(plan: Plan, folder: Path) -> None:
     """
     for left in folder.glob(f"{PLAN}.*.part"):  # of a killed run; the folder is locked
         left.unlink(missing_ok=True)
-    before, any_there = read_plan(folder), any((*folder.glob("*.parquet"), *folder.glob(f"{SHARDS}/*.parquet")))
+    before, any_there = (
+        read_plan(folder),
+        any((*folder.glob("*.parquet"), *folder.glob(f"{SHARDS}/*.parquet"))),
+    )
     if before is None:
-        if any_there and not (folder / PLAN).exists():  # of an empty one, the shards themselves tell whose they are
-            raise InputError(f"folder {str(folder)!r} holds Parquet files and no {PLAN}; give --out a folder of its own.")
+        # of an empty one, the shards themselves tell whose they are
+        if any_there and not (folder / PLAN).exists():
+            raise InputError(
+                f"folder {str(folder)!r} holds Parquet files and no {PLAN}; give --out a folder of its own."
+            )
     elif any_there and (before.hash != plan.hash or before.count > plan.count):
-        raise InputError(f"folder {str(folder)!r} holds another plan: {_difference(before, plan)}; give --out another folder.")
+        raise InputError(
+            f"folder {str(folder)!r} holds another plan: {_difference(before, plan)}; give "
+            "--out another folder."
+        )
     if before != plan:
         part = folder / f"{PLAN}.{os.getpid()}.part"
         try:
@@ -119,7 +144,9 @@ def settle_plan(plan: Plan, folder: Path) -> None:
                 os.fsync(file.fileno())
             part.replace(folder / PLAN)
         except OSError as error:
-            raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(folder / PLAN)) from error
+            raise OSError(
+                error.errno or errno.EIO, error.strerror or str(error), str(folder / PLAN)
+            ) from error
         finally:
             part.unlink(missing_ok=True)
 
@@ -131,7 +158,11 @@ def _difference(before: Plan, now: Plan) -> str:
     for field in fields(before.work):
         there, here = getattr(before.work, field.name), getattr(now.work, field.name)
         if there != here:
-            return "another robot" if field.name == "robot" else f"its {field.name} is {shown(there)}, not {shown(here)}"
+            return (
+                "another robot"
+                if field.name == "robot"
+                else (f"its {field.name} is {shown(there)}, not {shown(here)}")
+            )
     for name in ("seed", "shard_rows", "version", "count"):
         if getattr(before, name) != getattr(now, name):
             return f"its {name} is {getattr(before, name)!r}, not {getattr(now, name)!r}"

@@ -23,15 +23,16 @@ POLICIES = ("shipped", "baseline", "random")
 @final
 @dataclass(frozen=True, kw_only=True)
 class Rollouts:
-    """Episodes of an environment, each from a seed of its own, which `gymnasium.make(...).reset(seed=...)` takes as well."""
+    """Episodes of an environment, each from a seed of its own, which `gymnasium.make(...).reset(seed=...)`
+    takes as well."""
 
     env: str
     """A task's name or id."""
     policy: str = "random"
     """Who acts: one of `POLICIES`."""
     options: tuple[tuple[str, Any], ...] = ()
-    """Of the environment, name and value, as JSON has it. A robot, or a robot file's name, becomes the file's text, so that the data set
-    hangs on no file that may change."""
+    """Of the environment, name and value, as JSON has it. A robot, or a robot file's name, becomes the file's
+    text, so that the data set hangs on no file that may change."""
 
     def __post_init__(self) -> None:
         from fastrod_envs.policies import find
@@ -42,8 +43,13 @@ class Rollouts:
             raise InputError(f"env is {shown(self.env)}; give a task's name, such as 'Reach'.")
         object.__setattr__(self, "env", name_of(self.env))
         pairs = self.options if isinstance(self.options, (tuple, list)) else (self.options,)
-        if not all(isinstance(pair, (tuple, list)) and len(pair) == 2 and isinstance(pair[0], str) for pair in pairs):
-            raise InputError(f"options are {shown(self.options)}; give pairs of name and value, such as (('n_steps', 100),).")
+        if not all(
+            isinstance(pair, (tuple, list)) and len(pair) == 2 and isinstance(pair[0], str) for pair in pairs
+        ):
+            raise InputError(
+                f"options are {shown(self.options)}; give pairs of name and value, such as "
+                "(('n_steps', 100),)."
+            )
         object.__setattr__(self, "options", tuple((name, _written(name, value)) for name, value in pairs))
         if self.policy not in POLICIES:
             raise InputError(f"no policy {self.policy!r} to roll out; {nearest(str(self.policy), POLICIES)}")
@@ -71,7 +77,10 @@ class Rollouts:
         from fastrod_envs.vector import BatchEnv
 
         rng = np.random.default_rng(seed)
-        seeds = [int(np.random.SeedSequence((seed[0], first + i)).generate_state(1, np.uint64)[0] >> np.uint64(1)) for i in range(count)]
+        seeds = [
+            int(np.random.SeedSequence((seed[0], first + i)).generate_state(1, np.uint64)[0] >> np.uint64(1))
+            for i in range(count)
+        ]
         policy = Policy(find(self.env, self.policy)) if self.policy == "shipped" else None
         options = {**({} if policy is None else policy.options), "threads": 1, **self._given()}
         env = BatchEnv(self.env, num_envs=count, **options)
@@ -92,18 +101,28 @@ class Rollouts:
             given["randomise"] = {**randomise, "robot": robot_of(text)}
         return given
 
-    def _run(self, env: Any, policy: Any, first: int, seeds: Sequence[int], rng: np.random.Generator) -> list[Column]:
+    def _run(
+        self, env: Any, policy: Any, first: int, seeds: Sequence[int], rng: np.random.Generator
+    ) -> list[Column]:
         n, n_steps, n_actions = env.num_envs, env.n_steps, env.task.n_actions
         seen = np.full((n, n_steps + 1, env.single_observation_space.shape[0]), np.nan, np.float32)
         done = np.full((n, n_steps + 1, n_actions), np.nan, np.float32)
         reward, distance = np.full((n, n_steps + 1), np.nan), np.full((n, n_steps + 1), np.nan)
-        flags = {name: np.zeros((n, n_steps + 1), bool) for name in ("terminated", "truncated", "success", "lost")}
+        flags = {
+            name: np.zeros((n, n_steps + 1), bool) for name in ("terminated", "truncated", "success", "lost")
+        }
         length = np.zeros(n, np.int64)
         observation, _ = env.reset(seed=list(seeds))
         open_ = np.ones(n, bool)
         for step in range(n_steps):
             drawn = rng.uniform(-1.0, 1.0, (n, n_actions))
-            act = policy.act(observation) if policy is not None else env.baseline() if self.policy == "baseline" else drawn
+            act = (
+                policy.act(observation)
+                if policy is not None
+                else env.baseline()
+                if self.policy == "baseline"
+                else drawn
+            )
             act = np.clip(np.asarray(act, np.float32), -1.0, 1.0)
             seen[open_, step], done[open_, step] = observation[open_], act[open_]
             observation, gained, terminated, truncated, told = env.step(act)
@@ -124,10 +143,14 @@ class Rollouts:
             Column("step", place, "", "of the episode; the last has the final observation and no action"),
             Column("seed", np.asarray(seeds, np.int64)[episode], "", "of the episode, for reset(seed=...)"),
         ]
-        columns += numbered("obs", seen[used], "", "observation before the step, as the environment scales it")
+        columns += numbered(
+            "obs", seen[used], "", "observation before the step, as the environment scales it"
+        )
         columns += numbered("action", done[used], "", "from -1 to 1; nan in the last row")
         columns.append(Column("reward", reward[used], "", "of the step; nan in the last row"))
-        columns.append(Column("distance", distance[used], "m", "from the goal, after the step; nan in the last row"))
+        columns.append(
+            Column("distance", distance[used], "m", "from the goal, after the step; nan in the last row")
+        )
         columns += [Column(name, values[used], "", "after the step") for name, values in flags.items()]
         return columns
 
@@ -137,7 +160,8 @@ class Rollouts:
 
 
 def _written(name: str, value: object) -> Any:
-    """An option as a plan holds it. Raises `InputError` for what JSON has no words for, and what `load_robot` raises."""
+    """An option as a plan holds it. Raises `InputError` for what JSON has no words for, and what `load_robot`
+    raises."""
     from fastrod_envs.randomisation import Randomisation
 
     told = value
@@ -152,7 +176,9 @@ def _written(name: str, value: object) -> Any:
     try:
         return json.loads(json.dumps(told, allow_nan=False))
     except (TypeError, ValueError) as error:
-        raise InputError(f"option {name!r} is {shown(value)}; a plan holds finite numbers, words, lists and mappings.") from error
+        raise InputError(
+            f"option {name!r} is {shown(value)}; a plan holds finite numbers, words, lists and mappings."
+        ) from error
 
 
 def _text(robot: object) -> object:

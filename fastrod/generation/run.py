@@ -68,12 +68,13 @@ def generate(
 ) -> Summary:
     """Make all shards of `plan` that are not in `folder` yet, and check that every row is there once.
 
-    `workers` processes here, one for each core by default; with `ray` the tasks of a cluster (`run_on_ray`), by default as many as it
-    has cores for. A run that was killed, whole or in part, is finished by the same call: a shard is there whole or not at all, and is
-    the same whoever makes it. Call it below `if __name__ == "__main__":`, as with every program that starts processes.
+    `workers` processes here, one for each core by default; with `ray` the tasks of a cluster (`run_on_ray`),
+    by default as many as it has cores for. A run that was killed, whole or in part, is finished by the same
+    call: a shard is there whole or not at all, and is the same whoever makes it. Call it below `if __name__
+    == "__main__":`, as with every program that starts processes.
 
-    Raises `InputError` where the folder holds another plan, where another run writes into it, or cannot be written; `HostError` where
-    workers or cluster are lost; `OSError` where the disk is full.
+    Raises `InputError` where the folder holds another plan, where another run writes into it, or cannot be
+    written; `HostError` where workers or cluster are lost; `OSError` where the disk is full.
     """
     start = time.perf_counter()
     if not isinstance(plan, Plan):
@@ -81,7 +82,10 @@ def generate(
     if not isinstance(folder, (str, os.PathLike)):
         raise InputError(f"folder is {shown(folder)}; give a path.")
     if ray is not None and not isinstance(ray, str):
-        raise InputError(f"ray is {shown(ray)}; give the address of a cluster, 'auto' for the one here, or 'local' to start one.")
+        raise InputError(
+            f"ray is {shown(ray)}; give the address of a cluster, 'auto' for the one here, or "
+            "'local' to start one."
+        )
     if workers is not None:
         within("workers", workers, 1, 4096, whole=True)
     for module, extra in (("pyarrow", "parquet"), *((("ray", "ray"),) if ray is not None else ())):
@@ -91,7 +95,9 @@ def generate(
     with _own(folder) as keep:
         files = folder / SHARDS
         if files.exists() and not files.is_dir():
-            raise InputError(f"{str(files)!r} is a file; it must be a folder: remove it, or give --out another folder.")
+            raise InputError(
+                f"{str(files)!r} is a file; it must be a folder: remove it, or give --out another folder."
+            )
         settle_plan(plan, folder)
         files.mkdir(exist_ok=True)
         sweep_parts(files)
@@ -101,7 +107,11 @@ def generate(
         if progress is not None:
             progress(plan.kind, done, plan.count)
         if todo:
-            run = run_here(plan, files, todo, workers or cores()) if ray is None else run_on_ray(plan, files, todo, ray, workers)
+            run = (
+                run_here(plan, files, todo, workers or cores())
+                if ray is None
+                else run_on_ray(plan, files, todo, ray, workers)
+            )
             try:
                 for shard in run:
                     keep()
@@ -114,16 +124,23 @@ def generate(
                 sweep_parts(files)
         rows = counted(plan, files)
         return Summary(
-            folder=str(folder), kind=plan.kind, count=plan.count, rows=rows, failed=sum(shard.failed for shard in whole.values()),
-            shards=plan.n_shards, made=len(todo), made_count=made, seconds=time.perf_counter() - start,
+            folder=str(folder),
+            kind=plan.kind,
+            count=plan.count,
+            rows=rows,
+            failed=sum(shard.failed for shard in whole.values()),
+            shards=plan.n_shards,
+            made=len(todo),
+            made_count=made,
+            seconds=time.perf_counter() - start,
             bytes=sum(path.stat().st_size for path in files.iterdir() if path.suffix == ".parquet"),
-        )  # fmt: skip
+        )
 
 
 @contextmanager
 def _own(folder: Path) -> Iterator[Callable[[], None]]:
-    """The folder, made where it is not there, for this process alone. What comes is called once there is something to keep: an error
-    before leaves the folder as it was. Raises `InputError`."""
+    """The folder, made where it is not there, for this process alone. What comes is called once there is
+    something to keep: an error before leaves the folder as it was. Raises `InputError`."""
     fresh = [path for path in (folder, *folder.parents) if not path.exists()]
     name = folder / _LOCK
     locked_before = name.exists()
@@ -137,7 +154,10 @@ def _own(folder: Path) -> Iterator[Callable[[], None]]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise InputError(f"another fastrod generate writes into {str(folder)!r}; wait for it, or give --out another folder.") from error
+            raise InputError(
+                f"another fastrod generate writes into {str(folder)!r}; wait for it, or give "
+                "--out another folder."
+            ) from error
         except OSError:
             pass  # a file system without locks
         before, kept = _State.of(folder), list[bool]()
@@ -164,7 +184,8 @@ class _State(NamedTuple):
     def of(cls, folder: Path) -> _State:
         plan, files = folder / PLAN, folder / SHARDS
         return cls(
-            plan.read_bytes() if plan.is_file() else None, frozenset(path.name for path in files.iterdir()) if files.is_dir() else None
+            plan.read_bytes() if plan.is_file() else None,
+            frozenset(path.name for path in files.iterdir()) if files.is_dir() else None,
         )
 
     def put_back(self, folder: Path) -> bool:

@@ -1,8 +1,9 @@
 """Shapes along chains of neighbouring inputs: where the last ones stood foretells the next.
 
-The boundary unknowns x of a robot whose inputs move along a smooth curve are a smooth function of the place on it. A polynomial
-through the last four solutions is then so good a guess that one Newton pass, and one more with the gain of the first, which is a
-quarter of the work, bring the residual below the tolerance. Where they do not, `fastrod.solver.settle` does, from the same guess or cold.
+The boundary unknowns x of a robot whose inputs move along a smooth curve are a smooth function of the place
+on it. A polynomial through the last four solutions is then so good a guess that one Newton pass, and one more
+with the gain of the first, which is a quarter of the work, bring the residual below the tolerance. Where they
+do not, `fastrod.solver.settle` does, from the same guess or cold.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ class ChainSolver:
     """A batch of one robot, without effects and contact, that goes along `n` chains side by side."""
 
     def __init__(self, robot: Robot, n: int, points_per_segment: int, threads: int = 1) -> None:
-        """`points_per_segment` as for `Simulator`. With `threads` more than one a process of its own is the better use of a core
-        (perf/bench_generate.py)."""
+        """`points_per_segment` as for `Simulator`. With `threads` more than one a process of its own is the
+        better use of a core (perf/bench_generate.py)."""
         self.layout, self.params, rest = compile_robots((robot,), points_per_segment)
         self._reader = Reader(self.layout, self.params, rest, n)
         self._passes = Passes(self.layout, self.params, n, threads, carry=False)
@@ -50,7 +51,8 @@ class ChainSolver:
         self._near = _NEAR * float(self.params.reach[0])
 
     def settle(self, given: Inputs, tolerance: float) -> Settled:
-        """The next shapes of all chains: inputs as for `Simulator.settle`, each robot's own, boundary residual within `tolerance` [m].
+        """The next shapes of all chains: inputs as for `Simulator.settle`, each robot's own, boundary
+        residual within `tolerance` [m].
 
         Raises `InputError` for inputs that no robot can have; a row that does not converge is not ok.
         """
@@ -94,5 +96,6 @@ class ChainSolver:
             left = left[~there]
         left = np.sort(np.concatenate([left, far]))
         memory.x[left] = guess[left]
-        self._passes.arrive_at(left, ports)  # `settle` starts from this guess, and does not move it to the new inputs
+        # `settle` starts from this guess, and does not move it to the new inputs
+        self._passes.arrive_at(left, ports)
         return left

@@ -29,11 +29,13 @@ _LOAD = 2.0  # tip force by default, in EI/l^2: bends every robot well, and has 
 @final
 @dataclass(frozen=True, kw_only=True)
 class Shapes:
-    """Commands drawn evenly: each segment's bend from a disc, its extension from its range, the tip force from a ball.
+    """Commands drawn evenly: each segment's bend from a disc, its extension from its range, the tip force
+    from a ball.
 
-    A row is a point on a great circle of a sphere for each of these. By Archimedes, two coordinates of a point even on the sphere of
-    four dimensions are even in the disc, three of five even in the ball, one of three even in the interval: each row by itself is
-    distributed exactly so, and neighbours of a chain, `STRIDE` apart on every circle, are near each other. Chains are independent.
+    A row is a point on a great circle of a sphere for each of these. By Archimedes, two coordinates of a
+    point even on the sphere of four dimensions are even in the disc, three of five even in the ball, one of
+    three even in the interval: each row by itself is distributed exactly so, and neighbours of a chain,
+    `STRIDE` apart on every circle, are near each other. Chains are independent.
     """
 
     robot: str = field(repr=False)
@@ -41,7 +43,8 @@ class Shapes:
     bend: float = 1.0
     """Radius of the disc of a segment's bend [rad]."""
     force: float = -1.0
-    """Radius of the ball of tip forces [N]; below zero stands for 2 EI/l^2 of the softest segment and the whole length."""
+    """Radius of the ball of tip forces [N]; below zero stands for 2 EI/l^2 of the softest segment and the
+    whole length."""
     tolerance: float = 1e-6
     """Largest boundary residual of a row that is ok [m]."""
     points_per_segment: int = 6
@@ -59,7 +62,8 @@ class Shapes:
         robot = robot_of(self.robot)
         if robot.effects:
             raise InputError(
-                f"robot {robot.name!r} has effects; a shape is that of the plain rod: take them out, or generate rollouts, which have them."
+                f"robot {robot.name!r} has effects; a shape is that of the plain rod: take them out, or "
+                "generate rollouts, which have them."
             )
         SegmentActions(robot)
         if isinstance(self.force, (int, float)) and self.force < 0.0:
@@ -70,7 +74,10 @@ class Shapes:
         within("points", self.points, 0, nodes, whole=True)
         if self.points and nodes % self.points:
             near = min((k for k in range(1, nodes + 1) if nodes % k == 0), key=lambda k: abs(k - self.points))
-            raise InputError(f"points is {self.points}; the rod has {nodes} steps, of which they must be an even part, such as {near}.")
+            raise InputError(
+                f"points is {self.points}; the rod has {nodes} steps, of which they must be an "
+                f"even part, such as {near}."
+            )
 
     @property
     def index(self) -> str:
@@ -89,11 +96,16 @@ class Shapes:
         lanes = -(-count // self.chain)
         draw = Draw(self, robot, lanes, rng)
         solver = ChainSolver(robot, lanes, self.points_per_segment)
-        rows = [self._rows(robot, at, solver.settle(self._inputs(robot, at), self.tolerance)) for at in map(draw.at, range(self.chain))]
+        rows = [
+            self._rows(robot, at, solver.settle(self._inputs(robot, at), self.tolerance))
+            for at in map(draw.at, range(self.chain))
+        ]
         order = rng.permutation(count)
         columns = [Column("row", np.arange(first, first + count), "", "counts over the whole data set")]
         chain = np.tile(np.arange(lanes), self.chain)[:count][order] + first
-        columns.append(Column("chain", chain, "", "rows of a chain are neighbours: keep them on one side of a split"))
+        columns.append(
+            Column("chain", chain, "", "rows of a chain are neighbours: keep them on one side of a split")
+        )
         for same in zip(*rows, strict=True):
             values = np.concatenate([column.values for column in same])[:count][order]
             columns.append(Column(same[0].name, values, same[0].unit, same[0].about))
@@ -105,7 +117,11 @@ class Shapes:
 
     def _inputs(self, robot: Robot, drawn: Drawn) -> Inputs:
         turn = matrix_from_quaternion(np.array(robot.base_quaternion))
-        return Inputs(tendon_length=robot.rest_tendon_length + drawn.dl, extension=drawn.extension, tip_force=drawn.force @ turn.T)
+        return Inputs(
+            tendon_length=robot.rest_tendon_length + drawn.dl,
+            extension=drawn.extension,
+            tip_force=drawn.force @ turn.T,
+        )
 
     def _rows(self, robot: Robot, drawn: Drawn, settled: Settled) -> list[Column]:
         """One row of each lane; base frame, as in a run log."""
@@ -118,9 +134,16 @@ class Shapes:
             return np.where(lost, np.nan, a).astype(kind)
 
         tip = (shape.tip_position - origin) @ turn
-        quaternion = quaternion_from_matrix(turn.T @ np.where(lost[:, :, None], np.eye(3), shape.tip_rotation))
+        quaternion = quaternion_from_matrix(
+            turn.T @ np.where(lost[:, :, None], np.eye(3), shape.tip_rotation)
+        )
         wrench = np.concatenate([shape.base_wrench[:, :3] @ turn, shape.base_wrench[:, 3:] @ turn], axis=1)
-        columns = numbered("dl", drawn.dl, "m", "change of a tendon's length against the straight rest robot; negative is pulled")
+        columns = numbered(
+            "dl",
+            drawn.dl,
+            "m",
+            "change of a tendon's length against the straight rest robot; negative is pulled",
+        )
         columns += numbered("ext", drawn.extension, "m", "change of a segment's length")
         columns += several(("tip_fx", "tip_fy", "tip_fz"), drawn.force, "N", "force on the tip, base frame")
         columns += several(("tip_x", "tip_y", "tip_z"), seen(tip, np.float64), "m", "tip, base frame")
@@ -128,14 +151,26 @@ class Shapes:
         columns += numbered("tension", seen(shape.tension), "N", "tension of a tendon")
         names = ("base_fx", "base_fy", "base_fz")
         columns += several(names, seen(wrench[:, :3]), "N", "force of the rod on its base, base frame")
-        columns += several(("base_mx", "base_my", "base_mz"), seen(wrench[:, 3:]), "N m", "moment of the rod on its base, base frame")
+        columns += several(
+            ("base_mx", "base_my", "base_mz"),
+            seen(wrench[:, 3:]),
+            "N m",
+            "moment of the rod on its base, base frame",
+        )
         if self.points:
             every = (shape.position.shape[1] - 1) // self.points
             nodes = (shape.position[:, every::every] - origin) @ turn
             for k in range(self.points):
                 names = (f"p{k + 1}_x", f"p{k + 1}_y", f"p{k + 1}_z")
-                columns += several(names, seen(nodes[:, k]), "m", f"backbone after {k + 1} of {self.points} parts, base frame")
-        columns.append(Column("residual", shape.residual.astype(np.float32), "m", "largest boundary residual"))
+                columns += several(
+                    names,
+                    seen(nodes[:, k]),
+                    "m",
+                    f"backbone after {k + 1} of {self.points} parts, base frame",
+                )
+        columns.append(
+            Column("residual", shape.residual.astype(np.float32), "m", "largest boundary residual")
+        )
         columns.append(Column("ok", ok.copy(), "", f"the residual is within {self.tolerance:g} m"))
         return columns
 
@@ -169,9 +204,12 @@ class Draw:
         low, high = self._range.T
         extension = low + (high - low) * 0.5 * (1.0 + _on(self._extension, step)[..., 0])
         extension = np.clip(extension, low, high)  # a rounding below the end is none
-        action = np.concatenate([extension[..., None], bend * actions.offset[:, None]], axis=-1).reshape(len(bend), -1)
+        action = np.concatenate([extension[..., None], bend * actions.offset[:, None]], axis=-1).reshape(
+            len(bend), -1
+        )
         dl = np.zeros((len(bend), actions.robot.n_tendons))
-        for k, row in enumerate(actions.matrix[: actions.robot.n_tendons].T):  # in one order: a batch is its rows bit by bit
+        # in one order: a batch is its rows bit by bit
+        for k, row in enumerate(actions.matrix[: actions.robot.n_tendons].T):
             dl += action[:, k, None] * row
         return Drawn(dl, extension, work.force * _on(self._force, step)[:, :3])
 

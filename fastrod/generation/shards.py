@@ -39,7 +39,8 @@ def path_of(plan: Plan, folder: Path, index: int) -> Path:
 
 
 def write(plan: Plan, folder: Path, index: int, columns: Sequence[Column]) -> Shard:
-    """Write a shard, whole or not at all: under a name of its own, to the disk, and only then where it belongs.
+    """Write a shard, whole or not at all: under a name of its own, to the disk, and only then where it
+    belongs.
 
     Raises `OSError` where the disk is full or the folder gone; nothing is left behind then.
     """
@@ -50,14 +51,18 @@ def write(plan: Plan, folder: Path, index: int, columns: Sequence[Column]) -> Sh
     arrays, kinds = [], []
     for column in columns:
         arrays.append(arrow.array(column.values))
-        kinds.append(arrow.field(column.name, arrays[-1].type, metadata={"unit": column.unit, "about": column.about}))
+        kinds.append(
+            arrow.field(column.name, arrays[-1].type, metadata={"unit": column.unit, "about": column.about})
+        )
     about = {_HASH: plan.hash, _INDEX: str(index), _FAILED: str(made.failed), _UNITS: str(made.units)}
     table = arrow.Table.from_arrays(arrays, schema=arrow.schema(kinds, metadata=about))
     path = path_of(plan, folder, index)
     part = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:12]}.part")
     try:
         with part.open("wb") as file:
-            parquet.write_table(table, file, compression="zstd", compression_level=_LEVEL, use_dictionary=False)
+            parquet.write_table(
+                table, file, compression="zstd", compression_level=_LEVEL, use_dictionary=False
+            )
             file.flush()
             os.fsync(file.fileno())
         os.replace(part, path)  # noqa: PTH105
@@ -70,8 +75,9 @@ def write(plan: Plan, folder: Path, index: int, columns: Sequence[Column]) -> Sh
 
 
 def found(plan: Plan, folder: Path) -> dict[int, Shard]:
-    """The whole shards of this plan in the folder. One that is torn, whose index cannot be read, or that is too short for a count that
-    has grown, is left out and will be written again. Raises `InputError` for a shard of another plan, and for one beyond the count."""
+    """The whole shards of this plan in the folder. One that is torn, whose index cannot be read, or that is
+    too short for a count that has grown, is left out and will be written again. Raises `InputError` for a
+    shard of another plan, and for one beyond the count."""
     shards: dict[int, Shard] = {}
     for path in sorted(folder.iterdir()):
         match = _NAME.fullmatch(path.name)
@@ -83,9 +89,17 @@ def found(plan: Plan, folder: Path) -> dict[int, Shard]:
         told = _told(path)
         if told is None:
             continue
-        if told.get(_HASH, b"").decode() != plan.hash or path != path_of(plan, folder, index) or index >= plan.n_shards:
+        if (
+            told.get(_HASH, b"").decode() != plan.hash
+            or path != path_of(plan, folder, index)
+            or index >= plan.n_shards
+        ):
             raise InputError(f"{str(path)!r} is a shard of another plan; give --out a folder of its own.")
-        if int(told[_INDEX]) == index and int(told[_UNITS]) == len(plan.rows(index)) and _index(plan, path) is not None:
+        if (
+            int(told[_INDEX]) == index
+            and int(told[_UNITS]) == len(plan.rows(index))
+            and _index(plan, path) is not None
+        ):
             shards[index] = Shard(index, int(told[_UNITS]), int(told[b"rows"]), int(told[_FAILED]))
     return shards
 
@@ -125,7 +139,8 @@ def sweep_parts(folder: Path) -> int:
 
 
 def counted(plan: Plan, folder: Path) -> int:
-    """Rows of all shards, after reading their index column: every index occurs, each in its own shard, once (an episode: with steps from
+    """Rows of all shards, after reading their index column: every index occurs, each in its own shard, once
+    (an episode: with steps from
     0 on, each once). Raises `InputError` where one is lost or doubled, or a file cannot be read."""
     total, name = 0, plan.work.index
     for shard in range(plan.n_shards):
@@ -146,6 +161,8 @@ def counted(plan: Plan, folder: Path) -> int:
             good = np.array_equal(unit[begins], wanted) and np.array_equal(step, place)
         if not good:
             ends = f"from {wanted[0]} to {wanted[-1]}"
-            raise InputError(f"{str(path)!r} does not hold each {name} {ends} once; remove it, and generate again.")
+            raise InputError(
+                f"{str(path)!r} does not hold each {name} {ends} once; remove it, and generate again."
+            )
         total += len(unit)
     return total

@@ -1,4 +1,5 @@
-"""Identification sweeps: robots with a sealed effect, their logs simulated and identified, and the seal opened last."""
+"""Identification sweeps: robots with a sealed effect, their logs simulated and identified, and the seal
+opened last."""
 
 from __future__ import annotations
 
@@ -21,8 +22,9 @@ _TOLERANCE = 1e-8  # m
 @final
 @dataclass(frozen=True, kw_only=True)
 class Sweep:
-    """Row i has effect i modulo their number, with values drawn anew. The log is that of `fastrod excite`, simulated at rest row by row,
-    with noise on the tip; the model is the one that is identified, so that what is missed is missed for want of information."""
+    """Row i has effect i modulo their number, with values drawn anew. The log is that of `fastrod excite`,
+    simulated at rest row by row, with noise on the tip; the model is the one that is identified, so that what
+    is missed is missed for want of information."""
 
     robot: str = field(repr=False)
     """A robot file's text; what is identified is this robot."""
@@ -46,7 +48,9 @@ class Sweep:
         if not robot.n_tendons:
             raise InputError(f"robot {robot.name!r} has no tendons; there is nothing to excite.")
         if robot.effects:
-            raise InputError(f"robot {robot.name!r} has effects already; a sweep seals its own into a plain robot.")
+            raise InputError(
+                f"robot {robot.name!r} has effects already; a sweep seals its own into a plain robot."
+            )
 
     @property
     def index(self) -> str:
@@ -81,12 +85,23 @@ class Sweep:
             except FastrodError as error:
                 rows.append({**row, **_NOTHING, "problem": str(error)})
                 continue
-            fitted = {f"{one.name}.{name}": estimate.value for one in result.effects for name, estimate in one.parameters.items()}
-            rows.append({
-                **row, "verdict": str(result.verdict), "named": " ".join(one.name for one in result.effects),
-                "first": bool(result.effects) and result.effects[0].name == effect, "found": json.dumps(fitted),
-                "floor": float(result.noise.floor), "before": result.test.before, "after": result.test.after,
-            })  # fmt: skip
+            fitted = {
+                f"{one.name}.{name}": estimate.value
+                for one in result.effects
+                for name, estimate in one.parameters.items()
+            }
+            rows.append(
+                {
+                    **row,
+                    "verdict": str(result.verdict),
+                    "named": " ".join(one.name for one in result.effects),
+                    "first": bool(result.effects) and result.effects[0].name == effect,
+                    "found": json.dumps(fitted),
+                    "floor": float(result.noise.floor),
+                    "before": result.test.before,
+                    "after": result.test.after,
+                }
+            )
         columns = [Column("row", np.arange(first, first + count), "", "counts over the whole data set")]
         for name, (unit, about) in _ABOUT.items():
             cells = [row[name] for row in rows]
@@ -95,12 +110,20 @@ class Sweep:
 
     def failed(self, columns: Sequence[Column]) -> int:
         """Rows whose log could not be identified."""
-        return sum(sum(bool(cell) for cell in column.values) for column in columns if column.name == "problem")
+        return sum(
+            sum(bool(cell) for cell in column.values) for column in columns if column.name == "problem"
+        )
 
 
 _NOTHING: dict[str, Any] = {
-    "verdict": "", "named": "", "first": False, "found": "{}", "floor": float("nan"), "before": float("nan"), "after": float("nan"),
-}  # fmt: skip
+    "verdict": "",
+    "named": "",
+    "first": False,
+    "found": "{}",
+    "floor": float("nan"),
+    "before": float("nan"),
+    "after": float("nan"),
+}
 _ABOUT = {
     "effect": ("", "the sealed one"),
     "sealed": ("", "its values, JSON, effect.parameter in its unit"),
@@ -116,7 +139,8 @@ _ABOUT = {
 
 
 def _simulated(robots: list[Robot], log: Any, dt: float) -> np.ndarray:
-    """(n_robots, n_rows, 3) measured tips of robots that follow a log at rest, effects with a memory included."""
+    """(n_robots, n_rows, 3) measured tips of robots that follow a log at rest, effects with a memory
+    included."""
     from fastrod.identification.log.inputs import inputs
     from fastrod.simulator import Simulator
 

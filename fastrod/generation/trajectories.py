@@ -23,9 +23,11 @@ _POINTS = 8  # steps of a segment
 @final
 @dataclass(frozen=True, kw_only=True)
 class Trajectories:
-    """Each segment goes at a limited rate toward a target in its disc of bends and its range of extension; targets change at random.
+    """Each segment goes at a limited rate toward a target in its disc of bends and its range of extension;
+    targets change at random.
 
-    The first step is settled, the others are steps of the simulator. What is measured has the drawn effects in it.
+    The first step is settled, the others are steps of the simulator. What is measured has the drawn effects
+    in it.
     """
 
     robot: str = field(repr=False)
@@ -69,7 +71,9 @@ class Trajectories:
         robots, drawn = zip(*(with_effects(plain, self.effects, rng) for _ in range(count)), strict=True)
         turn = matrix_from_quaternion(np.array(plain.base_quaternion))
         force = self.force * in_ball(rng, count, 3)
-        simulator = Simulator(list(robots) if self.effects else plain, count, self.dt, _POINTS, outputs="tip", threads=1)
+        simulator = Simulator(
+            list(robots) if self.effects else plain, count, self.dt, _POINTS, outputs="tip", threads=1
+        )
         actions, n = SegmentActions(plain), plain.n_segments
         low, high = np.array([segment.extension for segment in plain.segments]).T
         bend, extension = np.zeros((count, n, 2)), np.zeros((count, n))
@@ -86,32 +90,69 @@ class Trajectories:
             bend = bend + way * np.minimum(1.0, self.speed * self.dt / np.maximum(far, 1e-12))
             most = self.speed * self.dt / self.bend * (high - low)
             extension = np.clip(extension + np.clip(aim_extension - extension, -most, most), low, high)
-            action = np.concatenate([extension[..., None], bend * actions.offset[:, None]], axis=-1).reshape(count, -1)
+            action = np.concatenate([extension[..., None], bend * actions.offset[:, None]], axis=-1).reshape(
+                count, -1
+            )
             given = actions.inputs(action)
             state = (simulator.step if step else simulator.settle)(**given, tip_force=force @ turn.T)
             seen = simulator.measure()
             dl = given["tendon_length"] - plain.rest_tendon_length
-            rows.append((dl, extension.copy(), seen.tip_position, quaternion_from_matrix(seen.tip_rotation), state.residual[:, None]))
+            rows.append(
+                (
+                    dl,
+                    extension.copy(),
+                    seen.tip_position,
+                    quaternion_from_matrix(seen.tip_rotation),
+                    state.residual[:, None],
+                )
+            )
             ok.append(state.ok)
-        dl, ext, tip, quaternion, residual = (np.stack(parts, 1).reshape(count * self.steps, -1) for parts in zip(*rows, strict=True))
+        dl, ext, tip, quaternion, residual = (
+            np.stack(parts, 1).reshape(count * self.steps, -1) for parts in zip(*rows, strict=True)
+        )
         good = np.stack(ok, 1).ravel()
         tip, quaternion = (np.where(good[:, None], a, np.nan) for a in (tip, quaternion))
         step_of = np.tile(np.arange(self.steps), count)
         columns = [
-            Column("episode", np.repeat(np.arange(first, first + count), self.steps), "", "counts over the whole data set"),
+            Column(
+                "episode",
+                np.repeat(np.arange(first, first + count), self.steps),
+                "",
+                "counts over the whole data set",
+            ),
             Column("step", step_of, "", "of the episode"),
             Column("t", step_of * self.dt, "s", "since the episode's start"),
         ]
-        columns += numbered("dl", dl, "m", "commanded change of a tendon's length against the straight rest robot; negative is pulled")
+        columns += numbered(
+            "dl",
+            dl,
+            "m",
+            "commanded change of a tendon's length against the straight rest robot; negative is pulled",
+        )
         columns += numbered("ext", ext, "m", "commanded change of a segment's length")
-        columns += several(("tip_fx", "tip_fy", "tip_fz"), np.repeat(force, self.steps, 0), "N", "force on the tip, base frame")
+        columns += several(
+            ("tip_fx", "tip_fy", "tip_fz"),
+            np.repeat(force, self.steps, 0),
+            "N",
+            "force on the tip, base frame",
+        )
         columns += several(("tip_x", "tip_y", "tip_z"), tip, "m", "tip as measured, base frame")
-        columns += several(("tip_qw", "tip_qx", "tip_qy", "tip_qz"), quaternion.astype(np.float32), "", "base_from_tip as measured")
+        columns += several(
+            ("tip_qw", "tip_qx", "tip_qy", "tip_qz"),
+            quaternion.astype(np.float32),
+            "",
+            "base_from_tip as measured",
+        )
         for name in drawn[0]:
             values = np.repeat([one[name] for one in drawn], self.steps)
             columns.append(Column(name, values, "", "drawn for the episode, in its parameter's unit"))
         columns.append(
-            Column("residual", residual[:, 0].astype(np.float32), "m", "largest boundary residual: how far the observer is behind")
+            Column(
+                "residual",
+                residual[:, 0].astype(np.float32),
+                "m",
+                "largest boundary residual: how far the observer is behind",
+            )
         )
         columns.append(Column("ok", good, "", "the observer did not diverge"))
         return columns

@@ -1,7 +1,7 @@
 """Rigid hosts: other physics engines that carry a rod, feel its weight, and whose bodies it touches.
 
-`Rod` knows no engine; README.md beside this file says how any engine carries one. PyBullet (`pip install 'fastrod[hosts]'`) and MuJoCo
-(`pip install 'fastrod[mujoco]'`) are imported on first use.
+`Rod` knows no engine; README.md beside this file says how any engine carries one. PyBullet (`pip install
+'fastrod[hosts]'`) and MuJoCo (`pip install 'fastrod[mujoco]'`) are imported on first use.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -22,14 +22,39 @@ if TYPE_CHECKING:
     from fastrod.hosts.visuals import Visuals
 
 __all__ = [
-    "Bullet", "BulletArm", "BulletLink", "Camera", "Capsules", "Host", "Motion", "MountedRod", "MujocoBody", "MujocoRod", "Rod",
-    "RodBodies", "SoftManiSim", "Visuals", "add_capsules", "connect",
-]  # fmt: skip
+    "Bullet",
+    "BulletArm",
+    "BulletLink",
+    "Camera",
+    "Capsules",
+    "Host",
+    "Motion",
+    "MountedRod",
+    "MujocoBody",
+    "MujocoRod",
+    "Rod",
+    "RodBodies",
+    "SoftManiSim",
+    "Visuals",
+    "add_capsules",
+    "connect",
+]
 _HOME = {
-    "Bullet": "bullet", "BulletArm": "arm", "BulletLink": "link", "Camera": "camera", "Capsules": "capsules", "MountedRod": "mounted",
-    "MujocoBody": "mujoco", "MujocoRod": "mujoco", "Rod": "rod", "RodBodies": "bodies", "SoftManiSim": "softmanisim",
-    "Visuals": "visuals", "add_capsules": "mujoco", "connect": "bullet",
-}  # fmt: skip
+    "Bullet": "bullet",
+    "BulletArm": "arm",
+    "BulletLink": "link",
+    "Camera": "camera",
+    "Capsules": "capsules",
+    "MountedRod": "mounted",
+    "MujocoBody": "mujoco",
+    "MujocoRod": "mujoco",
+    "Rod": "rod",
+    "RodBodies": "bodies",
+    "SoftManiSim": "softmanisim",
+    "Visuals": "visuals",
+    "add_capsules": "mujoco",
+    "connect": "bullet",
+}
 
 
 def __getattr__(name: str) -> Any:

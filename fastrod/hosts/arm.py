@@ -22,13 +22,15 @@ _STARTS = 8
 class BulletArm:
     """The joints from a body's base to its tip link, one after the other, each turning or sliding.
 
-    The joints of one arm are numbered in the order of `names`; joint positions q are (n_joints,) [rad], or [m] where a joint slides.
-    Frames are URDF frames, not those of the centres of mass. The kinematics are computed outside of PyBullet, from what it tells of
-    the body: they hold at any q and move nothing. Joints on the way to the tip that are not the arm's own are taken where they stand.
+    The joints of one arm are numbered in the order of `names`; joint positions q are (n_joints,) [rad], or
+    [m] where a joint slides. Frames are URDF frames, not those of the centres of mass. The kinematics are
+    computed outside of PyBullet, from what it tells of the body: they hold at any q and move nothing. Joints
+    on the way to the tip that are not the arm's own are taken where they stand.
     """
 
     def __init__(self, bullet: Any, body: int, tip: int | str, joints: Sequence[str] | None = None) -> None:
-        """`tip`: number or name of a link; `joints`: names, those between base and tip that move if left out. Raises `HostError`."""
+        """`tip`: number or name of a link; `joints`: names, those between base and tip that move if left out.
+        Raises `HostError`."""
         self.bullet = b = Bullet(bullet)
         self.body = body
         self.tip = b.link_named(body, tip) if isinstance(tip, str) else int(tip)
@@ -39,13 +41,21 @@ class BulletArm:
         self.names: tuple[str, ...] = tuple(known) if joints is None else tuple(joints)
         """Of the joints."""
         if not self.names or len(set(self.names)) < len(self.names):
-            raise HostError(f"the arm's joints are {list(self.names)!r}; name at least one between base and tip of body {body}, each once.")
+            raise HostError(
+                f"the arm's joints are {list(self.names)!r}; name at least one between base and "
+                f"tip of body {body}, each once."
+            )
         for name in self.names:
             if name not in known:
-                raise HostError(f"body {body} has no moving joint {name!r} between its base and the tip; {nearest(name, known)}")
+                raise HostError(
+                    f"body {body} has no moving joint {name!r} between its base and the tip; "
+                    f"{nearest(name, known)}"
+                )
         self._own: Ints = np.array([known[name] for name in self.names])
         self._joint = [self._chain.joint[k] for k in self._own]
-        self._axes = [(k, bool(self._chain.slides[k]), self._chain.axis[k].tolist()) for k in self._own.tolist()]
+        self._axes = [
+            (k, bool(self._chain.slides[k]), self._chain.axis[k].tolist()) for k in self._own.tolist()
+        ]
         self._other = [k for k in range(len(known)) if k not in self._own]
         self.n_joints = len(self.names)
         info = [b.getJointInfo(body, j) for j in self._joint]
@@ -64,19 +74,31 @@ class BulletArm:
 
     @classmethod
     def load(
-        cls, bullet: Any, path: str, *, tip: int | str, joints: Sequence[str] | None = None,
-        position: ArrayLike = (0.0, 0.0, 0.0), quaternion: ArrayLike = (1.0, 0.0, 0.0, 0.0),
-    ) -> BulletArm:  # fmt: skip
-        """Load a URDF, with the inertia that it states, and fix its base frame at `position` (3,) [m] and `quaternion` (4,) w x y z,
-        world. Raises `HostError` for a file that PyBullet cannot load, `InputError` for a pose that is none."""
+        cls,
+        bullet: Any,
+        path: str,
+        *,
+        tip: int | str,
+        joints: Sequence[str] | None = None,
+        position: ArrayLike = (0.0, 0.0, 0.0),
+        quaternion: ArrayLike = (1.0, 0.0, 0.0, 0.0),
+    ) -> BulletArm:
+        """Load a URDF, with the inertia that it states, and fix its base frame at `position` (3,) [m] and
+        `quaternion` (4,) w x y z, world. Raises `HostError` for a file that PyBullet cannot load,
+        `InputError` for a pose that is none."""
         b = Bullet(bullet)
         place, turn = _floats(position), _floats(quaternion)
         if place.shape != (3,) or turn.shape != (4,):
-            raise InputError(f"the arm's base is at {position!r}, {quaternion!r}; give position (3,) [m] and quaternion (4,) w x y z.")
+            raise InputError(
+                f"the arm's base is at {position!r}, {quaternion!r}; give position (3,) [m] "
+                "and quaternion (4,) w x y z."
+            )
         pose = _target(np.concatenate([place, turn]), "base pose", (7,))
         flags = b.URDF_USE_INERTIA_FROM_FILE
         try:
-            body = b.loadURDF(str(path), pose[:3].tolist(), to_xyzw(pose[3:]).tolist(), useFixedBase=True, flags=flags)
+            body = b.loadURDF(
+                str(path), pose[:3].tolist(), to_xyzw(pose[3:]).tolist(), useFixedBase=True, flags=flags
+            )
         except HostError as error:
             raise HostError(f"PyBullet cannot load {str(path)!r}; is it the path of a URDF file?") from error
         try:
@@ -94,7 +116,8 @@ class BulletArm:
         return np.array([state[1] for state in self.bullet.getJointStates(self.body, self._joint)])
 
     def place(self, q: ArrayLike, q_dot: ArrayLike = 0.0) -> None:
-        """Be at q with velocity `q_dot`, (n_joints,) or one for all, at once; hold q from then on. Raises `InputError`."""
+        """Be at q with velocity `q_dot`, (n_joints,) or one for all, at once; hold q from then on. Raises
+        `InputError`."""
         to, rate = self._inside(q, "q"), _floats(q_dot)
         rate = self._checked(np.full(self.n_joints, rate) if rate.ndim == 0 else rate, "q_dot")
         for joint, p, v in zip(self._joint, to.tolist(), rate.tolist(), strict=True):
@@ -102,36 +125,51 @@ class BulletArm:
         self.drive(to)
 
     def drive(self, q: ArrayLike, q_dot: ArrayLike | None = None) -> None:
-        """Let the motors move the joints during the next steps, no stronger than `effort`, no faster than `velocity_limit`.
+        """Let the motors move the joints during the next steps, no stronger than `effort`, no faster than
+        `velocity_limit`.
 
-        Without `q_dot` the next step ends at q where limits and effort allow, and later ones stay there. With it, q is where the joints
-        should be now and `q_dot` how fast they go: the next step ends at q + dt q_dot; give both anew before each step. Raises
+        Without `q_dot` the next step ends at q where limits and effort allow, and later ones stay there. With
+        it, q is where the joints should be now and `q_dot` how fast they go: the next step ends at q + dt
+        q_dot; give both anew before each step. Raises
         `InputError`.
         """
         to = self._inside(q, "q").tolist()
         rate = [0.0] * self.n_joints if q_dot is None else self._checked(q_dot, "q_dot").tolist()
         command, mode = self.bullet.setJointMotorControl2, self.bullet.POSITION_CONTROL
         for joint, p, v, (effort, fastest) in zip(self._joint, to, rate, self._motor, strict=True):
-            command(self.body, joint, mode, targetPosition=p, targetVelocity=v, force=effort, positionGain=_GAIN, velocityGain=_GAIN,
-                    maxVelocity=fastest)  # fmt: skip
+            command(
+                self.body,
+                joint,
+                mode,
+                targetPosition=p,
+                targetVelocity=v,
+                force=effort,
+                positionGain=_GAIN,
+                velocityGain=_GAIN,
+                maxVelocity=fastest,
+            )
 
     def freeze(self) -> None:
         """Hold all joints where they are."""
         self.drive(np.clip(self.position(), self.lower, self.upper))
 
     def frame(self, q: ArrayLike) -> Floats:
-        """(7,) pose of the tip link at q: position [m] and quaternion w x y z, w not negative, world. Raises `InputError`."""
+        """(7,) pose of the tip link at q: position [m] and quaternion w x y z, w not negative, world. Raises
+        `InputError`."""
         return _pose(self._frames(self._checked(q, "q"))[1])
 
     def jacobian(self, q: ArrayLike) -> Floats:
-        """(6, n_joints) velocity of the tip frame's origin, then angular velocity, world, per joint velocity at q. Raises `InputError`."""
+        """(6, n_joints) velocity of the tip frame's origin, then angular velocity, world, per joint velocity
+        at q. Raises `InputError`."""
         return self._jacobian(*self._frames(self._checked(q, "q")))
 
     def solve(self, target: ArrayLike, q0: ArrayLike) -> Floats:
-        """(n_joints,) within the limits, near q0, where the tip has the `target` pose (7,), or is at the `target` position (3,), world.
+        """(n_joints,) within the limits, near q0, where the tip has the `target` pose (7,), or is at the
+        `target` position (3,), world.
 
-        Damped least squares (Levenberg and Marquardt) to 1e-9 m and rad from q0, then from a few starts around it; the same q every
-        time. Raises `InputError` for what is no pose, `HostError` where no q is found.
+        Damped least squares (Levenberg and Marquardt) to 1e-9 m and rad from q0, then from a few starts
+        around it; the same q every time. Raises `InputError` for what is no pose, `HostError` where no q is
+        found.
         """
         to = _target(target, "target", (3,), (7,))
         rows = 6 if len(to) == 7 else 3
@@ -148,7 +186,8 @@ class BulletArm:
                 return best
         turn = f" and {np.linalg.norm(off[3:]):.3g} rad" if rows == 6 else ""
         raise HostError(
-            f"no joint positions within the limits were found near q0 for the target {np.round(to, 4).tolist()}; the best is "
+            "no joint positions within the limits were found near q0 for the target "
+            f"{np.round(to, 4).tolist()}; the best is "
             f"{np.linalg.norm(off[:3]):.3g} m{turn} off."
         )
 
@@ -212,13 +251,18 @@ class BulletArm:
             (xx, xy, xz, u), (yx, yy, yz, v), (zx, zy, zz, w), _ = every[k]
             x, y, z = xx * a + xy * b + xz * c, yx * a + yy * b + yz * c, zx * a + zy * b + zz * c
             u, v, w = p - u, q - v, r - w
-            columns.append((x, y, z, 0.0, 0.0, 0.0) if slides else (y * w - z * v, z * u - x * w, x * v - y * u, x, y, z))
+            columns.append(
+                (x, y, z, 0.0, 0.0, 0.0) if slides else (y * w - z * v, z * u - x * w, x * v - y * u, x, y, z)
+            )
         return np.array(columns).T
 
     def _checked(self, values: ArrayLike, name: str) -> Floats:
         v = _floats(values)
         if v.shape != (self.n_joints,) or not np.isfinite(v).all():
-            raise InputError(f"{name} is {values!r}; give {self.n_joints} finite numbers, one for each of {', '.join(self.names)}.")
+            raise InputError(
+                f"{name} is {values!r}; give {self.n_joints} finite numbers, one for each of "
+                f"{', '.join(self.names)}."
+            )
         return v
 
     def _inside(self, values: ArrayLike, name: str) -> Floats:
@@ -226,13 +270,16 @@ class BulletArm:
         beyond = (q < self.lower - 1e-9) | (q > self.upper + 1e-9)
         if beyond.any():
             k = int(beyond.argmax())
-            raise InputError(f"{name} of {self.names[k]} is {q[k]:.6g}; its limits are {self.lower[k]:.6g} and {self.upper[k]:.6g}.")
+            raise InputError(
+                f"{name} of {self.names[k]} is {q[k]:.6g}; its limits are {self.lower[k]:.6g} "
+                f"and {self.upper[k]:.6g}."
+            )
         return q
 
 
 class _Chain(NamedTuple):
-    """Joints from base to tip as matrices: the frame after one is that before it times constant + sine sin q + cosine cos q, or
-    constant + sine q for one that slides."""
+    """Joints from base to tip as matrices: the frame after one is that before it times constant + sine sin q
+    + cosine cos q, or constant + sine q for one that slides."""
 
     joint: list[int]
     slides: Flags
@@ -260,7 +307,8 @@ def _chain(b: Bullet, body: int, tip: int) -> _Chain:
     axes, constant, sine, cosine = (list[Floats]() for _ in range(4))
     for i, link in enumerate(links):
         info = b.getJointInfo(body, link)
-        # PyBullet tells where the joint is in the parent's frame of mass, and the turn from there to the child's frame of mass inverted.
+        # PyBullet tells where the joint is in the parent's frame of mass, and the turn from there to the
+        # child's frame of mass inverted.
         turn = _matrix((0.0, 0.0, 0.0), info[15]).T
         turn[:3, :3] = turn[:3, :3] @ com[i + 1][:3, :3].T
         turn[:3, 3] = info[14]
@@ -268,7 +316,10 @@ def _chain(b: Bullet, body: int, tip: int) -> _Chain:
         if info[2] == b.JOINT_FIXED:
             continue
         if info[2] not in (b.JOINT_REVOLUTE, b.JOINT_PRISMATIC):
-            raise HostError(f"joint {info[1].decode()!r} of body {body} neither turns about one axis nor slides; an arm's joints do.")
+            raise HostError(
+                f"joint {info[1].decode()!r} of body {body} neither turns about one axis nor "
+                "slides; an arm's joints do."
+            )
         axis = com[i + 1][:3, :3] @ np.array(info[13])
         still, s, c = np.eye(4), np.zeros((4, 4)), np.zeros((4, 4))
         if info[2] == b.JOINT_PRISMATIC:
@@ -284,30 +335,47 @@ def _chain(b: Bullet, body: int, tip: int) -> _Chain:
             matrices.append(fixed @ part)
         fixed = np.eye(4)
     if not joint:
-        raise HostError(f"body {body} has no joint that moves between its base and link {tip}; an arm needs one.")
+        raise HostError(
+            f"body {body} has no joint that moves between its base and link {tip}; an arm needs one."
+        )
     base = np.asarray(np.linalg.inv(com[0]), float)
-    return _Chain(joint, np.array(slides), np.array(axes), np.array(constant), np.array(sine), np.array(cosine), base, fixed)
+    return _Chain(
+        joint,
+        np.array(slides),
+        np.array(axes),
+        np.array(constant),
+        np.array(sine),
+        np.array(cosine),
+        base,
+        fixed,
+    )
 
 
 def _matrix(position: Sequence[float], xyzw: Sequence[float]) -> Floats:
     """(4, 4) of PyBullet's pose."""
     (u, v, w), (x, y, z, s) = position, xyzw
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - s * z), 2 * (x * z + s * y), u],
-        [2 * (x * y + s * z), 1 - 2 * (x * x + z * z), 2 * (y * z - s * x), v],
-        [2 * (x * z - s * y), 2 * (y * z + s * x), 1 - 2 * (x * x + y * y), w],
-        [0.0, 0.0, 0.0, 1.0],
-    ])  # fmt: skip
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - s * z), 2 * (x * z + s * y), u],
+            [2 * (x * y + s * z), 1 - 2 * (x * x + z * z), 2 * (y * z - s * x), v],
+            [2 * (x * z - s * y), 2 * (y * z + s * x), 1 - 2 * (x * x + y * y), w],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
 
 
 def _quaternion(rotation: Floats) -> tuple[float, float, float, float]:
-    """w x y z, w not negative, of (3, 3): `fastrod.rotation.quaternion_from_matrix` for one, in a fraction of its time."""
+    """w x y z, w not negative, of (3, 3): `fastrod.rotation.quaternion_from_matrix` for one, in a fraction of
+    its time."""
     (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
     sums = (1.0 + a + e + i, 1.0 + a - e - i, 1.0 - a + e - i, 1.0 - a - e + i)
     k = sums.index(max(sums))
     w, x, y, z = (
-        (sums[0], h - f, c - g, d - b), (h - f, sums[1], b + d, c + g), (c - g, b + d, sums[2], f + h), (d - b, c + g, f + h, sums[3])
-    )[k]  # fmt: skip
+        (sums[0], h - f, c - g, d - b),
+        (h - f, sums[1], b + d, c + g),
+        (c - g, b + d, sums[2], f + h),
+        (d - b, c + g, f + h, sums[3]),
+    )[k]
     size = math.copysign(math.sqrt(w * w + x * x + y * y + z * z), w)
     return w / size, x / size, y / size, z / size
 
@@ -328,10 +396,14 @@ def _floats(values: ArrayLike) -> Floats:
 def _target(values: ArrayLike, name: str, *shapes: tuple[int]) -> Floats:
     pose = _floats(values)
     if pose.shape not in shapes or not np.isfinite(pose).all():
-        kinds = " or ".join("a position (3,)" if n == 3 else "position and quaternion w x y z (7,)" for (n,) in shapes)
+        kinds = " or ".join(
+            "a position (3,)" if n == 3 else "position and quaternion w x y z (7,)" for (n,) in shapes
+        )
         raise InputError(f"{name} is {values!r}; give {kinds}, world, in m.")
     if len(pose) == 7 and abs((norm := float(np.linalg.norm(pose[3:]))) - 1.0) > 1e-6:
-        raise InputError(f"the {name}'s quaternion {pose[3:].tolist()} has norm {norm:.6g}; it must be 1, as w x y z.")
+        raise InputError(
+            f"the {name}'s quaternion {pose[3:].tolist()} has norm {norm:.6g}; it must be 1, as w x y z."
+        )
     if len(pose) == 7:
         pose = np.concatenate([pose[:3], pose[3:] / np.linalg.norm(pose[3:])])
     return pose

@@ -16,26 +16,42 @@ from fastrod.types import Floats
 
 @final
 class RodBodies:
-    """Capsules along the backbone, their axes its chords and their cross-sections turned with it; they have no mass, and move as told.
+    """Capsules along the backbone, their axes its chords and their cross-sections turned with it; they have
+    no mass, and move as told.
 
-    A capsule pushes what it meets with the velocity at which it moves. It never touches its own kind, nor bodies it is told to `ignore`.
+    A capsule pushes what it meets with the velocity at which it moves. It never touches its own kind, nor
+    bodies it is told to `ignore`.
     """
 
     def __init__(
-        self, bullet: Any, length: float | Sequence[float], radius: float | Sequence[float], n_capsules: int = 16, *,
-        color: Sequence[float] = (0.5, 0.0, 0.6, 1.0), head_color: Sequence[float] | None = None, friction: float = 0.5,
-    ) -> None:  # fmt: skip
-        """`length` of the backbone, split evenly, or of each capsule [m]; `radius` one, or one for each capsule [m]; colours RGBA.
-        Raises `HostError`."""
-        if n_capsules < 1 or not np.all(np.asarray(length) > 0.0) or np.shape(length) not in ((), (n_capsules,)):
+        self,
+        bullet: Any,
+        length: float | Sequence[float],
+        radius: float | Sequence[float],
+        n_capsules: int = 16,
+        *,
+        color: Sequence[float] = (0.5, 0.0, 0.6, 1.0),
+        head_color: Sequence[float] | None = None,
+        friction: float = 0.5,
+    ) -> None:
+        """`length` of the backbone, split evenly, or of each capsule [m]; `radius` one, or one for each
+        capsule [m]; colours RGBA. Raises `HostError`."""
+        if (
+            n_capsules < 1
+            or not np.all(np.asarray(length) > 0.0)
+            or np.shape(length) not in ((), (n_capsules,))
+        ):
             raise HostError(
-                f"{n_capsules} capsules for {length} m; give at least one, and a positive length, of the whole or one for each."
+                f"{n_capsules} capsules for {length} m; give at least one, and a positive length, of the "
+                "whole or one for each."
             )
         self.bullet = b = Bullet(bullet)
         radii = np.broadcast_to(np.asarray(radius, float), n_capsules)
         if not (radii > 0.0).all():
             raise HostError(f"radius is {radius!r} m; it must be positive.")
-        lengths = np.broadcast_to(np.asarray(length, float) / (n_capsules if np.ndim(length) == 0 else 1), n_capsules).tolist()
+        lengths = np.broadcast_to(
+            np.asarray(length, float) / (n_capsules if np.ndim(length) == 0 else 1), n_capsules
+        ).tolist()
         self.ids: list[int] = []
         """Body of each capsule, base first."""
         for i, (r, own) in enumerate(zip(radii.tolist(), lengths, strict=True)):
@@ -44,7 +60,10 @@ class RodBodies:
             visual = b.createVisualShape(b.GEOM_CAPSULE, radius=r, length=own, rgbaColor=list(rgba))
             self.ids.append(b.createMultiBody(0.0, shape, visual))
             b.changeDynamics(self.ids[-1], -1, lateralFriction=friction, restitution=0.0)
-        self._position, self._quaternion = np.zeros((n_capsules, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (n_capsules, 1))
+        self._position, self._quaternion = (
+            np.zeros((n_capsules, 3)),
+            np.tile([1.0, 0.0, 0.0, 0.0], (n_capsules, 1)),
+        )
 
     def ignore(self, body: int) -> None:
         """Pass through a body, all its links."""
@@ -53,15 +72,18 @@ class RodBodies:
                 self.bullet.setCollisionFilterPair(own, body, -1, link, 0)
 
     def place(self, position: Floats, rotation: Floats) -> None:
-        """Stand at rest along the nodes: `position` (n_capsules + 1, 3) world [m], `rotation` (n_capsules + 1, 3, 3)."""
+        """Stand at rest along the nodes: `position` (n_capsules + 1, 3) world [m], `rotation` (n_capsules +
+        1, 3, 3)."""
         self._position, self._quaternion = chords(position, rotation)
-        for own, p, q in zip(self.ids, self._position.tolist(), to_xyzw(self._quaternion).tolist(), strict=True):
+        for own, p, q in zip(
+            self.ids, self._position.tolist(), to_xyzw(self._quaternion).tolist(), strict=True
+        ):
             self.bullet.resetBasePositionAndOrientation(own, p, q)
             self.bullet.resetBaseVelocity(own, [0.0] * 3, [0.0] * 3)
 
     def head_for(self, position: Floats, rotation: Floats, dt: float) -> None:
-        """Move toward these nodes so that the next step of `dt` [s] ends there: what is in the way feels the velocity. `place` them
-        afterwards, or they go on."""
+        """Move toward these nodes so that the next step of `dt` [s] ends there: what is in the way feels the
+        velocity. `place` them afterwards, or they go on."""
         to, turned = chords(position, rotation)
         linear = (to - self._position) / dt
         angular = turn_between(self._quaternion, turned) / dt

@@ -27,8 +27,8 @@ def pybullet() -> Any:
 class Bullet:
     """One PyBullet world: every function of the module, called with this world's physicsClientId.
 
-    Takes what a user has: a client's number, the module itself, a `BulletClient`, another `Bullet`. `HostError` where no world
-    answers.
+    Takes what a user has: a client's number, the module itself, a `BulletClient`, another `Bullet`.
+    `HostError` where no world answers.
     """
 
     def __init__(self, bullet: Any) -> None:
@@ -39,11 +39,16 @@ class Bullet:
         else:
             number = getattr(bullet, "_client", bullet)
         if isinstance(number, bool) or not isinstance(number, int):
-            raise HostError(f"bullet is {bullet!r}; give a physicsClientId, the pybullet module or a BulletClient that is connected.")
+            raise HostError(
+                f"bullet is {bullet!r}; give a physicsClientId, the pybullet module or a "
+                "BulletClient that is connected."
+            )
         self.number: int = number
         """physicsClientId."""
         if not self.isConnected():
-            raise HostError(f"PyBullet has no world {number}; connect first, for example with fastrod.hosts.connect().")
+            raise HostError(
+                f"PyBullet has no world {number}; connect first, for example with fastrod.hosts.connect()."
+            )
 
     def __getattr__(self, name: str) -> Any:
         module = pybullet()
@@ -64,7 +69,9 @@ class Bullet:
             except error as what:
                 if not pybullet().isConnected(physicsClientId=self.number):
                     raise HostError(f"PyBullet's world {self.number} has been disconnected.") from what
-                raise HostError(f"PyBullet refused {name}: {str(what).rstrip('.')}; is the body still in the world?") from what
+                raise HostError(
+                    f"PyBullet refused {name}: {str(what).rstrip('.')}; is the body still in the world?"
+                ) from what
 
         return call
 
@@ -98,18 +105,26 @@ class Bullet:
         return names[name]
 
 
-def connect(*, gui: bool = False, dt: float = 0.005, gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)) -> Bullet:
+def connect(
+    *, gui: bool = False, dt: float = 0.005, gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
+) -> Bullet:
     """A new, empty world with time step `dt` [s] and `gravity` [m/s^2]; headless unless `gui`.
 
-    `HostError` for a GUI without a display: PyBullet itself would end the process. `InputError` on wrong numbers.
+    `HostError` for a GUI without a display: PyBullet itself would end the process. `InputError` on wrong
+    numbers.
     """
     module = pybullet()
     if not isinstance(dt, (int, float)) or not 0.0 < dt < 1.0:
         raise InputError(f"dt is {dt!r} s; it must be positive, usually 0.001 to 0.01.")
     if np.shape(gravity) != (3,) or not np.isfinite(gravity).all():
-        raise InputError(f"gravity is {gravity!r}; give three numbers, world [m/s^2], for example (0, 0, -9.81).")
+        raise InputError(
+            f"gravity is {gravity!r}; give three numbers, world [m/s^2], for example (0, 0, -9.81)."
+        )
     if gui and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
-        raise HostError("PyBullet's GUI needs a display, and DISPLAY is not set; leave gui=False (headless), or start an X server.")
+        raise HostError(
+            "PyBullet's GUI needs a display, and DISPLAY is not set; leave gui=False "
+            "(headless), or start an X server."
+        )
     number = module.connect(module.GUI if gui else module.DIRECT)
     if number < 0:
         raise HostError("PyBullet opened no world; a GUI can be open only once in a process.")

@@ -38,7 +38,8 @@ class View(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
-    """A pinhole camera. It draws on the CPU (PyBullet's TinyRenderer), so it needs neither a display nor a graphics card.
+    """A pinhole camera. It draws on the CPU (PyBullet's TinyRenderer), so it needs neither a display nor a
+    graphics card.
 
     >>> Camera(width=64, height=48).fov
     60.0
@@ -59,26 +60,35 @@ class Camera:
         for name in ("width", "height"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise InputError(f"Camera.{name} is {value!r}; it must be a whole number of pixels, at least 1.")
+                raise InputError(
+                    f"Camera.{name} is {value!r}; it must be a whole number of pixels, at least 1."
+                )
         if not 0.0 < self.fov < 180.0:
             raise InputError(f"Camera.fov is {self.fov!r}; it must be between 0 and 180 degrees.")
         if not 0.0 < self.near < self.far < math.inf:
-            raise InputError(f"Camera.near is {self.near!r} m and Camera.far is {self.far!r} m; it must be 0 < near < far.")
+            raise InputError(
+                f"Camera.near is {self.near!r} m and Camera.far is {self.far!r} m; it must be 0 < near < far."
+            )
 
     def look(self, bullet: Any, eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Image:
-        """A picture of the world `bullet` from `eye` toward `target`, with `up` upward in it: each (3,), world [m].
+        """A picture of the world `bullet` from `eye` toward `target`, with `up` upward in it: each (3,),
+        world [m].
 
         Raises `HostError` where there is no such world, `InputError` where the three give no view.
         """
         b = Bullet(bullet)
         view = b.computeViewMatrix(*_checked(eye, target, up))
         projection = b.computeProjectionMatrixFOV(self.fov, self.width / self.height, self.near, self.far)
-        _, _, rgba, z, mask = b.getCameraImage(self.width, self.height, view, projection, renderer=b.ER_TINY_RENDERER)
+        _, _, rgba, z, mask = b.getCameraImage(
+            self.width, self.height, view, projection, renderer=b.ER_TINY_RENDERER
+        )
         size = (self.height, self.width)
         body = np.reshape(mask, size).astype(np.int64)
         # the z-buffer holds 0 at the near plane and 1 at the far one, linear in 1 / depth
         depth = self.far * self.near / (self.far - (self.far - self.near) * np.reshape(z, size).astype(float))
-        return Image(np.reshape(rgba, (*size, 4))[..., :3].astype(np.uint8), np.where(body < 0, np.inf, depth), body)
+        return Image(
+            np.reshape(rgba, (*size, 4))[..., :3].astype(np.uint8), np.where(body < 0, np.inf, depth), body
+        )
 
 
 def _checked(*given: ArrayLike) -> list[list[float]]:
@@ -96,6 +106,7 @@ def _checked(*given: ArrayLike) -> list[list[float]]:
     sight = target - eye
     if not np.linalg.norm(np.cross(sight, up)) > 1e-9 * np.linalg.norm(sight) * np.linalg.norm(up):
         raise InputError(
-            f"the camera looks along {sight.tolist()} with {up.tolist()} upward; the two must be vectors in different directions."
+            f"the camera looks along {sight.tolist()} with {up.tolist()} upward; the two must be vectors in "
+            "different directions."
         )
     return [v.tolist() for v in vectors]

@@ -1,4 +1,5 @@
-"""`Capsules`: a rod's body as rigid capsules, one along each chord of its backbone, for engines that know no rods."""
+"""`Capsules`: a rod's body as rigid capsules, one along each chord of its backbone, for engines that know no
+rods."""
 
 from __future__ import annotations
 
@@ -22,19 +23,23 @@ class Capsules(NamedTuple):
     radius: Floats
     """(n,) [m]."""
     velocity: Floats
-    """(n, 6) of the centre [m/s], then angular [rad/s]: the mean of the last step, zero where the rod was only put."""
+    """(n, 6) of the centre [m/s], then angular [rad/s]: the mean of the last step, zero where the rod was
+    only put."""
 
     @property
     def ends(self) -> Floats:
         """(n, 2, 3) centres of the half spheres [m], the one nearer to the base first."""
         shape = self.center.shape
-        z = matrix_from_quaternion(self.quaternion.reshape(-1, 4))[:, :, 2].reshape(shape) * self.half_length[..., None]
+        z = (
+            matrix_from_quaternion(self.quaternion.reshape(-1, 4))[:, :, 2].reshape(shape)
+            * self.half_length[..., None]
+        )
         return np.stack([self.center - z, self.center + z], axis=-2)
 
 
 def chords(position: Floats, rotation: Floats) -> tuple[Floats, Floats]:
-    """Middle (..., n, 3) and quaternion (..., n, 4) w x y z of each capsule between nodes (..., n + 1, 3) with frames
-    (..., n + 1, 3, 3): z along the chord, x as near as can be to the material's d1."""
+    """Middle (..., n, 3) and quaternion (..., n, 4) w x y z of each capsule between nodes (..., n + 1, 3)
+    with frames (..., n + 1, 3, 3): z along the chord, x as near as can be to the material's d1."""
     chord = np.diff(position, axis=-2)
     z = chord / np.linalg.norm(chord, axis=-1, keepdims=True)
     x = 0.5 * (rotation[..., :-1, :, 0] + rotation[..., 1:, :, 0])
@@ -54,7 +59,9 @@ def along(position: Floats, rotation: Floats, radius: Floats) -> Capsules:
 def moved(before: Capsules, after: Capsules, time: float) -> Capsules:
     """`after` with the velocity that leads there from `before` within a time [s]."""
     linear = (after.center - before.center) / time
-    return after._replace(velocity=np.concatenate([linear, turn_between(before.quaternion, after.quaternion) / time], axis=-1))
+    return after._replace(
+        velocity=np.concatenate([linear, turn_between(before.quaternion, after.quaternion) / time], axis=-1)
+    )
 
 
 def turn_between(before: Floats, after: Floats) -> Floats:

@@ -20,12 +20,15 @@ from fastrod.types import Floats
 
 
 class CarriedRod(ABC):
-    """One rod on one body of an engine, both ways: the body's motion moves the rod's base, the body feels the base's wrench.
+    """One rod on one body of an engine, both ways: the body's motion moves the rod's base, the body feels the
+    base's wrench.
 
-    Bodies that the rod touches are its obstacles: contact bends the rod, its host feels the force, and the body is pushed with it. Any
-    other body meets the rod's capsules. The rod's weight is that in the gravity of the world at each step.
+    Bodies that the rod touches are its obstacles: contact bends the rod, its host feels the force, and the
+    body is pushed with it. Any other body meets the rod's capsules. The rod's weight is that in the gravity
+    of the world at each step.
 
-    A step is `rod.step(...)`, or for several rods in one world `begin` each, one step of the engine, `end` each.
+    A step is `rod.step(...)`, or for several rods in one world `begin` each, one step of the engine, `end`
+    each.
     """
 
     touched: Sequence[Touching]
@@ -57,7 +60,8 @@ class CarriedRod(ABC):
 
     @abstractmethod
     def _head_for(self) -> None:
-        """Capsules are to be where the rod is at the end of the engine's step, as far as the engine lets them."""
+        """Capsules are to be where the rod is at the end of the engine's step, as far as the engine lets
+        them."""
 
     @abstractmethod
     def _step_engine(self) -> None:
@@ -98,8 +102,8 @@ class CarriedRod(ABC):
     def step(self, **inputs: Any) -> State:
         """One step of rod and world together.
 
-        Inputs as for `Simulator.step`, but base and obstacles, which the world gives; what is not given stays as it was commanded last,
-        and the wires are those of the straight robot until then.
+        Inputs as for `Simulator.step`, but base and obstacles, which the world gives; what is not given stays
+        as it was commanded last, and the wires are those of the straight robot until then.
         """
         state = self.begin(**inputs)
         self._step_engine()
@@ -108,19 +112,23 @@ class CarriedRod(ABC):
 
     @final
     def begin(self, **inputs: Any) -> State:
-        """Where the rod will be at the end of the next step; its wrench goes to the host, its pushes to what it touches.
+        """Where the rod will be at the end of the next step; its wrench goes to the host, its pushes to what
+        it touches.
 
-        A step that cannot be solved (`state.ok` is false, and `state.problems` says why) leaves the rod where it came to, with half the
-        forces of the step before; after a few in a row the rod settles anew. Raises `InputError` as
-        `Simulator.step`, `HostError` where the rod is lost, where 25 steps in a row cannot be solved, or where the world's time step has
-        changed.
+        A step that cannot be solved (`state.ok` is false, and `state.problems` says why) leaves the rod where
+        it came to, with half the forces of the step before; after a few in a row the rod settles anew. Raises
+        `InputError` as
+        `Simulator.step`, `HostError` where the rod is lost, where 25 steps in a row cannot be solved, or
+        where the world's time step has changed.
         """
         self._look()
         inputs = _checked(inputs)
         if self.state is None:
             self.settle(**inputs)
         motion = self._host.motion()
-        state = self.state = self.rod.advance(motion.pose, motion.velocity, self.dt, **self._scene(), **self._loads(inputs))
+        state = self.state = self.rod.advance(
+            motion.pose, motion.velocity, self.dt, **self._scene(), **self._loads(inputs)
+        )
         self._accepted(inputs)
         if state.ok[0]:
             self.wrench = state.base_wrench[0].copy()
@@ -146,8 +154,8 @@ class CarriedRod(ABC):
 
     @final
     def reset(self) -> None:
-        """Forget the rod's shape and its contacts, but not its inputs: after the host or a body was put somewhere else. The next step
-        settles where the host then is."""
+        """Forget the rod's shape and its contacts, but not its inputs: after the host or a body was put
+        somewhere else. The next step settles where the host then is."""
         self.rod.reset()
         self.state, self.wrench = None, np.zeros(6)
         self._forget()
@@ -171,13 +179,27 @@ class CarriedRod(ABC):
 
 
 def rod_of(
-    robot: Robot, touched: Sequence[Touching], *, dt: float, max_contacts: int, points_per_segment: int, capsules_per_segment: int
+    robot: Robot,
+    touched: Sequence[Touching],
+    *,
+    dt: float,
+    max_contacts: int,
+    points_per_segment: int,
+    capsules_per_segment: int,
 ) -> Rod:
     """The rod of a `CarriedRod` that feels what it touches. Raises `InputError`, `RobotError`."""
     scene = None
     if touched:
-        scene = ContactScene(obstacles=[part.obstacle for body in touched for part in body.parts], max_contacts=max_contacts)
-    return Rod(robot, dt=dt, contact=scene, points_per_segment=points_per_segment, capsules_per_segment=capsules_per_segment)
+        scene = ContactScene(
+            obstacles=[part.obstacle for body in touched for part in body.parts], max_contacts=max_contacts
+        )
+    return Rod(
+        robot,
+        dt=dt,
+        contact=scene,
+        points_per_segment=points_per_segment,
+        capsules_per_segment=capsules_per_segment,
+    )
 
 
 def check_gravity(robot: Robot, gravity: Floats, how: str) -> None:

@@ -20,25 +20,30 @@ _FINGER_MASS = 0.02  # kg
 _SPEED = 0.05  # m/s at which a finger opens and closes
 _GRIP = 10.0  # N, the most that a finger pushes with
 _SUCTION = 200.0  # N
-_FRICTION = 0.5, 2.0  # head, fingers; PyBullet multiplies it with the other body's, 0.5 by default: rubber on anything is 1
+# head, fingers; PyBullet multiplies it with the other body's, 0.5 by default: rubber on anything is 1
+_FRICTION = 0.5, 2.0
 _GAIN = 0.3  # of a finger's error that its motor removes in a step
-_SQUEEZE = 0.2  # m/s, times the step: how far a finger is told to go beyond what stops it, so that its motor pushes in full
+# m/s, times the step: how far a finger is told to go beyond what stops it, so that its motor pushes in full
+_SQUEEZE = 0.2
 
 
 @final
 class Gripper:
-    """A sphere at the rod's tip, which moves as told, and two box fingers that slide on it along the tip's d1, driven by motors.
+    """A sphere at the rod's tip, which moves as told, and two box fingers that slide on it along the tip's
+    d1, driven by motors.
 
-    The fingers are bodies with mass: what is between them is held by friction alone, with at most 10 N a finger, and stops them.
-    Both are told the same opening, so that what is held stays in the middle.
+    The fingers are bodies with mass: what is between them is held by friction alone, with at most 10 N a
+    finger, and stops them. Both are told the same opening, so that what is held stays in the middle.
     """
 
     def __init__(self, bullet: Any, radius: float, max_width: float, color: Sequence[float]) -> None:
-        """`radius` of the head [m]; `max_width` between the inner faces of the open fingers [m], 0 for a head without fingers.
-        Stands at the origin, fingers open. Raises `HostError`."""
+        """`radius` of the head [m]; `max_width` between the inner faces of the open fingers [m], 0 for a head
+        without fingers. Stands at the origin, fingers open. Raises `HostError`."""
         self.bullet = b = Bullet(bullet)
         if not 0.0 <= max_width < 1.0:
-            raise HostError(f"max_grasp_width is {max_width!r} m; it must be from 0 (no fingers) to below 1 m.")
+            raise HostError(
+                f"max_grasp_width is {max_width!r} m; it must be from 0 (no fingers) to below 1 m."
+            )
         head = b.createCollisionShape(b.GEOM_SPHERE, radius=radius)
         seen = b.createVisualShape(b.GEOM_SPHERE, radius=radius, rgbaColor=list(color))
         n, long = 2 * (max_width > 0.0), radius + _FINGER[2]
@@ -48,11 +53,20 @@ class Gripper:
             shape = b.createCollisionShape(b.GEOM_BOX, halfExtents=half)
             visual = b.createVisualShape(b.GEOM_BOX, halfExtents=half, rgbaColor=[0.25, 0.25, 0.28, 1.0])
         self.body: int = b.createMultiBody(
-            0.0, head, seen, linkMasses=[_FINGER_MASS] * n, linkCollisionShapeIndices=[shape] * n, linkVisualShapeIndices=[visual] * n,
-            linkPositions=[[0.0, 0.0, 0.5 * long]] * n, linkOrientations=[[0.0, 0.0, 0.0, 1.0]] * n,
-            linkInertialFramePositions=[[0.0] * 3] * n, linkInertialFrameOrientations=[[0.0, 0.0, 0.0, 1.0]] * n,
-            linkParentIndices=[0] * n, linkJointTypes=[b.JOINT_PRISMATIC] * n, linkJointAxis=[[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]][:n],
-        )  # fmt: skip
+            0.0,
+            head,
+            seen,
+            linkMasses=[_FINGER_MASS] * n,
+            linkCollisionShapeIndices=[shape] * n,
+            linkVisualShapeIndices=[visual] * n,
+            linkPositions=[[0.0, 0.0, 0.5 * long]] * n,
+            linkOrientations=[[0.0, 0.0, 0.0, 1.0]] * n,
+            linkInertialFramePositions=[[0.0] * 3] * n,
+            linkInertialFrameOrientations=[[0.0, 0.0, 0.0, 1.0]] * n,
+            linkParentIndices=[0] * n,
+            linkJointTypes=[b.JOINT_PRISMATIC] * n,
+            linkJointAxis=[[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]][:n],
+        )
         """The head is its base, the fingers are its links 0 and 1."""
         self.links = range(-1, n)
         self.fingers = range(n)
@@ -61,10 +75,17 @@ class Gripper:
         for link in self.links:
             friction = _FRICTION[link >= 0]
             b.changeDynamics(
-                self.body, link, lateralFriction=friction, restitution=0.0, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0
+                self.body,
+                link,
+                lateralFriction=friction,
+                restitution=0.0,
+                linearDamping=0.0,
+                angularDamping=0.0,
+                jointDamping=0.0,
             )
         for finger in self.fingers:
-            b.changeDynamics(self.body, finger, frictionAnchor=1)  # without it what is held creeps down, 5 mm/s with steps of 10 ms
+            # without it what is held creeps down, 5 mm/s with steps of 10 ms
+            b.changeDynamics(self.body, finger, frictionAnchor=1)
         self._max, self._wanted, self._told = max_width, max_width, max_width
         self._held = False
         for finger in self.fingers:
@@ -76,16 +97,21 @@ class Gripper:
     @property
     def width(self) -> float:
         """Between the inner faces of the fingers [m]; 0 without fingers."""
-        return float(sum(self.bullet.getJointState(self.body, f)[0] for f in self.fingers)) - 0.5 * _FINGER[0] * len(self.fingers)
+        return float(sum(self.bullet.getJointState(self.body, f)[0] for f in self.fingers)) - 0.5 * _FINGER[
+            0
+        ] * len(self.fingers)
 
     def open_to(self, fraction: float) -> None:
-        """Tell the fingers to open or close to this fraction of the largest width; they get there at 5 cm/s, as time passes."""
+        """Tell the fingers to open or close to this fraction of the largest width; they get there at 5 cm/s,
+        as time passes."""
         self._wanted, self._held = fraction * self._max, False
 
     def place(self, position: Floats, quaternion: Floats) -> None:
         """Stand at rest at `position` (3,) world [m], turned by `quaternion` (4,) w x y z."""
         self._position, self._quaternion = position.copy(), quaternion.copy()
-        self.bullet.resetBasePositionAndOrientation(self.body, position.tolist(), to_xyzw(quaternion).tolist())
+        self.bullet.resetBasePositionAndOrientation(
+            self.body, position.tolist(), to_xyzw(quaternion).tolist()
+        )
         self.bullet.resetBaseVelocity(self.body, [0.0] * 3, [0.0] * 3)
 
     def head_for(self, position: Floats, quaternion: Floats, dt: float) -> None:
@@ -101,7 +127,11 @@ class Gripper:
         if self._held or self._told == self._wanted:
             return
         step, beyond = _SPEED * dt, max(_SQUEEZE * dt, 5e-4)
-        if self._wanted < self._told and self.width - self._told > 2.0 * (beyond + step / _GAIN) and self._touching():
+        if (
+            self._wanted < self._told
+            and self.width - self._told > 2.0 * (beyond + step / _GAIN)
+            and self._touching()
+        ):
             self._held = True
             self._told = self.width - 2.0 * beyond
         else:
@@ -109,22 +139,39 @@ class Gripper:
         self._tell()
 
     def attach(self, others: Sequence[int]) -> int | None:
-        """Fix to the head what is nearest of what it touches and can be moved, as it stands; `others` of the robot that are near pass
-        through it while it is held. The body, or None where there is none."""
+        """Fix to the head what is nearest of what it touches and can be moved, as it stands; `others` of the
+        robot that are near pass through it while it is held. The body, or None where there is none."""
         self.release()
         b = self.bullet
         own = {self.body, *others}
         known = [b.getBodyUniqueId(i) for i in range(b.getNumBodies())]
-        points = [p for other in known if other not in own for p in b.getClosestPoints(self.body, other, TOUCH)]
+        points = [
+            p for other in known if other not in own for p in b.getClosestPoints(self.body, other, TOUCH)
+        ]
         points = [p for p in points if b.getDynamicsInfo(p[2], p[4])[0] > 0.0]
         if not points:
             return None
         nearest = min(points, key=lambda p: float(p[8]))
         body, link = int(nearest[2]), int(nearest[4])
-        pose = b.getBasePositionAndOrientation(body) if link < 0 else b.getLinkState(body, link, computeForwardKinematics=1)[:2]
+        pose = (
+            b.getBasePositionAndOrientation(body)
+            if link < 0
+            else b.getLinkState(body, link, computeForwardKinematics=1)[:2]
+        )
         back = b.invertTransform(*b.getBasePositionAndOrientation(self.body))
         position, turn = b.multiplyTransforms(*back, *pose)
-        hold = b.createConstraint(self.body, -1, body, link, b.JOINT_FIXED, [0.0] * 3, position, [0.0] * 3, turn, [0.0, 0.0, 0.0, 1.0])
+        hold = b.createConstraint(
+            self.body,
+            -1,
+            body,
+            link,
+            b.JOINT_FIXED,
+            [0.0] * 3,
+            position,
+            [0.0] * 3,
+            turn,
+            [0.0, 0.0, 0.0, 1.0],
+        )
         b.changeConstraint(hold, maxForce=_SUCTION)
         pairs = [(self.body, own_link) for own_link in self.links]
         pairs += [(other, -1) for other in others if b.getClosestPoints(other, body, self.reach)]
@@ -136,7 +183,8 @@ class Gripper:
         """Let go of what is attached, if anything is."""
         if self._suction is not None:
             hold, body, _ = self._suction
-            if any(self.bullet.getBodyUniqueId(i) == body for i in range(self.bullet.getNumBodies())):  # nobody removed it meanwhile
+            # nobody removed it meanwhile
+            if any(self.bullet.getBodyUniqueId(i) == body for i in range(self.bullet.getNumBodies())):
                 self.bullet.removeConstraint(hold)
                 self._filter(1)
             self._suction = None
@@ -148,14 +196,22 @@ class Gripper:
 
     def _touching(self) -> bool:
         """Whether both fingers had contact in the last step."""
-        return all(self.bullet.getContactPoints(bodyA=self.body, linkIndexA=finger) for finger in self.fingers)
+        return all(
+            self.bullet.getContactPoints(bodyA=self.body, linkIndexA=finger) for finger in self.fingers
+        )
 
     def _tell(self) -> None:
         for finger in self.fingers:
             self.bullet.setJointMotorControl2(
-                self.body, finger, self.bullet.POSITION_CONTROL, targetPosition=0.5 * (self._told + _FINGER[0]), force=_GRIP,
-                positionGain=_GAIN, velocityGain=1.0, maxVelocity=1.0,
-            )  # fmt: skip
+                self.body,
+                finger,
+                self.bullet.POSITION_CONTROL,
+                targetPosition=0.5 * (self._told + _FINGER[0]),
+                force=_GRIP,
+                positionGain=_GAIN,
+                velocityGain=1.0,
+                maxVelocity=1.0,
+            )
 
     def _filter(self, collide: int) -> None:
         assert self._suction is not None

@@ -28,15 +28,21 @@ def to_xyzw(quaternion: ArrayLike) -> Floats:
 class BulletLink:
     """A rod's base, fixed to a link (-1: the body's base).
 
-    The mount is given in the link's URDF frame, the one that a URDF's joints and meshes are drawn in, not in the frame of its centre
-    of mass. `fastrod.hosts.Host` says what the methods do.
+    The mount is given in the link's URDF frame, the one that a URDF's joints and meshes are drawn in, not in
+    the frame of its centre of mass. `fastrod.hosts.Host` says what the methods do.
     """
 
     def __init__(
-        self, bullet: Any, body: int, link: int | str = -1, *,
-        position: ArrayLike = (0.0, 0.0, 0.0), quaternion: ArrayLike = (1.0, 0.0, 0.0, 0.0),
-    ) -> None:  # fmt: skip
-        """`link`: number or name; `position` (3,) [m] and `quaternion` (4,) w x y z, link_from_base. Raises `HostError`."""
+        self,
+        bullet: Any,
+        body: int,
+        link: int | str = -1,
+        *,
+        position: ArrayLike = (0.0, 0.0, 0.0),
+        quaternion: ArrayLike = (1.0, 0.0, 0.0, 0.0),
+    ) -> None:
+        """`link`: number or name; `position` (3,) [m] and `quaternion` (4,) w x y z, link_from_base. Raises
+        `HostError`."""
         self.bullet = Bullet(bullet)
         self.body = body
         self.link = self.bullet.link_named(body, link) if isinstance(link, str) else int(link)
@@ -62,13 +68,15 @@ def link_motion(bullet: Bullet, body: int, link: int) -> Motion:
         com, turn = bullet.getBasePositionAndOrientation(body)
         linear, angular = bullet.getBaseVelocity(body)
         inertial = bullet.getDynamicsInfo(body, -1)
-        back = bullet.invertTransform(inertial[3], inertial[4])  # com_from_frame, for bodies whose mass is off their origin
+        # com_from_frame, for bodies whose mass is off their origin
+        back = bullet.invertTransform(inertial[3], inertial[4])
         position, quaternion = bullet.multiplyTransforms(com, turn, *back)
     else:
         state = bullet.getLinkState(body, link, computeLinkVelocity=1, computeForwardKinematics=1)
         com, position, quaternion, linear, angular = state[0], state[4], state[5], state[6], state[7]
     velocity = np.array([*linear, *angular])
-    velocity[:3] += np.cross(velocity[3:], np.subtract(position, com))  # PyBullet's velocity is that of the centre of mass
+    # PyBullet's velocity is that of the centre of mass
+    velocity[:3] += np.cross(velocity[3:], np.subtract(position, com))
     return Motion(np.array([*position, *from_xyzw(quaternion)]), velocity)
 
 
@@ -82,7 +90,12 @@ def mount_pose(position: ArrayLike, quaternion: ArrayLike) -> tuple[Floats, Floa
     """Position (3,) [m] and quaternion (4,) w x y z of a mount; `HostError` for what is none."""
     p, q = np.asarray(position, float), np.asarray(quaternion, float)
     if p.shape != (3,) or q.shape != (4,) or not np.isfinite([*p, *q]).all():
-        raise HostError(f"the mount is {position!r}, {quaternion!r}; give a position (3,) [m] and a quaternion (4,) w x y z.")
+        raise HostError(
+            f"the mount is {position!r}, {quaternion!r}; give a position (3,) [m] and a "
+            "quaternion (4,) w x y z."
+        )
     if abs((norm := float(np.linalg.norm(q))) - 1.0) > 1e-6:
-        raise HostError(f"the mount's quaternion {list(map(float, q))!r} has norm {norm:.6g}; it must be 1, as w x y z.")
+        raise HostError(
+            f"the mount's quaternion {list(map(float, q))!r} has norm {norm:.6g}; it must be 1, as w x y z."
+        )
     return p, q

@@ -19,20 +19,31 @@ from fastrod.types import Floats
 
 @final
 class MountedRod(CarriedRod):
-    """One rod on a link of a PyBullet body (`CarriedRod`). Bodies that are not named in `touch` meet the rod's capsules, which push
-    them at their speed and feel nothing.
+    """One rod on a link of a PyBullet body (`CarriedRod`). Bodies that are not named in `touch` meet the
+    rod's capsules, which push them at their speed and feel nothing.
     """
 
     def __init__(
-        self, robot: Robot, host: BulletLink, *,
-        touch: Sequence[int | tuple[int, int]] = (), friction: float = 0.3, relaxation: float = 0.1,
-        points_per_segment: int = 10, capsules_per_segment: int = 10, max_contacts: int = 16,
-        color: Sequence[float] = (0.5, 0.0, 0.6, 1.0), head_color: Sequence[float] | None = None,
-    ) -> None:  # fmt: skip
-        """`touch`: numbers of bodies, each its base alone, or (body, link); `friction` of the rod on them; `relaxation` [s] of
-        the rod against a changing contact force (`Touching`). The time step is the world's. Raises `HostError`, `InputError`."""
+        self,
+        robot: Robot,
+        host: BulletLink,
+        *,
+        touch: Sequence[int | tuple[int, int]] = (),
+        friction: float = 0.3,
+        relaxation: float = 0.1,
+        points_per_segment: int = 10,
+        capsules_per_segment: int = 10,
+        max_contacts: int = 16,
+        color: Sequence[float] = (0.5, 0.0, 0.6, 1.0),
+        head_color: Sequence[float] | None = None,
+    ) -> None:
+        """`touch`: numbers of bodies, each its base alone, or (body, link); `friction` of the rod on them;
+        `relaxation` [s] of the rod against a changing contact force (`Touching`). The time step is the
+        world's. Raises `HostError`, `InputError`."""
         if not isinstance(host, BulletLink):
-            raise HostError(f"host is {host!r}; give BulletLink(world, body, link), the link that carries the rod.")
+            raise HostError(
+                f"host is {host!r}; give BulletLink(world, body, link), the link that carries the rod."
+            )
         super().__init__(host, host.bullet.dt)
         self.host, self.bullet = host, host.bullet
         check_robot(robot)
@@ -40,15 +51,27 @@ class MountedRod(CarriedRod):
         check_contact(relaxation, friction)
         check_touch(touch)
         links = [_link_of(t) for t in touch]
-        self.touched = [Touched(self.bullet, body, link, dt=self.dt, relaxation=relaxation, friction=friction) for body, link in links]
+        self.touched = [
+            Touched(self.bullet, body, link, dt=self.dt, relaxation=relaxation, friction=friction)
+            for body, link in links
+        ]
         self.rod = rod_of(
-            robot, self.touched, dt=self.dt, max_contacts=max_contacts,
-            points_per_segment=points_per_segment, capsules_per_segment=capsules_per_segment,
-        )  # fmt: skip
+            robot,
+            self.touched,
+            dt=self.dt,
+            max_contacts=max_contacts,
+            points_per_segment=points_per_segment,
+            capsules_per_segment=capsules_per_segment,
+        )
         self._stride = points_per_segment // capsules_per_segment
         radii = self.rod.radius.tolist()
-        lengths = np.repeat([segment.length for segment in robot.segments], capsules_per_segment) / capsules_per_segment
-        self.bodies = RodBodies(self.bullet, lengths.tolist(), radii, len(radii), color=color, head_color=head_color)
+        lengths = (
+            np.repeat([segment.length for segment in robot.segments], capsules_per_segment)
+            / capsules_per_segment
+        )
+        self.bodies = RodBodies(
+            self.bullet, lengths.tolist(), radii, len(radii), color=color, head_color=head_color
+        )
         for body in {host.body, *(body for body, _ in links)}:
             self.bodies.ignore(body)
 
@@ -59,7 +82,8 @@ class MountedRod(CarriedRod):
     def _look(self) -> None:
         if self.bullet.dt != self.dt:
             raise HostError(
-                f"the world's time step is now {self.bullet.dt:g} s, and the rod was mounted for {self.dt:g} s; "
+                f"the world's time step is now {self.bullet.dt:g} s, and the rod was mounted for "
+                f"{self.dt:g} s; "
                 "remove() it and mount it anew."
             )
 

@@ -1,4 +1,5 @@
-"""`MujocoRod`: a rod on a body of a MuJoCo model; `add_capsules` puts its capsules into the model before it is compiled."""
+"""`MujocoRod`: a rod on a body of a MuJoCo model; `add_capsules` puts its capsules into the model before it
+is compiled."""
 
 from __future__ import annotations
 
@@ -22,22 +23,39 @@ __all__ = ["MujocoBody", "MujocoRod", "add_capsules"]
 
 
 def add_capsules(
-    spec: Any, robot: Robot, host: str, *, touch: Sequence[str] = (), name: str = "rod", capsules_per_segment: int = 10,
-    friction: float = 0.5, color: Sequence[float] = (0.5, 0.0, 0.6, 1.0), head_color: Sequence[float] | None = None,
-) -> tuple[str, ...]:  # fmt: skip
-    """Add a rod's body to a `mujoco.MjSpec`: mocap bodies `name 0`, `name 1`, ... with a capsule each, base first; returns their names.
+    spec: Any,
+    robot: Robot,
+    host: str,
+    *,
+    touch: Sequence[str] = (),
+    name: str = "rod",
+    capsules_per_segment: int = 10,
+    friction: float = 0.5,
+    color: Sequence[float] = (0.5, 0.0, 0.6, 1.0),
+    head_color: Sequence[float] | None = None,
+) -> tuple[str, ...]:
+    """Add a rod's body to a `mujoco.MjSpec`: mocap bodies `name 0`, `name 1`, ... with a capsule each, base
+    first; returns their names.
 
-    They pass through the bodies of the host's kinematic tree, and through those named in `touch`, which the rod itself will touch: give
-    both here as to `MujocoRod`. `friction` against all others; colours RGBA. Bodies of the tree that have no name get one, since
-    MuJoCo's exclusions go by name. Raises `HostError`, `InputError`.
+    They pass through the bodies of the host's kinematic tree, and through those named in `touch`, which the
+    rod itself will touch: give both here as to `MujocoRod`. `friction` against all others; colours RGBA.
+    Bodies of the tree that have no name get one, since MuJoCo's exclusions go by name. Raises `HostError`,
+    `InputError`.
     """
     lib = mujoco()
     if not isinstance(spec, lib.MjSpec):
-        raise HostError(f"spec is a {type(spec).__name__}; give a mujoco.MjSpec, for example mujoco.MjSpec.from_file(path).")
+        raise HostError(
+            f"spec is a {type(spec).__name__}; give a mujoco.MjSpec, for example "
+            "mujoco.MjSpec.from_file(path)."
+        )
     check_robot(robot)
     check_touch(touch)
     check_contact(0.0, friction)
-    if isinstance(capsules_per_segment, bool) or not isinstance(capsules_per_segment, (int, np.integer)) or capsules_per_segment < 1:
+    if (
+        isinstance(capsules_per_segment, bool)
+        or not isinstance(capsules_per_segment, (int, np.integer))
+        or capsules_per_segment < 1
+    ):
         raise InputError(f"{capsules_per_segment!r} capsules a segment; give at least one, a whole number.")
     color = _rgba("color", color)
     head_color = None if head_color is None else _rgba("head_color", head_color)
@@ -50,16 +68,22 @@ def add_capsules(
             body.name = f"{name} passes {k}"
     names = tuple(f"{name} {k}" for k in range(robot.n_segments * capsules_per_segment))
     if any(b.name in names for b in spec.bodies):
-        raise HostError(f"the model has a body {names[0]!r} already; give each rod a name of its own: add_capsules(..., name='left').")
+        raise HostError(
+            f"the model has a body {names[0]!r} already; give each rod a name of its own: "
+            "add_capsules(..., name='left')."
+        )
     radii, lengths = _sizes(robot, capsules_per_segment)
     middles = np.cumsum(lengths) - 0.5 * lengths
     for k, own in enumerate(names):
         body = spec.worldbody.add_body(name=own, mocap=True, pos=[0.0, 0.0, middles[k]])
         rgba = head_color if head_color is not None and k == len(names) - 1 else color
         body.add_geom(
-            name=own, type=lib.mjtGeom.mjGEOM_CAPSULE, size=[radii[k], 0.5 * lengths[k], 0.0], rgba=list(rgba),
+            name=own,
+            type=lib.mjtGeom.mjGEOM_CAPSULE,
+            size=[radii[k], 0.5 * lengths[k], 0.0],
+            rgba=list(rgba),
             friction=[friction, 0.005, 0.0001],
-        )  # fmt: skip
+        )
         for other in passed:
             spec.add_exclude(bodyname1=own, bodyname2=other.name)
     return names
@@ -69,23 +93,38 @@ def add_capsules(
 class MujocoRod(CarriedRod):
     """One rod on a body of a MuJoCo model (`CarriedRod`).
 
-    The rod's capsules are mocap bodies (`add_capsules`). MuJoCo puts them where it is told, but its contacts take them to be at rest: a
-    body in their way is pushed by how deep they have come, follows them at their speed some hundredths of a second behind, and is
-    held by friction as if by a thing that stands still. What the rod feels, and pushes at the right speed, are bodies in `touch`.
+    The rod's capsules are mocap bodies (`add_capsules`). MuJoCo puts them where it is told, but its contacts
+    take them to be at rest: a body in their way is pushed by how deep they have come, follows them at their
+    speed some hundredths of a second behind, and is held by friction as if by a thing that stands still. What
+    the rod feels, and pushes at the right speed, are bodies in `touch`.
 
-    Bodies that are not in `touch` meet the capsules, and `felt` tells how hard. With `feel` these forces bend the rod too.
+    Bodies that are not in `touch` meet the capsules, and `felt` tells how hard. With `feel` these forces bend
+    the rod too.
     """
 
     def __init__(
-        self, robot: Robot, model: Any, data: Any, body: int | str, *,
-        position: ArrayLike = (0.0, 0.0, 0.0), quaternion: ArrayLike = (1.0, 0.0, 0.0, 0.0),
-        touch: Sequence[int | str] = (), friction: float = 0.3, relaxation: float = 0.1, feel: bool = False,
-        name: str = "rod", points_per_segment: int = 10, max_contacts: int = 16,
-    ) -> None:  # fmt: skip
-        """`body`: name or number of what carries the rod, with the mount `position` (3,) [m] and `quaternion` (4,) w x y z, body_from_base.
-        `touch`: names or numbers of bodies; `friction` of the rod on them; `relaxation` [s] of the rod against a changing contact
-        force (`Touching`). `feel`: MuJoCo's contacts of the capsules bend the rod (`Feedback`). `name` as given to `add_capsules`.
-        The time step is the model's. Raises `HostError`, `InputError`."""
+        self,
+        robot: Robot,
+        model: Any,
+        data: Any,
+        body: int | str,
+        *,
+        position: ArrayLike = (0.0, 0.0, 0.0),
+        quaternion: ArrayLike = (1.0, 0.0, 0.0, 0.0),
+        touch: Sequence[int | str] = (),
+        friction: float = 0.3,
+        relaxation: float = 0.1,
+        feel: bool = False,
+        name: str = "rod",
+        points_per_segment: int = 10,
+        max_contacts: int = 16,
+    ) -> None:
+        """`body`: name or number of what carries the rod, with the mount `position` (3,) [m] and `quaternion`
+        (4,) w x y z, body_from_base.
+        `touch`: names or numbers of bodies; `friction` of the rod on them; `relaxation` [s] of the rod
+        against a changing contact force (`Touching`). `feel`: MuJoCo's contacts of the capsules bend the rod
+        (`Feedback`). `name` as given to `add_capsules`. The time step is the model's. Raises `HostError`,
+        `InputError`."""
         check_robot(robot)
         host = MujocoBody(model, data, body, position=position, quaternion=quaternion)
         super().__init__(host, float(model.opt.timestep))
@@ -101,13 +140,19 @@ class MujocoRod(CarriedRod):
         _check_fit(model.geom_size[self._geoms], robot, name)
         for other in touched:
             self._check_excluded(other, name)
-        self._bodies = [TouchedBody(model, data, b, dt=self.dt, relaxation=relaxation, friction=friction) for b in touched]
+        self._bodies = [
+            TouchedBody(model, data, b, dt=self.dt, relaxation=relaxation, friction=friction) for b in touched
+        ]
         self.touched = self._bodies
         per_segment = len(self._geoms) // robot.n_segments
         self.rod = rod_of(
-            robot, self.touched, dt=self.dt, max_contacts=max_contacts,
-            points_per_segment=points_per_segment, capsules_per_segment=per_segment,
-        )  # fmt: skip
+            robot,
+            self.touched,
+            dt=self.dt,
+            max_contacts=max_contacts,
+            points_per_segment=points_per_segment,
+            capsules_per_segment=per_segment,
+        )
         self._capsule_of = {geom: k for k, geom in enumerate(self._geoms)}
         self._width = _sizes(robot, per_segment)[1]
         self._feedback = Feedback(robot.n_segments, per_segment, self._width) if feel else None
@@ -126,7 +171,8 @@ class MujocoRod(CarriedRod):
         return force
 
     def remove(self) -> None:
-        """Take the rod out: its capsules are seen and touched by nothing any more, and its forces are gone."""
+        """Take the rod out: its capsules are seen and touched by nothing any more, and its forces are
+        gone."""
         self._release()
         self.model.geom_contype[self._geoms] = self.model.geom_conaffinity[self._geoms] = 0
         self.model.geom_rgba[self._geoms, 3] = 0.0
@@ -134,7 +180,8 @@ class MujocoRod(CarriedRod):
     def _look(self) -> None:
         if float(self.model.opt.timestep) != self.dt:
             raise HostError(
-                f"the model's time step is now {self.model.opt.timestep:g} s, and the rod was mounted for {self.dt:g} s; mount it anew."
+                f"the model's time step is now {self.model.opt.timestep:g} s, and the rod was mounted for "
+                f"{self.dt:g} s; mount it anew."
             )
 
     def _gravity(self) -> Floats:
@@ -175,9 +222,13 @@ class MujocoRod(CarriedRod):
         try:
             force = np.array(given, dtype=float)
         except (TypeError, ValueError) as error:
-            raise InputError(f"line_force is not an array of numbers; with feel=True give (3,) or {shape} [N/m].") from error
+            raise InputError(
+                f"line_force is not an array of numbers; with feel=True give (3,) or {shape} [N/m]."
+            ) from error
         if force.shape not in ((3,), shape):
-            raise InputError(f"line_force has shape {force.shape}; with feel=True give (3,) or {shape} [N/m].")
+            raise InputError(
+                f"line_force has shape {force.shape}; with feel=True give (3,) or {shape} [N/m]."
+            )
         return force
 
     def _arrived(self) -> None:
@@ -202,7 +253,8 @@ class MujocoRod(CarriedRod):
         own = self.capsule_bodies[0]
         if (min(own, body) << 16) + max(own, body) not in self.model.exclude_signature:
             raise HostError(
-                f"the capsules of {name!r} collide with {self.model.body(body).name!r}, which the rod is to touch itself; "
+                f"the capsules of {name!r} collide with {self.model.body(body).name!r}, which the rod is to "
+                "touch itself; "
                 "name it in add_capsules(..., touch=[...]) too."
             )
 
@@ -210,7 +262,9 @@ class MujocoRod(CarriedRod):
 def _spec_body(spec: Any, name: object) -> Any:
     body = spec.body(name) if isinstance(name, str) else None
     if body is None:
-        raise HostError(f"the spec has no body {name!r}; {nearest(str(name), [b.name for b in spec.bodies if b.name])}")
+        raise HostError(
+            f"the spec has no body {name!r}; {nearest(str(name), [b.name for b in spec.bodies if b.name])}"
+        )
     return body
 
 
@@ -248,7 +302,8 @@ def _check_fit(size: Floats, robot: Robot, name: str) -> None:
     for k, (is_, be) in enumerate(zip(size[:, :2], np.stack([radii, 0.5 * lengths], axis=1), strict=True)):
         if not np.allclose(is_, be, rtol=1e-6, atol=0.0):
             raise HostError(
-                f"capsule {k} of {name!r} has radius {is_[0]:.4g} m and half length {is_[1]:.4g} m, where this robot has {be[0]:.4g} m "
+                f"capsule {k} of {name!r} has radius {is_[0]:.4g} m and half length {is_[1]:.4g} m, where "
+                f"this robot has {be[0]:.4g} m "
                 f"and {be[1]:.4g} m; they were added for another robot."
             )
 
@@ -259,7 +314,13 @@ def _capsule_bodies(model: Any, name: str, robot: Robot) -> list[int]:
     while (own := f"{name} {len(found)}") in numbers:
         found.append(numbers[own])
     if not found or any(model.body_mocapid[i] < 0 for i in found):
-        raise HostError(f"the model has no capsules of a rod {name!r}; call add_capsules(..., name={name!r}) on its spec before compile().")
+        raise HostError(
+            f"the model has no capsules of a rod {name!r}; call add_capsules(..., "
+            f"name={name!r}) on its spec before compile()."
+        )
     if len(found) % robot.n_segments:
-        raise HostError(f"the {len(found)} capsules of {name!r} do not fit {robot.n_segments} segments; they were added for another robot.")
+        raise HostError(
+            f"the {len(found)} capsules of {name!r} do not fit {robot.n_segments} segments; "
+            "they were added for another robot."
+        )
     return found

@@ -27,9 +27,14 @@ def check_world(model: object, data: object) -> None:
     """`HostError` for what is no model, or data of another one."""
     lib = mujoco()
     if not isinstance(model, lib.MjModel) or not isinstance(data, lib.MjData):
-        raise HostError(f"model and data are {type(model).__name__} and {type(data).__name__}; give a mujoco.MjModel and its MjData.")
+        raise HostError(
+            f"model and data are {type(model).__name__} and {type(data).__name__}; give a "
+            "mujoco.MjModel and its MjData."
+        )
     if data.xpos.shape[0] != model.nbody or data.qpos.shape[0] != model.nq:
-        raise HostError(f"the data are of another model: {data.xpos.shape[0]} bodies, where this one has {model.nbody}.")
+        raise HostError(
+            f"the data are of another model: {data.xpos.shape[0]} bodies, where this one has {model.nbody}."
+        )
 
 
 def body_number(model: Any, body: object) -> int:
@@ -42,12 +47,16 @@ def body_number(model: Any, body: object) -> int:
             raise HostError(f"the model has no body {body!r}; {nearest(body, [n for n in names if n])}")
         return number
     if isinstance(body, bool) or not isinstance(body, (int, np.integer)) or not 0 <= body < model.nbody:
-        raise HostError(f"body is {body!r}; give the name of a body, or its number from 0 (the world) to {model.nbody - 1}.")
+        raise HostError(
+            f"body is {body!r}; give the name of a body, or its number from 0 (the world) to "
+            f"{model.nbody - 1}."
+        )
     return int(body)
 
 
 def refresh(model: Any, data: Any) -> None:
-    """Poses and velocities of all bodies from the joints as they are now: mj_step leaves those of the step's start."""
+    """Poses and velocities of all bodies from the joints as they are now: mj_step leaves those of the step's
+    start."""
     lib = mujoco()
     lib.mj_kinematics(model, data)
     lib.mj_comPos(model, data)
@@ -55,10 +64,13 @@ def refresh(model: Any, data: Any) -> None:
 
 
 def velocity_of(model: Any, data: Any, body: int, *, com: bool) -> Floats:
-    """(6,) linear [m/s], then angular velocity [rad/s], world, of a body's centre of mass or of its frame's origin."""
+    """(6,) linear [m/s], then angular velocity [rad/s], world, of a body's centre of mass or of its frame's
+    origin."""
     lib = mujoco()
     found = np.zeros(6)
-    lib.mj_objectVelocity(model, data, lib.mjtObj.mjOBJ_BODY if com else lib.mjtObj.mjOBJ_XBODY, body, found, 0)
+    lib.mj_objectVelocity(
+        model, data, lib.mjtObj.mjOBJ_BODY if com else lib.mjtObj.mjOBJ_XBODY, body, found, 0
+    )
     return np.concatenate([found[3:], found[:3]])  # MuJoCo has the angular one first
 
 
@@ -72,8 +84,8 @@ def com_motion(model: Any, data: Any, body: int) -> Motion:
 class Applied:
     """One rod's share of what `data.xfrc_applied` has for a body.
 
-    MuJoCo keeps these forces until somebody clears them, and others may have put their own there: this adds its own, and takes just
-    that away again.
+    MuJoCo keeps these forces until somebody clears them, and others may have put their own there: this adds
+    its own, and takes just that away again.
     """
 
     def __init__(self, data: Any, body: int) -> None:
@@ -82,7 +94,8 @@ class Applied:
         self._left: Floats | None = None
 
     def put(self, wrench: Floats) -> None:
-        """(6,) force [N] and moment about the centre of mass [N m], world, in place of what was put before."""
+        """(6,) force [N] and moment about the centre of mass [N m], world, in place of what was put
+        before."""
         self.take()
         there = self._data.xfrc_applied[self._body]
         self._before = there.copy()
@@ -90,7 +103,8 @@ class Applied:
         self._left = there.copy()
 
     def take(self) -> None:
-        """Leave the forces as they were, and what others added since. Who has cleared them meanwhile is not contradicted."""
+        """Leave the forces as they were, and what others added since. Who has cleared them meanwhile is not
+        contradicted."""
         left, self._left = self._left, None
         there = self._data.xfrc_applied[self._body]
         if left is None or not there.any():
@@ -106,17 +120,24 @@ class MujocoBody:
     """
 
     def __init__(
-        self, model: Any, data: Any, body: int | str, *,
-        position: ArrayLike = (0.0, 0.0, 0.0), quaternion: ArrayLike = (1.0, 0.0, 0.0, 0.0),
-    ) -> None:  # fmt: skip
-        """`body`: number or name; `position` (3,) [m] and `quaternion` (4,) w x y z, body_from_base. Raises `HostError`."""
+        self,
+        model: Any,
+        data: Any,
+        body: int | str,
+        *,
+        position: ArrayLike = (0.0, 0.0, 0.0),
+        quaternion: ArrayLike = (1.0, 0.0, 0.0, 0.0),
+    ) -> None:
+        """`body`: number or name; `position` (3,) [m] and `quaternion` (4,) w x y z, body_from_base. Raises
+        `HostError`."""
         check_world(model, data)
         self.model, self.data = model, data
         self.body = body_number(model, body)
         self._position, self._quaternion = mount_pose(position, quaternion)
         self._applied = Applied(data, self.body)
         self.mocap_velocity: Floats = np.zeros(6)
-        """Of the body's frame, linear [m/s] and angular [rad/s], world: for a mocap body, which MuJoCo itself takes to be at rest."""
+        """Of the body's frame, linear [m/s] and angular [rad/s], world: for a mocap body, which MuJoCo itself
+        takes to be at rest."""
 
     def motion(self) -> Motion:
         """Of the rod's base, with the joints as they are now."""

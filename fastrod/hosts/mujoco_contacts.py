@@ -11,7 +11,9 @@ from fastrod.hosts.mujoco_body import mujoco
 from fastrod.simulator import Simulator
 from fastrod.types import Floats, Ints
 
-_SLOWLY = 1.01  # that the part grows in a step: one that is larger without contact than with it would take over too little on average
+# that the part grows in a step: one that is larger without contact than with it would take over too little on
+# average
+_SLOWLY = 1.01
 _SHALLOW = 1e-5  # m: less is not taken for the depth that a force belongs to
 
 
@@ -40,7 +42,10 @@ def read(model: Any, data: Any, capsule_of: Mapping[int, int], width: Floats) ->
     starts = np.concatenate([[0.0], np.cumsum(width)])
     for i in range(data.ncon):
         contact = data.contact[i]
-        for own, other, sign in ((int(contact.geom1), int(contact.geom2), -1.0), (int(contact.geom2), int(contact.geom1), 1.0)):
+        for own, other, sign in (
+            (int(contact.geom1), int(contact.geom2), -1.0),
+            (int(contact.geom2), int(contact.geom1), 1.0),
+        ):
             if own in capsule_of:
                 k = capsule_of[own]
                 lib.mj_contactForce(model, data, i, inside)
@@ -48,20 +53,25 @@ def read(model: Any, data: Any, capsule_of: Mapping[int, int], width: Floats) ->
                 s = starts[k] + float(np.clip(0.5 * width[k] + along, 0.0, width[k]))
                 rows.append((k, s, int(model.geom_bodyid[other])))
                 points.append(np.array(contact.pos))
-                forces.append(sign * (inside[:3] @ contact.frame.reshape(3, 3)))  # on geom2: its normal points there
+                # on geom2: its normal points there
+                forces.append(sign * (inside[:3] @ contact.frame.reshape(3, 3)))
                 depths.append(max(-float(contact.dist), 0.0))
     return Felt(
-        np.array([row[0] for row in rows], np.int64), np.array([row[1] for row in rows]), np.array([row[2] for row in rows], np.int64),
-        np.array(points).reshape(-1, 3), np.array(forces).reshape(-1, 3), np.array(depths),
-    )  # fmt: skip
+        np.array([row[0] for row in rows], np.int64),
+        np.array([row[1] for row in rows]),
+        np.array([row[2] for row in rows], np.int64),
+        np.array(points).reshape(-1, 3),
+        np.array(forces).reshape(-1, 3),
+        np.array(depths),
+    )
 
 
 class Feedback:
     """MuJoCo's contact forces as a line force of the rod, relaxed against its compliance.
 
-    A contact of stiffness k at a point of compliance C, taken over at once, diverges where k C exceeds 1: the rod gives way, the force
-    is gone, the rod is back. A part 1 / (1 + sum k C) of the change is what an implicit step would take; C falls with the cube of
-    the arclength.
+    A contact of stiffness k at a point of compliance C, taken over at once, diverges where k C exceeds 1: the
+    rod gives way, the force is gone, the rod is back. A part 1 / (1 + sum k C) of the change is what an
+    implicit step would take; C falls with the cube of the arclength.
     """
 
     def __init__(self, n_segments: int, per_segment: int, width: Floats) -> None:
@@ -72,7 +82,8 @@ class Feedback:
         self._part = 1.0
 
     def take(self, felt: Felt, simulator: Simulator) -> None:
-        """Go toward the forces of the last step; stay where the rod could not be solved, whose compliance nobody knows."""
+        """Go toward the forces of the last step; stay where the rod could not be solved, whose compliance
+        nobody knows."""
         if not simulator.state.ok[0]:
             return
         wanted = np.zeros_like(self.force)
@@ -87,7 +98,8 @@ class Feedback:
         self.force += self._part * (wanted - self.force)
 
     def line_force(self) -> Floats:
-        """(n_segments, capsules of one + 1, 3) [N/m]: linear between the capsules' ends, with the sum of the forces."""
+        """(n_segments, capsules of one + 1, 3) [N/m]: linear between the capsules' ends, with the sum of the
+        forces."""
         ends = np.zeros((self._n, self._per + 1, 3))
         each = self.force.reshape(self._n, self._per, 2, 3)
         ends[:, :-1] += each[:, :, 0]

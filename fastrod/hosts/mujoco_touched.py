@@ -20,28 +20,37 @@ _INVERSE = np.array([1.0, -1.0, -1.0, -1.0])  # of a unit quaternion w x y z
 
 @final
 class TouchedBody(Touching):
-    """A body that a rod touches, and what the rod does to it (`Touching`). Poses and velocities are as `data` have them:
+    """A body that a rod touches, and what the rod does to it (`Touching`). Poses and velocities are as `data`
+    have them:
     `MujocoBody.motion` has brought them up to date."""
 
-    def __init__(self, model: Any, data: Any, body: int, *, dt: float, relaxation: float, friction: float) -> None:
-        """`relaxation` tau [s]; `friction` of rod on the body. Raises `HostError` where nothing of the body can be touched."""
+    def __init__(
+        self, model: Any, data: Any, body: int, *, dt: float, relaxation: float, friction: float
+    ) -> None:
+        """`relaxation` tau [s]; `friction` of rod on the body. Raises `HostError` where nothing of the body
+        can be touched."""
         self.model, self.data, self.body = model, data, body
         solid = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
         self.geoms: list[int] = np.flatnonzero(solid & (model.geom_bodyid == body)).tolist()
         if not self.geoms:
-            raise HostError(f"body {model.body(body).name!r} has no geom that collides, so nothing can touch it.")
+            raise HostError(
+                f"body {model.body(body).name!r} has no geom that collides, so nothing can touch it."
+            )
         still = model.body_weldid[body] == 0 or model.body_mocapid[model.body_weldid[body]] >= 0
         mass = 0.0 if still else float(model.body_mass[body])
         parts = _parts(model, body, self.geoms)
         self._applied = Applied(data, body)
-        super().__init__(parts, mass, model.body_inertia[body].copy(), dt=dt, relaxation=relaxation, friction=friction)
+        super().__init__(
+            parts, mass, model.body_inertia[body].copy(), dt=dt, relaxation=relaxation, friction=friction
+        )
 
     def com(self) -> Motion:
         """Of the inertial frame (`data.xipos`, `data.ximat`), whose axes are those of the body's inertia."""
         return com_motion(self.model, self.data, self.body)
 
     def overlap(self, capsules: Sequence[int]) -> Floats:
-        """(3,) the body's way out of the deepest overlap of one of its geoms with one of these, world [m]; its length is the depth."""
+        """(3,) the body's way out of the deepest overlap of one of its geoms with one of these, world [m];
+        its length is the depth."""
         lib = mujoco()
         deepest, way, ends = 0.0, np.zeros(3), np.zeros(6)
         for own in capsules:
@@ -51,7 +60,8 @@ class TouchedBody(Touching):
         return way
 
     def apply(self, wrench: Floats) -> None:
-        """(6,) force [N] and moment about the centre of mass [N m], world, in place of the last; it acts until `release`."""
+        """(6,) force [N] and moment about the centre of mass [N m], world, in place of the last; it acts
+        until `release`."""
         self._applied.put(wrench)
 
     def release(self) -> None:
@@ -72,7 +82,8 @@ def _parts(model: Any, body: int, geoms: Sequence[int]) -> list[Part]:
 
 
 def obstacle_of(model: Any, geom: int, name: str) -> Obstacle:
-    """A geom as an obstacle, in its own frame. Raises `HostError` for height fields and other shapes that a rod cannot touch."""
+    """A geom as an obstacle, in its own frame. Raises `HostError` for height fields and other shapes that a
+    rod cannot touch."""
     kinds = mujoco().mjtGeom
     kind, (a, b, c) = model.geom_type[geom], model.geom_size[geom].tolist()
     if kind == kinds.mjGEOM_BOX:
@@ -88,7 +99,10 @@ def obstacle_of(model: Any, geom: int, name: str) -> Obstacle:
     if kind == kinds.mjGEOM_MESH:
         return _hull(model, int(model.geom_dataid[geom]), name)
     word = str(kinds(int(kind))).rsplit("_", 1)[-1].lower()
-    raise HostError(f"geom {geom} of {name!r} is of the kind {word}, which a rod cannot touch; give it a mesh, or a simple shape.")
+    raise HostError(
+        f"geom {geom} of {name!r} is of the kind {word}, which a rod cannot touch; give it a "
+        "mesh, or a simple shape."
+    )
 
 
 def _hull(model: Any, number: int, name: str) -> Obstacle:

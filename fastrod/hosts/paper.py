@@ -51,26 +51,38 @@ class Shapes:
     """Commands to settled shapes, each as if it were the first."""
 
     def __init__(self, robot: Robot, n_points: int) -> None:
-        """`n_points` along the whole robot. Raises `RobotError` where the robot cannot be driven by actions."""
+        """`n_points` along the whole robot. Raises `RobotError` where the robot cannot be driven by
+        actions."""
         self.robot = robot
         self.n_points = n_points
         self._actions = SegmentActions(robot)
         self._simulator = Simulator(robot, 1, threads=1)
 
     def command(self, action: ArrayLike | None, base_pos: ArrayLike, base_orin: ArrayLike) -> Command:
-        """A checked command; `action` None is the straight robot. Raises `InputError` on a wrong length, on what is not finite, and
-        beyond the range of extension or half a turn of bend."""
-        given = np.zeros(self._actions.n_actions) if action is None else numbers("action", action, self._actions.n_actions)
+        """A checked command; `action` None is the straight robot. Raises `InputError` on a wrong length, on
+        what is not finite, and beyond the range of extension or half a turn of bend."""
+        given = (
+            np.zeros(self._actions.n_actions)
+            if action is None
+            else numbers("action", action, self._actions.n_actions)
+        )
         for k, (extension, *bends) in enumerate(given.reshape(-1, 3).tolist()):
             low, high = self.robot.segments[k].extension
             if not low - 1e-12 <= extension <= high + 1e-12:
-                raise InputError(f"the extension of segment {k + 1} is {extension:g} m; its range is from {low:g} to {high:g} m.")
+                raise InputError(
+                    f"the extension of segment {k + 1} is {extension:g} m; its range is from "
+                    f"{low:g} to {high:g} m."
+                )
             if math.hypot(*bends) > (most := _MOST_BEND * float(self._actions.offset[k])) * (1.0 + 1e-9):
-                raise InputError(f"the displacements of segment {k + 1} are {bends} m; together at most {most:.4g} m, half a turn of bend.")
+                raise InputError(
+                    f"the displacements of segment {k + 1} are {bends} m; together at most "
+                    f"{most:.4g} m, half a turn of bend."
+                )
         return Command(given, numbers("base_pos", base_pos, 3), turn_of("base_orin", base_orin))
 
     def at(self, command: Command) -> Shape:
-        """The robot at rest under its own weight, without contact. Raises `InputError` where there is no such shape."""
+        """The robot at rest under its own weight, without contact. Raises `InputError` where there is no such
+        shape."""
         base = np.concatenate([command.base_position, product(command.base_quaternion, _FROM_FASTROD)])
         self._simulator.reset()  # a cold start, so that the answer does not depend on what was asked before
         signed = (command.action.reshape(-1, 3) * _SIGNS).ravel()
@@ -90,33 +102,44 @@ class Shapes:
 def between(a: Command, b: Command, share: float) -> Command:
     """Part of the way from one command to the other."""
     turn = quaternion_from_vector(share * turn_between(a.base_quaternion[None], b.base_quaternion[None])[0])
-    action, position = ((1.0 - share) * x + share * y for x, y in ((a.action, b.action), (a.base_position, b.base_position)))
+    action, position = (
+        (1.0 - share) * x + share * y for x, y in ((a.action, b.action), (a.base_position, b.base_position))
+    )
     return Command(action, position, product(turn, a.base_quaternion))
 
 
 def paper_robot(n: int, radius: float) -> Robot:
-    """The paper's prototype in `n` extensible segments of 0.1 m, of body `radius` [m]; the wires are so stiff that a bend is what its
-    displacement says to 1e-4 rad, and the offset of 7.5 mm is not the paper's, which gives none."""
+    """The paper's prototype in `n` extensible segments of 0.1 m, of body `radius` [m]; the wires are so stiff
+    that a bend is what its displacement says to 1e-4 rad, and the offset of 7.5 mm is not the paper's, which
+    gives none."""
     wires = tuple(Tendon(offset=0.0075, angle=k * math.pi / 2.0, compliance=1e-8) for k in range(4))
     segment = Segment(
-        length=0.1, bending_stiffness=(0.0022, 0.0022), torsional_stiffness=0.001, extension=(-0.05, 0.1),
-        body_radius=max(radius, 0.0075), tendons=wires,
-    )  # fmt: skip
+        length=0.1,
+        bending_stiffness=(0.0022, 0.0022),
+        torsional_stiffness=0.001,
+        extension=(-0.05, 0.1),
+        body_radius=max(radius, 0.0075),
+        tendons=wires,
+    )
     return Robot(name=f"softmanisim_{n}", segments=(segment,) * n, gravity=(0.0, 0.0, 0.0))
 
 
 def turn_of(name: str, turn: ArrayLike) -> Floats:
-    """(4,) w x y z of three Euler angles as for getQuaternionFromEuler [rad], or of a quaternion x y z w. Raises `InputError`."""
+    """(4,) w x y z of three Euler angles as for getQuaternionFromEuler [rad], or of a quaternion x y z w.
+    Raises `InputError`."""
     q = numbers(name, turn, 3, 4)
     if len(q) == 3:
         return from_xyzw(pybullet().getQuaternionFromEuler(q.tolist()))
     if abs((norm := float(np.linalg.norm(q))) - 1.0) > 1e-3:
-        raise InputError(f"{name} is {q.tolist()}, a quaternion of norm {norm:.6g}; it must be 1, as x y z w.")
+        raise InputError(
+            f"{name} is {q.tolist()}, a quaternion of norm {norm:.6g}; it must be 1, as x y z w."
+        )
     return from_xyzw(q / norm)
 
 
 def numbers(name: str, value: ArrayLike, *lengths: int) -> Floats:
-    """(n,) finite numbers, n one of `lengths`; columns and rows are taken too. Raises `InputError` that calls it `name`."""
+    """(n,) finite numbers, n one of `lengths`; columns and rows are taken too. Raises `InputError` that calls
+    it `name`."""
     try:
         v = np.atleast_1d(np.squeeze(np.array(value, dtype=float)))
     except (TypeError, ValueError):

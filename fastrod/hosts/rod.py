@@ -1,4 +1,5 @@
-"""`Rod`: rods for any physics engine: the base's motion in, capsules and the wrench on the base out. It knows no engine."""
+"""`Rod`: rods for any physics engine: the base's motion in, capsules and the wrench on the base out. It knows
+no engine."""
 
 from __future__ import annotations
 
@@ -23,9 +24,16 @@ from fastrod.solver.state import Snapshot, State
 from fastrod.types import Flags, Floats, Ints, Shape
 
 INPUTS = (
-    "tendon_length", "tension", "extension", "tip_force", "tip_moment", "line_force", "point_force",
-    "follower_tip_force", "gravity",
-)  # fmt: skip
+    "tendon_length",
+    "tension",
+    "extension",
+    "tip_force",
+    "tip_moment",
+    "line_force",
+    "point_force",
+    "follower_tip_force",
+    "gravity",
+)
 """What an engine may tell a rod beside its base: keyword arguments of `Simulator.step`."""
 OBSTACLES = ("obstacle_pose", "obstacle_velocity")
 """The same of rods with a contact scene."""
@@ -61,8 +69,9 @@ class Rod:
     The rod's weight is that in the `gravity` (3,) that the engine gives, world [m/s^2]; in the robot's own
     until then.
 
-    With `n_robots` every array has a robot axis first; without it there is one rod and no such axis, but in `state`, which always has
-    one. Inputs that are not given stay as they were given last; the wires are those of the straight robot until then.
+    With `n_robots` every array has a robot axis first; without it there is one rod and no such axis, but in
+    `state`, which always has one. Inputs that are not given stay as they were given last; the wires are those
+    of the straight robot until then.
 
     >>> import fastrod
     >>> rod = fastrod.Rod(fastrod.load_robot("prototype"), dt=0.01)
@@ -72,27 +81,53 @@ class Rod:
     """
 
     def __init__(
-        self, robot: Robot, *, dt: float = 0.01, n_robots: int | None = None, contact: ContactScene | None = None,
-        points_per_segment: int = 10, capsules_per_segment: int = 10, threads: int | None = 1,
-    ) -> None:  # fmt: skip
-        """`dt`: the rod's longest step [s]; an engine's step that is longer is done in equal parts. `contact`: what the rod feels.
-        Capsules are as thick as contact has the rod. Raises `InputError`, `RobotError`."""
+        self,
+        robot: Robot,
+        *,
+        dt: float = 0.01,
+        n_robots: int | None = None,
+        contact: ContactScene | None = None,
+        points_per_segment: int = 10,
+        capsules_per_segment: int = 10,
+        threads: int | None = 1,
+    ) -> None:
+        """`dt`: the rod's longest step [s]; an engine's step that is longer is done in equal parts.
+        `contact`: what the rod feels. Capsules are as thick as contact has the rod. Raises `InputError`,
+        `RobotError`."""
         check_robot(robot)
         if isinstance(n_robots, bool):
-            raise InputError(f"n_robots is {n_robots}; give how many rods there are, or None for one without a robot axis.")
+            raise InputError(
+                f"n_robots is {n_robots}; give how many rods there are, or None for one without a robot axis."
+            )
         if contact is not None and not isinstance(contact, ContactScene):
-            raise InputError(f"contact is {shown(contact)}; give fastrod.contact.ContactScene(obstacles=[...]) or None.")
+            raise InputError(
+                f"contact is {shown(contact)}; give fastrod.contact.ContactScene(obstacles=[...]) or None."
+            )
         if (
             not isinstance(capsules_per_segment, (int, np.integer))
             or capsules_per_segment < 1
-            or (isinstance(points_per_segment, (int, np.integer)) and points_per_segment % capsules_per_segment)
+            or (
+                isinstance(points_per_segment, (int, np.integer))
+                and points_per_segment % capsules_per_segment
+            )
         ):
-            raise InputError(f"{capsules_per_segment} capsules for {points_per_segment} points of a segment; give a divisor of the points.")
+            raise InputError(
+                f"{capsules_per_segment} capsules for {points_per_segment} points of a "
+                "segment; give a divisor of the points."
+            )
         if contact is not None and contact.worlds is not None:
-            raise InputError("ContactScene.worlds puts several rods into one world; a Rod is alone in its own: leave worlds out.")
+            raise InputError(
+                "ContactScene.worlds puts several rods into one world; a Rod is alone in its "
+                "own: leave worlds out."
+            )
         self.simulator = Simulator(
-            robot, 1 if n_robots is None else n_robots, dt, points_per_segment, threads=threads, contact=contact,
-        )  # fmt: skip
+            robot,
+            1 if n_robots is None else n_robots,
+            dt,
+            points_per_segment,
+            threads=threads,
+            contact=contact,
+        )
         """Its `jacobian`, `compliance`, `shape` are those of the last state."""
         self.dt = self.simulator.dt
         """Longest step of the rod [s]."""
@@ -129,17 +164,20 @@ class Rod:
 
     @property
     def wrench(self) -> Floats:
-        """(6,) force [N], then moment about the base point [N m], that the rod exerts on its base, world; zero before the first step."""
+        """(6,) force [N], then moment about the base point [N m], that the rod exerts on its base, world;
+        zero before the first step."""
         return self._one(self._wrench)
 
     @property
     def base(self) -> Floats:
-        """(7,) pose of the base that shape and wrench belong to: where the engine's step was expected to end."""
+        """(7,) pose of the base that shape and wrench belong to: where the engine's step was expected to
+        end."""
         return self._one(self._base)
 
     @property
     def failed(self) -> int:
-        """The rod's own steps in a row that could not be solved; 0 after one that could. Of several rods the most."""
+        """The rod's own steps in a row that could not be solved; 0 after one that could. Of several rods the
+        most."""
         return int(self._failed.max())
 
     @property
@@ -148,8 +186,10 @@ class Rod:
         return self._failed.copy()
 
     def settle(self, base_pose: ArrayLike | None = None, **inputs: Any) -> State:
-        """At rest on a base at rest, (7,) position [m] and quaternion w x y z, world; the robot file's own if left out. Inputs as for
-        `advance`; the clock stands still. Raises `InputError`, and `HostError` where nothing finite is found; then nothing has changed."""
+        """At rest on a base at rest, (7,) position [m] and quaternion w x y z, world; the robot file's own if
+        left out. Inputs as for
+        `advance`; the clock stands still. Raises `InputError`, and `HostError` where nothing finite is found;
+        then nothing has changed."""
         given, around = self._sorted(inputs)
         base = self._home if base_pose is None else self._poses(base_pose)
         before = self.snapshot()
@@ -162,16 +202,18 @@ class Rod:
     def advance(self, base_pose: ArrayLike, base_twist: ArrayLike, time_step: float, **inputs: Any) -> State:
         """The rod at the end of the engine's next step of `time_step` [s].
 
-        `base_pose` (7,) where the base is before the step, position [m] and quaternion w x y z, world; `base_twist` (6,) velocity of
-        its origin [m/s] and angular velocity [rad/s], world, at which it is taken to go on. Inputs as for `Simulator.step`: `INPUTS`,
-        and `obstacle_pose` and `obstacle_velocity` at the end of the step where there is a contact scene. Base and obstacles are led
-        there in the rod's own steps.
+        `base_pose` (7,) where the base is before the step, position [m] and quaternion w x y z, world;
+        `base_twist` (6,) velocity of its origin [m/s] and angular velocity [rad/s], world, at which it is
+        taken to go on. Inputs as for `Simulator.step`: `INPUTS`, and `obstacle_pose` and `obstacle_velocity`
+        at the end of the step where there is a contact scene. Base and obstacles are led there in the rod's
+        own steps.
 
-        A step that cannot be solved (`state.ok` is false, and `state.problems` says why) leaves the rod where it came to, with half the
-        wrench of the engine's step before; after a few in a row the rod settles anew. Of several rods, each
-        fails alone: one whose input cannot be used, or that is lost, keeps shape, capsules and base as well. Raises `InputError` for
-        unusable input, `HostError` where all rods are lost, one was lost before it had a shape, or 25 steps in a row could not be solved
-        of any rod; then nothing has moved.
+        A step that cannot be solved (`state.ok` is false, and `state.problems` says why) leaves the rod where
+        it came to, with half the wrench of the engine's step before; after a few in a row the rod settles
+        anew. Of several rods, each fails alone: one whose input cannot be used, or that is lost, keeps shape,
+        capsules and base as well. Raises `InputError` for unusable input, `HostError` where all rods are
+        lost, one was lost before it had a shape, or 25 steps in a row could not be solved of any rod; then
+        nothing has moved.
         """
         motion, n = self._motion(base_pose, base_twist), self._substeps(time_step)
         given, around = self._sorted(inputs)
@@ -183,7 +225,9 @@ class Rod:
             self.simulator.dt = dt
             raise
 
-    def _advanced(self, motion: Motion, given: dict[str, Any], around: dict[str, Any], time_step: float, n: int) -> State:
+    def _advanced(
+        self, motion: Motion, given: dict[str, Any], around: dict[str, Any], time_step: float, n: int
+    ) -> State:
         if self._state is None:
             self._settled(motion.pose, given, around)
         elif self._fresh.any():
@@ -191,7 +235,12 @@ class Rod:
         self.simulator.dt = h = time_step / n
         wrench = self._wrench
         for k in range(n):
-            self._solved(motion.after((k + 1) * h), given, self._part_way(around, n - k) if n > 1 else around, 0.5 * wrench)
+            self._solved(
+                motion.after((k + 1) * h),
+                given,
+                self._part_way(around, n - k) if n > 1 else around,
+                0.5 * wrench,
+            )
         before, self._capsules = self._capsules, self._along(self.state)
         if before is not None:
             self._capsules = moved(before, self._capsules, time_step)
@@ -199,9 +248,10 @@ class Rod:
         return self.state
 
     def reset(self, rows: ArrayLike | None = None) -> None:
-        """Forget the rod's shape and its contacts, but not its inputs nor its clock: after the base was put somewhere else. The next step
-        settles where the base then is. `rows`: indices or a mask of the rods that are reset, all without it; the others go on, and
-        shapes and capsules of these are shown as they were until then. Raises `InputError` for what is no rows."""
+        """Forget the rod's shape and its contacts, but not its inputs nor its clock: after the base was put
+        somewhere else. The next step settles where the base then is. `rows`: indices or a mask of the rods
+        that are reset, all without it; the others go on, and shapes and capsules of these are shown as they
+        were until then. Raises `InputError` for what is no rows."""
         which = np.ones(self.simulator.n_robots, bool)
         self.simulator.reset(rows)
         if rows is not None:
@@ -211,19 +261,32 @@ class Rod:
         if which.all():
             self._state = self._capsules = None
         self._fresh = self._fresh | which
-        self._wrench, self._failed = np.where(which[:, None], 0.0, self._wrench), np.where(which, 0, self._failed)
+        self._wrench, self._failed = (
+            np.where(which[:, None], 0.0, self._wrench),
+            np.where(which, 0, self._failed),
+        )
 
     def snapshot(self) -> RodSnapshot:
         """A copy of everything that a later step depends on."""
         return RodSnapshot(
-            self.simulator.snapshot(), self.time, self._state, self._wrench.copy(), self._base.copy(), dict(self._inputs),
-            dict(self._obstacles), self._capsules, self._failed.copy(), self._fresh.copy(),
-        )  # fmt: skip
+            self.simulator.snapshot(),
+            self.time,
+            self._state,
+            self._wrench.copy(),
+            self._base.copy(),
+            dict(self._inputs),
+            dict(self._obstacles),
+            self._capsules,
+            self._failed.copy(),
+            self._fresh.copy(),
+        )
 
     def restore(self, snapshot: RodSnapshot) -> None:
         """Go back to a `snapshot` of this rod. Raises `InputError` for that of another."""
         if not isinstance(snapshot, RodSnapshot):
-            raise InputError(f"the snapshot is a {type(snapshot).__name__}; give what Rod.snapshot() returned.")
+            raise InputError(
+                f"the snapshot is a {type(snapshot).__name__}; give what Rod.snapshot() returned."
+            )
         self.simulator.restore(snapshot.simulator)
         self.time, self._state, self._capsules = snapshot.time, snapshot.state, snapshot.capsules
         self._failed, self._fresh = snapshot.failed.copy(), snapshot.fresh.copy()
@@ -231,7 +294,9 @@ class Rod:
         self._inputs, self._obstacles = dict(snapshot.inputs), dict(snapshot.obstacles)
 
     def _settled(self, base: Floats, given: dict[str, Any], around: dict[str, Any]) -> State:
-        self._keep(self.simulator.settle(base_pose=base, **around, **given), given, around, base, 0.5 * self._wrench)
+        self._keep(
+            self.simulator.settle(base_pose=base, **around, **given), given, around, base, 0.5 * self._wrench
+        )
         self._fresh[:] = False
         self._capsules = self._along(self.state)
         return self.state
@@ -243,7 +308,9 @@ class Rod:
         self._wrench = np.where(rows[:, None], self._wrench, going)
         now = self._along(self.state)
         before = now if self._capsules is None else self._capsules
-        self._capsules = Capsules(*(np.where(rows.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(now, before, strict=True)))
+        self._capsules = Capsules(
+            *(np.where(rows.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(now, before, strict=True))
+        )
         self._fresh = rows & ~self.state.ok
 
     def _solved(self, base: Floats, given: dict[str, Any], around: dict[str, Any], half: Floats) -> None:
@@ -262,7 +329,8 @@ class Rod:
             )
 
     def _anew(self, rows: Flags, base: Floats, given: dict[str, Any], around: dict[str, Any]) -> State:
-        """These rods at rest, from the straight rod; the others, memories and clocks of their effects too, stay as they are."""
+        """These rods at rest, from the straight rod; the others, memories and clocks of their effects too,
+        stay as they are."""
         sim = self.simulator
         if sim.contact is None:
             sim.reset(rows)
@@ -275,9 +343,15 @@ class Rod:
         sim.restore(before, ~rows)
         return sim.state
 
-    def _keep(self, state: State, given: dict[str, Any], around: Mapping[str, Any], base: Floats, half: Floats) -> None:
-        """Take a state over. Rods that are lost in it stay as they were; those that are not ok have the wrench `half` (n_robots, 6)."""
-        found = [np.isfinite(a).reshape(len(a), -1).all(axis=1) for a in (state.position, state.tip_position, state.base_wrench)]
+    def _keep(
+        self, state: State, given: dict[str, Any], around: Mapping[str, Any], base: Floats, half: Floats
+    ) -> None:
+        """Take a state over. Rods that are lost in it stay as they were; those that are not ok have the
+        wrench `half` (n_robots, 6)."""
+        found = [
+            np.isfinite(a).reshape(len(a), -1).all(axis=1)
+            for a in (state.position, state.tip_position, state.base_wrench)
+        ]
         lost: Flags = ~np.logical_and.reduce(found)
         if lost.any():
             i, before = int(lost.argmax()), self._state
@@ -286,9 +360,14 @@ class Rod:
                 raise HostError(f"{which} is lost: {state.problems.get(i, 'its shape is not finite')}")
             unknown = {int(i): "its shape is not finite." for i in np.flatnonzero(lost)}
             shape = taken_shape(Shape(*(getattr(state, name) for name in Shape._fields)), before, lost)
-            state = replace(state, **shape._asdict(), ok=state.ok & ~lost, problems=unknown | dict(state.problems))
+            state = replace(
+                state, **shape._asdict(), ok=state.ok & ~lost, problems=unknown | dict(state.problems)
+            )
         self._state, self._inputs = state, given
-        self._obstacles |= {name: np.array(np.atleast_2d(pose), float) for name, pose in (around.get("obstacle_pose") or {}).items()}
+        self._obstacles |= {
+            name: np.array(np.atleast_2d(pose), float)
+            for name, pose in (around.get("obstacle_pose") or {}).items()
+        }
         self._wrench = np.where(state.ok[:, None], state.base_wrench, half)
         self._base = np.where(lost[:, None], self._base, np.broadcast_to(base, self._base.shape))
 
@@ -297,7 +376,11 @@ class Rod:
         known = INPUTS if self.simulator.contact is None else (*INPUTS, *OBSTACLES)
         for name in inputs:
             if name not in known:
-                why = "it needs a contact scene: Rod(robot, contact=...)." if name in OBSTACLES else nearest(name, known)
+                why = (
+                    "it needs a contact scene: Rod(robot, contact=...)."
+                    if name in OBSTACLES
+                    else nearest(name, known)
+                )
                 raise InputError(f"a rod has no input {name!r}; {why}")
         for name, value in inputs.items():
             refuse_masked(name, value)
@@ -323,12 +406,18 @@ class Rod:
 
     def _substeps(self, time_step: float) -> int:
         if isinstance(time_step, bool) or not isinstance(time_step, (int, float, np.floating, np.integer)):
-            raise InputError(f"time_step is {time_step!r}; give the length of the engine's step, a positive number [s].")
+            raise InputError(
+                f"time_step is {time_step!r}; give the length of the engine's step, a positive number [s]."
+            )
         if not (math.isfinite(time_step) and time_step > 0.0):
-            raise InputError(f"time_step is {time_step!r} s; the length of the engine's step must be positive and finite.")
+            raise InputError(
+                f"time_step is {time_step!r} s; the length of the engine's step must be positive and finite."
+            )
         n = max(1, math.ceil(time_step / self.dt - 1e-9))
         if n > _MOST_SUBSTEPS:
-            raise InputError(f"time_step is {time_step:g} s, {n} of the rod's steps of {self.dt:g} s; was it given in ms?")
+            raise InputError(
+                f"time_step is {time_step:g} s, {n} of the rod's steps of {self.dt:g} s; was it given in ms?"
+            )
         return n
 
     def _motion(self, base_pose: ArrayLike, base_twist: ArrayLike) -> Motion:
@@ -341,7 +430,10 @@ class Rod:
         pose = self._rows("base_pose", base_pose, 7, "position [m] and quaternion w x y z")
         norm = np.linalg.norm(pose[..., 3:], axis=-1, keepdims=True)
         if (off := np.abs(norm - 1.0)).max() > 1e-3:
-            raise InputError(f"base_pose has a quaternion of norm {norm.ravel()[off.argmax()]:.4g}; it must be 1, as w x y z.")
+            raise InputError(
+                f"base_pose has a quaternion of norm {norm.ravel()[off.argmax()]:.4g}; it must "
+                "be 1, as w x y z."
+            )
         return np.concatenate([pose[..., :3], pose[..., 3:] / norm], axis=-1)
 
     def _twists(self, base_twist: ArrayLike) -> Floats:
@@ -381,4 +473,6 @@ def _copied(value: Any) -> Any:
 def check_robot(robot: object) -> None:
     """Raises `RobotError` for what is not one robot."""
     if not isinstance(robot, Robot):
-        raise RobotError(f"robot is {shown(robot)}; give one Robot, for example fastrod.load_robot('prototype').")
+        raise RobotError(
+            f"robot is {shown(robot)}; give one Robot, for example fastrod.load_robot('prototype')."
+        )

@@ -20,8 +20,11 @@ from fastrod.types import Floats
 class Touched(Touching):
     """A link (-1: the base) that a rod touches, and what the rod does to it (`Touching`)."""
 
-    def __init__(self, bullet: Any, body: int, link: int = -1, *, dt: float, relaxation: float, friction: float) -> None:
-        """`relaxation` tau [s]; `friction` of rod on the body. Raises `HostError` where the link has no shape to touch."""
+    def __init__(
+        self, bullet: Any, body: int, link: int = -1, *, dt: float, relaxation: float, friction: float
+    ) -> None:
+        """`relaxation` tau [s]; `friction` of rod on the body. Raises `HostError` where the link has no shape
+        to touch."""
         self.bullet = Bullet(bullet)
         self.bullet.check(body, link)
         self.body, self.link = body, link
@@ -36,15 +39,20 @@ class Touched(Touching):
         return _com_motion(self.bullet, self.body, self.link)
 
     def overlap(self, capsules: Sequence[int]) -> Floats:
-        """(3,) the link's way out of its deepest overlap with one of these bodies, world [m]; its length is the depth."""
-        found = [p for own in capsules for p in self.bullet.getClosestPoints(own, self.body, 0.0, -1, self.link)]
+        """(3,) the link's way out of its deepest overlap with one of these bodies, world [m]; its length is
+        the depth."""
+        found = [
+            p for own in capsules for p in self.bullet.getClosestPoints(own, self.body, 0.0, -1, self.link)
+        ]
         if not found:
             return np.zeros(3)
         deepest = min(found, key=lambda p: p[8])
-        return np.asarray(min(deepest[8], 0.0) * np.array(deepest[7]))  # its normal points from the link to the capsule
+        # its normal points from the link to the capsule
+        return np.asarray(min(deepest[8], 0.0) * np.array(deepest[7]))
 
     def apply(self, wrench: Floats) -> None:
-        """(6,) force [N] and moment about the centre of mass [N m], world, for one `stepSimulation`: then PyBullet forgets it."""
+        """(6,) force [N] and moment about the centre of mass [N m], world, for one `stepSimulation`: then
+        PyBullet forgets it."""
         exert(self.bullet, self.body, self.link, wrench, self.com().pose[:3])
 
 
@@ -62,7 +70,9 @@ def _shapes(bullet: Bullet, body: int, link: int) -> list[Part]:
     """The collision shapes of a link."""
     found = []
     label = bullet.getBodyInfo(body)[1].decode() or "body"
-    for i, (_, _, kind, size, _file, position, quaternion) in enumerate(bullet.getCollisionShapeData(body, link)):
+    for i, (_, _, kind, size, _file, position, quaternion) in enumerate(
+        bullet.getCollisionShapeData(body, link)
+    ):
         name = f"{label} {body}" + (f" link {link}" if link >= 0 else "") + (f" part {i}" if i else "")
         if kind == bullet.GEOM_BOX:
             made = box(size, name=name)
@@ -77,7 +87,10 @@ def _shapes(bullet: Bullet, body: int, link: int) -> list[Part]:
         elif kind == bullet.GEOM_MESH:
             made = _hull(bullet, body, link, name)
         else:
-            raise HostError(f"body {body} has a collision shape of PyBullet's kind {kind}, which a rod cannot touch; give it a mesh.")
+            raise HostError(
+                f"body {body} has a collision shape of PyBullet's kind {kind}, which a rod "
+                "cannot touch; give it a mesh."
+            )
         found.append(Part(made, np.asarray(position, float), from_xyzw(quaternion)))
     return found
 

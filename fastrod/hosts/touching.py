@@ -31,24 +31,38 @@ class Part(NamedTuple):
 class Touching(ABC):
     """A body that a rod touches, and what the rod does to it.
 
-    A step is implicit in the body's inertia: to the rod it is where it would be at the step's end without the rod, and gives way by
-    F dt^2 / m and M dt^2 / I. A contact that lasts gives no more momentum than stops the body at the rod, at any time step.
+    A step is implicit in the body's inertia: to the rod it is where it would be at the step's end without the
+    rod, and gives way by F dt^2 / m and M dt^2 / I. A contact that lasts gives no more momentum than stops
+    the body at the rod, at any time step.
 
-    The rod answers a changing load with tau dF/dt more (Kelvin and Voigt): a rod without mass and damping would swing with what it
-    pushes for ever. That is implicit too: dt^2 becomes dt^2 + tau dt, and the body is expected where tau dF of the last force has
-    been taken off.
+    The rod answers a changing load with tau dF/dt more (Kelvin and Voigt): a rod without mass and damping
+    would swing with what it pushes for ever. That is implicit too: dt^2 becomes dt^2 + tau dt, and the body
+    is expected where tau dF of the last force has been taken off.
     """
 
-    def __init__(self, parts: Sequence[Part], mass: float, inertia: Floats, *, dt: float, relaxation: float, friction: float) -> None:
-        """`inertia` (3,) about the axes of the centre of mass' frame [kg m^2]; `relaxation` tau [s]; `friction` of rod on the body."""
+    def __init__(
+        self,
+        parts: Sequence[Part],
+        mass: float,
+        inertia: Floats,
+        *,
+        dt: float,
+        relaxation: float,
+        friction: float,
+    ) -> None:
+        """`inertia` (3,) about the axes of the centre of mass' frame [kg m^2]; `relaxation` tau [s];
+        `friction` of rod on the body."""
         self.dt, self.relaxation = dt, relaxation
         self.mass = mass
         """0: it does not move for the rod [kg]."""
         self._inertia: Floats = np.maximum(inertia, 1e-12)
-        self.parts = [part._replace(obstacle=dataclasses.replace(part.obstacle, friction=friction)) for part in parts]
+        self.parts = [
+            part._replace(obstacle=dataclasses.replace(part.obstacle, friction=friction)) for part in parts
+        ]
         self.names = tuple(part.obstacle.name for part in self.parts)
         self.exerted: Floats = np.zeros(6)
-        """Force [N] and moment about its centre of mass [N m] that the rod exerted on it in the last step, world."""
+        """Force [N] and moment about its centre of mass [N m] that the rod exerted on it in the last step,
+        world."""
         self._before: Floats = np.zeros(6)
 
     @abstractmethod
@@ -57,15 +71,18 @@ class Touching(ABC):
 
     @abstractmethod
     def overlap(self, capsules: Sequence[int]) -> Floats:
-        """(3,) the way out of what it overlaps most of these bodies or geoms of its engine, world [m]; zero where it overlaps none."""
+        """(3,) the way out of what it overlaps most of these bodies or geoms of its engine, world [m]; zero
+        where it overlaps none."""
 
     @abstractmethod
     def apply(self, wrench: Floats) -> None:
-        """Feel (6,) force [N] and moment about the centre of mass [N m], world, during the engine's next step."""
+        """Feel (6,) force [N] and moment about the centre of mass [N m], world, during the engine's next
+        step."""
 
     @final
     def give(self) -> tuple[float, Floats, Floats]:
-        """How far it moves per force [m/N] and turns per moment (3, 3) [rad/(N m)] in the next step, and its centre of mass (3,)."""
+        """How far it moves per force [m/N] and turns per moment (3, 3) [rad/(N m)] in the next step, and its
+        centre of mass (3,)."""
         pose = self.com().pose
         if self.mass == 0.0:
             return 0.0, np.zeros((3, 3)), pose[:3]
@@ -76,12 +93,13 @@ class Touching(ABC):
     def expected(self, capsules: Sequence[int]) -> tuple[dict[str, Floats], dict[str, Floats]]:
         """Pose (7,) and velocity (6,) of each part at the end of the next step, were it not for the rod.
 
-        What overlaps the rod's `capsules` already (a contact that was lost for a step) is expected most of the way outside: out at once
-        it would leave at overlap / dt.
+        What overlaps the rod's `capsules` already (a contact that was lost for a step) is expected most of
+        the way outside: out at once it would leave at overlap / dt.
         """
         motion = self.com()
         if self.mass > 0.0:
-            back = self.relaxation / (self.dt**2 + self.relaxation * self.dt)  # per step: tau dt of the force before, as a velocity
+            # per step: tau dt of the force before, as a velocity
+            back = self.relaxation / (self.dt**2 + self.relaxation * self.dt)
             by_force, by_moment, _ = self.give()
             change = np.concatenate([by_force * self._before[:3], by_moment @ self._before[3:]])
             motion = motion._replace(velocity=motion.velocity - back * change)
@@ -101,8 +119,8 @@ class Touching(ABC):
     def push(self, state: State) -> tuple[Floats, Floats]:
         """Exert the forces of the rod in its contacts with this body.
 
-        Returns what was exerted beyond these forces, (6,) with its moment about a point, and that point (3,): the rod's host takes
-        its opposite.
+        Returns what was exerted beyond these forces, (6,) with its moment about a point, and that point (3,):
+        the rod's host takes its opposite.
         """
         com = self.com().pose[:3]
         if self.mass == 0.0:

@@ -19,7 +19,8 @@ from fastrod.types import Floats
 _PLANE = 2.0  # m, edge of a ground without end
 _ENDLESS = 20.0  # m; a flat mesh wider than this is such a ground
 _THICK = 1e-4  # m, of a plane
-_UNKNOWN = 0.05  # m, edge of the cube that stands for what has neither a mesh that can be read nor a collision shape
+# m, edge of the cube that stands for what has neither a mesh that can be read nor a collision shape
+_UNKNOWN = 0.05
 
 
 class Shape(NamedTuple):
@@ -39,8 +40,8 @@ class Shape(NamedTuple):
 class Visuals:
     """The visual shapes of all bodies that a PyBullet world has now, and where they are from step to step.
 
-    Mesh files are read as `fastrod.contact.mesh` reads them, within `MeshLimits()`; those that are not, and meshes
-    without a file, become the box around their link's collision shape.
+    Mesh files are read as `fastrod.contact.mesh` reads them, within `MeshLimits()`; those that are not, and
+    meshes without a file, become the box around their link's collision shape.
     """
 
     def __init__(self, bullet: Any, ignore: Collection[int] = ()) -> None:
@@ -70,12 +71,15 @@ class Visuals:
         self.shapes: tuple[Shape, ...] = tuple(shapes)
 
     def poses(self) -> Floats:
-        """(n_shapes, 7) position [m] and quaternion w x y z of each shape's link now, world. Raises `HostError` where a body is gone."""
+        """(n_shapes, 7) position [m] and quaternion w x y z of each shape's link now, world. Raises
+        `HostError` where a body is gone."""
         b, found = self.bullet, dict[tuple[int, int], tuple[Any, Any]]()
         for body, back in self._frame_from_com.items():
             found[body, -1] = b.multiplyTransforms(*b.getBasePositionAndOrientation(body), *back)
         for body, links in self._links.items():
-            for link, state in zip(links, b.getLinkStates(body, links, computeForwardKinematics=1), strict=True):
+            for link, state in zip(
+                links, b.getLinkStates(body, links, computeForwardKinematics=1), strict=True
+            ):
                 found[body, link] = state[4], state[5]
         poses = np.empty((len(self._places), 7))
         for k, place in enumerate(self._places):
@@ -117,7 +121,9 @@ class Visuals:
         if link >= 0:
             position, quaternion = b.getLinkState(body, link, computeForwardKinematics=1)[4:6]
         else:
-            position, quaternion = b.multiplyTransforms(*b.getBasePositionAndOrientation(body), *self._frame_from_com[body])
+            position, quaternion = b.multiplyTransforms(
+                *b.getBasePositionAndOrientation(body), *self._frame_from_com[body]
+            )
         turn = matrix_from_quaternion(from_xyzw(quaternion)[None])[0]
         return (np.asarray(box.vertices) - position) @ turn, np.asarray(box.faces)
 
@@ -142,7 +148,11 @@ def _read(path: str, scale: Any) -> Any:
         vertices, faces = read_mesh(Path(path), MeshLimits())
     except InputError:
         return None
-    if not len(faces) or not np.isfinite(vertices).all() or not 0 <= faces.min() <= faces.max() < len(vertices):
+    if (
+        not len(faces)
+        or not np.isfinite(vertices).all()
+        or not 0 <= faces.min() <= faces.max() < len(vertices)
+    ):
         return None
     mesh: Any = trimesh.Trimesh(vertices, faces, process=False)
     mesh.merge_vertices()  # files have one for each normal: a fifth of them is enough
@@ -159,7 +169,9 @@ def _ground() -> Any:
     return ground
 
 
-def _placed(vertices: Floats, faces: NDArray[np.int64], own: bool, part: Any) -> tuple[Floats, NDArray[np.int64]]:
+def _placed(
+    vertices: Floats, faces: NDArray[np.int64], own: bool, part: Any
+) -> tuple[Floats, NDArray[np.int64]]:
     """In the link's frame."""
     if not own:
         return vertices, faces

@@ -1,6 +1,8 @@
-"""The closed loop: from logs and a robot to what the model lacks, with the error before and after on data held out.
+"""The closed loop: from logs and a robot to what the model lacks, with the error before and after on data
+held out.
 
-Stages: noise and coverage of the log; which base parameters it can see at all; base fit; outliers; then, effect by effect,
+Stages: noise and coverage of the log; which base parameters it can see at all; base fit; outliers; then,
+effect by effect,
 `search`; backward elimination; audit of what remains; verdict, bounds and advice.
 """
 
@@ -8,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -28,9 +31,11 @@ from fastrod.model.robot import Robot
 from fastrod.types import Ints
 
 MAX_EFFECTS = 4
-_SEARCH_ROWS = 1500  # samples that the search looks at; the operators run over all, and what is found is fitted to all
+# samples that the search looks at; the operators run over all, and what is found is fitted to all
+_SEARCH_ROWS = 1500
 _MENDS = 0.02  # of the error above the noise: an effect beside a dominant one that brings less is not named
-_SPARE = 2  # effects beyond max_effects that the search may hold: among many small ones the dominant one may come late
+# effects beyond max_effects that the search may hold: among many small ones the dominant one may come late
+_SPARE = 2
 _MORE_STAGES = 3  # beyond max_effects: foils take stages too
 
 
@@ -48,10 +53,10 @@ def identify(
 ) -> Result:
     """Find what the model of `robot` lacks to explain `logs`, and say how much it brings on data held out.
 
-    `held_out`: labels of runs, or `RUN@START:END` [s], that no fit sees; where none is given, every fourth stretch of each
-    run. `max_effects` at most are named. `exclude` takes effects out of the library. `free_camera` leaves registration,
-    marker offset and latency to the fit. `network` trains a small network on what is left and reports it apart. `progress`
-    is called with what is done, and how far of how much.
+    `held_out`: labels of runs, or `RUN@START:END` [s], that no fit sees; where none is given, every fourth
+    stretch of each run. `max_effects` at most are named. `exclude` takes effects out of the library.
+    `free_camera` leaves registration, marker offset and latency to the fit. `network` trains a small network
+    on what is left and reports it apart. `progress` is called with what is done, and how far of how much.
     Deterministic. Raises `LogError` for a log that cannot tell anything, `RobotError` for a wrong `[fit]`.
     """
     if isinstance(max_effects, bool) or not isinstance(max_effects, int) or max_effects < 0:
@@ -60,14 +65,20 @@ def identify(
         check_network()
     log = merged([logs] if isinstance(logs, RunLog) else list(logs))
     if not log.driven.any():
-        raise LogError(f"log {log.name!r} has no row in which every input is there; there is nothing to drive the model with.")
+        raise LogError(
+            f"log {log.name!r} has no row in which every input is there; there is nothing to "
+            "drive the model with."
+        )
     samples = sample(log)
     check_log(samples, robot)
     tell = progress or (lambda *_: None)
     tested, labels = held_out_rows(samples, held_out)
     train = samples.rows[~tested[samples.rows]]
     if len(train) < LEAST_ROWS:
-        raise LogError(f"log {log.name!r} leaves {len(train)} rows to fit once {', '.join(labels)} are held out; it needs {LEAST_ROWS}.")
+        raise LogError(
+            f"log {log.name!r} leaves {len(train)} rows to fit once {', '.join(labels)} are held "
+            f"out; it needs {LEAST_ROWS}."
+        )
     base_model(robot, free_camera=free_camera)  # refuses a wrong [fit] before anything is solved
     chosen = _thinned(train, _SEARCH_ROWS)
     tell("registration", 0, max_effects + _SPARE + 2)
@@ -87,19 +98,36 @@ def identify(
     state, found = _library(search, base, start, last, found, max_effects, steps) if found else (start, found)
     if search.spent:
         base.notes.append(
-            f"the search stopped early: the model hardly converges, and has taken {MOST_PASSES:.0f} passes for each row; "
+            f"the search stopped early: the model hardly converges, and has taken {MOST_PASSES:.0f} passes "
+            "for each row; "
             "more effects may be missing"
         )
     tell("prediction on all samples", max_effects + _SPARE + 1, max_effects + _SPARE + 2)
     result = assemble(
-        samples=samples, rows=_thinned(train, ALL_AT_ONCE), tested=tested, labels=labels, base=base, search=search, start=start, last=last,
-        last_sigma=last_sigma, state=state, found=found, steps=steps, fixed=fixed, threads=threads,
-    )  # fmt: skip
+        samples=samples,
+        rows=_thinned(train, ALL_AT_ONCE),
+        tested=tested,
+        labels=labels,
+        base=base,
+        search=search,
+        start=start,
+        last=last,
+        last_sigma=last_sigma,
+        state=state,
+        found=found,
+        steps=steps,
+        fixed=fixed,
+        threads=threads,
+    )
     if placed is not robot:
         at = between(robot, result.identified)
         sentence = f"{at.sentence().capitalize()}; all errors are given with it registered there."
         result = replace(result, registration=at, summary=f"{result.summary} {sentence}")
     return replace(result, network=residual_network(samples, model.wiring, result)) if network else result
+
+
+def _report_stage(tell: Callable[[str, int, int], None], stage: int, max_effects: int, name: str) -> None:
+    tell(name, min(stage + 1, max_effects), max_effects + 2)
 
 
 def _found(
@@ -109,7 +137,7 @@ def _found(
     state, steps = start, list[Step]()
     found: list[str] = []
     for stage in range(max_effects + _MORE_STAGES):
-        search.report = lambda name, stage=stage: tell(name, min(stage + 1, max_effects), max_effects + 2)  # type: ignore[misc]
+        search.report = partial(_report_stage, tell, stage, max_effects)
         step = search.stage(state)
         if step.taken is None and stage == 0:
             pair = _pair(search, state, step)
@@ -121,17 +149,29 @@ def _found(
             break
         state = base.weighed(search, step.taken.state)
         if step.taken.foil is None:
-            found += [name for name in state.model.effects if name not in found and name not in start.model.effects]
+            found += [
+                name for name in state.model.effects if name not in found and name not in start.model.effects
+            ]
     return found, state, steps
 
 
 def _library(
-    search: Search, base: Base, start: State, state: State, found: list[str], max_effects: int, steps: list[Step]
+    search: Search,
+    base: Base,
+    start: State,
+    state: State,
+    found: list[str],
+    max_effects: int,
+    steps: list[Step],
 ) -> tuple[State, list[str]]:
     """The effects that are needed once foils are gone, with their state."""
     alone = search.bare(state) if state.foils else state
     noise = start.fit.residual.size * float((base.noise.sigma**2).mean())
-    while state.foils and len(found) < max_effects and alone.fit.loss * float((base.target.sigma**2).mean()) > 2.0 * noise:
+    while (
+        state.foils
+        and len(found) < max_effects
+        and alone.fit.loss * float((base.target.sigma**2).mean()) > 2.0 * noise
+    ):
         step = search.stage(alone, with_foils=False)
         if step.taken is None or step.taken.state is None:
             break
@@ -150,7 +190,10 @@ def _library(
 
 def _pair(search: Search, state: State, step: Step) -> Step | None:
     """Two effects at once, where none passes alone: of the five that come nearest."""
-    near = sorted((c for c in step.candidates if c.state is not None and c.foil is None and c.share > 0.01), key=lambda c: -c.share)[:5]
+    near = sorted(
+        (c for c in step.candidates if c.state is not None and c.foil is None and c.share > 0.01),
+        key=lambda c: -c.share,
+    )[:5]
     best: Candidate | None = None
     for i, one in enumerate(near):
         for other in near[i + 1 :]:

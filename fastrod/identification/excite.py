@@ -1,8 +1,9 @@
 """The run that separates effects: which way to move a robot, so that its log can tell what the model lacks.
 
-Rest; four blocks in base orientations A-B-B-A with a known load off-on-off-on; rest; the first block's start again. Each
-block moves one segment at a time and then all, in triangles of decreasing amplitude, circles, holds and at random. Which
-part separates which pair of effects was measured on simulated logs by leaving it out.
+Rest; four blocks in base orientations A-B-B-A with a known load off-on-off-on; rest; the first block's start
+again. Each block moves one segment at a time and then all, in triangles of decreasing amplitude, circles,
+holds and at random. Which part separates which pair of effects was measured on simulated logs by leaving it
+out.
 """
 
 from __future__ import annotations
@@ -51,10 +52,12 @@ class Excitation:
     @property
     def comment(self) -> str:
         """The parts as text, a line each."""
-        lines = [f"{part.start:7.1f} to {part.end:6.1f} s  {part.name}: {part.purpose}" for part in self.parts]
+        lines = [
+            f"{part.start:7.1f} to {part.end:6.1f} s  {part.name}: {part.purpose}" for part in self.parts
+        ]
         return (
-            "Inputs of a run that separates effects; drive them, fill tip_x tip_y tip_z, and give the file to fastrod identify.\n"
-            + "\n".join(lines)
+            "Inputs of a run that separates effects; drive them, fill tip_x tip_y tip_z, and give the file "
+            "to fastrod identify.\n" + "\n".join(lines)
         )
 
 
@@ -68,8 +71,9 @@ def excitation(
     speed: float = 1.0,
     seed: int = 1,
 ) -> Excitation:
-    """The run for `robot`: largest bend of a segment `bend` [rad], known tip mass `payload` [kg] on and off, samples at `rate` [Hz],
-    triangles at `speed` [rad/s]. Without `payload`, one that bends the robot well but does not make it snap, F l^2 / EI = 1. Without
+    """The run for `robot`: largest bend of a segment `bend` [rad], known tip mass `payload` [kg] on and off,
+    samples at `rate` [Hz], triangles at `speed` [rad/s]. Without `payload`, one that bends the robot well but
+    does not make it snap, F l^2 / EI = 1. Without
     `turn` the base stays as it is, where a bench cannot be turned.
 
     Raises `InputError` for a robot that wires do not drive, or for numbers that are not positive.
@@ -105,7 +109,9 @@ def excitation(
     blocks = [_block(wiring, bend, rate, speed, number, rng) for number in range(4)]
     add("rest", still(REST), "noise of the camera, zero of the drives")
     turned, loaded = [np.zeros(len(rows[0]), bool)], [np.zeros(len(rows[0]), bool)]
-    for number, (pieces, other, load) in enumerate(zip(blocks, (False, True, True, False), (False, True, False, True), strict=True)):
+    for number, (pieces, other, load) in enumerate(
+        zip(blocks, (False, True, True, False), (False, True, False, True), strict=True)
+    ):
         other = other and turn
         label = f"block {number + 1}, base {'B' if other else 'A'}{', load on' if load and payload else ''}"
         before = sum(len(r) for r in rows)
@@ -121,7 +127,11 @@ def excitation(
         loaded.append(np.full(added, load))
     first = np.concatenate([what for _, what, _ in blocks[0]])[: round(_REPEAT * rate)]
     add("rest", still(REST), "the same again: slow drift, plastic set")
-    add("repeat", first, "the start of the first block again: drift, temperature, plastic set, a base that slipped")
+    add(
+        "repeat",
+        first,
+        "the start of the first block again: drift, temperature, plastic set, a base that slipped",
+    )
     add("return", _line(first[-1], np.zeros_like(first[-1]), bend, rate, speed), "back to rest")
     path = np.concatenate(rows)
     rest = len(path) - sum(len(a) for a in turned)
@@ -145,8 +155,11 @@ def excitation(
     return Excitation(log, tuple(parts))
 
 
-def _block(wiring: Wiring, bend: float, rate: float, speed: float, number: int, rng: np.random.Generator) -> list[tuple[str, Floats, str]]:
-    """Pieces of one block, each (name, (n, n_segments, 2) bends [rad], purpose), from straight to straight."""
+def _block(
+    wiring: Wiring, bend: float, rate: float, speed: float, number: int, rng: np.random.Generator
+) -> list[tuple[str, Floats, str]]:
+    """Pieces of one block, each (name, (n, n_segments, 2) bends [rad], purpose), from straight to
+    straight."""
     n = wiring.n_segments
     zero = np.zeros((n, 2))
     pieces: list[tuple[str, Floats, str]] = []
@@ -157,7 +170,11 @@ def _block(wiring: Wiring, bend: float, rate: float, speed: float, number: int, 
         corners = [zero, *(side * share * bend * unit for share in _LADDER for side in (1.0, -1.0)), zero]
         alone = f" of segment {k + 1} alone" if n > 1 else ""
         pieces.append(
-            (f"triangles{alone}", _through(corners, bend, rate, speed), "friction against backlash and slack, by reversals of many sizes")
+            (
+                f"triangles{alone}",
+                _through(corners, bend, rate, speed),
+                "friction against backlash and slack, by reversals of many sizes",
+            )
         )
     slow = number % 2 == 0
     turns = _circle(n, 0.75 * bend, rate, 6.0 if slow else 2.5, 1.0 if slow else -1.0)

@@ -23,7 +23,7 @@ from fastrod.types import (
     Shape,
     Surfaces,
     Touching,
-)  # fmt: skip
+)
 
 from .contact.bvh import STACK
 from .contact.contact_set import T_ARM, T_FORCE, T_N, T_S
@@ -61,10 +61,12 @@ def _pass(
     process: float,
     noise: float,
 ) -> None:
-    """One forward pass of the robots with these indices, chunk by chunk, in as many parts as `scratch` has rows.
+    """One forward pass of the robots with these indices, chunk by chunk, in as many parts as `scratch` has
+    rows.
 
-    `scratch` is (n_parts, scratch_size). Flags: `feed` moves x to first order to the new inputs before the pass; `carry`
-    keeps the covariance between passes; `update` corrects x after it with P- = P + `process` and the residual variance
+    `scratch` is (n_parts, scratch_size). Flags: `feed` moves x to first order to the new inputs before the
+    pass; `carry` keeps the covariance between passes; `update` corrects x after it with P- = P + `process`
+    and the residual variance
     `noise` [m^2]. Which part does a chunk changes no bit of it.
     """
     n, n_parts = len(robots), scratch.shape[0]
@@ -75,9 +77,24 @@ def _pass(
             for w in range(LANES):
                 lanes[w] = robots[start + min(w, count - 1)]
             pass_chunk(
-                lanes, count, params, ports, layout, memory, shape, response, probes, start, scratch[part],
-                n_col, feed, carry, update, process, noise,
-            )  # fmt: skip
+                lanes,
+                count,
+                params,
+                ports,
+                layout,
+                memory,
+                shape,
+                response,
+                probes,
+                start,
+                scratch[part],
+                n_col,
+                feed,
+                carry,
+                update,
+                process,
+                noise,
+            )
 
 
 def _iterate(
@@ -106,7 +123,8 @@ def _iterate(
     status: Ints,
     scratch: Floats,
 ) -> None:
-    """One contact iteration (`iterate_world`) of the worlds whose rows begin at worlds[0], worlds[1], ...; the last entry is the end.
+    """One contact iteration (`iterate_world`) of the worlds whose rows begin at worlds[0], worlds[1], ...;
+    the last entry is the end.
 
     The fields of the `Scenery` come one by one, for numba hands no tuple of tuples to threads.
     """
@@ -114,12 +132,35 @@ def _iterate(
     for part in prange(n_parts):
         for k in range(part, len(worlds) - 1, n_parts):
             scenery = Scenery(
-                rods, surfaces, frames, frames_before, frames_slip, shape, before, tracked, slides, tolerance, margin, damping
+                rods,
+                surfaces,
+                frames,
+                frames_before,
+                frames_slip,
+                shape,
+                before,
+                tracked,
+                slides,
+                tolerance,
+                margin,
+                damping,
             )
             iterate_world(
-                worlds[k], worlds[k + 1], rows, scenery, touching, clearance, probes, memory, proposed, unknown, gap, trouble, status,
+                worlds[k],
+                worlds[k + 1],
+                rows,
+                scenery,
+                touching,
+                clearance,
+                probes,
+                memory,
+                proposed,
+                unknown,
+                gap,
+                trouble,
+                status,
                 scratch[part],
-            )  # fmt: skip
+            )
 
 
 @entry
@@ -134,10 +175,18 @@ def place_all(s: Floats, starts: Floats, n_steps: int, grid: Floats, node: Ints)
 
 @entry
 def arrange(
-    rows: Ints, touching: Touching, s_given: Floats, starts: Floats, n_steps: int, grid: Floats, node_given: Ints, probes: Probes
+    rows: Ints,
+    touching: Touching,
+    s_given: Floats,
+    starts: Floats,
+    n_steps: int,
+    grid: Floats,
+    node_given: Ints,
+    probes: Probes,
 ) -> bool:
-    """Put a node under every contact of these robots, and under the point forces that were given (arclengths `s_given`
-    (n_robots, m)); fills the loads of `probes`. False where a segment has more of them than nodes."""
+    """Put a node under every contact of these robots, and under the point forces that were given (arclengths
+    `s_given` (n_robots, m)); fills the loads of `probes`. False where a segment has more of them than
+    nodes."""
     m, n_slots = s_given.shape[1], probes.node.shape[1]
     s, node, work = np.empty(m + n_slots), np.empty(m + n_slots, np.int64), np.empty(m + n_slots)
     fits = True
@@ -155,7 +204,9 @@ def arrange(
             for a in range(3):
                 taken = q < touching.used[i]
                 probes.force[r, q, a] = touching.slot[i, q, T_FORCE + a] if taken else 0.0
-                probes.arm[r, q, a] = -touching.slot[i, q, T_ARM] * touching.slot[i, q, T_N + a] if taken else 0.0
+                probes.arm[r, q, a] = (
+                    -touching.slot[i, q, T_ARM] * touching.slot[i, q, T_N + a] if taken else 0.0
+                )
     return fits
 
 
@@ -185,17 +236,35 @@ def _look(
         for r in range(part, len(rows), n_parts):
             i = rows[r]
             scenery = Scenery(
-                rods, surfaces, frames, frames_before, frames_slip, shape, before, tracked, slides, tolerance, margin, damping
+                rods,
+                surfaces,
+                frames,
+                frames_before,
+                frames_slip,
+                shape,
+                before,
+                tracked,
+                slides,
+                tolerance,
+                margin,
+                damping,
             )
             n_found[r], gap[i] = look_at(i, scenery, clearance, found[r], scratch[part])
 
 
 @entry
 def cast_rays(
-    origin: Floats, direction: Floats, longest: float, surfaces: Surfaces, frames: Floats, distance: Floats, obstacle: Ints, normal: Floats
+    origin: Floats,
+    direction: Floats,
+    longest: float,
+    surfaces: Surfaces,
+    frames: Floats,
+    distance: Floats,
+    obstacle: Ints,
+    normal: Floats,
 ) -> None:
-    """Nearest obstacle along the unit directions (n_robots, m, 3): `distance`, infinite where none is met up to `longest`, which
-    obstacle, or -1, and the outward normal there."""
+    """Nearest obstacle along the unit directions (n_robots, m, 3): `distance`, infinite where none is met up
+    to `longest`, which obstacle, or -1, and the outward normal there."""
     stack = np.empty(2 * STACK)
     for i in range(origin.shape[0]):
         at = frames[i if len(frames) > 1 else 0]
@@ -216,11 +285,23 @@ def cast_rays(
 def look_at_rods(worlds: Ints, rows: Ints, scenery: Scenery, touching: Touching, gap: Floats) -> None:
     """Lower each robot's smallest gap to that between rods (`search_rods`)."""
     for k in range(len(worlds) - 1):
-        search_rods(worlds[k], worlds[k + 1], rows, scenery.shape, scenery.rods, touching, len(scenery.surfaces.kind), 0.0, gap, False)
+        search_rods(
+            worlds[k],
+            worlds[k + 1],
+            rows,
+            scenery.shape,
+            scenery.rods,
+            touching,
+            len(scenery.surfaces.kind),
+            0.0,
+            gap,
+            False,
+        )
 
 
 def _named(body: Callable[..., None], name: str) -> Callable[..., None]:
-    """The body under a name of its own: numba's cache would hand the serial code to a parallel function of the same name."""
+    """The body under a name of its own: numba's cache would hand the serial code to a parallel function of
+    the same name."""
     twin = FunctionType(body.__code__, body.__globals__, name)
     twin.__qualname__ = name
     return twin

@@ -1,7 +1,8 @@
 """How kernels are compiled: one set of flags, and a cache that never goes stale.
 
-numba keys its cache on the one file of the cached function, so an edit in a helper module would give stale results.
-The cache directory is therefore named after a hash of every kernel source, of the arrays' names and of numba's version.
+numba keys its cache on the one file of the cached function, so an edit in a helper module would give stale
+results. The cache directory is therefore named after a hash of every kernel source, of the arrays' names and
+of numba's version.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ _njit: Any = numba.njit  # its type does not know _nrt
 LANES = 16
 """Robots that one pass of a kernel's inner loop holds side by side; the loop over them becomes SIMD code."""
 
-# contract: fused multiply-add. arcp: x / 6 is x times 1/6. nsz: x + 0 is x. None of them may assume that NaN is absent:
+# contract: fused multiply-add. arcp: x / 6 is x times 1/6. nsz: x + 0 is x. None of them may assume that NaN
+# is absent:
 # NaN is how a lost robot is seen.
 _FAST = {"arcp", "contract", "nsz"}
 
@@ -36,7 +38,12 @@ def _cache_dir() -> str | None:
     for source in (*sorted(here.rglob("*.py")), here.parent / "types.py"):
         digest.update(source.name.encode() + source.read_bytes())
     name = digest.hexdigest()[:16]
-    homes = [os.environ.get("FASTROD_CACHE_DIR"), os.environ.get("XDG_CACHE_HOME"), Path.home() / ".cache", tempfile.gettempdir()]
+    homes = [
+        os.environ.get("FASTROD_CACHE_DIR"),
+        os.environ.get("XDG_CACHE_HOME"),
+        Path.home() / ".cache",
+        tempfile.gettempdir(),
+    ]
     for home in homes:
         if not home:
             continue
@@ -58,14 +65,15 @@ announce(cached=CACHE_DIR is not None)
 def kernel(function: _Function) -> _Function:
     """Compile `function` as part of the `entry` that calls it.
 
-    Without numba's reference counts: an atomic increment for each array of a NamedTuple at each call cost as much as the
-    arithmetic. A kernel may therefore slice arrays but not make them.
+    Without numba's reference counts: an atomic increment for each array of a NamedTuple at each call cost as
+    much as the arithmetic. A kernel may therefore slice arrays but not make them.
     """
     return cast(_Function, _njit(error_model="numpy", fastmath=_FAST, nogil=True, _nrt=False)(function))
 
 
 def entry(function: _Function) -> _Function:
-    """Compile what Python calls, on first call, and keep it across processes where a folder is writable. It may make arrays."""
+    """Compile what Python calls, on first call, and keep it across processes where a folder is writable. It
+    may make arrays."""
     return _compile(function)
 
 
@@ -75,7 +83,8 @@ def parallel_entry(function: _Function) -> _Function:
 
 
 def inline(function: _Function) -> _Function:
-    """A helper that LLVM pastes into its caller: a call left in a loop over lanes would keep it from becoming SIMD code.
+    """A helper that LLVM pastes into its caller: a call left in a loop over lanes would keep it from becoming
+    SIMD code.
 
     numba's own inline="always" pastes before typing and compiles three times as long.
     """
@@ -86,7 +95,9 @@ def _compile(function: _Function, **options: bool) -> _Function:
     before = _config.CACHE_DIR
     _config.CACHE_DIR = CACHE_DIR or before
     try:
-        made = _njit(cache=CACHE_DIR is not None, error_model="numpy", fastmath=_FAST, nogil=True, **options)(function)
+        made = _njit(cache=CACHE_DIR is not None, error_model="numpy", fastmath=_FAST, nogil=True, **options)(
+            function
+        )
     finally:
         _config.CACHE_DIR = before
     return cast(_Function, made)

@@ -1,4 +1,5 @@
-"""Say on stderr that a kernel is being compiled: a first run that prints nothing for half a minute looks hung."""
+"""Say on stderr that a kernel is being compiled: a first run that prints nothing for half a minute looks
+hung."""
 
 from __future__ import annotations
 

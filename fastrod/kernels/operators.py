@@ -1,8 +1,8 @@
 """Operators with memory on the lengths of the wires: rows (robots or parameter sets) x steps x wires.
 
-Each changes `x` (n_rows, n_steps, n_wires) in place from command to effect and carries `memory` (n_rows, ...) on; nan in
-the memory means that the wire begins at rest at its first length. `dt` (n_steps,) is the time before each step [s].
-Parameters have the shape (n_rows, n_wires), so that every wire may have its own.
+Each changes `x` (n_rows, n_steps, n_wires) in place from command to effect and carries `memory` (n_rows, ...)
+on; nan in the memory means that the wire begins at rest at its first length. `dt` (n_steps,) is the time
+before each step [s]. Parameters have the shape (n_rows, n_wires), so that every wire may have its own.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ BUFFER = 128
 
 @entry
 def play(x: Floats, memory: Floats, half_width: Floats, rounding: Floats) -> None:
-    """Backlash: the output p stays until the input has crossed the gap, |x - p| <= w; with a rounding c the mean of three
-    plays of half widths w (1 - c), w, w (1 + c). memory (n_rows, 3 n_wires): p."""
+    """Backlash: the output p stays until the input has crossed the gap, |x - p| <= w; with a rounding c the
+    mean of three plays of half widths w (1 - c), w, w (1 + c). memory (n_rows, 3 n_wires): p."""
     n = x.shape[2]
     for r in range(x.shape[0]):
         for w in range(n):
@@ -46,12 +46,20 @@ def play(x: Floats, memory: Floats, half_width: Floats, rounding: Floats) -> Non
 
 
 @entry
-def elastoplastic(x: Floats, memory: Floats, amplitude: Floats, presliding: Floats, spread: Floats, growth: Floats, angle: Floats) -> None:
-    """Dry friction without rates: sliders in parallel, each sticking until it has been dragged by its own r_j (Iwan,
-    Prandtl and Ishlinskii): z_j = min(1, max(-1, z_j + x' / r_j)), out x - a (1 + g angle) mean z_j.
+def elastoplastic(
+    x: Floats,
+    memory: Floats,
+    amplitude: Floats,
+    presliding: Floats,
+    spread: Floats,
+    growth: Floats,
+    angle: Floats,
+) -> None:
+    """Dry friction without rates: sliders in parallel, each sticking until it has been dragged by its own r_j
+    (Iwan, Prandtl and Ishlinskii): z_j = min(1, max(-1, z_j + x' / r_j)), out x - a (1 + g angle) mean z_j.
 
-    The radii are spread evenly in their logarithm over r exp(-s) to r exp(s). angle (n_rows, n_steps, n_wires) wrapped by the wire [rad];
-    memory (n_rows, (1 + SLIDERS) n_wires): x, z_j.
+    The radii are spread evenly in their logarithm over r exp(-s) to r exp(s). angle (n_rows, n_steps,
+    n_wires) wrapped by the wire [rad]; memory (n_rows, (1 + SLIDERS) n_wires): x, z_j.
     """
     n = x.shape[2]
     for r in range(x.shape[0]):
@@ -79,7 +87,8 @@ def elastoplastic(x: Floats, memory: Floats, amplitude: Floats, presliding: Floa
 
 @entry
 def relaxation(x: Floats, memory: Floats, share: Floats, time_constant: Floats, dt: Floats) -> None:
-    """Standard linear solid: out x - c (x - y), tau y' = x - y, x linear in between; memory (n_rows, 2 n_wires): x, y."""
+    """Standard linear solid: out x - c (x - y), tau y' = x - y, x linear in between; memory (n_rows, 2
+    n_wires): x, y."""
     n = x.shape[2]
     for r in range(x.shape[0]):
         for w in range(n):
@@ -100,7 +109,8 @@ def relaxation(x: Floats, memory: Floats, share: Floats, time_constant: Floats, 
 
 @entry
 def second_order(x: Floats, memory: Floats, period: Floats, damping: Floats, dt: Floats) -> None:
-    """T^2 y'' + 2 z T y' + y = x, exact for x linear in between; T = 0 is y = x. memory (n_rows, 3 n_wires): x, y, y'."""
+    """T^2 y'' + 2 z T y' + y = x, exact for x linear in between; T = 0 is y = x. memory (n_rows, 3 n_wires):
+    x, y, y'."""
     n = x.shape[2]
     for r in range(x.shape[0]):
         for w in range(n):
@@ -128,8 +138,9 @@ def second_order(x: Floats, memory: Floats, period: Floats, damping: Floats, dt:
 
 @entry
 def yielding(bend: Floats, memory: Floats, share: Floats, yield_at: Floats) -> None:
-    """Plastic set of bends (n_rows, n_steps, n_segments, 2), in place: out b + c p, p dragged along once |b - p| exceeds y, in any
-    direction; it begins at the straight rod. memory (n_rows, 2 n_segments): p; share and yield_at (n_rows, n_segments)."""
+    """Plastic set of bends (n_rows, n_steps, n_segments, 2), in place: out b + c p, p dragged along once |b -
+    p| exceeds y, in any direction; it begins at the straight rod. memory (n_rows, 2 n_segments): p; share and
+    yield_at (n_rows, n_segments)."""
     for r in range(bend.shape[0]):
         for k in range(bend.shape[2]):
             px, py = memory[r, 2 * k], memory[r, 2 * k + 1]
@@ -151,8 +162,8 @@ def yielding(bend: Floats, memory: Floats, share: Floats, yield_at: Floats) -> N
 def delay(x: Floats, memory: Floats, lag: Floats, dt: Floats) -> None:
     """Out x(t - d), a monotone cubic through the four samples around it, linear where there are not four.
 
-    lag (n_rows,) [s]. memory (n_rows, 1 + BUFFER (1 + n_wires)): count, then clock and lengths of each past step. Before the
-    first step the wires are taken as at rest there.
+    lag (n_rows,) [s]. memory (n_rows, 1 + BUFFER (1 + n_wires)): count, then clock and lengths of each past
+    step. Before the first step the wires are taken as at rest there.
     """
     n = x.shape[2]
     width = 1 + n
@@ -194,7 +205,8 @@ def delay(x: Floats, memory: Floats, lag: Floats, dt: Floats) -> None:
                     earlier = (old - memory[r, oldest + 1 + w]) / before
                     # between the last two samples there is none beyond: the parabola's slope at its end
                     later = (memory[r, newest + 1 + w] - new) / after if after > 0.0 else 2.0 * here - earlier
-                    # slopes at both ends; zero where the wire reverses and at most three times either neighbour, so that nothing
+                    # slopes at both ends; zero where the wire reverses and at most three times either
+                    # neighbour, so that nothing
                     # overshoots (Fritsch and Carlson 1980)
                     a = (earlier * span + here * before) / (span + before) if earlier * here > 0.0 else 0.0
                     reach = after if after > 0.0 else before

@@ -1,4 +1,5 @@
-"""3-vectors, rotations and symmetric 3x3 matrices as tuples of floats: they stay in registers, so a helper costs nothing.
+"""3-vectors, rotations and symmetric 3x3 matrices as tuples of floats: they stay in registers, so a helper
+costs nothing.
 
 A rotation or matrix is its nine entries row by row; a symmetric matrix its xx, xy, xz, yy, yz, zz.
 """
@@ -91,10 +92,16 @@ def from_quaternion(q: tuple[float, float, float, float]) -> Mat:
     """Rotation of a unit quaternion w x y z."""
     w, x, y, z = q
     return (
-        1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
-        2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x),
-        2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y),
-    )  # fmt: skip
+        1.0 - 2.0 * (y * y + z * z),
+        2.0 * (x * y - w * z),
+        2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z),
+        1.0 - 2.0 * (x * x + z * z),
+        2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y),
+        2.0 * (y * z + w * x),
+        1.0 - 2.0 * (x * x + y * y),
+    )
 
 
 @inline
@@ -114,15 +121,24 @@ def sym_inv(s: Sym) -> Sym:
     xy = s[2] * s[4] - s[1] * s[5]
     xz = s[1] * s[4] - s[2] * s[3]
     k = 1.0 / (s[0] * xx + s[1] * xy + s[2] * xz)
-    return k * xx, k * xy, k * xz, k * (s[0] * s[5] - s[2] * s[2]), k * (s[1] * s[2] - s[0] * s[4]), k * (s[0] * s[3] - s[1] * s[1])
+    return (
+        k * xx,
+        k * xy,
+        k * xz,
+        k * (s[0] * s[5] - s[2] * s[2]),
+        k * (s[1] * s[2] - s[0] * s[4]),
+        k * (s[0] * s[3] - s[1] * s[1]),
+    )
 
 
 @inline
 def exp_map(o: Vec) -> tuple[Mat, float, float, float]:
-    """Rotation exp([o]x), and (a, b, c) of its derivative: psi = a do + b (o.do) o - c o x do, with dC = C [psi]x.
+    """Rotation exp([o]x), and (a, b, c) of its derivative: psi = a do + b (o.do) o - c o x do, with dC = C
+    [psi]x.
 
-    Taken through the Cayley vector p = g o, g = 2 tan(|o|/2)/|o| as a series in |o|^2: exactly a rotation for any o,
-    and no sine, for which these machines have no SIMD code. The series' first neglected term is 31 |o|^8 / 362880.
+    Taken through the Cayley vector p = g o, g = 2 tan(|o|/2)/|o| as a series in |o|^2: exactly a rotation for
+    any o, and no sine, for which these machines have no SIMD code. The series' first neglected term is 31
+    |o|^8 / 362880.
     """
     t = dot(o, o)
     g = 1.0 + t * (1.0 / 12.0 + t * (1.0 / 120.0 + t * (17.0 / 20160.0)))
@@ -130,7 +146,14 @@ def exp_map(o: Vec) -> tuple[Mat, float, float, float]:
     k = 1.0 / (1.0 + 0.25 * g * g * t)
     a = k * g
     c = 0.5 * a * g
-    xx, xy, xz, yy, yz, zz = c * o[0] * o[0], c * o[0] * o[1], c * o[0] * o[2], c * o[1] * o[1], c * o[1] * o[2], c * o[2] * o[2]
+    xx, xy, xz, yy, yz, zz = (
+        c * o[0] * o[0],
+        c * o[0] * o[1],
+        c * o[0] * o[2],
+        c * o[1] * o[1],
+        c * o[1] * o[2],
+        c * o[2] * o[2],
+    )
     x, y, z = a * o[0], a * o[1], a * o[2]
     rotation = (1.0 - yy - zz, xy - z, xz + y, xy + z, 1.0 - xx - zz, yz - x, xz - y, yz + x, 1.0 - xx - yy)
     return rotation, a, k * dg, c
@@ -142,4 +165,8 @@ def exp_map_variation(o: Vec, coefficients: Vec, do: Vec) -> Vec:
     a, b, c = coefficients
     along = b * dot(o, do)
     turn = cross(o, do)
-    return a * do[0] + along * o[0] - c * turn[0], a * do[1] + along * o[1] - c * turn[1], a * do[2] + along * o[2] - c * turn[2]
+    return (
+        a * do[0] + along * o[0] - c * turn[0],
+        a * do[1] + along * o[1] - c * turn[1],
+        a * do[2] + along * o[2] - c * turn[2],
+    )

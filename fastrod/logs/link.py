@@ -1,4 +1,5 @@
-"""`RobotLink`: a robot that is driven by its wires and tells where it is; a simulated one, an emulated one and a prototype all are."""
+"""`RobotLink`: a robot that is driven by its wires and tells where it is; a simulated one, an emulated one
+and a prototype all are."""
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ from fastrod.types import Floats
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Measurement:
-    """One reading of a robot, in the units, signs and frames of a `RunLog` row. What a robot cannot tell is nan.
+    """One reading of a robot, in the units, signs and frames of a `RunLog` row. What a robot cannot tell is
+    nan.
 
     Raises `InputError` where a length, a position or a quaternion has the wrong shape.
     """
@@ -23,7 +25,8 @@ class Measurement:
     t: float
     """Time of the reading by the robot's own clock [s]."""
     dl: Floats
-    """(n_tendons,) change of each tendon's length against the straight rest robot, as the motors report it [m]; negative = pulled."""
+    """(n_tendons,) change of each tendon's length against the straight rest robot, as the motors report it
+    [m]; negative = pulled."""
     ext: Floats
     """(n_segments,) change of each segment's backbone length [m]."""
     tip_position: Floats
@@ -40,14 +43,17 @@ class Measurement:
         for name in ("dl", "ext", "tip_position", "tip_quaternion", "tension"):
             value = np.array(getattr(self, name), dtype=np.float64)
             if value.ndim != 1 or value.size != sizes.get(name, value.size):
-                raise InputError(f"Measurement.{name} has shape {value.shape}; it must be ({sizes.get(name, 'n')},).")
+                raise InputError(
+                    f"Measurement.{name} has shape {value.shape}; it must be ({sizes.get(name, 'n')},)."
+                )
             value.setflags(write=False)
             object.__setattr__(self, name, value)
 
 
 @runtime_checkable
 class RobotLink(Protocol):
-    """What teleop drives and a recorder records. Commands and readings may come from different threads; none of them waits for motion."""
+    """What teleop drives and a recorder records. Commands and readings may come from different threads; none
+    of them waits for motion."""
 
     @property
     def robot(self) -> Robot:
@@ -58,8 +64,9 @@ class RobotLink(Protocol):
         """Motion may do harm: it stops when nobody watches."""
 
     def command(self, dl: ArrayLike, ext: ArrayLike | None = None) -> None:
-        """Go to these changes of tendon length (n_tendons,) [m], negative = pulled, and of segment length (n_segments,) [m]. A link that is
-        stopped ignores it. Raises `InputError` for what no robot of this kind can be told."""
+        """Go to these changes of tendon length (n_tendons,) [m], negative = pulled, and of segment length
+        (n_segments,) [m]. A link that is stopped ignores it. Raises `InputError` for what no robot of this
+        kind can be told."""
 
     def read(self) -> Measurement:
         """The newest reading."""

@@ -1,4 +1,5 @@
-"""Recording: the readings of a session as a run log, on disk row by row, so that a killed session loses nothing."""
+"""Recording: the readings of a session as a run log, on disk row by row, so that a killed session loses
+nothing."""
 
 from __future__ import annotations
 
@@ -31,19 +32,21 @@ _ALWAYS = ("t", "run", *_TIP, *_TIP_QUATERNION, *_TIP_FORCE, "payload", *_BASE_Q
 _KNOWN = r"t|run|payload|tip_(q?[xyz]|qw|f[xyz])|base_q[wxyz]|(dl|ext|cmd_dl|tension)_\d+|p\d+_[xyz]"
 """Names of columns that are a recorder's own, or a run log's."""
 _QUATERNION_SLACK = 1e-2  # what `read_log` allows
-_NUDGES = (1, -1, 2, -2, 3, -3, 4, -4)  # last places of one component: dividing by the norm alone need not end at norm 1
+# last places of one component: dividing by the norm alone need not end at norm 1
+_NUDGES = (1, -1, 2, -2, 3, -3, 4, -4)
 
 
 @final
 class Recorder:
     """Readings as the rows of a `RunLog`.
 
-    Each row goes to PATH.part at once, in one write to the operating system: a process that is killed loses none. Rows are not forced
-    onto the disk itself (fsync), so a machine that loses power may lose the last seconds. `stop` writes the finished log to PATH and
-    takes the part away; what a killed session leaves, `recover` turns into a log. Where PATH.part is removed
-    or renamed, or its folder is, the next row notices: all rows are written again at PATH, or, where that
-    cannot be, in the system's temporary folder. Rows without a measured tip are kept. Commands
-    (cmd_dl_1 ...), tensions (tension_1 ...) and `extra` are kept as further columns. May be used from several threads.
+    Each row goes to PATH.part at once, in one write to the operating system: a process that is killed loses
+    none. Rows are not forced onto the disk itself (fsync), so a machine that loses power may lose the last
+    seconds. `stop` writes the finished log to PATH and takes the part away; what a killed session leaves,
+    `recover` turns into a log. Where PATH.part is removed or renamed, or its folder is, the next row notices:
+    all rows are written again at PATH, or, where that cannot be, in the system's temporary folder. Rows
+    without a measured tip are kept. Commands (cmd_dl_1 ...), tensions (tension_1 ...) and `extra` are kept as
+    further columns. May be used from several threads.
     """
 
     def __init__(
@@ -55,12 +58,12 @@ class Recorder:
         extra: Sequence[str] = (),
         on_move: Callable[[str], None] | None = None,
     ) -> None:
-        """Record `robot` to the .csv or .parquet at `path`, or, where it is None, in memory alone; `extra` names further columns of
-        numbers. `on_move` is called where rows had to be written again, with a sentence: where they are, how
-        many.
+        """Record `robot` to the .csv or .parquet at `path`, or, where it is None, in memory alone; `extra`
+        names further columns of numbers. `on_move` is called where rows had to be written again, with a
+        sentence: where they are, how many.
 
-        Raises `InputError` where the path cannot be one, or, but for `overwrite`, where a file or a left-over part is there; where a
-        name of `extra` is taken, given twice, or none.
+        Raises `InputError` where the path cannot be one, or, but for `overwrite`, where a file or a left-over
+        part is there; where a name of `extra` is taken, given twice, or none.
         """
         self.robot = robot
         self.extra = _names(extra)
@@ -74,9 +77,19 @@ class Recorder:
         extends = any(segment.extension != (0.0, 0.0) for segment in robot.segments)
         self._ext = robot.n_segments if extends else 0
         self._columns = [
-            "t", "run", *(f"dl_{k}" for k in n), *(f"ext_{k}" for k in range(1, self._ext + 1)), *_TIP, *_TIP_QUATERNION, *_TIP_FORCE,
-            "payload", *_BASE_QUATERNION, *(f"cmd_dl_{k}" for k in n), *(f"tension_{k}" for k in n), *self.extra,
-        ]  # fmt: skip
+            "t",
+            "run",
+            *(f"dl_{k}" for k in n),
+            *(f"ext_{k}" for k in range(1, self._ext + 1)),
+            *_TIP,
+            *_TIP_QUATERNION,
+            *_TIP_FORCE,
+            "payload",
+            *_BASE_QUATERNION,
+            *(f"cmd_dl_{k}" for k in n),
+            *(f"tension_{k}" for k in n),
+            *self.extra,
+        ]
         self._rows: list[list[float]] = []
         self._labels: list[str] = []
         self._lock = Lock()
@@ -97,9 +110,11 @@ class Recorder:
         return len(self._rows)
 
     def start(self, t: float, run: str = "") -> None:
-        """Begin at the robot's time `t` [s], which is 0 in the log; or, while recording, begin another run, labelled `run`.
+        """Begin at the robot's time `t` [s], which is 0 in the log; or, while recording, begin another run,
+        labelled `run`.
 
-        Raises `InputError` for a label that is taken, for a log that is written already, and where PATH.part cannot be made.
+        Raises `InputError` for a label that is taken, for a log that is written already, and where PATH.part
+        cannot be made.
         """
         label = run.strip()
         with self._lock:
@@ -119,16 +134,24 @@ class Recorder:
             self._recording = True
 
     def add(
-        self, measurement: Measurement, *, tip_force: ArrayLike | None = None, payload: float = 0.0, commanded_dl: ArrayLike | None = None,
-        base_quaternion: ArrayLike | None = None, extra: Mapping[str, float] | None = None,
-    ) -> bool:  # fmt: skip
-        """Append a reading; whether it was new: one from before the start, or the same one again, is left out.
+        self,
+        measurement: Measurement,
+        *,
+        tip_force: ArrayLike | None = None,
+        payload: float = 0.0,
+        commanded_dl: ArrayLike | None = None,
+        base_quaternion: ArrayLike | None = None,
+        extra: Mapping[str, float] | None = None,
+    ) -> bool:
+        """Append a reading; whether it was new: one from before the start, or the same one again, is left
+        out.
 
-        `tip_force` (3,) known force on the tip, base frame [N], None for none; `payload` known mass at the tip [kg]; nan where a load is
-        not known. `commanded_dl` (n_tendons,) [m], None where nothing was commanded. `base_quaternion` (4,) world_from_base, w x y z, None
-        where nobody asks: a log keeps it if any row has it. `extra` numbers of the further columns; what is not given is nan.
-        Raises `InputError` for a reading of another robot, for an `extra` that was not named before, for a clock that runs back, and
-        where the row cannot be written.
+        `tip_force` (3,) known force on the tip, base frame [N], None for none; `payload` known mass at the
+        tip [kg]; nan where a load is not known. `commanded_dl` (n_tendons,) [m], None where nothing was
+        commanded. `base_quaternion` (4,) world_from_base, w x y z, None where nobody asks: a log keeps it if
+        any row has it. `extra` numbers of the further columns; what is not given is nan. Raises `InputError`
+        for a reading of another robot, for an `extra` that was not named before, for a clock that runs back,
+        and where the row cannot be written.
         """
         n = self.robot.n_tendons
         more = {} if extra is None else extra
@@ -136,12 +159,17 @@ class Recorder:
             if name not in self.extra:
                 raise InputError(f"no column {name!r} is recorded; {nearest(str(name), self.extra)}")
         groups: list[tuple[str, Any, int]] = [
-            ("dl", measurement.dl, n), ("ext", measurement.ext if self._ext else [], self._ext), ("tip", measurement.tip_position, 3),
-            ("tip quaternion", measurement.tip_quaternion, 4), ("tip_force", np.zeros(3) if tip_force is None else tip_force, 3),
-            ("payload", [payload], 1), ("base_quaternion", np.full(4, np.nan) if base_quaternion is None else base_quaternion, 4),
-            ("commanded_dl", np.full(n, np.nan) if commanded_dl is None else commanded_dl, n), ("tension", measurement.tension, n),
+            ("dl", measurement.dl, n),
+            ("ext", measurement.ext if self._ext else [], self._ext),
+            ("tip", measurement.tip_position, 3),
+            ("tip quaternion", measurement.tip_quaternion, 4),
+            ("tip_force", np.zeros(3) if tip_force is None else tip_force, 3),
+            ("payload", [payload], 1),
+            ("base_quaternion", np.full(4, np.nan) if base_quaternion is None else base_quaternion, 4),
+            ("commanded_dl", np.full(n, np.nan) if commanded_dl is None else commanded_dl, n),
+            ("tension", measurement.tension, n),
             ("extra", [more.get(name, np.nan) for name in self.extra], len(self.extra)),
-        ]  # fmt: skip
+        ]
         values = []
         for name, given, size in groups:
             try:
@@ -149,9 +177,14 @@ class Recorder:
             except (TypeError, ValueError, OverflowError) as error:
                 raise InputError(f"{name} of the reading is {given!r}; it must be numbers.") from error
             if row.shape != (size,):
-                raise InputError(f"{name} of the reading has shape {row.shape}; robot {self.robot.name!r} needs ({size},).")
+                raise InputError(
+                    f"{name} of the reading has shape {row.shape}; robot {self.robot.name!r} needs ({size},)."
+                )
             if name == "base_quaternion" and abs(np.linalg.norm(row) - 1.0) > _QUATERNION_SLACK:
-                raise InputError(f"base_quaternion of the reading is {row.tolist()}, of norm {np.linalg.norm(row):.6g}; it must be 1.")
+                raise InputError(
+                    f"base_quaternion of the reading is {row.tolist()}, of norm "
+                    f"{np.linalg.norm(row):.6g}; it must be 1."
+                )
             values.append(np.where(np.isfinite(row), row, np.nan))
         with self._lock:
             if not self._recording:
@@ -160,7 +193,10 @@ class Recorder:
             if not np.isfinite(t):
                 raise InputError(f"the reading has t = {measurement.t!r}; a row needs a finite time [s].")
             if t < self._last:
-                raise InputError(f"the robot's clock ran back, from {self._last:g} s to {t:g} s of the recording; start another run.")
+                raise InputError(
+                    f"the robot's clock ran back, from {self._last:g} s to {t:g} s of the "
+                    "recording; start another run."
+                )
             if t < 0.0 or t == self._last:
                 return False
             self._last = t
@@ -196,7 +232,12 @@ class Recorder:
                 if self.path is not None:
                     _part(self.path).unlink(missing_ok=True)
                 raise InputError("no reading came in while recording; there is nothing to keep.")
-            log = _log(self._columns, self._labels, np.array(self._rows), "session" if self.path is None else self.path.stem)
+            log = _log(
+                self._columns,
+                self._labels,
+                np.array(self._rows),
+                "session" if self.path is None else self.path.stem,
+            )
             if self.path is not None:
                 _finish(log, self.path, f"Recorded on robot {self.robot.name}.", kept)
                 self._done = True
@@ -255,10 +296,11 @@ class Recorder:
 
 
 def recover(path: str | Path) -> RunLog:
-    """The log of a session that was killed: PATH, made of the PATH.part that it left (either may be given), which is then taken away.
+    """The log of a session that was killed: PATH, made of the PATH.part that it left (either may be given),
+    which is then taken away.
 
-    A last row that was cut short is left out. Raises `LogError` where there is no part, or no whole row in it; `InputError` where
-    PATH is there already or cannot be written.
+    A last row that was cut short is left out. Raises `LogError` where there is no part, or no whole row in
+    it; `InputError` where PATH is there already or cannot be written.
     """
     path = Path(path)
     target = path.with_name(path.name.removesuffix(".part"))
@@ -268,7 +310,9 @@ def recover(path: str | Path) -> RunLog:
     try:
         lines = part.read_text(encoding="utf-8").splitlines(keepends=True)
     except (OSError, UnicodeDecodeError) as error:
-        raise LogError(f"{str(part)!r} cannot be recovered: {getattr(error, 'strerror', None) or error}.") from error
+        raise LogError(
+            f"{str(part)!r} cannot be recovered: {getattr(error, 'strerror', None) or error}."
+        ) from error
     whole = lines if lines and lines[-1].endswith("\n") else lines[:-1]
     table = read_table(_rewritten(part, whole)) if len(whole) != len(lines) else read_table(part)
     if not table.get("t", ("",)):
@@ -283,7 +327,8 @@ def recover(path: str | Path) -> RunLog:
 
 
 def free_path(path: str | Path) -> Path:
-    """`path`, or where it or its part is there already, the next free name: session.csv, session-2.csv, session-3.csv ..."""
+    """`path`, or where it or its part is there already, the next free name: session.csv, session-2.csv,
+    session-3.csv ..."""
     path = Path(path)
     stem, number, found = path.stem, 2, path
     while found.exists() or _part(found).exists():
@@ -299,7 +344,10 @@ def _checked(path: Path, overwrite: bool) -> Path:
         raise InputError(f"folder {str(path.parent)!r} is not there; make it, or record somewhere else.")
     if path.is_dir():
         raise InputError(f"{str(path)!r} is a folder; give the file to record to.")
-    for taken, what in ((path, "is there already"), (_part(path), "is what a session that did not end has left: recover it")):
+    for taken, what in (
+        (path, "is there already"),
+        (_part(path), "is what a session that did not end has left: recover it"),
+    ):
         if taken.exists() and not overwrite:
             raise InputError(f"{str(taken)!r} {what}, or record to {free_path(path).name!r}.")
     return path
@@ -311,9 +359,13 @@ def _names(extra: Sequence[str]) -> tuple[str, ...]:
     names = tuple(extra)
     for name in names:
         if not isinstance(name, str) or not name or name != name.strip() or re.search(r"[,\r\n]", name):
-            raise InputError(f"extra column {name!r} is no name; give one line of text without commas, no space around it.")
+            raise InputError(
+                f"extra column {name!r} is no name; give one line of text without commas, no space around it."
+            )
         if re.fullmatch(_KNOWN, name):
-            raise InputError(f"extra column {name!r} is a name that run logs have for something else; give another.")
+            raise InputError(
+                f"extra column {name!r} is a name that run logs have for something else; give another."
+            )
         if names.count(name) > 1:
             raise InputError(f"extra column {name!r} is named twice; each name stands for one column.")
     return names
@@ -351,15 +403,25 @@ def _log(names: Sequence[str], labels: Sequence[str], rows: Floats, name: str) -
     column: Mapping[str, Floats] = dict(zip((name for name in names if name != "run"), rows.T, strict=True))
 
     def group(pattern: str | Sequence[str]) -> Floats:
-        wanted = pattern if not isinstance(pattern, str) else [name for name in names if re.fullmatch(pattern, name)]
+        wanted = (
+            pattern
+            if not isinstance(pattern, str)
+            else [name for name in names if re.fullmatch(pattern, name)]
+        )
         return np.stack([column[name] for name in wanted], axis=1) if wanted else np.zeros((len(rows), 0))
 
-    quaternion, force, payload, ext = group(_TIP_QUATERNION), group(_TIP_FORCE), column["payload"], group(r"ext_\d+")
+    quaternion, force, payload, ext = (
+        group(_TIP_QUATERNION),
+        group(_TIP_FORCE),
+        column["payload"],
+        group(r"ext_\d+"),
+    )
     base = group(r"base_q[wxyz]")
     extra = {
         name: values
         for name, values in column.items()
-        if not re.fullmatch(_KNOWN, name) or (re.fullmatch(r"(cmd_dl|tension)_\d+", name) and not np.isnan(values).all())
+        if not re.fullmatch(_KNOWN, name)
+        or (re.fullmatch(r"(cmd_dl|tension)_\d+", name) and not np.isnan(values).all())
     }
     return RunLog(
         name=name,
@@ -377,7 +439,8 @@ def _log(names: Sequence[str], labels: Sequence[str], rows: Floats, name: str) -
 
 
 def _unit(quaternion: Floats) -> Floats:
-    """(n, 4) of a norm that is 1 to the last bit: `read_log` scales by it, and must find what was recorded."""
+    """(n, 4) of a norm that is 1 to the last bit: `read_log` scales by it, and must find what was
+    recorded."""
     quaternion = quaternion / np.linalg.norm(quaternion, axis=1)[:, None]
     for ulps in _NUDGES:
         off = np.linalg.norm(quaternion, axis=1) != 1.0

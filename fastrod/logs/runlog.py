@@ -47,7 +47,8 @@ class RunLog:
     run: NDArray[np.str_]
     """(n,) label of the run that the sample belongs to; '' where the log names none."""
     dl: Floats
-    """(n, n_tendons) change of each tendon's length against the straight rest robot [m], negative = pulled."""
+    """(n, n_tendons) change of each tendon's length against the straight rest robot [m], negative =
+    pulled."""
     tip_position: Floats
     """(n, 3) measured tip, base frame [m]."""
     ext: Floats | None = None
@@ -68,14 +69,24 @@ class RunLog:
     def __post_init__(self) -> None:
         n = len(self.t)
         shapes: dict[str, tuple[int | None, ...]] = {
-            "t": (n,), "run": (n,), "dl": (n, None), "tip_position": (n, 3), "ext": (n, None), "tip_quaternion": (n, 4),
-            "points": (n, None, 3), "tip_force": (n, 3), "payload": (n,), "base_quaternion": (n, 4),
-        }  # fmt: skip
+            "t": (n,),
+            "run": (n,),
+            "dl": (n, None),
+            "tip_position": (n, 3),
+            "ext": (n, None),
+            "tip_quaternion": (n, 4),
+            "points": (n, None, 3),
+            "tip_force": (n, 3),
+            "payload": (n,),
+            "base_quaternion": (n, 4),
+        }
         for name, shape in shapes.items():
             if (value := getattr(self, name)) is None:
                 continue
             array = np.array(value, dtype=np.str_ if name == "run" else np.float64)
-            if array.ndim != len(shape) or any(want not in (None, got) for want, got in zip(shape, array.shape, strict=True)):
+            if array.ndim != len(shape) or any(
+                want not in (None, got) for want, got in zip(shape, array.shape, strict=True)
+            ):
                 wanted = ", ".join("any" if size is None else str(size) for size in shape)
                 raise LogError(f"RunLog.{name} has shape {array.shape}; it must be ({wanted}).")
             array.setflags(write=False)
@@ -103,19 +114,24 @@ class RunLog:
     @property
     def measured(self) -> NDArray[np.bool_]:
         """(n,) rows that a model can be compared with: time, every input and the tip are there."""
-        return np.asarray(self.driven & np.isfinite(self.t) & np.isfinite(self.tip_position).all(axis=1), dtype=np.bool_)
+        return np.asarray(
+            self.driven & np.isfinite(self.t) & np.isfinite(self.tip_position).all(axis=1), dtype=np.bool_
+        )
 
     def rows(self, which: NDArray[np.bool_] | NDArray[np.int64] | slice) -> RunLog:
         """The samples `which`: a mask (n,), indices or a slice."""
         index = np.arange(len(self))[which]
         cut = {
-            f.name: value[index] for f in fields(self) if f.name not in ("name", "extra") and (value := getattr(self, f.name)) is not None
+            f.name: value[index]
+            for f in fields(self)
+            if f.name not in ("name", "extra") and (value := getattr(self, f.name)) is not None
         }
         extra = {key: _taken(value, index) for key, value in self.extra.items()}
         return replace(self, extra=extra, **cut)
 
     def only(self, run: str) -> RunLog:
-        """The samples of one run. Raises `UnknownNameError` with the nearest label, or saying that the log names none."""
+        """The samples of one run. Raises `UnknownNameError` with the nearest label, or saying that the log
+        names none."""
         run = str(run)  # numpy's words quote as np.str_(...)
         if run not in self.runs:
             if not (named := [" ".join(label.split()) for label in self.runs if label]):
@@ -128,7 +144,8 @@ def read_log(path: str | Path, robot: Robot) -> RunLog:
     """The run log at `path` (.csv or .parquet) for `robot`, checked against it.
 
     Lines of a CSV that start with # are comments. Rows count from 1 after the header.
-    Raises `LogError`, one sentence with row and column, for a file that cannot be read or that does not fit the robot.
+    Raises `LogError`, one sentence with row and column, for a file that cannot be read or that does not fit
+    the robot.
     """
     path = Path(path)
     table = read_table(path)
@@ -210,13 +227,19 @@ def read_table(path: str | Path) -> Table:
         return _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path)
     except LogError:
         raise
-    except (OSError, ValueError, csv.Error) as error:  # ValueError: bytes that are no text, or a path that no file can have
-        why = "it is not text" if isinstance(error, UnicodeDecodeError) else getattr(error, "strerror", None) or str(error)
+    # ValueError: bytes that are no text, or a path that no file can have
+    except (OSError, ValueError, csv.Error) as error:
+        why = (
+            "it is not text"
+            if isinstance(error, UnicodeDecodeError)
+            else getattr(error, "strerror", None) or str(error)
+        )
         raise LogError(f"log {str(path)!r} cannot be read: {why}.") from error
 
 
 def numbers(table: Table, name: str, where: str) -> Floats:
-    """(n,) floats of the column `name`; an empty cell is nan. `where` names the file in errors (`LogError`)."""
+    """(n,) floats of the column `name`; an empty cell is nan. `where` names the file in errors
+    (`LogError`)."""
     cells = table[name]
     if isinstance(cells, np.ndarray):
         values = cells
@@ -227,7 +250,10 @@ def numbers(table: Table, name: str, where: str) -> Floats:
             values = np.array([_number(cell, row, name, where) for row, cell in enumerate(cells, 1)])
     if np.isinf(values).any():
         row = int(np.argmax(np.isinf(values)))
-        raise LogError(f"{where} row {row + 1}, column {name} is {values[row]}; it must be finite, or empty where it is missing.")
+        raise LogError(
+            f"{where} row {row + 1}, column {name} is {values[row]}; it must be finite, or empty "
+            "where it is missing."
+        )
     return values
 
 
@@ -235,15 +261,23 @@ def _read_csv(path: Path) -> Table:
     with path.open(encoding="utf-8-sig", newline="") as file:
         rows = [row for row in csv.reader(line for line in file if not line.startswith("#")) if row]
     if not rows:
-        raise LogError(f"{path.name} is empty; a run log starts with a header such as t,dl_1,tip_x,tip_y,tip_z.")
+        raise LogError(
+            f"{path.name} is empty; a run log starts with a header such as t,dl_1,tip_x,tip_y,tip_z."
+        )
     header = [name.strip() for name in rows[0]]
     if len(header) == 1 and ";" in header[0]:
-        raise LogError(f"{path.name} is separated by semicolons; a run log is separated by commas, with decimal points.")
+        raise LogError(
+            f"{path.name} is separated by semicolons; a run log is separated by commas, with decimal points."
+        )
     _check_header(header, path.name)
     for number, row in enumerate(rows[1:], 1):
         if len(row) != len(header):
-            raise LogError(f"{path.name} row {number} has {len(row)} values; the header names {len(header)} columns.")
-    return dict(zip(header, zip(*rows[1:], strict=True) if len(rows) > 1 else ((),) * len(header), strict=True))
+            raise LogError(
+                f"{path.name} row {number} has {len(row)} values; the header names {len(header)} columns."
+            )
+    return dict(
+        zip(header, zip(*rows[1:], strict=True) if len(rows) > 1 else ((),) * len(header), strict=True)
+    )
 
 
 def _check_header(header: list[str], where: str) -> None:
@@ -270,20 +304,28 @@ def _read_parquet(path: Path) -> Table:
                 cells = column.cast("string").to_pylist()
             table[name] = _cells(cells)
     except arrow.ArrowException as error:
-        raise LogError(f"{path.name} is not a Parquet file: {str(error).splitlines()[0].rstrip('.')}.") from error
+        raise LogError(
+            f"{path.name} is not a Parquet file: {str(error).splitlines()[0].rstrip('.')}."
+        ) from error
     if not table:
         raise LogError(f"{path.name} has no columns.")
     return table
 
 
 def _check_declared(metadata: Any, where: str) -> None:
-    """Raise `LogError` where a file unpacks to more than a run log has; a few kB may declare any number of rows."""
-    chunks = [metadata.row_group(k).column(j) for k in range(metadata.num_row_groups) for j in range(metadata.row_group(k).num_columns)]
+    """Raise `LogError` where a file unpacks to more than a run log has; a few kB may declare any number of
+    rows."""
+    chunks = [
+        metadata.row_group(k).column(j)
+        for k in range(metadata.num_row_groups)
+        for j in range(metadata.row_group(k).num_columns)
+    ]
     n_values = max(metadata.num_rows * metadata.num_columns, sum(chunk.num_values for chunk in chunks))
     n_bytes = sum(chunk.total_uncompressed_size for chunk in chunks)
     if n_values > _MOST_VALUES or n_bytes > _MOST_BYTES:
         raise LogError(
-            f"{where} declares {n_values} values of {n_bytes} bytes; a log may have {_MOST_VALUES} of {_MOST_BYTES} bytes. Cut it in parts."
+            f"{where} declares {n_values} values of {n_bytes} bytes; a log may have {_MOST_VALUES} of "
+            f"{_MOST_BYTES} bytes. Cut it in parts."
         )
 
 
@@ -292,9 +334,14 @@ def _check_words(column: Any, where: str) -> None:
     compute, n_bytes = _pyarrow("pyarrow.compute"), 0
     for chunk in column.chunks:
         if hasattr(chunk, "dictionary") and len(chunk):
-            n_bytes += compute.sum(compute.take(compute.binary_length(chunk.dictionary), chunk.indices)).as_py() or 0
+            n_bytes += (
+                compute.sum(compute.take(compute.binary_length(chunk.dictionary), chunk.indices)).as_py() or 0
+            )
     if n_bytes > _MOST_BYTES:
-        raise LogError(f"{where} declares a column of {n_bytes} bytes of text; a log may have {_MOST_BYTES}. Cut it in parts.")
+        raise LogError(
+            f"{where} declares a column of {n_bytes} bytes of text; a log may have "
+            f"{_MOST_BYTES}. Cut it in parts."
+        )
 
 
 def _cells(cells: Sequence[Any]) -> Sequence[str] | Floats:
@@ -313,21 +360,30 @@ def _pyarrow(name: str) -> Any:
     try:
         return import_module(name)
     except ImportError as error:
-        raise LogError("a .parquet log needs the package pyarrow, which is not installed; install it, or give the log as .csv.") from error
+        raise LogError(
+            "a .parquet log needs the package pyarrow, which is not installed; install it, or "
+            "give the log as .csv."
+        ) from error
 
 
 def _need(table: Table, names: Sequence[str], where: str, why: str) -> None:
     missing = [name for name in names if name not in table]
     if missing:
         plural = "columns" if len(missing) > 1 else "column"
-        raise LogError(f"{where} lacks {plural} {', '.join(missing)} {why}; {_nearest_column(missing[0], table)}")
+        raise LogError(
+            f"{where} lacks {plural} {', '.join(missing)} {why}; {_nearest_column(missing[0], table)}"
+        )
 
 
 def _nearest_column(name: str, table: Table) -> str:
     if same := [column for column in table if column.lower() == name.lower()]:
         return f"did you mean {same[0]!r}?"
     near = nearest(name, table)
-    return near if near.startswith("did") else f"its columns are {', '.join(' '.join(column.split()) for column in table)}."
+    return (
+        near
+        if near.startswith("did")
+        else (f"its columns are {', '.join(' '.join(column.split()) for column in table)}.")
+    )
 
 
 def _dl_columns(table: Table, robot: Robot, where: str) -> list[str]:
@@ -339,7 +395,8 @@ def _dl_columns(table: Table, robot: Robot, where: str) -> list[str]:
         twins = [name for name in robot_names() if load_robot(name).n_tendons == len(given)]
         hint = f" Shipped robots with {len(given)}: {', '.join(twins)}." if twins else ""
         raise LogError(
-            f"{where} has {len(given)} dl_ columns ({given[0]} to {given[-1]}); robot {robot.name!r} has {robot.n_tendons} tendons "
+            f"{where} has {len(given)} dl_ columns ({given[0]} to {given[-1]}); robot {robot.name!r} has "
+            f"{robot.n_tendons} tendons "
             f"and needs {f'dl_1 to dl_{robot.n_tendons}' if names else 'none'}.{hint}"
         )
     _need(table, names, where, f"that robot {robot.name!r} needs for its {robot.n_tendons} tendons")
@@ -353,13 +410,18 @@ def _extension(table: Table, robot: Robot, where: str, known: set[str]) -> Float
         return None
     names = [f"ext_{k}" for k in range(1, robot.n_segments + 1)]
     if wrong := [name for name in given if name not in names]:
-        raise LogError(f"{where} has column {wrong[0]!r}; robot {robot.name!r} has {robot.n_segments} segments, ext_1 to {names[-1]}.")
+        raise LogError(
+            f"{where} has column {wrong[0]!r}; robot {robot.name!r} has {robot.n_segments} "
+            f"segments, ext_1 to {names[-1]}."
+        )
     known.update(given)
     n = len(table[given[0]])
     return np.stack([numbers(table, name, where) if name in given else np.zeros(n) for name in names], axis=1)
 
 
-def _points(table: Table, robot: Robot, where: str, group: Callable[[Sequence[str]], Floats | None]) -> Floats | None:
+def _points(
+    table: Table, robot: Robot, where: str, group: Callable[[Sequence[str]], Floats | None]
+) -> Floats | None:
     """(n, k, 3) of p1_x ... pk_z, where k is the number of the robot's [log] points."""
     numbers = {int(m[1]) for name in table if (m := re.fullmatch(r"p(\d+)_[xyz]", name))}
     if not numbers:
@@ -367,7 +429,8 @@ def _points(table: Table, robot: Robot, where: str, group: Callable[[Sequence[st
     k = len(robot.log_points)
     if numbers != set(range(1, k + 1)):
         raise LogError(
-            f"{where} has points p{min(numbers)} to p{max(numbers)}; robot {robot.name!r} names the arclengths of {k}. "
+            f"{where} has points p{min(numbers)} to p{max(numbers)}; robot {robot.name!r} names the "
+            f"arclengths of {k}. "
             "Give one arclength for each in its robot file: [log] points = [...]."
         )
     columns = group([f"p{i}_{axis}" for i in range(1, k + 1) for axis in "xyz"])
@@ -385,7 +448,10 @@ def _number(cell: str, row: int, name: str, where: str) -> float:
     try:
         return float(cell.strip() or "nan")
     except ValueError:
-        raise LogError(f"{where} row {row}, column {name} is {cell!r}; it must be a number, or empty where it is missing.") from None
+        raise LogError(
+            f"{where} row {row}, column {name} is {cell!r}; it must be a number, or empty where "
+            "it is missing."
+        ) from None
 
 
 def _unit(quaternion: Floats | None, names: Sequence[str], where: str) -> Floats | None:
@@ -397,7 +463,9 @@ def _unit(quaternion: Floats | None, names: Sequence[str], where: str) -> Floats
     if (off := np.abs(norm - 1.0) > _QUATERNION_SLACK).any():
         row = int(np.argmax(off))
         columns = f"columns {names[0]} to {names[-1]}"
-        raise LogError(f"{where} row {row + 1}, {columns} have norm {norm[row]:.6g}; a quaternion w x y z has norm 1.")
+        raise LogError(
+            f"{where} row {row + 1}, {columns} have norm {norm[row]:.6g}; a quaternion w x y z has norm 1."
+        )
     return np.asarray(quaternion / norm[:, None], dtype=np.float64)
 
 
@@ -409,7 +477,8 @@ def _check_time(log: RunLog, where: str) -> None:
             row, before = rows[back[0] + 1], rows[back[0]]
             inside = f" inside run {label!r}" if label else ""
             raise LogError(
-                f"{where} row {row + 1}, column t is {log.t[row]:g} s after {log.t[before]:g} s{inside}; time must not run back. "
+                f"{where} row {row + 1}, column t is {log.t[row]:g} s after {log.t[before]:g} s{inside}; "
+                "time must not run back. "
                 "Name several runs in a column run."
             )
 
@@ -448,7 +517,13 @@ def _check_units(log: RunLog, robot: Robot, where: str) -> None:
         refuse(outside, f"column ext_{k + 1}", log.ext[:, k], "m", why)
     if log.payload is not None:
         refuse(log.payload < 0.0, "column payload", log.payload, "kg", "a mass is not negative.")
-        refuse(log.payload > _HEAVIEST, "column payload", log.payload, "kg", f"more than {_HEAVIEST:g} kg. Was it given in g?")
+        refuse(
+            log.payload > _HEAVIEST,
+            "column payload",
+            log.payload,
+            "kg",
+            f"more than {_HEAVIEST:g} kg. Was it given in g?",
+        )
 
 
 def _measured(log: RunLog) -> Iterator[tuple[str, Floats]]:
@@ -460,7 +535,8 @@ def _measured(log: RunLog) -> Iterator[tuple[str, Floats]]:
 
 
 def _check_changes(log: RunLog, robot: Robot, where: str) -> None:
-    """Refuse absolute tendon lengths in place of their changes: every one about as long as at rest, on a robot that cannot grow so far."""
+    """Refuse absolute tendon lengths in place of their changes: every one about as long as at rest, on a
+    robot that cannot grow so far."""
     rest = np.asarray(robot.rest_tendon_length)
     if not rest.size or not np.isfinite(log.dl).all(axis=1).any():
         return
@@ -468,8 +544,10 @@ def _check_changes(log: RunLog, robot: Robot, where: str) -> None:
     grows = sum(segment.extension[1] for segment in robot.segments)
     if (np.abs(usual - rest) < _LIKE_REST * rest).all() and grows < 0.5 * robot.length:
         raise LogError(
-            f"{where} has a median of {usual[0]:.4g} m in column dl_1, where robot {robot.name!r} has a tendon of {rest[0]:.4g} m at rest: "
-            "these look like absolute lengths. The log takes changes against the straight robot, negative = pulled."
+            f"{where} has a median of {usual[0]:.4g} m in column dl_1, where robot {robot.name!r} has a "
+            f"tendon of {rest[0]:.4g} m at rest: "
+            "these look like absolute lengths. The log takes changes against the straight robot, negative = "
+            "pulled."
         )
 
 

@@ -20,7 +20,8 @@ from fastrod.types import Floats
 
 @final
 class SimulatedRobot:
-    """A robot that moves at once to what it is told, effects of its file included, and measures without noise.
+    """A robot that moves at once to what it is told, effects of its file included, and measures without
+    noise.
 
     >>> import fastrod
     >>> link = SimulatedRobot(fastrod.load_robot("prototype"))
@@ -29,8 +30,16 @@ class SimulatedRobot:
     [0.0182, 0.0, 0.0667]
     """
 
-    def __init__(self, robot: Robot, *, dt: float = 1.0 / 30.0, real: bool = False, clock: Callable[[], float] = time.monotonic) -> None:
-        """`dt` [s] between two readings, as effects with a memory count time; `real` asks to be treated like a robot that can do harm;
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        dt: float = 1.0 / 30.0,
+        real: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """`dt` [s] between two readings, as effects with a memory count time; `real` asks to be treated like
+        a robot that can do harm;
         `clock` gives its time [s]."""
         self._robot, self._real, self._clock = robot, real, clock
         self._simulator = Simulator(robot, dt=dt, points_per_segment=10, threads=1)
@@ -55,7 +64,9 @@ class SimulatedRobot:
     def command(self, dl: ArrayLike, ext: ArrayLike | None = None) -> None:
         """As `RobotLink.command`. Raises `InputError` on wrong shapes and on what is not finite."""
         change = _numbers("dl", dl, self._robot.n_tendons)
-        extension = np.zeros(self._robot.n_segments) if ext is None else _numbers("ext", ext, self._robot.n_segments)
+        extension = (
+            np.zeros(self._robot.n_segments) if ext is None else _numbers("ext", ext, self._robot.n_segments)
+        )
         with self._lock:
             if not self.stopped:
                 self._change, self._extension = change, extension
@@ -72,9 +83,14 @@ class SimulatedRobot:
         base, rotation = state.position[0, 0], state.rotation[0, 0]
         turn = rotation.T @ state.tip_rotation[0]
         return Measurement(
-            t=self._clock() - self._began, dl=change, ext=extension, tip_position=rotation.T @ (state.tip_position[0] - base),
-            tip_quaternion=quaternion_from_matrix(turn[None])[0], tension=state.tension[0], problem=state.problems.get(0, ""),
-        )  # fmt: skip
+            t=self._clock() - self._began,
+            dl=change,
+            ext=extension,
+            tip_position=rotation.T @ (state.tip_position[0] - base),
+            tip_quaternion=quaternion_from_matrix(turn[None])[0],
+            tension=state.tension[0],
+            problem=state.problems.get(0, ""),
+        )
 
     def stop(self) -> None:
         """Stay where it was told to be last."""

@@ -34,16 +34,24 @@ class Rest(NamedTuple):
 def compile_robots(robots: Sequence[Robot], n_steps: int) -> tuple[Layout, Params, Rest]:
     """Arrays of the robots of one batch; a single robot stands for all.
 
-    Robots may differ in every number, but not in their counts, modes or routing: `RobotError` names the one that does.
+    Robots may differ in every number, but not in their counts, modes or routing: `RobotError` names the one
+    that does.
     """
     first = robots[0]
     for i, robot in enumerate(robots):
         for what in ("n_segments", "n_tendons"):
             if getattr(robot, what) != getattr(first, what):
                 here, there = getattr(robot, what), getattr(first, what)
-                raise RobotError(f"robot {i} of the batch has {what} {here}, robot 0 has {there}; counts must agree.")
-        if [s.mode for s in robot.segments] != [s.mode for s in first.segments] or list(robot.tendon_segment) != list(first.tendon_segment):
-            raise RobotError(f"robot {i} of the batch has other segment modes or tendon ends than robot 0; they must agree.")
+                raise RobotError(
+                    f"robot {i} of the batch has {what} {here}, robot 0 has {there}; counts must agree."
+                )
+        if [s.mode for s in robot.segments] != [s.mode for s in first.segments] or list(
+            robot.tendon_segment
+        ) != list(first.tendon_segment):
+            raise RobotError(
+                f"robot {i} of the batch has other segment modes or tendon ends than robot 0; "
+                "they must agree."
+            )
     return _layout(first, n_steps), _params(robots), _rest(robots)
 
 
@@ -70,13 +78,19 @@ def _params(robots: Sequence[Robot]) -> Params:
     reach = np.array([robot.length for robot in robots])
     softest = np.array([min(min(s.bending_stiffness) for s in robot.segments) for robot in robots])
     distance = np.linalg.norm(offset, axis=-1)
-    mean_offset = distance.sum((1, 2)) / np.maximum((distance > 0.0).sum((1, 2)), 1) if robots[0].n_tendons else reach
+    mean_offset = (
+        distance.sum((1, 2)) / np.maximum((distance > 0.0).sum((1, 2)), 1) if robots[0].n_tendons else reach
+    )
     return Params(
         length=np.array([[s.length for s in robot.segments] for robot in robots]),
         offset=offset,
-        compliance=np.array([[max(t.compliance, _INEXTENSIBLE) for t in row] for row in tendons]).reshape(len(robots), -1),
+        compliance=np.array([[max(t.compliance, _INEXTENSIBLE) for t in row] for row in tendons]).reshape(
+            len(robots), -1
+        ),
         pretension=np.array([[t.pretension for t in row] for row in tendons]).reshape(len(robots), -1),
-        unilateral=np.array([[t.unilateral for t in row] for row in tendons], dtype=bool).reshape(len(robots), -1),
+        unilateral=np.array([[t.unilateral for t in row] for row in tendons], dtype=bool).reshape(
+            len(robots), -1
+        ),
         moment_scale=softest / reach,
         tension_scale=softest / (mean_offset * reach),
         reach=reach,
@@ -84,9 +98,13 @@ def _params(robots: Sequence[Robot]) -> Params:
 
 
 def _rest(robots: Sequence[Robot]) -> Rest:
-    stiffness = np.array([[(*s.bending_stiffness, s.torsional_stiffness) for s in robot.segments] for robot in robots])
+    stiffness = np.array(
+        [[(*s.bending_stiffness, s.torsional_stiffness) for s in robot.segments] for robot in robots]
+    )
     precurvature = np.array([[s.precurvature for s in robot.segments] for robot in robots])
-    weight = np.array([[np.multiply(s.line_density, robot.gravity) for s in robot.segments] for robot in robots])
+    weight = np.array(
+        [[np.multiply(s.line_density, robot.gravity) for s in robot.segments] for robot in robots]
+    )
     return Rest(
         stiffness=stiffness[:, :, None, :],
         precurvature=precurvature[:, :, None, :].astype(float),

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from fastrod.errors import RobotError, nearest
 
 Mode: TypeAlias = Literal["tendon_length", "tendon_tension", "passive", "paper"]
-"""Boundary mode of a segment: what is prescribed at its end (Rucker and Webster 2011; `paper`: SoftManiSim, eqs. 2b and 3b)."""
+"""Boundary mode of a segment: what is prescribed at its end (Rucker and Webster 2011; `paper`: SoftManiSim,
+eqs. 2b and 3b)."""
 
 MODES: tuple[str, ...] = get_args(Mode)
 _LONGEST = 10.0  # m; a longer segment was given in mm
@@ -22,7 +23,8 @@ _LONGEST = 10.0  # m; a longer segment was given in mm
 _SHORTEST = 1e-6  # m
 _STIFF = (1e-20, 1e15)  # N m^2
 _GRAVITY = (0.0, 0.0, -9.81)  # m/s^2
-_MOST = 1e9  # of any other number, in its unit: beyond it products of a few numbers leave what a float can hold
+# of any other number, in its unit: beyond it products of a few numbers leave what a float can hold
+_MOST = 1e9
 
 
 def _positive(where: str, value: float, unit: str, low: float = 0.0, high: float = math.inf) -> None:
@@ -36,7 +38,9 @@ def _finite(where: str, values: tuple[float, ...], count: int, unit: str) -> Non
     if len(values) != count or not all(math.isfinite(v) for v in values):
         raise RobotError(f"{where} is {list(values)!r}; it must be {count} finite numbers [{unit}].")
     if any(abs(v) > _MOST for v in values):
-        raise RobotError(f"{where} is {list(values)!r}; its numbers must be between {-_MOST:g} and {_MOST:g} {unit}.")
+        raise RobotError(
+            f"{where} is {list(values)!r}; its numbers must be between {-_MOST:g} and {_MOST:g} {unit}."
+        )
 
 
 def _per_segment(value: float | tuple[float, ...], n_crossed: int, where: str) -> tuple[float, ...]:
@@ -44,7 +48,8 @@ def _per_segment(value: float | tuple[float, ...], n_crossed: int, where: str) -
         return (float(value),) * n_crossed
     if len(value) != n_crossed:
         raise RobotError(
-            f"{where} has {len(value)} values; give one, or {n_crossed}: one for each segment that the tendon crosses, base first."
+            f"{where} has {len(value)} values; give one, or {n_crossed}: one for each segment that the "
+            "tendon crosses, base first."
         )
     return value
 
@@ -65,8 +70,8 @@ class Tendon:
     angle: float | tuple[float, ...]
     """Position around it, from d1 toward d2 [rad]."""
     compliance: float = 1e-5
-    """Stretch per tension, l(l) = L + compliance (T - pretension) [m/N]. Below 1e-9 counts as 1e-9: three or more wires that do
-    not stretch at all lock the twist with tensions beyond bound."""
+    """Stretch per tension, l(l) = L + compliance (T - pretension) [m/N]. Below 1e-9 counts as 1e-9: three or
+    more wires that do not stretch at all lock the twist with tensions beyond bound."""
     pretension: float = 0.0
     """Tension at which the tendon has its commanded length [N]."""
     unilateral: bool = False
@@ -81,12 +86,18 @@ class Tendon:
         angles = self.angle if isinstance(self.angle, tuple) else (self.angle,)
         _finite("Tendon.angle", angles, len(angles), "rad")
         if any(abs(a) > 2.0 * math.pi + 1e-6 for a in angles):
-            raise RobotError(f"Tendon.angle is {self.angle!r} rad; more than a turn. Was it given in degrees?")
+            raise RobotError(
+                f"Tendon.angle is {self.angle!r} rad; more than a turn. Was it given in degrees?"
+            )
         if not 0.0 <= self.compliance <= _MOST:
-            raise RobotError(f"Tendon.compliance is {self.compliance!r} m/N; it must be zero or positive, for example 1e-5.")
+            raise RobotError(
+                f"Tendon.compliance is {self.compliance!r} m/N; it must be zero or positive, "
+                "for example 1e-5."
+            )
         if not abs(self.pretension) <= _MOST or (self.unilateral and self.pretension < 0.0):
             raise RobotError(
-                f"Tendon.pretension is {self.pretension!r} N; it must be finite, and not negative for a wire that can go slack."
+                f"Tendon.pretension is {self.pretension!r} N; it must be finite, and not negative for a "
+                "wire that can go slack."
             )
 
     def position(self, n_crossed: int) -> tuple[tuple[float, float], ...]:
@@ -120,10 +131,15 @@ class Segment:
     def __post_init__(self) -> None:
         _positive("Segment.length", self.length, "m")
         if self.length > _LONGEST:
-            raise RobotError(f"Segment.length is {self.length!r} m; more than {_LONGEST:g} m. Was it given in mm?")
+            raise RobotError(
+                f"Segment.length is {self.length!r} m; more than {_LONGEST:g} m. Was it given in mm?"
+            )
         _positive("Segment.length", self.length, "m", _SHORTEST)
         if not isinstance(self.bending_stiffness, (tuple, list)) or len(self.bending_stiffness) != 2:
-            raise RobotError(f"Segment.bending_stiffness is {self.bending_stiffness!r}; give two values, EI_x and EI_y [N m^2].")
+            raise RobotError(
+                f"Segment.bending_stiffness is {self.bending_stiffness!r}; give two values, "
+                "EI_x and EI_y [N m^2]."
+            )
         for value in self.bending_stiffness:
             _positive("Segment.bending_stiffness", value, "N m^2", *_STIFF)
         _positive("Segment.torsional_stiffness", self.torsional_stiffness, "N m^2", *_STIFF)
@@ -136,7 +152,9 @@ class Segment:
                 f"give [smallest, largest] change of the {self.length:g} m length, around 0."
             )
         if not 0.0 <= self.line_density <= _MOST:
-            raise RobotError(f"Segment.line_density is {self.line_density!r} kg/m; it must be zero or positive.")
+            raise RobotError(
+                f"Segment.line_density is {self.line_density!r} kg/m; it must be zero or positive."
+            )
         if self.mode not in MODES:
             raise RobotError(f"Segment.mode is {self.mode!r}; {nearest(str(self.mode), MODES)}")
         if self.mode == "passive" and self.tendons:
@@ -144,7 +162,10 @@ class Segment:
         if self.mode != "passive" and not self.tendons:
             raise RobotError(f"A segment in mode {self.mode!r} needs tendons; give some, or mode 'passive'.")
         if not (math.isfinite(self.body_radius) and 0.0 <= self.body_radius <= _LONGEST):
-            raise RobotError(f"Segment.body_radius is {self.body_radius!r} m; it must be between 0 and {_LONGEST:g} m. Was it given in mm?")
+            raise RobotError(
+                f"Segment.body_radius is {self.body_radius!r} m; it must be between 0 and "
+                f"{_LONGEST:g} m. Was it given in mm?"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,7 +173,7 @@ class Robot:
     """A chain of segments on a base, and the world it stands in.
 
     >>> wire = Tendon(offset=0.0075, angle=0.0)
-    >>> rod = Segment(length=0.07, bending_stiffness=(0.0022, 0.0022), torsional_stiffness=0.001, tendons=(wire,))
+    >>> rod = Segment(length=0.07, bending_stiffness=(0.0022,) * 2, torsional_stiffness=1e-3, tendons=(wire,))
     >>> Robot(name="one", segments=(rod,)).rest_tendon_length
     array([0.07])
     """
@@ -184,7 +205,9 @@ class Robot:
         _finite("Robot.base_quaternion", self.base_quaternion, 4, "w x y z")
         if abs(math.hypot(*self.base_quaternion) - 1.0) > 1e-6:
             norm = math.hypot(*self.base_quaternion)
-            raise RobotError(f"Robot.base_quaternion {list(self.base_quaternion)!r} has norm {norm:.6g}; it must be 1.")
+            raise RobotError(
+                f"Robot.base_quaternion {list(self.base_quaternion)!r} has norm {norm:.6g}; it must be 1."
+            )
         _finite("Robot.gravity", self.gravity, 3, "m/s^2")
         if tuple(self.gravity) != _GRAVITY:
             object.__setattr__(self, "states_gravity", True)
@@ -192,7 +215,8 @@ class Robot:
         paper = [segment.mode == "paper" for segment in self.segments]
         if any(paper) and not all(paper):
             raise RobotError(
-                f"Robot {self.name!r} mixes mode 'paper' with other modes; the paper's reduced model drops the tendons "
+                f"Robot {self.name!r} mixes mode 'paper' with other modes; the paper's reduced model drops "
+                "the tendons "
                 "from the balance, so it holds for a whole robot or not at all."
             )
         for k, segment in enumerate(self.segments):
@@ -200,24 +224,34 @@ class Robot:
                 for crossed, (x, y) in zip(self.segments, tendon.position(k + 1), strict=False):
                     if math.hypot(x, y) > crossed.length:
                         raise RobotError(
-                            f"Tendon offset {math.hypot(x, y):.6g} m of segment {k + 1} is larger than the length {crossed.length:g} m "
+                            f"Tendon offset {math.hypot(x, y):.6g} m of segment {k + 1} is larger than the "
+                            f"length {crossed.length:g} m "
                             "of a segment that it crosses. Was it given in mm?"
                         )
                     if crossed.body_radius and math.hypot(x, y) > crossed.body_radius:
                         raise RobotError(
-                            f"Tendon offset {math.hypot(x, y):.6g} m of segment {k + 1} lies beyond the body radius "
+                            f"Tendon offset {math.hypot(x, y):.6g} m of segment {k + 1} lies beyond the "
+                            "body radius "
                             f"{crossed.body_radius:g} m; it must run inside the body."
                         )
         total = sum(segment.length for segment in self.segments)
         if any(not 0.0 <= s <= total for s in self.log_points):
-            raise RobotError(f"[log] points is {list(self.log_points)!r}; each must be an arclength between 0 and {total:g} m.")
+            raise RobotError(
+                f"[log] points is {list(self.log_points)!r}; each must be an arclength between "
+                f"0 and {total:g} m."
+            )
 
     def _check_sensor(self) -> None:
         for key, value in self.sensor.items():
             most = {"registration_sd": 2, "noise": 3}.get(key, 1)
             numbers = value if isinstance(value, (list, tuple)) else (value,)
-            if not 1 <= len(numbers) <= most or (key == "registration_sd" and isinstance(value, (list, tuple)) and len(value) != 2):
-                raise RobotError(f"[sensor] {key} has {len(numbers)} numbers; give one{', or two: m and rad' if most == 2 else ''}.")
+            if not 1 <= len(numbers) <= most or (
+                key == "registration_sd" and isinstance(value, (list, tuple)) and len(value) != 2
+            ):
+                raise RobotError(
+                    f"[sensor] {key} has {len(numbers)} numbers; give "
+                    f"one{', or two: m and rad' if most == 2 else ''}."
+                )
             if most == 1 and isinstance(value, (list, tuple)):
                 raise RobotError(f"[sensor] {key} is {list(value)!r}; give one number.")
             if not all(0.0 <= number <= _MOST for number in numbers):
@@ -241,7 +275,9 @@ class Robot:
     @property
     def tendon_segment(self) -> NDArray[np.int64]:
         """(n_tendons,) index of the segment at whose end the tendon is fixed."""
-        return np.array([k for k, segment in enumerate(self.segments) for _ in segment.tendons], dtype=np.int64)
+        return np.array(
+            [k for k, segment in enumerate(self.segments) for _ in segment.tendons], dtype=np.int64
+        )
 
     @property
     def length(self) -> float:

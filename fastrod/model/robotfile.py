@@ -34,17 +34,25 @@ def load_robot(source: str | Path) -> Robot:
     Raises `UnknownNameError` for a name that is not shipped, `RobotError` for a file that is not a robot.
     """
     if not isinstance(source, (str, Path)):
-        raise UnknownNameError(f"robot is {source!r}; give the name of a shipped robot or the path of a .toml.")
+        raise UnknownNameError(
+            f"robot is {source!r}; give the name of a shipped robot or the path of a .toml."
+        )
     text = str(source)
     if text in robot_names():
-        return loads(files("fastrod").joinpath("robots").joinpath(f"{text}.toml").read_text(encoding="utf-8"), text)
+        return loads(
+            files("fastrod").joinpath("robots").joinpath(f"{text}.toml").read_text(encoding="utf-8"), text
+        )
     path = Path(source)
     try:
         unknown = path.suffix != ".toml" and not path.is_file()
     except (OSError, ValueError) as error:  # ValueError: a path that no file can have
-        raise RobotError(f"robot file {shown(text)} cannot be read: {getattr(error, 'strerror', None) or error}.") from error
+        raise RobotError(
+            f"robot file {shown(text)} cannot be read: {getattr(error, 'strerror', None) or error}."
+        ) from error
     if unknown:
-        raise UnknownNameError(f"no robot {shown(text)}; {nearest(text, robot_names())} A path must end in .toml.")
+        raise UnknownNameError(
+            f"no robot {shown(text)}; {nearest(text, robot_names())} A path must end in .toml."
+        )
     content = read_text(path, f"robot file {shown(text)}", RobotError)
     return loads(content, text)
 
@@ -96,7 +104,9 @@ def dumps(robot: Robot) -> str:
         data["log"] = {"points": list(robot.log_points)}
     for section in ("fit", "sensor"):
         if content := getattr(robot, section):
-            data[section] = {key: dict(value) if isinstance(value, Mapping) else value for key, value in content.items()}
+            data[section] = {
+                key: dict(value) if isinstance(value, Mapping) else value for key, value in content.items()
+            }
     return tomli_w.dumps(data)
 
 
@@ -135,7 +145,9 @@ def _segment(table: Any, where: str) -> Segment:
         table |= {"bending_stiffness": [e * i, e * i], "torsional_stiffness": g * j}
     tendons = table.get("tendons", [])
     if not isinstance(tendons, list):
-        raise RobotError(f"{where}: tendons must be a list of tables, [ {{offset = ..., angle = ...}}, ... ].")
+        raise RobotError(
+            f"{where}: tendons must be a list of tables, [ {{offset = ..., angle = ...}}, ... ]."
+        )
     _check_needed(table, ("length", "bending_stiffness", "torsional_stiffness"), where)
     if table.get("mode", MODES[0]) not in MODES:
         raise RobotError(f"{where}: mode is {table['mode']!r}; {nearest(str(table['mode']), MODES)}")
@@ -153,7 +165,9 @@ def _written(segment: Segment) -> dict[str, Any]:
     data = {key: list(value) if isinstance(value, tuple) else value for key, value in data.items()}
     if segment.tendons:
         plain = [{f.name: getattr(tendon, f.name) for f in fields(Tendon)} for tendon in segment.tendons]
-        data["tendons"] = [{key: list(v) if isinstance(v, tuple) else v for key, v in tendon.items()} for tendon in plain]
+        data["tendons"] = [
+            {key: list(v) if isinstance(v, tuple) else v for key, v in tendon.items()} for tendon in plain
+        ]
     return data
 
 

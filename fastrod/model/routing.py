@@ -1,4 +1,5 @@
-"""How wires and bends hang together: the linear map between the bend of the segments and the lengths of the wires."""
+"""How wires and bends hang together: the linear map between the bend of the segments and the lengths of the
+wires."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ class Wiring:
     tendon_segment: Ints
     """(n_tendons,) segment at whose end the wire ends."""
     arms: Floats
-    """(n_tendons, 2 n_segments) d(wire length)/d(bend x, bend y of each segment) [m/rad], bend about d1 and d2."""
+    """(n_tendons, 2 n_segments) d(wire length)/d(bend x, bend y of each segment) [m/rad], bend about d1 and
+    d2."""
     bend_from_wires: Floats
     """(2 n_segments, n_tendons) least-squares inverse of `arms` [rad/m]."""
     drive: Ints
@@ -53,7 +55,8 @@ class Wiring:
         return np.ascontiguousarray(per_segment[..., self.tendon_segment])
 
     def bend(self, dl: Floats) -> Floats:
-        """(..., n_segments, 2) bend about d1 and d2 [rad] that these wire lengths (..., n_tendons) ask for."""
+        """(..., n_segments, 2) bend about d1 and d2 [rad] that these wire lengths (..., n_tendons) ask
+        for."""
         return _times(dl, self.bend_from_wires.T).reshape(*dl.shape[:-1], self.n_segments, 2)
 
     def wires(self, bend: Floats) -> Floats:
@@ -62,7 +65,8 @@ class Wiring:
 
 
 def _times(a: Floats, matrix: Floats) -> Floats:
-    """a @ matrix, summed in one order: BLAS takes another one with the number of rows, and a batch must be its robots bit by bit."""
+    """a @ matrix, summed in one order: BLAS takes another one with the number of rows, and a batch must be
+    its robots bit by bit."""
     out = np.zeros((*a.shape[:-1], matrix.shape[1]))
     for i, row in enumerate(matrix):
         out += a[..., i, None] * row
@@ -70,7 +74,8 @@ def _times(a: Floats, matrix: Floats) -> Floats:
 
 
 def wire(robot: Robot) -> Wiring:
-    """The wiring of a robot: l_i = l + sum_k (bend_x y_ik - bend_y x_ik), constant curvature in each segment."""
+    """The wiring of a robot: l_i = l + sum_k (bend_x y_ik - bend_y x_ik), constant curvature in each
+    segment."""
     ends = robot.tendon_segment
     positions = [tendon.position(int(end) + 1) for tendon, end in zip(robot.tendons, ends, strict=True)]
     arms = np.zeros((robot.n_tendons, 2 * robot.n_segments))
@@ -85,7 +90,11 @@ def wire(robot: Robot) -> Wiring:
         drive[t] = count
         size = float(np.abs(arms[t]).max())
         for other in range(t + 1, robot.n_tendons):
-            if drive[other] < 0 and ends[other] == ends[t] and np.abs(arms[t] + arms[other]).max() < 1e-3 * size:
+            if (
+                drive[other] < 0
+                and ends[other] == ends[t]
+                and np.abs(arms[t] + arms[other]).max() < 1e-3 * size
+            ):
                 drive[other], sign[other] = count, -1.0
                 break
         count += 1
@@ -93,7 +102,9 @@ def wire(robot: Robot) -> Wiring:
         n_segments=robot.n_segments,
         tendon_segment=ends,
         arms=arms,
-        bend_from_wires=np.asarray(np.linalg.pinv(arms), dtype=np.float64) if robot.n_tendons else arms.T.copy(),
+        bend_from_wires=np.asarray(np.linalg.pinv(arms), dtype=np.float64)
+        if robot.n_tendons
+        else arms.T.copy(),
         drive=drive.astype(np.int64),
         drive_sign=sign,
         reach=np.array([float(np.hypot(*places[-1])) for places in positions]),

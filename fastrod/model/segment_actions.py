@@ -23,11 +23,13 @@ class WireInputs(TypedDict):
 
 
 class SegmentActions:
-    """A robot driven by one action a segment, base segment first: extension, then two tendon displacements [m] (the paper's action).
+    """A robot driven by one action a segment, base segment first: extension, then two tendon displacements
+    [m] (the paper's action).
 
-    A displacement `d` bends the segment by d / offset [rad]: the first toward +d1 of its base, the second toward +d2. The wires
-    of distal segments give way to the bends and extensions of the segments that they cross, so every segment has its own
-    action. Without load and with wires that do not stretch, the segments are arcs of these bends.
+    A displacement `d` bends the segment by d / offset [rad]: the first toward +d1 of its base, the second
+    toward +d2. The wires of distal segments give way to the bends and extensions of the segments that they
+    cross, so every segment has its own action. Without load and with wires that do not stretch, the segments
+    are arcs of these bends.
 
     >>> import fastrod
     >>> actions = SegmentActions(fastrod.load_robot("prototype"))
@@ -36,17 +38,24 @@ class SegmentActions:
     """
 
     def __init__(self, robot: Robot, offset: float | None = None) -> None:
-        """`offset`: displacement per bend [m/rad]; by default the distance of each segment's first wire from the backbone. Raises
+        """`offset`: displacement per bend [m/rad]; by default the distance of each segment's first wire from
+        the backbone. Raises
         `RobotError` where a segment is not driven by the lengths of two or more wires around it."""
         wiring = wire(robot)
         n = robot.n_segments
         offsets = np.full(n, offset, float) if offset else np.zeros(n)
         for k, segment in enumerate(robot.segments):
             if segment.mode not in ("tendon_length", "paper"):
-                raise RobotError(f"segment {k + 1} of robot {robot.name!r} is {segment.mode}; an action needs wires driven by length.")
+                raise RobotError(
+                    f"segment {k + 1} of robot {robot.name!r} is {segment.mode}; an action "
+                    "needs wires driven by length."
+                )
             arms = np.array([tendon.position(k + 1)[k] for tendon in segment.tendons])
             if np.linalg.matrix_rank(arms) < 2:
-                raise RobotError(f"the wires of segment {k + 1} of robot {robot.name!r} bend it in one plane; an action needs two.")
+                raise RobotError(
+                    f"the wires of segment {k + 1} of robot {robot.name!r} bend it in one "
+                    "plane; an action needs two."
+                )
             offsets[k] = offsets[k] or np.hypot(*arms[0])
         bends = np.zeros((n, 2, 3 * n))  # about d1 and d2, by the action
         for k in range(n):
@@ -60,8 +69,8 @@ class SegmentActions:
         longer = np.cumsum(self.by_extension, axis=0)[robot.tendon_segment]
         by_length = longer + np.moveaxis(wiring.wires(np.moveaxis(bends, 2, 0)), 0, 1)
         self.matrix: Floats = np.concatenate([by_length, self.by_extension])
-        """(n_tendons + n_segments, 3 n_segments) d(tendon length, extension)/d(action): `Simulator.jacobian() @ matrix` is the
-        tip's Jacobian by actions."""
+        """(n_tendons + n_segments, 3 n_segments) d(tendon length, extension)/d(action): `Simulator.jacobian()
+        @ matrix` is the tip's Jacobian by actions."""
 
     @property
     def n_actions(self) -> int:
@@ -69,7 +78,8 @@ class SegmentActions:
         return 3 * self.robot.n_segments
 
     def inputs(self, action: ArrayLike) -> WireInputs:
-        """Wire lengths and extensions of an action (..., 3 n_segments) [m]. Raises `InputError` where it is not one."""
+        """Wire lengths and extensions of an action (..., 3 n_segments) [m]. Raises `InputError` where it is
+        not one."""
         refuse_masked("action", action)
         try:
             a = np.asarray(action, dtype=np.float64)
@@ -77,11 +87,15 @@ class SegmentActions:
             raise InputError(f"action is {shown(action)}; give {self.n_actions} numbers [m].") from error
         if a.ndim == 0 or a.shape[-1] != self.n_actions:
             raise InputError(
-                f"action has shape {a.shape}; it must be (..., {self.n_actions}): extension and two displacements for each of "
+                f"action has shape {a.shape}; it must be (..., {self.n_actions}): extension and two "
+                "displacements for each of "
                 f"{self.robot.n_segments} segments, base first [m]."
             )
         if not np.isfinite(a).all():
-            raise InputError(f"action holds a value that is not finite: {np.array2string(a.ravel()[:9], max_line_width=1000)}.")
+            raise InputError(
+                "action holds a value that is not finite: "
+                f"{np.array2string(a.ravel()[:9], max_line_width=1000)}."
+            )
         change = a @ self.matrix.T
         return WireInputs(
             tendon_length=self.robot.rest_tendon_length + change[..., : self.robot.n_tendons],

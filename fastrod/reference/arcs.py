@@ -1,4 +1,5 @@
-"""Constant-curvature arcs: the shape that follows from tendon lengths alone, and the first guess of the solvers."""
+"""Constant-curvature arcs: the shape that follows from tendon lengths alone, and the first guess of the
+solvers."""
 
 from __future__ import annotations
 
@@ -33,35 +34,56 @@ _ROUNDS = 20  # of the guess, at most
 
 
 def constant_curvature(
-    robot: Robot, tendon_length: ArrayLike, extension: ArrayLike | None = None, *, points_per_segment: int = 20
+    robot: Robot,
+    tendon_length: ArrayLike,
+    extension: ArrayLike | None = None,
+    *,
+    points_per_segment: int = 20,
 ) -> ReferenceShape:
     """Shape of a chain of constant-curvature arcs from the tendon lengths alone: no stiffness, no loads.
 
-    Per segment the least-squares (u_x, u_y) with u_z = 0, after a distal tendon's path through the segments before it,
-    at its own offsets there, is taken off its length. A segment without tendons keeps its precurvature. Without loads,
-    with lengths that fit together and wires that do not stretch this is the rod's own shape, whatever its stiffness.
+    Per segment the least-squares (u_x, u_y) with u_z = 0, after a distal tendon's path through the segments
+    before it, at its own offsets there, is taken off its length. A segment without tendons keeps its
+    precurvature. Without loads, with lengths that fit together and wires that do not stretch this is the
+    rod's own shape, whatever its stiffness.
 
     `tendon_length` (n_tendons,) [m], absolute, base to where the tendon ends; `extension` (n_segments,) [m].
     `residual` is the largest length that the arcs miss [m]; `tension` is nan.
-    Source: Kasaei et al., CoRL 2024, eq. 2b (curvature of the segment base from the wire lengths), one arc a segment.
-    Raises `InputError` on wrong shapes and ranges.
+    Source: Kasaei et al., CoRL 2024, eq. 2b (curvature of the segment base from the wire lengths), one arc a
+    segment. Raises `InputError` on wrong shapes and ranges.
     """
     length = np.asarray(tendon_length, dtype=np.float64)
     if length.shape != (robot.n_tendons,) or not np.all(np.isfinite(length)):
-        raise InputError(f"tendon_length has shape {length.shape}; it must be ({robot.n_tendons},) finite lengths [m].")
+        raise InputError(
+            f"tendon_length has shape {length.shape}; it must be ({robot.n_tendons},) finite lengths [m]."
+        )
     backbone = segment_length(robot, extension)
-    u = curvature_of_length(robot, backbone, length, np.array([segment.precurvature for segment in robot.segments]))
+    u = curvature_of_length(
+        robot, backbone, length, np.array([segment.precurvature for segment in robot.segments])
+    )
     fraction = np.arange(1, points_per_segment + 1) / points_per_segment
     states = arc_states(robot, backbone, u, fraction)
-    s = np.concatenate([[0.0], *(end - step * (1.0 - fraction) for end, step in zip(np.cumsum(backbone), backbone, strict=True))])
+    s = np.concatenate(
+        [
+            [0.0],
+            *(end - step * (1.0 - fraction) for end, step in zip(np.cumsum(backbone), backbone, strict=True)),
+        ]
+    )
     missed = float(np.abs(states[-1, PATH] - length).max(initial=0.0))
     return shape_of(
-        s, states, tension=np.full(robot.n_tendons, np.nan), residual=missed, evaluations=1, success=True, message="constant-curvature arcs"
+        s,
+        states,
+        tension=np.full(robot.n_tendons, np.nan),
+        residual=missed,
+        evaluations=1,
+        success=True,
+        message="constant-curvature arcs",
     )
 
 
 def curvature_of_length(robot: Robot, backbone: Array, tendon_length: Array, unheld: Array) -> Array:
-    """(n_segments, 3) least-squares arc curvature; `unheld` (n_segments, 3) where a segment's own lengths are not known.
+    """(n_segments, 3) least-squares arc curvature; `unheld` (n_segments, 3) where a segment's own lengths are
+    not known.
 
     A length is known where `tendon_length` is positive.
     """
@@ -98,10 +120,11 @@ def arc_states(robot: Robot, backbone: Array, u: Array, fraction: Array) -> Arra
 
 
 def first_guess(problem: Problem) -> tuple[Array, Array, Array, Array]:
-    """Where the solvers start: arc curvature (n_segments, 3), tension (n_tendons,), base moment (3,), follower force (3,).
+    """Where the solvers start: arc curvature (n_segments, 3), tension (n_tendons,), base moment (3,),
+    follower force (3,).
 
-    The cantilever is statically determinate: on the arc that the lengths prescribe, the loads give every moment, and the
-    least-norm tensions follow. A guess of zero instead diverges.
+    The cantilever is statically determinate: on the arc that the lengths prescribe, the loads give every
+    moment, and the least-norm tensions follow. A guess of zero instead diverges.
     """
     robot = problem.robot
     backbone = np.diff(problem.segment_end, prepend=0.0)
@@ -122,7 +145,8 @@ def first_guess(problem: Problem) -> tuple[Array, Array, Array, Array]:
                 rest = moment[k] - span_moment(first[k], tension, u[k])
                 tension[own] = np.linalg.lstsq(columns, rest, rcond=1e-9)[0]
             elif not problem.paper:
-                # a full step would swing from side to side, the further the larger the load's bend of the whole robot
+                # a full step would swing from side to side, the further the larger the load's bend of the
+                # whole robot
                 bend = problem.length * float(np.linalg.norm(base_moment)) / problem.bending_stiffness
                 u[k] += (curvature_of_moment(first[k], tension, moment[k], u[k]) - u[k]) / (1.0 + 0.5 * bend)
         if np.abs(u - before).max() * problem.length < 0.01:
@@ -131,7 +155,8 @@ def first_guess(problem: Problem) -> tuple[Array, Array, Array, Array]:
 
 
 def _load_moment(problem: Problem, backbone: Array, u: Array) -> tuple[Array, Array, Array]:
-    """Moment of the loads on the arcs, material frame: mid-segment (n_segments, 3), base (3,); follower force (3,), world."""
+    """Moment of the loads on the arcs, material frame: mid-segment (n_segments, 3), base (3,); follower force
+    (3,), world."""
     n = 10
     states = arc_states(problem.robot, backbone, u, np.arange(1, 2 * n + 1) / (2 * n))
     rotation = states[:, ROTATION].reshape(-1, 3, 3)

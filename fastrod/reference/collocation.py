@@ -44,19 +44,31 @@ def solve_bvp(
 ) -> ReferenceShape:
     """Static shape of one robot by collocation (scipy.integrate.solve_bvp), fourth order, adaptive mesh.
 
-    The same equations, inputs, units and frames as `shoot`; states of all spans stacked on [0, 1], tensions as
-    parameters. Not for mode `paper`, whose conditions are more than its unknowns, and not for a unilateral tendon that
-    goes slack. `rtol` bounds the relative residual of the slopes on at most `max_nodes` nodes, `tolerance` [m] the
-    boundary residual of a success.
+    The same equations, inputs, units and frames as `shoot`; states of all spans stacked on [0, 1], tensions
+    as parameters. Not for mode `paper`, whose conditions are more than its unknowns, and not for a unilateral
+    tendon that goes slack. `rtol` bounds the relative residual of the slopes on at most `max_nodes` nodes,
+    `tolerance` [m] the boundary residual of a success.
 
     Source: Rucker and Webster, IEEE T-RO 27(6), 2011, section III.
     Raises `InputError` for inputs of the wrong shape or range, and for robots in mode `paper`.
     """
     from scipy.integrate import solve_bvp as collocate
 
-    problem = make_problem(robot, tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force, follower_tip_force)
+    problem = make_problem(
+        robot,
+        tendon_length,
+        tension,
+        extension,
+        tip_force,
+        tip_moment,
+        line_force,
+        point_force,
+        follower_tip_force,
+    )
     if problem.paper:
-        raise InputError("solve_bvp cannot do mode 'paper': its tendon lengths are met by least squares only; use shoot.")
+        raise InputError(
+            "solve_bvp cannot do mode 'paper': its tendon lengths are met by least squares only; use shoot."
+        )
     n_spans, n_free, width = len(problem.spans), int(problem.free.sum()), 15 + robot.n_tendons
     calls = 0
 
@@ -83,7 +95,9 @@ def solve_bvp(
     nodes = np.linspace(0.0, 1.0, 11)
     states, p = _guess(problem, nodes)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        found = collocate(fun, conditions, nodes, states, p=p, tol=rtol, bc_tol=0.1 * tolerance, max_nodes=max_nodes)
+        found = collocate(
+            fun, conditions, nodes, states, p=p, tol=rtol, bc_tol=0.1 * tolerance, max_nodes=max_nodes
+        )
     p = p if found.p is None else found.p
     s = grid(problem, points_per_segment)
     missed = float(np.abs(conditions(found.y[:, 0], found.y[:, -1], p)).max())
@@ -111,7 +125,8 @@ def _sample(problem: Problem, solution: Callable[[Array], Array], s: Array) -> A
 
 
 def _conditions(problem: Problem, first: Array, last: Array, tension: Array, follower: Array) -> Array:
-    """Base pose, everything but u continuous at each cut, total moment continuous there, and the tip; `first`, `last` (n_spans, width)."""
+    """Base pose, everything but u continuous at each cut, total moment continuous there, and the tip;
+    `first`, `last` (n_spans, width)."""
     scale = problem.length**2 / problem.bending_stiffness
     still = np.r_[: CURVATURE.start, PATH.start : first.shape[1]]
     parts = [(first[0] - base_state(problem.robot))[still]]
@@ -126,7 +141,8 @@ def _conditions(problem: Problem, first: Array, last: Array, tension: Array, fol
 def _guess(problem: Problem, nodes: Array) -> tuple[Array, Array]:
     """Arcs under the first guess: stacked states (n_spans * width, n_nodes) and parameters.
 
-    The last parameter is a spare, held at zero: scipy treats a problem without parameters as one of another kind.
+    The last parameter is a spare, held at zero: scipy treats a problem without parameters as one of another
+    kind.
     """
     u, tension, _, follower = first_guess(problem)
     backbone = np.diff(problem.segment_end, prepend=0.0)
@@ -139,4 +155,6 @@ def _guess(problem: Problem, nodes: Array) -> tuple[Array, Array]:
         block = np.array([np.interp(here, s, column) for column in states.T])
         block[CURVATURE] = u[span.segment][:, None]
         stacked.append(block)
-    return np.concatenate(stacked), np.concatenate([tension[problem.free], follower if problem.follows else [], [0.0]])
+    return np.concatenate(stacked), np.concatenate(
+        [tension[problem.free], follower if problem.follows else [], [0.0]]
+    )

@@ -37,17 +37,28 @@ def make_problem(
     given = mode == "tendon_tension"
     length = _per_tendon("tendon_length", tendon_length, free | paper, "m")
     if np.any(length[free | paper] <= 0.0) or np.any(length > _LONGEST):
-        raise InputError(f"tendon_length is {length.tolist()!r} m; lengths are absolute, base to end, between 0 and {_LONGEST:g} m. In mm?")
+        raise InputError(
+            f"tendon_length is {length.tolist()!r} m; lengths are absolute, base to end, "
+            f"between 0 and {_LONGEST:g} m. In mm?"
+        )
     pull = np.where(given, _per_tendon("tension", tension, given, "N"), 0.0)
     unilateral = np.array([tendon.unilateral for tendon in robot.tendons], dtype=bool)
     if np.any(pull[unilateral] < 0.0):
-        raise InputError(f"tension is {pull.tolist()!r} N; a unilateral tendon cannot push, so it must not be negative.")
+        raise InputError(
+            f"tension is {pull.tolist()!r} N; a unilateral tendon cannot push, so it must not be negative."
+        )
     segment_end = np.cumsum(segment_length(robot, extension))
     force = _vector("tip_force", tip_force, "N")
     return Problem(
         robot=robot,
         paper=paper,
-        spans=_spans(robot, segment_end, _line_force(robot, line_force), _point_force(point_force or (), segment_end[-1]), force),
+        spans=_spans(
+            robot,
+            segment_end,
+            _line_force(robot, line_force),
+            _point_force(point_force or (), segment_end[-1]),
+            force,
+        ),
         segment_end=segment_end,
         tendon_length=length,
         tension=pull,
@@ -64,11 +75,16 @@ def segment_length(robot: Robot, extension: ArrayLike | None) -> Array:
         return rest
     change = _array("extension", extension)
     if change.shape != rest.shape:
-        raise InputError(f"extension has shape {change.shape}; it must be ({robot.n_segments},), one change of length a segment [m].")
+        raise InputError(
+            f"extension has shape {change.shape}; it must be ({robot.n_segments},), one change "
+            "of length a segment [m]."
+        )
     for k, (segment, value) in enumerate(zip(robot.segments, change, strict=True), 1):
         low, high = segment.extension
         if not low <= value <= high:
-            raise InputError(f"extension of segment {k} is {value:.6g} m; its range is {low:g} to {high:g} m.")
+            raise InputError(
+                f"extension of segment {k} is {value:.6g} m; its range is {low:g} to {high:g} m."
+            )
     return np.asarray(rest + change)
 
 
@@ -80,7 +96,9 @@ def tendon_offset(robot: Robot, segment: int) -> tuple[NDArray[np.int64], Array]
     return crossing, np.array(offset, dtype=np.float64).reshape(-1, 3)
 
 
-def _spans(robot: Robot, segment_end: Array, line: list[Array], points: list[tuple[float, Array]], tip_force: Array) -> tuple[Span, ...]:
+def _spans(
+    robot: Robot, segment_end: Array, line: list[Array], points: list[tuple[float, Array]], tip_force: Array
+) -> tuple[Span, ...]:
     """Base first; cut wherever a load jumps or bends, so that an integrator never has to find the place."""
     near = 1e-12 * segment_end[-1]
     spans: list[Span] = []
@@ -90,7 +108,11 @@ def _spans(robot: Robot, segment_end: Array, line: list[Array], points: list[tup
         segment = robot.segments[k]
         low, high = (0.0 if k == 0 else segment_end[k - 1]), segment_end[k]
         knot = np.linspace(low, high, len(line[k]))
-        cut = [low, *sorted(s for s in {*knot, *(s for s, _ in points)} if low + near < s < high - near), high]
+        cut = [
+            low,
+            *sorted(s for s in {*knot, *(s for s, _ in points)} if low + near < s < high - near),
+            high,
+        ]
         tendon, offset = tendon_offset(robot, k)
         for start, end in reversed(list(pairwise(cut))):
             f = np.array([[np.interp(s, knot, line[k][:, axis]) for axis in range(3)] for s in (start, end)])
@@ -119,15 +141,22 @@ def _line_force(robot: Robot, value: ArrayLike | None) -> list[Array]:
     if given.shape == (3,):
         given = np.broadcast_to(given, (n, 2, 3))
     if given.ndim != 3 or given.shape[0] != n or given.shape[1] < 2 or given.shape[2] != 3:
-        raise InputError(f"line_force has shape {given.shape}; it must be (3,) or ({n}, points, 3) with two points or more [N/m].")
-    return [given[k] + segment.line_density * np.array(robot.gravity) for k, segment in enumerate(robot.segments)]
+        raise InputError(
+            f"line_force has shape {given.shape}; it must be (3,) or ({n}, points, 3) with two "
+            "points or more [N/m]."
+        )
+    return [
+        given[k] + segment.line_density * np.array(robot.gravity) for k, segment in enumerate(robot.segments)
+    ]
 
 
 def _point_force(pairs: PointForce, length: float) -> list[tuple[float, Array]]:
     checked = []
     for pair in pairs:
         if len(pair) != 2 or np.ndim(pair[0]) != 0:
-            raise InputError(f"point_force holds {pair!r}; each entry must be a pair of arclength [m] and force (3,) [N].")
+            raise InputError(
+                f"point_force holds {pair!r}; each entry must be a pair of arclength [m] and force (3,) [N]."
+            )
         s = float(pair[0])
         if not 0.0 <= s <= length * (1.0 + 1e-12):
             raise InputError(f"point_force stands at {s:.6g} m; the backbone runs from 0 to {length:.6g} m.")
@@ -157,9 +186,13 @@ def _per_tendon(name: str, value: ArrayLike | None, needed: NDArray[np.bool_], u
     """(n_tendons,); what is not needed may be anything, nan too."""
     if value is None:
         if needed.any():
-            raise InputError(f"{name} is missing; the modes of this robot ask for it: ({len(needed)},) [{unit}].")
+            raise InputError(
+                f"{name} is missing; the modes of this robot ask for it: ({len(needed)},) [{unit}]."
+            )
         return np.zeros(len(needed))
     array = _array(name, value, needed)
     if array.shape != needed.shape:
-        raise InputError(f"{name} has shape {array.shape}; it must be ({len(needed)},), one value a tendon [{unit}].")
+        raise InputError(
+            f"{name} has shape {array.shape}; it must be ({len(needed)},), one value a tendon [{unit}]."
+        )
     return np.where(needed, array, 0.0)

@@ -1,7 +1,8 @@
 """The tendon rod as equations on numpy arrays: what `shoot` and `solve_bvp` both integrate.
 
-Rucker and Webster, IEEE T-RO 27(6), 2011, section III, in its inextensible, unshearable limit and solved for the
-curvature. r position, R = [d1 d2 d3] rotation (world_from_material), u curvature, n and m internal force and moment.
+Rucker and Webster, IEEE T-RO 27(6), 2011, section III, in its inextensible, unshearable limit and solved for
+the curvature. r position, R = [d1 d2 d3] rotation (world_from_material), u curvature, n and m internal force
+and moment.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ PATH = slice(15, None)
 class ReferenceShape:
     """One robot at rest, as a reference solver found it; SI units, world frame unless said otherwise.
 
-    n_points = n_segments * points_per_segment + 1, base first, evenly spaced in each segment. Curvature jumps at a
-    joint; the point there holds the value just before it.
+    n_points = n_segments * points_per_segment + 1, base first, evenly spaced in each segment. Curvature jumps
+    at a joint; the point there holds the value just before it.
     """
 
     position: Array
@@ -59,7 +60,8 @@ class ReferenceShape:
 
 @dataclass(frozen=True, kw_only=True)
 class Span:
-    """A stretch of backbone where nothing jumps: one stiffness, one set of tendons, a line force linear in s."""
+    """A stretch of backbone where nothing jumps: one stiffness, one set of tendons, a line force linear in
+    s."""
 
     segment: int
     start: float
@@ -127,8 +129,12 @@ class Problem:
 
     def scaled(self, fraction: float) -> Problem:
         """The same robot under a fraction of its loads."""
-        spans = tuple(replace(s, line_force=fraction * s.line_force, force=fraction * s.force) for s in self.spans)
-        return replace(self, spans=spans, tip_moment=fraction * self.tip_moment, follower=fraction * self.follower)
+        spans = tuple(
+            replace(s, line_force=fraction * s.line_force, force=fraction * s.force) for s in self.spans
+        )
+        return replace(
+            self, spans=spans, tip_moment=fraction * self.tip_moment, follower=fraction * self.follower
+        )
 
 
 def hat(v: Array) -> Array:
@@ -143,7 +149,9 @@ def turn(angle: Array) -> Array:
     theta = float(np.linalg.norm(angle))
     k = hat(angle)
     # np.sinc keeps both coefficients exact through zero angle
-    return np.asarray(np.eye(3) + np.sinc(theta / np.pi) * k + 0.5 * np.sinc(theta / (2.0 * np.pi)) ** 2 * (k @ k))
+    return np.asarray(
+        np.eye(3) + np.sinc(theta / np.pi) * k + 0.5 * np.sinc(theta / (2.0 * np.pi)) ** 2 * (k @ k)
+    )
 
 
 def base_state(robot: Robot) -> Array:
@@ -156,8 +164,8 @@ def base_state(robot: Robot) -> Array:
 def moment_and_stiffness(span: Span, tension: Array, u: Array) -> tuple[Array, Array, Array]:
     """Moment of a cut, its derivative, and how fast the tendons' paths grow there.
 
-    m = K (u - u*) + sum_i T_i d_i x t_i and A = dm/du = K - sum_i T_i/|q_i| [d_i]x (I - t_i t_i^T) [d_i]x, with
-    q_i = e3 + u x d_i and t_i = q_i/|q_i|.
+    m = K (u - u*) + sum_i T_i d_i x t_i and A = dm/du = K - sum_i T_i/|q_i| [d_i]x (I - t_i t_i^T) [d_i]x,
+    with q_i = e3 + u x d_i and t_i = q_i/|q_i|.
 
     `tension` (n_tendons,), `u` (p, 3); returns m (p, 3), A (p, 3, 3), |q_i| (p, n_crossing).
     """
@@ -180,7 +188,8 @@ def span_moment(span: Span, tension: Array, u: Array) -> Array:
 
 
 def internal_force(span: Span, s: Array, tip_force: Array) -> Array:
-    """n(s) = F + integral_s^l f + the point forces beyond s, world (p, 3) [N]; eq. 1c is printed with integral_0^s.
+    """n(s) = F + integral_s^l f + the point forces beyond s, world (p, 3) [N]; eq. 1c is printed with
+    integral_0^s.
 
     `tip_force` (3,) is the part that the tip's own rotation decides.
     """
@@ -212,7 +221,8 @@ def slope(span: Span, tension: Array, tip_force: Array, s: Array, state: Array) 
 def curvature_of_moment(span: Span, tension: Array, moment: Array, u: Array) -> Array:
     """u (3,) at which the cut of `span` carries `moment` (3,): Newton from `u`.
 
-    For T >= 0 it is the minimum of a convex function, 1/2 (u-u*)^T K (u-u*) + sum T_i |q_i| - m u, so there is one.
+    For T >= 0 it is the minimum of a convex function, 1/2 (u-u*)^T K (u-u*) + sum T_i |q_i| - m u, so there
+    is one.
     """
     for _ in range(50):
         m, stiffness, _ = moment_and_stiffness(span, tension, u[None])
@@ -228,7 +238,8 @@ def curvature_of_moment(span: Span, tension: Array, moment: Array, u: Array) -> 
 def tip_residual(problem: Problem, tension: Array, tip_force: Array, tip: Array) -> Array:
     """What the tip of a trial misses [m]: lengths of the free tendons, m(l) - R^T M, follower force.
 
-    l_i = L_i + c_i (T_i - T0_i): a stretching tendon is what makes the tensions unique for any number of tendons.
+    l_i = L_i + c_i (T_i - T0_i): a stretching tendon is what makes the tensions unique for any number of
+    tendons.
     """
     scale = problem.length**2 / problem.bending_stiffness
     rotation = tip[ROTATION].reshape(3, 3)
@@ -248,7 +259,8 @@ def grid(problem: Problem, points_per_segment: int) -> Array:
 
 
 def shape_of(s: Array, states: Array, **found: object) -> ReferenceShape:
-    """A `ReferenceShape` of the states (n_points, 15 + n_tendons) at `s`, and of what the solver has to say."""
+    """A `ReferenceShape` of the states (n_points, 15 + n_tendons) at `s`, and of what the solver has to
+    say."""
     rotation = states[:, ROTATION].reshape(-1, 3, 3)
     return ReferenceShape(
         position=states[:, POSITION],

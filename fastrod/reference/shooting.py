@@ -61,28 +61,32 @@ def shoot(
 ) -> ReferenceShape:
     """Static shape of one robot by shooting: scipy integrates, scipy finds the boundary unknowns.
 
-    Unknowns: total internal moment at the base, tension of every tendon of a `tendon_length` segment. Conditions: each
-    such tendon's length, l_i = L_i + c_i (T_i - T0_i), and m(l) = R^T M_tip. A unilateral tendon whose tension would be
-    negative is slack, T = 0, and its length condition is dropped. Total moment is continuous across a joint, so what
-    jumps there is u. A robot in mode `paper`: T = 0 in the balance, unknowns u_x and u_y at each segment's base with
-    u_z = 0 there, and the tendon lengths met in the least-squares sense.
+    Unknowns: total internal moment at the base, tension of every tendon of a `tendon_length` segment.
+    Conditions: each such tendon's length, l_i = L_i + c_i (T_i - T0_i), and m(l) = R^T M_tip. A unilateral
+    tendon whose tension would be negative is slack, T = 0, and its length condition is dropped. Total moment
+    is continuous across a joint, so what jumps there is u. A robot in mode `paper`: T = 0 in the balance,
+    unknowns u_x and u_y at each segment's base with u_z = 0 there, and the tendon lengths met in the
+    least-squares sense.
 
-    - `tendon_length` (n_tendons,) [m], absolute, base to where the tendon ends; read in `tendon_length` and `paper` segments.
+    - `tendon_length` (n_tendons,) [m], absolute, base to where the tendon ends; read in `tendon_length` and
+      `paper` segments.
     - `tension` (n_tendons,) [N]; read in `tendon_tension` segments.
     - `extension` (n_segments,) change of backbone length [m].
-    - `tip_force` [N], `tip_moment` [N m]: (3,), dead, world frame. `follower_tip_force` (3,) [N], material frame of the tip.
-    - `line_force` [N/m], world: (3,), or (n_segments, points, 3) linear between evenly spaced points of each segment.
-      A segment's line_density * gravity is added.
-    - `point_force`: pairs of arclength along the backbone as it is, extension included [m], and force (3,), world [N].
+    - `tip_force` [N], `tip_moment` [N m]: (3,), dead, world frame. `follower_tip_force` (3,) [N], material
+      frame of the tip.
+    - `line_force` [N/m], world: (3,), or (n_segments, points, 3) linear between evenly spaced points of each
+      segment. A segment's line_density * gravity is added.
+    - `point_force`: pairs of arclength along the backbone as it is, extension included [m], and force (3,),
+      world [N].
     - `method`: `lm` least squares; `slsqp` and `trust-constr` with the conditions as equality constraints.
     - `integrator`, `rtol`, `atol`: of scipy.integrate.solve_ivp, over each stretch where no load jumps.
-    - `guess`: an earlier shape of the same robot; by default arcs from the lengths and the loads' moment on them. When
-      that fails, the loads are raised in steps.
+    - `guess`: an earlier shape of the same robot; by default arcs from the lengths and the loads' moment on
+      them. When that fails, the loads are raised in steps.
     - `tolerance` [m]: a residual above it is no success; see `ReferenceShape.residual` for the scaling.
 
-    Source: Rucker and Webster, IEEE T-RO 27(6), 2011, section III (tendon rod, here inextensible and unshearable);
-    mode `paper`: Kasaei et al., CoRL 2024, eq. 1 to 3, with eq. 1c's integral taken from s to l.
-    Raises `InputError` for inputs of the wrong shape or range. A search that fails returns success False.
+    Source: Rucker and Webster, IEEE T-RO 27(6), 2011, section III (tendon rod, here inextensible and
+    unshearable); mode `paper`: Kasaei et al., CoRL 2024, eq. 1 to 3, with eq. 1c's integral taken from s to
+    l. Raises `InputError` for inputs of the wrong shape or range. A search that fails returns success False.
     """
     if method not in _METHODS:
         raise InputError(f"no method {method!r}; {nearest(str(method), _METHODS)}")
@@ -90,10 +94,22 @@ def shoot(
         raise InputError(f"no integrator {integrator!r}; {nearest(str(integrator), _INTEGRATORS)}")
     if points_per_segment < 1:
         raise InputError(f"points_per_segment is {points_per_segment}; it must be 1 or more.")
-    problem = make_problem(robot, tendon_length, tension, extension, tip_force, tip_moment, line_force, point_force, follower_tip_force)
+    problem = make_problem(
+        robot,
+        tendon_length,
+        tension,
+        extension,
+        tip_force,
+        tip_moment,
+        line_force,
+        point_force,
+        follower_tip_force,
+    )
     search = _Search(method, integrator, rtol, atol, tolerance)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        problem, x, missed, passes = _complementary(search, problem, None if guess is None else _from_shape(problem, guess))
+        problem, x, missed, passes = _complementary(
+            search, problem, None if guess is None else _from_shape(problem, guess)
+        )
         s = grid(problem, points_per_segment)
         try:
             states = _march(search, problem, x, s)
@@ -108,7 +124,8 @@ def shoot(
         residual=missed,
         evaluations=passes,
         success=bool(success),
-        message=f"{'solved' if success else 'not solved'} with {method}: residual {missed:.3g} m after {passes} forward passes",
+        message=f"{'solved' if success else 'not solved'} with {method}: residual {missed:.3g} m after "
+        f"{passes} forward passes",
     )
 
 
@@ -125,7 +142,10 @@ class _Search:
 
 def _scale(problem: Problem) -> tuple[float, float, float]:
     """Units that make every unknown about one: moment or curvature, tension, force."""
-    offset = max((float(np.abs(span.offset).max(initial=0.0)) for span in problem.spans), default=0.0) or problem.length
+    offset = (
+        max((float(np.abs(span.offset).max(initial=0.0)) for span in problem.spans), default=0.0)
+        or problem.length
+    )
     moment = problem.bending_stiffness / problem.length
     return (1.0 / problem.length if problem.paper else moment), moment / offset, moment / problem.length
 
@@ -137,7 +157,8 @@ def _pack(problem: Problem, base: Array, tension: Array, follower: Array) -> Arr
 
 
 def _unpack(problem: Problem, x: Array) -> tuple[Array, Array, Array]:
-    """Base moment (3,), or in mode `paper` u_x, u_y per segment (n_segments, 2); tension (n_tendons,); follower force (3,), world."""
+    """Base moment (3,), or in mode `paper` u_x, u_y per segment (n_segments, 2); tension (n_tendons,);
+    follower force (3,), world."""
     first, second, third = _scale(problem)
     n_base = 2 * problem.robot.n_segments if problem.paper else 3
     n_free = int(problem.free.sum())
@@ -163,7 +184,9 @@ def _from_shape(problem: Problem, shape: ReferenceShape) -> Array:
     # one point into each segment, because the joint itself holds the value before it
     base = shape.curvature[[k * step + (k > 0) for k in range(n)], :2]
     if not problem.paper:
-        base = span_moment(problem.spans[0], np.where(problem.free, tension, problem.tension), shape.curvature[0])
+        base = span_moment(
+            problem.spans[0], np.where(problem.free, tension, problem.tension), shape.curvature[0]
+        )
     return _pack(problem, base, tension, shape.tip_rotation @ problem.follower)
 
 
@@ -198,7 +221,13 @@ def _entry(problem: Problem, before: Span | None, span: Span, base: Array, tensi
 
 
 def _along(
-    search: _Search, problem: Problem, span: Span, tension: Array, follower: Array, state: Array, inside: Array
+    search: _Search,
+    problem: Problem,
+    span: Span,
+    tension: Array,
+    follower: Array,
+    state: Array,
+    inside: Array,
 ) -> tuple[Array, Array]:
     """State at the end of a span, and states (p, 15 + n_tendons) at the arclengths `inside`."""
     from scipy.integrate import solve_ivp
@@ -208,7 +237,12 @@ def _along(
             raise ArithmeticError("the trial coils up")
         return np.asarray(slope(span, tension, follower, np.array([s]), y[None])[0])
 
-    options: Any = {"method": search.integrator, "rtol": search.rtol, "atol": search.atol, "dense_output": bool(len(inside))}
+    options: Any = {
+        "method": search.integrator,
+        "rtol": search.rtol,
+        "atol": search.atol,
+        "dense_output": bool(len(inside)),
+    }
     found: Any = solve_ivp(fun, (span.start, span.end), state, **options)
     end = np.array(found.y[:, -1])
     if not found.success or not np.all(np.isfinite(end)):
@@ -244,7 +278,8 @@ def _solve(search: _Search, problem: Problem, guess: Array) -> tuple[Array, floa
         return _missed(search, problem, x) / problem.length
 
     def jacobian(x: Array) -> Array:
-        # a step at the square root of the integrator's error balances that error against the curvature of the residual
+        # a step at the square root of the integrator's error balances that error against the curvature of the
+        # residual
         step = search.rtol**0.5
         here = residual(x)
         return np.stack([(residual(x + step * e) - here) / step for e in np.eye(len(x))], axis=1)
@@ -252,16 +287,31 @@ def _solve(search: _Search, problem: Problem, guess: Array) -> tuple[Array, floa
     n_conditions = len(residual(guess))
     if len(guess) > n_conditions:
         n_tendons = problem.robot.n_tendons
-        raise InputError(f"{len(guess)} unknowns for {n_tendons} tendon lengths; mode 'paper' needs two tendons a segment or more.")
+        raise InputError(
+            f"{len(guess)} unknowns for {n_tendons} tendon lengths; mode 'paper' needs two "
+            "tendons a segment or more."
+        )
     square = len(guess) == n_conditions
     x = _FIND[search.method](residual, jacobian, guess, square, search.tolerance / problem.length)
     return x, float(np.abs(residual(x)).max(initial=0.0)) * problem.length, passes
 
 
-def _least_squares(residual: Residual, jacobian: Residual, guess: Array, _square: bool, _tolerance: float) -> Array:
+def _least_squares(
+    residual: Residual, jacobian: Residual, guess: Array, _square: bool, _tolerance: float
+) -> Array:
     from scipy.optimize import least_squares
 
-    found = least_squares(residual, guess, jac=jacobian, method="lm", x_scale="jac", xtol=1e-12, ftol=1e-14, gtol=1e-15, max_nfev=100)
+    found = least_squares(
+        residual,
+        guess,
+        jac=jacobian,
+        method="lm",
+        x_scale="jac",
+        xtol=1e-12,
+        ftol=1e-14,
+        gtol=1e-15,
+        max_nfev=100,
+    )
     return np.asarray(found.x)
 
 
@@ -270,14 +320,20 @@ def _slsqp(residual: Residual, jacobian: Residual, guess: Array, square: bool, t
 
     if not square:
         squares, gradient = _half_squares(residual, jacobian)
-        return np.asarray(minimize(squares, guess, jac=gradient, method="SLSQP", options={"ftol": 1e-20, "maxiter": 500}).x)
+        return np.asarray(
+            minimize(squares, guess, jac=gradient, method="SLSQP", options={"ftol": 1e-20, "maxiter": 500}).x
+        )
     # with nothing to minimise, SLSQP's step is Newton's on the conditions, safeguarded by its line search
     conditions: Any = {"type": "eq", "fun": residual, "jac": jacobian}
     options: Any = {"ftol": 0.1 * tolerance, "maxiter": 200}
-    return np.asarray(minimize(_nothing, guess, jac=_no_slope, method="SLSQP", constraints=conditions, options=options).x)
+    return np.asarray(
+        minimize(_nothing, guess, jac=_no_slope, method="SLSQP", constraints=conditions, options=options).x
+    )
 
 
-def _trust_constr(residual: Residual, jacobian: Residual, guess: Array, square: bool, tolerance: float) -> Array:
+def _trust_constr(
+    residual: Residual, jacobian: Residual, guess: Array, square: bool, tolerance: float
+) -> Array:
     from scipy.optimize import NonlinearConstraint, minimize
 
     def gauss_newton(x: Array) -> Array:
@@ -287,11 +343,23 @@ def _trust_constr(residual: Residual, jacobian: Residual, guess: Array, square: 
     if not square:
         squares, gradient = _half_squares(residual, jacobian)
         options: Any = {"gtol": 1e-14, "xtol": 1e-13, "maxiter": 500}
-        return np.asarray(minimize(squares, guess, jac=gradient, hess=gauss_newton, method="trust-constr", options=options).x)
+        return np.asarray(
+            minimize(
+                squares, guess, jac=gradient, hess=gauss_newton, method="trust-constr", options=options
+            ).x
+        )
     conditions: Any = NonlinearConstraint(residual, 0.0, 0.0, jac=jacobian, hess=_no_curvature)
     limits: Any = {"gtol": 0.1 * tolerance, "xtol": 1e-13, "maxiter": 500}
     hess: Any = _no_curvature
-    found = minimize(_nothing, guess, jac=_no_slope, hess=hess, method="trust-constr", constraints=conditions, options=limits)
+    found = minimize(
+        _nothing,
+        guess,
+        jac=_no_slope,
+        hess=hess,
+        method="trust-constr",
+        constraints=conditions,
+        options=limits,
+    )
     return np.asarray(found.x)
 
 
@@ -317,7 +385,8 @@ _FIND = {"lm": _least_squares, "slsqp": _slsqp, "trust-constr": _trust_constr}
 def _continued(search: _Search, problem: Problem, guess: Array | None) -> tuple[Array, float, int]:
     """One search; where it fails, or the loads are large, the loads in steps, each from the shape before.
 
-    Under large loads a cantilever has several equilibria: the one that grows out of the unloaded rod is meant.
+    Under large loads a cantilever has several equilibria: the one that grows out of the unloaded rod is
+    meant.
     """
     bend = _load_bend(problem)
     passes = 0
@@ -348,11 +417,20 @@ def _continued(search: _Search, problem: Problem, guess: Array | None) -> tuple[
 
 def _load_bend(problem: Problem) -> float:
     """About how far the loads alone would bend the straight rod [rad]; a cantilever's P l^2 / EI."""
-    force = max(float(np.linalg.norm(internal_force(span, np.array([span.start]), problem.follower))) for span in problem.spans)
-    return problem.length * (problem.length * force + float(np.linalg.norm(problem.tip_moment))) / problem.bending_stiffness
+    force = max(
+        float(np.linalg.norm(internal_force(span, np.array([span.start]), problem.follower)))
+        for span in problem.spans
+    )
+    return (
+        problem.length
+        * (problem.length * force + float(np.linalg.norm(problem.tip_moment)))
+        / problem.bending_stiffness
+    )
 
 
-def _complementary(search: _Search, problem: Problem, guess: Array | None) -> tuple[Problem, Array, float, int]:
+def _complementary(
+    search: _Search, problem: Problem, guess: Array | None
+) -> tuple[Problem, Array, float, int]:
     """Search with the right tendons slack: T >= 0, path no longer than the wire, and one of them tight."""
     unilateral = np.array([tendon.unilateral for tendon in problem.robot.tendons], dtype=bool) & problem.free
     wire = problem.tendon_length - problem.compliance * problem.pretension

@@ -1,1 +1,2 @@
-"""From inputs to equilibrium: the boundary solver, cold starts, responses, and batches put together, on the CPU or a GPU."""
+"""From inputs to equilibrium: the boundary solver, cold starts, responses, and batches put together, on the
+CPU or a GPU."""

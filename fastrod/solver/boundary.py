@@ -22,7 +22,13 @@ if TYPE_CHECKING:
 
 _config: Any = numba.config
 _SMALL = 4 * LANES  # robots below which starting threads costs more than it saves
-NO_PROBES = Probes(np.empty((0, 0), np.int64), np.empty((0, 0, 3)), np.empty((0, 0, 3)), np.empty((0, 0, 0)), np.empty((0, 0, 0)))
+NO_PROBES = Probes(
+    np.empty((0, 0), np.int64),
+    np.empty((0, 0, 3)),
+    np.empty((0, 0, 3)),
+    np.empty((0, 0, 0)),
+    np.empty((0, 0, 0)),
+)
 
 
 def check_size(layout: Layout, n_robots: int, outputs: Literal["full", "tip"]) -> None:
@@ -50,13 +56,23 @@ def _physical_memory() -> int:
 
 
 class Passes:
-    """Robots of one layout. `params` is replaced where effects change a robot's numbers, and never written into.
+    """Robots of one layout. `params` is replaced where effects change a robot's numbers, and never written
+    into.
 
-    On a GPU the memory stays there from pass to pass; `memory`, `x` and `peek` fetch it where the device has a newer one.
+    On a GPU the memory stays there from pass to pass; `memory`, `x` and `peek` fetch it where the device has
+    a newer one.
     """
 
-    def __init__(self, layout: Layout, params: Params, n_robots: int, threads: int, carry: bool, device: Device = "cpu") -> None:
-        self.layout, self.params, self.n_robots, self.threads, self.carry = layout, params, n_robots, threads, carry
+    def __init__(
+        self, layout: Layout, params: Params, n_robots: int, threads: int, carry: bool, device: Device = "cpu"
+    ) -> None:
+        self.layout, self.params, self.n_robots, self.threads, self.carry = (
+            layout,
+            params,
+            n_robots,
+            threads,
+            carry,
+        )
         self.device: Device = device
         self._memory: Memory = self._new_memory(follower=False, track_force=False)
         self._resident: Resident | None = None
@@ -133,7 +149,11 @@ class Passes:
 
     def n_residuals(self, ports: Ports) -> int:
         """Boundary residuals of a robot."""
-        return len(self.layout.row_tendon) + (0 if self.layout.paper else 3) + (3 if len(ports.follower_force) else 0)
+        return (
+            len(self.layout.row_tendon)
+            + (0 if self.layout.paper else 3)
+            + (3 if len(ports.follower_force) else 0)
+        )
 
     def n_columns(self, ports: Ports) -> int:
         """Columns of sensitivities that a pass carries without contact."""
@@ -147,9 +167,15 @@ class Passes:
         n_x = 2 * len(layout.first_tendon) if layout.paper else 3 + len(layout.free_tendon)
         n_x += 3 if follower else 0
         return [
-            (n, n_x), (n if self.carry else 0, n_x * (n_x + 1) // 2), (n, n_x, n_e + (3 if track_force else 0)), (n, n_x), (n, n_x),
-            (n, n_rows), (n if track_force else 0, 3), (n, 3),
-        ]  # fmt: skip
+            (n, n_x),
+            (n if self.carry else 0, n_x * (n_x + 1) // 2),
+            (n, n_x, n_e + (3 if track_force else 0)),
+            (n, n_x),
+            (n, n_x),
+            (n, n_rows),
+            (n if track_force else 0, 3),
+            (n, 3),
+        ]
 
     def _new_memory(self, follower: bool, track_force: bool) -> Memory:
         single = ("covariance", "gain", "move", "defect")
@@ -160,7 +186,8 @@ class Passes:
         return Memory(**fields)
 
     def remember(self, follower: bool, track_force: bool, force: Floats | None) -> None:
-        """Widen or narrow the memory when a follower force or a moving tip force comes or goes; x of the rod itself is kept.
+        """Widen or narrow the memory when a follower force or a moving tip force comes or goes; x of the rod
+        itself is kept.
         `force` is the tip force that x belongs to."""
         if self._fields(follower, track_force) != [a.shape for a in self._memory]:
             self.memory = self._refitted(self.peek(), follower, track_force, force)
@@ -189,7 +216,8 @@ class Passes:
         return new
 
     def arrive_at(self, rows: Ints, ports: Ports) -> None:
-        """These robots were brought to these inputs by another way than a step: the next one moves from there."""
+        """These robots were brought to these inputs by another way than a step: the next one moves from
+        there."""
         rows_of = self.layout.row_tendon
         lengths = np.broadcast_to(ports.tendon_length, (self.n_robots, ports.tendon_length.shape[1]))
         memory = self.memory
@@ -203,14 +231,27 @@ class Passes:
         n, n_points, n_tendons = self.n_robots, self.n_points, len(self.layout.tendon_segment)
 
         def make(wanted: bool, *axes: int) -> Floats:
-            return (np.full((n, *axes), np.nan) if holes else np.empty((n, *axes))) if wanted else np.empty((0, *axes))
+            return (
+                (np.full((n, *axes), np.nan) if holes else np.empty((n, *axes)))
+                if wanted
+                else np.empty((0, *axes))
+            )
 
         full = outputs == "full"
         return Shape(
-            make(full, n_points, 3), make(full, n_points, 3, 3), make(full, n_points, 3), make(full, n_points),
-            make(full, n_points, 3), make(full, n_points, 3), make(True, 3), make(True, 3, 3), make(full, n_tendons),
-            make(full, n_tendons), make(full, 6), make(True),
-        )  # fmt: skip
+            make(full, n_points, 3),
+            make(full, n_points, 3, 3),
+            make(full, n_points, 3),
+            make(full, n_points),
+            make(full, n_points, 3),
+            make(full, n_points, 3),
+            make(True, 3),
+            make(True, 3, 3),
+            make(full, n_tendons),
+            make(full, n_tendons),
+            make(full, 6),
+            make(True),
+        )
 
     def run(
         self,
@@ -227,7 +268,8 @@ class Passes:
         n_col: int | None = None,
         probes: Probes = NO_PROBES,
     ) -> None:
-        """One forward pass of these robots (`kernels.batch`). What it writes into the shape is there after `collect`."""
+        """One forward pass of these robots (`kernels.batch`). What it writes into the shape is there after
+        `collect`."""
         n_probes = probes.node.shape[1]
         if n_col is None:
             n_col = self.n_x + 3 * n_probes if n_probes else self.n_columns(ports)
@@ -235,18 +277,45 @@ class Passes:
             response = Response(np.empty((0, 0, 0)), np.empty((0, 0, 0)), np.empty((0, 0)))
         if self._runner is not None and self._resident is not None:
             self._runner.run(
-                rows, self.params, ports, self.layout, self._resident, shape, response, n_col, self.n_residuals(ports),
-                feed, carry, update, process, noise,
-            )  # fmt: skip
+                rows,
+                self.params,
+                ports,
+                self.layout,
+                self._resident,
+                shape,
+                response,
+                n_col,
+                self.n_residuals(ports),
+                feed,
+                carry,
+                update,
+                process,
+                noise,
+            )
             return
         parts = 1 if len(rows) <= _SMALL else min(self.threads, -(-len(rows) // LANES))
-        size = scratch_size(len(self.layout.tendon_segment), self.n_x, n_col, self.n_residuals(ports), n_probes)
+        size = scratch_size(
+            len(self.layout.tendon_segment), self.n_x, n_col, self.n_residuals(ports), n_probes
+        )
         scratch = np.empty((parts, size))
         body = pass_serial if parts == 1 else pass_parallel
         body(
-            rows, self.params, ports, self.layout, self._memory, shape, response, probes, scratch,
-            n_col, feed, carry, update, process, noise,
-        )  # fmt: skip
+            rows,
+            self.params,
+            ports,
+            self.layout,
+            self._memory,
+            shape,
+            response,
+            probes,
+            scratch,
+            n_col,
+            feed,
+            carry,
+            update,
+            process,
+            noise,
+        )
 
     def collect(self, shape: Shape, only: str | None = None) -> Shape:
         """The shape with what the passes wrote into it, or into one field: on a GPU that is still there."""

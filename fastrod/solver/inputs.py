@@ -1,4 +1,5 @@
-"""What a caller gives, checked and broadcast into `Ports`: shapes are refused at once, bad values row by row."""
+"""What a caller gives, checked and broadcast into `Ports`: shapes are refused at once, bad values row by
+row."""
 
 from __future__ import annotations
 
@@ -55,11 +56,13 @@ class Inputs(NamedTuple):
 
 
 class Reader:
-    """Turns inputs into arrays with a robot axis of 1 or n_robots, and collects what is wrong with which robot."""
+    """Turns inputs into arrays with a robot axis of 1 or n_robots, and collects what is wrong with which
+    robot."""
 
     def __init__(self, layout: Layout, params: Params, rest: Rest, n_robots: int) -> None:
         self.layout, self.params, self.rest, self.n_robots = layout, params, rest, n_robots
-        # A tendon at distance d can differ from the backbone by d times the bend; more than a full turn per segment is no shape.
+        # A tendon at distance d can differ from the backbone by d times the bend; more than a full turn per
+        # segment is no shape.
         self._slack: Floats = 2.0 * np.pi * np.linalg.norm(params.offset, axis=-1).sum(1)
         self.problems: dict[int, str] = {}
         self.loads: tuple[Floats, Floats] = (np.zeros((1, 0)), np.zeros((1, 0, 3)))
@@ -85,9 +88,14 @@ class Reader:
         if given.tension is not None and not given_tension.any():
             raise InputError("tension was given, but no segment of this robot is in mode tendon_tension.")
         if given.follower_tip_force is not None and layout.paper:
-            raise InputError("follower_tip_force was given, but mode paper has dead loads only; give tip_force.")
+            raise InputError(
+                "follower_tip_force was given, but mode paper has dead loads only; give tip_force."
+            )
         if given.tension is None and given_tension.any():
-            raise InputError(f"tension is missing; segments in mode tendon_tension need tension (n_robots, {n_tendons}) [N].")
+            raise InputError(
+                "tension is missing; segments in mode tendon_tension need tension (n_robots, "
+                f"{n_tendons}) [N]."
+            )
         pull = self._optional("tension", given.tension, (n_tendons,), "N")
         grid, node_force = self.point_forces(given.point_force, stretch)
         return Ports(
@@ -116,18 +124,31 @@ class Reader:
                 raise TypeError
             a = a.astype(np.float64)
         except (TypeError, ValueError, OverflowError) as error:
-            raise InputError(f"{name} is not an array of numbers; give (n_robots, {', '.join(map(str, shape))}) [{unit}].") from error
+            raise InputError(
+                f"{name} is not an array of numbers; give (n_robots, {', '.join(map(str, shape))}) [{unit}]."
+            ) from error
         if a.shape == shape:
             a = a[None]
         if a.shape[1:] != shape or a.shape[0] not in (1, self.n_robots):
             wanted = ", ".join(map(str, shape))
-            raise InputError(f"{name} has shape {np.shape(value)}; it must be ({self.n_robots}, {wanted}) or ({wanted},) [{unit}].")
-        a = np.array(a, order="C")  # a copy: the caller may write into his own before the next step asks what has changed
+            raise InputError(
+                f"{name} has shape {np.shape(value)}; it must be ({self.n_robots}, {wanted}) "
+                f"or ({wanted},) [{unit}]."
+            )
+        # a copy: the caller may write into his own before the next step asks what has changed
+        a = np.array(a, order="C")
         if not np.vdot(a, a) < _MOST**2:
-            finite, small = (np.asarray(good.reshape(len(a), -1).all(1)) for good in (np.isfinite(a), np.abs(a) < _MOST))
-            self._note(~finite, lambda i: f"{name} holds a value that is not finite: {_line(a[i].ravel()[:6])}.")
-            self._note(~small, lambda i: f"{name} holds a value beyond {_MOST:g} {unit}: {_line(a[i].ravel()[:6])}.")
-            a[~(np.abs(a) < _MOST)] = np.nan  # these rows are left out; nan passes through without a warning, inf does not
+            finite, small = (
+                np.asarray(good.reshape(len(a), -1).all(1)) for good in (np.isfinite(a), np.abs(a) < _MOST)
+            )
+            self._note(
+                ~finite, lambda i: f"{name} holds a value that is not finite: {_line(a[i].ravel()[:6])}."
+            )
+            self._note(
+                ~small, lambda i: f"{name} holds a value beyond {_MOST:g} {unit}: {_line(a[i].ravel()[:6])}."
+            )
+            # these rows are left out; nan passes through without a warning, inf does not
+            a[~(np.abs(a) < _MOST)] = np.nan
         return a
 
     def _optional(self, name: str, value: ArrayLike | None, shape: tuple[int, ...], unit: str) -> Floats:
@@ -160,7 +181,8 @@ class Reader:
         if tendon_length is None:
             if len(layout.row_tendon):
                 raise InputError(
-                    f"tendon_length is missing; give (n_robots, {n_tendons}) absolute lengths, base to where each tendon ends [m]; "
+                    f"tendon_length is missing; give (n_robots, {n_tendons}) absolute lengths, base to "
+                    "where each tendon ends [m]; "
                     "Robot.rest_tendon_length holds those of the straight robot."
                 )
             return np.zeros((1, n_tendons))
@@ -171,15 +193,21 @@ class Reader:
             longer = lengths - ends
             if lengths.min(initial=np.inf) > 0.0 and (np.abs(longer) <= slack).all():
                 return lengths
-            long = (longer > slack) & ~params.unilateral  # a wire that can go slack may hang as loose as it likes
+            # a wire that can go slack may hang as loose as it likes
+            long = (longer > slack) & ~params.unilateral
             bad = ((lengths <= 0.0) | (-longer > slack) | long | (lengths > 20.0 * ends))[:, rows].any(1)
         if bad.any():
-            self._note(bad, lambda i: _length_sentence(lengths[min(i, len(lengths) - 1)][rows], ends[min(i, len(ends) - 1)][rows]))
+            self._note(
+                bad,
+                lambda i: _length_sentence(
+                    lengths[min(i, len(lengths) - 1)][rows], ends[min(i, len(ends) - 1)][rows]
+                ),
+            )
         return lengths
 
     def line_force(self, line_force: ArrayLike | None, grid: Floats) -> Floats:
-        """`Ports.line_force`: self-weight plus what is given, uniform, or linear over each step with the true force and moment of that
-        step. `grid` as in `Ports`."""
+        """`Ports.line_force`: self-weight plus what is given, uniform, or linear over each step with the true
+        force and moment of that step. `grid` as in `Ports`."""
         weight = self._weight
         if line_force is None:
             return weight
@@ -193,8 +221,14 @@ class Reader:
         points = np.shape(line_force)[-2]
         sampled = self._array("line_force", line_force, (n_segments, points, 3), "N/m")
         if points < 2:
-            raise InputError(f"line_force has {points} points a segment; give two or more, or one force (3,) for all.")
-        nodes = grid if len(grid) else np.broadcast_to(np.linspace(0.0, 1.0, n_steps + 1), (1, n_segments, n_steps + 1))
+            raise InputError(
+                f"line_force has {points} points a segment; give two or more, or one force (3,) for all."
+            )
+        nodes = (
+            grid
+            if len(grid)
+            else np.broadcast_to(np.linspace(0.0, 1.0, n_steps + 1), (1, n_segments, n_steps + 1))
+        )
         return np.ascontiguousarray(weight + _per_step(sampled, nodes))
 
     def _pose(self, base_pose: ArrayLike) -> Floats:
@@ -202,13 +236,20 @@ class Reader:
         norm = np.sqrt(np.einsum("ij,ij->i", pose[:, 3:], pose[:, 3:]))
         bad = np.abs(norm - 1.0) > 1e-3
         if bad.any():
-            self._note(bad, lambda i: f"base_pose has a quaternion of norm {norm[min(i, len(norm) - 1)]:.4g}; it must be 1, as w x y z.")
+            self._note(
+                bad,
+                lambda i: (
+                    "base_pose has a quaternion of norm "
+                    f"{norm[min(i, len(norm) - 1)]:.4g}; it must be 1, as w x y z."
+                ),
+            )
         pose[:, 3:] /= np.where(bad, 1.0, norm)[:, None]
         return pose
 
     def point_forces(self, point_force: PointForces | None, stretch: Floats) -> tuple[Floats, Floats]:
-        """`Ports.grid` with a node at each point force, and `Ports.node_force`; `stretch` (1 or n_robots, n_segments) is the extension [m].
-        Raises `InputError` where a segment has more point forces than nodes to put them on."""
+        """`Ports.grid` with a node at each point force, and `Ports.node_force`; `stretch` (1 or n_robots,
+        n_segments) is the extension [m]. Raises `InputError` where a segment has more point forces than nodes
+        to put them on."""
         layout, params = self.layout, self.params
         n_segments, n_steps = len(layout.first_tendon), layout.n_steps
         self.loads = np.zeros((1, 0)), np.zeros((1, 0, 3))
@@ -217,7 +258,9 @@ class Reader:
         try:
             pairs = [(np.atleast_1d(np.asarray(s, float))[:, None], f) for s, f in point_force]
         except (TypeError, ValueError, OverflowError) as error:
-            raise InputError("point_force must be (arclength [m], force [N]) pairs, for example [(0.03, (0, 0.1, 0))].") from error
+            raise InputError(
+                "point_force must be (arclength [m], force [N]) pairs, for example [(0.03, (0, 0.1, 0))]."
+            ) from error
         if not pairs:
             return self.point_forces(None, stretch)
         for s, _ in point_force:
@@ -231,12 +274,17 @@ class Reader:
         total = starts[:, -1:]
         self._note(
             ((s < 0.0) | (s > total * (1.0 + 1e-9))).any(1),
-            lambda i: f"point_force at arclength {_line(s[i])} m; the rod runs from 0 to {total[i, 0]:.6g} m.",
+            lambda i: (
+                f"point_force at arclength {_line(s[i])} m; the rod runs from 0 to {total[i, 0]:.6g} m."
+            ),
         )
         grid, node = np.empty((n, n_segments, n_steps + 1)), np.empty(s.shape, np.int64)
-        if (crowded := place_all(np.array(s, order="C"), np.array(starts, order="C"), n_steps, grid, node)) >= 0:
+        if (
+            crowded := place_all(np.array(s, order="C"), np.array(starts, order="C"), n_steps, grid, node)
+        ) >= 0:
             raise InputError(
-                f"the point forces on one segment of robot {crowded} are more than its {n_steps} steps have nodes for; "
+                f"the point forces on one segment of robot {crowded} are more than its {n_steps} steps have "
+                "nodes for; "
                 f"give Simulator more points_per_segment, up to {s.shape[1] + 1}."
             )
         force = np.stack([np.broadcast_to(f, (n, 3)) for f in forces], axis=1)
@@ -249,10 +297,11 @@ class Reader:
 
 
 def _per_step(sampled: Floats, nodes: Floats) -> Floats:
-    """(n, n_segments, 2 n_steps, 3) line force at both ends of each step, from samples evenly spaced over each segment.
+    """(n, n_segments, 2 n_steps, 3) line force at both ends of each step, from samples evenly spaced over
+    each segment.
 
-    The polyline through the samples may bend inside a step; the straight line put in its place has its integral and its
-    first moment.
+    The polyline through the samples may bend inside a step; the straight line put in its place has its
+    integral and its first moment.
     """
     n_cells = sampled.shape[2] - 1
     n = max(len(sampled), len(nodes))
@@ -262,13 +311,19 @@ def _per_step(sampled: Floats, nodes: Floats) -> Floats:
     part = (t - cell)[..., None]
     f0, f1 = (np.take_along_axis(f, (cell + k)[..., None], axis=2) for k in (0, 1))
     start = np.arange(n_cells)[:, None]
-    force = 0.5 * (f[:, :, :-1] + f[:, :, 1:])  # of whole cells, and their moment about the start of the segment
+    # of whole cells, and their moment about the start of the segment
+    force = 0.5 * (f[:, :, :-1] + f[:, :, 1:])
     moment = start * force + (f[:, :, :-1] + 2.0 * f[:, :, 1:]) / 6.0
-    before_f, before_m = (np.concatenate([np.zeros_like(a[:, :, :1]), np.cumsum(a, axis=2)], axis=2) for a in (force, moment))
+    before_f, before_m = (
+        np.concatenate([np.zeros_like(a[:, :, :1]), np.cumsum(a, axis=2)], axis=2) for a in (force, moment)
+    )
     slope = f1 - f0
     own_f = part * f0 + 0.5 * part**2 * slope
     own_m = cell[..., None] * own_f + 0.5 * part**2 * f0 + part**3 * slope / 3.0
-    F, M = (np.take_along_axis(a, cell[..., None], axis=2) + own for a, own in ((before_f, own_f), (before_m, own_m)))
+    F, M = (
+        np.take_along_axis(a, cell[..., None], axis=2) + own
+        for a, own in ((before_f, own_f), (before_m, own_m))
+    )
     width = np.maximum(np.diff(t, axis=2), 1e-12)[..., None]
     middle = (0.5 * (t[:, :, 1:] + t[:, :, :-1]))[..., None]
     mean = np.diff(F, axis=2) / width
@@ -289,4 +344,7 @@ def _length_sentence(lengths: Floats, ends: Floats) -> str:
         hint = " Was it given in mm?"
     elif abs(lengths[worst]) < 0.5 * ends[worst]:
         hint = " Is it a change of length? Add Robot.rest_tendon_length."
-    return f"tendon_length {lengths[worst]:.6g} m is impossible for a tendon that ends at arclength {ends[worst]:.6g} m.{hint}"
+    return (
+        f"tendon_length {lengths[worst]:.6g} m is impossible for a tendon that ends at arclength "
+        f"{ends[worst]:.6g} m.{hint}"
+    )

@@ -1,4 +1,5 @@
-"""Some robots of a batch put back, or made anew, while the others go on: arrays of now and then, merged row by row."""
+"""Some robots of a batch put back, or made anew, while the others go on: arrays of now and then, merged row
+by row."""
 
 from __future__ import annotations
 
@@ -15,13 +16,14 @@ Arrays = TypeVar("Arrays", bound=tuple[Any, ...])
 
 
 def taken(now: Any, then: Any, rows: Flags) -> Any:
-    """`now`, with `rows` (n_robots,) as in `then`; either may have a robot axis of 1 for all. A new array, or `now` where nothing
-    changes; what `now` has no robots for stays."""
+    """`now`, with `rows` (n_robots,) as in `then`; either may have a robot axis of 1 for all. A new array, or
+    `now` where nothing changes; what `now` has no robots for stays."""
     if len(now) == 0 or len(then) == 0 or now.shape[1:] != then.shape[1:]:
         return now
     if len(now) == 1 and len(then) == 1 and np.array_equal(now, then, equal_nan=now.dtype.kind == "f"):
         return now
-    merged = np.array(np.broadcast_to(now, (len(rows), *now.shape[1:])), order="C")  # kernels are compiled anew for any other order
+    # kernels are compiled anew for any other order
+    merged = np.array(np.broadcast_to(now, (len(rows), *now.shape[1:])), order="C")
     merged[rows] = np.broadcast_to(then, merged.shape)[rows]
     return merged
 
@@ -37,12 +39,16 @@ def taken_shape(now: Shape, then: State, rows: Flags) -> Shape:
 
 
 def restore_contact(engine: Engine, then: ContactSnapshot, rows: Flags) -> None:
-    """Put the robots `rows` of an engine back: their contacts, where they were, and the obstacles around them."""
+    """Put the robots `rows` of an engine back: their contacts, where they were, and the obstacles around
+    them."""
     engine.touching = taken_each(engine.touching, Touching(*then.touching), rows)
     engine.clearance = taken_each(engine.clearance, Clearance(*then.clearance), rows)
     if engine.before is not None and then.before is not None:
         engine.before = taken_each(engine.before, then.before, rows)
-    engine.tracked, engine.gap = np.where(rows, then.tracked, engine.tracked), np.where(rows, then.gap, engine.gap)
+    engine.tracked, engine.gap = (
+        np.where(rows, then.tracked, engine.tracked),
+        np.where(rows, then.gap, engine.gap),
+    )
     engine.poses = taken(engine.poses, then.poses, rows)
     engine.poses_before = taken(engine.poses_before, then.poses_before, rows)
     engine.at_last_step = (engine.before, engine.poses_before)

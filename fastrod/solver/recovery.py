@@ -9,7 +9,8 @@ from fastrod.solver.settle import Pass, load_parameter, settle
 from fastrod.types import Flags, Floats, Ints, Ports
 
 TOLERANCE = 1e-9  # m: that of `Simulator.settle`
-# of F l^2/EI: on three shipped robots `settle` solves all of 180 random tip forces of 20, 8 to 100 % of those of
+# of F l^2/EI: on three shipped robots `settle` solves all of 180 random tip forces of 20, 8 to 100 % of those
+# of
 # 50, and at most 2 % of those of 200
 _HOPELESS = 30.0
 

@@ -14,7 +14,9 @@ from fastrod.types import Floats, Ints, Memory, Params, Ports, Probes, Response,
 
 _ROWS = 1024  # of one pass: robots times copies of them
 _HALF = 0.5e-4 * np.repeat(np.eye(3), 2, axis=0) * np.array([[1.0], [-1.0]] * 3)
-_TURNS: Floats = np.array([[[1.0, -x, -y, -z], [x, 1.0, -z, y], [y, z, 1.0, -x], [z, -y, x, 1.0]] for x, y, z in _HALF])[:, None]
+_TURNS: Floats = np.array(
+    [[[1.0, -x, -y, -z], [x, 1.0, -z, y], [y, z, 1.0, -x], [z, -y, x, 1.0]] for x, y, z in _HALF]
+)[:, None]
 """(6, 1, 4, 4) what turns a quaternion forward and back by 1e-4 rad about each axis of the world."""
 Relocate = Callable[[Floats], Mapping[str, Floats]]
 """Extensions -> the ports that change with them."""
@@ -23,15 +25,16 @@ Relocate = Callable[[Floats], Mapping[str, Floats]]
 class Linear:
     """Passes that change nothing, at the present boundary of `rows`, with their linear response.
 
-    `probes` are the contact forces that act on each row of `rows`. The last one is at the tip and carries none: its columns
-    are those of a tip force.
+    `probes` are the contact forces that act on each row of `rows`. The last one is at the tip and carries
+    none: its columns are those of a tip force.
     """
 
     def __init__(self, passes: Passes, rows: Ints, ports: Ports, probes: Probes = NO_PROBES) -> None:
         self.passes, self.rows, self.ports, self.probes = passes, rows, ports, probes
 
     def respond(self, columns: bool = True) -> tuple[Response, Shape]:
-        """Residuals, tip and their derivatives by the unknowns and, last, by a tip force; rows that are not asked are nan."""
+        """Residuals, tip and their derivatives by the unknowns and, last, by a tip force; rows that are not
+        asked are nan."""
         passes, ports = self.passes, self.ports
         n, n_e, n_probes = passes.n_robots, passes.n_residuals(ports), self.probes.node.shape[1]
         extra = 3 * n_probes if n_probes else 0 if len(ports.follower_force) else 3
@@ -42,21 +45,34 @@ class Linear:
             for a in response:
                 a.fill(np.nan)
         shape = passes.new_shape("tip", holes)
-        passes.run(self.rows, ports, shape, response=response, update=False, noise=1e-20, n_col=n_col, probes=self.probes)
+        passes.run(
+            self.rows,
+            ports,
+            shape,
+            response=response,
+            update=False,
+            noise=1e-20,
+            n_col=n_col,
+            probes=self.probes,
+        )
         return response, passes.collect(shape)
 
     def jacobian(self, relocate: Relocate | None = None, turning: bool = False) -> Floats:
-        """(n, 6, n_tendons + n_segments) change of the tip by tendons (length, or tension where that is the mode), then by extensions;
-        with `turning` three columns more, by the rotation vector of the base, world.
+        """(n, 6, n_tendons + n_segments) change of the tip by tendons (length, or tension where that is the
+        mode), then by extensions; with `turning` three columns more, by the rotation vector of the base,
+        world.
 
-        All but those of lengths come from central differences of the pass at fixed unknowns, as rows of one batch. `relocate` tells
-        what an extension moves besides itself.
+        All but those of lengths come from central differences of the pass at fixed unknowns, as rows of one
+        batch. `relocate` tells what an extension moves besides itself.
         """
         moved, delta, pulled = self._spread(turning)
         (m, n), n_rows = delta.shape, len(self.rows)
 
         def respond(copies: slice, columns: bool) -> tuple[Response, Shape]:
-            twin, k = self._copies({name: a[copies] for name, a in moved.items()}, relocate), len(moved["extension"][copies])
+            twin, k = (
+                self._copies({name: a[copies] for name, a in moved.items()}, relocate),
+                len(moved["extension"][copies]),
+            )
             response, shape = twin.respond(columns)
             return Response(*(_split(a, k) for a in response)), Shape(*(_split(a, k) for a in shape))
 
@@ -68,39 +84,64 @@ class Linear:
         for j in range(0, m, per):
             response, shape = respond(slice(1 + 2 * j, 1 + 2 * (j + per)), False)
             some = slice(j, j + per)
-            by_input[some], error[some] = _differences(response, shape.tip_position, shape.tip_rotation, delta[some])
+            by_input[some], error[some] = _differences(
+                response, shape.tip_position, shape.tip_rotation, delta[some]
+            )
         return self._arrange(by_residual, by_input, error, pulled)
 
     def fits(self, turning: bool) -> bool:
         """`step` is one pass with all its differences."""
         layout = self.passes.layout
-        m = len(layout.tendon_segment) - len(layout.row_tendon) + len(layout.first_tendon) + (3 if turning else 0)
+        m = (
+            len(layout.tendon_segment)
+            - len(layout.row_tendon)
+            + len(layout.first_tendon)
+            + (3 if turning else 0)
+        )
         return 0 < len(self.rows) * (1 + 2 * m) <= LANES
 
     def step(
-        self, relocate: Relocate | None, turning: bool, outputs: Literal["full", "tip"], process: float, noise: float
+        self,
+        relocate: Relocate | None,
+        turning: bool,
+        outputs: Literal["full", "tip"],
+        process: float,
+        noise: float,
     ) -> tuple[Shape, Floats]:
-        """An observer pass of all robots that updates them, and the Jacobian at the shape that it hands out, in one: the differences
-        ride in the lanes that a few robots leave empty."""
+        """An observer pass of all robots that updates them, and the Jacobian at the shape that it hands out,
+        in one: the differences ride in the lanes that a few robots leave empty."""
         passes = self.passes
         moved, delta, pulled = self._spread(turning)
         k, n = 1 + 2 * len(delta), passes.n_robots
         twin = self._copies(moved, relocate)
         n_e, n_col = passes.n_residuals(self.ports), passes.n_columns(self.ports)
-        response = Response(np.empty((k * n, n_e, n_col)), np.empty((k * n, 6, n_col)), np.empty((k * n, n_e)))
+        response = Response(
+            np.empty((k * n, n_e, n_col)), np.empty((k * n, 6, n_col)), np.empty((k * n, n_e))
+        )
         shape = twin.passes.new_shape(outputs, False)
-        twin.passes.run(twin.rows, twin.ports, shape, response=response, feed=True, carry=passes.carry, process=process, noise=noise)
+        twin.passes.run(
+            twin.rows,
+            twin.ports,
+            shape,
+            response=response,
+            feed=True,
+            carry=passes.carry,
+            process=process,
+            noise=noise,
+        )
         twin.passes.collect(shape)
         own: Any
         a: Any
         for own, a in zip(passes.memory, twin.passes.memory, strict=True):
             own[:] = a[: len(own)]
-        jacobian = self._combine(Response(*(_split(a, k) for a in response)), Shape(*(_split(a, k) for a in shape)), delta, pulled)
+        jacobian = self._combine(
+            Response(*(_split(a, k) for a in response)), Shape(*(_split(a, k) for a in shape)), delta, pulled
+        )
         return Shape(*(a[: len(a) // k] for a in shape)), jacobian
 
     def _spread(self, turning: bool) -> tuple[dict[str, Floats], Floats, list[int]]:
-        """Ports of 1 + 2 m copies, as they are and then forward and back by each input (1 + 2 m, n, ...), by how much (m, n), and the
-        tendons whose input is a tension."""
+        """Ports of 1 + 2 m copies, as they are and then forward and back by each input (1 + 2 m, n, ...), by
+        how much (m, n), and the tendons whose input is a tension."""
         layout, params, ports, n = self.passes.layout, self.passes.params, self.ports, self.passes.n_robots
         n_tendons, n_segments = len(layout.tendon_segment), len(layout.first_tendon)
         held = layout.row_tendon.tolist()
@@ -110,7 +151,10 @@ class Linear:
         delta = np.full((m, n), 1e-4)
         delta[: len(pulled)] *= params.tension_scale
         delta[len(pulled) : n_inputs] *= params.reach
-        moved = {name: np.empty((1 + 2 * m, n, getattr(ports, name).shape[1])) for name in ("tension", "extension", "base_pose")}
+        moved = {
+            name: np.empty((1 + 2 * m, n, getattr(ports, name).shape[1]))
+            for name in ("tension", "extension", "base_pose")
+        }
         for name, a in moved.items():
             a[:] = getattr(ports, name)
         for j in range(n_inputs):
@@ -125,7 +169,9 @@ class Linear:
     def _combine(self, response: Response, shape: Shape, delta: Floats, pulled: list[int]) -> Floats:
         """The Jacobian from the copies of `_spread`."""
         by_residual = self._close(Response(*(a[0] for a in response)))
-        differences = _differences(Response(*(a[1:] for a in response)), shape.tip_position[1:], shape.tip_rotation[1:], delta)
+        differences = _differences(
+            Response(*(a[1:] for a in response)), shape.tip_position[1:], shape.tip_rotation[1:], delta
+        )
         return self._arrange(by_residual, *differences, pulled)
 
     def _arrange(self, by_residual: Floats, by_input: Floats, error: Floats, pulled: list[int]) -> Floats:
@@ -134,7 +180,10 @@ class Linear:
         jacobian = np.empty((n, 6, n_tendons + m - len(pulled)))
         jacobian[:, :, layout.row_tendon] = by_residual[:, :, :n_held]
         closed = (by_input - np.matmul(by_residual, error[..., None])[..., 0]).transpose(1, 2, 0)
-        jacobian[:, :, pulled], jacobian[:, :, n_tendons:] = closed[:, :, : len(pulled)], closed[:, :, len(pulled) :]
+        jacobian[:, :, pulled], jacobian[:, :, n_tendons:] = (
+            closed[:, :, : len(pulled)],
+            closed[:, :, len(pulled) :],
+        )
         return jacobian
 
     def _close(self, response: Response) -> Floats:
@@ -151,13 +200,23 @@ class Linear:
 
         if relocate is not None:
             each = [relocate(one) for one in moved["extension"]]
-            moved |= {name: np.stack([np.broadcast_to(one[name], (n, *one[name].shape[1:])) for one in each]) for name in each[0]}
+            moved |= {
+                name: np.stack([np.broadcast_to(one[name], (n, *one[name].shape[1:])) for one in each])
+                for name in each[0]
+            }
         moved = {name: a.reshape(k * n, *a.shape[2:]) for name, a in moved.items()}
         ports = Ports(
-            *(moved[name] if name in moved else a if len(a) == 1 else copied(a) for name, a in zip(Ports._fields, self.ports, strict=True))
+            *(
+                moved[name] if name in moved else a if len(a) == 1 else copied(a)
+                for name, a in zip(Ports._fields, self.ports, strict=True)
+            )
         )
         params: tuple[Any, ...] = passes.params
-        twin = passes.twin(k * n, Params(*(a if len(a) == 1 else copied(a) for a in params)), Memory(*map(copied, passes.peek())))
+        twin = passes.twin(
+            k * n,
+            Params(*(a if len(a) == 1 else copied(a) for a in params)),
+            Memory(*map(copied, passes.peek())),
+        )
         probes = Probes(*map(copied, self.probes)) if self.probes.node.shape[1] else self.probes
         rows = (self.rows + n * np.arange(k)[:, None]).ravel()
         return Linear(twin, rows, ports, probes)
@@ -180,7 +239,8 @@ def _split(a: Any, k: int) -> Any:
 
 
 def _differences(response: Response, p: Floats, r: Floats, delta: Floats) -> tuple[Floats, Floats]:
-    """(m, n, 6) and (m, n, n_e): central differences of tip pose (2 m, n, ...) and residuals, forward and back by turns."""
+    """(m, n, 6) and (m, n, n_e): central differences of tip pose (2 m, n, ...) and residuals, forward and
+    back by turns."""
     e, turn = response.error, r[::2] @ np.swapaxes(r[1::2], 2, 3)
     change = np.empty((*delta.shape, 6))
     change[..., :3] = p[::2] - p[1::2]
@@ -191,7 +251,8 @@ def _differences(response: Response, p: Floats, r: Floats, delta: Floats) -> tup
 
 
 def inverse(a: Floats) -> Floats:
-    """(n, b, a) least-squares inverses of matrices (n, a, b); nan for those with a number that is not finite."""
+    """(n, b, a) least-squares inverses of matrices (n, a, b); nan for those with a number that is not
+    finite."""
     found = np.full((len(a), a.shape[2], a.shape[1]), np.nan)
     good = np.isfinite(a).all((1, 2))
     if a.shape[1] == a.shape[2]:
@@ -205,8 +266,9 @@ def inverse(a: Floats) -> Floats:
 
 
 def stretch(passes: Passes, rows: Ints, change: Floats) -> None:
-    """These robots' extensions are about to change by this much (1 or n_robots, n_segments) [m]: the wires that grow along with
-    their segments are, for the boundary, as they were. The gain knows of wires alone; it would pull at every wire."""
+    """These robots' extensions are about to change by this much (1 or n_robots, n_segments) [m]: the wires
+    that grow along with their segments are, for the boundary, as they were. The gain knows of wires alone; it
+    would pull at every wire."""
     if not change.any():
         return
     layout = passes.layout

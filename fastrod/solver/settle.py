@@ -1,4 +1,5 @@
-"""Repeat the observer's pass on frozen inputs until every boundary residual is small: damped Newton, then load continuation."""
+"""Repeat the observer's pass on frozen inputs until every boundary residual is small: damped Newton, then
+load continuation."""
 
 from __future__ import annotations
 
@@ -17,17 +18,20 @@ Pass: TypeAlias = Callable[[Ints, Ports], Floats]
 _MAX_PASSES = 40
 _FREE_PASSES = 20  # robots with wires that can go slack: semi-smooth Newton first, monotone only after that
 _STEEP = 6.0
-_PATIENCE = 4  # passes within tolerance after which tensions that still wander are let go: nothing determines them
-_LONGEST_STEP = 1.5  # in EI/l, about radians of bend: a longer Newton step lands on another equilibrium, if on any
+# passes within tolerance after which tensions that still wander are let go: nothing determines them
+_PATIENCE = 4
+# in EI/l, about radians of bend: a longer Newton step lands on another equilibrium, if on any
+_LONGEST_STEP = 1.5
 _SMALLEST_STEP = 1.0 / 64.0
 _SMALLEST_LOAD_STEP = 1.0 / 256.0
 
 
 def settle(rows: Ints, warm: Flags, boundary: Passes, ports: Ports, tolerance: float, run: Pass) -> Ints:
-    """Bring the robots `rows` to rest on `ports`; the passes that each took, and -1 where none of three ways converged.
+    """Bring the robots `rows` to rest on `ports`; the passes that each took, and -1 where none of three ways
+    converged.
 
-    Warm robots start from their last x, moved to first order to the new inputs; others, and warm ones that fail, from a
-    cold guess; what still fails is led there by its loads, from none to all.
+    Warm robots start from their last x, moved to first order to the new inputs; others, and warm ones that
+    fail, from a cold guess; what still fails is led there by its loads, from none to all.
     """
     layout, params = boundary.layout, boundary.params
     passes = np.zeros(boundary.n_robots, np.int64)
@@ -49,13 +53,16 @@ def settle(rows: Ints, warm: Flags, boundary: Passes, ports: Ports, tolerance: f
 
 
 def load_parameter(rows: Ints, params: Params, ports: Ports) -> Floats:
-    """F l^2/EI of all forces together: beyond about six a rod has equilibria that no growing load would lead to."""
+    """F l^2/EI of all forces together: beyond about six a rod has equilibria that no growing load would lead
+    to."""
 
     def of(a: Floats) -> Floats:
         return a if len(a) == 1 else a[rows]
 
     length = params.length + ports.extension
-    force = np.linalg.norm(of(ports.tip_force), axis=1) + np.linalg.norm(of(ports.tip_moment), axis=1) / of(params.reach)
+    force = np.linalg.norm(of(ports.tip_force), axis=1) + np.linalg.norm(of(ports.tip_moment), axis=1) / of(
+        params.reach
+    )
     force = force + (of(length) * np.linalg.norm(of(ports.line_force), axis=-1).max(-1)).sum(1)
     for extra in (ports.follower_force[:, None], ports.node_force):
         if len(extra):
@@ -81,7 +88,8 @@ def _newton(rows: Ints, boundary: Passes, ports: Ports, tolerance: float, run: P
         # in paper mode the wires may contradict each other: at the least-squares boundary the residual stays
         better = residual <= 2.0 * best if layout.paper else residual < best
         if count < _FREE_PASSES:
-            # a wire that goes slack or taut puts a corner into the residuals: over it they rise before they fall
+            # a wire that goes slack or taut puts a corner into the residuals: over it they rise before they
+            # fall
             better |= one_sided & np.isfinite(residual)
         shorter = _within_reach(after - x_tried, rows, layout, params)
         if better.all() and shorter is None:
@@ -90,7 +98,9 @@ def _newton(rows: Ints, boundary: Passes, ports: Ports, tolerance: float, run: P
         else:
             if shorter is not None:
                 with np.errstate(invalid="ignore"):  # a robot that is lost has no step to shorten
-                    after = np.where(shorter[:, None] < 1.0, x_tried + shorter[:, None] * (after - x_tried), after)
+                    after = np.where(
+                        shorter[:, None] < 1.0, x_tried + shorter[:, None] * (after - x_tried), after
+                    )
             x_at = np.where(better[:, None], x_tried, x_at)
             step = np.where(better[:, None], after - x_tried, step)
             best = np.where(better, residual, best)
@@ -100,7 +110,10 @@ def _newton(rows: Ints, boundary: Passes, ports: Ports, tolerance: float, run: P
         # only a pass that was accepted can end it: what it wrote is what the caller gets
         closed = better & (np.isfinite(residual) if layout.paper else residual <= tolerance)
         patience -= closed
-        done = closed & (_still(step, rows, layout, params, tolerance + 1e-6 * residual) | ((patience <= 0) & (residual <= tolerance)))
+        done = closed & (
+            _still(step, rows, layout, params, tolerance + 1e-6 * residual)
+            | ((patience <= 0) & (residual <= tolerance))
+        )
         lost = ~done & ((damping < _SMALLEST_STEP) | ~np.isfinite(step).all(1))
         failed.append(rows[lost])
         keep = ~(done | lost)
@@ -114,7 +127,8 @@ def _newton(rows: Ints, boundary: Passes, ports: Ports, tolerance: float, run: P
 
 
 def _within_reach(step: Floats, rows: Ints, layout: Layout, params: Params) -> Floats | None:
-    """Factors that keep the base moment from changing by more than `_LONGEST_STEP` EI/l in a pass; None where all do."""
+    """Factors that keep the base moment from changing by more than `_LONGEST_STEP` EI/l in a pass; None where
+    all do."""
     n_base = 2 * len(layout.first_tendon) if layout.paper else 3
     moment = params.moment_scale if len(params.moment_scale) == 1 else params.moment_scale[rows]
     turn = np.abs(step[:, :n_base]).max(1) / moment
@@ -126,7 +140,8 @@ def _within_reach(step: Floats, rows: Ints, layout: Layout, params: Params) -> F
 def _still(step: Floats, rows: Ints, layout: Layout, params: Params, small: Floats) -> Flags:
     """The unknowns no longer move.
 
-    A small residual says little about tensions where tendons hardly stretch, and in paper mode the wires may disagree:
+    A small residual says little about tensions where tendons hardly stretch, and in paper mode the wires may
+    disagree:
     then the least-squares boundary is the answer, and the residual says by how much they do.
     """
 
@@ -142,14 +157,19 @@ def _still(step: Floats, rows: Ints, layout: Layout, params: Params, small: Floa
     return np.asarray(np.abs(step[:, 3 : 3 + n_free]).max(1) <= 1e-6 * of(params.tension_scale))
 
 
-def _continuation(rows: Ints, boundary: Passes, ports: Ports, tolerance: float, run: Pass, passes: Ints) -> Ints:
-    """From the unloaded robot to the loaded one, in load steps that grow with success; the robots that did not arrive."""
+def _continuation(
+    rows: Ints, boundary: Passes, ports: Ports, tolerance: float, run: Pass, passes: Ints
+) -> Ints:
+    """From the unloaded robot to the loaded one, in load steps that grow with success; the robots that did
+    not arrive."""
     layout, params = boundary.layout, boundary.params
     part = np.zeros(boundary.n_robots)
-    longest = np.full(boundary.n_robots, 0.25)  # a longer stride than a load parameter of three could land on another equilibrium
+    # a longer stride than a load parameter of three could land on another equilibrium
+    longest = np.full(boundary.n_robots, 0.25)
     longest[rows] = np.minimum(0.25, 0.5 * _STEEP / np.maximum(load_parameter(rows, params, ports), 1e-9))
     stride = longest.copy()
-    heavy = rows[longest[rows] < _SMALLEST_LOAD_STEP]  # hundreds of times what bends a rod by a radian: steps without end
+    # hundreds of times what bends a rod by a radian: steps without end
+    heavy = rows[longest[rows] < _SMALLEST_LOAD_STEP]
     unloaded = _loaded(ports, part)
     cold_start(rows, layout, params, unloaded, boundary.memory)
     if len(heavy):

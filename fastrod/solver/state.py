@@ -21,9 +21,9 @@ from fastrod.types import Flags, Floats, Ints, Memory, Params, Ports
 class Observer:
     """Gains of the boundary observer (the paper's Q and V, eqs. 5 and 12), on unknowns scaled to about one.
 
-    A simulator without an observer of its own takes the gains so high that a step is a Gauss-Newton step; the variance
-    that is then left over is far below the process noise, and is not carried. More `measurement_noise` smooths the boundary
-    over time.
+    A simulator without an observer of its own takes the gains so high that a step is a Gauss-Newton step; the
+    variance that is then left over is far below the process noise, and is not carried. More
+    `measurement_noise` smooths the boundary over time.
     """
 
     process_noise: float = 100.0
@@ -40,10 +40,11 @@ class Observer:
 
 @dataclass(frozen=True, repr=False)
 class State:
-    """The robots after a step: new arrays, robot axis first, world frame. With outputs="tip", those along the rod are empty.
+    """The robots after a step: new arrays, robot axis first, world frame. With outputs="tip", those along the
+    rod are empty.
 
-    A node is shared by two segments at a joint; its curvature is that of the distal one. Read, do not write: `shape` goes by
-    these arrays.
+    A node is shared by two segments at a joint; its curvature is that of the distal one. Read, do not write:
+    `shape` goes by these arrays.
     """
 
     position: Floats

@@ -1,4 +1,5 @@
-"""`Actor`: a policy without its noise as plain arrays, so that asking it needs neither torch nor stable-baselines3."""
+"""`Actor`: a policy without its noise as plain arrays, so that asking it needs neither torch nor
+stable-baselines3."""
 
 from __future__ import annotations
 
@@ -14,7 +15,8 @@ from fastrod_envs.arrays import read_arrays, write_arrays
 
 Activation = Literal["tanh", "relu"]
 Singles = NDArray[np.float32]
-_MOST, _LEAST = 1e5, 1e-7  # of a weight or bound, and of `reach`: products of three layers fit single precision
+# of a weight or bound, and of `reach`: products of three layers fit single precision
+_MOST, _LEAST = 1e5, 1e-7
 
 
 class Actor(NamedTuple):
@@ -46,28 +48,57 @@ class Actor(NamedTuple):
         """Write a .npz file."""
         held: dict[str, Any] = {f"weight_{k}": w for k, w in enumerate(self.weights)}
         held |= {f"bias_{k}": b for k, b in enumerate(self.biases)}
-        held |= {"middle": self.middle, "reach": self.reach, "activation": self.activation, "squashed": self.squashed}
+        held |= {
+            "middle": self.middle,
+            "reach": self.reach,
+            "activation": self.activation,
+            "squashed": self.squashed,
+        }
         write_arrays(path, held, compress=True)
 
 
 def load_actor(path: Path) -> Actor:
-    """The actor in a .npz file. Raises `InputError` where it is damaged, or its layers do not fit together."""
+    """The actor in a .npz file. Raises `InputError` where it is damaged, or its layers do not fit
+    together."""
     held = read_arrays(path, "no actor that `fastrod train` wrote")
     n = sum(name.startswith("weight_") for name in held)
-    names = ("middle", "reach", "activation", "squashed", *(f"{kind}_{k}" for k in range(n) for kind in ("weight", "bias")))
+    names = (
+        "middle",
+        "reach",
+        "activation",
+        "squashed",
+        *(f"{kind}_{k}" for k in range(n) for kind in ("weight", "bias")),
+    )
     if wrong := set(names) ^ held.keys():
-        raise InputError(f"{str(path)!r} is no actor that `fastrod train` wrote: {sorted(wrong)[0]!r} is missing or too much.")
+        raise InputError(
+            f"{str(path)!r} is no actor that `fastrod train` wrote: {sorted(wrong)[0]!r} is "
+            "missing or too much."
+        )
     weights, biases = [held[f"weight_{k}"] for k in range(n)], [held[f"bias_{k}"] for k in range(n)]
-    activation, squashed, middle, reach = str(held["activation"]), held["squashed"], held["middle"], held["reach"]
+    activation, squashed, middle, reach = (
+        str(held["activation"]),
+        held["squashed"],
+        held["middle"],
+        held["reach"],
+    )
     why = _misfit(weights, biases, middle, reach)
     if activation not in get_args(Activation) or squashed.shape != () or squashed.dtype != np.bool_:
         why = f"its activation is {shown(activation, 40)} and squashed {shown(squashed.tolist(), 40)}"
     if why:
         raise InputError(f"{str(path)!r} is no actor that `fastrod train` wrote: {why}.")
-    return Actor(tuple(weights), tuple(biases), middle, reach, "tanh" if activation == "tanh" else "relu", bool(squashed))
+    return Actor(
+        tuple(weights),
+        tuple(biases),
+        middle,
+        reach,
+        "tanh" if activation == "tanh" else "relu",
+        bool(squashed),
+    )
 
 
-def _misfit(weights: list[np.ndarray], biases: list[np.ndarray], middle: np.ndarray, reach: np.ndarray) -> str:
+def _misfit(
+    weights: list[np.ndarray], biases: list[np.ndarray], middle: np.ndarray, reach: np.ndarray
+) -> str:
     """What hinders the layers to be one network of finite numbers, or nothing."""
     arrays = (middle, reach, *weights, *biases)
     if not weights or any(a.dtype != np.float32 for a in arrays):
@@ -76,7 +107,12 @@ def _misfit(weights: list[np.ndarray], biases: list[np.ndarray], middle: np.ndar
         return "it holds a number that is not finite"
     ends = [*(w.shape for w in weights), *(b.shape for b in biases), middle.shape, reach.shape]
     widths = [middle.size, *(b.size for b in biases)]
-    fitting = [*zip(widths[1:], widths[:-1], strict=True), *((size,) for size in widths[1:]), (widths[0],), (widths[0],)]
+    fitting = [
+        *zip(widths[1:], widths[:-1], strict=True),
+        *((size,) for size in widths[1:]),
+        (widths[0],),
+        (widths[0],),
+    ]
     if ends != fitting or not all(widths):
         return f"its layers of shapes {shown([*ends])} do not fit together"
     if any(np.abs(a).max() > _MOST for a in arrays):
@@ -90,9 +126,17 @@ def actor_of(model: Any) -> Actor:
 
     policy = model.policy
     if hasattr(policy, "mlp_extractor"):  # PPO
-        parts, features, squashed = [*policy.mlp_extractor.policy_net, policy.action_net], policy.features_extractor, False
+        parts, features, squashed = (
+            [*policy.mlp_extractor.policy_net, policy.action_net],
+            policy.features_extractor,
+            False,
+        )
     elif hasattr(policy.actor, "latent_pi"):  # SAC
-        parts, features, squashed = [*policy.actor.latent_pi, policy.actor.mu], policy.actor.features_extractor, True
+        parts, features, squashed = (
+            [*policy.actor.latent_pi, policy.actor.mu],
+            policy.actor.features_extractor,
+            True,
+        )
     else:  # TD3
         parts, features, squashed = list(policy.actor.mu), policy.actor.features_extractor, True
 
@@ -102,6 +146,10 @@ def actor_of(model: Any) -> Actor:
     linear = [part for part in parts if isinstance(part, torch.nn.Linear)]
     hidden = next(part for part in parts if not isinstance(part, torch.nn.Linear))
     return Actor(
-        tuple(plain(part.weight) for part in linear), tuple(plain(part.bias) for part in linear), plain(features.middle),
-        plain(features.reach), "tanh" if isinstance(hidden, torch.nn.Tanh) else "relu", squashed,
-    )  # fmt: skip
+        tuple(plain(part.weight) for part in linear),
+        tuple(plain(part.bias) for part in linear),
+        plain(features.middle),
+        plain(features.reach),
+        "tanh" if isinstance(hidden, torch.nn.Tanh) else "relu",
+        squashed,
+    )

@@ -1,4 +1,5 @@
-"""What the tasks with arms share: a soft robot whose base is told where to be, and how arms and boxes are drawn."""
+"""What the tasks with arms share: a soft robot whose base is told where to be, and how arms and boxes are
+drawn."""
 
 from __future__ import annotations
 
@@ -17,31 +18,56 @@ from fastrod.types import Floats
 from fastrod_envs.task import Solid, Tube
 
 _CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
-_FACES = np.array([
-    [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
-])  # fmt: skip
+_FACES = np.array(
+    [
+        [0, 1, 3],
+        [0, 3, 2],
+        [4, 6, 7],
+        [4, 7, 5],
+        [0, 4, 5],
+        [0, 5, 1],
+        [2, 3, 7],
+        [2, 7, 6],
+        [0, 2, 6],
+        [0, 6, 4],
+        [1, 5, 7],
+        [1, 7, 3],
+    ]
+)
 _UPRIGHT = np.eye(3)
 
 
 @final
 class SoftArm:
-    """One soft robot free of contact, driven by the actions of `SegmentActions`, on a base that is where it is told."""
+    """One soft robot free of contact, driven by the actions of `SegmentActions`, on a base that is where it
+    is told."""
 
     def __init__(
-        self, robot: Robot, *, dt: float, points_per_segment: int, largest_bend: float, bend_rate: float, extension_rate: float
+        self,
+        robot: Robot,
+        *,
+        dt: float,
+        points_per_segment: int,
+        largest_bend: float,
+        bend_rate: float,
+        extension_rate: float,
     ) -> None:
-        """`dt` of a step [s]; `largest_bend` of a segment toward d1, and toward d2 [rad]; largest rates of bends [rad/s] and of extensions
-        [m/s]."""
+        """`dt` of a step [s]; `largest_bend` of a segment toward d1, and toward d2 [rad]; largest rates of
+        bends [rad/s] and of extensions [m/s]."""
         self.actions = SegmentActions(robot)
         n = robot.n_segments
         self.simulator = Simulator(robot, dt=dt, points_per_segment=points_per_segment, threads=1)
         self.dt = dt
         bend = largest_bend * self.actions.offset
-        self.lower: Floats = np.ravel([(robot.segments[k].extension[0], -bend[k], -bend[k]) for k in range(n)])
+        self.lower: Floats = np.ravel(
+            [(robot.segments[k].extension[0], -bend[k], -bend[k]) for k in range(n)]
+        )
         """(3 n_segments,) least action [m]."""
         self.upper: Floats = np.ravel([(robot.segments[k].extension[1], bend[k], bend[k]) for k in range(n)])
         """(3 n_segments,) largest action [m]."""
-        self.rate: Floats = np.ravel([(extension_rate, bend_rate * a, bend_rate * a) for a in self.actions.offset])
+        self.rate: Floats = np.ravel(
+            [(extension_rate, bend_rate * a, bend_rate * a) for a in self.actions.offset]
+        )
         """(3 n_segments,) largest rate of an action [m/s]."""
         self.action: Floats = np.zeros(3 * n)
         """(3 n_segments,) where it is driven [m]."""
@@ -70,7 +96,8 @@ class SoftArm:
         return np.asarray(self._now.tip_rotation[0])
 
     def begin(self, robot: Robot | None, base: ArrayLike, action: ArrayLike) -> None:
-        """Settle from nothing, whatever went before, made anew where another `robot` is given. Raises `HostError` where it has no shape."""
+        """Settle from nothing, whatever went before, made anew where another `robot` is given. Raises
+        `HostError` where it has no shape."""
         if robot is not None:
             self.simulator.replace([0], [robot])
         self.base, self.action = np.array(base, float), np.array(action, float)
@@ -78,7 +105,8 @@ class SoftArm:
         self._keep(self.simulator.settle(base_pose=self.base, **self.actions.inputs(self.action)))
 
     def drive(self, action: Floats, base: Floats | None = None) -> None:
-        """One step, at the end of which it is driven to an action, cut to its range, on a base. Raises `HostError` where it is lost."""
+        """One step, at the end of which it is driven to an action, cut to its range, on a base. Raises
+        `HostError` where it is lost."""
         self.action = np.clip(action, self.lower, self.upper)
         self.base = self.base if base is None else base
         given: dict[str, Any] = {"base_pose": self.base, **self.actions.inputs(self.action)}
@@ -87,11 +115,15 @@ class SoftArm:
     def settle(self, action: Floats) -> None:
         """Come to rest where an action, cut to its range, has it. Raises `HostError` where it is lost."""
         self.action = np.clip(action, self.lower, self.upper)
-        self._keep(self.simulator.settle(base_pose=self.base, **self.actions.inputs(self.action), tolerance=1e-7))
+        self._keep(
+            self.simulator.settle(base_pose=self.base, **self.actions.inputs(self.action), tolerance=1e-7)
+        )
 
     def posture(self) -> Floats:
         """(3 n_segments,) the action from -1, the least, to 1, the largest; 0 where it has no range."""
-        return np.asarray((2.0 * self.action - self.lower - self.upper) / np.maximum(self.upper - self.lower, 1e-12))
+        return np.asarray(
+            (2.0 * self.action - self.lower - self.upper) / np.maximum(self.upper - self.lower, 1e-12)
+        )
 
     def jacobian(self) -> Floats:
         """(6, 3 n_segments) d(tip position [m], rotation vector [rad]) / d(action), world."""
@@ -105,7 +137,9 @@ class SoftArm:
     def _keep(self, state: State) -> None:
         far = np.abs(state.tip_position[0] - self.base[:3]).max() if state.ok[0] else np.inf
         if not far < 2.0 * self.actions.robot.length + 1.0:
-            raise HostError(f"the soft robot is lost: {state.problems.get(0, 'its tip is nowhere near its base')}")
+            raise HostError(
+                f"the soft robot is lost: {state.problems.get(0, 'its tip is nowhere near its base')}"
+            )
         self._state = state
 
 
@@ -115,14 +149,25 @@ def short(vector: Floats, longest: float) -> Floats:
 
 
 def solid_box(
-    middle: ArrayLike, half: ArrayLike, color: tuple[float, float, float], rotation: Floats = _UPRIGHT, opacity: float = 1.0
+    middle: ArrayLike,
+    half: ArrayLike,
+    color: tuple[float, float, float],
+    rotation: Floats = _UPRIGHT,
+    opacity: float = 1.0,
 ) -> Solid:
-    """A box to draw: its `middle` (3,) world [m], `half` of its edges (3,) [m], `rotation` (3, 3) world_from_box."""
-    return Solid(np.asarray(middle, float) + (_CORNERS * np.asarray(half, float)) @ rotation.T, _FACES, color, opacity)
+    """A box to draw: its `middle` (3,) world [m], `half` of its edges (3,) [m], `rotation` (3, 3)
+    world_from_box."""
+    return Solid(
+        np.asarray(middle, float) + (_CORNERS * np.asarray(half, float)) @ rotation.T, _FACES, color, opacity
+    )
 
 
 def arm_tube(arm: BulletArm) -> Tube:
     """A serial arm as a tube along the origins of its links."""
     b, n = arm.bullet, arm.tip + 1
     base = b.getBasePositionAndOrientation(arm.body)[0]
-    return Tube(np.array([base, *(s[4] for s in b.getLinkStates(arm.body, range(n), computeForwardKinematics=1))]), 0.035, (0.6, 0.65, 0.7))
+    return Tube(
+        np.array([base, *(s[4] for s in b.getLinkStates(arm.body, range(n), computeForwardKinematics=1))]),
+        0.035,
+        (0.6, 0.65, 0.7),
+    )

@@ -15,19 +15,23 @@ from numpy.lib import format as npy
 from fastrod.errors import InputError
 
 LARGEST = 64_000_000
-"""Bytes that the arrays of a file may have, unless `read_arrays` is given another number; a shipped actor has 0.3 million."""
+"""Bytes that the arrays of a file may have, unless `read_arrays` is given another number; a shipped actor has
+0.3 million."""
 _MOST = 1000  # arrays of a file
 _KINDS = "fiubU"  # numbers, flags and words: no objects, which are pickles
 
 
 def read_arrays(path: Path, what: str, largest: int = LARGEST) -> dict[str, np.ndarray]:
-    """Arrays of a .npz by name. Raises `InputError` for a damaged, too large or foreign file, which is no `what`."""
+    """Arrays of a .npz by name. Raises `InputError` for a damaged, too large or foreign file, which is no
+    `what`."""
     try:
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()
             total = sum(member.file_size for member in members)
             if len(members) > _MOST or total > largest:
-                raise ValueError(f"it declares {len(members)} arrays of {total} bytes, more than {_MOST} or {largest}")
+                raise ValueError(
+                    f"it declares {len(members)} arrays of {total} bytes, more than {_MOST} or {largest}"
+                )
             return {member.filename.removesuffix(".npy"): _array(archive, member) for member in members}
     except Exception as error:  # zipfile, zlib, numpy's headers: from BadZipFile to TokenError
         why = getattr(error, "strerror", None) or str(error).rstrip(".") or type(error).__name__
@@ -53,6 +57,8 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
         raise ValueError(f"{member.filename!r} is an array of {dtype}; numbers and words alone are read")
     start = held.tell()
     if math.prod(shape) * dtype.itemsize != len(data) - start:
-        raise ValueError(f"{member.filename!r} declares shape {shape} of {dtype} and has {len(data) - start} bytes")
+        raise ValueError(
+            f"{member.filename!r} declares shape {shape} of {dtype} and has {len(data) - start} bytes"
+        )
     values = np.frombuffer(data, dtype, offset=start) if len(data) > start else np.empty(0, dtype)
     return values.reshape(shape, order="F" if by_column else "C").copy()

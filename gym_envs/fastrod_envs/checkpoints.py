@@ -25,14 +25,17 @@ def save_checkpoint(model: Any, path: Path) -> None:
 
 
 def load_checkpoint(model: Any, path: Path) -> None:
-    """Put what `save_checkpoint` wrote into a fresh model of its plan. Raises `InputError` for another or damaged file."""
+    """Put what `save_checkpoint` wrote into a fresh model of its plan. Raises `InputError` for another or
+    damaged file."""
     import torch
 
     held = read_arrays(path, "a checkpoint of `fastrod train`", LARGEST + 4 * _size(model))
     states: dict[str, Any] = {}
     try:
         for name, state in model.get_parameters().items():
-            tensors = {key.removeprefix(f"{name}/"): _tensor(held, key) for key in held if key.startswith(f"{name}/")}
+            tensors = {
+                key.removeprefix(f"{name}/"): _tensor(held, key) for key in held if key.startswith(f"{name}/")
+            }
             if "param_groups" in state:
                 memory: dict[int, dict[str, Any]] = {}
                 for key, tensor in tensors.items():
@@ -52,23 +55,33 @@ def load_checkpoint(model: Any, path: Path) -> None:
             setattr(model, name, int(count))
     except (KeyError, ValueError, RuntimeError, TypeError) as error:
         why = f"{error} is missing" if isinstance(error, KeyError) else str(error)
-        raise InputError(f"{str(path)!r} is no checkpoint of the plan beside it: {why.rstrip('.')}.") from error
+        raise InputError(
+            f"{str(path)!r} is no checkpoint of the plan beside it: {why.rstrip('.')}."
+        ) from error
 
 
 def save_replay(model: Any, path: Path) -> None:
     """Write what the replay buffer holds to a .npz."""
     buffer = model.replay_buffer
     n = buffer.buffer_size if buffer.full else buffer.pos
-    write_arrays(path, {name: getattr(buffer, name)[:n] for name in _REPLAY} | {"pos": np.int64(buffer.pos), "full": np.bool_(buffer.full)})
+    write_arrays(
+        path,
+        {name: getattr(buffer, name)[:n] for name in _REPLAY}
+        | {"pos": np.int64(buffer.pos), "full": np.bool_(buffer.full)},
+    )
 
 
 def load_replay(model: Any, path: Path) -> None:
-    """Put what `save_replay` wrote into the buffer of a fresh model. Raises `InputError` for another or damaged file."""
+    """Put what `save_replay` wrote into the buffer of a fresh model. Raises `InputError` for another or
+    damaged file."""
     buffer = model.replay_buffer
     into = {name: getattr(buffer, name) for name in _REPLAY}
-    held = read_arrays(path, "a replay buffer of `fastrod train`", LARGEST + sum(a.nbytes for a in into.values()))
+    held = read_arrays(
+        path, "a replay buffer of `fastrod train`", LARGEST + sum(a.nbytes for a in into.values())
+    )
     misfit = InputError(
-        f"{str(path)!r} is no replay buffer of the plan beside it; without that file the training goes on with an empty one."
+        f"{str(path)!r} is no replay buffer of the plan beside it; without that file the training goes on "
+        "with an empty one."
     )
     if set(held) != {*_REPLAY, "pos", "full"} or any(held[name].shape != () for name in ("pos", "full")):
         raise misfit
@@ -77,7 +90,11 @@ def load_replay(model: Any, path: Path) -> None:
     if not (0 <= pos < buffer.buffer_size or (full and pos == 0)):
         raise misfit
     for name, values in into.items():
-        if held[name].shape != (n, *values.shape[1:]) or held[name].dtype != values.dtype or not np.isfinite(held[name]).all():
+        if (
+            held[name].shape != (n, *values.shape[1:])
+            or held[name].dtype != values.dtype
+            or not np.isfinite(held[name]).all()
+        ):
             raise misfit
         values[:n] = held[name]
     buffer.pos, buffer.full = pos, full
@@ -87,7 +104,11 @@ def _flat(state: dict[str, Any]) -> dict[str, Any]:
     """Tensors of a module's or an optimizer's state by name."""
     if "param_groups" not in state:
         return state
-    return {f"{number}/{field}": value for number, memory in state["state"].items() for field, value in memory.items()}
+    return {
+        f"{number}/{field}": value
+        for number, memory in state["state"].items()
+        for field, value in memory.items()
+    }
 
 
 def _variables(model: Any) -> list[str]:
@@ -111,7 +132,8 @@ def _tensor(held: dict[str, np.ndarray], name: str) -> Any:
 
 
 def _check_memory(model: Any, name: str, memory: dict[int, dict[str, Any]]) -> None:
-    """Raise `ValueError` for moments that do not fit their parameters; torch notices in its first step only."""
+    """Raise `ValueError` for moments that do not fit their parameters; torch notices in its first step
+    only."""
     whole: Any = model
     for attribute in name.split("."):
         whole = getattr(whole, attribute)

@@ -1,4 +1,5 @@
-"""What a task is, for people: its documentation, and every number of its observations and actions with its unit."""
+"""What a task is, for people: its documentation, and every number of its observations and actions with its
+unit."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ def summary() -> str:
 
 
 def describe(name: str, options: Mapping[str, Any] | None = None) -> str:
-    """Documentation of a task: what it is, its options, observation and action number by number. Raises `UnknownNameError`,
+    """Documentation of a task: what it is, its options, observation and action number by number. Raises
+    `UnknownNameError`,
     `InputError`."""
     kind = task_class(name)
     task = make_task(name, 1, options or {})
@@ -47,9 +49,11 @@ def _fields(parts: tuple[Field, ...]) -> str:
         n = len(part.low)
         where = f"{at}" if n == 1 else f"{at}..{at + n - 1}"
         low, high = ("same" if len(set(side)) == 1 else "mixed" for side in (part.low, part.high))
-        span = f"{part.low[0]:g} to {part.high[0]:g}" if low == high == "same" else "; ".join(
-            f"{a:g} to {b:g}" for a, b in zip(part.low, part.high, strict=True)
-        )  # fmt: skip
+        span = (
+            f"{part.low[0]:g} to {part.high[0]:g}"
+            if low == high == "same"
+            else "; ".join(f"{a:g} to {b:g}" for a, b in zip(part.low, part.high, strict=True))
+        )
         lines.append(f"  {where:>7}  {part.name:<12} {part.unit or '-':<5} {part.about} ({span})")
         at += n
     return "\n".join(lines)
@@ -57,7 +61,10 @@ def _fields(parts: tuple[Field, ...]) -> str:
 
 def _options(kind: type[Any]) -> str:
     docs = {name: text for base in reversed(kind.__mro__) for name, text in _attribute_docs(base).items()}
-    return "\n".join(f"  {option.name} = {option.default!r}: {docs.get(option.name, '')}" for option in dataclasses.fields(kind))
+    return "\n".join(
+        f"  {option.name} = {option.default!r}: {docs.get(option.name, '')}"
+        for option in dataclasses.fields(kind)
+    )
 
 
 def _attribute_docs(kind: type[Any]) -> dict[str, str]:
@@ -70,7 +77,11 @@ def _attribute_docs(kind: type[Any]) -> dict[str, str]:
     assert isinstance(body, ast.ClassDef)
     found: dict[str, str] = {}
     for one, following in zip(body.body, body.body[1:], strict=False):
-        text = following.value.value if isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant) else None
+        text = (
+            following.value.value
+            if isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant)
+            else None
+        )
         if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name) and isinstance(text, str):
             found[one.target.id] = " ".join(text.split())
     return found

@@ -1,4 +1,5 @@
-"""`Episodes`: a task step by step, its episodes counted, its actions checked; what both kinds of environment share."""
+"""`Episodes`: a task step by step, its episodes counted, its actions checked; what both kinds of environment
+share."""
 
 from __future__ import annotations
 
@@ -65,9 +66,14 @@ class Episodes:
         try:
             a = np.asarray(actions, dtype=np.float64)
         except (TypeError, ValueError) as error:
-            raise InputError(f"actions are {actions!r}; give numbers from -1 to 1, ({self.n}, {self.task.n_actions}).") from error
+            raise InputError(
+                f"actions are {actions!r}; give numbers from -1 to 1, ({self.n}, {self.task.n_actions})."
+            ) from error
         if a.shape != (self.n, self.task.n_actions):
-            raise InputError(f"actions have shape {a.shape}; they must be ({self.n}, {self.task.n_actions}), each from -1 to 1.")
+            raise InputError(
+                f"actions have shape {a.shape}; they must be ({self.n}, "
+                f"{self.task.n_actions}), each from -1 to 1."
+            )
         if not np.isfinite(a).all():
             i = int(np.flatnonzero(~np.isfinite(a).all(1))[0])
             raise InputError(f"the action of environment {i} is not finite: {a[i]}; nothing was simulated.")
@@ -77,7 +83,10 @@ class Episodes:
         """One step of all. Raises `InputError` as `checked`, and where an episode has not begun."""
         checked = self.checked(actions)
         if not self._running.all():
-            raise InputError(f"environment {int(np.flatnonzero(~self._running)[0])} has no episode under way; call reset() first.")
+            raise InputError(
+                f"environment {int(np.flatnonzero(~self._running)[0])} has no episode under "
+                "way; call reset() first."
+            )
         self.task.act(checked)
         outcome = self.task.outcome()
         reward = np.zeros(self.n)
@@ -96,10 +105,18 @@ class Episodes:
         return np.clip(seen.astype(np.float32), self.low, self.high)
 
     def info(self, moment: Moment) -> dict[str, Any]:
-        """Arrays (n, ...) of what happened: distance, success, contact, lost, position, desired, the terms of the reward, and facts."""
+        """Arrays (n, ...) of what happened: distance, success, contact, lost, position, desired, the terms of
+        the reward, and facts."""
         o = moment.outcome
         told: dict[str, Any] = {
-            "distance": o.distance, "success": o.success, "contact": o.contact, "lost": o.lost,
-            "position": o.position, "desired": o.desired, **o.facts,
-        }  # fmt: skip
-        return {name: a.copy() for name, a in told.items()} | {"reward_terms": {name: a.copy() for name, a in o.terms.items()}}
+            "distance": o.distance,
+            "success": o.success,
+            "contact": o.contact,
+            "lost": o.lost,
+            "position": o.position,
+            "desired": o.desired,
+            **o.facts,
+        }
+        return {name: a.copy() for name, a in told.items()} | {
+            "reward_terms": {name: a.copy() for name, a in o.terms.items()}
+        }

@@ -1,4 +1,5 @@
-"""A policy's episodes beside those of the scripted baseline, of random and goal-blind actions, and of none: table, figures, plot."""
+"""A policy's episodes beside those of the scripted baseline, of random and goal-blind actions, and of none:
+table, figures, plot."""
 
 from __future__ import annotations
 
@@ -64,14 +65,21 @@ class Evaluation:
 
 
 def evaluate(
-    env: str, policy: Policy | None, *, episodes: int = 100, seed: int = 0, options: Mapping[str, Any] | None = None,
-    baselines: bool = True, progress: Progress | None = None,
-) -> Evaluation:  # fmt: skip
+    env: str,
+    policy: Policy | None,
+    *,
+    episodes: int = 100,
+    seed: int = 0,
+    options: Mapping[str, Any] | None = None,
+    baselines: bool = True,
+    progress: Progress | None = None,
+) -> Evaluation:
     """Episodes of seeds `seed`, `seed` + 1, ..., one each, for every agent.
 
-    `policy` None evaluates the baselines alone; otherwise options that it was trained on hold where they change what it sees or does.
-    Goal-blind repeats, step by step, the mean of what the policy (or the baseline) did in
-    these very episodes: what is left when it does not look. Still does not move at all. Raises `InputError`, `UnknownNameError`.
+    `policy` None evaluates the baselines alone; otherwise options that it was trained on hold where they
+    change what it sees or does. Goal-blind repeats, step by step, the mean of what the policy (or the
+    baseline) did in these very episodes: what is left when it does not look. Still does not move at all.
+    Raises `InputError`, `UnknownNameError`.
     """
     if not isinstance(episodes, int) or episodes < 1:
         raise InputError(f"episodes is {episodes!r}; it must be a whole number, at least 1.")
@@ -81,7 +89,9 @@ def evaluate(
     try:
         if policy is not None:
             policy.check(batch)
-        agents: dict[str, Agent] = {} if policy is None else {"policy": lambda _, observation, __: policy.act(observation)}
+        agents: dict[str, Agent] = (
+            {} if policy is None else {"policy": lambda _, observation, __: policy.act(observation)}
+        )
         if baselines or policy is None:
             agents["baseline"] = lambda e, _, __: e.baseline()
         trials: dict[str, Trial] = {}
@@ -103,7 +113,9 @@ def evaluate(
         batch.close()
 
 
-def _run(env: BatchEnv, agent: Agent, episodes: int, seed: int, name: str, progress: Progress | None) -> tuple[Trial, Floats]:
+def _run(
+    env: BatchEnv, agent: Agent, episodes: int, seed: int, name: str, progress: Progress | None
+) -> tuple[Trial, Floats]:
     """The trial, and the mean action (n_steps, n_actions) of each step over the episodes."""
     ends: list[dict[str, Any]] = []
     total, count = np.zeros((env.n_steps, env.task.n_actions)), np.zeros((env.n_steps, 1))
@@ -120,18 +132,33 @@ def _run(env: BatchEnv, agent: Agent, episodes: int, seed: int, name: str, progr
             observation, _, terminated, truncated, told = env.step(actions)
             for i in np.flatnonzero((terminated | truncated) & open_):
                 final = told["final_info"]
-                found[i] = {key: value[i] for key, value in final.items() if isinstance(value, np.ndarray) and not key.startswith("_")}
-                found[i] |= {"r": final["episode"]["r"][i], "l": final["episode"]["l"][i]}  # type: ignore[operator]
+                found[i] = {
+                    key: value[i]
+                    for key, value in final.items()
+                    if isinstance(value, np.ndarray) and not key.startswith("_")
+                }
+                episode = final["episode"]
+                found[i] |= {"r": episode["r"][i], "l": episode["l"][i]}  # type: ignore[operator]
                 open_[i] = False
             if progress is not None:
                 progress(name, min(episodes, start + int((wanted & ~open_).sum())), episodes)
         ends += [row for row in found if row is not None]
     columns = {key: np.array([row[key] for row in ends]) for key in ends[0]}
-    own = {key: columns.pop(key) for key in ("distance", "success", "contact", "lost", "position", "desired", "r", "l")}
+    own = {
+        key: columns.pop(key)
+        for key in ("distance", "success", "contact", "lost", "position", "desired", "r", "l")
+    }
     trial = Trial(
-        own["distance"], own["success"], own["contact"], own["lost"], own["position"], own["desired"], own["r"],
-        own["l"].astype(float), columns,
-    )  # fmt: skip
+        own["distance"],
+        own["success"],
+        own["contact"],
+        own["lost"],
+        own["position"],
+        own["desired"],
+        own["r"],
+        own["l"].astype(float),
+        columns,
+    )
     return trial, total / np.maximum(count, 1.0)
 
 
@@ -150,13 +177,21 @@ def figures(evaluation: Evaluation) -> dict[str, dict[str, Any]]:
     told: dict[str, dict[str, Any]] = {}
     for name, trial in evaluation.trials.items():
         told[name] = {
-            "episodes": len(trial.distance), "success": float(trial.success.mean()), "distance_mean_m": float(trial.distance.mean()),
-            "distance_std_m": float(trial.distance.std()), "distance_median_m": float(np.median(trial.distance)),
-            "distance_largest_m": float(trial.distance.max()), "contact": float(trial.contact.mean()), "lost": float(trial.lost.mean()),
-            "return_mean": float(trial.returned.mean()), "steps_mean": float(trial.steps.mean()),
+            "episodes": len(trial.distance),
+            "success": float(trial.success.mean()),
+            "distance_mean_m": float(trial.distance.mean()),
+            "distance_std_m": float(trial.distance.std()),
+            "distance_median_m": float(np.median(trial.distance)),
+            "distance_largest_m": float(trial.distance.max()),
+            "contact": float(trial.contact.mean()),
+            "lost": float(trial.lost.mean()),
+            "return_mean": float(trial.returned.mean()),
+            "steps_mean": float(trial.steps.mean()),
             "correlation": [None if np.isnan(c) else float(c) for c in correlation(trial)],
-            "facts_mean": {key: np.asarray(value, float).mean(0).tolist() for key, value in trial.facts.items()},
-        }  # fmt: skip
+            "facts_mean": {
+                key: np.asarray(value, float).mean(0).tolist() for key, value in trial.facts.items()
+            },
+        }
     return told
 
 
@@ -166,21 +201,43 @@ def table(evaluation: Evaluation) -> Table:
     from rich.table import Table
 
     grid = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    grid.title = f"{evaluation.env}: seeds {evaluation.seed} on; success is a distance below {1e3 * evaluation.accuracy:g} mm"
+    grid.title = (
+        f"{evaluation.env}: seeds {evaluation.seed} on; success is a distance below "
+        f"{1e3 * evaluation.accuracy:g} mm"
+    )
     grid.title_justify = "left"
-    for head in ("agent", "episodes", "success", "distance mm", "median", "largest", "contact", "lost", "goal to end: r", "return"):
+    for head in (
+        "agent",
+        "episodes",
+        "success",
+        "distance mm",
+        "median",
+        "largest",
+        "contact",
+        "lost",
+        "goal to end: r",
+        "return",
+    ):
         grid.add_column(head, justify="left" if head == "agent" else "right")
     for name, row in figures(evaluation).items():
         r = [f"{c:.3f}" for c in row["correlation"] if c is not None]
         grid.add_row(
-            name, str(row["episodes"]), f"{100 * row['success']:.0f} %",
-            f"{1e3 * row['distance_mean_m']:.2f} ± {1e3 * row['distance_std_m']:.2f}", f"{1e3 * row['distance_median_m']:.2f}",
-            f"{1e3 * row['distance_largest_m']:.1f}", f"{100 * row['contact']:.0f} %", f"{100 * row['lost']:.0f} %", " ".join(r) or "-",
+            name,
+            str(row["episodes"]),
+            f"{100 * row['success']:.0f} %",
+            f"{1e3 * row['distance_mean_m']:.2f} ± {1e3 * row['distance_std_m']:.2f}",
+            f"{1e3 * row['distance_median_m']:.2f}",
+            f"{1e3 * row['distance_largest_m']:.1f}",
+            f"{100 * row['contact']:.0f} %",
+            f"{100 * row['lost']:.0f} %",
+            " ".join(r) or "-",
             f"{row['return_mean']:.2f}",
-        )  # fmt: skip
+        )
     for key, value in figures(evaluation)[next(iter(evaluation.trials))]["facts_mean"].items():
         numbers = ", ".join(f"{v:.4g}" for v in np.ravel(value))
-        grid.caption = (f"{grid.caption}; " if grid.caption else f"mean of the {next(iter(evaluation.trials))}: ") + f"{key} {numbers}"
+        grid.caption = (
+            f"{grid.caption}; " if grid.caption else f"mean of the {next(iter(evaluation.trials))}: "
+        ) + f"{key} {numbers}"
     return grid
 
 
@@ -188,9 +245,12 @@ def write(evaluation: Evaluation, out: Path) -> list[Path]:
     """evaluation.json and evaluation.png in the folder `out`; the files written."""
     out.mkdir(parents=True, exist_ok=True)
     told = {
-        "env": evaluation.env, "seed": evaluation.seed, "options": {key: str(v) for key, v in evaluation.options.items()},
-        "accuracy_m": evaluation.accuracy, "agents": figures(evaluation),
-    }  # fmt: skip
+        "env": evaluation.env,
+        "seed": evaluation.seed,
+        "options": {key: str(v) for key, v in evaluation.options.items()},
+        "accuracy_m": evaluation.accuracy,
+        "agents": figures(evaluation),
+    }
     path = out / "evaluation.json"
     path.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
     return [path, _plot(evaluation, out / "evaluation.png")]
@@ -201,12 +261,31 @@ def _plot(evaluation: Evaluation, path: Path) -> Path:
 
     figure = Figure(figsize=(10.0, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2)
-    colors = {"policy": "#1b6ca8", "baseline": "#2e8b57", "goal-blind": "#b8860b", "random": "#888888", "still": "#bbbbbb"}
+    colors = {
+        "policy": "#1b6ca8",
+        "baseline": "#2e8b57",
+        "goal-blind": "#b8860b",
+        "random": "#888888",
+        "still": "#bbbbbb",
+    }
     for name, trial in evaluation.trials.items():
         x = np.sort(1e3 * trial.distance)
-        left.step(np.maximum(x, 1e-3), np.arange(1, len(x) + 1) / len(x), where="post", color=colors[name], label=name, lw=1.8)
+        left.step(
+            np.maximum(x, 1e-3),
+            np.arange(1, len(x) + 1) / len(x),
+            where="post",
+            color=colors[name],
+            label=name,
+            lw=1.8,
+        )
     left.axvline(1e3 * evaluation.accuracy, color="#c0392b", ls=":", lw=1.2, label="success")
-    left.set(xscale="log", xlabel="distance [mm]", ylabel="part of the episodes", ylim=(0.0, 1.02), title=evaluation.env)
+    left.set(
+        xscale="log",
+        xlabel="distance [mm]",
+        ylabel="part of the episodes",
+        ylim=(0.0, 1.02),
+        title=evaluation.env,
+    )
     left.legend(frameon=False, fontsize=8)
     first, trial = next(iter(evaluation.trials.items()))
     low = 1e3 * min(trial.desired.min(), trial.position.min())
@@ -215,7 +294,14 @@ def _plot(evaluation: Evaluation, path: Path) -> Path:
     for k, (axis, color) in enumerate(zip("xyz", ("#c0392b", "#2e8b57", "#1b6ca8"), strict=True)):
         r = correlation(trial)[k]
         if not np.isnan(r):
-            right.plot(1e3 * trial.desired[:, k], 1e3 * trial.position[:, k], ".", color=color, ms=4, label=f"{axis}, r = {r:.3f}")
+            right.plot(
+                1e3 * trial.desired[:, k],
+                1e3 * trial.position[:, k],
+                ".",
+                color=color,
+                ms=4,
+                label=f"{axis}, r = {r:.3f}",
+            )
     right.set(xlabel="desired [mm]", ylabel="at the end [mm]", title=f"{first}: end over goal")
     if right.get_legend_handles_labels()[0]:
         right.legend(frameon=False, fontsize=8)

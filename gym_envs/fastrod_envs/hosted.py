@@ -37,11 +37,13 @@ class Cell(ABC):
 
     @abstractmethod
     def begin(self, draws: Floats, difficulty: float, robot: Robot | None) -> None:
-        """Start an episode from the same state as any other, but for its draws (n_draws,) and the soft robot, where it is another."""
+        """Start an episode from the same state as any other, but for its draws (n_draws,) and the soft robot,
+        where it is another."""
 
     @abstractmethod
     def act(self, action: Floats, duration: float) -> None:
-        """Simulate this long [s] with this action (n_actions,), from -1 to 1. Raises `HostError` where the soft robot is lost."""
+        """Simulate this long [s] with this action (n_actions,), from -1 to 1. Raises `HostError` where the
+        soft robot is lost."""
 
     @abstractmethod
     def result(self) -> Result:
@@ -80,7 +82,13 @@ class HostedTask(Task):
     """Of an episode [s]."""
 
     def __init__(
-        self, n_envs: int, options: Options, robot: Robot, actions: tuple[Field, ...], states: tuple[Field, ...], goals: tuple[Field, ...]
+        self,
+        n_envs: int,
+        options: Options,
+        robot: Robot,
+        actions: tuple[Field, ...],
+        states: tuple[Field, ...],
+        goals: tuple[Field, ...],
     ) -> None:
         """`robot` is the soft robot, before anything of it is randomised."""
         super().__init__(n_envs, options)
@@ -102,7 +110,8 @@ class HostedTask(Task):
         """A new environment."""
 
     def begin(self, rows: Ints, draws: Floats) -> None:
-        """As `Task.begin`, cell by cell. A cell that raises `HostError` is closed and made anew; if it raises again, so does this."""
+        """As `Task.begin`, cell by cell. A cell that raises `HostError` is closed and made anew; if it raises
+        again, so does this."""
         for i, row in zip(rows, draws, strict=True):
             robot = None
             if self._random is not None and self._random.n_draws:
@@ -118,8 +127,8 @@ class HostedTask(Task):
             self._sane[i] = self.cells[i].result()
 
     def act(self, action: Floats) -> None:
-        """As `Task.act`. A cell that raises `HostError`, or whose state is not finite, is lost until its next episode, and shows its last
-        good step."""
+        """As `Task.act`. A cell that raises `HostError`, or whose state is not finite, is lost until its next
+        episode, and shows its last good step."""
         for i, cell in enumerate(self.cells):
             try:
                 cell.act(action[i], self.dt)
@@ -139,11 +148,15 @@ class HostedTask(Task):
 
         return Outcome(
             terms={name: each([r.terms[name] for r in results]) for name in results[0].terms},
-            distance=each([r.distance for r in results]), success=each([r.success for r in results]) & ~self._lost,
-            position=each([r.position for r in results]), desired=each([r.desired for r in results]),
-            terminated=each([r.terminated for r in results]), contact=each([r.contact for r in results]), lost=self._lost.copy(),
+            distance=each([r.distance for r in results]),
+            success=each([r.success for r in results]) & ~self._lost,
+            position=each([r.position for r in results]),
+            desired=each([r.desired for r in results]),
+            terminated=each([r.terminated for r in results]),
+            contact=each([r.contact for r in results]),
+            lost=self._lost.copy(),
             facts={name: each([r.facts[name] for r in results]) for name in results[0].facts},
-        )  # fmt: skip
+        )
 
     def state(self) -> Floats:
         """(n_envs, size of `states`) after each cell's last good step; a copy."""

@@ -1,6 +1,8 @@
-"""Lessons from a task's scripted baseline: the policy acts, the baseline says what it would have done (dataset aggregation).
+"""Lessons from a task's scripted baseline: the policy acts, the baseline says what it would have done
+(dataset aggregation).
 
-Ross, Gordon, Bagnell, "A Reduction of Imitation Learning and Structured Prediction to No-Regret Online Learning", AISTATS 2011.
+Ross, Gordon, Bagnell, "A Reduction of Imitation Learning and Structured Prediction to No-Regret Online
+Learning", AISTATS 2011.
 """
 
 from __future__ import annotations
@@ -30,18 +32,29 @@ def actor_mean(model: BaseAlgorithm, observation: torch.Tensor) -> torch.Tensor:
     return torch.as_tensor(policy.actor(observation))
 
 
-def imitate(model: BaseAlgorithm, env: BatchEnv, steps: int, seed: int, progress: Callable[[str, int, int], None] | None = None) -> float:
-    """Fit the policy's mean to the baseline over about `steps` environment steps; the root mean square of what is left, in actions.
+def imitate(
+    model: BaseAlgorithm,
+    env: BatchEnv,
+    steps: int,
+    seed: int,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> float:
+    """Fit the policy's mean to the baseline over about `steps` environment steps; the root mean square of
+    what is left, in actions.
 
-    In the first round the baseline acts, from then on the policy with less and less of it, so that the lessons are where the policy
-    goes.
+    In the first round the baseline acts, from then on the policy with less and less of it, so that the
+    lessons are where the policy goes.
     """
     rng, policy = np.random.default_rng(seed), model.policy
     per_round = max(1, steps // (_ROUNDS * env.num_envs))
     seen: list[np.ndarray] = []
     said: list[np.ndarray] = []
     observation, _ = env.reset(seed=seed)
-    parameters = [p for name, p in policy.named_parameters() if "log_std" not in name and "critic" not in name and "value" not in name]
+    parameters = [
+        p
+        for name, p in policy.named_parameters()
+        if "log_std" not in name and "critic" not in name and "value" not in name
+    ]
     optimizer = torch.optim.Adam(parameters, lr=1e-3)
     left = float("nan")
     for k in range(_ROUNDS):

@@ -1,4 +1,5 @@
-"""What every task can be told: length of an episode, what is observed, what an action is, what differs from robot to robot."""
+"""What every task can be told: length of an episode, what is observed, what an action is, what differs from
+robot to robot."""
 
 from __future__ import annotations
 
@@ -23,27 +24,37 @@ class Options:
     """Keyword arguments of `gymnasium.make` and `make_vec`, the same for every task; some tasks have more."""
 
     n_steps: int | None = None
-    """Steps of an episode, None for the task's own number; 1, with `action="displacement"`, is the paper's bandit."""
+    """Steps of an episode, None for the task's own number; 1, with `action="displacement"`, is the paper's
+    bandit."""
     observation: Observation = "state"
     """`state`: goal, robot and scene; `goal`: the goal alone, as in the paper."""
     action: Action = "rate"
     """`rate`: how fast tendons are displaced; `displacement`: where they go, at once (the paper's)."""
     randomise: Randomisation | Robot | str | Path | Mapping[str, Any] | None = None
-    """What differs from episode to episode in the robot's parameters and effects (`Randomisation`): a robot file, such as an
-    identified.toml, or a mapping of names to ranges."""
+    """What differs from episode to episode in the robot's parameters and effects (`Randomisation`): a robot
+    file, such as an identified.toml, or a mapping of names to ranges."""
     difficulty: float = 1.0
-    """From 0, all goals are the easiest, to 1, the whole task; `set_difficulty` changes it between episodes (curriculum)."""
+    """From 0, all goals are the easiest, to 1, the whole task; `set_difficulty` changes it between episodes
+    (curriculum)."""
     threads: int | None = None
     """Of the simulator; None is numba's number."""
     device: Device = "cpu"
-    """Of the simulator, `cpu` or `cuda`; tasks in which rods feel contact or hold a host's bodies have the CPU alone."""
+    """Of the simulator, `cpu` or `cuda`; tasks in which rods feel contact or hold a host's bodies have the
+    CPU alone."""
 
     def __post_init__(self) -> None:
-        if self.n_steps is not None and (not isinstance(self.n_steps, Integral) or isinstance(self.n_steps, bool) or self.n_steps < 1):
-            raise InputError(f"n_steps is {self.n_steps!r}; it must be a whole number, at least 1, or None for the task's own.")
+        if self.n_steps is not None and (
+            not isinstance(self.n_steps, Integral) or isinstance(self.n_steps, bool) or self.n_steps < 1
+        ):
+            raise InputError(
+                f"n_steps is {self.n_steps!r}; it must be a whole number, at least 1, or None "
+                "for the task's own."
+            )
         for name, kinds in (("observation", get_args(Observation)), ("action", get_args(Action))):
             if getattr(self, name) not in kinds:
-                raise InputError(f"{name} is {getattr(self, name)!r}; it must be {' or '.join(map(repr, kinds))}.")
+                raise InputError(
+                    f"{name} is {getattr(self, name)!r}; it must be {' or '.join(map(repr, kinds))}."
+                )
         checked_difficulty(self.difficulty)
         checked_name(self.device)
 
@@ -72,10 +83,13 @@ def checked_mapping(given: object) -> dict[str, Any]:
 
 
 def with_steps(options: Mapping[str, Any], max_episode_steps: int | None, n_steps: int) -> dict[str, Any]:
-    """Options with Gymnasium's name of n_steps as ours; the task's own `n_steps`, which `make_vec` gives where nobody else does, yields to
-    an option. Raises `InputError` where both are given and differ."""
+    """Options with Gymnasium's name of n_steps as ours; the task's own `n_steps`, which `make_vec` gives
+    where nobody else does, yields to an option. Raises `InputError` where both are given and differ."""
     if max_episode_steps is None or (options.get("n_steps") is not None and max_episode_steps == n_steps):
         return dict(options)
     if options.get("n_steps", max_episode_steps) != max_episode_steps:
-        raise InputError(f"n_steps is {options['n_steps']!r} and max_episode_steps {max_episode_steps!r}; give one of them.")
+        raise InputError(
+            f"n_steps is {options['n_steps']!r} and max_episode_steps {max_episode_steps!r}; "
+            "give one of them."
+        )
     return {**options, "n_steps": max_episode_steps}

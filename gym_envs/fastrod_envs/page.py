@@ -63,20 +63,32 @@ class Page:
         scene.world_axes.visible = False
         scene.configure_environment_map(None)
         scene.configure_default_lights(False)
-        scene.add_light_hemisphere("/lights/sky", sky_color=(255, 255, 255), ground_color=(205, 208, 216), intensity=1.9)
+        scene.add_light_hemisphere(
+            "/lights/sky", sky_color=(255, 255, 255), ground_color=(205, 208, 216), intensity=1.9
+        )
         for name, place, intensity in _LAMPS:
             scene.add_light_directional(f"/lights/{name}", position=place, intensity=intensity)
         width = 4.0 * math.ceil(1.0 + float(np.abs(self._places).max()))
         scene.add_grid(
-            "/floor", width=width, height=width, plane="xy", cell_size=0.1, section_size=0.5, cell_color=(226, 229, 235),
-            section_color=(196, 202, 212), shadow_opacity=0.0,
-        )  # fmt: skip
+            "/floor",
+            width=width,
+            height=width,
+            plane="xy",
+            cell_size=0.1,
+            section_size=0.5,
+            cell_color=(226, 229, 235),
+            section_color=(196, 202, 212),
+            shadow_opacity=0.0,
+        )
         for i, place in enumerate(self._places):
             scene.add_frame(f"/env{i}", show_axes=False, position=place)
         eye, target = np.array(scenery.eye), np.array(scenery.target)
         away = eye - target
         back = 1.0 + 1.2 * float(np.ptp(self._places, axis=0).max()) / max(float(np.linalg.norm(away)), 1e-9)
-        self._server.initial_camera.position, self._server.initial_camera.look_at = target + back * away, target
+        self._server.initial_camera.position, self._server.initial_camera.look_at = (
+            target + back * away,
+            target,
+        )
 
     def _draw(self, at: str, scenery: Scenery) -> list[str]:
         """Everything of one environment; the names it has in the page."""
@@ -87,7 +99,14 @@ class Page:
         for i, ball in enumerate(scenery.balls):
             names.append(f"{at}/ball{i}")
             mesh = ball_mesh()
-            self._mesh(names[-1], np.asarray(ball.position) + ball.radius * mesh.vertices, mesh.faces, ball.color, 1.0, flat=False)
+            self._mesh(
+                names[-1],
+                np.asarray(ball.position) + ball.radius * mesh.vertices,
+                mesh.faces,
+                ball.color,
+                1.0,
+                flat=False,
+            )
         for i, solid in enumerate(scenery.solids):
             names.append(f"{at}/solid{i}")
             self._mesh(names[-1], solid.vertices, solid.faces, solid.color, solid.opacity, flat=True)
@@ -97,13 +116,22 @@ class Page:
             self._line(names[-1], np.stack([points[:-1], points[1:]], axis=1), line.color)
         return names
 
-    def _mesh(self, name: str, vertices: Floats, faces: Any, color: tuple[float, ...], opacity: float, *, flat: bool) -> None:
+    def _mesh(
+        self, name: str, vertices: Floats, faces: Any, color: tuple[float, ...], opacity: float, *, flat: bool
+    ) -> None:
         handle = self._known(name, vertices)
         if handle is None:
             handle = self._server.scene.add_mesh_simple(
-                name, np.asarray(vertices, np.float32), np.asarray(faces, np.uint32), color=_bytes(color),
-                opacity=None if opacity >= 1.0 else opacity, flat_shading=flat, side="double", cast_shadow=False, receive_shadow=False,
-            )  # fmt: skip
+                name,
+                np.asarray(vertices, np.float32),
+                np.asarray(faces, np.uint32),
+                color=_bytes(color),
+                opacity=None if opacity >= 1.0 else opacity,
+                flat_shading=flat,
+                side="double",
+                cast_shadow=False,
+                receive_shadow=False,
+            )
         elif np.abs(self._drawn[name][1] - vertices).max() > _STILL:
             handle.vertices = np.asarray(vertices, np.float32)
         else:
@@ -113,7 +141,9 @@ class Page:
     def _line(self, name: str, pairs: Floats, color: tuple[float, ...]) -> None:
         handle = self._known(name, pairs)
         if handle is None:
-            handle = self._server.scene.add_line_segments(name, np.asarray(pairs, np.float32), _bytes(color), thickness=0.004)
+            handle = self._server.scene.add_line_segments(
+                name, np.asarray(pairs, np.float32), _bytes(color), thickness=0.004
+            )
         elif np.abs(self._drawn[name][1] - pairs).max(initial=0.0) > _STILL:
             handle.points = np.asarray(pairs, np.float32)
         else:
@@ -133,7 +163,11 @@ def _bytes(color: tuple[float, ...]) -> tuple[int, int, int]:
 
 def _extent(scenery: Scenery) -> float:
     """Width of a square around an environment, from above [m]."""
-    parts = [t.points for t in scenery.tubes] + [s.vertices for s in scenery.solids] + [line.points for line in scenery.lines]
+    parts = (
+        [t.points for t in scenery.tubes]
+        + [s.vertices for s in scenery.solids]
+        + [line.points for line in scenery.lines]
+    )
     parts += [np.asarray(ball.position)[None] for ball in scenery.balls]
     points = np.concatenate([np.asarray(part, float)[:, :2] for part in parts])
     lengths = [float(np.linalg.norm(np.diff(tube.points, axis=0), axis=1).sum()) for tube in scenery.tubes]
@@ -155,4 +189,6 @@ def _free_port() -> int:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((_HOST, port))
             return port
-    raise InputError(f"ports {_PORT} to {_PORT + _TRIES - 1} are all in use on {_HOST}; close a page to free one.")
+    raise InputError(
+        f"ports {_PORT} to {_PORT + _TRIES - 1} are all in use on {_HOST}; close a page to free one."
+    )

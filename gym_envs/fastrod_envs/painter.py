@@ -1,8 +1,9 @@
-"""A small painter in numpy: what a `Scenery` looks like, in some milliseconds, without a window or a graphics card.
+"""A small painter in numpy: what a `Scenery` looks like, in some milliseconds, without a window or a graphics
+card.
 
-Everything becomes triangles. Those of one layer are cut into rows of pixels, and rows into fragments, at twice the picture's
-resolution; the nearest fragment of every pixel is kept and only then shaded. See-through solids are layers of their own, laid
-over what is opaque.
+Everything becomes triangles. Those of one layer are cut into rows of pixels, and rows into fragments, at
+twice the picture's resolution; the nearest fragment of every pixel is kept and only then shaded. See-through
+solids are layers of their own, laid over what is opaque.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ _NEAR = 0.02  # m before the eye: nothing nearer is drawn
 _FINE = 2  # fragments a pixel, each way
 _SIDES = 24  # of a tube
 _LIGHT = np.array([0.35, -0.25, 0.9]) / np.linalg.norm([0.35, -0.25, 0.9])
-_SKY, _HORIZON, _FLOOR, _GRID = (np.array(c) for c in ((0.80, 0.86, 0.93), (0.96, 0.97, 0.98), (0.87, 0.89, 0.91), (0.71, 0.74, 0.78)))
+_SKY, _HORIZON, _FLOOR, _GRID = (
+    np.array(c) for c in ((0.80, 0.86, 0.93), (0.96, 0.97, 0.98), (0.87, 0.89, 0.91), (0.71, 0.74, 0.78))
+)
 _MOUNT = (0.30, 0.33, 0.38)
 _SQUARE, _FOG = 0.1, 1.6  # m: of the grid; where the floor fades into the horizon
 
@@ -73,16 +76,21 @@ class Camera(NamedTuple):
 
 def paint(scenery: Scenery, width: int, height: int) -> np.ndarray:
     """(height, width, 3) uint8 of an environment."""
-    heights = [tube.points[:, 2] for tube in scenery.tubes] + [solid.vertices[:, 2] for solid in scenery.solids]
+    heights = [tube.points[:, 2] for tube in scenery.tubes] + [
+        solid.vertices[:, 2] for solid in scenery.solids
+    ]
     heights += [ball.position[2:] for ball in scenery.balls]
     lowest = min((float(z.min()) for z in heights if len(z)), default=0.0)
-    floor = 0.0 if lowest > -0.02 else 0.25 * math.floor(4.0 * lowest)  # a step at a time, so that it stays under what moves
+    # a step at a time, so that it stays under what moves
+    floor = 0.0 if lowest > -0.02 else 0.25 * math.floor(4.0 * lowest)
     camera = _camera(scenery.eye, scenery.target, width, height)
     opaque = [_lit(Mesh(s.vertices, s.faces), s.color, True) for s in scenery.solids if s.opacity >= 1.0]
     opaque += [layer for tube in scenery.tubes for layer in _tube_layers(tube)]
     opaque += [_ball_layer(ball) for ball in scenery.balls]
     solid = _joined([layer for layer in opaque if len(layer.corners)])
-    picture = _ground(scenery.eye, scenery.target, width, height, floor) * _shadow(solid, camera, floor)[:, :, None]
+    picture = (
+        _ground(scenery.eye, scenery.target, width, height, floor) * _shadow(solid, camera, floor)[:, :, None]
+    )
     ribbons = [_ribbon(line, camera) for line in scenery.lines if len(line.points) > 1]
     layers = [(_joined([solid, *ribbons]), 1.0)] + [
         (_lit(Mesh(s.vertices, s.faces), s.color, True), s.opacity) for s in _far_to_near(scenery, camera)
@@ -109,21 +117,29 @@ def tube_mesh(points: Floats, radius: float, sides: int = _SIDES) -> Mesh:
     u, v = (np.concatenate([a, np.repeat(a[-1:], len(cap), axis=0)]) for a in (u, v))
     angle = np.linspace(0.0, 2.0 * np.pi, sides, endpoint=False)
     ring = u[:, None] * np.cos(angle)[:, None] + v[:, None] * np.sin(angle)[:, None]
-    return Mesh((centre[:, None] + reach[:, None, None] * ring).reshape(-1, 3), _grid_faces(len(centre), sides))
+    return Mesh(
+        (centre[:, None] + reach[:, None, None] * ring).reshape(-1, 3), _grid_faces(len(centre), sides)
+    )
 
 
 @lru_cache(maxsize=4)
 def ball_mesh(sides: int = 16) -> Mesh:
     """A ball of radius 1."""
-    polar, around = np.linspace(0.0, np.pi, sides // 2 + 1), np.linspace(0.0, 2.0 * np.pi, sides, endpoint=False)
+    polar, around = (
+        np.linspace(0.0, np.pi, sides // 2 + 1),
+        np.linspace(0.0, 2.0 * np.pi, sides, endpoint=False),
+    )
     z = np.broadcast_to(-np.cos(polar)[:, None], (len(polar), sides))
-    points = np.stack([np.sin(polar)[:, None] * np.cos(around), np.sin(polar)[:, None] * np.sin(around), z], axis=2)
+    points = np.stack(
+        [np.sin(polar)[:, None] * np.cos(around), np.sin(polar)[:, None] * np.sin(around), z], axis=2
+    )
     return Mesh(points.reshape(-1, 3), _grid_faces(len(polar), sides))
 
 
 @lru_cache(maxsize=64)
 def _grid_faces(n_rings: int, sides: int) -> Ints:
-    """(m, 3) of rings of vertices, each joined with the next, counter-clockwise where the second is in front."""
+    """(m, 3) of rings of vertices, each joined with the next, counter-clockwise where the second is in
+    front."""
     i, j = np.meshgrid(np.arange(n_rings - 1), np.arange(sides), indexing="ij")
     a, b = i * sides + j, i * sides + (j + 1) % sides
     quads = np.stack([a, b, b + sides, a, b + sides, a + sides], axis=2)
@@ -141,7 +157,9 @@ def _camera(eye: tuple[float, ...], target: tuple[float, ...], width: int, heigh
 
 
 @lru_cache(maxsize=32)
-def _ground(eye: tuple[float, ...], target: tuple[float, ...], width: int, height: int, floor: float) -> Floats:
+def _ground(
+    eye: tuple[float, ...], target: tuple[float, ...], width: int, height: int, floor: float
+) -> Floats:
     """(height, width, 3) what is behind everything: the floor's grid, which fades into the sky."""
     fine = 3
     camera = _camera(eye, target, fine * width, fine * height)
@@ -165,7 +183,8 @@ def _ground(eye: tuple[float, ...], target: tuple[float, ...], width: int, heigh
 
 
 def _shadow(layer: Layer, camera: Camera, floor: float) -> Floats:
-    """(height, width) how bright the floor is under what stands between it and the light: soft at the edges."""
+    """(height, width) how bright the floor is under what stands between it and the light: soft at the
+    edges."""
     light = np.ones((camera.height, camera.width))
     if not len(layer.corners) or camera.eye[2] <= floor:
         return light
@@ -177,7 +196,10 @@ def _shadow(layer: Layer, camera: Camera, floor: float) -> Floats:
     if not len(rows):
         return light
     margin = 8
-    window = (slice(max(rows[0] - margin, 0), rows[-1] + margin + 1), slice(max(columns[0] - margin, 0), columns[-1] + margin + 1))
+    window = (
+        slice(max(rows[0] - margin, 0), rows[-1] + margin + 1),
+        slice(max(columns[0] - margin, 0), columns[-1] + margin + 1),
+    )
     soft = dark[window]
     for reach in (1, 2, 3):
         for axis in (0, 1):
@@ -196,7 +218,10 @@ def _tube_layers(tube: Tube) -> list[Layer]:
     normals = (body.vertices - centre) / tube.radius
     color = np.broadcast_to(np.array(tube.color, float), (len(body.faces), 3))
     along = (points[1] - points[0]) / max(float(np.linalg.norm(points[1] - points[0])), 1e-12)
-    return [Layer(body.vertices[body.faces], normals[body.faces], color, np.ones(len(body.faces))), _plate(points[0], along, tube.radius)]
+    return [
+        Layer(body.vertices[body.faces], normals[body.faces], color, np.ones(len(body.faces))),
+        _plate(points[0], along, tube.radius),
+    ]
 
 
 def _plate(foot: Floats, along: Floats, radius: float) -> Layer:
@@ -204,9 +229,12 @@ def _plate(foot: Floats, along: Floats, radius: float) -> Layer:
     ends = np.array([foot - 0.7 * radius * along, foot])
     rim = tube_mesh(ends, 2.2 * radius, 2 * _SIDES).vertices[: 4 * _SIDES].reshape(2, 2 * _SIDES, 3)
     outward = (rim[1] - foot) / (2.2 * radius)
-    rings = np.concatenate([np.broadcast_to(ends[:1, None], rim[:1].shape), rim, np.broadcast_to(ends[1:, None], rim[:1].shape)])
+    rings = np.concatenate(
+        [np.broadcast_to(ends[:1, None], rim[:1].shape), rim, np.broadcast_to(ends[1:, None], rim[:1].shape)]
+    )
     faces = _grid_faces(4, 2 * _SIDES)
-    normals = np.broadcast_to(-along, (*faces.shape, 3)).reshape(3, -1, 3, 3).copy()  # lower side, rim, upper side
+    # lower side, rim, upper side
+    normals = np.broadcast_to(-along, (*faces.shape, 3)).reshape(3, -1, 3, 3).copy()
     normals[1] = outward[faces.reshape(3, -1, 3)[1] % (2 * _SIDES)]
     normals[2] = along
     color = np.broadcast_to(np.array(_MOUNT), (len(faces), 3))
@@ -232,7 +260,8 @@ def _ball_layer(ball: Ball) -> Layer:
 
 
 def _lit(mesh: Mesh, color: tuple[float, ...], rounded: bool) -> Layer:
-    """Triangles under the light; `rounded`: smooth where neighbours are nearly in one plane, so that only edges show."""
+    """Triangles under the light; `rounded`: smooth where neighbours are nearly in one plane, so that only
+    edges show."""
     corners = np.asarray(mesh.vertices, float)[mesh.faces]
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flat = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-18)
@@ -242,7 +271,9 @@ def _lit(mesh: Mesh, color: tuple[float, ...], rounded: bool) -> Layer:
         mean = np.stack([np.bincount(corner, np.repeat(area[:, k], 3), n) for k in range(3)], axis=1)
         mean = (mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-18))[mesh.faces]
         normals = np.where(((mean * normals).sum(2) > 0.9)[:, :, None], mean, normals)
-    return Layer(corners, normals, np.broadcast_to(np.array(color, float), (len(corners), 3)), np.ones(len(corners)))
+    return Layer(
+        corners, normals, np.broadcast_to(np.array(color, float), (len(corners), 3)), np.ones(len(corners))
+    )
 
 
 def _ribbon(line: Line, camera: Camera) -> Layer:
@@ -250,9 +281,13 @@ def _ribbon(line: Line, camera: Camera) -> Layer:
     p = np.asarray(line.points, float)
     view = p - camera.eye
     side = np.cross(np.gradient(p, axis=0), view)
-    side *= (view @ camera.axes[2] / camera.focus)[:, None] / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-18)
+    side *= (view @ camera.axes[2] / camera.focus)[:, None] / np.maximum(
+        np.linalg.norm(side, axis=1, keepdims=True), 1e-18
+    )
     i = np.arange(len(p) - 1)
-    faces = np.concatenate([np.stack([i, i + 1, i + len(p)], 1), np.stack([i + 1, i + len(p) + 1, i + len(p)], 1)])
+    faces = np.concatenate(
+        [np.stack([i, i + 1, i + len(p)], 1), np.stack([i + 1, i + len(p) + 1, i + len(p)], 1)]
+    )
     layer = _lit(Mesh(np.concatenate([p - side, p + side]), faces), line.color, False)
     return layer._replace(shade=np.zeros(len(faces)))
 
@@ -265,11 +300,14 @@ def _joined(layers: list[Layer]) -> Layer:
 def _far_to_near(scenery: Scenery, camera: Camera) -> list[Solid]:
     """Solids that one sees through."""
     clear = [solid for solid in scenery.solids if solid.opacity < 1.0]
-    return sorted(clear, key=lambda solid: -float(np.linalg.norm(np.asarray(solid.vertices).mean(0) - camera.eye)))
+    return sorted(
+        clear, key=lambda solid: -float(np.linalg.norm(np.asarray(solid.vertices).mean(0) - camera.eye))
+    )
 
 
 def _projected(corners: Floats, camera: Camera) -> tuple[Floats, Floats]:
-    """Pixels (m, 3, 2) of triangles and (m, 3) one over their depth [1/m], which is linear in a picture; 0: before the near plane."""
+    """Pixels (m, 3, 2) of triangles and (m, 3) one over their depth [1/m], which is linear in a picture; 0:
+    before the near plane."""
     seen = (corners - camera.eye) @ camera.axes.T
     depth = seen[:, :, 2]
     visible = (depth > _NEAR).all(1, keepdims=True)
@@ -284,7 +322,9 @@ def _fragments(at: Floats, inverse: Floats, width: int, height: int) -> tuple[In
     double = a[:, 0] * (at[:, 2, 0] - at[:, 0, 0]) + b[:, 0] * (at[:, 2, 1] - at[:, 0, 1])
     top = np.maximum(np.ceil(at[:, :, 1].min(1) - 0.5), 0.0)
     rows = np.minimum(np.floor(at[:, :, 1].max(1) - 0.5), height - 1.0) - top + 1.0
-    rows = np.where((np.abs(double) > 1e-9) & (inverse[:, 0] > 0.0), np.maximum(rows, 0.0), 0.0).astype(np.int64)
+    rows = np.where((np.abs(double) > 1e-9) & (inverse[:, 0] > 0.0), np.maximum(rows, 0.0), 0.0).astype(
+        np.int64
+    )
     triangle, y = _counted(rows)
     y += top[triangle].astype(np.int64)
     sign = np.sign(double)[:, None]
@@ -292,11 +332,16 @@ def _fragments(at: Floats, inverse: Floats, width: int, height: int) -> tuple[In
     c = -(a * at[:, :, 0] + b * at[:, :, 1])
     with np.errstate(divide="ignore", invalid="ignore"):  # a row crosses no edge that is level
         crossing = -(b[triangle] * (y[:, None] + 0.5) + c[triangle]) / a[triangle]
-    enters, leaves = np.where(a[triangle] > 0.0, crossing, 0.0), np.where(a[triangle] < 0.0, crossing, float(width))
+    enters, leaves = (
+        np.where(a[triangle] > 0.0, crossing, 0.0),
+        np.where(a[triangle] < 0.0, crossing, float(width)),
+    )
     left = np.maximum(np.maximum(enters[:, 0], enters[:, 1]), np.maximum(enters[:, 2], 0.0))
     right = np.minimum(np.minimum(leaves[:, 0], leaves[:, 1]), leaves[:, 2])
     first = np.ceil(left - 0.5)
-    row, x = _counted(np.maximum(np.minimum(np.floor(right - 0.5), width - 1.0) - first + 1.0, 0.0).astype(np.int64))
+    row, x = _counted(
+        np.maximum(np.minimum(np.floor(right - 0.5), width - 1.0) - first + 1.0, 0.0).astype(np.int64)
+    )
     x += first[row].astype(np.int64)
     triangle, y = triangle[row], y[row]
     e, f = at[:, 1] - at[:, 0], at[:, 2] - at[:, 0]
@@ -316,7 +361,9 @@ def _counted(counts: Ints) -> tuple[Ints, Ints]:
 
 def _nearest(pixel: Ints, inverse: Floats, size: int) -> tuple[Ints, Ints]:
     """The pixels that are covered, and the nearest fragment of each."""
-    key = (inverse.astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)) | np.arange(len(pixel), dtype=np.uint64)
+    key = (inverse.astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)) | np.arange(
+        len(pixel), dtype=np.uint64
+    )
     best = np.zeros(size, np.uint64)
     np.maximum.at(best, pixel, key)
     covered = np.flatnonzero(best)
@@ -324,7 +371,8 @@ def _nearest(pixel: Ints, inverse: Floats, size: int) -> tuple[Ints, Ints]:
 
 
 def _lay(picture: Floats, layers: list[tuple[Layer, float]], camera: Camera) -> None:
-    """Lay triangles over a picture (height * width, 3), each layer over those before it where it is nearer than the first."""
+    """Lay triangles over a picture (height * width, 3), each layer over those before it where it is nearer
+    than the first."""
     fine = camera._replace(width=_FINE * camera.width, height=_FINE * camera.height)
     found = []
     for layer, opacity in layers:
@@ -334,7 +382,9 @@ def _lay(picture: Floats, layers: list[tuple[Layer, float]], camera: Camera) -> 
         triangle = triangle[which]
         # the left one of two neighbours within a pixel and a triangle is shaded for both
         alone = np.ones(len(covered), np.bool_)
-        alone[1:] = (triangle[1:] != triangle[:-1]) | (covered[1:] != covered[:-1] + 1) | (covered[1:] % _FINE == 0)
+        alone[1:] = (
+            (triangle[1:] != triangle[:-1]) | (covered[1:] != covered[:-1] + 1) | (covered[1:] % _FINE == 0)
+        )
         shaded = _shaded(layer, covered[alone], triangle[alone], at, inverse, fine)[np.cumsum(alone) - 1]
         found.append((covered, depth[which], shaded, opacity))
     mark = np.zeros(fine.width * fine.height, np.bool_)
@@ -360,7 +410,9 @@ def _lay(picture: Floats, layers: list[tuple[Layer, float]], camera: Camera) -> 
         picture[:, k] += np.bincount(parent, color[:, k], len(picture)) / _FINE**2
 
 
-def _shaded(layer: Layer, pixel: Ints, triangle: Ints, at: Floats, inverse: Floats, camera: Camera) -> NDArray[np.float32]:
+def _shaded(
+    layer: Layer, pixel: Ints, triangle: Ints, at: Floats, inverse: Floats, camera: Camera
+) -> NDArray[np.float32]:
     """(n, 3) colour of the triangles at these pixels."""
     y, x = np.divmod(pixel, camera.width)
     e, f, start = at[:, 1] - at[:, 0], at[:, 2] - at[:, 0], at[:, 0] - 0.5
@@ -371,13 +423,21 @@ def _shaded(layer: Layer, pixel: Ints, triangle: Ints, at: Floats, inverse: Floa
     dn = np.stack([n[:, 1] - n[:, 0], n[:, 2] - n[:, 0]], axis=1)
     by_x = (dn[:, 0] * f[:, 1:] - dn[:, 1] * e[:, 1:]) / whole[:, 0]
     by_y = (dn[:, 1] * e[:, :1] - dn[:, 0] * f[:, :1]) / whole[:, 0]
-    single = np.concatenate([n[:, 0], by_x, by_y, start, layer.color, layer.shade[:, None]], axis=1).astype(np.float32)[triangle]
+    single = np.concatenate([n[:, 0], by_x, by_y, start, layer.color, layer.shade[:, None]], axis=1).astype(
+        np.float32
+    )[triangle]
     x, y = x.astype(np.float32), y.astype(np.float32)
-    normal = single[:, :3] + single[:, 3:6] * (x - single[:, 9])[:, None] + single[:, 6:9] * (y - single[:, 10])[:, None]
+    normal = (
+        single[:, :3]
+        + single[:, 3:6] * (x - single[:, 9])[:, None]
+        + single[:, 6:9] * (y - single[:, 10])[:, None]
+    )
     view = -camera.rays(x + np.float32(0.5), y + np.float32(0.5)).astype(np.float32)
     light = _LIGHT.astype(np.float32)
     size, far, facing = _dot(normal, normal), _dot(view, view), _dot(normal, view)
-    scale = np.where(facing < 0.0, np.float32(-1.0), np.float32(1.0)) / np.sqrt(np.maximum(size, np.float32(1e-18)))
+    scale = np.where(facing < 0.0, np.float32(-1.0), np.float32(1.0)) / np.sqrt(
+        np.maximum(size, np.float32(1e-18))
+    )
     view /= np.sqrt(far)[:, None]
     toward = scale * (normal @ light)
     half = view + light

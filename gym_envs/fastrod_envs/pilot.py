@@ -1,4 +1,5 @@
-"""`TrackPilot`: a policy that was trained on the task Track, at the commands of a real or an emulated robot."""
+"""`TrackPilot`: a policy that was trained on the task Track, at the commands of a real or an emulated
+robot."""
 
 from __future__ import annotations
 
@@ -25,11 +26,13 @@ _EARLY = 1e-6  # of a step: a clock that is this much short of it has reached it
 
 @final
 class TrackPilot:
-    """Commands for a robot whose tip is to follow a path, one step of `dt` seconds after the other, as the task Track has them.
+    """Commands for a robot whose tip is to follow a path, one step of `dt` seconds after the other, as the
+    task Track has them.
 
-    The policy is asked once a step, with the very observation of the task; between steps the command stays, and a call that comes late
-    is one step. The first call begins at home, with straight wires. A tip that is not measured (nan) is taken to be where it was last
-    seen, for one step; after that the robot stays where it is until the tip is seen again.
+    The policy is asked once a step, with the very observation of the task; between steps the command stays,
+    and a call that comes late is one step. The first call begins at home, with straight wires. A tip that is
+    not measured (nan) is taken to be where it was last seen, for one step; after that the robot stays where
+    it is until the tip is seen again.
 
     >>> from fastrod_envs.policies import Policy, find
     >>> pilot = TrackPilot(Policy(find("Track", "shipped")), "circle")
@@ -40,24 +43,42 @@ class TrackPilot:
     dt = DT
     """Of a step [s]."""
 
-    def __init__(self, policy: Policy, path: str | Trajectory, robot: Robot | None = None, *, phase: float = 0.0, way: int = 1) -> None:
-        """Follow `path`, of the task by its name or a trajectory in a plane across the robot, base frame: from `phase` [s] on it, forward
-        (`way` 1) or backward (-1). `robot`, by default the prototype, says what is in reach, as in `ReachableSurface`.
+    def __init__(
+        self,
+        policy: Policy,
+        path: str | Trajectory,
+        robot: Robot | None = None,
+        *,
+        phase: float = 0.0,
+        way: int = 1,
+    ) -> None:
+        """Follow `path`, of the task by its name or a trajectory in a plane across the robot, base frame:
+        from `phase` [s] on it, forward (`way` 1) or backward (-1). `robot`, by default the prototype, says
+        what is in reach, as in `ReachableSurface`.
 
-        Raises `InputError` for a policy of another task, or of other observations or actions than the task has by default; for a robot
-        that is not one segment with two pairs of wires; for a path out of a plane. Raises `UnknownNameError` for a name of no path.
+        Raises `InputError` for a policy of another task, or of other observations or actions than the task
+        has by default; for a robot that is not one segment with two pairs of wires; for a path out of a
+        plane. Raises `UnknownNameError` for a name of no path.
         """
         told = policy.options
-        if name_of(policy.plan.env) != "Track" or told.get("observation", "state") != "state" or told.get("action", "rate") != "rate":
+        if (
+            name_of(policy.plan.env) != "Track"
+            or told.get("observation", "state") != "state"
+            or told.get("action", "rate") != "rate"
+        ):
             raise InputError(
-                f"the policy was trained on {policy.plan.env} with {told}; give one of Track that observes the state and tells rates."
+                f"the policy was trained on {policy.plan.env} with {told}; give one of Track that observes "
+                "the state and tells rates."
             )
         if way not in (1, -1) or not math.isfinite(phase):
             raise InputError(f"phase is {phase!r} s and way {way!r}; give a finite time, and 1 or -1.")
         self.robot = load_robot("prototype") if robot is None else robot
         """Whose wires they are."""
         if self.robot.n_segments != 1:
-            raise InputError(f"robot {self.robot.name!r} has {self.robot.n_segments} segments; a policy of Track drives one.")
+            raise InputError(
+                f"robot {self.robot.name!r} has {self.robot.n_segments} segments; a policy of "
+                "Track drives one."
+            )
         self._matrix: Floats = SegmentActions(self.robot).matrix[: self.robot.n_tendons, DRIVEN]
         known = references(self.robot.length, PERIOD)
         if isinstance(path, str) and path not in known:
@@ -68,7 +89,10 @@ class TrackPilot:
         self._phase, self._way = float(phase), float(way)
         turn = self._path.position(np.linspace(0.0, self._path.period, 721))
         if np.ptp(turn[:, 2]) > 1e-9:
-            raise InputError(f"path {self._path.name!r} rises by {np.ptp(turn[:, 2]):g} m; a policy of Track follows one in a plane.")
+            raise InputError(
+                f"path {self._path.name!r} rises by {np.ptp(turn[:, 2]):g} m; a policy of "
+                "Track follows one in a plane."
+            )
         radius = max(RADIUS, float(np.hypot(turn[:, 0], turn[:, 1]).max()))
         self._surface = ReachableSurface(self.robot, height=float(turn[0, 2]), radius=radius)
         self._policy = policy
@@ -95,21 +119,27 @@ class TrackPilot:
         return np.array(self._surface.nearest(self._along(t))[0])
 
     def command(self, tip: ArrayLike, t: float) -> Floats:
-        """(n_tendons,) change of each wire's length [m] for a tip that is measured at `tip` (3,), base frame [m], nan where it is not, at
-        the path's time `t` [s]. Raises `InputError` on a tip that is not one and on a time that runs back."""
+        """(n_tendons,) change of each wire's length [m] for a tip that is measured at `tip` (3,), base frame
+        [m], nan where it is not, at the path's time `t` [s]. Raises `InputError` on a tip that is not one and
+        on a time that runs back."""
         try:
             seen = np.array(tip, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise InputError(f"tip is {tip!r}; give three numbers, base frame [m].") from error
         if seen.shape != (3,) or np.isinf(seen).any():
-            raise InputError(f"tip is {tip!r}; give three numbers, base frame [m], nan where it was not measured.")
+            raise InputError(
+                f"tip is {tip!r}; give three numbers, base frame [m], nan where it was not measured."
+            )
         if not math.isfinite(t):
             raise InputError(f"t is {t!r} s; give a finite time.")
         if self._step < 0:
             self._began = float(t)
         step = math.floor((t - self._began) / DT + _EARLY)
         if step < self._step:
-            raise InputError(f"t is {t:g} s, before the step at {self._began + self._step * DT:g} s; a pilot's time does not run back.")
+            raise InputError(
+                f"t is {t:g} s, before the step at {self._began + self._step * DT:g} s; a "
+                "pilot's time does not run back."
+            )
         if step > self._step:
             self._step = step
             self._advance(seen, float(t))
@@ -129,8 +159,12 @@ class TrackPilot:
             self._sight.note(self._action, wanted, tip)
         posture = (2.0 * self._displacement - self._low - self._high) / (self._high - self._low)
         state = self._sight.state(coming(lambda ahead: self._along(t + ahead)), tip, posture)
-        self._action = np.clip(self._policy.act(np.clip(state.astype(np.float32), self._least, self._largest)), -1.0, 1.0)
-        self._displacement = np.clip(self._displacement + DT * np.array(RATE) * self._action, self._low, self._high)
+        self._action = np.clip(
+            self._policy.act(np.clip(state.astype(np.float32), self._least, self._largest)), -1.0, 1.0
+        )
+        self._displacement = np.clip(
+            self._displacement + DT * np.array(RATE) * self._action, self._low, self._high
+        )
 
     def _along(self, t: float) -> Floats:
         """(1, 3) the path at a time [s]."""

@@ -21,21 +21,29 @@ SHIPPED = "shipped"
 def shipped() -> tuple[str, ...]:
     """Names of the tasks whose trained policy comes with the package."""
     folder = files("fastrod_envs") / "trained"
-    return tuple(sorted(entry.name for entry in folder.iterdir() if (entry / ACTOR).is_file())) if folder.is_dir() else ()
+    return (
+        tuple(sorted(entry.name for entry in folder.iterdir() if (entry / ACTOR).is_file()))
+        if folder.is_dir()
+        else ()
+    )
 
 
 def find(env: str, given: str) -> Path:
-    """The folder of a policy: one that `fastrod train` wrote (or a policy.zip in it), or `shipped` for the one that comes with the package.
-    Raises `InputError`."""
+    """The folder of a policy: one that `fastrod train` wrote (or a policy.zip in it), or `shipped` for the
+    one that comes with the package. Raises `InputError`."""
     path = Path(given)
     if given == SHIPPED:
         name = name_of(env)
         if name not in shipped():
-            raise InputError(f"no policy is shipped for {env!r}; there are those of {', '.join(shipped()) or 'none'}.")
+            raise InputError(
+                f"no policy is shipped for {env!r}; there are those of {', '.join(shipped()) or 'none'}."
+            )
         return Path(str(files("fastrod_envs") / "trained" / name))
     folder = path.parent if path.suffix == ".zip" else path
     if not (folder / CONFIG).is_file():
-        raise InputError(f"{given!r} holds no policy; give the folder that `fastrod train` wrote, or 'shipped'.")
+        raise InputError(
+            f"{given!r} holds no policy; give the folder that `fastrod train` wrote, or 'shipped'."
+        )
     return folder
 
 
@@ -46,8 +54,8 @@ class Policy:
     def __init__(self, folder: Path, *, trust: bool = False) -> None:
         """Read actor.npz, which a training has from its first checkpoint on.
 
-        A folder that has a file of stable-baselines3 in its place is read with `trust` alone, as that runs code of
-        whoever made it. Raises `InputError` where the folder holds neither.
+        A folder that has a file of stable-baselines3 in its place is read with `trust` alone, as that runs
+        code of whoever made it. Raises `InputError` where the folder holds neither.
         """
         self.plan: Plan = read_config(folder)[0]
         if (folder / ACTOR).is_file():
@@ -60,12 +68,18 @@ class Policy:
         try:
             self._actor = actor_of(model)
         except Exception as error:  # of a network that is built otherwise
-            raise InputError(f"the network in {str(path)!r} is not built as `fastrod train` builds one: {error!r}.") from error
+            raise InputError(
+                f"the network in {str(path)!r} is not built as `fastrod train` builds one: {error!r}."
+            ) from error
 
     @property
     def options(self) -> dict[str, Any]:
         """Options of the environment on which its observations and actions depend."""
-        return {name: self.plan.options[name] for name in ("observation", "action", "n_steps", "grip") if name in self.plan.options}
+        return {
+            name: self.plan.options[name]
+            for name in ("observation", "action", "n_steps", "grip")
+            if name in self.plan.options
+        }
 
     def check(self, env: BatchEnv) -> None:
         """Raises `InputError` where the policy was trained for other observations or actions."""
@@ -73,7 +87,8 @@ class Policy:
         given = env.single_observation_space.shape, env.single_action_space.shape
         if given != ((n_obs,), (n_actions,)):
             raise InputError(
-                f"the policy was trained on {self.plan.env} with {n_obs} observations and {n_actions} actions; here they are "
+                f"the policy was trained on {self.plan.env} with {n_obs} observations and {n_actions} "
+                "actions; here they are "
                 f"{given[0]} and {given[1]}."
             )
 

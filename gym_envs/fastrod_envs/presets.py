@@ -1,4 +1,5 @@
-"""How each task is trained unless the command says otherwise: algorithm, batch, steps, and the options of its environments."""
+"""How each task is trained unless the command says otherwise: algorithm, batch, steps, and the options of its
+environments."""
 
 from __future__ import annotations
 
@@ -33,10 +34,15 @@ class Preset:
 
 
 _ROBOTS: Mapping[str, Any] = {
-    "backlash.half_width": (0.0, 4e-4), "friction.half_width": (0.0, 3e-4), "drum_gain.gain": (-0.1, 0.1), "latency.delay": (0.0, 0.1),
-    "gravity.line_density": (0.0, 0.3), "creep.share": (0.0, 0.1), "tendon_stretch.compliance": (0.0, 5e-4),
+    "backlash.half_width": (0.0, 4e-4),
+    "friction.half_width": (0.0, 3e-4),
+    "drum_gain.gain": (-0.1, 0.1),
+    "latency.delay": (0.0, 0.1),
+    "gravity.line_density": (0.0, 0.3),
+    "creep.share": (0.0, 0.1),
+    "tendon_stretch.compliance": (0.0, 5e-4),
     "stiffening.cubic": (-0.1, 0.1),
-}  # fmt: skip
+}
 """Effects of a prototype that may be: what Track is trained on."""
 
 _PRESETS: Mapping[str, Preset] = {
@@ -49,21 +55,31 @@ _PRESETS: Mapping[str, Preset] = {
     "BoxExplore": Preset(n_envs=8, steps=0, imitate=12_000),
     "PickPlace": Preset(n_envs=8, steps=0, imitate=40_000),
     "DualArm": Preset(n_envs=8, steps=0, imitate=12_000),
-    "Track": Preset(n_envs=128, steps=1_000_000, imitate=100_000, options={"reward": "precise", "randomise": {**_ROBOTS, "absent": 0.4}}),
+    "Track": Preset(
+        n_envs=128,
+        steps=1_000_000,
+        imitate=100_000,
+        options={"reward": "precise", "randomise": {**_ROBOTS, "absent": 0.4}},
+    ),
 }
 
 
 def preset_of(env: str) -> Preset:
-    """The preset of a task by its name or id; tasks without one of their own have the general one. Raises `UnknownNameError`."""
+    """The preset of a task by its name or id; tasks without one of their own have the general one. Raises
+    `UnknownNameError`."""
     return _PRESETS.get(name_of(env), Preset())
 
 
-def settings_of(algorithm: str, n_envs: int, n_steps: int, steps: int, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Keyword arguments of stable-baselines3's class: the paper's network, learning rate and discount, and numbers that use the batch.
+def settings_of(
+    algorithm: str, n_envs: int, n_steps: int, steps: int, given: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Keyword arguments of stable-baselines3's class: the paper's network, learning rate and discount, and
+    numbers that use the batch.
 
-    PPO learns from whole episodes of the batch, in ten or more minibatches. SAC and TD3 take one gradient step for 16 environment
-    steps, on large minibatches: the learner, not the simulator, is what takes time. Raises `UnknownNameError` for an algorithm or a
-    setting that is not there, `InputError` for a setting that cannot be.
+    PPO learns from whole episodes of the batch, in ten or more minibatches. SAC and TD3 take one gradient
+    step for 16 environment steps, on large minibatches: the learner, not the simulator, is what takes time.
+    Raises `UnknownNameError` for an algorithm or a setting that is not there, `InputError` for a setting that
+    cannot be.
     """
     if algorithm not in ALGORITHMS:
         raise UnknownNameError(f"no algorithm {algorithm!r}; {nearest(algorithm, ALGORITHMS)}")
@@ -72,53 +88,96 @@ def settings_of(algorithm: str, n_envs: int, n_steps: int, steps: int, given: Ma
     if algorithm == "ppo":
         rollout = int(given.get("n_steps", min(max(n_steps, 4096 // n_envs), max(steps // n_envs, 2))))
         batch = _divisor(n_envs * rollout, min(4096, n_envs * rollout // 8))
-        own = {"n_steps": rollout, "batch_size": batch, "n_epochs": 8, "gae_lambda": 0.95, "clip_range": 0.2, "ent_coef": 0.0}
+        own = {
+            "n_steps": rollout,
+            "batch_size": batch,
+            "n_epochs": 8,
+            "gae_lambda": 0.95,
+            "clip_range": 0.2,
+            "ent_coef": 0.0,
+        }
     else:
         own = {
-            "batch_size": 1024, "buffer_size": 1_000_000, "train_freq": 1, "gradient_steps": max(1, n_envs // 16),
-            "learning_starts": max(10 * n_envs, 1000), "tau": 0.005,
-        }  # fmt: skip
+            "batch_size": 1024,
+            "buffer_size": 1_000_000,
+            "train_freq": 1,
+            "gradient_steps": max(1, n_envs // 16),
+            "learning_starts": max(10 * n_envs, 1000),
+            "tau": 0.005,
+        }
     return {**common, **own, **given}
 
 
 _Range = tuple[type, float, float]
 _COMMON: Mapping[str, _Range] = {
-    "learning_rate": (float, 0.0, 1.0), "gamma": (float, 0.0, 1.0), "batch_size": (int, 1, 1e8), "stats_window_size": (int, 1, 1e6),
-}  # fmt: skip
+    "learning_rate": (float, 0.0, 1.0),
+    "gamma": (float, 0.0, 1.0),
+    "batch_size": (int, 1, 1e8),
+    "stats_window_size": (int, 1, 1e6),
+}
 _EXPLORING: Mapping[str, _Range] = {"use_sde": (bool, 0, 1), "sde_sample_freq": (int, -1, 1e9)}
 _OFF_POLICY: Mapping[str, _Range] = {
-    "buffer_size": (int, 1, 1e9), "learning_starts": (int, 0, 1e12), "tau": (float, 0.0, 1.0), "train_freq": (int, 1, 1e9),
-    "gradient_steps": (int, -1, 1e6), "n_steps": (int, 1, 1e4), "optimize_memory_usage": (bool, 0, 1),
-}  # fmt: skip
+    "buffer_size": (int, 1, 1e9),
+    "learning_starts": (int, 0, 1e12),
+    "tau": (float, 0.0, 1.0),
+    "train_freq": (int, 1, 1e9),
+    "gradient_steps": (int, -1, 1e6),
+    "n_steps": (int, 1, 1e4),
+    "optimize_memory_usage": (bool, 0, 1),
+}
 _SETTINGS: Mapping[str, Mapping[str, _Range]] = {
     "ppo": {
-        **_COMMON, **_EXPLORING, "n_steps": (int, 2, 1e6), "batch_size": (int, 2, 1e8), "n_epochs": (int, 1, 1e4),
-        "gae_lambda": (float, 0.0, 1.0), "clip_range": (float, 1e-9, 1e3),
-        "clip_range_vf": (float, 1e-9, 1e9), "normalize_advantage": (bool, 0, 1), "ent_coef": (float, 0.0, 1e3),
-        "vf_coef": (float, 0.0, 1e3), "max_grad_norm": (float, 1e-9, 1e9), "target_kl": (float, 1e-9, 1e9),
+        **_COMMON,
+        **_EXPLORING,
+        "n_steps": (int, 2, 1e6),
+        "batch_size": (int, 2, 1e8),
+        "n_epochs": (int, 1, 1e4),
+        "gae_lambda": (float, 0.0, 1.0),
+        "clip_range": (float, 1e-9, 1e3),
+        "clip_range_vf": (float, 1e-9, 1e9),
+        "normalize_advantage": (bool, 0, 1),
+        "ent_coef": (float, 0.0, 1e3),
+        "vf_coef": (float, 0.0, 1e3),
+        "max_grad_norm": (float, 1e-9, 1e9),
+        "target_kl": (float, 1e-9, 1e9),
     },
     "sac": {
-        **_COMMON, **_EXPLORING, **_OFF_POLICY, "ent_coef": (float, 0.0, 1e3), "target_update_interval": (int, 1, 1e9),
-        "target_entropy": (float, -1e6, 1e6), "use_sde_at_warmup": (bool, 0, 1),
+        **_COMMON,
+        **_EXPLORING,
+        **_OFF_POLICY,
+        "ent_coef": (float, 0.0, 1e3),
+        "target_update_interval": (int, 1, 1e9),
+        "target_entropy": (float, -1e6, 1e6),
+        "use_sde_at_warmup": (bool, 0, 1),
     },
     "td3": {
-        **_COMMON, **_OFF_POLICY, "policy_delay": (int, 1, 1e6), "target_policy_noise": (float, 0.0, 1e3),
+        **_COMMON,
+        **_OFF_POLICY,
+        "policy_delay": (int, 1, 1e6),
+        "target_policy_noise": (float, 0.0, 1e3),
         "target_noise_clip": (float, 0.0, 1e3),
     },
-}  # fmt: skip
-"""Settings of each algorithm of stable-baselines3 that a command line can give: kind, least and largest value; 0 is no learning rate."""
+}
+"""Settings of each algorithm of stable-baselines3 that a command line can give: kind, least and largest
+value; 0 is no learning rate."""
 _WORDS: Mapping[str, str] = {"ent_coef": "auto", "target_entropy": "auto"}
 """Of SAC: a word that is as good as a number."""
 _NONE = ("clip_range_vf", "target_kl")
 _SYNONYMS: Mapping[str, str] = {
-    "lr": "learning_rate", "discount": "gamma", "epochs": "n_epochs", "minibatch": "batch_size", "rollout": "n_steps",
-    "lambda": "gae_lambda", "entropy": "ent_coef",
-}  # fmt: skip
+    "lr": "learning_rate",
+    "discount": "gamma",
+    "epochs": "n_epochs",
+    "minibatch": "batch_size",
+    "rollout": "n_steps",
+    "lambda": "gae_lambda",
+    "entropy": "ent_coef",
+}
 """What other libraries call them."""
 
 
 def _check_settings(algorithm: str, given: Mapping[str, Any]) -> None:
-    """Raises `UnknownNameError` for a setting that the algorithm does not take, `InputError` for a value that it cannot have."""
+    """Raises `UnknownNameError` for a setting that the algorithm does not take, `InputError` for a value that
+    it cannot have."""
     known = _SETTINGS[algorithm]
     for name, value in given.items():
         if name == "policy_kwargs" and isinstance(value, Mapping):
@@ -130,11 +189,21 @@ def _check_settings(algorithm: str, given: Mapping[str, Any]) -> None:
         if (algorithm == "sac" and _is_word(name, value)) or (value is None and name in _NONE):
             continue
         kind, least, most = known[name]
-        right = isinstance(value, bool) if kind is bool else isinstance(value, (int, kind)) and not isinstance(value, bool)
+        right = (
+            isinstance(value, bool)
+            if kind is bool
+            else isinstance(value, (int, kind)) and not isinstance(value, bool)
+        )
         if not right or not least <= value <= most or (name == "learning_rate" and value == 0.0):
-            what = {bool: "true or false", int: f"a whole number from {least:g} to {most:g}", float: f"a number from {least:g} to {most:g}"}
+            what = {
+                bool: "true or false",
+                int: f"a whole number from {least:g} to {most:g}",
+                float: f"a number from {least:g} to {most:g}",
+            }
             above = ", above 0" if name == "learning_rate" else ""
-            raise InputError(f"setting {name!r} of {algorithm} is {shown(value)}; it must be {what[kind]}{above}.")
+            raise InputError(
+                f"setting {name!r} of {algorithm} is {shown(value)}; it must be {what[kind]}{above}."
+            )
 
 
 def _is_word(name: str, value: object) -> bool:
@@ -143,9 +212,17 @@ def _is_word(name: str, value: object) -> bool:
     if word is None or not isinstance(value, str):
         return False
     head, _, start = value.partition("_")
-    return value == word or (name == "ent_coef" and head == word and re.fullmatch(r"\d*\.?\d+", start) is not None and float(start) > 0.0)
+    return value == word or (
+        name == "ent_coef"
+        and head == word
+        and re.fullmatch(r"\d*\.?\d+", start) is not None
+        and float(start) > 0.0
+    )
 
 
 def _divisor(total: int, most: int) -> int:
     """The largest divisor of `total` up to `most`: minibatches of one size."""
-    return max((d for k in range(1, int(total**0.5) + 1) if total % k == 0 for d in (k, total // k) if d <= most), default=total)
+    return max(
+        (d for k in range(1, int(total**0.5) + 1) if total % k == 0 for d in (k, total // k) if d <= most),
+        default=total,
+    )

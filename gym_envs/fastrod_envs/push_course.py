@@ -20,7 +20,8 @@ class PushOptions(Options):
     """Of Push and QuadrupedPush."""
 
     feels: bool = True
-    """What the cube exerts on the bar bends the robot in its next step; False: the bar moves as if nothing were there."""
+    """What the cube exerts on the bar bends the robot in its next step; False: the bar moves as if nothing
+    were there."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -57,7 +58,8 @@ class Course:
 
     @property
     def height(self) -> float:
-        """At which the bar pushes: little above half the cube's, so that it clears the floor where it is tilted [m]."""
+        """At which the bar pushes: little above half the cube's, so that it clears the floor where it is
+        tilted [m]."""
         return 0.5 * self.size + 0.005
 
     @property
@@ -109,12 +111,20 @@ class Drive:
         for _ in range(30):
             at = simulator.settle(**self.inputs(q)).tip_position[0]
             off = tip - at
-            q = np.clip(q + np.linalg.solve(self.jacobian(simulator), np.clip(off, -0.05, 0.05)), self.low, self.high)
+            q = np.clip(
+                q + np.linalg.solve(self.jacobian(simulator), np.clip(off, -0.05, 0.05)), self.low, self.high
+            )
         if np.abs(off).max() > 1e-4:
-            raise InputError(f"robot {simulator.robots[0].name!r} does not reach {tip.round(3).tolist()} m, where its tip is to begin.")
+            raise InputError(
+                f"robot {simulator.robots[0].name!r} does not reach {tip.round(3).tolist()} m, "
+                "where its tip is to begin."
+            )
         return q
 
 
 def longer(robot: Robot, length: float, extension: tuple[float, float]) -> Robot:
     """A robot whose segments have this length and extension [m]."""
-    return replace(robot, segments=tuple(replace(segment, length=length, extension=extension) for segment in robot.segments))
+    return replace(
+        robot,
+        segments=tuple(replace(segment, length=length, extension=extension) for segment in robot.segments),
+    )

@@ -43,7 +43,8 @@ _AROUND = 0.15  # m, the longest vector to the cube
 _AWAY = 0.6  # m, no cube is pushed farther
 _SHIFT, _TURN = 0.01, 0.1  # m and rad, the most by which the cube begins elsewhere
 _MOST = 1.0  # N that a robot feels: a bar that jams the cube against the floor would exert any force
-_RELAXATION = 0.3  # s, in which a robot answers what it feels: it has no mass, and would swing with what it pushes
+# s, in which a robot answers what it feels: it has no mass, and would swing with what it pushes
+_RELAXATION = 0.3
 _AT_REST = 1e-5  # m, residual of a robot that counts as at rest
 _PASSES = 8
 _CLEAR = 0.002  # m, of the bar above the floor
@@ -53,17 +54,28 @@ _ROD, _BAR, _CUBE, _GOAL = (0.9, 0.55, 0.15), (0.35, 0.35, 0.38), (0.2, 0.45, 0.
 
 @final
 class PushCell(Cell):
-    """A cube on a floor, a soft robot with a bar at its tip on a base that stands still, and a goal. The world is built anew for every
-    episode: nothing is left of the one before."""
+    """A cube on a floor, a soft robot with a bar at its tip on a base that stands still, and a goal. The
+    world is built anew for every episode: nothing is left of the one before."""
 
-    def __init__(self, course: Course, robot: Robot, options: PushOptions, duration: float, backdrop: Callable[[], Bullet]) -> None:
-        """`robot` before it is randomised; `duration` of an environment step [s]; `backdrop` makes the world for pictures."""
+    def __init__(
+        self,
+        course: Course,
+        robot: Robot,
+        options: PushOptions,
+        duration: float,
+        backdrop: Callable[[], Bullet],
+    ) -> None:
+        """`robot` before it is randomised; `duration` of an environment step [s]; `backdrop` makes the world
+        for pictures."""
         self.course, self.options, self._backdrop = course, options, backdrop
         self._n = max(1, math.ceil(duration / _STEP - 1e-9))
         self._dt = duration / self._n
         self.drive = Drive(robot, course.bend)
         self._own = self._simulator(robot)
-        self.home = self.drive.reach(self._own, np.array([course.place[0] - course.behind - course.gap, course.place[1], course.height]))
+        self.home = self.drive.reach(
+            self._own,
+            np.array([course.place[0] - course.behind - course.gap, course.place[1], course.height]),
+        )
         """(3,) of `Drive` at the start of an episode."""
         self._own.reset()
         self._own.settle(**self.drive.inputs(self.home), **_load(np.zeros(6)), tolerance=_AT_REST)
@@ -79,13 +91,15 @@ class PushCell(Cell):
         self.desired: Floats = np.zeros(2)
         """(2,) goal of the cube, world [m]."""
         self.felt: Floats = np.zeros(6)
-        """Force of the cube on the bar [N] and its moment about the tip [N m], world: as the robot answers it, with a delay."""
+        """Force of the cube on the bar [N] and its moment about the tip [N m], world: as the robot answers
+        it, with a delay."""
         self.touched = False
         """The robot met the cube in this episode."""
 
     def begin(self, draws: Floats, difficulty: float, robot: Robot | None) -> None:
-        """`draws` (5,): the goal's x and y, the cube's shift in x and y, its turn. With `difficulty` 0 the goal is in the middle of the
-        course's rectangle. Raises `HostError` where a randomised robot does not come to rest."""
+        """`draws` (5,): the goal's x and y, the cube's shift in x and y, its turn. With `difficulty` 0 the
+        goal is in the middle of the course's rectangle. Raises `HostError` where a randomised robot does not
+        come to rest."""
         course = self.course
         least, largest = np.array(course.least), np.array(course.largest)
         self.desired = 0.5 * (least + largest) + difficulty * (draws[:2] - 0.5) * (largest - least)
@@ -96,23 +110,29 @@ class PushCell(Cell):
         else:
             self.simulator = self._simulator(robot)
             self._settled(passes=0)
-        self._build(np.array(course.place) + _SHIFT * (2.0 * draws[2:4] - 1.0), _TURN * (2.0 * draws[4] - 1.0))
+        self._build(
+            np.array(course.place) + _SHIFT * (2.0 * draws[2:4] - 1.0), _TURN * (2.0 * draws[4] - 1.0)
+        )
 
     def act(self, action: Floats, duration: float) -> None:
-        """Move the numbers of `Drive` by their rates, or toward their places no faster than these, within their ranges and with the bar
-        off the floor: in equal parts of at most 0.1 s, at rest in each. Raises `HostError` where the rod is lost."""
+        """Move the numbers of `Drive` by their rates, or toward their places no faster than these, within
+        their ranges and with the bar off the floor: in equal parts of at most 0.1 s, at rest in each. Raises
+        `HostError` where the rod is lost."""
         drive = self.drive
         if self.options.action == "rate":
             there = self.q + duration * drive.rate * action
         else:
-            there = self.q + np.clip(drive.placed(action) - self.q, -duration * drive.rate, duration * drive.rate)
+            there = self.q + np.clip(
+                drive.placed(action) - self.q, -duration * drive.rate, duration * drive.rate
+            )
         there = np.clip(there, drive.low, drive.high)
         for left in range(self._n, 0, -1):
             self.q = self._clear(self.q + (there - self.q) / left)
             self._move(self._settled())
 
     def result(self) -> Result:
-        """`distance` is from the cube's middle to its goal in the plane [m]; terms exp(-k d^2), and 0.5 once the cube was touched."""
+        """`distance` is from the cube's middle to its goal in the plane [m]; terms exp(-k d^2), and 0.5 once
+        the cube was touched."""
         position = self._cube()[0]
         desired = np.array([*self.desired, 0.5 * self.course.size])
         d = float(np.hypot(*(position - desired)[:2]))
@@ -126,7 +146,17 @@ class PushCell(Cell):
         cube, tip = position[:2], self.tip
         to_goal, to_cube = _at_most(self.desired - cube, _NEAR), _at_most(cube - tip[:2], _AROUND)
         return np.array(
-            [*self.desired, *cube, math.cos(turn), math.sin(turn), *tip, *to_goal, *to_cube, *self.drive.posture(self.q), self.touched]
+            [
+                *self.desired,
+                *cube,
+                math.cos(turn),
+                math.sin(turn),
+                *tip,
+                *to_goal,
+                *to_cube,
+                *self.drive.posture(self.q),
+                self.touched,
+            ]
         )
 
     def goal(self) -> Floats:
@@ -134,10 +164,13 @@ class PushCell(Cell):
         return self.desired
 
     def baseline(self) -> Floats:
-        """(3,) straight along the way that the cube has to go, slower when near; the cube stays on the bar, which keeps its height."""
+        """(3,) straight along the way that the cube has to go, slower when near; the cube stays on the bar,
+        which keeps its height."""
         drive, way = self.drive, self.desired - self._cube()[0][:2]
         d = float(np.hypot(*way))
-        velocity = np.array([*(way * min(SPEED / max(d, 1e-9), 1.0 / TIME)), (self.course.height - self.tip[2]) / TIME])
+        velocity = np.array(
+            [*(way * min(SPEED / max(d, 1e-9), 1.0 / TIME)), (self.course.height - self.tip[2]) / TIME]
+        )
         jacobian = drive.jacobian(self.simulator) * drive.rate
         rates = resolved(jacobian[None], velocity[None], np.zeros((1, 3)))[0]
         if self.options.action == "rate":
@@ -154,12 +187,16 @@ class PushCell(Cell):
         goal = np.array([*self.desired, 0.5 * self.course.size])
         eye, target = self._view()
         return Scenery(
-            tubes=(neck, bar), solids=(Solid(vertices, faces, _CUBE),),
-            balls=(Ball(goal, 0.012, _GOAL),), eye=eye, target=target,
-        )  # fmt: skip
+            tubes=(neck, bar),
+            solids=(Solid(vertices, faces, _CUBE),),
+            balls=(Ball(goal, 0.012, _GOAL),),
+            eye=eye,
+            target=target,
+        )
 
     def picture(self, width: int, height: int) -> np.ndarray:
-        """(height, width, 3) uint8, from the course's right, of a second world that is made for pictures when the first is asked for."""
+        """(height, width, 3) uint8, from the course's right, of a second world that is made for pictures when
+        the first is asked for."""
         course = self.course
         if self._studio is None:
             self._studio = self._backdrop()
@@ -167,8 +204,12 @@ class PushCell(Cell):
         tube, bar = _bodies(studio, course, self._own.robots[0])
         _place(course, self.simulator.state, tube, bar)
         turn = self.world.getBasePositionAndOrientation(self._cube_body)[1]
-        box = studio.createVisualShape(studio.GEOM_BOX, halfExtents=[0.5 * course.size] * 3, rgbaColor=[*_CUBE, 1.0])
-        disc = studio.createVisualShape(studio.GEOM_CYLINDER, radius=0.02, length=0.002, rgbaColor=[*_GOAL, 1.0])
+        box = studio.createVisualShape(
+            studio.GEOM_BOX, halfExtents=[0.5 * course.size] * 3, rgbaColor=[*_CUBE, 1.0]
+        )
+        disc = studio.createVisualShape(
+            studio.GEOM_CYLINDER, radius=0.02, length=0.002, rgbaColor=[*_GOAL, 1.0]
+        )
         shown = [
             studio.createMultiBody(0.0, -1, box, position.tolist(), turn),
             studio.createMultiBody(0.0, -1, disc, [*self.desired, 0.001]),
@@ -212,7 +253,9 @@ class PushCell(Cell):
         world.setTimeStep(self._dt / _WITHIN)
         world.setPhysicsEngineParameter(deterministicOverlappingPairs=1)
         half = [0.5 * course.size] * 3
-        ground = world.createMultiBody(0.0, world.createCollisionShape(world.GEOM_BOX, halfExtents=[5.0, 5.0, 0.5]), -1, [0.0, 0.0, -0.5])
+        ground = world.createMultiBody(
+            0.0, world.createCollisionShape(world.GEOM_BOX, halfExtents=[5.0, 5.0, 0.5]), -1, [0.0, 0.0, -0.5]
+        )
         box = world.createCollisionShape(world.GEOM_BOX, halfExtents=half)
         turned = [0.0, 0.0, math.sin(0.5 * turn), math.cos(0.5 * turn)]
         self._cube_body = int(world.createMultiBody(course.mass, box, -1, [*place, half[0]], turned))
@@ -231,7 +274,9 @@ class PushCell(Cell):
         for _ in range(_WITHIN):
             self.world.stepSimulation()
             for contact in self.world.getContactPoints(self._bar.ids[0], self._cube_body):
-                normal, size, first, along, second, across = (np.array(contact[k]) for k in (7, 9, 10, 11, 12, 13))
+                normal, size, first, along, second, across = (
+                    np.array(contact[k]) for k in (7, 9, 10, 11, 12, 13)
+                )
                 force = size * normal - first * along - second * across
                 total += np.concatenate([force, np.cross(np.array(contact[5]) - tip, force)])
         met = {body for contact in self.world.getContactPoints(self._cube_body) for body in contact[1:3]}
@@ -242,8 +287,8 @@ class PushCell(Cell):
         _place(self.course, state, self._tube, self._bar)
 
     def _settled(self, passes: int = _PASSES) -> State:
-        """The robot at rest under what it feels, or `HostError`. A few `passes` get there from the step before; not with effects, for
-        which each is a step in time."""
+        """The robot at rest under what it feels, or `HostError`. A few `passes` get there from the step
+        before; not with effects, for which each is a step in time."""
         inputs = {**self.drive.inputs(self.q), **_load(self.felt)}
         for _ in range(0 if self._own.robots[0].effects else passes):
             state = self.simulator.step(**inputs)
@@ -257,7 +302,11 @@ class PushCell(Cell):
 
     def _clear(self, q: Floats) -> Floats:
         """Numbers near these with which the bar does not enter the floor."""
-        lowest = self.course.thickness + 0.5 * self.course.width * abs(float(self.simulator.state.tip_rotation[0, 2, 1])) + _CLEAR
+        lowest = (
+            self.course.thickness
+            + 0.5 * self.course.width * abs(float(self.simulator.state.tip_rotation[0, 2, 1]))
+            + _CLEAR
+        )
         if self.tip[2] > lowest + _FASTEST * self._dt:
             return q
         rise = self.drive.jacobian(self.simulator)[2]
@@ -265,7 +314,9 @@ class PushCell(Cell):
         if lacks <= 0.0:
             return q
         by = self.drive.rate**2 * rise
-        return np.asarray(np.clip(q + lacks / max(float(rise @ by), 1e-12) * by, self.drive.low, self.drive.high))
+        return np.asarray(
+            np.clip(q + lacks / max(float(rise @ by), 1e-12) * by, self.drive.low, self.drive.high)
+        )
 
 
 class PushTask(HostedTask):
@@ -280,25 +331,41 @@ class PushTask(HostedTask):
     def __init__(self, n_envs: int, options: Options, course: Course) -> None:
         self.course = course
         drive = Drive(course.robot, course.bend)
-        low, high, what = (-drive.rate, drive.rate, "rate of the") if options.action == "rate" else (drive.low, drive.high, "")
+        low, high, what = (
+            (-drive.rate, drive.rate, "rate of the")
+            if options.action == "rate"
+            else (drive.low, drive.high, "")
+        )
         unit = "m/s" if options.action == "rate" else "m"
         names = "extension, displacements toward d1 and d2 of every segment alike"
         actions = (Field("displacement", unit, tuple(low), tuple(high), f"{what} {names}".strip()),)
-        foot, far, place = np.array(course.robot.base_position), 1.5 * course.robot.length, np.array(course.place)
+        foot, far, place = (
+            np.array(course.robot.base_position),
+            1.5 * course.robot.length,
+            np.array(course.place),
+        )
         goal = Field("goal", "m", course.least, course.largest, "where the cube is to be, x and y, world")
         states = (
             goal,
             Field("cube", "m", tuple(place - _AWAY), tuple(place + _AWAY), "its middle, x and y, world"),
             Field(
-                "turn",
-                "",
-                (-1.0,) * 2,
-                (1.0,) * 2,
-                "cosine and sine of four times the cube's angle about z",
+                "turn", "", (-1.0,) * 2, (1.0,) * 2, "cosine and sine of four times the cube's angle about z"
             ),
             Field("tip", "m", tuple(foot - far), tuple(foot + far), "of the robot, world"),
-            Field("error", "m", (-_NEAR,) * 2, (_NEAR,) * 2, f"from cube to goal, x and y, at most {_NEAR:g} m of it"),
-            Field("way", "m", (-_AROUND,) * 2, (_AROUND,) * 2, f"from tip to cube, x and y, at most {_AROUND:g} m of it"),
+            Field(
+                "error",
+                "m",
+                (-_NEAR,) * 2,
+                (_NEAR,) * 2,
+                f"from cube to goal, x and y, at most {_NEAR:g} m of it",
+            ),
+            Field(
+                "way",
+                "m",
+                (-_AROUND,) * 2,
+                (_AROUND,) * 2,
+                f"from tip to cube, x and y, at most {_AROUND:g} m of it",
+            ),
             Field("posture", "", (-1.0,) * 3, (1.0,) * 3, "displacements, from their least to their largest"),
             Field("touched", "", (0.0,), (1.0,), "the robot has touched the cube in this episode"),
         )
@@ -329,7 +396,9 @@ def _bodies(world: Bullet, course: Course, robot: Robot) -> tuple[RodBodies, Rod
 def _bar_nodes(course: Course, state: State) -> tuple[Floats, Floats]:
     """Ends (2, 3) of the bar and the tip's rotation at both (2, 3, 3)."""
     tip, rotation = state.tip_position[0], state.tip_rotation[0]
-    return tip + 0.5 * course.width * np.array([-rotation[:, 1], rotation[:, 1]]), np.array([rotation, rotation])
+    return tip + 0.5 * course.width * np.array([-rotation[:, 1], rotation[:, 1]]), np.array(
+        [rotation, rotation]
+    )
 
 
 def _place(course: Course, state: State, tube: RodBodies, bar: RodBodies) -> None:

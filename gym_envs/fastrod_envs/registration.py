@@ -23,16 +23,31 @@ _TASKS: Mapping[str, str] = {
     "Track": "fastrod_envs.tasks.track:Track",
 }
 N_STEPS: Mapping[str, int] = {
-    "BoxExplore": 40, "Catch": 40, "DualArm": 40, "PickPlace": 60, "Push": 40, "QuadrupedPush": 40, "Reach": 40, "TubeInsert": 50,
-    "ReachObstacle": 40, "Track": 200,
-}  # fmt: skip
-"""`n_steps` of each task's class, for Gymnasium: the tasks themselves, which import numba, are imported when one is made."""
+    "BoxExplore": 40,
+    "Catch": 40,
+    "DualArm": 40,
+    "PickPlace": 60,
+    "Push": 40,
+    "QuadrupedPush": 40,
+    "Reach": 40,
+    "TubeInsert": 50,
+    "ReachObstacle": 40,
+    "Track": 200,
+}
+"""`n_steps` of each task's class, for Gymnasium: the tasks themselves, which import numba, are imported when
+one is made."""
 SOLVED: Mapping[str, float] = {
-    "BoxExplore": 34.0, "Catch": 5.0, "PickPlace": 67.0, "Push": 49.0, "QuadrupedPush": 43.0, "Reach": 31.0, "ReachObstacle": 31.0,
+    "BoxExplore": 34.0,
+    "Catch": 5.0,
+    "PickPlace": 67.0,
+    "Push": 49.0,
+    "QuadrupedPush": 43.0,
+    "Reach": 31.0,
+    "ReachObstacle": 31.0,
     "Track": 196.0,
-}  # fmt: skip
-"""Mean return from which a task counts as solved, for Gymnasium: nine tenths of the way from a robot at rest to the shipped policy, with
-the task's own options (100 episodes from seed 100, of hosted tasks 4)."""
+}
+"""Mean return from which a task counts as solved, for Gymnasium: nine tenths of the way from a robot at rest
+to the shipped policy, with the task's own options (100 episodes from seed 100, of hosted tasks 4)."""
 NAMESPACE = "fastrod"
 VERSION = "v0"
 
@@ -75,9 +90,13 @@ def register_all() -> None:
     for name, id_ in zip(names(), ids(), strict=True):
         if id_ not in registry:
             register(
-                id=id_, entry_point="fastrod_envs.single:SingleEnv", vector_entry_point="fastrod_envs.vector:BatchEnv",
-                kwargs={"task": name}, max_episode_steps=N_STEPS[name], reward_threshold=SOLVED.get(name),
-            )  # fmt: skip
+                id=id_,
+                entry_point="fastrod_envs.single:SingleEnv",
+                vector_entry_point="fastrod_envs.vector:BatchEnv",
+                kwargs={"task": name},
+                max_episode_steps=N_STEPS[name],
+                reward_threshold=SOLVED.get(name),
+            )
 
 
 __all__ = ["Options", "ids", "make_task", "name_of", "names", "register_all", "task_class"]

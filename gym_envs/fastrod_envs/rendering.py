@@ -28,8 +28,9 @@ class Renderer:
         self._page: Page | None = None
 
     def render(self, task: Task) -> tuple[np.ndarray, ...] | None:
-        """With rgb_array a picture (360, 480, 3) uint8 of every environment: N of them cost N times 15 to 40 ms. With viser the page shows
-        the first 16 now, and None is returned, as it is without a mode. Raises `InputError` where viser is missing, or no port is free."""
+        """With rgb_array a picture (360, 480, 3) uint8 of every environment: N of them cost N times 15 to 40
+        ms. With viser the page shows the first 16 now, and None is returned, as it is without a mode. Raises
+        `InputError` where viser is missing, or no port is free."""
         if self._mode == "rgb_array":
             return tuple(_picture(task, i) for i in range(task.n_envs))
         if self._mode == "viser":

@@ -22,10 +22,11 @@ _FAR = 2.0  # of the robot's length: no tip is farther from its base
 
 
 class RodTask(Task):
-    """Robots driven by the displacements of their segments (`SegmentActions`): all at home when an episode begins.
+    """Robots driven by the displacements of their segments (`SegmentActions`): all at home when an episode
+    begins.
 
-    `action="rate"`: an action is the displacements' rate, as a part of the largest; one observer pass a step. `"displacement"`: it is
-    where they go, at once, from the least to the largest, and the rod settles there.
+    `action="rate"`: an action is the displacements' rate, as a part of the largest; one observer pass a step.
+    `"displacement"`: it is where they go, at once, from the least to the largest, and the rod settles there.
     """
 
     points_per_segment: ClassVar[int]
@@ -37,11 +38,21 @@ class RodTask(Task):
     on_gpu: ClassVar[bool] = True
 
     def __init__(
-        self, n_envs: int, options: Options, robot: Robot, *, driven: ArrayLike, limit: ArrayLike, rate: ArrayLike,
-        home: ArrayLike | None = None, contact: ContactScene | None = None, feel_contact: bool = True,
-    ) -> None:  # fmt: skip
-        """`driven` are the driven numbers among the robot's 3 n_segments, `limit` (n_driven, 2) their range [m], `rate` (n_driven,) [m/s]
-        their largest rate, `home` (n_driven,) where they begin [m]. `contact` and `feel_contact` as in `Simulator`."""
+        self,
+        n_envs: int,
+        options: Options,
+        robot: Robot,
+        *,
+        driven: ArrayLike,
+        limit: ArrayLike,
+        rate: ArrayLike,
+        home: ArrayLike | None = None,
+        contact: ContactScene | None = None,
+        feel_contact: bool = True,
+    ) -> None:
+        """`driven` are the driven numbers among the robot's 3 n_segments, `limit` (n_driven, 2) their range
+        [m], `rate` (n_driven,) [m/s] their largest rate, `home` (n_driven,) where they begin [m]. `contact`
+        and `feel_contact` as in `Simulator`."""
         super().__init__(n_envs, options)
         self._random = Randomisation.of(options.randomise)
         self.base_robot = robot if self._random is None else self._random.base(robot)
@@ -60,15 +71,26 @@ class RodTask(Task):
         names = ", ".join(f"{k // 3 + 1}{'eab'[k % 3]}" for k in self.driven)
         self.actions = (
             Field(
-                "displacement", unit, tuple(reach[0]), tuple(reach[1]), f"{about} ({names}: segment, and e extension, a, b toward d1, d2)"
+                "displacement",
+                unit,
+                tuple(reach[0]),
+                tuple(reach[1]),
+                f"{about} ({names}: segment, and e extension, a, b toward d1, d2)",
             ),
         )
         robots = [self.base_robot] * n_envs if self._varies else [self.base_robot]
         self.simulator = Simulator(
-            robots if self._varies else self.base_robot, n_robots=n_envs, dt=self.dt, points_per_segment=self.points_per_segment,
-            outputs=self.outputs, threads=options.threads, contact=contact, hold_gain=self.hold_gain,
-            feel_contact=feel_contact, device=options.device,
-        )  # fmt: skip
+            robots if self._varies else self.base_robot,
+            n_robots=n_envs,
+            dt=self.dt,
+            points_per_segment=self.points_per_segment,
+            outputs=self.outputs,
+            threads=options.threads,
+            contact=contact,
+            hold_gain=self.hold_gain,
+            feel_contact=feel_contact,
+            device=options.device,
+        )
         self._turn = matrix_from_quaternion(np.array([self.base_robot.base_quaternion]))[0]
         self._foot = np.array(self.base_robot.base_position)
         self.displacement: Floats = np.tile(self.home, (n_envs, 1))
@@ -93,19 +115,25 @@ class RodTask(Task):
     def start(self, rows: Ints, draws: Floats) -> None:
         """Put these robots at home, made anew where they are randomised; `draws` as in `begin`."""
         self.displacement[rows] = self.home
-        self.tip[rows], self.direction[rows] = self._home_tip, self._home_direction  # of one that is lost from the start
+        # of one that is lost from the start
+        self.tip[rows], self.direction[rows] = self._home_tip, self._home_direction
         if self._varies and self._random is not None:
             self.simulator.replace(rows, self._random.draw(self.base_robot, draws[:, self.n_draws :]))
             state = self.simulator.settle(**self._inputs(), rows=rows)
         else:
             self.simulator.restore(self._home, rows)
-            state = self.simulator.settle(**self._inputs(), rows=rows) if self.loaded else self.simulator.state
+            state = (
+                self.simulator.settle(**self._inputs(), rows=rows) if self.loaded else self.simulator.state
+            )
         self._keep(state.tip_position, state.tip_rotation[:, :, 2], state.ok, rows)
 
     def act(self, action: Floats) -> None:
-        """Rates move the displacements within their range, in one step; displacements are settled to 1e-7 m. Then comes `moved`."""
+        """Rates move the displacements within their range, in one step; displacements are settled to 1e-7 m.
+        Then comes `moved`."""
         if self.options.action == "rate":
-            self.displacement = np.clip(self.displacement + self.dt * self._rate * action, self._low, self._high)
+            self.displacement = np.clip(
+                self.displacement + self.dt * self._rate * action, self._low, self._high
+            )
             state = self.simulator.step(**self._inputs())
         else:
             self.displacement = 0.5 * (self._low + self._high) + 0.5 * (self._high - self._low) * action
@@ -125,12 +153,15 @@ class RodTask(Task):
         if not self.base_robot.effects:
             return self.tip
         seen = self.simulator.measure().tip_position
-        p = self._foot + (seen[:, :1] * self._turn[:, 0] + seen[:, 1:2] * self._turn[:, 1] + seen[:, 2:] * self._turn[:, 2])
+        p = self._foot + (
+            seen[:, :1] * self._turn[:, 0] + seen[:, 1:2] * self._turn[:, 1] + seen[:, 2:] * self._turn[:, 2]
+        )
         return np.where(np.isfinite(p), p, self.tip)
 
     def toward(self, velocity: Floats, jacobian: Floats | None = None, weight: ArrayLike = 1.0) -> Floats:
-        """(n_envs, n_actions) the action that moves the tips with these velocities (n_envs, 3) [m/s]: damped resolved rates, with the
-        simulator's Jacobian or one of d(tip)/d(driven) (n_envs, 3, n_driven). Numbers with a smaller `weight` (n_driven,) move less."""
+        """(n_envs, n_actions) the action that moves the tips with these velocities (n_envs, 3) [m/s]: damped
+        resolved rates, with the simulator's Jacobian or one of d(tip)/d(driven) (n_envs, 3, n_driven).
+        Numbers with a smaller `weight` (n_driven,) move less."""
         if jacobian is None:
             jacobian = self.model().jacobian()[:, :3] @ self._actions.matrix[:, self.driven]
         scale = self._rate * np.asarray(weight)
@@ -141,14 +172,18 @@ class RodTask(Task):
         return np.asarray((2.0 * there - self._low - self._high) / (self._high - self._low))
 
     def model(self) -> Simulator:
-        """The simulator, or where effects act a model without them, at rest on the same commands: within a backlash nothing answers, and
-        a Jacobian that says so would stay there."""
+        """The simulator, or where effects act a model without them, at rest on the same commands: within a
+        backlash nothing answers, and a Jacobian that says so would stay there."""
         if not self.base_robot.effects:
             return self.simulator
         if self._model is None:
             plain = replace(self.base_robot, effects=())
             self._model = Simulator(
-                plain, n_robots=self.n_envs, points_per_segment=self.points_per_segment, outputs="tip", device=self.options.device
+                plain,
+                n_robots=self.n_envs,
+                points_per_segment=self.points_per_segment,
+                outputs="tip",
+                device=self.options.device,
             )
         self._model.settle(**self._inputs(), tolerance=1e-6)
         return self._model
@@ -161,7 +196,10 @@ class RodTask(Task):
             return Tube(self.simulator.state.position[i], radius, (0.9, 0.55, 0.15))
         if self._drawn is None:
             self._drawn = Simulator(self.base_robot, dt=self.dt, points_per_segment=8, threads=1)
-        given = {name: a[i] if np.ndim(a) == 2 and len(a) == self.n_envs else a for name, a in self._inputs().items()}
+        given = {
+            name: a[i] if np.ndim(a) == 2 and len(a) == self.n_envs else a
+            for name, a in self._inputs().items()
+        }
         return Tube(self._drawn.settle(**given).position[0], radius, (0.9, 0.55, 0.15))
 
     def _inputs(self) -> dict[str, Any]:
@@ -182,7 +220,9 @@ class RodTask(Task):
         """Note where the tips of these robots are; those that are lost stay where they were last seen."""
         some = np.ones(self.n_envs, bool) if rows is None else np.isin(np.arange(self.n_envs), rows)
         with np.errstate(invalid="ignore"):
-            sane = (np.abs(tip - self._foot) < _FAR * self.base_robot.length).all(1) & np.isfinite(direction).all(1)
+            sane = (np.abs(tip - self._foot) < _FAR * self.base_robot.length).all(1) & np.isfinite(
+                direction
+            ).all(1)
         good = some & ok & sane
         self.tip = np.where(good[:, None], tip, self.tip)
         self.direction = np.where(good[:, None], direction, self.direction)
@@ -190,8 +230,8 @@ class RodTask(Task):
 
 
 def resolved(jacobian: Floats, velocity: Floats, wish: Floats) -> Floats:
-    """(n, n_q) rates within -1 and 1 that give the velocities (n, m): damped pseudo-inverse of `jacobian` (n, m, n_q), and in its
-    null space slowly toward `wish` (n, n_q)."""
+    """(n, n_q) rates within -1 and 1 that give the velocities (n, m): damped pseudo-inverse of `jacobian` (n,
+    m, n_q), and in its null space slowly toward `wish` (n, n_q)."""
     transposed = np.swapaxes(jacobian, 1, 2)
     square = jacobian @ transposed
     damping = 1e-3 * np.trace(square, axis1=1, axis2=2) + 1e-12

@@ -1,4 +1,5 @@
-"""stable-baselines3 on a batch: a `VecEnv` around `BatchEnv`, and features scaled by the bounds of the observation."""
+"""stable-baselines3 on a batch: a `VecEnv` around `BatchEnv`, and features scaled by the bounds of the
+observation."""
 
 from __future__ import annotations
 
@@ -18,8 +19,8 @@ from fastrod_envs.vector import BatchEnv
 
 @final
 class BatchVecEnv(VecEnv):
-    """A `BatchEnv` as stable-baselines3 wants it: `terminal_observation`, `TimeLimit.truncated` and `episode` in the infos of those that
-    ended, with what the last step told of them (distance, success, ...).
+    """A `BatchEnv` as stable-baselines3 wants it: `terminal_observation`, `TimeLimit.truncated` and `episode`
+    in the infos of those that ended, with what the last step told of them (distance, success, ...).
 
     >>> env = BatchVecEnv(BatchEnv("Reach", num_envs=2))
     >>> env.reset().shape == (2, *env.observation_space.shape)
@@ -45,13 +46,17 @@ class BatchVecEnv(VecEnv):
 
     def step_wait(self) -> Any:
         """Observations, rewards, dones and infos of the step."""
-        observation, reward, terminated, truncated, told = self.env.step(self._action if self._action is not None else [])
+        observation, reward, terminated, truncated, told = self.env.step(
+            self._action if self._action is not None else []
+        )
         done = terminated | truncated
         nothing: dict[str, Any] = {}
         infos = [nothing] * self.num_envs
         if done.any():
             final = told["final_info"]
-            plain = [name for name, a in final.items() if not name.startswith("_") and not isinstance(a, dict)]
+            plain = [
+                name for name, a in final.items() if not name.startswith("_") and not isinstance(a, dict)
+            ]
             for i in np.flatnonzero(done):
                 row: dict[str, Any] = {name: final[name][i] for name in plain}
                 episode = final["episode"]
@@ -72,14 +77,20 @@ class BatchVecEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Environments of a batch have no attributes of their own."""
-        raise InputError(f"attribute {attr_name!r} cannot be set: the environments of a batch share their attributes.")
+        raise InputError(
+            f"attribute {attr_name!r} cannot be set: the environments of a batch share their attributes."
+        )
 
-    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+    ) -> list[Any]:
         """Call the batch's method once; its answer stands for each index."""
         answer = getattr(self.env, method_name)(*method_args, **method_kwargs)
         return [answer] * len(list(self._get_indices(indices)))
 
-    def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]], indices: Any = None) -> list[bool]:
+    def env_is_wrapped(
+        self, wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]], indices: Any = None
+    ) -> list[bool]:
         """None is."""
         return [False] * len(list(self._get_indices(indices)))
 
@@ -90,7 +101,8 @@ class BatchVecEnv(VecEnv):
 
 @final
 class ScaledFeatures(BaseFeaturesExtractor):
-    """Observations from -1 to 1 by the bounds of their space: part of the policy, so that it needs nothing beside its file."""
+    """Observations from -1 to 1 by the bounds of their space: part of the policy, so that it needs nothing
+    beside its file."""
 
     middle: torch.Tensor
     reach: torch.Tensor

@@ -21,7 +21,8 @@ from fastrod_envs.vector import action_space
 
 @final
 class SingleEnv(gymnasium.Env[Singles, Any]):
-    """One robot. `info` holds distance [m], success, contact, lost, position and desired (3,) [m], reward_terms, and facts of the task.
+    """One robot. `info` holds distance [m], success, contact, lost, position and desired (3,) [m],
+    reward_terms, and facts of the task.
 
     >>> env = SingleEnv("Reach")
     >>> observation, info = env.reset(seed=0)
@@ -30,17 +31,30 @@ class SingleEnv(gymnasium.Env[Singles, Any]):
     ['height', 'reach']
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "viser"], "render_fps": 25}  # type: ignore[misc]
+    metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]
+        "render_modes": ["rgb_array", "viser"],
+        "render_fps": 25,
+    }
 
-    def __init__(self, task: str, *, max_episode_steps: int | None = None, render_mode: str | None = None, **options: Any) -> None:
-        """As `BatchEnv`, with one environment. One that `gymnasium.make` makes without n_steps leaves the end of an episode to it."""
+    def __init__(
+        self,
+        task: str,
+        *,
+        max_episode_steps: int | None = None,
+        render_mode: str | None = None,
+        **options: Any,
+    ) -> None:
+        """As `BatchEnv`, with one environment. One that `gymnasium.make` makes without n_steps leaves the end
+        of an episode to it."""
         self._spec: EnvSpec | None = None
         self._own_steps = max_episode_steps is not None or options.get("n_steps") is not None
         self.render_mode = render_mode
         self._renderer = Renderer(render_mode)
         self.task = make_task(task, 1, with_steps(options, max_episode_steps, task_class(task).n_steps))
         self._episodes = Episodes(self.task)
-        self.observation_space = gymnasium.spaces.Box(self._episodes.low, self._episodes.high, dtype=np.float32)
+        self.observation_space = gymnasium.spaces.Box(
+            self._episodes.low, self._episodes.high, dtype=np.float32
+        )
         self.action_space = action_space(self.task)
 
     @property
@@ -52,10 +66,14 @@ class SingleEnv(gymnasium.Env[Singles, Any]):
     def spec(self, made: EnvSpec | None) -> None:
         self._spec = made
         if made is not None and not self._own_steps:
-            self._episodes.n_steps = sys.maxsize  # its TimeLimit counts, to max_episode_steps of gymnasium.make or of the registry
+            # its TimeLimit counts, to max_episode_steps of gymnasium.make or of the registry
+            self._episodes.n_steps = sys.maxsize
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Singles, dict[str, Any]]:
-        """Begin an episode; `options={"difficulty": level}` sets the curriculum's level. Raises `InputError`."""
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Singles, dict[str, Any]]:
+        """Begin an episode; `options={"difficulty": level}` sets the curriculum's level. Raises
+        `InputError`."""
         super().reset(seed=seed)
         options = checked_mapping(options)
         level = checked_difficulty(options.pop("difficulty", self.task.difficulty))
@@ -68,19 +86,25 @@ class SingleEnv(gymnasium.Env[Singles, Any]):
         return self._episodes.observation()[0], {}
 
     def step(self, action: ArrayLike) -> tuple[Singles, float, bool, bool, dict[str, Any]]:
-        """One step. Raises `InputError` on a wrong shape and on what is not finite; then nothing was simulated."""
+        """One step. Raises `InputError` on a wrong shape and on what is not finite; then nothing was
+        simulated."""
         moment = self._episodes.advance(np.asanyarray(action)[None])
         return (
-            self._episodes.observation()[0], float(moment.reward[0]), bool(moment.terminated[0]), bool(moment.truncated[0]),
+            self._episodes.observation()[0],
+            float(moment.reward[0]),
+            bool(moment.terminated[0]),
+            bool(moment.truncated[0]),
             _first(self._episodes.info(moment)),
-        )  # fmt: skip
+        )
 
     def _warn_of_limit(self) -> None:
-        """Say that the TimeLimit of `gymnasium.make` has ended an episode before its n_steps; nobody else resets at this very step."""
+        """Say that the TimeLimit of `gymnasium.make` has ended an episode before its n_steps; nobody else
+        resets at this very step."""
         usual, own = self.task.n_steps, self._episodes.n_steps
         if self._spec is not None and self._own_steps and own > usual == self._episodes.elapsed[0]:
             warnings.warn(
-                f"n_steps is {own}, but gymnasium.make ended the episode after {usual} steps; give max_episode_steps={own} as well.",
+                f"n_steps is {own}, but gymnasium.make ended the episode after {usual} steps; give "
+                f"max_episode_steps={own} as well.",
                 stacklevel=3,
             )
 
@@ -107,5 +131,7 @@ def _first(told: dict[str, Any]) -> dict[str, Any]:
     """The first row of every array, numbers as Python's own."""
     row: dict[str, Any] = {}
     for name, value in told.items():
-        row[name] = _first(value) if isinstance(value, dict) else value[0].item() if np.ndim(value) == 1 else value[0]
+        row[name] = (
+            _first(value) if isinstance(value, dict) else value[0].item() if np.ndim(value) == 1 else value[0]
+        )
     return row

@@ -1,4 +1,5 @@
-"""Random numbers of every environment, from a seed of its own: the same whatever the number of environments beside it."""
+"""Random numbers of every environment, from a seed of its own: the same whatever the number of environments
+beside it."""
 
 from __future__ import annotations
 
@@ -24,9 +25,13 @@ class Streams:
     def seed(self, seeds: Sequence[int | None]) -> None:
         """A seed for each environment; None leaves that one's stream as it is. Raises `InputError`."""
         if len(seeds) != self._n:
-            raise InputError(f"{len(seeds)} seeds for {self._n} environments; give one number, or one for each.")
+            raise InputError(
+                f"{len(seeds)} seeds for {self._n} environments; give one number, or one for each."
+            )
         for seed in seeds:
-            if seed is not None and (isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0):
+            if seed is not None and (
+                isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0
+            ):
                 raise InputError(f"seed is {seed!r}; it must be a whole number, zero or positive.")
         for i, seed in enumerate(seeds):
             if seed is not None:

@@ -1,4 +1,5 @@
-"""`ReachableSurface`: what a single segment without extension can reach, and the nearest point of it to points of a plane."""
+"""`ReachableSurface`: what a single segment without extension can reach, and the nearest point of it to
+points of a plane."""
 
 from __future__ import annotations
 
@@ -15,24 +16,34 @@ from fastrod.simulator import Simulator
 from fastrod.types import Floats
 
 _RINGS, _SPOKES = 25, 48
-_PASSES = 12  # Gauss-Newton; each takes a tenth of what the last left, as the surface is far flatter than it is away
+# Gauss-Newton; each takes a tenth of what the last left, as the surface is far flatter than it is away
+_PASSES = 12
 
 
 @final
 class ReachableSurface:
-    """The surface as a camera on the base measures it, in the base frame, for points up to `radius` [m] from the axis at one `height` [m].
+    """The surface as a camera on the base measures it, in the base frame, for points up to `radius` [m] from
+    the axis at one `height` [m].
 
-    Effects between motor and wire change how a point is reached, and not which points; they are left out. Those of load, material and
-    sensing are in.
+    Effects between motor and wire change how a point is reached, and not which points; they are left out.
+    Those of load, material and sensing are in.
     """
 
     def __init__(self, robot: Robot, *, height: float, radius: float) -> None:
         tables = named_effects(robot)
-        kept = tuple({"name": name, **table} for name, table in tables.items() if get_effect(name).seam is not Seam.ACTUATION)
+        kept = tuple(
+            {"name": name, **table}
+            for name, table in tables.items()
+            if get_effect(name).seam is not Seam.ACTUATION
+        )
         plain = replace(robot, effects=kept, base_position=(0.0, 0.0, 0.0))
         self._height, self._radius = height, radius
-        rho, phi = np.meshgrid(np.linspace(0.0, radius, _RINGS), np.arange(_SPOKES) * 2.0 * np.pi / _SPOKES, indexing="ij")
-        goal = np.stack([rho * np.cos(phi), rho * np.sin(phi), np.full_like(rho, height)], axis=-1).reshape(-1, 3)
+        rho, phi = np.meshgrid(
+            np.linspace(0.0, radius, _RINGS), np.arange(_SPOKES) * 2.0 * np.pi / _SPOKES, indexing="ij"
+        )
+        goal = np.stack([rho * np.cos(phi), rho * np.sin(phi), np.full_like(rho, height)], axis=-1).reshape(
+            -1, 3
+        )
         actions = SegmentActions(plain)
         simulator = Simulator(plain, n_robots=len(goal), points_per_segment=10, outputs="tip")
         q = goal[:, :2] * 2.0 * actions.offset[0] / plain.segments[0].length

@@ -101,7 +101,8 @@ class Outcome:
 class Task(ABC):
     """A task for `n_envs` robots.
 
-    Class docstrings of tasks are their documentation: what is to be done, the reward's formula, the success criterion, the baseline.
+    Class docstrings of tasks are their documentation: what is to be done, the reward's formula, the success
+    criterion, the baseline.
     """
 
     name: ClassVar[str]
@@ -122,7 +123,8 @@ class Task(ABC):
     dt: float
     """Time of a step [s]."""
     actions: tuple[Field, ...]
-    """Parts of an action; every number goes from -1 to 1, and low and high say what -1 and 1 mean, in the unit."""
+    """Parts of an action; every number goes from -1 to 1, and low and high say what -1 and 1 mean, in the
+    unit."""
     states: tuple[Field, ...]
     """Parts of an observation of the state, in the order of `state()`."""
     goals: tuple[Field, ...]
@@ -130,7 +132,10 @@ class Task(ABC):
 
     def __init__(self, n_envs: int, options: Options) -> None:
         if options.device != "cpu" and not self.on_gpu:
-            raise InputError(f"device is {options.device!r}; {self.name} has contact or a host's bodies, which need device 'cpu'.")
+            raise InputError(
+                f"device is {options.device!r}; {self.name} has contact or a host's bodies, "
+                "which need device 'cpu'."
+            )
         self.n_envs, self.options = n_envs, options
         self.difficulty = options.difficulty
         self.total_draws = self.n_draws
@@ -142,8 +147,8 @@ class Task(ABC):
 
     @abstractmethod
     def begin(self, rows: Ints, draws: Floats) -> None:
-        """Start an episode for these robots; `draws` (len(rows), total_draws) are even from 0 to 1. What a robot then is depends on
-        nothing but its draws."""
+        """Start an episode for these robots; `draws` (len(rows), total_draws) are even from 0 to 1. What a
+        robot then is depends on nothing but its draws."""
 
     @abstractmethod
     def act(self, action: Floats) -> None:
@@ -163,14 +168,16 @@ class Task(ABC):
 
     @abstractmethod
     def baseline(self) -> Floats:
-        """(n_envs, n_actions) what the scripted baseline does now, from -1 to 1; it may use what the simulator knows."""
+        """(n_envs, n_actions) what the scripted baseline does now, from -1 to 1; it may use what the
+        simulator knows."""
 
     @abstractmethod
     def scenery(self, i: int) -> Scenery:
         """What environment i looks like now."""
 
     def picture(self, i: int, width: int, height: int) -> np.ndarray | None:  # noqa: ARG002
-        """(height, width, 3) uint8 of environment i where a host draws it; None leaves it to the drawing of `scenery`."""
+        """(height, width, 3) uint8 of environment i where a host draws it; None leaves it to the drawing of
+        `scenery`."""
         return None
 
     def close(self) -> None:  # noqa: B027
@@ -189,7 +196,9 @@ def size(parts: tuple[Field, ...]) -> int:
 
 def bounds(parts: tuple[Field, ...]) -> tuple[Floats, Floats]:
     """(n,) least and (n,) largest value of every number of these parts, each in its unit."""
-    return np.concatenate([np.array(p.low, float) for p in parts]), np.concatenate([np.array(p.high, float) for p in parts])
+    return np.concatenate([np.array(p.low, float) for p in parts]), np.concatenate(
+        [np.array(p.high, float) for p in parts]
+    )
 
 
 def length(vectors: Floats) -> Floats:

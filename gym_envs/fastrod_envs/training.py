@@ -1,4 +1,5 @@
-"""Training on stable-baselines3: a folder with policy, configuration, checkpoints and curves; it goes on after a kill."""
+"""Training on stable-baselines3: a folder with policy, configuration, checkpoints and curves; it goes on
+after a kill."""
 
 from __future__ import annotations
 
@@ -21,7 +22,13 @@ from fastrod_envs.presets import ALGORITHMS, NETWORK, preset_of, settings_of
 from fastrod_envs.registration import NAMESPACE, VERSION, name_of
 
 Progress = Callable[[str, int, int], None]
-CONFIG, POLICY, ACTOR, CHECKPOINT, REPLAY = "config.json", "policy.zip", "actor.npz", "checkpoint.npz", "replay.npz"
+CONFIG, POLICY, ACTOR, CHECKPOINT, REPLAY = (
+    "config.json",
+    "policy.zip",
+    "actor.npz",
+    "checkpoint.npz",
+    "replay.npz",
+)
 FOREIGN = ("checkpoint.zip", POLICY)
 """Files of stable-baselines3: to read one runs code of whoever made it."""
 _EVERY = 20  # checkpoints of a training
@@ -52,12 +59,21 @@ class Plan:
         name_of(self.env)
         if self.algorithm not in ALGORITHMS:
             raise UnknownNameError(f"no algorithm {self.algorithm!r}; {nearest(self.algorithm, ALGORITHMS)}")
-        for what, least, most in (("steps", 0, 10**15), ("n_envs", 1, 10**6), ("seed", 0, 2**32 - 1), ("imitate", 0, 10**15)):
+        for what, least, most in (
+            ("steps", 0, 10**15),
+            ("n_envs", 1, 10**6),
+            ("seed", 0, 2**32 - 1),
+            ("imitate", 0, 10**15),
+        ):
             value = getattr(self, what)
             if not isinstance(value, int) or not least <= value <= most:
-                raise InputError(f"{what} is {shown(value)}; it must be a whole number from {least} to {most}.")
+                raise InputError(
+                    f"{what} is {shown(value)}; it must be a whole number from {least} to {most}."
+                )
         if not 0.0 <= self.curriculum <= 1.0:
-            raise InputError(f"curriculum is {self.curriculum!r}; it must be the difficulty at the start, from 0 to 1.")
+            raise InputError(
+                f"curriculum is {self.curriculum!r}; it must be the difficulty at the start, from 0 to 1."
+            )
 
 
 class _State(TypedDict):
@@ -68,15 +84,23 @@ class _State(TypedDict):
 
 
 def make_plan(
-    env: str, *, algorithm: str | None = None, steps: int | None = None, n_envs: int | None = None, seed: int = 0,
-    imitate: int | None = None, options: Mapping[str, Any] | None = None, settings: Mapping[str, Any] | None = None,
+    env: str,
+    *,
+    algorithm: str | None = None,
+    steps: int | None = None,
+    n_envs: int | None = None,
+    seed: int = 0,
+    imitate: int | None = None,
+    options: Mapping[str, Any] | None = None,
+    settings: Mapping[str, Any] | None = None,
     curriculum: float = 1.0,
-) -> Plan:  # fmt: skip
+) -> Plan:
     """The preset of a task, with what is given here instead. Raises `UnknownNameError`, `InputError`."""
     from fastrod_envs.registration import task_class
 
     preset = preset_of(env)
-    if n_envs is not None and (not isinstance(n_envs, int) or n_envs < 1):  # before rollouts are divided among them
+    # before rollouts are divided among them
+    if n_envs is not None and (not isinstance(n_envs, int) or n_envs < 1):
         raise InputError(f"n_envs is {n_envs!r}; it must be a whole number, at least 1.")
     kind = task_class(env)
     chosen = algorithm or preset.algorithm
@@ -85,18 +109,24 @@ def make_plan(
     wanted = {**preset.options, **(options or {})}
     n_steps = kind.options_class.read(wanted).n_steps or kind.n_steps
     return Plan(
-        env=f"{NAMESPACE}/{name_of(env)}-{VERSION}", algorithm=chosen, n_envs=many,
-        steps=in_all, seed=seed, imitate=preset.imitate if imitate is None else imitate, options=wanted,
-        settings=settings_of(chosen, many, n_steps, in_all, {**own, **(settings or {})}), curriculum=curriculum,
-    )  # fmt: skip
+        env=f"{NAMESPACE}/{name_of(env)}-{VERSION}",
+        algorithm=chosen,
+        n_envs=many,
+        steps=in_all,
+        seed=seed,
+        imitate=preset.imitate if imitate is None else imitate,
+        options=wanted,
+        settings=settings_of(chosen, many, n_steps, in_all, {**own, **(settings or {})}),
+        curriculum=curriculum,
+    )
 
 
 def train(plan: Plan, out: Path, progress: Progress | None = None) -> Path:
     """Train into the folder `out`; the path of its policy.zip.
 
-    The folder holds config.json (the plan, versions, steps and seconds done), checkpoint.npz (with replay.npz for SAC
-    and TD3, until the end), actor.npz with the network alone, tensorboard curves, and at the end policy.zip, for
-    stable-baselines3 itself. Raises `InputError` where the folder holds a training already.
+    The folder holds config.json (the plan, versions, steps and seconds done), checkpoint.npz (with replay.npz
+    for SAC and TD3, until the end), actor.npz with the network alone, tensorboard curves, and at the end
+    policy.zip, for stable-baselines3 itself. Raises `InputError` where the folder holds a training already.
     """
     if (out / CONFIG).exists():
         raise InputError(f"{str(out)!r} holds a training; go on with it by --resume, or name another folder.")
@@ -105,11 +135,14 @@ def train(plan: Plan, out: Path, progress: Progress | None = None) -> Path:
     return _run(plan, out, progress)
 
 
-def resume(out: Path, steps: int | None = None, progress: Progress | None = None, *, trust: bool = False) -> Path:
+def resume(
+    out: Path, steps: int | None = None, progress: Progress | None = None, *, trust: bool = False
+) -> Path:
     """Go on with the training in `out` from its last checkpoint, to its own number of steps or to `steps`.
 
-    SAC and TD3 have an empty replay buffer where it had ended. A folder that has a file of stable-baselines3 in place
-    of checkpoint.npz is refused without `trust`: to read that file runs code of whoever made it. Raises `InputError`.
+    SAC and TD3 have an empty replay buffer where it had ended. A folder that has a file of stable-baselines3
+    in place of checkpoint.npz is refused without `trust`: to read that file runs code of whoever made it.
+    Raises `InputError`.
     """
     plan, _ = read_config(out)
     if steps is not None:
@@ -126,15 +159,25 @@ def read_config(out: Path) -> tuple[Plan, dict[str, Any]]:
         held = json.loads(path.read_text(encoding="utf-8"))
         plan = msgspec.convert(held["plan"], Plan)
         if unknown := held["plan"].keys() - {field.name for field in fields(Plan)}:
-            raise ValueError(f"it has an unknown key {min(unknown)!r}; {nearest(min(unknown), [field.name for field in fields(Plan)])}")
+            raise ValueError(
+                f"it has an unknown key {min(unknown)!r}; "
+                f"{nearest(min(unknown), [field.name for field in fields(Plan)])}"
+            )
         state = {**msgspec.convert(held["state"], dict[str, Any]), **msgspec.convert(held["state"], _State)}
         if not 0.0 <= state["seconds"] < float("inf"):
             raise ValueError(f"it says that {state['seconds']} s are done")
     except UnknownNameError as error:
         raise UnknownNameError(f"{str(path)!r}: {error}") from error
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        why = f"it lacks {error}" if isinstance(error, KeyError) else getattr(error, "strerror", None) or str(error).rstrip(".")
-        raise InputError(f"{str(path)!r} is no configuration of a training ({why}); `fastrod train ENV --out DIR` writes one.") from error
+        why = (
+            f"it lacks {error}"
+            if isinstance(error, KeyError)
+            else getattr(error, "strerror", None) or str(error).rstrip(".")
+        )
+        raise InputError(
+            f"{str(path)!r} is no configuration of a training ({why}); `fastrod train ENV "
+            "--out DIR` writes one."
+        ) from error
     return plan, state
 
 
@@ -154,13 +197,17 @@ def load_foreign(path: Path, algorithm: str, env: Any = None, *, trust: bool) ->
     """
     if not trust:
         raise InputError(
-            f"{str(path)!r} is a file of stable-baselines3, and to read it runs code of whoever made it; if you trust "
-            "them, add --trust (in Python trust=True), or give a folder with a checkpoint.npz or actor.npz of `fastrod train`."
+            f"{str(path)!r} is a file of stable-baselines3, and to read it runs code of whoever made it; if "
+            "you trust "
+            "them, add --trust (in Python trust=True), or give a folder with a checkpoint.npz or actor.npz "
+            "of `fastrod train`."
         )
     try:
         return algorithm_class(algorithm).load(path, env=env, device="cpu")
     except Exception as error:  # whatever a stranger's file raises
-        raise InputError(f"{str(path)!r} cannot be read as a model of stable-baselines3: {error!r}.") from error
+        raise InputError(
+            f"{str(path)!r} cannot be read as a model of stable-baselines3: {error!r}."
+        ) from error
 
 
 def _run(plan: Plan, out: Path, progress: Progress | None, trust: bool = False) -> Path:
@@ -174,10 +221,16 @@ def _run(plan: Plan, out: Path, progress: Progress | None, trust: bool = False) 
     env = BatchEnv(name_of(plan.env), num_envs=plan.n_envs, **plan.options)
     try:
         env.reset(seed=plan.seed)  # kernels start their threads now, and set those of torch
-        torch.set_num_threads(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+        torch.set_num_threads(
+            len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        )
         vec = BatchVecEnv(env)
         started, before = time.monotonic(), float(state["seconds"])
-        foreign = None if (out / CHECKPOINT).exists() else next((out / name for name in FOREIGN if (out / name).exists()), None)
+        foreign = (
+            None
+            if (out / CHECKPOINT).exists()
+            else next((out / name for name in FOREIGN if (out / name).exists()), None)
+        )
         if foreign is not None:
             model = load_foreign(foreign, plan.algorithm, vec, trust=trust)
         else:
@@ -200,12 +253,20 @@ def _run(plan: Plan, out: Path, progress: Progress | None, trust: bool = False) 
 
         def note() -> None:
             _save(model, out)
-            state["steps_done"], state["seconds"] = int(model.num_timesteps), before + time.monotonic() - started
+            state["steps_done"], state["seconds"] = (
+                int(model.num_timesteps),
+                before + time.monotonic() - started,
+            )
             _write_config(out, plan, state)
 
         left = plan.steps - model.num_timesteps
         if left > 0:
-            model.learn(left, callback=_callback(plan, note, progress), reset_num_timesteps=False, tb_log_name=plan.algorithm)
+            model.learn(
+                left,
+                callback=_callback(plan, note, progress),
+                reset_num_timesteps=False,
+                tb_log_name=plan.algorithm,
+            )
         note()
         _atomically(out / POLICY, model.save)
         (out / REPLAY).unlink(missing_ok=True)
@@ -215,7 +276,8 @@ def _run(plan: Plan, out: Path, progress: Progress | None, trust: bool = False) 
 
 
 def _fresh(plan: Plan, vec: Any, board: str | None) -> Any:
-    """The model of a plan before its first step. Raises `InputError` for settings that its algorithm refuses."""
+    """The model of a plan before its first step. Raises `InputError` for settings that its algorithm
+    refuses."""
     import torch
 
     from fastrod_envs.sb3 import ScaledFeatures
@@ -227,10 +289,20 @@ def _fresh(plan: Plan, vec: Any, board: str | None) -> Any:
     kind, own = algorithm_class(plan.algorithm), settings.pop("policy_kwargs", {})
     try:
         return kind(
-            "MlpPolicy", vec, seed=plan.seed, device="cpu", verbose=0, tensorboard_log=board, policy_kwargs={**policy, **own}, **settings
+            "MlpPolicy",
+            vec,
+            seed=plan.seed,
+            device="cpu",
+            verbose=0,
+            tensorboard_log=board,
+            policy_kwargs={**policy, **own},
+            **settings,
         )
     except (TypeError, ValueError, AssertionError, MemoryError) as error:  # of stable-baselines3 and torch
-        raise InputError(f"{plan.algorithm} cannot be set up with the settings {shown(settings)}: {str(error).rstrip('.')}.") from error
+        raise InputError(
+            f"{plan.algorithm} cannot be set up with the settings {shown(settings)}: "
+            f"{str(error).rstrip('.')}."
+        ) from error
 
 
 def _callback(plan: Plan, note: Callable[[], None], progress: Progress | None) -> Any:
@@ -242,7 +314,9 @@ def _callback(plan: Plan, note: Callable[[], None], progress: Progress | None) -
     class Watch(BaseCallback):
         def __init__(self) -> None:
             super().__init__()
-            self.told: dict[str, deque[float]] = {name: deque(maxlen=1000) for name in ("distance", "is_success", "contact", "lost")}
+            self.told: dict[str, deque[float]] = {
+                name: deque(maxlen=1000) for name in ("distance", "is_success", "contact", "lost")
+            }
             self.next_note = -1
 
         def _on_step(self) -> bool:
@@ -257,7 +331,9 @@ def _callback(plan: Plan, note: Callable[[], None], progress: Progress | None) -
                 self.next_note += every
             if plan.curriculum < 1.0:
                 part = min(1.0, 2.0 * self.num_timesteps / plan.steps)
-                self.training_env.env_method("set_difficulty", plan.curriculum + (1.0 - plan.curriculum) * part)
+                self.training_env.env_method(
+                    "set_difficulty", plan.curriculum + (1.0 - plan.curriculum) * part
+                )
             if progress is not None:
                 progress(f"{plan.env} {plan.algorithm}", min(self.num_timesteps, plan.steps), plan.steps)
             return True
@@ -277,7 +353,11 @@ def _callback(plan: Plan, note: Callable[[], None], progress: Progress | None) -
 
 def _save(model: Any, out: Path) -> None:
     """The checkpoint, whole or not at all, and the network alone."""
-    if hasattr(model, "save_replay_buffer") and model.replay_buffer is not None and model.replay_buffer.size():
+    if (
+        hasattr(model, "save_replay_buffer")
+        and model.replay_buffer is not None
+        and model.replay_buffer.size()
+    ):
         _atomically(out / REPLAY, partial(save_replay, model))
     _atomically(out / CHECKPOINT, partial(save_checkpoint, model))
     _atomically(out / ACTOR, actor_of(model).save)
@@ -290,12 +370,18 @@ def _atomically(path: Path, write: Callable[[Path], Any]) -> None:
 
 
 def _write_config(out: Path, plan: Plan, state: Mapping[str, Any]) -> None:
-    packages = {name: version(name) for name in ("fastrod", "gymnasium", "numba", "numpy", "stable-baselines3", "torch")}
+    packages = {
+        name: version(name)
+        for name in ("fastrod", "gymnasium", "numba", "numpy", "stable-baselines3", "torch")
+    }
     held = {"plan": asdict(plan), "state": dict(state), "versions": packages}
     try:
         text = json.dumps(held, indent=1) + "\n"
     except TypeError as error:
-        raise InputError(f"the options {plan.options!r} cannot be saved beside the policy; give numbers, words and file paths.") from error
+        raise InputError(
+            f"the options {plan.options!r} cannot be saved beside the policy; give numbers, "
+            "words and file paths."
+        ) from error
     _atomically(out / CONFIG, lambda path: path.write_text(text, encoding="utf-8"))
 
 

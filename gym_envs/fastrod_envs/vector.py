@@ -29,10 +29,12 @@ def action_space(task: Task) -> gymnasium.spaces.Box:
 class BatchEnv(VectorEnv[Singles, Any, Any]):
     """N environments in one; those that end begin anew in the same step (`AutoresetMode.SAME_STEP`).
 
-    Environment i of `reset(seed=s)` is the environment of `gymnasium.make` after `reset(seed=s + i)`, bit for bit, whatever N is.
+    Environment i of `reset(seed=s)` is the environment of `gymnasium.make` after `reset(seed=s + i)`, bit for
+    bit, whatever N is.
 
-    `info` holds arrays (n, ...), each with its mask `_name` as Gymnasium has it: distance [m], success, contact, lost, position and
-    desired (3,) [m], and reward_terms; after a step in which episodes ended also final_obs and final_info of those.
+    `info` holds arrays (n, ...), each with its mask `_name` as Gymnasium has it: distance [m], success,
+    contact, lost, position and desired (3,) [m], and reward_terms; after a step in which episodes ended also
+    final_obs and final_info of those.
 
     >>> env = BatchEnv("Reach", num_envs=3)
     >>> observation, info = env.reset(seed=0)
@@ -42,22 +44,34 @@ class BatchEnv(VectorEnv[Singles, Any, Any]):
     """
 
     metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]
-        "autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": ["rgb_array", "viser"], "render_fps": 25,
-    }  # fmt: skip
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+        "render_modes": ["rgb_array", "viser"],
+        "render_fps": 25,
+    }
 
     def __init__(
-        self, task: str, num_envs: int = 1, *, max_episode_steps: int | None = None, render_mode: str | None = None, **options: Any
+        self,
+        task: str,
+        num_envs: int = 1,
+        *,
+        max_episode_steps: int | None = None,
+        render_mode: str | None = None,
+        **options: Any,
     ) -> None:
-        """`task` is the name in the id; `options` are those of the task (`Options`), `max_episode_steps` is another name of n_steps.
-        Raises `InputError`, `UnknownNameError`, `HostError`."""
+        """`task` is the name in the id; `options` are those of the task (`Options`), `max_episode_steps` is
+        another name of n_steps. Raises `InputError`, `UnknownNameError`, `HostError`."""
         if not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
             raise InputError(f"num_envs is {num_envs!r}; it must be a whole number, at least 1.")
         self.render_mode = render_mode
         self._renderer = Renderer(render_mode)
-        self.task = make_task(task, int(num_envs), with_steps(options, max_episode_steps, task_class(task).n_steps))
+        self.task = make_task(
+            task, int(num_envs), with_steps(options, max_episode_steps, task_class(task).n_steps)
+        )
         self.num_envs = int(num_envs)
         self._episodes = Episodes(self.task)
-        self.single_observation_space = gymnasium.spaces.Box(self._episodes.low, self._episodes.high, dtype=np.float32)
+        self.single_observation_space = gymnasium.spaces.Box(
+            self._episodes.low, self._episodes.high, dtype=np.float32
+        )
         self.single_action_space = action_space(self.task)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -81,17 +95,23 @@ class BatchEnv(VectorEnv[Singles, Any, Any]):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Singles, dict[str, Any]]:
-        """Begin episodes in all environments, or in those of `options={"reset_mask": (n,) bool}`. A whole-number seed s gives
-        environment i the seed s + i; those that go on keep theirs. Raises `InputError`; then nothing has changed."""
+        """Begin episodes in all environments, or in those of `options={"reset_mask": (n,) bool}`. A
+        whole-number seed s gives environment i the seed s + i; those that go on keep theirs. Raises
+        `InputError`; then nothing has changed."""
         super().reset(seed=None)
         options = checked_mapping(options)
         mask = np.asarray(options.pop("reset_mask", self._every))
         if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
-            raise InputError(f"reset_mask has shape {mask.shape} and type {mask.dtype}; give ({self.num_envs},) bool, some of it True.")
+            raise InputError(
+                f"reset_mask has shape {mask.shape} and type {mask.dtype}; give "
+                f"({self.num_envs},) bool, some of it True."
+            )
         level = checked_difficulty(options.pop("difficulty", self.task.difficulty))
         if options:
             raise InputError(f"reset has no option {next(iter(options))!r}; known: difficulty, reset_mask.")
-        self._episodes.seed([s if begins else None for s, begins in zip(self._seeds(seed), mask, strict=True)])
+        self._episodes.seed(
+            [s if begins else None for s, begins in zip(self._seeds(seed), mask, strict=True)]
+        )
         self.task.set_difficulty(level)
         self._episodes.begin(np.flatnonzero(mask))
         return self._episodes.observation(), {}
@@ -102,12 +122,20 @@ class BatchEnv(VectorEnv[Singles, Any, Any]):
             return [None] * self.num_envs
         if isinstance(seed, (int, np.integer)) and not isinstance(seed, bool):
             return [int(seed) + i for i in range(self.num_envs)]
-        if isinstance(seed, (bool, str)) or not isinstance(seed, (Sequence, np.ndarray)) or len(seed) != self.num_envs:
-            raise InputError(f"seed is {seed!r}; give one whole number, zero or positive, or one for each of {self.num_envs} environments.")
+        if (
+            isinstance(seed, (bool, str))
+            or not isinstance(seed, (Sequence, np.ndarray))
+            or len(seed) != self.num_envs
+        ):
+            raise InputError(
+                f"seed is {seed!r}; give one whole number, zero or positive, or one for each "
+                f"of {self.num_envs} environments."
+            )
         return list(seed)
 
     def step(self, actions: ArrayLike) -> tuple[Singles, Floats, Flags, Flags, dict[str, Any]]:
-        """One step of all environments: `actions` (n, n_actions); observations (n, size), rewards, terminated and truncated (n,), infos.
+        """One step of all environments: `actions` (n, n_actions); observations (n, size), rewards, terminated
+        and truncated (n,), infos.
 
         Raises `InputError` on a wrong shape and on what is not finite; then nothing was simulated.
         """
@@ -122,7 +150,12 @@ class BatchEnv(VectorEnv[Singles, Any, Any]):
             for i in rows:
                 final[i] = observation[i]
             told["episode"] = {"r": self._episodes.returned.copy(), "l": self._episodes.elapsed.copy()}
-            infos |= {"final_obs": final, "_final_obs": done, "final_info": _masked(told, done), "_final_info": done}
+            infos |= {
+                "final_obs": final,
+                "_final_obs": done,
+                "final_info": _masked(told, done),
+                "_final_info": done,
+            }
             self._episodes.begin(rows)
             begun = self._episodes.observation()
             observation = np.where(done[:, None], begun, observation)
@@ -137,7 +170,8 @@ class BatchEnv(VectorEnv[Singles, Any, Any]):
         self.task.set_difficulty(level)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """With rgb_array a picture (height, width, 3) of every environment; with viser the page shows the first ones now."""
+        """With rgb_array a picture (height, width, 3) of every environment; with viser the page shows the
+        first ones now."""
         return self._renderer.render(self.task)
 
     def close_extras(self, **kwargs: Any) -> None:  # noqa: ARG002

@@ -47,7 +47,8 @@ def bases() -> Floats:
 
 @final
 class Grid(RodScene):
-    """64 five-segment reachers, each in a world of its own. The crests run along the field's diagonal and bow toward its middle."""
+    """64 five-segment reachers, each in a world of its own. The crests run along the field's diagonal and bow
+    toward its middle."""
 
     name = "grid"
     about = "Sixty-four five-segment reachers sway in waves, each with a phase of its own, in one simulator."
@@ -72,18 +73,24 @@ class Grid(RodScene):
         bend = np.array(BENDS) * self.actions.offset
         longest = np.array([segment.extension[1] for segment in self.actions.robot.segments])
         extension = longest * (0.5 - 0.5 * np.cos(angle))
-        return np.stack([extension, bend * np.sin(angle), TWIST * bend * np.cos(angle)], axis=2).reshape(len(angle), 3 * n)
+        return np.stack([extension, bend * np.sin(angle), TWIST * bend * np.cos(angle)], axis=2).reshape(
+            len(angle), 3 * n
+        )
 
     def inputs(self, t: float) -> dict[str, Any]:
         """`action` at time t [s], and the robots' places as `base_pose`."""
         return {**self.actions.inputs(self.action(t)), "base_pose": self.bases}
 
     def check(self) -> dict[str, float]:
-        """The waves must be solved to `RESIDUAL`, move every tip by `WAY`, differ between neighbours, and come back after a period."""
+        """The waves must be solved to `RESIDUAL`, move every tip by `WAY`, differ between neighbours, and
+        come back after a period."""
         tips: list[Floats] = []
         residual = 0.0
         for t, state in self.run():
-            self.expect(bool(state.ok.all()), f"at {t:.3g} s {int((~state.ok).sum())} robots are not ok: {dict(state.problems)}")
+            self.expect(
+                bool(state.ok.all()),
+                f"at {t:.3g} s {int((~state.ok).sum())} robots are not ok: {dict(state.problems)}",
+            )
             residual = max(residual, float(state.residual.max()))
             tips.append(state.tip_position - self.bases[:, :3])
         path, steps = np.array(tips), round(PERIOD / self.dt)
@@ -93,7 +100,10 @@ class Grid(RodScene):
         off = float(np.linalg.norm(path[2 * steps :] - path[steps : len(path) - steps], axis=2).max())
         self.expect(residual < RESIDUAL, f"a boundary is {residual:.3g} m off.")
         self.expect(way > WAY, f"a tip covers {way:.3g} m; it must be {WAY:g} m.")
-        self.expect(apart > DIFFERENT, f"two neighbours are {apart:.3g} m from being alike; each must have a phase of its own.")
+        self.expect(
+            apart > DIFFERENT,
+            f"two neighbours are {apart:.3g} m from being alike; each must have a phase of its own.",
+        )
         self.expect(off < PERIODIC, f"a tip is {off:.3g} m from where it was a period before.")
         return {
             "boundary residual, m": residual,

@@ -1,8 +1,9 @@
 """Measured data of three real robots, each as a `RunLog` and the `Robot` that it was measured on.
 
-Every adapter turns a published table into SI units and into the robot's base frame: z along the straight rod away from
-the base, right-handed. What the authors publish is used as published; what they do not is *nominal*: a round number of
-the right size, never fitted to the log. A replay with nominal geometry is therefore the error before any identification.
+Every adapter turns a published table into SI units and into the robot's base frame: z along the straight rod
+away from the base, right-handed. What the authors publish is used as published; what they do not is
+*nominal*: a round number of the right size, never fitted to the log. A replay with nominal geometry is
+therefore the error before any identification.
 """
 
 from __future__ import annotations
@@ -55,20 +56,25 @@ ARMLAB_DIRECTION = (205.0, 85.0, 325.0)
 def asl_trunk(path: str | Path, run: str | None = None) -> tuple[RunLog, Robot]:
     """Three-segment trunk of Stanford ASL, hanging: one run, or all of them.
 
-    Frame: base x = mocap x, base y = mocap z, base z = -mocap y (down), at the height y = 0 of the mocap frame. The base
-    point is not published: in each run it lies over the mean of the three disk centres in the run's first row, where the
-    motors are within 4 deg of rest (rest pose and motor zeros change between sessions).
+    Frame: base x = mocap x, base y = mocap z, base z = -mocap y (down), at the height y = 0 of the mocap
+    frame. The base point is not published: in each run it lies over the mean of the three disk centres in the
+    run's first row, where the motors are within 4 deg of rest (rest pose and motor zeros change between
+    sessions).
 
-    Published: disk heights, which motor ends where, pull directions, payload. Antagonistic pairs on one spool are one
-    push-pull tendon each, so the robot has six, in the order of motors 3 5 | 1 6 | 2 4. `dl` = -spool radius times the
-    *commanded* motor angle u, for that is what a user has beforehand; `extra` keeps the measured angles phi (up to 5 rows
-    stale). Tip = disk 3; points p1, p2 = disks 1 and 2.
-    Nominal: spool radius, pitch radius, wire compliance, bending stiffness 0.05, torsional stiffness 0.5 N m^2 (a corrugated hose bends
-    but hardly twists; much less, and the pushing half of the pairs, which has no pretension here, would buckle it), a
-    weightless body. Only `payload` loads the rod, and how far it sags rests on the nominal stiffness.
+    Published: disk heights, which motor ends where, pull directions, payload. Antagonistic pairs on one spool
+    are one push-pull tendon each, so the robot has six, in the order of motors 3 5 | 1 6 | 2 4. `dl` = -spool
+    radius times the
+    *commanded* motor angle u, for that is what a user has beforehand; `extra` keeps the measured angles phi
+    (up to 5 rows stale). Tip = disk 3; points p1, p2 = disks 1 and 2.
+    Nominal: spool radius, pitch radius, wire compliance, bending stiffness 0.05, torsional stiffness 0.5 N
+    m^2 (a corrugated hose bends but hardly twists; much less, and the pushing half of the pairs, which has no
+    pretension here, would buckle it), a weightless body. Only `payload` loads the rod, and how far it sags
+    rests on the nominal stiffness.
     """
     table, where = _table(path, "asl_trunk"), Path(path).name
-    disks = [_metres(table, (f"x{k}_mm", f"z{k}_mm", f"y{k}_mm"), where) * (1.0, 1.0, -1.0) for k in (1, 2, 3)]
+    disks = [
+        _metres(table, (f"x{k}_mm", f"z{k}_mm", f"y{k}_mm"), where) * (1.0, 1.0, -1.0) for k in (1, 2, 3)
+    ]
     labels = np.array(table["run"])
     for label in dict.fromkeys(labels.tolist()):
         rows = labels == label
@@ -80,7 +86,10 @@ def asl_trunk(path: str | Path, run: str | None = None) -> tuple[RunLog, Robot]:
         name=Path(path).stem,
         t=numbers(table, "t_s", where),
         run=labels,
-        dl=np.stack([-ASL_SPOOL_RADIUS * np.radians(numbers(table, f"u{motor}_deg", where)) for motor in order], axis=1),
+        dl=np.stack(
+            [-ASL_SPOOL_RADIUS * np.radians(numbers(table, f"u{motor}_deg", where)) for motor in order],
+            axis=1,
+        ),
         tip_position=disks[2],
         points=np.stack(disks[:2], axis=1),
         payload=numbers(table, "payload_g", where) / 1000.0,
@@ -98,7 +107,12 @@ def _asl_robot() -> Robot:
             torsional_stiffness=0.5,
             body_radius=0.04,
             tendons=tuple(
-                Tendon(offset=ASL_PITCH_RADIUS, angle=math.radians(ASL_DIRECTION[motor]), compliance=ASL_COMPLIANCE) for motor in motors
+                Tendon(
+                    offset=ASL_PITCH_RADIUS,
+                    angle=math.radians(ASL_DIRECTION[motor]),
+                    compliance=ASL_COMPLIANCE,
+                )
+                for motor in motors
             ),
         )
         for start, end, motors in zip(starts, ASL_DISKS, ASL_MOTORS, strict=True)
@@ -119,17 +133,23 @@ def _asl_robot() -> Robot:
     )
 
 
-def ethz_beam(path: str | Path, run: str | None = None, *, settled: float | None = 1.0) -> tuple[RunLog, Robot]:
-    """Clamped silicone beam of ETH Zurich, let go from straight under a known tip load: one run, or all of them.
+def ethz_beam(
+    path: str | Path, run: str | None = None, *, settled: float | None = 1.0
+) -> tuple[RunLog, Robot]:
+    """Clamped silicone beam of ETH Zurich, let go from straight under a known tip load: one run, or all of
+    them.
 
-    Frame: axes as measured (gravity -x, beam axis +z), origin such that the mean of the three tip markers starts at
-    (0, 0, length). The clamp's markers move between sessions and the start is held straight by hand (scatter 0.4 mm in x,
-    more in y and z), so no better origin is known: only the drop along x since the own start is a clean measurement.
+    Frame: axes as measured (gravity -x, beam axis +z), origin such that the mean of the three tip markers
+    starts at (0, 0, length). The clamp's markers move between sessions and the start is held straight by hand
+    (scatter 0.4 mm in x, more in y and z), so no better origin is known: only the drop along x since the own
+    start is a clean measurement.
 
-    Published: dimensions, density, modulus (the shipped robot `ethz_beam` has them), tip load, gravity. The load hangs
-    from the upper edge of the tip face; here it acts at the centre. `tip_force` = the load along -x, constant.
-    `settled`: the tip counts as measured in the last so many seconds of a run; what comes before, held by hand and then
-    ringing at 4 to 8 Hz, is given as missing, for a static model says nothing about it. None gives the whole run.
+    Published: dimensions, density, modulus (the shipped robot `ethz_beam` has them), tip load, gravity. The
+    load hangs from the upper edge of the tip face; here it acts at the centre. `tip_force` = the load along
+    -x, constant.
+    `settled`: the tip counts as measured in the last so many seconds of a run; what comes before, held by
+    hand and then ringing at 4 to 8 Hz, is given as missing, for a static model says nothing about it. None
+    gives the whole run.
     """
     robot = load_robot("ethz_beam")
     table, where = _table(path, "ethz_beam"), Path(path).name
@@ -154,15 +174,17 @@ def ethz_beam(path: str | Path, run: str | None = None, *, settled: float | None
 def armlab_tdcr(path: str | Path) -> tuple[RunLog, Robot]:
     """One segment with three tendons of ARM-Lab, hanging, static: the whole grid of shortenings as one run.
 
-    Frame: base x = mocap x, base y = mocap z, base z = -mocap y (down); the rest tip, the mean of the three rows with at
-    most 0.1 mm of pull, lies at (0, 0, length). There is no clock: `t` counts the rows as acquired, 1 s each.
+    Frame: base x = mocap x, base y = mocap z, base z = -mocap y (down); the rest tip, the mean of the three
+    rows with at most 0.1 mm of pull, lies at (0, 0, length). There is no clock: `t` counts the rows as
+    acquired, 1 s each.
 
-    Published: three tendons 120 deg apart, their shortening (`dl` = -l_mm / 1000), tip position. Every sweep only loads.
-    Rows with glitch = 1 are given as missing.
-    Nominal: length and pitch radius in the middle of the published fits; stiffness as the paper's prototype; weightless;
-    angles 205, 85, 325 deg, which is where the tip went when one tendon was pulled alone (-155, 86, -37 deg), rounded to 5
-    deg and 120 deg apart. The grid pulls all three tendons together too. The real body shortens then; this rod cannot, so
-    the common part of the pull stretches the tendons and only the differences bend: the tensions mean nothing here.
+    Published: three tendons 120 deg apart, their shortening (`dl` = -l_mm / 1000), tip position. Every sweep
+    only loads. Rows with glitch = 1 are given as missing.
+    Nominal: length and pitch radius in the middle of the published fits; stiffness as the paper's prototype;
+    weightless; angles 205, 85, 325 deg, which is where the tip went when one tendon was pulled alone (-155,
+    86, -37 deg), rounded to 5 deg and 120 deg apart. The grid pulls all three tendons together too. The real
+    body shortens then; this rod cannot, so the common part of the pull stretches the tendons and only the
+    differences bend: the tensions mean nothing here.
     """
     table, where = _table(path, "armlab_tdcr"), Path(path).name
     pull = _metres(table, ("l1_mm", "l2_mm", "l3_mm"), where)
@@ -182,9 +204,16 @@ def armlab_tdcr(path: str | Path) -> tuple[RunLog, Robot]:
 
 def _armlab_robot() -> Robot:
     tendons = tuple(
-        Tendon(offset=ARMLAB_PITCH_RADIUS, angle=math.radians(angle), compliance=ARMLAB_COMPLIANCE) for angle in ARMLAB_DIRECTION
+        Tendon(offset=ARMLAB_PITCH_RADIUS, angle=math.radians(angle), compliance=ARMLAB_COMPLIANCE)
+        for angle in ARMLAB_DIRECTION
     )
-    rod = Segment(length=ARMLAB_LENGTH, bending_stiffness=(0.0022, 0.0022), torsional_stiffness=0.001, body_radius=0.008, tendons=tendons)
+    rod = Segment(
+        length=ARMLAB_LENGTH,
+        bending_stiffness=(0.0022, 0.0022),
+        torsional_stiffness=0.001,
+        body_radius=0.008,
+        tendons=tendons,
+    )
     return Robot(
         name="armlab_tdcr",
         segments=(rod,),
@@ -211,7 +240,8 @@ _ADAPTERS: dict[str, Callable[[str | Path], tuple[RunLog, Robot]]] = {
 
 
 def detect(path: str | Path) -> Callable[[str | Path], tuple[RunLog, Robot]] | None:
-    """The adapter of the measured set whose raw file `path` is, known by its header; None for any other file."""
+    """The adapter of the measured set whose raw file `path` is, known by its header; None for any other
+    file."""
     try:
         with Path(path).open(encoding="utf-8-sig") as file:
             header = {name.strip() for name in file.readline(4096).split(",")}
@@ -223,15 +253,16 @@ def detect(path: str | Path) -> Callable[[str | Path], tuple[RunLog, Robot]] | N
 def read(path: str | Path, given: Robot | None) -> tuple[RunLog, Robot]:
     """A run log of the robot `given`, or a raw file of a measured set, which brings its own, with that robot.
 
-    Raises `InputError` where a run log comes without its robot, or the robot given has other tendons than the set's; `LogError` as the
-    readers.
+    Raises `InputError` where a run log comes without its robot, or the robot given has other tendons than the
+    set's; `LogError` as the readers.
     """
     path = Path(path)
     if adapter := detect(path):
         log, robot = adapter(path)
         if given is not None and given.n_tendons != robot.n_tendons:
             raise InputError(
-                f"robot {given.name!r} has {given.n_tendons} tendons, the one of {path.name} has {robot.n_tendons}; "
+                f"robot {given.name!r} has {given.n_tendons} tendons, the one of {path.name} has "
+                f"{robot.n_tendons}; "
                 "leave --robot out to take its own."
             )
         return log, given or robot
@@ -243,7 +274,10 @@ def read(path: str | Path, given: Robot | None) -> tuple[RunLog, Robot]:
 def _table(path: str | Path, name: str) -> Table:
     table = read_table(path)
     if missing := [column for column in _HEADERS[name] if column not in table]:
-        raise LogError(f"{Path(path).name} is not the raw file of {name}: it lacks column {missing[0]}; {nearest(missing[0], table)}")
+        raise LogError(
+            f"{Path(path).name} is not the raw file of {name}: it lacks column {missing[0]}; "
+            f"{nearest(missing[0], table)}"
+        )
     return table
 
 

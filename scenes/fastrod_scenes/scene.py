@@ -1,4 +1,5 @@
-"""`Scene`: robots, what surrounds them, what they are told, and what physics expects of it; `load(name)` finds one."""
+"""`Scene`: robots, what surrounds them, what they are told, and what physics expects of it; `load(name)`
+finds one."""
 
 from __future__ import annotations
 
@@ -43,7 +44,8 @@ class SceneError(FastrodError, AssertionError):
 
 
 class Scene(ABC):
-    """A simulation from the first input to the last, and the figures by which it is judged. It keeps nothing between runs.
+    """A simulation from the first input to the last, and the figures by which it is judged. It keeps nothing
+    between runs.
 
     >>> load("wall").dt
     0.01
@@ -63,7 +65,8 @@ class Scene(ABC):
 
     @abstractmethod
     def check(self) -> dict[str, float]:
-        """Run, and return the figures measured (name with unit -> value); `SceneError` where one is not as it must be."""
+        """Run, and return the figures measured (name with unit -> value); `SceneError` where one is not as it
+        must be."""
 
     @final
     def progress(self, t: float) -> float:
@@ -90,7 +93,8 @@ class RodScene(Scene):
 
     @final
     def run(self) -> Iterator[tuple[float, State]]:
-        """(t [s], state) of a new simulator's steps; the first has the inputs of t = 0, the last those of `duration`."""
+        """(t [s], state) of a new simulator's steps; the first has the inputs of t = 0, the last those of
+        `duration`."""
         simulator = self.simulator()
         for k in range(round(self.duration / self.dt) + 1):
             yield k * self.dt, simulator.step(**self.inputs(k * self.dt))
@@ -153,11 +157,15 @@ class Stage(HostedWorld):
     @final
     def soft_bodies(self) -> tuple[SoftBody, ...]:
         """All rods, in order."""
-        return tuple(SoftBody(rod.simulator.robots[0], rod.state, tuple(rod.bodies.ids)) for rod in self.rods if rod.state is not None)
+        return tuple(
+            SoftBody(rod.simulator.robots[0], rod.state, tuple(rod.bodies.ids))
+            for rod in self.rods
+            if rod.state is not None
+        )
 
     def carry(self) -> None:
-        """Put what follows the arm for the eye alone to where the arm is now: `advance` does so itself, who drives the arm by other ways
-        does it after each step of the world."""
+        """Put what follows the arm for the eye alone to where the arm is now: `advance` does so itself, who
+        drives the arm by other ways does it after each step of the world."""
 
 
 class HostedScene(Scene):

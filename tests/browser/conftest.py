@@ -1,4 +1,5 @@
-"""A real browser: Debian's chromium, driven by playwright. Where it is missing these tests skip, but for .ci/run, where they fail."""
+"""A real browser: Debian's chromium, driven by playwright. Where it is missing these tests skip, but for
+.ci/run, where they fail."""
 
 from __future__ import annotations
 

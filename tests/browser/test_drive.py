@@ -1,4 +1,5 @@
-"""Driving a robot in a real browser: sliders, drag, keys, scenes, stop, and what happens when a page is closed."""
+"""Driving a robot in a real browser: sliders, drag, keys, scenes, stop, and what happens when a page is
+closed."""
 
 from __future__ import annotations
 
@@ -36,7 +37,8 @@ def test_a_slider_moved_by_keys_bends_the_robot_and_the_picture(app: App, window
     for _ in range(45):
         thumb.press("ArrowRight")
     assert seen.until(lambda: page_of(app).pilot.arrived and page_of(app).pilot.bent(0)[0] > np.radians(44.0))
-    # an arc of 45 degrees and 0.07 m ends at (1 - cos a) l / a beside its base; wires of 1e-5 m/N give way a little
+    # an arc of 45 degrees and 0.07 m ends at (1 - cos a) l / a beside its base; wires of 1e-5 m/N give way a
+    # little
     a, length = np.radians(45.0), 0.07
     assert tip_of(app)[0] - before[0] == pytest.approx((1.0 - np.cos(a)) * length / a, rel=0.03)
     seen.page.wait_for_timeout(500)

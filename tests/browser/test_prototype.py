@@ -35,13 +35,18 @@ STANDS = 2e-5  # m of a wire: what noise of the plant and the drives' regulators
 
 
 class Paced:
-    """The emulated prototype in stepped time, a cycle every 10 ms at most: however busy the machine is, no cycle of its own is late."""
+    """The emulated prototype in stepped time, a cycle every 10 ms at most: however busy the machine is, no
+    cycle of its own is late."""
 
     real = True
 
     def __init__(self, bench: Bench) -> None:
         self.prototype = bench.prototype
-        self.robot, self.supervisor, self.clock = bench.prototype.robot, bench.prototype.supervisor, bench.prototype.clock
+        self.robot, self.supervisor, self.clock = (
+            bench.prototype.robot,
+            bench.prototype.supervisor,
+            bench.prototype.clock,
+        )
         self.source = bench.prototype.source
         self.asked: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self.ended = threading.Event()
@@ -157,7 +162,8 @@ def test_hands_drive_it_and_the_page_shows_what_it_says(bed: Bed, window: Window
 
 def test_what_is_beyond_a_limit_is_said_and_not_done(app: App, window: Windows) -> None:
     hardware = load_hardware()
-    tight = replace(hardware, limits=replace(hardware.limits, curvature=8.0))  # 0.56 rad; the slider goes to 61 degrees by its wires
+    # 0.56 rad; the slider goes to 61 degrees by its wires
+    tight = replace(hardware, limits=replace(hardware.limits, curvature=8.0))
     with emulated(tight, seed=3, effect="none", home=False) as bench:
         bed = Bed(bench, app)
         seen = window(app.address)
@@ -193,8 +199,11 @@ def test_stop_stands_at_once_and_go_on_moves_nothing(bed: Bed, window: Windows) 
     assert seen.until(lambda: bool(bed.link.wires()[0] > there[0] + 2e-4))
 
 
-def test_stop_only_stops_however_often_it_is_pressed(bed: Bed, window: Windows, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fastrod_viewer.session._HASTY", 60.0)  # a browser without a GPU may need a second for a click
+def test_stop_only_stops_however_often_it_is_pressed(
+    bed: Bed, window: Windows, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # a browser without a GPU may need a second for a click
+    monkeypatch.setattr("fastrod_viewer.session._HASTY", 60.0)
     seen, other = window(bed.app.address), window(bed.app.address)
     for each in (seen, other):
         assert each.page.get_by_role("button", name="GO ON").is_disabled()
@@ -207,7 +216,10 @@ def test_stop_only_stops_however_often_it_is_pressed(bed: Bed, window: Windows, 
     assert bed.says(seen, "GO ON within a second of a stop is ignored; press it again.")
     assert bed.stands(seen)
     monkeypatch.undo()
-    for press in (lambda: other.page.get_by_role("button", name="STOP", exact=True).click(), lambda: other.page.keyboard.press("Escape")):
+    for press in (
+        lambda: other.page.get_by_role("button", name="STOP", exact=True).click(),
+        lambda: other.page.keyboard.press("Escape"),
+    ):
         press()
         other.page.wait_for_timeout(1100)
         assert bed.page.session.stopped
@@ -219,11 +231,13 @@ def test_stop_only_stops_however_often_it_is_pressed(bed: Bed, window: Windows, 
     bed.go_on(seen)
     assert other.until(lambda: not bed.page.session.stopped)
     for each in (seen, other):
-        assert each.until(lambda each=each: each.page.get_by_role("button", name="GO ON").is_disabled())  # type: ignore[misc]
+        assert each.until(lambda each=each: each.page.get_by_role("button", name="GO ON").is_disabled())
         assert each.errors == []
 
 
-def test_after_a_fault_the_page_says_why_and_releases_when_the_cause_is_gone(bed: Bed, window: Windows) -> None:
+def test_after_a_fault_the_page_says_why_and_releases_when_the_cause_is_gone(
+    bed: Bed, window: Windows
+) -> None:
     seen = window(bed.app.address)
     assert bed.says(seen, "marker seen")
     bed.emulator.hidden = True
@@ -249,7 +263,9 @@ def test_nothing_moves_when_nobody_watches(bed: Bed, window: Windows, how: str) 
     if how == "closed":
         seen.close()
     else:
-        seen.page.evaluate("() => { setTimeout(() => { const end = Date.now() + 9000; while (Date.now() < end); }, 0); }")
+        seen.page.evaluate(
+            "() => { setTimeout(() => { const end = Date.now() + 9000; while (Date.now() < end); }, 0); }"
+        )
     assert other.until(lambda: bed.link.prototype.supervisor.first is not None)
     assert bed.stands(other)
     there = bed.link.wires()
@@ -263,7 +279,9 @@ def test_nothing_moves_when_nobody_watches(bed: Bed, window: Windows, how: str) 
     assert other.until(lambda: not bed.page.session.stopped)
 
 
-def test_a_recording_has_the_cameras_sightings_by_the_robots_clock(bed: Bed, window: Windows, tmp_path: Path) -> None:
+def test_a_recording_has_the_cameras_sightings_by_the_robots_clock(
+    bed: Bed, window: Windows, tmp_path: Path
+) -> None:
     seen = window(bed.app.address)
     seen.page.get_by_role("tab", name="Save").click()
     seen.page.get_by_role("button", name="Record a run log").click()
@@ -279,17 +297,33 @@ def test_a_recording_has_the_cameras_sightings_by_the_robots_clock(bed: Bed, win
     log = read_log(path, bed.link.robot)
     rate = load_hardware().camera.rate
     assert len(log) > 8
-    np.testing.assert_allclose(np.diff(log.t), 1.0 / rate, atol=0.011)  # each frame once, by the clock that cycles count
+    # each frame once, by the clock that cycles count
+    np.testing.assert_allclose(np.diff(log.t), 1.0 / rate, atol=0.011)
     assert 0.0 <= log.t[0] < 0.2
     assert log.dl[-1, 0] == pytest.approx(-0.0075 * np.radians(20.0), abs=1e-4)
-    assert 0.008 < log.tip_position[-1, 0] < 0.014  # an arc of 20 degrees and 70 mm ends 12 mm beside its base
+    # an arc of 20 degrees and 70 mm ends 12 mm beside its base
+    assert 0.008 < log.tip_position[-1, 0] < 0.014
     assert {"marker_flag", "marker_error", "current_1", "cmd_dl_1"} <= set(log.extra)
     assert seen.errors == []
 
 
 def test_sigterm_saves_the_recording_and_switches_off(tmp_path: Path, window: Windows) -> None:
-    command = [sys.executable, "-m", "fastrod.commands.cli", "drive", "--emulate", "--seed", "3", "--no-home", "--no-open", "--port", "0"]
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    command = [
+        sys.executable,
+        "-m",
+        "fastrod.commands.cli",
+        "drive",
+        "--emulate",
+        "--seed",
+        "3",
+        "--no-home",
+        "--no-open",
+        "--port",
+        "0",
+    ]
+    with subprocess.Popen(
+        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdout is not None
         line = process.stdout.readline()
         assert "http://127.0.0.1:" in line, process.communicate()

@@ -43,16 +43,22 @@ def test_the_time_slider_moves_the_robot_and_the_figures(app: App, window: Windo
     assert seen.until(lambda: page.frame == 0)
     seen.page.wait_for_timeout(500)
     before, left = seen.pixels(), thumb.bounding_box()
-    turned = float(page.playback.frame_time[np.argmin(np.abs(page.playback.base_quaternion[:, 0] - np.sqrt(0.5)))])
+    turned = float(
+        page.playback.frame_time[np.argmin(np.abs(page.playback.base_quaternion[:, 0] - np.sqrt(0.5)))]
+    )
     part = (turned + 5.0) / page.playback.duration  # the base lies on its side there
-    seen.page.mouse.click(left["x"] + 0.5 * left["width"] + part * (right["x"] - left["x"]), left["y"] + 0.5 * left["height"])
+    seen.page.mouse.click(
+        left["x"] + 0.5 * left["width"] + part * (right["x"] - left["x"]), left["y"] + 0.5 * left["height"]
+    )
     assert seen.until(lambda: abs(page.playback.frame_time[page.frame] - turned) < 10.0)
     seen.page.wait_for_timeout(500)
     assert (np.abs(seen.pixels().astype(int) - before)[:500, 340:].max(axis=2) > 40).sum() > 1000
     assert seen.errors == []
 
 
-def test_before_and_after_can_be_switched(app: App, window: Windows, tmp_path: Path, log_with_report: Path) -> None:
+def test_before_and_after_can_be_switched(
+    app: App, window: Windows, tmp_path: Path, log_with_report: Path
+) -> None:
     app.open(load(log_with_report))
     seen = window(app.address)
     page = replayed(app)
@@ -84,7 +90,8 @@ def test_a_session_is_recorded_read_back_and_replayed(app: App, window: Windows,
     log = read_log(path, robot)
     assert len(log) > 20
     assert log.dl[-1, 0] == pytest.approx(-0.0075 * np.radians(30.0), rel=1e-9)
-    result = replay(log, robot)  # the model that was driven answers as it did: 20 points a segment here, 10 there
+    # the model that was driven answers as it did: 20 points a segment here, 10 there
+    result = replay(log, robot)
     assert result.rms < 1e-6
     seen.page.get_by_role("button", name="Replay the recording").click()
     assert seen.until(lambda: isinstance(app.page, ReplayPage))
@@ -93,7 +100,9 @@ def test_a_session_is_recorded_read_back_and_replayed(app: App, window: Windows,
 
 
 @pytest.mark.parametrize("what", ["prototype", DEMO_LOG])
-def test_an_exported_page_opens_from_disk_without_a_network(app: App, window: Windows, tmp_path: Path, what: str) -> None:
+def test_an_exported_page_opens_from_disk_without_a_network(
+    app: App, window: Windows, tmp_path: Path, what: str
+) -> None:
     app.open(what)
     seen = window(app.address)
     if what == "prototype":

@@ -20,13 +20,19 @@ def prototype(compliance: float = 1e-7) -> Robot:
 def bent(x: float | Floats, y: float | Floats = 0.0) -> Floats:
     """(..., 4) tendon lengths that bend it toward +x and +y by these curvatures [1/m]."""
     angle = 0.5 * np.pi * np.arange(4)
-    return LENGTH * (1.0 - OFFSET * (np.cos(angle) * np.asarray(x)[..., None] + np.sin(angle) * np.asarray(y)[..., None]))
+    return LENGTH * (
+        1.0 - OFFSET * (np.cos(angle) * np.asarray(x)[..., None] + np.sin(angle) * np.asarray(y)[..., None])
+    )
 
 
 def passive(length: float = 0.3, stiffness: float = 0.02, weight: float = 0.3) -> Robot:
     """A rod without wires; `weight` [kg/m]."""
     rod = Segment(
-        length=length, bending_stiffness=(stiffness, stiffness), torsional_stiffness=stiffness, mode="passive", line_density=weight
+        length=length,
+        bending_stiffness=(stiffness, stiffness),
+        torsional_stiffness=stiffness,
+        mode="passive",
+        line_density=weight,
     )
     half = np.sqrt(0.5)
     return Robot(name="passive", segments=(rod,), base_quaternion=(float(half), 0.0, float(half), 0.0))

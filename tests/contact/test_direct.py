@@ -42,13 +42,16 @@ def naive_point(p, triangles):
 
 
 def naive_segment(p, q, triangles):
-    """(n,) distance from the segment p-q to each triangle: 0 where it crosses, else the least over edges and ends."""
+    """(n,) distance from the segment p-q to each triangle: 0 where it crosses, else the least over edges and
+    ends."""
     corner, edge, d = triangles, np.roll(triangles, -1, axis=1) - triangles, q - p
     normal = np.cross(edge[:, 0], edge[:, 1])
     hp, hq = dot(normal, p - corner[:, 0]), dot(normal, q - corner[:, 0])
     with np.errstate(divide="ignore", invalid="ignore"):
         x = p + (hp / (hp - hq))[:, None] * d
-        crosses = (hp * hq <= 0.0) & (dot(np.cross(edge, x[:, None] - corner), normal[:, None]) >= 0.0).all(axis=1)
+        crosses = (hp * hq <= 0.0) & (dot(np.cross(edge, x[:, None] - corner), normal[:, None]) >= 0.0).all(
+            axis=1
+        )
     best = np.minimum(naive_point(p, triangles), naive_point(q, triangles))
     w, dd, de, ee = p - corner, dot(d, d), dot(edge, d), dot(edge, edge)
     det = dd * ee - de**2
@@ -138,14 +141,23 @@ def test_an_open_surface_is_solid_behind_its_normals():
 
 
 def segments(rng, solid, n):
-    """Around, short and long, and exactly or nearly parallel to edges: where closest points are not unique."""
+    """Around, short and long, and exactly or nearly parallel to edges: where closest points are not
+    unique."""
     t, size = solid.triangles, solid.extents.max()
-    start = np.vstack([rng.uniform(-0.7, 0.7, (n, 3)) * solid.extents, t[rng.integers(len(t), size=3 * n)].mean(axis=1)])
+    start = np.vstack(
+        [rng.uniform(-0.7, 0.7, (n, 3)) * solid.extents, t[rng.integers(len(t), size=3 * n)].mean(axis=1)]
+    )
     start[n:] += 0.1 * size * rng.normal(size=(3 * n, 3)) * rng.choice([0.01, 0.3, 1.0], size=(3 * n, 1))
     edges = t[:, 1] - t[:, 0]
-    along = np.vstack([rng.normal(size=(2 * n, 3)), np.eye(3)[rng.integers(3, size=n)], edges[rng.integers(len(t), size=n)]])
-    along[2 * n :] += rng.choice([0.0, 1e-15, 1e-12, 1e-8], size=(2 * n, 1)) * rng.normal(size=(2 * n, 3)) * size
-    return start, start + along / np.linalg.norm(along, axis=1, keepdims=True) * size * 10.0 ** rng.uniform(-4, 0.2, (4 * n, 1))
+    along = np.vstack(
+        [rng.normal(size=(2 * n, 3)), np.eye(3)[rng.integers(3, size=n)], edges[rng.integers(len(t), size=n)]]
+    )
+    along[2 * n :] += (
+        rng.choice([0.0, 1e-15, 1e-12, 1e-8], size=(2 * n, 1)) * rng.normal(size=(2 * n, 3)) * size
+    )
+    return start, start + along / np.linalg.norm(along, axis=1, keepdims=True) * size * 10.0 ** rng.uniform(
+        -4, 0.2, (4 * n, 1)
+    )
 
 
 @pytest.mark.parametrize("name", SOLIDS)
@@ -181,7 +193,9 @@ def test_a_segment_parallel_to_a_face_is_not_missed():
         ((-0.01069241, -0.01419146, 0.0102913), (0.01301461, -0.01419146, 0.0102913)),
     ]
     for a, b in [*zip(start, ends, strict=True), *np.array(found)]:
-        assert scene.segment(0, a, b).distance == pytest.approx(naive_segment(a, b, triangles).min(), abs=EXACT)
+        assert scene.segment(0, a, b).distance == pytest.approx(
+            naive_segment(a, b, triangles).min(), abs=EXACT
+        )
 
 
 def test_a_segment_that_crosses_has_no_distance_and_one_of_no_length_is_a_point():
@@ -190,7 +204,8 @@ def test_a_segment_that_crosses_has_no_distance_and_one_of_no_length_is_a_point(
     assert through.distance == pytest.approx(0.0, abs=EXACT)
     assert abs(through.point[2]) == pytest.approx(0.01)
     assert scene.segment(0, (0.001, 0.002, 0.0), (0.001, 0.002, 0.05)).fraction == pytest.approx(0.2)
-    assert scene.segment(0, (0.001, 0.002, -0.002), (0.001, 0.002, 0.004)).distance == pytest.approx(0.006)  # inside: to the wall
+    # inside: to the wall
+    assert scene.segment(0, (0.001, 0.002, -0.002), (0.001, 0.002, 0.004)).distance == pytest.approx(0.006)
     for p in np.random.default_rng(3).uniform(-0.04, 0.04, (40, 3)):
         assert scene.segment(0, p, p).distance == pytest.approx(abs(scene.point(0, p).distance), abs=EXACT)
 
@@ -203,7 +218,9 @@ def test_faces_far_below_a_millimetre_are_not_lost():
     scene = DirectScene([obstacle])
     triangles = obstacle.vertices[obstacle.faces]
     for a, b in zip(*segments(rng, solid, 12), strict=True):
-        assert scene.segment(0, a, b).distance == pytest.approx(naive_segment(a, b, triangles).min(), abs=EXACT)
+        assert scene.segment(0, a, b).distance == pytest.approx(
+            naive_segment(a, b, triangles).min(), abs=EXACT
+        )
         assert abs(scene.point(0, a).distance) == pytest.approx(naive_point(a, triangles).min(), abs=EXACT)
 
 
@@ -212,7 +229,10 @@ def test_a_moved_mesh_is_the_mesh_moved():
     obstacle = mesh(SOLIDS["torus"](), position=(0.1, 0.0, 0.2))
     scene = DirectScene([sphere(0.01), obstacle])
     still = DirectScene([mesh(SOLIDS["torus"]())])
-    assert scene.point(1, (0.1, 0.0, 0.2)).distance == pytest.approx(still.point(0, (0, 0, 0)).distance, abs=EXACT)  # at rest
+    # at rest
+    assert scene.point(1, (0.1, 0.0, 0.2)).distance == pytest.approx(
+        still.point(0, (0, 0, 0)).distance, abs=EXACT
+    )
     for _ in range(30):
         q = rng.normal(size=4)
         q /= np.linalg.norm(q)
@@ -235,8 +255,12 @@ def test_the_tree_of_a_mesh_is_built_once():
     first, second = DirectScene([obstacle]), DirectScene([obstacle, obstacle])
     first.place(0, (0.1, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
     second.place(1, (0.2, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-    distances = [first.point(0, (0, 0, 0.05)).distance, *(second.point(k, (0, 0, 0.05)).distance for k in (0, 1))]
-    assert_allclose(distances, [math.hypot(0.075, 0.04), 0.04, math.hypot(0.175, 0.04)])  # poses are each scene's own
+    distances = [
+        first.point(0, (0, 0, 0.05)).distance,
+        *(second.point(k, (0, 0, 0.05)).distance for k in (0, 1)),
+    ]
+    # poses are each scene's own
+    assert_allclose(distances, [math.hypot(0.075, 0.04), 0.04, math.hypot(0.175, 0.04)])
     assert len({id(m) for m in (*first._meshes, *second._meshes)}) == 1
 
 
@@ -247,10 +271,19 @@ def surface(obstacle, n):
     round_ = np.stack([np.cos(2 * math.pi * u), np.sin(2 * math.pi * u)], axis=-1)
     if obstacle.shape == "box":
         square = np.stack([u - 0.5, v - 0.5, np.full(u.shape, 0.5)], axis=-1)
-        return np.vstack([np.roll(side * square, k, axis=1) for k in range(3) for side in (1.0, -1.0)]) * (a, b, c)
+        return np.vstack([np.roll(side * square, k, axis=1) for k in range(3) for side in (1.0, -1.0)]) * (
+            a,
+            b,
+            c,
+        )
     if obstacle.shape == "cylinder":
         wall = np.column_stack([a * round_, b * (v - 0.5)])
-        return np.vstack([wall, *(np.column_stack([a * v[:, None] * round_, np.full(u.shape, z)]) for z in (-b / 2, b / 2))])
+        return np.vstack(
+            [
+                wall,
+                *(np.column_stack([a * v[:, None] * round_, np.full(u.shape, z)]) for z in (-b / 2, b / 2)),
+            ]
+        )
     ball = a * np.column_stack([np.sin(math.pi * v)[:, None] * round_, np.cos(math.pi * v)])
     if obstacle.shape == "sphere":
         return ball
@@ -258,7 +291,13 @@ def surface(obstacle, n):
     return np.vstack([ends, np.column_stack([a * round_, b * (v - 0.5)])])
 
 
-PRIMITIVES = [sphere(0.02), box((0.04, 0.06, 0.03)), cylinder(0.02, 0.05), cylinder(0.03, 0.01), capsule(0.015, 0.04)]
+PRIMITIVES = [
+    sphere(0.02),
+    box((0.04, 0.06, 0.03)),
+    cylinder(0.02, 0.05),
+    cylinder(0.03, 0.01),
+    capsule(0.015, 0.04),
+]
 
 
 def holds(obstacle, p):
@@ -277,7 +316,8 @@ def test_primitives_know_their_nearest_surface_point(obstacle):
     for p in rng.uniform(-0.04, 0.04, (60, 3)):
         found = scene.point(0, p)
         nearest = np.linalg.norm(samples - p, axis=1).min()
-        assert -1e-12 <= nearest - abs(found.distance) < 4e-4  # samples lie on the surface, the nearest within a step of the grid
+        # samples lie on the surface, the nearest within a step of the grid
+        assert -1e-12 <= nearest - abs(found.distance) < 4e-4
         assert (found.distance < 0.0) == holds(obstacle, p)
         assert abs(scene.point(0, found.point).distance) < EXACT
         assert_allclose(found.point + found.distance * found.normal, p, atol=EXACT)
@@ -288,14 +328,32 @@ def test_primitives_know_their_nearest_surface_point(obstacle):
 
 
 def test_closed_forms_by_hand():
-    scene = DirectScene([box((0.2, 0.4, 0.6)), cylinder(0.1, 0.4), capsule(0.1, 0.4), plane((0, 0, 0.1), (0, 1, 0)), sphere(0.1)])
+    scene = DirectScene(
+        [
+            box((0.2, 0.4, 0.6)),
+            cylinder(0.1, 0.4),
+            capsule(0.1, 0.4),
+            plane((0, 0, 0.1), (0, 1, 0)),
+            sphere(0.1),
+        ]
+    )
     cases = [
-        (0, (0.2, 0.0, 0.0), 0.1), (0, (0.13, 0.24, 0.0), 0.05), (0, (0.0, 0.18, 0.0), -0.02), (0, (0.102, 0.203, 0.306), 0.007),
-        (1, (0.0, 0.0, 0.19), -0.01), (1, (0.13, 0.0, 0.24), 0.05), (1, (0.0, 0.0, 0.0), -0.1), (1, (0.0, 0.05, 0.3), 0.1),
-        (2, (0.0, 0.0, 0.35), 0.05), (2, (0.0, 0.05, -0.1), -0.05), (2, (0.0, 0.0, 0.0), -0.1),
-        (3, (5.0, 0.03, -7.0), 0.03), (3, (0.0, -2.0, 0.0), -2.0),
-        (4, (0.0, 0.0, 0.0), -0.1), (4, (0.3, 0.0, 0.4), 0.4),
-    ]  # fmt: skip
+        (0, (0.2, 0.0, 0.0), 0.1),
+        (0, (0.13, 0.24, 0.0), 0.05),
+        (0, (0.0, 0.18, 0.0), -0.02),
+        (0, (0.102, 0.203, 0.306), 0.007),
+        (1, (0.0, 0.0, 0.19), -0.01),
+        (1, (0.13, 0.0, 0.24), 0.05),
+        (1, (0.0, 0.0, 0.0), -0.1),
+        (1, (0.0, 0.05, 0.3), 0.1),
+        (2, (0.0, 0.0, 0.35), 0.05),
+        (2, (0.0, 0.05, -0.1), -0.05),
+        (2, (0.0, 0.0, 0.0), -0.1),
+        (3, (5.0, 0.03, -7.0), 0.03),
+        (3, (0.0, -2.0, 0.0), -2.0),
+        (4, (0.0, 0.0, 0.0), -0.1),
+        (4, (0.3, 0.0, 0.4), 0.4),
+    ]
     for k, p, distance in cases:
         assert scene.point(k, p).distance == pytest.approx(distance, abs=1e-14)
     assert_allclose(scene.point(3, (5.0, 0.03, -7.0)).normal, (0.0, 1.0, 0.0), atol=1e-15)
@@ -312,7 +370,8 @@ def test_segment_of_a_primitive_is_its_lowest_point(obstacle):
         found = scene.segment(0, a, b)
         along = [scene.point(0, a + t * (b - a)).distance for t in np.linspace(0.0, 1.0, 101)]
         assert found.distance <= min(along) + EXACT
-        assert found.distance >= min(along) - 0.005 * math.dist(a, b)  # a distance changes no faster than the point moves
+        # a distance changes no faster than the point moves
+        assert found.distance >= min(along) - 0.005 * math.dist(a, b)
         assert scene.point(0, found.on_segment).distance == pytest.approx(found.distance, abs=EXACT)
         assert math.dist(found.point, found.on_segment) == pytest.approx(abs(found.distance), abs=EXACT)
 

@@ -33,22 +33,55 @@ def spoilt(row, value):
 
 BROKEN = {
     "nothing": (([], []), {}, "mesh 'mesh' is empty: it has 0 faces"),
-    "no area": ((V[[0, 1, 0]], [[0, 1, 2]]), {}, "mesh 'mesh' is empty: it has 1 faces and none with an area"),
+    "no area": (
+        (V[[0, 1, 0]], [[0, 1, 2]]),
+        {},
+        "mesh 'mesh' is empty: it has 1 faces and none with an area",
+    ),
     "on a line": (([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]], [[0, 1, 2]]), {"open_surface": True}, "empty"),
-    "nan": ((spoilt(3, math.nan), F), {}, r"vertex 3 of mesh 'mesh' is \[nan, nan, nan\]; all must be finite \(1 of 8 are not\)"),
+    "nan": (
+        (spoilt(3, math.nan), F),
+        {},
+        r"vertex 3 of mesh 'mesh' is \[nan, nan, nan\]; all must be "
+        r"finite \(1 of 8 are not\)",
+    ),
     "inf": ((spoilt(5, math.inf), F), {}, "vertex 5 .* finite"),
-    "index high": ((V, np.where(F == 7, 8, F)), {}, r"face \d+ of mesh 'mesh' is .*8.*; its numbers must be between 0 and 7"),
+    "index high": (
+        (V, np.where(F == 7, 8, F)),
+        {},
+        r"face \d+ of mesh 'mesh' is .*8.*; its numbers must be "
+        r"between 0 and 7",
+    ),
     "index low": ((V, np.where(F == 7, -1, F)), {}, "-1.* must be between 0 and 7"),
     "quads": ((V, [[0, 1, 2, 3]]), {}, r"faces of shape \(1, 4\).*triangles only"),
     "float faces": ((V, F + 0.5), {}, "type float64; they must be .* integers"),
     "flat vertices": ((V[:, :2], F), {}, r"vertices of shape \(8, 2\)"),
     "words": (([["a", "b", "c"]], F), {}, "no table of numbers"),
-    "open": ((V, F[:-1]), {}, "mesh 'mesh' is not watertight: it has 3 open edges; .*open_surface=True.*solid lies behind its normals"),
-    "inverted": ((V, F[:, ::-1]), {"name": "cup"}, r"mesh 'cup' is inverted: it has a negative volume.*inwards.*mesh\.invert\(\)"),
+    "open": (
+        (V, F[:-1]),
+        {},
+        "mesh 'mesh' is not watertight: it has 3 open edges; "
+        ".*open_surface=True.*solid lies behind its normals",
+    ),
+    "inverted": (
+        (V, F[:, ::-1]),
+        {"name": "cup"},
+        r"mesh 'cup' is inverted: it has a negative "
+        r"volume.*inwards.*mesh\.invert\(\)",
+    ),
     "one of two inverted": (shell(inner=0.005, offset=0.08), {}, "inverted: 1 of its 2 bodies have"),
-    "winding": ((V, np.vstack([F[:-1], F[-1:, ::-1]])), {}, r"3 edges whose two faces wind in opposite ways; .*fix_winding"),
+    "winding": (
+        (V, np.vstack([F[:-1], F[-1:, ::-1]])),
+        {},
+        r"3 edges whose two faces wind in opposite "
+        r"ways; .*fix_winding",
+    ),
     "no volume": ((V[[0, 1, 2]], [[0, 1, 2], [0, 2, 1]]), {}, "encloses no volume.*open_surface=True"),
-    "touching": (trimesh.util.concatenate([CUBE, CUBE.copy().apply_translation((0.02, 0.03, 0))]), {}, "1 edges with more than two faces"),
+    "touching": (
+        trimesh.util.concatenate([CUBE, CUBE.copy().apply_translation((0.02, 0.03, 0))]),
+        {},
+        "1 edges with more than two faces",
+    ),
     "millimetres": ((1000.0 * V, F), {}, r"40 m wide; more than 10 m\. Was it given in mm\? scale=0\.001"),
     "tiny": ((V, F), {"scale": 1e-3}, "4e-05 m wide; tiny"),
     "scale zero": ((V, F), {"scale": 0.0}, r"scale of mesh 'mesh' is 0\.0; it must be positive and finite"),
@@ -69,19 +102,31 @@ def test_a_mesh_that_cannot_be_is_refused_in_one_sentence(case):
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: sphere(0.0), r"size of sphere 'sphere' is \[0\.0, 0\.0, 0\.0\] m; a sphere needs 1 positive and 2 zero numbers"),
+        (
+            lambda: sphere(0.0),
+            r"size of sphere 'sphere' is \[0\.0, 0\.0, 0\.0\] m; a sphere needs 1 "
+            r"positive and 2 zero numbers",
+        ),
         (lambda: box((0.1, -0.1, 0.1)), "a box needs 3 positive numbers"),
         (lambda: box((0.1, 0.1)), "must be 3 finite numbers"),
         (lambda: cylinder(0.01, math.nan), "size of cylinder .* must be 2 finite numbers"),
         (lambda: capsule(0.01, 20.0), r"20\.02 m wide; more than 10 m\. Was it given in mm\?"),
         (lambda: sphere(1e-6), "tiny"),
-        (lambda: sphere(0.1, position=(0.0, 0.0)), r"position of sphere 'sphere' is \(0\.0, 0\.0\); it must be 3 finite numbers \[m\]"),
+        (
+            lambda: sphere(0.1, position=(0.0, 0.0)),
+            r"position of sphere 'sphere' is \(0\.0, 0\.0\); it must "
+            r"be 3 finite numbers \[m\]",
+        ),
         (lambda: sphere(0.1, quaternion=(1.0, 1.0, 0.0, 0.0)), r"norm 1\.41421; it must be 1"),
         (lambda: sphere(0.1, friction=-0.1), r"friction of sphere 'sphere' is -0\.1; .* between 0 and 10"),
         (lambda: sphere(0.1, friction=10.5), "friction .* between 0 and 10"),
         (lambda: sphere(0.1, friction=math.nan), "friction"),
         (lambda: sphere(0.1, friction="low"), "friction .* 'low'; it must be a number"),
-        (lambda: sphere(0.1, stiffness=0.0), r"stiffness of sphere 'sphere' is 0\.0 N/m; it must be positive, or inf"),
+        (
+            lambda: sphere(0.1, stiffness=0.0),
+            r"stiffness of sphere 'sphere' is 0\.0 N/m; it must be "
+            r"positive, or inf",
+        ),
         (lambda: sphere(0.1, stiffness=math.nan), "stiffness"),
         (lambda: sphere(0.1, stifness=3.0), "no option 'stifness'; did you mean 'stiffness'"),
         (lambda: plane(normal=(0.0, 0.0, 0.0)), "plane normal .* must have a direction"),
@@ -98,9 +143,18 @@ def test_a_number_out_of_range_is_refused(make, words):
 
 
 def _made(**changed):
-    given = {"name": "x", "shape": "sphere", "size": (0.1, 0.0, 0.0), "position": (0, 0, 0), "quaternion": (1, 0, 0, 0), "friction": 0}
+    given = {
+        "name": "x",
+        "shape": "sphere",
+        "size": (0.1, 0.0, 0.0),
+        "position": (0, 0, 0),
+        "quaternion": (1, 0, 0, 0),
+        "friction": 0,
+    }
     none, nothing = np.empty((0, 3)), np.empty((0, 3), dtype=np.int64)
-    return Obstacle(**given | {"vertices": none, "faces": nothing, "stiffness": math.inf, "closed": True} | changed)
+    return Obstacle(
+        **given | {"vertices": none, "faces": nothing, "stiffness": math.inf, "closed": True} | changed
+    )
 
 
 def test_a_friction_above_five_is_called_unusual():
@@ -126,15 +180,24 @@ def test_files_that_cannot_be_read_say_which_and_what_is_near(tmp_path):
 def test_a_file_gives_the_mesh_that_was_written(tmp_path, suffix):
     CUBE.export(tmp_path / f"cup.{suffix}")
     loaded = mesh(str(tmp_path / f"cup.{suffix}"), position=[0, 0, 1], friction=0.2)
-    assert (loaded.name, loaded.shape, loaded.closed, loaded.position) == ("cup", "mesh", True, (0.0, 0.0, 1.0))
-    assert (loaded.vertices.shape, loaded.faces.shape, loaded.faces.dtype) == ((8, 3), (12, 3), np.int64)  # merged
+    assert (loaded.name, loaded.shape, loaded.closed, loaded.position) == (
+        "cup",
+        "mesh",
+        True,
+        (0.0, 0.0, 1.0),
+    )
+    # merged
+    assert (loaded.vertices.shape, loaded.faces.shape, loaded.faces.dtype) == ((8, 3), (12, 3), np.int64)
     assert_allclose(loaded.as_trimesh().volume, 0.02 * 0.03 * 0.04, rtol=1e-6)  # float32
 
 
 def test_bodies_of_a_scene_keep_their_transforms_and_millimetres_scale(tmp_path):
     scene = trimesh.Scene()
     for x in (0.0, 50.0):
-        scene.add_geometry(CUBE.copy().apply_scale(1000.0), transform=trimesh.transformations.translation_matrix((x, 0.0, 0.0)))
+        scene.add_geometry(
+            CUBE.copy().apply_scale(1000.0),
+            transform=trimesh.transformations.translation_matrix((x, 0.0, 0.0)),
+        )
     scene.export(tmp_path / "two.glb")
     two = mesh(Path(tmp_path / "two.glb"), scale=0.001)
     assert_allclose(np.ptp(two.vertices, axis=0), (0.07, 0.03, 0.04), rtol=1e-6)
@@ -166,7 +229,8 @@ def test_a_sliver_is_joined_to_its_neighbour_and_the_surface_stays_closed():
     a, b, c = F[0]
     longest = max(((a, b, c), (b, c, a), (c, a, b)), key=lambda e: np.linalg.norm(V[e[0]] - V[e[1]]))
     p, q, r = longest
-    middle = 0.4 * V[p] + 0.6 * V[q]  # new vertex on one side of the edge only: a face without area fills the gap
+    # new vertex on one side of the edge only: a face without area fills the gap
+    middle = 0.4 * V[p] + 0.6 * V[q]
     faces = np.vstack([F[1:], [[p, 8, r], [8, q, r], [p, q, 8]]])
     made = mesh((np.vstack([V, middle]), faces))
     solid = made.as_trimesh()
@@ -199,7 +263,9 @@ def test_primitives_say_their_size_and_draw_themselves():
     assert_allclose(made[4].as_trimesh().face_normals, [(0.0, 0.0, 1.0)] * 2)
 
 
-@pytest.mark.parametrize("normal", [(0.0, 0.0, 3.0), (1.0, 2.0, -0.5), (0.0, 0.0, -1.0), (1e-9, 0.0, -1.0), (0.0, -1.0, 0.0)])
+@pytest.mark.parametrize(
+    "normal", [(0.0, 0.0, 3.0), (1.0, 2.0, -0.5), (0.0, 0.0, -1.0), (1e-9, 0.0, -1.0), (0.0, -1.0, 0.0)]
+)
 def test_a_plane_turns_its_z_to_the_normal(normal):
     w, x, y, z = plane(normal=normal).quaternion
     third = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
@@ -210,7 +276,8 @@ def test_pseudonormals_of_a_cube_are_its_diagonals():
     normals = pseudonormals(V, F)
     size = np.array([0.02, 0.03, 0.04])
     assert_allclose(np.linalg.norm(normals, axis=-1), 1.0)
-    assert_allclose(normals[:, 4:], np.sign(V[F]) / math.sqrt(3.0), atol=1e-12)  # however the corner is cut, by the angle weights
+    # however the corner is cut, by the angle weights
+    assert_allclose(normals[:, 4:], np.sign(V[F]) / math.sqrt(3.0), atol=1e-12)
     assert_allclose(normals[:, 0], CUBE.face_normals, atol=1e-12)
     middle = 0.5 * (V[F] + V[np.roll(F, -1, axis=1)]) / (0.5 * size)
     out = np.where(np.abs(middle) > 0.99, np.sign(middle), 0.0)

@@ -1,4 +1,5 @@
-"""The contact law against every choice of open and closed contacts, and, with friction, against its own conditions."""
+"""The contact law against every choice of open and closed contacts, and, with friction, against its own
+conditions."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ from numpy.testing import assert_allclose
 from fastrod.kernels.contact.contact_law import contact_forces, law_size
 
 GOOD = 5e-9
-"""m; the law is solved to 1e-10 m in its own measure, motions of some mm; conditions add up several of these."""
+"""m; the law is solved to 1e-10 m in its own measure, motions of some mm; conditions add up several of
+these."""
 
 
 @njit()
@@ -27,7 +29,9 @@ def solve(W, b, friction=0.0, compliance=0.0, start=None):
     n, m = len(W), b.shape[1] // 3
     force = np.zeros(b.shape) if start is None else start.copy()
     agreed = np.zeros(n, np.int64)
-    friction, compliance = (np.array(np.broadcast_to(a, (n, m)), float, order="C") for a in (friction, compliance))
+    friction, compliance = (
+        np.array(np.broadcast_to(a, (n, m)), float, order="C") for a in (friction, compliance)
+    )
     W, b = (np.array(a, float, order="C") for a in (W, b))
     _solve_all(W, b, friction, compliance, force, agreed, np.empty(law_size(m)))
     return force, agreed == 1
@@ -42,11 +46,17 @@ def worlds(rng, n, m, condition=100.0):
 
 
 def along_a_rod(rng, n, m, bunched):
-    """W of contacts on a cantilever of 0.1 m that bends two ways and hardly stretches; nearly singular where they are `bunched`."""
-    s = rng.uniform(0.03, 0.1, (n, 1)) + rng.uniform(-1e-4, 1e-4, (n, m)) if bunched else rng.uniform(0.02, 0.1, (n, m))
+    """W of contacts on a cantilever of 0.1 m that bends two ways and hardly stretches; nearly singular where
+    they are `bunched`."""
+    s = (
+        rng.uniform(0.03, 0.1, (n, 1)) + rng.uniform(-1e-4, 1e-4, (n, m))
+        if bunched
+        else rng.uniform(0.02, 0.1, (n, m))
+    )
     low, high = np.minimum(s[:, :, None], s[:, None]), np.maximum(s[:, :, None], s[:, None])
     bend = low**2 * (3.0 * high - low) / 6.0 / 0.0022
-    frame = np.linalg.qr(rng.normal(size=(n, m, 3, 3)))[0]  # columns: x, y, z of the rod in the contact's own axes
+    # columns: x, y, z of the rod in the contact's own axes
+    frame = np.linalg.qr(rng.normal(size=(n, m, 3, 3)))[0]
     W = np.einsum("ncik,ncd,ndjk,k->ncidj", frame, bend, frame, np.array([1.0, 1.0, 1e-3]))
     return W.reshape(n, 3 * m, 3 * m), 2e-3 * rng.normal(size=(n, 3 * m))
 
@@ -67,19 +77,28 @@ def by_choice(W, b, compliance):
 
 
 def violation(W, b, friction, compliance, force):
-    """(n,) how far forces are from the law, as a motion [m]: gap, pull, both at once; cone; slip not against the force."""
+    """(n,) how far forces are from the law, as a motion [m]: gap, pull, both at once; cone; slip not against
+    the force."""
     n, m = len(W), b.shape[1] // 3
     u = ((W @ force[:, :, None])[:, :, 0] + b).reshape(n, m, 3)
     f = force.reshape(n, m, 3)
     size = np.diagonal(W, axis1=1, axis2=2).reshape(n, m, 3)
     un, fn = u[:, :, 0] + compliance * f[:, :, 0], f[:, :, 0]
     normal = np.abs(np.minimum(un, fn * (size[:, :, 0] + compliance)))
-    ft, slip, soft = np.linalg.norm(f[:, :, 1:], axis=2), np.linalg.norm(u[:, :, 1:], axis=2), size[:, :, 1:].max(2)
+    ft, slip, soft = (
+        np.linalg.norm(f[:, :, 1:], axis=2),
+        np.linalg.norm(u[:, :, 1:], axis=2),
+        size[:, :, 1:].max(2),
+    )
     cone = np.maximum(ft - friction * fn, 0.0) * soft
     inside = np.minimum(slip, np.maximum(friction * fn - ft, 0.0) * soft)  # what slips is on the cone
     against = np.linalg.norm(ft[:, :, None] * u[:, :, 1:] + slip[:, :, None] * f[:, :, 1:], axis=2) * soft
     opposed = np.minimum(slip, against / np.maximum(slip, ft * soft + 1e-300))
-    return np.where(friction > 0.0, np.maximum(normal, np.maximum(cone, np.maximum(inside, opposed))), np.maximum(normal, ft * soft)).max(1)
+    return np.where(
+        friction > 0.0,
+        np.maximum(normal, np.maximum(cone, np.maximum(inside, opposed))),
+        np.maximum(normal, ft * soft),
+    ).max(1)
 
 
 @pytest.mark.parametrize("m", [1, 2, 3, 5])
@@ -166,7 +185,10 @@ def test_any_start_ends_at_the_same_forces():
     assert_allclose(kept * size, one * size, rtol=0, atol=GOOD)
 
 
-WEDGE = np.kron(np.array([[1.0, -1.0], [-1.0, 1.0]]), np.diag([1.0, 0.5, 0.5]))[None], np.array([[-1e-3, 0.0, 0.0, -1e-3, 0.0, 0.0]])
+WEDGE = (
+    np.kron(np.array([[1.0, -1.0], [-1.0, 1.0]]), np.diag([1.0, 0.5, 0.5]))[None],
+    np.array([[-1e-3, 0.0, 0.0, -1e-3, 0.0, 0.0]]),
+)
 """Two walls that face each other on one point, each 1 mm too near."""
 
 

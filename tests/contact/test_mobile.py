@@ -13,7 +13,9 @@ PULL = np.array([-0.009, 0.0, 0.009, 0.0])
 
 def wall_and_rod(**wall):
     robot = load_robot("prototype")
-    scene = ContactScene(obstacles=[plane(point=(0.02, 0.0, 0.0), normal=(-1.0, 0.0, 0.0), name="wall", **wall)])
+    scene = ContactScene(
+        obstacles=[plane(point=(0.02, 0.0, 0.0), normal=(-1.0, 0.0, 0.0), name="wall", **wall)]
+    )
     return robot.rest_tendon_length, Simulator(robot, points_per_segment=10, contact=scene)
 
 
@@ -61,7 +63,8 @@ def test_body_that_is_hit_off_its_middle_gives_way_by_turning():
 
 @pytest.mark.parametrize("seed", range(5))
 def test_mobility_is_that_of_a_rigid_body(seed):
-    # W_ce = A_c (1/m + [r_c]^T I^-1 [r_e]) A_e^T for contacts on one body, nothing between two bodies or with a rod
+    # W_ce = A_c (1/m + [r_c]^T I^-1 [r_e]) A_e^T for contacts on one body, nothing between two bodies or with
+    # a rod
     rng = np.random.default_rng(seed)
     m = 5
     touched = np.array([0.0, 1.0, 2.0, 0.0, -1.0])
@@ -82,7 +85,9 @@ def test_mobility_is_that_of_a_rigid_body(seed):
         for e in range(m):
             if touched[c] >= 0 and touched[e] >= 0 and body[int(touched[c])] == body[int(touched[e])]:
                 g = give[int(touched[c])]
-                block = g[0] * np.eye(3) + hat(place[c] - g[10:]).T @ g[1:10].reshape(3, 3) @ hat(place[e] - g[10:])
+                block = g[0] * np.eye(3) + hat(place[c] - g[10:]).T @ g[1:10].reshape(3, 3) @ hat(
+                    place[e] - g[10:]
+                )
                 expected[3 * c : 3 * c + 3, 3 * e : 3 * e + 3] += axes[c] @ block @ axes[e].T
     add_mobility(m, touched, place.ravel(), axes.ravel(), body, give, W)
     np.testing.assert_allclose(W, expected, atol=1e-12)
@@ -99,4 +104,6 @@ def test_straight_rod_pressed_along_its_axis_on_something_soft(stiffness):
     assert state.ok[0]
     assert state.contacts.in_contact("wall")[0]
     if stiffness < 1e4:  # below the load under which the straight rod buckles
-        np.testing.assert_allclose(state.contacts.total_force[0], [0, 0, -stiffness * 0.0005], atol=1e-6 * stiffness)
+        np.testing.assert_allclose(
+            state.contacts.total_force[0], [0, 0, -stiffness * 0.0005], atol=1e-6 * stiffness
+        )

@@ -78,7 +78,10 @@ def test_crowds_fit_as_long_as_there_are_nodes():
     """n - 1 loads in one segment take all of its inner nodes, wherever they are; one more does not fit."""
     rng = np.random.default_rng(3)
     n_steps = 6
-    s = 0.03 + 0.07 * np.sort(np.where(rng.random((300, 1)) < 0.5, 0.999, 0.001) + 1e-4 * rng.uniform(-1, 1, (300, n_steps - 1)), axis=1)
+    s = 0.03 + 0.07 * np.sort(
+        np.where(rng.random((300, 1)) < 0.5, 0.999, 0.001) + 1e-4 * rng.uniform(-1, 1, (300, n_steps - 1)),
+        axis=1,
+    )
     at, node, crowded = placed(s, n_steps)
     assert crowded == -1
     assert_array_equal(node, np.broadcast_to(n_steps + np.arange(1, n_steps), node.shape))

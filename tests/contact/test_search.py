@@ -1,4 +1,5 @@
-"""No touch hides between two nodes: the search along a rod against a dense sampling, and steps against a signed distance of their own."""
+"""No touch hides between two nodes: the search along a rod against a dense sampling, and steps against a
+signed distance of their own."""
 
 from __future__ import annotations
 
@@ -37,8 +38,8 @@ def _search(curve, sweep, surfaces, frames, found):
 @pytest.mark.parametrize("nearest", [False, True])
 @pytest.mark.parametrize("radius", [0.0, 0.002, 0.012])
 def test_every_dip_of_an_interval_is_found(scenes, radius, nearest):
-    """Several balls of one mesh beside three nodes that are 30 mm apart: every ball that the rod enters has a candidate, and the
-    smallest gap is the sampled one."""
+    """Several balls of one mesh beside three nodes that are 30 mm apart: every ball that the rod enters has a
+    candidate, and the smallest gap is the sampled one."""
     rng, dense = np.random.default_rng(11), np.linspace(0.0, 0.06, 24001)
     line = np.stack([0.0 * dense, 0.0 * dense, dense], axis=1)
     s = np.array([0.0, 0.03, 0.06])
@@ -55,9 +56,13 @@ def test_every_dip_of_an_interval_is_found(scenes, radius, nearest):
         phi = scenes.distances(obstacle, np.array([0.0, 0, 0, 1, 0, 0, 0]), line)
         found = np.zeros((64, CANDIDATE))
         sweep = Sweep(np.array([radius]), 2, 0.0, 1e-3, 1e-3, nearest)
-        count, gap = _search(curve, sweep, pack([obstacle]), frames_of(np.array([[[0.0, 0, 0, 1, 0, 0, 0]]]))[0], found)
+        count, gap = _search(
+            curve, sweep, pack([obstacle]), frames_of(np.array([[[0.0, 0, 0, 1, 0, 0, 0]]]))[0], found
+        )
         assert gap <= phi.min() - radius + UNSEEN
-        dips = 1 + np.flatnonzero((phi[1:-1] < phi[:-2]) & (phi[1:-1] <= phi[2:]) & (phi[1:-1] < radius - UNSEEN))
+        dips = 1 + np.flatnonzero(
+            (phi[1:-1] < phi[:-2]) & (phi[1:-1] <= phi[2:]) & (phi[1:-1] < radius - UNSEEN)
+        )
         for k in dips if not nearest else []:
             near = np.abs(found[:count, 1] - dense[k]) < 1e-3
             assert near.any(), (at, depth, dense[k])
@@ -67,8 +72,11 @@ def test_every_dip_of_an_interval_is_found(scenes, radius, nearest):
 
 
 def test_the_curve_of_contact_is_the_shape():
-    """At 6 steps a segment the curve that contact searches and `shape` agree between the nodes, in contact too."""
-    scene = ContactScene(obstacles=[sphere(0.02, name="ball", position=(0.035, 0.004, 0.05))], rod_radius=0.004)
+    """At 6 steps a segment the curve that contact searches and `shape` agree between the nodes, in contact
+    too."""
+    scene = ContactScene(
+        obstacles=[sphere(0.02, name="ball", position=(0.035, 0.004, 0.05))], rod_radius=0.004
+    )
     sim = fastrod.Simulator(prototype(1e-5), points_per_segment=6, contact=scene)
     for part in np.linspace(0.0, 1.0, 6):
         state = sim.step(bent(12.0 * part, 4.0 * part))
@@ -77,9 +85,15 @@ def test_the_curve_of_contact_is_the_shape():
     s, p, t = state.arclength[0], state.position[0], state.rotation[0, :, :, 2]
     x = np.linspace(0.0, 1.0, 33)[1:-1, None, None]
     h = np.diff(s)[:, None]
-    hermite = (1 + 2 * x) * (1 - x) ** 2 * p[:-1] + h * x * (1 - x) ** 2 * t[:-1] + x**2 * (3 - 2 * x) * p[1:] - h * x**2 * (1 - x) * t[1:]
+    hermite = (
+        (1 + 2 * x) * (1 - x) ** 2 * p[:-1]
+        + h * x * (1 - x) ** 2 * t[:-1]
+        + x**2 * (3 - 2 * x) * p[1:]
+        - h * x**2 * (1 - x) * t[1:]
+    )
     at = (s[:-1] + x[:, :, 0] * np.diff(s)).reshape(1, -1)
-    assert np.linalg.norm(sim.shape(at).position[0] - hermite.reshape(-1, 3), axis=1).max() < 1e-5  # both are of the fourth order
+    # both are of the fourth order
+    assert np.linalg.norm(sim.shape(at).position[0] - hermite.reshape(-1, 3), axis=1).max() < 1e-5
 
 
 @pytest.mark.parametrize(
@@ -90,8 +104,8 @@ def test_the_curve_of_contact_is_the_shape():
     ],
 )
 def test_what_is_stuck_is_said(obstacle, points, words):
-    """An obstacle comes down on the whole rod in one step: it is not gone through, and one sentence says what, where, and what to
-    do."""
+    """An obstacle comes down on the whole rod in one step: it is not gone through, and one sentence says
+    what, where, and what to do."""
     scene = ContactScene(obstacles=[obstacle], rod_radius=0.004, max_passes=60)
     sim = fastrod.Simulator(prototype(1e-5), points_per_segment=points, contact=scene)
     sim.step(bent(1.0))
@@ -119,11 +133,13 @@ def test_what_is_stuck_is_said(obstacle, points, words):
     ],
 )
 def test_no_scene_is_deeper_than_it_says(scenes, seed, index, rows):
-    """A slice of `perf/contact_scenes.py`: whoever is ok is outside, and whoever is not says what is stuck."""
+    """A slice of `perf/contact_scenes.py`: whoever is ok is outside, and whoever is not says what is
+    stuck."""
     batch = scenes.make_batch(seed, index)
     played = scenes.play(batch, rows, max_passes=40)
     assert played.touching.any() or played.sentences
-    assert np.nanmax(np.where(played.ok, played.depth, np.nan)) < 3e-5  # UNSEEN, the rest's 1e-6 m and the sampling's error
+    # UNSEEN, the rest's 1e-6 m and the sampling's error
+    assert np.nanmax(np.where(played.ok, played.depth, np.nan)) < 3e-5
     for said in played.sentences:
         assert repr(batch.obstacle.name) in said
         assert "arclength" in said

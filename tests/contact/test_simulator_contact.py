@@ -1,4 +1,5 @@
-"""Rods against obstacles through the simulator: published figures, statics, friction, and what may never happen."""
+"""Rods against obstacles through the simulator: published figures, statics, friction, and what may never
+happen."""
 
 from __future__ import annotations
 
@@ -18,20 +19,27 @@ ON_SIDE = (np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0)  # turns the axis of a cylinder
 
 def wall(stiffness: float = np.inf, friction: float = 0.0) -> ContactScene:
     return ContactScene(
-        obstacles=[plane(point=(0.012, 0, 0), normal=(-1, 0, 0), name="wall", stiffness=stiffness, friction=friction)], rod_radius=0.0
+        obstacles=[
+            plane(point=(0.012, 0, 0), normal=(-1, 0, 0), name="wall", stiffness=stiffness, friction=friction)
+        ],
+        rod_radius=0.0,
     )
 
 
 def bar(friction: float = 0.0, **options) -> ContactScene:
     return ContactScene(
-        obstacles=[cylinder(0.01, 0.2, name="bar", position=(0.018, 0, 0.05), quaternion=ON_SIDE, friction=friction)],
+        obstacles=[
+            cylinder(0.01, 0.2, name="bar", position=(0.018, 0, 0.05), quaternion=ON_SIDE, friction=friction)
+        ],
         rod_radius=0.003,
         **options,
     )
 
 
 # tip force [N] and tip z [m] of a rod whose wires do not stretch
-@pytest.mark.parametrize(("curvature", "force", "z"), [(8.0, 0.576, 0.067955), (12.0, 1.323, 0.066458), (16.0, 2.071, 0.064271)])
+@pytest.mark.parametrize(
+    ("curvature", "force", "z"), [(8.0, 0.576, 0.067955), (12.0, 1.323, 0.066458), (16.0, 2.071, 0.064271)]
+)
 def test_tip_pressed_on_a_wall(curvature, force, z):
     state = fastrod.Simulator(prototype(), contact=wall()).settle(bent(curvature))
     assert state.ok.all()
@@ -66,11 +74,14 @@ def test_soft_walls_approach_the_rigid_one():
 
 @pytest.mark.parametrize("stiffness", [4.0, 100.0])
 def test_rod_that_lies_on_a_soft_floor_needs_no_contact_at_every_place(stiffness):
-    """A contact more is a spring more: there are no more of them than hold the rod, however many it might have."""
+    """A contact more is a spring more: there are no more of them than hold the rod, however many it might
+    have."""
     robot, press, half = passive(0.2, 0.0022, 0.0), [], np.sqrt(0.5)
     for most in (16, 32):
         floor = plane(point=(0, 0, -0.005), normal=(0, 0, 1), name="floor", stiffness=stiffness)
-        sim = fastrod.Simulator(robot, contact=ContactScene(obstacles=[floor], rod_radius=0.012, max_contacts=most))
+        sim = fastrod.Simulator(
+            robot, contact=ContactScene(obstacles=[floor], rod_radius=0.012, max_contacts=most)
+        )
         state = sim.settle(base_pose=[0.0, 0.0, 0.006, half, 0.0, half, 0.0])
         assert state.ok.all(), state.problems
         press.append(state.contacts.total_force[0, 2])
@@ -120,7 +131,8 @@ def test_forces_and_moments_balance():
 
 
 def test_friction_holds_then_slides_and_takes_energy():
-    """The tip is dragged along a wall: within the cone it sticks, beyond it slides against the force on it."""
+    """The tip is dragged along a wall: within the cone it sticks, beyond it slides against the force on
+    it."""
     friction, sim = 0.4, fastrod.Simulator(prototype(1e-5), contact=wall(friction=0.4))
     state = sim.settle(bent(12.0))
     state = sim.settle(bent(12.0))
@@ -138,7 +150,8 @@ def test_friction_holds_then_slides_and_takes_energy():
         assert pressed > 0.0
         assert np.linalg.norm(across) <= friction * pressed * (1.0 + 1e-6)
         work += across @ slip
-        # friction never adds energy: what sticks may still creep by the 1e-6 m to which a step is at rest, what slides loses some
+        # friction never adds energy: what sticks may still creep by the 1e-6 m to which a step is at rest,
+        # what slides loses some
         assert across @ slip <= 1e-6 * np.linalg.norm(across)
         if np.linalg.norm(across) < friction * pressed * (1.0 - 1e-4):
             assert np.linalg.norm(slip) < 2e-6  # a step is at rest to 1e-6 m
@@ -152,7 +165,8 @@ def test_friction_holds_then_slides_and_takes_energy():
 
 
 def test_a_moving_belt_drags_the_tip():
-    """Velocity without a change of pose: the surface slips under the rod, which leans after it within the cone."""
+    """Velocity without a change of pose: the surface slips under the rod, which leans after it within the
+    cone."""
     sim = fastrod.Simulator(prototype(1e-5), contact=wall(friction=0.3))
     sim.settle(bent(10.0))
     for _ in range(30):
@@ -239,8 +253,15 @@ def test_a_mesh_bears_as_its_shape_does():
     import trimesh
 
     exact = fastrod.Simulator(prototype(1e-5), contact=bar()).settle(bent(12.0, 1.0))
-    tessellated = mesh(trimesh.creation.cylinder(0.01, 0.2, sections=720), name="bar", position=(0.018, 0, 0.05), quaternion=ON_SIDE)
-    state = fastrod.Simulator(prototype(1e-5), contact=ContactScene(obstacles=[tessellated], rod_radius=0.003)).settle(bent(12.0, 1.0))
+    tessellated = mesh(
+        trimesh.creation.cylinder(0.01, 0.2, sections=720),
+        name="bar",
+        position=(0.018, 0, 0.05),
+        quaternion=ON_SIDE,
+    )
+    state = fastrod.Simulator(
+        prototype(1e-5), contact=ContactScene(obstacles=[tessellated], rod_radius=0.003)
+    ).settle(bent(12.0, 1.0))
     assert state.ok.all(), state.problems
     assert_allclose(state.tip_position, exact.tip_position, rtol=0, atol=2e-6)
     assert_allclose(state.contacts.total_force, exact.contacts.total_force, rtol=0, atol=0.02)
@@ -248,7 +269,9 @@ def test_a_mesh_bears_as_its_shape_does():
 
 def test_two_rods_press_each_other():
     base = np.array([[0, 0, 0, 1, 0, 0, 0], [0.03, 0.004, 0, 1, 0, 0, 0]], dtype=float)
-    sim = fastrod.Simulator(prototype(1e-5), n_robots=2, contact=ContactScene(worlds=[0, 0], rod_radius=0.004))
+    sim = fastrod.Simulator(
+        prototype(1e-5), n_robots=2, contact=ContactScene(worlds=[0, 0], rod_radius=0.004)
+    )
     for i in range(1, 9):
         state = sim.settle(bent([1.0 * i, -1.2 * i], [0.2 * i, -0.3 * i]), base_pose=base)
         assert state.ok.all(), state.problems
@@ -268,7 +291,10 @@ def test_queries():
     assert hits.distance[0, 0] == pytest.approx(0.012)
     assert hits.obstacle.tolist() == [[0, -1]]
     assert_allclose(hits.normal[0, 0], [-1, 0, 0], rtol=0, atol=1e-12)
-    free = fastrod.Simulator(prototype(1e-5), contact=ContactScene(obstacles=[sphere(0.005, position=(0, 0.02, 0.066))], rod_radius=0.0))
+    free = fastrod.Simulator(
+        prototype(1e-5),
+        contact=ContactScene(obstacles=[sphere(0.005, position=(0, 0.02, 0.066))], rod_radius=0.0),
+    )
     free.settle(bent(0.0, -6.0))
     free.step(bent(0.0, 3.0))
     ends = free.clearance()
@@ -298,7 +324,8 @@ def test_obstacles_that_are_seen_and_not_felt():
 
 
 def test_compliance_and_jacobian_hold_the_contact_forces():
-    """With the contact forces held, a small change of a tendon moves the tip as the same rod with those forces as loads."""
+    """With the contact forces held, a small change of a tendon moves the tip as the same rod with those
+    forces as loads."""
     sim = fastrod.Simulator(prototype(1e-5), contact=bar())
     state = sim.settle(bent(12.0, 1.0))
     free = fastrod.Simulator(prototype(1e-5))
@@ -326,7 +353,9 @@ def test_a_snapshot_holds_the_contacts():
 
 
 def test_tip_outputs_touch_as_full_ones_do():
-    full, tip = (fastrod.Simulator(prototype(1e-5), contact=bar(), outputs=outputs) for outputs in ("full", "tip"))
+    full, tip = (
+        fastrod.Simulator(prototype(1e-5), contact=bar(), outputs=outputs) for outputs in ("full", "tip")
+    )
     for part in np.linspace(0.0, 1.0, 6):
         whole, short = (sim.step(bent(12.0 * part, 1.0)) for sim in (full, tip))
     assert short.position.size == 0
@@ -344,10 +373,28 @@ def test_tip_outputs_touch_as_full_ones_do():
         (lambda: fastrod.Simulator(prototype(), contact=ContactScene(rod_radius=5.0)), "mm"),
         (lambda: fastrod.Simulator(prototype(), contact=ContactScene(mounting=0.2)), "mounting"),
         (lambda: fastrod.Simulator(prototype(), 2, contact=ContactScene(worlds=[0])), "world of each"),
-        (lambda: fastrod.Simulator(prototype()).step(bent(0.0), obstacle_pose={"wall": [0] * 7}), "contact scene"),
-        (lambda: fastrod.Simulator(prototype(), contact=wall()).step(bent(0.0), obstacle_pose={"wal": [0] * 7}), "did you mean 'wall'"),
-        (lambda: fastrod.Simulator(prototype(), contact=wall()).step(bent(0.0), obstacle_pose={"wall": [0] * 6}), "shape"),
-        (lambda: fastrod.Simulator(prototype(), contact=wall()).step(bent(0.0), obstacle_pose={"wall": [0, 0, 0, 2, 0, 0, 0]}), "norm"),
+        (
+            lambda: fastrod.Simulator(prototype()).step(bent(0.0), obstacle_pose={"wall": [0] * 7}),
+            "contact scene",
+        ),
+        (
+            lambda: fastrod.Simulator(prototype(), contact=wall()).step(
+                bent(0.0), obstacle_pose={"wal": [0] * 7}
+            ),
+            "did you mean 'wall'",
+        ),
+        (
+            lambda: fastrod.Simulator(prototype(), contact=wall()).step(
+                bent(0.0), obstacle_pose={"wall": [0] * 6}
+            ),
+            "shape",
+        ),
+        (
+            lambda: fastrod.Simulator(prototype(), contact=wall()).step(
+                bent(0.0), obstacle_pose={"wall": [0, 0, 0, 2, 0, 0, 0]}
+            ),
+            "norm",
+        ),
         (lambda: fastrod.Simulator(prototype()).clearance(), "contact scene"),
         (lambda: fastrod.Simulator(prototype(), contact=wall()).clearance(), "step or settle"),
     ],

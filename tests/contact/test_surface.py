@@ -39,7 +39,9 @@ PRIMITIVES = {
 def _distances(k, frame, points, bound, surfaces, out):
     stack = np.empty(2 * STACK)
     for i in range(len(points)):
-        d, n, near = signed_distance(k, frame, (points[i, 0], points[i, 1], points[i, 2]), bound[i], surfaces, stack)
+        d, n, near = signed_distance(
+            k, frame, (points[i, 0], points[i, 1], points[i, 2]), bound[i], surfaces, stack
+        )
         out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = d, n[0], n[1], n[2], 1.0 if near else 0.0
 
 
@@ -47,7 +49,10 @@ def _distances(k, frame, points, bound, surfaces, out):
 def _rays(k, frame, points, directions, longest, surfaces, out):
     stack = np.empty(2 * STACK)
     for i in range(len(points)):
-        p, along = (points[i, 0], points[i, 1], points[i, 2]), (directions[i, 0], directions[i, 1], directions[i, 2])
+        p, along = (
+            (points[i, 0], points[i, 1], points[i, 2]),
+            (directions[i, 0], directions[i, 1], directions[i, 2]),
+        )
         t, n = ray_hit(k, frame, p, along, longest, surfaces, stack)
         out[i, 0], out[i, 1], out[i, 2], out[i, 3] = t, n[0], n[1], n[2]
 
@@ -57,7 +62,9 @@ def _walls(k, frame, points, reach, surfaces, count, out):
     stack, found = np.empty(2 * STACK), np.empty(5 * MOST_PLANES)
     for i in range(len(points)):
         p = (points[i, 0], points[i, 1], points[i, 2])
-        count[i] = walls(k, frame, p, reach, signed_distance(k, frame, p, FAR, surfaces, stack)[0], surfaces, stack, found)
+        count[i] = walls(
+            k, frame, p, reach, signed_distance(k, frame, p, FAR, surfaces, stack)[0], surfaces, stack, found
+        )
         for j in range(5 * count[i]):
             out[i, j] = found[j]
 
@@ -66,7 +73,9 @@ def _walls(k, frame, points, reach, surfaces, count, out):
 def _curvatures(k, frame, points, surfaces, out):
     stack = np.empty(2 * STACK)
     for i in range(len(points)):
-        first, second, along = surface_curvature(k, frame, (points[i, 0], points[i, 1], points[i, 2]), surfaces, stack)
+        first, second, along = surface_curvature(
+            k, frame, (points[i, 0], points[i, 1], points[i, 2]), surfaces, stack
+        )
         out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = first, second, along[0], along[1], along[2]
 
 
@@ -82,20 +91,38 @@ class Seen:
     def distance(self, points, bound=FAR):
         """(n,) distance, (n, 3) normal, (n,) nearer than the bound."""
         out = np.empty((len(points), 5))
-        _distances(1, self.frame, np.ascontiguousarray(points), np.broadcast_to(bound, len(points)).astype(float), self.surfaces, out)
+        _distances(
+            1,
+            self.frame,
+            np.ascontiguousarray(points),
+            np.broadcast_to(bound, len(points)).astype(float),
+            self.surfaces,
+            out,
+        )
         return out[:, 0], out[:, 1:4], out[:, 4] == 1.0
 
     def ray(self, points, directions, longest=FAR):
         """(n,) length, inf where there is no hit, and (n, 3) normal."""
         out = np.empty((len(points), 4))
-        _rays(1, self.frame, np.ascontiguousarray(points), np.ascontiguousarray(directions), longest, self.surfaces, out)
+        _rays(
+            1,
+            self.frame,
+            np.ascontiguousarray(points),
+            np.ascontiguousarray(directions),
+            longest,
+            self.surfaces,
+            out,
+        )
         return np.where(out[:, 0] < FAR, out[:, 0], np.inf), out[:, 1:]
 
     def walls(self, points, reach):
         """For each point its walls, (distance, normal) by distance."""
         count, out = np.zeros(len(points), np.int64), np.empty((len(points), 5 * MOST_PLANES))
         _walls(1, self.frame, np.ascontiguousarray(points), reach, self.surfaces, count, out)
-        return [sorted((row[5 * j], *row[5 * j + 1 : 5 * j + 4]) for j in range(n)) for n, row in zip(count, out, strict=True)]
+        return [
+            sorted((row[5 * j], *row[5 * j + 1 : 5 * j + 4]) for j in range(n))
+            for n, row in zip(count, out, strict=True)
+        ]
 
     def second_derivative(self, points):
         """(n, 3, 3) of the distance, put together from what `surface_curvature` returns."""
@@ -105,7 +132,10 @@ class Seen:
         tangent = np.eye(3) - n[:, :, None] * n[:, None]
         one = np.isclose(out[:, 0], out[:, 1])
         a = np.where(one[:, None], 0.0, along)
-        return out[:, 0, None, None] * (tangent - a[:, :, None] * a[:, None]) + out[:, 1, None, None] * a[:, :, None] * a[:, None]
+        return (
+            out[:, 0, None, None] * (tangent - a[:, :, None] * a[:, None])
+            + out[:, 1, None, None] * a[:, :, None] * a[:, None]
+        )
 
 
 def random_pose(rng):
@@ -122,7 +152,9 @@ def places(rng, solid, n):
     weight[2 * n :, 1:] = 0.0
     weight /= weight.sum(axis=1, keepdims=True)
     away = rng.normal(size=(3 * n, 3)) * 10.0 ** rng.uniform(-6, -2, size=(3 * n, 1))
-    return np.vstack([rng.uniform(-0.8, 0.8, (n, 3)) * solid.extents, (pick * weight[..., None]).sum(axis=1) + away])
+    return np.vstack(
+        [rng.uniform(-0.8, 0.8, (n, 3)) * solid.extents, (pick * weight[..., None]).sum(axis=1) + away]
+    )
 
 
 def direct(obstacle, pose, points):
@@ -146,7 +178,8 @@ def test_a_mesh_is_as_far_as_the_direct_path_says(name):
     assert (d > 0).any()
     assert_allclose(d, distance, rtol=0, atol=SAME)
     assert_allclose(np.linalg.norm(n, axis=1), 1.0, rtol=0, atol=1e-9)
-    for p, di, ni in zip(points, d, n, strict=True):  # also where two faces are as near, and the paths choose differently
+    # also where two faces are as near, and the paths choose differently
+    for p, di, ni in zip(points, d, n, strict=True):
         assert abs(scene.point(0, p - di * ni).distance) < 2e-9
     assert np.median(np.linalg.norm(n - normal, axis=1)) < 1e-9
 
@@ -156,13 +189,19 @@ def test_a_primitive_is_as_far_as_the_direct_path_says(name):
     rng = np.random.default_rng(2)
     obstacle, pose = PRIMITIVES[name](), random_pose(rng)
     seen = Seen(obstacle, pose)
-    local = np.vstack([rng.uniform(-0.06, 0.06, (300, 3)), rng.uniform(-0.03, 0.03, (100, 1)) * np.eye(3)[rng.integers(3, size=100)]])
+    local = np.vstack(
+        [
+            rng.uniform(-0.06, 0.06, (300, 3)),
+            rng.uniform(-0.03, 0.03, (100, 1)) * np.eye(3)[rng.integers(3, size=100)],
+        ]
+    )
     points = local @ seen.turn.T + seen.at
     _, distance, normal = direct(obstacle, pose, points)
     d, n, near = seen.distance(points)
     assert near.all()
     assert_allclose(d, distance, rtol=0, atol=1e-12)
-    assert (np.linalg.norm(n - normal, axis=1) < 1e-9).mean() > 0.9  # the rest is on an axis, or as near to two sides
+    # the rest is on an axis, or as near to two sides
+    assert (np.linalg.norm(n - normal, axis=1) < 1e-9).mean() > 0.9
     unique = slice(0, 300)
     assert_allclose(n[unique], normal[unique], rtol=0, atol=1e-9)
 
@@ -238,11 +277,14 @@ def test_a_ray_meets_the_triangle_that_brute_force_finds(name):
     assert np.abs(seen.distance(at)[0]).max() < SAME
     assert_allclose(np.linalg.norm(n[hit], axis=1), 1.0, rtol=0, atol=1e-12)
     short = 0.7 * np.median(expected[hit])
-    assert_allclose(Seen(obstacle).ray(p, v, short)[0], np.where(expected <= short, expected, np.inf), rtol=0, atol=1e-12)
+    assert_allclose(
+        Seen(obstacle).ray(p, v, short)[0], np.where(expected <= short, expected, np.inf), rtol=0, atol=1e-12
+    )
 
 
 def exact_ray(obstacle, p, v):
-    """Where a ray from outside enters, or from inside leaves, inf if never; for a sphere, a plane and a box."""
+    """Where a ray from outside enters, or from inside leaves, inf if never; for a sphere, a plane and a
+    box."""
     if obstacle.shape == "plane":
         t = np.array([-p[2] / v[2]])
     elif obstacle.shape == "sphere":
@@ -315,9 +357,14 @@ def test_the_walls_of_a_concave_corner():
 
 
 def test_a_wall_is_seen_from_above_the_diagonal_of_its_two_triangles():
-    wide, slim = trimesh.creation.box(extents=(0.25, 0.25, 0.25)), trimesh.creation.box(extents=(0.0625, 0.125, 0.125))
+    wide, slim = (
+        trimesh.creation.box(extents=(0.25, 0.25, 0.25)),
+        trimesh.creation.box(extents=(0.0625, 0.125, 0.125)),
+    )
     slim.invert()
-    beside, above = Seen(mesh(trimesh.util.concatenate([wide, slim]))).walls([[1e-6, 0.0, 0.0605], [0.0, 0.0, 0.0605]], 0.01)
+    beside, above = Seen(mesh(trimesh.util.concatenate([wide, slim]))).walls(
+        [[1e-6, 0.0, 0.0605], [0.0, 0.0, 0.0605]], 0.01
+    )
     assert len(beside) == 1
     assert len(above) == 1
 
@@ -337,7 +384,9 @@ def test_the_outside_of_a_convex_body_has_one_wall():
 
 def difference(seen, points, h):
     """(n, 3, 3) central difference of the normal."""
-    columns = [(seen.distance(points + e)[1] - seen.distance(points - e)[1]) / (2.0 * h) for e in h * np.eye(3)]
+    columns = [
+        (seen.distance(points + e)[1] - seen.distance(points - e)[1]) / (2.0 * h) for e in h * np.eye(3)
+    ]
     return np.stack(columns, axis=2)
 
 
@@ -346,13 +395,17 @@ def test_the_normal_turns_as_the_curvature_says(name):
     rng = np.random.default_rng(9)
     solid = trimesh.creation.icosphere(subdivisions=1, radius=0.03)
     seen = Seen(mesh(solid) if name == "mesh" else PRIMITIVES[name](), random_pose(rng))
-    points = (places(rng, solid, 200) if name == "mesh" else rng.uniform(-0.06, 0.06, (600, 3))) @ seen.turn.T + seen.at
+    points = (
+        places(rng, solid, 200) if name == "mesh" else rng.uniform(-0.06, 0.06, (600, 3))
+    ) @ seen.turn.T + seen.at
     points = points[seen.distance(points)[0] > 3e-3]
     expected = seen.second_derivative(points)
     coarse, fine = difference(seen, points, 2e-6), difference(seen, points, 1e-6)
-    smooth = np.abs(coarse - fine).max(axis=(1, 2)) < 1e-3  # where a difference straddles two features it depends on its step
+    # where a difference straddles two features it depends on its step
+    smooth = np.abs(coarse - fine).max(axis=(1, 2)) < 1e-3
     assert smooth.mean() > 0.9
-    assert_allclose(fine[smooth], expected[smooth], rtol=0, atol=2e-3)  # of up to 1 / 3 mm: error of order h^2 / d^3
+    # of up to 1 / 3 mm: error of order h^2 / d^3
+    assert_allclose(fine[smooth], expected[smooth], rtol=0, atol=2e-3)
     if name == "mesh":  # faces, edges and vertices were all met
         rank = np.linalg.matrix_rank(expected, tol=1.0)
         assert set(rank) == {0, 1, 2}
@@ -360,7 +413,9 @@ def test_the_normal_turns_as_the_curvature_says(name):
 
 @pytest.mark.parametrize("name", [*SOLIDS, "tetrahedron"])
 def test_every_triangle_is_in_one_leaf_and_every_box_holds_what_is_below(name):
-    tetrahedron = trimesh.Trimesh([(0, 0, 0), (0.1, 0, 0), (0, 0.1, 0), (0, 0, 0.1)], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+    tetrahedron = trimesh.Trimesh(
+        [(0, 0, 0), (0.1, 0, 0), (0, 0.1, 0), (0, 0, 0.1)], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]
+    )
     obstacle = mesh(tetrahedron if name == "tetrahedron" else SOLIDS[name]())
     s = pack([mesh(SOLIDS["box"](), name="first"), sphere(0.1), obstacle])
     n = len(obstacle.faces)

@@ -4,8 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-UR5 = [(0.0, 0.089159, np.pi / 2), (-0.425, 0.0, 0.0), (-0.39225, 0.0, 0.0), (0.0, 0.10915, np.pi / 2), (0.0, 0.09465, -np.pi / 2),
-       (0.0, 0.0823, 0.0)]  # fmt: skip
+UR5 = [
+    (0.0, 0.089159, np.pi / 2),
+    (-0.425, 0.0, 0.0),
+    (-0.39225, 0.0, 0.0),
+    (0.0, 0.10915, np.pi / 2),
+    (0.0, 0.09465, -np.pi / 2),
+    (0.0, 0.0823, 0.0),
+]
 """a [m], d [m], alpha [rad] of each joint (Denavit and Hartenberg), as the maker prints them."""
 
 
@@ -17,7 +23,14 @@ class DhArm:
         frames = [np.eye(4)]
         for angle, (a, d, alpha) in zip(q, UR5, strict=True):
             c, s, ca, sa = np.cos(angle), np.sin(angle), np.cos(alpha), np.sin(alpha)
-            link = np.array([[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0.0, sa, ca, d], [0.0, 0.0, 0.0, 1.0]])
+            link = np.array(
+                [
+                    [c, -s * ca, s * sa, a * c],
+                    [s, c * ca, -c * sa, a * s],
+                    [0.0, sa, ca, d],
+                    [0.0, 0.0, 0.0, 1.0],
+                ]
+            )
             frames.append(frames[-1] @ link)
         return frames
 

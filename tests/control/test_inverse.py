@@ -1,4 +1,5 @@
-"""Plans by learning: without effects they are the nearest points in reach; with effects the tip still goes there."""
+"""Plans by learning: without effects they are the nearest points in reach; with effects the tip still goes
+there."""
 
 from __future__ import annotations
 
@@ -68,13 +69,15 @@ def test_without_effects_the_tip_goes_to_the_nearest_points() -> None:
 def test_the_nearest_points_are_nearest() -> None:
     given = made()
     near, goal = given.nearest[given.n_approach :], TURN
-    # a single arc of length l that bends by b in the plane phi: the tip is l / b (1 - cos b) out and l / b sin b up
+    # a single arc of length l that bends by b in the plane phi: the tip is l / b (1 - cos b) out and l / b
+    # sin b up
     b, phi = np.meshgrid(np.linspace(1e-6, 2.0, 800), np.linspace(-np.pi, np.pi, 721), indexing="ij")
     out, up = PROTOTYPE.length / b * (1.0 - np.cos(b)), PROTOTYPE.length / b * np.sin(b)
     surface = np.stack([out * np.cos(phi), out * np.sin(phi), up], axis=-1).reshape(-1, 3)
     for k in range(0, len(goal), 7):
         least = np.linalg.norm(surface - goal[k], axis=1).min()
-        assert np.linalg.norm(near[k] - goal[k]) == pytest.approx(least, abs=5e-6)  # tendons stretch, and the grid is 0.2 mm wide
+        # tendons stretch, and the grid is 0.2 mm wide
+        assert np.linalg.norm(near[k] - goal[k]) == pytest.approx(least, abs=5e-6)
         assert np.linalg.norm(surface - near[k], axis=1).min() < 2e-4
 
 
@@ -118,11 +121,16 @@ def test_all_at_once_and_a_camera_that_is_off() -> None:
 
 
 def test_the_base_may_stand_anyhow() -> None:
-    lying = replace(with_effects("gravity"), base_position=(0.3, -0.2, 0.1), base_quaternion=(np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0))
+    lying = replace(
+        with_effects("gravity"),
+        base_position=(0.3, -0.2, 0.1),
+        base_quaternion=(np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0),
+    )
     given = plan(lying, TURN, RATE)
     path = slice(given.n_approach, None)
     assert_allclose(given.predicted[path], given.nearest[path], atol=1e-5)
-    assert rms(run(made("gravity").robot, given)[path] - given.nearest[path]) > 1e-4  # gravity points elsewhere in this frame
+    # gravity points elsewhere in this frame
+    assert rms(run(made("gravity").robot, given)[path] - given.nearest[path]) > 1e-4
 
 
 def test_the_approach_is_smooth_and_begins_where_the_robot_stands() -> None:
@@ -159,7 +167,9 @@ def test_a_limit_is_kept_and_the_rest_done() -> None:
 
 
 def test_a_segment_that_extends_reaches_the_path_itself() -> None:
-    longer = replace(PROTOTYPE, segments=tuple(replace(segment, extension=(0.0, 0.02)) for segment in PROTOTYPE.segments))
+    longer = replace(
+        PROTOTYPE, segments=tuple(replace(segment, extension=(0.0, 0.02)) for segment in PROTOTYPE.segments)
+    )
     given = plan(longer, TURN, RATE)
     path = slice(given.n_approach, None)
     assert given.rms_nearest < 1e-6
@@ -207,7 +217,11 @@ def test_more_rollouts_are_never_worse() -> None:
         ({"start": [0.001, 0.0]}, "give 4 changes of wire length"),
         ({"start": [0.001, 0.0, 0.001, 0.0]}, "pull one wire as far as its opposite gives"),
         ({"start": [-0.01, 0.0, 0.01, 0.0], "limit": 0.005}, "within the limits"),
-        ({"rate_limit": 1e-3}, r"wire \d would move at 0.0\d+ m/s at .* s, beyond rate_limit 0.001 m/s; give a slower path"),
+        (
+            {"rate_limit": 1e-3},
+            r"wire \d would move at 0.0\d+ m/s at .* s, beyond rate_limit 0.001 m/s; "
+            r"give a slower path",
+        ),
     ],
 )
 def test_what_cannot_be_planned_is_said(options: dict[str, Any], sentence: str) -> None:
@@ -217,6 +231,8 @@ def test_what_cannot_be_planned_is_said(options: dict[str, Any], sentence: str) 
 
 
 def test_a_robot_without_displacements_is_refused() -> None:
-    pulled = replace(PROTOTYPE, segments=tuple(replace(segment, mode="tendon_tension") for segment in PROTOTYPE.segments))
+    pulled = replace(
+        PROTOTYPE, segments=tuple(replace(segment, mode="tendon_tension") for segment in PROTOTYPE.segments)
+    )
     with pytest.raises(RobotError, match="an action needs wires driven by length"):
         plan(pulled, TURN, RATE)

@@ -1,4 +1,5 @@
-"""The tip on a base: analytic Jacobian against differences of the settled tip, frames, control that closes the loop, refusals."""
+"""The tip on a base: analytic Jacobian against differences of the settled tip, frames, control that closes
+the loop, refusals."""
 
 from __future__ import annotations
 
@@ -30,9 +31,13 @@ BASES: list[tuple[Any, list[float]]] = [
 def two_segments(line_density: float = 0.15) -> Robot:
     wires = tuple(Tendon(offset=0.0075, angle=k * np.pi / 2) for k in range(4))
     segment = Segment(
-        length=0.1, bending_stiffness=(0.0022, 0.0022), torsional_stiffness=0.001, extension=(0.0, 0.03), line_density=line_density,
+        length=0.1,
+        bending_stiffness=(0.0022, 0.0022),
+        torsional_stiffness=0.001,
+        extension=(0.0, 0.03),
+        line_density=line_density,
         tendons=wires,
-    )  # fmt: skip
+    )
     return Robot(name="two", segments=(segment, segment))
 
 
@@ -41,7 +46,9 @@ def soft_tip(base: Any, line_density: float = 0.15, **options: Any) -> SoftTip:
 
 
 @pytest.mark.parametrize(("base", "q_base"), BASES, ids=["fixed", "moving", "turning", "arm"])
-def test_the_jacobian_is_that_of_the_settled_tip_under_weight_and_loads(base: Any, q_base: list[float]) -> None:
+def test_the_jacobian_is_that_of_the_settled_tip_under_weight_and_loads(
+    base: Any, q_base: list[float]
+) -> None:
     tip = soft_tip(base, flange_from_base=MOUNT)
     q = np.array([*q_base, *ACTION])
     tip.place(q, settle=True, tolerance=1e-12, **LOADS)
@@ -71,9 +78,14 @@ def test_rows_of_rotation_are_those_of_the_settled_tip() -> None:
     J = tip.jacobian(rotation=True)
     assert J.shape == (6, 12)
     for j in range(12):
-        ends = [tip.place(q + sign * 1e-5 * np.eye(12)[j], settle=True, tolerance=1e-13).tip_rotation[0] for sign in (1.0, -1.0)]
+        ends = [
+            tip.place(q + sign * 1e-5 * np.eye(12)[j], settle=True, tolerance=1e-13).tip_rotation[0]
+            for sign in (1.0, -1.0)
+        ]
         turn = ends[0] @ ends[1].T
-        expected = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2e-5
+        expected = (
+            0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2e-5
+        )
         assert_allclose(J[3:, j], expected, atol=1e-5 * np.abs(J[3:]).max())  # (1e-5 / 0.0075)^2 is 2e-6
 
 
@@ -83,7 +95,9 @@ def test_the_base_stands_where_frame_and_mount_say() -> None:
     flange = DhArm().chain(np.array(Q_ARM))[-1]
     assert_allclose(state.position[0, 0], flange[:3, 3] + flange[:3, :3] @ MOUNT[:3], atol=1e-12)
     c, s = np.cos(0.6), np.sin(0.6)
-    assert_allclose(state.rotation[0, 0], flange[:3, :3] @ [[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]], atol=1e-12)
+    assert_allclose(
+        state.rotation[0, 0], flange[:3, :3] @ [[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]], atol=1e-12
+    )
     assert_array_equal(tip.position, state.tip_position[0])
 
 
@@ -133,13 +147,20 @@ def test_the_loop_closes_on_a_point_that_can_be_reached(base: Any, q_base: list[
     tip = soft_tip(base)
     low, high = tip.limits()
     n = len(q_base)
-    goal = tip.place(np.array([*q_base, *ACTION]) + 0.3e-2, settle=True, tip_force=(0.03, 0.0, 0.0)).tip_position[0]
+    goal = tip.place(
+        np.array([*q_base, *ACTION]) + 0.3e-2, settle=True, tip_force=(0.03, 0.0, 0.0)
+    ).tip_position[0]
     q = np.array([*q_base, 0.01, 0.002, 0.0, 0.01, -0.001, 0.001])
     tip.place(q, settle=True, tip_force=(0.03, 0.0, 0.0))
     control = ResolvedRate(
-        gain=5.0, damping=1e-3, weight=[1.0] * n + [25.0] * 6, rate=[1.0] * n + [0.05] * 6, error_limit=0.02,
-        lower=[-7.0] * n + low.tolist(), upper=[7.0] * n + high.tolist(),
-    )  # fmt: skip
+        gain=5.0,
+        damping=1e-3,
+        weight=[1.0] * n + [25.0] * 6,
+        rate=[1.0] * n + [0.05] * 6,
+        error_limit=0.02,
+        lower=[-7.0] * n + low.tolist(),
+        upper=[7.0] * n + high.tolist(),
+    )
     for _ in range(400):
         q = q + 0.01 * control.rates(q, tip.jacobian(), goal - tip.position, np.zeros(3), 0.01)
         tip.place(q, tip_force=(0.03, 0.0, 0.0))
@@ -153,7 +174,9 @@ def test_moving_in_the_null_space_leaves_the_tip() -> None:
     tip = soft_tip(DhArm())
     q = np.array([*Q_ARM, *ACTION])
     start = tip.place(q, settle=True).tip_position[0]
-    control = ResolvedRate(damping=0.0, posture=q + 0.1 * np.array([1.0, -1.0, 1.0, 1.0, -1.0, 1.0, *[0.0] * 6]))
+    control = ResolvedRate(
+        damping=0.0, posture=q + 0.1 * np.array([1.0, -1.0, 1.0, 1.0, -1.0, 1.0, *[0.0] * 6])
+    )
     moved = []
     for step in (1e-2, 5e-3):
         rates = control.rates(q, tip.jacobian(), np.zeros(3), np.zeros(3), 1.0)
@@ -167,30 +190,80 @@ def test_moving_in_the_null_space_leaves_the_tip() -> None:
 @pytest.mark.parametrize(
     ("make", "sentence"),
     [
-        (lambda: SoftTip(Simulator(two_segments(), n_robots=2)), r"^simulator is Simulator\(.*\); give a Simulator of one robot\.$"),
-        (lambda: FixedBase((0.0, 0.0, 0.0)), r"^FixedBase\.pose is \(0\.0, 0\.0, 0\.0\); give seven finite numbers, position \[m\] and "),
-        (lambda: MovingBase((0, 0, 0, 2, 0, 0, 0)), r"^MovingBase\.pose has a quaternion of norm 2; it must be 1, as w x y z\.$"),
-        (lambda: soft_tip(FixedBase(), flange_from_base=[np.nan] * 7), r"^flange_from_base is \[nan.*\]; give seven finite numbers, "),
-        (lambda: soft_tip(MovingBase()).place([0.0] * 6), r"^q has shape \(6,\); it must be \(9,\): 3 of the base, then extension and "
-         r"two displacements for each of 2 segments \[m\]\.$"),
-        (lambda: soft_tip(FixedBase()).place([np.nan] * 6), r"^q holds a value that is not finite: \[nan nan nan nan nan nan\]\.$"),
+        (
+            lambda: SoftTip(Simulator(two_segments(), n_robots=2)),
+            r"^simulator is Simulator\(.*\); give a "
+            r"Simulator of one robot\.$",
+        ),
+        (
+            lambda: FixedBase((0.0, 0.0, 0.0)),
+            r"^FixedBase\.pose is \(0\.0, 0\.0, 0\.0\); give seven finite "
+            r"numbers, position \[m\] and ",
+        ),
+        (
+            lambda: MovingBase((0, 0, 0, 2, 0, 0, 0)),
+            r"^MovingBase\.pose has a quaternion of norm 2; it must "
+            r"be 1, as w x y z\.$",
+        ),
+        (
+            lambda: soft_tip(FixedBase(), flange_from_base=[np.nan] * 7),
+            r"^flange_from_base is \[nan.*\]; give seven finite numbers, ",
+        ),
+        (
+            lambda: soft_tip(MovingBase()).place([0.0] * 6),
+            r"^q has shape \(6,\); it must be \(9,\): 3 of "
+            r"the base, then extension and "
+            r"two displacements for each of 2 segments \[m\]\.$",
+        ),
+        (
+            lambda: soft_tip(FixedBase()).place([np.nan] * 6),
+            r"^q holds a value that is not finite: \[nan "
+            r"nan nan nan nan nan\]\.$",
+        ),
         (lambda: soft_tip(FixedBase()).place("here"), r"^q is 'here'; give 6 numbers\.$"),
-        (lambda: soft_tip(FixedBase()).place(ACTION, base_pose=[0.0]), r"^base_pose is \[0\.0\]; give seven finite numbers, "),
+        (
+            lambda: soft_tip(FixedBase()).place(ACTION, base_pose=[0.0]),
+            r"^base_pose is \[0\.0\]; give seven finite numbers, ",
+        ),
         (lambda: soft_tip(FixedBase()).position, r"^position needs a placed robot; call place first\.$"),
         (lambda: soft_tip(FixedBase()).jacobian(), r"^jacobian needs a placed robot; call place first\.$"),
-        (lambda: soft_tip(FixedBase()).limits(0.0), r"^largest_bend is 0\.0 rad; it must be a number, positive and finite\.$"),
-        (lambda: soft_tip(FixedBase()).finite_differences(ACTION, -1.0), r"^step is -1\.0; it must be a number, positive and finite\.$"),
+        (
+            lambda: soft_tip(FixedBase()).limits(0.0),
+            r"^largest_bend is 0\.0 rad; it must be a number, "
+            r"positive and finite\.$",
+        ),
+        (
+            lambda: soft_tip(FixedBase()).finite_differences(ACTION, -1.0),
+            r"^step is -1\.0; it must be a number, positive and finite\.$",
+        ),
     ],
-)  # fmt: skip
+)
 def test_refusals(make: Any, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         make()
 
 
 def test_a_robot_that_no_action_drives_is_refused() -> None:
-    with pytest.raises(RobotError, match=r"^segment 1 of robot .* is passive; an action needs wires driven by length\.$"):
-        SoftTip(Simulator(Robot(name="p", segments=(Segment(
-            length=0.07, bending_stiffness=(0.0022, 0.0022), torsional_stiffness=0.001, mode="passive"),))))  # fmt: skip
+    with pytest.raises(
+        RobotError,
+        match=r"^segment 1 of robot .* is passive; an action needs wires driven "
+        r"by length\.$",
+    ):
+        SoftTip(
+            Simulator(
+                Robot(
+                    name="p",
+                    segments=(
+                        Segment(
+                            length=0.07,
+                            bending_stiffness=(0.0022, 0.0022),
+                            torsional_stiffness=0.001,
+                            mode="passive",
+                        ),
+                    ),
+                )
+            )
+        )
     assert SoftTip(Simulator(load_robot("prototype"))).n_q == 3
 
 
@@ -202,25 +275,33 @@ def test_steps_that_extend_keep_up_with_the_rod() -> None:
         q[[0, 3]] += 5e-4
         state = tip.place(q)
         assert state.ok[0]
-        assert state.residual[0] < 3e-3  # a moment counts as its length; pulling at every wire loses the robot here
+        # a moment counts as its length; pulling at every wire loses the robot here
+        assert state.residual[0] < 3e-3
     stepped = tip.place(q).tip_position[0]
     assert_allclose(stepped, tip.place(q, settle=True).tip_position[0], atol=2e-5)
 
 
 @pytest.mark.parametrize("rows", [1024, 3], ids=["at once", "one input after another"])
 @pytest.mark.parametrize("loaded", [False, True])
-def test_many_robots_have_the_jacobians_of_one(rows: int, loaded: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_robots_have_the_jacobians_of_one(
+    rows: int, loaded: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(fastrod.solver.response, "_ROWS", rows)
     robot, n = two_segments(), 9
-    actions = SoftTip(Simulator(robot)).actions.inputs(0.5 * np.array(ACTION) + np.random.default_rng(1).uniform(0.0, 3e-3, (n, 6)))
+    actions = SoftTip(Simulator(robot)).actions.inputs(
+        0.5 * np.array(ACTION) + np.random.default_rng(1).uniform(0.0, 3e-3, (n, 6))
+    )
     force = np.random.default_rng(2).uniform(-0.1, 0.1, (n, 3))
-    many, one = Simulator(robot, n_robots=n, points_per_segment=6, threads=1), Simulator(robot, points_per_segment=6, threads=1)
+    many, one = (
+        Simulator(robot, n_robots=n, points_per_segment=6, threads=1),
+        Simulator(robot, points_per_segment=6, threads=1),
+    )
     many.settle(**actions, tip_force=force, point_force=[(0.13, force)] if loaded else None)
     got = many.jacobian(turning=True)
     assert got.shape == (n, 6, 8 + 2 + 3)
     for i in range(n):
         load = {"point_force": [(0.13, force[i])]} if loaded else {}
-        one.settle(**{name: a[i] for name, a in actions.items()}, tip_force=force[i], **load)  # type: ignore[arg-type]
+        one.settle(**{name: a[i] for name, a in actions.items()}, tip_force=force[i], **load)
         assert_allclose(got[i], one.jacobian(turning=True)[0], atol=1e-7)
         assert_array_equal(many.jacobian()[i], got[i, :, :10])
 
@@ -249,16 +330,21 @@ def test_who_misses_a_step_goes_on_from_the_extension_it_had() -> None:
 
 
 def test_finite_differences_stay_within_the_range_of_an_extension():
-    # the prototype cannot extend: no column to compare; a segment at the end of its range is differenced to one side
+    # the prototype cannot extend: no column to compare; a segment at the end of its range is differenced to
+    # one side
     fixed = SoftTip(Simulator(load_robot("prototype"), points_per_segment=6), MovingBase())
     q = [0.0, 0.0, 0.0, 0.0, 0.002, -0.001]
     fixed.place(q, settle=True)
     columns = [0, 1, 2, 4, 5]
-    np.testing.assert_allclose(fixed.finite_differences(q)[:, columns], fixed.jacobian()[:, columns], rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(
+        fixed.finite_differences(q)[:, columns], fixed.jacobian()[:, columns], rtol=1e-3, atol=1e-4
+    )
     np.testing.assert_array_equal(fixed.finite_differences(q)[:, 3], 0.0)
     reacher = load_robot("five_segment_reacher")
     tip = SoftTip(Simulator(reacher, points_per_segment=6))
     q = np.zeros(tip.n_q)
     q[1::3] = 0.002
     tip.place(q, settle=True)
-    np.testing.assert_allclose(tip.finite_differences(q, step=1e-5)[:, -3], tip.jacobian()[:, -3], rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(
+        tip.finite_differences(q, step=1e-5)[:, -3], tip.jacobian()[:, -3], rtol=1e-3, atol=1e-3
+    )

@@ -1,4 +1,5 @@
-"""What the fuzz tests share: how often they try, odd values, mutations of tables and texts, and what a sentence is."""
+"""What the fuzz tests share: how often they try, odd values, mutations of tables and texts, and what a
+sentence is."""
 
 from __future__ import annotations
 
@@ -13,12 +14,19 @@ from hypothesis import strategies as st
 
 from fastrod.model.robotfile import dumps, load_robot, robot_names
 
-SLOW = [HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.data_too_large, HealthCheck.function_scoped_fixture]
+SLOW = [
+    HealthCheck.too_slow,
+    HealthCheck.filter_too_much,
+    HealthCheck.data_too_large,
+    HealthCheck.function_scoped_fixture,
+]
 
 
 def tried(times: int) -> settings:
     """The same `times` examples on every machine."""
-    return settings(derandomize=True, deadline=None, max_examples=times, database=None, suppress_health_check=SLOW)
+    return settings(
+        derandomize=True, deadline=None, max_examples=times, database=None, suppress_health_check=SLOW
+    )
 
 
 LONGEST = 1500
@@ -83,13 +91,17 @@ odd_leaves = st.one_of(
 )
 odd_values = st.recursive(
     odd_leaves,
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.sampled_from(["offset", "angle", "name", "x", "é"]), inner, max_size=3),
+    lambda inner: (
+        st.lists(inner, max_size=4)
+        | st.dictionaries(st.sampled_from(["offset", "angle", "name", "x", "é"]), inner, max_size=3)
+    ),
     max_leaves=8,
 )
 
 
 def is_sentence(error: BaseException) -> bool:
-    """Whether this error is told in one line that ends, and that nobody else's words stand in place of ours."""
+    """Whether this error is told in one line that ends, and that nobody else's words stand in place of
+    ours."""
     text = str(error)
     foreign = ("Traceback", "msgspec", "numpy", "ndarray", "object of type", "tuple index", "NoneType")
     return (
@@ -114,10 +126,20 @@ SECTIONS: dict[str, Any] = {
     "world": {"gravity": [0.0, 0.0, -9.81]},
     "log": {"points": [0.01, 0.05]},
     "fit": {"segment.*.bending_stiffness": {"sd": 0.3}, "tendon.1.gain": {"sd": 0.1, "shared": True}},
-    "sensor": {"noise": 0.0003, "registration_sd": [0.001, 0.01], "marker_offset_sd": 0.002, "latency_sd": 0.1},
+    "sensor": {
+        "noise": 0.0003,
+        "registration_sd": [0.001, 0.01],
+        "marker_offset_sd": 0.002,
+        "latency_sd": 0.1,
+    },
     "effect": [{"name": "backlash", "half_width": 0.0002}, {"name": "payload", "mass": 0.01}],
 }
-numbers_of = {"name": "x", "length": 0.07, "bending_stiffness": [0.0022, 0.0022], "torsional_stiffness": 0.001}
+numbers_of = {
+    "name": "x",
+    "length": 0.07,
+    "bending_stiffness": [0.0022, 0.0022],
+    "torsional_stiffness": 0.001,
+}
 
 
 @st.composite
@@ -144,7 +166,11 @@ def good_tables(draw: st.DrawFn) -> dict[str, Any]:
             if mode != "passive":
                 wire = st.fixed_dictionaries(
                     {"offset": st.floats(0.002, 0.02), "angle": st.floats(0.0, 6.28)},
-                    optional={"compliance": st.floats(0.0, 1e-3), "pretension": st.floats(0.0, 5.0), "unilateral": st.booleans()},
+                    optional={
+                        "compliance": st.floats(0.0, 1e-3),
+                        "pretension": st.floats(0.0, 5.0),
+                        "unilateral": st.booleans(),
+                    },
                 )
                 segment["tendons"] = draw(st.lists(wire, min_size=1, max_size=4))
             table["segment"].append(segment)
@@ -187,7 +213,11 @@ def mutated_tables(draw: st.DrawFn) -> dict[str, Any]:
         if not places:
             break
         node, key = places[draw(st.integers(0, len(places) - 1))]
-        match draw(st.sampled_from(["put", "put", "number", "number", "drop", "add", "rename", "wrap", "empty", "twice"])):
+        match draw(
+            st.sampled_from(
+                ["put", "put", "number", "number", "drop", "add", "rename", "wrap", "empty", "twice"]
+            )
+        ):
             case "put":
                 node[key] = draw(odd_values)
             case "number":
@@ -232,7 +262,9 @@ def broken_texts(draw: st.DrawFn, text: str) -> bytes:
                     raw[:start]
                     + draw(
                         st.binary(max_size=8)
-                        | st.sampled_from([b'"""', b"[[", b"]", b"\r\n", b"\xef\xbb\xbf", b"=", b"nan", b"-inf", b",", b'"'])
+                        | st.sampled_from(
+                            [b'"""', b"[[", b"]", b"\r\n", b"\xef\xbb\xbf", b"=", b"nan", b"-inf", b",", b'"']
+                        )
                     )
                     + raw[start:]
                 )

@@ -1,4 +1,5 @@
-"""Files from strangers: a slice of `python perf/fuzz_files.py`, and what it can only stumble on, one row each."""
+"""Files from strangers: a slice of `python perf/fuzz_files.py`, and what it can only stumble on, one row
+each."""
 
 from __future__ import annotations
 
@@ -43,18 +44,32 @@ def folder(tmp_path_factory: pytest.TempPathFactory, originals: Originals) -> Pa
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_damaged_file_is_read_right_or_refused_in_a_sentence(kind: str, folder: Path, originals: Originals) -> None:
+def test_a_damaged_file_is_read_right_or_refused_in_a_sentence(
+    kind: str, folder: Path, originals: Originals
+) -> None:
     first = KINDS.index(kind)
     for index in range(first, first + 17 * len(KINDS), len(KINDS)):
         outcome = try_file(index, 7, folder, originals)
-        assert outcome.verdict in (*FINE, "over time"), outcome  # time is of the machine: the command looks at it
+        # time is of the machine: the command looks at it
+        assert outcome.verdict in (*FINE, "over time"), outcome
 
 
-def policy(path: Path, originals: Originals, *, actor: bytes | None = None, config: bytes | None = None, **files: bytes) -> Path:
+def policy(
+    path: Path,
+    originals: Originals,
+    *,
+    actor: bytes | None = None,
+    config: bytes | None = None,
+    **files: bytes,
+) -> Path:
     """A folder of a policy; `actor` of no bytes leaves it out."""
     given = originals.policy
     path.mkdir()
-    for name, data in {"actor.npz": given[0] if actor is None else actor, "config.json": config or given[1], **files}.items():
+    for name, data in {
+        "actor.npz": given[0] if actor is None else actor,
+        "config.json": config or given[1],
+        **files,
+    }.items():
         if data:
             (path / name).write_bytes(data)
     return path
@@ -83,18 +98,30 @@ FOREIGN: dict[str, list[str]] = {
 @pytest.mark.parametrize("name", FOREIGN)
 @pytest.mark.parametrize("trust", [False, True])
 def test_code_in_a_folder_runs_with_trust_alone(
-    name: str, trust: bool, tmp_path: Path, originals: Originals, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    name: str,
+    trust: bool,
+    tmp_path: Path,
+    originals: Originals,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed: pip install 'fastrod[rl]'")
+    pytest.importorskip(
+        "stable_baselines3", reason="stable-baselines3 is not installed: pip install 'fastrod[rl]'"
+    )
     monkeypatch.chdir(tmp_path)
     canary = tmp_path / "canary"
-    given = originals.policy[1].replace(b"fastrod/Reach-v0", b"fastrod/Track-v0") if name == "drive" else originals.policy[1]
+    given = (
+        originals.policy[1].replace(b"fastrod/Reach-v0", b"fastrod/Track-v0")
+        if name == "drive"
+        else originals.policy[1]
+    )
     config = json.loads(given)
     config["plan"]["n_envs"] = 2
     theirs = {"policy.zip": foreign(canary), "checkpoint.zip": foreign(canary), "replay.pkl": foreign(canary)}
     path = policy(tmp_path / "theirs", originals, actor=b"", config=json.dumps(config).encode(), **theirs)
     words = [str(path) if word == "FOLDER" else word for word in FOREIGN[name]]
-    assert main([*words, *(["--trust"] if trust else [])]) == 2  # with trust their code has run, and what it made is no model
+    # with trust their code has run, and what it made is no model
+    assert main([*words, *(["--trust"] if trust else [])]) == 2
     said = capsys.readouterr().err
     assert canary.exists() == trust
     assert ("runs code of whoever made it" in said) != trust
@@ -109,31 +136,47 @@ def test_trust_is_of_files_of_others_alone(tmp_path: Path, originals: Originals)
 
 
 ACTORS: dict[str, tuple[Callable[[Originals], bytes], str]] = {
-    "nan": (lambda o: changed(o, weight_1=np.full((256, 256), np.nan, np.float32)), "a number that is not finite"),
+    "nan": (
+        lambda o: changed(o, weight_1=np.full((256, 256), np.nan, np.float32)),
+        "a number that is not finite",
+    ),
     "shapes": (lambda o: changed(o, weight_1=np.zeros((256, 3), np.float32)), "do not fit together"),
     "transposed": (lambda o: changed(o, weight_0=o.actor["weight_0"].T), "do not fit together"),
     "doubles": (lambda o: changed(o, bias_0=np.zeros(256)), "not numbers of single precision"),
     "missing": (lambda o: changed(o, bias_1=None), "'bias_1' is missing or too much"),
     "objects": (lambda o: changed(o, bias_0=np.array([None])), "numbers and words alone are read"),
-    "beyond": (lambda o: changed(o, bias_0=np.full(256, 1e30, np.float32)), "it holds a number beyond 100000"),
+    "beyond": (
+        lambda o: changed(o, bias_0=np.full(256, 1e30, np.float32)),
+        "it holds a number beyond 100000",
+    ),
     "no distance": (lambda o: changed(o, reach=np.zeros(23, np.float32)), "bounds without a distance"),
     "activation": (lambda o: changed(o, activation="x\ny"), r"its activation is 'x\\ny'"),
     "truncated": (lambda o: o.policy[0][:-1000], "File is not a zip file"),
     "flipped": (lambda o: o.policy[0][:3000] + b"\xff\xff" + o.policy[0][3002:], "is it whole"),
-    "declares 10 GB": (lambda o: declared("weight_0.npy", 10**10), "it declares 1 arrays of 10000000000 bytes"),
+    "declares 10 GB": (
+        lambda o: declared("weight_0.npy", 10**10),
+        "it declares 1 arrays of 10000000000 bytes",
+    ),
     "unpacks to 200 MB": (lambda o: o.zeros, "it declares 1 arrays of 200000128 bytes"),
     "a shape of 10^12": (
-        lambda o: npz(o.actor).replace(b"'shape': (256, 256), }          ", b"'shape': (1000000, 1000000), }  "),
+        lambda o: npz(o.actor).replace(
+            b"'shape': (256, 256), }          ", b"'shape': (1000000, 1000000), }  "
+        ),
         "is it whole",
     ),
 }
 
 
 @pytest.mark.parametrize("name", ACTORS)
-def test_a_damaged_actor_is_one_sentence(name: str, tmp_path: Path, originals: Originals, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_damaged_actor_is_one_sentence(
+    name: str, tmp_path: Path, originals: Originals, capsys: pytest.CaptureFixture[str]
+) -> None:
     make, words = ACTORS[name]
     path = policy(tmp_path / "p", originals, actor=make(originals))
-    assert main(["evaluate", "Reach", str(path), "--episodes", "1", "--no-baselines", "--option", "n_steps=2"]) == 2
+    assert (
+        main(["evaluate", "Reach", str(path), "--episodes", "1", "--no-baselines", "--option", "n_steps=2"])
+        == 2
+    )
     said = capsys.readouterr().err
     assert words.replace("\\\\", "\\") in said
     assert len(said.splitlines()) == 1
@@ -145,9 +188,15 @@ CONFIGS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "no plan": (lambda c: c.pop("plan"), "it lacks 'plan'"),
     "env": (lambda c: c["plan"].update(env=[1]), "Expected `str`, got `array`"),
     "options": (lambda c: c["plan"].update(options=None), "Expected `object`, got `null`"),
-    "n_envs": (lambda c: c["plan"].update(n_envs=10**12), "n_envs is 1000000000000; it must be a whole number from 1 to 1000000"),
+    "n_envs": (
+        lambda c: c["plan"].update(n_envs=10**12),
+        "n_envs is 1000000000000; it must be a whole number from 1 to 1000000",
+    ),
     "algorithm": (lambda c: c["plan"].update(algorithm="pp0"), "did you mean 'ppo'?"),
-    "unknown key": (lambda c: c["plan"].update(curiculum=1.0), "unknown key 'curiculum'; did you mean 'curriculum'?"),
+    "unknown key": (
+        lambda c: c["plan"].update(curiculum=1.0),
+        "unknown key 'curiculum'; did you mean 'curriculum'?",
+    ),
     "seconds": (lambda c: c["state"].update(seconds=float("nan")), "it says that nan s are done"),
 }
 
@@ -170,15 +219,55 @@ def text_of(n: int) -> str:
 
 MESHES: dict[str, tuple[str, str | bytes, MeshLimits | None, str]] = {
     "archive": ("a.zip", b"PK", None, "has the unknown suffix '.zip'"),
-    "collada": ("a.dae", b"<COLLADA/>", None, "An archive, or a scene that refers to other files, is not read"),
+    "collada": (
+        "a.dae",
+        b"<COLLADA/>",
+        None,
+        "An archive, or a scene that refers to other files, is not read",
+    ),
     "gltf": ("a.gltf", b"{}", None, "known: glb, obj, off, ply, stl."),
-    "bytes": ("a.obj", text_of(100), MeshLimits(n_bytes=500), "has 828 bytes, more than 500; mesh(..., limits=MeshLimits(n_bytes="),
-    "faces": ("a.obj", text_of(100), MeshLimits(n_faces=99), "has 100 faces, more than 99; mesh(..., limits=MeshLimits(n_faces="),
-    "long polygon": ("a.obj", text_of(1) + "f " + "1 2 3 " * 2000, None, "has a line of 12002 bytes, more than 10000"),
-    "polygon": ("a.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n300 " + "0 1 2 " * 100, MeshLimits(n_faces=9), "has 298 faces, more than 9"),
-    "seconds": ("a.obj", text_of(600_000), MeshLimits(seconds=1e-3), "was not read within 0.001 s; mesh(..., limits=MeshLimits(seconds="),
-    "memory": ("a.obj", text_of(600_000), MeshLimits(memory=150_000_000), "needs more than 150000000 bytes of memory to be read"),
-    "cut": ("a.stl", bytes(80) + (5).to_bytes(4, "little") + bytes(249), None, "declares 5 faces, which take 334 bytes, and it has 333"),
+    "bytes": (
+        "a.obj",
+        text_of(100),
+        MeshLimits(n_bytes=500),
+        "has 828 bytes, more than 500; mesh(..., limits=MeshLimits(n_bytes=",
+    ),
+    "faces": (
+        "a.obj",
+        text_of(100),
+        MeshLimits(n_faces=99),
+        "has 100 faces, more than 99; mesh(..., limits=MeshLimits(n_faces=",
+    ),
+    "long polygon": (
+        "a.obj",
+        text_of(1) + "f " + "1 2 3 " * 2000,
+        None,
+        "has a line of 12002 bytes, more than 10000",
+    ),
+    "polygon": (
+        "a.off",
+        "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n300 " + "0 1 2 " * 100,
+        MeshLimits(n_faces=9),
+        "has 298 faces, more than 9",
+    ),
+    "seconds": (
+        "a.obj",
+        text_of(600_000),
+        MeshLimits(seconds=1e-3),
+        "was not read within 0.001 s; mesh(..., limits=MeshLimits(seconds=",
+    ),
+    "memory": (
+        "a.obj",
+        text_of(600_000),
+        MeshLimits(memory=150_000_000),
+        "needs more than 150000000 bytes of memory to be read",
+    ),
+    "cut": (
+        "a.stl",
+        bytes(80) + (5).to_bytes(4, "little") + bytes(249),
+        None,
+        "declares 5 faces, which take 334 bytes, and it has 333",
+    ),
     "no faces": ("a.stl", b"", None, "is empty: it has 0 bytes"),
     "declared": (
         "a.ply",
@@ -191,7 +280,9 @@ MESHES: dict[str, tuple[str, str | bytes, MeshLimits | None, str]] = {
 
 
 @pytest.mark.parametrize("name", MESHES)
-def test_a_mesh_beyond_the_limits_is_refused_in_a_sentence(name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_mesh_beyond_the_limits_is_refused_in_a_sentence(
+    name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     file, content, limits, words = MESHES[name]
     (tmp_path / file).write_bytes(content if isinstance(content, bytes) else content.encode())
     with pytest.raises(InputError) as caught:
@@ -201,7 +292,9 @@ def test_a_mesh_beyond_the_limits_is_refused_in_a_sentence(name: str, tmp_path: 
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_file_that_is_read_apart_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, originals: Originals) -> None:
+def test_a_file_that_is_read_apart_is_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, originals: Originals
+) -> None:
     (tmp_path / "ball.stl").write_bytes(originals.meshes["mesh stl"])
     here = mesh(tmp_path / "ball.stl")
     monkeypatch.setattr("fastrod.contact.meshfile._SMALL", 1000)
@@ -210,7 +303,9 @@ def test_a_file_that_is_read_apart_is_the_same(tmp_path: Path, monkeypatch: pyte
     np.testing.assert_array_equal(apart.faces, here.faces)
 
 
-def test_a_mesh_opens_no_other_file_and_logs_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str], originals: Originals) -> None:
+def test_a_mesh_opens_no_other_file_and_logs_nothing(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], originals: Originals
+) -> None:
     opened: list[str] = []
     watching = True
 
@@ -221,7 +316,8 @@ def test_a_mesh_opens_no_other_file_and_logs_nothing(tmp_path: Path, capfd: pyte
     for name in ("secret.mtl", "secret.png", "secret.bin"):
         (tmp_path / name).write_text("newmtl a\nmap_Kd secret.png\n", encoding="ascii")
     (tmp_path / "a.obj").write_bytes(b"mtllib secret.mtl\nusemtl a\n" + originals.meshes["mesh obj"])
-    broken = originals.meshes["mesh stl text"].replace(b"facet normal", b"facet normal x", 1)  # trimesh logs a traceback and goes on
+    # trimesh logs a traceback and goes on
+    broken = originals.meshes["mesh stl text"].replace(b"facet normal", b"facet normal x", 1)
     (tmp_path / "a.stl").write_bytes(broken)
     sys.addaudithook(watch)
     try:
@@ -234,8 +330,12 @@ def test_a_mesh_opens_no_other_file_and_logs_nothing(tmp_path: Path, capfd: pyte
     assert not logging.getLogger("trimesh.util").filters
 
 
-@pytest.mark.parametrize(("file", "words"), [("rows", "declares 160000000 values"), ("words", "of 100000000000 bytes of text")])
-def test_a_small_parquet_that_unpacks_to_much_is_refused(file: str, words: str, tmp_path: Path, originals: Originals) -> None:
+@pytest.mark.parametrize(
+    ("file", "words"), [("rows", "declares 160000000 values"), ("words", "of 100000000000 bytes of text")]
+)
+def test_a_small_parquet_that_unpacks_to_much_is_refused(
+    file: str, words: str, tmp_path: Path, originals: Originals
+) -> None:
     path = tmp_path / "log.parquet"
     path.write_bytes(getattr(originals, file))
     with pytest.raises(LogError, match=words):
@@ -257,15 +357,43 @@ def test_a_refusal_quotes_libraries_in_one_line(tmp_path: Path, originals: Origi
 
 
 TABLES: dict[str, tuple[str, str, str]] = {
-    "denormal drum": ("drum_radius = 0.008     # m", "drum_radius = 1e-320", "is 1e-320; it must be from 0.0001 to 0.1"),
-    "huge gear": ("drum_radius = 0.008     # m", "drum_radius = 0.008\ngear = 1e308", "gear of node 1 is 1e+308; it must be from"),
-    "digits": ("drum_radius = 0.008     # m", f"drum_radius = 0.008\ncounts_per_turn = {'9' * 400}", "drive 1"),
+    "denormal drum": (
+        "drum_radius = 0.008     # m",
+        "drum_radius = 1e-320",
+        "is 1e-320; it must be from 0.0001 to 0.1",
+    ),
+    "huge gear": (
+        "drum_radius = 0.008     # m",
+        "drum_radius = 0.008\ngear = 1e308",
+        "gear of node 1 is 1e+308; it must be from",
+    ),
+    "digits": (
+        "drum_radius = 0.008     # m",
+        f"drum_radius = 0.008\ncounts_per_turn = {'9' * 400}",
+        "drive 1",
+    ),
     "tiny limit": ("tension = 15.0", "tension = 1e-320", "Limits.tension is 1e-320 N; less than 1e-09 N"),
-    "huge limit": ("curvature = 16.0", "curvature = 1e308", "Limits.curvature is 1e+308 1/m; more than 1e+09 1/m."),
-    "huge matrix": ("[800.0, 0.0, 319.5]", "[1e308, 0.0, 319.5]", "its numbers must be between -1e+06 and 1e+06"),
+    "huge limit": (
+        "curvature = 16.0",
+        "curvature = 1e308",
+        "Limits.curvature is 1e+308 1/m; more than 1e+09 1/m.",
+    ),
+    "huge matrix": (
+        "[800.0, 0.0, 319.5]",
+        "[1e308, 0.0, 319.5]",
+        "its numbers must be between -1e+06 and 1e+06",
+    ),
     "huge picture": ("size = [640, 480]", "size = [640000, 480]", "whole numbers from 16 to 20000 [px]"),
-    "tiny rate": ("rate = 15.0", "rate = 1e-320", "Camera.rate is 1e-320 Hz; it must be from 0.01 to 100000 Hz"),
-    "tiny marker": ("size = 0.018", "size = 1e-320", "Marker.size is 1e-320 m; it must be from 0.0001 to 1 m"),
+    "tiny rate": (
+        "rate = 15.0",
+        "rate = 1e-320",
+        "Camera.rate is 1e-320 Hz; it must be from 0.01 to 100000 Hz",
+    ),
+    "tiny marker": (
+        "size = 0.018",
+        "size = 1e-320",
+        "Marker.size is 1e-320 m; it must be from 0.0001 to 1 m",
+    ),
     "deep": ('robot = "prototype"', "robot = " + "[" * 100_000, "its tables stand too deep in one another"),
     "long key": ('robot = "prototype"', "a." * 20_000 + "a = 1", "it has a key of more than 50 parts"),
     "large": ('robot = "prototype"', "#" * 1_000_001, "it has more than 1000000 bytes"),
@@ -289,13 +417,18 @@ def test_numbers_that_a_float_can_hold_and_their_squares_cannot(tmp_path: Path, 
     for column in (6, 7):  # a tip's coordinate
         row = cells[3].split(",")
         row[column] = "1e300"
-        (tmp_path / "log.csv").write_text("\n".join([*cells[:3], ",".join(row), *cells[4:]]), encoding="utf-8")
+        (tmp_path / "log.csv").write_text(
+            "\n".join([*cells[:3], ",".join(row), *cells[4:]]), encoding="utf-8"
+        )
         with pytest.raises(LogError, match="row 2"):
             read_log(tmp_path / "log.csv", load_robot("prototype"))
 
 
 def test_a_robot_file_has_the_same_bounds(tmp_path: Path) -> None:
-    for text, words in (("a." * 20_000 + "a = 1", "a key of more than 50 parts"), ("#" * 1_000_001, "more than 1000000 bytes")):
+    for text, words in (
+        ("a." * 20_000 + "a = 1", "a key of more than 50 parts"),
+        ("#" * 1_000_001, "more than 1000000 bytes"),
+    ):
         (tmp_path / "mine.toml").write_text(text, encoding="utf-8")
         with pytest.raises(RobotError, match=words):
             load_robot(tmp_path / "mine.toml")

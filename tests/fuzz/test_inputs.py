@@ -1,4 +1,5 @@
-"""Any values at all as a simulator's inputs: a state, or one sentence; and what was refused has changed nothing."""
+"""Any values at all as a simulator's inputs: a state, or one sentence; and what was refused has changed
+nothing."""
 
 from __future__ import annotations
 
@@ -40,7 +41,18 @@ SHAPES = {
     "follower_tip_force": (3,),
     "base_pose": (7,),
 }
-DTYPES = [np.float64, np.float32, np.float16, np.int64, np.uint8, bool, complex, object, np.str_, "datetime64[s]"]
+DTYPES = [
+    np.float64,
+    np.float32,
+    np.float16,
+    np.int64,
+    np.uint8,
+    bool,
+    complex,
+    object,
+    np.str_,
+    "datetime64[s]",
+]
 HUGE = [np.nan, np.inf, -np.inf, 1e-320, 1e3, 1e9, 1e30, 1e100, 1e200, 1.7e308, -1e30, -1.7e308]
 
 
@@ -50,7 +62,11 @@ def robot(kind: str = "plain") -> Robot:
 
     made = rod(extension=(-0.005, 0.02), line_density=0.01)
     if kind == "effects":
-        effects = ({"name": "backlash", "half_width": 1e-4}, {"name": "creep", "share": 0.1}, {"name": "payload", "mass": 0.01})
+        effects = (
+            {"name": "backlash", "half_width": 1e-4},
+            {"name": "creep", "share": 0.1},
+            {"name": "payload", "mass": 0.01},
+        )
         made = replace(made, effects=effects)
     return made
 
@@ -80,13 +96,19 @@ def well(state: State) -> None:
     for name in FIELDS:
         assert np.isfinite(getattr(state, name)[state.ok]).all(), name
     assert set(state.problems) == set(np.flatnonzero(~state.ok).tolist())
-    assert not any("\n" in sentence or not sentence.rstrip().endswith((".", "?")) for sentence in state.problems.values()), state.problems
+    assert not any(
+        "\n" in sentence or not sentence.rstrip().endswith((".", "?")) for sentence in state.problems.values()
+    ), state.problems
 
 
 def differing(one: State, other: State, rows: Any = slice(None)) -> list[str]:
     """In what two states are not the same bit for bit."""
     names = (*FIELDS, "ok", "passes")
-    return [name for name in names if not np.array_equal(getattr(one, name)[rows], getattr(other, name)[rows], equal_nan=True)]
+    return [
+        name
+        for name in names
+        if not np.array_equal(getattr(one, name)[rows], getattr(other, name)[rows], equal_nan=True)
+    ]
 
 
 @st.composite
@@ -95,7 +117,20 @@ def arrays(draw: st.DrawFn, core: tuple[int, ...]) -> Any:
     if draw(st.integers(0, 9)) == 0:
         return draw(odd_values)
     shape = draw(
-        st.sampled_from([core, (1, *core), (N, *core), (N + 1, *core), (), (0, *core), (*core, 1), (N, *core, 2), (N, 1), (2, N, *core)])
+        st.sampled_from(
+            [
+                core,
+                (1, *core),
+                (N, *core),
+                (N + 1, *core),
+                (),
+                (0, *core),
+                (*core, 1),
+                (N, *core, 2),
+                (N, 1),
+                (2, N, *core),
+            ]
+        )
     )
     base = np.broadcast_to(np.float64(draw(st.sampled_from([0.0, 0.07, 0.1, 1.0]))), shape).copy()
     if base.size and draw(st.booleans()):
@@ -112,7 +147,14 @@ def arrays(draw: st.DrawFn, core: tuple[int, ...]) -> Any:
 def inputs(draw: st.DrawFn) -> dict[str, Any]:
     """Keyword arguments of a step, most of them bad."""
     given: dict[str, Any] = {"tendon_length": np.full((N, 4), 0.07)}
-    for name in draw(st.lists(st.sampled_from([*SHAPES, "tension", "point_force", "line_force 4"]), min_size=1, max_size=3, unique=True)):
+    for name in draw(
+        st.lists(
+            st.sampled_from([*SHAPES, "tension", "point_force", "line_force 4"]),
+            min_size=1,
+            max_size=3,
+            unique=True,
+        )
+    ):
         if name == "point_force":
             pair = st.tuples(arrays(()), arrays((3,)))
             given[name] = draw(st.lists(pair, max_size=3) | odd_values | st.lists(odd_values, max_size=2))
@@ -135,8 +177,15 @@ def tried_call(sim: Simulator, call: str, given: dict[str, Any]) -> State | None
 
 
 @tried(80)
-@given(given_=inputs(), call=st.sampled_from(["step", "settle"]), kind=st.sampled_from(["plain", "effects"]), warm=st.booleans())
-def test_odd_inputs_are_a_state_or_a_sentence_that_changes_nothing(given_: dict[str, Any], call: str, kind: str, warm: bool) -> None:
+@given(
+    given_=inputs(),
+    call=st.sampled_from(["step", "settle"]),
+    kind=st.sampled_from(["plain", "effects"]),
+    warm=st.booleans(),
+)
+def test_odd_inputs_are_a_state_or_a_sentence_that_changes_nothing(
+    given_: dict[str, Any], call: str, kind: str, warm: bool
+) -> None:
     sim, twin = simulator(kind), simulator(kind)
     if warm:
         assert differing(sim.settle(**good(sim, 1)), twin.settle(**good(twin, 1))) == []
@@ -151,13 +200,19 @@ def test_odd_inputs_are_a_state_or_a_sentence_that_changes_nothing(given_: dict[
 
 @tried(80)
 @given(
-    name=st.sampled_from([*SHAPES]), row=st.integers(0, N - 1), value=st.sampled_from(HUGE) | st.floats(), place=st.integers(0, 6),
-    call=st.sampled_from(["step", "settle"]), kind=st.sampled_from(["plain", "effects"]), warm=st.booleans(),
-)  # fmt: skip
+    name=st.sampled_from([*SHAPES]),
+    row=st.integers(0, N - 1),
+    value=st.sampled_from(HUGE) | st.floats(),
+    place=st.integers(0, 6),
+    call=st.sampled_from(["step", "settle"]),
+    kind=st.sampled_from(["plain", "effects"]),
+    warm=st.booleans(),
+)
 def test_a_bad_row_changes_no_bit_of_its_neighbours(
     name: str, row: int, value: float, place: int, call: str, kind: str, warm: bool
 ) -> None:
-    assume(name != "tip_force" or not np.isfinite(value))  # a force that moves is learned by one more pass of all
+    # a force that moves is learned by one more pass of all
+    assume(name != "tip_force" or not np.isfinite(value))
     sim, twin = simulator(kind), simulator(kind)
     core = SHAPES[name]
     usual = np.zeros((N, *core))
@@ -178,11 +233,13 @@ def test_a_bad_row_changes_no_bit_of_its_neighbours(
 
 
 odd_rows = st.one_of(
-    st.sampled_from([None, 0, -1, N, [0, N], [-N - 1], [], True, [True] * N, [True] * (N + 1), [0.0], [1.5], "x"])
+    st.sampled_from(
+        [None, 0, -1, N, [0, N], [-N - 1], [], True, [True] * N, [True] * (N + 1), [0.0], [1.5], "x"]
+    )
     | st.sampled_from([[[0, 1]], {"a": 1}, 10**30, np.nan, [None], 1j]),
     st.lists(st.integers(-6, 6), max_size=5),
     odd_values,
-)  # fmt: skip
+)
 
 
 @tried(80)
@@ -221,7 +278,19 @@ def test_odd_rows_and_arclengths_are_refused_and_change_nothing(rows: Any, what:
 
 @tried(100)
 @given(
-    name=st.sampled_from(["robot", "n_robots", "dt", "points_per_segment", "outputs", "observer", "threads", "contact", "hold_gain"]),
+    name=st.sampled_from(
+        [
+            "robot",
+            "n_robots",
+            "dt",
+            "points_per_segment",
+            "outputs",
+            "observer",
+            "threads",
+            "contact",
+            "hold_gain",
+        ]
+    ),
     value=odd_values,
 )
 def test_an_odd_simulator_is_one_or_a_sentence(name: str, value: Any) -> None:
@@ -236,7 +305,8 @@ def test_an_odd_simulator_is_one_or_a_sentence(name: str, value: Any) -> None:
 
 
 class Twins(RuleBasedStateMachine):
-    """Two simulators driven alike, one of which is given bad input in between, and sent back to where it was."""
+    """Two simulators driven alike, one of which is given bad input in between, and sent back to where it
+    was."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -301,7 +371,9 @@ class Twins(RuleBasedStateMachine):
 def test_a_session_with_bad_input_is_the_session_without(tmp_path: Any) -> None:
     from hypothesis.stateful import run_state_machine_as_test
 
-    run_state_machine_as_test(Twins, settings=settings(tried(25), stateful_step_count=12, suppress_health_check=SLOW))
+    run_state_machine_as_test(
+        Twins, settings=settings(tried(25), stateful_step_count=12, suppress_health_check=SLOW)
+    )
     assert Twins.alike is not None
 
 

@@ -23,9 +23,15 @@ ROBOT = load_robot("prototype")
 INPUTS = ["dl_1", "dl_2", "dl_3", "dl_4"]
 TIP = ["tip_x", "tip_y", "tip_z"]
 FURTHER = [
-    ["run"], ["ext_1"], ["tip_qw", "tip_qx", "tip_qy", "tip_qz"], ["tip_fx", "tip_fy", "tip_fz"], ["payload"],
-    ["base_qw", "base_qx", "base_qy", "base_qz"], ["note"], ["p1_x", "p1_y", "p1_z"],
-]  # fmt: skip
+    ["run"],
+    ["ext_1"],
+    ["tip_qw", "tip_qx", "tip_qy", "tip_qz"],
+    ["tip_fx", "tip_fy", "tip_fz"],
+    ["payload"],
+    ["base_qw", "base_qx", "base_qy", "base_qz"],
+    ["note"],
+    ["p1_x", "p1_y", "p1_z"],
+]
 CELLS = [
     "",
     "nan",
@@ -92,12 +98,18 @@ def cells(draw: st.DrawFn, name: str, row: int) -> str:
 def grids(draw: st.DrawFn) -> list[list[str]]:
     """A header and rows of a run log with up to three things changed."""
     header = ["t", *INPUTS, *TIP] + [
-        name for group in draw(st.lists(st.sampled_from(FURTHER), max_size=3, unique_by=tuple)) for name in group
+        name
+        for group in draw(st.lists(st.sampled_from(FURTHER), max_size=3, unique_by=tuple))
+        for name in group
     ]
     grid = [header, *([cells(draw, name, row) for name in header] for row in range(draw(st.integers(0, 5))))]
     for _ in range(draw(st.integers(0, 3))):
         i, j = draw(st.integers(0, len(grid) - 1)), draw(st.integers(0, max(0, len(grid[0]) - 1)))
-        change = draw(st.sampled_from(["cell", "cell", "number", "name", "drop", "twice", "row", "short", "long", "swap"]))
+        change = draw(
+            st.sampled_from(
+                ["cell", "cell", "number", "name", "drop", "twice", "row", "short", "long", "swap"]
+            )
+        )
         if change == "row":
             grid.insert(i, list(grid[i]))
         elif change == "short":
@@ -115,7 +127,9 @@ def grids(draw: st.DrawFn) -> list[list[str]]:
                     row[j : j + 1] = [] if change == "drop" else [row[j]] * 2
         elif j < len(grid[i]) and i:
             grid[i][j] = (
-                draw(st.sampled_from(CELLS)) if change == "cell" else repr(draw(odd_numbers.filter(lambda n: abs(n) < 1e300 or n != n)))
+                draw(st.sampled_from(CELLS))
+                if change == "cell"
+                else repr(draw(odd_numbers.filter(lambda n: abs(n) < 1e300 or n != n)))
             )
     return grid
 
@@ -125,9 +139,11 @@ def texts(draw: st.DrawFn) -> str:
     """A run log's text, in one of many ways of writing CSV."""
     made = io.StringIO()
     writer = csv.writer(
-        made, lineterminator=draw(st.sampled_from(["\n", "\n", "\r\n", "\r"])), delimiter=draw(st.sampled_from([",", ",", ",", ";", "\t"])),
+        made,
+        lineterminator=draw(st.sampled_from(["\n", "\n", "\r\n", "\r"])),
+        delimiter=draw(st.sampled_from([",", ",", ",", ";", "\t"])),
         quoting=draw(st.sampled_from([csv.QUOTE_MINIMAL, csv.QUOTE_ALL])),
-    )  # fmt: skip
+    )
     writer.writerows(draw(grids()))
     head = draw(st.sampled_from(["", "", "\ufeff", "# a comment\n", "\n\n", "\ufeff# with, commas\n"]))
     return head + made.getvalue()
@@ -135,7 +151,18 @@ def texts(draw: st.DrawFn) -> str:
 
 def same(one: RunLog, other: RunLog) -> None:
     """Two logs have the same numbers and texts."""
-    for name in ("t", "run", "dl", "tip_position", "ext", "tip_quaternion", "points", "tip_force", "payload", "base_quaternion"):
+    for name in (
+        "t",
+        "run",
+        "dl",
+        "tip_position",
+        "ext",
+        "tip_quaternion",
+        "points",
+        "tip_force",
+        "payload",
+        "base_quaternion",
+    ):
         a, b = getattr(one, name), getattr(other, name)
         assert (a is None) == (b is None), name
         if a is not None:
@@ -200,15 +227,29 @@ def columns(draw: st.DrawFn) -> dict[str, object]:
     n = draw(st.integers(0, 4))
     made: dict[str, object] = {name: pa.array([0.01 * k for k in range(n)]) for name in ("t", *INPUTS, *TIP)}
     kinds = {
-        "int": pa.array([1] * n), "bool": pa.array([True] * n), "text": pa.array(["x"] * n), "digits": pa.array(["0.01"] * n),
-        "none": pa.nulls(n), "bytes": pa.array([b"\xff"] * n), "list": pa.array([[1.0, 2.0]] * n), "struct": pa.array([{"a": 1}] * n),
-        "time": pa.array([5] * n, pa.timestamp("ns")), "span": pa.array([5] * n, pa.duration("s")), "date": pa.array([5] * n, pa.date32()),
-        "decimal": pa.array([1] * n).cast(pa.decimal128(30, 2)), "f16": pa.array(np.zeros(n, np.float16)), "inf": pa.array([np.inf] * n),
-        "huge": pa.array([2**63 - 1] * n), "map": pa.array([[("a", 1)]] * n, pa.map_(pa.string(), pa.int64())),
-        "some": pa.array([None] * min(n, 1) + ["x"] * (n - 1)), "category": pa.array(["a"] * n).dictionary_encode(),
-    }  # fmt: skip
+        "int": pa.array([1] * n),
+        "bool": pa.array([True] * n),
+        "text": pa.array(["x"] * n),
+        "digits": pa.array(["0.01"] * n),
+        "none": pa.nulls(n),
+        "bytes": pa.array([b"\xff"] * n),
+        "list": pa.array([[1.0, 2.0]] * n),
+        "struct": pa.array([{"a": 1}] * n),
+        "time": pa.array([5] * n, pa.timestamp("ns")),
+        "span": pa.array([5] * n, pa.duration("s")),
+        "date": pa.array([5] * n, pa.date32()),
+        "decimal": pa.array([1] * n).cast(pa.decimal128(30, 2)),
+        "f16": pa.array(np.zeros(n, np.float16)),
+        "inf": pa.array([np.inf] * n),
+        "huge": pa.array([2**63 - 1] * n),
+        "map": pa.array([[("a", 1)]] * n, pa.map_(pa.string(), pa.int64())),
+        "some": pa.array([None] * min(n, 1) + ["x"] * (n - 1)),
+        "category": pa.array(["a"] * n).dictionary_encode(),
+    }
     for _ in range(draw(st.integers(0, 3))):
-        name = draw(st.sampled_from(["t", "run", "dl_2", "tip_x", "note", "payload", "ext_1", "dl_5", "p1_x", "é"]))
+        name = draw(
+            st.sampled_from(["t", "run", "dl_2", "tip_x", "note", "payload", "ext_1", "dl_5", "p1_x", "é"])
+        )
         made[name] = kinds[draw(st.sampled_from(sorted(kinds)))]
     for name in draw(st.lists(st.sampled_from([*made]), max_size=1)):
         del made[name]
@@ -254,7 +295,9 @@ def test_replay_of_an_odd_log_answers(folder: Path, text: str) -> None:
 def test_identify_of_an_odd_log_answers(folder: Path, text: str) -> None:
     path, out = folder / "identified.csv", folder / "identified"
     path.write_text(text, encoding="utf-8", newline="")
-    code, printed = run("identify", str(path), "--robot", "prototype", "--max-effects", "0", "--out", str(out))
+    code, printed = run(
+        "identify", str(path), "--robot", "prototype", "--max-effects", "0", "--out", str(out)
+    )
     assert code == 2  # none is long enough
     assert printed.count("\n") == 1, printed
     assert not out.exists()
@@ -297,7 +340,8 @@ PART = "\n".join(["# Recorded on robot prototype.", HEADER, *ROWS, ""])
 @tried(100)
 @given(data=st.data())
 def test_a_torn_part_is_recovered_or_kept(folder: Path, data: st.DataObject) -> None:
-    """What a killed session left, cut and broken: whole rows come back as they were; where nothing comes back, nothing is taken away."""
+    """What a killed session left, cut and broken: whole rows come back as they were; where nothing comes
+    back, nothing is taken away."""
     at = data.draw(st.integers(0, len(PART)))
     raw = data.draw(st.just(PART[:at].encode()) | broken_texts(PART))
     target, part = folder / "torn.csv", folder / "torn.csv.part"
@@ -315,4 +359,6 @@ def test_a_torn_part_is_recovered_or_kept(folder: Path, data: st.DataObject) -> 
         if raw == PART[:at].encode():
             assert_array_equal(log.t, [0.02 * k for k in range(PART[:at].count("\n") - 2)])
             same(log, read_log(target, ROBOT))
-    assert [file.name for file in folder.glob("torn*")] == ["torn.csv"] if target.exists() else ["torn.csv.part"]
+    assert (
+        [file.name for file in folder.glob("torn*")] == ["torn.csv"] if target.exists() else ["torn.csv.part"]
+    )

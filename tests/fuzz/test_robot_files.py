@@ -26,7 +26,8 @@ def loaded(path: Path) -> Robot | None:
 
 
 def simulated(robot: Robot, path: Path) -> None:
-    """Settle a robot at rest, and step it: finite where ok, a reason where not; no warning and no other error."""
+    """Settle a robot at rest, and step it: finite where ok, a reason where not; no warning and no other
+    error."""
     modes = {segment.mode for segment in robot.segments}
     inputs: dict[str, Any] = {"tendon_length": robot.rest_tendon_length}
     if "tendon_tension" in modes:
@@ -39,7 +40,17 @@ def simulated(robot: Robot, path: Path) -> None:
         told(error)
         return
     for state in states:
-        for name in ("position", "rotation", "curvature", "moment", "force", "tip_position", "tension", "base_wrench", "residual"):
+        for name in (
+            "position",
+            "rotation",
+            "curvature",
+            "moment",
+            "force",
+            "tip_position",
+            "tension",
+            "base_wrench",
+            "residual",
+        ):
             assert np.isfinite(getattr(state, name)[state.ok]).all(), name
         assert set(state.problems) == set(np.flatnonzero(~state.ok).tolist())
     if states[-1].ok.all():

@@ -25,11 +25,16 @@ from fastrod_envs.vector import BatchEnv
 
 
 def made(work: Kind, count: int) -> dict[str, np.ndarray]:
-    return {column.name: np.asarray(column.values) for column in columns_of(Plan(work=work, count=count, shard_rows=count), 0)}
+    return {
+        column.name: np.asarray(column.values)
+        for column in columns_of(Plan(work=work, count=count, shard_rows=count), 0)
+    }
 
 
 def group(table: dict[str, np.ndarray], prefix: str) -> np.ndarray:
-    names = [name for name in table if name.startswith(f"{prefix}_") and name.removeprefix(f"{prefix}_").isdigit()]
+    names = [
+        name for name in table if name.startswith(f"{prefix}_") and name.removeprefix(f"{prefix}_").isdigit()
+    ]
     return np.stack([table[name] for name in names], axis=1)
 
 
@@ -62,7 +67,9 @@ def test_an_episode_is_played_again_from_its_seed(policy: str) -> None:
     "work",
     [
         Rollouts(env="Reach", options=(("n_steps", 3),)),
-        Trajectories(robot=dumps(fastrod.load_robot("prototype")), effects=("backlash",), steps=3, force=0.01),
+        Trajectories(
+            robot=dumps(fastrod.load_robot("prototype")), effects=("backlash",), steps=3, force=0.01
+        ),
         Sweep(robot=dumps(fastrod.load_robot("prototype")), rate=1.0),
     ],
     ids=lambda work: type(work).__name__,
@@ -108,7 +115,9 @@ def test_the_measured_tip_is_that_of_the_effects_that_are_told() -> None:
         effects: dict[str, dict[str, Any]] = {}
         for name, value in told.items():
             effects.setdefault(name.partition(".")[0], {})[name.partition(".")[2]] = value
-        robot = fastrod.Robot(name="one", segments=plain.segments, effects=tuple({"name": n, **v} for n, v in effects.items()))
+        robot = fastrod.Robot(
+            name="one", segments=plain.segments, effects=tuple({"name": n, **v} for n, v in effects.items())
+        )
         sim = fastrod.Simulator(robot, 1, dt=0.02, points_per_segment=8, threads=1)
         for step, dl in enumerate(group(table, "dl")[rows]):
             (sim.step if step else sim.settle)(plain.rest_tendon_length + dl)
@@ -160,7 +169,18 @@ def test_effects_take_turns_and_a_log_that_tells_nothing_is_kept(monkeypatch: py
 def test_a_robot_file_named_by_an_option_is_in_the_plan(tmp_path: Path) -> None:
     mine = tmp_path / "mine.toml"
     robot = fastrod.load_robot("five_segment_reacher")
-    words = ("generate", "rollouts", "--env", "Reach", "--option", f"randomise={mine}", "--option", "n_steps=3", "--shard-rows", "2")
+    words = (
+        "generate",
+        "rollouts",
+        "--env",
+        "Reach",
+        "--option",
+        f"randomise={mine}",
+        "--option",
+        "n_steps=3",
+        "--shard-rows",
+        "2",
+    )
     mine.write_text(dumps(replace(robot, effects=({"name": "backlash", "half_width": 1e-4},))))
     out = tmp_path / "out"
     assert cli.main([*words, "--count", "2", "--out", str(out), "--workers", "1"]) == 0
@@ -168,7 +188,7 @@ def test_a_robot_file_named_by_an_option_is_in_the_plan(tmp_path: Path) -> None:
     assert plan is not None
     assert str(mine) not in (out / "plan.json").read_text()
     before = columns_of(plan, 0)
-    assert plan.work._given()["randomise"].effects[0]["half_width"] == 1e-4  # type: ignore[union-attr]
+    assert plan.work._given()["randomise"].effects[0]["half_width"] == 1e-4
     mine.write_text(dumps(replace(robot, effects=({"name": "backlash", "half_width": 2e-4},))))
     after = columns_of(plan, 0)
     for one, other in zip(before, after, strict=True):
@@ -190,14 +210,21 @@ def test_all_ways_to_say_a_robot_make_one_plan(tmp_path: Path) -> None:
     assert len({plan.hash for plan in plans}) == 1
     whole = Randomisation(robot=robot, spread=0.1, parameters={"bending_stiffness": (0.9, 1.1)})
     assert Rollouts(env="Reach", options=(("randomise", whole),))._given()["randomise"]["robot"] == robot
-    with pytest.raises(InputError, match=r"^option 'n_steps' is \{1\}; a plan holds finite numbers, words, lists and mappings\.$"):
+    with pytest.raises(
+        InputError,
+        match=r"^option 'n_steps' is \{1\}; a plan holds finite numbers, words, "
+        r"lists and mappings\.$",
+    ):
         Rollouts(env="Reach", options=(("n_steps", {1}),))
 
 
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (("rollouts",), "rollouts are of an environment or of a robot's own motion; give --env ENV or --robot R.\n"),
+        (
+            ("rollouts",),
+            "rollouts are of an environment or of a robot's own motion; give --env ENV or --robot R.\n",
+        ),
         (
             ("rollouts", "--env", "Reach", "--robot", "prototype"),
             "rollouts are of an environment or of a robot's own motion; give --env ENV or --robot R.\n",
@@ -211,14 +238,31 @@ def test_all_ways_to_say_a_robot_make_one_plan(tmp_path: Path) -> None:
             "--steps is of a robot's own motion; with --env give --option NAME=VALUE, such as n_steps=100.\n",
         ),
         (("rollouts", "--env", "Reech"), "no environment 'Reech'; did you mean 'Reach'?\n"),
-        (("rollouts", "--env", "Reach", "--policy", "shiped"), "no policy 'shiped' to roll out; did you mean 'shipped'?\n"),
-        (("rollouts", "--env", "Reach", "--option", "n_stepz=3"), "no option 'n_stepz'; did you mean 'n_steps'?\n"),
-        (("rollouts", "--robot", "prototype", "--effect", "backlsh"), "no effect 'backlsh'; did you mean 'backlash'?\n"),
-        (("sweep", "--robot", "ethz_beam"), "robot 'ethz_beam' has no tendons; there is nothing to excite.\n"),
-        (("sweep", "--robot", "prototype", "--noise", "2"), "noise is 2.0 m; it must be a number at least 0 and at most 1.\n"),
+        (
+            ("rollouts", "--env", "Reach", "--policy", "shiped"),
+            "no policy 'shiped' to roll out; did you mean 'shipped'?\n",
+        ),
+        (
+            ("rollouts", "--env", "Reach", "--option", "n_stepz=3"),
+            "no option 'n_stepz'; did you mean 'n_steps'?\n",
+        ),
+        (
+            ("rollouts", "--robot", "prototype", "--effect", "backlsh"),
+            "no effect 'backlsh'; did you mean 'backlash'?\n",
+        ),
+        (
+            ("sweep", "--robot", "ethz_beam"),
+            "robot 'ethz_beam' has no tendons; there is nothing to excite.\n",
+        ),
+        (
+            ("sweep", "--robot", "prototype", "--noise", "2"),
+            "noise is 2.0 m; it must be a number at least 0 and at most 1.\n",
+        ),
     ],
 )
-def test_wrong_words_are_one_sentence(words: tuple[str, ...], sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_words_are_one_sentence(
+    words: tuple[str, ...], sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main(["generate", *words, "--count", "1", "--out", str(tmp_path / "out")]) == 2
     assert capsys.readouterr() == ("", sentence)
     assert not (tmp_path / "out").exists()
@@ -227,12 +271,21 @@ def test_wrong_words_are_one_sentence(words: tuple[str, ...], sentence: str, tmp
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        ({"options": {"n_steps": 5}}, "options are {'n_steps': 5}; give pairs of name and value, such as (('n_steps', 100),)."),
-        ({"options": ("a",)}, "options are ('a',); give pairs of name and value, such as (('n_steps', 100),)."),
+        (
+            {"options": {"n_steps": 5}},
+            "options are {'n_steps': 5}; give pairs of name and value, such as (('n_steps', 100),).",
+        ),
+        (
+            {"options": ("a",)},
+            "options are ('a',); give pairs of name and value, such as (('n_steps', 100),).",
+        ),
         ({"options": 3}, "options are 3; give pairs of name and value, such as (('n_steps', 100),)."),
         ({"policy": None}, "no policy None to roll out; known: baseline, random, shipped."),
         ({"env": None}, "env is None; give a task's name, such as 'Reach'."),
-        ({"options": (("randomise", 5),)}, "randomise is 5; give a Randomisation, a robot file, or a mapping of names to ranges."),
+        (
+            {"options": (("randomise", 5),)},
+            "randomise is 5; give a Randomisation, a robot file, or a mapping of names to ranges.",
+        ),
     ],
 )
 def test_wrong_rollouts_are_one_sentence(words: dict[str, Any], sentence: str) -> None:
@@ -248,4 +301,10 @@ def test_what_a_sweep_cannot_seal() -> None:
     with pytest.raises(UnknownNameError, match="no effect 'frction'; did you mean 'friction'"):
         Sweep(robot=dumps(robot), effects=("frction",))
     with pytest.raises(InputError, match="has effects already; a sweep seals its own into a plain robot"):
-        Sweep(robot=dumps(fastrod.Robot(name="worn", segments=robot.segments, effects=({"name": "backlash", "half_width": 1e-4},))))
+        Sweep(
+            robot=dumps(
+                fastrod.Robot(
+                    name="worn", segments=robot.segments, effects=({"name": "backlash", "half_width": 1e-4},)
+                )
+            )
+        )

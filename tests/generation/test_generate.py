@@ -40,7 +40,14 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_what_is_made_is_told_and_read_back(whole: Path) -> None:
     again = generate(small(), whole, workers=1)
-    assert (again.count, again.rows, again.failed, again.shards, again.made, again.rate) == (600, 600, 0, 12, 0, 0.0)
+    assert (again.count, again.rows, again.failed, again.shards, again.made, again.rate) == (
+        600,
+        600,
+        0,
+        12,
+        0,
+        0.0,
+    )
     assert rows_of(whole) == list(range(600))
     assert read_plan(whole) == small()
     table = parquet.read_table(whole / "shards")
@@ -66,7 +73,11 @@ def test_a_killed_worker_loses_and_doubles_nothing(whole: Path, tmp_path: Path) 
 
     def kill_one(_: str, done: int, __: int) -> None:
         if done >= 200 and not killed:
-            workers = [child for child in psutil.Process().children() if any("spawn_main" in word for word in child.cmdline())]
+            workers = [
+                child
+                for child in psutil.Process().children()
+                if any("spawn_main" in word for word in child.cmdline())
+            ]
             workers[0].send_signal(signal.SIGKILL)
             killed.append(workers[0].pid)
 
@@ -91,14 +102,17 @@ def die(_, done, __):
 
 generate(small(), sys.argv[1], workers=2, progress=die)
 """
-"""A command that is killed after its second shard, however fast its workers are: it lets them run no more than a few shards ahead."""
+"""A command that is killed after its second shard, however fast its workers are: it lets them run no more
+than a few shards ahead."""
 
 
 def test_a_killed_command_is_finished_by_the_same_command(whole: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     paths = os.pathsep.join(filter(None, [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH")]))
     words = [sys.executable, "-c", KILLED, str(out)]
-    first = subprocess.run(words, check=False, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": paths})
+    first = subprocess.run(
+        words, check=False, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": paths}
+    )
     assert first.returncode == -signal.SIGKILL
     workers = [int(pid) for pid in first.stdout.split()]
     assert len(workers) >= 2
@@ -133,7 +147,11 @@ def test_a_shard_with_a_broken_page_is_made_again(whole: Path, tmp_path: Path) -
     good = broken.read_bytes()
     broken.write_bytes(good[:4] + b"\xff" * 60 + good[64:])  # the first pages; the footer stays
     assert parquet.read_metadata(broken).num_rows == 50
-    with pytest.raises(InputError, match=r"shapes-000004.parquet' cannot be read; remove it, and generate again\.$"):
+    with pytest.raises(
+        InputError,
+        match=r"shapes-000004.parquet' cannot be read; remove it, and generate "
+        r"again\.$",
+    ):
         shards.counted(small(), tmp_path / "shards")
     assert generate(small(), tmp_path, workers=1).made == 1
     assert bits(tmp_path) == bits(whole)
@@ -142,7 +160,10 @@ def test_a_shard_with_a_broken_page_is_made_again(whole: Path, tmp_path: Path) -
 def test_a_data_set_grows_with_its_count(whole: Path, tmp_path: Path) -> None:
     assert generate(small(count=575), tmp_path, workers=1).made == 12
     for name in ("row", "chain", "dl_1", "tip_x"):  # rows that are there stay what they are
-        values = [parquet.read_table(folder / "shards", columns=[name]).column(name).to_pylist() for folder in (tmp_path, whole)]
+        values = [
+            parquet.read_table(folder / "shards", columns=[name]).column(name).to_pylist()
+            for folder in (tmp_path, whole)
+        ]
         assert values[0] == values[1][:575]
     summary = generate(small(count=600), tmp_path, workers=1)
     assert summary.made == 1  # the last one was short
@@ -158,7 +179,12 @@ def test_a_data_set_grows_with_its_count(whole: Path, tmp_path: Path) -> None:
         (lambda: small(shard_rows=60), "its shard_rows is 50, not 60"),
         (lambda: small(count=599), "its count is 600, not 599"),
         (lambda: replace(small(), version="0.0.1"), "its version is"),
-        (lambda: replace(small(), work=replace(small().work, robot=small().work.robot.replace("0.0022", "0.0023"))), "another robot"),
+        (
+            lambda: replace(
+                small(), work=replace(small().work, robot=small().work.robot.replace("0.0022", "0.0023"))
+            ),
+            "another robot",
+        ),
     ],
 )
 def test_a_folder_of_another_plan_is_refused(whole: Path, plan: Callable[[], Plan], difference: str) -> None:
@@ -186,12 +212,19 @@ def test_strange_files_are_refused(whole: Path, tmp_path: Path) -> None:
     for name in ("foreign", "beyond", "other", "planless", "broken"):
         shutil.copytree(whole, tmp_path / name)
     generate(small(seed=9, count=50), tmp_path / "nine", workers=1)
-    shutil.copy(tmp_path / "nine" / "shards" / "shapes-000000.parquet", tmp_path / "foreign" / "shards" / "shapes-000004.parquet")
-    shutil.copy(whole / "shards" / "shapes-000000.parquet", tmp_path / "beyond" / "shards" / "shapes-000012.parquet")
+    shutil.copy(
+        tmp_path / "nine" / "shards" / "shapes-000000.parquet",
+        tmp_path / "foreign" / "shards" / "shapes-000004.parquet",
+    )
+    shutil.copy(
+        whole / "shards" / "shapes-000000.parquet", tmp_path / "beyond" / "shards" / "shapes-000012.parquet"
+    )
     (tmp_path / "other" / "shards" / "mine.parquet").write_bytes(b"")
     (tmp_path / "planless" / PLAN).unlink()
     (tmp_path / "broken" / PLAN).write_text('{"kind": "shapes"}')
-    assert "shapes-000004.parquet' is a shard of another plan; give --out a folder of its own." in refused("foreign")
+    assert "shapes-000004.parquet' is a shard of another plan; give --out a folder of its own." in refused(
+        "foreign"
+    )
     assert "shapes-000012.parquet' is a shard of another plan" in refused("beyond")
     assert "mine.parquet' is no shard of this plan" in refused("other")
     assert "holds Parquet files and no plan.json" in refused("planless")
@@ -212,7 +245,11 @@ def test_rows_that_are_doubled_are_found(whole: Path, tmp_path: Path) -> None:
     path = tmp_path / "shards" / "shapes-000002.parquet"
     table = parquet.read_table(path)
     parquet.write_table(table.take([0, *range(49)]).replace_schema_metadata(table.schema.metadata), path)
-    with pytest.raises(InputError, match=r"shapes-000002.parquet' does not hold each row from 100 to 149 once; remove it"):
+    with pytest.raises(
+        InputError,
+        match=r"shapes-000002.parquet' does not hold each row from 100 to 149 "
+        r"once; remove it",
+    ):
         generate(small(), tmp_path, workers=1)
 
 
@@ -262,7 +299,9 @@ def test_two_commands_do_not_write_into_one_folder(tmp_path: Path) -> None:
             seen.append(str(error.value))
 
     generate(small(count=100), tmp_path, workers=1, progress=second)
-    assert seen == [f"another fastrod generate writes into {str(tmp_path)!r}; wait for it, or give --out another folder."]
+    assert seen == [
+        f"another fastrod generate writes into {str(tmp_path)!r}; wait for it, or give --out another folder."
+    ]
 
 
 def test_work_that_kills_every_worker_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -274,7 +313,11 @@ def test_work_that_kills_every_worker_ends(tmp_path: Path, monkeypatch: pytest.M
         yield
 
     monkeypatch.setattr(here, "_pool", dying)
-    with pytest.raises(HostError, match=r"the workers died 3 times without a shard; is there memory enough for 2\?"):
+    with pytest.raises(
+        HostError,
+        match=r"the workers died 3 times without a shard; is there memory enough "
+        r"for 2\?",
+    ):
         generate(small(), tmp_path, workers=2)
     assert pools == [12, 12, 12]
 
@@ -290,7 +333,9 @@ def test_an_error_of_a_task_is_the_commands(tmp_path: Path, monkeypatch: pytest.
     assert not list(tmp_path.iterdir())
 
 
-def test_a_disk_that_is_full_for_the_plan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_disk_that_is_full_for_the_plan(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     def full(_: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -327,12 +372,17 @@ def test_deaths_are_counted_from_the_last_shard(tmp_path: Path, monkeypatch: pyt
     assert pools == [12, 11, 10, 10, 10]
 
 
-def test_a_run_that_makes_nothing_leaves_the_folder_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_that_makes_nothing_leaves_the_folder_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def wrong(*_: Any) -> Any:
         raise InputError("no such shape.")
 
     def state(folder: Path) -> dict[str, bytes]:
-        return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b"" for path in folder.rglob("*")}
+        return {
+            str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b""
+            for path in folder.rglob("*")
+        }
 
     grown = tmp_path / "grown"
     generate(small(count=100), grown, workers=1)
@@ -360,16 +410,24 @@ def test_a_run_that_makes_nothing_leaves_the_folder_as_it_was(tmp_path: Path, mo
             "argument --count: '0.5' is not a whole number, such as 1000000 or 1e6; "
             "`fastrod generate shapes --help` says how it is used.\n",
         ),
-        (("--foo",), "fastrod generate shapes does not know '--foo'; `fastrod generate shapes --help` tells.\n"),
+        (
+            ("--foo",),
+            "fastrod generate shapes does not know '--foo'; `fastrod generate shapes --help` tells.\n",
+        ),
         (("--count", "0"), "count is 0; it must be a whole number at least 1 and at most 1e+12.\n"),
         (("--seed", "-1"), "seed is -1; it must be a whole number at least 0 and at most 9.22337e+18.\n"),
         (("--shard-rows", "0"), "--shard-rows is 0; it must be at least 1.\n"),
         (("--workers", "0"), "workers is 0; it must be a whole number at least 1 and at most 4096.\n"),
         (("--force", "-1"), "--force is -1.0 N; it must be zero or positive.\n"),
-        (("--robot", "protoype"), "no robot 'protoype'; did you mean 'prototype'? A path must end in .toml.\n"),
+        (
+            ("--robot", "protoype"),
+            "no robot 'protoype'; did you mean 'prototype'? A path must end in .toml.\n",
+        ),
     ],
 )
-def test_wrong_words_are_one_sentence(words: tuple[str, ...], sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_words_are_one_sentence(
+    words: tuple[str, ...], sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main([*WORDS, "--out", str(tmp_path / "out"), *words]) == 2
     assert capsys.readouterr() == ("", sentence)
     assert not list(tmp_path.glob("out/shards/*"))
@@ -390,14 +448,26 @@ def test_a_count_may_have_an_exponent(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("call", "sentence"),
     [
-        (lambda _: Plan(work=3, count=1), "work is 3; give Shapes, Rollouts, Trajectories, Sweep."),  # type: ignore[arg-type]
-        (lambda _: Shapes(robot=5), "robot is 5; give the text of a robot file, such as fastrod.model.robotfile.dumps(robot)."),  # type: ignore[arg-type]
-        (lambda _: Shapes(robot=load_robot("prototype")), "robot is Robot("),  # type: ignore[arg-type]
-        (lambda _: Sweep(robot=small().work.robot, effects="backlash"), "effects are 'backlash'; give a tuple of names, such as ("),  # type: ignore[union-attr, arg-type]
-        (lambda _: Trajectories(robot=small().work.robot, effects=(3,)), "effects are (3,); give a tuple of names, such as ("),  # type: ignore[union-attr, arg-type]
-        (lambda path: generate(3, path), "plan is 3; give a fastrod.generation.Plan."),  # type: ignore[arg-type]
-        (lambda _: generate(small(), None), "folder is None; give a path."),  # type: ignore[arg-type]
-        (lambda path: generate(small(), path, ray=True), "ray is True; give the address of a cluster, 'auto' for the one here, or"),  # type: ignore[arg-type]
+        (lambda _: Plan(work=3, count=1), "work is 3; give Shapes, Rollouts, Trajectories, Sweep."),
+        (
+            lambda _: Shapes(robot=5),
+            "robot is 5; give the text of a robot file, such as fastrod.model.robotfile.dumps(robot).",
+        ),
+        (lambda _: Shapes(robot=load_robot("prototype")), "robot is Robot("),
+        (
+            lambda _: Sweep(robot=small().work.robot, effects="backlash"),
+            "effects are 'backlash'; give a tuple of names, such as (",
+        ),
+        (
+            lambda _: Trajectories(robot=small().work.robot, effects=(3,)),
+            "effects are (3,); give a tuple of names, such as (",
+        ),
+        (lambda path: generate(3, path), "plan is 3; give a fastrod.generation.Plan."),
+        (lambda _: generate(small(), None), "folder is None; give a path."),
+        (
+            lambda path: generate(small(), path, ray=True),
+            "ray is True; give the address of a cluster, 'auto' for the one here, or",
+        ),
     ],
 )
 def test_wrong_things_are_one_sentence(call: Callable[[Path], Any], sentence: str, tmp_path: Path) -> None:
@@ -410,12 +480,18 @@ def test_wrong_things_are_one_sentence(call: Callable[[Path], Any], sentence: st
 
 def test_shards_that_are_a_file_are_refused(tmp_path: Path) -> None:
     (tmp_path / "shards").write_text("")
-    with pytest.raises(InputError, match=r"shards' is a file; it must be a folder: remove it, or give --out another folder\.$"):
+    with pytest.raises(
+        InputError,
+        match=r"shards' is a file; it must be a folder: remove it, or give --out "
+        r"another folder\.$",
+    ):
         generate(small(), tmp_path, workers=1)
     assert [path.name for path in tmp_path.iterdir()] == ["shards"]
 
 
-def test_what_is_not_installed_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_not_installed_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     from importlib import util
 
     find = util.find_spec
@@ -423,20 +499,37 @@ def test_what_is_not_installed_is_named(tmp_path: Path, monkeypatch: pytest.Monk
         ("pyarrow", (), "fastrod generate needs pyarrow: pip install 'fastrod[parquet]'.\n"),
         ("ray", ("--ray", "local"), "fastrod generate --ray needs ray: pip install 'fastrod[ray]'.\n"),
     ):
-        monkeypatch.setattr(util, "find_spec", lambda name, missing=missing: None if name == missing else find(name))
+        monkeypatch.setattr(
+            util, "find_spec", lambda name, missing=missing: None if name == missing else find(name)
+        )
         assert cli.main([*WORDS, "--out", str(tmp_path / "out"), *words]) == 2
         assert capsys.readouterr().err == sentence
     assert not (tmp_path / "out").exists()
 
 
 def test_the_command_prints_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main([*WORDS[:4], "--count", "64", "--out", str(tmp_path / "out"), "--workers", "1", "--line-density", "0.1"]) == 0
+    assert (
+        cli.main(
+            [
+                *WORDS[:4],
+                "--count",
+                "64",
+                "--out",
+                str(tmp_path / "out"),
+                "--workers",
+                "1",
+                "--line-density",
+                "0.1",
+            ]
+        )
+        == 0
+    )
     out, err = capsys.readouterr()
     assert "64, each once" in out
     assert "rows/s" in out
     assert err == ""
     plan = read_plan(tmp_path / "out")
     assert plan is not None
-    assert "line_density = 0.1" in plan.work.robot  # type: ignore[union-attr]
+    assert "line_density = 0.1" in plan.work.robot
     values = parquet.read_table(tmp_path / "out" / "shards").column("base_fz").to_numpy()
     assert np.isfinite(values).all()

@@ -16,7 +16,9 @@ def test_machines_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     # 100 tasks on 10 cores: ten rounds of 2 s; on 80 cores two rounds; on more, one
     assert by["1,000,000", 1]["seconds"] == pytest.approx(1.0 + 20.0 + 1e-3)
     assert by["1,000,000", 8]["seconds"] == pytest.approx(1.0 + 4.0 + 1e-3)
-    assert by["1,000,000", 32]["seconds"] == by["1,000,000", 128]["seconds"] == pytest.approx(1.0 + 2.0 + 1e-3)
+    assert (
+        by["1,000,000", 32]["seconds"] == by["1,000,000", 128]["seconds"] == pytest.approx(1.0 + 2.0 + 1e-3)
+    )
     # a million tasks hand out in 1000 s what 1280 cores do in 1564
     assert by["10,000,000,000", 128]["seconds"] == pytest.approx(1.0 + 2.0 * 782 + 10.0)
     assert by["10,000,000,000", 128]["bound"] == "work"

@@ -36,8 +36,11 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("written", [False, True])
-def test_a_killed_ray_worker_loses_and_doubles_nothing(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: bool) -> None:
-    """A worker that kills itself in its sixth shard, before or after writing it: none has to be caught at work."""
+def test_a_killed_ray_worker_loses_and_doubles_nothing(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: bool
+) -> None:
+    """A worker that kills itself in its sixth shard, before or after writing it: none has to be caught at
+    work."""
     from fastrod.generation import on_ray
 
     mark = tmp_path / "killed"
@@ -75,7 +78,9 @@ def test_an_error_on_a_worker_is_the_drivers(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("*/.*.part"))
 
 
-def test_a_machine_that_does_not_see_the_folder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_machine_that_does_not_see_the_folder_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from fastrod.generation import on_ray
 
     elsewhere = str(tmp_path / "elsewhere")
@@ -84,7 +89,11 @@ def test_a_machine_that_does_not_see_the_folder_is_named(tmp_path: Path, monkeyp
         return "" if elsewhere else path
 
     monkeypatch.setattr(on_ray, "_touch", touch)
-    with pytest.raises(InputError, match=r"machine .* does not see folder .*shards'; give --out a folder that all machines share\."):
+    with pytest.raises(
+        InputError,
+        match=r"machine .* does not see folder .*shards'; give --out a folder "
+        r"that all machines share\.",
+    ):
         generate(small(), tmp_path, ray="auto")
     assert bits(tmp_path) == {}
 
@@ -97,16 +106,21 @@ def test_a_folder_that_a_machine_cannot_write_is_named(tmp_path: Path) -> None:
     assert stat.S_ISREG((tmp_path / "probe").stat().st_mode)
 
 
-def test_a_cluster_that_does_not_answer_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cluster_that_does_not_answer_is_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse(**_: object) -> None:
-        raise ConnectionError("Could not find any running Ray instance.\nPlease specify the one to connect to.")
+        raise ConnectionError(
+            "Could not find any running Ray instance.\nPlease specify the one to connect to."
+        )
 
     monkeypatch.setattr(ray, "is_initialized", lambda: False)
     monkeypatch.setattr(ray, "init", refuse)
     with pytest.raises(HostError) as error:
         generate(small(), tmp_path, ray="auto")
     assert str(error.value) == (
-        "no Ray cluster answers at 'auto': Please specify the one to connect to. Start one with `ray start --head`, or give --ray local."
+        "no Ray cluster answers at 'auto': Please specify the one to connect to. Start one with `ray start "
+        "--head`, or give --ray local."
     )
     assert not list(tmp_path.iterdir())
     with socket.socket() as taken:  # bound, and nobody listens

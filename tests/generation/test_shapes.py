@@ -25,7 +25,9 @@ DENSITY = 0.004  # kg/m
 
 def heavy(name: str = "five_segment_reacher") -> Robot:
     robot = fastrod.load_robot(name)
-    return replace(robot, segments=tuple(replace(segment, line_density=DENSITY) for segment in robot.segments))
+    return replace(
+        robot, segments=tuple(replace(segment, line_density=DENSITY) for segment in robot.segments)
+    )
 
 
 def made(robot: Robot, count: int, shard: int = 0, **words: Any) -> dict[str, np.ndarray]:
@@ -57,7 +59,9 @@ def test_a_row_is_what_a_cold_simulator_finds(name: str) -> None:
     assert state.ok.all()
     assert (table["residual"] <= 1e-6).all()
     # the boundary is within the tolerance; the tip, further out, is by a few times that
-    np.testing.assert_allclose(group(table, "tip_x", "tip_y", "tip_z"), state.tip_position, rtol=0.0, atol=5e-6)
+    np.testing.assert_allclose(
+        group(table, "tip_x", "tip_y", "tip_z"), state.tip_position, rtol=0.0, atol=5e-6
+    )
     tension = group(table, *(f"tension_{k + 1}" for k in range(robot.n_tendons)))
     np.testing.assert_allclose(tension, state.tension, rtol=0.0, atol=1e-4 * np.abs(state.tension).max())
 
@@ -65,7 +69,9 @@ def test_a_row_is_what_a_cold_simulator_finds(name: str) -> None:
 def test_six_steps_a_segment_are_within_the_tolerance_of_sixty() -> None:
     robot = heavy()
     table = made(robot, 128)
-    state = fastrod.Simulator(robot, 128, points_per_segment=60, outputs="tip").settle(**wires(table, robot), tolerance=1e-10)
+    state = fastrod.Simulator(robot, 128, points_per_segment=60, outputs="tip").settle(
+        **wires(table, robot), tolerance=1e-10
+    )
     error = np.linalg.norm(group(table, "tip_x", "tip_y", "tip_z") - state.tip_position, axis=1)
     assert np.median(error) < 1e-6
     assert error.max() < 5e-6
@@ -76,15 +82,22 @@ def test_the_base_bears_tip_force_and_weight() -> None:
     table = made(robot, 192)
     # a segment that grows keeps its mass per length
     length = robot.length + table["ext_5"]
-    expected = group(table, "tip_fx", "tip_fy", "tip_fz") + DENSITY * length[:, None] * np.array(robot.gravity)
+    expected = group(table, "tip_fx", "tip_fy", "tip_fz") + DENSITY * length[:, None] * np.array(
+        robot.gravity
+    )
     np.testing.assert_allclose(group(table, "base_fx", "base_fy", "base_fz"), expected, atol=1e-8)
 
 
 def test_the_last_point_is_the_tip_and_frames_are_the_bases() -> None:
     plain = heavy("prototype")
-    turned = replace(plain, base_position=(0.3, -0.2, 0.1), base_quaternion=(np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)))  # about gravity
+    # about gravity
+    turned = replace(
+        plain, base_position=(0.3, -0.2, 0.1), base_quaternion=(np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
+    )
     one, other = (made(robot, 64, points=3) for robot in (plain, turned))
-    np.testing.assert_allclose(group(one, "p3_x", "p3_y", "p3_z"), group(one, "tip_x", "tip_y", "tip_z"), atol=1e-8)
+    np.testing.assert_allclose(
+        group(one, "p3_x", "p3_y", "p3_z"), group(one, "tip_x", "tip_y", "tip_z"), atol=1e-8
+    )
     for name, values in one.items():
         np.testing.assert_allclose(other[name], values, atol=2e-6, err_msg=name)
 
@@ -126,9 +139,14 @@ def test_neighbours_are_near_and_chains_are_told() -> None:
 def test_a_shard_is_a_pure_function_of_plan_and_number() -> None:
     robot = heavy("prototype")
     one, again, next_, seeded = (
-        made(robot, 100), made(robot, 100), made(robot, 100, shard=1),
-        {c.name: c.values for c in columns_of(Plan(work=Shapes(robot=dumps(robot)), count=100, shard_rows=100, seed=1), 0)},
-    )  # fmt: skip
+        made(robot, 100),
+        made(robot, 100),
+        made(robot, 100, shard=1),
+        {
+            c.name: c.values
+            for c in columns_of(Plan(work=Shapes(robot=dumps(robot)), count=100, shard_rows=100, seed=1), 0)
+        },
+    )
     for name, values in one.items():
         np.testing.assert_array_equal(again[name], values)
     assert one["row"].tolist() == list(range(100))
@@ -142,7 +160,9 @@ def test_rows_of_their_own_are_settled_cold() -> None:
     table = made(robot, 40, chain=1)
     state = fastrod.Simulator(robot, 40, points_per_segment=6).settle(**wires(table, robot), tolerance=1e-6)
     assert len(set(table["chain"])) == 40
-    np.testing.assert_allclose(group(table, "tip_x", "tip_y", "tip_z"), state.tip_position, rtol=0.0, atol=5e-6)
+    np.testing.assert_allclose(
+        group(table, "tip_x", "tip_y", "tip_z"), state.tip_position, rtol=0.0, atol=5e-6
+    )
 
 
 def test_a_row_that_does_not_converge_is_kept_and_marked(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -195,4 +215,6 @@ def test_robots_that_have_no_such_shapes() -> None:
     with pytest.raises(InputError, match="has effects; a shape is that of the plain rod"):
         Shapes(robot=dumps(replace(robot, effects=({"name": "backlash", "half_width": 1e-4},))))
     with pytest.raises(RobotError, match="an action needs wires driven by length"):
-        Shapes(robot=dumps(replace(robot, segments=(replace(robot.segments[0], mode="passive", tendons=()),))))
+        Shapes(
+            robot=dumps(replace(robot, segments=(replace(robot.segments[0], mode="passive", tendons=()),)))
+        )

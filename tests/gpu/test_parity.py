@@ -41,7 +41,8 @@ def test_a_jacobian_of_lengths_is_the_same_to_rounding() -> None:
 
 def test_every_input_is_the_same() -> None:
     robot = chain()
-    here, there = pair(robot, recover=False)  # the last step diverges, and what settles it begins elsewhere on a GPU
+    # the last step diverges, and what settles it begins elsewhere on a GPU
+    here, there = pair(robot, recover=False)
     lengths = bend(robot, 0.3, 0.1) + np.where(robot.tendon_segment == 1, 0.01, 0.0)
     lengths[5] += 0.004
     given: dict[str, Any] = {
@@ -74,14 +75,20 @@ def test_robots_that_differ_keep_their_own_numbers() -> None:
 
 
 def test_effects_in_the_robot_file() -> None:
-    here, there = pair(replace(rod(), effects=({"name": "backlash", "half_width": 2e-4}, {"name": "gravity", "line_density": 0.05})))
+    here, there = pair(
+        replace(
+            rod(),
+            effects=({"name": "backlash", "half_width": 2e-4}, {"name": "gravity", "line_density": 0.05}),
+        )
+    )
     for k in range(3):
         a, b = (sim.step(**inputs(rod(), k)) for sim in (here, there))
         assert_same(a, b)
         assert b.ok.all()
 
 
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of numpy, where the simulator runs the lost robot's pass
+# of numpy, where the simulator runs the lost robot's pass
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_a_lost_robot_beside_good_ones() -> None:
     here, there = pair(rod())
     rest = rod().rest_tendon_length

@@ -20,7 +20,7 @@ def one_segment(**changes: Any) -> Robot:
 def two_segments(**changes: Any) -> Robot:
     """Antagonistic wires, those of the far segment at places of their own in the near one."""
     (near,) = one_segment().segments
-    wires = tuple(replace(t, offset=(0.006, 0.005), angle=(t.angle + 0.7, t.angle)) for t in near.tendons)  # type: ignore[operator]
+    wires = tuple(replace(t, offset=(0.006, 0.005), angle=(t.angle + 0.7, t.angle)) for t in near.tendons)
     far = replace(near, length=0.06, bending_stiffness=(0.0015, 0.002), tendons=wires)
     return Robot(name="two", segments=(near, far), log_points=(0.05, 0.1), **changes)
 

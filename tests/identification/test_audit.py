@@ -21,7 +21,8 @@ RATE, SIZE = 8.0, 0.9
 
 @cache
 def samples() -> Samples:
-    """The designed run: rests, holds, reversals, and its beginning once more at the end; no load, one base."""
+    """The designed run: rests, holds, reversals, and its beginning once more at the end; no load, one
+    base."""
     run = excitation(one_segment(), rate=RATE).log
     return sample(replace(run, tip_position=np.zeros((len(run), 3)), payload=None, base_quaternion=None))
 
@@ -56,7 +57,8 @@ def patterns() -> dict[str, np.ndarray]:
     turn = np.array([[1.0, 0.2, 0.3], [-0.3, 1.0, 0.1]])
     return {
         "static": (b**2 * np.sign(b)) @ turn + 0.5 * (b[:, :1] * b[:, 1:]) * np.array([0.3, -0.2, 1.0]),
-        "memory": (b - lag) @ turn - ((b - lag) * b).mean(0) / (b**2).mean(0) * b @ turn,  # what no multiple of the input is
+        # what no multiple of the input is
+        "memory": (b - lag) @ turn - ((b - lag) * b).mean(0) / (b**2).mean(0) * b @ turn,
         "drift": np.tanh(t / (N * DT) * 4.0 - 2.0) * np.array([1.0, -0.5, 0.2]),
     }
 
@@ -108,7 +110,9 @@ def test_shares_are_of_the_variance() -> None:
     residual = planted(patterns()["static"], 0.5, 0)
     one, other = run(residual), run(1e-4 * residual)
     assert_allclose(
-        [other.static, other.memory, other.drift, other.exogenous], [one.static, one.memory, one.drift, one.exogenous], atol=1e-9
+        [other.static, other.memory, other.drift, other.exogenous],
+        [one.static, one.memory, one.drift, one.exogenous],
+        atol=1e-9,
     )
     nothing = run(np.zeros((N, 3)))
     assert (nothing.structured, nothing.kind, nothing.z) == (0.0, "none", 0.0)

@@ -17,12 +17,14 @@ from fastrod.identification.excite import REST, Excitation, excitation
 from fastrod.logs.runlog import read_log, write_log
 from fastrod.model.routing import wire
 
-ROBOTS = pytest.mark.parametrize("robot", [one_segment(), two_segments(), load_robot("tdcr_b")], ids=lambda robot: robot.name)
+ROBOTS = pytest.mark.parametrize(
+    "robot", [one_segment(), two_segments(), load_robot("tdcr_b")], ids=lambda robot: robot.name
+)
 RATE, BEND, SPEED = 15.0, 0.8, 1.0
 
 
 def made(robot: Robot, **changes: float) -> Excitation:
-    return excitation(robot, **({"bend": BEND, "rate": RATE, "speed": SPEED, "payload": 0.03} | changes))  # type: ignore[arg-type]
+    return excitation(robot, **({"bend": BEND, "rate": RATE, "speed": SPEED, "payload": 0.03} | changes))
 
 
 def bends(robot: Robot, run: Excitation) -> np.ndarray:
@@ -73,11 +75,19 @@ def test_it_rests_where_it_says(robot: Robot) -> None:
 
 
 HALF = float(np.sqrt(0.5))
-MOUNTS = [(1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (HALF, HALF, 0.0, 0.0), (HALF, 0.0, HALF, 0.0), (0.8, 0.36, 0.48, 0.0)]
+MOUNTS = [
+    (1.0, 0.0, 0.0, 0.0),
+    (0.0, 1.0, 0.0, 0.0),
+    (HALF, HALF, 0.0, 0.0),
+    (HALF, 0.0, HALF, 0.0),
+    (0.8, 0.36, 0.48, 0.0),
+]
 
 
 @pytest.mark.parametrize("mount", MOUNTS, ids=["up", "down", "about x", "about y", "askew"])
-def test_base_orientations_are_a_b_b_a_with_the_load_off_and_on(mount: tuple[float, float, float, float]) -> None:
+def test_base_orientations_are_a_b_b_a_with_the_load_off_and_on(
+    mount: tuple[float, float, float, float],
+) -> None:
     """However the robot is mounted, gravity comes from another side in B."""
     robot = one_segment(base_quaternion=mount)
     run = made(robot)
@@ -121,8 +131,8 @@ def test_base_and_load_change_only_at_rest(robot: Robot) -> None:
 @ROBOTS
 @pytest.mark.parametrize("speed", [0.5, 1.0])
 def test_nothing_jumps(robot: Robot, speed: float) -> None:
-    """The fastest are steps, at three times the speed of the triangles, and the smooth noise: a sum of eight sines of up to 1 Hz,
-    at most 0.6 bend / sqrt(8) each, in two directions."""
+    """The fastest are steps, at three times the speed of the triangles, and the smooth noise: a sum of eight
+    sines of up to 1 Hz, at most 0.6 bend / sqrt(8) each, in two directions."""
     run = made(robot, speed=speed)
     rate = np.linalg.norm(np.diff(bends(robot, run), axis=0), axis=-1) * RATE
     assert rate.max() <= max(3.0 * speed, 0.6 * BEND * np.sqrt(8.0) * 2.0 * np.pi * np.sqrt(2.0)) * 1.001
@@ -141,18 +151,30 @@ def test_each_block_has_triangles_of_each_segment_a_circle_holds_and_noise() -> 
     run = made(robot)
     found = bends(robot, run)
     for number in range(1, 5):
-        names = [part.name.partition(": ")[2] for part in run.parts if part.name.startswith(f"block {number}")]
+        names = [
+            part.name.partition(": ")[2] for part in run.parts if part.name.startswith(f"block {number}")
+        ]
         circle = "slow circle" if number % 2 else "fast circle"
         holds = [f"step and hold {k}" for k in (1, 2, 3)]
-        assert names == ["pause", "triangles of segment 1 alone", "triangles of segment 2 alone", circle, *holds, "random"]
+        assert names == [
+            "pause",
+            "triangles of segment 1 alone",
+            "triangles of segment 2 alone",
+            circle,
+            *holds,
+            "random",
+        ]
     for part in run.parts:
         here = found[rows(run, part.start, part.end)]
         if "alone" in part.name:
             other = 1 if "segment 1" in part.name else 0
             assert_allclose(here[:, other], 0.0, atol=1e-6)
-            turns = here[:, 1 - other] @ (here[:, 1 - other][np.argmax(np.linalg.norm(here[:, 1 - other], axis=1))] / BEND)
+            turns = here[:, 1 - other] @ (
+                here[:, 1 - other][np.argmax(np.linalg.norm(here[:, 1 - other], axis=1))] / BEND
+            )
             top = turns[1:-1][(np.diff(turns)[:-1] * np.diff(turns)[1:]) < 0.0]
-            assert_allclose(np.abs(top), BEND * np.repeat([1.0, 0.6, 0.28], 2), rtol=1e-5)  # decreasing, each to both sides
+            # decreasing, each to both sides
+            assert_allclose(np.abs(top), BEND * np.repeat([1.0, 0.6, 0.28], 2), rtol=1e-5)
         if "hold" in part.name:
             still = (np.linalg.norm(np.diff(here, axis=0), axis=(1, 2)) == 0.0).sum() / RATE
             assert still >= 3.9  # of four seconds

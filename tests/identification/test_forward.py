@@ -59,10 +59,15 @@ def log(robot: Robot, n: int = N) -> RunLog:
     """Every kind of input: wires, extensions, loads, another base half way."""
     turned = Rotation.from_rotvec(np.where(np.arange(n)[:, None] < n // 2, 0.0, [0.9, -0.5, 0.3]))
     return log_of(
-        robot, wave(robot, n), t=times(n), payload=np.where(np.arange(n) % 20 < 10, 0.0, 0.02), ext=np.full((n, robot.n_segments), 1e-3),
-        tip_force=np.outer(np.sin(np.arange(n)), [0.02, 0.01, -0.01]), base_quaternion=turned.as_quat(scalar_first=True),
+        robot,
+        wave(robot, n),
+        t=times(n),
+        payload=np.where(np.arange(n) % 20 < 10, 0.0, 0.02),
+        ext=np.full((n, robot.n_segments), 1e-3),
+        tip_force=np.outer(np.sin(np.arange(n)), [0.02, 0.01, -0.01]),
+        base_quaternion=turned.as_quat(scalar_first=True),
         points=np.zeros((n, len(robot.log_points), 3)),
-    )  # fmt: skip
+    )
 
 
 def stepped(robot: Robot, what: RunLog) -> Pose:
@@ -81,14 +86,17 @@ def stepped(robot: Robot, what: RunLog) -> Pose:
             "base_pose": np.concatenate([robot.base_position, what.base_quaternion[i]]),
             "extension": what.ext[i],
         }
-        assert sim.settle(robot.rest_tendon_length + what.dl[i], tolerance=1e-10 * robot.length, **given).ok.all()
+        assert sim.settle(
+            robot.rest_tendon_length + what.dl[i], tolerance=1e-10 * robot.length, **given
+        ).ok.all()
         seen.append(sim.measure())
     position, rotation, points = (np.concatenate(parts) for parts in zip(*seen, strict=True))
     return Pose(position, rotation, points, np.ones(len(what), bool))
 
 
 def predicted(robot: Robot, what: RunLog) -> Pose:
-    """The rows of a log as identification sees them: the robot's effects are known, nothing else is fitted."""
+    """The rows of a log as identification sees them: the robot's effects are known, nothing else is
+    fitted."""
     samples = sample(what)
     model = base_model(robot)
     pose = predict(model, model.start, samples, Rod(samples, robot, points=True))
@@ -108,7 +116,10 @@ def having(robot: Robot, *tables: dict[str, Any]) -> Robot:
 
 
 def test_every_effect_with_a_memory_or_a_clock_is_here() -> None:
-    assert {name for name in registry.effect_names() if has_memory(get_effect(name))} | {"temperature", "time_drift"} == set(TABLES)
+    assert {name for name in registry.effect_names() if has_memory(get_effect(name))} | {
+        "temperature",
+        "time_drift",
+    } == set(TABLES)
 
 
 @pytest.mark.parametrize("name", TABLES)
@@ -117,7 +128,8 @@ def test_a_log_in_one_go_is_a_simulator_step_by_step(name: str) -> None:
     what = log(robot)
     found = predicted(robot, what)
     assert_alike(found, stepped(robot, what), robot.length)
-    assert np.abs(found.position - predicted(two_segments(), what).position).max() > 1e-4  # and the effect is there
+    # and the effect is there
+    assert np.abs(found.position - predicted(two_segments(), what).position).max() > 1e-4
 
 
 def test_all_effects_at_once_are_the_simulator() -> None:

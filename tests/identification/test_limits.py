@@ -20,7 +20,8 @@ def moving(rate: float) -> Samples:
 
 
 def test_a_thick_beam_shears() -> None:
-    """The closed form: over bending, 3 EI / (k G A l^2) of a round rod with E = 3 G and k = 0.9 is 2.5 (r / l)^2; of the library 2.65."""
+    """The closed form: over bending, 3 EI / (k G A l^2) of a round rod with E = 3 G and k = 0.9 is 2.5 (r /
+    l)^2; of the library 2.65."""
     robot = load_robot("ethz_beam")
     (said,) = (line for line in limits(robot, moving(15.0)) if "shear" in line)
     (segment,) = robot.segments

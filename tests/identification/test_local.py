@@ -28,7 +28,8 @@ def robot() -> Robot:
 
 
 def samples() -> Samples:
-    """Loads, two base orientations, and a measured tip that is some tenths of a millimetre from the nominal one."""
+    """Loads, two base orientations, and a measured tip that is some tenths of a millimetre from the nominal
+    one."""
     turned = Rotation.from_rotvec(np.where(np.arange(N)[:, None] < N // 2, 0.0, [0.9, -0.5, 0.3]))
     inputs: dict[str, Any] = {
         "payload": np.where(np.arange(N) % 20 < 10, 0.0, 0.02),
@@ -100,23 +101,42 @@ def exact_slopes(here: Place, model: Model, theta: np.ndarray, j: int) -> np.nda
 
 # What a local slope may be off by, as a share of the exact one (root mean square over rows and numbers seen):
 # wires go through the rod by one-sided differences of 2 mrad, the camera by none;
-WIRES = dict.fromkeys(["drum_gain", "encoder_offset", "coupling", "slack", "stiffening", "temperature"], 0.004)
+WIRES = dict.fromkeys(
+    ["drum_gain", "encoder_offset", "coupling", "slack", "stiffening", "temperature"], 0.004
+)
 CAMERA = dict.fromkeys(["marker_offset", "frame_misalignment", "lens", "camera_scale", "time_drift"], 1e-4)
-# a force from the tip by one-sided differences of 2e-3 EI / l^2, and from there on linear: a twentieth of a typical payload here;
+# a force from the tip by one-sided differences of 2e-3 EI / l^2, and from there on linear: a twentieth of a
+# typical payload here;
 FORCE = dict.fromkeys(["payload", "tip_force"], 0.02)
-# operators have corners, which the local difference of a fiftieth of a typical size looks over: play has nothing but corners, and an
+# operators have corners, which the local difference of a fiftieth of a typical size looks over: play has
+# nothing but corners, and an
 # oscillator that is sampled more slowly than it rings answers to its period at any phase;
-MEMORY = {"latency": 0.015, "backlash": 0.15, "friction": 0.01, "creep": 0.004, "plastic_set": 0.006, "dynamics": 0.15}
-# what changes the rod has one secant, over a typical size: it is off by how much the effect saturates over that. Wires that stretch
+MEMORY = {
+    "latency": 0.015,
+    "backlash": 0.15,
+    "friction": 0.01,
+    "creep": 0.004,
+    "plastic_set": 0.006,
+    "dynamics": 0.15,
+}
+# what changes the rod has one secant, over a typical size: it is off by how much the effect saturates over
+# that. Wires that stretch
 # by thirty times their compliance here do so by a third.
 ROD = {
-    "gravity": 0.07, "tendon_stretch": 0.45, "routing_angle": 0.15, "axial_compression": 0.03, "precurvature": 0.02,
-    "stiffness_taper": 0.05, "stiffness_anisotropy": 0.2,
-}  # fmt: skip
+    "gravity": 0.07,
+    "tendon_stretch": 0.45,
+    "routing_angle": 0.15,
+    "axial_compression": 0.03,
+    "precurvature": 0.02,
+    "stiffness_taper": 0.05,
+    "stiffness_anisotropy": 0.2,
+}
 NOTHING = 0.01  # sigma, by a typical size: a slope that small is not compared; nobody can see it
 
 
-def assert_slopes(here: Place, model: Model, theta: np.ndarray, first: int, tolerance: dict[str, float]) -> None:
+def assert_slopes(
+    here: Place, model: Model, theta: np.ndarray, first: int, tolerance: dict[str, float]
+) -> None:
     residual = here.local.residual(model, theta)
     J = here.local.slopes(model, theta, residual)
     assert J.shape == (*residual.shape, len(theta))
@@ -135,13 +155,21 @@ def assert_slopes(here: Place, model: Model, theta: np.ndarray, first: int, tole
 
 
 def near_neutral(name: str) -> tuple[Place, Model, np.ndarray, int]:
-    """The base's reference and a candidate at hardly anything: a twentieth of its typical size, its shape where a fit starts. Dynamics as
-    a fit starts it: a period far below the time between samples rings at any phase."""
+    """The base's reference and a candidate at hardly anything: a twentieth of its typical size, its shape
+    where a fit starts. Dynamics as a fit starts it: a period far below the time between samples rings at any
+    phase."""
     here = base()
     model = here.model.without(name).with_effect(name)
     first = len(model.without(name).unknowns)
     theta = np.concatenate(
-        [[v for u, v in zip(here.model.unknowns, here.theta, strict=True) if u.place[:2] != ("effect", name)], model.start[first:]]
+        [
+            [
+                v
+                for u, v in zip(here.model.unknowns, here.theta, strict=True)
+                if u.place[:2] != ("effect", name)
+            ],
+            model.start[first:],
+        ]
     )
     for j in range(first, len(theta)):
         unknown = model.unknowns[j]
@@ -156,7 +184,11 @@ def test_slopes_of_the_base_parameters() -> None:
     """Stiffness by a one-sided difference of 5 %, lengths of two."""
     here = base()
     assert_slopes(
-        here, here.model, here.theta, 0, {"bending_stiffness": 0.07, "torsional_stiffness": 0.05, "length": 0.01, **WIRES, **CAMERA}
+        here,
+        here.model,
+        here.theta,
+        0,
+        {"bending_stiffness": 0.07, "torsional_stiffness": 0.05, "length": 0.01, **WIRES, **CAMERA},
     )
 
 
@@ -214,7 +246,9 @@ def test_a_local_fit_finds_what_was_planted() -> None:
     told.tip = pose.position + SIGMA * np.random.default_rng(8).normal(size=(N, 3))
     told.rotation, told.points, told.seen = None, np.zeros((N, 0, 3)), np.zeros((N, 0, 3), bool)
     assert len(log) == N
-    local = Local(here.model, here.theta, here.samples, Rod(here.samples, here.model.robot, points=True), told)
+    local = Local(
+        here.model, here.theta, here.samples, Rod(here.samples, here.model.robot, points=True), told
+    )
     fit = local.fit(here.model, here.theta, 20)
     error = np.sqrt(np.diag(np.linalg.inv(fit.hessian)))
     assert abs(fit.theta[place] - true[place]) < 3.0 * error[place]
@@ -232,4 +266,6 @@ def test_rows_that_do_not_count() -> None:
     ok[9] = False
     residual = target.residual(pose._replace(ok=ok))
     assert_array_equal(residual[[7, 9]], 0.0)
-    assert_array_equal(np.delete(residual, [7, 9], axis=0), np.delete(here.target.residual(pose), [7, 9], axis=0))
+    assert_array_equal(
+        np.delete(residual, [7, 9], axis=0), np.delete(here.target.residual(pose), [7, 9], axis=0)
+    )

@@ -1,4 +1,5 @@
-"""The network on what is left: it finds what follows from the inputs, and nothing in noise; it is never part of the result."""
+"""The network on what is left: it finds what follows from the inputs, and nothing in noise; it is never part
+of the result."""
 
 from __future__ import annotations
 
@@ -35,8 +36,10 @@ def left(residual: np.ndarray) -> tuple[float, float]:
     """Held-out rms of a residual, without the network and with it [m]."""
     here = samples()
     tested, _ = held_out_rows(here, ())
-    result = SimpleNamespace(residual_after=residual, used=~tested, tested=tested, outlier=np.zeros_like(tested))
-    told = residual_network(here, wire(one_segment()), result)  # type: ignore[arg-type]
+    result = SimpleNamespace(
+        residual_after=residual, used=~tested, tested=tested, outlier=np.zeros_like(tested)
+    )
+    told = residual_network(here, wire(one_segment()), result)
     assert told["inputs"] > 4
     return float(np.sqrt((residual[tested] ** 2).sum(1).mean())), told["held_out_rms_m"]
 
@@ -65,21 +68,33 @@ def test_missing_rows_are_left_out() -> None:
     residual[::7] = np.nan
     here = samples()
     tested, _ = held_out_rows(here, ())
-    result = SimpleNamespace(residual_after=residual, used=~tested, tested=tested, outlier=np.zeros_like(tested))
-    assert np.isfinite(residual_network(here, wire(one_segment()), result)["held_out_rms_m"])  # type: ignore[arg-type]
+    result = SimpleNamespace(
+        residual_after=residual, used=~tested, tested=tested, outlier=np.zeros_like(tested)
+    )
+    assert np.isfinite(residual_network(here, wire(one_segment()), result)["held_out_rms_m"])
 
 
 def test_without_scikit_learn_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "sklearn.neural_network", None)
-    with pytest.raises(InputError, match=r"needs scikit-learn; install fastrod\[network\], or leave --network out"):
+    with pytest.raises(
+        InputError,
+        match=r"needs scikit-learn; install fastrod\[network\], or leave "
+        r"--network out",
+    ):
         left(noise())
 
 
 def test_it_is_reported_apart() -> None:
     """The same result, digit by digit, with a number beside it."""
     log, robot = backlash_log(), load_robot("prototype")
-    without, with_it = (identify(log, robot, held_out=["two"], max_effects=0, network=on, threads=1) for on in (False, True))
+    without, with_it = (
+        identify(log, robot, held_out=["two"], max_effects=0, network=on, threads=1) for on in (False, True)
+    )
     assert without.network == {}
     assert 0.0 < with_it.network["held_out_rms_m"] < with_it.test.after
     assert_array_equal(with_it.after, without.after)
-    assert (with_it.test, with_it.verdict, with_it.identified) == (without.test, without.verdict, without.identified)
+    assert (with_it.test, with_it.verdict, with_it.identified) == (
+        without.test,
+        without.verdict,
+        without.identified,
+    )

@@ -1,4 +1,5 @@
-"""A log with measured orientations: they inform the base model, and what they cannot explain does not lead it astray."""
+"""A log with measured orientations: they inform the base model, and what they cannot explain does not lead it
+astray."""
 
 from __future__ import annotations
 
@@ -29,7 +30,10 @@ def late(nominal: Robot) -> RunLog:
     assert run.base_quaternion is not None
     assert run.payload is not None
     (segment,) = nominal.segments
-    stiff = replace(nominal, segments=(replace(segment, bending_stiffness=tuple(1.1 * k for k in segment.bending_stiffness)),))
+    stiff = replace(
+        nominal,
+        segments=(replace(segment, bending_stiffness=tuple(1.1 * k for k in segment.bending_stiffness)),),
+    )
     simulator = Simulator(stiff, n_robots=len(run), points_per_segment=12)
     pose = np.column_stack([np.zeros((len(run), 3)), run.base_quaternion])
     weight = run.payload[:, None] * np.array(nominal.gravity)
@@ -39,7 +43,10 @@ def late(nominal: Robot) -> RunLog:
     tip, turn = base.inv().apply(state.tip_position), base.inv() * Rotation.from_matrix(state.tip_rotation)
     rng = np.random.default_rng(3)
     tip = tip[np.maximum(np.arange(len(run)) - LATE, 0)] + NOISE * rng.normal(size=tip.shape)
-    turn = Rotation.from_rotvec(TURN * rng.normal(size=tip.shape)) * turn[np.maximum(np.arange(len(run)) - LATE, 0)]
+    turn = (
+        Rotation.from_rotvec(TURN * rng.normal(size=tip.shape))
+        * turn[np.maximum(np.arange(len(run)) - LATE, 0)]
+    )
     return replace(run, tip_position=tip, tip_quaternion=quaternion_from_matrix(turn.as_matrix()))
 
 
@@ -51,7 +58,9 @@ def test_the_base_fit_is_no_worse_than_the_model_as_it_was(late: RunLog, nominal
     assert late.payload is not None
     pose = np.column_stack([np.zeros((len(late), 3)), late.base_quaternion])
     state = simulator.settle(
-        nominal.rest_tendon_length + late.dl, tip_force=late.payload[:, None] * np.array(nominal.gravity), base_pose=pose
+        nominal.rest_tendon_length + late.dl,
+        tip_force=late.payload[:, None] * np.array(nominal.gravity),
+        base_pose=pose,
     )
     tip = Rotation.from_quat(late.base_quaternion, scalar_first=True).inv().apply(state.tip_position)
     off = np.linalg.norm(late.tip_position - tip, axis=1)[found.used]

@@ -1,4 +1,5 @@
-"""What a log of another camera, of mixed-up inputs or of another unit makes `identify` and `replay` do: register, ask, or refuse."""
+"""What a log of another camera, of mixed-up inputs or of another unit makes `identify` and `replay` do:
+register, ask, or refuse."""
 
 from __future__ import annotations
 
@@ -30,11 +31,20 @@ from fastrod.rotation import quaternion_from_matrix
 ROBOT = loads(farlog.TOML)
 TURN, SHIFT = farlog.camera(0.6, 0.34)
 HALF = np.diag([-1.0, -1.0, 1.0])
-RIGHT = re.escape("Are the units, the signs (negative = pulled) and the order of the dl_ columns right, and is it this robot?")
+RIGHT = re.escape(
+    "Are the units, the signs (negative = pulled) and the order of the dl_ columns right, and "
+    "is it this robot?"
+)
 
 
 def log_of(run: farlog.Run, **columns: Any) -> RunLog:
-    given = {"name": "far", "t": run.t, "run": np.full(len(run.t), ""), "dl": run.dl, "tip_position": run.tip} | columns
+    given = {
+        "name": "far",
+        "t": run.t,
+        "run": np.full(len(run.t), ""),
+        "dl": run.dl,
+        "tip_position": run.tip,
+    } | columns
     return RunLog(**given)
 
 
@@ -76,7 +86,8 @@ def test_points_in_space_or_in_a_plane_tell_any_rotation(cloud: str, angle: floa
     measured = points @ rotation.T + shift + 3e-4 * rng.normal(size=points.shape)
     measured[::11] += 0.2 * rng.normal(size=measured[::11].shape)  # outliers
     found = align(measured, points)
-    # the pull towards no rotation is a thousandth of the spread: of an arc, whose other spread is a third, up to some hundredths
+    # the pull towards no rotation is a thousandth of the spread: of an arc, whose other spread is a third, up
+    # to some hundredths
     assert Rotation.from_matrix(found.rotation @ rotation.T).magnitude() < 0.03
     assert np.linalg.det(found.rotation) == pytest.approx(1.0)
     assert np.linalg.norm(found.shift - shift) < 2e-3
@@ -84,7 +95,8 @@ def test_points_in_space_or_in_a_plane_tell_any_rotation(cloud: str, angle: floa
 
 @pytest.mark.parametrize("turn", [0.0, 0.6])
 def test_points_on_a_line_tell_no_rotation_about_it(turn: float) -> None:
-    """Turned about another axis the line follows, and nothing turns about the line itself; with measured orientations all is known."""
+    """Turned about another axis the line follows, and nothing turns about the line itself; with measured
+    orientations all is known."""
     rng = np.random.default_rng(5)
     points = np.column_stack([rng.uniform(-0.05, 0.05, 300), np.zeros(300), np.full(300, 0.07)])
     rotation = Rotation.from_rotvec([0.0, turn, 0.0]).as_matrix()
@@ -117,20 +129,24 @@ def identified(angle: float, distance: float, *, prior: bool = False) -> Result:
 
 
 @pytest.mark.parametrize(("angle", "distance"), [(0.6, 0.34), (3.0, 1.0)])
-def test_a_camera_far_off_is_registered_and_the_effect_named_as_ever(angle: float, distance: float, tmp_path: Path) -> None:
+def test_a_camera_far_off_is_registered_and_the_effect_named_as_ever(
+    angle: float, distance: float, tmp_path: Path
+) -> None:
     result = identified(angle, distance)
     assert result.registration is not None
     assert result.registration.angle == pytest.approx(angle, abs=0.02)
     assert result.registration.distance == pytest.approx(distance, abs=3e-3)
     said = (
-        f"The camera stands {np.degrees(result.registration.angle):.1f} deg and {result.registration.distance:.2g} m from where the robot"
+        f"The camera stands {np.degrees(result.registration.angle):.1f} deg and "
+        f"{result.registration.distance:.2g} m from where the robot"
     )
     assert said in result.summary
     assert report.to_json(result)["registration"]["angle_rad"] == result.registration.angle
     assert result.effects[0].name in ("backlash", "friction")  # friction without spread is backlash
     width = result.effects[0].parameters["half_width"]
     assert width.value == pytest.approx(farlog.PLAY, rel=0.03)
-    # arcs are no rods of Kirchhoff: measured when this was written 1.40, and 1.00 with coupling beside it on the camera of the file
+    # arcs are no rods of Kirchhoff: measured when this was written 1.40, and 1.00 with coupling beside it on
+    # the camera of the file
     assert result.test.after < 1.5 * result.noise.floor < 0.2 * result.test.before
     paths = {path.name: path for path in report.write(result, tmp_path)}
     again = replay(seen(angle, distance), load_robot(paths["identified.toml"]))
@@ -148,11 +164,28 @@ def test_it_takes_no_more_than_with_the_right_prior() -> None:
 
 
 REFUSED = {
-    "signs": (lambda: replace(seen(), dl=-seen().dl), rf"it moves -0\.\d+ times as predicted\. {RIGHT} .* the sign of every dl_ reversed"),
-    "half a turn": (lambda: log_of(farlog.log(900, rotation=HALF)), r"A camera turned by 1[78]\d deg would look the same: if yours is"),
-    "columns moved on": (order(1, 2, 0, 4, 5, 3), rf"{RIGHT} .* the dl_ columns of each segment moved on by 2"),
-    "left-handed": (mirrored([[1, 0, 0], [0, 1, 0], [0, 0, -1]]), "In a left-handed frame the model would follow"),
-    "x and y exchanged": (mirrored([[0, 1, 0], [1, 0, 0], [0, 0, 1]]), "In a left-handed frame the model would follow"),
+    "signs": (
+        lambda: replace(seen(), dl=-seen().dl),
+        rf"it moves -0\.\d+ times as predicted\. {RIGHT} .* "
+        r"the sign of every dl_ reversed",
+    ),
+    "half a turn": (
+        lambda: log_of(farlog.log(900, rotation=HALF)),
+        r"A camera turned by 1[78]\d deg would "
+        r"look the same: if yours is",
+    ),
+    "columns moved on": (
+        order(1, 2, 0, 4, 5, 3),
+        rf"{RIGHT} .* the dl_ columns of each segment moved on by 2",
+    ),
+    "left-handed": (
+        mirrored([[1, 0, 0], [0, 1, 0], [0, 0, -1]]),
+        "In a left-handed frame the model would follow",
+    ),
+    "x and y exchanged": (
+        mirrored([[0, 1, 0], [1, 0, 0], [0, 0, 1]]),
+        "In a left-handed frame the model would follow",
+    ),
     "left-handed and far": (
         mirrored([[1, 0, 0], [0, 1, 0], [0, 0, -1]], lambda: seen(0.6, 0.34)),
         "In a left-handed frame the model would follow",
@@ -164,8 +197,16 @@ ASKED = {
     "mm": (scaled(1e3), rf"{RIGHT} The model would follow with every dl_ times 0\.001 \(mm to m\)"),
     "twice": (scaled(2.0), r"with every dl_ times 0\.5 \(a diameter for a radius\)"),
     "half": (scaled(0.5), r"with every dl_ times 2 \(a radius for a diameter\)"),
-    "time in ms": (lambda: replace(seen(), t=1e3 * seen().t), r"has a row every 50 s and lasts .* s; is column t in ms\?"),
-    "a camera far off": (lambda: seen(0.6, 0.34), r"the camera stands 34\.\d deg and 0\.34 m from where the robot file says"),
+    "time in ms": (
+        lambda: replace(seen(), t=1e3 * seen().t),
+        r"has a row every 50 s and lasts .* s; is "
+        r"column t in ms\?",
+    ),
+    "a camera far off": (
+        lambda: seen(0.6, 0.34),
+        r"the camera stands 34\.\d deg and 0\.34 m from where the "
+        r"robot file says",
+    ),
 }
 
 
@@ -212,7 +253,9 @@ def test_replay_prints_its_questions_and_is_done(tmp_path: Path, monkeypatch: An
     assert main(["replay", "flipped.csv", "--robot", "mine.toml"]) == 0
     told = capsys.readouterr()
     assert "excursion" in told.out
-    assert re.search(r"^log 'flipped' is further from robot 'mine' .* the sign of every dl_ reversed", told.err)
+    assert re.search(
+        r"^log 'flipped' is further from robot 'mine' .* the sign of every dl_ reversed", told.err
+    )
     assert len(told.err.splitlines()) == 1
     rest = np.asarray(ROBOT.rest_tendon_length)
     Path("absolute.csv").write_text(farlog.csv(run._replace(dl=run.dl + rest)))

@@ -23,7 +23,7 @@ def log(name: str = "log", labels: tuple[str, ...] = ("a", "b"), n: int = 40, be
 
 
 def samples(**changes: tuple[str, ...]) -> Samples:
-    return sample(log(**changes))  # type: ignore[arg-type]
+    return sample(log(**changes))
 
 
 def test_by_default_every_fourth_of_twenty_stretches_of_each_run() -> None:
@@ -36,7 +36,15 @@ def test_by_default_every_fourth_of_twenty_stretches_of_each_run() -> None:
 
 @pytest.mark.parametrize(
     ("text", "first", "last"),
-    [("a", 0, 39), ("b", 40, 79), ("a@1:2", 10, 19), ("b@3:", 70, 79), ("b@:0.5", 40, 44), ("a@2.25:2.55", 23, 25), ("a@.45:1.", 5, 9)],
+    [
+        ("a", 0, 39),
+        ("b", 40, 79),
+        ("a@1:2", 10, 19),
+        ("b@3:", 70, 79),
+        ("b@:0.5", 40, 44),
+        ("a@2.25:2.55", 23, 25),
+        ("a@.45:1.", 5, 9),
+    ],
 )
 def test_held_out_syntax(text: str, first: int, last: int) -> None:
     mask, words = held_out_rows(samples(), [text])
@@ -57,7 +65,11 @@ def test_several_stretches_and_every_run_at_once() -> None:
     ("text", "kind", "sentence"),
     [
         (["c"], UnknownNameError, "no run 'c' to hold out in log 'log'; known: a, b"),
-        (["a@1-2"], LogError, "'a@1-2' is no stretch of time; write RUN@START:END in seconds, for example a@90:150"),
+        (
+            ["a@1-2"],
+            LogError,
+            "'a@1-2' is no stretch of time; write RUN@START:END in seconds, for example a@90:150",
+        ),
         (["a@10:20"], LogError, "'a@10:20' has no samples; the log's runs last to 3.9 s"),
         (["a@2:1"], LogError, "has no samples"),
         (["a", "b"], LogError, "everything in log 'log' is held out"),
@@ -71,7 +83,11 @@ def test_what_cannot_be_held_out(text: list[str], kind: type[Exception], sentenc
 
 
 def test_runs_that_have_no_names() -> None:
-    with pytest.raises(UnknownNameError, match=r"no run 'c' to hold out; log 'log' names no runs: give a time, as in '@60:'"):
+    with pytest.raises(
+        UnknownNameError,
+        match=r"no run 'c' to hold out; log 'log' names no runs: give a "
+        r"time, as in '@60:'",
+    ):
         held_out_rows(sample(log(labels=("",))), ["c"])
     with pytest.raises(UnknownNameError, match="did you mean 'circle'"):
         held_out_rows(samples(labels=("circle", "square")), ["cirle"])
@@ -113,6 +129,8 @@ def test_logs_that_do_not_go_together() -> None:
         merged([replace(log("first"), tip_quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (80, 1))), log("second")])
     with pytest.raises(LogError, match="different numbers of tendons"):
         merged([log("first"), replace(log("second"), dl=np.zeros((80, 3)))])
-    two_points, one_point = (replace(log(name), points=np.zeros((80, k, 3))) for name, k in (("first", 2), ("second", 1)))
+    two_points, one_point = (
+        replace(log(name), points=np.zeros((80, k, 3))) for name, k in (("first", 2), ("second", 1))
+    )
     with pytest.raises(LogError, match="different numbers of points"):
         merged([two_points, one_point])

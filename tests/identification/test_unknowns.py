@@ -24,7 +24,11 @@ from fastrod.model.routing import wire
 
 def fitted(robot: Robot, **targets: Any) -> Model:
     """The model of a robot with this `[fit]`; __ in a name stands for a dot, `all` for the wildcard."""
-    return base_model(replace(robot, fit={name.replace("__", ".").replace("all", "*"): prior for name, prior in targets.items()}))
+    return base_model(
+        replace(
+            robot, fit={name.replace("__", ".").replace("all", "*"): prior for name, prior in targets.items()}
+        )
+    )
 
 
 def names(model: Model) -> list[str]:
@@ -51,7 +55,8 @@ def test_a_robot_that_says_nothing_has_unknown_stiffness() -> None:
     assert model.effects == ()
     robot = model.robot_at(np.log([1.5, 0.5]))
     for was, now in zip(two_segments().segments, robot.segments, strict=True):
-        assert_allclose(now.bending_stiffness, np.multiply(was.bending_stiffness, 1.5), rtol=1e-14)  # both axes
+        # both axes
+        assert_allclose(now.bending_stiffness, np.multiply(was.bending_stiffness, 1.5), rtol=1e-14)
         assert_allclose(now.torsional_stiffness, 0.5 * was.torsional_stiffness, rtol=1e-14)
 
 
@@ -102,7 +107,9 @@ def test_stiffness_that_is_named_is_not_added_again() -> None:
     assert names(model) == ["segment.2.bending_stiffness", "segment.*.torsional_stiffness"]
     robot = model.robot_at(at(model, segment__2__bending_stiffness=0.002))
     # of an anisotropic one the mean is fitted, the ratio stays: nominal (0.0015, 0.002)
-    assert_allclose(robot.segments[1].bending_stiffness, np.array([0.0015, 0.002]) * 0.002 / 0.00175, rtol=1e-14)
+    assert_allclose(
+        robot.segments[1].bending_stiffness, np.array([0.0015, 0.002]) * 0.002 / 0.00175, rtol=1e-14
+    )
     assert robot.segments[0].bending_stiffness == two_segments().segments[0].bending_stiffness
 
 
@@ -117,7 +124,9 @@ def test_shared_is_the_same_factor_or_the_same_addition() -> None:
     assert names(model)[:3] == ["segment.*.length", "tendon.*.offset", "tendon.*.angle"]
     # the prior of a factor: its sd over the mean of the nominal values
     assert_allclose(model.prior[1][0], 1.3e-3 / 0.065, rtol=1e-14)
-    robot = model.robot_at(at(model, segment__all__length=1.1, tendon__all__offset=0.9, tendon__all__angle=0.2))
+    robot = model.robot_at(
+        at(model, segment__all__length=1.1, tendon__all__offset=0.9, tendon__all__angle=0.2)
+    )
     for was, now in zip(nominal.segments, robot.segments, strict=True):
         assert_allclose(now.length, 1.1 * was.length, rtol=1e-14)
         for one, other in zip(was.tendons, now.tendons, strict=True):
@@ -128,28 +137,42 @@ def test_shared_is_the_same_factor_or_the_same_addition() -> None:
 def test_one_wire_alone_moves_by_what_is_said() -> None:
     nominal = two_segments()
     model = fitted(nominal, tendon__5__offset={"sd": 3e-4}, tendon__6__angle={"sd": 0.05})
-    robot = model.robot_at(at(model, tendon__5__offset=0.0066, tendon__6__angle=nominal.tendons[5].angle[1] - 0.25))  # type: ignore[index]
+    robot = model.robot_at(
+        at(model, tendon__5__offset=0.0066, tendon__6__angle=nominal.tendons[5].angle[1] - 0.25)
+    )
     # a wire through two segments has its mean fitted: offsets (6, 5) mm by a factor, angles by an addition
     assert_allclose(robot.tendons[4].offset, np.array([0.006, 0.005]) * 0.0066 / 0.0055, rtol=1e-14)
     mean = np.mean(nominal.tendons[5].angle)
-    added = nominal.tendons[5].angle[1] - 0.25 - mean  # type: ignore[index]
+    added = nominal.tendons[5].angle[1] - 0.25 - mean
     assert_allclose(robot.tendons[5].angle, np.add(nominal.tendons[5].angle, added), rtol=1e-13)
     assert [robot.tendons[k] for k in (0, 1, 2, 3, 6, 7)] == [nominal.tendons[k] for k in (0, 1, 2, 3, 6, 7)]
 
 
 def test_body_radii_and_log_points_stay_where_they_fit() -> None:
-    nominal = replace(two_segments(), segments=tuple(replace(s, body_radius=0.0078) for s in two_segments().segments))
+    nominal = replace(
+        two_segments(), segments=tuple(replace(s, body_radius=0.0078) for s in two_segments().segments)
+    )
     nominal = replace(nominal, log_points=(0.05, 0.13))
-    model = fitted(nominal, segment__all__length={"sd": 1e-3, "shared": True}, tendon__all__offset={"sd": 3e-4, "shared": True})
+    model = fitted(
+        nominal,
+        segment__all__length={"sd": 1e-3, "shared": True},
+        tendon__all__offset={"sd": 3e-4, "shared": True},
+    )
     robot = model.robot_at(at(model, segment__all__length=0.9, tendon__all__offset=1.2))
     assert_allclose(robot.log_points, (0.05, 0.9 * 0.13), rtol=1e-14)
-    assert_allclose([s.body_radius for s in robot.segments], [0.009, 0.0078], rtol=1e-12)  # 7.5 mm by 1.2; 5 and 6 mm fit
+    # 7.5 mm by 1.2; 5 and 6 mm fit
+    assert_allclose([s.body_radius for s in robot.segments], [0.009, 0.0078], rtol=1e-12)
 
 
 @pytest.mark.parametrize(
     ("target", "prior", "sentence"),
     [
-        ("segment.1.lenght", {"sd": 1e-3}, r"\[fit\] 'segment.1.lenght' is no parameter; did you mean 'segment.\*.length'"),
+        (
+            "segment.1.lenght",
+            {"sd": 1e-3},
+            r"\[fit\] 'segment.1.lenght' is no parameter; did you mean "
+            r"'segment.\*.length'",
+        ),
         ("tendon.*.gian", {"sd": 1e-3}, r"did you mean 'tendon.\*.gain'"),
         ("tendons.1.gain", {"sd": 1e-3}, r"did you mean 'tendon.\*.gain'"),
         ("tendon.*.length", {"sd": 1e-3}, r"'tendon.\*.length' is no parameter"),
@@ -172,24 +195,33 @@ def test_bad_targets_get_one_sentence(target: str, prior: dict[str, float], sent
 
 def test_the_camera_is_known_unless_it_is_said_not_to_be() -> None:
     assert base_model(one_segment()).effects == ()
-    model = base_model(one_segment(sensor={"registration_sd": (1e-3, 0.02), "marker_offset_sd": 2e-3, "latency_sd": 0.05}))
+    model = base_model(
+        one_segment(sensor={"registration_sd": (1e-3, 0.02), "marker_offset_sd": 2e-3, "latency_sd": 0.05})
+    )
     assert model.effects == ("latency", "marker_offset", "frame_misalignment")
     sd = dict(zip(names(model), model.prior[1], strict=True))
-    assert [sd[f"frame_misalignment.{kind}_{a}"] for kind in ("shift", "rotation") for a in "xyz"] == [1e-3] * 3 + [0.02] * 3
+    assert [sd[f"frame_misalignment.{kind}_{a}"] for kind in ("shift", "rotation") for a in "xyz"] == [
+        1e-3
+    ] * 3 + [0.02] * 3
     assert [sd[f"marker_offset.{a}"] for a in "xyz"] == [2e-3] * 3
     assert sd["latency.delay"] == 0.05
-    values = model.values(at(model, latency__delay=0.07, marker_offset__y=1e-3, frame_misalignment__rotation_z=0.01))
+    values = model.values(
+        at(model, latency__delay=0.07, marker_offset__y=1e-3, frame_misalignment__rotation_z=0.01)
+    )
     assert values["latency"].tolist() == [0.07]
     assert values["marker_offset"].tolist() == [0.0, 1e-3, 0.0]
     turned = columns(get_effect("frame_misalignment"), model.wiring).index("rotation_z")
     assert np.flatnonzero(values["frame_misalignment"]).tolist() == [turned]
     free = base_model(one_segment(), free_camera=True)
     assert dict(zip(names(free), free.prior[1], strict=True))["latency.delay"] == FREE_CAMERA["latency_sd"]
-    assert model.limits[0][names(model).index("latency.delay")] == 0.0  # what is measured is not measured before it happens
+    # what is measured is not measured before it happens
+    assert model.limits[0][names(model).index("latency.delay")] == 0.0
 
 
 def test_effects_of_the_robot_are_known_and_those_added_are_not() -> None:
-    robot = two_segments(effects=({"name": "creep", "share": 0.1, "time_constant": 2.0}, {"name": "drum_gain", "gain": 0.02}))
+    robot = two_segments(
+        effects=({"name": "creep", "share": 0.1, "time_constant": 2.0}, {"name": "drum_gain", "gain": 0.02})
+    )
     model = base_model(robot)
     assert model.effects == ("drum_gain", "creep")
     assert not any("creep" in name for name in names(model))
@@ -202,7 +234,10 @@ def test_effects_of_the_robot_are_known_and_those_added_are_not() -> None:
     assert_allclose(values["friction"][:2], 3e-4, rtol=1e-12)  # one number for both segments
     assert values["friction"][3] == 0.0  # left out: neutral
     split = model.with_effect("friction", split=True)
-    assert [n for n in names(split) if "half_width" in n] == ["friction.half_width_1", "friction.half_width_2"]
+    assert [n for n in names(split) if "half_width" in n] == [
+        "friction.half_width_1",
+        "friction.half_width_2",
+    ]
     back = more.without("friction")
     assert (back.effects, names(back)) == (model.effects, names(model))
 
@@ -227,13 +262,24 @@ def test_every_effect_of_the_library_can_be_unknown(name: str) -> None:
 def test_the_identified_robot_is_the_prediction_and_survives_its_file() -> None:
     """`identified` as TOML and back is the same robot, and `replay` of it says what the fit said."""
     robot = two_segments(
-        fit={"segment.*.length": {"sd": 1e-3, "shared": True}, "tendon.*.gain": {"sd": 0.02}, "tendon.*.zero": {"sd": 2e-4}},
+        fit={
+            "segment.*.length": {"sd": 1e-3, "shared": True},
+            "tendon.*.gain": {"sd": 0.02},
+            "tendon.*.zero": {"sd": 2e-4},
+        },
         effects=({"name": "coupling", "from_distal": 0.05},),
     )
-    model = base_model(robot).with_effect("stiffening").with_effect("payload").with_effect("tendon_stretch", split=True)
+    model = (
+        base_model(robot)
+        .with_effect("stiffening")
+        .with_effect("payload")
+        .with_effect("tendon_stretch", split=True)
+    )
     low, high = model.limits
     rng = np.random.default_rng(7)
-    theta = np.clip(model.start + 0.5 * np.minimum(model.prior[1], 0.2) * rng.normal(size=len(model.unknowns)), low, high)
+    theta = np.clip(
+        model.start + 0.5 * np.minimum(model.prior[1], 0.2) * rng.normal(size=len(model.unknowns)), low, high
+    )
     made = model.identified(theta)
     back = loads(dumps(made))
     assert back == made
@@ -254,7 +300,9 @@ def test_the_identified_robot_is_the_prediction_and_survives_its_file() -> None:
     assert np.abs(replay(log, robot).tip_position - told.position).max() > 1e-3
 
 
-@pytest.mark.parametrize("name", ["marker_offset", "frame_misalignment", "time_drift", "creep", "temperature"])
+@pytest.mark.parametrize(
+    "name", ["marker_offset", "frame_misalignment", "time_drift", "creep", "temperature"]
+)
 def test_replay_of_the_identified_robot_knows_camera_memory_and_time(name: str) -> None:
     robot = two_segments()
     model = base_model(robot).with_effect(name)

@@ -25,11 +25,20 @@ RIPPLE = Foil("ripple", "static", "periodic", np.zeros((1, 3, 2)), 1)
 def took(foil: Foil | None, name: str = "backlash") -> Step:
     """A stage that took a foil, or an effect."""
     taken = Candidate(foil.name if foil else name, None, 9.0, 99.0, 0.5, 1, "", foil)
-    return Step(None, (), taken)  # type: ignore[arg-type]
+    return Step(None, (), taken)
 
 
 def opinion(**changed: Any) -> Opinion:
-    given = {"base": BASE, "library": BASE, "after": BASE, "floor": FLOOR, "left_out": 0.0, "audit": CLEAN, "steps": [], "found": []}
+    given = {
+        "base": BASE,
+        "library": BASE,
+        "after": BASE,
+        "floor": FLOOR,
+        "left_out": 0.0,
+        "audit": CLEAN,
+        "steps": [],
+        "found": [],
+    }
     made = judge(**(given | changed))
     assert made.verdict in get_args(Verdict)
     assert made.kind in KINDS
@@ -42,12 +51,24 @@ def opinion(**changed: Any) -> Opinion:
 def found(left: float, **changed: Any) -> Opinion:
     """Backlash, with a static structure that carries `left` of the error above the noise."""
     after = 0.5
-    return opinion(library=after, after=after, audit=Audit(left / after, 0.0, 0.0, 0.0, 5.0), found=["backlash"], **changed)
+    return opinion(
+        library=after,
+        after=after,
+        audit=Audit(left / after, 0.0, 0.0, 0.0, 5.0),
+        found=["backlash"],
+        **changed,
+    )
 
 
 def test_a_residual_of_noise_is_none() -> None:
     made = opinion(base=1.02 * FLOOR, library=1.02 * FLOOR, after=1.02 * FLOOR)
-    assert (made.verdict, made.kind, made.left, made.patterns, made.drop_effects) == ("none", "none", 0.0, (), False)
+    assert (made.verdict, made.kind, made.left, made.patterns, made.drop_effects) == (
+        "none",
+        "none",
+        0.0,
+        (),
+        False,
+    )
 
 
 @pytest.mark.parametrize(
@@ -72,19 +93,23 @@ def test_structure_below_six_percent_is_none() -> None:
 
 @pytest.mark.parametrize(("foil", "kind"), [(JUMP, "drift"), (SWAY, "unknown"), (RIPPLE, "static")])
 def test_a_foil_alone_is_not_in_the_library_and_gives_its_kind(foil: Foil, kind: str) -> None:
-    made = opinion(after=FLOOR, steps=[took(foil), Step(None, (), None)])  # type: ignore[arg-type]
+    made = opinion(after=FLOOR, steps=[took(foil), Step(None, (), None)])
     assert (made.verdict, made.kind, made.left, made.patterns) == ("not_in_library", kind, 1.0, (foil.what,))
     assert foil.what in made.summary
 
 
 def test_the_kind_is_of_what_is_larger_the_foil_or_the_structure_behind_it() -> None:
     after = 0.8  # the foil has taken 0.3
-    small, large = (opinion(after=after, steps=[took(JUMP)], audit=Audit(0.0, share / after, 0.0, 0.0, 5.0)) for share in (0.29, 0.31))
+    small, large = (
+        opinion(after=after, steps=[took(JUMP)], audit=Audit(0.0, share / after, 0.0, 0.0, 5.0))
+        for share in (0.29, 0.31)
+    )
     assert (small.kind, large.kind) == ("drift", "memory")
 
 
 def test_borders_are_in_order() -> None:
-    """What the words must mean, whatever the exact numbers: half of the squares left is not partly explained."""
+    """What the words must mean, whatever the exact numbers: half of the squares left is not partly
+    explained."""
     assert 0.01 <= _EXPLAINED <= 0.12
     assert 0.2 <= _PARTLY <= 0.5
     assert _EXPLAINED < _FOREIGN <= _PARTLY
@@ -135,7 +160,9 @@ def test_held_out_error_counts() -> None:
 )
 def test_a_foil_beside_an_effect_counts_by_what_it_takes(foreign: float, verdict: str, dropped: bool) -> None:
     library = 0.7
-    made = opinion(library=library, after=library - foreign, steps=[took(None), took(JUMP)], found=["backlash"])
+    made = opinion(
+        library=library, after=library - foreign, steps=[took(None), took(JUMP)], found=["backlash"]
+    )
     assert (made.verdict, made.drop_effects, made.patterns) == (verdict, dropped, (JUMP.what,))
     assert JUMP.what in made.summary
     assert ("backlash" in made.summary) != dropped
@@ -154,7 +181,8 @@ def test_several_effects_are_listed() -> None:
 
 
 def test_a_log_at_its_floor_divides_by_no_zero() -> None:
-    """The base model below the noise estimate: the error above it is none, and what seems left stays a share."""
+    """The base model below the noise estimate: the error above it is none, and what seems left stays a
+    share."""
     for base in (0.5 * FLOOR, FLOOR):
         assert opinion(base=base, library=base, after=base).verdict == "none"
         assert opinion(base=base, library=base, after=base, audit=Audit(0.5, 0.0, 0.0, 0.0, 5.0)).left == 1.0

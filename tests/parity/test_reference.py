@@ -17,7 +17,8 @@ from fastrod.reference import constant_curvature, shoot, solve_bvp
 
 EI, LENGTH = 0.0022, 0.07
 
-# The truth files hold 1e-12 m; the integrator's rtol of 1e-9 over a rod of 0.1 to 0.4 m leaves 1e-11 m of each.
+# The truth files hold 1e-12 m; the integrator's rtol of 1e-9 over a rod of 0.1 to 0.4 m leaves 1e-11 m of
+# each.
 TIP = 1e-9
 
 
@@ -28,10 +29,16 @@ def rotation(row: dict[str, str], letter: str) -> np.ndarray:
 def one_segment(row: dict[str, str]) -> tuple[Robot, dict[str, Any]]:
     """Robot and inputs of a row of tendon_length_truth.csv."""
     n = int(row["n"])
-    tendons = tuple(Tendon(offset=float(row["offset"]), angle=2.0 * np.pi * i / n, compliance=float(row["c"])) for i in range(n))
+    tendons = tuple(
+        Tendon(offset=float(row["offset"]), angle=2.0 * np.pi * i / n, compliance=float(row["c"]))
+        for i in range(n)
+    )
     stiffness = float(row["EI"])
     segment = Segment(
-        length=float(row["l"]), bending_stiffness=(stiffness, stiffness), torsional_stiffness=float(row["GJ"]), tendons=tendons
+        length=float(row["l"]),
+        bending_stiffness=(stiffness, stiffness),
+        torsional_stiffness=float(row["GJ"]),
+        tendons=tendons,
     )
     inputs = {
         "tendon_length": numbers(row, *[f"L{i + 1}" for i in range(n)]),
@@ -47,12 +54,21 @@ def in_mode(robot: Robot, mode: Mode) -> Robot:
 
 def with_wires(robot: Robot, **change: Any) -> Robot:
     return replace(
-        robot, segments=tuple(replace(segment, tendons=tuple(replace(t, **change) for t in segment.tendons)) for segment in robot.segments)
+        robot,
+        segments=tuple(
+            replace(segment, tendons=tuple(replace(t, **change) for t in segment.tendons))
+            for segment in robot.segments
+        ),
     )
 
 
 def cantilever(**change: Any) -> Robot:
-    words: dict[str, Any] = {"length": LENGTH, "bending_stiffness": (EI, EI), "torsional_stiffness": 0.001, "mode": "passive"}
+    words: dict[str, Any] = {
+        "length": LENGTH,
+        "bending_stiffness": (EI, EI),
+        "torsional_stiffness": 0.001,
+        "mode": "passive",
+    }
     return Robot(name="rod", segments=(Segment(**(words | change)),), gravity=(0.0, 0.0, -9.81))
 
 
@@ -71,7 +87,9 @@ def test_shoot_is_the_truth_in_tendon_length(case: int) -> None:
     assert_allclose(shape.tip_rotation, rotation(row, "R"), rtol=0, atol=TIP / LENGTH)
     # curvature is a rotation over a length, tension a moment over an offset
     assert_allclose(shape.curvature[0], numbers(row, "u0x", "u0y", "u0z"), rtol=0, atol=1e-7)
-    assert_allclose(shape.tension, numbers(row, *[f"T{i + 1}" for i in range(robot.n_tendons)]), rtol=0, atol=1e-7)
+    assert_allclose(
+        shape.tension, numbers(row, *[f"T{i + 1}" for i in range(robot.n_tendons)]), rtol=0, atol=1e-7
+    )
 
 
 @pytest.mark.parametrize("case", ["A01", "A07", "A09", "A15", "A23", "B25", "B29", "B33", "B35"])
@@ -79,10 +97,15 @@ def test_shoot_is_the_truth_in_tendon_length(case: int) -> None:
 def test_shoot_is_the_truth_on_a_chain(case: str, mode: Mode) -> None:
     row = next(row for row in rows("tdcr_cases.csv") if row["case"] == case)
     robot = in_mode(load_robot(f"tdcr_{row['robot'].lower()}"), mode)
-    tension, length = numbers(row, *[f"q{i}" for i in range(1, 7)]), numbers(row, *[f"kir_len{i}" for i in range(1, 7)])
+    tension, length = (
+        numbers(row, *[f"q{i}" for i in range(1, 7)]),
+        numbers(row, *[f"kir_len{i}" for i in range(1, 7)]),
+    )
     compliance = np.array([tendon.compliance for tendon in robot.tendons])
     loads = {"tip_force": numbers(row, "fx", "fy", "fz"), "tip_moment": numbers(row, "mx", "my", "mz")}
-    given = {"tension": tension} if mode == "tendon_tension" else {"tendon_length": length - compliance * tension}
+    given = (
+        {"tension": tension} if mode == "tendon_tension" else {"tendon_length": length - compliance * tension}
+    )
     shape = shoot(robot, **given, **loads)
     assert shape.success, shape.message
     assert_allclose(shape.tip_position, numbers(row, "kir_px", "kir_py", "kir_pz"), rtol=0, atol=TIP)
@@ -114,7 +137,8 @@ def test_shoot_is_the_truth_in_paper_mode(case: int, method: Any) -> None:
 
 # w/L of a cantilever under P L^2 / EI, elliptic integrals
 @pytest.mark.parametrize(
-    ("load", "deflection"), [(1.0, 0.301720773800), (2.0, 0.493457480397), (5.0, 0.713791523612), (10.0, 0.810609024880)]
+    ("load", "deflection"),
+    [(1.0, 0.301720773800), (2.0, 0.493457480397), (5.0, 0.713791523612), (10.0, 0.810609024880)],
 )
 @pytest.mark.parametrize("method", ["lm", "slsqp", "trust-constr"])
 def test_elastica(load: float, deflection: float, method: Any) -> None:
@@ -125,7 +149,11 @@ def test_elastica(load: float, deflection: float, method: Any) -> None:
 
 def test_methods_and_integrators_agree() -> None:
     robot, length = prototype(-0.004, -0.002, 0.004, 0.002)
-    loads: dict[str, Any] = {"tip_force": (0.1, 0.2, -0.1), "point_force": [(0.03, (0.3, 0.0, 0.0))], "follower_tip_force": (0.1, 0.0, 0.2)}
+    loads: dict[str, Any] = {
+        "tip_force": (0.1, 0.2, -0.1),
+        "point_force": [(0.03, (0.3, 0.0, 0.0))],
+        "follower_tip_force": (0.1, 0.0, 0.2),
+    }
     best = shoot(robot, length, **loads)
     for method in ("slsqp", "trust-constr"):
         other = shoot(robot, length, **loads, method=method)
@@ -160,25 +188,36 @@ def test_collocation_agrees_with_shooting() -> None:
 def test_collocation_agrees_with_shooting_on_a_chain() -> None:
     row = next(row for row in rows("tdcr_cases.csv") if row["case"] == "B33")
     robot = load_robot("tdcr_b")
-    length = numbers(row, *[f"kir_len{i}" for i in range(1, 7)]) - 1e-5 * numbers(row, *[f"q{i}" for i in range(1, 7)])
+    length = numbers(row, *[f"kir_len{i}" for i in range(1, 7)]) - 1e-5 * numbers(
+        row, *[f"q{i}" for i in range(1, 7)]
+    )
     shape = solve_bvp(robot, length, tip_force=numbers(row, "fx", "fy", "fz"))
     assert shape.success, shape.message
     assert_allclose(shape.tip_position, numbers(row, "kir_px", "kir_py", "kir_pz"), rtol=0, atol=1e-8)
     passive = solve_bvp(cantilever(), tip_force=(0.7, 0.0, 0.0))
-    assert_allclose(passive.position, shoot(cantilever(), tip_force=(0.7, 0.0, 0.0)).position, rtol=0, atol=1e-9)
+    assert_allclose(
+        passive.position, shoot(cantilever(), tip_force=(0.7, 0.0, 0.0)).position, rtol=0, atol=1e-9
+    )
 
 
 def test_constant_curvature_is_an_arc() -> None:
-    """Lengths of an arc of angle a toward d1: l_i = l - a offset cos b_i; tip at l/a (1 - cos a, 0, sin a)."""
+    """Lengths of an arc of angle a toward d1: l_i = l - a offset cos b_i; tip at l/a (1 - cos a, 0, sin
+    a)."""
     angle = 1.2
     robot, length = prototype(*(-angle * 0.0075 * np.cos(np.arange(4) * np.pi / 2.0)))
     shape = constant_curvature(robot, length)
     # angles in the robot file are rounded to 1e-12 rad
-    assert_allclose(shape.tip_position, LENGTH / angle * np.array([1.0 - np.cos(angle), 0.0, np.sin(angle)]), rtol=0, atol=1e-12)
+    assert_allclose(
+        shape.tip_position,
+        LENGTH / angle * np.array([1.0 - np.cos(angle), 0.0, np.sin(angle)]),
+        rtol=0,
+        atol=1e-12,
+    )
     assert_allclose(shape.tendon_length, length, rtol=0, atol=1e-13)
     assert shape.residual < 1e-12
     assert np.isnan(shape.tension).all()
-    # without loads and stretch the mechanics have nothing to add: 1e-10 m/N under 2 N over an offset of 0.0075 m
+    # without loads and stretch the mechanics have nothing to add: 1e-10 m/N under 2 N over an offset of
+    # 0.0075 m
     rod = shoot(with_wires(robot, compliance=1e-10), length)
     assert_allclose(shape.position, rod.position, rtol=0, atol=1e-8)
 
@@ -187,7 +226,8 @@ def test_constant_curvature_takes_off_what_distal_tendons_use() -> None:
     robot = load_robot("tdcr_b")
     first, second = np.array([4.0, -2.0]), np.array([-3.0, 5.0])
     stretch = [
-        [np.array([y, -x]) for x, y in tendon.position(k + 1)] for tendon, k in zip(robot.tendons, robot.tendon_segment, strict=True)
+        [np.array([y, -x]) for x, y in tendon.position(k + 1)]
+        for tendon, k in zip(robot.tendons, robot.tendon_segment, strict=True)
     ]
     length = robot.rest_tendon_length + 0.1 * np.array(
         [sum(row @ u for row, u in zip(rows_, (first, second), strict=False)) for rows_ in stretch]
@@ -238,7 +278,9 @@ def test_a_follower_force_turns_with_the_tip() -> None:
 def test_extension_is_a_longer_segment() -> None:
     robot = cantilever(extension=(0.0, 0.02))
     shape = shoot(robot, extension=[0.01], tip_force=(0.3, 0.0, 0.0))
-    assert_allclose(shape.position, shoot(cantilever(length=0.08), tip_force=(0.3, 0.0, 0.0)).position, rtol=0, atol=1e-14)
+    assert_allclose(
+        shape.position, shoot(cantilever(length=0.08), tip_force=(0.3, 0.0, 0.0)).position, rtol=0, atol=1e-14
+    )
 
 
 def test_a_slack_wire_pulls_no_more() -> None:

@@ -1,4 +1,5 @@
-"""The rod once more, one robot at a time in plain numpy: slow, obvious, and the same discrete equations as the kernels."""
+"""The rod once more, one robot at a time in plain numpy: slow, obvious, and the same discrete equations as
+the kernels."""
 
 from __future__ import annotations
 
@@ -25,9 +26,15 @@ def solve_u(m: np.ndarray, K: np.ndarray, u_star: np.ndarray, d: np.ndarray, T: 
 
 
 def march(
-    robot: Robot, n_steps: int, m0: np.ndarray, tension: np.ndarray, tip_force: np.ndarray, line_force: np.ndarray
+    robot: Robot,
+    n_steps: int,
+    m0: np.ndarray,
+    tension: np.ndarray,
+    tip_force: np.ndarray,
+    line_force: np.ndarray,
 ) -> dict[str, np.ndarray]:
-    """Tip, rotation, end moment and path lengths of the tendons from the base moment and all tensions (no other loads)."""
+    """Tip, rotation, end moment and path lengths of the tendons from the base moment and all tensions (no
+    other loads)."""
     e3 = np.array([0.0, 0.0, 1.0])
     R, r, m = np.eye(3), np.zeros(3), np.array(m0, float)
     ends = robot.tendon_segment
@@ -36,7 +43,9 @@ def march(
     for k, segment in enumerate(robot.segments):
         K = np.array([*segment.bending_stiffness, segment.torsional_stiffness])
         crossing = np.flatnonzero(ends >= k)
-        d = np.array([[*robot.tendons[t].position(int(ends[t]) + 1)[k], 0.0] for t in crossing]).reshape(-1, 3)
+        d = np.array([[*robot.tendons[t].position(int(ends[t]) + 1)[k], 0.0] for t in crossing]).reshape(
+            -1, 3
+        )
         T = tension[crossing]
         h = segment.length / n_steps
         for _ in range(n_steps):

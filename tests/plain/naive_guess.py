@@ -1,4 +1,5 @@
-"""The cold start once more, one robot at a time in plain numpy: pseudo-inverses by SVD, sums over the loads beyond as they are written."""
+"""The cold start once more, one robot at a time in plain numpy: pseudo-inverses by SVD, sums over the loads
+beyond as they are written."""
 
 from __future__ import annotations
 
@@ -14,8 +15,7 @@ RANK = 1e-3  # singular values below this part of the largest are left out
 def guess(i: int, layout: Layout, params: Params, ports: Ports) -> tuple[np.ndarray, np.ndarray]:
     """Boundary unknowns x and curvature at the base of robot i."""
     params, ports = (
-        type(group)(*(a[min(i, len(a) - 1)] if len(a) else None for a in group))  # type: ignore[call-arg]
-        for group in (params, ports)
+        type(group)(*(a[min(i, len(a) - 1)] if len(a) else None for a in group)) for group in (params, ports)
     )
     n_segments = len(layout.first_tendon)
     length = params.length + ports.extension

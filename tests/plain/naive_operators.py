@@ -1,4 +1,5 @@
-"""The operators on wire lengths once more, one wire and one moment at a time: the whole path is known, nothing is carried on."""
+"""The operators on wire lengths once more, one wire and one moment at a time: the whole path is known,
+nothing is carried on."""
 
 from __future__ import annotations
 
@@ -8,7 +9,11 @@ from scipy.interpolate import CubicHermiteSpline
 
 def play(x: np.ndarray, half_width: float, rounding: float = 0.0) -> np.ndarray:
     """The mean of three sharp ones."""
-    return np.asarray(np.mean([sharp_play(x, half_width * factor) for factor in (1.0 - rounding, 1.0, 1.0 + rounding)], axis=0))
+    return np.asarray(
+        np.mean(
+            [sharp_play(x, half_width * factor) for factor in (1.0 - rounding, 1.0, 1.0 + rounding)], axis=0
+        )
+    )
 
 
 def sharp_play(x: np.ndarray, half_width: float) -> np.ndarray:
@@ -33,14 +38,19 @@ def yielding(bend: np.ndarray, share: float, yield_at: float) -> np.ndarray:
     return np.array(out)
 
 
-def elastoplastic(x: np.ndarray, amplitude: float, radii: np.ndarray, growth: float, angle: np.ndarray) -> np.ndarray:
+def elastoplastic(
+    x: np.ndarray, amplitude: float, radii: np.ndarray, growth: float, angle: np.ndarray
+) -> np.ndarray:
     """A slider that sticks is a play: what it lags behind by, in its own radius, is its force."""
-    force = np.mean([(np.append(0.0, x - x[0]) - play(np.append(0.0, x - x[0]), r))[1:] / r for r in radii], axis=0)
+    force = np.mean(
+        [(np.append(0.0, x - x[0]) - play(np.append(0.0, x - x[0]), r))[1:] / r for r in radii], axis=0
+    )
     return np.asarray(x - amplitude * (1.0 + growth * angle) * force)
 
 
 def exp(A: np.ndarray) -> np.ndarray:
-    """Series of a thousandth of A, squared ten times; scipy's starts threads for it, which costs a hundred times as much."""
+    """Series of a thousandth of A, squared ten times; scipy's starts threads for it, which costs a hundred
+    times as much."""
     part, term = np.eye(len(A)), np.eye(len(A))
     for k in range(1, 13):
         term = term @ A / (1024.0 * k)
@@ -89,7 +99,11 @@ def delay(x: np.ndarray, lag: float, dt: np.ndarray, buffer: int) -> np.ndarray:
             continue
         j = earlier[-1]
         ends, values = t[j : j + 2], x[j : j + 2]
-        gaps = [t[j] - t[j - 1] if j > first else 0.0, t[j + 1] - t[j], t[j + 2] - t[j + 1] if j + 2 <= i else 0.0]
+        gaps = [
+            t[j] - t[j - 1] if j > first else 0.0,
+            t[j + 1] - t[j],
+            t[j + 2] - t[j + 1] if j + 2 <= i else 0.0,
+        ]
         if gaps[0] <= 0.0 or gaps[1] <= 0.0:
             out.append(np.interp(wanted, ends, values))
             continue

@@ -1,4 +1,5 @@
-"""Where a cold start begins: closed forms, and the kernel against its obvious twin. Small enough to run without the compiler."""
+"""Where a cold start begins: closed forms, and the kernel against its obvious twin. Small enough to run
+without the compiler."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ from fastrod.solver.inputs import Inputs, Reader
 from fastrod.types import Layout, Memory, Params, Ports
 
 N_STEPS = 6  # not a divisor of the guess's eight samples
-# The twin does the same sums in another order: some fifty loads, forty rotations and a pseudo-inverse whose condition is below 1e4
+# The twin does the same sums in another order: some fifty loads, forty rotations and a pseudo-inverse whose
+# condition is below 1e4
 # here, each to 1e-16: 1e-13 is what is seen. A wrong term shows in the first digits.
 CLOSE = 1e-10
 
@@ -43,7 +45,9 @@ def case(robots: list[Robot], n: int, seed: int, *, skip: tuple[str, ...] = (), 
         "tip_moment": force * robot.length * rng.normal(size=(n, 3)),
         "line_force": force / robot.length * rng.normal(size=(n, n_segments, 5, 3)),
         "point_force": [(robot.length * part, force * rng.normal(size=3)) for part in (0.31, 0.77)],
-        "base_pose": np.hstack([rng.normal(size=(n, 3)), quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)]),
+        "base_pose": np.hstack(
+            [rng.normal(size=(n, 3)), quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)]
+        ),
     }
     if not layout.paper:
         inputs["follower_tip_force"] = force * rng.normal(size=(n, 3))
@@ -51,7 +55,9 @@ def case(robots: list[Robot], n: int, seed: int, *, skip: tuple[str, ...] = (), 
         ends = np.cumsum(params.length + extension, axis=1)[:, layout.tendon_segment]
         turn = rng.normal(size=(n, n_segments, 2)) / n_segments
         across = np.stack([params.offset[..., 1], -params.offset[..., 0]], axis=-1)
-        inputs["tendon_length"] = ends + (across * turn[:, :, None]).sum((1, 3)) + 1e-4 * rng.normal(size=(n, n_tendons))
+        inputs["tendon_length"] = (
+            ends + (across * turn[:, :, None]).sum((1, 3)) + 1e-4 * rng.normal(size=(n, n_tendons))
+        )
     if any(segment.mode == "tendon_tension" for segment in robot.segments):
         inputs["tension"] = rng.uniform(0.0, 1.0, (n, n_tendons))
     inputs = {name: value for name, value in (inputs | given).items() if name not in skip}
@@ -59,7 +65,8 @@ def case(robots: list[Robot], n: int, seed: int, *, skip: tuple[str, ...] = (), 
 
 
 def fill(case: Case, n: int, rows: list[int] | None = None) -> Memory:
-    """The memory of n robots after a cold start of `rows`, all of them by default; it was full of something else before."""
+    """The memory of n robots after a cold start of `rows`, all of them by default; it was full of something
+    else before."""
     layout, params, ports = case
     passes = Passes(layout, params, n, threads=1, carry=True)
     passes.remember(len(ports.follower_force) > 0, True, None)
@@ -79,20 +86,29 @@ def off_the_twin(case: Case, n: int) -> float:
         x, u = guess(i, *case)
         s = min(i, len(params.reach) - 1)
         moment, tension = params.moment_scale[s], params.tension_scale[s]
-        units = np.repeat([moment, tension, moment / params.reach[s]], [n_base, n_free, len(x) - n_base - n_free])
+        units = np.repeat(
+            [moment, tension, moment / params.reach[s]], [n_base, n_free, len(x) - n_base - n_free]
+        )
         assert memory.x.shape[1] == len(x)
-        for got, wanted in ((memory.x[i] / units, x / units), (memory.curvature_guess[i] * params.reach[s], u * params.reach[s])):
+        for got, wanted in (
+            (memory.x[i] / units, x / units),
+            (memory.curvature_guess[i] * params.reach[s], u * params.reach[s]),
+        ):
             largest = max(largest, float((np.abs(got - wanted) / (1.0 + np.abs(wanted))).max(initial=0.0)))
     return largest
 
 
 def in_mode(robot: Robot, mode: str) -> Robot:
-    """The robot with all segments in this mode; one that ships without wires gets three where it needs some."""
+    """The robot with all segments in this mode; one that ships without wires gets three where it needs
+    some."""
 
     def wires(of: Segment) -> tuple[Tendon, ...]:
         return () if mode == "passive" else of.tendons or rod(n_tendons=3).tendons
 
-    return replace(robot, segments=tuple(replace(segment, mode=mode, tendons=wires(segment)) for segment in robot.segments))
+    return replace(
+        robot,
+        segments=tuple(replace(segment, mode=mode, tendons=wires(segment)) for segment in robot.segments),
+    )
 
 
 def varied(robot: Robot, rng: np.random.Generator) -> Robot:
@@ -106,7 +122,10 @@ def varied(robot: Robot, rng: np.random.Generator) -> Robot:
             precurvature=tuple(rng.normal(size=3) / of.length / 5.0),
             line_density=0.05,
             extension=(-0.1 * of.length, 0.2 * of.length),
-            tendons=tuple(replace(t, pretension=rng.uniform(0.0, 0.5), unilateral=bool(rng.integers(2))) for t in of.tendons),
+            tendons=tuple(
+                replace(t, pretension=rng.uniform(0.0, 0.5), unilateral=bool(rng.integers(2)))
+                for t in of.tendons
+            ),
         )
 
     return replace(robot, segments=tuple(segment(s) for s in robot.segments))
@@ -130,7 +149,11 @@ def chain(n_segments: int, rng: np.random.Generator) -> Robot:
             for _ in range(0 if mode == "passive" else int(rng.integers(1, 6)))
         )
         stiffness = tuple(rng.uniform(0.001, 0.003, 2))
-        segments.append(Segment(length=0.05, bending_stiffness=stiffness, torsional_stiffness=0.001, mode=mode, tendons=wires))
+        segments.append(
+            Segment(
+                length=0.05, bending_stiffness=stiffness, torsional_stiffness=0.001, mode=mode, tendons=wires
+            )
+        )
     return varied(Robot(name="chain", segments=tuple(segments)), rng)
 
 
@@ -146,9 +169,20 @@ def test_chains_by_chance(seed: int) -> None:
     assert off_the_twin((layout, params._replace(offset=offset), ports), 2) < CLOSE
 
 
-@pytest.mark.parametrize("kind", ["tip_force", "tip_moment", "line_force", "point_force", "follower_tip_force", "base_pose", "extension"])
+@pytest.mark.parametrize(
+    "kind",
+    ["tip_force", "tip_moment", "line_force", "point_force", "follower_tip_force", "base_pose", "extension"],
+)
 def test_each_kind_of_load_alone(kind: str) -> None:
-    kinds = ("tip_force", "tip_moment", "line_force", "point_force", "follower_tip_force", "base_pose", "extension")
+    kinds = (
+        "tip_force",
+        "tip_moment",
+        "line_force",
+        "point_force",
+        "follower_tip_force",
+        "base_pose",
+        "extension",
+    )
     robot = varied(load_robot("tdcr_b"), np.random.default_rng(1))
     assert off_the_twin(case([robot], 2, seed=2, skip=tuple(k for k in kinds if k != kind)), 2) < CLOSE
 
@@ -157,7 +191,8 @@ def in_plane(angle: float, n: int) -> np.ndarray:
     return np.outer((-1.0) ** np.arange(n), [np.cos(angle), np.sin(angle)])
 
 
-# without a wire out of the plane, and without any arm at all, the smaller singular value, or both, count as none
+# without a wire out of the plane, and without any arm at all, the smaller singular value, or both, count as
+# none
 FLAT: dict[str, Callable[[], np.ndarray]] = {
     "one wire": lambda: in_plane(0.3, 1),
     "opposite wires": lambda: in_plane(0.7, 2),
@@ -181,7 +216,9 @@ def test_wires_nearly_in_a_plane_say_nothing_about_the_bend_across_it(off: float
     """Opposite wires, written with a few digits of pi, and lengths that do not quite agree."""
     robot = rod(n_tendons=2)
     first, last = robot.segments[0].tendons
-    robot = replace(robot, segments=(replace(robot.segments[0], tendons=(first, replace(last, angle=np.pi - off))),))
+    robot = replace(
+        robot, segments=(replace(robot.segments[0], tendons=(first, replace(last, angle=np.pi - off))),)
+    )
     lengths = robot.rest_tendon_length + np.array([0.003, -0.003]) + 1e-6
     state = Simulator(robot, points_per_segment=3).settle(lengths, tip_force=(0.05, 0.05, 0.0))
     assert state.ok.all()
@@ -194,27 +231,37 @@ def test_wires_nearly_in_a_plane_say_nothing_about_the_bend_across_it(off: float
 
 @pytest.mark.parametrize("ratio", [2e-3, 1e-2, 0.1])
 def test_wires_nearly_in_a_plane_bend_and_pull_as_asked(ratio: float) -> None:
-    """Curvature and tensions out of the plane are as large as rounding over the ratio of singular values makes them, in the twin too.
-    What stands is what they are for: the curvature uses up the lengths, and the tensions give the moment."""
-    wires = 0.0075 * (in_plane(0.4, 4) + ratio * np.array([[0.4, -1.0], [-0.4, 1.0], [-0.4, 1.0], [0.4, -1.0]]))
+    """Curvature and tensions out of the plane are as large as rounding over the ratio of singular values
+    makes them, in the twin too. What stands is what they are for: the curvature uses up the lengths, and the
+    tensions give the moment."""
+    wires = 0.0075 * (
+        in_plane(0.4, 4) + ratio * np.array([[0.4, -1.0], [-0.4, 1.0], [-0.4, 1.0], [0.4, -1.0]])
+    )
     u_asked = np.array([3.0, -5.0])
     robot = rod()
     longer = 0.07 * arms(wires) @ u_asked
     layout, params, ports = case(
-        [robot], 1, 0, skip=("line_force", "point_force", "follower_tip_force", "extension", "base_pose"),
-        tendon_length=robot.rest_tendon_length + longer, tip_force=(0.0, 0.0, 0.0), tip_moment=(0.01, 0.02, 0.0),
-    )  # fmt: skip
+        [robot],
+        1,
+        0,
+        skip=("line_force", "point_force", "follower_tip_force", "extension", "base_pose"),
+        tendon_length=robot.rest_tendon_length + longer,
+        tip_force=(0.0, 0.0, 0.0),
+        tip_moment=(0.01, 0.02, 0.0),
+    )
     params = params._replace(offset=np.array(wires[None, None]))
     memory = fill((layout, params, ports), 1)
     u, tension = memory.curvature_guess[0], memory.x[0, 3:]
-    assert_allclose(0.07 * arms(wires) @ u[:2], longer, rtol=0.0, atol=1e-15)  # a few roundings of the length itself, 0.07 m
+    # a few roundings of the length itself, 0.07 m
+    assert_allclose(0.07 * arms(wires) @ u[:2], longer, rtol=0.0, atol=1e-15)
     x, _ = guess(0, layout, params, ports)
     largest = np.abs(arms(wires).T * x[3:]).sum()  # the moments of the single wires, which nearly cancel
     assert_allclose(arms(wires).T @ tension, arms(wires).T @ x[3:], rtol=0.0, atol=1e-13 * largest)
 
 
 def test_an_arc_from_its_lengths() -> None:
-    """Wires at distance d differ from the backbone by d times the bend; four more wires of another length only pull."""
+    """Wires at distance d differ from the backbone by d times the bend; four more wires of another length
+    only pull."""
     robot = rod()
     layout, params, rest = compile_robots([robot], N_STEPS)
     ports = Reader(layout, params, rest, 1).ports(Inputs(bend(robot, 0.5, -0.3)))
@@ -222,14 +269,22 @@ def test_an_arc_from_its_lengths() -> None:
     assert_allclose(memory.curvature_guess[0], [0.5 / 0.07, -0.3 / 0.07, 0.0], rtol=1e-13)
     assert_allclose(memory.x[0, :3], 0.0, atol=1e-18)
     # K u = -sum T (d_y, -d_x), shared by opposite wires
-    assert_allclose(memory.x[0, 3:], 0.0022 / 0.07 / (2.0 * 0.0075) * np.array([-0.3, -0.5, 0.3, 0.5]), rtol=1e-12, atol=1e-15)
+    assert_allclose(
+        memory.x[0, 3:],
+        0.0022 / 0.07 / (2.0 * 0.0075) * np.array([-0.3, -0.5, 0.3, 0.5]),
+        rtol=1e-12,
+        atol=1e-15,
+    )
 
 
 def test_a_straight_rod_carries_the_moment_of_its_loads() -> None:
     robot = rod("passive", line_density=0.2)
     layout, params, rest = compile_robots([robot], N_STEPS)
-    pose = (0.4, 100.0, -3.0, np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)  # d3 along world x, d1 along -z: the weight bends it about d2
-    ports = Reader(layout, params, rest, 1).ports(Inputs(tip_force=(0.0, 0.3, 0.0), tip_moment=(0.0, 0.0, 0.01), base_pose=pose))
+    # d3 along world x, d1 along -z: the weight bends it about d2
+    pose = (0.4, 100.0, -3.0, np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)
+    ports = Reader(layout, params, rest, 1).ports(
+        Inputs(tip_force=(0.0, 0.3, 0.0), tip_moment=(0.0, 0.0, 0.01), base_pose=pose)
+    )
     memory = fill((layout, params, ports), 1)
     weight = 0.2 * 9.81 * 0.07 * 0.035  # about world y, which is d2
     assert_allclose(memory.x[0], [-(0.07 * 0.3 + 0.01), weight, 0.0], atol=1e-16)

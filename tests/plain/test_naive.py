@@ -1,4 +1,5 @@
-"""The kernels against their obvious twin. Small enough to run without the compiler, and with every index checked."""
+"""The kernels against their obvious twin. Small enough to run without the compiler, and with every index
+checked."""
 
 from __future__ import annotations
 
@@ -16,10 +17,17 @@ from fastrod import Robot, Simulator, load_robot
 def chain() -> Robot:
     robot = load_robot("tdcr_b")
     first, last = robot.segments
-    return replace(robot, segments=(first, replace(last, bending_stiffness=(0.002, 0.003), precurvature=(1.0, -2.0, 0.5))))
+    return replace(
+        robot,
+        segments=(first, replace(last, bending_stiffness=(0.002, 0.003), precurvature=(1.0, -2.0, 0.5))),
+    )
 
 
-@pytest.mark.parametrize("robot", [rod(), rod("passive"), rod(n_tendons=3, bending_stiffness=(0.002, 0.003)), chain()], ids=range(4))
+@pytest.mark.parametrize(
+    "robot",
+    [rod(), rod("passive"), rod(n_tendons=3, bending_stiffness=(0.002, 0.003)), chain()],
+    ids=range(4),
+)
 def test_settled_boundary_closes_in_the_twin_too(robot: Robot) -> None:
     n_steps, force, line = 3, np.array([0.05, -0.04, 0.02]), np.array([0.1, 0.0, -0.2])
     lengths = bend(robot, 0.4, -0.3) if robot.n_tendons else None
@@ -35,7 +43,8 @@ def test_settled_boundary_closes_in_the_twin_too(robot: Robot) -> None:
 
 
 def test_every_input_and_output_once() -> None:
-    """Follower force, point force, extension, sampled load, slack wire, Jacobian, compliance and dense shape, with indices checked."""
+    """Follower force, point force, extension, sampled load, slack wire, Jacobian, compliance and dense shape,
+    with indices checked."""
     robot = chain()
     first, last = robot.segments
     slack = tuple(replace(t, unilateral=True, pretension=0.1) for t in last.tendons)
@@ -52,17 +61,18 @@ def test_every_input_and_output_once() -> None:
         "base_pose": (0.1, 0.2, 0.3, 0.6, 0.8, 0.0, 0.0),
     }
     force = np.array([[0.0, 0.02, 0.0], [0.01, 0.0, 0.0], [0.0, 0.0, -0.02]])
-    state = sim.settle(lengths, tip_force=force, **given)  # type: ignore[arg-type]
+    state = sim.settle(lengths, tip_force=force, **given)
     assert state.ok.all(), state.problems
     assert (state.tension[:, 5] == 0.0).all()
-    at_rest = sim.step(lengths, tip_force=force, **given)  # type: ignore[arg-type]
-    loaded = sim.step(lengths, tip_force=1.02 * force, **given)  # type: ignore[arg-type]
+    at_rest = sim.step(lengths, tip_force=force, **given)
+    loaded = sim.step(lengths, tip_force=1.02 * force, **given)
     assert loaded.passes.tolist() == [2, 2, 2]  # the first time the force moves its gain is learned
     moved = np.linalg.norm(loaded.tip_position - at_rest.tip_position, axis=1)
-    assert (loaded.residual < 0.02 * moved).all()  # and a change of 2 % is then an error of less than 2 % of what it does
+    # and a change of 2 % is then an error of less than 2 % of what it does
+    assert (loaded.residual < 0.02 * moved).all()
     # the compliance predicts the tip of a nearby load
-    moved = sim.settle(lengths, tip_force=1.05 * force, **given)  # type: ignore[arg-type]
-    near = sim.settle(lengths, tip_force=1.04 * force, **given)  # type: ignore[arg-type]
+    moved = sim.settle(lengths, tip_force=1.05 * force, **given)
+    near = sim.settle(lengths, tip_force=1.04 * force, **given)
     predicted = near.tip_position + np.einsum("rij,rj->ri", sim.compliance()[:, :3], 0.01 * force)
     assert_allclose(moved.tip_position, predicted, atol=1e-7)
     assert np.isfinite(sim.jacobian()).all()
@@ -78,7 +88,10 @@ def test_tension_and_paper_modes() -> None:
     assert_allclose(twin["moment"], 0.0, atol=1e-8)
     paper = replace(
         chain(),
-        segments=tuple(replace(s, mode="paper", precurvature=(0.0, 0.0, 0.0), bending_stiffness=(0.002, 0.002)) for s in chain().segments),
+        segments=tuple(
+            replace(s, mode="paper", precurvature=(0.0, 0.0, 0.0), bending_stiffness=(0.002, 0.002))
+            for s in chain().segments
+        ),
     )
     lengths = bend(paper, 0.4, 0.2) + bend(paper, -0.2, 0.3, 1) - paper.rest_tendon_length
     state = Simulator(paper, points_per_segment=3).settle(lengths, tip_force=(0.05, 0.0, 0.02))

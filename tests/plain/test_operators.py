@@ -1,4 +1,5 @@
-"""The operators against their obvious twin: two rows, three wires, every wire with numbers of its own, in two calls."""
+"""The operators against their obvious twin: two rows, three wires, every wire with numbers of its own, in two
+calls."""
 
 from __future__ import annotations
 
@@ -16,9 +17,14 @@ from fastrod.kernels.operators import BUFFER, SLIDERS
 N_STEPS = BUFFER + 40
 rng = np.random.default_rng(12)
 PATH = np.cumsum(rng.uniform(-0.4, 0.4, (2, N_STEPS, 3)), axis=1) + 0.3
-DT = rng.uniform(0.001, 0.05, N_STEPS) * (rng.random(N_STEPS) > 0.1)  # irregular, and some steps that take no time
+# irregular, and some steps that take no time
+DT = rng.uniform(0.001, 0.05, N_STEPS) * (rng.random(N_STEPS) > 0.1)
 ANGLE = rng.uniform(0.0, 1.0, PATH.shape)
-SHARE, WIDTH, SPREAD = rng.uniform(0.0, 1.0, (2, 3)), rng.uniform(0.05, 0.6, (2, 3)), rng.uniform(0.0, 0.9, (2, 3))
+SHARE, WIDTH, SPREAD = (
+    rng.uniform(0.0, 1.0, (2, 3)),
+    rng.uniform(0.05, 0.6, (2, 3)),
+    rng.uniform(0.0, 0.9, (2, 3)),
+)
 WIDTH[0, 0] = SHARE[1, 1] = 0.0
 SLOW = WIDTH + 0.02
 LAG = np.array([0.11, 1e3])
@@ -51,7 +57,11 @@ CASES: dict[str, Case] = {
         lambda x, m, s: operators.second_order(x, m, WIDTH, SPREAD, DT[s]),
         lambda x, r, w: naive.second_order(x, WIDTH[r, w], SPREAD[r, w], DT),
     ),
-    "delay": (1 + 4 * BUFFER, lambda x, m, s: operators.delay(x, m, LAG, DT[s]), lambda x, r, w: naive.delay(x, LAG[r], DT, BUFFER)),
+    "delay": (
+        1 + 4 * BUFFER,
+        lambda x, m, s: operators.delay(x, m, LAG, DT[s]),
+        lambda x, r, w: naive.delay(x, LAG[r], DT, BUFFER),
+    ),
     "no delay": (
         1 + 4 * BUFFER,
         lambda x, m, s: operators.delay(x, m, np.zeros(2), DT[s]),
@@ -72,7 +82,9 @@ def test_operator_is_its_twin(name: str) -> None:
     for r in range(2):
         for w in range(3):
             # rounding of some hundred steps, and of a matrix squared ten times
-            assert_allclose(found[r, :, w], twin(PATH[r, :, w], r, w), atol=1e-11, err_msg=f"row {r}, wire {w}")
+            assert_allclose(
+                found[r, :, w], twin(PATH[r, :, w], r, w), atol=1e-11, err_msg=f"row {r}, wire {w}"
+            )
     assert np.isfinite(memory[:, : width if "delay" not in name else 1]).all()
 
 
@@ -87,5 +99,7 @@ def test_yielding_is_its_twin() -> None:
     for r in range(2):
         for k in range(3):
             # rounding of some hundred steps
-            assert_allclose(found[r, :, k], naive.yielding(path[r, :, k], SHARE[r, k], WIDTH[r, k]), atol=1e-13)
+            assert_allclose(
+                found[r, :, k], naive.yielding(path[r, :, k], SHARE[r, k], WIDTH[r, k]), atol=1e-13
+            )
     assert np.isfinite(memory).all()

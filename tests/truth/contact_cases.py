@@ -19,20 +19,29 @@ def ring(n: int, offset: float, first: float = 0.0) -> list[list[float]]:
     return (offset * np.stack([np.cos(angle), np.sin(angle)], axis=1)).tolist()
 
 
-def bent(length: Sequence[float], offsets: list[list[list[float]]], kappa_x: Sequence[float], kappa_y: Sequence[float]) -> list[float]:
-    """Tendon lengths [m] that bend segment k toward +x by kappa_x[k] and toward +y by kappa_y[k] [1/m] in the mean."""
+def bent(
+    length: Sequence[float],
+    offsets: list[list[list[float]]],
+    kappa_x: Sequence[float],
+    kappa_y: Sequence[float],
+) -> list[float]:
+    """Tendon lengths [m] that bend segment k toward +x by kappa_x[k] and toward +y by kappa_y[k] [1/m] in the
+    mean."""
     places = np.asarray(offsets, dtype=float)
     pulled = places[..., 0] * np.asarray(kappa_x)[:, None] + places[..., 1] * np.asarray(kappa_y)[:, None]
     return np.nansum(np.asarray(length)[:, None] * (1.0 - pulled), axis=0).tolist()
 
 
 def cases() -> dict[str, dict[str, Any]]:
-    """Rods in contact, by name, as plain numbers: the arguments of `minimise`, the obstacle as a dict with its kind."""
+    """Rods in contact, by name, as plain numbers: the arguments of `minimise`, the obstacle as a dict with
+    its kind."""
     four = [ring(4, 0.0075)]
     away = [[float("nan")] * 2] * 4
     pair = [ring(4, 0.0075) + ring(4, 0.0075, np.pi / 4.0), away + ring(4, 0.0075, np.pi / 4.0)]
 
-    def one(kappa_x: float, kappa_y: float, tip_force: list[float], rho: float, obstacle: dict[str, Any]) -> dict[str, Any]:
+    def one(
+        kappa_x: float, kappa_y: float, tip_force: list[float], rho: float, obstacle: dict[str, Any]
+    ) -> dict[str, Any]:
         return {
             **_PROTOTYPE,
             "offsets": four,
@@ -49,9 +58,27 @@ def cases() -> dict[str, dict[str, Any]]:
     return {
         "wall": one(12.0, 0.0, still, 0.0, wall),
         "wall_radius": one(8.0, 0.0, still, 0.005, wall),
-        "bar": one(10.0, 1.0, still, 0.003, {"kind": "cylinder", "point": [0.0155, 0.0, 0.04], "axis": [0.0, 1.0, 0.0], "radius": 0.008}),
-        "sphere": one(9.0, 4.0, [0.1, -0.15, -0.05], 0.003, {"kind": "sphere", "centre": [0.028, 0.006, 0.055], "radius": 0.015}),
-        "box_edge": one(12.0, 1.0, still, 0.002, {"kind": "box", "centre": [0.0245, 0.0, 0.018], "half": [0.02, 0.03, 0.018]}),
+        "bar": one(
+            10.0,
+            1.0,
+            still,
+            0.003,
+            {"kind": "cylinder", "point": [0.0155, 0.0, 0.04], "axis": [0.0, 1.0, 0.0], "radius": 0.008},
+        ),
+        "sphere": one(
+            9.0,
+            4.0,
+            [0.1, -0.15, -0.05],
+            0.003,
+            {"kind": "sphere", "centre": [0.028, 0.006, 0.055], "radius": 0.015},
+        ),
+        "box_edge": one(
+            12.0,
+            1.0,
+            still,
+            0.002,
+            {"kind": "box", "centre": [0.0245, 0.0, 0.018], "half": [0.02, 0.03, 0.018]},
+        ),
         "heavy": {
             "length": [0.3],
             "K": [[0.02, 0.02, 0.015]],
@@ -62,7 +89,12 @@ def cases() -> dict[str, dict[str, Any]]:
             "tip_force": still,
             "line_force": [0.0, 0.0, -3.0],
             "base_rotation": [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]],
-            "obstacle": {"kind": "cylinder", "point": [0.15, 0.0, -0.04], "axis": [0.0, 1.0, 0.0], "radius": 0.03},
+            "obstacle": {
+                "kind": "cylinder",
+                "point": [0.15, 0.0, -0.04],
+                "axis": [0.0, 1.0, 0.0],
+                "radius": 0.03,
+            },
             "rho": 0.004,
         },
         "two_segments": {
@@ -78,7 +110,13 @@ def cases() -> dict[str, dict[str, Any]]:
             "obstacle": {"kind": "half_space", "point": [0.03, 0.0, 0.12], "normal": [-1.0, 0.2, -0.2]},
             "rho": 0.003,
         },
-        "tube": one(13.0, 1.0, still, 0.003, {"kind": "tube", "point": [0.006, 0.0, 0.0], "axis": [0.0, 0.0, 1.0], "radius": 0.01}),
+        "tube": one(
+            13.0,
+            1.0,
+            still,
+            0.003,
+            {"kind": "tube", "point": [0.006, 0.0, 0.0], "axis": [0.0, 0.0, 1.0], "radius": 0.01},
+        ),
     }
 
 

@@ -1,16 +1,20 @@
-"""A tendon rod pressed against obstacles without friction, as a constrained minimum of energy: numpy and scipy only.
+"""A tendon rod pressed against obstacles without friction, as a constrained minimum of energy: numpy and
+scipy only.
 
-The rod is a row of exact arcs of constant curvature u_j. At rest, over all u that keep the rod off the obstacle by rho,
-    V(u) = sum_j h/2 (u_j - u*)^T K (u_j - u*)  +  sum_i (l_i - L_i + c_i T0_i)^2 / (2 c_i)  -  sum_k F_k . r_k
-is least, subject to  phi(r(s_k)) - rho >= 0  at the nodes, and wherever between two of them phi has its minimum along the
-rod. The multiplier lambda_k [N] is the force there, along the outward normal grad phi. Signorini's conditions (lambda >= 0,
-gap >= 0, lambda gap = 0) are then the optimality conditions. With nodes alone a touching rod would hang on a node, its force
-not square to the rod, an error of the first order in h; the places between move with the rod, and the error is of the second.
+The rod is a row of exact arcs of constant curvature u_j. At rest, over all u that keep the rod off the
+obstacle by rho,
+    V(u) = sum_j h/2 (u_j - u*)^T K (u_j - u*)  +  sum_i (l_i - L_i + c_i T0_i)^2 / (2 c_i)  -  sum_k F_k .
+    r_k
+is least, subject to  phi(r(s_k)) - rho >= 0  at the nodes, and wherever between two of them phi has its
+minimum along the rod. The multiplier lambda_k [N] is the force there, along the outward normal grad phi.
+Signorini's conditions (lambda >= 0, gap >= 0, lambda gap = 0) are then the optimality conditions. With nodes
+alone a touching rod would hang on a node, its force not square to the rod, an error of the first order in h;
+the places between move with the rod, and the error is of the second.
 
-Sequential quadratic programming (Nocedal and Wright, Numerical Optimization, 2nd ed., ch. 18) with the exact Hessian of the
-Lagrangian; each quadratic program by non-negative least squares on its dual (Lawson and Hanson, Solving Least Squares
-Problems, ch. 23). Least energy has more than one bottom around an obstacle: lengths and loads grow from the rod at rest
-in steps, and the answer is the bottom which that path leads to.
+Sequential quadratic programming (Nocedal and Wright, Numerical Optimization, 2nd ed., ch. 18) with the exact
+Hessian of the Lagrangian; each quadratic program by non-negative least squares on its dual (Lawson and
+Hanson, Solving Least Squares Problems, ch. 23). Least energy has more than one bottom around an obstacle:
+lengths and loads grow from the rod at rest in steps, and the answer is the bottom which that path leads to.
 """
 
 from __future__ import annotations
@@ -20,7 +24,19 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from contact_chain import Chain, Rod, chain_of, energy_of, hessian_of, jacobian_of, path_of, rotation_of, slope_of, stretch_of, turning_of
+from contact_chain import (
+    Chain,
+    Rod,
+    chain_of,
+    energy_of,
+    hessian_of,
+    jacobian_of,
+    path_of,
+    rotation_of,
+    slope_of,
+    stretch_of,
+    turning_of,
+)
 from contact_shapes import Obstacle
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import cho_factor, cho_solve, cholesky, null_space, solve_triangular
@@ -28,11 +44,13 @@ from scipy.optimize import brentq, nnls
 
 Floats = NDArray[np.float64]
 E3 = np.array([0.0, 0.0, 1.0])
-_SOFT = 1e-12  # m/N of give in a contact, so that neighbours which share a force have one answer: 1e-12 m at 1 N
+# m/N of give in a contact, so that neighbours which share a force have one answer: 1e-12 m at 1 N
+_SOFT = 1e-12
 _LIFT = 1e4  # N/m, of the squares that lift the energy across a contact
 _FLAT = 0.1  # 1/m of curvature of the gap along the rod, below which a touching point is not followed
 _HANGS = 1e-10  # m
-_TIGHT = 1e-10  # N m of moment that may be out of balance at the end; lengths of 0.1 m over 1e-6 m/N round to 1e-11 N
+# N m of moment that may be out of balance at the end; lengths of 0.1 m over 1e-6 m/N round to 1e-11 N
+_TIGHT = 1e-10
 _CLOSE = 1e-9  # m that a node may be inside at the end
 
 
@@ -50,7 +68,8 @@ class Minimum(NamedTuple):
     gap: Floats
     """(n_nodes,) distance to the nearest obstacle less rho [m]; negative would be inside."""
     contact_force: Floats
-    """(n_nodes, 3) of the obstacles on the rod [N]. Neighbours share one point force: sum them, or see `patches`."""
+    """(n_nodes, 3) of the obstacles on the rod [N]. Neighbours share one point force: sum them, or see
+    `patches`."""
     total_force: Floats
     """(3,) sum of the contact forces [N]."""
     tension: Floats
@@ -70,7 +89,8 @@ class Minimum(NamedTuple):
     stationarity: float
     """Largest moment out of balance [N m]."""
     stability: float
-    """Lowest curvature of V along the contacts, relative to the rod's bending: below zero it rests on a ridge (see `nudge`)."""
+    """Lowest curvature of V along the contacts, relative to the rod's bending: below zero it rests on a ridge
+    (see `nudge`)."""
     converged: bool
     """Violation below 1e-9 m, stationarity below 1e-10 N m, and every force times its gap below 1e-9 N m."""
 
@@ -131,20 +151,25 @@ def minimise(
 ) -> Minimum:
     """Least energy of a chain of rods under dead loads, no node nearer than `rho` [m] to an obstacle.
 
-    - `length` [m]: one number, or (n_segments,) for a chain. `K` (3,) or (n_segments, 3): EI_x, EI_y, GJ [N m^2].
-    - `offsets` [m]: (n, 2), or (n_segments, n, 2) with nan where a tendon does not run; None for a passive rod.
+    - `length` [m]: one number, or (n_segments,) for a chain. `K` (3,) or (n_segments, 3): EI_x, EI_y, GJ [N
+      m^2].
+    - `offsets` [m]: (n, 2), or (n_segments, n, 2) with nan where a tendon does not run; None for a passive
+      rod.
     - `tendon_length` (n,) [m], base to end; `compliance` [m/N] > 0 and `pretension` [N]: one or (n,).
     - `tip_force` (3,) [N], `line_force` (3,) [N/m], world. `precurvature`: 0, (3,) or (n_segments, 3) [1/m].
     - `base_rotation` (3, 3) world_from_material at the base.
     - `elements` a segment, each of constant curvature.
     - Lengths and loads reach their values in `load_steps` steps from the rod at rest.
-    - `nudge` (3,) [N] acts on the tip in all steps but the last: off a ridge of the energy, where symmetry could keep the rod.
+    - `nudge` (3,) [N] acts on the tip in all steps but the last: off a ridge of the energy, where symmetry
+      could keep the rod.
     - `planar` keeps the curvature about d2 alone, that is the rod in its own x z plane, ridge or not.
     """
     lengths = np.atleast_1d(np.asarray(length, dtype=float))
     wires = np.atleast_1d(np.asarray(tendon_length, dtype=float))
     n_segments, m = len(lengths), len(wires)
-    places = np.broadcast_to(np.zeros((0, 2)) if offsets is None else np.asarray(offsets, dtype=float), (n_segments, m, 2))
+    places = np.broadcast_to(
+        np.zeros((0, 2)) if offsets is None else np.asarray(offsets, dtype=float), (n_segments, m, 2)
+    )
     compliances = np.broadcast_to(np.asarray(compliance, dtype=float), (m,))
     step = np.repeat(lengths / elements, elements)
     place = np.repeat(places, elements, axis=0)
@@ -160,8 +185,12 @@ def minimise(
     def rod(share: float, rest: Floats) -> Rod:
         return Rod(
             step=step,
-            stiffness=np.repeat(np.broadcast_to(np.asarray(K, dtype=float), (n_segments, 3)), elements, axis=0),
-            precurvature=np.repeat(np.broadcast_to(np.asarray(precurvature, dtype=float), (n_segments, 3)), elements, axis=0),
+            stiffness=np.repeat(
+                np.broadcast_to(np.asarray(K, dtype=float), (n_segments, 3)), elements, axis=0
+            ),
+            precurvature=np.repeat(
+                np.broadcast_to(np.asarray(precurvature, dtype=float), (n_segments, 3)), elements, axis=0
+            ),
             crossing=(~np.isnan(place[..., 0])).astype(float),
             offset=flat,
             free_length=rest + share * (wires - compliances * np.asarray(pretension, dtype=float) - rest),
@@ -192,7 +221,12 @@ def patches(found: Minimum, least: float = 1e-6) -> list[Patch]:
     runs = np.split(on, np.flatnonzero(np.diff(on) > 2) + 1) if len(on) else []
     s = found.arclength
     return [
-        Patch(float(np.average(s[run], weights=size[run])), float(s[run[0]]), float(s[run[-1]]), found.contact_force[run].sum(axis=0))
+        Patch(
+            float(np.average(s[run], weights=size[run])),
+            float(s[run[0]]),
+            float(s[run[-1]]),
+            found.contact_force[run].sum(axis=0),
+        )
         for run in runs
     ]
 
@@ -229,7 +263,12 @@ def _bottom(
         near = np.flatnonzero(look.gap < 2.0 * reach)
         move = np.zeros_like(x)
         move[free], wanted = _quadratic(
-            hessian[np.ix_(free, free)], slope[free], rows[np.ix_(near, free)], look.gap[near], now[near], scale[free]
+            hessian[np.ix_(free, free)],
+            slope[free],
+            rows[np.ix_(near, free)],
+            look.gap[near],
+            now[near],
+            scale[free],
         )
         farthest = float(np.linalg.norm(jacobian @ move, axis=1).max())
         part = min(1.0, reach / farthest) if farthest > 0.0 else 1.0
@@ -244,7 +283,8 @@ def _bottom(
 
 
 def _look(rod: Rod, obstacles: tuple[Obstacle, ...], x: Floats) -> _Look:
-    """The rod at curvatures x (3 e,), with a node at each minimum of an obstacle's distance within a step that may touch."""
+    """The rod at curvatures x (3 e,), with a node at each minimum of an obstacle's distance within a step
+    that may touch."""
     u, n = rod.fine(x), len(rod.step)
     chain = chain_of(rod, u)
     begins = np.concatenate([rod.base_position[None], chain.node[:-1]])
@@ -271,13 +311,18 @@ def _look(rod: Rod, obstacles: tuple[Obstacle, ...], x: Floats) -> _Look:
     fine = _cut(rod, at, np.array([s for _, s, _ in cuts]))
     if cuts:
         chain = chain_of(fine, fine.fine(x))
-    # node numbers in the cut rod: the ends of elements, each before it in the list moved on by the cuts up to it
+    # node numbers in the cut rod: the ends of elements, each before it in the list moved on by the cuts up to
+    # it
     ends = np.arange(n) + np.searchsorted(at, np.arange(n), side="right")
     touch = at + np.arange(len(cuts))
     found = [o.distance(chain.node) for o in obstacles]
-    which = np.concatenate([np.repeat(np.arange(len(obstacles)), n), np.array([k for _, _, k in cuts], dtype=np.intp)])
+    which = np.concatenate(
+        [np.repeat(np.arange(len(obstacles)), n), np.array([k for _, _, k in cuts], dtype=np.intp)]
+    )
     node = np.concatenate([np.tile(ends, len(obstacles)), touch])
-    slot = np.concatenate([np.arange(len(obstacles) * n), (len(obstacles) + which[len(obstacles) * n :]) * n + at])
+    slot = np.concatenate(
+        [np.arange(len(obstacles) * n), (len(obstacles) + which[len(obstacles) * n :]) * n + at]
+    )
     return _Look(
         rod=fine,
         chain=chain,
@@ -313,19 +358,24 @@ def _cut(rod: Rod, at: NDArray[np.intp], where: Floats) -> Rod:
 
 
 def _sliding(look: _Look, u: Floats, c: int, there: Floats) -> Floats:
-    """(3 e, 3 e) what the touching point's own motion along the rod takes off the second derivative of its gap."""
+    """(3 e, 3 e) what the touching point's own motion along the rod takes off the second derivative of its
+    gap."""
     p, chain, rod = look.node[c], look.chain, look.rod
     frame = chain.start[p] @ rotation_of(rod.step[p] * u[p])
     tangent = frame[:, 2]
     spin = np.swapaxes(chain.spin * rod.step[:, None, None], 0, 1).copy()
     spin[:, p + 1 :] = 0.0
-    turned = rod.coarse(np.swapaxes(np.cross(spin, tangent[:, None, None], axisa=0, axisb=0), 0, 2).swapaxes(1, 2))
+    turned = rod.coarse(
+        np.swapaxes(np.cross(spin, tangent[:, None, None], axisa=0, axisb=0), 0, 2).swapaxes(1, 2)
+    )
     mixed = there.T @ (look.curved[c] @ tangent) + turned.T @ look.normal[c]
     rate = tangent @ look.curved[c] @ tangent + look.normal[c] @ frame @ np.cross(u[p], E3)
     return np.outer(mixed, mixed) / max(float(rate), _FLAT)
 
 
-def _quadratic(hessian: Floats, slope: Floats, rows: Floats, gap: Floats, force: Floats, scale: Floats) -> tuple[Floats, Floats]:
+def _quadratic(
+    hessian: Floats, slope: Floats, rows: Floats, gap: Floats, force: Floats, scale: Floats
+) -> tuple[Floats, Floats]:
     """Least  d H d / 2 + slope d  with  rows d + gap >= 0: the move d and its multipliers."""
     pressed = force > 0.0
     held = rows[pressed]
@@ -353,12 +403,17 @@ def _quadratic(hessian: Floats, slope: Floats, rows: Floats, gap: Floats, force:
     return soft @ wanted - cho_solve(factor, slope), wanted
 
 
-def _search(rod: Rod, obstacles: tuple[Obstacle, ...], x: Floats, move: Floats, part: float, price: float) -> tuple[Floats, float]:
-    """Halve the move until energy plus `price` [N] times the depth of the nodes falls, or it is only rounding."""
+def _search(
+    rod: Rod, obstacles: tuple[Obstacle, ...], x: Floats, move: Floats, part: float, price: float
+) -> tuple[Floats, float]:
+    """Halve the move until energy plus `price` [N] times the depth of the nodes falls, or it is only
+    rounding."""
 
     def merit(x: Floats) -> float:
         look = _look(rod, obstacles, x)
-        return energy_of(look.rod, look.rod.fine(x), look.chain) + price * float(np.maximum(-look.gap, 0.0).sum())
+        return energy_of(look.rod, look.rod.fine(x), look.chain) + price * float(
+            np.maximum(-look.gap, 0.0).sum()
+        )
 
     here = merit(x)
     bending = float((rod.step[:, None] * rod.stiffness).max())
@@ -369,18 +424,26 @@ def _search(rod: Rod, obstacles: tuple[Obstacle, ...], x: Floats, move: Floats, 
     return x + part * move, part
 
 
-def _answer(rod: Rod, obstacles: tuple[Obstacle, ...], x: Floats, force: Floats, load: Floats, state: _State) -> Minimum:
+def _answer(
+    rod: Rod, obstacles: tuple[Obstacle, ...], x: Floats, force: Floats, load: Floats, state: _State
+) -> Minimum:
     look = _look(rod, obstacles, x)
     contact = np.zeros((len(look.rod.step) + 1, 3))
     np.add.at(contact, look.node + 1, force[look.slot][:, None] * look.normal)
     positions = np.concatenate([rod.base_position[None], look.chain.node])
-    gap = np.min([o.distance(positions).value - rod.rho for o in obstacles], axis=0) if obstacles else np.full(len(positions), np.inf)
+    gap = (
+        np.min([o.distance(positions).value - rod.rho for o in obstacles], axis=0)
+        if obstacles
+        else np.full(len(positions), np.inf)
+    )
     u = rod.fine(x)
     chain = chain_of(rod, u)
     stretch, direction = stretch_of(rod, u)
     tension = stretch / rod.compliance
     # moment of rod and wires in the middle of the first three elements, in the world, carried on to the base
-    moment = rod.stiffness * (u - rod.precurvature) + np.einsum("i,ji,jix->jx", tension, rod.crossing, np.cross(rod.offset, direction))
+    moment = rod.stiffness * (u - rod.precurvature) + np.einsum(
+        "i,ji,jix->jx", tension, rod.crossing, np.cross(rod.offset, direction)
+    )
     turned = np.einsum("jxy,jy->jx", chain.start @ rotation_of(0.5 * rod.step[:, None] * u), moment)
     return Minimum(
         arclength=np.concatenate([[0.0], np.cumsum(look.rod.step)]),

@@ -1,9 +1,10 @@
 """A tendon rod as the minimum of an energy: numpy and scipy only, nothing shared with the package under test.
 
 The rod is a row of elements of constant curvature u_j, each turning its frame by exp(h [u_j]x). At rest
-    V(u) = sum_j h/2 (u_j - u*)^T K (u_j - u*)  +  sum_i (l_i - L_i + c_i T0_i)^2 / (2 c_i)  -  sum_k F_k . r_k
-is least, with l_i = sum_j h |e3 + u_j x d_ij| and the loads at the nodes. No boundary value problem, no moment balance
-and no integrator: what the two ways share is the physics alone.
+    V(u) = sum_j h/2 (u_j - u*)^T K (u_j - u*)  +  sum_i (l_i - L_i + c_i T0_i)^2 / (2 c_i)  -  sum_k F_k .
+    r_k
+is least, with l_i = sum_j h |e3 + u_j x d_ij| and the loads at the nodes. No boundary value problem, no
+moment balance and no integrator: what the two ways share is the physics alone.
 """
 
 from __future__ import annotations
@@ -66,9 +67,12 @@ def minimise(
 ) -> Minimum:
     """Least energy of a chain of rods under dead loads.
 
-    - `length` [m]: one number, or (n_segments,) for a chain. `K` (3,) or (n_segments, 3): EI_x, EI_y, GJ [N m^2].
-    - `offsets` [m]: (n, 2), or (n_segments, n, 2) with nan where a tendon does not run. `tendon_length` (n,) [m], base to end.
-    - `compliance` [m/N] and `pretension` [N]: one or (n,); compliance must be positive, for the energy to exist.
+    - `length` [m]: one number, or (n_segments,) for a chain. `K` (3,) or (n_segments, 3): EI_x, EI_y, GJ [N
+      m^2].
+    - `offsets` [m]: (n, 2), or (n_segments, n, 2) with nan where a tendon does not run. `tendon_length` (n,)
+      [m], base to end.
+    - `compliance` [m/N] and `pretension` [N]: one or (n,); compliance must be positive, for the energy to
+      exist.
     - `tip_force` (3,) [N], `line_force` (3,) [N/m], world. `precurvature`: 0, (3,) or (n_segments, 3) [1/m].
     - `elements` a segment on the coarsest of `levels` grids, each twice as fine as the one before.
     """
@@ -89,8 +93,12 @@ def minimise(
         node_force = half + np.concatenate([half[1:], np.asarray(tip_force, dtype=float)[None]])
         rod = _Rod(
             step=step,
-            stiffness=np.repeat(np.broadcast_to(np.asarray(K, dtype=float), (n_segments, 3)), per_segment, axis=0),
-            precurvature=np.repeat(np.broadcast_to(np.asarray(precurvature, dtype=float), (n_segments, 3)), per_segment, axis=0),
+            stiffness=np.repeat(
+                np.broadcast_to(np.asarray(K, dtype=float), (n_segments, 3)), per_segment, axis=0
+            ),
+            precurvature=np.repeat(
+                np.broadcast_to(np.asarray(precurvature, dtype=float), (n_segments, 3)), per_segment, axis=0
+            ),
             crossing=crossing.astype(float),
             offset=flat,
             free_length=wires - compliances * np.asarray(pretension, dtype=float),
@@ -127,7 +135,9 @@ def gradient(rod: _Rod, u: NDArray[Any]) -> NDArray[Any]:
     if rod.unilateral:
         tension = np.where(tension.real > 0.0, tension, 0.0)
     # d|q|/du = d x t
-    out = out + np.einsum("bi,j,ji,bjix->bjx", tension, rod.step, rod.crossing, np.cross(rod.offset[None], direction))
+    out = out + np.einsum(
+        "bi,j,ji,bjix->bjx", tension, rod.step, rod.crossing, np.cross(rod.offset[None], direction)
+    )
     lever = np.cross(tangent, rod.step[:, None] * _beyond(rod.node_force))
     later = np.flip(np.cumsum(np.flip(lever, 1), axis=1), 1) - lever
     turned = np.einsum("bjyx,bjy->bjx", start, later)
@@ -152,7 +162,10 @@ def _bottom(rod: _Rod, u: NDArray[np.float64]) -> NDArray[np.float64]:
         # an element may turn by this much in one step: beyond it the energy is far from its parabola
         move *= min(1.0, reach / float(np.abs(rod.step[:, None] * move).sum()))
         here = energy(rod, u[None])[0]
-        while energy(rod, (u + move)[None])[0] > here + 1e-13 * (abs(here) + bending) and np.abs(move).max() > 1e-14:
+        while (
+            energy(rod, (u + move)[None])[0] > here + 1e-13 * (abs(here) + bending)
+            and np.abs(move).max() > 1e-14
+        ):
             move = 0.5 * move
         u = u + move
         if np.abs(move).max() < 1e-11 * (1.0 + np.abs(u).max()):
@@ -180,7 +193,8 @@ def _answer(rod: _Rod, u: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _richardson(answers: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """The elements' error runs in even powers of h, because every rule used is symmetric about the middle of an element."""
+    """The elements' error runs in even powers of h, because every rule used is symmetric about the middle of
+    an element."""
     table = list(answers)
     for power in range(1, len(table)):
         table = [(4.0**power * fine - coarse) / (4.0**power - 1.0) for coarse, fine in pairwise(table)]
@@ -196,7 +210,8 @@ def _path(rod: _Rod, u: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
 
 
 def _frames(rod: _Rod, u: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Frame at each element's start (batch, e, 3, 3), tangent at its middle (batch, e, 3), frame at the tip (batch, 3, 3)."""
+    """Frame at each element's start (batch, e, 3, 3), tangent at its middle (batch, e, 3), frame at the tip
+    (batch, 3, 3)."""
     h = rod.step[:, None]
     whole, half = _rotation(h * u), _rotation(0.5 * h * u)
     frame = np.broadcast_to(np.eye(3, dtype=u.dtype), (len(u), 3, 3))
@@ -220,7 +235,8 @@ def _hat(w: NDArray[Any]) -> NDArray[Any]:
 
 
 def _series(square: NDArray[Any], first: int) -> NDArray[Any]:
-    """sum_k (-theta^2)^k / (first + 2 k)!, analytic where sin(theta)/theta is not: element angles are below one."""
+    """sum_k (-theta^2)^k / (first + 2 k)!, analytic where sin(theta)/theta is not: element angles are below
+    one."""
     term = np.ones_like(square) / float(np.prod(np.arange(1, first + 1)))
     total = term
     for k in range(1, 14):

@@ -1,8 +1,11 @@
-"""The rod of the plant: virtual work on Legendre curvatures, many samples at once. numpy only, nothing shared with the package under test.
+"""The rod of the plant: virtual work on Legendre curvatures, many samples at once. numpy only, nothing shared
+with the package under test.
 
-Equal segments with four wires each; wire i sits at OFFSET (cos a_i, sin a_i) in the material frame and runs from the base to the end of its
-segment. r' = R e3, R' = R [u]x; the base is the origin, its frame the identity. Energy, per arclength s,
-    integral (u - u*)' K (u - u*) / 2 ds  +  sum_i (l_i - L_i)^2 / (2 c)  -  work of dead loads,   l_i = integral |e3 + u x d_i| ds,
+Equal segments with four wires each; wire i sits at OFFSET (cos a_i, sin a_i) in the material frame and runs
+from the base to the end of its segment. r' = R e3, R' = R [u]x; the base is the origin, its frame the
+identity. Energy, per arclength s,
+    integral (u - u*)' K (u - u*) / 2 ds  +  sum_i (l_i - L_i)^2 / (2 c)  -  work of dead loads,   l_i =
+    integral |e3 + u x d_i| ds,
 is least over u(s) = sum_m P_m(s) a_m in every segment, by Newton steps with the whole second derivative.
 """
 
@@ -31,7 +34,8 @@ def angles(segments: int) -> Array:
 
 
 def routing(segments: int) -> Array:
-    """(2 segments, 2 segments) pair lengths [m] of bends [rad]; a distal pair feels the segments before its own too."""
+    """(2 segments, 2 segments) pair lengths [m] of bends [rad]; a distal pair feels the segments before its
+    own too."""
     angle = angles(segments).reshape(segments, 4)[:, :2].reshape(-1)
     row = OFFSET * np.stack([np.sin(angle), -np.cos(angle)], axis=1)
     crosses = np.arange(segments)[None] <= (np.arange(2 * segments) // 2)[:, None]
@@ -51,15 +55,20 @@ def wires(pair: Array) -> Array:
 
 
 def _lobatto() -> tuple[Array, Array, Array, Array]:
-    """On [0, 1]: nodes (n,), integral of a function from each node to 1 (n, n), Legendre modes there (n, modes) and at both Gauss points
-    of the steps between them (2, n - 1, modes)."""
+    """On [0, 1]: nodes (n,), integral of a function from each node to 1 (n, n), Legendre modes there (n,
+    modes) and at both Gauss points of the steps between them (2, n - 1, modes)."""
     n = _NODES
     x = np.concatenate([[-1.0], np.sort(legendre.legroots(legendre.legder(np.eye(n)[n - 1]))), [1.0]])
     primitive = [legendre.legint(row) for row in np.eye(n)]
     beyond = np.stack([legendre.legval(1.0, p) - legendre.legval(x, p) for p in primitive], axis=1)
     gauss = 0.5 * (x[:-1] + x[1:]) + 0.5 * np.diff(x) * np.array([[-1.0], [1.0]]) / np.sqrt(3.0)
     inverse = np.linalg.inv(legendre.legvander(x, n - 1))
-    return 0.5 * (x + 1.0), 0.5 * beyond @ inverse, legendre.legvander(x, _MODES - 1), legendre.legvander(gauss, _MODES - 1)
+    return (
+        0.5 * (x + 1.0),
+        0.5 * beyond @ inverse,
+        legendre.legvander(x, _MODES - 1),
+        legendre.legvander(gauss, _MODES - 1),
+    )
 
 
 NODES, _BEYOND, _MODE, _MODE_GAUSS = _lobatto()
@@ -68,7 +77,8 @@ NODES, _BEYOND, _MODE, _MODE_GAUSS = _lobatto()
 
 @cache
 def _chain(segments: int) -> tuple[Array, Array]:
-    """Integral from each node to the tip (nodes, nodes) [m] and modes at the nodes (nodes, modes), of the whole chain."""
+    """Integral from each node to the tip (nodes, nodes) [m] and modes at the nodes (nodes, modes), of the
+    whole chain."""
     later = np.triu(np.ones((segments, segments)), 1)
     beyond = np.kron(np.eye(segments), _BEYOND) + np.kron(later, np.tile(_BEYOND[0], (len(NODES), 1)))
     return LENGTH * beyond, np.kron(np.eye(segments), _MODE)
@@ -91,19 +101,44 @@ class Rod:
     """(nodes,) [kg/m]."""
 
     def rest(
-        self, dl: Array, tip_force: Array, down: Array, *, payload: Array | float = 0.0, lever: float = 0.0, field: Field | None = None
+        self,
+        dl: Array,
+        tip_force: Array,
+        down: Array,
+        *,
+        payload: Array | float = 0.0,
+        lever: float = 0.0,
+        field: Field | None = None,
     ) -> tuple[Array, Array]:
-        """Where the energy is least: chords of the segments (n, segments, 3) [m] and rotations of the tip (n, 3, 3).
+        """Where the energy is least: chords of the segments (n, segments, 3) [m] and rotations of the tip (n,
+        3, 3).
 
-        - `dl` (n, tendons) [m]; `tip_force` (n, 3) [N] and `down` (n, 3) [m/s^2], the acceleration of gravity, in the base frame.
-        - `payload` (n, 1) [kg], with its centre `lever` [m] beyond the tip. `field` pulls the tip by what it gives there.
+        - `dl` (n, tendons) [m]; `tip_force` (n, 3) [N] and `down` (n, 3) [m/s^2], the acceleration of
+          gravity, in the base frame.
+        - `payload` (n, 1) [kg], with its centre `lever` [m] beyond the tip. `field` pulls the tip by what it
+          gives there.
         """
         n = len(dl)
         modes = np.zeros((n, self.segments, _MODES, 3))
         modes[:, :, 0, :2] = (pairs(dl) @ np.linalg.inv(routing(self.segments)).T).reshape(n, -1, 2) / LENGTH
-        modes, tension, todo, weight = modes.reshape(n, -1, 3), np.zeros_like(dl), np.arange(n), payload * down
+        modes, tension, todo, weight = (
+            modes.reshape(n, -1, 3),
+            np.zeros_like(dl),
+            np.arange(n),
+            payload * down,
+        )
         for k in range(120):
-            move, pull = self._newton(modes[todo], tension[todo], dl[todo], tip_force[todo], down[todo], weight[todo], lever, field, k > 11)
+            move, pull = self._newton(
+                modes[todo],
+                tension[todo],
+                dl[todo],
+                tip_force[todo],
+                down[todo],
+                weight[todo],
+                lever,
+                field,
+                k > 11,
+            )
             most = LENGTH * np.abs(move).sum(axis=(1, 2))
             # a radian in one pass is far enough, and less where it does not settle
             part = np.minimum(1.0, (1.0 if k < 12 else 0.3) / np.maximum(most, 1e-12))[:, None]
@@ -117,10 +152,14 @@ class Rod:
 
     def _shape(self, modes: Array) -> tuple[Array, Array]:
         """Chords (n, segments, 3) [m] and frames at the nodes (n, nodes, 3, 3)."""
-        gauss = np.einsum("gjm,nsmx->gnsjx", _MODE_GAUSS, modes.reshape(len(modes), self.segments, _MODES, 3), optimize=True)
+        gauss = np.einsum(
+            "gjm,nsmx->gnsjx", _MODE_GAUSS, modes.reshape(len(modes), self.segments, _MODES, 3), optimize=True
+        )
         h = LENGTH * np.diff(NODES)[:, None]
         # fourth order Magnus
-        step = _exponential(0.5 * h * (gauss[0] + gauss[1]) + (np.sqrt(3.0) / 12.0) * h**2 * _cross(gauss[0], gauss[1]))
+        step = _exponential(
+            0.5 * h * (gauss[0] + gauss[1]) + (np.sqrt(3.0) / 12.0) * h**2 * _cross(gauss[0], gauss[1])
+        )
         frame = np.empty((len(modes), self.segments, len(NODES), 3, 3))
         now = np.broadcast_to(np.eye(3), (len(modes), 3, 3))
         for s in range(self.segments):
@@ -145,7 +184,8 @@ class Rod:
     ) -> tuple[Array, Array]:
         """A step of the modes (n, segments * modes, 3) and the tensions (n, tendons) [N] after it.
 
-        Tensions are unknowns of their own: what a stiff wire would pull in a shape that is not yet the right one is absurd.
+        Tensions are unknowns of their own: what a stiff wire would pull in a shape that is not yet the right
+        one is absurd.
         """
         n, size = len(modes), 3 * modes.shape[1]
         beyond, mode = _chain(self.segments)
@@ -153,27 +193,47 @@ class Rod:
         weighted = step[:, None] * mode
         _, frame = self._shape(modes)
         u = mode @ modes
-        stiffness = np.tile(np.diag([EI, EI, GJ]), (nodes, 1, 1)) if self.stiffness is None else self.stiffness
+        stiffness = (
+            np.tile(np.diag([EI, EI, GJ]), (nodes, 1, 1)) if self.stiffness is None else self.stiffness
+        )
         moment = np.einsum("jxy,njy->njx", stiffness, u - self.precurvature)
         # wires
         angle = angles(self.segments) if self.angle is None else self.angle
         place = OFFSET * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
         last = np.repeat(np.arange(self.segments), 4)
-        crosses = (np.repeat(np.arange(self.segments), len(NODES))[:, None] <= last).astype(float)  # (nodes, tendons)
+        # (nodes, tendons)
+        crosses = (np.repeat(np.arange(self.segments), len(NODES))[:, None] <= last).astype(float)
         q = _cross(u[:, :, None], place) + np.array([0.0, 0.0, 1.0])
         speed = np.sqrt(np.sum(q * q, axis=-1))
-        taut = (np.einsum("j,nji,ji->ni", step, speed, crosses) - dl - LENGTH * (last + 1.0)) / self.compliance
+        taut = (
+            np.einsum("j,nji,ji->ni", step, speed, crosses) - dl - LENGTH * (last + 1.0)
+        ) / self.compliance
         turn = _cross(place, q) * (crosses / speed)[..., None]  # d|q|/du
-        slope = (weighted.T @ turn.reshape(n, nodes, -1)).reshape(n, len(mode.T), -1, 3).swapaxes(1, 2).reshape(n, -1, size)
+        slope = (
+            (weighted.T @ turn.reshape(n, nodes, -1))
+            .reshape(n, len(mode.T), -1, 3)
+            .swapaxes(1, 2)
+            .reshape(n, -1, size)
+        )
         moment = moment + np.einsum("ni,njix->njx", taut, turn)
         # d2|q|/du2 = ([d]x'[d]x - turn turn') / |q|
         pull = tension[:, None] * crosses / speed
         lock = np.sum(place**2, axis=1)[:, None, None] * np.eye(3) - place[:, :, None] * place[:, None]
-        curving = stiffness + (pull @ lock.reshape(-1, 9)).reshape(n, nodes, 3, 3) - np.swapaxes(pull[..., None] * turn, 2, 3) @ turn
+        curving = (
+            stiffness
+            + (pull @ lock.reshape(-1, 9)).reshape(n, nodes, 3, 3)
+            - np.swapaxes(pull[..., None] * turn, 2, 3) @ turn
+        )
         products = (weighted[:, :, None] * mode[:, None]).reshape(nodes, -1)
-        hessian = (np.swapaxes(curving.reshape(n, nodes, 9), 1, 2) @ products).reshape(n, 3, 3, len(mode.T), -1)
-        hessian = hessian.transpose(0, 3, 1, 4, 2).reshape(n, size, size) + np.swapaxes(slope, 1, 2) @ slope / self.compliance
-        # loads: dt = dtheta x t turns all that is beyond; two turns, the nearer to the base outermost, give t N' - (t.N) 1
+        hessian = (np.swapaxes(curving.reshape(n, nodes, 9), 1, 2) @ products).reshape(
+            n, 3, 3, len(mode.T), -1
+        )
+        hessian = (
+            hessian.transpose(0, 3, 1, 4, 2).reshape(n, size, size)
+            + np.swapaxes(slope, 1, 2) @ slope / self.compliance
+        )
+        # loads: dt = dtheta x t turns all that is beyond; two turns, the nearer to the base outermost, give t
+        # N' - (t.N) 1
         if field is not None:
             arm = beyond @ frame[..., 2]
             pull_tip, change = field(arm[:, 0])
@@ -182,13 +242,25 @@ class Rod:
             moved = _cross(np.swapaxes(frame, 2, 3), arm[:, :, None])
             moved = (weighted.T @ moved.reshape(n, nodes, 9)).reshape(n, size, 3)
             hessian = hessian - moved @ change @ np.swapaxes(moved, 1, 2)
-        force = (tip_force + weight)[:, None] + (beyond @ np.broadcast_to(self.density, nodes))[:, None] * down[:, None]
+        force = (tip_force + weight)[:, None] + (beyond @ np.broadcast_to(self.density, nodes))[
+            :, None
+        ] * down[:, None]
         spread = _outer(frame[..., 2], force)
-        work = (beyond @ spread.reshape(n, nodes, 9)).reshape(n, nodes, 3, 3) + lever * _outer(frame[:, -1, :, 2], weight)[:, None]
-        lift = np.stack([work[..., 1, 2] - work[..., 2, 1], work[..., 2, 0] - work[..., 0, 2], work[..., 0, 1] - work[..., 1, 0]], axis=-1)
+        work = (beyond @ spread.reshape(n, nodes, 9)).reshape(n, nodes, 3, 3) + lever * _outer(
+            frame[:, -1, :, 2], weight
+        )[:, None]
+        lift = np.stack(
+            [
+                work[..., 1, 2] - work[..., 2, 1],
+                work[..., 2, 0] - work[..., 0, 2],
+                work[..., 0, 1] - work[..., 1, 0],
+            ],
+            axis=-1,
+        )
         moment = moment - (lift[:, :, None] @ frame)[:, :, 0]
         twice = (work - np.trace(work, axis1=2, axis2=3)[..., None, None] * np.eye(3)) @ frame
-        # what each mode has turned before a node: integral from the base of P_m R', then both orders of the two turns
+        # what each mode has turned before a node: integral from the base of P_m R', then both orders of the
+        # two turns
         turned = (beyond[0] - beyond) @ (mode[:, :, None, None] * frame[:, :, None]).reshape(n, nodes, -1)
         turned = turned.reshape(n, nodes, -1, 3, 3).transpose(0, 2, 4, 1, 3).reshape(n, size, -1)
         half = turned @ (weighted[:, None, :, None] * twice[:, :, :, None]).reshape(n, 3 * nodes, size)

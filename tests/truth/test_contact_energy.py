@@ -1,4 +1,5 @@
-"""The constrained minimum of energy against published figures, against the free minimum, and against the package's own rod."""
+"""The constrained minimum of energy against published figures, against the free minimum, and against the
+package's own rod."""
 
 from __future__ import annotations
 
@@ -27,10 +28,19 @@ def at_rest(name: str, elements: int = 40) -> contact_energy.Minimum:
 
 
 def pressed(kappa: float, compliance: float, elements: int = 20, **options: Any) -> contact_energy.Minimum:
-    """The prototype, bent in the plane to a mean curvature kappa [1/m] that would take its tip through the wall at x = 12 mm."""
+    """The prototype, bent in the plane to a mean curvature kappa [1/m] that would take its tip through the
+    wall at x = 12 mm."""
     lengths = contact_cases.bent([0.07], [RING], [kappa], [0.0])
     return contact_energy.minimise(
-        0.07, [0.0022, 0.0022, 0.001], RING, lengths, compliance, obstacle=WALL, elements=elements, load_steps=4, **options
+        0.07,
+        [0.0022, 0.0022, 0.001],
+        RING,
+        lengths,
+        compliance,
+        obstacle=WALL,
+        elements=elements,
+        load_steps=4,
+        **options,
     )
 
 
@@ -40,13 +50,17 @@ def extrapolated(coarse: Any, fine: Any) -> Any:
 
 
 # tip force [N] and tip z [m]; they belong to wires that do not stretch: 1e-7 m/N moves z by less than 1e-6 m
-@pytest.mark.parametrize(("kappa", "force", "z"), [(8.0, 0.576, 0.067955), (12.0, 1.323, 0.066458), (16.0, 2.071, 0.064271)])
+@pytest.mark.parametrize(
+    ("kappa", "force", "z"), [(8.0, 0.576, 0.067955), (12.0, 1.323, 0.066458), (16.0, 2.071, 0.064271)]
+)
 def test_tip_on_a_wall(kappa: float, force: float, z: float) -> None:
     coarse, fine = pressed(kappa, 1e-7, planar=True), pressed(kappa, 1e-7, 40, planar=True)
     assert coarse.converged
     assert fine.converged
     assert fine.tip_position[0] == pytest.approx(0.012, abs=1e-9)
-    assert_allclose(extrapolated(coarse.total_force, fine.total_force), [-force, 0.0, 0.0], rtol=0, atol=0.002 * force)
+    assert_allclose(
+        extrapolated(coarse.total_force, fine.total_force), [-force, 0.0, 0.0], rtol=0, atol=0.002 * force
+    )
     assert extrapolated(coarse.tip_position, fine.tip_position)[2] == pytest.approx(z, abs=3e-6)
     # the whole of it acts on the tip
     assert [p.arclength for p in contact_energy.patches(fine)] == pytest.approx([0.07])
@@ -59,7 +73,8 @@ def test_wires_that_stretch_press_less() -> None:
 
 
 def test_bent_far_the_planar_answer_is_a_ridge() -> None:
-    """From a mean curvature of about 12.4 1/m on the tip slides along the wall and the rod leaves the plane."""
+    """From a mean curvature of about 12.4 1/m on the tip slides along the wall and the rod leaves the
+    plane."""
     assert pressed(12.0, 1e-5).stability > 0.05
     ridge, valley = pressed(16.0, 1e-5, planar=True), pressed(16.0, 1e-5, nudge=[0.0, 0.01, 0.0])
     assert ridge.stability < -0.5
@@ -80,8 +95,12 @@ def test_away_from_the_obstacle_it_is_the_free_rod(name: str) -> None:
     free = energy.minimise(**case, levels=3)
     assert not fine.contact_force.any()
     # two extrapolations of different rules: the fourth power of h is left
-    assert_allclose(extrapolated(coarse.tip_position, fine.tip_position), free.tip_position, rtol=0, atol=2e-8)
-    assert_allclose(extrapolated(coarse.tip_rotation, fine.tip_rotation), free.tip_rotation, rtol=0, atol=2e-6)
+    assert_allclose(
+        extrapolated(coarse.tip_position, fine.tip_position), free.tip_position, rtol=0, atol=2e-8
+    )
+    assert_allclose(
+        extrapolated(coarse.tip_rotation, fine.tip_rotation), free.tip_rotation, rtol=0, atol=2e-6
+    )
     assert_allclose(extrapolated(coarse.tension, fine.tension), free.tension, rtol=0, atol=1e-4)
 
 
@@ -102,11 +121,16 @@ def test_signorini(name: str) -> None:
 
 @pytest.mark.parametrize("name", CASES)
 def test_a_force_between_the_ends_is_square_to_the_rod(name: str) -> None:
-    """Where phi is least along the rod its normal has no part along it; a node that held the rod would fail this."""
+    """Where phi is least along the rod its normal has no part along it; a node that held the rod would fail
+    this."""
     found = at_rest(name)
     for i in np.flatnonzero(np.linalg.norm(found.contact_force[:-1], axis=1) > 1e-6):
-        # both sides are arcs of one curvature: the tangent in the middle is the chord from the far ends, weighted
-        ahead, behind = found.positions[i + 1] - found.positions[i], found.positions[i] - found.positions[i - 1]
+        # both sides are arcs of one curvature: the tangent in the middle is the chord from the far ends,
+        # weighted
+        ahead, behind = (
+            found.positions[i + 1] - found.positions[i],
+            found.positions[i] - found.positions[i - 1],
+        )
         a, b = np.linalg.norm(ahead), np.linalg.norm(behind)
         tangent = (ahead / a * b + behind / b * a) / (a + b)
         across = found.contact_force[i] @ tangent / np.linalg.norm(found.contact_force[i])
@@ -124,7 +148,8 @@ def test_balance(name: str) -> None:
     force[-1] += case["tip_force"]
     assert_allclose(found.base_force + force.sum(axis=0), 0.0, rtol=0, atol=1e-6)
     moment = np.cross(found.positions - found.positions[0], force).sum(axis=0)
-    # carried from the middles of three elements to the base; and a line force on the ends of its element is f h^2 / 8 of moment
+    # carried from the middles of three elements to the base; and a line force on the ends of its element is f
+    # h^2 / 8 of moment
     atol = 1e-4 * np.abs(moment).max() + np.linalg.norm(line) * step.max() ** 2 / 6.0
     assert_allclose(found.base_moment, -moment, rtol=0, atol=atol)
 
@@ -144,7 +169,10 @@ def test_base_force_is_the_work_of_moving_the_base(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["bar", "sphere", "heavy", "tube"])
 def test_error_falls_with_the_square_of_the_element(name: str) -> None:
-    tips, forces = zip(*[(found.tip_position, found.total_force) for found in (at_rest(name, n) for n in (10, 20, 40))], strict=True)
+    tips, forces = zip(
+        *[(found.tip_position, found.total_force) for found in (at_rest(name, n) for n in (10, 20, 40))],
+        strict=True,
+    )
     for values in (tips, forces):
         far, near = np.linalg.norm(values[0] - values[1]), np.linalg.norm(values[1] - values[2])
         # where in its element the rod touches changes from grid to grid: no clean power of four
@@ -154,9 +182,14 @@ def test_error_falls_with_the_square_of_the_element(name: str) -> None:
 
 @pytest.mark.parametrize("name", CASES)
 def test_the_package_has_the_same_rod_under_these_forces(name: str) -> None:
-    """Contact forces as point forces on the package's rod, which solves a boundary value problem and knows no obstacle."""
+    """Contact forces as point forces on the package's rod, which solves a boundary value problem and knows no
+    obstacle."""
     case, found = CASES[name], at_rest(name, 80)
-    on = [i for i in np.flatnonzero(np.linalg.norm(found.contact_force, axis=1) > 1e-9) if i < len(found.arclength) - 1]
+    on = [
+        i
+        for i in np.flatnonzero(np.linalg.norm(found.contact_force, axis=1) > 1e-9)
+        if i < len(found.arclength) - 1
+    ]
     state = fastrod.Simulator(robot(case), points_per_segment=80).settle(
         case["tendon_length"] or None,
         tip_force=found.contact_force[-1] + np.asarray(case["tip_force"]),
@@ -164,7 +197,8 @@ def test_the_package_has_the_same_rod_under_these_forces(name: str) -> None:
         point_force=[(found.arclength[i], found.contact_force[i]) for i in on] or None,
     )
     assert state.ok.all()
-    # what 80 elements leave, mostly by the contact force they are given: 3e-6 m, and 7e-6 m for the heavy rod of 0.3 m
+    # what 80 elements leave, mostly by the contact force they are given: 3e-6 m, and 7e-6 m for the heavy rod
+    # of 0.3 m
     assert_allclose(state.tip_position[0], found.tip_position, rtol=0, atol=1e-5)
     assert_allclose(state.tension[0], found.tension, rtol=0, atol=5e-4)
     # on the host, so of the other sign
@@ -188,11 +222,21 @@ def robot(case: dict[str, Any]) -> fastrod.Robot:
             for i in np.flatnonzero(crossed == k + 1)
         )
         mode = "tendon_length" if wires else "passive"
-        segments.append(fastrod.Segment(length=length, bending_stiffness=(K[0], K[1]), torsional_stiffness=K[2], tendons=wires, mode=mode))
+        segments.append(
+            fastrod.Segment(
+                length=length,
+                bending_stiffness=(K[0], K[1]),
+                torsional_stiffness=K[2],
+                tendons=wires,
+                mode=mode,
+            )
+        )
     # upright, or turned about y so that d3 lies along x
     quarter = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
     upright = np.array_equal(case["base_rotation"], np.eye(3))
-    return fastrod.Robot(name="case", segments=tuple(segments), base_quaternion=(1.0, 0.0, 0.0, 0.0) if upright else quarter)
+    return fastrod.Robot(
+        name="case", segments=tuple(segments), base_quaternion=(1.0, 0.0, 0.0, 0.0) if upright else quarter
+    )
 
 
 @pytest.mark.parametrize(
@@ -202,7 +246,9 @@ def robot(case: dict[str, Any]) -> fastrod.Robot:
         contact_shapes.Sphere([0.1, 0.2, 0.3], 0.5),
         contact_shapes.Cylinder([0.0, 0.0, 0.1], [1.0, 0.3, 0.2], 0.3),
         contact_shapes.Cylinder([0.0, 0.0, 0.1], [1.0, 0.3, 0.2], 0.3, 0.5),
-        contact_shapes.Box([0.0, 0.1, 0.0], [0.3, 0.4, 0.5], [[0.6, 0.0, 0.8], [0.0, 1.0, 0.0], [-0.8, 0.0, 0.6]]),
+        contact_shapes.Box(
+            [0.0, 0.1, 0.0], [0.3, 0.4, 0.5], [[0.6, 0.0, 0.8], [0.0, 1.0, 0.0], [-0.8, 0.0, 0.6]]
+        ),
         contact_shapes.Tube([0.0, 0.1, 0.0], [0.0, 0.1, 1.0], 2.0),
     ],
     ids=lambda solid: type(solid).__name__,
@@ -211,8 +257,25 @@ def test_distances(solid: contact_shapes.Obstacle) -> None:
     """A signed distance has a unit gradient; and ours are the derivatives they say, by differences."""
     points = np.random.default_rng(0).normal(size=(200, 3))
     found, step = solid.distance(points), 1e-6
-    sides = [(solid.distance(points + step * axis), solid.distance(points - step * axis)) for axis in np.eye(3)]
+    sides = [
+        (solid.distance(points + step * axis), solid.distance(points - step * axis)) for axis in np.eye(3)
+    ]
     assert_allclose(np.linalg.norm(found.normal, axis=1), 1.0, rtol=1e-12)
-    assert_allclose(found.normal, np.stack([(a.value - b.value) / (2.0 * step) for a, b in sides], axis=1), rtol=0, atol=1e-8)
-    assert_allclose(found.hessian, np.stack([(a.normal - b.normal) / (2.0 * step) for a, b in sides], axis=2), rtol=0, atol=1e-7)
-    assert_allclose(solid.distance(points - found.value[:, None] * found.normal).value[found.value > 0], 0.0, rtol=0, atol=1e-12)
+    assert_allclose(
+        found.normal,
+        np.stack([(a.value - b.value) / (2.0 * step) for a, b in sides], axis=1),
+        rtol=0,
+        atol=1e-8,
+    )
+    assert_allclose(
+        found.hessian,
+        np.stack([(a.normal - b.normal) / (2.0 * step) for a, b in sides], axis=2),
+        rtol=0,
+        atol=1e-7,
+    )
+    assert_allclose(
+        solid.distance(points - found.value[:, None] * found.normal).value[found.value > 0],
+        0.0,
+        rtol=0,
+        atol=1e-12,
+    )

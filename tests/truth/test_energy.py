@@ -49,12 +49,19 @@ def test_least_energy_of_a_chain_is_the_truth(case: str) -> None:
     # angles 90, -30, 210 deg
     place = np.array([[0.0, 1.0], [np.cos(np.pi / 6.0), -0.5], [-np.cos(np.pi / 6.0), -0.5]])
     away = np.full((3, 2), np.nan)
-    offsets = np.stack([np.concatenate([first * place, second * place]), np.concatenate([away, second * place])])
+    offsets = np.stack(
+        [np.concatenate([first * place, second * place]), np.concatenate([away, second * place])]
+    )
     tension = numbers(row, *[f"q{i}" for i in range(1, 7)])
     path = numbers(row, *[f"kir_len{i}" for i in range(1, 7)])
     c = 1e-5
     found = energy.minimise(
-        [length, length], stiffness * np.array([1.0, 1.0, 2.0 / 2.6]), offsets, path - c * tension, c, numbers(row, "fx", "fy", "fz")
+        [length, length],
+        stiffness * np.array([1.0, 1.0, 2.0 / 2.6]),
+        offsets,
+        path - c * tension,
+        c,
+        numbers(row, "fx", "fy", "fz"),
     )
     # the file's own answers are good to some 1e-11 m; the extrapolation's error estimate bounds ours
     assert found.error < 1e-8

@@ -15,7 +15,9 @@ from plant_rod import COMPLIANCE, EI, GJ, GRAVITY, LENGTH, OFFSET
 SIDEWAYS = [np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0]
 
 
-def least_energy(bend: np.ndarray, payload: float, down: np.ndarray, compliance: float = COMPLIANCE, line: float = 0.0) -> np.ndarray:
+def least_energy(
+    bend: np.ndarray, payload: float, down: np.ndarray, compliance: float = COMPLIANCE, line: float = 0.0
+) -> np.ndarray:
     """Tip [m] of bends (segments, 2) [rad] under a payload [kg] and a line weight [N/m]."""
     segments = len(bend)
     angle = plant_rod.angles(segments)
@@ -25,7 +27,15 @@ def least_energy(bend: np.ndarray, payload: float, down: np.ndarray, compliance:
     lengths = plant.arc_lengths(bend[None])[0] + LENGTH * np.repeat(np.arange(1, segments + 1), 4)
     K = np.tile([EI, EI, GJ], (segments, 1))
     found = energy.minimise(
-        np.full(segments, LENGTH), K, offsets, lengths, compliance, payload * down, line / GRAVITY * down, elements=6, levels=3
+        np.full(segments, LENGTH),
+        K,
+        offsets,
+        lengths,
+        compliance,
+        payload * down,
+        line / GRAVITY * down,
+        elements=6,
+        levels=3,
     )
     assert found.error < 5e-6
     return found.tip_position
@@ -33,7 +43,12 @@ def least_energy(bend: np.ndarray, payload: float, down: np.ndarray, compliance:
 
 def still(bend: np.ndarray, payload: float) -> plant.Inputs:
     """Two samples of one pose, the base turned by 90 degrees."""
-    return plant.Inputs(np.array([0.0, 1.0]), plant.arc_lengths(np.stack([bend, bend])), np.full(2, payload), np.tile(SIDEWAYS, (2, 1)))
+    return plant.Inputs(
+        np.array([0.0, 1.0]),
+        plant.arc_lengths(np.stack([bend, bend])),
+        np.full(2, payload),
+        np.tile(SIDEWAYS, (2, 1)),
+    )
 
 
 @pytest.mark.parametrize(
@@ -83,7 +98,10 @@ def test_every_effect_moves_the_tip_by_its_size(name: str, designed: plant.Input
 
 def test_coupling_needs_two_segments() -> None:
     inputs = plant.operator_inputs(np.random.default_rng(0), segments=2, seconds=8.0)
-    moved = plant.pose(inputs, plant.draw(0, "coupling", segments=2))[0] - plant.pose(inputs, plant.draw(0, "none"))[0]
+    moved = (
+        plant.pose(inputs, plant.draw(0, "coupling", segments=2))[0]
+        - plant.pose(inputs, plant.draw(0, "none"))[0]
+    )
     assert np.abs(moved).max() > 1e-3
     assert "coupling" not in plant.library(1)
 
@@ -136,12 +154,18 @@ def test_a_dominant_effect_dominates() -> None:
     assert len(many.effects) == 9
     assert set(many.effects) <= set(plant.LIBRARY)
     bare = plant.pose(inputs, plant.Seal({}, 1))[0]
-    moved = [np.sqrt(np.mean((plant.pose(inputs, plant.Seal({n: e}, 1))[0] - bare) ** 2)) for n, e in many.effects.items()]
+    moved = [
+        np.sqrt(np.mean((plant.pose(inputs, plant.Seal({n: e}, 1))[0] - bare) ** 2))
+        for n, e in many.effects.items()
+    ]
     # 0.1 to 0.2 of the dominant one, were every effect in proportion to its size
     assert max(moved[1:]) < 0.4 * moved[0]
 
 
 def test_draws_are_independent_of_what_else_is_drawn() -> None:
-    assert plant.draw(4, "gravity").effects["gravity"] == plant.draw(4, ["payload", "gravity"]).effects["gravity"]
+    assert (
+        plant.draw(4, "gravity").effects["gravity"]
+        == plant.draw(4, ["payload", "gravity"]).effects["gravity"]
+    )
     with pytest.raises(ValueError, match="no effect of a robot of 1 segment"):
         plant.draw(0, "coupling")

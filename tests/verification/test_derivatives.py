@@ -1,4 +1,5 @@
-"""Jacobian, compliance and dense output against central differences of the settled answer: exact for the discrete rod."""
+"""Jacobian, compliance and dense output against central differences of the settled answer: exact for the
+discrete rod."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ from fastrod import Robot, Simulator, load_robot
 
 
 def difference(sim: Simulator, base: dict[str, np.ndarray], name: str, axis: int, delta: float) -> np.ndarray:
-    """(6,) central difference of the settled tip pose by one entry of one input, with the next order taken off."""
+    """(6,) central difference of the settled tip pose by one entry of one input, with the next order taken
+    off."""
     fine, coarse = (_central(sim, base, name, axis, k * delta) for k in (1.0, 2.0))
     return (4.0 * fine - coarse) / 3.0
 
@@ -23,7 +25,7 @@ def _central(sim: Simulator, base: dict[str, np.ndarray], name: str, axis: int, 
     for sign in (1.0, -1.0):
         moved = {key: value.copy() for key, value in base.items()}
         moved[name][axis] += sign * delta
-        state = sim.settle(**moved, tolerance=1e-13)  # type: ignore[arg-type]
+        state = sim.settle(**moved, tolerance=1e-13)
         ends.append((state.tip_position[0], state.tip_rotation[0]))
     (p1, r1), (p0, r0) = ends
     turn = r1 @ r0.T
@@ -33,9 +35,13 @@ def _central(sim: Simulator, base: dict[str, np.ndarray], name: str, axis: int, 
 
 def check(robot: Robot, base: dict[str, np.ndarray], points: int = 6) -> None:
     sim = Simulator(robot, points_per_segment=points)
-    sim.settle(**base, tolerance=1e-13)  # type: ignore[arg-type]
+    sim.settle(**base, tolerance=1e-13)
     jacobian, compliance = sim.jacobian()[0], sim.compliance()[0]
-    columns = [("tendon_length", i, 1e-6) for i in range(robot.n_tendons)] if robot.segments[0].mode != "tendon_tension" else []
+    columns = (
+        [("tendon_length", i, 1e-6) for i in range(robot.n_tendons)]
+        if robot.segments[0].mode != "tendon_tension"
+        else []
+    )
     for name, i, delta in columns:
         expected = difference(sim, base, name, i, delta)
         assert_allclose(jacobian[:, i], expected, atol=1e-6 * np.abs(expected).max())
@@ -56,7 +62,11 @@ def test_one_segment(n_tendons: int) -> None:
 
 def test_anisotropic_precurved_rod_with_a_moment_on_its_tip() -> None:
     robot = rod(bending_stiffness=(0.0022, 0.003), precurvature=(1.0, -2.0, 3.0))
-    base = {"tendon_length": bend(robot, 0.5, 0.6), "tip_force": np.array([0.1, 0.0, -0.1]), "tip_moment": np.array([1e-3, 2e-3, -1e-3])}
+    base = {
+        "tendon_length": bend(robot, 0.5, 0.6),
+        "tip_force": np.array([0.1, 0.0, -0.1]),
+        "tip_moment": np.array([1e-3, 2e-3, -1e-3]),
+    }
     check(robot, base)
 
 
@@ -69,8 +79,20 @@ def test_passive_rod_and_paper_mode() -> None:
 def test_chain_with_extension() -> None:
     robot = load_robot("five_segment_reacher")
     robot = replace(robot, segments=robot.segments[2:])
-    lengths = bend(robot, 0.3, 0.2) + bend(robot, -0.2, 0.3, 1) + bend(robot, 0.1, 0.4, 2) - 2.0 * robot.rest_tendon_length
-    check(robot, {"tendon_length": lengths, "tip_force": np.array([0.02, -0.03, 0.01]), "extension": np.array([0.0, 0.0, 0.01])})
+    lengths = (
+        bend(robot, 0.3, 0.2)
+        + bend(robot, -0.2, 0.3, 1)
+        + bend(robot, 0.1, 0.4, 2)
+        - 2.0 * robot.rest_tendon_length
+    )
+    check(
+        robot,
+        {
+            "tendon_length": lengths,
+            "tip_force": np.array([0.02, -0.03, 0.01]),
+            "extension": np.array([0.0, 0.0, 0.01]),
+        },
+    )
 
 
 def test_tensions_as_inputs() -> None:
@@ -78,7 +100,7 @@ def test_tensions_as_inputs() -> None:
     robot = replace(robot, segments=tuple(replace(s, mode="tendon_tension") for s in robot.segments))
     base = {"tension": np.array([2.0, 0.5, 0.0, 1.0, 0.0, 0.3]), "tip_force": np.array([0.1, 0.0, 0.2])}
     sim = Simulator(robot, points_per_segment=8)
-    sim.settle(**base, tolerance=1e-13)  # type: ignore[arg-type]
+    sim.settle(**base, tolerance=1e-13)
     jacobian = sim.jacobian()[0]
     for i in range(6):
         expected = difference(sim, base, "tension", i, 1e-4)
@@ -87,17 +109,24 @@ def test_tensions_as_inputs() -> None:
 
 def test_compliance_beside_a_follower_force() -> None:
     robot = rod()
-    base = {"tendon_length": bend(robot, 0.6, 0.1), "tip_force": np.array([0.0, 0.1, 0.0]), "follower_tip_force": np.array([0.1, 0.0, 0.1])}
+    base = {
+        "tendon_length": bend(robot, 0.6, 0.1),
+        "tip_force": np.array([0.0, 0.1, 0.0]),
+        "follower_tip_force": np.array([0.1, 0.0, 0.1]),
+    }
     check(robot, base)
 
 
 def test_extension_under_a_point_force_that_stays_at_its_arclength() -> None:
     robot = rod("passive", extension=(0.0, 0.05))
     sim = Simulator(robot, points_per_segment=8)
-    loads = {"point_force": [(0.04, (0.0, 0.2, 0.0))], "line_force": np.array([[[0.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 1.0]]])}
-    sim.settle(extension=[0.02], tolerance=1e-13, **loads)  # type: ignore[arg-type]
+    loads = {
+        "point_force": [(0.04, (0.0, 0.2, 0.0))],
+        "line_force": np.array([[[0.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 1.0]]]),
+    }
+    sim.settle(extension=[0.02], tolerance=1e-13, **loads)
     jacobian = sim.jacobian()[0, :3, 0]
-    ends = [sim.settle(extension=[0.02 + d], tolerance=1e-13, **loads).tip_position[0] for d in (1e-5, -1e-5)]  # type: ignore[arg-type]
+    ends = [sim.settle(extension=[0.02 + d], tolerance=1e-13, **loads).tip_position[0] for d in (1e-5, -1e-5)]
     expected = (ends[0] - ends[1]) / 2e-5
     assert_allclose(jacobian, expected, atol=1e-6 * np.abs(expected).max())
 
@@ -107,8 +136,8 @@ def test_shape_between_nodes_is_as_good_as_at_nodes() -> None:
     lengths = bend(robot, 0.9, 0.2) + bend(robot, -0.5, 0.7, 1) - robot.rest_tendon_length
     loads = {"tip_force": (0.2, -0.1, 0.1), "line_force": (0.1, 0.2, 0.0)}
     coarse, fine = Simulator(robot, points_per_segment=10), Simulator(robot, points_per_segment=80)
-    state = coarse.settle(lengths, **loads)  # type: ignore[arg-type]
-    fine.settle(lengths, **loads)  # type: ignore[arg-type]
+    state = coarse.settle(lengths, **loads)
+    fine.settle(lengths, **loads)
     s = np.linspace(0.0, 0.4, 57)
     one, two = coarse.shape(s), fine.shape(s)
     at_nodes = np.abs(state.position - fine.shape(state.arclength[0]).position).max()
@@ -116,7 +145,8 @@ def test_shape_between_nodes_is_as_good_as_at_nodes() -> None:
     assert_allclose(one.rotation, two.rotation, atol=1e-5)
     away = np.abs(s - 0.2) > 1e-3  # at the joint the curvature jumps
     assert_allclose(one.curvature[:, away], two.curvature[:, away], atol=2e-3)
-    assert_allclose(coarse.shape(0.2).curvature[0, 0], state.curvature[0, 10], atol=1e-12)  # at a joint the distal side, as in the state
+    # at a joint the distal side, as in the state
+    assert_allclose(coarse.shape(0.2).curvature[0, 0], state.curvature[0, 10], atol=1e-12)
     again = coarse.shape(state.arclength[0])
     assert_allclose(again.position, state.position, atol=1e-15)
     assert_allclose(again.curvature[:, :-1], state.curvature[:, :-1], atol=1e-7)

@@ -17,7 +17,16 @@ from scipy.spatial.transform import Rotation
 from fastrod import Robot, Segment, Simulator, load_robot
 from fastrod.effects.base import get_effect
 from fastrod.effects.pipeline import Measurement
-from fastrod.kernels.operators import BUFFER, SLIDERS, delay, elastoplastic, play, relaxation, second_order, yielding
+from fastrod.kernels.operators import (
+    BUFFER,
+    SLIDERS,
+    delay,
+    elastoplastic,
+    play,
+    relaxation,
+    second_order,
+    yielding,
+)
 from fastrod.model.routing import wire
 from fastrod.solver.state import State
 
@@ -43,9 +52,19 @@ def rounded(path: np.ndarray) -> np.ndarray:
     return played(path, rounding=0.3)
 
 
-def rubbed(path: np.ndarray, amplitude: float = 0.3, radius: float = 0.2, spread: float = 0.4, growth: float = 0.0) -> np.ndarray:
+def rubbed(
+    path: np.ndarray, amplitude: float = 0.3, radius: float = 0.2, spread: float = 0.4, growth: float = 0.0
+) -> np.ndarray:
     x = path[None, :, None].copy()
-    elastoplastic(x, full(1 + SLIDERS), one(amplitude), one(radius), one(spread), one(growth), np.abs(path)[None, :, None].copy())
+    elastoplastic(
+        x,
+        full(1 + SLIDERS),
+        one(amplitude),
+        one(radius),
+        one(spread),
+        one(growth),
+        np.abs(path)[None, :, None].copy(),
+    )
     return np.asarray(x[0, :, 0])
 
 
@@ -82,8 +101,12 @@ def test_a_loop_does_not_know_how_finely_its_path_is_sampled(law: Law) -> None:
 
 @pytest.mark.parametrize("law", [played, rounded, rubbed, yielded])
 def test_a_loop_within_a_loop_is_wiped_out(law: Law) -> None:
-    """Return-point memory: back at the corner where a small loop left the large one, as if it had not been."""
-    plain, looped = law(along([0.0, 1.0, -0.8, 0.5, 0.9], 50)), law(along([0.0, 1.0, -0.8, 0.5, -0.1, 0.3, 0.05, 0.5, 0.9], 50))
+    """Return-point memory: back at the corner where a small loop left the large one, as if it had not
+    been."""
+    plain, looped = (
+        law(along([0.0, 1.0, -0.8, 0.5, 0.9], 50)),
+        law(along([0.0, 1.0, -0.8, 0.5, -0.1, 0.3, 0.05, 0.5, 0.9], 50)),
+    )
     assert_allclose(looped[-51:], plain[-51:], atol=ROUNDING)
 
 
@@ -102,8 +125,8 @@ def test_play_rests_for_twice_its_half_width_after_every_reversal(amplitude: flo
 
 
 def test_rounded_play_turns_in_three_steps_about_the_same_gap() -> None:
-    """It rests for 2 w (1 - c) after a reversal, moves at a third and two thirds of the input's speed until 2 w and 2 w (1 + c), and
-    then follows at the same distance w as the sharp one."""
+    """It rests for 2 w (1 - c) after a reversal, moves at a third and two thirds of the input's speed until 2
+    w and 2 w (1 + c), and then follows at the same distance w as the sharp one."""
     w, c, n = 0.1, 0.3, 3000
     x = along([0.0, 1.0, -1.0], n)
     travel = 1.0 - x[n:]
@@ -130,7 +153,8 @@ def test_friction_saturates_at_its_half_width() -> None:
 
 
 def test_the_area_of_a_friction_loop() -> None:
-    # one slider's loop is a parallelogram of height 2 a and width 2 (A - r_j): closed area 4 a mean max(A - r_j, 0)
+    # one slider's loop is a parallelogram of height 2 a and width 2 (A - r_j): closed area 4 a mean max(A -
+    # r_j, 0)
     radii = 0.2 * np.exp(0.4 * np.linspace(-1.0, 1.0, SLIDERS))
     areas = []
     for amplitude in (0.05, 0.2, 0.5, 1.0):
@@ -150,7 +174,8 @@ def test_friction_grows_with_the_angle_that_a_wire_wraps() -> None:
     x = along([0.0, 2.0], 10)
     assert_allclose((x - rubbed(x, growth=0.5))[-1], 0.3 * (1.0 + 0.5 * 2.0), atol=ROUNDING)
     robot = rod()
-    dl = np.linspace(0.0, 1.0, 50)[:, None] * (bend(robot, 0.8, 0.6) - robot.rest_tendon_length)  # a bend of one radian in the end
+    # a bend of one radian in the end
+    dl = np.linspace(0.0, 1.0, 50)[:, None] * (bend(robot, 0.8, 0.6) - robot.rest_tendon_length)
     table = {"half_width": 2e-4, "presliding": 1e-4, "growth": 0.7, "spread": 0.0}
     values = np.array([[*table.values()]])
     what: Any = get_effect("friction")
@@ -167,7 +192,8 @@ def test_nothing_yields_below_the_yield_and_a_set_stays() -> None:
     y = yielded(x)
     assert_allclose(y[180], 0.2 * (0.9 - 0.5), atol=ROUNDING)  # what was beyond the yield, times the share
     assert_allclose(y[180:] - x[180:], y[180], atol=ROUNDING)
-    assert_allclose(yielded(along([0.0, 2.0, -2.0, 2.0, 0.0], 40))[-1], 0.2 * 0.5, atol=ROUNDING)  # a large set shrinks on the way back
+    # a large set shrinks on the way back
+    assert_allclose(yielded(along([0.0, 2.0, -2.0, 2.0, 0.0], 40))[-1], 0.2 * 0.5, atol=ROUNDING)
 
 
 def test_a_bend_that_leaves_its_plane_drags_the_set_along_a_tractrix() -> None:
@@ -272,7 +298,8 @@ def test_a_delayed_ramp_is_the_ramp_of_a_moment_ago() -> None:
     for lag in (0.0, 0.003, 0.1, 0.7):
         x = (2.0 * t)[None, :, None].copy()
         delay(x, full(1 + BUFFER * 2), np.array([lag]), dt)
-        assert_allclose(x[0, :, 0], np.maximum(2.0 * (t - lag), 2.0 * t[0]), atol=ROUNDING * 20)  # times up to 14 s
+        # times up to 14 s
+        assert_allclose(x[0, :, 0], np.maximum(2.0 * (t - lag), 2.0 * t[0]), atol=ROUNDING * 20)
     # a delay beyond the buffer is cut to the oldest step that is kept
     x = (2.0 * t)[None, :, None].copy()
     delay(x, full(1 + BUFFER * 2), np.array([1e3]), dt)
@@ -287,7 +314,8 @@ def delayed(path: np.ndarray, lag: float, dt: np.ndarray) -> np.ndarray:
 
 
 def test_a_delayed_parabola_is_exact_from_the_third_sample_on() -> None:
-    """A cubic with the slopes of the parabolas through three samples is the parabola itself; a line would be off by up to h^2 / 4."""
+    """A cubic with the slopes of the parabolas through three samples is the parabola itself; a line would be
+    off by up to h^2 / 4."""
     dt = np.random.default_rng(10).uniform(0.01, 0.03, 100)
     t = np.cumsum(dt)
     for lag in (0.005, 0.061, 0.25):  # between the last two samples, and further back
@@ -298,7 +326,8 @@ def test_a_delayed_parabola_is_exact_from_the_third_sample_on() -> None:
 
 
 def test_a_delayed_wave_converges_faster_than_with_lines() -> None:
-    """Halved steps: errors of lines fall by 4, of cubics by 8, but for the turns, where the slope is taken as zero and they are lines'."""
+    """Halved steps: errors of lines fall by 4, of cubics by 8, but for the turns, where the slope is taken as
+    zero and they are lines'."""
     errors = []
     for n in (200, 400):
         t = np.linspace(0.0, 10.0, n + 1)
@@ -315,7 +344,8 @@ def test_a_delayed_wave_converges_faster_than_with_lines() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_delay_overshoots_nowhere(seed: int) -> None:
-    """At reversals, sudden stops and irregular times: what comes out lies between the two samples around it."""
+    """At reversals, sudden stops and irregular times: what comes out lies between the two samples around
+    it."""
     rng = np.random.default_rng(seed)
     dt = rng.uniform(0.001, 0.05, 120)
     t = np.cumsum(dt)
@@ -353,8 +383,8 @@ def seen(robot: Robot, lengths: Any = None, **inputs: Any) -> Measurement:
 
 
 def apart(one: State, two: State, atol: float = 1e-12) -> float:
-    """The largest difference as a part of what two settled states may differ by: 1e-12 m, 1e-10 of a rotation, 1e-5 N, and 1e-7 of
-    the number."""
+    """The largest difference as a part of what two settled states may differ by: 1e-12 m, 1e-10 of a
+    rotation, 1e-5 N, and 1e-7 of the number."""
     allowed = {"position": atol, "rotation": 100.0 * atol, "tension": 1e-5}
     pairs = [(getattr(one, name), getattr(two, name), most) for name, most in allowed.items()]
     return float(np.max([np.max(np.abs(a - b) / (most + 1e-7 * np.abs(b))) for a, b, most in pairs]))
@@ -379,11 +409,23 @@ def pull(robot: Robot) -> np.ndarray:
 
 def test_gravity_is_the_weight_of_the_body() -> None:
     robot, density = chain(), [0.2, 0.4]
-    heavy = replace(robot, segments=tuple(replace(s, line_density=d) for s, d in zip(robot.segments, density, strict=True)))
-    assert apart(settled(having(robot, "gravity", line_density=density), pull(robot), **LOADS), settled(heavy, pull(robot), **LOADS)) <= 1.0
+    heavy = replace(
+        robot,
+        segments=tuple(replace(s, line_density=d) for s, d in zip(robot.segments, density, strict=True)),
+    )
+    assert (
+        apart(
+            settled(having(robot, "gravity", line_density=density), pull(robot), **LOADS),
+            settled(heavy, pull(robot), **LOADS),
+        )
+        <= 1.0
+    )
     sampled = LOADS | {"line_force": np.full((2, 5, 3), 0.1) * np.arange(5)[:, None]}
     assert (
-        apart(settled(having(robot, "gravity", line_density=density), pull(robot), **sampled), settled(heavy, pull(robot), **sampled))
+        apart(
+            settled(having(robot, "gravity", line_density=density), pull(robot), **sampled),
+            settled(heavy, pull(robot), **sampled),
+        )
         <= 1.0
     )
 
@@ -391,14 +433,22 @@ def test_gravity_is_the_weight_of_the_body() -> None:
 def test_payload_is_a_tip_force_along_gravity() -> None:
     robot = replace(chain(), gravity=(0.0, 3.0, -9.0))
     more = LOADS | {"tip_force": np.add(LOADS["tip_force"], [0.0, 0.02 * 3.0, -0.02 * 9.0])}
-    assert apart(settled(having(robot, "payload", mass=0.02), pull(robot), **LOADS), settled(robot, pull(robot), **more)) <= 1.0
+    assert (
+        apart(
+            settled(having(robot, "payload", mass=0.02), pull(robot), **LOADS),
+            settled(robot, pull(robot), **more),
+        )
+        <= 1.0
+    )
 
 
 def test_the_effect_tip_force_turns_with_the_base() -> None:
     robot = having(chain(), "tip_force", x=0.1, y=-0.05, z=0.2)
     turned, still = (seen(robot, pull(robot), **given) for given in ({"base_pose": LOADS["base_pose"]}, {}))
     assert_allclose(turned.tip_position, still.tip_position, atol=1e-11)
-    assert apart(settled(robot, pull(robot)), settled(chain(), pull(robot), tip_force=(0.1, -0.05, 0.2))) <= 1.0
+    assert (
+        apart(settled(robot, pull(robot)), settled(chain(), pull(robot), tip_force=(0.1, -0.05, 0.2))) <= 1.0
+    )
 
 
 def with_tendons(robot: Robot, **changes: Callable[[Any, int, int], Any]) -> Robot:
@@ -407,7 +457,9 @@ def with_tendons(robot: Robot, **changes: Callable[[Any, int, int], Any]) -> Rob
     for k, segment in enumerate(robot.segments):
         tendons = []
         for tendon in segment.tendons:
-            tendons.append(replace(tendon, **{name: change(tendon, t, k) for name, change in changes.items()}))
+            tendons.append(
+                replace(tendon, **{name: change(tendon, t, k) for name, change in changes.items()})
+            )
             t += 1
         segments.append(replace(segment, tendons=tuple(tendons)))
     return replace(robot, segments=tuple(segments))
@@ -417,17 +469,30 @@ def test_tendon_stretch_is_compliance() -> None:
     robot, more = chain(), [1e-4, 3e-4]
     soft = with_tendons(robot, compliance=lambda tendon, t, k: tendon.compliance + more[k])
     assert (
-        apart(settled(having(robot, "tendon_stretch", compliance=more), pull(robot), **LOADS), settled(soft, pull(robot), **LOADS)) <= 1.0
+        apart(
+            settled(having(robot, "tendon_stretch", compliance=more), pull(robot), **LOADS),
+            settled(soft, pull(robot), **LOADS),
+        )
+        <= 1.0
     )
 
 
 def test_routing_angle_is_the_angle_of_a_tendon() -> None:
     robot, angles = chain(), [0.1, -0.2, 0.05, 0.0, 0.3, -0.1]  # three wires a segment: each is a drive
     turned = with_tendons(robot, angle=lambda tendon, t, k: tendon.angle + angles[t])
-    assert apart(settled(having(robot, "routing_angle", angle=angles), pull(robot), **LOADS), settled(turned, pull(robot), **LOADS)) <= 1.0
+    assert (
+        apart(
+            settled(having(robot, "routing_angle", angle=angles), pull(robot), **LOADS),
+            settled(turned, pull(robot), **LOADS),
+        )
+        <= 1.0
+    )
     pairs = with_tendons(rod(), angle=lambda tendon, t, k: tendon.angle + (0.1, -0.2)[t % 2])
     assert (
-        apart(settled(having(rod(), "routing_angle", angle=[0.1, -0.2]), bend(rod(), 0.5, 0.3)), settled(pairs, bend(rod(), 0.5, 0.3)))
+        apart(
+            settled(having(rod(), "routing_angle", angle=[0.1, -0.2]), bend(rod(), 0.5, 0.3)),
+            settled(pairs, bend(rod(), 0.5, 0.3)),
+        )
         <= 1.0
     )
 
@@ -442,7 +507,11 @@ def test_drum_gain_and_temperature_scale_the_pull() -> None:
     robot, lengths = rod(), bend(rod(), 0.5, 0.3)
     dl = lengths - robot.rest_tendon_length
     assert (
-        apart(settled(having(robot, "drum_gain", gain=[0.2, -0.1]), lengths), settled(robot, lengths + dl * [0.2, -0.1, 0.2, -0.1])) <= 1.0
+        apart(
+            settled(having(robot, "drum_gain", gain=[0.2, -0.1]), lengths),
+            settled(robot, lengths + dl * [0.2, -0.1, 0.2, -0.1]),
+        )
+        <= 1.0
     )
     sim = Simulator(having(robot, "temperature", gain=0.1, time_constant=40.0), dt=10.0, points_per_segment=8)
     for k in range(4):  # the first input is at time zero
@@ -451,7 +520,8 @@ def test_drum_gain_and_temperature_scale_the_pull() -> None:
 
 
 def test_only_what_bends_is_gained() -> None:
-    """A pull that all wires share is the backbone's to take, not the gain's: it would be tension between stiff parts."""
+    """A pull that all wires share is the backbone's to take, not the gain's: it would be tension between
+    stiff parts."""
     robot = rod()
     common = settled(having(robot, "drum_gain", gain=0.5), robot.rest_tendon_length - 1e-5)
     assert apart(common, settled(robot, robot.rest_tendon_length - 1e-5)) <= 1.0
@@ -467,8 +537,14 @@ def test_coupling_slack_and_stiffening_change_the_bend_that_is_asked_for() -> No
     coupled = settled(having(robot, "coupling", from_distal=0.2, from_proximal=-0.1), asked(near, far))
     assert apart(coupled, settled(robot, asked(near + 0.2 * far, far - 0.1 * near))) <= 1.0
     stiff = settled(having(robot, "stiffening", cubic=[0.3, -0.2]), asked(near, far))
-    assert apart(stiff, settled(robot, asked(near * (1.0 - 0.3 * (near @ near)), far * (1.0 + 0.2 * (far @ far))))) <= 1.0
-    loose = settled(having(rod(), "slack", half_width=1e-3), bend(rod(), 0.5, 0.1))  # of 3.75 mm and of 0.75 mm
+    assert (
+        apart(
+            stiff, settled(robot, asked(near * (1.0 - 0.3 * (near @ near)), far * (1.0 + 0.2 * (far @ far))))
+        )
+        <= 1.0
+    )
+    # of 3.75 mm and of 0.75 mm
+    loose = settled(having(rod(), "slack", half_width=1e-3), bend(rod(), 0.5, 0.1))
     assert apart(loose, settled(rod(), bend(rod(), 0.5 - 1e-3 / 0.0075, 0.0))) <= 1.0
 
 
@@ -477,7 +553,10 @@ def test_a_body_that_its_wires_press_bends_more_easily() -> None:
     robot = rod()
     lengths, soft = bend(robot, 0.5, -0.3), having(robot, "compression_softening", gain=40.0)
     assert apart(settled(soft, lengths), settled(robot, lengths)) <= 1.0
-    assert apart(settled(soft, lengths - 1e-3), settled(robot, bend(robot, 0.5 * 1.04, -0.3 * 1.04) - 1e-3)) <= 1.0
+    assert (
+        apart(settled(soft, lengths - 1e-3), settled(robot, bend(robot, 0.5 * 1.04, -0.3 * 1.04) - 1e-3))
+        <= 1.0
+    )
 
 
 def test_axial_compression_is_an_extension_that_the_wires_follow() -> None:
@@ -502,12 +581,17 @@ def test_anisotropy_is_another_stiffness_about_each_axis() -> None:
     other = replace(
         robot,
         segments=tuple(
-            replace(s, bending_stiffness=(s.bending_stiffness[0] * (1.0 + e), s.bending_stiffness[1] * (1.0 - e)))
+            replace(
+                s, bending_stiffness=(s.bending_stiffness[0] * (1.0 + e), s.bending_stiffness[1] * (1.0 - e))
+            )
             for s, e in zip(robot.segments, ratio, strict=True)
         ),
     )
     assert (
-        apart(settled(having(robot, "stiffness_anisotropy", ratio=ratio), pull(robot), **LOADS), settled(other, pull(robot), **LOADS))
+        apart(
+            settled(having(robot, "stiffness_anisotropy", ratio=ratio), pull(robot), **LOADS),
+            settled(other, pull(robot), **LOADS),
+        )
         <= 1.0
     )
 
@@ -516,7 +600,12 @@ def test_taper_is_a_chain_of_ever_softer_pieces() -> None:
     n, slope = 40, 0.5
     middles = (np.arange(n) + 0.5) / n
     pieces = [
-        Segment(length=0.07 / n, bending_stiffness=(0.0022 * k, 0.0022 * k), torsional_stiffness=0.001 * k, mode="passive")
+        Segment(
+            length=0.07 / n,
+            bending_stiffness=(0.0022 * k, 0.0022 * k),
+            torsional_stiffness=0.001 * k,
+            mode="passive",
+        )
         for k in 1.0 + slope * (1.0 - 2.0 * middles)
     ]
     loads = {"tip_force": (0.1, 0.3, -0.1), "tip_moment": (1e-3, 0.0, 2e-3)}
@@ -529,7 +618,10 @@ def test_taper_is_a_chain_of_ever_softer_pieces() -> None:
 
 def test_uniform_precurvature_is_the_segments_own() -> None:
     robot = chain()
-    own = replace(robot, segments=tuple(replace(s, precurvature=(k + 1.0, -2.0, 0.0)) for k, s in enumerate(robot.segments)))
+    own = replace(
+        robot,
+        segments=tuple(replace(s, precurvature=(k + 1.0, -2.0, 0.0)) for k, s in enumerate(robot.segments)),
+    )
     difference = apart(
         settled(having(robot, "precurvature", uniform_x=[1.0, 2.0], uniform_y=-2.0), pull(robot), **LOADS),
         settled(own, pull(robot), **LOADS),
@@ -538,12 +630,14 @@ def test_uniform_precurvature_is_the_segments_own() -> None:
 
 
 def test_a_bow_moves_the_tip_and_does_not_turn_it() -> None:
-    # theta(s) = b (s - s^2 / l): nothing at the tip, and its integral is b l^2 / 6; beyond it terms of theta^2, 1e-5 here
+    # theta(s) = b (s - s^2 / l): nothing at the tip, and its integral is b l^2 / 6; beyond it terms of
+    # theta^2, 1e-5 here
     state = settled(having(rod("passive"), "precurvature", bow_x=0.3, bow_y=-0.2))
     assert_allclose(state.tip_rotation[0], np.eye(3), atol=1e-5)
     assert_allclose(state.tip_position[0, :2], np.array([-0.2, -0.3]) * 0.07**2 / 6.0, rtol=1e-4)
     stiff = settled(having(rod(), "precurvature", uniform_x=2.0), rod().rest_tendon_length)
-    assert np.abs(stiff.tip_position[0, :2]).max() < 5e-5  # wires that hardly stretch straighten a uniform one, but not a bow
+    # wires that hardly stretch straighten a uniform one, but not a bow
+    assert np.abs(stiff.tip_position[0, :2]).max() < 5e-5
     bowed = settled(having(rod(), "precurvature", bow_x=2.0), rod().rest_tendon_length)
     assert_allclose(bowed.tip_position[0, 1], -2.0 * 0.07**2 / 6.0, rtol=2e-2)
 
@@ -561,7 +655,14 @@ def test_what_the_camera_makes_of_the_tip() -> None:
         return seen(having(robot, name, **values), lengths, **given)
 
     turn, shift = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix(), np.array([0.01, -0.02, 0.005])
-    values = {"rotation_x": 0.3, "rotation_y": -0.2, "rotation_z": 0.5, "shift_x": 0.01, "shift_y": -0.02, "shift_z": 0.005}
+    values = {
+        "rotation_x": 0.3,
+        "rotation_y": -0.2,
+        "rotation_z": 0.5,
+        "shift_x": 0.01,
+        "shift_y": -0.02,
+        "shift_z": 0.005,
+    }
     frame = look("frame_misalignment", **values)
     assert_allclose(frame.tip_position[0], turn @ r + shift, atol=1e-15)
     assert_allclose(frame.points[0], points @ turn.T + shift, atol=1e-15)
@@ -592,17 +693,26 @@ def test_what_the_camera_makes_of_the_tip() -> None:
 
 
 def test_effects_of_the_camera_act_from_the_marker_on() -> None:
-    tables = ({"name": "time_drift", "x": 1e-3}, {"name": "camera_scale", "scale": 0.1}, {"name": "marker_offset", "z": 0.01})
+    tables = (
+        {"name": "time_drift", "x": 1e-3},
+        {"name": "camera_scale", "scale": 0.1},
+        {"name": "marker_offset", "z": 0.01},
+    )
     robot = replace(rod(), effects=tables)
     sim = Simulator(robot, dt=1.0)
     for _ in range(2):
         sim.settle(robot.rest_tendon_length)
-    assert_allclose(sim.measure().tip_position[0], [1e-3, 0.0, 1.1 * 0.08], atol=1e-9)  # drift after scale after marker
+    # drift after scale after marker
+    assert_allclose(sim.measure().tip_position[0], [1e-3, 0.0, 1.1 * 0.08], atol=1e-9)
 
 
-@pytest.mark.parametrize(("name", "values"), [("latency", {"delay": 0.12}), ("dynamics", {"period": 0.2}), ("creep", {"share": 0.2})])
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [("latency", {"delay": 0.12}), ("dynamics", {"period": 0.2}), ("creep", {"share": 0.2})],
+)
 def test_an_effect_on_the_wires_is_its_operator_on_what_bends(name: str, values: dict[str, float]) -> None:
-    """In a simulator, step by step, an operator is the simulator of the base model on wires that went through it."""
+    """In a simulator, step by step, an operator is the simulator of the base model on wires that went through
+    it."""
     robot = rod()
     path = np.stack([bend(robot, 0.8 * np.sin(0.4 * k), 0.5 * np.cos(0.3 * k)) for k in range(12)])
     what: Any = get_effect(name)

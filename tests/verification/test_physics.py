@@ -13,11 +13,13 @@ from truth.energy import minimise
 from fastrod import Robot, Simulator, load_robot
 from fastrod.reference import shoot
 
-ELASTICA = {1.0: 0.301720773800, 2.0: 0.493457480397, 5.0: 0.713791523612, 10.0: 0.810609024880}  # P l^2/EI -> w/l
+# P l^2/EI -> w/l
+ELASTICA = {1.0: 0.301720773800, 2.0: 0.493457480397, 5.0: 0.713791523612, 10.0: 0.810609024880}
 
 
 def test_no_load_and_equal_bends_give_an_arc() -> None:
-    # r(l) of an arc of angle b about d1 is (0, -(1 - cos b), sin b) l/b: the method is exact for constant moment
+    # r(l) of an arc of angle b about d1 is (0, -(1 - cos b), sin b) l/b: the method is exact for constant
+    # moment
     robot = rod()
     for angle in (0.3, 1.0, 2.5):
         state = Simulator(robot).settle(bend(robot, angle, 0.0))
@@ -36,7 +38,9 @@ def test_a_precurved_twisted_rod_is_a_helix() -> None:
     # the axis passes at distance k/(k^2+t^2) from the base, toward the first normal
     normal = np.cross(u, [0.0, 0.0, 1.0])
     centre = normal / (u @ u)
-    assert_allclose(np.linalg.norm(centre_line - (centre - (centre @ axis) * axis), axis=1), 12.0 / (u @ u), rtol=1e-6)
+    assert_allclose(
+        np.linalg.norm(centre_line - (centre - (centre @ axis) * axis), axis=1), 12.0 / (u @ u), rtol=1e-6
+    )
 
 
 @pytest.mark.parametrize(("load", "deflection"), ELASTICA.items())
@@ -52,7 +56,11 @@ def test_shape_is_fourth_order_in_the_step(mode: str) -> None:
     lengths = bend(robot, 0.8, -0.5) if mode != "passive" else None
 
     def tip(n: int) -> np.ndarray:
-        return Simulator(robot, points_per_segment=n).settle(lengths, tip_force=(0.1, 0.3, -0.1), tolerance=1e-12).tip_position[0]
+        return (
+            Simulator(robot, points_per_segment=n)
+            .settle(lengths, tip_force=(0.1, 0.3, -0.1), tolerance=1e-12)
+            .tip_position[0]
+        )
 
     exact, steps = tip(320), np.array([8, 16, 32])
     slope = np.polyfit(np.log(steps), np.log([np.linalg.norm(tip(n) - exact) for n in steps]), 1)[0]
@@ -86,7 +94,11 @@ def test_rotating_the_world_rotates_the_answer() -> None:
     robot = replace(robot, gravity=(0.0, 0.0, 0.0))
     half = np.pi / 7
     quaternion = np.array([np.cos(half), *(np.sin(half) * np.array([1, 2, -2]) / 3)])
-    rotation = Simulator(replace(robot, base_quaternion=tuple(quaternion))).settle(robot.rest_tendon_length).tip_rotation[0]
+    rotation = (
+        Simulator(replace(robot, base_quaternion=tuple(quaternion)))
+        .settle(robot.rest_tendon_length)
+        .tip_rotation[0]
+    )
     force = np.array([0.1, -0.2, 0.05])
     lengths = bend(robot, 0.6, 0.7)
     one = Simulator(robot).settle(lengths, tip_force=force)
@@ -125,7 +137,8 @@ def test_inextensible_tendons_lock_the_twist_and_loose_ones_let_the_rod_go() -> 
         twist.append(np.abs(state.curvature[0, :, 2]).max())
         tip.append(state.tip_position[0])
     assert twist[0] > twist[1] > twist[2] > 0.0
-    assert twist[2] > twist[3] == twist[4]  # as the cube root of the compliance, down to the stiffest wire there is
+    # as the cube root of the compliance, down to the stiffest wire there is
+    assert twist[2] > twist[3] == twist[4]
     assert twist[3] < 0.1 * twist[1]
     loose = Simulator(rod(compliance=1e6)).settle(lengths, tip_force=force)
     free = Simulator(rod("passive")).settle(tip_force=force)
@@ -137,7 +150,8 @@ def test_a_slack_wire_carries_nothing() -> None:
     (segment,) = robot.segments
     wires = tuple(replace(t, unilateral=True, pretension=0.2) for t in segment.tendons)
     robot = replace(robot, segments=(replace(segment, tendons=wires),))
-    lengths = robot.rest_tendon_length + np.array([-0.004, 0.0, 0.01, 0.0])  # pulled by one, the opposite one paid out far
+    # pulled by one, the opposite one paid out far
+    lengths = robot.rest_tendon_length + np.array([-0.004, 0.0, 0.01, 0.0])
     state = Simulator(robot).settle(lengths)
     assert state.ok.all()
     assert state.tension[0, 2] == 0.0
@@ -161,10 +175,16 @@ def test_a_follower_force_keeps_its_place_on_the_tip() -> None:
 def test_point_force_anywhere_matches_the_twin_and_keeps_the_order() -> None:
     robot = rod()
     lengths = bend(robot, 0.7, 0.2)
-    loads = {"point_force": [(0.0313, (0.2, 0.1, 0.0)), (0.0521, (-0.1, 0.0, 0.3))], "tip_force": (0.0, 0.1, 0.0)}
-    twin = shoot(robot, lengths, **loads)  # type: ignore[arg-type]
+    loads = {
+        "point_force": [(0.0313, (0.2, 0.1, 0.0)), (0.0521, (-0.1, 0.0, 0.3))],
+        "tip_force": (0.0, 0.1, 0.0),
+    }
+    twin = shoot(robot, lengths, **loads)
     error = [
-        np.linalg.norm(Simulator(robot, points_per_segment=n).settle(lengths, **loads).tip_position[0] - twin.tip_position)  # type: ignore[arg-type]
+        np.linalg.norm(
+            Simulator(robot, points_per_segment=n).settle(lengths, **loads).tip_position[0]
+            - twin.tip_position
+        )
         for n in (6, 24)
     ]
     assert error[1] < 1e-7
@@ -191,7 +211,9 @@ def test_stiffness_and_precurvature_that_vary_along_the_rod() -> None:
     n, length, force = 10, 0.07, 1e-6
     sim = Simulator(rod("passive"), points_per_segment=n)
     s = np.linspace(0.0, length, 2 * n + 1)
-    stiffness = np.tile([0.0022, 0.0022, 0.001], (2 * n + 1, 1)) * (1.0 + 0.5 * (1.0 - 2.0 * s / length))[:, None]
+    stiffness = (
+        np.tile([0.0022, 0.0022, 0.001], (2 * n + 1, 1)) * (1.0 + 0.5 * (1.0 - 2.0 * s / length))[:, None]
+    )
     bare = sim._reader.rest
     rest = np.zeros((1, 1, 2 * n + 1, 3))
     sim._reader.rest = bare._replace(stiffness=stiffness[None, None], precurvature=rest)
@@ -200,7 +222,11 @@ def test_stiffness_and_precurvature_that_vary_along_the_rod() -> None:
     fine = np.linspace(0.0, length, 20001)
     w = np.trapezoid((length - fine) ** 2 / (0.0022 * (1.0 + 0.5 * (1.0 - 2.0 * fine / length))), fine)
     assert_allclose(state.tip_position[0, 1], force * w, rtol=1e-5)
-    assert_allclose(sim.shape([0.033]).position[0, 0, 1], np.interp(0.033, state.arclength[0], state.position[0, :, 1]), rtol=2e-2)
+    assert_allclose(
+        sim.shape([0.033]).position[0, 0, 1],
+        np.interp(0.033, state.arclength[0], state.position[0, :, 1]),
+        rtol=2e-2,
+    )
     # and a plane u*(s) without load turns the tip by its integral
     rest[0, 0, :, 0] = 8.0 * np.cos(20.0 * s)
     sim._reader.rest = bare._replace(stiffness=stiffness[None, None], precurvature=rest)
@@ -210,7 +236,12 @@ def test_stiffness_and_precurvature_that_vary_along_the_rod() -> None:
 
 
 def one_sided(robot: Robot) -> Robot:
-    return replace(robot, segments=tuple(replace(s, tendons=tuple(replace(t, unilateral=True) for t in s.tendons)) for s in robot.segments))
+    return replace(
+        robot,
+        segments=tuple(
+            replace(s, tendons=tuple(replace(t, unilateral=True) for t in s.tendons)) for s in robot.segments
+        ),
+    )
 
 
 @pytest.mark.parametrize("pull", [0.0, 3e-4, -1e-3])
@@ -219,15 +250,19 @@ def test_cable_robots_taut_and_loose_match_the_twin(pull: float) -> None:
     rng = np.random.default_rng(4)
     for robot in (one_sided(rod()), one_sided(load_robot("tdcr_a"))):
         angles = rng.uniform(-0.6, 0.6, (40, 2 * robot.n_segments))
-        lengths = np.stack([sum(bend(robot, *a[2 * k : 2 * k + 2], k) for k in range(robot.n_segments)) for a in angles])
+        lengths = np.stack(
+            [sum(bend(robot, *a[2 * k : 2 * k + 2], k) for k in range(robot.n_segments)) for a in angles]
+        )
         lengths -= (robot.n_segments - 1) * robot.rest_tendon_length + pull * (1 + robot.tendon_segment)
         force = rng.uniform(-0.1, 0.1, (40, 3))
         state = Simulator(robot, n_robots=40).settle(lengths, tip_force=force)
         assert state.ok.all(), state.problems
         assert (state.tension >= 0.0).all()
-        assert (state.path_length <= lengths + 1e-5 * state.tension + 1e-8).all()  # a wire is never shorter than its path
+        # a wire is never shorter than its path
+        assert (state.path_length <= lengths + 1e-5 * state.tension + 1e-8).all()
         assert np.abs(state.moment[:, -1]).max() < 1e-9  # and the tip is free of moment
-        for i in (0, 1) if robot.n_segments == 1 else ():  # the twin takes minutes on a chain with slack wires
+        # the twin takes minutes on a chain with slack wires
+        for i in (0, 1) if robot.n_segments == 1 else ():
             twin = shoot(robot, lengths[i], tip_force=force[i])
             assert twin.success
             assert_allclose(state.tip_position[i], twin.tip_position, atol=1e-7)
@@ -238,8 +273,10 @@ def test_any_sampling_of_a_line_force_keeps_its_force_and_moment() -> None:
     for points in (2, 4, 7, 31, 200):
         line = rng.uniform(-1.0, 1.0, (1, points, 3))
         loads = {"line_force": line, "point_force": [(0.0237, (0.0, 1e-9, 0.0))]}  # which moves the nodes
-        state = Simulator(rod("passive")).settle(**loads)  # type: ignore[arg-type]
-        assert_allclose(state.base_wrench[0, :3], np.trapezoid(line[0], dx=0.07 / (points - 1), axis=0), atol=2e-9)
-        twin = shoot(rod("passive"), **loads)  # type: ignore[arg-type]
+        state = Simulator(rod("passive")).settle(**loads)
+        assert_allclose(
+            state.base_wrench[0, :3], np.trapezoid(line[0], dx=0.07 / (points - 1), axis=0), atol=2e-9
+        )
+        twin = shoot(rod("passive"), **loads)
         # a polyline that bends inside a step is met in force and moment there: what is left is of third order
         assert_allclose(state.tip_position[0], twin.tip_position, atol=2e-6)

@@ -27,7 +27,9 @@ def test_appendix_j_cantilever(truth: Read) -> None:
 def test_appendix_b_paper_mode_from_a_cold_start(truth: Read) -> None:
     table = truth("appB_truth.csv")
     sim = Simulator(rod("paper", offset=0.01), n_robots=100)
-    state = sim.settle(table("L1", "L2", "L3", "L4"), tip_force=table("Fx", "Fy", "Fz"), line_force=(1.0, 1.0, 1.0))
+    state = sim.settle(
+        table("L1", "L2", "L3", "L4"), tip_force=table("Fx", "Fy", "Fz"), line_force=(1.0, 1.0, 1.0)
+    )
     assert state.ok.all()
     assert state.passes.max() <= 6
     assert state.residual.max() <= 1e-9
@@ -56,7 +58,11 @@ def test_two_segment_robots(truth: Read, name: str, mode: str) -> None:
     tension, length = table(*(f"q{i}" for i in range(1, 7))), table(*(f"kir_len{i}" for i in range(1, 7)))
     loads = {"tip_force": table("fx", "fy", "fz"), "tip_moment": table("mx", "my", "mz")}
     sim = Simulator(robot, n_robots=len(tension))
-    state = sim.settle(tension=tension, **loads) if mode == "tendon_tension" else sim.settle(length - 1e-5 * tension, **loads)
+    state = (
+        sim.settle(tension=tension, **loads)
+        if mode == "tendon_tension"
+        else sim.settle(length - 1e-5 * tension, **loads)
+    )
     assert state.ok.all()
     np.testing.assert_allclose(state.tip_position, table("kir_px", "kir_py", "kir_pz"), rtol=0, atol=1e-7)
     rotation = table(*(f"kir_r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))).reshape(-1, 3, 3)
@@ -77,7 +83,10 @@ def test_prescribed_lengths_loads_in_any_direction(truth: Read, n: int) -> None:
                     bending_stiffness=(float(row["EI"]), float(row["EI"])),
                     torsional_stiffness=float(row["GJ"]),
                     tendons=tuple(
-                        Tendon(offset=float(row["offset"]), angle=2 * np.pi * i / n, compliance=float(row["c"])) for i in range(n)
+                        Tendon(
+                            offset=float(row["offset"]), angle=2 * np.pi * i / n, compliance=float(row["c"])
+                        )
+                        for i in range(n)
                     ),
                 ),
             ),
@@ -85,7 +94,9 @@ def test_prescribed_lengths_loads_in_any_direction(truth: Read, n: int) -> None:
         for row in table.rows
     ]
     lengths, tension = table(*(f"L{i + 1}" for i in range(n))), table(*(f"T{i + 1}" for i in range(n)))
-    state = Simulator(robots).settle(lengths, tip_force=table("Fx", "Fy", "Fz"), line_force=table("fx", "fy", "fz"))
+    state = Simulator(robots).settle(
+        lengths, tip_force=table("Fx", "Fy", "Fz"), line_force=table("fx", "fy", "fz")
+    )
     assert state.ok.all()
     np.testing.assert_allclose(state.tip_position, table("tip_x", "tip_y", "tip_z"), rtol=0, atol=1e-7)
     np.testing.assert_allclose(state.tension, tension, rtol=1e-4)

@@ -20,7 +20,11 @@ def test_push_holds_at_other_time_steps(dt, monkeypatch):
 
 def test_push_that_misses_is_told(monkeypatch):
     monkeypatch.setattr(push, "PLACE", (0.36, 0.3, push.SIZE / 2))
-    with pytest.raises(SceneError, match=r"^scene neck_push: the cube moved .* m; the neck is to push it farther than it is wide\.$"):
+    with pytest.raises(
+        SceneError,
+        match=r"^scene neck_push: the cube moved .* m; the neck is to push it "
+        r"farther than it is wide\.$",
+    ):
         push.NeckPush().check()
 
 
@@ -40,7 +44,8 @@ def test_neck_stands_on_the_head_with_its_axes_as_told():
     world, mount = standing(0.005, 0.5)
     pose, trunk = mount.motion().pose, world.getBasePositionAndOrientation(mount.body)
     axes = np.array(world.getMatrixFromQuaternion(np.roll(pose[3:], -1).tolist())).reshape(3, 3)
-    np.testing.assert_allclose(axes[:, 2], [np.cos(0.5), 0.0, np.sin(0.5)], atol=0.01)  # the trunk stands level to that
+    # the trunk stands level to that
+    np.testing.assert_allclose(axes[:, 2], [np.cos(0.5), 0.0, np.sin(0.5)], atol=0.01)
     np.testing.assert_allclose(axes[:, 1], [0.0, -1.0, 0.0], atol=0.01)
     assert np.abs(pose[:2] - np.array(trunk[0])[:2] - MOUNT[:2]).max() < 0.02
     assert max(abs(v) for v in world.getBaseVelocity(mount.body)[0]) < 0.01
@@ -52,7 +57,11 @@ def test_gait_of_the_neck_is_a_sine():
     stage = push.NeckPush().stage()
     bends = SegmentActions(robot).matrix[: robot.n_tendons, 1::3]
     for t in (0.0, 0.3, 1.1):
-        pulled = stage.gait(t)["tendon_length"] - robot.rest_tendon_length - np.cumsum(stage.gait(t)["extension"])[robot.tendon_segment]
+        pulled = (
+            stage.gait(t)["tendon_length"]
+            - robot.rest_tendon_length
+            - np.cumsum(stage.gait(t)["extension"])[robot.tendon_segment]
+        )
         each = np.linalg.lstsq(bends, pulled, rcond=None)[0] / stage.actions.offset
         np.testing.assert_allclose(each, push.SWING / 3 * np.sin(push.RATE * t - np.pi / 2), atol=1e-12)
     stage.close()

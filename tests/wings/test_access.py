@@ -32,7 +32,17 @@ def address(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     """Of each kind of page there is."""
     folder = tmp_path_factory.mktemp("access")
     if request.param == "drive":
-        words = ["fastrod.commands.cli", "drive", "--emulate", "--seed", "3", "--no-home", "--no-open", "--port", "0"]
+        words = [
+            "fastrod.commands.cli",
+            "drive",
+            "--emulate",
+            "--seed",
+            "3",
+            "--no-home",
+            "--no-open",
+            "--port",
+            "0",
+        ]
         command, pipe = [sys.executable, "-m", *words], subprocess.PIPE
         with subprocess.Popen(command, cwd=folder, stdout=pipe, stderr=pipe, text=True) as process:
             assert process.stdout is not None
@@ -242,24 +252,53 @@ def nonsense(uuid: str) -> dict[str, bytes | str]:
         "an attribute": {**update, "updates": {"update_cb": []}},
         "an attribute that is none": {**update, "updates": {"nope": 1}},
         "a file for a slider": {
-            "type": "FileTransferStartUpload", "source_component_uuid": uuid, "transfer_uuid": "t",
-            "filename": "f", "mime_type": "m", "part_count": 0, "size_bytes": 0,
+            "type": "FileTransferStartUpload",
+            "source_component_uuid": uuid,
+            "transfer_uuid": "t",
+            "filename": "f",
+            "mime_type": "m",
+            "part_count": 0,
+            "size_bytes": 0,
         },
         "a tunnel": {"type": "ShareUrlRequest"},
         "a camera of words": {
-            "type": "ViewerCameraMessage", "wxyz": ["a"] * 4, "position": None, "fov": "wide", "near": [],
-            "far": {}, "image_height": "x", "image_width": "y", "look_at": 3, "up_direction": "up",
+            "type": "ViewerCameraMessage",
+            "wxyz": ["a"] * 4,
+            "position": None,
+            "fov": "wide",
+            "near": [],
+            "far": {},
+            "image_height": "x",
+            "image_width": "y",
+            "look_at": 3,
+            "up_direction": "up",
         },
         "a camera of the wrong sizes": {
-            "type": "ViewerCameraMessage", "wxyz": [1.0], "position": [], "fov": 1.0, "near": 1.0, "far": 1.0,
-            "image_height": 1, "image_width": 0, "look_at": [0.0], "up_direction": [1.0],
+            "type": "ViewerCameraMessage",
+            "wxyz": [1.0],
+            "position": [],
+            "fov": 1.0,
+            "near": 1.0,
+            "far": 1.0,
+            "image_height": 1,
+            "image_width": 0,
+            "look_at": [0.0],
+            "up_direction": [1.0],
         },
         "a drag to nowhere": {
-            "type": "SceneNodeDragMessage", "phase": "update", "name": "/grip", "instance_index": None,
-            "start_position": [0.0] * 3, "start_screen_pos": [0.0] * 2, "end_position": [float("nan")] * 3,
-            "end_screen_pos": [0.0] * 2, "button": "left", "modifier": None, "owner": "",
+            "type": "SceneNodeDragMessage",
+            "phase": "update",
+            "name": "/grip",
+            "instance_index": None,
+            "start_position": [0.0] * 3,
+            "start_screen_pos": [0.0] * 2,
+            "end_position": [float("nan")] * 3,
+            "end_screen_pos": [0.0] * 2,
+            "button": "left",
+            "modifier": None,
+            "owner": "",
         },
-    }  # fmt: skip
+    }
     raw = {"text": "hello", "nothing": b"", "noise": np.random.default_rng(5).bytes(4000)}
     return raw | {name: msgspec.msgpack.encode(message) for name, message in messages.items()}
 

@@ -1,4 +1,5 @@
-"""`BulletArm` and the UR5 that ships: kinematics against the published table, statics against PyBullet, motors against the clock."""
+"""`BulletArm` and the UR5 that ships: kinematics against the published table, statics against PyBullet,
+motors against the clock."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ from fastrod.rotation import matrix_from_quaternion, product
 from fastrod.types import Floats
 from fastrod_scenes.robots import ur5_path
 
-# Universal Robots, "DH parameters for calculations of kinematics and dynamics": d [m], a [m], alpha [rad]; mass [kg] and centre of
+# Universal Robots, "DH parameters for calculations of kinematics and dynamics": d [m], a [m], alpha [rad];
+# mass [kg] and centre of
 # mass [m] in the frame after the joint.
 DH = (
     (0.089159, 0.0, np.pi / 2),
@@ -27,7 +29,14 @@ DH = (
     (0.0823, 0.0, 0.0),
 )
 MASS = (3.7, 8.393, 2.275, 1.219, 1.219, 0.1879)
-CENTRE = ((0, -0.02561, 0.00193), (0.2125, 0, 0.11336), (0.15, 0, 0.0265), (0, -0.0018, 0.01634), (0, 0.0018, 0.01634), (0, 0, -0.001159))
+CENTRE = (
+    (0, -0.02561, 0.00193),
+    (0.2125, 0, 0.11336),
+    (0.15, 0, 0.0265),
+    (0, -0.0018, 0.01634),
+    (0, 0.0018, 0.01634),
+    (0, 0, -0.001159),
+)
 POSES = {
     "ready": (0.0, -1.57, 1.57, -1.57, -1.57, 0.0),
     "low": (0.6, -1.2, 1.4, -1.8, -1.57, 0.4),
@@ -38,11 +47,14 @@ POSES = {
 
 
 def dh_frames(q: Floats) -> list[Floats]:
-    """World frames (4, 4) after each joint; the first factor is ROS's turn from base_link to the controller's base."""
+    """World frames (4, 4) after each joint; the first factor is ROS's turn from base_link to the controller's
+    base."""
     frames, frame = [], np.diag([-1.0, -1.0, 1.0, 1.0])
     for angle, (d, a, alpha) in zip(q, DH, strict=True):
         c, s, ca, sa = np.cos(angle), np.sin(angle), np.cos(alpha), np.sin(alpha)
-        frame = frame @ np.array([[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1]])
+        frame = frame @ np.array(
+            [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1]]
+        )
         frames.append(frame)
     return frames
 
@@ -80,7 +92,9 @@ def test_kinematics_are_those_of_the_published_table(arm: BulletArm) -> None:
 
 
 def test_names_and_limits(arm: BulletArm) -> None:
-    assert arm.names == tuple(f"{j}_joint" for j in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"))
+    assert arm.names == tuple(
+        f"{j}_joint" for j in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+    )
     assert_allclose(arm.upper, np.pi * np.array([2, 2, 1, 2, 2, 2]))
     assert_allclose(arm.lower, -arm.upper)
     assert_allclose(arm.velocity_limit, np.pi)
@@ -88,22 +102,29 @@ def test_names_and_limits(arm: BulletArm) -> None:
 
 
 def test_jacobian_is_the_slope_of_the_frame(world: Bullet) -> None:
-    arm = BulletArm.load(world, ur5_path(), tip="tool0", position=(0.2, -0.1, 0.5), quaternion=(0.5, -0.5, 0.5, 0.5))
+    arm = BulletArm.load(
+        world, ur5_path(), tip="tool0", position=(0.2, -0.1, 0.5), quaternion=(0.5, -0.5, 0.5, 0.5)
+    )
     h = 1e-5  # central differences: h^2 from the series, 1e-16 / h from rounding
     for q in np.random.default_rng(21).uniform(-3.0, 3.0, (20, 6)):
         slopes = []
         for d in h * np.eye(6):
             after, before = arm.frame(q + d), arm.frame(q - d)
             turn = product(after[3:], before[3:] * [1.0, -1.0, -1.0, -1.0])
-            slopes.append(np.concatenate([after[:3] - before[:3], 2.0 * np.sign(turn[0]) * turn[1:]]) / (2.0 * h))
+            slopes.append(
+                np.concatenate([after[:3] - before[:3], 2.0 * np.sign(turn[0]) * turn[1:]]) / (2.0 * h)
+            )
         assert_allclose(arm.jacobian(q), np.transpose(slopes), atol=1e-9)
 
 
 def test_frame_is_where_pybullet_puts_the_link(world: Bullet) -> None:
-    arm = BulletArm.load(world, ur5_path(), tip="tool0", position=(0.2, -0.1, 0.5), quaternion=(0.8, 0.0, 0.6, 0.0))
+    arm = BulletArm.load(
+        world, ur5_path(), tip="tool0", position=(0.2, -0.1, 0.5), quaternion=(0.8, 0.0, 0.6, 0.0)
+    )
     for q in np.random.default_rng(22).uniform(-3.0, 3.0, (20, 6)):
         arm.place(q)
-        # PyBullet's own answer is the rough one: where ours agrees with the table to 1e-15, it is off by up to 4e-7
+        # PyBullet's own answer is the rough one: where ours agrees with the table to 1e-15, it is off by up
+        # to 4e-7
         assert apart(arm.frame(q), link_pose(world, arm.body, arm.tip)) < 2e-6
         assert_array_equal(arm.position(), q)
 
@@ -122,10 +143,13 @@ CRANKED = """<robot name="cranked">
   <joint name="turn" type="continuous"><parent link="foot"/><child link="post"/>
     <origin xyz="0.1 0 0.2" rpy="0.1 0.2 0.3"/><axis xyz="0.6 0 0.8"/></joint>
   <joint name="push" type="prismatic"><parent link="post"/><child link="slide"/>
-    <origin xyz="0 0.1 0" rpy="0.5 0 -0.3"/><axis xyz="0 0.8 -0.6"/><limit lower="-0.1" upper="0.4" effort="50" velocity="1"/></joint>
-  <joint name="bolt" type="fixed"><parent link="slide"/><child link="plate"/><origin xyz="0.1 0.2 0" rpy="1 0 0.2"/></joint>
+    <origin xyz="0 0.1 0" rpy="0.5 0 -0.3"/><axis xyz="0 0.8 -0.6"/>
+    <limit lower="-0.1" upper="0.4" effort="50" velocity="1"/></joint>
+  <joint name="bolt" type="fixed"><parent link="slide"/><child link="plate"/>
+    <origin xyz="0.1 0.2 0" rpy="1 0 0.2"/></joint>
   <joint name="nod" type="revolute"><parent link="plate"/><child link="hand"/>
-    <origin xyz="0 0 0.3" rpy="0 0.4 0"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="50" velocity="2"/></joint>
+    <origin xyz="0 0 0.3" rpy="0 0.4 0"/><axis xyz="0 1 0"/>
+    <limit lower="-2" upper="2" effort="50" velocity="2"/></joint>
 </robot>"""
 
 
@@ -137,14 +161,18 @@ def cranked(tmp_path: Path) -> str:
 
 
 def test_a_body_of_any_shape(world: Bullet, cranked: str) -> None:
-    """Tilted frames of mass, axes of any direction, a slide, a fixed joint on the way, a joint without limits."""
-    arm = BulletArm.load(world, cranked, tip="hand", position=(1.0, 2.0, 3.0), quaternion=(0.8, 0.0, 0.6, 0.0))
+    """Tilted frames of mass, axes of any direction, a slide, a fixed joint on the way, a joint without
+    limits."""
+    arm = BulletArm.load(
+        world, cranked, tip="hand", position=(1.0, 2.0, 3.0), quaternion=(0.8, 0.0, 0.6, 0.0)
+    )
     assert arm.names == ("turn", "push", "nod")
     assert arm.lower[0] == -np.inf
     assert arm.effort[0] == np.inf
     for q in np.random.default_rng(23).uniform([-3, -0.1, -2], [3, 0.4, 2], (20, 3)):
         arm.place(q)
-        assert apart(arm.frame(q), link_pose(world, arm.body, arm.tip)) < 2e-6  # PyBullet's roughness, as above
+        # PyBullet's roughness, as above
+        assert apart(arm.frame(q), link_pose(world, arm.body, arm.tip)) < 2e-6
         slope = [(arm.frame(q + d) - arm.frame(q - d))[:3] / 2e-5 for d in 1e-5 * np.eye(3)]
         assert_allclose(arm.jacobian(q)[:3], np.transpose(slope), atol=1e-9)
     near = q + np.array([0.01, 0.001, 0.0])
@@ -171,7 +199,8 @@ def test_masses_are_the_published_ones(world: Bullet, arm: BulletArm) -> None:
 
 @pytest.mark.parametrize("pose", POSES)
 def test_weight_on_the_joints(world: Bullet, arm: BulletArm, pose: str) -> None:
-    """tau = d/dq of sum m g z, by the table's centres of mass; central differences of h 1e-6 of an energy of some 100 J: 1e-8 N m."""
+    """tau = d/dq of sum m g z, by the table's centres of mass; central differences of h 1e-6 of an energy of
+    some 100 J: 1e-8 N m."""
 
     def energy(q: Floats) -> float:
         frames = dh_frames(q)
@@ -204,11 +233,19 @@ def test_a_folded_arm_meets_itself(world: Bullet, arm: BulletArm) -> None:
 
 def test_asking_moves_nothing(world: Bullet, arm: BulletArm) -> None:
     arm.place(POSES["ready"])
-    before = world.getJointStates(arm.body, range(6)), world.getNumBodies(), link_pose(world, arm.body, arm.tip).tolist()
+    before = (
+        world.getJointStates(arm.body, range(6)),
+        world.getNumBodies(),
+        link_pose(world, arm.body, arm.tip).tolist(),
+    )
     arm.frame(np.ones(6))
     arm.jacobian(np.ones(6))
     arm.solve(arm.frame(np.ones(6)), np.full(6, 0.9))
-    assert (world.getJointStates(arm.body, range(6)), world.getNumBodies(), link_pose(world, arm.body, arm.tip).tolist()) == before
+    assert (
+        world.getJointStates(arm.body, range(6)),
+        world.getNumBodies(),
+        link_pose(world, arm.body, arm.tip).tolist(),
+    ) == before
 
 
 def test_two_worlds(world: Bullet, arm: BulletArm) -> None:
@@ -232,8 +269,9 @@ def test_the_base_may_move(world: Bullet, arm: BulletArm) -> None:
 
 @pytest.mark.parametrize("forward", [False, True])
 def test_motors_follow_a_circle(world: Bullet, arm: BulletArm, forward: bool) -> None:
-    """Radius 0.2 m in 20 s, of which a quarter, a switching load of 20 N on the flange: 0.9 um off without and 1.2 um with feedforward,
-    which ends a step at q + dt q_dot and so is behind by dt^2 / 2 of the acceleration: 0.3 um. Allowed is three times what was measured.
+    """Radius 0.2 m in 20 s, of which a quarter, a switching load of 20 N on the flange: 0.9 um off without
+    and 1.2 um with feedforward, which ends a step at q + dt q_dot and so is behind by dt^2 / 2 of the
+    acceleration: 0.3 um. Allowed is three times what was measured.
     """
     dt, n = world.dt, 1000
     centre = arm.frame(POSES["ready"])
@@ -316,11 +354,23 @@ def test_solve_stays_within_limits(world: Bullet, cranked: str) -> None:
         (HostError, "has no body 7", lambda a: BulletArm(a.bullet, 7, "tool0")),
         (HostError, "no joint that moves", lambda a: BulletArm(a.bullet, a.body, -1)),
         (HostError, "did you mean 'elbow_joint'", lambda a: BulletArm(a.bullet, a.body, "tool0", ("elbow",))),
-        (HostError, "each once", lambda a: BulletArm(a.bullet, a.body, "tool0", ("elbow_joint", "elbow_joint"))),
+        (
+            HostError,
+            "each once",
+            lambda a: BulletArm(a.bullet, a.body, "tool0", ("elbow_joint", "elbow_joint")),
+        ),
         (HostError, "at least one", lambda a: BulletArm(a.bullet, a.body, "tool0", ())),
         (HostError, "cannot load 'none.urdf'", lambda a: BulletArm.load(a.bullet, "none.urdf", tip=0)),
-        (InputError, "arm's base is at", lambda a: BulletArm.load(a.bullet, ur5_path(), tip=0, position=(0.0, 1.0))),
-        (InputError, "base pose's quaternion", lambda a: BulletArm.load(a.bullet, ur5_path(), tip=0, quaternion=(0, 0, 0, 2))),
+        (
+            InputError,
+            "arm's base is at",
+            lambda a: BulletArm.load(a.bullet, ur5_path(), tip=0, position=(0.0, 1.0)),
+        ),
+        (
+            InputError,
+            "base pose's quaternion",
+            lambda a: BulletArm.load(a.bullet, ur5_path(), tip=0, quaternion=(0, 0, 0, 2)),
+        ),
         (InputError, "q is .*give 6 finite numbers", lambda a: a.frame(np.zeros(5))),
         (InputError, "q is 'home'; give 6 finite numbers", lambda a: a.frame("home")),
         (InputError, "q is .*give 6 finite numbers", lambda a: a.jacobian(np.full(6, np.nan))),
@@ -330,7 +380,11 @@ def test_solve_stays_within_limits(world: Bullet, cranked: str) -> None:
         (InputError, "q_dot is", lambda a: a.place(np.zeros(6), np.zeros(2))),
         (InputError, "target is .*position \\(3,\\) or", lambda a: a.solve(np.zeros(4), np.zeros(6))),
         (InputError, "quaternion .* has norm 2", lambda a: a.solve((0.3, 0.2, 0.3, 2, 0, 0, 0), np.zeros(6))),
-        (HostError, "no joint positions within the limits .* is 1.05 m off", lambda a: a.solve((2.0, 0.0, 0.0), np.zeros(6))),
+        (
+            HostError,
+            "no joint positions within the limits .* is 1.05 m off",
+            lambda a: a.solve((2.0, 0.0, 0.0), np.zeros(6)),
+        ),
     ],
 )
 def test_bad_input(arm: BulletArm, error: type[Exception], sentence: str, do: object) -> None:

@@ -1,4 +1,5 @@
-"""Tasks with arms in PyBullet worlds: episodes that depend on their draws alone, baselines that solve them, geometry against PyBullet's."""
+"""Tasks with arms in PyBullet worlds: episodes that depend on their draws alone, baselines that solve them,
+geometry against PyBullet's."""
 
 from __future__ import annotations
 
@@ -20,8 +21,11 @@ from fastrod_envs.vector import BatchEnv
 NAMES = ("BoxExplore", "PickPlace", "DualArm")
 
 
-def rollout(env: SingleEnv, seed: int, n_steps: int = 25, *, scripted: bool = True) -> tuple[np.ndarray, np.ndarray]:
-    """Observations and rewards of an episode's first steps, with the baseline's actions or with random ones."""
+def rollout(
+    env: SingleEnv, seed: int, n_steps: int = 25, *, scripted: bool = True
+) -> tuple[np.ndarray, np.ndarray]:
+    """Observations and rewards of an episode's first steps, with the baseline's actions or with random
+    ones."""
     rng = np.random.default_rng(seed)
     seen, rewards = [env.reset(seed=seed)[0]], []
     for _ in range(n_steps):
@@ -61,9 +65,14 @@ def test_an_episode_is_the_same_bit_for_bit_whatever_came_before(name: str) -> N
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("randomise", [None, {"bending_stiffness": (0.9, 1.1), "backlash.half_width": (0.0, 1e-5)}])
+@pytest.mark.parametrize(
+    "randomise", [None, {"bending_stiffness": (0.9, 1.1), "backlash.half_width": (0.0, 1e-5)}]
+)
 def test_an_environment_of_a_batch_is_the_single_one_of_its_seed(name: str, randomise: Any) -> None:
-    batch, single = BatchEnv(name, num_envs=3, threads=1, randomise=randomise), SingleEnv(name, threads=1, randomise=randomise)
+    batch, single = (
+        BatchEnv(name, num_envs=3, threads=1, randomise=randomise),
+        SingleEnv(name, threads=1, randomise=randomise),
+    )
     seen, _ = batch.reset(seed=7)
     alone, _ = single.reset(seed=9)
     assert_array_equal(seen[2], alone)
@@ -112,7 +121,9 @@ def test_random_actions_leave_numbers_finite_and_within_their_bounds(name: str, 
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("options", [{"n_steps": 1}, {"n_steps": 1, "action": "displacement"}, {"observation": "goal"}])
+@pytest.mark.parametrize(
+    "options", [{"n_steps": 1}, {"n_steps": 1, "action": "displacement"}, {"observation": "goal"}]
+)
 def test_options_of_every_task(name: str, options: dict[str, Any]) -> None:
     env = SingleEnv(name, threads=1, **options)
     parts = env.task.goals if options.get("observation") == "goal" else env.task.states
@@ -160,11 +171,14 @@ def test_clearance_in_the_box_is_pybullets() -> None:
     found, expected = [], []
     for seed in range(4):
         rollout(env, seed, n_steps=20, scripted=seed % 2 == 0)
-        cell: Any = env.task.cells[0]  # type: ignore[attr-defined]
+        cell: Any = env.task.cells[0]
         cell._pose()
         found.append(cell._clearance())
-        expected.append(min(p[8] for own in cell.bodies.ids for p in cell.world.getClosestPoints(own, cell.walls, 0.2)))
-    # the capsules' axes are chords: with nodes every 1 cm and bends of 1.7 rad in 0.1 m they sag by less than 0.01^2 * 17 / 8 m
+        expected.append(
+            min(p[8] for own in cell.bodies.ids for p in cell.world.getClosestPoints(own, cell.walls, 0.2))
+        )
+    # the capsules' axes are chords: with nodes every 1 cm and bends of 1.7 rad in 0.1 m they sag by less than
+    # 0.01^2 * 17 / 8 m
     assert_allclose(found, expected, atol=3e-4)
     env.close()
 
@@ -218,7 +232,7 @@ def test_the_cube_is_lifted_carried_and_left_at_rest(grip: str) -> None:
 def test_a_cube_that_is_let_go_in_the_air_falls_freely(grip: str) -> None:
     env = SingleEnv("PickPlace", threads=1, grip=grip)
     env.reset(seed=1)
-    cell: Any = env.task.cells[0]  # type: ignore[attr-defined]
+    cell: Any = env.task.cells[0]
     while cell.place[2] < cell.spot[2] + 0.05:
         env.step(env.baseline())
     before = cell.place[2]
@@ -233,12 +247,13 @@ def test_a_cube_that_is_let_go_in_the_air_falls_freely(grip: str) -> None:
 def test_the_arm_moves_the_tip_as_told_while_the_soft_robot_bends() -> None:
     env = SingleEnv("PickPlace", threads=1)
     env.reset(seed=0)
-    cell: Any = env.task.cells[0]  # type: ignore[attr-defined]
+    cell: Any = env.task.cells[0]
     before = cell.soft.tip.copy()
     for _ in range(4):
         env.step(np.array([0.4, 0.0, 0.0, 1.0, -1.0]))
     moved = cell.soft.tip - before
-    # bent by 0.4 rad more the robot sags more; 0.2 m of 0.03 kg/m weigh 0.06 N: w L^4 / (8 E I) = 12 mm where it is horizontal
+    # bent by 0.4 rad more the robot sags more; 0.2 m of 0.03 kg/m weigh 0.06 N: w L^4 / (8 E I) = 12 mm where
+    # it is horizontal
     assert_allclose(moved, [0.4 * 0.25 * 0.4, 0.0, 0.0], atol=0.012 * np.sin(0.7))
     assert cell.bend == pytest.approx(0.4, abs=0.31)
     env.close()
@@ -275,7 +290,7 @@ def test_a_ball_that_is_let_go_falls_and_ends_the_episode() -> None:
 def test_a_head_that_is_pulled_too_far_lets_go() -> None:
     env = SingleEnv("DualArm", threads=1)
     env.reset(seed=2)
-    cell: Any = env.task.cells[0]  # type: ignore[attr-defined]
+    cell: Any = env.task.cells[0]
     while not cell.held[1]:
         action = env.baseline()
         env.step(action)
@@ -290,7 +305,7 @@ def test_a_head_that_is_pulled_too_far_lets_go() -> None:
 def test_tips_move_as_told() -> None:
     env = SingleEnv("DualArm", threads=1)
     env.reset(seed=0)
-    cell: Any = env.task.cells[0]  # type: ignore[attr-defined]
+    cell: Any = env.task.cells[0]
     before = np.stack([soft.tip for soft in cell.softs])
     velocity = np.array([[0.2, 0.3, 0.0], [0.2, 0.0, -0.3]])
     for _ in range(3):
@@ -301,7 +316,10 @@ def test_tips_move_as_told() -> None:
     env.close()
 
 
-@pytest.mark.parametrize(("name", "middle"), [("BoxExplore", None), ("PickPlace", (0.5, 0.04, 0.165)), ("DualArm", (0.06, 0.0, 0.3))])
+@pytest.mark.parametrize(
+    ("name", "middle"),
+    [("BoxExplore", None), ("PickPlace", (0.5, 0.04, 0.165)), ("DualArm", (0.06, 0.0, 0.3))],
+)
 def test_difficulty_goes_from_the_easiest_goals_to_all(name: str, middle: tuple[float, ...] | None) -> None:
     task = SingleEnv(name, threads=1).task
     draws = np.random.default_rng(0).random((12, task.n_draws))

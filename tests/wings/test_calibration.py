@@ -1,4 +1,5 @@
-"""Calibration, registration and latency: what was put in comes out within its standard error; views that do not tell are refused."""
+"""Calibration, registration and latency: what was put in comes out within its standard error; views that do
+not tell are refused."""
 
 from __future__ import annotations
 
@@ -18,7 +19,9 @@ from fastrod_device.latency import estimate_latency
 
 BOARD = CharucoBoard(columns=7, rows=5, square=0.02, marker=0.015, dictionary="DICT_4X4_50")
 CAMERA = Camera(
-    matrix=((800.0, 0.0, 322.3), (0.0, 805.0, 238.1), (0.0, 0.0, 1.0)), distortion=(-0.2, 0.08, 0.001, -0.0005, 0.0), size=(640, 480)
+    matrix=((800.0, 0.0, 322.3), (0.0, 805.0, 238.1), (0.0, 0.0, 1.0)),
+    distortion=(-0.2, 0.08, 0.001, -0.0005, 0.0),
+    size=(640, 480),
 )
 MIDDLE = np.array([0.07, 0.05, 0.0])
 
@@ -47,7 +50,14 @@ def test_drawn_board_is_the_printed_one():
     height, width = print_.shape
     camera = Camera(matrix=((640.0, 0.0, 31.5), (0.0, 640.0, 31.5), (0.0, 0.0, 1.0)), size=(width, height))
     scene = Scene(white=255.0, black=0.0, blur=0.0, noise=0.0, gradient=(0.0, 0.0), vignetting=0.0)
-    seen = draw_board(camera, BOARD, np.array([0.0, 0.0, 0.2]), np.array([1.0, 0.0, 0.0, 0.0]), rng=np.random.default_rng(0), scene=scene)
+    seen = draw_board(
+        camera,
+        BOARD,
+        np.array([0.0, 0.0, 0.2]),
+        np.array([1.0, 0.0, 0.0, 0.0]),
+        rng=np.random.default_rng(0),
+        scene=scene,
+    )
     assert (height, width) == (6 * 64, 8 * 64)
     assert np.abs(seen.astype(int) - print_).max() <= 1
 
@@ -61,7 +71,14 @@ def test_calibration_finds_the_camera(images):
     wanted = CAMERA.intrinsics
     assert_allclose(found.matrix, wanted, atol=2.5)
     assert_allclose(found.distortion[:2], CAMERA.lens[:2], atol=0.04)
-    off = np.array([found.matrix[0, 0] - 800.0, found.matrix[1, 1] - 805.0, found.matrix[0, 2] - 322.3, found.matrix[1, 2] - 238.1])
+    off = np.array(
+        [
+            found.matrix[0, 0] - 800.0,
+            found.matrix[1, 1] - 805.0,
+            found.matrix[0, 2] - 322.3,
+            found.matrix[1, 2] - 238.1,
+        ]
+    )
     assert (np.abs(off) < 5.0 * found.stderr[:4]).all()
     assert found.stderr[8] == 0.0
     camera = found.camera(rate=15.0, latency=0.02)
@@ -74,7 +91,9 @@ def test_views_that_do_not_tell(images):
     flat = [draw_board(CAMERA, BOARD, *view(rng, 0.0), rng=rng) for _ in range(6)]
     with pytest.raises(CalibrationError, match=r"all alike|focal length|do not determine"):
         calibrate(flat, BOARD)
-    with pytest.raises(CalibrationError, match="3 of 3 views show the board well enough; 5 or more are needed"):
+    with pytest.raises(
+        CalibrationError, match="3 of 3 views show the board well enough; 5 or more are needed"
+    ):
         calibrate(images[:3], BOARD)
     with pytest.raises(CalibrationError, match=r"0 of 6 views .* \(no board seen\)"):
         calibrate([np.zeros((480, 640), dtype=np.uint8)] * 6, BOARD)
@@ -105,7 +124,9 @@ def test_registration_finds_the_place(views):
     still = register_base(pictures[:1] * 2, BOARD, CAMERA, position=position[0], quaternion=quaternion[0])
     assert_allclose(still.position, stand[0], atol=3e-4)
     # a board that is held worse than it is seen: the scatter says so
-    held = register_base(pictures, BOARD, CAMERA, position=position + 1e-3 * rng.standard_normal((6, 3)), quaternion=quaternion)
+    held = register_base(
+        pictures, BOARD, CAMERA, position=position + 1e-3 * rng.standard_normal((6, 3)), quaternion=quaternion
+    )
     assert (held.position_stderr > 1.5e-4).all()
 
 
@@ -146,7 +167,9 @@ def recording(seed, rate, delay, amplitude=0.003, noise=3e-4):
     a, b = (np.interp(seen - delay, t, w) / 0.008 for w in (x, y))
     theta = np.hypot(a, b) + 1e-9
     across = 0.07 * (1.0 - np.cos(theta)) / theta**2
-    tip = np.stack([across * a, across * b, 0.07 * np.sin(theta) / theta], axis=1) + noise * rng.standard_normal((len(seen), 3))
+    tip = np.stack(
+        [across * a, across * b, 0.07 * np.sin(theta) / theta], axis=1
+    ) + noise * rng.standard_normal((len(seen), 3))
     tip[rng.random(len(seen)) < 0.1] = np.nan
     return t, np.stack([x, y, -x, -y], axis=1), seen, tip
 

@@ -73,7 +73,7 @@ def test_the_picture_is_upright_and_not_mirrored(world: Bullet) -> None:
 )
 def test_a_camera_that_cannot_be_says_so(arguments: dict[str, float], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
-        Camera(**arguments)  # type: ignore[arg-type]
+        Camera(**arguments)
 
 
 def test_a_view_that_cannot_be_says_so(world: Bullet) -> None:

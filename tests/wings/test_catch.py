@@ -24,7 +24,8 @@ def task_of(env: BatchEnv | SingleEnv) -> Catch:
 
 
 def rollout(n: int, seed: int, row: int, steps: int, **options) -> list[np.ndarray]:
-    """Observations and rewards of environment `row`, whose actions are the same whatever the others do; every other one is at random."""
+    """Observations and rewards of environment `row`, whose actions are the same whatever the others do; every
+    other one is at random."""
     env = BatchEnv("Catch", num_envs=n, threads=1, **options)
     own, others = np.random.default_rng(5), np.random.default_rng(n)
     env.reset(seed=seed)
@@ -40,7 +41,9 @@ def rollout(n: int, seed: int, row: int, steps: int, **options) -> list[np.ndarr
 def stiff_wires() -> Robot:
     """The same robot with wires that hardly stretch."""
     robot = standing_robot()
-    segments = [replace(s, tendons=tuple(replace(t, compliance=1e-9) for t in s.tendons)) for s in robot.segments]
+    segments = [
+        replace(s, tendons=tuple(replace(t, compliance=1e-9) for t in s.tendons)) for s in robot.segments
+    ]
     return replace(robot, segments=tuple(segments))
 
 
@@ -57,7 +60,9 @@ def test_jacobian_is_that_of_the_arcs():
     displacement = np.random.default_rng(1).uniform(-0.01, 0.01, (4, 5))
     way = np.random.default_rng(2).uniform(-1e-5, 1e-5, (4, 5))
     change = arcs_tip(displacement + way) - arcs_tip(displacement - way)
-    assert_allclose(np.einsum("nij,nj->ni", arcs_jacobian(displacement), 2.0 * way), change, rtol=0, atol=1e-10)
+    assert_allclose(
+        np.einsum("nij,nj->ni", arcs_jacobian(displacement), 2.0 * way), change, rtol=0, atol=1e-10
+    )
 
 
 def test_directions_are_even_over_the_sphere():
@@ -151,7 +156,9 @@ def test_difficulty_0_has_no_load_and_a_target_that_comes_to_the_tip():
     assert task.least.max() < 0.05
 
 
-@pytest.mark.parametrize("options", [{}, {"action": "displacement"}, {"randomise": {"bending_stiffness": (0.8, 1.2)}}])
+@pytest.mark.parametrize(
+    "options", [{}, {"action": "displacement"}, {"randomise": {"bending_stiffness": (0.8, 1.2)}}]
+)
 def test_a_seed_is_a_rollout_whatever_is_beside_it(options):
     three, one = rollout(3, 7, 2, 50, **options), rollout(1, 9, 0, 50, **options)
     for a, b in zip(three, one, strict=True):
@@ -187,7 +194,12 @@ def test_random_actions_stay_within_the_bounds(options):
 
 
 def test_effects_are_randomised_and_felt():
-    env = BatchEnv("Catch", num_envs=20, threads=1, randomise={"bending_stiffness": (0.8, 1.2), "camera_scale.scale": (0.05, 0.1)})
+    env = BatchEnv(
+        "Catch",
+        num_envs=20,
+        threads=1,
+        randomise={"bending_stiffness": (0.8, 1.2), "camera_scale.scale": (0.05, 0.1)},
+    )
     env.reset(seed=0)
     task = task_of(env)
     assert (np.linalg.norm(task.measured() - task.tip, axis=1) > 0.005).all()

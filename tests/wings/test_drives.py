@@ -1,4 +1,5 @@
-"""Both ends of a virtual CAN bus: the controller's drives, from finding them to moving them, and what happens when something fails."""
+"""Both ends of a virtual CAN bus: the controller's drives, from finding them to moving them, and what happens
+when something fails."""
 
 from __future__ import annotations
 
@@ -52,7 +53,7 @@ class Bench:
     def run(self, cycles: int, target: object = None) -> list[Feedback]:
         pacer, seen = Pacer(self.clock, self.rate), []
         for _ in range(cycles):
-            seen.append(self.bus.exchange(target))  # type: ignore[arg-type]
+            seen.append(self.bus.exchange(target))
             pacer.wait()
         return seen
 
@@ -122,9 +123,19 @@ def test_process_data_cannot_be_asked_for_and_what_is_unused_is_invalid():
                 node.objects.values[(index, 1)] &= 0x3FFF_FFFF
         bench.bus.connect()
         for k, node in enumerate(bench.nodes._nodes, 1):
-            held = {index: node.objects.values[(index, 1)] for base in (0x1400, 0x1800) for index in range(base, base + 4)}
+            held = {
+                index: node.objects.values[(index, 1)]
+                for base in (0x1400, 0x1800)
+                for index in range(base, base + 4)
+            }
             assert (held[0x1400], held[0x1800], held[0x1801]) == (0x200 + k, 0x4000_0180 + k, 0x4000_0280 + k)
-            assert [held[index] >> 30 for index in (0x1401, 0x1402, 0x1403, 0x1802, 0x1803)] == [0b10, 0b10, 0b10, 0b11, 0b11]
+            assert [held[index] >> 30 for index in (0x1401, 0x1402, 0x1403, 0x1802, 0x1803)] == [
+                0b10,
+                0b10,
+                0b10,
+                0b11,
+                0b11,
+            ]
             assert [held[index] & 0x7FF for index in (0x1401, 0x1802)] == [0x300 + k, 0x380 + k]
 
 
@@ -135,7 +146,10 @@ def test_pdos_that_the_dictionary_lacks_are_left_alone(tmp_path: Path):
         del dictionary[index]
     canopen.export_od(dictionary, str(own))
     clock, name = SteppedClock(), f"virtual:drives-{next(_names)}"
-    with EmulatedDrives(SPECS, name, clock=clock, wires=Springs()) as nodes, DriveBus(SPECS, name, clock=clock, rate=100.0, eds=own) as bus:
+    with (
+        EmulatedDrives(SPECS, name, clock=clock, wires=Springs()) as nodes,
+        DriveBus(SPECS, name, clock=clock, rate=100.0, eds=own) as bus,
+    ):
         bus.connect()
         assert bus.newest.nmt.tolist() == [5] * 4
         assert nodes.states == ("switch on disabled",) * 4
@@ -153,7 +167,8 @@ def test_a_ramp_of_set_points_is_followed_with_a_lag(ready):
     seen = [ready.run(1, np.full(4, round(speed * k / ready.rate)))[0] for k in range(100)]
     assert np.ptp([f.velocity for f in seen[50:]]) <= 0.02 * speed
     assert seen[-1].velocity == pytest.approx(np.full(4, speed), rel=0.01)
-    # the drive interpolates over one period; its position loop lags by 3 ms, less the substep of 1 ms that it has looked ahead
+    # the drive interpolates over one period; its position loop lags by 3 ms, less the substep of 1 ms that it
+    # has looked ahead
     assert seen[-1].following_error == pytest.approx(np.full(4, speed * 2e-3), abs=1)
     last = ready.run(10)[-1]
     np.testing.assert_array_equal(last.position, np.full(4, round(speed * 99 / ready.rate)))
@@ -188,7 +203,8 @@ def test_homing_ends_where_each_wire_is_taut(ready):
     assert np.all(tension < 2.0 + 4000 * SPECS[0].metres_per_count * STIFFNESS * 0.01 + 0.2)
     assert states(end) == ["operation enabled"] * 4
     told = Transmission(SPECS).tension(end.torque)
-    np.testing.assert_allclose(told, tension, atol=4 * 1.2e-4 * SPECS[0].newtons_per_torque)  # noise of thousandths
+    # noise of thousandths
+    np.testing.assert_allclose(told, tension, atol=4 * 1.2e-4 * SPECS[0].newtons_per_torque)
 
 
 def test_homing_then_goes_to_its_offset(ready):
@@ -375,7 +391,9 @@ def test_an_encoder_jump_is_seen_and_the_drive_moves_the_wire_by_it(ready):
     assert not np.delete(after - before, 2).any()
     last = ready.run(30)[-1]
     np.testing.assert_allclose(last.position, before, atol=1)
-    np.testing.assert_allclose(ready.nodes.true_pulled, [0, 0, -1500 * SPECS[2].metres_per_count, 0], atol=1e-6)
+    np.testing.assert_allclose(
+        ready.nodes.true_pulled, [0, 0, -1500 * SPECS[2].metres_per_count, 0], atol=1e-6
+    )
 
 
 def test_an_encoder_jump_beyond_the_window_is_a_following_error(ready):
@@ -453,7 +471,10 @@ def test_faults_are_reset_only_when_asked_and_nothing_is_enabled_by_it(ready):
 def test_a_drive_that_is_not_there_is_named():
     name = f"virtual:drives-{next(_names)}"
     clock = SteppedClock()
-    with EmulatedDrives(SPECS[:1], name, clock=clock, wires=Springs()) as _, DriveBus(SPECS[:2], name, clock=clock) as bus:
+    with (
+        EmulatedDrives(SPECS[:1], name, clock=clock, wires=Springs()) as _,
+        DriveBus(SPECS[:2], name, clock=clock) as bus,
+    ):
         with pytest.raises(DeviceError, match="the drive at node 2 does not answer"):
             bus.connect()
         with pytest.raises(DeviceError, match="not connected"):
@@ -492,7 +513,7 @@ def test_moves_that_cannot_be(ready):
     with pytest.raises(InputError, match="positive thousandths"):
         ready.bus.homing(np.zeros(4), 100)
     with pytest.raises(UnknownNameError, match="did you mean 'csp'"):
-        ready.bus.enable("cps")  # type: ignore[arg-type]
+        ready.bus.enable("cps")
     with pytest.raises(InputError, match="position_limit"):
         ready.bus.connect(position_limit=np.array([1, 2]))
 
@@ -557,7 +578,9 @@ def test_codes_in_words():
 def test_counts_and_torques_go_round():
     transmission = Transmission(SPECS)
     dl, tension = np.array([-3e-3, 2e-3, 0.0, 1e-3]), np.array([0.5, 1.0, 2.0, 5.0])
-    np.testing.assert_allclose(transmission.dl(transmission.counts(dl)), dl, atol=0.5 * SPECS[0].metres_per_count)
+    np.testing.assert_allclose(
+        transmission.dl(transmission.counts(dl)), dl, atol=0.5 * SPECS[0].metres_per_count
+    )
     one = 1e-3 * SPECS[0].rated_torque * SPECS[0].newtons_per_torque
     np.testing.assert_allclose(transmission.tension(transmission.torque(tension)), tension, atol=0.5 * one)
     # one turn of the drum: gear x counts, and its circumference
@@ -565,7 +588,10 @@ def test_counts_and_torques_go_round():
     np.testing.assert_allclose(turn[:2], [-2 * np.pi * 0.008, -2 * np.pi * 0.008], rtol=1e-12)
 
 
-@pytest.mark.parametrize("given", [{"node": 0}, {"node": 200}, {"direction": 0}, {"drum_radius": 8.0}, {"gear": -1.0}, {"efficiency": 1.5}])
+@pytest.mark.parametrize(
+    "given",
+    [{"node": 0}, {"node": 200}, {"direction": 0}, {"drum_radius": 8.0}, {"gear": -1.0}, {"efficiency": 1.5}],
+)
 def test_a_drive_that_cannot_be(given):
     with pytest.raises(InputError):
         DriveSpec(**({"node": 1, "drum_radius": 0.008} | given))

@@ -246,10 +246,7 @@ def test_the_shipped_table_is_what_a_drive_lists() -> None:
         (0x6065, "Node 3 has no object 0x6065: the following error is not limited by the drive."),
         (0x6085, "Node 3 has no object 0x6085: the deceleration of a quick stop is the drive's own."),
         (0x605A, "Node 3 has no object 0x605A: after a quick stop it does what it was set to do before."),
-        (
-            0x60C2,
-            "Node 3 has no object 0x60C2:01: how long it interpolates set-points is the drive's own.",
-        ),
+        (0x60C2, "Node 3 has no object 0x60C2:01: how long it interpolates set-points is the drive's own."),
         (
             0x6076,
             "Node 3 has no object 0x6076: its rated torque is not compared with DriveSpec.rated_torque.",
@@ -373,7 +370,9 @@ def test_what_is_no_such_file_is_one_sentence(data: bytes, says: str, tmp_path: 
 
 
 def test_what_is_not_limited_is_printed_and_in_the_journal(tmp_path: Path, capsys: Any) -> None:
-    pytest.importorskip("cv2", reason="opencv-python-headless is not installed: pip install 'fastrod[device]'")
+    pytest.importorskip(
+        "cv2", reason="opencv-python-headless is not installed: pip install 'fastrod[device]'"
+    )
     path, events = tmp_path / "poor.eds", tmp_path / "run.csv"
     path.write_bytes(WRITTEN["Windows"](eds(without(0x607F))))
     options = Namespace(emulate=True, no_home=True, seed=1, real_time=False, eds=path, bus=None, camera=None)

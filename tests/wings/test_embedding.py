@@ -1,4 +1,5 @@
-"""The page on embedding runs as it stands, and its recipe keeps to physics on an engine with conventions of its own."""
+"""The page on embedding runs as it stands, and its recipe keeps to physics on an engine with conventions of
+its own."""
 
 from __future__ import annotations
 
@@ -19,14 +20,25 @@ from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_ve
 
 PAGE = (Path(fastrod.hosts.__file__).parent / "README.md").read_text(encoding="utf-8")
 EXAMPLES = re.findall(r"```python\n(.*?)```\n\n```\n(.*?)```", PAGE, flags=re.S)
-RECIPE = next(block for block in re.findall(r"```python\n(.*?)```", PAGE, flags=re.S) if "def embedded_step" in block)
+RECIPE = next(
+    block for block in re.findall(r"```python\n(.*?)```", PAGE, flags=re.S) if "def embedded_step" in block
+)
 
 
 class TinyEngine:
-    """One rigid body on a spring: x y z w, forces at the centre of mass, torque and inertia in the body frame, semi-implicit Euler."""
+    """One rigid body on a spring: x y z w, forces at the centre of mass, torque and inertia in the body
+    frame, semi-implicit Euler."""
 
-    def __init__(self, mass=1.0, inertia=(0.1, 0.2, 0.15), spring=0.0, twist=0.0, damping=0.0, gravity=0.0) -> None:
-        self.mass, self.inertia, self.spring, self.twist, self.damping = mass, np.array(inertia), spring, twist, damping
+    def __init__(
+        self, mass=1.0, inertia=(0.1, 0.2, 0.15), spring=0.0, twist=0.0, damping=0.0, gravity=0.0
+    ) -> None:
+        self.mass, self.inertia, self.spring, self.twist, self.damping = (
+            mass,
+            np.array(inertia),
+            spring,
+            twist,
+            damping,
+        )
         self.gravity = np.array([0.0, 0.0, -gravity])
         self.position, self.orientation = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
         self.velocity, self.spin = np.zeros(3), np.zeros(3)
@@ -41,11 +53,18 @@ class TinyEngine:
 
     def step(self, dt) -> None:
         turn = matrix_from_quaternion(np.roll(self.orientation, 1)[None])[0]
-        force = self._force + self.mass * self.gravity - self.spring * np.array(self.position) - self.damping * self.velocity
+        force = (
+            self._force
+            + self.mass * self.gravity
+            - self.spring * np.array(self.position)
+            - self.damping * self.velocity
+        )
         inertia = turn @ np.diag(self.inertia) @ turn.T
         moment = turn @ self._torque - self.twist * self.vector() - 0.2 * self.damping * self.spin
         self.velocity = self.velocity + dt * force / self.mass
-        self.spin = self.spin + dt * np.linalg.solve(inertia, moment - np.cross(self.spin, inertia @ self.spin))
+        self.spin = self.spin + dt * np.linalg.solve(
+            inertia, moment - np.cross(self.spin, inertia @ self.spin)
+        )
         self.position = (np.array(self.position) + dt * self.velocity).tolist()
         turned = product(quaternion_from_vector(dt * self.spin), np.roll(self.orientation, 1))
         self.orientation = np.roll(turned / np.linalg.norm(turned), -1).tolist()
@@ -69,7 +88,8 @@ def test_the_example_prints_its_output(code: str, output: str) -> None:
 
 @pytest.mark.parametrize("dt", [0.003, 0.025])
 def test_rod_hangs_on_the_spring_with_its_weight_and_turns_it_with_its_moment(embedded_step, dt) -> None:
-    # at rest: k z = -(m g + w), and the torsion spring holds the weight's moment about the centre of mass, kappa phi = arm x w
+    # at rest: k z = -(m g + w), and the torsion spring holds the weight's moment about the centre of mass,
+    # kappa phi = arm x w
     robot = soft_robot(line_density=0.5)
     body = TinyEngine(spring=200.0, twist=40.0, damping=20.0, gravity=9.81)
     rod, offset = Rod(robot, dt=0.01), np.array([0.1, 0.0, 0.05])
@@ -96,7 +116,8 @@ def test_impulse_of_the_tip_force_is_the_bodys_momentum(embedded_step) -> None:
 
 
 def test_bounce_keeps_its_energy(embedded_step) -> None:
-    # straight up and down: 1/2 m v^2 + 1/2 k z^2 + w z is constant; semi-implicit Euler lets it swing by omega dt / 2
+    # straight up and down: 1/2 m v^2 + 1/2 k z^2 + w z is constant; semi-implicit Euler lets it swing by
+    # omega dt / 2
     robot = soft_robot(line_density=0.5)
     body, rod, energy, dt = TinyEngine(spring=100.0), Rod(robot, dt=0.01), [], 0.002
     weight = 0.5 * robot.length * 9.81
@@ -105,7 +126,8 @@ def test_bounce_keeps_its_energy(embedded_step) -> None:
         energy.append(0.5 * body.velocity[2] ** 2 + 50.0 * body.position[2] ** 2 + weight * body.position[2])
     swing = weight**2 / (2.0 * 100.0)  # from the top to rest
     assert np.abs(energy).max() < 0.02 * swing * 2.0
-    assert abs(np.mean(energy[-314:]) - np.mean(energy[:314])) < 1e-3 * swing  # 314 steps of 2 ms are a period of 2 pi / 10 s
+    # 314 steps of 2 ms are a period of 2 pi / 10 s
+    assert abs(np.mean(energy[-314:]) - np.mean(energy[:314])) < 1e-3 * swing
 
 
 def test_tilted_body_feels_the_torque_in_its_own_frame(embedded_step) -> None:
@@ -124,7 +146,9 @@ def test_tilted_body_feels_the_torque_in_its_own_frame(embedded_step) -> None:
 def test_limit_of_the_time_step_is_where_the_page_has_it(part: float, calm: bool) -> None:
     # x' = x + dt v', v' = v - dt K / m (x + dt v): eigenvalues leave the unit circle where dt^2 K / m is 4/3
     robot, dt, turn = soft_robot(), 0.01, (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)
-    scene = ContactScene(obstacles=[plane(point=(0, 0, -0.005), normal=(0, 0, 1), name="floor", stiffness=4.0)])
+    scene = ContactScene(
+        obstacles=[plane(point=(0, 0, -0.005), normal=(0, 0, 1), name="floor", stiffness=4.0)]
+    )
     rod = Rod(robot, dt=dt, contact=scene)
     start = 0.006
 

@@ -37,7 +37,8 @@ def test_hanging_rod_weighs_on_its_base(stage):
     state = sideways.rod.step()
     # the moment of the weight is that of the mass where it hangs: integral of x rho g ds
     lever = 0.8 * 9.81 * np.trapezoid(state.position[0, :, 0], state.arclength[0])
-    assert sideways.rod.wrench[4] == pytest.approx(lever, rel=1e-4)  # trapezoid of 21 nodes on a curve: (h / L)^2
+    # trapezoid of 21 nodes on a curve: (h / L)^2
+    assert sideways.rod.wrench[4] == pytest.approx(lever, rel=1e-4)
 
 
 def test_weight_is_that_of_the_world_as_it_is_now(stage):
@@ -87,7 +88,8 @@ def test_a_load_that_no_rod_holds_leaves_the_shape(stage):
 
 
 def test_rod_follows_a_host_that_moves(stage):
-    # a base that moves at a constant velocity is where the rod expects it: the shape is that at rest, carried along
+    # a base that moves at a constant velocity is where the rod expects it: the shape is that at rest, carried
+    # along
     robot = soft_robot()
     s = stage(robot)
     pulled = robot.rest_tendon_length + np.array([-3, 0, 3, 0, -6, 2, 6, -2]) * 1e-3
@@ -134,7 +136,9 @@ def test_step_that_cannot_be_solved_keeps_action_and_reaction(stage, monkeypatch
     for k in range(30):
         s.carry([SPEED * k * s.dt, 0.0, 0.0], [SPEED, 0.0, 0.0])
         if k == 8:  # while it presses
-            monkeypatch.setattr(s.rod.simulator, "step", lambda *a, **b: replace(solved(*a, **b), ok=np.array([False])))
+            monkeypatch.setattr(
+                s.rod.simulator, "step", lambda *a, **b: replace(solved(*a, **b), ok=np.array([False]))
+            )
         elif k == 10:
             monkeypatch.undo()
         s.rod.step()
@@ -160,7 +164,11 @@ def test_time_step_that_changes_is_a_sentence(stage):
     s = stage(soft_robot())
     s.rod.step()
     s.set_dt(0.002)
-    with pytest.raises(HostError, match=r"time step is now 0.002 s, and the rod was mounted for 0.005 s; .*mount it anew\."):
+    with pytest.raises(
+        HostError,
+        match=r"time step is now 0.002 s, and the rod was mounted for 0.005 s; "
+        r".*mount it anew\.",
+    ):
         s.rod.step()
 
 
@@ -171,7 +179,11 @@ def test_bad_input_is_not_kept(stage):
         s.rod.step(tip_force=(0.0, 0.0, float("nan")))
     with pytest.raises(InputError, match=r"^a mounted rod has no input 'base_pose'; the host gives it$"):
         s.rod.step(base_pose=(0, 0, 0, 1, 0, 0, 0))
-    with pytest.raises(InputError, match=r"^a mounted rod has no input 'tendon_lenght'; did you mean 'tendon_length'\?$"):
+    with pytest.raises(
+        InputError,
+        match=r"^a mounted rod has no input 'tendon_lenght'; did you mean "
+        r"'tendon_length'\?$",
+    ):
         s.rod.step(tendon_lenght=0)
     s.rod.step()
     np.testing.assert_allclose(s.rod.wrench[:3], [0.01, 0.0, 0.0], atol=1e-9)
@@ -184,7 +196,11 @@ def test_rod_that_stays_lost_is_told(stage, monkeypatch):
         monkeypatch.setattr(s.rod.simulator, way, lambda *a, **b: lost)
     for _ in range(25):
         assert not s.rod.step().ok[0]
-    with pytest.raises(HostError, match=r"^26 steps in a row could not be solved, the last: contact: it stands\. Move .*call reset\(\)\.$"):
+    with pytest.raises(
+        HostError,
+        match=r"^26 steps in a row could not be solved, the last: contact: it "
+        r"stands\. Move .*call reset\(\)\.$",
+    ):
         s.rod.step()
 
 
@@ -211,4 +227,6 @@ def test_capsules_lie_along_the_backbone(stage):
         found = [s.world.getBasePositionAndOrientation(body) for body in s.rod.bodies.ids]
         pose = np.array([p for p, _ in found]), np.roll([q for _, q in found], 1, axis=1)
     np.testing.assert_allclose(pose[0], capsules.center, atol=1e-7)
-    np.testing.assert_allclose(matrix_from_quaternion(pose[1]), matrix_from_quaternion(capsules.quaternion), atol=1e-6)
+    np.testing.assert_allclose(
+        matrix_from_quaternion(pose[1]), matrix_from_quaternion(capsules.quaternion), atol=1e-6
+    )

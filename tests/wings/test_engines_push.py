@@ -19,9 +19,16 @@ def stage(request):
 
 
 def push(stage, dt, direction, gravity, duration=0.8, mass=MASS, place=None):
-    """A rod along x is carried against a cube; the cube's velocity along the way, its momentum, the host's impulse."""
+    """A rod along x is carried against a cube; the cube's velocity along the way, its momentum, the host's
+    impulse."""
     floor = -SIZE / 2 if gravity else None
-    s = stage(soft_robot(), dt=dt, gravity=gravity, cubes=[Cube(SIZE, mass, place or END[direction], 1.0)], floor=floor)
+    s = stage(
+        soft_robot(),
+        dt=dt,
+        gravity=gravity,
+        cubes=[Cube(SIZE, mass, place or END[direction], 1.0)],
+        floor=floor,
+    )
     s.rod.settle()
     way, forces, speeds, ok = WAY[direction], [], [], True
     for k in range(round(duration / dt)):
@@ -40,15 +47,19 @@ def test_momentum_of_a_free_cube_is_the_impulse_on_the_host(stage, dt, direction
     assert ok
     assert momentum @ WAY[direction] > 0.9 * MASS * SPEED
     np.testing.assert_allclose(momentum, -impulse[-1], atol=1e-9)
-    # an elastic rod without any loss would leave it at twice the speed; along its axis this one is stiff, and only stops it
+    # an elastic rod without any loss would leave it at twice the speed; along its axis this one is stiff, and
+    # only stops it
     assert speeds.max() < (1.01 if direction == "axial" else 1.5) * SPEED
 
 
 @pytest.mark.parametrize("direction", ["axial", "side"])
 @pytest.mark.parametrize("dt", [0.005])
 def test_cube_on_the_floor_follows_the_tip(stage, dt, direction):
-    # from the side the rod bends by some 3 cm until 20 g slide; a cube of 100 g would bend it as far as it is long
-    speeds, _, impulse, ok = push(stage, dt, direction, gravity=9.81, duration=1.2, mass=MASS if direction == "axial" else 0.02)
+    # from the side the rod bends by some 3 cm until 20 g slide; a cube of 100 g would bend it as far as it is
+    # long
+    speeds, _, impulse, ok = push(
+        stage, dt, direction, gravity=9.81, duration=1.2, mass=MASS if direction == "axial" else 0.02
+    )
     assert ok
     assert speeds[len(speeds) // 2 :].mean() == pytest.approx(SPEED, rel=0.02)
     assert speeds.max() < stage.hop * SPEED  # no launch
@@ -56,7 +67,8 @@ def test_cube_on_the_floor_follows_the_tip(stage, dt, direction):
 
 
 def test_push_against_friction_is_the_friction(stage):
-    # once it slides the host holds mu N against the way; N is the weight, and what the tip's own friction presses the cube down with
+    # once it slides the host holds mu N against the way; N is the weight, and what the tip's own friction
+    # presses the cube down with
     dt, window = 0.005, 0.6
     _, _, impulse, _ = push(stage, dt, "axial", gravity=9.81, duration=1.2)
     held, _, lifted = (impulse[-1] - impulse[-1 - round(window / dt)]) / window
@@ -72,7 +84,9 @@ def test_light_and_heavy_cubes_are_not_launched(stage, mass):
 
 
 def test_cube_that_is_hit_off_its_middle_turns_and_is_not_launched(stage):
-    speeds, momentum, impulse, ok = push(stage, 0.005, "axial", gravity=0.0, duration=0.4, place=[END["axial"][0], 0.03, 0.02])
+    speeds, momentum, impulse, ok = push(
+        stage, 0.005, "axial", gravity=0.0, duration=0.4, place=[END["axial"][0], 0.03, 0.02]
+    )
     assert ok
     assert speeds.max() < 1.5 * SPEED
     np.testing.assert_allclose(momentum, -impulse[-1], atol=1e-9)
@@ -83,12 +97,19 @@ def test_cube_that_falls_on_a_long_soft_rod_gains_no_energy(stage, dt):
     import fastrod
 
     mass, height = 0.02, 0.1
-    s = stage(fastrod.load_robot("five_segment_reacher"), dt=dt, gravity=9.81, cubes=[Cube(0.06, mass, [0.15, 0.0, height])])
+    s = stage(
+        fastrod.load_robot("five_segment_reacher"),
+        dt=dt,
+        gravity=9.81,
+        cubes=[Cube(0.06, mass, [0.15, 0.0, height])],
+    )
     inertia, energy = mass * 0.06**2 / 6.0, []
     for _ in range(round(0.3 / dt)):
         s.rod.step()
         linear, angular = np.split(s.velocity(), 2)
-        energy.append(mass * 9.81 * s.position()[2] + 0.5 * mass * linear @ linear + 0.5 * inertia * angular @ angular)
+        energy.append(
+            mass * 9.81 * s.position()[2] + 0.5 * mass * linear @ linear + 0.5 * inertia * angular @ angular
+        )
     assert max(energy) < mass * 9.81 * height * (1.0 + 1e-6)
     assert min(energy[-5:]) < 0.9 * max(energy)  # what it hit took some
 

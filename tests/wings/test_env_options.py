@@ -42,7 +42,9 @@ def actions(env: BatchEnv, n: int, seed: int = 0) -> np.ndarray:
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize(
-    "options", [{"n_steps": 1}, {"observation": "goal"}, {"action": "displacement", "n_steps": 2}], ids=["bandit", "goal", "displacement"]
+    "options",
+    [{"n_steps": 1}, {"observation": "goal"}, {"action": "displacement", "n_steps": 2}],
+    ids=["bandit", "goal", "displacement"],
 )
 def test_every_task_knows_the_common_options(name: str, options: dict[str, Any]) -> None:
     env = made(name, 1, **options)
@@ -68,7 +70,7 @@ def test_difficulty_is_a_number_from_zero_to_one(name: str) -> None:
     assert_array_equal(env.task.goal(), easiest)
     for level in (-0.1, 1.5, np.nan, "hard"):
         with pytest.raises(InputError, match="difficulty"):
-            env.set_difficulty(level)  # type: ignore[arg-type]
+            env.set_difficulty(level)
     env.close()
 
 
@@ -85,16 +87,27 @@ def test_a_difficulty_scales_the_goals_of_reach() -> None:
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"n_step": 5}, r"n_step'.*n_steps"), ({"n_steps": 0}, "n_steps"), ({"n_steps": 2.5}, "n_steps"), ({"n_steps": True}, "n_steps"),
-        ({"observation": "image"}, "observation.*state.*goal"), ({"action": "torque"}, "action.*rate.*displacement"),
-        ({"difficulty": 2}, "difficulty"), ({"reward": "best"}, "reward.*paper.*precise"), ({"threads": 0}, "threads"),
-        ({"render_mode": "human"}, "render_mode.*rgb_array.*viser"), ({"num_envs": 0}, "num_envs"), ({"num_envs": 1.5}, "num_envs"),
-        ({"randomise": 3}, "randomise"), ({"randomise": {"bending_stifness": (1, 2)}}, "bending_stiffness"),
-        ({"randomise": {"backlash.half_widht": (0, 1)}}, "half_width"), ({"randomise": {"bending_stiffness": (2, 1)}}, "range"),
-        ({"randomise": {"bending_stiffness": (0, 1)}}, "positive"), ({"randomise": {"bending_stiffness": (1, np.nan)}}, "finite"),
+        ({"n_step": 5}, r"n_step'.*n_steps"),
+        ({"n_steps": 0}, "n_steps"),
+        ({"n_steps": 2.5}, "n_steps"),
+        ({"n_steps": True}, "n_steps"),
+        ({"observation": "image"}, "observation.*state.*goal"),
+        ({"action": "torque"}, "action.*rate.*displacement"),
+        ({"difficulty": 2}, "difficulty"),
+        ({"reward": "best"}, "reward.*paper.*precise"),
+        ({"threads": 0}, "threads"),
+        ({"render_mode": "human"}, "render_mode.*rgb_array.*viser"),
+        ({"num_envs": 0}, "num_envs"),
+        ({"num_envs": 1.5}, "num_envs"),
+        ({"randomise": 3}, "randomise"),
+        ({"randomise": {"bending_stifness": (1, 2)}}, "bending_stiffness"),
+        ({"randomise": {"backlash.half_widht": (0, 1)}}, "half_width"),
+        ({"randomise": {"bending_stiffness": (2, 1)}}, "range"),
+        ({"randomise": {"bending_stiffness": (0, 1)}}, "positive"),
+        ({"randomise": {"bending_stiffness": (1, np.nan)}}, "finite"),
         ({"randomise": {"spread": 1.0}}, "spread"),
     ],
-)  # fmt: skip
+)
 def test_what_is_wrong_is_said_in_a_sentence(options: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence) as caught:
         BatchEnv("Reach", **options)
@@ -117,7 +130,7 @@ def test_steps_and_options_of_the_wrong_kind_are_refused() -> None:
     env = BatchEnv("Reach", 2, n_steps=np.int64(3), difficulty=np.float32(0.5))
     assert env.n_steps == 3
     with pytest.raises(InputError, match="options are 3"):
-        env.reset(options=3)  # type: ignore[arg-type]
+        env.reset(options=3)
 
 
 def test_max_episode_steps_is_another_name() -> None:
@@ -138,22 +151,29 @@ def ended(env: gymnasium.Env[Any, Any]) -> int:
 @pytest.mark.parametrize(
     ("options", "steps"),
     [
-        ({}, 40), ({"max_episode_steps": 80}, 80), ({"max_episode_steps": 10}, 10), ({"n_steps": 7}, 7),
-        ({"n_steps": 80, "max_episode_steps": 80}, 80), ({"n_steps": 80, "max_episode_steps": -1}, 80),
+        ({}, 40),
+        ({"max_episode_steps": 80}, 80),
+        ({"max_episode_steps": 10}, 10),
+        ({"n_steps": 7}, 7),
+        ({"n_steps": 80, "max_episode_steps": 80}, 80),
+        ({"n_steps": 80, "max_episode_steps": -1}, 80),
     ],
-)  # fmt: skip
+)
 def test_make_ends_an_episode_where_it_is_told(options: dict[str, int], steps: int) -> None:
-    env = gymnasium.make("fastrod/Reach-v0", threads=1, **options)  # type: ignore[arg-type]
+    env = gymnasium.make("fastrod/Reach-v0", threads=1, **options)
     assert [ended(env), ended(env)] == [steps, steps]
     assert ended(SingleEnv("Reach", threads=1, n_steps=options.get("n_steps"))) == options.get("n_steps", 40)
     if "max_episode_steps" in options and "n_steps" not in options:
-        assert gymnasium.make_vec("fastrod/Reach-v0", num_envs=2, threads=1, **options).n_steps == steps  # type: ignore[attr-defined]
+        assert gymnasium.make_vec("fastrod/Reach-v0", num_envs=2, threads=1, **options).n_steps == steps
 
 
 def test_a_number_of_steps_beyond_the_limit_of_make_is_not_cut_in_silence() -> None:
     env = gymnasium.make("fastrod/Reach-v0", threads=1, n_steps=80)
     assert ended(env) == 40
-    with pytest.warns(UserWarning, match="n_steps is 80, but gymnasium.make ended the episode after 40 steps; give max_episode_steps=80"):
+    with pytest.warns(
+        UserWarning,
+        match="n_steps is 80, but gymnasium.make ended the episode after 40 steps; give max_episode_steps=80",
+    ):
         env.reset()
 
 
@@ -213,17 +233,30 @@ def test_a_robot_file_with_effects_is_simulated_within_its_spread(tmp_path: Path
         assert ((widths >= 0.8 * 2e-4) & (widths <= 1.2 * 2e-4)).all()
         assert len(np.unique(widths)) == 4
         assert np.isfinite(env.step(actions(env, 1)[0])[0]).all()
-    fixed = made("Reach", 4, randomise=Randomisation(robot=replace(hanging_robot(), effects=({"name": "backlash", "half_width": 2e-4},))))
+    fixed = made(
+        "Reach",
+        4,
+        randomise=Randomisation(
+            robot=replace(hanging_robot(), effects=({"name": "backlash", "half_width": 2e-4},))
+        ),
+    )
     fixed.reset(seed=0)
     assert fixed.task.total_draws == task_class("Reach").n_draws
     assert np.isfinite(fixed.step(actions(fixed, 1)[0])[0]).all()
 
 
 def test_an_effect_may_be_absent() -> None:
-    drawn = Randomisation(effects={"backlash.half_width": (1e-4, 3e-4), "latency.delay": (0.05, 0.1)}, absent=0.4)
+    drawn = Randomisation(
+        effects={"backlash.half_width": (1e-4, 3e-4), "latency.delay": (0.05, 0.1)}, absent=0.4
+    )
     base = drawn.base(hanging_robot())
     robots = drawn.draw(base, np.random.default_rng(0).random((400, drawn.n_draws)))
-    values = np.array([[dict(table)[key] for table, key in zip(robot.effects, ("delay", "half_width"), strict=True)] for robot in robots])
+    values = np.array(
+        [
+            [dict(table)[key] for table, key in zip(robot.effects, ("delay", "half_width"), strict=True)]
+            for robot in robots
+        ]
+    )
     assert {table["name"] for table in robots[0].effects} == {"latency", "backlash"}
     for column, (low, high) in zip(values.T, ((0.05, 0.1), (1e-4, 3e-4)), strict=True):
         there = column[column != 0.0]
@@ -250,7 +283,9 @@ def test_a_picture_shows_what_is_where() -> None:
     # seen from the side, the target in the middle; at distance d a metre is 360 / (2 d tan 18 deg) pixels
     view = {"eye": (2.0, 0.0, 0.3), "target": (0.0, 0.0, 0.3)}
     empty = paint(Scenery(**view), 480, 360).astype(int)
-    ball = paint(Scenery(balls=(Ball(np.array([0.0, 0.2, 0.4]), 0.05, (1.0, 0.0, 0.0)),), **view), 480, 360).astype(int)
+    ball = paint(
+        Scenery(balls=(Ball(np.array([0.0, 0.2, 0.4]), 0.05, (1.0, 0.0, 0.0)),), **view), 480, 360
+    ).astype(int)
     red = (ball[:, :, 0] - ball[:, :, 1] > 60) & (np.abs(ball - empty).sum(2) > 60)
     rows, columns = np.nonzero(red)
     scale = 360.0 / (2.0 * 2.0 * np.tan(np.radians(18.0)))
@@ -273,16 +308,21 @@ def test_what_is_nearer_hides_what_is_behind() -> None:
         return int((picture[:, :, 0] > picture[:, :, 2] + 40).sum())
 
     assert red() > 20
-    assert red(flat(0.01)) == pytest.approx(red(), rel=0.3)  # below the ball, whose edge mixes with what is behind
+    # below the ball, whose edge mixes with what is behind
+    assert red(flat(0.01)) == pytest.approx(red(), rel=0.3)
     assert red(flat(0.3)) == 0
     assert red(flat(0.3)._replace(opacity=0.3)) > 20
 
 
 def test_meshes_are_closed_and_look_outward() -> None:
     bow = np.array([[0.1 * np.sin(a), 0.0, 0.1 * (1.0 - np.cos(a))] for a in np.linspace(0.0, 1.5, 40)])
-    for mesh, volume in ((ball_mesh(64), 4.0 / 3.0 * np.pi), (tube_mesh(bow, 0.01, 64), np.pi * 1e-4 * 0.15 + 2.0 / 3.0 * np.pi * 1e-6)):
+    for mesh, volume in (
+        (ball_mesh(64), 4.0 / 3.0 * np.pi),
+        (tube_mesh(bow, 0.01, 64), np.pi * 1e-4 * 0.15 + 2.0 / 3.0 * np.pi * 1e-6),
+    ):
         a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-        enclosed = float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum()) / 6.0  # the open foot of the tube lies at the origin
+        # the open foot of the tube lies at the origin
+        enclosed = float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum()) / 6.0
         assert enclosed == pytest.approx(volume, rel=0.02)
 
 
@@ -337,7 +377,9 @@ def test_a_page_without_viser_says_what_to_install(monkeypatch: pytest.MonkeyPat
         env.render()
 
 
-@pytest.mark.parametrize("wrong", [1.1, "ab", ("a", 1), None, (1.0,), (0.9, 1.0, 1.1), (2.0, 1.0), (1.0, float("nan"))])
+@pytest.mark.parametrize(
+    "wrong", [1.1, "ab", ("a", 1), None, (1.0,), (0.9, 1.0, 1.1), (2.0, 1.0), (1.0, float("nan"))]
+)
 def test_a_range_is_two_numbers(wrong: Any) -> None:
     with pytest.raises(InputError, match=r"the range of 'bending_stiffness' is .*least, largest"):
         made("Reach", randomise={"bending_stiffness": wrong})

@@ -1,4 +1,5 @@
-"""The same seed gives the same rollout, bit for bit: whatever stands beside an environment, and whatever happened in it before."""
+"""The same seed gives the same rollout, bit for bit: whatever stands beside an environment, and whatever
+happened in it before."""
 
 from __future__ import annotations
 
@@ -68,7 +69,9 @@ def together(env: BatchEnv, given: np.ndarray, seed: int) -> list[Rollout]:
         observations.append(observation)
         rewards.append(reward)
         endings.append(terminated | truncated)
-    columns = zip(*(np.swapaxes(np.array(a), 0, 1) for a in (observations, rewards, endings, positions)), strict=True)
+    columns = zip(
+        *(np.swapaxes(np.array(a), 0, 1) for a in (observations, rewards, endings, positions)), strict=True
+    )
     return [Rollout(*column) for column in columns]
 
 
@@ -82,7 +85,8 @@ def test_an_environment_does_not_know_its_neighbours(name: str) -> None:
     hosted = task_class(name).hosted
     if hosted:
         pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'fastrod[hosts]'")
-    n, steps, options = (2, 4, {"n_steps": 2}) if hosted else (3, 12, {"n_steps": 4})  # worlds of rigid bodies take their time
+    # worlds of rigid bodies take their time
+    n, steps, options = (2, 4, {"n_steps": 2}) if hosted else (3, 12, {"n_steps": 4})
     options["threads"] = 1
     env = BatchEnv(name, n, **options)
     given = actions(env, steps)
@@ -152,7 +156,7 @@ def test_a_seed_is_a_whole_number(seed: Any) -> None:
 
 def test_numpys_seeds_do_not_overflow() -> None:
     env = BatchEnv("Reach", 2, threads=1)
-    assert_array_equal(env.reset(seed=np.uint8(255))[0], env.reset(seed=255)[0])  # type: ignore[arg-type]
+    assert_array_equal(env.reset(seed=np.uint8(255))[0], env.reset(seed=255)[0])
 
 
 def test_a_masked_reset_seeds_those_that_begin() -> None:
@@ -172,7 +176,11 @@ def test_a_refused_reset_changes_nothing() -> None:
     env, twin = (BatchEnv("Reach", 2, threads=1) for _ in range(2))
     for one in (env, twin):
         one.reset(seed=0, options={"difficulty": 0.5})
-    for wrong in ({"options": {"difficulty": 0.1, "level": 1}}, {"seed": [1, -1]}, {"seed": 3, "options": {"difficulty": 2.0}}):
+    for wrong in (
+        {"options": {"difficulty": 0.1, "level": 1}},
+        {"seed": [1, -1]},
+        {"seed": 3, "options": {"difficulty": 2.0}},
+    ):
         with pytest.raises(InputError):
             env.reset(**wrong)
     assert env.task.difficulty == 0.5
@@ -180,10 +188,11 @@ def test_a_refused_reset_changes_nothing() -> None:
 
 
 def test_a_robot_lost_from_the_start_knows_no_earlier_episode() -> None:
-    heavy = {"randomise": {"gravity.line_density": (1.0, 1.0)}, "threads": 1}  # too heavy for its first shape to be found
+    # too heavy for its first shape to be found
+    heavy = {"randomise": {"gravity.line_density": (1.0, 1.0)}, "threads": 1}
     fresh, used = (BatchEnv("Reach", 1, **heavy) for _ in range(2))
     used.reset(seed=1)
-    used.task.tip[:] += 0.1  # type: ignore[attr-defined]  # as if it had been elsewhere
+    used.task.tip[:] += 0.1  # as if it had been elsewhere
     assert_array_equal(used.reset(seed=3)[0], fresh.reset(seed=3)[0])
-    assert_array_equal(used.task.direction, fresh.task.direction)  # type: ignore[attr-defined]
-    assert_array_equal(used.task.tip, fresh.task.tip)  # type: ignore[attr-defined]
+    assert_array_equal(used.task.direction, fresh.task.direction)
+    assert_array_equal(used.task.tip, fresh.task.tip)

@@ -70,17 +70,18 @@ def test_gymnasiums_checker_has_nothing_to_say(name: str) -> None:
 
 
 def task_length(env: gymnasium.Env[Any, Any]) -> int:
-    return int(env.unwrapped.task.n_actions)  # type: ignore[attr-defined]
+    return int(env.unwrapped.task.n_actions)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_stable_baselines_checker_has_nothing_to_say(name: str) -> None:
     checker = pytest.importorskip(
-        "stable_baselines3.common.env_checker", reason="stable-baselines3 is not installed: pip install 'fastrod[rl]'"
+        "stable_baselines3.common.env_checker",
+        reason="stable-baselines3 is not installed: pip install 'fastrod[rl]'",
     )
     env = single(name)
     checker.check_env(env.unwrapped, warn=True)
-    assert (env.unwrapped.task.actions[0].unit or "") == env.unwrapped.task.actions[0].unit  # type: ignore[attr-defined]
+    assert (env.unwrapped.task.actions[0].unit or "") == env.unwrapped.task.actions[0].unit
     env.close()
 
 
@@ -133,7 +134,9 @@ def test_a_step_brings_new_arrays_within_the_spaces(batch: BatchEnv) -> None:
         assert np.isfinite(reward).all()
         assert (info["distance"] >= 0.0).all()
         terms = info["reward_terms"]
-        assert_allclose(sum(terms[key] for key in terms if not key.startswith("_")), reward, rtol=1e-12, atol=1e-12)
+        assert_allclose(
+            sum(terms[key] for key in terms if not key.startswith("_")), reward, rtol=1e-12, atol=1e-12
+        )
 
 
 def test_episodes_end_and_begin_in_the_same_step(batch: BatchEnv) -> None:
@@ -245,7 +248,8 @@ def test_nothing_breaks_under_random_actions(name: str) -> None:
     alone = isinstance(env.task, RodTask) and env.task.simulator.contact is None
     env.reset(seed=11)
     with np.errstate(divide="raise", over="raise", invalid="raise"):
-        for action in np.sign(drawn(env, 6, 400 if alone else 60)):  # at the largest rates: the roughest there is
+        # at the largest rates: the roughest there is
+        for action in np.sign(drawn(env, 6, 400 if alone else 60)):
             observation, reward, *_, info = env.step(action)
             assert np.isfinite(observation).all()
             assert np.isfinite(reward).all()

@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed: pip install 'fastrod[rl]'")
+pytest.importorskip(
+    "stable_baselines3", reason="stable-baselines3 is not installed: pip install 'fastrod[rl]'"
+)
 
 from rich.console import Console
 

@@ -1,4 +1,5 @@
-"""Runs on the emulated prototype in stepped time: what hands are asked for, what is recorded, what is kept when it is stopped."""
+"""Runs on the emulated prototype in stepped time: what hands are asked for, what is recorded, what is kept
+when it is stopped."""
 
 from __future__ import annotations
 
@@ -27,7 +28,10 @@ from fastrod_device.workbench import Bench, emulated
 
 ROBOT = load_robot("prototype")
 MASS = 0.01
-UPRIGHT, TILTED = np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.9659258262890683, 0.25881904510252074, 0.0, 0.0])
+UPRIGHT, TILTED = (
+    np.array([1.0, 0.0, 0.0, 0.0]),
+    np.array([0.9659258262890683, 0.25881904510252074, 0.0, 0.0]),
+)
 SECONDS = 1.6  # of a block
 
 
@@ -74,9 +78,14 @@ def short_run() -> Excitation:
     payload = np.where((block == 1) | (block == 2), MASS, 0.0)
     base = np.where((block == 2)[:, None], TILTED, UPRIGHT)
     log = RunLog(
-        name="short", t=t, run=np.full(len(t), "run"), dl=wires(0.3 * np.stack([np.sin(phase), np.sin(phase) ** 2], axis=1)),
-        tip_position=np.full((len(t), 3), np.nan), payload=payload, base_quaternion=base,
-    )  # fmt: skip
+        name="short",
+        t=t,
+        run=np.full(len(t), "run"),
+        dl=wires(0.3 * np.stack([np.sin(phase), np.sin(phase) ** 2], axis=1)),
+        tip_position=np.full((len(t), 3), np.nan),
+        payload=payload,
+        base_quaternion=base,
+    )
     return Excitation(log=log, parts=())
 
 
@@ -89,7 +98,13 @@ def circle_plan() -> Plan:
 
 def test_hands_are_asked_in_the_order_of_the_run(bench: Bench, tmp_path: Path) -> None:
     hands, run, told = Noting(bench), short_run(), []
-    log = excite(bench.prototype, run, hands, tmp_path / "run.csv", progress=lambda what, done, total: told.append((what, done, total)))
+    log = excite(
+        bench.prototype,
+        run,
+        hands,
+        tmp_path / "run.csv",
+        progress=lambda what, done, total: told.append((what, done, total)),
+    )
     assert hands.asked == [("hang", MASS), ("turn", TILTED[1]), ("hang", 0.0), ("turn", 0.0)]
     first, second, third = np.diff(hands.at)
     # after each, the robot waits until hands have left the marker free
@@ -159,13 +174,16 @@ def test_a_plan_is_followed_by_the_model_and_by_the_policy(bench: Bench, tmp_pat
     model = tracking("circle", follow(bench.prototype, made, tmp_path / "model.csv"), made)
     pilot = TrackPilot(Policy(find("Track", "shipped")), "circle", ROBOT)
     bench.prototype.follow(lambda s: (1.0 - min(s, 1.0)) * made.dl[-1], 1.2)  # a policy begins at home
-    law = follow(bench.prototype, made, tmp_path / "policy.csv", law=lambda tip, t: pilot.command(tip, t - APPROACH))
+    law = follow(
+        bench.prototype, made, tmp_path / "policy.csv", law=lambda tip, t: pilot.command(tip, t - APPROACH)
+    )
     policy = tracking("circle", law, made)
     for found in (model, policy):
         on_path = np.isfinite(found.path).all(axis=1)
         assert on_path.sum() == pytest.approx(references(ROBOT.length)["circle"].period * 15.0, abs=4)
         assert found.log.measured[on_path].mean() > 0.9
-    # 20 mm of circle by a body that is some per cent stiffer or softer than the model's: the wires decide, to some tenths of a millimetre;
+    # 20 mm of circle by a body that is some per cent stiffer or softer than the model's: the wires decide, to
+    # some tenths of a millimetre;
     # the policy sees the tip, a frame and a latency late: its own residual is about a millimetre
     assert model.distance < 1e-3
     assert policy.distance < 2e-3
@@ -190,7 +208,12 @@ def test_a_stop_on_the_way_keeps_the_rows(bench: Bench, tmp_path: Path) -> None:
 def test_a_law_beyond_the_limits_is_refused(bench: Bench, tmp_path: Path) -> None:
     made = circle_plan()
     with pytest.raises((RefusedError, DeviceError)) as caught:
-        follow(bench.prototype, made, tmp_path / "far.csv", law=lambda tip, t: made.dl[0] if t < 0.5 else np.full(4, 0.05))
+        follow(
+            bench.prototype,
+            made,
+            tmp_path / "far.csv",
+            law=lambda tip, t: made.dl[0] if t < 0.5 else np.full(4, 0.05),
+        )
     assert "\n" not in str(caught.value)
     assert len(read_log(tmp_path / "far.csv", ROBOT)) > 4
 
@@ -199,20 +222,38 @@ def test_a_law_beyond_the_limits_is_refused(bench: Bench, tmp_path: Path) -> Non
 
 
 def test_tracking_numbers_by_hand() -> None:
-    """Off by 1 mm along x; the nearest points in reach are 2 mm above the path; the robot lags by the plan's lead."""
+    """Off by 1 mm along x; the nearest points in reach are 2 mm above the path; the robot lags by the plan's
+    lead."""
     n, lead = 40, 0.1
     t = 0.05 * np.arange(n)
     target = np.stack([0.02 * np.cos(t), 0.02 * np.sin(t), np.full(n, 0.07)], axis=1)
     target[:8] = np.nan
     nearest = target + np.array([0.0, 0.0, 2e-3])
     made = Plan(
-        robot=ROBOT, t=t, dl=np.zeros((n, 4)), ext=np.zeros((n, 1)), target=target, predicted=nearest, nearest=nearest, lead=lead,
-        n_approach=8, rms_predicted=0.0, rms_nearest=0.0, rms_distance=0.0, rollouts=1,
-    )  # fmt: skip
+        robot=ROBOT,
+        t=t,
+        dl=np.zeros((n, 4)),
+        ext=np.zeros((n, 1)),
+        target=target,
+        predicted=nearest,
+        nearest=nearest,
+        lead=lead,
+        n_approach=8,
+        rms_predicted=0.0,
+        rms_nearest=0.0,
+        rms_distance=0.0,
+        rollouts=1,
+    )
     tip = np.where(np.isfinite(target), target + np.array([1e-3, 0.0, 0.0]), 9.0)
     tip[20] = np.nan
     late = np.append(t + lead, t[-1] + 5.0)  # a row after the plan
-    log = RunLog(name="x", t=late, run=np.full(n + 1, ""), dl=np.zeros((n + 1, 4)), tip_position=np.vstack([tip, [9.0] * 3]))
+    log = RunLog(
+        name="x",
+        t=late,
+        run=np.full(n + 1, ""),
+        dl=np.zeros((n + 1, 4)),
+        tip_position=np.vstack([tip, [9.0] * 3]),
+    )
     found = tracking("circle", log, made)
     assert_allclose(found.rms, [1e-3, 0.0, 0.0], atol=1e-12)
     assert_allclose(found.floor_rms, [0.0, 0.0, 2e-3], atol=1e-12)

@@ -11,20 +11,40 @@ from fastrod.errors import InputError
 from fastrod_viewer.export import external_references, legend, wrap, write_page
 
 PAGE = (
-    "<!doctype html><html><head><title>Viser</title><script>const a='https://example.org/x.js'</script></head><body><p>3D</p></body></html>"
+    "<!doctype html><html><head><title>Viser</title><script>const "
+    "a='https://example.org/x.js'</script></head><body><p>3D</p></body></html>"
 )
 PLOT = '<svg viewBox="0 0 9 9"><defs><path id="residual-a"/></defs><use href="#residual-a"/></svg>'
 
 
 def test_words_stand_in_the_page_as_text() -> None:
     page = wrap(
-        PAGE, title="a < b", subtitle="run & model", legend_html=legend([("#c00", "tip <measured>")]), plot_svg=PLOT,
-        facts=[("rms", "0.5 mm"), ("<b>", "x")], note="\"noted\"",
-    )  # fmt: skip
+        PAGE,
+        title="a < b",
+        subtitle="run & model",
+        legend_html=legend([("#c00", "tip <measured>")]),
+        plot_svg=PLOT,
+        facts=[("rms", "0.5 mm"), ("<b>", "x")],
+        note='"noted"',
+    )
     assert "<title>a &lt; b</title>" in page
-    for words in ("run &amp; model", "tip &lt;measured&gt;", "--c: #c00", "0.5 mm", "&lt;b&gt;", "&quot;noted&quot;", PLOT):
+    for words in (
+        "run &amp; model",
+        "tip &lt;measured&gt;",
+        "--c: #c00",
+        "0.5 mm",
+        "&lt;b&gt;",
+        "&quot;noted&quot;",
+        PLOT,
+    ):
         assert words in page
-    assert page.index("<style>") < page.index("</head>") < page.index("<p>3D</p>") < page.index('class="fr-over"') < page.index("</body>")
+    assert (
+        page.index("<style>")
+        < page.index("</head>")
+        < page.index("<p>3D</p>")
+        < page.index('class="fr-over"')
+        < page.index("</body>")
+    )
     assert external_references(page) == []
     assert "pointer-events: none" in page
 
@@ -122,7 +142,12 @@ def test_visers_own_page_is_wrapped_and_stays_whole(viser_page: str) -> None:
     assert page.count("</body>") == 1
     assert external_references(page) == []
     added = page.replace(
-        viser_page[viser_page.index("<title>Viser</title>") + len("<title>Viser</title>") : viser_page.index("</head>")], ""
+        viser_page[
+            viser_page.index("<title>Viser</title>") + len("<title>Viser</title>") : viser_page.index(
+                "</head>"
+            )
+        ],
+        "",
     )
     assert "http://" not in added[added.index("<style>") :]
     assert "https://" not in added[added.index("<style>") :]

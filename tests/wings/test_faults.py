@@ -1,4 +1,5 @@
-"""Faults put into a prototype that moves: it stops, says why, keeps every line and row, and moves again only when a person says so."""
+"""Faults put into a prototype that moves: it stops, says why, keeps every line and row, and moves again only
+when a person says so."""
 
 from __future__ import annotations
 
@@ -41,14 +42,23 @@ class Rig:
 
     def __init__(self, folder: Path, *, rate: float, following_error: float) -> None:
         hardware = load_hardware()
-        hardware = replace(hardware, limits=replace(hardware.limits, rate=rate, following_error=following_error))
+        hardware = replace(
+            hardware, limits=replace(hardware.limits, rate=rate, following_error=following_error)
+        )
         self.bus = f"virtual:faults-{next(_names)}"
         self.clock, self.radius, self.jump = SteppedClock(), RADIUS, 0.0
-        self.emulator = Emulator(hardware, self.bus, clock=self.clock, seal=seal(3, "none"), seed=3, taut=True)
+        self.emulator = Emulator(
+            hardware, self.bus, clock=self.clock, seal=seal(3, "none"), seed=3, taut=True
+        )
         self.drives = self.emulator.drives
         self.events, self.log = folder / "events.csv", folder / "log.csv"
         self.prototype = Prototype(
-            hardware, self.bus, self.emulator, clock=self.clock, journal=Journal(self.events), wall=lambda: self.clock.now() + self.jump
+            hardware,
+            self.bus,
+            self.emulator,
+            clock=self.clock,
+            journal=Journal(self.events),
+            wall=lambda: self.clock.now() + self.jump,
         )
         self.supervisor = self.prototype.supervisor
         self.prototype.start(home=False)
@@ -93,7 +103,9 @@ class Rig:
 
 
 @contextmanager
-def moving(folder: Path, moment: float, *, rate: float = 0.02, following_error: float = 2.5e-4) -> Iterator[Rig]:
+def moving(
+    folder: Path, moment: float, *, rate: float = 0.02, following_error: float = 2.5e-4
+) -> Iterator[Rig]:
     """With a following error of 1 mm a wire that stalls is found by its tension before."""
     rig = Rig(folder, rate=rate, following_error=following_error)
     try:
@@ -133,15 +145,24 @@ def storm(rig: Rig) -> None:
 
 
 FAULTS: dict[str, tuple[Callable[[Rig], None], tuple[str, ...]]] = {
-    "heartbeat lost": (lambda rig: rig.drives.lose_heartbeat(1), ("drive 2 (node 2)", "sent its last heartbeat")),
-    "emergency message": (lambda rig: rig.drives.emergency(2, 0x2310, lasting=True), ("drive 3 (node 3)", "0x2310", "over-current")),
+    "heartbeat lost": (
+        lambda rig: rig.drives.lose_heartbeat(1),
+        ("drive 2 (node 2)", "sent its last heartbeat"),
+    ),
+    "emergency message": (
+        lambda rig: rig.drives.emergency(2, 0x2310, lasting=True),
+        ("drive 3 (node 3)", "0x2310", "over-current"),
+    ),
     "following error": (block, ("(node ", "ollowing error")),
     "bus off": (lambda rig: rig.drives.bus_off(), ("the bus carries nothing",)),
     "node reboot": (lambda rig: rig.drives.reboot(3), ("drive 4 (node 4)", "0 (booting)")),
     "camera frozen": (freeze, ("the camera repeats its frames",)),
     "marker lost": (hide, ("the marker was last seen", "the limit is 500 ms")),
     "clock jump": (jump, ("the wall clock jumped by 3.6e+06 ms",)),
-    "encoder jump": (lambda rig: rig.drives.encoder_jump(0, 2500), ("drive 1 (node 1)", "moved its wire by -1.")),
+    "encoder jump": (
+        lambda rig: rig.drives.encoder_jump(0, 2500),
+        ("drive 1 (node 1)", "moved its wire by -1."),
+    ),
     "foreign SYNC": (storm, ("another node sends SYNC (5 since the last cycle)",)),
 }
 ONCE = ("following error", "clock jump")  # nothing tells that they are still there
@@ -149,7 +170,9 @@ ONCE = ("following error", "clock jump")  # nothing tells that they are still th
 
 @pytest.mark.parametrize("moment", [0.75, 1.32])
 @pytest.mark.parametrize("name", FAULTS)
-def test_a_fault_stops_the_robot_is_named_and_nothing_is_lost_or_starts_again(name: str, moment: float, tmp_path: Path) -> None:
+def test_a_fault_stops_the_robot_is_named_and_nothing_is_lost_or_starts_again(
+    name: str, moment: float, tmp_path: Path
+) -> None:
     inject, words = FAULTS[name]
     with moving(tmp_path, moment) as rig:
         inject(rig)
@@ -197,7 +220,8 @@ def test_a_release_waits_for_the_end_of_the_cause(name: str, tmp_path: Path) -> 
         assert not any(rig.enabled)
         where = rig.drives.true_pulled
         rig.prototype.release()
-        if name in ("node reboot", "encoder jump"):  # its counter is lost: only a new start, with its homing, helps
+        # its counter is lost: only a new start, with its homing, helps
+        if name in ("node reboot", "encoder jump"):
             assert rig.stopped
             assert "where its wire is may be lost" in rig.prototype.read().problem
             return
@@ -234,8 +258,11 @@ def test_a_jump_beyond_the_drives_own_window_is_named_as_a_jump(tmp_path: Path) 
         rig.go_on(0.5, lambda: rig.stopped)
         assert rig.supervisor.first is not None
         assert rig.supervisor.first.kind == "encoder jump"
-        assert "emergency message" in [fault.kind for fault in rig.supervisor.faults]  # the drive's own following error
-        assert [line[1] for line in rig.prototype.journal.lines] == [fault.kind for fault in rig.supervisor.faults]
+        # the drive's own following error
+        assert "emergency message" in [fault.kind for fault in rig.supervisor.faults]
+        assert [line[1] for line in rig.prototype.journal.lines] == [
+            fault.kind for fault in rig.supervisor.faults
+        ]
 
 
 def test_a_controller_that_pauses_is_stopped_when_it_comes_back(tmp_path: Path) -> None:
@@ -254,7 +281,8 @@ def test_drives_whose_controller_is_gone_stop_by_themselves(tmp_path: Path) -> N
 
     with moving(tmp_path, 0.75) as rig, can.Bus(interface="virtual", channel=rig.bus.split(":")[1]) as other:
         rows, t = len(rig.recorder), rig.clock.now()
-        for _ in range(100):  # another SYNC goes on, by which the drives keep time; targets and heartbeats do not come any more
+        # another SYNC goes on, by which the drives keep time; targets and heartbeats do not come any more
+        for _ in range(100):
             rig.clock.sleep_until(rig.clock.now() + 0.01)
             other.send(can.Message(arbitration_id=0x80, is_extended_id=False))
             _heard(other, 8)
@@ -288,7 +316,7 @@ from dataclasses import replace
 import fastrod_device.configuring, fastrod_device.cycle
 fastrod_device.configuring.PATIENCE, fastrod_device.cycle._PAUSE = 1.0, 0.8
 hardware = load_hardware()
-limits = replace(hardware.limits, sighting_age=None, feedback_age=0.5, heartbeat_age=2.0, cycle=0.5)  # a busy machine is no fault here
+limits = replace(hardware.limits, sighting_age=None, feedback_age=0.5, heartbeat_age=2.0, cycle=0.5)
 hardware = replace(hardware, limits=limits)
 class Still:
     eye, number, due = Eye(hardware.camera, hardware.marker, seed=1), 0, 0.0

@@ -1,4 +1,5 @@
-"""The hardware file: what it says is what comes out, the camera in it or beside it, and one sentence for each mistake."""
+"""The hardware file: what it says is what comes out, the camera in it or beside it, and one sentence for each
+mistake."""
 
 from __future__ import annotations
 
@@ -53,7 +54,11 @@ def test_what_is_left_out_has_defaults(tmp_path: Path) -> None:
 
 def test_the_camera_may_be_a_file_beside_it(tmp_path: Path) -> None:
     shipped = load_hardware()
-    camera = replace(shipped.camera, matrix=((812.5, 0.0, 318.25), (0.0, 811.125, 240.5), (0.0, 0.0, 1.0)), distortion=(-0.2, 0.1, 0, 0, 0))
+    camera = replace(
+        shipped.camera,
+        matrix=((812.5, 0.0, 318.25), (0.0, 811.125, 240.5), (0.0, 0.0, 1.0)),
+        distortion=(-0.2, 0.1, 0, 0, 0),
+    )
     save_camera(camera, tmp_path / "camera.toml")
     (tmp_path / "mine.toml").write_text('camera = "camera.toml"\n' + without_camera(), encoding="utf-8")
     hardware = load_hardware(tmp_path / "mine.toml")
@@ -71,17 +76,34 @@ def test_the_robot_may_be_a_file_beside_it_or_given(tmp_path: Path) -> None:
 MISTAKES = {
     "top key": ("pretension", "pretention", "has an unknown key 'pretention'; did you mean 'pretension'?"),
     "drive key": ("node = 3", "nod = 3", "drive 3 has an unknown key 'nod'; did you mean 'node'?"),
-    "camera key": ("latency = 0.03", "latancy = 0.03", "[camera] has an unknown key 'latancy'; did you mean 'latency'?"),
-    "limit key": ("displacement =", "displacements =", "[limits] has an unknown key 'displacements'; did you mean 'displacement'?"),
+    "camera key": (
+        "latency = 0.03",
+        "latancy = 0.03",
+        "[camera] has an unknown key 'latancy'; did you mean 'latency'?",
+    ),
+    "limit key": (
+        "displacement =",
+        "displacements =",
+        "[limits] has an unknown key 'displacements'; did you mean 'displacement'?",
+    ),
     "no robot": ('robot = "prototype"', "", "lacks robot."),
     "drive without drum": ("drum_radius = 0.008     # m", "", "drive 1 lacks drum_radius."),
     "a word for a number": ("size = 0.018", 'size = "18 mm"', "[marker]: size: Expected 'float', got 'str'."),
-    "one number of many": ("size = [640, 480]", 'size = [640, "480"]', "[camera]: size[1]: Expected 'int', got 'str'."),
-    "a word for the rate": ("rate = 100.0 ", 'rate = "fast" ', "rate is 'fast'; it must be from 50 to 500 Hz."),
+    "one number of many": (
+        "size = [640, 480]",
+        'size = [640, "480"]',
+        "[camera]: size[1]: Expected 'int', got 'str'.",
+    ),
+    "a word for the rate": (
+        "rate = 100.0 ",
+        'rate = "fast" ',
+        "rate is 'fast'; it must be from 50 to 500 Hz.",
+    ),
     "pretension that no drive can tell": (
         "pretension = 1.0 ",
         "pretension = 0.1 ",
-        "pretension is 0.1 N; the drive at node 1 tells torque in steps of 0.113 N of its wire, so it must be at least 0.114 N.",
+        "pretension is 0.1 N; the drive at node 1 tells torque in steps of 0.113 N of its wire, so it must "
+        "be at least 0.114 N.",
     ),
     "a coarser drive": (
         "node = 3\ndrum_radius = 0.008",
@@ -89,13 +111,41 @@ MISTAKES = {
         "node 3 tells torque in steps of 1.13 N of its wire, so it must",
     ),
     "rate out of range": ("rate = 100.0 ", "rate = 5.0 ", "rate is 5.0; it must be from 50 to 500 Hz."),
-    "drum in mm": ("drum_radius = 0.008     # m", "drum_radius = 8", "drive 1: DriveSpec.drum_radius of node 1 is 8"),
-    "dictionary": ("DICT_4X4_50", "DICT_4X4_5", "[marker]: no marker dictionary 'DICT_4X4_5'; did you mean 'DICT_4X4_50'?"),
-    "marker's number": ("id = 7", "id = 70", "[marker]: Marker.id is 70; DICT_4X4_50 has the numbers 0 to 49."),
-    "a node twice": ("node = 4", "node = 3", "the drives have node ids [1, 2, 3, 3]; each must be there once."),
-    "too few drives": ("[[drive]]\nnode = 2\ndrum_radius = 0.008\n", "", "there are 3 drives and robot 'prototype' has 4 tendons."),
-    "robot is a number": ('robot = "prototype"', "robot = 3", "robot is 3; give a shipped robot's name, or a robot file's in quotes."),
-    "no such robot": ('robot = "prototype"', 'robot = "prototyp"', "no robot 'prototyp'; did you mean 'prototype'?"),
+    "drum in mm": (
+        "drum_radius = 0.008     # m",
+        "drum_radius = 8",
+        "drive 1: DriveSpec.drum_radius of node 1 is 8",
+    ),
+    "dictionary": (
+        "DICT_4X4_50",
+        "DICT_4X4_5",
+        "[marker]: no marker dictionary 'DICT_4X4_5'; did you mean 'DICT_4X4_50'?",
+    ),
+    "marker's number": (
+        "id = 7",
+        "id = 70",
+        "[marker]: Marker.id is 70; DICT_4X4_50 has the numbers 0 to 49.",
+    ),
+    "a node twice": (
+        "node = 4",
+        "node = 3",
+        "the drives have node ids [1, 2, 3, 3]; each must be there once.",
+    ),
+    "too few drives": (
+        "[[drive]]\nnode = 2\ndrum_radius = 0.008\n",
+        "",
+        "there are 3 drives and robot 'prototype' has 4 tendons.",
+    ),
+    "robot is a number": (
+        'robot = "prototype"',
+        "robot = 3",
+        "robot is 3; give a shipped robot's name, or a robot file's in quotes.",
+    ),
+    "no such robot": (
+        'robot = "prototype"',
+        'robot = "prototyp"',
+        "no robot 'prototyp'; did you mean 'prototype'?",
+    ),
 }
 
 
@@ -123,7 +173,10 @@ def test_tables_that_are_none(tmp_path: Path) -> None:
     for text, sentence in (
         ("limits = 3\n" + TEXT.replace("[limits]", "[limit]"), "unknown key 'limit'"),
         ("camera = 3\n" + without_camera(), r"\[camera\] is 3; it must be a table"),
-        ('camera = "none.toml"\n' + without_camera(), "there is no file .*none.toml.*; give a camera file, or a table"),
+        (
+            'camera = "none.toml"\n' + without_camera(),
+            "there is no file .*none.toml.*; give a camera file, or a table",
+        ),
         ("drive = 3\n" + TEXT[: TEXT.index("[[drive]]")], r"drive is one table; write \[\[drive\]\]"),
         ("drive = [3]\n" + TEXT[: TEXT.index("[[drive]]")], "drive 1 is 3; it must be a table"),
     ):
@@ -142,5 +195,9 @@ def test_files_that_are_none(tmp_path: Path) -> None:
     path = tmp_path / "camera.toml"
     path.write_text(path.read_text(encoding="utf-8").replace("rate = ", "rat = "), encoding="utf-8")
     (tmp_path / "mine.toml").write_text('camera = "camera.toml"\n' + without_camera(), encoding="utf-8")
-    with pytest.raises(UnknownNameError, match=r"camera file '.*camera.toml' has an unknown key 'rat'; did you mean 'rate'\?"):
+    with pytest.raises(
+        UnknownNameError,
+        match=r"camera file '.*camera.toml' has an unknown key 'rat'; did "
+        r"you mean 'rate'\?",
+    ):
         load_hardware(tmp_path / "mine.toml")

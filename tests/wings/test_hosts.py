@@ -17,7 +17,8 @@ MOUNT = {"position": (0.02, 0.01, 0.05), "quaternion": (0.5, 0.5, -0.5, 0.5)}
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_joints_feel_the_wrench_through_the_transposed_jacobian(seed):
-    # M dq'/dt with the rod, less that without it, is J^T F; PyBullet keeps poses in single precision, so 1e-7 is what it has
+    # M dq'/dt with the rod, less that without it, is J^T F; PyBullet keeps poses in single precision, so 1e-7
+    # is what it has
     world = empty_world(dt=0.001)
     arm, q, rate = kuka(world, seed)
     n = len(q)
@@ -51,7 +52,9 @@ def test_free_body_feels_force_and_moment(inertial):
     world = empty_world(dt=0.001)
     shape = world.createCollisionShape(world.GEOM_BOX, halfExtents=[0.05, 0.03, 0.02])
     off = [0.01, -0.02, 0.03] if inertial else [0.0, 0.0, 0.0]
-    body = world.createMultiBody(2.0, shape, -1, [0.1, 0.2, 0.3], to_xyzw([0.5, 0.5, 0.5, -0.5]).tolist(), off)
+    body = world.createMultiBody(
+        2.0, shape, -1, [0.1, 0.2, 0.3], to_xyzw([0.5, 0.5, 0.5, -0.5]).tolist(), off
+    )
     world.changeDynamics(body, -1, linearDamping=0.0, angularDamping=0.0)
     link = BulletLink(world, body, **MOUNT)
     wrench = np.array([0.5, -0.3, 0.2, 0.02, 0.01, -0.03])
@@ -78,7 +81,8 @@ def test_motion_of_the_base_is_the_derivative_of_its_pose(seed):
         return link.motion().pose
 
     after, before, motion = pose(h), pose(-h), (pose(0.0), link.motion())[1]
-    np.testing.assert_allclose((after - before)[:3] / (2 * h), motion.velocity[:3], atol=2e-4)  # poses in single precision: 1e-7 / h
+    # poses in single precision: 1e-7 / h
+    np.testing.assert_allclose((after - before)[:3] / (2 * h), motion.velocity[:3], atol=2e-4)
     turn = matrix_from_quaternion(after[None, 3:])[0] @ matrix_from_quaternion(before[None, 3:])[0].T
     spin = np.array([turn[2, 1], turn[0, 2], turn[1, 0]]) / (2 * h)
     np.testing.assert_allclose(spin, motion.velocity[3:], atol=5e-4)
@@ -93,7 +97,8 @@ def test_base_of_a_body_is_its_frame_and_not_its_centre_of_mass():
     np.testing.assert_allclose(link_motion(world, body, -1).pose[:3], [0.3, 0.0, 0.0], atol=1e-6)
     world.resetBaseVelocity(body, [0.0] * 3, [0.0, 0.0, 2.0])
     # the centre of mass rests, so the frame, 0.1 m below it in y, goes round it: w x (-0.1 e_y) = +0.2 e_x
-    np.testing.assert_allclose(link_motion(world, body, -1).velocity[:3], [0.2, 0.0, 0.0], atol=1e-6)  # single precision
+    # single precision
+    np.testing.assert_allclose(link_motion(world, body, -1).velocity[:3], [0.2, 0.0, 0.0], atol=1e-6)
 
 
 def test_rod_follows_a_host_that_moves_and_turns():
@@ -102,7 +107,9 @@ def test_rod_follows_a_host_that_moves_and_turns():
     rod = MountedRod(robot, link)
     pulled = robot.rest_tendon_length + np.array([-3, 0, 3, 0, -6, 2, 6, -2]) * 1e-3
     rest = rod.settle(tendon_length=pulled).tip_position[0]
-    world.resetBasePositionAndOrientation(link.body, [0.3, -0.2, 0.1], to_xyzw([0.5, 0.5, -0.5, 0.5]).tolist())
+    world.resetBasePositionAndOrientation(
+        link.body, [0.3, -0.2, 0.1], to_xyzw([0.5, 0.5, -0.5, 0.5]).tolist()
+    )
     rod.step()
     turn = matrix_from_quaternion(np.array([[0.5, 0.5, -0.5, 0.5]]))[0]
     np.testing.assert_allclose(rod.state.tip_position[0], [0.3, -0.2, 0.1] + turn @ rest, atol=1e-6)
@@ -175,7 +182,11 @@ def test_client_is_taken_as_users_have_it():
 def test_gui_without_a_display_is_a_sentence(monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.setattr("sys.platform", "linux")
-    with pytest.raises(HostError, match=r"^PyBullet's GUI needs a display, and DISPLAY is not set; leave gui=False"):
+    with pytest.raises(
+        HostError,
+        match=r"^PyBullet's GUI needs a display, and DISPLAY is not set; leave "
+        r"gui=False",
+    ):
         connect(gui=True)
 
 
@@ -184,9 +195,17 @@ def test_what_is_not_there_is_a_sentence():
     arm, _, _ = kuka(world, 0)
     with pytest.raises(HostError, match=r"this PyBullet world has no body 7; it has \[0\]\."):
         BulletLink(world, 7)
-    with pytest.raises(HostError, match=r"body 0 has no link 9; -1 is its base, links are numbered from 0 to 6\."):
+    with pytest.raises(
+        HostError,
+        match=r"body 0 has no link 9; -1 is its base, links are numbered from 0 "
+        r"to 6\.",
+    ):
         BulletLink(world, arm, 9)
-    with pytest.raises(HostError, match=r"body 0 has no link 'lbr_iiwa_link_8'; did you mean 'lbr_iiwa_link_7'\?"):
+    with pytest.raises(
+        HostError,
+        match=r"body 0 has no link 'lbr_iiwa_link_8'; did you mean "
+        r"'lbr_iiwa_link_7'\?",
+    ):
         BulletLink(world, arm, "lbr_iiwa_link_8")
     with pytest.raises(HostError, match=r"quaternion \[1.0, 1.0, 0.0, 0.0\] has norm 1.41421; it must be 1"):
         BulletLink(world, arm, 0, quaternion=(1, 1, 0, 0))
@@ -194,7 +213,11 @@ def test_what_is_not_there_is_a_sentence():
         Bullet("world")
     with pytest.raises(HostError, match=r"PyBullet has no world 9999; connect first"):
         Bullet(9999)
-    with pytest.raises(InputError, match=r"3 capsules for 10 points of a segment; give a divisor of the points\."):
+    with pytest.raises(
+        InputError,
+        match=r"3 capsules for 10 points of a segment; give a divisor of the "
+        r"points\.",
+    ):
         MountedRod(soft_robot(), carrier(world), capsules_per_segment=3)
     with pytest.raises(InputError, match=r"relaxation is -1 s; it must be a number, zero or positive\."):
         MountedRod(soft_robot(), carrier(world), relaxation=-1)

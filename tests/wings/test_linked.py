@@ -44,9 +44,12 @@ class Watched:
         self.inner = SimulatedRobot(fastrod.load_robot("prototype"), real=True)
         self.robot, self.read, self.close = self.inner.robot, self.inner.read, self.inner.close
         self.supervisor = SimpleNamespace(
-            limits=SimpleNamespace(displacement=0.005, rate=0.004), state=State.RUNNING, status="It runs.", first=None,
+            limits=SimpleNamespace(displacement=0.005, rate=0.004),
+            state=State.RUNNING,
+            status="It runs.",
+            first=None,
             client_lost=lambda now: self.halt(f"nobody, at {now:g} s"),
-        )  # fmt: skip
+        )
         self.clock = SimpleNamespace(now=lambda: 7.0)
         self.source: object | None = object()
         self.sighting = SimpleNamespace(t=6.96, flag="")
@@ -61,7 +64,11 @@ class Watched:
 
     def halt(self, why: str) -> None:
         self.inner.stop()
-        self.supervisor.state, self.supervisor.first, self.supervisor.status = State.STOPPED, why, f"Stopped: {why}."
+        self.supervisor.state, self.supervisor.first, self.supervisor.status = (
+            State.STOPPED,
+            why,
+            f"Stopped: {why}.",
+        )
 
     def stop(self) -> None:
         self.halt("a button")
@@ -92,7 +99,7 @@ def until(holds: Callable[[], bool], seconds: float = 30.0) -> bool:
 
 def driven(link: object) -> Session:
     world = FreeWorld(fastrod.load_robot("prototype"))
-    return Session(world, Pilot(world, reach=Linked(link).reach), draw=lambda frame: None, link=link)  # type: ignore[arg-type]
+    return Session(world, Pilot(world, reach=Linked(link).reach), draw=lambda frame: None, link=link)
 
 
 def test_wires_keep_to_the_rate_of_the_link_and_go_straight() -> None:
@@ -164,7 +171,8 @@ def test_a_fault_stops_the_session_which_waits_until_the_link_is_ready() -> None
     link.readings.dl = np.array([-0.001, 0.0, 0.001, 0.0])  # where it came to rest
     n = len(link.glides)
     session.pilot.bend(0, 0.6, 0.0)
-    assert until(lambda: session.pilot.bent(0)[0] == pytest.approx(0.001 / 0.0075))  # the model stands as the encoders say
+    # the model stands as the encoders say
+    assert until(lambda: session.pilot.bent(0)[0] == pytest.approx(0.001 / 0.0075))
     time.sleep(1.1)  # sooner it is ignored
     session.release()
     assert link.asked == 1
@@ -227,14 +235,17 @@ def test_when_nobody_watches_the_guard_is_told_so() -> None:
 
 def test_figures_of_a_link() -> None:
     link = Watched()
-    far, now = Linked(link), link.read()  # type: ignore[arg-type]
-    assert far_rows(far, now) == [("Wires pull", "1.00 · 2.00 · 3.00 · 4.00 N"), ("Camera", "marker seen 40 ms ago")]
+    far, now = Linked(link), link.read()
+    assert far_rows(far, now) == [
+        ("Wires pull", "1.00 · 2.00 · 3.00 · 4.00 N"),
+        ("Camera", "marker seen 40 ms ago"),
+    ]
     link.sighting = SimpleNamespace(t=6.99, flag="no marker")
     assert far.camera() == "no marker, last trusted 0.0 s ago"
     link.sighting = SimpleNamespace(t=5.0, flag="")
     assert far.camera() == "no picture for 2.0 s"
     link.source = None
-    assert Linked(link).camera() == ""  # type: ignore[arg-type]
+    assert Linked(link).camera() == ""
 
 
 def test_a_recording_of_a_link_begins_by_its_clock(tmp_path: Path) -> None:

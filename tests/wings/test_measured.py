@@ -1,4 +1,5 @@
-"""Adapters of the measured sets: units, frames, order, on a few rows in the published form; and on the sets where they are there."""
+"""Adapters of the measured sets: units, frames, order, on a few rows in the published form; and on the sets
+where they are there."""
 
 from __future__ import annotations
 
@@ -18,13 +19,21 @@ from fastrod_scenes import measured
 from fastrod_scenes.measured import armlab_tdcr, asl_trunk, detect, ethz_beam
 
 DATA = Path(os.environ.get("FASTROD_DATA", Path(__file__).parents[3] / "shared" / "data"))
-needs_data = pytest.mark.skipif(not (DATA / "asl_trunk.csv").is_file(), reason="no measured sets here; FASTROD_DATA names their folder")
+needs_data = pytest.mark.skipif(
+    not (DATA / "asl_trunk.csv").is_file(), reason="no measured sets here; FASTROD_DATA names their folder"
+)
 
 ASL_HEADER = (
-    "run,payload_g,row,t_s," + ",".join(f"u{k}_deg" for k in range(1, 7)) + "," + ",".join(f"phi{k}_deg" for k in range(1, 7)) + ","
+    "run,payload_g,row,t_s,"
+    + ",".join(f"u{k}_deg" for k in range(1, 7))
+    + ","
+    + ",".join(f"phi{k}_deg" for k in range(1, 7))
+    + ","
     + ",".join(f"{axis}{k}_mm" for k in (1, 2, 3) for axis in "xyz")
-)  # fmt: skip
-ETHZ_HEADER = "run,tip_load_N,t_s," + ",".join(f"{m}{k}_{axis}_mm" for m in ("tip", "base") for k in (1, 2, 3) for axis in "xyz")
+)
+ETHZ_HEADER = "run,tip_load_N,t_s," + ",".join(
+    f"{m}{k}_{axis}_mm" for m in ("tip", "base") for k in (1, 2, 3) for axis in "xyz"
+)
 ARMLAB = """row,l1_mm,l2_mm,l3_mm,x_mm,y_mm,z_mm,glitch,after_jump
 0,0,0,0.1,-43,-144,276,0,0
 1,0,0.1,0,-43,-144,278,0,0
@@ -36,7 +45,10 @@ ARMLAB = """row,l1_mm,l2_mm,l3_mm,x_mm,y_mm,z_mm,glitch,after_jump
 def asl_file(tmp_path: Path) -> Path:
     rest = "100,-106,105,100,-202,105,100,-320,105"
     pulled = "100,-106,105,100,-202,105,130,-310,145"
-    rows = [f"first,100,0,0,{','.join('0' * 6)},{','.join('0' * 6)},{rest}", f"first,100,1,0.04,1,2,3,4,5,6,10,20,30,40,50,60,{pulled}"]
+    rows = [
+        f"first,100,0,0,{','.join('0' * 6)},{','.join('0' * 6)},{rest}",
+        f"first,100,1,0.04,1,2,3,4,5,6,10,20,30,40,50,60,{pulled}",
+    ]
     path = tmp_path / "trunk.csv"
     path.write_text("\n".join([ASL_HEADER, *rows, rows[0].replace("first", "second")]))
     return path
@@ -48,7 +60,8 @@ def test_asl_trunk_units_frame_and_order(tmp_path: Path) -> None:
     assert_allclose(log.tip_position[:2], [[0.0, 0.0, 0.320], [0.030, 0.040, 0.310]], atol=1e-12)
     assert log.points is not None
     assert_allclose(log.points[0], [[0.0, 0.0, 0.106], [0.0, 0.0, 0.202]], atol=1e-12)
-    assert_allclose(np.degrees(-log.dl[1] / measured.ASL_SPOOL_RADIUS), [3, 5, 1, 6, 2, 4])  # commanded; motors 3 5 | 1 6 | 2 4
+    # commanded; motors 3 5 | 1 6 | 2 4
+    assert_allclose(np.degrees(-log.dl[1] / measured.ASL_SPOOL_RADIUS), [3, 5, 1, 6, 2, 4])
     assert sorted(log.extra) == [f"phi{k}_deg" for k in range(1, 7)]
     assert_allclose([log.extra[f"phi{k}_deg"][1] for k in range(1, 7)], [10, 20, 30, 40, 50, 60])  # measured
     assert log.payload is not None
@@ -86,10 +99,13 @@ def test_armlab_tdcr_rest_tip_is_straight_and_glitches_are_missing(tmp_path: Pat
     path.write_text(ARMLAB)
     log, robot = armlab_tdcr(path)
     assert_allclose(log.tip_position[:2].mean(axis=0), [0.0, 0.0, measured.ARMLAB_LENGTH], atol=1e-12)
-    assert_allclose(log.tip_position[2] - (0.0, 0.0, measured.ARMLAB_LENGTH), [0.007, 0.057, -0.030], atol=1e-12)
+    assert_allclose(
+        log.tip_position[2] - (0.0, 0.0, measured.ARMLAB_LENGTH), [0.007, 0.057, -0.030], atol=1e-12
+    )
     assert_array_equal(log.measured, [True, True, True, False])
     assert_allclose(log.dl[2], [0.0, -0.008, 0.0])
-    assert log.run.tolist() == ["cell_000", "cell_000", "cell_030", "cell_030"]  # 2.5 mm each: 8 mm of tendon 2 is in the fourth
+    # 2.5 mm each: 8 mm of tendon 2 is in the fourth
+    assert log.run.tolist() == ["cell_000", "cell_000", "cell_030", "cell_030"]
     # the tip goes toward the tendon that is pulled, tendon 2 at 85 deg
     assert np.dot(log.tip_position[2, :2], robot.tendons[1].position(1)[0]) > 0.0
 
@@ -102,12 +118,17 @@ def test_a_pull_at_the_edge_of_the_cube_is_in_the_last_cell(tmp_path: Path) -> N
 
 
 def test_robots_say_what_is_not_known_of_them(tmp_path: Path) -> None:
-    """Free are the numbers that nobody publishes: identification may move them, and the frame, but not what is published."""
+    """Free are the numbers that nobody publishes: identification may move them, and the frame, but not what
+    is published."""
     (tmp_path / "tdcr.csv").write_text(ARMLAB)
     (_, trunk), (_, tdcr) = asl_trunk(asl_file(tmp_path)), armlab_tdcr(tmp_path / "tdcr.csv")
     free = {robot.name: [u.name for u in base_model(robot).unknowns] for robot in (trunk, tdcr)}
     sides = [f"tendon.{k}." for k in range(1, 7)]
-    assert set(free["asl_trunk"]) >= {*(f"{side}gain" for side in sides), *(f"{side}zero" for side in sides), "segment.3.length"}
+    assert set(free["asl_trunk"]) >= {
+        *(f"{side}gain" for side in sides),
+        *(f"{side}zero" for side in sides),
+        "segment.3.length",
+    }
     assert {"segment.1.length", "tendon.*.offset"} <= set(free["armlab_tdcr"])
     for robot in (trunk, tdcr):
         assert robot.sensor["registration_sd"] == (0.01, 0.05)
@@ -119,7 +140,8 @@ def test_base_frames_hang_right_handed(tmp_path: Path) -> None:
     (tmp_path / "tdcr.csv").write_text(ARMLAB)
     for _, robot in (asl_trunk(asl_file(tmp_path)), armlab_tdcr(tmp_path / "tdcr.csv")):
         w, x, y, z = robot.base_quaternion
-        down = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])  # d3 of the base in the world
+        # d3 of the base in the world
+        down = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
         assert np.dot(down, robot.gravity) == pytest.approx(9.81)
         assert loads(dumps(robot)) == robot  # an identified robot can be written down
 
@@ -137,7 +159,9 @@ def test_detect_knows_the_raw_files_by_their_header(tmp_path: Path) -> None:
 
 def test_wrong_file_and_wrong_run_answer_with_one_sentence(tmp_path: Path) -> None:
     path = asl_file(tmp_path)
-    with pytest.raises(LogError, match=r"trunk\.csv is not the raw file of armlab_tdcr: it lacks column l1_mm"):
+    with pytest.raises(
+        LogError, match=r"trunk\.csv is not the raw file of armlab_tdcr: it lacks column l1_mm"
+    ):
         armlab_tdcr(path)
     with pytest.raises(UnknownNameError, match="no run 'frist' in log 'trunk'; did you mean 'first'"):
         asl_trunk(path, run="frist")
@@ -161,7 +185,9 @@ def test_measured_set_is_a_valid_run_log(name: str, tmp_path: Path) -> None:
 @needs_data
 def test_ethz_beam_drops_as_published() -> None:
     log, _ = ethz_beam(DATA / "ethz_beam.csv")
-    drop = {run: -1e3 * float(log.only(run).tip_position[log.only(run).measured, 0].mean()) for run in log.runs}
+    drop = {
+        run: -1e3 * float(log.only(run).tip_position[log.only(run).measured, 0].mean()) for run in log.runs
+    }
     assert drop["gravity_a"] == pytest.approx(6.5, abs=0.1)
     assert drop["gravity_b"] == pytest.approx(6.5, abs=0.1)
     assert drop["load52_a"] == pytest.approx(16.95, abs=0.1)
@@ -176,13 +202,15 @@ def test_nominal_replay_of_the_beam_is_an_unshearable_rod() -> None:
     result = replay(log, robot)
     assert result.converged.all()
     drop = {run: -1e3 * float(result.tip_position[log.run == run, 0].mean()) for run in log.runs}
-    assert drop["gravity_a"] == pytest.approx(6.6, abs=0.1)  # published for an unshearable rod: 6.6 and 15.8 mm
+    # published for an unshearable rod: 6.6 and 15.8 mm
+    assert drop["gravity_a"] == pytest.approx(6.6, abs=0.1)
     assert drop["load52_a"] == pytest.approx(15.8, abs=0.1)
 
 
 @needs_data
 def test_motors_of_the_trunk_follow_what_they_are_told_late() -> None:
-    """Why it matters whether `dl` is commanded or measured: on the wandering run they are 11.5 deg apart (rms, to 80 deg of motion)."""
+    """Why it matters whether `dl` is commanded or measured: on the wandering run they are 11.5 deg apart
+    (rms, to 80 deg of motion)."""
     log, _ = asl_trunk(DATA / "asl_trunk.csv", run="perlin_0g")
     order = [motor for pair in measured.ASL_MOTORS for motor in pair]
     told = np.degrees(-log.dl / measured.ASL_SPOOL_RADIUS)

@@ -22,12 +22,18 @@ from fastrod_scenes.ur5.mujoco_arm import JOINTS, MujocoArm, arm_spec
 
 MOUNT = {"position": (0.02, 0.01, 0.05), "quaternion": (0.5, 0.5, -0.5, 0.5)}
 BALL = '<body name="ball" pos="0.024 0 0.15"><freejoint/><geom type="sphere" size="0.02" mass="0.05"/></body>'
-SLIDING = BALL.replace("0.024 0 0.15", "0.033 0 0.15").replace("<freejoint/>", '<joint type="slide" axis="1 0 0"/>')
-POST = '<body name="post" pos="0 0 0"><geom type="box" size=".01 .01 .01" contype="0" conaffinity="0"/></body>'
+SLIDING = BALL.replace("0.024 0 0.15", "0.033 0 0.15").replace(
+    "<freejoint/>", '<joint type="slide" axis="1 0 0"/>'
+)
+POST = (
+    '<body name="post" pos="0 0 0"><geom type="box" size=".01 .01 .01" contype="0" conaffinity="0"/></body>'
+)
 
 
 def spec_of(inside, gravity=0.0, dt=0.005):
-    return mujoco.MjSpec.from_string(f'<mujoco><option timestep="{dt}" gravity="0 0 {-gravity}"/><worldbody>{inside}</worldbody></mujoco>')
+    return mujoco.MjSpec.from_string(
+        f'<mujoco><option timestep="{dt}" gravity="0 0 {-gravity}"/><worldbody>{inside}</worldbody></mujoco>'
+    )
 
 
 def moving_arm(seed, dt=0.001):
@@ -79,7 +85,9 @@ def test_motion_of_the_base_is_the_derivative_of_its_pose():
     after, before, now = pose(h), pose(-h), (pose(0.0), link.motion())[1]
     np.testing.assert_allclose((after - before)[:3] / (2 * h), now.velocity[:3], atol=1e-8)
     turn = matrix_from_quaternion(after[None, 3:])[0] @ matrix_from_quaternion(before[None, 3:])[0].T
-    spin = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / (2 * h)
+    spin = (
+        0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / (2 * h)
+    )
     np.testing.assert_allclose(spin, now.velocity[3:], atol=1e-8)
 
 
@@ -111,7 +119,9 @@ def test_forces_of_others_stay_and_the_rods_own_go():
     mujoco.mj_step(model, data)
     for rod in rods:
         rod.end()
-    np.testing.assert_allclose(data.qvel[:3] - before, 0.005 * (others[:3] + np.array([1.0, 2.0, 0.0])), atol=1e-9)
+    np.testing.assert_allclose(
+        data.qvel[:3] - before, 0.005 * (others[:3] + np.array([1.0, 2.0, 0.0])), atol=1e-9
+    )
     np.testing.assert_allclose(data.xfrc_applied[cart], others, atol=1e-15)
     rods[0].step()
     rods[0].step()
@@ -124,19 +134,26 @@ def test_forces_of_others_stay_and_the_rods_own_go():
 
 def test_every_geom_is_an_obstacle_where_it_is():
     hull = np.random.default_rng(8).normal(size=(40, 3)) * 0.03
-    spec = spec_of('<body name="probe" mocap="true" pos="0.15 0.1 0.12"><geom name="probe" size="0.001"/></body>')
+    spec = spec_of(
+        '<body name="probe" mocap="true" pos="0.15 0.1 0.12"><geom name="probe" size="0.001"/></body>'
+    )
     spec.add_mesh(name="hull", uservert=hull.ravel())
     kinds = mujoco.mjtGeom
     shapes = {
-        "box": (kinds.mjGEOM_BOX, [0.01, 0.02, 0.03]), "sphere": (kinds.mjGEOM_SPHERE, [0.03, 0, 0]),
-        "cylinder": (kinds.mjGEOM_CYLINDER, [0.02, 0.025, 0]), "capsule": (kinds.mjGEOM_CAPSULE, [0.02, 0.025, 0]),
+        "box": (kinds.mjGEOM_BOX, [0.01, 0.02, 0.03]),
+        "sphere": (kinds.mjGEOM_SPHERE, [0.03, 0, 0]),
+        "cylinder": (kinds.mjGEOM_CYLINDER, [0.02, 0.025, 0]),
+        "capsule": (kinds.mjGEOM_CAPSULE, [0.02, 0.025, 0]),
         "mesh": (kinds.mjGEOM_MESH, [0, 0, 0]),
-    }  # fmt: skip
+    }
     for name, (kind, size) in shapes.items():
         body = spec.worldbody.add_body(name=name, pos=[0.1, 0.2, 0.3], quat=[0.9, 0.1, -0.3, 0.3])
         body.add_freejoint()
-        body.add_geom(size=[0.005, 0, 0], pos=[0.0, 0.03, 0.0], mass=0.3, contype=0, conaffinity=0)  # moves the centre of mass
-        own = body.add_geom(name=name, type=kind, size=size, pos=[0.01, 0.0, 0.0], quat=[0.8, 0.6, 0.0, 0.0], mass=0.2)
+        # moves the centre of mass
+        body.add_geom(size=[0.005, 0, 0], pos=[0.0, 0.03, 0.0], mass=0.3, contype=0, conaffinity=0)
+        own = body.add_geom(
+            name=name, type=kind, size=size, pos=[0.01, 0.0, 0.0], quat=[0.8, 0.6, 0.0, 0.0], mass=0.2
+        )
         if name == "mesh":
             own.meshname = "hull"
     model = spec.compile()
@@ -147,17 +164,25 @@ def test_every_geom_is_an_obstacle_where_it_is():
         assert [part.obstacle.shape for part in touched.parts] == [name]
         pose = touched.expected([])[0][name]
         robot = soft_robot(1)
-        sim = Simulator(robot, contact=ContactScene(obstacles=[touched.parts[0].obstacle], rod_radius=0.001, mounting=0.0))
+        sim = Simulator(
+            robot, contact=ContactScene(obstacles=[touched.parts[0].obstacle], rod_radius=0.001, mounting=0.0)
+        )
         # the rod's base is where the probe is, and its tip beside it: both must be as far from the body
-        state = sim.settle(robot.rest_tendon_length, base_pose=(0.15, 0.1, 0.12, 1, 0, 0, 0), obstacle_pose={name: pose})
+        state = sim.settle(
+            robot.rest_tendon_length, base_pose=(0.15, 0.1, 0.12, 1, 0, 0, 0), obstacle_pose={name: pose}
+        )
         ends = []
         for point in state.position[0, [0, -1]]:
             data.mocap_pos[0] = point
             refresh(model, data)
-            ends.append(mujoco.mj_geomDistance(model, data, model.geom("probe").id, model.geom(name).id, 1.0, None))
+            ends.append(
+                mujoco.mj_geomDistance(model, data, model.geom("probe").id, model.geom(name).id, 1.0, None)
+            )
         assert min(ends) > 0.0
         assert 0.0 < sim.clearance()[0] <= min(ends) + 1e-5
-        np.testing.assert_allclose(touched.com().pose[:3], com_motion(model, data, model.body(name).id).pose[:3])
+        np.testing.assert_allclose(
+            touched.com().pose[:3], com_motion(model, data, model.body(name).id).pose[:3]
+        )
 
 
 def stand(ball=BALL, **options):
@@ -198,7 +223,11 @@ def test_contacts_that_are_felt_bend_the_rod_and_stay_calm():
     assert np.abs(data.qvel).max() < 1e-3
     given = rod.step(line_force=(0.1, 0.0, 0.0))
     assert given.ok[0]
-    with pytest.raises(InputError, match=r"^line_force has shape \(2, 3, 3\); with feel=True give \(3,\) or \(2, 11, 3\) \[N/m\]\.$"):
+    with pytest.raises(
+        InputError,
+        match=r"^line_force has shape \(2, 3, 3\); with feel=True give \(3,\) or "
+        r"\(2, 11, 3\) \[N/m\]\.$",
+    ):
         rod.step(line_force=np.zeros((2, 3, 3)))
     rod.reset()
     rod.step(line_force=(0.0, 0.0, 0.0))
@@ -233,8 +262,15 @@ def test_line_force_of_a_call_that_is_refused_is_not_kept():
     given[:] = 9.0  # the caller's own array
     for bad, sentence in (
         ({"line_force": (np.nan, 0, 0)}, "^line_force holds a value that is not finite"),
-        ({"line_force": ("a", "b", "c")}, r"^line_force is not an array of numbers; with feel=True give \(3,\) or \(2, 11, 3\) \[N/m\]\.$"),
-        ({"line_force": (5.0, 0.0, 0.0), "tip_force": (np.nan, 0.0, 0.0)}, "^tip_force holds a value that is not finite"),
+        (
+            {"line_force": ("a", "b", "c")},
+            r"^line_force is not an array of numbers; with feel=True give "
+            r"\(3,\) or \(2, 11, 3\) \[N/m\]\.$",
+        ),
+        (
+            {"line_force": (5.0, 0.0, 0.0), "tip_force": (np.nan, 0.0, 0.0)},
+            "^tip_force holds a value that is not finite",
+        ),
     ):
         for call in (rod.step, rod.settle):
             with pytest.raises(InputError, match=sentence):
@@ -249,8 +285,13 @@ def test_capsules_of_another_robot_are_refused():
     spec, robot = spec_of(POST), soft_robot(1)
     add_capsules(spec, robot, "post")
     model = spec.compile()
-    longer = dataclasses.replace(robot, segments=tuple(dataclasses.replace(s, length=1.5 * s.length) for s in robot.segments))
-    sentence = r"^capsule 0 of 'rod' has radius 0.012 m and half length 0.005 m, where this robot has 0.012 m and 0.0075 m; they were added"
+    longer = dataclasses.replace(
+        robot, segments=tuple(dataclasses.replace(s, length=1.5 * s.length) for s in robot.segments)
+    )
+    sentence = (
+        r"^capsule 0 of 'rod' has radius 0.012 m and half length 0.005 m, where this robot has 0.012 "
+        r"m and 0.0075 m; they were added"
+    )
     with pytest.raises(HostError, match=sentence):
         MujocoRod(longer, model, mujoco.MjData(model), "post")
     assert MujocoRod(robot, model, mujoco.MjData(model), "post").step().ok[0]
@@ -288,18 +329,37 @@ def test_servos_hold_the_arm_where_it_is_told():
         mujoco.mj_step(model, data)
     np.testing.assert_allclose(arm.position(), q, atol=1e-9)  # its weight is balanced
     assert np.abs(arm.torque()).max() < 1e-4
-    with pytest.raises(InputError, match=rf"^q is \[0, 0\]; give 6 finite numbers, one for each of {JOINTS[0]}"):
+    with pytest.raises(
+        InputError,
+        match=r"^q is \[0, 0\]; give 6 finite numbers, one for each of "
+        rf"{JOINTS[0]}",
+    ):
         arm.drive([0, 0])
 
 
 @pytest.mark.parametrize(
     ("options", "error", "sentence"),
     [
-        ({"robot": "prototype"}, RobotError, r"^robot is 'prototype'; give one Robot, for example fastrod.load_robot\('prototype'\)\.$"),
-        ({"capsules_per_segment": "a"}, InputError, r"^'a' capsules a segment; give at least one, a whole number\.$"),
+        (
+            {"robot": "prototype"},
+            RobotError,
+            r"^robot is 'prototype'; give one Robot, for example "
+            r"fastrod.load_robot\('prototype'\)\.$",
+        ),
+        (
+            {"capsules_per_segment": "a"},
+            InputError,
+            r"^'a' capsules a segment; give at least one, a whole "
+            r"number\.$",
+        ),
         ({"capsules_per_segment": 2.5}, InputError, r"^2.5 capsules a segment; give at least one"),
         ({"capsules_per_segment": True}, InputError, r"^True capsules a segment; give at least one"),
-        ({"color": (1, 2)}, InputError, r"^color is \(1, 2\); give red, green, blue and opacity, four numbers from 0 to 1\.$"),
+        (
+            {"color": (1, 2)},
+            InputError,
+            r"^color is \(1, 2\); give red, green, blue and opacity, four "
+            r"numbers from 0 to 1\.$",
+        ),
         ({"head_color": "red"}, InputError, r"^head_color is 'red'; give red, green, blue and opacity"),
         ({"friction": np.nan}, InputError, r"^friction is nan; it must be a number, zero or positive\.$"),
         ({"friction": -1}, InputError, r"^friction is -1; it must be a number, zero or positive\.$"),
@@ -327,7 +387,10 @@ def test_rod_of_a_model_asks_for_a_robot_and_a_list():
 
 def test_what_is_not_there_is_a_sentence(monkeypatch):
     robot = soft_robot()
-    spec = spec_of(POST + BALL + '<body name="ghost"><freejoint/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>')
+    spec = spec_of(
+        POST + BALL + '<body name="ghost"><freejoint/><inertial pos="0 0 0" mass="1" '
+        'diaginertia="1 1 1"/></body>'
+    )
     with pytest.raises(HostError, match=r"^spec is a str; give a mujoco.MjSpec"):
         add_capsules("arm.xml", robot, "post")
     with pytest.raises(HostError, match=r"^the spec has no body 'pst'; did you mean 'post'\?"):
@@ -335,10 +398,18 @@ def test_what_is_not_there_is_a_sentence(monkeypatch):
     with pytest.raises(InputError, match=r"^0 capsules a segment; give at least one, a whole number\.$"):
         add_capsules(spec, robot, "post", capsules_per_segment=0)
     bare = spec_of(POST).compile()
-    with pytest.raises(HostError, match=r"^the model has no capsules of a rod 'rod'; call add_capsules\(\.\.\., name='rod'\) on its spec"):
+    with pytest.raises(
+        HostError,
+        match=r"^the model has no capsules of a rod 'rod'; call "
+        r"add_capsules\(\.\.\., name='rod'\) on its spec",
+    ):
         MujocoRod(robot, bare, mujoco.MjData(bare), "post")
     add_capsules(spec, robot, "post")
-    with pytest.raises(HostError, match=r"^the model has a body 'rod 0' already; give each rod a name of its own"):
+    with pytest.raises(
+        HostError,
+        match=r"^the model has a body 'rod 0' already; give each rod a name of "
+        r"its own",
+    ):
         add_capsules(spec, robot, "post")
     model = spec.compile()
     data = mujoco.MjData(model)
@@ -347,20 +418,42 @@ def test_what_is_not_there_is_a_sentence(monkeypatch):
         ({"body": 99}, r"^body is 99; give the name of a body, or its number from 0 \(the world\) to 23\.$"),
         (
             {"touch": ["ball"]},
-            r"^the capsules of 'rod' collide with 'ball', .*; name it in add_capsules\(\.\.\., touch=\[\.\.\.\]\) too\.$",
+            r"^the capsules of 'rod' collide with 'ball', .*; name it in add_capsules\(\.\.\., "
+            r"touch=\[\.\.\.\]\) too\.$",
         ),
-        ({"quaternion": (1, 1, 0, 0)}, r"^the mount's quaternion \[1.0, 1.0, 0.0, 0.0\] has norm 1.41421; it must be 1"),
-        ({"robot": soft_robot(3)}, r"^the 20 capsules of 'rod' do not fit 3 segments; they were added for another robot\.$"),
-        ({"data": mujoco.MjData(bare)}, r"^the data are of another model: 2 bodies, where this one has 24\.$"),
+        (
+            {"quaternion": (1, 1, 0, 0)},
+            r"^the mount's quaternion \[1.0, 1.0, 0.0, 0.0\] has norm 1.41421; "
+            r"it must be 1",
+        ),
+        (
+            {"robot": soft_robot(3)},
+            r"^the 20 capsules of 'rod' do not fit 3 segments; they were added for "
+            r"another robot\.$",
+        ),
+        (
+            {"data": mujoco.MjData(bare)},
+            r"^the data are of another model: 2 bodies, where this one has 24\.$",
+        ),
         ({"model": "model"}, r"^model and data are str and MjData; give a mujoco.MjModel and its MjData\.$"),
     ):
         with pytest.raises(HostError, match=sentence):
             MujocoRod(**{"robot": robot, "model": model, "data": data, "body": "post"} | options)
-    with pytest.raises(HostError, match=r"^body 'ghost' has no geom that collides, so nothing can touch it\.$"):
+    with pytest.raises(
+        HostError, match=r"^body 'ghost' has no geom that collides, so nothing can touch it\.$"
+    ):
         TouchedBody(model, data, model.body("ghost").id, dt=0.005, relaxation=0.1, friction=0.3)
-    round_one = spec_of('<body name="egg"><freejoint/><geom type="ellipsoid" size=".01 .02 .03"/></body>').compile()
-    with pytest.raises(HostError, match=r"^geom 0 of 'egg' is of the kind ellipsoid, which a rod cannot touch"):
+    round_one = spec_of(
+        '<body name="egg"><freejoint/><geom type="ellipsoid" size=".01 .02 .03"/></body>'
+    ).compile()
+    with pytest.raises(
+        HostError, match=r"^geom 0 of 'egg' is of the kind ellipsoid, which a rod cannot touch"
+    ):
         TouchedBody(round_one, mujoco.MjData(round_one), 1, dt=0.005, relaxation=0.1, friction=0.3)
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(HostError, match=r"^MuJoCo is not installed; pip install 'fastrod\[mujoco\]' brings it\.$"):
+    with pytest.raises(
+        HostError,
+        match=r"^MuJoCo is not installed; pip install 'fastrod\[mujoco\]' brings "
+        r"it\.$",
+    ):
         fastrod.hosts.add_capsules(spec, robot, "post")

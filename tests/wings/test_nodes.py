@@ -75,7 +75,10 @@ class Wire:
 
     def map(self, kind: int = 1) -> None:
         """Controlword and target in, statusword and position out; operational."""
-        for communication, cob_id, entries in ((0x1400, 0x205, (0x60400010, 0x607A0020)), (0x1800, 0x40000185, (0x60410010, 0x60640020))):
+        for communication, cob_id, entries in (
+            (0x1400, 0x205, (0x60400010, 0x607A0020)),
+            (0x1800, 0x40000185, (0x60410010, 0x60640020)),
+        ):
             assert self.write(communication, 1, cob_id | 0x80000000, 4) == 0
             assert self.write(communication, 2, kind, 1) == 0
             assert self.write(communication + 0x200, 0, 0, 1) == 0
@@ -362,7 +365,8 @@ def test_without_heartbeats_it_stops_at_the_moment_it_must(wire):
     assert struct.unpack_from("<HB", wire.hear(0x085)) == (0x8130, 0x11)
     assert wire.nodes.states == ("quick stop active",)
     assert not wire.nodes.moving.any()
-    # the heartbeat came at 0; the ramp from 10,000 counts/s by 10,000 rpm/s = 682,667 counts/s2 takes 15 ms; the shaft lags by some ms
+    # the heartbeat came at 0; the ramp from 10,000 counts/s by 10,000 rpm/s = 682,667 counts/s2 takes 15 ms;
+    # the shaft lags by some ms
     assert 0.165 < wire.nodes.stopped_at[0] < 0.19
 
 

@@ -112,7 +112,9 @@ def test_taking_over_moves_nothing() -> None:
 @pytest.mark.parametrize("name", fastrod.robot_names())
 def test_every_knob_reads_what_it_was_put_to(name: str) -> None:
     world, pilot = piloted(name)
-    knobs = [knob for group in drive_knobs(world, pilot) for knob in group.knobs] + list(load_knobs(world.robot, pilot).knobs)
+    knobs = [knob for group in drive_knobs(world, pilot) for knob in group.knobs] + list(
+        load_knobs(world.robot, pilot).knobs
+    )
     for knob in knobs:
         assert knob.low < knob.high
         assert knob.label.endswith("]")
@@ -278,7 +280,9 @@ def test_a_measured_robot_that_differs_shows_its_residual() -> None:
     world = FreeWorld(robot)
     pilot = Pilot(world)
     seen: list[Measurement | None] = []
-    session = Session(world, pilot, draw=lambda frame: seen.append(frame.measured), link=SimulatedRobot(robot))
+    session = Session(
+        world, pilot, draw=lambda frame: seen.append(frame.measured), link=SimulatedRobot(robot)
+    )
     recorder = Recorder(robot)
     recorder.start(0.0, "by hand")
     session.recorder = recorder
@@ -318,6 +322,6 @@ def test_a_measurement_has_the_shapes_of_a_log() -> None:
         "tip_quaternion": [1, 0, 0, 0],
         "tension": np.zeros(4),
     }
-    assert Measurement(**good).problem == ""  # type: ignore[arg-type]
+    assert Measurement(**good).problem == ""
     with pytest.raises(InputError, match=r"Measurement.tip_position has shape \(2,\); it must be \(3,\)"):
-        Measurement(**(good | {"tip_position": np.zeros(2)}))  # type: ignore[arg-type]
+        Measurement(**(good | {"tip_position": np.zeros(2)}))

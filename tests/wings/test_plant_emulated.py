@@ -1,4 +1,5 @@
-"""The emulated robot against the simulator and closed forms, its effects against what the seal claims, and the seal itself."""
+"""The emulated robot against the simulator and closed forms, its effects against what the seal claims, and
+the seal itself."""
 
 from __future__ import annotations
 
@@ -76,16 +77,31 @@ def test_without_effect_it_is_the_simulator_at_rest() -> None:
 def test_line_weight_is_the_simulators() -> None:
     robot = rod()
     for down in np.array([[0.0, 1.0, 0.0], [0.6, 0.0, -0.8]]):
-        state = Simulator(robot, dt=0.01).settle(robot.rest_tendon_length + wires(0.5, -0.6), line_force=5.0 * down)
-        assert_allclose(Rod(weight=5.0).rest(wires(0.5, -0.6), STILL, down).position, state.tip_position[0], rtol=0, atol=2e-6)
+        state = Simulator(robot, dt=0.01).settle(
+            robot.rest_tendon_length + wires(0.5, -0.6), line_force=5.0 * down
+        )
+        assert_allclose(
+            Rod(weight=5.0).rest(wires(0.5, -0.6), STILL, down).position,
+            state.tip_position[0],
+            rtol=0,
+            atol=2e-6,
+        )
 
 
 @pytest.mark.parametrize("bend", [0.05, 0.7, -1.3, 2.5])
 def test_without_load_it_is_an_arc(bend: float) -> None:
     rest = Rod(compliance=STIFF).rest(wires(0.0, bend), STILL, DOWN)
-    assert_allclose(rest.position, LENGTH / bend * np.array([1.0 - math.cos(bend), 0.0, math.sin(bend)]), rtol=0, atol=2e-7)
-    # EI u = sum of tension times distance, shared by the two wires of the pair; 1e-9 m/N makes newtons of the last picometres
-    assert_allclose(rest.tension, EI * bend / (2.0 * OFFSET * LENGTH) * np.array([1.0, 0.0, -1.0, 0.0]), rtol=0, atol=0.05)
+    assert_allclose(
+        rest.position,
+        LENGTH / bend * np.array([1.0 - math.cos(bend), 0.0, math.sin(bend)]),
+        rtol=0,
+        atol=2e-7,
+    )
+    # EI u = sum of tension times distance, shared by the two wires of the pair; 1e-9 m/N makes newtons of the
+    # last picometres
+    assert_allclose(
+        rest.tension, EI * bend / (2.0 * OFFSET * LENGTH) * np.array([1.0, 0.0, -1.0, 0.0]), rtol=0, atol=0.05
+    )
 
 
 def test_small_loads_bend_a_beam_whose_tip_the_wires_keep_from_turning() -> None:
@@ -130,12 +146,22 @@ def test_a_warm_start_from_afar_ends_where_a_cold_one_does() -> None:
 
 
 def test_tensions_change_with_the_wires_by_their_slope() -> None:
-    it, dl, force, h = Rod(compliance=3e-4, settling=0.3, weight=3.0), wires(0.3, 0.5), np.array([0.2, 0.1, -0.5]), 1e-6
+    it, dl, force, h = (
+        Rod(compliance=3e-4, settling=0.3, weight=3.0),
+        wires(0.3, 0.5),
+        np.array([0.2, 0.1, -0.5]),
+        1e-6,
+    )
     here = it.rest(dl, force, DOWN)
     for i, step in enumerate(h * np.eye(4)):
         ahead, behind = it.rest(dl + step, force, DOWN, here), it.rest(dl - step, force, DOWN, here)
         # the slope is that of the last pass but one, 3e-4 rad away at most
-        assert_allclose((ahead.tension - behind.tension) / (2.0 * h), here.slope[:, i], rtol=0, atol=1e-3 * np.abs(here.slope).max())
+        assert_allclose(
+            (ahead.tension - behind.tension) / (2.0 * h),
+            here.slope[:, i],
+            rtol=0,
+            atol=1e-3 * np.abs(here.slope).max(),
+        )
 
 
 def test_a_wire_whose_strands_settle_gives_less_the_more_it_is_pulled() -> None:
@@ -151,7 +177,9 @@ def test_a_wire_whose_strands_settle_gives_less_the_more_it_is_pulled() -> None:
 # ---------------------------------------------------------------- loads on the plant
 
 
-@pytest.mark.parametrize("quaternion", [(1.0, 0.0, 0.0, 0.0), ABOUT_X, (0.5, -0.5, 0.5, 0.5), (0.8, 0.0, 0.6, 0.0)])
+@pytest.mark.parametrize(
+    "quaternion", [(1.0, 0.0, 0.0, 0.0), ABOUT_X, (0.5, -0.5, 0.5, 0.5), (0.8, 0.0, 0.6, 0.0)]
+)
 def test_a_mass_pulls_down_in_the_world_however_the_base_stands(quaternion: tuple[float, ...]) -> None:
     robot = Plant(seal(0, "none"))
     robot.turn(quaternion)
@@ -303,7 +331,8 @@ def test_stretch_loses_the_sealed_share_of_a_small_bend_and_lets_a_load_turn_the
     lost = hidden("tendon_stretch").open()["tendon_stretch"]["gain_loss"]
     robot = Plant(hidden("tendon_stretch"))
     robot.advance(0.0, wires(0.05, 0.0))
-    assert bend_of(robot.tip()[1]) == pytest.approx(0.05 * (1.0 - lost), rel=0.01)  # beside it the wires' own 0.3 percent
+    # beside it the wires' own 0.3 percent
+    assert bend_of(robot.tip()[1]) == pytest.approx(0.05 * (1.0 - lost), rel=0.01)
     loaded, plain = Plant(hidden("tendon_stretch")), Plant(seal(0, "none"))
     for it in (loaded, plain):
         it.turn(ABOUT_X)
@@ -366,7 +395,9 @@ def test_a_bumped_camera_sees_another_tip_and_the_robot_stays() -> None:
     assert_allclose(before[0], robot.tip()[0], rtol=0, atol=1e-12)
     assert 5e-4 < np.linalg.norm(after[0] - before[0]) < 6e-3
     turned = np.array([numbers[f"about_{axis}"] for axis in "xyz"])
-    assert np.trace(after[1] @ before[1].T) == pytest.approx(1.0 + 2.0 * math.cos(np.linalg.norm(turned)), abs=1e-12)
+    assert np.trace(after[1] @ before[1].T) == pytest.approx(
+        1.0 + 2.0 * math.cos(np.linalg.norm(turned)), abs=1e-12
+    )
     assert_allclose(robot.tip()[0], before[0], rtol=0, atol=1e-12)
 
 
@@ -430,7 +461,9 @@ def test_a_seal_tells_nothing_until_it_is_opened() -> None:
         assert repr(closed) == str(closed) == f"{closed}" == "sealed"
         assert repr(robot) == "Plant(sealed)"
         assert all(name.startswith("_") for name in vars(robot))
-        assert not [word for name in vars(robot) for word in (*KINDS, "ripple", "bump") if word == name.strip("_")]
+        assert not [
+            word for name in vars(robot) for word in (*KINDS, "ripple", "bump") if word == name.strip("_")
+        ]
         assert not hasattr(closed, "__dict__")
         assert "Rod(" not in repr(robot._rod)
         assert {name for name in dir(closed) if not name.startswith("_")} == {"open", "stiffness"}
@@ -449,9 +482,16 @@ def test_what_was_opened_is_a_copy() -> None:
 def test_the_plant_stands_alone() -> None:
     """Of the simulator it may know the errors and the names of array types."""
     for module in (plant, plant_rod, sys.modules[Seal.__module__]):
-        lines = [line for line in inspect.getsource(module).splitlines() if "import" in line and "fastrod" in line and "device" not in line]
+        lines = [
+            line
+            for line in inspect.getsource(module).splitlines()
+            if "import" in line and "fastrod" in line and "device" not in line
+        ]
         assert all("fastrod.errors" in line or "fastrod.types" in line for line in lines)
-    code = "from fastrod_device.plant import Plant; from fastrod_device.seal import seal; Plant(seal(3)).tip(); print('quiet')"
+    code = (
+        "from fastrod_device.plant import Plant; from fastrod_device.seal import seal; "
+        "Plant(seal(3)).tip(); print('quiet')"
+    )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert said.stdout == "quiet\n"
     assert said.stderr == ""
@@ -461,13 +501,15 @@ def test_the_plant_stands_alone() -> None:
 
 
 def test_wrong_names_and_seeds_say_so() -> None:
-    with pytest.raises(UnknownNameError, match=r"no effect 'backlsh' can be sealed; did you mean 'backlash'\?"):
+    with pytest.raises(
+        UnknownNameError, match=r"no effect 'backlsh' can be sealed; did you mean 'backlash'\?"
+    ):
         seal(1, "backlsh")
     for wrong in (-1, 1.5, True, "1"):
         with pytest.raises(InputError, match="it must be a whole number from 0"):
-            seal(wrong)  # type: ignore[arg-type]
+            seal(wrong)
     with pytest.raises(InputError, match="it needs a Seal"):
-        Plant({"backlash": {}})  # type: ignore[arg-type]
+        Plant({"backlash": {}})
 
 
 def test_wrong_inputs_say_so_and_leave_the_plant_as_it_was() -> None:
@@ -476,8 +518,13 @@ def test_wrong_inputs_say_so_and_leave_the_plant_as_it_was() -> None:
     before = robot.tip()[0]
     for wrong in ([0.0] * 3, [0.0] * 5, [0.0, 0.0, "a", 0.0], np.zeros((4, 1)), None):
         with pytest.raises(InputError, match="it must be four lengths of wire"):
-            robot.advance(1.1, wrong)  # type: ignore[arg-type]
-    for far in ([math.nan, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, math.nan], [1.0, 0.0, -1.0, 0.0], [math.inf, 0.0, 0.0, 0.0]):
+            robot.advance(1.1, wrong)
+    for far in (
+        [math.nan, 0.0, 0.0, 0.0],
+        [0.0, 0.0, 0.0, math.nan],
+        [1.0, 0.0, -1.0, 0.0],
+        [math.inf, 0.0, 0.0, 0.0],
+    ):
         with pytest.raises(InputError, match="Was it given in mm"):
             robot.advance(1.1, far)
     for t in (0.9, math.nan, math.inf):
@@ -485,7 +532,7 @@ def test_wrong_inputs_say_so_and_leave_the_plant_as_it_was() -> None:
             robot.advance(t, np.zeros(4))
     for mass in (-0.1, math.nan, 50.0, "1"):
         with pytest.raises(InputError, match="Was it given in g"):
-            robot.hang(mass)  # type: ignore[arg-type]
+            robot.hang(mass)
     for turn in ((1.0, 1.0, 0.0, 0.0), (1.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 0.0)):
         with pytest.raises(InputError, match="it must be a unit quaternion"):
             robot.turn(turn)

@@ -1,4 +1,5 @@
-"""Playback: the same figures as `replay`, the true shape behind every predicted tip, and a clock without pauses."""
+"""Playback: the same figures as `replay`, the true shape behind every predicted tip, and a clock without
+pauses."""
 
 from __future__ import annotations
 
@@ -43,12 +44,16 @@ def test_figures_are_those_of_replay(demo: RunLog, robot: Robot) -> None:
     made, straight = Playback.of(demo, robot), replay(demo, robot)
     assert_array_equal(made.origin, np.flatnonzero(demo.driven))
     assert_allclose(made.before.tip_position, straight.tip_position[made.origin], rtol=0, atol=1e-12)
-    assert_allclose(made.before.residual, np.linalg.norm(straight.residual, axis=1)[made.origin], rtol=0, atol=1e-12)
+    assert_allclose(
+        made.before.residual, np.linalg.norm(straight.residual, axis=1)[made.origin], rtol=0, atol=1e-12
+    )
     assert made.before.rms == pytest.approx(straight.rms, rel=1e-12)
     assert made.before.rms_of(np.ones(len(made.log), bool)) == pytest.approx(straight.rms, rel=1e-12)
 
 
-@pytest.mark.parametrize("robot", [ROBOT, with_(MEMORY), with_(MEMORY, LOAD), with_(CAMERA), with_(MEMORY, CAMERA)])
+@pytest.mark.parametrize(
+    "robot", [ROBOT, with_(MEMORY), with_(MEMORY, LOAD), with_(CAMERA), with_(MEMORY, CAMERA)]
+)
 def test_the_drawn_tip_is_the_predicted_tip(demo: RunLog, robot: Robot) -> None:
     track = (made := Playback.of(demo, robot, frames=400)).before
     shapes, predicted = track.shapes, track.tip_position[made.frames]
@@ -61,16 +66,23 @@ def test_the_drawn_tip_is_the_predicted_tip(demo: RunLog, robot: Robot) -> None:
     assert shapes.position.shape == (400, n_points, 3)
     assert shapes.rotation.shape == (400, n_points, 3, 3)
     along = np.linalg.norm(np.diff(shapes.position, axis=1), axis=2).sum(axis=1)
-    assert_allclose(along, ROBOT.length, rtol=1e-3)  # the backbone does not stretch; chords are a little short
-    assert_allclose(np.swapaxes(shapes.rotation, 2, 3) @ shapes.rotation, np.broadcast_to(np.eye(3), shapes.rotation.shape), atol=1e-7)
+    # the backbone does not stretch; chords are a little short
+    assert_allclose(along, ROBOT.length, rtol=1e-3)
+    assert_allclose(
+        np.swapaxes(shapes.rotation, 2, 3) @ shapes.rotation,
+        np.broadcast_to(np.eye(3), shapes.rotation.shape),
+        atol=1e-7,
+    )
     slope = shapes.position[:, 1] - shapes.position[:, 0]
-    assert_allclose(slope / np.linalg.norm(slope, axis=1)[:, None], shapes.rotation[:, 0, :, 2], atol=0.05)  # tangent, camera and all
+    # tangent, camera and all
+    assert_allclose(slope / np.linalg.norm(slope, axis=1)[:, None], shapes.rotation[:, 0, :, 2], atol=0.05)
 
 
 def test_a_camera_sees_the_whole_backbone_move(demo: RunLog) -> None:
     plain, seen = (Playback.of(demo, robot, frames=50).before.shapes for robot in (ROBOT, with_(CAMERA)))
     turn = matrix_from_quaternion(np.array([np.cos(0.05), 0.0, np.sin(0.05), 0.0]))
-    assert_allclose(seen.position, plain.position @ turn.T + (0.004, 0.0, 0.0), rtol=0, atol=2e-5)  # of two step sizes
+    # of two step sizes
+    assert_allclose(seen.position, plain.position @ turn.T + (0.004, 0.0, 0.0), rtol=0, atol=2e-5)
     assert_allclose(seen.rotation, turn @ plain.rotation, rtol=0, atol=1e-3)
 
 
@@ -138,10 +150,13 @@ def folder(tmp_path: Path, demo: RunLog) -> Path:
     out = tmp_path / "wobble_identified"
     out.mkdir()
     report = {
-        "log": "wobble", "verdict": "explained", "summary": "Backlash.", "effects": [{"name": "backlash"}],
+        "log": "wobble",
+        "verdict": "explained",
+        "summary": "Backlash.",
+        "effects": [{"name": "backlash"}],
         "held_out": ["every fourth of 20 stretches of each run"],
         "error": {"held_out": {"before_rms_m": 3e-3, "after_rms_m": None}},
-    }  # fmt: skip
+    }
     (out / "report.json").write_text(json.dumps(report))
     save_robot(with_(MEMORY, MARKER), out / "identified.toml")
     return tmp_path
@@ -186,7 +201,9 @@ def test_a_log_without_a_robot_asks_for_one(folder: Path, demo: RunLog) -> None:
 
 
 def test_a_wrong_robot_and_a_blind_log_are_said_in_a_sentence(folder: Path, demo: RunLog) -> None:
-    trunk = next(r for r in map(fastrod.load_robot, fastrod.robot_names()) if r.n_tendons not in (0, ROBOT.n_tendons))
+    trunk = next(
+        r for r in map(fastrod.load_robot, fastrod.robot_names()) if r.n_tendons not in (0, ROBOT.n_tendons)
+    )
     with pytest.raises(LogError, match="dl_ columns"):
         load(folder / "wobble.csv", trunk)
     with pytest.raises(InputError, match="leave --robot out to take the identified one"):
@@ -231,7 +248,9 @@ def test_live_curves_keep_every_peak(demo: RunLog) -> None:
 
 
 def test_live_curves_break_between_runs(demo: RunLog) -> None:
-    log = replace(demo.rows(slice(0, 600)), run=np.repeat(["a", "b", "c"], 200), t=np.tile(0.1 * np.arange(200.0), 3))
+    log = replace(
+        demo.rows(slice(0, 600)), run=np.repeat(["a", "b", "c"], 200), t=np.tile(0.1 * np.arange(200.0), 3)
+    )
     made = Playback.of(log, ROBOT, frames=20)
     for most in (100, 2000):
         shown = curves(made, most)

@@ -1,4 +1,5 @@
-"""The prototype as a robot link: what it is told, what it records, what homing finds, how it starts and ends."""
+"""The prototype as a robot link: what it is told, what it records, what homing finds, how it starts and
+ends."""
 
 from __future__ import annotations
 
@@ -40,8 +41,17 @@ pytest.importorskip("cv2", reason="opencv-python-headless is not installed: pip 
 
 HARDWARE = load_hardware()
 # in real time a busy machine is no fault
-_YOUNG = {"feedback_age": 5.0, "heartbeat_age": 9.0, "cycle": 5.0, "command_age": 9.0, "clock_jump": 9.0, "sighting_age": None}
-PATIENT = replace(HARDWARE, limits=replace(HARDWARE.limits, encoder_jump=0.05, following_error=0.05, **_YOUNG))
+_YOUNG = {
+    "feedback_age": 5.0,
+    "heartbeat_age": 9.0,
+    "cycle": 5.0,
+    "command_age": 9.0,
+    "clock_jump": 9.0,
+    "sighting_age": None,
+}
+PATIENT = replace(
+    HARDWARE, limits=replace(HARDWARE.limits, encoder_jump=0.05, following_error=0.05, **_YOUNG)
+)
 BENT = np.array([-0.002, 0.001, 0.002, -0.001])
 _names = itertools.count()
 
@@ -231,7 +241,7 @@ def test_a_recording_that_cannot_go_on_stops_the_drives_in_stepped_time_too(tmp_
         recorder = prototype.recorder_for(tmp_path / "log.csv")
         recorder.start(prototype.elapsed)
         prototype.record(recorder)
-        prototype.payload = np.ones(2)  # type: ignore[assignment]  # no number: the row cannot be made
+        prototype.payload = np.ones(2)  # no number: the row cannot be made
         with pytest.raises((InputError, ValueError)):
             prototype.wait(1.0)
         assert prototype.supervisor.state is State.STOPPED
@@ -261,7 +271,8 @@ def test_rows_have_the_wires_of_the_moment_of_exposure(tmp_path: Any) -> None:
         offset = began - prototype._zero
         expected = np.stack([np.interp(log.t + offset, times, wires[:, k]) for k in range(4)], axis=1)
         late = log.t > 0.1
-        # the plant lives between two cycles by the same straight lines; a count is 0.6 um, a cycle of lag would be 90 um
+        # the plant lives between two cycles by the same straight lines; a count is 0.6 um, a cycle of lag
+        # would be 90 um
         np.testing.assert_allclose(log.dl[late], expected[late], atol=4e-6)
         assert rows == len(log.t) >= 28
         assert {*EXTRA, "current_1", "current_4"} <= set(log.extra)
@@ -438,8 +449,7 @@ def test_a_camera_that_cannot_be_believed_is_flagged_and_marker_lost_stays_armed
 
 @pytest.mark.parametrize("raising", ["quick_stop", "close", "camera"])
 def test_an_adapter_that_raises_as_it_closes_keeps_nothing_open(
-    raising: str,
-    monkeypatch: pytest.MonkeyPatch,
+    raising: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*_: object) -> None:
         raise ValueError("the handle\nis invalid")
@@ -520,9 +530,7 @@ def test_a_full_disk_stops_the_robot_and_both_logs_say_so(small_disk: Any) -> No
 
 @pytest.mark.parametrize("unseen", [True, False], ids=["behind the file's end", "spare file"])
 def test_a_journals_room_is_reserved_unseen_and_given_back(
-    unseen: bool,
-    small_disk: Any,
-    monkeypatch: pytest.MonkeyPatch,
+    unseen: bool, small_disk: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not unseen:
         monkeypatch.setattr("fastrod_device.journal._reserved", lambda *_: False)
@@ -575,7 +583,9 @@ def test_homing_finds_where_the_robot_is_straight(effect: str) -> None:
         assert np.abs(bending).max() < 3e-5  # m
         assert (true < 0.0).all()  # every wire is pulled
         assert np.abs(prototype.readings.dl if prototype.readings is not None else np.zeros(4)).max() < 1e-6
-        assert [tendon.pretension for tendon in prototype.robot.segments[0].tendons] == pytest.approx([1.0] * 4, abs=0.35)
+        assert [tendon.pretension for tendon in prototype.robot.segments[0].tendons] == pytest.approx(
+            [1.0] * 4, abs=0.35
+        )
 
 
 def test_it_works_without_a_camera() -> None:
@@ -590,7 +600,9 @@ def test_it_works_without_a_camera() -> None:
 
 @pytest.mark.parametrize("stepped", [True, False])
 def test_drives_that_are_not_there_are_one_sentence(stepped: bool) -> None:
-    with Prototype(HARDWARE, "virtual:nobody", None, clock=SteppedClock() if stepped else WallClock()) as prototype:
+    with Prototype(
+        HARDWARE, "virtual:nobody", None, clock=SteppedClock() if stepped else WallClock()
+    ) as prototype:
         with pytest.raises(DeviceError, match="node 1 does not answer") as error:
             prototype.start()
         assert "\n" not in str(error.value)
@@ -675,7 +687,7 @@ def test_follow_in_real_time_tells_what_stopped_it() -> None:
         prototype.release()
         assert _until(lambda: prototype.supervisor.state is State.READY)
         with pytest.raises(DeviceError, match="ZeroDivisionError"):
-            prototype.follow(lambda t: np.zeros(4) / (0 if t > 0.1 else 1) if t < 0.1 else 1 // 0, 30.0)  # type: ignore[arg-type,return-value]
+            prototype.follow(lambda t: np.zeros(4) / (0 if t > 0.1 else 1) if t < 0.1 else 1 // 0, 30.0)
         prototype.release()
         assert _until(lambda: prototype.supervisor.state is State.READY)
         threading.Timer(0.2, lambda: emulator.drives.emergency(1, 0x3210)).start()
@@ -743,7 +755,8 @@ def test_a_release_that_is_older_than_a_stop_releases_nothing() -> None:
         robot.stop()
         with suppress(DeviceError):
             robot.wait(0.1)
-        robot._jobs.put(lambda stops=robot._stops: robot._release(stops))  # as by release(), in a thread that comes to it late
+        # as by release(), in a thread that comes to it late
+        robot._jobs.put(lambda stops=robot._stops: robot._release(stops))
         robot.stop()
         with suppress(DeviceError):
             robot.wait(0.1)

@@ -18,11 +18,16 @@ WAY = {"axial": np.array([1.0, 0.0, 0.0]), "side": np.array([0.0, 1.0, 0.0])}
 
 def test_still_wall_is_felt_by_the_host_as_the_simulator_has_it():
     world, robot = empty_world(), soft_robot()
-    wall = world.createMultiBody(0.0, world.createCollisionShape(world.GEOM_BOX, halfExtents=[0.05, 0.5, 0.5]), -1, [0.12, 0.0, 0.1])
+    wall = world.createMultiBody(
+        0.0, world.createCollisionShape(world.GEOM_BOX, halfExtents=[0.05, 0.5, 0.5]), -1, [0.12, 0.0, 0.1]
+    )
     rod = MountedRod(robot, carrier(world), touch=[wall], friction=0.0)
     rod.settle(tendon_length=robot.rest_tendon_length)
     alone = Simulator(
-        robot, dt=world.dt, points_per_segment=10, contact=ContactScene(obstacles=[plane(point=(0.07, 0, 0), normal=(-1, 0, 0), name="w")])
+        robot,
+        dt=world.dt,
+        points_per_segment=10,
+        contact=ContactScene(obstacles=[plane(point=(0.07, 0, 0), normal=(-1, 0, 0), name="w")]),
     )
     for k in range(40):
         pull = robot.rest_tendon_length + 0.0002 * k * np.array([-1, 0, 1, 0, -2, 0, 2, 0])
@@ -45,16 +50,26 @@ def test_every_shape_of_pybullet_is_an_obstacle_where_it_is():
         "capsule": world.createCollisionShape(world.GEOM_CAPSULE, radius=0.02, height=0.05),
         "mesh": world.createCollisionShape(world.GEOM_MESH, vertices=hull.tolist()),
     }
-    probe = world.createMultiBody(0.0, world.createCollisionShape(world.GEOM_SPHERE, radius=0.001), -1, [0.15, 0.1, 0.12])
+    probe = world.createMultiBody(
+        0.0, world.createCollisionShape(world.GEOM_SPHERE, radius=0.001), -1, [0.15, 0.1, 0.12]
+    )
     for name, shape in shapes.items():
-        body = world.createMultiBody(1.0, shape, -1, [0.1, 0.2, 0.3], turn, baseInertialFramePosition=[0.01, 0.0, 0.0])
+        body = world.createMultiBody(
+            1.0, shape, -1, [0.1, 0.2, 0.3], turn, baseInertialFramePosition=[0.01, 0.0, 0.0]
+        )
         touched = Touched(world, body, dt=0.005, relaxation=0.1, friction=0.3)
         assert [part.obstacle.shape for part in touched.parts] == [name]
         pose = touched.expected([])[0][touched.names[0]]
         robot = soft_robot(1)
-        sim = Simulator(robot, contact=ContactScene(obstacles=[touched.parts[0].obstacle], rod_radius=0.001, mounting=0.0))
+        sim = Simulator(
+            robot, contact=ContactScene(obstacles=[touched.parts[0].obstacle], rod_radius=0.001, mounting=0.0)
+        )
         # the rod's base is where the probe is, and its tip beside it: both must be as far from the body
-        state = sim.settle(robot.rest_tendon_length, base_pose=(0.15, 0.1, 0.12, 1, 0, 0, 0), obstacle_pose={touched.names[0]: pose})
+        state = sim.settle(
+            robot.rest_tendon_length,
+            base_pose=(0.15, 0.1, 0.12, 1, 0, 0, 0),
+            obstacle_pose={touched.names[0]: pose},
+        )
         ends = []
         for point in state.position[0, [0, -1]]:
             world.resetBasePositionAndOrientation(probe, point.tolist(), [0, 0, 0, 1])
@@ -68,9 +83,13 @@ def test_every_shape_of_pybullet_is_an_obstacle_where_it_is():
 def test_what_cannot_be_touched_is_a_sentence():
     world = empty_world()
     ghost = world.createMultiBody(1.0, -1, -1, [0, 0, 0])
-    with pytest.raises(HostError, match=r"link -1 of body 0 has no collision shape, so nothing can touch it\."):
+    with pytest.raises(
+        HostError, match=r"link -1 of body 0 has no collision shape, so nothing can touch it\."
+    ):
         Touched(world, ghost, dt=0.005, relaxation=0.1, friction=0.3)
-    sim = Simulator(soft_robot(), contact=ContactScene(obstacles=[plane(point=(1, 0, 0), normal=(-1, 0, 0), name="wall")]))
+    sim = Simulator(
+        soft_robot(), contact=ContactScene(obstacles=[plane(point=(1, 0, 0), normal=(-1, 0, 0), name="wall")])
+    )
     with pytest.raises(InputError, match=r"the mobility of 'wall' is .*; give \[m/N\], \(3, 3\)"):
         sim.set_free("wall", -1.0, np.eye(3), np.zeros(3))
     with pytest.raises(UnknownNameError, match=r"no obstacle 'wal'; did you mean 'wall'\?"):
@@ -99,7 +118,11 @@ def test_world_or_body_that_has_gone_is_a_sentence():
     rod = MountedRod(robot, link, touch=[np.int64(box)])
     rod.step()
     world.removeBody(box)
-    with pytest.raises(HostError, match=r"^PyBullet refused getBasePositionAndOrientation: .*; is the body still in the world\?$"):
+    with pytest.raises(
+        HostError,
+        match=r"^PyBullet refused getBasePositionAndOrientation: .*; is the body "
+        r"still in the world\?$",
+    ):
         rod.step()
     world.disconnect()
     with pytest.raises(HostError, match=r"^PyBullet's world \d+ has been disconnected\.$"):

@@ -1,4 +1,5 @@
-"""Push and QuadrupedPush: mechanics of the bar and the cube, exact episodes, what the baseline reaches, wrong input."""
+"""Push and QuadrupedPush: mechanics of the bar and the cube, exact episodes, what the baseline reaches, wrong
+input."""
 
 import numpy as np
 import pytest
@@ -120,7 +121,9 @@ def test_goals_fill_their_rectangle_and_gather_in_its_middle_when_it_is_easy(nam
         task.close()
 
 
-@pytest.mark.parametrize("options", [{}, {"action": "displacement"}, {"randomise": {"bending_stiffness": (0.8, 1.2)}}], ids=str)
+@pytest.mark.parametrize(
+    "options", [{}, {"action": "displacement"}, {"randomise": {"bending_stiffness": (0.8, 1.2)}}], ids=str
+)
 def test_an_episode_depends_on_nothing_but_its_seed(options):
     actions = some_actions(12)
     three, one = BatchEnv("QuadrupedPush", 3, **options), BatchEnv("QuadrupedPush", 1, **options)
@@ -140,7 +143,8 @@ def test_pictures_show_goal_and_cube_and_leave_the_world_as_it_is(name):
     actions = some_actions(10)
     seen = []
     for looked_at in (False, True):
-        task, _ = begun(name, np.array([1.0, 0.0, 0.5, 0.5, 0.5]))  # the goal beside the cube, toward the camera
+        # the goal beside the cube, toward the camera
+        task, _ = begun(name, np.array([1.0, 0.0, 0.5, 0.5, 0.5]))
         for action in actions:
             task.act(action[None])
             if looked_at:

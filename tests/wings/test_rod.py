@@ -24,7 +24,8 @@ def test_weight_and_moment_of_a_level_rod():
     robot, half = soft_robot(line_density=0.8), np.sqrt(0.5)
     rod = Rod(robot)
     state = rod.settle((0.1, 0.2, 0.3, half, 0.0, half, 0.0))
-    # the force is the weight; its moment about the base is that of the mass where it hangs: integral of (x - x0) rho g ds
+    # the force is the weight; its moment about the base is that of the mass where it hangs: integral of (x -
+    # x0) rho g ds
     assert_allclose(rod.wrench[:3], [0, 0, -0.8 * robot.length * 9.81], atol=1e-9)
     lever = 0.8 * 9.81 * np.trapezoid(state.position[0, :, 0] - 0.1, state.arclength[0])
     assert rod.wrench[4] == pytest.approx(lever, rel=1e-4)  # trapezoid of 21 nodes: (h / L)^2
@@ -58,7 +59,8 @@ def test_clock_is_the_engines_whatever_its_step(step):
 
 @pytest.mark.parametrize("step", [0.003, 0.01, 0.025, 0.06])
 def test_rod_is_where_the_base_will_be_at_the_end_of_the_step(step):
-    # a base on a circle, with its true pose and twist: the rod of the next step stands on the pose that a constant twist leads to
+    # a base on a circle, with its true pose and twist: the rod of the next step stands on the pose that a
+    # constant twist leads to
     robot, rate, radius = soft_robot(), 2.0, 0.3
     rod = Rod(robot, dt=0.01)
     rest = rod.settle(HOME, tendon_length=robot.rest_tendon_length + PULL).tip_position[0]
@@ -71,7 +73,8 @@ def test_rod_is_where_the_base_will_be_at_the_end_of_the_step(step):
         end = Motion(pose, twist).after(step)
         assert_allclose(rod.base, end, atol=1e-12)
         turn = matrix_from_quaternion(end[None, 3:])[0]
-        assert_allclose(state.tip_position[0], end[:3] + turn @ rest, atol=1e-6)  # without loads it is carried as it is
+        # without loads it is carried as it is
+        assert_allclose(state.tip_position[0], end[:3] + turn @ rest, atol=1e-6)
 
 
 def test_substeps_are_those_of_a_simulator_on_the_same_way():
@@ -82,7 +85,11 @@ def test_substeps_are_those_of_a_simulator_on_the_same_way():
     sim.settle(robot.rest_tendon_length, base_pose=pose)
     state = rod.advance(pose, twist, 0.04, tip_force=(0.01, 0.0, 0.0))
     for k in range(4):
-        expected = sim.step(robot.rest_tendon_length, tip_force=(0.01, 0.0, 0.0), base_pose=Motion(pose, twist).after(0.01 * (k + 1)))
+        expected = sim.step(
+            robot.rest_tendon_length,
+            tip_force=(0.01, 0.0, 0.0),
+            base_pose=Motion(pose, twist).after(0.01 * (k + 1)),
+        )
     assert_array_equal(state.position, expected.position)
     assert_array_equal(rod.wrench, expected.base_wrench[0])
 
@@ -101,7 +108,8 @@ def test_weight_is_that_in_the_gravity_that_the_engine_gives():
 
 
 def test_memory_of_the_wires_runs_on_the_engines_clock():
-    # a second-order lag of the wires: what it has done after 60 ms is the same in steps of any length, to the order of the steps
+    # a second-order lag of the wires: what it has done after 60 ms is the same in steps of any length, to the
+    # order of the steps
     robot = soft_robot(1)
     slow = replace(robot, effects=({"name": "dynamics", "period": 0.1, "damping": 0.7},))
     tips = []
@@ -157,7 +165,9 @@ def test_wall_bends_the_rod_as_in_the_simulator_and_comes_in_parts():
 def test_many_rods_are_as_many_single_ones():
     robot = soft_robot(line_density=0.2)
     many = Rod(robot, n_robots=3, dt=0.01)
-    poses = np.array([[0.1 * k, 0.0, 0.0, *quaternion_from_vector(np.array([0.0, 0.4 * k, 0.0]))] for k in range(3)])
+    poses = np.array(
+        [[0.1 * k, 0.0, 0.0, *quaternion_from_vector(np.array([0.0, 0.4 * k, 0.0]))] for k in range(3)]
+    )
     twists = np.array([[0.0, 0.1 * k, 0.0, 0.0, 0.0, 0.3 * k] for k in range(3)])
     for _ in range(3):
         state = many.advance(poses, twists, 0.015, tip_force=[[0.01 * k, 0.0, 0.0] for k in range(3)])
@@ -177,7 +187,11 @@ def test_many_rods_are_as_many_single_ones():
 def test_rod_that_fails_leaves_its_neighbour_alone(monkeypatch, walled):
     # what the wires of row 0 remember has moved once a step, as in a lone rod, whatever becomes of row 1
     robot = replace(soft_robot(1), effects=({"name": "dynamics", "period": 0.1, "damping": 0.7},))
-    scene = ContactScene(obstacles=[plane(point=(0.01, 0, 0), normal=(-1, 0, 0), name="wall")]) if walled else None
+    scene = (
+        ContactScene(obstacles=[plane(point=(0.01, 0, 0), normal=(-1, 0, 0), name="wall")])
+        if walled
+        else None
+    )
     pair, lone = Rod(robot, n_robots=2, contact=scene), Rod(robot, contact=scene)
     step = pair.simulator.step
     settled = []
@@ -207,7 +221,11 @@ def test_rod_that_fails_leaves_its_neighbour_alone(monkeypatch, walled):
 @pytest.mark.parametrize("walled", [False, True])
 def test_bad_input_of_one_rod_is_told_and_the_others_go_on(walled):
     robot = replace(soft_robot(1), effects=({"name": "dynamics", "period": 0.1, "damping": 0.7},))
-    scene = ContactScene(obstacles=[plane(point=(0.01, 0, 0), normal=(-1, 0, 0), name="wall")]) if walled else None
+    scene = (
+        ContactScene(obstacles=[plane(point=(0.01, 0, 0), normal=(-1, 0, 0), name="wall")])
+        if walled
+        else None
+    )
     pair, lone = Rod(robot, n_robots=2, contact=scene), Rod(robot, contact=scene)
     wires, force = robot.rest_tendon_length + PULL[:4], np.array([0.02, 0.01, 0.0])
     for rod in (pair, lone):
@@ -224,7 +242,8 @@ def test_bad_input_of_one_rod_is_told_and_the_others_go_on(walled):
         assert_array_equal(both.position[1], shape)
         assert_array_equal(pair.capsules.center[1], capsules)
         assert_array_equal(pair.base[1], HOME)
-        assert_allclose(pair.wrench[1], 0.5 ** (k + 1) * wrench, rtol=1e-14)  # a step of the engine halves it once, not each part
+        # a step of the engine halves it once, not each part
+        assert_allclose(pair.wrench[1], 0.5 ** (k + 1) * wrench, rtol=1e-14)
     assert pair.failures.tolist() == [0, 8]
     assert pair.failed == 8
     assert pair.time == lone.time
@@ -243,7 +262,13 @@ def test_rod_that_is_reset_settles_and_the_others_go_on():
             again.reset()
             assert not pair.wrench[1].any()
         for rod in (pair, going, again):
-            rod.advance(HOME, STILL, 0.01, tendon_length=wires if k else robot.rest_tendon_length, tip_force=(0.0, 0.02, 0.0))
+            rod.advance(
+                HOME,
+                STILL,
+                0.01,
+                tendon_length=wires if k else robot.rest_tendon_length,
+                tip_force=(0.0, 0.02, 0.0),
+            )
         assert_array_equal(pair.state.position[0], going.state.position[0])
         assert_allclose(pair.state.position[1], again.state.position[0], atol=1e-12)
         assert_allclose(pair.wrench, [going.wrench, again.wrench], atol=1e-10)
@@ -254,10 +279,21 @@ def test_rod_that_is_reset_settles_and_the_others_go_on():
 
 def test_what_the_caller_writes_into_its_own_arrays_changes_nothing():
     robot = soft_robot()
-    wires, force, where = robot.rest_tendon_length + PULL, np.array([0.02, 0.0, 0.0]), [(0.13, np.array([0.0, 0.05, 0.0]))]
+    wires, force, where = (
+        robot.rest_tendon_length + PULL,
+        np.array([0.02, 0.0, 0.0]),
+        [(0.13, np.array([0.0, 0.05, 0.0]))],
+    )
     rod, twin = Rod(robot), Rod(robot)
     rod.advance(HOME, STILL, 0.01, tendon_length=wires, tip_force=force, point_force=where)
-    twin.advance(HOME, STILL, 0.01, tendon_length=wires.copy(), tip_force=force.copy(), point_force=[(0.13, (0.0, 0.05, 0.0))])
+    twin.advance(
+        HOME,
+        STILL,
+        0.01,
+        tendon_length=wires.copy(),
+        tip_force=force.copy(),
+        point_force=[(0.13, (0.0, 0.05, 0.0))],
+    )
     then = rod.snapshot()
     wires[:], force[:] = 0.0, 7.0
     where[0][1][:] = -3.0
@@ -318,17 +354,59 @@ def test_bad_input_moves_nothing():
     rod.advance(HOME, STILL, 0.01)
     before = rod.snapshot()
     for base, twist, step, inputs, sentence in (
-        ((0, 0, 0), STILL, 0.01, {}, r"^base_pose has shape \(3,\); it must be \(7,\), position \[m\] and quaternion w x y z, world\.$"),
+        (
+            (0, 0, 0),
+            STILL,
+            0.01,
+            {},
+            r"^base_pose has shape \(3,\); it must be \(7,\), position \[m\] and "
+            r"quaternion w x y z, world\.$",
+        ),
         (HOME, (0, 0, 0), 0.01, {}, r"^base_twist has shape \(3,\); it must be \(6,\), velocity"),
-        ((0, 0, 0, 2, 0, 0, 0), STILL, 0.01, {}, r"^base_pose has a quaternion of norm 2; it must be 1, as w x y z\.$"),
+        (
+            (0, 0, 0, 2, 0, 0, 0),
+            STILL,
+            0.01,
+            {},
+            r"^base_pose has a quaternion of norm 2; it must be 1, as "
+            r"w x y z\.$",
+        ),
         ((np.nan, 0, 0, 1, 0, 0, 0), STILL, 0.01, {}, r"^base_pose holds a value that is not finite"),
         (HOME, (np.inf, 0, 0, 0, 0, 0), 0.01, {}, r"^base_twist holds a value that is not finite"),
         ("here", STILL, 0.01, {}, r"^base_pose is not an array of numbers; give \(7,\)"),
-        (HOME, STILL, -0.01, {}, r"^time_step is -0.01 s; the length of the engine's step must be positive and finite\.$"),
+        (
+            HOME,
+            STILL,
+            -0.01,
+            {},
+            r"^time_step is -0.01 s; the length of the engine's step must be positive "
+            r"and finite\.$",
+        ),
         (HOME, STILL, "dt", {}, r"^time_step is 'dt'; give the length of the engine's step"),
-        (HOME, STILL, 5000.0, {}, r"^time_step is 5000 s, 500000 of the rod's steps of 0.01 s; was it given in ms\?$"),
-        (HOME, STILL, 0.01, {"tip_fource": (0, 0, 0)}, r"^a rod has no input 'tip_fource'; did you mean 'tip_force'\?$"),
-        (HOME, STILL, 0.01, {"obstacle_pose": {}}, r"^a rod has no input 'obstacle_pose'; it needs a contact scene: Rod\(robot, contact="),
+        (
+            HOME,
+            STILL,
+            5000.0,
+            {},
+            r"^time_step is 5000 s, 500000 of the rod's steps of 0.01 s; was it given "
+            r"in ms\?$",
+        ),
+        (
+            HOME,
+            STILL,
+            0.01,
+            {"tip_fource": (0, 0, 0)},
+            r"^a rod has no input 'tip_fource'; did you mean "
+            r"'tip_force'\?$",
+        ),
+        (
+            HOME,
+            STILL,
+            0.01,
+            {"obstacle_pose": {}},
+            r"^a rod has no input 'obstacle_pose'; it needs a "
+            r"contact scene: Rod\(robot, contact=",
+        ),
         (HOME, STILL, 0.01, {"tip_force": (0, np.nan, 0)}, r"^tip_force holds a value that is not finite"),
     ):
         with pytest.raises(InputError, match=sentence):
@@ -343,19 +421,39 @@ def test_what_no_rod_can_be_is_a_sentence():
         _ = Rod(robot).state
     with pytest.raises(InputError, match=r"^the rod has no state yet"):
         _ = Rod(robot).capsules
-    with pytest.raises(InputError, match=r"^3 capsules for 10 points of a segment; give a divisor of the points\.$"):
+    with pytest.raises(
+        InputError,
+        match=r"^3 capsules for 10 points of a segment; give a divisor of the "
+        r"points\.$",
+    ):
         Rod(robot, capsules_per_segment=3)
     for bad in ([robot, robot], "prototype"):
-        with pytest.raises(RobotError, match=r"^robot is .*; give one Robot, for example fastrod.load_robot\('prototype'\)\.$"):
+        with pytest.raises(
+            RobotError,
+            match=r"^robot is .*; give one Robot, for example "
+            r"fastrod.load_robot\('prototype'\)\.$",
+        ):
             Rod(bad, n_robots=2)
-    with pytest.raises(InputError, match=r"^contact is 'x'; give fastrod.contact.ContactScene\(obstacles=\[\.\.\.\]\) or None\.$"):
+    with pytest.raises(
+        InputError,
+        match=r"^contact is 'x'; give "
+        r"fastrod.contact.ContactScene\(obstacles=\[\.\.\.\]\) or None\.$",
+    ):
         Rod(robot, contact="x")
-    with pytest.raises(InputError, match=r"^n_robots is True; give how many rods there are, or None for one without a robot axis\.$"):
+    with pytest.raises(
+        InputError,
+        match=r"^n_robots is True; give how many rods there are, or None for one "
+        r"without a robot axis\.$",
+    ):
         Rod(robot, n_robots=True)
     with pytest.raises(InputError, match=r"^dt is 0 s; it must be a number, positive and finite\.$"):
         Rod(robot, dt=0)
     with pytest.raises(InputError, match=r"^ContactScene.worlds puts several rods into one world"):
-        Rod(robot, n_robots=2, contact=ContactScene(obstacles=[box((1, 1, 1), name="b", position=(9, 0, 0))], worlds=[0, 0]))
+        Rod(
+            robot,
+            n_robots=2,
+            contact=ContactScene(obstacles=[box((1, 1, 1), name="b", position=(9, 0, 0))], worlds=[0, 0]),
+        )
     with pytest.raises(InputError, match=r"^base_pose has shape \(4, 7\); it must be \(7,\) or \(2, 7\)"):
         Rod(robot, n_robots=2).advance(np.tile(HOME, (4, 1)), STILL, 0.01)
 
@@ -371,7 +469,11 @@ def test_rod_that_stays_lost_is_told(monkeypatch):
     assert rod.failed == 1
     for _ in range(24):
         rod.advance(HOME, STILL, 0.01)
-    with pytest.raises(HostError, match=r"^26 steps in a row could not be solved, the last: contact: it stands\."):
+    with pytest.raises(
+        HostError,
+        match=r"^26 steps in a row could not be solved, the last: contact: it "
+        r"stands\.",
+    ):
         rod.advance(HOME, STILL, 0.01)
     nothing = replace(good, tip_position=np.full((1, 3), np.nan), problems={})
     monkeypatch.setattr(rod.simulator, "settle", lambda *a, **b: nothing)

@@ -29,7 +29,8 @@ def pushing(task: TubeInsert) -> np.ndarray:
 
 
 def rollout(n: int, seed: int, row: int, steps: int, **options) -> list[np.ndarray]:
-    """Observations and rewards of environment `row`: ahead, with bends at random that are the same whatever the others do."""
+    """Observations and rewards of environment `row`: ahead, with bends at random that are the same whatever
+    the others do."""
     env = BatchEnv("TubeInsert", num_envs=n, threads=1, **options)
     own, others = np.random.default_rng(5), np.random.default_rng(n)
     env.reset(seed=seed)
@@ -95,7 +96,8 @@ def test_a_rolled_robot_sees_and_does_the_same_as_one_that_is_not():
     for _ in range(35):
         task.act(task.baseline())
     assert task.tip[0, 0] > 0.01
-    assert_allclose(task.tip[1], task.tip[0], rtol=0, atol=2e-4)  # three wires are not the same from every side
+    # three wires are not the same from every side
+    assert_allclose(task.tip[1], task.tip[0], rtol=0, atol=2e-4)
     first, second = task.state()
     assert_allclose(second[1:3], [np.cos(angle), -np.sin(angle)], atol=1e-12)
     assert_allclose(second[5:7], [first[6], -first[5]], rtol=0, atol=2e-4)
@@ -110,7 +112,11 @@ def test_pushing_straight_ahead_presses_on_the_wall_and_ends_the_episode():
         _, reward, terminated, _, info = env.step(pushing(task))
         forces.append(info["force"])
         d = info["distance"]
-        expected = np.exp(-d / 0.02) - np.clip(info["force"] / tube_insert.FORCE - 1.0, 0.0, 1.0) - 10.0 * (info["force"] > 0.6)
+        expected = (
+            np.exp(-d / 0.02)
+            - np.clip(info["force"] / tube_insert.FORCE - 1.0, 0.0, 1.0)
+            - 10.0 * (info["force"] > 0.6)
+        )
         assert_allclose(reward, expected, rtol=0, atol=1e-12)
         if terminated.any():
             break
@@ -182,11 +188,15 @@ def test_displacement_goes_there_in_parts():
     env = SingleEnv("TubeInsert", n_steps=1, action="displacement", difficulty=0.0, threads=1)
     env.reset(seed=0)
     feed = tube_insert.SHALLOWEST + tube_insert.OUTSIDE
-    _, _, terminated, truncated, info = env.step([0.0, 0.0, 0.0, 0.0, 2.0 * feed / tube_insert.LIMIT[4, 1] - 1.0])
+    _, _, terminated, truncated, info = env.step(
+        [0.0, 0.0, 0.0, 0.0, 2.0 * feed / tube_insert.LIMIT[4, 1] - 1.0]
+    )
     assert truncated
     assert not terminated
     assert info["success"]
-    assert info["distance"] == pytest.approx(np.linalg.norm(middle(np.array([0.03]))[0] - [0, 0, 0.03]), abs=1e-3)
+    assert info["distance"] == pytest.approx(
+        np.linalg.norm(middle(np.array([0.03]))[0] - [0, 0, 0.03]), abs=1e-3
+    )
 
 
 @pytest.mark.parametrize("options", [{}, {"observation": "goal"}, {"n_steps": 3}])
@@ -218,7 +228,12 @@ def test_who_is_not_solved_stays_and_is_lost_in_the_end():
 
 
 def test_effects_and_other_robots():
-    env = BatchEnv("TubeInsert", num_envs=2, threads=1, randomise={"backlash.half_width": (0.0, 1e-4), "camera_scale.scale": (0.02, 0.03)})
+    env = BatchEnv(
+        "TubeInsert",
+        num_envs=2,
+        threads=1,
+        randomise={"backlash.half_width": (0.0, 1e-4), "camera_scale.scale": (0.02, 0.03)},
+    )
     env.reset(seed=0)
     for _ in range(12):
         observation, *_ = env.step(env.baseline())

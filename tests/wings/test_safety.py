@@ -34,11 +34,22 @@ quickly = settings(derandomize=True, max_examples=120, deadline=None)
 
 
 def healthy(t: float = 0.0, **other: Any) -> Readings:
-    """Four enabled drives that hold; `name=(drive, value)` sets one drive's figure, `name=value` all of them."""
+    """Four enabled drives that hold; `name=(drive, value)` sets one drive's figure, `name=value` all of
+    them."""
     base = Readings(
-        t=t, dl=np.zeros(4), rate=np.zeros(4), tension=np.full(4, 2.0), current=np.zeros(4), following_error=np.zeros(4),
-        statusword=np.full(4, 0x1637), age=np.full(4, 0.004), heartbeat_age=np.full(4, 0.02), nmt=np.full(4, 5), emergencies=(), lost="",
-    )  # fmt: skip
+        t=t,
+        dl=np.zeros(4),
+        rate=np.zeros(4),
+        tension=np.full(4, 2.0),
+        current=np.zeros(4),
+        following_error=np.zeros(4),
+        statusword=np.full(4, 0x1637),
+        age=np.full(4, 0.004),
+        heartbeat_age=np.full(4, 0.02),
+        nmt=np.full(4, 5),
+        emergencies=(),
+        lost="",
+    )
     for name, value in other.items():
         if isinstance(value, tuple) and name != "emergencies":
             array = getattr(base, name).copy()
@@ -56,7 +67,9 @@ class Bench:
         self.stops: list[Fault] = []
         self.fails = 0
         self.now = 100.0
-        self.supervisor = Supervisor(ROBOT, limits or Limits(), on_stop=self._stop, nodes=NODES, words=lambda code: f"code {code:04X}")
+        self.supervisor = Supervisor(
+            ROBOT, limits or Limits(), on_stop=self._stop, nodes=NODES, words=lambda code: f"code {code:04X}"
+        )
         if running:
             self.supervisor.enabled(self.now)
             self.watch()
@@ -69,7 +82,9 @@ class Bench:
             self.fails -= 1
             raise OSError("bus is gone")
 
-    def watch(self, dt: float = DT, jump: float = 0.0, camera: CameraWatch | None = SEES, **other: Any) -> Fault | None:
+    def watch(
+        self, dt: float = DT, jump: float = 0.0, camera: CameraWatch | None = SEES, **other: Any
+    ) -> Fault | None:
         self.now += dt
         return self.supervisor.watch(self.now, 1.7e9 + self.now + jump, healthy(self.now, **other), camera)
 
@@ -98,15 +113,27 @@ CASES: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
     ("following error", {"following_error": (1, -0.0011)}, ("drive 2 (node 5)", "-1.1 mm", "1 mm")),
     ("tension", {"tension": (1, 15.5)}, ("drive 2 (node 5)", "15.5 N", "15 N")),
     ("tension", {"tension": (3, -16.0)}, ("drive 4 (node 7)", "-16 N")),
-    ("displacement", {"dl": (1, -0.0093), "dt": 0.3, "limits": SLOW}, ("drive 2 (node 5)", "-9.3 mm", "9 mm")),
-    ("slack wire", {"tension": (1, 0.1), "limits": Limits(slack=0.2)}, ("drive 2 (node 5)", "0.1 N", "0.2 N")),
+    (
+        "displacement",
+        {"dl": (1, -0.0093), "dt": 0.3, "limits": SLOW},
+        ("drive 2 (node 5)", "-9.3 mm", "9 mm"),
+    ),
+    (
+        "slack wire",
+        {"tension": (1, 0.1), "limits": Limits(slack=0.2)},
+        ("drive 2 (node 5)", "0.1 N", "0.2 N"),
+    ),
     ("camera frozen", {"camera": CameraWatch(age=0.3, frozen=True)}, ("repeats its frames", "300 ms")),
     ("marker lost", {"camera": CameraWatch(age=0.6, frozen=False)}, ("600 ms", "500 ms")),
     ("marker lost", {"camera": CameraWatch(age=INF, frozen=False)}, ("inf",)),
     ("marker lost", {"camera": CameraWatch(age=-5.0, frozen=False)}, ("-5000 ms", "500 ms")),
     ("marker lost", {"camera": CameraWatch(age=0.6, frozen=False, flag="outlier")}, ("flagged 'outlier'",)),
-    ("command stale", {"dt": 0.6, "rate": (1, 0.02), "limits": Limits(cycle=1.0)}, ("20 mm/s", "600 ms", "500 ms")),
-]  # fmt: skip
+    (
+        "command stale",
+        {"dt": 0.6, "rate": (1, 0.02), "limits": Limits(cycle=1.0)},
+        ("20 mm/s", "600 ms", "500 ms"),
+    ),
+]
 
 
 @pytest.mark.parametrize(("kind", "other", "words"), CASES)
@@ -152,7 +179,8 @@ def test_a_healthy_robot_runs_on() -> None:
 def test_a_late_sample_has_gone_further_and_is_no_jump() -> None:
     bench = Bench()
     bench.watch(age=np.full(4, 0.025))
-    assert bench.watch(dl=(1, 0.00135), age=np.full(4, 0.001)) is None  # 34 ms between samples: 1.02 mm by rate, and 0.5
+    # 34 ms between samples: 1.02 mm by rate, and 0.5
+    assert bench.watch(dl=(1, 0.00135), age=np.full(4, 0.001)) is None
     assert bench.watch(dl=(1, 0.0030)) is not None
     assert bench.stops[0].kind == "encoder jump"
 
@@ -179,7 +207,11 @@ def test_an_encoder_jump_is_the_cause_of_a_drives_following_error() -> None:
     bench = Bench()
     found = bench.watch(dl=(1, 0.003), emergencies=EMCY, statusword=(1, 0x0238))
     assert found is not None
-    assert [fault.kind for fault in bench.supervisor.faults] == ["encoder jump", "emergency message", "drive fault"]
+    assert [fault.kind for fault in bench.supervisor.faults] == [
+        "encoder jump",
+        "emergency message",
+        "drive fault",
+    ]
 
 
 def test_a_watchdog_stops_a_loop_that_does_not_look_any_more() -> None:
@@ -217,7 +249,12 @@ def test_a_stamp_of_the_future_does_not_keep_a_command_young() -> None:
 
 def test_of_several_faults_the_cause_is_first_and_the_rest_is_kept() -> None:
     bench = Bench()
-    first = bench.watch(heartbeat_age=np.full(4, 1.0), age=np.full(4, 1.0), lost="bus-off", camera=CameraWatch(age=9.0, frozen=True))
+    first = bench.watch(
+        heartbeat_age=np.full(4, 1.0),
+        age=np.full(4, 1.0),
+        lost="bus-off",
+        camera=CameraWatch(age=9.0, frozen=True),
+    )
     assert first is not None
     kinds = [fault.kind for fault in bench.supervisor.faults]
     assert kinds == ["bus off", "heartbeat lost", "feedback stale", "camera frozen", "marker lost"]
@@ -240,7 +277,12 @@ def test_slowing_down_after_a_stop_is_no_new_fault() -> None:
 
 def test_what_is_off_is_looked_at_and_not_stopped() -> None:
     bench = Bench(running=False)
-    assert bench.watch(statusword=np.full(4, 0x0240), heartbeat_age=np.full(4, INF), nmt=np.full(4, -1), emergencies=EMCY) is None
+    assert (
+        bench.watch(
+            statusword=np.full(4, 0x0240), heartbeat_age=np.full(4, INF), nmt=np.full(4, -1), emergencies=EMCY
+        )
+        is None
+    )
     assert bench.supervisor.client_lost(bench.now) is None
     assert (bench.supervisor.state, bench.supervisor.status) == (State.OFF, "The drives are off.")
     bench.now += 5.0  # until it is enabled nobody need look
@@ -260,7 +302,10 @@ def test_what_is_off_is_looked_at_and_not_stopped() -> None:
         ([[0.0] * 4], r"shape \(1, 4\)"),
         (["a"] * 4, "must be 4 numbers"),
         (None, "shape"),
-        ([-0.0079, -0.0079, 0.0079, 0.0079], "segment 1 was told to bend with 21.2[0-9]* 1/m; this robot's limit is 20 1/m"),
+        (
+            [-0.0079, -0.0079, 0.0079, 0.0079],
+            "segment 1 was told to bend with 21.2[0-9]* 1/m; this robot's limit is 20 1/m",
+        ),
     ],
 )
 def test_a_command_beyond_a_limit_is_refused_with_its_figures(dl: Any, words: str) -> None:
@@ -306,7 +351,9 @@ lengths = st.lists(st.floats(-0.02, 0.02), min_size=4, max_size=4).map(np.array)
 
 @quickly
 @given(lengths, lengths, st.floats(0.001, 0.1), st.floats(0.0, 1.0))
-def test_a_limited_step_goes_straight_and_no_wire_beyond_its_rate(a: np.ndarray, b: np.ndarray, rate: float, dt: float) -> None:
+def test_a_limited_step_goes_straight_and_no_wire_beyond_its_rate(
+    a: np.ndarray, b: np.ndarray, rate: float, dt: float
+) -> None:
     c = limited(a, b, rate, dt)
     assert np.abs(c - a).max() <= rate * dt * (1.0 + 1e-12) + 1e-17
     part = np.linalg.norm(c - a) / max(np.linalg.norm(b - a), 1e-300)
@@ -317,7 +364,8 @@ def test_a_limited_step_goes_straight_and_no_wire_beyond_its_rate(a: np.ndarray,
 
 
 @pytest.mark.parametrize(
-    ("wanted", "rate", "dt"), [(NAN, 0.03, 0.01), (INF, 0.03, 0.01), (0.0, 0.03, -0.01), (0.0, 0.0, 0.01), (0.0, 0.03, NAN)]
+    ("wanted", "rate", "dt"),
+    [(NAN, 0.03, 0.01), (INF, 0.03, 0.01), (0.0, 0.03, -0.01), (0.0, 0.0, 0.01), (0.0, 0.03, NAN)],
 )
 def test_a_step_that_cannot_be_is_named(wanted: float, rate: float, dt: float) -> None:
     with pytest.raises(InputError, match=r"finite|must be positive"):
@@ -328,7 +376,10 @@ def test_a_stop_can_be_pressed_in_any_state_and_again() -> None:
     for running in (False, True):
         bench = Bench(running=running)
         fault = bench.supervisor.emergency_stop(bench.now, "the red button.")
-        assert (fault.kind, fault.sentence) == ("emergency stop", "the emergency stop was pressed: the red button.")
+        assert (fault.kind, fault.sentence) == (
+            "emergency stop",
+            "the emergency stop was pressed: the red button.",
+        )
         assert bench.supervisor.state is State.STOPPED
         bench.supervisor.emergency_stop(bench.now + 1.0)
         assert len(bench.stops) == 2  # sent again: the first may have been lost
@@ -359,11 +410,14 @@ def test_nobody_watches() -> None:
     assert bench.supervisor.client_lost(bench.now) is None
 
 
-@pytest.mark.parametrize("error", [ValueError("no such\nthing"), KeyboardInterrupt(), SystemExit(0), RefusedError("wire 1 was told 9 mm.")])
+@pytest.mark.parametrize(
+    "error",
+    [ValueError("no such\nthing"), KeyboardInterrupt(), SystemExit(0), RefusedError("wire 1 was told 9 mm.")],
+)
 def test_whatever_leaves_a_guarded_block_stops_first(error: BaseException) -> None:
     bench, clock = Bench(), SteppedClock()
     clock.sleep_until(7.0)
-    with pytest.raises(type(error)), bench.supervisor.guard(clock):  # noqa: PT012 - the guard is what is tested
+    with pytest.raises(type(error)), bench.supervisor.guard(clock):  # noqa: PT012
         assert bench.stops == []
         raise error
     assert [(fault.kind, fault.t) for fault in bench.stops] == [("exception", 7.0)]
@@ -461,19 +515,45 @@ def test_history_tells_when_and_why() -> None:
 
 
 def test_only_a_person_leads_out_of_a_stop_and_a_stop_is_always_possible() -> None:
-    out = {(event, after) for (before, event), after in TRANSITIONS.items() if before is State.STOPPED and after is not State.STOPPED}
+    out = {
+        (event, after)
+        for (before, event), after in TRANSITIONS.items()
+        if before is State.STOPPED and after is not State.STOPPED
+    }
     assert out == {("acknowledged", State.OFF)}
     assert all(TRANSITIONS[state, "fault"] is State.STOPPED for state in State)
-    into = {(before, event) for (before, event), after in TRANSITIONS.items() if after is State.RUNNING and before is not State.RUNNING}
+    into = {
+        (before, event)
+        for (before, event), after in TRANSITIONS.items()
+        if after is State.RUNNING and before is not State.RUNNING
+    }
     assert into == {(State.READY, "command")}
 
 
-EVENTS = ("enabled", "disabled", "check", "wild", "watch", "sick", "late", "stop", "lost", "exception", "acknowledge")
+EVENTS = (
+    "enabled",
+    "disabled",
+    "check",
+    "wild",
+    "watch",
+    "sick",
+    "late",
+    "stop",
+    "lost",
+    "exception",
+    "acknowledge",
+)
 
 
 @quickly
-@given(st.lists(st.sampled_from(EVENTS), max_size=40), st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=4, max_size=4))
-@example(["enabled", "check", "stop", "enabled", "check", "watch", "disabled", "check", "acknowledge", "check"], [0.0, 0.0, 0.0, NAN])
+@given(
+    st.lists(st.sampled_from(EVENTS), max_size=40),
+    st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=4, max_size=4),
+)
+@example(
+    ["enabled", "check", "stop", "enabled", "check", "watch", "disabled", "check", "acknowledge", "check"],
+    [0.0, 0.0, 0.0, NAN],
+)
 def test_whatever_happens_only_a_release_ends_a_stop(events: list[str], wild: list[float]) -> None:
     bench = Bench(running=False)
     s = bench.supervisor
@@ -484,7 +564,9 @@ def test_whatever_happens_only_a_release_ends_a_stop(events: list[str], wild: li
             if event in ("check", "wild"):
                 told = s.check(BENT if event == "check" else wild, bench.now)
             elif event in ("watch", "sick", "late"):
-                bench.watch(dt=0.3 if event == "late" else DT, heartbeat_age=(0, 9.0 if event == "sick" else 0.01))
+                bench.watch(
+                    dt=0.3 if event == "late" else DT, heartbeat_age=(0, 9.0 if event == "sick" else 0.01)
+                )
             elif event in ("enabled", "disabled", "acknowledge"):
                 getattr(s, event)(bench.now)
             elif event == "stop":
@@ -517,7 +599,8 @@ def test_a_command_passes_as_it_is_or_not_at_all(dl: list[float]) -> None:
     supervisor = Supervisor(ROBOT, Limits())
     supervisor.enabled(0.0)
     x, y = dl[0] - dl[2], dl[1] - dl[3]
-    fits = max(map(abs, dl)) <= 0.008 and math.hypot(x, y) / (2.0 * 0.0075) / 0.07 <= 20.0  # the closed form of four wires
+    # the closed form of four wires
+    fits = max(map(abs, dl)) <= 0.008 and math.hypot(x, y) / (2.0 * 0.0075) / 0.07 <= 20.0
     try:
         told: np.ndarray | None = supervisor.check(dl, 0.0)
     except RefusedError:
@@ -531,7 +614,9 @@ def test_stop_is_pressed_by_another_thread_while_the_loop_watches() -> None:
         bench = Bench()
         begun, pressed, refused = threading.Event(), threading.Event(), 0
 
-        def press(bench: Bench = bench, begun: threading.Event = begun, pressed: threading.Event = pressed) -> None:
+        def press(
+            bench: Bench = bench, begun: threading.Event = begun, pressed: threading.Event = pressed
+        ) -> None:
             begun.wait()
             bench.supervisor.emergency_stop(bench.now, "from a page")
             pressed.set()
@@ -557,7 +642,8 @@ def test_stop_is_pressed_by_another_thread_while_the_loop_watches() -> None:
 
 
 def test_a_slow_stop_holds_up_nobody_else() -> None:
-    """The lock is not held while the stop is sent: another thread sees the state, and its own stop goes through."""
+    """The lock is not held while the stop is sent: another thread sees the state, and its own stop goes
+    through."""
     inside, go = threading.Event(), threading.Event()
     sent: list[str] = []
 
@@ -615,7 +701,9 @@ def test_a_supervisor_that_cannot_be_is_named() -> None:
 
 
 def test_names_without_node_ids_and_codes_without_words() -> None:
-    one = Robot(name="one", segments=(replace(ROBOT.segments[0], tendons=(Tendon(offset=0.0075, angle=0.0),) * 4),))
+    one = Robot(
+        name="one", segments=(replace(ROBOT.segments[0], tendons=(Tendon(offset=0.0075, angle=0.0),) * 4),)
+    )
     supervisor = Supervisor(one, Limits())
     supervisor.enabled(0.0)
     fault = supervisor.watch(0.01, None, healthy(0.01, emergencies=EMCY))
@@ -626,9 +714,16 @@ def test_names_without_node_ids_and_codes_without_words() -> None:
 @pytest.mark.parametrize(
     ("word", "state"),
     [
-        (0x0000, "not ready"), (0x0240, "switched off"), (0x0221, "ready to switch on"), (0x0233, "switched on"), (0x0637, "enabled"),
-        (0x0217, "quick stop"), (0x021F, "reacting to a fault"), (0x0218, "in fault"), (0x0002, "no state"),
+        (0x0000, "not ready"),
+        (0x0240, "switched off"),
+        (0x0221, "ready to switch on"),
+        (0x0233, "switched on"),
+        (0x0637, "enabled"),
+        (0x0217, "quick stop"),
+        (0x021F, "reacting to a fault"),
+        (0x0218, "in fault"),
+        (0x0002, "no state"),
     ],
-)  # fmt: skip
+)
 def test_statuswords_in_words(word: int, state: str) -> None:
     assert state in drive_state(word)

@@ -14,7 +14,17 @@ from fastrod.model.segment_actions import SegmentActions
 from fastrod_scenes import load
 from fastrod_viewer import palette
 from fastrod_viewer.chains import tangents
-from fastrod_viewer.scene_graph import SHAPES, Options, Picture, Trail, ball, bounds, ghost, grid_places, legend
+from fastrod_viewer.scene_graph import (
+    SHAPES,
+    Options,
+    Picture,
+    Trail,
+    ball,
+    bounds,
+    ghost,
+    grid_places,
+    legend,
+)
 from fastrod_viewer.world import Body, Rods
 
 
@@ -30,7 +40,11 @@ def bent(name, n_robots=1, seed=3, points=20):
     simulator = fastrod.Simulator(robot, n_robots, points_per_segment=points)
     if not robot.n_tendons:
         return robot, simulator, simulator.settle()
-    moves = np.random.default_rng(seed).uniform(-0.004, 0.004, (n_robots, robot.n_segments, 3)) * [0.0, 1.0, 1.0]
+    moves = np.random.default_rng(seed).uniform(-0.004, 0.004, (n_robots, robot.n_segments, 3)) * [
+        0.0,
+        1.0,
+        1.0,
+    ]
     state = simulator.settle(**SegmentActions(robot).inputs(moves.reshape(n_robots, -1)))
     assert state.ok.all()
     return robot, simulator, state
@@ -45,15 +59,23 @@ def ends(batch):
 def check(batches):
     for batch in batches.values():
         n = len(batch.position)
-        assert (batch.position.shape, batch.wxyz.shape, batch.scale.shape, batch.color.shape) == ((n, 3), (n, 4), (n, 3), (n, 3))
-        assert (batch.position.dtype, batch.wxyz.dtype, batch.scale.dtype, batch.color.dtype) == (np.float32,) * 3 + (np.uint8,)
+        assert (batch.position.shape, batch.wxyz.shape, batch.scale.shape, batch.color.shape) == (
+            (n, 3),
+            (n, 4),
+            (n, 3),
+            (n, 3),
+        )
+        assert (batch.position.dtype, batch.wxyz.dtype, batch.scale.dtype, batch.color.dtype) == (
+            np.float32,
+        ) * 3 + (np.uint8,)
         assert all(np.isfinite(a).all() for a in batch[1:])
         assert_allclose(np.linalg.norm(batch.wxyz, axis=1), 1.0, atol=1e-6)
         assert (batch.scale >= 0.0).all()
     return batches
 
 
-# -- the rod ---------------------------------------------------------------------------------------------------------------------------
+# -- the rod
+# ----------------------------------------------------------------------------------------------------
 
 
 def test_pieces_of_an_arc_lie_on_the_arc():
@@ -84,22 +106,30 @@ def test_chain_follows_the_rod(name, points):
     pose = simulator.shape(np.minimum(s, joints[-1]))
     points_on = pose.position[0].reshape(-1, p + 1, 3)
     tolerance = 1e-4 * robot.length if points == 4 else 1e-5 * robot.length
-    assert_allclose(body.position.reshape(-1, p, 3), 0.5 * (points_on[:, 1:] + points_on[:, :-1]), atol=tolerance)
+    assert_allclose(
+        body.position.reshape(-1, p, 3), 0.5 * (points_on[:, 1:] + points_on[:, :-1]), atol=tolerance
+    )
     chord = points_on[:, 1:] - points_on[:, :-1]
     size = np.linalg.norm(chord, axis=-1, keepdims=True)
-    assert_allclose(tangents(body.wxyz.astype(float)).reshape(-1, p, 3), chord / size, atol=0.01 if points == 4 else 1e-3)
-    # neighbours overlap, by the radius times the angle between them, so that no wedge opens on the outside of the bend
+    assert_allclose(
+        tangents(body.wxyz.astype(float)).reshape(-1, p, 3), chord / size, atol=0.01 if points == 4 else 1e-3
+    )
+    # neighbours overlap, by the radius times the angle between them, so that no wedge opens on the outside of
+    # the bend
     over = body.scale[:, 2].reshape(-1, p, 1) - size
     tangent = pose.rotation[0, :, :, 2].reshape(-1, p + 1, 3)
     turn = np.linalg.norm(tangent[:, 1:] - tangent[:, :-1], axis=-1, keepdims=True)
-    assert_allclose(over, picture.tube_radius[:, None, None] * turn, atol=1e-2 * size.max())  # turns evenly between nodes
+    # turns evenly between nodes
+    assert_allclose(over, picture.tube_radius[:, None, None] * turn, atol=1e-2 * size.max())
     assert (over >= -1e-6).all()
 
 
 def test_nodes_that_are_not_even_do_not_show():
     robot = fastrod.load_robot("tdcr_a")
     simulator = fastrod.Simulator(robot, points_per_segment=20)
-    state = simulator.settle(robot.rest_tendon_length, point_force=[(0.133, (0.1, 0.0, 0.0)), (0.207, (0.0, 0.1, 0.0))])
+    state = simulator.settle(
+        robot.rest_tendon_length, point_force=[(0.133, (0.1, 0.0, 0.0)), (0.207, (0.0, 0.1, 0.0))]
+    )
     assert np.ptp(np.diff(state.arclength[0])) > 1e-3
     body = Picture(seen(robot, state)).frame(seen(robot, state))["body"]
     assert_allclose(np.linalg.norm(np.diff(body.position[:40], axis=0), axis=1), 0.2 / 40, rtol=1e-3)
@@ -115,7 +145,8 @@ def test_tip_is_at_the_tip():
     assert_allclose(tip.scale, 0.012)
 
 
-# -- what sits on it -------------------------------------------------------------------------------------------------------------------
+# -- what sits on it
+# ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["prototype", "tdcr_a", "tdcr_b", "five_segment_reacher"])
@@ -131,11 +162,16 @@ def test_tendons_run_at_their_offsets_and_are_as_long_as_they_are(name):
     total = np.zeros(robot.n_tendons)
     for i, (t, k) in enumerate(pairs):
         own = slice(pieces * i, pieces * (i + 1))
-        pose = simulator.shape(np.minimum(joints[k] + np.linspace(0.0, 1.0, pieces + 1) * (joints[k + 1] - joints[k]), joints[-1]))
+        pose = simulator.shape(
+            np.minimum(
+                joints[k] + np.linspace(0.0, 1.0, pieces + 1) * (joints[k + 1] - joints[k]), joints[-1]
+            )
+        )
         offset = np.array([*robot.tendons[t].position(int(robot.tendon_segment[t]) + 1)[k], 0.0])
         on = pose.position[0] + pose.rotation[0] @ offset
         assert_allclose(tendons.position[own], 0.5 * (on[1:] + on[:-1]), atol=2e-6)
-        assert_allclose(first[own], on[:-1], atol=3e-5)  # a chain is as long as its tendon, so pieces are as long as their arcs
+        # a chain is as long as its tendon, so pieces are as long as their arcs
+        assert_allclose(first[own], on[:-1], atol=3e-5)
         assert_allclose(last[own], on[1:], atol=3e-5)
         total[t] += tendons.scale[own, 2].sum(dtype=float)
     assert_allclose(total, state.path_length[0], rtol=1e-4)
@@ -171,13 +207,19 @@ def test_robot_without_tendons_is_its_body():
     found = check(Picture(rods, Options(color_by="tension")).frame(rods))
     assert set(found) == {"body", "tip", "load_shafts", "load_heads"}
     assert_allclose(found["body"].scale[:, 0], 0.015)
-    assert "no tendons" in legend(rods, Options(color_by="tension"), Picture(rods, Options(color_by="tension"))).html()
+    assert (
+        "no tendons"
+        in legend(rods, Options(color_by="tension"), Picture(rods, Options(color_by="tension"))).html()
+    )
 
 
-# -- frames ----------------------------------------------------------------------------------------------------------------------------
+# -- frames
+# ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("options", [Options(frames=True), Options(color_by="strain", body="skin"), Options(color_by="tension")])
+@pytest.mark.parametrize(
+    "options", [Options(frames=True), Options(color_by="strain", body="skin"), Options(color_by="tension")]
+)
 def test_counts_stay_over_a_rollout(options):
     robot = fastrod.load_robot("five_segment_reacher")
     actions = SegmentActions(robot)
@@ -235,7 +277,11 @@ def test_robot_that_is_lost_stays_and_is_red():
     before = picture.frame(seen(robot, state))
     along = ("position", "rotation", "curvature", "arclength", "tension")
     gone = {
-        name: np.where(np.arange(2).reshape(-1, *[1] * (getattr(state, name).ndim - 1)) == 1, np.nan, getattr(state, name))
+        name: np.where(
+            np.arange(2).reshape(-1, *[1] * (getattr(state, name).ndim - 1)) == 1,
+            np.nan,
+            getattr(state, name),
+        )
         for name in along
     }
     after = check(picture.frame(seen(robot, replace(state, ok=np.array([True, False]), **gone))))
@@ -248,13 +294,17 @@ def test_robot_that_is_lost_stays_and_is_red():
 
 def test_robot_that_was_never_there_is_straight():
     robot, _, state = bent("prototype")
-    gone = {name: np.full_like(getattr(state, name), np.nan) for name in ("position", "rotation", "curvature", "arclength", "tension")}
+    gone = {
+        name: np.full_like(getattr(state, name), np.nan)
+        for name in ("position", "rotation", "curvature", "arclength", "tension")
+    }
     rods = seen(robot, replace(state, ok=np.array([False]), **gone))
     found = check(Picture(rods).frame(rods))
     assert_allclose(found["body"].position[:, 2], (np.arange(40) + 0.5) * 0.07 / 40, atol=1e-7)
 
 
-# -- colours ---------------------------------------------------------------------------------------------------------------------------
+# -- colours
+# ----------------------------------------------------------------------------------------------------
 
 
 def test_segments_have_colours_of_their_own():
@@ -262,7 +312,9 @@ def test_segments_have_colours_of_their_own():
     color = Picture(seen(robot, state)).frame(seen(robot, state))["body"].color.reshape(5, 40, 3)
     assert (color == color[:, :1]).all()
     assert len(np.unique(color[:, 0], axis=0)) == 5
-    apart = [np.abs(np.subtract(a, b)).sum() for i, a in enumerate(palette.SEGMENTS) for b in palette.SEGMENTS[:i]]
+    apart = [
+        np.abs(np.subtract(a, b)).sum() for i, a in enumerate(palette.SEGMENTS) for b in palette.SEGMENTS[:i]
+    ]
     assert len(palette.SEGMENTS) >= 8
     assert min(apart) > 60
 
@@ -280,7 +332,11 @@ def test_more_bend_is_brighter():
     table = palette.SEQUENTIAL @ np.array([0.2126, 0.7152, 0.0722])
     assert (np.diff(table) > -0.8).all()  # of 255: rounding
     largest = 1.3 / 0.07
-    assert largest <= Picture(seen(robot, state), Options(color_by="curvature")).range.see(np.array([largest])) <= 1.5 * largest
+    assert (
+        largest
+        <= Picture(seen(robot, state), Options(color_by="curvature")).range.see(np.array([largest]))
+        <= 1.5 * largest
+    )
 
 
 def test_proximal_segment_has_its_own_curvature_up_to_the_joint():
@@ -309,7 +365,9 @@ def test_slack_wire_is_light_and_thin():
     whole = rod("tendon_length")
     wires = tuple(replace(tendon, unilateral=True) for tendon in whole.segments[0].tendons)
     robot = replace(whole, segments=(replace(whole.segments[0], tendons=wires),))
-    state = fastrod.Simulator(robot).settle(bend(robot, 0.0, 0.8) + np.array([-0.0001, 0.0001, 0.003, 0.0001]))
+    state = fastrod.Simulator(robot).settle(
+        bend(robot, 0.0, 0.8) + np.array([-0.0001, 0.0001, 0.003, 0.0001])
+    )
     slack = state.tension[0] <= 1e-6
     assert slack.any()
     assert not slack.all()
@@ -342,7 +400,8 @@ def test_pushing_rod_is_violet_and_tension_has_two_sides():
     assert (shown["body"].color == palette.BODY).all()
 
 
-# -- arrows ----------------------------------------------------------------------------------------------------------------------------
+# -- arrows
+# ----------------------------------------------------------------------------------------------------
 
 
 def test_contact_arrow_begins_on_the_wall_and_points_off_it():
@@ -364,12 +423,16 @@ def test_contact_arrow_begins_on_the_wall_and_points_off_it():
     # the wall is free where x < 0.02: off it is -x
     head, shaft = (found[name] for name in ("contact_heads", "contact_shafts"))
     assert_allclose(tangents(head.wxyz[there].astype(float)), [[-1.0, 0.0, 0.0]] * n, atol=1e-6)
-    start, end = ends(shaft._replace(**{name: getattr(shaft, name)[there] for name in ("position", "wxyz", "scale")}))
+    start, end = ends(
+        shaft._replace(**{name: getattr(shaft, name)[there] for name in ("position", "wxyz", "scale")})
+    )
     assert_allclose(start, state.contacts.point[0], atol=1e-6)
     assert_allclose(end, head.position[there], atol=1e-6)
     force = np.linalg.norm(state.contacts.force[0], axis=-1)
     unit = 0.0022 / 0.07**2
-    assert_allclose(shaft.scale[there, 2] + head.scale[there, 2], 0.3 * 0.07 * force / (force + unit), rtol=1e-5)
+    assert_allclose(
+        shaft.scale[there, 2] + head.scale[there, 2], 0.3 * 0.07 * force / (force + unit), rtol=1e-5
+    )
 
 
 def test_load_arrow_is_at_the_tip():
@@ -427,10 +490,13 @@ def test_ball_that_is_nowhere_has_no_size():
     assert_allclose(found.scale[:, 0], [0.01, 0.0])
 
 
-# -- meshes, places, words -------------------------------------------------------------------------------------------------------------
+# -- meshes, places, words
+# ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("name", "volume"), [("bar", np.pi), ("disc", np.pi), ("ball", 4.0 * np.pi / 3.0), ("cone", np.pi / 3.0)])
+@pytest.mark.parametrize(
+    ("name", "volume"), [("bar", np.pi), ("disc", np.pi), ("ball", 4.0 * np.pi / 3.0), ("cone", np.pi / 3.0)]
+)
 def test_closed_meshes_are_closed_and_outward(name, volume):
     mesh = SHAPES[name]
     edges = {(int(a), int(b)) for face in mesh.faces for a, b in zip(face, np.roll(face, -1), strict=True)}
@@ -453,7 +519,10 @@ def test_open_meshes_face_outward(name):
 
 
 def test_meshes_have_the_sizes_they_are_said_to_have():
-    reach = {name: (mesh.vertices.min(0).round(5).tolist(), mesh.vertices.max(0).round(5).tolist()) for name, mesh in SHAPES.items()}
+    reach = {
+        name: (mesh.vertices.min(0).round(5).tolist(), mesh.vertices.max(0).round(5).tolist())
+        for name, mesh in SHAPES.items()
+    }
     for name in ("tube", "wire", "bar", "disc"):
         assert reach[name] == ([-1.0, -1.0, -0.5], [1.0, 1.0, 0.5])
     assert reach["ball"] == ([-1.0] * 3, [1.0] * 3)
@@ -480,9 +549,13 @@ def test_bounds_hold_the_robots():
     one, _, state = bent("tdcr_a")
     assert bounds(seen(one, state))[1] == pytest.approx(0.62 * 0.4)  # room to bend to both sides
     cube = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]], np.float32)
-    far, wide = np.array([[0.4, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]]), Body("floor", cube, np.zeros((0, 3), np.uint32), (0, 0, 0))
+    far, wide = (
+        np.array([[0.4, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]]),
+        Body("floor", cube, np.zeros((0, 3), np.uint32), (0, 0, 0)),
+    )
     near = wide._replace(name="box", vertices=0.05 * cube)
-    assert bounds(seen(one, state), [wide], far)[1] == pytest.approx(0.62 * 0.4)  # a floor is no reason to step back
+    # a floor is no reason to step back
+    assert bounds(seen(one, state), [wide], far)[1] == pytest.approx(0.62 * 0.4)
     centre, radius = bounds(seen(one, state), [near], far)
     corners = np.array([[0.45, y, z] for y in (-0.05, 0.05) for z in (-0.05, 0.05)])
     assert (np.linalg.norm(corners - centre, axis=1) <= radius + 1e-12).all()
@@ -520,7 +593,11 @@ def test_bad_option_is_one_sentence():
         Options(body="skins")
     with pytest.raises(InputError, match=r"^Options.tendons is 1; it must be True or False\.$"):
         Options(tendons=1)
-    with pytest.raises(InputError, match=r"^Options.pieces is 0; it must be a whole number, at least 1, or None\.$"):
+    with pytest.raises(
+        InputError,
+        match=r"^Options.pieces is 0; it must be a whole number, at least 1, or "
+        r"None\.$",
+    ):
         Options(pieces=0)
 
 

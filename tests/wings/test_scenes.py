@@ -67,23 +67,30 @@ def test_airway_is_a_watertight_wall_with_two_handles():
     assert len(np.unique(directed, axis=0)) == len(directed)  # no edge twice in one direction ...
     assert {tuple(e) for e in directed} == {tuple(e) for e in directed[:, ::-1]}  # ... and each in both
     assert len(np.unique(faces)) == len(vertices)
-    assert len(vertices) - len(directed) // 2 + len(faces) == 2 - 2 * 2  # one body of genus 2, or Euler's number would differ
+    # one body of genus 2, or Euler's number would differ
+    assert len(vertices) - len(directed) // 2 + len(faces) == 2 - 2 * 2
     corner = vertices[faces]
     volume = np.einsum("ij,ij->", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])) / 6.0
     ring = np.pi * ((airway_mesh.RADIUS + airway_mesh.WALL) ** 2 - airway_mesh.RADIUS**2)
     long = 2.0 * airway_mesh.path_length() - airway_mesh.TRACHEA
-    assert volume == pytest.approx(ring * long, rel=0.15)  # where the tubes melt the wall is a little more, or less
+    # where the tubes melt the wall is a little more, or less
+    assert volume == pytest.approx(ring * long, rel=0.15)
     assert mesh((vertices, faces)).closed
 
 
 def test_airway_stands_where_the_distance_says():
     vertices, _ = airway_mesh.airway()
-    ends = [airway_mesh.middle(branch, np.array([airway_mesh.path_length()])) for branch in airway_mesh.BRANCHES]
-    cut = np.min([np.linalg.norm(vertices - end, axis=1) for end in ends], axis=0) < 2.0 * (airway_mesh.RADIUS + airway_mesh.WALL)
+    ends = [
+        airway_mesh.middle(branch, np.array([airway_mesh.path_length()])) for branch in airway_mesh.BRANCHES
+    ]
+    cut = np.min([np.linalg.norm(vertices - end, axis=1) for end in ends], axis=0) < 2.0 * (
+        airway_mesh.RADIUS + airway_mesh.WALL
+    )
     distance = airway_mesh.lumen_distance(vertices[~cut & (vertices[:, 2] > 0.004)])
     inner = distance < airway_mesh.WALL / 2.0
     assert inner.sum() > 1000
-    # marching tetrahedra cut a corner of cell^2 / 8 r = 0.07 mm, and an edge's end is moved by up to 5 % of its 1.8 to 3.1 mm
+    # marching tetrahedra cut a corner of cell^2 / 8 r = 0.07 mm, and an edge's end is moved by up to 5 % of
+    # its 1.8 to 3.1 mm
     assert np.abs(distance[inner]).max() < 3.5e-4
     assert np.abs(distance[~inner] - airway_mesh.WALL).max() < 3.5e-4
 
@@ -91,7 +98,9 @@ def test_airway_stands_where_the_distance_says():
 def test_airway_is_open_at_its_three_ends():
     depth = np.linspace(-0.02, airway_mesh.path_length() + 0.02, 60)
     for branch in airway_mesh.BRANCHES:
-        assert (airway_mesh.lumen_distance(airway_mesh.middle(branch, depth)) < -0.9 * airway_mesh.RADIUS).all()
+        assert (
+            airway_mesh.lumen_distance(airway_mesh.middle(branch, depth)) < -0.9 * airway_mesh.RADIUS
+        ).all()
 
 
 def test_middle_of_the_airway_is_as_long_as_its_depth_and_turns_as_it_heads():

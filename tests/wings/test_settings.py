@@ -1,4 +1,5 @@
-"""What `fastrod train --set` takes: the settings of an algorithm, answered with the nearest name before anything is made."""
+"""What `fastrod train --set` takes: the settings of an algorithm, answered with the nearest name before
+anything is made."""
 
 from __future__ import annotations
 
@@ -8,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed: pip install 'fastrod[rl]'")
+pytest.importorskip(
+    "stable_baselines3", reason="stable-baselines3 is not installed: pip install 'fastrod[rl]'"
+)
 
 from fastrod.commands.cli import main
 from fastrod_envs.presets import _SETTINGS, ALGORITHMS, settings_of
@@ -34,7 +37,12 @@ WRONG = [
 
 @pytest.mark.parametrize(("algorithm", "pair", "sentence"), WRONG)
 def test_a_setting_that_cannot_be_is_a_sentence(
-    algorithm: str, pair: str, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    algorithm: str,
+    pair: str,
+    sentence: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["train", "Reach", "--algo", algorithm, "--set", pair]) == 2

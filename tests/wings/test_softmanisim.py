@@ -1,4 +1,5 @@
-"""The paper's class on fastrod's model: every method, and the faults of the paper's own code that it must not have."""
+"""The paper's class on fastrod's model: every method, and the faults of the paper's own code that it must not
+have."""
 
 from __future__ import annotations
 
@@ -48,7 +49,10 @@ def make() -> Iterator[Callable[..., SoftManiSim]]:
 
 def poses(b: Bullet) -> dict[int, list[float]]:
     bodies = [b.getBodyUniqueId(i) for i in range(b.getNumBodies())]
-    return {i: [*np.concatenate(b.getBasePositionAndOrientation(i)), *np.concatenate(b.getBaseVelocity(i))] for i in bodies}
+    return {
+        i: [*np.concatenate(b.getBasePositionAndOrientation(i)), *np.concatenate(b.getBaseVelocity(i))]
+        for i in bodies
+    }
 
 
 def place_of(sim: SoftManiSim, body: int) -> np.ndarray[Any, Any]:
@@ -60,13 +64,17 @@ def speed_of(sim: SoftManiSim, body: int) -> np.ndarray[Any, Any]:
 
 
 def axis(quaternion: Any, k: int) -> np.ndarray[Any, Any]:
-    return np.array([np.reshape(pybullet.getMatrixFromQuaternion(q), (3, 3))[:, k] for q in np.atleast_2d(quaternion)])
+    return np.array(
+        [np.reshape(pybullet.getMatrixFromQuaternion(q), (3, 3))[:, k] for q in np.atleast_2d(quaternion)]
+    )
 
 
 # shape
 
 
-def test_the_straight_robot_points_along_y_and_bends_as_in_the_paper(make: Callable[..., SoftManiSim]) -> None:
+def test_the_straight_robot_points_along_y_and_bends_as_in_the_paper(
+    make: Callable[..., SoftManiSim],
+) -> None:
     sim = make(number_of_segment=1)
     world, own = sim.move_robot_ori()
     assert world.shape == own.shape == (30, 7)
@@ -79,15 +87,19 @@ def test_the_straight_robot_points_along_y_and_bends_as_in_the_paper(make: Calla
 
 
 def test_orientations_are_those_of_the_backbone(make: Callable[..., SoftManiSim]) -> None:
-    """z of each quaternion is the tangent, to the order of central differences; the whole bend is displacement over offset."""
+    """z of each quaternion is the tangent, to the order of central differences; the whole bend is
+    displacement over offset."""
     sim = make(number_of_sphere=200)
     rng = np.random.default_rng(3)
     for _ in range(3):
         action = np.c_[rng.uniform(-0.02, 0.05, 3), rng.uniform(-0.006, 0.006, (3, 2))]
         world, _ = sim.move_robot_ori(action.ravel(), [0.1, 0.2, 0.3], rng.uniform(-2, 2, 3))
         s = np.linspace(0.0, 0.3 + action[:, 0].sum(), 200)
-        assert_allclose(axis(world[1:-1, 3:], 2), (world[2:, :3] - world[:-2, :3]) / (s[2:] - s[:-2])[:, None], atol=0.03)
-        for k, end in enumerate(np.cumsum(0.1 + action[:, 0])):  # the last points inside each segment: less than its bend by their share
+        assert_allclose(
+            axis(world[1:-1, 3:], 2), (world[2:, :3] - world[:-2, :3]) / (s[2:] - s[:-2])[:, None], atol=0.03
+        )
+        # the last points inside each segment: less than its bend by their share
+        for k, end in enumerate(np.cumsum(0.1 + action[:, 0])):
             inside = (s >= end - 0.1 - action[k, 0]) & (s <= end)
             first, last = axis(world[inside][[0, -1], 3:], 2)
             share = np.ptp(s[inside]) / (0.1 + action[k, 0])
@@ -188,7 +200,8 @@ def test_the_marker_is_only_seen(make: Callable[..., SoftManiSim]) -> None:
 
 @pytest.mark.parametrize("dt", STEPS)
 def test_a_cube_takes_the_speed_of_what_pushes_it(make: Callable[..., SoftManiSim], dt: float) -> None:
-    """In the step of the first contact the head may be one step's way inside: the engine takes out a fifth of it a step, as speed."""
+    """In the step of the first contact the head may be one step's way inside: the engine takes out a fifth of
+    it a step, as speed."""
     sim = make(dt=dt, gravity=0.0, max_grasp_width=0.0)
     cube = sim.add_a_cube([0, 0.3 + 0.0225 + 0.02 + 0.01, 0], size=[0.04] * 3)
     seen = []
@@ -244,13 +257,15 @@ def test_the_first_placement_passes_through_nothing(make: Callable[..., SoftMani
 
 def test_contact_is_of_surfaces_not_of_boxes(make: Callable[..., SoftManiSim]) -> None:
     sim = make(dt=0.005, gravity=0.0)
-    sim.move_robot_ori(base_orin=[0, 0, -math.pi / 4])  # along x = y: the corners of its bounding box are empty
+    # along x = y: the corners of its bounding box are empty
+    sim.move_robot_ori(base_orin=[0, 0, -math.pi / 4])
     beside = sim.add_a_cube([0.18, 0.05, 0], size=[0.05] * 3)
     low, high = (np.array([sim.bullet.getAABB(i) for i in sim._capsules.ids])[:, k] for k in (0, 1))
     assert (low.min(axis=0) < [0.18, 0.05, 0]).all()
     assert (high.max(axis=0) > [0.18, 0.05, 0]).all()
     assert not sim.is_robot_in_contact(beside)
-    on = sim.add_a_cube([0.1 + 0.0324, 0.1 - 0.0324, 0], ori=about_z(math.pi / 4), size=[0.05] * 3)  # 45.8 mm aside: 0.8 mm clear
+    # 45.8 mm aside: 0.8 mm clear
+    on = sim.add_a_cube([0.1 + 0.0324, 0.1 - 0.0324, 0], ori=about_z(math.pi / 4), size=[0.05] * 3)
     assert sim.is_robot_in_contact(on)
     assert not sim.is_gripper_in_contact(on)
     assert not sim.is_tip_in_contact(on)
@@ -275,7 +290,9 @@ def test_a_tilted_cube_near_the_tip_does_not_touch_it(make: Callable[..., SoftMa
 # grasping
 
 
-def test_suction_carries_a_cube_as_it_stands_and_lets_it_fall(make: Callable[..., SoftManiSim], caplog: pytest.LogCaptureFixture) -> None:
+def test_suction_carries_a_cube_as_it_stands_and_lets_it_fall(
+    make: Callable[..., SoftManiSim], caplog: pytest.LogCaptureFixture
+) -> None:
     sim = make(max_grasp_width=0.0)
     cube = sim.add_a_cube([0.005, 0, 0.03], ori=about_z(0.3), size=[0.06] * 3, mass=0.5)
     sim.wait(0.1)
@@ -357,13 +374,17 @@ def test_a_cube_stands_as_told_and_falls_without_damping(make: Callable[..., Sof
 
 def test_pictures_have_true_colours_and_depth(make: Callable[..., SoftManiSim]) -> None:
     sim = make(max_grasp_width=0.0)
-    sim.camera, sim.in_hand_camera = Camera(width=64, height=48), Camera(width=64, height=48, near=0.005, far=3.0)
+    sim.camera, sim.in_hand_camera = (
+        Camera(width=64, height=48),
+        Camera(width=64, height=48, near=0.005, far=3.0),
+    )
     red = sim.add_a_cube([0, 0.5, 0.3], size=[0.1] * 3, color=[1, 0, 0, 1], mass=0.0)
     sim.move_robot_ori(base_pos=[0, 0, 0.3])
     rgb, depth = sim.in_hand_camera_capture_image()
     assert rgb[24, 32, 0] > 100
     assert rgb[24, 32, 1:].max() < 30
-    assert depth[24, 32] == pytest.approx(0.15 - 0.0235, abs=1e-3)  # from the front of the head, 23.5 mm beyond the tip
+    # from the front of the head, 23.5 mm beyond the tip
+    assert depth[24, 32] == pytest.approx(0.15 - 0.0235, abs=1e-3)
     sim.view = View((0.6, 0.5, 0.3), (0, 0.5, 0.3))
     rgb, depth = sim.capture_image()
     assert rgb[24, 32, 0] > 100
@@ -383,7 +404,8 @@ def test_pictures_have_true_colours_and_depth(make: Callable[..., SoftManiSim]) 
 def test_the_camera_in_the_hand_rolls_with_the_robot(make: Callable[..., SoftManiSim]) -> None:
     sim = make(max_grasp_width=0.0)
     sim.in_hand_camera = Camera(width=64, height=48, near=0.005, far=3.0)
-    sim.add_a_cube([0.05, 0.45, 1.05], size=[0.03] * 3, color=[0, 0, 1, 1], mass=0.0)  # up and right of the tip
+    # up and right of the tip
+    sim.add_a_cube([0.05, 0.45, 1.05], size=[0.03] * 3, color=[0, 0, 1, 1], mass=0.0)
     for roll, rows, columns in ((0.0, slice(0, 24), slice(32, 64)), (math.pi, slice(24, 48), slice(0, 32))):
         sim.create_robot()
         sim.move_robot_ori(base_pos=[0, 0, 1], base_orin=[0, roll, 0])

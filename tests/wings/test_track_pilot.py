@@ -30,10 +30,11 @@ PROTOTYPE = fastrod.load_robot("prototype")
 WORN = replace(
     PROTOTYPE,
     effects=(
-        {"name": "backlash", "half_width": 2e-4}, {"name": "creep", "share": 0.08, "time_constant": 2.0},
+        {"name": "backlash", "half_width": 2e-4},
+        {"name": "creep", "share": 0.08, "time_constant": 2.0},
         {"name": "camera_scale", "scale": 0.02},
     ),
-)  # fmt: skip
+)
 SHAPES = ("triangle", "square", "circle")
 
 
@@ -61,7 +62,9 @@ def episode(path: str, seed: int, robot: Robot, n_steps: int = 120) -> dict[str,
 
 def follow(pilot: TrackPilot, robot: Robot, n_steps: int = 120) -> dict[str, Any]:
     """The same with a simulator like the environment's."""
-    simulator = Simulator(robot, dt=DT, points_per_segment=Track.points_per_segment, outputs="tip", hold_gain=Track.hold_gain)
+    simulator = Simulator(
+        robot, dt=DT, points_per_segment=Track.points_per_segment, outputs="tip", hold_gain=Track.hold_gain
+    )
     simulator.settle(robot.rest_tendon_length)
     found: dict[str, Any] = {"dl": [], "tip": []}
     t, off = 0.0, []
@@ -91,7 +94,10 @@ def test_it_does_what_the_environment_does(path: Any, seed: int, robot: Robot) -
 
 
 def test_both_ways_round_were_seen() -> None:
-    ways = {episode(path, seed, PROTOTYPE, n_steps=1)["way"] for path, seed in (("triangle", 1), ("square", 2), ("circle", 4))}
+    ways = {
+        episode(path, seed, PROTOTYPE, n_steps=1)["way"]
+        for path, seed in (("triangle", 1), ("square", 2), ("circle", 4))
+    }
     assert ways == {-1, 1}
 
 
@@ -106,7 +112,9 @@ def test_a_simulated_robot_is_led_along_the_path() -> None:
         if now[0] > APPROACH:
             off.append(np.linalg.norm(tip - pilot.nearest(now[0])))
         link.command(pilot.command(tip, now[0]))
-    assert np.mean(off) == pytest.approx(follow(TrackPilot(policy(), "circle"), PROTOTYPE, 199)["distance"], abs=2e-5)
+    assert np.mean(off) == pytest.approx(
+        follow(TrackPilot(policy(), "circle"), PROTOTYPE, 199)["distance"], abs=2e-5
+    )
     assert np.mean(off) < 5e-4
 
 
@@ -123,7 +131,9 @@ def test_a_path_of_ones_own_is_the_tasks_where_it_is_the_same() -> None:
 
 def test_between_steps_the_command_stays() -> None:
     coarse, fine = TrackPilot(policy(), "square"), TrackPilot(policy(), "square")
-    tips = PROTOTYPE.length * np.array([0.0, 0.0, 1.0]) + np.random.default_rng(2).normal(scale=1e-3, size=(40, 3))
+    tips = PROTOTYPE.length * np.array([0.0, 0.0, 1.0]) + np.random.default_rng(2).normal(
+        scale=1e-3, size=(40, 3)
+    )
     for k, tip in enumerate(tips):
         wanted = coarse.command(tip, DT * k)
         assert_array_equal(fine.command(tip, DT * k), wanted)
@@ -163,7 +173,9 @@ def test_commands_stay_within_the_tasks_limits() -> None:
     assert_allclose(np.abs(pilot.displacement), np.abs(dl[-1, :2]), atol=1e-13)
 
 
-def pilot_of(path: Any = "circle", robot: Robot | None = None, name: str = "Track", **options: Any) -> TrackPilot:
+def pilot_of(
+    path: Any = "circle", robot: Robot | None = None, name: str = "Track", **options: Any
+) -> TrackPilot:
     return TrackPilot(Policy(find(name, "shipped")), path, robot, **options)
 
 
@@ -175,8 +187,16 @@ def pilot_of(path: Any = "circle", robot: Robot | None = None, name: str = "Trac
         (lambda: pilot_of(way=0), InputError, "phase is 0.0 s and way 0; give a finite time, and 1 or -1"),
         (lambda: pilot_of(phase=np.nan), InputError, "phase is nan s"),
         (lambda: pilot_of(helix(radius=0.02, pitch=0.01)), InputError, r"path 'helix' rises by 0.01 m"),
-        (lambda: pilot_of(robot=fastrod.load_robot("five_segment_reacher")), InputError, "has 5 segments; a policy of Track drives one"),
-        (lambda: pilot_of(3.0), InputError, "path is 3.0; give a Trajectory or one of 'triangle', 'square', 'circle'"),
+        (
+            lambda: pilot_of(robot=fastrod.load_robot("five_segment_reacher")),
+            InputError,
+            "has 5 segments; a policy of Track drives one",
+        ),
+        (
+            lambda: pilot_of(3.0),
+            InputError,
+            "path is 3.0; give a Trajectory or one of 'triangle', 'square', 'circle'",
+        ),
     ],
 )
 def test_what_cannot_be_piloted_is_said(make: Any, error: type[Exception], sentence: str) -> None:
@@ -208,7 +228,11 @@ def test_a_policy_with_other_options_is_refused(tmp_path: Path) -> None:
     given = policy()
     goal = Policy(find("Track", "shipped"))
     goal.plan = replace(given.plan, options={**given.plan.options, "observation": "goal"})
-    with pytest.raises(InputError, match=r"with \{'observation': 'goal'\}; give one of Track that observes the state"):
+    with pytest.raises(
+        InputError,
+        match=r"with \{'observation': 'goal'\}; give one of Track that observes "
+        r"the state",
+    ):
         TrackPilot(goal, "circle")
 
 

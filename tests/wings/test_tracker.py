@@ -1,4 +1,5 @@
-"""The eye and the tracker: pixels where OpenCV has them, exact coverage, no bias, no flips; what is doubtful is flagged; camera files."""
+"""The eye and the tracker: pixels where OpenCV has them, exact coverage, no bias, no flips; what is doubtful
+is flagged; camera files."""
 
 from __future__ import annotations
 
@@ -15,7 +16,17 @@ from fastrod.model.robot import Segment
 from fastrod.model.robotfile import load_robot
 from fastrod.rotation import product, quaternion_from_vector
 from fastrod_device import camera as camera_module
-from fastrod_device.camera import Camera, Frame, Marker, VideoCamera, compose, inverse, load_camera, rotation, save_camera
+from fastrod_device.camera import (
+    Camera,
+    Frame,
+    Marker,
+    VideoCamera,
+    compose,
+    inverse,
+    load_camera,
+    rotation,
+    save_camera,
+)
 from fastrod_device.drawing import Eye, Scene, draw, project
 from fastrod_device.errors import DeviceError
 from fastrod_device.gates import FrameOrder, Workspace
@@ -31,7 +42,9 @@ FACING = np.array([0.0, 1.0, 0.0, 0.0])  # the marker's z toward the camera
 
 def pose(distance, tilt, azimuth, roll, x=0.0, y=0.0):
     lean = quaternion_from_vector(tilt * np.array([np.cos(azimuth), np.sin(azimuth), 0.0]))
-    return np.array([x, y, distance]), product(lean, product(FACING, quaternion_from_vector(np.array([0.0, 0.0, roll]))))
+    return np.array([x, y, distance]), product(
+        lean, product(FACING, quaternion_from_vector(np.array([0.0, 0.0, roll])))
+    )
 
 
 def angle(a, b):
@@ -40,7 +53,10 @@ def angle(a, b):
 
 def frames(camera, poses, scene=None, seed=0, rate=15.0):
     rng = np.random.default_rng(seed)
-    return [Frame(image=draw(camera, MARKER, *p, rng=rng, scene=scene), t=k / rate, number=k + 1) for k, p in enumerate(poses)]
+    return [
+        Frame(image=draw(camera, MARKER, *p, rng=rng, scene=scene), t=k / rate, number=k + 1)
+        for k, p in enumerate(poses)
+    ]
 
 
 def test_projection_is_opencvs():
@@ -50,9 +66,16 @@ def test_projection_is_opencvs():
 
 
 def test_a_pixel_is_covered_by_its_area():
-    # edges at thirds of a pixel, parallel to the rows: 15 mm at 0.1 m are 120 px, pixel (0, 0) reaches from -0.5 to 0.5
+    # edges at thirds of a pixel, parallel to the rows: 15 mm at 0.1 m are 120 px, pixel (0, 0) reaches from
+    # -0.5 to 0.5
     camera = replace(CAMERA, matrix=((800.0, 0.0, 319.5 + 1.0 / 3.0), (0.0, 800.0, 239.5), (0.0, 0.0, 1.0)))
-    image = draw(camera, MARKER, *pose(0.1, 0.0, 0.0, 0.0), rng=np.random.default_rng(0), scene=replace(SHARP, white=240.0, black=0.0))
+    image = draw(
+        camera,
+        MARKER,
+        *pose(0.1, 0.0, 0.0, 0.0),
+        rng=np.random.default_rng(0),
+        scene=replace(SHARP, white=240.0, black=0.0),
+    )
     # black from 319.833 - 60 = 259.833 on: of pixel 260 (259.5 to 260.5) a third is white
     assert image[240, 258:263].tolist() == [240, 240, 80, 0, 0]
     assert image[178:182, 262].tolist() == [240, 240, 0, 0]
@@ -64,15 +87,26 @@ def test_drawing_is_a_slow_obvious_twin():
     n, some = 12, np.s_[200:215, 265:380]
     rows, columns = np.mgrid[some]
     offset = (np.arange(n) + 0.5) / n - 0.5
-    fine = np.stack(np.broadcast_arrays(columns[..., None, None] + offset, rows[..., None, None] + offset[:, None]), -1).reshape(-1, 1, 2)
+    fine = np.stack(
+        np.broadcast_arrays(columns[..., None, None] + offset, rows[..., None, None] + offset[:, None]), -1
+    ).reshape(-1, 1, 2)
     many = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-12)
-    rays = cv2.undistortPoints(fine.astype(np.float64), BENT.intrinsics, BENT.lens, criteria=many).reshape(-1, 2)
+    rays = cv2.undistortPoints(fine.astype(np.float64), BENT.intrinsics, BENT.lens, criteria=many).reshape(
+        -1, 2
+    )
     R = rotation(quaternion)
     rays = np.column_stack([rays, np.ones(len(rays))])
     on = (rays * (R[:, 2] @ position / (rays @ R[:, 2]))[:, None] - position) @ R[:, :2]
     cell = MARKER.size / 6.0
-    i, j = np.floor((on[:, 0] + 4.0 * cell) / cell).astype(int), np.floor((4.0 * cell - on[:, 1]) / cell).astype(int)
-    texture = np.pad(cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 7, 6), 1, constant_values=255)
+    i, j = (
+        np.floor((on[:, 0] + 4.0 * cell) / cell).astype(int),
+        np.floor((4.0 * cell - on[:, 1]) / cell).astype(int),
+    )
+    texture = np.pad(
+        cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 7, 6),
+        1,
+        constant_values=255,
+    )
     inside = (i >= 0) & (i < 8) & (j >= 0) & (j < 8)
     level = np.where(texture[np.clip(j, 0, 7), np.clip(i, 0, 7)] > 0, SHARP.white, SHARP.black)
     slow = np.where(inside, level, SHARP.background).reshape(*rows.shape, n * n).mean(-1)
@@ -85,7 +119,11 @@ def test_what_cannot_be_seen_is_not_drawn():
     empty = Eye(CAMERA, MARKER, scene=SHARP).draw(*pose(0.1, 0.0, 0.0, 0.0), marker=False)
     assert (empty == 110).all()
     away = np.array([1.0, 0.0, 0.0, 0.0])
-    for position, quaternion in (((0.0, 0.0, 0.1), away), ((0.0, 0.0, -0.1), FACING), ((0.0, 0.0, 0.1), pose(0.1, math.pi, 0, 0)[1])):
+    for position, quaternion in (
+        ((0.0, 0.0, 0.1), away),
+        ((0.0, 0.0, -0.1), FACING),
+        ((0.0, 0.0, 0.1), pose(0.1, math.pi, 0, 0)[1]),
+    ):
         assert_array_equal(Eye(CAMERA, MARKER, scene=SHARP).draw(np.array(position), quaternion), empty)
     outside = Eye(CAMERA, MARKER, scene=SHARP).draw(*pose(0.1, 0.2, 0.0, 0.3, x=0.2))
     assert_array_equal(outside, empty)
@@ -118,7 +156,9 @@ def test_clean_pictures_have_no_bias(camera, tilt):
     for k in range(25):
         there = pose(0.15, math.radians(tilt), *rng.uniform(0.0, 6.28, 2), *rng.uniform(-0.015, 0.015, 2))
         tracker.reset()
-        seen = tracker.look(Frame(image=draw(camera, MARKER, *there, rng=rng, scene=scene), t=0.0, number=k), there)
+        seen = tracker.look(
+            Frame(image=draw(camera, MARKER, *there, rng=rng, scene=scene), t=0.0, number=k), there
+        )
         assert seen.flag in ("", "ambiguous")
         corner.append(seen.corners - project(camera, SQUARE @ rotation(there[1]).T + there[0]))
         moved.append(seen.position - there[0])
@@ -134,7 +174,9 @@ def test_error_of_noisy_pictures(distance, largest):
     rng = np.random.default_rng(2)
     tracker, error = MarkerTracker(BENT, MARKER), []
     for k in range(30):
-        there = pose(distance, rng.uniform(0.0, 0.8), *rng.uniform(0.0, 6.28, 2), *rng.uniform(-0.1, 0.1, 2) * distance)
+        there = pose(
+            distance, rng.uniform(0.0, 0.8), *rng.uniform(0.0, 6.28, 2), *rng.uniform(-0.1, 0.1, 2) * distance
+        )
         tracker.reset()
         image = draw(BENT, MARKER, *there, rng=rng, scene=Scene(noise=3.0, blur=0.9))
         error.append(tracker.look(Frame(image=image, t=0.0, number=k), there).position - there[0])
@@ -149,7 +191,9 @@ def test_smooth_motion_through_the_frontal_pose_does_not_flip():
     seen = [tracker.look(frame) for frame in frames(CAMERA, poses, Scene(noise=3.0))]
     ok = np.array([s.ok for s in seen])
     assert ok.mean() > 0.9
-    assert max(angle(s.quaternion, q) for s, (_, q) in zip(seen, poses, strict=True) if s.ok) < math.radians(5.0)
+    assert max(angle(s.quaternion, q) for s, (_, q) in zip(seen, poses, strict=True) if s.ok) < math.radians(
+        5.0
+    )
     assert np.std([s.position[0] - p[0] for s, (p, _) in zip(seen, poses, strict=True) if s.ok]) < 2e-5
 
 
@@ -167,9 +211,19 @@ def test_the_expected_pose_tells_the_solutions_apart():
 
 
 def test_place_of_camera_and_marker():
-    camera = replace(CAMERA, position=(0.04, 0.0, 0.215), quaternion=tuple(quaternion_from_vector(np.array([0.3, 2.7, 0.1]))))
-    marker = replace(MARKER, position=(0.001, -0.002, 0.003), quaternion=tuple(quaternion_from_vector(np.array([0.05, 0.1, 0.7]))))
-    base_from_tip = compose(compose(camera.base_from_camera, pose(0.13, 0.3, 0.3, 0.4)), inverse(marker.tip_from_marker))
+    camera = replace(
+        CAMERA,
+        position=(0.04, 0.0, 0.215),
+        quaternion=tuple(quaternion_from_vector(np.array([0.3, 2.7, 0.1]))),
+    )
+    marker = replace(
+        MARKER,
+        position=(0.001, -0.002, 0.003),
+        quaternion=tuple(quaternion_from_vector(np.array([0.05, 0.1, 0.7]))),
+    )
+    base_from_tip = compose(
+        compose(camera.base_from_camera, pose(0.13, 0.3, 0.3, 0.4)), inverse(marker.tip_from_marker)
+    )
     image = Eye(camera, marker).draw(*base_from_tip)
     seen = MarkerTracker(camera, marker).look(Frame(image=image, t=1.0, number=4))
     assert (seen.flag, seen.t, seen.number) == ("", 1.0, 4)
@@ -329,7 +383,8 @@ def test_a_covered_side_is_an_outlier():
     image = frames(CAMERA, [pose(0.15, 0.2, 0.0, 0.0)])[0].image.copy()
     whole = MarkerTracker(CAMERA, MARKER).look(Frame(image=image, t=0.0, number=1))
     left, top = whole.corners[0]
-    image[int(top) - 8 : int(top) + 70, int(left) + 5 : int(left) - 20 : -1] = 40  # a wire as dark as the ink along the left side
+    # a wire as dark as the ink along the left side
+    image[int(top) - 8 : int(top) + 70, int(left) + 5 : int(left) - 20 : -1] = 40
     seen = MarkerTracker(CAMERA, MARKER).look(Frame(image=image, t=0.0, number=1))
     assert whole.ok
     assert seen.flag in ("outlier", "no marker")
@@ -340,7 +395,9 @@ def test_other_markers_are_not_taken():
     assert MarkerTracker(CAMERA, MARKER).look(Frame(image=image, t=0.0, number=1)).flag == "no marker"
     apriltag = Marker(size=0.015, id=5, dictionary="DICT_APRILTAG_16h5")
     there = pose(0.12, 0.3, 0.0, 0.0)
-    seen = MarkerTracker(CAMERA, apriltag).look(Frame(image=Eye(CAMERA, apriltag).draw(*there), t=0.0, number=1))
+    seen = MarkerTracker(CAMERA, apriltag).look(
+        Frame(image=Eye(CAMERA, apriltag).draw(*there), t=0.0, number=1)
+    )
     assert seen.ok
     assert_allclose(seen.position, there[0], atol=1e-4)
 

@@ -1,4 +1,5 @@
-"""The tracks: their checks can fail, shares are counted right, what is held does not move, and the soft robot can do it alone."""
+"""The tracks: their checks can fail, shares are counted right, what is held does not move, and the soft robot
+can do it alone."""
 
 from __future__ import annotations
 
@@ -14,7 +15,17 @@ from fastrod_scenes import load
 from fastrod_scenes.scene import SceneError
 from fastrod_scenes.ur5 import soft_ur5
 from fastrod_scenes.ur5.soft_ur5 import OFFSET, SoftUR5, track_robot
-from fastrod_scenes.ur5.tracking import APPROACH, CENTER, LARGEST_ERROR, LEAST_SHARE, Track, TrackCircle, Tracking, record, share
+from fastrod_scenes.ur5.tracking import (
+    APPROACH,
+    CENTER,
+    LARGEST_ERROR,
+    LEAST_SHARE,
+    Track,
+    TrackCircle,
+    Tracking,
+    record,
+    share,
+)
 
 
 def follow(path, seconds, **options):
@@ -32,7 +43,9 @@ def follow(path, seconds, **options):
 def test_check_fails_without_gain(monkeypatch):
     monkeypatch.setattr(TrackCircle, "duration", 3.0)
     monkeypatch.setattr(soft_ur5, "GAIN", 0.0)
-    with pytest.raises(SceneError, match=r"^scene track_circle: the mean squared error after the approach is"):
+    with pytest.raises(
+        SceneError, match=r"^scene track_circle: the mean squared error after the approach is"
+    ):
         load("track_circle").check()
     assert soft_ur5.GAIN == 0.0
 
@@ -43,7 +56,9 @@ def test_check_fails_without_feedforward(monkeypatch):
     with pytest.raises(SceneError, match="the mean squared error after the approach is") as error:
         load("track_circle").check()
     # behind by v / gain: the error's square is (2 pi 0.2 / 20 / 10)^2, a third of it for each of x, y and z
-    assert float(str(error.value).split(" is ")[1].split()[0]) == pytest.approx((0.02 * np.pi / 10.0) ** 2 / 3.0, rel=0.1)
+    assert float(str(error.value).split(" is ")[1].split()[0]) == pytest.approx(
+        (0.02 * np.pi / 10.0) ** 2 / 3.0, rel=0.1
+    )
 
 
 def test_check_fails_where_the_arm_does_it(monkeypatch):
@@ -68,7 +83,9 @@ def test_parts_make_up_the_way():
     run = follow(load("track_figure_eight").path(), 1.5)
     assert np.linalg.norm(run.way, axis=1).min() > 1e-3
     going = slice(5, None)  # the first steps set out from rest
-    assert_allclose((run.by_soft + run.by_arm)[going], run.way[going], atol=0.02 * np.linalg.norm(run.way, axis=1).max())
+    assert_allclose(
+        (run.by_soft + run.by_arm)[going], run.way[going], atol=0.02 * np.linalg.norm(run.way, axis=1).max()
+    )
     assert run.soft_share(0.0) > LEAST_SHARE
 
 
@@ -111,7 +128,9 @@ def test_scaled_path_is_the_path_about_the_center(name):
     scene = load(f"track_{name}")
     assert isinstance(scene, Track)
     t = np.linspace(0.0, 20.0, 50)
-    assert_allclose(scene.path(0.4).position(t) - CENTER, 0.4 * (scene.path().position(t) - CENTER), atol=1e-12)
+    assert_allclose(
+        scene.path(0.4).position(t) - CENTER, 0.4 * (scene.path().position(t) - CENTER), atol=1e-12
+    )
 
 
 def test_following_a_mounted_rod_is_as_placing_it():
@@ -128,6 +147,8 @@ def test_following_a_mounted_rod_is_as_placing_it():
         followed.follow(q, state, pose)
         placed.place(q, settle=True)
         assert_allclose(followed.position, placed.position, atol=1e-9)
-        assert_allclose(followed.jacobian(rotation=True), placed.jacobian(rotation=True), rtol=1e-6, atol=1e-6)
+        assert_allclose(
+            followed.jacobian(rotation=True), placed.jacobian(rotation=True), rtol=1e-6, atol=1e-6
+        )
     finally:
         world.disconnect()

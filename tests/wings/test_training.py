@@ -1,4 +1,5 @@
-"""Training on stable-baselines3: a small one to its end, one that is broken off and goes on, and what is written."""
+"""Training on stable-baselines3: a small one to its end, one that is broken off and goes on, and what is
+written."""
 
 from __future__ import annotations
 
@@ -8,14 +9,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed: pip install 'fastrod[rl]'")
+pytest.importorskip(
+    "stable_baselines3", reason="stable-baselines3 is not installed: pip install 'fastrod[rl]'"
+)
 
 from fastrod.errors import FastrodError, InputError, UnknownNameError
 from fastrod_envs.arrays import read_arrays, write_arrays
 from fastrod_envs.imitation import imitate
 from fastrod_envs.policies import Policy, find, shipped
 from fastrod_envs.sb3 import BatchVecEnv
-from fastrod_envs.training import CHECKPOINT, CONFIG, POLICY, REPLAY, algorithm_class, make_plan, read_config, resume, train
+from fastrod_envs.training import (
+    CHECKPOINT,
+    CONFIG,
+    POLICY,
+    REPLAY,
+    algorithm_class,
+    make_plan,
+    read_config,
+    resume,
+    train,
+)
 from fastrod_envs.vector import BatchEnv
 
 
@@ -24,7 +37,9 @@ class BrokenOffError(Exception):
 
 
 def test_training_writes_a_policy_with_its_configuration(tmp_path: Path) -> None:
-    plan = make_plan("Reach", steps=2560, n_envs=32, seed=3, options={"n_steps": 20}, settings={"n_epochs": 2})
+    plan = make_plan(
+        "Reach", steps=2560, n_envs=32, seed=3, options={"n_steps": 20}, settings={"n_epochs": 2}
+    )
     path = train(plan, tmp_path / "run")
     held = json.loads((tmp_path / "run" / CONFIG).read_text())
     assert path == tmp_path / "run" / POLICY
@@ -35,7 +50,8 @@ def test_training_writes_a_policy_with_its_configuration(tmp_path: Path) -> None
     assert held["state"]["steps_done"] >= 2560
     assert held["versions"]["stable-baselines3"]
     assert any((tmp_path / "run" / "tensorboard").rglob("events*"))
-    assert (tmp_path / "run" / CHECKPOINT).is_file()  # --resume with more steps goes on from it, and never from policy.zip
+    # --resume with more steps goes on from it, and never from policy.zip
+    assert (tmp_path / "run" / CHECKPOINT).is_file()
     assert not (tmp_path / "run" / REPLAY).exists()
     env = BatchEnv("Reach", num_envs=3, n_steps=20)
     observation, _ = env.reset(seed=0)
@@ -45,14 +61,24 @@ def test_training_writes_a_policy_with_its_configuration(tmp_path: Path) -> None
     assert actions.shape == (3, 11)
     assert (np.abs(actions) <= 1.0).all()
     model = algorithm_class("ppo").load(path, device="cpu")
-    widths = [layer.out_features for layer in model.policy.mlp_extractor.policy_net if hasattr(layer, "out_features")]
+    widths = [
+        layer.out_features
+        for layer in model.policy.mlp_extractor.policy_net
+        if hasattr(layer, "out_features")
+    ]
     assert widths == [256, 256]
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "sac", "td3"])
 def test_a_training_that_is_killed_goes_on_from_its_checkpoint(tmp_path: Path, algorithm: str) -> None:
-    settings = {"n_steps": 10, "n_epochs": 1} if algorithm == "ppo" else {"learning_starts": 100, "batch_size": 64, "gradient_steps": 1}
-    plan = make_plan("Reach", algorithm=algorithm, steps=3200, n_envs=16, options={"n_steps": 10}, settings=settings)
+    settings = (
+        {"n_steps": 10, "n_epochs": 1}
+        if algorithm == "ppo"
+        else {"learning_starts": 100, "batch_size": 64, "gradient_steps": 1}
+    )
+    plan = make_plan(
+        "Reach", algorithm=algorithm, steps=3200, n_envs=16, options={"n_steps": 10}, settings=settings
+    )
 
     def kill(_: str, done: int, __: int) -> None:
         if done >= 1600:
@@ -78,12 +104,18 @@ def test_a_training_that_is_killed_goes_on_from_its_checkpoint(tmp_path: Path, a
     for _ in range(5):
         observation, *_ = env.step(env.baseline())
     model = algorithm_class(algorithm).load(path, device="cpu")
-    np.testing.assert_allclose(Policy(tmp_path / "run").act(observation), model.predict(observation, deterministic=True)[0], atol=2e-5)
+    np.testing.assert_allclose(
+        Policy(tmp_path / "run").act(observation),
+        model.predict(observation, deterministic=True)[0],
+        atol=2e-5,
+    )
 
 
 def test_resume_takes_more_steps(tmp_path: Path) -> None:
     settings = {"n_steps": 10, "n_epochs": 1}
-    train(make_plan("Reach", steps=320, n_envs=16, options={"n_steps": 10}, settings=settings), tmp_path / "run")
+    train(
+        make_plan("Reach", steps=320, n_envs=16, options={"n_steps": 10}, settings=settings), tmp_path / "run"
+    )
     resume(tmp_path / "run")
     assert read_config(tmp_path / "run")[1]["steps_done"] == 320  # it was done
     resume(tmp_path / "run", 640)
@@ -93,7 +125,9 @@ def test_resume_takes_more_steps(tmp_path: Path) -> None:
 
 def test_a_damaged_checkpoint_is_refused_in_a_sentence(tmp_path: Path) -> None:
     settings = {"n_steps": 10, "n_epochs": 1}
-    train(make_plan("Reach", steps=160, n_envs=16, options={"n_steps": 10}, settings=settings), tmp_path / "run")
+    train(
+        make_plan("Reach", steps=160, n_envs=16, options={"n_steps": 10}, settings=settings), tmp_path / "run"
+    )
     path = tmp_path / "run" / CHECKPOINT
     whole, held = path.read_bytes(), read_arrays(path, "checkpoint")
     weight, moment = "policy/action_net.weight", "policy.optimizer/0/exp_avg"
@@ -122,7 +156,9 @@ def test_lessons_bring_the_policy_to_the_baseline() -> None:
     from fastrod_envs.sb3 import ScaledFeatures
 
     kwargs = {"net_arch": [64, 64], "features_extractor_class": ScaledFeatures}
-    model = algorithm_class("ppo")("MlpPolicy", BatchVecEnv(env), seed=0, device="cpu", policy_kwargs=kwargs, **plan.settings)
+    model = algorithm_class("ppo")(
+        "MlpPolicy", BatchVecEnv(env), seed=0, device="cpu", policy_kwargs=kwargs, **plan.settings
+    )
 
     def ends() -> float:
         observation, _ = env.reset(seed=50)
@@ -156,7 +192,7 @@ def test_the_adapter_tells_what_stable_baselines_asks_for() -> None:
         assert infos[i]["episode"]["l"] == 3
     assert env.env_method("set_difficulty", 0.5) == [None] * 4
     assert env.get_attr("n_steps", [0, 1]) == [3, 3]
-    assert env.env_is_wrapped(object) == [False] * 4  # type: ignore[arg-type]
+    assert env.env_is_wrapped(object) == [False] * 4
     with pytest.raises(InputError, match="share their attributes"):
         env.set_attr("n_steps", 4)
 

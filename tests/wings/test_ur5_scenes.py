@@ -1,4 +1,5 @@
-"""The box that a soft robot explores, and the fork that carries two: what the scenes' own checks leave open."""
+"""The box that a soft robot explores, and the fork that carries two: what the scenes' own checks leave
+open."""
 
 from __future__ import annotations
 
@@ -26,12 +27,15 @@ def test_corners_are_eight_and_their_cubes_lie_in_them() -> None:
     for k, corner in enumerate(corners):
         assert_allclose(np.abs(box.cube_at(k) - corner), 0.5 * box.cube)
         assert_allclose(
-            box.off_cube(k, np.array([corner, box.cube_at(k), corner + np.array([0.0, 0.0, 0.01])]))[:2], [0.0, 0.5 * box.cube], atol=1e-15
+            box.off_cube(k, np.array([corner, box.cube_at(k), corner + np.array([0.0, 0.0, 0.01])]))[:2],
+            [0.0, 0.5 * box.cube],
+            atol=1e-15,
         )
 
 
 def test_walls_leave_the_entry_open_and_nothing_else() -> None:
-    """Rays along x at the front wall: those within the octagon pass, those outside do not; a box without an entry stops all."""
+    """Rays along x at the front wall: those within the octagon pass, those outside do not; a box without an
+    entry stops all."""
     at = np.random.default_rng(30).uniform(-0.09, 0.09, (400, 2))
     turned = np.abs(np.concatenate([at, (at @ [[1.0, 1.0], [-1.0, 1.0]]) / np.sqrt(2.0)], axis=1)).max(axis=1)
     for box in (Box(), Box(entry=0.0)):
@@ -65,7 +69,8 @@ def test_aim_jacobian_is_the_slope_of_the_miss_where_it_is_zero() -> None:
                 turn = matrix_from_quaternion(quaternion_from_vector(s * column[3:])[None])[0]
                 ends.append(miss(tip + s * column[:3], turn @ rotation, point))
             slopes.append((ends[0] - ends[1]) / (2.0 * h))
-        # the point comes nearer by as much as the line's end moves; central differences: h^2, and 1e-16 / h from rounding
+        # the point comes nearer by as much as the line's end moves; central differences: h^2, and 1e-16 / h
+        # from rounding
         assert_allclose(-aim_jacobian(tip, rotation, point, jacobian), np.transpose(slopes), atol=1e-8)
 
 
@@ -87,7 +92,13 @@ def test_bracket_is_where_its_link_is_and_nothing_can_touch_it() -> None:
     world = connect()
     host = BulletLink(world, world.createMultiBody(1.0, -1, -1, [0.1, 0.2, 0.3]))
     bracket = Bracket(
-        host, [((0.0, 0.0, 0.0), (0.0, 0.0, 0.1)), ((0.0, 0.0, 0.1), (0.0, 0.0, 0.05)), ((0.0, 0.0, 0.0), (0.1, 0.0, 0.0))], 0.01
+        host,
+        [
+            ((0.0, 0.0, 0.0), (0.0, 0.0, 0.1)),
+            ((0.0, 0.0, 0.1), (0.0, 0.0, 0.05)),
+            ((0.0, 0.0, 0.0), (0.1, 0.0, 0.0)),
+        ],
+        0.01,
     )
     world.resetBasePositionAndOrientation(host.body, [0.4, 0.5, 0.6], [0.0, 0.0, 1.0, 0.0])
     bracket.follow()
@@ -168,7 +179,8 @@ def test_ur5_feels_both_soft_robots_wherever_they_are() -> None:
             alone = stage.arm.jacobian(stage.arm.position()).T @ stage.rods[0].wrench
             assert np.abs(expected).max() > 0.05
             assert np.abs(felt - expected).max() < 1e-6 * np.abs(expected).max()
-            assert np.abs(felt - alone).max() > 0.1 * np.abs(expected).max()  # the figure tells one robot from two
+            # the figure tells one robot from two
+            assert np.abs(felt - alone).max() > 0.1 * np.abs(expected).max()
             stage.arm.drive(stage.q)
     assert stage.bases().max() < 1e-6
     stage.close()

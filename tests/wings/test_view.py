@@ -43,7 +43,9 @@ from fastrod_viewer.worlds import FreeWorld, SceneWorld
         (["prototype", "--host", "192.0.2.1"], "host '192.0.2.1' is not an address of this machine"),
     ],
 )
-def test_what_cannot_be_shown_is_one_sentence(words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_shown_is_one_sentence(
+    words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["view", "--no-open", *words]) == 2
     said = capsys.readouterr()
     assert sentence in said.err
@@ -97,7 +99,9 @@ def test_a_message_is_sent_although_a_client_began_to_wait_in_that_moment() -> N
 
 
 def test_loopback_is_told_from_the_rest() -> None:
-    assert [is_loopback(h) for h in ("127.0.0.1", "localhost", "::1", "0.0.0.0", "192.168.1.2", "robot.lab")] == [True] * 3 + [False] * 3
+    assert [
+        is_loopback(h) for h in ("127.0.0.1", "localhost", "::1", "0.0.0.0", "192.168.1.2", "robot.lab")
+    ] == [True] * 3 + [False] * 3
 
 
 def test_names_and_files_stand_for_what_they_are(tmp_path: Path) -> None:
@@ -133,14 +137,25 @@ def test_it_serves_this_machine_alone_and_ends_at_once(end: signal.Signals) -> N
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    words = [sys.executable, "-m", "fastrod.commands.cli", "view", "prototype", "--no-open", "--port", str(port)]
+    words = [
+        sys.executable,
+        "-m",
+        "fastrod.commands.cli",
+        "view",
+        "prototype",
+        "--no-open",
+        "--port",
+        str(port),
+    ]
 
     def heed() -> None:
         """Background jobs of a shell ignore SIGINT; this one does not."""
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
     pipe = subprocess.PIPE
-    with subprocess.Popen(words, stdout=pipe, stderr=pipe, text=True, env=os.environ, preexec_fn=heed) as process:
+    with subprocess.Popen(
+        words, stdout=pipe, stderr=pipe, text=True, env=os.environ, preexec_fn=heed
+    ) as process:
         try:
             assert process.stdout is not None
             assert process.stderr is not None
@@ -170,7 +185,7 @@ def _address() -> str:
 @pytest.mark.parametrize(("host", "announced"), [("127.0.0.1", False), ("0.0.0.0", True)])
 def test_the_address_is_the_key(
     host: str, announced: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:  # fmt: skip
+) -> None:
     opened: list[str] = []
     monkeypatch.setattr(App, "wait", lambda app: opened.append(app.served.key))
     monkeypatch.setattr(webbrowser, "open", opened.append)

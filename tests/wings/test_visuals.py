@@ -1,4 +1,5 @@
-"""What the bodies of a PyBullet world look like: the triangles stand where PyBullet's own camera sees them."""
+"""What the bodies of a PyBullet world look like: the triangles stand where PyBullet's own camera sees
+them."""
 
 import numpy as np
 import pytest
@@ -26,11 +27,14 @@ def corners(visuals):
     """(n, 3) vertices of all shapes, world."""
     poses = visuals.poses()
     turns = matrix_from_quaternion(poses[:, 3:])
-    return np.concatenate([s.vertices @ r.T + p[:3] for s, r, p in zip(visuals.shapes, turns, poses, strict=True)])
+    return np.concatenate(
+        [s.vertices @ r.T + p[:3] for s, r, p in zip(visuals.shapes, turns, poses, strict=True)]
+    )
 
 
 def picture_bounds(world, body, eye=(0.9, -1.1, 1.6), target=(0.1, 0.1, 1.0)):
-    """Least and largest pixel (column, row) that shows the body, and the function that projects points to pixels."""
+    """Least and largest pixel (column, row) that shows the body, and the function that projects points to
+    pixels."""
     view = np.reshape(world.computeViewMatrix(eye, target, (0, 0, 1)), (4, 4)).T
     projection = np.reshape(world.computeProjectionMatrixFOV(FOV, WIDTH / HEIGHT, 0.05, 10.0), (4, 4)).T
     _, _, _, _, mask = world.getCameraImage(
@@ -41,7 +45,9 @@ def picture_bounds(world, body, eye=(0.9, -1.1, 1.6), target=(0.1, 0.1, 1.0)):
     def pixels(points):
         clip = np.column_stack([points, np.ones(len(points))]) @ (projection @ view).T
         ndc = clip[:, :2] / clip[:, 3:]
-        return np.column_stack([(ndc[:, 0] + 1.0) * WIDTH / 2.0 - 0.5, (1.0 - ndc[:, 1]) * HEIGHT / 2.0 - 0.5])
+        return np.column_stack(
+            [(ndc[:, 0] + 1.0) * WIDTH / 2.0 - 0.5, (1.0 - ndc[:, 1]) * HEIGHT / 2.0 - 0.5]
+        )
 
     return np.array([[columns.min(), rows.min()], [columns.max(), rows.max()]]), pixels
 
@@ -56,7 +62,9 @@ def made(world, kind, tmp_path):
     if kind == "capsule":
         return {"shapeType": world.GEOM_CAPSULE, "radius": 0.05, "length": 0.3}
     path = tmp_path / f"wedge.{kind}"
-    wedge = trimesh.Trimesh([[0, 0, 0], [200, 0, 0], [0, 100, 0], [0, 0, 300]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+    wedge = trimesh.Trimesh(
+        [[0, 0, 0], [200, 0, 0], [0, 100, 0], [0, 0, 300]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]
+    )
     path.write_text(wedge.export(file_type="obj"))
     return {"shapeType": world.GEOM_MESH, "fileName": str(path), "meshScale": [0.001, 0.002, 0.001]}
 
@@ -64,17 +72,31 @@ def made(world, kind, tmp_path):
 @pytest.mark.parametrize("kind", ["box", "sphere", "cylinder", "capsule", "obj"])
 @pytest.mark.parametrize("link", [False, True])
 def test_shape_stands_where_the_camera_sees_it(world, tmp_path, kind, link):
-    seen = world.createVisualShape(**made(world, kind, tmp_path), visualFramePosition=[0.05, -0.03, 0.04], visualFrameOrientation=TURN)
+    seen = world.createVisualShape(
+        **made(world, kind, tmp_path), visualFramePosition=[0.05, -0.03, 0.04], visualFrameOrientation=TURN
+    )
     links = {
-        "linkMasses": [1.0], "linkCollisionShapeIndices": [-1], "linkVisualShapeIndices": [seen if link else -1],
-        "linkPositions": [[0.05, 0.0, 0.1]], "linkOrientations": [[0.0, 0.28, 0.0, 0.96]],
-        "linkInertialFramePositions": [[0.1, 0.0, 0.2]], "linkInertialFrameOrientations": [[0.6, 0.0, 0.0, 0.8]],
-        "linkParentIndices": [0], "linkJointTypes": [world.JOINT_REVOLUTE], "linkJointAxis": [[0.0, 0.0, 1.0]],
-    }  # fmt: skip
+        "linkMasses": [1.0],
+        "linkCollisionShapeIndices": [-1],
+        "linkVisualShapeIndices": [seen if link else -1],
+        "linkPositions": [[0.05, 0.0, 0.1]],
+        "linkOrientations": [[0.0, 0.28, 0.0, 0.96]],
+        "linkInertialFramePositions": [[0.1, 0.0, 0.2]],
+        "linkInertialFrameOrientations": [[0.6, 0.0, 0.0, 0.8]],
+        "linkParentIndices": [0],
+        "linkJointTypes": [world.JOINT_REVOLUTE],
+        "linkJointAxis": [[0.0, 0.0, 1.0]],
+    }
     body = world.createMultiBody(
-        1.0, -1, -1 if link else seen, [0.0, 0.1, 1.0], [0.0, 0.0, 0.6, 0.8],
-        baseInertialFramePosition=[0.2, 0.1, 0.0], baseInertialFrameOrientation=[0.0, 0.6, 0.0, 0.8], **(links if link else {}),
-    )  # fmt: skip
+        1.0,
+        -1,
+        -1 if link else seen,
+        [0.0, 0.1, 1.0],
+        [0.0, 0.0, 0.6, 0.8],
+        baseInertialFramePosition=[0.2, 0.1, 0.0],
+        baseInertialFrameOrientation=[0.0, 0.6, 0.0, 0.8],
+        **(links if link else {}),
+    )
     if link:
         world.resetJointState(body, 0, 0.7)
     visuals = Visuals(world)
@@ -106,13 +128,21 @@ def test_quadruped_encloses_what_touches(world):
     boxes = np.array([world.getAABB(body, link) for link in range(-1, world.getNumJoints(body))])
     center = 0.5 * (boxes[:, 0].min(axis=0) + boxes[:, 1].max(axis=0))
     np.testing.assert_allclose(0.5 * (points.min(axis=0) + points.max(axis=0)), center, atol=0.05)
-    np.testing.assert_allclose(np.ptp(points, axis=0), boxes[:, 1].max(axis=0) - boxes[:, 0].min(axis=0), atol=0.1)
+    np.testing.assert_allclose(
+        np.ptp(points, axis=0), boxes[:, 1].max(axis=0) - boxes[:, 0].min(axis=0), atol=0.1
+    )
 
 
 def test_colours_and_what_is_left_out(world):
-    red = world.createMultiBody(0.0, -1, world.createVisualShape(world.GEOM_SPHERE, radius=0.1, rgbaColor=[1.0, 0.0, 0.0, 0.5]))
-    blue = world.createMultiBody(0.0, -1, world.createVisualShape(world.GEOM_SPHERE, radius=0.1, rgbaColor=[0.0, 0.0, 1.0, 1.0]))
-    world.createMultiBody(0.0, -1, world.createVisualShape(world.GEOM_SPHERE, radius=0.1, rgbaColor=[0.0, 1.0, 0.0, 0.0]))
+    red = world.createMultiBody(
+        0.0, -1, world.createVisualShape(world.GEOM_SPHERE, radius=0.1, rgbaColor=[1.0, 0.0, 0.0, 0.5])
+    )
+    blue = world.createMultiBody(
+        0.0, -1, world.createVisualShape(world.GEOM_SPHERE, radius=0.1, rgbaColor=[0.0, 0.0, 1.0, 1.0])
+    )
+    world.createMultiBody(
+        0.0, -1, world.createVisualShape(world.GEOM_SPHERE, radius=0.1, rgbaColor=[0.0, 1.0, 0.0, 0.0])
+    )
     assert [shape.rgba for shape in Visuals(world).shapes] == [(1.0, 0.0, 0.0, 0.5), (0.0, 0.0, 1.0, 1.0)]
     assert [shape.rgba for shape in Visuals(world, ignore=[red]).shapes] == [(0.0, 0.0, 1.0, 1.0)]
     none = Visuals(world, ignore=[red, blue])
@@ -130,10 +160,15 @@ def test_ground_without_end_is_a_square(world):
 
 
 def test_mesh_that_cannot_be_read_is_a_box_around_what_touches(world):
-    vertices, faces = [[0.0, 0, 0], [0.3, 0, 0], [0, 0.2, 0], [0, 0, 0.1]], [0, 2, 1, 0, 1, 3, 1, 2, 3, 0, 3, 2]
+    vertices, faces = (
+        [[0.0, 0, 0], [0.3, 0, 0], [0, 0.2, 0], [0, 0, 0.1]],
+        [0, 2, 1, 0, 1, 3, 1, 2, 3, 0, 3, 2],
+    )
     seen = world.createVisualShape(world.GEOM_MESH, vertices=vertices, indices=faces)
     touched = world.createCollisionShape(world.GEOM_MESH, vertices=vertices)
-    body = world.createMultiBody(1.0, touched, seen, [1.0, 2.0, 3.0], TURN, baseInertialFramePosition=[0.1, 0.0, 0.0])
+    body = world.createMultiBody(
+        1.0, touched, seen, [1.0, 2.0, 3.0], TURN, baseInertialFramePosition=[0.1, 0.0, 0.0]
+    )
     points, box = corners(Visuals(world)), np.array(world.getAABB(body))
     np.testing.assert_allclose([points.min(axis=0), points.max(axis=0)], box, atol=1e-6)
 

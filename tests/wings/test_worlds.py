@@ -1,4 +1,5 @@
-"""The worlds that the viewer shows: they play and obey a hand, and what a hand does has the effect that physics gives it."""
+"""The worlds that the viewer shows: they play and obey a hand, and what a hand does has the effect that
+physics gives it."""
 
 import sys
 from dataclasses import replace
@@ -28,9 +29,13 @@ def heavy(mode="tendon_length"):
     """A level, heavy robot of one segment."""
     wires = tuple(Tendon(offset=0.0075, angle=k * np.pi / 2) for k in range(4))
     segment = Segment(
-        length=0.2, bending_stiffness=(0.01, 0.01), torsional_stiffness=0.008, line_density=0.3, mode=mode,
+        length=0.2,
+        bending_stiffness=(0.01, 0.01),
+        torsional_stiffness=0.008,
+        line_density=0.3,
+        mode=mode,
         tendons=() if mode == "passive" else wires,
-    )  # fmt: skip
+    )
     return Robot(name="heavy", segments=(segment,), base_quaternion=(np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0))
 
 
@@ -49,7 +54,9 @@ def test_world_plays_and_obeys(name):
     world = open_world(name)
     try:
         start = world.t
-        for move in [world.play] * 5 + [lambda: world.drive(still(world))] * 5 * world.by_hand + [world.reset]:
+        for move in (
+            [world.play] * 5 + [lambda: world.drive(still(world))] * 5 * world.by_hand + [world.reset]
+        ):
             move()
             poses = world.poses()
             assert poses.shape == (len(world.bodies), 7)
@@ -74,7 +81,11 @@ def test_scene_in_mujoco_is_played_and_no_hand_drives_it():
         assert_allclose(tip(world), state[1].tip_position[0], atol=1e-12)
     assert not world.by_hand
     for refused in (lambda: world.drive(still(world)), world.jacobian):
-        with pytest.raises(InputError, match=r"^scene 'ur5_mujoco' has a script that moves its robots; no hand can drive them\.$"):
+        with pytest.raises(
+            InputError,
+            match=r"^scene 'ur5_mujoco' has a script that moves its robots; no "
+            r"hand can drive them\.$",
+        ):
             refused()
     world.reset()
     assert world.t == 0.0
@@ -102,7 +113,9 @@ def test_script_begins_again_after_its_end():
 
 
 @pytest.mark.parametrize(
-    "robot", [*map(load_robot, robot_names()), *map(heavy, ("tendon_length", "passive", "tendon_tension"))], ids=lambda r: r.name
+    "robot",
+    [*map(load_robot, robot_names()), *map(heavy, ("tendon_length", "passive", "tendon_tension"))],
+    ids=lambda r: r.name,
 )
 def test_free_robot_shows_itself_without_a_jump(robot):
     world = FreeWorld(robot)
@@ -150,7 +163,11 @@ def test_gravity_off_takes_the_sag_away():
     assert sag[2] < -0.02
     assert_allclose(weightless, [0.2, 0.0, 0.0], atol=1e-8)
     double = FreeWorld(replace(heavy("passive"), gravity=(0.0, 0.0, -2.0 * 9.81)))
-    assert_allclose(rest(world, still(world, gravity=2.0, payload=0.01)), rest(double, still(double, payload=0.01)), atol=1e-7)
+    assert_allclose(
+        rest(world, still(world, gravity=2.0, payload=0.01)),
+        rest(double, still(double, payload=0.01)),
+        atol=1e-7,
+    )
 
 
 def test_hand_sets_the_tension():
@@ -169,10 +186,18 @@ def test_jacobian_of_a_free_robot(name, n_robots):
 
     def tip_at(action):
         given = actions.inputs(action)
-        return rest(world, Hand(given["tendon_length"], given["extension"], tip_force=np.array([0.02, 0.0, 0.01])))
+        return rest(
+            world, Hand(given["tendon_length"], given["extension"], tip_force=np.array([0.02, 0.0, 0.01]))
+        )
 
-    step, columns = 1e-5, [j for j in range(actions.n_actions) if j % 3 or world.robot.segments[j // 3].extension[1]]
-    differences = [(tip_at(at + step * e) - tip_at(at - step * e)) / (2.0 * step) for e in np.eye(actions.n_actions)[columns]]
+    step, columns = (
+        1e-5,
+        [j for j in range(actions.n_actions) if j % 3 or world.robot.segments[j // 3].extension[1]],
+    )
+    differences = [
+        (tip_at(at + step * e) - tip_at(at - step * e)) / (2.0 * step)
+        for e in np.eye(actions.n_actions)[columns]
+    ]
     tip_at(at)
     jacobian = world.jacobian()
     assert jacobian.shape == (3, actions.n_actions)
@@ -228,7 +253,9 @@ def test_world_goes_on_after_what_cannot_be_done():
         assert world.t == t
         assert_allclose(tip(world), before)
     jump = world.actions.inputs(np.tile([0.0, 0.01, -0.01], 5))
-    world.drive(replace(still(world, tip_force=np.array([0.3, 0.2, -0.2])), tendon_length=jump["tendon_length"]))
+    world.drive(
+        replace(still(world, tip_force=np.array([0.3, 0.2, -0.2])), tendon_length=jump["tendon_length"])
+    )
     assert np.isfinite(tip(world)).all()
     assert world.t > t
     with pytest.raises(InputError, match="not driven by tendon lengths"):
@@ -238,7 +265,12 @@ def test_world_goes_on_after_what_cannot_be_done():
 def test_tracking_jacobian_against_the_model():
     world = open_world("track_circle")
     try:
-        hand = Hand(**{k: world.actions.inputs([0.015, 0.004, 0.002, 0.015, -0.003, 0.003])[k] for k in ("tendon_length", "extension")})
+        hand = Hand(
+            **{
+                k: world.actions.inputs([0.015, 0.004, 0.002, 0.015, -0.003, 0.003])[k]
+                for k in ("tendon_length", "extension")
+            }
+        )
         rest(world, hand, 40)
         jacobian = world.jacobian()
         assert jacobian.shape == (3, 6 + 6)
@@ -257,7 +289,11 @@ def test_tracking_jacobian_against_the_model():
 
 @pytest.mark.parametrize(
     ("name", "bracket"),
-    [("track_circle", lambda s: s.robot.bracket), ("explore", lambda s: s.bracket), ("dual_arm", lambda s: s.bracket)],
+    [
+        ("track_circle", lambda s: s.robot.bracket),
+        ("explore", lambda s: s.bracket),
+        ("dual_arm", lambda s: s.bracket),
+    ],
 )
 def test_hand_moves_the_flange(name, bracket):
     world = open_world(name)
@@ -270,8 +306,13 @@ def test_hand_moves_the_flange(name, bracket):
         rest(world, replace(hand, base=np.concatenate([by, np.zeros(3)])), 60)
         assert_allclose(stage.arm.frame(stage.arm.position())[:3] - flange[:3], by, atol=2e-4)
         assert_allclose(tip(world) - before, by, atol=5e-4)
-        place = [w for w, body in zip(world.poses(), world.bodies, strict=True) if body.name == f"body {bracket(stage).body}"]
-        assert_allclose(place[0][:3], stage.arm.frame(stage.arm.position())[:3], atol=1e-4)  # the bracket has come along
+        place = [
+            w
+            for w, body in zip(world.poses(), world.bodies, strict=True)
+            if body.name == f"body {bracket(stage).body}"
+        ]
+        # the bracket has come along
+        assert_allclose(place[0][:3], stage.arm.frame(stage.arm.position())[:3], atol=1e-4)
     finally:
         world.close()
 
@@ -283,7 +324,9 @@ def test_arm_stays_where_it_cannot_go_and_the_soft_robot_goes_on():
         rest(world, hand, 30)
         before = world._stage.arm.position()
         far = replace(hand, base=np.array([3.0, 0.0, 0.0, 0.0, 0.0, 0.0]), extension=np.array([0.01, 0.01]))
-        far = replace(far, tendon_length=world.actions.inputs([0.01, 0.0, 0.0, 0.01, 0.0, 0.0])["tendon_length"])
+        far = replace(
+            far, tendon_length=world.actions.inputs([0.01, 0.0, 0.0, 0.01, 0.0, 0.0])["tendon_length"]
+        )
         t = world.t
         with pytest.raises(HostError, match=r"flange|no joint positions"):
             world.drive(far)
@@ -294,7 +337,8 @@ def test_arm_stays_where_it_cannot_go_and_the_soft_robot_goes_on():
         rest(world, replace(hand, base_rate=rate), 50)
         assert_allclose(world._stage.arm.position() - before, 50 * world.dt * rate, atol=2e-3)
         after = world._stage.arm.position()
-        rest(world, replace(hand, base=far.base), 5)  # where a drag has brought the arm, the hand's base goes on
+        # where a drag has brought the arm, the hand's base goes on
+        rest(world, replace(hand, base=far.base), 5)
         assert_allclose(world._stage.arm.position(), after, atol=2e-3)
         with pytest.raises(InputError, match="extension"):
             world.drive(replace(hand, extension=np.array([0.5, 0.0])))
@@ -308,7 +352,11 @@ def test_other_rods_keep_what_they_were_told():
     world = open_world("dual_arm")
     try:
         second = world.rods[1].state.path_length.copy()
-        rest(world, Hand(world.actions.inputs([0.0, 0.004, 0.0, 0.0, 0.0, 0.004])["tendon_length"], np.zeros(2)), 30)
+        rest(
+            world,
+            Hand(world.actions.inputs([0.0, 0.004, 0.0, 0.0, 0.0, 0.004])["tendon_length"], np.zeros(2)),
+            30,
+        )
         assert_allclose(world.rods[1].state.path_length, second, atol=1e-4)
         assert np.abs(world.rods[0].state.path_length - second).max() > 1e-3
     finally:

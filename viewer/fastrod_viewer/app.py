@@ -39,16 +39,21 @@ _BRAND = (37, 99, 235)
 
 @final
 class App:
-    """One page at a time on one server, for every browser that is connected. `close` it, or use it as a context."""
+    """One page at a time on one server, for every browser that is connected. `close` it, or use it as a
+    context."""
 
     def __init__(
-        self, *, host: str = "127.0.0.1", port: int | None = None, folder: Path | None = None,
+        self,
+        *,
+        host: str = "127.0.0.1",
+        port: int | None = None,
+        folder: Path | None = None,
         server: Served | None = None,
         say: Callable[[str], None] = lambda sentence: print(sentence, file=sys.stderr, flush=True),
-    ) -> None:  # fmt: skip
-        """`port` None takes the first free one from 8080 on, 0 any; `server` is one that `serve` has started already; `folder` takes what
-        is recorded (default: where one stands); `say` hears what a person should know. Raises `InputError` where viser is missing, or the
-        host or port cannot be had."""
+    ) -> None:
+        """`port` None takes the first free one from 8080 on, 0 any; `server` is one that `serve` has started
+        already; `folder` takes what is recorded (default: where one stands); `say` hears what a person should
+        know. Raises `InputError` where viser is missing, or the host or port cannot be had."""
         self.folder, self.say = folder or Path.cwd(), say
         self.served = server or serve(host, port)
         self.server = self.served.viser
@@ -77,9 +82,16 @@ class App:
         """Where a browser finds it, with the key that the page and its websocket need."""
         return self.served.address
 
-    def open(self, what: str | Path | World | Robot | Playback, *, link: RobotLink | None = None, script: bool = False) -> None:
-        """Show a scene or robot by name or file, a world, a robot, or a log with what models say to it. With a `link`, hands drive that
-        robot, and the world is its model. What was shown before stays where this cannot be: raises `FastrodError`."""
+    def open(
+        self,
+        what: str | Path | World | Robot | Playback,
+        *,
+        link: RobotLink | None = None,
+        script: bool = False,
+    ) -> None:
+        """Show a scene or robot by name or file, a world, a robot, or a log with what models say to it. With
+        a `link`, hands drive that robot, and the world is its model. What was shown before stays where this
+        cannot be: raises `FastrodError`."""
         with self._lock:
             new = self._found(what)
             _check_link(new, link)
@@ -91,9 +103,16 @@ class App:
             else:
                 script = script or not isinstance(new, FreeWorld)
                 self.page = DrivePage(
-                    self.server, self.canvas, new, folder=self.folder, replay=self._replay, echo=self._echo,
-                    may=self._panels.may, link=link, script=script,
-                )  # fmt: skip
+                    self.server,
+                    self.canvas,
+                    new,
+                    folder=self.folder,
+                    replay=self._replay,
+                    echo=self._echo,
+                    may=self._panels.may,
+                    link=link,
+                    script=script,
+                )
             self._show_picker(str(what) if isinstance(what, str) and not is_log(what) else self.page.title)
             self._picker.disabled = link is not None  # another scene would let go of the robot
 
@@ -127,7 +146,9 @@ class App:
         if current not in names:
             names.insert(0, current)
         if self._picker is None:
-            self._picker = self.server.gui.add_dropdown("Scene", tuple(names), initial_value=current, order=-1.0)
+            self._picker = self.server.gui.add_dropdown(
+                "Scene", tuple(names), initial_value=current, order=-1.0
+            )
             self._picker.on_update(self._picked)
         elif self._picker.value != current or tuple(self._picker.options) != tuple(names):
             self._picker.options = tuple(names)
@@ -151,7 +172,8 @@ class App:
             note.remove()
 
     def _replay(self, log: RunLog, world: World) -> None:
-        """A recording beside the model, in a thread of its own: the session that calls this is closed by it."""
+        """A recording beside the model, in a thread of its own: the session that calls this is closed by
+        it."""
 
         def job() -> None:
             try:
@@ -199,16 +221,21 @@ DEMO_LOG = "measured log (demo)"
 """The log that ships with the package, in the picker."""
 
 
-def found(what: str | Path | World | Robot | Playback, robot: str | Path | None = None, n_robots: int = 1) -> World | Playback:
-    """What a page shows: the log or world that a name or a path stands for, or what was given; `robot` is a log's, `n_robots` of a robot
-    stand in a grid. Raises `FastrodError`, one sentence, where there is none."""
+def found(
+    what: str | Path | World | Robot | Playback, robot: str | Path | None = None, n_robots: int = 1
+) -> World | Playback:
+    """What a page shows: the log or world that a name or a path stands for, or what was given; `robot` is a
+    log's, `n_robots` of a robot stand in a grid. Raises `FastrodError`, one sentence, where there is none."""
     if isinstance(what, (World, Playback)):
         return what
     if n_robots > MOST:
         raise InputError(f"n_robots is {n_robots}; a browser draws up to {MOST}.")
     if n_robots != 1:
         if not isinstance(what, Robot) and str(what) in names():
-            raise InputError(f"{str(what)!r} is a scene, which has its own robots; several in a grid can be had of a robot.")
+            raise InputError(
+                f"{str(what)!r} is a scene, which has its own robots; several in a grid can be "
+                "had of a robot."
+            )
         return FreeWorld(what if isinstance(what, Robot) else load_robot(what), n_robots)
     if str(what) == DEMO_LOG:
         return demo_log()
@@ -227,7 +254,8 @@ def _check_link(shown: World | Playback, link: RobotLink | None) -> None:
     ours, theirs = shown.robot, link.robot
     if (ours.n_tendons, ours.n_segments) != (theirs.n_tendons, theirs.n_segments):
         raise InputError(
-            f"the link's robot {theirs.name!r} has {theirs.n_segments} segments and {theirs.n_tendons} tendons, its model {ours.name!r} "
+            f"the link's robot {theirs.name!r} has {theirs.n_segments} segments and {theirs.n_tendons} "
+            f"tendons, its model {ours.name!r} "
             f"{ours.n_segments} and {ours.n_tendons}; give the model of the robot that is driven."
         )
 
@@ -247,11 +275,19 @@ def is_log(what: str | Path) -> bool:
 
 
 def view(
-    what: str | Path | World | Robot | Playback = FIRST, *, host: str = "127.0.0.1", port: int | None = None, open_browser: bool = True,
-    robot: str | Path | None = None, n_robots: int = 1, link: RobotLink | None = None, script: bool = False,
+    what: str | Path | World | Robot | Playback = FIRST,
+    *,
+    host: str = "127.0.0.1",
+    port: int | None = None,
+    open_browser: bool = True,
+    robot: str | Path | None = None,
+    n_robots: int = 1,
+    link: RobotLink | None = None,
+    script: bool = False,
     server: Served | None = None,
-) -> None:  # fmt: skip
-    """Show something in the browser until Ctrl+C: a scene or robot by name, a robot's file, a log with what models say to it.
+) -> None:
+    """Show something in the browser until Ctrl+C: a scene or robot by name, a robot's file, a log with what
+    models say to it.
 
     `server` is one that `serve` has started. SIGTERM ends it as Ctrl+C does: robots are stopped, recordings
     saved. Raises `FastrodError`, one sentence, for what cannot be shown.

@@ -35,7 +35,9 @@ class Canvas:
         scene.set_up_direction("+z")
         scene.configure_environment_map(None)
         scene.configure_default_lights(False)
-        scene.add_light_hemisphere("/lights/sky", sky_color=(255, 255, 255), ground_color=(205, 208, 216), intensity=1.9)
+        scene.add_light_hemisphere(
+            "/lights/sky", sky_color=(255, 255, 255), ground_color=(205, 208, 216), intensity=1.9
+        )
         for name, place, intensity in _LAMPS:
             scene.add_light_directional(f"/lights/{name}", position=place, intensity=intensity)
         scene.world_axes.visible = False
@@ -47,7 +49,12 @@ class Canvas:
 
     def clear(self) -> None:
         """Take everything away."""
-        for handle in [*(batch for batch, _ in self._batches.values()), *self._bodies, *self._fixed, *(n[0] for n in self._notes.values())]:
+        for handle in [
+            *(batch for batch, _ in self._batches.values()),
+            *self._bodies,
+            *self._fixed,
+            *(n[0] for n in self._notes.values()),
+        ]:
             handle.remove()
         self._batches, self._bodies, self._fixed, self._notes = {}, [], [], {}
         self._poses = np.zeros((0, 7))
@@ -57,10 +64,23 @@ class Canvas:
         cell = 10.0 ** np.floor(np.log10(size / 2.0))
         extent = float(2.0 * np.ceil(size / (5.0 * cell)) * 5.0 * cell)
         grid = self.server.scene.add_grid(
-            "/floor", width=extent, height=extent, plane="xy", cell_size=float(cell), section_size=float(5.0 * cell),
-            cell_color=_FLOOR[0], section_color=_FLOOR[1], cell_thickness=1.0, section_thickness=1.2, shadow_opacity=0.0,
-            position=(float(np.round(middle[0] / cell) * cell), float(np.round(middle[1] / cell) * cell), height),
-        )  # fmt: skip
+            "/floor",
+            width=extent,
+            height=extent,
+            plane="xy",
+            cell_size=float(cell),
+            section_size=float(5.0 * cell),
+            cell_color=_FLOOR[0],
+            section_color=_FLOOR[1],
+            cell_thickness=1.0,
+            section_thickness=1.2,
+            shadow_opacity=0.0,
+            position=(
+                float(np.round(middle[0] / cell) * cell),
+                float(np.round(middle[1] / cell) * cell),
+                height,
+            ),
+        )
         self._fixed.append(grid)
 
     def add_bodies(self, bodies: Sequence[Body], poses: Floats) -> None:
@@ -68,11 +88,18 @@ class Canvas:
         for body, pose in zip(bodies, poses, strict=True):
             self._bodies.append(
                 self.server.scene.add_mesh_simple(
-                    f"/bodies/{body.name}", body.vertices, body.faces, color=body.color,
+                    f"/bodies/{body.name}",
+                    body.vertices,
+                    body.faces,
+                    color=body.color,
                     opacity=None if body.opacity >= 1.0 else body.opacity,
-                    side="double", position=pose[:3], wxyz=pose[3:], cast_shadow=False, receive_shadow=False,
+                    side="double",
+                    position=pose[:3],
+                    wxyz=pose[3:],
+                    cast_shadow=False,
+                    receive_shadow=False,
                 )
-            )  # fmt: skip
+            )
         self._poses = np.array(poses)
 
     def move_bodies(self, poses: Floats) -> None:
@@ -95,15 +122,27 @@ class Canvas:
                 known[0].remove()
                 del self._batches[name]
             return
-        if known is not None and (known[1].shape != batch.shape or len(known[1].position) != len(batch.position)):
+        if known is not None and (
+            known[1].shape != batch.shape or len(known[1].position) != len(batch.position)
+        ):
             known[0].remove()
             known = None
         if known is None:
             unit = SHAPES[batch.shape]
             handle = self.server.scene.add_batched_meshes_simple(
-                f"/{name}", unit.vertices, unit.faces, batch.wxyz, batch.position, batched_scales=batch.scale, batched_colors=batch.color,
-                lod="off", opacity=opacity, side="front", cast_shadow=False, receive_shadow=False,
-            )  # fmt: skip
+                f"/{name}",
+                unit.vertices,
+                unit.faces,
+                batch.wxyz,
+                batch.position,
+                batched_scales=batch.scale,
+                batched_colors=batch.color,
+                lod="off",
+                opacity=opacity,
+                side="front",
+                cast_shadow=False,
+                receive_shadow=False,
+            )
             self._batches[name] = handle, batch
             return
         handle, before = known
@@ -119,12 +158,16 @@ class Canvas:
         self._batches[name] = handle, batch
 
     def show_all(self, batches: Mapping[str, Instances], prefix: str) -> None:
-        """Draw these, those of one shape together, and take away what had this prefix before: each array costs as much to send as its
-        bytes, and a good deal on top."""
+        """Draw these, those of one shape together, and take away what had this prefix before: each array
+        costs as much to send as its bytes, and a good deal on top."""
         by_shape: dict[str, list[Instances]] = {}
         for batch in batches.values():
             by_shape.setdefault(batch.shape, []).append(batch)
-        for name in [name for name in self._batches if name.startswith(prefix) and name.removeprefix(prefix) not in by_shape]:
+        for name in [
+            name
+            for name in self._batches
+            if name.startswith(prefix) and name.removeprefix(prefix) not in by_shape
+        ]:
             self.show(name, None)
         for shape, some in by_shape.items():
             arrays = (np.concatenate(parts) for parts in zip(*(batch[1:] for batch in some), strict=True))

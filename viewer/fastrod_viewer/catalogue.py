@@ -1,4 +1,5 @@
-"""The worlds that there are by name: shipped robots, scenes, and robot files. Nothing heavy is imported before a world is opened."""
+"""The worlds that there are by name: shipped robots, scenes, and robot files. Nothing heavy is imported
+before a world is opened."""
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ if TYPE_CHECKING:
     from fastrod_viewer.world import World
 
 ROD_SCENES: Mapping[str, str] = {
-    "airway": "A thin robot is fed into a forked airway and steered into the left bronchus, its twin into the right one.",
+    "airway": "A thin robot is fed into a forked airway and steered into the left bronchus, its twin into "
+    "the right one.",
     "bar": "The five-segment reacher closes around a bar and grips it.",
     "draped": "A cylinder rises under a heavy, sagging rod, which drapes itself over it.",
     "grid": "Sixty-four five-segment reachers sway in waves, each with a phase of its own, in one simulator.",
@@ -25,11 +27,16 @@ ROD_SCENES: Mapping[str, str] = {
 """Scenes without a host, and what they are about: each scene's own sentence, here without importing it."""
 HOSTED_SCENES: Mapping[str, str] = {
     "dual_arm": "A UR5 carries two soft robots that move in opposite phase, and feels the sum of both.",
-    "explore": "A soft robot on a UR5 enters a box and, the UR5 held still, looks at each of its eight corners.",
-    "neck_look": "A Unitree A1 bends its four-segment neck over the wall of a box and looks into every corner of it.",
-    "neck_push": "A Unitree A1 swings its three-segment neck as sin(w t) and pushes a cube over the floor, which its legs feel.",
-    "pick_gripper": "A soft robot on a UR5 takes a cube from a table with two fingers, carries it sideways and puts it on a spot.",
-    "pick_suction": "A soft robot on a UR5 takes a cube from a table by suction, carries it sideways and puts it on a spot.",
+    "explore": "A soft robot on a UR5 enters a box and, the UR5 held still, looks at each of its eight "
+    "corners.",
+    "neck_look": "A Unitree A1 bends its four-segment neck over the wall of a box and looks into every "
+    "corner of it.",
+    "neck_push": "A Unitree A1 swings its three-segment neck as sin(w t) and pushes a cube over the floor, "
+    "which its legs feel.",
+    "pick_gripper": "A soft robot on a UR5 takes a cube from a table with two fingers, carries it sideways "
+    "and puts it on a spot.",
+    "pick_suction": "A soft robot on a UR5 takes a cube from a table by suction, carries it sideways and "
+    "puts it on a spot.",
     "track_circle": "The tip of a soft robot on a UR5 follows a circle.",
     "track_figure_eight": "The tip of a soft robot on a UR5 follows a figure eight.",
     "track_helix": "The tip of a soft robot on a UR5 follows a helix.",
@@ -38,7 +45,8 @@ HOSTED_SCENES: Mapping[str, str] = {
 }
 """Scenes in a PyBullet world (`pip install fastrod[hosts]`), likewise."""
 MUJOCO_SCENES: Mapping[str, str] = {
-    "ur5_mujoco": "A UR5 in MuJoCo carries a soft robot that bends and presses a sprung plate aside, and feels the spring in its joints.",
+    "ur5_mujoco": "A UR5 in MuJoCo carries a soft robot that bends and presses a sprung plate aside, and "
+    "feels the spring in its joints."
 }
 """Scenes in a MuJoCo model (`pip install fastrod[mujoco]`), likewise."""
 _DRIVES = {
@@ -58,19 +66,29 @@ def about(robot: Robot) -> str:
     n = robot.n_segments
     modes = dict.fromkeys(segment.mode for segment in robot.segments)
     how = " and ".join(_DRIVES[mode] for mode in modes)
-    return f"{'One segment' if n == 1 else f'{n} segments'}, {robot.length:g} m{' in all' if n > 1 else ''}, {how}."
+    return (
+        f"{'One segment' if n == 1 else f'{n} segments'}, {robot.length:g} "
+        f"m{' in all' if n > 1 else ''}, {how}."
+    )
 
 
 def catalogue() -> dict[str, str]:
-    """Name -> one sentence on it, for `open_world`: robots first, then scenes of rods alone, then those with a host."""
-    return {**{name: about(load_robot(name)) for name in robot_names()}, **ROD_SCENES, **HOSTED_SCENES, **MUJOCO_SCENES}
+    """Name -> one sentence on it, for `open_world`: robots first, then scenes of rods alone, then those with
+    a host."""
+    return {
+        **{name: about(load_robot(name)) for name in robot_names()},
+        **ROD_SCENES,
+        **HOSTED_SCENES,
+        **MUJOCO_SCENES,
+    }
 
 
 def open_world(name: str | Path | Robot) -> World:
-    """The world of a scene's name; or a robot free in space, of a shipped name, of the path of a .toml, or as it is.
+    """The world of a scene's name; or a robot free in space, of a shipped name, of the path of a .toml, or as
+    it is.
 
-    Raises `UnknownNameError` with the nearest name, `RobotError` for a file that is no robot, `HostError` where a scene needs PyBullet
-    or MuJoCo and it is not installed.
+    Raises `UnknownNameError` with the nearest name, `RobotError` for a file that is no robot, `HostError`
+    where a scene needs PyBullet or MuJoCo and it is not installed.
     """
     from fastrod_viewer.worlds import FreeWorld, SceneWorld
 
@@ -90,5 +108,7 @@ def open_world(name: str | Path | Robot) -> World:
 
         return HostedView(scene)
     if text not in robot_names() and not text.endswith(".toml"):
-        raise UnknownNameError(f"no scene and no robot {text!r}; {nearest(text, catalogue())} A robot file's path ends in .toml.")
+        raise UnknownNameError(
+            f"no scene and no robot {text!r}; {nearest(text, catalogue())} A robot file's path ends in .toml."
+        )
     return FreeWorld(load_robot(name))

@@ -1,4 +1,5 @@
-"""Cross-sections between nodes, and pieces between cross-sections, compiled: a picture has a thousand of them, thirty times a second.
+"""Cross-sections between nodes, and pieces between cross-sections, compiled: a picture has a thousand of
+them, thirty times a second.
 
 All in one file, by which numba keys its cache.
 """
@@ -15,8 +16,8 @@ from fastrod.types import Floats, Ints
 
 @entry
 def quaternions(rotation: Floats, found: Floats) -> None:
-    """Fill `found` (n, p, 4), w x y z, of rotation matrices (n, p, 3, 3), by the largest component (Shepperd 1978); the sign does not jump
-    from one point of a rod to the next."""
+    """Fill `found` (n, p, 4), w x y z, of rotation matrices (n, p, 3, 3), by the largest component (Shepperd
+    1978); the sign does not jump from one point of a rod to the next."""
     for i in range(len(rotation)):
         for j in range(rotation.shape[1]):
             r, q = rotation[i, j], found[i, j]
@@ -24,11 +25,26 @@ def quaternions(rotation: Floats, found: Floats) -> None:
             if trace > max(r[0, 0], r[1, 1], r[2, 2]):
                 q[0], q[1], q[2], q[3] = 1.0 + trace, r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
             elif r[0, 0] >= max(r[1, 1], r[2, 2]):
-                q[0], q[1], q[2], q[3] = r[2, 1] - r[1, 2], 1.0 + 2.0 * r[0, 0] - trace, r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]
+                q[0], q[1], q[2], q[3] = (
+                    r[2, 1] - r[1, 2],
+                    1.0 + 2.0 * r[0, 0] - trace,
+                    r[0, 1] + r[1, 0],
+                    r[0, 2] + r[2, 0],
+                )
             elif r[1, 1] >= r[2, 2]:
-                q[0], q[1], q[2], q[3] = r[0, 2] - r[2, 0], r[0, 1] + r[1, 0], 1.0 + 2.0 * r[1, 1] - trace, r[1, 2] + r[2, 1]
+                q[0], q[1], q[2], q[3] = (
+                    r[0, 2] - r[2, 0],
+                    r[0, 1] + r[1, 0],
+                    1.0 + 2.0 * r[1, 1] - trace,
+                    r[1, 2] + r[2, 1],
+                )
             else:
-                q[0], q[1], q[2], q[3] = r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], 1.0 + 2.0 * r[2, 2] - trace
+                q[0], q[1], q[2], q[3] = (
+                    r[1, 0] - r[0, 1],
+                    r[0, 2] + r[2, 0],
+                    r[1, 2] + r[2, 1],
+                    1.0 + 2.0 * r[2, 2] - trace,
+                )
             size = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
             if j > 0:
                 before = found[i, j - 1]
@@ -40,13 +56,24 @@ def quaternions(rotation: Floats, found: Floats) -> None:
 
 @entry
 def sample(
-    position: Floats, tangent: Floats, quaternion: Floats, arclength: Floats, n_steps: int, segment: Ints, fraction: Floats,
-    at: Floats, turn: Floats, interval: Ints, part: Floats,
-) -> None:  # fmt: skip
-    """Fill `at` (n, m, 3), `turn` (n, m, 4), `interval` (n, m) and `part` (n, m) at `fraction` (m,) of `segment` (m,).
+    position: Floats,
+    tangent: Floats,
+    quaternion: Floats,
+    arclength: Floats,
+    n_steps: int,
+    segment: Ints,
+    fraction: Floats,
+    at: Floats,
+    turn: Floats,
+    interval: Ints,
+    part: Floats,
+) -> None:
+    """Fill `at` (n, m, 3), `turn` (n, m, 4), `interval` (n, m) and `part` (n, m) at `fraction` (m,) of
+    `segment` (m,).
 
-    Positions by cubic Hermite polynomials of position (n, p, 3) and tangent (n, p, 3), rotations by normalised lerp of quaternion
-    (n, p, 4); nodes need not be even: where forces act on points, nodes stand at them.
+    Positions by cubic Hermite polynomials of position (n, p, 3) and tangent (n, p, 3), rotations by
+    normalised lerp of quaternion (n, p, 4); nodes need not be even: where forces act on points, nodes stand
+    at them.
     """
     for i in range(len(position)):
         s = arclength[i]
@@ -62,7 +89,9 @@ def sample(
             weight = t * t * (3.0 - 2.0 * t)
             for c in range(3):
                 p0, p1 = position[i, k, c], position[i, k + 1, c]
-                at[i, j, c] = p0 + weight * (p1 - p0) + t * r * h * (r * tangent[i, k, c] - t * tangent[i, k + 1, c])
+                at[i, j, c] = (
+                    p0 + weight * (p1 - p0) + t * r * h * (r * tangent[i, k, c] - t * tangent[i, k + 1, c])
+                )
             size = 0.0
             for c in range(4):
                 turn[i, j, c] = quaternion[i, k, c] + t * (quaternion[i, k + 1, c] - quaternion[i, k, c])
@@ -75,15 +104,23 @@ def sample(
 
 @entry
 def strands(
-    at: Floats, turn: Floats, source: Ints, offset: Floats, n_pieces: int,
-    centre: Floats, along: Floats, length: Floats, bend: Floats,
-) -> None:  # fmt: skip
+    at: Floats,
+    turn: Floats,
+    source: Ints,
+    offset: Floats,
+    n_pieces: int,
+    centre: Floats,
+    along: Floats,
+    length: Floats,
+    bend: Floats,
+) -> None:
     """Straight pieces of strands that run beside rods, each through one segment.
 
-    Cross-sections `at` (n, q, n_pieces + 1, 3) and `turn` (n, q, n_pieces + 1, 4); strand c runs through those of `source[c]`, at `offset`
-    (1 or n, m, 2) along d1 and d2. Fill `centre` (n, m, n_pieces, 3), `along` (n, m, n_pieces, 4), whose z is along the piece, `length` and
-    `bend` (n, m, n_pieces), by how much the rod's tangent changes over the piece. In the middle of an arc the tangent is parallel to
-    the chord, so that a strand in the middle of the rod takes the rod's own rotation.
+    Cross-sections `at` (n, q, n_pieces + 1, 3) and `turn` (n, q, n_pieces + 1, 4); strand c runs through
+    those of `source[c]`, at `offset` (1 or n, m, 2) along d1 and d2. Fill `centre` (n, m, n_pieces, 3),
+    `along` (n, m, n_pieces, 4), whose z is along the piece, `length` and
+    `bend` (n, m, n_pieces), by how much the rod's tangent changes over the piece. In the middle of an arc the
+    tangent is parallel to the chord, so that a strand in the middle of the rod takes the rod's own rotation.
     """
     point, q = np.empty((2, 3)), np.empty(4)
     d = np.empty((2, 3, 3))  # at both ends of a piece: d1, d2, d3
@@ -95,9 +132,21 @@ def strands(
             for j in range(n_pieces + 1):
                 a, b, u, v = turn[i, k, j, 0], turn[i, k, j, 1], turn[i, k, j, 2], turn[i, k, j, 3]
                 d[0], point[0] = d[1], point[1]
-                d[1, 0, 0], d[1, 0, 1], d[1, 0, 2] = 1.0 - 2.0 * (u * u + v * v), 2.0 * (b * u + a * v), 2.0 * (b * v - a * u)
-                d[1, 1, 0], d[1, 1, 1], d[1, 1, 2] = 2.0 * (b * u - a * v), 1.0 - 2.0 * (b * b + v * v), 2.0 * (u * v + a * b)
-                d[1, 2, 0], d[1, 2, 1], d[1, 2, 2] = 2.0 * (b * v + a * u), 2.0 * (u * v - a * b), 1.0 - 2.0 * (b * b + u * u)
+                d[1, 0, 0], d[1, 0, 1], d[1, 0, 2] = (
+                    1.0 - 2.0 * (u * u + v * v),
+                    2.0 * (b * u + a * v),
+                    2.0 * (b * v - a * u),
+                )
+                d[1, 1, 0], d[1, 1, 1], d[1, 1, 2] = (
+                    2.0 * (b * u - a * v),
+                    1.0 - 2.0 * (b * b + v * v),
+                    2.0 * (u * v + a * b),
+                )
+                d[1, 2, 0], d[1, 2, 1], d[1, 2, 2] = (
+                    2.0 * (b * v + a * u),
+                    2.0 * (u * v - a * b),
+                    1.0 - 2.0 * (b * b + u * u),
+                )
                 for e in range(3):
                     point[1, e] = at[i, k, j, e] + x * d[1, 0, e] + y * d[1, 1, e]
                 if j == 0:
@@ -117,9 +166,22 @@ def strands(
                     along[i, c, j - 1] = q
                     continue
                 # the shortest turn from the rod's middle tangent to the chord, then the rod's: r q
-                mx, my, mz = 2.0 * (q[1] * q[3] + q[0] * q[2]), 2.0 * (q[2] * q[3] - q[0] * q[1]), 1.0 - 2.0 * (q[1] ** 2 + q[2] ** 2)
-                cx, cy, cz = (point[1, 0] - point[0, 0]) / size, (point[1, 1] - point[0, 1]) / size, (point[1, 2] - point[0, 2]) / size
-                w, rx, ry, rz = 1.0 + mx * cx + my * cy + mz * cz, my * cz - mz * cy, mz * cx - mx * cz, mx * cy - my * cx
+                mx, my, mz = (
+                    2.0 * (q[1] * q[3] + q[0] * q[2]),
+                    2.0 * (q[2] * q[3] - q[0] * q[1]),
+                    1.0 - 2.0 * (q[1] ** 2 + q[2] ** 2),
+                )
+                cx, cy, cz = (
+                    (point[1, 0] - point[0, 0]) / size,
+                    (point[1, 1] - point[0, 1]) / size,
+                    (point[1, 2] - point[0, 2]) / size,
+                )
+                w, rx, ry, rz = (
+                    1.0 + mx * cx + my * cy + mz * cz,
+                    my * cz - mz * cy,
+                    mz * cx - mx * cz,
+                    mx * cy - my * cx,
+                )
                 norm = math.sqrt(w * w + rx * rx + ry * ry + rz * rz)
                 w, rx, ry, rz = w / norm, rx / norm, ry / norm, rz / norm
                 along[i, c, j - 1, 0] = w * q[0] - rx * q[1] - ry * q[2] - rz * q[3]

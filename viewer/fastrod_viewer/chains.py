@@ -50,32 +50,52 @@ class Pieces(NamedTuple):
 
 
 def nodes(position: Floats, rotation: Floats, arclength: Floats) -> Nodes:
-    """Of positions (n_robots, n_points, 3), rotations (n_robots, n_points, 3, 3) and arclengths (n_robots, n_points), finite."""
+    """Of positions (n_robots, n_points, 3), rotations (n_robots, n_points, 3, 3) and arclengths (n_robots,
+    n_points), finite."""
     quaternion = np.empty((*rotation.shape[:2], 4))
     kernels.quaternions(rotation, quaternion)
-    return Nodes(np.ascontiguousarray(position), np.ascontiguousarray(rotation[..., 2]), quaternion, np.ascontiguousarray(arclength))
+    return Nodes(
+        np.ascontiguousarray(position),
+        np.ascontiguousarray(rotation[..., 2]),
+        quaternion,
+        np.ascontiguousarray(arclength),
+    )
 
 
 class Sampler:
-    """Cross-sections at fixed fractions of the segments: positions by cubic Hermite polynomials, rotations by normalised lerp."""
+    """Cross-sections at fixed fractions of the segments: positions by cubic Hermite polynomials, rotations by
+    normalised lerp."""
 
     def __init__(self, n_steps: int, segment: Ints, fraction: Floats) -> None:
-        """`segment` (m,) and `fraction` (m,) of its length, 0 to 1; a segment has `n_steps` intervals between nodes."""
+        """`segment` (m,) and `fraction` (m,) of its length, 0 to 1; a segment has `n_steps` intervals between
+        nodes."""
         self.n_steps, self.segment, self.fraction = n_steps, segment, fraction
 
     def __call__(self, rods: Nodes) -> Samples:
         """(n_robots, m, ...) at the m cross-sections of these rods."""
         n, m = len(rods.position), len(self.segment)
-        found = Samples(np.empty((n, m, 3)), np.empty((n, m, 4)), np.empty((n, m), np.int64), np.empty((n, m)))
+        found = Samples(
+            np.empty((n, m, 3)), np.empty((n, m, 4)), np.empty((n, m), np.int64), np.empty((n, m))
+        )
         kernels.sample(
-            rods.position, rods.tangent, rods.quaternion, rods.arclength, self.n_steps, self.segment, self.fraction,
-            found.position, found.quaternion, found.interval, found.part,
-        )  # fmt: skip
+            rods.position,
+            rods.tangent,
+            rods.quaternion,
+            rods.arclength,
+            self.n_steps,
+            self.segment,
+            self.fraction,
+            found.position,
+            found.quaternion,
+            found.interval,
+            found.part,
+        )
         return found
 
 
 def along(between: tuple[Floats, Floats], samples: Samples) -> Floats:
-    """(n_robots, m) linear between the values (n_robots, n_points - 1) at the start and the end of each interval."""
+    """(n_robots, m) linear between the values (n_robots, n_points - 1) at the start and the end of each
+    interval."""
     start, end = (np.take_along_axis(a, samples.interval, axis=1) for a in between)
     return np.asarray(start + samples.part * (end - start))
 
@@ -95,8 +115,9 @@ def aim(direction: Floats) -> Floats:
 
 
 def pieces(samples: Samples, n_strips: int, source: Ints, offset: Floats) -> Pieces:
-    """Of strands through segments: `samples` are those of `n_strips` segments, as many of each; strand c runs through those of `source[c]`
-    (n_strands,) at `offset` (1 or n_robots, n_strands, 2) along d1 and d2 [m]."""
+    """Of strands through segments: `samples` are those of `n_strips` segments, as many of each; strand c runs
+    through those of `source[c]` (n_strands,) at `offset` (1 or n_robots, n_strands, 2) along d1 and d2
+    [m]."""
     n, count = samples.part.shape
     ends = count // n_strips
     shape = n, len(source), ends - 1

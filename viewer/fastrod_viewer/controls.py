@@ -24,12 +24,18 @@ _SETTLED = 0.3  # s after a change in which a control is left alone: it may be u
 
 @final
 class Controls:
-    """Handles of one robot's controls, made inside the tabs `drive` and `loads`; they follow the pilot, whoever moves it."""
+    """Handles of one robot's controls, made inside the tabs `drive` and `loads`; they follow the pilot,
+    whoever moves it."""
 
     def __init__(
-        self, server: viser.ViserServer, session: Session, drive: Any, loads: Any, *,
+        self,
+        server: viser.ViserServer,
+        session: Session,
+        drive: Any,
+        loads: Any,
+        *,
         may: Callable[[Any], bool],
-    ) -> None:  # fmt: skip
+    ) -> None:
         """`may` says of an event whether the page it comes from may act."""
         self.server, self.session, self.pilot, self._may = server, session, session.pilot, may
         self.chosen = 0
@@ -62,11 +68,15 @@ class Controls:
             gui.add_markdown("This scene plays its own script; it cannot be driven by hand.")
             return
         if world.scripted and session.link is None:
-            script = gui.add_checkbox("Demo motion", session.scripted, hint="It moves by itself until you move it.")
+            script = gui.add_checkbox(
+                "Demo motion", session.scripted, hint="It moves by itself until you move it."
+            )
             self._listen(script, lambda on: setattr(session, "scripted", bool(on)), take_over=False)
             self._followers.append((script, lambda: session.scripted))
         if world.host:
-            frozen = gui.add_checkbox("Freeze the rigid host", False, hint="Its joints hold still; only the soft robot moves.")
+            frozen = gui.add_checkbox(
+                "Freeze the rigid host", False, hint="Its joints hold still; only the soft robot moves."
+            )
             self._listen(frozen, lambda on: pilot.freeze(bool(on)))
         if not world.robot.n_tendons:
             gui.add_markdown("This robot has no wires. Load its tip instead: tab *Loads*.")
@@ -80,14 +90,24 @@ class Controls:
         if world.robot.n_tendons:
             most = self._fastest()
             now = min(most, max(5, 5 * round(math.degrees(self.pilot.speeds.bend) / 5)))
-            speed = gui.add_slider("Speed [°/s]", 5, most, 5, now, hint="Largest rate at which a segment bends; wires and base in step.")
+            speed = gui.add_slider(
+                "Speed [°/s]",
+                5,
+                most,
+                5,
+                now,
+                hint="Largest rate at which a segment bends; wires and base in step.",
+            )
             self._listen(speed, self._set_speed, take_over=False)
 
     def _fastest(self) -> int:
         """Largest speed that is offered [°/s]: a linked robot's wires do not follow every one."""
         if self.pilot.actions is None or not math.isfinite(self.pilot.reach.rate):
             return _FASTEST
-        return min(_FASTEST, max(10, 5 * int(math.degrees(self.pilot.reach.rate / self.pilot.actions.offset.max()) / 5)))
+        return min(
+            _FASTEST,
+            max(10, 5 * int(math.degrees(self.pilot.reach.rate / self.pilot.actions.offset.max()) / 5)),
+        )
 
     def _set_speed(self, degrees: float) -> None:
         usual = Speeds()
@@ -104,7 +124,9 @@ class Controls:
         gui = self.server.gui
         with gui.add_folder(group.title or None, expand_by_default=group.open):
             for knob in group.knobs:
-                handle = gui.add_slider(knob.label, knob.low, knob.high, float(f"{knob.step:.6g}"), knob.value, hint=knob.hint)
+                handle = gui.add_slider(
+                    knob.label, knob.low, knob.high, float(f"{knob.step:.6g}"), knob.value, hint=knob.hint
+                )
                 self._listen(handle, knob.put)
                 self._followers.append((handle, partial(getattr, knob, "value")))
 
@@ -146,10 +168,15 @@ class Controls:
         if self.pilot.actions is None or not session.world.by_hand:
             return
         # not A, D, W, S, nor arrows: with these viser flies the camera
-        for name, key, axis, sign in (("+x", "L", 0, 1), ("-x", "J", 0, -1), ("+y", "I", 1, 1), ("-y", "K", 1, -1)):
-            self._key(f"Bend toward {name}", key, lambda axis=axis, sign=sign: self._bend(axis, sign))  # type: ignore[misc]
+        for name, key, axis, sign in (
+            ("+x", "L", 0, 1),
+            ("-x", "J", 0, -1),
+            ("+y", "I", 1, 1),
+            ("-y", "K", 1, -1),
+        ):
+            self._key(f"Bend toward {name}", key, partial(self._bend, axis, sign))
         for k in range(min(session.world.robot.n_segments, 9)):
-            self._key(f"Keys bend segment {k + 1}", str(k + 1), lambda k=k: setattr(self, "chosen", k))  # type: ignore[misc]
+            self._key(f"Keys bend segment {k + 1}", str(k + 1), partial(setattr, self, "chosen", k))
 
     def _key(self, label: str, key: Any, do: Callable[[], None]) -> None:
         self._command(label, key).on_trigger(lambda event: do() if self._may(event) else None)

@@ -13,7 +13,8 @@ GAIN = 8.0
 FARTHEST = 0.25
 """Of the robot's length: a tip that is dragged farther counts as this far."""
 DAMPING = 0.02
-"""Of the robot's length by 1 rad: where less than that moves the tip, the way is given up rather than the segments thrown about."""
+"""Of the robot's length by 1 rad: where less than that moves the tip, the way is given up rather than the
+segments thrown about."""
 JOINT_RATE = 0.4
 """Largest of a host's joint in a drag [rad/s]."""
 JOINT_COST = 25.0
@@ -21,16 +22,25 @@ JOINT_COST = 25.0
 
 
 def drag_rates(
-    robot: Robot, actions: SegmentActions, action: Floats, jacobian: Floats, error: Floats, limits: tuple[Floats, Floats, Floats], dt: float
+    robot: Robot,
+    actions: SegmentActions,
+    action: Floats,
+    jacobian: Floats,
+    error: Floats,
+    limits: tuple[Floats, Floats, Floats],
+    dt: float,
 ) -> Floats:
-    """(n_joints + n_actions,) rates of a host's joints [rad/s] and of the segments' actions [m/s] for the next `dt` [s].
+    """(n_joints + n_actions,) rates of a host's joints [rad/s] and of the segments' actions [m/s] for the
+    next `dt` [s].
 
-    `action` (n_actions,) now [m]; `jacobian` (3, n_joints + n_actions) of the tip; `error` (3,) from the tip to the hand [m]; `limits`:
+    `action` (n_actions,) now [m]; `jacobian` (3, n_joints + n_actions) of the tip; `error` (3,) from the tip
+    to the hand [m]; `limits`:
     least and largest action, and largest rates, (n_actions,) each.
 
-    The rates x that minimise |J x - gain error|^2 + l^2 sum of weight x^2 within the limits: damped least squares (Wampler 1986, Nakamura
-    and Hanafusa 1986) with bounds. `ResolvedRate` would keep the direction of the error, or stand still; a hand pulls wherever it likes,
-    also where a robot at its limits can go part of the way only.
+    The rates x that minimise |J x - gain error|^2 + l^2 sum of weight x^2 within the limits: damped least
+    squares (Wampler 1986, Nakamura and Hanafusa 1986) with bounds. `ResolvedRate` would keep the direction of
+    the error, or stand still; a hand pulls wherever it likes, also where a robot at its limits can go part of
+    the way only.
     """
     from scipy.optimize import lsq_linear
 
@@ -48,7 +58,10 @@ def drag_rates(
     scale = 1.0 / np.sqrt(weight[moves])  # unknowns of one size
     rows = np.concatenate([jacobian[:, moves] * scale, DAMPING * robot.length * np.eye(int(moves.sum()))])
     found = lsq_linear(
-        rows, np.concatenate([wanted, np.zeros(int(moves.sum()))]), (least[moves] / scale, largest[moves] / scale), method="bvls"
+        rows,
+        np.concatenate([wanted, np.zeros(int(moves.sum()))]),
+        (least[moves] / scale, largest[moves] / scale),
+        method="bvls",
     )
     rates = np.zeros(len(rate))
     rates[moves] = scale * found.x

@@ -30,8 +30,11 @@ _WIDE, _THIN = 1.15, 0.2  # of the body's radius: the plate that stands for a me
 class Drawing:
     """Robots, surroundings, loads, the tip's trail, and what was measured beside them."""
 
-    def __init__(self, canvas: Canvas, world: World, options: Options, *, trail: bool = True, measured: bool = False) -> None:
-        """`measured`: frames will tell where the tip was measured, and the legend says what that looks like."""
+    def __init__(
+        self, canvas: Canvas, world: World, options: Options, *, trail: bool = True, measured: bool = False
+    ) -> None:
+        """`measured`: frames will tell where the tip was measured, and the legend says what that looks
+        like."""
         self.canvas, self.world = canvas, world
         self.options, self.trail, self._tips = options, trail, measured
         rods = world.rods[0]
@@ -41,7 +44,9 @@ class Drawing:
         self._pictures = [Picture(r, options) for r in world.rods]
         self._trails = self._new_trails()
         self._track = Trail(_TRAIL, 0.3 * self.radius)
-        self._ends: Floats = np.array([[b.vertices.min(axis=0), b.vertices.max(axis=0)] for b in world.bodies]).reshape(-1, 2, 3)
+        self._ends: Floats = np.array(
+            [[b.vertices.min(axis=0), b.vertices.max(axis=0)] for b in world.bodies]
+        ).reshape(-1, 2, 3)
         canvas.clear()
         canvas.add_bodies(world.bodies, world.poses())
         lowest = min(float(r.state.position[..., 2].min()) for r in world.rods)
@@ -81,7 +86,9 @@ class Drawing:
         for k, (rods, picture) in enumerate(zip(self.world.rods, self._pictures, strict=True)):
             shown = picture.frame(rods, tip_force=force if k == 0 else None)
             if self.trail:
-                for i, (path, tip) in enumerate(zip(self._trails[k], rods.state.tip_position + rods.place, strict=False)):
+                for i, (path, tip) in enumerate(
+                    zip(self._trails[k], rods.state.tip_position + rods.place, strict=False)
+                ):
                     path.add(tip)
                     shown[f"trail {i}"] = path.instances(0.12 * self.radius, TRAIL)
             self.canvas.show_all(shown, f"rod{k}/")
@@ -98,7 +105,9 @@ class Drawing:
             return
         tip = self.world.rods[0].state.tip_position[0]
         inside = np.einsum("nji,nj->ni", matrix_from_quaternion(poses[:, 3:]), tip - poses[:, :3])
-        within = ((inside > self._ends[:, 0] - self.radius) & (inside < self._ends[:, 1] + self.radius)).all(axis=1)
+        within = ((inside > self._ends[:, 0] - self.radius) & (inside < self._ends[:, 1] + self.radius)).all(
+            axis=1
+        )
         for k, body in enumerate(self.world.bodies):
             self.canvas.fade(k, min(body.opacity, _GLASS) if within[k] else body.opacity)
 
@@ -118,8 +127,13 @@ class Drawing:
             own = np.array([1.0, 0.0, 0.0, 0.0]) if upright else now.tip_quaternion
             turn = product(quaternion_from_matrix(base[None])[0], own)
             self.canvas.show("measured", _plate(place, turn, self.radius))
-            self.canvas.show("measured axes", None if upright else frames(place[None], turn[None], 1.7 * self.radius))
-        self.canvas.show("measured trail", self._track.instances(0.12 * self.radius, MEASURED) if self.trail and len(self._track) else None)
+            self.canvas.show(
+                "measured axes", None if upright else frames(place[None], turn[None], 1.7 * self.radius)
+            )
+        self.canvas.show(
+            "measured trail",
+            self._track.instances(0.12 * self.radius, MEASURED) if self.trail and len(self._track) else None,
+        )
 
     def _new_trails(self) -> list[list[Trail]]:
         """Of each robot, where they are few."""
@@ -128,5 +142,6 @@ class Drawing:
 
 
 def _plate(place: Floats, turn: Floats, radius: float) -> Instances:
-    """A disc at `place` (3,), turned by `turn` (4,), as large as the tip of a body of `radius` [m], and then some."""
+    """A disc at `place` (3,), turned by `turn` (4,), as large as the tip of a body of `radius` [m], and then
+    some."""
     return instances("disc", place, turn, radius * np.array([_WIDE, _WIDE, _THIN]), MEASURED)

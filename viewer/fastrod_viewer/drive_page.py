@@ -37,10 +37,24 @@ _LOOKS = 0.15  # s between two pictures of a camera in hand
 _LONG = 1.5  # s of one step
 _FARTHER = 1.35  # away from a robot beside whose picture there is one of a camera
 _NOTHING = np.full((240, 320, 3), 230, dtype=np.uint8)  # before the first picture
-_COMPILING = "Computing … The first use of contact compiles for a minute or two, once on this machine; tight contact takes its time, too."
+_COMPILING = (
+    "Computing … The first use of contact compiles for a minute or two, once on this machine; "
+    "tight contact takes its time, too."
+)
 _GO_ON = "After a stop: commands are taken again, from where the robot stands."
-_COLORS = {"segment": "segment", "curvature": "curvature", "surface strain": "strain", "wire tension": "tension"}
-_PARTS = {"spacers": "Spacers", "tendons": "Wires", "contacts": "Contact forces", "loads": "Loads", "frames": "Tip frame"}
+_COLORS = {
+    "segment": "segment",
+    "curvature": "curvature",
+    "surface strain": "strain",
+    "wire tension": "tension",
+}
+_PARTS = {
+    "spacers": "Spacers",
+    "tendons": "Wires",
+    "contacts": "Contact forces",
+    "loads": "Loads",
+    "frames": "Tip frame",
+}
 _BODIES = {"backbone and wires": "backbone", "skin": "skin"}
 
 
@@ -49,10 +63,18 @@ class DrivePage(Page):
     """Controls on one side, the robot, a legend, and what its camera sees."""
 
     def __init__(
-        self, server: viser.ViserServer, canvas: Canvas, world: World, *, folder: Path,
-        replay: Callable[[RunLog, World], None], echo: Callable[[], float], may: Callable[[Any], bool],
-        link: RobotLink | None = None, script: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        server: viser.ViserServer,
+        canvas: Canvas,
+        world: World,
+        *,
+        folder: Path,
+        replay: Callable[[RunLog, World], None],
+        echo: Callable[[], float],
+        may: Callable[[Any], bool],
+        link: RobotLink | None = None,
+        script: bool = False,
+    ) -> None:
         """`folder` takes recordings; `replay` shows one; `echo` is the time that pages take to draw [s];
         `may` says of an event whether the page it comes from may act."""
         self.server, self.world, self.title, self._may = server, world, world.name, may
@@ -62,8 +84,12 @@ class DrivePage(Page):
         gentle = _GENTLE if touches else _REAL if link is not None and link.real else 1.0
         self.pilot = Pilot(world, Speeds().times(gentle), reach=None if far is None else far.reach)
         many = len(world.rods[0].state.ok) > FINE
-        self.drawing = Drawing(canvas, world, Options(body="skin" if touches or many else "backbone"), measured=link is not None)
-        self.sight = Sight(self.drawing.middle, self.drawing.size * (1.0 if far is None or not far.sees else _FARTHER))
+        self.drawing = Drawing(
+            canvas, world, Options(body="skin" if touches or many else "backbone"), measured=link is not None
+        )
+        self.sight = Sight(
+            self.drawing.middle, self.drawing.size * (1.0 if far is None or not far.sees else _FARTHER)
+        )
         self.session = Session(world, self.pilot, draw=self._draw, link=link, script=script)
         ball = min(1.25 * self.drawing.radius, 0.1 * world.robot.length)
         middle, can = world.rods[0].place[0], self._can_drag()
@@ -101,7 +127,8 @@ class DrivePage(Page):
             self.figures.content = facts([("Tip", self._tip())], news=_COMPILING)
 
     def lost(self, client: int, left: int) -> None:
-        """The client's hand lets go of the grip; with nobody left, what was on its way stops (`Session.nobody`)."""
+        """The client's hand lets go of the grip; with nobody left, what was on its way stops
+        (`Session.nobody`)."""
         if self.grip is not None:
             self.grip.lost(client)
         if left == 0:
@@ -115,11 +142,20 @@ class DrivePage(Page):
     def export(self) -> str:
         """The robot as it stands now, with its legend, time and tip; nothing moves in it."""
         serializer = self.server.get_scene_serializer()
-        shown: list[tuple[str, str]] = [("robot", self.world.robot.name), ("t", f"{self.world.t:.2f} s"), ("tip", self._tip())]
+        shown: list[tuple[str, str]] = [
+            ("robot", self.world.robot.name),
+            ("t", f"{self.world.t:.2f} s"),
+            ("tip", self._tip()),
+        ]
         return wrap(
-            serializer.as_html(), title=self.title, subtitle=self.world.about, legend_html=self.drawing.legend, plot_svg=None, facts=shown,
+            serializer.as_html(),
+            title=self.title,
+            subtitle=self.world.about,
+            legend_html=self.drawing.legend,
+            plot_svg=None,
+            facts=shown,
             note="Drag to turn, scroll to zoom.",
-        )  # fmt: skip
+        )
 
     def _can_drag(self) -> bool:
         return self.world.by_hand and self.pilot.actions is not None
@@ -130,15 +166,26 @@ class DrivePage(Page):
         gui, session = self.server.gui, self.session
         self.panel = gui.add_folder(None)
         with self.panel:
-            self.stop = gui.add_button("STOP", color="red", icon=viser.Icon.HAND_STOP, hint="Everything stands still at once. Key: Esc")
+            self.stop = gui.add_button(
+                "STOP",
+                color="red",
+                icon=viser.Icon.HAND_STOP,
+                hint="Everything stands still at once. Key: Esc",
+            )
             self.stop.on_click(stops(session))
-            self.go_on = gui.add_button("GO ON", color="green", icon=viser.Icon.PLAYER_PLAY, disabled=True, hint=_GO_ON)
+            self.go_on = gui.add_button(
+                "GO ON", color="green", icon=viser.Icon.PLAYER_PLAY, disabled=True, hint=_GO_ON
+            )
             self.go_on.on_click(lambda event: session.release() if self._may(event) else None)
-            self.figures = gui.add_html("")  # below: as it grows and shrinks, it must not move GO ON to where STOP was
+            # below: as it grows and shrinks, it must not move GO ON to where STOP was
+            self.figures = gui.add_html("")
             self.run = gui.add_button_group("Run", self._runs())
             self.run.on_click(self._run)
             tabs = gui.add_tab_group()
-            drive, loads = tabs.add_tab("Drive", viser.Icon.ADJUSTMENTS), tabs.add_tab("Loads", viser.Icon.WEIGHT)
+            drive, loads = (
+                tabs.add_tab("Drive", viser.Icon.ADJUSTMENTS),
+                tabs.add_tab("Loads", viser.Icon.WEIGHT),
+            )
             self.controls = Controls(self.server, session, drive, loads, may=self._may)
             with tabs.add_tab("View", viser.Icon.EYE):
                 self._view()
@@ -177,7 +224,9 @@ class DrivePage(Page):
     def _view(self) -> None:
         gui, options = self.server.gui, self.drawing.options
         color = gui.add_dropdown("Colour", tuple(_COLORS), initial_value="segment")
-        body = gui.add_dropdown("Body", tuple(_BODIES), initial_value=next(k for k, v in _BODIES.items() if v == options.body))
+        body = gui.add_dropdown(
+            "Body", tuple(_BODIES), initial_value=next(k for k, v in _BODIES.items() if v == options.body)
+        )
         boxes = {name: gui.add_checkbox(label, getattr(options, name)) for name, label in _PARTS.items()}
         trail = gui.add_checkbox("Trail of the tip", True)
 
@@ -203,10 +252,16 @@ class DrivePage(Page):
         gui = self.server.gui
         self.record = gui.add_button("Record a run log", icon=viser.Icon.PLAYER_RECORD, color="red")
         self.record.on_click(self._recording)
-        self.recorded = gui.add_markdown("Inputs, tip and tensions at every step, as a CSV that `fastrod identify` reads.")
+        self.recorded = gui.add_markdown(
+            "Inputs, tip and tensions at every step, as a CSV that `fastrod identify` reads."
+        )
         self.again = gui.add_button("Replay the recording", color="gray", disabled=True)
         self.again.on_click(lambda event: self._play_back() if self._may(event) else None)
-        page = gui.add_button("Export as a web page", color="gray", hint="One HTML file; it opens without a server and without a network.")
+        page = gui.add_button(
+            "Export as a web page",
+            color="gray",
+            hint="One HTML file; it opens without a server and without a network.",
+        )
         page.on_click(lambda event: send(event.client, f"{self.title}.html", lambda: self.export().encode()))
         png = gui.add_button("Save a picture (PNG)", color="gray")
         png.on_click(lambda event: send(event.client, f"{self.title}.png", lambda: picture(event.client)))
@@ -282,11 +337,15 @@ class DrivePage(Page):
             model = state.rotation[0, 0].T @ (state.tip_position[0] - state.position[0, 0])
             x, y, z = (1e3 * frame.measured.tip_position).tolist()
             rows.append(("Measured tip", f"{x:.1f}, {y:.1f}, {z:.1f} mm"))
-            rows.append(("Measured − model", f"{1e3 * np.linalg.norm(frame.measured.tip_position - model):.2f} mm"))
+            rows.append(
+                ("Measured − model", f"{1e3 * np.linalg.norm(frame.measured.tip_position - model):.2f} mm")
+            )
         if session.far is not None and frame.measured is not None:
             rows += far_rows(session.far, frame.measured)
         t = self.world.t if frame.measured is None else frame.measured.t
-        rows.append(("Time", f"{t:.1f} s" + (f", {frame.pace:.0%} of real time" if frame.pace < 0.95 else "")))
+        rows.append(
+            ("Time", f"{t:.1f} s" + (f", {frame.pace:.0%} of real time" if frame.pace < 0.95 else ""))
+        )
         if self._latency == self._latency:
             echo = self._echo()
             drawn = f" + {1e3 * echo:.0f} browser" if echo == echo else ""
@@ -305,7 +364,10 @@ class DrivePage(Page):
         if tuple(self.run.options) != options:
             self.run.options = options
         self.controls.follow()
-        if self.drawing.options.color_by != "segment" and (legend := self.drawing.legend) != self.legend.content:
+        if (
+            self.drawing.options.color_by != "segment"
+            and (legend := self.drawing.legend) != self.legend.content
+        ):
             self.legend.content = legend
 
     def _state(self, frame: Frame) -> tuple[str, str]:
@@ -315,7 +377,11 @@ class DrivePage(Page):
         if session.releasing:
             return "", f"Releasing. {status}"
         if session.stopped:
-            how = "GO ON within a second of a stop is ignored; press it again." if session.hasty else "Press the green button to go on."
+            how = (
+                "GO ON within a second of a stop is ignored; press it again."
+                if session.hasty
+                else "Press the green button to go on."
+            )
             return f"{status or 'Stopped.'} {how}", ""
         if session.link is not None:
             return frame.problem, status
@@ -327,7 +393,8 @@ class DrivePage(Page):
 
 
 def fitted(seen: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(height, width, 3) a picture about as wide as its window: of a small one every pixel many times, of a large one not every pixel."""
+    """(height, width, 3) a picture about as wide as its window: of a small one every pixel many times, of a
+    large one not every pixel."""
     apart = max(1, seen.shape[1] // _WIDE)
     times = max(1, round(_WIDE / seen.shape[1]))
     return np.repeat(np.repeat(seen[::apart, ::apart], times, axis=0), times, axis=1)
@@ -336,5 +403,9 @@ def fitted(seen: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def far_rows(far: Linked, measured: Measurement) -> list[tuple[str, str]]:
     """What a robot at the other end of a link tells of itself."""
     tension = far.tension(measured)
-    rows = [("Wires pull", " · ".join(f"{value:.2f}" for value in tension.tolist()) + " N")] if np.isfinite(tension).all() else []
+    rows = (
+        [("Wires pull", " · ".join(f"{value:.2f}" for value in tension.tolist()) + " N")]
+        if np.isfinite(tension).all()
+        else []
+    )
     return rows + ([("Camera", camera)] if (camera := far.camera()) else [])

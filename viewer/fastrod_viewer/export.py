@@ -1,4 +1,5 @@
-"""One page that opens from disk, without a network: viser's own player with a title, a legend, figures and a residual plot over it."""
+"""One page that opens from disk, without a network: viser's own player with a title, a legend, figures and a
+residual plot over it."""
 
 from __future__ import annotations
 
@@ -6,51 +7,34 @@ import re
 from collections.abc import Sequence
 from html import escape
 from html.parser import HTMLParser
+from importlib.resources import files
 from pathlib import Path
 
 from fastrod.errors import InputError
 
-_LOADS = ("src", "srcset", "href", "xlink:href", "poster", "data", "action", "formaction", "background", "manifest")
+_LOADS = (
+    "src",
+    "srcset",
+    "href",
+    "xlink:href",
+    "poster",
+    "data",
+    "action",
+    "formaction",
+    "background",
+    "manifest",
+)
 _OUTWARD = re.compile(r"^\s*(https?:)?//", re.IGNORECASE)
-_URL = re.compile(r"""url\(\s*['"]?\s*((?:https?:)?//[^'")\s]*)|@import\s+['"]\s*((?:https?:)?//[^'"]*)""", re.IGNORECASE)
+_URL = re.compile(
+    r"""url\(\s*['"]?\s*((?:https?:)?//[^'")\s]*)|@import\s+['"]\s*((?:https?:)?//[^'"]*)""", re.IGNORECASE
+)
 
-_CSS = """
-.fr-over, .fr-over * { box-sizing: border-box; }
-.fr-over { position: fixed; inset: 0; z-index: 5; pointer-events: none; color: #1f2937; display: flex; flex-direction: column;
-  font: 13.5px/1.45 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; -webkit-text-size-adjust: 100%; }
-.fr-card { background: rgba(255, 255, 255, .9); border: 1px solid #e3e7ed; border-radius: 10px; box-shadow: 0 1px 6px rgba(31, 41, 55, .08);
-  pointer-events: auto; }
-.fr-top { position: absolute; top: 12px; left: 12px; width: 310px; max-height: calc(100% - BOTTOM - 12px); padding: 12px 16px;
-  overflow: auto; }
-.fr-top h1 { font-size: 18px; line-height: 1.25; font-weight: 650; letter-spacing: -.01em; margin: 0; overflow-wrap: anywhere; }
-.fr-top > p { margin: 3px 0 0; color: #5b6472; overflow-wrap: anywhere; }
-.fr-over summary { cursor: pointer; font-weight: 600; color: #2166c4; font-size: 13px; border-radius: 4px; }
-.fr-over summary:focus-visible { outline: 2px solid #2166c4; outline-offset: 2px; }
-.fr-legend { margin-top: 9px; display: flex; flex-wrap: wrap; gap: 3px 14px; }
-.fr-legend i { display: inline-block; width: 11px; height: 11px; border-radius: 3px; margin-right: 6px; background: var(--c, #8b94a3); }
-.fr-more { margin-top: 9px; }
-.fr-facts { border-collapse: collapse; width: 100%; margin-top: 5px; }
-.fr-facts th { text-align: left; font-weight: 400; color: #5b6472; padding: 4px 12px 4px 0; vertical-align: top; min-width: 8.2em; }
-.fr-facts td { text-align: right; font-weight: 600; padding: 4px 0; font-variant-numeric: tabular-nums; vertical-align: top;
-  white-space: nowrap; }
-.fr-facts tr + tr > * { border-top: 1px solid #e9ecf1; }
-.fr-note { margin: 8px 0 0; color: #5b6472; font-size: 12px; }
-.fr-plot { position: absolute; right: 12px; bottom: BOTTOM; left: 334px; max-width: 940px; margin: 0 auto; padding: 7px 14px;
-  width: fit-content; }
-.fr-plot[open] { width: auto; }
-.fr-plot .fr-scroll { overflow-x: auto; margin-top: 4px; }
-.fr-plot svg { display: block; width: 100%; min-width: 560px; height: auto; max-height: 24vh; }
-@media (max-width: 700px) {
-  .fr-top { right: 8px; left: 8px; top: 8px; width: auto; padding: 9px 12px; max-height: 60%; }
-  .fr-top h1 { font-size: 16px; }
-  .fr-plot { right: 8px; left: 8px; }
-}
-@media print { .fr-card { box-shadow: none; } }
-"""
+_CSS = (files("fastrod_viewer") / "export.css").read_text(encoding="utf-8")
 _FOLD = "document.querySelectorAll('.fr-over details').forEach(d=>{if(innerWidth<=700)d.open=false})"
 """On a phone the robot has the screen, and figures and plot wait behind their headings."""
 _ABOVE_PLAYER = "52px"
-"""Room for viser's own play button and slider, which lie along the bottom of a page with more than one moment."""
+"""Room for viser's own play button and slider, which lie along the bottom of a page with more than one
+moment."""
 
 
 def wrap(
@@ -63,30 +47,47 @@ def wrap(
     facts: Sequence[tuple[str, str]] = (),
     note: str = "",
 ) -> str:
-    """`viser_html`, what a viser serializer's `as_html` gives, with our own words over it; the middle stays free for the hand that turns
-    the view. `legend_html` (see `legend`) and `plot_svg` are put in as they are, all else as text.
+    """`viser_html`, what a viser serializer's `as_html` gives, with our own words over it; the middle stays
+    free for the hand that turns the view. `legend_html` (see `legend`) and `plot_svg` are put in as they are,
+    all else as text.
 
-    Raises `InputError` where `viser_html` is no whole page, or where what is added would load something from elsewhere.
+    Raises `InputError` where `viser_html` is no whole page, or where what is added would load something from
+    elsewhere.
     """
     head, body = viser_html.find("</head>"), viser_html.rfind("</body>")
     if not 0 <= head < body:
-        raise InputError("viser_html is not a page: it has no </head> followed by </body>; give what a viser serializer's as_html returns.")
+        raise InputError(
+            "viser_html is not a page: it has no </head> followed by </body>; give what a "
+            "viser serializer's as_html returns."
+        )
     panel = _panel(title, subtitle, legend_html, facts, note) + _plot(plot_svg)
     style = f"<style>{_CSS.replace('BOTTOM', _ABOVE_PLAYER)}</style>"
     added = f'<div class="fr-over">{panel}</div><script>{_FOLD}</script>'
     if outward := external_references(style + added):
-        raise InputError(f"the exported page would load {outward[0]!r}; a page that opens offline refers to nothing outside of itself.")
-    named = re.sub(r"<title>.*?</title>", lambda _: f"<title>{escape(title)}</title>", viser_html[:head], count=1, flags=re.DOTALL)
+        raise InputError(
+            f"the exported page would load {outward[0]!r}; a page that opens offline refers to "
+            "nothing outside of itself."
+        )
+    named = re.sub(
+        r"<title>.*?</title>",
+        lambda _: f"<title>{escape(title)}</title>",
+        viser_html[:head],
+        count=1,
+        flags=re.DOTALL,
+    )
     return named + style + viser_html[head:body] + added + viser_html[body:]
 
 
 def legend(entries: Sequence[tuple[str, str]]) -> str:
     """The legend of (CSS colour, label) pairs, for `wrap`."""
-    return "".join(f'<span><i style="--c: {escape(colour)}"></i>{escape(label)}</span>' for colour, label in entries)
+    return "".join(
+        f'<span><i style="--c: {escape(colour)}"></i>{escape(label)}</span>' for colour, label in entries
+    )
 
 
 def external_references(html: str) -> list[str]:
-    """Addresses beyond the page that its elements, attributes and styles point to, scripts left out; empty for a page that is whole."""
+    """Addresses beyond the page that its elements, attributes and styles point to, scripts left out; empty
+    for a page that is whole."""
     reader = _References()
     reader.feed(html)
     reader.close()
@@ -94,12 +95,15 @@ def external_references(html: str) -> list[str]:
 
 
 def write_page(html: str, path: str | Path) -> Path:
-    """Write `html` to `path`, whole or not at all; the path. Raises `InputError` where it cannot be written; makes no folder."""
+    """Write `html` to `path`, whole or not at all; the path. Raises `InputError` where it cannot be written;
+    makes no folder."""
     target = Path(path)
     if target.suffix not in (".html", ".htm"):
         raise InputError(f"{str(path)!r} does not end in .html; a page does.")
     if not target.parent.is_dir():
-        raise InputError(f"folder {str(target.parent)!r} is not there; make it, or write the page somewhere else.")
+        raise InputError(
+            f"folder {str(target.parent)!r} is not there; make it, or write the page somewhere else."
+        )
     if target.is_dir():
         raise InputError(f"{str(path)!r} is a folder; give the file to write the page to.")
     part = target.with_name(target.name + ".part")
@@ -117,7 +121,11 @@ def _panel(title: str, subtitle: str, legend_html: str, facts: Sequence[tuple[st
     rows = "".join(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in facts)
     table = f'<table class="fr-facts">{rows}</table>' if rows else ""
     small = f'<p class="fr-note">{escape(note)}</p>' if note else ""
-    more = f'<details class="fr-more" open><summary>Figures</summary>{table}{small}</details>' if table else small
+    more = (
+        f'<details class="fr-more" open><summary>Figures</summary>{table}{small}</details>'
+        if table
+        else small
+    )
     return (
         f'<div class="fr-card fr-top"><h1>{escape(title)}</h1>'
         + (f"<p>{escape(subtitle)}</p>" if subtitle else "")
@@ -129,7 +137,10 @@ def _panel(title: str, subtitle: str, legend_html: str, facts: Sequence[tuple[st
 def _plot(plot_svg: str | None) -> str:
     if plot_svg is None:
         return ""
-    return f'<details class="fr-card fr-plot" open><summary>Tip error over time</summary><div class="fr-scroll">{plot_svg}</div></details>'
+    return (
+        '<details class="fr-card fr-plot" open><summary>Tip error over time</summary><div '
+        f'class="fr-scroll">{plot_svg}</div></details>'
+    )
 
 
 class _References(HTMLParser):

@@ -15,7 +15,8 @@ from fastrod_viewer.palette import Colors, Range
 from fastrod_viewer.shapes import Instances, instances
 
 SLACK = 1e-3
-"""A wire that can go slack is drawn so at tensions below this share of EI/(d l); a rod that can push, below minus that."""
+"""A wire that can go slack is drawn so at tensions below this share of EI/(d l); a rod that can push, below
+minus that."""
 
 _WIRE = 0.06  # of the smallest tendon offset
 _PROBLEM = 0.65  # share of the warning in the colour of a robot that is not ok
@@ -25,7 +26,9 @@ def warned(color: Colors, bad: Flags) -> Colors:
     """(n_robots, ..., 3) colours, those of `bad` robots reddish."""
     if not bad.any():
         return color
-    return np.where(bad.reshape(-1, *[1] * (color.ndim - 1)), palette.blend(color, palette.PROBLEM, _PROBLEM), color)
+    return np.where(
+        bad.reshape(-1, *[1] * (color.ndim - 1)), palette.blend(color, palette.PROBLEM, _PROBLEM), color
+    )
 
 
 def smallest_offset(params: Params) -> float:
@@ -36,7 +39,8 @@ def smallest_offset(params: Params) -> float:
 
 @final
 class Spacers:
-    """Discs as wide as the body: one at the base, then about 1.6 body radii apart to the end of every segment, where one stands always."""
+    """Discs as wide as the body: one at the base, then about 1.6 body radii apart to the end of every
+    segment, where one stands always."""
 
     def __init__(self, params: Params, radius: Floats, options: Options, n_steps: int) -> None:
         """`radius` (n_segments,) of the body [m]."""
@@ -63,10 +67,14 @@ class Spacers:
 
 @final
 class Tendons:
-    """Chains of wires at the tendons' offsets from the backbone, for each segment that a tendon crosses one."""
+    """Chains of wires at the tendons' offsets from the backbone, for each segment that a tendon crosses
+    one."""
 
-    def __init__(self, robot: Robot, params: Params, surface: Floats | None, n_steps: int, n_pieces: int) -> None:
-        """`surface` (n_segments,) [m]: so far from the backbone, as on the skin of the body; None: where they are. `n_pieces` a segment."""
+    def __init__(
+        self, robot: Robot, params: Params, surface: Floats | None, n_steps: int, n_pieces: int
+    ) -> None:
+        """`surface` (n_segments,) [m]: so far from the backbone, as on the skin of the body; None: where they
+        are. `n_pieces` a segment."""
         pairs = [(t, k) for t, end in enumerate(robot.tendon_segment) for k in range(int(end) + 1)]
         self.tendon, self.segment = np.array(pairs, np.int64).reshape(-1, 2).T
         """(n_crossings,) tendon, and segment that it crosses, of each chain."""
@@ -85,8 +93,9 @@ class Tendons:
         self._n_segments = n
 
     def instances(self, rod: Nodes, tension: Floats, ok: Flags, colors: Range | None) -> Instances:
-        """(n_robots * n_crossings * n_pieces) of `tension` (n_robots, n_tendons) [N], coloured by it within a range, which grows with the
-        tensions of robots that are `ok`, or None: by taut, slack and pushing. What is not known, nan, is taut."""
+        """(n_robots * n_crossings * n_pieces) of `tension` (n_robots, n_tendons) [N], coloured by it within a
+        range, which grows with the tensions of robots that are `ok`, or None: by taut, slack and pushing.
+        What is not known, nan, is taut."""
         strand = pieces(self._sample(rod), self._n_segments, self.segment, self._offset)
         # the arc over the chord, so that a chain is as long as its tendon
         length = strand.length * (1.0 + strand.bend**2 / 24.0)
@@ -100,4 +109,6 @@ class Tendons:
             known = np.where(np.isfinite(tension), tension, 0.0)
             color = palette.diverging(known, colors.see(known[ok]))
         color = np.broadcast_to(color[:, self.tendon, None], (*length.shape, 3))
-        return instances("wire", strand.centre, strand.quaternion, np.stack([thick, thick, length], axis=-1), color)
+        return instances(
+            "wire", strand.centre, strand.quaternion, np.stack([thick, thick, length], axis=-1), color
+        )

@@ -20,18 +20,30 @@ _HINT = "drag me"
 
 @final
 class Grip:
-    """Follows the tip, or the hand that has got hold of it; the pilot then takes the tip there by inverse kinematics."""
+    """Follows the tip, or the hand that has got hold of it; the pilot then takes the tip there by inverse
+    kinematics."""
 
     def __init__(
-        self, server: viser.ViserServer, session: Session, radius: float, place: Floats, *,
+        self,
+        server: viser.ViserServer,
+        session: Session,
+        radius: float,
+        place: Floats,
+        *,
         may: Callable[[Any], bool],
-    ) -> None:  # fmt: skip
+    ) -> None:
         """`radius` of the ball [m]; `place` (3,) is where the world's origin is drawn for the robot that
         hands drive [m]; `may` says of an event whether the page it comes from may act."""
         self.session, self._place, self._may = session, place, may
         self._held_by: int | None = None
         self._ball: Any = server.scene.add_icosphere(
-            "/grip", radius, color=ACCENT, opacity=0.55, subdivisions=3, cast_shadow=False, receive_shadow=False
+            "/grip",
+            radius,
+            color=ACCENT,
+            opacity=0.55,
+            subdivisions=3,
+            cast_shadow=False,
+            receive_shadow=False,
         )
         self._hint: Any = server.scene.add_label("/grip/hint", _HINT, position=(0.0, 0.0, 2.2 * radius))
         self._ball.on_drag("left")(self._dragged)

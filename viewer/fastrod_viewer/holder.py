@@ -30,9 +30,13 @@ class Holder:
     """
 
     def __init__(
-        self, pages: Callable[[], Collection[int]], *, changed: Callable[[], None] = lambda: None,
-        moved: Callable[[], None] = lambda: None, clock: Callable[[], float] = time.monotonic,
-    ) -> None:  # fmt: skip
+        self,
+        pages: Callable[[], Collection[int]],
+        *,
+        changed: Callable[[], None] = lambda: None,
+        moved: Callable[[], None] = lambda: None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         """`pages` are those that are open and answer; `changed` hears when a standing has changed, and
         `moved` when the controls have left a page: what is on its way stops then."""
         self._pages, self._changed, self._moved, self._clock = pages, changed, moved, clock

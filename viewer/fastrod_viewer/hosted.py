@@ -1,4 +1,5 @@
-"""`HostedView`: a scene in a PyBullet world, played or driven by hand: its soft robots, the arm that carries them, and its other bodies."""
+"""`HostedView`: a scene in a PyBullet world, played or driven by hand: its soft robots, the arm that carries
+them, and its other bodies."""
 
 from __future__ import annotations
 
@@ -18,15 +19,18 @@ from fastrod_viewer.world import Body, Hand, Rods, World
 from fastrod_viewer.worlds import Loads, actions_of, moved, radii, wires
 
 SWING = 1.0
-"""Largest way of a joint to where the flange is told to be [rad]: what is farther is another posture of the arm."""
+"""Largest way of a joint to where the flange is told to be [rad]: what is farther is another posture of the
+arm."""
 _INVERSE = np.array([1.0, -1.0, -1.0, -1.0])  # of a unit quaternion w x y z
 
 
 @final
 class HostedView(World):
-    """One scene. A hand drives the first soft robot and the arm that carries it; other soft robots keep what they were told last.
+    """One scene. A hand drives the first soft robot and the arm that carries it; other soft robots keep what
+    they were told last.
 
-    After a hand has driven, the script begins anew with the next `play`. Worlds whose soft robot is no `MountedRod` only play.
+    After a hand has driven, the script begins anew with the next `play`. Worlds whose soft robot is no
+    `MountedRod` only play.
     """
 
     scripted = True
@@ -39,7 +43,8 @@ class HostedView(World):
         self._kinematics: SoftTip | None = None
         self._joints: Floats | None = None  # that a hand drives the arm to
         self._home: Floats = np.zeros(7)  # of the flange, where Hand.base is zero
-        self._base: Floats | None = None  # the last that the arm has followed; None: it was moved by other ways since
+        # the last that the arm has followed; None: it was moved by other ways since
+        self._base: Floats | None = None
         self._steps, self._driven, self._frozen = 0, False, False
         self.by_hand = self.loads = isinstance(self._stage, Stage)
         self.host = self.base_moves = isinstance(self._stage, Stage) and self._stage.arm is not None
@@ -49,7 +54,8 @@ class HostedView(World):
         self._loads = Loads(self.robot)
         self._radius = [radii(soft.robot) for soft in self._soft]
         self._bodies = tuple(
-            Body(shape.name, shape.vertices, shape.faces, _color(shape.rgba), shape.rgba[3]) for shape in self._visuals.shapes
+            Body(shape.name, shape.vertices, shape.faces, _color(shape.rgba), shape.rgba[3])
+            for shape in self._visuals.shapes
         )
 
     @property
@@ -61,11 +67,15 @@ class HostedView(World):
     def rods(self) -> tuple[Rods, ...]:
         """The stage's soft robots, where they are in the world: none is drawn elsewhere."""
         still = np.zeros((1, 3))
-        return tuple(Rods((soft.robot,), soft.state, still, radius) for soft, radius in zip(self._soft, self._radius, strict=True))
+        return tuple(
+            Rods((soft.robot,), soft.state, still, radius)
+            for soft, radius in zip(self._soft, self._radius, strict=True)
+        )
 
     @property
     def bodies(self) -> tuple[Body, ...]:
-        """Visual shapes of the first stage, the soft robots' capsules left out; a reset brings the same again."""
+        """Visual shapes of the first stage, the soft robots' capsules left out; a reset brings the same
+        again."""
         return self._bodies
 
     def poses(self) -> Floats:
@@ -85,11 +95,14 @@ class HostedView(World):
         self._arrived()
 
     def drive(self, hand: Hand) -> None:
-        """One step by hand. Where the arm cannot do what it is told, it stays, the step is done, and `HostError` then says why; where the
-        soft robot is lost the world is reset. Raises `InputError` for what no robot can be told; the world then has not moved."""
+        """One step by hand. Where the arm cannot do what it is told, it stays, the step is done, and
+        `HostError` then says why; where the soft robot is lost the world is reset. Raises `InputError` for
+        what no robot can be told; the world then has not moved."""
         stage = self._stage
         if not isinstance(stage, Stage):
-            raise InputError(f"scene {self.name!r} has a script that moves its robots; no hand can drive them.")
+            raise InputError(
+                f"scene {self.name!r} has a script that moves its robots; no hand can drive them."
+            )
         given = self._loads.added(wires(self.robot, hand), hand)
         moved(np.zeros(7), hand.base)  # refuses what is no motion
         refused: HostError | None = None
@@ -120,21 +133,28 @@ class HostedView(World):
         self._see()
 
     def jacobian(self) -> Floats:
-        """(3, n_joints + n_actions): the arm's joints, then the actions; the columns of an arm that is frozen are zero. Raises `InputError`
-        where there is none."""
+        """(3, n_joints + n_actions): the arm's joints, then the actions; the columns of an arm that is frozen
+        are zero. Raises `InputError` where there is none."""
         if not isinstance(self._stage, Stage):
-            raise InputError(f"scene {self.name!r} has a script that moves its robots; there is no Jacobian for a drag.")
+            raise InputError(
+                f"scene {self.name!r} has a script that moves its robots; there is no Jacobian for a drag."
+            )
         if self.actions is None:
-            raise InputError(f"robot {self.robot.name!r} is not driven by tendon lengths, so no drag can move its tip.")
+            raise InputError(
+                f"robot {self.robot.name!r} is not driven by tendon lengths, so no drag can move its tip."
+            )
         rod, arm = self._stage.rods[0], self._stage.arm
         if arm is None:
             jacobian = np.asarray(rod.simulator.jacobian()[0, :3] @ self.actions.matrix)
             if not np.isfinite(jacobian).all():
-                raise InputError(f"there is no Jacobian here: {self._soft[0].state.problems.get(0, 'the robot is not ok')}")
+                raise InputError(
+                    f"there is no Jacobian here: {self._soft[0].state.problems.get(0, 'the robot is not ok')}"
+                )
             return jacobian
         if self._kinematics is None:
             self._kinematics = SoftTip(rod.simulator, arm, flange_from_base=_mount(arm, rod))
-        q = np.concatenate([arm.position(), np.zeros(self.actions.n_actions)])  # the tip's way by an action is the simulator's own
+        # the tip's way by an action is the simulator's own
+        q = np.concatenate([arm.position(), np.zeros(self.actions.n_actions)])
         self._kinematics.follow(q, self._soft[0].state, _unit(rod.host.motion().pose))
         jacobian = self._kinematics.jacobian()
         if self._frozen:
@@ -163,7 +183,8 @@ class HostedView(World):
         self._steps += 1
 
     def _drive_arm(self, arm: BulletArm, hand: Hand) -> None:
-        """Tell the motors. Raises `HostError` where the flange cannot go there; what they were told before then holds."""
+        """Tell the motors. Raises `HostError` where the flange cannot go there; what they were told before
+        then holds."""
         if self._joints is None:
             self._joints = np.clip(arm.position(), arm.lower, arm.upper)
             self._home, self._base = arm.frame(self._joints), np.zeros(6)
@@ -178,7 +199,10 @@ class HostedView(World):
         if hand.base_rate is not None:
             rate = np.asarray(hand.base_rate, dtype=np.float64)
             if rate.shape != (arm.n_joints,) or not np.isfinite(rate).all():
-                raise HostError(f"Hand.base_rate is {hand.base_rate!r}; give {arm.n_joints} finite numbers, one a joint [rad/s].")
+                raise HostError(
+                    f"Hand.base_rate is {hand.base_rate!r}; give {arm.n_joints} finite numbers, "
+                    "one a joint [rad/s]."
+                )
             self._joints, self._base = np.clip(self._joints + self.dt * rate, arm.lower, arm.upper), None
             arm.drive(self._joints)
             return
@@ -190,7 +214,8 @@ class HostedView(World):
             to = arm.solve(moved(self._home, base), self._joints)
             if (far := float(np.abs(to - self._joints).max())) > SWING:
                 raise HostError(
-                    f"the flange would get there by a swing of {far:.2g} rad of one joint, into another posture; the arm stays."
+                    f"the flange would get there by a swing of {far:.2g} rad of one joint, into another "
+                    "posture; the arm stays."
                 )
             self._joints = to
         self._base = base.copy()

@@ -1,4 +1,5 @@
-"""`Knob`: one number that a hand sets, in the unit in which people think of it; and those of a robot, group by group."""
+"""`Knob`: one number that a hand sets, in the unit in which people think of it; and those of a robot, group
+by group."""
 
 from __future__ import annotations
 
@@ -33,7 +34,8 @@ class Knob:
 
     @property
     def value(self) -> float:
-        """Where it stands, rounded to a tenth of a step, and to 0 within half a step of it, within its ends."""
+        """Where it stands, rounded to a tenth of a step, and to 0 within half a step of it, within its
+        ends."""
         digits = max(0, 1 - math.floor(math.log10(self.step)))
         value = self.get()
         return min(max(round(value, digits) if abs(value) >= 0.5 * self.step else 0.0, self.low), self.high)
@@ -74,7 +76,11 @@ def drive_knobs(world: World, pilot: Pilot) -> list[Group]:
             groups.append(Group("", tuple(_all_bend(pilot, n, axis) for axis in (0, 1))))
         groups += [Group(f"Segment {k + 1}", _segment(robot, pilot, k), n <= 2) for k in range(n)]
     if robot.n_tendons:
-        groups.append(Group("Wires", tuple(_wire(robot, pilot, i) for i in range(robot.n_tendons)), pilot.actions is None))
+        groups.append(
+            Group(
+                "Wires", tuple(_wire(robot, pilot, i) for i in range(robot.n_tendons)), pilot.actions is None
+            )
+        )
     if world.base_moves and not pilot.linked:
         title = "Flange of the host" if world.host else "Base"
         groups.append(Group(title, tuple(_base(robot, pilot, axis) for axis in range(6)), open=False))
@@ -86,13 +92,23 @@ def load_knobs(robot: Robot, pilot: Pilot) -> Group:
     most = largest_force(robot)
     heaviest = nice(most / 9.81 / _GRAM)
     payload = Knob(
-        label="Payload [g]", low=0.0, high=heaviest, step=heaviest / 100.0, hint="Mass at the tip.",
-        get=lambda: pilot.loads[1] / _GRAM, put=lambda v: pilot.load(payload=v * _GRAM),
-    )  # fmt: skip
+        label="Payload [g]",
+        low=0.0,
+        high=heaviest,
+        step=heaviest / 100.0,
+        hint="Mass at the tip.",
+        get=lambda: pilot.loads[1] / _GRAM,
+        put=lambda v: pilot.load(payload=v * _GRAM),
+    )
     gravity = Knob(
-        label="Gravity [× g]", low=0.0, high=3.0, step=0.05, hint="On robot and payload.",
-        get=lambda: pilot.loads[2], put=lambda v: pilot.load(gravity=v),
-    )  # fmt: skip
+        label="Gravity [× g]",
+        low=0.0,
+        high=3.0,
+        step=0.05,
+        hint="On robot and payload.",
+        get=lambda: pilot.loads[2],
+        put=lambda v: pilot.load(gravity=v),
+    )
     return Group("", (*(_force(pilot, axis, most) for axis in range(3)), payload, gravity))
 
 
@@ -113,19 +129,28 @@ def _segment(robot: Robot, pilot: Pilot, k: int) -> tuple[Knob, ...]:
     most = min(LARGEST_BEND / _DEGREE, _whole(pilot.reach.displacement, _arm(pilot, k) * _DEGREE))
     bends = tuple(
         Knob(
-            label=f"Bend {name} [°]", low=-most, high=most, step=1.0, hint=f"Bends the segment toward {name} of its base.",
+            label=f"Bend {name} [°]",
+            low=-most,
+            high=most,
+            step=1.0,
+            hint=f"Bends the segment toward {name} of its base.",
             get=lambda axis=axis: pilot.bent(k)[axis] / _DEGREE,  # type: ignore[misc]
             put=lambda v, axis=axis: _bend(pilot, k, axis, v),  # type: ignore[misc]
         )
         for axis, name in enumerate("xy")
-    )  # fmt: skip
+    )
     low, high = (v / _MM for v in robot.segments[k].extension)
     if high <= low:
         return bends
     extend = Knob(
-        label="Extend [mm]", low=low, high=high, step=0.1, hint="Lengthens the segment.",
-        get=lambda: float(pilot.goals.action[3 * k]) / _MM, put=lambda v: pilot.extend(k, v * _MM),
-    )  # fmt: skip
+        label="Extend [mm]",
+        low=low,
+        high=high,
+        step=0.1,
+        hint="Lengthens the segment.",
+        get=lambda: float(pilot.goals.action[3 * k]) / _MM,
+        put=lambda v: pilot.extend(k, v * _MM),
+    )
     return (*bends, extend)
 
 
@@ -151,17 +176,27 @@ def _wire(robot: Robot, pilot: Pilot, i: int) -> Knob:
     name = f"Wire {i + 1}" + (f", segment {k + 1}" if robot.n_segments > 1 else "")
     if segment.mode == "tendon_tension":
         return Knob(
-            label=f"{name} [N]", low=0.0, high=LARGEST_TENSION, step=0.05, hint="Tension of the wire.",
-            get=lambda: float(pilot.goals.tension[i]), put=lambda v: pilot.pull_with(i, v),
-        )  # fmt: skip
+            label=f"{name} [N]",
+            low=0.0,
+            high=LARGEST_TENSION,
+            step=0.05,
+            hint="Tension of the wire.",
+            get=lambda: float(pilot.goals.tension[i]),
+            put=lambda v: pilot.pull_with(i, v),
+        )
     most = min(
         nice(LARGEST_BEND * sum(math.hypot(*place) for place in robot.tendons[i].position(k + 1)) / _MM),
         0.05 * _whole(pilot.reach.displacement / _MM - 1e-3, 0.05),
     )
     return Knob(
-        label=f"{name} [mm]", low=-most, high=most, step=0.05, hint="Positive pulls the wire, negative lets it out.",
-        get=lambda: -float(pilot.change[i]) / _MM, put=lambda v: pilot.wire(i, -v * _MM),
-    )  # fmt: skip
+        label=f"{name} [mm]",
+        low=-most,
+        high=most,
+        step=0.05,
+        hint="Positive pulls the wire, negative lets it out.",
+        get=lambda: -float(pilot.change[i]) / _MM,
+        put=lambda v: pilot.wire(i, -v * _MM),
+    )
 
 
 def _base(robot: Robot, pilot: Pilot, axis: int) -> Knob:
@@ -175,9 +210,14 @@ def _base(robot: Robot, pilot: Pilot, axis: int) -> Knob:
         pilot.move_base(base)
 
     return Knob(
-        label=f"{word}{'xyz'[axis % 3]} [{unit}]", low=-most, high=most, step=1.0, hint="From where it began, world axes.",
-        get=lambda: float(pilot.goals.base[axis]) / factor, put=put,
-    )  # fmt: skip
+        label=f"{word}{'xyz'[axis % 3]} [{unit}]",
+        low=-most,
+        high=most,
+        step=1.0,
+        hint="From where it began, world axes.",
+        get=lambda: float(pilot.goals.base[axis]) / factor,
+        put=put,
+    )
 
 
 def _force(pilot: Pilot, axis: int, most: float) -> Knob:
@@ -187,6 +227,11 @@ def _force(pilot: Pilot, axis: int, most: float) -> Knob:
         pilot.load(tip_force=force)
 
     return Knob(
-        label=f"Tip force {'xyz'[axis]} [N]", low=-most, high=most, step=most / 100.0, hint="Force on the tip, world axes.",
-        get=lambda: float(pilot.loads[0][axis]), put=put,
-    )  # fmt: skip
+        label=f"Tip force {'xyz'[axis]} [N]",
+        low=-most,
+        high=most,
+        step=most / 100.0,
+        hint="Force on the tip, world axes.",
+        get=lambda: float(pilot.loads[0][axis]),
+        put=put,
+    )

@@ -63,20 +63,32 @@ class Legend:
             stops = ",".join(palette.css(color) for color in self.bar)
             labels = "".join(f"<span>{_number(tick.value)}</span>" for tick in self.ticks)
             parts.append(
-                f'<div style="height:10px;border-radius:5px;background:linear-gradient(to right,{stops})"></div>'
-                f'<div style="display:flex;justify-content:space-between;color:#445;margin-top:2px">{labels}</div>'
+                '<div style="height:10px;border-radius:5px;background:linear-gradient(to '
+                f'right,{stops})"></div>'
+                "<div "
+                f'style="display:flex;justify-content:space-between;color:#445;margin-top:2px">{labels}</div>'
             )
         if self.wires:
-            parts.append('<div style="font-weight:600;margin:6px 0 4px">Tendons</div>' + _swatches(self.wires, "4px"))
+            parts.append(
+                '<div style="font-weight:600;margin:6px 0 4px">Tendons</div>' + _swatches(self.wires, "4px")
+            )
         if self.tips:
-            parts.append('<div style="font-weight:600;margin:6px 0 4px">Tip, and its trail</div>' + _swatches(self.tips, "4px"))
-        return f'<div style="font:12px/1.4 system-ui,sans-serif;color:#223;padding:4px 2px">{"".join(parts)}</div>'
+            parts.append(
+                '<div style="font-weight:600;margin:6px 0 4px">Tip, and its trail</div>'
+                + _swatches(self.tips, "4px")
+            )
+        return (
+            '<div style="font:12px/1.4 system-ui,sans-serif;color:#223;padding:4px '
+            f'2px">{"".join(parts)}</div>'
+        )
 
 
 def _swatches(entries: tuple[Entry, ...], height: str) -> str:
     items = "".join(
         '<span style="display:inline-flex;align-items:center;margin:0 10px 2px 0;white-space:nowrap">'
-        f'<span style="width:14px;height:{height};border-radius:3px;margin-right:5px;background:{palette.css(entry.color)}"></span>'
+        "<span "
+        f'style="width:14px;height:{height};border-radius:3px;margin-right:5px;'
+        f'background:{palette.css(entry.color)}"></span>'
         f"{escape(entry.name)}</span>"
         for entry in entries
     )

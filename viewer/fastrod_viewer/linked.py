@@ -1,6 +1,7 @@
 """`Linked`: a robot at the other end of a link, with what some links offer beyond driving and reading.
 
-Each offer is a protocol of its own. A link that lacks one is driven all the same; the page then shows less of it.
+Each offer is a protocol of its own. A link that lacks one is driven all the same; the page then shows less of
+it.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ _MAY_MOVE = ("ready", "running")
 
 @dataclass(frozen=True, kw_only=True)
 class Reach:
-    """What the wires of a linked robot may do; nothing keeps those of a simulated one. Raises `InputError`."""
+    """What the wires of a linked robot may do; nothing keeps those of a simulated one. Raises
+    `InputError`."""
 
     displacement: float = math.inf
     """Largest change of a wire's length, either way [m]."""
@@ -169,7 +171,11 @@ class Linked:
         self._gliding = link if isinstance(link, Gliding) else None
         self._sighted = link if isinstance(link, Sighted) and link.source is not None else None
         self._seeing = link if isinstance(link, Seeing) else None
-        self._own = link if isinstance(link, Recording) and (self._sighted is not None or not isinstance(link, Sighted)) else None
+        self._own = (
+            link
+            if isinstance(link, Recording) and (self._sighted is not None or not isinstance(link, Sighted))
+            else None
+        )
         self._seen = -math.inf
 
     @property
@@ -205,7 +211,8 @@ class Linked:
         return None if self._seeing is None else self._seeing.picture()
 
     def command(self, dl: Floats, ext: Floats, seconds: float) -> None:
-        """Go there, evenly within so long [s] where it can. Raises `FastrodError` for what is beyond its limits."""
+        """Go there, evenly within so long [s] where it can. Raises `FastrodError` for what is beyond its
+        limits."""
         if self._gliding is not None and not ext.any():
             self._gliding.glide(dl, seconds)
         else:
@@ -253,7 +260,8 @@ class Linked:
         return f"{sighting.flag}{last}"
 
     def recorder(self, path: Path) -> tuple[Recorder, bool]:
-        """A recorder, begun at the link's time, and whether the link itself fills it from now on. Raises `InputError`."""
+        """A recorder, begun at the link's time, and whether the link itself fills it from now on. Raises
+        `InputError`."""
         if self._own is None:
             recorder = Recorder(self.link.robot, path)
             recorder.start(self.link.read().t, "by hand")

@@ -11,7 +11,8 @@ from fastrod_viewer.world import Hand, World
 
 
 def measure(world: World, hand: Hand | None) -> Measurement:
-    """What a perfect encoder and camera say of the world's first robot now; t is the world's, frames those of a run log."""
+    """What a perfect encoder and camera say of the world's first robot now; t is the world's, frames those of
+    a run log."""
     state = world.rods[0].state
     base, rotation = state.position[0, 0], state.rotation[0, 0]
     tip = rotation.T @ state.tip_rotation[0]
@@ -21,15 +22,21 @@ def measure(world: World, hand: Hand | None) -> Measurement:
         change = state.path_length[0] - _stretch(world) - world.robot.rest_tendon_length
         extension = np.diff(_ends(world), prepend=0.0) - [segment.length for segment in world.robot.segments]
     return Measurement(
-        t=world.t, dl=change, ext=extension, tip_position=rotation.T @ (state.tip_position[0] - base),
-        tip_quaternion=quaternion_from_matrix(tip[None])[0], tension=state.tension[0],
-    )  # fmt: skip
+        t=world.t,
+        dl=change,
+        ext=extension,
+        tip_position=rotation.T @ (state.tip_position[0] - base),
+        tip_quaternion=quaternion_from_matrix(tip[None])[0],
+        tension=state.tension[0],
+    )
 
 
 def _stretch(world: World) -> Floats:
     """(n_tendons,) by which each wire is longer than it was told to be: compliance (T - pretension) [m]."""
     tendons = [tendon for segment in world.robot.segments for tendon in segment.tendons]
-    compliance, pretension = (np.array([getattr(tendon, name) for tendon in tendons]) for name in ("compliance", "pretension"))
+    compliance, pretension = (
+        np.array([getattr(tendon, name) for tendon in tendons]) for name in ("compliance", "pretension")
+    )
     return np.asarray(compliance * (world.rods[0].state.tension[0] - pretension), dtype=np.float64)
 
 

@@ -62,7 +62,8 @@ class MujocoView(World):
         return np.concatenate([data.geom_xpos[self._geoms], turn], axis=1)
 
     def play(self) -> None:
-        """One step of the script, or from its end back to its beginning. Raises `HostError` where the rod is lost, after a reset."""
+        """One step of the script, or from its end back to its beginning. Raises `HostError` where the rod is
+        lost, after a reset."""
         if self._steps >= round(self.duration / self.dt):
             self.reset()
             return
@@ -99,4 +100,6 @@ def _body(model: Any, geom: int) -> Body:
     vertices = np.asarray(drawn.vertices) * (_GROUND if shape.shape == "plane" else 1.0)
     red, green, blue, alpha = model.geom_rgba[geom].tolist()
     color = (round(255.0 * red), round(255.0 * green), round(255.0 * blue))
-    return Body(shape.name, vertices.astype(np.float32), np.asarray(drawn.faces).astype(np.uint32), color, alpha)
+    return Body(
+        shape.name, vertices.astype(np.float32), np.asarray(drawn.faces).astype(np.uint32), color, alpha
+    )

@@ -9,7 +9,8 @@ from fastrod.errors import InputError, nearest
 COLOR_BY: tuple[str, ...] = ("segment", "curvature", "strain", "tension")
 BODIES: tuple[str, ...] = ("backbone", "skin")
 FINE = 16
-"""Of more robots than this, spacers and tendons are not drawn, whatever the options say: the browser would have too much to do."""
+"""Of more robots than this, spacers and tendons are not drawn, whatever the options say: the browser would
+have too much to do."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,10 +18,11 @@ class Options:
     """What is drawn, and what colours mean."""
 
     color_by: str = "segment"
-    """`segment`; `curvature`, |u_xy| [1/m]; `strain`, body radius times |u_xy|, the largest of bending in the body [%]; `tension` of the
-    tendons [N], which are then drawn on a grey body."""
+    """`segment`; `curvature`, |u_xy| [1/m]; `strain`, body radius times |u_xy|, the largest of bending in the
+    body [%]; `tension` of the tendons [N], which are then drawn on a grey body."""
     body: str = "backbone"
-    """`backbone`: slender, with spacer discs, and tendons between them; `skin`: as thick as the body is, tendons hidden, but with
+    """`backbone`: slender, with spacer discs, and tendons between them; `skin`: as thick as the body is,
+    tendons hidden, but with
     `color_by="tension"` drawn on it."""
     tendons: bool = True
     """Of up to 16 robots."""
@@ -36,12 +38,18 @@ class Options:
     def __post_init__(self) -> None:
         for name, known in (("color_by", COLOR_BY), ("body", BODIES)):
             if getattr(self, name) not in known:
-                raise InputError(f"Options.{name} is {getattr(self, name)!r}; {nearest(str(getattr(self, name)), known)}")
+                raise InputError(
+                    f"Options.{name} is {getattr(self, name)!r}; {nearest(str(getattr(self, name)), known)}"
+                )
         for name in ("tendons", "spacers", "contacts", "loads", "frames"):
             if not isinstance(getattr(self, name), bool):
                 raise InputError(f"Options.{name} is {getattr(self, name)!r}; it must be True or False.")
-        if self.pieces is not None and (not isinstance(self.pieces, int) or isinstance(self.pieces, bool) or self.pieces < 1):
-            raise InputError(f"Options.pieces is {self.pieces!r}; it must be a whole number, at least 1, or None.")
+        if self.pieces is not None and (
+            not isinstance(self.pieces, int) or isinstance(self.pieces, bool) or self.pieces < 1
+        ):
+            raise InputError(
+                f"Options.pieces is {self.pieces!r}; it must be a whole number, at least 1, or None."
+            )
 
     def pieces_of(self, n_robots: int) -> int:
         """Straight pieces a segment of so many robots."""

@@ -58,7 +58,8 @@ class Page(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What a first look shows: a sphere about `middle` (3,) of radius `size` [m], from in front and a little above."""
+    """What a first look shows: a sphere about `middle` (3,) of radius `size` [m], from in front and a little
+    above."""
 
     middle: Floats
     size: float
@@ -85,7 +86,8 @@ def is_upright(client: Any) -> bool:
 
 
 def picture(client: Any) -> bytes:
-    """PNG of what a client sees. Raises `TimeoutError` where it does not draw, `RuntimeError` where it has left."""
+    """PNG of what a client sees. Raises `TimeoutError` where it does not draw, `RuntimeError` where it has
+    left."""
     from matplotlib.image import imsave
 
     width = min(int(client.camera.image_width), _LARGEST_PICTURE[0])
@@ -99,7 +101,8 @@ def picture(client: Any) -> bytes:
 def facts(rows: Sequence[tuple[str, str]], problem: str = "", *, news: str = "") -> str:
     """HTML of names and values in two columns, and below them what is wrong, or worth knowing."""
     cells = "".join(
-        f'<div style="color:#6b7280">{html.escape(name)}</div><div style="font-variant-numeric:tabular-nums">{html.escape(value)}</div>'
+        f'<div style="color:#6b7280">{html.escape(name)}</div><div '
+        f'style="font-variant-numeric:tabular-nums">{html.escape(value)}</div>'
         for name, value in rows
     )
     warning = "".join(
@@ -107,7 +110,9 @@ def facts(rows: Sequence[tuple[str, str]], problem: str = "", *, news: str = "")
         for text, color in ((problem, "#b91c1c"), (news, "#1d4ed8"))
         if text
     )
-    style = "display:grid;grid-template-columns:fit-content(60%) 1fr;gap:2px 12px;font-size:13px;padding:4px 9px"
+    style = (
+        "display:grid;grid-template-columns:fit-content(60%) 1fr;gap:2px 12px;font-size:13px;padding:4px 9px"
+    )
     return f'<div style="{style}">{cells}{warning}</div>'
 
 
@@ -122,7 +127,9 @@ def save_name(path: Path) -> str:
 def tell(client: Any, title: str, body: str, *, failed: bool = False) -> None:
     """A note in the corner of one client's page, if it is still there."""
     if client is not None:
-        client.add_notification(title, body, auto_close_seconds=None if failed else 5.0, color="red" if failed else "green")
+        client.add_notification(
+            title, body, auto_close_seconds=None if failed else 5.0, color="red" if failed else "green"
+        )
 
 
 def send(client: Any, name: str, make: Callable[[], bytes]) -> None:

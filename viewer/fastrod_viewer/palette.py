@@ -1,4 +1,5 @@
-"""Colours: of segments, of wires, of things, and of numbers. All read well on white and for colour-blind eyes."""
+"""Colours: of segments, of wires, of things, and of numbers. All read well on white and for colour-blind
+eyes."""
 
 from __future__ import annotations
 
@@ -55,12 +56,24 @@ def _table(*controls: Color) -> Colors:
 
 
 SEQUENTIAL: Colors = _table(
-    (58, 22, 92), (58, 64, 140), (42, 108, 147), (30, 150, 138), (84, 192, 104), (172, 218, 68), (252, 232, 80)
-)  # fmt: skip
+    (58, 22, 92),
+    (58, 64, 140),
+    (42, 108, 147),
+    (30, 150, 138),
+    (84, 192, 104),
+    (172, 218, 68),
+    (252, 232, 80),
+)
 """(256, 3) from none, dark, to most, bright; it brightens all the way."""
 DIVERGING: Colors = _table(
-    (34, 60, 140), (70, 130, 200), (150, 185, 215), (196, 196, 196), (238, 176, 110), (214, 98, 36), (130, 24, 16)
-)  # fmt: skip
+    (34, 60, 140),
+    (70, 130, 200),
+    (150, 185, 215),
+    (196, 196, 196),
+    (238, 176, 110),
+    (214, 98, 36),
+    (130, 24, 16),
+)
 """(256, 3) from most negative over none to most positive."""
 
 
@@ -104,7 +117,8 @@ def nice_above(value: float) -> float:
 
 
 class Range:
-    """How far a range of colours goes: to a round number beyond what was seen, and never back, so that colours do not flicker."""
+    """How far a range of colours goes: to a round number beyond what was seen, and never back, so that
+    colours do not flicker."""
 
     def __init__(self, least: float) -> None:
         """`least` [unit of the values]: it goes that far from the beginning."""

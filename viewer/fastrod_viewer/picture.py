@@ -51,8 +51,8 @@ class Picture:
     """
 
     def __init__(self, rods: Rods, options: Options | None = None) -> None:
-        """Robots, their number and nodes, and whether there is contact, are those of `rods`. Raises `InputError` on a state without
-        the rod (`outputs="tip"`)."""
+        """Robots, their number and nodes, and whether there is contact, are those of `rods`. Raises
+        `InputError` on a state without the rod (`outputs="tip"`)."""
         self.options = options = options or Options()
         robot, state = rods.robots[0], rods.state
         if not state.position.size:
@@ -64,7 +64,9 @@ class Picture:
         self.body_radius: Floats = np.where(radius > 0.0, radius, 0.02 * params.length.min(0))
         """(n_segments,) [m]; where none is known, a fiftieth of the length."""
         crossed = params.offset.any((0, 2, 3))
-        slender = np.where(crossed, np.minimum(_SLENDER * smallest_offset(params), self.body_radius), self.body_radius)
+        slender = np.where(
+            crossed, np.minimum(_SLENDER * smallest_offset(params), self.body_radius), self.body_radius
+        )
         skin = options.body == "skin"
         self.tube_radius: Floats = self.body_radius if skin else slender
         """(n_segments,) of the body as drawn [m]."""
@@ -74,11 +76,18 @@ class Picture:
         self._sample = Sampler(n_steps, np.repeat(k, len(ends)), np.tile(ends, len(k)))
         few = bool(crossed.any()) and self.n_robots <= FINE
         by_tension = options.color_by == "tension"
-        self._spacers = Spacers(params, self.body_radius, options, n_steps) if few and options.spacers and not skin else None
+        self._spacers = (
+            Spacers(params, self.body_radius, options, n_steps)
+            if few and options.spacers and not skin
+            else None
+        )
         self._tendons: Tendons | None = None
         if few and options.tendons and (by_tension or not skin):
-            self._tendons = Tendons(robot, params, self.body_radius if skin else None, n_steps, max(8, self.pieces // 4))
-        self._joints = n_steps * np.arange(1, self.n_segments) - 1  # intervals that end where another segment begins
+            self._tendons = Tendons(
+                robot, params, self.body_radius if skin else None, n_steps, max(8, self.pieces // 4)
+            )
+        # intervals that end where another segment begins
+        self._joints = n_steps * np.arange(1, self.n_segments) - 1
         plain = [palette.BODY if by_tension else palette.segment_color(i) for i in range(self.n_segments)]
         shape = (self.n_robots, self.n_segments, self.pieces, 3)
         self._plain: Colors = np.broadcast_to(np.array(plain, np.uint8)[:, None], shape)
@@ -90,7 +99,9 @@ class Picture:
         }
         self.range: Range | None = Range(least[options.color_by]) if options.color_by in least else None
         """Of colours that stand for numbers [1/m, % or N]; it grows with what is seen."""
-        self._contacts = (32 if self.n_robots <= 4 else 8) if options.contacts and state.contacts is not None else 0
+        self._contacts = (
+            (32 if self.n_robots <= 4 else 8) if options.contacts and state.contacts is not None else 0
+        )
         self._half_force = params.moment_scale / params.reach  # (1 or n_robots,)
         self._reach = params.reach
         self._last = _at_rest(rods, params.length, n_steps)
@@ -103,14 +114,16 @@ class Picture:
         return self._tendons is not None
 
     def frame(self, rods: Rods, *, tip_force: Floats | None = None) -> dict[str, Instances]:
-        """What is seen now: `body`, `tip`, and where options, robots and scene have them `spacers`, `tendons`, `contact_shafts`,
-        `contact_heads`, `load_shafts`, `load_heads`, `frames`; the same keys and counts in every frame. World frame, each robot at its
-        place.
+        """What is seen now: `body`, `tip`, and where options, robots and scene have them `spacers`,
+        `tendons`, `contact_shafts`,
+        `contact_heads`, `load_shafts`, `load_heads`, `frames`; the same keys and counts in every frame. World
+        frame, each robot at its place.
 
-        Arrows begin where the force acts. Those of contacts show the force on the rod, from the obstacle into the rod; the largest 32
-        a robot, or 8 of more than 4 robots. Those of loads show `tip_force` (3,) or (n_robots, 3), world [N]. An arrow is
-        0.3 L F / (F + EI / L^2) long, with L the robot's length and EI its smallest bending stiffness. Robots that are not ok are
-        reddish; where a state is not finite, the last finite one is shown.
+        Arrows begin where the force acts. Those of contacts show the force on the rod, from the obstacle into
+        the rod; the largest 32 a robot, or 8 of more than 4 robots. Those of loads show `tip_force` (3,) or
+        (n_robots, 3), world [N]. An arrow is
+        0.3 L F / (F + EI / L^2) long, with L the robot's length and EI its smallest bending stiffness. Robots
+        that are not ok are reddish; where a state is not finite, the last finite one is shown.
         """
         state, place = rods.state, np.asarray(rods.place, float)
         pose, lost = self._finite(state)
@@ -126,10 +139,18 @@ class Picture:
         tip = rod.position[:, -1]
         if self._contacts:
             point, force = self._touches(state.contacts)
-            found["contact_shafts"], found["contact_heads"] = self._arrows(point + place[:, None, :], force, palette.CONTACT)
+            found["contact_shafts"], found["contact_heads"] = self._arrows(
+                point + place[:, None, :], force, palette.CONTACT
+            )
         if self.options.loads:
-            load = np.zeros((self.n_robots, 3)) if tip_force is None else np.broadcast_to(tip_force, (self.n_robots, 3))
-            found["load_shafts"], found["load_heads"] = self._arrows(tip[:, None], load[:, None], palette.LOAD)
+            load = (
+                np.zeros((self.n_robots, 3))
+                if tip_force is None
+                else np.broadcast_to(tip_force, (self.n_robots, 3))
+            )
+            found["load_shafts"], found["load_heads"] = self._arrows(
+                tip[:, None], load[:, None], palette.LOAD
+            )
         if self.options.frames:
             size = max(3.0 * float(self.body_radius[-1]), 0.06 * float(self._reach.max()))
             found["frames"] = frames(tip, rod.quaternion[:, -1], size)
@@ -150,7 +171,9 @@ class Picture:
         color = warned(color, bad)
         end = np.full((self.n_robots, 3), self.tube_radius[-1])
         return {
-            "body": instances("tube", piece.centre, piece.quaternion, np.stack([thick, thick, length], axis=-1), color),
+            "body": instances(
+                "tube", piece.centre, piece.quaternion, np.stack([thick, thick, length], axis=-1), color
+            ),
             "tip": instances("cap", at.position[:, -1], at.quaternion[:, -1], end, color[:, -1, -1]),
         }
 
@@ -161,7 +184,11 @@ class Picture:
         # a node between segments has the distal one's curvature: the proximal one's goes on as it came
         end[:, self._joints] = np.maximum(2.0 * size[:, self._joints] - size[:, self._joints - 1], 0.0)
         found = along((size[:, :-1], end), at)
-        return found if self.options.color_by == "curvature" else 100.0 * self.body_radius[self._sample.segment] * found
+        return (
+            found
+            if self.options.color_by == "curvature"
+            else 100.0 * self.body_radius[self._sample.segment] * found
+        )
 
     def _touches(self, contacts: Contacts | None) -> tuple[Floats, Floats]:
         """Points and forces (n_robots, n_arrows, 3) of the largest contact forces, then zeros."""
@@ -177,14 +204,21 @@ class Picture:
         return point, force
 
     def _arrows(self, start: Floats, force: Floats, color: Color) -> tuple[Instances, Instances]:
-        """Shafts and heads from `start` (n_robots, n, 3) of `force` (n_robots, n, 3) [N]; none where it is zero or not finite."""
+        """Shafts and heads from `start` (n_robots, n, 3) of `force` (n_robots, n, 3) [N]; none where it is
+        zero or not finite."""
         if not force.any():
             return self._no_arrows(start.size // 3, color)
         force = np.where(np.isfinite(force).all(-1, keepdims=True), force, 0.0)
         size = np.linalg.norm(force, axis=-1)
         length = _ARROW * self._reach[:, None] * size / (size + self._half_force[:, None])
         direction = force / np.maximum(size, 1e-30)[..., None]
-        return arrows(start.reshape(-1, 3), direction.reshape(-1, 3), length.ravel(), 0.15 * float(self.body_radius.max()), color)
+        return arrows(
+            start.reshape(-1, 3),
+            direction.reshape(-1, 3),
+            length.ravel(),
+            0.15 * float(self.body_radius.max()),
+            color,
+        )
 
     def _no_arrows(self, n: int, color: Color) -> tuple[Instances, Instances]:
         """n of them that are not there, the same each time: nothing is sent again."""
@@ -197,9 +231,16 @@ class Picture:
         """The last finite pose of each robot, and whose is not that of `state`."""
         now = _Pose(state.position, state.rotation, state.arclength, state.curvature)
         with np.errstate(invalid="ignore"):
-            good = np.asarray(np.stack([(np.abs(a) < _FAR).reshape(self.n_robots, -1).all(axis=1) for a in now]).all(axis=0))
+            good = np.asarray(
+                np.stack([(np.abs(a) < _FAR).reshape(self.n_robots, -1).all(axis=1) for a in now]).all(axis=0)
+            )
         if not good.all():
-            now = _Pose(*(np.where(good.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(now, self._last, strict=True)))
+            now = _Pose(
+                *(
+                    np.where(good.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+                    for a, b in zip(now, self._last, strict=True)
+                )
+            )
         self._last = now
         return now, ~good
 

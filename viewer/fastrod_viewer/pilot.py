@@ -53,7 +53,8 @@ class Goals:
     """Where the controls of a robot stand, or where it is on its way there."""
 
     action: Floats
-    """(3 n_segments,) extension and two displacements of each segment [m]; empty where it is not driven so."""
+    """(3 n_segments,) extension and two displacements of each segment [m]; empty where it is not driven
+    so."""
     wire: Floats
     """(n_tendons,) change of each tendon's length on top of what the actions take [m]."""
     tension: Floats
@@ -81,7 +82,8 @@ class Pilot:
     """
 
     def __init__(self, world: World, speeds: Speeds | None = None, *, reach: Reach | None = None) -> None:
-        """`reach`: what the wires of the robot that is driven may do; they keep to its rate whatever the speeds are."""
+        """`reach`: what the wires of the robot that is driven may do; they keep to its rate whatever the
+        speeds are."""
         self.linked, self.reach = reach is not None, reach or Reach()
         self.robot: Robot = world.robot
         self.actions: SegmentActions | None = world.actions
@@ -162,7 +164,8 @@ class Pilot:
         self._act(segment, 0, float(extension))
 
     def wire(self, tendon: int, change: float) -> None:
-        """Change one tendon's length to `change` against the straight rest robot [m], negative = pulled; the bends keep theirs."""
+        """Change one tendon's length to `change` against the straight rest robot [m], negative = pulled; the
+        bends keep theirs."""
         with self._lock:
             wire = self._goals.wire.copy()
             wire[tendon] += float(change) - self._change(self._goals)[tendon]
@@ -181,7 +184,13 @@ class Pilot:
         with self._lock:
             self._goals = _with(self._goals, base=np.array(displacement, dtype=np.float64))
 
-    def load(self, *, tip_force: ArrayLike | None = None, payload: float | None = None, gravity: float | None = None) -> None:
+    def load(
+        self,
+        *,
+        tip_force: ArrayLike | None = None,
+        payload: float | None = None,
+        gravity: float | None = None,
+    ) -> None:
         """Loads: force on the tip (3,) world [N], mass at the tip [kg], times gravity. What is None stays."""
         with self._lock:
             if tip_force is not None:
@@ -221,11 +230,14 @@ class Pilot:
             self._pull = None
 
     def adopt(self, change: Floats, extension: Floats) -> None:
-        """Take over a robot as it stands: changes of tendon length (n_tendons,) and of segment length (n_segments,) [m]."""
+        """Take over a robot as it stands: changes of tendon length (n_tendons,) and of segment length
+        (n_segments,) [m]."""
         with self._lock:
             action, rest = self._zero.action, np.array(change, dtype=np.float64)
             if self.actions is not None:
-                taken = np.linalg.lstsq(self.actions.matrix, np.concatenate([change, extension]), rcond=None)[0]
+                taken = np.linalg.lstsq(self.actions.matrix, np.concatenate([change, extension]), rcond=None)[
+                    0
+                ]
                 action = np.clip(taken, self._lower, self._upper)
                 rest -= self.actions.matrix[: len(rest)] @ action
             rest[np.abs(rest) < _NOTHING] = 0.0
@@ -249,17 +261,26 @@ class Pilot:
                 action = now.action
             wire = _toward(now.wire, goals.wire, speeds.bend * self._offset * dt)
             tension = _toward(now.tension, goals.tension, LARGEST_TENSION * dt)
-            base = np.concatenate([
-                _toward(now.base[:3], goals.base[:3], speeds.base * dt), _toward(now.base[3:], goals.base[3:], 5.0 * speeds.base * dt)
-            ])  # fmt: skip
+            base = np.concatenate(
+                [
+                    _toward(now.base[:3], goals.base[:3], speeds.base * dt),
+                    _toward(now.base[3:], goals.base[3:], 5.0 * speeds.base * dt),
+                ]
+            )
             self._before, self._now = now, self._within_rate(now, Goals(action, wire, tension, base), dt)
             there = self._now
             extension = np.zeros(self.robot.n_segments) if self.actions is None else there.action[::3]
             return Hand(
-                tendon_length=self.robot.rest_tendon_length + self._change(there), extension=extension, tension=there.tension,
-                base=there.base, base_rate=rate, tip_force=self._tip_force, payload=self._payload, gravity=self._gravity,
+                tendon_length=self.robot.rest_tendon_length + self._change(there),
+                extension=extension,
+                tension=there.tension,
+                base=there.base,
+                base_rate=rate,
+                tip_force=self._tip_force,
+                payload=self._payload,
+                gravity=self._gravity,
                 freeze=self._freeze,
-            )  # fmt: skip
+            )
 
     def _within_rate(self, now: Goals, then: Goals, dt: float) -> Goals:
         """As far from `now` toward `then` as no wire is faster than it may be; straight there."""
@@ -273,7 +294,10 @@ class Pilot:
         with self._lock:
             k = 3 * segment + which
             if not 0 <= k < len(self._goals.action):
-                raise InputError(f"segment {segment + 1} cannot be driven; robot {self.robot.name!r} has {self.robot.n_segments} segments.")
+                raise InputError(
+                    f"segment {segment + 1} cannot be driven; robot {self.robot.name!r} has "
+                    f"{self.robot.n_segments} segments."
+                )
             action = self._goals.action.copy()
             action[k] = min(max(value, self._lower[k]), self._upper[k])
             self._goals = _with(self._goals, action=action)
@@ -291,7 +315,8 @@ class Pilot:
         return rates
 
     def _follow_drag(self, dt: float) -> Floats | None:
-        """One step of the tip toward where it is dragged: the goals move; (n_joints,) rates of the host's joints [rad/s], or None."""
+        """One step of the tip toward where it is dragged: the goals move; (n_joints,) rates of the host's
+        joints [rad/s], or None."""
         if self.actions is None or self._pull is None:
             return None
         try:
@@ -324,7 +349,10 @@ def _toward(now: Floats, goal: Floats, step: float) -> Floats:
 
 def _arm(robot: Robot) -> float:
     """Largest distance of a tendon from the backbone [m]; 0 without tendons."""
-    return max((math.hypot(*t.position(k + 1)[k]) for k, s in enumerate(robot.segments) for t in s.tendons), default=0.0)
+    return max(
+        (math.hypot(*t.position(k + 1)[k]) for k, s in enumerate(robot.segments) for t in s.tendons),
+        default=0.0,
+    )
 
 
 def _limits(robot: Robot, actions: SegmentActions | None, reach: Reach) -> tuple[Floats, Floats]:

@@ -31,29 +31,34 @@ Progress = Callable[[int, int], None]
 
 
 class Shapes(NamedTuple):
-    """The rod at the kept frames, in the frame of the log's tip: as the camera sees it, where the model has one. Fields are named as in
+    """The rod at the kept frames, in the frame of the log's tip: as the camera sees it, where the model has
+    one. Fields are named as in
     `State`, with frames in the place of robots."""
 
     position: Floats
-    """(m, n_points, 3) backbone [m], POINTS_PER_SEGMENT points a segment and one more; nan where the model did not converge."""
+    """(m, n_points, 3) backbone [m], POINTS_PER_SEGMENT points a segment and one more; nan where the model
+    did not converge."""
     rotation: Floats
     """(m, n_points, 3, 3) log_from_material."""
     arclength: Floats
     """(m, n_points) [m]."""
     tip_position: Floats
-    """(m, 3) what the camera should see of the tip [m]; off the backbone's end by the marker's offset, where the model has one."""
+    """(m, 3) what the camera should see of the tip [m]; off the backbone's end by the marker's offset, where
+    the model has one."""
     ok: Flags
     """(m,) the model converged."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Track:
-    """What one model says to the log. The row axis is that of `Playback.log`; residual = measured - predicted."""
+    """What one model says to the log. The row axis is that of `Playback.log`; residual = measured -
+    predicted."""
 
     label: str
     robot: Robot
     tip_position: Floats
-    """(n, 3) predicted, frame of the log [m]; nan where nothing was measured or the model did not converge."""
+    """(n, 3) predicted, frame of the log [m]; nan where nothing was measured or the model did not
+    converge."""
     points: Floats | None
     """(n, k, 3) predicted further points [m], where the log measured some."""
     residual: Floats
@@ -86,7 +91,8 @@ class Findings:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Playback:
-    """A log, one or two models beside it, and a clock that runs through both. Lengths in metres, in the frame of the log's tip."""
+    """A log, one or two models beside it, and a clock that runs through both. Lengths in metres, in the frame
+    of the log's tip."""
 
     log: RunLog
     """Rows with a time and all inputs, run after run."""
@@ -95,7 +101,8 @@ class Playback:
     origin: Ints
     """(n,) their rows in the log that was given."""
     time: Floats
-    """(n,) from 0, non-decreasing, with the pauses between runs, and long ones inside of them, closed up [s]."""
+    """(n,) from 0, non-decreasing, with the pauses between runs, and long ones inside of them, closed up
+    [s]."""
     breaks: Ints
     """Rows before which a run begins or a pause was closed up: curves are interrupted there."""
     frames: Ints
@@ -118,10 +125,12 @@ class Playback:
         frames: int = FRAMES,
         progress: Progress | None = None,
     ) -> Playback:
-        """The playback of `log` with one model or two; `labels` name them, `frames` is the most that keep their shape, `progress` is called
-        with how much is done of how much. `nominal` is what a later identification starts from (default: `before`).
+        """The playback of `log` with one model or two; `labels` name them, `frames` is the most that keep
+        their shape, `progress` is called with how much is done of how much. `nominal` is what a later
+        identification starts from (default: `before`).
 
-        Raises `LogError` for a log without a row to compare, `InputError` for a robot that lengths do not drive.
+        Raises `LogError` for a log without a row to compare, `InputError` for a robot that lengths do not
+        drive.
         """
         if frames < 2:
             raise InputError(f"frames is {frames!r}; a playback keeps 2 at least.")
@@ -142,9 +151,17 @@ class Playback:
             if progress is not None:
                 progress((k + 1) * each, each * len(robots))
         return Playback(
-            log=log, nominal=nominal or before, origin=samples.origin, time=time, breaks=breaks, frames=kept, before=tracks[0],
-            after=tracks[1] if len(tracks) > 1 else None, findings=findings, tested=_tested(samples, findings),
-        )  # fmt: skip
+            log=log,
+            nominal=nominal or before,
+            origin=samples.origin,
+            time=time,
+            breaks=breaks,
+            frames=kept,
+            before=tracks[0],
+            after=tracks[1] if len(tracks) > 1 else None,
+            findings=findings,
+            tested=_tested(samples, findings),
+        )
 
     @cached_property
     def frame_time(self) -> Floats:
@@ -174,7 +191,8 @@ class Playback:
         return (self.before,) if self.after is None else (self.before, self.after)
 
     def at(self, time: float) -> int:
-        """The frame that is shown at `time` [s]: the last one that is not later; times outside are those of the ends."""
+        """The frame that is shown at `time` [s]: the last one that is not later; times outside are those of
+        the ends."""
         return int(np.clip(np.searchsorted(self.frame_time, time, side="right") - 1, 0, len(self.frames) - 1))
 
     def run_at(self, frame: int) -> str:
@@ -190,12 +208,14 @@ def load(
     frames: int = FRAMES,
     progress: Progress | None = None,
 ) -> Playback:
-    """The playback of the log at `path`: the identified model, where LOG_identified/ beside the log (or here, or the folder `identified`)
-    holds one, beside the same model without the effects that were found; otherwise `robot` alone.
+    """The playback of the log at `path`: the identified model, where LOG_identified/ beside the log (or here,
+    or the folder `identified`) holds one, beside the same model without the effects that were found;
+    otherwise `robot` alone.
 
-    `robot` is a shipped name, a path to a .toml or a Robot. Without it, a raw file of a measured set brings its own, and else it is that of
-    identified.toml beside the log or in LOG_identified/. Raises `InputError` where none of these is there, or where `identified` is not
-    of this log; `LogError` for a log that does not fit.
+    `robot` is a shipped name, a path to a .toml or a Robot. Without it, a raw file of a measured set brings
+    its own, and else it is that of identified.toml beside the log or in LOG_identified/. Raises `InputError`
+    where none of these is there, or where `identified` is not of this log; `LogError` for a log that does not
+    fit.
     """
     path = Path(path)
     given = None if robot is None else robot if isinstance(robot, Robot) else load_robot(robot)
@@ -205,42 +225,68 @@ def load(
         label = "model with effects" if nominal.effects else "model"
         return Playback.of(log, nominal, labels=(label,), frames=frames, progress=progress)
     if found.findings.effects:
-        stripped = replace(found.robot, effects=tuple(e for e in found.robot.effects if e["name"] not in found.findings.effects))
+        stripped = replace(
+            found.robot,
+            effects=tuple(e for e in found.robot.effects if e["name"] not in found.findings.effects),
+        )
         labels: tuple[str, ...] = (SWITCHED_OFF, with_effects(found.findings.effects))
         both: tuple[Robot, Robot | None] = (stripped, found.robot)
     else:
         labels, both = (BEFORE,), (found.robot, None)
-    return Playback.of(log, *both, labels=labels, nominal=nominal, findings=found.findings, frames=frames, progress=progress)
+    return Playback.of(
+        log, *both, labels=labels, nominal=nominal, findings=found.findings, frames=frames, progress=progress
+    )
 
 
 def identify(
-    playback: Playback, *, held_out: Sequence[str] = (), frames: int = FRAMES, progress: Callable[[str, int, int], None] | None = None
+    playback: Playback,
+    *,
+    held_out: Sequence[str] = (),
+    frames: int = FRAMES,
+    progress: Callable[[str, int, int], None] | None = None,
 ) -> Playback:
-    """Look for what the model lacks, in this thread (seconds to minutes): the playback of the base model with its own parameters fitted,
-    beside the model with what was found; one model where nothing was. `progress` is called with what is done, and how far of how much.
+    """Look for what the model lacks, in this thread (seconds to minutes): the playback of the base model with
+    its own parameters fitted, beside the model with what was found; one model where nothing was. `progress`
+    is called with what is done, and how far of how much.
 
     Raises what `fastrod.identification.attribution.identify` raises.
     """
     from fastrod.identification import attribution
 
-    # A Result has the base model's prediction but not its robot, whose shape is drawn here: without effects, `identified` is that robot.
+    # A Result has the base model's prediction but not its robot, whose shape is drawn here: without effects,
+    # `identified` is that robot.
     base = attribution.identify(playback.log, playback.nominal, held_out=held_out, max_effects=0)
     result = attribution.identify(playback.log, playback.nominal, held_out=held_out, progress=progress)
     findings = Findings(
-        verdict=result.verdict, summary=result.summary, effects=tuple(effect.name for effect in result.effects),
-        held_out=tuple(result.held_out), held_out_rms=(result.test.before, result.test.after), source="this session",
-    )  # fmt: skip
+        verdict=result.verdict,
+        summary=result.summary,
+        effects=tuple(effect.name for effect in result.effects),
+        held_out=tuple(result.held_out),
+        held_out_rms=(result.test.before, result.test.after),
+        source="this session",
+    )
     made = Playback.of(
-        playback.log, base.identified, result.identified if findings.effects else None, labels=(BEFORE, with_effects(findings.effects)),
-        nominal=playback.nominal, findings=findings, frames=frames,
-    )  # fmt: skip
+        playback.log,
+        base.identified,
+        result.identified if findings.effects else None,
+        labels=(BEFORE, with_effects(findings.effects)),
+        nominal=playback.nominal,
+        findings=findings,
+        frames=frames,
+    )
     return replace(made, origin=playback.origin[made.origin], tested=result.tested)
 
 
 def with_effects(names: Sequence[str]) -> str:
     """The label of a model with these effects."""
     words = [name.replace("_", " ") for name in names]
-    return f"with {', '.join(words[:-1])} and {words[-1]}" if len(words) > 1 else f"with {words[0]}" if words else "with no effect"
+    return (
+        f"with {', '.join(words[:-1])} and {words[-1]}"
+        if len(words) > 1
+        else f"with {words[0]}"
+        if words
+        else "with no effect"
+    )
 
 
 class _Found(NamedTuple):
@@ -249,28 +295,34 @@ class _Found(NamedTuple):
 
 
 def _identification(path: Path, folder: Path | None, given: Robot | None) -> _Found | None:
-    """The identification in `folder`, or else the first of this log, and of the robot `given`, that lies where the command puts it."""
+    """The identification in `folder`, or else the first of this log, and of the robot `given`, that lies
+    where the command puts it."""
     if folder is not None:
         found = _report(folder, path)
         if found is None:
             raise InputError(
-                f"folder {str(folder)!r} lacks report.json and identified.toml of log {path.stem!r}; fastrod identify writes them."
+                f"folder {str(folder)!r} lacks report.json and identified.toml of log {path.stem!r}; "
+                "fastrod identify writes them."
             )
         if given is not None and given.n_tendons != found.robot.n_tendons:
             raise InputError(
-                f"robot {given.name!r} has {given.n_tendons} tendons, the one of {str(folder)!r} has {found.robot.n_tendons}; "
+                f"robot {given.name!r} has {given.n_tendons} tendons, the one of {str(folder)!r} has "
+                f"{found.robot.n_tendons}; "
                 "leave --robot out to take the identified one."
             )
         return found
     for place in dict.fromkeys((path.parent / f"{path.stem}_identified", Path(f"{path.stem}_identified"))):
         found = _report(place, path)
-        if found is not None and (given is None or (given.name, given.n_tendons) == (found.robot.name, found.robot.n_tendons)):
+        if found is not None and (
+            given is None or (given.name, given.n_tendons) == (found.robot.name, found.robot.n_tendons)
+        ):
             return found
     return None
 
 
 def _report(folder: Path, path: Path) -> _Found | None:
-    """What report.json and identified.toml in `folder` say about the log at `path`; None where they are not there, or of another log."""
+    """What report.json and identified.toml in `folder` say about the log at `path`; None where they are not
+    there, or of another log."""
     report, robot = folder / "report.json", folder / "identified.toml"
     if not (report.is_file() and robot.is_file()):
         return None
@@ -279,13 +331,20 @@ def _report(folder: Path, path: Path) -> _Found | None:
         errors = data["error"]["held_out"]
         nan = float("nan")
         findings = Findings(
-            verdict=str(data["verdict"]), summary=str(data.get("summary", "")), effects=tuple(str(e["name"]) for e in data["effects"]),
-            held_out=tuple(map(str, data["held_out"])), source=str(folder),
-            held_out_rms=tuple(nan if errors[key] is None else float(errors[key]) for key in ("before_rms_m", "after_rms_m")),  # type: ignore[arg-type]
-        )  # fmt: skip
+            verdict=str(data["verdict"]),
+            summary=str(data.get("summary", "")),
+            effects=tuple(str(e["name"]) for e in data["effects"]),
+            held_out=tuple(map(str, data["held_out"])),
+            source=str(folder),
+            held_out_rms=tuple(
+                nan if errors[key] is None else float(errors[key]) for key in ("before_rms_m", "after_rms_m")
+            ),  # type: ignore[arg-type]
+        )
         named = data["log"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(f"{str(report)!r} is not a report of fastrod identify: {error or type(error).__name__}.") from error
+        raise InputError(
+            f"{str(report)!r} is not a report of fastrod identify: {error or type(error).__name__}."
+        ) from error
     return _Found(load_robot(robot), findings) if named == path.stem else None
 
 
@@ -294,7 +353,11 @@ def _read(path: Path, given: Robot | None, found: _Found | None) -> tuple[RunLog
     if detect(path):
         return read(path, given)
     beside = path.parent / "identified.toml"
-    robot = given or (None if found is None else found.robot) or (load_robot(beside) if path.is_file() and beside.is_file() else None)
+    robot = (
+        given
+        or (None if found is None else found.robot)
+        or (load_robot(beside) if path.is_file() and beside.is_file() else None)
+    )
     if robot is None and not path.is_file():
         raise LogError(f"log {str(path)!r} cannot be read: there is no such file.")
     return read(path, robot)
@@ -304,7 +367,10 @@ def _samples(log: RunLog) -> Any:
     from fastrod.identification.log.forward import sample  # loads numba
 
     if not log.measured.any():
-        raise LogError(f"log {log.name!r} has no row in which every input and the tip are there; there is nothing to compare.")
+        raise LogError(
+            f"log {log.name!r} has no row in which every input and the tip are there; there is "
+            "nothing to compare."
+        )
     return sample(log)
 
 
@@ -314,7 +380,11 @@ def _tested(samples: Any, findings: Findings | None) -> Flags | None:
         return None
     from fastrod.identification.log.split import held_out_rows
 
-    words = [] if len(findings.held_out) == 1 and findings.held_out[0].startswith(_EVERY_FOURTH) else list(findings.held_out)
+    words = (
+        []
+        if len(findings.held_out) == 1 and findings.held_out[0].startswith(_EVERY_FOURTH)
+        else list(findings.held_out)
+    )
     try:
         return held_out_rows(samples, words)[0]
     except FastrodError:
@@ -335,13 +405,19 @@ def _track(log: RunLog, robot: Robot, frames: Ints, label: str, tell: Progress) 
     answer = replay(log, robot, progress=tell)
     residual = np.asarray(np.linalg.norm(answer.residual, axis=1))
     return Track(
-        label=label, robot=robot, tip_position=answer.tip_position, points=answer.points, residual=residual, rms=answer.rms,
+        label=label,
+        robot=robot,
+        tip_position=answer.tip_position,
+        points=answer.points,
+        residual=residual,
+        rms=answer.rms,
         shapes=_shapes(log, robot, frames),
-    )  # fmt: skip
+    )
 
 
 def _shapes(log: RunLog, robot: Robot, frames: Ints) -> Shapes:
-    """The rod that `replay` solves, whole: with effects, the one of `forward.predict`, and its camera sees the backbone too."""
+    """The rod that `replay` solves, whole: with effects, the one of `forward.predict`, and its camera sees
+    the backbone too."""
     from fastrod.identification.log import forward
     from fastrod.identification.log.inputs import base_of, inputs
     from fastrod.identification.log.unknowns import known_model
@@ -376,7 +452,8 @@ def _shapes(log: RunLog, robot: Robot, frames: Ints) -> Shapes:
 
 
 def _finer(arclength: Floats, n_segments: int) -> Floats:
-    """(m, n_segments * POINTS_PER_SEGMENT + 1) arclengths, even within each segment, from the nodes of a coarser rod."""
+    """(m, n_segments * POINTS_PER_SEGMENT + 1) arclengths, even within each segment, from the nodes of a
+    coarser rod."""
     ends = arclength[:, :: (arclength.shape[1] - 1) // n_segments]
     part = np.linspace(0.0, 1.0, POINTS_PER_SEGMENT, endpoint=False)
     inner = ends[:, :-1, None] + np.diff(ends, axis=1)[:, :, None] * part

@@ -1,4 +1,5 @@
-"""`ReplayDrawing`: one moment of a playback on a canvas; the models' rods, the measured tip, and the residual between them."""
+"""`ReplayDrawing`: one moment of a playback on a canvas; the models' rods, the measured tip, and the residual
+between them."""
 
 from __future__ import annotations
 
@@ -44,14 +45,18 @@ class ReplayDrawing:
         up = matrix_from_quaternion(playback.base_quaternion)[:, 2, 2].min() > _UPRIGHT
         middle, size, floor = (0.22, 0.95, 0.0) if up else (-0.4, 1.5, -1.15)
         self.sight = Sight(np.array([0.0, 0.0, middle * robot.length]), size * robot.length)
-        """The robot in the upper part of the picture, above the plot, and all around its base where that turns."""
+        """The robot in the upper part of the picture, above the plot, and all around its base where that
+        turns."""
         canvas.clear()
         canvas.floor(1.5 * robot.length, floor * robot.length, np.zeros(3))
 
     @property
     def legend(self) -> str:
         """HTML of what is what."""
-        entries = [Entry("measured tip, and its trail", MEASURED), Entry("residual, from the predicted tip", CONTACT)]
+        entries = [
+            Entry("measured tip, and its trail", MEASURED),
+            Entry("residual, from the predicted tip", CONTACT),
+        ]
         if len(self.playback.tracks) > 1:
             entries.append(Entry("the other model", GHOST))
         return Legend("Measured beside predicted", "", tuple(entries)).html()
@@ -61,15 +66,20 @@ class ReplayDrawing:
         self._trail.clear()
 
     def draw(self, frame: int, choice: str, magnify: float) -> None:
-        """A frame, with the model of the label `choice`, or `BOTH`; the residual is drawn `magnify` times as long."""
+        """A frame, with the model of the label `choice`, or `BOTH`; the residual is drawn `magnify` times as
+        long."""
         playback, last = self.playback, len(self.playback.tracks) - 1
         quaternion, row = playback.base_quaternion[frame], playback.frames[frame]
         turn = matrix_from_quaternion(quaternion[None])[0]
-        for k, (track, rods, picture) in enumerate(zip(playback.tracks, self._rods, self._pictures, strict=True)):
+        for k, (track, rods, picture) in enumerate(
+            zip(playback.tracks, self._rods, self._pictures, strict=True)
+        ):
             state = state_of(track.shapes, frame, quaternion, rods.robots[0].n_tendons)
             full = choice == track.label or (choice == BOTH and k == last)
             self.canvas.show_all(picture.frame(rods._replace(state=state)) if full else {}, f"model{k}/")
-            thin = ghost(state.position[0], 0.12 * self._radius, GHOST) if choice == BOTH and not full else None
+            thin = (
+                ghost(state.position[0], 0.12 * self._radius, GHOST) if choice == BOTH and not full else None
+            )
             self.canvas.show(f"ghost{k}", thin)
         shown = next((track for track in playback.tracks if track.label == choice), playback.tracks[last])
         measured, predicted = turn @ playback.measured_tip[row], turn @ shown.tip_position[row]
@@ -98,17 +108,24 @@ class ReplayDrawing:
         along = way[None] / max(size, 1e-12)
         shaft, head = arrows(predicted[None], along, np.array([magnify * size]), 0.08 * self._radius, CONTACT)
         self.canvas.show_all({"shaft": shaft, "head": head}, "residual/")
-        self.canvas.note("residual", f"{1e3 * size:.2f} mm", measured + np.array([0.0, 0.0, 1.2 * self._radius]))
+        self.canvas.note(
+            "residual", f"{1e3 * size:.2f} mm", measured + np.array([0.0, 0.0, 1.2 * self._radius])
+        )
 
 
 def state_of(shapes: Shapes, frame: int, quaternion: Floats, n_tendons: int) -> State:
-    """The rod of one frame as a `State` in the world of `quaternion` (4,) world_from_log; tensions, which a log does not tell, are nan."""
+    """The rod of one frame as a `State` in the world of `quaternion` (4,) world_from_log; tensions, which a
+    log does not tell, are nan."""
     turn = matrix_from_quaternion(quaternion[None])[0]
     position, rotation = shapes.position[frame] @ turn.T, turn @ shapes.rotation[frame]
     arclength = shapes.arclength[frame]
     step = np.diff(arclength)
     relative = np.swapaxes(rotation[:-1], 1, 2) @ rotation[1:]
-    small = [relative[:, 2, 1] - relative[:, 1, 2], relative[:, 0, 2] - relative[:, 2, 0], relative[:, 1, 0] - relative[:, 0, 1]]
+    small = [
+        relative[:, 2, 1] - relative[:, 1, 2],
+        relative[:, 0, 2] - relative[:, 2, 0],
+        relative[:, 1, 0] - relative[:, 0, 1],
+    ]
     bend = 0.5 * np.stack(small, axis=1) / step[:, None]
     none, unknown = np.zeros((1, len(position), 3)), np.full((1, n_tendons), np.nan)
     return State(

@@ -34,7 +34,8 @@ _FIND = "What does the model lack?"
 
 @final
 class ReplayPage(Page):
-    """The robot as models have it, the measured tip, the residual as an arrow and over time, and a switch between the models."""
+    """The robot as models have it, the measured tip, the residual as an arrow and over time, and a switch
+    between the models."""
 
     def __init__(self, server: viser.ViserServer, canvas: Canvas, playback: Playback) -> None:
         self.server, self.canvas = server, canvas
@@ -89,7 +90,10 @@ class ReplayPage(Page):
                 serializer.insert_sleep(pause)
             html = serializer.as_html()
             self.frame = -1
-        rows = [("samples", str(len(playback.log))), *((track.label, f"{1e3 * track.rms:.3f} mm rms") for track in playback.tracks)]
+        rows = [
+            ("samples", str(len(playback.log))),
+            *((track.label, f"{1e3 * track.rms:.3f} mm rms") for track in playback.tracks),
+        ]
         faster = playback.duration / max(pause * (len(frames) - 1), 1e-9)
         if faster > 1.1:
             rows.append(("shown", f"{faster:.1f} times as fast"))
@@ -97,9 +101,14 @@ class ReplayPage(Page):
         if found is not None:
             rows.append(("verdict", found.verdict.replace("_", " ")))
         return wrap(
-            html, title=self.title, subtitle="Measured beside predicted", legend_html=self.drawing.legend, plot_svg=svg(playback),
-            facts=rows, note=found.summary if found is not None else "",
-        )  # fmt: skip
+            html,
+            title=self.title,
+            subtitle="Measured beside predicted",
+            legend_html=self.drawing.legend,
+            plot_svg=svg(playback),
+            facts=rows,
+            note=found.summary if found is not None else "",
+        )
 
     def _take(self, playback: Playback) -> None:
         """Show this playback from now on."""
@@ -111,7 +120,9 @@ class ReplayPage(Page):
             self.choice = playback.tracks[-1].label
             """Label of the model that is shown, or `both`."""
             usual = max(playback.tracks[-1].rms, 1e-9)
-            self._magnify = min(_FACTORS, key=lambda f: abs(np.log(float(f) * usual / (_SEEN * self.drawing.length))))
+            self._magnify = min(
+                _FACTORS, key=lambda f: abs(np.log(float(f) * usual / (_SEEN * self.drawing.length)))
+            )
             self._time, self.frame = 0.0, -1
             self._build()
             stand_back(self.server, self.sight)
@@ -132,23 +143,35 @@ class ReplayPage(Page):
             self.figures = gui.add_html("")
             duration = max(playback.duration, 1e-3)
             step = float(f"{max(duration / 2000.0, 1e-3):.1g}")
-            self.slider: Any = gui.add_slider("Time [s]", 0.0, float(np.ceil(duration / step) * step), step, 0.0)
+            self.slider: Any = gui.add_slider(
+                "Time [s]", 0.0, float(np.ceil(duration / step) * step), step, 0.0
+            )
             self.slider.on_update(self._scrub)
             self.play = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE, hint="Key: space")
             self.play.on_click(lambda _: self._toggle())
-            gui.add_dropdown("Speed", tuple(_SPEEDS), initial_value="1 ×").on_update(lambda e: self._set(speed=_SPEEDS[e.target.value]))
+            gui.add_dropdown("Speed", tuple(_SPEEDS), initial_value="1 ×").on_update(
+                lambda e: self._set(speed=_SPEEDS[e.target.value])
+            )
             labels = tuple(track.label for track in playback.tracks)
             options = (*labels, BOTH) if len(labels) > 1 else labels
-            gui.add_dropdown("Model", options, initial_value=self.choice).on_update(lambda e: self._set(choice=e.target.value))
+            gui.add_dropdown("Model", options, initial_value=self.choice).on_update(
+                lambda e: self._set(choice=e.target.value)
+            )
             hint = "The arrow from the predicted to the measured tip is drawn so many times longer."
             magnify = gui.add_dropdown("Residual ×", _FACTORS, initial_value=self._magnify, hint=hint)
             magnify.on_update(lambda e: self._set(magnify=e.target.value))
             if playback.findings is None:
-                self.find = gui.add_button(_FIND, color="teal", hint="As `fastrod identify` does, on this log: seconds to minutes.")
+                self.find = gui.add_button(
+                    _FIND, color="teal", hint="As `fastrod identify` does, on this log: seconds to minutes."
+                )
                 self.find.on_click(lambda event: self._identify(event.client))
             gui.add_html(self._verdict())
-            page = gui.add_button("Export as a web page", color="gray", hint="One HTML file with the motion in it.")
-            page.on_click(lambda event: send(event.client, f"{self.title}.html", lambda: self.export().encode()))
+            page = gui.add_button(
+                "Export as a web page", color="gray", hint="One HTML file with the motion in it."
+            )
+            page.on_click(
+                lambda event: send(event.client, f"{self.title}.html", lambda: self.export().encode())
+            )
             png = gui.add_button("Save a picture (PNG)", color="gray")
             png.on_click(lambda event: send(event.client, f"{self.title}.png", lambda: picture(event.client)))
         with aside.add_tab("Legend"):
@@ -170,22 +193,35 @@ class ReplayPage(Page):
         dot: Any = {"show": True, "size": 9, "fill": css(MEASURED)}
         series = [
             uplot.Series(label="t [s]"),
-            *(uplot.Series(label=track.label, stroke=color, width=1.5) for track, color in zip(tracks, colors, strict=False)),
+            *(
+                uplot.Series(label=track.label, stroke=color, width=1.5)
+                for track, color in zip(tracks, colors, strict=False)
+            ),
             uplot.Series(label="now", stroke=css(MEASURED), points=dot),
         ]
-        most = max(float(np.nanmax(line, initial=1e-9)) for line in (lines.before, lines.after) if line is not None)
+        most = max(
+            float(np.nanmax(line, initial=1e-9)) for line in (lines.before, lines.after) if line is not None
+        )
         scales = {"x": uplot.Scale(time=False), "y": uplot.Scale(range=(0.0, 1.08 * most))}
         axes = (uplot.Axis(label="time [s]"), uplot.Axis(label="mm"))
-        return self.server.gui.add_uplot(self._plotted(0), tuple(series), axes=axes, scales=scales, height=170)
+        return self.server.gui.add_uplot(
+            self._plotted(0), tuple(series), axes=axes, scales=scales, height=170
+        )
 
     def _plotted(self, frame: int) -> tuple[Floats, ...]:
         """The curves, and a dot where the clock is."""
         lines = self._curves
-        chosen = lines.before if lines.after is None or self.choice == self.playback.before.label else lines.after
+        chosen = (
+            lines.before if lines.after is None or self.choice == self.playback.before.label else lines.after
+        )
         now = np.full(len(lines.time), np.nan)
         k = min(int(np.searchsorted(lines.time, self.playback.frame_time[frame])), len(now) - 1)
         now[k] = chosen[k]
-        return (lines.time, lines.before, now) if lines.after is None else (lines.time, lines.before, lines.after, now)
+        return (
+            (lines.time, lines.before, now)
+            if lines.after is None
+            else (lines.time, lines.before, lines.after, now)
+        )
 
     def _verdict(self) -> str:
         found = self.playback.findings
@@ -193,7 +229,11 @@ class ReplayPage(Page):
             return ""
         before, after = (1e3 * v for v in found.held_out_rms)
         named = ", ".join(name.replace("_", " ") for name in found.effects) or "none"
-        rows = [("Verdict", found.verdict.replace("_", " ")), ("Effects", named), ("Held out", f"{before:.3f} → {after:.3f} mm rms")]
+        rows = [
+            ("Verdict", found.verdict.replace("_", " ")),
+            ("Effects", named),
+            ("Held out", f"{before:.3f} → {after:.3f} mm rms"),
+        ]
         return facts(rows)
 
     def _scrub(self, event: Any) -> None:
@@ -207,8 +247,14 @@ class ReplayPage(Page):
         self._playing = not self._playing
         self._wake.set()
 
-    def _set(self, *, speed: float | None = None, choice: str | None = None, magnify: str | None = None) -> None:
-        self._speed, self.choice, self._magnify = speed or self._speed, choice or self.choice, magnify or self._magnify
+    def _set(
+        self, *, speed: float | None = None, choice: str | None = None, magnify: str | None = None
+    ) -> None:
+        self._speed, self.choice, self._magnify = (
+            speed or self._speed,
+            choice or self.choice,
+            magnify or self._magnify,
+        )
         self.frame = -1
         self._wake.set()
 

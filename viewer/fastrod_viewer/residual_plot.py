@@ -1,4 +1,5 @@
-"""The distance between measurement and model over time: arrays for a live plot, and an inline SVG for a page."""
+"""The distance between measurement and model over time: arrays for a live plot, and an inline SVG for a
+page."""
 
 from __future__ import annotations
 
@@ -24,10 +25,21 @@ _RUNS = 40  # starts of runs that are marked
 _INK, _LINE, _HELD = "#4b5563", "#9ca3af", "#dbe7f8"
 _WIDE, _HIGH = 9.0, 1.8  # in; 100 px each
 _STYLE: dict[Any, Any] = {
-    "svg.fonttype": "path", "svg.hashsalt": "fastrod", "font.size": 8.5, "axes.spines.top": False, "axes.spines.right": False,
-    "axes.edgecolor": _LINE, "axes.labelcolor": _INK, "xtick.color": _INK, "ytick.color": _INK, "text.color": _INK,
-    "legend.frameon": False, "lines.solid_capstyle": "round", "lines.linewidth": 1.1, "path.simplify": True,
-}  # fmt: skip
+    "svg.fonttype": "path",
+    "svg.hashsalt": "fastrod",
+    "font.size": 8.5,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": _LINE,
+    "axes.labelcolor": _INK,
+    "xtick.color": _INK,
+    "ytick.color": _INK,
+    "text.color": _INK,
+    "legend.frameon": False,
+    "lines.solid_capstyle": "round",
+    "lines.linewidth": 1.1,
+    "path.simplify": True,
+}
 
 
 class Curves(NamedTuple):
@@ -44,8 +56,9 @@ class Curves(NamedTuple):
 def curves(playback: Playback, most: int = MOST) -> Curves:
     """The residual of each model over time, in at most `most` points.
 
-    A log with more rows is drawn as its envelope: each stretch of rows by its least residual at its first row and its greatest at its last,
-    so that no peak is lost. Curves are interrupted where a run begins, unless there are so many that little else would be left.
+    A log with more rows is drawn as its envelope: each stretch of rows by its least residual at its first row
+    and its greatest at its last, so that no peak is lost. Curves are interrupted where a run begins, unless
+    there are so many that little else would be left.
     """
     if most < 20:
         raise InputError(f"most is {most!r}; a curve needs 20 points at least.")
@@ -59,15 +72,22 @@ def curves(playback: Playback, most: int = MOST) -> Curves:
         last = np.append(first[1:], n) - 1
     whole = len(first) == n
     gaps = np.searchsorted(first, cuts) * (1 if whole else 2)
-    time = playback.time[first] if whole else np.stack([playback.time[first], playback.time[last]], axis=1).ravel()
+    time = (
+        playback.time[first]
+        if whole
+        else np.stack([playback.time[first], playback.time[last]], axis=1).ravel()
+    )
     made = [_thin(1e3 * track.residual, first, whole) for track in playback.tracks]
     lines = [np.insert(line, gaps, np.nan) for line in made]
-    return Curves(np.insert(time, gaps, time[gaps] if len(gaps) else []), lines[0], lines[1] if len(lines) > 1 else None)
+    return Curves(
+        np.insert(time, gaps, time[gaps] if len(gaps) else []), lines[0], lines[1] if len(lines) > 1 else None
+    )
 
 
 def svg(playback: Playback) -> str:
-    """The residual of each model over time, about 900 x 180 px, as an SVG that stands inside a page: no reference leads out of it, and
-    its text is drawn as paths. What no fit saw is shaded. The same playback gives the same text."""
+    """The residual of each model over time, about 900 x 180 px, as an SVG that stands inside a page: no
+    reference leads out of it, and its text is drawn as paths. What no fit saw is shaded. The same playback
+    gives the same text."""
     import matplotlib as mpl
     from matplotlib.backends.backend_svg import FigureCanvasSVG  # no window, and no pyplot state to clean up
     from matplotlib.figure import Figure
@@ -79,20 +99,33 @@ def svg(playback: Playback) -> str:
         axes.patch.set_visible(False)
         shaded = _shade(axes, playback)
         shown = curves(playback, 2 * _BINS)
-        for track, line, colour in zip(playback.tracks, (shown.before, shown.after), (BEFORE, AFTER), strict=False):
+        for track, line, colour in zip(
+            playback.tracks, (shown.before, shown.after), (BEFORE, AFTER), strict=False
+        ):
             assert line is not None
             axes.plot(shown.time, line, color=colour, label=_name(track), zorder=3)
             axes.axhline(1e3 * track.rms, color=colour, lw=1.0, ls=(0, (4, 3)), zorder=2)
         if len(starts := _starts(playback)) <= _RUNS:
             for row in starts:
                 axes.axvline(playback.time[row], color=_LINE, lw=0.6, ls=":", zorder=1)
-        closed = ", runs one after the other" if len(starts) else ", long pauses left out" if len(playback.breaks) else ""
+        closed = (
+            ", runs one after the other"
+            if len(starts)
+            else ", long pauses left out"
+            if len(playback.breaks)
+            else ""
+        )
         axes.set(xlabel=f"time{closed} [s]", ylabel="tip error [mm]")
         axes.set_xlim(0.0, playback.duration or 1.0)
         axes.set_ylim(bottom=0.0)
         figure.legend(loc="outside upper right", ncols=3 if shaded else 2)
         file = io.StringIO()
-        figure.savefig(file, format="svg", transparent=True, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+        figure.savefig(
+            file,
+            format="svg",
+            transparent=True,
+            metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")),
+        )
     return _inline(file.getvalue())
 
 
@@ -101,7 +134,8 @@ def _name(track: Track) -> str:
 
 
 def _thin(values: Floats, first: Ints, whole: bool) -> Floats:
-    """The least and the greatest of each stretch that begins at `first`, in turn; nan where all of a stretch is."""
+    """The least and the greatest of each stretch that begins at `first`, in turn; nan where all of a stretch
+    is."""
     if whole:
         return values
     return np.stack([np.fmin.reduceat(values, first), np.fmax.reduceat(values, first)], axis=1).ravel()
@@ -117,7 +151,9 @@ def _shade(axes: Axes, playback: Playback) -> bool:
     stretches = _stretches(playback.tested) if playback.tested is not None else []
     for k, (start, end) in enumerate(stretches):
         label = "seen by no fit" if k == 0 else ""
-        axes.axvspan(playback.time[start], playback.time[end], color=_HELD, alpha=0.55, lw=0.0, zorder=0, label=label)
+        axes.axvspan(
+            playback.time[start], playback.time[end], color=_HELD, alpha=0.55, lw=0.0, zorder=0, label=label
+        )
     return bool(stretches)
 
 

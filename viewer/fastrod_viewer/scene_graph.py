@@ -1,4 +1,5 @@
-"""From states to what is seen: poses, sizes and colours of instances of a few unit meshes; nothing here knows a browser.
+"""From states to what is seen: poses, sizes and colours of instances of a few unit meshes; nothing here knows
+a browser.
 
 The one door of `picture`, `fittings`, `arrows`, `legend`, `options` and `shapes`.
 """
@@ -55,7 +56,8 @@ def grid_places(n: int, spacing: float) -> Floats:
 
 
 def bounds(rods: Rods, bodies: Sequence[Body] = (), poses: Floats | None = None) -> tuple[Floats, float]:
-    """Centre (3,) and radius [m] of a sphere around the robots and the bodies at `poses` (n, 7), floors and other large things left out:
+    """Centre (3,) and radius [m] of a sphere around the robots and the bodies at `poses` (n, 7), floors and
+    other large things left out:
     what a first look should show."""
     state = rods.state
     n = len(state.ok)

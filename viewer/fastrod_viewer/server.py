@@ -1,4 +1,5 @@
-"""The viser server: which port, which host. Light, so that a browser loads the page while the simulator is still being imported."""
+"""The viser server: which port, which host. Light, so that a browser loads the page while the simulator is
+still being imported."""
 
 from __future__ import annotations
 
@@ -27,8 +28,9 @@ def serve(host: str = "127.0.0.1", port: int | None = None) -> Served:
 
 @functools.cache
 def _push_from_any_thread() -> None:
-    """viser 1.1 wakes its senders from the thread that draws, while its own thread may be changing the queue of those who wait: once in
-    some hours of motion that raises in the middle of a picture. By then the message is in the buffer; only the waking is left to do."""
+    """viser 1.1 wakes its senders from the thread that draws, while its own thread may be changing the queue
+    of those who wait: once in some hours of motion that raises in the middle of a picture. By then the
+    message is in the buffer; only the waking is left to do."""
     from viser.infra._async_message_buffer import AsyncMessageBuffer
 
     plain: Any = AsyncMessageBuffer.push
@@ -46,16 +48,22 @@ def _push_from_any_thread() -> None:
 
 
 def free_port(host: str, port: int | None) -> int:
-    """`port` if it is free, or for None the first free one from 8080 on. Raises `InputError`, one sentence, where there is none."""
+    """`port` if it is free, or for None the first free one from 8080 on. Raises `InputError`, one sentence,
+    where there is none."""
     if port is not None and not 0 <= port < 65536:
         raise InputError(f"port is {port}; it must be between 1 and 65535, or 0 for any that is free.")
     for candidate in range(PORT, PORT + _TRIES) if port is None else [port]:
         if _free(host, candidate):
             return candidate
     if port is None:
-        raise InputError(f"ports {PORT} to {PORT + _TRIES - 1} are all in use on {host}; name a free one with --port.")
+        raise InputError(
+            f"ports {PORT} to {PORT + _TRIES - 1} are all in use on {host}; name a free one with --port."
+        )
     other = next((p for p in range(port + 1, min(port + 1 + _TRIES, 65536)) if _free(host, p)), None)
-    raise InputError(f"port {port} is in use on {host}; " + (f"{other} is free: --port {other}." if other else "name another with --port."))
+    raise InputError(
+        f"port {port} is in use on {host}; "
+        + (f"{other} is free: --port {other}." if other else "name another with --port.")
+    )
 
 
 def _free(host: str, port: int) -> bool:
@@ -63,7 +71,8 @@ def _free(host: str, port: int) -> bool:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
     except OSError as error:
         raise InputError(
-            f"host {host!r} is not an address of this machine; 127.0.0.1 is, and 0.0.0.0 stands for all of its addresses."
+            f"host {host!r} is not an address of this machine; 127.0.0.1 is, and 0.0.0.0 stands for all of "
+            "its addresses."
         ) from error
     with socket.socket(family, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -72,7 +81,8 @@ def _free(host: str, port: int) -> bool:
         except OSError as error:
             if error.errno == errno.EADDRNOTAVAIL:
                 raise InputError(
-                    f"host {host!r} is not an address of this machine; 127.0.0.1 is, and 0.0.0.0 stands for all of its addresses."
+                    f"host {host!r} is not an address of this machine; 127.0.0.1 is, and 0.0.0.0 stands for "
+                    "all of its addresses."
                 ) from error
             return False
     return True

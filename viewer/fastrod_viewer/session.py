@@ -30,7 +30,9 @@ _SAID = 4.0  # s for which a problem stays on the page
 _QUICKEST = 0.008  # s between two pictures, when hands are quick
 _SPREAD = 1.25  # of a step, over which a robot spreads it: the next one may come late
 _RELEASED = 3.0  # s in which a robot must be ready after a release, or stays stopped
-_HASTY = 1.0  # s after a stop in which a real robot is not released: that was a click too many, or one meant for something else
+# s after a stop in which a real robot is not released: that was a click too many, or one meant for something
+# else
+_HASTY = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +45,8 @@ class Frame:
     measured: Measurement | None
     """Of a robot that is not the world itself."""
     latency: float
-    """From the oldest input that this picture answers to the end of its computation [s]; nan where there was none."""
+    """From the oldest input that this picture answers to the end of its computation [s]; nan where there was
+    none."""
     pace: float
     """Seconds of the world in a second, lately; 1 while nothing moves."""
     problem: str
@@ -52,15 +55,23 @@ class Frame:
 
 @final
 class Session:
-    """Advances a world and hands a `Frame` to `draw` when something has changed. Every method may be called from any thread.
+    """Advances a world and hands a `Frame` to `draw` when something has changed. Every method may be called
+    from any thread.
 
-    With a `link`, hands drive that robot, the world is its model and gets the same commands, and `Frame.measured` is what the robot
-    says. A real robot stops when `nobody` watches. Where it has stopped, by whatever it was, the session is stopped too, and the model
-    stands as the robot's encoders say, until `release`.
+    With a `link`, hands drive that robot, the world is its model and gets the same commands, and
+    `Frame.measured` is what the robot says. A real robot stops when `nobody` watches. Where it has stopped,
+    by whatever it was, the session is stopped too, and the model stands as the robot's encoders say, until
+    `release`.
     """
 
     def __init__(
-        self, world: World, pilot: Pilot, *, draw: Callable[[Frame], None], link: RobotLink | None = None, script: bool = False
+        self,
+        world: World,
+        pilot: Pilot,
+        *,
+        draw: Callable[[Frame], None],
+        link: RobotLink | None = None,
+        script: bool = False,
     ) -> None:
         self.world, self.pilot, self.link = world, pilot, link
         self.far = None if link is None else Linked(link)
@@ -130,12 +141,14 @@ class Session:
 
     @property
     def releasing(self) -> bool:
-        """A release was asked for, and the robot at the other end of the link has not said yet that it is ready."""
+        """A release was asked for, and the robot at the other end of the link has not said yet that it is
+        ready."""
         return self._stopped and time.perf_counter() - self._released < _RELEASED
 
     @property
     def hasty(self) -> bool:
-        """The last release came so soon after a stop that it was ignored; True for some seconds, while it is stopped."""
+        """The last release came so soon after a stop that it was ignored; True for some seconds, while it is
+        stopped."""
         return self._stopped and not self.releasing and time.perf_counter() - self._hasty < _SAID
 
     def touch(self) -> None:
@@ -155,7 +168,8 @@ class Session:
         self.touch()
 
     def stop(self) -> None:
-        """Everything stands still, at once; commands wait for `release`. While stopped it is a stop again, and ends a release under way."""
+        """Everything stands still, at once; commands wait for `release`. While stopped it is a stop again,
+        and ends a release under way."""
         self._halt(nobody=False)
 
     def _halt(self, *, nobody: bool) -> None:
@@ -167,8 +181,9 @@ class Session:
         self.touch()
 
     def release(self) -> None:
-        """Take commands again, from where the robot stands. A linked robot may take a while until it is ready, or refuse. Ignored while
-        nothing is stopped or a release is under way, and, where the robot is real, within a second of the last stop.
+        """Take commands again, from where the robot stands. A linked robot may take a while until it is
+        ready, or refuse. Ignored while nothing is stopped or a release is under way, and, where the robot is
+        real, within a second of the last stop.
         """
         with self._gate:  # a stop that is pressed meanwhile comes after it
             now = time.perf_counter()
@@ -198,7 +213,8 @@ class Session:
         self.touch()
 
     def reset(self) -> None:
-        """World and controls back to the beginning; a robot at the other end of a link goes there, straight, no faster than it may."""
+        """World and controls back to the beginning; a robot at the other end of a link goes there, straight,
+        no faster than it may."""
 
         def job() -> None:
             if self.link is not None:
@@ -244,7 +260,11 @@ class Session:
                 since, self._since = self._since, None
                 did = self._do_jobs()
                 moves = self._moves()
-                due = self._advance(max(due, began - _BEHIND), began, at_once=since is not None) if moves else began
+                due = (
+                    self._advance(max(due, began - _BEHIND), began, at_once=since is not None)
+                    if moves
+                    else began
+                )
                 if (moves or did or since is not None) and not self._closed.is_set():
                     self._show(since)
                 left = 1.0 / RATE - (time.perf_counter() - began)
@@ -278,14 +298,21 @@ class Session:
             return True
         if self._stopped or (self._paused and not self._steps):
             return False
-        if self._steps or self._scripted or self.world.host or self.world.robot.effects or self.recorder is not None:
+        if (
+            self._steps
+            or self._scripted
+            or self.world.host
+            or self.world.robot.effects
+            or self.recorder is not None
+        ):
             return True
         return not self.pilot.arrived or time.perf_counter() - self._asked < _REST / RATE
 
     def _advance(self, due: float, began: float, *, at_once: bool) -> float:
         """Steps of the world up to now, one at least where hands wait for it; when the next one is due."""
         if self.far is not None:
-            self._try(min(max(began - self._moved, _QUICKEST), 1.0 / RATE))  # late, it is slower: nothing is made up for
+            # late, it is slower: nothing is made up for
+            self._try(min(max(began - self._moved, _QUICKEST), 1.0 / RATE))
             self._moved, self._steps = began, 0
             return began
         dt = self.world.dt
@@ -304,7 +331,8 @@ class Session:
         return due
 
     def _try(self, dt: float) -> bool:
-        """One step; whether it could be done. Otherwise the problem is kept, and hands are where they were before."""
+        """One step; whether it could be done. Otherwise the problem is kept, and hands are where they were
+        before."""
         try:
             self._one(dt)
         except FastrodError as error:
@@ -339,7 +367,9 @@ class Session:
             still = self._hand if self._paused and not self._stopped else None
             hand = self.pilot.step(dt) if still is None else still
             if not self._stopped:
-                self.far.command(hand.tendon_length - self.world.robot.rest_tendon_length, hand.extension, _SPREAD * dt)
+                self.far.command(
+                    hand.tendon_length - self.world.robot.rest_tendon_length, hand.extension, _SPREAD * dt
+                )
             self._hand = hand
             self.world.drive(hand)
         if time.perf_counter() - self._said > _SAID:
@@ -350,8 +380,8 @@ class Session:
             self._record(self.recorder)
 
     def record(self, path: Path) -> None:
-        """Record to `path` from now on; in the session's thread. A link that can fills the log by itself, reading by reading.
-        Raises `InputError`."""
+        """Record to `path` from now on; in the session's thread. A link that can fills the log by itself,
+        reading by reading. Raises `InputError`."""
         if self.far is not None:
             self.recorder, self._fed = self.far.recorder(path)
             return
@@ -378,7 +408,9 @@ class Session:
             return
         rotation = self.world.rods[0].state.rotation[0, 0]
         change = hand.tendon_length - self.world.robot.rest_tendon_length
-        recorder.add(measurement, tip_force=rotation.T @ hand.tip_force, payload=hand.payload, commanded_dl=change)
+        recorder.add(
+            measurement, tip_force=rotation.T @ hand.tip_force, payload=hand.payload, commanded_dl=change
+        )
 
     def _show(self, since: float | None) -> None:
         measured = None if self.link is None else self.link.read()
@@ -391,7 +423,8 @@ class Session:
         if self.link is not None:
             self.link.stop()  # before a long log is written
         try:
-            with contextlib.suppress(InputError):  # no reading, or no room: nobody is left to be told, and rows are in PATH.part
+            # no reading, or no room: nobody is left to be told, and rows are in PATH.part
+            with contextlib.suppress(InputError):
                 self.end_recording()
         finally:
             if self.link is not None:

@@ -59,11 +59,14 @@ def ball(position: Floats, radius: float, color: Color) -> Instances:
     centre = np.asarray(position, dtype=np.float64).reshape(-1, 3)
     there = np.isfinite(centre).all(1, keepdims=True)
     turn = np.broadcast_to([1.0, 0.0, 0.0, 0.0], (len(centre), 4))
-    return instances("ball", np.where(there, centre, 0.0), turn, np.where(there, np.full(centre.shape, radius), 0.0), color)
+    return instances(
+        "ball", np.where(there, centre, 0.0), turn, np.where(there, np.full(centre.shape, radius), 0.0), color
+    )
 
 
 def _lathe(profile: list[tuple[float, float]], n_sides: int) -> Mesh:
-    """The surface that a profile of (radius, z), from the lower end up, sweeps around z; a radius of 0 closes it in a point."""
+    """The surface that a profile of (radius, z), from the lower end up, sweeps around z; a radius of 0 closes
+    it in a point."""
     angle = np.linspace(0.0, 2.0 * np.pi, n_sides, endpoint=False)
     around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     vertices: list[Floats] = []
@@ -100,5 +103,6 @@ SHAPES: Mapping[str, Mesh] = MappingProxyType(
         "cap": _lathe(_arc(0.0, np.pi / 2, 8), 24),
     }
 )
-"""Of radius 1 around z. `tube` and `wire`: open, from z = -1/2 to 1/2; `bar` and `disc`: the same, closed, `disc` with a slight
-bevel; `ball`; `cone`: closed, base at z = 0, apex at z = 1; `cap`: the half of a ball above z = 0, open below."""
+"""Of radius 1 around z. `tube` and `wire`: open, from z = -1/2 to 1/2; `bar` and `disc`: the same, closed,
+`disc` with a slight bevel; `ball`; `cone`: closed, base at z = 0, apex at z = 1; `cap`: the half of a ball
+above z = 0, open below."""

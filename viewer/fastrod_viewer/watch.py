@@ -17,13 +17,20 @@ _KEY = "fastrod-echo"
 
 @final
 class Watch:
-    """Asks every page for an answer every second, and tells who came and went, `lost(client, clients left)` for the latter.
+    """Asks every page for an answer every second, and tells who came and went, `lost(client, clients left)`
+    for the latter.
 
     A page that does not answer within three seconds counts as gone until it answers again. Each is asked in a
     thread of its own, so that those which do not answer hide no other.
     """
 
-    def __init__(self, server: viser.ViserServer, *, lost: Callable[[int, int], None], tick: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        *,
+        lost: Callable[[int, int], None],
+        tick: Callable[[], None] = lambda: None,
+    ) -> None:
         """`tick` is called every second."""
         self.server = server
         self._lost, self._tick = lost, tick

@@ -116,7 +116,8 @@ class World(ABC):
 
     @abstractmethod
     def drive(self, hand: Hand) -> None:
-        """One step by hand. Raises `FastrodError` where it cannot be done; the world is then as after its last good step, or reset."""
+        """One step by hand. Raises `FastrodError` where it cannot be done; the world is then as after its
+        last good step, or reset."""
 
     @abstractmethod
     def reset(self) -> None:
@@ -124,8 +125,9 @@ class World(ABC):
 
     @abstractmethod
     def jacobian(self) -> Floats:
-        """(3, n_joints + n_actions) d(tip position, world [m]) / d(joints of the host, action) at the last state; n_joints is 0 where no
-        host can be moved by a drag. Raises `FastrodError` where there is none."""
+        """(3, n_joints + n_actions) d(tip position, world [m]) / d(joints of the host, action) at the last
+        state; n_joints is 0 where no host can be moved by a drag. Raises `FastrodError` where there is
+        none."""
 
     def picture(self) -> NDArray[np.uint8] | None:
         """(height, width, 3) what a camera in hand sees now, where there is one."""

@@ -1,4 +1,5 @@
-"""Worlds without a rigid host: `FreeWorld`, robots in empty space, and `SceneWorld`, a scene of rods and obstacles."""
+"""Worlds without a rigid host: `FreeWorld`, robots in empty space, and `SceneWorld`, a scene of rods and
+obstacles."""
 
 from __future__ import annotations
 
@@ -39,8 +40,9 @@ _COLORS = ((146, 154, 166), (176, 146, 110), (120, 150, 132), (160, 128, 146))
 class SimulatedWorld(World):
     """What worlds of one simulator, without a host, have in common.
 
-    A step that is not ok is settled; where that fails too, the simulator is as before the step. Where contact is in the way the robots
-    stand as far as they came, and go on from there. Either way an `InputError` says why.
+    A step that is not ok is settled; where that fails too, the simulator is as before the step. Where contact
+    is in the way the robots stand as far as they came, and go on from there. Either way an `InputError` says
+    why.
     """
 
     by_hand = True
@@ -65,7 +67,9 @@ class SimulatedWorld(World):
         self._start = simulator.snapshot()
         self._one: Simulator | None = None
         if simulator.n_robots > 1 and contact is None and not self.robot.effects:
-            self._one = Simulator(self.robot, 1, self.dt, (simulator.n_points - 1) // self.robot.n_segments, threads=1)
+            self._one = Simulator(
+                self.robot, 1, self.dt, (simulator.n_points - 1) // self.robot.n_segments, threads=1
+            )
         self._given: dict[str, Any] = {}
         self._clock = self._t = 0.0
 
@@ -94,19 +98,21 @@ class SimulatedWorld(World):
 
     @final
     def play(self) -> None:
-        """One step of the script, or from its end back to its beginning. Raises `InputError`; the script has then gone on all the same."""
+        """One step of the script, or from its end back to its beginning. Raises `InputError`; the script has
+        then gone on all the same."""
         clock = self._clock + self.dt
         if clock > self.duration + 1e-9 and not self.endless:
             self.reset()
             return
-        self._clock = clock % self.duration if self.endless else clock  # beyond a step that fails the script goes on
+        # beyond a step that fails the script goes on
+        self._clock = clock % self.duration if self.endless else clock
         self._advance(self.inputs(self._clock), part_way=True)
 
     @final
     def drive(self, hand: Hand) -> None:
-        """One step by hand. What the hand does not tell, obstacles and the base's own way among it, stays as the script has it now.
-        Among obstacles, robots that the script has bent in ways of their own are moved by what the first one is: no robot could jump to
-        another's bends there."""
+        """One step by hand. What the hand does not tell, obstacles and the base's own way among it, stays as
+        the script has it now. Among obstacles, robots that the script has bent in ways of their own are moved
+        by what the first one is: no robot could jump to another's bends there."""
         held = self.held(self._clock)
         given = held | wires(self.robot, hand)
         if self._touches and np.ndim(own := held.get("tendon_length", 0.0)) == 2:
@@ -117,9 +123,12 @@ class SimulatedWorld(World):
 
     @final
     def jacobian(self) -> Floats:
-        """(3, n_actions) of the first robot. Raises `InputError` where it is not driven by tendon lengths, or is not ok."""
+        """(3, n_actions) of the first robot. Raises `InputError` where it is not driven by tendon lengths, or
+        is not ok."""
         if self.actions is None:
-            raise InputError(f"robot {self.robot.name!r} is not driven by tendon lengths, so no drag can move its tip.")
+            raise InputError(
+                f"robot {self.robot.name!r} is not driven by tendon lengths, so no drag can move its tip."
+            )
         simulator, state = self.simulator, self._state
         if self._one is not None:  # of many alike the first alone: a fraction of the time of all
             simulator, state = self._one, self._one.settle(**_first(self._given))
@@ -142,8 +151,8 @@ class SimulatedWorld(World):
 
     @final
     def _advance(self, given: dict[str, Any], *, part_way: bool = False) -> None:
-        """Simulate these inputs; a step that cannot be done is as if it had not been, or with `part_way`, among obstacles, done as far as
-        it could be: a script goes on from there."""
+        """Simulate these inputs; a step that cannot be done is as if it had not been, or with `part_way`,
+        among obstacles, done as far as it could be: a script goes on from there."""
         before = self.simulator.snapshot()
         state = self.simulator.step(**given)
         if not state.ok.all() and not self._touches:
@@ -167,7 +176,9 @@ class FreeWorld(SimulatedWorld):
     endless = True
     duration = PERIOD
 
-    def __init__(self, robot: Robot, n_robots: int = 1, dt: float = 1.0 / 30.0, *, points_per_segment: int = 6) -> None:
+    def __init__(
+        self, robot: Robot, n_robots: int = 1, dt: float = 1.0 / 30.0, *, points_per_segment: int = 6
+    ) -> None:
         """As for `Simulator`. Raises `InputError`, `RobotError`."""
         simulator = Simulator(robot, n_robots, dt, points_per_segment, threads=1 if n_robots == 1 else None)
         super().__init__(simulator, None, grid_places(n_robots, _APART * robot.length))
@@ -197,8 +208,8 @@ class FreeWorld(SimulatedWorld):
 
 @final
 class SceneWorld(SimulatedWorld):
-    """A scene of rods and obstacles. Robots of separate worlds are drawn in one: obstacles that all of them have stand there once, each
-    where it is for the first robot."""
+    """A scene of rods and obstacles. Robots of separate worlds are drawn in one: obstacles that all of them
+    have stand there once, each where it is for the first robot."""
 
     endless = False
 
@@ -220,7 +231,11 @@ class SceneWorld(SimulatedWorld):
 
     def held(self, t: float) -> dict[str, Any]:
         """Obstacles, bases and loads, but no speed: the obstacles stand still."""
-        return {name: value for name, value in self.inputs(t).items() if name not in ("obstacle_velocity", "tension")}
+        return {
+            name: value
+            for name, value in self.inputs(t).items()
+            if name not in ("obstacle_velocity", "tension")
+        }
 
     def arrived(self, given: dict[str, Any]) -> None:
         """The obstacles are where they were told to be."""
@@ -246,7 +261,8 @@ class Loads:
     def __init__(self, robot: Robot) -> None:
         self._gravity = np.array(robot.gravity)
         density = np.array([segment.line_density for segment in robot.segments])
-        self._weight: Floats = np.repeat((density[:, None] * self._gravity)[:, None], 2, axis=1)  # (n_segments, 2, 3) [N/m]
+        # (n_segments, 2, 3) [N/m]
+        self._weight: Floats = np.repeat((density[:, None] * self._gravity)[:, None], 2, axis=1)
 
     def added(self, given: dict[str, Any], hand: Hand) -> dict[str, Any]:
         """`given` with these loads on top of its own, as `Simulator.step` takes them."""
@@ -284,20 +300,26 @@ def wires(robot: Robot, hand: Hand) -> dict[str, Any]:
 
 
 def moved(pose: Floats, base: Floats) -> Floats:
-    """Poses (..., 7) displaced and turned, each about its own origin, by `base` (6,) as in `Hand`. Raises `InputError`."""
+    """Poses (..., 7) displaced and turned, each about its own origin, by `base` (6,) as in `Hand`. Raises
+    `InputError`."""
     by = np.asarray(base, dtype=np.float64)
     if by.shape != (6,) or not np.isfinite(by).all():
-        raise InputError(f"Hand.base is {base!r}; give six finite numbers, displacement [m] and rotation vector [rad], world.")
+        raise InputError(
+            f"Hand.base is {base!r}; give six finite numbers, displacement [m] and rotation "
+            "vector [rad], world."
+        )
     turn = np.broadcast_to(quaternion_from_vector(by[3:]), pose[..., 3:].shape)
     return np.concatenate([pose[..., :3] + by[:3], product(turn, pose[..., 3:])], axis=-1)
 
 
 def sway(robot: Robot, actions: SegmentActions | None, angle: float) -> dict[str, Any]:
-    """Inputs that show what a robot can do, of period 2 pi in `angle` [rad]; it is straight at 0, and segments follow one another as a
-    wave."""
+    """Inputs that show what a robot can do, of period 2 pi in `angle` [rad]; it is straight at 0, and
+    segments follow one another as a wave."""
     if not robot.n_tendons:
         stiffness = float(np.mean([segment.bending_stiffness for segment in robot.segments]))
-        side = np.array([math.sin(angle), math.sin(2.0 * angle), 0.0]) * 2.0 * PUSH * stiffness / robot.length**2
+        side = (
+            np.array([math.sin(angle), math.sin(2.0 * angle), 0.0]) * 2.0 * PUSH * stiffness / robot.length**2
+        )
         return {"tip_force": matrix_from_quaternion(np.array([robot.base_quaternion]))[0] @ side}
     n = robot.n_segments
     behind = (math.pi / 3.0) * np.arange(n) / n
@@ -307,7 +329,11 @@ def sway(robot: Robot, actions: SegmentActions | None, angle: float) -> dict[str
     low, high = np.array([segment.extension for segment in robot.segments]).T
     extension = 0.3 * np.where(high > 0.0, high, low) * (1.0 - math.cos(angle))
     if actions is not None:
-        return dict(actions.inputs(np.concatenate([extension[:, None], actions.offset[:, None] * bends], axis=1).ravel()))
+        return dict(
+            actions.inputs(
+                np.concatenate([extension[:, None], actions.offset[:, None] * bends], axis=1).ravel()
+            )
+        )
     given: dict[str, Any] = {"extension": extension}
     longer = np.cumsum(extension)[robot.tendon_segment]
     shorter, tension = np.zeros(robot.n_tendons), np.zeros(robot.n_tendons)
@@ -316,7 +342,12 @@ def sway(robot: Robot, actions: SegmentActions | None, angle: float) -> dict[str
         shorter[i] = (places * bends[: k + 1]).sum()
         segment = robot.segments[k]
         toward = places[-1] / np.linalg.norm(places[-1])
-        most = SWAY / n * float(np.mean(segment.bending_stiffness)) / (segment.length * np.linalg.norm(places[-1]))
+        most = (
+            SWAY
+            / n
+            * float(np.mean(segment.bending_stiffness))
+            / (segment.length * np.linalg.norm(places[-1]))
+        )
         tension[i] = 0.5 * most * (1.0 + toward @ bends[k] * n / SWAY)
     modes = {segment.mode for segment in robot.segments}
     if modes & {"tendon_length", "paper"}:
@@ -346,4 +377,6 @@ def _body(obstacle: Obstacle, color: tuple[int, int, int], robot: Robot) -> Body
         turn = matrix_from_quaternion(np.array([obstacle.quaternion]))[0]
         vertices = _SQUARE * robot.length * vertices + ((middle - obstacle.position) @ turn) * [1.0, 1.0, 0.0]
     opacity = _GLASS if obstacle.shape in ("plane", "mesh") else 1.0
-    return Body(obstacle.name, vertices.astype(np.float32), np.asarray(drawn.faces).astype(np.uint32), color, opacity)
+    return Body(
+        obstacle.name, vertices.astype(np.float32), np.asarray(drawn.faces).astype(np.uint32), color, opacity
+    )

@@ -15,9 +15,9 @@ from fastrod.types import Floats
 class AxialCompression(Static):
     """The backbone shortens under the pull of its wires.
 
-    Equation: l_k -> l_k (1 - e |theta_k|) + p c_k, with c_k what the wires of segment k pull in common, and p the body's share of it
-    Source: v_z = 1 - sum T / EA, Rucker and Webster 2011, with T from wires that pull only
-    Residual signature: along the tangent of the tip, even in the bend; in proportion to common pull
+    Equation: l_k -> l_k (1 - e |theta_k|) + p c_k, with c_k what the wires of segment k pull in common, and p
+    the body's share of it Source: v_z = 1 - sum T / EA, Rucker and Webster 2011, with T from wires that pull
+    only Residual signature: along the tangent of the tip, even in the bend; in proportion to common pull
     """
 
     seam = Seam.ACTUATION
@@ -30,11 +30,12 @@ class AxialCompression(Static):
     confounded_with = ("marker_offset", "stiffening")
     synonyms = ("backbone_compression",)
 
-    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         wiring = ports.wiring
         n = wiring.n_segments
         bend = np.linalg.norm(ports.bend(), axis=-1)
         pulled = -wiring.length * values[:, :n] * bend
         ports.extension += pulled + values[:, n:] * ports.common()
-        # The wires follow what the bend takes from the body; of a common pull they keep what the body does not follow.
+        # The wires follow what the bend takes from the body; of a common pull they keep what the body does
+        # not follow.
         ports.tendon_length += np.cumsum(pulled, axis=1)[:, wiring.tendon_segment]

@@ -14,15 +14,24 @@ from fastrod.types import Floats
 class Backlash(Operator):
     """Play of gears and of wires in their holes.
 
-    Equation: p = max(l - w, min(l + w, p)); rounded corners are the mean over half widths w (1 - c), w, w (1 + c)
-    Source: play operator (Visintin 1994); backlash of wire drives (Palli and Melchiorri)
-    Residual signature: flat spot after every reversal, as wide at small as at large bends, the same at every speed
+    Equation: p = max(l - w, min(l + w, p)); rounded corners are the mean over half widths w (1 - c), w, w (1
+    + c) Source: play operator (Visintin 1994); backlash of wire drives (Palli and Melchiorri)
+    Residual signature: flat spot after every reversal, as wide at small as at large bends, the same at every
+    speed
     """
 
     seam = Seam.ACTUATION
     order = 30.0
     parameters = (
-        Parameter("half_width", "m", bounds=(0.0, 0.6), typical=0.03, starts=(0.012, 0.04), per="segment", of="reach"),
+        Parameter(
+            "half_width",
+            "m",
+            bounds=(0.0, 0.6),
+            typical=0.03,
+            starts=(0.012, 0.04),
+            per="segment",
+            of="reach",
+        ),
         Parameter("rounding", "", bounds=(0.0, 0.4), typical=0.15, starts=(0.15,), shape=True),
     )
     excited_by = "slow reversals of many sizes"
@@ -32,7 +41,7 @@ class Backlash(Operator):
     def memory(self, n_robots: int, n_tendons: int) -> Floats:
         return np.full((n_robots, 3 * n_tendons), np.nan)
 
-    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Wiring) -> Floats:  # noqa: ARG002
+    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Wiring) -> Floats:
         out = dl.copy()
         play(out, memory, wiring.by_end(values[:, :-1]), np.repeat(values[:, -1:], wiring.n_tendons, axis=1))
         return out

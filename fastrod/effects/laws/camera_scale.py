@@ -24,6 +24,6 @@ class CameraScale(Static):
     excited_by = "the whole workspace; a known distance"
     confounded_with = ("axial_compression", "marker_offset")
 
-    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         ports.tip_position += values * ports.tip_position
         ports.points += values[:, None] * ports.points

@@ -25,5 +25,5 @@ class CompressionSoftening(Static):
     confounded_with = ("axial_compression", "stiffening")
     synonyms = ("pull_dependent_gain",)
 
-    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         ports.shift_bend(-values[:, :, None] * ports.common()[..., None] * ports.bend())

@@ -30,7 +30,7 @@ class Coupling(Static):
     confounded_with = ("encoder_offset",)
     synonyms = ("inter_segment_coupling",)
 
-    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         if ports.wiring.n_segments < 2:
             return
         bend = ports.bend()

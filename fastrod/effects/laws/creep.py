@@ -23,7 +23,15 @@ class Creep(Operator):
     order = 55.0
     parameters = (
         Parameter("share", "", bounds=(0.0, 1.0), typical=0.08, starts=(0.08,)),
-        Parameter("time_constant", "s", neutral=5.0, bounds=(0.05, 300.0), typical=5.0, starts=(0.5, 3.0, 15.0, 60.0), shape=True),
+        Parameter(
+            "time_constant",
+            "s",
+            neutral=5.0,
+            bounds=(0.05, 300.0),
+            typical=5.0,
+            starts=(0.5, 3.0, 15.0, 60.0),
+            shape=True,
+        ),
     )
     excited_by = "steps and holds of several time constants, the same path at two speeds"
     confounded_with = ("friction", "time_drift", "dynamics")

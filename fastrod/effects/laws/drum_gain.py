@@ -25,6 +25,6 @@ class DrumGain(Static):
     confounded_with = ("tendon_stretch", "stiffness_taper", "stiffening")
     synonyms = ("spool_radius", "actuation_gain")
 
-    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         gain = ports.wiring.by_tendon(values)
         ports.shift_wires(gain * ports.dl)

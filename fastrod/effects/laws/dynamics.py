@@ -23,7 +23,9 @@ class Dynamics(Operator):
     order = 70.0
     parameters = (
         Parameter("period", "s", bounds=(0.0, 1.0), typical=0.08, starts=(0.03, 0.08, 0.16)),
-        Parameter("damping", "", neutral=0.3, bounds=(0.02, 0.98), typical=0.3, starts=(0.1, 0.6), shape=True),
+        Parameter(
+            "damping", "", neutral=0.3, bounds=(0.02, 0.98), typical=0.3, starts=(0.1, 0.6), shape=True
+        ),
     )
     excited_by = "steps and fast reversals, sampled at ten times the frequency"
     confounded_with = ("latency", "creep")

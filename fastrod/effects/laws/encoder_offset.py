@@ -25,5 +25,5 @@ class EncoderOffset(Static):
     confounded_with = ("precurvature", "frame_misalignment", "marker_offset")
     synonyms = ("zero_offset", "motor_zero")
 
-    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         ports.shift_wires(ports.wiring.by_tendon(values) * ports.wiring.drive_sign)

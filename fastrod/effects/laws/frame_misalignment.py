@@ -38,7 +38,7 @@ class FrameMisalignment(Static):
     confounded_with = ("precurvature", "encoder_offset", "gravity")
     synonyms = ("registration",)
 
-    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         turn = _turn(values[:, :3])
         ports.tip_position[:] = np.einsum("nij,nj->ni", turn, ports.tip_position) + values[:, 3:]
         ports.tip_rotation[:] = turn @ ports.tip_rotation
@@ -48,4 +48,6 @@ class FrameMisalignment(Static):
 def _turn(vector: Floats) -> Floats:
     """(n, 3, 3) rotation by a rotation vector (n, 3) [rad]."""
     half = 0.5 * np.linalg.norm(vector, axis=1)
-    return matrix_from_quaternion(np.column_stack([np.cos(half), 0.5 * np.sinc(half / np.pi)[:, None] * vector]))
+    return matrix_from_quaternion(
+        np.column_stack([np.cos(half), 0.5 * np.sinc(half / np.pi)[:, None] * vector])
+    )

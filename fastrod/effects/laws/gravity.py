@@ -15,15 +15,18 @@ class Gravity(Static):
 
     Equation: f(s) += rho g, world frame
     Source: Rucker and Webster 2011, distributed load of the rod equations
-    Residual signature: fixed to gravity: turns against the base; an S, which moves the tip and hardly turns it
+    Residual signature: fixed to gravity: turns against the base; an S, which moves the tip and hardly turns
+    it
     """
 
     seam = Seam.LOAD
     order = 10.0
-    parameters = (Parameter("line_density", "kg/m", bounds=(0.0, 20.0), typical=0.3, starts=(0.2,), per="segment"),)
+    parameters = (
+        Parameter("line_density", "kg/m", bounds=(0.0, 20.0), typical=0.3, starts=(0.2,), per="segment"),
+    )
     excited_by = "two base orientations"
     confounded_with = ("payload", "precurvature", "frame_misalignment", "tip_force")
     synonyms = ("self_weight", "sag")
 
-    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         ports.add_line_force(values[:, :, None] * ports.gravity[:, None, :])

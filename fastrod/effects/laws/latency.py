@@ -15,8 +15,9 @@ class Latency(Operator):
     """Delay between command and measured tip, of the drives, the bus and the camera together.
 
     Equation: l(t) = l_cmd(t - d), a cubic between samples; d is cut to the last 128 samples
-    Source: transport delay; sensor delay as a parameter, as in MATLAB System Identification (delay of a process model)
-    Residual signature: along the velocity of the predicted tip and in proportion to it, zero at rest
+    Source: transport delay; sensor delay as a parameter, as in MATLAB System Identification (delay of a
+    process model) Residual signature: along the velocity of the predicted tip and in proportion to it, zero
+    at rest
     """
 
     seam = Seam.ACTUATION
@@ -29,7 +30,7 @@ class Latency(Operator):
     def memory(self, n_robots: int, n_tendons: int) -> Floats:
         return np.full((n_robots, 1 + BUFFER * (1 + n_tendons)), np.nan)
 
-    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Wiring) -> Floats:  # noqa: ARG002
+    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Wiring) -> Floats:
         out = dl.copy()
         delay(out, memory, np.ascontiguousarray(values[:, 0]), dt)
         return out

@@ -25,7 +25,9 @@ class Lens(Static):
     confounded_with = ("stiffening", "axial_compression")
     synonyms = ("lens_distortion",)
 
-    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         square = (ports.wiring.length.sum()) ** 2
         for place in (ports.tip_position[:, None], ports.points):
-            place[..., :2] += values[:, :, None] * (place[..., :2] ** 2).sum(-1, keepdims=True) / square * place[..., :2]
+            place[..., :2] += (
+                values[:, :, None] * (place[..., :2] ** 2).sum(-1, keepdims=True) / square * place[..., :2]
+            )

@@ -30,5 +30,5 @@ class MarkerOffset(Static):
     excited_by = "wide bends with tip orientation"
     confounded_with = ("axial_compression", "stiffness_taper", "precurvature")
 
-    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         ports.tip_position += np.einsum("nij,nj->ni", ports.tip_rotation, values)

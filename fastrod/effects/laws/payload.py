@@ -25,5 +25,5 @@ class Payload(Static):
     confounded_with = ("gravity", "tip_force")
     synonyms = ("tip_mass",)
 
-    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         ports.tip_force += values * ports.gravity

@@ -23,7 +23,15 @@ class PlasticSet(Operator):
     order = 60.0
     parameters = (
         Parameter("share", "", bounds=(-0.5, 1.0), typical=0.08, starts=(0.08,)),
-        Parameter("yield_at", "rad", neutral=0.7, bounds=(0.1, 2.0), typical=0.7, starts=(0.45, 0.65, 0.85), shape=True),
+        Parameter(
+            "yield_at",
+            "rad",
+            neutral=0.7,
+            bounds=(0.1, 2.0),
+            typical=0.7,
+            starts=(0.45, 0.65, 0.85),
+            shape=True,
+        ),
     )
     excited_by = "growing amplitudes with a return to zero after each"
     confounded_with = ("friction", "time_drift")
@@ -32,9 +40,10 @@ class PlasticSet(Operator):
     def memory(self, n_robots: int, n_tendons: int) -> Floats:
         return np.full((n_robots, 2 * n_tendons), np.nan)
 
-    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Wiring) -> Floats:  # noqa: ARG002
+    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Wiring) -> Floats:
         change = wiring.bend(dl)
-        driven = np.unique(wiring.tendon_segment)  # where no wire ends nothing is commanded, and `memory` has no room
+        # where no wire ends nothing is commanded, and `memory` has no room
+        driven = np.unique(wiring.tendon_segment)
         bend = np.ascontiguousarray(change[:, :, driven])
         share, at = (np.repeat(values[:, k : k + 1], len(driven), axis=1) for k in (0, 1))
         yielding(bend, memory, share, at)

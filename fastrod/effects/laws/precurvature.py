@@ -13,8 +13,8 @@ from fastrod.types import Floats
 class Precurvature(Static):
     """The body is not straight without moments.
 
-    Equation: u*(s) -> u*(s) + b (1 - 2 s / l) + u_0: a bow, which stiff wires do not straighten, and a uniform part, which they do
-    Source: paper eq. 1c, m = K (u - u*)
+    Equation: u*(s) -> u*(s) + b (1 - 2 s / l) + u_0: a bow, which stiff wires do not straighten, and a
+    uniform part, which they do Source: paper eq. 1c, m = K (u - u*)
     Residual signature: constant in the body frame: the tip moves and does not turn
     """
 
@@ -30,9 +30,11 @@ class Precurvature(Static):
     confounded_with = ("frame_misalignment", "encoder_offset", "marker_offset")
     synonyms = ("pre_curvature", "initial_curvature")
 
-    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         n = ports.wiring.n_segments
         ports.resolve()
         for axis in (0, 1):
             bow, uniform = values[:, axis * n : (axis + 1) * n], values[:, (2 + axis) * n : (3 + axis) * n]
-            ports.precurvature[..., axis] += bow[..., None] * (1.0 - 2.0 * ports.fraction) + uniform[..., None]
+            ports.precurvature[..., axis] += (
+                bow[..., None] * (1.0 - 2.0 * ports.fraction) + uniform[..., None]
+            )

@@ -27,7 +27,7 @@ class RoutingAngle(Static):
     confounded_with = ("stiffness_anisotropy", "frame_misalignment")
     synonyms = ("mis_routing",)
 
-    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         angle = ports.wiring.by_tendon(values)[:, None]
         c, s = np.cos(angle), np.sin(angle)
         x, y = ports.offset[..., 0].copy(), ports.offset[..., 1].copy()

@@ -22,11 +22,21 @@ class Slack(Static):
 
     seam = Seam.ACTUATION
     order = 50.0
-    parameters = (Parameter("half_width", "m", bounds=(0.0, 0.6), typical=0.04, starts=(0.015, 0.05), per="segment", of="reach"),)
+    parameters = (
+        Parameter(
+            "half_width",
+            "m",
+            bounds=(0.0, 0.6),
+            typical=0.04,
+            starts=(0.015, 0.05),
+            per="segment",
+            of="reach",
+        ),
+    )
     excited_by = "slow crossings of neutral, large bends"
     confounded_with = ("stiffening", "drum_gain")
     synonyms = ("dead_zone",)
 
-    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         dl, gap = ports.dl, ports.wiring.by_end(values)
         ports.shift_wires(-np.clip(dl, -gap, gap))

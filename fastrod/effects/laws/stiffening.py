@@ -22,12 +22,14 @@ class Stiffening(Static):
 
     seam = Seam.ACTUATION
     order = 65.0
-    parameters = (Parameter("cubic", "1/rad^2", bounds=(-0.5, 0.5), typical=0.08, starts=(0.06,), per="segment"),)
+    parameters = (
+        Parameter("cubic", "1/rad^2", bounds=(-0.5, 0.5), typical=0.08, starts=(0.06,), per="segment"),
+    )
     excited_by = "bends of many amplitudes up to 60 degrees and more"
     confounded_with = ("drum_gain", "slack", "lens")
     synonyms = ("nonlinear_material",)
 
-    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         bend = ports.bend()
         square = np.minimum((bend**2).sum(-1, keepdims=True), 2.0)
         ports.shift_bend(-values[:, :, None] * square * bend)

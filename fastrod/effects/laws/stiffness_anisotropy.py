@@ -25,6 +25,6 @@ class StiffnessAnisotropy(Static):
     confounded_with = ("routing_angle", "frame_misalignment")
     synonyms = ("anisotropy",)
 
-    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         ports.stiffness[..., 0] *= 1.0 + values[:, :, None]
         ports.stiffness[..., 1] *= 1.0 - values[:, :, None]

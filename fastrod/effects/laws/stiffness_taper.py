@@ -25,6 +25,6 @@ class StiffnessTaper(Static):
     confounded_with = ("drum_gain", "tendon_stretch", "marker_offset")
     synonyms = ("taper",)
 
-    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         ports.resolve()
         ports.stiffness *= 1.0 + values[:, :, None, None] * (1.0 - 2.0 * ports.fraction)[:, None]

@@ -24,12 +24,20 @@ class Temperature(Static):
     order = 25.0
     parameters = (
         Parameter("gain", "", bounds=(-0.5, 0.5), typical=0.05, starts=(0.05, -0.05)),
-        Parameter("time_constant", "s", neutral=100.0, bounds=(20.0, 5000.0), typical=100.0, starts=(30.0, 150.0), shape=True),
+        Parameter(
+            "time_constant",
+            "s",
+            neutral=100.0,
+            bounds=(20.0, 5000.0),
+            typical=100.0,
+            starts=(30.0, 150.0),
+            shape=True,
+        ),
     )
     excited_by = "the first block of motion repeated at the end"
     confounded_with = ("time_drift", "creep", "drum_gain")
     synonyms = ("warm_up",)
 
-    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         warm = values[:, 0] * (1.0 - np.exp(-ports.time / values[:, 1]))
         ports.shift_wires(warm[:, None] * ports.dl)

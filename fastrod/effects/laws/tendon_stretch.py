@@ -20,10 +20,12 @@ class TendonStretch(Static):
 
     seam = Seam.ACTUATION
     order = 85.0
-    parameters = (Parameter("compliance", "m/N", bounds=(0.0, 0.02), typical=3e-4, starts=(2e-4,), per="segment"),)
+    parameters = (
+        Parameter("compliance", "m/N", bounds=(0.0, 0.02), typical=3e-4, starts=(2e-4,), per="segment"),
+    )
     excited_by = "a known load of 50 to 100 g on and off"
     confounded_with = ("drum_gain", "stiffness_taper")
     synonyms = ("tendon_compliance", "wire_stretch")
 
-    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         ports.compliance += ports.wiring.by_end(values)

@@ -29,7 +29,7 @@ class TimeDrift(Static):
     confounded_with = ("creep", "temperature", "plastic_set")
     synonyms = ("drift",)
 
-    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         shift = values * ports.time[:, None]
         ports.tip_position += shift
         ports.points += shift[:, None]

@@ -31,5 +31,5 @@ class TipForce(Static):
     confounded_with = ("gravity", "payload", "stiffness_taper", "frame_misalignment")
     synonyms = ("external_force",)
 
-    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:  # noqa: ARG002
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         ports.tip_force += np.einsum("nij,nj->ni", ports.base_rotation, values)

@@ -1,4 +1,5 @@
-"""The paper's mismatch network, kept apart: what a network can still predict of what the physics leaves. Never part of "after"."""
+"""The paper's mismatch network, kept apart: what a network can still predict of what the physics leaves.
+Never part of "after"."""
 
 from __future__ import annotations
 
@@ -18,13 +19,17 @@ def check_network() -> None:
     try:
         import sklearn.neural_network  # noqa: F401
     except ImportError as error:
-        raise InputError("the residual network needs scikit-learn; install fastrod[network], or leave --network out.") from error
+        raise InputError(
+            "the residual network needs scikit-learn; install fastrod[network], or leave --network out."
+        ) from error
 
 
 def residual_network(samples: Samples, wiring: Wiring, result: Result) -> dict[str, float]:
-    """Train on the residual after the named effects, test on the samples held out: distance rms with it [m], and its input count.
+    """Train on the residual after the named effects, test on the samples held out: distance rms with it [m],
+    and its input count.
 
-    Inputs are those of the audit without time: present inputs, plays, lags, velocities. Raises `InputError` without scikit-learn.
+    Inputs are those of the audit without time: present inputs, plays, lags, velocities. Raises `InputError`
+    without scikit-learn.
     """
     check_network()
     from sklearn.neural_network import MLPRegressor
@@ -39,7 +44,10 @@ def residual_network(samples: Samples, wiring: Wiring, result: Result) -> dict[s
     test = result.tested & ~result.outlier & np.isfinite(residual).all(1)
     scale = float(residual[train].std())
     model = make_pipeline(
-        StandardScaler(), MLPRegressor(hidden_layer_sizes=_LAYERS, alpha=1e-2, early_stopping=True, max_iter=300, random_state=0)
+        StandardScaler(),
+        MLPRegressor(
+            hidden_layer_sizes=_LAYERS, alpha=1e-2, early_stopping=True, max_iter=300, random_state=0
+        ),
     )
     model.fit(inputs[train], residual[train] / scale)
     left = residual[test] - scale * model.predict(inputs[test])

@@ -15,9 +15,12 @@ from fastrod.types import Floats
 _SEPARATES: dict[frozenset[str], str] = {
     frozenset(pair.split("/")): run
     for pair, run in {
-        "friction/backlash": "reversals of many sizes, slowly, the smallest below three gaps: backlash is as wide at every bend",
-        "friction/creep": "holds of 4 s and more after steps, and the same loop at two speeds: friction stays, creep decays",
-        "friction/plastic_set": "small loops after a large one: friction shows in each, a set only after a new extreme",
+        "friction/backlash": "reversals of many sizes, slowly, the smallest below three gaps: backlash is "
+        "as wide at every bend",
+        "friction/creep": "holds of 4 s and more after steps, and the same loop at two speeds: friction "
+        "stays, creep decays",
+        "friction/plastic_set": "small loops after a large one: friction shows in each, a set only after a "
+        "new extreme",
         "backlash/slack": "reversals away from neutral: backlash shows there, slack only around neutral",
         "latency/dynamics": "fast and slow motion with sudden stops, beyond 50 degrees: only dynamics ring",
         "latency/creep": "stops and holds: a delay is over after the delay",
@@ -28,10 +31,12 @@ _SEPARATES: dict[frozenset[str], str] = {
         "gravity/frame_misalignment": "a second base orientation, turned by 90 degrees",
         "gravity/tip_force": "a second base orientation, turned by 90 degrees",
         "payload/tip_force": "a second base orientation, turned by 90 degrees",
-        "precurvature/frame_misalignment": "the free shape with slack wires, or a marker at half length: the tip cannot tell",
+        "precurvature/frame_misalignment": "the free shape with slack wires, or a marker at half length: "
+        "the tip cannot tell",
         "precurvature/encoder_offset": "wide bends with the tip's orientation measured",
         "precurvature/marker_offset": "wide bends with the tip's orientation measured",
-        "tendon_stretch/drum_gain": "a known mass of 50 to 100 g at the tip on and off: only stretch gives way to it",
+        "tendon_stretch/drum_gain": "a known mass of 50 to 100 g at the tip on and off: only stretch gives "
+        "way to it",
         "tendon_stretch/stiffness_taper": "a known mass of 50 to 100 g at the tip on and off",
         "stiffness_taper/drum_gain": "bends to 50 degrees and more, or a marker at half length",
         "stiffening/drum_gain": "bends of many amplitudes, to 50 degrees and more",
@@ -50,7 +55,10 @@ def separating_run(one: str, other: str) -> str:
     run = _SEPARATES.get(frozenset((one, other)))
     if run is None:
         both = [getattr(get_effect(name), "excited_by", "") for name in (one, other)]
-        run = "; ".join(dict.fromkeys(text for text in both if text)) or "motion over the whole workspace at two speeds, with holds"
+        run = (
+            "; ".join(dict.fromkeys(text for text in both if text))
+            or "motion over the whole workspace at two speeds, with holds"
+        )
     return f"to tell {one.replace('_', ' ')} from {other.replace('_', ' ')}: {run}"
 
 
@@ -62,15 +70,21 @@ def look_at(pattern: str) -> str:
 def loaded(samples: Samples, robot: Robot) -> bool:
     """A load is known: in the log, or the robot's own weight in its file."""
     log = samples.log
-    weight = any(segment.line_density > 0.0 for segment in robot.segments) and bool(np.any(np.array(robot.gravity) != 0.0))
-    return weight or any(a is not None and bool(np.any(np.nan_to_num(a) != 0.0)) for a in (log.tip_force, log.payload))
+    weight = any(segment.line_density > 0.0 for segment in robot.segments) and bool(
+        np.any(np.array(robot.gravity) != 0.0)
+    )
+    return weight or any(
+        a is not None and bool(np.any(np.nan_to_num(a) != 0.0)) for a in (log.tip_force, log.payload)
+    )
 
 
 def why_unknown(name: str, samples: Samples, robot: Robot) -> str:
     """Why this log says nothing about a parameter of the robot."""
     log = samples.log
     if "stiffness" in name and not loaded(samples, robot):
-        return "no known load in this log: with prescribed lengths the shape is geometry, whatever the stiffness"
+        return (
+            "no known load in this log: with prescribed lengths the shape is geometry, whatever the stiffness"
+        )
     if "stiffness" in name:
         return "the known loads in this log bend the robot too little to show it"
     if "line_density" in name and not _turns(log.base_quaternion):
@@ -79,23 +93,41 @@ def why_unknown(name: str, samples: Samples, robot: Robot) -> str:
 
 
 def missing_excitation(samples: Samples, bend: Floats) -> list[str]:
-    """What this run lacks to separate effects, in a sentence each. `bend` (n, n_segments, 2) commanded [rad]."""
+    """What this run lacks to separate effects, in a sentence each. `bend` (n, n_segments, 2) commanded
+    [rad]."""
     log = samples.log
     lacks = []
     if not _turns(log.base_quaternion):
-        lacks.append("one base orientation only: gravity and payload cannot be told from zeros, registration or precurvature")
+        lacks.append(
+            "one base orientation only: gravity and payload cannot be told from zeros, "
+            "registration or precurvature"
+        )
     if log.payload is None and log.tip_force is None:
-        lacks.append("no known load: stretch of the wires cannot be told from the gain of the drives, stiffness is not seen")
+        lacks.append(
+            "no known load: stretch of the wires cannot be told from the gain of the drives, "
+            "stiffness is not seen"
+        )
     size = np.linalg.norm(bend, axis=-1)
     if size.size and float(size.max()) < 0.45:
-        lacks.append(f"bends to {np.degrees(size.max()):.0f} degrees only: stiffening, taper, compression and a set hardly show")
-    holds = [rows for rows in at_rest(samples) if samples.time[samples.rows[rows[-1]]] - samples.time[samples.rows[rows[0]]] >= 2.0]
+        lacks.append(
+            f"bends to {np.degrees(size.max()):.0f} degrees only: stiffening, taper, compression "
+            "and a set hardly show"
+        )
+    holds = [
+        rows
+        for rows in at_rest(samples)
+        if samples.time[samples.rows[rows[-1]]] - samples.time[samples.rows[rows[0]]] >= 2.0
+    ]
     if not holds:
         lacks.append("no holds: creep cannot be told from friction, and the noise is not known from rest")
     if bend.shape[1] > 1:
         moved = size > 0.1
-        if not any((moved[:, k] & ~np.delete(moved, k, axis=1).any(1)).mean() > 0.03 for k in range(bend.shape[1])):
-            lacks.append("no segment ever moves alone: coupling between segments looks like their own zeros and gains")
+        if not any(
+            (moved[:, k] & ~np.delete(moved, k, axis=1).any(1)).mean() > 0.03 for k in range(bend.shape[1])
+        ):
+            lacks.append(
+                "no segment ever moves alone: coupling between segments looks like their own zeros and gains"
+            )
     return lacks
 
 

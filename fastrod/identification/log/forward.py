@@ -1,7 +1,7 @@
 """A log through the model: commands, effects, rod, camera; for any vector of unknowns.
 
-The operators on the wires run causally over every sample of every run. The rod is static, so each sample is one robot of a
-batch, and only those samples are solved that the loss looks at.
+The operators on the wires run causally over every sample of every run. The rod is static, so each sample is
+one robot of a batch, and only those samples are solved that the loss looks at.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ from fastrod.solver.inputs import Inputs, Reader
 from fastrod.types import Flags, Floats, Ints, Params, Ports
 
 TOLERANCE = 1e-8  # of the robot's length: far below any camera
-_LOST = 500  # passes that a row takes which none of the ways to settle it solves (measured: 900 for a batch with some hundreds of them)
+# passes that a row takes which none of the ways to settle it solves (measured: 900 for a batch with some
+# hundreds of them)
+_LOST = 500
 N_STEPS = 6  # steps of a segment: the tip to some micrometres
 
 
@@ -83,14 +85,22 @@ def sample(log: RunLog, rows: Ints | None = None) -> Samples:
 class Rod:
     """The batch that solves the rows of `samples`; it stays warm from one parameter vector to the next."""
 
-    def __init__(self, samples: Samples, robot: Robot, *, points: bool = False, threads: int | None = None) -> None:
+    def __init__(
+        self, samples: Samples, robot: Robot, *, points: bool = False, threads: int | None = None
+    ) -> None:
         from fastrod.simulator import Simulator
 
         self.threads = threads
         self.samples, self.points = samples, points and samples.log.points is not None
         bare = replace(robot, effects=())
         n = len(samples.rows)
-        self._sim = Simulator(bare, n_robots=n, points_per_segment=N_STEPS, outputs="full" if self.points else "tip", threads=threads)
+        self._sim = Simulator(
+            bare,
+            n_robots=n,
+            points_per_segment=N_STEPS,
+            outputs="full" if self.points else "tip",
+            threads=threads,
+        )
         self._tolerance = TOLERANCE * robot.length
         self._log = samples.log.rows(samples.rows)
         self.runs = 0
@@ -99,15 +109,23 @@ class Rod:
         """Passes of a row so far, on the average."""
 
     def solve(self, ports: Ports, params: Params, robot: Robot, rows: Flags | None = None) -> Pose:
-        """Pose at the rows, for these ports and this robot; only of the `rows` of a mask, where one is given."""
+        """Pose at the rows, for these ports and this robot; only of the `rows` of a mask, where one is
+        given."""
         self.runs += 1
-        state = self._sim.settle_ports(ports, params, self._tolerance, None if rows is None or rows.all() else np.flatnonzero(rows))
+        state = self._sim.settle_ports(
+            ports, params, self._tolerance, None if rows is None or rows.all() else np.flatnonzero(rows)
+        )
         self.cost += float(np.where(state.passes < 0, _LOST, state.passes).mean())
         turn = matrix_from_quaternion(np.broadcast_to(ports.base_pose, (len(state.ok), 7))[:, 3:])
         origin = ports.base_pose[:, :3]
         points = np.zeros((len(state.ok), 0, 3))
         if self.points:
-            points = self._sim.shape(np.minimum(np.array(robot.log_points), np.nanmin(state.arclength[:, -1]))).position - origin[:, None]
+            points = (
+                self._sim.shape(
+                    np.minimum(np.array(robot.log_points), np.nanmin(state.arclength[:, -1]))
+                ).position
+                - origin[:, None]
+            )
         return Pose(
             np.einsum("nji,nj->ni", turn, state.tip_position - origin),
             np.swapaxes(turn, 1, 2) @ state.tip_rotation,
@@ -141,22 +159,33 @@ class Bench:
 
     def open(self) -> EffectPorts:
         """Ports of the rows, ready for effects."""
-        return self._open(self.ports, len(self.samples.rows), self.samples.time[self.samples.rows], self.base_rotation)
+        return self._open(
+            self.ports, len(self.samples.rows), self.samples.time[self.samples.rows], self.base_rotation
+        )
 
     def _open(self, ports: Ports, n: int, time: Floats, base_rotation: Floats) -> EffectPorts:
         return open_ports(
-            ports, self.params, self.wiring, n=n, rest_length=self.robot.rest_tendon_length, gravity=np.array(self.robot.gravity)[None],
-            base_rotation=base_rotation, time=time, n_steps=N_STEPS,
-        )  # fmt: skip
+            ports,
+            self.params,
+            self.wiring,
+            n=n,
+            rest_length=self.robot.rest_tendon_length,
+            gravity=np.array(self.robot.gravity)[None],
+            base_rotation=base_rotation,
+            time=time,
+            n_steps=N_STEPS,
+        )
 
     def wires(self, chain: list[tuple[Effect, Floats]]) -> Floats | None:
-        """(n_rows, n_tendons) change of wire length [m] after the effects of `chain` up to the last one with a memory, over every
-        sample; None where none has a memory."""
+        """(n_rows, n_tendons) change of wire length [m] after the effects of `chain` up to the last one with
+        a memory, over every sample; None where none has a memory."""
         last = max((i for i, (what, _) in enumerate(chain) if has_memory(what)), default=-1)
         if last < 0:
             return None
         samples, n = self.samples, len(self.dl)
-        opened = self._open(self._alone(self.dl + self.robot.rest_tendon_length), n, samples.time, self.base_rotation[:1])
+        opened = self._open(
+            self._alone(self.dl + self.robot.rest_tendon_length), n, samples.time, self.base_rotation[:1]
+        )
         for what, values in chain[: last + 1]:
             if not has_memory(what):
                 what.apply(np.broadcast_to(values, (n, len(values))), np.empty((n, 0)), opened, None, 0.0)
@@ -166,7 +195,9 @@ class Bench:
             for part in samples.runs:
                 if hasattr(what, "sweep"):
                     memory = what.memory(1, self.wiring.n_tendons)
-                    out[part] = what.sweep(values[None], memory, dl[None, part], samples.dt[part], self.wiring)[0]
+                    out[part] = what.sweep(
+                        values[None], memory, dl[None, part], samples.dt[part], self.wiring
+                    )[0]
                 else:
                     out[part] = self._step_by_step(what, values, dl[part], part)
             opened.shift_wires(out - dl)
@@ -174,7 +205,10 @@ class Bench:
 
     def _alone(self, length: Floats) -> Ports:
         """Ports with these wire lengths and nothing else."""
-        bare = {name: getattr(self.ports, name)[:1] for name in ("extension", "tip_force", "tip_moment", "line_force")}
+        bare = {
+            name: getattr(self.ports, name)[:1]
+            for name in ("extension", "tip_force", "tip_moment", "line_force")
+        }
         return self.ports._replace(tendon_length=length, **bare)
 
     def _step_by_step(self, what: Effect, values: Floats, dl: Floats, part: slice) -> Floats:
@@ -184,7 +218,10 @@ class Bench:
         for i in range(len(dl)):
             at = part.start + i
             one = self._open(
-                self._alone(dl[i : i + 1] + self.robot.rest_tendon_length), 1, self.samples.time[at : at + 1], self.base_rotation[:1]
+                self._alone(dl[i : i + 1] + self.robot.rest_tendon_length),
+                1,
+                self.samples.time[at : at + 1],
+                self.base_rotation[:1],
             )
             what.apply(values[None], memory, one, None, float(self.samples.dt[at]))
             out[i] = one.dl[0]
@@ -197,13 +234,25 @@ class Bench:
         opened = self.open()
         for what, values in before[: last + 1]:  # for what they change beside the wires' lengths
             if not has_memory(what):
-                what.apply(np.broadcast_to(values, (len(opened), len(values))), np.empty((len(opened), 0)), opened, None, 0.0)
+                what.apply(
+                    np.broadcast_to(values, (len(opened), len(values))),
+                    np.empty((len(opened), 0)),
+                    opened,
+                    None,
+                    0.0,
+                )
         wires = self.wires(before)
         if wires is not None:
             opened.tendon_length = wires + self.robot.rest_tendon_length
         rest = before[last + 1 :] + [link for link in chain if link[0].seam in (Seam.MATERIAL, Seam.LOAD)]
         for what, values in rest:
-            what.apply(np.broadcast_to(values, (len(opened), len(values))), np.empty((len(opened), 0)), opened, None, 0.0)
+            what.apply(
+                np.broadcast_to(values, (len(opened), len(values))),
+                np.empty((len(opened), 0)),
+                opened,
+                None,
+                0.0,
+            )
         return opened
 
     def kernel(self, opened: EffectPorts) -> tuple[Ports, Params]:
@@ -211,14 +260,25 @@ class Bench:
         return close_ports(opened, self.ports, self.params)
 
     def see(self, pose: Pose, chain: list[tuple[Effect, Floats]], opened: EffectPorts | None = None) -> Pose:
-        """The pose as the camera sees it, by the effects of sensing in `chain`; `opened`: ports that the others have changed."""
+        """The pose as the camera sees it, by the effects of sensing in `chain`; `opened`: ports that the
+        others have changed."""
         links = [link for link in chain if link[0].seam is Seam.SENSING]
         if not links:
             return pose
         ports = self.open() if opened is None else opened
-        ports.tip_position, ports.tip_rotation, ports.points = pose.position.copy(), pose.rotation.copy(), pose.points.copy()
+        ports.tip_position, ports.tip_rotation, ports.points = (
+            pose.position.copy(),
+            pose.rotation.copy(),
+            pose.points.copy(),
+        )
         for what, values in links:
-            what.apply(np.broadcast_to(values, (len(ports), len(values))), np.empty((len(ports), 0)), ports, None, 0.0)
+            what.apply(
+                np.broadcast_to(values, (len(ports), len(values))),
+                np.empty((len(ports), 0)),
+                ports,
+                None,
+                0.0,
+            )
         return Pose(ports.tip_position, ports.tip_rotation, ports.points, pose.ok)
 
 
@@ -227,7 +287,15 @@ def bench(samples: Samples, robot: Robot, wiring: Wiring) -> Bench:
     log = samples.log.rows(samples.rows)
     layout, params, rest = compile_robots((replace(robot, effects=()),), N_STEPS)
     ports = Reader(layout, params, rest, len(log)).ports(_given(inputs(log, robot)))
-    return Bench(robot, wiring, samples, ports, params, np.asarray(samples.log.dl), matrix_from_quaternion(ports.base_pose[:, 3:]))
+    return Bench(
+        robot,
+        wiring,
+        samples,
+        ports,
+        params,
+        np.asarray(samples.log.dl),
+        matrix_from_quaternion(ports.base_pose[:, 3:]),
+    )
 
 
 def _given(keywords: dict[str, Floats]) -> Inputs:
@@ -242,7 +310,10 @@ def chain_of(model: Model, theta: Floats) -> list[tuple[Effect, Floats]]:
     for name in model.effects:
         what = get_effect(name)
         if what.seam is not Seam.ACTUATION and has_memory(what):
-            raise InputError(f"effect {name!r} has a memory at the seam {what.seam.name}; over a log only those of ACTUATION are carried.")
+            raise InputError(
+                f"effect {name!r} has a memory at the seam {what.seam.name}; over a log only "
+                "those of ACTUATION are carried."
+            )
     return [(get_effect(name), values) for name, values in model.values(theta).items()]
 
 

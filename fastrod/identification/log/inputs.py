@@ -13,7 +13,8 @@ from fastrod.types import Floats
 def tendon_length(log: RunLog, robot: Robot) -> Floats | None:
     """(n, n_tendons) absolute tendon lengths [m]; None without tendons.
 
-    `dl` is counted from the straight rest robot, extension and all: a robot that grows straight pays out its tendons.
+    `dl` is counted from the straight rest robot, extension and all: a robot that grows straight pays out its
+    tendons.
     """
     return np.asarray(robot.rest_tendon_length + log.dl, dtype=np.float64) if robot.n_tendons else None
 
@@ -35,7 +36,11 @@ def inputs(log: RunLog, robot: Robot) -> dict[str, Floats]:
 
 def base_of(log: RunLog, robot: Robot) -> tuple[Floats, Floats]:
     """world_from_base (n, 3, 3) of each row, and the base's position in the world [m]."""
-    quaternion = log.base_quaternion if log.base_quaternion is not None else np.tile(robot.base_quaternion, (len(log), 1))
+    quaternion = (
+        log.base_quaternion
+        if log.base_quaternion is not None
+        else np.tile(robot.base_quaternion, (len(log), 1))
+    )
     return matrix_from_quaternion(quaternion), np.array(robot.base_position)
 
 

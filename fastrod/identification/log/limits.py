@@ -1,4 +1,5 @@
-"""What no effect of the library can carry, because the rod's state does not hold it; said where a robot is likely to show it."""
+"""What no effect of the library can carry, because the rod's state does not hold it; said where a robot is
+likely to show it."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ def limits(robot: Robot, samples: Samples) -> list[str]:
     thickest = max((s.body_radius / robot.length for s in robot.segments), default=0.0)
     if (share := _SHEAR * thickest**2) > _WORTH_SAYING:
         found.append(
-            f"shear is not the rod's: {1.0 / (2.0 * thickest):.1f} times as long as thick, it is some {100 * share:.0f} % of the deflection"
+            f"shear is not the rod's: {1.0 / (2.0 * thickest):.1f} times as long as thick, it is some "
+            f"{100 * share:.0f} % of the deflection"
         )
     mass = sum(s.line_density * s.length for s in robot.segments)
     if mass > 0.0:
@@ -26,5 +28,8 @@ def limits(robot: Robot, samples: Samples) -> list[str]:
         frequency = 0.56 * math.sqrt(soft / (mass * robot.length**3))
         steps = sorted(samples.dt[samples.dt > 0.0].tolist())
         if frequency < _SLOW and steps and 2.0 * frequency * steps[len(steps) // 2] < 1.0:
-            found.append(f"inertia and damping are not the rod's: it rings near {frequency:.1f} Hz, which a static model cannot follow")
+            found.append(
+                f"inertia and damping are not the rod's: it rings near {frequency:.1f} Hz, which a "
+                "static model cannot follow"
+            )
     return found

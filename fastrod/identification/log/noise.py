@@ -1,4 +1,5 @@
-"""What of a measurement is noise: the camera at rest, and the samples that are outliers whatever the model."""
+"""What of a measurement is noise: the camera at rest, and the samples that are outliers whatever the
+model."""
 
 from __future__ import annotations
 
@@ -39,7 +40,11 @@ class Noise:
 def at_rest(samples: Samples) -> list[Ints]:
     """Stretches of rows at which no input has moved for a while: arrays of indices into `samples.rows`."""
     log = samples.log
-    drives = [log.dl] + [a.reshape(len(log), -1) for a in (log.ext, log.tip_force, log.payload, log.base_quaternion) if a is not None]
+    drives = [log.dl] + [
+        a.reshape(len(log), -1)
+        for a in (log.ext, log.tip_force, log.payload, log.base_quaternion)
+        if a is not None
+    ]
     every = np.concatenate(drives, axis=1)
     span = np.maximum(np.ptp(every, axis=0), 1e-12)
     moved = (np.abs(np.diff(every, axis=0)) > _STILL * span).any(1)
@@ -49,12 +54,16 @@ def at_rest(samples: Samples) -> list[Ints]:
     since = samples.time - samples.time[last]
     quiet = (since >= _SETTLE)[samples.rows]
     label = last[samples.rows]
-    return [rows for key in np.unique(label[quiet]) if len(rows := np.flatnonzero(quiet & (label == key))) >= _LEAST]
+    return [
+        rows
+        for key in np.unique(label[quiet])
+        if len(rows := np.flatnonzero(quiet & (label == key))) >= _LEAST
+    ]
 
 
 def read_noise(samples: Samples, tip: Floats, residual: Floats) -> Noise:
-    """Noise of the measured `tip` (n_rows, 3) [m] from stretches at rest, or from the fastest part of a `residual` where the robot
-    never rests."""
+    """Noise of the measured `tip` (n_rows, 3) [m] from stretches at rest, or from the fastest part of a
+    `residual` where the robot never rests."""
     parts = at_rest(samples)
     if sum(len(p) for p in parts) >= ENOUGH:
         flat = []
@@ -65,9 +74,13 @@ def read_noise(samples: Samples, tip: Floats, residual: Floats) -> Noise:
             middle = tip[rows] - np.median(tip[rows], axis=0)
             for _ in range(2):  # the drift, of samples that are no outliers
                 near = np.abs(middle) <= 4.0 * _TO_SIGMA * np.median(np.abs(middle), axis=0)
-                middle = middle - line * (near * line * middle).sum(0) / np.maximum((near * line**2).sum(0), 1e-12)
+                middle = middle - line * (near * line * middle).sum(0) / np.maximum(
+                    (near * line**2).sum(0), 1e-12
+                )
             flat.append(middle * np.sqrt(len(rows) / (len(rows) - 2.0)))
-            inside = np.clip(middle, *(side * 4.0 * _TO_SIGMA * np.median(np.abs(middle), axis=0) for side in (-1.0, 1.0)))
+            inside = np.clip(
+                middle, *(side * 4.0 * _TO_SIGMA * np.median(np.abs(middle), axis=0) for side in (-1.0, 1.0))
+            )
             pairs += [(inside[1:] * inside[:-1]).sum(), (inside**2).sum()]
             weight += len(rows)
         every = np.concatenate(flat)
@@ -77,19 +90,30 @@ def read_noise(samples: Samples, tip: Floats, residual: Floats) -> Noise:
         lag1 = float(pairs[0] / max(pairs[1], 1e-30))
         if lag1 > _MOVES:  # what moves at rest is no noise: a base that sways
             return Noise(
-                _fast(np.concatenate([np.diff(tip[rows], n=3, axis=0) for rows in parts])), lag1, f"{len(every)} samples at rest, fast part"
+                _fast(np.concatenate([np.diff(tip[rows], n=3, axis=0) for rows in parts])),
+                lag1,
+                f"{len(every)} samples at rest, fast part",
             )
         return Noise(np.maximum(sigma, 1e-7), lag1, f"{len(every)} samples at rest")
-    return Noise(_fast(np.diff(residual, n=3, axis=0)), 0.0, "third differences of the residual; the robot never rests in this log")
+    return Noise(
+        _fast(np.diff(residual, n=3, axis=0)),
+        0.0,
+        "third differences of the residual; the robot never rests in this log",
+    )
 
 
 def _fast(third: Floats) -> Floats:
     """(3,) sigma of white noise with these third differences (n, 3), robustly."""
-    return np.asarray(np.maximum(_TO_SIGMA * np.median(np.abs(third), axis=0) / np.sqrt(20.0), 1e-7) if len(third) else np.full(3, 1e-4))
+    return np.asarray(
+        np.maximum(_TO_SIGMA * np.median(np.abs(third), axis=0) / np.sqrt(20.0), 1e-7)
+        if len(third)
+        else np.full(3, 1e-4)
+    )
 
 
 def keep(samples: Samples, residual: Floats, noise: Noise) -> Flags:
-    """(n_rows,) rows that are no outliers: Hampel's filter on a residual (n_rows, 3), the same mask for every model."""
+    """(n_rows,) rows that are no outliers: Hampel's filter on a residual (n_rows, 3), the same mask for every
+    model."""
     good = np.ones(len(residual), bool)
     run = np.searchsorted([part.start for part in samples.runs], samples.rows, side="right")
     for label in np.unique(run):

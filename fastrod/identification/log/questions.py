@@ -1,7 +1,9 @@
-"""Is this a log of this robot? What a user who mixed up units, signs, order, frame or time should be asked, before any fit.
+"""Is this a log of this robot? What a user who mixed up units, signs, order, frame or time should be asked,
+before any fit.
 
-The model as the robot file has it is laid beside some hundred rows: as it is, seen by a camera that stands elsewhere, seen in a
-left-handed frame, and with other inputs. Where another reading follows the measurement far better, that is the question.
+The model as the robot file has it is laid beside some hundred rows: as it is, seen by a camera that stands
+elsewhere, seen in a left-handed frame, and with other inputs. Where another reading follows the measurement
+far better, that is the question.
 """
 
 from __future__ import annotations
@@ -27,11 +29,21 @@ _LEVER = 0.3  # robot lengths: what a measured rotation counts beside positions
 _STILL = 0.01  # robot lengths: a log that moves less says nothing
 _FURTHER = 1.1  # times the motion: what is left of a model that moves otherwise
 _SCALES = {
-    1e-3: "mm to m", 1e-2: "cm to m", 0.1: "a decimal place", 0.0254: "inches to m", np.pi / 180.0: "degrees to radians",
-    0.5: "a diameter for a radius", 2.0: "a radius for a diameter", 10.0: "a decimal place", 1e3: "converted twice",
-}  # fmt: skip
+    1e-3: "mm to m",
+    1e-2: "cm to m",
+    0.1: "a decimal place",
+    0.0254: "inches to m",
+    np.pi / 180.0: "degrees to radians",
+    0.5: "a diameter for a radius",
+    2.0: "a radius for a diameter",
+    10.0: "a decimal place",
+    1e3: "converted twice",
+}
 _AS_GOOD = 1.3  # times what a moved camera leaves
-_RIGHT = "Are the units, the signs (negative = pulled) and the order of the dl_ columns right, and is it this robot?"
+_RIGHT = (
+    "Are the units, the signs (negative = pulled) and the order of the dl_ columns right, and is it "
+    "this robot?"
+)
 _PACE = 1.0  # s from row to row; a dense log that takes longer has its time in another unit
 _DENSE = 0.1  # of the motion from row to row
 
@@ -41,7 +53,8 @@ class Reading:
     """What a first look says of a log."""
 
     registration: Registration | None
-    """Of a camera that stands far from where the robot file says; None where it does not, or where nothing would follow from it."""
+    """Of a camera that stands far from where the robot file says; None where it does not, or where nothing
+    would follow from it."""
     questions: tuple[str, ...]
     """What to ask the user, a sentence each."""
     refusal: str
@@ -51,12 +64,17 @@ class Reading:
 
 
 def questions(log: RunLog, robot: Robot, *, threads: int | None = None) -> tuple[str, ...]:
-    """What `log` makes one ask about its units, signs, order, frame and time; nothing where it fits `robot`."""
+    """What `log` makes one ask about its units, signs, order, frame and time; nothing where it fits
+    `robot`."""
     if int(log.measured.sum()) < _LEAST:
         return ()
     samples = sample(log)
     reading = read(samples, robot, threads=threads)
-    moved = () if reading.registration is None else (f"{reading.registration.sentence()}; fastrod identify takes it from there.",)
+    moved = (
+        ()
+        if reading.registration is None
+        else (f"{reading.registration.sentence()}; fastrod identify takes it from there.",)
+    )
     return (*moved, *reading.questions)
 
 
@@ -67,7 +85,8 @@ def read(samples: Samples, robot: Robot, *, threads: int | None = None) -> Readi
     look = _Look(samples, robot, threads)
     nothing = Reading(registration=None, questions=tuple(asked), refusal="", guess="")
     frame, far = look.frame, look.frame.is_large(robot.length)
-    as_it_is = look.as_it_is if far else min(look.as_it_is, frame.left)  # a small misalignment is for the search to name
+    # a small misalignment is for the search to name
+    as_it_is = look.as_it_is if far else min(look.as_it_is, frame.left)
     if look.motion < _STILL * robot.length or not (look.solved or robot.n_tendons):
         return nothing
     if as_it_is < _FOLLOWS * look.motion and not far:
@@ -77,37 +96,57 @@ def read(samples: Samples, robot: Robot, *, threads: int | None = None) -> Readi
     tried = [(look.with_inputs(dl), words) for dl, words in _other_inputs(samples, robot, look.scale)]
     left, words = min(tried, default=(np.inf, ""))
     mixed_up = left < enough
-    if mixed_up and moved:  # a rotation about the base's axis looks like other signs or another order: then the columns are asked for
+    # a rotation about the base's axis looks like other signs or another order: then the columns are asked for
+    if mixed_up and moved:
         mixed_up = left < _AS_GOOD * frame.left and not _declared(robot, frame)
     mirrored = look.mirrored.left < min(enough, _BETTER * frame.left)
     if mirrored and mixed_up:
         mirrored = look.mirrored.left < _BETTER * left
     guess = ""
     if mirrored:
-        guess = "In a left-handed frame the model would follow: is an axis of the camera reversed, or are two of them exchanged?"
+        guess = (
+            "In a left-handed frame the model would follow: is an axis of the camera reversed, or are "
+            "two of them exchanged?"
+        )
     elif mixed_up:
         times = f" {as_it_is / left:.0f} times as closely" if np.isfinite(as_it_is) else ""
         guess = f"The model would follow{times} with {words}."
         if moved:
             turn = f"{np.degrees(frame.angle):.0f} deg"
-            guess += f" A camera turned by {turn} would look the same: if yours is, give [sensor] registration_sd in the robot file."
+            guess += (
+                f" A camera turned by {turn} would look the same: if yours is, give [sensor] "
+                "registration_sd in the robot file."
+            )
     further = look.centred > _FURTHER * look.motion and not (moved and not guess)
     name = samples.log.name
     refusal = ""
     if further:
         asked.append(further_than_still(samples, robot, look.scale, guess))
     elif guess:
-        asked.append(f"log {name!r} fits robot {robot.name!r} badly. {guess}" + ("" if mirrored else f" {_RIGHT}"))
+        asked.append(
+            f"log {name!r} fits robot {robot.name!r} badly. {guess}" + ("" if mirrored else f" {_RIGHT}")
+        )
     if mirrored or (guess and further and "times" not in words):
         refusal = asked[-1]
-    return Reading(registration=frame if moved and not guess else None, questions=tuple(asked), refusal=refusal, guess=guess)
+    return Reading(
+        registration=frame if moved and not guess else None,
+        questions=tuple(asked),
+        refusal=refusal,
+        guess=guess,
+    )
 
 
 def further_than_still(samples: Samples, robot: Robot, scale: float, guess: str = "") -> str:
-    """The question to a user whose model moves otherwise than the measurement, `scale` times as predicted along with it."""
-    moves = f"it moves {scale:.2g} times as predicted" if np.isfinite(scale) else "the model cannot be solved for its inputs"
+    """The question to a user whose model moves otherwise than the measurement, `scale` times as predicted
+    along with it."""
+    moves = (
+        f"it moves {scale:.2g} times as predicted"
+        if np.isfinite(scale)
+        else "the model cannot be solved for its inputs"
+    )
     return (
-        f"log {samples.log.name!r} is further from robot {robot.name!r} than from a robot that stands still: {moves}. {_RIGHT}"
+        f"log {samples.log.name!r} is further from robot {robot.name!r} than from a robot that stands "
+        f"still: {moves}. {_RIGHT}"
         f"{' ' if guess else ''}{guess}"
     )
 
@@ -123,7 +162,10 @@ def time_question(samples: Samples) -> str:
     if pace < _PACE or size(np.diff(tip, axis=0)) > _DENSE * motion:
         return ""
     name, last = samples.log.name, float(samples.time.max())
-    return f"log {name!r} has a row every {pace:.3g} s and lasts {last:.3g} s; is column t in ms? It takes seconds."
+    return (
+        f"log {name!r} has a row every {pace:.3g} s and lasts {last:.3g} s; is column t in ms? It takes "
+        "seconds."
+    )
 
 
 class _Look:
@@ -139,12 +181,21 @@ class _Look:
         self.rod = Rod(self.samples, robot, points=with_points, threads=threads)
         self.tip = np.asarray(log.tip_position)
         self.points = log.points if with_points and log.points is not None else np.zeros((len(rows), 0, 3))
-        self.turned = np.zeros(len(rows), bool) if log.tip_quaternion is None else np.isfinite(log.tip_quaternion).all(1)
-        self.turn = np.eye(3)[None] if log.tip_quaternion is None else matrix_from_quaternion(np.nan_to_num(log.tip_quaternion, nan=0.5))
+        self.turned = (
+            np.zeros(len(rows), bool)
+            if log.tip_quaternion is None
+            else np.isfinite(log.tip_quaternion).all(1)
+        )
+        self.turn = (
+            np.eye(3)[None]
+            if log.tip_quaternion is None
+            else matrix_from_quaternion(np.nan_to_num(log.tip_quaternion, nan=0.5))
+        )
         self.motion = size(self.tip - np.median(self.tip, axis=0))
         """[m]."""
         pose = self._pose(np.asarray(samples.log.dl))
-        self.solved = int(pose.ok.sum()) >= max(_LEAST, len(rows) // 2)  # of inputs in another unit the rests are solved
+        # of inputs in another unit the rests are solved
+        self.solved = int(pose.ok.sum()) >= max(_LEAST, len(rows) // 2)
         self.as_it_is = self.centred = np.inf
         """Distance that the model leaves as it is, and with both motions about their middles [m]."""
         self.scale = np.nan
@@ -159,12 +210,15 @@ class _Look:
             self.frame, self.mirrored = (self._aligned(pose, mirrored=mirrored) for mirrored in (False, True))
 
     def with_inputs(self, dl: Floats) -> float:
-        """Distance that other inputs would leave [m], with a camera that may stand where the search still finds it."""
+        """Distance that other inputs would leave [m], with a camera that may stand where the search still
+        finds it."""
         pose = self._pose(dl)
         if int(pose.ok.sum()) < max(_LEAST, len(pose.ok) // 2):
             return float("inf")
         frame = self._aligned(pose)
-        return frame.left if not frame.is_large(self.robot.length) else size((self.tip - pose.position)[pose.ok])
+        return (
+            frame.left if not frame.is_large(self.robot.length) else size((self.tip - pose.position)[pose.ok])
+        )
 
     def _pose(self, dl: Floats) -> Pose:
         samples = replace(self.samples, log=replace(self.samples.log, dl=dl))
@@ -176,7 +230,9 @@ class _Look:
         seen = np.concatenate([self.tip[pose.ok], self.points[both].reshape(-1, 3)])
         made = np.concatenate([pose.position[pose.ok], pose.points[both].reshape(-1, 3)])
         rows = pose.ok & self.turned
-        turns = self.turn[rows] @ np.swapaxes(pose.rotation[rows], 1, 2) if rows.any() and not mirrored else None
+        turns = (
+            self.turn[rows] @ np.swapaxes(pose.rotation[rows], 1, 2) if rows.any() and not mirrored else None
+        )
         found = align(seen, made, turns=turns, lever=_LEVER * self.robot.length, mirrored=mirrored)
         return replace(found, left=size((self.tip - pose.position @ found.rotation.T - found.shift)[pose.ok]))
 
@@ -203,7 +259,8 @@ def _other_inputs(samples: Samples, robot: Robot, scale: float) -> Iterator[tupl
         if columns != tuple(range(n)):
             yield dl[:, list(columns)], words
     for factor, words in _SCALES.items():
-        fewer = not np.isfinite(scale) or scale < 1.0  # a rod that bends far moves less than in proportion: not the very factor
+        # a rod that bends far moves less than in proportion: not the very factor
+        fewer = not np.isfinite(scale) or scale < 1.0
         if (factor < 1.0) == fewer and factor * float(np.abs(dl).max()) < robot.length:
             yield factor * dl, f"every dl_ times {factor:.4g} ({words})"
 

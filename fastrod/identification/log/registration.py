@@ -1,4 +1,5 @@
-"""Where the camera stands: the rigid motion that lays predicted points on measured ones, roughly, before anything is fitted."""
+"""Where the camera stands: the rigid motion that lays predicted points on measured ones, roughly, before
+anything is fitted."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ _ROTATION = ("rotation_x", "rotation_y", "rotation_z")
 _SHIFT = ("shift_x", "shift_y", "shift_z")
 _LARGE_ROTATION = 0.25  # rad; a smaller one is left to the search, as the effect that it is
 _LARGE_SHIFT = 0.3  # robot lengths
-_PULL = 1e-3  # of the cloud's largest spread: a rotation that moves the points by less stays as the robot file has it
+# of the cloud's largest spread: a rotation that moves the points by less stays as the robot file has it
+_PULL = 1e-3
 _ROUNDS = 20  # of reweighting
 _COUNTED = 0.85  # of the rows: the farther ones may be outliers
 
@@ -44,19 +46,27 @@ class Registration:
         return float(np.linalg.norm(self.shift))
 
     def is_large(self, length: float) -> bool:
-        """Whether it is farther off than a search by slopes finds its way, on a robot of this `length` [m]."""
+        """Whether it is farther off than a search by slopes finds its way, on a robot of this `length`
+        [m]."""
         return self.angle > _LARGE_ROTATION or self.distance > _LARGE_SHIFT * length
 
     def sentence(self) -> str:
         """Say it to a user."""
-        return f"the camera stands {np.degrees(self.angle):.1f} deg and {self.distance:.2g} m from where the robot file says"
+        return (
+            f"the camera stands {np.degrees(self.angle):.1f} deg and {self.distance:.2g} m from where "
+            "the robot file says"
+        )
 
     def on(self, robot: Robot) -> Robot:
-        """`robot` seen by this camera: with the effect `frame_misalignment`, after what its file has of it already."""
+        """`robot` seen by this camera: with the effect `frame_misalignment`, after what its file has of it
+        already."""
         before = frame_of(robot)
         rotation, shift = self.rotation @ before.rotation, self.rotation @ before.shift + self.shift
         vector = Rotation.from_matrix(rotation).as_rotvec()
-        table = {"name": EFFECT, **dict(zip((*_ROTATION, *_SHIFT), (*vector.tolist(), *shift.tolist()), strict=True))}
+        table = {
+            "name": EFFECT,
+            **dict(zip((*_ROTATION, *_SHIFT), (*vector.tolist(), *shift.tolist()), strict=True)),
+        }
         others = tuple(effect for effect in robot.effects if canonical_name(str(effect["name"])) != EFFECT)
         return replace(robot, effects=(*others, table))
 
@@ -64,7 +74,9 @@ class Registration:
 def frame_of(robot: Robot) -> Registration:
     """The camera's frame as the effects of `robot` have it."""
     table = named_effects(robot).get(EFFECT, {})
-    vector, shift = (np.array([float(table.get(name, 0.0)) for name in names]) for names in (_ROTATION, _SHIFT))
+    vector, shift = (
+        np.array([float(table.get(name, 0.0)) for name in names]) for names in (_ROTATION, _SHIFT)
+    )
     return Registration(rotation=Rotation.from_rotvec(vector).as_matrix(), shift=shift, left=float("nan"))
 
 
@@ -75,11 +87,20 @@ def between(file: Robot, found: Robot) -> Registration:
     return Registration(rotation=rotation, shift=two.shift - rotation @ one.shift, left=float("nan"))
 
 
-def align(measured: Floats, predicted: Floats, *, turns: Floats | None = None, lever: float = 0.0, mirrored: bool = False) -> Registration:
-    """The rigid motion from `predicted` to `measured` points (n, 3) [m], robustly (Kabsch 1976, Cauchy weights by distance).
+def align(
+    measured: Floats,
+    predicted: Floats,
+    *,
+    turns: Floats | None = None,
+    lever: float = 0.0,
+    mirrored: bool = False,
+) -> Registration:
+    """The rigid motion from `predicted` to `measured` points (n, 3) [m], robustly (Kabsch 1976, Cauchy
+    weights by distance).
 
-    `turns` (m, 3, 3) are measured rotations times the transposes of predicted ones; each counts as points at `lever` [m]. What the
-    points do not determine, as the rotation about a line of them, stays zero. `mirrored`: the best improper rotation instead.
+    `turns` (m, 3, 3) are measured rotations times the transposes of predicted ones; each counts as points at
+    `lever` [m]. What the points do not determine, as the rotation about a line of them, stays zero.
+    `mirrored`: the best improper rotation instead.
     """
     weight = np.ones(len(measured))
     rotation, shift = np.eye(3), np.zeros(3)

@@ -40,7 +40,8 @@ _MOST_RUNS = 20  # lines of the table; a log with more runs is read in residuals
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Replay:
-    """A log and what the model says to the same inputs. Lengths in metres, base frame; residual = measured - predicted."""
+    """A log and what the model says to the same inputs. Lengths in metres, base frame; residual = measured -
+    predicted."""
 
     log: RunLog
     robot: Robot
@@ -91,7 +92,8 @@ class Replay:
 
     @property
     def baseline_rms(self) -> float:
-        """What no model at all leaves: the measured tip's distance from the straight robot's tip, root mean square [m]."""
+        """What no model at all leaves: the measured tip's distance from the straight robot's tip, root mean
+        square [m]."""
         return _rms(self.log.tip_position[self.compared] - (0.0, 0.0, self.robot.length))
 
     @property
@@ -108,24 +110,37 @@ class Replay:
         """The rows of the mask `which` (n,)."""
         points = None if self.points is None else self.points[which]
         tip, converged = self.tip_position[which], self.converged[which]
-        return Replay(log=self.log.rows(which), robot=self.robot, tip_position=tip, converged=converged, points=points)
+        return Replay(
+            log=self.log.rows(which), robot=self.robot, tip_position=tip, converged=converged, points=points
+        )
 
 
-def replay(log: RunLog, robot: Robot, *, simulator: Callable[..., Any] | None = None, progress: Progress | None = None) -> Replay:
+def replay(
+    log: RunLog,
+    robot: Robot,
+    *,
+    simulator: Callable[..., Any] | None = None,
+    progress: Progress | None = None,
+) -> Replay:
     """The model's answer to every row of `log`, each row one robot of a batch.
 
-    Effects of the robot are carried over the whole log, memories, clocks and camera included; each run begins at rest. The
-    measured frame is taken as the robot's base frame: nothing is registered and nothing is fitted. Where another reading of the log
-    would follow far better, `questions` of the answer ask for it. `simulator` stands in for `fastrod.Simulator`, and leaves the
-    questions out; `progress` is called with the rows done and the rows in all.
-    Raises `LogError` where no row of the log can be compared, `InputError` for a robot that lengths do not drive.
+    Effects of the robot are carried over the whole log, memories, clocks and camera included; each run begins
+    at rest. The measured frame is taken as the robot's base frame: nothing is registered and nothing is
+    fitted. Where another reading of the log would follow far better, `questions` of the answer ask for it.
+    `simulator` stands in for `fastrod.Simulator`, and leaves the questions out; `progress` is called with the
+    rows done and the rows in all. Raises `LogError` where no row of the log can be compared, `InputError` for
+    a robot that lengths do not drive.
     """
     _check_driven_by_lengths(robot)
     if not log.measured.any():
-        raise LogError(f"log {log.name!r} has no row in which every input and the tip are there; there is nothing to compare.")
+        raise LogError(
+            f"log {log.name!r} has no row in which every input and the tip are there; there is "
+            "nothing to compare."
+        )
     asked: tuple[str, ...] = ()
     if simulator is None:
-        from fastrod.identification.log.questions import questions  # these load numba, which no other command line word needs
+        # these load numba, which no other command line word needs
+        from fastrod.identification.log.questions import questions
         from fastrod.simulator import Simulator
 
         asked = questions(log, robot)
@@ -133,7 +148,11 @@ def replay(log: RunLog, robot: Robot, *, simulator: Callable[..., Any] | None = 
             return _with_effects(log, robot, progress, asked)
         simulator = Simulator
     n_points = 0 if log.points is None else len(robot.log_points)
-    tip, points, converged = np.full((len(log), 3), np.nan), np.full((len(log), n_points, 3), np.nan), np.zeros(len(log), dtype=np.bool_)
+    tip, points, converged = (
+        np.full((len(log), 3), np.nan),
+        np.full((len(log), n_points, 3), np.nan),
+        np.zeros(len(log), dtype=np.bool_),
+    )
     rows = np.flatnonzero(log.driven)
     for start in range(0, len(rows), CHUNK):
         chunk = rows[start : start + CHUNK]
@@ -141,7 +160,14 @@ def replay(log: RunLog, robot: Robot, *, simulator: Callable[..., Any] | None = 
         if progress is not None:
             progress(start + len(chunk), len(rows))
     tip[~converged], points[~converged] = np.nan, np.nan
-    return Replay(log=log, robot=robot, tip_position=tip, converged=converged, points=points if n_points else None, questions=asked)
+    return Replay(
+        log=log,
+        robot=robot,
+        tip_position=tip,
+        converged=converged,
+        points=points if n_points else None,
+        questions=asked,
+    )
 
 
 def _with_effects(log: RunLog, robot: Robot, progress: Progress | None, asked: tuple[str, ...]) -> Replay:
@@ -150,7 +176,11 @@ def _with_effects(log: RunLog, robot: Robot, progress: Progress | None, asked: t
 
     samples, model = sample(log), known_model(robot)
     n_points = 0 if log.points is None else len(robot.log_points)
-    tip, points, converged = np.full((len(log), 3), np.nan), np.full((len(log), n_points, 3), np.nan), np.zeros(len(log), dtype=np.bool_)
+    tip, points, converged = (
+        np.full((len(log), 3), np.nan),
+        np.full((len(log), n_points, 3), np.nan),
+        np.zeros(len(log), dtype=np.bool_),
+    )
     for start in range(0, len(samples.log), CHUNK):
         part = samples.on(np.arange(start, min(start + CHUNK, len(samples.log))))
         pose = predict(model, np.zeros(0), part, Rod(part, robot, points=n_points > 0))
@@ -158,11 +188,19 @@ def _with_effects(log: RunLog, robot: Robot, progress: Progress | None, asked: t
         tip[rows], points[rows], converged[rows] = pose.position[pose.ok], pose.points[pose.ok], True
         if progress is not None:
             progress(part.rows[-1] + 1, len(samples.log))
-    return Replay(log=log, robot=robot, tip_position=tip, converged=converged, points=points if n_points else None, questions=asked)
+    return Replay(
+        log=log,
+        robot=robot,
+        tip_position=tip,
+        converged=converged,
+        points=points if n_points else None,
+        questions=asked,
+    )
 
 
 def make_folder(path: str | Path) -> Path:
-    """The folder at `path`, made where it is not there. Raises `InputError` where it cannot be made or written into."""
+    """The folder at `path`, made where it is not there. Raises `InputError` where it cannot be made or
+    written into."""
     folder = Path(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -195,7 +233,12 @@ def table(result: Replay) -> Table:
 
     title = f"{result.log.name} on {result.robot.name}: tip residual [mm], base frame"
     grid = Table(
-        title=escape(title), title_justify="left", caption_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0)
+        title=escape(title),
+        title_justify="left",
+        caption_justify="left",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+        padding=(0, 1, 0, 0),
     )
     for name in ("run", "rms x", "rms y", "rms z", "rms", "max", "excursion", "converged"):
         grid.add_column(name, justify="left" if name == "run" else "right")
@@ -205,14 +248,19 @@ def table(result: Replay) -> Table:
     if len(parts) > _MOST_RUNS:
         grid.add_row(f"... {len(parts) - _MOST_RUNS} more runs")
     grid.add_row("all", *_cells(result), style="bold")
-    grid.caption = f"{_MEANING}; rms, max of its length\nexcursion: measured tip from its own mean; {_NONE} if below the rms\n{_STATIC}"
+    grid.caption = (
+        f"{_MEANING}; rms, max of its length\nexcursion: measured tip from its own mean; {_NONE} "
+        f"if below the rms\n{_STATIC}"
+    )
     return grid
 
 
 def draw(result: Replay) -> Figure:
-    """Measured and predicted x, y, z and their distance over time, the two paths seen along y and along z, and how the distance spreads.
+    """Measured and predicted x, y, z and their distance over time, the two paths seen along y and along z,
+    and how the distance spreads.
 
-    Only rows that were measured are drawn. Above `DENSE` rows the curves over time are envelopes and the paths points.
+    Only rows that were measured are drawn. Above `DENSE` rows the curves over time are envelopes and the
+    paths points.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # no window, and no pyplot state to clean up
     from matplotlib.figure import Figure
@@ -231,10 +279,17 @@ def draw(result: Replay) -> Figure:
     right.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=2, frameon=False)
     share = f", {1e2 * result.rms / result.excursion_rms:.0f} % of the excursion" if _moves(result) else ""
     figure.suptitle(
-        f"{result.log.name} on {result.robot.name}: tip error {1e3 * result.rms:.3g} mm rms{share}", x=0.01, ha="left", fontweight="bold"
+        f"{result.log.name} on {result.robot.name}: tip error {1e3 * result.rms:.3g} mm rms{share}",
+        x=0.01,
+        ha="left",
+        fontweight="bold",
     )
     rows = f"{int(result.compared.sum())} of {len(result.log)} rows compared; only measured rows are drawn"
-    rows += f"; a band spans the least to the greatest of {_stride(shown.log, _BINS)} rows" if len(shown.log) > DENSE else ""
+    rows += (
+        f"; a band spans the least to the greatest of {_stride(shown.log, _BINS)} rows"
+        if len(shown.log) > DENSE
+        else ""
+    )
     left.supxlabel(f"{_MEANING}; {_STATIC}\n{rows}", x=0.01, ha="left", fontsize=8, color=_INK)
     return figure
 
@@ -243,13 +298,15 @@ def _check_driven_by_lengths(robot: Robot) -> None:
     for number, segment in enumerate(robot.segments, 1):
         if segment.mode == "tendon_tension":
             raise InputError(
-                f"segment {number} of robot {robot.name!r} is in mode 'tendon_tension', but a run log gives tendon lengths; "
+                f"segment {number} of robot {robot.name!r} is in mode 'tendon_tension', but a run log gives "
+                "tendon lengths; "
                 "replay it in mode 'tendon_length'."
             )
 
 
 def _solve(log: RunLog, robot: Robot, simulator: Callable[..., Any]) -> tuple[Floats, Floats, Mask]:
-    """Tip (n, 3) and further points (n, k, 3) in the base frame [m], and which rows converged, of one batch."""
+    """Tip (n, 3) and further points (n, k, 3) in the base frame [m], and which rows converged, of one
+    batch."""
     sim = simulator(robot, n_robots=len(log))
     state = sim.settle(**inputs(log, robot))
     rotation, origin = base_of(log, robot)
@@ -258,11 +315,16 @@ def _solve(log: RunLog, robot: Robot, simulator: Callable[..., Any]) -> tuple[Fl
         shape = sim.shape(np.array(robot.log_points))
         points = np.asarray(shape.position, dtype=np.float64)
     tip = np.asarray(state.tip_position, dtype=np.float64)
-    return _into_base(tip[:, None] - origin, rotation)[:, 0], _into_base(points - origin, rotation), np.asarray(state.ok, dtype=np.bool_)
+    return (
+        _into_base(tip[:, None] - origin, rotation)[:, 0],
+        _into_base(points - origin, rotation),
+        np.asarray(state.ok, dtype=np.bool_),
+    )
 
 
 def _into_base(world: Floats, rotation: Floats) -> Floats:
-    """(n, k, 3) vectors of the world frame, in the base frame of each row; `rotation` (n, 3, 3) is world_from_base."""
+    """(n, k, 3) vectors of the world frame, in the base frame of each row; `rotation` (n, 3, 3) is
+    world_from_base."""
     return np.asarray(np.einsum("nji,nkj->nki", rotation, world), dtype=np.float64)
 
 
@@ -279,18 +341,23 @@ def _cells(part: Replay) -> list[str]:
 
 
 def _moves(part: Replay) -> bool:
-    """Whether the measured tip moves by at least the rms of its residual; otherwise a share of the excursion says nothing."""
+    """Whether the measured tip moves by at least the rms of its residual; otherwise a share of the excursion
+    says nothing."""
     return part.excursion_rms > 0.0 and part.excursion_rms >= part.rms
 
 
 def _write_residuals(result: Replay, path: Path) -> None:
     log, residual = result.log, result.residual
     names = [f"{what}_{axis}" for what in ("measured", "predicted", "residual") for axis in "xyz"]
-    values = np.concatenate([log.tip_position, result.tip_position, residual, np.linalg.norm(residual, axis=1)[:, None]], axis=1)
+    values = np.concatenate(
+        [log.tip_position, result.tip_position, residual, np.linalg.norm(residual, axis=1)[:, None]], axis=1
+    )
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["t", "run", *names, "residual_norm", "converged"])
-        for t, run, row, ok in zip(log.t.tolist(), log.run.tolist(), values.tolist(), result.converged.tolist(), strict=True):
+        for t, run, row, ok in zip(
+            log.t.tolist(), log.run.tolist(), values.tolist(), result.converged.tolist(), strict=True
+        ):
             writer.writerow([_text(t), run, *map(_text, row), int(ok)])
 
 
@@ -302,7 +369,8 @@ _MEASURED, _PREDICTED, _RESIDUAL, _INK = "#1f2937", "#e4572e", "#2a78b5", "#4b55
 
 
 def _timeline(log: RunLog) -> tuple[Floats, NDArray[np.int64]]:
-    """(n,) time with the runs laid one after the other from 0 [s], and the first row of each run but the first.
+    """(n,) time with the runs laid one after the other from 0 [s], and the first row of each run but the
+    first.
 
     A log of one run keeps its own time. Every row has a time.
     """
@@ -319,7 +387,8 @@ def _broken(x: Floats, y: Floats, gaps: NDArray[np.int64]) -> tuple[Floats, Floa
 
 
 def _gaps(time: Floats, breaks: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Rows before which a curve is interrupted: where a run starts, or where the log skips far more time than it usually does."""
+    """Rows before which a curve is interrupted: where a run starts, or where the log skips far more time than
+    it usually does."""
     skip = np.diff(time)
     usual = float(np.nanmedian(skip)) if np.isfinite(skip).any() else 0.0
     long = np.flatnonzero(skip > 30.0 * usual) + 1 if usual > 0.0 else breaks
@@ -332,8 +401,24 @@ def _over_time(panels: list[Axes], shown: Replay) -> None:
     gaps = _gaps(time, breaks)
     curve = partial(_band, stride=_stride(shown.log, _BINS)) if len(time) > DENSE else _line
     for k, axis in enumerate("xyz"):
-        curve(panels[k], time, 1e3 * shown.tip_position[:, k], gaps, colour=_PREDICTED, width=2.2, label="predicted")
-        curve(panels[k], time, 1e3 * shown.log.tip_position[:, k], gaps, colour=_MEASURED, width=0.9, label="measured")
+        curve(
+            panels[k],
+            time,
+            1e3 * shown.tip_position[:, k],
+            gaps,
+            colour=_PREDICTED,
+            width=2.2,
+            label="predicted",
+        )
+        curve(
+            panels[k],
+            time,
+            1e3 * shown.log.tip_position[:, k],
+            gaps,
+            colour=_MEASURED,
+            width=0.9,
+            label="measured",
+        )
         panels[k].set_ylabel(f"tip {axis} [mm]")
     curve(panels[3], time, _norm(shown), gaps, colour=_RESIDUAL, width=0.9, label="")
     _rms_line(panels[3].axhline, shown)
@@ -344,12 +429,32 @@ def _over_time(panels: list[Axes], shown: Replay) -> None:
     _name_runs(panels, shown.log.run[[0, *breaks]].tolist(), time, breaks)
 
 
-def _line(axes: Axes, time: Floats, values: Floats, gaps: NDArray[np.int64], *, colour: str, width: float, label: str) -> None:
+def _line(
+    axes: Axes,
+    time: Floats,
+    values: Floats,
+    gaps: NDArray[np.int64],
+    *,
+    colour: str,
+    width: float,
+    label: str,
+) -> None:
     axes.plot(*_broken(time, values, gaps), color=colour, lw=width, alpha=0.85, label=label)
 
 
-def _band(axes: Axes, time: Floats, values: Floats, gaps: NDArray[np.int64], *, colour: str, width: float, label: str, stride: int) -> None:
-    """The least and the greatest of each `stride` rows, none across a gap, filled between; edges half as wide as a line's `width`."""
+def _band(
+    axes: Axes,
+    time: Floats,
+    values: Floats,
+    gaps: NDArray[np.int64],
+    *,
+    colour: str,
+    width: float,
+    label: str,
+    stride: int,
+) -> None:
+    """The least and the greatest of each `stride` rows, none across a gap, filled between; edges half as wide
+    as a line's `width`."""
     starts = np.union1d(np.arange(0, len(time), stride), gaps)
     breaks = np.searchsorted(starts, gaps)
     ends = np.append(starts[1:], len(time)) - 1
@@ -357,7 +462,15 @@ def _band(axes: Axes, time: Floats, values: Floats, gaps: NDArray[np.int64], *, 
     low, high = (np.repeat(extreme.reduceat(values, starts), 2) for extreme in (np.fmin, np.fmax))
     across, bottom = _broken(x, low, 2 * breaks)
     top = _broken(x, high, 2 * breaks)[1]
-    axes.fill_between(across, bottom, top, facecolor=(colour, 0.3), edgecolor=(colour, 0.9), lw=0.5 * min(width, 1.6), label=label)
+    axes.fill_between(
+        across,
+        bottom,
+        top,
+        facecolor=(colour, 0.3),
+        edgecolor=(colour, 0.9),
+        lw=0.5 * min(width, 1.6),
+        label=label,
+    )
 
 
 def _stride(log: RunLog, parts: int) -> int:
@@ -366,7 +479,8 @@ def _stride(log: RunLog, parts: int) -> int:
 
 
 def _path(axes: Axes, shown: Replay, plane: tuple[int, int]) -> None:
-    """Both tips in a plane of the base [mm]: predicted below measured, or points of both in turns where there are many."""
+    """Both tips in a plane of the base [mm]: predicted below measured, or points of both in turns where there
+    are many."""
     a, b = plane
     tips = [1e3 * shown.tip_position[:, plane], 1e3 * shown.log.tip_position[:, plane]]
     if len(shown.log) > DENSE:
@@ -376,8 +490,18 @@ def _path(axes: Axes, shown: Replay, plane: tuple[int, int]) -> None:
         axes.scatter(points[:, 0], points[:, 1], c=colours.tolist(), s=1.6, lw=0.0, alpha=0.8)
     else:
         gaps = _gaps(*_timeline(shown.log))
-        for tip, colour, width, size in zip(tips, (_PREDICTED, _MEASURED), (1.6, 0.6), (4.5, 2.5), strict=True):
-            axes.plot(*_broken(tip[:, 0], tip[:, 1], gaps), color=colour, lw=width, marker=".", ms=size, mew=0.0, alpha=0.7)
+        for tip, colour, width, size in zip(
+            tips, (_PREDICTED, _MEASURED), (1.6, 0.6), (4.5, 2.5), strict=True
+        ):
+            axes.plot(
+                *_broken(tip[:, 0], tip[:, 1], gaps),
+                color=colour,
+                lw=width,
+                marker=".",
+                ms=size,
+                mew=0.0,
+                alpha=0.7,
+            )
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel(f"{'xyz'[a]} [mm]")
     axes.set_ylabel(f"{'xyz'[b]} [mm]")
@@ -388,7 +512,9 @@ def _path(axes: Axes, shown: Replay, plane: tuple[int, int]) -> None:
 def _spread(axes: Axes, shown: Replay) -> None:
     """How many rows have which residual distance [mm]."""
     norm = _norm(shown)
-    axes.hist(norm[np.isfinite(norm)], bins=40, range=(0.0, 1e3 * shown.max or 1.0), color=_RESIDUAL, alpha=0.8)
+    axes.hist(
+        norm[np.isfinite(norm)], bins=40, range=(0.0, 1e3 * shown.max or 1.0), color=_RESIDUAL, alpha=0.8
+    )
     _rms_line(axes.axvline, shown)
     axes.set_xlabel("distance [mm]")
     axes.set_ylabel("rows")
@@ -412,4 +538,6 @@ def _name_runs(panels: list[Axes], labels: list[str], time: Floats, breaks: NDAr
             axes.axvline(time[start], color=_INK, lw=0.7, ls=":")
     if len(breaks) and len(breaks) < 8:
         for start, label in zip((0, *breaks), labels, strict=True):
-            panels[0].text(time[start], 1.02, f" {label}", transform=panels[0].get_xaxis_transform(), fontsize=8)
+            panels[0].text(
+                time[start], 1.02, f" {label}", transform=panels[0].get_xaxis_transform(), fontsize=8
+            )

@@ -17,7 +17,8 @@ _STRETCHES = 20  # of each run, of which every fourth is held out
 
 
 def merged(logs: Sequence[RunLog]) -> RunLog:
-    """Several logs of one robot as one, each run labelled by its log where there are several. Raises `LogError` where they differ."""
+    """Several logs of one robot as one, each run labelled by its log where there are several. Raises
+    `LogError` where they differ."""
     if not logs:
         raise LogError("no log was given.")
     if len(logs) == 1:
@@ -25,7 +26,8 @@ def merged(logs: Sequence[RunLog]) -> RunLog:
     names = [log.name for log in logs]
     if len(set(names)) < len(names):
         raise LogError(
-            f"two logs are named {next(n for n in names if names.count(n) > 1)!r}; rename one, so that their runs can be told apart."
+            f"two logs are named {next(n for n in names if names.count(n) > 1)!r}; rename one, so that "
+            "their runs can be told apart."
         )
     if len({log.dl.shape[1] for log in logs}) > 1:
         raise LogError("the logs have different numbers of tendons; they must be of one robot.")
@@ -40,10 +42,15 @@ def merged(logs: Sequence[RunLog]) -> RunLog:
             columns[name] = np.concatenate(parts)
         elif any(have) and name in ("payload", "tip_force"):
             width = () if name == "payload" else (3,)
-            columns[name] = np.concatenate([np.zeros((len(log), *width)) if p is None else p for p, log in zip(parts, logs, strict=True)])
+            columns[name] = np.concatenate(
+                [np.zeros((len(log), *width)) if p is None else p for p, log in zip(parts, logs, strict=True)]
+            )
         elif any(have):
             has, lacks = (logs[have.index(flag)].name for flag in (True, False))
-            raise LogError(f"log {has!r} has columns for {name}, log {lacks!r} has none; logs that share parameters need the same columns.")
+            raise LogError(
+                f"log {has!r} has columns for {name}, log {lacks!r} has none; logs that share "
+                "parameters need the same columns."
+            )
     labels = [np.array([f"{log.name}:{label}" if label else log.name for label in log.run]) for log in logs]
     return RunLog(
         name=" + ".join(names),
@@ -58,8 +65,9 @@ def merged(logs: Sequence[RunLog]) -> RunLog:
 def held_out_rows(samples: Samples, held_out: Sequence[str]) -> tuple[Flags, list[str]]:
     """(n,) samples that are held out, and what they are in words.
 
-    Each of `held_out` is the label of a run, or `RUN@START:END` in seconds of the run's own time (`@60:` is from 60 s on; the run
-    may be left out where there is one). Without any: every fourth of twenty stretches of each run.
+    Each of `held_out` is the label of a run, or `RUN@START:END` in seconds of the run's own time (`@60:` is
+    from 60 s on; the run may be left out where there is one). Without any: every fourth of twenty stretches
+    of each run.
     """
     log = samples.log
     mask = np.zeros(len(log), bool)
@@ -73,17 +81,30 @@ def held_out_rows(samples: Samples, held_out: Sequence[str]) -> tuple[Flags, lis
         if label and label not in log.runs:
             named = [run for run in log.runs if run]
             if not named:
-                raise UnknownNameError(f"no run {label!r} to hold out; log {log.name!r} names no runs: give a time, as in '@60:'.")
-            raise UnknownNameError(f"no run {label!r} to hold out in log {log.name!r}; {nearest(label, named)}")
+                raise UnknownNameError(
+                    f"no run {label!r} to hold out; log {log.name!r} names no runs: give "
+                    "a time, as in '@60:'."
+                )
+            raise UnknownNameError(
+                f"no run {label!r} to hold out in log {log.name!r}; {nearest(label, named)}"
+            )
         rows = (log.run == label) if label else np.ones(len(log), bool)
         if window:
             match = re.fullmatch(r"(\d*\.?\d+|\d+\.|):(\d*\.?\d+|\d+\.|)", window)
             if match is None:
-                raise LogError(f"held-out {text!r} is no stretch of time; write RUN@START:END in seconds, for example {label}@90:150.")
-            start, end = (float(part) if part else edge for part, edge in zip(match.groups(), (-np.inf, np.inf), strict=True))
+                raise LogError(
+                    f"held-out {text!r} is no stretch of time; write RUN@START:END in seconds, "
+                    f"for example {label}@90:150."
+                )
+            start, end = (
+                float(part) if part else edge
+                for part, edge in zip(match.groups(), (-np.inf, np.inf), strict=True)
+            )
             rows = rows & (samples.time >= start) & (samples.time < end)
         if not rows.any():
-            raise LogError(f"held-out {text!r} has no samples; the log's runs last to {samples.time.max():g} s.")
+            raise LogError(
+                f"held-out {text!r} has no samples; the log's runs last to {samples.time.max():g} s."
+            )
         mask |= rows
     if mask[samples.rows].all():
         raise LogError(f"everything in log {log.name!r} is held out; leave something to fit.")

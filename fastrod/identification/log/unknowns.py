@@ -1,4 +1,5 @@
-"""What is not known: parameters of the robot and of effects, each with a prior; and the model that a vector of them makes."""
+"""What is not known: parameters of the robot and of effects, each with a prior; and the model that a vector
+of them makes."""
 
 from __future__ import annotations
 
@@ -17,16 +18,23 @@ from fastrod.model.robot import Robot
 from fastrod.model.routing import Wiring, wire
 from fastrod.types import Floats
 
-_SEGMENT = {"length": "m", "bending_stiffness": "N m^2", "torsional_stiffness": "N m^2", "line_density": "kg/m"}
+_SEGMENT = {
+    "length": "m",
+    "bending_stiffness": "N m^2",
+    "torsional_stiffness": "N m^2",
+    "line_density": "kg/m",
+}
 _TENDON = {"offset": "m", "angle": "rad", "compliance": "m/N", "gain": "", "zero": "m"}
-_ADDED = ("angle", "gain", "zero")  # a shared one of these is the same number for all; of the others, the same factor
+# a shared one of these is the same number for all; of the others, the same factor
+_ADDED = ("angle", "gain", "zero")
 _POSITIVE = ("length", "bending_stiffness", "torsional_stiffness", "offset")
 STIFFNESS_SD = 0.3
 """Relative prior of EI and GJ where the robot file says nothing."""
 FREE_CAMERA = {"registration_sd": (0.01, 0.05), "marker_offset_sd": 0.02, "latency_sd": 0.15}
 """Priors of a camera that nobody calibrated: m and rad, m, s."""
 ROUGH = (0.1, 0.2)
-"""Prior of a rough registration: robot lengths, rad. With 0.55 mm of backlash one was 0.003 rad and 1.3 mm off."""
+"""Prior of a rough registration: robot lengths, rad. With 0.55 mm of backlash one was 0.003 rad and 1.3 mm
+off."""
 _WIDE = 5.0  # typical sizes: width of the prior of an effect's size
 
 
@@ -93,8 +101,15 @@ class Model:
         """(p,) mean and sd of the fitted numbers."""
         return np.array([u.outside(u.mean) for u in self.unknowns]), np.array([u.sd for u in self.unknowns])
 
-    def with_effect(self, name: str, start: Mapping[str, float] | None = None, drop: Sequence[str] = (), split: bool = False) -> Model:
-        """This model with one more effect, all its parameters unknown but those named in `drop`, which stay neutral."""
+    def with_effect(
+        self,
+        name: str,
+        start: Mapping[str, float] | None = None,
+        drop: Sequence[str] = (),
+        split: bool = False,
+    ) -> Model:
+        """This model with one more effect, all its parameters unknown but those named in `drop`, which stay
+        neutral."""
         added = effect_unknowns(name, self.wiring, start or {}, drop, split)
         names = tuple(known for known in effect_names() if known in (*self.effects, name))
         return replace(self, effects=names, unknowns=self.unknowns + added)
@@ -105,7 +120,8 @@ class Model:
         return replace(self, effects=tuple(e for e in self.effects if e != name), unknowns=kept)
 
     def values(self, theta: Floats) -> dict[str, Floats]:
-        """Effect name -> (n_columns,) values at the fitted numbers `theta` (p,); what is not unknown, as the robot has it or neutral."""
+        """Effect name -> (n_columns,) values at the fitted numbers `theta` (p,); what is not unknown, as the
+        robot has it or neutral."""
         known = named_effects(self.robot)
         values = {name: read_values(name, known.get(name, {}), self.wiring, "robot") for name in self.effects}
         for unknown, number in zip(self.unknowns, theta, strict=True):
@@ -122,7 +138,8 @@ class Model:
         return _whole(robot, self.robot)
 
     def identified(self, theta: Floats) -> Robot:
-        """The robot with its effects as tables; `[fit]` and `[sensor]` are left out, for what they asked for is in it now."""
+        """The robot with its effects as tables; `[fit]` and `[sensor]` are left out, for what they asked for
+        is in it now."""
         tables = []
         for name, values in self.values(theta).items():
             table: dict[str, Any] = {"name": name}
@@ -156,17 +173,35 @@ def base_model(robot: Robot, *, free_camera: bool = False, registered: bool = Fa
         if not any(u.place[:2] == ("robot", kind) for u in unknowns):
             name = f"segment.*.{kind}"
             numbers = tuple(str(k) for k in range(robot.n_segments))
-            unknowns.append(Unknown(name, "x nominal", 1.0, 1.0, STIFFNESS_SD, (0.05, 20.0), 0.05, ("robot", kind, *numbers), log=True))
+            unknowns.append(
+                Unknown(
+                    name,
+                    "x nominal",
+                    1.0,
+                    1.0,
+                    STIFFNESS_SD,
+                    (0.05, 20.0),
+                    0.05,
+                    ("robot", kind, *numbers),
+                    log=True,
+                )
+            )
     sensor = dict(robot.sensor) | (FREE_CAMERA if free_camera else {})
     if registered:
-        sensor["registration_sd"] = _wider(sensor.get("registration_sd", 0.0), (ROUGH[0] * robot.length, ROUGH[1]))
+        sensor["registration_sd"] = _wider(
+            sensor.get("registration_sd", 0.0), (ROUGH[0] * robot.length, ROUGH[1])
+        )
     unknowns += _camera(sensor, robot, wiring)
     effects += [u.place[1] for u in unknowns if u.place[0] == "effect"]
     return Model(robot, wiring, tuple(name for name in effect_names() if name in effects), tuple(unknowns))
 
 
 def effect_unknowns(
-    name: str, wiring: Wiring, start: Mapping[str, float] | None = None, drop: Sequence[str] = (), split: bool = False
+    name: str,
+    wiring: Wiring,
+    start: Mapping[str, float] | None = None,
+    drop: Sequence[str] = (),
+    split: bool = False,
 ) -> tuple[Unknown, ...]:
     """The parameters of an effect as unknowns; one for all segments, or with `split` one for each."""
     found = []
@@ -188,10 +223,18 @@ def effect_unknowns(
             sd = 1.5 if log else _WIDE * parameter.scale
             found.append(
                 Unknown(
-                    f"{name}.{label}", parameter.unit, begin, mean, sd, parameter.bounds, parameter.scale,
-                    ("effect", name, *map(str, places)), log, parameter.shape,
+                    f"{name}.{label}",
+                    parameter.unit,
+                    begin,
+                    mean,
+                    sd,
+                    parameter.bounds,
+                    parameter.scale,
+                    ("effect", name, *map(str, places)),
+                    log,
+                    parameter.shape,
                 )
-            )  # fmt: skip
+            )
     return tuple(found)
 
 
@@ -209,11 +252,15 @@ def _targets(robot: Robot, wiring: Wiring, target: str, prior: Mapping[str, floa
     unknown = [key for key in prior if key not in ("sd", "shared")]
     if unknown or "sd" not in prior:
         raise RobotError(
-            f"robot {robot.name!r}: [fit] {target!r} is {dict(prior)!r}; give {{sd = ...}} in its unit, and shared = true for one for all."
+            f"robot {robot.name!r}: [fit] {target!r} is {dict(prior)!r}; give {{sd = ...}} in its unit, and "
+            "shared = true for one for all."
         )
     sd = float(prior["sd"])
     if not (math.isfinite(sd) and sd > 0.0):
-        raise RobotError(f"robot {robot.name!r}: [fit] {target!r} has sd {sd!r}; it must be positive: leave out what is known.")
+        raise RobotError(
+            f"robot {robot.name!r}: [fit] {target!r} has sd {sd!r}; it must be positive: leave "
+            "out what is known."
+        )
     which = list(range(count)) if number == "*" else [int(number) - 1]
     if kind in ("gain", "zero"):
         return _drive_unknowns(wiring, kind, which, sd, bool(prior.get("shared")), target)
@@ -224,17 +271,45 @@ def _targets(robot: Robot, wiring: Wiring, target: str, prior: Mapping[str, floa
         if kind in _ADDED:
             return [Unknown(target, unit, 0.0, 0.0, sd, (-10.0 * sd, 10.0 * sd), 0.3 * sd, places)]
         middle = float(np.mean(nominal)) or 1.0
-        return [Unknown(target, "x nominal", 1.0, 1.0, sd / middle, (0.05, 20.0), min(0.05, 0.3 * sd / middle), places, log=True)]
+        return [
+            Unknown(
+                target,
+                "x nominal",
+                1.0,
+                1.0,
+                sd / middle,
+                (0.05, 20.0),
+                min(0.05, 0.3 * sd / middle),
+                places,
+                log=True,
+            )
+        ]
     made = []
     for k, value in zip(which, nominal, strict=True):
-        low = max(value - 10.0 * sd, 0.05 * value if kind in _POSITIVE else -math.inf if kind == "angle" else 0.0)
+        low = max(
+            value - 10.0 * sd, 0.05 * value if kind in _POSITIVE else -math.inf if kind == "angle" else 0.0
+        )
         step = min(0.3 * sd, 0.05 * abs(value) or math.inf)
-        made.append(Unknown(f"{word}.{k + 1}.{kind}", unit, value, value, sd, (low, value + 10.0 * sd), step, ("robot", kind, str(k))))
+        made.append(
+            Unknown(
+                f"{word}.{k + 1}.{kind}",
+                unit,
+                value,
+                value,
+                sd,
+                (low, value + 10.0 * sd),
+                step,
+                ("robot", kind, str(k)),
+            )
+        )
     return made
 
 
-def _drive_unknowns(wiring: Wiring, kind: str, which: list[int], sd: float, shared: bool, target: str) -> list[Unknown]:
-    """Gains and zeros of wires are those of their drives: antagonists of one drive cannot be told apart by a bend."""
+def _drive_unknowns(
+    wiring: Wiring, kind: str, which: list[int], sd: float, shared: bool, target: str
+) -> list[Unknown]:
+    """Gains and zeros of wires are those of their drives: antagonists of one drive cannot be told apart by a
+    bend."""
     name = "drum_gain" if kind == "gain" else "encoder_offset"
     unit = _TENDON[kind]
     drives = list(dict.fromkeys(int(wiring.drive[t]) for t in which))
@@ -243,10 +318,16 @@ def _drive_unknowns(wiring: Wiring, kind: str, which: list[int], sd: float, shar
     return [
         Unknown(
             target if shared else f"tendon.{int(np.flatnonzero(wiring.drive == group[0])[0]) + 1}.{kind}",
-            unit, 0.0, 0.0, sd, (low, 10.0 * sd), 0.1 * sd, ("effect", name, *map(str, group)),
+            unit,
+            0.0,
+            0.0,
+            sd,
+            (low, 10.0 * sd),
+            0.1 * sd,
+            ("effect", name, *map(str, group)),
         )
         for group in groups
-    ]  # fmt: skip
+    ]
 
 
 def _pair(registration: Any) -> tuple[float, float]:
@@ -280,7 +361,11 @@ def _camera(sensor: Mapping[str, Any], robot: Robot, wiring: Wiring) -> list[Unk
             if effect_name == "latency":
                 low, start = 0.0, mean or min(0.5 * sd, 0.05)
             place = ("effect", effect_name, str(every.index(label)))
-            made.append(Unknown(f"{effect_name}.{label}", unit, start, mean, sd, (low, mean + 10.0 * sd), 0.1 * sd, place))
+            made.append(
+                Unknown(
+                    f"{effect_name}.{label}", unit, start, mean, sd, (low, mean + 10.0 * sd), 0.1 * sd, place
+                )
+            )
     return made
 
 
@@ -304,7 +389,9 @@ def _changed(robot: Robot, nominal: Robot, unknown: Unknown, value: float) -> Ro
             own: Any = getattr(nominal.segments[number], kind)
             new: Any = tuple(v * now / was for v in own) if isinstance(own, tuple) else now
             if kind == "length":
-                segments[number] = replace(segments[number], length=now, extension=_range(segments[number].extension, now))
+                segments[number] = replace(
+                    segments[number], length=now, extension=_range(segments[number].extension, now)
+                )
             else:
                 segments[number] = replace(segments[number], **{kind: new})
         else:
@@ -312,14 +399,20 @@ def _changed(robot: Robot, nominal: Robot, unknown: Unknown, value: float) -> Ro
             place = number - int(np.searchsorted(nominal.tendon_segment, k))
             tendons = list(segments[k].tendons)
             own = getattr(nominal.tendons[number], kind)
-            new = now if not isinstance(own, tuple) else tuple(v + now - was if kind == "angle" else v * now / was for v in own)
+            new = (
+                now
+                if not isinstance(own, tuple)
+                else tuple(v + now - was if kind == "angle" else v * now / was for v in own)
+            )
             tendons[place] = replace(tendons[place], **{kind: new})
-            segments[k] = replace(segments[k], tendons=tuple(tendons), body_radius=0.0)  # set again when all is known
+            # set again when all is known
+            segments[k] = replace(segments[k], tendons=tuple(tendons), body_radius=0.0)
     return replace(robot, segments=tuple(segments), log_points=())
 
 
 def _whole(robot: Robot, nominal: Robot) -> Robot:
-    """What a change of lengths and offsets must not lose: log points and body radii, moved where they would not fit."""
+    """What a change of lengths and offsets must not lose: log points and body radii, moved where they would
+    not fit."""
     widest = [0.0] * robot.n_segments
     for tendon, end in zip(robot.tendons, robot.tendon_segment, strict=True):
         for k, place in enumerate(tendon.position(int(end) + 1)):
@@ -328,7 +421,9 @@ def _whole(robot: Robot, nominal: Robot) -> Robot:
         replace(s, body_radius=max(n.body_radius, w) if n.body_radius else 0.0)
         for s, n, w in zip(robot.segments, nominal.segments, widest, strict=True)
     )
-    return replace(robot, segments=segments, log_points=tuple(min(s, robot.length) for s in nominal.log_points))
+    return replace(
+        robot, segments=segments, log_points=tuple(min(s, robot.length) for s in nominal.log_points)
+    )
 
 
 def _range(extension: tuple[float, float], length: float) -> tuple[float, float]:

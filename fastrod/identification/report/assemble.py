@@ -1,4 +1,5 @@
-"""From the end of the search to a `Result`: predictions on every sample, errors, estimates, classes, verdict."""
+"""From the end of the search to a `Result`: predictions on every sample, errors, estimates, classes,
+verdict."""
 
 from __future__ import annotations
 
@@ -27,15 +28,29 @@ ALL_AT_ONCE = 20000
 """Samples a batch when all are predicted."""
 _SURE = 1.06  # the variance of the noise is known from rest to about 6 %
 _FAR = 0.3  # of the robot's length: an error beyond counts no more, as an outlier's
-_SAY_LIMITS = 0.05  # of the error above the noise: where so much is left, shear and inertia are worth a sentence
+# of the error above the noise: where so much is left, shear and inertia are worth a sentence
+_SAY_LIMITS = 0.05
 
 
 def assemble(
-    *, samples: Samples, rows: Ints, tested: Flags, labels: Sequence[str], base: Base, search: Search, start: State, last: State,
-    last_sigma: Floats, state: State, found: list[str], steps: list[Step], fixed: dict[str, Estimate], threads: int | None,
-) -> Result:  # fmt: skip
-    """The result of a search: `start` without effects, `state` with those `found`, `last` with foils too. What was found is fitted
-    again to the training `rows`, of which the search saw a part."""
+    *,
+    samples: Samples,
+    rows: Ints,
+    tested: Flags,
+    labels: Sequence[str],
+    base: Base,
+    search: Search,
+    start: State,
+    last: State,
+    last_sigma: Floats,
+    state: State,
+    found: list[str],
+    steps: list[Step],
+    fixed: dict[str, Estimate],
+    threads: int | None,
+) -> Result:
+    """The result of a search: `start` without effects, `state` with those `found`, `last` with foils too.
+    What was found is fitted again to the training `rows`, of which the search saw a part."""
     robot = base.robot
     inspected = audit(search.samples, last.model.wiring, last.fit.residual, base.noise.lag1)
     squares = {"base": _square(start, base.weights[0]), "library": _square(state, base.target.sigma)}
@@ -65,7 +80,8 @@ def assemble(
     path = _path(start, state, found, samples, robot, used, test, search, threads)
     opinion = judge(
         **squares,
-        left_out=max(0.0, test_error.after**2 - _SURE * base.noise.floor**2) / max(test_error.before**2 - base.noise.floor**2, 1e-30),
+        left_out=max(0.0, test_error.after**2 - _SURE * base.noise.floor**2)
+        / max(test_error.before**2 - base.noise.floor**2, 1e-30),
         floor=base.noise.floor**2,
         audit=inspected,
         steps=steps,
@@ -82,7 +98,11 @@ def assemble(
     classes = _classes(steps, kept)
     effects = [_effect(name, estimates, classes, path, steps, base.noise.floor) for name in kept]
     wiring = state.model.wiring
-    lacks = advice.missing_excitation(search.samples, wiring.bend(np.asarray(samples.log.dl))) if wiring.n_tendons else []
+    lacks = (
+        advice.missing_excitation(search.samples, wiring.bend(np.asarray(samples.log.dl)))
+        if wiring.n_tendons
+        else []
+    )
     recommended = [advice.look_at(pattern) for pattern in opinion.patterns]
     recommended += [advice.separating_run(e.name, other) for e in effects for other in e.cannot_be_told_from]
     base_estimates = {name: e for name, e in estimates.items() if name.partition(".")[0] not in kept} | fixed
@@ -100,9 +120,18 @@ def assemble(
         after=after,
         train=train_error,
         test=test_error,
-        verdict="ambiguous" if opinion.verdict == "explained" and effects and effects[0].cannot_be_told_from else opinion.verdict,
+        verdict="ambiguous"
+        if opinion.verdict == "explained" and effects and effects[0].cannot_be_told_from
+        else opinion.verdict,
         summary=" ".join(
-            [opinion.summary, *(_sentences(limits(robot, samples)) if opinion.left > _SAY_LIMITS or not robot.n_tendons else [])]
+            [
+                opinion.summary,
+                *(
+                    _sentences(limits(robot, samples))
+                    if opinion.left > _SAY_LIMITS or not robot.n_tendons
+                    else []
+                ),
+            ]
         ),
         effects=effects,
         base_parameters=base_estimates,
@@ -120,14 +149,19 @@ def assemble(
     )
 
 
-def _nearer(one: State, other: State, samples: Samples, rows: Ints, robot: Robot, threads: int | None) -> State:
-    """The state whose prediction is nearer at the rows: a fit that goes by slopes can leave the valley where a load makes the rod snap."""
+def _nearer(
+    one: State, other: State, samples: Samples, rows: Ints, robot: Robot, threads: int | None
+) -> State:
+    """The state whose prediction is nearer at the rows: a fit that goes by slopes can leave the valley where
+    a load makes the rod snap."""
     part = samples.on(rows)
 
     def off(state: State) -> float:
         pose = predict(state.model, state.theta, part, Rod(part, robot, threads=threads))
         error = np.linalg.norm(np.asarray(samples.log.tip_position)[rows] - pose.position, axis=1)
-        return float(np.mean(np.where(pose.ok, np.minimum(error, _FAR * robot.length), _FAR * robot.length) ** 2))
+        return float(
+            np.mean(np.where(pose.ok, np.minimum(error, _FAR * robot.length), _FAR * robot.length) ** 2)
+        )
 
     return other if off(other) <= off(one) else one
 
@@ -139,7 +173,8 @@ def _square(state: State, sigma: Floats) -> float:
 
 
 def _own(state: State, name: str) -> float:
-    """How far an effect by itself moves the prediction: squares over the samples, the other parameters as they are."""
+    """How far an effect by itself moves the prediction: squares over the samples, the other parameters as
+    they are."""
     theta = state.theta.copy()
     for j, unknown in enumerate(state.model.unknowns):
         if unknown.place[:2] == ("effect", name) and not unknown.shape:
@@ -156,7 +191,9 @@ def _effect(
     steps: list[Step],
     floor: float,
 ) -> Found:
-    parameters = {key.partition(".")[2]: value for key, value in estimates.items() if key.partition(".")[0] == name}
+    parameters = {
+        key.partition(".")[2]: value for key, value in estimates.items() if key.partition(".")[0] == name
+    }
     taken = next((s.taken for s in steps if s.taken is not None and s.taken.name == name), None)
     evidence = {} if taken is None else {"z": taken.z, "bic": taken.bic_gain, "loss_share": taken.share}
     at = next(i for i, stage in enumerate(path) if stage.name == name)
@@ -164,14 +201,21 @@ def _effect(
     gain = (path[at - 1].held_out ** 2 - path[at].held_out ** 2) / excess
     title = (type(get_effect(name)).__doc__ or name).strip().splitlines()[0]
     return Found(
-        name=name, title=title, parameters=parameters, held_out_gain=gain, evidence=evidence, cannot_be_told_from=classes.get(name, [])
+        name=name,
+        title=title,
+        parameters=parameters,
+        held_out_gain=gain,
+        evidence=evidence,
+        cannot_be_told_from=classes.get(name, []),
     )
 
 
 def _classes(steps: list[Step], found: list[str]) -> dict[str, list[str]]:
     """Effects that explained a stage as well as the one that was taken."""
     return {
-        step.taken.name: [r for r in step.rivals if r not in found] for step in steps if step.taken is not None and step.taken.name in found
+        step.taken.name: [r for r in step.rivals if r not in found]
+        for step in steps
+        if step.taken is not None and step.taken.name in found
     }
 
 
@@ -185,10 +229,15 @@ def _tried(step: Step, kept: list[str], base: Base) -> list[Tried]:
             left = float(np.sqrt(c.state.losses.sum() / step.before.losses.sum())) * scale
         made.append(
             Tried(
-                name=c.name, held_out_rms=left, score=c.z, bic_gain=c.bic_gain, kept=c.name in kept,
-                why="kept" if c.name in kept else c.why or "another explains more", kind=c.foil.kind if c.foil else "effect",
+                name=c.name,
+                held_out_rms=left,
+                score=c.z,
+                bic_gain=c.bic_gain,
+                kept=c.name in kept,
+                why="kept" if c.name in kept else c.why or "another explains more",
+                kind=c.foil.kind if c.foil else "effect",
             )
-        )  # fmt: skip
+        )
     return made
 
 
@@ -198,14 +247,20 @@ def _estimates(state: State) -> tuple[dict[str, Estimate], tuple[list[str], Floa
     stderr = np.sqrt(np.maximum(np.diag(C), 0.0)) if n else np.zeros(0)
     _, sd = state.model.prior
     made = {}
-    for u, number, error, prior, at in zip(state.model.unknowns, state.theta, stderr, sd, state.fit.at_bound, strict=False):
+    for u, number, error, prior, at in zip(
+        state.model.unknowns, state.theta, stderr, sd, state.fit.at_bound, strict=False
+    ):
         value = u.inside(float(number))
         seen = bool(error < SEEN * prior)
         made[u.name] = Estimate(
-            value=value, stderr=float(error * value if u.log else error), unit=u.unit, identifiable=seen,
-            why="" if seen else "the data narrow its prior by less than a third", at_bound=at,
+            value=value,
+            stderr=float(error * value if u.log else error),
+            unit=u.unit,
+            identifiable=seen,
+            why="" if seen else "the data narrow its prior by less than a third",
+            at_bound=at,
             prior_sd=float(prior * value if u.log else prior),
-        )  # fmt: skip
+        )
     spread = np.where(stderr > 0.0, stderr, 1.0)
     return made, ([u.name for u in state.model.unknowns], np.asarray(C / spread[:, None] / spread[None, :]))
 
@@ -260,7 +315,10 @@ def _path(
 
     def stage(name: str, at: State) -> Stage:
         tip = _everywhere(at.model, at.theta, samples, robot, threads)
-        errors = [float(np.sqrt(_distance(samples, tip, which).mean())) if which.any() else float("nan") for which in (used, test)]
+        errors = [
+            float(np.sqrt(_distance(samples, tip, which).mean())) if which.any() else float("nan")
+            for which in (used, test)
+        ]
         return Stage(name=name, train=errors[0], held_out=errors[1])
 
     stages = [stage("base", start)]

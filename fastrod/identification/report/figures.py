@@ -32,12 +32,29 @@ _CLOSE_UP = 12.0  # s
 _PIECES = 90  # of the mean residual over time
 _LAG = 6.0  # s of autocorrelation
 _STYLE: dict[Any, Any] = {
-    "svg.fonttype": "none", "svg.hashsalt": "fastrod", "font.family": ["sans-serif"], "font.size": 9.5, "axes.spines.top": False,
-    "axes.spines.right": False, "axes.edgecolor": "#9ca3af", "axes.labelcolor": _INK, "axes.titlesize": 10.5, "axes.titleweight": "bold",
-    "axes.titlelocation": "left", "axes.grid": True, "axes.axisbelow": True, "grid.color": "#e5e7eb", "grid.linewidth": 0.7,
-    "xtick.color": _INK, "ytick.color": _INK, "text.color": "#1f2937", "legend.frameon": False, "legend.fontsize": 9.0,
-    "lines.linewidth": 1.4, "lines.solid_capstyle": "round",
-}  # fmt: skip
+    "svg.fonttype": "none",
+    "svg.hashsalt": "fastrod",
+    "font.family": ["sans-serif"],
+    "font.size": 9.5,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#9ca3af",
+    "axes.labelcolor": _INK,
+    "axes.titlesize": 10.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e5e7eb",
+    "grid.linewidth": 0.7,
+    "xtick.color": _INK,
+    "ytick.color": _INK,
+    "text.color": "#1f2937",
+    "legend.frameon": False,
+    "legend.fontsize": 9.0,
+    "lines.linewidth": 1.4,
+    "lines.solid_capstyle": "round",
+}
 
 
 def error_over_time(result: Result, signals: Signals) -> str:
@@ -46,7 +63,13 @@ def error_over_time(result: Result, signals: Signals) -> str:
         axes = figure.subplots()
         time, breaks = _timeline(result)
         for start, end in _stretches(result.tested):
-            axes.axvspan(time[start], time[end], color=_HELD, lw=0.0, label="held out" if start == _stretches(result.tested)[0][0] else "")
+            axes.axvspan(
+                time[start],
+                time[end],
+                color=_HELD,
+                lw=0.0,
+                label="held out" if start == _stretches(result.tested)[0][0] else "",
+            )
         at = time[signals.rows]
         pairs = [("before", BEFORE, signals.before), ("after", AFTER, signals.after)]
         for label, colour, residual in pairs if result.effects else [("base model", BEFORE, signals.before)]:
@@ -54,7 +77,9 @@ def error_over_time(result: Result, signals: Signals) -> str:
         axes.axhline(1e3 * result.noise.floor, color=NOISE, ls="--", lw=1.3, label="noise floor")
         for row in breaks[:_RUNS]:
             axes.axvline(time[row], color="#9ca3af", lw=0.7, ls=":")
-        axes.set(xlabel=f"time{', runs one after the other' if len(breaks) else ''} [s]", ylabel="tip error [mm]")
+        axes.set(
+            xlabel=f"time{', runs one after the other' if len(breaks) else ''} [s]", ylabel="tip error [mm]"
+        )
         axes.set_ylim(bottom=0.0)
         axes.margins(x=0.0)
         figure.legend(loc="outside upper right", ncols=4)
@@ -68,13 +93,17 @@ def whole_paths(result: Result, signals: Signals) -> str:
     rows = _thin(signals.rows)
     measured = 1e3 * np.asarray(result.log.tip_position)[rows]
     first = _widest(measured)
-    planes = [first] if result.effects else [first, (min(3 - sum(first), first[0]), max(3 - sum(first), first[0]))]
+    planes = (
+        [first] if result.effects else [first, (min(3 - sum(first), first[0]), max(3 - sum(first), first[0]))]
+    )
     step, run = np.diff(rows), signals.run[np.searchsorted(signals.rows, rows)]
     gaps = np.flatnonzero((step > 3 * np.median(step)) | (np.diff(run) != 0)) + 1
     held = result.tested[rows]
     with _figure("paths", 4.8) as (figure, out):
         grid = np.atleast_1d(figure.subplots(1, 2, sharex=len(planes) == 1, sharey=len(planes) == 1))
-        for axes, (title, colour, tip), (a, b) in zip(grid, panels * len(planes), planes * len(panels), strict=True):
+        for axes, (title, colour, tip), (a, b) in zip(
+            grid, panels * len(planes), planes * len(panels), strict=True
+        ):
             seen = np.where(held[:, None], measured, np.nan)[:, (a, b)]
             said = np.where(held[:, None], 1e3 * tip[rows], np.nan)[:, (a, b)]
             _trail(axes, measured[:, (a, b)], gaps, "#dfe3e9", 1.6, "measured, fitted")
@@ -83,14 +112,23 @@ def whole_paths(result: Result, signals: Signals) -> str:
             wide, high = (float(np.ptp(measured[:, k])) for k in (a, b))
             if max(wide, high) < _SLIM * min(wide, high):
                 axes.set_aspect("equal", adjustable="box")
-            axes.set(xlabel=f"tip {'xyz'[a]} [mm]", ylabel=f"tip {'xyz'[b]} [mm]", title=f"{title}, {'xyz'[a]}{'xyz'[b]} plane")
-        named = {label: handle for axes in grid for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+            axes.set(
+                xlabel=f"tip {'xyz'[a]} [mm]",
+                ylabel=f"tip {'xyz'[b]} [mm]",
+                title=f"{title}, {'xyz'[a]}{'xyz'[b]} plane",
+            )
+        named = {
+            label: handle
+            for axes in grid
+            for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+        }
         figure.legend(list(named.values()), list(named), loc="outside upper right", ncols=4)
     return out()
 
 
 def close_up(result: Result, signals: Signals) -> tuple[str, str]:
-    """The held-out stretch in which the base model is worst: each axis over time, and both paths; and when it is."""
+    """The held-out stretch in which the base model is worst: each axis over time, and both paths; and when it
+    is."""
     rows = _worst_stretch(result, signals)
     time = signals.time[np.searchsorted(signals.rows, rows)]
     tips = [("before", BEFORE, result.before, 1.6), ("after", AFTER, result.after, 1.6)]
@@ -112,7 +150,9 @@ def close_up(result: Result, signals: Signals) -> tuple[str, str]:
             axes.plot(1e3 * tip[rows, a], 1e3 * tip[rows, b], color=colour, lw=width)
         axes.set_aspect("equal", adjustable="datalim")
         axes.set(xlabel=f"tip {'xyz'[a]} [mm]", ylabel=f"tip {'xyz'[b]} [mm]")
-        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=3, markerscale=2.0)
+        figure.legend(
+            *panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=3, markerscale=2.0
+        )
     run = str(result.log.run[rows[0]])
     return out(), f"{f'run {run}, ' if run else ''}{time[0]:.0f} to {time[-1]:.0f} s"
 
@@ -142,7 +182,9 @@ def autocorrelation(result: Result, signals: Signals) -> str:
     """How alike a residual is to itself some time later; a perfect model leaves only the band."""
     steps = np.diff(result.log.t)
     step = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 1.0
-    lags = np.unique(np.round(np.linspace(1, max(2, min(len(signals.rows) // 4, round(_LAG / step))), 90)).astype(int))
+    lags = np.unique(
+        np.round(np.linspace(1, max(2, min(len(signals.rows) // 4, round(_LAG / step))), 90)).astype(int)
+    )
     pairs = [("before", BEFORE, signals.before), ("after", AFTER, signals.after)]
     with _figure("autocorrelation", 2.9) as (figure, out):
         axes = figure.subplots()
@@ -151,7 +193,15 @@ def autocorrelation(result: Result, signals: Signals) -> str:
         for label, colour, residual in pairs if result.effects else [("base model", BEFORE, signals.before)]:
             values = [_alike(residual, signals, int(lag)) for lag in lags]
             axes.plot(lags * step, values, color=colour, marker="o", ms=2.6, label=label)
-        axes.plot([step], [result.noise.lag1], color=NOISE, marker="D", ms=6.0, ls="none", label="camera at rest, one sample later")
+        axes.plot(
+            [step],
+            [result.noise.lag1],
+            color=NOISE,
+            marker="D",
+            ms=6.0,
+            ls="none",
+            label="camera at rest, one sample later",
+        )
         axes.axhline(0.0, color="#9ca3af", lw=0.7)
         axes.set(xlabel="lag [s]", ylabel="autocorrelation")
         axes.set_ylim(min(-0.1, axes.get_ylim()[0]), 1.02)
@@ -169,11 +219,29 @@ def added(result: Result) -> str:
         widest = 1e3 * max((v for s in stages for v in (s.train, s.held_out) if np.isfinite(v)), default=1.0)
         for i, stage in enumerate(stages):
             colour = BEFORE if i == 0 else AFTER
-            for offset, value, alpha, label in ((-0.19, stage.held_out, 1.0, "held out"), (0.19, stage.train, 0.4, "train")):
-                axes.barh(i + offset, 1e3 * np.nan_to_num(value), height=0.34, color=colour, alpha=alpha, label=label if i == 1 else "")
+            for offset, value, alpha, label in (
+                (-0.19, stage.held_out, 1.0, "held out"),
+                (0.19, stage.train, 0.4, "train"),
+            ):
+                axes.barh(
+                    i + offset,
+                    1e3 * np.nan_to_num(value),
+                    height=0.34,
+                    color=colour,
+                    alpha=alpha,
+                    label=label if i == 1 else "",
+                )
             share = (stages[0].held_out ** 2 - stage.held_out**2) / excess if excess > 0.0 else 0.0
-            text = f" {millimetres(stage.held_out)} mm" + (f",  {min(100.0, 100.0 * share):.0f} % explained" if i and excess > 0.0 else "")
-            axes.text(1e3 * max(np.nan_to_num(stage.held_out), floor) + 0.006 * widest, i - 0.19, text, va="center", fontsize=9.5)
+            text = f" {millimetres(stage.held_out)} mm" + (
+                f",  {min(100.0, 100.0 * share):.0f} % explained" if i and excess > 0.0 else ""
+            )
+            axes.text(
+                1e3 * max(np.nan_to_num(stage.held_out), floor) + 0.006 * widest,
+                i - 0.19,
+                text,
+                va="center",
+                fontsize=9.5,
+            )
         axes.axvline(1e3 * floor, color=NOISE, ls="--", lw=1.4, label="noise floor")
         axes.set_yticks(range(len(stages)), ["base model", *(f"+ {words(s.name)}" for s in stages[1:])])
         axes.invert_yaxis()
@@ -193,7 +261,11 @@ def left_over_time(result: Result, signals: Signals) -> str:
     sigma = 1e3 * result.noise.sigma
     with _figure("left", 3.3) as (figure, out):
         for k, axes in enumerate(figure.subplots(3, 1, sharex=True, sharey=True)):
-            mean = 1e3 * np.bincount(place, weights=signals.after[:, k], minlength=_PIECES) / np.where(count > 0, count, np.nan)
+            mean = (
+                1e3
+                * np.bincount(place, weights=signals.after[:, k], minlength=_PIECES)
+                / np.where(count > 0, count, np.nan)
+            )
             wide = 2.0 * sigma[k] / np.sqrt(max(float(np.median(count)), 1.0))
             axes.axhspan(-wide, wide, color=NOISE, alpha=0.16, lw=0)
             axes.axhline(0.0, color="#9ca3af", lw=0.7)
@@ -224,7 +296,15 @@ def correlations(names: list[str], matrix: Floats) -> str:
             for i in range(n):
                 for j in range(n):
                     ink = "#ffffff" if abs(matrix[i, j]) > 0.75 else "#1f2937"
-                    axes.text(j, i, f"{matrix[i, j]:.2f}".replace("-", "−"), ha="center", va="center", fontsize=7.5, color=ink)
+                    axes.text(
+                        j,
+                        i,
+                        f"{matrix[i, j]:.2f}".replace("-", "−"),
+                        ha="center",
+                        va="center",
+                        fontsize=7.5,
+                        color=ink,
+                    )
         figure.colorbar(picture, ax=axes, shrink=0.9, aspect=14, pad=0.02)
     return out()
 
@@ -242,7 +322,9 @@ def _figure(name: str, height: float, width: float = _WIDE) -> Iterator[tuple[Fi
         FigureCanvasSVG(figure)
         yield figure, lambda: written[0]
         file = io.StringIO()
-        figure.savefig(file, format="svg", dpi=150, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+        figure.savefig(
+            file, format="svg", dpi=150, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type"))
+        )
     written.append(_inline(file.getvalue(), name, width / _WIDE))
 
 
@@ -265,7 +347,9 @@ def _small(png: re.Match[str]) -> str:
 
     image = Image.open(io.BytesIO(base64.b64decode(png.group())))
     file = io.BytesIO()
-    image.convert("RGBA").quantize(48, method=Image.Quantize.FASTOCTREE).save(file, format="png", optimize=True)
+    image.convert("RGBA").quantize(48, method=Image.Quantize.FASTOCTREE).save(
+        file, format="png", optimize=True
+    )
     return base64.b64encode(file.getvalue()).decode("ascii")
 
 
@@ -279,8 +363,18 @@ def _cloud(axes: Axes, view: View, values: Floats, held: Flags, colour: str) -> 
     rows = np.arange(len(values))[:: max(1, -(-len(values) // _MOST))]
     for which, alpha in ((~held[rows], 0.22), (held[rows], 0.75)):
         part = rows[which]
-        axes.scatter(view.signal[part], values[part], s=6.0, c=colour, alpha=alpha, lw=0, rasterized=len(rows) > _VECTOR)
-    means = [(x, mean) for x, mean, count in bin_means(view.signal, values) if count >= min(8, len(values) // 50)]
+        axes.scatter(
+            view.signal[part],
+            values[part],
+            s=6.0,
+            c=colour,
+            alpha=alpha,
+            lw=0,
+            rasterized=len(rows) > _VECTOR,
+        )
+    means = [
+        (x, mean) for x, mean, count in bin_means(view.signal, values) if count >= min(8, len(values) // 50)
+    ]
     axes.plot(*np.array(means).T, color="#111827", lw=1.6, marker="o", ms=3.0)
 
 
@@ -289,14 +383,30 @@ def _loops(axes: Axes, view: View, values: Floats, held: Flags, colour: str) -> 
     jump = np.flatnonzero(np.diff(view.rows) != 1) + 1
     for which, alpha, width in ((~held, 0.30, 0.8), (held, 0.95, 1.1)):
         x, y = (np.where(which, v, np.nan) for v in (view.signal, values))
-        axes.plot(np.insert(x, jump, np.nan), np.insert(y, jump, np.nan), color=colour, alpha=alpha, lw=width, rasterized=len(x) > _VECTOR)
+        axes.plot(
+            np.insert(x, jump, np.nan),
+            np.insert(y, jump, np.nan),
+            color=colour,
+            alpha=alpha,
+            lw=width,
+            rasterized=len(x) > _VECTOR,
+        )
 
 
 def _trail(axes: Axes, points: Floats, gaps: Ints, colour: str, width: float, label: str) -> None:
     """A path (n, 2) with a break before each of the rows `gaps`."""
     x, y = (np.insert(points[:, k], gaps, np.nan) for k in (0, 1))
     axes.plot(
-        x, y, color=colour, lw=width, marker=".", ms=1.5 * width, mew=0.0, solid_joinstyle="round", label=label, rasterized=len(x) > _VECTOR
+        x,
+        y,
+        color=colour,
+        lw=width,
+        marker=".",
+        ms=1.5 * width,
+        mew=0.0,
+        solid_joinstyle="round",
+        label=label,
+        rasterized=len(x) > _VECTOR,
     )
 
 

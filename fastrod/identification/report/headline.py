@@ -26,7 +26,11 @@ def explained(result: Result) -> float:
     """Share of the held-out error above the noise that is gone; nan where there was none."""
     floor = result.noise.floor**2
     excess = result.test.before**2 - floor
-    return min(1.0, (result.test.before**2 - result.test.after**2) / excess) if excess > 0.03 * floor else math.nan
+    return (
+        min(1.0, (result.test.before**2 - result.test.after**2) / excess)
+        if excess > 0.03 * floor
+        else math.nan
+    )
 
 
 def header(result: Result) -> str:
@@ -34,7 +38,8 @@ def header(result: Result) -> str:
     log = result.log
     used = f"{int(result.used.sum())} samples fitted, {int((result.tested & result.measured).sum())} held out"
     return (
-        f"<header><b>fastrod identify</b><span>log <b>{escape(log.name)}</b></span><span>robot <b>{escape(result.robot.name)}</b></span>"
+        f"<header><b>fastrod identify</b><span>log <b>{escape(log.name)}</b></span><span>robot "
+        f"<b>{escape(result.robot.name)}</b></span>"
         f"<span>{used} ({escape(', '.join(result.held_out))})</span></header>"
     )
 
@@ -46,7 +51,9 @@ def hero(result: Result) -> str:
     (left if len(result.effects) > 1 else right).append(("d", _next(result)))
     grid = ""
     for parts in (left, right):
-        grid += f'<div class="col">{"".join(f"<div class={place}>{part}</div>" for place, part in parts)}</div>'
+        grid += (
+            f'<div class="col">{"".join(f"<div class={place}>{part}</div>" for place, part in parts)}</div>'
+        )
     first, *rest = re.split(r"(?<=[.!?]) (?=[A-Z])", result.summary, maxsplit=1)
     more = f'<p class="more">{escape(rest[0])}</p>' if rest else ""
     top = f'<span class="badge">{VERDICTS[result.verdict]}</span><h1>{escape(first)}</h1>{more}'
@@ -65,7 +72,11 @@ def _numbers(result: Result) -> str:
     else:
         what = _number(f'<em class="was">{millimetres(test.before)}</em> mm', f"base model, {interval}")
     share = explained(result)
-    gone = _number(percent(max(share, 0.0)), "of the error above the noise explained") if result.effects and math.isfinite(share) else ""
+    gone = (
+        _number(percent(max(share, 0.0)), "of the error above the noise explained")
+        if result.effects and math.isfinite(share)
+        else ""
+    )
     times = _number(f"{rounded(ratio, 3)} ×" if math.isfinite(ratio) else NOTHING, "the noise floor")
     return f'<div class="numbers">{what}{gone}{times}</div>'
 
@@ -76,26 +87,48 @@ def _number(big: str, small: str) -> str:
 
 def _bars(result: Result) -> str:
     """Errors as bars with the noise floor through them."""
-    rows = [("held out, before", "before", result.test.before, None), ("held out, after", "after", result.test.after, result.test.interval)]
-    rows += [("train, before", "before train", result.train.before, None), ("train, after", "after train", result.train.after, None)]
+    rows = [
+        ("held out, before", "before", result.test.before, None),
+        ("held out, after", "after", result.test.after, result.test.interval),
+    ]
+    rows += [
+        ("train, before", "before train", result.train.before, None),
+        ("train, after", "after train", result.train.after, None),
+    ]
     if not result.effects:
-        rows = [("held out", "before", result.test.before, result.test.interval), ("train", "before train", result.train.before, None)]
+        rows = [
+            ("held out", "before", result.test.before, result.test.interval),
+            ("train", "before train", result.train.before, None),
+        ]
     widest = max((v for _, _, v, _ in rows if math.isfinite(v)), default=0.0)
     whole = max(widest, result.noise.floor, 1e-12) / 0.86
     made = []
     for label, kind, value, interval in rows:
         width = 100.0 * (value if math.isfinite(value) else 0.0) / whole
-        marks = f'<div class="floor bar" style="left:{100.0 * result.noise.floor / whole:.2f}%;min-width:0"></div>'
+        marks = (
+            '<div class="floor bar" '
+            f'style="left:{100.0 * result.noise.floor / whole:.2f}%;min-width:0"></div>'
+        )
         right = width
         if interval is not None and all(map(math.isfinite, interval)):
             low, high = (100.0 * v / whole for v in interval)
-            marks += f'<div class="interval bar" style="left:{low:.2f}%;width:{high - low:.2f}%;border-radius:0"></div>'
+            marks += (
+                '<div class="interval bar" '
+                f'style="left:{low:.2f}%;width:{high - low:.2f}%;border-radius:0"></div>'
+            )
             right = max(width, high)
-        right = max(right, 100.0 * result.noise.floor / whole) if right > 80.0 * result.noise.floor / whole else right
+        right = (
+            max(right, 100.0 * result.noise.floor / whole)
+            if right > 80.0 * result.noise.floor / whole
+            else right
+        )
         text = f'<i style="left:{right:.2f}%">{millimetres(value)}</i>'
         bar = f'<div class="bar {kind}" style="width:{width:.2f}%"></div>'
         made.append(f'<span class="label">{label}</span><div class="track">{bar}{marks}{text}</div>')
-    key = f"┆ noise floor {millimetres(result.noise.floor)} mm, from {escape(result.noise.how)} · whisker: 95 % interval"
+    key = (
+        f"┆ noise floor {millimetres(result.noise.floor)} mm, from {escape(result.noise.how)} · whisker: "
+        "95 % interval"
+    )
     return f'<div class="bars">{"".join(made)}</div><p class="key">{key}</p>'
 
 
@@ -105,7 +138,8 @@ def _found(result: Result) -> str:
         cards = []
         for found in result.effects:
             rows = "".join(
-                f'<tr><td>{escape(plain_name(name))}</td><td class="n">{with_error(e.value, e.stderr, e.unit)}</td><td>{mark(e)}</td></tr>'
+                f"<tr><td>{escape(plain_name(name))}</td><td "
+                f'class="n">{with_error(e.value, e.stderr, e.unit)}</td><td>{mark(e)}</td></tr>'
                 for name, e in found.parameters.items()
             )
             share = f"{_of_all(found.held_out_gain)} of the held-out error above the noise"
@@ -118,10 +152,21 @@ def _found(result: Result) -> str:
         return f'<h3>What it looks like</h3><div class="card">{listed(result.patterns)}</div>'
     if result.verdict == "none":
         seen = [b for b in result.bounds if math.isfinite(b.value)]
-        first = sorted(seen, key=lambda b: b.name not in ("payload", "gravity", "friction", "backlash", "latency", "creep"))[:6]
-        return f'<h3>What would have shown</h3><div class="card">{listed(bound_sentence(b) for b in first)}</div>'
-    kind = SHARES.get({"unknown": "exogenous"}.get(result.remaining_kind, result.remaining_kind), ("of no known kind", ""))[0]
-    return f'<h3>What is left</h3><div class="card">{percent(result.remaining_share)} of the error above the noise: {kind}.</div>'
+        first = sorted(
+            seen,
+            key=lambda b: b.name not in ("payload", "gravity", "friction", "backlash", "latency", "creep"),
+        )[:6]
+        return (
+            "<h3>What would have shown</h3><div "
+            f'class="card">{listed(bound_sentence(b) for b in first)}</div>'
+        )
+    kind = SHARES.get(
+        {"unknown": "exogenous"}.get(result.remaining_kind, result.remaining_kind), ("of no known kind", "")
+    )[0]
+    return (
+        f'<h3>What is left</h3><div class="card">{percent(result.remaining_share)} of the error above '
+        f"the noise: {kind}.</div>"
+    )
 
 
 def _of_all(share: float) -> str:
@@ -144,17 +189,27 @@ def _told_apart(result: Result) -> str:
         lines = ["Nothing: no other effect of the library explains this log as well."]
     if not lines:
         unseen = [words(b.name) for b in result.bounds if not math.isfinite(b.value)]
-        lines = [f"This log cannot show {escape(', '.join(unseen))}."] if unseen else ["Nothing that the library knows."]
+        lines = (
+            [f"This log cannot show {escape(', '.join(unseen))}."]
+            if unseen
+            else ["Nothing that the library knows."]
+        )
     return f"<h3>What cannot be told</h3><ul>{''.join(f'<li>{line}</li>' for line in lines)}</ul>"
 
 
 def _next(result: Result) -> str:
-    use = "<pre><code>robot = fastrod.load_robot(&quot;identified.toml&quot;)\nsim = fastrod.Simulator(robot)</code></pre>"
+    use = (
+        "<pre><code>robot = fastrod.load_robot(&quot;identified.toml&quot;)\nsim = "
+        "fastrod.Simulator(robot)</code></pre>"
+    )
     lines = [escape(line) for line in result.advice]
     if lines:
         if result.robot.n_tendons:
             name = result.robot.name if result.robot.name in robot_names() else "R"
-            lines.append(f"<code>fastrod excite --robot {escape(name)}</code> writes a run that separates most effects.")
+            lines.append(
+                f"<code>fastrod excite --robot {escape(name)}</code> writes a run that separates "
+                "most effects."
+            )
         return f"<h3>What to run next</h3><ul>{''.join(f'<li>{line}</li>' for line in lines)}</ul>"
     if result.effects:
         return f"<h3>What to do next</h3>Use the corrected model, which lies beside this page:{use}"
@@ -163,4 +218,7 @@ def _next(result: Result) -> str:
             "<h3>What to do next</h3>Look at the robot and the camera for what is named here. "
             "An effect of your own joins the library by <code>@fastrod.effects.base.effect</code>."
         )
-    return "<h3>What to do next</h3>Use the model as it is; <code>identified.toml</code> holds its fitted parameters."
+    return (
+        "<h3>What to do next</h3>Use the model as it is; <code>identified.toml</code> holds its fitted "
+        "parameters."
+    )

@@ -31,7 +31,8 @@ def listed(lines: Iterable[str]) -> str:
 
 
 def mark(e: Estimate, always: bool = False) -> str:
-    """HTML beside an estimate: at its bound, not identifiable and why, or what to note; only with `always` also that it is identifiable."""
+    """HTML beside an estimate: at its bound, not identifiable and why, or what to note; only with `always`
+    also that it is identifiable."""
     marks = []
     if e.at_bound:
         marks.append('<span class="chip">at bound</span>')

@@ -37,69 +37,108 @@ def page(result: Result) -> str:
     body = [header(result), "<main>", hero(result)]
     if len(signals.rows):
         views = {found.name: signals.view(found) for found in result.effects}
-        body += [_fit(result, signals), *(_effect(result, found, views[found.name]) for found in result.effects)]
+        body += [
+            _fit(result, signals),
+            *(_effect(result, found, views[found.name]) for found in result.effects),
+        ]
         body += [_memory(result, signals, list(views.values()))]
-    body += [_parameters(result), _remaining(result, signals), _bounds(result), _candidates(result), "</main>", _footer(result)]
+    body += [
+        _parameters(result),
+        _remaining(result, signals),
+        _bounds(result),
+        _candidates(result),
+        "</main>",
+        _footer(result),
+    ]
     title = f"{VERDICTS[result.verdict]}: {result.log.name} on {result.robot.name}"
-    head = f'<meta charset="utf-8">\n<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>{escape(title)}</title>'
+    head = (
+        '<meta charset="utf-8">\n<meta name="viewport" content="width=device-width, '
+        f'initial-scale=1">\n<title>{escape(title)}</title>'
+    )
     inside = "\n".join(part for part in body if part)
-    return f'<!DOCTYPE html>\n<html lang="en">\n<head>\n{head}\n<style>\n{style}</style>\n</head>\n<body>\n{inside}\n</body>\n</html>\n'
+    return (
+        "<!DOCTYPE html>\n<html "
+        f'lang="en">\n<head>\n{head}\n<style>\n{style}</style>\n</head>\n<body>\n{inside}\n</body>\n</html>\n'
+    )
 
 
 def _fit(result: Result, signals: Signals) -> str:
     stretch, when = figures.close_up(result, signals)
-    blue = "Blue should lie on the noise floor, and on the dark points." if result.effects else "Orange should lie on the noise floor."
+    blue = (
+        "Blue should lie on the noise floor, and on the dark points."
+        if result.effects
+        else "Orange should lie on the noise floor."
+    )
     parts = [
         figure(
             figures.error_over_time(result, signals),
-            f"Distance between measured and predicted tip, rms over short bins. {blue} Shaded: held out, seen by no fit.",
+            f"Distance between measured and predicted tip, rms over short bins. {blue} Shaded: held out, "
+            "seen by no fit.",
         ),
-        figure(stretch, f"The held-out stretch on which the base model is worst ({escape(when)}), axis by axis and as a path."),
         figure(
-            figures.whole_paths(result, signals), "The whole path in grey; dark what was held out, and in colour what the model says of it."
+            stretch,
+            f"The held-out stretch on which the base model is worst ({escape(when)}), axis by "
+            "axis and as a path.",
+        ),
+        figure(
+            figures.whole_paths(result, signals),
+            "The whole path in grey; dark what was held out, and in colour what the model says of it.",
         ),
     ]
     if len(result.path) > 1:
         parts.append(
-            figure(figures.added(result), "Effects in the order of what they bring. An effect that helps only in training is no physics.")
+            figure(
+                figures.added(result),
+                "Effects in the order of what they bring. An effect that helps "
+                "only in training is no physics.",
+            )
         )
     if result.effects:
-        return section("Before and after", "The base model with its own parameters fitted, against the model with what was found.", *parts)
+        return section(
+            "Before and after",
+            "The base model with its own parameters fitted, against the model with what was found.",
+            *parts,
+        )
     return section("Measured and predicted", "The base model with its own parameters fitted.", *parts)
 
 
 def _effect(result: Result, found: Found, view: View) -> str:
-    forms = (("z", "z over held-out blocks {:.1f}", 1.0), ("bic", "BIC gain {:.0f}", 1.0), ("loss_share", "{:.1f} % of the loss", 100.0))
+    forms = (
+        ("z", "z over held-out blocks {:.1f}", 1.0),
+        ("bic", "BIC gain {:.0f}", 1.0),
+        ("loss_share", "{:.1f} % of the loss", 100.0),
+    )
     evidence = ", ".join(
-        form.format(found.evidence[key] * factor) for key, form, factor in forms if math.isfinite(found.evidence.get(key, math.nan))
+        form.format(found.evidence[key] * factor)
+        for key, form, factor in forms
+        if math.isfinite(found.evidence.get(key, math.nan))
     )
     proof = f'<p class="law"><b>Evidence</b> {evidence}</p>' if evidence else ""
-    laws = "".join(f'<p class="law"><b>{key}</b> {_coded(key, text)}</p>' for key, text in law(found.name).items())
+    laws = "".join(
+        f'<p class="law"><b>{key}</b> {_coded(key, text)}</p>' for key, text in law(found.name).items()
+    )
     what = "Loops should close to a line" if view.connected else "The trend (black: mean) should become flat"
     caption = (
         f"{what} inside the green band of two noise sigmas. "
-        f"{'Strong' if view.connected else 'Dark'}: held out. Before: base model; after: with all that was found."
+        f"{'Strong' if view.connected else 'Dark'}: held out. Before: base model; after: with all that was "
+        "found."
     )
     picture = figures.against_signal(view, result, f"effect-{found.name}")
-    return section(
-        words(found.name).capitalize(),
-        escape(found.title),
-        figure(picture, caption),
-        laws,
-        proof,
-    )
+    return section(words(found.name).capitalize(), escape(found.title), figure(picture, caption), laws, proof)
 
 
 def _memory(result: Result, signals: Signals, drawn: Sequence[View]) -> str:
     parts = []
     if not any(view.connected for view in drawn) and (loops := signals.loops()) is not None:
         caption = (
-            "Residual along the bend against the commanded bend. Open loops: memory, such as friction or backlash. "
+            "Residual along the bend against the commanded bend. Open loops: memory, such as friction or "
+            "backlash. "
             "A line that is not flat: something static."
         )
         parts.append(figure(figures.against_signal(loops, result, "loops"), caption))
     caption = (
-        "How alike the residual is to itself some time later. Above the band: something is left that a model could explain. "
+        "How alike the residual is to itself some time later. Above the band: something is left that a "
+        "model could explain. "
         f"The camera at rest has {_signed(result.noise.lag1)} from one sample to the next."
     )
     parts.append(figure(figures.autocorrelation(result, signals), caption))
@@ -107,7 +146,10 @@ def _memory(result: Result, signals: Signals, drawn: Sequence[View]) -> str:
 
 
 def _parameters(result: Result) -> str:
-    groups = {"of the robot": result.base_parameters, **{f"of {words(found.name)}": found.parameters for found in result.effects}}
+    groups = {
+        "of the robot": result.base_parameters,
+        **{f"of {words(found.name)}": found.parameters for found in result.effects},
+    }
     parts = [_estimates(groups)]
     names, matrix = result.correlation
     if len(names) > 1:
@@ -144,24 +186,29 @@ def _remaining(result: Result, signals: Signals) -> str:
         parts.append(f"<p>Outside the library, but found as a pattern:</p>{listed(result.patterns)}")
     shares = [(key, getattr(audit, key), *SHARES[key]) for key in SHARES]
     rest = max(0.0, 1.0 - sum(share for _, share, _, _ in shares))
-    bars = "".join(f'<div style="width:{100 * share:.2f}%;background:{colour}"></div>' for _, share, _, colour in shares)
+    bars = "".join(
+        f'<div style="width:{100 * share:.2f}%;background:{colour}"></div>' for _, share, _, colour in shares
+    )
     shares.append(("noise", rest, "the remainder", "#e3e7ed"))
     legend = "".join(
-        f'<span style="--c:{colour}">{key}: {percent(share)} <em class="soft">({text})</em></span>' for key, share, text, colour in shares
+        f'<span style="--c:{colour}">{key}: {percent(share)} <em class="soft">({text})</em></span>'
+        for key, share, text, colour in shares
     )
     taken_off = " once the pattern above is taken off" if result.patterns else ""
     parts.append(f"<h3>The residual's variance{taken_off}</h3>")
     parts.append(f'<div class="shares">{bars}</div><div class="legend">{legend}</div>')
     if len(signals.rows):
         caption = (
-            "What is left of each axis, mean over stretches of time, and the band in which noise would leave it. "
+            "What is left of each axis, mean over stretches of time, and the band in which noise would "
+            "leave it. "
             "A step, a slope or a wave is no noise."
         )
         parts.append(figure(figures.left_over_time(result, signals), caption))
     if result.network:
         with_it = result.network["held_out_rms_m"]
         parts.append(
-            f"<p>A network on what is left brings the held-out error from {millimetres(result.test.after)} to {millimetres(with_it)} mm; "
+            f"<p>A network on what is left brings the held-out error from {millimetres(result.test.after)} "
+            f"to {millimetres(with_it)} mm; "
             "it names nothing and is no part of <em>after</em>.</p>"
         )
     lead = f"{percent(result.remaining_share)} of the error above the noise remains unexplained."
@@ -186,11 +233,12 @@ def _candidates(result: Result) -> str:
     if not result.tried:
         return ""
     rows = [
-        f'<tr{" class=kept" if t.kept else ""}><td>{escape(words(t.name))}</td><td>{_kind(t.kind)}</td>'
-        f'<td class="n">{millimetres(t.held_out_rms)}</td><td class="n">{_score(t.score, t.held_out_rms)}</td>'
+        f"<tr{' class=kept' if t.kept else ''}><td>{escape(words(t.name))}</td><td>{_kind(t.kind)}</td>"
+        f'<td class="n">{millimetres(t.held_out_rms)}</td><td '
+        f'class="n">{_score(t.score, t.held_out_rms)}</td>'
         f'<td class="n">{_score(t.bic_gain, t.held_out_rms, 0)}</td><td>{escape(t.why)}</td></tr>'
         for t in result.tried
-    ]  # fmt: skip
+    ]
     head = _head("candidate", "", "#held-out rms [mm]", "#z", "#BIC gain", "why")
     more = ""
     if len(rows) > _NOT_FOUND + 2:
@@ -198,10 +246,13 @@ def _candidates(result: Result) -> str:
         more = f"<details><summary>{len(rows) - _NOT_FOUND} more</summary>{rest}</details>"
         rows = rows[:_NOT_FOUND]
     lead = (
-        "Each was fitted beside the base model and judged on blocks of the training data that its fit had not seen; "
+        "Each was fitted beside the base model and judged on blocks of the training data that its fit had "
+        "not seen; "
         f"{result.solves} batches of the rod in all."
     )
-    return section("Candidates", lead, f'<div class="scroll"><table>{head}{"".join(rows)}</table></div>{more}')
+    return section(
+        "Candidates", lead, f'<div class="scroll"><table>{head}{"".join(rows)}</table></div>{more}'
+    )
 
 
 def _footer(result: Result) -> str:
@@ -215,7 +266,10 @@ def _footer(result: Result) -> str:
 
 def _head(*names: str) -> str:
     """The head of a table; a column of numbers has a # before its name."""
-    cells = (f'<th class="n">{escape(name[1:])}</th>' if name[:1] == "#" else f"<th>{escape(name)}</th>" for name in names)
+    cells = (
+        f'<th class="n">{escape(name[1:])}</th>' if name[:1] == "#" else f"<th>{escape(name)}</th>"
+        for name in names
+    )
     return f"<tr>{''.join(cells)}</tr>"
 
 

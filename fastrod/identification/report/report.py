@@ -1,4 +1,5 @@
-"""What `identify` found, for machines, for the browser and for the terminal: report.json, report.html, identified.toml, a table."""
+"""What `identify` found, for machines, for the browser and for the terminal: report.json, report.html,
+identified.toml, a table."""
 
 from __future__ import annotations
 
@@ -15,7 +16,14 @@ from fastrod.identification.log.replay import make_folder
 from fastrod.identification.report.headline import explained
 from fastrod.identification.report.page import page
 from fastrod.identification.report.result import Error, Result
-from fastrod.identification.report.wording import VERDICTS, millimetres, percent, plain_name, with_error, words
+from fastrod.identification.report.wording import (
+    VERDICTS,
+    millimetres,
+    percent,
+    plain_name,
+    with_error,
+    words,
+)
 from fastrod.identification.search.solve import Estimate
 from fastrod.model.robotfile import save_robot
 
@@ -74,7 +82,10 @@ def to_json(result: Result) -> dict[str, Any]:
             }
             for t in result.tried
         ],
-        "bounds": [{"name": b.name, "parameter": b.parameter, "unit": b.unit, "value": b.value} for b in result.bounds],
+        "bounds": [
+            {"name": b.name, "parameter": b.parameter, "unit": b.unit, "value": b.value}
+            for b in result.bounds
+        ],
         "advice": list(result.advice),
         "notes": list(result.notes),
         "solves": result.solves,
@@ -91,7 +102,8 @@ def text(result: Result) -> str:
 
 
 def write(result: Result, out_dir: str | Path) -> list[Path]:
-    """Write report.json, report.html and identified.toml into `out_dir`, each whole or not at all; the paths written."""
+    """Write report.json, report.html and identified.toml into `out_dir`, each whole or not at all; the paths
+    written."""
     out = make_folder(out_dir)
     written = []
     for name, make in (("report.json", text), ("report.html", page)):
@@ -119,24 +131,51 @@ def table(result: Result) -> Group:
     from rich.text import Text
 
     colour = {"none": "green", "explained": "green", "not_in_library": "red"}.get(result.verdict, "yellow")
-    title = Text.assemble((f" {VERDICTS[result.verdict]} ", f"bold reverse {colour}"), f" {result.log.name} on {result.robot.name}")
-    errors = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 2, 0, 0), title=escape("tip error, rms [mm]"), title_justify="left")
+    title = Text.assemble(
+        (f" {VERDICTS[result.verdict]} ", f"bold reverse {colour}"),
+        f" {result.log.name} on {result.robot.name}",
+    )
+    errors = Table(
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+        padding=(0, 2, 0, 0),
+        title=escape("tip error, rms [mm]"),
+        title_justify="left",
+    )
     for name in ("", "before", "after", "95 % interval", "noise floor"):
         errors.add_column(name, justify="right" if name else "left")
     floor = millimetres(result.noise.floor)
     low, high = (millimetres(v) for v in result.test.interval)
     errors.add_row("train", millimetres(result.train.before), millimetres(result.train.after), "", floor)
-    errors.add_row("held out", millimetres(result.test.before), millimetres(result.test.after), f"{low} to {high}", floor, style="bold")
+    errors.add_row(
+        "held out",
+        millimetres(result.test.before),
+        millimetres(result.test.after),
+        f"{low} to {high}",
+        floor,
+        style="bold",
+    )
     parts: list[Any] = [title, Text(result.summary), Text(), errors]
     if result.effects:
-        grid = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 2, 0, 0), title="what the model lacked", title_justify="left")
+        grid = Table(
+            box=box.SIMPLE_HEAD,
+            pad_edge=False,
+            padding=(0, 2, 0, 0),
+            title="what the model lacked",
+            title_justify="left",
+        )
         for name in ("effect", "parameter", "estimate", "note"):
             grid.add_column(name, overflow="fold")
         for found in result.effects:
             label = words(found.name)
             for name, e in found.parameters.items():
                 note = " ".join(filter(None, ("at bound" if e.at_bound else "", e.why)))
-                grid.add_row(escape(label), escape(words(name)), escape(with_error(e.value, e.stderr, e.unit)), escape(note))
+                grid.add_row(
+                    escape(label),
+                    escape(words(name)),
+                    escape(with_error(e.value, e.stderr, e.unit)),
+                    escape(note),
+                )
                 label = ""
         share = explained(result)
         if math.isfinite(share):
@@ -148,7 +187,11 @@ def table(result: Result) -> Group:
         for f in result.effects
         if f.cannot_be_told_from
     ]
-    lines += [f"not identifiable: {plain_name(name)}, {e.why}" for name, e in result.base_parameters.items() if not e.identifiable]
+    lines += [
+        f"not identifiable: {plain_name(name)}, {e.why}"
+        for name, e in result.base_parameters.items()
+        if not e.identifiable
+    ]
     lines += [f"remains: {pattern}" for pattern in result.patterns if result.effects]
     lines += [f"note: {note}" for note in result.notes] + [f"run next: {line}" for line in result.advice]
     return Group(*parts, *(Text(f"- {line}") for line in lines))
@@ -162,7 +205,12 @@ def _registration(camera: Registration | None) -> dict[str, Any] | None:
     """Where a camera stands that was far from where the robot file says; None where it was not."""
     if camera is None:
         return None
-    return {"angle_rad": camera.angle, "distance_m": camera.distance, "rotation": camera.rotation, "shift_m": camera.shift}
+    return {
+        "angle_rad": camera.angle,
+        "distance_m": camera.distance,
+        "rotation": camera.rotation,
+        "shift_m": camera.shift,
+    }
 
 
 def _estimates(every: Mapping[str, Estimate]) -> dict[str, Any]:

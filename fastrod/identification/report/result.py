@@ -28,7 +28,8 @@ class Found:
     title: str
     parameters: Mapping[str, Estimate]
     held_out_gain: float
-    """Share of the held-out error (mean square above the noise) that goes with it: what is lost when it is taken out again."""
+    """Share of the held-out error (mean square above the noise) that goes with it: what is lost when it is
+    taken out again."""
     evidence: Mapping[str, float]
     """z over held-out blocks, BIC, share of the loss, when it was added."""
     cannot_be_told_from: Sequence[str]
@@ -121,7 +122,8 @@ class Result:
     solves: int
     """Batches of the rod that the search took."""
     registration: Registration | None = None
-    """Where the camera stands from where the robot file says, fitted; None where it stood near enough for the search."""
+    """Where the camera stands from where the robot file says, fitted; None where it stood near enough for the
+    search."""
     network: Mapping[str, float] = field(default_factory=dict)
     """Held-out rms with a network on what is left, where one was asked for."""
 

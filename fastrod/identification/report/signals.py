@@ -1,4 +1,5 @@
-"""What a residual is drawn against: for each effect the signal that its seam suggests, and the direction in which it shows most."""
+"""What a residual is drawn against: for each effect the signal that its seam suggests, and the direction in
+which it shows most."""
 
 from __future__ import annotations
 
@@ -46,7 +47,12 @@ class Signals:
 
     def __init__(self, result: Result) -> None:
         self.result = result
-        counted = result.measured & ~result.outlier & np.isfinite(result.before).all(1) & np.isfinite(result.after).all(1)
+        counted = (
+            result.measured
+            & ~result.outlier
+            & np.isfinite(result.before).all(1)
+            & np.isfinite(result.after).all(1)
+        )
         self.rows: Ints = np.flatnonzero(counted)
         log = result.log.rows(self.rows)
         self.log = log
@@ -75,20 +81,31 @@ class Signals:
         if name in _SPEED:
             return self._along_motion()
         if name in _WEIGHT or (what.seam is Seam.LOAD and name != "tip_force"):
-            return self._along_force(self._gravity(), "share of gravity that pulls across the robot", "residual the way gravity pulls")
+            return self._along_force(
+                self._gravity(),
+                "share of gravity that pulls across the robot",
+                "residual the way gravity pulls",
+            )
         if name == "tip_force":
-            force = np.array([found.parameters[axis].value if axis in found.parameters else 0.0 for axis in "xyz"])
-            return self._along_force(force, "share of the force that pulls across the robot", "residual the way the force pulls")
+            force = np.array(
+                [found.parameters[axis].value if axis in found.parameters else 0.0 for axis in "xyz"]
+            )
+            return self._along_force(
+                force, "share of the force that pulls across the robot", "residual the way the force pulls"
+            )
         if what.seam is Seam.SENSING or not self.bend.shape[1]:
             return self._over_tip()
         if name == "creep":
-            return self._behind(found.parameters["time_constant"].value if "time_constant" in found.parameters else 5.0)
+            return self._behind(
+                found.parameters["time_constant"].value if "time_constant" in found.parameters else 5.0
+            )
         if has_memory(what):
             return self.loops() or self._over_bend()
         return self._over_bend()
 
     def loops(self) -> View | None:
-        """The residual along the bend against the commanded bend, where motion is in one direction; None without wires."""
+        """The residual along the bend against the commanded bend, where motion is in one direction; None
+        without wires."""
         best: tuple[float, Floats, Flags, int, float] | None = None
         for k in range(self.bend.shape[1]):
             size = float(np.abs(self.bend[:, k]).max(initial=0.0))
@@ -105,14 +122,22 @@ class Signals:
             keep = np.ones(len(along), bool)
         direction = self._tip_direction(along)
         segment = f" of segment {k + 1}" if self.bend.shape[1] > 1 else ""
-        axis = {0: "about x", 1: "about the diagonal", 2: "about y", 3: "about the other diagonal"}[round(angle / np.pi * _DIRECTIONS)]
+        axis = {0: "about x", 1: "about the diagonal", 2: "about y", 3: "about the other diagonal"}[
+            round(angle / np.pi * _DIRECTIONS)
+        ]
         return View(
-            self.rows[keep], np.degrees(along[keep]), (self.before @ direction)[keep], (self.after @ direction)[keep],
-            f"commanded bend{segment} {axis} [°]", "residual along the bend", connected=True,
-        )  # fmt: skip
+            self.rows[keep],
+            np.degrees(along[keep]),
+            (self.before @ direction)[keep],
+            (self.after @ direction)[keep],
+            f"commanded bend{segment} {axis} [°]",
+            "residual along the bend",
+            connected=True,
+        )
 
     def _best(self, signals: list[tuple[str, Floats]], components: list[tuple[str, Floats]]) -> View:
-        """The pair of a signal and a residual's direction that explains most of what was there before; directions (3,) or (n, 3)."""
+        """The pair of a signal and a residual's direction that explains most of what was there before;
+        directions (3,) or (n, 3)."""
         best: tuple[float, str, Floats, str, Floats] | None = None
         for label, signal in signals:
             for word, direction in components:
@@ -141,7 +166,10 @@ class Signals:
 
     def _over_tip(self) -> View:
         tips = [(f"predicted tip {axis} [mm]", 1e3 * self.tip[:, k]) for k, axis in enumerate("xyz")]
-        radius = ("predicted distance of the tip from the base's axis [mm]", 1e3 * np.linalg.norm(self.tip[:, :2], axis=1))
+        radius = (
+            "predicted distance of the tip from the base's axis [mm]",
+            1e3 * np.linalg.norm(self.tip[:, :2], axis=1),
+        )
         return self._best([*tips, radius], [*self._axes(), *self._radial()])
 
     def _over_bend(self) -> View:
@@ -151,7 +179,9 @@ class Signals:
             segment = f" of segment {k + 1}" if many else ""
             for j, axis in enumerate("xy"):
                 signals.append((f"commanded bend{segment} about {axis} [°]", np.degrees(self.bend[:, k, j])))
-            signals.append((f"commanded bend{segment} [°]", np.degrees(np.linalg.norm(self.bend[:, k], axis=1))))
+            signals.append(
+                (f"commanded bend{segment} [°]", np.degrees(np.linalg.norm(self.bend[:, k], axis=1)))
+            )
         return self._best(signals, [*self._axes(), *self._radial()])
 
     def _behind(self, time_constant: float) -> View:
@@ -162,9 +192,14 @@ class Signals:
             segment = f" of segment {k + 1}" if self.bend.shape[1] > 1 else ""
             slow = _low_pass(self.bend[:, k], step, self._follows(), max(time_constant, 0.05))
             for j, axis in enumerate("xy"):
-                label = f"commanded bend{segment} about {axis} less its mean over the last {time_constant:.2g} s [°]"
+                label = (
+                    f"commanded bend{segment} about {axis} less its mean over the last "
+                    f"{time_constant:.2g} s [°]"
+                )
                 signals.append((label, np.degrees(self.bend[:, k, j] - slow[:, j])))
-                components.append((f"residual along the bend about {axis}", self._tip_direction(self.bend[:, k, j])))
+                components.append(
+                    (f"residual along the bend about {axis}", self._tip_direction(self.bend[:, k, j]))
+                )
         return self._best(signals, components)
 
     def _along_motion(self) -> View:
@@ -175,7 +210,9 @@ class Signals:
         velocity[1:-1][whole] = (self.tip[2:] - self.tip[:-2])[whole] / step[whole, None]
         speed = np.linalg.norm(velocity, axis=1)
         unit = velocity / np.where(speed > 1e-9, speed, np.nan)[:, None]
-        return self._best([("predicted speed of the tip [mm/s]", 1e3 * speed)], [("residual along the motion", unit)])
+        return self._best(
+            [("predicted speed of the tip [mm/s]", 1e3 * speed)], [("residual along the motion", unit)]
+        )
 
     def _along_force(self, force: Floats, signal: str, residual: str) -> View:
         """Along the part of a force, base frame, that pulls across the robot; against the share of it."""

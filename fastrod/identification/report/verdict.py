@@ -12,9 +12,11 @@ from fastrod.identification.search.model_selection import Step
 from fastrod.identification.search.residual_test import Audit
 
 _CLEAN = 0.06  # of the residual's variance: structure below it is none
-_EXPLAINED, _PARTLY = 0.03, 0.45  # of the mean square above the noise: what may be left for these verdicts; 0.03 is 17 % of the rms
+# of the mean square above the noise: what may be left for these verdicts; 0.03 is 17 % of the rms
+_EXPLAINED, _PARTLY = 0.03, 0.45
 _UNCERTAIN = 0.75  # left beyond this: what was found may be a stand-in for what is missing
-_FOREIGN = 0.3  # of the error above the noise: patterns outside the library that carry this much are the finding
+# of the error above the noise: patterns outside the library that carry this much are the finding
+_FOREIGN = 0.3
 _CARRIES = 0.5  # of the error above the noise, by one effect, where three are needed
 _MIN_EXCESS = 0.03  # of the noise's variance
 
@@ -35,17 +37,32 @@ class Opinion:
 
 
 def judge(
-    *, base: float, library: float, after: float, floor: float, left_out: float, audit: Audit, steps: Sequence[Step], found: Sequence[str]
+    *,
+    base: float,
+    library: float,
+    after: float,
+    floor: float,
+    left_out: float,
+    audit: Audit,
+    steps: Sequence[Step],
+    found: Sequence[str],
 ) -> Opinion:
-    """The verdict. Mean squares of the distance on the training data [m^2]: of the `base` model, with the `library` effects found,
-    `after` those and foils, and the noise `floor`; `left_out`: share of the held-out error above the noise that is left."""
+    """The verdict. Mean squares of the distance on the training data [m^2]: of the `base` model, with the
+    `library` effects found,
+    `after` those and foils, and the noise `floor`; `left_out`: share of the held-out error above the noise
+    that is left."""
     excess = max(base - floor, _MIN_EXCESS * floor, 1e-30)
     foils = [step.taken.foil for step in steps if step.taken is not None and step.taken.foil is not None]
-    patterns = tuple({foil.name: foil.what for foil in reversed(foils)}.values())[::-1]  # the strongest of each family
+    # the strongest of each family
+    patterns = tuple({foil.name: foil.what for foil in reversed(foils)}.values())[::-1]
     foreign = max(library - after, 0.0) / excess if foils else 0.0
     structured = audit.structured * after / excess
     left = min(1.0, foreign + structured)
-    kind = {"exogenous": "unknown"}.get(foils[0].kind, foils[0].kind) if foils and foreign >= structured else audit.kind
+    kind = (
+        {"exogenous": "unknown"}.get(foils[0].kind, foils[0].kind)
+        if foils and foreign >= structured
+        else audit.kind
+    )
     if not found and not foils:
         if audit.structured <= _CLEAN:
             return Opinion(
@@ -59,7 +76,14 @@ def judge(
         why = "Structure remains in the residual that no effect of the library explains"
         return Opinion("not_in_library", f"{why}; it is {_words(kind)}.", kind, left, (), False)
     if not found:
-        return Opinion("not_in_library", f"No effect of the library explains the residual: {patterns[0]}.", kind, 1.0, patterns, False)
+        return Opinion(
+            "not_in_library",
+            f"No effect of the library explains the residual: {patterns[0]}.",
+            kind,
+            1.0,
+            patterns,
+            False,
+        )
     spoken = [name.replace("_", " ") for name in found]
     names = ", ".join(spoken[:-1]) + " and " + spoken[-1] if len(found) > 1 else spoken[0]
     left = left if np.isnan(left_out) else max(left, min(left_out, 1.0))
@@ -67,14 +91,24 @@ def judge(
         more = f" What little remains: {patterns[0]}." if patterns else ""
         gone = 100.0 * (1.0 - (left if np.isnan(left_out) else min(max(left_out, 0.0), 1.0)))
         it = "it" if len(found) == 1 else "them"
-        said = f"The model lacked {names}; with {it}, {_share(gone)} of the held-out mean square above the noise is gone.{more}"
+        said = (
+            f"The model lacked {names}; with {it}, {_share(gone)} of the held-out mean square above the "
+            f"noise is gone.{more}"
+        )
         return Opinion("explained", said, kind if left > 0.02 else "none", left, patterns, False)
     if foreign > _FOREIGN or left > _PARTLY:
         what = f": {patterns[0]}" if patterns else f"; what is left is {_words(kind)}"
         certain = foreign < 0.5 and left < _UNCERTAIN
         also = f" {names} {'is' if len(found) == 1 else 'are'} there too." if certain else ""
         part = "Most" if max(foreign, left) > 0.5 else "A good part"
-        return Opinion("not_in_library", f"{part} of what is missing is not in the library{what}.{also}", kind, left, patterns, not certain)
+        return Opinion(
+            "not_in_library",
+            f"{part} of what is missing is not in the library{what}.{also}",
+            kind,
+            left,
+            patterns,
+            not certain,
+        )
     what = f": {patterns[0]}" if patterns else f"; it is {_words(kind)}"
     return Opinion(
         "partly_explained",

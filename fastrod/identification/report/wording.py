@@ -1,4 +1,5 @@
-"""Words and numbers as a roboticist says them: millimetres, degrees, milliseconds, grams, with the digits that are known."""
+"""Words and numbers as a roboticist says them: millimetres, degrees, milliseconds, grams, with the digits
+that are known."""
 
 from __future__ import annotations
 
@@ -18,9 +19,14 @@ VERDICTS = {
     "not_in_library": "Not in the library",
 }
 _NOUNS = {
-    "line_density": "self-weight", "cubic": "cubic term", "radial": "radial term", "per_bend": "shortening", "ratio": "difference",
-    "from_distal": "share of the neighbour", "from_proximal": "share of the neighbour",
-}  # fmt: skip
+    "line_density": "self-weight",
+    "cubic": "cubic term",
+    "radial": "radial term",
+    "per_bend": "shortening",
+    "ratio": "difference",
+    "from_distal": "share of the neighbour",
+    "from_proximal": "share of the neighbour",
+}
 
 _SCALES: dict[str, tuple[tuple[float, float, str], ...]] = {
     # SI unit: (least size, factor, unit), the largest first
@@ -44,7 +50,9 @@ _SCALES: dict[str, tuple[tuple[float, float, str], ...]] = {
 def friendly(unit: str, size: float) -> tuple[float, str]:
     """The factor from the SI `unit` to the one in which a number of about `size` is said, and that unit."""
     scales = _SCALES.get(unit, ((0.0, 1.0, unit),))
-    return next((factor, name) for least, factor, name in scales if not math.isfinite(size) or abs(size) >= least)
+    return next(
+        (factor, name) for least, factor, name in scales if not math.isfinite(size) or abs(size) >= least
+    )
 
 
 def amount(value: float, unit: str, digits: int = 2) -> str:
@@ -56,7 +64,8 @@ def amount(value: float, unit: str, digits: int = 2) -> str:
 
 
 def estimate(value: float, stderr: float, unit: str) -> tuple[str, str, str]:
-    """A fitted number and its standard error with the digits that are known, and their unit; – for what is not there."""
+    """A fitted number and its standard error with the digits that are known, and their unit; – for what is
+    not there."""
     factor, name = friendly(unit, value or stderr)
     if not math.isfinite(value):
         return NOTHING, NOTHING, name
@@ -115,14 +124,18 @@ def plain_name(name: str) -> str:
 def law(name: str) -> dict[str, str]:
     """Equation, Source and Residual signature of an effect, from its docstring."""
     text = inspect.cleandoc(type(get_effect(name)).__doc__ or "")
-    found = re.findall(r"^(Equation|Source|Residual signature): (.*(?:\n(?!\n|\w[\w ]*: ).*)*)", text, flags=re.MULTILINE)
+    found = re.findall(
+        r"^(Equation|Source|Residual signature): (.*(?:\n(?!\n|\w[\w ]*: ).*)*)", text, flags=re.MULTILINE
+    )
     return {key: " ".join(value.split()) for key, value in found}
 
 
 def bound_sentence(bound: Bound) -> str:
     """From which size on an effect would have shown."""
     stem = re.sub(r"_([xyz]|\d+)$", "", bound.parameter)
-    noun = _NOUNS.get(stem, f"component along {stem}" if len(stem) == 1 else "size" if stem == "size" else words(stem))
+    noun = _NOUNS.get(
+        stem, f"component along {stem}" if len(stem) == 1 else "size" if stem == "size" else words(stem)
+    )
     if not math.isfinite(bound.value):
         needs = str(getattr(get_effect(bound.name), "excited_by", ""))
         return f"this log cannot show {words(bound.name)}" + (f"; it takes {needs}" if needs else "")

@@ -1,7 +1,8 @@
 """What no effect of the library is: patterns that a residual may have for reasons outside the model.
 
-Each foil is a few linear columns, some of them found by a scan. They compete with the effects on the same terms; where one
-wins, the verdict is that the cause is not in the library, and of which kind it is. They are never part of "after".
+Each foil is a few linear columns, some of them found by a scan. They compete with the effects on the same
+terms; where one wins, the verdict is that the cause is not in the library, and of which kind it is. They are
+never part of "after".
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ def foils(local: Local, tangent: Floats, residual: Floats) -> list[Foil]:
     solver = _Projected(tangent, residual)
     found = []
     families = [_ripple(local), _contact(local), _attraction(local), _patch(local)]
-    if all(local.samples.time[part].max() > _LONG for part in local.samples.runs):  # short runs have no history of their own
+    # short runs have no history of their own
+    if all(local.samples.time[part].max() > _LONG for part in local.samples.runs):
         families += [_bump(local), _slip(local), _sway(local, residual)]
     for family in families:
         best: tuple[float, Foil] | None = None
@@ -75,7 +77,12 @@ class _Projected:
 
 def _sensed(local: Local, change: Floats) -> Floats:
     """(n, n_out, k) weighted columns of changes of the seen tip (n, 3, k) [m]."""
-    return _weighted(local, np.concatenate([change, np.zeros((len(change), 3 + 3 * local.pose.points.shape[1], change.shape[2]))], axis=1))
+    return _weighted(
+        local,
+        np.concatenate(
+            [change, np.zeros((len(change), 3 + 3 * local.pose.points.shape[1], change.shape[2]))], axis=1
+        ),
+    )
 
 
 def _weighted(local: Local, change: Floats) -> Floats:
@@ -108,7 +115,13 @@ def _bump(local: Local) -> Iterator[Foil]:
     for at in np.quantile(t, np.linspace(0.03, 0.97, _TIMES)):
         step = (t > at).astype(float)
         columns = _sensed(local, step[:, None, None] * np.eye(3)[None])
-        yield Foil("bump", "drift", f"the measured tip jumps at {_when(local, at)} and stays: base or camera was moved", columns, 1)
+        yield Foil(
+            "bump",
+            "drift",
+            f"the measured tip jumps at {_when(local, at)} and stays: base or camera was moved",
+            columns,
+            1,
+        )
 
 
 def _slip(local: Local) -> Iterator[Foil]:
@@ -121,7 +134,13 @@ def _slip(local: Local) -> Iterator[Foil]:
         for drive in range(wiring.n_drives):
             pull = np.where(wiring.drive == drive, wiring.drive_sign, 0.0)
             columns = _weighted(local, (local.by_bend @ wiring.bend(pull).ravel() * step[:, None])[..., None])
-            yield Foil("slip", "drift", f"the zero of drive {drive + 1} jumps at {_when(local, at)}: its wire slipped", columns, 2)
+            yield Foil(
+                "slip",
+                "drift",
+                f"the zero of drive {drive + 1} jumps at {_when(local, at)}: its wire slipped",
+                columns,
+                2,
+            )
 
 
 def _sway(local: Local, residual: Floats) -> Iterator[Foil]:
@@ -140,8 +159,16 @@ def _sway(local: Local, residual: Floats) -> Iterator[Foil]:
         for fine in f + np.array([-0.5, 0.0, 0.5]) / (_NARROW * duration):
             angle = 2.0 * np.pi * fine * t
             both = np.stack([np.sin(angle), np.cos(angle)], axis=1)
-            columns = _sensed(local, (both[:, None, :, None] * np.eye(3)[None, :, None, :]).reshape(len(t), 3, 6))
-            yield Foil("sway", "exogenous", f"a line at {fine:.3f} Hz that no input has: the base or the camera sways", columns, 1)
+            columns = _sensed(
+                local, (both[:, None, :, None] * np.eye(3)[None, :, None, :]).reshape(len(t), 3, 6)
+            )
+            yield Foil(
+                "sway",
+                "exogenous",
+                f"a line at {fine:.3f} Hz that no input has: the base or the camera sways",
+                columns,
+                1,
+            )
 
 
 def _ripple(local: Local) -> Iterator[Foil]:
@@ -160,16 +187,21 @@ def _ripple(local: Local) -> Iterator[Foil]:
             response = local.by_bend @ wiring.bend(pull).ravel()
             parts += [response * np.sin(angle)[:, None], response * np.cos(angle)[:, None]]
         yield Foil(
-            "ripple", "static", f"periodic in the wires with {1e3 * wavelength:.2f} mm: an eccentric drum or a gear",
-            _weighted(local, np.stack(parts, axis=-1)), 1,
-        )  # fmt: skip
+            "ripple",
+            "static",
+            f"periodic in the wires with {1e3 * wavelength:.2f} mm: an eccentric drum or a gear",
+            _weighted(local, np.stack(parts, axis=-1)),
+            1,
+        )
 
 
 def _contact(local: Local) -> Iterator[Foil]:
     """One-sided push along n where the tip goes beyond a plane n . x = c."""
     tip = local.pose.position
     angle = np.arange(24) * np.pi / 12.0
-    directions = [np.array([np.cos(a) * c, np.sin(a) * c, z]) for a, (c, z) in product(angle, ((1.0, 0.0), (0.8, -0.6)))]
+    directions = [
+        np.array([np.cos(a) * c, np.sin(a) * c, z]) for a, (c, z) in product(angle, ((1.0, 0.0), (0.8, -0.6)))
+    ]
     for n in directions:
         along = tip @ n
         for share in (0.5, 0.65, 0.75, 0.85, 0.93):
@@ -180,7 +212,8 @@ def _contact(local: Local) -> Iterator[Foil]:
             yield Foil(
                 "contact",
                 "static",
-                f"one-sided, where the tip goes beyond a plane towards {np.round(n, 2).tolist()}: it touches something",
+                f"one-sided, where the tip goes beyond a plane towards {np.round(n, 2).tolist()}: it "
+                "touches something",
                 columns,
                 3,
             )
@@ -199,7 +232,11 @@ def _attraction(local: Local) -> Iterator[Foil]:
         world = np.einsum("nij,nj->ni", np.broadcast_to(base, (len(tip), 3, 3)), force)
         columns = _weighted(local, np.einsum("nij,nj->ni", local.by_force, world)[..., None])
         yield Foil(
-            "attraction", "static", f"a pull towards a point near {np.round(1e3 * place).tolist()} mm: a magnet or a spring", columns, 4
+            "attraction",
+            "static",
+            f"a pull towards a point near {np.round(1e3 * place).tolist()} mm: a magnet or a spring",
+            columns,
+            4,
         )
 
 
@@ -211,4 +248,10 @@ def _patch(local: Local) -> Iterator[Foil]:
         place = tip.mean(0) + reach * far * np.array([np.cos(a), np.sin(a)])
         near = np.exp(-0.5 * ((tip - place) ** 2).sum(1) / (width * reach) ** 2)
         columns = _sensed(local, near[:, None, None] * np.eye(3)[None])
-        yield Foil("patch", "static", f"confined to the workspace around {np.round(1e3 * place).tolist()} mm", columns, 3)
+        yield Foil(
+            "patch",
+            "static",
+            f"confined to the workspace around {np.round(1e3 * place).tolist()} mm",
+            columns,
+            3,
+        )

@@ -1,4 +1,5 @@
-"""Before the search: is this a log of this robot, what is its noise, which base parameters does it show, how do they fit."""
+"""Before the search: is this a log of this robot, what is its noise, which base parameters does it show, how
+do they fit."""
 
 from __future__ import annotations
 
@@ -26,13 +27,19 @@ _RESTLESS = 0.25  # of the motion: noise beyond it is no noise
 
 
 class Base:
-    """The samples of the search, their noise and weights, and the base model; `rows` are all that may be fitted."""
+    """The samples of the search, their noise and weights, and the base model; `rows` are all that may be
+    fitted."""
 
     def __init__(self, samples: Samples, rows: Ints, model: Model, robot: Robot, threads: int | None) -> None:
         self.rows = rows
         self.samples, self.model, self.robot = samples, model, robot
         self.rod = Rod(samples, robot, points=samples.log.points is not None, threads=threads)
-        self.target = Target(samples, np.full(3, 1e-3 * robot.length), rotation_sigma=_TURN, points=samples.log.points is not None)
+        self.target = Target(
+            samples,
+            np.full(3, 1e-3 * robot.length),
+            rotation_sigma=_TURN,
+            points=samples.log.points is not None,
+        )
         n = len(samples.rows)
         self.block: Ints = np.minimum(np.arange(n) * N_BLOCKS // n, N_BLOCKS - 1)
         self.noise = Noise(np.full(3, 1e-3), 0.0, "")
@@ -41,12 +48,15 @@ class Base:
         """Sigma of each stage."""
 
     def fit(self, search: Search) -> tuple[State, dict[str, Estimate]]:
-        """The base model with its own parameters fitted; those that this log cannot see stay nominal, with the reason."""
+        """The base model with its own parameters fitted; those that this log cannot see stay nominal, with
+        the reason."""
         model, target = self.model, self.target
         local = Local(model, model.start, self.samples, self.rod, target)
         if not local.pose.ok.all():
             lost = int((~local.pose.ok).sum())
-            self.notes.append(f"the model did not converge on {lost} of {len(local.pose.ok)} rows; they do not count")
+            self.notes.append(
+                f"the model did not converge on {lost} of {len(local.pose.ok)} rows; they do not count"
+            )
         raw = target.tip - local.pose.position
         self.noise = self._noise()
         given = self.robot.sensor.get("noise", 0.0)
@@ -59,7 +69,9 @@ class Base:
             self.notes.append(f"{out} of {len(raw)} rows are outliers and do not count")
         self.weigh(self.noise.sigma)
         fixed = self._unseen(local)
-        model = Model(model.robot, model.wiring, model.effects, tuple(u for u in model.unknowns if u.name not in fixed))
+        model = Model(
+            model.robot, model.wiring, model.effects, tuple(u for u in model.unknowns if u.name not in fixed)
+        )
         self.model = model
         self.weigh(self.noise.sigma * max(1.0, rms(target.residual(local.pose))))
         state = search.start(model, model.start)
@@ -83,25 +95,31 @@ class Base:
         made.noise, made.notes, made.weights = self.noise, self.notes, self.weights
         made.weigh(self.target.sigma)
         pose = predict(state.model, state.theta, samples, made.rod)
-        made.target.weight = (keep(samples, np.nan_to_num(made.target.tip - pose.position), self.noise) & pose.ok).astype(float)
+        made.target.weight = (
+            keep(samples, np.nan_to_num(made.target.tip - pose.position), self.noise) & pose.ok
+        ).astype(float)
         return made
 
     def weigh(self, sigma: Floats) -> None:
-        """Positions count by `sigma` (3,) [m], and orientations as much more or less than by their noise as positions do: weighed apart,
-        what one of them cannot explain would leave the other to decide alone."""
+        """Positions count by `sigma` (3,) [m], and orientations as much more or less than by their noise as
+        positions do: weighed apart, what one of them cannot explain would leave the other to decide alone."""
         self.target.sigma = sigma.copy()
         self.target.rotation_sigma = _TURN * float((sigma / self.noise.sigma).max())
 
     def weighed(self, search: Search, state: State) -> State:
-        """The state fitted again with weights of the size of its own residual, never below the noise: what a model does not
-        explain yet must not push its parameters beyond their priors."""
-        self.weigh(self.target.sigma * max(rms(state.fit.residual), float((self.noise.sigma / self.target.sigma).max())))
+        """The state fitted again with weights of the size of its own residual, never below the noise: what a
+        model does not explain yet must not push its parameters beyond their priors."""
+        self.weigh(
+            self.target.sigma
+            * max(rms(state.fit.residual), float((self.noise.sigma / self.target.sigma).max()))
+        )
         self.weights.append(self.target.sigma.copy())
         return search.refined(search.refined(state))
 
     def _unseen(self, local: Local) -> dict[str, Estimate]:
-        """Base parameters whose prior this log does not narrow: Fisher information at the noise, others free. And stiffnesses that nobody
-        put into `[fit]`, where no load is known: what the wires' give would show of them, any gain of the drives shows as well."""
+        """Base parameters whose prior this log does not narrow: Fisher information at the noise, others free.
+        And stiffnesses that nobody put into `[fit]`, where no load is known: what the wires' give would show
+        of them, any gain of the drives shows as well."""
         model = self.model
         r = local.residual(model, model.start)
         J = local.slopes(model, model.start, r)
@@ -111,7 +129,11 @@ class Base:
         fixed = {}
         posterior = np.sqrt(np.maximum(np.diag(np.linalg.pinv(H)), 0.0)) if len(sd) else sd
         for u, narrowed, prior in zip(model.unknowns, posterior, sd, strict=True):
-            blind = "stiffness" in u.name and u.name not in model.robot.fit and not advice.loaded(self.samples, model.robot)
+            blind = (
+                "stiffness" in u.name
+                and u.name not in model.robot.fit
+                and not advice.loaded(self.samples, model.robot)
+            )
             if blind or narrowed > SEEN * prior:
                 fixed[u.name] = Estimate(
                     value=u.start if u.place[0] == "robot" else u.mean,
@@ -125,12 +147,14 @@ class Base:
 
 
 def check_motion(base: Base, state: State, guess: str) -> None:
-    """Refuse a log that the fitted model follows worse than a robot that stands still: it is of another robot, or in other units, as
-    the sentence `guess` may say. Raises `LogError`."""
+    """Refuse a log that the fitted model follows worse than a robot that stands still: it is of another
+    robot, or in other units, as the sentence `guess` may say. Raises `LogError`."""
     good = (base.target.weight > 0.0) & state.local.pose.ok
     measured, predicted = (
         base.target.tip[good],
-        state.local.seen(state.model, state.theta, state.local.solved(state.model, state.theta)).position[good],
+        state.local.seen(state.model, state.theta, state.local.solved(state.model, state.theta)).position[
+            good
+        ],
     )
     if 2 * state.local.pose.ok.sum() < state.local.pose.ok.size or not np.isfinite(predicted).all():
         raise LogError(further_than_still(base.samples, base.robot, np.nan, guess))
@@ -140,10 +164,15 @@ def check_motion(base: Base, state: State, guess: str) -> None:
     if float(((measured - predicted) ** 2).sum()) > moves:
         scale = float((measured * predicted).sum() / max((predicted**2).sum(), 1e-30))
         raise LogError(further_than_still(base.samples, base.robot, scale, guess))
-    if base.noise.floor > _RESTLESS * np.sqrt(moves / max(len(measured), 1)) and base.noise.floor > 0.01 * base.robot.length:
+    if (
+        base.noise.floor > _RESTLESS * np.sqrt(moves / max(len(measured), 1))
+        and base.noise.floor > 0.01 * base.robot.length
+    ):
         raise LogError(
-            f"in log {name!r} the measured tip jumps by {1e3 * base.noise.floor:.3g} mm from sample to sample while the inputs rest, "
-            f"{100 * base.noise.floor / np.sqrt(moves / len(measured)):.0f} % of its motion; are two robots or two markers mixed?"
+            f"in log {name!r} the measured tip jumps by {1e3 * base.noise.floor:.3g} mm from sample to "
+            "sample while the inputs rest, "
+            f"{100 * base.noise.floor / np.sqrt(moves / len(measured)):.0f} % of its motion; are two robots "
+            "or two markers mixed?"
         )
 
 
@@ -152,18 +181,37 @@ def check_log(samples: Samples, robot: Robot) -> None:
     log = samples.log
     measured = int(log.measured.sum())
     if measured == 0:
-        raise LogError(f"log {log.name!r} has no row in which every input and the tip are there; there is nothing to explain.")
+        raise LogError(
+            f"log {log.name!r} has no row in which every input and the tip are there; there is "
+            "nothing to explain."
+        )
     if measured < LEAST_ROWS:
-        raise LogError(f"log {log.name!r} has {measured} measured rows; identification needs {LEAST_ROWS} at least, better two thousand.")
-    inputs = [log.dl, *(a.reshape(len(log), -1) for a in (log.ext, log.tip_force, log.payload, log.base_quaternion) if a is not None)]
+        raise LogError(
+            f"log {log.name!r} has {measured} measured rows; identification needs {LEAST_ROWS} "
+            "at least, better two thousand."
+        )
+    inputs = [
+        log.dl,
+        *(
+            a.reshape(len(log), -1)
+            for a in (log.ext, log.tip_force, log.payload, log.base_quaternion)
+            if a is not None
+        ),
+    ]
     moves = np.concatenate([np.ptp(a, axis=0) for a in inputs]) if inputs else np.zeros(0)
     if not (moves > 1e-9).any():
-        raise LogError(f"in log {log.name!r} no input ever changes; nothing can be told from it. fastrod excite writes a run that does.")
+        raise LogError(
+            f"in log {log.name!r} no input ever changes; nothing can be told from it. fastrod "
+            "excite writes a run that does."
+        )
     if float(np.ptp(np.asarray(log.tip_position)[log.measured], axis=0).max()) < 1e-7 * robot.length:
         raise LogError(f"in log {log.name!r} the measured tip never moves; is the camera's column filled?")
     for mode, number in ((s.mode, k) for k, s in enumerate(robot.segments, 1)):
         if mode == "tendon_tension":
-            raise InputError(f"segment {number} of robot {robot.name!r} is in mode 'tendon_tension', but a run log gives tendon lengths.")
+            raise InputError(
+                f"segment {number} of robot {robot.name!r} is in mode 'tendon_tension', but a "
+                "run log gives tendon lengths."
+            )
 
 
 def rms(residual: Floats) -> float:

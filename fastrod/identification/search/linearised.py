@@ -1,12 +1,14 @@
 """The model near one parameter vector: wires, loads and camera exactly, the rod by its slopes.
 
-A candidate effect changes the rod's inputs by little. So the rod is solved once at a reference, and once for each
-direction that its inputs can take; after that a candidate costs no rod at all. What is accepted is solved exactly.
+A candidate effect changes the rod's inputs by little. So the rod is solved once at a reference, and once for
+each direction that its inputs can take; after that a candidate costs no rod at all. What is accepted is
+solved exactly.
 """
 
 from __future__ import annotations
 
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
@@ -28,7 +30,11 @@ class Target:
         log = samples.log.rows(samples.rows)
         self.tip = np.asarray(log.tip_position)
         quaternion = log.tip_quaternion
-        self.rotation = None if quaternion is None or not np.isfinite(quaternion).all() else matrix_from_quaternion(quaternion)
+        self.rotation = (
+            None
+            if quaternion is None or not np.isfinite(quaternion).all()
+            else matrix_from_quaternion(quaternion)
+        )
         self.points = log.points if points and log.points is not None else np.zeros((len(log), 0, 3))
         self.seen = np.isfinite(self.points)
         self.sigma, self.rotation_sigma = sigma, rotation_sigma
@@ -36,20 +42,25 @@ class Target:
         """(n,) 0 for outliers."""
 
     def residual(self, pose: Pose) -> Floats:
-        """(n, n_out) measured - predicted over sigma: tip, rotation vector, points; 0 for rows that do not count."""
+        """(n, n_out) measured - predicted over sigma: tip, rotation vector, points; 0 for rows that do not
+        count."""
         parts = [(self.tip - pose.position) / self.sigma]
         if self.rotation is not None:
             turn = self.rotation @ np.swapaxes(pose.rotation, 1, 2)
             parts.append(_vector(turn) / self.rotation_sigma)
         if self.points.shape[1]:
-            parts.append((np.where(self.seen, self.points - pose.points, 0.0) / self.sigma).reshape(len(self.tip), -1))
+            parts.append(
+                (np.where(self.seen, self.points - pose.points, 0.0) / self.sigma).reshape(len(self.tip), -1)
+            )
         every = np.concatenate(parts, axis=1)
         return np.asarray(np.where((self.weight > 0.0)[:, None] & pose.ok[:, None], every, 0.0))
 
 
 def _vector(turn: Floats) -> Floats:
     """(n, 3) rotation vector of rotations that are small (exact to third order)."""
-    skew = 0.5 * np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=1)
+    skew = 0.5 * np.stack(
+        [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=1
+    )
     sine = np.linalg.norm(skew, axis=1, keepdims=True)
     angle = np.arctan2(sine, 0.5 * (np.trace(turn, axis1=1, axis2=2)[:, None] - 1.0))
     return np.asarray(skew * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-9), 1.0))
@@ -65,7 +76,13 @@ class Local:
     """The model `model` at `theta`, and all models near it."""
 
     def __init__(self, model: Model, theta: Floats, samples: Samples, rod: Rod, target: Target) -> None:
-        self.model, self.theta, self.samples, self.rod, self.target = model, theta.copy(), samples, rod, target
+        self.model, self.theta, self.samples, self.rod, self.target = (
+            model,
+            theta.copy(),
+            samples,
+            rod,
+            target,
+        )
         self.robot = model.robot_at(theta)
         self.bench = bench(samples, self.robot, model.wiring)
         self.chain = chain_of(model, theta)
@@ -104,16 +121,24 @@ class Local:
             change = np.zeros((1, wiring.n_segments, 2))
             change.reshape(-1)[j] = _BEND
             every.append(self._solved(length=self.opened.tendon_length + wiring.wires(change)) / _BEND)
-        return np.stack(every, axis=-1) if every else np.zeros((len(self.samples.rows), 6 + 3 * self.pose.points.shape[1], 0))
+        return (
+            np.stack(every, axis=-1)
+            if every
+            else np.zeros((len(self.samples.rows), 6 + 3 * self.pose.points.shape[1], 0))
+        )
 
     @cached_property
     def by_force(self) -> Floats:
         """(n, 6 + 3k, 3) per N, world."""
         step = _FORCE * min(min(s.bending_stiffness) for s in self.robot.segments) / self.robot.length**2
-        return np.stack([self._solved(force=self.opened.tip_force + step * np.eye(3)[j]) / step for j in range(3)], axis=-1)
+        return np.stack(
+            [self._solved(force=self.opened.tip_force + step * np.eye(3)[j]) / step for j in range(3)],
+            axis=-1,
+        )
 
     def is_light(self, name: str) -> bool:
-        """Whether an effect changes only wire lengths, the tip force or the camera: then no rod need be solved for it."""
+        """Whether an effect changes only wire lengths, the tip force or the camera: then no rod need be
+        solved for it."""
         what = get_effect(name)
         if has_memory(what) or what.seam is Seam.SENSING:
             return True
@@ -122,26 +147,37 @@ class Local:
             self._columns_kind[key] = self._probe(name)
         return self._columns_kind[key]
 
-    _columns_kind: dict[tuple[str, str], bool] = {}  # noqa: RUF012  # a fact about each effect, not about this object
+    _columns_kind: ClassVar[dict[tuple[str, str], bool]] = {}
 
     def _probe(self, name: str) -> bool:
         what, opened = get_effect(name), self.bench.open()
         unknowns = effect_unknowns(name, self.model.wiring)
-        values = Model(self.model.robot, self.model.wiring, (name,), unknowns).values(np.array([u.outside(u.start) for u in unknowns]))[
-            name
-        ]
+        values = Model(self.model.robot, self.model.wiring, (name,), unknowns).values(
+            np.array([u.outside(u.start) for u in unknowns])
+        )[name]
         before = {
             key: getattr(opened, key).copy()
-            for key in ("extension", "offset", "compliance", "stiffness", "precurvature", "tip_moment", "line_force")
+            for key in (
+                "extension",
+                "offset",
+                "compliance",
+                "stiffness",
+                "precurvature",
+                "tip_moment",
+                "line_force",
+            )
         }
-        what.apply(np.broadcast_to(values, (len(opened), len(values))), np.empty((len(opened), 0)), opened, None, 0.0)
+        what.apply(
+            np.broadcast_to(values, (len(opened), len(values))), np.empty((len(opened), 0)), opened, None, 0.0
+        )
         return all(np.array_equal(getattr(opened, key), old) for key, old in before.items())
 
     def _is_light(self, unknown: Unknown) -> bool:
         return unknown.place[0] == "effect" and self.is_light(unknown.place[1])
 
     def column(self, unknown: Unknown) -> Floats:
-        """(n, 6 + 3k) change of the true pose per unit of an unknown that needs the rod, one-sided difference at the reference."""
+        """(n, 6 + 3k) change of the true pose per unit of an unknown that needs the rod, one-sided difference
+        at the reference."""
         if unknown.place not in self._columns:
             step = unknown.scale
             model, theta = self.model, self.theta
@@ -165,12 +201,18 @@ class Local:
 
     def driven(self, model: Model, theta: Floats) -> Floats:
         """(n, 6 + 3k) change of the true pose by wires and tip forces."""
-        light = [link for link, name in zip(chain_of(model, theta), model.effects, strict=True) if self.is_light(name)]
+        light = [
+            link
+            for link, name in zip(chain_of(model, theta), model.effects, strict=True)
+            if self.is_light(name)
+        ]
         opened = self.bench.drive(light)
         change = np.zeros((len(opened), 6 + 3 * self.pose.points.shape[1]))
         moved = opened.tendon_length - self._length
         if moved.any():
-            change += np.einsum("nij,nj->ni", self.by_bend, self.model.wiring.bend(moved).reshape(len(opened), -1))
+            change += np.einsum(
+                "nij,nj->ni", self.by_bend, self.model.wiring.bend(moved).reshape(len(opened), -1)
+            )
         force = opened.tip_force - self._force
         if force.any():
             change += np.einsum("nij,nj->ni", self.by_force, force)
@@ -182,11 +224,14 @@ class Local:
         change = np.zeros((len(self.samples.rows), 6 + 3 * self.pose.points.shape[1]))
         for unknown, number in zip(model.unknowns, theta, strict=True):
             if not self._is_light(unknown):
-                change += self.column(unknown) * (unknown.inside(float(number)) - at.get(unknown.place, unknown.mean))
+                change += self.column(unknown) * (
+                    unknown.inside(float(number)) - at.get(unknown.place, unknown.mean)
+                )
         return change
 
     def seen(self, model: Model, theta: Floats, change: Floats) -> Pose:
-        """What the camera sees after a change (n, 6 + 3k) of the true pose: tip [m], rotation vector [rad], points [m], base frame."""
+        """What the camera sees after a change (n, 6 + 3k) of the true pose: tip [m], rotation vector [rad],
+        points [m], base frame."""
         rotation = self.pose.rotation
         links = [link for link in chain_of(model, theta) if link[0].seam is Seam.SENSING]
         if links or self.target.rotation is not None:
@@ -196,7 +241,9 @@ class Local:
 
     def residual(self, model: Model, theta: Floats) -> Floats:
         """(n, n_out) weighted."""
-        return self.target.residual(self.seen(model, theta, self.driven(model, theta) + self.solved(model, theta)))
+        return self.target.residual(
+            self.seen(model, theta, self.driven(model, theta) + self.solved(model, theta))
+        )
 
     def slopes(self, model: Model, theta: Floats, residual: Floats) -> Floats:
         """(n, n_out, p) of the prediction, by differences that run only what an unknown moves."""
@@ -213,7 +260,9 @@ class Local:
             moved[j] += step
             change = driven + solved
             if not self._is_light(unknown):
-                change = change + self.column(unknown) * (unknown.inside(float(moved[j])) - unknown.inside(float(theta[j])))
+                change = change + self.column(unknown) * (
+                    unknown.inside(float(moved[j])) - unknown.inside(float(theta[j]))
+                )
             elif get_effect(unknown.place[1]).seam is not Seam.SENSING:
                 change = self.driven(model, moved) + solved
             J[..., j] = (residual - self.target.residual(self.seen(model, moved, change))) / step
@@ -221,7 +270,8 @@ class Local:
         return J
 
     def fit(self, model: Model, start: Floats, iterations: int) -> Fit:
-        """The best parameters near here, from `start` (p,) on, within the model's limits and under its priors."""
+        """The best parameters near here, from `start` (p,) on, within the model's limits and under its
+        priors."""
         mean, sd = model.prior
         return minimise(
             lambda theta: self.residual(model, theta),
@@ -234,7 +284,9 @@ class Local:
         )
 
 
-def exact_residual(model: Model, theta: Floats, samples: Samples, rod: Rod, target: Target) -> tuple[Floats, Flags]:
+def exact_residual(
+    model: Model, theta: Floats, samples: Samples, rod: Rod, target: Target
+) -> tuple[Floats, Flags]:
     """(n, n_out) weighted residual with the rod solved, and (n,) which rows converged."""
     from fastrod.identification.log.forward import predict
 

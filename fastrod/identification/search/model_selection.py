@@ -1,4 +1,5 @@
-"""What speaks for a candidate: the states that the search compares, and the rules by which one is taken, a rival, or needless."""
+"""What speaks for a candidate: the states that the search compares, and the rules by which one is taken, a
+rival, or needless."""
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ from fastrod.types import Floats
 
 Z_ACCEPT, BIC_ACCEPT, SHARE_ACCEPT = 3.0, 10.0, 0.006
 Z_STRONG, BIC_STRONG = 1.7, 60.0  # an effect that shows in a few blocks only, but there beyond doubt
-Z_BLOCKS, SHARE_BLOCKS = 3.5, 0.03  # or one that block after block confirms, where a smooth residual is worth few samples
+# or one that block after block confirms, where a smooth residual is worth few samples
+Z_BLOCKS, SHARE_BLOCKS = 3.5, 0.03
 Z_RIVAL, BIC_RIVAL = 2.0, 10.0
 Z_KEEP, BIC_KEEP, SHARE_KEEP = 2.0, 6.0, 0.015
 
@@ -90,16 +92,18 @@ class Bound:
 
 
 def advantage(one: Candidate, other: Candidate) -> float:
-    """BIC by which one candidate is better than the other, with the effective samples of the one that leaves less."""
+    """BIC by which one candidate is better than the other, with the effective samples of the one that leaves
+    less."""
     assert one.state is not None
     assert other.state is not None
     losses = one.state.fit.loss, other.state.fit.loss
-    size = effective_size((one if losses[0] <= losses[1] else other).state.fit.residual)  # type: ignore[union-attr]
+    size = effective_size((one.state if losses[0] <= losses[1] else other.state).fit.residual)
     return bic(losses[1], other.n_parameters, size) - bic(losses[0], one.n_parameters, size)
 
 
 def best_of(candidates: Sequence[Candidate]) -> Candidate | None:
-    """The winner by `advantage`, compared one after the other; of equals the first, None of none. All must have been fitted."""
+    """The winner by `advantage`, compared one after the other; of equals the first, None of none. All must
+    have been fitted."""
     best: Candidate | None = None
     for candidate in candidates:
         if best is None or advantage(candidate, best) > 0.0:
@@ -117,11 +121,16 @@ def z_between(one: Candidate, other: Candidate) -> float:
 def unphysical(state: State, name: str) -> str:
     """Why an effect's parameters cannot be, or nothing."""
     sizes = []
-    for unknown, number, at_bound in zip(state.model.unknowns, state.fit.theta, state.fit.at_bound, strict=False):
+    for unknown, number, at_bound in zip(
+        state.model.unknowns, state.fit.theta, state.fit.at_bound, strict=False
+    ):
         if unknown.place[:2] != ("effect", name) or unknown.shape:
             continue
         value = unknown.inside(float(number))
         sizes.append(abs(value - unknown.mean))
         if at_bound and value != unknown.mean:
-            return f"its {unknown.name.partition('.')[2]} would be {value:.3g} {unknown.unit}, at the bound of what is physical"
+            return (
+                f"its {unknown.name.partition('.')[2]} would be {value:.3g} {unknown.unit}, at the bound "
+                "of what is physical"
+            )
     return "" if any(size > 0.0 for size in sizes) else "its best size is zero"

@@ -1,7 +1,9 @@
-"""What of a residual follows from anything that is known: inputs now, inputs before, or time; without naming a cause.
+"""What of a residual follows from anything that is known: inputs now, inputs before, or time; without naming
+a cause.
 
-Ridge regression on general features, judged on blocks that it has not seen. The shares are increments: static features
-first, then those with memory, then time. What follows from none of them and is still not noise is a signal from outside.
+Ridge regression on general features, judged on blocks that it has not seen. The shares are increments: static
+features first, then those with memory, then time. What follows from none of them and is still not noise is a
+signal from outside.
 """
 
 from __future__ import annotations
@@ -47,14 +49,18 @@ class Audit:
         return name if self.structured > 0.0 and parts[name] > 0.0 else "none"
 
 
-def audit(samples: Samples, wiring: Wiring, residual: Floats, noise_lag1: float = 0.0, n_blocks: int = 10) -> Audit:
+def audit(
+    samples: Samples, wiring: Wiring, residual: Floats, noise_lag1: float = 0.0, n_blocks: int = 10
+) -> Audit:
     """Audit a residual (n_rows, n_out) in order of time, on `n_blocks` folds of short blocks."""
     variance = float((residual**2).sum())
     block = np.arange(len(residual)) * _PIECES // max(len(residual), 1) % n_blocks
     if variance <= 0.0 or n_blocks < 3:
         return Audit(0.0, 0.0, 0.0, 0.0, 0.0)
     static, memory, drift = features(samples, wiring)
-    losses: list[Floats] = [np.asarray(np.bincount(block, weights=(residual**2).sum(1), minlength=n_blocks), dtype=np.float64)]
+    losses: list[Floats] = [
+        np.asarray(np.bincount(block, weights=(residual**2).sum(1), minlength=n_blocks), dtype=np.float64)
+    ]
     columns = np.zeros((len(residual), 0))
     left = residual
     shares = []
@@ -68,10 +74,16 @@ def audit(samples: Samples, wiring: Wiring, residual: Floats, noise_lag1: float 
             left = rest
         else:
             shares.append(0.0)
-    order = np.diff(samples.rows) <= max(1.0, 1.5 * float(np.median(np.diff(samples.rows))) if len(samples.rows) > 1 else 1.0)
+    order = np.diff(samples.rows) <= max(
+        1.0, 1.5 * float(np.median(np.diff(samples.rows))) if len(samples.rows) > 1 else 1.0
+    )
     pair = float((left[1:] * left[:-1])[order].sum()) / max(float((left**2).sum()), 1e-300)
     beyond = max(0.0, pair - max(noise_lag1, 0.0)) if len(left) > 50 else 0.0
-    exogenous = beyond * float((left**2).sum()) / variance if beyond > 4.0 / np.sqrt(max(left.size, 1)) + 0.02 else 0.0
+    exogenous = (
+        beyond * float((left**2).sum()) / variance
+        if beyond > 4.0 / np.sqrt(max(left.size, 1)) + 0.02
+        else 0.0
+    )
     z = paired(losses[0], losses[-1]) if len(losses) > 1 else 0.0
     return Audit(shares[0], shares[1], shares[2], exogenous, float(max(z, beyond * np.sqrt(left.size))))
 
@@ -100,10 +112,16 @@ def _ridge(features: Floats, residual: Floats, block: Ints, n_blocks: int) -> tu
 def features(samples: Samples, wiring: Wiring) -> tuple[Floats, Floats, Floats]:
     """Static, memory and time features (n_rows, any), each of about unit size."""
     log, rows = samples.log, samples.rows
-    bend = wiring.bend(np.asarray(log.dl)).reshape(len(log), -1) if wiring.n_tendons else np.zeros((len(log), 0))
+    bend = (
+        wiring.bend(np.asarray(log.dl)).reshape(len(log), -1) if wiring.n_tendons else np.zeros((len(log), 0))
+    )
     top = max(float(np.abs(bend).max(initial=0.0)), 1e-9)
     b = bend / top
-    others = [np.asarray(a).reshape(len(log), -1) for a in (log.ext, log.tip_force, log.payload, log.base_quaternion) if a is not None]
+    others = [
+        np.asarray(a).reshape(len(log), -1)
+        for a in (log.ext, log.tip_force, log.payload, log.base_quaternion)
+        if a is not None
+    ]
     more = np.concatenate(others, axis=1) if others else np.zeros((len(log), 0))
     more = (more - more.mean(0)) / np.maximum(more.std(0), 1e-9) * (np.ptp(more, axis=0) > 1e-9)
     more = more[:, np.ptp(more, axis=0) > 0.0]
@@ -112,7 +130,9 @@ def features(samples: Samples, wiring: Wiring) -> tuple[Floats, Floats, Floats]:
     now = np.concatenate([b, 0.5 * more], axis=1)
     for i in range(now.shape[1]):
         static += [now[:, i : i + 1] * now[:, i:]]
-    static += [b[:, i : i + 1] * b[:, j : j + 1] * b[:, j:] for i in range(b.shape[1]) for j in range(i, b.shape[1])]
+    static += [
+        b[:, i : i + 1] * b[:, j : j + 1] * b[:, j:] for i in range(b.shape[1]) for j in range(i, b.shape[1])
+    ]
     if now.shape[1]:
         for width in (1.5, 5.0):
             direction = width * rng.normal(size=(now.shape[1], _RANDOM // 2))
@@ -125,7 +145,8 @@ def features(samples: Samples, wiring: Wiring) -> tuple[Floats, Floats, Floats]:
 
 
 def _memory(b: Floats, dt: Floats) -> Floats:
-    """Plays of four widths, low-passes of four time constants, velocity, its sign, acceleration of bends (n, 2 n_segments)."""
+    """Plays of four widths, low-passes of four time constants, velocity, its sign, acceleration of bends (n,
+    2 n_segments)."""
     from fastrod.kernels.operators import play, relaxation
 
     if not b.shape[1]:
@@ -133,11 +154,22 @@ def _memory(b: Floats, dt: Floats) -> Floats:
     found = []
     for width in _PLAYS:
         x = b[None].copy()
-        play(x, np.full((1, 3 * b.shape[1]), np.nan), np.full((1, b.shape[1]), width), np.zeros((1, b.shape[1])))
+        play(
+            x,
+            np.full((1, 3 * b.shape[1]), np.nan),
+            np.full((1, b.shape[1]), width),
+            np.zeros((1, b.shape[1])),
+        )
         found.append((b - x[0]) / width)
     for lag in _LAGS:
         x = b[None].copy()
-        relaxation(x, np.full((1, 2 * b.shape[1]), np.nan), np.ones((1, b.shape[1])), np.full((1, b.shape[1]), lag), dt)
+        relaxation(
+            x,
+            np.full((1, 2 * b.shape[1]), np.nan),
+            np.ones((1, b.shape[1])),
+            np.full((1, b.shape[1]), lag),
+            dt,
+        )
         found.append(2.0 * (b - x[0]))
     velocity = np.diff(b, axis=0, prepend=b[:1]) / np.maximum(dt, 1e-3)[:, None]
     found += [velocity, np.tanh(velocity / 0.05), np.diff(velocity, axis=0, prepend=velocity[:1])]

@@ -1,7 +1,8 @@
-"""The search for what the model lacks: fit every candidate beside what is known, judge it on blocks it has not seen, keep the
-best, ask again.
+"""The search for what the model lacks: fit every candidate beside what is known, judge it on blocks it has
+not seen, keep the best, ask again.
 
-Every candidate starts from the same reference, weights and outlier mask. Foils (`foils`) compete on the same terms.
+Every candidate starts from the same reference, weights and outlier mask. Foils (`foils`) compete on the same
+terms.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from fastrod.identification.search.model_selection import (
     best_of,
     unphysical,
     z_between,
-)  # fmt: skip
+)
 from fastrod.identification.search.solve import Fit, bic, effective_size, held_out_losses, minimise, paired
 from fastrod.types import Floats, Ints
 
@@ -67,7 +68,8 @@ class Search:
     report: Callable[[str], None] = field(default=lambda _: None)
 
     def start(self, model: Model, theta: Floats, iterations: int = 6) -> State:
-        """The state of a model without anything found, linearised twice: at `theta` (p,), and where the fit from there ends."""
+        """The state of a model without anything found, linearised twice: at `theta` (p,), and where the fit
+        from there ends."""
         local = Local(model, theta, self.samples, self.rod, self.target)
         fit = self._fit(local, model, theta, np.zeros((0,)), (), iterations)
         return self.refined(self._state(model, local, fit, ()))
@@ -75,21 +77,36 @@ class Search:
     def refined(self, state: State, iterations: int = 4) -> State:
         """The same with the rod solved at the state's own parameters."""
         local = Local(state.model, state.theta, self.samples, self.rod, self.target)
-        fit = self._fit(local, state.model, state.theta, state.fit.theta[len(state.theta) :], state.foils, iterations)
+        fit = self._fit(
+            local, state.model, state.theta, state.fit.theta[len(state.theta) :], state.foils, iterations
+        )
         if not np.isfinite(fit.loss):
             return state
         return self._state(state.model, local, fit, state.foils)
 
     def again(self, state: State) -> State:
-        """A state of other samples, fitted to these; foils, which belong to their samples, are left behind."""
+        """A state of other samples, fitted to these; foils, which belong to their samples, are left
+        behind."""
         local = Local(state.model, state.theta, self.samples, self.rod, self.target)
-        return self.refined(self._state(state.model, local, self._fit(local, state.model, state.theta, np.zeros(0), (), 6), ()))
+        return self.refined(
+            self._state(
+                state.model, local, self._fit(local, state.model, state.theta, np.zeros(0), (), 6), ()
+            )
+        )
 
     def _state(self, model: Model, local: Local, fit: Fit, found: tuple[Foil, ...]) -> State:
         losses = held_out_losses(fit.residual, fit.slopes, fit.precision, self.block, N_BLOCKS)
         return State(model, local, fit, losses, found)
 
-    def _fit(self, local: Local, model: Model, theta: Floats, amplitudes: Floats, found: Sequence[Foil], iterations: int) -> Fit:
+    def _fit(
+        self,
+        local: Local,
+        model: Model,
+        theta: Floats,
+        amplitudes: Floats,
+        found: Sequence[Foil],
+        iterations: int,
+    ) -> Fit:
         """The best parameters near `local`, with the amplitudes of foils as further linear unknowns."""
         n = len(model.unknowns)
         mean, sd = model.prior
@@ -110,9 +127,14 @@ class Search:
             return np.concatenate([own, columns], axis=-1)
 
         return minimise(
-            residual, slopes, np.concatenate([theta, amplitudes]), np.concatenate([mean, np.zeros(k)]),
-            np.concatenate([sd, wide]), (np.concatenate([low, -free]), np.concatenate([high, free])), iterations,
-        )  # fmt: skip
+            residual,
+            slopes,
+            np.concatenate([theta, amplitudes]),
+            np.concatenate([mean, np.zeros(k)]),
+            np.concatenate([sd, wide]),
+            (np.concatenate([low, -free]), np.concatenate([high, free])),
+            iterations,
+        )
 
     @property
     def spent(self) -> bool:
@@ -122,9 +144,12 @@ class Search:
     # ------------------------------------------------------------ candidates
 
     def candidate(self, state: State, name: str) -> Candidate:
-        """An effect fitted beside a state, from each of its starts; not fitted once the search has `spent` its passes."""
+        """An effect fitted beside a state, from each of its starts; not fitted once the search has `spent`
+        its passes."""
         if self.spent:
-            return Candidate(name, None, 0.0, 0.0, 0.0, 0, "not tried: the model hardly converges on this log")
+            return Candidate(
+                name, None, 0.0, 0.0, 0.0, 0, "not tried: the model hardly converges on this log"
+            )
         drop = self._unseen(state, name)
         every = state.model.with_effect(name)
         added = every.unknowns[len(state.model.unknowns) :]
@@ -138,12 +163,21 @@ class Search:
                 0.0,
                 0.0,
                 0,
-                "this log does not excite it: " + (getattr(get_effect(name), "excited_by", "") or "no response"),
+                "this log does not excite it: "
+                + (getattr(get_effect(name), "excited_by", "") or "no response"),
             )
         model = state.model.with_effect(name, drop=drop)
         fits = self._from_starts(state, model, name)
         if fits is None:
-            return Candidate(name, None, 0.0, 0.0, 0.0, len(model.unknowns) - len(state.model.unknowns), "its slopes promise nothing")
+            return Candidate(
+                name,
+                None,
+                0.0,
+                0.0,
+                0.0,
+                len(model.unknowns) - len(state.model.unknowns),
+                "its slopes promise nothing",
+            )
         return self.judged(state, self._state(model, state.local, fits, state.foils), name)
 
     def _unseen(self, state: State, name: str) -> list[str]:
@@ -172,7 +206,14 @@ class Search:
         starts = {p.name: p.on(model.wiring).starts for p in get_effect(name).parameters}
         # per-segment and per-drive columns share their parameter's starts
         own = [
-            starts[next(key for key in sorted(starts, key=len, reverse=True) if u.name.partition(".")[2].startswith(key))] for u in added
+            starts[
+                next(
+                    key
+                    for key in sorted(starts, key=len, reverse=True)
+                    if u.name.partition(".")[2].startswith(key)
+                )
+            ]
+            for u in added
         ]
         grouped = list(dict.fromkeys(tuple(s) for s in own))
         combos = list(product(*grouped))[: 2 * _STARTS]
@@ -183,7 +224,13 @@ class Search:
         for combo in combos:
             pick = dict(zip(grouped, combo, strict=True))
             theta = np.concatenate(
-                [state.theta, [u.outside(float(np.clip(pick[tuple(s)], *u.bounds))) for u, s in zip(added, own, strict=True)]]
+                [
+                    state.theta,
+                    [
+                        u.outside(float(np.clip(pick[tuple(s)], *u.bounds)))
+                        for u, s in zip(added, own, strict=True)
+                    ],
+                ]
             )
             promise = self._promise(state, model, theta)
             promising.append((promise, theta))
@@ -195,13 +242,24 @@ class Search:
             if best is None or fit.loss < best.loss:
                 best = fit
         assert best is not None
-        return self._fit(local, model, best.theta[: len(model.unknowns)], best.theta[len(model.unknowns) :], state.foils, _MANY)
+        return self._fit(
+            local,
+            model,
+            best.theta[: len(model.unknowns)],
+            best.theta[len(model.unknowns) :],
+            state.foils,
+            _MANY,
+        )
 
     def _promise(self, state: State, model: Model, theta: Floats) -> float:
-        """Loss that the response to the new parameters could take away at best, beside what the others can absorb."""
+        """Loss that the response to the new parameters could take away at best, beside what the others can
+        absorb."""
         n = len(state.model.unknowns)
-        at = state.local.residual(model, theta) - (state.columns @ state.fit.theta[n:] if state.foils else 0.0)
-        shift = (state.fit.residual - at).reshape(-1, 1)  # the response at the start itself: operators have no slope at neutral
+        at = state.local.residual(model, theta) - (
+            state.columns @ state.fit.theta[n:] if state.foils else 0.0
+        )
+        # the response at the start itself: operators have no slope at neutral
+        shift = (state.fit.residual - at).reshape(-1, 1)
         base = state.fit.slopes.reshape(shift.shape[0], state.fit.slopes.shape[-1])
         J = np.concatenate([base, shift], axis=1)
         sizes = [j for j, u in enumerate(model.unknowns) if j >= n and not u.shape]
@@ -212,13 +270,20 @@ class Search:
                 moved = neutral.copy()
                 moved[j] = model.unknowns[j].mean
                 columns.append(
-                    (state.local.residual(model, moved) - (state.columns @ state.fit.theta[n:] if state.foils else 0.0) - at).ravel()
+                    (
+                        state.local.residual(model, moved)
+                        - (state.columns @ state.fit.theta[n:] if state.foils else 0.0)
+                        - at
+                    ).ravel()
                 )
             J = np.concatenate([J, np.stack(columns, axis=1)], axis=1)
         r = state.fit.residual.ravel()
-        gram = J.T @ J + np.diag(np.concatenate([state.fit.precision, np.full(J.shape[1] - base.shape[1], 1e-9)]))
+        gram = J.T @ J + np.diag(
+            np.concatenate([state.fit.precision, np.full(J.shape[1] - base.shape[1], 1e-9)])
+        )
         b = J.T @ r
-        b[: base.shape[1]] = np.minimum(np.abs(b[: base.shape[1]]), 0.0)  # the base is at its minimum, priors and all
+        # the base is at its minimum, priors and all
+        b[: base.shape[1]] = np.minimum(np.abs(b[: base.shape[1]]), 0.0)
         return float(b @ np.linalg.lstsq(gram, b, rcond=1e-12)[0])
 
     def judged(self, state: State, with_it: State, name: str, foil: Foil | None = None) -> Candidate:
@@ -229,7 +294,11 @@ class Search:
         z = paired(state.losses, with_it.losses)
         share = 1.0 - with_it.fit.loss / state.fit.loss
         why = "" if foil else unphysical(with_it, name)
-        evident = (z > Z_ACCEPT and gain > BIC_ACCEPT) or (z > Z_STRONG and gain > BIC_STRONG) or (z > Z_BLOCKS and share > SHARE_BLOCKS)
+        evident = (
+            (z > Z_ACCEPT and gain > BIC_ACCEPT)
+            or (z > Z_STRONG and gain > BIC_STRONG)
+            or (z > Z_BLOCKS and share > SHARE_BLOCKS)
+        )
         if not why and not (share > SHARE_ACCEPT and evident):
             why = f"no gain on held-out blocks (z {z:.1f}, BIC {gain:.0f}, {100 * share:.1f} % of the loss)"
         return Candidate(name, with_it, z, gain, share, k, why, foil)
@@ -238,7 +307,8 @@ class Search:
         """The best foil of each family beside a state, linear in everything."""
         made = []
         for foil in foils(state.local, state.fit.slopes, state.fit.residual):
-            columns = np.where(np.isfinite(foil.columns), foil.columns, 0.0)  # a row without a shape tells nothing
+            # a row without a shape tells nothing
+            columns = np.where(np.isfinite(foil.columns), foil.columns, 0.0)
             slopes = np.concatenate([state.fit.slopes, columns], axis=-1)
             flat = slopes.reshape(-1, slopes.shape[-1])
             precision = np.concatenate([state.fit.precision, np.full(foil.columns.shape[-1], 1e-9)])
@@ -248,9 +318,15 @@ class Search:
             step = np.linalg.lstsq(H, b, rcond=1e-12)[0]
             residual = state.fit.residual - slopes @ step
             theta = np.concatenate([state.fit.theta, np.zeros(foil.columns.shape[-1])]) + step
-            fit = Fit(theta, residual, slopes, precision, (*state.fit.at_bound, *(False,) * foil.columns.shape[-1]))
+            fit = Fit(
+                theta, residual, slopes, precision, (*state.fit.at_bound, *(False,) * foil.columns.shape[-1])
+            )
             with_it = State(
-                state.model, state.local, fit, held_out_losses(residual, slopes, precision, self.block, N_BLOCKS), (*state.foils, foil)
+                state.model,
+                state.local,
+                fit,
+                held_out_losses(residual, slopes, precision, self.block, N_BLOCKS),
+                (*state.foils, foil),
             )
             made.append(self.judged(state, with_it, foil.name, foil))
         return made
@@ -262,10 +338,13 @@ class Search:
         single = state.model.wiring.n_segments < 2
         driven = state.model.wiring.n_tendons > 0
         return [
-            name for name in effect_names()
-            if name not in state.model.effects and name not in self.excluded and not (name == "coupling" and single)
+            name
+            for name in effect_names()
+            if name not in state.model.effects
+            and name not in self.excluded
+            and not (name == "coupling" and single)
             and (driven or get_effect(name).seam.name != "ACTUATION")
-        ]  # fmt: skip
+        ]
 
     def stage(self, state: State, *, with_foils: bool = True) -> Step:
         """Try everything beside `state`; take the best, if any passes."""
@@ -276,11 +355,18 @@ class Search:
         return self.choose(state, tried, with_foils=with_foils)
 
     def choose(self, state: State, tried: list[Candidate], *, with_foils: bool) -> Step:
-        """Solve the promising ones exactly, then take the best by evidence; foils only where they beat it clearly."""
-        fitted = sorted((c for c in tried if c.state is not None and c.z > 1.0 and c.share > SHARE_ACCEPT), key=lambda c: -c.share)
+        """Solve the promising ones exactly, then take the best by evidence; foils only where they beat it
+        clearly."""
+        fitted = sorted(
+            (c for c in tried if c.state is not None and c.z > 1.0 and c.share > SHARE_ACCEPT),
+            key=lambda c: -c.share,
+        )
         most = fitted[0].share if fitted else 0.0
-        near = [c for c in fitted if 1.0 - c.share < _NEAR * (1.0 - most) and c.share > most / _NEAR][:_REFINED]
-        heavy = [c for c in fitted if not state.local.is_light(c.name) and c.share > 0.6 * most]  # of these even the fit so far is linear
+        near = [c for c in fitted if 1.0 - c.share < _NEAR * (1.0 - most) and c.share > most / _NEAR][
+            :_REFINED
+        ]
+        # of these even the fit so far is linear
+        heavy = [c for c in fitted if not state.local.is_light(c.name) and c.share > 0.6 * most]
         exact = {}
         for candidate in dict.fromkeys([*near, *heavy]):
             assert candidate.state is not None
@@ -297,14 +383,25 @@ class Search:
             others = self.foil_candidates(state)
             tried += others
             foil = best_of([c for c in others if c.passes])
-        if foil is not None and (best is None or (advantage(foil, best) > BIC_RIVAL and z_between(foil, best) > Z_RIVAL)):
+        if foil is not None and (
+            best is None or (advantage(foil, best) > BIC_RIVAL and z_between(foil, best) > Z_RIVAL)
+        ):
             return Step(state, tuple(tried), foil)
         if best is None:
             return Step(state, tuple(tried), None)
-        sure = [c for c in passing if c is not best and c.share > best.share and z_between(c, best) > Z_ACCEPT]
-        best = max(sure, key=lambda c: c.share) if sure else best  # blocks that no fit has seen overrule the count of parameters
+        sure = [
+            c for c in passing if c is not best and c.share > best.share and z_between(c, best) > Z_ACCEPT
+        ]
+        # blocks that no fit has seen overrule the count of parameters
+        best = max(sure, key=lambda c: c.share) if sure else best
         rivals = [c for c in tried if c.foil is None and c.name != best.name and self._rival(best, c)]
-        fewer = best_of([c for c in rivals if c.passes and c.n_parameters < best.n_parameters and advantage(best, c) < BIC_RIVAL])
+        fewer = best_of(
+            [
+                c
+                for c in rivals
+                if c.passes and c.n_parameters < best.n_parameters and advantage(best, c) < BIC_RIVAL
+            ]
+        )
         if fewer is not None:
             rivals = [best, *(c for c in rivals if c is not fewer)]
             best = fewer
@@ -330,10 +427,12 @@ class Search:
         fit = self._fit(local, model, theta, state.fit.theta[len(state.model.unknowns) :], state.foils, 8)
         return self._state(model, local, fit, state.foils)
 
-    def eliminated(self, state: State, found: Sequence[str], least: float, noise: float) -> tuple[State, list[str]]:
-        """Drop effects that what came later has made needless, and those that bring less than `least` where what is left
-        is of the size of the `noise` [both m^2 summed over the residual]: beside a dominant effect they only mend its form.
-        The state, and who is left."""
+    def eliminated(
+        self, state: State, found: Sequence[str], least: float, noise: float
+    ) -> tuple[State, list[str]]:
+        """Drop effects that what came later has made needless, and those that bring less than `least` where
+        what is left is of the size of the `noise` [both m^2 summed over the residual]: beside a dominant
+        effect they only mend its form. The state, and who is left."""
         left = list(found)
         while len(left) > 1:
             weakest: tuple[float, str, State] | None = None
@@ -343,7 +442,9 @@ class Search:
                 needed = verdict.z > Z_KEEP and (verdict.bic_gain > BIC_KEEP or verdict.share > SHARE_KEEP)
                 needless = not needed and not (verdict.z > Z_STRONG and verdict.bic_gain > BIC_STRONG)
                 variance = float((self.target.sigma**2).mean())
-                small = (fewer.fit.loss - state.fit.loss) * variance < least and fewer.fit.loss * variance < 2.0 * noise
+                small = (
+                    fewer.fit.loss - state.fit.loss
+                ) * variance < least and fewer.fit.loss * variance < 2.0 * noise
                 if (needless or small) and (weakest is None or verdict.bic_gain < weakest[0]):
                     weakest = verdict.bic_gain, name, fewer
             if weakest is None:
@@ -352,9 +453,13 @@ class Search:
         return state, left
 
     def bounds(self, state: State) -> list[Bound]:
-        """For every effect that is not in the model, the size from which it would have shown: three standard errors beyond its
-        estimate, at the typical shape."""
-        inflate = np.sqrt(max(1.0, state.fit.loss / state.fit.residual.size) * state.fit.residual.size / effective_size(state.fit.residual))
+        """For every effect that is not in the model, the size from which it would have shown: three standard
+        errors beyond its estimate, at the typical shape."""
+        inflate = np.sqrt(
+            max(1.0, state.fit.loss / state.fit.residual.size)
+            * state.fit.residual.size
+            / effective_size(state.fit.residual)
+        )
         flat = state.fit.slopes.reshape(state.fit.residual.size, state.fit.slopes.shape[-1])
         base = flat.T @ flat + np.diag(state.fit.precision)
         made = []
@@ -378,8 +483,14 @@ class Search:
                 cross = flat.T @ column
                 power = float(column @ column - cross @ np.linalg.lstsq(base, cross, rcond=1e-12)[0])
                 # x, y, z of one kind, and drives, are one size; a bound in another unit is a bound of its own
-                kind = next(p.name for p in get_effect(name).parameters if u.name.partition(".")[2].startswith(p.name))
-                key = kind if kind[-2:] not in ("_x", "_y", "_z") and kind not in ("x", "y", "z") else kind[:-1].rstrip("_")
+                kind = next(
+                    p.name for p in get_effect(name).parameters if u.name.partition(".")[2].startswith(p.name)
+                )
+                key = (
+                    kind
+                    if kind[-2:] not in ("_x", "_y", "_z") and kind not in ("x", "y", "z")
+                    else kind[:-1].rstrip("_")
+                )
                 if power <= 1e-6 * float(column @ column) or power * u.scale**2 < 1e-2:
                     worst[key] = np.inf
                     continue
@@ -387,6 +498,7 @@ class Search:
                 worst[key] = max(worst.get(key, 0.0), abs(estimate) + 3.0 * inflate / np.sqrt(power))
                 units[key] = u.unit
             made += [
-                Bound(name, key or "size", units.get(key, ""), size if np.isfinite(size) else float("nan")) for key, size in worst.items()
+                Bound(name, key or "size", units.get(key, ""), size if np.isfinite(size) else float("nan"))
+                for key, size in worst.items()
             ]
         return made

@@ -1,4 +1,5 @@
-"""Least squares with priors, and what may be said of it: standard errors, held-out blocks without refits, evidence."""
+"""Least squares with priors, and what may be said of it: standard errors, held-out blocks without refits,
+evidence."""
 
 from __future__ import annotations
 
@@ -123,10 +124,15 @@ def _solve(A: Floats, b: Floats) -> Floats:
 
 
 def covariance(fit: Fit) -> Floats:
-    """(p, p) of the fitted numbers: priors and data, the data's variance as the residual shows it, correlated samples counted less."""
+    """(p, p) of the fitted numbers: priors and data, the data's variance as the residual shows it, correlated
+    samples counted less."""
     if not len(fit.theta):
         return np.zeros((0, 0))
-    inflate = max(1.0, fit.loss / max(fit.residual.size - len(fit.theta), 1)) * fit.residual.size / effective_size(fit.residual)
+    inflate = (
+        max(1.0, fit.loss / max(fit.residual.size - len(fit.theta), 1))
+        * fit.residual.size
+        / effective_size(fit.residual)
+    )
     flat = fit.slopes.reshape(-1, fit.slopes.shape[-1])
     return np.asarray(np.linalg.pinv(flat.T @ flat / inflate + np.diag(fit.precision)))
 
@@ -146,7 +152,9 @@ def bic(loss: float, n_parameters: int, size: float) -> float:
     return size * float(np.log(max(loss, 1e-300))) + n_parameters * float(np.log(size))
 
 
-def held_out_losses(residual: Floats, slopes: Floats, precision: Floats, block: Ints, n_blocks: int) -> Floats:
+def held_out_losses(
+    residual: Floats, slopes: Floats, precision: Floats, block: Ints, n_blocks: int
+) -> Floats:
     """(n_blocks,) loss of each block predicted from the others, by one Newton step from the fit to all.
 
     theta_-k = theta - (H - H_k)^-1 J_k^T r_k.
@@ -154,7 +162,9 @@ def held_out_losses(residual: Floats, slopes: Floats, precision: Floats, block: 
     n_out, p = slopes.shape[1], slopes.shape[2]
     losses = np.zeros(n_blocks)
     if not p:
-        return np.asarray(np.bincount(block, weights=(residual**2).sum(1), minlength=n_blocks), dtype=np.float64)
+        return np.asarray(
+            np.bincount(block, weights=(residual**2).sum(1), minlength=n_blocks), dtype=np.float64
+        )
     flat = slopes.reshape(-1, p)
     H = flat.T @ flat + np.diag(precision)
     for k in range(n_blocks):
@@ -170,8 +180,8 @@ def held_out_losses(residual: Floats, slopes: Floats, precision: Floats, block: 
 
 
 def paired(before: Floats, after: Floats) -> float:
-    """z of the gain from losses `before` to those `after`, both (n_blocks,): of its mean, or of the mean logarithm of the ratio where a
-    few blocks hold most of the loss."""
+    """z of the gain from losses `before` to those `after`, both (n_blocks,): of its mean, or of the mean
+    logarithm of the ratio where a few blocks hold most of the loss."""
     scores = []
     for gain in (before - after, np.log(np.maximum(before, 1e-12)) - np.log(np.maximum(after, 1e-12))):
         spread = float(gain.std(ddof=1)) if len(gain) > 1 else 0.0

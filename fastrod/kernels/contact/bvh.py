@@ -1,8 +1,10 @@
-"""Closest point and first hit on the triangles of a mesh, through a bounding-volume hierarchy; everything in the mesh's own frame.
+"""Closest point and first hit on the triangles of a mesh, through a bounding-volume hierarchy; everything in
+the mesh's own frame.
 
-A node of the hierarchy holds the boxes of its two children and two links: the index of a child node, or, below zero, a
-leaf's triangles as -1 - (LEAF_CODE first + count). The closest feature of a triangle a, b, c is 0 its face, 1 to 3 the
-edges ab, bc, ca, 4 to 6 the corners: the pseudonormal of the feature gives the sign (Baerentzen and Aanaes 2005).
+A node of the hierarchy holds the boxes of its two children and two links: the index of a child node, or,
+below zero, a leaf's triangles as -1 - (LEAF_CODE first + count). The closest feature of a triangle a, b, c is
+0 its face, 1 to 3 the edges ab, bc, ca, 4 to 6 the corners: the pseudonormal of the feature gives the sign
+(Baerentzen and Aanaes 2005).
 """
 
 from __future__ import annotations
@@ -66,8 +68,11 @@ def _box_distance(p: Vec, box: Floats, o: int) -> float:
 
 
 @kernel
-def nearest_triangle(p: Vec, bound: float, root: int, surfaces: Surfaces, stack: Numbers) -> tuple[float, Vec, int, int]:
-    """Squared distance, closest point, triangle and feature; triangle -1 where nothing is closer than `bound` [m]."""
+def nearest_triangle(
+    p: Vec, bound: float, root: int, surfaces: Surfaces, stack: Numbers
+) -> tuple[float, Vec, int, int]:
+    """Squared distance, closest point, triangle and feature; triangle -1 where nothing is closer than `bound`
+    [m]."""
     best = bound * bound
     found, triangle, feature = p, -1, 0
     stack[0], stack[1] = float(root), 0.0
@@ -91,7 +96,9 @@ def nearest_triangle(p: Vec, bound: float, root: int, surfaces: Surfaces, stack:
             continue
         code = -1 - link
         for t in range(code // LEAF_CODE, code // LEAF_CODE + code % LEAF_CODE):
-            q, which = closest_on_triangle(p, corner(surfaces, t, 0), corner(surfaces, t, 1), corner(surfaces, t, 2))
+            q, which = closest_on_triangle(
+                p, corner(surfaces, t, 0), corner(surfaces, t, 1), corner(surfaces, t, 2)
+            )
             e = sub(p, q)
             d = dot(e, e)
             if d < best:
@@ -100,8 +107,11 @@ def nearest_triangle(p: Vec, bound: float, root: int, surfaces: Surfaces, stack:
 
 
 @kernel
-def signed_triangle(p: Vec, bound: float, root: int, surfaces: Surfaces, stack: Numbers) -> tuple[float, Vec, int]:
-    """Signed distance, its gradient (the outward unit normal) and the triangle; FAR where the surface is beyond `bound`."""
+def signed_triangle(
+    p: Vec, bound: float, root: int, surfaces: Surfaces, stack: Numbers
+) -> tuple[float, Vec, int]:
+    """Signed distance, its gradient (the outward unit normal) and the triangle; FAR where the surface is
+    beyond `bound`."""
     square, q, t, feature = nearest_triangle(p, bound, root, surfaces, stack)
     if t < 0:
         return FAR, (0.0, 0.0, 0.0), -1
@@ -118,7 +128,8 @@ def signed_triangle(p: Vec, bound: float, root: int, surfaces: Surfaces, stack: 
 
 @kernel
 def _keep_plane(d: float, normal: Vec, t: int, found: Numbers, n_found: int, most: int) -> int:
-    """Note a plane, in place of one with the same normal or of the farthest that is farther; returns how many there are."""
+    """Note a plane, in place of one with the same normal or of the farthest that is farther; returns how many
+    there are."""
     at, farthest = n_found, -1.0
     for j in range(n_found):
         if dot(normal, (found[5 * j + 1], found[5 * j + 2], found[5 * j + 3])) > 0.99999:
@@ -134,14 +145,24 @@ def _keep_plane(d: float, normal: Vec, t: int, found: Numbers, n_found: int, mos
 
 
 @kernel
-def facing_planes(p: Vec, reach: float, nearest: float, root: int, surfaces: Surfaces, stack: Numbers, found: Numbers, most: int) -> int:
+def facing_planes(
+    p: Vec,
+    reach: float,
+    nearest: float,
+    root: int,
+    surfaces: Surfaces,
+    stack: Numbers,
+    found: Numbers,
+    most: int,
+) -> int:
     """Faces that p is in front of, closer than `reach`: the walls of a concave corner.
 
-    p projects inside them, or their planes are no nearer than the surface itself, which is `nearest`: around a concave edge
-    each plane bounds the free side on both, around a convex one p beyond a face is nearer to its plane.
+    p projects inside them, or their planes are no nearer than the surface itself, which is `nearest`: around
+    a concave edge each plane bounds the free side on both, around a convex one p beyond a face is nearer to
+    its plane.
 
-    Writes distance, normal and triangle of the `most` nearest with different normals to `found` (5 numbers each); returns
-    how many.
+    Writes distance, normal and triangle of the `most` nearest with different normals to `found` (5 numbers
+    each); returns how many.
     """
     n_found = 0
     limit = reach * reach
@@ -190,10 +211,14 @@ def _safe_inverse(x: float) -> float:
 
 
 @kernel
-def first_hit(p: Vec, direction: Vec, longest: float, root: int, surfaces: Surfaces, stack: Numbers) -> tuple[float, int]:
-    """Parameter t of the first triangle that p + t direction meets, 0 <= t <= longest, and the triangle; FAR and -1 if none.
+def first_hit(
+    p: Vec, direction: Vec, longest: float, root: int, surfaces: Surfaces, stack: Numbers
+) -> tuple[float, int]:
+    """Parameter t of the first triangle that p + t direction meets, 0 <= t <= longest, and the triangle; FAR
+    and -1 if none.
 
-    Two-sided, with edges included (Moeller and Trumbore 1997, with a tolerance of 1e-9 on the barycentric coordinates).
+    Two-sided, with edges included (Moeller and Trumbore 1997, with a tolerance of 1e-9 on the barycentric
+    coordinates).
     """
     best, triangle = longest, -1
     inverse = (_safe_inverse(direction[0]), _safe_inverse(direction[1]), _safe_inverse(direction[2]))

@@ -1,4 +1,5 @@
-"""Between the nodes of one robot's shape: cubic Hermite curves through positions and tangents, and through rotations.
+"""Between the nodes of one robot's shape: cubic Hermite curves through positions and tangents, and through
+rotations.
 
 `Curve` is one robot's rows of a `Shape`. The error is of fourth order in the spacing, as the integrator's.
 """
@@ -14,8 +15,8 @@ from ..vec import Mat, Vec
 
 
 class Curve(NamedTuple):
-    """One robot's nodes: position (n_points, 3) world [m], rotation (n_points, 3, 3) world_from_material, curvature (n_points, 3) material
-    [1/m], arclength (n_points,) [m]."""
+    """One robot's nodes: position (n_points, 3) world [m], rotation (n_points, 3, 3) world_from_material,
+    curvature (n_points, 3) material [1/m], arclength (n_points,) [m]."""
 
     position: Floats
     rotation: Floats

@@ -1,13 +1,15 @@
-"""Contact forces of one world from the compliance of its contact points: Signorini's law with Coulomb friction.
+"""Contact forces of one world from the compliance of its contact points: Signorini's law with Coulomb
+friction.
 
-The motion of contact c in its own frame (normal, two tangents) is u = b + W lambda; W is the compliance between contacts
-(symmetric), b the motion without contact forces: the gap along the normal, the slip since the last step along the tangents.
-Normal:   0 <= lambda_n,  0 <= u_n + compliance lambda_n,  their product 0.
+The motion of contact c in its own frame (normal, two tangents) is u = b + W lambda; W is the compliance
+between contacts (symmetric), b the motion without contact forces: the gap along the normal, the slip since
+the last step along the tangents. Normal:   0 <= lambda_n,  0 <= u_n + compliance lambda_n,  their product 0.
 Friction: |lambda_t| <= mu lambda_n; where it slips, lambda_t = -mu lambda_n u_t / |u_t|.
 
-First an active set: each contact is open, sticks or slips; the equations of these states are solved together, the states
-corrected until they agree (a semi-smooth Newton method; Alart and Curnier 1991). Where they do not come to rest, contact by
-contact (nonlinear Gauss-Seidel; Jean 1999), which converges for every symmetric W that is positive.
+First an active set: each contact is open, sticks or slips; the equations of these states are solved together,
+the states corrected until they agree (a semi-smooth Newton method; Alart and Curnier 1991). Where they do not
+come to rest, contact by contact (nonlinear Gauss-Seidel; Jean 1999), which converges for every symmetric W
+that is positive.
 """
 
 from __future__ import annotations
@@ -34,8 +36,8 @@ def law_size(m: int) -> int:
 
 @kernel
 def solve_dense(a: Numbers, n: int, stride: int) -> bool:
-    """Gauss elimination with partial pivoting of n equations in `a`, rows `stride` apart, with stride - n right-hand sides; the
-    solutions replace those. False where the matrix is singular."""
+    """Gauss elimination with partial pivoting of n equations in `a`, rows `stride` apart, with stride - n
+    right-hand sides; the solutions replace those. False where the matrix is singular."""
     for c in range(n):
         pivot = c
         for r in range(c + 1, n):
@@ -85,7 +87,8 @@ def _sweep(m: int, W: Floats, b: Numbers, friction: Numbers, compliance: Numbers
         force[o] = new
         if friction[c] <= 0.0:
             continue
-        step = 1.0 / max(W[o + 1, o + 1] + W[o + 2, o + 2], 1e-300)  # the larger eigenvalue of the tangential block is below the sum
+        # the larger eigenvalue of the tangential block is below the sum
+        step = 1.0 / max(W[o + 1, o + 1] + W[o + 2, o + 2], 1e-300)
         for _ in range(4):
             t1 = force[o + 1] - step * _motion(W, b, force, o + 1, 3 * m)
             t2 = force[o + 2] - step * _motion(W, b, force, o + 2, 3 * m)
@@ -101,7 +104,16 @@ def _sweep(m: int, W: Floats, b: Numbers, friction: Numbers, compliance: Numbers
 
 @kernel
 def _row_of_state(
-    c: int, i: int, m: int, W: Floats, b: Numbers, compliance: Numbers, friction: Numbers, state: Numbers, along: Numbers, a: Numbers
+    c: int,
+    i: int,
+    m: int,
+    W: Floats,
+    b: Numbers,
+    compliance: Numbers,
+    friction: Numbers,
+    state: Numbers,
+    along: Numbers,
+    a: Numbers,
 ) -> None:
     """Equation i (normal, tangents) of contact c in its state, as a row of the linear system."""
     n = 3 * m
@@ -124,7 +136,14 @@ def _row_of_state(
 
 @kernel
 def _correct_states(
-    m: int, W: Floats, b: Numbers, friction: Numbers, compliance: Numbers, force: Numbers, state: Numbers, along: Numbers
+    m: int,
+    W: Floats,
+    b: Numbers,
+    friction: Numbers,
+    compliance: Numbers,
+    force: Numbers,
+    state: Numbers,
+    along: Numbers,
 ) -> float:
     """States that these forces ask for; how far they are from agreement, as a motion [m]."""
     wrong = 0.0
@@ -148,7 +167,9 @@ def _correct_states(
         size = math.sqrt(t1 * t1 + t2 * t2)
         if size <= friction[c] * force[o] * (1.0 + 1e-9) or size == 0.0:
             if state[c] != STICK:
-                wrong = max(wrong, soft * abs(size - friction[c] * force[o]) + _AGREE * 2.0 * (state[c] == OPEN))
+                wrong = max(
+                    wrong, soft * abs(size - friction[c] * force[o]) + _AGREE * 2.0 * (state[c] == OPEN)
+                )
             state[c] = STICK
         else:
             turn = abs(along[2 * c] - t1 / size) + abs(along[2 * c + 1] - t2 / size)
@@ -174,14 +195,21 @@ def _obeys(m: int, W: Floats, b: Numbers, friction: Numbers, compliance: Numbers
         if not size <= most * (1.0 + 1e-6) + 1e-12:
             return False
         # what slips does so against a force at the edge of the cone
-        if most > 0.0 and slip > 10.0 * _HOLDS and not -(u1 * force[o + 1] + u2 * force[o + 2]) >= 0.999 * slip * most:
+        if (
+            most > 0.0
+            and slip > 10.0 * _HOLDS
+            and not -(u1 * force[o + 1] + u2 * force[o + 2]) >= 0.999 * slip * most
+        ):
             return False
     return True
 
 
 @kernel
-def contact_forces(m: int, W: Floats, b: Numbers, friction: Numbers, compliance: Numbers, force: Numbers, work: Numbers) -> bool:
-    """Forces (3 m: normal and two tangents of each contact), from the given ones as a start; whether they obey the law."""
+def contact_forces(
+    m: int, W: Floats, b: Numbers, friction: Numbers, compliance: Numbers, force: Numbers, work: Numbers
+) -> bool:
+    """Forces (3 m: normal and two tangents of each contact), from the given ones as a start; whether they
+    obey the law."""
     n = 3 * m
     a, o = work[: n * (n + 1)], n * (n + 1)
     state, along, best = work[o : o + m], work[o + m : o + 3 * m], work[o + 3 * m : o + 6 * m]
@@ -190,8 +218,15 @@ def contact_forces(m: int, W: Floats, b: Numbers, friction: Numbers, compliance:
     for c in range(m):
         state[c] = OPEN if force[3 * c] <= 0.0 else STICK
         size = math.sqrt(force[3 * c + 1] ** 2 + force[3 * c + 2] ** 2)
-        slips = friction[c] > 0.0 and state[c] == STICK and size >= friction[c] * force[3 * c] * (1.0 - 1e-6) and size > 0.0
-        along[2 * c], along[2 * c + 1] = (force[3 * c + 1] / size, force[3 * c + 2] / size) if slips else (0.0, 0.0)
+        slips = (
+            friction[c] > 0.0
+            and state[c] == STICK
+            and size >= friction[c] * force[3 * c] * (1.0 - 1e-6)
+            and size > 0.0
+        )
+        along[2 * c], along[2 * c + 1] = (
+            (force[3 * c + 1] / size, force[3 * c + 2] / size) if slips else (0.0, 0.0)
+        )
         state[c] = SLIP if slips else state[c]
     agreed = False
     for count in range(_ROUNDS):

@@ -1,8 +1,9 @@
-"""One contact iteration of one world (the robots that may touch each other): new forces by the law, new contacts by the search.
+"""One contact iteration of one world (the robots that may touch each other): new forces by the law, new
+contacts by the search.
 
-The pass before has put every contact on a node of its own, and has written how the contact points move with their forces
-and with the closing of the boundary (`Probes`). With the forces that the law asks for on that linear model the boundary is
-closed. The search on the same shape says where the gap is violated next.
+The pass before has put every contact on a node of its own, and has written how the contact points move with
+their forces and with the closing of the boundary (`Probes`). With the forces that the law asks for on that
+linear model the boundary is closed. The search on the same shape says where the gap is violated next.
 """
 
 from __future__ import annotations
@@ -16,31 +17,48 @@ from ..rod.gather import pick
 from ..vec import dot
 from .bvh import FAR, STACK, Numbers
 from .centreline import Curve, curve_of, interval_of, point_at
-from .contact_set import T_FORCE, T_OBSTACLE, T_S, add_walls, choose, merge, pressed_only, segment_at, slot_force, stands, violation
+from .contact_set import (
+    T_FORCE,
+    T_OBSTACLE,
+    T_S,
+    add_walls,
+    choose,
+    merge,
+    pressed_only,
+    segment_at,
+    slot_force,
+    stands,
+    violation,
+)
 from .problem import Scenery, apply_law, forces_size
 from .proximity import CANDIDATE, Sweep, crosses, entered, search_obstacles
 from .rod_proximity import search_rods
 
 GOES_ON, AT_REST, LOST = 0, 1, 2
 NOTHING, MOVES, UNSOLVED, INSIDE, THROUGH, DIVERGED = 0, 1, 2, 3, 4, 5
-"""What keeps a robot from rest: it still moves, its forces do not obey the law, the rod is inside of something, it went through
-something, its numbers are no numbers."""
-TROUBLE = 4  # numbers of one: which of these, obstacle (from n_obstacles on: rods; -1: none), arclength, size [m]
+"""What keeps a robot from rest: it still moves, its forces do not obey the law, the rod is inside of
+something, it went through something, its numbers are no numbers."""
+# numbers of one: which of these, obstacle (from n_obstacles on: rods; -1: none), arclength, size [m]
+TROUBLE = 4
 _MOST_FOUND = 64
-_LONGEST_TURN = 0.5  # of EI/l in the base moment, about radians of bend: farther the linear model does not reach
+# of EI/l in the base moment, about radians of bend: farther the linear model does not reach
+_LONGEST_TURN = 0.5
 _LONGEST_MOVE = 0.05  # of the rod's length, of a contact point
 
 
 def world_size(n_rows: int, n_slots: int, most_slots: int, n_points: int) -> int:
-    """Numbers of scratch that `iterate_world` needs, with `n_slots` contacts in this pass and `most_slots` in the next."""
+    """Numbers of scratch that `iterate_world` needs, with `n_slots` contacts in this pass and `most_slots` in
+    the next."""
     search = n_rows * (1 + _MOST_FOUND * CANDIDATE) + 3 * most_slots + 4 * n_points + 4 * STACK
     return max(forces_size(n_rows, n_slots), search)
 
 
 @kernel
-def _stride(r: int, i: int, count: int, scenery: Scenery, probes: Probes, proposed: Floats, unknown: Numbers) -> tuple[float, float]:
-    """How far the proposed forces and the closing boundary move the row [m], and the part of it that may be taken; the
-    change of the unknowns goes to `unknown`."""
+def _stride(
+    r: int, i: int, count: int, scenery: Scenery, probes: Probes, proposed: Floats, unknown: Numbers
+) -> tuple[float, float]:
+    """How far the proposed forces and the closing boundary move the row [m], and the part of it that may be
+    taken; the change of the unknowns goes to `unknown`."""
     n_x = probes.unknown.shape[1]
     rods = scenery.rods
     turn, pull = 0.0, 0.0
@@ -64,19 +82,24 @@ def _stride(r: int, i: int, count: int, scenery: Scenery, probes: Probes, propos
                     v += m[3 * q + a, 1 + 3 * p + g] * (proposed[r, p, g] - probes.force[r, p, g])
             square += v * v
         move = max(move, math.sqrt(square))
-    part = min(1.0, min(_LONGEST_TURN / max(turn, max(pull, 1e-300)), _LONGEST_MOVE * rods.reach[i] / max(move, 1e-300)))
+    part = min(
+        1.0,
+        min(_LONGEST_TURN / max(turn, max(pull, 1e-300)), _LONGEST_MOVE * rods.reach[i] / max(move, 1e-300)),
+    )
     return max(move, turn * rods.reach[i]), part
 
 
 @kernel
 def _press(r: int, i: int, scenery: Scenery, touching: Touching, probes: Probes, proposed: Floats) -> float:
-    """How much farther the proposed forces go into soft obstacles, or move free ones [m]; where a rod is pressed along its axis
-    nothing else moves."""
+    """How much farther the proposed forces go into soft obstacles, or move free ones [m]; where a rod is
+    pressed along its axis nothing else moves."""
     deepest = 0.0
     for q in range(touching.used[i]):
         k = int(touching.slot[i, q, T_OBSTACLE])
         own = k < len(scenery.surfaces.kind)
-        soft = scenery.surfaces.compliance[k] + scenery.surfaces.give[k, 0] if own else scenery.rods.compliance
+        soft = (
+            scenery.surfaces.compliance[k] + scenery.surfaces.give[k, 0] if own else scenery.rods.compliance
+        )
         for a in range(3):
             deepest = max(deepest, soft * abs(proposed[r, q, a] - probes.force[r, q, a]))
     return deepest
@@ -84,15 +107,25 @@ def _press(r: int, i: int, scenery: Scenery, touching: Touching, probes: Probes,
 
 @inline
 def sweep_of(i: int, scenery: Scenery, margin: float) -> Sweep:
-    """How robot i is searched; `margin` is a part of its length, and candidates nearer than a twentieth of an integration step are one."""
+    """How robot i is searched; `margin` is a part of its length, and candidates nearer than a twentieth of an
+    integration step are one."""
     rods = scenery.rods
-    return Sweep(rods.radius[i], rods.n_steps, rods.first[i], margin * rods.reach[i], 0.05 * rods.spacing[i], margin > 1.0)
+    return Sweep(
+        rods.radius[i],
+        rods.n_steps,
+        rods.first[i],
+        margin * rods.reach[i],
+        0.05 * rods.spacing[i],
+        margin > 1.0,
+    )
 
 
 @kernel
-def went_through(i: int, scenery: Scenery, clearance: Clearance, close: bool, work: Numbers) -> tuple[int, float]:
-    """The obstacle that robot i has gone through since the last step, and where on the rod; -1 where there is none. Unless `close`
-    asked only where some node has moved farther than it was away from all."""
+def went_through(
+    i: int, scenery: Scenery, clearance: Clearance, close: bool, work: Numbers
+) -> tuple[int, float]:
+    """The obstacle that robot i has gone through since the last step, and where on the rod; -1 where there is
+    none. Unless `close` asked only where some node has moved farther than it was away from all."""
     if not scenery.tracked[i]:
         return -1, 0.0
     shape = scenery.shape
@@ -100,22 +133,35 @@ def went_through(i: int, scenery: Scenery, clearance: Clearance, close: bool, wo
     frames = scenery.frames[pick(i, len(scenery.frames))]
     for j in range(shape.arclength.shape[1]):
         p, q = shape.position[i, j], clearance.position[i, j]
-        close = close or not clearance.distance[i, j] > math.sqrt((p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2)
+        close = close or not clearance.distance[i, j] > math.sqrt(
+            (p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2
+        )
     if not close:
         return -1, 0.0
     sweep = sweep_of(i, scenery, scenery.margin)
-    return crosses(curve_of(scenery.before, i), curve_of(shape, i), frames_before, frames, sweep, scenery.surfaces, work)
+    return crosses(
+        curve_of(scenery.before, i), curve_of(shape, i), frames_before, frames, sweep, scenery.surfaces, work
+    )
 
 
 @kernel
-def look_at(i: int, scenery: Scenery, clearance: Clearance, found: Floats, work: Numbers) -> tuple[int, float]:
-    """Number of candidates of robot i and its smallest gap; -1 where it has gone through an obstacle since the last step."""
+def look_at(
+    i: int, scenery: Scenery, clearance: Clearance, found: Floats, work: Numbers
+) -> tuple[int, float]:
+    """Number of candidates of robot i and its smallest gap; -1 where it has gone through an obstacle since
+    the last step."""
     if went_through(i, scenery, clearance, False, work)[0] >= 0:
         return -1, 0.0
     return search_obstacles(
-        curve_of(scenery.shape, i), sweep_of(i, scenery, scenery.margin), scenery.surfaces, scenery.frames[pick(i, len(scenery.frames))],
-        clearance.distance[i], clearance.position[i], work, found,
-    )  # fmt: skip
+        curve_of(scenery.shape, i),
+        sweep_of(i, scenery, scenery.margin),
+        scenery.surfaces,
+        scenery.frames[pick(i, len(scenery.frames))],
+        clearance.distance[i],
+        clearance.position[i],
+        work,
+        found,
+    )
 
 
 @kernel
@@ -135,8 +181,9 @@ def iterate_world(
     status: Ints,
     work: Numbers,
 ) -> None:
-    """Rows `first` to `last` of one pass. Writes the smallest gap of each row, its status and what keeps it from rest (`trouble`
-    (n_robots, TROUBLE)); a world that is not at rest gets its next forces, unknowns and contacts."""
+    """Rows `first` to `last` of one pass. Writes the smallest gap of each row, its status and what keeps it
+    from rest (`trouble` (n_robots, TROUBLE)); a world that is not at rest gets its next forces, unknowns and
+    contacts."""
     n_slots, n_obstacles, n_x = touching.slot.shape[1], len(scenery.surfaces.kind), probes.unknown.shape[1]
     solved = apply_law(first, last, rows, scenery, touching, probes, proposed, work)
     farthest, part = 0.0, 1.0
@@ -151,7 +198,9 @@ def iterate_world(
             return
         move = max(move, _press(r, i, scenery, touching, probes, proposed))
         farthest, part = max(farthest, max(move, residual)), min(part, most)
-        _name_hardest(trouble[i], MOVES if solved else UNSOLVED, max(move, residual), touching.used[i], touching.slot[i])
+        _name_hardest(
+            trouble[i], MOVES if solved else UNSOLVED, max(move, residual), touching.used[i], touching.slot[i]
+        )
     o, size, worst = 0, _MOST_FOUND * CANDIDATE, 0.0
     n_found, o = work[o : o + last - first], o + last - first
     points, o = work[o : o + 3 * n_slots].reshape((n_slots, 3)), o + 3 * n_slots
@@ -161,16 +210,28 @@ def iterate_world(
         i = rows[r]
         found = all_found[(r - first) * size : (r - first + 1) * size].reshape((_MOST_FOUND, CANDIDATE))
         count, gap[i] = search_obstacles(
-            curve_of(scenery.shape, i), sweep_of(i, scenery, scenery.margin), scenery.surfaces,
+            curve_of(scenery.shape, i),
+            sweep_of(i, scenery, scenery.margin),
+            scenery.surfaces,
             scenery.frames[pick(i, len(scenery.frames))],
-            clearance.distance[i], clearance.position[i], scratch, found,
-        )  # fmt: skip
+            clearance.distance[i],
+            clearance.position[i],
+            scratch,
+            found,
+        )
         n_found[r - first] = float(count)
-        deep, where = violation(count, found, touching.used[i], touching.slot[i], scenery.rods.spacing[i], scenery.surfaces)
+        deep, where = violation(
+            count, found, touching.used[i], touching.slot[i], scenery.rods.spacing[i], scenery.surfaces
+        )
         worst = max(worst, deep)
         if deep > scenery.tolerance:
             _say(trouble[i], INSIDE, int(found[where, 0]), found[where, 1], deep)
-    worst = max(worst, search_rods(first, last, rows, scenery.shape, scenery.rods, touching, n_obstacles, scenery.margin, gap, False))
+    worst = max(
+        worst,
+        search_rods(
+            first, last, rows, scenery.shape, scenery.rods, touching, n_obstacles, scenery.margin, gap, False
+        ),
+    )
     if not solved and farthest <= scenery.tolerance:
         solved = True
         for r in range(first, last):
@@ -192,14 +253,20 @@ def iterate_world(
         slot = touching.slot[i]
         for q in range(touching.used[i]):
             for a in range(3):
-                slot[q, T_FORCE + a] = probes.force[r, q, a] + part * (proposed[r, q, a] - probes.force[r, q, a])
+                slot[q, T_FORCE + a] = probes.force[r, q, a] + part * (
+                    proposed[r, q, a] - probes.force[r, q, a]
+                )
         for a in range(n_x):
             memory.x[i, a] += part * unknown[r, a]
     for r in range(first, last):
         i = rows[r]
         found = all_found[(r - first) * size : (r - first + 1) * size].reshape((_MOST_FOUND, CANDIDATE))
-        _renew(i, int(n_found[r - first]), found, points, curve_of(scenery.shape, i), scenery, touching, scratch)
-    search_rods(first, last, rows, scenery.shape, scenery.rods, touching, n_obstacles, scenery.margin, gap, True)
+        _renew(
+            i, int(n_found[r - first]), found, points, curve_of(scenery.shape, i), scenery, touching, scratch
+        )
+    search_rods(
+        first, last, rows, scenery.shape, scenery.rods, touching, n_obstacles, scenery.margin, gap, True
+    )
 
 
 @inline
@@ -225,7 +292,10 @@ def _face(i: int, n_found: int, found: Floats, scenery: Scenery, stack: Numbers)
     if not scenery.tracked[i]:
         return
     before, curve, rods = curve_of(scenery.before, i), curve_of(scenery.shape, i), scenery.rods
-    frames_before, frames = scenery.frames_before[pick(i, len(scenery.frames_before))], scenery.frames[pick(i, len(scenery.frames))]
+    frames_before, frames = (
+        scenery.frames_before[pick(i, len(scenery.frames_before))],
+        scenery.frames[pick(i, len(scenery.frames))],
+    )
     seen = False
     for f in range(n_found):
         s, k = found[f, 1], int(found[f, 0])
@@ -233,9 +303,12 @@ def _face(i: int, n_found: int, found: Floats, scenery: Scenery, stack: Numbers)
         if found[f, 2] + radius >= 0.0:
             continue
         d, n = entered(k, before, curve, s, frames_before[k], frames[k], scenery.surfaces, stack)
-        for j in range(0 if seen else len(curve.arclength)):  # across a thin plate the nearest side says nothing: the deepest node does
+        # across a thin plate the nearest side says nothing: the deepest node does
+        for j in range(0 if seen else len(curve.arclength)):
             if curve.arclength[j] > rods.first[i]:
-                d_j, n_j = entered(k, before, curve, curve.arclength[j], frames_before[k], frames[k], scenery.surfaces, stack)
+                d_j, n_j = entered(
+                    k, before, curve, curve.arclength[j], frames_before[k], frames[k], scenery.surfaces, stack
+                )
                 if d_j < FAR and (d_j < d or d == FAR):
                     d, n, s = d_j, n_j, curve.arclength[j]
         seen = True
@@ -261,11 +334,23 @@ def _renew(
     margin = scenery.margin * rods.reach[i]
     _face(i, n_found, found, scenery, scratch)
     count = choose(
-        n_found, found, touching.used[i], slot, len(frames), rods.radius[i], scenery.surfaces, rods.n_steps,
-        curve.arclength, spacing, scenery.tolerance, 0.2 * margin,
-    )  # fmt: skip
+        n_found,
+        found,
+        touching.used[i],
+        slot,
+        len(frames),
+        rods.radius[i],
+        scenery.surfaces,
+        rods.n_steps,
+        curve.arclength,
+        spacing,
+        scenery.tolerance,
+        0.2 * margin,
+    )
     count = merge(count, slot, spacing)
     for c in range(count):
         j, part = interval_of(curve, slot[c, T_S], 0)
         points[c, 0], points[c, 1], points[c, 2] = point_at(curve, j, part)
-    touching.used[i] = add_walls(count, slot, points, frames, margin, scenery.surfaces, scratch[2 * STACK :], scratch)
+    touching.used[i] = add_walls(
+        count, slot, points, frames, margin, scenery.surfaces, scratch[2 * STACK :], scratch
+    )

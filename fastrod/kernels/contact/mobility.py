@@ -17,7 +17,8 @@ def axis_of(axes: Numbers, a: int) -> Vec:
 
 @inline
 def given_way(give: Numbers, here: Vec, there: Vec, force: Vec) -> Vec:
-    """Motion of a body at `here` under a force at `there`: f t + (W (r x f)) x q, r and q from its centre of mass."""
+    """Motion of a body at `here` under a force at `there`: f t + (W (r x f)) x q, r and q from its centre of
+    mass."""
     centre = (give[10], give[11], give[12])
     moment = cross(sub(there, centre), force)
     turn = (
@@ -29,9 +30,11 @@ def given_way(give: Numbers, here: Vec, there: Vec, force: Vec) -> Vec:
 
 
 @kernel
-def add_mobility(m: int, touched: Numbers, place: Numbers, axes: Numbers, body: Ints, give: Floats, W: Floats) -> None:
-    """Add to the compliance W of m contacts what the bodies of the obstacles `touched` (-1: a rod) give way, both sides being pushed
-    apart by the same force at `place` (3 each, world)."""
+def add_mobility(
+    m: int, touched: Numbers, place: Numbers, axes: Numbers, body: Ints, give: Floats, W: Floats
+) -> None:
+    """Add to the compliance W of m contacts what the bodies of the obstacles `touched` (-1: a rod) give way,
+    both sides being pushed apart by the same force at `place` (3 each, world)."""
     for c in range(m):
         k = int(touched[c])
         if k < 0 or not give[k, 0] > 0.0:

@@ -1,4 +1,5 @@
-"""Nodes on given arclengths: the grid of a segment bends so that point loads act on nodes, where they cost no truncation error."""
+"""Nodes on given arclengths: the grid of a segment bends so that point loads act on nodes, where they cost no
+truncation error."""
 
 from __future__ import annotations
 
@@ -11,8 +12,9 @@ _END = 1e-9  # of a segment: a load nearer to its end than this is on it
 
 @kernel
 def place_nodes(s: Floats, starts: Floats, n_steps: int, grid: Floats, node: Ints, work: Floats) -> bool:
-    """Move the nodes nearest to the arclengths s (m,) onto them: writes `grid` (n_segments, n_steps + 1), fractions of each
-    segment, and the `node` of each s; -1 where s is nan. False where a segment has more of them than nodes.
+    """Move the nodes nearest to the arclengths s (m,) onto them: writes `grid` (n_segments, n_steps + 1),
+    fractions of each segment, and the `node` of each s; -1 where s is nan. False where a segment has more of
+    them than nodes.
 
     `starts` (n_segments + 1,) are the arclengths of the joints; `work` holds m numbers.
     """

@@ -1,7 +1,8 @@
-"""Signed distance to the simple shapes and the first hit of a ray on them, in closed form; everything in the shape's own frame.
+"""Signed distance to the simple shapes and the first hit of a ray on them, in closed form; everything in the
+shape's own frame.
 
-Sphere (radius), box (edge lengths), cylinder and capsule (radius, length of the straight part, axis z), plane (solid where
-z <= 0). The gradient of the signed distance is the outward unit normal.
+Sphere (radius), box (edge lengths), cylinder and capsule (radius, length of the straight part, axis z), plane
+(solid where z <= 0). The gradient of the signed distance is the outward unit normal.
 """
 
 from __future__ import annotations
@@ -54,7 +55,8 @@ def signed_primitive(kind: int, size: Vec, p: Vec) -> tuple[float, Vec]:
 
 @kernel
 def ray_primitive(kind: int, size: Vec, p: Vec, direction: Vec, longest: float) -> float:
-    """Length to the surface along a unit direction, by stepping to tangent planes; FAR where it is not met up to `longest`."""
+    """Length to the surface along a unit direction, by stepping to tangent planes; FAR where it is not met up
+    to `longest`."""
     if signed_primitive(kind, size, p)[0] < 0.0:
         return _way_out(kind, size, p, direction, longest)
     t = 0.0
@@ -65,7 +67,8 @@ def ray_primitive(kind: int, size: Vec, p: Vec, direction: Vec, longest: float) 
             return t
         if away >= 0.0:
             return FAR  # every shape here is convex: what moves away stays away
-        t += d / -away  # the tangent plane lies between a convex shape and what is outside it: a step to it is safe
+        # the tangent plane lies between a convex shape and what is outside it: a step to it is safe
+        t += d / -away
         if t > longest:
             return FAR
     return FAR
@@ -73,7 +76,8 @@ def ray_primitive(kind: int, size: Vec, p: Vec, direction: Vec, longest: float) 
 
 @kernel
 def _way_out(kind: int, size: Vec, p: Vec, direction: Vec, longest: float) -> float:
-    """From inside: the distance is convex along the ray, so it has one root there; by doubling, then bisection."""
+    """From inside: the distance is convex along the ray, so it has one root there; by doubling, then
+    bisection."""
     low, high = 0.0, 1e-3
     while signed_primitive(kind, size, axpy(high, direction, p))[0] < 0.0:
         low, high = high, 2.0 * high

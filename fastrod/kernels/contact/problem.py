@@ -1,9 +1,10 @@
-"""The contact forces of one world: every contact measured on the present shape, the linear model of how all of them move, and
-the law on it.
+"""The contact forces of one world: every contact measured on the present shape, the linear model of how all
+of them move, and the law on it.
 
-The model m = d + C (F - F_now) comes from the pass (`Probes`): robots are coupled by nothing but their contacts. A force on a
-curved surface turns as its point moves; F = F_law + B m with B the force times the second derivative of the distance. Solved
-for m, the model holds that as well. Without B the iteration diverges where a compliant tip rests on a small ball.
+The model m = d + C (F - F_now) comes from the pass (`Probes`): robots are coupled by nothing but their
+contacts. A force on a curved surface turns as its point moves; F = F_law + B m with B the force times the
+second derivative of the distance. Solved for m, the model holds that as well. Without B the iteration
+diverges where a compliant tip rests on a small ball.
 """
 
 from __future__ import annotations
@@ -30,13 +31,14 @@ from .contact_set import (
     slot_force,
     slot_normal,
     wall_at,
-)  # fmt: skip
+)
 from .mobility import add_mobility, axis_of
 from .proximity import carried
 from .rod_proximity import twin_of
 from .surface import surface_curvature
 
-_FORGETS, _PART_KEPT = 0.5, 0.3  # of a hold: what is left after one pass, and what damps where nothing is curved
+# of a hold: what is left after one pass, and what damps where nothing is curved
+_FORGETS, _PART_KEPT = 0.5, 0.3
 
 
 class Scenery(NamedTuple):
@@ -49,8 +51,9 @@ class Scenery(NamedTuple):
     frames_before: Floats
     """(1 or n_robots, n_obstacles, 12) at the last step."""
     frames_slip: Floats
-    """(1 or n_robots, n_obstacles, 12) where the obstacles' material was at the last step: what slip is counted from. Another
-    than `frames_before` where a velocity was given (a belt moves, its frame does not)."""
+    """(1 or n_robots, n_obstacles, 12) where the obstacles' material was at the last step: what slip is
+    counted from. Another than `frames_before` where a velocity was given (a belt moves, its frame does
+    not)."""
     shape: Shape
     before: Shape
     """The shapes at the last step; of length 0 if there is none."""
@@ -63,8 +66,8 @@ class Scenery(NamedTuple):
     margin: float
     """Gap below which a contact is watched, as a part of the rod's length."""
     damping: float
-    """0, or how many times the largest turning of a force is held against the motion of its point: where the plain iteration
-    finds no rest, this one goes down in energy, slowly."""
+    """0, or how many times the largest turning of a force is held against the motion of its point: where the
+    plain iteration finds no rest, this one goes down in energy, slowly."""
 
 
 @inline
@@ -99,9 +102,18 @@ def _node_point(shape: Shape, i: int, node: int) -> Vec:
 
 @kernel
 def _measure(
-    r: int, q: int, other: int, rows: Ints, scenery: Scenery, touching: Touching, probes: Probes, stack: Numbers, found: Numbers
+    r: int,
+    q: int,
+    other: int,
+    rows: Ints,
+    scenery: Scenery,
+    touching: Touching,
+    probes: Probes,
+    stack: Numbers,
+    found: Numbers,
 ) -> Vec:
-    """Gap and normal of a contact on the present shape, kept in its slot; the slip since the last step (world)."""
+    """Gap and normal of a contact on the present shape, kept in its slot; the slip since the last step
+    (world)."""
     i = rows[r]
     slot, node = touching.slot[i, q], probes.node[r, q]
     p = _node_point(scenery.shape, i, node)
@@ -110,19 +122,27 @@ def _measure(
     if other < 0:
         k = int(slot[T_OBSTACLE])
         frame = scenery.frames[pick(i, len(scenery.frames)), k]
-        d, n = wall_at(k, frame, p, old, scenery.margin * scenery.rods.reach[i], scenery.surfaces, stack, found)
+        d, n = wall_at(
+            k, frame, p, old, scenery.margin * scenery.rods.reach[i], scenery.surfaces, stack, found
+        )
         slot[T_GAP] = d - slot[T_RADIUS]
         slot[T_N], slot[T_N + 1], slot[T_N + 2] = n
         if not slides:
             return 0.0, 0.0, 0.0
-        ground = carried(frame, scenery.frames_slip[pick(i, len(scenery.frames_slip)), k], add(p, arm_of(slot)))
+        ground = carried(
+            frame, scenery.frames_slip[pick(i, len(scenery.frames_slip)), k], add(p, arm_of(slot))
+        )
         return sub(ground, _material_before(i, node, slot, scenery))
     b, q_b = rows[other], twin_of(touching, len(scenery.surfaces.kind), i, q)
     twin = touching.slot[b, q_b]
     e = sub(p, _node_point(scenery.shape, b, probes.node[other, q_b]))
     along, thick = dot(e, old), slot[T_RADIUS] + twin[T_RADIUS]
     length = math.sqrt(dot(e, e))
-    n, gap = (scale(1.0 / length, e), length - thick) if along > 0.2 * length and length > 1e-12 else (old, along - thick)
+    n, gap = (
+        (scale(1.0 / length, e), length - thick)
+        if along > 0.2 * length and length > 1e-12
+        else (old, along - thick)
+    )
     for a in range(3):
         slot[T_N + a], twin[T_N + a] = n[a], -n[a]
     slot[T_GAP], twin[T_GAP] = gap, gap
@@ -164,12 +184,22 @@ def _across(first: float, second: float, along: Vec, n: Vec, v: Vec) -> Vec:
 
 @kernel
 def _turning(
-    r: int, q: int, other: int, twin: int, rows: Ints, scenery: Scenery, touching: Touching, probes: Probes, stack: Numbers, bend: Floats
+    r: int,
+    q: int,
+    other: int,
+    twin: int,
+    rows: Ints,
+    scenery: Scenery,
+    touching: Touching,
+    probes: Probes,
+    stack: Numbers,
+    bend: Floats,
 ) -> float:
-    """How the force on a contact turns as its point moves: force times curvature of the gap, (9,) into `bend`; its largest size.
+    """How the force on a contact turns as its point moves: force times curvature of the gap, (9,) into
+    `bend`; its largest size.
 
-    Along a rod the contact stays where the gap is least, and other material comes under it: what that takes away is the square
-    of the mixed derivative over the second derivative of the gap along the rod.
+    Along a rod the contact stays where the gap is least, and other material comes under it: what that takes
+    away is the square of the mixed derivative over the second derivative of the gap along the rod.
     """
     i, slot, node = rows[r], touching.slot[rows[r], q], probes.node[r, q]
     for a in range(9):
@@ -186,7 +216,9 @@ def _turning(
         if slot[T_GAP] + slot[T_RADIUS] <= 0.0:
             return 0.0
         k = int(slot[T_OBSTACLE])
-        first, second, along = surface_curvature(k, scenery.frames[pick(i, len(scenery.frames)), k], p, scenery.surfaces, stack)
+        first, second, along = surface_curvature(
+            k, scenery.frames[pick(i, len(scenery.frames)), k], p, scenery.surfaces, stack
+        )
     else:
         node_b = probes.node[other, twin]
         length = slot[T_GAP] + slot[T_RADIUS] + touching.slot[rows[other], twin][T_RADIUS]
@@ -194,7 +226,9 @@ def _turning(
             return 0.0
         first, second, along = 1.0 / length, 1.0 / length, _axis(0)
         v, inside_other = scale(-1.0, _tangent(scenery.shape, rows[other], node_b)), node_b < last
-        rate_v = dot(v, _across(first, second, along, n, v)) - dot(n, _bow(scenery.shape, rows[other], node_b))
+        rate_v = dot(v, _across(first, second, along, n, v)) - dot(
+            n, _bow(scenery.shape, rows[other], node_b)
+        )
     if first == 0.0:
         return 0.0
     turned_t, turned_v = _across(first, second, along, n, t), _across(first, second, along, n, v)
@@ -204,7 +238,11 @@ def _turning(
         x, y = dot(turned_t, _axis(a)), dot(turned_v, _axis(a))
         det = rate_t * rate_v - mixed * mixed
         if inside and inside_other and det > 1e-3 * first * first:
-            row = axpy(-(rate_v * x - mixed * y) / det, turned_t, axpy(-(rate_t * y - mixed * x) / det, turned_v, row))
+            row = axpy(
+                -(rate_v * x - mixed * y) / det,
+                turned_t,
+                axpy(-(rate_t * y - mixed * x) / det, turned_v, row),
+            )
         elif inside and rate_t > 1e-3:
             row = axpy(-x / rate_t, turned_t, row)
         elif inside_other and rate_v > 1e-3:
@@ -215,8 +253,11 @@ def _turning(
 
 
 @kernel
-def _assemble(first: int, last: int, rows: Ints, touching: Touching, probes: Probes, start: Numbers, model: Floats) -> int:
-    """The linear models of all rows side by side; `start` gets the first contact point of each. How many points there are."""
+def _assemble(
+    first: int, last: int, rows: Ints, touching: Touching, probes: Probes, start: Numbers, model: Floats
+) -> int:
+    """The linear models of all rows side by side; `start` gets the first contact point of each. How many
+    points there are."""
     n = 0
     for r in range(first, last):
         start[r - first] = float(n)
@@ -234,8 +275,18 @@ def _assemble(first: int, last: int, rows: Ints, touching: Touching, probes: Pro
 
 
 @kernel
-def _bend_model(n: int, m: int, points: Numbers, bends: Floats, stiff: Numbers, damping: float, model: Floats, work: Numbers) -> None:
-    """The model when the forces turn with their surfaces: m = model(F + B m), solved for m; as it was where that has no answer."""
+def _bend_model(
+    n: int,
+    m: int,
+    points: Numbers,
+    bends: Floats,
+    stiff: Numbers,
+    damping: float,
+    model: Floats,
+    work: Numbers,
+) -> None:
+    """The model when the forces turn with their surfaces: m = model(F + B m), solved for m; as it was where
+    that has no answer."""
     size = 3 * n
     stride = 2 * size + 1
     for a in range(size):
@@ -269,8 +320,8 @@ def _bend_model(n: int, m: int, points: Numbers, bends: Floats, stiff: Numbers, 
 
 @kernel
 def _keep_hold(first: int, last: int, rows: Ints, m: int, touching: Touching, stiff: Numbers) -> None:
-    """Where no contact is curved any more, damp by a part of what was stiff some passes ago: a contact that goes to and fro between
-    an edge and a face would not come to rest, as the face by itself is not damped."""
+    """Where no contact is curved any more, damp by a part of what was stiff some passes ago: a contact that
+    goes to and fro between an edge and a face would not come to rest, as the face by itself is not damped."""
     most, kept = 0.0, 0.0
     for c in range(m):
         most = max(most, stiff[c])
@@ -328,9 +379,17 @@ def forces_size(n_rows: int, n_slots: int) -> int:
 
 @kernel
 def apply_law(
-    first: int, last: int, rows: Ints, scenery: Scenery, touching: Touching, probes: Probes, proposed: Floats, work: Numbers
+    first: int,
+    last: int,
+    rows: Ints,
+    scenery: Scenery,
+    touching: Touching,
+    probes: Probes,
+    proposed: Floats,
+    work: Numbers,
 ) -> bool:
-    """Forces that the law asks for on the linear model, into `proposed` (n_rows, n_slots, 3); whether it could be solved."""
+    """Forces that the law asks for on the linear model, into `proposed` (n_rows, n_slots, 3); whether it
+    could be solved."""
     n_obstacles, n_rows = len(scenery.surfaces.kind), last - first
     most = n_rows * probes.node.shape[1]
     size, o = 3 * most, 0
@@ -362,7 +421,10 @@ def apply_law(
                 now[3 * (base + q) + a] = probes.force[r, q, a]
             k, other, twin = int(slot[T_OBSTACLE]), -1, -1
             if k >= n_obstacles:
-                other, twin = _row_of_robot(k - n_obstacles, rows, first, last), twin_of(touching, n_obstacles, i, q)
+                other, twin = (
+                    _row_of_robot(k - n_obstacles, rows, first, last),
+                    twin_of(touching, n_obstacles, i, q),
+                )
                 if other < r or (other == r and twin < q):
                     continue  # counted from its other side
             slip = _measure(r, q, other, rows, scenery, touching, probes, stack, found)
@@ -370,7 +432,10 @@ def apply_law(
             t1, t2 = _tangents(normal)
             for a in range(3):
                 axes[9 * m + a], axes[9 * m + 3 + a], axes[9 * m + 6 + a] = normal[a], t1[a], t2[a]
-            points[2 * m], points[2 * m + 1] = float(base + q), float(int(start[other - first]) + twin) if other >= 0 else -1.0
+            points[2 * m], points[2 * m + 1] = (
+                float(base + q),
+                float(int(start[other - first]) + twin) if other >= 0 else -1.0,
+            )
             b[3 * m], b[3 * m + 1], b[3 * m + 2] = slot[T_GAP], dot(slip, t1), dot(slip, t2)
             mu = scenery.surfaces.friction[k] if other < 0 else scenery.rods.friction
             friction[m] = mu if scenery.slides[i] and (other < 0 or scenery.slides[rows[other]]) else 0.0
@@ -397,7 +462,11 @@ def apply_law(
         for side in range(2):
             g = int(points[2 * c + side])
             if g >= 0:
-                v = (_moved(n, model, 3 * g, change), _moved(n, model, 3 * g + 1, change), _moved(n, model, 3 * g + 2, change))
+                v = (
+                    _moved(n, model, 3 * g, change),
+                    _moved(n, model, 3 * g + 1, change),
+                    _moved(n, model, 3 * g + 2, change),
+                )
                 for a in range(3):
                     b[3 * c + a] += (1.0 if side == 0 else -1.0) * dot(v, axis_of(axes[9 * c :], a))
         for e in range(m):
@@ -416,9 +485,20 @@ def apply_law(
                 change[3 * g + a] += (1.0 if side == 0 else -1.0) * f[a]
     for c in range(m if bent else 0):  # and what the forces turn
         g, h = int(points[2 * c]), int(points[2 * c + 1])
-        v = (_moved(n, model, 3 * g, change), _moved(n, model, 3 * g + 1, change), _moved(n, model, 3 * g + 2, change))
+        v = (
+            _moved(n, model, 3 * g, change),
+            _moved(n, model, 3 * g + 1, change),
+            _moved(n, model, 3 * g + 2, change),
+        )
         if h >= 0:
-            v = sub(v, (_moved(n, model, 3 * h, change), _moved(n, model, 3 * h + 1, change), _moved(n, model, 3 * h + 2, change)))
+            v = sub(
+                v,
+                (
+                    _moved(n, model, 3 * h, change),
+                    _moved(n, model, 3 * h + 1, change),
+                    _moved(n, model, 3 * h + 2, change),
+                ),
+            )
         for a in range(3):
             row = bends[c, 3 * a : 3 * a + 3]
             turn = row[0] * v[0] + row[1] * v[1] + row[2] * v[2] - scenery.damping * stiff[c] * v[a]

@@ -1,11 +1,13 @@
 """Where one rod comes nearest to the obstacles: local minima of the signed distance along its centreline.
 
-phi(s) is the signed distance of the centreline, with slope n . r'. It changes by at most 1 per metre, so that what was
-measured once rules out whole stretches, along the rod and over time (`Clearance`). Where phi may fall below the rod's
-radius and the margin, its minimum in an interval is found on the slope; every minimum is a candidate for contact:
+phi(s) is the signed distance of the centreline, with slope n . r'. It changes by at most 1 per metre, so that
+what was measured once rules out whole stretches, along the rod and over time (`Clearance`). Where phi may
+fall below the rod's radius and the margin, its minimum in an interval is found on the slope; every minimum is
+a candidate for contact:
 obstacle, arclength, gap and normal.
 
-An interval can hold several minima. It is halved until no part of it can hide a dip below the rod's radius that is deeper than
+An interval can hold several minima. It is halved until no part of it can hide a dip below the rod's radius
+that is deeper than
 `UNSEEN` (`_may_hide`), so that the whole rod is searched and not its nodes.
 """
 
@@ -24,13 +26,17 @@ from .surface import ray_hit, signed_distance
 
 CANDIDATE = 6  # numbers of one: obstacle, arclength, gap, normal
 UNSEEN = 1e-5
-"""A dip below the rod's radius that is shallower may stay unseen [m]: a tenth of the depth at which a rest is none."""
+"""A dip below the rod's radius that is shallower may stay unseen [m]: a tenth of the depth at which a rest is
+none."""
 _ITERATIONS = 40
-_STEEP = 1.01  # |dr/ds| of the interpolated curve is below it: 1 at the nodes, and to fourth order between them
+# |dr/ds| of the interpolated curve is below it: 1 at the nodes, and to fourth order between them
+_STEEP = 1.01
 _DEEPEST = 20  # halvings of an interval
-_COARSE = 1.0 / 16.0  # of an interval: no finer where the rod is deep already, for there all that matters is known
+# of an interval: no finer where the rod is deep already, for there all that matters is known
+_COARSE = 1.0 / 16.0
 _FLAT = 1e-9  # a slope below it is none
-_RELAY = 0.25  # of the rod's length: how far beyond what is needed a first look goes, so that later ones are spared
+# of the rod's length: how far beyond what is needed a first look goes, so that later ones are spared
+_RELAY = 0.25
 
 
 class Sweep(NamedTuple):
@@ -52,13 +58,21 @@ class Sweep(NamedTuple):
 @inline
 def node_point(curve: Curve, j: int, start: int, part: float) -> Vec:
     """Node j; for the first one the point where contact begins."""
-    return point_at(curve, j, part if j == start else 0.0) if j < len(curve.arclength) - 1 else point_at(curve, j - 1, 1.0)
+    return (
+        point_at(curve, j, part if j == start else 0.0)
+        if j < len(curve.arclength) - 1
+        else point_at(curve, j - 1, 1.0)
+    )
 
 
 @inline
 def node_tangent(curve: Curve, j: int, start: int, part: float) -> Vec:
     """dr/ds at node j; for the first one at the point where contact begins."""
-    return tangent_at(curve, j, part if j == start else 0.0) if j < len(curve.arclength) - 1 else tangent_at(curve, j - 1, 1.0)
+    return (
+        tangent_at(curve, j, part if j == start else 0.0)
+        if j < len(curve.arclength) - 1
+        else tangent_at(curve, j - 1, 1.0)
+    )
 
 
 @inline
@@ -69,10 +83,18 @@ def radius_after(sweep: Sweep, j: int) -> float:
 
 @kernel
 def minimum(
-    k: int, frame: Floats, curve: Curve, j: int, low: float, high: float, phi_high: float, surfaces: Surfaces, stack: Numbers
+    k: int,
+    frame: Floats,
+    curve: Curve,
+    j: int,
+    low: float,
+    high: float,
+    phi_high: float,
+    surfaces: Surfaces,
+    stack: Numbers,
 ) -> tuple[float, float, Vec]:
-    """Fraction, signed distance and normal of the minimum in the interval after node j: phi falls at `low`, and at `high`
-    it rises or is higher. Bisection on the slope, with a secant once both ends have one."""
+    """Fraction, signed distance and normal of the minimum in the interval after node j: phi falls at `low`,
+    and at `high` it rises or is higher. Bisection on the slope, with a secant once both ends have one."""
     slope_low, slope_high = 0.0, 0.0
     part, d, n = high, phi_high, (0.0, 0.0, 1.0)
     for count in range(_ITERATIONS):
@@ -91,7 +113,8 @@ def minimum(
 
 @kernel
 def _note(k: int, s: float, gap: float, n: Vec, spacing: float, found: Floats, n_found: int) -> int:
-    """Write a candidate, in place of a near or (where full) of the widest one that is wider; returns how many there are."""
+    """Write a candidate, in place of a near or (where full) of the widest one that is wider; returns how many
+    there are."""
     at, widest = n_found, -FAR
     for c in range(n_found):
         if int(found[c, 0]) == k and abs(found[c, 1] - s) < spacing:
@@ -112,9 +135,10 @@ def _note(k: int, s: float, gap: float, n: Vec, spacing: float, found: Floats, n
 def _may_hide(f0: float, f1: float, length: float, curvature: float, level: float) -> bool:
     """Whether phi may fall below `level` in a stretch of this length with phi = f0 and f1 at its ends.
 
-    The square of the distance to a fixed point has a second derivative of at most 2 (r' . r' + phi |r''|) along the curve; so phi^2,
-    the least of them, lies above the parabola of that second derivative through the ends. It falls by length^2 / 8 phi, where phi by
-    itself might fall by length / 2. Without a radius, or inside of an obstacle, that slope is all that is known.
+    The square of the distance to a fixed point has a second derivative of at most 2 (r' . r' + phi |r''|)
+    along the curve; so phi^2, the least of them, lies above the parabola of that second derivative through
+    the ends. It falls by length^2 / 8 phi, where phi by itself might fall by length / 2. Without a radius, or
+    inside of an obstacle, that slope is all that is known.
     """
     level = min(level, min(f0, f1) - UNSEEN)
     if level <= 0.0:
@@ -135,12 +159,24 @@ def _bend(curve: Curve, j: int) -> float:
 
 @kernel
 def _search_interval(
-    k: int, frame: Floats, curve: Curve, j: int, low: float, ends: Numbers, sweep: Sweep, smallest: float, surfaces: Surfaces,
-    stack: Numbers, found: Floats, n_found: int,
-) -> tuple[int, float]:  # fmt: skip
-    """Minima of the interval after node j from its fraction `low` on; returns how many candidates there are, and the smallest gap.
+    k: int,
+    frame: Floats,
+    curve: Curve,
+    j: int,
+    low: float,
+    ends: Numbers,
+    sweep: Sweep,
+    smallest: float,
+    surfaces: Surfaces,
+    stack: Numbers,
+    found: Floats,
+    n_found: int,
+) -> tuple[int, float]:
+    """Minima of the interval after node j from its fraction `low` on; returns how many candidates there are,
+    and the smallest gap.
 
-    `ends` begins with phi and slope at `low`, then fraction, phi and slope at the end; there is room for `_DEEPEST` more of these.
+    `ends` begins with phi and slope at `low`, then fraction, phi and slope at the end; there is room for
+    `_DEEPEST` more of these.
     """
     h = curve.arclength[j + 1] - curve.arclength[j]
     rho, curvature = radius_after(sweep, j), 1.1 * max(_bend(curve, j), _bend(curve, j + 1))
@@ -158,7 +194,9 @@ def _search_interval(
             if fine and least < level - rho and _may_hide(f0, f1, length, curvature, level):
                 x = 0.5 * (x0 + x1)
                 ends[o + 3] = x
-                ends[o + 4], normal, _ = signed_distance(k, frame, point_at(curve, j, x), FAR, surfaces, stack)
+                ends[o + 4], normal, _ = signed_distance(
+                    k, frame, point_at(curve, j, x), FAR, surfaces, stack
+                )
                 ends[o + 5] = dot(normal, tangent_at(curve, j, x))
                 smallest = min(smallest, ends[o + 4] - rho)
                 m += 1
@@ -180,12 +218,20 @@ def _search_interval(
 
 @kernel
 def search_obstacles(
-    curve: Curve, sweep: Sweep, surfaces: Surfaces, frames: Floats, distance: Floats, position: Floats, work: Numbers, found: Floats
+    curve: Curve,
+    sweep: Sweep,
+    surfaces: Surfaces,
+    frames: Floats,
+    distance: Floats,
+    position: Floats,
+    work: Numbers,
+    found: Floats,
 ) -> tuple[int, float]:
-    """Candidates of one robot, written to `found` (n_most, CANDIDATE), and the smallest gap (a lower bound where it is
-    beyond the margin).
+    """Candidates of one robot, written to `found` (n_most, CANDIDATE), and the smallest gap (a lower bound
+    where it is beyond the margin).
 
-    `distance` (n_points,) and `position` (n_points, 3) are the robot's rows of `Clearance`, kept up to date; `work` holds
+    `distance` (n_points,) and `position` (n_points, 3) are the robot's rows of `Clearance`, kept up to date;
+    `work` holds
     4 n_points + 4 STACK numbers.
     """
     n, n_obstacles = len(curve.arclength), len(frames)
@@ -194,7 +240,9 @@ def search_obstacles(
     start = 0
     while start < n - 2 and curve.arclength[start + 1] <= sweep.first:
         start += 1
-    part = max(0.0, (sweep.first - curve.arclength[start]) / (curve.arclength[start + 1] - curve.arclength[start]))
+    part = max(
+        0.0, (sweep.first - curve.arclength[start]) / (curve.arclength[start + 1] - curve.arclength[start])
+    )
     for j in range(start, n):
         p = node_point(curve, j, start, part)
         e = sub(p, (position[j, 0], position[j, 1], position[j, 2]))
@@ -204,7 +252,10 @@ def search_obstacles(
     for k in range(n_obstacles):
         frame = frames[k]
         for j in range(start, n):
-            h = max(curve.arclength[min(j + 1, n - 1)] - curve.arclength[j], curve.arclength[j] - curve.arclength[max(j - 1, start)])
+            h = max(
+                curve.arclength[min(j + 1, n - 1)] - curve.arclength[j],
+                curve.arclength[j] - curve.arclength[max(j - 1, start)],
+            )
             thick = max(radius_after(sweep, max(j - 1, 0)), radius_after(sweep, j))
             need = thick + sweep.margin + h
             if known[j] > need:
@@ -219,16 +270,30 @@ def search_obstacles(
                 smallest = min(smallest, phi[j] - radius_after(sweep, j - 1))
             if near and j == start and slope[j] > 0.0 and phi[j] - radius_after(sweep, j) < sweep.margin:
                 n_found = _note(
-                    k, max(sweep.first, curve.arclength[j]), phi[j] - radius_after(sweep, j), normal, sweep.spacing, found, n_found
+                    k,
+                    max(sweep.first, curve.arclength[j]),
+                    phi[j] - radius_after(sweep, j),
+                    normal,
+                    sweep.spacing,
+                    found,
+                    n_found,
                 )
             if near and j == n - 1 and slope[j] < 0.0 and phi[j] - radius_after(sweep, j - 1) < sweep.margin:
-                n_found = _note(k, curve.arclength[j], phi[j] - radius_after(sweep, j - 1), normal, sweep.spacing, found, n_found)
+                n_found = _note(
+                    k,
+                    curve.arclength[j],
+                    phi[j] - radius_after(sweep, j - 1),
+                    normal,
+                    sweep.spacing,
+                    found,
+                    n_found,
+                )
         for j in range(start, n - 1):
             low = part if j == start else 0.0
             ends[0], ends[1], ends[2], ends[3], ends[4] = phi[j], slope[j], 1.0, phi[j + 1], slope[j + 1]
             n_found, smallest = _search_interval(
                 k, frame, curve, j, low, ends, sweep, smallest, surfaces, stack, found, n_found
-            )  # fmt: skip
+            )
     for j in range(start, n):
         if least[j] < FAR:
             distance[j] = least[j]
@@ -238,13 +303,19 @@ def search_obstacles(
 
 @kernel
 def crosses(
-    before: Curve, after: Curve, frames_before: Floats, frames: Floats, sweep: Sweep, surfaces: Surfaces, stack: Numbers
+    before: Curve,
+    after: Curve,
+    frames_before: Floats,
+    frames: Floats,
+    sweep: Sweep,
+    surfaces: Surfaces,
+    stack: Numbers,
 ) -> tuple[int, float]:
-    """The obstacle that a node went through on its straight way from `before` to `after`, seen from the obstacle, and the node's
-    arclength; -1 where there is none.
+    """The obstacle that a node went through on its straight way from `before` to `after`, seen from the
+    obstacle, and the node's arclength; -1 where there is none.
 
-    Both ends are outside, and the way between enters: through a body if the surfaces at both ends face different ways or
-    the way runs deep; sliding along a convex surface is neither.
+    Both ends are outside, and the way between enters: through a body if the surfaces at both ends face
+    different ways or the way runs deep; sliding along a convex surface is neither.
     """
     n, j = len(after.arclength), 0
     deep = 0.02 * after.arclength[n - 1]
@@ -273,7 +344,9 @@ def crosses(
                 continue
             if dot(n_p, n_q) < 0.2:
                 return k, s
-            middle = signed_distance(k, frames[k], axpy(0.5 * (t + length), direction, p), FAR, surfaces, stack)[0]
+            middle = signed_distance(
+                k, frames[k], axpy(0.5 * (t + length), direction, p), FAR, surfaces, stack
+            )[0]
             if middle < -deep:
                 return k, s
     return -1, 0.0
@@ -281,10 +354,18 @@ def crosses(
 
 @kernel
 def entered(
-    k: int, before: Curve, after: Curve, s: float, frame_before: Floats, frame: Floats, surfaces: Surfaces, stack: Numbers
+    k: int,
+    before: Curve,
+    after: Curve,
+    s: float,
+    frame_before: Floats,
+    frame: Floats,
+    surfaces: Surfaces,
+    stack: Numbers,
 ) -> tuple[float, Vec]:
-    """Signed distance of the centreline at s to the side of obstacle k by which it came in since `before`, and that side's normal; FAR
-    where it came in by none. The nearest side of a thin plate may be the other one."""
+    """Signed distance of the centreline at s to the side of obstacle k by which it came in since `before`,
+    and that side's normal; FAR where it came in by none. The nearest side of a thin plate may be the other
+    one."""
     i, share = interval_of(before, s, 0)
     j, part = interval_of(after, s, 0)
     p, q = carried(frame_before, frame, point_at(before, i, share)), point_at(after, j, part)

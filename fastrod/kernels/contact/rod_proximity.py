@@ -1,7 +1,8 @@
 """Where rods come near each other, or one rod near itself: minima of the distance between two centrelines.
 
-Pairs of intervals that cannot be near are skipped by as many intervals as their distance allows. From the closest points of
-two chords a Newton iteration finds the minimum on the curves. Both rods get a slot; the same number in T_TWIN links them.
+Pairs of intervals that cannot be near are skipped by as many intervals as their distance allows. From the
+closest points of two chords a Newton iteration finds the minimum on the curves. Both rods get a slot; the
+same number in T_TWIN links them.
 """
 
 from __future__ import annotations
@@ -26,7 +27,11 @@ def twin_of(touching: Touching, n_obstacles: int, robot: int, q: int) -> int:
     other = int(slot[T_OBSTACLE]) - n_obstacles
     for p in range(touching.used[other]):
         twin = touching.slot[other, p]
-        if twin[T_TWIN] == slot[T_TWIN] and int(twin[T_OBSTACLE]) == n_obstacles + robot and not (other == robot and p == q):
+        if (
+            twin[T_TWIN] == slot[T_TWIN]
+            and int(twin[T_OBSTACLE]) == n_obstacles + robot
+            and not (other == robot and p == q)
+        ):
             return p
     return -1
 
@@ -38,7 +43,8 @@ def _clamp(x: float) -> float:
 
 @kernel
 def _closest_on_chords(p: Vec, u: Vec, q: Vec, v: Vec) -> tuple[float, float]:
-    """Fractions of the closest points of p + s u and q + t v (Ericson, Real-Time Collision Detection, 5.1.9)."""
+    """Fractions of the closest points of p + s u and q + t v (Ericson, Real-Time Collision Detection,
+    5.1.9)."""
     e = sub(p, q)
     a, b, c, d, f = dot(u, u), dot(u, v), dot(v, v), dot(u, e), dot(v, e)
     det = a * c - b * b
@@ -52,7 +58,9 @@ def _closest_on_chords(p: Vec, u: Vec, q: Vec, v: Vec) -> tuple[float, float]:
 
 
 @kernel
-def _nearest_on_curves(a: Curve, b: Curve, s: float, t: float, low_a: float, low_b: float) -> tuple[float, float, float, Vec]:
+def _nearest_on_curves(
+    a: Curve, b: Curve, s: float, t: float, low_a: float, low_b: float
+) -> tuple[float, float, float, Vec]:
     """Arclengths of the minimum near s and t, the distance there and the direction from b to a."""
     end_a, end_b = a.arclength[len(a.arclength) - 1], b.arclength[len(b.arclength) - 1]
     e = (0.0, 0.0, 1.0)
@@ -77,7 +85,9 @@ def _nearest_on_curves(a: Curve, b: Curve, s: float, t: float, low_a: float, low
 
 
 @kernel
-def _known(touching: Touching, n_obstacles: int, robot: int, other: int, s: float, t: float, spacing: float) -> int:
+def _known(
+    touching: Touching, n_obstacles: int, robot: int, other: int, s: float, t: float, spacing: float
+) -> int:
     """Slot of `robot` that holds this contact with `other` already; -1 if none does."""
     for q in range(touching.used[robot]):
         slot = touching.slot[robot, q]
@@ -90,7 +100,17 @@ def _known(touching: Touching, n_obstacles: int, robot: int, other: int, s: floa
 
 @kernel
 def _add_pair(
-    touching: Touching, n_obstacles: int, robot: int, other: int, s: float, t: float, n: Vec, gap: float, rods: Rods, a: Curve, b: Curve
+    touching: Touching,
+    n_obstacles: int,
+    robot: int,
+    other: int,
+    s: float,
+    t: float,
+    n: Vec,
+    gap: float,
+    rods: Rods,
+    a: Curve,
+    b: Curve,
 ) -> bool:
     """A slot on both rods, linked by a number that neither has used; False where one of them is full."""
     need = 2 if robot == other else 1
@@ -104,16 +124,42 @@ def _add_pair(
             link = max(link, touching.slot[which, q, T_TWIN] + 1.0)
     r_a = rods.radius[robot, segment_at(a.arclength, rods.n_steps, s)]
     r_b = rods.radius[other, segment_at(b.arclength, rods.n_steps, t)]
-    open_slot(touching.slot[robot, touching.used[robot]], n_obstacles + other, s, int(link), n, gap, r_a, rods.friction)
+    open_slot(
+        touching.slot[robot, touching.used[robot]],
+        n_obstacles + other,
+        s,
+        int(link),
+        n,
+        gap,
+        r_a,
+        rods.friction,
+    )
     touching.used[robot] += 1
-    open_slot(touching.slot[other, touching.used[other]], n_obstacles + robot, t, int(link), scale(-1.0, n), gap, r_b, rods.friction)
+    open_slot(
+        touching.slot[other, touching.used[other]],
+        n_obstacles + robot,
+        t,
+        int(link),
+        scale(-1.0, n),
+        gap,
+        r_b,
+        rods.friction,
+    )
     touching.used[other] += 1
     return True
 
 
 @kernel
 def _search_pair(
-    robot: int, other: int, shape: Shape, rods: Rods, touching: Touching, n_obstacles: int, margin: float, gap: Floats, add: bool
+    robot: int,
+    other: int,
+    shape: Shape,
+    rods: Rods,
+    touching: Touching,
+    n_obstacles: int,
+    margin: float,
+    gap: Floats,
+    add: bool,
 ) -> float:
     a, b = curve_of(shape, robot), curve_of(shape, other)
     n = len(a.arclength)
@@ -121,7 +167,8 @@ def _search_pair(
     thickest = 0.0
     for k in range(rods.radius.shape[1]):
         thickest = max(thickest, rods.radius[robot, k] + rods.radius[other, k])
-    apart = 0.5 * math.pi * thickest + 2.0 * rods.spacing[robot] if robot == other else -FAR  # along one rod, nearer is no contact
+    # along one rod, nearer is no contact
+    apart = 0.5 * math.pi * thickest + 2.0 * rods.spacing[robot] if robot == other else -FAR
     for i in range(n - 1):
         if a.arclength[i + 1] <= rods.first[robot]:
             continue
@@ -131,7 +178,9 @@ def _search_pair(
         j = 0
         while j < n - 1:
             h_b = b.arclength[j + 1] - b.arclength[j]
-            if b.arclength[j + 1] <= rods.first[other] or (robot == other and b.arclength[j] - a.arclength[i + 1] < apart):
+            if b.arclength[j + 1] <= rods.first[other] or (
+                robot == other and b.arclength[j] - a.arclength[i + 1] < apart
+            ):
                 j += 1
                 continue
             q = point_at(b, j, 0.0)
@@ -148,7 +197,10 @@ def _search_pair(
             s, t, distance, normal = _nearest_on_curves(
                 a, b, a.arclength[i] + x * h_a, b.arclength[j] + y * h_b, rods.first[robot], rods.first[other]
             )
-            here = abs(s - a.arclength[i] - x * h_a) < 2.0 * h_a and abs(t - b.arclength[j] - y * h_b) < 2.0 * h_b
+            here = (
+                abs(s - a.arclength[i] - x * h_a) < 2.0 * h_a
+                and abs(t - b.arclength[j] - y * h_b) < 2.0 * h_b
+            )
             if here and not (robot == other and t - s < apart):
                 thick = (
                     rods.radius[robot, segment_at(a.arclength, rods.n_steps, s)]
@@ -173,11 +225,24 @@ def _search_pair(
 
 @kernel
 def search_rods(
-    first: int, last: int, rows: Ints, shape: Shape, rods: Rods, touching: Touching, n_obstacles: int, margin: float, gap: Floats, add: bool
+    first: int,
+    last: int,
+    rows: Ints,
+    shape: Shape,
+    rods: Rods,
+    touching: Touching,
+    n_obstacles: int,
+    margin: float,
+    gap: Floats,
+    add: bool,
 ) -> float:
-    """Violation of the contacts between the robots of one world [m]; with `add` they are also moved and new ones added."""
+    """Violation of the contacts between the robots of one world [m]; with `add` they are also moved and new
+    ones added."""
     worst = 0.0
     for r in range(first, last):
         for other in range(r if rods.own else r + 1, last):
-            worst = max(worst, _search_pair(rows[r], rows[other], shape, rods, touching, n_obstacles, margin, gap, add))
+            worst = max(
+                worst,
+                _search_pair(rows[r], rows[other], shape, rods, touching, n_obstacles, margin, gap, add),
+            )
     return worst

@@ -33,7 +33,9 @@ def _size(k: int, surfaces: Surfaces) -> Vec:
 
 
 @kernel
-def signed_distance(k: int, frame: Numbers, p: Vec, bound: float, surfaces: Surfaces, stack: Numbers) -> tuple[float, Vec, bool]:
+def signed_distance(
+    k: int, frame: Numbers, p: Vec, bound: float, surfaces: Surfaces, stack: Numbers
+) -> tuple[float, Vec, bool]:
     """Signed distance of the world point p to obstacle k and its gradient, the outward normal, world.
 
     Beyond `bound` a lower bound of the distance, a zero normal and False.
@@ -55,12 +57,23 @@ def signed_distance(k: int, frame: Numbers, p: Vec, bound: float, surfaces: Surf
 
 
 @kernel
-def walls(k: int, frame: Numbers, p: Vec, reach: float, nearest: float, surfaces: Surfaces, stack: Numbers, found: Numbers) -> int:
-    """Faces of obstacle k around the world point p, nearer than `reach` (`facing_planes`), normals in the world; `nearest` is its
-    distance."""
+def walls(
+    k: int,
+    frame: Numbers,
+    p: Vec,
+    reach: float,
+    nearest: float,
+    surfaces: Surfaces,
+    stack: Numbers,
+    found: Numbers,
+) -> int:
+    """Faces of obstacle k around the world point p, nearer than `reach` (`facing_planes`), normals in the
+    world; `nearest` is its distance."""
     if surfaces.kind[k] != MESH:
         return 0
-    n = facing_planes(to_obstacle(frame, p), reach, nearest, surfaces.root[k], surfaces, stack, found, MOST_PLANES)
+    n = facing_planes(
+        to_obstacle(frame, p), reach, nearest, surfaces.root[k], surfaces, stack, found, MOST_PLANES
+    )
     for j in range(n):
         normal = mul(turn_of(frame), (found[5 * j + 1], found[5 * j + 2], found[5 * j + 3]))
         found[5 * j + 1], found[5 * j + 2], found[5 * j + 3] = normal
@@ -68,8 +81,11 @@ def walls(k: int, frame: Numbers, p: Vec, reach: float, nearest: float, surfaces
 
 
 @kernel
-def ray_hit(k: int, frame: Numbers, p: Vec, direction: Vec, longest: float, surfaces: Surfaces, stack: Numbers) -> tuple[float, Vec]:
-    """Length to obstacle k along a unit direction, up to `longest`, and the outward normal there; FAR where it is not met."""
+def ray_hit(
+    k: int, frame: Numbers, p: Vec, direction: Vec, longest: float, surfaces: Surfaces, stack: Numbers
+) -> tuple[float, Vec]:
+    """Length to obstacle k along a unit direction, up to `longest`, and the outward normal there; FAR where
+    it is not met."""
     local, along = to_obstacle(frame, p), mul_t(turn_of(frame), direction)
     if surfaces.kind[k] == MESH:
         t, triangle = first_hit(local, along, longest, surfaces.root[k], surfaces, stack)
@@ -85,9 +101,12 @@ def ray_hit(k: int, frame: Numbers, p: Vec, direction: Vec, longest: float, surf
 
 
 @kernel
-def surface_curvature(k: int, frame: Numbers, p: Vec, surfaces: Surfaces, stack: Numbers) -> tuple[float, float, Vec]:
-    """How the normal of obstacle k turns as the world point p, outside, moves across it: by the first number per length
-    [1/m], and along the unit direction that is returned by the second. (The second derivative of the distance.)"""
+def surface_curvature(
+    k: int, frame: Numbers, p: Vec, surfaces: Surfaces, stack: Numbers
+) -> tuple[float, float, Vec]:
+    """How the normal of obstacle k turns as the world point p, outside, moves across it: by the first number
+    per length [1/m], and along the unit direction that is returned by the second. (The second derivative of
+    the distance.)"""
     local = to_obstacle(frame, p)
     kind, size = surfaces.kind[k], _size(k, surfaces)
     first, second, along = 0.0, 0.0, (0.0, 0.0, 1.0)
@@ -108,7 +127,11 @@ def surface_curvature(k: int, frame: Numbers, p: Vec, surfaces: Surfaces, stack:
         if sides > 1.5:
             first = 1.0 / math.sqrt(dot(beyond, beyond))
             second = first if sides > 2.5 else 0.0
-            along = (0.0 if x > 0.0 else 1.0, 0.0 if y > 0.0 else 1.0, 0.0 if z > 0.0 else 1.0) if sides < 2.5 else along
+            along = (
+                (0.0 if x > 0.0 else 1.0, 0.0 if y > 0.0 else 1.0, 0.0 if z > 0.0 else 1.0)
+                if sides < 2.5
+                else along
+            )
     elif kind == SPHERE:
         first = 1.0 / max(math.sqrt(dot(local, local)), 1e-12)
         second = first

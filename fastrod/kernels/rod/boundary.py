@@ -38,7 +38,11 @@ def close_lengths(
     gamma: Lanes,
 ) -> None:
     """l_i - L_i - c_i (T_i - T0_i) and its derivatives, one row for each commanded tendon."""
-    n_t, n_rows, n_free = len(layout.tendon_segment) + sh.GROUP, len(layout.row_tendon), len(layout.free_tendon)
+    n_t, n_rows, n_free = (
+        len(layout.tendon_segment) + sh.GROUP,
+        len(layout.row_tendon),
+        len(layout.free_tendon),
+    )
     n_base = 2 * len(layout.first_tendon) if layout.paper else 3
     for r in range(n_rows):
         t = layout.row_tendon[r]
@@ -54,11 +58,18 @@ def close_lengths(
             i = robots[w]
             compliance = params.compliance[pick(i, len(params.compliance)), t]
             value = x[(n_base + f) * W + w]
-            # a slack wire's unknown is no tension but a measure of how loose it hangs; d/T as slope is about a taut wire's
+            # a slack wire's unknown is no tension but a measure of how loose it hangs; d/T as slope is about
+            # a taut wire's
             s = pick(i, len(params.reach))
-            slope = max(compliance, params.moment_scale[s] / (params.tension_scale[s] * params.tension_scale[s]))
-            stretch = slope if value < 0.0 and params.unilateral[pick(i, len(params.unilateral)), t] else compliance
-            error[f * W + w] -= stretch * value - compliance * params.pretension[pick(i, len(params.pretension)), t]
+            slope = max(
+                compliance, params.moment_scale[s] / (params.tension_scale[s] * params.tension_scale[s])
+            )
+            stretch = (
+                slope if value < 0.0 and params.unilateral[pick(i, len(params.unilateral)), t] else compliance
+            )
+            error[f * W + w] -= (
+                stretch * value - compliance * params.pretension[pick(i, len(params.pretension)), t]
+            )
             if n_col > 0:
                 gamma[(f * n_col + n_base + f) * W + w] -= stretch
 
@@ -109,7 +120,16 @@ def close_tip(
 
 
 @kernel
-def loosen(robots: Lanes, params: Params, layout: Layout, x: Lanes, columns: Lanes, n_col: int, n_e: int, gamma: Lanes) -> None:
+def loosen(
+    robots: Lanes,
+    params: Params,
+    layout: Layout,
+    x: Lanes,
+    columns: Lanes,
+    n_col: int,
+    n_e: int,
+    gamma: Lanes,
+) -> None:
     """A slack wire carries nothing: its unknown moves no residual but its own, and not the tip."""
     for f in range(len(layout.free_tendon) if n_col > 0 else 0):
         t = layout.free_tendon[f]
@@ -121,7 +141,9 @@ def loosen(robots: Lanes, params: Params, layout: Layout, x: Lanes, columns: Lan
                     columns[((3 + f) * col.COLUMN + k) * W + w] = 0.0
                 s = pick(robots[w], len(params.reach))
                 slope = params.moment_scale[s] / (params.tension_scale[s] * params.tension_scale[s])
-                gamma[(f * n_col + 3 + f) * W + w] = -max(params.compliance[pick(robots[w], len(params.compliance)), t], slope)
+                gamma[(f * n_col + 3 + f) * W + w] = -max(
+                    params.compliance[pick(robots[w], len(params.compliance)), t], slope
+                )
 
 
 @kernel
@@ -141,7 +163,8 @@ def form_gain(
     noise: float,
     carry: bool,
 ) -> None:
-    """G of the scaled unknowns from the derivatives of the residuals; their units stay in `work` after its first n_p + 2 fields."""
+    """G of the scaled unknowns from the derivatives of the residuals; their units stay in `work` after its
+    first n_p + 2 fields."""
     n_x = memory.x.shape[1]
     n_p = padded(n_x, BLOCK)
     units = work[(n_p + 2) * W :]
@@ -217,9 +240,15 @@ def update_boundary(
                     moved = 0.0
                     for r in range(n_e):
                         moved += G[(r * n_p + a) * W + w] * gamma[(r * n_col + n_col - 3 + b) * W + w]
-                    if n_col == n_x:  # the force columns are the follower force's; a dead force does not enter its own row
+                    # the force columns are the follower force's; a dead force does not enter its own row
+                    if n_col == n_x:
                         s = pick(i, len(params.reach))
-                        moved -= G[((n_e - 3 + b) * n_p + a) * W + w] * params.reach[s] * params.reach[s] / params.moment_scale[s]
+                        moved -= (
+                            G[((n_e - 3 + b) * n_p + a) * W + w]
+                            * params.reach[s]
+                            * params.reach[s]
+                            / params.moment_scale[s]
+                        )
                     memory.gain[i, a, n_e + b] = -unit * moved
             if carry:
                 for b in range(a + 1):
@@ -227,7 +256,16 @@ def update_boundary(
 
 
 @kernel
-def hold_boundary(robots: Lanes, count: int, params: Params, memory: Memory, layout: Layout, x: Lanes, error: Lanes, n_e: int) -> None:
+def hold_boundary(
+    robots: Lanes,
+    count: int,
+    params: Params,
+    memory: Memory,
+    layout: Layout,
+    x: Lanes,
+    error: Lanes,
+    n_e: int,
+) -> None:
     """The update of x by the gain of an earlier pass: Newton's method with a held derivative."""
     for w in range(count):
         i = robots[w]

@@ -1,9 +1,11 @@
-"""One forward pass of up to LANES robots: gather, march along the chain, form the residuals, update the boundary, scatter.
+"""One forward pass of up to LANES robots: gather, march along the chain, form the residuals, update the
+boundary, scatter.
 
-Unknowns x: the total base moment m(0) (3, material frame), the tension of every free tendon, and with a follower force
-its world value (3). Residuals e: tendon lengths, the tip moment (3) and the follower force (3), all in metres: moments
-times l^2/EI, forces times l^3/EI. In paper mode the unknowns are (m_x, m_y) at the base of each segment, with u_z = 0
-there, and the residuals are the lengths alone (the paper's eqs. 2b and 3b).
+Unknowns x: the total base moment m(0) (3, material frame), the tension of every free tendon, and with a
+follower force its world value (3). Residuals e: tendon lengths, the tip moment (3) and the follower force
+(3), all in metres: moments times l^2/EI, forces times l^3/EI. In paper mode the unknowns are (m_x, m_y) at
+the base of each segment, with u_z = 0 there, and the residuals are the lengths alone (the paper's eqs. 2b and
+3b).
 """
 
 from __future__ import annotations
@@ -35,7 +37,9 @@ def scratch_size(n_tendons: int, n_x: int, n_col: int, n_e: int, n_probes: int =
 
 
 @kernel
-def solve_section(half: Lanes, stage: Lanes, tendon: Lanes, path: Lanes, first: int, n: int, loaded: bool, cuts: int) -> None:
+def solve_section(
+    half: Lanes, stage: Lanes, tendon: Lanes, path: Lanes, first: int, n: int, loaded: bool, cuts: int
+) -> None:
     """Curvature of a stage from its moment, and the paths of the tendons that cross it.
 
     `half`: K there, and u* three half steps further on, a view into the node.
@@ -80,9 +84,11 @@ def march_columns(
         if layout.paper and c < n_base and c // 2 > k:
             continue  # its segment has not begun
         tendon = layout.free_tendon[c - n_base] if n_base <= c < n_base + n_free else n
-        drive = paths[(tendon if tendon >= first else n) * sh.PATHS * W :]  # after the last tendon all is zero
+        # after the last tendon all is zero
+        drive = paths[(tendon if tendon >= first else n) * sh.PATHS * W :]
         axis = c - n_base - n_free
-        load = node[(sh.N_R + 3 * axis) * W :] if 0 <= axis < 3 else paths[n * sh.PATHS * W :]  # R^T e_axis is a row of R
+        # R^T e_axis is a row of R
+        load = node[(sh.N_R + 3 * axis) * W :] if 0 <= axis < 3 else paths[n * sh.PATHS * W :]
         if probes.node.shape[1] > 0 and c >= n_x:
             load_column(c - n_x, k * layout.n_steps + j, node, probes, first_row, count, given)
             load = given
@@ -95,7 +101,9 @@ def march_columns(
 
 
 @kernel
-def load_unknowns(robots: Lanes, ports: Ports, params: Params, memory: Memory, layout: Layout, x: Lanes, tendon: Lanes) -> None:
+def load_unknowns(
+    robots: Lanes, ports: Ports, params: Params, memory: Memory, layout: Layout, x: Lanes, tendon: Lanes
+) -> None:
     """x of each lane, and the tensions that it means."""
     n_x = memory.x.shape[1]
     n_base = 2 * len(layout.first_tendon) if layout.paper else 3
@@ -170,10 +178,18 @@ def write_summary(
 
 @kernel
 def write_response(
-    robots: Lanes, count: int, node: Lanes, columns: Lanes, error: Lanes, gamma: Lanes, n_col: int, n_e: int, response: Response
+    robots: Lanes,
+    count: int,
+    node: Lanes,
+    columns: Lanes,
+    error: Lanes,
+    gamma: Lanes,
+    n_col: int,
+    n_e: int,
+    response: Response,
 ) -> None:
-    """Residuals, and the change of residuals and tip by each column; a column has the tip's turn in the tip's frame, `response` in the
-    world's."""
+    """Residuals, and the change of residuals and tip by each column; a column has the tip's turn in the tip's
+    frame, `response` in the world's."""
     for w in range(count):
         i = robots[w]
         rotation = sh.get_mat(node, sh.N_R, w)
@@ -217,10 +233,12 @@ def pass_chunk(
     process: float,
     noise: float,
 ) -> None:
-    """One observer pass of the robots whose indices are the first `count` of `robots` (the rest repeat the last one).
+    """One observer pass of the robots whose indices are the first `count` of `robots` (the rest repeat the
+    last one).
 
-    Without columns (`n_col` 0) the update is by the gain that the robot has. With probes (the rows from `first_row` on are
-    these robots') the boundary is not updated: how it would be, and how the contact points then move, is written to the probes.
+    Without columns (`n_col` 0) the update is by the gain that the robot has. With probes (the rows from
+    `first_row` on are these robots') the boundary is not updated: how it would be, and how the contact points
+    then move, is written to the probes.
     """
     n, n_x, n_rows = len(layout.tendon_segment), memory.x.shape[1], len(layout.row_tendon)
     n_segments, n_steps = params.length.shape[1], layout.n_steps
@@ -250,7 +268,12 @@ def pass_chunk(
     work = scratch[o:]
 
     at_start, at_middle, at_end = node[sh.N_K * W :], node[(sh.N_K + 3) * W :], node[(sh.N_K + 6) * W :]
-    varied = ports.stiffness.shape[2] > 1 or ports.line_force.shape[2] > 1 or len(ports.grid) > 0 or len(ports.node_force) > 0
+    varied = (
+        ports.stiffness.shape[2] > 1
+        or ports.line_force.shape[2] > 1
+        or len(ports.grid) > 0
+        or len(ports.node_force) > 0
+    )
     first_cuts, cuts = FIRST_CUTS, RESPONSE_CUTS if placed else CUTS
     for i in range(len(length)):
         length[i] = 0.0
@@ -301,17 +324,44 @@ def pass_chunk(
             if dense:
                 scatter_node(k * n_steps + j, count, robots, node, s, shape)
             sh.second_stage(node, stages)
-            solve_section(at_middle, stages[sh.STAGE * W :], tendon, paths[sh.PATH * W :], first, n, loaded, cuts)
+            solve_section(
+                at_middle, stages[sh.STAGE * W :], tendon, paths[sh.PATH * W :], first, n, loaded, cuts
+            )
             sh.third_stage(node, stages)
-            solve_section(at_middle, stages[2 * sh.STAGE * W :], tendon, paths[2 * sh.PATH * W :], first, n, loaded, cuts)
+            solve_section(
+                at_middle,
+                stages[2 * sh.STAGE * W :],
+                tendon,
+                paths[2 * sh.PATH * W :],
+                first,
+                n,
+                loaded,
+                cuts,
+            )
             sh.fourth_stage(node, stages)
-            solve_section(at_end, stages[3 * sh.STAGE * W :], tendon, paths[3 * sh.PATH * W :], first, n, loaded, cuts)
+            solve_section(
+                at_end, stages[3 * sh.STAGE * W :], tendon, paths[3 * sh.PATH * W :], first, n, loaded, cuts
+            )
             sh.end_step(node, stages)
             for g in range(first, n, sh.GROUP):
                 sh.add_lengths(length[g * W :], node, paths[g * sh.PATHS * W :])
             if update or placed or n_probes > 0:
                 march_columns(
-                    k, j, n_col, n_x, placed or n_probes > 0, layout, node, stages, paths, columns, change, probes, first_row, count, given
+                    k,
+                    j,
+                    n_col,
+                    n_x,
+                    placed or n_probes > 0,
+                    layout,
+                    node,
+                    stages,
+                    paths,
+                    columns,
+                    change,
+                    probes,
+                    first_row,
+                    count,
+                    given,
                 )
             sh.advance(node, stages)
             if n_probes > 0:
@@ -325,7 +375,9 @@ def pass_chunk(
     if dense:
         sh.start_step(node, stages)
         first = layout.first_tendon[n_segments - 1]
-        solve_section(at_end, stages, tendon, paths, first, n, first < n and not layout.paper, first_cuts + cuts)
+        solve_section(
+            at_end, stages, tendon, paths, first, n, first < n and not layout.paper, first_cuts + cuts
+        )
         for i in range(3 * W):
             node[sh.N_U * W + i] = stages[sh.S_U * W + i]
         scatter_node(n_segments * n_steps, count, robots, node, s, shape)
@@ -343,17 +395,56 @@ def pass_chunk(
     if placed:
         write_response(robots, count, node, columns, error, gamma, n_col, n_e, response)
     if n_probes > 0:
-        form_gain(robots, params, memory, layout, gamma, n_col, n_e, P, G, scaled, work, process, noise, carry)
-        respond(robots, count, params, memory, layout, x, error, gamma, G, work[(n_p + 2) * W :], n_col, n_e, n_p, moves, probes, first_row)
+        form_gain(
+            robots, params, memory, layout, gamma, n_col, n_e, P, G, scaled, work, process, noise, carry
+        )
+        respond(
+            robots,
+            count,
+            params,
+            memory,
+            layout,
+            x,
+            error,
+            gamma,
+            G,
+            work[(n_p + 2) * W :],
+            n_col,
+            n_e,
+            n_p,
+            moves,
+            probes,
+            first_row,
+        )
     elif update:
         if n_col > 0:
-            update_boundary(robots, count, params, memory, layout, x, error, gamma, n_col, n_e, P, G, scaled, work, process, noise, carry)
+            update_boundary(
+                robots,
+                count,
+                params,
+                memory,
+                layout,
+                x,
+                error,
+                gamma,
+                n_col,
+                n_e,
+                P,
+                G,
+                scaled,
+                work,
+                process,
+                noise,
+                carry,
+            )
         else:
             hold_boundary(robots, count, params, memory, layout, x, error, n_e)
         for w in range(count):
             i = robots[w]
             for r in range(n_rows):
-                memory.length_before[i, r] = ports.tendon_length[pick(i, len(ports.tendon_length)), layout.row_tendon[r]]
+                memory.length_before[i, r] = ports.tendon_length[
+                    pick(i, len(ports.tendon_length)), layout.row_tendon[r]
+                ]
             if len(memory.force_before) > 0:
                 for a in range(3):
                     memory.force_before[i, a] = ports.tip_force[pick(i, len(ports.tip_force)), a]

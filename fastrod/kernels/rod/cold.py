@@ -1,8 +1,9 @@
 """Where a cold start begins, one robot at a time.
 
-    u of each segment, of least norm:    l (1 + u_x d_y - u_y d_x) = what is left there of each wire that ends with it
-    m(s) on these arcs:                  M + (r_tip - r) x F + sum over the loads beyond of (r_j - r) x f_j, material frame
-    T, of least norm about pretension:   sum of T (d_y, -d_x) = mean of m - K (u - u*) over the segment, tip first
+    u of each segment, of least norm:    l (1 + u_x d_y - u_y d_x) = what is left there of each wire that ends
+    with it m(s) on these arcs:                  M + (r_tip - r) x F + sum over the loads beyond of (r_j - r)
+    x f_j, material frame T, of least norm about pretension:   sum of T (d_y, -d_x) = mean of m - K (u - u*)
+    over the segment, tip first
 
 A wire's (d_y, -d_x), the moment of its unit tension, is called its arm.
 """
@@ -24,8 +25,9 @@ SAMPLES = 8
 """Steps in which a segment's arc is sampled; the guess needs no more."""
 
 _RANK = 1e-3
-"""Part of the larger singular value below which the smaller counts as none: wires that leave a plane by less, as two at 0 and 3.1416 do,
-say nothing about the bend across it, and a micrometre of their lengths would ask for curvatures beyond all bounds."""
+"""Part of the larger singular value below which the smaller counts as none: wires that leave a plane by less,
+as two at 0 and 3.1416 do, say nothing about the bend across it, and a micrometre of their lengths would ask
+for curvatures beyond all bounds."""
 
 Axes: TypeAlias = tuple[float, float, float, float, float]
 
@@ -106,11 +108,13 @@ def _along(axes: Axes, dx: float, dy: float) -> tuple[float, float]:
 
 @kernel
 def _principal(offset: Floats, first: int, last: int) -> Axes:
-    """Principal axes of the arms of wires first ... last - 1: cosine and sine of the major one, `lean`, and 1 / sigma^2 of both.
+    """Principal axes of the arms of wires first ... last - 1: cosine and sine of the major one, `lean`, and 1
+    / sigma^2 of both.
 
-    They diagonalise the 2 x 2 normal matrix, whose own smaller eigenvalue would drown in rounding where the wires are nearly in
-    one plane. The columns along the axes keep it: `lean` times the major one is what rounding left of it in the minor one. A
-    singular value that counts as none has 0 for 1 / sigma^2, which makes the inverse a pseudo-inverse.
+    They diagonalise the 2 x 2 normal matrix, whose own smaller eigenvalue would drown in rounding where the
+    wires are nearly in one plane. The columns along the axes keep it: `lean` times the major one is what
+    rounding left of it in the minor one. A singular value that counts as none has 0 for 1 / sigma^2, which
+    makes the inverse a pseudo-inverse.
     """
     xx, xy, yy = 0.0, 0.0, 0.0
     for t in range(first, last):
@@ -136,14 +140,17 @@ def _principal(offset: Floats, first: int, last: int) -> Axes:
 
 @kernel
 def _bend(i: int, layout: Layout, params: Params, ports: Ports, work: Work) -> None:
-    """Constant curvature of each segment, its own where no length is prescribed, and the moment that it takes."""
+    """Constant curvature of each segment, its own where no length is prescribed, and the moment that it
+    takes."""
     n_tendons = len(layout.tendon_segment)
     rest = ports.precurvature[pick(i, len(ports.precurvature))]
     offsets = params.offset[pick(i, len(params.offset))]
     for t in range(n_tendons):
         work.left[t] = ports.tendon_length[pick(i, len(ports.tendon_length)), t]
     for k in range(len(layout.first_tendon)):
-        length = params.length[pick(i, len(params.length)), k] + ports.extension[pick(i, len(ports.extension)), k]
+        length = (
+            params.length[pick(i, len(params.length)), k] + ports.extension[pick(i, len(ports.extension)), k]
+        )
         offset, first, last = offsets[k], layout.first_tendon[k], _last(k, layout)
         u = _vec(rest[k], 0)
         if first < last and (layout.paper or work.free[first]):
@@ -170,7 +177,9 @@ def _sample(i: int, layout: Layout, params: Params, ports: Ports, work: Work) ->
     turn, place = from_quaternion((pose[3], pose[4], pose[5], pose[6])), (0.0, 0.0, 0.0)
     n_segments, n_f, n_steps = len(layout.first_tendon), line.shape[1], layout.n_steps
     for k in range(n_segments):
-        length = params.length[pick(i, len(params.length)), k] + ports.extension[pick(i, len(ports.extension)), k]
+        length = (
+            params.length[pick(i, len(params.length)), k] + ports.extension[pick(i, len(ports.extension)), k]
+        )
         h = length / SAMPLES
         u = _vec(work.curvature, k)
         half, whole = _exp(scale(0.5 * h, u)), _exp(scale(h, u))
@@ -196,7 +205,8 @@ def _balance(i: int, layout: Layout, ports: Ports, follower: Vec, work: Work) ->
     """Moment of the loads, from the tip down."""
     at = len(work.place) - 1
     force = add(_vec(ports.tip_force, pick(i, len(ports.tip_force))), follower)
-    moment = add(_vec(ports.tip_moment, pick(i, len(ports.tip_moment))), cross(_vec(work.place, at), force))  # about the base
+    # about the base
+    moment = add(_vec(ports.tip_moment, pick(i, len(ports.tip_moment))), cross(_vec(work.place, at), force))
     for k in range(len(layout.first_tendon) - 1, -1, -1):
         local, mean = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         for j in range(SAMPLES, -1, -1):
@@ -231,7 +241,8 @@ def _pull(i: int, layout: Layout, params: Params, ports: Ports, work: Work) -> N
         for t in range(first, last):
             p, q = _along(axes, offset[t, 0], offset[t, 1])
             tension[t] += a * p + b * q
-    # A wire that can go slack starts taut: from there Newton finds which ones let go; from slack it would not see them.
+    # A wire that can go slack starts taut: from there Newton finds which ones let go; from slack it would not
+    # see them.
     taut = 0.01 * params.tension_scale[pick(i, len(params.tension_scale))]
     for t in range(n_tendons):
         if params.unilateral[pick(i, len(params.unilateral)), t]:
@@ -267,23 +278,34 @@ def _keep(i: int, layout: Layout, ports: Ports, follower: Vec, memory: Memory, w
 
 @entry
 def begin(rows: Ints, layout: Layout, params: Params, ports: Ports, memory: Memory) -> None:
-    """Fill x and the curvature guess of the robots `rows` from their inputs alone, and forget what was learned before."""
+    """Fill x and the curvature guess of the robots `rows` from their inputs alone, and forget what was
+    learned before."""
     n_segments, n_tendons = len(layout.first_tendon), len(layout.tendon_segment)
     n = n_segments * (SAMPLES + 1)
     free = np.zeros(n_tendons, np.bool_)
     for j in range(len(layout.free_tendon)):
         free[layout.free_tendon[j]] = True
     work = Work(
-        free, np.empty(n_tendons), np.empty(n_tendons), np.empty((n_segments, 3)), np.empty((n_segments, 3)),
-        np.empty((n, 3)), np.empty((n, 9)), np.empty((n, 3)), np.empty((n_segments, 3)), np.empty((n_segments, 3)),
-    )  # fmt: skip
+        free,
+        np.empty(n_tendons),
+        np.empty(n_tendons),
+        np.empty((n_segments, 3)),
+        np.empty((n_segments, 3)),
+        np.empty((n, 3)),
+        np.empty((n, 9)),
+        np.empty((n, 3)),
+        np.empty((n_segments, 3)),
+        np.empty((n_segments, 3)),
+    )
     for r in range(len(rows)):
         i = rows[r]
         _bend(i, layout, params, ports, work)
         _sample(i, layout, params, ports, work)
         follower = (0.0, 0.0, 0.0)
         if len(ports.follower_force) > 0:
-            follower = mul(_mat(work.turn, n - 1), _vec(ports.follower_force, pick(i, len(ports.follower_force))))
+            follower = mul(
+                _mat(work.turn, n - 1), _vec(ports.follower_force, pick(i, len(ports.follower_force)))
+            )
         _balance(i, layout, ports, follower, work)
         if not layout.paper:
             _pull(i, layout, params, ports, work)

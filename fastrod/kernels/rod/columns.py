@@ -1,7 +1,9 @@
-"""Sensitivities along the rod: the exact derivative of the discrete step, one column for each boundary unknown.
+"""Sensitivities along the rod: the exact derivative of the discrete step, one column for each boundary
+unknown.
 
-A column is (phi, dm, dr): the rotation as a vector in the material frame (dR = R [phi]x), the change of the total
-moment in the material frame, and the change of position in the world frame. The steps below differentiate
+A column is (phi, dm, dr): the rotation as a vector in the material frame (dR = R [phi]x), the change of the
+total moment in the material frame, and the change of position in the world frame. The steps below
+differentiate
 `shape` term by term, so a column is the derivative of the computed shape, not only of the rod.
 """
 
@@ -33,7 +35,8 @@ from .shape import (
 )
 
 C_PHI, C_M, C_POS, COLUMN = 0, 3, 6, 27
-C_U, C_PHI_BEFORE, C_TANGENT = 9, 21, 24  # of the last step: weighted changes of u at the stages, phi at its start, of the tangents
+# of the last step: weighted changes of u at the stages, phi at its start, of the tangents
+C_U, C_PHI_BEFORE, C_TANGENT = 9, 21, 24
 
 
 @inline
@@ -41,7 +44,8 @@ def _turned(stages: Lanes, k: int, w: int, do: Vec, dmm: Vec, dtorsion: float) -
     """C, psi and the change of m of stage k."""
     rotation = get_mat(stages, k * STAGE + S_C, w)
     psi = exp_map_variation(get(stages, k * STAGE + S_O, w), get(stages, k * STAGE + S_VAR, w), do)
-    # m_x and m_y are turned by the whole C, not by the torsion-corrected m: their share of psi needs the z of C^T M
+    # m_x and m_y are turned by the whole C, not by the torsion-corrected m: their share of psi needs the z of
+    # C^T M
     moment = get(stages, k * STAGE + S_MM, w)
     axial = rotation[2] * moment[0] + rotation[5] * moment[1] + rotation[8] * moment[2]
     m = get(stages, k * STAGE + S_M, w)
@@ -72,8 +76,9 @@ def _tangent(rotation: Mat, psi: Vec) -> Vec:
 
 @kernel
 def step_column(column: Lanes, node: Lanes, stages: Lanes, path: Lanes, load: Lanes) -> None:
-    """Carry one column over the step. `path`: of the tendon whose tension the column is, or zeros; `load`: the tip force
-    that it is, in the frame of the start, or zeros. One body for all columns: a second one would compile for seconds."""
+    """Carry one column over the step. `path`: of the tendon whose tension the column is, or zeros; `load`:
+    the tip force that it is, in the frame of the start, or zeros. One body for all columns: a second one
+    would compile for seconds."""
     for w in range(W):
         h = node[N_H * W + w]
         phi, dm1 = get(column, C_PHI, w), get(column, C_M, w)
@@ -87,7 +92,9 @@ def step_column(column: Lanes, node: Lanes, stages: Lanes, path: Lanes, load: La
         k1 = (dn1[1], -dn1[0], 0.0)
         w1 = _torsion_slope(stages, 0, w, du1, dm1)
 
-        rotation, psi, dm = _turned(stages, 1, w, scale(0.5 * h, du1), axpy(0.5 * h, k1, dm1), dm1[2] + 0.5 * h * w1)
+        rotation, psi, dm = _turned(
+            stages, 1, w, scale(0.5 * h, du1), axpy(0.5 * h, k1, dm1), dm1[2] + 0.5 * h * w1
+        )
         du2 = _curvature(stages, 1, w, sub(dm, get(path, 1 * PATH + P_C, w)))
         w2 = _torsion_slope(stages, 1, w, du2, dm)
         t2 = _tangent(rotation, psi)
@@ -95,7 +102,12 @@ def step_column(column: Lanes, node: Lanes, stages: Lanes, path: Lanes, load: La
 
         turn = add(cross(du1, u2), cross(u1, du2))
         rotation, psi, dm = _turned(
-            stages, 2, w, axpy(0.5 * h, du2, scale(0.125 * h * h, turn)), axpy(0.5 * h, k2, dm1), dm1[2] + 0.5 * h * w2
+            stages,
+            2,
+            w,
+            axpy(0.5 * h, du2, scale(0.125 * h * h, turn)),
+            axpy(0.5 * h, k2, dm1),
+            dm1[2] + 0.5 * h * w2,
         )
         du3 = _curvature(stages, 2, w, sub(dm, get(path, 2 * PATH + P_C, w)))
         w3 = _torsion_slope(stages, 2, w, du3, dm)
@@ -124,20 +136,40 @@ def step_column(column: Lanes, node: Lanes, stages: Lanes, path: Lanes, load: La
 
 @kernel
 def place_column(column: Lanes, node: Lanes, stages: Lanes) -> None:
-    """The change of position over the step that `step_column` has just done: Jacobians want it, the observer does not."""
+    """The change of position over the step that `step_column` has just done: Jacobians want it, the observer
+    does not."""
     for w in range(W):
-        c2, c3, c4 = get_mat(stages, STAGE + S_C, w), get_mat(stages, 2 * STAGE + S_C, w), get_mat(stages, 3 * STAGE + S_C, w)
+        c2, c3, c4 = (
+            get_mat(stages, STAGE + S_C, w),
+            get_mat(stages, 2 * STAGE + S_C, w),
+            get_mat(stages, 3 * STAGE + S_C, w),
+        )
         tangent = axpy(2.0, (c2[2] + c3[2], c2[5] + c3[5], c2[8] + c3[8]), (c4[2], c4[5], 1.0 + c4[8]))
         change = add(cross(get(column, C_PHI_BEFORE, w), tangent), get(column, C_TANGENT, w))
-        put(column, C_POS, w, axpy(node[N_H * W + w] / 6.0, mul(get_mat(node, N_R, w), change), get(column, C_POS, w)))
+        put(
+            column,
+            C_POS,
+            w,
+            axpy(node[N_H * W + w] / 6.0, mul(get_mat(node, N_R, w), change), get(column, C_POS, w)),
+        )
 
 
 @kernel
 def add_length_changes(change: Lanes, column: Lanes, path: Lanes) -> None:
     """Change of the path length of GROUP tendons over the step, for one column."""
     for w in range(W):
-        du1, du2, du3, du4 = get(column, C_U, w), get(column, C_U + 3, w), get(column, C_U + 6, w), get(column, C_U + 9, w)
+        du1, du2, du3, du4 = (
+            get(column, C_U, w),
+            get(column, C_U + 3, w),
+            get(column, C_U + 6, w),
+            get(column, C_U + 9, w),
+        )
         for i in range(GROUP):
             p = i * PATHS + P_C
-            c1, c2, c3, c4 = get(path, p, w), get(path, p + PATH, w), get(path, p + 2 * PATH, w), get(path, p + 3 * PATH, w)
+            c1, c2, c3, c4 = (
+                get(path, p, w),
+                get(path, p + PATH, w),
+                get(path, p + 2 * PATH, w),
+                get(path, p + 3 * PATH, w),
+            )
             change[i * W + w] += dot(c1, du1) + dot(c2, du2) + dot(c3, du3) + dot(c4, du4)

@@ -55,8 +55,12 @@ def _fill(
             low = min(int(where), 1) if stiffness.shape[0] > 1 else 0
             base = 2 * j + low if stiffness.shape[0] > 1 else 0
             up = base + 1 if stiffness.shape[0] > 1 else 0
-            node[(sh.N_K + 3 * half + a) * W + lane] = stiffness[base, a] + (where - low) * (stiffness[up, a] - stiffness[base, a])
-            node[(sh.N_USTAR + 3 * half + a) * W + lane] = rest[base, a] + (where - low) * (rest[up, a] - rest[base, a])
+            node[(sh.N_K + 3 * half + a) * W + lane] = stiffness[base, a] + (where - low) * (
+                stiffness[up, a] - stiffness[base, a]
+            )
+            node[(sh.N_USTAR + 3 * half + a) * W + lane] = rest[base, a] + (where - low) * (
+                rest[up, a] - rest[base, a]
+            )
     offset = params.offset[pick(i, len(params.offset)), k]
     for t in range(len(layout.tendon_segment)):
         crosses = t >= layout.first_tendon[k]

@@ -30,11 +30,14 @@ def unknown_unit(a: int, s: int, params: Params, layout: Layout) -> float:
 
 
 @kernel
-def feed_forward(robots: Lanes, count: int, ports: Ports, params: Params, memory: Memory, layout: Layout) -> None:
+def feed_forward(
+    robots: Lanes, count: int, ports: Ports, params: Params, memory: Memory, layout: Layout
+) -> None:
     """Move x from the inputs of the last pass to the new ones, to second order where the motion goes on.
 
-    First order: x += v, v = G (L - L_before) - G (de/dF) (F - F_before). What the last pass then had to correct is the
-    second-order term of the last move; a move along the same line by the ratio k needs k^2 of it again.
+    First order: x += v, v = G (L - L_before) - G (de/dF) (F - F_before). What the last pass then had to
+    correct is the second-order term of the last move; a move along the same line by the ratio k needs k^2 of
+    it again.
     """
     n_rows, n_x = len(layout.row_tendon), memory.x.shape[1]
     n_e = memory.gain.shape[2] - (3 if len(memory.force_before) > 0 else 0)
@@ -71,7 +74,9 @@ def feed_forward(robots: Lanes, count: int, ports: Ports, params: Params, memory
 
 
 @kernel
-def gather_base(robots: Lanes, ports: Ports, params: Params, memory: Memory, layout: Layout, node: Lanes, x: Lanes) -> None:
+def gather_base(
+    robots: Lanes, ports: Ports, params: Params, memory: Memory, layout: Layout, node: Lanes, x: Lanes
+) -> None:
     """Base frame and total internal force at the base: all the loads beyond it."""
     n_segments, n_steps, n_f = params.length.shape[1], layout.n_steps, ports.line_force.shape[2]
     for w in range(W):
@@ -96,7 +101,9 @@ def gather_base(robots: Lanes, ports: Ports, params: Params, memory: Memory, lay
                 else:
                     grid = ports.grid[pick(i, len(ports.grid)), k]
                     for j in range(n_steps):
-                        total += 0.5 * l_k * (grid[j + 1] - grid[j]) * (line[k, 2 * j, a] + line[k, 2 * j + 1, a])
+                        total += (
+                            0.5 * l_k * (grid[j + 1] - grid[j]) * (line[k, 2 * j, a] + line[k, 2 * j + 1, a])
+                        )
             if len(ports.node_force) > 0:
                 for j in range(n_segments * n_steps + 1):
                     total += ports.node_force[pick(i, len(ports.node_force)), j, a]
@@ -116,7 +123,9 @@ def gather_segment(k: int, robots: Lanes, params: Params, layout: Layout, tendon
 
 
 @kernel
-def gather_step(k: int, j: int, robots: Lanes, ports: Ports, params: Params, layout: Layout, node: Lanes) -> None:
+def gather_step(
+    k: int, j: int, robots: Lanes, ports: Ports, params: Params, layout: Layout, node: Lanes
+) -> None:
     """Step length, line force, stiffness and point force of step j of segment k."""
     n_k, n_f = ports.stiffness.shape[2], ports.line_force.shape[2]
     for w in range(W):
@@ -143,7 +152,9 @@ def gather_step(k: int, j: int, robots: Lanes, ports: Ports, params: Params, lay
                     node[(sh.N_USTAR + 3 * half + a) * W + w] = rest[at, a]
         if len(ports.node_force) > 0:  # a force on the node itself acts on what is before it, not beyond
             for a in range(3):
-                node[(sh.N_N + a) * W + w] -= ports.node_force[pick(i, len(ports.node_force)), k * layout.n_steps + j, a]
+                node[(sh.N_N + a) * W + w] -= ports.node_force[
+                    pick(i, len(ports.node_force)), k * layout.n_steps + j, a
+                ]
 
 
 @kernel

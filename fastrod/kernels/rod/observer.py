@@ -2,12 +2,13 @@
 
     P- = P + Q dt;  G = P- Gamma^T (Gamma P- Gamma^T + V^-1/dt)^-1;  x -= G e;  P = (I - G Gamma) P-
 
-The rows of Gamma are taken one after the other, as a Kalman filter takes measurements with independent noise: the same
-G and P to rounding, with divisions by a number in place of a matrix, and sound where Gamma has more rows than rank
-(four wires on two unknowns in paper mode) or a nearly singular direction (tendons that hardly stretch).
+The rows of Gamma are taken one after the other, as a Kalman filter takes measurements with independent noise:
+the same G and P to rounding, with divisions by a number in place of a matrix, and sound where Gamma has more
+rows than rank (four wires on two unknowns in paper mode) or a nearly singular direction (tendons that hardly
+stretch).
 
-Vectors over unknowns are padded with zeros to a multiple of BLOCK entries, so that one loop over lanes does BLOCK
-multiply-adds.
+Vectors over unknowns are padded with zeros to a multiple of BLOCK entries, so that one loop over lanes does
+BLOCK multiply-adds.
 """
 
 from __future__ import annotations
@@ -23,7 +24,9 @@ BLOCK = 4
 def dot_block(out: Lanes, a: Lanes, b: Lanes) -> None:
     """out += a . b over one block."""
     for w in range(W):
-        out[w] += a[w] * b[w] + a[W + w] * b[W + w] + a[2 * W + w] * b[2 * W + w] + a[3 * W + w] * b[3 * W + w]
+        out[w] += (
+            a[w] * b[w] + a[W + w] * b[W + w] + a[2 * W + w] * b[2 * W + w] + a[3 * W + w] * b[3 * W + w]
+        )
 
 
 @kernel
@@ -50,7 +53,8 @@ def scale_block(a: Lanes, b: Lanes, k: Lanes) -> None:
 def gain(P: Lanes, G: Lanes, gamma: Lanes, work: Lanes, n_x: int, n_e: int, noise: float) -> None:
     """P- to P in place, and G, from the rows of Gamma and the variance V^-1/dt of one residual.
 
-    P[a * n_pad + b], G[i * n_pad + a] (transposed), gamma[i * n_pad + a], each times W; work holds n_pad + 2 numbers a lane.
+    P[a * n_pad + b], G[i * n_pad + a] (transposed), gamma[i * n_pad + a], each times W; work holds n_pad + 2
+    numbers a lane.
     """
     n_pad = BLOCK * ((n_x + BLOCK - 1) // BLOCK)
     row, block = n_pad * W, BLOCK * W
@@ -69,13 +73,16 @@ def gain(P: Lanes, G: Lanes, gamma: Lanes, work: Lanes, n_x: int, n_e: int, nois
         for b in range(0, row, block):
             dot_block(number, work[b : b + block], g_i[b : b + block])
         for w in range(W):
-            inverse[w] = 1.0 / max(number[w], noise)  # rounding may take P a little below zero where nothing is left to learn
+            # rounding may take P a little below zero where nothing is left to learn
+            inverse[w] = 1.0 / max(number[w], noise)
         k_i = G[i * row : (i + 1) * row]
         for b in range(0, row, block):
             scale_block(k_i[b : b + block], work[b : b + block], inverse)
         for a in range(n_x):
             for b in range(0, row, block):
-                subtract_block(P[a * row + b : a * row + b + block], work[b : b + block], k_i[a * W : (a + 1) * W])
+                subtract_block(
+                    P[a * row + b : a * row + b + block], work[b : b + block], k_i[a * W : (a + 1) * W]
+                )
         for j in range(i):
             k_j = G[j * row : (j + 1) * row]
             for w in range(W):

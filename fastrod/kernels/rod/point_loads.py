@@ -1,7 +1,8 @@
 """Contact points on the nodes of a pass: their forces go in, and how they move comes out.
 
-A force F on the point `arm` away from the centreline is F and the moment arm x F on the node: what is before the node
-carries them, what is beyond does not. Each probe brings three columns, a unit force along each world axis.
+A force F on the point `arm` away from the centreline is F and the moment arm x F on the node: what is before
+the node carries them, what is beyond does not. Each probe brings three columns, a unit force along each world
+axis.
 """
 
 from __future__ import annotations
@@ -46,8 +47,11 @@ def load_base(probes: Probes, first_row: int, count: int, node: Lanes) -> None:
 
 
 @kernel
-def load_column(c: int, at: int, node: Lanes, probes: Probes, first_row: int, count: int, given: Lanes) -> None:
-    """The unit force of contact column c in the frame of the step that starts at node `at`: none beyond its own node."""
+def load_column(
+    c: int, at: int, node: Lanes, probes: Probes, first_row: int, count: int, given: Lanes
+) -> None:
+    """The unit force of contact column c in the frame of the step that starts at node `at`: none beyond its
+    own node."""
     q, a = c // 3, c % 3
     for w in range(W):
         acts = 1.0 if probes.node[row_of(first_row, count, w), q] > at else 0.0
@@ -56,7 +60,9 @@ def load_column(c: int, at: int, node: Lanes, probes: Probes, first_row: int, co
 
 
 @kernel
-def leave(at: int, probes: Probes, first_row: int, count: int, node: Lanes, columns: Lanes, n_x: int, n_col: int) -> None:
+def leave(
+    at: int, probes: Probes, first_row: int, count: int, node: Lanes, columns: Lanes, n_x: int, n_col: int
+) -> None:
     """Beyond node `at` the loads on it no longer act: internal force, moment and their columns jump."""
     for w in range(W):
         r = row_of(first_row, count, w)
@@ -79,8 +85,11 @@ def leave(at: int, probes: Probes, first_row: int, count: int, node: Lanes, colu
 
 
 @kernel
-def arrive(at: int, probes: Probes, first_row: int, count: int, node: Lanes, columns: Lanes, n_col: int, moves: Lanes) -> None:
-    """Motion of the contact points on node `at`, one number for each column: moves[(3 q + axis) n_col + column]."""
+def arrive(
+    at: int, probes: Probes, first_row: int, count: int, node: Lanes, columns: Lanes, n_col: int, moves: Lanes
+) -> None:
+    """Motion of the contact points on node `at`, one number for each column: moves[(3 q + axis) n_col +
+    column]."""
     for w in range(W):
         r = row_of(first_row, count, w)
         for q in range(probes.node.shape[1]):
@@ -114,7 +123,8 @@ def respond(
     probes: Probes,
     first_row: int,
 ) -> None:
-    """Close the boundary: motion of unknowns and contact points by the residual (column 0) and by each unit force."""
+    """Close the boundary: motion of unknowns and contact points by the residual (column 0) and by each unit
+    force."""
     n_x, n_free = memory.x.shape[1], len(layout.free_tendon)
     n_f = 3 * probes.node.shape[1]
     for w in range(count):
@@ -128,7 +138,9 @@ def respond(
             for c in range(n_f + 1):
                 value = 0.0
                 for e in range(n_e):
-                    value += G[(e * n_p + a) * W + w] * (error[e * W + w] if c == 0 else gamma[(e * n_col + n_x + c - 1) * W + w])
+                    value += G[(e * n_p + a) * W + w] * (
+                        error[e * W + w] if c == 0 else gamma[(e * n_col + n_x + c - 1) * W + w]
+                    )
                 probes.unknown[r, a, c] = -units[a * W + w] * value
         for q in range(n_f):
             for c in range(n_f + 1):

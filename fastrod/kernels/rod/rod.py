@@ -1,15 +1,15 @@
 """The rod's equations, one cross-section at a time.
 
 Key (Rucker and Webster 2011, IEEE T-RO 27(6), with the paper's letters):
-  u  curvature, material frame [1/m]          m  total internal moment of rod and tendons, material frame [N m]
-  K  diag(EI_x, EI_y, GJ) [N m^2]             u* precurvature [1/m]
+  u  curvature, material frame [1/m]          m  total internal moment of rod and tendons, material frame [N
+  m] K  diag(EI_x, EI_y, GJ) [N m^2]             u* precurvature [1/m]
   d  tendon position (d_x, d_y) [m]           T  tendon tension [N], positive pulls
   q = e3 + u x d,  t = q/|q|,  c = d x t      l' = |q| growth of the tendon's path along the backbone
   A = K + sum T grad^2|q|                     the stiffness of rod and tendons together
 
-The tendons' share of the energy is sum T |q(u)|, its gradient T c the moment T d x t of the tendon, its Hessian
-(|d|^2 I - d d^T - c c^T) T / |q|. In closed form d x q = (d_y p, -d_x p, |d|^2 u_z), |q|^2 = p^2 + |d|^2 u_z^2 with
-p = 1 + u_x d_y - u_y d_x.
+The tendons' share of the energy is sum T |q(u)|, its gradient T c the moment T d x t of the tendon, its
+Hessian (|d|^2 I - d d^T - c c^T) T / |q|. In closed form d x q = (d_y p, -d_x p, |d|^2 u_z), |q|^2 = p^2 +
+|d|^2 u_z^2 with p = 1 + u_x d_y - u_y d_x.
 """
 
 from __future__ import annotations
@@ -44,7 +44,9 @@ def tendon_stiffness(dx: float, dy: float, c: Vec, k: float) -> Sym:
 
 
 @inline
-def curvature_correction(u: Vec, m: Vec, K: Vec, u_star: Vec, tendon_moment: Vec, tendon_hessian: Sym) -> tuple[Vec, Sym]:
+def curvature_correction(
+    u: Vec, m: Vec, K: Vec, u_star: Vec, tendon_moment: Vec, tendon_hessian: Sym
+) -> tuple[Vec, Sym]:
     """One Newton step on K (u - u*) + sum T c(u) = m: the new u and A^-1 at the old one."""
     a = tendon_hessian
     inverse = sym_inv((K[0] + a[0], a[1], a[2], K[1] + a[3], a[4], K[2] + a[5]))

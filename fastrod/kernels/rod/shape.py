@@ -1,9 +1,10 @@
 """One integration step of the rod along arclength, LANES robots side by side.
 
-The step is the fourth-order Runge-Kutta-Munthe-Kaas method on SO(3) with two commutators (Munthe-Kaas and Owren 1999),
-for R' = R [u]x with u from the total moment. The moment is carried in the frame R_n of the step's start,
-M' = -(C e3) x n with R = R_n C, so that arcs and helices (constant M) cost no truncation error and a joint, where the
-total moment is continuous but u jumps, needs no special case. Lengths and position use the same four stages.
+The step is the fourth-order Runge-Kutta-Munthe-Kaas method on SO(3) with two commutators (Munthe-Kaas and
+Owren 1999), for R' = R [u]x with u from the total moment. The moment is carried in the frame R_n of the
+step's start, M' = -(C e3) x n with R = R_n C, so that arcs and helices (constant M) cost no truncation error
+and a joint, where the total moment is continuous but u jumps, needs no special case. Lengths and position use
+the same four stages.
 
 Buffers are one-dimensional, field f of lane w at f * LANES + w; the offsets below name the fields.
 """
@@ -20,12 +21,16 @@ W = LANES
 Lanes = Any  # a one-dimensional float64 array; numba's types are not mypy's
 
 # node: the cross-section where a step starts
-N_R, N_POS, N_M, N_N, N_U = 0, 9, 12, 15, 18  # rotation, position, moment (material), internal force (world), curvature
-N_F0, N_F1, N_H, N_K, N_USTAR = 21, 24, 27, 28, 37  # line force at both ends, step length, K and u* at start, middle, end
+# rotation, position, moment (material), internal force (world), curvature
+N_R, N_POS, N_M, N_N, N_U = 0, 9, 12, 15, 18
+# line force at both ends, step length, K and u* at start, middle, end
+N_F0, N_F1, N_H, N_K, N_USTAR = 21, 24, 27, 28, 37
 NODE = 46
 # stage: one of the four evaluations of a step, and (fifth) its end
-S_O, S_VAR, S_C, S_M, S_N, S_U, S_INV = 0, 3, 6, 15, 18, 21, 24  # vector of C, its variation, C, m, n (start frame), u, A^-1
-S_MM, S_DM, S_SUM = 30, 33, 36  # moment in the start frame, its slope, sums over tendons (moment, then Hessian)
+# vector of C, its variation, C, m, n (start frame), u, A^-1
+S_O, S_VAR, S_C, S_M, S_N, S_U, S_INV = 0, 3, 6, 15, 18, 21, 24
+# moment in the start frame, its slope, sums over tendons (moment, then Hessian)
+S_MM, S_DM, S_SUM = 30, 33, 36
 STAGE = 45
 # tendon: position and tension; path: what a tendon does at a stage
 T_DX, T_DY, T_T, TENDON = 0, 1, 2, 3
@@ -103,12 +108,18 @@ def _enter(stages: Lanes, k: int, w: int, o: Vec, moment: Vec, torsion: float, g
     m = mul_t(rotation, moment)
     put(stages, k * STAGE + S_M, w, (m[0], m[1], torsion))
     put(stages, k * STAGE + S_U, w, guess)
-    put(stages, k * STAGE + S_DM, w, cross(get(stages, k * STAGE + S_N, w), (rotation[2], rotation[5], rotation[8])))
+    put(
+        stages,
+        k * STAGE + S_DM,
+        w,
+        cross(get(stages, k * STAGE + S_N, w), (rotation[2], rotation[5], rotation[8])),
+    )
 
 
 @kernel
 def second_stage(node: Lanes, stages: Lanes) -> None:
-    """Stage 2, half a step on: o = h/2 u1 and M = M1 + h/2 M1'; u is guessed by its slope, A u' = -u x m - e3 x n."""
+    """Stage 2, half a step on: o = h/2 u1 and M = M1 + h/2 M1'; u is guessed by its slope, A u' = -u x m - e3
+    x n."""
     for w in range(W):
         h = node[N_H * W + w]
         u1, m = get(stages, S_U, w), get(stages, S_M, w)
@@ -125,7 +136,8 @@ def second_stage(node: Lanes, stages: Lanes) -> None:
             m[2] + 0.5 * h * torsion_slope(stages, 0, w),
             axpy(0.5 * h, slope, u1),
         )
-        put(stages, S_O, w, slope)  # stage 1 needs no rotation vector; its place keeps du/ds for the fourth stage's guess
+        # stage 1 needs no rotation vector; its place keeps du/ds for the fourth stage's guess
+        put(stages, S_O, w, slope)
 
 
 @kernel
@@ -136,18 +148,35 @@ def third_stage(node: Lanes, stages: Lanes) -> None:
         u1, u2 = get(stages, S_U, w), get(stages, STAGE + S_U, w)
         o = axpy(0.5 * h, u2, scale(0.125 * h * h, cross(u1, u2)))
         m = get(stages, S_M, w)
-        _enter(stages, 2, w, o, axpy(0.5 * h, get(stages, STAGE + S_DM, w), m), m[2] + 0.5 * h * torsion_slope(stages, 1, w), u2)
+        _enter(
+            stages,
+            2,
+            w,
+            o,
+            axpy(0.5 * h, get(stages, STAGE + S_DM, w), m),
+            m[2] + 0.5 * h * torsion_slope(stages, 1, w),
+            u2,
+        )
 
 
 @kernel
 def fourth_stage(node: Lanes, stages: Lanes) -> None:
-    """Stage 4, a step on: o = h u3 and M = M1 + h M3'; u is guessed by the parabola through u1, its slope, and u3: 4 u3 - 3 u1 - h u1'."""
+    """Stage 4, a step on: o = h u3 and M = M1 + h M3'; u is guessed by the parabola through u1, its slope,
+    and u3: 4 u3 - 3 u1 - h u1'."""
     for w in range(W):
         h = node[N_H * W + w]
         u1, u3 = get(stages, S_U, w), get(stages, 2 * STAGE + S_U, w)
         guess = axpy(4.0, u3, axpy(-3.0, u1, scale(-h, get(stages, S_O, w))))
         m = get(stages, S_M, w)
-        _enter(stages, 3, w, scale(h, u3), axpy(h, get(stages, 2 * STAGE + S_DM, w), m), m[2] + h * torsion_slope(stages, 2, w), guess)
+        _enter(
+            stages,
+            3,
+            w,
+            scale(h, u3),
+            axpy(h, get(stages, 2 * STAGE + S_DM, w), m),
+            m[2] + h * torsion_slope(stages, 2, w),
+            guess,
+        )
 
 
 @kernel
@@ -163,7 +192,9 @@ def end_step(node: Lanes, stages: Lanes) -> None:
         put(stages, 4 * STAGE + S_N, w, get(stages, 3 * STAGE + S_N, w))
         m = get(stages, S_M, w)
         torsion = (
-            torsion_slope(stages, 0, w) + 2.0 * (torsion_slope(stages, 1, w) + torsion_slope(stages, 2, w)) + torsion_slope(stages, 3, w)
+            torsion_slope(stages, 0, w)
+            + 2.0 * (torsion_slope(stages, 1, w) + torsion_slope(stages, 2, w))
+            + torsion_slope(stages, 3, w)
         )
         _enter(stages, 4, w, o, axpy(h / 6.0, slope, m), m[2] + h / 6.0 * torsion, u4)
 
@@ -174,7 +205,11 @@ def advance(node: Lanes, stages: Lanes) -> None:
     for w in range(W):
         h = node[N_H * W + w]
         rotation = get_mat(node, N_R, w)
-        c2, c3, c4 = get_mat(stages, STAGE + S_C, w), get_mat(stages, 2 * STAGE + S_C, w), get_mat(stages, 3 * STAGE + S_C, w)
+        c2, c3, c4 = (
+            get_mat(stages, STAGE + S_C, w),
+            get_mat(stages, 2 * STAGE + S_C, w),
+            get_mat(stages, 3 * STAGE + S_C, w),
+        )
         tangent = axpy(2.0, (c2[2] + c3[2], c2[5] + c3[5], c2[8] + c3[8]), (c4[2], c4[5], 1.0 + c4[8]))
         put(node, N_POS, w, axpy(h / 6.0, mul(rotation, tangent), get(node, N_POS, w)))
         put_mat(node, N_R, w, matmul(rotation, get_mat(stages, 4 * STAGE + S_C, w)))
@@ -240,7 +275,12 @@ def correct_curvature(stage: Lanes, stiffness: Lanes, rest: Lanes) -> None:
     for w in range(W):
         hessian = get(stage, S_SUM + 3, w) + get(stage, S_SUM + 6, w)
         u, inverse = curvature_correction(
-            get(stage, S_U, w), get(stage, S_M, w), get(stiffness, 0, w), get(rest, 0, w), get(stage, S_SUM, w), hessian
+            get(stage, S_U, w),
+            get(stage, S_M, w),
+            get(stiffness, 0, w),
+            get(rest, 0, w),
+            get(stage, S_SUM, w),
+            hessian,
         )
         put(stage, S_U, w, u)
         put(stage, S_INV, w, inverse[0:3])
@@ -254,4 +294,6 @@ def add_lengths(length: Lanes, node: Lanes, path: Lanes) -> None:
         h = node[N_H * W + w] / 6.0
         for i in range(GROUP):
             q = (i * PATHS + P_Q) * W + w
-            length[i * W + w] += h * (path[q] + 2.0 * (path[q + PATH * W] + path[q + 2 * PATH * W]) + path[q + 3 * PATH * W])
+            length[i * W + w] += h * (
+                path[q] + 2.0 * (path[q + PATH * W] + path[q + 2 * PATH * W]) + path[q + 3 * PATH * W]
+            )

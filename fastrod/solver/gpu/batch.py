@@ -1,7 +1,9 @@
-"""What is launched on a GPU: a thread takes one robot after the other, with the scratch of a pass in its local memory.
+"""What is launched on a GPU: a thread takes one robot after the other, with the scratch of a pass in its
+local memory.
 
-Local memory is laid out by the machine so that the same field of neighbouring threads lies side by side, it is written
-back through the first cache, and its addresses are constants: a strided scratch in global memory has only the first.
+Local memory is laid out by the machine so that the same field of neighbouring threads lies side by side, it
+is written back through the first cache, and its addresses are constants: a strided scratch in global memory
+has only the first.
 """
 
 from __future__ import annotations
@@ -19,21 +21,26 @@ from fastrod.types import Floats, Ints, Layout, Memory, Params, Ports, Probes, R
 
 _cuda: Any = cuda
 _config: Any = numba.config
-# the same files as fastrod.kernels.rod.chunk and gather, for the other machine: no type checker would find them there
-_chunk, _gather = import_module("fastrod.solver.gpu.kernels.rod.chunk"), import_module("fastrod.solver.gpu.kernels.rod.gather")
+# the same files as fastrod.kernels.rod.chunk and gather, for the other machine: no type checker would find
+# them there
+_chunk, _gather = (
+    import_module("fastrod.solver.gpu.kernels.rod.chunk"),
+    import_module("fastrod.solver.gpu.kernels.rod.gather"),
+)
 pass_chunk, scratch_size, feed_forward = _chunk.pass_chunk, _chunk.scratch_size, _gather.feed_forward
 
 BLOCK = 64
 """Threads of a block."""
 BLOCKS = 2
-"""Blocks that a multiprocessor is given: a warp for each of its four schedulers. A thread's scratch is 8 to 25 kB, and what more threads
-have does not fit into the caches."""
+"""Blocks that a multiprocessor is given: a warp for each of its four schedulers. A thread's scratch is 8 to
+25 kB, and what more threads have does not fit into the caches."""
 _SCRATCH = 256  # numbers by which the room for a pass grows: each size is a compilation
 
 
 @cache
 def pass_robots(size: int) -> Any:
-    """The kernel of one forward pass (`pass_chunk`) of the robots `rows`, with room for `size` numbers a thread."""
+    """The kernel of one forward pass (`pass_chunk`) of the robots `rows`, with room for `size` numbers a
+    thread."""
 
     def run(
         rows: Ints,
@@ -59,9 +66,24 @@ def pass_robots(size: int) -> Any:
         for r in range(_cuda.grid(1), len(rows), _cuda.gridsize(1)):
             robots[0] = rows[r]
             pass_chunk(
-                robots, 1, params, ports, layout, memory, shape, response, probes, 0, scratch,
-                n_col, feed, carry, update, process, noise,
-            )  # fmt: skip
+                robots,
+                1,
+                params,
+                ports,
+                layout,
+                memory,
+                shape,
+                response,
+                probes,
+                0,
+                scratch,
+                n_col,
+                feed,
+                carry,
+                update,
+                process,
+                noise,
+            )
 
     return launched(run)
 
@@ -101,7 +123,8 @@ def room(n_tendons: int, n_x: int, n_col: int, n_e: int) -> int:
 
 
 def launch(kernel: Any, n: int, *arguments: Any) -> None:
-    """Run `kernel` for n robots: at most `BLOCKS` blocks for each multiprocessor, whose threads come back for more."""
+    """Run `kernel` for n robots: at most `BLOCKS` blocks for each multiprocessor, whose threads come back for
+    more."""
     if n == 0:
         return
     if SIMULATED:

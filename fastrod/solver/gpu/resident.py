@@ -1,4 +1,5 @@
-"""`Resident`: the observer's memory on the device and on the host, each array as new as it must be and not copied before."""
+"""`Resident`: the observer's memory on the device and on the host, each array as new as it must be and not
+copied before."""
 
 from __future__ import annotations
 
@@ -15,13 +16,15 @@ FIELDS = Memory._fields
 
 
 def fill(device: Any, array: Any) -> None:
-    """Copy into an array on the device that is as large: as rows of numbers, for the simulator stumbles over axes of length 1."""
+    """Copy into an array on the device that is as large: as rows of numbers, for the simulator stumbles over
+    axes of length 1."""
     if device.size:
         device.reshape(-1).copy_to_device(np.ascontiguousarray(array).reshape(-1))
 
 
 class Resident:
-    """The two copies of a `Memory`. A field is stale on the device after the host was let write to it, and the other way round."""
+    """The two copies of a `Memory`. A field is stale on the device after the host was let write to it, and
+    the other way round."""
 
     def __init__(self, memory: Memory) -> None:
         self._host = memory
@@ -42,7 +45,8 @@ class Resident:
         return self._host
 
     def write(self, fields: Iterable[str] = FIELDS) -> Memory:
-        """As `read`, and the caller may write into these fields: the device takes them over before its next pass."""
+        """As `read`, and the caller may write into these fields: the device takes them over before its next
+        pass."""
         self._stale_there.update(fields)
         return self.read(fields)
 
@@ -67,7 +71,10 @@ class Resident:
 
         own, at = self.there(), _cuda.to_device(rows)
         for name in FIELDS:
-            into, values = getattr(own, name), np.ascontiguousarray(getattr(new, name)[rows]) if len(getattr(new, name)) else None
+            into, values = (
+                getattr(own, name),
+                np.ascontiguousarray(getattr(new, name)[rows]) if len(getattr(new, name)) else None,
+            )
             if values is not None and values.size:
                 flat = _cuda.to_device(values.reshape(len(rows), -1))
                 launch(put_rows, len(rows), at, flat, into.reshape(into.shape[0], into.size // into.shape[0]))

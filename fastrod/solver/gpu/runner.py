@@ -12,15 +12,19 @@ from fastrod.solver.gpu.resident import Resident, fill
 from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports, Response, Shape
 
 _cuda: Any = cuda
-_SMALL = 4096  # bytes: an array up to here is compared with what the device has, a larger one is the same if it is the same object
+# bytes: an array up to here is compared with what the device has, a larger one is the same if it is the same
+# object
+_SMALL = 4096
 _BY_FEED = ("x", "move", "defect", "length_before", "force_before")
 _BY_UPDATE = ("x", "covariance", "gain", "defect", "length_before", "force_before")
 
 
 class Runner:
-    """What the device holds besides the memory: robots and ports as they were last given, and what the last passes wrote.
+    """What the device holds besides the memory: robots and ports as they were last given, and what the last
+    passes wrote.
 
-    Robots and ports are replaced, never changed in place; so an array that is the same object is not sent again.
+    Robots and ports are replaced, never changed in place; so an array that is the same object is not sent
+    again.
     """
 
     def __init__(self) -> None:
@@ -50,26 +54,50 @@ class Runner:
         process: float,
         noise: float,
     ) -> None:
-        """One forward pass of these robots. What it writes of `shape` stays on the device until `collect`; `response` comes back."""
+        """One forward pass of these robots. What it writes of `shape` stays on the device until `collect`;
+        `response` comes back."""
         there = memory.there()
         into = self._bind(shape, rows)
-        answer: Any = Response(*(_cuda.to_device(np.ascontiguousarray(a)) for a in response)) if len(response.tip) else _NO_RESPONSE
+        answer: Any = (
+            Response(*(_cuda.to_device(np.ascontiguousarray(a)) for a in response))
+            if len(response.tip)
+            else _NO_RESPONSE
+        )
         kernel = pass_robots(room(len(layout.tendon_segment), there.x.shape[1], n_col, n_e))
         given = self._all("params", params), self._all("ports", ports), self._all("layout", layout)
         launch(
-            kernel, len(rows), self._send("rows", rows), *given, there, into, self._all("response", answer),
-            n_col, feed, carry, update, float(process), float(noise),
-        )  # fmt: skip
+            kernel,
+            len(rows),
+            self._send("rows", rows),
+            *given,
+            there,
+            into,
+            self._all("response", answer),
+            n_col,
+            feed,
+            carry,
+            update,
+            float(process),
+            float(noise),
+        )
         written = {"curvature_guess", *(_BY_FEED if feed else ()), *(_BY_UPDATE if update else ())}
         memory.written_there(written)
         if len(response.tip):
             for host, device in zip(response, answer, strict=True):
                 device.copy_to_host(host)
 
-    def move_to_inputs(self, rows: Ints, params: Params, ports: Ports, layout: Layout, memory: Resident) -> None:
+    def move_to_inputs(
+        self, rows: Ints, params: Params, ports: Ports, layout: Layout, memory: Resident
+    ) -> None:
         """`feed_forward` of these robots, without a pass."""
         there = memory.there()
-        arguments = self._send("rows", rows), self._all("ports", ports), self._all("params", params), there, self._all("layout", layout)
+        arguments = (
+            self._send("rows", rows),
+            self._all("ports", ports),
+            self._all("params", params),
+            there,
+            self._all("layout", layout),
+        )
         launch(move_to_inputs, len(rows), *arguments)
         memory.written_there(_BY_FEED)
 
@@ -82,7 +110,8 @@ class Runner:
         return flags
 
     def collect(self, shape: Shape, only: str | None = None) -> None:
-        """Bring what passes wrote into `shape`, or one field of it, to the host; rows that no pass wrote stay as they are there."""
+        """Bring what passes wrote into `shape`, or one field of it, to the host; rows that no pass wrote stay
+        as they are there."""
         if self._written is not shape or self._touched is None:
             return
         every = bool(self._touched.all())
@@ -97,7 +126,8 @@ class Runner:
                 host[self._touched] = self._out[name].copy_to_host()[self._touched]
 
     def _bind(self, shape: Shape, rows: Ints) -> Shape:
-        """Room on the device for what passes write into this shape: that of the last one, where the sizes agree."""
+        """Room on the device for what passes write into this shape: that of the last one, where the sizes
+        agree."""
         if self._written is not shape:
             for name, host in shape._asdict().items():
                 if name not in self._out or self._out[name].shape != host.shape:
@@ -116,7 +146,9 @@ class Runner:
             return array
         before, device = self._sent.get(key, (None, None))
         small = array.nbytes <= _SMALL
-        if before is not None and (np.array_equal(before, array) and before.dtype == array.dtype if small else before is array):
+        if before is not None and (
+            np.array_equal(before, array) and before.dtype == array.dtype if small else before is array
+        ):
             return device
         if device is not None and device.shape == array.shape and device.dtype == array.dtype and array.size:
             fill(device, array)

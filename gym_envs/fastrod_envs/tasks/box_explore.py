@@ -23,7 +23,17 @@ from fastrod_envs.task import Ball, Field, Line, Scenery, Tube
 from fastrod_scenes.robots import ur5_path
 from fastrod_scenes.ur5.box import COLORS, CORNERS, Box
 from fastrod_scenes.ur5.carried import OFFSET, RADIUS, Bracket, soft_robot
-from fastrod_scenes.ur5.exploration import ADAPTER, BACKWARD, ELBOW_UP, ENTRY, EXTENSION, FORWARD, INTO, LARGEST_BEND, STANDOFF
+from fastrod_scenes.ur5.exploration import (
+    ADAPTER,
+    BACKWARD,
+    ELBOW_UP,
+    ENTRY,
+    EXTENSION,
+    FORWARD,
+    INTO,
+    LARGEST_BEND,
+    STANDOFF,
+)
 from fastrod_scenes.ur5.look import aim_jacobian, miss
 
 STEP = 0.05
@@ -51,7 +61,8 @@ class BoxExploreOptions(Options):
     """Of BoxExplore."""
 
     camera: bool = False
-    """Observe also where in the tip's picture the cube's colour is seen; a picture of 48 x 36 pixels is drawn in each step."""
+    """Observe also where in the tip's picture the cube's colour is seen; a picture of 48 x 36 pixels is drawn
+    in each step."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -63,13 +74,15 @@ class BoxExploreOptions(Options):
 class BoxExplore(HostedTask):
     """Look at the cube in a corner of a box, into which a UR5 has put a soft robot, and touch no wall.
 
-    The UR5 stands still; where its flange is (8 mm and 3 degrees around the middle of the entry), how the robot is bent at the start and
-    which of the eight corners is the goal differ from episode to episode. Nine numbers drive the three segments: extension (0.04 m/s)
-    and two bends (2 rad/s) each. The distance is what the line of sight, d3 of the tip, misses the middle of the cube by, along an arc
-    about the tip [m]. Success: it is below 10 mm, and the cube shows in 20 pixels or more of the tip's picture of 160 x 120, in
-    its colour. Reward: exp(-m / 0.1 m) + exp(-m / 0.01 m), m the miss, and -1 at contact. Contact, less than the body's
-    radius between backbone and a wall, ends the episode; otherwise it has 40 steps of 50 ms. `difficulty`: 0 has the four corners
-    in the back, 1 all. Baseline: resolved rates of the line of sight, the rest of the motion toward the bends of the scene `explore`.
+    The UR5 stands still; where its flange is (8 mm and 3 degrees around the middle of the entry), how the
+    robot is bent at the start and which of the eight corners is the goal differ from episode to episode. Nine
+    numbers drive the three segments: extension (0.04 m/s) and two bends (2 rad/s) each. The distance is what
+    the line of sight, d3 of the tip, misses the middle of the cube by, along an arc about the tip [m].
+    Success: it is below 10 mm, and the cube shows in 20 pixels or more of the tip's picture of 160 x 120, in
+    its colour. Reward: exp(-m / 0.1 m) + exp(-m / 0.01 m), m the miss, and -1 at contact. Contact, less than
+    the body's radius between backbone and a wall, ends the episode; otherwise it has 40 steps of 50 ms.
+    `difficulty`: 0 has the four corners in the back, 1 all. Baseline: resolved rates of the line of sight,
+    the rest of the motion toward the bends of the scene `explore`.
     """
 
     name = "BoxExplore"
@@ -91,7 +104,15 @@ class BoxExplore(HostedTask):
         box = Box()
         inside = tuple(box.corner(5) - [0.5, 0.2, 0.2]), tuple(box.corner(0) + 0.2)
         ones = ((-1.0,) * 3, (1.0,) * 3)
-        goals = (Field("cube", "m", tuple(box.cube_at(5)), tuple(box.cube_at(0)), "middle of the cube to look at, world"),)
+        goals = (
+            Field(
+                "cube",
+                "m",
+                tuple(box.cube_at(5)),
+                tuple(box.cube_at(0)),
+                "middle of the cube to look at, world",
+            ),
+        )
         states: tuple[Field, ...] = (
             *goals,
             Field("tip", "m", *inside, "world"),
@@ -109,12 +130,19 @@ class BoxExplore(HostedTask):
             Field("base", "m", *inside, "of the soft robot, world"),
             Field("base_right", "", *ones, "d1 of the base, world"),
             Field("base_sight", "", *ones, "d3 of the base, world"),
-            Field("clearance", "m", (-NEAR_WALL,), (NEAR_WALL,), f"least of the body from a wall, at most {NEAR_WALL:g} m either way"),
+            Field(
+                "clearance",
+                "m",
+                (-NEAR_WALL,),
+                (NEAR_WALL,),
+                f"least of the body from a wall, at most {NEAR_WALL:g} m either way",
+            ),
             Field("posture", "", (-1.0,) * 9, (1.0,) * 9, "displacements, from their least to their largest"),
         )
         if self.camera:
             about = (
-                "where the cube's colour is in the tip's picture, right and up from its middle, and its part of the picture; 0 0 0: nowhere"
+                "where the cube's colour is in the tip's picture, right and up from its middle, and its "
+                "part of the picture; 0 0 0: nowhere"
             )
             states += (Field("seen", "", (-1.0, -1.0, 0.0), (1.0, 1.0, 1.0), about),)
         super().__init__(n_envs, options, robot, actions, states, goals)
@@ -138,11 +166,17 @@ class _Inside(Cell):
         self.bracket = Bracket(tool, [((0.0, 0.0, 0.0), (0.0, 0.0, ADAPTER))], RADIUS)
         robot = task.base_robot
         self.soft = SoftArm(
-            robot, dt=task.dt / self.n_parts, points_per_segment=_POINTS, largest_bend=LARGEST_BEND, bend_rate=BEND_RATE,
+            robot,
+            dt=task.dt / self.n_parts,
+            points_per_segment=_POINTS,
+            largest_bend=LARGEST_BEND,
+            bend_rate=BEND_RATE,
             extension_rate=EXTENSION_RATE,
-        )  # fmt: skip
+        )
         n = 3 * _POINTS
-        self.bodies = RodBodies(self.world, robot.length, RADIUS, n, color=(*_GREY, 1.0), head_color=(0.1, 0.1, 0.1, 1.0))
+        self.bodies = RodBodies(
+            self.world, robot.length, RADIUS, n, color=(*_GREY, 1.0), head_color=(0.1, 0.1, 0.1, 1.0)
+        )
         self.corner = 0
 
     def begin(self, draws: Floats, difficulty: float, robot: Robot | None) -> None:
@@ -152,7 +186,9 @@ class _Inside(Cell):
         flange = np.concatenate([at, product(quaternion_from_vector(entry[3:]), np.array(INTO))])
         self.arm.place(self.arm.solve(flange, ELBOW_UP[int(draws[13] >= 0.5)]))
         start = np.zeros((3, 3))
-        start[:, 1:] = START_BEND * (2.0 * draws[7:13].reshape(3, 2) - 1.0) * self.soft.actions.offset[:, None]
+        start[:, 1:] = (
+            START_BEND * (2.0 * draws[7:13].reshape(3, 2) - 1.0) * self.soft.actions.offset[:, None]
+        )
         self.soft.begin(robot, self.link.motion().pose, start.ravel())
         self._base_rotation = matrix_from_quaternion(self.soft.base[None, 3:])[0]
         self._goal = self.box.cube_at(self.corner)
@@ -177,20 +213,38 @@ class _Inside(Cell):
         contact = self._gap < 0.0
         tip, far = self.soft.tip, float(np.linalg.norm(self._goal - self.soft.tip))
         return Result(
-            terms={"aim": math.exp(-self._off / 0.1), "precise": math.exp(-self._off / 0.01), "contact": -1.0 if contact else 0.0},
-            distance=self._off, success=self._off < self.accuracy and seen >= LEAST_PIXELS and not contact,
-            position=tip + far * self.soft.tip_rotation[:, 2], desired=self._goal.copy(), terminated=contact, contact=contact,
+            terms={
+                "aim": math.exp(-self._off / 0.1),
+                "precise": math.exp(-self._off / 0.01),
+                "contact": -1.0 if contact else 0.0,
+            },
+            distance=self._off,
+            success=self._off < self.accuracy and seen >= LEAST_PIXELS and not contact,
+            position=tip + far * self.soft.tip_rotation[:, 2],
+            desired=self._goal.copy(),
+            terminated=contact,
+            contact=contact,
             facts={"clearance": self._gap, "pixels": float(seen)},
-        )  # fmt: skip
+        )
 
     def state(self) -> Floats:
         soft, rotation, base = self.soft, self.soft.tip_rotation, self._base_rotation
         shown, fine = (self._miss * (most / max(self._off, most)) for most in (FAR, FINE))
         far = np.linalg.norm(self._goal - soft.tip)
         parts = [
-            self._goal, soft.tip, rotation[:, 0], rotation[:, 2], shown, fine, [far], soft.base[:3], base[:, 0], base[:, 2],
-            [min(max(self._gap, -NEAR_WALL), NEAR_WALL)], soft.posture(),
-        ]  # fmt: skip
+            self._goal,
+            soft.tip,
+            rotation[:, 0],
+            rotation[:, 2],
+            shown,
+            fine,
+            [far],
+            soft.base[:3],
+            base[:, 0],
+            base[:, 2],
+            [min(max(self._gap, -NEAR_WALL), NEAR_WALL)],
+            soft.posture(),
+        ]
         if self.camera:
             parts.append(self._where())
         return np.concatenate(parts)
@@ -202,9 +256,16 @@ class _Inside(Cell):
         soft = self.soft
         jacobian = aim_jacobian(soft.tip, soft.tip_rotation, self._goal, soft.jacobian())
         control = ResolvedRate(
-            gain=6.0, lower=soft.lower, upper=soft.upper, rate=soft.rate, weight=soft.rate**-2.0, error_limit=0.1, damping=1e-3,
-            posture=self._posture, posture_gain=4.0,
-        )  # fmt: skip
+            gain=6.0,
+            lower=soft.lower,
+            upper=soft.upper,
+            rate=soft.rate,
+            weight=soft.rate**-2.0,
+            error_limit=0.1,
+            damping=1e-3,
+            posture=self._posture,
+            posture_gain=4.0,
+        )
         rates = control.rates(soft.action, jacobian, self._miss, np.zeros(2), STEP)
         if not self.at_once:
             return np.asarray(rates / soft.rate)
@@ -221,16 +282,22 @@ class _Inside(Cell):
         far = np.linalg.norm(self._goal - self.soft.tip)
         sight = np.stack([self.soft.tip, self.soft.tip + far * self.soft.tip_rotation[:, 2]])
         return Scenery(
-            tubes=(Tube(self.soft.nodes, RADIUS, _GREY), arm_tube(self.arm)), balls=(Ball(self._goal, 0.022, COLORS[self.corner]),),
-            solids=tuple(solids), lines=(Line(sight, (0.9, 0.1, 0.1)),), eye=(0.5, -1.1, 0.9), target=(0.8, 0.0, 0.45),
-        )  # fmt: skip
+            tubes=(Tube(self.soft.nodes, RADIUS, _GREY), arm_tube(self.arm)),
+            balls=(Ball(self._goal, 0.022, COLORS[self.corner]),),
+            solids=tuple(solids),
+            lines=(Line(sight, (0.9, 0.1, 0.1)),),
+            eye=(0.5, -1.1, 0.9),
+            target=(0.8, 0.0, 0.45),
+        )
 
     def picture(self, width: int, height: int) -> np.ndarray:
         """From the side, its wall cut away, and in a corner what the tip sees."""
         self._pose()
         side = Camera(width=width, height=height, fov=36.0, near=0.8005, far=4.0)
         rgb = side.look(self.world, (0.78, -1.0, 0.45), (0.78, 0.0, 0.45)).rgb
-        small = self._look(Camera(width=max(width // 4, 1), height=max(height // 4, 1), fov=70.0, near=0.005, far=2.0)).rgb
+        small = self._look(
+            Camera(width=max(width // 4, 1), height=max(height // 4, 1), fov=70.0, near=0.005, far=2.0)
+        ).rgb
         rgb[: small.shape[0], : small.shape[1]] = small
         return rgb
 
@@ -259,7 +326,8 @@ class _Inside(Cell):
         depth, width, tall = box.inner
         y, z = np.abs(y), np.abs(z - box.height)
         walls = np.minimum(np.minimum(0.5 * width - y, 0.5 * tall - z), box.front + box.wall + depth - x)
-        open_by = box.entry - np.maximum(np.maximum(y, z), math.sqrt(0.5) * (y + z))  # from the sides of the octagon, inward
+        # from the sides of the octagon, inward
+        open_by = box.entry - np.maximum(np.maximum(y, z), math.sqrt(0.5) * (y + z))
         before = np.maximum(np.maximum(box.front - x, x - box.front - box.wall), 0.0)
         entry = np.where(open_by > 0.0, np.hypot(open_by, before), np.where(before > 0.0, before, open_by))
         return float(np.where(x > box.front + box.wall, np.minimum(walls, entry), entry).min()) - RADIUS
@@ -280,7 +348,12 @@ class _Inside(Cell):
         self._pose()
         image = self._look(_EYE)
         hue = image.rgb / np.maximum(np.linalg.norm(image.rgb, axis=2, keepdims=True), 1.0)
-        return int(((image.segmentation == self.cubes[self.corner]) & ((hue @ _HUES.T).argmax(axis=2) == self.corner)).sum())
+        return int(
+            (
+                (image.segmentation == self.cubes[self.corner])
+                & ((hue @ _HUES.T).argmax(axis=2) == self.corner)
+            ).sum()
+        )
 
     def _where(self) -> Floats:
         """(3,) where the cube's colour is in a small picture."""
@@ -290,7 +363,10 @@ class _Inside(Cell):
         rows, columns = np.nonzero(hue @ _HUES[self.corner] > _ALIKE)
         if not len(rows):
             return np.zeros(3)
-        right, up = (columns.mean() + 0.5) / (0.5 * _SMALL.width) - 1.0, 1.0 - (rows.mean() + 0.5) / (0.5 * _SMALL.height)
+        right, up = (
+            (columns.mean() + 0.5) / (0.5 * _SMALL.width) - 1.0,
+            1.0 - (rows.mean() + 0.5) / (0.5 * _SMALL.height),
+        )
         return np.array([right, up, len(rows) / rgb[..., 0].size])
 
 

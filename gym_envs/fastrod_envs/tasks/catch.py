@@ -43,7 +43,10 @@ def standing_robot() -> Robot:
             torsional_stiffness=STIFFNESS,
             body_radius=0.012,
             extension=EXTENSION if k else (0.0, 0.0),
-            tendons=tuple(Tendon(offset=OFFSET, angle=2.0 * math.pi * (j / 3 + k / 6), compliance=1e-4) for j in range(3)),
+            tendons=tuple(
+                Tendon(offset=OFFSET, angle=2.0 * math.pi * (j / 3 + k / 6), compliance=1e-4)
+                for j in range(3)
+            ),
         )
         for k in range(2)
     )
@@ -54,16 +57,19 @@ def standing_robot() -> Robot:
 class Catch(RodTask):
     """Catch a target with the tip of a robot that an unknown load bends.
 
-    The robot stands upright: two segments of 0.1 m, four bends and the extension of the second. A target crosses its workspace in a
-    straight line at 0.02 to 0.08 m/s; where and when it crosses, its direction and its speed are drawn for every episode. So is a force
-    at the tip, of any direction and up to 0.15 N, which stays all the while and is not observed: it bends the robot by up to
-    some 12 mm. Observed are the measured tip, the target's position and its velocity.
+    The robot stands upright: two segments of 0.1 m, four bends and the extension of the second. A target
+    crosses its workspace in a straight line at 0.02 to 0.08 m/s; where and when it crosses, its direction and
+    its speed are drawn for every episode. So is a force at the tip, of any direction and up to 0.15 N, which
+    stays all the while and is not observed: it bends the robot by up to some 12 mm. Observed are the measured
+    tip, the target's position and its velocity.
 
-    Caught: the tip within 10 mm of the target at the end of a step; this ends the episode with success. Else it ends after 40
-    steps of 50 ms. Reward: -min(d, 0.2 m) / 0.2 m a step, d the tip's distance from the target [m], and 10 for the catch.
-    `distance`, by which the task is judged, is the least d of the episode so far. With difficulty 0 there is no load, and a slow target
-    passes the tip's place at home. Baseline: resolved rates with the Jacobian of unloaded arcs, from the measured tip to
-    where a tip of 0.2 m/s can first meet the target; what is at its limit is left out.
+    Caught: the tip within 10 mm of the target at the end of a step; this ends the episode with success. Else
+    it ends after 40 steps of 50 ms. Reward: -min(d, 0.2 m) / 0.2 m a step, d the tip's distance from the
+    target [m], and 10 for the catch.
+    `distance`, by which the task is judged, is the least d of the episode so far. With difficulty 0 there is
+    no load, and a slow target passes the tip's place at home. Baseline: resolved rates with the Jacobian of
+    unloaded arcs, from the measured tip to where a tip of 0.2 m/s can first meet the target; what is at its
+    limit is left out.
     """
 
     name = "Catch"
@@ -80,7 +86,8 @@ class Catch(RodTask):
         limit = np.array([(-BEND, BEND)] * 4 + [EXTENSION])
         rate = np.array([0.018] * 4 + [0.025])
         super().__init__(n_envs, options, standing_robot(), driven=_DRIVEN, limit=limit, rate=rate)
-        self.force[:] = 0.0  # a load that moves: from now on the simulator knows the gain for it, whatever comes first
+        # a load that moves: from now on the simulator knows the gain for it, whatever comes first
+        self.force[:] = 0.0
         self.simulator.settle(**self._inputs())
         self._home = self.simulator.snapshot()
         self._limit = limit
@@ -111,7 +118,9 @@ class Catch(RodTask):
 
     def begin(self, rows: Ints, draws: Floats) -> None:
         ease = self.difficulty
-        self.force[rows] = ease * LARGEST_LOAD * np.cbrt(draws[:, 0].copy())[:, None] * directions(draws[:, 1:3])
+        self.force[rows] = (
+            ease * LARGEST_LOAD * np.cbrt(draws[:, 0].copy())[:, None] * directions(draws[:, 1:3])
+        )
         self.start(rows, draws)
         low, high = self._limit.T
         posture = ease * _PART * (0.5 * (low + high) + (draws[:, 3:8] - 0.5) * (high - low))
@@ -131,14 +140,23 @@ class Catch(RodTask):
         caught = (d <= self.accuracy) & ~self.lost
         terms = {"distance": -np.minimum(d, 0.2) / 0.2, "catch": np.where(caught, 10.0, 0.0)}
         return Outcome(
-            terms=terms, distance=self.least.copy(), success=caught, position=self.tip, desired=self.desired.copy(), terminated=caught,
-            contact=np.zeros(self.n_envs, bool), lost=self.lost, facts={"load": self.force.copy()},
-        )  # fmt: skip
+            terms=terms,
+            distance=self.least.copy(),
+            success=caught,
+            position=self.tip,
+            desired=self.desired.copy(),
+            terminated=caught,
+            contact=np.zeros(self.n_envs, bool),
+            lost=self.lost,
+            facts={"load": self.force.copy()},
+        )
 
     def state(self) -> Floats:
         seen = self.measured()
         error = shortened(self.desired - seen, NEAR)
-        return np.concatenate([self.desired, self.velocity, seen, self.direction, error, self.posture()], axis=1)
+        return np.concatenate(
+            [self.desired, self.velocity, seen, self.direction, error, self.posture()], axis=1
+        )
 
     def goal(self) -> Floats:
         return np.concatenate([self.desired, self.velocity], axis=1)
@@ -185,8 +203,14 @@ def arcs_tip(displacement: Floats) -> Floats:
     bend = np.hypot(a, b)
     sine, versine = np.sinc(bend / np.pi), 0.5 * np.sinc(0.5 * bend / np.pi) ** 2
     along = a * x + b * y  # turned about (-b, a, 0) by the bend (Rodrigues)
-    turned = (x + a * (sine * z - versine * along), y + b * (sine * z - versine * along), z * np.cos(bend) - sine * along)
-    return np.stack([p + q for p, q in zip(_arc(a, b, np.full(len(a), SEGMENT)), turned, strict=True)], axis=1)
+    turned = (
+        x + a * (sine * z - versine * along),
+        y + b * (sine * z - versine * along),
+        z * np.cos(bend) - sine * along,
+    )
+    return np.stack(
+        [p + q for p, q in zip(_arc(a, b, np.full(len(a), SEGMENT)), turned, strict=True)], axis=1
+    )
 
 
 def arcs_jacobian(displacement: Floats) -> Floats:
@@ -200,7 +224,8 @@ def arcs_jacobian(displacement: Floats) -> Floats:
 
 
 def _arc(a: Floats, b: Floats, long: Floats) -> tuple[Floats, Floats, Floats]:
-    """End of an arc of this length [m] that bends by a toward d1 and b toward d2 [rad], in the frame of its beginning."""
+    """End of an arc of this length [m] that bends by a toward d1 and b toward d2 [rad], in the frame of its
+    beginning."""
     bend = np.hypot(a, b)
     aside = 0.5 * long * np.sinc(0.5 * bend / np.pi) ** 2
     return a * aside, b * aside, long * np.sinc(bend / np.pi)

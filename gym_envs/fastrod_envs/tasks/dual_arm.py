@@ -51,24 +51,28 @@ _MASS = 0.005  # kg
 _POINTS = 5
 _SIDES = (-1.0, 1.0)
 _COLORS = ((0.5, 0.0, 0.6), (0.0, 0.45, 0.5))
-_FACING = ((math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0), (math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0))  # w x y z: d3 along x, against x
+# w x y z: d3 along x, against x
+_FACING = ((math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0), (math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0))
 _YELLOW, _GREEN, _GREY = (0.95, 0.75, 0.1), (0.1, 0.55, 0.25), (0.45, 0.47, 0.5)
 
 
 @final
 class DualArm(HostedTask):
-    """Pass a ball from one soft robot to the other, which brings it to a goal that the first one cannot reach.
+    """Pass a ball from one soft robot to the other, which brings it to a goal that the first one cannot
+    reach.
 
-    Two robots of two segments look at each other along x. The head of the first holds the ball at the start, by suction; that of the
-    second takes hold of it where it touches it and its grip is on. An action is the velocity of both tips along x, y, z (up to
-    0.1 m/s, by damped resolved rates) and both grips, on above 0. A head that is pulled 4 mm from where it holds lets go. Start, 0.2 rad
-    of each segment either way, and goal, 20 x 60 x 50 mm either way around (60, 0, 300) mm, differ from episode to episode; `difficulty`
-    scales both.
+    Two robots of two segments look at each other along x. The head of the first holds the ball at the start,
+    by suction; that of the second takes hold of it where it touches it and its grip is on. An action is the
+    velocity of both tips along x, y, z (up to
+    0.1 m/s, by damped resolved rates) and both grips, on above 0. A head that is pulled 4 mm from where it
+    holds lets go. Start, 0.2 rad of each segment either way, and goal, 20 x 60 x 50 mm either way around (60,
+    0, 300) mm, differ from episode to episode; `difficulty` scales both.
 
-    Distance: from ball to goal [m]. Success: below 10 mm, with the second robot alone holding it. Reward, each step: 0.2 exp(-g / 0.05 m),
-    g from the second head to the ball; 0.3 while the second alone holds it; 0.5 exp(-d / 0.05 m) meanwhile, d the distance; 1 for
-    success; -1 where the ball falls or the robots touch each other, which end the episode. Otherwise it has 40 steps of 0.1 s. The ball's
-    weight does not bend the robots. Baseline: both to the middle, the second from its side; then on, off, to the goal.
+    Distance: from ball to goal [m]. Success: below 10 mm, with the second robot alone holding it. Reward,
+    each step: 0.2 exp(-g / 0.05 m), g from the second head to the ball; 0.3 while the second alone holds it;
+    0.5 exp(-d / 0.05 m) meanwhile, d the distance; 1 for success; -1 where the ball falls or the robots touch
+    each other, which end the episode. Otherwise it has 40 steps of 0.1 s. The ball's weight does not bend the
+    robots. Baseline: both to the middle, the second from its side; then on, off, to the goal.
     """
 
     name = "DualArm"
@@ -81,22 +85,52 @@ class DualArm(HostedTask):
         grips = Field("grips", "", (-1.0, -1.0), (1.0, 1.0), "of both heads, on above 0")
         low, high = tips_range()
         if options.action == "rate":
-            moves = Field("velocity", "m/s", (-SPEED,) * 6, (SPEED,) * 6, "of the first tip and of the second, world")
+            moves = Field(
+                "velocity", "m/s", (-SPEED,) * 6, (SPEED,) * 6, "of the first tip and of the second, world"
+            )
         else:
-            moves = Field("tips", "m", tuple(low.ravel()), tuple(high.ravel()), f"where both go, at most with {SPEED:g} m/s, world")
+            moves = Field(
+                "tips",
+                "m",
+                tuple(low.ravel()),
+                tuple(high.ravel()),
+                f"where both go, at most with {SPEED:g} m/s, world",
+            )
         far = tuple(np.tile([-BASE, -0.3, HEIGHT - 0.3], 2)), tuple(np.tile([BASE, 0.3, HEIGHT + 0.3], 2))
         near = (-NEAR,) * 3, (NEAR,) * 3
-        goals = (Field("goal", "m", tuple(np.subtract(GOAL, SPREAD)), tuple(np.add(GOAL, SPREAD)), "where the ball is to be, world"),)
+        goals = (
+            Field(
+                "goal",
+                "m",
+                tuple(np.subtract(GOAL, SPREAD)),
+                tuple(np.add(GOAL, SPREAD)),
+                "where the ball is to be, world",
+            ),
+        )
         states = (
             *goals,
             Field("ball", "m", far[0][:3], far[1][:3], "its middle, world"),
             Field("tips", "m", *far, "of the first robot and of the second, world"),
             Field("directions", "", (-1.0,) * 6, (1.0,) * 6, "of both tips' tangents, world"),
-            Field("to_ball", "m", *near, f"from the second tip to the ball's middle, at most {NEAR:g} m of it"),
+            Field(
+                "to_ball", "m", *near, f"from the second tip to the ball's middle, at most {NEAR:g} m of it"
+            ),
             Field("to_goal", "m", *near, f"from ball to goal, at most {NEAR:g} m of it"),
             Field("gap", "m", (-NEAR,), (NEAR,), f"between the second head and the ball, at most {NEAR:g} m"),
-            Field("grips", "", (0.0,) * 4, (1.0,) * 4, "the first and the second told to hold; the first and the second hold the ball"),
-            Field("posture", "", (-1.0,) * 12, (1.0,) * 12, "extensions and displacements of both, from their least to their largest"),
+            Field(
+                "grips",
+                "",
+                (0.0,) * 4,
+                (1.0,) * 4,
+                "the first and the second told to hold; the first and the second hold the ball",
+            ),
+            Field(
+                "posture",
+                "",
+                (-1.0,) * 12,
+                (1.0,) * 12,
+                "extensions and displacements of both, from their least to their largest",
+            ),
         )
         robot = soft_robot("passer", 2, extension=EXTENSION, line_density=0.03)
         super().__init__(n_envs, options, robot, (moves, grips), states, goals)
@@ -124,18 +158,29 @@ class _Pair(Cell):
         robot = task.base_robot
         self.softs = [
             SoftArm(
-                robot, dt=task.dt / self.n_parts, points_per_segment=_POINTS, largest_bend=LARGEST_BEND, bend_rate=BEND_RATE,
+                robot,
+                dt=task.dt / self.n_parts,
+                points_per_segment=_POINTS,
+                largest_bend=LARGEST_BEND,
+                bend_rate=BEND_RATE,
                 extension_rate=EXTENSION_RATE,
             )
             for _ in _SIDES
-        ]  # fmt: skip
-        self.bases = [np.array([side * BASE, 0.0, HEIGHT, *facing]) for side, facing in zip(_SIDES, _FACING, strict=True)]
-        self.bodies = [RodBodies(self.shown, robot.length, RADIUS, 2 * _POINTS, color=(*color, 1.0)) for color in _COLORS]
+        ]
+        self.bases = [
+            np.array([side * BASE, 0.0, HEIGHT, *facing])
+            for side, facing in zip(_SIDES, _FACING, strict=True)
+        ]
+        self.bodies = [
+            RodBodies(self.shown, robot.length, RADIUS, 2 * _POINTS, color=(*color, 1.0)) for color in _COLORS
+        ]
         self.shown_ball, self.shown_heads = _furnish(self.shown)
         b = self.shown
         mark = b.createVisualShape(b.GEOM_SPHERE, radius=0.006, rgbaColor=[*_GREEN, 1.0])
         self.mark: int = b.createMultiBody(0.0, -1, mark)
-        mount = b.createVisualShape(b.GEOM_BOX, halfExtents=[0.02, 0.04, 0.5 * HEIGHT + 0.02], rgbaColor=[*_GREY, 1.0])
+        mount = b.createVisualShape(
+            b.GEOM_BOX, halfExtents=[0.02, 0.04, 0.5 * HEIGHT + 0.02], rgbaColor=[*_GREY, 1.0]
+        )
         for side in _SIDES:
             b.createMultiBody(0.0, -1, mount, [side * (BASE + 0.02), 0.0, 0.5 * HEIGHT])
 
@@ -192,23 +237,45 @@ class _Pair(Cell):
         success = passed and distance < self.accuracy and not contact
         return Result(
             terms={
-                "meet": 0.2 * math.exp(-max(self._gap, 0.0) / 0.05), "pass": 0.3 if passed else 0.0,
-                "goal": 0.5 * math.exp(-distance / 0.05) if passed else 0.0, "success": 1.0 if success else 0.0,
+                "meet": 0.2 * math.exp(-max(self._gap, 0.0) / 0.05),
+                "pass": 0.3 if passed else 0.0,
+                "goal": 0.5 * math.exp(-distance / 0.05) if passed else 0.0,
+                "success": 1.0 if success else 0.0,
                 "failure": -1.0 if contact or fell else 0.0,
             },
-            distance=distance, success=success, position=self.place.copy(), desired=self.goal_at.copy(), terminated=contact or fell,
-            contact=contact, facts={"first_holds": float(self.held[0]), "second_holds": float(self.held[1]), "apart": self._apart},
-        )  # fmt: skip
+            distance=distance,
+            success=success,
+            position=self.place.copy(),
+            desired=self.goal_at.copy(),
+            terminated=contact or fell,
+            contact=contact,
+            facts={
+                "first_holds": float(self.held[0]),
+                "second_holds": float(self.held[1]),
+                "apart": self._apart,
+            },
+        )
 
     def state(self) -> Floats:
         first, second = self.softs
         low, high = np.array([-BASE, -0.3, HEIGHT - 0.3]), np.array([BASE, 0.3, HEIGHT + 0.3])
-        return np.concatenate([
-            self.goal_at, np.clip(self.place, low, high), np.clip(first.tip, low, high), np.clip(second.tip, low, high),
-            first.tip_rotation[:, 2], second.tip_rotation[:, 2],
-            short(self.place - second.tip, NEAR), short(self.goal_at - self.place, NEAR),
-            [min(max(self._gap, -NEAR), NEAR)], self.told, self.held, first.posture(), second.posture(),
-        ])  # fmt: skip
+        return np.concatenate(
+            [
+                self.goal_at,
+                np.clip(self.place, low, high),
+                np.clip(first.tip, low, high),
+                np.clip(second.tip, low, high),
+                first.tip_rotation[:, 2],
+                second.tip_rotation[:, 2],
+                short(self.place - second.tip, NEAR),
+                short(self.goal_at - self.place, NEAR),
+                [min(max(self._gap, -NEAR), NEAR)],
+                self.told,
+                self.held,
+                first.posture(),
+                second.posture(),
+            ]
+        )
 
     def goal(self) -> Floats:
         return self.goal_at
@@ -236,14 +303,21 @@ class _Pair(Cell):
 
     def scenery(self) -> Scenery:
         return Scenery(
-            tubes=tuple(Tube(soft.nodes, RADIUS, color) for soft, color in zip(self.softs, _COLORS, strict=True)),
+            tubes=tuple(
+                Tube(soft.nodes, RADIUS, color) for soft, color in zip(self.softs, _COLORS, strict=True)
+            ),
             balls=(
-                Ball(self.goal_at, 0.006, _GREEN), Ball(self.place, BALL, _YELLOW),
+                Ball(self.goal_at, 0.006, _GREEN),
+                Ball(self.place, BALL, _YELLOW),
                 *(Ball(soft.tip, _HEAD, (0.0, 0.0, 0.75)) for soft in self.softs),
             ),
-            solids=tuple(solid_box([side * (BASE + 0.02), 0.0, 0.5 * HEIGHT], [0.02, 0.04, 0.5 * HEIGHT + 0.02], _GREY) for side in _SIDES),
-            eye=(0.1, -0.75, 0.5), target=(0.0, 0.0, 0.28),
-        )  # fmt: skip
+            solids=tuple(
+                solid_box([side * (BASE + 0.02), 0.0, 0.5 * HEIGHT], [0.02, 0.04, 0.5 * HEIGHT + 0.02], _GREY)
+                for side in _SIDES
+            ),
+            eye=(0.1, -0.75, 0.5),
+            target=(0.0, 0.0, 0.28),
+        )
 
     def picture(self, width: int, height: int) -> np.ndarray:
         b = self.shown
@@ -297,13 +371,18 @@ class _Pair(Cell):
         """Where the ball is, and how far the robots are from each other."""
         self.place = np.array(self.world.getBasePositionAndOrientation(self.ball)[0])
         self._gap = float(np.linalg.norm(self.place - self.softs[1].tip)) - _HOLD
-        between = np.linalg.norm(self.softs[0].nodes[:, None] - self.softs[1].nodes[None], axis=2) - 2.0 * RADIUS
+        between = (
+            np.linalg.norm(self.softs[0].nodes[:, None] - self.softs[1].nodes[None], axis=2) - 2.0 * RADIUS
+        )
         between[-1] -= _HEAD - RADIUS
         between[:, -1] -= _HEAD - RADIUS
         self._apart = float(between.min())
 
     def _fell(self) -> bool:
-        return bool(self.place[2] < HEIGHT - _FALLEN) or float(np.abs(self.place - [0.0, 0.0, HEIGHT]).max()) > BASE
+        return (
+            bool(self.place[2] < HEIGHT - _FALLEN)
+            or float(np.abs(self.place - [0.0, 0.0, HEIGHT]).max()) > BASE
+        )
 
     def _over(self) -> bool:
         return self._apart < 0.0 or self._fell()

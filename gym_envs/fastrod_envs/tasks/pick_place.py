@@ -1,4 +1,5 @@
-"""PickPlace: a UR5 with a soft robot picks a cube from a table and puts it on a spot, by suction or with two fingers."""
+"""PickPlace: a UR5 with a soft robot picks a cube from a table and puts it on a spot, by suction or with two
+fingers."""
 
 from __future__ import annotations
 
@@ -41,7 +42,8 @@ BEND, START_BEND = 0.8, 0.3
 REST = 0.02
 """Largest speed of a cube that rests [m/s]."""
 LIFT, PRESS = 0.06, 0.006
-"""Of the baseline: how high it lifts the cube, and how far below a place it aims, so that it gets there [m]."""
+"""Of the baseline: how high it lifts the cube, and how far below a place it aims, so that it gets there
+[m]."""
 NEAR = 0.05
 """Errors are observed up to this length [m]."""
 _HEAD = RADIUS + 0.0025  # m
@@ -50,7 +52,8 @@ _HIGH = 0.16  # m, of the tip's range above that
 _RANGE = ((0.36, 0.64), (-0.26, 0.26))  # m, of the tip in x and y
 _PART, _DT = 0.05, 0.01  # s, longest step of arm and soft robot, of the world
 _MASS, _TABLE = 0.05, ((0.5, 0.0, TOP - 0.01), (0.2, 0.32, 0.01))  # kg; middle and half size
-_DOWN = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # world_from_tip without weight; it bends toward d1, world -y
+# world_from_tip without weight; it bends toward d1, world -y
+_DOWN = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _ELBOW_UP = (0.3, -1.5, 1.5, -1.5, -1.57, 0.3)  # rad
 _ORANGE, _WOOD, _GREEN, _BODY = (0.9, 0.45, 0.1), (0.8, 0.72, 0.6), (0.1, 0.55, 0.25), (0.5, 0.0, 0.6)
 _POINTS = 5
@@ -73,16 +76,19 @@ class PickPlaceOptions(Options):
 class PickPlace(HostedTask):
     """Pick a cube from a table and put it on a spot, with a soft robot on a UR5.
 
-    An action is what an operator gives: velocity of the tip along x, y, z (up to 0.25 m/s), rate of the soft robot's bend (up to
-    1 rad/s), and the grip, on above 0. The UR5's joints follow by resolved rates, so that the tip moves as told while the soft robot
-    bends and looks down; the robot's own weight, which arm and operator do not reckon with, moves it aside by some millimetres.
-    The tip stays above a cube that lies on the table. Cube and spot differ from episode to episode by 8 cm in x and 7 cm in y each
-    way, and the bend at the start by 0.3 rad; with `difficulty` from 1 to 0 both come to the middle, 8 cm apart.
+    An action is what an operator gives: velocity of the tip along x, y, z (up to 0.25 m/s), rate of the soft
+    robot's bend (up to
+    1 rad/s), and the grip, on above 0. The UR5's joints follow by resolved rates, so that the tip moves as
+    told while the soft robot bends and looks down; the robot's own weight, which arm and operator do not
+    reckon with, moves it aside by some millimetres. The tip stays above a cube that lies on the table. Cube
+    and spot differ from episode to episode by 8 cm in x and 7 cm in y each way, and the bend at the start by
+    0.3 rad; with `difficulty` from 1 to 0 both come to the middle, 8 cm apart.
 
-    Distance: of the cube's middle from where it is to lie [m]. Success: below 20 mm, released, slower than 0.02 m/s. Reward, each
-    step: 0.2 exp(-g / 0.05 m), g from the tip to where it grasps the cube, or 0.2 once the cube is held or lies on the spot; 0.3
-    while it is held or lies there; 0.5 exp(-d / 0.1 m) - 0.5 exp(-d0 / 0.1 m), d the distance, d0 that at the start; 1 for success; -1
-    where the cube falls from the table, which ends the episode. Otherwise it has 60 steps of 0.1 s. The cube does not bend the soft robot.
+    Distance: of the cube's middle from where it is to lie [m]. Success: below 20 mm, released, slower than
+    0.02 m/s. Reward, each step: 0.2 exp(-g / 0.05 m), g from the tip to where it grasps the cube, or 0.2 once
+    the cube is held or lies on the spot; 0.3 while it is held or lies there; 0.5 exp(-d / 0.1 m) - 0.5
+    exp(-d0 / 0.1 m), d the distance, d0 that at the start; 1 for success; -1 where the cube falls from the
+    table, which ends the episode. Otherwise it has 60 steps of 0.1 s. The cube does not bend the soft robot.
     Baseline: down where it is above the cube, up, across, down where the cube is above the spot, off.
     """
 
@@ -100,13 +106,19 @@ class PickPlace(HostedTask):
         if options.action == "rate":
             actions = (
                 Field("velocity", "m/s", (-SPEED,) * 3, (SPEED,) * 3, "of the tip, world"),
-                Field("bend_rate", "rad/s", (-BEND_RATE,), (BEND_RATE,), "of the soft robot"), grip,
-            )  # fmt: skip
+                Field("bend_rate", "rad/s", (-BEND_RATE,), (BEND_RATE,), "of the soft robot"),
+                grip,
+            )
         else:
             actions = (
-                Field("tip", "m", tuple(low), tuple(high), f"where it goes, at most with {SPEED:g} m/s, world"),
-                Field("bend", "rad", (-BEND,), (BEND,), f"of the soft robot, at most with {BEND_RATE:g} rad/s"), grip,
-            )  # fmt: skip
+                Field(
+                    "tip", "m", tuple(low), tuple(high), f"where it goes, at most with {SPEED:g} m/s, world"
+                ),
+                Field(
+                    "bend", "rad", (-BEND,), (BEND,), f"of the soft robot, at most with {BEND_RATE:g} rad/s"
+                ),
+                grip,
+            )
         corners = (SPOT[0] - SPREAD[0], NEAREST, TOP), (SPOT[0] + SPREAD[0], SPOT[1] + SPREAD[1], TOP + SIDE)
         near, ones = ((-NEAR,) * 3, (NEAR,) * 3), ((-1.0,) * 3, (1.0,) * 3)
         goals = (Field("spot", "m", *corners, "where the cube's middle is to be, world"),)
@@ -115,10 +127,18 @@ class PickPlace(HostedTask):
             Field("cube", "m", *_cube_range(), "its middle, world"),
             Field("tip", "m", tuple(low - 0.1), tuple(high + 0.1), "world"),
             Field("direction", "", *ones, "of the tip's tangent, world"),
-            Field("to_cube", "m", *near, f"from the tip to where it grasps the cube, at most {NEAR:g} m of it"),
+            Field(
+                "to_cube", "m", *near, f"from the tip to where it grasps the cube, at most {NEAR:g} m of it"
+            ),
             Field("to_spot", "m", *near, f"from the cube to the spot, at most {NEAR:g} m of it"),
             Field("bend", "rad", (-BEND,), (BEND,), "as driven"),
-            Field("grip", "", (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), "told to hold; opening of the fingers, 0 closed; the cube is held"),
+            Field(
+                "grip",
+                "",
+                (0.0, 0.0, 0.0),
+                (1.0, 1.0, 1.0),
+                "told to hold; opening of the fingers, 0 closed; the cube is held",
+            ),
         )
         super().__init__(n_envs, options, soft_robot("picker", 2, line_density=0.03), actions, states, goals)
 
@@ -129,7 +149,9 @@ class PickPlace(HostedTask):
 def tip_range(grip: Grip) -> tuple[Floats, Floats]:
     """(3,) least and largest place of the tip, world [m]."""
     least = TOP + SIDE + _HEAD + _ABOVE[grip]
-    return np.array([_RANGE[0][0], _RANGE[1][0], least]), np.array([_RANGE[0][1], _RANGE[1][1], least + _HIGH])
+    return np.array([_RANGE[0][0], _RANGE[1][0], least]), np.array(
+        [_RANGE[0][1], _RANGE[1][1], least + _HIGH]
+    )
 
 
 def _cube_range() -> tuple[tuple[float, float, float], tuple[float, float, float]]:
@@ -138,10 +160,15 @@ def _cube_range() -> tuple[tuple[float, float, float], tuple[float, float, float
 
 
 class _Table(Cell):
-    """Two worlds: one of table, cube and gripper, made anew for every episode, and one with the arm, for its kinematics and pictures."""
+    """Two worlds: one of table, cube and gripper, made anew for every episode, and one with the arm, for its
+    kinematics and pictures."""
 
     def __init__(self, task: PickPlace) -> None:
-        self.grip, self.at_once, self.accuracy = task.grip, task.options.action == "displacement", task.accuracy
+        self.grip, self.at_once, self.accuracy = (
+            task.grip,
+            task.options.action == "displacement",
+            task.accuracy,
+        )
         self.n_parts = max(1, math.ceil(task.dt / _PART - 1e-9))
         self.n_steps = max(1, math.ceil(task.dt / self.n_parts / _DT - 1e-9))
         self.step = task.dt / (self.n_parts * self.n_steps)
@@ -152,17 +179,31 @@ class _Table(Cell):
         self.shown = connect()
         self.arm = BulletArm.load(self.shown, ur5_path(), tip="tool0")
         self.home = self.arm.solve(_flange(np.array(HOME), 0.0, task.base_robot.length), _ELBOW_UP)
-        self.bracket = Bracket(BulletLink(self.shown, self.arm.body, self.arm.tip), [((0.0, 0.0, 0.0), (0.0, 0.0, ADAPTER))], RADIUS)
+        self.bracket = Bracket(
+            BulletLink(self.shown, self.arm.body, self.arm.tip),
+            [((0.0, 0.0, 0.0), (0.0, 0.0, ADAPTER))],
+            RADIUS,
+        )
         robot = task.base_robot
         self.soft = SoftArm(
-            robot, dt=task.dt / self.n_parts, points_per_segment=_POINTS, largest_bend=0.5 * BEND, bend_rate=BEND_RATE, extension_rate=0.01
+            robot,
+            dt=task.dt / self.n_parts,
+            points_per_segment=_POINTS,
+            largest_bend=0.5 * BEND,
+            bend_rate=BEND_RATE,
+            extension_rate=0.01,
         )
         self.bodies = RodBodies(self.shown, robot.length, RADIUS, 2 * _POINTS, color=(*_BODY, 1.0))
         self.shown_cube, self.shown_spot, self.shown_gripper = _furnish(self.shown, self.width)
 
     def begin(self, draws: Floats, difficulty: float, robot: Robot | None) -> None:
         off = difficulty * (2.0 * draws[:4].reshape(2, 2) - 1.0) * SPREAD
-        side = np.array([[CUBE[0], -NEAREST + difficulty * (CUBE[1] + NEAREST)], [SPOT[0], NEAREST + difficulty * (SPOT[1] - NEAREST)]])
+        side = np.array(
+            [
+                [CUBE[0], -NEAREST + difficulty * (CUBE[1] + NEAREST)],
+                [SPOT[0], NEAREST + difficulty * (SPOT[1] - NEAREST)],
+            ]
+        )
         (start, spot), z = side + off, TOP + 0.5 * SIDE
         self.spot = np.array([*spot, z])
         self.bend = START_BEND * difficulty * (2.0 * float(draws[4]) - 1.0)
@@ -183,7 +224,10 @@ class _Table(Cell):
 
     def act(self, action: Floats, duration: float) -> None:
         velocity, bend_rate, part = SPEED * action[:3], BEND_RATE * float(action[3]), duration / self.n_parts
-        to, bend = 0.5 * (self.low + self.high) + 0.5 * (self.high - self.low) * action[:3], BEND * float(action[3])
+        to, bend = (
+            0.5 * (self.low + self.high) + 0.5 * (self.high - self.low) * action[:3],
+            BEND * float(action[3]),
+        )
         self._tell(bool(action[4] > 0.0))
         for _ in range(self.n_parts):
             if self.at_once:
@@ -199,23 +243,35 @@ class _Table(Cell):
         success = there and not self.held and not self.told and self.speed < REST
         return Result(
             terms={
-                "reach": 0.2 if self.held or there else 0.2 * math.exp(-grasp / 0.05), "hold": 0.3 if self.held or there else 0.0,
-                "place": 0.5 * (math.exp(-distance / 0.1) - math.exp(-self._first / 0.1)), "success": 1.0 if success else 0.0,
+                "reach": 0.2 if self.held or there else 0.2 * math.exp(-grasp / 0.05),
+                "hold": 0.3 if self.held or there else 0.0,
+                "place": 0.5 * (math.exp(-distance / 0.1) - math.exp(-self._first / 0.1)),
+                "success": 1.0 if success else 0.0,
                 "fall": -1.0 if fell else 0.0,
             },
-            distance=distance, success=success, position=self.place.copy(), desired=self.spot.copy(), terminated=fell,
+            distance=distance,
+            success=success,
+            position=self.place.copy(),
+            desired=self.spot.copy(),
+            terminated=fell,
             facts={"held": float(self.held), "speed": self.speed},
-        )  # fmt: skip
+        )
 
     def state(self) -> Floats:
         soft = self.soft
         low, high = _cube_range()
         opening = min(max(self.gripper.width / self.width, 0.0), 1.0) if self.width else float(not self.told)
-        return np.concatenate([
-            self.spot, np.clip(self.place, low, high), np.clip(soft.tip, self.low - 0.1, self.high + 0.1), soft.tip_rotation[:, 2],
-            short(self.place + self.above - soft.tip, NEAR), short(self.spot - self.place, NEAR),
-            [self.bend, self.told, opening, self.held],
-        ])  # fmt: skip
+        return np.concatenate(
+            [
+                self.spot,
+                np.clip(self.place, low, high),
+                np.clip(soft.tip, self.low - 0.1, self.high + 0.1),
+                soft.tip_rotation[:, 2],
+                short(self.place + self.above - soft.tip, NEAR),
+                short(self.spot - self.place, NEAR),
+                [self.bend, self.told, opening, self.held],
+            ]
+        )
 
     def goal(self) -> Floats:
         return self.spot
@@ -236,7 +292,9 @@ class _Table(Cell):
             off, high = float(np.hypot(way[0], way[1])), -float(way[2])
             want = min(LIFT, 3.0 * max(0.0, off - 0.004))
             velocity = np.array([way[0], way[1], want - PRESS - high])
-            grip = min(0.006 - off, 0.004 - high) / 0.002 if self.width else min(0.03 - off, 0.04 - high) / 0.01
+            grip = (
+                min(0.006 - off, 0.004 - high) / 0.002 if self.width else min(0.03 - off, 0.04 - high) / 0.01
+            )
         grip = min(max(grip, -1.0), 1.0)
         velocity = np.clip(4.0 * velocity, -SPEED, SPEED)
         bend_rate = min(max(-2.0 * self.bend, -BEND_RATE), BEND_RATE)
@@ -253,16 +311,24 @@ class _Table(Cell):
         for finger in self.gripper.fingers:
             side = self.world.getJointState(self.gripper.body, finger)[0] * (1.0 if finger == 0 else -1.0)
             half = np.array([0.003, 0.01, 0.5 * self.gripper.reach])
-            solids.append(solid_box(self.soft.tip + rotation @ [side, 0.0, half[2]], half, (0.25, 0.25, 0.28), rotation))
+            solids.append(
+                solid_box(self.soft.tip + rotation @ [side, 0.0, half[2]], half, (0.25, 0.25, 0.28), rotation)
+            )
         return Scenery(
             tubes=(Tube(self.soft.nodes, RADIUS, _BODY), arm_tube(self.arm)),
             balls=(Ball(self.spot, 0.01, _GREEN), Ball(self.soft.tip, _HEAD, (0.0, 0.0, 0.75))),
-            solids=tuple(solids), eye=(1.3, -0.7, 0.75), target=(0.4, 0.0, 0.25),
-        )  # fmt: skip
+            solids=tuple(solids),
+            eye=(1.3, -0.7, 0.75),
+            target=(0.4, 0.0, 0.25),
+        )
 
     def picture(self, width: int, height: int) -> np.ndarray:
         self._pose()
-        return Camera(width=width, height=height, fov=38.0).look(self.shown, (1.25, -0.65, 0.7), (0.42, 0.0, 0.27)).rgb
+        return (
+            Camera(width=width, height=height, fov=38.0)
+            .look(self.shown, (1.25, -0.65, 0.7), (0.42, 0.0, 0.27))
+            .rgb
+        )
 
     def close(self) -> None:
         self.world.disconnect()
@@ -293,7 +359,9 @@ class _Table(Cell):
     def _follow(self) -> None:
         """The joints, by resolved rates toward the flange's pose."""
         now = self.arm.frame(self.q)
-        error = np.concatenate([self.flange[:3] - now[:3], turn_between(now[None, 3:], self.flange[None, 3:])[0]])
+        error = np.concatenate(
+            [self.flange[:3] - now[:3], turn_between(now[None, 3:], self.flange[None, 3:])[0]]
+        )
         jacobian = self.arm.jacobian(self.q)
         step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + 1e-6 * np.eye(6), error)
         most = self.arm.velocity_limit * self.soft.dt
@@ -327,7 +395,9 @@ class _Table(Cell):
         self.speed = float(np.linalg.norm(b.getBaseVelocity(self.cube)[0]))
         if self.width:
             fingers = self.gripper.fingers
-            self.held = self.told and all(b.getContactPoints(self.gripper.body, self.cube, finger, -1) for finger in fingers)
+            self.held = self.told and all(
+                b.getContactPoints(self.gripper.body, self.cube, finger, -1) for finger in fingers
+            )
 
     def _pose(self) -> None:
         """The world of pictures as the other one is."""
@@ -336,18 +406,26 @@ class _Table(Cell):
         self.bracket.follow()
         self.bodies.place(self.soft.nodes, self.soft.rotations)
         b.resetBasePositionAndOrientation(self.shown_cube, self.place.tolist(), to_xyzw(self._turn).tolist())
-        b.resetBasePositionAndOrientation(self.shown_spot, [*self.spot[:2], TOP + 0.0002], [0.0, 0.0, 0.0, 1.0])
+        b.resetBasePositionAndOrientation(
+            self.shown_spot, [*self.spot[:2], TOP + 0.0002], [0.0, 0.0, 0.0, 1.0]
+        )
         self.shown_gripper.place(*self._head)
         for finger in self.gripper.fingers:
-            b.resetJointState(self.shown_gripper.body, finger, self.world.getJointState(self.gripper.body, finger)[0])
+            b.resetJointState(
+                self.shown_gripper.body, finger, self.world.getJointState(self.gripper.body, finger)[0]
+            )
 
 
 def _flange(tip: Floats, bend: float, length: float) -> Floats:
-    """(7,) pose of the flange that has the tip of the weightless soft robot of this bend and length at a point, looking down."""
+    """(7,) pose of the flange that has the tip of the weightless soft robot of this bend and length at a
+    point, looking down."""
     c, s = math.cos(bend), math.sin(bend)
     # an arc: (1 - cos b) / b and sin b / b of its length
-    x, z = (length * (1.0 - c) / bend, length * s / bend) if abs(bend) > 1e-4 else (0.5 * length * bend, length)
-    turn = _DOWN @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]).T  # world_from_flange: the rod's axes are the flange's
+    x, z = (
+        (length * (1.0 - c) / bend, length * s / bend) if abs(bend) > 1e-4 else (0.5 * length * bend, length)
+    )
+    # world_from_flange: the rod's axes are the flange's
+    turn = _DOWN @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]).T
     return np.concatenate([tip - turn @ [x, 0.0, z + ADAPTER], quaternion_from_matrix(turn[None])[0]])
 
 
@@ -359,7 +437,9 @@ def _furnish(b: Bullet, width: float) -> tuple[int, int, Gripper]:
         b.createVisualShape(b.GEOM_BOX, halfExtents=half, rgbaColor=[*_WOOD, 1.0]),
     )
     b.createMultiBody(0.0, shape, seen, middle)
-    plinth = b.createVisualShape(b.GEOM_BOX, halfExtents=[0.12, 0.22, 0.5 * TOP - 0.01], rgbaColor=[0.45, 0.47, 0.50, 1.0])
+    plinth = b.createVisualShape(
+        b.GEOM_BOX, halfExtents=[0.12, 0.22, 0.5 * TOP - 0.01], rgbaColor=[0.45, 0.47, 0.50, 1.0]
+    )
     b.createMultiBody(0.0, -1, plinth, [*middle[:2], 0.5 * TOP - 0.01])
     edge = [0.5 * SIDE] * 3
     shape, seen = (

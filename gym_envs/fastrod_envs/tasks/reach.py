@@ -31,17 +31,22 @@ class ReachOptions(Options):
     """Of Reach and ReachObstacle."""
 
     reward: Reward = "paper"
-    """`paper`: its formula; `precise`: with exp(-d / 0.01 m) on top, which still rises within the last centimetre."""
+    """`paper`: its formula; `precise`: with exp(-d / 0.01 m) on top, which still rises within the last
+    centimetre."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.reward not in get_args(Reward):
-            raise InputError(f"reward is {self.reward!r}; it must be {' or '.join(map(repr, get_args(Reward)))}.")
+            raise InputError(
+                f"reward is {self.reward!r}; it must be {' or '.join(map(repr, get_args(Reward)))}."
+            )
 
 
 def hanging_robot() -> Robot:
     """`five_segment_reacher`, from `BASE` down."""
-    return replace(load_robot("five_segment_reacher"), base_position=BASE, base_quaternion=(0.0, 1.0, 0.0, 0.0))
+    return replace(
+        load_robot("five_segment_reacher"), base_position=BASE, base_quaternion=(0.0, 1.0, 0.0, 0.0)
+    )
 
 
 class ReachTask(RodTask):
@@ -87,7 +92,10 @@ class ReachTask(RodTask):
     def rewards(self, distance: Floats) -> dict[str, Floats]:
         """The terms of both tasks, each (n_envs,), by the distances (n_envs,) from tip to goal [m]."""
         z = self.tip[:, 2]
-        terms = {"reach": np.exp(-50.0 * distance**2), "height": np.where((z < LOWEST) | (z > HIGHEST), -0.5, 0.0)}
+        terms = {
+            "reach": np.exp(-50.0 * distance**2),
+            "height": np.where((z < LOWEST) | (z > HIGHEST), -0.5, 0.0),
+        }
         if getattr(self.options, "reward", "paper") == "precise":
             terms["precise"] = np.exp(-distance / 0.01)
         return terms
@@ -97,10 +105,11 @@ class ReachTask(RodTask):
 class Reach(ReachTask):
     """Bring the tip of a five-segment robot to a goal: x, y from -0.2 to 0.2 m, z from 0.1 to 0.25 m.
 
-    The robot is 0.5 m long and hangs from (0, 0, 0.5) m. Ten bends and the extension of the last segment are driven.
-    Reward (the paper's): exp(-50 d^2), and -0.5 while the tip's z is not within 0.07 and 0.28 m; d is the tip's distance from the
-    goal [m]. `reward="precise"` adds exp(-d / 0.01 m). Success: d below 10 mm. An episode has 40 steps of 50 ms and does not end
-    before. Baseline: damped resolved rates with the simulator's Jacobian.
+    The robot is 0.5 m long and hangs from (0, 0, 0.5) m. Ten bends and the extension of the last segment are
+    driven. Reward (the paper's): exp(-50 d^2), and -0.5 while the tip's z is not within 0.07 and 0.28 m; d is
+    the tip's distance from the goal [m]. `reward="precise"` adds exp(-d / 0.01 m). Success: d below 10 mm. An
+    episode has 40 steps of 50 ms and does not end before. Baseline: damped resolved rates with the
+    simulator's Jacobian.
     """
 
     name = "Reach"
@@ -114,9 +123,15 @@ class Reach(ReachTask):
         distance = length(self.tip - self.desired)
         never = np.zeros(self.n_envs, bool)
         return Outcome(
-            terms=self.rewards(distance), distance=distance, success=(distance < self.accuracy) & ~self.lost, position=self.tip,
-            desired=self.desired.copy(), terminated=never, contact=never, lost=self.lost,
-        )  # fmt: skip
+            terms=self.rewards(distance),
+            distance=distance,
+            success=(distance < self.accuracy) & ~self.lost,
+            position=self.tip,
+            desired=self.desired.copy(),
+            terminated=never,
+            contact=never,
+            lost=self.lost,
+        )
 
     def baseline(self) -> Floats:
         return self.toward((self.desired - self.measured()) / (2.0 * self.dt))
@@ -126,8 +141,8 @@ class Reach(ReachTask):
 
 
 def drives() -> tuple[Ints, Floats, Floats]:
-    """Which (11,) of the reacher's fifteen numbers are driven, all bends and the last extension; their ranges (11, 2) [m] and largest
-    rates (11,) [m/s]."""
+    """Which (11,) of the reacher's fifteen numbers are driven, all bends and the last extension; their ranges
+    (11, 2) [m] and largest rates (11,) [m/s]."""
     driven = np.array([k for k in range(15) if k % 3 or k == 12])
     bend, extension = (-0.012, 0.012), (0.0, 0.05)
     limit = np.array([extension if k == 12 else bend for k in driven])

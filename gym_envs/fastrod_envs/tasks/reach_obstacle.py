@@ -14,19 +14,21 @@ from fastrod_envs.task import Ball, Field, Outcome, Scenery, Solid, length
 from fastrod_envs.tasks.reach import ReachTask, drives, hanging_robot
 
 BAR, SIZE = (0.0, 0.06, 0.35), (0.4, 0.02, 0.02)
-"""Middle of the bar, world [m], and its edges [m]: the paper's, but 0.06 m beside the robot's axis; the paper's robot begins in it."""
+"""Middle of the bar, world [m], and its edges [m]: the paper's, but 0.06 m beside the robot's axis; the
+paper's robot begins in it."""
 SEEN = 0.05
 """Clearance is observed up to here [m]."""
 
 
 @final
 class ReachObstacle(ReachTask):
-    """Reach (which see: robot, goals, actions) around a bar of 0.4 x 0.02 x 0.02 m along x at (0, 0.06, 0.35) m.
+    """Reach (which see: robot, goals, actions) around a bar of 0.4 x 0.02 x 0.02 m along x at (0, 0.06, 0.35)
+    m.
 
-    Reward: that of Reach, but -1 alone in the step in which the robot touches the bar; that ends the episode, and fails. Contact is
-    by geometry: the robot's surface, 12 mm around its backbone, at both ends of a step; where a robot may have gone right through the
-    bar within the step, the way between is looked at. Success: d below 10 mm without contact. 40 steps of 50 ms. Baseline: resolved
-    rates by the segments below the bar.
+    Reward: that of Reach, but -1 alone in the step in which the robot touches the bar; that ends the episode,
+    and fails. Contact is by geometry: the robot's surface, 12 mm around its backbone, at both ends of a step;
+    where a robot may have gone right through the bar within the step, the way between is looked at. Success:
+    d below 10 mm without contact. 40 steps of 50 ms. Baseline: resolved rates by the segments below the bar.
     """
 
     name = "ReachObstacle"
@@ -36,9 +38,21 @@ class ReachObstacle(ReachTask):
         driven, limit, rate = drives()
         bar = box(SIZE, name="bar", position=BAR)
         scene = ContactScene(obstacles=[bar])
-        super().__init__(n_envs, options, hanging_robot(), driven=driven, limit=limit, rate=rate, contact=scene, feel_contact=False)
+        super().__init__(
+            n_envs,
+            options,
+            hanging_robot(),
+            driven=driven,
+            limit=limit,
+            rate=rate,
+            contact=scene,
+            feel_contact=False,
+        )
         self.prepare()
-        self.states = (*self.states, Field("clearance", "m", (-SEEN,), (SEEN,), f"of the robot from the bar, at most {SEEN:g} m"))
+        self.states = (
+            *self.states,
+            Field("clearance", "m", (-SEEN,), (SEEN,), f"of the robot from the bar, at most {SEEN:g} m"),
+        )
         self._clearance: Floats = np.full(n_envs, SEEN)
         self._touches: Flags = np.zeros(n_envs, bool)
 
@@ -53,7 +67,8 @@ class ReachObstacle(ReachTask):
         gap = np.nan_to_num(self.simulator.clearance(), nan=SEEN, posinf=SEEN)
         self._touches = gap < 0.0
         moved = np.sqrt(((self.simulator.state.position - before) ** 2).sum(2).max(1))
-        jumps = (moved > SIZE[1]) & (gap + self._clearance < moved) & ~self._touches  # who may have gone through it within the step
+        # who may have gone through it within the step
+        jumps = (moved > SIZE[1]) & (gap + self._clearance < moved) & ~self._touches
         if jumps.any() and self.options.action == "rate":
             self._touches |= jumps & (self.simulator.swept_clearance(0.002, jumps) < 0.0)
         self._clearance = gap
@@ -63,10 +78,16 @@ class ReachObstacle(ReachTask):
         touches = self._touches
         terms = {name: np.where(touches, 0.0, term) for name, term in self.rewards(distance).items()}
         return Outcome(
-            terms={**terms, "contact": np.where(touches, -1.0, 0.0)}, distance=distance,
-            success=(distance < self.accuracy) & ~touches & ~self.lost, position=self.tip, desired=self.desired.copy(),
-            terminated=touches.copy(), contact=touches.copy(), lost=self.lost, facts={"clearance": self._clearance.copy()},
-        )  # fmt: skip
+            terms={**terms, "contact": np.where(touches, -1.0, 0.0)},
+            distance=distance,
+            success=(distance < self.accuracy) & ~touches & ~self.lost,
+            position=self.tip,
+            desired=self.desired.copy(),
+            terminated=touches.copy(),
+            contact=touches.copy(),
+            lost=self.lost,
+            facts={"clearance": self._clearance.copy()},
+        )
 
     def state(self) -> Floats:
         return np.concatenate([super().state(), np.clip(self._clearance, -SEEN, SEEN)[:, None]], axis=1)
@@ -77,4 +98,6 @@ class ReachObstacle(ReachTask):
 
     def scenery(self, i: int) -> Scenery:
         bar = Solid(*box_mesh(SIZE, BAR), (0.55, 0.57, 0.6))
-        return Scenery(tubes=(self.tube(i),), balls=(Ball(self.desired[i], 0.012, (0.85, 0.2, 0.15)),), solids=(bar,))
+        return Scenery(
+            tubes=(self.tube(i),), balls=(Ball(self.desired[i], 0.012, (0.85, 0.2, 0.15)),), solids=(bar,)
+        )

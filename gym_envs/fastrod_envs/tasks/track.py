@@ -31,7 +31,8 @@ MEMORY = 0.5
 DT = 0.05
 """Of a step [s]."""
 DRIVEN, LIMIT, RATE = (1, 2), ((-0.008, 0.008), (-0.008, 0.008)), (0.01, 0.01)
-"""Numbers of the robot's action (`SegmentActions`) that are driven; their least and largest [m]; their largest rate [m/s]."""
+"""Numbers of the robot's action (`SegmentActions`) that are driven; their least and largest [m]; their
+largest rate [m/s]."""
 RADIUS = 0.03
 """The surface of reach is known so far from the axis [m]."""
 
@@ -43,25 +44,40 @@ class TrackOptions(Options):
     path: Shape | Literal["any"] = "any"
     """Which path; `any` draws one for each episode."""
     reward: Reward = "paper"
-    """`paper`: exp(-500 d^2) of the distance from the path; `precise`: exp(-e / 0.5 mm) on top, e from the nearest point in reach."""
+    """`paper`: exp(-500 d^2) of the distance from the path; `precise`: exp(-e / 0.5 mm) on top, e from the
+    nearest point in reach."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.path not in (*get_args(Shape), "any"):
-            raise InputError(f"path is {self.path!r}; it must be 'any', {' or '.join(map(repr, get_args(Shape)))}.")
+            raise InputError(
+                f"path is {self.path!r}; it must be 'any', {' or '.join(map(repr, get_args(Shape)))}."
+            )
         if self.reward not in get_args(Reward):
-            raise InputError(f"reward is {self.reward!r}; it must be {' or '.join(map(repr, get_args(Reward)))}.")
+            raise InputError(
+                f"reward is {self.reward!r}; it must be {' or '.join(map(repr, get_args(Reward)))}."
+            )
 
 
 def fields(robot: Robot) -> tuple[tuple[Field, ...], tuple[Field, ...]]:
     """Parts of the goal, and of the state, as they are observed."""
     reach = 1.2 * robot.length
     box = (-reach,) * 3, (reach,) * 3
-    goals = (Field("path", "m", box[0] * 4, box[1] * 4, f"now and {', '.join(map(str, AHEAD))} s ahead, base frame"),)
+    goals = (
+        Field(
+            "path", "m", box[0] * 4, box[1] * 4, f"now and {', '.join(map(str, AHEAD))} s ahead, base frame"
+        ),
+    )
     states = (
         *goals,
         Field("tip", "m", *box, "where it is measured"),
-        Field("error", "m", (-NEAR,) * 3, (NEAR,) * 3, f"from the tip to the nearest point in reach of the path's, at most {NEAR:g} m"),
+        Field(
+            "error",
+            "m",
+            (-NEAR,) * 3,
+            (NEAR,) * 3,
+            f"from the tip to the nearest point in reach of the path's, at most {NEAR:g} m",
+        ),
         Field("before", "m", (-NEAR,) * 3, (NEAR,) * 3, "the error one step ago"),
         Field("mean", "m", (-NEAR,) * 3, (NEAR,) * 3, f"of the error, over the last {MEMORY:g} s or so"),
         Field("posture", "", (-1.0,) * 2, (1.0,) * 2, "displacements, from their least to their largest"),
@@ -90,14 +106,18 @@ class Sight:
         self._before[rows], self._mean[rows] = self._error[rows], 0.0
 
     def note(self, action: Floats, wanted: Floats, seen: Floats) -> None:
-        """A step was done: actions (n, 2), then points in reach that are wanted and measured tips (n, 3) [m]."""
+        """A step was done: actions (n, 2), then points in reach that are wanted and measured tips (n, 3)
+        [m]."""
         self._last = action
         self._before, self._error = self._error, _off(wanted, seen)
         self._mean = self._mean + DT / MEMORY * (self._error - self._mean)
 
     def state(self, goal: Floats, seen: Floats, posture: Floats) -> Floats:
-        """(n, size of the states) with the path that comes (n, 12), measured tips (n, 3) [m] and postures (n, 2)."""
-        return np.concatenate([goal, seen, self._error, self._before, self._mean, posture, self._last], axis=1)
+        """(n, size of the states) with the path that comes (n, 12), measured tips (n, 3) [m] and postures (n,
+        2)."""
+        return np.concatenate(
+            [goal, seen, self._error, self._before, self._mean, posture, self._last], axis=1
+        )
 
 
 def _off(wanted: Floats, seen: Floats) -> Floats:
@@ -107,15 +127,18 @@ def _off(wanted: Floats, seen: Floats) -> Floats:
 
 @final
 class Track(RodTask):
-    """Follow a triangle of 40 mm, a square of 25 mm or a circle of 20 mm radius with the tip of the prototype, one turn in 9 s.
+    """Follow a triangle of 40 mm, a square of 25 mm or a circle of 20 mm radius with the tip of the
+    prototype, one turn in 9 s.
 
-    Two tendon pairs and no extension reach a surface only; the paths lie in the plane of the straight robot's tip, millimetres off
-    it. Judged is what the camera measures, effects of sensing included, from 1 s on: `distance` is the mean distance of the tip from
-    the nearest point to the path that the robot can reach; `error` from the path itself, `floor` that of the nearest points, `mae` and
+    Two tendon pairs and no extension reach a surface only; the paths lie in the plane of the straight robot's
+    tip, millimetres off it. Judged is what the camera measures, effects of sensing included, from 1 s on:
+    `distance` is the mean distance of the tip from the nearest point to the path that the robot can reach;
+    `error` from the path itself, `floor` that of the nearest points, `mae` and
     `mae_floor` (3,) the same axis by axis [m].
-    Reward (the paper's): exp(-500 d^2), d from the path [m]. Success: mean distance below 0.5 mm. 200 steps of 50 ms.
-    Path, where on it the episode begins, and which way round are drawn. With `randomise="identified.toml"` the effects of an identified
-    robot act. Baseline: resolved rates to the nearest point in reach, with its velocity.
+    Reward (the paper's): exp(-500 d^2), d from the path [m]. Success: mean distance below 0.5 mm. 200 steps
+    of 50 ms. Path, where on it the episode begins, and which way round are drawn. With
+    `randomise="identified.toml"` the effects of an identified robot act. Baseline: resolved rates to the
+    nearest point in reach, with its velocity.
     """
 
     name = "Track"
@@ -135,14 +158,21 @@ class Track(RodTask):
         self._surface = ReachableSurface(self.base_robot, height=self.base_robot.length, radius=RADIUS)
         self.goals, self.states = fields(self.base_robot)
         n = n_envs
-        self._which, self._phase, self._way, self._size = np.zeros(n, np.int64), np.zeros(n), np.ones(n), np.ones(n)
+        self._which, self._phase, self._way, self._size = (
+            np.zeros(n, np.int64),
+            np.zeros(n),
+            np.ones(n),
+            np.ones(n),
+        )
         self._t = np.zeros(n)
         self._sight = Sight(n)
         self._sums, self._counted = np.zeros((n, 9)), np.zeros(n)
 
     def begin(self, rows: Ints, draws: Floats) -> None:
         self.start(rows, draws)
-        self._which[rows] = np.minimum((draws[:, 0] * len(self._names)).astype(np.int64), len(self._names) - 1)
+        self._which[rows] = np.minimum(
+            (draws[:, 0] * len(self._names)).astype(np.int64), len(self._names) - 1
+        )
         self._phase[rows] = PERIOD * draws[:, 1]
         self._way[rows] = np.where(draws[:, 2] < 0.5, 1.0, -1.0)
         self._size[rows] = self.difficulty
@@ -183,10 +213,16 @@ class Track(RodTask):
         mean = np.where(self._counted[:, None] > 0, self._sums / np.maximum(self._counted, 1)[:, None], now)
         never = np.zeros(self.n_envs, bool)
         return Outcome(
-            terms=terms, distance=mean[:, 0], success=(mean[:, 0] < self.accuracy) & ~self.lost, position=seen.copy(), desired=wanted,
-            terminated=never, contact=never, lost=self.lost,
+            terms=terms,
+            distance=mean[:, 0],
+            success=(mean[:, 0] < self.accuracy) & ~self.lost,
+            position=seen.copy(),
+            desired=wanted,
+            terminated=never,
+            contact=never,
+            lost=self.lost,
             facts={"error": mean[:, 1], "floor": mean[:, 2], "mae": mean[:, 3:6], "mae_floor": mean[:, 6:]},
-        )  # fmt: skip
+        )
 
     def state(self) -> Floats:
         return self._sight.state(self.goal(), self.measured(), self.posture())
@@ -204,5 +240,9 @@ class Track(RodTask):
         line = self._known[self._names[self._which[i]]].position(t) * [self._size[i], self._size[i], 1.0]
         now = Ball(self.path(0.0)[i], 0.0015, (0.85, 0.2, 0.15))
         return Scenery(
-            tubes=(self.tube(i),), balls=(now,), lines=(Line(line, (0.2, 0.35, 0.8)),), eye=(0.13, 0.13, 0.12), target=(0.0, 0.0, 0.04)
+            tubes=(self.tube(i),),
+            balls=(now,),
+            lines=(Line(line, (0.2, 0.35, 0.8)),),
+            eye=(0.13, 0.13, 0.12),
+            target=(0.0, 0.0, 0.04),
         )

@@ -28,7 +28,8 @@ STIFFNESS = 1e-3
 OFFSET = 0.0015
 """Of the tendons from the backbone [m]."""
 STRAIGHT, TURN, ANGLE = 0.015, 0.07, math.radians(60.0)
-"""The tube: length before the turn [m], radius of the turn of its middle [m], and by how much it turns [rad]."""
+"""The tube: length before the turn [m], radius of the turn of its middle [m], and by how much it turns
+[rad]."""
 LUMEN, WALL = 0.0055, 0.003
 """Radius inside, and thickness [m]."""
 FLARE, MOUTH = 0.006, 0.012
@@ -42,7 +43,8 @@ SHALLOWEST, DEEPEST = 0.03, 0.07
 ASIDE = 0.0025
 """The rod's axis misses the mouth's middle by up to so much in x and in y [m]."""
 LAG = 0.006
-"""The baseline bends a segment as the tube does so far behind its end: one that is half in the turn bends outside of it too [m]."""
+"""The baseline bends a segment as the tube does so far behind its end: one that is half in the turn bends
+outside of it too [m]."""
 GAIN = 20.0
 """Of the baseline: bend of the outer segment per distance of the tip from the tube's middle [rad/m]."""
 NEAR = 0.05
@@ -68,7 +70,10 @@ def thin_robot() -> Robot:
             bending_stiffness=(STIFFNESS, STIFFNESS),
             torsional_stiffness=STIFFNESS,
             body_radius=BODY,
-            tendons=tuple(Tendon(offset=OFFSET, angle=2.0 * math.pi * (j / 3 + k / 6), compliance=1e-5) for j in range(3)),
+            tendons=tuple(
+                Tendon(offset=OFFSET, angle=2.0 * math.pi * (j / 3 + k / 6), compliance=1e-5)
+                for j in range(3)
+            ),
         )
         for k in range(2)
     )
@@ -77,22 +82,27 @@ def thin_robot() -> Robot:
 
 @final
 class TubeInsert(Task):
-    """Feed a rod of two bending segments into a curved tube until its tip is at a given depth, and do not press on the wall.
+    """Feed a rod of two bending segments into a curved tube until its tip is at a given depth, and do not
+    press on the wall.
 
-    The tube stands still: the middle of its mouth is the origin, it runs along z for 15 mm and then turns by 60 degrees toward x on
-    a radius of 70 mm. It is 11 mm wide inside, the rod 4 mm; nothing rubs. The base moves along z (feed, up to 0.02 m/s), and each of
-    the two segments of 40 mm bends both ways (0.8 rad at most, 0.4 rad/s). Drawn for every episode: the goal's depth along the tube's
-    middle, 30 to 70 mm; the roll of robot and base about z, any; and by how much the rod's axis misses the mouth's middle, up to 2.5
-    mm in x and in y. What is observed and done is in the robot's own axes, seen from the mouth's middle; of the contacts only the wrench at
-    the base is felt. F is the sum of the sizes of all forces on the wall.
+    The tube stands still: the middle of its mouth is the origin, it runs along z for 15 mm and then turns by
+    60 degrees toward x on a radius of 70 mm. It is 11 mm wide inside, the rod 4 mm; nothing rubs. The base
+    moves along z (feed, up to 0.02 m/s), and each of the two segments of 40 mm bends both ways (0.8 rad at
+    most, 0.4 rad/s). Drawn for every episode: the goal's depth along the tube's middle, 30 to 70 mm; the roll
+    of robot and base about z, any; and by how much the rod's axis misses the mouth's middle, up to 2.5 mm in
+    x and in y. What is observed and done is in the robot's own axes, seen from the mouth's middle; of the
+    contacts only the wrench at the base is felt. F is the sum of the sizes of all forces on the wall.
 
-    Reward a step: exp(-d / 0.02 m), d the tip's distance from the goal [m]; -(F - 0.3 N) / 0.3 N, at most -1, where F is beyond
-    0.3 N; -10 where it is beyond 0.6 N, which ends the episode, failed. Success: d below 5 mm, and F never beyond 0.3 N in the
-    episode. An episode has 50 steps of 100 ms, and may end before by force, or when a robot's shape was not found 5 times in a
-    row (it stays where it was; from the third time on it settles anew, if it is in the tube then). With
-    difficulty 0 the goal is 30 mm deep, the rod is in the middle and not rolled.
-    `action="displacement"` goes there in 16 equal parts, one after the other. Baseline: each segment bent as the tube is at its
-    place, the outer one also against the tip's distance from the middle; constant feed that slows down over the last 10 mm.
+    Reward a step: exp(-d / 0.02 m), d the tip's distance from the goal [m]; -(F - 0.3 N) / 0.3 N, at most -1,
+    where F is beyond
+    0.3 N; -10 where it is beyond 0.6 N, which ends the episode, failed. Success: d below 5 mm, and F never
+    beyond 0.3 N in the episode. An episode has 50 steps of 100 ms, and may end before by force, or when a
+    robot's shape was not found 5 times in a row (it stays where it was; from the third time on it settles
+    anew, if it is in the tube then). With difficulty 0 the goal is 30 mm deep, the rod is in the middle and
+    not rolled.
+    `action="displacement"` goes there in 16 equal parts, one after the other. Baseline: each segment bent as
+    the tube is at its place, the outer one also against the tip's distance from the middle; constant feed
+    that slows down over the last 10 mm.
     """
 
     name = "TubeInsert"
@@ -106,16 +116,23 @@ class TubeInsert(Task):
         self._random = Randomisation.of(options.randomise)
         self.base_robot = thin_robot() if self._random is None else self._random.base(thin_robot())
         if abs(self.base_robot.length - 2.0 * SEGMENT) > 1e-9:
-            raise InputError(f"robot {self.base_robot.name!r} is {self.base_robot.length:g} m long; TubeInsert's is {2.0 * SEGMENT:g} m.")
+            raise InputError(
+                f"robot {self.base_robot.name!r} is {self.base_robot.length:g} m long; "
+                f"TubeInsert's is {2.0 * SEGMENT:g} m."
+            )
         self._varies = self._random is not None and self._random.n_draws > 0
         if self._varies and self._random is not None:
             self.total_draws = self.n_draws + self._random.n_draws
         wires = SegmentActions(self.base_robot).matrix[: self.base_robot.n_tendons]
         self._wires = wires[:, list(_BENDS)]
         self.simulator = Simulator(
-            [self.base_robot] * n_envs if self._varies else self.base_robot, n_robots=n_envs, dt=self.dt, points_per_segment=10,
-            threads=options.threads, contact=ContactScene(obstacles=[mesh(tube_mesh(), name="tube")], max_passes=250),
-        )  # fmt: skip
+            [self.base_robot] * n_envs if self._varies else self.base_robot,
+            n_robots=n_envs,
+            dt=self.dt,
+            points_per_segment=10,
+            threads=options.threads,
+            contact=ContactScene(obstacles=[mesh(tube_mesh(), name="tube")], max_passes=250),
+        )
         self._parts()
         self.displacement: Floats = np.zeros((n_envs, 5))
         """(n_envs, 5) of the wires, two a segment, and the feed [m]."""
@@ -147,29 +164,73 @@ class TubeInsert(Task):
         low, high = (-RATE, RATE) if rate else LIMIT.T
         unit, word = ("m/s", "rate of the ") if rate else ("m", "")
         self.actions = (
-            Field("displacement", unit, tuple(low[:4]), tuple(high[:4]), f"{word}displacements (1a, 1b, 2a, 2b: toward d1, d2)"),
+            Field(
+                "displacement",
+                unit,
+                tuple(low[:4]),
+                tuple(high[:4]),
+                f"{word}displacements (1a, 1b, 2a, 2b: toward d1, d2)",
+            ),
             Field("feed", unit, tuple(low[4:]), tuple(high[4:]), f"{word}base along z"),
         )
         one, two, three = (1.0,), (1.0,) * 2, (1.0,) * 3
         far = tuple(0.2 * v for v in three)
         self.goals = (
-            Field("depth", "m", (SHALLOWEST,), (DEEPEST,), "where the tip is to be, along the tube's middle from its mouth"),
+            Field(
+                "depth",
+                "m",
+                (SHALLOWEST,),
+                (DEEPEST,),
+                "where the tip is to be, along the tube's middle from its mouth",
+            ),
             Field("turn", "", tuple(-v for v in two), two, "where the tube turns to, toward d1 and d2"),
-            Field("aside", "m", (-2.0 * ASIDE,) * 2, (2.0 * ASIDE,) * 2, "of the rod's axis from the mouth's middle, along d1 and d2"),
+            Field(
+                "aside",
+                "m",
+                (-2.0 * ASIDE,) * 2,
+                (2.0 * ASIDE,) * 2,
+                "of the rod's axis from the mouth's middle, along d1 and d2",
+            ),
         )
         self.states = (
             *self.goals,
-            Field("tip", "m", tuple(-v for v in far), far, "where it is measured, from the mouth's middle, robot's axes"),
+            Field(
+                "tip",
+                "m",
+                tuple(-v for v in far),
+                far,
+                "where it is measured, from the mouth's middle, robot's axes",
+            ),
             Field("direction", "", tuple(-v for v in three), three, "of the tip's tangent, robot's axes"),
-            Field("error", "m", (-NEAR,) * 3, (NEAR,) * 3, f"from tip to goal, at most {NEAR:g} m of it, robot's axes"),
+            Field(
+                "error",
+                "m",
+                (-NEAR,) * 3,
+                (NEAR,) * 3,
+                f"from tip to goal, at most {NEAR:g} m of it, robot's axes",
+            ),
             Field("station", "m", (-0.2,), (0.2,), "depth of the tip along the tube's middle"),
             Field(
-                "away", "m", (-NEAR,) * 2, (NEAR,) * 2, "of the tip from the tube's middle: in the plane of the turn, outward, and across"
+                "away",
+                "m",
+                (-NEAR,) * 2,
+                (NEAR,) * 2,
+                "of the tip from the tube's middle: in the plane of the turn, outward, and across",
             ),
-            Field("force", "N", (-2.0 * FORCE,) * 3, (2.0 * FORCE,) * 3, "on the base, robot's axes, at most so much"),
+            Field(
+                "force",
+                "N",
+                (-2.0 * FORCE,) * 3,
+                (2.0 * FORCE,) * 3,
+                "on the base, robot's axes, at most so much",
+            ),
             Field("moment", "N m", (-0.1,) * 3, (0.1,) * 3, "on the base, robot's axes, at most so much"),
             Field(
-                "posture", "", (-1.0,) * 4 + tuple(-v for v in one), (1.0,) * 5, "displacements and feed, from their least to their largest"
+                "posture",
+                "",
+                (-1.0,) * 4 + tuple(-v for v in one),
+                (1.0,) * 5,
+                "displacements and feed, from their least to their largest",
             ),
         )
 
@@ -248,10 +309,20 @@ class TubeInsert(Task):
             "fail": np.where(beyond, -10.0, 0.0),
         }
         return Outcome(
-            terms=terms, distance=d, success=(d < self.accuracy) & (self.largest <= FORCE) & ~self.lost, position=self.tip.copy(),
-            desired=desired, terminated=beyond, contact=self.force > FORCE, lost=self.lost,
-            facts={"force": self.force.copy(), "largest_force": self.largest.copy(), "failed": self.failed.astype(float)},
-        )  # fmt: skip
+            terms=terms,
+            distance=d,
+            success=(d < self.accuracy) & (self.largest <= FORCE) & ~self.lost,
+            position=self.tip.copy(),
+            desired=desired,
+            terminated=beyond,
+            contact=self.force > FORCE,
+            lost=self.lost,
+            facts={
+                "force": self.force.copy(),
+                "largest_force": self.largest.copy(),
+                "failed": self.failed.astype(float),
+            },
+        )
 
     def state(self) -> Floats:
         seen = self.measured()
@@ -259,7 +330,9 @@ class TubeInsert(Task):
         error = shortened(middle(self.depth) - seen, NEAR)
         own = [self._own(v) for v in (seen, self.direction, error)]
         felt = [self._own(self.wrench[:, :3]), self._own(self.wrench[:, 3:])]
-        return np.concatenate([self.goal(), *own, np.stack([station, out, across], axis=1), *felt, self.posture()], axis=1)
+        return np.concatenate(
+            [self.goal(), *own, np.stack([station, out, across], axis=1), *felt, self.posture()], axis=1
+        )
 
     def goal(self) -> Floats:
         turn = self.roll * (1.0, -1.0)
@@ -278,7 +351,9 @@ class TubeInsert(Task):
         seen = self.simulator.measure().tip_position
         c, s = self.roll.T
         foot = self._inputs()["base_pose"][:, :3]
-        p = foot + np.stack([c * seen[:, 0] - s * seen[:, 1], s * seen[:, 0] + c * seen[:, 1], seen[:, 2]], axis=1)
+        p = foot + np.stack(
+            [c * seen[:, 0] - s * seen[:, 1], s * seen[:, 0] + c * seen[:, 1], seen[:, 2]], axis=1
+        )
         return np.where(np.isfinite(p), p, self.tip)
 
     def baseline(self) -> Floats:
@@ -291,7 +366,9 @@ class TubeInsert(Task):
         sideways = -inside * across * GAIN
         c, s = self.roll[:, 0], -self.roll[:, 1]
         bends = [c * inner, s * inner, c * inward - s * sideways, s * inward + c * sideways]
-        there = np.column_stack([OFFSET * np.stack(bends, axis=1), self.displacement[:, 4] + self.dt * RATE[4] * feed])
+        there = np.column_stack(
+            [OFFSET * np.stack(bends, axis=1), self.displacement[:, 4] + self.dt * RATE[4] * feed]
+        )
         low, high = LIMIT.T
         if self.options.action == "rate":
             return np.asarray(np.clip((there - self.displacement) / (self.dt * RATE), -1.0, 1.0))
@@ -320,14 +397,18 @@ class TubeInsert(Task):
     def _own(self, vectors: Floats) -> Floats:
         """World vectors (n_envs, 3) along the robot's axes."""
         c, s = self.roll.T
-        return np.stack([c * vectors[:, 0] + s * vectors[:, 1], c * vectors[:, 1] - s * vectors[:, 0], vectors[:, 2]], axis=1)
+        return np.stack(
+            [c * vectors[:, 0] + s * vectors[:, 1], c * vectors[:, 1] - s * vectors[:, 0], vectors[:, 2]],
+            axis=1,
+        )
 
 
 def pressed(state: State) -> Floats:
     """(n,) sum of the sizes of the forces on the wall [N]."""
     total = np.zeros(len(state.ok))
     if state.contacts is not None:
-        for k in range(state.contacts.force.shape[1]):  # one after the other: the same bits, however many the others have
+        # one after the other: the same bits, however many the others have
+        for k in range(state.contacts.force.shape[1]):
             total += np.nan_to_num(length(state.contacts.force[:, k]))
     return total
 
@@ -341,12 +422,14 @@ def middle(depth: Floats) -> Floats:
     """(n, 3) points of the tube's middle at these depths [m], straight on before and beyond."""
     angle, beyond = heading(depth), np.maximum(depth - STRAIGHT - TURN * ANGLE, 0.0)
     along = np.minimum(depth, STRAIGHT) + TURN * np.sin(angle) + beyond * math.cos(ANGLE)
-    return np.stack([TURN * (1.0 - np.cos(angle)) + beyond * math.sin(ANGLE), np.zeros(len(angle)), along], axis=1)
+    return np.stack(
+        [TURN * (1.0 - np.cos(angle)) + beyond * math.sin(ANGLE), np.zeros(len(angle)), along], axis=1
+    )
 
 
 def place(points: Floats) -> tuple[Floats, Floats, Floats]:
-    """Depth along the tube's middle of points (n, 3), and how far they are from it: in the plane of the turn, away from the turn's
-    centre, and across, along y; each (n,) [m]."""
+    """Depth along the tube's middle of points (n, 3), and how far they are from it: in the plane of the turn,
+    away from the turn's centre, and across, along y; each (n,) [m]."""
     x, z = points[:, 0] - TURN, points[:, 2] - STRAIGHT
     turned = np.clip(np.arctan2(np.maximum(z, 0.0), -x), 0.0, ANGLE)
     c, s = np.cos(turned), np.sin(turned)
@@ -355,7 +438,8 @@ def place(points: Floats) -> tuple[Floats, Floats, Floats]:
 
 @lru_cache(maxsize=1)
 def tube_mesh() -> tuple[Floats, Ints]:
-    """(n_vertices, 3) [m] and (n_faces, 3) of the tube's wall, watertight, counter-clockwise seen from outside; do not write to them."""
+    """(n_vertices, 3) [m] and (n_faces, 3) of the tube's wall, watertight, counter-clockwise seen from
+    outside; do not write to them."""
     end = STRAIGHT + TURN * ANGLE
     round_ = np.linspace(0.0, 0.5 * np.pi, _FILLET)  # the mouth is rounded, for no edge to stand into the way
     depth = np.concatenate([MOUTH * (1.0 - np.cos(round_)), np.linspace(STRAIGHT, end, _RINGS)])

@@ -48,14 +48,20 @@ class _Look(Stage):
         self.actions = SegmentActions(self.robot)
         self.camera = Camera(width=96, height=96, fov=80.0, near=0.01, far=2.0)
         self.rod = MountedRod(
-            self.robot, self.mount, touch=self.walls, points_per_segment=8, capsules_per_segment=8,
-            color=(0.9, 0.55, 0.15, 1.0), head_color=(0.15, 0.15, 0.2, 1.0),
-        )  # fmt: skip
+            self.robot,
+            self.mount,
+            touch=self.walls,
+            points_per_segment=8,
+            capsules_per_segment=8,
+            color=(0.9, 0.55, 0.15, 1.0),
+            head_color=(0.15, 0.15, 0.2, 1.0),
+        )
         self.rods = (self.rod,)
         self.rod.settle(**self.bends(0.0, 0.0))
 
     def bends(self, over: float, aside: float) -> WireInputs:
-        """`over` from 0 (straight) to 1 (the tip looks down), `aside` to the left [rad]; the same in every segment."""
+        """`over` from 0 (straight) to 1 (the tip looks down), `aside` to the left [rad]; the same in every
+        segment."""
         n = self.robot.n_segments
         action = np.zeros(self.actions.n_actions)
         action[0::3] = STRETCH * over
@@ -70,14 +76,20 @@ class _Look(Stage):
         """Of the camera in the tip, which looks along the neck; d1 is up in it."""
         state = self.rod.state
         assert state is not None
-        turn, eye = state.tip_rotation[0], state.tip_position[0] + (RADIUS + 0.002) * state.tip_rotation[0, :, 2]
+        turn, eye = (
+            state.tip_rotation[0],
+            state.tip_position[0] + (RADIUS + 0.002) * state.tip_rotation[0, :, 2],
+        )
         return self.camera.look(self.world, eye, eye + turn[:, 2], turn[:, 0])
 
 
 def _script(part: float) -> tuple[float, float]:
-    """Bend over the wall in the first two fifths of the run, look to both sides, and go back in the last two fifths."""
+    """Bend over the wall in the first two fifths of the run, look to both sides, and go back in the last two
+    fifths."""
     over = min(1.0, 2.5 * part, 2.5 * (1.0 - part))
-    return 0.5 - 0.5 * math.cos(math.pi * max(over, 0.0)), SWAY * math.sin(2.0 * math.pi * min(max(5.0 * (part - 0.4), 0.0), 1.0))
+    return 0.5 - 0.5 * math.cos(math.pi * max(over, 0.0)), SWAY * math.sin(
+        2.0 * math.pi * min(max(5.0 * (part - 0.4), 0.0), 1.0)
+    )
 
 
 def _box(world: Bullet) -> list[int]:
@@ -87,7 +99,9 @@ def _box(world: Bullet) -> list[int]:
         size = [WALL / 2, WIDTH / 2 + WALL, HEIGHT / 2] if x else [WIDTH / 2, WALL / 2, HEIGHT / 2]
         shape = world.createCollisionShape(world.GEOM_BOX, halfExtents=size)
         picture = world.createVisualShape(world.GEOM_BOX, halfExtents=size, rgbaColor=[0.55, 0.6, 0.68, 1.0])
-        walls.append(int(world.createMultiBody(0.0, shape, picture, [MIDDLE[0] + x, MIDDLE[1] + y, HEIGHT / 2])))
+        walls.append(
+            int(world.createMultiBody(0.0, shape, picture, [MIDDLE[0] + x, MIDDLE[1] + y, HEIGHT / 2]))
+        )
     return walls
 
 
@@ -107,7 +121,9 @@ class NeckLook(HostedScene):
     """Unitree A1 with a neck of four segments and a camera in its tip."""
 
     name = "neck_look"
-    about = "A Unitree A1 bends its four-segment neck over the wall of a box and looks into every corner of it."
+    about = (
+        "A Unitree A1 bends its four-segment neck over the wall of a box and looks into every corner of it."
+    )
     dt = 0.01
     duration = 4.0
 
@@ -119,7 +135,14 @@ class NeckLook(HostedScene):
         world, rod = stage.world, stage.rod
         stood = np.array(world.getBasePositionAndOrientation(stage.mount.body)[0])
         outside = self._look(stage, Seen(np.zeros(4, np.int64), 0.0))
-        seen, clearance, force, gave, lowest, weighed = Seen(np.zeros(4, np.int64), 0.0), math.inf, 0.0, 0.0, math.inf, 0.0
+        seen, clearance, force, gave, lowest, weighed = (
+            Seen(np.zeros(4, np.int64), 0.0),
+            math.inf,
+            0.0,
+            0.0,
+            math.inf,
+            0.0,
+        )
         for t in self.play(stage):
             state = rod.state
             assert state is not None
@@ -128,14 +151,25 @@ class NeckLook(HostedScene):
             clearance = min(clearance, float(state.contacts.clearance[0]))
             force = max(force, float(np.linalg.norm(state.contacts.total_force[0])))
             weighed = max(weighed, abs(float(rod.wrench[2]) + 0.4 * float(state.arclength[0, -1]) * 9.81))
-            gave = max(gave, float(np.linalg.norm(world.getBasePositionAndOrientation(stage.mount.body)[0] - stood)))
+            gave = max(
+                gave, float(np.linalg.norm(world.getBasePositionAndOrientation(stage.mount.body)[0] - stood))
+            )
             lowest = min(lowest, float(state.tip_position[0, 2]))
             if 0.4 <= t / self.duration <= 0.6 and round(t / self.dt) % 5 == 0:
                 seen = self._look(stage, seen)
-        self.expect(bool((outside.pixels == 0).all()), f"from outside {int((outside.pixels > 0).sum())} of the corners can be seen.")
+        self.expect(
+            bool((outside.pixels == 0).all()),
+            f"from outside {int((outside.pixels > 0).sum())} of the corners can be seen.",
+        )
         count = int((seen.pixels >= PIXELS).sum())
-        self.expect(count == len(CORNERS), f"{count} of {len(CORNERS)} corners were seen; pixels of each: {seen.pixels.tolist()}.")
-        self.expect(seen.depth_error < 0.02, f"the depth picture is {seen.depth_error:.3g} m off a marker; it is 0.015 m in radius.")
+        self.expect(
+            count == len(CORNERS),
+            f"{count} of {len(CORNERS)} corners were seen; pixels of each: {seen.pixels.tolist()}.",
+        )
+        self.expect(
+            seen.depth_error < 0.02,
+            f"the depth picture is {seen.depth_error:.3g} m off a marker; it is 0.015 m in radius.",
+        )
         self.expect(clearance > 0.0, f"the neck touches the box; clearance {clearance:.3g} m.")
         self.expect(lowest < HEIGHT, f"the tip comes down to {lowest:.3g} m; the wall is {HEIGHT:g} m high.")
         self.expect(weighed < 1e-6, f"the trunk feels {weighed:.3g} N more or less than the neck's weight.")
@@ -158,6 +192,11 @@ class NeckLook(HostedScene):
         for marker, count in zip(stage.markers, counts, strict=True):
             if count >= PIXELS:
                 eye = state.tip_position[0] + (RADIUS + 0.002) * state.tip_rotation[0, :, 2]
-                ahead = float((np.array(stage.world.getBasePositionAndOrientation(marker)[0]) - eye) @ state.tip_rotation[0, :, 2])
-                error = max(error, abs(float(np.median(picture.depth[picture.segmentation == marker])) - ahead))
+                ahead = float(
+                    (np.array(stage.world.getBasePositionAndOrientation(marker)[0]) - eye)
+                    @ state.tip_rotation[0, :, 2]
+                )
+                error = max(
+                    error, abs(float(np.median(picture.depth[picture.segmentation == marker])) - ahead)
+                )
         return Seen(np.maximum(so_far.pixels, counts), error)

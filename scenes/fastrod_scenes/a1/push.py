@@ -26,8 +26,8 @@ STRETCH = 0.024
 RATE = 2.0
 """omega of its gait [rad/s]."""
 FOLLOWS = 0.1
-"""How far the cube's speed may be off the tip's while it is pushed (rms), of the tip's largest: the tip slides up the cube as it
-swings."""
+"""How far the cube's speed may be off the tip's while it is pushed (rms), of the tip's largest: the tip
+slides up the cube as it swings."""
 LAUNCH = 1.3
 """Largest speed of the cube, of the tip's."""
 STANDS = 0.02
@@ -42,7 +42,14 @@ class _Push(Stage):
         self.mount = mount
         self.robot = robot = neck(3, STRETCH)
         self.actions = SegmentActions(robot)
-        self.rod = MountedRod(robot, mount, touch=[self.cube], points_per_segment=8, capsules_per_segment=8, color=(0.9, 0.55, 0.15, 1.0))
+        self.rod = MountedRod(
+            robot,
+            mount,
+            touch=[self.cube],
+            points_per_segment=8,
+            capsules_per_segment=8,
+            color=(0.9, 0.55, 0.15, 1.0),
+        )
         self.rods = (self.rod,)
         self.rod.settle(**self.gait(0.0))
 
@@ -72,7 +79,10 @@ class NeckPush(HostedScene):
     """Unitree A1 with a neck of three segments that swings as sin(omega t)."""
 
     name = "neck_push"
-    about = "A Unitree A1 swings its three-segment neck as sin(w t) and pushes a cube over the floor, which its legs feel."
+    about = (
+        "A Unitree A1 swings its three-segment neck as sin(w t) and pushes a cube over the floor, which "
+        "its legs feel."
+    )
     dt = 0.005
     duration = 2.0 * math.pi / RATE
 
@@ -103,18 +113,40 @@ class NeckPush(HostedScene):
             before = velocity
             tips.append(state.tip_position[0])
             if len(tips) > 1:
-                speeds.append((float(velocity[0]), float(tips[-1][0] - tips[-2][0]) / self.dt, bool(state.contacts.count[0])))
-            gave = max(gave, float(np.linalg.norm(world.getBasePositionAndOrientation(stage.mount.body)[0] - stood)))
+                speeds.append(
+                    (
+                        float(velocity[0]),
+                        float(tips[-1][0] - tips[-2][0]) / self.dt,
+                        bool(state.contacts.count[0]),
+                    )
+                )
+            gave = max(
+                gave, float(np.linalg.norm(world.getBasePositionAndOrientation(stage.mount.body)[0] - stood))
+            )
             depth = max(depth, float(np.nan_to_num(-state.contacts.gap, nan=0.0).max(initial=0.0)))
             moved = world.getBasePositionAndOrientation(cube)[0][0] - start[0]
         own, tip, touching = (np.array(column) for column in zip(*speeds, strict=True))
         pressing = touching & (tip > 0.2 * tip.max())
-        self.expect(moved > SIZE, f"the cube moved {moved:.3g} m; the neck is to push it farther than it is wide.")
-        self.expect(balance < 1e-6, f"the trunk feels {balance:.3g} N more or less than the neck's weight and what pushes the cube.")
-        self.expect(momentum < 1e-6, f"the cube's momentum changes by {momentum:.3g} N s beside the impulses of neck, floor and weight.")
-        self.expect(pressing.sum() * self.dt > 0.3, f"the neck pushes for {pressing.sum() * self.dt:.3g} s only.")
+        self.expect(
+            moved > SIZE, f"the cube moved {moved:.3g} m; the neck is to push it farther than it is wide."
+        )
+        self.expect(
+            balance < 1e-6,
+            f"the trunk feels {balance:.3g} N more or less than the neck's weight and what pushes the cube.",
+        )
+        self.expect(
+            momentum < 1e-6,
+            f"the cube's momentum changes by {momentum:.3g} N s beside the "
+            "impulses of neck, floor and weight.",
+        )
+        self.expect(
+            pressing.sum() * self.dt > 0.3, f"the neck pushes for {pressing.sum() * self.dt:.3g} s only."
+        )
         follows = float(np.sqrt(np.mean((own - tip)[pressing] ** 2)) / tip.max())
-        self.expect(follows < FOLLOWS, f"the cube's speed differs by {100 * follows:.3g} % (rms) of the tip's largest from the tip's.")
+        self.expect(
+            follows < FOLLOWS,
+            f"the cube's speed differs by {100 * follows:.3g} % (rms) of the tip's largest from the tip's.",
+        )
         launch = float(own.max() / tip.max())
         self.expect(launch < LAUNCH, f"the cube moves {launch:.3g} times as fast as the tip ever does.")
         self.expect(gave < STANDS, f"the trunk gave way by {gave:.3g} m.")
@@ -131,9 +163,17 @@ class NeckPush(HostedScene):
 
 
 def _floor_force(world: Bullet, body: int) -> NDArray[np.float64]:
-    """(3,) of all contacts on a body in the last step, world [N]; PyBullet reports friction as it acts on the other body."""
+    """(3,) of all contacts on a body in the last step, world [N]; PyBullet reports friction as it acts on the
+    other body."""
     total = np.zeros(3)
     for contact in world.getContactPoints(bodyA=body):
-        normal, size, first, along, second, across = contact[7], contact[9], contact[10], contact[11], contact[12], contact[13]
+        normal, size, first, along, second, across = (
+            contact[7],
+            contact[9],
+            contact[10],
+            contact[11],
+            contact[12],
+            contact[13],
+        )
         total += size * np.array(normal) - first * np.array(along) - second * np.array(across)
     return total

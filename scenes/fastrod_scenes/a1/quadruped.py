@@ -22,12 +22,18 @@ _REST = 200  # steps until it stands still on its own
 
 
 def neck(n_segments: int, stretch: float = 0.0) -> Robot:
-    """Segments of 0.1 m that stretch by up to `stretch` [m], 0.4 kg/m, stiff enough to push 50 g over a floor."""
+    """Segments of 0.1 m that stretch by up to `stretch` [m], 0.4 kg/m, stiff enough to push 50 g over a
+    floor."""
     wires = tuple(Tendon(offset=OFFSET, angle=0.5 * math.pi * k, compliance=1e-6) for k in range(4))
     segment = Segment(
-        length=0.1, extension=(0.0, stretch), bending_stiffness=(0.05, 0.05), torsional_stiffness=0.03,
-        body_radius=RADIUS, line_density=0.4, tendons=wires,
-    )  # fmt: skip
+        length=0.1,
+        extension=(0.0, stretch),
+        bending_stiffness=(0.05, 0.05),
+        torsional_stiffness=0.03,
+        body_radius=RADIUS,
+        line_density=0.4,
+        tendons=wires,
+    )
     return Robot(name=f"neck of {n_segments}", segments=(segment,) * n_segments)
 
 
@@ -42,8 +48,8 @@ def floor(world: Bullet) -> int:
 
 
 def standing(dt: float, pitch: float) -> tuple[Bullet, BulletLink]:
-    """A world with an A1 that stands in it, and the mount of its neck, which points `pitch` above forward [rad]; its d1 is up from there,
-    its d2 to the right."""
+    """A world with an A1 that stands in it, and the mount of its neck, which points `pitch` above forward
+    [rad]; its d1 is up from there, its d2 to the right."""
     world = connect(dt=dt)
     import pybullet_data  # comes with PyBullet, which `connect` asks for in a sentence
 
@@ -55,9 +61,12 @@ def standing(dt: float, pitch: float) -> tuple[Bullet, BulletLink]:
             continue
         angle = next(a for part, a in _STANCE.items() if part in name.decode())
         world.resetJointState(body, j, angle)
-        world.setJointMotorControl2(body, j, world.POSITION_CONTROL, angle, force=33.5, positionGain=0.5, velocityGain=1.0)
+        world.setJointMotorControl2(
+            body, j, world.POSITION_CONTROL, angle, force=33.5, positionGain=0.5, velocityGain=1.0
+        )
     for _ in range(_REST):
         world.stepSimulation()
     c, s = math.cos(pitch), math.sin(pitch)
-    axes = np.array([[-s, 0.0, c], [0.0, -1.0, 0.0], [c, 0.0, s]])  # d1, d2, d3 in the trunk's frame, as columns
+    # d1, d2, d3 in the trunk's frame, as columns
+    axes = np.array([[-s, 0.0, c], [0.0, -1.0, 0.0], [c, 0.0, s]])
     return world, BulletLink(world, body, -1, position=MOUNT, quaternion=quaternion_from_matrix(axes))

@@ -27,10 +27,11 @@ OFFSET = 0.0015
 OUTSIDE, INSIDE = -0.005, 0.09
 """Depth of the fed length, at first and at last, along z from the entry [m]."""
 LAG = 0.0063
-"""A segment bends as the airway does so far behind its end: a segment that is half in a turn bends outside of it too [m]."""
+"""A segment bends as the airway does so far behind its end: a segment that is half in a turn bends outside of
+it too [m]."""
 FACET = 1.5e-4
-"""How far the mesh may stand into the smooth lumen [m]: a cell of 1.8 mm on a curve of 6 mm gives 0.07 mm, its shifted vertices
-as much."""
+"""How far the mesh may stand into the smooth lumen [m]: a cell of 1.8 mm on a curve of 6 mm gives 0.07 mm,
+its shifted vertices as much."""
 LARGEST = 0.05
 """Force of the wall that a bronchus takes without harm, at one place [N]."""
 
@@ -57,16 +58,22 @@ def _inside(state: State, robot: int) -> NDArray[np.float64]:
 
 @final
 class Airway(RodScene):
-    """Two robots, each in a world of its own: the first is steered left, the second right. The feed is straight, along z."""
+    """Two robots, each in a world of its own: the first is steered left, the second right. The feed is
+    straight, along z."""
 
     name = "airway"
-    about = "A thin robot is fed into a forked airway and steered into the left bronchus, its twin into the right one."
+    about = (
+        "A thin robot is fed into a forked airway and steered into the left bronchus, its twin into the "
+        "right one."
+    )
     dt = 0.01
     duration = 1.9
 
     def simulator(self) -> Simulator:
         obstacle = mesh(airway(), name="airway", friction=0.1)
-        return Simulator(_robot(), n_robots=len(BRANCHES), dt=self.dt, contact=ContactScene(obstacles=[obstacle]))
+        return Simulator(
+            _robot(), n_robots=len(BRANCHES), dt=self.dt, contact=ContactScene(obstacles=[obstacle])
+        )
 
     def inputs(self, t: float) -> dict[str, Any]:
         robot = _robot()
@@ -75,7 +82,10 @@ class Airway(RodScene):
         angle = np.array([tendon.angle for tendon in robot.tendons])
         bend = np.array([heading(depth - robot.length + end - LAG) for end in ends])
         pull = OFFSET * bend * np.cos(angle - np.array(list(BRANCHES.values()))[:, None])
-        return {"tendon_length": ends - pull, "base_pose": (0.0, 0.0, depth - robot.length, 1.0, 0.0, 0.0, 0.0)}
+        return {
+            "tendon_length": ends - pull,
+            "base_pose": (0.0, 0.0, depth - robot.length, 1.0, 0.0, 0.0, 0.0),
+        }
 
     def check(self) -> dict[str, float]:
         figures: list[Worst] = []
@@ -85,18 +95,33 @@ class Airway(RodScene):
         for t, state in watch(self, self.run(), figures):
             contacts = contacts_of(state)
             steps, touched, passes = steps + 1, touched + (contacts.count > 0), passes + state.passes
-            largest = max(largest, float(np.linalg.norm(np.nan_to_num(contacts.force), axis=2).max(initial=0.0)))
+            largest = max(
+                largest, float(np.linalg.norm(np.nan_to_num(contacts.force), axis=2).max(initial=0.0))
+            )
             nodes = np.concatenate([_inside(state, i) for i in range(len(BRANCHES))])
             closest = max(closest, float(lumen_distance(nodes).max(initial=-math.inf)))
-            self.expect(closest < FACET - BODY, f"at {t:.3g} s the centreline comes within {-closest:.4g} m of the lumen's wall.")
+            self.expect(
+                closest < FACET - BODY,
+                f"at {t:.3g} s the centreline comes within {-closest:.4g} m of the lumen's wall.",
+            )
         self.expect(bool((touched > 0).all()), "a robot never touches the wall.")
-        self.expect(largest < LARGEST, f"the wall is pressed with {largest:.3g} N at one place, more than {LARGEST:g} N.")
-        off = [float(np.linalg.norm(middle(b, np.array([INSIDE])) - state.tip_position[i])) for i, b in enumerate(BRANCHES)]
+        self.expect(
+            largest < LARGEST,
+            f"the wall is pressed with {largest:.3g} N at one place, more than {LARGEST:g} N.",
+        )
+        off = [
+            float(np.linalg.norm(middle(b, np.array([INSIDE])) - state.tip_position[i]))
+            for i, b in enumerate(BRANCHES)
+        ]
         for branch, away in zip(BRANCHES, off, strict=True):
-            self.expect(away < RADIUS, f"the tip meant for the {branch} bronchus ends {away:.3g} m from its middle.")
+            self.expect(
+                away < RADIUS, f"the tip meant for the {branch} bronchus ends {away:.3g} m from its middle."
+            )
         most = worst(figures)
         self.expect(most.force < FORCE, f"base force and contact forces differ by {most.force:.3g} N.")
-        self.expect(most.moment < FORCE, f"base moment and that of the contacts differ by {most.moment:.3g} N m.")
+        self.expect(
+            most.moment < FORCE, f"base moment and that of the contacts differ by {most.moment:.3g} N m."
+        )
         return {
             "centreline to the lumen's wall, least, m": -closest,
             "force at one place, largest, N": largest,

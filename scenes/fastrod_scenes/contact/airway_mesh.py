@@ -1,8 +1,10 @@
-"""A branching airway made by code: a trachea that forks into two curved bronchi, as distances and as a watertight mesh.
+"""A branching airway made by code: a trachea that forks into two curved bronchi, as distances and as a
+watertight mesh.
 
-Frame: the entry lies at the origin, z runs into the trachea; lengths in metres. The lumen is the smooth union of one tube for
-each bronchus; the two share the trachea, which is wider by the smoothing. The wall is what lies between the lumen and the
-same union with a larger radius, cut off at the entry and at the bronchi's ends, where the lumen is open to the outside.
+Frame: the entry lies at the origin, z runs into the trachea; lengths in metres. The lumen is the smooth union
+of one tube for each bronchus; the two share the trachea, which is wider by the smoothing. The wall is what
+lies between the lumen and the same union with a larger radius, cut off at the entry and at the bronchi's
+ends, where the lumen is open to the outside.
 """
 
 from __future__ import annotations
@@ -32,7 +34,8 @@ RADIUS = 0.006
 WALL = 0.004
 """Thickness [m]."""
 BLEND = 0.004
-"""Distance over which the tubes melt into each other; the trachea's lumen is wider than a bronchus' by a quarter of it [m]."""
+"""Distance over which the tubes melt into each other; the trachea's lumen is wider than a bronchus' by a
+quarter of it [m]."""
 
 _SPACING = 0.002  # m between the points of a tube's polyline: it cuts a turn's corner by 8 um
 _CELL = 0.0018  # m
@@ -50,7 +53,8 @@ def heading(depth: float) -> float:
 
 
 def middle(branch: str, depth: Floats) -> Floats:
-    """(n, 3) points on the middle of the tube into `branch`, at depths (n,) along it; straight on before and beyond [m]."""
+    """(n, 3) points on the middle of the tube into `branch`, at depths (n,) along it; straight on before and
+    beyond [m]."""
     angle = np.clip((depth - TRACHEA) / TURN, 0.0, BEND)
     beyond = np.maximum(depth - TRACHEA - TURN * BEND, 0.0)
     along = np.minimum(depth, TRACHEA) + TURN * np.sin(angle) + beyond * math.cos(BEND)
@@ -69,7 +73,8 @@ def lumen_distance(points: Floats) -> Floats:
 
 @lru_cache(maxsize=1)
 def airway() -> tuple[Floats, Ints]:
-    """(n_vertices, 3) [m] and (n_faces, 3) of the wall, watertight, counter-clockwise seen from outside; do not write to them.
+    """(n_vertices, 3) [m] and (n_faces, 3) of the wall, watertight, counter-clockwise seen from outside; do
+    not write to them.
 
     >>> vertices, faces = airway()
     >>> len(vertices) - len(faces) // 2  # two handles: the three ends of one wall are open
@@ -77,7 +82,10 @@ def airway() -> tuple[Floats, Ints]:
     """
     reach = RADIUS + WALL + 2.0 * _CELL
     ends = np.concatenate([middle(branch, np.linspace(0.0, path_length(), 50)) for branch in BRANCHES])
-    axes = [np.arange(low - reach, high + reach, _CELL) for low, high in zip(ends.min(axis=0), ends.max(axis=0), strict=True)]
+    axes = [
+        np.arange(low - reach, high + reach, _CELL)
+        for low, high in zip(ends.min(axis=0), ends.max(axis=0), strict=True)
+    ]
     lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     distance = _union(lattice, before=0.05, beyond=0.05)
     wall = np.maximum(distance - RADIUS - WALL, RADIUS - distance)
@@ -93,9 +101,9 @@ def airway() -> tuple[Floats, Ints]:
 
 
 def surface(values: Floats, cell: float) -> tuple[Floats, Ints]:
-    """Zero level of `values` on a cubic lattice of edge `cell` [m] by marching tetrahedra: (n, 3) vertices, (m, 3) faces around
-    the negative side, which must not reach the lattice's border. Each cube is six tetrahedra along its diagonal, so that
-    neighbours share their edges and the surface is closed.
+    """Zero level of `values` on a cubic lattice of edge `cell` [m] by marching tetrahedra: (n, 3) vertices,
+    (m, 3) faces around the negative side, which must not reach the lattice's border. Each cube is six
+    tetrahedra along its diagonal, so that neighbours share their edges and the surface is closed.
     """
     shape = np.array(values.shape)
     stride = np.array([shape[1] * shape[2], shape[2], 1])
@@ -113,7 +121,9 @@ def surface(values: Floats, cell: float) -> tuple[Floats, Ints]:
     tetra = np.concatenate(sixth)
     below = flat[tetra] < 0.0
     edges = _crossed(tetra, below)
-    _, first, names = np.unique(np.sort(edges, axis=-1).reshape(-1, 2) @ [len(flat), 1], return_index=True, return_inverse=True)
+    _, first, names = np.unique(
+        np.sort(edges, axis=-1).reshape(-1, 2) @ [len(flat), 1], return_index=True, return_inverse=True
+    )
     start, end = np.sort(edges, axis=-1).reshape(-1, 2)[first].T
     part = np.clip(flat[start] / (flat[start] - flat[end]), _SHORTEST, 1.0 - _SHORTEST)[:, None]
     place = [np.stack(np.unravel_index(corner, tuple(shape)), axis=-1) * cell for corner in (start, end)]
@@ -121,13 +131,17 @@ def surface(values: Floats, cell: float) -> tuple[Floats, Ints]:
 
 
 def _crossed(tetra: Ints, below: NDArray[np.bool_]) -> Ints:
-    """(n_faces, 3, 2) lattice points at the ends of the edges on which each face has its corners; `tetra` right-handed."""
+    """(n_faces, 3, 2) lattice points at the ends of the edges on which each face has its corners; `tetra`
+    right-handed."""
     faces = []
     even = [p for p in permutations(range(4)) if np.linalg.det(np.eye(4)[list(p)]) > 0.0]
     for one in range(4):
         a, b, c, d = next(p for p in even if p[0] == one)
         alone = below.sum(axis=1) == 1
-        for rows, corners in ((alone & below[:, a], (b, c, d)), ((below.sum(axis=1) == 3) & ~below[:, a], (b, d, c))):
+        for rows, corners in (
+            (alone & below[:, a], (b, c, d)),
+            ((below.sum(axis=1) == 3) & ~below[:, a], (b, d, c)),
+        ):
             faces.append(np.stack([tetra[rows][:, [a, k]] for k in corners], axis=1))
     for pair in ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)):
         a, b, c, d = next(p for p in even if p[:2] == pair)
@@ -138,7 +152,8 @@ def _crossed(tetra: Ints, below: NDArray[np.bool_]) -> Ints:
 
 
 def _union(points: Floats, *, before: float, beyond: float) -> Floats:
-    """Smooth minimum of the distances of points (n, 3) to the middles of the tubes, made longer at both ends [m]."""
+    """Smooth minimum of the distances of points (n, 3) to the middles of the tubes, made longer at both ends
+    [m]."""
     depth = np.arange(-before, path_length() + beyond + _SPACING, _SPACING)
     left, right = (_to_polyline(points, middle(branch, depth)) for branch in BRANCHES)
     mixed = np.maximum(BLEND - np.abs(left - right), 0.0)

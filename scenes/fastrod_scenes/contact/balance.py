@@ -1,4 +1,5 @@
-"""What every scene with contact must obey, as figures: balance of forces and moments, and how deep anything lies in a wall."""
+"""What every scene with contact must obey, as figures: balance of forces and moments, and how deep anything
+lies in a wall."""
 
 from __future__ import annotations
 
@@ -41,12 +42,14 @@ def contacts_of(state: State) -> Contacts:
 
 
 def force_error(state: State, loads: ArrayLike = (0.0, 0.0, 0.0)) -> float:
-    """Largest component of base force - contact forces - loads, `loads` (3,) or (n_robots, 3) world, on a rod [N]."""
+    """Largest component of base force - contact forces - loads, `loads` (3,) or (n_robots, 3) world, on a rod
+    [N]."""
     return float(np.abs(state.base_wrench[:, :3] - contacts_of(state).total_force - np.asarray(loads)).max())
 
 
 def moment_error(state: State) -> float:
-    """Largest component of base moment - sum of r x F of the contacts, about the base points, where nothing else loads [N m]."""
+    """Largest component of base moment - sum of r x F of the contacts, about the base points, where nothing
+    else loads [N m]."""
     contacts = contacts_of(state)
     arm = contacts.point - state.position[:, :1]
     return float(np.abs(state.base_wrench[:, 3:] - np.nansum(np.cross(arm, contacts.force), axis=1)).max())
@@ -57,17 +60,29 @@ def rises(values: list[float]) -> bool:
     return all(a < b for a, b in pairwise(values))
 
 
-def watch(scene: Scene, run: Iterable[tuple[float, State]], figures: list[Worst]) -> Iterator[tuple[float, State]]:
-    """The run as it is, with the balance of weightless robots kept in `figures`; `SceneError` where a robot or a balance fails."""
+def watch(
+    scene: Scene, run: Iterable[tuple[float, State]], figures: list[Worst]
+) -> Iterator[tuple[float, State]]:
+    """The run as it is, with the balance of weightless robots kept in `figures`; `SceneError` where a robot
+    or a balance fails."""
     for t, state in run:
-        scene.expect(bool(state.ok.all()), f"at {t:.3g} s robot {int(np.argmin(state.ok))} is lost: {state.problems}")
+        scene.expect(
+            bool(state.ok.all()), f"at {t:.3g} s robot {int(np.argmin(state.ok))} is lost: {state.problems}"
+        )
         contacts = contacts_of(state)
         scene.expect(not contacts.deep.any(), f"at {t:.3g} s a centreline lies inside an obstacle.")
         now = Worst(
-            force_error(state), moment_error(state), float(-contacts.clearance.min()), int(state.passes.max()), int(contacts.count.max())
+            force_error(state),
+            moment_error(state),
+            float(-contacts.clearance.min()),
+            int(state.passes.max()),
+            int(contacts.count.max()),
         )
         figures.append(now)
-        scene.expect(now.depth <= DEPTH, f"at {t:.3g} s a rod lies {now.depth:.3g} m deep in something rigid, more than {DEPTH:g} m.")
+        scene.expect(
+            now.depth <= DEPTH,
+            f"at {t:.3g} s a rod lies {now.depth:.3g} m deep in something rigid, more than {DEPTH:g} m.",
+        )
         yield t, state
 
 

@@ -1,6 +1,7 @@
 """The five-segment reacher closes around a bar and grips it at three places.
 
-Straight segments, which lie on the bar, alternate with bent ones, which stand off it: a rounded triangle around the bar.
+Straight segments, which lie on the bar, alternate with bent ones, which stand off it: a rounded triangle
+around the bar.
 """
 
 from __future__ import annotations
@@ -48,12 +49,16 @@ class Bar(RodScene):
             quaternion=(math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0),
             friction=0.3,
         )
-        return Simulator(load_robot("five_segment_reacher"), dt=self.dt, contact=ContactScene(obstacles=[bar]))
+        return Simulator(
+            load_robot("five_segment_reacher"), dt=self.dt, contact=ContactScene(obstacles=[bar])
+        )
 
     def inputs(self, t: float) -> dict[str, Any]:
         robot = load_robot("five_segment_reacher")
         part = 2.0 * self.progress(t)
-        bend = np.cumsum([0.0, FIRST * min(part, 1.0), 0.0, SECOND * max(part - 1.0, 0.0), 0.0])[robot.tendon_segment]
+        bend = np.cumsum([0.0, FIRST * min(part, 1.0), 0.0, SECOND * max(part - 1.0, 0.0), 0.0])[
+            robot.tendon_segment
+        ]
         angle = np.array([tendon.angle for tendon in robot.tendons])
         return {"tendon_length": robot.rest_tendon_length - OFFSET * bend * np.cos(angle)}
 
@@ -71,7 +76,9 @@ class Bar(RodScene):
         squeeze = float(np.linalg.norm(contacts.force[0, :count], axis=1).min())
         self.expect(squeeze > 1e-3, f"one place presses with only {squeeze:.3g} N.")
         self.expect(most.force < FORCE, f"base force and contact forces differ by {most.force:.3g} N.")
-        self.expect(most.moment < FORCE, f"base moment and that of the contacts differ by {most.moment:.3g} N m.")
+        self.expect(
+            most.moment < FORCE, f"base moment and that of the contacts differ by {most.moment:.3g} N m."
+        )
         return {
             "contacts at the end": float(count),
             "least force of a contact, N": squeeze,

@@ -1,7 +1,7 @@
 """Two rods that cross at a right angle; the tendons of one press it against the other.
 
-Without friction the crossing is stable while the rods are bent by less than they are thick: the force P of two rods of radius r
-pushes them apart sidewise as a spring of stiffness -P / 2r would.
+Without friction the crossing is stable while the rods are bent by less than they are thick: the force P of
+two rods of radius r pushes them apart sidewise as a spring of stiffness -P / 2r would.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ TOUCH = 1e-7
 
 @final
 class Pair(RodScene):
-    """The first rod stands upright, the second lies along y, on the first one's side of larger x; no friction."""
+    """The first rod stands upright, the second lies along y, on the first one's side of larger x; no
+    friction."""
 
     name = "pair"
     about = "A rod bends onto another that crosses it, and the two press on each other."
@@ -70,13 +71,21 @@ class Pair(RodScene):
                 gap = max(gap, float(np.abs(contacts.gap[:, 0]).max()))
                 force.append(float(np.linalg.norm(contacts.total_force[0])))
         self.expect(len(force) > 20, f"the rods touch in {len(force)} steps only.")
-        self.expect(bool(contacts.in_contact("rod 1")[0] and contacts.in_contact("rod 0")[1]), "the rods do not name each other.")
+        self.expect(
+            bool(contacts.in_contact("rod 1")[0] and contacts.in_contact("rod 0")[1]),
+            "the rods do not name each other.",
+        )
         self.expect(rises(force), "the force between the rods does not grow with every bit of bend.")
         self.expect(reaction < 1e-12, f"what one rod does to the other and back differ by {reaction:.3g} N.")
-        self.expect(gap < TOUCH and apart < TOUCH, f"the rods press on each other {gap:.3g} m apart, at points {apart:.3g} m apart.")
+        self.expect(
+            gap < TOUCH and apart < TOUCH,
+            f"the rods press on each other {gap:.3g} m apart, at points {apart:.3g} m apart.",
+        )
         most = worst(figures)
         self.expect(most.force < FORCE, f"base forces and contact forces differ by {most.force:.3g} N.")
-        self.expect(most.moment < FORCE, f"base moments and those of the contacts differ by {most.moment:.3g} N m.")
+        self.expect(
+            most.moment < FORCE, f"base moments and those of the contacts differ by {most.moment:.3g} N m."
+        )
         return {
             "force at the end, N": force[-1],
             "action and reaction, N": reaction,

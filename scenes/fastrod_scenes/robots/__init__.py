@@ -4,7 +4,8 @@ from importlib.resources import files
 
 
 def ur5_path() -> str:
-    """Path of the UR5's URDF: joints `shoulder_pan_joint` to `wrist_3_joint`, tip link `tool0` with z out of the flange.
+    """Path of the UR5's URDF: joints `shoulder_pan_joint` to `wrist_3_joint`, tip link `tool0` with z out of
+    the flange.
 
     Its frames, zero pose and values are told in the file's first comment, with their source.
 

@@ -1,4 +1,5 @@
-"""`Box`: a closed box with one narrow entry and a coloured cube in each of its inner corners, in a PyBullet world."""
+"""`Box`: a closed box with one narrow entry and a coloured cube in each of its inner corners, in a PyBullet
+world."""
 
 from __future__ import annotations
 
@@ -12,15 +13,30 @@ from fastrod.errors import RobotError
 from fastrod.hosts import Bullet
 from fastrod.types import Floats
 
-CORNERS = tuple(f"{depth} {side} {height}" for depth, side, height in (
-    ("back", "left", "top"), ("back", "left", "bottom"), ("back", "right", "bottom"), ("back", "right", "top"),
-    ("front", "right", "top"), ("front", "right", "bottom"), ("front", "left", "bottom"), ("front", "left", "top"),
-))  # fmt: skip
+CORNERS = tuple(
+    f"{depth} {side} {height}"
+    for depth, side, height in (
+        ("back", "left", "top"),
+        ("back", "left", "bottom"),
+        ("back", "right", "bottom"),
+        ("back", "right", "top"),
+        ("front", "right", "top"),
+        ("front", "right", "bottom"),
+        ("front", "left", "bottom"),
+        ("front", "left", "top"),
+    )
+)
 """As one looks through the entry, each beside the one before it."""
 COLORS = (
-    (0.90, 0.10, 0.10), (0.10, 0.70, 0.15), (0.10, 0.25, 0.95), (0.95, 0.85, 0.05),
-    (0.85, 0.10, 0.80), (0.05, 0.80, 0.85), (1.00, 0.50, 0.00), (0.45, 0.20, 0.60),
-)  # fmt: skip
+    (0.90, 0.10, 0.10),
+    (0.10, 0.70, 0.15),
+    (0.10, 0.25, 0.95),
+    (0.95, 0.85, 0.05),
+    (0.85, 0.10, 0.80),
+    (0.05, 0.80, 0.85),
+    (1.00, 0.50, 0.00),
+    (0.45, 0.20, 0.60),
+)
 """Red, green, blue of the corners' cubes."""
 _WOOD, _PLINTH = (0.80, 0.72, 0.60, 1.0), (0.45, 0.47, 0.50, 1.0)
 
@@ -40,7 +56,8 @@ class Part(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Box:
-    """A box of thin walls on a plinth; the entry, an octagon, is in the middle of its front wall, which faces -x.
+    """A box of thin walls on a plinth; the entry, an octagon, is in the middle of its front wall, which faces
+    -x.
 
     >>> Box().corner(0).round(3).tolist()
     [1.054, 0.2, 0.625]
@@ -63,7 +80,10 @@ class Box:
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.entry < 0.5 * min(self.inner[1:]) or not self.wall > 0.0:
-            raise RobotError(f"a box with an entry of half width {self.entry!r} m and walls of {self.wall!r} m cannot be built.")
+            raise RobotError(
+                f"a box with an entry of half width {self.entry!r} m and walls of "
+                f"{self.wall!r} m cannot be built."
+            )
 
     def corner(self, k: int) -> Floats:
         """(3,) inner corner, world [m]."""
@@ -81,7 +101,9 @@ class Box:
     def off_cube(self, k: int, points: Floats) -> Floats:
         """(n,) distance of world points (n, 3) from the surface of the cube in a corner [m]."""
         beyond = np.abs(points - self.cube_at(k)) - 0.5 * self.cube
-        return np.asarray(np.abs(np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0)))
+        return np.asarray(
+            np.abs(np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0))
+        )
 
     def parts(self) -> list[Part]:
         """Walls, and the plinth below them."""
@@ -112,21 +134,30 @@ class Box:
         return parts
 
     def build(self, world: Bullet) -> tuple[int, dict[int, int]]:
-        """Body of the walls, and bodies of the cubes by the numbers of their corners; the cubes touch nothing."""
+        """Body of the walls, and bodies of the cubes by the numbers of their corners; the cubes touch
+        nothing."""
         parts = self.parts()
         half, places = [part.half for part in parts], [part.middle for part in parts]
         turns = [(math.sin(0.5 * part.turn), 0.0, 0.0, math.cos(0.5 * part.turn)) for part in parts]
         kinds = [world.GEOM_BOX] * len(parts)
         solid = world.createCollisionShapeArray(
-            shapeTypes=kinds, halfExtents=half, collisionFramePositions=places, collisionFrameOrientations=turns
+            shapeTypes=kinds,
+            halfExtents=half,
+            collisionFramePositions=places,
+            collisionFrameOrientations=turns,
         )
         seen = world.createVisualShapeArray(
-            shapeTypes=kinds, halfExtents=half, visualFramePositions=places, visualFrameOrientations=turns,
+            shapeTypes=kinds,
+            halfExtents=half,
+            visualFramePositions=places,
+            visualFrameOrientations=turns,
             rgbaColors=[part.color for part in parts],
-        )  # fmt: skip
+        )
         walls: int = world.createMultiBody(0.0, solid, seen)
         cubes = {}
         for k in self.marked:
-            shape = world.createVisualShape(world.GEOM_BOX, halfExtents=[0.5 * self.cube] * 3, rgbaColor=[*COLORS[k], 1.0])
+            shape = world.createVisualShape(
+                world.GEOM_BOX, halfExtents=[0.5 * self.cube] * 3, rgbaColor=[*COLORS[k], 1.0]
+            )
             cubes[k] = world.createMultiBody(0.0, -1, shape, self.cube_at(k).tolist())
         return walls, cubes

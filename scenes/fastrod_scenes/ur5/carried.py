@@ -1,4 +1,5 @@
-"""What a UR5 carries: soft robots of segments that bend and extend, and the bracket between flange and robots, for the eye alone."""
+"""What a UR5 carries: soft robots of segments that bend and extend, and the bracket between flange and
+robots, for the eye alone."""
 
 from __future__ import annotations
 
@@ -23,14 +24,19 @@ RADIUS = 0.012
 def soft_robot(name: str, n_segments: int, *, extension: float = 0.03, line_density: float = 0.1) -> Robot:
     """Segments of 0.1 m with four wires each; `extension` either way [m], `line_density` [kg/m].
 
-    The backbone is twice as stiff as the prototype's and four times in torsion: bent sideways, such a robot turns a softer one by
-    more than a radian with its weight.
+    The backbone is twice as stiff as the prototype's and four times in torsion: bent sideways, such a robot
+    turns a softer one by more than a radian with its weight.
     """
     wires = tuple(Tendon(offset=OFFSET, angle=k * math.pi / 2.0) for k in range(4))
     segment = Segment(
-        length=0.1, bending_stiffness=(0.005, 0.005), torsional_stiffness=0.004, body_radius=RADIUS, line_density=line_density,
-        extension=(-extension, extension), tendons=wires,
-    )  # fmt: skip
+        length=0.1,
+        bending_stiffness=(0.005, 0.005),
+        torsional_stiffness=0.004,
+        body_radius=RADIUS,
+        line_density=line_density,
+        extension=(-extension, extension),
+        tendons=wires,
+    )
     return Robot(name=name, segments=(segment,) * n_segments)
 
 
@@ -47,17 +53,22 @@ class Bracket:
         turns = [_from_z(d / np.linalg.norm(d)) for d in along]
         n = len(ends)
         shape = b.createVisualShapeArray(
-            shapeTypes=[b.GEOM_CYLINDER] * n, radii=[radius] * n, lengths=np.linalg.norm(along, axis=1).tolist(),
-            visualFramePositions=places.tolist(), visualFrameOrientations=[to_xyzw(q).tolist() for q in turns],
+            shapeTypes=[b.GEOM_CYLINDER] * n,
+            radii=[radius] * n,
+            lengths=np.linalg.norm(along, axis=1).tolist(),
+            visualFramePositions=places.tolist(),
+            visualFrameOrientations=[to_xyzw(q).tolist() for q in turns],
             rgbaColors=[[0.25, 0.26, 0.28, 1.0]] * n,
-        )  # fmt: skip
+        )
         self.body: int = b.createMultiBody(0.0, -1, shape)
         self.follow()
 
     def follow(self) -> None:
         """Be where the host is now."""
         pose = self.host.motion().pose
-        self.host.bullet.resetBasePositionAndOrientation(self.body, pose[:3].tolist(), to_xyzw(pose[3:]).tolist())
+        self.host.bullet.resetBasePositionAndOrientation(
+            self.body, pose[:3].tolist(), to_xyzw(pose[3:]).tolist()
+        )
 
 
 def _from_z(direction: Floats) -> Floats:

@@ -20,9 +20,11 @@ APART, DEEP, PRONG = 0.06, 0.04, 0.02
 TILT = math.radians(20.0)
 """Of either prong, outward [rad]."""
 FLANGE = (0.45, 0.10, 0.60, 0.0, math.sqrt(0.5), math.sqrt(0.5), 0.0)
-"""Where the UR5 holds still: position [m] and quaternion w x y z, world; the flange looks down, the fork is along y."""
+"""Where the UR5 holds still: position [m] and quaternion w x y z, world; the flange looks down, the fork is
+along y."""
 WAY = (0.0, -0.09, 0.04)
-"""From there, as the UR5 moves [m]: so slowly that a base, placed by its mount's speed, lags by less than `POSE_ERROR`."""
+"""From there, as the UR5 moves [m]: so slowly that a base, placed by its mount's speed, lags by less than
+`POSE_ERROR`."""
 TURN = 0.15
 """About the vertical, meanwhile [rad]."""
 ELBOW_UP = (0.0, -1.5, 1.6, -1.7, -1.57, 0.0)
@@ -48,7 +50,8 @@ _EVERY = 10  # steps between two looks at the clearance
 
 
 def opposite(t: float) -> tuple[Floats, Floats]:
-    """Actions (6,) of both soft robots at time t [s]: [m]. Each goes round; the second mirrors what the first does half a period later."""
+    """Actions (6,) of both soft robots at time t [s]: [m]. Each goes round; the second mirrors what the first
+    does half a period later."""
     actions = []
     for side, phase in ((1.0, 2.0 * math.pi * t / PERIOD), (-1.0, 2.0 * math.pi * t / PERIOD + math.pi)):
         round_about = OFFSET * np.outer(BENDS, [side * math.cos(phase), math.sin(phase)])
@@ -65,25 +68,35 @@ class DualArm(Stage):
 
     def __init__(self, dt: float) -> None:
         self.world = connect(dt=dt)
-        self.world.setPhysicsEngineParameter(numSolverIterations=200, solverResidualThreshold=0.0)  # the motors' rates to the last digit
+        # the motors' rates to the last digit
+        self.world.setPhysicsEngineParameter(numSolverIterations=200, solverResidualThreshold=0.0)
         self.dt = dt
         self.arm = BulletArm.load(self.world, ur5_path(), tip="tool0")
         self.q: Floats = self.arm.solve(FLANGE, ELBOW_UP)
         """(6,) joints that the UR5 is driven to [rad]."""
         self.arm.place(self.q)
         for link in range(-1, self.world.getNumJoints(self.arm.body)):  # PyBullet's own, no part of a UR5
-            self.world.changeDynamics(self.arm.body, link, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0)
+            self.world.changeDynamics(
+                self.arm.body, link, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0
+            )
         robot = soft_robot("arm", 2, extension=EXTENSION)
         self.actions = SegmentActions(robot)
         self.mounts = [self._mount(side) for side in (1.0, -1.0)]
         """Position (3,) [m] and quaternion (4,) w x y z of both bases, flange_from_base."""
-        links = [BulletLink(self.world, self.arm.body, self.arm.tip, position=m[:3], quaternion=m[3:]) for m in self.mounts]
+        links = [
+            BulletLink(self.world, self.arm.body, self.arm.tip, position=m[:3], quaternion=m[3:])
+            for m in self.mounts
+        ]
         first, second = (
-            MountedRod(robot, link, color=color) for link, color in zip(links, ((0.5, 0.0, 0.6, 1.0), (0.0, 0.45, 0.5, 1.0)), strict=True)
+            MountedRod(robot, link, color=color)
+            for link, color in zip(links, ((0.5, 0.0, 0.6, 1.0), (0.0, 0.45, 0.5, 1.0)), strict=True)
         )
         self.rods = (first, second)
         middle = np.array([0.0, 0.0, DEEP])
-        prongs = [(np.array([m[0] - math.copysign(PRONG * math.sin(TILT), m[0]), 0.0, DEEP]), m[:3]) for m in self.mounts]
+        prongs = [
+            (np.array([m[0] - math.copysign(PRONG * math.sin(TILT), m[0]), 0.0, DEEP]), m[:3])
+            for m in self.mounts
+        ]
         bars = [(np.zeros(3), middle), (prongs[0][0], prongs[1][0]), *prongs]
         self.bracket = Bracket(BulletLink(self.world, self.arm.body, self.arm.tip), bars, RADIUS)
         for rod, action in zip(self.rods, opposite(0.0), strict=True):
@@ -100,7 +113,9 @@ class DualArm(Stage):
         """(7,) pose at time t [s] that the UR5 is driven to, world."""
         part = eased((t - STILL) / MOVE)
         turn = quaternion_from_vector(np.array([0.0, 0.0, part * TURN]))
-        return np.concatenate([np.array(FLANGE[:3]) + part * np.array(WAY), product(turn, np.array(FLANGE[3:]))])
+        return np.concatenate(
+            [np.array(FLANGE[:3]) + part * np.array(WAY), product(turn, np.array(FLANGE[3:]))]
+        )
 
     def advance(self, t: float) -> None:
         """The soft robots go to `opposite` at the step's end; the UR5, from `STILL` on, to `flange` there."""
@@ -122,13 +137,14 @@ class DualArm(Stage):
         self.bracket.follow()
 
     def begin(self, t: float) -> None:
-        """Both soft robots, toward where they are at time t [s]; their wrenches act in the next step of the world."""
+        """Both soft robots, toward where they are at time t [s]; their wrenches act in the next step of the
+        world."""
         for rod, action in zip(self.rods, opposite(t), strict=True):
             rod.begin(**self.actions.inputs(action))
 
     def bases(self) -> Floats:
-        """(2,) how far either base is from its mount on the flange, as the measured joints have it: the larger of the position's error
-        [m] and of any axis's."""
+        """(2,) how far either base is from its mount on the flange, as the measured joints have it: the
+        larger of the position's error [m] and of any axis's."""
         flange = self.arm.frame(self.arm.position())
         turn = matrix_from_quaternion(flange[None, 3:])[0]
         off = np.empty(2)
@@ -136,7 +152,9 @@ class DualArm(Stage):
             assert rod.state is not None
             position, rotation = rod.state.position[0, 0], rod.state.rotation[0, 0]
             axes = turn @ matrix_from_quaternion(mount[None, 3:])[0]
-            off[k] = max(np.abs(position - flange[:3] - turn @ mount[:3]).max(), np.abs(rotation - axes).max())
+            off[k] = max(
+                np.abs(position - flange[:3] - turn @ mount[:3]).max(), np.abs(rotation - axes).max()
+            )
         return off
 
     def tips(self) -> Floats:
@@ -148,7 +166,11 @@ class DualArm(Stage):
     def weight(self) -> float:
         """Of both soft robots, as long as they are now [N]: their mass per length stays as they extend."""
         density = self.actions.robot.segments[0].line_density
-        return 9.81 * density * sum(float(rod.state.arclength[0, -1]) for rod in self.rods if rod.state is not None)
+        return (
+            9.81
+            * density
+            * sum(float(rod.state.arclength[0, -1]) for rod in self.rods if rod.state is not None)
+        )
 
     def force(self) -> Floats:
         """(3,) sum that the UR5 felt in the last step, world [N]."""
@@ -164,13 +186,19 @@ class DualArm(Stage):
         return min((float(p[8]) for points in found for p in points), default=within)
 
     def felt(self, t: float) -> tuple[Floats, Floats]:
-        """Torques (6,) that the UR5's joints feel in a step to time t [s], and those of the sum of both wrenches, J^T F [N m].
+        """Torques (6,) that the UR5's joints feel in a step to time t [s], and those of the sum of both
+        wrenches, J^T F [N m].
 
-        Felt is mass matrix times change of the joints' rates in one step, with the soft robots less without, motors off. Afterwards the
-        world is as before; the soft robots are where they are at time t, and the motors off.
+        Felt is mass matrix times change of the joints' rates in one step, with the soft robots less without,
+        motors off. Afterwards the world is as before; the soft robots are where they are at time t, and the
+        motors off.
         """
         b, arm = self.world, self.arm
-        joints = [b.getJointInfo(arm.body, j)[0] for j in range(b.getNumJoints(arm.body)) if b.getJointInfo(arm.body, j)[3] > -1]
+        joints = [
+            b.getJointInfo(arm.body, j)[0]
+            for j in range(b.getNumJoints(arm.body))
+            if b.getJointInfo(arm.body, j)[3] > -1
+        ]
         b.setJointMotorControlArray(arm.body, joints, b.VELOCITY_CONTROL, forces=[0.0] * len(joints))
         q = arm.position()
         mass = np.array(b.calculateMassMatrix(arm.body, q.tolist()))
@@ -205,8 +233,8 @@ class DualArms(HostedScene):
         return DualArm(self.dt)
 
     def check(self) -> dict[str, float]:
-        """Bases must be on their mounts, the UR5 must feel the weight of both robots and J^T F of their wrenches, the tips' paths must be
-        mirror images, and nothing may come near anything else."""
+        """Bases must be on their mounts, the UR5 must feel the weight of both robots and J^T F of their
+        wrenches, the tips' paths must be mirror images, and nothing may come near anything else."""
         stage = self.stage()
         tips: list[Floats] = []
         off = weight = torque = error = 0.0
@@ -217,8 +245,14 @@ class DualArms(HostedScene):
             weight = max(weight, float(np.abs(stage.force() + np.array([0.0, 0.0, stage.weight()])).max()))
             if k % _EVERY == 0:
                 gap, rigid = np.minimum((gap, rigid), stage.clearance()).tolist()
-                self.expect(gap > CLEARANCE, f"at {t:.3g} s the soft robots are {gap:.3g} m apart; it must be {CLEARANCE:g} m.")
-                self.expect(rigid > CLEARANCE, f"at {t:.3g} s a soft robot is {rigid:.3g} m from the UR5; it must be {CLEARANCE:g} m.")
+                self.expect(
+                    gap > CLEARANCE,
+                    f"at {t:.3g} s the soft robots are {gap:.3g} m apart; it must be {CLEARANCE:g} m.",
+                )
+                self.expect(
+                    rigid > CLEARANCE,
+                    f"at {t:.3g} s a soft robot is {rigid:.3g} m from the UR5; it must be {CLEARANCE:g} m.",
+                )
             if t <= STILL + 1e-9:
                 tips.append(stage.tips())
             if k == n:
@@ -229,8 +263,14 @@ class DualArms(HostedScene):
         mirror = float(np.abs(path[half:, 0] * [-1.0, 1.0, 1.0] - path[:-half, 1]).max())
         way = float(np.linalg.norm(np.ptp(path[:, 0], axis=0)))
         self.expect(off < POSE_ERROR, f"a base is {off:.3g} (m, or of its axes) off its mount on the flange.")
-        self.expect(weight < FORCE_ERROR, f"the sum of both forces differs by {weight:.3g} N from the weight of both soft robots.")
-        self.expect(error < WRENCH_ERROR, f"what the joints feel differs by {error:.3g} from the torques of the sum of both wrenches.")
+        self.expect(
+            weight < FORCE_ERROR,
+            f"the sum of both forces differs by {weight:.3g} N from the weight of both soft robots.",
+        )
+        self.expect(
+            error < WRENCH_ERROR,
+            f"what the joints feel differs by {error:.3g} from the torques of the sum of both wrenches.",
+        )
         self.expect(way > 0.1, f"a tip covers {way:.3g} m; it must go round.")
         self.expect(mirror < MIRROR_ERROR, f"the paths of the tips are {mirror:.3g} m off mirror images.")
         return {

@@ -35,7 +35,8 @@ EXTENSION = 0.03
 LARGEST_BEND = 1.7
 """Of a segment [rad]."""
 FORWARD, BACKWARD = (0.0, 0.3, 0.3), (-0.2, 1.2, 1.4)
-"""Bends of the segments toward a corner that roughly look at it, in the back and in the front of the box [rad]."""
+"""Bends of the segments toward a corner that roughly look at it, in the back and in the front of the box
+[rad]."""
 APPROACH, ENTER, BEND, AIM, STRAIGHTEN, LEAVE = 2.0, 3.0, 1.2, 0.8, 1.2, 2.5
 """Parts of a run; `BEND` and `AIM` for each corner [s]."""
 INSIDE = APPROACH + ENTER
@@ -62,7 +63,8 @@ class Look(NamedTuple):
 
 @final
 class Exploration(Stage):
-    """UR5, soft robot and box, and an operator who drives by the clock; where the robots start follows from the seed."""
+    """UR5, soft robot and box, and an operator who drives by the clock; where the robots start follows from
+    the seed."""
 
     arm: BulletArm
 
@@ -74,10 +76,14 @@ class Exploration(Stage):
         self.world = connect(dt=dt)
         self.walls, self.cubes = box.build(self.world)
         self.arm = BulletArm.load(self.world, ur5_path(), tip="tool0")
-        self.off = np.concatenate([rng.uniform([-0.12, -0.1, -0.1], [-0.02, 0.1, 0.1]), rng.uniform(-0.3, 0.3, 3)])
-        """(6,) of the flange at the start from where it is before the entry: [m] and rotation vector [rad], world."""
+        self.off = np.concatenate(
+            [rng.uniform([-0.12, -0.1, -0.1], [-0.02, 0.1, 0.1]), rng.uniform(-0.3, 0.3, 3)]
+        )
+        """(6,) of the flange at the start from where it is before the entry: [m] and rotation vector [rad],
+        world."""
         self.entry = rng.uniform(-1.0, 1.0, 6) * ENTRY
-        """(6,) of the flange inside from the middle of the entry, square to it: [m] and rotation vector [rad], world."""
+        """(6,) of the flange inside from the middle of the entry, square to it: [m] and rotation vector
+        [rad], world."""
         self.q: Floats = self.arm.solve(self.flange(0.0), ELBOW_UP[rng.integers(len(ELBOW_UP))])
         """(6,) joints that the UR5 is driven to [rad]."""
         self.frozen = False
@@ -93,7 +99,9 @@ class Exploration(Stage):
         self.action.reshape(3, 3)[:, 1:] = OFFSET * rng.uniform(-0.3, 0.3, (3, 2))
         self._from = self.action
         lower, upper = SoftTip(self.rod.simulator).limits(LARGEST_BEND)
-        self._aim = ResolvedRate(gain=8.0, lower=lower, upper=upper, rate=np.tile([0.03, 2.0 * OFFSET, 2.0 * OFFSET], 3))
+        self._aim = ResolvedRate(
+            gain=8.0, lower=lower, upper=upper, rate=np.tile([0.03, 2.0 * OFFSET, 2.0 * OFFSET], 3)
+        )
         self.camera = Camera(width=160, height=120, fov=70.0, near=0.005, far=2.0)
         self.looks: dict[int, Look] = {}
         """Of each corner, by its number."""
@@ -105,7 +113,12 @@ class Exploration(Stage):
         before = self.box.front - BEFORE - self.actions.robot.length - ADAPTER
         x = before + into * (self.box.front - STANDOFF - ADAPTER - before)
         off = (1.0 - start) * self.off + self.entry
-        return np.concatenate([np.array([x, 0.0, self.box.height]) + off[:3], product(quaternion_from_vector(off[3:]), np.array(INTO))])
+        return np.concatenate(
+            [
+                np.array([x, 0.0, self.box.height]) + off[:3],
+                product(quaternion_from_vector(off[3:]), np.array(INTO)),
+            ]
+        )
 
     def posture(self, corner: int) -> Floats:
         """(9,) action that bends the robot roughly toward a corner [m], without regard to its weight."""
@@ -119,8 +132,8 @@ class Exploration(Stage):
         return posture.ravel()
 
     def advance(self, t: float) -> None:
-        """What the operator does at time t [s]: approach, enter, bend toward and aim at each corner in turn, straighten, leave. After
-        each aim a picture of the corner goes into `looks`."""
+        """What the operator does at time t [s]: approach, enter, bend toward and aim at each corner in turn,
+        straighten, leave. After each aim a picture of the corner goes into `looks`."""
         end = t + self.dt
         corner, over = divmod(round((t - INSIDE) / self.dt), round((BEND + AIM) / self.dt))
         looking = 0 <= corner < len(CORNERS)
@@ -187,18 +200,24 @@ class Exploration(Stage):
         return Look(self.picture(), self._eye(), np.stack([-d1, d2, -d3], axis=1), off)
 
     def seen(self, corner: int) -> tuple[int, float]:
-        """Pixels of the picture of a corner that show its cube in its colour, and the largest distance of what they show from the cube
-        [m]: of each pixel's point, by its depth, from the cube's true surface."""
+        """Pixels of the picture of a corner that show its cube in its colour, and the largest distance of
+        what they show from the cube [m]: of each pixel's point, by its depth, from the cube's true
+        surface."""
         image, look = self.looks[corner].image, self.looks[corner]
         if corner not in self.cubes:
             return 0, 0.0
         hue = image.rgb / np.maximum(np.linalg.norm(image.rgb, axis=2, keepdims=True), 1.0)
         known = np.array(COLORS) / np.linalg.norm(COLORS, axis=1, keepdims=True)
-        rows, columns = np.nonzero((image.segmentation == self.cubes[corner]) & ((hue @ known.T).argmax(axis=2) == corner))
+        rows, columns = np.nonzero(
+            (image.segmentation == self.cubes[corner]) & ((hue @ known.T).argmax(axis=2) == corner)
+        )
         if not len(rows):
             return 0, 0.0
         pixel = 2.0 * np.tan(0.5 * np.radians(self.camera.fov)) / self.camera.height
-        x, y = pixel * (columns + 0.5 - 0.5 * self.camera.width), pixel * (0.5 * self.camera.height - rows - 0.5)
+        x, y = (
+            pixel * (columns + 0.5 - 0.5 * self.camera.width),
+            pixel * (0.5 * self.camera.height - rows - 0.5),
+        )
         rays = np.stack([x, y, -np.ones(len(x))], axis=1) @ look.rotation.T
         points = look.eye + image.depth[rows, columns][:, None] * rays
         return len(rows), float(self.box.off_cube(corner, points).max())
@@ -209,7 +228,10 @@ class Exploration(Stage):
 
     def arm_distance(self, within: float = 0.3) -> float:
         """Of the UR5's links from the box, at most `within` [m]."""
-        return min((float(p[8]) for p in self.world.getClosestPoints(self.arm.body, self.walls, within)), default=within)
+        return min(
+            (float(p[8]) for p in self.world.getClosestPoints(self.arm.body, self.walls, within)),
+            default=within,
+        )
 
     def soft_clearance(self, within: float = 0.1) -> float:
         """Of the soft robot from the box, at most `within` [m]; negative inside a wall."""

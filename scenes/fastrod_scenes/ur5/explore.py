@@ -47,7 +47,12 @@ class Explore(HostedScene):
     def check(self) -> dict[str, float]:
         """The worst of each figure of `measure` over all `runs`, of seeds one after the other."""
         every = [Explore(seed=self.seed + k, box=self.box).measure() for k in range(self.runs)]
-        smallest = ("corners seen", "pixels of a cube, least", "distance of the UR5 from the box, m", "clearance of the soft robot, m")
+        smallest = (
+            "corners seen",
+            "pixels of a cube, least",
+            "distance of the UR5 from the box, m",
+            "clearance of the soft robot, m",
+        )
         return {name: (min if name in smallest else max)(run[name] for run in every) for name in every[0]}
 
     def measure(self) -> dict[str, float]:
@@ -65,18 +70,31 @@ class Explore(HostedScene):
             if k % _EVERY == 0:
                 arm, soft = min(arm, stage.arm_distance()), min(soft, stage.soft_clearance())
                 self.expect(
-                    soft > CLEARANCE, f"at {t:.3g} s the soft robot is {soft:.3g} m from a wall; it must stay {CLEARANCE:g} m away."
+                    soft > CLEARANCE,
+                    f"at {t:.3g} s the soft robot is {soft:.3g} m from a wall; it must "
+                    f"stay {CLEARANCE:g} m away.",
                 )
-                self.expect(arm > CLEARANCE, f"at {t:.3g} s the UR5 is {arm:.3g} m from the box; it must stay {CLEARANCE:g} m away.")
+                self.expect(
+                    arm > CLEARANCE,
+                    f"at {t:.3g} s the UR5 is {arm:.3g} m from the box; it must stay {CLEARANCE:g} m away.",
+                )
             if stage.frozen:
                 held = stage.arm.position() if held is None else held
                 moved = max(moved, float(np.abs(stage.arm.position() - held).max()))
             if len(stage.looks) > seen:
                 name, look = CORNERS[seen], stage.looks[seen]
                 count, error = stage.seen(seen)
-                self.expect(count >= LEAST_PIXELS, f"the corner {name} shows in {count} pixels; it takes {LEAST_PIXELS} to be seen.")
-                self.expect(error < DEPTH_ERROR, f"by its depth, a pixel of the corner {name} is {error:.3g} m off the cube.")
-                self.expect(look.miss < MISS, f"the line of sight misses the corner {name} by {look.miss:.3g} m.")
+                self.expect(
+                    count >= LEAST_PIXELS,
+                    f"the corner {name} shows in {count} pixels; it takes {LEAST_PIXELS} to be seen.",
+                )
+                self.expect(
+                    error < DEPTH_ERROR,
+                    f"by its depth, a pixel of the corner {name} is {error:.3g} m off the cube.",
+                )
+                self.expect(
+                    look.miss < MISS, f"the line of sight misses the corner {name} by {look.miss:.3g} m."
+                )
                 off.append(look.miss)
                 depth.append(error)
                 pixels.append(count)

@@ -1,4 +1,5 @@
-"""Looking at a point with the tip of a soft robot: by how much the line of sight misses it, and how that changes with the actions."""
+"""Looking at a point with the tip of a soft robot: by how much the line of sight misses it, and how that
+changes with the actions."""
 
 from __future__ import annotations
 
@@ -10,7 +11,8 @@ from fastrod.types import Floats
 
 
 def miss(tip: Floats, rotation: Floats, point: Floats) -> Floats:
-    """(2,) what the line of sight, d3 of the tip, is off the point: toward d1 and d2 of the tip, along an arc about the tip [m].
+    """(2,) what the line of sight, d3 of the tip, is off the point: toward d1 and d2 of the tip, along an arc
+    about the tip [m].
 
     `tip` (3,) world [m]; `rotation` (3, 3) world_from_tip; `point` (3,) world [m].
     """
@@ -22,10 +24,11 @@ def miss(tip: Floats, rotation: Floats, point: Floats) -> Floats:
 
 
 def aim_jacobian(tip: Floats, rotation: Floats, point: Floats, jacobian: Floats) -> Floats:
-    """(2, n) motion of the point where the line of sight ends, as far away as `point`, toward d1 and d2, per motion of the coordinates.
+    """(2, n) motion of the point where the line of sight ends, as far away as `point`, toward d1 and d2, per
+    motion of the coordinates.
 
-    `jacobian` (6, n) of the tip: position [m], then rotation vector [rad], world. Where it is this long, the line of sight turns with
-    the tip, and moves with it.
+    `jacobian` (6, n) of the tip: position [m], then rotation vector [rad], world. Where it is this long, the
+    line of sight turns with the tip, and moves with it.
     """
     sight = np.linalg.norm(point - tip) * rotation[:, 2]
     moved = jacobian[:3] + np.cross(jacobian[3:].T, sight).T

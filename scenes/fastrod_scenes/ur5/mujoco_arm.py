@@ -12,14 +12,22 @@ from fastrod.hosts.mujoco_body import mujoco
 from fastrod.types import Floats
 from fastrod_scenes.robots import ur5_path
 
-JOINTS = ("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint", "wrist_3_joint")
+JOINTS = (
+    "shoulder_pan_joint",
+    "shoulder_lift_joint",
+    "elbow_joint",
+    "wrist_1_joint",
+    "wrist_2_joint",
+    "wrist_3_joint",
+)
 _STIFF, _DAMPED = 2e4, 4e2  # of a servo [N m/rad, N m s/rad]
 _ARMATURE = 0.1  # rotor inertia seen through the gear [kg m^2]
 
 
 def arm_spec(dt: float) -> Any:
-    """A `mujoco.MjSpec` of the UR5 at the world's origin, with a servo on each joint and the tip link `tool0`; its own weight is
-    balanced, so that the servos feel what it carries. More may be added before it is compiled."""
+    """A `mujoco.MjSpec` of the UR5 at the world's origin, with a servo on each joint and the tip link
+    `tool0`; its own weight is balanced, so that the servos feel what it carries. More may be added before it
+    is compiled."""
     lib = mujoco()
     spec = lib.MjSpec.from_file(ur5_path())
     spec.compiler.fusestatic = False  # or tool0 would be gone
@@ -32,7 +40,9 @@ def arm_spec(dt: float) -> Any:
             geom.conaffinity = 0  # links meet everything but each other: the shapes of neighbours overlap
     for name in JOINTS:
         spec.joint(name).armature = _ARMATURE
-        spec.add_actuator(name=name, target=name, trntype=lib.mjtTrn.mjTRN_JOINT).set_to_position(kp=_STIFF, kv=_DAMPED)
+        spec.add_actuator(name=name, target=name, trntype=lib.mjtTrn.mjTRN_JOINT).set_to_position(
+            kp=_STIFF, kv=_DAMPED
+        )
     return spec
 
 

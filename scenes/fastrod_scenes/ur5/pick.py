@@ -1,4 +1,5 @@
-"""A UR5 with a soft robot picks a cube from a table and puts it on a spot: by suction, and by the friction of two fingers."""
+"""A UR5 with a soft robot picks a cube from a table and puts it on a spot: by suction, and by the friction of
+two fingers."""
 
 from __future__ import annotations
 
@@ -57,14 +58,18 @@ class _Pick(HostedScene):
         start, mass, held = stage.cube_pose()[0], stage.mass, np.zeros(3)
         before, slip, fastest, depth, off_flange = "", 0.0, 0.0, 0.0, 0.0
         away = speed = gap = math.inf
-        carried: list[tuple[float, ...]] = []  # height of the cube, sideways place of cube and of the soft robot's base, bend
+        # height of the cube, sideways place of cube and of the soft robot's base, bend
+        carried: list[tuple[float, ...]] = []
         for t in self.play(stage):
             at, phase, seen = f"at {t:.3g} s", stage.phase.name, stage.cube_from_tip()
             position, rotation = stage.cube_pose()
             if phase in ("lift", "carry", "lower"):
                 held = seen if phase == "lift" != before else held
                 slip = max(slip, float(np.linalg.norm(seen - held)))
-                self.expect(slip < self.slip, f"{at} the cube is {slip:.3g} m from where it was held: not lifted, or dropped.")
+                self.expect(
+                    slip < self.slip,
+                    f"{at} the cube is {slip:.3g} m from where it was held: not lifted, or dropped.",
+                )
             if phase == "carry":
                 carried.append((position[2] - start[2], position[1], float(stage.points[0, 1]), stage.bend))
             before, speed = phase, stage.cube_speed()
@@ -73,22 +78,44 @@ class _Pick(HostedScene):
             depth = max(depth, -stage.clearance([stage.cube, *stage.soft, stage.arm.body], stage.table, 0.01))
             self.expect(depth < DEPTH, f"{at} something is {depth:.3g} m deep in the table.")
             off_flange = max(off_flange, stage.off_flange())
-            self.expect(off_flange < OFF_FLANGE, f"{at} the soft robot's base is {off_flange:.3g} m off its mount on the flange.")
+            self.expect(
+                off_flange < OFF_FLANGE,
+                f"{at} the soft robot's base is {off_flange:.3g} m off its mount on the flange.",
+            )
             self.expect(stage.mass == mass, f"{at} the cube has {stage.mass:.3g} kg; it had {mass:.3g} kg.")
             if phase == "rest":
-                away, gap = stage.clearance(stage.soft, stage.cube), stage.clearance([stage.cube], stage.table)
+                away, gap = (
+                    stage.clearance(stage.soft, stage.cube),
+                    stage.clearance([stage.cube], stage.table),
+                )
         height, sideways, base, bend = np.array(carried).T
         lifted, way, by_arm, bent = height.min(), np.ptp(sideways), np.ptp(base), np.ptp(bend)
-        self.expect(lifted > LIFTED, f"the cube is carried {lifted:.3g} m above the table; it must be {LIFTED:g} m or more.")
-        self.expect(way > CARRIED, f"the cube is carried {way:.3g} m sideways; it must be {CARRIED:g} m or more.")
-        self.expect(min(by_arm, way - by_arm) > SHARE, f"of {way:.3g} m sideways, {by_arm:.3g} m are by the arm; both must take part.")
-        self.expect(bent > BENT, f"the soft robot bends by {bent:.3g} rad meanwhile; it must be {BENT:g} rad or more.")
+        self.expect(
+            lifted > LIFTED,
+            f"the cube is carried {lifted:.3g} m above the table; it must be {LIFTED:g} m or more.",
+        )
+        self.expect(
+            way > CARRIED, f"the cube is carried {way:.3g} m sideways; it must be {CARRIED:g} m or more."
+        )
+        self.expect(
+            min(by_arm, way - by_arm) > SHARE,
+            f"of {way:.3g} m sideways, {by_arm:.3g} m are by the arm; both must take part.",
+        )
+        self.expect(
+            bent > BENT, f"the soft robot bends by {bent:.3g} rad meanwhile; it must be {BENT:g} rad or more."
+        )
         off, lean = float(np.linalg.norm(position[:2] - SPOT)), math.acos(min(1.0, rotation[2, 2]))
-        self.expect(off < self.accuracy, f"the cube ends {off:.3g} m from the spot; it must be within {self.accuracy:g} m.")
+        self.expect(
+            off < self.accuracy,
+            f"the cube ends {off:.3g} m from the spot; it must be within {self.accuracy:g} m.",
+        )
         self.expect(lean < LEAN, f"the cube ends {lean:.3g} rad from upright.")
         self.expect(speed < REST, f"the cube still moves at {speed:.3g} m/s at the end.")
         self.expect(gap < 1e-3, f"the cube is {gap:.3g} m above the table at the end.")
-        self.expect(away > AWAY, f"the soft robot ends {away:.3g} m from the cube; it must have left it by {AWAY:g} m.")
+        self.expect(
+            away > AWAY,
+            f"the soft robot ends {away:.3g} m from the cube; it must have left it by {AWAY:g} m.",
+        )
         return {
             "height of the lift, m": float(lifted),
             "way sideways, m": float(way),
@@ -110,7 +137,10 @@ class PickSuction(_Pick):
     """The head attaches the cube that it touches, and lets it go."""
 
     name = "pick_suction"
-    about = "A soft robot on a UR5 takes a cube from a table by suction, carries it sideways and puts it on a spot."
+    about = (
+        "A soft robot on a UR5 takes a cube from a table by suction, carries it sideways and puts it on "
+        "a spot."
+    )
     duration = duration(fingers=False)
     fingers = False
     accuracy = 0.005
@@ -122,7 +152,10 @@ class PickGripper(_Pick):
     """The fingers squeeze the cube, and friction alone holds it."""
 
     name = "pick_gripper"
-    about = "A soft robot on a UR5 takes a cube from a table with two fingers, carries it sideways and puts it on a spot."
+    about = (
+        "A soft robot on a UR5 takes a cube from a table with two fingers, carries it sideways and puts "
+        "it on a spot."
+    )
     duration = duration(fingers=True)
     fingers = True
     accuracy = 0.01

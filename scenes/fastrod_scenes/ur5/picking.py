@@ -1,4 +1,5 @@
-"""`Picking`: a UR5 with a soft robot of the paper's class, a table, a cube and a spot to put it on, and the script that does it."""
+"""`Picking`: a UR5 with a soft robot of the paper's class, a table, a cube and a spot to put it on, and the
+script that does it."""
 
 from __future__ import annotations
 
@@ -39,10 +40,15 @@ RADIUS = 0.015
 WIDTH = 0.05
 """Between the open fingers [m]."""
 _HEAD = RADIUS + 0.0025  # m, the head's radius
-_PRESS = 1e-4  # m, onto the table before it lets go: PyBullet's boxes touch where they overlap, and what is above falls onto an edge
-_ABOVE = 0.0005, 0.003  # m from the cube to the head that grasps it by suction, which asks for touch, and by fingers
-_DOWN = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # world_from_tip; the robot bends toward its d1, world -y
-_MOUNT = np.sqrt(0.5) * np.array([1.0, 1.0, 0.0, 0.0])  # flange_from_robot: the straight robot, its +y, points out of the flange
+# m, onto the table before it lets go: PyBullet's boxes touch where they overlap, and what is above falls onto
+# an edge
+_PRESS = 1e-4
+# m from the cube to the head that grasps it by suction, which asks for touch, and by fingers
+_ABOVE = 0.0005, 0.003
+# world_from_tip; the robot bends toward its d1, world -y
+_DOWN = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+# flange_from_robot: the straight robot, its +y, points out of the flange
+_MOUNT = np.sqrt(0.5) * np.array([1.0, 1.0, 0.0, 0.0])
 _ORIGIN = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 _ELBOW_UP = (0.3, -1.5, 1.5, -1.5, -1.57, 0.3)  # rad
 
@@ -67,7 +73,8 @@ class Cube(NamedTuple):
     mass: float = 0.08
     """[kg]"""
     friction: float = 0.5
-    """Coefficient, by which PyBullet multiplies that of what it touches: 0.5 of the table, 2 of the fingers."""
+    """Coefficient, by which PyBullet multiplies that of what it touches: 0.5 of the table, 2 of the
+    fingers."""
 
 
 def script(cube: Cube, fingers: bool) -> tuple[Phase, ...]:
@@ -95,10 +102,11 @@ def duration(*, fingers: bool) -> float:
 
 @final
 class Picking(HostedWorld):
-    """The arm follows from the script: it brings the flange to where the tip is as scripted, with the bend that the soft robot has.
+    """The arm follows from the script: it brings the flange to where the tip is as scripted, with the bend
+    that the soft robot has.
 
-    The soft robot's base is where the flange will be at the end of the step, by its measured motion. The arm does not feel the soft
-    robot, nor does the cube bend it: `SoftManiSim` has its own shape.
+    The soft robot's base is where the flange will be at the end of the step, by its measured motion. The arm
+    does not feel the soft robot, nor does the cube bend it: `SoftManiSim` has its own shape.
     """
 
     def __init__(self, cube: Cube, fingers: bool, dt: float) -> None:
@@ -108,7 +116,9 @@ class Picking(HostedWorld):
         self.table = self._furnish()
         self.arm = BulletArm.load(b, ur5_path(), tip="tool0")
         flange = BulletLink(b, self.arm.body, self.arm.tip)
-        self.mount = BulletLink(b, self.arm.body, self.arm.tip, position=(0.0, 0.0, ADAPTER), quaternion=_MOUNT)
+        self.mount = BulletLink(
+            b, self.arm.body, self.arm.tip, position=(0.0, 0.0, ADAPTER), quaternion=_MOUNT
+        )
         """The soft robot's base on the flange."""
         robot = paper_robot(2, RADIUS)
         self._actions, self._model = SegmentActions(robot), Simulator(robot, threads=1)
@@ -124,11 +134,18 @@ class Picking(HostedWorld):
         self._bracket = Bracket(flange, [((0.0, 0.0, 0.0), (0.0, 0.0, ADAPTER))], 0.012)
         known = {b.getBodyUniqueId(i) for i in range(b.getNumBodies())}
         self.sim = SoftManiSim(
-            b, body_sphere_radius=RADIUS, number_of_sphere=13, number_of_segment=2, robot=robot, max_grasp_width=WIDTH * fingers
+            b,
+            body_sphere_radius=RADIUS,
+            number_of_sphere=13,
+            number_of_segment=2,
+            robot=robot,
+            max_grasp_width=WIDTH * fingers,
         )
         self.soft = [i for i in map(b.getBodyUniqueId, range(b.getNumBodies())) if i not in known]
         """Bodies of the soft robot, its gripper included."""
-        self.cube = self.sim.add_a_cube([*cube.start, TOP + 0.5 * SIDE], size=[SIDE] * 3, mass=cube.mass, color=(0.9, 0.45, 0.1, 1.0))
+        self.cube = self.sim.add_a_cube(
+            [*cube.start, TOP + 0.5 * SIDE], size=[SIDE] * 3, mass=cube.mass, color=(0.9, 0.45, 0.1, 1.0)
+        )
         b.changeDynamics(self.cube, -1, lateralFriction=cube.friction)
         self._follow()
 
@@ -136,14 +153,19 @@ class Picking(HostedWorld):
     def state(self) -> State:
         """Of the soft robot, settled where its base is."""
         pose = self._place.copy()
-        pose[3:] = product(pose[3:], _MOUNT * [1.0, -1.0, -1.0, -1.0])  # fastrod's frame of the base: d3 along the robot's +y
+        # fastrod's frame of the base: d3 along the robot's +y
+        pose[3:] = product(pose[3:], _MOUNT * [1.0, -1.0, -1.0, -1.0])
         return self._model.settle(**self._actions.inputs(self._action(self._bend)), base_pose=pose)
 
     @property
     def soft_bodies(self) -> tuple[SoftBody, ...]:
         """The one; its gripper is none of its capsules."""
         b = self.world
-        capsules = (i for i in self.soft if any(shape[2] == b.GEOM_CAPSULE for shape in b.getCollisionShapeData(i, -1)))
+        capsules = (
+            i
+            for i in self.soft
+            if any(shape[2] == b.GEOM_CAPSULE for shape in b.getCollisionShapeData(i, -1))
+        )
         return (SoftBody(self._model.robots[0], self.state, tuple(capsules)),)
 
     @property
@@ -181,12 +203,14 @@ class Picking(HostedWorld):
         return float(np.linalg.norm(self.mount.motion().pose[:3] - self.points[0, :3]))
 
     def clearance(self, bodies: list[int], other: int, within: float = 0.2) -> float:
-        """Least distance of any of these bodies from another one [m], at most `within`; negative where they overlap."""
+        """Least distance of any of these bodies from another one [m], at most `within`; negative where they
+        overlap."""
         near = (p[8] for body in bodies for p in self.world.getClosestPoints(body, other, within))
         return float(min(near, default=within))
 
     def advance(self, t: float) -> None:
-        """Tip and bend go from one phase's end to the next one's, at rest at both; the head takes hold as `grasp` begins, and lets go as
+        """Tip and bend go from one phase's end to the next one's, at rest at both; the head takes hold as
+        `grasp` begins, and lets go as
         `release` does."""
         end = t + self.dt
         k = min(int(np.searchsorted(self._ends, end - 1e-9)), len(self.script) - 1)
@@ -217,14 +241,19 @@ class Picking(HostedWorld):
         """One step of the world, at the end of which the soft robot is on the flange."""
         self._place = self.mount.motion().after(self.dt)
         action = self._action(self._bend)
-        self.points, _ = self.sim.move_robot_ori(action, self._place[:3], to_xyzw(self._place[3:]), camera_marker=False)
+        self.points, _ = self.sim.move_robot_ori(
+            action, self._place[:3], to_xyzw(self._place[3:]), camera_marker=False
+        )
         self._bracket.follow()
 
     def _joints(self, tip: Floats, bend: float, near: ArrayLike) -> Floats:
         """(6,) that bring the tip of the soft robot of this bend to a point, looking down."""
         if self._planned is None or self._planned[0] != bend:
             state = self._model.settle(**self._actions.inputs(self._action(bend)), base_pose=_ORIGIN)
-            self._planned = bend, np.concatenate([state.tip_rotation[0], state.tip_position[0][:, None]], axis=1)
+            self._planned = (
+                bend,
+                np.concatenate([state.tip_rotation[0], state.tip_position[0][:, None]], axis=1),
+            )
         from_base = self._planned[1]
         turn = _DOWN @ from_base[:, :3].T  # world_from_flange: the rod's axes are the flange's
         flange = tip - turn @ (from_base[:, 3] + [0.0, 0.0, ADAPTER])
@@ -239,10 +268,22 @@ class Picking(HostedWorld):
         b = self.world
         half, middle = [0.2, 0.32, 0.01], [0.52, 0.0, TOP - 0.01]
         wood = b.createVisualShape(b.GEOM_BOX, halfExtents=half, rgbaColor=[0.80, 0.72, 0.60, 1.0])
-        table: int = b.createMultiBody(0.0, b.createCollisionShape(b.GEOM_BOX, halfExtents=half), wood, middle)
-        plinth = b.createVisualShape(b.GEOM_BOX, halfExtents=[0.12, 0.22, 0.5 * TOP - 0.01], rgbaColor=[0.45, 0.47, 0.50, 1.0])
-        floor = b.createVisualShape(b.GEOM_BOX, halfExtents=[1.0, 1.0, 0.01], rgbaColor=[0.85, 0.86, 0.88, 1.0])
-        spot = b.createVisualShape(b.GEOM_CYLINDER, radius=0.03, length=0.001, rgbaColor=[0.10, 0.55, 0.25, 1.0])
-        for seen, place in ((plinth, [*middle[:2], 0.5 * TOP - 0.01]), (floor, [0.0, 0.0, -0.011]), (spot, [*SPOT, TOP + 0.0002])):
+        table: int = b.createMultiBody(
+            0.0, b.createCollisionShape(b.GEOM_BOX, halfExtents=half), wood, middle
+        )
+        plinth = b.createVisualShape(
+            b.GEOM_BOX, halfExtents=[0.12, 0.22, 0.5 * TOP - 0.01], rgbaColor=[0.45, 0.47, 0.50, 1.0]
+        )
+        floor = b.createVisualShape(
+            b.GEOM_BOX, halfExtents=[1.0, 1.0, 0.01], rgbaColor=[0.85, 0.86, 0.88, 1.0]
+        )
+        spot = b.createVisualShape(
+            b.GEOM_CYLINDER, radius=0.03, length=0.001, rgbaColor=[0.10, 0.55, 0.25, 1.0]
+        )
+        for seen, place in (
+            (plinth, [*middle[:2], 0.5 * TOP - 0.01]),
+            (floor, [0.0, 0.0, -0.011]),
+            (spot, [*SPOT, TOP + 0.0002]),
+        ):
             b.createMultiBody(0.0, -1, seen, place)
         return table

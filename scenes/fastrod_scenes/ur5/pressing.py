@@ -36,16 +36,30 @@ class Pressing(MujocoStage):
         robot = soft_robot("presser", 2)
         spec = arm_spec(dt)
         tip = _tip(robot.length)
-        spec.worldbody.add_geom(name="floor", type=lib.mjtGeom.mjGEOM_PLANE, size=[1.0, 1.0, 0.1], rgba=[0.8, 0.8, 0.8, 1.0])
-        plate = spec.worldbody.add_body(name="plate", pos=[tip[0], tip[1] + _GAP + 0.5 * _THICK, tip[2] + 0.03], gravcomp=1.0)
-        plate.add_joint(name="plate", type=lib.mjtJoint.mjJNT_SLIDE, axis=[0.0, 1.0, 0.0], stiffness=SPRING, damping=DAMPER)
-        plate.add_geom(type=lib.mjtGeom.mjGEOM_BOX, size=[0.06, 0.5 * _THICK, 0.06], mass=MASS, rgba=[0.9, 0.6, 0.2, 1.0])
+        spec.worldbody.add_geom(
+            name="floor", type=lib.mjtGeom.mjGEOM_PLANE, size=[1.0, 1.0, 0.1], rgba=[0.8, 0.8, 0.8, 1.0]
+        )
+        plate = spec.worldbody.add_body(
+            name="plate", pos=[tip[0], tip[1] + _GAP + 0.5 * _THICK, tip[2] + 0.03], gravcomp=1.0
+        )
+        plate.add_joint(
+            name="plate",
+            type=lib.mjtJoint.mjJNT_SLIDE,
+            axis=[0.0, 1.0, 0.0],
+            stiffness=SPRING,
+            damping=DAMPER,
+        )
+        plate.add_geom(
+            type=lib.mjtGeom.mjGEOM_BOX, size=[0.06, 0.5 * _THICK, 0.06], mass=MASS, rgba=[0.9, 0.6, 0.2, 1.0]
+        )
         add_capsules(spec, robot, "tool0", touch=["plate"])
         self.model = spec.compile()
         self.data = lib.MjData(self.model)
         self.arm = MujocoArm(self.model, self.data)
         self.arm.place(START)
-        self.rod = MujocoRod(robot, self.model, self.data, "tool0", position=(0.0, 0.0, ADAPTER), touch=["plate"], friction=0.1)
+        self.rod = MujocoRod(
+            robot, self.model, self.data, "tool0", position=(0.0, 0.0, ADAPTER), touch=["plate"], friction=0.1
+        )
         self._actions = SegmentActions(robot)
         self._toward = self._plate_side()
         self.rod.settle()
@@ -71,10 +85,14 @@ class Pressing(MujocoStage):
 
 @final
 class UR5Mujoco(MujocoScene):
-    """At rest the plate's spring is what the soft robot presses with, and what the arm's base feels sideways."""
+    """At rest the plate's spring is what the soft robot presses with, and what the arm's base feels
+    sideways."""
 
     name = "ur5_mujoco"
-    about = "A UR5 in MuJoCo carries a soft robot that bends and presses a sprung plate aside, and feels the spring in its joints."
+    about = (
+        "A UR5 in MuJoCo carries a soft robot that bends and presses a sprung plate aside, and feels "
+        "the spring in its joints."
+    )
     dt = 0.01
     duration = 4.0
 
@@ -83,8 +101,8 @@ class UR5Mujoco(MujocoScene):
         return Pressing(self.dt)
 
     def check(self) -> dict[str, float]:
-        """At the end the plate's spring, the rod's base force and the first servo's torque must agree to 2 %, and the swing must have moved
-        the plate on."""
+        """At the end the plate's spring, the rod's base force and the first servo's torque must agree to 2 %,
+        and the swing must have moved the plate on."""
         stage = self.stage()
         pressed, most, lost = 0.0, 0.0, 0
         for t in self.play(stage):
@@ -97,14 +115,27 @@ class UR5Mujoco(MujocoScene):
         torque = float(stage.arm.torque()[0])  # about the world's z
         moment = stage.rod.wrench[3:] + np.cross(stage.rod.rod.base[:3], stage.rod.wrench[:3])
         self.expect(lost == 0, f"{lost} steps could not be solved.")
-        self.expect(pressed > 0.005, f"the plate has gone {pressed:.4f} m; the soft robot bends farther than the gap.")
-        self.expect(most > pressed + 0.005, f"the arm's swing moved the plate from {pressed:.4f} m to {most:.4f} m only.")
-        self.expect(abs(felt - spring) < 0.02 * spring, f"the base feels {felt:.4f} N, the spring has {spring:.4f} N.")
-        self.expect(abs(torque + moment[2]) < 0.02 * abs(moment[2]), f"the first servo holds {torque:.4f} N m against {moment[2]:.4f} N m.")
+        self.expect(
+            pressed > 0.005, f"the plate has gone {pressed:.4f} m; the soft robot bends farther than the gap."
+        )
+        self.expect(
+            most > pressed + 0.005,
+            f"the arm's swing moved the plate from {pressed:.4f} m to {most:.4f} m only.",
+        )
+        self.expect(
+            abs(felt - spring) < 0.02 * spring, f"the base feels {felt:.4f} N, the spring has {spring:.4f} N."
+        )
+        self.expect(
+            abs(torque + moment[2]) < 0.02 * abs(moment[2]),
+            f"the first servo holds {torque:.4f} N m against {moment[2]:.4f} N m.",
+        )
         return {
-            "plate_displaced_m": stage.displaced, "plate_displaced_by_the_swing_m": most - pressed, "spring_N": spring, "felt_N": felt,
+            "plate_displaced_m": stage.displaced,
+            "plate_displaced_by_the_swing_m": most - pressed,
+            "spring_N": spring,
+            "felt_N": felt,
             "first_servo_Nm": torque,
-        }  # fmt: skip
+        }
 
 
 def _tip(length: float) -> Floats:

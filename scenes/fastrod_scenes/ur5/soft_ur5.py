@@ -40,7 +40,8 @@ ERROR_LIMIT = 0.1
 POSTURE_GAIN = 2.0
 """[1/s]"""
 BEND_WEIGHT, EXTENSION_WEIGHT = 0.02, 0.05
-"""Cost of a segment's bend by 1 rad, and of its extension by `EXTENSION`, where that of a joint's 1 rad is 1."""
+"""Cost of a segment's bend by 1 rad, and of its extension by `EXTENSION`, where that of a joint's 1 rad is
+1."""
 JOINT_RATE, BEND_RATE, EXTENSION_RATE = 1.0, 2.0, 0.06
 """Largest of a joint and of a bend [rad/s], and of an extension [m/s]."""
 
@@ -51,7 +52,8 @@ class Step(NamedTuple):
     tip: Floats
     """(3,) at its end [m]."""
     by_soft: Floats
-    """(3,) way of the tip by the soft robot's actions: the tip's Jacobian before the step times their change [m]."""
+    """(3,) way of the tip by the soft robot's actions: the tip's Jacobian before the step times their change
+    [m]."""
     by_arm: Floats
     """(3,) the same by the arm's joints, as measured [m]."""
 
@@ -59,22 +61,28 @@ class Step(NamedTuple):
 def track_robot() -> Robot:
     """Two segments of 0.1 m that extend by up to `EXTENSION`, 0.1 kg/m."""
     robot = soft_robot("tracker", 2, line_density=0.1)
-    return replace(robot, segments=tuple(replace(segment, extension=(0.0, EXTENSION)) for segment in robot.segments))
+    return replace(
+        robot, segments=tuple(replace(segment, extension=(0.0, EXTENSION)) for segment in robot.segments)
+    )
 
 
 @final
 class SoftUR5:
-    """The UR5 at the world's origin, the soft robot below its flange, and a controller of both, in a world of its own.
+    """The UR5 at the world's origin, the soft robot below its flange, and a controller of both, in a world of
+    its own.
 
-    Coordinates q (12,): the joints [rad], then extension and two displacements for each segment [m] (`SoftTip`).
+    Coordinates q (12,): the joints [rad], then extension and two displacements for each segment [m]
+    (`SoftTip`).
 
-    The task leaves q nine ways to move. In these it goes toward the posture in which it began, in the metric of the weights: where
-    the tip is slow, q comes to rest where the weighted square of its way from that posture is least. So the weights alone share the
-    motion out: bends are cheap, and the arm takes the part of the way that would bend the soft robot too much.
+    The task leaves q nine ways to move. In these it goes toward the posture in which it began, in the metric
+    of the weights: where the tip is slow, q comes to rest where the weighted square of its way from that
+    posture is least. So the weights alone share the motion out: bends are cheap, and the arm takes the part
+    of the way that would bend the soft robot too much.
     """
 
     def __init__(self, *, dt: float, tip: ArrayLike, depth: float = DEPTH, movers: Movers = "both") -> None:
-        """The soft robot's base begins `depth` [m] above the point `tip` (3,) [m], world, which is its tip's by default."""
+        """The soft robot's base begins `depth` [m] above the point `tip` (3,) [m], world, which is its tip's
+        by default."""
         self.dt, self.movers = dt, movers
         self.world = b = connect(dt=dt)
         self.arm = BulletArm.load(b, ur5_path(), tip="tool0")
@@ -82,9 +90,13 @@ class SoftUR5:
         joints = self.arm.solve(np.concatenate([flange, DOWN]), ELBOW_UP)
         self.arm.place(joints)
         host = BulletLink(b, self.arm.body, self.arm.tip, position=(0.0, 0.0, ADAPTER))
-        self.bracket = Bracket(BulletLink(b, self.arm.body, self.arm.tip), [(np.zeros(3), np.array([0.0, 0.0, ADAPTER]))], 0.015)
+        self.bracket = Bracket(
+            BulletLink(b, self.arm.body, self.arm.tip), [(np.zeros(3), np.array([0.0, 0.0, ADAPTER]))], 0.015
+        )
         self.rod = MountedRod(track_robot(), host, capsules_per_segment=5)
-        self.kinematics = SoftTip(self.rod.simulator, self.arm, flange_from_base=(0.0, 0.0, ADAPTER, 1.0, 0.0, 0.0, 0.0))
+        self.kinematics = SoftTip(
+            self.rod.simulator, self.arm, flange_from_base=(0.0, 0.0, ADAPTER, 1.0, 0.0, 0.0, 0.0)
+        )
         start = np.concatenate([joints, STRAIGHT])
         low, high = self.kinematics.limits(LARGEST_BEND)
         self.lower: Floats = np.concatenate([self.arm.lower, low])
@@ -96,12 +108,21 @@ class SoftUR5:
         """Coordinates that move."""
         bend = BEND_WEIGHT / OFFSET**2
         weight = np.concatenate([np.ones(n), [EXTENSION_WEIGHT / EXTENSION**2, bend, bend] * 2])
-        rate = np.concatenate([np.full(n, JOINT_RATE), [EXTENSION_RATE, BEND_RATE * OFFSET, BEND_RATE * OFFSET] * 2])
+        rate = np.concatenate(
+            [np.full(n, JOINT_RATE), [EXTENSION_RATE, BEND_RATE * OFFSET, BEND_RATE * OFFSET] * 2]
+        )
         part = self.moving
         self.control = ResolvedRate(
-            gain=GAIN, lower=self.lower[part], upper=self.upper[part], rate=rate[part], weight=weight[part], error_limit=ERROR_LIMIT,
-            damping=1e-3, posture=start[part], posture_gain=POSTURE_GAIN,
-        )  # fmt: skip
+            gain=GAIN,
+            lower=self.lower[part],
+            upper=self.upper[part],
+            rate=rate[part],
+            weight=weight[part],
+            error_limit=ERROR_LIMIT,
+            damping=1e-3,
+            posture=start[part],
+            posture_gain=POSTURE_GAIN,
+        )
         self.action: Floats = start[n:]
         """(6,) of the soft robot [m]."""
         self._state = self.rod.settle(**self.kinematics.actions.inputs(self.action))
@@ -118,13 +139,16 @@ class SoftUR5:
     def rest(self) -> Floats:
         """(3,) where the tip would come to rest with these joints and actions, world [m]."""
         simulator, before = self.rod.simulator, self.rod.simulator.snapshot()
-        pose = np.concatenate([self._state.position[0, 0], quaternion_from_matrix(self._state.rotation[0, :1])[0]])
+        pose = np.concatenate(
+            [self._state.position[0, 0], quaternion_from_matrix(self._state.rotation[0, :1])[0]]
+        )
         still = self._carried(simulator.settle(base_pose=pose, **self.kinematics.actions.inputs(self.action)))
         simulator.restore(before)
         return still
 
     def advance(self, error: Floats, velocity: Floats) -> Step:
-        """One step: the tip makes up for its `error` (3,) [m], as fast as the gain has it, and goes on with `velocity` (3,) [m/s]."""
+        """One step: the tip makes up for its `error` (3,) [m], as fast as the gain has it, and goes on with
+        `velocity` (3,) [m/s]."""
         q, n, part = self.q(), self.arm.n_joints, self.moving
         self.kinematics.follow(q, self._state, self._base)
         jacobian = self.kinematics.jacobian()

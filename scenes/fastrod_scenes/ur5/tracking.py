@@ -17,7 +17,8 @@ CENTER = (0.5, 0.0, 0.3)
 PERIOD = 20.0
 """Of a path [s]."""
 APPROACH = 2.0
-"""The tip starts from the center while the goal is on the path from t = 0 on; from here on it must have caught up [s]."""
+"""The tip starts from the center while the goal is on the path from t = 0 on; from here on it must have
+caught up [s]."""
 LARGEST_ERROR = 1e-6
 """Mean square, over time and over x, y and z [m^2]."""
 LEAST_SHARE = 0.5
@@ -64,13 +65,16 @@ class Record(NamedTuple):
     def lengths(self, start: float) -> tuple[float, float]:
         """Of the tip's paths by the soft robot alone and by the arm alone, from a time [s] on [m]."""
         on = self.t > start + 1e-9
-        by_soft, by_arm = (float(np.linalg.norm(part[on], axis=1).sum()) for part in (self.by_soft, self.by_arm))
+        by_soft, by_arm = (
+            float(np.linalg.norm(part[on], axis=1).sum()) for part in (self.by_soft, self.by_arm)
+        )
         return by_soft, by_arm
 
 
 def share(part: Floats, way: Floats) -> float:
-    """Sum of part . way over the sum of way . way, both (n, 3), step by step [m]: what part of the tip's motion was done by one of
-    those who move it. The shares of all are 1 together; one that moves across the path has none, one that works against it less."""
+    """Sum of part . way over the sum of way . way, both (n, 3), step by step [m]: what part of the tip's
+    motion was done by one of those who move it. The shares of all are 1 together; one that moves across the
+    path has none, one that works against it less."""
     return float((part * way).sum() / (way * way).sum())
 
 
@@ -100,15 +104,16 @@ class Tracking(Stage):
         self.robot.bracket.follow()
 
     def feedforward(self, t: float) -> Floats:
-        """(3,) mean velocity of the goal in the step that begins at time t [s], world [m/s]: around corners it ends on the goal too."""
+        """(3,) mean velocity of the goal in the step that begins at time t [s], world [m/s]: around corners
+        it ends on the goal too."""
         return np.asarray((self.path.position(t + self.dt) - self.path.position(t)) / self.dt)
 
 
 class Track(HostedScene):
     """One path, from the jump of the goal onto it to the end of a period after the approach.
 
-    As in the paper, the tip rests at the path's center when the goal begins to move along the path, and a longer error than 0.1 m
-    counts as 0.1 m.
+    As in the paper, the tip rests at the path's center when the goal begins to move along the path, and a
+    longer error than 0.1 m counts as 0.1 m.
     """
 
     dt = 0.02
@@ -124,7 +129,12 @@ class Track(HostedScene):
     @final
     def path(self, scale: float = 1.0) -> Trajectory:
         """The path, or one of the same form so many times as large."""
-        return trajectory(self.shape, period=PERIOD, center=CENTER, **{name: scale * size for name, size in self.sizes.items()})
+        return trajectory(
+            self.shape,
+            period=PERIOD,
+            center=CENTER,
+            **{name: scale * size for name, size in self.sizes.items()},
+        )
 
     @final
     def stage(self) -> Tracking:
@@ -138,18 +148,30 @@ class Track(HostedScene):
 
     @final
     def check(self) -> dict[str, float]:
-        """The tip's error, the soft robot's share, room to the limits, clearance and lag must be within the bounds of this module."""
+        """The tip's error, the soft robot's share, room to the limits, clearance and lag must be within the
+        bounds of this module."""
         stage = self.stage()
         lower, upper = stage.robot.lower, stage.robot.upper
         run = self.record(stage)
         error, part = run.mean_square(APPROACH), run.soft_share(APPROACH)
         by_soft, by_arm = run.lengths(APPROACH)
         room = float(np.minimum(run.q - lower, upper - run.q).min())
-        self.expect(error <= LARGEST_ERROR, f"the mean squared error after the approach is {error:.3g} m^2; at most {LARGEST_ERROR:g}.")
-        self.expect(part >= LEAST_SHARE, f"the soft robot does {part:.3f} of the tip's motion; it must be {LEAST_SHARE} or more.")
+        self.expect(
+            error <= LARGEST_ERROR,
+            f"the mean squared error after the approach is {error:.3g} m^2; at most {LARGEST_ERROR:g}.",
+        )
+        self.expect(
+            part >= LEAST_SHARE,
+            f"the soft robot does {part:.3f} of the tip's motion; it must be {LEAST_SHARE} or more.",
+        )
         self.expect(room >= -1e-6, f"a coordinate is {-room:.3g} beyond its limit.")
-        self.expect(run.clearance >= LEAST_CLEARANCE, f"the soft robot comes as near as {run.clearance:.3g} m to the arm.")
-        self.expect(run.lag <= LARGEST_LAG, f"the tip of a step is {run.lag:.3g} m off where it would come to rest.")
+        self.expect(
+            run.clearance >= LEAST_CLEARANCE,
+            f"the soft robot comes as near as {run.clearance:.3g} m to the arm.",
+        )
+        self.expect(
+            run.lag <= LARGEST_LAG, f"the tip of a step is {run.lag:.3g} m off where it would come to rest."
+        )
         return {
             "mean squared error, m^2": error,
             "with the approach, m^2": run.mean_square(0.0, PERIOD),

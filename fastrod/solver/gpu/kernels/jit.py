@@ -1,4 +1,5 @@
-"""How kernels are compiled for a GPU: as functions of the device, pasted into the one kernel that Python launches."""
+"""How kernels are compiled for a GPU: as functions of the device, pasted into the one kernel that Python
+launches."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ LANES = 1
 
 
 def kernel(function: _Function) -> _Function:
-    """Compile `function` as part of the kernel that calls it. IEEE numbers, with fused multiply-add: NaN is how a lost robot is seen."""
+    """Compile `function` as part of the kernel that calls it. IEEE numbers, with fused multiply-add: NaN is
+    how a lost robot is seen."""
     return function if SIMULATED else cast(_Function, _cuda.jit(device=True)(function))
 
 
@@ -33,7 +35,8 @@ def inline(function: _Function) -> _Function:
 
 
 def launched(function: _Function) -> Any:
-    """Compile what Python launches, on first launch, and keep it across processes where a folder is writable."""
+    """Compile what Python launches, on first launch, and keep it across processes where a folder is
+    writable."""
     if SIMULATED:
         return _cuda.jit()(function)
     folder, before = _cache_dir(), _config.CACHE_DIR
@@ -45,7 +48,8 @@ def launched(function: _Function) -> Any:
 
 
 def _cache_dir() -> str | None:
-    """Within the folder of the CPU's kernels, which is named after their sources: one for this file and this numba.cuda."""
+    """Within the folder of the CPU's kernels, which is named after their sources: one for this file and this
+    numba.cuda."""
     if CACHE_DIR is None:
         return None
     digest = hashlib.sha256(str(_cuda.__file__).encode() + Path(__file__).read_bytes()).hexdigest()[:16]
