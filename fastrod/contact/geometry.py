@@ -201,8 +201,8 @@ def _primitive(shape: ObstacleShape, size: Sequence[float], given: Placement) ->
         3 - _SIZES[shape]
     )
     none, nothing = np.empty((0, 3)), np.empty((0, 3), dtype=np.int64)
-    parts: dict[str, Any] = {"vertices": none, "faces": nothing, "closed": True}
-    return Obstacle(shape=shape, size=full, **parts, **options)
+    parts: dict[str, Any] = {"size": full, "vertices": none, "faces": nothing, "closed": True}
+    return Obstacle(shape=shape, **parts, **options)
 
 
 def sphere(radius: float, **options: Unpack[Placement]) -> Obstacle:
@@ -306,6 +306,7 @@ def mesh(
         )
     _check_extent(where, float(np.ptp(vertices, axis=0).max()), "scale")
     closed = _check_surface(where, vertices, faces, open_surface)
+    placed: dict[str, Any] = {"position": position, "quaternion": quaternion}  # `Obstacle` checks them
     return Obstacle(
         name=name,
         shape="mesh",
@@ -314,9 +315,8 @@ def mesh(
         faces=faces,
         closed=closed,
         friction=friction,
-        position=position,
-        quaternion=quaternion,
-        stiffness=stiffness,  # type: ignore[arg-type]
+        stiffness=stiffness,
+        **placed,
     )
 
 
