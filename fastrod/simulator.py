@@ -15,13 +15,13 @@ from fastrod.contact.engine import Engine
 from fastrod.contact.frames import blended
 from fastrod.contact.scene import ContactScene
 from fastrod.contact.step import COLD_PASSES, Ways, contact_step
-from fastrod.effects.pipeline import Chain, Measurement
+from fastrod.effects.pipeline import EffectPipeline, SensedPoses
 from fastrod.errors import InputError, RobotError, refuse_masked, shown
 from fastrod.kernels.rod.dense import between_nodes
 from fastrod.model.compile import compile_robots
 from fastrod.model.robot import Robot
 from fastrod.rotation import matrix_from_quaternion
-from fastrod.solver.boundary import Passes, check_size
+from fastrod.solver.boundary import BoundarySolver, check_size
 from fastrod.solver.gpu import device as devices
 from fastrod.solver.guess import cold_start
 from fastrod.solver.inputs import Inputs, PointForces, Reader, named_inputs
@@ -30,7 +30,7 @@ from fastrod.solver.recovery import TOLERANCE, Boundary, overloaded, what_to_do
 from fastrod.solver.response import Linear, stretch
 from fastrod.solver.settle import Pass, settle
 from fastrod.solver.state import Observer, Pose, Snapshot, State
-from fastrod.types import Flags, Floats, Ints, Memory, Params, Ports, Probes, Shape
+from fastrod.types import Flags, Floats, Ints, Memory, Params, PointLoads, Ports, RodShape
 
 _config: Any = numba.config
 _AT_REST = 1e-6  # m: contact and boundary of a step, where `settle` has a tolerance of its own
@@ -147,11 +147,11 @@ class Simulator:
         self._layout, self._plain, rest = compile_robots(self.robots, int(points_per_segment))
         check_size(self._layout, int(n_robots), outputs)
         threads = threads or numba.get_num_threads()
-        self._passes = Passes(
+        self._passes = BoundarySolver(
             self._layout, self._plain, self.n_robots, threads, carry=observer is not None, device=self.device
         )
         self._reader = Reader(self._layout, self._plain, rest, self.n_robots)
-        self._chain = Chain(self.robots, self.n_robots)
+        self._chain = EffectPipeline(self.robots, self.n_robots)
         # the last ports before effects; _plain is the robot before them
         self._bare: Ports | None = None
         self._all = np.arange(self.n_robots)
@@ -385,12 +385,12 @@ class Simulator:
         shape = self._passes.new_shape("full", True)
         passes = np.zeros(self.n_robots, np.int64)
 
-        def run(which: Ints, at: Ports, into: Shape, probes: Probes) -> None:
+        def run(which: Ints, at: Ports, into: RodShape, probes: PointLoads) -> None:
             self._passes.run(
                 which, at, into, probes=probes, update=False, noise=1e-10 if self._layout.paper else 1e-20
             )
 
-        def free(which: Ints, at: Ports, into: Shape) -> Flags:
+        def free(which: Ints, at: Ports, into: RodShape) -> Flags:
             if tolerance is not None:
                 return bring_to_rest(which, at, into)
             process, noise = self.observer.process_noise * self.dt, self.observer.measurement_noise / self.dt
@@ -407,7 +407,7 @@ class Simulator:
                 well[lost] = used[lost] > 0
             return np.asarray(well)
 
-        def bring_to_rest(which: Ints, at: Ports, into: Shape) -> Flags:
+        def bring_to_rest(which: Ints, at: Ports, into: RodShape) -> Flags:
             used = settle(which, self._warm, self._passes, at, tolerance or TOLERANCE, self._into(into))
             passes[which] += np.abs(used[which])
             return np.asarray(used > 0)
@@ -475,7 +475,7 @@ class Simulator:
         reason = f"settle did not bring the boundary residual below {tolerance:g} m"
         return self._finish(ports, shape, ok, passes, reason, rows[~ok[rows]], only)
 
-    def _into(self, shape: Shape) -> Pass:
+    def _into(self, shape: RodShape) -> Pass:
         """Passes on frozen inputs that write into `shape`."""
 
         def run(rows: Ints, ports: Ports) -> Floats:
@@ -668,7 +668,7 @@ class Simulator:
             raise InputError(f"{what} needs Simulator(..., outputs='full'); this one keeps the tip only.")
         return state
 
-    def measure(self) -> Measurement:
+    def measure(self) -> SensedPoses:
         """What a camera on the base sees of the last state: tip (and `log_points`, with outputs="full") in
         the base frame, effects of sensing included. Effects before the rod show in the state itself. Raises
         `InputError` before the first step."""
@@ -678,7 +678,7 @@ class Simulator:
         points = np.zeros((self.n_robots, 0, 3))
         if self.outputs == "full" and self.robots[0].log_points:
             points = self.shape(np.array(self.robots[0].log_points)).position - pose[:, None, :3]
-        seen = Measurement(
+        seen = SensedPoses(
             np.einsum("nji,nj->ni", turn, state.tip_position - pose[:, :3]),
             np.swapaxes(turn, 1, 2) @ state.tip_rotation,
             np.einsum("nji,nkj->nki", turn, points),
@@ -804,7 +804,7 @@ class Simulator:
         if not len(which):
             return
         _, params, rest = compile_robots([self.robots[0], *robots], self._layout.n_steps)
-        chain = Chain([self.robots[0], *robots], len(robots) + 1)
+        chain = EffectPipeline([self.robots[0], *robots], len(robots) + 1)
         if self._engine is not None and not np.array_equal(
             params.length[1:], np.broadcast_to(params.length[:1], params.length[1:].shape)
         ):
@@ -901,13 +901,13 @@ class Simulator:
             (force != before)[self._warm if max(len(force), len(before)) > 1 else slice(None)].any()
         )
 
-    def _sentence(self, reason: str, ports: Ports, shape: Shape, i: int) -> str:
+    def _sentence(self, reason: str, ports: Ports, shape: RodShape, i: int) -> str:
         return f"{reason}; residual {shape.residual[i]:.3g} m; {what_to_do(self._passes, ports, i)}."
 
     def _finish(
         self,
         ports: Ports,
-        shape: Shape,
+        shape: RodShape,
         ok: Flags,
         passes: Ints,
         reason: str,
@@ -946,17 +946,17 @@ class Simulator:
         self._ports = ports
         return self._hand_out(shape, ok, passes, problems)
 
-    def _kept(self, shape: Shape, ports: Ports, lost: Flags) -> tuple[Shape, Ports]:
+    def _kept(self, shape: RodShape, ports: Ports, lost: Flags) -> tuple[RodShape, Ports]:
         """`lost` robots as in the state before, nan where that holds no shape of theirs; `residual` is of
         what was tried."""
-        kept = Shape(*(np.array(a) for a in shape))
+        kept = RodShape(*(np.array(a) for a in shape))
         for a in kept:
             a[lost if len(a) else slice(0)] = np.nan
         if (have := lost & self._shaped).any() and self._state is not None and self._ports is not None:
             kept, ports = taken_shape(kept, self._state, have), taken_each(ports, self._ports, have)
         return kept._replace(residual=shape.residual), ports
 
-    def _hand_out(self, shape: Shape, ok: Flags, passes: Ints, problems: dict[int, str]) -> State:
+    def _hand_out(self, shape: RodShape, ok: Flags, passes: Ints, problems: dict[int, str]) -> State:
         contacts = None if self._felt is None else self._felt.contacts(shape, ok)
         if self._engine is not None and self._felt is None:
             self._engine.before = shape
@@ -976,8 +976,8 @@ def _check_positive(name: str, value: float, unit: str) -> None:
         raise InputError(f"{name} is {shown(value)} {unit}; it must be a number, positive and finite.")
 
 
-def _as_shape(state: State) -> Shape:
-    return Shape(*(getattr(state, name) for name in Shape._fields))
+def _as_shape(state: State) -> RodShape:
+    return RodShape(*(getattr(state, name) for name in RodShape._fields))
 
 
 def _copied(memory: Memory) -> Memory:

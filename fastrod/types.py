@@ -110,7 +110,7 @@ class Memory(NamedTuple):
     """(n_robots, 3) u at the base, from which the first cross-section is solved [1/m]."""
 
 
-class Shape(NamedTuple):
+class RodShape(NamedTuple):
     """What a pass writes: shapes, units and frames as in `fastrod.solver.state.State`; arrays that are not
     wanted have length 0."""
 
@@ -174,7 +174,7 @@ class Surfaces(NamedTuple):
     """(n_faces, 7, 3) pseudonormals of face, edges ab, bc, ca, corners a, b, c."""
 
 
-class Probes(NamedTuple):
+class PointLoads(NamedTuple):
     """Contact points of the robots of one pass, in the order of its rows: loads in, linear response out.
     Length 0 if none."""
 
@@ -191,7 +191,7 @@ class Probes(NamedTuple):
     """(n_rows, n_x, 1 + 3 n_probes) the same of the boundary unknowns."""
 
 
-class Rods(NamedTuple):
+class ContactRods(NamedTuple):
     """What contact needs to know of the robots themselves."""
 
     radius: Floats
@@ -217,7 +217,7 @@ class Rods(NamedTuple):
     """1: a rod touches itself too."""
 
 
-class Touching(NamedTuple):
+class ContactSet(NamedTuple):
     """The contacts of every robot, kept from one step to the next."""
 
     used: Ints

@@ -61,7 +61,7 @@ def errors(distance: float, tilt: float | None, n: int) -> Row:
     """Single frames at one distance; tilts up to 50 deg where none is given. The model expects the tip's
     orientation within 3 deg."""
     from fastrod.rotation import product, quaternion_from_vector
-    from fastrod_device.camera import Frame
+    from fastrod_device.camera import CameraFrame
     from fastrod_device.drawing import draw
     from fastrod_device.tracker import MarkerTracker
 
@@ -77,7 +77,7 @@ def errors(distance: float, tilt: float | None, n: int) -> Row:
         expected = position, product(quaternion, quaternion_from_vector(0.03 * rng.standard_normal(3)))
         tracker.reset()
         seen = tracker.look(
-            Frame(image=draw(camera, marker, position, quaternion, rng=rng), t=0.0, number=k), expected
+            CameraFrame(image=draw(camera, marker, position, quaternion, rng=rng), t=0.0, number=k), expected
         )
         flags.append(seen.flag)
         if seen.ok:
@@ -104,7 +104,7 @@ def flips(distance: float, swing: float, n: int) -> Row:
     import cv2
 
     from fastrod.rotation import quaternion_from_matrix
-    from fastrod_device.camera import Frame
+    from fastrod_device.camera import CameraFrame
     from fastrod_device.drawing import draw
     from fastrod_device.tracker import MarkerTracker
 
@@ -129,7 +129,7 @@ def flips(distance: float, swing: float, n: int) -> Row:
             0.1 * distance * math.cos(0.7 * t),
         )
         image = draw(camera, marker, position, quaternion, rng=rng)
-        sighting = tracker.look(Frame(image=image, t=t, number=k))
+        sighting = tracker.look(CameraFrame(image=image, t=t, number=k))
         seen_after += sighting.ok
         after += sighting.ok and angle(sighting.quaternion, quaternion) > FLIP
         found, _, _ = detector.detectMarkers(image)
@@ -203,7 +203,7 @@ def gates(kind: str, seeds: Sequence[int], moves: int) -> Row:
     from fastrod_device.errors import RefusedError
     from fastrod_device.gates import ASTRAY, OUTSIDE, TOO_FAST
     from fastrod_device.hardware import load_hardware
-    from fastrod_device.tracker import Sighting
+    from fastrod_device.tracker import MarkerSighting
     from fastrod_device.workbench import emulated
 
     note_progress(f"gates, {kind}")
@@ -217,8 +217,8 @@ def gates(kind: str, seeds: Sequence[int], moves: int) -> Row:
             prototype = bench.prototype
             look = prototype.tracker.look
 
-            def watched(frame: Any, expected: Any = None, *, now: float, look: Any = look) -> Sighting:
-                seen: Sighting = look(frame, expected, now=now)
+            def watched(frame: Any, expected: Any = None, *, now: float, look: Any = look) -> MarkerSighting:
+                seen: MarkerSighting = look(frame, expected, now=now)
                 flags[seen.flag] += 1
                 if seen.flag in ("", OUTSIDE, ASTRAY, TOO_FAST):
                     far.append(float(np.linalg.norm(seen.position)))
@@ -258,7 +258,7 @@ def gates(kind: str, seeds: Sequence[int], moves: int) -> Row:
 
 def times(distance: float, repeats: int) -> Row:
     """Median wall time of a frame."""
-    from fastrod_device.camera import Frame
+    from fastrod_device.camera import CameraFrame
     from fastrod_device.drawing import draw
     from fastrod_device.tracker import MarkerTracker
 
@@ -270,7 +270,7 @@ def times(distance: float, repeats: int) -> Row:
     drawn, looked = [], []
     for k in range(repeats):
         seconds, image = report.seconds(lambda: draw(camera, marker, *there, rng=rng))
-        frame = Frame(image=image, t=k / 15.0, number=k)
+        frame = CameraFrame(image=image, t=k / 15.0, number=k)
         drawn.append(seconds)
         looked.append(report.seconds(lambda frame=frame: tracker.look(frame))[0])  # type: ignore[misc]
     return {

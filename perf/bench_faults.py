@@ -29,8 +29,8 @@ import numpy as np
 from fastrod.errors import FastrodError
 from fastrod.logs.recording import Recorder, recover
 from fastrod.types import Floats
-from fastrod_device.bus import Line
-from fastrod_device.camera import Frame
+from fastrod_device.bus import BusLine
+from fastrod_device.camera import CameraFrame
 from fastrod_device.clock import SteppedClock, WallClock
 from fastrod_device.dictionary import object_dictionary
 from fastrod_device.drawing import Eye
@@ -41,7 +41,7 @@ from fastrod_device.hardware import load_hardware
 from fastrod_device.journal import Journal
 from fastrod_device.pacer import urgent
 from fastrod_device.prototype import Prototype
-from fastrod_device.safety import State
+from fastrod_device.safety import SafetyState
 from fastrod_device.seal import seal
 from fastrod_device.workbench import emulated
 from report import Column, Row, Section, command, note_progress
@@ -114,7 +114,7 @@ class Rig:
         self.prototype = Prototype(
             hardware, bus, self.emulator, clock=self.clock, eds=eds, journal=journal, wall=wall
         )
-        self._other = Line(bus)
+        self._other = BusLine(bus)
         self.prototype.start(home=False)
         self.recorder: Recorder = self.prototype.recorder_for(str(self.part))
         self.recorder.start(self.prototype.elapsed)
@@ -264,10 +264,10 @@ def fail(kind: str, k: int, folder: Path, *, stepped: bool, eds: Path | None) ->
     inject, words = INJECTIONS[kind]
     with rig(folder, k, stepped=stepped, eds=eds) as bench:
         supervisor, drives = bench.prototype.supervisor, bench.emulator.drives
-        bench.wait(0.7 + float(rng.uniform(0.0, 1.0)), lambda: supervisor.state is State.STOPPED)
+        bench.wait(0.7 + float(rng.uniform(0.0, 1.0)), lambda: supervisor.state is SafetyState.STOPPED)
         injected = bench.clock.now()
         inject(bench, k)
-        bench.wait(PATIENCE, lambda: supervisor.state is State.STOPPED)
+        bench.wait(PATIENCE, lambda: supervisor.state is SafetyState.STOPPED)
         fault = supervisor.first
         if fault is None:
             return Trial(
@@ -285,7 +285,7 @@ def fail(kind: str, k: int, folder: Path, *, stepped: bool, eds: Path | None) ->
 
         bench.wait(AFTER, look)
         at = float(np.nanmax(drives.stopped_at, initial=injected)) if not drives.moving.any() else math.inf
-        again |= bool(on.any()) or supervisor.state is not State.STOPPED
+        again |= bool(on.any()) or supervisor.state is not SafetyState.STOPPED
         bench.prototype.record(None)
         rows = len(bench.recorder)
         kept = bench.part.with_name(bench.part.name + ".part").read_text(encoding="utf-8").count("\n") - 2
@@ -316,14 +316,14 @@ class Still:
         self._eye = Eye(self._camera, load_hardware().marker, seed=1)
         self._number, self._due = 0, 0.0
 
-    def read(self) -> Frame | None:
+    def read(self) -> CameraFrame | None:
         """One at the camera's rate."""
         now = time.monotonic()
         if now < self._due:
             return None
         self._due, self._number = now + 1.0 / self._camera.rate, self._number + 1
         image = self._eye.draw(np.array([0.0, 0.0, 0.07]), np.array([1.0, 0.0, 0.0, 0.0]))
-        return Frame(image=image, t=now - self._camera.latency, number=self._number)
+        return CameraFrame(image=image, t=now - self._camera.latency, number=self._number)
 
     def close(self) -> None:
         """Nothing to give back."""

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from fastrod.identification.attribution import identify
-from fastrod.identification.log.forward import Rod, predict, sample
+from fastrod.identification.log.forward import PredictedRod, predict, sample
 from fastrod.identification.log.unknowns import base_model
 from fastrod.identification.report.result import Result
 from fastrod.logs.runlog import RunLog
@@ -98,7 +98,7 @@ def tip_rms(log: RunLog, robot: Robot, start: float, end: float) -> float:
     inside = samples.rows[(samples.time[samples.rows] >= start) & (samples.time[samples.rows] < end)]
     part = samples.on(inside)
     model = replace(base_model(replace(robot, fit={}, sensor={})), unknowns=())
-    pose = predict(model, np.zeros(0), part, Rod(part, robot))
+    pose = predict(model, np.zeros(0), part, PredictedRod(part, robot))
     error = ((samples.log.tip_position[inside] - pose.position) ** 2).sum(1)
     return float(np.sqrt(error[pose.ok].mean()))
 

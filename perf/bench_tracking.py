@@ -15,7 +15,7 @@ from report import Column, Row, Section, note_progress
 
 if TYPE_CHECKING:
     from fastrod.control import Trajectory
-    from fastrod_scenes.ur5.tracking import Record, Track, Tracking
+    from fastrod_scenes.ur5.tracking import Record, TrackingError, TrackingScene
 
 ERROR_TARGET, SHARE_TARGET = 1e-6, 0.5
 """Mean squared error after the approach [m^2], and the soft robot's share of the motion."""
@@ -85,7 +85,7 @@ class Reach:
                 return 0.0
         return found / len(goals)
 
-    def best(self, scene: Track) -> tuple[float, float, float]:
+    def best(self, scene: TrackingScene) -> tuple[float, float, float]:
         """Largest part of the path in reach from one place of the base; the largest scale at which all of it
         is; a depth for that."""
         part = max(self.points(scene.path(), depth, False) for depth in DEPTHS[::2])
@@ -96,7 +96,7 @@ class Reach:
         return part, 0.0, 0.0
 
 
-def steps(stage: Tracking, seconds: float) -> Iterator[float]:
+def steps(stage: TrackingError, seconds: float) -> Iterator[float]:
     """Advance the stage, t [s] by t, and close it."""
     try:
         for k in range(round(seconds / stage.dt)):
@@ -118,13 +118,13 @@ def row(name: str, reach: Reach | None, dt: float | None, seconds: float | None)
     needs no search."""
     from fastrod_scenes import load
     from fastrod_scenes.ur5.soft_ur5 import DEPTH
-    from fastrod_scenes.ur5.tracking import APPROACH, Track, Tracking, record
+    from fastrod_scenes.ur5.tracking import APPROACH, TrackingError, TrackingScene, record
 
     scene = load(name)
-    assert isinstance(scene, Track)
+    assert isinstance(scene, TrackingScene)
     dt, seconds = dt or scene.dt, seconds or scene.duration
     note_progress(f"{name}: both")
-    both = record(stage := Tracking(scene.path(), dt=dt), steps(stage, seconds))
+    both = record(stage := TrackingError(scene.path(), dt=dt), steps(stage, seconds))
     by_soft, by_arm = both.lengths(APPROACH)
     after, part = both.mean_square(APPROACH), both.soft_share(APPROACH)
     found: Row = {
@@ -143,12 +143,12 @@ def row(name: str, reach: Reach | None, dt: float | None, seconds: float | None)
     }
     note_progress(f"{name}: the arm alone")
     found |= figures(
-        "arm", record(stage := Tracking(scene.path(), dt=dt, movers="arm"), steps(stage, seconds))
+        "arm", record(stage := TrackingError(scene.path(), dt=dt, movers="arm"), steps(stage, seconds))
     )
     note_progress(f"{name}: the soft robot alone")
     reached, scale, depth = reach.best(scene) if reach else (1.0, 0.5, DEPTH)
     alone = record(
-        stage := Tracking(scene.path(scale), dt=dt, movers="soft", depth=depth), steps(stage, seconds)
+        stage := TrackingError(scene.path(scale), dt=dt, movers="soft", depth=depth), steps(stage, seconds)
     )
     found |= {"reach": reached, "scale": scale, "depth": depth, **figures("soft", alone)}
     return found

@@ -30,10 +30,10 @@ def frames(browser: Any, scene: str, seconds: float, closer: float, speed: float
     from fastrod_viewer.app import found
     from fastrod_viewer.canvas import Canvas
     from fastrod_viewer.drawing import Drawing
-    from fastrod_viewer.options import FINE, Options
-    from fastrod_viewer.page import Sight, stand_back
+    from fastrod_viewer.options import FINE, ViewOptions
+    from fastrod_viewer.page import PageView, stand_back
     from fastrod_viewer.server import serve
-    from fastrod_viewer.session import Frame
+    from fastrod_viewer.session import ViewFrame
 
     world = found(scene)
     server = serve(port=0)
@@ -43,9 +43,9 @@ def frames(browser: Any, scene: str, seconds: float, closer: float, speed: float
         drawing = Drawing(
             Canvas(server),
             world,
-            Options(body="skin" if many or world.rods[0].state.contacts is not None else "backbone"),
+            ViewOptions(body="skin" if many or world.rods[0].state.contacts is not None else "backbone"),
         )
-        sight = Sight(drawing.middle, closer * drawing.size)
+        sight = PageView(drawing.middle, closer * drawing.size)
         window.go(f"http://127.0.0.1:{server.get_port()}")
         window.close_toast()
         window.page.add_style_tag(
@@ -58,7 +58,7 @@ def frames(browser: Any, scene: str, seconds: float, closer: float, speed: float
         for _ in range(round(seconds * RATE)):
             for _ in range(steps):
                 world.play()
-            drawing.draw(Frame(world, None, None, float("nan"), 1.0, ""))
+            drawing.draw(ViewFrame(world, None, None, float("nan"), 1.0, ""))
             server.flush()
             window.page.wait_for_timeout(250)
             yield Image.open(io.BytesIO(window.page.locator("canvas").first.screenshot())).convert("RGB")

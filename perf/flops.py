@@ -200,7 +200,7 @@ def _instrument() -> dict[str, Tally]:
     jit.LANES = 1
     import fastrod.kernels as package
     from fastrod.solver import boundary as passes
-    from fastrod.types import Memory, Shape
+    from fastrod.types import Memory, RodShape
 
     modules = [
         importlib.import_module(f"fastrod.kernels.{info.name}")
@@ -231,7 +231,7 @@ def _instrument() -> dict[str, Tally]:
 
     def counting(*arguments: Any) -> None:
         counted: list[Any] = [
-            argument if isinstance(argument, Shape) else _countable(argument) for argument in arguments
+            argument if isinstance(argument, RodShape) else _countable(argument) for argument in arguments
         ]
         body(*counted)
         (memory,) = (i for i, argument in enumerate(arguments) if isinstance(argument, Memory))

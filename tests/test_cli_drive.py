@@ -17,7 +17,7 @@ from fastrod.commands.cli import main
 from fastrod.logs.runlog import read_log
 from fastrod_device import boards, workbench
 from fastrod_device.calibration import CharucoBoard
-from fastrod_device.camera import Frame, load_camera
+from fastrod_device.camera import CameraFrame, load_camera
 from fastrod_device.clock import SteppedClock, WallClock
 from fastrod_device.emulator import Emulator
 from fastrod_device.errors import CalibrationError
@@ -302,7 +302,7 @@ def test_what_was_recorded_before_a_stop_is_told(
 ) -> None:
     look = Emulator.read
 
-    def covered(emulator: Emulator) -> Frame | None:
+    def covered(emulator: Emulator) -> CameraFrame | None:
         emulator.hidden = emulator.clock.now() > 4.0
         return look(emulator)
 

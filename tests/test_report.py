@@ -33,7 +33,7 @@ from fastrod.identification.report.wording import (
     with_error,
 )
 from fastrod.identification.search.model_selection import Bound
-from fastrod.identification.search.residual_test import Audit
+from fastrod.identification.search.residual_test import ResidualStructure
 from fastrod.identification.search.solve import Estimate
 from fastrod.model.robotfile import load_robot
 from fastrod.simulator import Simulator
@@ -82,7 +82,7 @@ def wild(result: Result) -> Result:
         log=replace(result.log, name="a <script>alert(1)</script> & $x$"),
         effects=[*result.effects, *more],
         base_parameters=base,
-        remaining=Audit(0.1, 0.05, 0.02, 0.01, 3.0),
+        remaining=ResidualStructure(0.1, 0.05, 0.02, 0.01, 3.0),
         remaining_kind="static",
         remaining_share=0.12,
         patterns=["it <jumps>"],

@@ -19,7 +19,7 @@ from fastrod import Observer, Simulator, load_robot
 from fastrod.errors import InputError, RobotError, UnknownNameError
 from fastrod.kernels.rod.columns import step_column
 from fastrod.model.robotfile import dumps, loads
-from fastrod.solver.boundary import Passes
+from fastrod.solver.boundary import BoundarySolver
 
 
 def random_lengths(n: int, seed: int, reach: float = 1.0) -> np.ndarray:
@@ -64,14 +64,14 @@ def test_a_load_that_no_number_of_steps_would_bring_on_is_given_up(monkeypatch: 
     """Steps are in proportion to one over the load: 10 kN on a rod of 2 N mm^2 would take thousands, each of
     several passes."""
     sim, ran = Simulator(rod(), n_robots=2, points_per_segment=6), 0
-    run = Passes.run
+    run = BoundarySolver.run
 
     def counted(*args: Any, **keywords: Any) -> None:
         nonlocal ran
         ran += 1
         run(*args, **keywords)
 
-    monkeypatch.setattr(Passes, "run", counted)
+    monkeypatch.setattr(BoundarySolver, "run", counted)
     state = sim.settle(rod().rest_tendon_length, tip_force=[[0.0, 0.0, 0.0], [1e4, 0.0, 0.0]])
     assert ran < 100
     assert state.ok.tolist() == [True, False]

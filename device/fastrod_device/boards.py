@@ -14,10 +14,16 @@ import numpy as np
 from fastrod.errors import InputError
 from fastrod.rotation import product, quaternion_from_vector
 from fastrod.types import Floats
-from fastrod_device.calibration import BoardFinder, BoardView, CameraCalibration, CharucoBoard, Registration
-from fastrod_device.camera import Camera, Frame, FrameSource, Picture, Pose, compose, inverse, rotation
+from fastrod_device.calibration import (
+    BoardFinder,
+    BoardView,
+    CameraCalibration,
+    CharucoBoard,
+    MarkerRegistration,
+)
+from fastrod_device.camera import Camera, CameraFrame, FrameSource, Picture, Pose, compose, inverse, rotation
 from fastrod_device.clock import Clock
-from fastrod_device.drawing import Scene, draw_board
+from fastrod_device.drawing import DrawnScene, draw_board
 from fastrod_device.errors import CalibrationError
 
 if TYPE_CHECKING:
@@ -30,7 +36,7 @@ PATIENCE = 60.0
 """Time in which no picture can be taken, after which there will be no more [s]."""
 _STILL = 0.004  # of the diagonal: a corner that moves farther from frame to frame is blurred
 _POLL = 0.005  # s between two looks for a frame
-_SCENE = Scene(blur=1.0, noise=5.0)
+_SCENE = DrawnScene(blur=1.0, noise=5.0)
 _SHAKE = 1e-4  # m per axis, of a board that somebody holds or a fixture
 _ON_THE_WAY, _AT_REST = 0.2, 0.25  # s of an emulated hand from place to place, and there
 _FOCUS, _ASPECT, _CENTRE = 0.04, 0.005, 0.012  # of an emulated lens: off by these parts at most
@@ -38,7 +44,7 @@ _BENT, _TANGENT = (-0.25, -0.1), 5e-4  # of its k1, from and to, and of its p1 a
 _MOVED, _TURNED = 0.005, math.radians(2.0)  # of where an emulated camera stands, at most
 
 
-class BoardHands(Protocol):
+class BoardMover(Protocol):
     """Who holds the board."""
 
     def wave(self) -> None:
@@ -87,7 +93,7 @@ class BoardEye:
         """The board is at base_from_board, position (3,) [m] and quaternion (4,) w x y z, until `wave`."""
         self._still = position, quaternion
 
-    def read(self) -> Frame | None:
+    def read(self) -> CameraFrame | None:
         """The newest frame, where one is due."""
         now = self.clock.now()
         if now < self._next:
@@ -97,7 +103,7 @@ class BoardEye:
         position, quaternion = self._waved(now - self._began) if self._still is None else self._still
         position = position + _SHAKE * self._rng.normal(size=3)
         image = draw_board(self.camera, self.board, position, quaternion, rng=self._rng, scene=_SCENE)
-        return Frame(image=image, t=now, number=self._number)
+        return CameraFrame(image=image, t=now, number=self._number)
 
     def close(self) -> None:
         """Nothing is held."""
@@ -275,7 +281,7 @@ def lens_table(found: CameraCalibration, file: Camera, truth: Camera | None) -> 
     return table
 
 
-def place_table(found: Registration, file: Camera, truth: Camera | None) -> Table:
+def place_table(found: MarkerRegistration, file: Camera, truth: Camera | None) -> Table:
     """Where the camera stands: position, and how it is turned from where the file has it, each with standard
     errors."""
     table = _table("base_from_camera", truth)

@@ -99,7 +99,7 @@ def _plain(error: Exception) -> str:
 
 
 @final
-class Line:
+class BusLine:
     """One bus with the thread that listens to it: a canopen network whose frames are also sent raw.
 
     Frames that come are handed to what was subscribed at `network`. A receiver that fails does not end:

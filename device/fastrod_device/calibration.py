@@ -137,7 +137,7 @@ class CameraCalibration:
     """Views that did not, and why."""
 
     def camera(self, *, rate: float = 30.0, latency: float = 0.0) -> Camera:
-        """A camera with these intrinsics, at the origin until `Registration.camera` says where."""
+        """A camera with these intrinsics, at the origin until `MarkerRegistration.camera` says where."""
         rows = (_three(row) for row in self.matrix)
         k1, k2, p1, p2, k3 = self.distortion.tolist()
         return Camera(
@@ -150,7 +150,7 @@ class CameraCalibration:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Registration:
+class MarkerRegistration:
     """Where a camera stands, and how well that is known."""
 
     position: Floats
@@ -232,7 +232,7 @@ def calibrate(
 
 def register_base(
     images: Sequence[Picture], board: CharucoBoard, camera: Camera, *, position: Floats, quaternion: Floats
-) -> Registration:
+) -> MarkerRegistration:
     """Where the camera stands, from pictures of a board at known places: base_from_board, one for all images
     or one each.
 
@@ -270,7 +270,7 @@ def register_base(
             _stand(start, p, seen, camera)[0] for start, p, seen in zip(singles, space, pixels, strict=True)
         ]
         spread = np.maximum(spread, _scatter(one, found))
-    return Registration(
+    return MarkerRegistration(
         position=found[0],
         quaternion=found[1],
         position_stderr=spread[:3],

@@ -260,7 +260,7 @@ class Marker:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Frame:
+class CameraFrame:
     """One picture."""
 
     image: Picture
@@ -274,7 +274,7 @@ class Frame:
 class FrameSource(Protocol):
     """Where frames come from: a camera, an emulator, a file."""
 
-    def read(self) -> Frame | None:
+    def read(self) -> CameraFrame | None:
         """The newest frame that was not read yet, None where there is none; never waits. Raises `DeviceError`
         where the source is lost."""
 
@@ -324,7 +324,7 @@ class VideoCamera:
         self._thread = threading.Thread(target=self._run, name="fastrod camera", daemon=True)
         self._thread.start()
 
-    def read(self) -> Frame | None:
+    def read(self) -> CameraFrame | None:
         """The newest frame that was not read yet. Raises `DeviceError` where no more come."""
         with self._lock:
             newest, self._newest = self._newest, None
@@ -339,7 +339,7 @@ class VideoCamera:
         if not self._thread.is_alive():  # to release under a thread that still reads would crash
             self._capture.release()
 
-    def _grab(self) -> Frame | None:
+    def _grab(self) -> CameraFrame | None:
         import cv2
 
         good, image = self._capture.read()
@@ -348,7 +348,7 @@ class VideoCamera:
             return None
         grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         self._number += 1
-        return Frame(image=np.asarray(grey, dtype=np.uint8), t=t, number=self._number)
+        return CameraFrame(image=np.asarray(grey, dtype=np.uint8), t=t, number=self._number)
 
     def _run(self) -> None:
         failed = 0

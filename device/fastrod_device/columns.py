@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fastrod_device.gates import AHEAD, ASTRAY, BACK, FROZEN, OUTSIDE, REPEATED, TOO_FAST, TWICE
 from fastrod_device.readings import Readings
-from fastrod_device.tracker import Sighting
+from fastrod_device.tracker import MarkerSighting
 
 _REFUSED = (FROZEN, OUTSIDE, ASTRAY, TOO_FAST, TWICE, REPEATED, BACK, AHEAD)
 FLAGS = ("", "no marker", "outlier", "ambiguous", *_REFUSED)
@@ -20,7 +20,7 @@ def names(n_tendons: int) -> tuple[str, ...]:
     return (*EXTRA, *(f"current_{k}" for k in range(1, n_tendons + 1)))
 
 
-def values(sighting: Sighting, readings: Readings | None) -> dict[str, float]:
+def values(sighting: MarkerSighting, readings: Readings | None) -> dict[str, float]:
     """Of one row; currents are left out where none are known."""
     made = {
         "marker_error": sighting.error,

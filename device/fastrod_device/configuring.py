@@ -11,7 +11,7 @@ import numpy as np
 
 from fastrod.errors import InputError
 from fastrod.types import Ints
-from fastrod_device.bus import Line, guest
+from fastrod_device.bus import BusLine, guest
 from fastrod_device.dictionary import find, titled
 from fastrod_device.errors import DeviceError
 from fastrod_device.units import DriveSpec
@@ -103,7 +103,7 @@ class Configurator:
     expect heartbeats meanwhile."""
 
     def __init__(
-        self, line: Line, dictionary: Any, specs: Sequence[DriveSpec], beat: Callable[[], None]
+        self, line: BusLine, dictionary: Any, specs: Sequence[DriveSpec], beat: Callable[[], None]
     ) -> None:
         """Subscribes to the answers."""
         self._dictionary, self._specs, self._beat = dictionary, specs, beat

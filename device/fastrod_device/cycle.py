@@ -15,14 +15,14 @@ import numpy as np
 
 from fastrod.errors import InputError
 from fastrod.types import Ints
-from fastrod_device.bus import Line
+from fastrod_device.bus import BusLine
 from fastrod_device.clock import Clock
 from fastrod_device.configuring import BEAT, COMMAND, MASTER, PATIENCE
 from fastrod_device.errors import DeviceError
 from fastrod_device.faultcodes import ENABLED, FAULT, in_words, state_in_words
 from fastrod_device.inbox import SILENCE, Inbox
 from fastrod_device.pacer import Pacer
-from fastrod_device.readings import Feedback
+from fastrod_device.readings import DriveFeedback
 from fastrod_device.units import DriveSpec
 
 OFF, STOP, RUN, START, RESET = 0x0000, 0x0002, 0x000F, 0x001F, 0x0080
@@ -38,7 +38,7 @@ _COMMAND = struct.Struct("<Hi")
 class Cycle:
     """What is sent and what has come. Lists have one entry for each drive."""
 
-    def __init__(self, line: Line, specs: Sequence[DriveSpec], clock: Clock, rate: float) -> None:
+    def __init__(self, line: BusLine, specs: Sequence[DriveSpec], clock: Clock, rate: float) -> None:
         """Subscribes at `line`, which is started afterwards; `rate` [1/s]."""
         n = len(specs)
         self.line, self.clock, self.rate = line, clock, rate
@@ -67,7 +67,7 @@ class Cycle:
         """Number of drives."""
         return len(self.ids)
 
-    def exchange(self, target: Ints | None = None) -> Feedback:
+    def exchange(self, target: Ints | None = None) -> DriveFeedback:
         """As `DriveBus.exchange`."""
         if target is not None:
             self.hold = whole(self.n_drives, target, "target")
@@ -114,12 +114,12 @@ class Cycle:
     def until(
         self,
         seconds: float,
-        done: Callable[[Feedback], bool],
+        done: Callable[[DriveFeedback], bool],
         what: str,
         *,
         stoppable: bool = True,
         running: bool = False,
-    ) -> Feedback:
+    ) -> DriveFeedback:
         """Exchange in time until `done`; `what`: that the drives are waited for to do. `running`: all must
         stay enabled."""
         pacer = Pacer(self.clock, self.rate)
@@ -148,7 +148,7 @@ class Cycle:
         self.inbox.expect()
         self.line.send(0x80, b"")
 
-    def gather(self) -> Feedback:
+    def gather(self) -> DriveFeedback:
         """Everything that is known now."""
         return self.inbox.gather(self._unsent, any(self.configured))
 
@@ -156,7 +156,7 @@ class Cycle:
         """A drive has rebooted: it knows nothing any more."""
         self.configured[i], self.enabled[i], self.words[i] = False, False, OFF
 
-    def _let_go(self, now: Feedback) -> None:
+    def _let_go(self, now: DriveFeedback) -> None:
         """A drive that stopped by itself, or may have because the bus failed, is told to stay stopped when it
         hears us again."""
         deaf = {e.drive for e in now.emergencies if e.code >> 8 == 0x81}
@@ -190,7 +190,7 @@ class Cycle:
         except (self.line.error, OSError) as error:
             raise DeviceError(f"nothing can be sent to node {node}: {error}.") from error
 
-    def refuse_faults(self, now: Feedback, what: str = "is in fault") -> None:
+    def refuse_faults(self, now: DriveFeedback, what: str = "is in fault") -> None:
         """Raises `DeviceError` for the first drive in fault."""
         for i, word in enumerate(now.statusword):
             if state_in_words(int(word)) == FAULT:

@@ -24,7 +24,7 @@ _POOL, _SLACK = 4, 128  # noise pictures that are kept, and by how much one may 
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Scene:
+class DrawnScene:
     """How the picture looks. Raises `InputError`."""
 
     white: float = 210.0
@@ -88,7 +88,7 @@ def _fold(k1: float, k2: float, k3: float) -> float:
     return float(r[np.argmax(falling)]) if falling.any() else np.inf
 
 
-PLAIN = Scene()
+PLAIN = DrawnScene()
 """The scene where none is given."""
 
 
@@ -96,7 +96,9 @@ PLAIN = Scene()
 class Eye:
     """A camera that looks at a marker: pictures one after the other, their noise drawn by a seed."""
 
-    def __init__(self, camera: Camera, marker: Marker, *, seed: int = 0, scene: Scene | None = None) -> None:
+    def __init__(
+        self, camera: Camera, marker: Marker, *, seed: int = 0, scene: DrawnScene | None = None
+    ) -> None:
         self.camera, self.marker, self.scene = camera, marker, scene or PLAIN
         self._rng = np.random.default_rng(seed)
 
@@ -120,7 +122,7 @@ def draw(
     quaternion: Floats,
     *,
     rng: np.random.Generator,
-    scene: Scene | None = None,
+    scene: DrawnScene | None = None,
 ) -> Picture:
     """(h, w) picture of the marker on a tip at base_from_tip, position (3,) [m] and quaternion (4,); from
     behind it is not seen."""
@@ -136,7 +138,7 @@ def draw_board(
     quaternion: Floats,
     *,
     rng: np.random.Generator,
-    scene: Scene | None = None,
+    scene: DrawnScene | None = None,
 ) -> Picture:
     """(h, w) picture of a board at base_from_board, position (3,) [m] and quaternion (4,)."""
     camera_from_board = compose(inverse(camera.base_from_camera), (position, quaternion))
@@ -205,7 +207,7 @@ def _runs(bits: Picture) -> list[tuple[int, int, int]]:
 
 
 @lru_cache(maxsize=4)
-def _backdrop(size: tuple[int, int], scene: Scene) -> tuple[Singles, Singles, list[Singles]]:
+def _backdrop(size: tuple[int, int], scene: DrawnScene) -> tuple[Singles, Singles, list[Singles]]:
     """Light (h, w), the lit background (h, w), and noise pictures that are a little larger; single precision,
     for speed."""
     width, height = size
@@ -231,7 +233,7 @@ def _backdrop(size: tuple[int, int], scene: Scene) -> tuple[Singles, Singles, li
 
 
 def _picture(
-    camera: Camera, sheet: _Print | None, camera_from_print: Pose, rng: np.random.Generator, scene: Scene
+    camera: Camera, sheet: _Print | None, camera_from_print: Pose, rng: np.random.Generator, scene: DrawnScene
 ) -> Picture:
     import cv2
 

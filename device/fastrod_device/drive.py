@@ -15,14 +15,14 @@ import numpy as np
 
 from fastrod.errors import InputError, UnknownNameError, nearest
 from fastrod.types import Floats, Ints
-from fastrod_device.bus import Line
+from fastrod_device.bus import BusLine
 from fastrod_device.clock import Clock
 from fastrod_device.configuring import Configurator, DriveLimits
 from fastrod_device.cycle import OFF, RESET, RUN, START, Cycle, whole
 from fastrod_device.dictionary import object_dictionary
 from fastrod_device.errors import DeviceError
 from fastrod_device.faultcodes import ENABLED, FAULT, QUICK_STOP, READY, SWITCHED_ON, state_in_words
-from fastrod_device.readings import Emergency, Feedback
+from fastrod_device.readings import DriveFeedback, Emergency
 from fastrod_device.units import DriveSpec, Transmission
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ class DriveBus:
             )
         self._specs = Transmission(specs).specs
         dictionary = object_dictionary(eds)
-        self._line = Line(bus)
+        self._line = BusLine(bus)
         self._cycle = Cycle(self._line, self._specs, clock, float(rate))
         self._configurator = Configurator(self._line, dictionary, self._specs, self._cycle.beat)
         self._closed = False
@@ -94,7 +94,7 @@ class DriveBus:
         return len(self._specs)
 
     @property
-    def newest(self) -> Feedback:
+    def newest(self) -> DriveFeedback:
         """Of the last exchange."""
         return self._cycle.newest
 
@@ -222,7 +222,7 @@ class DriveBus:
                 self._cycle.hold[i] = int(fresh.position[i])
         self._cycle.release()
 
-        def step(now: Feedback) -> bool:
+        def step(now: DriveFeedback) -> bool:
             self._cycle.refuse_faults(now)
             for i, word in enumerate(now.statusword):
                 state = state_in_words(int(word))
@@ -249,7 +249,7 @@ class DriveBus:
         """Switch all drives off. Raises `DeviceError` where one stays on."""
         self._cycle.words, self._cycle.enabled = [OFF] * self.n_drives, [False] * self.n_drives
 
-        def off(now: Feedback) -> bool:
+        def off(now: DriveFeedback) -> bool:
             return not any(state_in_words(int(word)) in (ENABLED, QUICK_STOP) for word in now.statusword)
 
         self._cycle.until(1.0, off, "be disabled", stoppable=False)
@@ -281,12 +281,12 @@ class DriveBus:
 
     # the loop
 
-    def exchange(self, target: Ints | None = None) -> Feedback:
+    def exchange(self, target: Ints | None = None) -> DriveFeedback:
         """One cycle: `target` (n_drives,) [counts] to the drives, one SYNC, and what they say.
 
         None keeps the last target. Returns when all drives have answered, after 0.6 of a cycle at most. A bus
         that fails raises nothing:
-        `Feedback.lost` says why. Raises `InputError` for a target of another shape or kind.
+        `DriveFeedback.lost` says why. Raises `InputError` for a target of another shape or kind.
         """
         return self._cycle.exchange(target)
 
@@ -298,7 +298,7 @@ class DriveBus:
 
     # moves that cycle by themselves
 
-    def profile_move(self, target: Ints, velocity: float, acceleration: float) -> Feedback:
+    def profile_move(self, target: Ints, velocity: float, acceleration: float) -> DriveFeedback:
         """Go to `target` (n_drives,) [counts] along trapezoids, in the mode "ppm"; returns when all have
         arrived.
 
@@ -316,10 +316,10 @@ class DriveBus:
         self._cycle.hold = goal
         limit = 2.0 + 1.5 * (far / velocity + 2.0 * velocity / acceleration)
 
-        def taken(now: Feedback) -> bool:
+        def taken(now: DriveFeedback) -> bool:
             return bool(np.all(now.statusword & _ACKNOWLEDGED))
 
-        def arrived(now: Feedback) -> bool:
+        def arrived(now: DriveFeedback) -> bool:
             return bool(np.all(now.statusword & (_ACKNOWLEDGED | _REACHED) == _REACHED))
 
         for word, done, what in (
@@ -341,7 +341,7 @@ class DriveBus:
         order: Sequence[int] | None = None,
         rounds: int = 2,
         time_limit: float = 30.0,
-    ) -> Feedback:
+    ) -> DriveFeedback:
         """Pull the wires in, one after another, until each is taut; the counts there become 0.
 
         `threshold` (n_drives,) [thousandths of the rated torque], at `speed` [counts/s], one number or
@@ -389,7 +389,7 @@ class DriveBus:
         setup.write(i, 0x30B2, 0, current)  # mA
         setup.set_mode(i, 6)
 
-        def attained(now: Feedback) -> bool:
+        def attained(now: DriveFeedback) -> bool:
             if now.statusword[i] & _ERROR:
                 raise DeviceError(
                     f"the drive at node {spec.node} reports a homing error; is its wire on the drum?"
@@ -443,6 +443,6 @@ def _positive(**given: float) -> None:
             raise InputError(f"{name} is {value!r}; it must be a positive number.")
 
 
-def _once(now: Feedback) -> bool:  # noqa: ARG001
+def _once(now: DriveFeedback) -> bool:  # noqa: ARG001
     """One cycle is enough."""
     return True

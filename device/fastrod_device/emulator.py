@@ -17,9 +17,9 @@ import numpy as np
 
 from fastrod.rotation import quaternion_from_matrix
 from fastrod.types import Floats
-from fastrod_device.camera import Frame
+from fastrod_device.camera import CameraFrame
 from fastrod_device.clock import Clock
-from fastrod_device.drawing import Eye, Scene
+from fastrod_device.drawing import DrawnScene, Eye
 from fastrod_device.hardware import Hardware
 from fastrod_device.nodes import EmulatedDrives
 from fastrod_device.plant import Plant
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from can import BusABC
 
 _SHAKE = 1e-4  # m per axis, of the marker against the camera: a bench is not still
-_SCENE = Scene(blur=1.0, noise=5.0)
+_SCENE = DrawnScene(blur=1.0, noise=5.0)
 _HANDS = 1.0  # s for which hands that hang a load cover the marker
 _SLACK = 1e-3  # m, of a wire before it is homed, at most
 _KEPT = 8  # frames that nobody has fetched
@@ -68,7 +68,7 @@ class Emulator:
         self._eye = Eye(hardware.camera, hardware.marker, seed=seed, scene=_SCENE)
         self._due: deque[tuple[int, float, Floats, Floats]] = deque(maxlen=_KEPT)
         self._number, self._next = 0, 0.0
-        self._last: Frame | None = None
+        self._last: CameraFrame | None = None
         self._covered = -np.inf
         self.frozen = self.hidden = False
         """The camera repeats its last frame; the marker is covered."""
@@ -99,7 +99,7 @@ class Emulator:
         position = position + _SHAKE * self._rng.normal(size=3)
         self._due.append((self._number, t, position, quaternion_from_matrix(rotation[None])[0]))
 
-    def read(self) -> Frame | None:
+    def read(self) -> CameraFrame | None:
         """The newest frame that has arrived and was not read yet; drawn now, stamped with the time of its
         exposure."""
         arrived = self.clock.now() - self.hardware.camera.latency
@@ -111,9 +111,9 @@ class Emulator:
             return None
         number, t, position, quaternion = found
         if self.frozen and self._last is not None:
-            self._last = Frame(image=self._last.image, t=t, number=number)
+            self._last = CameraFrame(image=self._last.image, t=t, number=number)
         else:
-            self._last = Frame(
+            self._last = CameraFrame(
                 image=self._eye.draw(position, quaternion, marker=not self.hidden and t >= self._covered),
                 t=t,
                 number=number,

@@ -11,7 +11,7 @@ from typing import Protocol, final
 
 import numpy as np
 
-from fastrod.control.inverse import Plan
+from fastrod.control.inverse import InversePlan
 from fastrod.errors import InputError
 from fastrod.identification.excite import Excitation
 from fastrod.logs.recording import Recorder
@@ -27,7 +27,7 @@ of wire length [m]."""
 _SETTLE = 1.0  # s at rest before a path begins
 
 
-class Hands(Protocol):
+class HandMover(Protocol):
     """Who hangs the load and turns the bench: a person, or the emulator's own."""
 
     def hang(self, mass: float) -> None:
@@ -55,7 +55,12 @@ class AskingHands:
 
 
 def excite(
-    prototype: Prototype, run: Excitation, hands: Hands, path: str | Path, *, progress: Progress | None = None
+    prototype: Prototype,
+    run: Excitation,
+    hands: HandMover,
+    path: str | Path,
+    *,
+    progress: Progress | None = None,
 ) -> RunLog:
     """Drive `run`, hands doing what it asks, and record it to `path`: its inputs as the encoders had them,
     the known load, the base.
@@ -101,7 +106,7 @@ def excite(
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Tracking:
+class TrackingRun:
     """How well the measured tip followed a path, from the moment it was on it."""
 
     name: str
@@ -170,7 +175,7 @@ def drive_lag(log: RunLog) -> float:
 
 def follow(
     prototype: Prototype,
-    plan: Plan,
+    plan: InversePlan,
     path: str | Path,
     *,
     law: Law | None = None,
@@ -211,7 +216,7 @@ def _saved(prototype: Prototype, recorder: Recorder) -> None:
         recorder.stop()
 
 
-def tracking(name: str, log: RunLog, plan: Plan) -> Tracking:
+def tracking(name: str, log: RunLog, plan: InversePlan) -> TrackingRun:
     """A log of `follow` beside the path of its plan."""
     meant = log.t - plan.lead
     on = (meant >= plan.t[0]) & (meant <= plan.t[-1])
@@ -219,7 +224,7 @@ def tracking(name: str, log: RunLog, plan: Plan) -> Tracking:
         np.where(on[:, None], _between(meant, plan.t, points), np.nan)
         for points in (plan.target, plan.nearest, plan.predicted)
     )
-    return Tracking(name=name, log=log, path=path, nearest=nearest, predicted=predicted)
+    return TrackingRun(name=name, log=log, path=path, nearest=nearest, predicted=predicted)
 
 
 def _pieces(seconds: float, most: float = 5.0) -> list[tuple[float, float]]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from fastrod.model.robot import Robot
 from fastrod.types import Floats
-from fastrod_device.camera import Camera, Frame
+from fastrod_device.camera import Camera, CameraFrame
 
 OUTSIDE, ASTRAY, TOO_FAST, TWICE = "outside the workspace", "far from the model", "too fast", "two markers"
 """Flags of sightings that are refused."""
@@ -97,7 +97,7 @@ class FrameOrder:
         self._pictures: dict[int, None] = {}
         self._last = self._given = -math.inf
 
-    def check(self, frame: Frame, now: float | None) -> tuple[float, str]:
+    def check(self, frame: CameraFrame, now: float | None) -> tuple[float, str]:
         """Time of the frame [s] and its flag, "" where it is new. `now`: the clock [s], or None."""
         picture = hash(frame.image.tobytes())
         t, stamp = self._time(frame, now)
@@ -115,7 +115,7 @@ class FrameOrder:
         self._picture = picture
         return t, stamp or (BACK if late else REPEATED if known else "")
 
-    def _time(self, frame: Frame, now: float | None) -> tuple[float, str]:
+    def _time(self, frame: CameraFrame, now: float | None) -> tuple[float, str]:
         if now is not None and not frame.t <= now + _ROUNDED:
             flag = AHEAD
         elif not frame.t >= self._given:

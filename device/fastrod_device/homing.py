@@ -28,8 +28,8 @@ from fastrod_device.errors import DeviceError
 from fastrod_device.faultcodes import ENABLED, in_words, state_in_words
 from fastrod_device.hardware import Hardware
 from fastrod_device.pacer import Pacer
-from fastrod_device.readings import Feedback
-from fastrod_device.tracker import Sighting
+from fastrod_device.readings import DriveFeedback
+from fastrod_device.tracker import MarkerSighting
 from fastrod_device.units import Transmission
 
 ZERO_SD = 2e-5
@@ -50,7 +50,7 @@ _BEND, _TURNS, _TURN = 0.45, 4, 1.4  # rad at first, turns of the spiral, s each
 
 
 def home(
-    drives: DriveBus, hardware: Hardware, clock: Clock, look: Callable[[], Sighting | None] | None
+    drives: DriveBus, hardware: Hardware, clock: Clock, look: Callable[[], MarkerSighting | None] | None
 ) -> tuple[Transmission, Robot]:
     """Do it; wires as drives with their zero, and the robot with the tensions that its wires have there.
 
@@ -106,7 +106,7 @@ def home(
     return Transmission(hardware.drives, zero=transmission.counts(at)), tightened(hardware.robot, tension)
 
 
-def trouble(feedback: Feedback, hardware: Hardware, *, speed: float = 0.0) -> str:
+def trouble(feedback: DriveFeedback, hardware: Hardware, *, speed: float = 0.0) -> str:
     """What is wrong with drives that are homed: one sentence without its full stop, of the first that is
     found; empty where all is well.
 
@@ -202,7 +202,7 @@ def _measured(cycle: Callable[[Floats], Floats], at: Floats, hardware: Hardware)
 
 def _straightened(
     cycle: Callable[[Floats], Floats],
-    look: Callable[[], Sighting | None],
+    look: Callable[[], MarkerSighting | None],
     at: Floats,
     hardware: Hardware,
     clock: Clock,

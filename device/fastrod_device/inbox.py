@@ -12,10 +12,10 @@ from typing import final
 
 import numpy as np
 
-from fastrod_device.bus import Line
+from fastrod_device.bus import BusLine
 from fastrod_device.clock import Clock
 from fastrod_device.configuring import MOTION, STATUS
-from fastrod_device.readings import Emergency, Feedback
+from fastrod_device.readings import DriveFeedback, Emergency
 from fastrod_device.units import DriveSpec
 
 SILENCE = 0.1
@@ -29,7 +29,7 @@ class Inbox:
     """The newest words of all drives, and who has answered the last SYNC."""
 
     def __init__(
-        self, line: Line, specs: Sequence[DriveSpec], clock: Clock, booted: Callable[[int], None]
+        self, line: BusLine, specs: Sequence[DriveSpec], clock: Clock, booted: Callable[[int], None]
     ) -> None:
         """Subscribes; `booted` is called by the bus's thread with the index of a drive that says it has
         booted."""
@@ -100,7 +100,7 @@ class Inbox:
                 self._answered[i] = False
             self._waiting = 0
 
-    def gather(self, unsent: str, connected: bool) -> Feedback:
+    def gather(self, unsent: str, connected: bool) -> DriveFeedback:
         """Everything, now. `unsent`: why nothing could be sent, or empty."""
         now = self._clock.now()
         with self._lock:
@@ -115,7 +115,7 @@ class Inbox:
                     f"no drive has said anything for {silence:.2f} s; is the cable plugged in and the "
                     "power on?"
                 )
-            feedback = Feedback(
+            feedback = DriveFeedback(
                 t=now,
                 position=np.array(self._position, dtype=np.int64),
                 velocity=np.array(self._velocity, dtype=np.int64),

@@ -28,7 +28,7 @@ _PLAYS = (0.05, 0.15)  # half widths of lost motion, as parts of the largest mot
 
 
 @dataclass(frozen=True, kw_only=True)
-class Latency:
+class LoopLatency:
     """A delay, and how well it is known."""
 
     delay: float
@@ -39,7 +39,7 @@ class Latency:
 
 def estimate_latency(
     t_motion: Floats, motion: Floats, t_camera: Floats, position: Floats, *, longest: float = 0.4
-) -> Latency:
+) -> LoopLatency:
     """Delay of positions (n, 3) [m] at times t_camera (n,) behind a motion (m, k) at rising times t_motion
     (m,) [s].
 
@@ -123,10 +123,10 @@ def estimate_latency(
         raise CalibrationError(
             f"the delay is uncertain by {1e3 * stderr:.0f} ms; move the tip farther and faster, to and fro."
         )
-    return Latency(delay=delay, stderr=stderr)
+    return LoopLatency(delay=delay, stderr=stderr)
 
 
-def measure_latency(prototype: Prototype) -> Latency:
+def measure_latency(prototype: Prototype) -> LoopLatency:
     """Move the robot to and fro for some seconds, within half of its limits, and compare encoders with
     sightings.
 

@@ -11,13 +11,13 @@ from typing import final
 import numpy as np
 
 from fastrod.control import Trajectory, references
-from fastrod.control.inverse import Plan, plan
+from fastrod.control.inverse import InversePlan, plan
 from fastrod.identification.attribution import identify
 from fastrod.identification.excite import excitation
 from fastrod.identification.report.result import Result
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
-from fastrod_device.experiment import Hands, Progress, Tracking, drive_lag, excite, follow, tracking
+from fastrod_device.experiment import HandMover, Progress, TrackingRun, drive_lag, excite, follow, tracking
 from fastrod_device.prototype import Prototype
 
 APPROACH = 2.0
@@ -26,7 +26,7 @@ RATE = 20.0
 """Of the plans [Hz]."""
 
 
-def planned(model: Robot, path: Trajectory) -> Plan:
+def planned(model: Robot, path: Trajectory) -> InversePlan:
     """One turn of a path by a model, from straight."""
     return plan(
         model, path.position(np.arange(round(path.period * RATE) + 1) / RATE), RATE, approach=APPROACH
@@ -40,15 +40,15 @@ class Loop:
 
     result: Result
     """Of the identification."""
-    before: Sequence[Tracking]
+    before: Sequence[TrackingRun]
     """With plans by the model as it was."""
-    after: Sequence[Tracking]
+    after: Sequence[TrackingRun]
     """With plans by the identified model."""
 
 
 def close_loop(
     prototype: Prototype,
-    hands: Hands,
+    hands: HandMover,
     out: Path,
     *,
     payload: float | None = None,
@@ -91,7 +91,7 @@ def close_loop(
     )
 
 
-def _rest(prototype: Prototype, hands: Hands) -> None:
+def _rest(prototype: Prototype, hands: HandMover) -> None:
     """Load off, base as in the robot's file."""
     own = np.array(prototype.robot.base_quaternion)
     with prototype.resting():
@@ -102,7 +102,7 @@ def _rest(prototype: Prototype, hands: Hands) -> None:
 
 def _track(
     prototype: Prototype, path: Trajectory, model: Robot, lag: float, out: Path, stage: str, tell: Progress
-) -> tuple[RunLog, Plan]:
+) -> tuple[RunLog, InversePlan]:
     tell(f"{stage}, planning", 0, 2)
     made = planned(model, path)
     tell(stage, 1, 2)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fastrod.identification.report import report
-from fastrod_device.experiment import Tracking
+from fastrod_device.experiment import TrackingRun
 from fastrod_device.loop import Loop
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ def show(loop: Loop, console: Console, sealed: Mapping[str, Any] | None = None) 
     console.print(tracking_table(rows))
 
 
-def tracking_table(rows: Sequence[tuple[str, Tracking]]) -> Table:
+def tracking_table(rows: Sequence[tuple[str, TrackingRun]]) -> Table:
     """A row for each run along a path, with what drove it, mm."""
     from rich import box
     from rich.table import Table
@@ -143,7 +143,7 @@ def _flat(points: Any) -> tuple[Any, Any]:
     return 1e3 * points[:, 0], 1e3 * points[:, 1]
 
 
-def _figures(one: Tracking) -> dict[str, Any]:
+def _figures(one: TrackingRun) -> dict[str, Any]:
     return {
         "rms_m": one.rms,
         "floor_rms_m": one.floor_rms,

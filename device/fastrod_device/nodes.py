@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from fastrod.errors import InputError
 from fastrod.types import Floats
-from fastrod_device.bus import Line
+from fastrod_device.bus import BusLine
 from fastrod_device.clock import Clock
 from fastrod_device.dictionary import Key
 from fastrod_device.errors import DeviceError
@@ -88,7 +88,7 @@ class EmulatedDrives:
         """SYNCs in the cyclic mode, operation enabled, before which no set-point had come."""
         self.sdo_served = 0
         """SDO requests so far."""
-        self._line = Line(bus)
+        self._line = BusLine(bus)
         self._done = threading.Event()
         self._subscribe()
         self._thread = (

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 
 from fastrod.errors import InputError
 from fastrod.types import Floats
-from fastrod_device.plant_rod import COMPLIANCE, OFFSET, Rest, Rod
+from fastrod_device.plant_rod import COMPLIANCE, OFFSET, PlantRest, PlantRod
 from fastrod_device.seal import Seal
 
 _G = 9.81  # m/s^2
@@ -152,7 +152,7 @@ class Plant:
             )
         inside = seal.open()
         stretch, body = inside.get("tendon_stretch", _NOTHING), inside.get("gravity", _NOTHING)
-        self._rod = Rod(
+        self._rod = PlantRod(
             compliance=COMPLIANCE + stretch.get("compliance", 0.0),
             settling=stretch.get("settling", 0.0),
             knee=stretch.get("knee", 1.0),
@@ -177,8 +177,8 @@ class Plant:
         self._past: deque[_Moment] = deque()
         self._began = math.nan
         self._now = _Moment(-math.inf, (0.0, 0.0, 0.0, 0.0), self._load)
-        self._true: tuple[_Moment, Rest] | None = None
-        self._seen: tuple[_Moment, Rest] | None = None
+        self._true: tuple[_Moment, PlantRest] | None = None
+        self._seen: tuple[_Moment, PlantRest] | None = None
 
     def __repr__(self) -> str:
         return "Plant(sealed)"
@@ -327,7 +327,7 @@ class Plant:
         rest = self._true[1]
         return rest.position.copy(), rest.rotation.copy()
 
-    def _solve(self, moment: _Moment, last: tuple[_Moment, Rest] | None) -> tuple[_Moment, Rest]:
+    def _solve(self, moment: _Moment, last: tuple[_Moment, PlantRest] | None) -> tuple[_Moment, PlantRest]:
         if last is not None and last[0].wires == moment.wires and last[0].load == moment.load:
             return moment, last[1]
         down = np.array(moment.load.down)

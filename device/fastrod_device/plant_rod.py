@@ -69,7 +69,7 @@ _LOCK = np.einsum("xi,yi->ixy", _LEVER, _LEVER).reshape(4, 9)
 _LOCK[:, 8] = OFFSET**2
 
 
-class Rest(NamedTuple):
+class PlantRest(NamedTuple):
     """Where the rod is at rest, base frame."""
 
     position: Floats
@@ -90,7 +90,7 @@ class Rest(NamedTuple):
 
 @final
 @dataclass(frozen=True, kw_only=True, repr=False)
-class Rod:
+class PlantRod:
     """A rod and its wires. The extension of a wire by T is c ((1 - q) T + q T0 arcsinh(T / T0)): strands
     settle under load."""
 
@@ -116,7 +116,7 @@ class Rod:
     def _stiffness(self) -> Floats:
         return np.array([self.bending, self.bending, self.torsion])
 
-    def rest(self, dl: Floats, tip_force: Floats, down: Floats, start: Rest | None = None) -> Rest:
+    def rest(self, dl: Floats, tip_force: Floats, down: Floats, start: PlantRest | None = None) -> PlantRest:
         """The shape for wires `dl` (4,) [m] under the dead load `tip_force` (3,) [N], with the unit vector
         `down` (3,), base frame.
 
@@ -129,7 +129,7 @@ class Rod:
             if found is not None:
                 return found
         for parts in _STRIDES:
-            at: Rest | None = Rest(
+            at: PlantRest | None = PlantRest(
                 np.zeros(3),
                 _EYE,
                 np.zeros(4),
@@ -148,7 +148,7 @@ class Rod:
             "let no two wires pull apart."
         )
 
-    def _from(self, start: Rest, dl: Floats, tip_force: Floats, line: Floats) -> Rest | None:
+    def _from(self, start: PlantRest, dl: Floats, tip_force: Floats, line: Floats) -> PlantRest | None:
         """Newton from a shape whose wires are moved to first order."""
         moved = dl - start.dl
         modes = start.modes + (start.lever @ moved).reshape(_MODES, 3)
@@ -164,7 +164,7 @@ class Rod:
 
     def _newton(
         self, dl: Floats, tip_force: Floats, line: Floats, modes: Floats, tension: Floats
-    ) -> Rest | None:
+    ) -> PlantRest | None:
         """Newton on modes and tensions together; None where it does not settle."""
         force, elastic = tip_force + line, self._stiffness  # (n, 3), (3,)
         system = np.empty((_SIZE + 4, _SIZE + 4))
@@ -229,7 +229,9 @@ class Rod:
             if most < 3e-4:  # the next step would be its square
                 last = _frames(modes)
                 gain = inverse[:, _SIZE:]
-                return Rest(_WEIGHT @ last[:, :, 2], last[-1], tension, gain[_SIZE:], modes, dl, gain[:_SIZE])
+                return PlantRest(
+                    _WEIGHT @ last[:, :, 2], last[-1], tension, gain[_SIZE:], modes, dl, gain[:_SIZE]
+                )
         return None
 
 

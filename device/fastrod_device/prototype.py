@@ -21,7 +21,7 @@ from fastrod.logs.recording import Recorder
 from fastrod.model.robot import Robot
 from fastrod.types import Floats
 from fastrod_device import columns
-from fastrod_device.camera import Frame, FrameSource
+from fastrod_device.camera import CameraFrame, FrameSource
 from fastrod_device.clock import Clock, WallClock
 from fastrod_device.drive import DriveBus
 from fastrod_device.errors import DeviceError, RefusedError
@@ -33,10 +33,10 @@ from fastrod_device.homing import home
 from fastrod_device.journal import Journal
 from fastrod_device.pacer import Pacer, urgent, urgently
 from fastrod_device.readings import Readings
-from fastrod_device.safety import CameraWatch, Fault, State, Supervisor, limited
+from fastrod_device.safety import CameraWatch, Fault, SafetyState, Supervisor, limited
 from fastrod_device.safety_words import of_exception
 from fastrod_device.trace import Trace
-from fastrod_device.tracker import MarkerTracker, Sighting, outlined
+from fastrod_device.tracker import MarkerSighting, MarkerTracker, outlined
 from fastrod_device.units import Transmission
 
 Plan = Callable[[float], Floats]
@@ -111,9 +111,9 @@ class Prototype:
         self._past = Trace(n, int(_REMEMBERED * hardware.rate))
         self.readings: Readings | None = None
         """Of the newest cycle."""
-        self.sighting: Sighting | None = None
+        self.sighting: MarkerSighting | None = None
         """The newest, trusted or not."""
-        self._frame: Frame | None = None
+        self._frame: CameraFrame | None = None
         self._pace = hardware.limits.rate
         self._trusted, self._alike = self.clock.now(), 0
         self._zero = self.clock.now()
@@ -195,7 +195,7 @@ class Prototype:
             self.drives, self.hardware, self.clock, None if self.source is None else self._see
         )
 
-    def _see(self) -> Sighting | None:
+    def _see(self) -> MarkerSighting | None:
         frame = None if self.source is None else self.source.read()
         return None if frame is None else self.tracker.look(frame, now=self.clock.now())
 
@@ -209,7 +209,7 @@ class Prototype:
         if ext is not None and np.any(np.asarray(ext, dtype=np.float64) != 0.0):
             raise RefusedError("ext is not zero; the prototype has no segment that can extend.")
         with self._lock:  # checked and taken in one: nothing is left to move by after a stop and a release
-            if self.supervisor.state is State.STOPPED:
+            if self.supervisor.state is SafetyState.STOPPED:
                 return
             self._wanted, self._plan = self.supervisor.check(dl, self.clock.now(), stamp=stamp), None
             self._pace = self.hardware.limits.rate
@@ -266,7 +266,7 @@ class Prototype:
                 with self.supervisor.guard(self.clock):
                     self._cycle()
                     self.look()
-            if self.supervisor.state is State.STOPPED:
+            if self.supervisor.state is SafetyState.STOPPED:
                 raise DeviceError(self.supervisor.status)
 
     @contextmanager
@@ -294,7 +294,7 @@ class Prototype:
         """The newest sighting with the wires as they were then; without a camera the wires alone."""
         with self._lock:
             sighting, readings = self.sighting, self.readings
-        problem = self.supervisor.status if self.supervisor.state is State.STOPPED else ""
+        problem = self.supervisor.status if self.supervisor.state is SafetyState.STOPPED else ""
         if sighting is not None and self.source is not None:
             return self._measured(sighting, problem)
         n = self.robot.n_tendons
@@ -396,11 +396,14 @@ class Prototype:
         """One set-point to every drive, what they answer, and whether all is well."""
         self._do_jobs()
         now, dt = self.clock.now(), 1.0 / self.hardware.rate
-        planned = self._plan if self.supervisor.state in (State.READY, State.RUNNING) else None
+        planned = self._plan if self.supervisor.state in (SafetyState.READY, SafetyState.RUNNING) else None
         # unlocked: nobody knows how long it takes
         told = None if planned is None else planned[0](now - planned[1])
         with self._lock:
-            moving = self.supervisor.state in (State.READY, State.RUNNING)  # a stop may have come meanwhile
+            moving = self.supervisor.state in (
+                SafetyState.READY,
+                SafetyState.RUNNING,
+            )  # a stop may have come meanwhile
             if moving and told is not None and self._plan is planned:
                 self._wanted = self.supervisor.check(told, now)
             before, wanted = self._set, self._wanted
@@ -461,7 +464,7 @@ class Prototype:
                 if recorder.recording:  # otherwise somebody has just ended it
                     raise
 
-    def _measured(self, sighting: Sighting, problem: str) -> Measurement:
+    def _measured(self, sighting: MarkerSighting, problem: str) -> Measurement:
         readings = self.readings
         trusted = sighting.ok
         return Measurement(

@@ -22,7 +22,7 @@ class Emergency:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Feedback:
+class DriveFeedback:
     """The newest words of all drives, in the drives' units; drive axis first."""
 
     t: float

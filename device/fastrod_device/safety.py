@@ -33,12 +33,12 @@ from fastrod_device.safety_words import (
     of_exception,
 )
 
-__all__ = ["KINDS", "TRANSITIONS", "CameraWatch", "Fault", "Limits", "State", "Supervisor", "limited"]
+__all__ = ["KINDS", "TRANSITIONS", "CameraWatch", "Fault", "Limits", "SafetyState", "Supervisor", "limited"]
 
 _REMEMBERED = 1000  # changes of state
 
 
-class State(Enum):
+class SafetyState(Enum):
     """What the robot may do."""
 
     OFF = "off"
@@ -53,18 +53,18 @@ class State(Enum):
 
 TRANSITIONS = MappingProxyType(
     {
-        (State.OFF, "enabled"): State.READY,
-        (State.READY, "command"): State.RUNNING,
-        (State.RUNNING, "command"): State.RUNNING,
-        (State.OFF, "disabled"): State.OFF,
-        (State.READY, "disabled"): State.OFF,
-        (State.RUNNING, "disabled"): State.OFF,
-        (State.STOPPED, "disabled"): State.STOPPED,
-        (State.STOPPED, "acknowledged"): State.OFF,
-        (State.OFF, "fault"): State.STOPPED,
-        (State.READY, "fault"): State.STOPPED,
-        (State.RUNNING, "fault"): State.STOPPED,
-        (State.STOPPED, "fault"): State.STOPPED,
+        (SafetyState.OFF, "enabled"): SafetyState.READY,
+        (SafetyState.READY, "command"): SafetyState.RUNNING,
+        (SafetyState.RUNNING, "command"): SafetyState.RUNNING,
+        (SafetyState.OFF, "disabled"): SafetyState.OFF,
+        (SafetyState.READY, "disabled"): SafetyState.OFF,
+        (SafetyState.RUNNING, "disabled"): SafetyState.OFF,
+        (SafetyState.STOPPED, "disabled"): SafetyState.STOPPED,
+        (SafetyState.STOPPED, "acknowledged"): SafetyState.OFF,
+        (SafetyState.OFF, "fault"): SafetyState.STOPPED,
+        (SafetyState.READY, "fault"): SafetyState.STOPPED,
+        (SafetyState.RUNNING, "fault"): SafetyState.STOPPED,
+        (SafetyState.STOPPED, "fault"): SafetyState.STOPPED,
     }
 )
 """(state, event) -> next state; what is not here is refused. Only a person's `acknowledge` leaves STOPPED,
@@ -102,10 +102,10 @@ class Supervisor:
         self._inspector = Inspector(robot.n_tendons, limits, nodes, words)
         self._on_stop = on_stop
         self._lock = threading.RLock()  # a signal handler may press stop while this thread holds it
-        self._mode = State.OFF
+        self._mode = SafetyState.OFF
         self._faults: list[Fault] = []
         self._lasting: tuple[Fault, ...] = ()
-        self._history: deque[tuple[float, State, str]] = deque(maxlen=_REMEMBERED)
+        self._history: deque[tuple[float, SafetyState, str]] = deque(maxlen=_REMEMBERED)
         self._unsent, self._refusal = "", ""
         self._looked: float | None = None
         self._wall: float | None = None
@@ -113,9 +113,9 @@ class Supervisor:
         self._meant = -math.inf
 
     @property
-    def state(self) -> State:
+    def state(self) -> SafetyState:
         """Now."""
-        return State.STOPPED if self._faults else self._mode
+        return SafetyState.STOPPED if self._faults else self._mode
 
     @property
     def first(self) -> Fault | None:
@@ -128,7 +128,7 @@ class Supervisor:
         return tuple(self._faults)
 
     @property
-    def history(self) -> tuple[tuple[float, State, str], ...]:
+    def history(self) -> tuple[tuple[float, SafetyState, str], ...]:
         """(t [s], state, why) of the newest changes of state, oldest first."""
         with self._lock:
             return tuple(self._history)
@@ -139,7 +139,10 @@ class Supervisor:
         with self._lock:
             faults, mode = self.faults, self._mode
             if not faults:
-                words = {State.OFF: "The drives are off.", State.READY: "The drives are enabled and hold."}
+                words = {
+                    SafetyState.OFF: "The drives are off.",
+                    SafetyState.READY: "The drives are enabled and hold.",
+                }
                 return words.get(mode, "The robot follows commands.")
             parts = [f"Stopped ({faults[0].kind}): {faults[0].sentence.rstrip('.')}"]
             if len(faults) > 1:
@@ -156,7 +159,7 @@ class Supervisor:
         Raises `RefusedError` from any other state; where a stop came while they were being enabled, it is
         sent again first.
         """
-        if self.state is State.STOPPED:
+        if self.state is SafetyState.STOPPED:
             self._send(self.first)
         with self._lock:
             self._step("enabled", now, "the drives were enabled")
@@ -176,12 +179,12 @@ class Supervisor:
         `displacement` or `curvature`, older than `command_age`, or where the robot is off or stopped.
         """
         with self._lock:
-            if self.state is State.STOPPED:
+            if self.state is SafetyState.STOPPED:
                 raise RefusedError(
                     f"the robot is stopped: {self._faults[0].sentence.rstrip('.')}; a person "
                     "must release it first."
                 )
-            if self.state is State.OFF:
+            if self.state is SafetyState.OFF:
                 raise RefusedError("the drives are off; enable them first.")
             wanted = self.within(dl)
             meant = now if stamp is None else stamp
@@ -235,7 +238,7 @@ class Supervisor:
         with self._lock:
             if (
                 self._looked is None
-                or self.state not in (State.READY, State.RUNNING)
+                or self.state not in (SafetyState.READY, SafetyState.RUNNING)
                 or now - self._looked <= self.limits.cycle
             ):
                 return None
@@ -247,7 +250,7 @@ class Supervisor:
         """Nobody watches any more: a stop where drives are enabled, which is returned where it is the first;
         else None."""
         with self._lock:
-            if self.state not in (State.READY, State.RUNNING):
+            if self.state not in (SafetyState.READY, SafetyState.RUNNING):
                 return None
             sentence = f"nobody watches the robot any more while it is {self.state.value}."
             new = self._latch([Fault(kind="nobody watches", sentence=sentence, t=now)])
@@ -282,7 +285,7 @@ class Supervisor:
         homes, finds the wire again.
         """
         with self._lock:
-            if self.state is not State.STOPPED:
+            if self.state is not SafetyState.STOPPED:
                 raise RefusedError(
                     f"the robot is {self.state.value}, not stopped; there is nothing to release."
                 )
@@ -310,7 +313,7 @@ class Supervisor:
         after = TRANSITIONS.get((before, event))
         if after is None:
             raise RefusedError(f"{why}, but the robot is {before.value}; that is no time for it.")
-        if after is not State.STOPPED:
+        if after is not SafetyState.STOPPED:
             self._mode = after
         if after is not before:
             self._history.append((now, after, why))
@@ -323,8 +326,8 @@ class Supervisor:
         self._faults.extend(new)
         if was or not new:
             return None
-        self._mode, self._refusal = State.OFF, ""
-        self._history.append((new[0].t, State.STOPPED, new[0].sentence))
+        self._mode, self._refusal = SafetyState.OFF, ""
+        self._history.append((new[0].t, SafetyState.STOPPED, new[0].sentence))
         return new[0]
 
     def _send(self, fault: Fault | None) -> None:
@@ -357,14 +360,14 @@ class Supervisor:
         inspector, state = self._inspector, self.state
         inspector.require(readings)
         self._lasting = tuple(by_priority(inspector.lasting(now, readings, camera)))
-        if state is State.OFF:
+        if state is SafetyState.OFF:
             return ()
         found = [*inspector.drives(now, readings), *self._lasting]
-        if state is not State.STOPPED:
+        if state is not SafetyState.STOPPED:
             found += inspector.powered(now, readings, self._before)
             if self._looked is not None:
                 found += inspector.times(now, wall, self._looked, self._wall)
-        if state is State.RUNNING:
+        if state is SafetyState.RUNNING:
             found += inspector.command(now, readings, self._meant)
         return found
 

@@ -26,7 +26,16 @@ import numpy as np
 from fastrod.errors import InputError
 from fastrod.rotation import quaternion_from_matrix
 from fastrod.types import Floats
-from fastrod_device.camera import Camera, Frame, Marker, Picture, Pose, compose, dictionary_named, inverse
+from fastrod_device.camera import (
+    Camera,
+    CameraFrame,
+    Marker,
+    Picture,
+    Pose,
+    compose,
+    dictionary_named,
+    inverse,
+)
 from fastrod_device.edges import SideFit, Sides
 from fastrod_device.gates import TOO_FAST, TWICE, FrameOrder, Workspace
 
@@ -42,7 +51,7 @@ _GAUSS = 1.0 / math.sqrt(3.0)  # two points that weigh on a line as much as all 
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Sighting:
+class MarkerSighting:
     """What one frame says about the tip; nan where it says nothing."""
 
     t: float
@@ -118,10 +127,12 @@ class MarkerTracker:
 
     def reset(self) -> None:
         """Forget the last sighting, and the frames."""
-        self._last: Sighting | None = None
+        self._last: MarkerSighting | None = None
         self._order.reset()
 
-    def look(self, frame: Frame, expected: Pose | None = None, *, now: float | None = None) -> Sighting:
+    def look(
+        self, frame: CameraFrame, expected: Pose | None = None, *, now: float | None = None
+    ) -> MarkerSighting:
         """What the frame says. `expected`: base_from_tip by a model, position (3,) [m] and quaternion (4,),
         by which both solutions are judged; `now`: the clock [s], None where frames may have any stamp.
 
@@ -155,7 +166,7 @@ class MarkerTracker:
         ):
             flag = "ambiguous"
         pixels = self._fit.distorted(sides.corners)
-        sighting = Sighting(
+        sighting = MarkerSighting(
             t=t,
             number=frame.number,
             flag=flag,
@@ -344,9 +355,9 @@ def _turned(vector: Floats) -> Floats:
     return np.asarray(np.eye(3) + 2.0 / (1.0 + square) * (skew + skew @ skew))
 
 
-def _nothing(t: float, number: int, flag: str) -> Sighting:
+def _nothing(t: float, number: int, flag: str) -> MarkerSighting:
     """A frame without a pose."""
-    return Sighting(
+    return MarkerSighting(
         t=t,
         number=number,
         flag=flag,
@@ -361,7 +372,7 @@ def _nothing(t: float, number: int, flag: str) -> Sighting:
     )
 
 
-def outlined(image: Picture, sighting: Sighting) -> Picture:
+def outlined(image: Picture, sighting: MarkerSighting) -> Picture:
     """(h, w, 3) red, green, blue: a frame with the marker's sides, green where the sighting is trusted, red
     where it is not."""
     import cv2

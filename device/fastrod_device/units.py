@@ -11,7 +11,7 @@ import numpy as np
 
 from fastrod.errors import InputError, shown
 from fastrod.types import Floats, Ints
-from fastrod_device.readings import Feedback, Readings
+from fastrod_device.readings import DriveFeedback, Readings
 
 _RANGE = {
     "drum_radius": (1e-4, 0.1),
@@ -134,7 +134,7 @@ class Transmission:
         """(..., n_drives) motor currents [A] of torques in thousandths of the rated one."""
         return np.asarray(torque * self._torque * self._amperes, dtype=np.float64)
 
-    def readings(self, feedback: Feedback) -> Readings:
+    def readings(self, feedback: DriveFeedback) -> Readings:
         """What drives say, in SI units."""
         return Readings(
             t=feedback.t,

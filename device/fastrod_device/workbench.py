@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fastrod.errors import InputError
-from fastrod_device.boards import AskingBoardHands, BoardEye, BoardHands, bent, moved
+from fastrod_device.boards import AskingBoardHands, BoardEye, BoardMover, bent, moved
 from fastrod_device.calibration import CharucoBoard
 from fastrod_device.camera import Camera, FrameSource, VideoCamera
 from fastrod_device.clock import Clock, SteppedClock, WallClock
 from fastrod_device.emulator import Emulator
-from fastrod_device.experiment import AskingHands, Hands
+from fastrod_device.experiment import AskingHands, HandMover
 from fastrod_device.hardware import Hardware
 from fastrod_device.journal import Journal
 from fastrod_device.prototype import Prototype
@@ -27,11 +27,11 @@ _COUNT = itertools.count(1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Bench:
+class EmulatedBench:
     """A prototype and who helps it."""
 
     prototype: Prototype
-    hands: Hands
+    hands: HandMover
     emulator: Emulator | None
     """None where the prototype is real."""
 
@@ -41,7 +41,7 @@ class BoardBench:
     """A camera and who shows a board to it."""
 
     source: FrameSource
-    hands: BoardHands
+    hands: BoardMover
     clock: Clock
     truth: Camera | None
     """What an emulated camera is and where it stands; None where it is real."""
@@ -58,7 +58,7 @@ def emulated(
     journal: str | Path | None = None,
     home: bool = True,
     eds: str | Path | None = None,
-) -> Iterator[Bench]:
+) -> Iterator[EmulatedBench]:
     """The emulator, started, with a sealed plant: `seed` draws what is hidden (None: nobody knows), `effect`
     names it for those who test.
 
@@ -73,7 +73,7 @@ def emulated(
     try:
         with Prototype(hardware, name, emulator, clock=clock, eds=eds, journal=Journal(journal)) as prototype:
             prototype.start(home=home)
-            yield Bench(prototype=prototype, hands=emulator, emulator=emulator)
+            yield EmulatedBench(prototype=prototype, hands=emulator, emulator=emulator)
     finally:
         emulator.close()
 
@@ -87,7 +87,7 @@ def real(
     eds: str | Path | None = None,
     journal: str | Path | None = None,
     home: bool = True,
-) -> Iterator[Bench]:
+) -> Iterator[EmulatedBench]:
     """The prototype on `bus` ("socketcan:can0"), with the video device `camera` (None: without), started, a
     person's hands beside it.
 
@@ -97,7 +97,7 @@ def real(
     try:
         with Prototype(hardware, bus, source, eds=eds, journal=Journal(journal)) as prototype:
             prototype.start(home=home)
-            yield Bench(prototype=prototype, hands=AskingHands(), emulator=None)
+            yield EmulatedBench(prototype=prototype, hands=AskingHands(), emulator=None)
     finally:
         if source is not None:
             source.close()

@@ -21,11 +21,11 @@ from fastrod.model.robot import Robot
 from fastrod.types import Floats
 
 if TYPE_CHECKING:
-    from fastrod_device.calibration import CameraCalibration, CharucoBoard, Registration
+    from fastrod_device.calibration import CameraCalibration, CharucoBoard, MarkerRegistration
     from fastrod_device.camera import Camera
     from fastrod_device.experiment import Law, Progress
     from fastrod_device.hardware import Hardware
-    from fastrod_device.workbench import Bench, BoardBench
+    from fastrod_device.workbench import BoardBench, EmulatedBench
 
 DONE = 0
 _SWITCHES = 1e-3  # s: the thread of the drives waits no longer for one that draws
@@ -135,11 +135,11 @@ def _track(arguments: argparse.Namespace, _: Progress | None) -> int:
 def _policy(given: str, path: str, begins: float, robot: Robot, trust: bool) -> Law:
     """A policy of Track as a law; the path begins so many seconds into the plan."""
     try:
-        from fastrod_envs.pilot import TrackPilot
+        from fastrod_envs.pilot import PolicyDriver
         from fastrod_envs.policies import Policy, find
     except ImportError as error:
         raise InputError("--policy needs gymnasium: pip install 'fastrod[envs]'.") from error
-    pilot = TrackPilot(Policy(find("Track", given), trust=trust), path, robot)
+    pilot = PolicyDriver(Policy(find("Track", given), trust=trust), path, robot)
     return lambda tip, t: pilot.command(tip, t - begins)
 
 
@@ -276,7 +276,7 @@ def _hardware(arguments: argparse.Namespace) -> Hardware:
 @contextmanager
 def _bench(
     arguments: argparse.Namespace, hardware: Hardware, *, stepped: bool = True, journal: Path | None = None
-) -> Iterator[Bench]:
+) -> Iterator[EmulatedBench]:
     import sys
 
     from fastrod_device import workbench
@@ -416,7 +416,7 @@ def _place(row: Sequence[float]) -> tuple[Floats, Floats]:
     return position, quaternion / norm
 
 
-def _tell_views(found: CameraCalibration | Registration, passed: str) -> None:
+def _tell_views(found: CameraCalibration | MarkerRegistration, passed: str) -> None:
     print(
         f"{len(found.used)} views used, reprojection error {found.error:.3f} px rms; {len(found.refused)} "
         "views refused"

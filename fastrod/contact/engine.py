@@ -39,11 +39,22 @@ from fastrod.kernels.contact.iteration import (
     UNSOLVED,
     world_size,
 )
-from fastrod.kernels.contact.problem import Scenery
+from fastrod.kernels.contact.problem import SceneArrays
 from fastrod.kernels.contact.proximity import CANDIDATE
-from fastrod.types import Clearance, Flags, Floats, Ints, Memory, Ports, Probes, Rods, Shape, Touching
+from fastrod.types import (
+    Clearance,
+    ContactRods,
+    ContactSet,
+    Flags,
+    Floats,
+    Ints,
+    Memory,
+    PointLoads,
+    Ports,
+    RodShape,
+)
 
-Pass = Callable[[Ints, Ports, Shape, Probes], None]
+Pass = Callable[[Ints, Ports, RodShape, PointLoads], None]
 """(robots, ports, shape, probes): one forward pass into `shape` that leaves the boundary as it is."""
 
 MOST_FOUND = 64
@@ -62,12 +73,12 @@ _UNSOLVED = 6
 _FEW = 64  # robots below which starting threads costs more than it saves
 
 
-class Snapshot(NamedTuple):
+class ContactSnapshot(NamedTuple):
     """What an `Engine` remembers."""
 
-    touching: Touching
+    touching: ContactSet
     clearance: Clearance
-    before: Shape | None
+    before: RodShape | None
     """Shapes at the last step."""
     tracked: Flags
     """(n_robots,) `before` holds where the robot was."""
@@ -77,7 +88,7 @@ class Snapshot(NamedTuple):
     """(1 or n_robots, n_obstacles, 7) world."""
     poses_before: Floats
     """The same at the last step."""
-    at_last_step: tuple[Shape | None, Floats]
+    at_last_step: tuple[RodShape | None, Floats]
     """Shapes and obstacles before the last step."""
 
 
@@ -85,7 +96,9 @@ class Engine:
     """What contact remembers between steps, and how a step is done. Rows are robots' indices; arrays have the
     robot axis first."""
 
-    def __init__(self, scene: ContactScene, rods: Rods, length: Floats, n_points: int, threads: int) -> None:
+    def __init__(
+        self, scene: ContactScene, rods: ContactRods, length: Floats, n_points: int, threads: int
+    ) -> None:
         n = len(rods.reach)
         self.scene, self.rods, self.length, self.threads = scene, rods, length, threads
         self.surfaces = pack(scene.obstacles)
@@ -93,11 +106,11 @@ class Engine:
         self.poses_before = self.poses = scene.rest_poses()
         self.velocities: dict[int, Floats] = {}
         self.dt = 0.0
-        self.at_last_step: tuple[Shape | None, Floats] = (None, self.poses)
+        self.at_last_step: tuple[RodShape | None, Floats] = (None, self.poses)
         """Shape and obstacles before the last step."""
-        self.touching = Touching(np.zeros(n, np.int64), np.zeros((n, scene.max_contacts, SLOT)))
+        self.touching = ContactSet(np.zeros(n, np.int64), np.zeros((n, scene.max_contacts, SLOT)))
         self.clearance = Clearance(np.full((n, n_points), -np.inf), np.zeros((n, n_points, 3)))
-        self.before: Shape | None = None
+        self.before: RodShape | None = None
         self.tracked, self.slides = np.zeros(n, bool), np.ones(n, bool)
         self.gap = np.full(n, np.inf)
         self.trouble = np.zeros((n, TROUBLE))
@@ -131,17 +144,17 @@ class Engine:
         self.clearance.distance[rows] = -np.inf
         self.tracked[rows] = False
 
-    def snapshot(self) -> Snapshot:
+    def snapshot(self) -> ContactSnapshot:
         """A copy of everything that a later step depends on; shapes are handed out once and not written
         again."""
-        touching = Touching(self.touching.used.copy(), self.touching.slot.copy())
+        touching = ContactSet(self.touching.used.copy(), self.touching.slot.copy())
         clearance = Clearance(self.clearance.distance.copy(), self.clearance.position.copy())
         poses = self.poses, self.poses_before, self.at_last_step
-        return Snapshot(touching, clearance, self.before, self.tracked.copy(), self.gap.copy(), *poses)
+        return ContactSnapshot(touching, clearance, self.before, self.tracked.copy(), self.gap.copy(), *poses)
 
-    def restore(self, snapshot: Snapshot) -> None:
+    def restore(self, snapshot: ContactSnapshot) -> None:
         """Go back to a `snapshot` of this engine."""
-        self.touching = Touching(snapshot.touching.used.copy(), snapshot.touching.slot.copy())
+        self.touching = ContactSet(snapshot.touching.used.copy(), snapshot.touching.slot.copy())
         self.clearance = Clearance(snapshot.clearance.distance.copy(), snapshot.clearance.position.copy())
         self.before, self.tracked, self.gap = snapshot.before, snapshot.tracked.copy(), snapshot.gap.copy()
         self.poses, self.poses_before, self.at_last_step = (
@@ -177,7 +190,7 @@ class Engine:
         worlds[self.world[some]] = True
         return np.asarray(worlds[self.world])
 
-    def touches(self, rows: Ints, shape: Shape) -> Flags:
+    def touches(self, rows: Ints, shape: RodShape) -> Flags:
         """(n_robots,) which of `rows`, free until now, overlap something in `shape` or have gone through it;
         with their worlds."""
         some = np.zeros(len(self.gap), bool)
@@ -202,7 +215,7 @@ class Engine:
         start: Ports | None,
         end: Ports,
         memory: Memory,
-        shape: Shape,
+        shape: RodShape,
         run: Pass,
         tolerance: float,
         passes: Ints,
@@ -277,13 +290,13 @@ class Engine:
                 now[lost] = last[lost]
         return arrived, done
 
-    def accept(self, rows: Ints, shape: Shape, on_the_way: bool = False) -> None:
+    def accept(self, rows: Ints, shape: RodShape, on_the_way: bool = False) -> None:
         """These robots are at rest in `shape`: from there they slip and move. `on_the_way`: it will be
         written to again."""
         if len(rows) == len(self.gap) and not on_the_way:
             self.before = shape
         else:
-            self.before = Shape(*(np.array(a) for a in (shape if self.before is None else self.before)))
+            self.before = RodShape(*(np.array(a) for a in (shape if self.before is None else self.before)))
             for last, now in zip(self.before, shape, strict=True):
                 last[rows] = now[rows]
         self.tracked[rows] = True
@@ -295,7 +308,7 @@ class Engine:
             self.poses if (done >= 1.0).all() else between(self.poses_before, self.poses, done)
         )
 
-    def held(self, rows: Ints, ports: Ports, n_x: int) -> tuple[Ports, Probes]:
+    def held(self, rows: Ints, ports: Ports, n_x: int) -> tuple[Ports, PointLoads]:
         """The present contacts of these robots as loads of a pass, and a probe at the tip that carries
         none."""
         most = int(self.touching.used[rows].max(initial=0))
@@ -325,7 +338,7 @@ class Engine:
             done,
         )
 
-    def contacts(self, shape: Shape, ok: Flags) -> Contacts:
+    def contacts(self, shape: RodShape, ok: Flags) -> Contacts:
         """What touches what now."""
         n, n_obstacles = len(self.gap), len(self.surfaces.kind)
         slot = self.touching.slot
@@ -377,9 +390,9 @@ class Engine:
         rows: Ints,
         ports: Ports,
         memory: Memory,
-        shape: Shape,
+        shape: RodShape,
         run: Pass,
-        scenery: Scenery,
+        scenery: SceneArrays,
         passes: Ints,
         most: int,
     ) -> tuple[Flags, Flags]:
@@ -426,7 +439,7 @@ class Engine:
                 self.trouble[i, 0] = NO_CONTACT_LEFT
 
     def _iterate(
-        self, rows: Ints, ports: Ports, memory: Memory, shape: Shape, run: Pass, scenery: Scenery
+        self, rows: Ints, ports: Ports, memory: Memory, shape: RodShape, run: Pass, scenery: SceneArrays
     ) -> Ints:
         """One pass and one round of the law for the worlds of `rows`; their status. Worlds with as many
         contacts go together."""
@@ -454,9 +467,9 @@ class Engine:
         n_slots: int,
         ports: Ports,
         memory: Memory,
-        shape: Shape,
+        shape: RodShape,
         run: Pass,
-        scenery: Scenery,
+        scenery: SceneArrays,
     ) -> Ints:
         n, n_x = len(rows), memory.x.shape[1]
         probes = empty_probes(n, n_slots, n_x)
@@ -486,7 +499,7 @@ class Engine:
                 status[r] = LOST if status[r] == LOST else GOES_ON
         return status
 
-    def _arranged(self, rows: Ints, ports: Ports, probes: Probes) -> Ports:
+    def _arranged(self, rows: Ints, ports: Ports, probes: PointLoads) -> Ports:
         """The ports with a node under every contact; fills the loads of the probes."""
         n_robots, n_steps = len(self.gap), self.rods.n_steps
         n_segments = self.rods.radius.shape[1]
@@ -509,8 +522,8 @@ class Engine:
         return 1 if n <= _FEW else min(self.threads, n)
 
     def _scenery(
-        self, shape: Shape, tolerance: float, done: Floats, aim: Floats, damping: float = 0.0
-    ) -> Scenery:
+        self, shape: RodShape, tolerance: float, done: Floats, aim: Floats, damping: float = 0.0
+    ) -> SceneArrays:
         """The obstacles at the part `aim` of their way, and at the part `done` that is behind."""
         if self.poses is self.poses_before and not self.velocities:
             frames = before = slip = frames_of(self.poses)
@@ -523,7 +536,7 @@ class Engine:
                 ago[:, k] = slid
             frames, before, slip = frames_of(poses), frames_of(last), frames_of(ago)
         history = shape if self.before is None else self.before
-        return Scenery(
+        return SceneArrays(
             self.rods,
             self.surfaces,
             frames,
@@ -539,11 +552,11 @@ class Engine:
         )
 
 
-def empty_probes(n_rows: int, n_probes: int, n_x: int) -> Probes:
+def empty_probes(n_rows: int, n_probes: int, n_x: int) -> PointLoads:
     """Room for the contact points of a pass."""
     n_f = 3 * n_probes
     loads = np.zeros((n_rows, n_probes, 3)), np.zeros((n_rows, n_probes, 3))
-    return Probes(
+    return PointLoads(
         np.full((n_rows, n_probes), -1),
         *loads,
         np.zeros((n_rows, n_f, 1 + n_f)),

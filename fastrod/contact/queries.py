@@ -12,9 +12,9 @@ from fastrod.contact.frames import between, frames_of
 from fastrod.errors import InputError, refuse_masked
 from fastrod.kernels.batch import cast_rays, look_at_rods, look_serial
 from fastrod.kernels.contact.bvh import STACK
-from fastrod.kernels.contact.problem import Scenery
+from fastrod.kernels.contact.problem import SceneArrays
 from fastrod.kernels.contact.proximity import CANDIDATE
-from fastrod.types import Clearance, Flags, Floats, Ints, Shape
+from fastrod.types import Clearance, Flags, Floats, Ints, RodShape
 
 _EVERYTHING = 1e6  # of the rod's length: a margin within which all is near
 _MOST_LOOKS = 400
@@ -31,7 +31,7 @@ class Hits(NamedTuple):
     """(n_robots, n_rays, 3) outward normal there, world; nan where none is met."""
 
 
-def clearance(engine: Engine, shape: Shape, name: str | None = None) -> Floats:
+def clearance(engine: Engine, shape: RodShape, name: str | None = None) -> Floats:
     """(n_robots,) smallest gap between a robot's surface, mounting excepted, and the obstacle of this name,
     or all obstacles and, where they may touch, rods [m]. Negative by the depth where they overlap; inf where
     there is nothing; nan where there is no shape.
@@ -40,7 +40,7 @@ def clearance(engine: Engine, shape: Shape, name: str | None = None) -> Floats:
 
 
 def _gap(
-    engine: Engine, shape: Shape, poses: Floats, only: int | None = None, rows: Flags | None = None
+    engine: Engine, shape: RodShape, poses: Floats, only: int | None = None, rows: Flags | None = None
 ) -> Floats:
     n, n_points = shape.arclength.shape
     surfaces, which = engine.surfaces, slice(None) if only is None else [only]
@@ -56,7 +56,7 @@ def _gap(
     )
     frames = np.ascontiguousarray(frames_of(poses)[:, which])
     nobody = np.zeros(n, bool)
-    scenery = Scenery(
+    scenery = SceneArrays(
         engine.rods, surfaces, frames, frames, frames, shape, shape, nobody, nobody, 1e-9, _EVERYTHING, 0.0
     )
     finite = np.isfinite(shape.position).all((1, 2))
@@ -74,9 +74,9 @@ def _gap(
 
 def swept_clearance(
     engine: Engine,
-    before: Shape,
+    before: RodShape,
     poses_before: Floats,
-    after: Shape,
+    after: RodShape,
     tolerance: float,
     rows: Flags | None = None,
 ) -> Floats:

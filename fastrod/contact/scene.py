@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from fastrod.contact.geometry import Obstacle
 from fastrod.errors import InputError, UnknownNameError, nearest, refuse_masked
 from fastrod.model.robot import Robot
-from fastrod.types import Floats, Ints, Layout, Params, Rods
+from fastrod.types import ContactRods, Floats, Ints, Layout, Params
 
 _BEYOND_TENDONS = 1.1  # a body radius of 0 stands for just beyond the outermost tendon (Segment.body_radius)
 
@@ -112,7 +112,7 @@ class ContactScene:
             )
         return np.asarray(np.unique(worlds, return_inverse=True)[1], dtype=np.int64)
 
-    def rods(self, robots: Sequence[Robot], n_robots: int, layout: Layout, params: Params) -> Rods:
+    def rods(self, robots: Sequence[Robot], n_robots: int, layout: Layout, params: Params) -> ContactRods:
         """What contact needs to know of the robots of a simulator."""
         radius = np.array([self.radius_of(robot) for robot in robots])
         reach = np.array([robot.length for robot in robots])
@@ -128,7 +128,7 @@ class ContactScene:
             # writable, as a kernel would be compiled anew for a read-only one
             return np.array(np.broadcast_to(a, (n_robots, *a.shape[1:])), dtype=float, order="C")
 
-        return Rods(
+        return ContactRods(
             each(radius),
             each(first),
             each(spacing),

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fastrod.contact.engine import Engine, Pass
-from fastrod.types import Flags, Floats, Ints, Memory, Ports, Shape
+from fastrod.types import Flags, Floats, Ints, Memory, Ports, RodShape
 
 COLD_PASSES = 2000
 
@@ -16,9 +16,9 @@ COLD_PASSES = 2000
 class Ways(NamedTuple):
     """How a simulator moves robots without contact."""
 
-    free: Callable[[Ints, Ports, Shape], Flags]
+    free: Callable[[Ints, Ports, RodShape], Flags]
     """A step, or `settle`, of these robots; (n_robots,) which are well."""
-    settle: Callable[[Ints, Ports, Shape], Flags]
+    settle: Callable[[Ints, Ports, RodShape], Flags]
     """From the cold guess until at rest."""
     run: Pass
 
@@ -32,7 +32,7 @@ def contact_step(
     end: Ports,
     rest: Ports,
     memory: Memory,
-    shape: Shape,
+    shape: RodShape,
     tolerance: float,
     passes: Ints,
     most: int,
@@ -84,14 +84,14 @@ def _begin(
     end: Ports,
     rest: Ports,
     memory: Memory,
-    shape: Shape,
+    shape: RodShape,
     tolerance: float,
     passes: Ints,
 ) -> Floats:
     """Cold robots that would overlap something: led from their rest shape, or pushed out; how far each
     came."""
     x = memory.x.copy()
-    free_shape = Shape(*(a.copy() for a in shape))
+    free_shape = RodShape(*(a.copy() for a in shape))
     straight = ways.settle(rows, rest, shape)
     clear = straight & ~engine.touches(rows[straight[rows]], shape)
     engine.slides[rows] = False

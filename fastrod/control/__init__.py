@@ -1,6 +1,6 @@
 """Tip control: trajectories, the kinematics of a soft robot on a base that moves, and resolved rates."""
 
-from fastrod.control.kinematics import Arm, Base, FixedBase, MovingBase, SoftTip
+from fastrod.control.kinematics import Arm, BaseKinematics, FixedBase, MovingBase, SoftTip
 from fastrod.control.resolved_rate import ResolvedRate
 from fastrod.control.trajectories import (
     Trajectory,
@@ -17,7 +17,7 @@ from fastrod.control.trajectories import (
 
 __all__ = [
     "Arm",
-    "Base",
+    "BaseKinematics",
     "FixedBase",
     "MovingBase",
     "ResolvedRate",

@@ -33,7 +33,7 @@ _SMOOTHEST = 8  # averages over neighbours; a correction that makes it worse is 
 
 @final
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Plan:
+class InversePlan:
     """What to tell a robot, sample after sample, and where it then goes. The first `n_approach` rows lead to
     the path."""
 
@@ -81,14 +81,14 @@ def plan(
     gain: float = 1.0,
     rollouts: int = 15,
     tolerance: float = 1e-6,
-) -> Plan:
+) -> InversePlan:
     """The plan for a tip that is to be measured at `target` (n, 3), base frame [m], one row each 1 / `rate`
     [Hz].
 
     Effects of the robot's file are all in: sensing decides where the tip is measured, memory (backlash,
     friction, creep ...) how the wires lead it there; the robot begins at rest. A latency is led by sending
-    earlier (`Plan.lead`). A robot with two coordinates reaches a surface only; the tip then goes to the
-    points of it that are nearest to the path.
+    earlier (`InversePlan.lead`). A robot with two coordinates reaches a surface only; the tip then goes to
+    the points of it that are nearest to the path.
 
     `start` (n_tendons,) wire lengths where the robot stands [m], None for straight; from there it takes
     `approach` seconds to the first row of the path, at rest at both ends; with 0 s it begins on the path.
@@ -145,7 +145,7 @@ def plan(
     if rate_limit is not None:
         _check_speed(dl, rate, rate_limit)
     lost = np.full((n_approach, 3), np.nan)
-    return Plan(
+    return InversePlan(
         robot=robot,
         t=_frozen(np.arange(len(whole)) / rate),
         dl=_frozen(dl),

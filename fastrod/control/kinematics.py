@@ -20,7 +20,7 @@ from fastrod.types import Floats
 _STRAIGHT: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 
-class Base(Protocol):
+class BaseKinematics(Protocol):
     """What carries a soft robot: a flange whose pose follows from coordinates of its own (`Arm` is the same
     by another name)."""
 
@@ -35,7 +35,7 @@ class Base(Protocol):
         """(6, n_joints) d(position of the flange's origin [m], rotation vector [rad]) / dq, world."""
 
 
-Arm = Base
+Arm = BaseKinematics
 
 
 @final
@@ -116,7 +116,7 @@ class SoftTip:
     def __init__(
         self,
         simulator: Simulator,
-        base: Base | None = None,
+        base: BaseKinematics | None = None,
         *,
         flange_from_base: ArrayLike = _STRAIGHT,
         offset: float | None = None,
@@ -129,7 +129,9 @@ class SoftTip:
             raise InputError(f"simulator is {simulator!r}; give a Simulator of one robot.")
         robot = simulator.robots[0]
         self.simulator = simulator
-        self.base: Base = FixedBase((*robot.base_position, *robot.base_quaternion)) if base is None else base
+        self.base: BaseKinematics = (
+            FixedBase((*robot.base_position, *robot.base_quaternion)) if base is None else base
+        )
         self.actions = SegmentActions(robot, offset)
         self.n_base = int(self.base.n_joints)
         """Coordinates of the base."""

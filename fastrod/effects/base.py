@@ -26,7 +26,7 @@ import numpy as np
 
 from fastrod.effects.ports import EffectPorts
 from fastrod.errors import EffectError, UnknownNameError, nearest, shown
-from fastrod.model.routing import Wiring
+from fastrod.model.routing import Routing
 from fastrod.types import Floats
 
 Per = Literal["robot", "segment", "drive"]
@@ -92,7 +92,7 @@ class Parameter:
                 self, "starts", (self.neutral + self.typical,) if not self.shape else (self.typical,)
             )
 
-    def on(self, wiring: Wiring) -> Parameter:
+    def on(self, wiring: Routing) -> Parameter:
         """This parameter in its unit, for one robot."""
         if not self.of:
             return self
@@ -168,7 +168,7 @@ class Operator(ABC):
     order: ClassVar[float] = 50.0
 
     @abstractmethod
-    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Wiring) -> Floats:
+    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Routing) -> Floats:
         """(n_robots, n_steps, n_tendons) what the wires end up at, from `dl` commanded [m] and `dt`
         (n_steps,) before each step [s].
 
@@ -270,7 +270,7 @@ def load_library() -> None:
         plug_in.load()
 
 
-def columns(what: Effect, wiring: Wiring) -> list[str]:
+def columns(what: Effect, wiring: Routing) -> list[str]:
     """Names of the value columns of an effect on this robot: half_width, or half_width_1, half_width_2 ..."""
     names = []
     for parameter in what.parameters:
@@ -279,7 +279,7 @@ def columns(what: Effect, wiring: Wiring) -> list[str]:
     return names
 
 
-def read_values(name: str, given: Mapping[str, object], wiring: Wiring, where: str) -> Floats:
+def read_values(name: str, given: Mapping[str, object], wiring: Routing, where: str) -> Floats:
     """(n_columns,) values of an effect from its table in a robot file; a parameter that is not given is
     neutral.
 

@@ -12,12 +12,12 @@ from fastrod.effects.base import Effect, Seam, canonical_name, effect_names, get
 from fastrod.effects.ports import EffectPorts, close_ports, open_ports
 from fastrod.errors import EffectError, RobotError, nearest
 from fastrod.model.robot import Robot
-from fastrod.model.routing import Wiring, wire
+from fastrod.model.routing import Routing, wire
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.types import Flags, Floats, Params, Ports
 
 
-class Measurement(NamedTuple):
+class SensedPoses(NamedTuple):
     """What a camera on the base sees of the tip, effects of sensing included; base frame."""
 
     tip_position: Floats
@@ -57,7 +57,7 @@ def named_effects(robot: Robot) -> dict[str, dict[str, Any]]:
     return {name: tables[name] for name in effect_names() if name in tables}
 
 
-def _alike(one: Wiring, other: Wiring) -> bool:
+def _alike(one: Routing, other: Routing) -> bool:
     """Whether wires and segments are the same to a part in a million million."""
     return bool(
         np.allclose(one.arms, other.arms, rtol=1e-12, atol=0.0)
@@ -65,7 +65,7 @@ def _alike(one: Wiring, other: Wiring) -> bool:
     )
 
 
-class Chain:
+class EffectPipeline:
     """The effects that a batch of robots has, with their memories."""
 
     def __init__(self, robots: Sequence[Robot], n_robots: int) -> None:
@@ -172,15 +172,15 @@ class Chain:
         return slopes
 
     def sense(
-        self, measurement: Measurement, ports: Ports, params: Params, dt: float, n_steps: int
-    ) -> Measurement:
+        self, measurement: SensedPoses, ports: Ports, params: Params, dt: float, n_steps: int
+    ) -> SensedPoses:
         """The measurement with the effects of sensing."""
         opened = self._open(ports, params, n_steps)
         opened.tip_position, opened.tip_rotation, opened.points = (a.copy() for a in measurement)
         for link in self.links:
             if link.effect.seam is Seam.SENSING:
                 link.effect.apply(link.values, link.memory, opened, None, dt)
-        return Measurement(opened.tip_position, opened.tip_rotation, opened.points)
+        return SensedPoses(opened.tip_position, opened.tip_rotation, opened.points)
 
     def _open(self, ports: Ports, params: Params, n_steps: int) -> EffectPorts:
         opened = open_ports(

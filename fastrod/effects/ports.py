@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fastrod.model.routing import Wiring
+from fastrod.model.routing import Routing
 from fastrod.types import Floats, Params, Ports
 
 
@@ -19,7 +19,7 @@ class EffectPorts:
     """The ports of a step with the robot's own numbers beside them; every array has its row axis expanded and
     may be changed in place, unless "read" is said. World frame unless said otherwise."""
 
-    wiring: Wiring
+    wiring: Routing
     """Read: how wires and bends hang together."""
     rest_length: Floats
     """Read: (n_tendons,) lengths of the straight rest robot [m]."""
@@ -117,7 +117,7 @@ def _rows(a: Floats, n: int) -> Floats:
 def open_ports(
     ports: Ports,
     params: Params,
-    wiring: Wiring,
+    wiring: Routing,
     *,
     n: int,
     rest_length: Floats,

@@ -25,7 +25,7 @@ class Column:
     """What it is, in a few words."""
 
 
-class Work(Protocol):
+class ColumnWork(Protocol):
     """What a shard holds, and how it is made. A frozen dataclass of plain numbers and words, so that it can
     be written and compared."""
 

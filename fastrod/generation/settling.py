@@ -14,10 +14,10 @@ import numpy as np
 
 from fastrod.model.compile import compile_robots
 from fastrod.model.robot import Robot
-from fastrod.solver.boundary import Passes
+from fastrod.solver.boundary import BoundarySolver
 from fastrod.solver.inputs import Inputs, Reader
 from fastrod.solver.settle import settle
-from fastrod.types import Flags, Floats, Ints, Ports, Shape
+from fastrod.types import Flags, Floats, Ints, Ports, RodShape
 
 _EXTRAPOLATION = ((1.0,), (2.0, -1.0), (3.0, -3.0, 1.0), (4.0, -6.0, 4.0, -1.0))
 """Weights of the last solutions, newest first, by how many there are."""
@@ -31,7 +31,7 @@ _NOISE = 1e-20
 class Settled(NamedTuple):
     """A batch of shapes at rest; new arrays, robot axis first, world frame."""
 
-    shape: Shape
+    shape: RodShape
     ok: Flags
     """(n,) the residual is within the tolerance."""
 
@@ -45,7 +45,7 @@ class ChainSolver:
         better use of a core (perf/bench_generate.py)."""
         self.layout, self.params, rest = compile_robots((robot,), points_per_segment)
         self._reader = Reader(self.layout, self.params, rest, n)
-        self._passes = Passes(self.layout, self.params, n, threads, carry=False)
+        self._passes = BoundarySolver(self.layout, self.params, n, threads, carry=False)
         self._rows = np.arange(n)
         self._past: list[Floats] = []
         self._near = _NEAR * float(self.params.reach[0])
@@ -73,7 +73,7 @@ class ChainSolver:
         self._past = [self._passes.memory.x.copy(), *self._past[: len(_EXTRAPOLATION) - 1]]
         return Settled(shape, ok)
 
-    def _follow(self, ports: Ports, shape: Shape, tolerance: float) -> Ints:
+    def _follow(self, ports: Ports, shape: RodShape, tolerance: float) -> Ints:
         """Guess by the past and correct; the robots that are not there yet, back at their guess."""
         memory, weights = self._passes.memory, _EXTRAPOLATION[len(self._past) - 1]
         guess = weights[0] * self._past[0]

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from fastrod.hosts.arm import BulletArm
     from fastrod.hosts.bodies import RodBodies
     from fastrod.hosts.bullet import Bullet, connect
-    from fastrod.hosts.camera import Camera
+    from fastrod.hosts.camera import HostCamera
     from fastrod.hosts.capsules import Capsules
     from fastrod.hosts.link import BulletLink
     from fastrod.hosts.mounted import MountedRod
@@ -25,9 +25,9 @@ __all__ = [
     "Bullet",
     "BulletArm",
     "BulletLink",
-    "Camera",
     "Capsules",
     "Host",
+    "HostCamera",
     "Motion",
     "MountedRod",
     "MujocoBody",
@@ -43,7 +43,7 @@ _HOME = {
     "Bullet": "bullet",
     "BulletArm": "arm",
     "BulletLink": "link",
-    "Camera": "camera",
+    "HostCamera": "camera",
     "Capsules": "capsules",
     "MountedRod": "mounted",
     "MujocoBody": "mujoco",

@@ -1,4 +1,4 @@
-"""`Camera`: pictures of a PyBullet world, with metric depth."""
+"""`HostCamera`: pictures of a PyBullet world, with metric depth."""
 
 from __future__ import annotations
 
@@ -20,12 +20,13 @@ class Image(NamedTuple):
     rgb: NDArray[np.uint8]
     """(height, width, 3) red, green, blue."""
     depth: Floats
-    """(height, width) distance along the optical axis [m]; inf where nothing is nearer than `Camera.far`."""
+    """(height, width) distance along the optical axis [m]; inf where nothing is nearer than
+    `HostCamera.far`."""
     segmentation: NDArray[np.int64]
     """(height, width) body in each pixel, as PyBullet numbers it; -1 where there is none."""
 
 
-class View(NamedTuple):
+class CameraView(NamedTuple):
     """Where a camera stands and where it looks, world."""
 
     eye: ArrayLike
@@ -37,7 +38,7 @@ class View(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Camera:
+class HostCamera:
     """A pinhole camera. It draws on the CPU (PyBullet's TinyRenderer), so it needs neither a display nor a
     graphics card.
 

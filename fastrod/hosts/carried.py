@@ -12,7 +12,7 @@ from fastrod.contact import ContactScene
 from fastrod.errors import HostError, InputError, nearest
 from fastrod.hosts.host import Host
 from fastrod.hosts.rod import INPUTS, Rod
-from fastrod.hosts.touching import Touching
+from fastrod.hosts.touching import BodyContact
 from fastrod.model.robot import Robot
 from fastrod.simulator import Simulator
 from fastrod.solver.state import State
@@ -31,7 +31,7 @@ class CarriedRod(ABC):
     each.
     """
 
-    touched: Sequence[Touching]
+    touched: Sequence[BodyContact]
     rod: Rod
     """The rod itself, without the engine."""
 
@@ -180,7 +180,7 @@ class CarriedRod(ABC):
 
 def rod_of(
     robot: Robot,
-    touched: Sequence[Touching],
+    touched: Sequence[BodyContact],
     *,
     dt: float,
     max_contacts: int,

@@ -12,7 +12,7 @@ from fastrod.hosts.bodies import RodBodies
 from fastrod.hosts.carried import CarriedRod, check_contact, check_gravity, check_touch, rod_of
 from fastrod.hosts.link import BulletLink
 from fastrod.hosts.rod import check_robot
-from fastrod.hosts.surroundings import Touched
+from fastrod.hosts.surroundings import BulletBodyContact
 from fastrod.model.robot import Robot
 from fastrod.types import Floats
 
@@ -52,7 +52,7 @@ class MountedRod(CarriedRod):
         check_touch(touch)
         links = [_link_of(t) for t in touch]
         self.touched = [
-            Touched(self.bullet, body, link, dt=self.dt, relaxation=relaxation, friction=friction)
+            BulletBodyContact(self.bullet, body, link, dt=self.dt, relaxation=relaxation, friction=friction)
             for body, link in links
         ]
         self.rod = rod_of(

@@ -13,8 +13,8 @@ from fastrod.contact import ContactScene
 from fastrod.errors import HostError, InputError, nearest
 from fastrod.hosts.carried import CarriedRod, check_contact, check_gravity, check_touch, rod_of
 from fastrod.hosts.mujoco_body import MujocoBody, body_number, mujoco
-from fastrod.hosts.mujoco_contacts import Feedback, Felt, read
-from fastrod.hosts.mujoco_touched import TouchedBody
+from fastrod.hosts.mujoco_contacts import ContactFeedback, Felt, read
+from fastrod.hosts.mujoco_touched import MujocoBodyContact
 from fastrod.hosts.rod import check_robot
 from fastrod.model.robot import Robot
 from fastrod.types import Floats
@@ -123,7 +123,8 @@ class MujocoRod(CarriedRod):
         (4,) w x y z, body_from_base.
         `touch`: names or numbers of bodies; `friction` of the rod on them; `relaxation` [s] of the rod
         against a changing contact force (`Touching`). `feel`: MuJoCo's contacts of the capsules bend the rod
-        (`Feedback`). `name` as given to `add_capsules`. The time step is the model's. Raises `HostError`,
+        (`ContactFeedback`). `name` as given to `add_capsules`. The time step is the model's. Raises
+        `HostError`,
         `InputError`."""
         check_robot(robot)
         host = MujocoBody(model, data, body, position=position, quaternion=quaternion)
@@ -141,7 +142,8 @@ class MujocoRod(CarriedRod):
         for other in touched:
             self._check_excluded(other, name)
         self._bodies = [
-            TouchedBody(model, data, b, dt=self.dt, relaxation=relaxation, friction=friction) for b in touched
+            MujocoBodyContact(model, data, b, dt=self.dt, relaxation=relaxation, friction=friction)
+            for b in touched
         ]
         self.touched = self._bodies
         per_segment = len(self._geoms) // robot.n_segments
@@ -155,7 +157,7 @@ class MujocoRod(CarriedRod):
         )
         self._capsule_of = {geom: k for k, geom in enumerate(self._geoms)}
         self._width = _sizes(robot, per_segment)[1]
-        self._feedback = Feedback(robot.n_segments, per_segment, self._width) if feel else None
+        self._feedback = ContactFeedback(robot.n_segments, per_segment, self._width) if feel else None
         self._line_force: Floats | None = None
 
     @property

@@ -66,7 +66,7 @@ def read(model: Any, data: Any, capsule_of: Mapping[int, int], width: Floats) ->
     )
 
 
-class Feedback:
+class ContactFeedback:
     """MuJoCo's contact forces as a line force of the rod, relaxed against its compliance.
 
     A contact of stiffness k at a point of compliance C, taken over at once, diverges where k C exceeds 1: the

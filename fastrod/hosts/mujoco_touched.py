@@ -11,7 +11,7 @@ from fastrod.contact import Obstacle, box, capsule, cylinder, mesh, plane, spher
 from fastrod.errors import HostError
 from fastrod.hosts.host import Motion
 from fastrod.hosts.mujoco_body import Applied, com_motion, mujoco
-from fastrod.hosts.touching import Part, Touching
+from fastrod.hosts.touching import BodyContact, BodyPart
 from fastrod.rotation import matrix_from_quaternion, product
 from fastrod.types import Floats
 
@@ -19,9 +19,9 @@ _INVERSE = np.array([1.0, -1.0, -1.0, -1.0])  # of a unit quaternion w x y z
 
 
 @final
-class TouchedBody(Touching):
-    """A body that a rod touches, and what the rod does to it (`Touching`). Poses and velocities are as `data`
-    have them:
+class MujocoBodyContact(BodyContact):
+    """A body that a rod touches, and what the rod does to it (`BodyContact`). Poses and velocities are as
+    `data` have them:
     `MujocoBody.motion` has brought them up to date."""
 
     def __init__(
@@ -69,7 +69,7 @@ class TouchedBody(Touching):
         self._applied.take()
 
 
-def _parts(model: Any, body: int, geoms: Sequence[int]) -> list[Part]:
+def _parts(model: Any, body: int, geoms: Sequence[int]) -> list[BodyPart]:
     """The geoms of a body."""
     label = model.body(body).name or f"body {body}"
     turn = matrix_from_quaternion(model.body_iquat[body][None])[0].T
@@ -77,7 +77,9 @@ def _parts(model: Any, body: int, geoms: Sequence[int]) -> list[Part]:
     for i, geom in enumerate(geoms):
         made = obstacle_of(model, geom, label + (f" part {i}" if i else ""))
         position = turn @ (model.geom_pos[geom] - model.body_ipos[body])
-        parts.append(Part(made, position, product(model.body_iquat[body] * _INVERSE, model.geom_quat[geom])))
+        parts.append(
+            BodyPart(made, position, product(model.body_iquat[body] * _INVERSE, model.geom_quat[geom]))
+        )
     return parts
 
 

@@ -34,7 +34,7 @@ class Command(NamedTuple):
     """(4,) w x y z, world_from_robot."""
 
 
-class Shape(NamedTuple):
+class PaperShape(NamedTuple):
     """Where a command brings the robot: points evenly along the backbone, quaternions w x y z."""
 
     command: Command
@@ -47,7 +47,7 @@ class Shape(NamedTuple):
 
 
 @final
-class Shapes:
+class PaperShapes:
     """Commands to settled shapes, each as if it were the first."""
 
     def __init__(self, robot: Robot, n_points: int) -> None:
@@ -80,7 +80,7 @@ class Shapes:
                 )
         return Command(given, numbers("base_pos", base_pos, 3), turn_of("base_orin", base_orin))
 
-    def at(self, command: Command) -> Shape:
+    def at(self, command: Command) -> PaperShape:
         """The robot at rest under its own weight, without contact. Raises `InputError` where there is no such
         shape."""
         base = np.concatenate([command.base_position, product(command.base_quaternion, _FROM_FASTROD)])
@@ -96,7 +96,7 @@ class Shapes:
         own = np.concatenate([(pose.position[0] - command.base_position) @ turn, own_q], axis=1)
         world_q = product(np.broadcast_to(command.base_quaternion, (self.n_points, 4)), own_q)
         world = np.concatenate([own[:, :3] @ turn.T + command.base_position, world_q], axis=1)
-        return Shape(command, own, world, pose.rotation[0])
+        return PaperShape(command, own, world, pose.rotation[0])
 
 
 def between(a: Command, b: Command, share: float) -> Command:

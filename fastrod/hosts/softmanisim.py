@@ -14,10 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 from fastrod.errors import HostError, InputError
 from fastrod.hosts.bodies import RodBodies
 from fastrod.hosts.bullet import Bullet, connect
-from fastrod.hosts.camera import Camera, Image, View
+from fastrod.hosts.camera import CameraView, HostCamera, Image
 from fastrod.hosts.gripper import TOUCH, Gripper
 from fastrod.hosts.link import to_xyzw
-from fastrod.hosts.paper import Shape, Shapes, between, numbers, paper_robot, turn_of
+from fastrod.hosts.paper import PaperShape, PaperShapes, between, numbers, paper_robot, turn_of
 from fastrod.model.robot import Robot
 from fastrod.types import Floats
 
@@ -97,7 +97,7 @@ class SoftManiSim:
                 f"robot is {robot!r}; give a Robot, for example fastrod.load_robot('prototype')."
             )
         self._robot = robot or paper_robot(int(number_of_segment), body_sphere_radius)
-        self._shapes = Shapes(self._robot, int(number_of_sphere))
+        self._shapes = PaperShapes(self._robot, int(number_of_sphere))
         self._own_world = bullet is None
         self.bullet = connect(gui=gui, dt=_DT) if bullet is None else Bullet(bullet)
         """The world: every function of the pybullet module."""
@@ -108,11 +108,11 @@ class SoftManiSim:
 
             self.bullet.setAdditionalSearchPath(pybullet_data.getDataPath())
             self.plane_id = self.bullet.loadURDF("plane.urdf")
-        self.camera = Camera(near=0.05, far=5.0)
+        self.camera = HostCamera(near=0.05, far=5.0)
         """Of `capture_image`; set another to change it."""
-        self.view = View(eye=(0.65, 0.35, 0.45), target=(0.0, 0.15, 0.08))
+        self.view = CameraView(eye=(0.65, 0.35, 0.45), target=(0.0, 0.15, 0.08))
         """Where that camera stands and looks, world; set another to change it."""
-        self.in_hand_camera = Camera(near=0.005, far=3.0)
+        self.in_hand_camera = HostCamera(near=0.005, far=3.0)
         """Of `in_hand_camera_capture_image`."""
         self._colors = (
             numbers("body_color", body_color, 4).tolist(),
@@ -334,7 +334,7 @@ class SoftManiSim:
             self._bodies = None
             self._mark(False)
 
-    def _travel(self, goal: Shape) -> None:
+    def _travel(self, goal: PaperShape) -> None:
         """Go there, each step as far as the limits allow."""
         start, dt = self._now, self.bullet.dt
         most = min(self._radius, self._max_speed * dt)
@@ -359,7 +359,7 @@ class SoftManiSim:
             done = 1.0 if to is goal else end
             share = min(share * min(2.0, 0.95 * most / max(way, 1e-12)), 1.0 - done)
 
-    def _way(self, a: Shape, b: Shape) -> float:
+    def _way(self, a: PaperShape, b: PaperShape) -> float:
         """The farthest that any point of the robot moves between two shapes [m]."""
         corners = np.array([[x, y, self._gripper.reach] for x in (-0.5, 0.5) for y in (-0.5, 0.5)]) * [
             self._max_width,
@@ -370,7 +370,7 @@ class SoftManiSim:
         ways = np.concatenate([b.world[:, :3] - a.world[:, :3], gripper[1] - gripper[0]])
         return float(np.linalg.norm(ways, axis=1).max())
 
-    def _place(self, shape: Shape) -> None:
+    def _place(self, shape: PaperShape) -> None:
         self._capsules.place(shape.world[:, :3], shape.rotation)
         self._gripper.place(shape.world[-1, :3], shape.world[-1, 3:])
         self._now = shape

@@ -12,13 +12,13 @@ from fastrod.errors import HostError
 from fastrod.hosts.bullet import Bullet
 from fastrod.hosts.host import Motion
 from fastrod.hosts.link import exert, from_xyzw
-from fastrod.hosts.touching import Part, Touching
+from fastrod.hosts.touching import BodyContact, BodyPart
 from fastrod.types import Floats
 
 
 @final
-class Touched(Touching):
-    """A link (-1: the base) that a rod touches, and what the rod does to it (`Touching`)."""
+class BulletBodyContact(BodyContact):
+    """A link (-1: the base) that a rod touches, and what the rod does to it (`BodyContact`)."""
 
     def __init__(
         self, bullet: Any, body: int, link: int = -1, *, dt: float, relaxation: float, friction: float
@@ -66,7 +66,7 @@ def _com_motion(bullet: Bullet, body: int, link: int) -> Motion:
     return Motion(np.array([*position, *from_xyzw(quaternion)]), np.array([*linear, *angular]))
 
 
-def _shapes(bullet: Bullet, body: int, link: int) -> list[Part]:
+def _shapes(bullet: Bullet, body: int, link: int) -> list[BodyPart]:
     """The collision shapes of a link."""
     found = []
     label = bullet.getBodyInfo(body)[1].decode() or "body"
@@ -91,7 +91,7 @@ def _shapes(bullet: Bullet, body: int, link: int) -> list[Part]:
                 f"body {body} has a collision shape of PyBullet's kind {kind}, which a rod "
                 "cannot touch; give it a mesh."
             )
-        found.append(Part(made, np.asarray(position, float), from_xyzw(quaternion)))
+        found.append(BodyPart(made, np.asarray(position, float), from_xyzw(quaternion)))
     return found
 
 

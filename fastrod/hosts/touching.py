@@ -1,4 +1,4 @@
-"""`Touching`: a body of another engine as an obstacle of a rod, pushed by it."""
+"""`BodyContact`: a body of another engine as an obstacle of a rod, pushed by it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from fastrod.types import Floats
 _LEFT = 0.8  # of an overlap after a step
 
 
-class Part(NamedTuple):
+class BodyPart(NamedTuple):
     """One collision shape of a body."""
 
     obstacle: Obstacle
@@ -28,7 +28,7 @@ class Part(NamedTuple):
     """(4,) w x y z, com_from_obstacle."""
 
 
-class Touching(ABC):
+class BodyContact(ABC):
     """A body that a rod touches, and what the rod does to it.
 
     A step is implicit in the body's inertia: to the rod it is where it would be at the step's end without the
@@ -42,7 +42,7 @@ class Touching(ABC):
 
     def __init__(
         self,
-        parts: Sequence[Part],
+        parts: Sequence[BodyPart],
         mass: float,
         inertia: Floats,
         *,

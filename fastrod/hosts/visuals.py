@@ -23,7 +23,7 @@ _THICK = 1e-4  # m, of a plane
 _UNKNOWN = 0.05
 
 
-class Shape(NamedTuple):
+class VisualShape(NamedTuple):
     """Everything on one link that has one colour."""
 
     name: str
@@ -50,7 +50,7 @@ class Visuals:
         known = [b.getBodyUniqueId(i) for i in range(b.getNumBodies())]
         self._links: dict[int, list[int]] = {}
         self._frame_from_com: dict[int, tuple[Any, Any]] = {}
-        shapes: list[Shape] = []
+        shapes: list[VisualShape] = []
         places: list[tuple[int, int]] = []
         for body in known:
             if body in ignore:
@@ -62,13 +62,15 @@ class Visuals:
                 name = f"{label} {body}" + (f" link {link}" if link >= 0 else "")
                 meshes = [_placed(*self._mesh(body, link, part), part) for part in parts]
                 taken = sum(place == (body, link) for place in places)
-                shapes.append(Shape(name + (f" colour {taken + 1}" if taken else ""), *_joined(meshes), rgba))
+                shapes.append(
+                    VisualShape(name + (f" colour {taken + 1}" if taken else ""), *_joined(meshes), rgba)
+                )
                 places.append((body, link))
         self._places = places
         for body, link in places:
             if link >= 0 and link not in self._links.setdefault(body, []):
                 self._links[body].append(link)
-        self.shapes: tuple[Shape, ...] = tuple(shapes)
+        self.shapes: tuple[VisualShape, ...] = tuple(shapes)
 
     def poses(self) -> Floats:
         """(n_shapes, 7) position [m] and quaternion w x y z of each shape's link now, world. Raises

@@ -23,8 +23,8 @@ from fastrod.identification.log.split import held_out_rows, merged
 from fastrod.identification.log.unknowns import base_model
 from fastrod.identification.report.assemble import ALL_AT_ONCE, assemble
 from fastrod.identification.report.result import Result
-from fastrod.identification.search.base import LEAST_ROWS, Base, check_log, check_motion
-from fastrod.identification.search.model_selection import Candidate, State, Step
+from fastrod.identification.search.base import LEAST_ROWS, BaseFit, check_log, check_motion
+from fastrod.identification.search.model_selection import Candidate, ModelState, SearchStep
 from fastrod.identification.search.search import MOST_PASSES, Search
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
@@ -88,7 +88,7 @@ def identify(
     placed = robot if reading.registration is None else reading.registration.on(robot)
     model = base_model(placed, free_camera=free_camera, registered=placed is not robot)
     tell("base fit", 0, max_effects + _SPARE + 2)
-    base = Base(samples.on(chosen), train, model, robot, threads)
+    base = BaseFit(samples.on(chosen), train, model, robot, threads)
     base.notes += reading.questions
     search = Search(base.samples, base.rod, base.target, base.block, frozenset(exclude))
     start, fixed = base.fit(search)
@@ -131,10 +131,10 @@ def _report_stage(tell: Callable[[str, int, int], None], stage: int, max_effects
 
 
 def _found(
-    search: Search, base: Base, start: State, max_effects: int, tell: Callable[[str, int, int], None]
-) -> tuple[list[str], State, list[Step]]:
+    search: Search, base: BaseFit, start: ModelState, max_effects: int, tell: Callable[[str, int, int], None]
+) -> tuple[list[str], ModelState, list[SearchStep]]:
     """Effects in the order in which they were found, the state with them (and with foils), the steps."""
-    state, steps = start, list[Step]()
+    state, steps = start, list[SearchStep]()
     found: list[str] = []
     for stage in range(max_effects + _MORE_STAGES):
         search.report = partial(_report_stage, tell, stage, max_effects)
@@ -157,13 +157,13 @@ def _found(
 
 def _library(
     search: Search,
-    base: Base,
-    start: State,
-    state: State,
+    base: BaseFit,
+    start: ModelState,
+    state: ModelState,
     found: list[str],
     max_effects: int,
-    steps: list[Step],
-) -> tuple[State, list[str]]:
+    steps: list[SearchStep],
+) -> tuple[ModelState, list[str]]:
     """The effects that are needed once foils are gone, with their state."""
     alone = search.bare(state) if state.foils else state
     noise = start.fit.residual.size * float((base.noise.sigma**2).mean())
@@ -188,7 +188,7 @@ def _library(
     return base.weighed(search, alone), found
 
 
-def _pair(search: Search, state: State, step: Step) -> Step | None:
+def _pair(search: Search, state: ModelState, step: SearchStep) -> SearchStep | None:
     """Two effects at once, where none passes alone: of the five that come nearest."""
     near = sorted(
         (c for c in step.candidates if c.state is not None and c.foil is None and c.share > 0.01),

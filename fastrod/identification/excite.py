@@ -16,7 +16,7 @@ import numpy as np
 from fastrod.errors import InputError
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
-from fastrod.model.routing import Wiring, wire
+from fastrod.model.routing import Routing, wire
 from fastrod.rotation import matrix_from_quaternion, product
 from fastrod.types import Floats
 
@@ -31,7 +31,7 @@ _LADDER = (1.0, 0.6, 0.28)  # of the largest bend: triangles of decreasing ampli
 
 
 @dataclass(frozen=True)
-class Part:
+class MotionPhase:
     """A stretch of the run, and what it is for."""
 
     name: str
@@ -47,7 +47,7 @@ class Excitation:
     """A run to be driven: inputs as a log whose tip is empty, and its parts."""
 
     log: RunLog
-    parts: tuple[Part, ...]
+    parts: tuple[MotionPhase, ...]
 
     @property
     def comment(self) -> str:
@@ -96,12 +96,12 @@ def excitation(
     wiring = wire(robot)
     rng = np.random.default_rng(seed)
     rows: list[Floats] = []
-    parts: list[Part] = []
+    parts: list[MotionPhase] = []
 
     def add(name: str, what: Floats, purpose: str) -> None:
         start = sum(len(r) for r in rows) / rate
         rows.append(what)
-        parts.append(Part(name, start, start + len(what) / rate, purpose))
+        parts.append(MotionPhase(name, start, start + len(what) / rate, purpose))
 
     def still(seconds: float) -> Floats:
         return np.zeros((round(seconds * rate), wiring.n_segments, 2))
@@ -156,7 +156,7 @@ def excitation(
 
 
 def _block(
-    wiring: Wiring, bend: float, rate: float, speed: float, number: int, rng: np.random.Generator
+    wiring: Routing, bend: float, rate: float, speed: float, number: int, rng: np.random.Generator
 ) -> list[tuple[str, Floats, str]]:
     """Pieces of one block, each (name, (n, n_segments, 2) bends [rad], purpose), from straight to
     straight."""

@@ -10,26 +10,26 @@ from numba import prange
 
 from fastrod.types import (
     Clearance,
+    ContactRods,
+    ContactSet,
     Flags,
     Floats,
     Ints,
     Layout,
     Memory,
     Params,
+    PointLoads,
     Ports,
-    Probes,
     Response,
-    Rods,
-    Shape,
+    RodShape,
     Surfaces,
-    Touching,
 )
 
 from .contact.bvh import STACK
 from .contact.contact_set import T_ARM, T_FORCE, T_N, T_S
 from .contact.iteration import iterate_world, look_at
 from .contact.node_placement import place_nodes
-from .contact.problem import Scenery
+from .contact.problem import SceneArrays
 from .contact.rod_proximity import search_rods
 from .contact.surface import ray_hit
 from .jit import LANES, entry, parallel_entry
@@ -50,9 +50,9 @@ def _pass(
     ports: Ports,
     layout: Layout,
     memory: Memory,
-    shape: Shape,
+    shape: RodShape,
     response: Response,
-    probes: Probes,
+    probes: PointLoads,
     scratch: Lanes,
     n_col: int,
     feed: bool,
@@ -100,21 +100,21 @@ def _pass(
 def _iterate(
     worlds: Ints,
     rows: Ints,
-    rods: Rods,
+    rods: ContactRods,
     surfaces: Surfaces,
     frames: Floats,
     frames_before: Floats,
     frames_slip: Floats,
-    shape: Shape,
-    before: Shape,
+    shape: RodShape,
+    before: RodShape,
     tracked: Flags,
     slides: Flags,
     tolerance: float,
     margin: float,
     damping: float,
-    touching: Touching,
+    touching: ContactSet,
     clearance: Clearance,
-    probes: Probes,
+    probes: PointLoads,
     memory: Memory,
     proposed: Floats,
     unknown: Floats,
@@ -126,12 +126,12 @@ def _iterate(
     """One contact iteration (`iterate_world`) of the worlds whose rows begin at worlds[0], worlds[1], ...;
     the last entry is the end.
 
-    The fields of the `Scenery` come one by one, for numba hands no tuple of tuples to threads.
+    The fields of the `SceneArrays` come one by one, for numba hands no tuple of tuples to threads.
     """
     n_parts = scratch.shape[0]
     for part in prange(n_parts):
         for k in range(part, len(worlds) - 1, n_parts):
-            scenery = Scenery(
+            scenery = SceneArrays(
                 rods,
                 surfaces,
                 frames,
@@ -176,13 +176,13 @@ def place_all(s: Floats, starts: Floats, n_steps: int, grid: Floats, node: Ints)
 @entry
 def arrange(
     rows: Ints,
-    touching: Touching,
+    touching: ContactSet,
     s_given: Floats,
     starts: Floats,
     n_steps: int,
     grid: Floats,
     node_given: Ints,
-    probes: Probes,
+    probes: PointLoads,
 ) -> bool:
     """Put a node under every contact of these robots, and under the point forces that were given (arclengths
     `s_given` (n_robots, m)); fills the loads of `probes`. False where a segment has more of them than
@@ -212,13 +212,13 @@ def arrange(
 
 def _look(
     rows: Ints,
-    rods: Rods,
+    rods: ContactRods,
     surfaces: Surfaces,
     frames: Floats,
     frames_before: Floats,
     frames_slip: Floats,
-    shape: Shape,
-    before: Shape,
+    shape: RodShape,
+    before: RodShape,
     tracked: Flags,
     slides: Flags,
     tolerance: float,
@@ -235,7 +235,7 @@ def _look(
     for part in prange(n_parts):
         for r in range(part, len(rows), n_parts):
             i = rows[r]
-            scenery = Scenery(
+            scenery = SceneArrays(
                 rods,
                 surfaces,
                 frames,
@@ -282,7 +282,7 @@ def cast_rays(
 
 
 @entry
-def look_at_rods(worlds: Ints, rows: Ints, scenery: Scenery, touching: Touching, gap: Floats) -> None:
+def look_at_rods(worlds: Ints, rows: Ints, scenery: SceneArrays, touching: ContactSet, gap: Floats) -> None:
     """Lower each robot's smallest gap to that between rods (`search_rods`)."""
     for k in range(len(worlds) - 1):
         search_rods(

@@ -14,7 +14,7 @@ from fastrod.types import Floats, Layout, Params
 _INEXTENSIBLE = 1e-9  # m/N; below it the tensions of three wires that lock the twist grow without bound
 
 
-class Rest(NamedTuple):
+class DefaultInputs(NamedTuple):
     """What the ports hold when nobody asks for anything else; robot axis 1 or n_robots."""
 
     stiffness: Floats
@@ -31,7 +31,7 @@ class Rest(NamedTuple):
     """(n_robots, n_segments, 2) smallest and largest change of length [m]."""
 
 
-def compile_robots(robots: Sequence[Robot], n_steps: int) -> tuple[Layout, Params, Rest]:
+def compile_robots(robots: Sequence[Robot], n_steps: int) -> tuple[Layout, Params, DefaultInputs]:
     """Arrays of the robots of one batch; a single robot stands for all.
 
     Robots may differ in every number, but not in their counts, modes or routing: `RobotError` names the one
@@ -97,7 +97,7 @@ def _params(robots: Sequence[Robot]) -> Params:
     )
 
 
-def _rest(robots: Sequence[Robot]) -> Rest:
+def _rest(robots: Sequence[Robot]) -> DefaultInputs:
     stiffness = np.array(
         [[(*s.bending_stiffness, s.torsional_stiffness) for s in robot.segments] for robot in robots]
     )
@@ -105,7 +105,7 @@ def _rest(robots: Sequence[Robot]) -> Rest:
     weight = np.array(
         [[np.multiply(s.line_density, robot.gravity) for s in robot.segments] for robot in robots]
     )
-    return Rest(
+    return DefaultInputs(
         stiffness=stiffness[:, :, None, :],
         precurvature=precurvature[:, :, None, :].astype(float),
         weight=weight[:, :, None, :].astype(float),

@@ -12,7 +12,7 @@ from fastrod.types import Floats, Ints
 
 
 @dataclass(frozen=True)
-class Wiring:
+class Routing:
     """Routing of one robot's wires; the same for every robot of a batch."""
 
     n_segments: int
@@ -73,7 +73,7 @@ def _times(a: Floats, matrix: Floats) -> Floats:
     return out
 
 
-def wire(robot: Robot) -> Wiring:
+def wire(robot: Robot) -> Routing:
     """The wiring of a robot: l_i = l + sum_k (bend_x y_ik - bend_y x_ik), constant curvature in each
     segment."""
     ends = robot.tendon_segment
@@ -98,7 +98,7 @@ def wire(robot: Robot) -> Wiring:
                 drive[other], sign[other] = count, -1.0
                 break
         count += 1
-    return Wiring(
+    return Routing(
         n_segments=robot.n_segments,
         tendon_segment=ends,
         arms=arms,

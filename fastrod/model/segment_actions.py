@@ -13,7 +13,7 @@ from fastrod.model.routing import wire
 from fastrod.types import Floats
 
 
-class WireInputs(TypedDict):
+class TendonInputs(TypedDict):
     """Keyword arguments of `Simulator.step`."""
 
     tendon_length: Floats
@@ -77,7 +77,7 @@ class SegmentActions:
         """Numbers of an action: three a segment."""
         return 3 * self.robot.n_segments
 
-    def inputs(self, action: ArrayLike) -> WireInputs:
+    def inputs(self, action: ArrayLike) -> TendonInputs:
         """Wire lengths and extensions of an action (..., 3 n_segments) [m]. Raises `InputError` where it is
         not one."""
         refuse_masked("action", action)
@@ -97,7 +97,7 @@ class SegmentActions:
                 f"{np.array2string(a.ravel()[:9], max_line_width=1000)}."
             )
         change = a @ self.matrix.T
-        return WireInputs(
+        return TendonInputs(
             tendon_length=self.robot.rest_tendon_length + change[..., : self.robot.n_tendons],
             extension=change[..., self.robot.n_tendons :],
         )

@@ -1,4 +1,4 @@
-"""`Passes`: the boundary that robots remember, and one forward pass with it."""
+"""`BoundarySolver`: the boundary that robots remember, and one forward pass with it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fastrod.kernels.batch import move_to_inputs, pass_parallel, pass_serial
 from fastrod.kernels.jit import LANES
 from fastrod.kernels.rod.chunk import scratch_size
 from fastrod.solver.gpu.device import Device
-from fastrod.types import Flags, Floats, Ints, Layout, Memory, Params, Ports, Probes, Response, Shape
+from fastrod.types import Flags, Floats, Ints, Layout, Memory, Params, PointLoads, Ports, Response, RodShape
 
 if TYPE_CHECKING:
     from fastrod.solver.gpu.resident import Resident
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _config: Any = numba.config
 _SMALL = 4 * LANES  # robots below which starting threads costs more than it saves
-NO_PROBES = Probes(
+NO_PROBES = PointLoads(
     np.empty((0, 0), np.int64),
     np.empty((0, 0, 3)),
     np.empty((0, 0, 3)),
@@ -55,7 +55,7 @@ def _physical_memory() -> int:
         return 2**42
 
 
-class Passes:
+class BoundarySolver:
     """Robots of one layout. `params` is replaced where effects change a robot's numbers, and never written
     into.
 
@@ -116,7 +116,7 @@ class Passes:
             if len(own):
                 own[rows] = new[rows]
 
-    def twin(self, n_robots: int, params: Params, memory: Memory) -> Passes:
+    def twin(self, n_robots: int, params: Params, memory: Memory) -> BoundarySolver:
         """Other robots of the same layout, on the same device."""
         twin = copy(self)
         twin.n_robots, twin.params = n_robots, params
@@ -226,7 +226,7 @@ class Passes:
             memory.force_before[rows] = np.broadcast_to(ports.tip_force, (self.n_robots, 3))[rows]
         memory.move[rows], memory.defect[rows] = 0.0, 0.0
 
-    def new_shape(self, outputs: Literal["full", "tip"], holes: bool) -> Shape:
+    def new_shape(self, outputs: Literal["full", "tip"], holes: bool) -> RodShape:
         """Room for what a pass writes; `holes`: nan where it will not write."""
         n, n_points, n_tendons = self.n_robots, self.n_points, len(self.layout.tendon_segment)
 
@@ -238,7 +238,7 @@ class Passes:
             )
 
         full = outputs == "full"
-        return Shape(
+        return RodShape(
             make(full, n_points, 3),
             make(full, n_points, 3, 3),
             make(full, n_points, 3),
@@ -257,7 +257,7 @@ class Passes:
         self,
         rows: Ints,
         ports: Ports,
-        shape: Shape,
+        shape: RodShape,
         *,
         response: Response | None = None,
         feed: bool = False,
@@ -266,7 +266,7 @@ class Passes:
         process: float = 1.0,
         noise: float = 1.0,
         n_col: int | None = None,
-        probes: Probes = NO_PROBES,
+        probes: PointLoads = NO_PROBES,
     ) -> None:
         """One forward pass of these robots (`kernels.batch`). What it writes into the shape is there after
         `collect`."""
@@ -317,7 +317,7 @@ class Passes:
             noise,
         )
 
-    def collect(self, shape: Shape, only: str | None = None) -> Shape:
+    def collect(self, shape: RodShape, only: str | None = None) -> RodShape:
         """The shape with what the passes wrote into it, or into one field: on a GPU that is still there."""
         if self._runner is not None:
             self._runner.collect(shape, only)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from fastrod.errors import InputError, nearest, refuse_masked
 from fastrod.kernels.batch import place_all
-from fastrod.model.compile import Rest
+from fastrod.model.compile import DefaultInputs
 from fastrod.types import Floats, Layout, Params, Ports
 
 _P = ParamSpec("_P")
@@ -59,7 +59,7 @@ class Reader:
     """Turns inputs into arrays with a robot axis of 1 or n_robots, and collects what is wrong with which
     robot."""
 
-    def __init__(self, layout: Layout, params: Params, rest: Rest, n_robots: int) -> None:
+    def __init__(self, layout: Layout, params: Params, rest: DefaultInputs, n_robots: int) -> None:
         self.layout, self.params, self.rest, self.n_robots = layout, params, rest, n_robots
         # A tendon at distance d can differ from the backbone by d times the bend; more than a full turn per
         # segment is no shape.

@@ -7,10 +7,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from fastrod.contact.engine import Engine
-from fastrod.contact.engine import Snapshot as ContactSnapshot
+from fastrod.contact.engine import ContactSnapshot, Engine
 from fastrod.solver.state import State
-from fastrod.types import Clearance, Flags, Shape, Touching
+from fastrod.types import Clearance, ContactSet, Flags, RodShape
 
 Arrays = TypeVar("Arrays", bound=tuple[Any, ...])
 
@@ -33,15 +32,15 @@ def taken_each(now: Arrays, then: Arrays, rows: Flags) -> Arrays:
     return type(now)(*(taken(a, b, rows) for a, b in zip(now, then, strict=True)))
 
 
-def taken_shape(now: Shape, then: State, rows: Flags) -> Shape:
+def taken_shape(now: RodShape, then: State, rows: Flags) -> RodShape:
     """A shape with the rows of a state."""
-    return Shape(*(taken(a, getattr(then, name), rows) for name, a in now._asdict().items()))
+    return RodShape(*(taken(a, getattr(then, name), rows) for name, a in now._asdict().items()))
 
 
 def restore_contact(engine: Engine, then: ContactSnapshot, rows: Flags) -> None:
     """Put the robots `rows` of an engine back: their contacts, where they were, and the obstacles around
     them."""
-    engine.touching = taken_each(engine.touching, Touching(*then.touching), rows)
+    engine.touching = taken_each(engine.touching, ContactSet(*then.touching), rows)
     engine.clearance = taken_each(engine.clearance, Clearance(*then.clearance), rows)
     if engine.before is not None and then.before is not None:
         engine.before = taken_each(engine.before, then.before, rows)

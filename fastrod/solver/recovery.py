@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fastrod.solver.boundary import Passes
+from fastrod.solver.boundary import BoundarySolver
 from fastrod.solver.settle import Pass, load_parameter, settle
 from fastrod.types import Flags, Floats, Ints, Ports
 
@@ -19,7 +19,7 @@ class Boundary:
     """The boundary before a step, kept until it is known that nobody diverged: 21 numbers of a five-segment
     robot."""
 
-    def __init__(self, passes: Passes) -> None:
+    def __init__(self, passes: BoundarySolver) -> None:
         self._passes = passes
         # on a GPU a copy would have to come here at every step; its robots begin from the cold guess instead
         on_gpu = passes.device == "cuda"
@@ -53,13 +53,13 @@ class Boundary:
         return used
 
 
-def overloaded(passes: Passes, ports: Ports, row: int) -> float:
+def overloaded(passes: BoundarySolver, ports: Ports, row: int) -> float:
     """F l^2/EI of a robot's loads where that is beyond what a rod can hold, else 0."""
     size = float(load_parameter(np.array([row]), passes.params, ports)[0])
     return size if size > _HOPELESS else 0.0
 
 
-def what_to_do(passes: Passes, ports: Ports, row: int) -> str:
+def what_to_do(passes: BoundarySolver, ports: Ports, row: int) -> str:
     """The end of a sentence about a robot without a shape: what to change."""
     if size := overloaded(passes, ports, row):
         force = _of(passes.params.moment_scale, row) / _of(passes.params.reach, row)

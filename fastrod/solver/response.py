@@ -9,8 +9,8 @@ from typing import Any, Literal
 import numpy as np
 
 from fastrod.kernels.jit import LANES
-from fastrod.solver.boundary import NO_PROBES, Passes
-from fastrod.types import Floats, Ints, Memory, Params, Ports, Probes, Response, Shape
+from fastrod.solver.boundary import NO_PROBES, BoundarySolver
+from fastrod.types import Floats, Ints, Memory, Params, PointLoads, Ports, Response, RodShape
 
 _ROWS = 1024  # of one pass: robots times copies of them
 _HALF = 0.5e-4 * np.repeat(np.eye(3), 2, axis=0) * np.array([[1.0], [-1.0]] * 3)
@@ -29,10 +29,12 @@ class Linear:
     none: its columns are those of a tip force.
     """
 
-    def __init__(self, passes: Passes, rows: Ints, ports: Ports, probes: Probes = NO_PROBES) -> None:
+    def __init__(
+        self, passes: BoundarySolver, rows: Ints, ports: Ports, probes: PointLoads = NO_PROBES
+    ) -> None:
         self.passes, self.rows, self.ports, self.probes = passes, rows, ports, probes
 
-    def respond(self, columns: bool = True) -> tuple[Response, Shape]:
+    def respond(self, columns: bool = True) -> tuple[Response, RodShape]:
         """Residuals, tip and their derivatives by the unknowns and, last, by a tip force; rows that are not
         asked are nan."""
         passes, ports = self.passes, self.ports
@@ -68,13 +70,13 @@ class Linear:
         moved, delta, pulled = self._spread(turning)
         (m, n), n_rows = delta.shape, len(self.rows)
 
-        def respond(copies: slice, columns: bool) -> tuple[Response, Shape]:
+        def respond(copies: slice, columns: bool) -> tuple[Response, RodShape]:
             twin, k = (
                 self._copies({name: a[copies] for name, a in moved.items()}, relocate),
                 len(moved["extension"][copies]),
             )
             response, shape = twin.respond(columns)
-            return Response(*(_split(a, k) for a in response)), Shape(*(_split(a, k) for a in shape))
+            return Response(*(_split(a, k) for a in response)), RodShape(*(_split(a, k) for a in shape))
 
         if n_rows * (1 + 2 * m) <= LANES:  # as fast as without the differences
             return self._combine(*respond(slice(None), True), delta, pulled)
@@ -107,7 +109,7 @@ class Linear:
         outputs: Literal["full", "tip"],
         process: float,
         noise: float,
-    ) -> tuple[Shape, Floats]:
+    ) -> tuple[RodShape, Floats]:
         """An observer pass of all robots that updates them, and the Jacobian at the shape that it hands out,
         in one: the differences ride in the lanes that a few robots leave empty."""
         passes = self.passes
@@ -135,9 +137,12 @@ class Linear:
         for own, a in zip(passes.memory, twin.passes.memory, strict=True):
             own[:] = a[: len(own)]
         jacobian = self._combine(
-            Response(*(_split(a, k) for a in response)), Shape(*(_split(a, k) for a in shape)), delta, pulled
+            Response(*(_split(a, k) for a in response)),
+            RodShape(*(_split(a, k) for a in shape)),
+            delta,
+            pulled,
         )
-        return Shape(*(a[: len(a) // k] for a in shape)), jacobian
+        return RodShape(*(a[: len(a) // k] for a in shape)), jacobian
 
     def _spread(self, turning: bool) -> tuple[dict[str, Floats], Floats, list[int]]:
         """Ports of 1 + 2 m copies, as they are and then forward and back by each input (1 + 2 m, n, ...), by
@@ -166,7 +171,7 @@ class Linear:
             turns[:] = (_TURNS @ turns[..., None])[..., 0] / math.sqrt(1.0 + 0.25e-8)
         return moved, delta, pulled
 
-    def _combine(self, response: Response, shape: Shape, delta: Floats, pulled: list[int]) -> Floats:
+    def _combine(self, response: Response, shape: RodShape, delta: Floats, pulled: list[int]) -> Floats:
         """The Jacobian from the copies of `_spread`."""
         by_residual = self._close(Response(*(a[0] for a in response)))
         differences = _differences(
@@ -217,7 +222,7 @@ class Linear:
             Params(*(a if len(a) == 1 else copied(a) for a in params)),
             Memory(*map(copied, passes.peek())),
         )
-        probes = Probes(*map(copied, self.probes)) if self.probes.node.shape[1] else self.probes
+        probes = PointLoads(*map(copied, self.probes)) if self.probes.node.shape[1] else self.probes
         rows = (self.rows + n * np.arange(k)[:, None]).ravel()
         return Linear(twin, rows, ports, probes)
 
@@ -265,7 +270,7 @@ def inverse(a: Floats) -> Floats:
     return found
 
 
-def stretch(passes: Passes, rows: Ints, change: Floats) -> None:
+def stretch(passes: BoundarySolver, rows: Ints, change: Floats) -> None:
     """These robots' extensions are about to change by this much (1 or n_robots, n_segments) [m]: the wires
     that grow along with their segments are, for the boundary, as they were. The gain knows of wires alone; it
     would pull at every wire."""

@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from fastrod.solver.boundary import Passes
+from fastrod.solver.boundary import BoundarySolver
 from fastrod.solver.guess import cold_start
 from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports
 
@@ -26,7 +26,9 @@ _SMALLEST_STEP = 1.0 / 64.0
 _SMALLEST_LOAD_STEP = 1.0 / 256.0
 
 
-def settle(rows: Ints, warm: Flags, boundary: Passes, ports: Ports, tolerance: float, run: Pass) -> Ints:
+def settle(
+    rows: Ints, warm: Flags, boundary: BoundarySolver, ports: Ports, tolerance: float, run: Pass
+) -> Ints:
     """Bring the robots `rows` to rest on `ports`; the passes that each took, and -1 where none of three ways
     converged.
 
@@ -70,7 +72,9 @@ def load_parameter(rows: Ints, params: Params, ports: Ports) -> Floats:
     return np.broadcast_to(force * of(params.reach) / of(params.moment_scale), len(rows))
 
 
-def _newton(rows: Ints, boundary: Passes, ports: Ports, tolerance: float, run: Pass, passes: Ints) -> Ints:
+def _newton(
+    rows: Ints, boundary: BoundarySolver, ports: Ports, tolerance: float, run: Pass, passes: Ints
+) -> Ints:
     """Newton with step halving; the robots that did not converge."""
     layout, params = boundary.layout, boundary.params
     failed: list[Ints] = []
@@ -158,7 +162,7 @@ def _still(step: Floats, rows: Ints, layout: Layout, params: Params, small: Floa
 
 
 def _continuation(
-    rows: Ints, boundary: Passes, ports: Ports, tolerance: float, run: Pass, passes: Ints
+    rows: Ints, boundary: BoundarySolver, ports: Ports, tolerance: float, run: Pass, passes: Ints
 ) -> Ints:
     """From the unloaded robot to the loaded one, in load steps that grow with success; the robots that did
     not arrive."""

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fastrod.contact.contacts import Contacts
-from fastrod.contact.engine import Snapshot as ContactSnapshot
+from fastrod.contact.engine import ContactSnapshot
 from fastrod.errors import InputError
 from fastrod.model.robot import Robot
 from fastrod.solver.inputs import Inputs

@@ -12,12 +12,12 @@ import numpy as np
 from fastrod.errors import HostError
 from fastrod.model.robot import Robot
 from fastrod.types import Floats, Ints
-from fastrod_envs.options import Options
+from fastrod_envs.options import EnvOptions
 from fastrod_envs.randomisation import Randomisation
-from fastrod_envs.task import Field, Outcome, Scenery, Task
+from fastrod_envs.task import Backdrop, Field, Outcome, Task
 
 
-class Result(NamedTuple):
+class HostedResult(NamedTuple):
     """How a step of one environment went; as `Outcome`, without the robot axis."""
 
     terms: dict[str, float]
@@ -46,7 +46,7 @@ class Cell(ABC):
         soft robot is lost."""
 
     @abstractmethod
-    def result(self) -> Result:
+    def result(self) -> HostedResult:
         """How the last step went."""
 
     @abstractmethod
@@ -62,7 +62,7 @@ class Cell(ABC):
         """(n_actions,) of the scripted baseline."""
 
     @abstractmethod
-    def scenery(self) -> Scenery:
+    def scenery(self) -> Backdrop:
         """What it looks like, for the page; pictures come from PyBullet."""
 
     @abstractmethod
@@ -84,7 +84,7 @@ class HostedTask(Task):
     def __init__(
         self,
         n_envs: int,
-        options: Options,
+        options: EnvOptions,
         robot: Robot,
         actions: tuple[Field, ...],
         states: tuple[Field, ...],
@@ -102,7 +102,7 @@ class HostedTask(Task):
         for _ in range(n_envs):
             self.cells.append(self.cell())
         self._lost = np.zeros(n_envs, bool)
-        self._sane: list[Result | None] = [None] * n_envs
+        self._sane: list[HostedResult | None] = [None] * n_envs
         self._seen: Floats = np.zeros((n_envs, sum(len(part.low) for part in states)))
 
     @abstractmethod
@@ -170,7 +170,7 @@ class HostedTask(Task):
         """(n_envs, n_actions) of the cells' own baselines, clipped to -1 and 1."""
         return np.asarray(np.clip(np.array([cell.baseline() for cell in self.cells]), -1.0, 1.0))
 
-    def scenery(self, i: int) -> Scenery:
+    def scenery(self, i: int) -> Backdrop:
         """As cell i gives it."""
         return self.cells[i].scenery()
 

@@ -16,11 +16,11 @@ from fastrod_envs.randomisation import Randomisation
 
 Observation = Literal["state", "goal"]
 Action = Literal["rate", "displacement"]
-Made = TypeVar("Made", bound="Options")
+Made = TypeVar("Made", bound="EnvOptions")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options:
+class EnvOptions:
     """Keyword arguments of `gymnasium.make` and `make_vec`, the same for every task; some tasks have more."""
 
     n_steps: int | None = None

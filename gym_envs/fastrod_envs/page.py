@@ -1,4 +1,4 @@
-"""`Page`: the first environments of a task side by side in a browser, with viser."""
+"""`EnvPage`: the first environments of a task side by side in a browser, with viser."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from fastrod.access import serve_guarded
 from fastrod.errors import InputError
 from fastrod.types import Floats
 from fastrod_envs.painter import ball_mesh, tube_mesh
-from fastrod_envs.task import Scenery, Task
+from fastrod_envs.task import Backdrop, Task
 
 SHOWN = 16
 """Environments that are shown, at most."""
@@ -25,7 +25,7 @@ _LAMPS = (("key", (1.0, -1.6, 2.2), 1.5), ("fill", (-1.8, 0.8, 0.9), 0.6))
 
 
 @final
-class Page:
+class EnvPage:
     """A viser server on 127.0.0.1, on the first free port from 8080 on; its address, without which the page
     cannot be loaded, goes to stderr once."""
 
@@ -55,7 +55,7 @@ class Page:
         """Stop the server."""
         self._served.stop()
 
-    def _furnish(self, scenery: Scenery) -> None:
+    def _furnish(self, scenery: Backdrop) -> None:
         """Light, a floor, a frame for every environment, and from where one looks."""
         scene, self._server.initial_camera.fov = self._server.scene, math.radians(45.0)
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
@@ -90,7 +90,7 @@ class Page:
             target,
         )
 
-    def _draw(self, at: str, scenery: Scenery) -> list[str]:
+    def _draw(self, at: str, scenery: Backdrop) -> list[str]:
         """Everything of one environment; the names it has in the page."""
         names = []
         for i, tube in enumerate(scenery.tubes):
@@ -161,7 +161,7 @@ def _bytes(color: tuple[float, ...]) -> tuple[int, int, int]:
     return red, green, blue
 
 
-def _extent(scenery: Scenery) -> float:
+def _extent(scenery: Backdrop) -> float:
     """Width of a square around an environment, from above [m]."""
     parts = (
         [t.points for t in scenery.tubes]

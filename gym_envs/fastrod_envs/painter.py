@@ -1,5 +1,5 @@
-"""A small painter in numpy: what a `Scenery` looks like, in some milliseconds, without a window or a graphics
-card.
+"""A small painter in numpy: what a `Backdrop` looks like, in some milliseconds, without a window or a
+graphics card.
 
 Everything becomes triangles. Those of one layer are cut into rows of pixels, and rows into fragments, at
 twice the picture's resolution; the nearest fragment of every pixel is kept and only then shaded. See-through
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fastrod.types import Floats, Ints
-from fastrod_envs.task import Ball, Line, Scenery, Solid, Tube
+from fastrod_envs.task import Backdrop, Ball, DrawnLine, Solid, Tube
 
 _FIELD_OF_VIEW = math.radians(36.0)  # from bottom to top
 _NEAR = 0.02  # m before the eye: nothing nearer is drawn
@@ -30,7 +30,7 @@ _MOUNT = (0.30, 0.33, 0.38)
 _SQUARE, _FOG = 0.1, 1.6  # m: of the grid; where the floor fades into the horizon
 
 
-class Mesh(NamedTuple):
+class PaintedMesh(NamedTuple):
     """Triangles over shared vertices."""
 
     vertices: Floats
@@ -52,7 +52,7 @@ class Layer(NamedTuple):
     """(m,) 1 where light falls on it, 0 where it shows its bare colour."""
 
 
-class Camera(NamedTuple):
+class PainterCamera(NamedTuple):
     """Where the eye is, and what of the world a pixel is."""
 
     eye: Floats
@@ -74,7 +74,7 @@ class Camera(NamedTuple):
         return np.asarray(aside[:, None] * right + down[:, None] * below + ahead)
 
 
-def paint(scenery: Scenery, width: int, height: int) -> np.ndarray:
+def paint(scenery: Backdrop, width: int, height: int) -> np.ndarray:
     """(height, width, 3) uint8 of an environment."""
     heights = [tube.points[:, 2] for tube in scenery.tubes] + [
         solid.vertices[:, 2] for solid in scenery.solids
@@ -84,7 +84,9 @@ def paint(scenery: Scenery, width: int, height: int) -> np.ndarray:
     # a step at a time, so that it stays under what moves
     floor = 0.0 if lowest > -0.02 else 0.25 * math.floor(4.0 * lowest)
     camera = _camera(scenery.eye, scenery.target, width, height)
-    opaque = [_lit(Mesh(s.vertices, s.faces), s.color, True) for s in scenery.solids if s.opacity >= 1.0]
+    opaque = [
+        _lit(PaintedMesh(s.vertices, s.faces), s.color, True) for s in scenery.solids if s.opacity >= 1.0
+    ]
     opaque += [layer for tube in scenery.tubes for layer in _tube_layers(tube)]
     opaque += [_ball_layer(ball) for ball in scenery.balls]
     solid = _joined([layer for layer in opaque if len(layer.corners)])
@@ -93,13 +95,14 @@ def paint(scenery: Scenery, width: int, height: int) -> np.ndarray:
     )
     ribbons = [_ribbon(line, camera) for line in scenery.lines if len(line.points) > 1]
     layers = [(_joined([solid, *ribbons]), 1.0)] + [
-        (_lit(Mesh(s.vertices, s.faces), s.color, True), s.opacity) for s in _far_to_near(scenery, camera)
+        (_lit(PaintedMesh(s.vertices, s.faces), s.color, True), s.opacity)
+        for s in _far_to_near(scenery, camera)
     ]
     _lay(picture.reshape(-1, 3), layers, camera)
     return np.asarray(np.clip(255.0 * picture + 0.5, 0.0, 255.0).astype(np.uint8))
 
 
-def tube_mesh(points: Floats, radius: float, sides: int = _SIDES) -> Mesh:
+def tube_mesh(points: Floats, radius: float, sides: int = _SIDES) -> PaintedMesh:
     """A tube around (n, 3) points, rounded at its end, n > 1."""
     points = np.asarray(points, float)
     tangents = np.gradient(points, axis=0)
@@ -117,13 +120,13 @@ def tube_mesh(points: Floats, radius: float, sides: int = _SIDES) -> Mesh:
     u, v = (np.concatenate([a, np.repeat(a[-1:], len(cap), axis=0)]) for a in (u, v))
     angle = np.linspace(0.0, 2.0 * np.pi, sides, endpoint=False)
     ring = u[:, None] * np.cos(angle)[:, None] + v[:, None] * np.sin(angle)[:, None]
-    return Mesh(
+    return PaintedMesh(
         (centre[:, None] + reach[:, None, None] * ring).reshape(-1, 3), _grid_faces(len(centre), sides)
     )
 
 
 @lru_cache(maxsize=4)
-def ball_mesh(sides: int = 16) -> Mesh:
+def ball_mesh(sides: int = 16) -> PaintedMesh:
     """A ball of radius 1."""
     polar, around = (
         np.linspace(0.0, np.pi, sides // 2 + 1),
@@ -133,7 +136,7 @@ def ball_mesh(sides: int = 16) -> Mesh:
     points = np.stack(
         [np.sin(polar)[:, None] * np.cos(around), np.sin(polar)[:, None] * np.sin(around), z], axis=2
     )
-    return Mesh(points.reshape(-1, 3), _grid_faces(len(polar), sides))
+    return PaintedMesh(points.reshape(-1, 3), _grid_faces(len(polar), sides))
 
 
 @lru_cache(maxsize=64)
@@ -146,14 +149,16 @@ def _grid_faces(n_rings: int, sides: int) -> Ints:
     return np.asarray(quads.reshape(-1, 3))
 
 
-def _camera(eye: tuple[float, ...], target: tuple[float, ...], width: int, height: int) -> Camera:
+def _camera(eye: tuple[float, ...], target: tuple[float, ...], width: int, height: int) -> PainterCamera:
     forward = np.subtract(target, eye)
     forward = forward / max(float(np.linalg.norm(forward)), 1e-9)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     if np.linalg.norm(right) < 1e-6:  # looks straight down: y is up in the picture
         right = np.array([1.0, 0.0, 0.0])
     right /= np.linalg.norm(right)
-    return Camera(np.array(eye, float), np.array([right, np.cross(forward, right), forward]), width, height)
+    return PainterCamera(
+        np.array(eye, float), np.array([right, np.cross(forward, right), forward]), width, height
+    )
 
 
 @lru_cache(maxsize=32)
@@ -182,7 +187,7 @@ def _ground(
     return picture
 
 
-def _shadow(layer: Layer, camera: Camera, floor: float) -> Floats:
+def _shadow(layer: Layer, camera: PainterCamera, floor: float) -> Floats:
     """(height, width) how bright the floor is under what stands between it and the light: soft at the
     edges."""
     light = np.ones((camera.height, camera.width))
@@ -259,7 +264,7 @@ def _ball_layer(ball: Ball) -> Layer:
     return Layer(np.asarray(ball.position) + ball.radius * corners, corners, color, np.ones(len(corners)))
 
 
-def _lit(mesh: Mesh, color: tuple[float, ...], rounded: bool) -> Layer:
+def _lit(mesh: PaintedMesh, color: tuple[float, ...], rounded: bool) -> Layer:
     """Triangles under the light; `rounded`: smooth where neighbours are nearly in one plane, so that only
     edges show."""
     corners = np.asarray(mesh.vertices, float)[mesh.faces]
@@ -276,7 +281,7 @@ def _lit(mesh: Mesh, color: tuple[float, ...], rounded: bool) -> Layer:
     )
 
 
-def _ribbon(line: Line, camera: Camera) -> Layer:
+def _ribbon(line: DrawnLine, camera: PainterCamera) -> Layer:
     """A path as wide as two pixels, wherever it is."""
     p = np.asarray(line.points, float)
     view = p - camera.eye
@@ -288,7 +293,7 @@ def _ribbon(line: Line, camera: Camera) -> Layer:
     faces = np.concatenate(
         [np.stack([i, i + 1, i + len(p)], 1), np.stack([i + 1, i + len(p) + 1, i + len(p)], 1)]
     )
-    layer = _lit(Mesh(np.concatenate([p - side, p + side]), faces), line.color, False)
+    layer = _lit(PaintedMesh(np.concatenate([p - side, p + side]), faces), line.color, False)
     return layer._replace(shade=np.zeros(len(faces)))
 
 
@@ -297,7 +302,7 @@ def _joined(layers: list[Layer]) -> Layer:
     return Layer(*(np.concatenate(parts) for parts in zip(empty, *layers, strict=True)))
 
 
-def _far_to_near(scenery: Scenery, camera: Camera) -> list[Solid]:
+def _far_to_near(scenery: Backdrop, camera: PainterCamera) -> list[Solid]:
     """Solids that one sees through."""
     clear = [solid for solid in scenery.solids if solid.opacity < 1.0]
     return sorted(
@@ -305,7 +310,7 @@ def _far_to_near(scenery: Scenery, camera: Camera) -> list[Solid]:
     )
 
 
-def _projected(corners: Floats, camera: Camera) -> tuple[Floats, Floats]:
+def _projected(corners: Floats, camera: PainterCamera) -> tuple[Floats, Floats]:
     """Pixels (m, 3, 2) of triangles and (m, 3) one over their depth [1/m], which is linear in a picture; 0:
     before the near plane."""
     seen = (corners - camera.eye) @ camera.axes.T
@@ -370,7 +375,7 @@ def _nearest(pixel: Ints, inverse: Floats, size: int) -> tuple[Ints, Ints]:
     return covered, (best[covered] & np.uint64(0xFFFFFFFF)).astype(np.int64)
 
 
-def _lay(picture: Floats, layers: list[tuple[Layer, float]], camera: Camera) -> None:
+def _lay(picture: Floats, layers: list[tuple[Layer, float]], camera: PainterCamera) -> None:
     """Lay triangles over a picture (height * width, 3), each layer over those before it where it is nearer
     than the first."""
     fine = camera._replace(width=_FINE * camera.width, height=_FINE * camera.height)
@@ -411,7 +416,7 @@ def _lay(picture: Floats, layers: list[tuple[Layer, float]], camera: Camera) -> 
 
 
 def _shaded(
-    layer: Layer, pixel: Ints, triangle: Ints, at: Floats, inverse: Floats, camera: Camera
+    layer: Layer, pixel: Ints, triangle: Ints, at: Floats, inverse: Floats, camera: PainterCamera
 ) -> NDArray[np.float32]:
     """(n, 3) colour of the triangles at these pixels."""
     y, x = np.divmod(pixel, camera.width)

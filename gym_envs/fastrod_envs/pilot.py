@@ -1,4 +1,4 @@
-"""`TrackPilot`: a policy that was trained on the task Track, at the commands of a real or an emulated
+"""`PolicyDriver`: a policy that was trained on the task Track, at the commands of a real or an emulated
 robot."""
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from fastrod_envs.policies import Policy
 from fastrod_envs.registration import name_of
 from fastrod_envs.surface import ReachableSurface
 from fastrod_envs.task import bounds
-from fastrod_envs.tasks.track import DRIVEN, DT, LIMIT, PERIOD, RADIUS, RATE, Sight, coming, fields
+from fastrod_envs.tasks.track import DRIVEN, DT, LIMIT, PERIOD, RADIUS, RATE, TrackSight, coming, fields
 
 _EARLY = 1e-6  # of a step: a clock that is this much short of it has reached it
 
 
 @final
-class TrackPilot:
+class PolicyDriver:
     """Commands for a robot whose tip is to follow a path, one step of `dt` seconds after the other, as the
     task Track has them.
 
@@ -99,7 +99,7 @@ class TrackPilot:
         states = fields(self.robot)[1]
         self._least, self._largest = (a.astype(np.float32) for a in bounds(states))
         self._low, self._high = np.array(LIMIT).T
-        self._sight = Sight(1)
+        self._sight = TrackSight(1)
         self._displacement: Floats = np.zeros((1, len(DRIVEN)))
         self._action: Floats | None = None
         self._tip: Floats | None = None

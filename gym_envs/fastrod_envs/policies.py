@@ -12,7 +12,7 @@ from fastrod.errors import InputError
 from fastrod.types import Floats
 from fastrod_envs.actor import Actor, actor_of, load_actor
 from fastrod_envs.registration import name_of
-from fastrod_envs.training import ACTOR, CONFIG, FOREIGN, Plan, load_foreign, read_config
+from fastrod_envs.training import ACTOR, CONFIG, FOREIGN, TrainingPlan, load_foreign, read_config
 from fastrod_envs.vector import BatchEnv
 
 SHIPPED = "shipped"
@@ -57,7 +57,7 @@ class Policy:
         A folder that has a file of stable-baselines3 in its place is read with `trust` alone, as that runs
         code of whoever made it. Raises `InputError` where the folder holds neither.
         """
-        self.plan: Plan = read_config(folder)[0]
+        self.plan: TrainingPlan = read_config(folder)[0]
         if (folder / ACTOR).is_file():
             self._actor: Actor = load_actor(folder / ACTOR)
             return

@@ -12,11 +12,11 @@ from fastrod.model.robot import Robot
 from fastrod.model.segment_actions import SegmentActions
 from fastrod.simulator import Simulator
 from fastrod.types import Floats
-from fastrod_envs.options import Options
+from fastrod_envs.options import EnvOptions
 
 
 @dataclass(frozen=True, kw_only=True)
-class PushOptions(Options):
+class PushOptions(EnvOptions):
     """Of Push and QuadrupedPush."""
 
     feels: bool = True

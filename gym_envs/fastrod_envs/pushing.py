@@ -12,19 +12,19 @@ import numpy as np
 from fastrod.errors import HostError
 from fastrod.hosts.bodies import RodBodies
 from fastrod.hosts.bullet import Bullet, connect
-from fastrod.hosts.camera import Camera
+from fastrod.hosts.camera import HostCamera
 from fastrod.hosts.link import from_xyzw
 from fastrod.model.robot import Robot
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.simulator import Simulator
 from fastrod.solver.state import State
 from fastrod.types import Floats
-from fastrod_envs.hosted import Cell, HostedTask, Result
-from fastrod_envs.options import Options
+from fastrod_envs.hosted import Cell, HostedResult, HostedTask
+from fastrod_envs.options import EnvOptions
 from fastrod_envs.push_course import Course, Drive, PushOptions
 from fastrod_envs.rodtask import resolved
 from fastrod_envs.shapes import box_mesh
-from fastrod_envs.task import Ball, Field, Scenery, Solid, Tube
+from fastrod_envs.task import Backdrop, Ball, Field, Solid, Tube
 
 ACCURACY = 0.02
 """Of the cube's place [m]."""
@@ -130,14 +130,14 @@ class PushCell(Cell):
             self.q = self._clear(self.q + (there - self.q) / left)
             self._move(self._settled())
 
-    def result(self) -> Result:
+    def result(self) -> HostedResult:
         """`distance` is from the cube's middle to its goal in the plane [m]; terms exp(-k d^2), and 0.5 once
         the cube was touched."""
         position = self._cube()[0]
         desired = np.array([*self.desired, 0.5 * self.course.size])
         d = float(np.hypot(*(position - desired)[:2]))
         terms = {"reach": math.exp(-self.course.steepness * d**2), "touch": 0.5 * self.touched}
-        return Result(terms, d, d < ACCURACY, position, desired, facts={"touched": float(self.touched)})
+        return HostedResult(terms, d, d < ACCURACY, position, desired, facts={"touched": float(self.touched)})
 
     def state(self) -> Floats:
         """(17,) in the order of `PushTask.states`."""
@@ -177,7 +177,7 @@ class PushCell(Cell):
             return np.asarray(rates)
         return drive.posture(self.q + self._n * self._dt * drive.rate * rates)
 
-    def scenery(self) -> Scenery:
+    def scenery(self) -> Backdrop:
         """Rod and bar as tubes, the cube, and its goal as a ball; seen from the course's right."""
         position, rotation = self._cube()
         vertices, faces = box_mesh([self.course.size] * 3, position.tolist(), rotation)
@@ -186,7 +186,7 @@ class PushCell(Cell):
         bar = Tube(_bar_nodes(self.course, self.simulator.state)[0], self.course.thickness, _BAR)
         goal = np.array([*self.desired, 0.5 * self.course.size])
         eye, target = self._view()
-        return Scenery(
+        return Backdrop(
             tubes=(neck, bar),
             solids=(Solid(vertices, faces, _CUBE),),
             balls=(Ball(goal, 0.012, _GOAL),),
@@ -215,7 +215,7 @@ class PushCell(Cell):
             studio.createMultiBody(0.0, -1, disc, [*self.desired, 0.001]),
         ]
         eye, target = self._view()
-        picture = Camera(width=width, height=height, fov=45.0).look(studio, eye, target).rgb
+        picture = HostCamera(width=width, height=height, fov=45.0).look(studio, eye, target).rgb
         tube.remove()
         bar.remove()
         for body in shown:
@@ -322,13 +322,13 @@ class PushCell(Cell):
 class PushTask(HostedTask):
     """What Push and QuadrupedPush share: three numbers move the tip, the cube goes where it is pushed."""
 
-    options_class: ClassVar[type[Options]] = PushOptions
+    options_class: ClassVar[type[EnvOptions]] = PushOptions
     n_steps: ClassVar[int] = 40
     n_draws: ClassVar[int] = 5
     accuracy: ClassVar[float] = ACCURACY
     duration: ClassVar[float] = 4.0
 
-    def __init__(self, n_envs: int, options: Options, course: Course) -> None:
+    def __init__(self, n_envs: int, options: EnvOptions, course: Course) -> None:
         self.course = course
         drive = Drive(course.robot, course.bend)
         low, high, what = (

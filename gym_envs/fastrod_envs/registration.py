@@ -7,7 +7,7 @@ from importlib import import_module
 from typing import Any
 
 from fastrod.errors import UnknownNameError, nearest
-from fastrod_envs.options import Options
+from fastrod_envs.options import EnvOptions
 from fastrod_envs.task import Task
 
 _TASKS: Mapping[str, str] = {
@@ -99,4 +99,4 @@ def register_all() -> None:
             )
 
 
-__all__ = ["Options", "ids", "make_task", "name_of", "names", "register_all", "task_class"]
+__all__ = ["EnvOptions", "ids", "make_task", "name_of", "names", "register_all", "task_class"]

@@ -7,7 +7,7 @@ from typing import final
 import numpy as np
 
 from fastrod.errors import InputError
-from fastrod_envs.page import Page
+from fastrod_envs.page import EnvPage
 from fastrod_envs.painter import paint
 from fastrod_envs.task import Task
 
@@ -25,7 +25,7 @@ class Renderer:
         if mode is not None and mode not in MODES:
             raise InputError(f"render_mode is {mode!r}; it must be None, {' or '.join(map(repr, MODES))}.")
         self._mode = mode
-        self._page: Page | None = None
+        self._page: EnvPage | None = None
 
     def render(self, task: Task) -> tuple[np.ndarray, ...] | None:
         """With rgb_array a picture (360, 480, 3) uint8 of every environment: N of them cost N times 15 to 40
@@ -35,7 +35,7 @@ class Renderer:
             return tuple(_picture(task, i) for i in range(task.n_envs))
         if self._mode == "viser":
             if self._page is None:
-                self._page = Page(task)
+                self._page = EnvPage(task)
             else:
                 self._page.update(task)
         return None

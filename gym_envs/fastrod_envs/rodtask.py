@@ -14,7 +14,7 @@ from fastrod.model.segment_actions import SegmentActions
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.simulator import Simulator
 from fastrod.types import Flags, Floats, Ints
-from fastrod_envs.options import Options
+from fastrod_envs.options import EnvOptions
 from fastrod_envs.randomisation import Randomisation
 from fastrod_envs.task import Field, Task, Tube
 
@@ -40,7 +40,7 @@ class RodTask(Task):
     def __init__(
         self,
         n_envs: int,
-        options: Options,
+        options: EnvOptions,
         robot: Robot,
         *,
         driven: ArrayLike,

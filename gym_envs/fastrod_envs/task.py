@@ -10,7 +10,7 @@ import numpy as np
 
 from fastrod.errors import InputError
 from fastrod.types import Flags, Floats, Ints
-from fastrod_envs.options import Options, checked_difficulty
+from fastrod_envs.options import EnvOptions, checked_difficulty
 
 
 class Field(NamedTuple):
@@ -43,7 +43,7 @@ class Solid(NamedTuple):
     opacity: float = 1.0
 
 
-class Line(NamedTuple):
+class DrawnLine(NamedTuple):
     """A path to draw."""
 
     points: Floats
@@ -61,13 +61,13 @@ class Tube(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Scenery:
+class Backdrop:
     """What one environment looks like now, world frame."""
 
     tubes: tuple[Tube, ...] = ()
     balls: tuple[Ball, ...] = ()
     solids: tuple[Solid, ...] = ()
-    lines: tuple[Line, ...] = ()
+    lines: tuple[DrawnLine, ...] = ()
     eye: tuple[float, float, float] = (0.9, 0.9, 0.6)
     """From where it is looked at [m]."""
     target: tuple[float, float, float] = (0.0, 0.0, 0.25)
@@ -113,7 +113,7 @@ class Task(ABC):
     """Numbers from 0 to 1 that an episode draws for its goal and scene, randomisation apart."""
     accuracy: ClassVar[float]
     """Distance below which the task is done [m]."""
-    options_class: ClassVar[type[Options]] = Options
+    options_class: ClassVar[type[EnvOptions]] = EnvOptions
     """Its options."""
     hosted: ClassVar[bool] = False
     """Needs PyBullet (`pip install fastrod[hosts]`)."""
@@ -130,7 +130,7 @@ class Task(ABC):
     goals: tuple[Field, ...]
     """Parts of an observation of the goal, in the order of `goal()`."""
 
-    def __init__(self, n_envs: int, options: Options) -> None:
+    def __init__(self, n_envs: int, options: EnvOptions) -> None:
         if options.device != "cpu" and not self.on_gpu:
             raise InputError(
                 f"device is {options.device!r}; {self.name} has contact or a host's bodies, "
@@ -172,7 +172,7 @@ class Task(ABC):
         simulator knows."""
 
     @abstractmethod
-    def scenery(self, i: int) -> Scenery:
+    def scenery(self, i: int) -> Backdrop:
         """What environment i looks like now."""
 
     def picture(self, i: int, width: int, height: int) -> np.ndarray | None:  # noqa: ARG002

@@ -36,7 +36,7 @@ _LARGEST = 1_000_000  # bytes of a config.json; those that ship have a thousand
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class TrainingPlan:
     """What is trained and how; `config.json` holds it."""
 
     env: str
@@ -94,7 +94,7 @@ def make_plan(
     options: Mapping[str, Any] | None = None,
     settings: Mapping[str, Any] | None = None,
     curriculum: float = 1.0,
-) -> Plan:
+) -> TrainingPlan:
     """The preset of a task, with what is given here instead. Raises `UnknownNameError`, `InputError`."""
     from fastrod_envs.registration import task_class
 
@@ -108,7 +108,7 @@ def make_plan(
     many, in_all = n_envs or preset.n_envs, preset.steps if steps is None else steps
     wanted = {**preset.options, **(options or {})}
     n_steps = kind.options_class.read(wanted).n_steps or kind.n_steps
-    return Plan(
+    return TrainingPlan(
         env=f"{NAMESPACE}/{name_of(env)}-{VERSION}",
         algorithm=chosen,
         n_envs=many,
@@ -121,7 +121,7 @@ def make_plan(
     )
 
 
-def train(plan: Plan, out: Path, progress: Progress | None = None) -> Path:
+def train(plan: TrainingPlan, out: Path, progress: Progress | None = None) -> Path:
     """Train into the folder `out`; the path of its policy.zip.
 
     The folder holds config.json (the plan, versions, steps and seconds done), checkpoint.npz (with replay.npz
@@ -150,18 +150,18 @@ def resume(
     return _run(plan, out, progress, trust)
 
 
-def read_config(out: Path) -> tuple[Plan, dict[str, Any]]:
+def read_config(out: Path) -> tuple[TrainingPlan, dict[str, Any]]:
     """Plan and state of the training in a folder. Raises `InputError`, `UnknownNameError`."""
     path = out / CONFIG
     try:
         if path.stat().st_size > _LARGEST:
             raise ValueError(f"it has more than {_LARGEST} bytes")
         held = json.loads(path.read_text(encoding="utf-8"))
-        plan = msgspec.convert(held["plan"], Plan)
-        if unknown := held["plan"].keys() - {field.name for field in fields(Plan)}:
+        plan = msgspec.convert(held["plan"], TrainingPlan)
+        if unknown := held["plan"].keys() - {field.name for field in fields(TrainingPlan)}:
             raise ValueError(
                 f"it has an unknown key {min(unknown)!r}; "
-                f"{nearest(min(unknown), [field.name for field in fields(Plan)])}"
+                f"{nearest(min(unknown), [field.name for field in fields(TrainingPlan)])}"
             )
         state = {**msgspec.convert(held["state"], dict[str, Any]), **msgspec.convert(held["state"], _State)}
         if not 0.0 <= state["seconds"] < float("inf"):
@@ -210,7 +210,7 @@ def load_foreign(path: Path, algorithm: str, env: Any = None, *, trust: bool) ->
         ) from error
 
 
-def _run(plan: Plan, out: Path, progress: Progress | None, trust: bool = False) -> Path:
+def _run(plan: TrainingPlan, out: Path, progress: Progress | None, trust: bool = False) -> Path:
     import torch
 
     from fastrod_envs.imitation import imitate
@@ -275,7 +275,7 @@ def _run(plan: Plan, out: Path, progress: Progress | None, trust: bool = False) 
         env.close()
 
 
-def _fresh(plan: Plan, vec: Any, board: str | None) -> Any:
+def _fresh(plan: TrainingPlan, vec: Any, board: str | None) -> Any:
     """The model of a plan before its first step. Raises `InputError` for settings that its algorithm
     refuses."""
     import torch
@@ -305,13 +305,13 @@ def _fresh(plan: Plan, vec: Any, board: str | None) -> Any:
         ) from error
 
 
-def _callback(plan: Plan, note: Callable[[], None], progress: Progress | None) -> Any:
+def _callback(plan: TrainingPlan, note: Callable[[], None], progress: Progress | None) -> Any:
     """Checkpoints, curves of distance and success, the curriculum, and the bar."""
     from collections import deque
 
     from stable_baselines3.common.callbacks import BaseCallback
 
-    class Watch(BaseCallback):
+    class TrainingWatch(BaseCallback):
         def __init__(self) -> None:
             super().__init__()
             self.told: dict[str, deque[float]] = {
@@ -348,7 +348,7 @@ def _callback(plan: Plan, note: Callable[[], None], progress: Progress | None) -
                 note()
                 self.next_note += max(1, plan.steps // _EVERY)
 
-    return Watch()
+    return TrainingWatch()
 
 
 def _save(model: Any, out: Path) -> None:
@@ -369,7 +369,7 @@ def _atomically(path: Path, write: Callable[[Path], Any]) -> None:
     beside.replace(path)
 
 
-def _write_config(out: Path, plan: Plan, state: Mapping[str, Any]) -> None:
+def _write_config(out: Path, plan: TrainingPlan, state: Mapping[str, Any]) -> None:
     packages = {
         name: version(name)
         for name in ("fastrod", "gymnasium", "numba", "numpy", "stable-baselines3", "torch")

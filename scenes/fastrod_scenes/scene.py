@@ -138,7 +138,7 @@ class HostedWorld(ABC):
         self.world.disconnect()
 
 
-class Stage(HostedWorld):
+class SceneStage(HostedWorld):
     """A world with rods on hosts."""
 
     rods: tuple[MountedRod, ...]

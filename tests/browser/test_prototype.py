@@ -24,7 +24,7 @@ from fastrod.logs.recording import Recorder
 from fastrod.logs.runlog import read_log
 from fastrod_device.errors import DeviceError
 from fastrod_device.hardware import load_hardware
-from fastrod_device.workbench import Bench, emulated
+from fastrod_device.workbench import EmulatedBench, emulated
 from fastrod_viewer.app import App
 from fastrod_viewer.drive_page import DrivePage
 from fastrod_viewer.worlds import FreeWorld
@@ -40,7 +40,7 @@ class Paced:
 
     real = True
 
-    def __init__(self, bench: Bench) -> None:
+    def __init__(self, bench: EmulatedBench) -> None:
         self.prototype = bench.prototype
         self.robot, self.supervisor, self.clock = (
             bench.prototype.robot,
@@ -103,7 +103,7 @@ class Paced:
 class Bed:
     """A prototype, its page, and a window."""
 
-    def __init__(self, bench: Bench, app: App) -> None:
+    def __init__(self, bench: EmulatedBench, app: App) -> None:
         assert bench.emulator is not None
         self.app, self.emulator, self.link = app, bench.emulator, Paced(bench)
         app.open(FreeWorld(bench.prototype.robot), link=self.link)

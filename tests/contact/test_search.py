@@ -17,7 +17,7 @@ from fastrod.contact.frames import frames_of
 from fastrod.contact.tree import pack
 from fastrod.kernels.contact.bvh import STACK
 from fastrod.kernels.contact.centreline import Curve
-from fastrod.kernels.contact.proximity import CANDIDATE, UNSEEN, Sweep, search_obstacles
+from fastrod.kernels.contact.proximity import CANDIDATE, UNSEEN, ProximityOptions, search_obstacles
 
 
 @pytest.fixture
@@ -55,7 +55,7 @@ def test_every_dip_of_an_interval_is_found(scenes, radius, nearest):
         obstacle = mesh(trimesh.util.concatenate(balls))
         phi = scenes.distances(obstacle, np.array([0.0, 0, 0, 1, 0, 0, 0]), line)
         found = np.zeros((64, CANDIDATE))
-        sweep = Sweep(np.array([radius]), 2, 0.0, 1e-3, 1e-3, nearest)
+        sweep = ProximityOptions(np.array([radius]), 2, 0.0, 1e-3, 1e-3, nearest)
         count, gap = _search(
             curve, sweep, pack([obstacle]), frames_of(np.array([[[0.0, 0, 0, 1, 0, 0, 0]]]))[0], found
         )

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import fastrod
 from fastrod.control import circle, triangle
-from fastrod.control.inverse import Plan, plan
+from fastrod.control.inverse import InversePlan, plan
 from fastrod.errors import InputError, RobotError
 from fastrod.model.robot import Robot
 from fastrod.model.segment_actions import SegmentActions
@@ -38,11 +38,11 @@ def with_effects(*names: str) -> Robot:
 
 
 @cache
-def made(*names: str) -> Plan:
+def made(*names: str) -> InversePlan:
     return plan(with_effects(*names), TURN, RATE)
 
 
-def run(robot: Robot, given: Plan, lead: float = 0.0) -> Floats:
+def run(robot: Robot, given: InversePlan, lead: float = 0.0) -> Floats:
     """(n, 3) the tip as it is measured `lead` seconds after each row was sent."""
     simulator = Simulator(robot, dt=1.0 / RATE, points_per_segment=10)
     late = round(lead * RATE)

@@ -12,15 +12,15 @@ from numpy.testing import assert_allclose
 from rods import rod
 
 from fastrod.identification.excite import excitation
-from fastrod.identification.log.forward import Samples, sample
-from fastrod.identification.search.residual_test import Audit, audit
+from fastrod.identification.log.forward import LogSamples, sample
+from fastrod.identification.search.residual_test import ResidualStructure, audit
 from fastrod.model.routing import wire
 
 RATE, SIZE = 8.0, 0.9
 
 
 @cache
-def samples() -> Samples:
+def samples() -> LogSamples:
     """The designed run: rests, holds, reversals, and its beginning once more at the end; no load, one
     base."""
     run = excitation(one_segment(), rate=RATE).log
@@ -39,7 +39,7 @@ def bends() -> np.ndarray:
     return wire(one_segment()).bend(np.asarray(samples().log.dl))[:, 0] / SIZE
 
 
-def run(residual: np.ndarray, lag1: float = 0.0) -> Audit:
+def run(residual: np.ndarray, lag1: float = 0.0) -> ResidualStructure:
     return audit(samples(), wire(one_segment()), residual, lag1)
 
 

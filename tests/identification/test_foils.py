@@ -11,10 +11,10 @@ from numpy.testing import assert_allclose
 from truth import plant
 
 from fastrod.identification.excite import excitation
-from fastrod.identification.log.forward import Rod, sample
+from fastrod.identification.log.forward import PredictedRod, sample
 from fastrod.identification.log.unknowns import base_model
-from fastrod.identification.search.alternatives import Foil, foils
-from fastrod.identification.search.linearised import Local, Target
+from fastrod.identification.search.alternatives import AlternativePattern, foils
+from fastrod.identification.search.linearised import LinearisedModel, Target
 from fastrod.model.robotfile import load_robot
 
 NOISE = 3e-4  # m
@@ -45,15 +45,15 @@ def bare() -> np.ndarray:
 
 
 @cache
-def local() -> Local:
+def local() -> LinearisedModel:
     robot = load_robot("prototype")
     log = replace(excitation(robot, rate=5.0).log, tip_position=bare())
     model, samples = base_model(robot), sample(log)
-    return Local(
+    return LinearisedModel(
         model,
         model.start,
         samples,
-        Rod(samples, robot, threads=1),
+        PredictedRod(samples, robot, threads=1),
         Target(samples, np.full(3, NOISE), rotation_sigma=0.01, points=False),
     )
 
@@ -77,7 +77,7 @@ def left_by(columns: np.ndarray, residual: np.ndarray) -> float:
     )
 
 
-def ranked(residual: np.ndarray) -> list[tuple[float, Foil]]:
+def ranked(residual: np.ndarray) -> list[tuple[float, AlternativePattern]]:
     """Every family's best by BIC, the best first."""
     made = foils(local(), tangent(), residual)
     assert {foil.name for foil in made} == FAMILIES

@@ -16,7 +16,7 @@ import fastrod.effects.base as registry
 from fastrod import Robot, Simulator
 from fastrod.effects.base import Parameter, Seam, effect, get_effect, has_memory
 from fastrod.effects.ports import EffectPorts
-from fastrod.identification.log.forward import N_STEPS, Pose, Rod, predict, sample
+from fastrod.identification.log.forward import N_STEPS, PredictedPose, PredictedRod, predict, sample
 from fastrod.identification.log.unknowns import base_model
 from fastrod.logs.runlog import RunLog
 from fastrod.model.routing import wire
@@ -70,7 +70,7 @@ def log(robot: Robot, n: int = N) -> RunLog:
     )
 
 
-def stepped(robot: Robot, what: RunLog) -> Pose:
+def stepped(robot: Robot, what: RunLog) -> PredictedPose:
     """What a simulator of the robot measures, settled at every sample, its clock that of the log."""
     sim = Simulator(robot, points_per_segment=N_STEPS)
     seen = []
@@ -91,20 +91,20 @@ def stepped(robot: Robot, what: RunLog) -> Pose:
         ).ok.all()
         seen.append(sim.measure())
     position, rotation, points = (np.concatenate(parts) for parts in zip(*seen, strict=True))
-    return Pose(position, rotation, points, np.ones(len(what), bool))
+    return PredictedPose(position, rotation, points, np.ones(len(what), bool))
 
 
-def predicted(robot: Robot, what: RunLog) -> Pose:
+def predicted(robot: Robot, what: RunLog) -> PredictedPose:
     """The rows of a log as identification sees them: the robot's effects are known, nothing else is
     fitted."""
     samples = sample(what)
     model = base_model(robot)
-    pose = predict(model, model.start, samples, Rod(samples, robot, points=True))
+    pose = predict(model, model.start, samples, PredictedRod(samples, robot, points=True))
     assert pose.ok.all()
     return pose
 
 
-def assert_alike(one: Pose, two: Pose, length: float) -> None:
+def assert_alike(one: PredictedPose, two: PredictedPose, length: float) -> None:
     """Both settled, one to 1e-8 of the length: some of that at the tip, and over the length in angle."""
     assert_allclose(one.position, two.position, atol=3e-8 * length)
     assert_allclose(one.points, two.points, atol=3e-8 * length)
@@ -166,7 +166,7 @@ def test_several_runs_begin_with_no_memory() -> None:
     assert_allclose(samples.dt[1:N], np.diff(alone.t), rtol=1e-12)
     found = predicted(robot, both)
     for part, single in zip(samples.runs, (alone, other), strict=True):
-        assert_alike(Pose(*(a[part] for a in found)), predicted(robot, single), robot.length)
+        assert_alike(PredictedPose(*(a[part] for a in found)), predicted(robot, single), robot.length)
     # and as one run they would be something else
     merged = replace(both, run=np.full(2 * N, ""), t=0.05 * np.arange(2 * N))
     assert np.abs(predicted(robot, merged).position - found.position).max() > 1e-4
@@ -178,8 +178,8 @@ def test_a_loss_that_looks_at_some_rows_does_not_shorten_the_memory() -> None:
     whole = predicted(robot, what)
     samples = sample(what).on(np.array([3, 11, 12, 29]))
     model = base_model(robot)
-    some = predict(model, model.start, samples, Rod(samples, robot, points=True))
-    assert_alike(some, Pose(*(a[samples.rows] for a in whole)), robot.length)
+    some = predict(model, model.start, samples, PredictedRod(samples, robot, points=True))
+    assert_alike(some, PredictedPose(*(a[samples.rows] for a in whole)), robot.length)
 
 
 def test_rows_without_a_tip_are_driven_and_rows_without_an_input_are_not_there() -> None:
@@ -192,7 +192,7 @@ def test_rows_without_a_tip_are_driven_and_rows_without_an_input_are_not_there()
     assert_array_equal(samples.rows, [i for i in range(N - 1) if i not in (5, 6, 7, 8)])
     assert_allclose(samples.dt[20], what.t[21] - what.t[19], rtol=1e-12)
     model = base_model(robot)
-    found = predict(model, model.start, samples, Rod(samples, robot))
+    found = predict(model, model.start, samples, PredictedRod(samples, robot))
     kept = np.delete(np.arange(N), [20])
     alone = stepped(robot, what.rows(kept))
     assert_allclose(found.position, alone.position[samples.rows], atol=3e-8 * robot.length)

@@ -10,11 +10,11 @@ from identification.logs import log_of, one_segment
 from rods import rod
 
 from fastrod import load_robot
-from fastrod.identification.log.forward import Samples, sample
+from fastrod.identification.log.forward import LogSamples, sample
 from fastrod.identification.log.limits import limits
 
 
-def moving(rate: float) -> Samples:
+def moving(rate: float) -> LogSamples:
     robot = one_segment()
     return sample(log_of(robot, np.zeros((20, 4)), 1.0 / rate))
 

@@ -12,9 +12,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from fastrod import Robot
-from fastrod.identification.log.forward import Rod, Samples, predict, sample
+from fastrod.identification.log.forward import LogSamples, PredictedRod, predict, sample
 from fastrod.identification.log.unknowns import Model, base_model
-from fastrod.identification.search.linearised import Local, Target, exact_residual
+from fastrod.identification.search.linearised import LinearisedModel, Target, exact_residual
 
 N = 40
 SIGMA = np.array([2e-4, 3e-4, 4e-4])
@@ -27,7 +27,7 @@ def robot() -> Robot:
     )
 
 
-def samples() -> Samples:
+def samples() -> LogSamples:
     """Loads, two base orientations, and a measured tip that is some tenths of a millimetre from the nominal
     one."""
     turned = Rotation.from_rotvec(np.where(np.arange(N)[:, None] < N // 2, 0.0, [0.9, -0.5, 0.3]))
@@ -37,7 +37,7 @@ def samples() -> Samples:
     }
     bare = sample(log_of(two_segments(), wave(two_segments(), N), 0.1, points=np.zeros((N, 2, 3)), **inputs))
     model = base_model(two_segments())
-    pose = predict(model, model.start, bare, Rod(bare, two_segments(), points=True))
+    pose = predict(model, model.start, bare, PredictedRod(bare, two_segments(), points=True))
     rng = np.random.default_rng(3)
     tip = pose.position + SIGMA * rng.normal(size=(N, 3))
     turn = Rotation.from_rotvec(0.01 * rng.normal(size=(N, 3))) * Rotation.from_matrix(pose.rotation)
@@ -56,9 +56,9 @@ class Place:
             self.model = self.model.with_effect(name)
         self.theta = self.model.start
         self.samples = samples()
-        self.rod = Rod(self.samples, self.model.robot, points=True)
+        self.rod = PredictedRod(self.samples, self.model.robot, points=True)
         self.target = Target(self.samples, SIGMA, rotation_sigma=0.01, points=True)
-        self.local = Local(self.model, self.theta, self.samples, self.rod, self.target)
+        self.local = LinearisedModel(self.model, self.theta, self.samples, self.rod, self.target)
 
     def exact(self, model: Model, theta: np.ndarray) -> np.ndarray:
         residual, ok = exact_residual(model, theta, self.samples, self.rod, self.target)
@@ -246,8 +246,8 @@ def test_a_local_fit_finds_what_was_planted() -> None:
     told.tip = pose.position + SIGMA * np.random.default_rng(8).normal(size=(N, 3))
     told.rotation, told.points, told.seen = None, np.zeros((N, 0, 3)), np.zeros((N, 0, 3), bool)
     assert len(log) == N
-    local = Local(
-        here.model, here.theta, here.samples, Rod(here.samples, here.model.robot, points=True), told
+    local = LinearisedModel(
+        here.model, here.theta, here.samples, PredictedRod(here.samples, here.model.robot, points=True), told
     )
     fit = local.fit(here.model, here.theta, 20)
     error = np.sqrt(np.diag(np.linalg.inv(fit.hessian)))

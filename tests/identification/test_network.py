@@ -18,7 +18,7 @@ from fastrod.errors import InputError
 from fastrod.identification.attribution import identify
 from fastrod.identification.excite import excitation
 from fastrod.identification.learned.network import residual_network
-from fastrod.identification.log.forward import Samples, sample
+from fastrod.identification.log.forward import LogSamples, sample
 from fastrod.identification.log.split import held_out_rows
 from fastrod.model.robotfile import load_robot
 from fastrod.model.routing import wire
@@ -27,7 +27,7 @@ NOISE = 3e-4
 
 
 @cache
-def samples() -> Samples:
+def samples() -> LogSamples:
     run = excitation(one_segment(), rate=8.0).log
     return sample(replace(run, tip_position=np.zeros((len(run), 3)), payload=None, base_quaternion=None))
 

@@ -9,7 +9,7 @@ import pytest
 from identification.logs import log_of, one_segment, wires
 from numpy.testing import assert_allclose
 
-from fastrod.identification.log.forward import Samples, sample
+from fastrod.identification.log.forward import LogSamples, sample
 from fastrod.identification.log.noise import Noise, at_rest, keep, read_noise
 
 SIGMA = np.array([2e-4, 3e-4, 5e-4])
@@ -19,7 +19,7 @@ LONG = 2250  # as long as a designed run
 REST = (slice(0, 360), slice(1200, 1560))
 
 
-def samples(n: int = N, *, rests: bool = True) -> Samples:
+def samples(n: int = N, *, rests: bool = True) -> LogSamples:
     """Two minutes at 15 Hz: 24 s of rest, motion, 24 s of rest, motion; or motion alone."""
     robot = one_segment()
     moving = np.ones(n)

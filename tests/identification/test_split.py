@@ -10,7 +10,7 @@ from identification.logs import log_of, one_segment
 from numpy.testing import assert_array_equal
 
 from fastrod.errors import LogError, UnknownNameError
-from fastrod.identification.log.forward import Samples, sample
+from fastrod.identification.log.forward import LogSamples, sample
 from fastrod.identification.log.split import held_out_rows, merged
 from fastrod.logs.runlog import RunLog
 
@@ -22,7 +22,7 @@ def log(name: str = "log", labels: tuple[str, ...] = ("a", "b"), n: int = 40, be
     return replace(made, name=name, t=t)
 
 
-def samples(**changes: tuple[str, ...]) -> Samples:
+def samples(**changes: tuple[str, ...]) -> LogSamples:
     return sample(log(**changes))
 
 

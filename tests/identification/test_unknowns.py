@@ -15,7 +15,7 @@ from rods import rod
 from fastrod import Robot
 from fastrod.effects.base import columns, effect_names, get_effect
 from fastrod.errors import RobotError
-from fastrod.identification.log.forward import Rod, predict, sample
+from fastrod.identification.log.forward import PredictedRod, predict, sample
 from fastrod.identification.log.replay import replay
 from fastrod.identification.log.unknowns import FREE_CAMERA, STIFFNESS_SD, Model, base_model, effect_unknowns
 from fastrod.model.robotfile import dumps, loads
@@ -291,7 +291,7 @@ def test_the_identified_robot_is_the_prediction_and_survives_its_file() -> None:
             assert_allclose(values, model.values(theta)[name], rtol=1e-12)
     log = log_of(robot, wave(robot, 25), tip_force=np.tile([0.01, -0.02, 0.0], (25, 1)))
     samples = sample(log)
-    told = predict(model, theta, samples, Rod(samples, robot))
+    told = predict(model, theta, samples, PredictedRod(samples, robot))
     assert told.ok.all()
     shown = replay(log, back)
     assert shown.converged.all()
@@ -308,7 +308,7 @@ def test_replay_of_the_identified_robot_knows_camera_memory_and_time(name: str) 
     model = base_model(robot).with_effect(name)
     log = log_of(robot, wave(robot, 25))
     samples = sample(log)
-    told = predict(model, model.start, samples, Rod(samples, robot))
+    told = predict(model, model.start, samples, PredictedRod(samples, robot))
     assert_allclose(replay(log, model.identified(model.start)).tip_position, told.position, atol=5e-6)
 
 

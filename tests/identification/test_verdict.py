@@ -9,26 +9,33 @@ import pytest
 from numpy.testing import assert_allclose
 
 from fastrod.identification.report.result import Verdict
-from fastrod.identification.report.verdict import _EXPLAINED, _FOREIGN, _PARTLY, _UNCERTAIN, Opinion, judge
-from fastrod.identification.search.alternatives import Foil
-from fastrod.identification.search.model_selection import Candidate, Step
-from fastrod.identification.search.residual_test import Audit
+from fastrod.identification.report.verdict import (
+    _EXPLAINED,
+    _FOREIGN,
+    _PARTLY,
+    _UNCERTAIN,
+    VerdictGrounds,
+    judge,
+)
+from fastrod.identification.search.alternatives import AlternativePattern
+from fastrod.identification.search.model_selection import Candidate, SearchStep
+from fastrod.identification.search.residual_test import ResidualStructure
 
 BASE, FLOOR = 1.1, 0.1  # the error above the noise is 1
-CLEAN = Audit(0.0, 0.0, 0.0, 0.0, 0.0)
+CLEAN = ResidualStructure(0.0, 0.0, 0.0, 0.0, 0.0)
 KINDS = ("none", "static", "memory", "drift", "unknown")
-JUMP = Foil("bump", "drift", "the tip jumps", np.zeros((1, 3, 3)), 1)
-SWAY = Foil("sway", "exogenous", "a line", np.zeros((1, 3, 6)), 1)
-RIPPLE = Foil("ripple", "static", "periodic", np.zeros((1, 3, 2)), 1)
+JUMP = AlternativePattern("bump", "drift", "the tip jumps", np.zeros((1, 3, 3)), 1)
+SWAY = AlternativePattern("sway", "exogenous", "a line", np.zeros((1, 3, 6)), 1)
+RIPPLE = AlternativePattern("ripple", "static", "periodic", np.zeros((1, 3, 2)), 1)
 
 
-def took(foil: Foil | None, name: str = "backlash") -> Step:
+def took(foil: AlternativePattern | None, name: str = "backlash") -> SearchStep:
     """A stage that took a foil, or an effect."""
     taken = Candidate(foil.name if foil else name, None, 9.0, 99.0, 0.5, 1, "", foil)
-    return Step(None, (), taken)
+    return SearchStep(None, (), taken)
 
 
-def opinion(**changed: Any) -> Opinion:
+def opinion(**changed: Any) -> VerdictGrounds:
     given = {
         "base": BASE,
         "library": BASE,
@@ -48,13 +55,13 @@ def opinion(**changed: Any) -> Opinion:
     return made
 
 
-def found(left: float, **changed: Any) -> Opinion:
+def found(left: float, **changed: Any) -> VerdictGrounds:
     """Backlash, with a static structure that carries `left` of the error above the noise."""
     after = 0.5
     return opinion(
         library=after,
         after=after,
-        audit=Audit(left / after, 0.0, 0.0, 0.0, 5.0),
+        audit=ResidualStructure(left / after, 0.0, 0.0, 0.0, 5.0),
         found=["backlash"],
         **changed,
     )
@@ -74,26 +81,26 @@ def test_a_residual_of_noise_is_none() -> None:
 @pytest.mark.parametrize(
     ("audit", "kind"),
     [
-        (Audit(0.07, 0.01, 0.0, 0.0, 5.0), "static"),
-        (Audit(0.01, 0.07, 0.0, 0.0, 5.0), "memory"),
-        (Audit(0.0, 0.01, 0.07, 0.0, 5.0), "drift"),
-        (Audit(0.0, 0.0, 0.01, 0.07, 5.0), "unknown"),
+        (ResidualStructure(0.07, 0.01, 0.0, 0.0, 5.0), "static"),
+        (ResidualStructure(0.01, 0.07, 0.0, 0.0, 5.0), "memory"),
+        (ResidualStructure(0.0, 0.01, 0.07, 0.0, 5.0), "drift"),
+        (ResidualStructure(0.0, 0.0, 0.01, 0.07, 5.0), "unknown"),
     ],
 )
-def test_structure_that_nothing_explains_is_not_in_the_library(audit: Audit, kind: str) -> None:
+def test_structure_that_nothing_explains_is_not_in_the_library(audit: ResidualStructure, kind: str) -> None:
     made = opinion(audit=audit)
     assert (made.verdict, made.kind, made.patterns) == ("not_in_library", kind, ())
     assert_allclose(made.left, 0.08 * BASE)
 
 
 def test_structure_below_six_percent_is_none() -> None:
-    assert opinion(audit=Audit(0.03, 0.02, 0.009, 0.0, 5.0)).verdict == "none"
-    assert opinion(audit=Audit(0.03, 0.02, 0.011, 0.0, 5.0)).verdict == "not_in_library"
+    assert opinion(audit=ResidualStructure(0.03, 0.02, 0.009, 0.0, 5.0)).verdict == "none"
+    assert opinion(audit=ResidualStructure(0.03, 0.02, 0.011, 0.0, 5.0)).verdict == "not_in_library"
 
 
 @pytest.mark.parametrize(("foil", "kind"), [(JUMP, "drift"), (SWAY, "unknown"), (RIPPLE, "static")])
-def test_a_foil_alone_is_not_in_the_library_and_gives_its_kind(foil: Foil, kind: str) -> None:
-    made = opinion(after=FLOOR, steps=[took(foil), Step(None, (), None)])
+def test_a_foil_alone_is_not_in_the_library_and_gives_its_kind(foil: AlternativePattern, kind: str) -> None:
+    made = opinion(after=FLOOR, steps=[took(foil), SearchStep(None, (), None)])
     assert (made.verdict, made.kind, made.left, made.patterns) == ("not_in_library", kind, 1.0, (foil.what,))
     assert foil.what in made.summary
 
@@ -101,7 +108,7 @@ def test_a_foil_alone_is_not_in_the_library_and_gives_its_kind(foil: Foil, kind:
 def test_the_kind_is_of_what_is_larger_the_foil_or_the_structure_behind_it() -> None:
     after = 0.8  # the foil has taken 0.3
     small, large = (
-        opinion(after=after, steps=[took(JUMP)], audit=Audit(0.0, share / after, 0.0, 0.0, 5.0))
+        opinion(after=after, steps=[took(JUMP)], audit=ResidualStructure(0.0, share / after, 0.0, 0.0, 5.0))
         for share in (0.29, 0.31)
     )
     assert (small.kind, large.kind) == ("drift", "memory")
@@ -185,5 +192,10 @@ def test_a_log_at_its_floor_divides_by_no_zero() -> None:
     share."""
     for base in (0.5 * FLOOR, FLOOR):
         assert opinion(base=base, library=base, after=base).verdict == "none"
-        assert opinion(base=base, library=base, after=base, audit=Audit(0.5, 0.0, 0.0, 0.0, 5.0)).left == 1.0
+        assert (
+            opinion(
+                base=base, library=base, after=base, audit=ResidualStructure(0.5, 0.0, 0.0, 0.0, 5.0)
+            ).left
+            == 1.0
+        )
     assert opinion(base=0.0, library=0.0, after=0.0, floor=0.0).verdict == "none"

@@ -15,7 +15,7 @@ from rods import bend, rod
 
 from fastrod import Robot, Segment, Simulator, Tendon, load_robot, robot_names
 from fastrod.model.compile import compile_robots
-from fastrod.solver.boundary import Passes
+from fastrod.solver.boundary import BoundarySolver
 from fastrod.solver.guess import cold_start
 from fastrod.solver.inputs import Inputs, Reader
 from fastrod.types import Layout, Memory, Params, Ports
@@ -68,7 +68,7 @@ def fill(case: Case, n: int, rows: list[int] | None = None) -> Memory:
     """The memory of n robots after a cold start of `rows`, all of them by default; it was full of something
     else before."""
     layout, params, ports = case
-    passes = Passes(layout, params, n, threads=1, carry=True)
+    passes = BoundarySolver(layout, params, n, threads=1, carry=True)
     passes.remember(len(ports.follower_force) > 0, True, None)
     for a in passes.memory:
         a[:] = 7.0

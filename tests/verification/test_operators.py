@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from fastrod import Robot, Segment, Simulator, load_robot
 from fastrod.effects.base import get_effect
-from fastrod.effects.pipeline import Measurement
+from fastrod.effects.pipeline import SensedPoses
 from fastrod.kernels.operators import (
     BUFFER,
     SLIDERS,
@@ -376,7 +376,7 @@ def settled(robot: Robot, lengths: Any = None, **inputs: Any) -> State:
     return state
 
 
-def seen(robot: Robot, lengths: Any = None, **inputs: Any) -> Measurement:
+def seen(robot: Robot, lengths: Any = None, **inputs: Any) -> SensedPoses:
     sim = Simulator(robot, points_per_segment=8)
     sim.settle(lengths, tolerance=1e-12, **inputs)
     return sim.measure()
@@ -651,7 +651,7 @@ def test_what_the_camera_makes_of_the_tip() -> None:
     plain = seen(robot, lengths, **given)
     r, R, points = plain.tip_position[0], plain.tip_rotation[0], plain.points[0]
 
-    def look(name: str, **values: float) -> Measurement:
+    def look(name: str, **values: float) -> SensedPoses:
         return seen(having(robot, name, **values), lengths, **given)
 
     turn, shift = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix(), np.array([0.01, -0.02, 0.005])

@@ -13,7 +13,7 @@ from fastrod.errors import InputError, UnknownNameError
 from fastrod.rotation import product, quaternion_from_vector
 from fastrod_device.calibration import CharucoBoard, calibrate, register_base
 from fastrod_device.camera import Camera, compose, rotation
-from fastrod_device.drawing import Scene, draw_board
+from fastrod_device.drawing import DrawnScene, draw_board
 from fastrod_device.errors import CalibrationError
 from fastrod_device.latency import estimate_latency
 
@@ -49,7 +49,7 @@ def test_drawn_board_is_the_printed_one():
     print_ = BOARD.draw(64)
     height, width = print_.shape
     camera = Camera(matrix=((640.0, 0.0, 31.5), (0.0, 640.0, 31.5), (0.0, 0.0, 1.0)), size=(width, height))
-    scene = Scene(white=255.0, black=0.0, blur=0.0, noise=0.0, gradient=(0.0, 0.0), vignetting=0.0)
+    scene = DrawnScene(white=255.0, black=0.0, blur=0.0, noise=0.0, gradient=(0.0, 0.0), vignetting=0.0)
     seen = draw_board(
         camera,
         BOARD,

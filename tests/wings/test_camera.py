@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fastrod.errors import InputError
-from fastrod.hosts import Bullet, Camera, connect
+from fastrod.hosts import Bullet, HostCamera, connect
 
 pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'fastrod[hosts]'")
 
@@ -30,7 +30,7 @@ def box(b: Bullet, at: list[float], half: list[float], color: list[float]) -> in
 @pytest.mark.parametrize(("color", "channel"), [([1, 0, 0, 1], 0), ([0, 1, 0, 1], 1), ([0, 0, 1, 1], 2)])
 def test_a_colour_is_in_its_own_channel(world: Bullet, color: list[float], channel: int) -> None:
     box(world, [0.0, 0.0, 0.0], [0.1] * 3, color)
-    image = Camera(width=64, height=48).look(world, (0.0, -0.5, 0.0), (0.0, 0.0, 0.0))
+    image = HostCamera(width=64, height=48).look(world, (0.0, -0.5, 0.0), (0.0, 0.0, 0.0))
     middle = image.rgb[24, 32].tolist()
     assert image.rgb.dtype == np.uint8
     assert image.rgb.shape == (48, 64, 3)
@@ -42,14 +42,14 @@ def test_a_colour_is_in_its_own_channel(world: Bullet, color: list[float], chann
 def test_depth_is_the_distance_along_the_optical_axis(world: Bullet, distance: float) -> None:
     """A wall is equally deep everywhere, also far from the axis, where the ray to it is longer."""
     wall = box(world, [0.0, distance + 0.01, 0.0], [5.0, 0.01, 5.0], [1, 1, 1, 1])
-    image = Camera(width=80, height=60, near=0.005, far=4.0).look(world, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    image = HostCamera(width=80, height=60, near=0.005, far=4.0).look(world, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
     assert (image.segmentation == wall).all()
     assert np.abs(image.depth - distance).max() < 1e-3
 
 
 def test_nothing_is_infinitely_far(world: Bullet) -> None:
     cube = box(world, [0.0, 1.0, 0.0], [0.1] * 3, [1, 1, 1, 1])
-    image = Camera(width=80, height=60).look(world, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    image = HostCamera(width=80, height=60).look(world, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
     assert np.array_equal(np.isinf(image.depth), image.segmentation == -1)
     assert set(np.unique(image.segmentation)) == {-1, cube}
 
@@ -57,7 +57,7 @@ def test_nothing_is_infinitely_far(world: Bullet) -> None:
 def test_the_picture_is_upright_and_not_mirrored(world: Bullet) -> None:
     """Seen along +y with z upward, +x is on the right; each cube is where the pinhole puts it, to a pixel."""
     above, right = box(world, [0, 1, 0.3], [0.02] * 3, [1] * 4), box(world, [0.3, 1, 0], [0.02] * 3, [1] * 4)
-    seen = Camera(width=160, height=120, fov=60.0).look(world, (0, 0, 0), (0, 1, 0)).segmentation
+    seen = HostCamera(width=160, height=120, fov=60.0).look(world, (0, 0, 0), (0, 1, 0)).segmentation
     shift = 60.0 / math.tan(math.radians(30.0)) * 0.3  # pixels, at 1 m; the cubes' near faces stand at 0.98 m
     for body, row, column in ((above, 59.5 - shift, 79.5), (right, 59.5, 79.5 + shift)):
         assert np.argwhere(seen == body).mean(axis=0) == pytest.approx([row, column], abs=1.5)
@@ -73,11 +73,11 @@ def test_the_picture_is_upright_and_not_mirrored(world: Bullet) -> None:
 )
 def test_a_camera_that_cannot_be_says_so(arguments: dict[str, float], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
-        Camera(**arguments)
+        HostCamera(**arguments)
 
 
 def test_a_view_that_cannot_be_says_so(world: Bullet) -> None:
-    camera = Camera()
+    camera = HostCamera()
     with pytest.raises(InputError, match="different directions"):
         camera.look(world, (0, 0, 1), (0, 0, 0))
     with pytest.raises(InputError, match=r"target is .* give three finite numbers"):

@@ -22,7 +22,7 @@ from fastrod_device.errors import DeviceError
 from fastrod_device.faultcodes import CODES, STATUS_BITS, in_words, state_in_words
 from fastrod_device.nodes import EmulatedDrives
 from fastrod_device.pacer import Pacer, urgently
-from fastrod_device.readings import Feedback
+from fastrod_device.readings import DriveFeedback
 from fastrod_device.units import DriveSpec, Transmission
 
 pytest.importorskip("canopen", reason="canopen is not installed: pip install 'fastrod[device]'")
@@ -50,7 +50,7 @@ class Bench:
         self.bus = DriveBus(SPECS, self.name, clock=self.clock, rate=rate)
         self.rate = rate
 
-    def run(self, cycles: int, target: object = None) -> list[Feedback]:
+    def run(self, cycles: int, target: object = None) -> list[DriveFeedback]:
         pacer, seen = Pacer(self.clock, self.rate), []
         for _ in range(cycles):
             seen.append(self.bus.exchange(target))
@@ -74,7 +74,7 @@ def ready():
         yield bench
 
 
-def states(feedback: Feedback) -> list[str]:
+def states(feedback: DriveFeedback) -> list[str]:
     return [state_in_words(int(word)) for word in feedback.statusword]
 
 

@@ -22,7 +22,7 @@ from fastrod_envs.randomisation import Randomisation
 from fastrod_envs.registration import SOLVED, task_class
 from fastrod_envs.rodtask import RodTask
 from fastrod_envs.single import SingleEnv
-from fastrod_envs.task import Ball, Line, Scenery, Solid, Tube
+from fastrod_envs.task import Backdrop, Ball, DrawnLine, Solid, Tube
 from fastrod_envs.tasks.reach import hanging_robot
 from fastrod_envs.vector import BatchEnv
 
@@ -282,9 +282,9 @@ def flat(z: float = 0.0) -> Solid:
 def test_a_picture_shows_what_is_where() -> None:
     # seen from the side, the target in the middle; at distance d a metre is 360 / (2 d tan 18 deg) pixels
     view = {"eye": (2.0, 0.0, 0.3), "target": (0.0, 0.0, 0.3)}
-    empty = paint(Scenery(**view), 480, 360).astype(int)
+    empty = paint(Backdrop(**view), 480, 360).astype(int)
     ball = paint(
-        Scenery(balls=(Ball(np.array([0.0, 0.2, 0.4]), 0.05, (1.0, 0.0, 0.0)),), **view), 480, 360
+        Backdrop(balls=(Ball(np.array([0.0, 0.2, 0.4]), 0.05, (1.0, 0.0, 0.0)),), **view), 480, 360
     ).astype(int)
     red = (ball[:, :, 0] - ball[:, :, 1] > 60) & (np.abs(ball - empty).sum(2) > 60)
     rows, columns = np.nonzero(red)
@@ -293,8 +293,8 @@ def test_a_picture_shows_what_is_where() -> None:
     assert rows.mean() == pytest.approx(180 - 0.1 * scale, abs=1.0)
     assert red.sum() == pytest.approx(np.pi * (0.05 * scale) ** 2, rel=0.05)
     rod = Tube(np.array([[0.0, 0.0, z] for z in np.linspace(0.1, 0.5, 9)]), 0.01, (1.0, 0.5, 0.0))
-    line = Line(np.array([[0.0, -0.3, 0.35], [0.0, -0.1, 0.35]]), (0.0, 0.6, 0.0))
-    both = paint(Scenery(tubes=(rod,), lines=(line,), **view), 480, 360).astype(int)
+    line = DrawnLine(np.array([[0.0, -0.3, 0.35], [0.0, -0.1, 0.35]]), (0.0, 0.6, 0.0))
+    both = paint(Backdrop(tubes=(rod,), lines=(line,), **view), 480, 360).astype(int)
     assert (np.abs(both - empty).sum(2) > 90)[200:210, :].any(0).sum() == pytest.approx(0.02 * scale, abs=2)
     assert (both[:, :, 1] - both[:, :, 0] > 60).any(0).sum() == pytest.approx(0.2 * scale, abs=2)
 
@@ -304,7 +304,7 @@ def test_what_is_nearer_hides_what_is_behind() -> None:
     ball = Ball(np.array([0.05, 0.0, 0.1]), 0.05, (1.0, 0.0, 0.0))
 
     def red(*solids: Solid) -> int:
-        picture = paint(Scenery(balls=(ball,), solids=solids, **above), 120, 90).astype(int)
+        picture = paint(Backdrop(balls=(ball,), solids=solids, **above), 120, 90).astype(int)
         return int((picture[:, :, 0] > picture[:, :, 2] + 40).sum())
 
     assert red() > 20

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from fastrod import Simulator, load_robot
 from fastrod.control import references
-from fastrod.control.inverse import Plan
+from fastrod.control.inverse import InversePlan
 from fastrod.identification.excite import Excitation
 from fastrod.logs.runlog import RunLog, read_log
 from fastrod.model.routing import wire
@@ -24,7 +24,7 @@ from fastrod_device.hardware import load_hardware
 from fastrod_device.latency import play, sweep
 from fastrod_device.loop import APPROACH, planned
 from fastrod_device.prototype import Prototype
-from fastrod_device.workbench import Bench, emulated
+from fastrod_device.workbench import EmulatedBench, emulated
 
 ROBOT = load_robot("prototype")
 MASS = 0.01
@@ -36,7 +36,7 @@ SECONDS = 1.6  # of a block
 
 
 @pytest.fixture
-def bench() -> Iterator[Bench]:
+def bench() -> Iterator[EmulatedBench]:
     with emulated(load_hardware(), seed=11, effect="none", home=False) as made:
         yield made
 
@@ -45,7 +45,7 @@ def bench() -> Iterator[Bench]:
 class Noting:
     """Hands that note what they were asked for, and when; those of the emulator then do it."""
 
-    bench: Bench
+    bench: EmulatedBench
     asked: list[tuple[str, float]] = field(default_factory=list)
     at: list[float] = field(default_factory=list)
     stops: bool = False
@@ -89,14 +89,14 @@ def short_run() -> Excitation:
     return Excitation(log=log, parts=())
 
 
-def circle_plan() -> Plan:
+def circle_plan() -> InversePlan:
     return planned(ROBOT, references(ROBOT.length)["circle"])
 
 
 # ---------------------------------------------------------------- excite
 
 
-def test_hands_are_asked_in_the_order_of_the_run(bench: Bench, tmp_path: Path) -> None:
+def test_hands_are_asked_in_the_order_of_the_run(bench: EmulatedBench, tmp_path: Path) -> None:
     hands, run, told = Noting(bench), short_run(), []
     log = excite(
         bench.prototype,
@@ -126,7 +126,7 @@ def test_hands_are_asked_in_the_order_of_the_run(bench: Bench, tmp_path: Path) -
     assert (np.diff([done for _, done, _ in told]) >= 0).all()
 
 
-def test_the_wires_go_where_the_run_says(bench: Bench, tmp_path: Path) -> None:
+def test_the_wires_go_where_the_run_says(bench: EmulatedBench, tmp_path: Path) -> None:
     run = short_run()
     log = excite(bench.prototype, run, bench.hands, tmp_path / "run.csv")
     log = log.rows(log.t < SECONDS)  # later, hands have taken their time
@@ -140,7 +140,7 @@ def test_the_wires_go_where_the_run_says(bench: Bench, tmp_path: Path) -> None:
     assert np.sqrt(np.mean((state.tip_position - log.tip_position[free]) ** 2)) < 1e-3
 
 
-def test_what_is_returned_is_what_is_on_disk(bench: Bench, tmp_path: Path) -> None:
+def test_what_is_returned_is_what_is_on_disk(bench: EmulatedBench, tmp_path: Path) -> None:
     path = tmp_path / "run.csv"
     log = excite(bench.prototype, short_run(), bench.hands, path)
     again = read_log(path, ROBOT)
@@ -150,7 +150,7 @@ def test_what_is_returned_is_what_is_on_disk(bench: Bench, tmp_path: Path) -> No
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run.csv"]
 
 
-def test_a_stop_half_way_keeps_the_rows(bench: Bench, tmp_path: Path) -> None:
+def test_a_stop_half_way_keeps_the_rows(bench: EmulatedBench, tmp_path: Path) -> None:
     path = tmp_path / "run.csv"
     with pytest.raises(DeviceError, match="stop") as caught:
         excite(bench.prototype, short_run(), Noting(bench, stops=True), path)
@@ -165,14 +165,14 @@ def test_a_stop_half_way_keeps_the_rows(bench: Bench, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- follow
 
 
-def test_a_plan_is_followed_by_the_model_and_by_the_policy(bench: Bench, tmp_path: Path) -> None:
+def test_a_plan_is_followed_by_the_model_and_by_the_policy(bench: EmulatedBench, tmp_path: Path) -> None:
     pytest.importorskip("gymnasium", reason="gymnasium is not installed: pip install 'fastrod[envs]'")
-    from fastrod_envs.pilot import TrackPilot
+    from fastrod_envs.pilot import PolicyDriver
     from fastrod_envs.policies import Policy, find
 
     made = circle_plan()
     model = tracking("circle", follow(bench.prototype, made, tmp_path / "model.csv"), made)
-    pilot = TrackPilot(Policy(find("Track", "shipped")), "circle", ROBOT)
+    pilot = PolicyDriver(Policy(find("Track", "shipped")), "circle", ROBOT)
     bench.prototype.follow(lambda s: (1.0 - min(s, 1.0)) * made.dl[-1], 1.2)  # a policy begins at home
     law = follow(
         bench.prototype, made, tmp_path / "policy.csv", law=lambda tip, t: pilot.command(tip, t - APPROACH)
@@ -189,7 +189,7 @@ def test_a_plan_is_followed_by_the_model_and_by_the_policy(bench: Bench, tmp_pat
     assert policy.distance < 2e-3
 
 
-def test_a_stop_on_the_way_keeps_the_rows(bench: Bench, tmp_path: Path) -> None:
+def test_a_stop_on_the_way_keeps_the_rows(bench: EmulatedBench, tmp_path: Path) -> None:
     emulator, made = bench.emulator, circle_plan()
     assert emulator is not None
 
@@ -205,7 +205,7 @@ def test_a_stop_on_the_way_keeps_the_rows(bench: Bench, tmp_path: Path) -> None:
     assert not kept.measured[kept.t > 1.6].any()
 
 
-def test_a_law_beyond_the_limits_is_refused(bench: Bench, tmp_path: Path) -> None:
+def test_a_law_beyond_the_limits_is_refused(bench: EmulatedBench, tmp_path: Path) -> None:
     made = circle_plan()
     with pytest.raises((RefusedError, DeviceError)) as caught:
         follow(
@@ -229,7 +229,7 @@ def test_tracking_numbers_by_hand() -> None:
     target = np.stack([0.02 * np.cos(t), 0.02 * np.sin(t), np.full(n, 0.07)], axis=1)
     target[:8] = np.nan
     nearest = target + np.array([0.0, 0.0, 2e-3])
-    made = Plan(
+    made = InversePlan(
         robot=ROBOT,
         t=t,
         dl=np.zeros((n, 4)),

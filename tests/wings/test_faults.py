@@ -18,7 +18,7 @@ import pytest
 
 from fastrod.logs.recording import recover
 from fastrod.types import Floats
-from fastrod_device.bus import Line
+from fastrod_device.bus import BusLine
 from fastrod_device.clock import SteppedClock, WallClock
 from fastrod_device.emulator import Emulator
 from fastrod_device.errors import DeviceError, RefusedError
@@ -26,7 +26,7 @@ from fastrod_device.faultcodes import ENABLED
 from fastrod_device.hardware import load_hardware
 from fastrod_device.journal import Journal
 from fastrod_device.prototype import Prototype
-from fastrod_device.safety import State
+from fastrod_device.safety import SafetyState
 from fastrod_device.seal import seal
 
 pytest.importorskip("canopen", reason="canopen is not installed: pip install 'fastrod[device]'")
@@ -66,7 +66,7 @@ class Rig:
         self.recorder.start(self.prototype.elapsed)
         self.prototype.record(self.recorder)
         self._due, self.storm = 0.0, 0
-        self.other = Line(self.bus)
+        self.other = BusLine(self.bus)
         self.began = self.clock.now()
 
     def circle(self) -> Floats:
@@ -90,7 +90,7 @@ class Rig:
 
     @property
     def stopped(self) -> bool:
-        return self.supervisor.state is State.STOPPED
+        return self.supervisor.state is SafetyState.STOPPED
 
     @property
     def enabled(self) -> list[bool]:
@@ -225,7 +225,7 @@ def test_a_release_waits_for_the_end_of_the_cause(name: str, tmp_path: Path) -> 
             assert rig.stopped
             assert "where its wire is may be lost" in rig.prototype.read().problem
             return
-        assert rig.supervisor.state is State.READY
+        assert rig.supervisor.state is SafetyState.READY
         assert all(rig.enabled)
         np.testing.assert_allclose(rig.drives.true_pulled, where, atol=2e-6)  # nothing moves by it
         assert rig.prototype.journal.lines[-1][1] == "release"

@@ -19,9 +19,9 @@ from fastrod_device.emulator import Emulator
 from fastrod_device.errors import DeviceError
 from fastrod_device.hardware import load_hardware
 from fastrod_device.homing import home, trouble
-from fastrod_device.readings import Emergency, Feedback
+from fastrod_device.readings import DriveFeedback, Emergency
 from fastrod_device.seal import seal
-from fastrod_device.tracker import MarkerTracker, Sighting
+from fastrod_device.tracker import MarkerSighting, MarkerTracker
 from fastrod_device.units import Transmission
 
 pytest.importorskip("canopen", reason="canopen is not installed: pip install 'fastrod[device]'")
@@ -48,7 +48,7 @@ class Rig:
             following_error=int(HARDWARE.limits.following_error / HARDWARE.drives[0].metres_per_count)
         )
 
-    def look(self) -> Sighting | None:
+    def look(self) -> MarkerSighting | None:
         frame = self.emulator.read()
         if frame is None:
             return None
@@ -75,7 +75,7 @@ def rig() -> Iterator[Rig]:
         made.emulator.close()
 
 
-def well(**changed: Any) -> Feedback:
+def well(**changed: Any) -> DriveFeedback:
     """Four drives that do as they are told."""
     zero = np.zeros(4, dtype=np.int64)
     given: dict[str, Any] = {
@@ -91,7 +91,7 @@ def well(**changed: Any) -> Feedback:
         "emergencies": (),
         "lost": "",
     }
-    return Feedback(**(given | changed))
+    return DriveFeedback(**(given | changed))
 
 
 def test_nothing_is_wrong_with_drives_that_do_as_they_are_told() -> None:
@@ -192,7 +192,7 @@ def test_a_fault_while_the_wires_move_stops_all_at_once_and_is_named(
     with rig() as made:
         exchange, cycles, since = DriveBus.exchange, [0], [0.0]
 
-        def counted(self: DriveBus, target: Any = None) -> Feedback:
+        def counted(self: DriveBus, target: Any = None) -> DriveFeedback:
             cycles[0] += target is not None
             if cycles[0] == 20 and target is not None:
                 inject(made)
@@ -259,7 +259,7 @@ def test_a_camera_that_turns_left_into_right_is_found_in_the_second_round() -> N
     with rig() as made:
         look = made.look
 
-        def mirrored() -> Sighting | None:
+        def mirrored() -> MarkerSighting | None:
             sighting = look()
             if sighting is None or not sighting.ok:
                 return sighting

@@ -19,8 +19,8 @@ from fastrod.logs.runlog import read_log
 from fastrod.logs.simulated import SimulatedRobot
 from fastrod_viewer.drive_page import far_rows, fitted
 from fastrod_viewer.knobs import drive_knobs
-from fastrod_viewer.linked import Linked, Reach
-from fastrod_viewer.pilot import Pilot, Speeds
+from fastrod_viewer.linked import Linked, TendonLimits
+from fastrod_viewer.pilot import Speeds, Teleop
 from fastrod_viewer.session import Session
 from fastrod_viewer.worlds import FreeWorld
 
@@ -99,12 +99,12 @@ def until(holds: Callable[[], bool], seconds: float = 30.0) -> bool:
 
 def driven(link: object) -> Session:
     world = FreeWorld(fastrod.load_robot("prototype"))
-    return Session(world, Pilot(world, reach=Linked(link).reach), draw=lambda frame: None, link=link)
+    return Session(world, Teleop(world, reach=Linked(link).reach), draw=lambda frame: None, link=link)
 
 
 def test_wires_keep_to_the_rate_of_the_link_and_go_straight() -> None:
     world = FreeWorld(fastrod.load_robot("prototype"))
-    pilot = Pilot(world, Speeds(bend=20.0), reach=Reach(rate=0.004))
+    pilot = Teleop(world, Speeds(bend=20.0), reach=TendonLimits(rate=0.004))
     pilot.bend(0, 0.4, 0.2)
     pilot.wire(0, -0.004)
     told = [world.robot.rest_tendon_length]
@@ -118,7 +118,7 @@ def test_wires_keep_to_the_rate_of_the_link_and_go_straight() -> None:
 
 def test_bends_and_knobs_end_where_the_wires_do() -> None:
     world = FreeWorld(fastrod.load_robot("prototype"))
-    pilot = Pilot(world, reach=Reach(displacement=0.005))
+    pilot = Teleop(world, reach=TendonLimits(displacement=0.005))
     pilot.bend(0, 9.0, -9.0)
     assert np.abs(pilot.change).max() < 0.005
     groups = {group.title: group for group in drive_knobs(world, pilot)}
@@ -130,13 +130,13 @@ def test_bends_and_knobs_end_where_the_wires_do() -> None:
 @pytest.mark.parametrize("name", ["displacement", "rate"])
 def test_a_reach_is_positive(name: str) -> None:
     with pytest.raises(InputError, match=f"Reach.{name} is 0.0; it must be positive"):
-        Reach(**{name: 0.0})
+        TendonLimits(**{name: 0.0})
 
 
 def test_a_link_that_offers_nothing_is_driven_all_the_same() -> None:
     link = SimulatedRobot(fastrod.load_robot("prototype"))
     far = Linked(link)
-    assert far.reach == Reach()
+    assert far.reach == TendonLimits()
     assert far.ready
     assert not far.stopped
     assert (far.status, far.camera(), far.picture(), far.sees) == ("", "", None, False)
@@ -254,7 +254,7 @@ def test_a_recording_of_a_link_begins_by_its_clock(tmp_path: Path) -> None:
     world = FreeWorld(link.robot)
     for _ in range(60):
         world.play()
-    session = Session(world, Pilot(world), draw=lambda frame: None, link=link)
+    session = Session(world, Teleop(world), draw=lambda frame: None, link=link)
     session.ask(lambda: session.record(tmp_path / "a.csv"))
     session.start()
     assert until(lambda: session.recorder is not None and len(session.recorder) > 5)

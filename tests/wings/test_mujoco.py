@@ -15,7 +15,7 @@ from fastrod.contact import ContactScene
 from fastrod.errors import HostError, InputError, RobotError
 from fastrod.hosts import MujocoBody, MujocoRod, add_capsules
 from fastrod.hosts.mujoco_body import com_motion, refresh
-from fastrod.hosts.mujoco_touched import TouchedBody
+from fastrod.hosts.mujoco_touched import MujocoBodyContact
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.simulator import Simulator
 from fastrod_scenes.ur5.mujoco_arm import JOINTS, MujocoArm, arm_spec
@@ -160,7 +160,7 @@ def test_every_geom_is_an_obstacle_where_it_is():
     data = mujoco.MjData(model)
     refresh(model, data)
     for name in shapes:
-        touched = TouchedBody(model, data, model.body(name).id, dt=0.005, relaxation=0.1, friction=0.3)
+        touched = MujocoBodyContact(model, data, model.body(name).id, dt=0.005, relaxation=0.1, friction=0.3)
         assert [part.obstacle.shape for part in touched.parts] == [name]
         pose = touched.expected([])[0][name]
         robot = soft_robot(1)
@@ -442,14 +442,14 @@ def test_what_is_not_there_is_a_sentence(monkeypatch):
     with pytest.raises(
         HostError, match=r"^body 'ghost' has no geom that collides, so nothing can touch it\.$"
     ):
-        TouchedBody(model, data, model.body("ghost").id, dt=0.005, relaxation=0.1, friction=0.3)
+        MujocoBodyContact(model, data, model.body("ghost").id, dt=0.005, relaxation=0.1, friction=0.3)
     round_one = spec_of(
         '<body name="egg"><freejoint/><geom type="ellipsoid" size=".01 .02 .03"/></body>'
     ).compile()
     with pytest.raises(
         HostError, match=r"^geom 0 of 'egg' is of the kind ellipsoid, which a rod cannot touch"
     ):
-        TouchedBody(round_one, mujoco.MjData(round_one), 1, dt=0.005, relaxation=0.1, friction=0.3)
+        MujocoBodyContact(round_one, mujoco.MjData(round_one), 1, dt=0.005, relaxation=0.1, friction=0.3)
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(
         HostError,

@@ -15,17 +15,17 @@ from fastrod.logs.recording import Recorder
 from fastrod.logs.simulated import SimulatedRobot
 from fastrod_viewer.knobs import drive_knobs, largest_force, load_knobs, nice
 from fastrod_viewer.measuring import measure
-from fastrod_viewer.pilot import LARGEST_BEND, Pilot, Speeds
+from fastrod_viewer.pilot import LARGEST_BEND, Speeds, Teleop
 from fastrod_viewer.session import Session
-from fastrod_viewer.world import Hand
+from fastrod_viewer.world import ManualCommand
 from fastrod_viewer.worlds import FreeWorld
 
 DT = 1.0 / 30.0
 
 
-def piloted(name: str = "five_segment_reacher") -> tuple[FreeWorld, Pilot]:
+def piloted(name: str = "five_segment_reacher") -> tuple[FreeWorld, Teleop]:
     world = FreeWorld(fastrod.load_robot(name))
-    return world, Pilot(world)
+    return world, Teleop(world)
 
 
 def until(holds: Callable[[], bool], seconds: float = 30.0) -> bool:
@@ -165,7 +165,7 @@ def test_what_cannot_be_done_is_said_and_given_up(monkeypatch: pytest.MonkeyPatc
     world, pilot = piloted("prototype")
     drive = FreeWorld.drive
 
-    def refuse(self: FreeWorld, hand: Hand) -> None:
+    def refuse(self: FreeWorld, hand: ManualCommand) -> None:
         if hand.tendon_length[0] < 0.07 - 0.5 * 0.0075:
             raise InputError("robot 0 cannot be brought there: a wall.")
         drive(self, hand)
@@ -205,7 +205,7 @@ def test_a_real_robot_stops_when_nobody_watches_and_a_simulated_one_holds() -> N
         link = SimulatedRobot(robot, real=real)
         assert isinstance(link, RobotLink)
         world = FreeWorld(robot)
-        pilot = Pilot(world, Speeds(bend=0.1))
+        pilot = Teleop(world, Speeds(bend=0.1))
         session = Session(world, pilot, draw=lambda frame: None, link=link)
         session.start()
         pilot.bend(0, 1.0, 0.0)
@@ -238,7 +238,7 @@ def test_a_linked_robot_is_taken_over_where_it_stands_and_never_jumps() -> None:
             command(dl, ext)
 
     world = FreeWorld(robot)
-    pilot = Pilot(world, Speeds(bend=0.5))
+    pilot = Teleop(world, Speeds(bend=0.5))
     session = Session(world, pilot, draw=lambda frame: None, link=Heard())
     session.start()
     assert until(lambda: len(told) > 3)
@@ -278,7 +278,7 @@ def test_a_measured_robot_that_differs_shows_its_residual() -> None:
     """The link's robot has softer wires than its model; what is measured is the link's."""
     robot = fastrod.load_robot("prototype")
     world = FreeWorld(robot)
-    pilot = Pilot(world)
+    pilot = Teleop(world)
     seen: list[Measurement | None] = []
     session = Session(
         world, pilot, draw=lambda frame: seen.append(frame.measured), link=SimulatedRobot(robot)

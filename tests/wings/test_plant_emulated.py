@@ -21,7 +21,7 @@ from fastrod.rotation import matrix_from_quaternion
 from fastrod_device import plant, plant_rod
 from fastrod_device.errors import DeviceError
 from fastrod_device.plant import Plant
-from fastrod_device.plant_rod import EI, LENGTH, OFFSET, Rod
+from fastrod_device.plant_rod import EI, LENGTH, OFFSET, PlantRod
 from fastrod_device.seal import KINDS, NAMES, Seal, seal
 
 DOWN = np.array([0.0, 0.0, -1.0])
@@ -67,7 +67,7 @@ def test_without_effect_it_is_the_simulator_at_rest() -> None:
     robot = rod()
     state = Simulator(robot, n, dt=0.01).settle(robot.rest_tendon_length + dl, tip_force=force)
     assert state.ok.all()
-    cold = [Rod().rest(a, f, DOWN) for a, f in zip(dl, force, strict=True)]
+    cold = [PlantRod().rest(a, f, DOWN) for a, f in zip(dl, force, strict=True)]
     # both are discretised far finer than the 0.02 mm that the camera could ever tell
     assert_allclose([r.position for r in cold], state.tip_position, rtol=0, atol=2e-6)
     assert_allclose([r.rotation for r in cold], state.tip_rotation, rtol=0, atol=1e-4)
@@ -81,7 +81,7 @@ def test_line_weight_is_the_simulators() -> None:
             robot.rest_tendon_length + wires(0.5, -0.6), line_force=5.0 * down
         )
         assert_allclose(
-            Rod(weight=5.0).rest(wires(0.5, -0.6), STILL, down).position,
+            PlantRod(weight=5.0).rest(wires(0.5, -0.6), STILL, down).position,
             state.tip_position[0],
             rtol=0,
             atol=2e-6,
@@ -90,7 +90,7 @@ def test_line_weight_is_the_simulators() -> None:
 
 @pytest.mark.parametrize("bend", [0.05, 0.7, -1.3, 2.5])
 def test_without_load_it_is_an_arc(bend: float) -> None:
-    rest = Rod(compliance=STIFF).rest(wires(0.0, bend), STILL, DOWN)
+    rest = PlantRod(compliance=STIFF).rest(wires(0.0, bend), STILL, DOWN)
     assert_allclose(
         rest.position,
         LENGTH / bend * np.array([1.0 - math.cos(bend), 0.0, math.sin(bend)]),
@@ -106,16 +106,16 @@ def test_without_load_it_is_an_arc(bend: float) -> None:
 
 def test_small_loads_bend_a_beam_whose_tip_the_wires_keep_from_turning() -> None:
     aside = np.array([0.0, 1.0, 0.0])
-    tip = Rod(compliance=STIFF).rest(np.zeros(4), 1e-3 * aside, aside)
+    tip = PlantRod(compliance=STIFF).rest(np.zeros(4), 1e-3 * aside, aside)
     assert tip.position[1] == pytest.approx(1e-3 * LENGTH**3 / (12.0 * EI), rel=1e-3)  # F l^3 / 12 EI
-    line = Rod(compliance=STIFF, weight=1e-2).rest(np.zeros(4), STILL, aside)
+    line = PlantRod(compliance=STIFF, weight=1e-2).rest(np.zeros(4), STILL, aside)
     assert line.position[1] == pytest.approx(1e-2 * LENGTH**4 / (24.0 * EI), rel=1e-3)  # w l^4 / 24 EI
     assert_allclose([tip.rotation[1, 2], line.rotation[1, 2]], 0.0, atol=1e-6)
 
 
 def test_spread_of_the_weight_does_not_change_its_sum() -> None:
     x = np.linspace(0.0, 1.0, 2001)
-    spread = Rod(weight=4.0, slope=0.15, bulge=-0.25)
+    spread = PlantRod(weight=4.0, slope=0.15, bulge=-0.25)
     line = 4.0 * (1.0 + 0.15 * (1.0 - 2.0 * x) - 0.25 * (6.0 * x * (1.0 - x) - 1.0))
     steps = 0.5 * LENGTH * np.diff(x) * (line[1:] + line[:-1])
     beyond = np.append(np.cumsum(steps[::-1])[::-1], 0.0)
@@ -127,7 +127,7 @@ def test_spread_of_the_weight_does_not_change_its_sum() -> None:
 def test_a_quarter_turn_of_wires_and_loads_turns_the_shape() -> None:
     quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     dl, force, down = wires(0.4, -0.7), np.array([0.3, 0.5, -0.4]), np.array([0.6, 0.0, -0.8])
-    it = Rod(weight=4.0, slope=0.1, compliance=3e-4, settling=0.3)
+    it = PlantRod(weight=4.0, slope=0.1, compliance=3e-4, settling=0.3)
     one, other = it.rest(dl, force, down), it.rest(np.roll(dl, 1), quarter @ force, quarter @ down)
     assert_allclose(other.position, quarter @ one.position, rtol=0, atol=1e-10)
     assert_allclose(other.rotation, quarter @ one.rotation @ quarter.T, rtol=0, atol=1e-8)
@@ -136,7 +136,7 @@ def test_a_quarter_turn_of_wires_and_loads_turns_the_shape() -> None:
 
 def test_a_warm_start_from_afar_ends_where_a_cold_one_does() -> None:
     rng = np.random.default_rng(2)
-    it, last = Rod(weight=4.0, compliance=4e-4, settling=0.3), None
+    it, last = PlantRod(weight=4.0, compliance=4e-4, settling=0.3), None
     for _ in range(25):
         dl, force = wires(*rng.uniform(-0.7, 0.7, 2)), rng.uniform(-0.5, 0.5, 3)
         last = it.rest(dl, force, DOWN, last)
@@ -147,7 +147,7 @@ def test_a_warm_start_from_afar_ends_where_a_cold_one_does() -> None:
 
 def test_tensions_change_with_the_wires_by_their_slope() -> None:
     it, dl, force, h = (
-        Rod(compliance=3e-4, settling=0.3, weight=3.0),
+        PlantRod(compliance=3e-4, settling=0.3, weight=3.0),
         wires(0.3, 0.5),
         np.array([0.2, 0.1, -0.5]),
         1e-6,
@@ -165,7 +165,7 @@ def test_tensions_change_with_the_wires_by_their_slope() -> None:
 
 
 def test_a_wire_whose_strands_settle_gives_less_the_more_it_is_pulled() -> None:
-    it = Rod(compliance=4e-4, settling=0.3, knee=1.5)
+    it = PlantRod(compliance=4e-4, settling=0.3, knee=1.5)
     dl = wires(0.0, 0.9)
     rest = it.rest(dl, STILL, DOWN)
     pulled = rest.tension
@@ -223,7 +223,7 @@ def test_tensions_between_two_shapes_are_those_of_the_shape() -> None:
         one.advance(t, dl)
         other.advance(t, dl)
         other.tip()
-        rod_now = Rod().rest(dl, STILL, DOWN)
+        rod_now = PlantRod().rest(dl, STILL, DOWN)
         # 1/30 s of this motion bends by 0.05 rad, and what is of second order in it meets wires of 1e5 N/m
         assert_allclose(one.tension(), rod_now.tension, rtol=0, atol=0.02)
         assert_allclose(other.tension(), rod_now.tension, rtol=0, atol=0.02)
@@ -287,7 +287,7 @@ def test_the_path_counts_and_not_its_pace(name: str) -> None:
 
 def still(bend: tuple[float, float]) -> np.ndarray:
     """(3,) tip of the robot without effect [m]."""
-    return Rod().rest(wires(*bend), STILL, DOWN).position
+    return PlantRod().rest(wires(*bend), STILL, DOWN).position
 
 
 def test_creep_comes_after_a_step_and_ends_at_the_command() -> None:
@@ -297,7 +297,7 @@ def test_creep_comes_after_a_step_and_ends_at_the_command() -> None:
     for it in (robot, finer):
         it.advance(0.0, wires(0.0, 0.0))
         it.advance(0.01, wires(0.0, 0.8))
-    aim = bend_of(Rod().rest(wires(0.0, 0.8), STILL, DOWN).rotation)
+    aim = bend_of(PlantRod().rest(wires(0.0, 0.8), STILL, DOWN).rotation)
     left = [aim - bend_of(robot.tip()[1])]
     assert left[0] / aim == pytest.approx(whole, rel=0.03)  # of 10 ms nearly all is left
     for t in (1.0, 4.0, 16.0, 64.0, 1000.0):
@@ -408,7 +408,7 @@ def test_ripple_comes_again_with_every_turn_of_the_drum() -> None:
     error = []
     for k, b in enumerate(bend):
         robot.advance(0.01 * k, wires(0.0, b))
-        error.append(bend_of(robot.tip()[1]) - bend_of(Rod().rest(wires(0.0, b), STILL, DOWN).rotation))
+        error.append(bend_of(robot.tip()[1]) - bend_of(PlantRod().rest(wires(0.0, b), STILL, DOWN).rotation))
     error = OFFSET * np.array(error)
     swing = numbers["amplitude"] + numbers["tooth_amplitude"]
     assert 0.3 * swing < np.ptp(error) < 2.1 * swing
@@ -543,4 +543,4 @@ def test_wrong_inputs_say_so_and_leave_the_plant_as_it_was() -> None:
 
 def test_a_robot_that_snaps_says_so() -> None:
     with pytest.raises(DeviceError, match="finds no rest"):
-        Rod().rest(np.zeros(4), np.array([0.0, 300.0, 0.0]), DOWN)
+        PlantRod().rest(np.zeros(4), np.array([0.0, 300.0, 0.0]), DOWN)

@@ -22,16 +22,16 @@ from fastrod.logs.link import RobotLink
 from fastrod.logs.recording import recover
 from fastrod.logs.runlog import read_log
 from fastrod.types import Floats
-from fastrod_device.camera import Frame, Picture
+from fastrod_device.camera import CameraFrame, Picture
 from fastrod_device.clock import Clock, SteppedClock, WallClock
 from fastrod_device.columns import EXTRA, FLAGS
-from fastrod_device.drawing import Eye, Scene
+from fastrod_device.drawing import DrawnScene, Eye
 from fastrod_device.emulator import Emulator
 from fastrod_device.errors import DeviceError, RefusedError
 from fastrod_device.hardware import load_hardware
 from fastrod_device.journal import Journal
 from fastrod_device.prototype import Prototype
-from fastrod_device.safety import State
+from fastrod_device.safety import SafetyState
 from fastrod_device.seal import seal
 from fastrod_device.trace import Trace
 from fastrod_device.workbench import emulated
@@ -59,10 +59,10 @@ _names = itertools.count()
 class Changed:
     """The emulator's camera, with something done to each of its frames."""
 
-    def __init__(self, emulator: Emulator, change: Callable[[Frame], Frame]) -> None:
+    def __init__(self, emulator: Emulator, change: Callable[[CameraFrame], CameraFrame]) -> None:
         self.emulator, self.change = emulator, change
 
-    def read(self) -> Frame | None:
+    def read(self) -> CameraFrame | None:
         frame = self.emulator.read()
         return None if frame is None else self.change(frame)
 
@@ -76,7 +76,7 @@ def bench(
     *,
     camera: bool = True,
     hardware: Any = HARDWARE,
-    change: Callable[[Frame], Frame] | None = None,
+    change: Callable[[CameraFrame], CameraFrame] | None = None,
     journal: Journal | None = None,
 ) -> Iterator[tuple[Prototype, Emulator]]:
     """Started, with wires that have their pretension at power-on; `change` is made to each frame."""
@@ -159,7 +159,7 @@ def test_stop_holds_it_and_release_lets_it_go_on_from_where_it_stands() -> None:
 def test_a_release_of_what_is_not_stopped_does_nothing() -> None:
     with bench() as (prototype, _):
         prototype.release()
-        assert prototype.supervisor.state is State.READY
+        assert prototype.supervisor.state is SafetyState.READY
 
 
 # what it refuses
@@ -188,7 +188,7 @@ def test_what_is_refused_never_reaches_the_bus(told: dict[str, Any], words: str)
             prototype.wait(0.2)
         assert len(rows) >= 20
         assert len(set(rows)) == 1
-        assert prototype.supervisor.state is State.READY  # and it does not stop by it
+        assert prototype.supervisor.state is SafetyState.READY  # and it does not stop by it
 
 
 def test_set_points_keep_to_the_rate_however_far_the_command_is() -> None:
@@ -220,7 +220,7 @@ def test_an_exception_in_a_plan_stops_the_drives() -> None:
     with bench() as (prototype, emulator):
         with pytest.raises(KeyError):
             prototype.follow(plan, 1.0)
-        assert prototype.supervisor.state is State.STOPPED
+        assert prototype.supervisor.state is SafetyState.STOPPED
         for _ in range(30):
             with pytest.raises(DeviceError, match="KeyError"):
                 prototype.wait(0.01)
@@ -232,7 +232,7 @@ def test_a_plan_that_leads_beyond_a_limit_is_refused_and_stops_the_drives() -> N
     with bench() as (prototype, _):
         with pytest.raises(RefusedError, match="limit is 8 mm"):
             prototype.follow(lambda t: np.array([-0.02, 0.0, 0.02, 0.0]) * t, 1.0)
-        assert prototype.supervisor.state is State.STOPPED
+        assert prototype.supervisor.state is SafetyState.STOPPED
         assert np.abs(prototype.commanded).max() <= 0.008
 
 
@@ -244,7 +244,7 @@ def test_a_recording_that_cannot_go_on_stops_the_drives_in_stepped_time_too(tmp_
         prototype.payload = np.ones(2)  # no number: the row cannot be made
         with pytest.raises((InputError, ValueError)):
             prototype.wait(1.0)
-        assert prototype.supervisor.state is State.STOPPED
+        assert prototype.supervisor.state is SafetyState.STOPPED
 
 
 # what it records
@@ -307,7 +307,7 @@ def test_a_recording_that_is_ended_while_frames_come_stops_nothing(tmp_path: Any
         prototype.wait(0.3)
         recorder.stop()
         prototype.wait(0.3)
-        assert prototype.supervisor.state is State.READY
+        assert prototype.supervisor.state is SafetyState.READY
 
 
 def test_a_trace_goes_straight_between_its_points() -> None:
@@ -339,20 +339,20 @@ class Attack:
     """Does nothing to frames until it is `on`; then keeps them, and changes each."""
 
     def __init__(self) -> None:
-        self.eye = Eye(HARDWARE.camera, HARDWARE.marker, seed=1, scene=Scene(blur=1.0, noise=5.0))
-        self.on, self.n, self.bad, self.frames = False, 0, 0, list[Frame]()
+        self.eye = Eye(HARDWARE.camera, HARDWARE.marker, seed=1, scene=DrawnScene(blur=1.0, noise=5.0))
+        self.on, self.n, self.bad, self.frames = False, 0, 0, list[CameraFrame]()
 
-    def __call__(self, frame: Frame) -> Frame:
+    def __call__(self, frame: CameraFrame) -> CameraFrame:
         self.frames.append(frame)
         self.n += self.on
         made = self.changed(frame) if self.on else frame
         self.bad += made is not frame
         return made
 
-    def changed(self, frame: Frame) -> Frame:
+    def changed(self, frame: CameraFrame) -> CameraFrame:
         return frame
 
-    def old(self) -> Frame:
+    def old(self) -> CameraFrame:
         """From when the robot stood elsewhere."""
         return self.frames[self.n // 2]
 
@@ -363,14 +363,14 @@ class Attack:
 class Corner(Attack):
     """The marker is covered; one of its number lies in the picture's corner, 114 mm off."""
 
-    def changed(self, frame: Frame) -> Frame:
+    def changed(self, frame: CameraFrame) -> CameraFrame:
         return replace(frame, image=self.corner())
 
 
 class Two(Attack):
     """Both are seen."""
 
-    def changed(self, frame: Frame) -> Frame:
+    def changed(self, frame: CameraFrame) -> CameraFrame:
         other = self.corner()
         return replace(frame, image=np.where(np.arange(other.shape[1]) < 180, other, frame.image))
 
@@ -378,21 +378,21 @@ class Two(Attack):
 class Alternating(Attack):
     """Every second frame is an old picture, stamped anew."""
 
-    def changed(self, frame: Frame) -> Frame:
+    def changed(self, frame: CameraFrame) -> CameraFrame:
         return replace(frame, image=self.old().image) if self.n % 2 else frame
 
 
 class Back(Attack):
     """Every second frame is an old one."""
 
-    def changed(self, frame: Frame) -> Frame:
+    def changed(self, frame: CameraFrame) -> CameraFrame:
         return replace(self.old(), number=frame.number) if self.n % 2 else frame
 
 
 class Future(Attack):
     """One frame is stamped in the future."""
 
-    def changed(self, frame: Frame) -> Frame:
+    def changed(self, frame: CameraFrame) -> CameraFrame:
         return replace(frame, t=frame.t + 1e3) if self.n == 1 else frame
 
 
@@ -423,7 +423,7 @@ def test_a_camera_that_cannot_be_believed_is_flagged_and_marker_lost_stays_armed
         made.on = True
         with suppress(DeviceError):
             prototype.wait(2.0)
-        assert (prototype.supervisor.state is not State.STOPPED) == goes_on, prototype.supervisor.status
+        assert (prototype.supervisor.state is not SafetyState.STOPPED) == goes_on, prototype.supervisor.status
         emulator.hidden = True
         hidden = prototype.clock.now()
         with pytest.raises(DeviceError):
@@ -490,7 +490,7 @@ def test_logs_whose_folder_goes_away_go_on_in_a_new_one(renamed: bool, tmp_path:
             shutil.rmtree(folder)
         gone, rows = prototype.clock.now(), len(recorder)
         prototype.wait(0.5)
-        assert prototype.supervisor.state is State.READY
+        assert prototype.supervisor.state is SafetyState.READY
         (t, kind, sentence) = prototype.journal.lines[-1]
         assert kind == "recording"
         assert t - gone < 0.1  # with the next frame
@@ -515,7 +515,7 @@ def test_a_full_disk_stops_the_robot_and_both_logs_say_so(small_disk: Any) -> No
                 filler.write(bytes(512))
         with pytest.raises(InputError, match="No space left on device"):
             prototype.wait(5.0)
-        assert prototype.supervisor.state is State.STOPPED
+        assert prototype.supervisor.state is SafetyState.STOPPED
         n = len(recorder)
         why = "log.csv.part cannot be written: No space left on device"
         words = f"{why}; {n - 1} of its {n} rows are in log.csv.part."
@@ -668,7 +668,7 @@ def test_a_story_in_real_time(tmp_path: Any) -> None:
         assert _until(lambda: not emulator.drives.moving.any())
         prototype.command(np.zeros(4))  # ignored
         prototype.release()
-        assert _until(lambda: prototype.supervisor.state is State.READY)
+        assert _until(lambda: prototype.supervisor.state is SafetyState.READY)
         prototype.command(np.zeros(4))
         assert _until(lambda: np.allclose(prototype.read().dl, 0.0, atol=5e-6))
         assert prototype.broken is None
@@ -685,11 +685,11 @@ def test_follow_in_real_time_tells_what_stopped_it() -> None:
         with pytest.raises(RefusedError, match="limit is 8 mm"):
             prototype.follow(lambda t: np.array([-0.1, 0.0, 0.1, 0.0]) * t, 30.0)
         prototype.release()
-        assert _until(lambda: prototype.supervisor.state is State.READY)
+        assert _until(lambda: prototype.supervisor.state is SafetyState.READY)
         with pytest.raises(DeviceError, match="ZeroDivisionError"):
             prototype.follow(lambda t: np.zeros(4) / (0 if t > 0.1 else 1) if t < 0.1 else 1 // 0, 30.0)
         prototype.release()
-        assert _until(lambda: prototype.supervisor.state is State.READY)
+        assert _until(lambda: prototype.supervisor.state is SafetyState.READY)
         threading.Timer(0.2, lambda: emulator.drives.emergency(1, 0x3210)).start()
         with pytest.raises(DeviceError, match=r"node 2.*0x3210"):
             prototype.follow(lambda t: BENT * np.sin(t), 30.0)
@@ -716,7 +716,7 @@ def test_a_plan_that_hangs_is_found_by_the_watchdog_and_the_drives_stop() -> Non
         prototype.read()
         over.set()
         assert _until(lambda: not emulator.drives.moving.any())
-        assert prototype.supervisor.state is State.STOPPED
+        assert prototype.supervisor.state is SafetyState.STOPPED
         assert set(emulator.drives.states) == {"quick stop active"}
 
 
@@ -760,11 +760,11 @@ def test_a_release_that_is_older_than_a_stop_releases_nothing() -> None:
         robot.stop()
         with suppress(DeviceError):
             robot.wait(0.1)
-        assert robot.supervisor.state is State.STOPPED
+        assert robot.supervisor.state is SafetyState.STOPPED
         assert not emulator.drives.moving.any()
         robot.release()
         robot.wait(0.05)
-        assert robot.supervisor.state is State.READY
+        assert robot.supervisor.state is SafetyState.READY
 
 
 def test_hands_may_cover_the_marker_while_it_rests() -> None:
@@ -774,7 +774,7 @@ def test_hands_may_cover_the_marker_while_it_rests() -> None:
             emulator.hidden = True
             robot.wait(2.0)  # four times as long as a marker may be lost in motion
             emulator.hidden = False
-        assert robot.supervisor.state in (State.READY, State.RUNNING)
+        assert robot.supervisor.state in (SafetyState.READY, SafetyState.RUNNING)
         assert robot.sighting is not None
         assert robot.sighting.ok
 

@@ -7,7 +7,7 @@ from bullets import carrier, cube, empty_world, soft_robot
 from fastrod.contact import ContactScene, plane
 from fastrod.errors import HostError, InputError, UnknownNameError
 from fastrod.hosts import MountedRod
-from fastrod.hosts.surroundings import Touched
+from fastrod.hosts.surroundings import BulletBodyContact
 from fastrod.simulator import Simulator
 
 SPEED = 0.1
@@ -57,7 +57,7 @@ def test_every_shape_of_pybullet_is_an_obstacle_where_it_is():
         body = world.createMultiBody(
             1.0, shape, -1, [0.1, 0.2, 0.3], turn, baseInertialFramePosition=[0.01, 0.0, 0.0]
         )
-        touched = Touched(world, body, dt=0.005, relaxation=0.1, friction=0.3)
+        touched = BulletBodyContact(world, body, dt=0.005, relaxation=0.1, friction=0.3)
         assert [part.obstacle.shape for part in touched.parts] == [name]
         pose = touched.expected([])[0][touched.names[0]]
         robot = soft_robot(1)
@@ -86,7 +86,7 @@ def test_what_cannot_be_touched_is_a_sentence():
     with pytest.raises(
         HostError, match=r"link -1 of body 0 has no collision shape, so nothing can touch it\."
     ):
-        Touched(world, ghost, dt=0.005, relaxation=0.1, friction=0.3)
+        BulletBodyContact(world, ghost, dt=0.005, relaxation=0.1, friction=0.3)
     sim = Simulator(
         soft_robot(), contact=ContactScene(obstacles=[plane(point=(1, 0, 0), normal=(-1, 0, 0), name="wall")])
     )

@@ -20,7 +20,7 @@ from fastrod_device.clock import SteppedClock
 from fastrod_device.errors import RefusedError
 from fastrod_device.limits import Limits, limited
 from fastrod_device.readings import Emergency, Readings
-from fastrod_device.safety import KINDS, TRANSITIONS, CameraWatch, Fault, State, Supervisor
+from fastrod_device.safety import KINDS, TRANSITIONS, CameraWatch, Fault, SafetyState, Supervisor
 from fastrod_device.safety_words import drive_state
 
 ROBOT = load_robot("prototype")
@@ -76,7 +76,7 @@ class Bench:
             self.supervisor.check(BENT, self.now)
 
     def _stop(self, fault: Fault) -> None:
-        assert self.supervisor.state is State.STOPPED  # no command passes while the stop is on its way
+        assert self.supervisor.state is SafetyState.STOPPED  # no command passes while the stop is on its way
         self.stops.append(fault)
         if self.fails:
             self.fails -= 1
@@ -145,11 +145,11 @@ def test_every_kind_of_fault_stops_in_the_call_that_finds_it_and_says_what_it_wa
     if kind == "displacement":  # it came there slowly enough
         bench.watch(dl=(1, -0.0045), dt=0.3)
         bench.supervisor.check(BENT, bench.now)
-    assert (bench.supervisor.state, bench.stops) == (State.RUNNING, [])
+    assert (bench.supervisor.state, bench.stops) == (SafetyState.RUNNING, [])
     found = bench.watch(**other)
     assert found is not None
     assert (found.kind, found.t, bench.stops) == (kind, bench.now, [found])
-    assert bench.supervisor.state is State.STOPPED
+    assert bench.supervisor.state is SafetyState.STOPPED
     assert all(word in found.sentence for word in words), found.sentence
     assert found.sentence.endswith(".")
     assert found.sentence.count(". ") == 0  # one sentence
@@ -173,7 +173,10 @@ def test_a_healthy_robot_runs_on() -> None:
     reset = (Emergency(drive=0, code=0x0000, register=0, t=0.0),)  # CiA 301: the error is gone
     assert bench.watch(emergencies=reset) is None
     assert bench.watch(camera=None) is None
-    assert (bench.supervisor.state, bench.supervisor.status) == (State.RUNNING, "The robot follows commands.")
+    assert (bench.supervisor.state, bench.supervisor.status) == (
+        SafetyState.RUNNING,
+        "The robot follows commands.",
+    )
 
 
 def test_a_late_sample_has_gone_further_and_is_no_jump() -> None:
@@ -284,7 +287,7 @@ def test_what_is_off_is_looked_at_and_not_stopped() -> None:
         is None
     )
     assert bench.supervisor.client_lost(bench.now) is None
-    assert (bench.supervisor.state, bench.supervisor.status) == (State.OFF, "The drives are off.")
+    assert (bench.supervisor.state, bench.supervisor.status) == (SafetyState.OFF, "The drives are off.")
     bench.now += 5.0  # until it is enabled nobody need look
     bench.supervisor.enabled(bench.now)
     assert bench.watch() is None
@@ -313,7 +316,7 @@ def test_a_command_beyond_a_limit_is_refused_with_its_figures(dl: Any, words: st
     bench.supervisor.enabled(bench.now)
     with pytest.raises(RefusedError, match=words):
         bench.supervisor.check(dl, bench.now)
-    assert (bench.supervisor.state, bench.stops) == (State.READY, [])
+    assert (bench.supervisor.state, bench.stops) == (SafetyState.READY, [])
 
 
 def test_curvature_is_that_of_the_constant_curvature_arc() -> None:
@@ -380,7 +383,7 @@ def test_a_stop_can_be_pressed_in_any_state_and_again() -> None:
             "emergency stop",
             "the emergency stop was pressed: the red button.",
         )
-        assert bench.supervisor.state is State.STOPPED
+        assert bench.supervisor.state is SafetyState.STOPPED
         bench.supervisor.emergency_stop(bench.now + 1.0)
         assert len(bench.stops) == 2  # sent again: the first may have been lost
         assert bench.supervisor.faults == (fault,)
@@ -406,7 +409,11 @@ def test_nobody_watches() -> None:
     bench = Bench()
     fault = bench.supervisor.client_lost(bench.now)
     assert fault is not None
-    assert (fault.kind, bench.stops, bench.supervisor.state) == ("nobody watches", [fault], State.STOPPED)
+    assert (fault.kind, bench.stops, bench.supervisor.state) == (
+        "nobody watches",
+        [fault],
+        SafetyState.STOPPED,
+    )
     assert bench.supervisor.client_lost(bench.now) is None
 
 
@@ -468,7 +475,7 @@ def test_a_release_is_refused_while_the_cause_is_there(still: dict[str, Any]) ->
     with pytest.raises(RefusedError, match="last looked at"):
         bench.supervisor.acknowledge(bench.now + 60.0)
     bench.supervisor.acknowledge(bench.now)
-    assert (bench.supervisor.state, bench.supervisor.faults) == (State.OFF, ())
+    assert (bench.supervisor.state, bench.supervisor.faults) == (SafetyState.OFF, ())
     with pytest.raises(RefusedError, match="off, not stopped"):
         bench.supervisor.acknowledge(bench.now)
     with pytest.raises(RefusedError, match="drives are off"):
@@ -488,7 +495,7 @@ def test_a_drives_own_fault_is_reset_after_the_release() -> None:
     bench = Bench()
     bench.watch(statusword=(1, 0x0238))
     bench.supervisor.acknowledge(bench.now)
-    assert bench.supervisor.state is State.OFF
+    assert bench.supervisor.state is SafetyState.OFF
     bench.supervisor.enabled(bench.now)
     assert bench.watch(statusword=(1, 0x0238)) is not None  # it was not reset
 
@@ -499,7 +506,7 @@ def test_a_stop_while_drives_are_being_enabled_is_sent_once_more() -> None:
     with pytest.raises(RefusedError, match="enabled, but the robot is stopped"):
         bench.supervisor.enabled(bench.now)
     assert len(bench.stops) == 2
-    assert bench.supervisor.state is State.STOPPED
+    assert bench.supervisor.state is SafetyState.STOPPED
 
 
 def test_history_tells_when_and_why() -> None:
@@ -509,7 +516,7 @@ def test_history_tells_when_and_why() -> None:
     bench.watch()
     bench.supervisor.acknowledge(bench.now)
     states = [state for _, state, _ in bench.supervisor.history]
-    assert states == [State.READY, State.RUNNING, State.STOPPED, State.OFF]
+    assert states == [SafetyState.READY, SafetyState.RUNNING, SafetyState.STOPPED, SafetyState.OFF]
     assert bench.supervisor.history[2][0] == t
     assert "drive 2 (node 5)" in bench.supervisor.history[2][2]
 
@@ -518,16 +525,16 @@ def test_only_a_person_leads_out_of_a_stop_and_a_stop_is_always_possible() -> No
     out = {
         (event, after)
         for (before, event), after in TRANSITIONS.items()
-        if before is State.STOPPED and after is not State.STOPPED
+        if before is SafetyState.STOPPED and after is not SafetyState.STOPPED
     }
-    assert out == {("acknowledged", State.OFF)}
-    assert all(TRANSITIONS[state, "fault"] is State.STOPPED for state in State)
+    assert out == {("acknowledged", SafetyState.OFF)}
+    assert all(TRANSITIONS[state, "fault"] is SafetyState.STOPPED for state in SafetyState)
     into = {
         (before, event)
         for (before, event), after in TRANSITIONS.items()
-        if after is State.RUNNING and before is not State.RUNNING
+        if after is SafetyState.RUNNING and before is not SafetyState.RUNNING
     }
-    assert into == {(State.READY, "command")}
+    assert into == {(SafetyState.READY, "command")}
 
 
 EVENTS = (
@@ -577,20 +584,20 @@ def test_whatever_happens_only_a_release_ends_a_stop(events: list[str], wild: li
                 s.exception(bench.now, OSError())
         except RefusedError:
             assert event in ("check", "wild", "enabled", "acknowledge")
-        if before is State.STOPPED:
-            assert s.state is State.STOPPED or (event, s.state) == ("acknowledge", State.OFF)
+        if before is SafetyState.STOPPED:
+            assert s.state is SafetyState.STOPPED or (event, s.state) == ("acknowledge", SafetyState.OFF)
             assert s.first is first or event == "acknowledge"
             assert told is None
-        elif s.state is State.STOPPED:
+        elif s.state is SafetyState.STOPPED:
             assert len(bench.stops) == stops + 1
             assert s.first is bench.stops[-1]
         if event == "stop":
-            assert s.state is State.STOPPED
+            assert s.state is SafetyState.STOPPED
         if told is not None:
-            assert before in (State.READY, State.RUNNING)
+            assert before in (SafetyState.READY, SafetyState.RUNNING)
             assert np.isfinite(told).all()
             assert np.abs(told).max() <= s.limits.displacement
-        assert (s.state is State.STOPPED) == bool(s.faults)
+        assert (s.state is SafetyState.STOPPED) == bool(s.faults)
 
 
 @quickly
@@ -638,7 +645,7 @@ def test_stop_is_pressed_by_another_thread_while_the_loop_watches() -> None:
         thread.join()
         assert refused >= 1
         assert [fault.kind for fault in bench.stops] == ["emergency stop"]
-        assert bench.supervisor.state is State.STOPPED
+        assert bench.supervisor.state is SafetyState.STOPPED
 
 
 def test_a_slow_stop_holds_up_nobody_else() -> None:

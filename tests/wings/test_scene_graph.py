@@ -25,13 +25,13 @@ from fastrod_viewer.scene_graph import (
     grid_places,
     legend,
 )
-from fastrod_viewer.world import Body, Rods
+from fastrod_viewer.world import Body, DrawnRods
 
 
 def seen(robots, state, place=None):
     robots = robots if isinstance(robots, tuple) else (robots,)
     radius = tuple(segment.body_radius or 0.009 for segment in robots[0].segments)
-    return Rods(robots, state, np.zeros((len(state.ok), 3)) if place is None else place, radius)
+    return DrawnRods(robots, state, np.zeros((len(state.ok), 3)) if place is None else place, radius)
 
 
 def bent(name, n_robots=1, seed=3, points=20):

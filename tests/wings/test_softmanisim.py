@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from fastrod.hosts import Bullet, Camera, SoftManiSim, connect
-from fastrod.hosts.camera import View
+from fastrod.hosts import Bullet, HostCamera, SoftManiSim, connect
+from fastrod.hosts.camera import CameraView
 
 pybullet = pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'fastrod[hosts]'")
 
@@ -375,8 +375,8 @@ def test_a_cube_stands_as_told_and_falls_without_damping(make: Callable[..., Sof
 def test_pictures_have_true_colours_and_depth(make: Callable[..., SoftManiSim]) -> None:
     sim = make(max_grasp_width=0.0)
     sim.camera, sim.in_hand_camera = (
-        Camera(width=64, height=48),
-        Camera(width=64, height=48, near=0.005, far=3.0),
+        HostCamera(width=64, height=48),
+        HostCamera(width=64, height=48, near=0.005, far=3.0),
     )
     red = sim.add_a_cube([0, 0.5, 0.3], size=[0.1] * 3, color=[1, 0, 0, 1], mass=0.0)
     sim.move_robot_ori(base_pos=[0, 0, 0.3])
@@ -385,7 +385,7 @@ def test_pictures_have_true_colours_and_depth(make: Callable[..., SoftManiSim]) 
     assert rgb[24, 32, 1:].max() < 30
     # from the front of the head, 23.5 mm beyond the tip
     assert depth[24, 32] == pytest.approx(0.15 - 0.0235, abs=1e-3)
-    sim.view = View((0.6, 0.5, 0.3), (0, 0.5, 0.3))
+    sim.view = CameraView((0.6, 0.5, 0.3), (0, 0.5, 0.3))
     rgb, depth = sim.capture_image()
     assert rgb[24, 32, 0] > 100
     assert rgb[24, 32, 1:].max() < 30
@@ -403,7 +403,7 @@ def test_pictures_have_true_colours_and_depth(make: Callable[..., SoftManiSim]) 
 
 def test_the_camera_in_the_hand_rolls_with_the_robot(make: Callable[..., SoftManiSim]) -> None:
     sim = make(max_grasp_width=0.0)
-    sim.in_hand_camera = Camera(width=64, height=48, near=0.005, far=3.0)
+    sim.in_hand_camera = HostCamera(width=64, height=48, near=0.005, far=3.0)
     # up and right of the tip
     sim.add_a_cube([0.05, 0.45, 1.05], size=[0.03] * 3, color=[0, 0, 1, 1], mass=0.0)
     for roll, rows, columns in ((0.0, slice(0, 24), slice(32, 64)), (math.pi, slice(24, 48), slice(0, 32))):

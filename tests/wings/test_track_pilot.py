@@ -20,7 +20,7 @@ from fastrod.logs.simulated import SimulatedRobot
 from fastrod.model.robot import Robot
 from fastrod.simulator import Simulator
 from fastrod.types import Floats
-from fastrod_envs.pilot import TrackPilot
+from fastrod_envs.pilot import PolicyDriver
 from fastrod_envs.policies import Policy, find
 from fastrod_envs.randomisation import Randomisation
 from fastrod_envs.single import SingleEnv
@@ -60,7 +60,7 @@ def episode(path: str, seed: int, robot: Robot, n_steps: int = 120) -> dict[str,
     return found
 
 
-def follow(pilot: TrackPilot, robot: Robot, n_steps: int = 120) -> dict[str, Any]:
+def follow(pilot: PolicyDriver, robot: Robot, n_steps: int = 120) -> dict[str, Any]:
     """The same with a simulator like the environment's."""
     simulator = Simulator(
         robot, dt=DT, points_per_segment=Track.points_per_segment, outputs="tip", hold_gain=Track.hold_gain
@@ -84,7 +84,7 @@ def follow(pilot: TrackPilot, robot: Robot, n_steps: int = 120) -> dict[str, Any
 @pytest.mark.parametrize(("path", "seed"), [("triangle", 1), ("square", 2), ("circle", 4)])
 def test_it_does_what_the_environment_does(path: Any, seed: int, robot: Robot) -> None:
     there = episode(path, seed, robot)
-    here = follow(TrackPilot(policy(), path, robot, phase=there["phase"], way=there["way"]), robot)
+    here = follow(PolicyDriver(policy(), path, robot, phase=there["phase"], way=there["way"]), robot)
     assert np.ptp(there["dl"], axis=0).min() > 1e-3
     # lengths minus rest lengths round at 1e-17
     assert_allclose(here["dl"], there["dl"], rtol=0.0, atol=1e-9)
@@ -104,7 +104,7 @@ def test_both_ways_round_were_seen() -> None:
 def test_a_simulated_robot_is_led_along_the_path() -> None:
     now = [0.0]
     link = SimulatedRobot(PROTOTYPE, dt=DT, clock=lambda: now[0])
-    pilot = TrackPilot(policy(), "circle")
+    pilot = PolicyDriver(policy(), "circle")
     off = []
     for k in range(200):
         now[0] = DT * k
@@ -113,24 +113,24 @@ def test_a_simulated_robot_is_led_along_the_path() -> None:
             off.append(np.linalg.norm(tip - pilot.nearest(now[0])))
         link.command(pilot.command(tip, now[0]))
     assert np.mean(off) == pytest.approx(
-        follow(TrackPilot(policy(), "circle"), PROTOTYPE, 199)["distance"], abs=2e-5
+        follow(PolicyDriver(policy(), "circle"), PROTOTYPE, 199)["distance"], abs=2e-5
     )
     assert np.mean(off) < 5e-4
 
 
 def test_a_path_of_ones_own_is_the_tasks_where_it_is_the_same() -> None:
     own = circle(radius=0.02, period=9.0, center=(0.0, 0.0, PROTOTYPE.length))
-    one, other = (follow(TrackPilot(policy(), path), PROTOTYPE, 20) for path in ("circle", own))
+    one, other = (follow(PolicyDriver(policy(), path), PROTOTYPE, 20) for path in ("circle", own))
     assert_array_equal(one["dl"], other["dl"])
     wide = circle(radius=0.035, period=20.0, center=(0.0, 0.0, PROTOTYPE.length - 0.005))
-    far = TrackPilot(policy(), wide)
+    far = PolicyDriver(policy(), wide)
     assert_array_equal(far.wanted(5.0), wide.position(5.0))
     assert np.linalg.norm(far.nearest(0.0)[:2]) > 0.03
     assert np.linalg.norm(far.nearest(0.0) - far.wanted(0.0)) < 0.012
 
 
 def test_between_steps_the_command_stays() -> None:
-    coarse, fine = TrackPilot(policy(), "square"), TrackPilot(policy(), "square")
+    coarse, fine = PolicyDriver(policy(), "square"), PolicyDriver(policy(), "square")
     tips = PROTOTYPE.length * np.array([0.0, 0.0, 1.0]) + np.random.default_rng(2).normal(
         scale=1e-3, size=(40, 3)
     )
@@ -147,7 +147,7 @@ def test_a_dropout_is_the_last_known_tip_for_one_step_and_then_a_halt() -> None:
     lost = np.full(3, np.nan)
 
     def told(*tips: Floats) -> list[Floats]:
-        pilot = TrackPilot(policy(), "circle")
+        pilot = PolicyDriver(policy(), "circle")
         return [pilot.command(tip, DT * k) for k, tip in enumerate(tips)]
 
     held = told(known, known, known)
@@ -164,7 +164,7 @@ def test_a_dropout_is_the_last_known_tip_for_one_step_and_then_a_halt() -> None:
 
 
 def test_commands_stay_within_the_tasks_limits() -> None:
-    pilot = TrackPilot(policy(), "circle")
+    pilot = PolicyDriver(policy(), "circle")
     stuck = np.array([0.0, 0.0, PROTOTYPE.length])
     dl = np.array([pilot.command(stuck, DT * k) for k in range(400)])
     # the angles of the wires have twelve digits
@@ -175,8 +175,8 @@ def test_commands_stay_within_the_tasks_limits() -> None:
 
 def pilot_of(
     path: Any = "circle", robot: Robot | None = None, name: str = "Track", **options: Any
-) -> TrackPilot:
-    return TrackPilot(Policy(find(name, "shipped")), path, robot, **options)
+) -> PolicyDriver:
+    return PolicyDriver(Policy(find(name, "shipped")), path, robot, **options)
 
 
 @pytest.mark.parametrize(
@@ -233,14 +233,16 @@ def test_a_policy_with_other_options_is_refused(tmp_path: Path) -> None:
         match=r"with \{'observation': 'goal'\}; give one of Track that observes "
         r"the state",
     ):
-        TrackPilot(goal, "circle")
+        PolicyDriver(goal, "circle")
 
 
 def test_a_point_may_be_a_path() -> None:
     def still(t: Floats) -> tuple[Floats, Floats]:
         return np.zeros((*t.shape, 3)), np.zeros((*t.shape, 3))
 
-    pilot = TrackPilot(policy(), Trajectory(name="still", period=1.0, center=(0.0, 0.01, 0.069), path=still))
+    pilot = PolicyDriver(
+        policy(), Trajectory(name="still", period=1.0, center=(0.0, 0.01, 0.069), path=still)
+    )
     found = follow(pilot, PROTOTYPE, 80)
     assert_array_equal(pilot.wanted(3.0), [0.0, 0.01, 0.069])
     assert np.linalg.norm(found["tip"][-1] - pilot.nearest(3.0)) < 5e-4

@@ -18,7 +18,7 @@ from fastrod.rotation import product, quaternion_from_vector
 from fastrod_device import camera as camera_module
 from fastrod_device.camera import (
     Camera,
-    Frame,
+    CameraFrame,
     Marker,
     VideoCamera,
     compose,
@@ -27,7 +27,7 @@ from fastrod_device.camera import (
     rotation,
     save_camera,
 )
-from fastrod_device.drawing import Eye, Scene, draw, project
+from fastrod_device.drawing import DrawnScene, Eye, draw, project
 from fastrod_device.errors import DeviceError
 from fastrod_device.gates import FrameOrder, Workspace
 from fastrod_device.tracker import MarkerTracker
@@ -35,7 +35,7 @@ from fastrod_device.tracker import MarkerTracker
 CAMERA = Camera(matrix=((800.0, 0.0, 319.5), (0.0, 800.0, 239.5), (0.0, 0.0, 1.0)), size=(640, 480))
 BENT = replace(CAMERA, distortion=(-0.2, 0.08, 0.001, -0.0005, 0.0))
 MARKER = Marker(size=0.015, id=7)
-SHARP = Scene(blur=0.0, noise=0.0, gradient=(0.0, 0.0), vignetting=0.0)
+SHARP = DrawnScene(blur=0.0, noise=0.0, gradient=(0.0, 0.0), vignetting=0.0)
 SQUARE = 0.0075 * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
 FACING = np.array([0.0, 1.0, 0.0, 0.0])  # the marker's z toward the camera
 
@@ -54,7 +54,7 @@ def angle(a, b):
 def frames(camera, poses, scene=None, seed=0, rate=15.0):
     rng = np.random.default_rng(seed)
     return [
-        Frame(image=draw(camera, MARKER, *p, rng=rng, scene=scene), t=k / rate, number=k + 1)
+        CameraFrame(image=draw(camera, MARKER, *p, rng=rng, scene=scene), t=k / rate, number=k + 1)
         for k, p in enumerate(poses)
     ]
 
@@ -143,7 +143,7 @@ def test_eye_repeats_by_its_seed():
     first, same, other = (Eye(CAMERA, MARKER, seed=seed).draw(*there) for seed in (1, 1, 2))
     assert_array_equal(first, same)
     assert (first != other).mean() > 0.5
-    clean = Eye(CAMERA, MARKER, scene=Scene(noise=0.0)).draw(*there)
+    clean = Eye(CAMERA, MARKER, scene=DrawnScene(noise=0.0)).draw(*there)
     assert (first.astype(float) - clean).std() == pytest.approx(2.0, rel=0.05)
 
 
@@ -157,7 +157,7 @@ def test_clean_pictures_have_no_bias(camera, tilt):
         there = pose(0.15, math.radians(tilt), *rng.uniform(0.0, 6.28, 2), *rng.uniform(-0.015, 0.015, 2))
         tracker.reset()
         seen = tracker.look(
-            Frame(image=draw(camera, MARKER, *there, rng=rng, scene=scene), t=0.0, number=k), there
+            CameraFrame(image=draw(camera, MARKER, *there, rng=rng, scene=scene), t=0.0, number=k), there
         )
         assert seen.flag in ("", "ambiguous")
         corner.append(seen.corners - project(camera, SQUARE @ rotation(there[1]).T + there[0]))
@@ -178,8 +178,8 @@ def test_error_of_noisy_pictures(distance, largest):
             distance, rng.uniform(0.0, 0.8), *rng.uniform(0.0, 6.28, 2), *rng.uniform(-0.1, 0.1, 2) * distance
         )
         tracker.reset()
-        image = draw(BENT, MARKER, *there, rng=rng, scene=Scene(noise=3.0, blur=0.9))
-        error.append(tracker.look(Frame(image=image, t=0.0, number=k), there).position - there[0])
+        image = draw(BENT, MARKER, *there, rng=rng, scene=DrawnScene(noise=3.0, blur=0.9))
+        error.append(tracker.look(CameraFrame(image=image, t=0.0, number=k), there).position - there[0])
     assert np.isfinite(error).all()
     assert math.sqrt((np.array(error) ** 2).sum(1).mean()) < 0.5 * largest
 
@@ -188,7 +188,7 @@ def test_smooth_motion_through_the_frontal_pose_does_not_flip():
     t = np.arange(60) / 15.0
     poses = [pose(0.2, 0.35 * math.sin(1.1 * s), 0.6, 0.1, x=0.01 * math.sin(s)) for s in t]
     tracker = MarkerTracker(CAMERA, MARKER)
-    seen = [tracker.look(frame) for frame in frames(CAMERA, poses, Scene(noise=3.0))]
+    seen = [tracker.look(frame) for frame in frames(CAMERA, poses, DrawnScene(noise=3.0))]
     ok = np.array([s.ok for s in seen])
     assert ok.mean() > 0.9
     assert max(angle(s.quaternion, q) for s, (_, q) in zip(seen, poses, strict=True) if s.ok) < math.radians(
@@ -199,7 +199,7 @@ def test_smooth_motion_through_the_frontal_pose_does_not_flip():
 
 def test_the_expected_pose_tells_the_solutions_apart():
     there = pose(0.6, math.radians(25.0), 0.5, 0.2)  # 20 px: the picture hardly tells
-    frame = frames(CAMERA, [there], Scene(noise=2.0))[0]
+    frame = frames(CAMERA, [there], DrawnScene(noise=2.0))[0]
     alone = MarkerTracker(CAMERA, MARKER, sigma=0.5).look(frame)
     assert alone.flag == "ambiguous"
     assert not alone.ok
@@ -225,7 +225,7 @@ def test_place_of_camera_and_marker():
         compose(camera.base_from_camera, pose(0.13, 0.3, 0.3, 0.4)), inverse(marker.tip_from_marker)
     )
     image = Eye(camera, marker).draw(*base_from_tip)
-    seen = MarkerTracker(camera, marker).look(Frame(image=image, t=1.0, number=4))
+    seen = MarkerTracker(camera, marker).look(CameraFrame(image=image, t=1.0, number=4))
     assert (seen.flag, seen.t, seen.number) == ("", 1.0, 4)
     assert_allclose(seen.position, base_from_tip[0], atol=5e-5)
     assert angle(seen.quaternion, base_from_tip[1]) < 2e-3
@@ -236,21 +236,21 @@ def test_doubtful_frames_are_flagged_and_forgotten():
     near, far = pose(0.15, 0.4, 0.0, 0.0), pose(0.15, 0.4, 0.0, 0.0, x=0.03)
     images = [f.image for f in frames(CAMERA, [near, near, near, far, near, far])]
     tracker = MarkerTracker(CAMERA, MARKER, gate=0.5, slack=0.002)
-    assert tracker.look(Frame(image=images[0], t=0.0, number=1)).ok
-    assert tracker.look(Frame(image=images[1], t=0.03, number=1)).flag == "frozen"
-    again = tracker.look(Frame(image=images[0], t=0.03, number=2))
+    assert tracker.look(CameraFrame(image=images[0], t=0.0, number=1)).ok
+    assert tracker.look(CameraFrame(image=images[1], t=0.03, number=1)).flag == "frozen"
+    again = tracker.look(CameraFrame(image=images[0], t=0.03, number=2))
     assert again.flag == "frozen"
     assert np.isnan([*again.position, *again.quaternion, again.error, *again.corners.ravel()]).all()
-    none = tracker.look(Frame(image=np.full((480, 640), 100, dtype=np.uint8), t=0.03, number=3))
+    none = tracker.look(CameraFrame(image=np.full((480, 640), 100, dtype=np.uint8), t=0.03, number=3))
     assert none.flag == "no marker"
     assert np.isnan(none.position).all()
-    jump = tracker.look(Frame(image=images[3], t=0.04, number=4))  # 30 mm in 40 ms
+    jump = tracker.look(CameraFrame(image=images[3], t=0.04, number=4))  # 30 mm in 40 ms
     assert jump.flag == "too fast"
     assert jump.position[0] == pytest.approx(0.03, abs=1e-4)
-    assert tracker.look(Frame(image=images[4], t=0.05, number=5)).ok
-    assert tracker.look(Frame(image=images[5], t=0.12, number=6)).ok  # 0.5 m/s for 70 ms is 35 mm
+    assert tracker.look(CameraFrame(image=images[4], t=0.05, number=5)).ok
+    assert tracker.look(CameraFrame(image=images[5], t=0.12, number=6)).ok  # 0.5 m/s for 70 ms is 35 mm
     tracker.reset()
-    assert tracker.look(Frame(image=images[0], t=0.121, number=7)).ok
+    assert tracker.look(CameraFrame(image=images[0], t=0.121, number=7)).ok
 
 
 ROBOT = load_robot("prototype")  # one segment of 70 mm
@@ -340,7 +340,7 @@ def test_a_marker_of_the_right_number_need_not_be_the_robots(places, expected, f
     rng = np.random.default_rng(0)
     shaken = [np.atleast_2d(place) + 1e-4 * rng.normal(size=3) for place in places]
     pose_there = None if expected is None else (np.array(expected), np.array([1.0, 0.0, 0.0, 0.0]))
-    frames = [Frame(image=image, t=k / 30.0, number=k) for k, image in enumerate(seen_at(shaken))]
+    frames = [CameraFrame(image=image, t=k / 30.0, number=k) for k, image in enumerate(seen_at(shaken))]
     seen = [tracker.look(frame, pose_there, now=frame.t + 0.03) for frame in frames]
     assert [s.flag for s in seen] == flags
     for sighting, place in zip(seen, shaken, strict=True):
@@ -370,7 +370,7 @@ NEW, OLD, BACK, AHEAD = "", "repeated", "out of order", "from the future"
 def test_old_and_misdated_frames_are_flagged_and_leave_nothing_behind(frames, flags):
     pictures = np.random.default_rng(0).integers(0, 255, (6, 4, 4), dtype=np.uint8)
     order = FrameOrder(replace(CAMERA, rate=10.0, latency=0.13))
-    made = [Frame(image=pictures[i], t=t, number=n) for i, t, n in frames]
+    made = [CameraFrame(image=pictures[i], t=t, number=n) for i, t, n in frames]
     found = [order.check(frame, 0.1 * k + 0.13) for k, frame in enumerate(made)]
     assert [flag for _, flag in found] == flags
     times = [t for t, _ in found]
@@ -381,22 +381,22 @@ def test_old_and_misdated_frames_are_flagged_and_leave_nothing_behind(frames, fl
 
 def test_a_covered_side_is_an_outlier():
     image = frames(CAMERA, [pose(0.15, 0.2, 0.0, 0.0)])[0].image.copy()
-    whole = MarkerTracker(CAMERA, MARKER).look(Frame(image=image, t=0.0, number=1))
+    whole = MarkerTracker(CAMERA, MARKER).look(CameraFrame(image=image, t=0.0, number=1))
     left, top = whole.corners[0]
     # a wire as dark as the ink along the left side
     image[int(top) - 8 : int(top) + 70, int(left) + 5 : int(left) - 20 : -1] = 40
-    seen = MarkerTracker(CAMERA, MARKER).look(Frame(image=image, t=0.0, number=1))
+    seen = MarkerTracker(CAMERA, MARKER).look(CameraFrame(image=image, t=0.0, number=1))
     assert whole.ok
     assert seen.flag in ("outlier", "no marker")
 
 
 def test_other_markers_are_not_taken():
     image = Eye(CAMERA, replace(MARKER, id=3)).draw(*pose(0.15, 0.2, 0.0, 0.0))
-    assert MarkerTracker(CAMERA, MARKER).look(Frame(image=image, t=0.0, number=1)).flag == "no marker"
+    assert MarkerTracker(CAMERA, MARKER).look(CameraFrame(image=image, t=0.0, number=1)).flag == "no marker"
     apriltag = Marker(size=0.015, id=5, dictionary="DICT_APRILTAG_16h5")
     there = pose(0.12, 0.3, 0.0, 0.0)
     seen = MarkerTracker(CAMERA, apriltag).look(
-        Frame(image=Eye(CAMERA, apriltag).draw(*there), t=0.0, number=1)
+        CameraFrame(image=Eye(CAMERA, apriltag).draw(*there), t=0.0, number=1)
     )
     assert seen.ok
     assert_allclose(seen.position, there[0], atol=1e-4)
@@ -444,9 +444,11 @@ def test_bad_input():
     with pytest.raises(InputError, match="gate is 0"):
         MarkerTracker(CAMERA, MARKER, gate=0.0)
     with pytest.raises(InputError, match=r"must be uint8 of \(480, 640\)"):
-        MarkerTracker(CAMERA, MARKER).look(Frame(image=np.zeros((10, 10), dtype=np.uint8), t=0.0, number=1))
+        MarkerTracker(CAMERA, MARKER).look(
+            CameraFrame(image=np.zeros((10, 10), dtype=np.uint8), t=0.0, number=1)
+        )
     with pytest.raises(InputError, match="0 <= black < white <= 255"):
-        Scene(black=200.0, white=100.0)
+        DrawnScene(black=200.0, white=100.0)
 
 
 class Capture:

@@ -20,16 +20,16 @@ from fastrod_scenes.ur5.tracking import (
     CENTER,
     LARGEST_ERROR,
     LEAST_SHARE,
-    Track,
     TrackCircle,
-    Tracking,
+    TrackingError,
+    TrackingScene,
     record,
     share,
 )
 
 
 def follow(path, seconds, **options):
-    stage = Tracking(path, dt=TrackCircle.dt, **options)
+    stage = TrackingError(path, dt=TrackCircle.dt, **options)
 
     def times():
         for k in range(round(seconds / stage.dt)):
@@ -52,7 +52,7 @@ def test_check_fails_without_gain(monkeypatch):
 
 def test_check_fails_without_feedforward(monkeypatch):
     monkeypatch.setattr(TrackCircle, "duration", 3.0)
-    monkeypatch.setattr(Tracking, "feedforward", lambda self, t: np.zeros(3))
+    monkeypatch.setattr(TrackingError, "feedforward", lambda self, t: np.zeros(3))
     with pytest.raises(SceneError, match="the mean squared error after the approach is") as error:
         load("track_circle").check()
     # behind by v / gain: the error's square is (2 pi 0.2 / 20 / 10)^2, a third of it for each of x, y and z
@@ -126,7 +126,7 @@ def test_begins_at_the_center_at_rest():
 @pytest.mark.parametrize("name", ["square", "circle", "figure_eight", "helix", "square_helix"])
 def test_scaled_path_is_the_path_about_the_center(name):
     scene = load(f"track_{name}")
-    assert isinstance(scene, Track)
+    assert isinstance(scene, TrackingScene)
     t = np.linspace(0.0, 20.0, 50)
     assert_allclose(
         scene.path(0.4).position(t) - CENTER, 0.4 * (scene.path().position(t) - CENTER), atol=1e-12

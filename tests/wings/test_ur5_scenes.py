@@ -13,7 +13,7 @@ from fastrod.rotation import matrix_from_quaternion, quaternion_from_vector
 from fastrod_scenes.scene import SceneError
 from fastrod_scenes.ur5.box import COLORS, CORNERS, Box
 from fastrod_scenes.ur5.carried import Bracket, eased
-from fastrod_scenes.ur5.dual_arm import PERIOD, DualArm, opposite
+from fastrod_scenes.ur5.dual_arm import PERIOD, DualArmScene, opposite
 from fastrod_scenes.ur5.exploration import APPROACH, INSIDE, OUT, Exploration
 from fastrod_scenes.ur5.explore import CLEARANCE, STILL, Explore
 from fastrod_scenes.ur5.look import aim_jacobian, miss
@@ -171,7 +171,7 @@ def test_actions_mirror_each_other_half_a_period_later() -> None:
 
 
 def test_ur5_feels_both_soft_robots_wherever_they_are() -> None:
-    stage = DualArm(0.005)
+    stage = DualArmScene(0.005)
     for k in range(60):
         stage.advance(k * stage.dt)
         if k % 20 == 19:

@@ -14,7 +14,7 @@ from fastrod.rotation import matrix_from_quaternion, quaternion_from_vector
 from fastrod_scenes import load, names
 from fastrod_viewer.catalogue import HOSTED_SCENES, MUJOCO_SCENES, ROD_SCENES, about, catalogue, open_world
 from fastrod_viewer.hosted import HostedView
-from fastrod_viewer.world import Hand
+from fastrod_viewer.world import ManualCommand
 from fastrod_viewer.worlds import FreeWorld, SceneWorld, sway
 
 HOSTED = ["dual_arm", "explore", "neck_look", "neck_push", "pick_suction", "track_circle"]
@@ -22,7 +22,7 @@ HOSTED = ["dual_arm", "explore", "neck_look", "neck_push", "pick_suction", "trac
 
 def still(world, **options):
     """A hand that keeps the straight robot."""
-    return Hand(world.robot.rest_tendon_length, np.zeros(world.robot.n_segments), **options)
+    return ManualCommand(world.robot.rest_tendon_length, np.zeros(world.robot.n_segments), **options)
 
 
 def heavy(mode="tendon_length"):
@@ -187,7 +187,8 @@ def test_jacobian_of_a_free_robot(name, n_robots):
     def tip_at(action):
         given = actions.inputs(action)
         return rest(
-            world, Hand(given["tendon_length"], given["extension"], tip_force=np.array([0.02, 0.0, 0.01]))
+            world,
+            ManualCommand(given["tendon_length"], given["extension"], tip_force=np.array([0.02, 0.0, 0.01])),
         )
 
     step, columns = (
@@ -265,7 +266,7 @@ def test_world_goes_on_after_what_cannot_be_done():
 def test_tracking_jacobian_against_the_model():
     world = open_world("track_circle")
     try:
-        hand = Hand(
+        hand = ManualCommand(
             **{
                 k: world.actions.inputs([0.015, 0.004, 0.002, 0.015, -0.003, 0.003])[k]
                 for k in ("tendon_length", "extension")
@@ -354,7 +355,9 @@ def test_other_rods_keep_what_they_were_told():
         second = world.rods[1].state.path_length.copy()
         rest(
             world,
-            Hand(world.actions.inputs([0.0, 0.004, 0.0, 0.0, 0.0, 0.004])["tendon_length"], np.zeros(2)),
+            ManualCommand(
+                world.actions.inputs([0.0, 0.004, 0.0, 0.0, 0.0, 0.004])["tendon_length"], np.zeros(2)
+            ),
             30,
         )
         assert_allclose(world.rods[1].state.path_length, second, atol=1e-4)

@@ -22,11 +22,11 @@ from fastrod_viewer.catalogue import catalogue, open_world
 from fastrod_viewer.drive_page import DrivePage
 from fastrod_viewer.holder import Holder
 from fastrod_viewer.holder_panel import HolderPanels
-from fastrod_viewer.page import Page, is_upright, tell
+from fastrod_viewer.page import ViewerPage, is_upright, tell
 from fastrod_viewer.playback import Playback, load
 from fastrod_viewer.replay_page import ReplayPage
 from fastrod_viewer.server import serve
-from fastrod_viewer.watch import Watch
+from fastrod_viewer.watch import SceneWatch
 from fastrod_viewer.world import World
 from fastrod_viewer.worlds import FreeWorld
 
@@ -57,7 +57,7 @@ class App:
         self.folder, self.say = folder or Path.cwd(), say
         self.served = server or serve(host, port)
         self.server = self.served.viser
-        self.page: Page | None = None
+        self.page: ViewerPage | None = None
         self._lock = threading.Lock()
         gui = self.server.gui
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=_BRAND)
@@ -68,7 +68,7 @@ class App:
         self._picker: Any = None
         self.holder = Holder(lambda: self.watch.present(), changed=self._show_holder, moved=self._passed_on)
         self._panels = HolderPanels(self.server, self.holder)
-        self.watch = Watch(self.server, lost=self._lost, tick=self._tick)
+        self.watch = SceneWatch(self.server, lost=self._lost, tick=self._tick)
         self.server.on_client_connect(self._came)
 
     def __enter__(self) -> App:

@@ -23,7 +23,7 @@ class Nodes(NamedTuple):
     """(n_robots, n_points) [m]."""
 
 
-class Samples(NamedTuple):
+class ChainSamples(NamedTuple):
     """Cross-sections between the nodes."""
 
     position: Floats
@@ -71,10 +71,10 @@ class Sampler:
         nodes."""
         self.n_steps, self.segment, self.fraction = n_steps, segment, fraction
 
-    def __call__(self, rods: Nodes) -> Samples:
+    def __call__(self, rods: Nodes) -> ChainSamples:
         """(n_robots, m, ...) at the m cross-sections of these rods."""
         n, m = len(rods.position), len(self.segment)
-        found = Samples(
+        found = ChainSamples(
             np.empty((n, m, 3)), np.empty((n, m, 4)), np.empty((n, m), np.int64), np.empty((n, m))
         )
         kernels.sample(
@@ -93,7 +93,7 @@ class Sampler:
         return found
 
 
-def along(between: tuple[Floats, Floats], samples: Samples) -> Floats:
+def along(between: tuple[Floats, Floats], samples: ChainSamples) -> Floats:
     """(n_robots, m) linear between the values (n_robots, n_points - 1) at the start and the end of each
     interval."""
     start, end = (np.take_along_axis(a, samples.interval, axis=1) for a in between)
@@ -114,7 +114,7 @@ def aim(direction: Floats) -> Floats:
     return np.asarray(found / np.linalg.norm(found, axis=-1, keepdims=True))
 
 
-def pieces(samples: Samples, n_strips: int, source: Ints, offset: Floats) -> Pieces:
+def pieces(samples: ChainSamples, n_strips: int, source: Ints, offset: Floats) -> Pieces:
     """Of strands through segments: `samples` are those of `n_strips` segments, as many of each; strand c runs
     through those of `source[c]` (n_strands,) at `offset` (1 or n_robots, n_strands, 2) along d1 and d2
     [m]."""

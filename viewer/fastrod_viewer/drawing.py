@@ -12,11 +12,11 @@ from fastrod.types import Floats
 from fastrod_viewer.arrows import Trail, frames
 from fastrod_viewer.canvas import Canvas
 from fastrod_viewer.legend import Entry, legend
-from fastrod_viewer.options import FINE, Options
+from fastrod_viewer.options import FINE, ViewOptions
 from fastrod_viewer.palette import MEASURED, TRAIL
 from fastrod_viewer.picture import Picture
 from fastrod_viewer.scene_graph import bounds
-from fastrod_viewer.session import Frame
+from fastrod_viewer.session import ViewFrame
 from fastrod_viewer.shapes import Instances, instances
 from fastrod_viewer.world import World
 
@@ -31,7 +31,13 @@ class Drawing:
     """Robots, surroundings, loads, the tip's trail, and what was measured beside them."""
 
     def __init__(
-        self, canvas: Canvas, world: World, options: Options, *, trail: bool = True, measured: bool = False
+        self,
+        canvas: Canvas,
+        world: World,
+        options: ViewOptions,
+        *,
+        trail: bool = True,
+        measured: bool = False,
     ) -> None:
         """`measured`: frames will tell where the tip was measured, and the legend says what that looks
         like."""
@@ -53,7 +59,7 @@ class Drawing:
         if not any(body.name.startswith(("plane", "floor")) for body in world.bodies):
             canvas.floor(self.size, min(lowest, 0.0 if lowest > -1e-6 else lowest), self.middle)
 
-    def look(self, options: Options, *, trail: bool) -> None:
+    def look(self, options: ViewOptions, *, trail: bool) -> None:
         """Draw so from the next picture on."""
         if options != self.options:
             self._pictures = [Picture(rods, options) for rods in self.world.rods]
@@ -76,7 +82,7 @@ class Drawing:
         rods = self.world.rods[0]
         return np.asarray(rods.state.tip_position[0] + rods.place[0])
 
-    def draw(self, frame: Frame) -> None:
+    def draw(self, frame: ViewFrame) -> None:
         """One picture."""
         hand = frame.hand
         force = None
@@ -111,7 +117,7 @@ class Drawing:
         for k, body in enumerate(self.world.bodies):
             self.canvas.fade(k, min(body.opacity, _GLASS) if within[k] else body.opacity)
 
-    def _measured(self, frame: Frame) -> None:
+    def _measured(self, frame: ViewFrame) -> None:
         """The tip that the robot itself tells: a plate with axes, and where it was."""
         now = frame.measured
         seen = now is not None and bool(np.isfinite(now.tip_position).all())

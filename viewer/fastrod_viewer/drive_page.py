@@ -18,12 +18,12 @@ from fastrod_viewer.canvas import Canvas
 from fastrod_viewer.controls import Controls, stops
 from fastrod_viewer.drawing import Drawing
 from fastrod_viewer.export import wrap
-from fastrod_viewer.grip import Grip
+from fastrod_viewer.grip import DragHandle
 from fastrod_viewer.linked import Linked
-from fastrod_viewer.options import FINE, Options
-from fastrod_viewer.page import Page, Sight, facts, picture, save_name, send, stand_back, tell
-from fastrod_viewer.pilot import Pilot, Speeds
-from fastrod_viewer.session import Frame, Session
+from fastrod_viewer.options import FINE, ViewOptions
+from fastrod_viewer.page import PageView, ViewerPage, facts, picture, save_name, send, stand_back, tell
+from fastrod_viewer.pilot import Speeds, Teleop
+from fastrod_viewer.session import Session, ViewFrame
 from fastrod_viewer.world import World
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ _BODIES = {"backbone and wires": "backbone", "skin": "skin"}
 
 
 @final
-class DrivePage(Page):
+class DrivePage(ViewerPage):
     """Controls on one side, the robot, a legend, and what its camera sees."""
 
     def __init__(
@@ -82,18 +82,21 @@ class DrivePage(Page):
         touches = world.rods[0].state.contacts is not None
         far = None if link is None else Linked(link)
         gentle = _GENTLE if touches else _REAL if link is not None and link.real else 1.0
-        self.pilot = Pilot(world, Speeds().times(gentle), reach=None if far is None else far.reach)
+        self.pilot = Teleop(world, Speeds().times(gentle), reach=None if far is None else far.reach)
         many = len(world.rods[0].state.ok) > FINE
         self.drawing = Drawing(
-            canvas, world, Options(body="skin" if touches or many else "backbone"), measured=link is not None
+            canvas,
+            world,
+            ViewOptions(body="skin" if touches or many else "backbone"),
+            measured=link is not None,
         )
-        self.sight = Sight(
+        self.sight = PageView(
             self.drawing.middle, self.drawing.size * (1.0 if far is None or not far.sees else _FARTHER)
         )
         self.session = Session(world, self.pilot, draw=self._draw, link=link, script=script)
         ball = min(1.25 * self.drawing.radius, 0.1 * world.robot.length)
         middle, can = world.rods[0].place[0], self._can_drag()
-        self.grip = Grip(server, self.session, ball, middle, may=may) if can else None
+        self.grip = DragHandle(server, self.session, ball, middle, may=may) if can else None
         self._latency = float("nan")
         self._told = self._looked = 0.0
         self._last: RunLog | None = None
@@ -101,7 +104,7 @@ class DrivePage(Page):
         self._closing = False
         self._build()
         stand_back(server, self.sight)
-        self._draw(Frame(world, None, None, float("nan"), 1.0, ""))
+        self._draw(ViewFrame(world, None, None, float("nan"), 1.0, ""))
         self.session.start()
 
     def close(self) -> None:
@@ -232,7 +235,7 @@ class DrivePage(Page):
 
         def change(_: object) -> None:
             shown = {name: bool(box.value) for name, box in boxes.items()}
-            new = Options(color_by=_COLORS[color.value], body=_BODIES[body.value], **shown)
+            new = ViewOptions(color_by=_COLORS[color.value], body=_BODIES[body.value], **shown)
             self.session.ask(lambda: self._look(new, bool(trail.value)))
 
         color.on_update(change)
@@ -242,7 +245,7 @@ class DrivePage(Page):
         back = gui.add_button("Look at the robot again", color="gray")
         back.on_click(lambda _: stand_back(self.server, self.sight))
 
-    def _look(self, options: Options, trail: bool) -> None:
+    def _look(self, options: ViewOptions, trail: bool) -> None:
         self.drawing.look(options, trail=trail)
         self.legend.content = self.drawing.legend
 
@@ -308,7 +311,7 @@ class DrivePage(Page):
                 session.reset()
                 self.session.ask(self.drawing.forget)
 
-    def _draw(self, frame: Frame) -> None:
+    def _draw(self, frame: ViewFrame) -> None:
         """In the session's thread."""
         if self._closing:
             return
@@ -329,7 +332,7 @@ class DrivePage(Page):
             if seen is not None:
                 self.camera[1].image = fitted(seen)
 
-    def _tell(self, frame: Frame) -> None:
+    def _tell(self, frame: ViewFrame) -> None:
         rows = [("Tip", self._tip())]
         session = self.session
         if frame.measured is not None and np.isfinite(frame.measured.tip_position).all():
@@ -370,7 +373,7 @@ class DrivePage(Page):
         ):
             self.legend.content = legend
 
-    def _state(self, frame: Frame) -> tuple[str, str]:
+    def _state(self, frame: ViewFrame) -> tuple[str, str]:
         """What is wrong, and what is worth knowing."""
         session = self.session
         status = "" if session.far is None else session.far.status

@@ -10,7 +10,7 @@ from fastrod.model.robot import Robot
 from fastrod.types import Flags, Floats, Params
 from fastrod_viewer import palette
 from fastrod_viewer.chains import Nodes, Sampler, pieces
-from fastrod_viewer.options import Options
+from fastrod_viewer.options import ViewOptions
 from fastrod_viewer.palette import Colors, Range
 from fastrod_viewer.shapes import Instances, instances
 
@@ -42,7 +42,7 @@ class Spacers:
     """Discs as wide as the body: one at the base, then about 1.6 body radii apart to the end of every
     segment, where one stands always."""
 
-    def __init__(self, params: Params, radius: Floats, options: Options, n_steps: int) -> None:
+    def __init__(self, params: Params, radius: Floats, options: ViewOptions, n_steps: int) -> None:
         """`radius` (n_segments,) of the body [m]."""
         segment, fraction, width, thick, color = [0], [0.0], [1.15], [0.35], [palette.BASE]
         for k, (length, r) in enumerate(zip(params.length[0], radius, strict=True)):

@@ -1,4 +1,4 @@
-"""`Grip`: the ball at the tip that hands pull."""
+"""`DragHandle`: the ball at the tip that hands pull."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _HINT = "drag me"
 
 
 @final
-class Grip:
+class DragHandle:
     """Follows the tip, or the hand that has got hold of it; the pilot then takes the tip there by inverse
     kinematics."""
 

@@ -14,8 +14,8 @@ from fastrod.hosts import BulletArm, MountedRod, Visuals
 from fastrod.model.robot import Robot
 from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_vector
 from fastrod.types import Floats
-from fastrod_scenes.scene import HostedScene, HostedWorld, SoftBody, Stage
-from fastrod_viewer.world import Body, Hand, Rods, World
+from fastrod_scenes.scene import HostedScene, HostedWorld, SceneStage, SoftBody
+from fastrod_viewer.world import Body, DrawnRods, ManualCommand, World
 from fastrod_viewer.worlds import Loads, actions_of, moved, radii, wires
 
 SWING = 1.0
@@ -46,8 +46,8 @@ class HostedView(World):
         # the last that the arm has followed; None: it was moved by other ways since
         self._base: Floats | None = None
         self._steps, self._driven, self._frozen = 0, False, False
-        self.by_hand = self.loads = isinstance(self._stage, Stage)
-        self.host = self.base_moves = isinstance(self._stage, Stage) and self._stage.arm is not None
+        self.by_hand = self.loads = isinstance(self._stage, SceneStage)
+        self.host = self.base_moves = isinstance(self._stage, SceneStage) and self._stage.arm is not None
         self._see()
         self.robot: Robot = self._soft[0].robot
         self.actions = actions_of(self.robot)
@@ -64,11 +64,11 @@ class HostedView(World):
         return self._steps * self.dt
 
     @property
-    def rods(self) -> tuple[Rods, ...]:
+    def rods(self) -> tuple[DrawnRods, ...]:
         """The stage's soft robots, where they are in the world: none is drawn elsewhere."""
         still = np.zeros((1, 3))
         return tuple(
-            Rods((soft.robot,), soft.state, still, radius)
+            DrawnRods((soft.robot,), soft.state, still, radius)
             for soft, radius in zip(self._soft, self._radius, strict=True)
         )
 
@@ -94,12 +94,12 @@ class HostedView(World):
             raise
         self._arrived()
 
-    def drive(self, hand: Hand) -> None:
+    def drive(self, hand: ManualCommand) -> None:
         """One step by hand. Where the arm cannot do what it is told, it stays, the step is done, and
         `HostError` then says why; where the soft robot is lost the world is reset. Raises `InputError` for
         what no robot can be told; the world then has not moved."""
         stage = self._stage
-        if not isinstance(stage, Stage):
+        if not isinstance(stage, SceneStage):
             raise InputError(
                 f"scene {self.name!r} has a script that moves its robots; no hand can drive them."
             )
@@ -135,7 +135,7 @@ class HostedView(World):
     def jacobian(self) -> Floats:
         """(3, n_joints + n_actions): the arm's joints, then the actions; the columns of an arm that is frozen
         are zero. Raises `InputError` where there is none."""
-        if not isinstance(self._stage, Stage):
+        if not isinstance(self._stage, SceneStage):
             raise InputError(
                 f"scene {self.name!r} has a script that moves its robots; there is no Jacobian for a drag."
             )
@@ -182,7 +182,7 @@ class HostedView(World):
         self._soft = self._stage.soft_bodies
         self._steps += 1
 
-    def _drive_arm(self, arm: BulletArm, hand: Hand) -> None:
+    def _drive_arm(self, arm: BulletArm, hand: ManualCommand) -> None:
         """Tell the motors. Raises `HostError` where the flange cannot go there; what they were told before
         then holds."""
         if self._joints is None:

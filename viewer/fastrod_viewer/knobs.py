@@ -1,5 +1,5 @@
-"""`Knob`: one number that a hand sets, in the unit in which people think of it; and those of a robot, group
-by group."""
+"""`Control`: one number that a hand sets, in the unit in which people think of it; and those of a robot,
+group by group."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fastrod.model.robot import Robot
-from fastrod_viewer.pilot import LARGEST_BEND, LARGEST_TENSION, Pilot
+from fastrod_viewer.pilot import LARGEST_BEND, LARGEST_TENSION, Teleop
 from fastrod_viewer.world import World
 
 _ALL = 60.0  # deg, of each segment
@@ -19,7 +19,7 @@ _MM, _GRAM, _DEGREE = 1e-3, 1e-3, math.pi / 180.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Knob:
+class Control:
     """A slider without its page."""
 
     label: str
@@ -47,7 +47,7 @@ class Group:
 
     title: str
     """Empty for those that stand first, without a heading."""
-    knobs: tuple[Knob, ...]
+    knobs: tuple[Control, ...]
     open: bool = True
     """At first."""
 
@@ -67,7 +67,7 @@ def largest_force(robot: Robot) -> float:
     return nice(2.0 * min(min(s.bending_stiffness) for s in robot.segments) / robot.length**2)
 
 
-def drive_knobs(world: World, pilot: Pilot) -> list[Group]:
+def drive_knobs(world: World, pilot: Teleop) -> list[Group]:
     """Bends and extensions, wires, base: what there is of them."""
     robot, groups = world.robot, []
     n = robot.n_segments
@@ -87,11 +87,11 @@ def drive_knobs(world: World, pilot: Pilot) -> list[Group]:
     return groups
 
 
-def load_knobs(robot: Robot, pilot: Pilot) -> Group:
+def load_knobs(robot: Robot, pilot: Teleop) -> Group:
     """Tip force, payload, gravity."""
     most = largest_force(robot)
     heaviest = nice(most / 9.81 / _GRAM)
-    payload = Knob(
+    payload = Control(
         label="Payload [g]",
         low=0.0,
         high=heaviest,
@@ -100,7 +100,7 @@ def load_knobs(robot: Robot, pilot: Pilot) -> Group:
         get=lambda: pilot.loads[1] / _GRAM,
         put=lambda v: pilot.load(payload=v * _GRAM),
     )
-    gravity = Knob(
+    gravity = Control(
         label="Gravity [× g]",
         low=0.0,
         high=3.0,
@@ -112,7 +112,7 @@ def load_knobs(robot: Robot, pilot: Pilot) -> Group:
     return Group("", (*(_force(pilot, axis, most) for axis in range(3)), payload, gravity))
 
 
-def _all_bend(pilot: Pilot, n: int, axis: int) -> Knob:
+def _all_bend(pilot: Teleop, n: int, axis: int) -> Control:
     def get() -> float:
         return float(np.mean([pilot.bent(k)[axis] for k in range(n)])) / _DEGREE
 
@@ -122,13 +122,13 @@ def _all_bend(pilot: Pilot, n: int, axis: int) -> Knob:
 
     name = "xy"[axis]
     hint = f"Bends every segment by so many degrees toward {name}."
-    return Knob(label=f"All bend {name} [°]", low=-_ALL, high=_ALL, step=1.0, get=get, put=put, hint=hint)
+    return Control(label=f"All bend {name} [°]", low=-_ALL, high=_ALL, step=1.0, get=get, put=put, hint=hint)
 
 
-def _segment(robot: Robot, pilot: Pilot, k: int) -> tuple[Knob, ...]:
+def _segment(robot: Robot, pilot: Teleop, k: int) -> tuple[Control, ...]:
     most = min(LARGEST_BEND / _DEGREE, _whole(pilot.reach.displacement, _arm(pilot, k) * _DEGREE))
     bends = tuple(
-        Knob(
+        Control(
             label=f"Bend {name} [°]",
             low=-most,
             high=most,
@@ -142,7 +142,7 @@ def _segment(robot: Robot, pilot: Pilot, k: int) -> tuple[Knob, ...]:
     low, high = (v / _MM for v in robot.segments[k].extension)
     if high <= low:
         return bends
-    extend = Knob(
+    extend = Control(
         label="Extend [mm]",
         low=low,
         high=high,
@@ -154,7 +154,7 @@ def _segment(robot: Robot, pilot: Pilot, k: int) -> tuple[Knob, ...]:
     return (*bends, extend)
 
 
-def _arm(pilot: Pilot, k: int) -> float:
+def _arm(pilot: Teleop, k: int) -> float:
     """Of a segment's bend on its wires [m]."""
     return math.inf if pilot.actions is None else float(pilot.actions.offset[k])
 
@@ -164,18 +164,18 @@ def _whole(most: float, step: float) -> float:
     return float(math.floor(most / step)) if math.isfinite(most) else most
 
 
-def _bend(pilot: Pilot, k: int, axis: int, degrees: float) -> None:
+def _bend(pilot: Teleop, k: int, axis: int, degrees: float) -> None:
     bends = list(pilot.bent(k))
     bends[axis] = degrees * _DEGREE
     pilot.bend(k, *bends)
 
 
-def _wire(robot: Robot, pilot: Pilot, i: int) -> Knob:
+def _wire(robot: Robot, pilot: Teleop, i: int) -> Control:
     k = int(robot.tendon_segment[i])
     segment = robot.segments[k]
     name = f"Wire {i + 1}" + (f", segment {k + 1}" if robot.n_segments > 1 else "")
     if segment.mode == "tendon_tension":
-        return Knob(
+        return Control(
             label=f"{name} [N]",
             low=0.0,
             high=LARGEST_TENSION,
@@ -188,7 +188,7 @@ def _wire(robot: Robot, pilot: Pilot, i: int) -> Knob:
         nice(LARGEST_BEND * sum(math.hypot(*place) for place in robot.tendons[i].position(k + 1)) / _MM),
         0.05 * _whole(pilot.reach.displacement / _MM - 1e-3, 0.05),
     )
-    return Knob(
+    return Control(
         label=f"{name} [mm]",
         low=-most,
         high=most,
@@ -199,7 +199,7 @@ def _wire(robot: Robot, pilot: Pilot, i: int) -> Knob:
     )
 
 
-def _base(robot: Robot, pilot: Pilot, axis: int) -> Knob:
+def _base(robot: Robot, pilot: Teleop, axis: int) -> Control:
     straight = axis < 3
     unit, word, factor = ("mm", "", _MM) if straight else ("°", "Turn ", _DEGREE)
     most = nice(0.5 * robot.length / _MM) if straight else 90.0
@@ -209,7 +209,7 @@ def _base(robot: Robot, pilot: Pilot, axis: int) -> Knob:
         base[axis] = value * factor
         pilot.move_base(base)
 
-    return Knob(
+    return Control(
         label=f"{word}{'xyz'[axis % 3]} [{unit}]",
         low=-most,
         high=most,
@@ -220,13 +220,13 @@ def _base(robot: Robot, pilot: Pilot, axis: int) -> Knob:
     )
 
 
-def _force(pilot: Pilot, axis: int, most: float) -> Knob:
+def _force(pilot: Teleop, axis: int, most: float) -> Control:
     def put(value: float) -> None:
         force = pilot.loads[0].copy()
         force[axis] = value
         pilot.load(tip_force=force)
 
-    return Knob(
+    return Control(
         label=f"Tip force {'xyz'[axis]} [N]",
         low=-most,
         high=most,

@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from fastrod_viewer import palette
-from fastrod_viewer.options import Options
+from fastrod_viewer.options import ViewOptions
 from fastrod_viewer.palette import Color
 from fastrod_viewer.picture import Picture
-from fastrod_viewer.world import Rods
+from fastrod_viewer.world import DrawnRods
 
 
 class Entry(NamedTuple):
@@ -99,7 +99,7 @@ def _number(value: float) -> str:
     return f"{value:.3g}".replace("-", "−")
 
 
-def legend(rods: Rods, options: Options, picture: Picture) -> Legend:
+def legend(rods: DrawnRods, options: ViewOptions, picture: Picture) -> Legend:
     """Of a picture of `rods` with these options, with its ranges as they are now."""
     title, unit = _TITLES[options.color_by]
     robot = rods.robots[0]
@@ -130,7 +130,7 @@ def _color(row: palette.Colors) -> Color:
     return r, g, b
 
 
-def _wires(rods: Rods, picture: Picture) -> tuple[Entry, ...]:
+def _wires(rods: DrawnRods, picture: Picture) -> tuple[Entry, ...]:
     """The colours that the tendons of these robots can have."""
     if not picture.tendons_drawn:
         return ()

@@ -24,7 +24,7 @@ _MAY_MOVE = ("ready", "running")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reach:
+class TendonLimits:
     """What the wires of a linked robot may do; nothing keeps those of a simulated one. Raises
     `InputError`."""
 
@@ -79,7 +79,7 @@ class Ticking(Protocol):
         """[s]"""
 
 
-class Sighting(Protocol):
+class LinkedSighting(Protocol):
     """What a camera's frame says about the tip."""
 
     t: float
@@ -133,7 +133,7 @@ class Sighted(Protocol):
     """The camera; None where there is none."""
 
     @property
-    def sighting(self) -> Sighting | None:
+    def sighting(self) -> LinkedSighting | None:
         """The newest; None before the first."""
 
 
@@ -179,12 +179,12 @@ class Linked:
         self._seen = -math.inf
 
     @property
-    def reach(self) -> Reach:
+    def reach(self) -> TendonLimits:
         """What its wires may do."""
         if self._guarded is None:
-            return Reach()
+            return TendonLimits()
         limits = self._guarded.supervisor.limits
-        return Reach(displacement=limits.displacement, rate=limits.rate)
+        return TendonLimits(displacement=limits.displacement, rate=limits.rate)
 
     @property
     def stopped(self) -> bool:

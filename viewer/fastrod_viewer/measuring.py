@@ -7,10 +7,10 @@ import numpy as np
 from fastrod.logs.link import Measurement
 from fastrod.rotation import quaternion_from_matrix
 from fastrod.types import Floats
-from fastrod_viewer.world import Hand, World
+from fastrod_viewer.world import ManualCommand, World
 
 
-def measure(world: World, hand: Hand | None) -> Measurement:
+def measure(world: World, hand: ManualCommand | None) -> Measurement:
     """What a perfect encoder and camera say of the world's first robot now; t is the world's, frames those of
     a run log."""
     state = world.rods[0].state

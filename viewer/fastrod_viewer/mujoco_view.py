@@ -12,7 +12,7 @@ from fastrod.model.robot import Robot
 from fastrod.rotation import quaternion_from_matrix
 from fastrod.types import Floats
 from fastrod_scenes.scene import MujocoScene
-from fastrod_viewer.world import Body, Hand, Rods, World
+from fastrod_viewer.world import Body, DrawnRods, ManualCommand, World
 from fastrod_viewer.worlds import actions_of, radii
 
 _GROUND = 2.0  # m, edge of a plane
@@ -46,9 +46,9 @@ class MujocoView(World):
         return self._steps * self.dt
 
     @property
-    def rods(self) -> tuple[Rods, ...]:
+    def rods(self) -> tuple[DrawnRods, ...]:
         """The stage's one rod."""
-        return (Rods((self.robot,), self._stage.rod.rod.state, np.zeros((1, 3)), self._radius),)
+        return (DrawnRods((self.robot,), self._stage.rod.rod.state, np.zeros((1, 3)), self._radius),)
 
     @property
     def bodies(self) -> tuple[Body, ...]:
@@ -74,7 +74,7 @@ class MujocoView(World):
             raise
         self._steps += 1
 
-    def drive(self, hand: Hand) -> NoReturn:  # noqa: ARG002
+    def drive(self, hand: ManualCommand) -> NoReturn:  # noqa: ARG002
         """Raises `InputError`: only the script moves this world."""
         self._refuse()
 

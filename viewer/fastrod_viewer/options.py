@@ -14,7 +14,7 @@ have too much to do."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options:
+class ViewOptions:
     """What is drawn, and what colours mean."""
 
     color_by: str = "segment"

@@ -1,4 +1,4 @@
-"""`Page`: what the window shows at a time; a robot that is driven, or a log that is replayed."""
+"""`ViewerPage`: what the window shows at a time; a robot that is driven, or a log that is replayed."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ _FIELD = 0.75  # rad, vertical
 _WAIT = 20.0  # s for a page to draw its picture
 
 
-class Page(ABC):
+class ViewerPage(ABC):
     """One thing on the canvas, with controls of its own."""
 
     title: str
     """A few words."""
-    sight: Sight
+    sight: PageView
     """Where to look at first."""
 
     @abstractmethod
@@ -57,7 +57,7 @@ class Page(ABC):
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class PageView:
     """What a first look shows: a sphere about `middle` (3,) of radius `size` [m], from in front and a little
     above."""
 
@@ -73,7 +73,7 @@ class Sight:
         camera.position, camera.look_at = at + distance * away / np.linalg.norm(away), at
 
 
-def stand_back(server: viser.ViserServer, sight: Sight) -> None:
+def stand_back(server: viser.ViserServer, sight: PageView) -> None:
     """All clients, present and to come, look at this."""
     sight.show(server.initial_camera)
     for client in server.get_clients().values():

@@ -14,12 +14,12 @@ from fastrod.solver.state import State
 from fastrod.types import Flags, Floats
 from fastrod_viewer import palette
 from fastrod_viewer.arrows import arrows, frames
-from fastrod_viewer.chains import Nodes, Sampler, Samples, along, nodes, pieces
+from fastrod_viewer.chains import ChainSamples, Nodes, Sampler, along, nodes, pieces
 from fastrod_viewer.fittings import Spacers, Tendons, smallest_offset, warned
-from fastrod_viewer.options import FINE, Options
+from fastrod_viewer.options import FINE, ViewOptions
 from fastrod_viewer.palette import Color, Colors, Range
 from fastrod_viewer.shapes import Instances, instances
-from fastrod_viewer.world import Rods
+from fastrod_viewer.world import DrawnRods
 
 _SLENDER = 0.45  # of the smallest tendon offset
 _ARROW = 0.3  # of the robot's length
@@ -50,10 +50,10 @@ class Picture:
     (40, array([[0.  , 0.  , 0.07]], dtype=float32))
     """
 
-    def __init__(self, rods: Rods, options: Options | None = None) -> None:
+    def __init__(self, rods: DrawnRods, options: ViewOptions | None = None) -> None:
         """Robots, their number and nodes, and whether there is contact, are those of `rods`. Raises
         `InputError` on a state without the rod (`outputs="tip"`)."""
-        self.options = options = options or Options()
+        self.options = options = options or ViewOptions()
         robot, state = rods.robots[0], rods.state
         if not state.position.size:
             raise InputError("the state holds the tip only; a picture needs Simulator(..., outputs='full').")
@@ -113,7 +113,7 @@ class Picture:
         """Frames have `tendons`."""
         return self._tendons is not None
 
-    def frame(self, rods: Rods, *, tip_force: Floats | None = None) -> dict[str, Instances]:
+    def frame(self, rods: DrawnRods, *, tip_force: Floats | None = None) -> dict[str, Instances]:
         """What is seen now: `body`, `tip`, and where options, robots and scene have them `spacers`,
         `tendons`, `contact_shafts`,
         `contact_heads`, `load_shafts`, `load_heads`, `frames`; the same keys and counts in every frame. World
@@ -177,7 +177,7 @@ class Picture:
             "tip": instances("cap", at.position[:, -1], at.quaternion[:, -1], end, color[:, -1, -1]),
         }
 
-    def _bending(self, curvature: Floats, at: Samples) -> Floats:
+    def _bending(self, curvature: Floats, at: ChainSamples) -> Floats:
         """(n_robots, m) the number that colours stand for."""
         size = np.hypot(curvature[..., 0], curvature[..., 1])
         end = size[:, 1:].copy()
@@ -245,7 +245,7 @@ class Picture:
         return now, ~good
 
 
-def _at_rest(rods: Rods, length: Floats, n_steps: int) -> _Pose:
+def _at_rest(rods: DrawnRods, length: Floats, n_steps: int) -> _Pose:
     """Straight robots: shown until there is a finite pose. `length` (1 or n_robots, n_segments) [m]."""
     base = np.array([[*robot.base_position, *robot.base_quaternion] for robot in rods.robots])
     joints = np.concatenate([np.zeros((len(base), 1)), np.cumsum(length, axis=1)], axis=1)

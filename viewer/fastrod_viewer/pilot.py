@@ -1,4 +1,4 @@
-"""`Pilot`: what hands want, from sliders, keys or a drag of the tip, as motion within limits."""
+"""`Teleop`: what hands want, from sliders, keys or a drag of the tip, as motion within limits."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from fastrod.model.robot import Robot
 from fastrod.model.segment_actions import SegmentActions
 from fastrod.types import Floats
 from fastrod_viewer.drag import drag_rates
-from fastrod_viewer.linked import Reach
-from fastrod_viewer.world import Hand, World
+from fastrod_viewer.linked import TendonLimits
+from fastrod_viewer.world import ManualCommand, World
 
 LARGEST_BEND = math.pi / 2.0
 """Of a segment toward either side [rad]."""
@@ -69,7 +69,7 @@ class Goals:
 
 
 @final
-class Pilot:
+class Teleop:
     """Takes what hands want from any thread, and tells a world step by step how to get there.
 
     >>> import fastrod
@@ -81,10 +81,12 @@ class Pilot:
     True
     """
 
-    def __init__(self, world: World, speeds: Speeds | None = None, *, reach: Reach | None = None) -> None:
+    def __init__(
+        self, world: World, speeds: Speeds | None = None, *, reach: TendonLimits | None = None
+    ) -> None:
         """`reach`: what the wires of the robot that is driven may do; they keep to its rate whatever the
         speeds are."""
-        self.linked, self.reach = reach is not None, reach or Reach()
+        self.linked, self.reach = reach is not None, reach or TendonLimits()
         self.robot: Robot = world.robot
         self.actions: SegmentActions | None = world.actions
         self._world = world
@@ -249,7 +251,7 @@ class Pilot:
         with self._lock:
             self._goals, self._pull = self._zero, None
 
-    def step(self, dt: float) -> Hand:
+    def step(self, dt: float) -> ManualCommand:
         """What the world is told for the next `dt` [s]."""
         with self._lock:
             rate = self._follow_drag(dt) if self._pull is not None else None
@@ -270,7 +272,7 @@ class Pilot:
             self._before, self._now = now, self._within_rate(now, Goals(action, wire, tension, base), dt)
             there = self._now
             extension = np.zeros(self.robot.n_segments) if self.actions is None else there.action[::3]
-            return Hand(
+            return ManualCommand(
                 tendon_length=self.robot.rest_tendon_length + self._change(there),
                 extension=extension,
                 tension=there.tension,
@@ -355,7 +357,7 @@ def _arm(robot: Robot) -> float:
     )
 
 
-def _limits(robot: Robot, actions: SegmentActions | None, reach: Reach) -> tuple[Floats, Floats]:
+def _limits(robot: Robot, actions: SegmentActions | None, reach: TendonLimits) -> tuple[Floats, Floats]:
     """(3 n_segments,) least and largest action [m]."""
     if actions is None:
         return np.zeros(0), np.zeros(0)

@@ -30,7 +30,7 @@ _EVERY_FOURTH = "every fourth of "  # how a report says that nobody named what i
 Progress = Callable[[int, int], None]
 
 
-class Shapes(NamedTuple):
+class PlayedShapes(NamedTuple):
     """The rod at the kept frames, in the frame of the log's tip: as the camera sees it, where the model has
     one. Fields are named as in
     `State`, with frames in the place of robots."""
@@ -50,7 +50,7 @@ class Shapes(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Track:
+class PlayedTrack:
     """What one model says to the log. The row axis is that of `Playback.log`; residual = measured -
     predicted."""
 
@@ -65,7 +65,7 @@ class Track:
     """(n,) distance between measured and predicted tip [m]; nan where either is missing."""
     rms: float
     """Of `residual` over the whole log [m]."""
-    shapes: Shapes
+    shapes: PlayedShapes
 
     def rms_of(self, rows: Flags) -> float:
         """Root mean square of `residual` over the rows (n,) [m]; nan where none of them counts."""
@@ -107,8 +107,8 @@ class Playback:
     """Rows before which a run begins or a pause was closed up: curves are interrupted there."""
     frames: Ints
     """(m,) rows whose shapes are kept, evenly spread; the first and the last are among them."""
-    before: Track
-    after: Track | None
+    before: PlayedTrack
+    after: PlayedTrack | None
     findings: Findings | None = None
     tested: Flags | None = None
     """(n,) rows that no fit saw, where an identification says so."""
@@ -186,7 +186,7 @@ class Playback:
         return np.tile(np.array(self.before.robot.base_quaternion), (len(self.frames), 1))
 
     @property
-    def tracks(self) -> tuple[Track, ...]:
+    def tracks(self) -> tuple[PlayedTrack, ...]:
         """`before`, and `after` where there is one."""
         return (self.before,) if self.after is None else (self.before, self.after)
 
@@ -401,10 +401,10 @@ def _clock(log: RunLog) -> tuple[Floats, Ints]:
     return np.concatenate([[0.0], np.cumsum(np.where(cut, usual, step))]), np.flatnonzero(cut) + 1
 
 
-def _track(log: RunLog, robot: Robot, frames: Ints, label: str, tell: Progress) -> Track:
+def _track(log: RunLog, robot: Robot, frames: Ints, label: str, tell: Progress) -> PlayedTrack:
     answer = replay(log, robot, progress=tell)
     residual = np.asarray(np.linalg.norm(answer.residual, axis=1))
-    return Track(
+    return PlayedTrack(
         label=label,
         robot=robot,
         tip_position=answer.tip_position,
@@ -415,7 +415,7 @@ def _track(log: RunLog, robot: Robot, frames: Ints, label: str, tell: Progress) 
     )
 
 
-def _shapes(log: RunLog, robot: Robot, frames: Ints) -> Shapes:
+def _shapes(log: RunLog, robot: Robot, frames: Ints) -> PlayedShapes:
     """The rod that `replay` solves, whole: with effects, the one of `forward.predict`, and its camera sees
     the backbone too."""
     from fastrod.identification.log import forward
@@ -443,12 +443,12 @@ def _shapes(log: RunLog, robot: Robot, frames: Ints) -> Shapes:
     rotation = into[:, None] @ rotation
     tip = position[:, -1]
     if robot.effects:
-        seen = place.see(forward.Pose(tip, rotation[:, -1], position, state.ok), chain)
+        seen = place.see(forward.PredictedPose(tip, rotation[:, -1], position, state.ok), chain)
         turned = seen.rotation @ np.swapaxes(rotation[:, -1], 1, 2)
         tip, position, rotation = seen.position, seen.points, turned[:, None] @ rotation
     for array in (tip, position, rotation):
         array[~state.ok] = np.nan
-    return Shapes(position, rotation, arclength, tip, state.ok)
+    return PlayedShapes(position, rotation, arclength, tip, state.ok)
 
 
 def _finer(arclength: Floats, n_segments: int) -> Floats:

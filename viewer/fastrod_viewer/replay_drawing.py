@@ -14,13 +14,13 @@ from fastrod.types import Floats
 from fastrod_viewer.arrows import Trail, arrows, ghost
 from fastrod_viewer.canvas import Canvas
 from fastrod_viewer.legend import Entry, Legend
-from fastrod_viewer.options import Options
-from fastrod_viewer.page import Sight
+from fastrod_viewer.options import ViewOptions
+from fastrod_viewer.page import PageView
 from fastrod_viewer.palette import CONTACT, GHOST, MEASURED
 from fastrod_viewer.picture import Picture
-from fastrod_viewer.playback import Playback, Shapes
+from fastrod_viewer.playback import Playback, PlayedShapes
 from fastrod_viewer.shapes import ball
-from fastrod_viewer.world import Rods
+from fastrod_viewer.world import DrawnRods
 from fastrod_viewer.worlds import radii
 
 BOTH = "both"
@@ -40,11 +40,11 @@ class ReplayDrawing:
         radius = radii(robot)
         self._radius = max(radius)
         self._rods = [self._first(k, track.robot, radius) for k, track in enumerate(playback.tracks)]
-        self._pictures = [Picture(rods, Options(contacts=False, loads=False)) for rods in self._rods]
+        self._pictures = [Picture(rods, ViewOptions(contacts=False, loads=False)) for rods in self._rods]
         self._trail = Trail(_TRAIL, 0.02 * robot.length)
         up = matrix_from_quaternion(playback.base_quaternion)[:, 2, 2].min() > _UPRIGHT
         middle, size, floor = (0.22, 0.95, 0.0) if up else (-0.4, 1.5, -1.15)
-        self.sight = Sight(np.array([0.0, 0.0, middle * robot.length]), size * robot.length)
+        self.sight = PageView(np.array([0.0, 0.0, middle * robot.length]), size * robot.length)
         """The robot in the upper part of the picture, above the plot, and all around its base where that
         turns."""
         canvas.clear()
@@ -86,9 +86,9 @@ class ReplayDrawing:
         self._measured(measured)
         self._residual(measured, predicted, magnify)
 
-    def _first(self, k: int, robot: Robot, radius: tuple[float, ...]) -> Rods:
+    def _first(self, k: int, robot: Robot, radius: tuple[float, ...]) -> DrawnRods:
         state = state_of(self.playback.tracks[k].shapes, 0, self.playback.base_quaternion[0], robot.n_tendons)
-        return Rods((robot,), state, np.zeros((1, 3)), radius)
+        return DrawnRods((robot,), state, np.zeros((1, 3)), radius)
 
     def _measured(self, tip: Floats) -> None:
         if not np.isfinite(tip).all():
@@ -113,7 +113,7 @@ class ReplayDrawing:
         )
 
 
-def state_of(shapes: Shapes, frame: int, quaternion: Floats, n_tendons: int) -> State:
+def state_of(shapes: PlayedShapes, frame: int, quaternion: Floats, n_tendons: int) -> State:
     """The rod of one frame as a `State` in the world of `quaternion` (4,) world_from_log; tensions, which a
     log does not tell, are nan."""
     turn = matrix_from_quaternion(quaternion[None])[0]

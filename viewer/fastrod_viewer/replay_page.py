@@ -12,7 +12,7 @@ from fastrod.errors import FastrodError
 from fastrod.types import Floats
 from fastrod_viewer.canvas import Canvas
 from fastrod_viewer.export import wrap
-from fastrod_viewer.page import Page, facts, picture, send, stand_back, tell
+from fastrod_viewer.page import ViewerPage, facts, picture, send, stand_back, tell
 from fastrod_viewer.palette import MEASURED, css
 from fastrod_viewer.playback import Playback, identify
 from fastrod_viewer.replay_drawing import BOTH, ReplayDrawing
@@ -33,7 +33,7 @@ _FIND = "What does the model lack?"
 
 
 @final
-class ReplayPage(Page):
+class ReplayPage(ViewerPage):
     """The robot as models have it, the measured tip, the residual as an arrow and over time, and a switch
     between the models."""
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from fastrod.errors import InputError
 from fastrod.types import Flags, Floats, Ints
-from fastrod_viewer.playback import Playback, Track
+from fastrod_viewer.playback import Playback, PlayedTrack
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -129,7 +129,7 @@ def svg(playback: Playback) -> str:
     return _inline(file.getvalue())
 
 
-def _name(track: Track) -> str:
+def _name(track: PlayedTrack) -> str:
     return f"{track.label}: {1e3 * track.rms:.3g} mm rms"
 
 

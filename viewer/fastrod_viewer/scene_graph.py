@@ -15,21 +15,21 @@ from fastrod.rotation import matrix_from_quaternion
 from fastrod.types import Floats
 from fastrod_viewer.arrows import Trail, arrows, ghost
 from fastrod_viewer.legend import Legend, legend
-from fastrod_viewer.options import BODIES, COLOR_BY, Options
+from fastrod_viewer.options import BODIES, COLOR_BY, ViewOptions
 from fastrod_viewer.picture import Picture
-from fastrod_viewer.shapes import SHAPES, Instances, Mesh, ball
-from fastrod_viewer.world import Body, Rods
+from fastrod_viewer.shapes import SHAPES, DrawnMesh, Instances, ball
+from fastrod_viewer.world import Body, DrawnRods
 
 __all__ = [
     "BODIES",
     "COLOR_BY",
     "SHAPES",
+    "DrawnMesh",
     "Instances",
     "Legend",
-    "Mesh",
-    "Options",
     "Picture",
     "Trail",
+    "ViewOptions",
     "arrows",
     "ball",
     "bounds",
@@ -55,7 +55,7 @@ def grid_places(n: int, spacing: float) -> Floats:
     return np.asarray(spacing * (cells - 0.5 * cells.max(0, initial=0.0)))
 
 
-def bounds(rods: Rods, bodies: Sequence[Body] = (), poses: Floats | None = None) -> tuple[Floats, float]:
+def bounds(rods: DrawnRods, bodies: Sequence[Body] = (), poses: Floats | None = None) -> tuple[Floats, float]:
     """Centre (3,) and radius [m] of a sphere around the robots and the bodies at `poses` (n, 7), floors and
     other large things left out:
     what a first look should show."""

@@ -19,8 +19,8 @@ from fastrod.logs.recording import Recorder
 from fastrod.logs.runlog import RunLog
 from fastrod_viewer.linked import Linked
 from fastrod_viewer.measuring import measure
-from fastrod_viewer.pilot import Pilot
-from fastrod_viewer.world import Hand, World
+from fastrod_viewer.pilot import Teleop
+from fastrod_viewer.world import ManualCommand, World
 
 RATE = 30.0
 """Pictures a second."""
@@ -36,11 +36,11 @@ _HASTY = 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class ViewFrame:
     """What a picture shows."""
 
     world: World
-    hand: Hand | None
+    hand: ManualCommand | None
     """What the world was told last; None before, and where its script moves it."""
     measured: Measurement | None
     """Of a robot that is not the world itself."""
@@ -55,21 +55,22 @@ class Frame:
 
 @final
 class Session:
-    """Advances a world and hands a `Frame` to `draw` when something has changed. Every method may be called
-    from any thread.
+    """Advances a world and hands a `ViewFrame` to `draw` when something has changed. Every method may be
+    called from any thread.
 
     With a `link`, hands drive that robot, the world is its model and gets the same commands, and
-    `Frame.measured` is what the robot says. A real robot stops when `nobody` watches. Where it has stopped,
-    by whatever it was, the session is stopped too, and the model stands as the robot's encoders say, until
+    `ViewFrame.measured` is what the robot says. A real robot stops when `nobody` watches. Where it has
+    stopped, by whatever it was, the session is stopped too, and the model stands as the robot's encoders say,
+    until
     `release`.
     """
 
     def __init__(
         self,
         world: World,
-        pilot: Pilot,
+        pilot: Teleop,
         *,
-        draw: Callable[[Frame], None],
+        draw: Callable[[ViewFrame], None],
         link: RobotLink | None = None,
         script: bool = False,
     ) -> None:
@@ -90,7 +91,7 @@ class Session:
         self._steps = 0
         self._since: float | None = None
         self._asked = 0.0
-        self._hand: Hand | None = None
+        self._hand: ManualCommand | None = None
         self._problem, self._said = "", 0.0
         self._recorded, self._restarts = -np.inf, 0
         self._pace = 1.0
@@ -417,7 +418,7 @@ class Session:
         problem = self._problem or (measured.problem if measured is not None else "")
         now = time.perf_counter()
         latency = float("nan") if since is None else now - since
-        self._draw(Frame(self.world, self._hand, measured, latency, self._pace, problem))
+        self._draw(ViewFrame(self.world, self._hand, measured, latency, self._pace, problem))
 
     def _let_go(self) -> None:
         if self.link is not None:

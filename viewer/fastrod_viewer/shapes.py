@@ -15,7 +15,7 @@ from fastrod_viewer.palette import Color, Colors
 Singles = NDArray[np.float32]
 
 
-class Mesh(NamedTuple):
+class DrawnMesh(NamedTuple):
     """Triangles, counterclockwise seen from outside."""
 
     vertices: Singles
@@ -64,7 +64,7 @@ def ball(position: Floats, radius: float, color: Color) -> Instances:
     )
 
 
-def _lathe(profile: list[tuple[float, float]], n_sides: int) -> Mesh:
+def _lathe(profile: list[tuple[float, float]], n_sides: int) -> DrawnMesh:
     """The surface that a profile of (radius, z), from the lower end up, sweeps around z; a radius of 0 closes
     it in a point."""
     angle = np.linspace(0.0, 2.0 * np.pi, n_sides, endpoint=False)
@@ -83,7 +83,7 @@ def _lathe(profile: list[tuple[float, float]], n_sides: int) -> Mesh:
             faces.append(np.stack([lower, np.roll(lower, -1), upper], axis=1))
         if high > 0.0:
             faces.append(np.stack([np.roll(lower, -1), np.roll(upper, -1), upper], axis=1))
-    return Mesh(np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.uint32))
+    return DrawnMesh(np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.uint32))
 
 
 def _arc(first: float, last: float, n: int) -> list[tuple[float, float]]:
@@ -92,7 +92,7 @@ def _arc(first: float, last: float, n: int) -> list[tuple[float, float]]:
     return [(0.0 if abs(a) > np.pi / 2 - 1e-9 else float(np.cos(a)), float(np.sin(a))) for a in latitude]
 
 
-SHAPES: Mapping[str, Mesh] = MappingProxyType(
+SHAPES: Mapping[str, DrawnMesh] = MappingProxyType(
     {
         "tube": _lathe([(1.0, -0.5), (1.0, 0.5)], 24),
         "wire": _lathe([(1.0, -0.5), (1.0, 0.5)], 8),

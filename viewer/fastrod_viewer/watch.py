@@ -1,4 +1,4 @@
-"""`Watch`: which pages are open, and how long they take to answer."""
+"""`SceneWatch`: which pages are open, and how long they take to answer."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _KEY = "fastrod-echo"
 
 
 @final
-class Watch:
+class SceneWatch:
     """Asks every page for an answer every second, and tells who came and went, `lost(client, clients left)`
     for the latter.
 

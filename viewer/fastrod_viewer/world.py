@@ -29,7 +29,7 @@ class Body(NamedTuple):
     opacity: float = 1.0
 
 
-class Rods(NamedTuple):
+class DrawnRods(NamedTuple):
     """Robots of one simulator."""
 
     robots: tuple[Robot, ...]
@@ -43,7 +43,7 @@ class Rods(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Hand:
+class ManualCommand:
     """What a hand tells a world for one step."""
 
     tendon_length: Floats
@@ -87,9 +87,9 @@ class World(ABC):
     host: bool
     """A rigid host carries the robot, and can be frozen."""
     base_moves: bool
-    """`Hand.base` is heeded."""
+    """`ManualCommand.base` is heeded."""
     loads: bool
-    """`Hand.tip_force`, `payload` and `gravity` are heeded."""
+    """`ManualCommand.tip_force`, `payload` and `gravity` are heeded."""
 
     @property
     @abstractmethod
@@ -98,7 +98,7 @@ class World(ABC):
 
     @property
     @abstractmethod
-    def rods(self) -> tuple[Rods, ...]:
+    def rods(self) -> tuple[DrawnRods, ...]:
         """All soft robots; the first robot of the first is the one that a hand drives."""
 
     @property
@@ -115,7 +115,7 @@ class World(ABC):
         """One step of the script. Raises `FastrodError` where it cannot be done."""
 
     @abstractmethod
-    def drive(self, hand: Hand) -> None:
+    def drive(self, hand: ManualCommand) -> None:
         """One step by hand. Raises `FastrodError` where it cannot be done; the world is then as after its
         last good step, or reset."""
 

@@ -21,7 +21,7 @@ from fastrod.types import Floats
 from fastrod_scenes.scene import RodScene
 from fastrod_viewer.catalogue import about, catalogue, open_world
 from fastrod_viewer.scene_graph import grid_places
-from fastrod_viewer.world import Body, Hand, Rods, World
+from fastrod_viewer.world import Body, DrawnRods, ManualCommand, World
 
 __all__ = ["FreeWorld", "SceneWorld", "SimulatedWorld", "catalogue", "open_world"]
 
@@ -54,7 +54,8 @@ class SimulatedWorld(World):
     """The script ends as it began, and runs on without a jump."""
 
     def __init__(self, simulator: Simulator, contact: ContactScene | None, place: Floats) -> None:
-        """`contact`: the scene of the simulator, where it has one; `place` (n_robots, 3) as in `Rods` [m]."""
+        """`contact`: the scene of the simulator, where it has one; `place` (n_robots, 3) as in `DrawnRods`
+        [m]."""
         self.simulator = simulator
         self.dt = simulator.dt
         self.robot: Robot = simulator.robots[0]
@@ -85,9 +86,9 @@ class SimulatedWorld(World):
 
     @property
     @final
-    def rods(self) -> tuple[Rods, ...]:
+    def rods(self) -> tuple[DrawnRods, ...]:
         """All robots of the simulator."""
-        return (Rods(self.simulator.robots, self._state, self._place, self._radius),)
+        return (DrawnRods(self.simulator.robots, self._state, self._place, self._radius),)
 
     @final
     def reset(self) -> None:
@@ -109,7 +110,7 @@ class SimulatedWorld(World):
         self._advance(self.inputs(self._clock), part_way=True)
 
     @final
-    def drive(self, hand: Hand) -> None:
+    def drive(self, hand: ManualCommand) -> None:
         """One step by hand. What the hand does not tell, obstacles and the base's own way among it, stays as
         the script has it now. Among obstacles, robots that the script has bent in ways of their own are moved
         by what the first one is: no robot could jump to another's bends there."""
@@ -264,7 +265,7 @@ class Loads:
         # (n_segments, 2, 3) [N/m]
         self._weight: Floats = np.repeat((density[:, None] * self._gravity)[:, None], 2, axis=1)
 
-    def added(self, given: dict[str, Any], hand: Hand) -> dict[str, Any]:
+    def added(self, given: dict[str, Any], hand: ManualCommand) -> dict[str, Any]:
         """`given` with these loads on top of its own, as `Simulator.step` takes them."""
         force = np.asarray(hand.tip_force, dtype=np.float64) + hand.payload * hand.gravity * self._gravity
         more: dict[str, Any] = {"tip_force": force + np.asarray(given.get("tip_force", np.zeros(3)))}
@@ -288,7 +289,7 @@ def radii(robot: Robot, contact: ContactScene | None = None) -> tuple[float, ...
     return tuple(radius or 0.01 * robot.length for radius in (contact or ContactScene()).radius_of(robot))
 
 
-def wires(robot: Robot, hand: Hand) -> dict[str, Any]:
+def wires(robot: Robot, hand: ManualCommand) -> dict[str, Any]:
     """What a hand tells the tendons and the segments, as `Simulator.step` takes it."""
     modes = {segment.mode for segment in robot.segments}
     given: dict[str, Any] = {"extension": hand.extension}
@@ -300,7 +301,8 @@ def wires(robot: Robot, hand: Hand) -> dict[str, Any]:
 
 
 def moved(pose: Floats, base: Floats) -> Floats:
-    """Poses (..., 7) displaced and turned, each about its own origin, by `base` (6,) as in `Hand`. Raises
+    """Poses (..., 7) displaced and turned, each about its own origin, by `base` (6,) as in `ManualCommand`.
+    Raises
     `InputError`."""
     by = np.asarray(base, dtype=np.float64)
     if by.shape != (6,) or not np.isfinite(by).all():

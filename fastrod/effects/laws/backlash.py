@@ -6,7 +6,7 @@ import numpy as np
 
 from fastrod.effects.base import Operator, Parameter, Seam, effect
 from fastrod.kernels.operators import play
-from fastrod.model.routing import Wiring
+from fastrod.model.routing import Routing
 from fastrod.types import Floats
 
 
@@ -41,7 +41,7 @@ class Backlash(Operator):
     def memory(self, n_robots: int, n_tendons: int) -> Floats:
         return np.full((n_robots, 3 * n_tendons), np.nan)
 
-    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Wiring) -> Floats:
+    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Routing) -> Floats:
         out = dl.copy()
         play(out, memory, wiring.by_end(values[:, :-1]), np.repeat(values[:, -1:], wiring.n_tendons, axis=1))
         return out

@@ -6,7 +6,7 @@ import numpy as np
 
 from fastrod.effects.base import Operator, Parameter, Seam, effect
 from fastrod.kernels.operators import second_order
-from fastrod.model.routing import Wiring
+from fastrod.model.routing import Routing
 from fastrod.types import Floats
 
 
@@ -34,7 +34,7 @@ class Dynamics(Operator):
     def memory(self, n_robots: int, n_tendons: int) -> Floats:
         return np.full((n_robots, 3 * n_tendons), np.nan)
 
-    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Wiring) -> Floats:
+    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Routing) -> Floats:
         out = dl.copy()
         period, damping = (np.repeat(values[:, k : k + 1], wiring.n_tendons, axis=1) for k in (0, 1))
         second_order(out, memory, period, damping, dt)

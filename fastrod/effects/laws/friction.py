@@ -6,7 +6,7 @@ import numpy as np
 
 from fastrod.effects.base import Operator, Parameter, Seam, effect
 from fastrod.kernels.operators import SLIDERS, elastoplastic
-from fastrod.model.routing import Wiring
+from fastrod.model.routing import Routing
 from fastrod.types import Floats
 
 
@@ -46,7 +46,7 @@ class Friction(Operator):
     def memory(self, n_robots: int, n_tendons: int) -> Floats:
         return np.full((n_robots, (1 + SLIDERS) * n_tendons), np.nan)
 
-    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Wiring) -> Floats:
+    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Routing) -> Floats:
         out = dl.copy()
         n = wiring.n_segments
         wrapped = np.cumsum(np.linalg.norm(wiring.bend(dl), axis=-1), axis=-1)

@@ -6,7 +6,7 @@ import numpy as np
 
 from fastrod.effects.base import Operator, Parameter, Seam, effect
 from fastrod.kernels.operators import BUFFER, delay
-from fastrod.model.routing import Wiring
+from fastrod.model.routing import Routing
 from fastrod.types import Floats
 
 
@@ -30,7 +30,7 @@ class Latency(Operator):
     def memory(self, n_robots: int, n_tendons: int) -> Floats:
         return np.full((n_robots, 1 + BUFFER * (1 + n_tendons)), np.nan)
 
-    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Wiring) -> Floats:
+    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Routing) -> Floats:
         out = dl.copy()
         delay(out, memory, np.ascontiguousarray(values[:, 0]), dt)
         return out

@@ -6,7 +6,7 @@ import numpy as np
 
 from fastrod.effects.base import Operator, Parameter, Seam, effect
 from fastrod.kernels.operators import yielding
-from fastrod.model.routing import Wiring
+from fastrod.model.routing import Routing
 from fastrod.types import Floats
 
 
@@ -40,7 +40,7 @@ class PlasticSet(Operator):
     def memory(self, n_robots: int, n_tendons: int) -> Floats:
         return np.full((n_robots, 2 * n_tendons), np.nan)
 
-    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Wiring) -> Floats:
+    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Routing) -> Floats:
         change = wiring.bend(dl)
         # where no wire ends nothing is commanded, and `memory` has no room
         driven = np.unique(wiring.tendon_segment)

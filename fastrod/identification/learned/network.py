@@ -6,10 +6,10 @@ from __future__ import annotations
 import numpy as np
 
 from fastrod.errors import InputError
-from fastrod.identification.log.forward import Samples
+from fastrod.identification.log.forward import LogSamples
 from fastrod.identification.report.result import Result
 from fastrod.identification.search.residual_test import features
-from fastrod.model.routing import Wiring
+from fastrod.model.routing import Routing
 
 _LAYERS = (32, 32)
 
@@ -24,7 +24,7 @@ def check_network() -> None:
         ) from error
 
 
-def residual_network(samples: Samples, wiring: Wiring, result: Result) -> dict[str, float]:
+def residual_network(samples: LogSamples, wiring: Routing, result: Result) -> dict[str, float]:
     """Train on the residual after the named effects, test on the samples held out: distance rms with it [m],
     and its input count.
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fastrod.effects.base import get_effect
-from fastrod.identification.log.forward import Samples
+from fastrod.identification.log.forward import LogSamples
 from fastrod.identification.log.noise import at_rest
 from fastrod.model.robot import Robot
 from fastrod.types import Floats
@@ -67,7 +67,7 @@ def look_at(pattern: str) -> str:
     return f"look at the robot: {pattern}; mend it, or register an effect of your own for it, and run again"
 
 
-def loaded(samples: Samples, robot: Robot) -> bool:
+def loaded(samples: LogSamples, robot: Robot) -> bool:
     """A load is known: in the log, or the robot's own weight in its file."""
     log = samples.log
     weight = any(segment.line_density > 0.0 for segment in robot.segments) and bool(
@@ -78,7 +78,7 @@ def loaded(samples: Samples, robot: Robot) -> bool:
     )
 
 
-def why_unknown(name: str, samples: Samples, robot: Robot) -> str:
+def why_unknown(name: str, samples: LogSamples, robot: Robot) -> str:
     """Why this log says nothing about a parameter of the robot."""
     log = samples.log
     if "stiffness" in name and not loaded(samples, robot):
@@ -92,7 +92,7 @@ def why_unknown(name: str, samples: Samples, robot: Robot) -> str:
     return "this log does not move it: its effect is within the noise, or others do the same"
 
 
-def missing_excitation(samples: Samples, bend: Floats) -> list[str]:
+def missing_excitation(samples: LogSamples, bend: Floats) -> list[str]:
     """What this run lacks to separate effects, in a sentence each. `bend` (n, n_segments, 2) commanded
     [rad]."""
     log = samples.log

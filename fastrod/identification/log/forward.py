@@ -19,7 +19,7 @@ from fastrod.identification.log.unknowns import Model
 from fastrod.logs.runlog import RunLog
 from fastrod.model.compile import compile_robots
 from fastrod.model.robot import Robot
-from fastrod.model.routing import Wiring
+from fastrod.model.routing import Routing
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.solver.inputs import Inputs, Reader
 from fastrod.types import Flags, Floats, Ints, Params, Ports
@@ -31,7 +31,7 @@ _LOST = 500
 N_STEPS = 6  # steps of a segment: the tip to some micrometres
 
 
-class Pose(NamedTuple):
+class PredictedPose(NamedTuple):
     """What the rod does at each row, base frame, before the camera."""
 
     position: Floats
@@ -45,7 +45,7 @@ class Pose(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
+class LogSamples:
     """The driven rows of a log in the order in which they happened, and which of them the loss looks at."""
 
     log: RunLog
@@ -61,12 +61,12 @@ class Samples:
     dt: Floats
     """(n,) since the sample before; 0 at the start of a run [s]."""
 
-    def on(self, rows: Ints) -> Samples:
+    def on(self, rows: Ints) -> LogSamples:
         """The same samples, compared at other rows."""
         return replace(self, rows=rows)
 
 
-def sample(log: RunLog, rows: Ints | None = None) -> Samples:
+def sample(log: RunLog, rows: Ints | None = None) -> LogSamples:
     """The samples of a log; runs that are interleaved are put one after the other."""
     used = np.flatnonzero(log.driven & np.isfinite(log.t))
     order = np.concatenate([used[log.run[used] == label] for label in log.runs]) if len(used) else used
@@ -79,14 +79,14 @@ def sample(log: RunLog, rows: Ints | None = None) -> Samples:
         time[part] = ordered.t[part] - ordered.t[part.start]
         dt[part.start + 1 : part.stop] = np.diff(ordered.t[part])
     measured = np.flatnonzero(ordered.measured) if rows is None else rows
-    return Samples(ordered, order, measured, runs, time, dt)
+    return LogSamples(ordered, order, measured, runs, time, dt)
 
 
-class Rod:
+class PredictedRod:
     """The batch that solves the rows of `samples`; it stays warm from one parameter vector to the next."""
 
     def __init__(
-        self, samples: Samples, robot: Robot, *, points: bool = False, threads: int | None = None
+        self, samples: LogSamples, robot: Robot, *, points: bool = False, threads: int | None = None
     ) -> None:
         from fastrod.simulator import Simulator
 
@@ -108,7 +108,7 @@ class Rod:
         self.cost = 0.0
         """Passes of a row so far, on the average."""
 
-    def solve(self, ports: Ports, params: Params, robot: Robot, rows: Flags | None = None) -> Pose:
+    def solve(self, ports: Ports, params: Params, robot: Robot, rows: Flags | None = None) -> PredictedPose:
         """Pose at the rows, for these ports and this robot; only of the `rows` of a mask, where one is
         given."""
         self.runs += 1
@@ -126,7 +126,7 @@ class Rod:
                 ).position
                 - origin[:, None]
             )
-        return Pose(
+        return PredictedPose(
             np.einsum("nji,nj->ni", turn, state.tip_position - origin),
             np.swapaxes(turn, 1, 2) @ state.tip_rotation,
             np.einsum("nji,nkj->nki", turn, points),
@@ -143,12 +143,12 @@ class Rod:
 
 
 @dataclass(frozen=True, eq=False)
-class Bench:
+class PreparedLog:
     """The inputs of `samples` for one robot, before effects: what does not change while effects do."""
 
     robot: Robot
-    wiring: Wiring
-    samples: Samples
+    wiring: Routing
+    samples: LogSamples
     ports: Ports
     """Of the rows."""
     params: Params
@@ -259,7 +259,9 @@ class Bench:
         """What the kernel reads."""
         return close_ports(opened, self.ports, self.params)
 
-    def see(self, pose: Pose, chain: list[tuple[Effect, Floats]], opened: EffectPorts | None = None) -> Pose:
+    def see(
+        self, pose: PredictedPose, chain: list[tuple[Effect, Floats]], opened: EffectPorts | None = None
+    ) -> PredictedPose:
         """The pose as the camera sees it, by the effects of sensing in `chain`; `opened`: ports that the
         others have changed."""
         links = [link for link in chain if link[0].seam is Seam.SENSING]
@@ -279,15 +281,15 @@ class Bench:
                 None,
                 0.0,
             )
-        return Pose(ports.tip_position, ports.tip_rotation, ports.points, pose.ok)
+        return PredictedPose(ports.tip_position, ports.tip_rotation, ports.points, pose.ok)
 
 
-def bench(samples: Samples, robot: Robot, wiring: Wiring) -> Bench:
+def bench(samples: LogSamples, robot: Robot, wiring: Routing) -> PreparedLog:
     """The inputs of the rows of `samples` for `robot`."""
     log = samples.log.rows(samples.rows)
     layout, params, rest = compile_robots((replace(robot, effects=()),), N_STEPS)
     ports = Reader(layout, params, rest, len(log)).ports(_given(inputs(log, robot)))
-    return Bench(
+    return PreparedLog(
         robot,
         wiring,
         samples,
@@ -317,7 +319,7 @@ def chain_of(model: Model, theta: Floats) -> list[tuple[Effect, Floats]]:
     return [(get_effect(name), values) for name, values in model.values(theta).items()]
 
 
-def predict(model: Model, theta: Floats, samples: Samples, rod: Rod) -> Pose:
+def predict(model: Model, theta: Floats, samples: LogSamples, rod: PredictedRod) -> PredictedPose:
     """What the camera sees at the rows of `samples`, solved exactly."""
     robot = model.robot_at(theta)
     place = bench(samples, robot, model.wiring)

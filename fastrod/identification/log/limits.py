@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 
-from fastrod.identification.log.forward import Samples
+from fastrod.identification.log.forward import LogSamples
 from fastrod.model.robot import Robot
 
 _SHEAR = 2.65  # (r / l)^2 times this is shear over bending at the tip: 3 EI / (k G A l^2), E = 3 G, circle
@@ -13,7 +13,7 @@ _WORTH_SAYING = 0.03
 _SLOW = 10.0  # Hz; a rod that rings more slowly shows it
 
 
-def limits(robot: Robot, samples: Samples) -> list[str]:
+def limits(robot: Robot, samples: LogSamples) -> list[str]:
     """Sentences on shear and inertia, where this robot is thick or slow enough for them."""
     found = []
     thickest = max((s.body_radius / robot.length for s in robot.segments), default=0.0)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fastrod.identification.log.forward import Samples
+from fastrod.identification.log.forward import LogSamples
 from fastrod.types import Flags, Floats, Ints
 
 _STILL = 2e-4  # of an input's range; less is no motion
@@ -37,7 +37,7 @@ class Noise:
         return float(np.sqrt(np.sum(self.sigma**2)))
 
 
-def at_rest(samples: Samples) -> list[Ints]:
+def at_rest(samples: LogSamples) -> list[Ints]:
     """Stretches of rows at which no input has moved for a while: arrays of indices into `samples.rows`."""
     log = samples.log
     drives = [log.dl] + [
@@ -61,7 +61,7 @@ def at_rest(samples: Samples) -> list[Ints]:
     ]
 
 
-def read_noise(samples: Samples, tip: Floats, residual: Floats) -> Noise:
+def read_noise(samples: LogSamples, tip: Floats, residual: Floats) -> Noise:
     """Noise of the measured `tip` (n_rows, 3) [m] from stretches at rest, or from the fastest part of a
     `residual` where the robot never rests."""
     parts = at_rest(samples)
@@ -111,7 +111,7 @@ def _fast(third: Floats) -> Floats:
     )
 
 
-def keep(samples: Samples, residual: Floats, noise: Noise) -> Flags:
+def keep(samples: LogSamples, residual: Floats, noise: Noise) -> Flags:
     """(n_rows,) rows that are no outliers: Hampel's filter on a residual (n_rows, 3), the same mask for every
     model."""
     good = np.ones(len(residual), bool)

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fastrod.identification.log.forward import Pose, Rod, Samples, predict, sample
-from fastrod.identification.log.registration import Registration, align, size
+from fastrod.identification.log.forward import LogSamples, PredictedPose, PredictedRod, predict, sample
+from fastrod.identification.log.registration import CameraRegistration, align, size
 from fastrod.identification.log.unknowns import known_model
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
@@ -52,7 +52,7 @@ _DENSE = 0.1  # of the motion from row to row
 class Reading:
     """What a first look says of a log."""
 
-    registration: Registration | None
+    registration: CameraRegistration | None
     """Of a camera that stands far from where the robot file says; None where it does not, or where nothing
     would follow from it."""
     questions: tuple[str, ...]
@@ -78,7 +78,7 @@ def questions(log: RunLog, robot: Robot, *, threads: int | None = None) -> tuple
     return (*moved, *reading.questions)
 
 
-def read(samples: Samples, robot: Robot, *, threads: int | None = None) -> Reading:
+def read(samples: LogSamples, robot: Robot, *, threads: int | None = None) -> Reading:
     """Look at the rows of `samples`; nothing is fitted but where the camera stands."""
     late = time_question(samples)
     asked = [late] if late else []
@@ -136,7 +136,7 @@ def read(samples: Samples, robot: Robot, *, threads: int | None = None) -> Readi
     )
 
 
-def further_than_still(samples: Samples, robot: Robot, scale: float, guess: str = "") -> str:
+def further_than_still(samples: LogSamples, robot: Robot, scale: float, guess: str = "") -> str:
     """The question to a user whose model moves otherwise than the measurement, `scale` times as predicted
     along with it."""
     moves = (
@@ -151,7 +151,7 @@ def further_than_still(samples: Samples, robot: Robot, scale: float, guess: str 
     )
 
 
-def time_question(samples: Samples) -> str:
+def time_question(samples: LogSamples) -> str:
     """Whether the time of a dense log is in another unit; empty where it is not."""
     steps = samples.dt[samples.dt > 0.0]
     tip = np.asarray(samples.log.tip_position)[samples.rows]
@@ -171,14 +171,14 @@ def time_question(samples: Samples) -> str:
 class _Look:
     """The model as the robot file has it beside some rows of a log."""
 
-    def __init__(self, samples: Samples, robot: Robot, threads: int | None) -> None:
+    def __init__(self, samples: LogSamples, robot: Robot, threads: int | None) -> None:
         rows = samples.rows
         if len(rows) > _ROWS:
             rows = rows[np.linspace(0, len(rows) - 1, _ROWS).round().astype(int)]
         log = samples.log.rows(rows)
         with_points = log.points is not None and len(robot.log_points) > 0
         self.samples, self.robot, self.model = samples.on(rows), robot, known_model(robot)
-        self.rod = Rod(self.samples, robot, points=with_points, threads=threads)
+        self.rod = PredictedRod(self.samples, robot, points=with_points, threads=threads)
         self.tip = np.asarray(log.tip_position)
         self.points = log.points if with_points and log.points is not None else np.zeros((len(rows), 0, 3))
         self.turned = (
@@ -200,7 +200,7 @@ class _Look:
         """Distance that the model leaves as it is, and with both motions about their middles [m]."""
         self.scale = np.nan
         """How much of the predicted motion is measured."""
-        self.frame = self.mirrored = Registration(rotation=np.eye(3), shift=np.zeros(3), left=np.inf)
+        self.frame = self.mirrored = CameraRegistration(rotation=np.eye(3), shift=np.zeros(3), left=np.inf)
         if self.solved:
             seen, made = self.tip[pose.ok], pose.position[pose.ok]
             self.as_it_is = size(seen - made)
@@ -220,11 +220,11 @@ class _Look:
             frame.left if not frame.is_large(self.robot.length) else size((self.tip - pose.position)[pose.ok])
         )
 
-    def _pose(self, dl: Floats) -> Pose:
+    def _pose(self, dl: Floats) -> PredictedPose:
         samples = replace(self.samples, log=replace(self.samples.log, dl=dl))
         return predict(self.model, self.model.start, samples, self.rod)
 
-    def _aligned(self, pose: Pose, *, mirrored: bool = False) -> Registration:
+    def _aligned(self, pose: PredictedPose, *, mirrored: bool = False) -> CameraRegistration:
         """The camera that lays a prediction on what was measured; its `left` is that of the tips."""
         both = pose.ok & np.isfinite(self.points).all((1, 2))
         seen = np.concatenate([self.tip[pose.ok], self.points[both].reshape(-1, 3)])
@@ -237,14 +237,14 @@ class _Look:
         return replace(found, left=size((self.tip - pose.position @ found.rotation.T - found.shift)[pose.ok]))
 
 
-def _declared(robot: Robot, found: Registration) -> bool:
+def _declared(robot: Robot, found: CameraRegistration) -> bool:
     """Whether the robot file's [sensor] allows for a camera that is turned so far."""
     given = robot.sensor.get("registration_sd", 0.0)
     turn = float(given[1]) if isinstance(given, (tuple, list)) else float(given)
     return found.angle < 3.0 * turn
 
 
-def _other_inputs(samples: Samples, robot: Robot, scale: float) -> Iterator[tuple[Floats, str]]:
+def _other_inputs(samples: LogSamples, robot: Robot, scale: float) -> Iterator[tuple[Floats, str]]:
     """Tendon lengths (n, n_tendons) as they may have been meant, and how in words."""
     dl = np.asarray(samples.log.dl)
     n = dl.shape[1]

@@ -25,7 +25,7 @@ _COUNTED = 0.85  # of the rows: the farther ones may be outliers
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Registration:
+class CameraRegistration:
     """A camera's frame: measured = `rotation` predicted + `shift`."""
 
     rotation: Floats
@@ -71,20 +71,22 @@ class Registration:
         return replace(robot, effects=(*others, table))
 
 
-def frame_of(robot: Robot) -> Registration:
+def frame_of(robot: Robot) -> CameraRegistration:
     """The camera's frame as the effects of `robot` have it."""
     table = named_effects(robot).get(EFFECT, {})
     vector, shift = (
         np.array([float(table.get(name, 0.0)) for name in names]) for names in (_ROTATION, _SHIFT)
     )
-    return Registration(rotation=Rotation.from_rotvec(vector).as_matrix(), shift=shift, left=float("nan"))
+    return CameraRegistration(
+        rotation=Rotation.from_rotvec(vector).as_matrix(), shift=shift, left=float("nan")
+    )
 
 
-def between(file: Robot, found: Robot) -> Registration:
+def between(file: Robot, found: Robot) -> CameraRegistration:
     """Where the camera of `found` stands from where `file` says."""
     one, two = frame_of(file), frame_of(found)
     rotation = two.rotation @ one.rotation.T
-    return Registration(rotation=rotation, shift=two.shift - rotation @ one.shift, left=float("nan"))
+    return CameraRegistration(rotation=rotation, shift=two.shift - rotation @ one.shift, left=float("nan"))
 
 
 def align(
@@ -94,7 +96,7 @@ def align(
     turns: Floats | None = None,
     lever: float = 0.0,
     mirrored: bool = False,
-) -> Registration:
+) -> CameraRegistration:
     """The rigid motion from `predicted` to `measured` points (n, 3) [m], robustly (Kabsch 1976, Cauchy
     weights by distance).
 
@@ -118,7 +120,9 @@ def align(
         shift = aim - rotation @ middle
         off = np.linalg.norm(measured - predicted @ rotation.T - shift, axis=1)
         weight = 1.0 / (1.0 + (off / max(2.0 * float(np.median(off)), 1e-12)) ** 2)
-    return Registration(rotation=rotation, shift=shift, left=size(measured - predicted @ rotation.T - shift))
+    return CameraRegistration(
+        rotation=rotation, shift=shift, left=size(measured - predicted @ rotation.T - shift)
+    )
 
 
 def size(vectors: Floats) -> float:

@@ -171,7 +171,7 @@ def replay(
 
 
 def _with_effects(log: RunLog, robot: Robot, progress: Progress | None, asked: tuple[str, ...]) -> Replay:
-    from fastrod.identification.log.forward import Rod, predict, sample  # they load numba
+    from fastrod.identification.log.forward import PredictedRod, predict, sample  # they load numba
     from fastrod.identification.log.unknowns import known_model
 
     samples, model = sample(log), known_model(robot)
@@ -183,7 +183,7 @@ def _with_effects(log: RunLog, robot: Robot, progress: Progress | None, asked: t
     )
     for start in range(0, len(samples.log), CHUNK):
         part = samples.on(np.arange(start, min(start + CHUNK, len(samples.log))))
-        pose = predict(model, np.zeros(0), part, Rod(part, robot, points=n_points > 0))
+        pose = predict(model, np.zeros(0), part, PredictedRod(part, robot, points=n_points > 0))
         rows = samples.origin[part.rows[pose.ok]]
         tip[rows], points[rows], converged[rows] = pose.position[pose.ok], pose.points[pose.ok], True
         if progress is not None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from fastrod.errors import LogError, UnknownNameError, nearest
-from fastrod.identification.log.forward import Samples
+from fastrod.identification.log.forward import LogSamples
 from fastrod.logs.runlog import RunLog
 from fastrod.types import Flags
 
@@ -62,7 +62,7 @@ def merged(logs: Sequence[RunLog]) -> RunLog:
     )
 
 
-def held_out_rows(samples: Samples, held_out: Sequence[str]) -> tuple[Flags, list[str]]:
+def held_out_rows(samples: LogSamples, held_out: Sequence[str]) -> tuple[Flags, list[str]]:
     """(n,) samples that are held out, and what they are in words.
 
     Each of `held_out` is the label of a run, or `RUN@START:END` in seconds of the run's own time (`@60:` is

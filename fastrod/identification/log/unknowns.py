@@ -15,7 +15,7 @@ from fastrod.effects.base import columns, effect_names, get_effect, read_values
 from fastrod.effects.pipeline import named_effects
 from fastrod.errors import RobotError, nearest
 from fastrod.model.robot import Robot
-from fastrod.model.routing import Wiring, wire
+from fastrod.model.routing import Routing, wire
 from fastrod.types import Floats
 
 _SEGMENT = {
@@ -80,7 +80,7 @@ class Model:
 
     robot: Robot
     """Nominal; its own effects are known ones."""
-    wiring: Wiring
+    wiring: Routing
     effects: tuple[str, ...]
     """Names, in the order in which they act."""
     unknowns: tuple[Unknown, ...]
@@ -198,7 +198,7 @@ def base_model(robot: Robot, *, free_camera: bool = False, registered: bool = Fa
 
 def effect_unknowns(
     name: str,
-    wiring: Wiring,
+    wiring: Routing,
     start: Mapping[str, float] | None = None,
     drop: Sequence[str] = (),
     split: bool = False,
@@ -238,7 +238,7 @@ def effect_unknowns(
     return tuple(found)
 
 
-def _targets(robot: Robot, wiring: Wiring, target: str, prior: Mapping[str, float]) -> list[Unknown]:
+def _targets(robot: Robot, wiring: Routing, target: str, prior: Mapping[str, float]) -> list[Unknown]:
     """The unknowns of one line of `[fit]`."""
     match = re.fullmatch(r"(segment|tendon)\.(\*|\d+)\.(\w+)", target)
     kinds = {"segment": _SEGMENT, "tendon": _TENDON}
@@ -306,7 +306,7 @@ def _targets(robot: Robot, wiring: Wiring, target: str, prior: Mapping[str, floa
 
 
 def _drive_unknowns(
-    wiring: Wiring, kind: str, which: list[int], sd: float, shared: bool, target: str
+    wiring: Routing, kind: str, which: list[int], sd: float, shared: bool, target: str
 ) -> list[Unknown]:
     """Gains and zeros of wires are those of their drives: antagonists of one drive cannot be told apart by a
     bend."""
@@ -341,7 +341,7 @@ def _wider(given: Any, least: tuple[float, float]) -> tuple[float, float]:
     return max(shift, least[0]), max(turn, least[1])
 
 
-def _camera(sensor: Mapping[str, Any], robot: Robot, wiring: Wiring) -> list[Unknown]:
+def _camera(sensor: Mapping[str, Any], robot: Robot, wiring: Routing) -> list[Unknown]:
     """The camera's unknowns, about where the effects of the robot file have it."""
     made: list[Unknown] = []
     known = named_effects(robot)

@@ -10,14 +10,14 @@ import numpy as np
 
 from fastrod.effects.base import get_effect
 from fastrod.identification.log import advice
-from fastrod.identification.log.forward import Rod, Samples, predict
+from fastrod.identification.log.forward import LogSamples, PredictedRod, predict
 from fastrod.identification.log.limits import limits
 from fastrod.identification.log.noise import keep
 from fastrod.identification.log.unknowns import Model
-from fastrod.identification.report.result import Error, Found, Result, Stage, Tried
+from fastrod.identification.report.result import Error, Found, Result, SearchStage, Tried
 from fastrod.identification.report.verdict import judge
-from fastrod.identification.search.base import SEEN, Base, rms
-from fastrod.identification.search.model_selection import State, Step
+from fastrod.identification.search.base import SEEN, BaseFit, rms
+from fastrod.identification.search.model_selection import ModelState, SearchStep
 from fastrod.identification.search.residual_test import audit
 from fastrod.identification.search.search import Search
 from fastrod.identification.search.solve import Estimate, covariance
@@ -34,18 +34,18 @@ _SAY_LIMITS = 0.05
 
 def assemble(
     *,
-    samples: Samples,
+    samples: LogSamples,
     rows: Ints,
     tested: Flags,
     labels: Sequence[str],
-    base: Base,
+    base: BaseFit,
     search: Search,
-    start: State,
-    last: State,
+    start: ModelState,
+    last: ModelState,
     last_sigma: Floats,
-    state: State,
+    state: ModelState,
     found: list[str],
-    steps: list[Step],
+    steps: list[SearchStep],
     fixed: dict[str, Estimate],
     threads: int | None,
 ) -> Result:
@@ -150,14 +150,14 @@ def assemble(
 
 
 def _nearer(
-    one: State, other: State, samples: Samples, rows: Ints, robot: Robot, threads: int | None
-) -> State:
+    one: ModelState, other: ModelState, samples: LogSamples, rows: Ints, robot: Robot, threads: int | None
+) -> ModelState:
     """The state whose prediction is nearer at the rows: a fit that goes by slopes can leave the valley where
     a load makes the rod snap."""
     part = samples.on(rows)
 
-    def off(state: State) -> float:
-        pose = predict(state.model, state.theta, part, Rod(part, robot, threads=threads))
+    def off(state: ModelState) -> float:
+        pose = predict(state.model, state.theta, part, PredictedRod(part, robot, threads=threads))
         error = np.linalg.norm(np.asarray(samples.log.tip_position)[rows] - pose.position, axis=1)
         return float(
             np.mean(np.where(pose.ok, np.minimum(error, _FAR * robot.length), _FAR * robot.length) ** 2)
@@ -166,13 +166,13 @@ def _nearer(
     return other if off(other) <= off(one) else one
 
 
-def _square(state: State, sigma: Floats) -> float:
+def _square(state: ModelState, sigma: Floats) -> float:
     """Mean square distance that a state leaves at the samples of the search [m^2]."""
     counted = state.fit.residual[np.any(state.fit.residual != 0.0, axis=1), :3]
     return float(np.mean(((counted * sigma) ** 2).sum(1))) if len(counted) else 0.0
 
 
-def _own(state: State, name: str) -> float:
+def _own(state: ModelState, name: str) -> float:
     """How far an effect by itself moves the prediction: squares over the samples, the other parameters as
     they are."""
     theta = state.theta.copy()
@@ -187,8 +187,8 @@ def _effect(
     name: str,
     estimates: dict[str, Estimate],
     classes: dict[str, list[str]],
-    path: list[Stage],
-    steps: list[Step],
+    path: list[SearchStage],
+    steps: list[SearchStep],
     floor: float,
 ) -> Found:
     parameters = {
@@ -210,7 +210,7 @@ def _effect(
     )
 
 
-def _classes(steps: list[Step], found: list[str]) -> dict[str, list[str]]:
+def _classes(steps: list[SearchStep], found: list[str]) -> dict[str, list[str]]:
     """Effects that explained a stage as well as the one that was taken."""
     return {
         step.taken.name: [r for r in step.rivals if r not in found]
@@ -219,7 +219,7 @@ def _classes(steps: list[Step], found: list[str]) -> dict[str, list[str]]:
     }
 
 
-def _tried(step: Step, kept: list[str], base: Base) -> list[Tried]:
+def _tried(step: SearchStep, kept: list[str], base: BaseFit) -> list[Tried]:
     sigma = base.weights[0] if base.weights else base.target.sigma
     scale = rms(step.before.fit.residual[:, :3]) * float(np.sqrt((sigma**2).sum()))
     made = []
@@ -241,7 +241,7 @@ def _tried(step: Step, kept: list[str], base: Base) -> list[Tried]:
     return made
 
 
-def _estimates(state: State) -> tuple[dict[str, Estimate], tuple[list[str], Floats]]:
+def _estimates(state: ModelState) -> tuple[dict[str, Estimate], tuple[list[str], Floats]]:
     n = len(state.model.unknowns)
     C = covariance(state.fit)[:n, :n]
     stderr = np.sqrt(np.maximum(np.diag(C), 0.0)) if n else np.zeros(0)
@@ -265,30 +265,32 @@ def _estimates(state: State) -> tuple[dict[str, Estimate], tuple[list[str], Floa
     return made, ([u.name for u in state.model.unknowns], np.asarray(C / spread[:, None] / spread[None, :]))
 
 
-def _everywhere(model: Model, theta: Floats, samples: Samples, robot: Robot, threads: int | None) -> Floats:
+def _everywhere(
+    model: Model, theta: Floats, samples: LogSamples, robot: Robot, threads: int | None
+) -> Floats:
     """(n, 3) predicted tip of every driven sample [m]; nan where the rod did not converge."""
     tip = np.full((len(samples.log), 3), np.nan)
     for start in range(0, len(tip), ALL_AT_ONCE):
         rows = np.arange(start, min(start + ALL_AT_ONCE, len(tip)))
         part = samples.on(rows)
-        pose = predict(model, theta, part, Rod(part, robot, threads=threads))
+        pose = predict(model, theta, part, PredictedRod(part, robot, threads=threads))
         tip[rows] = np.where(pose.ok[:, None], pose.position, np.nan)
     return tip
 
 
-def _distance(samples: Samples, predicted: Floats, which: Flags) -> Floats:
+def _distance(samples: LogSamples, predicted: Floats, which: Flags) -> Floats:
     squares = ((np.asarray(samples.log.tip_position) - predicted)[which] ** 2).sum(1)
     return np.asarray(squares[np.isfinite(squares)])
 
 
-def _error(samples: Samples, before: Floats, after: Floats, which: Flags) -> Error:
+def _error(samples: LogSamples, before: Floats, after: Floats, which: Flags) -> Error:
     if not which.any():
         return Error(before=float("nan"), after=float("nan"), interval=(float("nan"), float("nan")))
     values = [float(np.sqrt(_distance(samples, p, which).mean())) for p in (before, after)]
     return Error(before=values[0], after=values[1], interval=_interval(samples, after, which))
 
 
-def _interval(samples: Samples, predicted: Floats, which: Flags) -> tuple[float, float]:
+def _interval(samples: LogSamples, predicted: Floats, which: Flags) -> tuple[float, float]:
     """95 % interval of a distance rms, by resampling blocks of samples."""
     squares = _distance(samples, predicted, which)
     if len(squares) < 20:
@@ -301,25 +303,25 @@ def _interval(samples: Samples, predicted: Floats, which: Flags) -> tuple[float,
 
 
 def _path(
-    start: State,
-    state: State,
+    start: ModelState,
+    state: ModelState,
     found: list[str],
-    samples: Samples,
+    samples: LogSamples,
     robot: Robot,
     used: Flags,
     test: Flags,
     search: Search,
     threads: int | None,
-) -> list[Stage]:
+) -> list[SearchStage]:
     """Error after each effect, added in the order of what each brings."""
 
-    def stage(name: str, at: State) -> Stage:
+    def stage(name: str, at: ModelState) -> SearchStage:
         tip = _everywhere(at.model, at.theta, samples, robot, threads)
         errors = [
             float(np.sqrt(_distance(samples, tip, which).mean())) if which.any() else float("nan")
             for which in (used, test)
         ]
-        return Stage(name=name, train=errors[0], held_out=errors[1])
+        return SearchStage(name=name, train=errors[0], held_out=errors[1])
 
     stages = [stage("base", start)]
     for i in range(1, len(found) + 1):

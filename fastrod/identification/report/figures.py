@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fastrod.identification.report.result import Result
-from fastrod.identification.report.signals import Signals, View, bin_means
+from fastrod.identification.report.signals import Signals, SignalView, bin_means
 from fastrod.identification.report.wording import millimetres, words
 from fastrod.types import Flags, Floats, Ints
 
@@ -157,7 +157,7 @@ def close_up(result: Result, signals: Signals) -> tuple[str, str]:
     return out(), f"{f'run {run}, ' if run else ''}{time[0]:.0f} to {time[-1]:.0f} s"
 
 
-def against_signal(view: View, result: Result, name: str) -> str:
+def against_signal(view: SignalView, result: Result, name: str) -> str:
     """A component of the residual, before and after, against what explains it."""
     held = result.tested[view.rows]
     panels = [("before", BEFORE, view.before), ("after", AFTER, view.after)]
@@ -358,7 +358,7 @@ def _halves(figure: Figure, ratios: tuple[float, float]) -> tuple[Any, Any]:
     return left, right
 
 
-def _cloud(axes: Axes, view: View, values: Floats, held: Flags, colour: str) -> None:
+def _cloud(axes: Axes, view: SignalView, values: Floats, held: Flags, colour: str) -> None:
     """Points, the held-out ones dark; and the mean over the signal."""
     rows = np.arange(len(values))[:: max(1, -(-len(values) // _MOST))]
     for which, alpha in ((~held[rows], 0.22), (held[rows], 0.75)):
@@ -378,7 +378,7 @@ def _cloud(axes: Axes, view: View, values: Floats, held: Flags, colour: str) -> 
     axes.plot(*np.array(means).T, color="#111827", lw=1.6, marker="o", ms=3.0)
 
 
-def _loops(axes: Axes, view: View, values: Floats, held: Flags, colour: str) -> None:
+def _loops(axes: Axes, view: SignalView, values: Floats, held: Flags, colour: str) -> None:
     """Lines between consecutive rows, the held-out ones dark."""
     jump = np.flatnonzero(np.diff(view.rows) != 1) + 1
     for which, alpha, width in ((~held, 0.30, 0.8), (held, 0.95, 1.1)):

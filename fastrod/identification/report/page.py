@@ -11,7 +11,7 @@ from fastrod.identification.report import figures
 from fastrod.identification.report.headline import header, hero
 from fastrod.identification.report.markup import SHARES, figure, listed, mark, section
 from fastrod.identification.report.result import Found, Result
-from fastrod.identification.report.signals import Signals, View
+from fastrod.identification.report.signals import Signals, SignalView
 from fastrod.identification.report.wording import (
     NOTHING,
     VERDICTS,
@@ -102,7 +102,7 @@ def _fit(result: Result, signals: Signals) -> str:
     return section("Measured and predicted", "The base model with its own parameters fitted.", *parts)
 
 
-def _effect(result: Result, found: Found, view: View) -> str:
+def _effect(result: Result, found: Found, view: SignalView) -> str:
     forms = (
         ("z", "z over held-out blocks {:.1f}", 1.0),
         ("bic", "BIC gain {:.0f}", 1.0),
@@ -127,7 +127,7 @@ def _effect(result: Result, found: Found, view: View) -> str:
     return section(words(found.name).capitalize(), escape(found.title), figure(picture, caption), laws, proof)
 
 
-def _memory(result: Result, signals: Signals, drawn: Sequence[View]) -> str:
+def _memory(result: Result, signals: Signals, drawn: Sequence[SignalView]) -> str:
     parts = []
     if not any(view.connected for view in drawn) and (loops := signals.loops()) is not None:
         caption = (

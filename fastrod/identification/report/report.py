@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fastrod.identification.log.registration import Registration
+from fastrod.identification.log.registration import CameraRegistration
 from fastrod.identification.log.replay import make_folder
 from fastrod.identification.report.headline import explained
 from fastrod.identification.report.page import page
@@ -201,7 +201,7 @@ def _error(error: Error) -> dict[str, float]:
     return {"before_rms_m": error.before, "after_rms_m": error.after}
 
 
-def _registration(camera: Registration | None) -> dict[str, Any] | None:
+def _registration(camera: CameraRegistration | None) -> dict[str, Any] | None:
     """Where a camera stands that was far from where the robot file says; None where it was not."""
     if camera is None:
         return None

@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 
 from fastrod.identification.log.noise import Noise
-from fastrod.identification.log.registration import Registration
+from fastrod.identification.log.registration import CameraRegistration
 from fastrod.identification.search.model_selection import Bound
-from fastrod.identification.search.residual_test import Audit
+from fastrod.identification.search.residual_test import ResidualStructure
 from fastrod.identification.search.solve import Estimate
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
@@ -62,7 +62,7 @@ class Error:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stage:
+class SearchStage:
     """One point of the path from before to after."""
 
     name: str
@@ -106,7 +106,7 @@ class Result:
     base_parameters: Mapping[str, Estimate]
     correlation: tuple[Sequence[str], Floats]
     """Names and (p, p) correlations of all fitted numbers."""
-    remaining: Audit
+    remaining: ResidualStructure
     remaining_kind: str
     """none | static | memory | drift | unknown."""
     remaining_share: float
@@ -114,14 +114,14 @@ class Result:
     patterns: Sequence[str]
     """What the remaining structure looks like, where a pattern outside the library fits it."""
     tried: Sequence[Tried]
-    path: Sequence[Stage]
+    path: Sequence[SearchStage]
     bounds: Sequence[Bound]
     advice: Sequence[str]
     notes: Sequence[str]
     """What is odd about this log."""
     solves: int
     """Batches of the rod that the search took."""
-    registration: Registration | None = None
+    registration: CameraRegistration | None = None
     """Where the camera stands from where the robot file says, fitted; None where it stood near enough for the
     search."""
     network: Mapping[str, float] = field(default_factory=dict)

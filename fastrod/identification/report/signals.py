@@ -25,7 +25,7 @@ _WEIGHT = ("gravity", "payload")
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class SignalView:
     """A residual before and after against a signal, at `rows`."""
 
     rows: Ints
@@ -72,7 +72,7 @@ class Signals:
         first = {label: float(log.t[log.run == label].min()) for label in log.runs}
         return np.asarray(self.log.t - np.array([first[label] for label in self.log.run.tolist()]))
 
-    def view(self, found: Found) -> View:
+    def view(self, found: Found) -> SignalView:
         """The residual against what explains this effect."""
         name = found.name
         what = get_effect(name)
@@ -103,7 +103,7 @@ class Signals:
             return self.loops() or self._over_bend()
         return self._over_bend()
 
-    def loops(self) -> View | None:
+    def loops(self) -> SignalView | None:
         """The residual along the bend against the commanded bend, where motion is in one direction; None
         without wires."""
         best: tuple[float, Floats, Flags, int, float] | None = None
@@ -125,7 +125,7 @@ class Signals:
         axis = {0: "about x", 1: "about the diagonal", 2: "about y", 3: "about the other diagonal"}[
             round(angle / np.pi * _DIRECTIONS)
         ]
-        return View(
+        return SignalView(
             self.rows[keep],
             np.degrees(along[keep]),
             (self.before @ direction)[keep],
@@ -135,7 +135,7 @@ class Signals:
             connected=True,
         )
 
-    def _best(self, signals: list[tuple[str, Floats]], components: list[tuple[str, Floats]]) -> View:
+    def _best(self, signals: list[tuple[str, Floats]], components: list[tuple[str, Floats]]) -> SignalView:
         """The pair of a signal and a residual's direction that explains most of what was there before;
         directions (3,) or (n, 3)."""
         best: tuple[float, str, Floats, str, Floats] | None = None
@@ -149,7 +149,7 @@ class Signals:
         _, label, signal, word, direction = best
         before, after = (self.before * direction).sum(1), (self.after * direction).sum(1)
         good = np.isfinite(signal) & np.isfinite(before)
-        return View(self.rows[good], signal[good], before[good], after[good], label, word)
+        return SignalView(self.rows[good], signal[good], before[good], after[good], label, word)
 
     def _axes(self) -> list[tuple[str, Floats]]:
         return [(f"residual along {axis}", row) for axis, row in zip("xyz", np.eye(3), strict=True)]
@@ -164,7 +164,7 @@ class Signals:
         around = np.column_stack([-unit[:, 1], unit[:, 0], unit[:, 2]])
         return [("residual outward, along the bend", unit), ("residual across the bend", around)]
 
-    def _over_tip(self) -> View:
+    def _over_tip(self) -> SignalView:
         tips = [(f"predicted tip {axis} [mm]", 1e3 * self.tip[:, k]) for k, axis in enumerate("xyz")]
         radius = (
             "predicted distance of the tip from the base's axis [mm]",
@@ -172,7 +172,7 @@ class Signals:
         )
         return self._best([*tips, radius], [*self._axes(), *self._radial()])
 
-    def _over_bend(self) -> View:
+    def _over_bend(self) -> SignalView:
         signals = []
         many = self.bend.shape[1] > 1
         for k in range(self.bend.shape[1]):
@@ -184,7 +184,7 @@ class Signals:
             )
         return self._best(signals, [*self._axes(), *self._radial()])
 
-    def _behind(self, time_constant: float) -> View:
+    def _behind(self, time_constant: float) -> SignalView:
         """How far the bend is from where it was over the last while."""
         step = np.diff(self.time, prepend=self.time[:1])
         signals, components = [], []
@@ -202,7 +202,7 @@ class Signals:
                 )
         return self._best(signals, components)
 
-    def _along_motion(self) -> View:
+    def _along_motion(self) -> SignalView:
         """Along the predicted velocity of the tip, against its speed."""
         velocity = np.full_like(self.tip, np.nan)
         step = self.time[2:] - self.time[:-2]
@@ -214,7 +214,7 @@ class Signals:
             [("predicted speed of the tip [mm/s]", 1e3 * speed)], [("residual along the motion", unit)]
         )
 
-    def _along_force(self, force: Floats, signal: str, residual: str) -> View:
+    def _along_force(self, force: Floats, signal: str, residual: str) -> SignalView:
         """Along the part of a force, base frame, that pulls across the robot; against the share of it."""
         force = np.broadcast_to(force, self.tip.shape)
         size = np.linalg.norm(force, axis=1)[:, None]

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fastrod.identification.report.result import Verdict
-from fastrod.identification.search.model_selection import Step
-from fastrod.identification.search.residual_test import Audit
+from fastrod.identification.search.model_selection import SearchStep
+from fastrod.identification.search.residual_test import ResidualStructure
 
 _CLEAN = 0.06  # of the residual's variance: structure below it is none
 # of the mean square above the noise: what may be left for these verdicts; 0.03 is 17 % of the rms
@@ -22,7 +22,7 @@ _MIN_EXCESS = 0.03  # of the noise's variance
 
 
 @dataclass(frozen=True)
-class Opinion:
+class VerdictGrounds:
     """A verdict and what goes with it."""
 
     verdict: Verdict
@@ -43,10 +43,10 @@ def judge(
     after: float,
     floor: float,
     left_out: float,
-    audit: Audit,
-    steps: Sequence[Step],
+    audit: ResidualStructure,
+    steps: Sequence[SearchStep],
     found: Sequence[str],
-) -> Opinion:
+) -> VerdictGrounds:
     """The verdict. Mean squares of the distance on the training data [m^2]: of the `base` model, with the
     `library` effects found,
     `after` those and foils, and the noise `floor`; `left_out`: share of the held-out error above the noise
@@ -65,7 +65,7 @@ def judge(
     )
     if not found and not foils:
         if audit.structured <= _CLEAN:
-            return Opinion(
+            return VerdictGrounds(
                 "none",
                 "The model explains this log down to its noise; nothing is missing that this log could show.",
                 "none",
@@ -74,9 +74,9 @@ def judge(
                 False,
             )
         why = "Structure remains in the residual that no effect of the library explains"
-        return Opinion("not_in_library", f"{why}; it is {_words(kind)}.", kind, left, (), False)
+        return VerdictGrounds("not_in_library", f"{why}; it is {_words(kind)}.", kind, left, (), False)
     if not found:
-        return Opinion(
+        return VerdictGrounds(
             "not_in_library",
             f"No effect of the library explains the residual: {patterns[0]}.",
             kind,
@@ -95,13 +95,13 @@ def judge(
             f"The model lacked {names}; with {it}, {_share(gone)} of the held-out mean square above the "
             f"noise is gone.{more}"
         )
-        return Opinion("explained", said, kind if left > 0.02 else "none", left, patterns, False)
+        return VerdictGrounds("explained", said, kind if left > 0.02 else "none", left, patterns, False)
     if foreign > _FOREIGN or left > _PARTLY:
         what = f": {patterns[0]}" if patterns else f"; what is left is {_words(kind)}"
         certain = foreign < 0.5 and left < _UNCERTAIN
         also = f" {names} {'is' if len(found) == 1 else 'are'} there too." if certain else ""
         part = "Most" if max(foreign, left) > 0.5 else "A good part"
-        return Opinion(
+        return VerdictGrounds(
             "not_in_library",
             f"{part} of what is missing is not in the library{what}.{also}",
             kind,
@@ -110,7 +110,7 @@ def judge(
             not certain,
         )
     what = f": {patterns[0]}" if patterns else f"; it is {_words(kind)}"
-    return Opinion(
+    return VerdictGrounds(
         "partly_explained",
         f"The model lacked {names}, but {100 * left:.0f} % of the mean square above the noise remains{what}.",
         kind,

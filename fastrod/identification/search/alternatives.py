@@ -13,7 +13,7 @@ from itertools import product
 
 import numpy as np
 
-from fastrod.identification.search.linearised import Local
+from fastrod.identification.search.linearised import LinearisedModel
 from fastrod.types import Floats
 
 _LONG = 20.0  # s, of a run in which something can happen
@@ -23,7 +23,7 @@ _NARROW = 4.0  # lines tried per 1 / duration
 
 
 @dataclass(frozen=True, eq=False)
-class Foil:
+class AlternativePattern:
     """A pattern, fitted by its columns."""
 
     name: str
@@ -37,7 +37,7 @@ class Foil:
     """Parameters that a scan has chosen, beside the k amplitudes."""
 
 
-def foils(local: Local, tangent: Floats, residual: Floats) -> list[Foil]:
+def foils(local: LinearisedModel, tangent: Floats, residual: Floats) -> list[AlternativePattern]:
     """The best of each family for a residual (n, n_out) that `tangent` (n, n_out, p) can absorb part of."""
     solver = _Projected(tangent, residual)
     found = []
@@ -46,7 +46,7 @@ def foils(local: Local, tangent: Floats, residual: Floats) -> list[Foil]:
     if all(local.samples.time[part].max() > _LONG for part in local.samples.runs):
         families += [_bump(local), _slip(local), _sway(local, residual)]
     for family in families:
-        best: tuple[float, Foil] | None = None
+        best: tuple[float, AlternativePattern] | None = None
         for foil in family:
             loss = solver.loss(foil.columns)
             if best is None or loss < best[0]:
@@ -75,7 +75,7 @@ class _Projected:
         return self.start - float(b @ np.linalg.solve(gram + ridge * np.eye(len(gram)), b))
 
 
-def _sensed(local: Local, change: Floats) -> Floats:
+def _sensed(local: LinearisedModel, change: Floats) -> Floats:
     """(n, n_out, k) weighted columns of changes of the seen tip (n, 3, k) [m]."""
     return _weighted(
         local,
@@ -85,7 +85,7 @@ def _sensed(local: Local, change: Floats) -> Floats:
     )
 
 
-def _weighted(local: Local, change: Floats) -> Floats:
+def _weighted(local: LinearisedModel, change: Floats) -> Floats:
     """(n, n_out, k) weighted from changes of the pose (n, 6 + 3k', k)."""
     target = local.target
     parts = [change[:, :3] / target.sigma[:, None]]
@@ -96,13 +96,13 @@ def _weighted(local: Local, change: Floats) -> Floats:
     return np.asarray(np.concatenate(parts, axis=1) * (target.weight > 0.0)[:, None, None])
 
 
-def _log_time(local: Local) -> Floats:
+def _log_time(local: LinearisedModel) -> Floats:
     """(n_rows,) time, runs one after the other [s]."""
     samples = local.samples
     return np.cumsum(samples.dt)[samples.rows]
 
 
-def _when(local: Local, at: float) -> str:
+def _when(local: LinearisedModel, at: float) -> str:
     """A moment of `_log_time` in the log's own time, with its run where there are several."""
     samples = local.samples
     row = int(samples.rows[int(np.argmax(_log_time(local) > at))])
@@ -110,12 +110,12 @@ def _when(local: Local, at: float) -> str:
     return f"{samples.log.t[row]:.1f} s{run}"
 
 
-def _bump(local: Local) -> Iterator[Foil]:
+def _bump(local: LinearisedModel) -> Iterator[AlternativePattern]:
     t = _log_time(local)
     for at in np.quantile(t, np.linspace(0.03, 0.97, _TIMES)):
         step = (t > at).astype(float)
         columns = _sensed(local, step[:, None, None] * np.eye(3)[None])
-        yield Foil(
+        yield AlternativePattern(
             "bump",
             "drift",
             f"the measured tip jumps at {_when(local, at)} and stays: base or camera was moved",
@@ -124,7 +124,7 @@ def _bump(local: Local) -> Iterator[Foil]:
         )
 
 
-def _slip(local: Local) -> Iterator[Foil]:
+def _slip(local: LinearisedModel) -> Iterator[AlternativePattern]:
     if not local.model.wiring.n_tendons:
         return
     t = _log_time(local)
@@ -134,7 +134,7 @@ def _slip(local: Local) -> Iterator[Foil]:
         for drive in range(wiring.n_drives):
             pull = np.where(wiring.drive == drive, wiring.drive_sign, 0.0)
             columns = _weighted(local, (local.by_bend @ wiring.bend(pull).ravel() * step[:, None])[..., None])
-            yield Foil(
+            yield AlternativePattern(
                 "slip",
                 "drift",
                 f"the zero of drive {drive + 1} jumps at {_when(local, at)}: its wire slipped",
@@ -143,7 +143,7 @@ def _slip(local: Local) -> Iterator[Foil]:
             )
 
 
-def _sway(local: Local, residual: Floats) -> Iterator[Foil]:
+def _sway(local: LinearisedModel, residual: Floats) -> Iterator[AlternativePattern]:
     t = _log_time(local)
     duration = float(np.ptp(t))
     if duration < 4.0 or len(t) < 32:
@@ -162,7 +162,7 @@ def _sway(local: Local, residual: Floats) -> Iterator[Foil]:
             columns = _sensed(
                 local, (both[:, None, :, None] * np.eye(3)[None, :, None, :]).reshape(len(t), 3, 6)
             )
-            yield Foil(
+            yield AlternativePattern(
                 "sway",
                 "exogenous",
                 f"a line at {fine:.3f} Hz that no input has: the base or the camera sways",
@@ -171,7 +171,7 @@ def _sway(local: Local, residual: Floats) -> Iterator[Foil]:
             )
 
 
-def _ripple(local: Local) -> Iterator[Foil]:
+def _ripple(local: LinearisedModel) -> Iterator[AlternativePattern]:
     wiring = local.model.wiring
     if not local.model.wiring.n_tendons:
         return
@@ -186,7 +186,7 @@ def _ripple(local: Local) -> Iterator[Foil]:
             angle = 2.0 * np.pi * dl[:, int(np.flatnonzero(wiring.drive == drive)[0])] / wavelength
             response = local.by_bend @ wiring.bend(pull).ravel()
             parts += [response * np.sin(angle)[:, None], response * np.cos(angle)[:, None]]
-        yield Foil(
+        yield AlternativePattern(
             "ripple",
             "static",
             f"periodic in the wires with {1e3 * wavelength:.2f} mm: an eccentric drum or a gear",
@@ -195,7 +195,7 @@ def _ripple(local: Local) -> Iterator[Foil]:
         )
 
 
-def _contact(local: Local) -> Iterator[Foil]:
+def _contact(local: LinearisedModel) -> Iterator[AlternativePattern]:
     """One-sided push along n where the tip goes beyond a plane n . x = c."""
     tip = local.pose.position
     angle = np.arange(24) * np.pi / 12.0
@@ -209,7 +209,7 @@ def _contact(local: Local) -> Iterator[Foil]:
             if beyond.max() <= 0.0:
                 continue
             columns = _sensed(local, (beyond[:, None] * n)[..., None])
-            yield Foil(
+            yield AlternativePattern(
                 "contact",
                 "static",
                 f"one-sided, where the tip goes beyond a plane towards {np.round(n, 2).tolist()}: it "
@@ -219,7 +219,7 @@ def _contact(local: Local) -> Iterator[Foil]:
             )
 
 
-def _attraction(local: Local) -> Iterator[Foil]:
+def _attraction(local: LinearisedModel) -> Iterator[AlternativePattern]:
     """A force towards a fixed point, as a magnet's."""
     tip = local.pose.position
     reach = float(np.quantile(np.linalg.norm(tip - tip.mean(0), axis=1), 0.98)) + 1e-9
@@ -231,7 +231,7 @@ def _attraction(local: Local) -> Iterator[Foil]:
         force = way / d2[:, None] ** 1.5 * reach**2
         world = np.einsum("nij,nj->ni", np.broadcast_to(base, (len(tip), 3, 3)), force)
         columns = _weighted(local, np.einsum("nij,nj->ni", local.by_force, world)[..., None])
-        yield Foil(
+        yield AlternativePattern(
             "attraction",
             "static",
             f"a pull towards a point near {np.round(1e3 * place).tolist()} mm: a magnet or a spring",
@@ -240,7 +240,7 @@ def _attraction(local: Local) -> Iterator[Foil]:
         )
 
 
-def _patch(local: Local) -> Iterator[Foil]:
+def _patch(local: LinearisedModel) -> Iterator[AlternativePattern]:
     """Something in one corner of the workspace only."""
     tip = local.pose.position[:, :2]
     reach = float(np.quantile(np.linalg.norm(tip - tip.mean(0), axis=1), 0.98)) + 1e-9
@@ -248,7 +248,7 @@ def _patch(local: Local) -> Iterator[Foil]:
         place = tip.mean(0) + reach * far * np.array([np.cos(a), np.sin(a)])
         near = np.exp(-0.5 * ((tip - place) ** 2).sum(1) / (width * reach) ** 2)
         columns = _sensed(local, near[:, None, None] * np.eye(3)[None])
-        yield Foil(
+        yield AlternativePattern(
             "patch",
             "static",
             f"confined to the workspace around {np.round(1e3 * place).tolist()} mm",

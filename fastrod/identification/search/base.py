@@ -7,12 +7,12 @@ import numpy as np
 
 from fastrod.errors import InputError, LogError
 from fastrod.identification.log import advice
-from fastrod.identification.log.forward import Rod, Samples, predict
+from fastrod.identification.log.forward import LogSamples, PredictedRod, predict
 from fastrod.identification.log.noise import ENOUGH, Noise, at_rest, keep, read_noise
 from fastrod.identification.log.questions import further_than_still
 from fastrod.identification.log.unknowns import Model
-from fastrod.identification.search.linearised import Local, Target
-from fastrod.identification.search.model_selection import State
+from fastrod.identification.search.linearised import LinearisedModel, Target
+from fastrod.identification.search.model_selection import ModelState
 from fastrod.identification.search.search import N_BLOCKS, Search
 from fastrod.identification.search.solve import Estimate
 from fastrod.model.robot import Robot
@@ -26,14 +26,16 @@ _TURN = 0.01  # rad, noise of a measured orientation
 _RESTLESS = 0.25  # of the motion: noise beyond it is no noise
 
 
-class Base:
+class BaseFit:
     """The samples of the search, their noise and weights, and the base model; `rows` are all that may be
     fitted."""
 
-    def __init__(self, samples: Samples, rows: Ints, model: Model, robot: Robot, threads: int | None) -> None:
+    def __init__(
+        self, samples: LogSamples, rows: Ints, model: Model, robot: Robot, threads: int | None
+    ) -> None:
         self.rows = rows
         self.samples, self.model, self.robot = samples, model, robot
-        self.rod = Rod(samples, robot, points=samples.log.points is not None, threads=threads)
+        self.rod = PredictedRod(samples, robot, points=samples.log.points is not None, threads=threads)
         self.target = Target(
             samples,
             np.full(3, 1e-3 * robot.length),
@@ -47,11 +49,11 @@ class Base:
         self.weights: list[Floats] = []
         """Sigma of each stage."""
 
-    def fit(self, search: Search) -> tuple[State, dict[str, Estimate]]:
+    def fit(self, search: Search) -> tuple[ModelState, dict[str, Estimate]]:
         """The base model with its own parameters fitted; those that this log cannot see stay nominal, with
         the reason."""
         model, target = self.model, self.target
-        local = Local(model, model.start, self.samples, self.rod, target)
+        local = LinearisedModel(model, model.start, self.samples, self.rod, target)
         if not local.pose.ok.all():
             lost = int((~local.pose.ok).sum())
             self.notes.append(
@@ -86,12 +88,14 @@ class Base:
         tip = np.asarray(every.log.tip_position)[every.rows]
         if sum(len(rows) for rows in at_rest(every)) >= ENOUGH:
             return read_noise(every, tip, tip)
-        pose = predict(self.model, self.model.start, every, Rod(every, self.robot, threads=self.rod.threads))
+        pose = predict(
+            self.model, self.model.start, every, PredictedRod(every, self.robot, threads=self.rod.threads)
+        )
         return read_noise(every, tip, np.nan_to_num(tip - pose.position))
 
-    def on(self, samples: Samples, state: State) -> Base:
+    def on(self, samples: LogSamples, state: ModelState) -> BaseFit:
         """The same robot, noise and weights at other samples; outliers by the residual of `state`."""
-        made = Base(samples, self.rows, self.model, self.robot, self.rod.threads)
+        made = BaseFit(samples, self.rows, self.model, self.robot, self.rod.threads)
         made.noise, made.notes, made.weights = self.noise, self.notes, self.weights
         made.weigh(self.target.sigma)
         pose = predict(state.model, state.theta, samples, made.rod)
@@ -106,7 +110,7 @@ class Base:
         self.target.sigma = sigma.copy()
         self.target.rotation_sigma = _TURN * float((sigma / self.noise.sigma).max())
 
-    def weighed(self, search: Search, state: State) -> State:
+    def weighed(self, search: Search, state: ModelState) -> ModelState:
         """The state fitted again with weights of the size of its own residual, never below the noise: what a
         model does not explain yet must not push its parameters beyond their priors."""
         self.weigh(
@@ -116,7 +120,7 @@ class Base:
         self.weights.append(self.target.sigma.copy())
         return search.refined(search.refined(state))
 
-    def _unseen(self, local: Local) -> dict[str, Estimate]:
+    def _unseen(self, local: LinearisedModel) -> dict[str, Estimate]:
         """Base parameters whose prior this log does not narrow: Fisher information at the noise, others free.
         And stiffnesses that nobody put into `[fit]`, where no load is known: what the wires' give would show
         of them, any gain of the drives shows as well."""
@@ -146,7 +150,7 @@ class Base:
         return fixed
 
 
-def check_motion(base: Base, state: State, guess: str) -> None:
+def check_motion(base: BaseFit, state: ModelState, guess: str) -> None:
     """Refuse a log that the fitted model follows worse than a robot that stands still: it is of another
     robot, or in other units, as the sentence `guess` may say. Raises `LogError`."""
     good = (base.target.weight > 0.0) & state.local.pose.ok
@@ -176,7 +180,7 @@ def check_motion(base: Base, state: State, guess: str) -> None:
         )
 
 
-def check_log(samples: Samples, robot: Robot) -> None:
+def check_log(samples: LogSamples, robot: Robot) -> None:
     """A log that cannot tell anything is refused in a sentence."""
     log = samples.log
     measured = int(log.measured.sum())

@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 from fastrod.effects.base import Seam, get_effect, has_memory
-from fastrod.identification.log.forward import Pose, Rod, Samples, bench, chain_of
+from fastrod.identification.log.forward import LogSamples, PredictedPose, PredictedRod, bench, chain_of
 from fastrod.identification.log.unknowns import Model, Unknown, effect_unknowns
 from fastrod.identification.search.solve import Fit, minimise
 from fastrod.rotation import matrix_from_quaternion
@@ -26,7 +26,7 @@ _FORCE = 2e-3  # of EI / l^2, step of the slopes by tip force
 class Target:
     """What was measured at the rows, and how much each number counts."""
 
-    def __init__(self, samples: Samples, sigma: Floats, *, rotation_sigma: float, points: bool) -> None:
+    def __init__(self, samples: LogSamples, sigma: Floats, *, rotation_sigma: float, points: bool) -> None:
         log = samples.log.rows(samples.rows)
         self.tip = np.asarray(log.tip_position)
         quaternion = log.tip_quaternion
@@ -41,7 +41,7 @@ class Target:
         self.weight = np.ones(len(log))
         """(n,) 0 for outliers."""
 
-    def residual(self, pose: Pose) -> Floats:
+    def residual(self, pose: PredictedPose) -> Floats:
         """(n, n_out) measured - predicted over sigma: tip, rotation vector, points; 0 for rows that do not
         count."""
         parts = [(self.tip - pose.position) / self.sigma]
@@ -72,10 +72,12 @@ def _turned(rotation: Floats, vector: Floats) -> Floats:
     return matrix_from_quaternion(quaternion) @ rotation
 
 
-class Local:
+class LinearisedModel:
     """The model `model` at `theta`, and all models near it."""
 
-    def __init__(self, model: Model, theta: Floats, samples: Samples, rod: Rod, target: Target) -> None:
+    def __init__(
+        self, model: Model, theta: Floats, samples: LogSamples, rod: PredictedRod, target: Target
+    ) -> None:
         self.model, self.theta, self.samples, self.rod, self.target = (
             model,
             theta.copy(),
@@ -94,7 +96,7 @@ class Local:
         at = self.bench.drive(light)
         self._length, self._force = at.tendon_length.copy(), at.tip_force.copy()
 
-    def _difference(self, pose: Pose) -> Floats:
+    def _difference(self, pose: PredictedPose) -> Floats:
         """(n, 6 + 3k) from the reference: tip, rotation vector, points."""
         turn = pose.rotation @ np.swapaxes(self.pose.rotation, 1, 2)
         points = (pose.points - self.pose.points).reshape(len(turn), -1)
@@ -229,7 +231,7 @@ class Local:
                 )
         return change
 
-    def seen(self, model: Model, theta: Floats, change: Floats) -> Pose:
+    def seen(self, model: Model, theta: Floats, change: Floats) -> PredictedPose:
         """What the camera sees after a change (n, 6 + 3k) of the true pose: tip [m], rotation vector [rad],
         points [m], base frame."""
         rotation = self.pose.rotation
@@ -237,7 +239,9 @@ class Local:
         if links or self.target.rotation is not None:
             rotation = _turned(rotation, change[:, 3:6])
         points = self.pose.points + change[:, 6:].reshape(self.pose.points.shape)
-        return self.bench.see(Pose(self.pose.position + change[:, :3], rotation, points, self.pose.ok), links)
+        return self.bench.see(
+            PredictedPose(self.pose.position + change[:, :3], rotation, points, self.pose.ok), links
+        )
 
     def residual(self, model: Model, theta: Floats) -> Floats:
         """(n, n_out) weighted."""
@@ -285,7 +289,7 @@ class Local:
 
 
 def exact_residual(
-    model: Model, theta: Floats, samples: Samples, rod: Rod, target: Target
+    model: Model, theta: Floats, samples: LogSamples, rod: PredictedRod, target: Target
 ) -> tuple[Floats, Flags]:
     """(n, n_out) weighted residual with the rod solved, and (n,) which rows converged."""
     from fastrod.identification.log.forward import predict

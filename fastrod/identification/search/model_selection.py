@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fastrod.identification.log.unknowns import Model
-from fastrod.identification.search.alternatives import Foil
-from fastrod.identification.search.linearised import Local
+from fastrod.identification.search.alternatives import AlternativePattern
+from fastrod.identification.search.linearised import LinearisedModel
 from fastrod.identification.search.solve import Fit, bic, effective_size, paired
 from fastrod.types import Floats
 
@@ -23,16 +23,16 @@ Z_KEEP, BIC_KEEP, SHARE_KEEP = 2.0, 6.0, 0.015
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class ModelState:
     """A model with its fit: what is accepted so far."""
 
     model: Model
-    local: Local
+    local: LinearisedModel
     fit: Fit
     """Of the unknowns, then of the accepted foils' amplitudes."""
     losses: Floats
     """(N_BLOCKS,) held out."""
-    foils: tuple[Foil, ...] = ()
+    foils: tuple[AlternativePattern, ...] = ()
 
     @property
     def theta(self) -> Floats:
@@ -51,7 +51,7 @@ class Candidate:
     """An effect, or a foil, beside a state."""
 
     name: str
-    state: State | None
+    state: ModelState | None
     """With the candidate accepted; None where it was not fitted."""
     z: float
     """Of the gain over held-out blocks."""
@@ -61,7 +61,7 @@ class Candidate:
     n_parameters: int
     why: str
     """Why it is not the one, in a sentence."""
-    foil: Foil | None = None
+    foil: AlternativePattern | None = None
 
     @property
     def passes(self) -> bool:
@@ -70,10 +70,10 @@ class Candidate:
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class SearchStep:
     """One stage of the search: who ran, who was taken."""
 
-    before: State
+    before: ModelState
     candidates: tuple[Candidate, ...]
     taken: Candidate | None
     rivals: tuple[str, ...] = ()
@@ -118,7 +118,7 @@ def z_between(one: Candidate, other: Candidate) -> float:
     return paired(other.state.losses, one.state.losses)
 
 
-def unphysical(state: State, name: str) -> str:
+def unphysical(state: ModelState, name: str) -> str:
     """Why an effect's parameters cannot be, or nothing."""
     sizes = []
     for unknown, number, at_bound in zip(

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fastrod.identification.log.forward import Samples
+from fastrod.identification.log.forward import LogSamples
 from fastrod.identification.search.solve import paired
-from fastrod.model.routing import Wiring
+from fastrod.model.routing import Routing
 from fastrod.types import Floats, Ints
 
 _RANDOM = 60  # Fourier features
@@ -25,7 +25,7 @@ _RIDGES = (1.0, 30.0, 1000.0)
 
 
 @dataclass(frozen=True)
-class Audit:
+class ResidualStructure:
     """Shares of the residual's variance that held-out blocks confirm."""
 
     static: float
@@ -50,13 +50,13 @@ class Audit:
 
 
 def audit(
-    samples: Samples, wiring: Wiring, residual: Floats, noise_lag1: float = 0.0, n_blocks: int = 10
-) -> Audit:
+    samples: LogSamples, wiring: Routing, residual: Floats, noise_lag1: float = 0.0, n_blocks: int = 10
+) -> ResidualStructure:
     """Audit a residual (n_rows, n_out) in order of time, on `n_blocks` folds of short blocks."""
     variance = float((residual**2).sum())
     block = np.arange(len(residual)) * _PIECES // max(len(residual), 1) % n_blocks
     if variance <= 0.0 or n_blocks < 3:
-        return Audit(0.0, 0.0, 0.0, 0.0, 0.0)
+        return ResidualStructure(0.0, 0.0, 0.0, 0.0, 0.0)
     static, memory, drift = features(samples, wiring)
     losses: list[Floats] = [
         np.asarray(np.bincount(block, weights=(residual**2).sum(1), minlength=n_blocks), dtype=np.float64)
@@ -85,7 +85,9 @@ def audit(
         else 0.0
     )
     z = paired(losses[0], losses[-1]) if len(losses) > 1 else 0.0
-    return Audit(shares[0], shares[1], shares[2], exogenous, float(max(z, beyond * np.sqrt(left.size))))
+    return ResidualStructure(
+        shares[0], shares[1], shares[2], exogenous, float(max(z, beyond * np.sqrt(left.size)))
+    )
 
 
 def _ridge(features: Floats, residual: Floats, block: Ints, n_blocks: int) -> tuple[Floats, Floats]:
@@ -109,7 +111,7 @@ def _ridge(features: Floats, residual: Floats, block: Ints, n_blocks: int) -> tu
     return best[1], best[2]
 
 
-def features(samples: Samples, wiring: Wiring) -> tuple[Floats, Floats, Floats]:
+def features(samples: LogSamples, wiring: Routing) -> tuple[Floats, Floats, Floats]:
     """Static, memory and time features (n_rows, any), each of about unit size."""
     log, rows = samples.log, samples.rows
     bend = (

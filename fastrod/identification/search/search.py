@@ -14,10 +14,10 @@ from itertools import product
 import numpy as np
 
 from fastrod.effects.base import effect_names, get_effect
-from fastrod.identification.log.forward import Rod, Samples
+from fastrod.identification.log.forward import LogSamples, PredictedRod
 from fastrod.identification.log.unknowns import Model
-from fastrod.identification.search.alternatives import Foil, foils
-from fastrod.identification.search.linearised import Local, Target
+from fastrod.identification.search.alternatives import AlternativePattern, foils
+from fastrod.identification.search.linearised import LinearisedModel, Target
 from fastrod.identification.search.model_selection import (
     BIC_ACCEPT,
     BIC_KEEP,
@@ -33,8 +33,8 @@ from fastrod.identification.search.model_selection import (
     Z_STRONG,
     Bound,
     Candidate,
-    State,
-    Step,
+    ModelState,
+    SearchStep,
     advantage,
     best_of,
     unphysical,
@@ -59,24 +59,24 @@ _FOIL_SD = 30.0  # of a foil's amplitude, in units of its own columns' size that
 class Search:
     """Samples, weights and blocks that all candidates share."""
 
-    samples: Samples
-    rod: Rod
+    samples: LogSamples
+    rod: PredictedRod
     target: Target
     block: Ints
     """(n,) number of each row's block, 0 to N_BLOCKS - 1; one block at a time is held out."""
     excluded: frozenset[str] = frozenset()
     report: Callable[[str], None] = field(default=lambda _: None)
 
-    def start(self, model: Model, theta: Floats, iterations: int = 6) -> State:
+    def start(self, model: Model, theta: Floats, iterations: int = 6) -> ModelState:
         """The state of a model without anything found, linearised twice: at `theta` (p,), and where the fit
         from there ends."""
-        local = Local(model, theta, self.samples, self.rod, self.target)
+        local = LinearisedModel(model, theta, self.samples, self.rod, self.target)
         fit = self._fit(local, model, theta, np.zeros((0,)), (), iterations)
         return self.refined(self._state(model, local, fit, ()))
 
-    def refined(self, state: State, iterations: int = 4) -> State:
+    def refined(self, state: ModelState, iterations: int = 4) -> ModelState:
         """The same with the rod solved at the state's own parameters."""
-        local = Local(state.model, state.theta, self.samples, self.rod, self.target)
+        local = LinearisedModel(state.model, state.theta, self.samples, self.rod, self.target)
         fit = self._fit(
             local, state.model, state.theta, state.fit.theta[len(state.theta) :], state.foils, iterations
         )
@@ -84,27 +84,29 @@ class Search:
             return state
         return self._state(state.model, local, fit, state.foils)
 
-    def again(self, state: State) -> State:
+    def again(self, state: ModelState) -> ModelState:
         """A state of other samples, fitted to these; foils, which belong to their samples, are left
         behind."""
-        local = Local(state.model, state.theta, self.samples, self.rod, self.target)
+        local = LinearisedModel(state.model, state.theta, self.samples, self.rod, self.target)
         return self.refined(
             self._state(
                 state.model, local, self._fit(local, state.model, state.theta, np.zeros(0), (), 6), ()
             )
         )
 
-    def _state(self, model: Model, local: Local, fit: Fit, found: tuple[Foil, ...]) -> State:
+    def _state(
+        self, model: Model, local: LinearisedModel, fit: Fit, found: tuple[AlternativePattern, ...]
+    ) -> ModelState:
         losses = held_out_losses(fit.residual, fit.slopes, fit.precision, self.block, N_BLOCKS)
-        return State(model, local, fit, losses, found)
+        return ModelState(model, local, fit, losses, found)
 
     def _fit(
         self,
-        local: Local,
+        local: LinearisedModel,
         model: Model,
         theta: Floats,
         amplitudes: Floats,
-        found: Sequence[Foil],
+        found: Sequence[AlternativePattern],
         iterations: int,
     ) -> Fit:
         """The best parameters near `local`, with the amplitudes of foils as further linear unknowns."""
@@ -143,7 +145,7 @@ class Search:
 
     # ------------------------------------------------------------ candidates
 
-    def candidate(self, state: State, name: str) -> Candidate:
+    def candidate(self, state: ModelState, name: str) -> Candidate:
         """An effect fitted beside a state, from each of its starts; not fitted once the search has `spent`
         its passes."""
         if self.spent:
@@ -180,7 +182,7 @@ class Search:
             )
         return self.judged(state, self._state(model, state.local, fits, state.foils), name)
 
-    def _unseen(self, state: State, name: str) -> list[str]:
+    def _unseen(self, state: ModelState, name: str) -> list[str]:
         """Size parameters of an effect that this log does not move at all: left at neutral."""
         model = state.model.with_effect(name)
         n = len(state.model.unknowns)
@@ -200,7 +202,7 @@ class Search:
                 unseen.append(u.name.partition(".")[2])
         return unseen
 
-    def _from_starts(self, state: State, model: Model, name: str) -> Fit | None:
+    def _from_starts(self, state: ModelState, model: Model, name: str) -> Fit | None:
         local, n = state.local, len(state.model.unknowns)
         added = model.unknowns[n:]
         starts = {p.name: p.on(model.wiring).starts for p in get_effect(name).parameters}
@@ -251,7 +253,7 @@ class Search:
             _MANY,
         )
 
-    def _promise(self, state: State, model: Model, theta: Floats) -> float:
+    def _promise(self, state: ModelState, model: Model, theta: Floats) -> float:
         """Loss that the response to the new parameters could take away at best, beside what the others can
         absorb."""
         n = len(state.model.unknowns)
@@ -286,7 +288,9 @@ class Search:
         b[: base.shape[1]] = np.minimum(np.abs(b[: base.shape[1]]), 0.0)
         return float(b @ np.linalg.lstsq(gram, b, rcond=1e-12)[0])
 
-    def judged(self, state: State, with_it: State, name: str, foil: Foil | None = None) -> Candidate:
+    def judged(
+        self, state: ModelState, with_it: ModelState, name: str, foil: AlternativePattern | None = None
+    ) -> Candidate:
         """A candidate's evidence against the state without it."""
         k = len(with_it.fit.theta) - len(state.fit.theta) + (foil.n_hidden if foil else 0)
         size = effective_size(with_it.fit.residual)
@@ -303,7 +307,7 @@ class Search:
             why = f"no gain on held-out blocks (z {z:.1f}, BIC {gain:.0f}, {100 * share:.1f} % of the loss)"
         return Candidate(name, with_it, z, gain, share, k, why, foil)
 
-    def foil_candidates(self, state: State) -> list[Candidate]:
+    def foil_candidates(self, state: ModelState) -> list[Candidate]:
         """The best foil of each family beside a state, linear in everything."""
         made = []
         for foil in foils(state.local, state.fit.slopes, state.fit.residual):
@@ -321,7 +325,7 @@ class Search:
             fit = Fit(
                 theta, residual, slopes, precision, (*state.fit.at_bound, *(False,) * foil.columns.shape[-1])
             )
-            with_it = State(
+            with_it = ModelState(
                 state.model,
                 state.local,
                 fit,
@@ -333,7 +337,7 @@ class Search:
 
     # ------------------------------------------------------------ stages
 
-    def names(self, state: State) -> list[str]:
+    def names(self, state: ModelState) -> list[str]:
         """Effects that may be tried."""
         single = state.model.wiring.n_segments < 2
         driven = state.model.wiring.n_tendons > 0
@@ -346,7 +350,7 @@ class Search:
             and (driven or get_effect(name).seam.name != "ACTUATION")
         ]
 
-    def stage(self, state: State, *, with_foils: bool = True) -> Step:
+    def stage(self, state: ModelState, *, with_foils: bool = True) -> SearchStep:
         """Try everything beside `state`; take the best, if any passes."""
         tried = []
         for name in self.names(state):
@@ -354,7 +358,7 @@ class Search:
             tried.append(self.candidate(state, name))
         return self.choose(state, tried, with_foils=with_foils)
 
-    def choose(self, state: State, tried: list[Candidate], *, with_foils: bool) -> Step:
+    def choose(self, state: ModelState, tried: list[Candidate], *, with_foils: bool) -> SearchStep:
         """Solve the promising ones exactly, then take the best by evidence; foils only where they beat it
         clearly."""
         fitted = sorted(
@@ -386,9 +390,9 @@ class Search:
         if foil is not None and (
             best is None or (advantage(foil, best) > BIC_RIVAL and z_between(foil, best) > Z_RIVAL)
         ):
-            return Step(state, tuple(tried), foil)
+            return SearchStep(state, tuple(tried), foil)
         if best is None:
-            return Step(state, tuple(tried), None)
+            return SearchStep(state, tuple(tried), None)
         sure = [
             c for c in passing if c is not best and c.share > best.share and z_between(c, best) > Z_ACCEPT
         ]
@@ -405,37 +409,37 @@ class Search:
         if fewer is not None:
             rivals = [best, *(c for c in rivals if c is not fewer)]
             best = fewer
-        return Step(state, tuple(tried), best, tuple(c.name for c in rivals))
+        return SearchStep(state, tuple(tried), best, tuple(c.name for c in rivals))
 
     def _rival(self, best: Candidate, other: Candidate) -> bool:
         if other.state is None or other.share < SHARE_ACCEPT or unphysical(other.state, other.name):
             return False
         return advantage(best, other) < BIC_RIVAL or z_between(best, other) < Z_RIVAL
 
-    def bare(self, state: State) -> State:
+    def bare(self, state: ModelState) -> ModelState:
         """`state` without its foils, fitted again: what the library alone explains."""
-        local = Local(state.model, state.theta, self.samples, self.rod, self.target)
+        local = LinearisedModel(state.model, state.theta, self.samples, self.rod, self.target)
         fit = self._fit(local, state.model, state.theta, np.zeros(0), (), 8)
         return self._state(state.model, local, fit, ())
 
-    def without(self, state: State, name: str) -> State:
+    def without(self, state: ModelState, name: str) -> ModelState:
         """`state` without one of its effects, fitted again."""
         model = state.model.without(name)
         kept = [j for j, u in enumerate(state.model.unknowns) if u.place[:2] != ("effect", name)]
         theta = state.theta[kept]
-        local = Local(model, theta, self.samples, self.rod, self.target)
+        local = LinearisedModel(model, theta, self.samples, self.rod, self.target)
         fit = self._fit(local, model, theta, state.fit.theta[len(state.model.unknowns) :], state.foils, 8)
         return self._state(model, local, fit, state.foils)
 
     def eliminated(
-        self, state: State, found: Sequence[str], least: float, noise: float
-    ) -> tuple[State, list[str]]:
+        self, state: ModelState, found: Sequence[str], least: float, noise: float
+    ) -> tuple[ModelState, list[str]]:
         """Drop effects that what came later has made needless, and those that bring less than `least` where
         what is left is of the size of the `noise` [both m^2 summed over the residual]: beside a dominant
         effect they only mend its form. The state, and who is left."""
         left = list(found)
         while len(left) > 1:
-            weakest: tuple[float, str, State] | None = None
+            weakest: tuple[float, str, ModelState] | None = None
             for name in left:
                 fewer = self.without(state, name)
                 verdict = self.judged(fewer, state, name)
@@ -452,7 +456,7 @@ class Search:
             state, left = weakest[2], [name for name in left if name != weakest[1]]
         return state, left
 
-    def bounds(self, state: State) -> list[Bound]:
+    def bounds(self, state: ModelState) -> list[Bound]:
         """For every effect that is not in the model, the size from which it would have shown: three standard
         errors beyond its estimate, at the typical shape."""
         inflate = np.sqrt(

@@ -1,14 +1,14 @@
 """Between the nodes of one robot's shape: cubic Hermite curves through positions and tangents, and through
 rotations.
 
-`Curve` is one robot's rows of a `Shape`. The error is of fourth order in the spacing, as the integrator's.
+`Curve` is one robot's rows of a `RodShape`. The error is of fourth order in the spacing, as the integrator's.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from fastrod.types import Floats, Shape
+from fastrod.types import Floats, RodShape
 
 from ..jit import inline, kernel
 from ..vec import Mat, Vec
@@ -25,7 +25,7 @@ class Curve(NamedTuple):
 
 
 @inline
-def curve_of(shape: Shape, i: int) -> Curve:
+def curve_of(shape: RodShape, i: int) -> Curve:
     """Robot i."""
     return Curve(shape.position[i], shape.rotation[i], shape.curvature[i], shape.arclength[i])
 

@@ -2,15 +2,15 @@
 contacts by the search.
 
 The pass before has put every contact on a node of its own, and has written how the contact points move with
-their forces and with the closing of the boundary (`Probes`). With the forces that the law asks for on that
-linear model the boundary is closed. The search on the same shape says where the gap is violated next.
+their forces and with the closing of the boundary (`PointLoads`). With the forces that the law asks for on
+that linear model the boundary is closed. The search on the same shape says where the gap is violated next.
 """
 
 from __future__ import annotations
 
 import math
 
-from fastrod.types import Clearance, Floats, Ints, Memory, Probes, Touching
+from fastrod.types import Clearance, ContactSet, Floats, Ints, Memory, PointLoads
 
 from ..jit import inline, kernel
 from ..rod.gather import pick
@@ -30,8 +30,8 @@ from .contact_set import (
     stands,
     violation,
 )
-from .problem import Scenery, apply_law, forces_size
-from .proximity import CANDIDATE, Sweep, crosses, entered, search_obstacles
+from .problem import SceneArrays, apply_law, forces_size
+from .proximity import CANDIDATE, ProximityOptions, crosses, entered, search_obstacles
 from .rod_proximity import search_rods
 
 GOES_ON, AT_REST, LOST = 0, 1, 2
@@ -55,7 +55,7 @@ def world_size(n_rows: int, n_slots: int, most_slots: int, n_points: int) -> int
 
 @kernel
 def _stride(
-    r: int, i: int, count: int, scenery: Scenery, probes: Probes, proposed: Floats, unknown: Numbers
+    r: int, i: int, count: int, scenery: SceneArrays, probes: PointLoads, proposed: Floats, unknown: Numbers
 ) -> tuple[float, float]:
     """How far the proposed forces and the closing boundary move the row [m], and the part of it that may be
     taken; the change of the unknowns goes to `unknown`."""
@@ -90,7 +90,9 @@ def _stride(
 
 
 @kernel
-def _press(r: int, i: int, scenery: Scenery, touching: Touching, probes: Probes, proposed: Floats) -> float:
+def _press(
+    r: int, i: int, scenery: SceneArrays, touching: ContactSet, probes: PointLoads, proposed: Floats
+) -> float:
     """How much farther the proposed forces go into soft obstacles, or move free ones [m]; where a rod is
     pressed along its axis nothing else moves."""
     deepest = 0.0
@@ -106,11 +108,11 @@ def _press(r: int, i: int, scenery: Scenery, touching: Touching, probes: Probes,
 
 
 @inline
-def sweep_of(i: int, scenery: Scenery, margin: float) -> Sweep:
+def sweep_of(i: int, scenery: SceneArrays, margin: float) -> ProximityOptions:
     """How robot i is searched; `margin` is a part of its length, and candidates nearer than a twentieth of an
     integration step are one."""
     rods = scenery.rods
-    return Sweep(
+    return ProximityOptions(
         rods.radius[i],
         rods.n_steps,
         rods.first[i],
@@ -122,7 +124,7 @@ def sweep_of(i: int, scenery: Scenery, margin: float) -> Sweep:
 
 @kernel
 def went_through(
-    i: int, scenery: Scenery, clearance: Clearance, close: bool, work: Numbers
+    i: int, scenery: SceneArrays, clearance: Clearance, close: bool, work: Numbers
 ) -> tuple[int, float]:
     """The obstacle that robot i has gone through since the last step, and where on the rod; -1 where there is
     none. Unless `close` asked only where some node has moved farther than it was away from all."""
@@ -146,7 +148,7 @@ def went_through(
 
 @kernel
 def look_at(
-    i: int, scenery: Scenery, clearance: Clearance, found: Floats, work: Numbers
+    i: int, scenery: SceneArrays, clearance: Clearance, found: Floats, work: Numbers
 ) -> tuple[int, float]:
     """Number of candidates of robot i and its smallest gap; -1 where it has gone through an obstacle since
     the last step."""
@@ -169,10 +171,10 @@ def iterate_world(
     first: int,
     last: int,
     rows: Ints,
-    scenery: Scenery,
-    touching: Touching,
+    scenery: SceneArrays,
+    touching: ContactSet,
     clearance: Clearance,
-    probes: Probes,
+    probes: PointLoads,
     memory: Memory,
     proposed: Floats,
     unknown: Floats,
@@ -287,7 +289,7 @@ def _name_hardest(trouble: Numbers, what: int, size: float, count: int, slot: Fl
 
 
 @kernel
-def _face(i: int, n_found: int, found: Floats, scenery: Scenery, stack: Numbers) -> None:
+def _face(i: int, n_found: int, found: Floats, scenery: SceneArrays, stack: Numbers) -> None:
     """Candidates whose centreline is inside an obstacle face the side by which it came in."""
     if not scenery.tracked[i]:
         return
@@ -324,8 +326,8 @@ def _renew(
     found: Floats,
     points: Floats,
     curve: Curve,
-    scenery: Scenery,
-    touching: Touching,
+    scenery: SceneArrays,
+    touching: ContactSet,
     scratch: Numbers,
 ) -> None:
     """The contacts of robot i for its next pass."""

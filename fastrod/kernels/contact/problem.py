@@ -1,7 +1,7 @@
 """The contact forces of one world: every contact measured on the present shape, the linear model of how all
 of them move, and the law on it.
 
-The model m = d + C (F - F_now) comes from the pass (`Probes`): robots are coupled by nothing but their
+The model m = d + C (F - F_now) comes from the pass (`PointLoads`): robots are coupled by nothing but their
 contacts. A force on a curved surface turns as its point moves; F = F_law + B m with B the force times the
 second derivative of the distance. Solved for m, the model holds that as well. Without B the iteration
 diverges where a compliant tip rests on a small ball.
@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from fastrod.types import Flags, Floats, Ints, Probes, Rods, Shape, Surfaces, Touching
+from fastrod.types import ContactRods, ContactSet, Flags, Floats, Ints, PointLoads, RodShape, Surfaces
 
 from ..jit import inline, kernel
 from ..rod.gather import pick
@@ -41,10 +41,10 @@ from .surface import surface_curvature
 _FORGETS, _PART_KEPT = 0.5, 0.3
 
 
-class Scenery(NamedTuple):
+class SceneArrays(NamedTuple):
     """What contact reads at one pass."""
 
-    rods: Rods
+    rods: ContactRods
     surfaces: Surfaces
     frames: Floats
     """(1 or n_robots, n_obstacles, 12) rotation row by row, position: world_from_obstacle."""
@@ -54,8 +54,8 @@ class Scenery(NamedTuple):
     """(1 or n_robots, n_obstacles, 12) where the obstacles' material was at the last step: what slip is
     counted from. Another than `frames_before` where a velocity was given (a belt moves, its frame does
     not)."""
-    shape: Shape
-    before: Shape
+    shape: RodShape
+    before: RodShape
     """The shapes at the last step; of length 0 if there is none."""
     tracked: Flags
     """(n_robots,) `before` holds where the robot was."""
@@ -80,7 +80,7 @@ def _tangents(n: Vec) -> tuple[Vec, Vec]:
 
 
 @kernel
-def _material_before(i: int, node: int, slot: Numbers, scenery: Scenery) -> Vec:
+def _material_before(i: int, node: int, slot: Numbers, scenery: SceneArrays) -> Vec:
     """Where the rod's material point of contact was at the last step, world."""
     shape, before = scenery.shape, curve_of(scenery.before, i)
     rotation = shape.rotation[i, node]
@@ -95,7 +95,7 @@ def _material_before(i: int, node: int, slot: Numbers, scenery: Scenery) -> Vec:
 
 
 @inline
-def _node_point(shape: Shape, i: int, node: int) -> Vec:
+def _node_point(shape: RodShape, i: int, node: int) -> Vec:
     row = shape.position[i, node]
     return row[0], row[1], row[2]
 
@@ -106,9 +106,9 @@ def _measure(
     q: int,
     other: int,
     rows: Ints,
-    scenery: Scenery,
-    touching: Touching,
-    probes: Probes,
+    scenery: SceneArrays,
+    touching: ContactSet,
+    probes: PointLoads,
     stack: Numbers,
     found: Numbers,
 ) -> Vec:
@@ -160,13 +160,13 @@ def _axis(a: int) -> Vec:
 
 
 @inline
-def _tangent(shape: Shape, i: int, node: int) -> Vec:
+def _tangent(shape: RodShape, i: int, node: int) -> Vec:
     rotation = shape.rotation[i, node]
     return rotation[0, 2], rotation[1, 2], rotation[2, 2]
 
 
 @inline
-def _bow(shape: Shape, i: int, node: int) -> Vec:
+def _bow(shape: RodShape, i: int, node: int) -> Vec:
     """r'' = R (u x e3)."""
     rotation, u = shape.rotation[i, node], shape.curvature[i, node]
     return (
@@ -189,9 +189,9 @@ def _turning(
     other: int,
     twin: int,
     rows: Ints,
-    scenery: Scenery,
-    touching: Touching,
-    probes: Probes,
+    scenery: SceneArrays,
+    touching: ContactSet,
+    probes: PointLoads,
     stack: Numbers,
     bend: Floats,
 ) -> float:
@@ -254,7 +254,7 @@ def _turning(
 
 @kernel
 def _assemble(
-    first: int, last: int, rows: Ints, touching: Touching, probes: Probes, start: Numbers, model: Floats
+    first: int, last: int, rows: Ints, touching: ContactSet, probes: PointLoads, start: Numbers, model: Floats
 ) -> int:
     """The linear models of all rows side by side; `start` gets the first contact point of each. How many
     points there are."""
@@ -319,7 +319,7 @@ def _bend_model(
 
 
 @kernel
-def _keep_hold(first: int, last: int, rows: Ints, m: int, touching: Touching, stiff: Numbers) -> None:
+def _keep_hold(first: int, last: int, rows: Ints, m: int, touching: ContactSet, stiff: Numbers) -> None:
     """Where no contact is curved any more, damp by a part of what was stiff some passes ago: a contact that
     goes to and fro between an edge and a face would not come to rest, as the face by itself is not damped."""
     most, kept = 0.0, 0.0
@@ -382,9 +382,9 @@ def apply_law(
     first: int,
     last: int,
     rows: Ints,
-    scenery: Scenery,
-    touching: Touching,
-    probes: Probes,
+    scenery: SceneArrays,
+    touching: ContactSet,
+    probes: PointLoads,
     proposed: Floats,
     work: Numbers,
 ) -> bool:

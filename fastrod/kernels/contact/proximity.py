@@ -39,7 +39,7 @@ _FLAT = 1e-9  # a slope below it is none
 _RELAY = 0.25
 
 
-class Sweep(NamedTuple):
+class ProximityOptions(NamedTuple):
     """How a search is to be done."""
 
     radius: Floats
@@ -76,7 +76,7 @@ def node_tangent(curve: Curve, j: int, start: int, part: float) -> Vec:
 
 
 @inline
-def radius_after(sweep: Sweep, j: int) -> float:
+def radius_after(sweep: ProximityOptions, j: int) -> float:
     """Of the interval after node j."""
     return float(sweep.radius[min(j // sweep.n_steps, len(sweep.radius) - 1)])
 
@@ -165,7 +165,7 @@ def _search_interval(
     j: int,
     low: float,
     ends: Numbers,
-    sweep: Sweep,
+    sweep: ProximityOptions,
     smallest: float,
     surfaces: Surfaces,
     stack: Numbers,
@@ -219,7 +219,7 @@ def _search_interval(
 @kernel
 def search_obstacles(
     curve: Curve,
-    sweep: Sweep,
+    sweep: ProximityOptions,
     surfaces: Surfaces,
     frames: Floats,
     distance: Floats,
@@ -307,7 +307,7 @@ def crosses(
     after: Curve,
     frames_before: Floats,
     frames: Floats,
-    sweep: Sweep,
+    sweep: ProximityOptions,
     surfaces: Surfaces,
     stack: Numbers,
 ) -> tuple[int, float]:

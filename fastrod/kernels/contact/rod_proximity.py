@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from fastrod.types import Floats, Ints, Rods, Shape, Touching
+from fastrod.types import ContactRods, ContactSet, Floats, Ints, RodShape
 
 from ..jit import inline, kernel
 from ..vec import Vec, axpy, dot, scale, sub
@@ -21,7 +21,7 @@ _ROUNDS = 12
 
 
 @kernel
-def twin_of(touching: Touching, n_obstacles: int, robot: int, q: int) -> int:
+def twin_of(touching: ContactSet, n_obstacles: int, robot: int, q: int) -> int:
     """Slot on the other rod that belongs to slot q of `robot`."""
     slot = touching.slot[robot, q]
     other = int(slot[T_OBSTACLE]) - n_obstacles
@@ -86,7 +86,7 @@ def _nearest_on_curves(
 
 @kernel
 def _known(
-    touching: Touching, n_obstacles: int, robot: int, other: int, s: float, t: float, spacing: float
+    touching: ContactSet, n_obstacles: int, robot: int, other: int, s: float, t: float, spacing: float
 ) -> int:
     """Slot of `robot` that holds this contact with `other` already; -1 if none does."""
     for q in range(touching.used[robot]):
@@ -100,7 +100,7 @@ def _known(
 
 @kernel
 def _add_pair(
-    touching: Touching,
+    touching: ContactSet,
     n_obstacles: int,
     robot: int,
     other: int,
@@ -108,7 +108,7 @@ def _add_pair(
     t: float,
     n: Vec,
     gap: float,
-    rods: Rods,
+    rods: ContactRods,
     a: Curve,
     b: Curve,
 ) -> bool:
@@ -153,9 +153,9 @@ def _add_pair(
 def _search_pair(
     robot: int,
     other: int,
-    shape: Shape,
-    rods: Rods,
-    touching: Touching,
+    shape: RodShape,
+    rods: ContactRods,
+    touching: ContactSet,
     n_obstacles: int,
     margin: float,
     gap: Floats,
@@ -228,9 +228,9 @@ def search_rods(
     first: int,
     last: int,
     rows: Ints,
-    shape: Shape,
-    rods: Rods,
-    touching: Touching,
+    shape: RodShape,
+    rods: ContactRods,
+    touching: ContactSet,
     n_obstacles: int,
     margin: float,
     gap: Floats,

@@ -10,7 +10,7 @@ the base of each segment, with u_z = 0 there, and the residuals are the lengths 
 
 from __future__ import annotations
 
-from fastrod.types import Layout, Memory, Params, Ports, Probes, Response, Shape
+from fastrod.types import Layout, Memory, Params, PointLoads, Ports, Response, RodShape
 
 from ..jit import LANES, kernel
 from ..vec import mul
@@ -70,7 +70,7 @@ def march_columns(
     paths: Lanes,
     columns: Lanes,
     change: Lanes,
-    probes: Probes,
+    probes: PointLoads,
     first_row: int,
     count: int,
     given: Lanes,
@@ -153,7 +153,7 @@ def write_summary(
     error: Lanes,
     n_e: int,
     wrench: Lanes,
-    shape: Shape,
+    shape: RodShape,
 ) -> None:
     """Tip, tensions, path lengths, base wrench and the largest residual of each robot."""
     for w in range(count):
@@ -221,9 +221,9 @@ def pass_chunk(
     ports: Ports,
     layout: Layout,
     memory: Memory,
-    shape: Shape,
+    shape: RodShape,
     response: Response,
-    probes: Probes,
+    probes: PointLoads,
     first_row: int,
     scratch: Lanes,
     n_col: int,

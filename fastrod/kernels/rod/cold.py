@@ -32,7 +32,7 @@ for curvatures beyond all bounds."""
 Axes: TypeAlias = tuple[float, float, float, float, float]
 
 
-class Work(NamedTuple):
+class ColdWorkspace(NamedTuple):
     """What is kept of one robot on the way; a segment's samples follow each other, SAMPLES + 1 of them."""
 
     free: Flags
@@ -139,7 +139,7 @@ def _principal(offset: Floats, first: int, last: int) -> Axes:
 
 
 @kernel
-def _bend(i: int, layout: Layout, params: Params, ports: Ports, work: Work) -> None:
+def _bend(i: int, layout: Layout, params: Params, ports: Ports, work: ColdWorkspace) -> None:
     """Constant curvature of each segment, its own where no length is prescribed, and the moment that it
     takes."""
     n_tendons = len(layout.tendon_segment)
@@ -170,7 +170,7 @@ def _bend(i: int, layout: Layout, params: Params, ports: Ports, work: Work) -> N
 
 
 @kernel
-def _sample(i: int, layout: Layout, params: Params, ports: Ports, work: Work) -> None:
+def _sample(i: int, layout: Layout, params: Params, ports: Ports, work: ColdWorkspace) -> None:
     """Frames along the arcs, and the line force and the point forces on the sample nearest to each."""
     pose = ports.base_pose[pick(i, len(ports.base_pose))]
     line = ports.line_force[pick(i, len(ports.line_force))]
@@ -201,7 +201,7 @@ def _sample(i: int, layout: Layout, params: Params, ports: Ports, work: Work) ->
 
 
 @kernel
-def _balance(i: int, layout: Layout, ports: Ports, follower: Vec, work: Work) -> None:
+def _balance(i: int, layout: Layout, ports: Ports, follower: Vec, work: ColdWorkspace) -> None:
     """Moment of the loads, from the tip down."""
     at = len(work.place) - 1
     force = add(_vec(ports.tip_force, pick(i, len(ports.tip_force))), follower)
@@ -220,7 +220,7 @@ def _balance(i: int, layout: Layout, ports: Ports, follower: Vec, work: Work) ->
 
 
 @kernel
-def _pull(i: int, layout: Layout, params: Params, ports: Ports, work: Work) -> None:
+def _pull(i: int, layout: Layout, params: Params, ports: Ports, work: ColdWorkspace) -> None:
     """Tensions that give each segment the mean moment that its arc wants."""
     tension, n_tendons = work.tension, len(layout.tendon_segment)
     offsets = params.offset[pick(i, len(params.offset))]
@@ -250,7 +250,7 @@ def _pull(i: int, layout: Layout, params: Params, ports: Ports, work: Work) -> N
 
 
 @kernel
-def _keep(i: int, layout: Layout, ports: Ports, follower: Vec, memory: Memory, work: Work) -> None:
+def _keep(i: int, layout: Layout, ports: Ports, follower: Vec, memory: Memory, work: ColdWorkspace) -> None:
     """The guess into the robot's memory, and what was learned before out of it."""
     x = memory.x[i]
     for a in range(3):
@@ -285,7 +285,7 @@ def begin(rows: Ints, layout: Layout, params: Params, ports: Ports, memory: Memo
     free = np.zeros(n_tendons, np.bool_)
     for j in range(len(layout.free_tendon)):
         free[layout.free_tendon[j]] = True
-    work = Work(
+    work = ColdWorkspace(
         free,
         np.empty(n_tendons),
         np.empty(n_tendons),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fastrod.types import Floats, Layout, Params, Ports, Shape
+from fastrod.types import Floats, Layout, Params, Ports, RodShape
 
 from ..jit import LANES, entry, kernel
 from . import shape as sh
@@ -23,7 +23,7 @@ def _fill(
     params: Params,
     ports: Ports,
     layout: Layout,
-    shape: Shape,
+    shape: RodShape,
     node: Lanes,
     tendon: Lanes,
 ) -> None:
@@ -77,7 +77,7 @@ def between_nodes(
     params: Params,
     ports: Ports,
     layout: Layout,
-    shape: Shape,
+    shape: RodShape,
     found: tuple[Floats, Floats, Floats],
 ) -> None:
     """Pose and curvature of query `queries[q]` of robot `robots[q]`, at arclength s[robot, query]."""

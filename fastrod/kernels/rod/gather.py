@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fastrod.types import Layout, Memory, Params, Ports, Shape
+from fastrod.types import Layout, Memory, Params, Ports, RodShape
 
 from ..jit import LANES, inline, kernel
 from ..vec import from_quaternion
@@ -158,7 +158,7 @@ def gather_step(
 
 
 @kernel
-def scatter_node(at: int, count: int, robots: Lanes, node: Lanes, s: Lanes, shape: Shape) -> None:
+def scatter_node(at: int, count: int, robots: Lanes, node: Lanes, s: Lanes, shape: RodShape) -> None:
     """Write the cross-section where the lanes stand."""
     for w in range(count):
         i = robots[w]

@@ -7,7 +7,7 @@ axis.
 
 from __future__ import annotations
 
-from fastrod.types import Layout, Memory, Params, Probes
+from fastrod.types import Layout, Memory, Params, PointLoads
 
 from ..jit import LANES, inline, kernel
 from ..vec import Vec, add, cross, mul, mul_t, sub
@@ -36,7 +36,7 @@ def _axis(a: int) -> Vec:
 
 
 @kernel
-def load_base(probes: Probes, first_row: int, count: int, node: Lanes) -> None:
+def load_base(probes: PointLoads, first_row: int, count: int, node: Lanes) -> None:
     """All contact forces lie beyond the base."""
     for w in range(W):
         r = row_of(first_row, count, w)
@@ -48,7 +48,7 @@ def load_base(probes: Probes, first_row: int, count: int, node: Lanes) -> None:
 
 @kernel
 def load_column(
-    c: int, at: int, node: Lanes, probes: Probes, first_row: int, count: int, given: Lanes
+    c: int, at: int, node: Lanes, probes: PointLoads, first_row: int, count: int, given: Lanes
 ) -> None:
     """The unit force of contact column c in the frame of the step that starts at node `at`: none beyond its
     own node."""
@@ -61,7 +61,7 @@ def load_column(
 
 @kernel
 def leave(
-    at: int, probes: Probes, first_row: int, count: int, node: Lanes, columns: Lanes, n_x: int, n_col: int
+    at: int, probes: PointLoads, first_row: int, count: int, node: Lanes, columns: Lanes, n_x: int, n_col: int
 ) -> None:
     """Beyond node `at` the loads on it no longer act: internal force, moment and their columns jump."""
     for w in range(W):
@@ -86,7 +86,14 @@ def leave(
 
 @kernel
 def arrive(
-    at: int, probes: Probes, first_row: int, count: int, node: Lanes, columns: Lanes, n_col: int, moves: Lanes
+    at: int,
+    probes: PointLoads,
+    first_row: int,
+    count: int,
+    node: Lanes,
+    columns: Lanes,
+    n_col: int,
+    moves: Lanes,
 ) -> None:
     """Motion of the contact points on node `at`, one number for each column: moves[(3 q + axis) n_col +
     column]."""
@@ -120,7 +127,7 @@ def respond(
     n_e: int,
     n_p: int,
     moves: Lanes,
-    probes: Probes,
+    probes: PointLoads,
     first_row: int,
 ) -> None:
     """Close the boundary: motion of unknowns and contact points by the residual (column 0) and by each unit

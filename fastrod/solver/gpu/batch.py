@@ -17,7 +17,7 @@ import numpy as np
 from numba import cuda
 
 from fastrod.solver.gpu.kernels.jit import SIMULATED, launched
-from fastrod.types import Floats, Ints, Layout, Memory, Params, Ports, Probes, Response, Shape
+from fastrod.types import Floats, Ints, Layout, Memory, Params, PointLoads, Ports, Response, RodShape
 
 _cuda: Any = cuda
 _config: Any = numba.config
@@ -48,7 +48,7 @@ def pass_robots(size: int) -> Any:
         ports: Ports,
         layout: Layout,
         memory: Memory,
-        shape: Shape,
+        shape: RodShape,
         response: Response,
         n_col: int,
         feed: bool,
@@ -62,7 +62,7 @@ def pass_robots(size: int) -> Any:
         # slices of length 0 of what the compiler then leaves out, and with it all that contact would do
         none = _cuda.local.array((1, 1), np.int64)[:, :0]
         nothing = _cuda.local.array((1, 1, 1), np.float64)[:, :0]
-        probes = Probes(none, nothing, nothing, nothing, nothing)
+        probes = PointLoads(none, nothing, nothing, nothing, nothing)
         for r in range(_cuda.grid(1), len(rows), _cuda.gridsize(1)):
             robots[0] = rows[r]
             pass_chunk(

@@ -9,7 +9,7 @@ from numba import cuda
 
 from fastrod.solver.gpu.batch import all_finite, launch, move_to_inputs, pass_robots, room
 from fastrod.solver.gpu.resident import Resident, fill
-from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports, Response, Shape
+from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports, Response, RodShape
 
 _cuda: Any = cuda
 # bytes: an array up to here is compared with what the device has, a larger one is the same if it is the same
@@ -29,7 +29,7 @@ class Runner:
 
     def __init__(self) -> None:
         self._sent: dict[str, tuple[Any, Any]] = {}
-        self._written: Shape | None = None
+        self._written: RodShape | None = None
         self._out: dict[str, Any] = {}
         self._touched: Flags | None = None
         self.sent_bytes = 0
@@ -44,7 +44,7 @@ class Runner:
         ports: Ports,
         layout: Layout,
         memory: Resident,
-        shape: Shape,
+        shape: RodShape,
         response: Response,
         n_col: int,
         n_e: int,
@@ -109,13 +109,13 @@ class Runner:
         flags: Flags = found.copy_to_host()
         return flags
 
-    def collect(self, shape: Shape, only: str | None = None) -> None:
+    def collect(self, shape: RodShape, only: str | None = None) -> None:
         """Bring what passes wrote into `shape`, or one field of it, to the host; rows that no pass wrote stay
         as they are there."""
         if self._written is not shape or self._touched is None:
             return
         every = bool(self._touched.all())
-        for name in Shape._fields if only is None else (only,):
+        for name in RodShape._fields if only is None else (only,):
             host: Floats = getattr(shape, name)
             if not host.size:
                 continue
@@ -125,7 +125,7 @@ class Runner:
             else:
                 host[self._touched] = self._out[name].copy_to_host()[self._touched]
 
-    def _bind(self, shape: Shape, rows: Ints) -> Shape:
+    def _bind(self, shape: RodShape, rows: Ints) -> RodShape:
         """Room on the device for what passes write into this shape: that of the last one, where the sizes
         agree."""
         if self._written is not shape:
@@ -135,7 +135,7 @@ class Runner:
             self._written, self._touched = shape, np.zeros(len(shape.residual), bool)
         if self._touched is not None:
             self._touched[rows] = True
-        return Shape(**self._out)
+        return RodShape(**self._out)
 
     def _all(self, group: str, arrays: Any) -> Any:
         return type(arrays)(*(self._send(f"{group}.{name}", a) for name, a in arrays._asdict().items()))

@@ -10,16 +10,16 @@ import numpy as np
 
 from fastrod.control import ResolvedRate
 from fastrod.errors import InputError
-from fastrod.hosts import BulletArm, BulletLink, Camera, connect
+from fastrod.hosts import BulletArm, BulletLink, HostCamera, connect
 from fastrod.hosts.bodies import RodBodies
 from fastrod.hosts.camera import Image
 from fastrod.model.robot import Robot
 from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_vector
 from fastrod.types import Floats
 from fastrod_envs.arms import SoftArm, arm_tube, solid_box
-from fastrod_envs.hosted import Cell, HostedTask, Result
-from fastrod_envs.options import Options
-from fastrod_envs.task import Ball, Field, Line, Scenery, Tube
+from fastrod_envs.hosted import Cell, HostedResult, HostedTask
+from fastrod_envs.options import EnvOptions
+from fastrod_envs.task import Backdrop, Ball, DrawnLine, Field, Tube
 from fastrod_scenes.robots import ur5_path
 from fastrod_scenes.ur5.box import COLORS, CORNERS, Box
 from fastrod_scenes.ur5.carried import OFFSET, RADIUS, Bracket, soft_robot
@@ -48,8 +48,8 @@ FAR, FINE = 0.2, 0.03
 """The miss is observed twice, up to these lengths [m]."""
 NEAR_WALL = 0.05
 """Clearance is observed up to this [m]."""
-_EYE = Camera(width=160, height=120, fov=70.0, near=0.005, far=2.0)
-_SMALL = Camera(width=48, height=36, fov=70.0, near=0.005, far=2.0)
+_EYE = HostCamera(width=160, height=120, fov=70.0, near=0.005, far=2.0)
+_SMALL = HostCamera(width=48, height=36, fov=70.0, near=0.005, far=2.0)
 _GREY = (0.35, 0.36, 0.38)
 _HUES = np.array(COLORS) / np.linalg.norm(COLORS, axis=1, keepdims=True)
 _ALIKE = 0.99  # cosine between a pixel's colour and the cube's
@@ -57,7 +57,7 @@ _POINTS = 10
 
 
 @dataclass(frozen=True, kw_only=True)
-class BoxExploreOptions(Options):
+class BoxExploreOptions(EnvOptions):
     """Of BoxExplore."""
 
     camera: bool = False
@@ -90,9 +90,9 @@ class BoxExplore(HostedTask):
     n_draws: ClassVar[int] = 14
     accuracy: ClassVar[float] = 0.01
     duration: ClassVar[float] = 2.0
-    options_class: ClassVar[type[Options]] = BoxExploreOptions
+    options_class: ClassVar[type[EnvOptions]] = BoxExploreOptions
 
-    def __init__(self, n_envs: int, options: Options) -> None:
+    def __init__(self, n_envs: int, options: EnvOptions) -> None:
         self.camera = isinstance(options, BoxExploreOptions) and options.camera
         robot = soft_robot("explorer", 3, extension=EXTENSION)
         low, high = _ranges()
@@ -208,11 +208,11 @@ class _Inside(Cell):
                 break
         self._notice(gap)
 
-    def result(self) -> Result:
+    def result(self) -> HostedResult:
         seen = self._pixels() if self._off < self.accuracy else 0
         contact = self._gap < 0.0
         tip, far = self.soft.tip, float(np.linalg.norm(self._goal - self.soft.tip))
-        return Result(
+        return HostedResult(
             terms={
                 "aim": math.exp(-self._off / 0.1),
                 "precise": math.exp(-self._off / 0.01),
@@ -272,7 +272,7 @@ class _Inside(Cell):
         to = soft.action + STEP * rates
         return np.asarray((2.0 * to - soft.lower - soft.upper) / np.maximum(soft.upper - soft.lower, 1e-12))
 
-    def scenery(self) -> Scenery:
+    def scenery(self) -> Backdrop:
         solids = []
         for part in self.box.parts():
             c, s = math.cos(part.turn), math.sin(part.turn)
@@ -281,11 +281,11 @@ class _Inside(Cell):
         solids += [solid_box(self.box.cube_at(k), [0.5 * self.box.cube] * 3, COLORS[k]) for k in self.cubes]
         far = np.linalg.norm(self._goal - self.soft.tip)
         sight = np.stack([self.soft.tip, self.soft.tip + far * self.soft.tip_rotation[:, 2]])
-        return Scenery(
+        return Backdrop(
             tubes=(Tube(self.soft.nodes, RADIUS, _GREY), arm_tube(self.arm)),
             balls=(Ball(self._goal, 0.022, COLORS[self.corner]),),
             solids=tuple(solids),
-            lines=(Line(sight, (0.9, 0.1, 0.1)),),
+            lines=(DrawnLine(sight, (0.9, 0.1, 0.1)),),
             eye=(0.5, -1.1, 0.9),
             target=(0.8, 0.0, 0.45),
         )
@@ -293,10 +293,10 @@ class _Inside(Cell):
     def picture(self, width: int, height: int) -> np.ndarray:
         """From the side, its wall cut away, and in a corner what the tip sees."""
         self._pose()
-        side = Camera(width=width, height=height, fov=36.0, near=0.8005, far=4.0)
+        side = HostCamera(width=width, height=height, fov=36.0, near=0.8005, far=4.0)
         rgb = side.look(self.world, (0.78, -1.0, 0.45), (0.78, 0.0, 0.45)).rgb
         small = self._look(
-            Camera(width=max(width // 4, 1), height=max(height // 4, 1), fov=70.0, near=0.005, far=2.0)
+            HostCamera(width=max(width // 4, 1), height=max(height // 4, 1), fov=70.0, near=0.005, far=2.0)
         ).rgb
         rgb[: small.shape[0], : small.shape[1]] = small
         return rgb
@@ -337,7 +337,7 @@ class _Inside(Cell):
         self.bodies.place(self.soft.nodes, self.soft.rotations)
         self.bracket.follow()
 
-    def _look(self, camera: Camera) -> Image:
+    def _look(self, camera: HostCamera) -> Image:
         """From before the tip's cap, along d3; d2 is up in it."""
         rotation = self.soft.tip_rotation
         eye = self.soft.tip + 1.2 * RADIUS * rotation[:, 2]

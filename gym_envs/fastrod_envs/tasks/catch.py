@@ -9,9 +9,9 @@ import numpy as np
 
 from fastrod.model.robot import Robot, Segment, Tendon
 from fastrod.types import Floats, Ints
-from fastrod_envs.options import Options
+from fastrod_envs.options import EnvOptions
 from fastrod_envs.rodtask import RodTask
-from fastrod_envs.task import Ball, Field, Line, Outcome, Scenery, length, shortened
+from fastrod_envs.task import Backdrop, Ball, DrawnLine, Field, Outcome, length, shortened
 
 SEGMENT = 0.1
 """Length of each of the two segments [m]."""
@@ -80,7 +80,7 @@ class Catch(RodTask):
     loaded = True
     dt = 0.05
 
-    def __init__(self, n_envs: int, options: Options) -> None:
+    def __init__(self, n_envs: int, options: EnvOptions) -> None:
         self.force: Floats = np.full((n_envs, 3), 1e-3)
         """(n_envs, 3) the undeclared load on the tip, world [N]."""
         limit = np.array([(-BEND, BEND)] * 4 + [EXTENSION])
@@ -174,11 +174,11 @@ class Catch(RodTask):
         stuck = (np.abs(posture) > 0.999) & (posture * pushes > 0.0)
         return self.toward(velocity, np.where(stuck[:, None, :], 0.0, jacobian))
 
-    def scenery(self, i: int) -> Scenery:
-        return Scenery(
+    def scenery(self, i: int) -> Backdrop:
+        return Backdrop(
             tubes=(self.tube(i),),
             balls=(Ball(self.desired[i], self.accuracy, (0.85, 0.2, 0.15)),),
-            lines=(Line(self._path[i], (0.85, 0.5, 0.45)),),
+            lines=(DrawnLine(self._path[i], (0.85, 0.5, 0.45)),),
             eye=(0.45, 0.45, 0.35),
             target=(0.0, 0.0, 0.12),
         )

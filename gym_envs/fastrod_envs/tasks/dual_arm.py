@@ -8,17 +8,17 @@ from typing import ClassVar, final
 import numpy as np
 
 from fastrod.errors import HostError
-from fastrod.hosts import Bullet, Camera, connect
+from fastrod.hosts import Bullet, HostCamera, connect
 from fastrod.hosts.bodies import RodBodies
 from fastrod.hosts.gripper import Gripper
 from fastrod.model.robot import Robot
 from fastrod.rotation import quaternion_from_matrix
 from fastrod.types import Floats
 from fastrod_envs.arms import SoftArm, short, solid_box
-from fastrod_envs.hosted import Cell, HostedTask, Result
-from fastrod_envs.options import Options
+from fastrod_envs.hosted import Cell, HostedResult, HostedTask
+from fastrod_envs.options import EnvOptions
 from fastrod_envs.rodtask import resolved
-from fastrod_envs.task import Ball, Field, Scenery, Tube
+from fastrod_envs.task import Backdrop, Ball, Field, Tube
 from fastrod_scenes.ur5.carried import RADIUS, soft_robot
 
 HEIGHT = 0.3
@@ -81,7 +81,7 @@ class DualArm(HostedTask):
     accuracy: ClassVar[float] = 0.01
     duration: ClassVar[float] = 4.0
 
-    def __init__(self, n_envs: int, options: Options) -> None:
+    def __init__(self, n_envs: int, options: EnvOptions) -> None:
         grips = Field("grips", "", (-1.0, -1.0), (1.0, 1.0), "of both heads, on above 0")
         low, high = tips_range()
         if options.action == "rate":
@@ -231,11 +231,11 @@ class _Pair(Cell):
             if self._over():
                 break
 
-    def result(self) -> Result:
+    def result(self) -> HostedResult:
         distance = float(np.linalg.norm(self.place - self.goal_at))
         passed, contact, fell = self.held[1] and not self.held[0], self._apart < 0.0, self._fell()
         success = passed and distance < self.accuracy and not contact
-        return Result(
+        return HostedResult(
             terms={
                 "meet": 0.2 * math.exp(-max(self._gap, 0.0) / 0.05),
                 "pass": 0.3 if passed else 0.0,
@@ -301,8 +301,8 @@ class _Pair(Cell):
             moves = (2.0 * to - self.low - self.high) / (self.high - self.low)
         return np.array([*moves.ravel(), *(2.0 * np.array(grips) - 1.0)])
 
-    def scenery(self) -> Scenery:
-        return Scenery(
+    def scenery(self) -> Backdrop:
+        return Backdrop(
             tubes=tuple(
                 Tube(soft.nodes, RADIUS, color) for soft, color in zip(self.softs, _COLORS, strict=True)
             ),
@@ -326,7 +326,9 @@ class _Pair(Cell):
             head.place(soft.tip, quaternion_from_matrix(soft.tip_rotation))
         for body, place in ((self.shown_ball, self.place), (self.mark, self.goal_at)):
             b.resetBasePositionAndOrientation(body, place.tolist(), [0.0, 0.0, 0.0, 1.0])
-        return Camera(width=width, height=height, fov=40.0).look(b, (0.1, -0.75, 0.5), (0.0, 0.0, 0.28)).rgb
+        return (
+            HostCamera(width=width, height=height, fov=40.0).look(b, (0.1, -0.75, 0.5), (0.0, 0.0, 0.28)).rgb
+        )
 
     def close(self) -> None:
         self.world.disconnect()

@@ -10,7 +10,7 @@ from typing import ClassVar, Literal, final, get_args
 import numpy as np
 
 from fastrod.errors import InputError
-from fastrod.hosts import Bullet, BulletArm, BulletLink, Camera, connect
+from fastrod.hosts import Bullet, BulletArm, BulletLink, HostCamera, connect
 from fastrod.hosts.bodies import RodBodies
 from fastrod.hosts.capsules import turn_between
 from fastrod.hosts.gripper import Gripper
@@ -19,9 +19,9 @@ from fastrod.model.robot import Robot
 from fastrod.rotation import matrix_from_quaternion, quaternion_from_matrix
 from fastrod.types import Floats
 from fastrod_envs.arms import SoftArm, arm_tube, short, solid_box
-from fastrod_envs.hosted import Cell, HostedTask, Result
-from fastrod_envs.options import Options
-from fastrod_envs.task import Ball, Field, Scenery, Tube
+from fastrod_envs.hosted import Cell, HostedResult, HostedTask
+from fastrod_envs.options import EnvOptions
+from fastrod_envs.task import Backdrop, Ball, Field, Tube
 from fastrod_scenes.robots import ur5_path
 from fastrod_scenes.ur5.carried import RADIUS, Bracket, soft_robot
 from fastrod_scenes.ur5.picking import ADAPTER, SIDE, TOP, WIDTH
@@ -60,7 +60,7 @@ _POINTS = 5
 
 
 @dataclass(frozen=True, kw_only=True)
-class PickPlaceOptions(Options):
+class PickPlaceOptions(EnvOptions):
     """Of PickPlace."""
 
     grip: Grip = "suction"
@@ -97,9 +97,9 @@ class PickPlace(HostedTask):
     n_draws: ClassVar[int] = 5
     accuracy: ClassVar[float] = 0.02
     duration: ClassVar[float] = 6.0
-    options_class: ClassVar[type[Options]] = PickPlaceOptions
+    options_class: ClassVar[type[EnvOptions]] = PickPlaceOptions
 
-    def __init__(self, n_envs: int, options: Options) -> None:
+    def __init__(self, n_envs: int, options: EnvOptions) -> None:
         self.grip: Grip = options.grip if isinstance(options, PickPlaceOptions) else "suction"
         low, high = tip_range(self.grip)
         grip = Field("grip", "", (-1.0,), (1.0,), "on above 0")
@@ -236,12 +236,12 @@ class _Table(Cell):
             self._move(velocity, bend_rate, part)
         self._look()
 
-    def result(self) -> Result:
+    def result(self) -> HostedResult:
         distance = float(np.linalg.norm(self.place - self.spot))
         there, fell = distance < self.accuracy, bool(self.place[2] < TOP - 0.02)
         grasp = float(np.linalg.norm(self.place + self.above - self.soft.tip))
         success = there and not self.held and not self.told and self.speed < REST
-        return Result(
+        return HostedResult(
             terms={
                 "reach": 0.2 if self.held or there else 0.2 * math.exp(-grasp / 0.05),
                 "hold": 0.3 if self.held or there else 0.0,
@@ -303,7 +303,7 @@ class _Table(Cell):
         to = 2.0 * (self.soft.tip + 0.1 * velocity - self.low) / (self.high - self.low) - 1.0
         return np.array([*to, (self.bend + 0.1 * bend_rate) / BEND, grip])
 
-    def scenery(self) -> Scenery:
+    def scenery(self) -> Backdrop:
         self._pose()
         turn = matrix_from_quaternion(self._turn[None])[0]
         solids = [solid_box(*_TABLE, _WOOD), solid_box(self.place, [0.5 * SIDE] * 3, _ORANGE, turn)]
@@ -314,7 +314,7 @@ class _Table(Cell):
             solids.append(
                 solid_box(self.soft.tip + rotation @ [side, 0.0, half[2]], half, (0.25, 0.25, 0.28), rotation)
             )
-        return Scenery(
+        return Backdrop(
             tubes=(Tube(self.soft.nodes, RADIUS, _BODY), arm_tube(self.arm)),
             balls=(Ball(self.spot, 0.01, _GREEN), Ball(self.soft.tip, _HEAD, (0.0, 0.0, 0.75))),
             solids=tuple(solids),
@@ -325,7 +325,7 @@ class _Table(Cell):
     def picture(self, width: int, height: int) -> np.ndarray:
         self._pose()
         return (
-            Camera(width=width, height=height, fov=38.0)
+            HostCamera(width=width, height=height, fov=38.0)
             .look(self.shown, (1.25, -0.65, 0.7), (0.42, 0.0, 0.27))
             .rgb
         )

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import final
 
 from fastrod.hosts.bullet import Bullet, connect
-from fastrod_envs.options import Options
+from fastrod_envs.options import EnvOptions
 from fastrod_envs.push_course import Course, longer
 from fastrod_envs.pushing import PushTask
 from fastrod_scenes.a1.quadruped import floor, neck
@@ -48,7 +48,7 @@ class Push(PushTask):
 
     name = "Push"
 
-    def __init__(self, n_envs: int, options: Options) -> None:
+    def __init__(self, n_envs: int, options: EnvOptions) -> None:
         super().__init__(n_envs, options, course())
 
     def backdrop(self) -> Bullet:

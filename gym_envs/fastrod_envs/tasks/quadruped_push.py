@@ -11,7 +11,7 @@ import numpy as np
 
 from fastrod.hosts.bullet import Bullet
 from fastrod.rotation import quaternion_from_matrix
-from fastrod_envs.options import Options
+from fastrod_envs.options import EnvOptions
 from fastrod_envs.push_course import Course, longer
 from fastrod_envs.pushing import PushTask
 from fastrod_scenes.a1.quadruped import neck, standing
@@ -60,7 +60,7 @@ class QuadrupedPush(PushTask):
 
     name = "QuadrupedPush"
 
-    def __init__(self, n_envs: int, options: Options) -> None:
+    def __init__(self, n_envs: int, options: EnvOptions) -> None:
         super().__init__(n_envs, options, course())
 
     def backdrop(self) -> Bullet:

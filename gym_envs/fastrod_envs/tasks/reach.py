@@ -11,9 +11,9 @@ from fastrod.errors import InputError
 from fastrod.model.robot import Robot
 from fastrod.model.robotfile import load_robot
 from fastrod.types import Floats, Ints
-from fastrod_envs.options import Options
+from fastrod_envs.options import EnvOptions
 from fastrod_envs.rodtask import RodTask
-from fastrod_envs.task import Ball, Field, Outcome, Scenery, length, shortened
+from fastrod_envs.task import Backdrop, Ball, Field, Outcome, length, shortened
 
 Reward = Literal["paper", "precise"]
 BASE = (0.0, 0.0, 0.5)
@@ -27,7 +27,7 @@ NEAR = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReachOptions(Options):
+class ReachOptions(EnvOptions):
     """Of Reach and ReachObstacle."""
 
     reward: Reward = "paper"
@@ -55,7 +55,7 @@ class ReachTask(RodTask):
     n_steps: ClassVar[int] = 40
     n_draws: ClassVar[int] = 3
     accuracy: ClassVar[float] = 0.01
-    options_class: ClassVar[type[Options]] = ReachOptions
+    options_class: ClassVar[type[EnvOptions]] = ReachOptions
     points_per_segment = 2
     hold_gain: ClassVar[float] = 1e-4
     dt = 0.05
@@ -114,7 +114,7 @@ class Reach(ReachTask):
 
     name = "Reach"
 
-    def __init__(self, n_envs: int, options: Options) -> None:
+    def __init__(self, n_envs: int, options: EnvOptions) -> None:
         driven, limit, rate = drives()
         super().__init__(n_envs, options, hanging_robot(), driven=driven, limit=limit, rate=rate)
         self.prepare()
@@ -136,8 +136,8 @@ class Reach(ReachTask):
     def baseline(self) -> Floats:
         return self.toward((self.desired - self.measured()) / (2.0 * self.dt))
 
-    def scenery(self, i: int) -> Scenery:
-        return Scenery(tubes=(self.tube(i),), balls=(Ball(self.desired[i], 0.012, (0.85, 0.2, 0.15)),))
+    def scenery(self, i: int) -> Backdrop:
+        return Backdrop(tubes=(self.tube(i),), balls=(Ball(self.desired[i], 0.012, (0.85, 0.2, 0.15)),))
 
 
 def drives() -> tuple[Ints, Floats, Floats]:

@@ -8,9 +8,9 @@ import numpy as np
 
 from fastrod.contact import ContactScene, box
 from fastrod.types import Flags, Floats, Ints
-from fastrod_envs.options import Options
+from fastrod_envs.options import EnvOptions
 from fastrod_envs.shapes import box_mesh
-from fastrod_envs.task import Ball, Field, Outcome, Scenery, Solid, length
+from fastrod_envs.task import Backdrop, Ball, Field, Outcome, Solid, length
 from fastrod_envs.tasks.reach import ReachTask, drives, hanging_robot
 
 BAR, SIZE = (0.0, 0.06, 0.35), (0.4, 0.02, 0.02)
@@ -34,7 +34,7 @@ class ReachObstacle(ReachTask):
     name = "ReachObstacle"
     outputs: ClassVar[str] = "full"
 
-    def __init__(self, n_envs: int, options: Options) -> None:
+    def __init__(self, n_envs: int, options: EnvOptions) -> None:
         driven, limit, rate = drives()
         bar = box(SIZE, name="bar", position=BAR)
         scene = ContactScene(obstacles=[bar])
@@ -96,8 +96,8 @@ class ReachObstacle(ReachTask):
         weight = np.where(self.driven < 6, 0.1, 1.0)  # the first two segments are beside the bar
         return self.toward((self.desired - self.measured()) / (2.0 * self.dt), weight=weight)
 
-    def scenery(self, i: int) -> Scenery:
+    def scenery(self, i: int) -> Backdrop:
         bar = Solid(*box_mesh(SIZE, BAR), (0.55, 0.57, 0.6))
-        return Scenery(
+        return Backdrop(
             tubes=(self.tube(i),), balls=(Ball(self.desired[i], 0.012, (0.85, 0.2, 0.15)),), solids=(bar,)
         )

@@ -13,10 +13,10 @@ from fastrod.errors import InputError
 from fastrod.model.robot import Robot
 from fastrod.model.robotfile import load_robot
 from fastrod.types import Floats, Ints
-from fastrod_envs.options import Options
+from fastrod_envs.options import EnvOptions
 from fastrod_envs.rodtask import RodTask
 from fastrod_envs.surface import ReachableSurface
-from fastrod_envs.task import Ball, Field, Line, Outcome, Scenery, length, shortened
+from fastrod_envs.task import Backdrop, Ball, DrawnLine, Field, Outcome, length, shortened
 
 Shape = Literal["triangle", "square", "circle"]
 Reward = Literal["paper", "precise"]
@@ -38,7 +38,7 @@ RADIUS = 0.03
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackOptions(Options):
+class TrackOptions(EnvOptions):
     """Of Track."""
 
     path: Shape | Literal["any"] = "any"
@@ -92,7 +92,7 @@ def coming(path: Callable[[float], Floats]) -> Floats:
 
 
 @final
-class Sight:
+class TrackSight:
     """What n robots remember of their errors, and the state that they observe."""
 
     def __init__(self, n: int) -> None:
@@ -145,11 +145,11 @@ class Track(RodTask):
     n_steps: ClassVar[int] = 200
     n_draws: ClassVar[int] = 3
     accuracy: ClassVar[float] = 5e-4
-    options_class: ClassVar[type[Options]] = TrackOptions
+    options_class: ClassVar[type[EnvOptions]] = TrackOptions
     points_per_segment: ClassVar[int] = 6
     dt = DT
 
-    def __init__(self, n_envs: int, options: Options) -> None:
+    def __init__(self, n_envs: int, options: EnvOptions) -> None:
         super().__init__(n_envs, options, load_robot("prototype"), driven=DRIVEN, limit=LIMIT, rate=RATE)
         assert isinstance(options, TrackOptions)
         self._known = references(self.base_robot.length, PERIOD)
@@ -165,7 +165,7 @@ class Track(RodTask):
             np.ones(n),
         )
         self._t = np.zeros(n)
-        self._sight = Sight(n)
+        self._sight = TrackSight(n)
         self._sums, self._counted = np.zeros((n, 9)), np.zeros(n)
 
     def begin(self, rows: Ints, draws: Floats) -> None:
@@ -235,14 +235,14 @@ class Track(RodTask):
         error = self._surface.nearest(self.path(0.0)) - self.measured()
         return self.toward(ahead / self.dt + error / (2.0 * self.dt))
 
-    def scenery(self, i: int) -> Scenery:
+    def scenery(self, i: int) -> Backdrop:
         t = np.linspace(0.0, PERIOD, 90)
         line = self._known[self._names[self._which[i]]].position(t) * [self._size[i], self._size[i], 1.0]
         now = Ball(self.path(0.0)[i], 0.0015, (0.85, 0.2, 0.15))
-        return Scenery(
+        return Backdrop(
             tubes=(self.tube(i),),
             balls=(now,),
-            lines=(Line(line, (0.2, 0.35, 0.8)),),
+            lines=(DrawnLine(line, (0.2, 0.35, 0.8)),),
             eye=(0.13, 0.13, 0.12),
             target=(0.0, 0.0, 0.04),
         )

@@ -15,9 +15,9 @@ from fastrod.model.segment_actions import SegmentActions
 from fastrod.simulator import Simulator
 from fastrod.solver.state import State
 from fastrod.types import Flags, Floats, Ints
-from fastrod_envs.options import Options
+from fastrod_envs.options import EnvOptions
 from fastrod_envs.randomisation import Randomisation
-from fastrod_envs.task import Ball, Field, Outcome, Scenery, Solid, Task, Tube, length, shortened
+from fastrod_envs.task import Backdrop, Ball, Field, Outcome, Solid, Task, Tube, length, shortened
 
 SEGMENT = 0.04
 """Length of each of the two segments [m]."""
@@ -111,7 +111,7 @@ class TubeInsert(Task):
     accuracy: ClassVar[float] = 0.005
     dt = 0.1
 
-    def __init__(self, n_envs: int, options: Options) -> None:
+    def __init__(self, n_envs: int, options: EnvOptions) -> None:
         super().__init__(n_envs, options)
         self._random = Randomisation.of(options.randomise)
         self.base_robot = thin_robot() if self._random is None else self._random.base(thin_robot())
@@ -374,9 +374,9 @@ class TubeInsert(Task):
             return np.asarray(np.clip((there - self.displacement) / (self.dt * RATE), -1.0, 1.0))
         return np.asarray(np.clip((2.0 * there - low - high) / (high - low), -1.0, 1.0))
 
-    def scenery(self, i: int) -> Scenery:
+    def scenery(self, i: int) -> Backdrop:
         vertices, faces = tube_mesh()
-        return Scenery(
+        return Backdrop(
             tubes=(Tube(self.simulator.state.position[i], BODY, (0.9, 0.55, 0.15)),),
             balls=(Ball(middle(self.depth[i : i + 1])[0], 0.003, (0.85, 0.2, 0.15)),),
             solids=(Solid(vertices, faces, (0.6, 0.7, 0.8), 0.35),),

@@ -8,11 +8,11 @@ from typing import NamedTuple, final
 import numpy as np
 from numpy.typing import NDArray
 
-from fastrod.hosts import Bullet, Camera, MountedRod
+from fastrod.hosts import Bullet, HostCamera, MountedRod
 from fastrod.hosts.camera import Image
-from fastrod.model.segment_actions import SegmentActions, WireInputs
+from fastrod.model.segment_actions import SegmentActions, TendonInputs
 from fastrod_scenes.a1.quadruped import RADIUS, neck, standing
-from fastrod_scenes.scene import HostedScene, Stage
+from fastrod_scenes.scene import HostedScene, SceneStage
 
 PITCH = 0.9
 """Of the neck's mount, above forward [rad]."""
@@ -39,14 +39,14 @@ class Seen(NamedTuple):
 
 
 @final
-class _Look(Stage):
+class _Look(SceneStage):
     def __init__(self, dt: float) -> None:
         self.world, self.mount = standing(dt, PITCH)
         self.walls = _box(self.world)
         self.markers = _markers(self.world)
         self.robot = neck(4, STRETCH)
         self.actions = SegmentActions(self.robot)
-        self.camera = Camera(width=96, height=96, fov=80.0, near=0.01, far=2.0)
+        self.camera = HostCamera(width=96, height=96, fov=80.0, near=0.01, far=2.0)
         self.rod = MountedRod(
             self.robot,
             self.mount,
@@ -59,7 +59,7 @@ class _Look(Stage):
         self.rods = (self.rod,)
         self.rod.settle(**self.bends(0.0, 0.0))
 
-    def bends(self, over: float, aside: float) -> WireInputs:
+    def bends(self, over: float, aside: float) -> TendonInputs:
         """`over` from 0 (straight) to 1 (the tip looks down), `aside` to the left [rad]; the same in every
         segment."""
         n = self.robot.n_segments

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fastrod.hosts import Bullet, MountedRod
-from fastrod.model.segment_actions import SegmentActions, WireInputs
+from fastrod.model.segment_actions import SegmentActions, TendonInputs
 from fastrod_scenes.a1.quadruped import neck, standing
-from fastrod_scenes.scene import HostedScene, Stage
+from fastrod_scenes.scene import HostedScene, SceneStage
 
 SIZE, MASS = 0.08, 0.05
 """Edge [m] and mass [kg] of the cube."""
@@ -35,7 +35,7 @@ STANDS = 0.02
 
 
 @final
-class _Push(Stage):
+class _Push(SceneStage):
     def __init__(self, dt: float) -> None:
         self.world, mount = standing(dt, PITCH)
         self.cube = _cube(self.world)
@@ -53,7 +53,7 @@ class _Push(Stage):
         self.rods = (self.rod,)
         self.rod.settle(**self.gait(0.0))
 
-    def gait(self, t: float) -> WireInputs:
+    def gait(self, t: float) -> TendonInputs:
         """Back and forth in the sagittal plane, back at first, the same in every segment."""
         swing = math.sin(RATE * t - 0.5 * math.pi)
         action = np.zeros(self.actions.n_actions)

@@ -41,7 +41,7 @@ COLORS = (
 _WOOD, _PLINTH = (0.80, 0.72, 0.60, 1.0), (0.45, 0.47, 0.50, 1.0)
 
 
-class Part(NamedTuple):
+class BoxPart(NamedTuple):
     """A plate: a box of its own, turned about x."""
 
     middle: tuple[float, float, float]
@@ -105,32 +105,32 @@ class Box:
             np.abs(np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0))
         )
 
-    def parts(self) -> list[Part]:
+    def parts(self) -> list[BoxPart]:
         """Walls, and the plinth below them."""
         x, (a, b, c), t, z = self.front + self.wall, self.inner, self.wall, self.height
         low = z - 0.5 * c - t
         middle, whole = (x + 0.5 * a, 0.0, z), 0.5 * c + t
-        parts = [Part((x + a + 0.5 * t, 0.0, z), (0.5 * t, 0.5 * b + t, whole))]
+        parts = [BoxPart((x + a + 0.5 * t, 0.0, z), (0.5 * t, 0.5 * b + t, whole))]
         for sign in (-1.0, 1.0):
-            parts.append(Part((middle[0], sign * 0.5 * (b + t), z), (0.5 * a, 0.5 * t, whole)))
-            parts.append(Part((middle[0], 0.0, z + sign * 0.5 * (c + t)), (0.5 * a, 0.5 * b, 0.5 * t)))
-        parts.append(Part((middle[0], 0.0, 0.5 * low), (0.35 * a, 0.35 * b, 0.5 * low), color=_PLINTH))
+            parts.append(BoxPart((middle[0], sign * 0.5 * (b + t), z), (0.5 * a, 0.5 * t, whole)))
+            parts.append(BoxPart((middle[0], 0.0, z + sign * 0.5 * (c + t)), (0.5 * a, 0.5 * b, 0.5 * t)))
+        parts.append(BoxPart((middle[0], 0.0, 0.5 * low), (0.35 * a, 0.35 * b, 0.5 * low), color=_PLINTH))
         return parts + self._front()
 
-    def _front(self) -> list[Part]:
+    def _front(self) -> list[BoxPart]:
         x, (_, b, c), t, e = self.front + 0.5 * self.wall, self.inner, 0.5 * self.wall, self.entry
         wide, tall = 0.5 * b + self.wall, 0.5 * c + self.wall
         if e == 0.0:
-            return [Part((x, 0.0, self.height), (t, wide, tall))]
+            return [BoxPart((x, 0.0, self.height), (t, wide, tall))]
         parts = []
         for sign in (-1.0, 1.0):
-            parts.append(Part((x, sign * 0.5 * (wide + e), self.height), (t, 0.5 * (wide - e), tall)))
-            parts.append(Part((x, 0.0, self.height + sign * 0.5 * (tall + e)), (t, e, 0.5 * (tall - e))))
+            parts.append(BoxPart((x, sign * 0.5 * (wide + e), self.height), (t, 0.5 * (wide - e), tall)))
+            parts.append(BoxPart((x, 0.0, self.height + sign * 0.5 * (tall + e)), (t, e, 0.5 * (tall - e))))
         side = e * math.tan(math.pi / 8.0)  # half of one; the square's corner is as far beyond it
         for k in range(4):
             turn = math.pi / 4.0 + k * math.pi / 2.0
             y, z = (e + 0.5 * side) * math.cos(turn), (e + 0.5 * side) * math.sin(turn)
-            parts.append(Part((x, y, self.height + z), (t, 0.5 * side, side), turn))
+            parts.append(BoxPart((x, y, self.height + z), (t, 0.5 * side, side), turn))
         return parts
 
     def build(self, world: Bullet) -> tuple[int, dict[int, int]]:

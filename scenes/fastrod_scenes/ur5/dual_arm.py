@@ -12,7 +12,7 @@ from fastrod.model.segment_actions import SegmentActions
 from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_vector
 from fastrod.types import Floats
 from fastrod_scenes.robots import ur5_path
-from fastrod_scenes.scene import HostedScene, Stage
+from fastrod_scenes.scene import HostedScene, SceneStage
 from fastrod_scenes.ur5.carried import OFFSET, RADIUS, Bracket, eased, soft_robot
 
 APART, DEEP, PRONG = 0.06, 0.04, 0.02
@@ -61,7 +61,7 @@ def opposite(t: float) -> tuple[Floats, Floats]:
 
 
 @final
-class DualArm(Stage):
+class DualArmScene(SceneStage):
     """A UR5 with a fork at its flange, and a soft robot of two segments on either prong."""
 
     arm: BulletArm
@@ -228,9 +228,9 @@ class DualArms(HostedScene):
     dt = 0.005
     duration = STILL + MOVE
 
-    def stage(self) -> DualArm:
+    def stage(self) -> DualArmScene:
         """A new world, the soft robots settled and carried by the motors."""
-        return DualArm(self.dt)
+        return DualArmScene(self.dt)
 
     def check(self) -> dict[str, float]:
         """Bases must be on their mounts, the UR5 must feel the weight of both robots and J^T F of their

@@ -7,13 +7,13 @@ from typing import NamedTuple, final
 import numpy as np
 
 from fastrod.control import ResolvedRate, SoftTip
-from fastrod.hosts import BulletArm, BulletLink, Camera, MountedRod, connect
+from fastrod.hosts import BulletArm, BulletLink, HostCamera, MountedRod, connect
 from fastrod.hosts.camera import Image
 from fastrod.model.segment_actions import SegmentActions
 from fastrod.rotation import product, quaternion_from_vector
 from fastrod.types import Floats
 from fastrod_scenes.robots import ur5_path
-from fastrod_scenes.scene import Stage
+from fastrod_scenes.scene import SceneStage
 from fastrod_scenes.ur5.box import COLORS, CORNERS, Box
 from fastrod_scenes.ur5.carried import OFFSET, RADIUS, Bracket, eased, soft_robot
 from fastrod_scenes.ur5.look import aim_jacobian, miss
@@ -62,7 +62,7 @@ class Look(NamedTuple):
 
 
 @final
-class Exploration(Stage):
+class Exploration(SceneStage):
     """UR5, soft robot and box, and an operator who drives by the clock; where the robots start follows from
     the seed."""
 
@@ -102,7 +102,7 @@ class Exploration(Stage):
         self._aim = ResolvedRate(
             gain=8.0, lower=lower, upper=upper, rate=np.tile([0.03, 2.0 * OFFSET, 2.0 * OFFSET], 3)
         )
-        self.camera = Camera(width=160, height=120, fov=70.0, near=0.005, far=2.0)
+        self.camera = HostCamera(width=160, height=120, fov=70.0, near=0.005, far=2.0)
         self.looks: dict[int, Look] = {}
         """Of each corner, by its number."""
         self.rod.settle(**self.actions.inputs(self.action))

@@ -46,7 +46,7 @@ JOINT_RATE, BEND_RATE, EXTENSION_RATE = 1.0, 2.0, 0.06
 """Largest of a joint and of a bend [rad/s], and of an extension [m/s]."""
 
 
-class Step(NamedTuple):
+class ArmStep(NamedTuple):
     """What one step did to the tip, world."""
 
     tip: Floats
@@ -146,7 +146,7 @@ class SoftUR5:
         simulator.restore(before)
         return still
 
-    def advance(self, error: Floats, velocity: Floats) -> Step:
+    def advance(self, error: Floats, velocity: Floats) -> ArmStep:
         """One step: the tip makes up for its `error` (3,) [m], as fast as the gain has it, and goes on with
         `velocity` (3,) [m/s]."""
         q, n, part = self.q(), self.arm.n_joints, self.moving
@@ -161,7 +161,7 @@ class SoftUR5:
         self._base = self.rod.host.motion().pose
         self.bracket.follow()
         way = self.q() - q
-        return Step(self.tip(), jacobian[:, n:] @ way[n:], jacobian[:, :n] @ way[:n])
+        return ArmStep(self.tip(), jacobian[:, n:] @ way[n:], jacobian[:, :n] @ way[:n])
 
     def clearance(self, within: float = 0.1) -> float:
         """Of the soft robot from the arm's links, at most `within` [m]; negative inside one."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from fastrod.control import Trajectory, trajectory
 from fastrod.types import Floats
-from fastrod_scenes.scene import HostedScene, Stage
+from fastrod_scenes.scene import HostedScene, SceneStage
 from fastrod_scenes.ur5.soft_ur5 import DEPTH, Movers, SoftUR5
 
 CENTER = (0.5, 0.0, 0.3)
@@ -79,7 +79,7 @@ def share(part: Floats, way: Floats) -> float:
 
 
 @final
-class Tracking(Stage):
+class TrackingError(SceneStage):
     """The UR5 and its soft robot, whose tip is sent along a path."""
 
     def __init__(self, path: Trajectory, *, dt: float, movers: Movers = "both", depth: float = DEPTH) -> None:
@@ -109,7 +109,7 @@ class Tracking(Stage):
         return np.asarray((self.path.position(t + self.dt) - self.path.position(t)) / self.dt)
 
 
-class Track(HostedScene):
+class TrackingScene(HostedScene):
     """One path, from the jump of the goal onto it to the end of a period after the approach.
 
     As in the paper, the tip rests at the path's center when the goal begins to move along the path, and a
@@ -137,12 +137,12 @@ class Track(HostedScene):
         )
 
     @final
-    def stage(self) -> Tracking:
+    def stage(self) -> TrackingError:
         """A new world, its tip at the path's center."""
-        return Tracking(self.path(), dt=self.dt)
+        return TrackingError(self.path(), dt=self.dt)
 
     @final
-    def record(self, stage: Tracking) -> Record:
+    def record(self, stage: TrackingError) -> Record:
         """Run to the end."""
         return record(stage, self.play(stage))
 
@@ -183,7 +183,7 @@ class Track(HostedScene):
         }
 
 
-def record(stage: Tracking, times: Iterable[float]) -> Record:
+def record(stage: TrackingError, times: Iterable[float]) -> Record:
     """What the stage does at these times, the end of each step [s]."""
     t: list[float] = []
     clearance, lag = np.inf, 0.0
@@ -199,7 +199,7 @@ def record(stage: Tracking, times: Iterable[float]) -> Record:
 
 
 @final
-class TrackSquare(Track):
+class TrackSquare(TrackingScene):
     """Sides of 0.4 m."""
 
     name = "track_square"
@@ -210,7 +210,7 @@ class TrackSquare(Track):
 
 
 @final
-class TrackCircle(Track):
+class TrackCircle(TrackingScene):
     """Radius 0.2 m."""
 
     name = "track_circle"
@@ -221,7 +221,7 @@ class TrackCircle(Track):
 
 
 @final
-class TrackFigureEight(Track):
+class TrackFigureEight(TrackingScene):
     """0.4 m either way."""
 
     name = "track_figure_eight"
@@ -232,7 +232,7 @@ class TrackFigureEight(Track):
 
 
 @final
-class TrackHelix(Track):
+class TrackHelix(TrackingScene):
     """Radius 0.2 m, pitch 0.1 m."""
 
     name = "track_helix"
@@ -243,7 +243,7 @@ class TrackHelix(Track):
 
 
 @final
-class TrackSquareHelix(Track):
+class TrackSquareHelix(TrackingScene):
     """Sides of 0.2 m, pitch 0.02 m."""
 
     name = "track_square_helix"
