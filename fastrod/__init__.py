@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
+from fastrod.errors import Problem
 from fastrod.loading import load_robot
 from fastrod.model.robot import Robot, Segment, Tendon
 from fastrod.model.robotfile import robot_names, save_robot
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Observer",
     "Pose",
+    "Problem",
     "Robot",
     "Rod",
     "Segment",

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from enum import Enum
 
 
 class FastrodError(Exception):
@@ -40,6 +41,51 @@ class EffectError(FastrodError, ValueError):
 
 class UnknownNameError(FastrodError, KeyError):
     """A name that is not known, answered with the near ones."""
+
+
+class Problem(Enum):
+    """What is wrong with a robot of a batch, for programs: the kind of a sentence in `State.problems`."""
+
+    BAD_INPUT = "bad_input"
+    """Its input cannot be used: not finite, out of range, impossible."""
+    DIVERGED = "diverged"
+    """A step's pass diverged, and no shape was found on these inputs."""
+    NOT_CONVERGED = "not_converged"
+    """`settle` did not bring the boundary residual below its tolerance."""
+    OVERLOADED = "overloaded"
+    """Its loads are beyond what a rod can hold: no shape was found, or only an unstable one."""
+    NEVER_SOLVED = "never_solved"
+    """It was left out before its first step."""
+    CONTACT_STUCK = "contact_stuck"
+    """The rod still moves on its contacts, or no forces were found that hold it there."""
+    CONTACT_INSIDE = "contact_inside"
+    """No forces were found that push the rod out of an obstacle, or no start outside of it."""
+    CONTACT_TUNNELLED = "contact_tunnelled"
+    """The rod would go through an obstacle."""
+    CONTACT_DIVERGED = "contact_diverged"
+    """The rod's shape diverged while an obstacle held it, or neither these inputs nor its rest shape could be
+    solved."""
+    NO_NODE_LEFT = "no_node_left"
+    """A segment has more contacts than nodes."""
+    NO_CONTACT_LEFT = "no_contact_left"
+    """The rod has as many contacts as it may have."""
+
+
+class ProblemSentence(str):
+    """A sentence that says what is wrong with a robot, and its `kind`."""
+
+    __slots__ = ("kind",)
+    kind: Problem
+
+    def __new__(cls, sentence: str, kind: Problem) -> ProblemSentence:
+        """A sentence of this kind."""
+        made = super().__new__(cls, sentence)
+        made.kind = kind
+        return made
+
+    def __getnewargs__(self) -> tuple[str, Problem]:  # type: ignore[override]
+        """What `pickle` and `copy` make it from."""
+        return str(self), self.kind
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

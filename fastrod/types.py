@@ -51,8 +51,8 @@ class Params(NamedTuple):
     """(n_robots,) EI/l, smallest EI over the whole length [N m]: makes moments comparable."""
     tension_scale: Floats
     """(n_robots,) EI/(d l), d the mean tendon offset [N]."""
-    reach: Floats
-    """(n_robots,) length of the whole chain [m]."""
+    rod_length: Floats
+    """(n_robots,) of the whole robot [m]."""
 
 
 class Ports(NamedTuple):

@@ -87,7 +87,7 @@ class Timed:
         shape = passes.new_shape("tip", False)
 
         def run(at: Ports) -> None:
-            passes.run(sim._all, at, shape, feed=True, process=1.0, noise=1e-20)
+            passes.run(sim._all, at, shape, predict=True, process=1.0, noise=1e-20)
             wait(sim.device)
 
         run(ports)
@@ -182,7 +182,7 @@ def time_section(rows: list[Row]) -> Section:
 def work_row(key: str, n_robots: int, points: int, operations: float) -> Row:
     """What a pass of one robot must move and reckon, from the arrays that it is given."""
     from fastrod.kernels.jit import LANES
-    from fastrod.kernels.rod.chunk import scratch_size
+    from fastrod.kernels.rod.workspace import scratch_size
 
     n = 64
     (small,) = (case for case in cases.cases(n) if case.key == key)

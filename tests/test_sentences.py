@@ -20,7 +20,7 @@ from fastrod.logs.recording import recover
 from fastrod.logs.runlog import read_log
 from fastrod.model.robotfile import dumps, load_robot, loads, save_robot
 from fastrod.model.segment_actions import SegmentActions
-from fastrod.solver.merge import taken
+from fastrod.solver.merge import merge_rows
 
 PROTOTYPE = dumps(load_robot("prototype"))
 LONG = "a" * 5000
@@ -259,7 +259,7 @@ def test_merged_rows_keep_the_order_that_kernels_are_compiled_for() -> None:
     """Another order of axes in memory is another type to numba: a first call would wait for its
     compilation."""
     now, then = np.zeros((1, 2, 3, 4)), np.ones((3, 2, 3, 4))
-    merged = taken(now, then, np.array([True, False, False]))
+    merged = merge_rows(now, then, np.array([True, False, False]))
     assert merged.flags.c_contiguous
     assert_array_equal(merged[:, 0, 0, 0], [1.0, 0.0, 0.0])
 

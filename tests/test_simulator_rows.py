@@ -55,7 +55,8 @@ def reacher() -> tuple[Robot, Callable[[float], Inputs]]:
 def test_a_held_gain_follows_a_slow_robot_as_closely_as_a_fresh_one() -> None:
     robot, at = reacher()
     fresh, held, still = (
-        Simulator(robot, dt=0.05, points_per_segment=2, threads=1, hold_gain=h) for h in (0.0, 5e-5, 0.0)
+        Simulator(robot, dt=0.05, points_per_segment=2, threads=1, kept_jacobian_tolerance=h)
+        for h in (0.0, 5e-5, 0.0)
     )
     fresh.settle(**at(0.0))
     held.settle(**at(0.0))
@@ -76,7 +77,8 @@ def test_a_held_gain_follows_a_slow_robot_as_closely_as_a_fresh_one() -> None:
 def test_held_steps_come_to_rest_where_settle_does() -> None:
     robot, at = reacher()
     sim, still = (
-        Simulator(robot, dt=0.05, points_per_segment=2, threads=1, hold_gain=h) for h in (5e-5, 0.0)
+        Simulator(robot, dt=0.05, points_per_segment=2, threads=1, kept_jacobian_tolerance=h)
+        for h in (5e-5, 0.0)
     )
     sim.settle(**at(0.0))
     for k in range(1, 60):
@@ -90,7 +92,8 @@ def test_held_steps_come_to_rest_where_settle_does() -> None:
 def test_a_gain_is_held_only_below_the_residual_that_is_allowed() -> None:
     robot, at = reacher()
     plain, strict, loose = (
-        Simulator(robot, dt=0.05, points_per_segment=2, threads=1, hold_gain=h) for h in (0.0, 1e-30, 1e-3)
+        Simulator(robot, dt=0.05, points_per_segment=2, threads=1, kept_jacobian_tolerance=h)
+        for h in (0.0, 1e-30, 1e-3)
     )
     tips = []
     for sim in (plain, strict, loose):
@@ -102,8 +105,8 @@ def test_a_gain_is_held_only_below_the_residual_that_is_allowed() -> None:
 
 @pytest.mark.parametrize("gain", [-1e-9, np.inf, np.nan, "much", None])
 def test_a_gain_to_hold_must_be_a_length(gain: Any) -> None:
-    with pytest.raises(InputError, match="hold_gain"):
-        Simulator(rod(), hold_gain=gain)
+    with pytest.raises(InputError, match="kept_jacobian_tolerance"):
+        Simulator(rod(), kept_jacobian_tolerance=gain)
 
 
 def backlash() -> Robot:
@@ -146,7 +149,9 @@ def made(case: str) -> tuple[Simulator, Inputs, Step]:
     """A simulator at home, its inputs there, and what it is told after."""
     robot, step, contact, hold = CASES[case]
     home = {"tendon_length": bend(robot, 0.1, -0.05)}
-    sim = Simulator(robot, N, dt=0.02, points_per_segment=8, threads=1, contact=contact, hold_gain=hold)
+    sim = Simulator(
+        robot, N, dt=0.02, points_per_segment=8, threads=1, contact=contact, kept_jacobian_tolerance=hold
+    )
     sim.settle(**home)
     return sim, home, step
 

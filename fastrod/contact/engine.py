@@ -18,6 +18,7 @@ from fastrod.contact.frames import back_by, between, blended, frames_of, longest
 from fastrod.contact.scene import ContactScene
 from fastrod.contact.tree import pack
 from fastrod.contact.trouble import NO_CONTACT_LEFT, NO_NODE_LEFT, sentence
+from fastrod.errors import Problem, ProblemSentence
 from fastrod.kernels.batch import (
     arrange,
     iterate_parallel,
@@ -321,15 +322,14 @@ class Engine:
         )
         return ports, probes
 
-    def why(self, i: int, done: float) -> str:
+    def why(self, i: int, done: float) -> ProblemSentence:
         """What stopped robot i, which came the part `done` of its step."""
         if self.trouble[i, 0] == NOTHING:
             if self.gap[i] < 0.0:
-                return (
-                    f"contact: the rod overlaps an obstacle by {-self.gap[i]:.3g} m, and no way out of "
-                    "it was found."
-                )
-            return "contact: neither the rod's rest shape nor these inputs could be solved."
+                deep = f"contact: the rod overlaps an obstacle by {-self.gap[i]:.3g} m"
+                return ProblemSentence(f"{deep}, and no way out of it was found.", Problem.CONTACT_INSIDE)
+            unsolved = "contact: neither the rod's rest shape nor these inputs could be solved."
+            return ProblemSentence(unsolved, Problem.CONTACT_DIVERGED)
         return sentence(
             self.trouble[i],
             self.scene,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fastrod.contact.scene import ContactScene
+from fastrod.errors import Problem, ProblemSentence
 from fastrod.kernels.contact.iteration import DIVERGED, INSIDE, MOVES, THROUGH, UNSOLVED
 from fastrod.types import Floats
 
@@ -12,8 +13,20 @@ NO_NODE_LEFT, NO_CONTACT_LEFT = 10, 11
 """A segment has as many contacts as nodes; the rod has as many as it may have. Beside what kernels.touch
 names."""
 
+_KINDS = {
+    MOVES: Problem.CONTACT_STUCK,
+    UNSOLVED: Problem.CONTACT_STUCK,
+    INSIDE: Problem.CONTACT_INSIDE,
+    THROUGH: Problem.CONTACT_TUNNELLED,
+    DIVERGED: Problem.CONTACT_DIVERGED,
+    NO_NODE_LEFT: Problem.NO_NODE_LEFT,
+    NO_CONTACT_LEFT: Problem.NO_CONTACT_LEFT,
+}
 
-def sentence(trouble: Floats, scene: ContactScene, n_steps: int, length: Floats, done: float) -> str:
+
+def sentence(
+    trouble: Floats, scene: ContactScene, n_steps: int, length: Floats, done: float
+) -> ProblemSentence:
     """Say what is stuck, where, by how much, and what to do; `length` (n_segments,) [m], `done` is the part
     of the step that was solved."""
     what, k, s, size = int(trouble[0]), int(trouble[1]), trouble[2], trouble[3]
@@ -43,8 +56,5 @@ def sentence(trouble: Floats, scene: ContactScene, n_steps: int, length: Floats,
         "ContactScene.max_contacts above "
         f"{scene.max_contacts}",
     }[what]
-    return (
-        f"contact: {words}."
-        if not 0.005 < done < 0.995
-        else (f"contact: after {100.0 * done:.0f} % of this step {words}.")
-    )
+    when = f"after {100.0 * done:.0f} % of this step " if 0.005 < done < 0.995 else ""
+    return ProblemSentence(f"contact: {when}{words}.", _KINDS[what])

@@ -48,7 +48,7 @@ class ChainSolver:
         self._passes = BoundarySolver(self.layout, self.params, n, threads, carry=False)
         self._rows = np.arange(n)
         self._past: list[Floats] = []
-        self._near = _NEAR * float(self.params.reach[0])
+        self._near = _NEAR * float(self.params.rod_length[0])
 
     def settle(self, given: Inputs, tolerance: float) -> Settled:
         """The next shapes of all chains: inputs as for `Simulator.settle`, each robot's own, boundary

@@ -19,9 +19,9 @@ from fastrod.hosts.capsules import Capsules, along, moved
 from fastrod.hosts.host import Motion
 from fastrod.model.robot import Robot
 from fastrod.simulator import Simulator
-from fastrod.solver.merge import taken_shape
+from fastrod.solver.merge import merge_shape
 from fastrod.solver.state import Snapshot, State
-from fastrod.types import Flags, Floats, Ints, RodShape
+from fastrod.types import Flags, Floats, Ints
 
 INPUTS = (
     "tendon_length",
@@ -359,7 +359,7 @@ class Rod:
                 which = "the rod" if len(lost) == 1 else f"rod {i} of {len(lost)}"
                 raise HostError(f"{which} is lost: {state.problems.get(i, 'its shape is not finite')}")
             unknown = {int(i): "its shape is not finite." for i in np.flatnonzero(lost)}
-            shape = taken_shape(RodShape(*(getattr(state, name) for name in RodShape._fields)), before, lost)
+            shape = merge_shape(state.as_shape(), before, lost)
             state = replace(
                 state, **shape._asdict(), ok=state.ok & ~lost, problems=unknown | dict(state.problems)
             )

@@ -33,68 +33,39 @@ from .contact.problem import SceneArrays
 from .contact.rod_proximity import search_rods
 from .contact.surface import ray_hit
 from .jit import LANES, entry, parallel_entry
-from .rod.chunk import pass_chunk
-from .rod.gather import feed_forward
-from .rod.shape import Lanes
+from .rod.chunk import Batch, Chunk, Mode, Output, pass_chunk
+from .rod.gather import predict
+from .rod.lanes import Lanes
+from .rod.workspace import Run
 
 
 @entry
 def move_to_inputs(robots: Lanes, ports: Ports, params: Params, memory: Memory, layout: Layout) -> None:
-    """`feed_forward` of these robots, without a pass."""
-    feed_forward(robots, len(robots), ports, params, memory, layout)
+    """`predict` of these robots, without a pass."""
+    predict(robots, len(robots), ports, params, memory, layout)
 
 
 def _pass(
-    robots: Lanes,
+    run: Run,
     params: Params,
     ports: Ports,
     layout: Layout,
     memory: Memory,
     shape: RodShape,
     response: Response,
-    probes: PointLoads,
-    scratch: Lanes,
-    n_col: int,
-    feed: bool,
-    carry: bool,
-    update: bool,
-    process: float,
-    noise: float,
+    loads: PointLoads,
 ) -> None:
-    """One forward pass of the robots with these indices, chunk by chunk, in as many parts as `scratch` has
-    rows.
-
-    `scratch` is (n_parts, scratch_size). Flags: `feed` moves x to first order to the new inputs before the
-    pass; `carry` keeps the covariance between passes; `update` corrects x after it with P- = P + `process`
-    and the residual variance
-    `noise` [m^2]. Which part does a chunk changes no bit of it.
-    """
-    n, n_parts = len(robots), scratch.shape[0]
-    for part in prange(n_parts):
+    """One forward pass of the robots of `run`, chunk by chunk, in as many tasks as its scratch has rows."""
+    n, n_tasks = len(run.robots), run.scratch.shape[0]
+    for task in prange(n_tasks):
+        batch, output = Batch(params, ports, layout, memory), Output(shape, response, loads)
+        mode = Mode(run.n_col, run.predict, run.propagate, run.update, run.process, run.noise)
         lanes = np.empty(LANES, np.int64)
-        for start in range(part * LANES, n, n_parts * LANES):
+        for start in range(task * LANES, n, n_tasks * LANES):
             count = min(LANES, n - start)
             for w in range(LANES):
-                lanes[w] = robots[start + min(w, count - 1)]
-            pass_chunk(
-                lanes,
-                count,
-                params,
-                ports,
-                layout,
-                memory,
-                shape,
-                response,
-                probes,
-                start,
-                scratch[part],
-                n_col,
-                feed,
-                carry,
-                update,
-                process,
-                noise,
-            )
+                lanes[w] = run.robots[start + min(w, count - 1)]
+            pass_chunk(Chunk(lanes, count, start), batch, output, run.scratch[task], mode)
 
 
 def _iterate(

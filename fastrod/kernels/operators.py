@@ -1,8 +1,9 @@
-"""Operators with memory on the lengths of the wires: rows (robots or parameter sets) x steps x wires.
+"""Operators with memory on the lengths of the tendons: rows (robots or parameter sets) x steps x tendons.
 
-Each changes `x` (n_rows, n_steps, n_wires) in place from command to effect and carries `memory` (n_rows, ...)
-on; nan in the memory means that the wire begins at rest at its first length. `dt` (n_steps,) is the time
-before each step [s]. Parameters have the shape (n_rows, n_wires), so that every wire may have its own.
+Each changes `x` (n_rows, n_steps, n_tendons) in place from command to effect and carries `memory` (n_rows,
+...)
+on; nan in the memory means that the tendon begins at rest at its first length. `dt` (n_steps,) is the time
+before each step [s]. Parameters have the shape (n_rows, n_tendons), so that every tendon may have its own.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ BUFFER = 128
 @entry
 def play(x: Floats, memory: Floats, half_width: Floats, rounding: Floats) -> None:
     """Backlash: the output p stays until the input has crossed the gap, |x - p| <= w; with a rounding c the
-    mean of three plays of half widths w (1 - c), w, w (1 + c). memory (n_rows, 3 n_wires): p."""
+    mean of three plays of half widths w (1 - c), w, w (1 + c). memory (n_rows, 3 n_tendons): p."""
     n = x.shape[2]
     for r in range(x.shape[0]):
         for w in range(n):
@@ -59,7 +60,7 @@ def elastoplastic(
     (Iwan, Prandtl and Ishlinskii): z_j = min(1, max(-1, z_j + x' / r_j)), out x - a (1 + g angle) mean z_j.
 
     The radii are spread evenly in their logarithm over r exp(-s) to r exp(s). angle (n_rows, n_steps,
-    n_wires) wrapped by the wire [rad]; memory (n_rows, (1 + SLIDERS) n_wires): x, z_j.
+    n_tendons) wrapped by the tendon [rad]; memory (n_rows, (1 + SLIDERS) n_tendons): x, z_j.
     """
     n = x.shape[2]
     for r in range(x.shape[0]):
@@ -86,14 +87,14 @@ def elastoplastic(
 
 
 @entry
-def relaxation(x: Floats, memory: Floats, share: Floats, time_constant: Floats, dt: Floats) -> None:
+def relaxation(x: Floats, memory: Floats, fraction: Floats, time_constant: Floats, dt: Floats) -> None:
     """Standard linear solid: out x - c (x - y), tau y' = x - y, x linear in between; memory (n_rows, 2
-    n_wires): x, y."""
+    n_tendons): x, y."""
     n = x.shape[2]
     for r in range(x.shape[0]):
         for w in range(n):
             before, y = memory[r, w], memory[r, n + w]
-            c, tau = share[r, w], time_constant[r, w]
+            c, tau = fraction[r, w], time_constant[r, w]
             if math.isnan(before):
                 before = x[r, 0, w]
                 y = before
@@ -109,7 +110,8 @@ def relaxation(x: Floats, memory: Floats, share: Floats, time_constant: Floats, 
 
 @entry
 def second_order(x: Floats, memory: Floats, period: Floats, damping: Floats, dt: Floats) -> None:
-    """T^2 y'' + 2 z T y' + y = x, exact for x linear in between; T = 0 is y = x. memory (n_rows, 3 n_wires):
+    """T^2 y'' + 2 z T y' + y = x, exact for x linear in between; T = 0 is y = x. memory (n_rows, 3
+    n_tendons):
     x, y, y'."""
     n = x.shape[2]
     for r in range(x.shape[0]):
@@ -137,9 +139,10 @@ def second_order(x: Floats, memory: Floats, period: Floats, damping: Floats, dt:
 
 
 @entry
-def yielding(bend: Floats, memory: Floats, share: Floats, yield_at: Floats) -> None:
+def yielding(bend: Floats, memory: Floats, fraction: Floats, yield_at: Floats) -> None:
     """Plastic set of bends (n_rows, n_steps, n_segments, 2), in place: out b + c p, p dragged along once |b -
-    p| exceeds y, in any direction; it begins at the straight rod. memory (n_rows, 2 n_segments): p; share and
+    p| exceeds y, in any direction; it begins at the straight rod. memory (n_rows, 2 n_segments): p; fraction
+    and
     yield_at (n_rows, n_segments)."""
     for r in range(bend.shape[0]):
         for k in range(bend.shape[2]):
@@ -150,11 +153,11 @@ def yielding(bend: Floats, memory: Floats, share: Floats, yield_at: Floats) -> N
                 dx, dy = bend[r, i, k, 0] - px, bend[r, i, k, 1] - py
                 size = math.sqrt(dx * dx + dy * dy)
                 if size > yield_at[r, k]:
-                    part = 1.0 - yield_at[r, k] / size
-                    px += part * dx
-                    py += part * dy
-                bend[r, i, k, 0] += share[r, k] * px
-                bend[r, i, k, 1] += share[r, k] * py
+                    slip = 1.0 - yield_at[r, k] / size
+                    px += slip * dx
+                    py += slip * dy
+                bend[r, i, k, 0] += fraction[r, k] * px
+                bend[r, i, k, 1] += fraction[r, k] * py
             memory[r, 2 * k], memory[r, 2 * k + 1] = px, py
 
 
@@ -162,8 +165,8 @@ def yielding(bend: Floats, memory: Floats, share: Floats, yield_at: Floats) -> N
 def delay(x: Floats, memory: Floats, lag: Floats, dt: Floats) -> None:
     """Out x(t - d), a monotone cubic through the four samples around it, linear where there are not four.
 
-    lag (n_rows,) [s]. memory (n_rows, 1 + BUFFER (1 + n_wires)): count, then clock and lengths of each past
-    step. Before the first step the wires are taken as at rest there.
+    lag (n_rows,) [s]. memory (n_rows, 1 + BUFFER (1 + n_tendons)): count, then clock and lengths of each past
+    step. Before the first step the tendons are taken as at rest there.
     """
     n = x.shape[2]
     width = 1 + n
@@ -174,15 +177,15 @@ def delay(x: Floats, memory: Floats, lag: Floats, dt: Floats) -> None:
         clock = memory[r, 1 + ((count - 1) % BUFFER) * width] if count > 0 else 0.0
         for i in range(x.shape[1]):
             clock += dt[i] if count > 0 else 0.0
-            slot = 1 + (count % BUFFER) * width
-            memory[r, slot] = clock
+            record = 1 + (count % BUFFER) * width
+            memory[r, record] = clock
             for w in range(n):
-                memory[r, slot + 1 + w] = x[r, i, w]
+                memory[r, record + 1 + w] = x[r, i, w]
             count += 1
             if lag[r] <= 0.0:
                 continue
             wanted = clock - lag[r]
-            newest = newer = older = slot
+            newest = newer = older = record
             steps = 0
             for back in range(1, min(count, BUFFER)):
                 newest, newer = newer, older
@@ -192,28 +195,28 @@ def delay(x: Floats, memory: Floats, lag: Floats, dt: Floats) -> None:
                     break
             oldest = 1 + ((count - 2 - steps) % BUFFER) * width
             span = memory[r, newer] - memory[r, older]
-            part = (wanted - memory[r, older]) / span if span > 0.0 else 1.0
-            part = min(max(part, 0.0), 1.0)
+            fraction = (wanted - memory[r, older]) / span if span > 0.0 else 1.0
+            fraction = min(max(fraction, 0.0), 1.0)
             before = memory[r, older] - memory[r, oldest]
             after = memory[r, newest] - memory[r, newer] if steps >= 2 else 0.0
             cubic = steps >= 1 and steps + 1 < min(count, BUFFER) and before > 0.0 and span > 0.0
             for w in range(n):
                 old, new = memory[r, older + 1 + w], memory[r, newer + 1 + w]
-                out = old + part * (new - old)
+                out = old + fraction * (new - old)
                 if cubic:
                     here = (new - old) / span
                     earlier = (old - memory[r, oldest + 1 + w]) / before
                     # between the last two samples there is none beyond: the parabola's slope at its end
                     later = (memory[r, newest + 1 + w] - new) / after if after > 0.0 else 2.0 * here - earlier
-                    # slopes at both ends; zero where the wire reverses and at most three times either
+                    # slopes at both ends; zero where the tendon reverses and at most three times either
                     # neighbour, so that nothing
                     # overshoots (Fritsch and Carlson 1980)
                     a = (earlier * span + here * before) / (span + before) if earlier * here > 0.0 else 0.0
-                    reach = after if after > 0.0 else before
-                    b = (here * reach + later * span) / (span + reach) if here * later > 0.0 else 0.0
+                    ahead = after if after > 0.0 else before
+                    b = (here * ahead + later * span) / (span + ahead) if here * later > 0.0 else 0.0
                     a = math.copysign(min(abs(a), 3.0 * abs(earlier), 3.0 * abs(here)), a)
                     b = math.copysign(min(abs(b), 3.0 * abs(here), 3.0 * abs(later)), b)
-                    u = part * (1.0 - part) * span
-                    out += u * ((1.0 - part) * (a - here) - part * (b - here))
+                    u = fraction * (1.0 - fraction) * span
+                    out += u * ((1.0 - fraction) * (a - here) - fraction * (b - here))
                 x[r, i, w] = out
         memory[r, 0] = float(count)

@@ -164,9 +164,9 @@ def exp_map_variation(o: Vec, coefficients: Vec, do: Vec) -> Vec:
     """psi of a change do of the vector o, from `exp_map`'s coefficients."""
     a, b, c = coefficients
     along = b * dot(o, do)
-    turn = cross(o, do)
+    across = cross(o, do)
     return (
-        a * do[0] + along * o[0] - c * turn[0],
-        a * do[1] + along * o[1] - c * turn[1],
-        a * do[2] + along * o[2] - c * turn[2],
+        a * do[0] + along * o[0] - c * across[0],
+        a * do[1] + along * o[1] - c * across[1],
+        a * do[2] + along * o[2] - c * across[2],
     )

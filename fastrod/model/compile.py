@@ -75,11 +75,11 @@ def _params(robots: Sequence[Robot]) -> Params:
     for i, robot in enumerate(robots):
         for t, (tendon, end) in enumerate(zip(robot.tendons, robot.tendon_segment, strict=True)):
             offset[i, : end + 1, t] = tendon.position(int(end) + 1)
-    reach = np.array([robot.length for robot in robots])
+    length = np.array([robot.length for robot in robots])
     softest = np.array([min(min(s.bending_stiffness) for s in robot.segments) for robot in robots])
     distance = np.linalg.norm(offset, axis=-1)
     mean_offset = (
-        distance.sum((1, 2)) / np.maximum((distance > 0.0).sum((1, 2)), 1) if robots[0].n_tendons else reach
+        distance.sum((1, 2)) / np.maximum((distance > 0.0).sum((1, 2)), 1) if robots[0].n_tendons else length
     )
     return Params(
         length=np.array([[s.length for s in robot.segments] for robot in robots]),
@@ -91,9 +91,9 @@ def _params(robots: Sequence[Robot]) -> Params:
         unilateral=np.array([[t.unilateral for t in row] for row in tendons], dtype=bool).reshape(
             len(robots), -1
         ),
-        moment_scale=softest / reach,
-        tension_scale=softest / (mean_offset * reach),
-        reach=reach,
+        moment_scale=softest / length,
+        tension_scale=softest / (mean_offset * length),
+        rod_length=length,
     )
 
 

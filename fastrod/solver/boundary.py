@@ -12,7 +12,7 @@ import numpy as np
 from fastrod.errors import InputError
 from fastrod.kernels.batch import move_to_inputs, pass_parallel, pass_serial
 from fastrod.kernels.jit import LANES
-from fastrod.kernels.rod.chunk import scratch_size
+from fastrod.kernels.rod.workspace import Mode, Run, scratch_size
 from fastrod.solver.gpu.device import Device
 from fastrod.types import Flags, Floats, Ints, Layout, Memory, Params, PointLoads, Ports, Response, RodShape
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _config: Any = numba.config
 _SMALL = 4 * LANES  # robots below which starting threads costs more than it saves
-NO_PROBES = PointLoads(
+NO_LOADS = PointLoads(
     np.empty((0, 0), np.int64),
     np.empty((0, 0, 3)),
     np.empty((0, 0, 3)),
@@ -64,15 +64,16 @@ class BoundarySolver:
     """
 
     def __init__(
-        self, layout: Layout, params: Params, n_robots: int, threads: int, carry: bool, device: Device = "cpu"
+        self,
+        layout: Layout,
+        params: Params,
+        n_robots: int,
+        threads: int,
+        propagate: bool,
+        device: Device = "cpu",
     ) -> None:
-        self.layout, self.params, self.n_robots, self.threads, self.carry = (
-            layout,
-            params,
-            n_robots,
-            threads,
-            carry,
-        )
+        self.layout, self.params, self.n_robots, self.threads = layout, params, n_robots, threads
+        self.propagate = propagate
         self.device: Device = device
         self._memory: Memory = self._new_memory(follower=False, track_force=False)
         self._resident: Resident | None = None
@@ -168,7 +169,7 @@ class BoundarySolver:
         n_x += 3 if follower else 0
         return [
             (n, n_x),
-            (n if self.carry else 0, n_x * (n_x + 1) // 2),
+            (n if self.propagate else 0, n_x * (n_x + 1) // 2),
             (n, n_x, n_e + (3 if track_force else 0)),
             (n, n_x),
             (n, n_x),
@@ -260,62 +261,30 @@ class BoundarySolver:
         shape: RodShape,
         *,
         response: Response | None = None,
-        feed: bool = False,
-        carry: bool = False,
+        predict: bool = False,
+        propagate: bool = False,
         update: bool = True,
         process: float = 1.0,
         noise: float = 1.0,
         n_col: int | None = None,
-        probes: PointLoads = NO_PROBES,
+        loads: PointLoads = NO_LOADS,
     ) -> None:
         """One forward pass of these robots (`kernels.batch`). What it writes into the shape is there after
         `collect`."""
-        n_probes = probes.node.shape[1]
+        n_loads = loads.node.shape[1]
         if n_col is None:
-            n_col = self.n_x + 3 * n_probes if n_probes else self.n_columns(ports)
+            n_col = self.n_x + 3 * n_loads if n_loads else self.n_columns(ports)
         if response is None:
             response = Response(np.empty((0, 0, 0)), np.empty((0, 0, 0)), np.empty((0, 0)))
+        mode = Mode(n_col, predict, propagate, update, float(process), float(noise))
         if self._runner is not None and self._resident is not None:
-            self._runner.run(
-                rows,
-                self.params,
-                ports,
-                self.layout,
-                self._resident,
-                shape,
-                response,
-                n_col,
-                self.n_residuals(ports),
-                feed,
-                carry,
-                update,
-                process,
-                noise,
-            )
+            self._runner.run(rows, self.params, ports, self.layout, self._resident, shape, response, mode)
             return
-        parts = 1 if len(rows) <= _SMALL else min(self.threads, -(-len(rows) // LANES))
-        size = scratch_size(
-            len(self.layout.tendon_segment), self.n_x, n_col, self.n_residuals(ports), n_probes
-        )
-        scratch = np.empty((parts, size))
-        body = pass_serial if parts == 1 else pass_parallel
-        body(
-            rows,
-            self.params,
-            ports,
-            self.layout,
-            self._memory,
-            shape,
-            response,
-            probes,
-            scratch,
-            n_col,
-            feed,
-            carry,
-            update,
-            process,
-            noise,
-        )
+        tasks = 1 if len(rows) <= _SMALL else min(self.threads, -(-len(rows) // LANES))
+        n_tendons, n_e = len(self.layout.tendon_segment), self.n_residuals(ports)
+        scratch = np.empty((tasks, scratch_size(n_tendons, self.n_x, n_col, n_e, n_loads)))
+        body = pass_serial if tasks == 1 else pass_parallel
+        body(Run(rows, scratch, *mode), self.params, ports, self.layout, self._memory, shape, response, loads)
 
     def collect(self, shape: RodShape, only: str | None = None) -> RodShape:
         """The shape with what the passes wrote into it, or into one field: on a GPU that is still there."""

@@ -1,17 +1,23 @@
-"""Robots whose observer pass diverged are settled on the same inputs; the others keep every bit."""
+"""Robots whose observer pass diverged are settled on the same inputs; robots pressed beyond what a rod
+carries
+are not ok, however they were solved; the others keep every bit."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
 from fastrod.solver.boundary import BoundarySolver
 from fastrod.solver.settle import Pass, load_parameter, settle
-from fastrod.types import Flags, Floats, Ints, Ports
+from fastrod.types import Flags, Floats, Ints, Params, Ports, RodShape
 
 TOLERANCE = 1e-9  # m: that of `Simulator.settle`
-# of F l^2/EI: on three shipped robots `settle` solves all of 180 random tip forces of 20, 8 to 100 % of those
-# of
-# 50, and at most 2 % of those of 200
+# of F l^2/EI: on three shipped robots `settle` solves all of 180 random tip forces of 20, 8 to 100 % of
+# those of
+# 50, and at most 2 % of those of 200. It is also three times pi^2, at which a segment whose ends the tendons
+# hold
+# buckles: a straight rod under more is solved to rounding, but no rod stands like that.
 _HOPELESS = 30.0
 
 
@@ -59,10 +65,66 @@ def overloaded(passes: BoundarySolver, ports: Ports, row: int) -> float:
     return size if size > _HOPELESS else 0.0
 
 
+def pressed(passes: BoundarySolver, ports: Ports, shape: RodShape, rows: Ints) -> Floats:
+    """(n_rows,) compression of each robot's worst segment, P l^2/EI of that segment; zero where the rod is
+    pulled.
+
+    P is the internal force along the chord from base to tip, times chord / length, at that end where it
+    presses
+    less: all of the force where the rod is straight, little where it has buckled and stands in a stable
+    shape.
+    """
+
+    def of(a: Floats) -> Floats:
+        return a if len(a) == 1 else a[rows]
+
+    params = passes.params
+    length = of(params.length + ports.extension)
+    force = of(ports.tip_force)
+    if len(ports.follower_force):
+        force = force + np.einsum("nij,nj->ni", shape.tip_rotation[rows], of(ports.follower_force))
+    beyond = np.einsum("nk,nka->na", length, of(ports.line_force).mean(2))
+    if len(ports.node_force):
+        beyond = beyond + of(ports.node_force).sum(1)
+    total = length.sum(1)[:, None]
+    chord = (shape.tip_position[rows] - of(ports.base_pose)[:, :3]) / total
+    along = np.minimum(-(force * chord).sum(1), -((force + beyond) * chord).sum(1))
+    stiffness = of(ports.stiffness).max(2)[:, :, :2].min(2)
+    return np.asarray(np.maximum(along, 0.0) * (length**2 / stiffness).max(1))
+
+
+def unstable(passes: BoundarySolver, ports: Ports, shape: RodShape, rows: Ints) -> Ints:
+    """Those of `rows` whose solved shape is an unstable balance, far beyond the load at which a segment
+    buckles."""
+    if not len(rows) or _largest_load(passes.params, ports) <= _HOPELESS:
+        return rows[:0]
+    rows = rows[load_parameter(rows, passes.params, ports) > _HOPELESS]
+    return rows[pressed(passes, ports, shape, rows) > _HOPELESS]
+
+
+def _largest_load(params: Params, ports: Ports) -> float:
+    """A cheap upper bound of the load parameter of all robots: a step asks for it every time. nan, where a
+    robot
+    whose input cannot be used has one."""
+
+    def size(a: Floats) -> float:
+        return math.sqrt(3.0) * float(np.abs(a).max(initial=0.0))
+
+    reach, segments = float(params.rod_length.max()), params.length.shape[1]
+    force = (
+        size(ports.tip_force)
+        + size(ports.tip_moment) / float(params.rod_length.min())
+        + size(ports.follower_force)
+    )
+    force += size(ports.line_force) * (reach + segments * float(np.abs(ports.extension).max(initial=0.0)))
+    force += size(ports.node_force) * ports.node_force.shape[1]
+    return force * reach / float(params.moment_scale.min())
+
+
 def what_to_do(passes: BoundarySolver, ports: Ports, row: int) -> str:
     """The end of a sentence about a robot without a shape: what to change."""
     if size := overloaded(passes, ports, row):
-        force = _of(passes.params.moment_scale, row) / _of(passes.params.reach, row)
+        force = _of(passes.params.moment_scale, row) / _of(passes.params.rod_length, row)
         return f"its loads are {size:.3g} times what bends it, EI/l^2 = {force:.3g} N: give less load"
     return "give inputs that a rod of this length can follow, or come there in smaller changes"
 

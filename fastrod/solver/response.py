@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from fastrod.kernels.jit import LANES
-from fastrod.solver.boundary import NO_PROBES, BoundarySolver
+from fastrod.solver.boundary import NO_LOADS, BoundarySolver
 from fastrod.types import Floats, Ints, Memory, Params, PointLoads, Ports, Response, RodShape
 
 _ROWS = 1024  # of one pass: robots times copies of them
@@ -25,22 +25,22 @@ Relocate = Callable[[Floats], Mapping[str, Floats]]
 class Linear:
     """Passes that change nothing, at the present boundary of `rows`, with their linear response.
 
-    `probes` are the contact forces that act on each row of `rows`. The last one is at the tip and carries
+    `loads` are the contact forces that act on each row of `rows`. The last one is at the tip and carries
     none: its columns are those of a tip force.
     """
 
     def __init__(
-        self, passes: BoundarySolver, rows: Ints, ports: Ports, probes: PointLoads = NO_PROBES
+        self, passes: BoundarySolver, rows: Ints, ports: Ports, loads: PointLoads = NO_LOADS
     ) -> None:
-        self.passes, self.rows, self.ports, self.probes = passes, rows, ports, probes
+        self.passes, self.rows, self.ports, self.loads = passes, rows, ports, loads
 
     def respond(self, columns: bool = True) -> tuple[Response, RodShape]:
         """Residuals, tip and their derivatives by the unknowns and, last, by a tip force; rows that are not
         asked are nan."""
         passes, ports = self.passes, self.ports
-        n, n_e, n_probes = passes.n_robots, passes.n_residuals(ports), self.probes.node.shape[1]
-        extra = 3 * n_probes if n_probes else 0 if len(ports.follower_force) else 3
-        n_col = passes.n_x + extra if columns or n_probes else 0
+        n, n_e, n_loads = passes.n_robots, passes.n_residuals(ports), self.loads.node.shape[1]
+        extra = 3 * n_loads if n_loads else 0 if len(ports.follower_force) else 3
+        n_col = passes.n_x + extra if columns or n_loads else 0
         holes = len(self.rows) < n
         response = Response(np.empty((n, n_e, n_col)), np.empty((n, 6, n_col)), np.empty((n, n_e)))
         if holes:
@@ -55,7 +55,7 @@ class Linear:
             update=False,
             noise=1e-20,
             n_col=n_col,
-            probes=self.probes,
+            loads=self.loads,
         )
         return response, passes.collect(shape)
 
@@ -126,8 +126,8 @@ class Linear:
             twin.ports,
             shape,
             response=response,
-            feed=True,
-            carry=passes.carry,
+            predict=True,
+            propagate=passes.propagate,
             process=process,
             noise=noise,
         )
@@ -155,7 +155,7 @@ class Linear:
         m = n_inputs + (3 if turning else 0)
         delta = np.full((m, n), 1e-4)
         delta[: len(pulled)] *= params.tension_scale
-        delta[len(pulled) : n_inputs] *= params.reach
+        delta[len(pulled) : n_inputs] *= params.rod_length
         moved = {
             name: np.empty((1 + 2 * m, n, getattr(ports, name).shape[1]))
             for name in ("tension", "extension", "base_pose")
@@ -222,19 +222,19 @@ class Linear:
             Params(*(a if len(a) == 1 else copied(a) for a in params)),
             Memory(*map(copied, passes.peek())),
         )
-        probes = PointLoads(*map(copied, self.probes)) if self.probes.node.shape[1] else self.probes
+        loads = PointLoads(*map(copied, self.loads)) if self.loads.node.shape[1] else self.loads
         rows = (self.rows + n * np.arange(k)[:, None]).ravel()
-        return Linear(twin, rows, ports, probes)
+        return Linear(twin, rows, ports, loads)
 
     def by_force(self) -> Floats:
         """(n, 6, 3) change of the tip per tip force."""
         response, _ = self.respond()
         n_x, params = self.passes.n_x, self.passes.params
         free, load = response.residual[:, :, :n_x], response.residual[:, :, -3:]
-        if len(self.ports.follower_force) and not self.probes.node.shape[1]:
+        if len(self.ports.follower_force) and not self.loads.node.shape[1]:
             # the follower force is an unknown; a dead force enters as its column, but not its own row
             load = load.copy()
-            load[:, -3:] -= (params.reach**2 / params.moment_scale)[:, None, None] * np.eye(3)
+            load[:, -3:] -= (params.rod_length**2 / params.moment_scale)[:, None, None] * np.eye(3)
         return np.asarray(response.tip[:, :, -3:] - response.tip[:, :, :n_x] @ (inverse(free) @ load))
 
 

@@ -48,8 +48,23 @@ def settle(
         cold_start(left, layout, params, ports, boundary.memory)
         left = _newton(left, boundary, ports, tolerance, run, passes)
     left = np.sort(np.concatenate([left, steep]))
+    # hundreds of times what bends a rod by a radian: steps without end; a pull may be solved at once all the
+    # same
+    heavy = left[_longest_stride(left, params, ports) < _SMALLEST_LOAD_STEP]
+    if len(heavy):
+        cold_start(heavy, layout, params, ports, boundary.memory)
+        stuck = _newton(heavy, boundary, ports, tolerance, run, passes)
+        left = np.setdiff1d(left, np.setdiff1d(heavy, stuck))
+        heavy = stuck
     if len(left):
-        left = _continuation(left, boundary, ports, tolerance, run, passes)
+        lost = _continuation(np.setdiff1d(left, heavy), boundary, ports, tolerance, run, passes)
+        if len(heavy):
+            cold_start(heavy, layout, params, _loaded(ports, np.zeros(boundary.n_robots)), boundary.memory)
+        left = np.sort(np.concatenate([lost, heavy]))
+        if len(left):
+            x = boundary.x[left]
+            run(left, ports)  # once: the residual of a robot that is lost is that of all of its loads
+            boundary.x[left] = x
     passes[left] = -1
     return passes
 
@@ -63,13 +78,13 @@ def load_parameter(rows: Ints, params: Params, ports: Ports) -> Floats:
 
     length = params.length + ports.extension
     force = np.linalg.norm(of(ports.tip_force), axis=1) + np.linalg.norm(of(ports.tip_moment), axis=1) / of(
-        params.reach
+        params.rod_length
     )
     force = force + (of(length) * np.linalg.norm(of(ports.line_force), axis=-1).max(-1)).sum(1)
     for extra in (ports.follower_force[:, None], ports.node_force):
         if len(extra):
             force = force + np.linalg.norm(of(extra), axis=-1).sum(1)
-    return np.broadcast_to(force * of(params.reach) / of(params.moment_scale), len(rows))
+    return np.broadcast_to(force * of(params.rod_length) / of(params.moment_scale), len(rows))
 
 
 def _newton(
@@ -154,7 +169,7 @@ def _still(step: Floats, rows: Ints, layout: Layout, params: Params, small: Floa
 
     if layout.paper:
         bend = np.abs(step).max(1) / of(params.moment_scale)
-        return np.asarray(bend * of(params.reach) <= small)
+        return np.asarray(bend * of(params.rod_length) <= small)
     n_free = len(layout.free_tendon)
     if not n_free:
         return np.ones(len(step), bool)
@@ -168,18 +183,12 @@ def _continuation(
     not arrive."""
     layout, params = boundary.layout, boundary.params
     part = np.zeros(boundary.n_robots)
-    # a longer stride than a load parameter of three could land on another equilibrium
     longest = np.full(boundary.n_robots, 0.25)
-    longest[rows] = np.minimum(0.25, 0.5 * _STEEP / np.maximum(load_parameter(rows, params, ports), 1e-9))
+    longest[rows] = _longest_stride(rows, params, ports)
     stride = longest.copy()
-    # hundreds of times what bends a rod by a radian: steps without end
-    heavy = rows[longest[rows] < _SMALLEST_LOAD_STEP]
     unloaded = _loaded(ports, part)
     cold_start(rows, layout, params, unloaded, boundary.memory)
-    if len(heavy):
-        run(heavy, ports)  # once: their residual is that of these loads, and not of none
-        cold_start(heavy, layout, params, unloaded, boundary.memory)
-    lost = np.union1d(heavy, _newton(np.setdiff1d(rows, heavy), boundary, unloaded, tolerance, run, passes))
+    lost = _newton(rows, boundary, unloaded, tolerance, run, passes)
     rows = np.setdiff1d(rows, lost)
     held = boundary.x.copy()
     while len(rows):
@@ -194,6 +203,13 @@ def _continuation(
         lost = np.concatenate([lost, missed[stride[missed] < _SMALLEST_LOAD_STEP]])
         rows = np.setdiff1d(rows[part[rows] < 1.0], lost)
     return np.sort(lost)
+
+
+def _longest_stride(rows: Ints, params: Params, ports: Ports) -> Floats:
+    """Part of the loads that one step of the continuation may bring: more than a load parameter of three
+    could land
+    on another equilibrium."""
+    return np.asarray(np.minimum(0.25, 0.5 * _STEEP / np.maximum(load_parameter(rows, params, ports), 1e-9)))
 
 
 def _loaded(ports: Ports, part: Floats) -> Ports:

@@ -11,10 +11,10 @@ import numpy as np
 
 from fastrod.contact.contacts import Contacts
 from fastrod.contact.engine import ContactSnapshot
-from fastrod.errors import InputError
+from fastrod.errors import InputError, Problem, ProblemSentence, shown
 from fastrod.model.robot import Robot
 from fastrod.solver.inputs import Inputs
-from fastrod.types import Flags, Floats, Ints, Memory, Params, Ports
+from fastrod.types import Flags, Floats, Ints, Memory, Params, Ports, RodShape
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,9 +80,21 @@ class State:
     """(n_robots,) forward passes that were spent: after `step` 1, or more where it settled a robot whose pass
     diverged; -1 where no shape was found, 0 where bad input left nothing to do."""
     problems: Mapping[int, str]
-    """Robot index -> what is wrong with it, for the robots that are not ok."""
+    """Robot index -> what is wrong with it, for the robots that are not ok: a sentence (`problem_kinds`)."""
     contacts: Contacts | None = None
     """What touches what; None without a contact scene."""
+
+    @property
+    def problem_kinds(self) -> dict[int, Problem]:
+        """Robot index -> the kind of its problem, for the robots that are not ok."""
+        return {
+            i: said.kind if isinstance(said, ProblemSentence) else Problem.DIVERGED
+            for i, said in self.problems.items()
+        }
+
+    def as_shape(self) -> RodShape:
+        """The arrays that a pass writes."""
+        return RodShape(*(getattr(self, name) for name in RodShape._fields))
 
     def __repr__(self) -> str:
         n = len(self.ok)
@@ -125,3 +137,24 @@ class Snapshot(NamedTuple):
     time: Floats
     """(n_robots,) as effects count it [s]; nan before the first step."""
     contact: ContactSnapshot | None
+
+
+def check_snapshot(
+    snapshot: Snapshot, n_robots: int, n_rows: int, effects: list[Floats], has_contact: bool
+) -> None:
+    """Raise `InputError` where a snapshot is none of the simulator with so many robots and commanded tendons,
+    these memories of effects, and perhaps a contact scene."""
+    if not isinstance(snapshot, Snapshot):
+        raise InputError(f"the snapshot is {shown(snapshot)}; give what Simulator.snapshot() returned.")
+    then = snapshot.memory
+    if (len(then.x), then.length_before.shape[1]) != (n_robots, n_rows):
+        raise InputError("the snapshot is of another simulator; its robots, tendons or their number differ.")
+    if [a.shape for a in snapshot.effects] != [a.shape for a in effects]:
+        raise InputError("the snapshot is of another simulator; its effects differ.")
+    if (snapshot.contact is None) == has_contact:
+        raise InputError("the snapshot is of another simulator; only one of them has a contact scene.")
+
+
+def copied(memory: Memory) -> Memory:
+    """A memory with arrays of its own."""
+    return Memory(*(a.copy() for a in memory))

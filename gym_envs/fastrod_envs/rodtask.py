@@ -31,8 +31,8 @@ class RodTask(Task):
 
     points_per_segment: ClassVar[int]
     outputs: ClassVar[Any] = "tip"
-    hold_gain: ClassVar[float] = 5e-5
-    """`Simulator(hold_gain=...)` [m]."""
+    kept_jacobian_tolerance: ClassVar[float] = 5e-5
+    """`Simulator(kept_jacobian_tolerance=...)` [m]."""
     loaded: ClassVar[bool] = False
     """An episode brings loads of its own: robots settle under them when it begins."""
     on_gpu: ClassVar[bool] = True
@@ -87,7 +87,7 @@ class RodTask(Task):
             outputs=self.outputs,
             threads=options.threads,
             contact=contact,
-            hold_gain=self.hold_gain,
+            kept_jacobian_tolerance=self.kept_jacobian_tolerance,
             feel_contact=feel_contact,
             device=options.device,
         )

@@ -288,7 +288,7 @@ def test_odd_rows_and_arclengths_are_refused_and_change_nothing(rows: Any, what:
             "observer",
             "threads",
             "contact",
-            "hold_gain",
+            "kept_jacobian_tolerance",
         ]
     ),
     value=odd_values,

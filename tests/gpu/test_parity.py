@@ -140,7 +140,7 @@ def test_an_observer_that_carries_its_covariance() -> None:
 
 
 def test_a_held_gain() -> None:
-    here, there = pair(rod(), hold_gain=1e-3, outputs="tip")
+    here, there = pair(rod(), kept_jacobian_tolerance=1e-3, outputs="tip")
     for k in range(4):
         a, b = (sim.step(inputs(rod(), k)["tendon_length"]) for sim in (here, there))
     assert_allclose(b.tip_position, a.tip_position, atol=1e-11)

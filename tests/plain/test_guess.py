@@ -84,15 +84,15 @@ def off_the_twin(case: Case, n: int) -> float:
     n_free = len(layout.free_tendon)
     for i in range(n):
         x, u = guess(i, *case)
-        s = min(i, len(params.reach) - 1)
+        s = min(i, len(params.rod_length) - 1)
         moment, tension = params.moment_scale[s], params.tension_scale[s]
         units = np.repeat(
-            [moment, tension, moment / params.reach[s]], [n_base, n_free, len(x) - n_base - n_free]
+            [moment, tension, moment / params.rod_length[s]], [n_base, n_free, len(x) - n_base - n_free]
         )
         assert memory.x.shape[1] == len(x)
         for got, wanted in (
             (memory.x[i] / units, x / units),
-            (memory.curvature_guess[i] * params.reach[s], u * params.reach[s]),
+            (memory.curvature_guess[i] * params.rod_length[s], u * params.rod_length[s]),
         ):
             largest = max(largest, float((np.abs(got - wanted) / (1.0 + np.abs(wanted))).max(initial=0.0)))
     return largest

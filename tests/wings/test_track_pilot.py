@@ -63,7 +63,11 @@ def episode(path: str, seed: int, robot: Robot, n_steps: int = 120) -> dict[str,
 def follow(pilot: PolicyDriver, robot: Robot, n_steps: int = 120) -> dict[str, Any]:
     """The same with a simulator like the environment's."""
     simulator = Simulator(
-        robot, dt=DT, points_per_segment=Track.points_per_segment, outputs="tip", hold_gain=Track.hold_gain
+        robot,
+        dt=DT,
+        points_per_segment=Track.points_per_segment,
+        outputs="tip",
+        kept_jacobian_tolerance=Track.kept_jacobian_tolerance,
     )
     simulator.settle(robot.rest_tendon_length)
     found: dict[str, Any] = {"dl": [], "tip": []}

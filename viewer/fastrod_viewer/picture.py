@@ -91,7 +91,7 @@ class Picture:
         plain = [palette.BODY if by_tension else palette.segment_color(i) for i in range(self.n_segments)]
         shape = (self.n_robots, self.n_segments, self.pieces, 3)
         self._plain: Colors = np.broadcast_to(np.array(plain, np.uint8)[:, None], shape)
-        bend = 1.0 / float(params.reach.min())
+        bend = 1.0 / float(params.rod_length.min())
         least = {
             "curvature": bend,
             "strain": 100.0 * bend * float(self.body_radius.max()),
@@ -102,8 +102,8 @@ class Picture:
         self._contacts = (
             (32 if self.n_robots <= 4 else 8) if options.contacts and state.contacts is not None else 0
         )
-        self._half_force = params.moment_scale / params.reach  # (1 or n_robots,)
-        self._reach = params.reach
+        self._half_force = params.moment_scale / params.rod_length  # (1 or n_robots,)
+        self._reach = params.rod_length
         self._last = _at_rest(rods, params.length, n_steps)
         self._tension: Floats = np.zeros(state.tension.shape)
         self._hidden: dict[tuple[int, Color], tuple[Instances, Instances]] = {}

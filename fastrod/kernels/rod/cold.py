@@ -1,11 +1,12 @@
-"""Where a cold start begins, one robot at a time.
+"""The guess that a cold start begins from, one robot at a time.
 
-    u of each segment, of least norm:    l (1 + u_x d_y - u_y d_x) = what is left there of each wire that ends
+    u of each segment, of least norm:    l (1 + u_x d_y - u_y d_x) = what is left there of each tendon that
+    ends
     with it m(s) on these arcs:                  M + (r_tip - r) x F + sum over the loads beyond of (r_j - r)
     x f_j, material frame T, of least norm about pretension:   sum of T (d_y, -d_x) = mean of m - K (u - u*)
     over the segment, tip first
 
-A wire's (d_y, -d_x), the moment of its unit tension, is called its arm.
+A tendon's (d_y, -d_x), the moment of its unit tension, is called its arm.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ SAMPLES = 8
 """Steps in which a segment's arc is sampled; the guess needs no more."""
 
 _RANK = 1e-3
-"""Part of the larger singular value below which the smaller counts as none: wires that leave a plane by less,
+"""Fraction of the larger singular value below which the smaller counts as none: tendons that leave a plane
+by less,
 as two at 0 and 3.1416 do, say nothing about the bend across it, and a micrometre of their lengths would ask
 for curvatures beyond all bounds."""
 
@@ -38,7 +40,7 @@ class ColdWorkspace(NamedTuple):
     free: Flags
     """(n_tendons,) the tension is unknown."""
     left: Floats
-    """(n_tendons,) length of the wire beyond the segments done [m]."""
+    """(n_tendons,) length of the tendon beyond the segments done [m]."""
     tension: Floats
     """(n_tendons,) [N]."""
     curvature: Floats
@@ -47,8 +49,8 @@ class ColdWorkspace(NamedTuple):
     """(n_segments, 3) K (u - u*) [N m]."""
     place: Floats
     """(n_samples, 3) from the base, world axes [m]."""
-    turn: Floats
-    """(n_samples, 9) rotation, row by row."""
+    rotation: Floats
+    """(n_samples, 9) row by row."""
     load: Floats
     """(n_samples, 3) world [N]."""
     at_base: Floats
@@ -82,25 +84,25 @@ def _tangent(m: Mat) -> Vec:
 def _exp(o: Vec) -> Mat:
     """Rotation of a rotation vector that may be long."""
     half = 0.5 * sqrt(dot(o, o))
-    part = 0.5 * sin(half) / half if half > 0.0 else 0.5
-    return from_quaternion((cos(half), part * o[0], part * o[1], part * o[2]))
+    sine = 0.5 * sin(half) / half if half > 0.0 else 0.5
+    return from_quaternion((cos(half), sine * o[0], sine * o[1], sine * o[2]))
 
 
 @inline
-def _share(j: int) -> float:
-    """Part of its segment that sample j stands for."""
+def _fraction(j: int) -> float:
+    """Fraction of its segment that sample j stands for."""
     return (0.5 if j == 0 or j == SAMPLES else 1.0) / SAMPLES
 
 
 @inline
 def _last(k: int, layout: Layout) -> int:
-    """One past the last wire that ends with segment k; its first is `first_tendon[k]`."""
+    """One past the last tendon that ends with segment k; its first is `first_tendon[k]`."""
     return int(layout.first_tendon[k + 1]) if k + 1 < len(layout.first_tendon) else len(layout.tendon_segment)
 
 
 @inline
 def _along(axes: Axes, dx: float, dy: float) -> tuple[float, float]:
-    """A wire's arm along both principal axes: over the wires these two columns are orthogonal."""
+    """A tendon's arm along both principal axes: over the tendons these two columns are orthogonal."""
     c, s, lean = axes[0], axes[1], axes[2]
     p = c * dy - s * dx
     return p, -c * dx - s * dy - lean * p
@@ -108,11 +110,12 @@ def _along(axes: Axes, dx: float, dy: float) -> tuple[float, float]:
 
 @kernel
 def _principal(offset: Floats, first: int, last: int) -> Axes:
-    """Principal axes of the arms of wires first ... last - 1: cosine and sine of the major one, `lean`, and 1
+    """Principal axes of the arms of tendons first ... last - 1: cosine and sine of the major one, `lean`,
+    and 1
     / sigma^2 of both.
 
     They diagonalise the 2 x 2 normal matrix, whose own smaller eigenvalue would drown in rounding where the
-    wires are nearly in one plane. The columns along the axes keep it: `lean` times the major one is what
+    tendons are nearly in one plane. The columns along the axes keep it: `lean` times the major one is what
     rounding left of it in the minor one. A singular value that counts as none has 0 for 1 / sigma^2, which
     makes the inverse a pseudo-inverse.
     """
@@ -174,7 +177,7 @@ def _sample(i: int, layout: Layout, params: Params, ports: Ports, work: ColdWork
     """Frames along the arcs, and the line force and the point forces on the sample nearest to each."""
     pose = ports.base_pose[pick(i, len(ports.base_pose))]
     line = ports.line_force[pick(i, len(ports.line_force))]
-    turn, place = from_quaternion((pose[3], pose[4], pose[5], pose[6])), (0.0, 0.0, 0.0)
+    rotation, place = from_quaternion((pose[3], pose[4], pose[5], pose[6])), (0.0, 0.0, 0.0)
     n_segments, n_f, n_steps = len(layout.first_tendon), line.shape[1], layout.n_steps
     for k in range(n_segments):
         length = (
@@ -188,10 +191,10 @@ def _sample(i: int, layout: Layout, params: Params, ports: Ports, work: ColdWork
             at = k * (SAMPLES + 1) + j
             _put(work.place, at, place)
             for a in range(9):
-                work.turn[at, a] = turn[a]
-            _put(work.load, at, scale(length * _share(j), _vec(line[k], round(j * (n_f - 1) / SAMPLES))))
+                work.rotation[at, a] = rotation[a]
+            _put(work.load, at, scale(length * _fraction(j), _vec(line[k], round(j * (n_f - 1) / SAMPLES))))
             if j < SAMPLES:
-                place, turn = add(place, mul(turn, chord)), matmul(turn, whole)
+                place, rotation = add(place, mul(rotation, chord)), matmul(rotation, whole)
     if len(ports.node_force) > 0:
         force = ports.node_force[pick(i, len(ports.node_force))]
         for j in range(n_segments * n_steps + 1):
@@ -211,8 +214,8 @@ def _balance(i: int, layout: Layout, ports: Ports, follower: Vec, work: ColdWork
         local, mean = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         for j in range(SAMPLES, -1, -1):
             place, own = _vec(work.place, at), _vec(work.load, at)
-            local = mul_t(_mat(work.turn, at), sub(moment, cross(place, force)))
-            mean = axpy(_share(j), local, mean)
+            local = mul_t(_mat(work.rotation, at), sub(moment, cross(place, force)))
+            mean = axpy(_fraction(j), local, mean)
             force, moment = add(force, own), add(moment, cross(place, own))
             at -= 1
         _put(work.at_base, k, local)
@@ -241,7 +244,8 @@ def _pull(i: int, layout: Layout, params: Params, ports: Ports, work: ColdWorksp
         for t in range(first, last):
             p, q = _along(axes, offset[t, 0], offset[t, 1])
             tension[t] += a * p + b * q
-    # A wire that can go slack starts taut: from there Newton finds which ones let go; from slack it would not
+    # A tendon that can go slack starts taut: from there Newton finds which ones let go; from slack it would
+    # not
     # see them.
     taut = 0.01 * params.tension_scale[pick(i, len(params.tension_scale))]
     for t in range(n_tendons):
@@ -304,7 +308,7 @@ def begin(rows: Ints, layout: Layout, params: Params, ports: Ports, memory: Memo
         follower = (0.0, 0.0, 0.0)
         if len(ports.follower_force) > 0:
             follower = mul(
-                _mat(work.turn, n - 1), _vec(ports.follower_force, pick(i, len(ports.follower_force)))
+                _mat(work.rotation, n - 1), _vec(ports.follower_force, pick(i, len(ports.follower_force)))
             )
         _balance(i, layout, ports, follower, work)
         if not layout.paper:

@@ -11,28 +11,8 @@ from __future__ import annotations
 
 from ..jit import inline, kernel
 from ..vec import Mat, Vec, add, axpy, cross, dot, exp_map_variation, mul, mul_t, scale, sub, sym_mul
-from .shape import (
-    GROUP,
-    N_H,
-    N_R,
-    P_C,
-    PATH,
-    PATHS,
-    S_C,
-    S_INV,
-    S_M,
-    S_MM,
-    S_N,
-    S_O,
-    S_U,
-    S_VAR,
-    STAGE,
-    Lanes,
-    W,
-    get,
-    get_mat,
-    put,
-)
+from .lanes import Lanes, W, get, get_mat, put, read, write
+from .shape import GROUP, N_H, N_R, P_C, PATH, PATHS, S_C, S_INV, S_M, S_MM, S_N, S_O, S_U, S_VAR, STAGE
 
 C_PHI, C_M, C_POS, COLUMN = 0, 3, 6, 27
 # of the last step: weighted changes of u at the stages, phi at its start, of the tangents
@@ -40,11 +20,11 @@ C_U, C_PHI_BEFORE, C_TANGENT = 9, 21, 24
 
 
 @inline
-def _turned(stages: Lanes, k: int, w: int, do: Vec, dmm: Vec, dtorsion: float) -> tuple[Mat, Vec, Vec]:
+def _rotated(stages: Lanes, k: int, w: int, do: Vec, dmm: Vec, dtorsion: float) -> tuple[Mat, Vec, Vec]:
     """C, psi and the change of m of stage k."""
     rotation = get_mat(stages, k * STAGE + S_C, w)
     psi = exp_map_variation(get(stages, k * STAGE + S_O, w), get(stages, k * STAGE + S_VAR, w), do)
-    # m_x and m_y are turned by the whole C, not by the torsion-corrected m: their share of psi needs the z of
+    # m_x and m_y rotate with the whole C, not with the torsion-corrected m: their part of psi needs the z of
     # C^T M
     moment = get(stages, k * STAGE + S_MM, w)
     axial = rotation[2] * moment[0] + rotation[5] * moment[1] + rotation[8] * moment[2]
@@ -76,11 +56,11 @@ def _tangent(rotation: Mat, psi: Vec) -> Vec:
 
 @kernel
 def step_column(column: Lanes, node: Lanes, stages: Lanes, path: Lanes, load: Lanes) -> None:
-    """Carry one column over the step. `path`: of the tendon whose tension the column is, or zeros; `load`:
+    """Move one column over the step. `path`: of the tendon whose tension the column is, or zeros; `load`:
     the tip force that it is, in the frame of the start, or zeros. One body for all columns: a second one
     would compile for seconds."""
     for w in range(W):
-        h = node[N_H * W + w]
+        h = read(node, N_H, w)
         phi, dm1 = get(column, C_PHI, w), get(column, C_M, w)
         n1, n2, n4 = get(stages, S_N, w), get(stages, STAGE + S_N, w), get(stages, 3 * STAGE + S_N, w)
         dn1, dn2, dn4 = cross(n1, phi), cross(n2, phi), cross(n4, phi)
@@ -92,7 +72,7 @@ def step_column(column: Lanes, node: Lanes, stages: Lanes, path: Lanes, load: La
         k1 = (dn1[1], -dn1[0], 0.0)
         w1 = _torsion_slope(stages, 0, w, du1, dm1)
 
-        rotation, psi, dm = _turned(
+        rotation, psi, dm = _rotated(
             stages, 1, w, scale(0.5 * h, du1), axpy(0.5 * h, k1, dm1), dm1[2] + 0.5 * h * w1
         )
         du2 = _curvature(stages, 1, w, sub(dm, get(path, 1 * PATH + P_C, w)))
@@ -100,12 +80,12 @@ def step_column(column: Lanes, node: Lanes, stages: Lanes, path: Lanes, load: La
         t2 = _tangent(rotation, psi)
         k2 = add(cross(n2, t2), cross(dn2, (rotation[2], rotation[5], rotation[8])))
 
-        turn = add(cross(du1, u2), cross(u1, du2))
-        rotation, psi, dm = _turned(
+        twist = add(cross(du1, u2), cross(u1, du2))
+        rotation, psi, dm = _rotated(
             stages,
             2,
             w,
-            axpy(0.5 * h, du2, scale(0.125 * h * h, turn)),
+            axpy(0.5 * h, du2, scale(0.125 * h * h, twist)),
             axpy(0.5 * h, k2, dm1),
             dm1[2] + 0.5 * h * w2,
         )
@@ -114,16 +94,16 @@ def step_column(column: Lanes, node: Lanes, stages: Lanes, path: Lanes, load: La
         t3 = _tangent(rotation, psi)
         k3 = add(cross(n2, t3), cross(dn2, (rotation[2], rotation[5], rotation[8])))
 
-        rotation, psi, dm = _turned(stages, 3, w, scale(h, du3), axpy(h, k3, dm1), dm1[2] + h * w3)
+        rotation, psi, dm = _rotated(stages, 3, w, scale(h, du3), axpy(h, k3, dm1), dm1[2] + h * w3)
         du4 = _curvature(stages, 3, w, sub(dm, get(path, 3 * PATH + P_C, w)))
         w4 = _torsion_slope(stages, 3, w, du4, dm)
         t4 = _tangent(rotation, psi)
         k4 = add(cross(n4, t4), cross(dn4, (rotation[2], rotation[5], rotation[8])))
 
-        turn = add(cross(du1, u4), cross(u1, du4))
-        do = axpy(h / 6.0, axpy(2.0, add(du2, du3), add(du1, du4)), scale(h * h / 12.0, turn))
+        twist = add(cross(du1, u4), cross(u1, du4))
+        do = axpy(h / 6.0, axpy(2.0, add(du2, du3), add(du1, du4)), scale(h * h / 12.0, twist))
         dmm = axpy(h / 6.0, axpy(2.0, add(k2, k3), add(k1, k4)), dm1)
-        rotation, psi, dm = _turned(stages, 4, w, do, dmm, dm1[2] + h / 6.0 * (w1 + 2.0 * (w2 + w3) + w4))
+        rotation, psi, dm = _rotated(stages, 4, w, do, dmm, dm1[2] + h / 6.0 * (w1 + 2.0 * (w2 + w3) + w4))
         put(column, C_PHI_BEFORE, w, phi)
         put(column, C_TANGENT, w, axpy(2.0, add(t2, t3), t4))
         put(column, C_PHI, w, add(mul_t(rotation, phi), psi))
@@ -135,7 +115,7 @@ def step_column(column: Lanes, node: Lanes, stages: Lanes, path: Lanes, load: La
 
 
 @kernel
-def place_column(column: Lanes, node: Lanes, stages: Lanes) -> None:
+def column_position(column: Lanes, node: Lanes, stages: Lanes) -> None:
     """The change of position over the step that `step_column` has just done: Jacobians want it, the observer
     does not."""
     for w in range(W):
@@ -150,7 +130,7 @@ def place_column(column: Lanes, node: Lanes, stages: Lanes) -> None:
             column,
             C_POS,
             w,
-            axpy(node[N_H * W + w] / 6.0, mul(get_mat(node, N_R, w), change), get(column, C_POS, w)),
+            axpy(read(node, N_H, w) / 6.0, mul(get_mat(node, N_R, w), change), get(column, C_POS, w)),
         )
 
 
@@ -172,4 +152,5 @@ def add_length_changes(change: Lanes, column: Lanes, path: Lanes) -> None:
                 get(path, p + 2 * PATH, w),
                 get(path, p + 3 * PATH, w),
             )
-            change[i * W + w] += dot(c1, du1) + dot(c2, du2) + dot(c3, du3) + dot(c4, du4)
+            longer = dot(c1, du1) + dot(c2, du2) + dot(c3, du3) + dot(c4, du4)
+            write(change, i, w, read(change, i, w) + longer)

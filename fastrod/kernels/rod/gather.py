@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from fastrod.types import Layout, Memory, Params, Ports, RodShape
+from fastrod.types import Floats, Layout, Memory, Params, Ports, RodShape
 
-from ..jit import LANES, inline, kernel
-from ..vec import from_quaternion
+from ..jit import inline, kernel
+from ..vec import Vec, from_quaternion
 from . import shape as sh
-from .shape import Lanes
-
-W = LANES
+from .lanes import Lanes, W, get, get_mat, put, put_mat, read, write
 
 
 @inline
 def pick(i: int, n: int) -> int:
     """Row of robot i in an array whose robot axis has length n, or 1 for all robots."""
     return i if n > 1 else 0
+
+
+@inline
+def _vec(a: Floats) -> Vec:
+    return a[0], a[1], a[2]
 
 
 @inline
@@ -26,12 +29,12 @@ def unknown_unit(a: int, s: int, params: Params, layout: Layout) -> float:
         return float(params.moment_scale[s])
     if a < n_base + len(layout.free_tendon):
         return float(params.tension_scale[s])
-    return float(params.moment_scale[s] / params.reach[s])
+    return float(params.moment_scale[s] / params.rod_length[s])
 
 
 @kernel
-def feed_forward(
-    robots: Lanes, count: int, ports: Ports, params: Params, memory: Memory, layout: Layout
+def predict(
+    robots: Lanes, n_robots: int, ports: Ports, params: Params, memory: Memory, layout: Layout
 ) -> None:
     """Move x from the inputs of the last pass to the new ones, to second order where the motion goes on.
 
@@ -41,9 +44,9 @@ def feed_forward(
     """
     n_rows, n_x = len(layout.row_tendon), memory.x.shape[1]
     n_e = memory.gain.shape[2] - (3 if len(memory.force_before) > 0 else 0)
-    for w in range(count):
+    for w in range(n_robots):
         i = robots[w]
-        s = pick(i, len(params.reach))
+        s = pick(i, len(params.rod_length))
         length = ports.tendon_length[pick(i, len(ports.tendon_length))]
         force = ports.tip_force[pick(i, len(ports.tip_force))]
         along, old, new = 0.0, 0.0, 0.0
@@ -82,14 +85,14 @@ def gather_base(
     for w in range(W):
         i = robots[w]
         p = ports.base_pose[pick(i, len(ports.base_pose))]
-        sh.put_mat(node, sh.N_R, w, from_quaternion((p[3], p[4], p[5], p[6])))
+        put_mat(node, sh.N_R, w, from_quaternion((p[3], p[4], p[5], p[6])))
         force = ports.tip_force[pick(i, len(ports.tip_force))]
         line = ports.line_force[pick(i, len(ports.line_force))]
         length = params.length[pick(i, len(params.length))]
         extension = ports.extension[pick(i, len(ports.extension))]
         for a in range(3):
-            node[(sh.N_POS + a) * W + w] = p[a]
-            node[(sh.N_U + a) * W + w] = memory.curvature_guess[i, a]
+            write(node, sh.N_POS + a, w, p[a])
+            write(node, sh.N_U + a, w, memory.curvature_guess[i, a])
             total = force[a]
             for k in range(n_segments):
                 l_k = length[k] + extension[k]
@@ -108,8 +111,8 @@ def gather_base(
                 for j in range(n_segments * n_steps + 1):
                     total += ports.node_force[pick(i, len(ports.node_force)), j, a]
             if len(ports.follower_force) > 0:
-                total += x[(memory.x.shape[1] - 3 + a) * W + w]
-            node[(sh.N_N + a) * W + w] = total
+                total += read(x, memory.x.shape[1] - 3 + a, w)
+            write(node, sh.N_N + a, w, total)
 
 
 @kernel
@@ -118,8 +121,8 @@ def gather_segment(k: int, robots: Lanes, params: Params, layout: Layout, tendon
     for w in range(W):
         offset = params.offset[pick(robots[w], len(params.offset)), k]
         for i in range(layout.first_tendon[k], len(layout.tendon_segment)):
-            tendon[(i * sh.TENDON + sh.T_DX) * W + w] = offset[i, 0]
-            tendon[(i * sh.TENDON + sh.T_DY) * W + w] = offset[i, 1]
+            write(tendon, i * sh.TENDON + sh.T_DX, w, offset[i, 0])
+            write(tendon, i * sh.TENDON + sh.T_DY, w, offset[i, 1])
 
 
 @kernel
@@ -136,37 +139,40 @@ def gather_step(
         else:
             g = pick(i, len(ports.grid))
             h *= ports.grid[g, k, j + 1] - ports.grid[g, k, j]
-        node[sh.N_H * W + w] = h
+        write(node, sh.N_H, w, h)
         if j == 0 or n_f > 1:
             line = ports.line_force[pick(i, len(ports.line_force)), k]
-            for a in range(3):
-                node[(sh.N_F0 + a) * W + w] = line[2 * j if n_f > 1 else 0, a]
-                node[(sh.N_F1 + a) * W + w] = line[2 * j + 1 if n_f > 1 else 0, a]
+            put(node, sh.N_F0, w, _vec(line[2 * j if n_f > 1 else 0]))
+            put(node, sh.N_F1, w, _vec(line[2 * j + 1 if n_f > 1 else 0]))
         if j == 0 or n_k > 1:
             stiffness = ports.stiffness[pick(i, len(ports.stiffness)), k]
             rest = ports.precurvature[pick(i, len(ports.precurvature)), k]
             for half in range(3):
-                at = 2 * j + half if n_k > 1 else 0
-                for a in range(3):
-                    node[(sh.N_K + 3 * half + a) * W + w] = stiffness[at, a]
-                    node[(sh.N_USTAR + 3 * half + a) * W + w] = rest[at, a]
+                h_j = 2 * j + half if n_k > 1 else 0
+                put(node, sh.N_K + 3 * half, w, _vec(stiffness[h_j]))
+                put(node, sh.N_USTAR + 3 * half, w, _vec(rest[h_j]))
         if len(ports.node_force) > 0:  # a force on the node itself acts on what is before it, not beyond
+            force = ports.node_force[pick(i, len(ports.node_force)), k * layout.n_steps + j]
             for a in range(3):
-                node[(sh.N_N + a) * W + w] -= ports.node_force[
-                    pick(i, len(ports.node_force)), k * layout.n_steps + j, a
-                ]
+                write(node, sh.N_N + a, w, read(node, sh.N_N + a, w) - force[a])
+
+
+@inline
+def scatter(a: Floats, v: Vec) -> None:
+    """a[:] = v."""
+    a[0], a[1], a[2] = v
 
 
 @kernel
-def scatter_node(at: int, count: int, robots: Lanes, node: Lanes, s: Lanes, shape: RodShape) -> None:
-    """Write the cross-section where the lanes stand."""
-    for w in range(count):
+def scatter_node(n: int, n_robots: int, robots: Lanes, node: Lanes, s: Lanes, shape: RodShape) -> None:
+    """Write the cross-section where the lanes stand: node n of the rod."""
+    for w in range(n_robots):
         i = robots[w]
-        shape.arclength[i, at] = s[w]
+        shape.arclength[i, n] = s[w]
+        scatter(shape.position[i, n], get(node, sh.N_POS, w))
+        scatter(shape.curvature[i, n], get(node, sh.N_U, w))
+        scatter(shape.moment[i, n], get(node, sh.N_M, w))
+        scatter(shape.force[i, n], get(node, sh.N_N, w))
+        m = get_mat(node, sh.N_R, w)
         for a in range(3):
-            shape.position[i, at, a] = node[(sh.N_POS + a) * W + w]
-            shape.curvature[i, at, a] = node[(sh.N_U + a) * W + w]
-            shape.moment[i, at, a] = node[(sh.N_M + a) * W + w]
-            shape.force[i, at, a] = node[(sh.N_N + a) * W + w]
-            for b in range(3):
-                shape.rotation[i, at, a, b] = node[(sh.N_R + 3 * a + b) * W + w]
+            scatter(shape.rotation[i, n, a], (m[3 * a], m[3 * a + 1], m[3 * a + 2]))

@@ -4,7 +4,8 @@
 
 The rows of Gamma are taken one after the other, as a Kalman filter takes measurements with independent noise:
 the same G and P to rounding, with divisions by a number in place of a matrix, and sound where Gamma has more
-rows than rank (four wires on two unknowns in paper mode) or a nearly singular direction (tendons that hardly
+rows than rank (four tendons on two unknowns in paper mode) or a nearly singular direction (tendons that
+hardly
 stretch).
 
 Vectors over unknowns are padded with zeros to a multiple of BLOCK entries, so that one loop over lanes does
@@ -13,10 +14,9 @@ BLOCK multiply-adds.
 
 from __future__ import annotations
 
-from ..jit import LANES, kernel
-from .shape import Lanes
+from ..jit import kernel
+from .lanes import LaneMatrix, Lanes, W, beyond, row_from, write
 
-W = LANES
 BLOCK = 4
 
 
@@ -50,44 +50,37 @@ def scale_block(a: Lanes, b: Lanes, k: Lanes) -> None:
 
 
 @kernel
-def gain(P: Lanes, G: Lanes, gamma: Lanes, work: Lanes, n_x: int, n_e: int, noise: float) -> None:
-    """P- to P in place, and G, from the rows of Gamma and the variance V^-1/dt of one residual.
+def gain(
+    P: LaneMatrix, G: LaneMatrix, gamma: LaneMatrix, vector: Lanes, n_x: int, n_e: int, noise: float
+) -> None:
+    """P- to P in place, and G (transposed), from the rows of Gamma and the variance V^-1/dt of one residual.
 
-    P[a * n_pad + b], G[i * n_pad + a] (transposed), gamma[i * n_pad + a], each times W; work holds n_pad + 2
-    numbers a lane.
+    All three matrices have n_p columns; `vector` holds n_p + 2 numbers a lane.
     """
-    n_pad = BLOCK * ((n_x + BLOCK - 1) // BLOCK)
-    row, block = n_pad * W, BLOCK * W
-    number = work[row : row + W]
-    inverse = work[row + W : row + 2 * W]
+    n_p = P.n_columns
+    number, inverse = beyond(vector, n_p), beyond(vector, n_p + 1)
     for i in range(n_e):
-        g_i = gamma[i * row : (i + 1) * row]
         for a in range(n_x):
-            out = work[a * W : (a + 1) * W]
             for w in range(W):
-                out[w] = 0.0
-            for b in range(0, row, block):
-                dot_block(out, P[a * row + b : a * row + b + block], g_i[b : b + block])
+                write(vector, a, w, 0.0)
+            for b in range(0, n_p, BLOCK):
+                dot_block(beyond(vector, a), row_from(P, a, b), row_from(gamma, i, b))
         for w in range(W):
             number[w] = noise
-        for b in range(0, row, block):
-            dot_block(number, work[b : b + block], g_i[b : b + block])
+        for b in range(0, n_p, BLOCK):
+            dot_block(number, beyond(vector, b), row_from(gamma, i, b))
         for w in range(W):
             # rounding may take P a little below zero where nothing is left to learn
             inverse[w] = 1.0 / max(number[w], noise)
-        k_i = G[i * row : (i + 1) * row]
-        for b in range(0, row, block):
-            scale_block(k_i[b : b + block], work[b : b + block], inverse)
+        for b in range(0, n_p, BLOCK):
+            scale_block(row_from(G, i, b), beyond(vector, b), inverse)
         for a in range(n_x):
-            for b in range(0, row, block):
-                subtract_block(
-                    P[a * row + b : a * row + b + block], work[b : b + block], k_i[a * W : (a + 1) * W]
-                )
+            for b in range(0, n_p, BLOCK):
+                subtract_block(row_from(P, a, b), beyond(vector, b), row_from(G, i, a))
         for j in range(i):
-            k_j = G[j * row : (j + 1) * row]
             for w in range(W):
                 number[w] = 0.0
-            for b in range(0, row, block):
-                dot_block(number, k_j[b : b + block], g_i[b : b + block])
-            for b in range(0, row, block):
-                subtract_block(k_j[b : b + block], k_i[b : b + block], number)
+            for b in range(0, n_p, BLOCK):
+                dot_block(number, row_from(G, j, b), row_from(gamma, i, b))
+            for b in range(0, n_p, BLOCK):
+                subtract_block(row_from(G, j, b), row_from(G, i, b), number)

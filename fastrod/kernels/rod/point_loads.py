@@ -1,28 +1,27 @@
-"""Contact points on the nodes of a pass: their forces go in, and how they move comes out.
+"""Point loads (contact forces) on the nodes of a pass: their forces go in, and how they move comes out.
 
 A force F on the point `arm` away from the centreline is F and the moment arm x F on the node: what is before
-the node carries them, what is beyond does not. Each probe brings three columns, a unit force along each world
+the node carries them, what is beyond does not. Each load brings three columns, a unit force along each world
 axis.
 """
 
 from __future__ import annotations
 
-from fastrod.types import Layout, Memory, Params, PointLoads
+from fastrod.types import PointLoads
 
-from ..jit import LANES, inline, kernel
+from ..jit import inline, kernel
 from ..vec import Vec, add, cross, mul, mul_t, sub
 from . import columns as col
 from . import shape as sh
 from .gather import pick
-from .shape import Lanes
-
-W = LANES
+from .lanes import Lanes, W, at, get, get_mat, put, read, write, write_at
+from .workspace import Batch, Chunk, Output, Sensitivities, Workspace
 
 
 @inline
-def row_of(first_row: int, count: int, w: int) -> int:
+def row_of(chunk: Chunk, w: int) -> int:
     """Row of lane w; the lanes beyond the last robot repeat it."""
-    return first_row + min(w, count - 1)
+    return chunk.first_row + min(w, chunk.n_robots - 1)
 
 
 @inline
@@ -36,122 +35,92 @@ def _axis(a: int) -> Vec:
 
 
 @kernel
-def load_base(probes: PointLoads, first_row: int, count: int, node: Lanes) -> None:
+def load_base(loads: PointLoads, chunk: Chunk, node: Lanes) -> None:
     """All contact forces lie beyond the base."""
     for w in range(W):
-        r = row_of(first_row, count, w)
-        for q in range(probes.node.shape[1]):
-            if probes.node[r, q] >= 0:
+        r = row_of(chunk, w)
+        for q in range(loads.node.shape[1]):
+            if loads.node[r, q] >= 0:
                 for a in range(3):
-                    node[(sh.N_N + a) * W + w] += probes.force[r, q, a]
+                    write(node, sh.N_N + a, w, read(node, sh.N_N + a, w) + loads.force[r, q, a])
 
 
 @kernel
-def load_column(
-    c: int, at: int, node: Lanes, probes: PointLoads, first_row: int, count: int, given: Lanes
-) -> None:
-    """The unit force of contact column c in the frame of the step that starts at node `at`: none beyond its
-    own node."""
+def load_column(c: int, n: int, node: Lanes, loads: PointLoads, chunk: Chunk, unit_force: Lanes) -> None:
+    """The unit force of contact column c in the frame of the step that starts at node n: none beyond its own
+    node."""
     q, a = c // 3, c % 3
     for w in range(W):
-        acts = 1.0 if probes.node[row_of(first_row, count, w), q] > at else 0.0
+        acts = 1.0 if loads.node[row_of(chunk, w), q] > n else 0.0
         for b in range(3):
-            given[b * W + w] = acts * node[(sh.N_R + 3 * a + b) * W + w]
+            write(unit_force, b, w, acts * read(node, sh.N_R + 3 * a + b, w))
 
 
 @kernel
-def leave(
-    at: int, probes: PointLoads, first_row: int, count: int, node: Lanes, columns: Lanes, n_x: int, n_col: int
-) -> None:
-    """Beyond node `at` the loads on it no longer act: internal force, moment and their columns jump."""
+def leave(n: int, loads: PointLoads, chunk: Chunk, node: Lanes, columns: Lanes, n_x: int, n_col: int) -> None:
+    """Beyond node n the loads on it no longer act: internal force, moment and their columns jump."""
     for w in range(W):
-        r = row_of(first_row, count, w)
-        for q in range(probes.node.shape[1]):
-            if probes.node[r, q] != at:
+        r = row_of(chunk, w)
+        for q in range(loads.node.shape[1]):
+            if loads.node[r, q] != n:
                 continue
-            rotation = sh.get_mat(node, sh.N_R, w)
-            force, arm = _three(probes.force[r, q]), _three(probes.arm[r, q])
+            rotation = get_mat(node, sh.N_R, w)
+            force, arm = _three(loads.force[r, q]), _three(loads.arm[r, q])
             moment = mul_t(rotation, cross(arm, force))
-            sh.put(node, sh.N_N, w, sub(sh.get(node, sh.N_N, w), force))
-            sh.put(node, sh.N_M, w, sub(sh.get(node, sh.N_M, w), moment))
+            put(node, sh.N_N, w, sub(get(node, sh.N_N, w), force))
+            put(node, sh.N_M, w, sub(get(node, sh.N_M, w), moment))
             for c in range(n_col):
                 o = c * col.COLUMN
-                turn = cross(moment, sh.get(columns, o + col.C_PHI, w))
-                sh.put(columns, o + col.C_M, w, sub(sh.get(columns, o + col.C_M, w), turn))
+                change = cross(moment, get(columns, o + col.C_PHI, w))
+                put(columns, o + col.C_M, w, sub(get(columns, o + col.C_M, w), change))
             for a in range(3):
                 o = (n_x + 3 * q + a) * col.COLUMN
                 own = mul_t(rotation, cross(arm, _axis(a)))
-                sh.put(columns, o + col.C_M, w, sub(sh.get(columns, o + col.C_M, w), own))
+                put(columns, o + col.C_M, w, sub(get(columns, o + col.C_M, w), own))
 
 
 @kernel
-def arrive(
-    at: int,
-    probes: PointLoads,
-    first_row: int,
-    count: int,
-    node: Lanes,
-    columns: Lanes,
-    n_col: int,
-    moves: Lanes,
-) -> None:
-    """Motion of the contact points on node `at`, one number for each column: moves[(3 q + axis) n_col +
-    column]."""
+def arrive(n: int, loads: PointLoads, chunk: Chunk, node: Lanes, sens: Sensitivities) -> None:
+    """Motion of the contact points on node n, one number for each column: moves[3 q + axis, column]."""
+    columns, moves = sens.columns, sens.moves
     for w in range(W):
-        r = row_of(first_row, count, w)
-        for q in range(probes.node.shape[1]):
-            if probes.node[r, q] != at:
+        r = row_of(chunk, w)
+        for q in range(loads.node.shape[1]):
+            if loads.node[r, q] != n:
                 continue
-            rotation, arm = sh.get_mat(node, sh.N_R, w), _three(probes.arm[r, q])
-            for c in range(n_col):
+            rotation, arm = get_mat(node, sh.N_R, w), _three(loads.arm[r, q])
+            for c in range(moves.n_columns):
                 o = c * col.COLUMN
-                turn = mul(rotation, sh.get(columns, o + col.C_PHI, w))
-                v = add(sh.get(columns, o + col.C_POS, w), cross(turn, arm))
+                angle = mul(rotation, get(columns, o + col.C_PHI, w))
+                v = add(get(columns, o + col.C_POS, w), cross(angle, arm))
                 for a in range(3):
-                    moves[((3 * q + a) * n_col + c) * W + w] = v[a]
+                    write_at(moves, 3 * q + a, c, w, v[a])
 
 
 @kernel
-def respond(
-    robots: Lanes,
-    count: int,
-    params: Params,
-    memory: Memory,
-    layout: Layout,
-    x: Lanes,
-    error: Lanes,
-    gamma: Lanes,
-    G: Lanes,
-    units: Lanes,
-    n_col: int,
-    n_e: int,
-    n_p: int,
-    moves: Lanes,
-    probes: PointLoads,
-    first_row: int,
-) -> None:
+def respond(chunk: Chunk, batch: Batch, output: Output, work: Workspace) -> None:
     """Close the boundary: motion of unknowns and contact points by the residual (column 0) and by each unit
     force."""
-    n_x, n_free = memory.x.shape[1], len(layout.free_tendon)
-    n_f = 3 * probes.node.shape[1]
-    for w in range(count):
-        i, r = robots[w], first_row + w
+    params, layout, loads, moves = batch.params, batch.layout, output.loads, work.sens.moves
+    n_x, n_e, n_f = work.size.x, work.size.e, 3 * loads.node.shape[1]
+    for w in range(chunk.n_robots):
+        i, r = chunk.robots[w], chunk.first_row + w
         unilateral = params.unilateral[pick(i, len(params.unilateral))]
-        for f in range(n_free if not layout.paper else 0):  # a slack wire's unknown moves nothing (`loosen`)
-            if unilateral[layout.free_tendon[f]] and x[(3 + f) * W + w] < 0.0:
+        # a slack tendon's unknown moves nothing (`release_slack_tendons`)
+        for f in range(len(layout.free_tendon) if not layout.paper else 0):
+            if unilateral[layout.free_tendon[f]] and read(work.x, 3 + f, w) < 0.0:
                 for q in range(n_f):
-                    moves[(q * n_col + 3 + f) * W + w] = 0.0
+                    write_at(moves, q, 3 + f, w, 0.0)
         for a in range(n_x):
             for c in range(n_f + 1):
                 value = 0.0
                 for e in range(n_e):
-                    value += G[(e * n_p + a) * W + w] * (
-                        error[e * W + w] if c == 0 else gamma[(e * n_col + n_x + c - 1) * W + w]
-                    )
-                probes.unknown[r, a, c] = -units[a * W + w] * value
+                    open_by = read(work.error, e, w) if c == 0 else at(work.gamma, e, n_x + c - 1, w)
+                    value += at(work.gain, e, a, w) * open_by
+                loads.unknown[r, a, c] = -read(work.units, a, w) * value
         for q in range(n_f):
             for c in range(n_f + 1):
-                value = moves[(q * n_col + n_x + c - 1) * W + w] if c > 0 else 0.0
+                value = at(moves, q, n_x + c - 1, w) if c > 0 else 0.0
                 for a in range(n_x):
-                    value += moves[(q * n_col + a) * W + w] * probes.unknown[r, a, c]
-                probes.motion[r, q, c] = value
+                    value += at(moves, q, a, w) * loads.unknown[r, a, c]
+                loads.motion[r, q, c] = value

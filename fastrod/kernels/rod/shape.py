@@ -6,19 +6,15 @@ step's start, M' = -(C e3) x n with R = R_n C, so that arcs and helices (constan
 and a joint, where the total moment is continuous but u jumps, needs no special case. Lengths and position use
 the same four stages.
 
-Buffers are one-dimensional, field f of lane w at f * LANES + w; the offsets below name the fields.
+The offsets below name the fields of the buffers (`lanes`).
 """
 
 from __future__ import annotations
 
-from typing import Any
-
-from ..jit import LANES, inline, kernel
-from ..vec import Mat, Vec, add, axpy, cross, exp_map, matmul, mul, mul_t, scale, sym_mul
+from ..jit import inline, kernel
+from ..vec import Vec, add, axpy, cross, exp_map, matmul, mul, mul_t, scale, sym_mul
+from .lanes import Lanes, W, get, get_mat, put, put_mat, read, write
 from .rod import curvature_correction, tendon_path, tendon_stiffness
-
-W = LANES
-Lanes = Any  # a one-dimensional float64 array; numba's types are not mypy's
 
 # node: the cross-section where a step starts
 # rotation, position, moment (material), internal force (world), curvature
@@ -39,41 +35,12 @@ PATHS = 4 * PATH  # of one tendon, stage after stage
 GROUP = 4  # tendons that one loop takes together: fewer loads and stores of the sums
 
 
-@inline
-def get(a: Lanes, field: int, w: int) -> Vec:
-    """The vector of lane w that begins at a field."""
-    return a[field * W + w], a[(field + 1) * W + w], a[(field + 2) * W + w]
-
-
-@inline
-def put(a: Lanes, field: int, w: int, v: Vec) -> None:
-    """a[field : field + 3] = v in lane w."""
-    a[field * W + w] = v[0]
-    a[(field + 1) * W + w] = v[1]
-    a[(field + 2) * W + w] = v[2]
-
-
-@inline
-def get_mat(a: Lanes, field: int, w: int) -> Mat:
-    """The matrix of lane w that begins at a field, row by row."""
-    x, y, z = get(a, field, w), get(a, field + 3, w), get(a, field + 6, w)
-    return x[0], x[1], x[2], y[0], y[1], y[2], z[0], z[1], z[2]
-
-
-@inline
-def put_mat(a: Lanes, field: int, w: int, m: Mat) -> None:
-    """a[field : field + 9] = M in lane w, row by row."""
-    put(a, field, w, (m[0], m[1], m[2]))
-    put(a, field + 3, w, (m[3], m[4], m[5]))
-    put(a, field + 6, w, (m[6], m[7], m[8]))
-
-
 @kernel
 def start_step(node: Lanes, stages: Lanes) -> None:
     """Loads of the step in its start frame, and stage 1: there C = I."""
     for w in range(W):
         rotation = get_mat(node, N_R, w)
-        h = node[N_H * W + w]
+        h = read(node, N_H, w)
         n = mul_t(rotation, get(node, N_N, w))
         f0 = mul_t(rotation, get(node, N_F0, w))
         f1 = mul_t(rotation, get(node, N_F1, w))
@@ -121,12 +88,12 @@ def second_stage(node: Lanes, stages: Lanes) -> None:
     """Stage 2, half a step on: o = h/2 u1 and M = M1 + h/2 M1'; u is guessed by its slope, A u' = -u x m - e3
     x n."""
     for w in range(W):
-        h = node[N_H * W + w]
+        h = read(node, N_H, w)
         u1, m = get(stages, S_U, w), get(stages, S_M, w)
         n = get(stages, S_N, w)
         inverse = get(stages, S_INV, w)[0:3] + get(stages, S_INV + 3, w)
-        turn = cross(u1, m)
-        slope = sym_mul(inverse, (n[1] - turn[0], -n[0] - turn[1], -turn[2]))
+        gyration = cross(u1, m)
+        slope = sym_mul(inverse, (n[1] - gyration[0], -n[0] - gyration[1], -gyration[2]))
         _enter(
             stages,
             1,
@@ -144,7 +111,7 @@ def second_stage(node: Lanes, stages: Lanes) -> None:
 def third_stage(node: Lanes, stages: Lanes) -> None:
     """Stage 3, half a step on: o = h/2 u2 + h^2/8 u1 x u2 and M = M1 + h/2 M2'; u is guessed as u2."""
     for w in range(W):
-        h = node[N_H * W + w]
+        h = read(node, N_H, w)
         u1, u2 = get(stages, S_U, w), get(stages, STAGE + S_U, w)
         o = axpy(0.5 * h, u2, scale(0.125 * h * h, cross(u1, u2)))
         m = get(stages, S_M, w)
@@ -164,7 +131,7 @@ def fourth_stage(node: Lanes, stages: Lanes) -> None:
     """Stage 4, a step on: o = h u3 and M = M1 + h M3'; u is guessed by the parabola through u1, its slope,
     and u3: 4 u3 - 3 u1 - h u1'."""
     for w in range(W):
-        h = node[N_H * W + w]
+        h = read(node, N_H, w)
         u1, u3 = get(stages, S_U, w), get(stages, 2 * STAGE + S_U, w)
         guess = axpy(4.0, u3, axpy(-3.0, u1, scale(-h, get(stages, S_O, w))))
         m = get(stages, S_M, w)
@@ -183,7 +150,7 @@ def fourth_stage(node: Lanes, stages: Lanes) -> None:
 def end_step(node: Lanes, stages: Lanes) -> None:
     """Rotation vector and moment over the whole step: the fifth entry of `stages`."""
     for w in range(W):
-        h = node[N_H * W + w]
+        h = read(node, N_H, w)
         u1, u4 = get(stages, S_U, w), get(stages, 3 * STAGE + S_U, w)
         u23 = add(get(stages, STAGE + S_U, w), get(stages, 2 * STAGE + S_U, w))
         o = axpy(h / 6.0, axpy(2.0, u23, add(u1, u4)), scale(h * h / 12.0, cross(u1, u4)))
@@ -203,7 +170,7 @@ def end_step(node: Lanes, stages: Lanes) -> None:
 def advance(node: Lanes, stages: Lanes) -> None:
     """Move the node to the end of the step."""
     for w in range(W):
-        h = node[N_H * W + w]
+        h = read(node, N_H, w)
         rotation = get_mat(node, N_R, w)
         c2, c3, c4 = (
             get_mat(stages, STAGE + S_C, w),
@@ -247,7 +214,7 @@ def tendon_sums(stage: Lanes, tendon: Lanes, path: Lanes) -> None:
             dx, dy, t = get(tendon, i * TENDON, w)
             q, c, inverse = tendon_path(u, dx, dy)
             put(path, i * PATHS + P_C, w, c)
-            path[(i * PATHS + P_Q) * W + w] = q
+            write(path, i * PATHS + P_Q, w, q)
             a = tendon_stiffness(dx, dy, c, t * inverse)
             sum_m = axpy(t, c, sum_m)
             sum_a = add((a[0], a[1], a[2]), sum_a)
@@ -266,7 +233,7 @@ def tendon_paths(stage: Lanes, tendon: Lanes, path: Lanes) -> None:
             dx, dy, _ = get(tendon, i * TENDON, w)
             q, c, _ = tendon_path(u, dx, dy)
             put(path, i * PATHS + P_C, w, c)
-            path[(i * PATHS + P_Q) * W + w] = q
+            write(path, i * PATHS + P_Q, w, q)
 
 
 @kernel
@@ -291,9 +258,9 @@ def correct_curvature(stage: Lanes, stiffness: Lanes, rest: Lanes) -> None:
 def add_lengths(length: Lanes, node: Lanes, path: Lanes) -> None:
     """Path length of GROUP tendons over the step."""
     for w in range(W):
-        h = node[N_H * W + w] / 6.0
+        h = read(node, N_H, w) / 6.0
         for i in range(GROUP):
-            q = (i * PATHS + P_Q) * W + w
-            length[i * W + w] += h * (
-                path[q] + 2.0 * (path[q + PATH * W] + path[q + 2 * PATH * W]) + path[q + 3 * PATH * W]
-            )
+            q = i * PATHS + P_Q
+            half = read(path, q + PATH, w) + read(path, q + 2 * PATH, w)
+            grown = h * (read(path, q, w) + 2.0 * half + read(path, q + 3 * PATH, w))
+            write(length, i, w, read(length, i, w) + grown)

@@ -16,18 +16,18 @@ import numba
 import numpy as np
 from numba import cuda
 
+from fastrod.kernels.rod.workspace import Mode
 from fastrod.solver.gpu.kernels.jit import SIMULATED, launched
 from fastrod.types import Floats, Ints, Layout, Memory, Params, PointLoads, Ports, Response, RodShape
 
 _cuda: Any = cuda
 _config: Any = numba.config
-# the same files as fastrod.kernels.rod.chunk and gather, for the other machine: no type checker would find
-# them there
-_chunk, _gather = (
-    import_module("fastrod.solver.gpu.kernels.rod.chunk"),
-    import_module("fastrod.solver.gpu.kernels.rod.gather"),
+# the same files as in fastrod.kernels.rod, for the other machine: no type checker would find them there
+_chunk, _gather, _workspace = (
+    import_module(f"fastrod.solver.gpu.kernels.rod.{name}") for name in ("chunk", "gather", "workspace")
 )
-pass_chunk, scratch_size, feed_forward = _chunk.pass_chunk, _chunk.scratch_size, _gather.feed_forward
+pass_chunk, predict, scratch_size = _chunk.pass_chunk, _gather.predict, _workspace.scratch_size
+Batch, Chunk, Output = _workspace.Batch, _workspace.Chunk, _workspace.Output
 
 BLOCK = 64
 """Threads of a block."""
@@ -50,50 +50,28 @@ def pass_robots(size: int) -> Any:
         memory: Memory,
         shape: RodShape,
         response: Response,
-        n_col: int,
-        feed: bool,
-        carry: bool,
-        update: bool,
-        process: float,
-        noise: float,
+        mode: Mode,
     ) -> None:
         scratch = _cuda.local.array(size, np.float64)
         robots = _cuda.local.array(1, np.int64)
         # slices of length 0 of what the compiler then leaves out, and with it all that contact would do
         none = _cuda.local.array((1, 1), np.int64)[:, :0]
         nothing = _cuda.local.array((1, 1, 1), np.float64)[:, :0]
-        probes = PointLoads(none, nothing, nothing, nothing, nothing)
+        loads = PointLoads(none, nothing, nothing, nothing, nothing)
+        batch, output = Batch(params, ports, layout, memory), Output(shape, response, loads)
         for r in range(_cuda.grid(1), len(rows), _cuda.gridsize(1)):
             robots[0] = rows[r]
-            pass_chunk(
-                robots,
-                1,
-                params,
-                ports,
-                layout,
-                memory,
-                shape,
-                response,
-                probes,
-                0,
-                scratch,
-                n_col,
-                feed,
-                carry,
-                update,
-                process,
-                noise,
-            )
+            pass_chunk(Chunk(robots, 1, 0), batch, output, scratch, mode)
 
     return launched(run)
 
 
 def _move(rows: Ints, ports: Ports, params: Params, memory: Memory, layout: Layout) -> None:
-    """`feed_forward` of these robots, without a pass."""
+    """`predict` of these robots, without a pass."""
     robots = _cuda.local.array(1, np.int64)
     for r in range(_cuda.grid(1), len(rows), _cuda.gridsize(1)):
         robots[0] = rows[r]
-        feed_forward(robots, 1, ports, params, memory, layout)
+        predict(robots, 1, ports, params, memory, layout)
 
 
 def _all_finite(x: Floats, finite: Any) -> None:

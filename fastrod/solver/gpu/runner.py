@@ -1,4 +1,4 @@
-"""`Runner`: passes on the GPU, for the arrays that `Passes` has on the host."""
+"""`Runner`: passes on the GPU, for the arrays that `BoundarySolver` has on the host."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numba import cuda
 
+from fastrod.kernels.rod.workspace import Mode
 from fastrod.solver.gpu.batch import all_finite, launch, move_to_inputs, pass_robots, room
 from fastrod.solver.gpu.resident import Resident, fill
 from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports, Response, RodShape
@@ -15,7 +16,7 @@ _cuda: Any = cuda
 # bytes: an array up to here is compared with what the device has, a larger one is the same if it is the same
 # object
 _SMALL = 4096
-_BY_FEED = ("x", "move", "defect", "length_before", "force_before")
+_BY_PREDICTION = ("x", "move", "defect", "length_before", "force_before")
 _BY_UPDATE = ("x", "covariance", "gain", "defect", "length_before", "force_before")
 
 
@@ -46,13 +47,7 @@ class Runner:
         memory: Resident,
         shape: RodShape,
         response: Response,
-        n_col: int,
-        n_e: int,
-        feed: bool,
-        carry: bool,
-        update: bool,
-        process: float,
-        noise: float,
+        mode: Mode,
     ) -> None:
         """One forward pass of these robots. What it writes of `shape` stays on the device until `collect`;
         `response` comes back."""
@@ -63,7 +58,8 @@ class Runner:
             if len(response.tip)
             else _NO_RESPONSE
         )
-        kernel = pass_robots(room(len(layout.tendon_segment), there.x.shape[1], n_col, n_e))
+        n_e = len(layout.row_tendon) + (0 if layout.paper else 3) + (3 if len(ports.follower_force) else 0)
+        kernel = pass_robots(room(len(layout.tendon_segment), there.x.shape[1], mode.n_col, n_e))
         given = self._all("params", params), self._all("ports", ports), self._all("layout", layout)
         launch(
             kernel,
@@ -73,14 +69,13 @@ class Runner:
             there,
             into,
             self._all("response", answer),
-            n_col,
-            feed,
-            carry,
-            update,
-            float(process),
-            float(noise),
+            mode,
         )
-        written = {"curvature_guess", *(_BY_FEED if feed else ()), *(_BY_UPDATE if update else ())}
+        written = {
+            "curvature_guess",
+            *(_BY_PREDICTION if mode.predict else ()),
+            *(_BY_UPDATE if mode.update else ()),
+        }
         memory.written_there(written)
         if len(response.tip):
             for host, device in zip(response, answer, strict=True):
@@ -89,7 +84,7 @@ class Runner:
     def move_to_inputs(
         self, rows: Ints, params: Params, ports: Ports, layout: Layout, memory: Resident
     ) -> None:
-        """`feed_forward` of these robots, without a pass."""
+        """`predict` of these robots, without a pass."""
         there = memory.there()
         arguments = (
             self._send("rows", rows),
@@ -99,7 +94,7 @@ class Runner:
             self._all("layout", layout),
         )
         launch(move_to_inputs, len(rows), *arguments)
-        memory.written_there(_BY_FEED)
+        memory.written_there(_BY_PREDICTION)
 
     def finite(self, memory: Resident) -> Flags:
         """(n_robots,) the boundary is one."""

@@ -57,7 +57,7 @@ class ReachTask(RodTask):
     accuracy: ClassVar[float] = 0.01
     options_class: ClassVar[type[EnvOptions]] = ReachOptions
     points_per_segment = 2
-    hold_gain: ClassVar[float] = 1e-4
+    kept_jacobian_tolerance: ClassVar[float] = 1e-4
     dt = 0.05
 
     def prepare(self) -> None:

@@ -1,0 +1,101 @@
+"""Numbers of LANES robots side by side, by name.
+
+A buffer is one-dimensional, field f of lane w at f * LANES + w; the offsets that name fields stand where a
+buffer's
+meaning does. A `LaneMatrix` holds a matrix for each lane.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from ..jit import LANES, inline, kernel
+from ..vec import Mat, Vec
+
+W = LANES
+Lanes = Any  # a one-dimensional float64 array; numba's types are not mypy's
+
+
+class LaneMatrix(NamedTuple):
+    """A matrix of every lane, row by row."""
+
+    entries: Lanes
+    n_columns: int
+
+
+@inline
+def read(a: Lanes, field: int, w: int) -> float:
+    """The number of lane w in a field."""
+    return a[field * W + w]  # type: ignore[no-any-return]
+
+
+@inline
+def write(a: Lanes, field: int, w: int, value: float) -> None:
+    """a[field] = value in lane w."""
+    a[field * W + w] = value
+
+
+@inline
+def at(m: LaneMatrix, r: int, c: int, w: int) -> float:
+    """Entry (r, c) of lane w."""
+    return m.entries[(r * m.n_columns + c) * W + w]  # type: ignore[no-any-return]
+
+
+@inline
+def write_at(m: LaneMatrix, r: int, c: int, w: int, value: float) -> None:
+    """m[r, c] = value in lane w."""
+    m.entries[(r * m.n_columns + c) * W + w] = value
+
+
+@inline
+def row_from(m: LaneMatrix, r: int, c: int) -> Lanes:
+    """The buffer from entry (r, c) on."""
+    return m.entries[(r * m.n_columns + c) * W :]
+
+
+@inline
+def beyond(a: Lanes, field: int) -> Lanes:
+    """The buffer from a field on."""
+    return a[field * W :]
+
+
+@inline
+def take(a: Lanes, first: int, n: int) -> tuple[Lanes, int]:
+    """n fields of a buffer, and the field behind them."""
+    return a[first * W : (first + n) * W], first + n
+
+
+@inline
+def get(a: Lanes, field: int, w: int) -> Vec:
+    """The vector of lane w that begins at a field."""
+    return a[field * W + w], a[(field + 1) * W + w], a[(field + 2) * W + w]
+
+
+@inline
+def put(a: Lanes, field: int, w: int, v: Vec) -> None:
+    """a[field : field + 3] = v in lane w."""
+    a[field * W + w] = v[0]
+    a[(field + 1) * W + w] = v[1]
+    a[(field + 2) * W + w] = v[2]
+
+
+@inline
+def get_mat(a: Lanes, field: int, w: int) -> Mat:
+    """The matrix of lane w that begins at a field, row by row."""
+    x, y, z = get(a, field, w), get(a, field + 3, w), get(a, field + 6, w)
+    return x[0], x[1], x[2], y[0], y[1], y[2], z[0], z[1], z[2]
+
+
+@inline
+def put_mat(a: Lanes, field: int, w: int, m: Mat) -> None:
+    """a[field : field + 9] = M in lane w, row by row."""
+    put(a, field, w, (m[0], m[1], m[2]))
+    put(a, field + 3, w, (m[3], m[4], m[5]))
+    put(a, field + 6, w, (m[6], m[7], m[8]))
+
+
+@kernel
+def clear(a: Lanes) -> None:
+    """Zero everywhere."""
+    for i in range(len(a)):
+        a[i] = 0.0
