@@ -29,12 +29,12 @@ def check_effects(robot: Robot, where: str) -> None:
 
     # the library imports numba, which a robot without effects does not need
     from fastrod.effects.pipeline import named_effects
-    from fastrod.model.routing import wire
+    from fastrod.model.routing import route
 
     try:
         tables = named_effects(robot)
     except (EffectError, UnknownNameError) as error:
         raise type(error)(f"{where}: {error}") from error
-    wiring = wire(robot)
+    wiring = route(robot)
     for name, table in tables.items():
         read_values(name, table, wiring, where)

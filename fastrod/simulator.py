@@ -175,7 +175,7 @@ class Simulator(Statics):
         what is not given stays where it was. `obstacle_velocity` name -> (6,) or (n_robots, 6) linear [m/s]
         and angular [rad/s] velocity of the obstacle's origin: slip is then counted by it, and not by how the
         pose has changed. Robots that touch something take as many passes as bring contact and boundary to
-        rest; `state.contacts` tells.
+        rest; `state.contacts` reports them.
 
         `derive` says that `jacobian(turning=True)` will be asked for: a robot or two without contact and
         effects then get it from the same pass, at the shape of the state, at little cost.
@@ -218,7 +218,8 @@ class Simulator(Statics):
         """Repeat the pass on frozen inputs until every boundary residual is below `tolerance` [m]; inputs as
         for `step`.
 
-        Where Newton's method would diverge the loads are brought on step by step. Robots that still do not
+        Where Newton's method would diverge, the loads grow from none to all (load continuation). Robots that
+        still do not
         converge have `ok` False and `passes` -1. In paper mode four tendons may contradict each other; then
         the
         least-squares boundary has converged, and `residual` says by how much they do.
@@ -381,7 +382,7 @@ class Simulator(Statics):
         are.
 
         With `turning`, three columns more: by the rotation vector of the base about its origin, world [rad].
-        World loads keep their direction, so the rod bends under them as it turns.
+        World loads keep their direction, so the rod bends under them as it rotates.
         """
         _, ports = self._last("jacobian")
         if self._derived is not None:
@@ -477,13 +478,13 @@ class Simulator(Statics):
         `InputError` before the first step."""
         state, ports = self._last("measure")
         pose = np.broadcast_to(ports.base_pose, (self.n_robots, 7))
-        turn = matrix_from_quaternion(pose[:, 3:])
+        rotation = matrix_from_quaternion(pose[:, 3:])
         points = np.zeros((self.n_robots, 0, 3))
         if self.outputs == "full" and self.robots[0].log_points:
             points = self.shape(np.array(self.robots[0].log_points)).position - pose[:, None, :3]
         seen = SensedPoses(
-            np.einsum("nji,nj->ni", turn, state.tip_position - pose[:, :3]),
-            np.swapaxes(turn, 1, 2) @ state.tip_rotation,
-            np.einsum("nji,nkj->nki", turn, points),
+            np.einsum("nji,nj->ni", rotation, state.tip_position - pose[:, :3]),
+            np.swapaxes(rotation, 1, 2) @ state.tip_rotation,
+            np.einsum("nji,nkj->nki", rotation, points),
         )
         return self._chain.sense(seen, ports, self._plain, self.dt, self._layout.n_steps)

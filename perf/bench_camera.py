@@ -198,7 +198,7 @@ def latency(rate: float, delay: float, seeds: int) -> Row:
 def gates(kind: str, seeds: Sequence[int], moves: int) -> Row:
     """An honest marker against the gates: an emulator with a sealed effect, driven to random bends at the
     full rate, with a load for the second half."""
-    from fastrod.model.routing import wire
+    from fastrod.model.routing import route
     from fastrod_device.columns import FLAGS
     from fastrod_device.errors import RefusedError
     from fastrod_device.gates import ASTRAY, OUTSIDE, TOO_FAST
@@ -208,7 +208,7 @@ def gates(kind: str, seeds: Sequence[int], moves: int) -> Row:
 
     note_progress(f"gates, {kind}")
     hardware = load_hardware()
-    wiring, length = wire(hardware.robot), hardware.robot.length
+    wiring, length = route(hardware.robot), hardware.robot.length
     most = hardware.limits.curvature * length
     flags, off, far, high = dict.fromkeys(FLAGS, 0), [0.0], [0.0], [length]
     for seed in seeds:
@@ -234,7 +234,7 @@ def gates(kind: str, seeds: Sequence[int], moves: int) -> Row:
                         bench.hands.hang(LOAD)
                     prototype.payload = LOAD
                 while True:
-                    dl = wiring.wires(rng.uniform(-most, most, (hardware.robot.n_segments, 2)))
+                    dl = wiring.tendon_change(rng.uniform(-most, most, (hardware.robot.n_segments, 2)))
                     try:
                         prototype.supervisor.within(dl)
                         break

@@ -203,11 +203,19 @@ def _instrument() -> dict[str, Tally]:
     from fastrod.types import Memory, RodShape
 
     modules = [
-        importlib.import_module(f"fastrod.kernels.{info.name}")
-        for info in pkgutil.iter_modules(package.__path__)
+        importlib.import_module(info.name)
+        for info in pkgutil.walk_packages(package.__path__, "fastrod.kernels.")
+        if not info.ispkg
     ]
     sections = {_short(module): Tally() for module in modules}
-    helpers = ("jit", "vec", "rod", "batch")  # their arithmetic belongs to the kernel that calls
+    helpers = (
+        "jit",
+        "vec",
+        "rod",
+        "batch",
+        "lanes",
+        "workspace",
+    )  # their arithmetic belongs to the kernel that calls
     wrapped: dict[int, Callable[..., Any]] = {}
     for module in modules:
         if _short(module) in helpers:

@@ -9,7 +9,7 @@ import numpy as np
 from fastrod.identification.log.replay import replay
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robotfile import load_robot
-from fastrod.model.routing import wire
+from fastrod.model.routing import route
 
 GAP = 3e-4
 """Half width of the play [m]."""
@@ -24,7 +24,7 @@ def backlash_log() -> RunLog:
         [size * np.sin(2.0 * np.pi * t / 4.2), 0.5 * size * np.cos(2.0 * np.pi * t / 6.7)], axis=1
     )
     bend[:45] = 0.0
-    dl = wire(robot).wires(bend[:, None])
+    dl = route(robot).tendon_change(bend[:, None])
     felt, at = np.empty_like(dl), dl[0]
     for i, commanded in enumerate(dl):
         felt[i] = at = np.clip(at, commanded - GAP, commanded + GAP)

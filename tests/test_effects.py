@@ -34,7 +34,7 @@ from fastrod.effects.ports import EffectPorts
 from fastrod.errors import EffectError, InputError, RobotError, UnknownNameError
 from fastrod.kernels.operators import BUFFER
 from fastrod.model.robotfile import dumps, loads
-from fastrod.model.routing import wire
+from fastrod.model.routing import route
 from fastrod.types import Floats
 
 NAMES = effect_names()
@@ -76,13 +76,13 @@ def having(robot: Robot, *tables: Table) -> Robot:
 
 def at_neutral(name: str, robot: Robot, *, shaped: bool = False) -> Table:
     """The effect's table with every value neutral; `shaped`: but for the parameters that only shape it."""
-    parameters = [p.on(wire(robot)) for p in get_effect(name).parameters]
+    parameters = [p.on(route(robot)) for p in get_effect(name).parameters]
     return {"name": name} | {p.name: p.starts[0] if shaped and p.shape else p.neutral for p in parameters}
 
 
 def at_typical(name: str, robot: Robot, times: float = 1.0) -> Table:
     """The effect's table with typical sizes, or a multiple of them; what shapes it is neutral."""
-    parameters = [p.on(wire(robot)) for p in get_effect(name).parameters]
+    parameters = [p.on(route(robot)) for p in get_effect(name).parameters]
     sizes = {
         p.name: float(np.clip(p.neutral + times * (p.typical or 0.0), *p.bounds))
         for p in parameters
@@ -275,7 +275,7 @@ def test_robots_without_wires_or_with_tensions_take_every_effect(name: str) -> N
 @pytest.mark.parametrize("name", OPERATORS)
 def test_a_sweep_over_a_log_is_its_steps_one_by_one(name: str) -> None:
     robot = two_segments()
-    wiring, what = wire(robot), get_effect(name)
+    wiring, what = route(robot), get_effect(name)
     assert isinstance(what, Operator)
     rng = np.random.default_rng(11)
     table = [at_typical(name, robot, times) for times in (1.0, 2.0)]
@@ -301,7 +301,7 @@ def test_memories_are_as_wide_as_their_operators_need() -> None:
     wires = {"backlash": 3, "friction": 6, "creep": 2, "dynamics": 3}
     assert set(OPERATORS) == {*wires, "latency", "plastic_set"}
     robot = two_segments()
-    wiring, n = wire(robot), robot.n_tendons
+    wiring, n = route(robot), robot.n_tendons
     dl = 0.002 * np.cumsum(np.random.default_rng(3).uniform(-1.0, 1.0, (1, 20, n)), axis=1)
     for name in OPERATORS:
         what: Any = get_effect(name)
@@ -331,7 +331,7 @@ def test_a_set_needs_no_memory_where_no_wire_ends() -> None:
     robot = having(
         Robot(name="few wires", segments=chain), {"name": "plastic_set", "share": 0.2, "yield_at": 0.1}
     )
-    wiring = wire(robot)
+    wiring = route(robot)
     what: Any = get_effect("plastic_set")
     memory = what.memory(1, 2)
     dl = 0.004 * np.ones((1, 5, 2)) * np.arange(5)[:, None]
@@ -485,7 +485,7 @@ def test_robots_of_a_batch_name_the_same_effects_and_share_their_wiring() -> Non
     with pytest.raises(RobotError, match="robot 1 of the batch has effects gravity, robot 0 has none"):
         Simulator([plain, heavy])
     with pytest.raises(
-        RobotError, match="robot 1 of the batch has segments of other lengths or wires at other places"
+        RobotError, match="robot 1 of the batch has segments of other lengths or tendons at other places"
     ):
         Simulator([heavy, having(rod(offset=0.008), *heavy.effects)])
     Simulator([plain, rod(offset=0.008)])  # which robots without effects may
@@ -535,7 +535,7 @@ def test_an_effect_says_what_it_is(name: str) -> None:
         assert all(low <= start <= high for start in (*p.starts, p.scale))
         assert p.shape or p.neutral == 0.0 != p.scale
     assert any(not p.shape for p in what.parameters)
-    wiring = wire(two_segments())
+    wiring = route(two_segments())
     assert len(columns(what, wiring)) == len(registry.read_values(name, {}, wiring, "test"))
     assert has_memory(what) == isinstance(what, Operator)
 
@@ -556,19 +556,19 @@ def test_effects_act_from_the_motor_to_the_camera() -> None:
 
 def test_wires_and_bends_belong_together() -> None:
     for robot in (one_segment(), two_segments(), load_robot("tdcr_b"), rod(n_tendons=3), rod("passive")):
-        wiring = wire(robot)
+        wiring = route(robot)
         change = np.random.default_rng(2).uniform(-1.0, 1.0, (5, robot.n_segments, 2))
-        dl = wiring.wires(change)
+        dl = wiring.tendon_change(change)
         for k in range(robot.n_segments) if robot.n_tendons else ():
             alone = change * (np.arange(robot.n_segments) == k)[:, None]
             expected = [bend(robot, *a[k], segment=k) - robot.rest_tendon_length for a in alone]
-            assert_allclose(wiring.wires(alone), expected, atol=1e-15)
+            assert_allclose(wiring.tendon_change(alone), expected, atol=1e-15)
         if robot.n_tendons:
             assert_allclose(wiring.bend(dl), change, atol=1e-12)
-    wiring = wire(two_segments())
+    wiring = route(two_segments())
     assert wiring.drive.tolist() == [0, 1, 0, 1, 2, 3, 2, 3]
     assert wiring.drive_sign.tolist() == [1.0, 1.0, -1.0, -1.0] * 2
-    assert wire(rod(n_tendons=3)).n_drives == 3
+    assert route(rod(n_tendons=3)).n_drives == 3
 
 
 # A user's own
@@ -670,7 +670,7 @@ def test_a_parameter_has_its_neutral_value_in_its_bounds() -> None:
         Parameter("size", "m", bounds=(1.0, 2.0))
     assert Parameter("size", "m", bounds=(0.0, 2.0)).scale == pytest.approx(0.2)
     assert Parameter("size", "m").starts == (1.0,)
-    scaled = Parameter("size", "m", bounds=(0.0, 2.0), typical=0.5, of="length").on(wire(two_segments()))
+    scaled = Parameter("size", "m", bounds=(0.0, 2.0), typical=0.5, of="length").on(route(two_segments()))
     assert (scaled.bounds, scaled.typical, scaled.of) == (
         (0.0, pytest.approx(0.26)),
         pytest.approx(0.065),

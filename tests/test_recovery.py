@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -11,9 +12,10 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from rods import bend, rod
 
-from fastrod import Observer, Robot, Simulator, State, load_robot
+from fastrod import Observer, Problem, Robot, Simulator, State, load_robot
 from fastrod.contact import ContactScene, plane
-from fastrod.errors import InputError
+from fastrod.errors import InputError, ProblemSentence
+from fastrod.solver.recovery import pressed
 
 N, ROWS, OTHERS = 4, np.array([1, 3]), np.array([0, 2])
 REACHER = load_robot("five_segment_reacher")
@@ -251,6 +253,7 @@ def test_a_straight_rod_pressed_beyond_buckling_is_not_ok(
     assert f"{abs(load):.3g} times what bends it" in state.problems[0]
     assert "give less load" in state.problems[0]
     assert "did not bring" not in state.problems[0]  # its residual is one of rounding
+    assert state.problem_kinds == {0: Problem.OVERLOADED}
     assert np.isnan(sim.jacobian()).all()
     assert sim.step(sim.robots[0].rest_tendon_length).ok.all()
 
@@ -263,15 +266,46 @@ def test_steps_and_settle_agree_on_loads_along_the_axis(load: float) -> None:
     assert_allclose(stepped.tip_position, settled.tip_position, atol=1e-9)
 
 
-def test_a_robot_that_has_buckled_is_ok() -> None:
+def test_a_press_counts_as_far_as_the_rod_stands_straight() -> None:
+    """Of the same force on the same robot: along the rod all of it, across it none, pulling none; what has
+    buckled and lies folded beside its base is not pressed."""
     robot = load_robot("prototype")
     sim = Simulator(robot, threads=1)
-    for k in range(1, 41):  # pushed aside a little, it goes down beside its base
-        force = np.array([0.02, 0.0, -40.0 * 0.0022 / 0.07**2]) * k / 40
-        sim.step(robot.rest_tendon_length, tip_force=force)
-    settled = sim.settle(robot.rest_tendon_length, tip_force=force)
-    if settled.ok[0]:  # the shape of a loaded arch is one of several; it is no straight one
-        assert settled.tip_position[0, 2] < 0.05
+    for k in range(1, 11):
+        state = sim.step(robot.rest_tendon_length, tip_force=[0.0, 0.0, -2.0 * k / 10])
+    ports, shape, rows = sim._ports, state.as_shape(), np.array([0])
+    assert ports is not None
+    straight = pressed(sim._passes, ports, shape, rows)[0]
+    assert straight == pytest.approx(2.0 * 0.07**2 / 0.0022, rel=1e-9)
+    for force in ([2.0, 0.0, 0.0], [0.0, 0.0, 2.0]):
+        assert pressed(sim._passes, ports._replace(tip_force=np.array([force])), shape, rows)[0] < 1e-6
+    folded = shape._replace(tip_position=np.array([[0.03, 0.0, 0.002]]))
+    assert pressed(sim._passes, ports, folded, rows)[0] < 0.05 * straight
+
+
+def test_each_problem_has_a_kind() -> None:
+    robot = load_robot("prototype")
+    rest = robot.rest_tendon_length
+    sim = Simulator(robot, 3, threads=1)
+    state = sim.settle(rest, rows=[0])
+    assert state.problem_kinds == {1: Problem.NEVER_SOLVED, 2: Problem.NEVER_SOLVED}
+    force = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, -500.0, 0.0]])
+    state = sim.settle(np.array([rest, np.full(4, np.nan), rest]), tip_force=force)
+    assert state.problem_kinds == {1: Problem.BAD_INPUT, 2: Problem.OVERLOADED}
+    assert all(isinstance(said, ProblemSentence) and len(said) > 20 for said in state.problems.values())
+    kept = pickle.loads(pickle.dumps(dict(state.problems)))
+    assert kept == state.problems
+    assert {i: said.kind for i, said in kept.items()} == state.problem_kinds
+    snapshot = sim.snapshot()
+    assert sim.settle(rest).problem_kinds == {}
+    sim.restore(snapshot, [1])
+    assert sim.state.problem_kinds == {1: Problem.BAD_INPUT}
+
+
+def test_the_old_name_of_an_option_says_the_new_one() -> None:
+    old: dict[str, Any] = {"hold_gain": 1e-4}
+    with pytest.raises(InputError, match=r"^the option 'hold_gain' is now 'kept_jacobian_tolerance'\.$"):
+        Simulator(REACHER, **old)
 
 
 @pytest.mark.parametrize(

@@ -39,21 +39,21 @@ def touching() -> Simulator:
 
 
 def segment(**given: Any) -> Segment:
-    wires = (Tendon(offset=0.007, angle=0.0),)
+    one_tendon = (Tendon(offset=0.007, angle=0.0),)
     return Segment(
         **{
             "length": 0.07,
             "bending_stiffness": (0.002, 0.002),
             "torsional_stiffness": 0.001,
-            "tendons": wires,
+            "tendons": one_tendon,
         }
         | given
     )
 
 
 def slack() -> Robot:
-    wire = Tendon(offset=0.007, angle=0.0, unilateral=True)
-    return Robot(name="slack", segments=(segment(mode="tendon_tension", tendons=(wire,)),))
+    tendon = Tendon(offset=0.007, angle=0.0, unilateral=True)
+    return Robot(name="slack", segments=(segment(mode="tendon_tension", tendons=(tendon,)),))
 
 
 def reading(t: float) -> Measurement:

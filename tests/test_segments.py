@@ -163,11 +163,11 @@ def test_a_robot_that_actions_cannot_drive_is_refused() -> None:
     with pytest.raises(RobotError) as caught:
         SegmentActions(pulled)
     assert str(caught.value) == (
-        "segment 1 of robot 'stiff' is tendon_tension; an action needs wires driven by length."
+        "segment 1 of robot 'stiff' is tendon_tension; an action needs tendons driven by length."
     )
     flat = replace(rod(n_tendons=2), name="flat")
     with pytest.raises(RobotError) as caught:
         SegmentActions(flat)
     assert str(caught.value) == (
-        "the wires of segment 1 of robot 'flat' bend it in one plane; an action needs two."
+        "the tendons of segment 1 of robot 'flat' bend it in one plane; an action needs two."
     )

@@ -267,7 +267,7 @@ def test_some_robots_settle_and_the_others_stay(case: str) -> None:
     assert same(sim.state, before, OTHERS)
     assert (sim.state.residual[ROWS] < 1e-9).all()
     assert sim.state.ok.all()
-    if case != "effect with memory":  # where a robot settles depends on where its wires were
+    if case != "effect with memory":  # where a robot settles depends on where its tendons were
         assert_allclose(
             sim.state.tip_position[ROWS], fresh.settle(**step(20)).tip_position[ROWS], rtol=0, atol=1e-8
         )

@@ -20,7 +20,7 @@ from dataclasses import replace
 import numpy as np
 
 from fastrod.model.robot import Robot
-from fastrod.model.routing import wire
+from fastrod.model.routing import route
 from fastrod.types import Floats
 from fastrod_device.clock import Clock
 from fastrod_device.drive import DriveBus
@@ -165,7 +165,7 @@ def tightened(robot: Robot, tension: Floats) -> Robot:
 def softness(robot: Robot) -> Floats:
     """(n_tendons, n_tendons) change of wire length by tension [m/N], straight and unloaded: what the wires
     give and the body bends."""
-    wiring = wire(robot)
+    wiring = route(robot)
     body = np.repeat([segment.length / min(segment.bending_stiffness) for segment in robot.segments], 2)
     own = np.array(
         [max(tendon.compliance, _STIFFEST) for segment in robot.segments for tendon in segment.tendons]
@@ -176,13 +176,13 @@ def softness(robot: Robot) -> Floats:
 def lean(robot: Robot, tip: Floats) -> Floats:
     """(n_tendons,) wire lengths [m] that bend a straight robot so that its tip (3,) is beside the axis by as
     much as this one; the least bends that do it."""
-    wiring = wire(robot)
+    wiring = route(robot)
     # from the middle of a segment to the tip
     beyond = np.cumsum(wiring.length[::-1])[::-1] - 0.5 * wiring.length
     by_bend = np.zeros((2, 2 * robot.n_segments))
     by_bend[0, 1::2], by_bend[1, 0::2] = beyond, -beyond
     bend = np.linalg.pinv(by_bend) @ tip[:2]
-    return wiring.wires(bend.reshape(robot.n_segments, 2))
+    return wiring.tendon_change(bend.reshape(robot.n_segments, 2))
 
 
 def _tightened(cycle: Callable[[Floats], Floats], at: Floats, hardware: Hardware) -> Floats:
@@ -251,12 +251,12 @@ def _straightened(
 def _spiral(hardware: Hardware) -> Floats:
     """(n, n_tendons) wire lengths [m] of a bend that circles and shrinks to nothing, all segments alike, at
     half of the rate at most."""
-    wiring, limits = wire(hardware.robot), hardware.limits
+    wiring, limits = route(hardware.robot), hardware.limits
     n = round(_TURNS * _TURN * hardware.rate)
     angle = 2.0 * np.pi * _TURNS * np.arange(1, n + 1) / n
     bend = np.sin(np.pi * np.arange(1, n + 1) / n) ** 0.25 * (1.0 - np.arange(1, n + 1) / n)
     way = np.stack([bend * np.cos(angle), bend * np.sin(angle)], axis=1)
-    dl = wiring.wires(np.repeat(way[:, None], wiring.n_segments, axis=1))
+    dl = wiring.tendon_change(np.repeat(way[:, None], wiring.n_segments, axis=1))
     quickest = float(np.abs(np.diff(dl, axis=0, prepend=0.0)).max()) * hardware.rate
     return (
         _BEND

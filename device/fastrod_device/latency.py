@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fastrod.errors import InputError
-from fastrod.model.routing import wire
+from fastrod.model.routing import route
 from fastrod.types import Floats
 from fastrod_device.errors import CalibrationError
 from fastrod_device.hardware import Hardware
@@ -183,13 +183,13 @@ def play(motion: Floats, half_width: float) -> Floats:
 def sweep(hardware: Hardware, t: Floats) -> Floats:
     """(n, n_tendons) changes of wire length [m] at times (n,) [s] of `measure_latency`'s motion: all segments
     bend alike, to and fro."""
-    wiring, limits = wire(hardware.robot), hardware.limits
+    wiring, limits = route(hardware.robot), hardware.limits
     whole = np.arange(0.0, _SWEEP, 1.0 / hardware.rate)
 
     def wires(times: Floats) -> Floats:
         grown = np.clip(np.minimum(times, _SWEEP - times) / _RAMP, 0.0, 1.0)
         bend = _BEND / wiring.n_segments * grown[:, None] * np.sin(2.0 * np.pi * np.outer(times, _WAVES))
-        return wiring.wires(np.repeat(bend[:, None], wiring.n_segments, axis=1))
+        return wiring.tendon_change(np.repeat(bend[:, None], wiring.n_segments, axis=1))
 
     way = wires(whole)
     bends = _BEND * math.sqrt(2.0) / wiring.n_segments

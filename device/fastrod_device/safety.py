@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from fastrod.errors import InputError
 from fastrod.model.robot import Robot
-from fastrod.model.routing import wire
+from fastrod.model.routing import route
 from fastrod.types import Floats
 from fastrod_device.clock import Clock
 from fastrod_device.errors import RefusedError
@@ -98,7 +98,7 @@ class Supervisor:
         if robot.n_tendons == 0:
             raise InputError(f"robot {robot.name!r} has no wires; there is nothing to drive.")
         self.limits = limits
-        self._wiring = wire(robot)
+        self._wiring = route(robot)
         self._inspector = Inspector(robot.n_tendons, limits, nodes, words)
         self._on_stop = on_stop
         self._lock = threading.RLock()  # a signal handler may press stop while this thread holds it

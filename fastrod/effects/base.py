@@ -99,7 +99,7 @@ class Parameter:
         size = (
             float(wiring.length.sum())
             if self.of == "length" or not wiring.n_tendons
-            else float(wiring.reach.mean())
+            else float(wiring.tendon_offset.mean())
         )
         assert self.typical is not None
         return Parameter(

@@ -12,7 +12,7 @@ from fastrod.effects.base import Effect, Seam, canonical_name, effect_names, get
 from fastrod.effects.ports import EffectPorts, close_ports, open_ports
 from fastrod.errors import EffectError, RobotError, nearest
 from fastrod.model.robot import Robot
-from fastrod.model.routing import Routing, wire
+from fastrod.model.routing import Routing, route
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.types import Flags, Floats, Params, Ports
 
@@ -71,7 +71,7 @@ class EffectPipeline:
     def __init__(self, robots: Sequence[Robot], n_robots: int) -> None:
         """Raises `EffectError`, `UnknownNameError` for effects that are not, `RobotError` where robots name
         different ones."""
-        self.wiring = wire(robots[0])
+        self.wiring = route(robots[0])
         tables = [named_effects(robot) for robot in robots]
         for i, named in enumerate(tables):
             if list(named) != list(tables[0]):
@@ -80,9 +80,9 @@ class EffectPipeline:
                     f"{', '.join(tables[0]) or 'none'}; "
                     "name the same effects in each, with neutral values where one has none."
                 )
-            if named and robots[i] is not robots[0] and not _alike(wire(robots[i]), self.wiring):
+            if named and robots[i] is not robots[0] and not _alike(route(robots[i]), self.wiring):
                 raise RobotError(
-                    f"robot {i} of the batch has segments of other lengths or wires at other places than "
+                    f"robot {i} of the batch has segments of other lengths or tendons at other places than "
                     "robot 0; "
                     "with effects these must agree: give robots that differ there a simulator each."
                 )

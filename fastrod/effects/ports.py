@@ -71,7 +71,7 @@ class EffectPorts:
     def common(self) -> Floats:
         """(n, n_segments) change of length that the wires of a segment share, beyond that of the segment
         before [m]."""
-        odd = self.dl - self.wiring.wires(self.bend())
+        odd = self.dl - self.wiring.tendon_change(self.bend())
         ends = np.zeros((len(odd), self.wiring.n_segments))
         for k in range(self.wiring.n_segments):
             if (own := self.wiring.tendon_segment == k).any():
@@ -82,7 +82,7 @@ class EffectPorts:
 
     def shift_bend(self, change: Floats) -> None:
         """Let the wires ask for another bend: (n, n_segments, 2) [rad] more."""
-        self.tendon_length += self.wiring.wires(change)
+        self.tendon_length += self.wiring.tendon_change(change)
 
     def shift_wires(self, change: Floats) -> None:
         """Change wire lengths by (n, n_tendons) [m], the part of it that bends.

@@ -14,7 +14,7 @@ from fastrod.effects.pipeline import named_effects
 from fastrod.errors import InputError, shown
 from fastrod.model.robot import Robot
 from fastrod.model.robotfile import loads
-from fastrod.model.routing import wire
+from fastrod.model.routing import route
 from fastrod.types import Floats
 
 _SPREAD = (0.5, 1.5)
@@ -54,7 +54,7 @@ def with_effects(
     Every number is drawn evenly from half to one and a half of its typical size, with either sign where both
     can be, within its bounds.
     """
-    wiring = wire(robot)
+    wiring = route(robot)
     tables: dict[str, dict[str, Any]] = {name: dict(table) for name, table in named_effects(robot).items()}
     told: dict[str, float] = {}
     for effect in effects:

@@ -16,7 +16,7 @@ import numpy as np
 from fastrod.errors import InputError
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
-from fastrod.model.routing import Routing, wire
+from fastrod.model.routing import Routing, route
 from fastrod.rotation import matrix_from_quaternion, product
 from fastrod.types import Floats
 
@@ -93,7 +93,7 @@ def excitation(
         raise InputError(f"payload is {payload!r} kg; it must be between 0 and 10 kg.")
     if bend > _RANGES["bend"][1]:
         raise InputError(f"bend is {bend!r} rad; a segment bends by 3 rad at most. Was it given in degrees?")
-    wiring = wire(robot)
+    wiring = route(robot)
     rng = np.random.default_rng(seed)
     rows: list[Floats] = []
     parts: list[MotionPhase] = []
@@ -147,7 +147,7 @@ def excitation(
         name=f"{robot.name}_excitation",
         t=np.arange(len(path)) / rate,
         run=np.full(len(path), ""),
-        dl=np.round(wiring.wires(path), 9),
+        dl=np.round(wiring.tendon_change(path), 9),
         tip_position=np.full((len(path), 3), np.nan),
         payload=np.where(np.concatenate(loaded), payload, 0.0),
         base_quaternion=np.where(np.concatenate(turned)[:, None], other_way, own),

@@ -11,7 +11,7 @@ from fastrod.errors import RobotError
 from fastrod.model.robot import Robot
 from fastrod.types import Floats, Layout, Params
 
-_INEXTENSIBLE = 1e-9  # m/N; below it the tensions of three wires that lock the twist grow without bound
+_INEXTENSIBLE = 1e-9  # m/N; below it the tensions of three tendons that lock the twist grow without bound
 
 
 class DefaultInputs(NamedTuple):

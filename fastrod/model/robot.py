@@ -56,7 +56,7 @@ def _per_segment(value: float | tuple[float, ...], n_crossed: int, where: str) -
 
 @dataclass(frozen=True, kw_only=True)
 class Tendon:
-    """A wire along the backbone, fixed at the end of its segment (the paper's pull wire).
+    """A tendon along the backbone, fixed at the end of its segment (the paper's pull wire).
 
     A tendon of a distal segment crosses the proximal ones; `offset` and `angle` are then one number for all
     segments or a tuple with one for each segment crossed, base first.
@@ -71,11 +71,11 @@ class Tendon:
     """Position around it, from d1 toward d2 [rad]."""
     compliance: float = 1e-5
     """Stretch per tension, l(l) = L + compliance (T - pretension) [m/N]. Below 1e-9 counts as 1e-9: three or
-    more wires that do not stretch at all lock the twist with tensions beyond bound."""
+    more tendons that do not stretch at all lock the twist with tensions beyond bound."""
     pretension: float = 0.0
     """Tension at which the tendon has its commanded length [N]."""
     unilateral: bool = False
-    """True: a wire that goes slack at T = 0; False: a push-pull rod that carries T < 0 too."""
+    """True: a cable that goes slack at T = 0; False: a push-pull rod that carries T < 0 too."""
 
     def __post_init__(self) -> None:
         for name in ("offset", "angle"):
@@ -172,8 +172,9 @@ class Segment:
 class Robot:
     """A chain of segments on a base, and the world it stands in.
 
-    >>> wire = Tendon(offset=0.0075, angle=0.0)
-    >>> rod = Segment(length=0.07, bending_stiffness=(0.0022,) * 2, torsional_stiffness=1e-3, tendons=(wire,))
+    >>> tendon = Tendon(offset=0.0075, angle=0.0)
+    >>> rod = Segment(length=0.07, bending_stiffness=(0.0022,) * 2, torsional_stiffness=1e-3,
+    tendons=(tendon,))
     >>> Robot(name="one", segments=(rod,)).rest_tendon_length
     array([0.07])
     """

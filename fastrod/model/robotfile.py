@@ -115,16 +115,16 @@ def save_robot(robot: Robot, path: str | Path) -> None:
     target = Path(path)
     if target.suffix != ".toml":
         raise RobotError(f"{str(path)!r} does not end in .toml; a robot file does.")
-    part = target.with_suffix(".toml.part")
+    unfinished = target.with_suffix(".toml.part")
     try:
         text = dumps(robot).encode()
-        part.write_bytes(text)
-        part.replace(target)
+        unfinished.write_bytes(text)
+        unfinished.replace(target)
     except ValueError as error:  # a name that is no text, or a path that no file can have
         raise RobotError(f"{str(path)!r} cannot be written: {error}.") from error
     except OSError as error:
         with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
+            unfinished.unlink(missing_ok=True)
         raise RobotError(f"{str(path)!r} cannot be written: {error.strerror}.") from error
 
 

@@ -1,5 +1,4 @@
-"""How wires and bends hang together: the linear map between the bend of the segments and the lengths of the
-wires."""
+"""Tendons and bends: the linear map between the bend of the segments and the lengths of the tendons."""
 
 from __future__ import annotations
 
@@ -13,33 +12,33 @@ from fastrod.types import Floats, Ints
 
 @dataclass(frozen=True)
 class Routing:
-    """Routing of one robot's wires; the same for every robot of a batch."""
+    """Routing of one robot's tendons; the same for every robot of a batch."""
 
     n_segments: int
     tendon_segment: Ints
-    """(n_tendons,) segment at whose end the wire ends."""
+    """(n_tendons,) segment at whose end the tendon ends."""
     arms: Floats
-    """(n_tendons, 2 n_segments) d(wire length)/d(bend x, bend y of each segment) [m/rad], bend about d1 and
+    """(n_tendons, 2 n_segments) d(tendon length)/d(bend x, bend y of each segment) [m/rad], bend about d1 and
     d2."""
-    bend_from_wires: Floats
+    bend_from_tendons: Floats
     """(2 n_segments, n_tendons) least-squares inverse of `arms` [rad/m]."""
     drive: Ints
-    """(n_tendons,) the drive of each wire: opposite wires of a segment are one antagonistic drive."""
+    """(n_tendons,) the drive of each tendon: opposite tendons of a segment are one antagonistic drive."""
     drive_sign: Floats
-    """(n_tendons,) +1 for the first wire of its drive, -1 for its antagonist."""
-    reach: Floats
-    """(n_tendons,) distance of the wire from the backbone in its last segment [m]."""
+    """(n_tendons,) +1 for the first tendon of its drive, -1 for its antagonist."""
+    tendon_offset: Floats
+    """(n_tendons,) distance of the tendon from the backbone in its last segment [m]."""
     length: Floats
     """(n_segments,) of the robot [m]."""
 
     @property
     def n_tendons(self) -> int:
-        """Wires of all segments."""
+        """Tendons of all segments."""
         return len(self.tendon_segment)
 
     @property
     def n_drives(self) -> int:
-        """Drives that pull them; an antagonistic pair of wires has one."""
+        """Drives that pull them; an antagonistic pair of tendons has one."""
         return int(self.drive.max()) + 1 if len(self.drive) else 0
 
     def count(self, per: str) -> int:
@@ -51,16 +50,16 @@ class Routing:
         return np.ascontiguousarray(per_drive[..., self.drive])
 
     def by_end(self, per_segment: Floats) -> Floats:
-        """(..., n_tendons) from (..., n_segments): the value of the segment at whose end the wire ends."""
+        """(..., n_tendons) from (..., n_segments): the value of the segment at whose end the tendon ends."""
         return np.ascontiguousarray(per_segment[..., self.tendon_segment])
 
     def bend(self, dl: Floats) -> Floats:
-        """(..., n_segments, 2) bend about d1 and d2 [rad] that these wire lengths (..., n_tendons) ask
+        """(..., n_segments, 2) bend about d1 and d2 [rad] that these tendon lengths (..., n_tendons) ask
         for."""
-        return _times(dl, self.bend_from_wires.T).reshape(*dl.shape[:-1], self.n_segments, 2)
+        return _times(dl, self.bend_from_tendons.T).reshape(*dl.shape[:-1], self.n_segments, 2)
 
-    def wires(self, bend: Floats) -> Floats:
-        """(..., n_tendons) change of wire length [m] that goes with a bend (..., n_segments, 2) [rad]."""
+    def tendon_change(self, bend: Floats) -> Floats:
+        """(..., n_tendons) change of tendon length [m] that goes with a bend (..., n_segments, 2) [rad]."""
         return _times(bend.reshape(*bend.shape[:-2], 2 * self.n_segments), self.arms.T)
 
 
@@ -73,8 +72,8 @@ def _times(a: Floats, matrix: Floats) -> Floats:
     return out
 
 
-def wire(robot: Robot) -> Routing:
-    """The wiring of a robot: l_i = l + sum_k (bend_x y_ik - bend_y x_ik), constant curvature in each
+def route(robot: Robot) -> Routing:
+    """The routing of a robot: l_i = l + sum_k (bend_x y_ik - bend_y x_ik), constant curvature in each
     segment."""
     ends = robot.tendon_segment
     positions = [tendon.position(int(end) + 1) for tendon, end in zip(robot.tendons, ends, strict=True)]
@@ -102,11 +101,11 @@ def wire(robot: Robot) -> Routing:
         n_segments=robot.n_segments,
         tendon_segment=ends,
         arms=arms,
-        bend_from_wires=np.asarray(np.linalg.pinv(arms), dtype=np.float64)
+        bend_from_tendons=np.asarray(np.linalg.pinv(arms), dtype=np.float64)
         if robot.n_tendons
         else arms.T.copy(),
         drive=drive.astype(np.int64),
         drive_sign=sign,
-        reach=np.array([float(np.hypot(*places[-1])) for places in positions]),
+        tendon_offset=np.array([float(np.hypot(*places[-1])) for places in positions]),
         length=np.array([segment.length for segment in robot.segments]),
     )

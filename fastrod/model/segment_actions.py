@@ -1,4 +1,4 @@
-"""Segments as one drives them: extension and two bends each, and the wire lengths that belong to them."""
+"""Segments as one drives them: extension and two bends each, and the tendon lengths that belong to them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from fastrod.errors import InputError, RobotError, refuse_masked, shown
 from fastrod.model.robot import Robot
-from fastrod.model.routing import wire
+from fastrod.model.routing import route
 from fastrod.types import Floats
 
 
@@ -27,8 +27,9 @@ class SegmentActions:
     [m] (the paper's action).
 
     A displacement `d` bends the segment by d / offset [rad]: the first toward +d1 of its base, the second
-    toward +d2. The wires of distal segments give way to the bends and extensions of the segments that they
-    cross, so every segment has its own action. Without load and with wires that do not stretch, the segments
+    toward +d2. The tendons of distal segments follow the bends and extensions of the segments that they
+    cross, so every segment has its own action. Without load and with tendons that do not stretch, the
+    segments
     are arcs of these bends.
 
     >>> import fastrod
@@ -38,22 +39,23 @@ class SegmentActions:
     """
 
     def __init__(self, robot: Robot, offset: float | None = None) -> None:
-        """`offset`: displacement per bend [m/rad]; by default the distance of each segment's first wire from
+        """`offset`: displacement per bend [m/rad]; by default the distance of each segment's first tendon
+        from
         the backbone. Raises
-        `RobotError` where a segment is not driven by the lengths of two or more wires around it."""
-        wiring = wire(robot)
+        `RobotError` where a segment is not driven by the lengths of two or more tendons around it."""
+        routing = route(robot)
         n = robot.n_segments
         offsets = np.full(n, offset, float) if offset else np.zeros(n)
         for k, segment in enumerate(robot.segments):
             if segment.mode not in ("tendon_length", "paper"):
                 raise RobotError(
                     f"segment {k + 1} of robot {robot.name!r} is {segment.mode}; an action "
-                    "needs wires driven by length."
+                    "needs tendons driven by length."
                 )
             arms = np.array([tendon.position(k + 1)[k] for tendon in segment.tendons])
             if np.linalg.matrix_rank(arms) < 2:
                 raise RobotError(
-                    f"the wires of segment {k + 1} of robot {robot.name!r} bend it in one "
+                    f"the tendons of segment {k + 1} of robot {robot.name!r} bend it in one "
                     "plane; an action needs two."
                 )
             offsets[k] = offsets[k] or np.hypot(*arms[0])
@@ -67,7 +69,7 @@ class SegmentActions:
         """(n_segments, 3 n_segments) d(extension)/d(action)."""
         self.by_extension[np.arange(n), 3 * np.arange(n)] = 1.0
         longer = np.cumsum(self.by_extension, axis=0)[robot.tendon_segment]
-        by_length = longer + np.moveaxis(wiring.wires(np.moveaxis(bends, 2, 0)), 0, 1)
+        by_length = longer + np.moveaxis(routing.tendon_change(np.moveaxis(bends, 2, 0)), 0, 1)
         self.matrix: Floats = np.concatenate([by_length, self.by_extension])
         """(n_tendons + n_segments, 3 n_segments) d(tendon length, extension)/d(action): `Simulator.jacobian()
         @ matrix` is the tip's Jacobian by actions."""

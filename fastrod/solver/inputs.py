@@ -303,7 +303,7 @@ class Reader:
             longer = lengths - ends
             if lengths.min(initial=np.inf) > 0.0 and (np.abs(longer) <= slack).all():
                 return lengths
-            # a wire that can go slack may hang as loose as it likes
+            # a tendon that can go slack may hang as loose as it likes
             long = (longer > slack) & ~params.unilateral
             bad = ((lengths <= 0.0) | (-longer > slack) | long | (lengths > 20.0 * ends))[:, rows].any(1)
         if bad.any():
@@ -418,7 +418,7 @@ def _per_step(sampled: Floats, nodes: Floats) -> Floats:
     f = np.broadcast_to(sampled, (n, *sampled.shape[1:]))
     t = np.broadcast_to(nodes, (n, *nodes.shape[1:])) * n_cells  # in cells
     cell = np.minimum(t.astype(int), n_cells - 1)
-    part = (t - cell)[..., None]
+    fraction = (t - cell)[..., None]
     f0, f1 = (np.take_along_axis(f, (cell + k)[..., None], axis=2) for k in (0, 1))
     start = np.arange(n_cells)[:, None]
     # of whole cells, and their moment about the start of the segment
@@ -428,8 +428,8 @@ def _per_step(sampled: Floats, nodes: Floats) -> Floats:
         np.concatenate([np.zeros_like(a[:, :, :1]), np.cumsum(a, axis=2)], axis=2) for a in (force, moment)
     )
     slope = f1 - f0
-    own_f = part * f0 + 0.5 * part**2 * slope
-    own_m = cell[..., None] * own_f + 0.5 * part**2 * f0 + part**3 * slope / 3.0
+    own_f = fraction * f0 + 0.5 * fraction**2 * slope
+    own_m = cell[..., None] * own_f + 0.5 * fraction**2 * f0 + fraction**3 * slope / 3.0
     F, M = (
         np.take_along_axis(a, cell[..., None], axis=2) + own
         for a, own in ((before_f, own_f), (before_m, own_m))

@@ -110,15 +110,15 @@ def _largest_load(params: Params, ports: Ports) -> float:
     def size(a: Floats) -> float:
         return math.sqrt(3.0) * float(np.abs(a).max(initial=0.0))
 
-    reach, segments = float(params.rod_length.max()), params.length.shape[1]
+    length, segments = float(params.rod_length.max()), params.length.shape[1]
     force = (
         size(ports.tip_force)
         + size(ports.tip_moment) / float(params.rod_length.min())
         + size(ports.follower_force)
     )
-    force += size(ports.line_force) * (reach + segments * float(np.abs(ports.extension).max(initial=0.0)))
+    force += size(ports.line_force) * (length + segments * float(np.abs(ports.extension).max(initial=0.0)))
     force += size(ports.node_force) * ports.node_force.shape[1]
-    return force * reach / float(params.moment_scale.min())
+    return force * length / float(params.moment_scale.min())
 
 
 def what_to_do(passes: BoundarySolver, ports: Ports, row: int) -> str:

@@ -14,10 +14,10 @@ from fastrod.types import Floats, Ints, Memory, Params, PointLoads, Ports, Respo
 
 _ROWS = 1024  # of one pass: robots times copies of them
 _HALF = 0.5e-4 * np.repeat(np.eye(3), 2, axis=0) * np.array([[1.0], [-1.0]] * 3)
-_TURNS: Floats = np.array(
+_ROTATIONS: Floats = np.array(
     [[[1.0, -x, -y, -z], [x, 1.0, -z, y], [y, z, 1.0, -x], [z, -y, x, 1.0]] for x, y, z in _HALF]
 )[:, None]
-"""(6, 1, 4, 4) what turns a quaternion forward and back by 1e-4 rad about each axis of the world."""
+"""(6, 1, 4, 4) what rotates a quaternion forward and back by 1e-4 rad about each axis of the world."""
 Relocate = Callable[[Floats], Mapping[str, Floats]]
 """Extensions -> the ports that change with them."""
 
@@ -35,8 +35,8 @@ class Linear:
         self.passes, self.rows, self.ports, self.loads = passes, rows, ports, loads
 
     def respond(self, columns: bool = True) -> tuple[Response, RodShape]:
-        """Residuals, tip and their derivatives by the unknowns and, last, by a tip force; rows that are not
-        asked are nan."""
+        """Residuals, tip and their derivatives by the unknowns and, last, by a tip force; other rows
+        are nan."""
         passes, ports = self.passes, self.ports
         n, n_e, n_loads = passes.n_robots, passes.n_residuals(ports), self.loads.node.shape[1]
         extra = 3 * n_loads if n_loads else 0 if len(ports.follower_force) else 3
@@ -65,7 +65,7 @@ class Linear:
         world.
 
         All but those of lengths come from central differences of the pass at fixed unknowns, as rows of one
-        batch. `relocate` tells what an extension moves besides itself.
+        batch. `relocate` returns what an extension moves besides itself.
         """
         moved, delta, pulled = self._spread(turning)
         (m, n), n_rows = delta.shape, len(self.rows)
@@ -167,8 +167,8 @@ class Linear:
             a[1 + 2 * j, :, i] += delta[j]
             a[2 + 2 * j, :, i] -= delta[j]
         if turning:
-            turns = moved["base_pose"][1 + 2 * n_inputs :, :, 3:]
-            turns[:] = (_TURNS @ turns[..., None])[..., 0] / math.sqrt(1.0 + 0.25e-8)
+            rotated = moved["base_pose"][1 + 2 * n_inputs :, :, 3:]
+            rotated[:] = (_ROTATIONS @ rotated[..., None])[..., 0] / math.sqrt(1.0 + 0.25e-8)
         return moved, delta, pulled
 
     def _combine(self, response: Response, shape: RodShape, delta: Floats, pulled: list[int]) -> Floats:
@@ -246,11 +246,11 @@ def _split(a: Any, k: int) -> Any:
 def _differences(response: Response, p: Floats, r: Floats, delta: Floats) -> tuple[Floats, Floats]:
     """(m, n, 6) and (m, n, n_e): central differences of tip pose (2 m, n, ...) and residuals, forward and
     back by turns."""
-    e, turn = response.error, r[::2] @ np.swapaxes(r[1::2], 2, 3)
+    e, rotation = response.error, r[::2] @ np.swapaxes(r[1::2], 2, 3)
     change = np.empty((*delta.shape, 6))
     change[..., :3] = p[::2] - p[1::2]
     for a, (i, j) in enumerate(((2, 1), (0, 2), (1, 0))):
-        change[..., 3 + a] = 0.5 * (turn[..., i, j] - turn[..., j, i])
+        change[..., 3 + a] = 0.5 * (rotation[..., i, j] - rotation[..., j, i])
     width = 2.0 * delta[..., None]
     return change / width, (e[::2] - e[1::2]) / width
 
@@ -271,9 +271,9 @@ def inverse(a: Floats) -> Floats:
 
 
 def stretch(passes: BoundarySolver, rows: Ints, change: Floats) -> None:
-    """These robots' extensions are about to change by this much (1 or n_robots, n_segments) [m]: the wires
-    that grow along with their segments are, for the boundary, as they were. The gain knows of wires alone; it
-    would pull at every wire."""
+    """These robots' extensions are about to change by this much (1 or n_robots, n_segments) [m]: the tendons
+    that grow along with their segments are, for the boundary, as they were. The gain knows of tendons alone;
+    it would pull at every one."""
     if not change.any():
         return
     layout = passes.layout

@@ -15,8 +15,10 @@ from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports
 Pass: TypeAlias = Callable[[Ints, Ports], Floats]
 """(robots, ports) -> residual of these robots at the x before the update [m]."""
 
-_MAX_PASSES = 40
-_FREE_PASSES = 20  # robots with wires that can go slack: semi-smooth Newton first, monotone only after that
+_MAX_ITERATIONS = 40
+_FREE_ITERATIONS = (
+    20  # robots with tendons that can go slack: semi-smooth Newton first, monotone only after that
+)
 _STEEP = 6.0
 # passes within tolerance after which tensions that still wander are let go: nothing determines them
 _PATIENCE = 4
@@ -29,11 +31,11 @@ _SMALLEST_LOAD_STEP = 1.0 / 256.0
 def settle(
     rows: Ints, warm: Flags, boundary: BoundarySolver, ports: Ports, tolerance: float, run: Pass
 ) -> Ints:
-    """Bring the robots `rows` to rest on `ports`; the passes that each took, and -1 where none of three ways
-    converged.
+    """Bring the robots `rows` to rest on `ports`; the passes that each took, and -1 where none of three
+    tries converged.
 
     Warm robots start from their last x, moved to first order to the new inputs; others, and warm ones that
-    fail, from a cold guess; what still fails is led there by its loads, from none to all.
+    fail, from a cold guess; what still fails by continuation of its loads, from none to all.
     """
     layout, params = boundary.layout, boundary.params
     passes = np.zeros(boundary.n_robots, np.int64)
@@ -99,18 +101,19 @@ def _newton(
     damping = np.ones(len(rows))
     patience = np.full(len(rows), _PATIENCE)
     one_sided = np.broadcast_to(params.unilateral.any(1), boundary.n_robots)[rows]
-    for count in range(_MAX_PASSES):
+    for count in range(_MAX_ITERATIONS):
         x_tried = boundary.x[rows]
         residual = run(rows, ports)
         passes[rows] += 1
         after = boundary.x[rows]
-        # in paper mode the wires may contradict each other: at the least-squares boundary the residual stays
+        # in paper mode the tendons may contradict each other: at the least-squares boundary the residual
+        # stays
         better = residual <= 2.0 * best if layout.paper else residual < best
-        if count < _FREE_PASSES:
-            # a wire that goes slack or taut puts a corner into the residuals: over it they rise before they
+        if count < _FREE_ITERATIONS:
+            # a tendon that goes slack or taut puts a corner into the residuals: over it they rise before they
             # fall
             better |= one_sided & np.isfinite(residual)
-        shorter = _within_reach(after - x_tried, rows, layout, params)
+        shorter = _within_step_limit(after - x_tried, rows, layout, params)
         if better.all() and shorter is None:
             x_at, step, best = x_tried, after - x_tried, residual
             damping[:] = 1.0
@@ -145,21 +148,22 @@ def _newton(
     return np.sort(np.concatenate([rows, *failed]))
 
 
-def _within_reach(step: Floats, rows: Ints, layout: Layout, params: Params) -> Floats | None:
+def _within_step_limit(step: Floats, rows: Ints, layout: Layout, params: Params) -> Floats | None:
     """Factors that keep the base moment from changing by more than `_LONGEST_STEP` EI/l in a pass; None where
     all do."""
     n_base = 2 * len(layout.first_tendon) if layout.paper else 3
     moment = params.moment_scale if len(params.moment_scale) == 1 else params.moment_scale[rows]
-    turn = np.abs(step[:, :n_base]).max(1) / moment
-    if not (turn > _LONGEST_STEP).any():
+    angle = np.abs(step[:, :n_base]).max(1) / moment
+    if not (angle > _LONGEST_STEP).any():
         return None
-    return np.asarray(np.minimum(1.0, _LONGEST_STEP / np.maximum(turn, 1e-300)))
+    return np.asarray(np.minimum(1.0, _LONGEST_STEP / np.maximum(angle, 1e-300)))
 
 
 def _still(step: Floats, rows: Ints, layout: Layout, params: Params, small: Floats) -> Flags:
     """The unknowns no longer move.
 
-    A small residual says little about tensions where tendons hardly stretch, and in paper mode the wires may
+    A small residual says little about tensions where tendons hardly stretch, and in paper mode the tendons
+    may
     disagree:
     then the least-squares boundary is the answer, and the residual says by how much they do.
     """
@@ -182,41 +186,41 @@ def _continuation(
     """From the unloaded robot to the loaded one, in load steps that grow with success; the robots that did
     not arrive."""
     layout, params = boundary.layout, boundary.params
-    part = np.zeros(boundary.n_robots)
+    fraction = np.zeros(boundary.n_robots)
     longest = np.full(boundary.n_robots, 0.25)
     longest[rows] = _longest_stride(rows, params, ports)
     stride = longest.copy()
-    unloaded = _loaded(ports, part)
+    unloaded = _loaded(ports, fraction)
     cold_start(rows, layout, params, unloaded, boundary.memory)
     lost = _newton(rows, boundary, unloaded, tolerance, run, passes)
     rows = np.setdiff1d(rows, lost)
     held = boundary.x.copy()
     while len(rows):
-        aim = np.minimum(part + stride, 1.0)
+        aim = np.minimum(fraction + stride, 1.0)
         missed = _newton(rows, boundary, _loaded(ports, aim), tolerance, run, passes)
         arrived = np.setdiff1d(rows, missed)
-        part[arrived] = aim[arrived]
+        fraction[arrived] = aim[arrived]
         held[arrived] = boundary.x[arrived]
         stride[arrived] = np.minimum(2.0 * stride[arrived], longest[arrived])
         boundary.x[missed] = held[missed]
         stride[missed] *= 0.5
         lost = np.concatenate([lost, missed[stride[missed] < _SMALLEST_LOAD_STEP]])
-        rows = np.setdiff1d(rows[part[rows] < 1.0], lost)
+        rows = np.setdiff1d(rows[fraction[rows] < 1.0], lost)
     return np.sort(lost)
 
 
 def _longest_stride(rows: Ints, params: Params, ports: Ports) -> Floats:
-    """Part of the loads that one step of the continuation may bring: more than a load parameter of three
+    """Fraction of the loads that one step of the continuation may bring: more than a load parameter of three
     could land
     on another equilibrium."""
     return np.asarray(np.minimum(0.25, 0.5 * _STEEP / np.maximum(load_parameter(rows, params, ports), 1e-9)))
 
 
-def _loaded(ports: Ports, part: Floats) -> Ports:
+def _loaded(ports: Ports, fraction: Floats) -> Ports:
     """The ports with each robot's loads scaled."""
 
     def scaled(a: Floats) -> Floats:
-        return a if not len(a) else np.ascontiguousarray(part.reshape(-1, *[1] * (a.ndim - 1)) * a)
+        return a if not len(a) else np.ascontiguousarray(fraction.reshape(-1, *[1] * (a.ndim - 1)) * a)
 
     return ports._replace(
         tip_force=scaled(ports.tip_force),

@@ -16,7 +16,7 @@ from fastrod.effects.pipeline import named_effects
 from fastrod.errors import InputError, nearest
 from fastrod.loading import load_robot
 from fastrod.model.robot import Robot
-from fastrod.model.routing import wire
+from fastrod.model.routing import route
 from fastrod.types import Floats
 
 _FACTORS = ("bending_stiffness", "torsional_stiffness", "line_density", "compliance", "offset")
@@ -138,7 +138,7 @@ class Randomisation:
                 read_values(
                     canonical_name(effect),
                     {parameter: float(value)},
-                    wire(own),
+                    route(own),
                     f"randomise, robot {own.name!r}",
                 )
         return replace(own, effects=tuple({"name": name, **table} for name, table in tables.items()))
@@ -161,7 +161,7 @@ class Randomisation:
         tables = {name: dict(table) for name, table in named_effects(base).items()}
         for place, u in zip(self._spread_over(base) if self.spread else [], rest, strict=False):
             low, high = next(
-                p.on(wire(base)).bounds for p in get_effect(place[0]).parameters if p.name == place[1]
+                p.on(route(base)).bounds for p in get_effect(place[0]).parameters if p.name == place[1]
             )
             times = 1.0 + self.spread * (2.0 * u - 1.0)
             tables[place[0]][place[1]] = np.clip(

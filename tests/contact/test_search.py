@@ -114,6 +114,7 @@ def test_what_is_stuck_is_said(obstacle, points, words):
     assert not state.ok[0]
     (said,) = state.problems.values()
     assert words in said
+    assert state.problem_kinds[0].value.startswith(("contact_", "no_"))
     assert "smaller steps" in said or "points_per_segment" in said or "max_" in said
     assert "100 %" not in said
     assert said.count("\n") == 0

@@ -234,5 +234,5 @@ def test_a_robot_without_displacements_is_refused() -> None:
     pulled = replace(
         PROTOTYPE, segments=tuple(replace(segment, mode="tendon_tension") for segment in PROTOTYPE.segments)
     )
-    with pytest.raises(RobotError, match="an action needs wires driven by length"):
+    with pytest.raises(RobotError, match="an action needs tendons driven by length"):
         plan(pulled, TURN, RATE)

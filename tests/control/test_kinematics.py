@@ -246,7 +246,7 @@ def test_refusals(make: Any, sentence: str) -> None:
 def test_a_robot_that_no_action_drives_is_refused() -> None:
     with pytest.raises(
         RobotError,
-        match=r"^segment 1 of robot .* is passive; an action needs wires driven "
+        match=r"^segment 1 of robot .* is passive; an action needs tendons driven "
         r"by length\.$",
     ):
         SoftTip(

@@ -19,7 +19,7 @@ from fastrod.generation.draws import in_ball, with_effects
 from fastrod.generation.plan import Kind
 from fastrod.generation.tasks import columns_of
 from fastrod.model.robotfile import dumps
-from fastrod.model.routing import wire
+from fastrod.model.routing import route
 from fastrod_envs.randomisation import Randomisation
 from fastrod_envs.vector import BatchEnv
 
@@ -92,7 +92,7 @@ def test_a_robots_own_motion_keeps_its_limits() -> None:
     table = made(work, 6)
     ext = group(table, "ext").reshape(6, 120, 5)
     dl = group(table, "dl") - np.cumsum(group(table, "ext"), axis=1)[:, robot.tendon_segment]
-    bend = wire(robot).bend(dl).reshape(6, 120, 5, 2)
+    bend = route(robot).bend(dl).reshape(6, 120, 5, 2)
     assert np.linalg.norm(bend, axis=-1).max() <= 0.7 + 1e-9
     assert np.linalg.norm(np.diff(bend, axis=1), axis=-1).max() <= 0.8 * 0.05 + 1e-9
     assert np.linalg.norm(np.diff(bend, axis=1), axis=-1).max() > 0.9 * 0.8 * 0.05
@@ -133,7 +133,7 @@ def test_values_of_effects_are_of_their_typical_size() -> None:
         assert [table["name"] for table in made_robot.effects] == ["backlash", "frame_misalignment"]
         for name, value in told.items():
             effect, _, key = name.partition(".")
-            parameter = next(p.on(wire(robot)) for p in get_effect(effect).parameters if p.name == key)
+            parameter = next(p.on(route(robot)) for p in get_effect(effect).parameters if p.name == key)
             assert parameter.bounds[0] <= value <= parameter.bounds[1]
             assert 0.49 * parameter.scale <= abs(value) <= 1.51 * parameter.scale
     assert len({told["backlash.half_width"] for _, told in drawn}) == 50

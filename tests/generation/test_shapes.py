@@ -17,7 +17,7 @@ from fastrod.generation.shapes import LONGEST_CHAIN, STRIDE, Draw
 from fastrod.generation.tasks import columns_of
 from fastrod.model.robot import Robot
 from fastrod.model.robotfile import dumps
-from fastrod.model.routing import wire
+from fastrod.model.routing import route
 from fastrod.solver.inputs import Inputs
 
 DENSITY = 0.004  # kg/m
@@ -108,7 +108,7 @@ def test_every_step_of_a_chain_is_drawn_evenly(step: int) -> None:
     work = Shapes(robot=dumps(robot), bend=1.2, force=0.03)
     drawn = Draw(work, robot, 5000, np.random.default_rng(11)).at(step)
     dl = drawn.dl - np.cumsum(drawn.extension, axis=1)[:, robot.tendon_segment]
-    bend = wire(robot).bend(dl)
+    bend = route(robot).bend(dl)
     for k in range(robot.n_segments):
         # in a disc the square of the radius is even, and so is the angle
         assert kstest((np.linalg.norm(bend[:, k], axis=1) / 1.2) ** 2, "uniform").pvalue > 1e-3
@@ -128,7 +128,7 @@ def test_neighbours_are_near_and_chains_are_told() -> None:
     robot = fastrod.load_robot("prototype")
     work = Shapes(robot=dumps(robot))
     draw = Draw(work, robot, 50, np.random.default_rng(2))
-    one, other = (wire(robot).bend(draw.at(step).dl) for step in (7, 8))
+    one, other = (route(robot).bend(draw.at(step).dl) for step in (7, 8))
     assert np.linalg.norm(one - other, axis=-1).max() <= 2.0 * np.sin(0.5 * STRIDE) + 1e-12
     assert 2.0 * np.pi > LONGEST_CHAIN * STRIDE
     chains = [made(robot, 128, shard)["chain"] for shard in (0, 1)]
@@ -214,7 +214,7 @@ def test_robots_that_have_no_such_shapes() -> None:
     robot = heavy("prototype")
     with pytest.raises(InputError, match="has effects; a shape is that of the plain rod"):
         Shapes(robot=dumps(replace(robot, effects=({"name": "backlash", "half_width": 1e-4},))))
-    with pytest.raises(RobotError, match="an action needs wires driven by length"):
+    with pytest.raises(RobotError, match="an action needs tendons driven by length"):
         Shapes(
             robot=dumps(replace(robot, segments=(replace(robot.segments[0], mode="passive", tendons=()),)))
         )

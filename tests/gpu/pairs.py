@@ -24,14 +24,14 @@ OTHERS = {
 }
 """Sizes of the numbers of a state in these robots: 1/l, EI/l, EI/l^2, EI/(d l)."""
 PAPER_STEP = ("position", "arclength", "tip_position", "path_length", "residual", "rotation", "tip_rotation")
-"""Of a step in paper mode: four wires on two unknowns have many gains, which single precision tells apart,
+"""Of a step in paper mode: four tendons on two unknowns have many gains, which single precision tells apart,
 and curvature and moment follow the gain to 1e-9 and some; once settled all agree."""
 SINGLE = {"covariance": 1e-5, "gain": 1e-5, "move": 1e-7, "defect": 1e-7}
 """Kept in single precision: their last bit turns on the last bit of a double."""
 
 
 def chain() -> Robot:
-    """Two segments with slack wires, the last one extensible, no number twice."""
+    """Two segments with slack tendons, the last one extensible, no number twice."""
     robot = load_robot("tdcr_b")
     first, last = robot.segments
     slack = tuple(replace(t, unilateral=True, pretension=0.1) for t in last.tendons)

@@ -10,7 +10,7 @@ from rods import rod
 
 from fastrod import Robot
 from fastrod.logs.runlog import RunLog
-from fastrod.model.routing import wire
+from fastrod.model.routing import route
 
 
 def one_segment(**changes: Any) -> Robot:
@@ -27,7 +27,7 @@ def two_segments(**changes: Any) -> Robot:
 
 def wires(robot: Robot, bends: np.ndarray) -> np.ndarray:
     """(n, n_tendons) dl of bends (n, n_segments, 2)."""
-    return wire(robot).wires(bends)
+    return route(robot).tendon_change(bends)
 
 
 def wave(robot: Robot, n: int, dt: float = 0.05, size: float = 0.7, seed: int = 0) -> np.ndarray:

@@ -14,7 +14,7 @@ from rods import rod
 from fastrod.identification.excite import excitation
 from fastrod.identification.log.forward import LogSamples, sample
 from fastrod.identification.search.residual_test import ResidualStructure, audit
-from fastrod.model.routing import wire
+from fastrod.model.routing import route
 
 RATE, SIZE = 8.0, 0.9
 
@@ -36,11 +36,11 @@ def noise(seed: int) -> np.ndarray:
 
 def bends() -> np.ndarray:
     """(N, 2) of unit size."""
-    return wire(one_segment()).bend(np.asarray(samples().log.dl))[:, 0] / SIZE
+    return route(one_segment()).bend(np.asarray(samples().log.dl))[:, 0] / SIZE
 
 
 def run(residual: np.ndarray, lag1: float = 0.0) -> ResidualStructure:
-    return audit(samples(), wire(one_segment()), residual, lag1)
+    return audit(samples(), route(one_segment()), residual, lag1)
 
 
 def planted(pattern: np.ndarray, share: float, seed: int) -> np.ndarray:
@@ -121,7 +121,7 @@ def test_shares_are_of_the_variance() -> None:
 def test_only_some_rows_and_a_robot_without_wires() -> None:
     few = samples().on(np.arange(0, N, 3))
     residual = planted(patterns()["static"], 0.5, 2)[::3]
-    assert audit(few, wire(one_segment()), residual).kind == "static"
+    assert audit(few, route(one_segment()), residual).kind == "static"
     passive = sample(log_of(rod("passive"), np.zeros((N, 0)), DT))
-    assert audit(passive, wire(rod("passive")), noise(1)).kind == "none"
-    assert audit(passive, wire(rod("passive")), planted(patterns()["drift"], 0.5, 1)).kind == "drift"
+    assert audit(passive, route(rod("passive")), noise(1)).kind == "none"
+    assert audit(passive, route(rod("passive")), planted(patterns()["drift"], 0.5, 1)).kind == "drift"

@@ -15,7 +15,7 @@ from fastrod import Robot, load_robot
 from fastrod.errors import InputError
 from fastrod.identification.excite import REST, Excitation, excitation
 from fastrod.logs.runlog import read_log, write_log
-from fastrod.model.routing import wire
+from fastrod.model.routing import route
 
 ROBOTS = pytest.mark.parametrize(
     "robot", [one_segment(), two_segments(), load_robot("tdcr_b")], ids=lambda robot: robot.name
@@ -29,7 +29,7 @@ def made(robot: Robot, **changes: float) -> Excitation:
 
 def bends(robot: Robot, run: Excitation) -> np.ndarray:
     """(n, n_segments, 2)."""
-    return wire(robot).bend(np.asarray(run.log.dl))
+    return route(robot).bend(np.asarray(run.log.dl))
 
 
 def rows(run: Excitation, start: float, end: float) -> slice:
@@ -58,7 +58,7 @@ def test_every_wire_stays_within_the_largest_bend(robot: Robot) -> None:
     assert (size <= BEND * (1.0 + 1e-6)).all()  # the file rounds to a nanometre of wire
     assert_allclose(size.max(0), BEND, rtol=1e-6)  # and every segment goes there
     # no wire is asked for more than its segments' bends of that size, each in the worst direction for it
-    arms = np.linalg.norm(wire(robot).arms.reshape(robot.n_tendons, robot.n_segments, 2), axis=2)
+    arms = np.linalg.norm(route(robot).arms.reshape(robot.n_tendons, robot.n_segments, 2), axis=2)
     assert (np.abs(run.log.dl) <= BEND * arms.sum(1) + 1e-9).all()
     assert (np.abs(run.log.dl).max(0) > 0.5 * BEND * arms.max(1)).all()
 

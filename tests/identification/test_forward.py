@@ -19,7 +19,7 @@ from fastrod.effects.ports import EffectPorts
 from fastrod.identification.log.forward import N_STEPS, PredictedPose, PredictedRod, predict, sample
 from fastrod.identification.log.unknowns import base_model
 from fastrod.logs.runlog import RunLog
-from fastrod.model.routing import wire
+from fastrod.model.routing import route
 from fastrod.types import Floats
 
 N = 30
@@ -241,4 +241,4 @@ def test_a_users_effect_without_a_sweep_goes_step_by_step(sluggish: str) -> None
     found = predicted(robot, what)
     assert_alike(found, stepped(robot, what), robot.length)
     assert np.abs(found.position - predicted(having(two_segments(), *tables), what).position).max() > 1e-3
-    assert registry.columns(get_effect(sluggish), wire(robot)) == ["tau"]
+    assert registry.columns(get_effect(sluggish), route(robot)) == ["tau"]

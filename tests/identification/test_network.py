@@ -21,7 +21,7 @@ from fastrod.identification.learned.network import residual_network
 from fastrod.identification.log.forward import LogSamples, sample
 from fastrod.identification.log.split import held_out_rows
 from fastrod.model.robotfile import load_robot
-from fastrod.model.routing import wire
+from fastrod.model.routing import route
 
 NOISE = 3e-4
 
@@ -39,7 +39,7 @@ def left(residual: np.ndarray) -> tuple[float, float]:
     result = SimpleNamespace(
         residual_after=residual, used=~tested, tested=tested, outlier=np.zeros_like(tested)
     )
-    told = residual_network(here, wire(one_segment()), result)
+    told = residual_network(here, route(one_segment()), result)
     assert told["inputs"] > 4
     return float(np.sqrt((residual[tested] ** 2).sum(1).mean())), told["held_out_rms_m"]
 
@@ -50,7 +50,7 @@ def noise() -> np.ndarray:
 
 def test_a_static_residual_is_predicted() -> None:
     """A corner of the workspace that is off by up to 3 mm: two thirds of it above the noise must go."""
-    bend = wire(one_segment()).bend(np.asarray(samples().log.dl))[:, 0]
+    bend = route(one_segment()).bend(np.asarray(samples().log.dl))[:, 0]
     corner = 3e-3 * np.exp(-0.5 * ((bend - [0.5, 0.2]) ** 2).sum(1) / 0.35**2)
     before, after = left(corner[:, None] * np.array([1.0, -0.5, 0.3]) + noise())
     floor = np.sqrt(3.0) * NOISE
@@ -71,7 +71,7 @@ def test_missing_rows_are_left_out() -> None:
     result = SimpleNamespace(
         residual_after=residual, used=~tested, tested=tested, outlier=np.zeros_like(tested)
     )
-    assert np.isfinite(residual_network(here, wire(one_segment()), result)["held_out_rms_m"])
+    assert np.isfinite(residual_network(here, route(one_segment()), result)["held_out_rms_m"])
 
 
 def test_without_scikit_learn_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,7 +19,7 @@ from fastrod.identification.log.forward import PredictedRod, predict, sample
 from fastrod.identification.log.replay import replay
 from fastrod.identification.log.unknowns import FREE_CAMERA, STIFFNESS_SD, Model, base_model, effect_unknowns
 from fastrod.model.robotfile import dumps, loads
-from fastrod.model.routing import wire
+from fastrod.model.routing import route
 
 
 def fitted(robot: Robot, **targets: Any) -> Model:
@@ -245,8 +245,8 @@ def test_effects_of_the_robot_are_known_and_those_added_are_not() -> None:
 @pytest.mark.parametrize("name", effect_names())
 def test_every_effect_of_the_library_can_be_unknown(name: str) -> None:
     robot = two_segments()
-    found = effect_unknowns(name, wire(robot), split=True)
-    assert len(found) == len(columns(get_effect(name), wire(robot)))
+    found = effect_unknowns(name, route(robot), split=True)
+    assert len(found) == len(columns(get_effect(name), route(robot)))
     model = base_model(robot).with_effect(name, split=True)
     low, high = model.limits
     assert (low <= model.start).all()

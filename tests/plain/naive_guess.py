@@ -48,7 +48,7 @@ def trapezoid() -> np.ndarray:
 
 
 def arms(offset: np.ndarray) -> np.ndarray:
-    """(n, 2) moment of a unit tension of each wire."""
+    """(n, 2) moment of a unit tension of each tendon."""
     return np.column_stack([offset[:, 1], -offset[:, 0]])
 
 

@@ -1,4 +1,4 @@
-"""The operators on wire lengths once more, one wire and one moment at a time: the whole path is known,
+"""The operators on tendon lengths once more, one tendon and one moment at a time: the whole path is known,
 nothing is carried on."""
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ def sharp_play(x: np.ndarray, half_width: float) -> np.ndarray:
     return np.array(out)
 
 
-def yielding(bend: np.ndarray, share: float, yield_at: float) -> np.ndarray:
+def yielding(bend: np.ndarray, fraction: float, yield_at: float) -> np.ndarray:
     """(n_steps, 2): a dog on a leash of length `yield_at` that begins at the straight rod."""
     p, out = np.zeros(2), []
     for here in bend:
         leash = float(np.linalg.norm(here - p))
         if leash > yield_at:
             p = here - yield_at * (here - p) / leash
-        out.append(here + share * p)
+        out.append(here + fraction * p)
     return np.array(out)
 
 
@@ -74,9 +74,9 @@ def linear(A: np.ndarray, start: np.ndarray, x: np.ndarray, dt: np.ndarray) -> n
     return np.array(out)
 
 
-def relaxation(x: np.ndarray, share: float, time_constant: float, dt: np.ndarray) -> np.ndarray:
+def relaxation(x: np.ndarray, fraction: float, time_constant: float, dt: np.ndarray) -> np.ndarray:
     y = linear(np.array([[-1.0 / time_constant]]), np.array([x[0]]), x, dt)[:, 0]
-    return np.asarray(x - share * (x - y))
+    return np.asarray(x - fraction * (x - y))
 
 
 def second_order(x: np.ndarray, period: float, damping: float, dt: np.ndarray) -> np.ndarray:

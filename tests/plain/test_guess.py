@@ -99,15 +99,15 @@ def off_the_twin(case: Case, n: int) -> float:
 
 
 def in_mode(robot: Robot, mode: str) -> Robot:
-    """The robot with all segments in this mode; one that ships without wires gets three where it needs
+    """The robot with all segments in this mode; one that ships without tendons gets three where it needs
     some."""
 
-    def wires(of: Segment) -> tuple[Tendon, ...]:
+    def routed(of: Segment) -> tuple[Tendon, ...]:
         return () if mode == "passive" else of.tendons or rod(n_tendons=3).tendons
 
     return replace(
         robot,
-        segments=tuple(replace(segment, mode=mode, tendons=wires(segment)) for segment in robot.segments),
+        segments=tuple(replace(segment, mode=mode, tendons=routed(segment)) for segment in robot.segments),
     )
 
 
@@ -140,18 +140,22 @@ def test_shipped_robots_in_every_mode(name: str, mode: str) -> None:
 
 
 def chain(n_segments: int, rng: np.random.Generator) -> Robot:
-    """Modes and numbers of wires by chance, each wire in another place in every segment."""
+    """Modes and numbers of tendons by chance, each tendon in another place in every segment."""
     segments = []
     for k in range(n_segments):
         mode = str(rng.choice(["tendon_length", "tendon_length", "tendon_tension", "passive"]))
-        wires = tuple(
+        pulling = tuple(
             Tendon(offset=tuple(rng.uniform(0.004, 0.009, k + 1)), angle=tuple(rng.uniform(-3.1, 3.1, k + 1)))
             for _ in range(0 if mode == "passive" else int(rng.integers(1, 6)))
         )
         stiffness = tuple(rng.uniform(0.001, 0.003, 2))
         segments.append(
             Segment(
-                length=0.05, bending_stiffness=stiffness, torsional_stiffness=0.001, mode=mode, tendons=wires
+                length=0.05,
+                bending_stiffness=stiffness,
+                torsional_stiffness=0.001,
+                mode=mode,
+                tendons=pulling,
             )
         )
     return varied(Robot(name="chain", segments=tuple(segments)), rng)
@@ -191,11 +195,11 @@ def in_plane(angle: float, n: int) -> np.ndarray:
     return np.outer((-1.0) ** np.arange(n), [np.cos(angle), np.sin(angle)])
 
 
-# without a wire out of the plane, and without any arm at all, the smaller singular value, or both, count as
+# without a tendon out of the plane, and without any arm at all, the smaller singular value, or both, count as
 # none
 FLAT: dict[str, Callable[[], np.ndarray]] = {
-    "one wire": lambda: in_plane(0.3, 1),
-    "opposite wires": lambda: in_plane(0.7, 2),
+    "one tendon": lambda: in_plane(0.3, 1),
+    "opposite tendons": lambda: in_plane(0.7, 2),
     "four in a plane": lambda: in_plane(-2.1, 4) * np.array([[1.0], [0.7], [0.4], [1.3]]),
     "twenty in a plane": lambda: in_plane(1.1, 20),
     "no arm": lambda: np.zeros((3, 2)),
@@ -205,15 +209,15 @@ FLAT: dict[str, Callable[[], np.ndarray]] = {
 
 
 @pytest.mark.parametrize("name", FLAT)
-def test_wires_that_leave_a_direction_free(name: str) -> None:
-    wires = 0.0075 * FLAT[name]()
-    layout, params, ports = case([varied(rod(n_tendons=len(wires)), np.random.default_rng(5))], 2, seed=6)
-    assert off_the_twin((layout, params._replace(offset=np.array(wires[None, None])), ports), 2) < CLOSE
+def test_tendons_that_leave_a_direction_free(name: str) -> None:
+    offsets = 0.0075 * FLAT[name]()
+    layout, params, ports = case([varied(rod(n_tendons=len(offsets)), np.random.default_rng(5))], 2, seed=6)
+    assert off_the_twin((layout, params._replace(offset=np.array(offsets[None, None])), ports), 2) < CLOSE
 
 
 @pytest.mark.parametrize("off", [0.0, 1e-12, 1e-9, 1e-6, 1e-3])
-def test_wires_nearly_in_a_plane_say_nothing_about_the_bend_across_it(off: float) -> None:
-    """Opposite wires, written with a few digits of pi, and lengths that do not quite agree."""
+def test_tendons_nearly_in_a_plane_say_nothing_about_the_bend_across_it(off: float) -> None:
+    """Opposite tendons, written with a few digits of pi, and lengths that do not quite agree."""
     robot = rod(n_tendons=2)
     first, last = robot.segments[0].tendons
     robot = replace(
@@ -230,16 +234,16 @@ def test_wires_nearly_in_a_plane_say_nothing_about_the_bend_across_it(off: float
 
 
 @pytest.mark.parametrize("ratio", [2e-3, 1e-2, 0.1])
-def test_wires_nearly_in_a_plane_bend_and_pull_as_asked(ratio: float) -> None:
+def test_tendons_nearly_in_a_plane_bend_and_pull_as_asked(ratio: float) -> None:
     """Curvature and tensions out of the plane are as large as rounding over the ratio of singular values
     makes them, in the twin too. What stands is what they are for: the curvature uses up the lengths, and the
     tensions give the moment."""
-    wires = 0.0075 * (
+    offsets = 0.0075 * (
         in_plane(0.4, 4) + ratio * np.array([[0.4, -1.0], [-0.4, 1.0], [-0.4, 1.0], [0.4, -1.0]])
     )
     u_asked = np.array([3.0, -5.0])
     robot = rod()
-    longer = 0.07 * arms(wires) @ u_asked
+    longer = 0.07 * arms(offsets) @ u_asked
     layout, params, ports = case(
         [robot],
         1,
@@ -249,18 +253,18 @@ def test_wires_nearly_in_a_plane_bend_and_pull_as_asked(ratio: float) -> None:
         tip_force=(0.0, 0.0, 0.0),
         tip_moment=(0.01, 0.02, 0.0),
     )
-    params = params._replace(offset=np.array(wires[None, None]))
+    params = params._replace(offset=np.array(offsets[None, None]))
     memory = fill((layout, params, ports), 1)
     u, tension = memory.curvature_guess[0], memory.x[0, 3:]
     # a few roundings of the length itself, 0.07 m
-    assert_allclose(0.07 * arms(wires) @ u[:2], longer, rtol=0.0, atol=1e-15)
+    assert_allclose(0.07 * arms(offsets) @ u[:2], longer, rtol=0.0, atol=1e-15)
     x, _ = guess(0, layout, params, ports)
-    largest = np.abs(arms(wires).T * x[3:]).sum()  # the moments of the single wires, which nearly cancel
-    assert_allclose(arms(wires).T @ tension, arms(wires).T @ x[3:], rtol=0.0, atol=1e-13 * largest)
+    largest = np.abs(arms(offsets).T * x[3:]).sum()  # the moments of the single tendons, which nearly cancel
+    assert_allclose(arms(offsets).T @ tension, arms(offsets).T @ x[3:], rtol=0.0, atol=1e-13 * largest)
 
 
 def test_an_arc_from_its_lengths() -> None:
-    """Wires at distance d differ from the backbone by d times the bend; four more wires of another length
+    """Wires at distance d differ from the backbone by d times the bend; four more tendons of another length
     only pull."""
     robot = rod()
     layout, params, rest = compile_robots([robot], N_STEPS)
@@ -268,7 +272,7 @@ def test_an_arc_from_its_lengths() -> None:
     memory = fill((layout, params, ports), 1)
     assert_allclose(memory.curvature_guess[0], [0.5 / 0.07, -0.3 / 0.07, 0.0], rtol=1e-13)
     assert_allclose(memory.x[0, :3], 0.0, atol=1e-18)
-    # K u = -sum T (d_y, -d_x), shared by opposite wires
+    # K u = -sum T (d_y, -d_x), shared by opposite tendons
     assert_allclose(
         memory.x[0, 3:],
         0.0022 / 0.07 / (2.0 * 0.0075) * np.array([-0.3, -0.5, 0.3, 0.5]),

@@ -1,4 +1,5 @@
-"""The operators against their obvious twin: two rows, three wires, every wire with numbers of its own, in two
+"""The operators against their obvious twin: two rows, three tendons, every tendon with numbers of its own,
+in two
 calls."""
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ PATH = np.cumsum(rng.uniform(-0.4, 0.4, (2, N_STEPS, 3)), axis=1) + 0.3
 # irregular, and some steps that take no time
 DT = rng.uniform(0.001, 0.05, N_STEPS) * (rng.random(N_STEPS) > 0.1)
 ANGLE = rng.uniform(0.0, 1.0, PATH.shape)
-SHARE, WIDTH, SPREAD = (
+FRACTION, WIDTH, SPREAD = (
     rng.uniform(0.0, 1.0, (2, 3)),
     rng.uniform(0.05, 0.6, (2, 3)),
     rng.uniform(0.0, 0.9, (2, 3)),
 )
-WIDTH[0, 0] = SHARE[1, 1] = 0.0
+WIDTH[0, 0] = FRACTION[1, 1] = 0.0
 SLOW = WIDTH + 0.02
 LAG = np.array([0.11, 1e3])
 RADII = SLOW[..., None] * np.exp(SPREAD[..., None] * np.linspace(-1.0, 1.0, SLIDERS))
@@ -44,13 +45,13 @@ CASES: dict[str, Case] = {
     ),
     "elastoplastic": (
         3 * (1 + SLIDERS),
-        lambda x, m, s: operators.elastoplastic(x, m, SHARE, SLOW, SPREAD, WIDTH, ANGLE[:, s].copy()),
-        lambda x, r, w: naive.elastoplastic(x, SHARE[r, w], RADII[r, w], WIDTH[r, w], ANGLE[r, :, w]),
+        lambda x, m, s: operators.elastoplastic(x, m, FRACTION, SLOW, SPREAD, WIDTH, ANGLE[:, s].copy()),
+        lambda x, r, w: naive.elastoplastic(x, FRACTION[r, w], RADII[r, w], WIDTH[r, w], ANGLE[r, :, w]),
     ),
     "relaxation": (
         6,
-        lambda x, m, s: operators.relaxation(x, m, SHARE, SLOW, DT[s]),
-        lambda x, r, w: naive.relaxation(x, SHARE[r, w], SLOW[r, w], DT),
+        lambda x, m, s: operators.relaxation(x, m, FRACTION, SLOW, DT[s]),
+        lambda x, r, w: naive.relaxation(x, FRACTION[r, w], SLOW[r, w], DT),
     ),
     "second_order": (
         9,
@@ -83,7 +84,7 @@ def test_operator_is_its_twin(name: str) -> None:
         for w in range(3):
             # rounding of some hundred steps, and of a matrix squared ten times
             assert_allclose(
-                found[r, :, w], twin(PATH[r, :, w], r, w), atol=1e-11, err_msg=f"row {r}, wire {w}"
+                found[r, :, w], twin(PATH[r, :, w], r, w), atol=1e-11, err_msg=f"row {r}, tendon {w}"
             )
     assert np.isfinite(memory[:, : width if "delay" not in name else 1]).all()
 
@@ -94,12 +95,12 @@ def test_yielding_is_its_twin() -> None:
     memory, found = np.full((2, 6), np.nan), path.copy()
     for part in (slice(0, 50), slice(50, N_STEPS)):
         bend = path[:, part].copy()
-        operators.yielding(bend, memory, SHARE, WIDTH)
+        operators.yielding(bend, memory, FRACTION, WIDTH)
         found[:, part] = bend
     for r in range(2):
         for k in range(3):
             # rounding of some hundred steps
             assert_allclose(
-                found[r, :, k], naive.yielding(path[r, :, k], SHARE[r, k], WIDTH[r, k]), atol=1e-13
+                found[r, :, k], naive.yielding(path[r, :, k], FRACTION[r, k], WIDTH[r, k]), atol=1e-13
             )
     assert np.isfinite(memory).all()

@@ -27,7 +27,7 @@ from fastrod.kernels.operators import (
     second_order,
     yielding,
 )
-from fastrod.model.routing import wire
+from fastrod.model.routing import route
 from fastrod.solver.state import State
 
 ROUNDING = 1e-13  # of numbers of size one, after some hundred operations
@@ -146,7 +146,7 @@ def test_friction_saturates_at_its_half_width() -> None:
     back = np.arange(801) > 400
     assert_allclose(lost[back & (x < 2.0 - 2.0 * r * np.exp(s))], -0.3, atol=ROUNDING)
     assert np.abs(lost).max() <= 0.3 + ROUNDING
-    # and before any slider slips the wire sticks: the loss is linear with slope a mean(1 / r_j)
+    # and before any slider slips the tendon sticks: the loss is linear with slope a mean(1 / r_j)
     radii = r * np.exp(s * np.linspace(-1.0, 1.0, SLIDERS))
     sticks = (x < r * np.exp(-s)) & ~back
     assert_allclose(lost[sticks], 0.3 * np.mean(1.0 / radii) * x[sticks], atol=ROUNDING)
@@ -170,7 +170,7 @@ def test_the_area_of_a_friction_loop() -> None:
     assert np.all(np.diff(areas) > 0.0)
 
 
-def test_friction_grows_with_the_angle_that_a_wire_wraps() -> None:
+def test_friction_grows_with_the_angle_that_a_tendon_wraps() -> None:
     x = along([0.0, 2.0], 10)
     assert_allclose((x - rubbed(x, growth=0.5))[-1], 0.3 * (1.0 + 0.5 * 2.0), atol=ROUNDING)
     robot = rod()
@@ -179,7 +179,7 @@ def test_friction_grows_with_the_angle_that_a_wire_wraps() -> None:
     table = {"half_width": 2e-4, "presliding": 1e-4, "growth": 0.7, "spread": 0.0}
     values = np.array([[*table.values()]])
     what: Any = get_effect("friction")
-    lost = dl - what.sweep(values, what.memory(1, 4), dl[None], np.full(50, 0.1), wire(robot))[0]
+    lost = dl - what.sweep(values, what.memory(1, 4), dl[None], np.full(50, 0.1), route(robot))[0]
     assert_allclose(np.abs(lost[-1]), 2e-4 * 1.7, rtol=1e-12)
 
 
@@ -478,7 +478,7 @@ def test_tendon_stretch_is_compliance() -> None:
 
 
 def test_routing_angle_is_the_angle_of_a_tendon() -> None:
-    robot, angles = chain(), [0.1, -0.2, 0.05, 0.0, 0.3, -0.1]  # three wires a segment: each is a drive
+    robot, angles = chain(), [0.1, -0.2, 0.05, 0.0, 0.3, -0.1]  # three tendons a segment: each is a drive
     turned = with_tendons(robot, angle=lambda tendon, t, k: tendon.angle + angles[t])
     assert (
         apart(
@@ -497,7 +497,7 @@ def test_routing_angle_is_the_angle_of_a_tendon() -> None:
     )
 
 
-def test_encoder_offset_shifts_the_wires_antagonists_opposite() -> None:
+def test_encoder_offset_shifts_the_tendons_antagonists_opposite() -> None:
     robot, lengths = rod(), bend(rod(), 0.5, 0.3)
     offset = settled(having(robot, "encoder_offset", offset=[3e-4, -2e-4]), lengths)
     assert apart(offset, settled(robot, lengths + np.array([3e-4, -2e-4, -3e-4, 2e-4]))) <= 1.0
@@ -520,7 +520,7 @@ def test_drum_gain_and_temperature_scale_the_pull() -> None:
 
 
 def test_only_what_bends_is_gained() -> None:
-    """A pull that all wires share is the backbone's to take, not the gain's: it would be tension between
+    """A pull that all tendons share is the backbone's to take, not the gain's: it would be tension between
     stiff parts."""
     robot = rod()
     common = settled(having(robot, "drum_gain", gain=0.5), robot.rest_tendon_length - 1e-5)
@@ -548,7 +548,7 @@ def test_coupling_slack_and_stiffening_change_the_bend_that_is_asked_for() -> No
     assert apart(loose, settled(rod(), bend(rod(), 0.5 - 1e-3 / 0.0075, 0.0))) <= 1.0
 
 
-def test_a_body_that_its_wires_press_bends_more_easily() -> None:
+def test_a_body_that_its_tendons_press_bends_more_easily() -> None:
     """By the gain times the common pull of its own segment; nothing without one."""
     robot = rod()
     lengths, soft = bend(robot, 0.5, -0.3), having(robot, "compression_softening", gain=40.0)
@@ -559,13 +559,13 @@ def test_a_body_that_its_wires_press_bends_more_easily() -> None:
     )
 
 
-def test_axial_compression_is_an_extension_that_the_wires_follow() -> None:
+def test_axial_compression_is_an_extension_that_the_tendons_follow() -> None:
     robot = rod(extension=(-0.02, 0.02))
     lengths = bend(robot, 0.6, 0.8)  # a bend of one radian
     short = settled(having(robot, "axial_compression", per_bend=0.05), lengths)
     assert apart(short, settled(robot, lengths - 0.05 * 0.07, extension=[-0.05 * 0.07])) <= 1.0
     assert_allclose(short.arclength[0, -1], 0.07 * 0.95, rtol=1e-12)
-    # and what the wires pull in common shortens a body that does not resist, without tension
+    # and what the tendons pull in common shortens a body that does not resist, without tension
     common = settled(having(robot, "axial_compression", common_share=1.0), lengths - 0.002)
     assert apart(common, settled(robot, lengths - 0.002, extension=[-0.002])) <= 1.0
     plain = settled(robot, lengths)
@@ -636,7 +636,7 @@ def test_a_bow_moves_the_tip_and_does_not_turn_it() -> None:
     assert_allclose(state.tip_rotation[0], np.eye(3), atol=1e-5)
     assert_allclose(state.tip_position[0, :2], np.array([-0.2, -0.3]) * 0.07**2 / 6.0, rtol=1e-4)
     stiff = settled(having(rod(), "precurvature", uniform_x=2.0), rod().rest_tendon_length)
-    # wires that hardly stretch straighten a uniform one, but not a bow
+    # tendons that hardly stretch straighten a uniform one, but not a bow
     assert np.abs(stiff.tip_position[0, :2]).max() < 5e-5
     bowed = settled(having(rod(), "precurvature", bow_x=2.0), rod().rest_tendon_length)
     assert_allclose(bowed.tip_position[0, 1], -2.0 * 0.07**2 / 6.0, rtol=2e-2)
@@ -710,15 +710,16 @@ def test_effects_of_the_camera_act_from_the_marker_on() -> None:
     ("name", "values"),
     [("latency", {"delay": 0.12}), ("dynamics", {"period": 0.2}), ("creep", {"share": 0.2})],
 )
-def test_an_effect_on_the_wires_is_its_operator_on_what_bends(name: str, values: dict[str, float]) -> None:
-    """In a simulator, step by step, an operator is the simulator of the base model on wires that went through
+def test_an_effect_on_the_tendons_is_its_operator_on_what_bends(name: str, values: dict[str, float]) -> None:
+    """In a simulator, step by step, an operator is the simulator of the base model on tendons that went
+    through
     it."""
     robot = rod()
     path = np.stack([bend(robot, 0.8 * np.sin(0.4 * k), 0.5 * np.cos(0.3 * k)) for k in range(12)])
     what: Any = get_effect(name)
     row = np.array([[values.get(p.name, p.neutral) for p in what.parameters]])
     dl = path - robot.rest_tendon_length
-    moved = what.sweep(row, what.memory(1, 4), dl[None], np.full(12, 0.05), wire(robot))[0]
+    moved = what.sweep(row, what.memory(1, 4), dl[None], np.full(12, 0.05), route(robot))[0]
     sim, base = Simulator(having(robot, name, **values), dt=0.05), Simulator(robot, dt=0.05)
     for there, here in zip(path, moved + robot.rest_tendon_length, strict=True):
         assert_allclose(sim.step(there).tip_position, base.step(here).tip_position, atol=1e-11)

@@ -137,7 +137,7 @@ def test_inextensible_tendons_lock_the_twist_and_loose_ones_let_the_rod_go() -> 
         twist.append(np.abs(state.curvature[0, :, 2]).max())
         tip.append(state.tip_position[0])
     assert twist[0] > twist[1] > twist[2] > 0.0
-    # as the cube root of the compliance, down to the stiffest wire there is
+    # as the cube root of the compliance, down to the stiffest tendon there is
     assert twist[2] > twist[3] == twist[4]
     assert twist[3] < 0.1 * twist[1]
     loose = Simulator(rod(compliance=1e6)).settle(lengths, tip_force=force)
@@ -145,11 +145,11 @@ def test_inextensible_tendons_lock_the_twist_and_loose_ones_let_the_rod_go() -> 
     assert_allclose(loose.tip_position, free.tip_position, atol=1e-7)
 
 
-def test_a_slack_wire_carries_nothing() -> None:
+def test_a_slack_tendon_carries_nothing() -> None:
     robot = rod()
     (segment,) = robot.segments
-    wires = tuple(replace(t, unilateral=True, pretension=0.2) for t in segment.tendons)
-    robot = replace(robot, segments=(replace(segment, tendons=wires),))
+    slack = tuple(replace(t, unilateral=True, pretension=0.2) for t in segment.tendons)
+    robot = replace(robot, segments=(replace(segment, tendons=slack),))
     # pulled by one, the opposite one paid out far
     lengths = robot.rest_tendon_length + np.array([-0.004, 0.0, 0.01, 0.0])
     state = Simulator(robot).settle(lengths)
@@ -258,10 +258,10 @@ def test_cable_robots_taut_and_loose_match_the_twin(pull: float) -> None:
         state = Simulator(robot, n_robots=40).settle(lengths, tip_force=force)
         assert state.ok.all(), state.problems
         assert (state.tension >= 0.0).all()
-        # a wire is never shorter than its path
+        # a tendon is never shorter than its path
         assert (state.path_length <= lengths + 1e-5 * state.tension + 1e-8).all()
         assert np.abs(state.moment[:, -1]).max() < 1e-9  # and the tip is free of moment
-        # the twin takes minutes on a chain with slack wires
+        # the twin takes minutes on a chain with slack tendons
         for i in (0, 1) if robot.n_segments == 1 else ():
             twin = shoot(robot, lengths[i], tip_force=force[i])
             assert twin.success

@@ -16,7 +16,7 @@ from fastrod.control import references
 from fastrod.control.inverse import InversePlan
 from fastrod.identification.excite import Excitation
 from fastrod.logs.runlog import RunLog, read_log
-from fastrod.model.routing import wire
+from fastrod.model.routing import route
 from fastrod.types import Floats
 from fastrod_device.errors import DeviceError, RefusedError
 from fastrod_device.experiment import excite, follow, tracking
@@ -67,7 +67,7 @@ class Noting:
 
 def wires(bend: Floats) -> Floats:
     """(n, 4) of bends (n, 2) [rad]."""
-    return wire(ROBOT).wires(bend[:, None])
+    return route(ROBOT).tendon_change(bend[:, None])
 
 
 def short_run() -> Excitation:
@@ -273,7 +273,7 @@ def test_the_sweep_keeps_within_half_of_the_limits() -> None:
         way, limits = sweep(chosen, t), chosen.limits
         assert np.abs(way).max() <= 0.5 * limits.displacement + 1e-9
         assert np.abs(np.diff(way, axis=0)).max() / 0.001 <= 0.51 * limits.rate
-        assert np.abs(wire(ROBOT).bend(way)).max() / ROBOT.length <= 0.5 * limits.curvature
+        assert np.abs(route(ROBOT).bend(way)).max() / ROBOT.length <= 0.5 * limits.curvature
         assert_allclose(way[[0, -1]], 0.0, atol=1e-5)
         assert np.abs(way).max() > 0.25 * min(limits.displacement, 0.008)
 

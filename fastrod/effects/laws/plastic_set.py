@@ -50,4 +50,4 @@ class PlasticSet(Operator):
         bend -= change[:, :, driven]
         change[:] = 0.0
         change[:, :, driven] = bend
-        return dl + wiring.wires(change)
+        return dl + wiring.tendon_change(change)

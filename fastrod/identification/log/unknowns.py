@@ -15,7 +15,7 @@ from fastrod.effects.base import columns, effect_names, get_effect, read_values
 from fastrod.effects.pipeline import named_effects
 from fastrod.errors import RobotError, nearest
 from fastrod.model.robot import Robot
-from fastrod.model.routing import Routing, wire
+from fastrod.model.routing import Routing, route
 from fastrod.types import Floats
 
 _SEGMENT = {
@@ -155,7 +155,7 @@ class Model:
 
 def known_model(robot: Robot) -> Model:
     """A robot with its own effects, nothing unknown."""
-    return Model(robot, wire(robot), tuple(named_effects(robot)), ())
+    return Model(robot, route(robot), tuple(named_effects(robot)), ())
 
 
 def base_model(robot: Robot, *, free_camera: bool = False, registered: bool = False) -> Model:
@@ -164,7 +164,7 @@ def base_model(robot: Robot, *, free_camera: bool = False, registered: bool = Fa
     `registered`: the camera's place in `robot` comes from a rough registration, and is fitted.
     Raises `RobotError` for a target that is none, naming the nearest.
     """
-    wiring = wire(robot)
+    wiring = route(robot)
     unknowns: list[Unknown] = []
     effects = list(named_effects(robot))
     for target, prior in robot.fit.items():

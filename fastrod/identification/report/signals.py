@@ -10,7 +10,7 @@ import numpy as np
 
 from fastrod.effects.base import Seam, get_effect, has_memory
 from fastrod.identification.report.result import Found, Result
-from fastrod.model.routing import wire
+from fastrod.model.routing import route
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.types import Flags, Floats, Ints
 
@@ -61,7 +61,7 @@ class Signals:
         self.tip = np.asarray(result.before[self.rows])
         _, number = np.unique(result.log.run, return_inverse=True)
         self.run: Ints = number[self.rows]
-        wiring = wire(result.robot)
+        wiring = route(result.robot)
         n = wiring.n_segments if wiring.n_tendons else 0
         self.bend: Floats = wiring.bend(np.asarray(log.dl)) if n else np.zeros((len(self.rows), 0, 2))
         self.time = self._time()

@@ -122,7 +122,9 @@ class LinearisedModel:
         for j in range(2 * wiring.n_segments if wiring.n_tendons else 0):
             change = np.zeros((1, wiring.n_segments, 2))
             change.reshape(-1)[j] = _BEND
-            every.append(self._solved(length=self.opened.tendon_length + wiring.wires(change)) / _BEND)
+            every.append(
+                self._solved(length=self.opened.tendon_length + wiring.tendon_change(change)) / _BEND
+            )
         return (
             np.stack(every, axis=-1)
             if every

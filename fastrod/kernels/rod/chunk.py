@@ -26,7 +26,7 @@ from .boundary import (
     update_boundary,
 )
 from .gather import gather_base, gather_segment, gather_step, pick, predict, scatter, scatter_node
-from .lanes import Lanes, W, at, beyond, clear, get, get_mat, put, read, row_from, write
+from .lanes import Lanes, W, at, clear, get, get_mat, put, read, write
 from .point_loads import arrive, leave, load_base, load_column, respond
 from .workspace import Batch, Chunk, Mode, Output, Rod, Sensitivities, Workspace, carve, scratch_size, sizes
 
@@ -46,16 +46,16 @@ def solve_section(
 
     `half`: K there, and u* three half steps further on, a view into the node.
     """
-    rest = beyond(half, sh.N_USTAR - sh.N_K)
+    rest = half[(sh.N_USTAR - sh.N_K) * W :]
     if not loaded:
         sh.curvature_without_tendons(stage, half, rest)
         for g in range(first, n, sh.GROUP):
-            sh.tendon_paths(stage, beyond(tendon, g * sh.TENDON), beyond(path, g * sh.PATHS))
+            sh.tendon_paths(stage, tendon[g * sh.TENDON * W :], path[g * sh.PATHS * W :])
         return
     for _ in range(iterations):
         sh.clear_sums(stage)
         for g in range(first, n, sh.GROUP):
-            sh.tendon_sums(stage, beyond(tendon, g * sh.TENDON), beyond(path, g * sh.PATHS))
+            sh.tendon_sums(stage, tendon[g * sh.TENDON * W :], path[g * sh.PATHS * W :])
         sh.correct_curvature(stage, half, rest)
 
 
@@ -63,18 +63,16 @@ def solve_section(
 def finish_stages(rod: Rod, first: int, n: int, loaded: bool, iterations: int) -> None:
     """Stages two to four of a step whose first one is solved, and its end."""
     node, stages, tendon, paths = rod
-    middle, end = beyond(node, sh.N_K + 3), beyond(node, sh.N_K + 6)
+    middle, end = node[(sh.N_K + 3) * W :], node[(sh.N_K + 6) * W :]
     sh.second_stage(node, stages)
-    solve_section(
-        middle, beyond(stages, sh.STAGE), tendon, beyond(paths, sh.PATH), first, n, loaded, iterations
-    )
+    solve_section(middle, stages[sh.STAGE * W :], tendon, paths[sh.PATH * W :], first, n, loaded, iterations)
     sh.third_stage(node, stages)
     solve_section(
-        middle, beyond(stages, 2 * sh.STAGE), tendon, beyond(paths, 2 * sh.PATH), first, n, loaded, iterations
+        middle, stages[2 * sh.STAGE * W :], tendon, paths[2 * sh.PATH * W :], first, n, loaded, iterations
     )
     sh.fourth_stage(node, stages)
     solve_section(
-        end, beyond(stages, 3 * sh.STAGE), tendon, beyond(paths, 3 * sh.PATH), first, n, loaded, iterations
+        end, stages[3 * sh.STAGE * W :], tendon, paths[3 * sh.PATH * W :], first, n, loaded, iterations
     )
     sh.end_step(node, stages)
 
@@ -92,27 +90,30 @@ def march_columns(
 ) -> None:
     """Move every column over step j of segment k and add its part of the tendon lengths."""
     node, stages, _, paths = rod
+    change = sens.change
     n, first = len(layout.tendon_segment), layout.first_tendon[k]
     n_base = 2 * len(layout.first_tendon) if layout.paper else 3
     n_free = len(layout.free_tendon)
-    nothing = beyond(paths, n * sh.PATHS)  # after the last tendon all is zero
+    nothing = paths[n * sh.PATHS * W :]  # after the last tendon all is zero
     for c in range(sens.moves.n_columns):
         if layout.paper and c < n_base and c // 2 > k:
             continue  # its segment has not begun
         tendon = layout.free_tendon[c - n_base] if n_base <= c < n_base + n_free else n
-        drive = beyond(paths, (tendon if tendon >= first else n) * sh.PATHS)
+        drive = paths[((tendon if tendon >= first else n) * sh.PATHS) * W :]
         axis = c - n_base - n_free
         # R^T e_axis is a row of R
-        load = beyond(node, sh.N_R + 3 * axis) if 0 <= axis < 3 else nothing
+        load = node[(sh.N_R + 3 * axis) * W :] if 0 <= axis < 3 else nothing
         if loads.node.shape[1] > 0 and c >= sens.n_x:
             load_column(c - sens.n_x, k * layout.n_steps + j, node, loads, chunk, sens.unit_force)
             load = sens.unit_force
-        column = beyond(sens.columns, c * col.COLUMN)
+        column = sens.columns[c * col.COLUMN * W :]
         col.step_column(column, node, stages, drive, load)
         if with_positions:
             col.column_position(column, node, stages)
         for g in range(first, n, sh.GROUP):
-            col.add_length_changes(row_from(sens.change, c, g), column, beyond(paths, g * sh.PATHS))
+            col.add_length_changes(
+                change.entries[(c * change.n_columns + g) * W :], column, paths[g * sh.PATHS * W :]
+            )
 
 
 @kernel
@@ -182,7 +183,7 @@ def march(chunk: Chunk, batch: Batch, output: Output, work: Workspace, mode: Mod
     """From base to tip: the rod, the tendons' lengths and the columns."""
     params, ports, layout, memory = batch
     rod, sens, n, loads = work.rod, work.sens, work.size.tendons, output.loads
-    node, start = rod.node, beyond(rod.node, sh.N_K)
+    node, start = rod.node, rod.node[sh.N_K * W :]
     dense, differentiated = len(output.shape.position) > 0, len(output.response.tip) > 0
     loaded = loads.node.shape[1] > 0
     varied, iterations = _is_varied(ports), RESPONSE_ITERATIONS if differentiated else ITERATIONS
@@ -212,7 +213,7 @@ def march(chunk: Chunk, batch: Batch, output: Output, work: Workspace, mode: Mod
                 scatter_node(at_node, chunk.n_robots, chunk.robots, node, work.s, output.shape)
             finish_stages(rod, first, n, pulled, iterations)
             for g in range(first, n, sh.GROUP):
-                sh.add_lengths(beyond(work.length, g), node, beyond(rod.paths, g * sh.PATHS))
+                sh.add_lengths(work.length[g * W :], node, rod.paths[g * sh.PATHS * W :])
             if mode.update or differentiated or loaded:
                 march_columns(k, j, differentiated or loaded, layout, rod, sens, loads, chunk)
             sh.advance(node, rod.stages)
@@ -233,7 +234,7 @@ def finish_tip(chunk: Chunk, batch: Batch, output: Output, work: Workspace, mode
     if loads.node.shape[1] > 0:
         leave(tip, loads, chunk, rod.node, work.sens.columns, work.size.x, mode.n_col)
     if len(output.shape.position) > 0:
-        first, end = layout.first_tendon[n_segments - 1], beyond(rod.node, sh.N_K + 6)
+        first, end = layout.first_tendon[n_segments - 1], rod.node[(sh.N_K + 6) * W :]
         iterations = RESPONSE_ITERATIONS if len(output.response.tip) > 0 else ITERATIONS
         sh.start_step(rod.node, rod.stages)
         pulled = first < n and not layout.paper

@@ -10,7 +10,7 @@ from ..jit import entry, kernel
 from . import shape as sh
 from .chunk import FIRST_ITERATIONS, finish_stages, solve_section
 from .gather import pick, scatter
-from .lanes import Lanes, W, beyond, get, get_mat, write
+from .lanes import Lanes, W, get, get_mat, write
 from .workspace import Rod
 
 
@@ -85,7 +85,7 @@ def between_nodes(
     tendon, path = np.zeros(n_t * sh.TENDON * W), np.zeros(n_t * sh.PATHS * W)
     rod = Rod(node, stages, tendon, path)
     loaded = n > 0 and not layout.paper
-    begin, end = beyond(node, sh.N_K), beyond(node, sh.N_K + 6)
+    begin, end = node[sh.N_K * W :], node[(sh.N_K + 6) * W :]
     for start in range(0, len(robots), W):
         count = min(W, len(robots) - start)
         for w in range(W):

@@ -48,18 +48,6 @@ def write_at(m: LaneMatrix, r: int, c: int, w: int, value: float) -> None:
 
 
 @inline
-def row_from(m: LaneMatrix, r: int, c: int) -> Lanes:
-    """The buffer from entry (r, c) on."""
-    return m.entries[(r * m.n_columns + c) * W :]
-
-
-@inline
-def beyond(a: Lanes, field: int) -> Lanes:
-    """The buffer from a field on."""
-    return a[field * W :]
-
-
-@inline
 def take(a: Lanes, first: int, n: int) -> tuple[Lanes, int]:
     """n fields of a buffer, and the field behind them."""
     return a[first * W : (first + n) * W], first + n

@@ -15,7 +15,7 @@ BLOCK multiply-adds.
 from __future__ import annotations
 
 from ..jit import kernel
-from .lanes import LaneMatrix, Lanes, W, beyond, row_from, write
+from .lanes import LaneMatrix, Lanes, W
 
 BLOCK = 4
 
@@ -57,30 +57,37 @@ def gain(
 
     All three matrices have n_p columns; `vector` holds n_p + 2 numbers a lane.
     """
-    n_p = P.n_columns
-    number, inverse = beyond(vector, n_p), beyond(vector, n_p + 1)
+    n_p, p, g, rows = P.n_columns, P.entries, G.entries, gamma.entries
+    row, block = n_p * W, BLOCK * W
+    number, inverse = vector[row : row + W], vector[row + W : row + 2 * W]
     for i in range(n_e):
+        g_i = rows[i * row : (i + 1) * row]
         for a in range(n_x):
+            out = vector[a * W : (a + 1) * W]
             for w in range(W):
-                write(vector, a, w, 0.0)
-            for b in range(0, n_p, BLOCK):
-                dot_block(beyond(vector, a), row_from(P, a, b), row_from(gamma, i, b))
+                out[w] = 0.0
+            for b in range(0, row, block):
+                dot_block(out, p[a * row + b : a * row + b + block], g_i[b : b + block])
         for w in range(W):
             number[w] = noise
-        for b in range(0, n_p, BLOCK):
-            dot_block(number, beyond(vector, b), row_from(gamma, i, b))
+        for b in range(0, row, block):
+            dot_block(number, vector[b : b + block], g_i[b : b + block])
         for w in range(W):
             # rounding may take P a little below zero where nothing is left to learn
             inverse[w] = 1.0 / max(number[w], noise)
-        for b in range(0, n_p, BLOCK):
-            scale_block(row_from(G, i, b), beyond(vector, b), inverse)
+        k_i = g[i * row : (i + 1) * row]
+        for b in range(0, row, block):
+            scale_block(k_i[b : b + block], vector[b : b + block], inverse)
         for a in range(n_x):
-            for b in range(0, n_p, BLOCK):
-                subtract_block(row_from(P, a, b), beyond(vector, b), row_from(G, i, a))
+            for b in range(0, row, block):
+                subtract_block(
+                    p[a * row + b : a * row + b + block], vector[b : b + block], k_i[a * W : (a + 1) * W]
+                )
         for j in range(i):
+            k_j = g[j * row : (j + 1) * row]
             for w in range(W):
                 number[w] = 0.0
-            for b in range(0, n_p, BLOCK):
-                dot_block(number, row_from(G, j, b), row_from(gamma, i, b))
-            for b in range(0, n_p, BLOCK):
-                subtract_block(row_from(G, j, b), row_from(G, i, b), number)
+            for b in range(0, row, block):
+                dot_block(number, k_j[b : b + block], g_i[b : b + block])
+            for b in range(0, row, block):
+                subtract_block(k_j[b : b + block], k_i[b : b + block], number)
