@@ -45,7 +45,7 @@ class ChainSolver:
         better use of a core (perf/bench_generate.py)."""
         self.layout, self.params, rest = compile_robots((robot,), points_per_segment)
         self._reader = Reader(self.layout, self.params, rest, n)
-        self._passes = BoundarySolver(self.layout, self.params, n, threads, carry=False)
+        self._passes = BoundarySolver(self.layout, self.params, n, threads, propagate=False)
         self._rows = np.arange(n)
         self._past: list[Floats] = []
         self._near = _NEAR * float(self.params.rod_length[0])

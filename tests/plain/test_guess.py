@@ -68,7 +68,7 @@ def fill(case: Case, n: int, rows: list[int] | None = None) -> Memory:
     """The memory of n robots after a cold start of `rows`, all of them by default; it was full of something
     else before."""
     layout, params, ports = case
-    passes = BoundarySolver(layout, params, n, threads=1, carry=True)
+    passes = BoundarySolver(layout, params, n, threads=1, propagate=True)
     passes.remember(len(ports.follower_force) > 0, True, None)
     for a in passes.memory:
         a[:] = 7.0
