@@ -134,12 +134,14 @@ def arclengths(arclength: ArrayLike, n_robots: int) -> Floats:
     return np.broadcast_to(s, (n_robots, s.shape[1]))
 
 
-def mobility(obstacle: str, translation: object, rotation: ArrayLike, center: ArrayLike) -> Floats:
+def mobility(obstacle: str, translation: float, rotation: ArrayLike, center: ArrayLike) -> Floats:
     """(13,) how far an obstacle's body moves (`Surfaces.give`). Raises `InputError`."""
     for name, given in (("translation", translation), ("rotation", rotation), ("center", center)):
         refuse_masked(name, given)
     try:
-        numbers = np.concatenate([np.ravel(a) for a in (translation, rotation, center)]).astype(float)
+        numbers = np.concatenate([np.ravel(np.asarray(a)) for a in (translation, rotation, center)]).astype(
+            float
+        )
     except (TypeError, ValueError, OverflowError):
         numbers = np.full(0, np.nan)
     if numbers.shape != (13,) or not np.isfinite(numbers).all() or not numbers[0] >= 0.0:

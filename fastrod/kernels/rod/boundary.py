@@ -24,7 +24,7 @@ def slack_slope(params: Params, i: int, t: int) -> float:
     it hangs, and d/T is about a taut one's slope."""
     s = pick(i, len(params.rod_length))
     slope = params.moment_scale[s] / (params.tension_scale[s] * params.tension_scale[s])
-    return max(params.compliance[pick(i, len(params.compliance)), t], slope)
+    return float(max(params.compliance[pick(i, len(params.compliance)), t], slope))
 
 
 @kernel

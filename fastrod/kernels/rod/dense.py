@@ -20,8 +20,8 @@ def _node_before(lane: int, i: int, s: float, layout: Layout, shape: RodShape, r
     the
     fraction of the whole step."""
     n_points, node = shape.arclength.shape[1], rod.node
-    at = np.searchsorted(shape.arclength[i], s * (1.0 + 1e-13), side="right") - 1
-    at = min(max(at, 0), n_points - 2)
+    past = int(np.searchsorted(shape.arclength[i], s * (1.0 + 1e-13), side="right"))
+    at = min(max(past - 1, 0), n_points - 2)
     whole, h = shape.arclength[i, at + 1] - shape.arclength[i, at], s - shape.arclength[i, at]
     write(node, sh.N_H, lane, h)
     for a in range(3):
