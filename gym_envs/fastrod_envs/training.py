@@ -18,7 +18,7 @@ import msgspec
 from fastrod.errors import InputError, UnknownNameError, nearest, shown
 from fastrod_envs.actor import actor_of
 from fastrod_envs.checkpoints import load_checkpoint, load_replay, save_checkpoint, save_replay
-from fastrod_envs.presets import ALGORITHMS, NETWORK, preset_of, settings_of
+from fastrod_envs.presets import ALGORITHMS, NETWORK, check_settings, preset_of, settings_of
 from fastrod_envs.registration import NAMESPACE, VERSION, name_of
 
 Progress = Callable[[str, int, int], None]
@@ -74,6 +74,7 @@ class TrainingPlan:
             raise InputError(
                 f"curriculum is {self.curriculum!r}; it must be the difficulty at the start, from 0 to 1."
             )
+        check_settings(self.algorithm, self.settings)
 
 
 class _State(TypedDict):
@@ -298,7 +299,8 @@ def _fresh(plan: TrainingPlan, vec: Any, board: str | None) -> Any:
             policy_kwargs={**policy, **own},
             **settings,
         )
-    except (TypeError, ValueError, AssertionError, MemoryError) as error:  # of stable-baselines3 and torch
+    # of stable-baselines3 and torch
+    except (TypeError, ValueError, AssertionError, MemoryError, RuntimeError) as error:
         raise InputError(
             f"{plan.algorithm} cannot be set up with the settings {shown(settings)}: "
             f"{str(error).rstrip('.')}."
