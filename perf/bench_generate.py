@@ -26,9 +26,8 @@ import numpy as np
 
 import fastrod
 from fastrod.generation import Plan, Shapes, generate
-from fastrod.generation.here import one_thread
+from fastrod.generation.here import cores, one_thread
 from fastrod.generation.plan import SHARDS
-from fastrod.generation.run import cores
 from fastrod.generation.settling import ChainSolver
 from fastrod.generation.shapes import Draw
 from fastrod.generation.shards import counted, found, write

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from fastrod.errors import HostError, InputError
-from fastrod.generation.here import ONE_THREAD
+from fastrod.generation.here import ONE_THREAD, cores
 from fastrod.generation.plan import Plan
 from fastrod.generation.shards import Shard
 
@@ -86,7 +86,7 @@ def _cluster(address: str, workers: int | None) -> Iterator[Any]:
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
     try:
         if address == "local":
-            ray.init(num_cpus=workers or _cores(), include_dashboard=False, **quiet)
+            ray.init(num_cpus=workers or cores(), include_dashboard=False, **quiet)
         else:
             ray.init(address=address, **quiet)
     except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
@@ -140,9 +140,3 @@ def _one_line(error: BaseException) -> str:
     """The last line that says something, as a sentence."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return (lines[-1] if lines else type(error).__name__).rstrip(".") + "."
-
-
-def _cores() -> int:
-    from fastrod.generation.run import cores
-
-    return cores()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,7 +15,7 @@ from typing import NamedTuple, final
 
 from fastrod.errors import InputError, shown
 from fastrod.generation.columns import within
-from fastrod.generation.here import run_here
+from fastrod.generation.here import cores, run_here
 from fastrod.generation.on_ray import run_on_ray
 from fastrod.generation.plan import PLAN, SHARDS, Plan, settle_plan
 from fastrod.generation.shards import counted, found, sweep_parts
@@ -51,11 +50,6 @@ class Summary:
     def rate(self) -> float:
         """Rows or episodes a second that this run made; 0 where it made none."""
         return self.made_count / self.seconds if self.made else 0.0
-
-
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 def generate(

@@ -99,7 +99,7 @@ def test_a_message_is_sent_although_a_client_began_to_wait_in_that_moment() -> N
         assert event.is_set()
 
 
-def test_loopback_is_told_from_the_rest() -> None:
+def test_loopback_is_distinguished() -> None:
     assert [
         is_loopback(h) for h in ("127.0.0.1", "localhost", "::1", "0.0.0.0", "192.168.1.2", "robot.lab")
     ] == [True] * 3 + [False] * 3
@@ -212,5 +212,5 @@ def test_the_address_is_the_key(
     address, key = opened
     assert address.endswith(f"/{key}/")
     assert f"prototype: {address} (Ctrl+C ends it)" in said.out
-    assert ("Other machines reach this page, too, at http://" in said.err) == announced
+    assert ("Other machines can open this page, too, at http://" in said.err) == announced
     assert (f"/{key}/ and whoever has this address can drive: it is the key" in said.err) == announced

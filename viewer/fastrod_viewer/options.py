@@ -1,4 +1,4 @@
-"""What is drawn of robots, and what colours mean."""
+"""Options of a view: what is drawn of robots, and what colours mean."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ have too much to do."""
 
 @dataclass(frozen=True, kw_only=True)
 class ViewOptions:
-    """What is drawn, and what colours mean."""
+    """Options of a view."""
 
     color_by: str = "segment"
     """`segment`; `curvature`, |u_xy| [1/m]; `strain`, body radius times |u_xy|, the largest of bending in the
