@@ -32,7 +32,7 @@ def mounted(robot: str, mass: float, place: Sequence[float], gravity: float, tou
     )
     world.changeDynamics(cube, -1, linearDamping=0.0, angularDamping=0.0)
     along_x = BulletLink(world, post, quaternion=(0.5**0.5, 0.0, 0.5**0.5, 0.0))
-    return MountedRod(fastrod.load_robot(robot), along_x, touch=[cube] if touch else []), cube
+    return MountedRod(fastrod.load_robot(robot), along_x, contact_bodies=[cube] if touch else []), cube
 
 
 def timed(what: str, step: Callable[[int], Any], steps: int, touching: Callable[[], bool]) -> Row:

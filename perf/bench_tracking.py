@@ -126,7 +126,7 @@ def row(name: str, reach: Reach | None, dt: float | None, seconds: float | None)
     note_progress(f"{name}: both")
     both = record(stage := TrackingError(scene.path(), dt=dt), steps(stage, seconds))
     by_soft, by_arm = both.lengths(APPROACH)
-    after, part = both.mean_square(APPROACH), both.soft_share(APPROACH)
+    after, part = both.mean_square(APPROACH), both.soft_fraction(APPROACH)
     found: Row = {
         "path": scene.shape,
         "paper": scene.paper,
@@ -175,7 +175,7 @@ def tracking_sections(quick: bool, dt: float | None) -> list[Section]:
     ]
     shares = [
         Column("path", "path"),
-        Column("share", "soft share", ".3f"),
+        Column("share", "soft fraction", ".3f"),
         Column("share_target", "target", ".1f"),
         Column("share_met", "met"),
         Column("by_soft", "tip by soft\nrobot m", ".2f"),

@@ -119,7 +119,7 @@ def test_an_exported_page_opens_from_disk_without_a_network(
     picture = alone.pixels()
     assert len(np.unique(picture[150:600, 420:860].reshape(-1, 3), axis=0)) > 200  # a robot, and not a blank
     assert alone.errors == []
-    assert [url for url in alone.asked if not url.startswith(("file:", "data:", "blob:"))] == []
+    assert [url for url in alone.requested if not url.startswith(("file:", "data:", "blob:"))] == []
     assert app.served.key not in path.read_text(encoding="utf-8")
 
 

@@ -19,8 +19,8 @@ def test_tip_and_base_wrench_agree_within_one_percent(case: str) -> None:
 
     assert case in CASES
     found = [at_rest(engine, case, 200) for engine in ("PyBullet", "MuJoCo")]
-    parts = apart(*found)
-    assert max(parts.values()) < 0.01, parts
+    costs = apart(*found)
+    assert max(costs.values()) < 0.01, costs
     # nothing agrees by being nothing: the weight hangs on the flange, and what pushes is felt
     weight = np.array([0.0, 0.0, -0.1 * carried()[0].length * 9.81])
     for result in found:

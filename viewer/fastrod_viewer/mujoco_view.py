@@ -7,7 +7,7 @@ from typing import Any, NoReturn, final
 import numpy as np
 
 from fastrod.errors import HostError, InputError
-from fastrod.hosts.mujoco_touched import obstacle_of
+from fastrod.hosts.mujoco_body_contact import obstacle_of
 from fastrod.model.robot import Robot
 from fastrod.rotation import quaternion_from_matrix
 from fastrod.types import Floats

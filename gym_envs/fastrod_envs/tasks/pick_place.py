@@ -12,7 +12,7 @@ import numpy as np
 from fastrod.errors import InputError
 from fastrod.hosts import Bullet, BulletArm, BulletLink, HostCamera, connect
 from fastrod.hosts.bodies import RodBodies
-from fastrod.hosts.capsules import turn_between
+from fastrod.hosts.capsules import rotation_between
 from fastrod.hosts.gripper import Gripper
 from fastrod.hosts.link import from_xyzw, to_xyzw
 from fastrod.model.robot import Robot
@@ -310,7 +310,7 @@ class _Table(Cell):
         rotation = self.soft.tip_rotation
         for finger in self.gripper.fingers:
             side = self.world.getJointState(self.gripper.body, finger)[0] * (1.0 if finger == 0 else -1.0)
-            half = np.array([0.003, 0.01, 0.5 * self.gripper.reach])
+            half = np.array([0.003, 0.01, 0.5 * self.gripper.length])
             solids.append(
                 solid_box(self.soft.tip + rotation @ [side, 0.0, half[2]], half, (0.25, 0.25, 0.28), rotation)
             )
@@ -360,7 +360,7 @@ class _Table(Cell):
         """The joints, by resolved rates toward the flange's pose."""
         now = self.arm.frame(self.q)
         error = np.concatenate(
-            [self.flange[:3] - now[:3], turn_between(now[None, 3:], self.flange[None, 3:])[0]]
+            [self.flange[:3] - now[:3], rotation_between(now[None, 3:], self.flange[None, 3:])[0]]
         )
         jacobian = self.arm.jacobian(self.q)
         step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + 1e-6 * np.eye(6), error)

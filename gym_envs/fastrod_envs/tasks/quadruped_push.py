@@ -54,8 +54,8 @@ class QuadrupedPush(PushTask):
     What is left out: the trunk stands still (a push of 0.12 N does not move 12 kg), so the legs are drawn
     only, and the bar has no weight. The bar pushes the cube as it moves; with the option `feels` the neck
     bends under what the bar felt, 0.3 s later. A rod that touches the cube within steps of 10 ms
-    (`MountedRod(touch=...)`) costs ten times as much, and its round tip does not steer a cube. A controller
-    keeps the bar off the floor.
+    (`MountedRod(contact_bodies=...)`) costs ten times as much, and its round tip does not steer a cube. A
+    controller keeps the bar off the floor.
     """
 
     name = "QuadrupedPush"
