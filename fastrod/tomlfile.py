@@ -10,7 +10,7 @@ from typing import Any
 from fastrod.errors import FastrodError
 
 _LARGEST = 1_000_000  # bytes; a robot of five segments has two thousand
-_DEEPEST = 50  # parts of a dotted key
+_DEEPEST = 50  # words of a dotted key
 
 
 def read_text(path: Path, where: str, error: type[FastrodError]) -> str:
@@ -35,7 +35,7 @@ def parse(text: str, where: str, error: type[FastrodError], what: str) -> dict[s
         for piece in re.split(r"[\n,=]", text)
     ):
         # tomllib takes a time that grows with the square of their number
-        raise error(f"{where} is not a {what}: it has a key of more than {_DEEPEST} parts.")
+        raise error(f"{where} is not a {what}: it has a key of more than {_DEEPEST} words.")
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as why:

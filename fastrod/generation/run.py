@@ -1,4 +1,4 @@
-"""`generate`: a plan into a folder of shards; begins, goes on, or finds everything there."""
+"""`generate`: a plan into a folder of shards; begins, continues, or finds everything there."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from fastrod.generation.columns import within
 from fastrod.generation.here import cores, run_here
 from fastrod.generation.on_ray import run_on_ray
 from fastrod.generation.plan import PLAN, SHARDS, Plan, settle_plan
-from fastrod.generation.shards import counted, found, sweep_parts
+from fastrod.generation.shards import counted, found, remove_partial_files
 from fastrod.generation.tasks import missing
 
 _LOCK = ".lock"
@@ -27,7 +27,7 @@ _LOCK = ".lock"
 @final
 @dataclass(frozen=True, kw_only=True)
 class Summary:
-    """What a folder holds now, and what this run had to do with it."""
+    """Content of a folder, and what this run added."""
 
     folder: str
     kind: str
@@ -63,9 +63,9 @@ def generate(
     """Make all shards of `plan` that are not in `folder` yet, and check that every row is there once.
 
     `workers` processes here, one for each core by default; with `ray` the tasks of a cluster (`run_on_ray`),
-    by default as many as it has cores for. A run that was killed, whole or in part, is finished by the same
-    call: a shard is there whole or not at all, and is the same whoever makes it. Call it below `if __name__
-    == "__main__":`, as with every program that starts processes.
+    by default as many as it has cores for. A run that was killed is finished by the same call: a shard is
+    there whole or not at all, and is the same whichever process makes it. Call it below `if __name__ ==
+    "__main__":`, as with every program that starts processes.
 
     Raises `InputError` where the folder holds another plan, where another run writes into it, or cannot be
     written; `HostError` where workers or cluster are lost; `OSError` where the disk is full.
@@ -94,7 +94,7 @@ def generate(
             )
         settle_plan(plan, folder)
         files.mkdir(exist_ok=True)
-        sweep_parts(files)
+        remove_partial_files(files)
         whole = found(plan, files)
         todo = missing(plan, whole)
         done, made = sum(shard.units for shard in whole.values()), 0
@@ -115,7 +115,7 @@ def generate(
                         progress(plan.kind, done + made, plan.count)
             finally:
                 run.close()
-                sweep_parts(files)
+                remove_partial_files(files)
         rows = counted(plan, files)
         return Summary(
             folder=str(folder),
@@ -168,7 +168,7 @@ def _own(folder: Path) -> Iterator[Callable[[], None]]:
 
 
 class _State(NamedTuple):
-    """What a folder held before."""
+    """Content of a folder before the run."""
 
     plan: bytes | None
     files: frozenset[str] | None
@@ -183,7 +183,7 @@ class _State(NamedTuple):
         )
 
     def put_back(self, folder: Path) -> bool:
-        """Whether nothing was made; the plan is then as before."""
+        """Restore the plan and return True if nothing was made."""
         now = _State.of(folder)
         if (now.files or frozenset()) - (self.files or frozenset()):
             return False

@@ -112,7 +112,8 @@ def test_jacobian_is_the_slope_of_the_frame(world: Bullet) -> None:
             after, before = arm.frame(q + d), arm.frame(q - d)
             rotation = product(after[3:], before[3:] * [1.0, -1.0, -1.0, -1.0])
             slopes.append(
-                np.concatenate([after[:3] - before[:3], 2.0 * np.sign(rotation[0]) * rotation[1:]]) / (2.0 * h)
+                np.concatenate([after[:3] - before[:3], 2.0 * np.sign(rotation[0]) * rotation[1:]])
+                / (2.0 * h)
             )
         assert_allclose(arm.jacobian(q), np.transpose(slopes), atol=1e-9)
 

@@ -134,7 +134,7 @@ def test_calc_tip_pos_agrees_with_the_motion_and_moves_nothing(make: Callable[..
     assert cube in before
     world, _ = sim.move_robot_ori(action, base, rotation)
     assert_array_equal(world[-1], [*position, *quaternion])
-    assert_array_equal(world, twin.move_robot_ori(action, base, rotation)[0])  # nor did it change what came later
+    assert_array_equal(world, twin.move_robot_ori(action, base, rotation)[0])  # nor did it change later ones
     assert_array_equal(sim.calc_tip_pos(action, base, rotation)[0], position)
 
 

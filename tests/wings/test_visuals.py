@@ -73,7 +73,9 @@ def made(world, kind, tmp_path):
 @pytest.mark.parametrize("link", [False, True])
 def test_shape_stands_where_the_camera_sees_it(world, tmp_path, kind, link):
     seen = world.createVisualShape(
-        **made(world, kind, tmp_path), visualFramePosition=[0.05, -0.03, 0.04], visualFrameOrientation=ROTATION
+        **made(world, kind, tmp_path),
+        visualFramePosition=[0.05, -0.03, 0.04],
+        visualFrameOrientation=ROTATION,
     )
     links = {
         "linkMasses": [1.0],
