@@ -211,8 +211,8 @@ def build() -> tuple[argparse.ArgumentParser, list[str]]:
             formatter_class=argparse.RawDescriptionHelpFormatter,
             description="The prototype on its bus, or its emulator.\n\nactions:\n"
             + "\n".join(f"  {name:<11}{what}" for name, what in ACTIONS.items()),
-            epilog="exit code:\n  0  done\n  1  the robot does not answer, was stopped during the run, or what "
-            "it measured does not suffice;\n     what was recorded until then is kept\n"
+            epilog="exit code:\n  0  done\n  1  the robot does not answer, was stopped during the run, or "
+            "what it measured does not suffice;\n     what was recorded until then is kept\n"
             "  2  the arguments or a file are wrong, and nothing has moved",
         )
     )

@@ -40,7 +40,7 @@ def test_a_path_in_the_plane_is_closed(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "pitch", "turn"), [("helix", 0.1, "circle"), ("square_helix", 0.02, "square")]
+    ("name", "pitch", "lap"), [("helix", 0.1, "circle"), ("square_helix", 0.02, "square")]
 )
 def test_a_helix_is_its_lap_that_sinks_by_the_pitch(name: str, pitch: float, lap: str) -> None:
     t = np.linspace(-7.0, 45.0, 60)

@@ -487,7 +487,7 @@ TABLES: dict[str, tuple[str, str, str]] = {
         "Marker.size is 1e-320 m; it must be from 0.0001 to 1 m",
     ),
     "deep": ('robot = "prototype"', "robot = " + "[" * 100_000, "its tables stand too deep in one another"),
-    "long key": ('robot = "prototype"', "a." * 20_000 + "a = 1", "it has a key of more than 50 parts"),
+    "long key": ('robot = "prototype"', "a." * 20_000 + "a = 1", "it has a key of more than 50 words"),
     "large": ('robot = "prototype"', "#" * 1_000_001, "it has more than 1000000 bytes"),
 }
 
@@ -518,7 +518,7 @@ def test_numbers_that_a_float_can_hold_and_their_squares_cannot(tmp_path: Path, 
 
 def test_a_robot_file_has_the_same_bounds(tmp_path: Path) -> None:
     for text, words in (
-        ("a." * 20_000 + "a = 1", "a key of more than 50 parts"),
+        ("a." * 20_000 + "a = 1", "a key of more than 50 words"),
         ("#" * 1_000_001, "more than 1000000 bytes"),
     ):
         (tmp_path / "mine.toml").write_text(text, encoding="utf-8")

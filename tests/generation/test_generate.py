@@ -53,7 +53,7 @@ def test_what_is_made_is_reported_and_read_back(whole: Path) -> None:
     table = parquet.read_table(whole / "shards")
     metadata = {field.name: field.metadata for field in table.schema}
     assert metadata["tip_x"] == {b"unit": b"m", b"about": b"tip, base frame"}
-    assert all(set(metadata) == {b"unit", b"about"} for metadata in metadata.values())
+    assert all(set(entry) == {b"unit", b"about"} for entry in metadata.values())
     first = parquet.read_metadata(whole / "shards" / "shapes-000000.parquet").metadata
     assert first is not None
     assert first[b"fastrod_plan"].decode() == small().hash

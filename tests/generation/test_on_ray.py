@@ -92,7 +92,7 @@ def test_a_machine_that_does_not_see_the_folder_is_named(
     with pytest.raises(
         InputError,
         match=r"machine .* does not see folder .*shards'; give --out a folder "
-        r"that all machines share\.",
+        r"that all machines see\.",
     ):
         generate(small(), tmp_path, ray="auto")
     assert bits(tmp_path) == {}

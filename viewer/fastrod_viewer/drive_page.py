@@ -79,15 +79,15 @@ class DrivePage(ViewerPage):
         `may` says of an event whether the page it comes from may act."""
         self.server, self.world, self.title, self._may = server, world, world.name, may
         self._folder, self._replay, self._echo = folder, replay, echo
-        touches = world.rods[0].state.contacts is not None
+        has_contact = world.rods[0].state.contacts is not None
         far = None if link is None else Linked(link)
-        gentle = _GENTLE if touches else _REAL if link is not None and link.real else 1.0
+        gentle = _GENTLE if has_contact else _REAL if link is not None and link.real else 1.0
         self.teleop = Teleop(world, Speeds().times(gentle), limits=None if far is None else far.limits)
         many = len(world.rods[0].state.ok) > FINE
         self.drawing = Drawing(
             canvas,
             world,
-            ViewOptions(body="skin" if touches or many else "backbone"),
+            ViewOptions(body="skin" if has_contact or many else "backbone"),
             measured=link is not None,
         )
         self.sight = PageView(

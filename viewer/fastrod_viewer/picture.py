@@ -137,7 +137,7 @@ class Picture:
             found["tendons"] = self._tendons.instances(rod, self._tension, ~bad, by_number)
         tip = rod.position[:, -1]
         if self._contacts:
-            point, force = self._touches(state.contacts)
+            point, force = self._contact_arrows(state.contacts)
             found["contact_shafts"], found["contact_heads"] = self._arrows(
                 point + place[:, None, :], force, palette.CONTACT
             )
@@ -189,7 +189,7 @@ class Picture:
             else 100.0 * self.body_radius[self._sample.segment] * found
         )
 
-    def _touches(self, contacts: Contacts | None) -> tuple[Floats, Floats]:
+    def _contact_arrows(self, contacts: Contacts | None) -> tuple[Floats, Floats]:
         """Points and forces (n_robots, n_arrows, 3) of the largest contact forces, then zeros."""
         point, force = np.zeros((2, self.n_robots, self._contacts, 3))
         if contacts is not None:

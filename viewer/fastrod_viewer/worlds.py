@@ -58,7 +58,7 @@ class SimulatedWorld(World):
         self.dt = simulator.dt
         self.robot: Robot = simulator.robots[0]
         self.actions = actions_of(self.robot)
-        self._touches = contact is not None
+        self._has_contact = contact is not None
         self._radius = radii(self.robot, contact)
         self._place = place
         self._home: Floats = np.array([[*r.base_position, *r.base_quaternion] for r in simulator.robots])
@@ -114,7 +114,7 @@ class SimulatedWorld(World):
         are moved by the same change as the first one: no robot could jump to another's bends there."""
         held = self.held(self._clock)
         given = held | tendon_inputs(self.robot, command)
-        if self._touches and np.ndim(own := held.get("tendon_length", 0.0)) == 2:
+        if self._has_contact and np.ndim(own := held.get("tendon_length", 0.0)) == 2:
             given["tendon_length"] = np.asarray(own) + (command.tendon_length - np.asarray(own)[0])
         pose = np.asarray(given.get("base_pose", self._home), dtype=np.float64)
         given["base_pose"] = moved(pose, command.base)
@@ -154,10 +154,10 @@ class SimulatedWorld(World):
         done as far as possible: a script continues from there."""
         before = self.simulator.snapshot()
         state = self.simulator.step(**given)
-        if not state.ok.all() and not self._touches:
+        if not state.ok.all() and not self._has_contact:
             state = self.simulator.settle(**given)
         done = bool(state.ok.all()) and _finite(state)
-        if done or (partial and self._touches and _finite(state)):
+        if done or (partial and self._has_contact and _finite(state)):
             self._state, self._given = state, given
             self._t = self._t + self.dt
         else:

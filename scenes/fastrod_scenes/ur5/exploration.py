@@ -223,7 +223,7 @@ class Exploration(SceneStage):
         points = look.eye + image.depth[rows, columns][:, None] * rays
         return len(rows), float(self.box.off_cube(corner, points).max())
 
-    def arm_touches(self) -> bool:
+    def arm_in_contact(self) -> bool:
         """The UR5 touches the box."""
         return any(p[8] <= 0.0 for p in self.world.getContactPoints(self.arm.body, self.walls))
 
