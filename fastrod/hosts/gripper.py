@@ -18,7 +18,7 @@ CONTACT_DISTANCE = 1e-3
 _FINGER = (0.006, 0.02, 0.025)  # m: thickness, width, and how far it stands out before the head
 _FINGER_MASS = 0.02  # kg
 _SPEED = 0.05  # m/s at which a finger opens and closes
-_GRIP_FORCE = 10.0  # N, the most that a finger pushes with
+_FINGER_FORCE = 10.0  # N, the most that a finger pushes with
 _SUCTION = 200.0  # N
 # head, fingers; PyBullet multiplies it with the other body's, 0.5 by default: rubber on anything is 1
 _FRICTION = 0.5, 2.0
@@ -210,7 +210,7 @@ class Gripper:
                 finger,
                 self.bullet.POSITION_CONTROL,
                 targetPosition=0.5 * (self._commanded + _FINGER[0]),
-                force=_GRIP_FORCE,
+                force=_FINGER_FORCE,
                 positionGain=_GAIN,
                 velocityGain=1.0,
                 maxVelocity=1.0,

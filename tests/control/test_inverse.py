@@ -1,4 +1,4 @@
-"""Plans by learning: without effects they are the nearest points in reach; with effects the tip still goes
+"""Plans by learning: without effects they are the nearest points of the workspace; with effects the tip still goes
 there."""
 
 from __future__ import annotations

@@ -283,7 +283,7 @@ def test_steps_that_extend_keep_up_with_the_rod() -> None:
         q[[0, 3]] += 5e-4
         state = tip.place(q)
         assert state.ok[0]
-        # a moment counts as its length; pulling at every wire loses the robot here
+        # a moment counts as its length; pulling at every tendon loses the robot here
         assert state.residual[0] < 3e-3
     stepped = tip.place(q).tip_position[0]
     assert_allclose(stepped, tip.place(q, settle=True).tip_position[0], atol=2e-5)

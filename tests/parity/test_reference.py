@@ -292,7 +292,7 @@ def test_a_slack_tendon_pulls_no_more() -> None:
     assert slack[2]
     assert not slack[0]
     assert (shape.tension >= 0.0).all()
-    # a slack wire is longer than its path; a taut one is stretched by its tension
+    # a slack tendon is longer than its path; a taut one is stretched by its tension
     assert (shape.tendon_length[slack] <= length[slack]).all()
     assert_allclose((shape.tendon_length - length - 1e-5 * shape.tension)[~slack], 0.0, rtol=0, atol=TIP)
 

@@ -108,7 +108,7 @@ def test_weight_is_that_in_the_gravity_that_the_engine_gives():
 
 
 def test_memory_of_the_tendons_runs_on_the_engines_clock():
-    # a second-order lag of the wires: what it has done after 60 ms is the same in steps of any length, to the
+    # a second-order lag of the tendons: what it has done after 60 ms is the same in steps of any length, to the
     # order of the steps
     robot = soft_robot(1)
     slow = replace(robot, effects=({"name": "dynamics", "period": 0.1, "damping": 0.7},))
@@ -185,7 +185,7 @@ def test_many_rods_are_as_many_single_ones():
 
 @pytest.mark.parametrize("walled", [False, True])
 def test_rod_that_fails_leaves_its_neighbour_alone(monkeypatch, walled):
-    # what the wires of row 0 remember has moved once a step, as in a lone rod, whatever becomes of row 1
+    # what the tendons of row 0 remember has moved once a step, as in a lone rod, whatever becomes of row 1
     robot = replace(soft_robot(1), effects=({"name": "dynamics", "period": 0.1, "damping": 0.7},))
     scene = (
         ContactScene(obstacles=[plane(point=(0.01, 0, 0), normal=(-1, 0, 0), name="wall")])

@@ -1,4 +1,4 @@
-"""The tracks: their checks can fail, shares are counted right, what is held does not move, and the soft robot
+"""The tracks: their checks can fail, fractions are counted right, what is held does not move, and the soft robot
 can do it alone."""
 
 from __future__ import annotations
