@@ -71,7 +71,7 @@ class Gripper:
         self.links = range(-1, n)
         self.fingers = range(n)
         self.length = long
-        """From the tip to the fingers' ends [m]."""
+        """Distance from the tip to the fingers' ends [m]."""
         for link in self.links:
             friction = _FRICTION[link >= 0]
             b.changeDynamics(

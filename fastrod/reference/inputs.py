@@ -1,4 +1,4 @@
-"""From a robot and its inputs to a `Problem`, with a sentence for everything that cannot be one."""
+"""Make a `Problem` of a robot and its inputs, with a sentence for everything that cannot be one."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Plans by learning: without effects they are the nearest points of the workspace; with effects the tip still goes
-there."""
+"""Plans by learning: without effects they are the nearest points of the workspace; with effects the tip still
+goes there."""
 
 from __future__ import annotations
 

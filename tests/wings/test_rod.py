@@ -108,8 +108,8 @@ def test_weight_is_that_in_the_gravity_that_the_engine_gives():
 
 
 def test_memory_of_the_tendons_runs_on_the_engines_clock():
-    # a second-order lag of the tendons: what it has done after 60 ms is the same in steps of any length, to the
-    # order of the steps
+    # a second-order lag of the tendons: what it has done after 60 ms is the same in steps of any length, to
+    # the order of the steps
     robot = soft_robot(1)
     slow = replace(robot, effects=({"name": "dynamics", "period": 0.1, "damping": 0.7},))
     tips = []

@@ -1,5 +1,5 @@
-"""The tracks: their checks can fail, fractions are counted right, what is held does not move, and the soft robot
-can do it alone."""
+"""The tracks: their checks can fail, fractions are counted right, what is held does not move, and the soft
+robot can do it alone."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from fastrod_viewer.shapes import Instances, instances
 _AXIS_ORIENTATIONS = np.array(
     [[np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0], [np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]]
 )
-"""From z to x, y and z."""
+"""Rotations of z to x, y and z."""
 _PAPER: Color = (255, 255, 255)
 
 

@@ -63,7 +63,7 @@ class ReplayPage(ViewerPage):
         """It computes next to nothing."""
 
     def tick(self) -> None:
-        """Nothing to do."""
+        """Do nothing."""
 
     def lost(self, client: int, left: int) -> None:
         """With nobody left it plays no further."""

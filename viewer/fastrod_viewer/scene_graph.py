@@ -1,5 +1,4 @@
-"""From states to what is seen: poses, sizes and colours of instances of a few unit meshes; nothing here knows
-a browser.
+"""Pictures of states: poses, sizes and colours of instances of a few unit meshes; independent of a browser.
 
 The one door of `picture`, `fittings`, `arrows`, `legend`, `options` and `shapes`.
 """

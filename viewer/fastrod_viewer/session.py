@@ -45,8 +45,8 @@ class ViewFrame:
     measured: Measurement | None
     """Of a robot that is not the world itself."""
     latency: float
-    """From the oldest input that this picture answers to the end of its computation [s]; nan where there was
-    none."""
+    """Time from the oldest input that this picture answers to the end of its computation [s]; nan where there
+    was none."""
     pace: float
     """Seconds of the world in a second, lately; 1 while nothing moves."""
     problem: str
@@ -126,7 +126,7 @@ class Session:
 
     @property
     def paused(self) -> bool:
-        """Nothing moves until `paused` is False again, or `step`."""
+        """True while everything stands still, until it is set to False or `step` is called."""
         return self._paused
 
     @paused.setter

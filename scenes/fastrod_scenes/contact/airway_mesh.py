@@ -43,7 +43,7 @@ _SHORTEST = 0.05  # of an edge: a vertex keeps so far from the lattice points, f
 
 
 def path_length() -> float:
-    """From the entry to the end of either bronchus, along its middle [m]."""
+    """Return the length from the entry to the end of either bronchus, along its middle [m]."""
     return TRACHEA + BEND_RADIUS * BEND + OUTLET
 
 

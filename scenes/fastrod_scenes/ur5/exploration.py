@@ -23,9 +23,9 @@ ADAPTER = 0.03
 INTO = (0.5, 0.5, 0.5, 0.5)
 """Of the flange as the robot enters, w x y z: its x, y, z are y, z, x of the world."""
 BEFORE = 0.05
-"""From the straight robot's tip to the entry, before it enters [m]."""
+"""Distance from the straight robot's tip to the entry, before it enters [m]."""
 STANDOFF = 0.03
-"""From the soft robot's base to the front wall, while it looks around [m]."""
+"""Distance from the soft robot's base to the front wall, while it looks around [m]."""
 ELBOW_UP = ((-0.4, -1.9, 1.8, 0.1, 1.1, 0.0), (-0.4, -1.9, 2.2, 2.8, -1.1, 3.1))
 """Joints of the UR5 about its pose before the entry, wrist in both directions [rad]."""
 ENTRY = (0.006, 0.008, 0.008, 0.7, 0.06, 0.06)
@@ -184,7 +184,7 @@ class Exploration(SceneStage):
         return state.tip_position[0], state.tip_rotation[0]
 
     def picture(self) -> Image:
-        """From before the tip's cap, along d3; d2 is up in it."""
+        """Return the picture from before the tip's cap, along d3; d2 is up in it."""
         _, rotation = self.tip()
         eye = self._eye()
         return self.camera.look(self.world, eye, eye + 0.1 * rotation[:, 2], rotation[:, 1])
