@@ -40,8 +40,9 @@ def test_the_peers_slopes_agree(tension: float) -> None:
 
 @pytest.mark.parametrize("paper", [True, False])
 def test_the_peer_solves_the_same_rod(paper: bool) -> None:
-    from cases import LINE, appendix_b_robot, arc_lengths
     from peers import Peer
+
+    from cases import LINE, appendix_b_robot, arc_lengths
 
     robot = appendix_b_robot(paper)
     length, force = arc_lengths(robot, np.array([[[0.4, -0.5]]]))[0], (0.1, -0.2, 0.15)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 import io
 import json
-import runpy
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -384,7 +384,8 @@ def _script(path: Path, argv: list[str]) -> int:
         0, str(path.parent)
     )  # as `python perf/bench_NAME.py` has it, for the scripts' common modules
     try:
-        return int(runpy.run_path(str(path))["main"](argv) or DONE)
+        # imported by name, so that a process that a benchmark starts finds its functions
+        return int(import_module(path.stem).main(argv) or DONE)
     finally:
         sys.path.remove(str(path.parent))
 

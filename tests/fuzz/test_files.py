@@ -20,7 +20,10 @@ import pytest
 pytest.importorskip("gymnasium", reason="gymnasium is not installed: pip install 'fastrod[envs]'")
 pytest.importorskip("pyarrow", reason="pyarrow is not installed: pip install 'fastrod[parquet]'")
 pytest.importorskip("can", reason="python-can is not installed (pip install 'fastrod[device]')")
-sys.path.insert(0, str(Path(__file__).parents[2] / "perf"))
+sys.path.insert(0, str(Path(__file__).parent))
+
+from fuzz_read import FINE, try_file, warm
+from fuzz_seeds import KINDS, Originals, foreign, npz
 
 from fastrod.commands.cli import main
 from fastrod.contact import MeshLimits, mesh
@@ -31,8 +34,6 @@ from fastrod.model.robotfile import load_robot
 from fastrod_device.hardware import SHIPPED, load_hardware
 from fastrod_envs.policies import Policy, find
 from fastrod_scenes.measured import read
-from fuzz_files import FINE, try_file, warm
-from fuzz_seeds import KINDS, Originals, foreign, npz
 
 
 @pytest.fixture(scope="module")

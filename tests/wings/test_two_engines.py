@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-
-@pytest.fixture(autouse=True)
-def _perf_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "perf"))
+from two_engines import CASES, apart, at_rest, carried
 
 
 @pytest.mark.parametrize("case", ["hanging", "pulled by 0.3 N", "on a fixed block", "on a sprung block"])
 def test_tip_and_base_wrench_agree_within_one_percent(case: str) -> None:
-    from two_engines import CASES, apart, at_rest, carried
-
     assert case in CASES
     found = [at_rest(engine, case, 200) for engine in ("PyBullet", "MuJoCo")]
     costs = apart(*found)
