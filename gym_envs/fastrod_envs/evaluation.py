@@ -108,7 +108,7 @@ def evaluate(
             }
             for name, agent in blind.items():
                 trials[name], _ = _run(batch, agent, episodes, seed, name, progress)
-        return Evaluation(f"fastrod/{name_of(env)}-v0", seed, wanted, kind.accuracy, trials)
+        return Evaluation(f"fastrod/{name_of(env)}-v0", seed, wanted, batch.task.accuracy, trials)
     finally:
         batch.close()
 

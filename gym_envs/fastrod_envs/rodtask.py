@@ -29,9 +29,9 @@ class RodTask(Task):
     `"displacement"`: it is where they go, at once, from the least to the largest, and the rod settles there.
     """
 
-    points_per_segment: ClassVar[int]
+    points_per_segment: int
     outputs: ClassVar[Any] = "tip"
-    hold_gain: ClassVar[float] = 5e-5
+    hold_gain: float = 5e-5
     """`Simulator(hold_gain=...)` [m]."""
     loaded: ClassVar[bool] = False
     """An episode brings loads of its own: robots settle under them when it begins."""
@@ -158,12 +158,23 @@ class RodTask(Task):
         )
         return np.where(np.isfinite(p), p, self.tip)
 
+    def jacobian(self) -> Floats:
+        """(n_envs, 6, n_driven) d(tip position, rotation vector)/d(driven), world, by the `model`: rows 0 to
+        2 per metre [m/m], 3 to 5 [rad/m]."""
+        return self.by_driven(self.model().jacobian())
+
+    def by_driven(self, jacobian: Floats) -> Floats:
+        """(n_envs, m, n_driven) of derivatives (n_envs, m, n_tendons + n_segments) by tendon lengths and
+        extensions, as `Simulator.jacobian` gives them."""
+        return np.asarray(jacobian @ self._actions.matrix[:, self.driven])
+
     def toward(self, velocity: Floats, jacobian: Floats | None = None, weight: ArrayLike = 1.0) -> Floats:
-        """(n_envs, n_actions) the action that moves the tips with these velocities (n_envs, 3) [m/s]: damped
-        resolved rates, with the simulator's Jacobian or one of d(tip)/d(driven) (n_envs, 3, n_driven).
-        Numbers with a smaller `weight` (n_driven,) move less."""
+        """(n_envs, n_actions) the action that moves the tips with these velocities (n_envs, m): damped
+        resolved rates by `jacobian` (n_envs, m, n_driven), the rows of `RodTask.jacobian` that the velocities
+        belong to; without one, m is 3 and they are those of the tips [m/s]. Numbers with a smaller `weight`
+        (n_driven,) move less."""
         if jacobian is None:
-            jacobian = self.model().jacobian()[:, :3] @ self._actions.matrix[:, self.driven]
+            jacobian = self.by_driven(self.model().jacobian()[:, :3])
         scale = self._rate * np.asarray(weight)
         q = scale * resolved(np.nan_to_num(jacobian) * scale, velocity, -self.posture())
         if self.options.action == "rate":

@@ -16,6 +16,7 @@ from fastrod_envs.episodes import Episodes, Singles
 from fastrod_envs.options import checked_difficulty, checked_mapping, with_steps
 from fastrod_envs.registration import make_task, task_class
 from fastrod_envs.rendering import Renderer
+from fastrod_envs.task import Task
 from fastrod_envs.vector import action_space
 
 
@@ -38,7 +39,7 @@ class SingleEnv(gymnasium.Env[Singles, Any]):
 
     def __init__(
         self,
-        task: str,
+        task: str | type[Task],
         *,
         max_episode_steps: int | None = None,
         render_mode: str | None = None,

@@ -111,8 +111,11 @@ class Task(ABC):
     """Of an episode, unless the options say otherwise."""
     n_draws: ClassVar[int]
     """Numbers from 0 to 1 that an episode draws for its goal and scene, randomisation apart."""
-    accuracy: ClassVar[float]
-    """Distance below which the task is done [m]."""
+    accuracy: float
+    """Distance below which the task is done [m]; a number of the class, which a robot of another size may
+    change."""
+    solved: ClassVar[float | None] = None
+    """Mean return from which the task counts as solved, for Gymnasium; None: nobody has said."""
     options_class: ClassVar[type[EnvOptions]] = EnvOptions
     """Its options."""
     hosted: ClassVar[bool] = False

@@ -51,15 +51,16 @@ class BatchEnv(VectorEnv[Singles, Any, Any]):
 
     def __init__(
         self,
-        task: str,
+        task: str | type[Task],
         num_envs: int = 1,
         *,
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        """`task` is the name in the id; `options` are those of the task (`Options`), `max_episode_steps` is
-        another name of n_steps. Raises `InputError`, `UnknownNameError`, `HostError`."""
+        """`task` is the name in the id, or a task's class; `options` are those of the task (`Options`),
+        `max_episode_steps` is another name of n_steps. Raises `InputError`, `UnknownNameError`,
+        `HostError`."""
         if not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
             raise InputError(f"num_envs is {num_envs!r}; it must be a whole number, at least 1.")
         self.render_mode = render_mode
