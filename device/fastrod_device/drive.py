@@ -46,7 +46,7 @@ class Jitter:
 
 @final
 class DriveBus:
-    """All drives of a robot on one CAN bus.
+    """All EPOS4 drives of a robot on one CAN bus, as `Drives`.
 
     `connect`, then `enable`, then `exchange` once a cycle; its caller keeps the time (`Pacer`). `exchange`
     and the calls that cycle by themselves (`enable`, `disable`, `reset_faults`, `profile_move`, `homing`)
@@ -65,9 +65,11 @@ class DriveBus:
         *,
         clock: Clock,
         rate: float = 200.0,
+        bitrate: int = 1_000_000,
         eds: str | Path | None = None,
     ) -> None:
-        """`rate` [1/s], of cycles; its period is a whole number of ms. `eds`: the drives' own dictionary.
+        """`rate` [1/s], of cycles; its period is a whole number of ms. `bitrate` [bit/s], of an adapter.
+        `eds`: the drives' own dictionary.
 
         Raises `InputError`, also for the EDS file, or `DeviceError` for the bus.
         """
@@ -80,7 +82,7 @@ class DriveBus:
             )
         self._specs = Transmission(specs).specs
         dictionary = object_dictionary(eds)
-        self._line = BusLine(bus)
+        self._line = BusLine(bus, bitrate)
         self._cycle = Cycle(self._line, self._specs, clock, float(rate))
         self._configurator = Configurator(self._line, dictionary, self._specs, self._cycle.beat)
         self._closed = False

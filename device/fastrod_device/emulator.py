@@ -20,8 +20,8 @@ from fastrod.types import Floats
 from fastrod_device.camera import CameraFrame
 from fastrod_device.clock import Clock
 from fastrod_device.drawing import DrawnScene, Eye
+from fastrod_device.drives import emulated_drives
 from fastrod_device.hardware import Hardware
-from fastrod_device.nodes import EmulatedDrives
 from fastrod_device.plant import Plant
 from fastrod_device.plant_rod import COMPLIANCE
 from fastrod_device.seal import Seal
@@ -72,7 +72,7 @@ class Emulator:
         self._covered = -np.inf
         self.frozen = self.hidden = False
         """The camera repeats its last frame; the marker is covered."""
-        self.drives = EmulatedDrives(hardware.drives, bus, clock=clock, wires=self, eds=eds)
+        self.drives = emulated_drives(hardware, bus, clock=clock, wires=self, eds=eds)
 
     def move(self, t: float, pulled: Floats) -> Floats:
         """Wires wound by (n_drives,) [m] since power-on: their tensions [N]. The rod stands straight until

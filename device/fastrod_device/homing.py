@@ -23,7 +23,7 @@ from fastrod.model.robot import Robot
 from fastrod.model.routing import wire
 from fastrod.types import Floats
 from fastrod_device.clock import Clock
-from fastrod_device.drive import DriveBus
+from fastrod_device.drives import Drives
 from fastrod_device.errors import DeviceError
 from fastrod_device.faultcodes import ENABLED, in_words, state_in_words
 from fastrod_device.hardware import Hardware
@@ -50,7 +50,7 @@ _BEND, _TURNS, _TURN = 0.45, 4, 1.4  # rad at first, turns of the spiral, s each
 
 
 def home(
-    drives: DriveBus, hardware: Hardware, clock: Clock, look: Callable[[], MarkerSighting | None] | None
+    drives: Drives, hardware: Hardware, clock: Clock, look: Callable[[], MarkerSighting | None] | None
 ) -> tuple[Transmission, Robot]:
     """Do it; wires as drives with their zero, and the robot with the tensions that its wires have there.
 

@@ -33,7 +33,7 @@ _TICK = 5e-3  # s, of the thread that keeps time where nobody steps it
 _CHUNK = 0.02  # s; longer gaps are gone through in pieces
 
 
-class Wires(Protocol):
+class Tendons(Protocol):
     """What the wires are fastened to: the emulated robot."""
 
     def move(self, t: float, pulled: Floats) -> Floats:
@@ -58,7 +58,7 @@ class EmulatedDrives:
         bus: str | can.BusABC,
         *,
         clock: Clock,
-        wires: Wires,
+        wires: Tendons,
         rate: float = 200.0,
         seed: int = 0,
         torque_noise: float = 1.0,

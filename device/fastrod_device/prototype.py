@@ -23,7 +23,7 @@ from fastrod.types import Floats
 from fastrod_device import columns
 from fastrod_device.camera import CameraFrame, FrameSource
 from fastrod_device.clock import Clock, WallClock
-from fastrod_device.drive import DriveBus
+from fastrod_device.drives import Drives, open_drives
 from fastrod_device.errors import DeviceError, RefusedError
 from fastrod_device.expectation import Expectation
 from fastrod_device.faultcodes import in_words
@@ -76,9 +76,10 @@ class Prototype:
         journal: Journal | None = None,
         wall: Callable[[], float] | None = None,
     ) -> None:
-        """Drives on `bus` ("socketcan:can0"), pictures from `source` (None: no camera). `wall` tells the time
-        of day [s], by default the machine's, and nothing where time is stepped; it must run as the clock
-        does. Raises `DeviceError` where there is no such bus."""
+        """Drives on `bus` ("socketcan:can0", or what drives of the hardware's kind take), pictures from
+        `source` (None: no camera). `wall` tells the time of day [s], by default the machine's, and nothing
+        where time is stepped; it must run as the clock does. Raises `DeviceError` where there is no such
+        bus."""
         self.hardware, self.source = hardware, source
         self._robot = hardware.robot
         self.clock: Clock = WallClock() if clock is None else clock
@@ -86,7 +87,7 @@ class Prototype:
         self.transmission = Transmission(hardware.drives)
         self._wall = time.time if wall is None and not self.clock.stepped else wall
         with urgently(not self.clock.stepped):  # for the bus's thread
-            self.drives = DriveBus(hardware.drives, bus, clock=self.clock, rate=hardware.rate, eds=eds)
+            self.drives: Drives = open_drives(hardware, bus, clock=self.clock, eds=eds)
         nodes = [spec.node for spec in hardware.drives]
         self.supervisor = Supervisor(
             hardware.robot, hardware.limits, on_stop=self._on_stop, nodes=nodes, words=in_words
@@ -361,7 +362,7 @@ class Prototype:
         self.journal.close()
 
     def _enable(self) -> None:
-        self.drives.enable("csp")
+        self.drives.enable()
         newest = self.drives.newest
         with self._lock:
             self._set = self._wanted = self.transmission.dl(newest.position)
