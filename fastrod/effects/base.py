@@ -46,6 +46,19 @@ class Seam(Enum):
     """Between the true tip and the measured one: `tip_position`, `tip_rotation`, `points`."""
 
 
+class Signal(Enum):
+    """What an effect's residual is drawn against in a report."""
+
+    TIME = "time since the start of the run"
+    MOTION = "speed of the tip"
+    GRAVITY = "direction of gravity against the robot"
+    FORCE = "direction of the effect's own force, its parameters x, y, z, against the robot"
+    TIP = "place of the tip"
+    LAG = "the bend less its mean over the effect's `time_constant`"
+    LOOP = "commanded bend, as loops"
+    BEND = "commanded bend"
+
+
 @dataclass(frozen=True)
 class Parameter:
     """One number of an effect, or one per segment or per drive.
@@ -123,8 +136,7 @@ class Parameter:
 
 @runtime_checkable
 class Effect(Protocol):
-    """What `@effect` asks of a class. Optional: `order`, `excited_by`, `confounded_with`, `synonyms`, and
-    `sweep` (see `Operator`)."""
+    """What `@effect` requires of a class. Optional: the attributes of `Law`, and `sweep` (see `Operator`)."""
 
     seam: ClassVar[Seam]
     parameters: ClassVar[tuple[Parameter, ...]]
@@ -141,31 +153,56 @@ class Effect(Protocol):
         ...
 
 
-class Static:
-    """Base of the library's effects without memory."""
+class Law:
+    """What identification and its report know of an effect; each attribute may be left out."""
 
-    excited_by: ClassVar[str] = ""
-    confounded_with: ClassVar[tuple[str, ...]] = ()
-    synonyms: ClassVar[tuple[str, ...]] = ()
     order: ClassVar[float] = 50.0
     """Place among the effects of the same seam, from the motor to the camera."""
+    synonyms: ClassVar[tuple[str, ...]] = ()
+    """Other names of it."""
+    excited_by: ClassVar[str] = ""
+    """Motion that shows it."""
+    confounded_with: ClassVar[tuple[str, ...]] = ()
+    """Effects that look alike in many logs."""
+    separated_by: ClassVar[Mapping[str, str]] = {}
+    """The run that separates it from another effect, by the other's name; either of two may say it."""
+    signal: ClassVar[Signal | None] = None
+    """What its residual is drawn against; None: what its seam suggests."""
+    least_segments: ClassVar[int] = 1
+    """A robot with fewer segments cannot show it."""
+    frequent: ClassVar[bool] = False
+    """Met on many robots: where nothing was found, its bound comes first."""
+
+
+def trait(what: Effect, name: str) -> Any:
+    """An optional attribute of an effect, one of `Law`."""
+    return getattr(what, name, getattr(Law, name))
+
+
+def signal_of(what: Effect) -> Signal:
+    """What an effect's residual is drawn against."""
+    given: Signal | None = trait(what, "signal")
+    if given is not None:
+        return given
+    if what.seam in (Seam.LOAD, Seam.SENSING):
+        return Signal.GRAVITY if what.seam is Seam.LOAD else Signal.TIP
+    return Signal.LOOP if has_memory(what) else Signal.BEND
+
+
+class Static(Law):
+    """Base of the library's effects without memory."""
 
     def memory(self, n_robots: int, n_tendons: int) -> Floats:
         """None."""
         return np.empty((n_robots, 0))
 
 
-class Operator(ABC):
+class Operator(Law, ABC):
     """Base of the library's effects with a memory: operators on the wires' lengths over time.
 
     `sweep` is the law, over many steps at once: a simulator calls it with one step, identification with a
     whole log.
     """
-
-    excited_by: ClassVar[str] = ""
-    confounded_with: ClassVar[tuple[str, ...]] = ()
-    synonyms: ClassVar[tuple[str, ...]] = ()
-    order: ClassVar[float] = 50.0
 
     @abstractmethod
     def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Routing) -> Floats:
@@ -212,7 +249,7 @@ def effect(cls: _Class) -> _Class:
         raise EffectError(
             f"effect {name!r} has parameters {made.parameters!r}; give a tuple of Parameter, at least one."
         )
-    synonyms = tuple(getattr(cls, "synonyms", ()))
+    synonyms = tuple(trait(made, "synonyms"))
     for word in (name, *synonyms):
         taken = _REGISTRY.get(_SYNONYMS.get(word, word))
         if (
@@ -237,8 +274,7 @@ def effect_names() -> list[str]:
     """Names of all registered effects, from the motor to the camera."""
     load_library()
     return sorted(
-        _REGISTRY,
-        key=lambda name: (_REGISTRY[name].seam.value, getattr(_REGISTRY[name], "order", 50.0), name),
+        _REGISTRY, key=lambda name: (_REGISTRY[name].seam.value, trait(_REGISTRY[name], "order"), name)
     )
 
 

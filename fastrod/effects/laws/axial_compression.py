@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -16,8 +17,9 @@ class AxialCompression(Static):
     """The backbone shortens under the pull of its wires.
 
     Equation: l_k -> l_k (1 - e |theta_k|) + p c_k, with c_k what the wires of segment k pull in common, and p
-    the body's share of it Source: v_z = 1 - sum T / EA, Rucker and Webster 2011, with T from wires that pull
-    only Residual signature: along the tangent of the tip, even in the bend; in proportion to common pull
+    the body's share of it
+    Source: v_z = 1 - sum T / EA, Rucker and Webster 2011, with T from wires that pull only
+    Residual signature: along the tangent of the tip, even in the bend; in proportion to common pull
     """
 
     seam = Seam.ACTUATION
@@ -29,6 +31,10 @@ class AxialCompression(Static):
     excited_by = "large bends; all wires pulled together"
     confounded_with = ("marker_offset", "stiffening")
     synonyms = ("backbone_compression",)
+    separated_by: ClassVar[Mapping[str, str]] = {
+        "marker_offset": "bends to 50 degrees and more, or all wires pulled together",
+        "stiffening": "bends to 50 degrees and more, or all wires pulled together",
+    }
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         wiring = ports.wiring

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 import numpy as np
 
 from fastrod.effects.base import Operator, Parameter, Seam, effect
@@ -15,7 +18,8 @@ class Backlash(Operator):
     """Play of gears and of wires in their holes.
 
     Equation: p = max(l - w, min(l + w, p)); rounded corners are the mean over half widths w (1 - c), w, w (1
-    + c) Source: play operator (Visintin 1994); backlash of wire drives (Palli and Melchiorri)
+    + c)
+    Source: play operator (Visintin 1994); backlash of wire drives (Palli and Melchiorri)
     Residual signature: flat spot after every reversal, as wide at small as at large bends, the same at every
     speed
     """
@@ -37,6 +41,10 @@ class Backlash(Operator):
     excited_by = "slow reversals of many sizes"
     confounded_with = ("friction", "slack")
     synonyms = ("gear_play", "play")
+    separated_by: ClassVar[Mapping[str, str]] = {
+        "slack": "reversals away from neutral: backlash shows there, slack only around neutral"
+    }
+    frequent = True
 
     def memory(self, n_robots: int, n_tendons: int) -> Floats:
         return np.full((n_robots, 3 * n_tendons), np.nan)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -29,6 +30,8 @@ class Coupling(Static):
     excited_by = "one segment moved at a time, then both"
     confounded_with = ("encoder_offset",)
     synonyms = ("inter_segment_coupling",)
+    separated_by: ClassVar[Mapping[str, str]] = {"encoder_offset": "one segment moved alone, then the other"}
+    least_segments = 2
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         if ports.wiring.n_segments < 2:

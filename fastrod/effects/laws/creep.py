@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 import numpy as np
 
-from fastrod.effects.base import Operator, Parameter, Seam, effect
+from fastrod.effects.base import Operator, Parameter, Seam, Signal, effect
 from fastrod.kernels.operators import relaxation
 from fastrod.model.routing import Routing
 from fastrod.types import Floats
@@ -36,6 +39,12 @@ class Creep(Operator):
     excited_by = "steps and holds of several time constants, the same path at two speeds"
     confounded_with = ("friction", "time_drift", "dynamics")
     synonyms = ("relaxation", "viscoelasticity")
+    separated_by: ClassVar[Mapping[str, str]] = {
+        "dynamics": "holds of 4 s and more",
+        "time_drift": "the first block of motion once more at the end",
+    }
+    signal = Signal.LAG
+    frequent = True
 
     def memory(self, n_robots: int, n_tendons: int) -> Floats:
         return np.full((n_robots, 2 * n_tendons), np.nan)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fastrod.effects.base import Operator, Parameter, Seam, effect
+from fastrod.effects.base import Operator, Parameter, Seam, Signal, effect
 from fastrod.kernels.operators import second_order
 from fastrod.model.routing import Routing
 from fastrod.types import Floats
@@ -30,6 +30,7 @@ class Dynamics(Operator):
     excited_by = "steps and fast reversals, sampled at ten times the frequency"
     confounded_with = ("latency", "creep")
     synonyms = ("inertia", "oscillation")
+    signal = Signal.MOTION
 
     def memory(self, n_robots: int, n_tendons: int) -> Floats:
         return np.full((n_robots, 3 * n_tendons), np.nan)

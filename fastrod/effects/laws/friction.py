@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 import numpy as np
 
 from fastrod.effects.base import Operator, Parameter, Seam, effect
@@ -15,9 +18,11 @@ class Friction(Operator):
     """Dry friction of the wires along the backbone, growing with the bend as a capstan.
 
     Equation: l -> l - a (1 + k phi) mean z_j, z_j = clip(z_j + l' / r_j, -1, 1), phi the angle that the wire
-    wraps, r_j over r e^(-+s) Source: Iwan 1966, Prandtl and Ishlinskii (sliders in parallel); capstan, Kato
-    et al. 2015, Palli and Melchiorri Residual signature: sign of the last direction of motion, saturating
-    with travel; loops that grow with the bend, blind to speed
+    wraps, r_j over r e^(-+s)
+    Source: Iwan 1966, Prandtl and Ishlinskii (sliders in parallel); capstan, Kato et al. 2015, Palli and
+    Melchiorri
+    Residual signature: sign of the last direction of motion, saturating with travel; loops that grow with the
+    bend, blind to speed
     """
 
     seam = Seam.ACTUATION
@@ -42,6 +47,15 @@ class Friction(Operator):
     excited_by = "nested loops of decreasing amplitude at two speeds, with holds"
     confounded_with = ("backlash", "plastic_set", "creep")
     synonyms = ("hysteresis", "coulomb_friction", "capstan")
+    separated_by: ClassVar[Mapping[str, str]] = {
+        "backlash": "reversals of many sizes, slowly, the smallest below three gaps: backlash is as wide "
+        "at every bend",
+        "creep": "holds of 4 s and more after steps, and the same loop at two speeds: friction stays, "
+        "creep decays",
+        "plastic_set": "small loops after a large one: friction shows in each, a set only after a new "
+        "extreme",
+    }
+    frequent = True
 
     def memory(self, n_robots: int, n_tendons: int) -> Floats:
         return np.full((n_robots, (1 + SLIDERS) * n_tendons), np.nan)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 from fastrod.effects.base import Parameter, Seam, Static, effect
 from fastrod.effects.ports import EffectPorts
@@ -14,7 +15,8 @@ class Precurvature(Static):
     """The body is not straight without moments.
 
     Equation: u*(s) -> u*(s) + b (1 - 2 s / l) + u_0: a bow, which stiff wires do not straighten, and a
-    uniform part, which they do Source: paper eq. 1c, m = K (u - u*)
+    uniform part, which they do
+    Source: paper eq. 1c, m = K (u - u*)
     Residual signature: constant in the body frame: the tip moves and does not turn
     """
 
@@ -29,6 +31,12 @@ class Precurvature(Static):
     excited_by = "wide bends with tip orientation; the free shape with slack wires"
     confounded_with = ("frame_misalignment", "encoder_offset", "marker_offset")
     synonyms = ("pre_curvature", "initial_curvature")
+    separated_by: ClassVar[Mapping[str, str]] = {
+        "frame_misalignment": "the free shape with slack wires, or a marker at half length: the tip cannot "
+        "tell",
+        "encoder_offset": "wide bends with the tip's orientation measured",
+        "marker_offset": "wide bends with the tip's orientation measured",
+    }
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         n = ports.wiring.n_segments

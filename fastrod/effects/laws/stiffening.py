@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -28,6 +29,10 @@ class Stiffening(Static):
     excited_by = "bends of many amplitudes up to 60 degrees and more"
     confounded_with = ("drum_gain", "slack", "lens")
     synonyms = ("nonlinear_material",)
+    separated_by: ClassVar[Mapping[str, str]] = {
+        "drum_gain": "bends of many amplitudes, to 50 degrees and more",
+        "slack": "bends of many amplitudes, slowly through neutral",
+    }
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         bend = ports.bend()

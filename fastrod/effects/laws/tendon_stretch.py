@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 from fastrod.effects.base import Parameter, Seam, Static, effect
 from fastrod.effects.ports import EffectPorts
@@ -26,6 +27,10 @@ class TendonStretch(Static):
     excited_by = "a known load of 50 to 100 g on and off"
     confounded_with = ("drum_gain", "stiffness_taper")
     synonyms = ("tendon_compliance", "wire_stretch")
+    separated_by: ClassVar[Mapping[str, str]] = {
+        "drum_gain": "a known mass of 50 to 100 g at the tip on and off: only stretch gives way to it",
+        "stiffness_taper": "a known mass of 50 to 100 g at the tip on and off",
+    }
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         ports.compliance += ports.wiring.by_end(values)

@@ -6,6 +6,7 @@ import math
 import re
 from html import escape
 
+from fastrod.effects.base import get_effect, trait
 from fastrod.identification.report.markup import SHARES, listed, mark
 from fastrod.identification.report.result import Result
 from fastrod.identification.report.wording import (
@@ -152,10 +153,7 @@ def _found(result: Result) -> str:
         return f'<h3>What it looks like</h3><div class="card">{listed(result.patterns)}</div>'
     if result.verdict == "none":
         seen = [b for b in result.bounds if math.isfinite(b.value)]
-        first = sorted(
-            seen,
-            key=lambda b: b.name not in ("payload", "gravity", "friction", "backlash", "latency", "creep"),
-        )[:6]
+        first = sorted(seen, key=lambda b: not trait(get_effect(b.name), "frequent"))[:6]
         return (
             "<h3>What would have shown</h3><div "
             f'class="card">{listed(bound_sentence(b) for b in first)}</div>'

@@ -7,7 +7,7 @@ import inspect
 import math
 import re
 
-from fastrod.effects.base import get_effect
+from fastrod.effects.base import get_effect, trait
 from fastrod.identification.search.model_selection import Bound
 
 NOTHING = "–"
@@ -137,7 +137,7 @@ def bound_sentence(bound: Bound) -> str:
         stem, f"component along {stem}" if len(stem) == 1 else "size" if stem == "size" else words(stem)
     )
     if not math.isfinite(bound.value):
-        needs = str(getattr(get_effect(bound.name), "excited_by", ""))
+        needs = str(trait(get_effect(bound.name), "excited_by"))
         return f"this log cannot show {words(bound.name)}" + (f"; it takes {needs}" if needs else "")
     return f"{words(bound.name)}: {a(noun)} above {amount(bound.value, bound.unit)} would have shown"
 

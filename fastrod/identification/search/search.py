@@ -13,7 +13,7 @@ from itertools import product
 
 import numpy as np
 
-from fastrod.effects.base import effect_names, get_effect
+from fastrod.effects.base import effect_names, get_effect, trait
 from fastrod.identification.log.forward import LogSamples, PredictedRod
 from fastrod.identification.log.unknowns import Model
 from fastrod.identification.search.alternatives import AlternativePattern, foils
@@ -165,8 +165,7 @@ class Search:
                 0.0,
                 0.0,
                 0,
-                "this log does not excite it: "
-                + (getattr(get_effect(name), "excited_by", "") or "no response"),
+                "this log does not excite it: " + (trait(get_effect(name), "excited_by") or "no response"),
             )
         model = state.model.with_effect(name, drop=drop)
         fits = self._from_starts(state, model, name)
@@ -339,14 +338,13 @@ class Search:
 
     def names(self, state: ModelState) -> list[str]:
         """Effects that may be tried."""
-        single = state.model.wiring.n_segments < 2
-        driven = state.model.wiring.n_tendons > 0
+        n_segments, driven = state.model.wiring.n_segments, state.model.wiring.n_tendons > 0
         return [
             name
             for name in effect_names()
             if name not in state.model.effects
             and name not in self.excluded
-            and not (name == "coupling" and single)
+            and trait(get_effect(name), "least_segments") <= n_segments
             and (driven or get_effect(name).seam.name != "ACTUATION")
         ]
 
