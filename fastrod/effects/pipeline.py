@@ -143,32 +143,37 @@ class EffectPipeline:
         return close_ports(opened, ports, params)
 
     def slopes(self, ports: Ports, params: Params, state: Any, dt: float, n_steps: int) -> Floats:
-        """(n_robots, n, n) d(what the rod feels) / d(what is commanded), of tendon lengths [m] then
-        extensions [m], where the robots stand; memories stay. `ports` are those before the effects."""
+        """(n_robots, n, n) d(what the rod feels) / d(what is commanded), of tendon lengths [m], or tensions
+        [N] where these are commanded, then extensions [m], where the robots stand; memories stay. `ports` are
+        those before the effects."""
 
-        def felt(length: Floats, extension: Floats) -> Floats:
+        def felt(driven: Floats, extension: Floats) -> Floats:
             links = [link._replace(memory=link.memory.copy()) for link in self.links]
-            opened = self._open(ports._replace(tendon_length=length, extension=extension), params, n_steps)
+            given = {"tendon_length": driven, "tension": driven, "extension": extension}
+            opened = self._open(ports._replace(**given), params, n_steps)
             self._apply(opened, state, 0.0 * dt, links)
-            return np.concatenate([opened.tendon_length, opened.extension], axis=1)
+            driven = np.where(self._pulled, opened.tension, opened.tendon_length)
+            return np.concatenate([driven, opened.extension], axis=1)
 
         n_tendons = self.wiring.n_tendons
-        delta = 1e-7 * float(self.wiring.length.sum())
+        step = 1e-7 * float(self.wiring.length.sum())
+        driven = np.where(self._pulled, ports.tension, ports.tendon_length)
         inputs = np.concatenate(
-            [np.broadcast_to(a, (self.n_robots, a.shape[1])) for a in (ports.tendon_length, ports.extension)],
-            axis=1,
+            [np.broadcast_to(a, (self.n_robots, a.shape[1])) for a in (driven, ports.extension)], axis=1
         )
         slopes = np.empty((self.n_robots, inputs.shape[1], inputs.shape[1]))
         for j in range(inputs.shape[1]):
-            if j < n_tendons and self._pulled[j]:  # a tension: no effect changes it
-                slopes[:, :, j] = np.arange(inputs.shape[1]) == j
-                continue
-            ends = []
+            pulled = j < n_tendons and self._pulled[j]
+            delta = 1e-4 * float(params.tension_scale.min()) if pulled else step
+            ends, unchanged = [], True
             for sign in (1.0, -1.0):
                 moved = inputs.copy()
                 moved[:, j] += sign * delta
                 ends.append(felt(moved[:, :n_tendons], moved[:, n_tendons:]))
+                unchanged &= np.array_equal(ends[-1][:, j], moved[:, j], equal_nan=True)
             slopes[:, :, j] = (ends[0] - ends[1]) / (2.0 * delta)
+            if pulled and unchanged:  # exactly, where no effect changes a tension
+                slopes[:, j, j] = 1.0
         return slopes
 
     def sense(
@@ -198,6 +203,8 @@ class EffectPipeline:
         opened.tendon_length[:, self._pulled] = self.rest_length[self._pulled]
         for given in (
             opened.tendon_length,
+            opened.tension,
+            opened.base_pose,
             opened.extension,
             opened.tip_force,
             opened.tip_moment,

@@ -7,7 +7,24 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fastrod.model.routing import Routing
+from fastrod.rotation import product, quaternion_from_vector
 from fastrod.types import Floats, Params, Ports
+
+CHANGEABLE = (
+    "tendon_length",
+    "tension",
+    "base_pose",
+    "extension",
+    "offset",
+    "compliance",
+    "pretension",
+    "stiffness",
+    "precurvature",
+    "tip_force",
+    "tip_moment",
+    "line_force",
+)
+"""Ports that an effect before the camera may change."""
 
 
 def _none() -> Floats:
@@ -37,6 +54,14 @@ class EffectPorts:
     """(n, n_segments, n_tendons, 2) wire positions in the material frame [m]."""
     compliance: Floats
     """(n, n_tendons) [m/N]."""
+    pretension: Floats
+    """(n, n_tendons) of tendons at their rest length [N]."""
+    tension: Floats
+    """(n, n_tendons) that is commanded where a segment is driven by tension [N]; nothing reads the others."""
+    base_pose: Floats
+    """(n, 7) position [m] and unit quaternion w x y z, world_from_base; change it through `move_base`.
+    `measure` goes by the base as it then stands, as a camera on it does; `base_rotation` stays that of the
+    command."""
     stiffness: Floats
     """(n, n_segments, n_k, 3) diag K, n_k 1 or 2 n_steps + 1 [N m^2]; see `resolve`."""
     precurvature: Floats
@@ -92,6 +117,12 @@ class EffectPorts:
         """
         self.shift_bend(self.wiring.bend(change))
 
+    def move_base(self, shift: Floats, rotation: Floats) -> None:
+        """Move the base by (n, 3) [m] and about itself by rotation vectors (n, 3) [rad], both world: a mount
+        that gives."""
+        self.base_pose[:, :3] += shift
+        self.base_pose[:, 3:] = product(quaternion_from_vector(rotation), self.base_pose[:, 3:])
+
     def resolve(self) -> None:
         """Give `stiffness` and `precurvature` a value at every half step, n_k = 2 n_steps + 1: the kernel
         wants both alike."""
@@ -137,6 +168,9 @@ def open_ports(
         extension=_rows(ports.extension, n),
         offset=_rows(params.offset, n),
         compliance=_rows(params.compliance, n),
+        pretension=_rows(params.pretension, n),
+        tension=_rows(ports.tension, n),
+        base_pose=_rows(ports.base_pose, n),
         stiffness=_rows(ports.stiffness, n),
         precurvature=_rows(ports.precurvature, n),
         tip_force=_rows(ports.tip_force, n),
@@ -151,6 +185,8 @@ def close_ports(opened: EffectPorts, ports: Ports, params: Params) -> tuple[Port
     return (
         ports._replace(
             tendon_length=opened.tendon_length,
+            tension=opened.tension,
+            base_pose=opened.base_pose,
             extension=opened.extension,
             stiffness=np.ascontiguousarray(opened.stiffness),
             precurvature=np.ascontiguousarray(opened.precurvature),
@@ -158,5 +194,5 @@ def close_ports(opened: EffectPorts, ports: Ports, params: Params) -> tuple[Port
             tip_moment=opened.tip_moment,
             line_force=np.ascontiguousarray(opened.line_force),
         ),
-        params._replace(offset=opened.offset, compliance=opened.compliance),
+        params._replace(offset=opened.offset, compliance=opened.compliance, pretension=opened.pretension),
     )

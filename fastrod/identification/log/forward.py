@@ -207,7 +207,7 @@ class PreparedLog:
         """Ports with these wire lengths and nothing else."""
         bare = {
             name: getattr(self.ports, name)[:1]
-            for name in ("extension", "tip_force", "tip_moment", "line_force")
+            for name in ("tension", "base_pose", "extension", "tip_force", "tip_moment", "line_force")
         }
         return self.ports._replace(tendon_length=length, **bare)
 

@@ -13,6 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 from fastrod.effects.base import Seam, get_effect, has_memory
+from fastrod.effects.ports import CHANGEABLE
 from fastrod.identification.log.forward import LogSamples, PredictedPose, PredictedRod, bench, chain_of
 from fastrod.identification.log.unknowns import Model, Unknown, effect_unknowns
 from fastrod.identification.search.solve import Fit, minimise
@@ -159,15 +160,8 @@ class LinearisedModel:
         )[name]
         before = {
             key: getattr(opened, key).copy()
-            for key in (
-                "extension",
-                "offset",
-                "compliance",
-                "stiffness",
-                "precurvature",
-                "tip_moment",
-                "line_force",
-            )
+            for key in CHANGEABLE
+            if key not in ("tendon_length", "tip_force")
         }
         what.apply(
             np.broadcast_to(values, (len(opened), len(values))), np.empty((len(opened), 0)), opened, None, 0.0
