@@ -85,7 +85,7 @@ def wild(result: Result) -> Result:
         base_parameters=base,
         remaining=ResidualStructure(0.1, 0.05, 0.02, 0.01, 3.0),
         remaining_kind="static",
-        remaining_share=0.12,
+        remaining_fraction=0.12,
         patterns=["it <jumps>"],
         test=replace(result.test, interval=(NAN, NAN)),
         advice=["turn <it>"],

@@ -431,10 +431,10 @@ def _shapes(log: RunLog, robot: Robot, frames: Ints) -> PlayedShapes:
         position, rotation, arclength = state.position, state.rotation, state.arclength
     else:
         model = known_model(robot)
-        place = forward.bench(forward.sample(log).on(frames), robot, model.wiring)
-        chain = forward.chain_of(model, np.zeros(0))
+        place = forward.prepare_log(forward.sample(log).on(frames), robot, model.wiring)
+        effects = forward.effects_at(model, np.zeros(0))
         sim = Simulator(bare, n_robots=len(frames), points_per_segment=forward.N_STEPS)
-        state = sim.settle_ports(*place.kernel(place.drive(chain)), forward.TOLERANCE * robot.length)
+        state = sim.settle_ports(*place.kernel(place.drive(effects)), forward.TOLERANCE * robot.length)
         arclength = _finer(state.arclength, robot.n_segments)
         fine = sim.shape(arclength)
         position, rotation = fine.position, fine.rotation
@@ -443,7 +443,7 @@ def _shapes(log: RunLog, robot: Robot, frames: Ints) -> PlayedShapes:
     rotation = into[:, None] @ rotation
     tip = position[:, -1]
     if robot.effects:
-        seen = place.see(forward.PredictedPose(tip, rotation[:, -1], position, state.ok), chain)
+        seen = place.see(forward.PredictedPose(tip, rotation[:, -1], position, state.ok), effects)
         rotated = seen.rotation @ np.swapaxes(rotation[:, -1], 1, 2)
         tip, position, rotation = seen.position, seen.points, rotated[:, None] @ rotation
     for array in (tip, position, rotation):

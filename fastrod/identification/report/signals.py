@@ -215,13 +215,17 @@ class Signals:
         force = force / np.where(size > 0.0, size, np.nan)
         chord = self.tip / np.linalg.norm(self.tip, axis=1, keepdims=True)
         across = force - (force * chord).sum(1, keepdims=True) * chord
-        share = np.linalg.norm(across, axis=1)
-        unit = across / np.where(share > 0.02, share, np.nan)[:, None]
-        return self._best([(signal, share)], [(residual, unit)])
+        fraction = np.linalg.norm(across, axis=1)
+        unit = across / np.where(fraction > 0.02, fraction, np.nan)[:, None]
+        return self._best([(signal, fraction)], [(residual, unit)])
 
     def _gravity(self) -> Floats:
-        robot, turn = self.result.robot, self.log.base_quaternion
-        quaternion = np.array([robot.base_quaternion]) if turn is None else np.asarray(turn)
+        robot, quaternion_of_base = self.result.robot, self.log.base_quaternion
+        quaternion = (
+            np.array([robot.base_quaternion])
+            if quaternion_of_base is None
+            else np.asarray(quaternion_of_base)
+        )
         return np.asarray(np.einsum("nji,j->ni", matrix_from_quaternion(quaternion), np.array(robot.gravity)))
 
     def _follows(self) -> Flags:
@@ -264,7 +268,7 @@ def _turned(bend: Floats, angle: float) -> tuple[Floats, Floats]:
 def _low_pass(values: Floats, step: Floats, follows: Flags, time_constant: float) -> Floats:
     """First-order lag of values (n, 2), begun anew where a row does not follow the one before."""
     out = values.copy()
-    share = 1.0 - np.exp(-np.maximum(step, 0.0) / time_constant)
+    fraction = 1.0 - np.exp(-np.maximum(step, 0.0) / time_constant)
     for i in np.flatnonzero(follows):
-        out[i] = out[i - 1] + share[i] * (values[i] - out[i - 1])
+        out[i] = out[i - 1] + fraction[i] * (values[i] - out[i - 1])
     return out
