@@ -169,7 +169,7 @@ def _excite(arguments: argparse.Namespace) -> int:
             justify="right" if name in ("from", "to") else "left",
         )
     said: set[str] = set()
-    for section in made.parts:
+    for section in made.phases:
         grid.add_row(
             f"{section.start:.1f}",
             f"{section.end:.1f}",
