@@ -42,7 +42,7 @@ def grounds(**changed: Any) -> VerdictGrounds:
         "after": BASE,
         "floor": FLOOR,
         "left_out": 0.0,
-        "audit": CLEAN,
+        "structure": CLEAN,
         "steps": [],
         "found": [],
     }
@@ -79,7 +79,7 @@ def test_a_residual_of_noise_is_none() -> None:
 
 
 @pytest.mark.parametrize(
-    ("audit", "kind"),
+    ("structure", "kind"),
     [
         (ResidualStructure(0.07, 0.01, 0.0, 0.0, 5.0), "static"),
         (ResidualStructure(0.01, 0.07, 0.0, 0.0, 5.0), "memory"),
@@ -100,7 +100,7 @@ def test_structure_below_six_percent_is_none() -> None:
     assert grounds(structure=ResidualStructure(0.03, 0.02, 0.011, 0.0, 5.0)).verdict == "not_in_library"
 
 
-@pytest.mark.parametrize(("foil", "kind"), [(JUMP, "drift"), (SWAY, "unknown"), (RIPPLE, "static")])
+@pytest.mark.parametrize(("alternative", "kind"), [(JUMP, "drift"), (SWAY, "unknown"), (RIPPLE, "static")])
 def test_a_foil_alone_is_not_in_the_library_and_gives_its_kind(
     alternative: AlternativePattern, kind: str
 ) -> None:
