@@ -40,7 +40,8 @@ def tips(force: Array) -> Array:
 
     The elastica by elliptic integrals of parameter m = (1 + sin b)/2, b the tip's angle, sin^2 phi = 1/(2
     m): sqrt(F l^2/EI) = K(m) - F(phi, m), and the tip follows from E. No step, no iteration but the
-    bisection of b. Source: Bisshopp and Drucker, Large deflection of cantilever beams, Q. Appl. Math.
+    bisection of b.
+    Source: Bisshopp and Drucker, Large deflection of cantilever beams, Q. Appl. Math.
     3(3), 1945.
     """
     from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc

@@ -94,7 +94,8 @@ def plan(
     `start` (n_tendons,) tendon lengths where the robot stands [m], None for straight; from there it takes
     `approach` seconds to the first row of the path, at rest at both ends; with 0 s it begins on the path.
     `limit` [m] is the largest displacement (`SegmentActions`), None for a bend of 180 degrees; extensions
-    stay within each segment's range. Method: the whole sequence is simulated; then every displacement is
+    stay within each segment's range.
+    Method: the whole sequence is simulated; then every displacement is
     corrected by `gain` times what, on the robot without effects of actuation, leads from the measured tip to
     the path, and so on, until no correction is above `tolerance` [m], for at most `rollouts` simulations. A
     correction that made it worse (one that rings) is taken back, and made smoother in time; the best is kept.

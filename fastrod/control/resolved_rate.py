@@ -24,7 +24,8 @@ class ResolvedRate:
 
     J# is the pseudo-inverse of least sum of weight q_dot^2. Near a singularity, where the smallest singular
     value s of the weighted Jacobian is below `threshold`, it is damped by l^2 = (1 - (s / threshold)^2)
-    damping^2: s / (s^2 + l^2) in the place of 1 / s. Source: Whitney 1969 (resolved rates); Nakamura and
+    damping^2: s / (s^2 + l^2) in the place of 1 / s.
+    Source: Whitney 1969 (resolved rates); Nakamura and
     Hanafusa 1986, Maciejewski and Klein 1988 (damping near a singularity alone); Flacco, De Luca and Khatib
     2012 (saturation in the null space).
 

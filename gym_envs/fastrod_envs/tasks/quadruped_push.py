@@ -48,7 +48,8 @@ class QuadrupedPush(PushTask):
 
     Reward: exp(-300 d^2), and 0.5 once the neck has touched the cube in this episode; d is the distance of
     the cube's middle from its goal in the plane [m]. Success: d below 20 mm. An episode has 40 steps of 0.1 s
-    and does not end before. Baseline: the tip goes straight along the way that the cube has to go, by damped
+    and does not end before.
+    Baseline: the tip goes straight along the way that the cube has to go, by damped
     resolved rates with the simulator's Jacobian. The cube stays on the bar; it ends within a few millimetres.
 
     What is left out: the trunk stands still (a push of 0.12 N does not move 12 kg), so the legs are drawn
