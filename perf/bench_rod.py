@@ -10,16 +10,21 @@ from functools import partial
 
 import numpy as np
 
+import appendix_j
 import cases
 import flops
-import rod_methods
+import peer_elastica
+import peer_fastrod
 import rod_solves
+from bench_peers import timed
 from cases import Case, TipError
 from fastrod import Simulator
 from floor import divisions, fused_multiply_adds
 from fresh import memory_section, start_section
 from report import Measurement, Row, Section, bench, goal, note_progress, table, thread_counts
 
+FORCE, WITHIN = 0.2, 1e-3
+"""Tip force across the cantilever [N], and allowed tip error as a fraction of the tip's deflection."""
 _STEPS = 10  # of a round, of which the best counts
 
 
@@ -169,20 +174,47 @@ def arithmetic_section(rows: list[Timed], n_robots: int) -> Section:
     )
 
 
+def cantilever_section() -> Section:
+    """PyElastica's dynamic relaxation and one `settle`; `fastrod bench peers` has error against time."""
+    note_progress("cantilever")
+    force, rows, notes = np.array([FORCE]), list[Row](), list[str]()
+    deflection = float(np.linalg.norm(appendix_j.tips(force)[0] - [0.0, appendix_j.LENGTH]))
+    for peer in (peer_fastrod.SETTLE, peer_elastica.PEER):
+        if sentence := peer.missing():
+            notes.append(sentence)
+            continue
+        for rung in peer.rungs:
+            point = timed(peer, rung, force)
+            if point.error <= WITHIN * deflection:
+                break
+        row: Row = {"solver": peer.name, "setting": rung.label, "ms": 1e3 * point.time}
+        ratio = 1e3 * point.time / (rows[0] if rows else row)["ms"]
+        rows.append(row | {"error_m": point.error, "ratio": ratio, **goal(point.error, WITHIN * deflection)})
+    return table(
+        "cantilever",
+        "A passive cantilever (Appendix J) beside PyElastica",
+        "solver | setting | ms:.2f CPU ms | error_m:.1e tip error~[m] | target:.1e | met | ratio:,.0f ratio "
+        "to~fastrod",
+        rows,
+        f"Passive rod of 0.07 m, tip force {FORCE} N across it, from the straight rod, warm: each at its "
+        f"coarsest setting whose tip is within {WITHIN:.1%} of the deflection.",
+        *notes,
+    )
+
+
 def measure(options: argparse.Namespace) -> list[Section]:
     """All tables, one after the other in this process (memory and start: in processes of their own)."""
     quick = options.quick
     n_robots = 256 if quick else 8192
-    timed = passes(n_robots, rounds=1 if quick else 3)
+    rows = passes(n_robots, rounds=1 if quick else 3)
     paths = [rod_solves.make_path(model) for model in ("paper", "full")]
     return [
-        time_section(timed, n_robots),
-        lag_section(timed),
-        arithmetic_section(timed, n_robots),
+        time_section(rows, n_robots),
+        lag_section(rows),
+        arithmetic_section(rows, n_robots),
         rod_solves.solve_section(paths, 512 if quick else n_robots, quick),
         rod_solves.path_section(paths, 10 if quick else 60),
-        rod_methods.integrator_section(512 if quick else n_robots, quick),
-        rod_methods.cantilever_section(quick),
+        cantilever_section(),
         memory_section(5_000 if quick else 100_000),
         start_section(quick),
     ]

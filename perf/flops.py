@@ -58,69 +58,54 @@ Parts = dict[str, Tally]
 """Operations by kernel file."""
 
 
-class Counted:
+class Counted(float):
     """A number that notes in `now`, by the fields of `Tally`, what is done with it."""
 
-    __slots__ = ("product", "value")
+    product = False
+    """Whether it is a product, which an addition would fuse with."""
     __array_ufunc__ = None  # a numpy number on the left leaves the operation to this class
     now = [0.0] * 5
 
-    def __init__(self, value: float, product: bool = False) -> None:
-        self.value = float(value)
-        self.product = product
-
-    def __float__(self) -> float:
-        return self.value
+    def _done(self, operation: int, value: float, times: int = 1) -> Counted:
+        Counted.now[operation] += times
+        made = Counted(value)
+        made.product = operation == 1
+        return made
 
     def _sum(self, other: Any, value: float) -> Counted:
-        Counted.now[0] += 1
         Counted.now[4] += self.product or (isinstance(other, Counted) and other.product)
-        return Counted(value)
+        return self._done(0, value)
 
     def __add__(self, other: Any) -> Counted:
-        return self._sum(other, self.value + float(other))
+        return self._sum(other, float(self) + float(other))
 
     def __sub__(self, other: Any) -> Counted:
-        return self._sum(other, self.value - float(other))
+        return self._sum(other, float(self) - float(other))
 
     def __rsub__(self, other: Any) -> Counted:
-        return self._sum(other, float(other) - self.value)
+        return self._sum(other, float(other) - float(self))
 
     def __mul__(self, other: Any) -> Counted:
-        Counted.now[1] += 1
-        return Counted(self.value * float(other), product=True)
+        return self._done(1, float(self) * float(other))
 
     def __truediv__(self, other: Any) -> Counted:
-        Counted.now[2] += 1
-        return Counted(self.value / float(other))
+        return self._done(2, float(self) / float(other))
 
     def __rtruediv__(self, other: Any) -> Counted:
-        return Counted(float(other)) / self
+        return self._done(2, float(other) / float(self))
 
     def __pow__(self, power: int) -> Counted:
-        Counted.now[1] += power - 1
-        return Counted(self.value**power, product=True)
+        return self._done(1, float(self) ** power, power - 1)
 
     def __neg__(self) -> Counted:
-        return Counted(-self.value, self.product)
+        made = Counted(-float(self))
+        made.product = self.product
+        return made
 
     def __abs__(self) -> Counted:
-        return Counted(abs(self.value))
+        return Counted(abs(float(self)))
 
-    def __lt__(self, other: Any) -> bool:
-        return self.value < float(other)
-
-    def __le__(self, other: Any) -> bool:
-        return self.value <= float(other)
-
-    def __gt__(self, other: Any) -> bool:
-        return self.value > float(other)
-
-    def __ge__(self, other: Any) -> bool:
-        return self.value >= float(other)
-
-    __radd__ = __add__
-    __rmul__ = __mul__
+    __radd__, __rmul__ = __add__, __mul__
 
 
 class _Math:
@@ -128,8 +113,7 @@ class _Math:
 
     @staticmethod
     def sqrt(x: Any) -> Counted:
-        Counted.now[3] += 1
-        return Counted(math.sqrt(float(x)))
+        return Counted()._done(3, math.sqrt(float(x)))
 
     def __getattr__(self, name: str) -> Any:
         return getattr(math, name)

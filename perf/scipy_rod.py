@@ -131,7 +131,7 @@ class Shooter:
         self.unit = np.full(2, 1.0 / length) if self.paper else full
         self.tolerance = self.atol / length ** np.repeat([0, 1, 2, 0], [3, 9, 3, N_TENDONS])
         self.x = np.zeros(len(self.unit))
-        self.passes = self.slopes = 0
+        self.passes = 0
 
     def right_hand_side(self, load: Sequence[float], tendons: Tendons) -> Callable[[float, Array], Any]:
         """f(s, y) as `solve_ivp` wants it."""
@@ -156,19 +156,13 @@ class Shooter:
         return state, tendons
 
     def march(self, x: Array, load: Sequence[float]) -> Array:
-        """State at the tip for the unknowns `x`: one forward pass; `odeint` is an integrator here too."""
-        from scipy.integrate import odeint, solve_ivp
+        """State at the tip for the unknowns `x`: one forward pass."""
+        from scipy.integrate import solve_ivp
 
         self.passes += 1
         state, tendons = self.start(x)
         slope, tolerances = self.right_hand_side(load, tendons), {"rtol": self.rtol, "atol": self.tolerance}
-        if self.integrator == "odeint":
-            ends = [0.0, self.rod[0]]
-            states, notes = odeint(slope, state, ends, tfirst=True, full_output=True, **tolerances)
-            self.slopes += int(notes["nfe"][-1])
-            return np.asarray(states[-1])
         found: Any = solve_ivp(slope, (0.0, self.rod[0]), state, method=self.integrator, **tolerances)
-        self.slopes += found.nfev
         return np.asarray(found.y[:, -1])
 
     def moment(self, u: Sequence[float], tendons: Tendons) -> tuple[Array, Array]:
