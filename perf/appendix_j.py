@@ -75,7 +75,7 @@ class Rung:
     """Solves all forces in one call, where the peer has such a thing of its own."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Peer:
     """One method to find the tip of the rod."""
 

@@ -131,7 +131,7 @@ def score(kind: str, row: dict[str, Any]) -> bool:
     true, named, verdict = row["true"], row["named"], row["verdict"]
     sets = [{name, *others} for name, others in zip(named, row["classes"], strict=True)]
     left = (row["after"] - row["floor"]) / max(row["before"] - row["floor"], 1e-9)
-    first = bool(named) and named[0] == true[0]
+    first = bool(named) and named[:1] == true[:1]
     if kind in ("none", "outside"):
         return bool(verdict == {"none": "none", "outside": "not_in_library"}[kind])
     if kind == "two":

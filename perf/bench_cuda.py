@@ -120,7 +120,7 @@ def time_rows(case: Case, n: int, points: int) -> list[Row]:
         error = np.abs(timed.state.tip_position - two.state.tip_position)[two.state.ok]
         rows.append(
             {"robot": case.key, "robots": n, "points": points, "device": f"{device} {threads or ''}".strip()}
-            | {f"{part}_ms": 1e3 * getattr(timed, part) for part in ("step", "kernel", "send", "fetch")}
+            | {f"{stage}_ms": 1e3 * getattr(timed, stage) for stage in ("step", "kernel", "send", "fetch")}
             | {"sent_bytes": timed.sent / n, "fetched_bytes": timed.fetched / n}
             | {"step_ratio": two.step / timed.step, "kernel_ratio": ratio}
             | (goal(ratio, _TARGET, least=True) if device == "cuda" else {})

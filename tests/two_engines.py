@@ -1,5 +1,5 @@
-"""One rod on one UR5 in PyBullet and in MuJoCo: where its tip is and what the flange feels, at rest, hanging
-and pushed."""
+"""One rod on one UR5 in PyBullet and in MuJoCo: its tip and the wrench on the flange, at rest, hanging and
+pushed."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Result(NamedTuple):
 
 
 def carried() -> tuple[Any, dict[str, Any]]:
-    """The rod, and its wires as they bend it toward the block."""
+    """The rod, and its tendons as they bend it toward the block."""
     from fastrod.model.segment_actions import SegmentActions
     from fastrod_scenes.ur5.carried import OFFSET, soft_robot
 
@@ -150,11 +150,11 @@ def apart(a: Result, b: Result) -> dict[str, float]:
     """How far two engines are apart: tips by the rod's length, forces and moments by the larger."""
     robot = carried()[0]
 
-    def part(u: Any, v: Any) -> float:
+    def relative(u: Any, v: Any) -> float:
         return float(np.linalg.norm(u - v) / max(np.linalg.norm(u), np.linalg.norm(v)))
 
     return {
         "tip": float(np.linalg.norm(a.tip - b.tip)) / robot.length,
-        "force": part(a.wrench[:3], b.wrench[:3]),
-        "moment": part(a.wrench[3:], b.wrench[3:]),
+        "force": relative(a.wrench[:3], b.wrench[:3]),
+        "moment": relative(a.wrench[3:], b.wrench[3:]),
     }
