@@ -66,7 +66,7 @@ class Spacers:
 
 
 @final
-class Tendons:
+class TendonLines:
     """Lines of tendons at their offsets from the backbone, one for each segment that a tendon crosses."""
 
     def __init__(

@@ -15,7 +15,7 @@ from fastrod.types import Flags, Floats
 from fastrod_viewer import palette
 from fastrod_viewer.arrows import arrows, frames
 from fastrod_viewer.curves import CurveSamples, Nodes, Sampler, along, nodes, pieces
-from fastrod_viewer.fittings import Spacers, Tendons, smallest_offset, warned
+from fastrod_viewer.fittings import Spacers, TendonLines, smallest_offset, warned
 from fastrod_viewer.options import FINE, ViewOptions
 from fastrod_viewer.palette import Color, Colors, Range
 from fastrod_viewer.shapes import Instances, instances
@@ -83,7 +83,7 @@ class Picture:
         )
         self._tendons: Tendons | None = None
         if few and options.tendons and (by_tension or not skin):
-            self._tendons = Tendons(
+            self._tendons = TendonLines(
                 robot, params, self.body_radius if skin else None, n_steps, max(8, self.pieces // 4)
             )
         # intervals that end where another segment begins

@@ -274,8 +274,8 @@ class _Inside(Cell):
 
     def scenery(self) -> Backdrop:
         solids = []
-        for part in self.box.parts():
-            c, s = math.cos(part.turn), math.sin(part.turn)
+        for part in self.box.pieces():
+            c, s = math.cos(part.angle), math.sin(part.angle)
             turn = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
             solids.append(solid_box(part.middle, part.half, part.color[:3], turn, 0.2))
         solids += [solid_box(self.box.cube_at(k), [0.5 * self.box.cube] * 3, COLORS[k]) for k in self.cubes]
