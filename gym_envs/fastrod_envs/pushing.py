@@ -325,7 +325,7 @@ class PushTask(HostedTask):
     options_class: ClassVar[type[EnvOptions]] = PushOptions
     n_steps: ClassVar[int] = 40
     n_draws: ClassVar[int] = 5
-    accuracy: ClassVar[float] = ACCURACY
+    accuracy: float = ACCURACY
     duration: ClassVar[float] = 4.0
 
     def __init__(self, n_envs: int, options: EnvOptions, course: Course) -> None:

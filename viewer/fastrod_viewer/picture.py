@@ -81,7 +81,7 @@ class Picture:
             if few and options.spacers and not skin
             else None
         )
-        self._tendons: Tendons | None = None
+        self._tendons: TendonLines | None = None
         if few and options.tendons and (by_tension or not skin):
             self._tendons = TendonLines(
                 robot, params, self.body_radius if skin else None, n_steps, max(8, self.pieces // 4)

@@ -88,7 +88,7 @@ class BoxExplore(HostedTask):
     name = "BoxExplore"
     n_steps: ClassVar[int] = 40
     n_draws: ClassVar[int] = 14
-    accuracy: ClassVar[float] = 0.01
+    accuracy: float = 0.01
     duration: ClassVar[float] = 2.0
     options_class: ClassVar[type[EnvOptions]] = BoxExploreOptions
 

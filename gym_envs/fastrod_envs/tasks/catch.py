@@ -75,7 +75,7 @@ class Catch(RodTask):
     name = "Catch"
     n_steps: ClassVar[int] = 40
     n_draws: ClassVar[int] = 12
-    accuracy: ClassVar[float] = 0.01
+    accuracy: float = 0.01
     points_per_segment = 4
     loaded = True
     dt = 0.05

@@ -78,7 +78,7 @@ class DualArm(HostedTask):
     name = "DualArm"
     n_steps: ClassVar[int] = 40
     n_draws: ClassVar[int] = 11
-    accuracy: ClassVar[float] = 0.01
+    accuracy: float = 0.01
     duration: ClassVar[float] = 4.0
 
     def __init__(self, n_envs: int, options: EnvOptions) -> None:

@@ -95,7 +95,7 @@ class PickPlace(HostedTask):
     name = "PickPlace"
     n_steps: ClassVar[int] = 60
     n_draws: ClassVar[int] = 5
-    accuracy: ClassVar[float] = 0.02
+    accuracy: float = 0.02
     duration: ClassVar[float] = 6.0
     options_class: ClassVar[type[EnvOptions]] = PickPlaceOptions
 

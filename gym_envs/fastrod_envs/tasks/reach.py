@@ -81,7 +81,7 @@ class ReachTask(RodTask):
 
     n_steps: ClassVar[int] = 40
     n_draws: ClassVar[int] = 3
-    accuracy: ClassVar[float] = 0.01
+    accuracy: float = 0.01
     options_class: ClassVar[type[EnvOptions]] = ReachRewardOptions
     points_per_segment = 2
     hold_gain = 1e-4
@@ -246,7 +246,7 @@ def places(robot: Robot, driven: Ints, limit: Floats, home: Floats) -> Floats:
     action[0, driven] = home
     middle = limit.mean(1)
     edges = middle + _HALF * (limit.T - middle)
-    action[1:, driven] = np.random.default_rng(0).uniform(*edges, (_N_GOALS, len(driven)))
+    action[1:, driven] = np.random.default_rng(0).uniform(edges[0], edges[1], (_N_GOALS, len(driven)))
     given = SegmentActions(plain).inputs(action)
     state = Simulator(plain, n_robots=len(action), points_per_segment=4, outputs="tip").settle(**given)
     tips = state.tip_position[1:][state.ok[1:]]

@@ -144,9 +144,9 @@ class Track(RodTask):
     name = "Track"
     n_steps: ClassVar[int] = 200
     n_draws: ClassVar[int] = 3
-    accuracy: ClassVar[float] = 5e-4
+    accuracy: float = 5e-4
     options_class: ClassVar[type[EnvOptions]] = TrackOptions
-    points_per_segment: ClassVar[int] = 6
+    points_per_segment: int = 6
     dt = DT
 
     def __init__(self, n_envs: int, options: EnvOptions) -> None:

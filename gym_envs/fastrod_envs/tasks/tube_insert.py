@@ -108,7 +108,7 @@ class TubeInsert(Task):
     name = "TubeInsert"
     n_steps: ClassVar[int] = 50
     n_draws: ClassVar[int] = 4
-    accuracy: ClassVar[float] = 0.005
+    accuracy: float = 0.005
     dt = 0.1
 
     def __init__(self, n_envs: int, options: EnvOptions) -> None:
