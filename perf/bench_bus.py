@@ -114,7 +114,6 @@ def loop(bus_name: str, rate: float, seconds: float, note: str = "") -> Row:
 
 
 def measure(options: argparse.Namespace) -> list[Section]:
-    """All loops."""
     seconds = 0.5 if options.quick else options.seconds
     short = min(seconds, 10.0)
     rows = []

@@ -241,7 +241,6 @@ def times(repeats: int, distance: float) -> Row:
 
 
 def measure(options: argparse.Namespace) -> list[Section]:
-    """All tables."""
     import cv2
 
     cv2.setNumThreads(1)

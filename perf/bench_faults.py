@@ -111,7 +111,6 @@ class Rig:
             self.prototype.command(circle(self.clock.now() - self._began))
 
     def sync(self) -> None:
-        """Another node's SYNC."""
         self._other.send(0x080, b"")
 
     def storm_on(self, syncs: int) -> None:
@@ -138,7 +137,6 @@ class Rig:
         return self.prototype.supervisor.state is SafetyState.STOPPED
 
     def close(self) -> None:
-        """Switch all off."""
         self._over.set()
         for thread in self._threads:
             thread.join(2.0)
@@ -250,7 +248,6 @@ def run(seconds: float, *, stepped: bool, eds: Path | None) -> Row:
 
 
 def fail(kind: str, k: int, folder: Path, **options: Any) -> Trial:
-    """One trial."""
     rng = np.random.default_rng([k, list(INJECTIONS).index(kind)])
     inject, words = INJECTIONS[kind]
     with rig(folder, k, **options) as bench:
@@ -362,7 +359,6 @@ def kill(k: int, folder: Path) -> Trial:
 
 
 def _row(kind: str, trials: Sequence[Trial]) -> Row:
-    """Of one kind."""
     worst = {name: 1e3 * max(getattr(t, name) for t in trials) for name in ("found", "rest", "whole")}
     sums = {
         name: sum(getattr(t, name) for t in trials) for name in ("named", "rows", "lost", "lines", "again")
@@ -373,7 +369,6 @@ def _row(kind: str, trials: Sequence[Trial]) -> Row:
 
 
 def measure(options: argparse.Namespace) -> list[Section]:
-    """All kinds."""
     times, found = 1 if options.quick else options.times, []
     urgent()  # before other programs, where that is granted
     how, time_is = {"stepped": options.stepped, "eds": options.eds}, ", stepped" if options.stepped else ""

@@ -65,7 +65,6 @@ def loaded(**options: Any) -> Shapes:
 
 
 def measure(options: argparse.Namespace) -> list[Section]:
-    """All sections."""
     quick, ray = options.quick, find_spec("ray") is not None
     rows = 512 if quick else Plan(work=loaded(), count=1).shard_rows
     with tempfile.TemporaryDirectory(prefix="fastrod-bench-") as folder:

@@ -74,7 +74,6 @@ def rods(steps: int) -> list[Row]:
 
 
 def paper(steps: int) -> list[Row]:
-    """The paper's class."""
     from fastrod.hosts import SoftManiSim
 
     soft = SoftManiSim()
@@ -110,7 +109,6 @@ def engines(steps: int) -> list[Row]:
 
 
 def measure(options: argparse.Namespace) -> list[Section]:
-    """All rows."""
     steps = 10 if options.quick else 200
     return [
         table(

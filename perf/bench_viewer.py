@@ -40,7 +40,6 @@ def check_installed() -> None:
 
 @contextmanager
 def browser() -> Iterator[Any]:
-    """Chromium."""
     from playwright.sync_api import sync_playwright
     from windows import ARGUMENTS
 
@@ -187,7 +186,6 @@ def memory(minutes: float, port: int) -> list[Row]:
 
 
 def measure(options: argparse.Namespace) -> list[Section]:
-    """All tables."""
     check_installed()
     port, seconds = options.port, 3.0 if options.quick else 20.0
     note_progress("answer to a slider")

@@ -87,7 +87,6 @@ def _plain(value: Any) -> Any:
 
 
 def show(sections: Sequence[Section], head: str) -> None:
-    """Print the tables."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
