@@ -12,6 +12,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
+from typing import Any
 
 from appendix_j import BENDING, LENGTH, Peer, Rung, Solve, one_by_one
 
@@ -26,13 +27,13 @@ def _chain(links: int, half_ends: bool, patience: float = 1.0) -> Iterator[Solve
     `patience` multiplies the steps, which are as many as it takes for the rest to be below the layout's
     error.
     """
-    from pybullet_utils.bullet_client import BulletClient
+    from fastrod.hosts import connect
 
-    bullet = BulletClient()
     h = 1.0 / links
     # of the first mode, slowed by the links' own inertia (Rayleigh's quotient)
     omega = 3.516 / math.sqrt(1.0 + 4.65 * _INERTIA * h * h)
     dt = 0.4 * math.sqrt(1.0 + _INERTIA) * h * h  # 0.8 of the stability limit of the fastest mode
+    bullet: Any = connect(dt=dt, gravity=(0.0, 0.0, 0.0))
     # the first mode is critically damped
     steps = math.ceil(patience * (10.5 + 2.5 * math.log(links)) / (omega * dt))
     ends = [h] * (links - 1) + [0.5 * h] if half_ends else [h] * links  # each link's far end from its joint
@@ -51,7 +52,6 @@ def _chain(links: int, half_ends: bool, patience: float = 1.0) -> Iterator[Solve
         linkJointTypes=[bullet.JOINT_REVOLUTE] * links,
         linkJointAxis=[[0, 0, 1]] * links,
     )
-    bullet.setTimeStep(dt)
     damping = {"linearDamping": 2.0 * omega, "angularDamping": 2.0 * omega, "jointDamping": 0.0}
     for j in joints:
         bullet.changeDynamics(chain, j, localInertiaDiagonal=[_INERTIA * h**3] * 3, **damping)
