@@ -11,15 +11,13 @@ from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 from fastrod.errors import InputError, UnknownNameError, nearest, shown
 from fastrod.types import Ints
 from fastrod_device.clock import Clock
 from fastrod_device.readings import DriveFeedback
-
-if TYPE_CHECKING:
-    from fastrod_device.hardware import Hardware
+from fastrod_device.units import DriveSpec
 
 GROUP = "fastrod.drives"
 _DRIVERS: Mapping[str, str] = {
@@ -113,12 +111,28 @@ class BusSpec:
             )
 
 
+class DrivenRobot(Protocol):
+    """What a hardware file says of its drives (`Hardware`)."""
+
+    @property
+    def drives(self) -> tuple[DriveSpec, ...]:
+        """In the order of the robot's tendons."""
+
+    @property
+    def rate(self) -> float:
+        """Of the control loop [Hz]."""
+
+    @property
+    def bus(self) -> BusSpec:
+        """Kind of the drives, and bit rate."""
+
+
 def drive_kinds() -> tuple[str, ...]:
     """Kinds of drives: the shipped ones, then those of installed packages."""
     return tuple(dict.fromkeys([*_DRIVERS, *(found.name for found in entry_points(group=GROUP))]))
 
 
-def open_drives(hardware: Hardware, bus: str, *, clock: Clock, eds: str | Path | None = None) -> Drives:
+def open_drives(hardware: DrivenRobot, bus: str, *, clock: Clock, eds: str | Path | None = None) -> Drives:
     """The drives of a hardware file at `bus`, whose name is the driver's matter ("socketcan:can0",
     "/dev/ttyUSB0"). `eds`: the file that lists an EPOS4's objects. Raises `DeviceError` where there is no
     such bus, `InputError`."""
@@ -136,7 +150,7 @@ def open_drives(hardware: Hardware, bus: str, *, clock: Clock, eds: str | Path |
     return drives
 
 
-def emulated_drives(hardware: Hardware, bus: Any, **given: Any) -> Any:
+def emulated_drives(hardware: DrivenRobot, bus: Any, **given: Any) -> Any:
     """Emulated drives of a hardware file's kind, at `bus`. Raises `InputError` for a kind that has no
     emulator."""
     kind = hardware.bus.kind
