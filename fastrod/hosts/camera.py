@@ -42,7 +42,7 @@ class HostCamera:
     """A pinhole camera. It draws on the CPU (PyBullet's TinyRenderer), so it needs neither a display nor a
     graphics card.
 
-    >>> Camera(width=64, height=48).fov
+    >>> HostCamera(width=64, height=48).fov
     60.0
     """
 

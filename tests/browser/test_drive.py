@@ -104,7 +104,7 @@ def test_keys_bend_pause_reset_and_stop(app: App, window: Windows) -> None:
     seen.page.get_by_role("button", name="STOP", exact=True).dblclick()
     seen.page.wait_for_timeout(300)
     assert page.session.stopped
-    seen.page.get_by_role("button", name="Resume").click()
+    seen.page.get_by_role("button", name="Resume", exact=True).click()
     assert seen.until(lambda: not page.session.stopped)
     keys.press("r")
     assert seen.until(lambda: float(np.abs(page.teleop.goals.action).max()) < 1e-9)
@@ -218,7 +218,7 @@ def test_closing_the_page_stops_a_real_robot(app: App, window: Windows) -> None:
     assert there.min() > -0.0075 * np.pi / 2.0 + 1e-3  # it had not arrived
     other.go(app.address)
     other.page.wait_for_timeout(1100)  # sooner it is ignored
-    other.page.get_by_role("button", name="Resume").click()
+    other.page.get_by_role("button", name="Resume", exact=True).click()
     assert other.until(lambda: not link.stopped)
 
 

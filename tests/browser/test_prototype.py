@@ -130,7 +130,7 @@ class Bed:
     def go_on(self, seen: Window) -> None:
         """When a person has had time to see why it stopped."""
         seen.page.wait_for_timeout(1100)
-        seen.page.get_by_role("button", name="Resume").click()
+        seen.page.get_by_role("button", name="Resume", exact=True).click()
 
     def says(self, seen: Window, words: str) -> bool:
         return seen.until(lambda: seen.page.get_by_text(re.compile(words)).count() > 0)
@@ -212,13 +212,13 @@ def test_stop_only_stops_however_often_it_is_pressed(
     monkeypatch.setattr("fastrod_viewer.session._HASTY", 60.0)
     seen, other = window(bed.app.address), window(bed.app.address)
     for each in (seen, other):
-        assert each.page.get_by_role("button", name="Resume").is_disabled()
+        assert each.page.get_by_role("button", name="Resume", exact=True).is_disabled()
     bed.slowly(seen)
     bed.bend(seen, "End")
     assert seen.until(lambda: bool(bed.link.change()[0] < -3e-4))
     seen.page.get_by_role("button", name="STOP", exact=True).dblclick()
     assert seen.until(lambda: bed.page.session.stopped)
-    seen.page.get_by_role("button", name="Resume").click()
+    seen.page.get_by_role("button", name="Resume", exact=True).click()
     assert bed.says(seen, "Resume within a second of a stop is ignored; press it again.")
     assert bed.stands(seen)
     monkeypatch.undo()
@@ -237,7 +237,9 @@ def test_stop_only_stops_however_often_it_is_pressed(
     bed.go_on(seen)
     assert other.until(lambda: not bed.page.session.stopped)
     for each in (seen, other):
-        assert each.until(lambda each=each: each.page.get_by_role("button", name="Resume").is_disabled())
+        assert each.until(
+            lambda each=each: each.page.get_by_role("button", name="Resume", exact=True).is_disabled()
+        )
         assert each.errors == []
 
 

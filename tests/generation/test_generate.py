@@ -412,7 +412,7 @@ def test_a_run_that_makes_nothing_leaves_the_folder_as_it_was(
         ),
         (
             ("--foo",),
-            "fastrod generate shapes does not know '--foo'; `fastrod generate shapes --help` tells.\n",
+            "fastrod generate shapes does not know '--foo'; `fastrod generate shapes --help` lists them.\n",
         ),
         (("--count", "0"), "count is 0; it must be a whole number at least 1 and at most 1e+12.\n"),
         (("--seed", "-1"), "seed is -1; it must be a whole number at least 0 and at most 9.22337e+18.\n"),

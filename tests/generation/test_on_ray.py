@@ -88,7 +88,7 @@ def test_a_machine_that_does_not_see_the_folder_is_named(
     def write_probe(path: str) -> str:
         return "" if elsewhere else path
 
-    monkeypatch.setattr(on_ray, "_touch", write_probe)
+    monkeypatch.setattr(on_ray, "_write_probe", write_probe)
     with pytest.raises(
         InputError,
         match=r"machine .* does not see folder .*shards'; give --out a folder "

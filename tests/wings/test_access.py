@@ -368,8 +368,8 @@ def test_one_page_has_the_controls_and_another_asks_for_them() -> None:
     assert holder.acts(1)  # the first that acts
     assert not holder.acts(2)
     assert [holder.standing(page) for page in (1, 2)] == ["has", "other"]
-    holder.submit(2)
-    holder.submit(3)  # waits in the queue
+    holder.request(2)
+    holder.request(3)  # waits in the queue
     assert [holder.standing(page) for page in (1, 2, 3)] == ["requested", "asking", "other"]
     assert holder.acts(1)
     clock.now += 0.9 * PATIENCE
@@ -378,24 +378,24 @@ def test_one_page_has_the_controls_and_another_asks_for_them() -> None:
     holder.grant(3)
     holder.keep(1)
     assert [holder.standing(page) for page in (1, 2)] == ["has", "refused"]
-    holder.submit(2)  # too soon
+    holder.request(2)  # too soon
     assert holder.standing(1) == "has"
     clock.now += 1.1 * AGAIN
     holder.tick()
     assert holder.standing(2) == "other"
     assert holder.acts(1)
-    holder.submit(2)
+    holder.request(2)
     assert moved == []
     clock.now += 1.1 * PATIENCE
     holder.tick()  # nobody refused
     assert [holder.standing(page) for page in (1, 2)] == ["other", "has"]
     assert moved == [clock.now]
     assert not holder.acts(1)
-    holder.submit(1)
+    holder.request(1)
     holder.grant(2)
     assert holder.standing(1) == "has"
     clock.now += 1.1 * IDLE
-    holder.submit(3)  # at once: page 1 did nothing for long
+    holder.request(3)  # at once: page 1 did nothing for long
     assert [holder.acts(page) for page in (1, 2, 3)] == [False, False, True]
     pages.remove(3)  # it left
     holder.tick()

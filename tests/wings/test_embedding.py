@@ -142,8 +142,8 @@ def test_tilted_body_feels_the_torque_in_its_own_frame(embedded_step) -> None:
     assert np.abs(moment).max() > 0.05
 
 
-@pytest.mark.parametrize(("part", "calm"), [(0.9, True), (1.1, False)])
-def test_limit_of_the_time_step_is_where_the_page_has_it(shape: float, calm: bool) -> None:
+@pytest.mark.parametrize(("fraction", "calm"), [(0.9, True), (1.1, False)])
+def test_limit_of_the_time_step_is_where_the_page_has_it(fraction: float, calm: bool) -> None:
     # x' = x + dt v', v' = v - dt K / m (x + dt v): eigenvalues leave the unit circle where dt^2 K / m is 4/3
     robot, dt, rotation = soft_robot(), 0.01, (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)
     scene = ContactScene(
@@ -157,7 +157,7 @@ def test_limit_of_the_time_step_is_where_the_page_has_it(shape: float, calm: boo
         return float(rod.wrench[2])
 
     stiffness = -(press(start + 1e-4) - press(start - 1e-4)) / 2e-4
-    mass = stiffness * dt**2 / (4.0 / 3.0 * shape)
+    mass = stiffness * dt**2 / (4.0 / 3.0 * fraction)
     z, v, rest = start + 1e-6, 0.0, press(start)
     runs = []
     for _ in range(60):

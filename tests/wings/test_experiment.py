@@ -86,7 +86,7 @@ def short_run() -> Excitation:
         payload=payload,
         base_quaternion=base,
     )
-    return Excitation(log=log, parts=())
+    return Excitation(log=log, phases=())
 
 
 def circle_plan() -> InversePlan:

@@ -39,16 +39,16 @@ class ViewOptions:
         for name, known in (("color_by", COLOR_BY), ("body", BODIES)):
             if getattr(self, name) not in known:
                 raise InputError(
-                    f"Options.{name} is {getattr(self, name)!r}; {nearest(str(getattr(self, name)), known)}"
+                    f"ViewOptions.{name} is {getattr(self, name)!r}; {nearest(str(getattr(self, name)), known)}"
                 )
         for name in ("tendons", "spacers", "contacts", "loads", "frames"):
             if not isinstance(getattr(self, name), bool):
-                raise InputError(f"Options.{name} is {getattr(self, name)!r}; it must be True or False.")
+                raise InputError(f"ViewOptions.{name} is {getattr(self, name)!r}; it must be True or False.")
         if self.pieces is not None and (
             not isinstance(self.pieces, int) or isinstance(self.pieces, bool) or self.pieces < 1
         ):
             raise InputError(
-                f"Options.pieces is {self.pieces!r}; it must be a whole number, at least 1, or None."
+                f"ViewOptions.pieces is {self.pieces!r}; it must be a whole number, at least 1, or None."
             )
 
     def pieces_of(self, n_robots: int) -> int:
