@@ -47,7 +47,9 @@ def _gap(engine: Engine, shape: Shape, poses: Floats, only: int | None = None, r
     )  # fmt: skip
     frames = np.ascontiguousarray(frames_of(poses)[:, which])
     nobody = np.zeros(n, bool)
-    scenery = Scenery(engine.rods, surfaces, frames, frames, frames, shape, shape, nobody, nobody, 1e-9, _EVERYTHING, 0.0)
+    scenery = Scenery(
+        engine.rods, surfaces, frames, frames, frames, shape, shape, shape, nobody, nobody, 1e-9, _EVERYTHING, np.zeros(len(nobody))
+    )
     finite = np.isfinite(shape.position).all((1, 2))
     gap, some = np.full(n, np.nan), np.flatnonzero(finite if rows is None else finite & rows)
     found, n_found = np.empty((len(some), MOST_FOUND, CANDIDATE)), np.zeros(len(some), np.int64)

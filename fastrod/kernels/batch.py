@@ -90,11 +90,12 @@ def _iterate(
     frames_slip: Floats,
     shape: Shape,
     before: Shape,
+    before_slip: Shape,
     tracked: Flags,
     slides: Flags,
     tolerance: float,
     margin: float,
-    damping: float,
+    damping: Floats,
     touching: Touching,
     clearance: Clearance,
     probes: Probes,
@@ -114,7 +115,7 @@ def _iterate(
     for part in prange(n_parts):
         for k in range(part, len(worlds) - 1, n_parts):
             scenery = Scenery(
-                rods, surfaces, frames, frames_before, frames_slip, shape, before, tracked, slides, tolerance, margin, damping
+                rods, surfaces, frames, frames_before, frames_slip, shape, before, before_slip, tracked, slides, tolerance, margin, damping
             )
             iterate_world(
                 worlds[k], worlds[k + 1], rows, scenery, touching, clearance, probes, memory, proposed, unknown, gap, trouble, status,
@@ -168,11 +169,12 @@ def _look(
     frames_slip: Floats,
     shape: Shape,
     before: Shape,
+    before_slip: Shape,
     tracked: Flags,
     slides: Flags,
     tolerance: float,
     margin: float,
-    damping: float,
+    damping: Floats,
     clearance: Clearance,
     gap: Floats,
     found: Floats,
@@ -185,7 +187,7 @@ def _look(
         for r in range(part, len(rows), n_parts):
             i = rows[r]
             scenery = Scenery(
-                rods, surfaces, frames, frames_before, frames_slip, shape, before, tracked, slides, tolerance, margin, damping
+                rods, surfaces, frames, frames_before, frames_slip, shape, before, before_slip, tracked, slides, tolerance, margin, damping
             )
             n_found[r], gap[i] = look_at(i, scenery, clearance, found[r], scratch[part])
 
