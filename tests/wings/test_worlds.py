@@ -83,7 +83,7 @@ def test_scene_in_mujoco_is_played_and_nobody_drives_it():
     for refused in (lambda: world.drive(still(world)), world.jacobian):
         with pytest.raises(
             InputError,
-            match=r"^scene 'ur5_mujoco' has a script that moves its robots; no "
+            match=r"^scene 'ur5_mujoco' has a script that moves its robots; they "
             r"cannot be driven by hand\.$",
         ):
             refused()

@@ -37,10 +37,9 @@ class ViewOptions:
 
     def __post_init__(self) -> None:
         for name, known in (("color_by", COLOR_BY), ("body", BODIES)):
-            if getattr(self, name) not in known:
-                raise InputError(
-                    f"ViewOptions.{name} is {getattr(self, name)!r}; {nearest(str(getattr(self, name)), known)}"
-                )
+            given = getattr(self, name)
+            if given not in known:
+                raise InputError(f"ViewOptions.{name} is {given!r}; {nearest(str(given), known)}")
         for name in ("tendons", "spacers", "contacts", "loads", "frames"):
             if not isinstance(getattr(self, name), bool):
                 raise InputError(f"ViewOptions.{name} is {getattr(self, name)!r}; it must be True or False.")
