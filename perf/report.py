@@ -95,12 +95,12 @@ def show(sections: Sequence[Section], head: str) -> None:
     console.width = max(console.width, _WIDTH)
     console.print(head, highlight=False)
     for section in sections:
-        made = Table(title=section.title, title_justify="left", title_style="bold")
+        made = Table()
         for i, column in enumerate(section.columns):
             made.add_column(Text(column.head), justify="left" if i == 0 else "right", no_wrap=True)
         for row in section.rows:
             made.add_row(*(Text(_text(row.get(column.key), column.form)) for column in section.columns))
-        console.print()
+        console.print(Text(f"\n{section.title}"), style="bold", highlight=False)
         console.print(made)
         for note in section.notes:
             console.print(Text(note), style="dim", highlight=False)
