@@ -74,7 +74,7 @@ def loop(bus_name: str, rate: float, seconds: float, note: str = "") -> Row:
         if bus_name == UDP:
             drives, missed = None, stack.enter_context(elsewhere(bus_name))
         else:
-            made = EmulatedDrives(SPECS, bus_name, clock=clock, wires=Springs())
+            made = EmulatedDrives(SPECS, bus_name, clock=clock, tendons=Springs())
             drives, missed = stack.enter_context(made), list[int]()
         bus = stack.enter_context(DriveBus(SPECS, bus_name, clock=clock, rate=rate))
         bus.connect()

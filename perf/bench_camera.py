@@ -210,7 +210,7 @@ def gates(kind: str, seeds: Sequence[int], moves: int) -> Row:
             for move in range(moves):
                 if move == moves // 2:
                     with prototype.resting():
-                        bench.hands.hang(LOAD)
+                        bench.assistant.hang(LOAD)
                     prototype.payload = LOAD
                 dl = allowed(prototype, rng)
                 for _ in range(10):

@@ -185,7 +185,7 @@ def circle(t: float) -> Floats:
 
 
 def _block(rig: Rig, _: int) -> None:
-    """The drive that pulls most: one that pays out is found by its tension before, as the others pull
+    """The drive that pulls most: one that lets tendon out is found by its tension before, as the others pull
     against it."""
     readings = rig.prototype.readings
     rig.emulator.drives.block(0 if readings is None else int(np.argmin(readings.rate)))
@@ -216,7 +216,10 @@ INJECTIONS: dict[str, tuple[Callable[[Rig, int], Any], str]] = {
     "camera frozen": (_camera("frozen"), "the camera repeats its frames"),
     "marker lost": (_camera("hidden"), "the marker was last seen"),
     "clock jump": (_jump, "the wall clock jumped"),
-    "encoder jump": (_drives(lambda drives, k: drives.encoder_jump(k % 4, _COUNTS[k % 4])), "moved its "),
+    "encoder jump": (
+        _drives(lambda drives, k: drives.encoder_jump(k % 4, _COUNTS[k % 4])),
+        "moved its tendon by",
+    ),
     "SYNC storm": (lambda rig, k: rig.storm_on(STORMS[k % 4]), "another node sends SYNC"),
 }
 """How each is done to the k-th trial, and what its sentence must say."""

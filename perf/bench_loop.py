@@ -30,7 +30,7 @@ def _one(seed: int, effect: str | None, *, load: bool) -> Row:
         emulated(load_hardware(), seed=seed, effect=effect) as bench,
     ):
         payload = None if load else 0.0
-        loop = close_loop(bench.prototype, bench.hands, Path(folder), payload=payload, turn=load)
+        loop = close_loop(bench.prototype, bench.assistant, Path(folder), payload=payload, turn=load)
         assert bench.emulator is not None
         sealed, stiffness = list(bench.emulator.seal.open()), bench.emulator.seal.stiffness()
     result = loop.result

@@ -344,12 +344,12 @@ class DriveBus:
         rounds: int = 2,
         time_limit: float = 30.0,
     ) -> DriveFeedback:
-        """Pull the wires in, one after another, until each is taut; the counts there become 0.
+        """Pull the tendons in, one after another, until each is taut; the counts there become 0.
 
         `threshold` (n_drives,) [thousandths of the rated torque], at `speed` [counts/s], one number or
         (n_drives,), reached by
         `acceleration` [counts/s2]; then to `offset` (n_drives,) [counts]. `order` of the drives; `rounds`:
-        what one wire pulls the others feel, so all are done more than once; `time_limit` [s] for each. The
+        what one tendon pulls the others feel, so all are done more than once; `time_limit` [s] for each. The
         drives end enabled in the mode "csp". Raises `InputError`, or `DeviceError`: stopped, a fault, or no
         end; the drives are then stopped.
         """
@@ -387,20 +387,20 @@ class DriveBus:
         setup.write(i, 0x6099, 1, setup.speed(i, speed))
         setup.write(i, 0x609A, 0, setup.acceleration(i, acceleration))
         setup.write(i, 0x30B1, 0, away)
-        setup.write(i, 0x30B0, 0, away)  # the count where the move ends: 0 is where the wire was taut
+        setup.write(i, 0x30B0, 0, away)  # the count where the move ends: 0 is where the tendon was taut
         setup.write(i, 0x30B2, 0, current)  # mA
         setup.set_mode(i, 6)
 
         def attained(now: DriveFeedback) -> bool:
             if now.statusword[i] & _ERROR:
                 raise DeviceError(
-                    f"the drive at node {spec.node} reports a homing error; is its wire on the drum?"
+                    f"the drive at node {spec.node} reports a homing error; is its tendon on the drum?"
                 )
             return bool(now.statusword[i] & _ACKNOWLEDGED and now.statusword[i] & _REACHED)
 
         self._cycle.until(0.5, _once, "be homed", running=True)
         self._cycle.words[i] = START
-        self._cycle.until(limit, attained, f"find the wire of node {spec.node} taut", running=True)
+        self._cycle.until(limit, attained, f"find the tendon of node {spec.node} taut", running=True)
         self._cycle.words[i] = RUN
         self._cycle.hold[i] = int(self._cycle.newest.position[i])
         self._cycle.until(0.5, _once, "be homed", running=True)

@@ -33,8 +33,8 @@ from fastrod_device.dynamixel_line import (
     PROFILE_ACCELERATION,
     PROFILE_VELOCITY,
     READ_BACK,
+    REVOLUTION,
     TORQUE_ENABLE,
-    TURN,
     VELOCITY_UNIT,
     WATCHDOG_TRIPPED,
     Register,
@@ -113,7 +113,7 @@ class DynamixelBus:
         """As in `Drives`; position and following error are limited by the supervisor alone, as `notices`
         says."""
         for node in self._ids:
-            self._line.ask(node, PING, b"", "be found")
+            self._line.request(node, PING, b"", "be found")
         self._setup, self._deceleration = [], np.maximum(np.asarray(deceleration, np.float64), 1.0)
         for i, node in enumerate(self._ids):
             self._line.write(node, TORQUE_ENABLE, 0)
@@ -178,11 +178,11 @@ class DynamixelBus:
             if not self._raw[i].error:
                 continue
             before = self._raw[i].position
-            self._line.ask(node, REBOOT, b"", "be rebooted")
+            self._line.request(node, REBOOT, b"", "be rebooted")
             end = self._clock.now() + _REBOOT
             while True:
                 try:
-                    self._line.ask(node, PING, b"", "come back from its reboot")
+                    self._line.request(node, PING, b"", "come back from its reboot")
                     break
                 except DeviceError:
                     if self._clock.now() >= end:
@@ -191,8 +191,8 @@ class DynamixelBus:
             self._enabled[i], self._known_errors[i] = False, 0
             self._set_up(i)
             # whole turns are forgotten; a shaft that is held by its gear has not gone half a turn meanwhile
-            turns = round((before - self._line.read(node, PRESENT_POSITION)) / TURN)
-            self._zero[i] -= turns * TURN
+            revolutions = round((before - self._line.read(node, PRESENT_POSITION)) / REVOLUTION)
+            self._zero[i] -= revolutions * REVOLUTION
         self.exchange()
         self._refuse_faults("stays in fault")
 

@@ -29,8 +29,8 @@ from fastrod_device.dynamixel_line import (
     PRESENT_VELOCITY,
     PROFILE_ACCELERATION,
     PROFILE_VELOCITY,
+    REVOLUTION,
     TORQUE_ENABLE,
-    TURN,
     VELOCITY_UNIT,
     WATCHDOG_TRIPPED,
     Register,
@@ -59,7 +59,7 @@ _TABLE = 512  # bytes
 _N_INDIRECT = 28
 _MODEL = 1020  # XM430-W350
 _WATCHDOG_UNIT = 0.02  # s
-_ACCELERATION_UNIT = 214.577 / 3600.0 * TURN  # counts/s2
+_ACCELERATION_UNIT = 214.577 / 3600.0 * REVOLUTION  # counts/s2
 _INSTRUCTION_ERROR, _RANGE_ERROR, _ACCESS_ERROR, _ALERT = 2, 4, 7, 0x80
 
 
@@ -76,7 +76,7 @@ class _Servo:
     def reboot(self) -> None:
         """Power-on: torque off, no error, whole turns forgotten."""
         self.table = bytearray(_TABLE)
-        self.base = TURN * math.floor(self.x / TURN)
+        self.base = REVOLUTION * math.floor(self.x / REVOLUTION)
         self.heard = 0.0
         self.errors = 0
         self.set(CURRENT_LIMIT, 1193)
@@ -156,13 +156,13 @@ class EmulatedDynamixels:
     one does. `moving` and `true_pulled` are what a test may know and a master never does."""
 
     def __init__(
-        self, specs: Sequence[DriveSpec], bus: str | None, *, clock: Clock, wires: Tendons, **_: Any
+        self, specs: Sequence[DriveSpec], bus: str | None, *, clock: Clock, tendons: Tendons, **_: Any
     ) -> None:
         """`bus` is what `virtual:NAME` then opens in this process; None: a test serves the bytes itself."""
         specs = Transmission(specs).specs
         self._servos = {spec.node: _Servo(spec) for spec in specs}
         self._wind: Floats = np.array([spec.direction * spec.metres_per_count for spec in specs])
-        self._clock, self._tendons, self._t = clock, wires, clock.now()
+        self._clock, self._tendons, self._t = clock, tendons, clock.now()
         self._bus, self._reader, self._out = bus, PacketReader(), bytearray()
         self._force = np.zeros(len(specs))
         self._lock = threading.RLock()
@@ -195,7 +195,7 @@ class EmulatedDynamixels:
         """Bytes from the controller."""
         with self._lock:
             self._advance()
-            for packet in self._reader.feed(data):
+            for packet in self._reader.take(data):
                 self._serve(packet)
 
     def read(self, timeout: float) -> bytes:  # noqa: ARG002

@@ -41,7 +41,7 @@ READ_BACK = (TORQUE_ENABLE, HARDWARE_ERROR, BUS_WATCHDOG, PRESENT_CURRENT, PRESE
 CURRENT_POSITION_MODE, WATCHDOG_TRIPPED = 5, 0xFF
 CURRENT_UNIT = 2.69e-3  # A
 VELOCITY_UNIT = 0.229 / 60.0 * 4096  # counts/s
-TURN = 4096
+REVOLUTION = 4096
 """Counts of a turn; a reboot forgets whole ones."""
 _ERRORS = {
     1: "it could not be done",
@@ -79,7 +79,7 @@ class ServoLine:
         self.lock = threading.RLock()
         """Held over a question and its answers."""
 
-    def ask(self, node: int, instruction: int, data: bytes, what: str) -> bytes:
+    def request(self, node: int, instruction: int, data: bytes, what: str) -> bytes:
         """The data of a servo's answer to what it is to do. Raises `DeviceError` where it is silent or
         refuses."""
         for _ in range(_TRIES):
@@ -100,11 +100,11 @@ class ServoLine:
     def write(self, node: int, register: Register, value: int) -> None:
         """Set a number of one servo. Raises `DeviceError`."""
         data = struct.pack("<H", register.address) + value.to_bytes(register.size, "little", signed=value < 0)
-        self.ask(node, WRITE, data, f"take {value} in register {register.address}")
+        self.request(node, WRITE, data, f"take {value} in register {register.address}")
 
     def read(self, node: int, register: Register) -> int:
         """A number of one servo. Raises `DeviceError`."""
-        data = self.ask(node, READ, struct.pack("<HH", *register), f"report register {register.address}")
+        data = self.request(node, READ, struct.pack("<HH", *register), f"report register {register.address}")
         if len(data) != register.size:
             raise DeviceError(f"the servo {node} answers register {register.address} with {len(data)} bytes.")
         return int.from_bytes(data, "little", signed=register in (PRESENT_POSITION, PRESENT_VELOCITY))
@@ -140,7 +140,7 @@ class ServoLine:
             end = time.monotonic() + patience
             while len(answers) < len(nodes):
                 data = self.port.read(max(end - time.monotonic(), 0.0))
-                for packet in reader.feed(data):
+                for packet in reader.take(data):
                     if packet.instruction == STATUS and packet.node in nodes and packet.data:
                         answers[packet.node] = packet.data
                 if not data and time.monotonic() >= end:

@@ -70,7 +70,7 @@ class PacketReader:
     def __init__(self) -> None:
         self._held = bytearray()
 
-    def feed(self, data: bytes) -> list[Packet]:
+    def take(self, data: bytes) -> list[Packet]:
         """The packets that these bytes complete."""
         self._held += data
         found = []

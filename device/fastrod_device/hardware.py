@@ -28,7 +28,7 @@ _SLOWEST, _QUICKEST = 50.0, 500.0  # Hz
 
 @dataclass(frozen=True, kw_only=True)
 class Hardware:
-    """A robot, one drive for each of its wires in the robot file's order, and what watches it. Raises
+    """A robot, one drive for each of its tendons in the robot file's order, and what watches it. Raises
     `InputError`."""
 
     robot: Robot
@@ -41,7 +41,7 @@ class Hardware:
     rate: float = 100.0
     """Control cycles a second, each with one SYNC [Hz]."""
     pretension: float = 1.0
-    """Of every wire when it is homed [N]."""
+    """Of every tendon when it is homed [N]."""
     homing_speed: float = 0.005
     """Of a tendon [m/s]."""
     bus: BusSpec = field(default_factory=BusSpec)
@@ -69,7 +69,7 @@ class Hardware:
             k, least = int(steps.argmax()), math.ceil(1e3 * steps.max()) / 1e3
             raise InputError(
                 f"pretension is {self.pretension!r} N; the drive at node {nodes[k]} tells torque in steps "
-                f"of {steps[k]:.3g} N of its wire, "
+                f"of {steps[k]:.3g} N of its tendon, "
                 f"so it must be at least {least:g} N."
             )
 
@@ -93,7 +93,7 @@ def load_hardware(path: str | Path | None = None, robot: Robot | None = None) ->
         raise InputError(f"{where} lacks {', '.join(missing)}.")
     if not isinstance(data["drive"], list):
         raise InputError(
-            f"{where}: drive is one table; write [[drive]], in double brackets, one for each wire."
+            f"{where}: drive is one table; write [[drive]], in double brackets, one for each tendon."
         )
     drives = tuple(
         from_table(DriveSpec, table, f"{where}: drive {k}") for k, table in enumerate(data["drive"], 1)

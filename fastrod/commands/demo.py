@@ -140,7 +140,7 @@ def _looped(console: Console, out: Path, seed: int | None, *, keep: bool, view: 
     )
     stages = Stages(console)
     with stages, emulated(load_hardware(), seed=seed) as bench:
-        loop = close_loop(bench.prototype, bench.hands, out, progress=stages)
+        loop = close_loop(bench.prototype, bench.assistant, out, progress=stages)
         assert bench.emulator is not None
         sealed = bench.emulator.seal.open()
     written = loop_report.write(loop, out, sealed)

@@ -96,7 +96,7 @@ def _excite(arguments: argparse.Namespace, progress: Progress | None) -> int:
     out = _recorded(arguments.out or Path("excite.csv"), hardware)
     run = excitation(hardware.robot, payload=arguments.payload, rate=hardware.camera.rate)
     with _kept(out), _bench(arguments, hardware, journal=out) as bench:
-        log = excite(bench.prototype, run, bench.hands, out, progress=progress)
+        log = excite(bench.prototype, run, bench.assistant, out, progress=progress)
     print(
         f"wrote {out}: {len(log)} rows, {int(log.measured.sum())} with the tip; next: fastrod identify "
         f"{out} --robot {_named(arguments)}"
@@ -134,8 +134,8 @@ def _track(arguments: argparse.Namespace, _: Progress | None) -> int:
 def _policy(given: str, path: str, begins: float, robot: Robot, trust: bool) -> Law:
     """A policy of Track as a law; the path begins so many seconds into the plan."""
     try:
-        from fastrod_envs.pilot import PolicyDriver
         from fastrod_envs.policies import Policy, find
+        from fastrod_envs.policy_driver import PolicyDriver
     except ImportError as error:
         raise InputError("--policy needs gymnasium: pip install 'fastrod[envs]'.") from error
     driver = PolicyDriver(Policy(find("Track", given), trust=trust), path, robot)
@@ -157,7 +157,7 @@ def _loop(arguments: argparse.Namespace, progress: Progress | None) -> int:
         )
     make_folder(out)
     with _kept(out), _bench(arguments, hardware, journal=out / _EVENTS) as bench:
-        loop = close_loop(bench.prototype, bench.hands, out, payload=arguments.payload, progress=progress)
+        loop = close_loop(bench.prototype, bench.assistant, out, payload=arguments.payload, progress=progress)
         sealed = None if bench.emulator is None else bench.emulator.seal.open()
     written = write(loop, out, sealed)
     show(loop, Console(), sealed)
@@ -181,11 +181,11 @@ def _calibrate(arguments: argparse.Namespace, progress: Progress | None) -> int:
     )
     before = hardware.camera
     with _board_bench(arguments, before, board, lens=True) as bench:
-        bench.hands.wave()
+        bench.assistant.wave()
         taken = collect(bench.source, board, _views(arguments), bench.clock, progress=progress)
     found = calibrate(taken.pictures, board)
     Console().print(lens_table(found, before, bench.truth))
-    _report_views(found, taken.told)
+    _report_views(found, taken.counted)
     save_camera(replace(before, matrix=found.camera().matrix, distortion=found.camera().distortion), out)
     print(f"wrote {out}: the file's camera with this lens; {_put_camera(out, arguments)}")
     return DONE
@@ -215,14 +215,14 @@ def _register(arguments: argparse.Namespace, progress: Progress | None) -> int:
     with _board_bench(arguments, before, board, lens=False) as bench:
         taken = []
         for position, quaternion in places:
-            bench.hands.place(position, quaternion)
+            bench.assistant.place(position, quaternion)
             taken.append(collect(bench.source, board, each, bench.clock, apart=0.0, progress=progress))
     pictures = [picture for some in taken for picture in some.pictures]
     counts = [len(some.pictures) for some in taken]
     position, quaternion = (np.repeat(np.stack(rows), counts, axis=0) for rows in zip(*places, strict=True))
     found = register_base(pictures, board, before, position=position, quaternion=quaternion)
     Console().print(place_table(found, before, bench.truth))
-    _report_views(found, "; ".join(some.told for some in taken))
+    _report_views(found, "; ".join(some.counted for some in taken))
     save_camera(found.camera(before), out)
     print(f"wrote {out}: the file's camera at this place; {_put_camera(out, arguments)}")
     return DONE

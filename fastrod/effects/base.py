@@ -36,7 +36,7 @@ class Seam(Enum):
     """Where an effect enters, from motor to camera; effects act in this order."""
 
     ACTUATION = 1
-    """Between the commanded wires and those that the rod feels: `tendon_length`, `extension`, `offset`,
+    """Between the commanded tendons and those that the rod feels: `tendon_length`, `extension`, `offset`,
     `compliance`."""
     MATERIAL = 2
     """The rod itself: `stiffness`, `precurvature`."""
@@ -80,10 +80,10 @@ class Parameter:
     starts: tuple[float, ...] = ()
     """Values that a fit starts from; `typical` where not given."""
     per: Per = "robot"
-    """One value for the robot, for each segment, or for each drive (a wire, or an antagonistic pair of
-    wires)."""
-    of: Literal["", "reach", "length"] = ""
-    """Bounds, typical size and starts are multiples of this: the wires' mean distance from the backbone, or
+    """One value for the robot, for each segment, or for each drive (a tendon, or an antagonistic pair of
+    tendons)."""
+    of: Literal["", "offset", "length"] = ""
+    """Bounds, typical size and starts are multiples of this: the tendons' mean distance from the backbone, or
     the robot's length."""
     shape: bool = False
     """True: it shapes an effect whose size another parameter gives (a time constant, a width); no size of its
@@ -96,6 +96,11 @@ class Parameter:
                 f"parameter {self.name!r} has neutral value {self.neutral}; it must lie in "
                 f"its bounds {low} to {high}."
             )
+        if self.of not in ("", "offset", "length"):
+            old = " ('reach' is called 'offset' now)" if self.of == "reach" else ""
+            raise EffectError(
+                f"parameter {self.name!r} is of {self.of!r}; it must be 'offset', 'length' or ''{old}."
+            )
         if self.typical is None:
             span = 0.1 * (high - low)
             object.__setattr__(self, "typical", span if math.isfinite(span) and span > 0.0 else 1.0)
@@ -105,14 +110,14 @@ class Parameter:
                 self, "starts", (self.neutral + self.typical,) if not self.shape else (self.typical,)
             )
 
-    def on(self, wiring: Routing) -> Parameter:
+    def on(self, routing: Routing) -> Parameter:
         """This parameter in its unit, for one robot."""
         if not self.of:
             return self
         size = (
-            float(wiring.length.sum())
-            if self.of == "length" or not wiring.n_tendons
-            else float(wiring.reach.mean())
+            float(routing.length.sum())
+            if self.of == "length" or not routing.n_tendons
+            else float(routing.reach.mean())
         )
         assert self.typical is not None
         return Parameter(
@@ -198,26 +203,25 @@ class Static(Law):
 
 
 class Operator(Law, ABC):
-    """Base of the library's effects with a memory: operators on the wires' lengths over time.
+    """Base of the library's effects with a memory: operators on the tendons' lengths over time.
 
     `sweep` is the law, over many steps at once: a simulator calls it with one step, identification with a
     whole log.
     """
 
     @abstractmethod
-    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Routing) -> Floats:
-        """(n_robots, n_steps, n_tendons) what the wires end up at, from `dl` commanded [m] and `dt`
+    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, routing: Routing) -> Floats:
+        """(n_robots, n_steps, n_tendons) what the tendons end up at, from `dl` commanded [m] and `dt`
         (n_steps,) before each step [s].
 
-        `memory` (n_robots, m) is changed in place; nan in it means that the wires begin at rest at the first
-        step.
-        """
+        `memory` (n_robots, m) is changed in place; nan in it means that the tendons begin at rest at the
+        first step."""
         ...
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         """One step of `sweep`."""
         dl = ports.tendon_length - ports.rest_length
-        ports.shift_wires(self.sweep(values, memory, dl[:, None], np.array([dt]), ports.wiring)[:, 0] - dl)
+        ports.shift_tendons(self.sweep(values, memory, dl[:, None], np.array([dt]), ports.routing)[:, 0] - dl)
 
 
 _REGISTRY: dict[str, Effect] = {}
@@ -237,10 +241,11 @@ def effect(cls: _Class) -> _Class:
             raise EffectError(
                 f"effect {name!r} does not say its {section}; its docstring needs a line '{section}: ...'."
             )
-    for part in ("seam", "parameters", "memory", "apply"):
-        if not hasattr(cls, part):
+    for member in ("seam", "parameters", "memory", "apply"):
+        if not hasattr(cls, member):
             raise EffectError(
-                f"effect {name!r} has no {part}; an effect has seam, parameters, memory(...) and apply(...)."
+                f"effect {name!r} has no {member}; an effect has seam, parameters, memory(...) and "
+                "apply(...)."
             )
     made: Any = cls()
     if not isinstance(made.seam, Seam):
@@ -306,16 +311,16 @@ def load_library() -> None:
         plug_in.load()
 
 
-def columns(what: Effect, wiring: Routing) -> list[str]:
+def columns(what: Effect, routing: Routing) -> list[str]:
     """Names of the value columns of an effect on this robot: half_width, or half_width_1, half_width_2 ..."""
     names = []
     for parameter in what.parameters:
-        count = wiring.count(parameter.per)
+        count = routing.count(parameter.per)
         names += [parameter.name] if count == 1 else [f"{parameter.name}_{k}" for k in range(1, count + 1)]
     return names
 
 
-def read_values(name: str, given: Mapping[str, object], wiring: Routing, where: str) -> Floats:
+def read_values(name: str, given: Mapping[str, object], routing: Routing, where: str) -> Floats:
     """(n_columns,) values of an effect from its table in a robot file; a parameter that is not given is
     neutral.
 
@@ -329,9 +334,9 @@ def read_values(name: str, given: Mapping[str, object], wiring: Routing, where: 
                 f"{where}: effect {name!r} has no parameter {key!r}; {nearest(str(key), known)}"
             )
     values: list[float] = []
-    for parameter in (p.on(wiring) for p in what.parameters):
+    for parameter in (p.on(routing) for p in what.parameters):
         value = given.get(parameter.name, parameter.neutral)
-        count = wiring.count(parameter.per)
+        count = routing.count(parameter.per)
         listed: Sequence[object] = value if isinstance(value, (list, tuple)) else (value,) * count
         if len(listed) != count:
             raise EffectError(

@@ -119,7 +119,7 @@ def register(task: _Class) -> _Class:
     if known is not None:
         unregister(task.name)
     _TASKS[task.name] = entry
-    _tell_gymnasium(task.name)
+    _add_to_gymnasium(task.name)
     return task
 
 
@@ -135,7 +135,7 @@ def unregister(name: str) -> None:
 def register_all() -> None:
     """Register the shipped tasks with Gymnasium."""
     for name in names():
-        _tell_gymnasium(name)
+        _add_to_gymnasium(name)
 
 
 @cache
@@ -172,7 +172,7 @@ def _checked(task: type[Any]) -> type[Task]:
     return task
 
 
-def _tell_gymnasium(name: str) -> None:
+def _add_to_gymnasium(name: str) -> None:
     """Register a task's id with Gymnasium, unless it is registered."""
     from gymnasium.envs.registration import register, registry
 

@@ -66,15 +66,15 @@ class RodTask(Task):
         self.home: Floats = np.zeros(len(self.driven)) if home is None else np.asarray(home, float)
         """(n_driven,) displacements at the start of an episode [m]."""
         rate_mode = options.action == "rate"
-        unit, reach = ("m/s", (-self._rate, self._rate)) if rate_mode else ("m", (self._low, self._high))
+        unit, span = ("m/s", (-self._rate, self._rate)) if rate_mode else ("m", (self._low, self._high))
         about = "rate of the displacements" if rate_mode else "displacements"
         names = ", ".join(f"{k // 3 + 1}{'eab'[k % 3]}" for k in self.driven)
         self.actions = (
             Field(
                 "displacement",
                 unit,
-                tuple(reach[0]),
-                tuple(reach[1]),
+                tuple(span[0]),
+                tuple(span[1]),
                 f"{about} ({names}: segment, and e extension, a, b toward d1, d2)",
             ),
         )
@@ -91,8 +91,8 @@ class RodTask(Task):
             feel_contact=feel_contact,
             device=options.device,
         )
-        self._turn = matrix_from_quaternion(np.array([self.base_robot.base_quaternion]))[0]
-        self._foot = np.array(self.base_robot.base_position)
+        self._base_rotation = matrix_from_quaternion(np.array([self.base_robot.base_quaternion]))[0]
+        self._base_position = np.array(self.base_robot.base_position)
         self.displacement: Floats = np.tile(self.home, (n_envs, 1))
         """(n_envs, n_driven) [m]."""
         self.tip: Floats = np.zeros((n_envs, 3))
@@ -109,7 +109,7 @@ class RodTask(Task):
         self._home_tip, self._home_direction = self.tip[0].copy(), self.direction[0].copy()
 
     def loads(self) -> dict[str, Any]:
-        """What the simulator is told besides wires: loads, obstacles."""
+        """What the simulator is told besides tendons: loads, obstacles."""
         return {}
 
     def start(self, rows: Ints, draws: Floats) -> None:
@@ -153,8 +153,10 @@ class RodTask(Task):
         if not self.base_robot.effects:
             return self.tip
         seen = self.simulator.measure().tip_position
-        p = self._foot + (
-            seen[:, :1] * self._turn[:, 0] + seen[:, 1:2] * self._turn[:, 1] + seen[:, 2:] * self._turn[:, 2]
+        p = self._base_position + (
+            seen[:, :1] * self._base_rotation[:, 0]
+            + seen[:, 1:2] * self._base_rotation[:, 1]
+            + seen[:, 2:] * self._base_rotation[:, 2]
         )
         return np.where(np.isfinite(p), p, self.tip)
 
@@ -231,7 +233,7 @@ class RodTask(Task):
         """Note where the tips of these robots are; those that are lost stay where they were last seen."""
         some = np.ones(self.n_envs, bool) if rows is None else np.isin(np.arange(self.n_envs), rows)
         with np.errstate(invalid="ignore"):
-            sane = (np.abs(tip - self._foot) < _FAR * self.base_robot.length).all(1) & np.isfinite(
+            sane = (np.abs(tip - self._base_position) < _FAR * self.base_robot.length).all(1) & np.isfinite(
                 direction
             ).all(1)
         good = some & ok & sane

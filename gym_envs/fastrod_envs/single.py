@@ -128,10 +128,10 @@ class SingleEnv(gymnasium.Env[Singles, Any]):
         self.task.close()
 
 
-def _first(told: dict[str, Any]) -> dict[str, Any]:
+def _first(reported: dict[str, Any]) -> dict[str, Any]:
     """The first row of every array, numbers as Python's own."""
     row: dict[str, Any] = {}
-    for name, value in told.items():
+    for name, value in reported.items():
         row[name] = (
             _first(value) if isinstance(value, dict) else value[0].item() if np.ndim(value) == 1 else value[0]
         )

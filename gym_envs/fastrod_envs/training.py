@@ -316,14 +316,14 @@ def _callback(plan: TrainingPlan, note: Callable[[], None], progress: Progress |
     class TrainingWatch(BaseCallback):
         def __init__(self) -> None:
             super().__init__()
-            self.told: dict[str, deque[float]] = {
+            self.reported: dict[str, deque[float]] = {
                 name: deque(maxlen=1000) for name in ("distance", "is_success", "contact", "lost")
             }
             self.next_note = -1
 
         def _on_step(self) -> bool:
             for i in self.locals["dones"].nonzero()[0]:
-                for name, values in self.told.items():
+                for name, values in self.reported.items():
                     values.append(float(self.locals["infos"][i][name]))
             every = max(1, plan.steps // _EVERY)
             if self.next_note < 0:
@@ -332,16 +332,16 @@ def _callback(plan: TrainingPlan, note: Callable[[], None], progress: Progress |
                 note()
                 self.next_note += every
             if plan.curriculum < 1.0:
-                part = min(1.0, 2.0 * self.num_timesteps / plan.steps)
+                done_fraction = min(1.0, 2.0 * self.num_timesteps / plan.steps)
                 self.training_env.env_method(
-                    "set_difficulty", plan.curriculum + (1.0 - plan.curriculum) * part
+                    "set_difficulty", plan.curriculum + (1.0 - plan.curriculum) * done_fraction
                 )
             if progress is not None:
                 progress(f"{plan.env} {plan.algorithm}", min(self.num_timesteps, plan.steps), plan.steps)
             return True
 
         def _on_rollout_end(self) -> None:
-            for name, values in self.told.items():
+            for name, values in self.reported.items():
                 if values:
                     self.logger.record(f"episodes/{name}", sum(values) / len(values))
 

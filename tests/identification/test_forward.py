@@ -227,7 +227,7 @@ class Sluggish:
         dl = ports.dl
         memory[:] = np.where(np.isnan(memory), dl, memory)
         memory += (dl - memory) * (dt / (dt + values))
-        ports.shift_wires(memory - dl)
+        ports.shift_tendons(memory - dl)
 
 
 @pytest.fixture

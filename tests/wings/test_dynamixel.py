@@ -82,9 +82,9 @@ def test_packets_are_those_of_the_specification() -> None:
 def test_a_header_within_the_data_is_none(data: bytes) -> None:
     packets = [Packet(7, WRITE, data), Packet(8, STATUS, data)]
     line = b"noise\xff\xff" + b"".join(packet.encoded() for packet in packets)
-    assert PacketReader().feed(line) == packets
+    assert PacketReader().take(line) == packets
     reader = PacketReader()
-    assert [found for k in range(len(line)) for found in reader.feed(line[k : k + 1])] == packets
+    assert [found for k in range(len(line)) for found in reader.take(line[k : k + 1])] == packets
 
 
 def test_damaged_packets_are_passed_over() -> None:
@@ -93,7 +93,7 @@ def test_damaged_packets_are_passed_over() -> None:
     for k in range(len(whole)):
         hurt = bytearray(whole)
         hurt[k] ^= 0x10
-        found = PacketReader().feed(bytes(hurt) + whole * 3 + b"\x00" * 70_000)
+        found = PacketReader().take(bytes(hurt) + whole * 3 + b"\x00" * 70_000)
         assert good in found
         assert all(packet == good for packet in found)
 
@@ -214,7 +214,7 @@ SPECS = tuple(
 @contextmanager
 def servos(**given: Any) -> Iterator[tuple[DynamixelBus, EmulatedDynamixels, SteppedClock]]:
     clock = SteppedClock()
-    emulated = EmulatedDynamixels(SPECS, None, clock=clock, wires=Loose())
+    emulated = EmulatedDynamixels(SPECS, None, clock=clock, tendons=Loose())
     bus = DynamixelBus(SPECS, emulated, clock=clock, **given)
     yield bus, emulated, clock
     bus.close()
@@ -405,7 +405,7 @@ def test_a_serial_device_carries_it_too(monkeypatch: pytest.MonkeyPatch) -> None
     master, slave = os.openpty()
     tty.setraw(slave)
     clock, done = WallClock(), threading.Event()
-    emulated = EmulatedDynamixels(SPECS, None, clock=clock, wires=Loose())
+    emulated = EmulatedDynamixels(SPECS, None, clock=clock, tendons=Loose())
 
     def serve() -> None:
         while not done.is_set():

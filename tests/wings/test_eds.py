@@ -168,7 +168,7 @@ class Bench:
 
     def __init__(self, own: Path | None = None, *, emulated: Path | None = None) -> None:
         name, self.clock = f"virtual:eds-{next(_names)}", SteppedClock()
-        self.nodes = EmulatedDrives(SPECS, name, clock=self.clock, wires=Springs(), eds=emulated)
+        self.nodes = EmulatedDrives(SPECS, name, clock=self.clock, tendons=Springs(), eds=emulated)
         self.bus = DriveBus(SPECS, name, clock=self.clock, rate=100.0, eds=own)
 
     def held(self, index: int, sub: int = 0) -> list[int]:

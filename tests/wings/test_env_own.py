@@ -76,7 +76,7 @@ class Aim(RodTask):
     def baseline(self):
         return self.toward(np.cross(self.direction, self.wanted) / (2.0 * self.dt), self.jacobian()[:, 3:])
 
-    def scenery(self, i):
+    def backdrop(self, i):
         return Backdrop(tubes=(self.tube(i),))
 '''
 

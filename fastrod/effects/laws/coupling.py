@@ -1,4 +1,4 @@
-"""Wires of one segment bend its neighbour too."""
+"""Tendons of one segment bend its neighbour too."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fastrod.types import Floats
 
 @effect
 class Coupling(Static):
-    """Wires of one segment bend its neighbour too.
+    """Tendons of one segment bend its neighbour too.
 
     Equation: theta_k -> theta_k + c theta_(k+1) + d theta_(k-1)
     Source: Camarillo, Carlson and Salisbury 2009; Roy, Wang and Simaan 2017
@@ -34,7 +34,7 @@ class Coupling(Static):
     least_segments = 2
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
-        if ports.wiring.n_segments < 2:
+        if ports.routing.n_segments < 2:
             return
         bend = ports.bend()
         change = np.zeros_like(bend)

@@ -1,4 +1,4 @@
-"""Viscoelastic body or wires: part of the bend comes late."""
+"""Viscoelastic body or tendons: part of the bend comes late."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from fastrod.types import Floats
 
 @effect
 class Creep(Operator):
-    """Viscoelastic body or wires: part of the bend comes late.
+    """Viscoelastic body or tendons: part of the bend comes late.
 
     Equation: l -> l - c (l - x), tau x' = l - x
-    Source: standard linear solid (Zener); creep of polymer wires and silicone bodies
+    Source: standard linear solid (Zener); creep of polymer tendons and silicone bodies
     Residual signature: after a step it decays with time whatever the direction; loops that depend on speed
     """
 
@@ -49,8 +49,8 @@ class Creep(Operator):
     def memory(self, n_robots: int, n_tendons: int) -> Floats:
         return np.full((n_robots, 2 * n_tendons), np.nan)
 
-    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Routing) -> Floats:
+    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, routing: Routing) -> Floats:
         out = dl.copy()
-        share, tau = (np.repeat(values[:, k : k + 1], wiring.n_tendons, axis=1) for k in (0, 1))
-        relaxation(out, memory, share, tau, dt)
+        fraction, tau = (np.repeat(values[:, k : k + 1], routing.n_tendons, axis=1) for k in (0, 1))
+        relaxation(out, memory, fraction, tau, dt)
         return out

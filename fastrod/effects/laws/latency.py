@@ -39,7 +39,7 @@ class Latency(Operator):
     def memory(self, n_robots: int, n_tendons: int) -> Floats:
         return np.full((n_robots, 1 + BUFFER * (1 + n_tendons)), np.nan)
 
-    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Routing) -> Floats:
+    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, routing: Routing) -> Floats:
         out = dl.copy()
         delay(out, memory, np.ascontiguousarray(values[:, 0]), dt)
         return out

@@ -1,4 +1,4 @@
-"""The body gets stiffer (or softer) as it bends, and its wires stretch for it."""
+"""The body gets stiffer (or softer) as it bends, and its tendons stretch for it."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from fastrod.types import Floats
 
 @effect
 class Stiffening(Static):
-    """The body gets stiffer (or softer) as it bends, and its wires stretch for it.
+    """The body gets stiffer (or softer) as it bends, and its tendons stretch for it.
 
     Equation: theta -> theta (1 - c min(|theta|^2, 2)) in each segment
-    Source: Yeoh 1993, cubic term of a hyperelastic bending moment against wires in series
+    Source: Yeoh 1993, cubic term of a hyperelastic bending moment against tendons in series
     Residual signature: odd and cubic in the bend, static
     """
 

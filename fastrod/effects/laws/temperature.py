@@ -46,4 +46,4 @@ class Temperature(Static):
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         warm = values[:, 0] * (1.0 - np.exp(-ports.time / values[:, 1]))
-        ports.shift_wires(warm[:, None] * ports.dl)
+        ports.shift_tendons(warm[:, None] * ports.dl)

@@ -1,4 +1,4 @@
-"""Wires stretch under tension."""
+"""Tendons stretch under tension."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fastrod.types import Floats
 
 @effect
 class TendonStretch(Static):
-    """Wires stretch under tension.
+    """Tendons stretch under tension.
 
     Equation: l_i = L_i + (c_i + c) T_i
     Source: Oliver-Butler, Till and Rucker 2019
@@ -33,4 +33,4 @@ class TendonStretch(Static):
     }
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
-        ports.compliance += ports.wiring.by_end(values)
+        ports.compliance += ports.routing.by_end(values)

@@ -200,7 +200,7 @@ class PreparedLog:
                     )[0]
                 else:
                     out[span] = self._step_by_step(what, values, dl[span], span)
-            opened.shift_wires(out - dl)
+            opened.shift_tendons(out - dl)
         return opened.dl[samples.rows]
 
     def _alone(self, length: Floats) -> Ports:

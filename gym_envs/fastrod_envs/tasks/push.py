@@ -52,7 +52,7 @@ class Push(PushTask):
     def __init__(self, n_envs: int, options: EnvOptions) -> None:
         super().__init__(n_envs, options, course())
 
-    def backdrop(self) -> Bullet:
+    def picture_world(self) -> Bullet:
         world = connect()
         floor(world)
         plate = world.createVisualShape(

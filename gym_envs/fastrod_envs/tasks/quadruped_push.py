@@ -27,10 +27,10 @@ def course() -> Course:
     pose = mount.motion().pose
     world.disconnect()
     c, s = math.cos(PITCH), math.sin(PITCH)
-    turn = quaternion_from_matrix(np.array([[-s, 0.0, c], [0.0, -1.0, 0.0], [c, 0.0, s]]))
+    quaternion = quaternion_from_matrix(np.array([[-s, 0.0, c], [0.0, -1.0, 0.0], [c, 0.0, s]]))
     robot = longer(neck(3), 0.14, (-0.04, 0.05))
     robot = replace(
-        robot, base_position=(float(pose[0]), 0.0, float(pose[2])), base_quaternion=tuple(turn.tolist())
+        robot, base_position=(float(pose[0]), 0.0, float(pose[2])), base_quaternion=tuple(quaternion.tolist())
     )
     return Course(robot=robot, place=(0.42, 0.0), least=(0.55, -0.1), largest=(0.7, 0.1), steepness=300.0)
 
@@ -64,5 +64,5 @@ class QuadrupedPush(PushTask):
     def __init__(self, n_envs: int, options: EnvOptions) -> None:
         super().__init__(n_envs, options, course())
 
-    def backdrop(self) -> Bullet:
+    def picture_world(self) -> Bullet:
         return standing(0.005, PITCH)[0]

@@ -31,7 +31,7 @@ NEAR = 0.05
 LENGTH = 0.5
 """Of the robot [m]: what distances of another robot's Reach are scaled by."""
 BEND = 1.6
-"""Of a segment of another robot, toward d1 and d2, at most [rad]: that of the paper's, 12 mm of wires at
+"""Of a segment of another robot, toward d1 and d2, at most [rad]: that of the paper's, 12 mm of tendons at
 7.5 mm."""
 _N_GOALS = 512  # postures whose tips are another robot's goals
 _HALF = 0.5  # of the limits: from anywhere within them the baseline finds all goals of the shipped robots
@@ -198,7 +198,7 @@ class Reach(ReachTask):
     def baseline(self) -> Floats:
         return self.toward((self.desired - self.measured()) / (2.0 * self.dt))
 
-    def scenery(self, i: int) -> Backdrop:
+    def backdrop(self, i: int) -> Backdrop:
         ball = Ball(self.desired[i], 0.012 * self.size, (0.85, 0.2, 0.15))
         if self._places is None:
             return Backdrop(tubes=(self.tube(i),), balls=(ball,))
