@@ -40,7 +40,7 @@ class Springs:
 
 def play_drives(bus: str, ends: Any) -> None:
     """The drives alone, until the other end speaks."""
-    with EmulatedDrives(SPECS, bus, clock=WallClock(), wires=Springs()) as drives:
+    with EmulatedDrives(SPECS, bus, clock=WallClock(), tendons=Springs()) as drives:
         ends.send("ready")
         ends.recv()
         ends.send(drives.missed_setpoints)

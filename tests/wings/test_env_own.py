@@ -189,7 +189,7 @@ def variant(**given: Any) -> Any:
         (lambda: variant(n_draws="two"), "Other.n_draws is 'two'; it must be of type int."),
         (
             lambda: registration.task_class("Aim").__mro__[1],
-            "task RodTask is not complete; it lacks baseline, begin",
+            "task RodTask is not complete; it lacks backdrop, baseline, begin",
         ),
     ],
 )
