@@ -79,8 +79,6 @@ ALLOWED: dict[str, str] = {
     "fastrod/hosts/mounted.py": "touch",
     "fastrod/hosts/mujoco.py": "touch",
     # names of modules that are not covered yet
-    "fastrod/commands/demo.py": "hands",
-    "fastrod/commands/drive.py": "hands pilot told",
     "fastrod/generation/draws.py": "wire",
     "fastrod/generation/settling.py": "carry reach",
     "viewer/fastrod_viewer/picture.py": "reach",

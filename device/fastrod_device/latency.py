@@ -188,7 +188,7 @@ def sweep(hardware: Hardware, t: Floats) -> Floats:
     def lengths_at(times: Floats) -> Floats:
         grown = np.clip(np.minimum(times, _SWEEP - times) / _RAMP, 0.0, 1.0)
         bend = _BEND / routing.n_segments * grown[:, None] * np.sin(2.0 * np.pi * np.outer(times, _WAVES))
-        return routing.lengths_at(np.repeat(bend[:, None], routing.n_segments, axis=1))
+        return routing.wires(np.repeat(bend[:, None], routing.n_segments, axis=1))
 
     path = lengths_at(whole)
     bends = _BEND * math.sqrt(2.0) / routing.n_segments

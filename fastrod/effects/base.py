@@ -96,10 +96,11 @@ class Parameter:
                 f"parameter {self.name!r} has neutral value {self.neutral}; it must lie in "
                 f"its bounds {low} to {high}."
             )
-        if self.of not in ("", "offset", "length"):
-            old = " ('reach' is called 'offset' now)" if self.of == "reach" else ""
+        given: str = self.of  # a law of somebody's package may say anything
+        if given not in ("", "offset", "length"):
+            old = " ('reach' is called 'offset' now)" if given == "reach" else ""
             raise EffectError(
-                f"parameter {self.name!r} is of {self.of!r}; it must be 'offset', 'length' or ''{old}."
+                f"parameter {self.name!r} is of {given!r}; it must be 'offset', 'length' or ''{old}."
             )
         if self.typical is None:
             span = 0.1 * (high - low)
