@@ -15,6 +15,7 @@ import numpy as np
 
 from fastrod.contact.contacts import TOUCHES, Contacts
 from fastrod.contact.frames import back_by, between, blended, frames_of, longest_move
+from fastrod.contact.progress import Damping, Progress
 from fastrod.contact.scene import ContactScene
 from fastrod.contact.tree import pack
 from fastrod.contact.trouble import NO_CONTACT_LEFT, NO_NODE_LEFT, sentence
@@ -31,6 +32,7 @@ from fastrod.kernels.contact.bvh import STACK
 from fastrod.kernels.contact.contact_set import SLOT, T_FORCE, T_GAP, T_N, T_OBSTACLE, T_RADIUS, T_S
 from fastrod.kernels.contact.iteration import (
     AT_REST,
+    BACK,
     GOES_ON,
     INSIDE,
     LOST,
@@ -61,13 +63,18 @@ Pass = Callable[[Ints, Ports, RodShape, PointLoads], None]
 MOST_FOUND = 64
 """Candidates of one robot that a look notes."""
 _BLOCK = 2048  # robots whose linear models are held at once
-# and twice as many for a robot that moves by less than this part of its length
-_MOST_PASSES, _NEARLY = 16, 1e-4
+_MOST_PASSES = 16  # and more for a robot that comes closer to rest
+_NEARLY = 1e-4  # of the length
+_LONGEST, _IDLE = (
+    4,
+    6,
+)  # as many times the passes are the end; passes in a row that came no closer: it goes in circles
 _MOST_INSIDE = 8  # passes in a row with the centreline inside of an obstacle: the step led too far
 _SMALLEST_PART = 1.0 / 64.0
-# part of the way below which a failure is taken for the loss of the equilibrium, not for too long a step
-_HARD = 1.0 / 4.0
-_DAMPING, _MOST_DAMPED, _DAMPED_TRIES = 1.5, 60, 6
+_HARD = (
+    1.0 / 4.0
+)  # part of the way below which a failure is taken for the loss of the equilibrium, not for too long a step
+_MOST_DAMPED, _DAMPED_TRIES, _MOST_REFUSED = 150, 10, 12
 _WANDERS = 1e-2  # of the length: a robot that moves by less goes around a place where it may come to rest
 # passes in a row without forces that obey the law: the hold is lost, and plain passes do not bring it back
 _UNSOLVED = 6
@@ -243,14 +250,7 @@ class Engine:
             self.clearance.distance[elsewhere] -= moved[elsewhere, None]
             ports = end if start is None or (aim[way] >= 1.0).all() else blended(start, end, aim)
             rest, unheld = self._settle(
-                way,
-                ports,
-                memory,
-                shape,
-                run,
-                self._scenery(shape, tolerance, done, aim),
-                passes,
-                _MOST_PASSES,
+                way, ports, memory, shape, run, self._scenery(shape, tolerance, done, aim), passes
             )
             wanders = (self.trouble[:, 0] == MOVES) & (self.trouble[:, 3] < _WANDERS * self.rods.reach)
             given_up = (stride <= _HARD) | unheld | self.whole_worlds(wanders)
@@ -262,8 +262,9 @@ class Engine:
                     count[hard],
                     slot[hard],
                 )
-                damped = self._scenery(shape, tolerance, done, aim, _DAMPING)
-                rest |= self._settle(hard, ports, memory, shape, run, damped, passes, _MOST_DAMPED)[0]
+                rest |= self._descend(
+                    hard, ports, memory, shape, run, self._scenery(shape, tolerance, done, aim), passes, tries
+                )
             good, bad = way[rest[way]], way[~rest[way]]
             trouble[bad] = self.trouble[bad]
             done[good] = aim[good]
@@ -394,14 +395,13 @@ class Engine:
         run: Pass,
         scenery: SceneArrays,
         passes: Ints,
-        most: int,
     ) -> tuple[Flags, Flags]:
         """Pass and law in turn on these inputs; (n_robots,) which came to rest, and which were given up as no
         forces hold them."""
         rest = np.zeros(len(self.gap), bool)
-        unsolved, inside = np.zeros(len(rest), np.int64), np.zeros(len(rest), np.int64)
-        still, plain = rows, scenery.damping == 0.0
-        for count in range(2 * most if plain else 3 * most):
+        unsolved, inside = (np.zeros(len(rest), np.int64) for _ in range(2))
+        progress, still = Progress(len(rest)), rows
+        for count in range(_LONGEST * _MOST_PASSES):
             status = self._iterate(still, ports, memory, shape, run, scenery)
             passes[still] += 1
             rest[still[status == AT_REST]] = True
@@ -410,19 +410,66 @@ class Engine:
                 self.gap[still] < -self.rods.radius[still].max(1) - _NEARLY * self.rods.reach[still]
             )
             inside[still] = np.where(deep, inside[still] + 1, 0)
-            hopeless = (inside >= (_MOST_INSIDE if plain else 3 * _MOST_INSIDE)) | (
-                plain & (unsolved >= _UNSOLVED)
-            )
-            if count >= most - 1:  # go on with what has nearly come to rest
-                hopeless |= ~(
-                    (self.trouble[:, 3] < _NEARLY * self.rods.reach)
-                    & np.isin(self.trouble[:, 0], (MOVES, INSIDE))
-                )
+            hopeless = (inside >= _MOST_INSIDE) | (unsolved >= _UNSOLVED)
+            progress.note(still, self.trouble[still, 4])
+            if count >= _MOST_PASSES - 1:  # go on with what comes closer to rest
+                hopeless |= progress.idle >= _IDLE
             still = still[(status != AT_REST) & (status != LOST) & ~self.whole_worlds(hopeless)[still]]
             if not len(still):
                 break
         self._count_contacts(rows[~rest[rows]], ports)
         return rest, unsolved >= _UNSOLVED
+
+    def _descend(
+        self,
+        rows: Ints,
+        ports: Ports,
+        memory: Memory,
+        shape: RodShape,
+        run: Pass,
+        scenery: SceneArrays,
+        passes: Ints,
+        tries: Ints,
+    ) -> Flags:
+        """The same where no equilibrium is near, damped: down in energy to one, in passes that go through
+        nothing; (n_robots,) which came to rest. A pass that goes through something, or finds no forces, is
+        taken back; `tries` counts this one."""
+        n = len(self.gap)
+        rest, still = np.zeros(n, bool), rows
+        progress, damping = Progress(n), Damping(scenery.damping, rows, tries)
+        frames = np.broadcast_to(scenery.frames, (n, *scenery.frames.shape[1:]))
+        frames_before = np.array(np.broadcast_to(scenery.frames_before, frames.shape))
+        scenery = scenery._replace(
+            before=RodShape(*(np.array(a) for a in scenery.before)), frames_before=frames_before
+        )
+        x, used, slot = memory.x.copy(), self.touching.used.copy(), self.touching.slot.copy()
+        for count in range(_LONGEST * _MOST_DAMPED):
+            here = memory.x[still].copy(), self.touching.used[still].copy(), self.touching.slot[still].copy()
+            status = self._iterate(still, ports, memory, shape, run, scenery)
+            passes[still] += 1
+            rest[still[status == AT_REST]] = True
+            away, on = still[status == BACK], still[status != BACK]
+            memory.x[away], self.touching.used[away], self.touching.slot[away] = (
+                x[away],
+                used[away],
+                slot[away],
+            )
+            x[on], used[on], slot[on] = (a[status != BACK] for a in here)
+            for last, now in zip(scenery.before, shape, strict=True):
+                last[on] = now[on]
+            frames_before[on] = frames[on]
+            progress.note(on, self.trouble[on, 4])
+            damping.note(on, self.trouble[on, 4])
+            damping.refuse(away)
+            hopeless = damping.refused >= _MOST_REFUSED
+            hopeless[away] |= used[away] == 0  # what touches nothing is not damped
+            if count >= _MOST_DAMPED - 1:
+                hopeless |= progress.idle >= 2 * _IDLE
+            still = still[(status != AT_REST) & (status != LOST) & ~self.whole_worlds(hopeless)[still]]
+            if not len(still):
+                break
+        self._count_contacts(rows[~rest[rows]], ports)
+        return rest
 
     def _count_contacts(self, rows: Ints, ports: Ports) -> None:
         """Say of robots that stay inside of something whether they lack contacts, or nodes to put them on."""
@@ -495,7 +542,7 @@ class Engine:
         if homeless.any():  # more contacts than nodes: what has no node has not been felt
             for r in np.flatnonzero(homeless.any(1)):
                 q = homeless[r].argmax()
-                self.trouble[rows[r]] = NO_NODE_LEFT, slot[r, q, T_OBSTACLE], slot[r, q, T_S], 0.0
+                self.trouble[rows[r], :4] = NO_NODE_LEFT, slot[r, q, T_OBSTACLE], slot[r, q, T_S], 0.0
                 status[r] = LOST if status[r] == LOST else GOES_ON
         return status
 
@@ -521,9 +568,7 @@ class Engine:
     def _parts(self, n: int) -> int:
         return 1 if n <= _FEW else min(self.threads, n)
 
-    def _scenery(
-        self, shape: RodShape, tolerance: float, done: Floats, aim: Floats, damping: float = 0.0
-    ) -> SceneArrays:
+    def _scenery(self, shape: RodShape, tolerance: float, done: Floats, aim: Floats) -> SceneArrays:
         """The obstacles at the part `aim` of their way, and at the part `done` that is behind."""
         if self.poses is self.poses_before and not self.velocities:
             frames = before = slip = frames_of(self.poses)
@@ -544,11 +589,12 @@ class Engine:
             slip,
             shape,
             history,
+            history,
             self.tracked,
             self.tracked & self.slides,
             tolerance,
             self.scene.watch,
-            damping,
+            np.zeros(len(self.gap)),
         )
 
 

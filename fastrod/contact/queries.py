@@ -57,7 +57,19 @@ def _gap(
     frames = np.ascontiguousarray(frames_of(poses)[:, which])
     nobody = np.zeros(n, bool)
     scenery = SceneArrays(
-        engine.rods, surfaces, frames, frames, frames, shape, shape, nobody, nobody, 1e-9, _EVERYTHING, 0.0
+        engine.rods,
+        surfaces,
+        frames,
+        frames,
+        frames,
+        shape,
+        shape,
+        shape,
+        nobody,
+        nobody,
+        1e-9,
+        _EVERYTHING,
+        np.zeros(len(nobody)),
     )
     finite = np.isfinite(shape.position).all((1, 2))
     gap, some = np.full(n, np.nan), np.flatnonzero(finite if rows is None else finite & rows)

@@ -118,7 +118,7 @@ def _largest_load(params: Params, ports: Ports) -> float:
     )
     force += size(ports.line_force) * (length + segments * float(np.abs(ports.extension).max(initial=0.0)))
     force += size(ports.node_force) * ports.node_force.shape[1]
-    return force * length / float(params.moment_scale.min())
+    return float(force * length / params.moment_scale.min())
 
 
 def what_to_do(passes: BoundarySolver, ports: Ports, row: int) -> str:

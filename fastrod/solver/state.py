@@ -157,4 +157,4 @@ def check_snapshot(
 
 def copied(memory: Memory) -> Memory:
     """A memory with arrays of its own."""
-    return Memory(*(a.copy() for a in memory))
+    return Memory._make(a.copy() for a in memory)

@@ -118,7 +118,8 @@ class Statics:
         linear = Linear(self._passes, rows, ports)
         if derive and self._bare is None and len(rows) == self.n_robots and linear.fits(turning=True):
             relocate = self._relocated if given.point_force else None
-            shape, self._derived = linear.step(relocate, True, self.outputs, **self._noise)
+            process, noise = self._noise
+            shape, self._derived = linear.step(relocate, True, self.outputs, process=process, noise=noise)
         else:
             shape = self._passes.new_shape(self.outputs, len(rows) < self.n_robots)
             kept = self._keeps_jacobian(learns)[rows]
@@ -141,16 +142,17 @@ class Statics:
         return self._finish(ports, shape, ok, passes, DIVERGED, Problem.DIVERGED, rows[~ok[rows]])
 
     @property
-    def _noise(self) -> dict[str, float]:
-        """Of one step."""
-        return {
-            "process": self.observer.process_noise * self.dt,
-            "noise": self.observer.measurement_noise / self.dt,
-        }
+    def _noise(self) -> tuple[float, float]:
+        """Process and measurement noise of one step."""
+        return self.observer.process_noise * self.dt, self.observer.measurement_noise / self.dt
 
     def _observe(self, rows: Ints, ports: Ports, shape: RodShape, *, predict: bool) -> None:
         """A pass of the observer, with its own gains."""
-        self._passes.run(rows, ports, shape, predict=predict, propagate=self._passes.propagate, **self._noise)
+        process, noise = self._noise
+        propagate = self._passes.propagate
+        self._passes.run(
+            rows, ports, shape, predict=predict, propagate=propagate, process=process, noise=noise
+        )
 
     def _learn_force(self, rows: Ints, ports: Ports) -> None:
         """A pass that changes nothing but the gain, which now knows a tip force."""

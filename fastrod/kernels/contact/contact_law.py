@@ -3,7 +3,8 @@ friction.
 
 The motion of contact c in its own frame (normal, two tangents) is u = b + W lambda; W is the compliance
 between contacts (symmetric), b the motion without contact forces: the gap along the normal, the slip since
-the last step along the tangents. Normal:   0 <= lambda_n,  0 <= u_n + compliance lambda_n,  their product 0.
+the last step along the tangents.
+Normal:   0 <= lambda_n,  0 <= u_n + compliance lambda_n,  their product 0.
 Friction: |lambda_t| <= mu lambda_n; where it slips, lambda_t = -mu lambda_n u_t / |u_t|.
 
 First an active set: each contact is open, sticks or slips; the equations of these states are solved together,

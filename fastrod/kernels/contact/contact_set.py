@@ -241,7 +241,7 @@ def choose(
             lonely = _CLOSE * spacing
         if near >= 0:
             slot[near, T_TAKEN] = 1.0
-            if gap >= slot[near, T_GAP] - 1e-10:
+            if gap >= slot[near, T_GAP] - (1e-10 if slot[near, T_ARM] > 0.0 else 0.0):
                 continue
             settles = nearest < max(0.5 * slot[near, T_SHIFT], _CLOSE * spacing)
             if settles or not carries(slot[near]) or slot[near, T_ARM] > 0.0:

@@ -34,12 +34,16 @@ from .problem import SceneArrays, apply_law, forces_size
 from .proximity import CANDIDATE, ProximityOptions, crosses, entered, search_obstacles
 from .rod_proximity import search_rods
 
-GOES_ON, AT_REST, LOST = 0, 1, 2
+GOES_ON, AT_REST, LOST, BACK = 0, 1, 2, 3
+"""Of a world after a pass; BACK: a damped iteration went through something, or found no forces, and is to go
+less far."""
 NOTHING, MOVES, UNSOLVED, INSIDE, THROUGH, DIVERGED = 0, 1, 2, 3, 4, 5
 """What keeps a robot from rest: it still moves, its forces do not obey the law, the rod is inside of
 something, it went through something, its numbers are no numbers."""
-# numbers of one: which of these, obstacle (from n_obstacles on: rods; -1: none), arclength, size [m]
-TROUBLE = 4
+TROUBLE = 5
+"""Numbers of one: which of these, obstacle (from n_obstacles on: rods; -1: none), arclength, size [m], and
+how far its world is from rest: the largest of motion, residual and violation [m]."""
+_NO_FORCE = 1e-12  # of the largest: what rounding leaves of a force that is gone
 _MOST_FOUND = 64
 # of EI/l in the base moment, about radians of bend: farther the linear model does not reach
 _LONGEST_TURN = 0.5
@@ -240,24 +244,36 @@ def iterate_world(
             solved = solved and stands(touching.used[rows[r]], touching.slot[rows[r]], scenery.tolerance)
     rest = solved and farthest <= scenery.tolerance and worst <= scenery.tolerance
     through = False
-    for r in range(first, last if rest else first):
+    for r in range(first, last):
+        trouble[rows[r], 4] = max(farthest, worst)
+    damped = scenery.damping[rows[first]] > 0.0
+    for r in range(first, last if rest or damped else first):
         crossed, where_s = went_through(rows[r], scenery, clearance, True, scratch)
         through = through or crossed >= 0
-        _say(trouble[rows[r]], THROUGH if crossed >= 0 else NOTHING, crossed, where_s, 0.0)
+        if crossed >= 0:
+            _say(trouble[rows[r]], THROUGH, crossed, where_s, 0.0)
+        elif rest:
+            _say(trouble[rows[r]], NOTHING, -1, 0.0, 0.0)
+    back = damped and (through or not solved)
     for r in range(first, last):
-        status[r] = LOST if through else AT_REST if rest else GOES_ON
-    if rest:
-        for r in range(first, last):
+        status[r] = BACK if back else LOST if through else AT_REST if rest else GOES_ON
+    if rest or back:
+        for r in range(first, last if rest else first):
             touching.used[rows[r]] = pressed_only(touching.used[rows[r]], touching.slot[rows[r]])
         return
     for r in range(first, last):
         i = rows[r]
-        slot = touching.slot[i]
+        slot, most = touching.slot[i], 0.0
         for q in range(touching.used[i]):
             for a in range(3):
                 slot[q, T_FORCE + a] = probes.force[r, q, a] + part * (
                     proposed[r, q, a] - probes.force[r, q, a]
                 )
+                most = max(most, abs(slot[q, T_FORCE + a]))
+        for q in range(touching.used[i]):
+            for a in range(3):
+                if abs(slot[q, T_FORCE + a]) <= _NO_FORCE * most:
+                    slot[q, T_FORCE + a] = 0.0
         for a in range(n_x):
             memory.x[i, a] += part * unknown[r, a]
     for r in range(first, last):

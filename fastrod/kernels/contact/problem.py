@@ -49,14 +49,17 @@ class SceneArrays(NamedTuple):
     frames: Floats
     """(1 or n_robots, n_obstacles, 12) rotation row by row, position: world_from_obstacle."""
     frames_before: Floats
-    """(1 or n_robots, n_obstacles, 12) at the last step."""
+    """(1 or n_robots, n_obstacles, 12) when the rods were in `before`."""
     frames_slip: Floats
     """(1 or n_robots, n_obstacles, 12) where the obstacles' material was at the last step: what slip is
     counted from. Another than `frames_before` where a velocity was given (a belt moves, its frame does
     not)."""
     shape: RodShape
     before: RodShape
-    """The shapes at the last step; of length 0 if there is none."""
+    """Where the rods have come from, and through nothing since: the last step, or the last pass of a damped
+    iteration; of length 0 if there is none."""
+    before_slip: RodShape
+    """The shapes at the last step: what slip is counted from."""
     tracked: Flags
     """(n_robots,) `before` holds where the robot was."""
     slides: Flags
@@ -65,9 +68,9 @@ class SceneArrays(NamedTuple):
     """Motion, residual and violation below which a world is at rest [m]."""
     margin: float
     """Gap below which a contact is watched, as a part of the rod's length."""
-    damping: float
-    """0, or how many times the largest turning of a force is held against the motion of its point: where the
-    plain iteration finds no rest, this one goes down in energy, slowly."""
+    damping: Floats
+    """(n_robots,) 0, or how many times the largest turning of a force is held against the motion of its
+    point: where the plain iteration finds no rest, this one goes down in energy, slowly."""
 
 
 @inline
@@ -82,7 +85,7 @@ def _tangents(n: Vec) -> tuple[Vec, Vec]:
 @kernel
 def _material_before(i: int, node: int, slot: Numbers, scenery: SceneArrays) -> Vec:
     """Where the rod's material point of contact was at the last step, world."""
-    shape, before = scenery.shape, curve_of(scenery.before, i)
+    shape, before = scenery.shape, curve_of(scenery.before_slip, i)
     rotation = shape.rotation[i, node]
     arm = arm_of(slot)
     local = (
@@ -319,13 +322,24 @@ def _bend_model(
 
 
 @kernel
-def _keep_hold(first: int, last: int, rows: Ints, m: int, touching: ContactSet, stiff: Numbers) -> None:
+def _keep_hold(
+    first: int,
+    last: int,
+    rows: Ints,
+    m: int,
+    rods: ContactRods,
+    touching: ContactSet,
+    force: Numbers,
+    stiff: Numbers,
+) -> None:
     """Where no contact is curved any more, damp by a part of what was stiff some passes ago: a contact that
-    goes to and fro between an edge and a face would not come to rest, as the face by itself is not damped."""
-    most, kept = 0.0, 0.0
+    goes to and fro between an edge and a face would not come to rest, as the face by itself is not damped. No
+    contact that presses is damped less than by the bending stiffness of its rod, EI/l^3."""
+    most, kept, least = 0.0, 0.0, 0.0
     for c in range(m):
         most = max(most, stiff[c])
     for r in range(first, last):
+        least = max(least, rods.moment_scale[rows[r]] / rods.reach[rows[r]] ** 2)
         for q in range(touching.used[rows[r]]):
             kept = max(kept, _FORGETS * touching.slot[rows[r], q, T_HOLD])
     for c in range(m if most == 0.0 else 0):
@@ -333,6 +347,9 @@ def _keep_hold(first: int, last: int, rows: Ints, m: int, touching: ContactSet, 
     for r in range(first, last):
         for q in range(touching.used[rows[r]]):
             touching.slot[rows[r], q, T_HOLD] = max(most, kept)
+    for c in range(m):
+        if force[3 * c] > 0.0:
+            stiff[c] = max(stiff[c], least)
 
 
 @kernel
@@ -412,7 +429,10 @@ def apply_law(
     stack, o = work[o : o + 2 * STACK], o + 2 * STACK
     scratch = work[o:]
     n = _assemble(first, last, rows, touching, probes, start, model)
-    m, bent = 0, scenery.damping > 0.0
+    damping = 0.0
+    for r in range(first, last):
+        damping = max(damping, scenery.damping[rows[r]])
+    m, bent = 0, damping > 0.0
     for r in range(first, last):
         i, base = rows[r], int(start[r - first])
         for q in range(touching.used[i]):
@@ -451,10 +471,10 @@ def apply_law(
             m += 1
     if m == 0:
         return True
-    if scenery.damping > 0.0:
-        _keep_hold(first, last, rows, m, touching, stiff)
+    if damping > 0.0:
+        _keep_hold(first, last, rows, m, scenery.rods, touching, force, stiff)
     if bent:
-        _bend_model(n, m, points, bends, stiff, scenery.damping, model, scratch)
+        _bend_model(n, m, points, bends, stiff, damping, model, scratch)
     for g in range(3 * n):
         change[g] = -now[g]
     W = matrix[: 9 * m * m].reshape((3 * m, 3 * m))
@@ -501,13 +521,13 @@ def apply_law(
             )
         for a in range(3):
             row = bends[c, 3 * a : 3 * a + 3]
-            turn = row[0] * v[0] + row[1] * v[1] + row[2] * v[2] - scenery.damping * stiff[c] * v[a]
-            force[3 * c + a] = turn
+            turn = row[0] * v[0] + row[1] * v[1] + row[2] * v[2] - damping * stiff[c] * v[a]
+            place[3 * c + a] = turn if force[3 * c] > 0.0 else 0.0  # what is open carries nothing
     for c in range(m if bent else 0):
         for side in range(2):
             g = int(points[2 * c + side])
             for a in range(3 if g >= 0 else 0):
-                change[3 * g + a] += (1.0 if side == 0 else -1.0) * force[3 * c + a]
+                change[3 * g + a] += (1.0 if side == 0 else -1.0) * place[3 * c + a]
     for r in range(first, last):
         base = int(start[r - first])
         for q in range(touching.used[rows[r]]):
