@@ -78,10 +78,6 @@ ALLOWED: dict[str, str] = {
     # an old option, which is refused with the new one
     "fastrod/hosts/mounted.py": "touch",
     "fastrod/hosts/mujoco.py": "touch",
-    # names of modules that are not covered yet
-    "fastrod/generation/draws.py": "wire",
-    "fastrod/generation/settling.py": "carry reach",
-    "viewer/fastrod_viewer/picture.py": "reach",
 }
 """Identifiers that stay, by file."""
 INSTEAD = {word: instead for words, instead in GONE.items() for word in words.split()}

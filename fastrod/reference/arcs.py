@@ -18,8 +18,8 @@ from fastrod.reference.rod import (
     POSITION,
     ROTATION,
     Array,
-    Problem,
     ReferenceShape,
+    RodProblem,
     Span,
     base_state,
     curvature_of_moment,
@@ -120,7 +120,7 @@ def arc_states(robot: Robot, backbone: Array, u: Array, fraction: Array) -> Arra
     return np.array(states)
 
 
-def first_guess(problem: Problem) -> tuple[Array, Array, Array, Array]:
+def first_guess(problem: RodProblem) -> tuple[Array, Array, Array, Array]:
     """Return the first guess of the solvers: arc curvature (n_segments, 3), tension (n_tendons,), base moment
     (3,), follower force (3,).
 
@@ -155,7 +155,7 @@ def first_guess(problem: Problem) -> tuple[Array, Array, Array, Array]:
     return u, tension, base_moment, follower
 
 
-def _load_moment(problem: Problem, backbone: Array, u: Array) -> tuple[Array, Array, Array]:
+def _load_moment(problem: RodProblem, backbone: Array, u: Array) -> tuple[Array, Array, Array]:
     """Moment of the loads on the arcs, material frame: mid-segment (n_segments, 3), base (3,); follower force
     (3,), world."""
     n = 10
@@ -171,12 +171,12 @@ def _load_moment(problem: Problem, backbone: Array, u: Array) -> tuple[Array, Ar
     return material[n :: 2 * n], material[0], follower
 
 
-def _ends(problem: Problem) -> list[tuple[float, float]]:
+def _ends(problem: RodProblem) -> list[tuple[float, float]]:
     ends = [0.0, *problem.segment_end.tolist()]
     return list(pairwise(ends))
 
 
-def _span_at(problem: Problem, s: float) -> Span:
+def _span_at(problem: RodProblem, s: float) -> Span:
     return next((span for span in problem.spans if s <= span.end), problem.spans[-1])
 
 

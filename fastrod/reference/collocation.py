@@ -15,8 +15,8 @@ from fastrod.reference.rod import (
     CURVATURE,
     PATH,
     Array,
-    Problem,
     ReferenceShape,
+    RodProblem,
     base_state,
     grid,
     shape_of,
@@ -113,7 +113,7 @@ def solve_bvp(
     )
 
 
-def _sample(problem: Problem, solution: Callable[[Array], Array], s: Array) -> Array:
+def _sample(problem: RodProblem, solution: Callable[[Array], Array], s: Array) -> Array:
     """States (n_points, width) at arclengths `s`; a cut's point from the span before it."""
     ends = np.array([span.end for span in problem.spans])
     out = []
@@ -124,7 +124,7 @@ def _sample(problem: Problem, solution: Callable[[Array], Array], s: Array) -> A
     return np.array(out)
 
 
-def _conditions(problem: Problem, first: Array, last: Array, tension: Array, follower: Array) -> Array:
+def _conditions(problem: RodProblem, first: Array, last: Array, tension: Array, follower: Array) -> Array:
     """Base pose, everything but u continuous at each cut, total moment continuous there, and the tip;
     `first`, `last` (n_spans, width)."""
     scale = problem.length**2 / problem.bending_stiffness
@@ -138,7 +138,7 @@ def _conditions(problem: Problem, first: Array, last: Array, tension: Array, fol
     return np.concatenate([*residuals, tip_residual(problem, tension, follower, last[-1])])
 
 
-def _guess(problem: Problem, nodes: Array) -> tuple[Array, Array]:
+def _guess(problem: RodProblem, nodes: Array) -> tuple[Array, Array]:
     """Arcs under the first guess: stacked states (n_spans * width, n_nodes) and parameters.
 
     The last parameter is a spare, held at zero: scipy treats a problem without parameters as one of another

@@ -1,4 +1,4 @@
-"""Make a `Problem` of a robot and its inputs, with a sentence for everything that cannot be one."""
+"""Make a `RodProblem` of a robot and its inputs, with a sentence for everything that cannot be one."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fastrod.errors import InputError
 from fastrod.model.robot import Robot
-from fastrod.reference.rod import Array, Problem, Span
+from fastrod.reference.rod import Array, RodProblem, Span
 
 PointForce: TypeAlias = Sequence[tuple[float, ArrayLike]]
 """Pairs of arclength along the backbone as it is [m] and force (3,), world [N]."""
@@ -29,7 +29,7 @@ def make_problem(
     line_force: ArrayLike | None,
     point_force: PointForce | None,
     follower_tip_force: ArrayLike | None,
-) -> Problem:
+) -> RodProblem:
     """Inputs of one robot, checked; shapes and units as in `shoot`. Raises `InputError`."""
     paper = robot.segments[0].mode == "paper"
     mode = np.array([robot.segments[k].mode for k in robot.tendon_segment], dtype=str)
@@ -49,7 +49,7 @@ def make_problem(
         )
     segment_end = np.cumsum(segment_length(robot, extension))
     force = _vector("tip_force", tip_force, "N")
-    return Problem(
+    return RodProblem(
         robot=robot,
         paper=paper,
         spans=_spans(

@@ -83,7 +83,7 @@ class Span:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Problem:
+class RodProblem:
     """Boundary value problem of one robot: its spans from the base to the tip, its commands and its loads."""
 
     robot: Robot
@@ -127,7 +127,7 @@ class Problem:
         """(n_tendons,) tension at which a tendon has its commanded length [N]."""
         return np.array([tendon.pretension for tendon in self.robot.tendons])
 
-    def scaled(self, fraction: float) -> Problem:
+    def scaled(self, fraction: float) -> RodProblem:
         """Return this robot under a fraction of its loads."""
         spans = tuple(
             replace(s, line_force=fraction * s.line_force, force=fraction * s.force) for s in self.spans
@@ -235,7 +235,7 @@ def curvature_of_moment(span: Span, tension: Array, moment: Array, u: Array) -> 
     return u
 
 
-def tip_residual(problem: Problem, tension: Array, tip_force: Array, tip: Array) -> Array:
+def tip_residual(problem: RodProblem, tension: Array, tip_force: Array, tip: Array) -> Array:
     """Return the residual at the tip of a trial [m]: lengths of the free tendons, m(l) - R^T M, follower
     force.
 
@@ -252,7 +252,7 @@ def tip_residual(problem: Problem, tension: Array, tip_force: Array, tip: Array)
     return np.concatenate(blocks)
 
 
-def grid(problem: Problem, points_per_segment: int) -> Array:
+def grid(problem: RodProblem, points_per_segment: int) -> Array:
     """(n_points,) arclength of the points of a `ReferenceShape` [m]."""
     ends = np.concatenate([[0.0], problem.segment_end])
     pieces = [np.linspace(a, b, points_per_segment + 1)[1:] for a, b in pairwise(ends)]

@@ -18,8 +18,8 @@ from fastrod.reference.rod import (
     PATH,
     ROTATION,
     Array,
-    Problem,
     ReferenceShape,
+    RodProblem,
     Span,
     base_state,
     curvature_of_moment,
@@ -140,7 +140,7 @@ class _Search:
     tolerance: float
 
 
-def _scale(problem: Problem) -> tuple[float, float, float]:
+def _scale(problem: RodProblem) -> tuple[float, float, float]:
     """Units that make every unknown about one: moment or curvature, tension, force."""
     offset = (
         max((float(np.abs(span.offset).max(initial=0.0)) for span in problem.spans), default=0.0)
@@ -150,13 +150,13 @@ def _scale(problem: Problem) -> tuple[float, float, float]:
     return (1.0 / problem.length if problem.paper else moment), moment / offset, moment / problem.length
 
 
-def _pack(problem: Problem, base: Array, tension: Array, follower: Array) -> Array:
+def _pack(problem: RodProblem, base: Array, tension: Array, follower: Array) -> Array:
     first, second, third = _scale(problem)
     blocks = [base.ravel() / first, tension[problem.free] / second]
     return np.concatenate([*blocks, follower / third] if problem.follows else blocks)
 
 
-def _unpack(problem: Problem, x: Array) -> tuple[Array, Array, Array]:
+def _unpack(problem: RodProblem, x: Array) -> tuple[Array, Array, Array]:
     """Base moment (3,), or in mode `paper` u_x, u_y per segment (n_segments, 2); tension (n_tendons,);
     follower force (3,), world."""
     first, second, third = _scale(problem)
@@ -169,12 +169,12 @@ def _unpack(problem: Problem, x: Array) -> tuple[Array, Array, Array]:
     return (base.reshape(-1, 2) if problem.paper else base), tension, follower
 
 
-def _guess(problem: Problem) -> Array:
+def _guess(problem: RodProblem) -> Array:
     u, tension, moment, follower = first_guess(problem)
     return _pack(problem, u[:, :2] if problem.paper else moment, tension, follower)
 
 
-def _from_shape(problem: Problem, shape: ReferenceShape) -> Array:
+def _from_shape(problem: RodProblem, shape: ReferenceShape) -> Array:
     """Unknowns of an earlier shape."""
     n = problem.robot.n_segments
     if shape.tension.shape != (problem.robot.n_tendons,) or (len(shape.arclength) - 1) % n:
@@ -190,7 +190,7 @@ def _from_shape(problem: Problem, shape: ReferenceShape) -> Array:
     return _pack(problem, base, tension, shape.tip_rotation @ problem.follower)
 
 
-def _march(search: _Search, problem: Problem, x: Array, points: Array | None = None) -> Array:
+def _march(search: _Search, problem: RodProblem, x: Array, points: Array | None = None) -> Array:
     """States (p, 15 + n_tendons) at `points`, base included, or the tip's alone (1, 15 + n_tendons).
 
     Raises ArithmeticError where a trial breaks off.
@@ -211,7 +211,9 @@ def _march(search: _Search, problem: Problem, x: Array, points: Array | None = N
     return state[None] if points is None else np.concatenate(out)
 
 
-def _entry(problem: Problem, before: Span | None, span: Span, base: Array, tension: Array, u: Array) -> Array:
+def _entry(
+    problem: RodProblem, before: Span | None, span: Span, base: Array, tension: Array, u: Array
+) -> Array:
     """Curvature (3,) at the base of a segment, after `u` (3,) at the end of the one before."""
     if problem.paper:
         return np.array([*base[span.segment], 0.0])
@@ -222,7 +224,7 @@ def _entry(problem: Problem, before: Span | None, span: Span, base: Array, tensi
 
 def _along(
     search: _Search,
-    problem: Problem,
+    problem: RodProblem,
     span: Span,
     tension: Array,
     follower: Array,
@@ -250,7 +252,7 @@ def _along(
     return end, np.asarray(found.sol(inside)).T if len(inside) else np.zeros((0, len(state)))
 
 
-def _missed(search: _Search, problem: Problem, x: Array) -> Array:
+def _missed(search: _Search, problem: RodProblem, x: Array) -> Array:
     """All boundary residuals of a trial [m]."""
     _, tension, follower = _unpack(problem, x)
     try:
@@ -268,7 +270,7 @@ def _missed(search: _Search, problem: Problem, x: Array) -> Array:
     return np.concatenate([length, compliance * (tip[ROTATION].reshape(3, 3) @ problem.follower - follower)])
 
 
-def _solve(search: _Search, problem: Problem, guess: Array) -> tuple[Array, float, int]:
+def _solve(search: _Search, problem: RodProblem, guess: Array) -> tuple[Array, float, int]:
     """Unknowns, largest residual [m] and forward passes of one search."""
     passes = 0
 
@@ -382,7 +384,7 @@ def _half_squares(residual: Residual, jacobian: Residual) -> tuple[Callable[[Arr
 _FIND = {"lm": _least_squares, "slsqp": _slsqp, "trust-constr": _trust_constr}
 
 
-def _continued(search: _Search, problem: Problem, guess: Array | None) -> tuple[Array, float, int]:
+def _continued(search: _Search, problem: RodProblem, guess: Array | None) -> tuple[Array, float, int]:
     """One search; where it fails, or the loads are large, the loads in steps, each from the shape before.
 
     Under large loads a cantilever has several equilibria: the one that grows out of the unloaded rod is
@@ -415,7 +417,7 @@ def _continued(search: _Search, problem: Problem, guess: Array | None) -> tuple[
     return x, missed, passes + more
 
 
-def _load_bend(problem: Problem) -> float:
+def _load_bend(problem: RodProblem) -> float:
     """About how far the loads alone would bend the straight rod [rad]; a cantilever's P l^2 / EI."""
     force = max(
         float(np.linalg.norm(internal_force(span, np.array([span.start]), problem.follower)))
@@ -429,8 +431,8 @@ def _load_bend(problem: Problem) -> float:
 
 
 def _complementary(
-    search: _Search, problem: Problem, guess: Array | None
-) -> tuple[Problem, Array, float, int]:
+    search: _Search, problem: RodProblem, guess: Array | None
+) -> tuple[RodProblem, Array, float, int]:
     """Search with the right tendons slack: T >= 0, path no longer than the tendon, and one of them tight."""
     unilateral = np.array([tendon.unilateral for tendon in problem.robot.tendons], dtype=bool) & problem.free
     tendon_path = problem.tendon_length - problem.compliance * problem.pretension

@@ -14,7 +14,7 @@ from . import shape as sh
 from .gather import pick, unknown_unit
 from .lanes import W, at, clear, get, get_mat, read, write, write_at
 from .observer import gain
-from .workspace import Batch, Chunk, Mode, Workspace
+from .workspace import Batch, Chunk, Mode, PassWorkspace
 
 
 @inline
@@ -28,7 +28,7 @@ def slack_slope(params: Params, i: int, t: int) -> float:
 
 
 @kernel
-def close_lengths(chunk: Chunk, batch: Batch, work: Workspace) -> None:
+def close_lengths(chunk: Chunk, batch: Batch, work: PassWorkspace) -> None:
     """l_i - L_i - c_i (T_i - T0_i) and its derivatives, one row for each commanded tendon."""
     params, ports, layout, _ = batch
     n_base = 2 * len(layout.first_tendon) if layout.paper else 3
@@ -57,7 +57,7 @@ def close_lengths(chunk: Chunk, batch: Batch, work: Workspace) -> None:
 
 
 @kernel
-def close_tip(chunk: Chunk, batch: Batch, work: Workspace) -> None:
+def close_tip(chunk: Chunk, batch: Batch, work: PassWorkspace) -> None:
     """m - R^T M_tip, and with a follower force F - R F_material, as lengths, with their derivatives."""
     params, ports, layout, _ = batch
     row, node, columns = len(layout.row_tendon), work.rod.node, work.sens.columns
@@ -93,7 +93,7 @@ def close_tip(chunk: Chunk, batch: Batch, work: Workspace) -> None:
 
 
 @kernel
-def release_slack_tendons(chunk: Chunk, batch: Batch, work: Workspace) -> None:
+def release_slack_tendons(chunk: Chunk, batch: Batch, work: PassWorkspace) -> None:
     """A slack tendon carries nothing: its unknown moves no residual but its own, and not the tip."""
     params, layout = batch.params, batch.layout
     for f in range(len(layout.free_tendon) if work.size.col > 0 else 0):
@@ -109,7 +109,7 @@ def release_slack_tendons(chunk: Chunk, batch: Batch, work: Workspace) -> None:
 
 
 @kernel
-def form_gain(chunk: Chunk, batch: Batch, work: Workspace, mode: Mode) -> None:
+def form_gain(chunk: Chunk, batch: Batch, work: PassWorkspace, mode: Mode) -> None:
     """G of the scaled unknowns from the derivatives of the residuals, and the unknowns' units."""
     n_x, n_e, P = work.size.x, work.size.e, work.covariance
     for w in range(W):
@@ -137,7 +137,7 @@ def form_gain(chunk: Chunk, batch: Batch, work: Workspace, mode: Mode) -> None:
 
 
 @kernel
-def update_boundary(chunk: Chunk, batch: Batch, work: Workspace, mode: Mode) -> None:
+def update_boundary(chunk: Chunk, batch: Batch, work: PassWorkspace, mode: Mode) -> None:
     """The observer's update of x and P, and the gain kept for the next inputs."""
     form_gain(chunk, batch, work, mode)
     memory, n_x, n_e, defect = batch.memory, work.size.x, work.size.e, work.vector
@@ -164,7 +164,7 @@ def update_boundary(chunk: Chunk, batch: Batch, work: Workspace, mode: Mode) -> 
 
 
 @kernel
-def _keep_force_gain(chunk: Chunk, batch: Batch, work: Workspace) -> None:
+def _keep_force_gain(chunk: Chunk, batch: Batch, work: PassWorkspace) -> None:
     """How x answers a tip force, beside the gain."""
     params, memory, n_x, n_e, n_col = batch.params, batch.memory, work.size.x, work.size.e, work.size.col
     for w in range(chunk.n_robots):
@@ -183,7 +183,7 @@ def _keep_force_gain(chunk: Chunk, batch: Batch, work: Workspace) -> None:
 
 
 @kernel
-def correct_with_kept_gain(chunk: Chunk, batch: Batch, work: Workspace) -> None:
+def correct_with_kept_gain(chunk: Chunk, batch: Batch, work: PassWorkspace) -> None:
     """The update of x by the gain of an earlier pass: Newton's method with a kept Jacobian (chord Newton)."""
     memory = batch.memory
     for w in range(chunk.n_robots):

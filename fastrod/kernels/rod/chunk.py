@@ -28,7 +28,18 @@ from .boundary import (
 from .gather import gather_base, gather_segment, gather_step, pick, predict, scatter, scatter_node
 from .lanes import Lanes, W, at, clear, get, get_mat, put, read, write
 from .point_loads import arrive, leave, load_base, load_column, respond
-from .workspace import Batch, Chunk, Mode, Output, Rod, Sensitivities, Workspace, carve, scratch_size, sizes
+from .workspace import (
+    Batch,
+    Chunk,
+    Mode,
+    Output,
+    PassWorkspace,
+    RodLanes,
+    Sensitivities,
+    carve,
+    scratch_size,
+    sizes,
+)
 
 __all__ = ["Batch", "Chunk", "Mode", "Output", "pass_chunk", "scratch_size"]
 ITERATIONS = (
@@ -60,7 +71,7 @@ def solve_section(
 
 
 @inline
-def finish_stages(rod: Rod, first: int, n: int, loaded: bool, iterations: int) -> None:
+def finish_stages(rod: RodLanes, first: int, n: int, loaded: bool, iterations: int) -> None:
     """Stages two to four of a step whose first one is solved, and its end."""
     node, stages, tendon, paths = rod
     middle, end = node[(sh.N_K + 3) * W :], node[(sh.N_K + 6) * W :]
@@ -83,7 +94,7 @@ def march_columns(
     j: int,
     with_positions: bool,
     layout: Layout,
-    rod: Rod,
+    rod: RodLanes,
     sens: Sensitivities,
     loads: PointLoads,
     chunk: Chunk,
@@ -163,7 +174,7 @@ def _is_varied(ports: Ports) -> bool:
 
 
 @kernel
-def _keep_curvature(rod: Rod) -> None:
+def _keep_curvature(rod: RodLanes) -> None:
     """u at the start of the step into the node."""
     for w in range(W):
         put(rod.node, sh.N_U, w, get(rod.stages, sh.S_U, w))
@@ -179,7 +190,7 @@ def add_base_moment(node: Lanes, wrench: Lanes, sign: float) -> None:
 
 
 @inline
-def march(chunk: Chunk, batch: Batch, output: Output, work: Workspace, mode: Mode) -> None:
+def march(chunk: Chunk, batch: Batch, output: Output, work: PassWorkspace, mode: Mode) -> None:
     """From base to tip: the rod, the tendons' lengths and the columns."""
     params, ports, layout, memory = batch
     rod, sens, n, loads = work.rod, work.sens, work.size.tendons, output.loads
@@ -226,7 +237,7 @@ def march(chunk: Chunk, batch: Batch, output: Output, work: Workspace, mode: Mod
 
 
 @inline
-def finish_tip(chunk: Chunk, batch: Batch, output: Output, work: Workspace, mode: Mode) -> None:
+def finish_tip(chunk: Chunk, batch: Batch, output: Output, work: PassWorkspace, mode: Mode) -> None:
     """What lies beyond the last step: loads on the tip, and the cross-section there."""
     params, layout, rod = batch.params, batch.layout, work.rod
     n, n_segments, loads = work.size.tendons, params.length.shape[1], output.loads
@@ -244,7 +255,7 @@ def finish_tip(chunk: Chunk, batch: Batch, output: Output, work: Workspace, mode
 
 
 @kernel
-def close(chunk: Chunk, batch: Batch, work: Workspace) -> None:
+def close(chunk: Chunk, batch: Batch, work: PassWorkspace) -> None:
     """The residuals with their derivatives, and the wrench on the base."""
     ports = batch.ports
     close_lengths(chunk, batch, work)
@@ -259,7 +270,7 @@ def close(chunk: Chunk, batch: Batch, work: Workspace) -> None:
 
 
 @kernel
-def write_summary(chunk: Chunk, output: Output, work: Workspace) -> None:
+def write_summary(chunk: Chunk, output: Output, work: PassWorkspace) -> None:
     """Tip, tensions, path lengths, base wrench and the largest residual of each robot."""
     shape, node = output.shape, work.rod.node
     for w in range(chunk.n_robots):
@@ -283,7 +294,7 @@ def write_summary(chunk: Chunk, output: Output, work: Workspace) -> None:
 
 
 @kernel
-def write_response(chunk: Chunk, output: Output, work: Workspace) -> None:
+def write_response(chunk: Chunk, output: Output, work: PassWorkspace) -> None:
     """Residuals, and the change of residuals and tip by each column; a column has the tip's rotation in the
     tip's
     frame, `response` in the world's."""

@@ -11,11 +11,13 @@ from . import shape as sh
 from .chunk import FIRST_ITERATIONS, finish_stages, solve_section
 from .gather import pick, scatter
 from .lanes import Lanes, W, get, get_mat, write
-from .workspace import Rod
+from .workspace import RodLanes
 
 
 @kernel
-def _node_before(lane: int, i: int, s: float, layout: Layout, shape: RodShape, rod: Rod) -> tuple[int, float]:
+def _node_before(
+    lane: int, i: int, s: float, layout: Layout, shape: RodShape, rod: RodLanes
+) -> tuple[int, float]:
     """Put the node before arclength s of robot i, and the step from there to s, into a lane; its number, and
     the
     fraction of the whole step."""
@@ -39,7 +41,7 @@ def _node_before(lane: int, i: int, s: float, layout: Layout, shape: RodShape, r
 
 @kernel
 def _loads_of_step(
-    lane: int, i: int, at: int, fraction: float, params: Params, ports: Ports, layout: Layout, rod: Rod
+    lane: int, i: int, at: int, fraction: float, params: Params, ports: Ports, layout: Layout, rod: RodLanes
 ) -> None:
     """Put the loads and stiffness of the step from node `at`, shortened to a fraction, into a lane."""
     node, k, j = rod.node, at // layout.n_steps, at % layout.n_steps
@@ -83,7 +85,7 @@ def between_nodes(
     n_t = n + sh.GROUP
     node, stages = np.zeros(sh.NODE * W), np.zeros(5 * sh.STAGE * W)
     tendon, path = np.zeros(n_t * sh.TENDON * W), np.zeros(n_t * sh.PATHS * W)
-    rod = Rod(node, stages, tendon, path)
+    rod = RodLanes(node, stages, tendon, path)
     loaded = n > 0 and not layout.paper
     begin, end = node[sh.N_K * W :], node[(sh.N_K + 6) * W :]
     for start in range(0, len(robots), W):

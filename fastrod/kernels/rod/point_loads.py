@@ -15,7 +15,7 @@ from . import columns as col
 from . import shape as sh
 from .gather import pick
 from .lanes import Lanes, W, at, get, get_mat, put, read, write, write_at
-from .workspace import Batch, Chunk, Output, Sensitivities, Workspace
+from .workspace import Batch, Chunk, Output, PassWorkspace, Sensitivities
 
 
 @inline
@@ -98,7 +98,7 @@ def arrive(n: int, loads: PointLoads, chunk: Chunk, node: Lanes, sens: Sensitivi
 
 
 @kernel
-def respond(chunk: Chunk, batch: Batch, output: Output, work: Workspace) -> None:
+def respond(chunk: Chunk, batch: Batch, output: Output, work: PassWorkspace) -> None:
     """Close the boundary: motion of unknowns and contact points by the residual (column 0) and by each unit
     force."""
     params, layout, loads, moves = batch.params, batch.layout, output.loads, work.sens.moves

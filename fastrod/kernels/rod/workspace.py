@@ -89,7 +89,7 @@ class Size(NamedTuple):
     """Unknowns, rounded up to whole blocks of `observer`."""
 
 
-class Rod(NamedTuple):
+class RodLanes(NamedTuple):
     """Where the march stands (the offsets of `shape` name the fields)."""
 
     node: Lanes
@@ -113,11 +113,11 @@ class Sensitivities(NamedTuple):
     """(3 n_loads, n_col) motion of the contact points."""
 
 
-class Workspace(NamedTuple):
+class PassWorkspace(NamedTuple):
     """The buffers of a pass."""
 
     size: Size
-    rod: Rod
+    rod: RodLanes
     sens: Sensitivities
     length: Lanes
     """(n_tendons + GROUP,) of the tendons' paths so far."""
@@ -166,7 +166,7 @@ def sizes(batch: Batch, n_loads: int, n_col: int) -> Size:
 
 
 @inline
-def carve(scratch: Lanes, size: Size) -> Workspace:
+def carve(scratch: Lanes, size: Size) -> PassWorkspace:
     """The buffers, one after the other in `scratch`; those that sums or unused tendons are read from are
     cleared."""
     n_t, n_p, n_e, n_col = size.tendons + sh.GROUP, size.p, size.e, size.col
@@ -195,9 +195,9 @@ def carve(scratch: Lanes, size: Size) -> Workspace:
     clear(paths)
     clear(tendon)
     clear(moves)
-    return Workspace(
+    return PassWorkspace(
         size,
-        Rod(node, stages, tendon, paths),
+        RodLanes(node, stages, tendon, paths),
         Sensitivities(size.x, columns, LaneMatrix(change, n_t), unit_force, LaneMatrix(moves, n_col)),
         length,
         x,
