@@ -14,7 +14,7 @@ from fastrod.contact import queries
 from fastrod.contact.engine import Engine
 from fastrod.contact.frames import blended
 from fastrod.contact.scene import ContactScene
-from fastrod.contact.step import COLD_PASSES, Ways, contact_step
+from fastrod.contact.step import COLD_ITERATIONS, ContactStep, empty_loads
 from fastrod.effects.pipeline import EffectPipeline, SensedPoses
 from fastrod.errors import InputError, RobotError, refuse_masked, shown
 from fastrod.kernels.rod.dense import between_nodes
@@ -22,15 +22,16 @@ from fastrod.model.compile import compile_robots
 from fastrod.model.robot import Robot
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.solver.boundary import BoundarySolver, check_size
+from fastrod.solver.contact_solver import LOST, RodSolver, frozen_pass
 from fastrod.solver.gpu import device as devices
 from fastrod.solver.guess import cold_start
 from fastrod.solver.inputs import Inputs, PointForces, Reader, named_inputs
 from fastrod.solver.merge import restore_contact, taken_each, taken_shape
-from fastrod.solver.recovery import TOLERANCE, Boundary, overloaded, what_to_do
+from fastrod.solver.recovery import Boundary, overloaded, what_to_do
 from fastrod.solver.response import Linear, stretch
 from fastrod.solver.settle import Pass, settle
 from fastrod.solver.state import Observer, Pose, Snapshot, State
-from fastrod.types import Flags, Floats, Ints, Memory, Params, PointLoads, Ports, RodShape
+from fastrod.types import Flags, Floats, Ints, Memory, Params, Ports, RodShape
 
 _config: Any = numba.config
 _AT_REST = 1e-6  # m: contact and boundary of a step, where `settle` has a tolerance of its own
@@ -45,7 +46,6 @@ _ALONG = (
     "path_length",
     "base_wrench",
 )
-_LOST = 0.1  # of the robot's length: a residual beyond it is no shape of this robot
 _DIVERGED = "the observer diverged, and no shape was found on these inputs"
 
 
@@ -250,7 +250,7 @@ class Simulator:
             gravity,
         )
         if self._felt is not None:
-            return self._touch(self._felt, given, obstacle_pose, obstacle_velocity, None)
+            return self._contact_step(self._felt, given, obstacle_pose, obstacle_velocity, None)
         moved = self._moved_obstacles(obstacle_pose, obstacle_velocity)
         tracked = self._passes.tracks_force
         ports, rows = self._read(given)
@@ -296,7 +296,7 @@ class Simulator:
                     noise=noise,
                 )
             self._passes.collect(shape)
-        ok = self._passes.finite & (shape.residual < _LOST * self._passes.params.reach)
+        ok = self._passes.finite & (shape.residual < LOST * self._passes.params.reach)
         passes = np.broadcast_to(np.int64(1 + learns), self.n_robots)
         if len(rows) < self.n_robots:
             read = np.isin(self._all, rows)
@@ -305,7 +305,7 @@ class Simulator:
             lost, self._derived = rows[~ok[rows]], None
             used = boundary.recover(lost, self._warm, ports, self._into(shape))
             self._passes.collect(shape)
-            ok |= (used > 0) & (shape.residual < _LOST * self._passes.params.reach)
+            ok |= (used > 0) & (shape.residual < LOST * self._passes.params.reach)
             passes = np.where(used < 0, -1, passes + used)
         return self._finish(ports, shape, ok, passes, _DIVERGED, rows[~ok[rows]])
 
@@ -357,14 +357,14 @@ class Simulator:
                     "settle with rows is for simulators without a contact scene; settle all, "
                     "or restore a snapshot's rows."
                 )
-            return self._touch(self._felt, given, obstacle_pose, obstacle_velocity, tolerance)
+            return self._contact_step(self._felt, given, obstacle_pose, obstacle_velocity, tolerance)
         moved = self._moved_obstacles(obstacle_pose, obstacle_velocity)
         only = None if rows is None else self._mask(rows)
         ports, read = self._read(given, only)
         self._move_obstacles(moved)
         return self._settle(ports, read, tolerance, only)
 
-    def _touch(
+    def _contact_step(
         self,
         engine: Engine,
         given: Inputs,
@@ -381,64 +381,37 @@ class Simulator:
             stretch(self._passes, rows, ports.extension - start.extension)
         engine.given_arclength, engine.given_force = self._reader.loads
         engine.move(poses, velocities, self.dt)
-        boundary = Boundary(self._passes) if self.recover else None
-        shape = self._passes.new_shape("full", True)
-        passes = np.zeros(self.n_robots, np.int64)
-
-        def run(which: Ints, at: Ports, into: RodShape, probes: PointLoads) -> None:
-            self._passes.run(
-                which, at, into, probes=probes, update=False, noise=1e-10 if self._layout.paper else 1e-20
-            )
-
-        def free(which: Ints, at: Ports, into: RodShape) -> Flags:
-            if tolerance is not None:
-                return bring_to_rest(which, at, into)
-            process, noise = self.observer.process_noise * self.dt, self.observer.measurement_noise / self.dt
-            self._passes.run(
-                which, at, into, feed=True, carry=self._passes.carry, process=process, noise=noise
-            )
-            passes[which] += 1
-            well = self._passes.finite & (into.residual < _LOST * self._passes.params.reach)
-            well &= np.isin(self._all, which)
-            lost = which[~well[which]]
-            if boundary is not None and len(lost):
-                used = boundary.recover(lost, self._warm, at, self._into(into))
-                passes[lost] += np.abs(used[lost])
-                well[lost] = used[lost] > 0
-            return np.asarray(well)
-
-        def bring_to_rest(which: Ints, at: Ports, into: RodShape) -> Flags:
-            used = settle(which, self._warm, self._passes, at, tolerance or TOLERANCE, self._into(into))
-            passes[which] += np.abs(used[which])
-            return np.asarray(used > 0)
-
-        ok, done = contact_step(
-            engine,
-            Ways(free, bring_to_rest, run),
-            rows,
-            self._warm,
-            start,
-            ports,
-            self._unloaded(ports),
-            self._passes.memory,
-            shape,
-            tolerance or _AT_REST,
-            passes,
-            engine.scene.max_passes if tolerance is None else COLD_PASSES,
+        solver = RodSolver(
+            boundary=self._passes,
+            warm=self._warm,
+            tolerance=tolerance,
+            recovery=Boundary(self._passes) if self.recover else None,
+            process=self.observer.process_noise * self.dt,
+            noise=self.observer.measurement_noise / self.dt,
+            used=np.zeros(self.n_robots, np.int64),
         )
+        shape, passes = self._passes.new_shape("full", True), solver.used
+        ok, done = ContactStep(
+            engine=engine,
+            solver=solver,
+            shape=shape,
+            end=ports,
+            tolerance=tolerance or _AT_REST,
+            most=engine.scene.max_iterations if tolerance is None else COLD_ITERATIONS,
+        ).run(rows, self._warm, start, self._unloaded(ports))
         for i in rows[~ok[rows]]:
-            if engine.led[i] and not overloaded(self._passes, ports, int(i)):
+            if engine.continued[i] and not overloaded(self._passes, ports, int(i)):
                 why = engine.why(int(i), float(done[i]))
             else:
                 why = self._sentence(_DIVERGED, ports, shape, int(i))
             self._reader.problems.setdefault(int(i), why)
         # a cold robot has no last inputs to go on from: it begins anew
         gone = np.isin(self._all, rows) & ~ok
-        held = gone & (engine.led | self.recover) & engine.tracked & ~engine.whole_worlds(~self._warm)
+        held = gone & (engine.continued | self.recover) & engine.tracked & ~engine.whole_worlds(~self._warm)
         if held.any() and start is not None:
             ports = blended(start, ports, done)
-        self._passes.arrive_at(np.flatnonzero(held | (ok & engine.led)), ports)
-        lost = np.flatnonzero(gone & ~(held & engine.led))
+        self._passes.arrive_at(np.flatnonzero(held | (ok & engine.continued)), ports)
+        lost = np.flatnonzero(gone & ~(held & engine.continued))
         state = self._finish(ports, shape, ok, np.where(ok, passes, -1), "contact", lost)
         self._warm[held] = True  # it stands where it came to, and goes on from there
         return state
@@ -478,11 +451,7 @@ class Simulator:
     def _into(self, shape: RodShape) -> Pass:
         """Passes on frozen inputs that write into `shape`."""
 
-        def run(rows: Ints, ports: Ports) -> Floats:
-            self._passes.run(rows, ports, shape, noise=1e-10 if self._layout.paper else 1e-20)
-            return self._passes.collect(shape, "residual").residual[rows]
-
-        return run
+        return frozen_pass(self._passes, shape)
 
     def shape(self, arclength: ArrayLike) -> Pose:
         """Pose and curvature of the last state at any arclength [m]: (n_queries,), or (n_robots, n_queries).
@@ -566,7 +535,9 @@ class Simulator:
         rows = np.flatnonzero(self._warm)
         if self._felt is None:
             return Linear(self._passes, rows, ports)
-        return Linear(self._passes, rows, *self._felt.held(rows, ports, self._passes.n_x))
+        most = int(self._felt.contact_set.used[rows].max(initial=0))
+        loads = empty_loads(len(rows), most + 1, self._passes.n_x)
+        return Linear(self._passes, rows, self._felt.held(rows, ports, loads), loads)
 
     def _relocated(self, extension: Floats) -> dict[str, Floats]:
         """The loads at other extensions: point forces stay at their arclength, so nodes and samples move over
@@ -608,7 +579,7 @@ class Simulator:
                 f"the mobility of {obstacle!r} is {numbers.tolist()}; give [m/N], (3, 3) [rad/(N m)] and "
                 "(3,) [m], finite, none negative."
             )
-        engine.surfaces.give[k] = numbers
+        engine.surfaces.mobility[k] = numbers
         engine.surfaces.body[k] = k if body is None else len(engine.surfaces.body) + body
 
     def clearance(self, obstacle: str | None = None) -> Floats:

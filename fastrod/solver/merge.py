@@ -9,7 +9,7 @@ import numpy as np
 
 from fastrod.contact.engine import ContactSnapshot, Engine
 from fastrod.solver.state import State
-from fastrod.types import Clearance, ContactSet, Flags, RodShape
+from fastrod.types import Flags, RodShape
 
 Arrays = TypeVar("Arrays", bound=tuple[Any, ...])
 
@@ -40,14 +40,11 @@ def taken_shape(now: RodShape, then: State, rows: Flags) -> RodShape:
 def restore_contact(engine: Engine, then: ContactSnapshot, rows: Flags) -> None:
     """Put the robots `rows` of an engine back: their contacts, where they were, and the obstacles around
     them."""
-    engine.touching = taken_each(engine.touching, ContactSet(*then.touching), rows)
-    engine.clearance = taken_each(engine.clearance, Clearance(*then.clearance), rows)
+    engine.contact_set = taken_each(engine.contact_set, then.contact_set, rows)
+    engine.clearance = taken_each(engine.clearance, then.clearance, rows)
     if engine.before is not None and then.before is not None:
         engine.before = taken_each(engine.before, then.before, rows)
-    engine.tracked, engine.gap = (
-        np.where(rows, then.tracked, engine.tracked),
-        np.where(rows, then.gap, engine.gap),
-    )
+    engine.tracked = np.where(rows, then.tracked, engine.tracked)
     engine.poses = taken(engine.poses, then.poses, rows)
     engine.poses_before = taken(engine.poses_before, then.poses_before, rows)
     engine.at_last_step = (engine.before, engine.poses_before)
