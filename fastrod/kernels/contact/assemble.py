@@ -123,8 +123,8 @@ def measure(
 
 @kernel
 def assemble_model(world: World, problem: ContactProblem) -> int:
-    """The linear models of all rows side by side, and the forces that they belong to. Returns how many
-    contact points there are."""
+    """The linear models of all rows side by side, the forces that they belong to, and the change that takes
+    these away. Returns how many contact points there are."""
     n, used, model = 0, world.contacts.used, problem.model
     for r in range(world.first, world.last):
         problem.first_point[r - world.first] = n
@@ -136,6 +136,7 @@ def assemble_model(world: World, problem: ContactProblem) -> int:
         o, m = 3 * problem.first_point[r - world.first], world.loads.motion[r]
         for a in range(3 * used[world.robot[r]]):
             problem.applied[o + a] = world.loads.force[r, a // 3, a % 3]
+            problem.change[o + a] = -problem.applied[o + a]
             model[o + a, 0] = m[a, 0]
             for c in range(3 * used[world.robot[r]]):
                 model[o + a, 1 + o + c] = m[a, 1 + c]
@@ -175,8 +176,6 @@ def _coupling(c: int, e: int, a: int, b: int, problem: ContactProblem) -> float:
 def assemble_delassus(m: int, n: int, world: World, problem: ContactProblem) -> None:
     """The Delassus matrix of m contacts, from the model of n contact points and the mobility of free bodies,
     and their motion without contact forces."""
-    for g in range(3 * n):
-        problem.change[g] = -problem.applied[g]
     for c in range(m):
         for side in range(2):
             g = problem.point[c, side]

@@ -37,13 +37,25 @@ def _measure_all(world: World, stack: Numbers, problem: ContactProblem) -> int:
 
 
 @kernel
+def _propose(world: World, problem: ContactProblem) -> None:
+    """Forces of all contacts, applied and changed, into `problem.proposed`."""
+    for r in range(world.first, world.last):
+        base = problem.first_point[r - world.first]
+        for q in range(world.contacts.used[world.robot[r]]):
+            for a in range(3):
+                g = 3 * (base + q) + a
+                problem.proposed[r - world.first, q, a] = problem.applied[g] + problem.change[g]
+
+
+@kernel
 def solve_contacts(world: World, stack: Numbers, problem: ContactProblem) -> bool:
     """Forces that the law asks for on the linear model, into `problem.proposed`; whether it could be
     solved."""
     damping = world.motion.damping
     n = assemble_model(world, problem)
     m = _measure_all(world, stack, problem)
-    if m == 0:
+    if m == 0:  # no contacts, or such as have lost their other side
+        _propose(world, problem)
         return True
     stiffened = damping > 0.0
     for c in range(m):
@@ -75,10 +87,5 @@ def solve_contacts(world: World, stack: Numbers, problem: ContactProblem) -> boo
                 problem.change[3 * g + a] += (1.0 if side == 0 else -1.0) * f[a]
     if stiffened:
         add_turned_forces(n, m, damping, problem)
-    for r in range(world.first, world.last):
-        base = problem.first_point[r - world.first]
-        for q in range(world.contacts.used[world.robot[r]]):
-            for a in range(3):
-                g = 3 * (base + q) + a
-                problem.proposed[r - world.first, q, a] = problem.applied[g] + problem.change[g]
+    _propose(world, problem)
     return solved
