@@ -18,7 +18,7 @@ from .bvh import Numbers, Record, normal_of
 from .centreline import curve_before, interval_of, point_at, rotation_at
 from .contact_set import arm_of, force_of, set_normal, wall_at
 from .mobility import add_mobility, axis_of
-from .problem import World, frame_of, node_position
+from .problem import World, node_position
 from .tunnelling import carried
 
 
@@ -53,7 +53,7 @@ def _measure_obstacle(r: int, q: int, world: World, stack: Numbers, problem: Con
     i, motion = world.robot[r], world.motion
     contact, node = world.contacts.contact[i, q], world.loads.node[r, q]
     p, k = node_position(world, i, node), contact.obstacle
-    frame, margin = frame_of(world, i, k), motion.margin * world.rods.length[i]
+    frame, margin = motion.frames[pick(i, len(motion.frames)), k], motion.margin * world.rods.length[i]
     d, n = wall_at(k, frame, p, normal_of(contact), margin, world.surfaces, stack, problem.wall)
     contact.gap = d - contact.radius
     set_normal(contact, n)

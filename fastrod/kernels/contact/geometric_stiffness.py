@@ -10,12 +10,13 @@ from __future__ import annotations
 from fastrod.types import ContactMotion, ContactProblem
 
 from ..jit import inline, kernel
+from ..rod.gather import pick
 from ..vec import Vec, axpy, dot, scale, sub
 from .assemble import moved
 from .bvh import Numbers, normal_of
 from .contact_law import solve_dense
 from .contact_set import force_of
-from .problem import World, frame_of, node_position
+from .problem import World, node_position
 from .surface import surface_curvature
 
 _FORGETS, _FRACTION_KEPT = 0.5, 0.3
@@ -80,7 +81,8 @@ def geometric_stiffness(
         if contact.gap + contact.radius <= 0.0:
             return 0.0
         k, p = contact.obstacle, node_position(world, i, node)
-        first, second, along = surface_curvature(k, frame_of(world, i, k), p, world.surfaces, stack)
+        frame = motion.frames[pick(i, len(motion.frames)), k]
+        first, second, along = surface_curvature(k, frame, p, world.surfaces, stack)
     else:
         b, node_b = world.robot[other], world.loads.node[other, q_other]
         length = contact.gap + contact.radius + world.contacts.contact[b, q_other].radius

@@ -21,9 +21,7 @@ from fastrod.types import (
 )
 
 from ..jit import inline, kernel
-from ..rod.gather import pick
 from ..vec import Vec
-from .bvh import Numbers
 from .rod_proximity import RodSearch
 from .surface import MOST_PLANES
 
@@ -122,13 +120,6 @@ def thread_problem(problem: ContactProblem, i: int) -> ContactProblem:
 def rod_search(world: World) -> RodSearch:
     """What the search between rods needs of a world."""
     return RodSearch(world.motion, world.rods, world.contacts, len(world.surfaces.kind), world.motion.margin)
-
-
-@inline
-def frame_of(world: World, i: int, k: int) -> Numbers:
-    """Frame of obstacle k beside robot i."""
-    frames = world.motion.frames
-    return frames[pick(i, len(frames)), k]
 
 
 @inline
