@@ -194,7 +194,8 @@ class PointLoads(NamedTuple):
 
 
 def _record(*fields: tuple[Any, ...]) -> np.dtype[Any]:
-    """A dtype whose elements have their fields as attributes, in Python as in a kernel."""
+    """A dtype whose elements have their fields as attributes, in Python as in a kernel. (No field may have the
+    name of an attribute that numpy gives every element, such as `size`.)"""
     return np.dtype((np.record, np.dtype(list(fields), align=True)))
 
 
@@ -230,7 +231,7 @@ SAMPLE = _record(("fraction", np.float64), ("distance", np.float64), ("slope", n
 """Signed distance of the centreline and its slope along the rod, at a fraction of an interval."""
 
 TROUBLE = _record(
-    ("cause", np.int64), ("obstacle", np.int64), ("arclength", np.float64), ("size", np.float64)
+    ("cause", np.int64), ("obstacle", np.int64), ("arclength", np.float64), ("distance", np.float64)
 )
 """What keeps a robot from rest: which of `kernels.contact.iteration`'s causes, on what obstacle (from
 n_obstacles on a rod; -1: none), where [m], and by how much [m]."""

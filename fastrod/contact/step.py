@@ -154,7 +154,7 @@ class ContactStep:
             motion = engine.motion(self.shape, self.tolerance, done, aim)
             rest, unheld = self._settle(left, ports, motion, _MOST_ITERATIONS)
             wanders = (engine.trouble["cause"] == MOVES) & (
-                engine.trouble["size"] < _WANDERS * engine.rods.length
+                engine.trouble["distance"] < _WANDERS * engine.rods.length
             )
             given_up = (length <= _HARD) | unheld | engine.whole_worlds(wanders)
             hard = left[(~rest & given_up & (tries < _DAMPED_TRIES))[left]]
@@ -212,7 +212,7 @@ class ContactStep:
             )
             if count >= most - 1:  # go on with what has nearly come to rest
                 hopeless |= ~(
-                    (trouble["size"] < _NEARLY * rods.length) & np.isin(trouble["cause"], (MOVES, INSIDE))
+                    (trouble["distance"] < _NEARLY * rods.length) & np.isin(trouble["cause"], (MOVES, INSIDE))
                 )
             still = still[(status != AT_REST) & (status != LOST) & ~engine.whole_worlds(hopeless)[still]]
             if not len(still):

@@ -17,7 +17,7 @@ NO_NODE_LEFT, NO_CONTACT_LEFT = 10, 11
 def sentence(trouble: Record, scene: ContactScene, n_steps: int, length: Floats, done: float) -> str:
     """Say what is stuck, where, by how much, and what to do; `length` (n_segments,) [m], `done` is the
     fraction of the step that was solved."""
-    k, s, size = int(trouble.obstacle), trouble.arclength, trouble.size
+    k, s, size = int(trouble.obstacle), trouble.arclength, trouble.distance
     name = (
         repr(scene.names[k])
         if 0 <= k < len(scene.names)

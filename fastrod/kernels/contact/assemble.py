@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from fastrod.types import ContactProblem, Floats
+from fastrod.types import ContactProblem, Floats, Ints
 
 from ..jit import inline, kernel
 from ..rod.gather import pick
@@ -155,14 +155,14 @@ def moved(n: int, model: Floats, g: int, change: Numbers) -> Vec:
 
 
 @kernel
-def _coupling(c: int, e: int, a: int, b: int, problem: ContactProblem) -> float:
+def _coupling(c: int, e: int, a: int, b: int, point: Ints, axes: Floats, model: Floats) -> float:
     """Motion of contact c along its axis a under a unit force of contact e along its axis b."""
-    total, model = 0.0, problem.model
-    u, v = axis_of(problem.axes[c], a), axis_of(problem.axes[e], b)
+    total = 0.0
+    u, v = axis_of(axes[c], a), axis_of(axes[e], b)
     for s in range(2):
-        g = problem.point[c, s]
+        g = point[c, s]
         for t in range(2):
-            h = problem.point[e, t]
+            h = point[e, t]
             if g >= 0 and h >= 0:
                 sign = 1.0 if s == t else -1.0
                 for x in range(3):
@@ -176,18 +176,19 @@ def _coupling(c: int, e: int, a: int, b: int, problem: ContactProblem) -> float:
 def assemble_delassus(m: int, n: int, world: World, problem: ContactProblem) -> None:
     """The Delassus matrix of m contacts, from the model of n contact points and the mobility of free bodies,
     and their motion without contact forces."""
+    point, axes, model, delassus = problem.point, problem.axes, problem.model, problem.delassus
     for c in range(m):
         for side in range(2):
-            g = problem.point[c, side]
+            g = point[c, side]
             if g >= 0:
-                v = moved(n, problem.model, g, problem.change)
+                v = moved(n, model, g, problem.change)
                 for a in range(3):
-                    motion = dot(v, axis_of(problem.axes[c], a))
+                    motion = dot(v, axis_of(axes[c], a))
                     problem.free[3 * c + a] += (1.0 if side == 0 else -1.0) * motion
         for e in range(m):
             for a in range(3):
                 for d in range(3):
-                    problem.delassus[3 * c + a, 3 * e + d] = _coupling(c, e, a, d, problem)
+                    delassus[3 * c + a, 3 * e + d] = _coupling(c, e, a, d, point, axes, model)
     add_mobility(
         m,
         problem.obstacle,

@@ -127,24 +127,25 @@ def _sweep(m: int, law: ContactLaw) -> float:
 
 
 @kernel
-def _row_of_state(c: int, i: int, m: int, law: ContactLaw) -> None:
-    """Equation i (normal, tangents) of contact c in its state, as a row of the linear system."""
-    n = 3 * m
-    row = law.system[3 * c + i]
-    kind = law.state[c]
-    for q in range(n + 1):
-        row[q] = 0.0
-    if kind == OPEN or (i > 0 and law.friction[c] <= 0.0):
-        row[3 * c + i] = 1.0
-    elif i == 0 or kind == STICK:
-        for q in range(n):
-            row[q] = law.W[3 * c + i, q]
-        row[3 * c + i] += law.compliance[c] if i == 0 else 0.0
-        row[3 * c + i] *= 1.0 + 1e-12  # two contacts that say the same leave a singular system otherwise
-        row[n] = -law.b[3 * c + i]
-    else:  # slip: lambda_t = mu lambda_n along
-        row[3 * c + i] = 1.0
-        row[3 * c] = -law.friction[c] * law.along[c, i - 1]
+def _write_system(m: int, law: ContactLaw) -> None:
+    """Equations (normal, tangents) of every contact in its state, as rows of the linear system."""
+    n, W, b, friction, compliance = 3 * m, law.W, law.b, law.friction, law.compliance
+    for o in range(n):
+        c, i = o // 3, o % 3
+        row, kind = law.system[o], law.state[c]
+        for q in range(n + 1):
+            row[q] = 0.0
+        if kind == OPEN or (i > 0 and friction[c] <= 0.0):
+            row[o] = 1.0
+        elif i == 0 or kind == STICK:
+            for q in range(n):
+                row[q] = W[o, q]
+            row[o] += compliance[c] if i == 0 else 0.0
+            row[o] *= 1.0 + 1e-12  # two contacts that say the same leave a singular system otherwise
+            row[n] = -b[o]
+        else:  # slip: lambda_t = mu lambda_n along
+            row[o] = 1.0
+            row[3 * c] = -friction[c] * law.along[c, i - 1]
 
 
 @kernel
@@ -238,9 +239,7 @@ def _active_set(m: int, law: ContactLaw) -> bool:
         wrong = _correct_states(m, law)
         if wrong <= _AGREE and count > 0:
             return True
-        for c in range(m):
-            for i in range(3):
-                _row_of_state(c, i, m, law)
+        _write_system(m, law)
         if not solve_dense(law.system, n, n + 1):
             return False
         for i in range(n):

@@ -307,9 +307,9 @@ def iterate_worlds(thread: int, batch: ContactIteration) -> None:
 
 
 @inline
-def _write(trouble: Record, cause: int, obstacle: int, s: float, size: float) -> None:
+def _write(trouble: Record, cause: int, obstacle: int, s: float, distance: float) -> None:
     """Write what keeps a robot from rest."""
-    trouble.cause, trouble.obstacle, trouble.arclength, trouble.size = cause, obstacle, s, size
+    trouble.cause, trouble.obstacle, trouble.arclength, trouble.distance = cause, obstacle, s, distance
 
 
 @kernel
