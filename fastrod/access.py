@@ -1,4 +1,4 @@
-"""`Access`: who may load a page that viser serves, and open its websocket."""
+"""`Access`: the check of who may load a page that viser serves, and open its websocket."""
 
 from __future__ import annotations
 
@@ -10,11 +10,14 @@ import logging
 import secrets
 import socket
 import sys
+import tempfile
 import threading
 import warnings
+import webbrowser
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from http import HTTPStatus
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
 from fastrod.errors import InputError
@@ -36,7 +39,7 @@ _WRONG_HOST = (
     "This page is not served under this name or port: open the address that was printed in the terminal, "
     "and through a tunnel forward the same port."
 )
-_WRONG_ORIGIN = "Another site asks for this page: open the address that was printed in the terminal."
+_WRONG_ORIGIN = "Another site requests this page: open the address that was printed in the terminal."
 _FULL = f"{MOST_PAGES} pages are open, which is the most: close one and load this again."
 _SENSELESS = "A page sent a message that makes no sense; it is ignored, and so are further ones."
 _KINDS = 20  # of sentences about pages: a page that sends nonsense for hours fills no terminal
@@ -50,15 +53,16 @@ class Access:
     Loopback keeps no web page out: a websocket has no same-origin rule, so whatever page a browser shows may
     open one to this machine, and a stranger's name may resolve to 127.0.0.1 (DNS rebinding). A request is
     answered only where its path begins with the key, its Host is an address that is served, and its Origin,
-    where a browser gives one, is that same address. The key is part of the path and no cookie: browsers send
+    where a browser gives one, is that same address. The key is in the path and no cookie: browsers send
     cookies to every port.
     """
 
     def __init__(self, host: str) -> None:
         """`host` as the server is bound to it."""
         self.key = secrets.token_urlsafe()
-        """First part of the path; new with every server."""
-        self._names = () if _every(host) else (f"[{host}]" if ":" in host else host.lower(),)
+        """First element of the path; new with every server."""
+        name = socket.gethostname() if _every(host) else host  # `elsewhere` prints it without a route
+        self._names = (f"[{name}]" if ":" in name else name.lower(),)
 
     def refusal(self, path: str, headers: Headers, arrived: tuple[str, int]) -> str | None:
         """Return one sentence that says why this request is refused, or None; `arrived` is the address and
@@ -75,8 +79,8 @@ class Access:
         return None
 
     def _served(self, address: str, port: int) -> set[str]:
-        """What Host may be: this machine's names for itself, the name that was bound, the address that was
-        reached."""
+        """Return the valid values of Host: this machine's names for itself, the name that was bound, the
+        address of the connection."""
         names = {*_LOCAL, *self._names, f"[{address}]" if ":" in address else address}
         return {f"{name}:{port}" for name in names} | (names if port == _HTTP_PORT else set())
 
@@ -97,7 +101,9 @@ class Access:
             without = request.path.removeprefix(f"/{self.key}") or "/"
             response = plain(connection, replace(request, path=without))
             if response is not None:
-                response.headers["Referrer-Policy"] = "no-referrer"  # a link must not tell the page's address
+                response.headers["Referrer-Policy"] = (
+                    "no-referrer"  # a link must not reveal the page's address
+                )
                 response.headers["X-Frame-Options"] = "DENY"
             return response
 
@@ -113,7 +119,7 @@ class Ignored:
         self._said: set[str] = set()
 
     def __call__(self, error: object = None, sentence: str = _SENSELESS) -> None:
-        """Mention it; `error` goes to the log of whoever debugs."""
+        """Mention it; `error` goes to the debug log."""
         cause = error if isinstance(error, BaseException) else None
         logging.getLogger(__name__).debug(sentence, exc_info=cause)
         if sentence not in self._said and len(self._said) < _KINDS:
@@ -121,9 +127,9 @@ class Ignored:
             print(sentence, file=sys.stderr, flush=True)
 
     def failed(self, error: Exception) -> None:
-        """Mention that what a page asked for could not be done."""
+        """Mention that a page's request could not be done."""
         why = " ".join(str(error).split())
-        self(error, f"What a page asked for failed, and is left undone: {type(error).__name__}, {why}")
+        self(error, f"A page's request failed, and is left undone: {type(error).__name__}, {why}")
 
     def of_loop(self, _: object, context: dict[str, Any]) -> None:
         """Hear an event loop's complaint."""
@@ -139,9 +145,10 @@ class Served:
     host: str
     """That it is bound to."""
     key: str
-    """First part of every path."""
+    """First element of every path."""
     ignored: Ignored
     """Hears of messages that make no sense."""
+    _closing: contextlib.ExitStack = field(default_factory=contextlib.ExitStack, init=False, repr=False)
 
     @property
     def address(self) -> str:
@@ -159,8 +166,18 @@ class Served:
             return ""
         return self.at(_outward(self.host) if _every(self.host) else self.host)
 
+    def open_browser(self) -> None:
+        """Open the page by a file that leads to it and that this user alone can read: other users of this
+        machine can read a command line, so the key must not be on the browser's."""
+        with contextlib.suppress(OSError):  # the address is printed, too
+            with tempfile.NamedTemporaryFile("w", prefix="fastrod-", suffix=".html", delete=False) as file:
+                self._closing.callback(Path(file.name).unlink, missing_ok=True)
+                file.write(f'<!doctype html><meta http-equiv="refresh" content="0; url={self.address}">\n')
+            webbrowser.open(Path(file.name).as_uri())
+
     def stop(self) -> None:
-        """End it."""
+        """End it, and remove what `open_browser` has written."""
+        self._closing.close()
         with contextlib.redirect_stdout(io.StringIO()):  # it says goodbye
             self.viser.stop()
 
@@ -225,7 +242,7 @@ def _outward(host: str) -> str:
 
 @final
 class _Failures(logging.Handler):
-    """Hears what websockets logs, and tells `ignored` of messages that ended their own connection."""
+    """Handler of what websockets logs; it reports to `ignored` messages that ended their own connection."""
 
     def __init__(self, ignored: Ignored) -> None:
         super().__init__(logging.ERROR)

@@ -29,6 +29,8 @@ _NOW = {
     "state": "solver.state",
     "wiring": "model.routing",
     "generation.command": "commands.generate",
+    "hosts.mujoco_touched": "hosts.mujoco_body_contact",
+    "hosts.touching": "hosts.body_contact",
     "identification.forward": "identification.log.forward",
     "identification.replay": "identification.log.replay",
     "identification.result": "identification.report.result",

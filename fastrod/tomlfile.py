@@ -10,12 +10,14 @@ from typing import Any
 from fastrod.errors import FastrodError
 
 _LARGEST = 1_000_000  # bytes; a robot of five segments has two thousand
-_DEEPEST = 50  # parts of a dotted key
+_DEEPEST = 50  # words of a dotted key
 
 
 def read_text(path: Path, where: str, error: type[FastrodError]) -> str:
     """The text of a TOML file, with or without a byte order mark. Raises `error`; `where` names the file."""
     try:
+        if path.exists() and not path.is_file():  # a pipe or a device may have no end
+            raise ValueError("it is no file")
         with path.open("rb") as file:
             content = file.read(_LARGEST + 1)
         if len(content) > _LARGEST:
@@ -33,7 +35,7 @@ def parse(text: str, where: str, error: type[FastrodError], what: str) -> dict[s
         for piece in re.split(r"[\n,=]", text)
     ):
         # tomllib takes a time that grows with the square of their number
-        raise error(f"{where} is not a {what}: it has a key of more than {_DEEPEST} parts.")
+        raise error(f"{where} is not a {what}: it has a key of more than {_DEEPEST} words.")
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as why:

@@ -194,8 +194,8 @@ class PointLoads(NamedTuple):
 
 
 def _record(*fields: tuple[Any, ...]) -> np.dtype[Any]:
-    """A dtype whose elements have their fields as attributes, in Python as in a kernel. (No field may have the
-    name of an attribute that numpy gives every element, such as `size`.)"""
+    """A dtype whose elements have their fields as attributes, in Python as in a kernel. (No field may have
+    the name of an attribute that numpy gives every element, such as `size`.)"""
     return np.dtype((np.record, np.dtype(list(fields), align=True)))
 
 
@@ -231,10 +231,15 @@ SAMPLE = _record(("fraction", np.float64), ("distance", np.float64), ("slope", n
 """Signed distance of the centreline and its slope along the rod, at a fraction of an interval."""
 
 TROUBLE = _record(
-    ("cause", np.int64), ("obstacle", np.int64), ("arclength", np.float64), ("distance", np.float64)
+    ("cause", np.int64),
+    ("obstacle", np.int64),
+    ("arclength", np.float64),
+    ("distance", np.float64),
+    ("from_rest", np.float64),
 )
 """What keeps a robot from rest: which of `kernels.contact.iteration`'s causes, on what obstacle (from
-n_obstacles on a rod; -1: none), where [m], and by how much [m]."""
+n_obstacles on a rod; -1: none), where [m], by how much [m], and how far its world is from rest: the largest
+of motion, residual and violation [m]."""
 
 
 class ContactRods(NamedTuple):
@@ -272,7 +277,7 @@ class ContactMotion(NamedTuple):
     frames: Floats
     """(1 or n_robots, n_obstacles, 12) rotation row by row, position: world_from_obstacle."""
     frames_before: Floats
-    """(1 or n_robots, n_obstacles, 12) at the last step."""
+    """(1 or n_robots, n_obstacles, 12) when the rods were in the shape before."""
     frames_slip: Floats
     """(1 or n_robots, n_obstacles, 12) where the obstacles' material was at the last step: what slip is
     counted from. Another than `frames_before` where a velocity was given (a belt moves, its frame does
@@ -287,7 +292,13 @@ class ContactMotion(NamedTuple):
     rotation_before: Floats
     curvature_before: Floats
     arclength_before: Floats
-    """The shapes at the last step."""
+    """Where the rods have come from, and through nothing since: the last step, or the last pass of a damped
+    iteration."""
+    position_slip: Floats
+    rotation_slip: Floats
+    curvature_slip: Floats
+    arclength_slip: Floats
+    """The shapes at the last step: what slip is counted from."""
     distance: Floats
     measured_at: Floats
     gap: Floats
@@ -300,9 +311,9 @@ class ContactMotion(NamedTuple):
     """Motion, residual and violation below which a world is at rest [m]."""
     margin: float
     """Gap below which a contact is watched, as a fraction of the rod's length."""
-    damping: float
-    """0, or how many times the largest geometric stiffness is held against the motion of its point: where the
-    plain iteration finds no rest, this one goes down in energy, slowly."""
+    damping: Floats
+    """(n_robots,) 0, or how many times the largest geometric stiffness is held against the motion of its
+    point: where the plain iteration finds no rest, this one goes down in energy, slowly."""
 
 
 class ContactSet(NamedTuple):

@@ -1,25 +1,23 @@
-"""A large batch on a GPU beside the CPU: `fastrod bench cuda`, or this file as a script; `--json` for
-programs, `--quick` for a smoke run, `--robots` for another size. Without a GPU: what a pass reads, writes and
-reckons, and one sentence."""
+"""A large batch on a GPU beside the CPU; without a GPU: what a pass reads, writes and computes, and one
+sentence."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 import cases
 import flops
-import report
 from cases import Case
-from fastrod import Simulator, State
+from fastrod import Simulator
 from fastrod.errors import InputError
 from fastrod.solver.gpu.device import checked
 from fastrod.types import Ports
-from report import Column, Row, Section, note_progress, seconds
+from report import Measurement, Row, Section, bench, best, goal, note_progress, table
 
 _STEPS = 6
 _TARGET = 50.0  # times two threads of the CPU
@@ -28,33 +26,34 @@ _H100 = 3.35e12, 33.5e12  # bytes and operations a second of an H100 SXM, from N
 _FMA = {(6, 0): 32, (7, 0): 32, (8, 0): 32, (9, 0): 64, (10, 0): 64}
 
 
-def sections(n_robots: int, quick: bool) -> list[Section]:
+def case_of(key: str, n: int) -> Case:
+    return next(case for case in cases.cases(n) if case.key == key)
+
+
+def measure(options: argparse.Namespace) -> list[Section]:
     """Both tables; without a GPU the second alone."""
+    n_robots, absent = options.robots or (64 if options.quick else 1_000_000), ""
     try:
         checked("cuda")
     except InputError as missing:
-        there, absent = False, str(missing)
-    else:
-        there, absent = True, ""
-    chosen = []
-    for key, n in (("prototype", n_robots), ("reacher", max(1, n_robots // 5))):
-        (case,) = (case for case in cases.cases(n) if case.key == key)
-        chosen.append((case, n, points_of(key, 16 if quick else 256)))
-    tallies = flops.count({case.key: points for case, _, points in chosen}, False)
+        absent = str(missing)
+    sizes = {"prototype": n_robots, "reacher": max(1, n_robots // 5)}
+    points = {key: points_of(key, 16 if options.quick else 256) for key in sizes}
+    tallies = flops.count(points, False)
     times: list[Row] = []
-    work: list[Row] = []
-    for case, n, points in chosen:
-        done = sum(tallies[case.key].values(), flops.Tally())
-        if there:
-            note_progress(f"{case.key}, {n} robots")
-            times += time_rows(case, n, points)
-        work.append(work_row(case.key, n, points, done.flops))
-    return ([time_section(times)] if there else []) + [work_section(work, absent)]
+    for key, n in sizes.items() if not absent else ():
+        note_progress(f"{key}, {n} robots")
+        times += time_rows(case_of(key, n), n, points[key])
+    work = [
+        work_row(key, n, points[key], sum(tallies[key].values(), flops.Tally()).flops)
+        for key, n in sizes.items()
+    ]
+    return ([time_section(times)] if times else []) + [work_section(work, absent)]
 
 
 def points_of(key: str, n: int) -> int:
     """The fewest points per segment that keep the tip error of the other tables."""
-    (case,) = (case for case in cases.cases(n) if case.key == key)
+    case = case_of(key, n)
     pose = case.at(_STEPS, False)
     return cases.fewest_points(case, pose, *cases.fine_solution(case, pose))[0]
 
@@ -63,15 +62,12 @@ class Timed:
     """Best times of a simulator's steps, and of their parts."""
 
     def __init__(self, sim: Simulator, case: Case) -> None:
-        self.sim = sim
-        self.step = self.kernel = self.send = self.fetch = np.inf
-        self.sent = self.fetched = 0
+        self.sim, steps = sim, Measurement()
         for k in range(1, _STEPS + 1):
-            words, before = case.words(case.at(k, False)), self._moved()
-            used, self.state = seconds(lambda words=words: sim.step(**words))
-            sent, fetched = (after - b for after, b in zip(self._moved(), before, strict=True))
-            if k > 1:
-                self.step, self.sent, self.fetched = min(self.step, used), sent, fetched
+            inputs, before = case.inputs(case.at(k, False)), self._moved()
+            self.state = steps.take(partial(sim.step, **inputs))
+            self.sent, self.fetched = (after - b for after, b in zip(self._moved(), before, strict=True))
+        self.step = min(steps.times[1:])
         self._parts()
 
     def _moved(self) -> tuple[int, int]:
@@ -79,8 +75,8 @@ class Timed:
         return (0, 0) if runner is None else (runner.sent_bytes, runner.fetched_bytes)
 
     def _parts(self) -> None:
-        """The pass alone, on ports that are there already; then what it costs more on new ones, and to bring
-        its shape back."""
+        """The pass alone, on ports that are there already; then what it costs more on new ones, and to
+        bring its shape back."""
         sim, passes = self.sim, self.sim._passes
         ports = sim._ports
         assert ports is not None
@@ -91,14 +87,16 @@ class Timed:
             wait(sim.device)
 
         run(ports)
-        self.kernel = report.best(lambda: run(ports), _STEPS)
-        new = [ports._replace(tendon_length=ports.tendon_length.copy()) for _ in range(_STEPS)]
-        self.send = max(0.0, min(seconds(lambda at=at: run(at))[0] for at in new) - self.kernel)
-        self.fetch = report.best(lambda: passes.collect(shape), _STEPS)
+        self.kernel = best(partial(run, ports), _STEPS)
+        sending = Measurement()
+        for new in [ports._replace(tendon_length=ports.tendon_length.copy()) for _ in range(_STEPS)]:
+            sending.take(partial(run, new))
+        self.send = max(0.0, sending.least - self.kernel)
+        self.fetch = best(lambda: passes.collect(shape), _STEPS)
 
 
 def wait(device: str) -> None:
-    """Until the GPU has done all it was told."""
+    """Until the GPU has done all its work."""
     if device == "cuda":
         from numba import cuda
 
@@ -109,115 +107,78 @@ def time_rows(case: Case, n: int, points: int) -> list[Row]:
     """The same steps from the same boundary: two threads, all threads, the GPU."""
     import numba
 
-    most = int(numba.config.NUMBA_NUM_THREADS)
-    first = Simulator(case.robot, n, points_per_segment=points, outputs="tip")
-    first.settle(**case.words(case.at(0, False)))
-    start = first.snapshot()
-    rows: list[Row] = []
-    two: Timed | None = None
-    states: list[State] = []
+    most, options = int(numba.config.NUMBA_NUM_THREADS), {"points_per_segment": points, "outputs": "tip"}
+    first = Simulator(case.robot, n, **options)
+    first.settle(**case.inputs(case.at(0, False)))
+    start, rows, two = first.snapshot(), list[Row](), None
     for device, threads in [("cpu", t) for t in sorted({min(2, most), most})] + [("cuda", None)]:
-        sim = Simulator(
-            case.robot, n, points_per_segment=points, outputs="tip", threads=threads, device=device
-        )
+        sim = Simulator(case.robot, n, threads=threads, device=device, **options)
         sim.restore(start)
         timed = Timed(sim, case)
         two = two or timed
-        states.append(timed.state)
-        error = np.abs(states[-1].tip_position - states[0].tip_position)[states[0].ok]
+        ratio = two.kernel / timed.kernel
+        error = np.abs(timed.state.tip_position - two.state.tip_position)[two.state.ok]
         rows.append(
-            {
-                "robot": case.key,
-                "robots": n,
-                "points": points,
-                "device": device if threads is None else f"{device} {threads}",
-                "step_ms": 1e3 * timed.step,
-                "kernel_ms": 1e3 * timed.kernel,
-                "send_ms": 1e3 * timed.send,
-                "fetch_ms": 1e3 * timed.fetch,
-                "sent_bytes": timed.sent / n,
-                "fetched_bytes": timed.fetched / n,
-                "step_ratio": two.step / timed.step,
-                "kernel_ratio": two.kernel / timed.kernel,
-                "target": _TARGET if device == "cuda" else None,
-                "met": two.kernel / timed.kernel >= _TARGET if device == "cuda" else None,
-                "difference_m": float(error.max(initial=0.0)),
-                "ok": float(timed.state.ok.mean()),
-            }
+            {"robot": case.key, "robots": n, "points": points, "device": f"{device} {threads or ''}".strip()}
+            | {f"{stage}_ms": 1e3 * getattr(timed, stage) for stage in ("step", "kernel", "send", "fetch")}
+            | {"sent_bytes": timed.sent / n, "fetched_bytes": timed.fetched / n}
+            | {"step_ratio": two.step / timed.step, "kernel_ratio": ratio}
+            | (goal(ratio, _TARGET, least=True) if device == "cuda" else {})
+            | {"difference_m": float(error.max(initial=0.0)), "ok": float(timed.state.ok.mean())}
         )
     return rows
 
 
 def time_section(rows: list[Row]) -> Section:
-    columns = [
-        Column("robot", "robot"),
-        Column("robots", "robots", ",d"),
-        Column("points", "points", "d"),
-        Column("device", "device,\nthreads"),
-        Column("step_ms", "step\n[ms]", ".1f"),
-        Column("kernel_ms", "pass\n[ms]", ".2f"),
-        Column("send_ms", "send\n[ms]", ".2f"),
-        Column("fetch_ms", "fetch\n[ms]", ".2f"),
-        Column("sent_bytes", "sent\nB / robot", ".0f"),
-        Column("fetched_bytes", "fetched\nB / robot", ".0f"),
-        Column("step_ratio", "step:\nfaster", ".1f"),
-        Column("kernel_ratio", "pass:\nfaster", ".1f"),
-        Column("target", "target", ".0f"),
-        Column("met", "met"),
-        Column("difference_m", "tip differs\n[m]", ".1e"),
-        Column("ok", "ok", ".2%"),
-    ]
-    notes = [
-        'Step: `Simulator.step`, outputs="tip", tendon lengths that move; pass: its kernel alone, on inputs '
-        "that are there. On a GPU a "
-        "step besides sends the lengths and fetches the tips; on both it checks its inputs, on one thread "
-        "of the CPU.",
-        "Faster: than two threads of the CPU (the first row); the target is for the pass. Tip differs, "
-        "most: from the first row's after "
-        "the same steps from the same boundary.",
-    ]
-    return Section("cuda", "One step of a large batch", columns, rows, notes)
+    return table(
+        "cuda",
+        "One step of a large batch",
+        "robot | robots:,d | points:d | device device,~threads | step_ms:.1f step~[ms] | kernel_ms:.2f "
+        "pass~[ms]| send_ms:.2f send~[ms] | fetch_ms:.2f fetch~[ms] | sent_bytes:.0f sent~B / robot"
+        "| fetched_bytes:.0f fetched~B / robot | step_ratio:.1f step:~faster | kernel_ratio:.1f pass:~faster"
+        "| target:.0f | met | difference_m:.1e tip differs~[m] | ok:.2%",
+        rows,
+        "Step: `Simulator.step`, outputs='tip', tendon lengths that move; pass: its kernel alone, on inputs "
+        "that are there. On a GPU a step besides sends the lengths and fetches the tips; on both it checks "
+        "its inputs, on one thread of the CPU.",
+        "Faster: than two threads of the CPU (the first row); the target is for the pass. Tip differs, most: "
+        "from the first row's after the same steps from the same boundary.",
+    )
 
 
 def work_row(key: str, n_robots: int, points: int, operations: float) -> Row:
-    """What a pass of one robot must move and reckon, from the arrays that it is given."""
+    """What a pass of one robot must move and compute, from the arrays that it is given."""
     from fastrod.kernels.jit import LANES
     from fastrod.kernels.rod.chunk import scratch_size
 
     n = 64
-    (small,) = (case for case in cases.cases(n) if case.key == key)
+    small = case_of(key, n)
     sim = Simulator(small.robot, n, points_per_segment=points, outputs="tip")
-    sim.settle(**small.words(small.at(0, False)))
+    sim.settle(**small.inputs(small.at(0, False)))
     passes, ports = sim._passes, sim._ports
     assert ports is not None
-    memory, shape = passes.peek(), passes.new_shape("tip", False)
 
     def each(arrays: Any) -> float:
         return sum(a.nbytes for a in arrays if isinstance(a, np.ndarray) and len(a) == n > 1) / n
 
-    moved = each(ports) + each(passes.params) + 2.0 * each(memory) + each(shape) + 8.0
-    scratch = (
-        8
-        * scratch_size(
-            len(passes.layout.tendon_segment), passes.n_x, passes.n_columns(ports), passes.n_residuals(ports)
-        )
-        / LANES
+    moved = (
+        each(ports)
+        + each(passes.params)
+        + 2.0 * each(passes.peek())
+        + each(passes.new_shape("tip", False))
+        + 8.0
     )
+    n_tendons, n_columns = len(passes.layout.tendon_segment), passes.n_columns(ports)
+    scratch = scratch_size(n_tendons, passes.n_x, n_columns, passes.n_residuals(ports))
     bandwidth, peak, name = device_limits()
-    return {
-        "robot": key,
-        "robots": n_robots,
-        "moved_bytes": moved,
-        "scratch_bytes": scratch,
-        "operations": operations,
-        "device": name,
-        "memory_floor_ms": 1e3 * moved * n_robots / bandwidth,
-        "arithmetic_floor_ms": 1e3 * operations * n_robots / peak,
-    }
+    floors = {"memory_floor_ms": moved / bandwidth, "arithmetic_floor_ms": operations / peak}
+    row: Row = {"robot": key, "robots": n_robots, "moved_bytes": moved, "scratch_bytes": 8 * scratch / LANES}
+    row |= {"operations": operations, "device": name}
+    return row | {name: 1e3 * floor * n_robots for name, floor in floors.items()}
 
 
 def device_limits() -> tuple[float, float, str]:
-    """Bytes and double-precision operations a second: copied and reckoned here, or of an H100."""
+    """Bytes and double-precision operations a second: copied and computed here, or of an H100."""
     try:
         checked("cuda")
     except InputError:
@@ -239,55 +200,29 @@ def device_limits() -> tuple[float, float, str]:
     copy()
     fma = _FMA.get(tuple(device.compute_capability), 2)
     peak = 2.0 * fma * device.MULTIPROCESSOR_COUNT * 1e3 * device.CLOCK_RATE
-    return (
-        2.0 * a.nbytes / report.best(copy, 10),
-        peak,
-        str(device.name.decode() if isinstance(device.name, bytes) else device.name),
-    )
+    name = device.name.decode() if isinstance(device.name, bytes) else device.name
+    return 2.0 * a.nbytes / best(copy, 10), peak, str(name)
 
 
 def work_section(rows: list[Row], absent: str) -> Section:
-    columns = [
-        Column("robot", "robot"),
-        Column("robots", "robots", ",d"),
-        Column("moved_bytes", "read and written\nbytes / robot", ",.0f"),
-        Column("scratch_bytes", "scratch\nbytes / thread", ",.0f"),
-        Column("operations", "flop\n/ pass", ",.0f"),
-        Column("device", "device"),
-        Column("memory_floor_ms", "memory floor\n[ms]", ".2f"),
-        Column("arithmetic_floor_ms", "arithmetic floor\n[ms]", ".2f"),
-    ]
-    limits = (
-        "an H100's data sheet"
-        if absent or rows[0]["device"] == "simulated"
-        else "a copy measured here, and the clock's multiply-adds"
-    )
-    notes = [
+    sheet = absent or rows[0]["device"] == "simulated"
+    limits = "an H100's data sheet" if sheet else "a copy measured here, and the clock's multiply-adds"
+    return table(
+        "work",
+        "What one pass moves and computes",
+        "robot | robots:,d | moved_bytes:,.0f read and written~bytes / robot | scratch_bytes:,.0f "
+        "scratch~bytes / thread| operations:,.0f flop~/ pass | device | memory_floor_ms:.2f memory floor~[ms]"
+        "| arithmetic_floor_ms:.2f arithmetic floor~[ms]",
+        rows,
+        *([f"No time was measured: {absent}"] if absent else []),
         "Memory floor: inputs, robot, memory of the observer (read and written) and tip once over the "
-        f"bandwidth; limits from {limits}. "
-        "The scratch of a thread stays on the device and is used again by its next robot; what of it falls "
-        "out of the caches comes on top."
-    ]
-    if absent:
-        notes.insert(0, f"No time was measured: {absent}")
-    return Section("work", "What one pass moves and reckons", columns, rows, notes)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Measure and print; the exit code."""
-    parser = argparse.ArgumentParser(prog="bench_cuda", description=__doc__)
-    parser.add_argument(
-        "--robots",
-        type=int,
-        default=None,
-        help="prototypes; reachers are a fifth as many (1000000; 64 with --quick)",
-    )
-    return report.command(
-        parser,
-        argv,
-        lambda options: sections(options.robots or (64 if options.quick else 1_000_000), options.quick),
+        f"bandwidth; limits from {limits}. The scratch of a thread stays on the device and is used again by "
+        "its next robot; what of it falls out of the caches comes on top.",
     )
 
 
+main = bench(
+    __doc__, measure, ("--robots", int, "prototypes; reachers are a fifth as many (1000000; 64 with --quick)")
+)
 if __name__ == "__main__":
     sys.exit(main())

@@ -1,33 +1,32 @@
-"""A prototype that runs, and faults put into one that moves: `python perf/bench_faults.py`; or `--quick`.
+"""A prototype that runs, and faults put into one that moves.
 
-First the whole way: connect to drives that have an EPOS4's objects (or those of `--eds FILE`) and no others,
-home, and move for a minute at 200 Hz.
+First the whole procedure: connect to drives that have an EPOS4's objects (or those of `--eds FILE`) and no
+others, home, and move for a minute at 200 Hz.
 
-The emulated prototype goes round in a circle by commands at 30 Hz that go on whatever happens, and records.
-At a moment that a seed draws something fails. Detection is when the supervisor finds it (a killed process has
-none: there it is when the drives miss its heartbeat), standstill when the last shaft comes to rest, as the
-emulator knows it and no controller does.
+The emulated prototype goes round in a circle by commands at 30 Hz that go on whatever happens, and
+records. At a moment that a seed draws something fails. Detection is when the supervisor finds it (a killed
+process has none: there it is when the drives miss its heartbeat), standstill when the last shaft comes to
+rest, as the emulator knows it and no controller does.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
-import signal
-import subprocess
+import multiprocessing
 import sys
 import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from fastrod.errors import FastrodError
-from fastrod.logs.recording import Recorder, recover
+from fastrod.logs.recording import recover
 from fastrod.types import Floats
 from fastrod_device.bus import BusLine
 from fastrod_device.camera import CameraFrame
@@ -44,45 +43,21 @@ from fastrod_device.prototype import Prototype
 from fastrod_device.safety import SafetyState
 from fastrod_device.seal import seal
 from fastrod_device.workbench import emulated
-from report import Column, Row, Section, command, note_progress
+from report import Row, Section, bench, note_progress, table
 
-RADIUS, TURN = 0.0025, 1.0  # m of wire, s
+RADIUS, PERIOD = 0.0025, 1.0  # m of tendon, s
 COMMANDS = 30.0  # Hz
-FOLLOWING = 2.5e-4  # m; with 1 mm a wire that stalls is found by its tension before
+FOLLOWING = 2.5e-4  # m; with 1 mm a tendon that stalls is found by its tension before
 SAFE = 0.05  # s from detection to standstill
 AFTER = 1.0  # s in which nothing may start again
 PATIENCE = 3.0  # s in which a fault must be found
 UDP = "udp_multicast:239.74.163.5:43179"
 LOOP = 200.0  # Hz
 STORMS = (1, 2, 5, 10)  # SYNCs in a cycle; with four drives' answers a bus of 1 Mbit/s carries ten in 10 ms
-RUN = (
-    Column("objects", "objects\nof a drive", "d"),
-    Column("notices", "not\nlimited", "d"),
-    Column("ready", "connected and\nhomed after [s]", ".1f"),
-    Column("seconds", "moved\nfor [s]", ".1f"),
-    Column("rate", "cycles\na second", ".1f"),
-    Column("missed", "set-points\nmissed", "d"),
-    Column("unanswered", "cycles not\nanswered", "d"),
-    Column("sdo", "SDO in\nthe loop", "d"),
-    Column("stopped", "stopped by"),
-)
-COLUMNS = (
-    Column("kind", "injected"),
-    Column("n", "n", "d"),
-    Column("safe", "stopped\nwithin 50 ms", "d"),
-    Column("named", "named", "d"),
-    Column("found", "injected to\nfound, worst [ms]", ".0f"),
-    Column("rest", "found to\nrest, worst [ms]", ".1f"),
-    Column("all", "injected to\nrest, worst [ms]", ".0f"),
-    Column("rows", "rows", "d"),
-    Column("lost", "rows\nlost", "d"),
-    Column("lines", "journal's\nlines lost", "d"),
-    Column("again", "enabled\nagain", "d"),
-)
+KILLED = "killed process"
 
 
-@dataclass
-class Trial:
+class Trial(NamedTuple):
     """What one fault led to; times [s]."""
 
     found: float
@@ -104,72 +79,67 @@ class Rig:
         self.jump, self.storm = 0.0, 0
         hardware, bus = load_hardware(), f"virtual:faults-{time.monotonic_ns()}"
         hardware = replace(hardware, limits=replace(hardware.limits, following_error=FOLLOWING))
-        hidden = seal(seed, "none")
-        self.emulator = Emulator(hardware, bus, clock=self.clock, seal=hidden, seed=seed, taut=True, eds=eds)
+        both: Any = {"clock": self.clock, "eds": eds}
+        self.emulator = Emulator(hardware, bus, seal=seal(seed, "none"), seed=seed, taut=True, **both)
         self.journal = folder / f"{seed}-{time.monotonic_ns()}.journal.csv"
-        self.part = self.journal.with_suffix(".log.csv")
+        self.log = self.journal.with_suffix(".log.csv")
         day = time.time() - self.clock.now()
-        wall: Callable[[], float] = lambda: self.clock.now() + day + self.jump  # noqa: E731
-        journal = Journal(self.journal)
+        wall: Any = lambda: self.clock.now() + day + self.jump  # noqa: E731
         self.prototype = Prototype(
-            hardware, bus, self.emulator, clock=self.clock, eds=eds, journal=journal, wall=wall
+            hardware, bus, self.emulator, journal=Journal(self.journal), wall=wall, **both
         )
         self._other = BusLine(bus)
         self.prototype.start(home=False)
-        self.recorder: Recorder = self.prototype.recorder_for(str(self.part))
-        self.recorder.start(self.prototype.elapsed)
-        self.prototype.record(self.recorder)
-        self._began, self._over = self.clock.now(), threading.Event()
-        self._thread = threading.Thread(target=self._command_on, daemon=True)
-        if not stepped:
-            self._thread.start()
+        self.recorder = record(self.prototype, self.log)
+        self._began, self._over, self._threads = self.clock.now(), threading.Event(), list[Any]()
+        self._repeat(1.0 / COMMANDS, self.command)
+
+    def _repeat(self, period: float, what: Callable[[], None]) -> None:
+        """From now on in real time; stepped time does it in `wait`."""
+
+        def repeat() -> None:
+            while not self._over.wait(period):
+                what()
+
+        if not self.clock.stepped:
+            self._threads.append(threading.Thread(target=repeat, daemon=True))
+            self._threads[-1].start()
 
     def command(self) -> None:
-        """Where the circle is now."""
+        """Send the circle's point of now."""
         with suppress(RefusedError):
             self.prototype.command(circle(self.clock.now() - self._began))
 
-    def _command_on(self) -> None:
-        while not self._over.wait(1.0 / COMMANDS):
-            self.command()
-
     def sync(self) -> None:
-        """Another node's SYNC."""
         self._other.send(0x080, b"")
-
-    def _sync_on(self) -> None:
-        while not self._over.wait(1e-3 / self.storm * max(STORMS)):
-            self.sync()
 
     def storm_on(self, syncs: int) -> None:
         """From now on so many SYNCs of another node in every 10 ms."""
         self.storm = syncs
-        if not self.clock.stepped:
-            threading.Thread(target=self._sync_on, daemon=True).start()
+        self._repeat(1e-3 / syncs * max(STORMS), self.sync)
 
-    def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
-        """So much time passes, stopped or not, with commands; whether `until` came true."""
+    def wait(self, seconds: float, until: Callable[[], bool]) -> None:
+        """So much time passes, stopped or not, with commands, or less if `until` comes true."""
         end, due = self.clock.now() + seconds, -math.inf
-        while self.clock.now() < end:
+        while self.clock.now() < end and not until():
             if not self.clock.stepped:
                 time.sleep(1e-3)
-            else:
-                if self.clock.now() >= due:
-                    due = self.clock.now() + 1.0 / COMMANDS
-                    self.command()
-                for _ in range(self.storm):
-                    self.sync()
-                with suppress(DeviceError):
-                    self.prototype.wait(1.0 / self.prototype.hardware.rate)
-            if until():
-                return True
-        return False
+                continue
+            if self.clock.now() >= due:
+                due = self.clock.now() + 1.0 / COMMANDS
+                self.command()
+            for _ in range(self.storm):
+                self.sync()
+            with suppress(DeviceError):
+                self.prototype.wait(1.0 / self.prototype.hardware.rate)
+
+    def stopped(self) -> bool:
+        return self.prototype.supervisor.state is SafetyState.STOPPED
 
     def close(self) -> None:
-        """Switch all off."""
         self._over.set()
-        if self._thread.is_alive():
-            self._thread.join(2.0)
+        for thread in self._threads:
+            thread.join(2.0)
         self.emulator.drives.restore()
         self.prototype.close()
         self._other.close()
@@ -177,32 +147,45 @@ class Rig:
 
 
 @contextmanager
-def rig(folder: Path, seed: int, *, stepped: bool, eds: Path | None) -> Iterator[Rig]:
+def rig(folder: Path, seed: int, **options: Any) -> Iterator[Rig]:
     """One, closed at the end."""
-    made = Rig(folder, seed, stepped=stepped, eds=eds)
+    made = Rig(folder, seed, **options)
     try:
         yield made
     finally:
         made.close()
 
 
+class Watch:
+    """Whether any drive was enabled again after it had stopped, or never stopped."""
+
+    def __init__(self, drives: Any) -> None:
+        self.drives, self.again = drives, False
+        self.on = np.ones(drives.n_drives, dtype=np.bool_)
+
+    def __call__(self) -> bool:
+        now = np.array([state == ENABLED for state in self.drives.states])
+        self.again |= bool((now & ~self.on).any())
+        self.on &= now
+        return False
+
+
+def record(prototype: Prototype, log: Path) -> Any:
+    recorder = prototype.recorder_for(str(log))
+    recorder.start(prototype.elapsed)
+    prototype.record(recorder)
+    return recorder
+
+
 def circle(t: float) -> Floats:
-    """(4,) wire lengths [m] at `t` [s]."""
-    angle = 2.0 * math.pi * t / TURN
+    """(4,) tendon lengths [m] at `t` [s]."""
+    angle = 2.0 * math.pi * t / PERIOD
     bend = RADIUS * min(1.0, t / 0.5) * np.array([math.cos(angle), math.sin(angle)])
     return np.concatenate([bend, -bend])
 
 
-def _freeze(rig: Rig, _: int) -> None:
-    rig.emulator.frozen = True
-
-
-def _hide(rig: Rig, _: int) -> None:
-    rig.emulator.hidden = True
-
-
 def _block(rig: Rig, _: int) -> None:
-    """The drive that pulls most: one that lets wire out is found by its tension before, as the others pull
+    """The drive that pulls most: one that lets tendon out is found by its tension before, as the others pull
     against it."""
     readings = rig.prototype.readings
     rig.emulator.drives.block(0 if readings is None else int(np.argmin(readings.rate)))
@@ -212,21 +195,30 @@ def _jump(rig: Rig, k: int) -> None:
     rig.jump += (3600.0, -0.5, 0.3)[k % 3]
 
 
-INJECTIONS: dict[str, tuple[Callable[[Rig, int], None], str]] = {
-    "heartbeat lost": (lambda rig, k: rig.emulator.drives.lose_heartbeat(k % 4), "sent its last heartbeat"),
+def _drives(call: Callable[[Any, int], Any]) -> Callable[[Rig, int], Any]:
+    return lambda rig, k: call(rig.emulator.drives, k)
+
+
+def _camera(flag: str) -> Callable[[Rig, int], Any]:
+    return lambda rig, _: setattr(rig.emulator, flag, True)
+
+
+_CODES, _COUNTS = (0x2310, 0x3210, 0x4310), (2000, -2000, 4000, -4000)
+INJECTIONS: dict[str, tuple[Callable[[Rig, int], Any], str]] = {
+    "heartbeat lost": (_drives(lambda drives, k: drives.lose_heartbeat(k % 4)), "sent its last heartbeat"),
     "emergency message": (
-        lambda rig, k: rig.emulator.drives.emergency(k % 4, (0x2310, 0x3210, 0x4310)[k % 3]),
+        _drives(lambda drives, k: drives.emergency(k % 4, _CODES[k % 3])),
         "sent an emergency: 0x",
     ),
     "following error": (_block, "ollowing error"),
-    "bus off": (lambda rig, _: rig.emulator.drives.bus_off(), "the bus carries nothing"),
-    "node reboot": (lambda rig, k: rig.emulator.drives.reboot(k % 4), "NMT state is 0 (booting)"),
-    "camera frozen": (_freeze, "the camera repeats its frames"),
-    "marker lost": (_hide, "the marker was last seen"),
+    "bus off": (_drives(lambda drives, _: drives.bus_off()), "the bus carries nothing"),
+    "node reboot": (_drives(lambda drives, k: drives.reboot(k % 4)), "NMT state is 0 (booting)"),
+    "camera frozen": (_camera("frozen"), "the camera repeats its frames"),
+    "marker lost": (_camera("hidden"), "the marker was last seen"),
     "clock jump": (_jump, "the wall clock jumped"),
     "encoder jump": (
-        lambda rig, k: rig.emulator.drives.encoder_jump(k % 4, (2000, -2000, 4000, -4000)[k % 4]),
-        "moved its wire by",
+        _drives(lambda drives, k: drives.encoder_jump(k % 4, _COUNTS[k % 4])),
+        "moved its tendon by",
     ),
     "SYNC storm": (lambda rig, k: rig.storm_on(STORMS[k % 4]), "another node sends SYNC"),
 }
@@ -241,71 +233,46 @@ def run(seconds: float, *, stepped: bool, eds: Path | None) -> Row:
         prototype, nodes = bench.prototype, bench.emulator.drives
         bus, ready = prototype.drives, prototype.elapsed
         bus.reset_statistics()
-        asked, missed, began = bus.sdo_requests, nodes.missed_setpoints, prototype.clock.now()
+        requests, missed, began = bus.sdo_requests, nodes.missed_setpoints, prototype.clock.now()
         with suppress(DeviceError):
             prototype.follow(circle, seconds)
-        passed, cycles, fault = prototype.clock.now() - began, bus.jitter.n, prototype.supervisor.first
+        passed, fault = prototype.clock.now() - began, prototype.supervisor.first
         return {
             "objects": len(object_dictionary(eds)),
             "notices": len(bus.notices),
             "ready": ready,
             "seconds": passed,
-            "rate": cycles / passed,
+            "rate": bus.jitter.n / passed,
             "missed": nodes.missed_setpoints - missed,
             "unanswered": bus.missed,
-            "sdo": bus.sdo_requests - asked,
+            "sdo": bus.sdo_requests - requests,
             "stopped": "nothing" if fault is None else fault.sentence,
         }
 
 
-def fail(kind: str, k: int, folder: Path, *, stepped: bool, eds: Path | None) -> Trial:
-    """One trial."""
+def fail(kind: str, k: int, folder: Path, **options: Any) -> Trial:
     rng = np.random.default_rng([k, list(INJECTIONS).index(kind)])
     inject, words = INJECTIONS[kind]
-    with rig(folder, k, stepped=stepped, eds=eds) as bench:
-        supervisor, drives = bench.prototype.supervisor, bench.emulator.drives
-        bench.wait(0.7 + float(rng.uniform(0.0, 1.0)), lambda: supervisor.state is SafetyState.STOPPED)
+    with rig(folder, k, **options) as bench:
+        drives, journal = bench.emulator.drives, bench.prototype.journal
+        bench.wait(0.7 + float(rng.uniform(0.0, 1.0)), bench.stopped)
         injected = bench.clock.now()
         inject(bench, k)
-        bench.wait(PATIENCE, lambda: supervisor.state is SafetyState.STOPPED)
-        fault = supervisor.first
+        bench.wait(PATIENCE, bench.stopped)
+        fault = bench.prototype.supervisor.first
         if fault is None:
-            return Trial(
-                math.inf, math.inf, math.inf, False, len(bench.recorder), 0, 1, False, "nothing was found"
-            )
-        on = np.ones(drives.n_drives, dtype=np.bool_)
-        again = False
-
-        def look() -> bool:
-            nonlocal on, again
-            now = np.array([state == ENABLED for state in drives.states])
-            again |= bool((now & ~on).any())
-            on &= now
-            return False
-
-        bench.wait(AFTER, look)
+            none = (math.inf, math.inf, math.inf)
+            return Trial(*none, False, len(bench.recorder), 0, 1, False, "nothing was found")
+        watch = Watch(drives)
+        bench.wait(AFTER, watch)
         at = float(np.nanmax(drives.stopped_at, initial=injected)) if not drives.moving.any() else math.inf
-        again |= bool(on.any()) or supervisor.state is not SafetyState.STOPPED
+        again = watch.again or bool(watch.on.any()) or not bench.stopped()
         bench.prototype.record(None)
-        rows = len(bench.recorder)
-        kept = bench.part.with_name(bench.part.name + ".part").read_text(encoding="utf-8").count("\n") - 2
-        lost = sum(
-            line[2] not in bench.journal.read_text(encoding="utf-8").replace('""', '"')
-            for line in bench.prototype.journal.lines
-        )
-        lines = lost + (not bench.prototype.journal.lines)
-        rest = max(at - fault.t, 0.0)
-        return Trial(
-            fault.t - injected,
-            rest,
-            at - injected,
-            words in fault.sentence,
-            rows,
-            rows - kept,
-            lines,
-            again,
-            fault.sentence,
-        )
+        rows, written = len(bench.recorder), bench.journal.read_text(encoding="utf-8").replace('""', '"')
+        kept = bench.log.with_name(bench.log.name + ".part").read_text(encoding="utf-8").count("\n") - 2
+        lines = sum(line[2] not in written for line in journal.lines) + (not journal.lines)
+        times = fault.t - injected, max(at - fault.t, 0.0), at - injected
+        return Trial(*times, words in fault.sentence, rows, rows - kept, lines, again, fault.sentence)
 
 
 class Still:
@@ -329,158 +296,132 @@ class Still:
         """Nothing to give back."""
 
 
-def be_killed(folder: str) -> int:
-    """The process that is killed: it tells how many rows it has recorded."""
+def be_killed(log: Path, ends: Any) -> None:
+    """The process that is killed: it sends how many rows it has recorded, and its supervisor's state."""
     urgent()
     hardware = load_hardware()
-    # its marker stands where the model says it moves
+    # its marker stands still, not where the model says it moves
     blind = replace(hardware, limits=replace(hardware.limits, sighting_age=None))
     with Prototype(blind, UDP, Still()) as prototype:
         prototype.start(home=False)
-        recorder = prototype.recorder_for(str(Path(folder) / "killed.csv"))
-        recorder.start(prototype.elapsed)
-        prototype.record(recorder)
-        began = time.monotonic()
+        recorder, began = record(prototype, log), time.monotonic()
         while True:
             prototype.command(circle(time.monotonic() - began))
-            print(len(recorder), prototype.supervisor.state.value, flush=True)
+            ends.send((len(recorder), prototype.supervisor.state.value))
             time.sleep(1.0 / COMMANDS)
 
 
 def kill(k: int, folder: Path) -> Trial:
     """One trial with the controller in a process of its own."""
-    rng, log = np.random.default_rng([k, 99]), folder / "killed.csv"
-    emulator = Emulator(load_hardware(), UDP, clock=WallClock(), seal=seal(k, "none"), seed=k, taut=True)
-    child = subprocess.Popen(
-        [sys.executable, __file__, "--be-killed", str(folder)], stdout=subprocess.PIPE, text=True
+    rng, log, spawn = (
+        np.random.default_rng([k, 99]),
+        folder / "killed.csv",
+        multiprocessing.get_context("spawn"),
     )
+    emulator = Emulator(load_hardware(), UDP, clock=WallClock(), seal=seal(k, "none"), seed=k, taut=True)
+    here, there = spawn.Pipe(duplex=False)
+    child, drives = spawn.Process(target=be_killed, args=(log, there)), emulator.drives
     try:
-        assert child.stdout is not None
-        told, end = "", math.inf
-        for line in child.stdout:
-            told = line
-            end = (
-                min(end, time.monotonic() + 1.0 + float(rng.uniform(0.0, 1.0)))
-                if int(line.split()[0])
-                else end
-            )
-            if time.monotonic() > end:
-                break
+        child.start()
+        there.close()
+        rows, state, end = 0, "", math.inf
+        while time.monotonic() < end:
+            rows, state = here.recv()
+            end = min(end, time.monotonic() + 1.0 + float(rng.uniform(0.0, 1.0))) if rows else end
         end = time.monotonic() + 0.2  # between two commands it may stand
-        while not (moved := bool(emulator.drives.moving.any())) and time.monotonic() < end:
+        while not (moved := bool(drives.moving.any())) and time.monotonic() < end:
             time.sleep(1e-3)
         injected = time.monotonic()
-        child.send_signal(signal.SIGKILL)
-        rows = int(
-            (told + "".join(line for line in child.stdout if line.endswith("\n"))).split("\n")[-2].split()[0]
-        )
-        child.wait()
-        on, again, after = np.ones(4, dtype=np.bool_), False, injected + 0.3 + AFTER
-        while time.monotonic() < after:
-            now = np.array([state == ENABLED for state in emulator.drives.states])
-            again, on = again or bool((now & ~on).any()), on & now
+        child.kill()
+        with suppress(EOFError):
+            while True:
+                rows, state = here.recv()
+        child.join()
+        watch = Watch(drives)
+        while time.monotonic() < injected + 0.3 + AFTER:
+            watch()
             time.sleep(1e-3)
-        again |= bool(on.any())
-        still = not emulator.drives.moving.any() and moved
-        at = float(np.nanmax(emulator.drives.stopped_at)) if still else math.inf
-        found = float(np.nanmax(emulator.drives.missed_at, initial=-math.inf))
+        at = float(np.nanmax(drives.stopped_at)) if moved and not drives.moving.any() else math.inf
+        found = float(np.nanmax(drives.missed_at, initial=-math.inf))
         kept = len(recover(log).t)
         log.unlink()
-        named = bool(np.isfinite(emulator.drives.missed_at).all())
-        sentence = (
-            "the controller's heartbeat is missed by every drive (emergency 0x8130)"
-            if named
-            else "a drive did not miss it"
+        named = bool(np.isfinite(drives.missed_at).all())
+        missed = "the controller's heartbeat is missed by every drive (emergency 0x8130)"
+        sentence = missed if named else "a drive did not miss it"
+        if not moved:
+            sentence = f"nothing moved before it was killed; it was {state}"
+        times, again = (
+            (found - injected, max(at - found, 0.0), at - injected),
+            watch.again or bool(watch.on.any()),
         )
-        sentence = sentence if moved else f"nothing moved before it was killed; it was {told.split()[-1]}"
-        return Trial(
-            found - injected,
-            max(at - found, 0.0),
-            at - injected,
-            named,
-            rows,
-            max(rows - kept, 0),
-            0,
-            again,
-            sentence,
-        )
+        return Trial(*times, named, rows, max(rows - kept, 0), 0, again, sentence)
     finally:
         child.kill()
-        child.wait()
+        child.join()
         emulator.close()
 
 
 def _row(kind: str, trials: Sequence[Trial]) -> Row:
-    """Of one kind."""
-    return {
-        "kind": kind,
-        "n": len(trials),
-        "safe": sum(trial.rest <= SAFE for trial in trials),
-        "named": sum(trial.named for trial in trials),
-        "found": 1e3 * max(trial.found for trial in trials),
-        "rest": 1e3 * max(trial.rest for trial in trials),
-        "all": 1e3 * max(trial.whole for trial in trials),
-        "rows": sum(trial.rows for trial in trials),
-        "lost": sum(trial.lost for trial in trials),
-        "lines": sum(trial.lines for trial in trials),
-        "again": sum(trial.again for trial in trials),
-        "sentence": next((t.sentence for t in trials if not t.named), trials[0].sentence),
+    worst = {name: 1e3 * max(getattr(t, name) for t in trials) for name in ("found", "rest", "whole")}
+    sums = {
+        name: sum(getattr(t, name) for t in trials) for name in ("named", "rows", "lost", "lines", "again")
     }
+    sentence = next((t.sentence for t in trials if not t.named), trials[0].sentence)
+    safe = sum(trial.rest <= SAFE for trial in trials)
+    return {"kind": kind, "n": len(trials), "safe": safe, **worst, **sums, "sentence": sentence}
 
 
-def measure(options: argparse.Namespace) -> Sequence[Section]:
-    """All kinds."""
-    times = 1 if options.quick else options.times
+def measure(options: argparse.Namespace) -> list[Section]:
+    times, found = 1 if options.quick else options.times, []
     urgent()  # before other programs, where that is granted
-    rows, whole = [], []
+    how, time_is = {"stepped": options.stepped, "eds": options.eds}, ", stepped" if options.stepped else ""
     if options.only is None:
         note_progress("connect, home, move")
-        whole.append(run(2.0 if options.quick else options.seconds, stepped=options.stepped, eds=options.eds))
+        found.append(
+            table(
+                "run",
+                f"connect, home and move at {LOOP:g} Hz{time_is}",
+                "objects:d objects~of a drive | notices:d not~limited | ready:.1f connected and~homed after "
+                "[s]| seconds:.1f moved~for [s] | rate:.1f cycles~a second | missed:d set-points~missed"
+                "| unanswered:d cycles not~answered | sdo:d SDO in~the loop | stopped stopped by",
+                [run(2.0 if options.quick else options.seconds, **how)],
+            )
+        )
+    rows = []
     with tempfile.TemporaryDirectory() as name:
-        for kind in INJECTIONS:
-            if options.only in (None, kind):
-                note_progress(kind)
-                how, folder = {"stepped": options.stepped, "eds": options.eds}, Path(name)
-                rows.append(_row(kind, [fail(kind, k, folder, **how) for k in range(times)]))
-        if options.only in (None, "killed process"):
-            note_progress("killed process")
-            rows.append(_row("killed process", [kill(k, Path(name)) for k in range(times)]))
-    notes = [
-        "A sentence of each kind, of a trial that was not named as it should where there is one:",
-        *(f"  {row['kind']}: {row['sentence']}" for row in rows),
-        "'found to rest' is 0 where set-points that do not come any more had stopped the shafts before: bus "
-        "off, killed process.",
-        "A killed process: SIGKILL, drives in another process on udp_multicast, always in real time; rows "
-        "are those that it had reported.",
-    ]
-    time_is = ", stepped" if options.stepped else ""
-    found = [Section("faults", f"faults injected into a moving prototype{time_is}", COLUMNS, rows, notes)]
-    if whole:
-        found.insert(0, Section("run", f"connect, home and move at {LOOP:g} Hz{time_is}", RUN, whole, []))
+        folder = Path(name)
+        for kind in [options.only] if options.only else [*INJECTIONS, KILLED]:
+            note_progress(kind)
+            trials = [
+                kill(k, folder) if kind == KILLED else fail(kind, k, folder, **how) for k in range(times)
+            ]
+            rows.append(_row(kind, trials))
+    found.append(
+        table(
+            "faults",
+            f"faults injected into a moving prototype{time_is}",
+            "kind injected | n:d | safe:d stopped~within 50 ms | named:d | found:.0f injected to~found, "
+            "worst [ms]| rest:.1f found to~rest, worst [ms] | whole:.0f injected to~rest, worst [ms] | rows:d"
+            "| lost:d rows~lost | lines:d journal's~lines lost | again:d enabled~again",
+            rows,
+            "A sentence of each kind, of a trial that was not named as it should where there is one:",
+            *(f"  {row['kind']}: {row['sentence']}" for row in rows),
+            "'found to rest' is 0 where set-points that do not come any more had stopped the shafts before: "
+            "bus off, killed process. A killed process: SIGKILL, drives in another process on udp_multicast, "
+            "always in real time; rows are those that it had reported.",
+        )
+    )
     return found
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Measure and print; the exit code."""
-    given = sys.argv[1:] if argv is None else list(argv)
-    if given[:1] == ["--be-killed"]:
-        return be_killed(given[1])
-    parser = argparse.ArgumentParser(
-        prog="bench_faults", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--times", type=int, default=20, help="of each kind (default: 20)")
-    parser.add_argument("--only", choices=[*INJECTIONS, "killed process"], help="this kind alone")
-    parser.add_argument("--seconds", type=float, default=60.0, help="of the loop at 200 Hz (default: 60)")
-    parser.add_argument("--eds", type=Path, metavar="FILE", help="of the drives (default: an EPOS4's)")
-    parser.add_argument(
-        "--stepped", action="store_true", help="as fast as the machine computes, not in real time"
-    )
-    try:
-        return command(parser, given, measure)
-    except FastrodError as error:
-        print(error, file=sys.stderr)
-        return 1
-
-
+main = bench(
+    __doc__,
+    measure,
+    ("--times", 20, "of each kind"),
+    ("--only", [*INJECTIONS, KILLED], "this kind alone"),
+    ("--seconds", 60.0, "of the loop at 200 Hz"),
+    ("--eds", Path, "of the drives (default: an EPOS4's)"),
+    ("--stepped", False, "as fast as the machine computes, not in real time"),
+)
 if __name__ == "__main__":
     sys.exit(main())

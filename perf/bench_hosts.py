@@ -1,19 +1,16 @@
-"""Rods on rigid hosts, a step of rod and world: `fastrod bench hosts`, or this file as a script; `--json` for
-programs, `--quick` for a smoke run."""
+"""Rods on rigid hosts: a step of rod and world, and one rod on one UR5 in PyBullet and in MuJoCo."""
 
 from __future__ import annotations
 
 import argparse
-import statistics
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-import report
-import two_engines
-from report import Column, Row, Section, note_progress
+from report import Measurement, Row, Section, bench, note_progress, table
 
 DT = 0.005
 SIZE = 0.06
@@ -27,34 +24,29 @@ def mounted(robot: str, mass: float, place: Sequence[float], gravity: float, tou
 
     world = connect(dt=DT, gravity=(0.0, 0.0, -gravity))
     post = world.createMultiBody(0.0, -1, -1, [0.0, 0.0, 0.0])
-    cube = world.createMultiBody(
-        mass, world.createCollisionShape(world.GEOM_BOX, halfExtents=[SIZE / 2] * 3), -1, list(place)
-    )
+    shape = world.createCollisionShape(world.GEOM_BOX, halfExtents=[SIZE / 2] * 3)
+    cube = world.createMultiBody(mass, shape, -1, list(place))
     world.changeDynamics(cube, -1, linearDamping=0.0, angularDamping=0.0)
     along_x = BulletLink(world, post, quaternion=(0.5**0.5, 0.0, 0.5**0.5, 0.0))
-    return MountedRod(fastrod.load_robot(robot), along_x, touch=[cube] if touch else []), cube
+    return MountedRod(fastrod.load_robot(robot), along_x, contact_bodies=[cube] if touch else []), cube
 
 
-def timed(what: str, step: Callable[[int], Any], steps: int, touching: Callable[[], bool]) -> Row:
-    """Milliseconds of a step: median, 95th percentile and the longest, and how many touched or failed."""
+def timed(
+    what: str, step: Callable[[int], Any], steps: int, contact: Callable[[], bool] = lambda: False
+) -> Row:
+    """Milliseconds of a step: median, 95th percentile and the longest, and how many were in contact or
+    failed."""
     note_progress(what)
     for k in range(3):
         step(k)
-    taken, touched, failed = [], 0, 0
+    taken, in_contact, failed = Measurement(), 0, 0
     for k in range(3, 3 + steps):
-        t, state = report.seconds(lambda k=k: step(k))
-        taken.append(1e3 * t)
-        touched += touching()
+        state = taken.take(partial(step, k))
+        in_contact += contact()
         failed += state is not None and not bool(state.ok[0])
-    return {
-        "what": what,
-        "median_ms": statistics.median(taken),
-        "p95_ms": float(np.quantile(taken, 0.95)),
-        "longest_ms": max(taken),
-        "touching": touched / steps,
-        "failed": failed,
-        "steps": steps,
-    }
+    times = {"median_ms": taken.median, "p95_ms": taken.quantile(0.95), "longest_ms": max(taken.times)}
+    row: Row = {"what": what, **{key: 1e3 * t for key, t in times.items()}}
+    return row | {"in_contact": in_contact / steps, "failed": failed, "steps": steps}
 
 
 def rods(steps: int) -> list[Row]:
@@ -62,14 +54,8 @@ def rods(steps: int) -> list[Row]:
     rows = []
     for robot in ("prototype", "five_segment_reacher"):
         rod, _ = mounted(robot, 0.1, (5.0, 0.0, 0.0), 0.0, touch=False)
-        rows.append(
-            timed(
-                f"{robot}, free",
-                lambda k, rod=rod: rod.step(tip_force=(0.0, 0.0, 1e-4 * np.sin(0.1 * k))),
-                steps,
-                lambda: False,
-            )
-        )
+        swing = lambda k, rod=rod: rod.step(tip_force=(0.0, 0.0, 1e-4 * np.sin(0.1 * k)))  # noqa: E731
+        rows.append(timed(f"{robot}, free", swing, steps))
     rod, _ = mounted("prototype", 0.1, (0.1 + 0.5 * SIZE - 0.017, 0.0, 0.0), 0.0, touch=True)
     rest, world = rod.simulator.robots[0].rest_tendon_length, rod.bullet
 
@@ -78,111 +64,75 @@ def rods(steps: int) -> list[Row]:
         world.resetBaseVelocity(rod.host.body, [0.1, 0.0, 0.0], [0.0, 0.0, 0.0])
         return rod.step(tendon_length=rest)
 
-    rows.append(
-        timed("prototype, pushes a free cube", push, steps, lambda: bool(rod.state.contacts.count[0]))
-    )
+    def felt(rod: Any) -> bool:
+        return bool(rod.state.contacts.count[0])
+
+    rows.append(timed("prototype, pushes a free cube", push, steps, partial(felt, rod)))
     long, _ = mounted("five_segment_reacher", 0.02, (0.15, 0.0, 0.1), 9.81, touch=True)
-    rows.append(
-        timed(
-            "five_segment_reacher, 20 g fall on it",
-            lambda _: long.step(),
-            steps,
-            lambda: bool(long.state.contacts.count[0]),
-        )
-    )
-    return rows
+    what = "five_segment_reacher, 20 g fall on it"
+    return [*rows, timed(what, lambda _: long.step(), steps, partial(felt, long))]
 
 
 def paper(steps: int) -> list[Row]:
-    """The paper's class."""
     from fastrod.hosts import SoftManiSim
 
     soft = SoftManiSim()
     soft.add_a_cube([0.1, 0.1, 0.03], size=[0.06] * 3)
     wave = np.array([0.0, 0.002, 0.001] * 3)
-    rows = [
-        timed(
-            "SoftManiSim, 3 segments: move_robot_ori",
-            lambda k: soft.move_robot_ori(wave * np.sin(0.02 * k)) and None,
+    calls: dict[str, tuple[Callable[[int], Any], int]] = {
+        "SoftManiSim, 3 segments: move_robot_ori": (
+            lambda k: soft.move_robot_ori(wave * np.sin(0.02 * k)),
             steps,
-            lambda: False,
         ),
-        timed(
-            "calc_tip_pos",
-            lambda k: soft.calc_tip_pos(wave * np.sin(0.02 * k)) and None,
-            steps,
-            lambda: False,
-        ),
-        timed(
-            "capture_image, 640 x 480",
-            lambda _: soft.capture_image() and None,
-            max(3, steps // 20),
-            lambda: False,
-        ),
-    ]
+        "calc_tip_pos": (lambda k: soft.calc_tip_pos(wave * np.sin(0.02 * k)), steps),
+        "capture_image, 640 x 480": (lambda _: soft.capture_image(), max(3, steps // 20)),
+    }
+    rows = [timed(what, lambda k, call=call: call(k) and None, n) for what, (call, n) in calls.items()]
     soft.close()
     return rows
 
 
 def engines(steps: int) -> list[Row]:
     """The same rod on the same UR5 in both engines."""
-    rows: list[Row] = []
+    import two_engines
+
+    rows = []
     for case in two_engines.CASES:
-        note_progress(f"two engines, {case}")
         found = {engine: two_engines.at_rest(engine, case, max(steps, 100)) for engine in two_engines.ENGINES}
-        taken = {
-            engine: timed(f"{engine}, {case}", lambda _, r=r: r.step(), steps, lambda: False)
-            for engine, r in found.items()
-        }
         apart = two_engines.apart(found["PyBullet"], found["MuJoCo"])
-        rows.append(
-            {
-                "what": case,
-                **{name: 100.0 * value for name, value in apart.items()},
-                "pybullet_ms": taken["PyBullet"]["median_ms"],
-                "mujoco_ms": taken["MuJoCo"]["median_ms"],
-            }
-        )
+        row: Row = {"what": case, **{name: 100.0 * value for name, value in apart.items()}}
+        for engine, result in found.items():
+            taken = timed(f"{engine}, {case}", lambda _, result=result: result.step(), steps)
+            row[f"{engine.lower()}_ms"] = taken["median_ms"]
+        rows.append(row)
     return rows
 
 
 def measure(options: argparse.Namespace) -> list[Section]:
-    """All rows."""
     steps = 10 if options.quick else 200
-    columns = [
-        Column("what", "step of"),
-        Column("median_ms", "median\nms", ".2f"),
-        Column("p95_ms", "95 %\nms", ".2f"),
-        Column("longest_ms", "longest\nms", ".1f"),
-        Column("touching", "in contact", ".2f"),
-        Column("failed", "not ok", "d"),
-        Column("steps", "steps", "d"),
+    return [
+        table(
+            "hosts",
+            "Rods on rigid hosts",
+            "what step of | median_ms:.2f median~ms | p95_ms:.2f 95 %~ms | longest_ms:.1f longest~ms"
+            "| in_contact:.2f in contact | failed:d not ok | steps:d",
+            rods(steps) + paper(steps),
+            f"One thread, world steps of {1e3 * DT:g} ms, ten points a segment; the step of PyBullet's world "
+            "is in it. Warm. The longest step is that in which a rod loses its hold.",
+        ),
+        table(
+            "engines",
+            "The same rod and host in PyBullet and in MuJoCo",
+            "what UR5 and rod,~at rest | tip:.4f tips apart~% of length | force:.4f forces apart~%"
+            "| moment:.4f moments apart~% | pybullet_ms:.2f PyBullet~ms a step | mujoco_ms:.2f MuJoCo~ms a "
+            "step",
+            engines(steps),
+            f"Tip of the rod and wrench on the flange, world, after {max(steps, 100)} steps; PyBullet's "
+            "motors hold the arm rigidly, MuJoCo's servos yield by some 1e-5 rad.",
+        ),
     ]
-    notes = [
-        f"One thread, world steps of {1e3 * DT:g} ms, ten points a segment; the step of PyBullet's "
-        "world is in it. Warm."
-    ]
-    pair = [
-        Column("what", "UR5 and rod,\nat rest"),
-        Column("tip", "tips apart\n% of length", ".4f"),
-        Column("force", "forces apart\n%", ".4f"),
-        Column("moment", "moments apart\n%", ".4f"),
-        Column("pybullet_ms", "PyBullet\nms a step", ".2f"),
-        Column("mujoco_ms", "MuJoCo\nms a step", ".2f"),
-    ]
-    alike = [
-        f"Tip of the rod and wrench on the flange, world, after {max(steps, 100)} steps; PyBullet's motors "
-        "hold the arm rigidly, "
-        "MuJoCo's servos give way by some 1e-5 rad."
-    ]
-    both = Section("engines", "The same rod and host in PyBullet and in MuJoCo", pair, engines(steps), alike)
-    return [Section("hosts", "Rods on rigid hosts", columns, rods(steps) + paper(steps), notes), both]
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Measure and print; the exit code."""
-    return report.command(argparse.ArgumentParser(prog="bench_hosts", description=__doc__), argv, measure)
-
-
+main = bench(__doc__, measure)
 if __name__ == "__main__":
     sys.exit(main())

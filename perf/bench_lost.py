@@ -1,12 +1,11 @@
-"""Random steps over all tasks: is a robot lost that `settle` can solve? A script; `--steps`, `--tasks`,
-`--json`."""
+"""Random steps over all tasks: is a robot lost that `settle` can solve? Exit code 1 where one is."""
 
 from __future__ import annotations
 
 import argparse
-import json
+import resource
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -14,10 +13,12 @@ from typing import Any
 import numpy as np
 
 import fastrod_envs
+from fastrod.errors import HostError
 from fastrod.simulator import Simulator
 from fastrod.types import Ports
 from fastrod_envs.registration import task_class
 from fastrod_envs.vector import BatchEnv
+from report import Row, Section, bench, note_progress, table
 
 HEAVY = {"gravity.line_density": (0.02, 0.1)}
 """Weight [kg/m] that half of the steps draw on top: at the upper end most passes of the reacher diverge at
@@ -98,14 +99,13 @@ def _settled(simulator: Simulator, i: int, ports: Ports) -> bool:
 
 
 def _settled_in_contact(simulator: Simulator, i: int, named: dict[str, Any]) -> bool:
-    n, layout = simulator.n_robots, simulator._layout
-    robot, scene = _robot(simulator, i), simulator.contact
-    fresh = Simulator(robot, points_per_segment=layout.n_steps, threads=1, contact=scene)
+    points, scene = simulator._layout.n_steps, simulator.contact
+    fresh = Simulator(_robot(simulator, i), points_per_segment=points, threads=1, contact=scene)
 
     def one(value: Any) -> Any:
         if isinstance(value, dict):
             return {key: one(v) for key, v in value.items()}
-        return value[i] if np.ndim(value) > 1 and len(value) == n else value
+        return value[i] if np.ndim(value) > 1 and len(value) == simulator.n_robots else value
 
     return bool(fresh.settle(**{name: one(value) for name, value in named.items()}).ok[0])
 
@@ -119,7 +119,7 @@ def drive(task: str, steps: int, seed: int = 0, **options: Any) -> Count:
         with watched(count):
             env.reset(seed=seed)
             while count.steps < steps:
-                # a direction that stays for a while, so that robots get somewhere
+                # a direction that stays for a while, so that robots move far
                 held = rng.uniform(-1.0, 1.0, env.action_space.shape)
                 for _ in range(5):
                     info = env.step(np.clip(held + 0.3 * rng.normal(size=held.shape), -1.0, 1.0))[4]
@@ -133,30 +133,67 @@ def drive(task: str, steps: int, seed: int = 0, **options: Any) -> Count:
     return count
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """1 where a robot was lost that settles."""
-    parser = argparse.ArgumentParser(prog="bench_lost", description=__doc__)
-    parser.add_argument("--steps", type=int, default=10_000, help="over all tasks (%(default)s)")
-    parser.add_argument("--tasks", nargs="*", default=fastrod_envs.names(), metavar="TASK")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true")
-    given = parser.parse_args(argv)
-    each = -(-given.steps // (2 * len(given.tasks)))
-    rows: dict[str, Count] = {}
-    for task in given.tasks:
-        rows[task] = drive(task, each, given.seed)
-        heavy = drive(task, each, given.seed + 1, randomise=HEAVY)
-        rows[f"{task}, heavy"] = heavy
-        for name in (task, f"{task}, heavy"):
-            if not given.json:
-                figures = (f"{key} {value:6}" for key, value in vars(rows[name]).items())
-                print(f"{name:24}", *figures, sep="  ", flush=True)
-    if given.json:
-        print(json.dumps({name: vars(count) for name, count in rows.items()}))
-    total = {key: sum(vars(count)[key] for count in rows.values()) for key in vars(Count())}
-    print(", ".join(f"{key} {value}" for key, value in total.items()), file=sys.stderr)
-    return int(total["solvable"] > 0)
+def endure(task: str, total: int) -> Row | None:
+    """Undirected random steps: anything not finite or out of the space, robots lost, memory grown; None
+    where the task needs what is not installed."""
+    n = 256 if task in _FRACTION else 1 if task_class(task).hosted else 16
+    steps = max(3, round(total * _FRACTION.get(task, 0.004) / n))
+    note_progress(f"endurance of {task}")
+    try:
+        env = BatchEnv(task, n)
+    except HostError:  # PyBullet is not installed
+        return None
+    env.reset(seed=0)
+    rng, space, bad = np.random.default_rng(0), env.single_observation_space, np.zeros(2, dtype=np.bool_)
+    lost, ended, start = 0, 0, 0
+    for k in range(steps):
+        seen, reward, terminated, truncated, info = env.step(rng.uniform(-1.0, 1.0, (n, env.task.n_actions)))
+        finite = all(np.isfinite(a).all() for a in (seen, reward, info["distance"]))
+        bad |= not finite, not ((seen >= space.low) & (seen <= space.high)).all()
+        lost, ended = lost + int(info["lost"].sum()), ended + int((terminated | truncated).sum())
+        if k == steps // 4:
+            start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    env.close()
+    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - start) / 1024.0
+    found = {"finite": not bad[0], "within": not bad[1], "ended": ended, "lost": lost, "grown": grown}
+    return {"task": task, "steps": n * steps, **found}
 
 
+_FRACTION = {"Reach": 0.4, "Catch": 0.3, "Track": 0.2, "ReachObstacle": 0.08}
+"""Of all steps of `endure`."""
+
+
+def measure(options: argparse.Namespace) -> list[Section]:
+    tasks = options.tasks or fastrod_envs.names()
+    each = 4 if options.quick else -(-options.steps // (2 * len(tasks)))
+    rows: list[Row] = []
+    for task in tasks:
+        note_progress(task)
+        rows.append({"task": task, **vars(drive(task, each, options.seed))})
+        rows.append({"task": f"{task}, heavy", **vars(drive(task, each, options.seed + 1, randomise=HEAVY))})
+    total = {key: sum(row[key] for row in rows) for key in vars(Count())}
+    return [
+        table(
+            "lost",
+            "Random steps: robots lost, and which of them a new simulator settles",
+            "task | steps:,d environment~steps | robots:,d robot-~steps | settled:,d | lost:d"
+            "| solvable:d of these~solvable | in_contact:d lost in~contact"
+            "| solvable_in_contact:d of these~solvable | ended:d episodes~lost",
+            [*rows, {"task": "all", **total}],
+            f"Heavy: with a weight of {HEAVY['gravity.line_density']} kg/m on top. Settled: the pass "
+            "diverged, and `step` settled. In contact a new simulator begins cold, and may find a rod on the "
+            "other side of a wall.",
+            failed=total["solvable"] > 0,
+        )
+    ]
+
+
+main = bench(
+    __doc__,
+    measure,
+    ("--steps", 10_000, "over all tasks"),
+    ("--tasks", (str,), "these alone"),
+    ("--seed", 0, "of all"),
+)
 if __name__ == "__main__":
     sys.exit(main())

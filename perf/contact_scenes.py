@@ -348,6 +348,7 @@ def measure(
 
 def sections(count: int, seed: int, first: int, minutes: float) -> list[Section]:
     """The table by kind, and the sentences."""
+    play(make_batch(seed, first))  # compiled, and not timed
     found: dict[str, list[Played]] = {kind: [] for kind in KINDS}
     said: Counter[str] = Counter()
     silent: list[str] = []

@@ -4,7 +4,7 @@ The count comes from the kernels themselves: a child process runs them as plain 
 numbers that count what is done with them. Each integration step costs the same, so with N steps a segment (N
 >= 2)
 
-    operations(N) = operations(2) + (N - 2) (operations(3) - operations(2))
+operations(N) = operations(2) + (N - 2) (operations(3) - operations(2))
 
 is exact; tendons and columns (unknowns, and three for a moving tip force) enter through the robot whose pass
 is counted. What the compiler saves by common subexpressions is not taken off, index arithmetic is not
@@ -15,21 +15,20 @@ Run as a script this module is that child: it reads what to count from stdin and
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 import os
+import pkgutil
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 
-@dataclass
-class Tally:
+class Tally(NamedTuple):
     """Floating operations of one pass of one robot."""
 
     add: float = 0.0
@@ -48,78 +47,65 @@ class Tally:
         """What remains when every product that is added at once goes into a fused multiply-add."""
         return self.flops - self.fused
 
-    def __add__(self, other: Tally) -> Tally:
-        return Tally(*(a + b for a, b in zip(asdict(self).values(), asdict(other).values(), strict=True)))
+    def __add__(self, other: Any) -> Tally:
+        return Tally(*(a + b for a, b in zip(self, other, strict=True)))
 
-    def __mul__(self, k: float) -> Tally:
-        return Tally(*(k * a for a in asdict(self).values()))
+    def __mul__(self, k: Any) -> Tally:
+        return Tally(*(k * a for a in self))
 
 
-class Counted:
-    """A number that notes in `now` what is done with it."""
+Parts = dict[str, Tally]
+"""Operations by kernel file."""
 
-    __slots__ = ("product", "value")
+
+class Counted(float):
+    """A number that notes in `now`, by the fields of `Tally`, what is done with it."""
+
+    product = False
+    """Whether it is a product, which an addition would fuse with."""
     __array_ufunc__ = None  # a numpy number on the left leaves the operation to this class
-    now = Tally()
+    now = [0.0] * 5
 
-    def __init__(self, value: float, product: bool = False) -> None:
-        self.value = float(value)
-        self.product = product
-
-    def __float__(self) -> float:
-        return self.value
+    def _done(self, operation: int, value: float, times: int = 1) -> Counted:
+        Counted.now[operation] += times
+        made = Counted(value)
+        made.product = operation == 1
+        return made
 
     def _sum(self, other: Any, value: float) -> Counted:
-        Counted.now.add += 1
-        if self.product or (isinstance(other, Counted) and other.product):
-            Counted.now.fused += 1
-        return Counted(value)
+        Counted.now[4] += self.product or (isinstance(other, Counted) and other.product)
+        return self._done(0, value)
 
     def __add__(self, other: Any) -> Counted:
-        return self._sum(other, self.value + float(other))
+        return self._sum(other, float(self) + float(other))
 
     def __sub__(self, other: Any) -> Counted:
-        return self._sum(other, self.value - float(other))
+        return self._sum(other, float(self) - float(other))
 
     def __rsub__(self, other: Any) -> Counted:
-        return self._sum(other, float(other) - self.value)
+        return self._sum(other, float(other) - float(self))
 
     def __mul__(self, other: Any) -> Counted:
-        Counted.now.multiply += 1
-        return Counted(self.value * float(other), product=True)
+        return self._done(1, float(self) * float(other))
 
     def __truediv__(self, other: Any) -> Counted:
-        Counted.now.divide += 1
-        return Counted(self.value / float(other))
+        return self._done(2, float(self) / float(other))
 
     def __rtruediv__(self, other: Any) -> Counted:
-        Counted.now.divide += 1
-        return Counted(float(other) / self.value)
+        return self._done(2, float(other) / float(self))
 
     def __pow__(self, power: int) -> Counted:
-        Counted.now.multiply += power - 1
-        return Counted(self.value**power, product=True)
+        return self._done(1, float(self) ** power, power - 1)
 
     def __neg__(self) -> Counted:
-        return Counted(-self.value, self.product)
+        made = Counted(-float(self))
+        made.product = self.product
+        return made
 
     def __abs__(self) -> Counted:
-        return Counted(abs(self.value))
+        return Counted(abs(float(self)))
 
-    def __lt__(self, other: Any) -> bool:
-        return self.value < float(other)
-
-    def __le__(self, other: Any) -> bool:
-        return self.value <= float(other)
-
-    def __gt__(self, other: Any) -> bool:
-        return self.value > float(other)
-
-    def __ge__(self, other: Any) -> bool:
-        return self.value >= float(other)
-
-    __radd__ = __add__
-    __rmul__ = __mul__
+    __radd__, __rmul__ = __add__, __mul__
 
 
 class _Math:
@@ -127,16 +113,15 @@ class _Math:
 
     @staticmethod
     def sqrt(x: Any) -> Counted:
-        Counted.now.root += 1
-        return Counted(math.sqrt(float(x)))
+        return Counted()._done(3, math.sqrt(float(x)))
 
     def __getattr__(self, name: str) -> Any:
         return getattr(math, name)
 
 
-def count(wanted: dict[str, int], forces: bool) -> dict[str, dict[str, Tally]]:
-    """Robot key -> {kernel file: operations} of one pass with that many points per segment; `forces`: the tip
-    force moves."""
+def count(wanted: dict[str, int], forces: bool) -> dict[str, Parts]:
+    """Robot key -> operations of one pass with that many points per segment; `forces`: the tip force
+    moves."""
     two, three = counted(list(wanted), forces, (2, 3))
     return {
         key: {name: two[key][name] * (3 - points) + three[key][name] * (points - 2) for name in two[key]}
@@ -144,117 +129,91 @@ def count(wanted: dict[str, int], forces: bool) -> dict[str, dict[str, Tally]]:
     }
 
 
-def counted(robots: Sequence[str], forces: bool, points: Sequence[int]) -> list[dict[str, dict[str, Tally]]]:
+def counted(robots: Sequence[str], forces: bool, points: Sequence[int]) -> list[dict[str, Parts]]:
     """As `count`, without the formula: for each number of points, the operations of every robot."""
-    words = json.dumps({"robots": robots, "forces": forces, "points": points})
-    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
-    done = subprocess.run(
-        [sys.executable, __file__],
-        input=words,
-        stdout=subprocess.PIPE,
-        text=True,
-        check=True,
-        env=environment,
+    words, environment = (
+        json.dumps([list(robots), forces, list(points)]),
+        {**os.environ, "NUMBA_DISABLE_JIT": "1"},
     )
-    found: list[dict[str, dict[str, dict[str, float]]]] = json.loads(done.stdout)
+    command = [sys.executable, __file__]
+    done = subprocess.run(
+        command, input=words, stdout=subprocess.PIPE, text=True, check=True, env=environment
+    )
     return [
-        {key: {name: Tally(**tally) for name, tally in parts.items()} for key, parts in one.items()}
-        for one in found
+        {key: {name: Tally(*tally) for name, tally in parts.items()} for key, parts in one.items()}
+        for one in json.loads(done.stdout)
     ]
 
 
 def _child() -> None:
-    asked = json.loads(sys.stdin.read())
+    robots, forces, points = json.load(sys.stdin)
     sections = _instrument()
     import cases
 
-    chosen = [case for case in cases.cases(1) if case.key in asked["robots"]]
-    found = [
-        {case.key: _counted_pass(case, points, asked["forces"], sections) for case in chosen}
-        for points in asked["points"]
-    ]
+    chosen = [case for case in cases.cases(1) if case.key in robots]
+    found = [{case.key: _counted_pass(case, n, forces, sections) for case in chosen} for n in points]
     print(json.dumps(found))
 
 
 def _counted_pass(
-    case: Any, points: int, forces: bool, sections: dict[str, Tally]
-) -> dict[str, dict[str, float]]:
+    case: Any, points: int, forces: bool, sections: dict[str, list[float]]
+) -> dict[str, list[float]]:
     """Operations by kernel file of the third step: by then a moving force has its columns."""
     from fastrod import Simulator
 
     sim = Simulator(case.robot, 1, points_per_segment=points, outputs="tip", threads=1)
     for step in range(3):
-        for name in sections:
-            sections[name] = Tally()
-        sim.step(**case.words(case.at(step, forces)))
-    return {name: asdict(tally) for name, tally in sections.items() if tally.flops}
+        for tally in sections.values():
+            tally[:] = [0.0] * 5
+        sim.step(**case.inputs(case.at(step, forces)))
+    return {name: list(tally) for name, tally in sections.items() if any(tally)}
 
 
-def _instrument() -> dict[str, Tally]:
+def _instrument() -> dict[str, list[float]]:
     """Make the kernels one lane wide and countable, and sort the counts by the file of the kernel at work."""
-    import importlib
-    import pkgutil
-
     from fastrod.kernels import jit
 
     jit.LANES = 1
     import fastrod.kernels as package
-    from fastrod.solver import boundary as passes
+    from fastrod.solver import boundary
     from fastrod.types import Memory, RodShape
 
-    modules = [
-        importlib.import_module(f"fastrod.kernels.{info.name}")
-        for info in pkgutil.iter_modules(package.__path__)
-    ]
-    sections = {_short(module): Tally() for module in modules}
+    names = [info.name for info in pkgutil.walk_packages(package.__path__, package.__name__ + ".")]
+    modules = [importlib.import_module(name) for name in names if ".contact" not in name]
+    sections = {_short(module): [0.0] * 5 for module in modules}
     helpers = ("jit", "vec", "rod", "batch")  # their arithmetic belongs to the kernel that calls
     wrapped: dict[int, Callable[..., Any]] = {}
-    for module in modules:
-        if _short(module) in helpers:
-            continue
+    for module in (module for module in modules if _short(module) not in helpers):
         for value in vars(module).values():
-            if (
-                callable(value)
-                and getattr(value, "__module__", "") == module.__name__
-                and not isinstance(value, type)
-            ):
-                wrapped[id(value)] = _attributed(value, _short(module), sections)
+            own = getattr(value, "__module__", "") == module.__name__
+            if own and callable(value) and not isinstance(value, type):
+                wrapped[id(value)] = _attributed(value, sections[_short(module)])
     for module in modules:
-        names = vars(module)
-        for name, value in list(names.items()):
-            if id(value) in wrapped:
-                names[name] = wrapped[id(value)]
-            elif value is math:
-                names[name] = _Math()
-        names["float"] = _kept
-    body = vars(passes)["pass_serial"]
+        held = vars(module)
+        for name, value in list(held.items()):
+            held[name] = _Math() if value is math else wrapped.get(id(value), value)
+        held["float"] = lambda value: value if isinstance(value, Counted) else float(value)
+    body = vars(boundary)["pass_serial"]
 
     def counting(*arguments: Any) -> None:
-        counted: list[Any] = [
-            argument if isinstance(argument, RodShape) else _countable(argument) for argument in arguments
-        ]
+        counted: list[Any] = [a if isinstance(a, RodShape) else _countable(a) for a in arguments]
         body(*counted)
         (memory,) = (i for i, argument in enumerate(arguments) if isinstance(argument, Memory))
         # what the next step begins from
         for kept, new in zip(arguments[memory], counted[memory], strict=True):
             kept[...] = new.astype(float)
 
-    vars(passes)["pass_serial"] = counting
+    vars(boundary)["pass_serial"] = counting
     return sections
 
 
-def _short(module: ModuleType) -> str:
-    return module.__name__.rpartition(".")[2]
+def _short(module: Any) -> str:
+    return str(module.__name__.rpartition(".")[2])
 
 
-def _kept(value: Any) -> Any:
-    return value if isinstance(value, Counted) else float(value)
-
-
-def _attributed(function: Callable[..., Any], section: str, sections: dict[str, Tally]) -> Callable[..., Any]:
+def _attributed(function: Callable[..., Any], tally: list[float]) -> Callable[..., Any]:
     def run(*arguments: Any) -> Any:
-        before = Counted.now
-        Counted.now = sections[section]
+        before, Counted.now = Counted.now, tally
         try:
             return function(*arguments)
         finally:
@@ -269,9 +228,7 @@ def _countable(argument: Any) -> Any:
         return type(argument)(*(_countable(a) for a in argument))
     if isinstance(argument, np.ndarray) and argument.dtype.kind == "f":
         made = np.empty(argument.shape, object)
-        flat = made.reshape(-1)
-        for i, value in enumerate(argument.ravel().tolist()):
-            flat[i] = Counted(value)
+        made.reshape(-1)[:] = [Counted(value) for value in argument.ravel().tolist()]
         return made
     return argument
 

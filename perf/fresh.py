@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from report import Column, Row, Section, note_progress, thread_counts
+from report import Row, Section, goal, note_progress, table, thread_counts
 
 MEMORY_TARGET = 2000.0
 """Bytes per five-segment robot beside its inputs."""
@@ -25,54 +25,38 @@ MEMORY_TARGET = 2000.0
 
 def _run(*words: str, **environment: str) -> dict[str, float]:
     """What this module prints as a script."""
-    done = subprocess.run(
-        [sys.executable, __file__, *words],
-        stdout=subprocess.PIPE,
-        text=True,
-        check=True,
-        env={**os.environ, **environment},
+    command = [sys.executable, __file__, *words]
+    found = subprocess.run(
+        command, stdout=subprocess.PIPE, text=True, check=True, env={**os.environ, **environment}
     )
-    found: dict[str, float] = json.loads(done.stdout)
-    return found
+    return dict(json.loads(found.stdout))
 
 
 def memory_section(n_robots: int) -> Section:
     note_progress("memory")
-    found = _run("memory", str(n_robots))
-    _, many = thread_counts()
+    each = {key: value / n_robots for key, value in _run("memory", str(n_robots)).items()}
+    held, resident = each["memory"] + each["state"], each["resident"]
     rows: list[Row] = [
-        _memory_row("observer's memory", found["memory"] / n_robots),
-        _memory_row("state that a step returns", found["state"] / n_robots),
-        _memory_row("both, sum of nbytes", (found["memory"] + found["state"]) / n_robots, MEMORY_TARGET),
-        _memory_row(
-            "process after ten steps, beside the inputs", found["resident"] / n_robots, MEMORY_TARGET
-        ),
-        _memory_row("its peak in a cold start", found["peak"] / n_robots),
-        _memory_row("the inputs themselves", found["inputs"] / n_robots),
+        {"what": "observer's memory", "bytes": each["memory"]},
+        {"what": "state that a step returns", "bytes": each["state"]},
+        {"what": "both, sum of nbytes", "bytes": held, **goal(held, MEMORY_TARGET)},
+        {
+            "what": "process after ten steps, beside the inputs",
+            "bytes": resident,
+            **goal(resident, MEMORY_TARGET),
+        },
+        {"what": "its peak in a cold start", "bytes": each["peak"]},
+        {"what": "the inputs themselves", "bytes": each["inputs"]},
     ]
-    columns = [
-        Column("what", "what"),
-        Column("bytes", "bytes / robot", ",.0f"),
-        Column("target", "target", ",.0f"),
-        Column("met", "met"),
-    ]
-    notes = [
-        f"{n_robots} robots five_segment_reacher, outputs='tip', f64, {many} threads, in a process of "
-        "its own."
-    ]
-    return Section("memory", "Memory", columns, rows, notes)
-
-
-def _memory_row(what: str, size: float, target: float | None = None) -> Row:
-    return {"what": what, "bytes": size, "target": target, "met": None if target is None else size <= target}
+    threads = thread_counts()[1]
+    note = f"{n_robots} robots five_segment_reacher, outputs='tip', f64, {threads} threads, own process."
+    return table("memory", "Memory", "what | bytes:,.0f bytes / robot | target:,.0f | met", rows, note)
 
 
 def _resident(name: str) -> float:
     """VmRSS or VmHWM of this process [bytes]."""
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith(name):
-            return 1024.0 * float(line.split()[1])
-    return float("nan")
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next((1024.0 * float(line.split()[1]) for line in lines if line.startswith(name)), float("nan"))
 
 
 def _memory(n_robots: int) -> dict[str, float]:
@@ -107,41 +91,30 @@ def _memory(n_robots: int) -> dict[str, float]:
 def start_section(quick: bool) -> Section:
     """Times of a process from its first line to its first steps, with kernels compiled and without."""
     note_progress("start")
-    rows: list[Row] = []
+    many = thread_counts()[1]
+    named = {
+        "import": ("import fastrod", 1),
+        "first": ("the first step of one robot, prototype", 1),
+        "all": ("all from the first line to that step's end", 1),
+        "parallel": (f"then the first step on {many} threads, 256 robots", many),
+        "settle": ("then the first settle", many),
+    }
+    found = {}
     with tempfile.TemporaryDirectory() as folder:
         if not quick:
             note_progress("start with an empty cache")
-            rows += _start_rows("empty cache", _run("start", FASTROD_CACHE_DIR=folder))
+            found["empty cache"] = _run("start", FASTROD_CACHE_DIR=folder)
         environment = {} if quick else {"FASTROD_CACHE_DIR": folder}
         again = [_run("start", **environment) for _ in range(1 if quick else 4)]
-    rows += _start_rows("cached", {key: min(run[key] for run in again) for key in again[0]})
-    columns = [
-        Column("cache", "kernels"),
-        Column("what", "what"),
-        Column("seconds", "s", ".3f"),
-        Column("threads", "threads"),
+    found["cached"] = {key: min(run[key] for run in again) for key in named}
+    rows = [
+        {"cache": cache, "what": what, "seconds": times[key], "threads": str(threads)}
+        for cache, times in found.items()
+        for key, (what, threads) in named.items()
     ]
-    notes = [
-        "Each in a fresh process, wall time"
-        + (", one run; the empty cache is left out." if quick else "; cached: best of four.")
-        + " Target: none."
-    ]
-    return Section("start", "Start", columns, rows, notes)
-
-
-def _start_rows(cache: str, found: dict[str, float]) -> list[Row]:
-    _, many = thread_counts()
-    named = [
-        ("import", "import fastrod", "1"),
-        ("first", "the first step of one robot, prototype", "1"),
-        ("all", "all from the first line to that step's end", "1"),
-        ("parallel", f"then the first step on {many} threads, 256 robots", str(many)),
-        ("settle", "then the first settle", str(many)),
-    ]
-    return [
-        {"cache": cache, "what": what, "seconds": found[key], "threads": threads}
-        for key, what, threads in named
-    ]
+    note = "one run; the empty cache is left out." if quick else "cached: best of four."
+    text = "cache kernels | what | seconds:.3f s | threads"
+    return table("start", "Start", text, rows, f"Each in a fresh process, wall time; {note}")
 
 
 def _start() -> dict[str, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -12,11 +12,10 @@ from typing import Any
 
 import numpy as np
 
-import appendix_j
-from appendix_j import Array
-from peer import Peer, Rung, Solve
+from appendix_j import BENDING, LENGTH, TORSION, Array, Peer, Rung, Solve, one_by_one
 
 _RADIUS, _DENSITY = 4e-3, 1e3  # m, kg/m^3: they scale time, not the answer
+_MOVING = ("position_collection", "director_collection", "velocity_collection", "omega_collection")
 
 
 @dataclass(frozen=True)
@@ -28,69 +27,56 @@ class Relaxation:
     """Shear and stretch stiffness [N]: as soft as the answer allows, because its waves limit the time
     step."""
     damping: float = 1.0
-    """Of the first bending mode, as a part of the critical one."""
+    """Of the first bending mode, as a fraction of the critical one."""
     step: float = 0.6
-    """Time step as a part of the stability limit of the shear waves."""
+    """Time step as a fraction of the stability limit of the shear waves."""
 
 
 class Stand:
     """The clamped rod in PyElastica.
 
-    The clamp holds the first element's director, so the rod begins half an element before the wall: clamped
-    where PyElastica's examples do it, at the first node, it would be half an element short, an error of 10 %
-    with 14 elements.
+    The clamp holds the first element's director, so the rod begins half an element before the wall:
+    clamped where PyElastica's examples do it, at the first node, it would be half an element short, an
+    error of 10 % with 14 elements.
     """
 
     def __init__(self, setting: Relaxation) -> None:
         ea: Any = importlib.import_module("elastica")
-        bench: Any = type("Bench", (ea.BaseSystemCollection, ea.Constraints, ea.Forcing, ea.Damping), {})
-        bending = appendix_j.bending()
-        n, h = setting.elements, appendix_j.length() / (setting.elements - 0.5)
+        system: Any = type("System", (ea.BaseSystemCollection, ea.Constraints, ea.Forcing, ea.Damping), {})
+        n, h = setting.elements, LENGTH / (setting.elements - 0.5)
         area, second = math.pi * _RADIUS**2, 0.25 * math.pi * _RADIUS**4
         mass = _DENSITY * area * h
-        self.omega = 3.516 / appendix_j.length() ** 2 * math.sqrt(bending / (_DENSITY * area))
+        self.omega = 3.516 / LENGTH**2 * math.sqrt(BENDING / (_DENSITY * area))
         """Of the first bending mode [rad/s]."""
         self.dt = np.float64(setting.step * math.sqrt(h * mass / setting.shear))
-        self.rod: Any = ea.CosseratRod.straight_rod(
-            n,
+        start, along, normal = (
             np.array([0.0, 0.0, -0.5 * h]),
             np.array([0.0, 0.0, 1.0]),
             np.array([1.0, 0.0, 0.0]),
-            n * h,
-            _RADIUS,
-            _DENSITY,
-            youngs_modulus=bending / second,
-            shear_modulus=appendix_j.torsion() / (2.0 * second),
         )
+        moduli = {"youngs_modulus": BENDING / second, "shear_modulus": TORSION / (2.0 * second)}
+        straight_rod = ea.CosseratRod.straight_rod
+        self.rod: Any = straight_rod(n, start, along, normal, n * h, _RADIUS, _DENSITY, **moduli)
         eye = np.eye(3)[:, :, None]
         inertia = 0.25 * h * h * mass  # its waves are then as fast as those of shear
         self.rod.shear_matrix[...] = setting.shear * eye
         self.rod.mass_second_moment_of_inertia[...] = inertia * eye
         self.rod.inv_mass_second_moment_of_inertia[...] = eye / inertia
         self._force = np.zeros(3)
-        self._system = sim = bench()
+        self._system = sim = system()
         sim.append(self.rod)
-        sim.constrain(self.rod).using(
-            ea.OneEndFixedBC, constrained_position_idx=(0,), constrained_director_idx=(0,)
-        )
+        clamp = {"constrained_position_idx": (0,), "constrained_director_idx": (0,)}
+        sim.constrain(self.rod).using(ea.OneEndFixedBC, **clamp)
         sim.add_forcing_to(self.rod).using(ea.EndpointForces, np.zeros(3), self._force, ramp_up_time=1e-12)
-        damping = 2.0 * setting.damping * self.omega
-        sim.dampen(self.rod).using(
-            ea.AnalyticalLinearDamper, uniform_damping_constant=damping, time_step=self.dt
-        )
+        damping = {"uniform_damping_constant": 2.0 * setting.damping * self.omega, "time_step": self.dt}
+        sim.dampen(self.rod).using(ea.AnalyticalLinearDamper, **damping)
         sim.finalize()
         self._stepper, self._now = ea.PositionVerlet(), np.float64(0.0)
-        self._moving = (
-            "position_collection",
-            "director_collection",
-            "velocity_collection",
-            "omega_collection",
-        )
-        self._straight = [getattr(self.rod, name).copy() for name in self._moving]
+        self._straight = [getattr(self.rod, name).copy() for name in _MOVING]
 
     def load(self, force: float) -> None:
         """Put the straight rod at rest under a tip force across it [N]."""
-        for name, before in zip(self._moving, self._straight, strict=True):
+        for name, before in zip(_MOVING, self._straight, strict=True):
             getattr(self.rod, name)[...] = before
         self._force[:] = 0.0, force, 0.0
         self._now = np.float64(0.0)
@@ -105,37 +91,26 @@ class Stand:
 @contextmanager
 def _relax(setting: Relaxation, patience: float) -> Iterator[Solve]:
     stand = Stand(setting)
-    steps = math.ceil(patience / (stand.omega * stand.dt))
 
-    def solve(force: Array) -> Array:
-        tips = np.empty((len(force), 2))
-        for i, across in enumerate(force.tolist()):
-            stand.load(across)
-            tips[i] = stand.run(steps)
-        return tips
+    def rest(across: float) -> Array:
+        stand.load(across)
+        return stand.run(math.ceil(patience / (stand.omega * stand.dt)))
 
-    yield solve
-
-
-def _rungs() -> Sequence[Rung]:
-    """Shear stiffer as the elements get finer. At 7 n^2 N what it gives takes off most of the elements' own
-    error, which is as much in its favour as a stiffness can be: ten times stiffer, with steps a third as
-    long, the error at 8 elements is four times as large."""
-    return [
-        Rung(f"{n} elements, {patience:g} / omega", partial(_relax, Relaxation(n, 7.0 * n * n), patience))
-        for n, patience in ((4, 8.0), (8, 11.0), (14, 13.0), (24, 15.0))
-    ]
+    yield one_by_one(rest)
 
 
 PEER = Peer(
     name="PyElastica",
     modules=("elastica",),
-    packages=("pyelastica",),
     same="its Cosserat rod begun half an element before the wall; shear and stretch cannot be left out, so "
-    "they are made stiff, the more "
-    "the finer, which takes off some of the elements' own error; rotary inertia for large stable steps, the "
-    "first mode critically damped.",
+    "they are made stiff, the more the finer, which takes off some of the elements' own error; rotary "
+    "inertia for large stable steps, the first mode critically damped.",
     also="dynamics, shear and stretch, contact between rods, muscles, many rods joined.",
-    rungs=_rungs,
-    family="PyElastica",
+    # Shear stiffer as the elements get finer. At 7 n^2 N its compliance takes off most of the elements' own
+    # error, which is as much in its favour as a stiffness can be: ten times stiffer, with steps a third as
+    # long, the error at 8 elements is four times as large.
+    rungs=[
+        Rung(f"{n} elements, {patience:g} / omega", partial(_relax, Relaxation(n, 7.0 * n * n), patience))
+        for n, patience in ((4, 8.0), (8, 11.0), (14, 13.0), (24, 15.0))
+    ],
 )

@@ -4,7 +4,7 @@ joints and hinges."""
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -12,9 +12,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-import appendix_j
-from appendix_j import Array
-from peer import Peer, Rung, Solve
+from appendix_j import BENDING, LENGTH, TORSION, Array, Peer, Rung, Solve, one_by_one
 
 if TYPE_CHECKING:
     import mujoco
@@ -55,34 +53,34 @@ def model(kind: Kind, setting: Setting) -> mujoco.MjModel:
 def _flex(setting: Setting) -> str:
     """A clamped edge half behind the wall, so that the clamp is at the wall for a curvature that lives at the
     vertices."""
-    n, length = setting.links, appendix_j.length()
-    h = length / (n - 0.5)
+    n = setting.links
+    h = LENGTH / (n - 0.5)
     second = 0.25 * math.pi * _RADIUS**4
     return (
         f'<flexcomp name="rod" type="grid" dim="1" count="{n + 1} 1 1" spacing="{h} 1 1" '
         f'pos="{0.5 * n * h - 0.5 * h} 0 0" '
         f'radius="{_RADIUS}" mass="{_MASS}"><pin id="0 1"/><edge equality="true" solref="1e-4 1" '
         'solimp="0.9999 0.9999 0.001"/>'
-        f'<elasticity young="{appendix_j.bending() / second}" '
-        f'shear="{appendix_j.torsion() / (2.0 * second)}" damping="{setting.damping}"/>'
+        f'<elasticity young="{BENDING / second}" '
+        f'shear="{TORSION / (2.0 * second)}" damping="{setting.damping}"/>'
         '<contact contype="0" conaffinity="0" selfcollide="none"/></flexcomp>'
     )
 
 
 def _chain(kind: Kind, setting: Setting) -> str:
     """Half a link clamped, whole links, half a link; a spring EI/h in each joint."""
-    n, length = setting.links, appendix_j.length()
-    h = length / n
-    spring = appendix_j.bending() / h
+    n = setting.links
+    h = LENGTH / n
+    spring = BENDING / h
     joint = f'<joint type="{kind}" axis="0 0 1" stiffness="{spring}" damping="{setting.damping * spring}"/>'
     body, at = "", 0.5 * h
     for i in range(n):
         link = h if i + 1 < n else 0.5 * h
-        mass = _MASS * link / length
-        turning = mass * h * h / 12.0
+        mass = _MASS * link / LENGTH
+        inertia = mass * h * h / 12.0
         body += (
             f'<body pos="{at} 0 0">{joint}<inertial pos="{link} 0 0" mass="{mass}" '
-            f'diaginertia="{turning} {turning} {turning}"/>'
+            f'diaginertia="{inertia} {inertia} {inertia}"/>'
         )
         at = link
     return body + "</body>" * n
@@ -95,17 +93,14 @@ def _one_by_one(kind: Kind, setting: Setting) -> Iterator[Solve]:
     made = model(kind, setting)
     data, tip = mujoco.MjData(made), _tip(kind, made)
 
-    def solve(force: Array) -> Array:
-        tips = np.empty((len(force), 2))
-        for i, across in enumerate(force):
-            mujoco.mj_resetData(made, data)
-            data.xfrc_applied[tip, 1] = across
-            mujoco.mj_step(made, data, nstep=setting.steps)
-            mujoco.mj_kinematics(made, data)
-            tips[i] = data.xipos[tip, 1::-1]
-        return tips
+    def rest(across: float) -> Array:
+        mujoco.mj_resetData(made, data)
+        data.xfrc_applied[tip, 1] = across
+        mujoco.mj_step(made, data, nstep=setting.steps)
+        mujoco.mj_kinematics(made, data)
+        return np.array(data.xipos[tip, 1::-1])
 
-    yield solve
+    yield one_by_one(rest)
 
 
 @contextmanager
@@ -134,64 +129,50 @@ def _tip(kind: Kind, made: mujoco.MjModel) -> int:
 
     if kind != "flex":
         return int(made.nbody) - 1
-    names = [mujoco.mj_id2name(made, mujoco.mjtObj.mjOBJ_BODY, i) or "" for i in range(made.nbody)]
-    return max(
-        (int(name[4:]), i) for i, name in enumerate(names) if name[:4] == "rod_" and name[4:].isdecimal()
-    )[1]
+    names = (mujoco.mj_id2name(made, mujoco.mjtObj.mjOBJ_BODY, i) or "" for i in range(made.nbody))
+    vertices = {i: name[4:] for i, name in enumerate(names) if name[:4] == "rod_" and name[4:].isdecimal()}
+    return max(vertices, key=lambda i: int(vertices[i]))
 
 
-def _rungs(kind: Kind) -> Sequence[Rung]:
-    settings = {
-        "flex": (
-            Setting(3, 0.2, 8, 0.1),
-            Setting(6, 0.2, 8, 0.1),
-            Setting(8, 0.2, 10, 0.1),
-            Setting(12, 0.1, 16, 0.2),
-            Setting(16, 0.05, 30, 0.2),
-            Setting(24, 0.03, 45, 0.2),
-            Setting(32, 0.02, 70, 0.2),
-        ),
-        "ball": tuple(Setting(n, 1.0, 6 + n // 16) for n in (2, 4, 8, 16, 32, 64)),
-        "hinge": tuple(Setting(n, 1.0, 6 + n // 16) for n in (2, 4, 8, 16, 32, 64, 128)),
-    }[kind]
+_FLEX = ((3, 0.2, 8, 0.1), (6, 0.2, 8, 0.1), (8, 0.2, 10, 0.1), (12, 0.1, 16, 0.2), (16, 0.05, 30, 0.2))
+_LONG = ((24, 0.03, 45, 0.2), (32, 0.02, 70, 0.2))
+
+
+def _rungs(kind: Kind) -> list[Rung]:
+    most = {"ball": 64, "hinge": 128}.get(kind, 0)
+    links = [Setting(n, 1.0, 6 + n // 16) for n in (2, 4, 8, 16, 32, 64, 128) if n <= most]
     return [
-        Rung(str(one), partial(_one_by_one, kind, one), partial(_together, kind, one)) for one in settings
+        Rung(str(one), partial(_one_by_one, kind, one), partial(_together, kind, one))
+        for one in links or [Setting(*words) for words in (*_FLEX, *_LONG)]
     ]
 
 
 _ALSO = (
-    "dynamics, joints and motors, its own contact with friction between all bodies, GPU by MJX and "
-    "Warp, inverse dynamics."
+    "dynamics, joints and motors, its own contact with friction between all bodies, GPU by MJX and Warp, "
+    "inverse dynamics."
 )
 FLEX = Peer(
     name="MuJoCo rod (flexcomp)",
     modules=("mujoco",),
-    packages=("mujoco",),
     same="a discrete elastic rod with EI and GJ as they are, begun half an edge before the wall; its edges "
-    "are held by constraints that "
-    "give a little, the less the shorter the step; brought to rest by long implicit steps (integrator "
-    "discrete).",
+    "are held by constraints that give a little, the less the shorter the step; brought to rest by long "
+    "implicit steps (integrator discrete).",
     also=_ALSO,
-    rungs=partial(_rungs, "flex"),
-    family="MuJoCo",
+    rungs=_rungs("flex"),
 )
 BALLS = Peer(
     name="MuJoCo chain, ball joints",
     modules=("mujoco",),
-    packages=("mujoco",),
     same="links with a spring EI/h in each ball joint, half a link at both ends. Twist gets EI too, for a "
-    "ball has one stiffness: "
-    "it is not loaded here.",
+    "ball has one stiffness: it is not loaded here.",
     also=_ALSO,
-    rungs=partial(_rungs, "ball"),
-    family="MuJoCo",
+    rungs=_rungs("ball"),
 )
 HINGES = Peer(
     name="MuJoCo chain, hinges",
     modules=("mujoco",),
-    packages=("mujoco",),
-    same="the same chain with hinges across the plane of the load: a plane rod, and the plane is told to it.",
+    same="the same chain with hinges across the plane of the load: a plane rod, and the plane is given to "
+    "it.",
     also=_ALSO,
-    rungs=partial(_rungs, "hinge"),
-    family="MuJoCo",
+    rungs=_rungs("hinge"),
 )

@@ -1,18 +1,17 @@
-"""scipy on the rod of Appendix J: shooting with the lean slope of `peers`, and collocation by `solve_bvp`."""
+"""scipy on the rod of Appendix J: shooting with the lean slope of `scipy_rod`, and collocation by
+`solve_bvp`."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-import appendix_j
-import peers
-from appendix_j import Array
-from peer import Peer, Rung, Solve
+import scipy_rod
+from appendix_j import BENDING, LENGTH, TORSION, Array, Peer, Rung, Solve, one_by_one
 
 _NO_TENDON = ((0.0, 0.0, 0.0),)  # one without tension: the compiled slope cannot go over none
 
@@ -23,36 +22,28 @@ def _shoot(method: str, rtol: float) -> Iterator[Solve]:
     from scipy.integrate import solve_ivp
     from scipy.optimize import root
 
-    length, bending = appendix_j.length(), appendix_j.bending()
-    rod = (length, bending, bending, appendix_j.torsion())
-    slope = peers.compiled_slope()
+    rod, slope = (LENGTH, BENDING, BENDING, TORSION), scipy_rod.compiled_slope()
     size = 15 + len(_NO_TENDON)
-    tolerance = 0.1 * rtol * length / length ** np.repeat([0, 1, 2, 0], [3, 9, 3, 1])
+    tolerance = 0.1 * rtol * LENGTH / LENGTH ** np.repeat([0, 1, 2, 0], [3, 9, 3, 1])
 
     def march(x: Array, load: tuple[float, ...]) -> Array:
         """State at the tip for curvatures x/l at the base."""
         state = np.zeros(size)
         state[[3, 7, 11]] = 1.0
-        state[12:15] = x / length
-        found: Any = solve_ivp(
-            lambda s, y: slope(s, y, load, rod, _NO_TENDON, np.empty(size)),
-            (0.0, length),
-            state,
-            method=method,
-            rtol=rtol,
-            atol=tolerance,
-        )
+        state[12:15] = x / LENGTH
+
+        def fun(s: float, y: Array) -> Any:
+            return slope(s, y, load, rod, _NO_TENDON, np.empty(size))
+
+        found: Any = solve_ivp(fun, (0.0, LENGTH), state, method=method, rtol=rtol, atol=tolerance)
         return np.asarray(found.y[:, -1])
 
-    def solve(force: Array) -> Array:
-        tips = np.empty((len(force), 2))
-        for i, across in enumerate(force.tolist()):
-            load = (0.0, across, 0.0, 0.0, 0.0, 0.0)
-            found = root(lambda x: length * march(x, load)[12:15], np.zeros(3), tol=0.1 * rtol)  # noqa: B023
-            tips[i] = march(found.x, load)[1:3]
-        return tips
+    def rest(across: float) -> Array:
+        load = (0.0, across, 0.0, 0.0, 0.0, 0.0)
+        found = root(lambda x: LENGTH * march(x, load)[12:15], np.zeros(3), tol=0.1 * rtol)
+        return march(found.x, load)[1:3]
 
-    yield solve
+    yield one_by_one(rest)
 
 
 @contextmanager
@@ -60,55 +51,39 @@ def _collocate(tol: float) -> Iterator[Solve]:
     """The plane problem: angle, curvature, across, along over s/l, four states."""
     from scipy.integrate import solve_bvp
 
-    length, bending = appendix_j.length(), appendix_j.bending()
     mesh = np.linspace(0.0, 1.0, 5)
     straight = np.array([np.zeros(5), np.zeros(5), np.zeros(5), mesh])
 
     def ends(a: Array, b: Array) -> Array:
         return np.array([a[0], b[1], a[2], a[3]])
 
-    def solve(force: Array) -> Array:
-        tips = np.empty((len(force), 2))
-        for i, across in enumerate(force.tolist()):
-            load = across * length**2 / bending
+    def rest(across: float) -> Array:
+        load = across * LENGTH**2 / BENDING
 
-            def fun(_: Array, y: Array) -> Array:
-                cos = np.cos(y[0])
-                return np.array([y[1], -load * cos, np.sin(y[0]), cos])  # noqa: B023
+        def fun(_: Array, y: Array) -> Array:
+            cos = np.cos(y[0])
+            return np.array([y[1], -load * cos, np.sin(y[0]), cos])
 
-            found: Any = solve_bvp(fun, ends, mesh, straight, tol=tol)
-            tips[i] = length * found.y[2:, -1]
-        return tips
+        found: Any = solve_bvp(fun, ends, mesh, straight, tol=tol)
+        return np.asarray(LENGTH * found.y[2:, -1])
 
-    yield solve
+    yield one_by_one(rest)
 
 
-def _shoot_rungs() -> Sequence[Rung]:
-    settings = (("RK23", 1e-2), ("RK45", 1e-3), ("RK45", 1e-5), ("DOP853", 1e-6), ("DOP853", 1e-9))
-    return [Rung(f"{method}, rtol {rtol:.0e}", partial(_shoot, method, rtol)) for method, rtol in settings]
-
-
-def _collocate_rungs() -> Sequence[Rung]:
-    return [Rung(f"tol {tol:.0e}", partial(_collocate, tol)) for tol in (1e-1, 1e-2, 1e-3, 1e-5, 1e-7)]
-
-
+_METHODS = (("RK23", 1e-2), ("RK45", 1e-3), ("RK45", 1e-5), ("DOP853", 1e-6), ("DOP853", 1e-9))
 SHOOT = Peer(
     name="scipy shooting",
     modules=("scipy",),
-    packages=("scipy",),
     same="the rod in space by solve_ivp and root, its slope compiled by numba, so that the time is scipy's "
     "own.",
     also="any equations: it is a solver, not a simulator.",
-    rungs=_shoot_rungs,
-    family="scipy",
+    rungs=[Rung(f"{method}, rtol {rtol:.0e}", partial(_shoot, method, rtol)) for method, rtol in _METHODS],
 )
 COLLOCATE = Peer(
     name="scipy solve_bvp",
     modules=("scipy",),
-    packages=("scipy",),
-    same="the rod in its plane, four states of numpy expressions; the plane is told to it, which fastrod "
+    same="the rod in its plane, four states of numpy expressions; the plane is given to it, which fastrod "
     "finds by itself.",
     also="any equations, and a mesh that refines itself.",
-    rungs=_collocate_rungs,
-    family="scipy",
+    rungs=[Rung(f"tol {tol:.0e}", partial(_collocate, tol)) for tol in (1e-1, 1e-2, 1e-3, 1e-5, 1e-7)],
 )

@@ -1,8 +1,8 @@
 """soromox on the rod of Appendix J: piecewise constant and geometric variable strain in JAX, with bending
 alone left free.
 
-It has dynamics, forces and Jacobians, but no solver for rest: that is Newton's method on its stiffness matrix
-and its forward kinematics, differentiated and compiled by JAX as one would write it.
+It has dynamics, forces and Jacobians, but no solver for rest: that is Newton's method on its stiffness
+matrix and its forward kinematics, differentiated and compiled by JAX as one would write it.
 """
 
 from __future__ import annotations
@@ -15,11 +15,9 @@ from typing import Any
 
 import numpy as np
 
-import appendix_j
-from appendix_j import Array
-from peer import Build, Peer, Rung, Solve
+from appendix_j import BENDING, LENGTH, Array, Peer, Rung, Solve
 
-_RADIUS, _DENSITY = 4e-3, 1e3  # m, kg/m^3: without a say in the answer
+_RADIUS, _DENSITY = 4e-3, 1e3  # m, kg/m^3: without influence on the answer
 _SMALL = 1e-9  # of the last step, in curvature times length
 _MOST = 30
 
@@ -27,16 +25,10 @@ _MOST = 30
 def _link(segments: int, straight: Sequence[float]) -> Any:
     from soromox.systems.components import LinkSpec
 
-    young = appendix_j.bending() / (0.25 * math.pi * _RADIUS**4)
-    length = appendix_j.length() / segments
-    return LinkSpec.circular(
-        length=length,
-        radius=_RADIUS,
-        density=_DENSITY,
-        reference_strain=list(straight),
-        young_modulus=young,
-        shear_modulus=young / 3.0,
-    )
+    young = BENDING / (0.25 * math.pi * _RADIUS**4)
+    size = {"length": LENGTH / segments, "radius": _RADIUS, "density": _DENSITY}
+    stiffness = {"young_modulus": young, "shear_modulus": young / 3.0}
+    return LinkSpec.circular(**size, **stiffness, reference_strain=list(straight))
 
 
 def _pcs(segments: int) -> tuple[Any, int, Callable[[Any], Any]]:
@@ -44,17 +36,16 @@ def _pcs(segments: int) -> tuple[Any, int, Callable[[Any], Any]]:
     import jax.numpy as jnp
     from soromox.systems.pcs import PlanarPCS, PlanarPCSStructure
 
-    bending_only = PlanarPCSStructure(
-        num_gauss_points=5, strain_selector=jnp.array([True, False, False] * segments)
-    )
+    selector = jnp.array([True, False, False] * segments)
+    bending_only = PlanarPCSStructure(num_gauss_points=5, strain_selector=selector)
     links = [_link(segments, (0.0, 1.0, 0.0)) for _ in range(segments)]
     robot = PlanarPCS.from_links(links, structure=bending_only, gravity=jnp.zeros(2), base_pose=jnp.zeros(3))
     return robot, segments, lambda q: robot.forward_kinematics_tips(q)[-1][1:]
 
 
 def _gvs(order: int, points: int) -> tuple[Any, int, Callable[[Any], Any]]:
-    """One segment whose curvature in the plane is a Legendre series of this order, integrated over so many
-    Gauss points."""
+    """One segment whose curvature in the plane is a Legendre series of this order, over so many Gauss
+    points."""
     import jax.numpy as jnp
     from soromox.systems.components import JointSpec
     from soromox.systems.gvs import GVS, GVSSegment, StrainBasisSpec
@@ -62,9 +53,8 @@ def _gvs(order: int, points: int) -> tuple[Any, int, Callable[[Any], Any]]:
     basis = StrainBasisSpec(type="legendre", strain_selector=("kappa_z",), basis_order=order)
     link = _link(1, (0.0, 0.0, 0.0, 1.0, 0.0, 0.0))
     segment = GVSSegment(link=link, joint=JointSpec(type="fixed"), basis=basis, num_gauss_points=points)
-    robot = GVS.from_segments(
-        [segment], gravity=jnp.zeros(3), base_pose=jnp.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-    )
+    base = jnp.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    robot = GVS.from_segments([segment], gravity=jnp.zeros(3), base_pose=base)
     return robot, order + 1, lambda q: robot.forward_kinematics_tips(q)[-1][:2, 3]
 
 
@@ -86,7 +76,7 @@ def _newton(make: Callable[[], tuple[Any, int, Callable[[Any], Any]]], together:
             def body(state: Any) -> Any:
                 q, _, i = state
                 change = jnp.linalg.solve(jax.jacfwd(residual)(q, force), residual(q, force))
-                return q - change, jnp.abs(change).max() * appendix_j.length(), i + 1
+                return q - change, jnp.abs(change).max() * LENGTH, i + 1
 
             start = (jnp.zeros(n), jnp.inf, 0)
             q, _, _ = jax.lax.while_loop(lambda state: (state[1] > _SMALL) & (state[2] < _MOST), body, start)
@@ -95,28 +85,13 @@ def _newton(make: Callable[[], tuple[Any, int, Callable[[Any], Any]]], together:
         compiled = jax.jit(jax.vmap(one) if together else one)
 
         def solve(force: Array) -> Array:
-            if together:
-                return np.asarray(compiled(force))
-            return np.array([compiled(across) for across in force])
+            return np.asarray(compiled(force) if together else [compiled(across) for across in force])
 
         yield solve
 
 
-def _both(make: Callable[[], tuple[Any, int, Callable[[Any], Any]]]) -> tuple[Build, Build]:
-    return partial(_newton, make, False), partial(_newton, make, True)
-
-
-def _pcs_rungs() -> Sequence[Rung]:
-    return [Rung(f"{n} segment{'s' * (n > 1)}", *_both(partial(_pcs, n))) for n in (1, 4, 16)]
-
-
-def _gvs_rungs() -> Sequence[Rung]:
-    # 5 points are its least; each setting takes long to build and to compile
-    settings = ((0, 5), (1, 6), (3, 12))
-    return [
-        Rung(f"order {order}, {points} points", *_both(partial(_gvs, order, points)))
-        for order, points in settings
-    ]
+def _rung(label: str, make: Callable[[], tuple[Any, int, Callable[[Any], Any]]]) -> Rung:
+    return Rung(label, partial(_newton, make, False), partial(_newton, make, True))
 
 
 _ALSO = (
@@ -125,18 +100,15 @@ _ALSO = (
 PCS = Peer(
     name="soromox PCS",
     modules=("soromox", "jax"),
-    packages=("soromox", "jax"),
     same="constant curvature a segment, plane, shear and stretch left out by its own choice of strains.",
     also=_ALSO,
-    rungs=_pcs_rungs,
-    family="soromox",
+    rungs=[_rung(f"{n} segment{'s' * (n > 1)}", partial(_pcs, n)) for n in (1, 4, 16)],
 )
 GVS = Peer(
     name="soromox GVS",
     modules=("soromox", "jax"),
-    packages=("soromox", "jax"),
     same="one segment in space, its curvature in the plane a Legendre series, every other strain left out.",
     also=_ALSO,
-    rungs=_gvs_rungs,
-    family="soromox",
+    # 5 points are its least; each setting takes long to build and to compile
+    rungs=[_rung(f"order {n}, {m} points", partial(_gvs, n, m)) for n, m in ((0, 5), (1, 6), (3, 12))],
 )

@@ -1,4 +1,9 @@
-"""What a benchmark prints: tables for people, the same rows as JSON for programs; and how time is taken."""
+"""The one runner of the benchmarks: takes times, prints tables for people and the same rows as JSON for
+programs.
+
+A benchmark is a file `bench_NAME.py` with `main = report.bench(__doc__, measure, ...)`; `measure` returns
+tables.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +13,19 @@ import json
 import math
 import os
 import platform
+import statistics
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+SHARED = ROOT.parent / "shared"
+sys.path += [str(ROOT / "tests"), str(ROOT / "tests" / "truth")]  # what benchmarks and checks share
 
 Value = float | int | str | bool | None
-Result = TypeVar("Result")
 Row = dict[str, Value]
 _WIDTH = 166  # characters of the widest table; a narrower terminal wraps its lines but loses nothing
 
@@ -29,6 +39,19 @@ class Column:
     form: str = ""
 
 
+def columns(text: str) -> list[Column]:
+    """Columns written as `key:format heading`, one after the other between bars; `~` breaks a heading's line.
+
+    A column without a heading is headed by its key.
+    """
+    found = []
+    for one in text.split("|"):
+        name, _, head = one.strip().partition(" ")
+        key, _, form = name.partition(":")
+        found.append(Column(key, head.strip().replace("~", "\n") or key, form))
+    return found
+
+
 @dataclass
 class Section:
     """One table: what was measured, and what must be known to read it."""
@@ -38,6 +61,8 @@ class Section:
     columns: Sequence[Column]
     rows: list[Row]
     notes: list[str] = field(default_factory=list)
+    failed: bool = False
+    """Whether this table is a check, and something in it is not as it must be: the exit code is then 1."""
 
     def as_json(self) -> Mapping[str, object]:
         meaning = {column.key: column.head.replace("\n", " ") for column in self.columns}
@@ -45,13 +70,23 @@ class Section:
         return {"title": self.title, "columns": meaning, "rows": rows, "notes": self.notes}
 
 
-def _plain(value: Value) -> Value:
+def table(key: str, title: str, text: str, rows: Iterable[Row], *notes: str, failed: bool = False) -> Section:
+    """A table whose columns are written as in `columns`."""
+    return Section(key, title, columns(text), list(rows), list(notes), failed)
+
+
+def goal(value: float, target: float, *, least: bool = False, name: str = "") -> Row:
+    """A target beside its figure, and whether it is met: at most `target`, or at `least` that much."""
+    met = value >= target if least else value <= target
+    return {f"{name}target": target, f"{name}met": bool(met)}
+
+
+def _plain(value: Any) -> Any:
     """JSON knows neither nan nor infinity."""
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def show(sections: Sequence[Section], head: str) -> None:
-    """Print the tables."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -60,13 +95,13 @@ def show(sections: Sequence[Section], head: str) -> None:
     console.width = max(console.width, _WIDTH)
     console.print(head, highlight=False)
     for section in sections:
-        table = Table(title=section.title, title_justify="left", title_style="bold")
+        made = Table()
         for i, column in enumerate(section.columns):
-            table.add_column(Text(column.head), justify="left" if i == 0 else "right", no_wrap=True)
+            made.add_column(Text(column.head), justify="left" if i == 0 else "right", no_wrap=True)
         for row in section.rows:
-            table.add_row(*(Text(_text(row.get(column.key), column.form)) for column in section.columns))
-        console.print()
-        console.print(table)
+            made.add_row(*(Text(_text(row.get(column.key), column.form)) for column in section.columns))
+        console.print(Text(f"\n{section.title}"), style="bold", highlight=False)
+        console.print(made)
         for note in section.notes:
             console.print(Text(note), style="dim", highlight=False)
 
@@ -91,46 +126,108 @@ def machine() -> dict[str, str]:
     import numpy
     import scipy
 
-    model = platform.processor() or platform.machine()
-    try:
-        with open("/proc/cpuinfo") as lines:  # noqa: PTH123
-            model = next(
-                (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), model
-            )
-    except OSError:
-        pass
+    cpu = Path("/proc/cpuinfo")
+    lines = cpu.read_text().splitlines() if cpu.exists() else []
+    model = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
     versions = (
         f"Python {platform.python_version()}, numpy {numpy.__version__}, numba {numba.__version__}, "
         f"scipy {scipy.__version__}"
     )
-    return {"cpu": model, "cores": str(numba.config.NUMBA_NUM_THREADS), "versions": versions}
+    return {
+        "cpu": model or platform.processor() or platform.machine(),
+        "cores": str(numba.config.NUMBA_NUM_THREADS),
+        "versions": versions,
+    }
 
 
 def thread_counts() -> tuple[int, int]:
     """One thread, and two where the machine has them."""
     import numba
 
-    config: object = numba.config
-    return 1, min(2, int(getattr(config, "NUMBA_NUM_THREADS", 1)))
+    return 1, min(2, int(numba.config.NUMBA_NUM_THREADS))
 
 
-def seconds(
-    run: Callable[[], Result], clock: Callable[[], float] = time.perf_counter
-) -> tuple[float, Result]:
-    """Time of one call by `clock` [s], wall time by default, without the collector of garbage, and what it
-    returned."""
-    gc.disable()
-    try:
-        start = clock()
-        result = run()
-        return clock() - start, result
-    finally:
-        gc.enable()
+class Measurement:
+    """Times of one thing by `clock` [s], wall time by default."""
+
+    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
+        self.clock, self.times = clock, list[float]()
+
+    def take(self, run: Callable[[], Any]) -> Any:
+        """Call once, without the collector of garbage; what the call returned."""
+        gc.disable()
+        try:
+            start = self.clock()
+            result = run()
+            self.times.append(self.clock() - start)
+            return result
+        finally:
+            gc.enable()
+
+    @property
+    def least(self) -> float:
+        """What the machine can do when nothing else wants it; nan before the first call."""
+        return min(self.times, default=math.nan)
+
+    @property
+    def median(self) -> float:
+        return statistics.median(self.times)
+
+    def quantile(self, q: float) -> float:
+        import numpy
+
+        return float(numpy.quantile(self.times, q))
+
+
+def alternate(runs: Sequence[Callable[[], Any]], rounds: int) -> list[Measurement]:
+    """Call all of `runs` once a round, so that what else the machine does meets each of them alike."""
+    found = [Measurement() for _ in runs]
+    for _ in range(rounds):
+        for measurement, run in zip(found, runs, strict=True):
+            measurement.take(run)
+    return found
+
+
+def seconds(run: Callable[[], Any], clock: Callable[[], float] = time.perf_counter) -> tuple[float, Any]:
+    """Time of one call [s], and what it returned."""
+    measurement = Measurement(clock)
+    result = measurement.take(run)
+    return measurement.least, result
 
 
 def best(run: Callable[[], object], repeats: int) -> float:
-    """Least wall time of several calls [s]: what the machine can do when nothing else wants it."""
-    return min((seconds(run)[0] for _ in range(repeats)), default=math.nan)
+    """Least wall time of several calls [s]."""
+    return alternate([run], repeats)[0].least
+
+
+Option = tuple[str, Any, str]
+"""`--name`, its default (or a type, where there is none; False for a switch; a list of choices), and its
+help."""
+
+
+def bench(
+    doc: str | None, measure: Callable[[argparse.Namespace], Sequence[Section]], *options: Option
+) -> Callable[[Sequence[str] | None], int]:
+    """The `main` of a benchmark, with `--json`, `--quick` and these options."""
+
+    def main(argv: Sequence[str] | None = None) -> int:
+        form = argparse.RawDescriptionHelpFormatter
+        parser = argparse.ArgumentParser(description=doc, formatter_class=form)
+        for name, default, words in options:
+            if default is False:
+                parser.add_argument(name, action="store_true", help=words)
+            elif isinstance(default, list):
+                parser.add_argument(name, choices=default, help=words)
+            elif isinstance(default, tuple):
+                parser.add_argument(name, nargs="+", type=default[0], help=words)
+            elif isinstance(default, type):
+                parser.add_argument(name, type=default, metavar=name[2:].upper(), help=words)
+            else:
+                words += " (default: %(default)s)"
+                parser.add_argument(name, type=type(default), default=default, help=words)
+        return command(parser, argv, measure)
+
+    return main
 
 
 def command(
@@ -138,16 +235,19 @@ def command(
     argv: Sequence[str] | None,
     measure: Callable[[argparse.Namespace], Sequence[Section]],
 ) -> int:
-    """A benchmark's command line: `--json`, `--quick` and what `parser` has besides; measure, print, and the
-    exit code."""
+    """Read a benchmark's command line, measure and print; the exit code."""
+    from fastrod.errors import FastrodError
+
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    parser.add_argument(
-        "--quick", action="store_true", help="little of everything: does it run? Its figures mean little"
-    )
+    parser.add_argument("--quick", action="store_true", help="little of everything: figures mean little")
     options = parser.parse_args(argv)
     # other work on the machine spoils figures, of two threads first
     start, load = time.perf_counter(), os.getloadavg()[0]
-    measured = measure(options)
+    try:
+        measured = measure(options)
+    except FastrodError as error:
+        print(error, file=sys.stderr)
+        return 2
     head = {
         **machine(),
         "load_before": f"{load:.2f}",
@@ -156,11 +256,8 @@ def command(
         "quick": str(options.quick).lower(),
     }
     if options.json:
-        print(
-            json.dumps(
-                {"machine": head, "sections": {section.key: section.as_json() for section in measured}}
-            )
-        )
+        made = {section.key: section.as_json() for section in measured}
+        print(json.dumps({"machine": head, "sections": made}))
     else:
         show(measured, ", ".join(f"{key} {value}" for key, value in head.items()))
-    return 0
+    return int(any(section.failed for section in measured))

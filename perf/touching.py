@@ -1,5 +1,5 @@
-"""Robots beside, along and against a mesh: the inputs of the contact benchmark, and FCL's answer for the same
-rods, capsule by capsule."""
+"""Robots beside, along and against a mesh: inputs of the contact benchmark, and FCL's answer, capsule by
+capsule."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cases import Array, arc_lengths
 from fastrod import Simulator, State, load_robot
 from fastrod.contact import ContactScene, mesh
 from fastrod.contact.geometry import Obstacle
-from report import best, seconds
+from report import Measurement, best
 
 ROBOT = "five_segment_reacher"
 POINTS = 6
@@ -28,12 +28,10 @@ N_CYCLE = 12
 SWING = 1.5e-3
 """Bend that each segment gains and loses in a cycle, either side [rad]: the tip goes about 1 mm a step."""
 FAR, GRAZING, PRESSED = 0.4, 2e-3, -3e-3
-"""Smallest gap between mesh and free rod over a cycle, the overlap that the mesh then prevents where it is
-negative [m]."""
-_APPROACH = 8
-"""Steps in which the mesh comes to where it stays."""
-_AWAY = 0.03
-"""How much farther off it begins [m]."""
+"""Smallest gap between mesh and free rod over a cycle, negative: the overlap that the mesh then prevents
+[m]."""
+_APPROACH, _AWAY = 8, 0.03
+"""Steps in which the mesh comes to its place, and how much farther off it begins [m]."""
 _WARM = 1
 """Steps before the timed ones."""
 
@@ -54,13 +52,13 @@ class Batch:
 
     @property
     def travel(self) -> float:
-        """Median way of a free robot's tip in a step [m]."""
+        """Median displacement of a free robot's tip in a step [m]."""
         tip = self.node[:, :, -1]
         return float(np.median(np.linalg.norm(np.roll(tip, -1, axis=0) - tip, axis=-1)))
 
 
 def make_batch(n: int) -> Batch:
-    """`n` reachers, each bent its own way, swinging their tips in a circle; seeded."""
+    """`n` reachers, each bent differently, swinging their tips in a circle; seeded."""
     robot, rng = load_robot(ROBOT), np.random.default_rng(3)
     rest = rng.uniform(-0.25, 0.25, (n, robot.n_segments, 2))
     phase = rng.uniform(0.0, 2.0 * np.pi, n)
@@ -110,7 +108,7 @@ class Timed:
     step_s: float
     """Mean of the timed steps, each the best of its rounds [s]."""
     touching: float
-    """Share of robot-steps in contact."""
+    """Fraction of robot-steps in contact."""
     contacts: float
     """Mean of a robot-step."""
     passes: float
@@ -126,56 +124,49 @@ class Timed:
 
 
 def run(batch: Batch, obstacle: Obstacle | None, gap: float, threads: int, budget: float) -> Timed:
-    """Bring the mesh to the robots, let them swing a little, then time steps: one cycle after the other while
-    the `budget` of seconds lasts, three steps at least."""
-    n = batch.tendon_length.shape[1]
+    """Bring the mesh to the robots, let them swing a little, then time steps: one cycle after the other
+    while the `budget` of seconds lasts, three steps at least."""
+    n, length = batch.tendon_length.shape[1], batch.tendon_length
     scene = None if obstacle is None else ContactScene(obstacles=[obstacle])
     sim = Simulator(load_robot(ROBOT), n, points_per_segment=POINTS, threads=threads, contact=scene)
     if obstacle is None:
-        states = [sim.settle(batch.tendon_length[0])]
+        states = [sim.settle(length[0])]
     else:
         pose = places(batch, gap)
         away = np.zeros_like(pose)
         away[:, :3] = _AWAY * batch.out
-        states = [sim.settle(batch.tendon_length[0], obstacle_pose={"ball": pose + away})]
+        states = [sim.settle(length[0], obstacle_pose={"ball": pose + away})]
         for k in range(1, _APPROACH + 1):
-            states.append(
-                sim.step(batch.tendon_length[0], obstacle_pose={"ball": pose + (1.0 - k / _APPROACH) * away})
-            )
-    states += [sim.step(batch.tendon_length[k]) for k in range(1, _WARM + 1)]
+            states.append(sim.step(length[0], obstacle_pose={"ball": pose + (1.0 - k / _APPROACH) * away}))
+    states += [sim.step(length[k]) for k in range(1, _WARM + 1)]
     not_ok = sum(int((~state.ok).sum()) for state in states)
-    state = states[-1]
-    taken = np.full(N_CYCLE, math.nan)
-    touching, contacts, passes, spent, k, earlier = [], [], [], 0.0, _WARM, ()
-    while spent < budget or k < _WARM + 3:
+    taken, passes = [Measurement() for _ in range(N_CYCLE)], []
+    touching, contacts, k, earlier = [0.0], [0.0], _WARM, ()
+    while sum(sum(each.times) for each in taken) < budget or k < _WARM + 3:
         k += 1
-        earlier = (
-            () if sim._engine is None else (sim._engine.before, *(a.copy() for a in sim._engine.clearance))
-        )
-        used, state = seconds(partial(sim.step, batch.tendon_length[k % N_CYCLE]))
-        spent += used
-        taken[k % N_CYCLE] = np.fmin(taken[k % N_CYCLE], used)
+        engine = sim._engine
+        earlier = () if engine is None else (engine.before, *(a.copy() for a in engine.clearance))
+        state = taken[k % N_CYCLE].take(partial(sim.step, length[k % N_CYCLE]))
         not_ok += int((~state.ok).sum())
         passes.append(state.passes[state.ok])
         if state.contacts is not None:
             touching.append(state.contacts.in_contact().mean())
             contacts.append(state.contacts.count.mean())
     nearest = math.nan if state.contacts is None else float(np.nanmedian(state.contacts.clearance))
-    share, mean = (float(np.mean(a)) if a else 0.0 for a in (touching, contacts))
+    fraction, mean = (float(np.mean(a[1:] or a)) for a in (touching, contacts))
     each = np.concatenate(passes)
-    n_faces = 0 if obstacle is None else len(obstacle.faces)
     return Timed(
-        n_faces,
-        float(np.nanmean(taken)),
-        share,
-        mean,
-        float(each.mean()),
-        int(each.max()),
-        nearest,
-        not_ok,
-        sim,
-        state,
-        earlier,
+        n_faces=0 if obstacle is None else len(obstacle.faces),
+        step_s=float(np.nanmean([one.least for one in taken])),
+        touching=fraction,
+        contacts=mean,
+        passes=float(each.mean()),
+        most_passes=int(each.max()),
+        gap=nearest,
+        not_ok=not_ok,
+        sim=sim,
+        last=state,
+        earlier=earlier,
     )
 
 
@@ -185,25 +176,23 @@ def query(timed: Timed, repeats: int) -> tuple[float, float]:
     engine: Any = timed.sim._engine
     before, distance, position = timed.earlier
     shape = before._replace(**{name: getattr(timed.last, name) for name in before._fields})
-    rows, kept = (
-        np.arange(timed.sim.n_robots),
-        (engine.before, engine.gap.copy(), *(a.copy() for a in engine.clearance)),
-    )
+    rows, clearance = np.arange(timed.sim.n_robots), engine.clearance
+    kept = engine.before, engine.gap.copy(), *(a.copy() for a in clearance)
     engine.before, found = before, []
     for cold in (True, False):
-        least = math.inf
+        searched = Measurement()
         for _ in range(repeats):
-            engine.clearance.distance[:] = -np.inf if cold else distance
-            engine.clearance.position[:] = position
+            clearance.distance[:] = -np.inf if cold else distance
+            clearance.position[:] = position
             engine.tracked[:] = not cold  # what has no past has gone through nothing
-            least = min(least, seconds(partial(engine.touches, rows, shape))[0])
-        found.append(least)
-    engine.before, engine.gap[:], engine.clearance.distance[:], engine.clearance.position[:] = kept
+            searched.take(partial(engine.touches, rows, shape))
+        found.append(searched.least)
+    engine.before, engine.gap[:], clearance.distance[:], clearance.position[:] = kept
     return found[0], found[1]
 
 
 def questions(timed: Timed, obstacle: Obstacle, pose: Array, rows: Iterable[int]) -> list[tuple[Any, ...]]:
-    """What to ask FCL about these robots: the mesh, a capsule of radius 1e-6 m on each chord between nodes,
+    """Queries of FCL for these robots: the mesh, a capsule of radius 1e-6 m on each chord between nodes,
     request and result."""
     import fcl
 
@@ -211,34 +200,28 @@ def questions(timed: Timed, obstacle: Obstacle, pose: Array, rows: Iterable[int]
     model.beginModel(len(obstacle.vertices), len(obstacle.faces))
     model.addSubModel(obstacle.vertices, obstacle.faces)
     model.endModel()
-    asked: list[tuple[Any, ...]] = []
+    found: list[tuple[Any, ...]] = []
     for i in rows:
         ball = fcl.CollisionObject(model, fcl.Transform(pose[i, 3:], pose[i, :3]))
         for a, b in pairwise(timed.last.position[i]):
-            asked.append(
-                (
-                    ball,
-                    _capsule(fcl, a, b),
-                    fcl.DistanceRequest(enable_nearest_points=True),
-                    fcl.DistanceResult(),
-                )
-            )
-    return asked
+            request = fcl.DistanceRequest(enable_nearest_points=True)
+            found.append((ball, _capsule(fcl, a, b), request, fcl.DistanceResult()))
+    return found
 
 
-def ask_fcl(asked: Sequence[tuple[Any, ...]]) -> float:
+def ask_fcl(queries: Sequence[tuple[Any, ...]]) -> float:
     """The smallest distance, one call each [m]."""
     import fcl
 
-    return float(min(fcl.distance(*question) for question in asked))
+    return float(min(fcl.distance(*question) for question in queries))
 
 
 def fcl_seconds(timed: Timed, obstacle: Obstacle, pose: Array, n_robots: int) -> tuple[float, int]:
-    """Seconds that FCL's calls take for one robot's intervals, and the number of robots asked about."""
+    """Seconds that FCL's calls take for one robot's intervals, and the number of robots queried."""
     rows = np.unique(np.linspace(0, len(pose) - 1, min(n_robots, len(pose))).astype(int))
-    asked = questions(timed, obstacle, pose, rows)
-    ask_fcl(asked)
-    return best(partial(ask_fcl, asked), 2) / len(rows), len(rows)
+    queries = questions(timed, obstacle, pose, rows)
+    ask_fcl(queries)
+    return best(partial(ask_fcl, queries), 2) / len(rows), len(rows)
 
 
 def _capsule(fcl: Any, a: Array, b: Array) -> Any:

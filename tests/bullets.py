@@ -7,7 +7,7 @@ from fastrod.model.robot import Robot, Segment, Tendon
 
 
 def soft_robot(n_segments=2, line_density=0.0, extension=(0.0, 0.0)):
-    wires = tuple(Tendon(offset=0.0075, angle=k * np.pi / 2) for k in range(4))
+    tendons = tuple(Tendon(offset=0.0075, angle=k * np.pi / 2) for k in range(4))
     segment = Segment(
         length=0.1,
         bending_stiffness=(0.0022, 0.0022),
@@ -15,7 +15,7 @@ def soft_robot(n_segments=2, line_density=0.0, extension=(0.0, 0.0)):
         body_radius=0.012,
         line_density=line_density,
         extension=extension,
-        tendons=wires,
+        tendons=tendons,
     )
     return Robot(name="soft", segments=(segment,) * n_segments)
 
@@ -44,11 +44,11 @@ def carrier(world, axis="z"):
     """A body without mass or shape that is moved by hand, and the base on it with the rod along this world
     axis."""
     half = np.sqrt(0.5)
-    turn = {"z": (1.0, 0.0, 0.0, 0.0), "x": (half, 0.0, half, 0.0), "-z": (0.0, 1.0, 0.0, 0.0)}[axis]
-    return BulletLink(world, world.createMultiBody(0.0, -1, -1, [0.0] * 3), quaternion=turn)
+    angle = {"z": (1.0, 0.0, 0.0, 0.0), "x": (half, 0.0, half, 0.0), "-z": (0.0, 1.0, 0.0, 0.0)}[axis]
+    return BulletLink(world, world.createMultiBody(0.0, -1, -1, [0.0] * 3), quaternion=angle)
 
 
-def carry(link, position, velocity):
+def move(link, position, velocity):
     link.bullet.resetBasePositionAndOrientation(link.body, list(position), [0.0, 0.0, 0.0, 1.0])
     link.bullet.resetBaseVelocity(link.body, list(velocity), [0.0] * 3)
 

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from bullets import carrier, carry, cube, empty_world
+from bullets import carrier, cube, empty_world, move
 
 from fastrod.hosts import MountedRod, MujocoRod, add_capsules
 from fastrod.model.robot import Robot
 
 HALF = np.sqrt(0.5)
-TURN = {"z": (1.0, 0.0, 0.0, 0.0), "x": (HALF, 0.0, HALF, 0.0), "-z": (0.0, 1.0, 0.0, 0.0)}
+ROTATION = {"z": (1.0, 0.0, 0.0, 0.0), "x": (HALF, 0.0, HALF, 0.0), "-z": (0.0, 1.0, 0.0, 0.0)}
 
 
 class Cube(NamedTuple):
@@ -23,7 +23,7 @@ class Cube(NamedTuple):
 
 
 class BulletStage:
-    """`touch`: the cubes are obstacles of the rod; those without mass stand still."""
+    """`contact_bodies`: the cubes are obstacles of the rod; those without mass stand still."""
 
     hop = 1.05
     """Largest speed of a cube that is pushed over the floor, over that of the push."""
@@ -37,7 +37,7 @@ class BulletStage:
         axis="x",
         cubes=(),
         floor=None,
-        touch=True,
+        contact_bodies=True,
         **options: Any,
     ) -> None:
         self.world = empty_world(dt, gravity)
@@ -49,10 +49,12 @@ class BulletStage:
             )
         self.cubes = [cube(self.world, c.size, c.mass, c.position, friction=c.friction) for c in cubes]
         self.link = carrier(self.world, axis)
-        self.rod = MountedRod(robot, self.link, touch=self.cubes if touch else [], **options)
+        self.rod = MountedRod(
+            robot, self.link, contact_bodies=self.cubes if contact_bodies else [], **options
+        )
 
-    def carry(self, position, velocity) -> None:
-        carry(self.link, position, velocity)
+    def move(self, position, velocity) -> None:
+        move(self.link, position, velocity)
 
     def velocity(self, k=0):
         """(6,) of a cube's centre of mass."""
@@ -88,7 +90,7 @@ class MujocoStage:
         axis="x",
         cubes=(),
         floor=None,
-        touch=True,
+        contact_bodies=True,
         **options: Any,
     ) -> None:
         import mujoco
@@ -113,18 +115,22 @@ class MujocoStage:
                 type=box, size=[c.size / 2] * 3, mass=c.mass, friction=[0.5 * c.friction, 0.005, 0.0001]
             )
         spec.worldbody.add_body(name="post", mocap=True)
-        touched = self.names if touch else []
+        names = self.names if contact_bodies else []
         add_capsules(
-            spec, robot, "post", touch=touched, capsules_per_segment=options.pop("capsules_per_segment", 10)
+            spec,
+            robot,
+            "post",
+            contact_bodies=names,
+            capsules_per_segment=options.pop("capsules_per_segment", 10),
         )
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         self.rod = MujocoRod(
-            robot, self.model, self.data, "post", quaternion=TURN[axis], touch=touched, **options
+            robot, self.model, self.data, "post", quaternion=ROTATION[axis], contact_bodies=names, **options
         )
         self.post = self.model.body("post").mocapid[0]
 
-    def carry(self, position, velocity) -> None:
+    def move(self, position, velocity) -> None:
         self.data.mocap_pos[self.post] = position
         self.rod.host.mocap_velocity[:3] = velocity
 

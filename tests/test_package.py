@@ -39,7 +39,7 @@ ALSO = {
     "mujoco": "import mujoco; from fastrod.hosts import MujocoRod, add_capsules",
     "ray": "import ray, pyarrow; from fastrod.generation.plan import Plan",
     "cuda": "from fastrod.solver.gpu import device",
-    "network": "from fastrod.identification import network; import sklearn",
+    "network": "from fastrod.identification.learned import network; import sklearn",
 }
 """What its extra is for, in one line."""
 

@@ -81,7 +81,7 @@ def test_the_elastica_is_the_slow_twin() -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_a_finer_setting_is_nearer_to_the_truth(name: str) -> None:
     force = np.array([0.1, 0.35, 0.7])
-    found = [error(rung, force) for rung in peer(name).rungs()[:SLOWEST]]
+    found = [error(rung, force) for rung in peer(name).rungs[:SLOWEST]]
     assert np.all(np.diff(found) < 0.0), found
     assert found[-1] < 0.01
 
@@ -93,7 +93,7 @@ def test_the_coarsest_setting_that_takes_long_to_compile(name: str) -> None:
     import appendix_j
 
     force = np.array([0.01])
-    with peer(name).rungs()[0].build() as solve:
+    with peer(name).rungs[0].build() as solve:
         across = solve(force)[0, 0]
     assert across / appendix_j.tips(force)[0, 0] == pytest.approx(0.75, rel=1e-3)
 
@@ -107,7 +107,7 @@ def test_what_is_relaxed_is_at_rest(name: str, monkeypatch: pytest.MonkeyPatch) 
     import peer_pybullet
 
     force, truth = np.array([0.3, 0.6]), appendix_j.tips(np.array([0.3, 0.6]))
-    rung = peer(name).rungs()[1]
+    rung = peer(name).rungs[1]
     with rung.build() as solve:
         tips = solve(force)
     if name.startswith("MuJoCo"):
@@ -127,7 +127,7 @@ def test_what_is_relaxed_is_at_rest(name: str, monkeypatch: pytest.MonkeyPatch) 
 def order(name: str) -> float:
     """Slope of log error over log links, 4 to 16 links."""
     force, links = np.array([0.2, 0.5]), [4, 8, 16]
-    found = [error(rung, force) for rung in peer(name).rungs() if int(rung.label.split()[0]) in links]
+    found = [error(rung, force) for rung in peer(name).rungs if int(rung.label.split()[0]) in links]
     return -float(np.polyfit(np.log(links), np.log(found), 1)[0])
 
 
@@ -142,7 +142,7 @@ def test_half_end_links_converge_at_second_order_and_equal_links_at_first() -> N
 )
 def test_all_in_one_call_is_one_after_the_other(name: str) -> None:
     force = np.array([0.65, 0.05, 0.3])
-    rung = peer(name).rungs()[1]
+    rung = peer(name).rungs[1]
     with rung.build() as one_by_one, rung.together() as together:
         assert_allclose(together(force), one_by_one(force), rtol=0, atol=1e-9)
         # nothing is left of the call before

@@ -3,6 +3,7 @@ become JSON."""
 
 from __future__ import annotations
 
+import importlib
 import json
 from collections import Counter
 from dataclasses import replace
@@ -23,9 +24,16 @@ def _perf_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.syspath_prepend(str(folder))
 
 
+def measured(capsys: pytest.CaptureFixture[str], name: str, *words: str) -> dict[str, Any]:
+    """Rows of each table of a quick run."""
+    assert importlib.import_module(f"bench_{name}").main(["--quick", "--json", *words]) == 0
+    sections = json.loads(capsys.readouterr().out)["sections"]
+    return {key: section["rows"] for key, section in sections.items()}
+
+
 @pytest.mark.parametrize("tension", [0.0, 2.0])
 def test_the_peers_slopes_agree(tension: float) -> None:
-    from peers import N_STATE, array_slope, compiled_slope, rod_slope
+    from scipy_rod import N_STATE, array_slope, compiled_slope, rod_slope
 
     rng = np.random.default_rng(4)
     y, load = rng.normal(size=N_STATE), rng.normal(size=6)
@@ -41,11 +49,11 @@ def test_the_peers_slopes_agree(tension: float) -> None:
 @pytest.mark.parametrize("paper", [True, False])
 def test_the_peer_solves_the_same_rod(paper: bool) -> None:
     from cases import LINE, appendix_b_robot, arc_lengths
-    from peers import Peer
+    from scipy_rod import Shooter
 
     robot = appendix_b_robot(paper)
     length, force = arc_lengths(robot, np.array([[[0.4, -0.5]]]))[0], (0.1, -0.2, 0.15)
-    peer = Peer(robot, "scalars", integrator="DOP853", rtol=1e-9, atol=1e-11)
+    peer = Shooter(robot, "scalars", integrator="DOP853", rtol=1e-9, atol=1e-11)
     tip, residual = peer.solve(length, (*force, *LINE))
     expected = shoot(robot, length, tip_force=force, line_force=LINE)
     assert expected.success
@@ -62,29 +70,55 @@ def test_the_count_of_operations_is_linear_in_the_steps() -> None:
 
 
 def test_rows_become_json_and_a_table(capsys: pytest.CaptureFixture[str]) -> None:
-    from report import Column, Section, show
+    from report import Column, columns, show, table
 
-    section = Section(
-        "key",
-        "Title",
-        [Column("a", "a [m]"), Column("b", "b", ".1f"), Column("c", "c")],
-        [{"a": "x", "b": 1.25, "c": True}],
-    )
-    assert json.loads(json.dumps(section.as_json()))["rows"] == [{"a": "x", "b": 1.25, "c": True}]
+    text = "a a [m] | b:.1f | c | d:,.0f two~lines"
+    assert columns(text)[1:] == [Column("b", "b", ".1f"), Column("c", "c"), Column("d", "two\nlines", ",.0f")]
+    row = {"a": "x", "b": 1.25, "c": True, "d": float("nan")}
+    section = table("key", "Title", text, [row], "A note.")
+    assert json.loads(json.dumps(section.as_json()))["rows"] == [{**row, "d": None}]
     show([section], "head")
     out = capsys.readouterr().out
-    assert "a [m]" in out
-    assert "1.2" in out
-    assert "yes" in out
+    assert all(word in out for word in ("a [m]", "1.2", "yes", "two", "lines", "A note."))
 
 
-def told(
-    case: str,
-    true: str,
-    named: list[str],
-    verdict: str,
-    left: float = 0.0,
-    classes: list[list[str]] | None = None,
+def test_the_runner_reads_options_and_says_what_failed(capsys: pytest.CaptureFixture[str]) -> None:
+    from fastrod.errors import InputError
+    from report import bench, table
+
+    given = []
+
+    def measure(options: Any) -> list[Any]:
+        given.append(vars(options))
+        if options.kind == "odd":
+            raise InputError("odd is no kind.")
+        return [table("key", "Title", "a", [{"a": 1}], failed=options.bad)]
+
+    kinds, several = ("--kind", ["even", "odd"], "one"), ("--some", (int,), "several")
+    main = bench("What.", measure, ("--n", 3, "count"), ("--bad", False, "flag"), kinds, several)
+    assert main(["--json", "--some", "1", "2"]) == 0
+    words = {"n": 3, "bad": False, "kind": None, "some": [1, 2], "json": True, "quick": False}
+    assert given == [words]
+    assert json.loads(capsys.readouterr().out)["sections"]["key"]["rows"] == [{"a": 1}]
+    assert main(["--bad", "--quick", "--n", "7"]) == 1
+    assert given[1] == {**words, "n": 7, "bad": True, "some": None, "json": False, "quick": True}
+    assert main(["--kind", "odd"]) == 2
+    assert capsys.readouterr().err == "odd is no kind.\n"
+
+
+def test_what_is_compared_is_measured_in_alternation() -> None:
+    from report import alternate, goal
+
+    calls: list[str] = []
+    found = alternate([lambda: calls.append("a"), lambda: calls.append("b")], 3)
+    assert calls == ["a", "b"] * 3
+    assert all(len(one.times) == 3 and one.least <= one.median <= max(one.times) for one in found)
+    assert goal(2.0, 1.0) == {"target": 1.0, "met": False}
+    assert goal(2.0, 1.0, least=True, name="x_") == {"x_target": 1.0, "x_met": True}
+
+
+def outcome(
+    case: str, true: str, named: list[str], verdict: str, left: float = 0.0, classes: Any = None
 ) -> dict[str, Any]:
     """A row of the attribution benchmark: `left` of the error above a floor of 0.5 mm, 2 mm before."""
     return {
@@ -106,29 +140,29 @@ def told(
 
 
 WANTED = [
-    (True, told("single", "creep", ["creep"], "explained")),
-    (False, told("single", "creep", ["friction", "creep"], "explained")),
-    (False, told("single", "creep", [], "none", 1.0)),
-    (True, told("none", "", [], "none", 1.0)),
-    (False, told("none", "", ["lens"], "explained")),
-    (True, told("outside", "bump", [], "not_in_library", 1.0)),
-    (False, told("outside", "bump", ["time_drift"], "partly_explained", 0.3)),
-    (True, told("two", "creep lens", ["lens", "creep"], "explained")),
-    (True, told("two", "creep lens", ["lens", "friction"], "explained", classes=[[], ["creep"]])),
-    (False, told("two", "creep lens", ["lens"], "partly_explained", 0.2)),
-    (True, told("dominant", "creep lens gravity", ["friction"], "explained", classes=[["creep"]])),
-    (False, told("dominant", "creep lens gravity", ["lens", "creep"], "explained")),
-    (False, told("dominant", "creep lens gravity", [], "none", 1.0)),
-    (True, told("deleted", "creep", ["friction"], "explained", 0.14)),
-    (False, told("deleted", "creep", ["friction"], "explained", 0.16)),
-    (False, told("deleted", "creep", ["friction"], "ambiguous", 0.16)),
-    (True, told("deleted", "creep", ["friction"], "not_in_library", 0.5)),
-    (True, told("deleted", "creep", [], "not_in_library", 1.0)),
-    (True, told("operator", "creep", ["friction"], "ambiguous")),
-    (True, told("operator", "creep", [], "none", 1.0)),
-    (False, told("operator", "creep", ["friction"], "explained")),
-    (True, told("noise", "lens", ["lens"], "ambiguous")),
-    (True, told("segments", "coupling", ["coupling"], "explained")),
+    (True, outcome("single", "creep", ["creep"], "explained")),
+    (False, outcome("single", "creep", ["friction", "creep"], "explained")),
+    (False, outcome("single", "creep", [], "none", 1.0)),
+    (True, outcome("none", "", [], "none", 1.0)),
+    (False, outcome("none", "", ["lens"], "explained")),
+    (True, outcome("outside", "bump", [], "not_in_library", 1.0)),
+    (False, outcome("outside", "bump", ["time_drift"], "partly_explained", 0.3)),
+    (True, outcome("two", "creep lens", ["lens", "creep"], "explained")),
+    (True, outcome("two", "creep lens", ["lens", "friction"], "explained", classes=[[], ["creep"]])),
+    (False, outcome("two", "creep lens", ["lens"], "partly_explained", 0.2)),
+    (True, outcome("dominant", "creep lens gravity", ["friction"], "explained", classes=[["creep"]])),
+    (False, outcome("dominant", "creep lens gravity", ["lens", "creep"], "explained")),
+    (False, outcome("dominant", "creep lens gravity", [], "none", 1.0)),
+    (True, outcome("deleted", "creep", ["friction"], "explained", 0.14)),
+    (False, outcome("deleted", "creep", ["friction"], "explained", 0.16)),
+    (False, outcome("deleted", "creep", ["friction"], "ambiguous", 0.16)),
+    (True, outcome("deleted", "creep", ["friction"], "not_in_library", 0.5)),
+    (True, outcome("deleted", "creep", [], "not_in_library", 1.0)),
+    (True, outcome("operator", "creep", ["friction"], "ambiguous")),
+    (True, outcome("operator", "creep", [], "none", 1.0)),
+    (False, outcome("operator", "creep", ["friction"], "explained")),
+    (True, outcome("noise", "lens", ["lens"], "ambiguous")),
+    (True, outcome("segments", "coupling", ["coupling"], "explained")),
     (False, {"case": "segments", "seed": 1, "true": ["coupling"], "error": "ValueError: it broke"}),
 ]
 
@@ -141,7 +175,8 @@ def test_a_verdict_is_scored_as_its_goal_wants(wanted: bool, row: dict[str, Any]
 
 
 def test_verdicts_are_summed_up_by_case(capsys: pytest.CaptureFixture[str]) -> None:
-    from bench_attribution import confusion, show, summary
+    from bench_attribution import confusion, sections, summary
+    from report import show
 
     rows = [row for _, row in WANTED]
     table = {line["case"]: line for line in summary(rows)}
@@ -152,7 +187,7 @@ def test_verdicts_are_summed_up_by_case(capsys: pytest.CaptureFixture[str]) -> N
         for case, n in Counter(r["case"] for r in rows).items()
     }
     assert table["segments"]["crashed"] == 1
-    assert table["deleted"]["verdicts"] == {"explained": 2, "ambiguous": 1, "not_in_library": 2}
+    assert table["deleted"]["verdicts"] == "2 explained, 1 ambiguous, 2 not_in_library"
     assert table["single"]["after_over_floor_median"] == pytest.approx(1.0)  # of those that named something
     assert table["deleted"]["after_within_1.15"] == 0.0
     assert confusion(rows) == {
@@ -162,34 +197,37 @@ def test_verdicts_are_summed_up_by_case(capsys: pytest.CaptureFixture[str]) -> N
         "lens": {"lens": 1},
     }
     assert json.loads(json.dumps(table))
-    show(rows, list(table.values()), 2)
+    found = sections(rows, 2)
+    assert [row["case"] for row in found[1].rows] == [row["case"] for wanted, row in WANTED if not wanted]
+    show(found, "head")
     out = capsys.readouterr().out
     assert "ValueError: it broke" in out
-    assert "single: 33.3 % of 3 as wanted" in out
+    assert "33.3%" in out
+    assert "friction (creep)" not in out  # as wanted
 
 
-def test_a_share_of_the_sealed_logs_has_some_of_each_kind() -> None:
-    from bench_attribution import COUNTS, GOALS, cases
+def test_a_fraction_of_the_sealed_logs_has_some_of_each_kind() -> None:
+    from bench_attribution import GOALS, cases
 
-    few = cases(0.02, [])
-    assert {case.kind for case in few} == set(COUNTS) == set(GOALS)
-    assert len(few) < 0.05 * sum(COUNTS.values())
+    few, total = cases(0.02, []), sum(count for count, _ in GOALS.values())
+    assert {case.kind for case in few} == set(GOALS)
+    assert len(few) < 0.05 * total
     every = cases(1.0, [])
-    assert len(every) == sum(COUNTS.values())
+    assert len(every) == total
     assert set(few) <= set(every)
     assert len(set(every)) == len(every)
     assert {case.kind for case in cases(0.1, ["none", "two"])} == {"none", "two"}
 
 
 def test_a_log_that_breaks_is_a_row() -> None:
-    from bench_attribution import Case, _safely, score
+    from bench_attribution import Case, safely, score
 
-    row = _safely(Case("single", 3, "no such effect"))
+    row = safely(Case("single", 3, "no such effect"))
     assert row["error"]
     assert not score("single", row)
 
 
-def test_a_robot_and_its_wires_stiffer_alike_change_under_loads_only() -> None:
+def test_a_robot_and_its_tendons_stiffer_alike_change_under_loads_only() -> None:
     from bench_measured import stiffer
     from fastrod import Simulator
 
@@ -209,38 +247,28 @@ def test_a_robot_and_its_wires_stiffer_alike_change_under_loads_only() -> None:
             loaded = [
                 Simulator(r).settle(lengths, tip_force=[0.1, 0.1, 0.0]).tip_position for r in (soft, hard)
             ]
-            gives = [np.linalg.norm(tip - one.tip_position) for tip in loaded]
+            moved = [np.linalg.norm(tip - one.tip_position) for tip in loaded]
             # in proportion, but for the bend that it adds
-            assert gives[1] * factor == pytest.approx(gives[0], rel=0.15)
+            assert moved[1] * factor == pytest.approx(moved[0], rel=0.15)
 
 
 def test_the_contact_bench_runs_and_its_states_are_what_they_say(capsys: pytest.CaptureFixture[str]) -> None:
-    import bench_contact
-
-    assert bench_contact.main(["--quick", "--json", "--robots", "3"]) == 0
-    sections = json.loads(capsys.readouterr().out)["sections"]
-    steps = sections["contact_steps"]["rows"]
-    assert [row["state"] for row in steps] == [
-        "no scene",
-        "free",
-        "free",
-        "grazing",
-        "grazing",
-        "in contact",
-        "in contact",
-    ]
+    tables = measured(capsys, "contact", "--robots", "3")
+    steps = tables["contact_steps"]
+    states = ["free", "grazing", "in contact"]
+    assert [row["state"] for row in steps] == ["no scene", *(state for state in states for _ in range(2))]
     assert {row["not_ok"] for row in steps} == {0}
     assert {row["touching"] for row in steps if row["state"] != "in contact"} == {0.0}
     assert {row["touching"] for row in steps if row["state"] == "in contact"} == {1.0}
     assert all(1e-3 < row["gap_m"] < 6e-3 for row in steps if row["state"] == "grazing")
     assert all(row["gap_m"] > 0.3 for row in steps if row["state"] == "free")
     assert all(row["passes"] == 1.0 for row in steps if row["state"] in ("free", "grazing"))
-    queries = sections["contact_query"]["rows"]
+    queries = tables["contact_query"]
     assert [row["faces"] for row in queries] == [320, 1280] * 3
     assert all(row["fcl_us"] > 0.0 and row["warm_us"] > 0.0 for row in queries)
 
 
-def test_fcl_is_asked_about_the_same_distances() -> None:
+def test_fcl_finds_the_same_distances() -> None:
     import touching
     from fastrod.contact.direct import DirectScene
 
@@ -260,40 +288,31 @@ def test_fcl_is_asked_about_the_same_distances() -> None:
     assert touching.fcl_seconds(timed, obstacle, pose, 2)[1] == 2
 
 
-def test_the_control_bench_runs_and_both_ways_follow_the_path(capsys: pytest.CaptureFixture[str]) -> None:
-    import bench_control
-
-    assert bench_control.main(["--quick", "--json"]) == 0
-    (section,) = json.loads(capsys.readouterr().out)["sections"].values()
-    exact, differences = section["rows"]
-    assert exact["way"] == "analytic"
+def test_the_control_bench_runs_and_both_follow_the_path(capsys: pytest.CaptureFixture[str]) -> None:
+    exact, differences = measured(capsys, "control")["control_step"]
+    assert exact["kind"] == "analytic"
     assert exact["ratio"] > 1.0
     assert max(exact["error_m"], differences["error_m"]) < 1e-3
 
 
 def test_the_hosts_bench_runs_and_its_states_are_what_they_say(capsys: pytest.CaptureFixture[str]) -> None:
-    import bench_hosts
-
-    assert bench_hosts.main(["--quick", "--json"]) == 0
-    sections = json.loads(capsys.readouterr().out)["sections"]
-    rows = {row["what"]: row for row in sections["hosts"]["rows"]}
+    tables = measured(capsys, "hosts")
+    rows = {row["what"]: row for row in tables["hosts"]}
     assert len(rows) == 7
-    assert rows["prototype, pushes a free cube"]["touching"] > 0.0
-    assert rows["prototype, free"]["touching"] == 0.0
+    assert rows["prototype, pushes a free cube"]["in_contact"] > 0.0
+    assert rows["prototype, free"]["in_contact"] == 0.0
     assert all(row["failed"] == 0 for row in rows.values())
-    assert len(sections["engines"]["rows"]) == 4
+    assert len(tables["engines"]) == 4
     # per cent
-    assert all(max(row["tip"], row["force"], row["moment"]) < 1.0 for row in sections["engines"]["rows"])
+    assert all(max(row["tip"], row["force"], row["moment"]) < 1.0 for row in tables["engines"])
 
 
 def test_the_envs_bench_runs_over_every_task(capsys: pytest.CaptureFixture[str]) -> None:
-    import bench_envs
     import fastrod_envs
 
-    assert bench_envs.main(["--quick", "--json"]) == 0
-    sections = json.loads(capsys.readouterr().out)["sections"]
-    reach, others = sections["reach"]["rows"], sections["tasks"]["rows"]
-    assert {row["way"] for row in reach} == {"SyncVectorEnv", "native batch"}
+    tables = measured(capsys, "envs")
+    reach, others = tables["reach"], tables["tasks"]
+    assert {row["kind"] for row in reach} == {"SyncVectorEnv", "native batch"}
     assert all(row["rate"] > 0.0 for row in [*reach, *others])
-    assert all(0.0 < row["share"] < 1.0 for row in reach if row["way"] == "native batch")
-    assert {row["way"] for row in others} == set(fastrod_envs.names()) - {"Reach"}
+    assert all(0.0 < row["fraction"] < 1.0 for row in reach if row["kind"] == "native batch")
+    assert {row["kind"] for row in others} == set(fastrod_envs.names()) - {"Reach"}

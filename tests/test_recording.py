@@ -203,8 +203,8 @@ def test_a_process_that_is_killed_loses_no_row(tmp_path: Path) -> None:
         while int(child.stdout.readline()) < 100:
             pass
         os.kill(child.pid, signal.SIGKILL)
-        told = child.stdout.read().splitlines(keepends=True)
-    added = max([100, *(int(line) for line in told if line.endswith("\n"))])
+        said = child.stdout.read().splitlines(keepends=True)
+    added = max([100, *(int(line) for line in said if line.endswith("\n"))])
     assert child.returncode == -signal.SIGKILL
     log = recover(path)
     assert len(log) >= added
@@ -276,11 +276,11 @@ for k in range(10):
 @pytest.mark.skipif(sys.platform == "win32", reason="resource limits")
 def test_a_disk_that_was_full_leaves_whole_rows(tmp_path: Path) -> None:
     path = tmp_path / "session.csv"
-    told = subprocess.run(
+    said = subprocess.run(
         [sys.executable, "-c", FULL, str(path)], capture_output=True, text=True, check=True
     ).stdout
     why, where = "session.csv.part cannot be written: File too large", "are in session.csv.part."
-    assert told.splitlines() == [f"{why}; {rows} {where}" for rows in ("4 of its 5 rows", "4 of its 6 rows")]
+    assert said.splitlines() == [f"{why}; {rows} {where}" for rows in ("4 of its 5 rows", "4 of its 6 rows")]
     assert recover(path).t.tolist() == [0.0, 1.0, 2.0, 3.0, 6.0, 7.0, 8.0, 9.0]
 
 
@@ -296,8 +296,8 @@ def test_further_columns_and_the_bases_orientation_are_kept(tmp_path: Path, suff
     for k in range(6):
         given = None if k == 2 else {"following error [m]": np.inf if k == 4 else errors[k]}
         recorder.add(reading(0.1 * k, rng), base_quaternion=None if k == 3 else bases[k], extra=given)
-    part = (tmp_path / f"{path.name}.part").read_bytes()
-    (kept / f"{path.name}.part").write_bytes(part)
+    partial = (tmp_path / f"{path.name}.part").read_bytes()
+    (kept / f"{path.name}.part").write_bytes(partial)
     log = recorder.stop()
     expected = np.where(np.isin(np.arange(6), (2, 4)), np.nan, errors)
     assert_array_equal(numbers(log.extra["following error [m]"]), expected)
@@ -370,7 +370,7 @@ def test_nothing_to_recover_is_said(tmp_path: Path) -> None:
         recover(tmp_path / "other.csv")
 
 
-def test_a_failed_end_keeps_the_part(tmp_path: Path) -> None:
+def test_a_failed_end_keeps_the_partial_file(tmp_path: Path) -> None:
     path = tmp_path / "session.csv"
     recorder = filled(Recorder(ROBOT, path), n=5)
     path.mkdir()  # somebody takes the name meanwhile
@@ -392,7 +392,7 @@ def unlink(folder: Path) -> None:
     (folder / "session.csv.part").unlink()
 
 
-def replace_part(folder: Path) -> None:
+def replace_partial(folder: Path) -> None:
     unlink(folder)
     (folder / "session.csv.part").write_text("another's\n")
 
@@ -409,7 +409,7 @@ def block(folder: Path) -> None:
         (leave, "logs/session.csv"),
         (rename, "logs/session.csv"),
         (unlink, "logs/session.csv"),
-        (replace_part, "logs/session-2.csv"),
+        (replace_partial, "logs/session-2.csv"),
         (block, "temporary/session.csv"),
     ],
 )
@@ -432,21 +432,21 @@ def test_a_log_that_was_removed_or_renamed_is_written_again_with_every_row(
     change(folder)
     if not at_the_end:
         recorder.add(reading(2.0, rng))  # the first row after it notices
-        part = tmp_path / f"{name}.part"
+        partial = tmp_path / f"{name}.part"
         assert recorder.path == tmp_path / name
         assert said == [recorder.moved]
         assert "was removed or renamed while it was recorded; all 21 rows are in" in said[0]
-        assert repr(str(part)) in said[0]
-        assert part.read_text().count("\n") == 23  # with comment and header
+        assert repr(str(partial)) in said[0]
+        assert partial.read_text().count("\n") == 23  # with comment and header
         recorder.add(reading(2.1, rng))
-        assert part.read_text().count("\n") == 24
+        assert partial.read_text().count("\n") == 24
         assert len(said) == 1
     log = recorder.stop()
     assert len(log) == (20 if at_the_end else 22)
     assert_same(read_log(tmp_path / name, ROBOT), log)
     assert len(said) == 1
     assert not (tmp_path / f"{name}.part").exists()
-    if change is replace_part:
+    if change is replace_partial:
         assert (folder / "session.csv.part").read_text() == "another's\n"
 
 
@@ -465,6 +465,12 @@ def test_rows_that_no_place_takes_are_in_no_file(tmp_path: Path, monkeypatch: py
     with pytest.raises(InputError, match=r"its 3 rows are in no file\."):
         recorder.stop()
     assert not recorder.recording
+    folder.unlink()  # there is room for it again
+    log = recorder.stop()
+    assert len(log) == 3
+    assert_same(read_log(folder / "session.csv", ROBOT), log)
+    with pytest.raises(InputError, match="nothing is being recorded"):
+        recorder.stop()
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])

@@ -105,7 +105,7 @@ SENTENCES: list[tuple[Callable[[], object], str]] = [
     ),
     (
         lambda: plan(rod(), np.zeros((3, 3)), 0.1, start="there"),
-        "start is 'there'; give 4 changes of wire length",
+        "start is 'there'; give 4 changes of tendon length",
     ),
     (lambda: demo(None, seed=-1), "seed is -1; it must be a whole number from 0"),
     (lambda: recorder(math.nan), "a recording begins at t = nan; it must be a finite time"),

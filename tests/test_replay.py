@@ -58,8 +58,8 @@ def log_of_the_other(n: int = 8) -> RunLog:
     under a known load."""
     from fastrod.reference import shoot
 
-    share = np.tile(np.arange(1, n + 1) / n, 2)
-    bend, turn = 0.9 * np.sin(np.pi * share), 4.0 * np.pi * share
+    fraction = np.tile(np.arange(1, n + 1) / n, 2)
+    bend, turn = 0.9 * np.sin(np.pi * fraction), 4.0 * np.pi * fraction
     nominal, real = load_robot("prototype"), other_robot()
     places = np.array([tendon.position(1)[0] for tendon in nominal.tendons])
     dl = -np.stack([bend * np.cos(turn), bend * np.sin(turn)], axis=1) @ places.T
@@ -70,7 +70,7 @@ def log_of_the_other(n: int = 8) -> RunLog:
     ]
     return RunLog(
         name="other",
-        t=8.0 * share,
+        t=8.0 * fraction,
         run=np.repeat(["free", "loaded"], n),
         dl=dl,
         tip_position=np.array(tips),

@@ -18,6 +18,7 @@ import pytest
 from numpy.testing import assert_allclose
 from reportlog import backlash_log
 
+from fastrod.effects.base import effect_names
 from fastrod.identification.attribution import identify
 from fastrod.identification.report import report
 from fastrod.identification.report.page import page
@@ -84,7 +85,7 @@ def wild(result: Result) -> Result:
         base_parameters=base,
         remaining=ResidualStructure(0.1, 0.05, 0.02, 0.01, 3.0),
         remaining_kind="static",
-        remaining_share=0.12,
+        remaining_fraction=0.12,
         patterns=["it <jumps>"],
         test=replace(result.test, interval=(NAN, NAN)),
         advice=["turn <it>"],
@@ -313,25 +314,7 @@ def test_terminal_table_fits_80_columns(result: Result) -> None:
         assert word in text, word
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "friction",
-        "creep",
-        "latency",
-        "gravity",
-        "tip_force",
-        "payload",
-        "time_drift",
-        "temperature",
-        "marker_offset",
-        "drum_gain",
-        "stiffness_anisotropy",
-        "lens",
-        "precurvature",
-        "coupling",
-    ],
-)
+@pytest.mark.parametrize("name", effect_names())
 def test_every_effect_has_a_signal(result: Result, name: str) -> None:
     value = Estimate(value=1.0, stderr=0.1, unit="", identifiable=True)
     given = dict.fromkeys(("x", "y", "time_constant"), value)

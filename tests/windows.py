@@ -35,10 +35,10 @@ class Window:
         )
         self.page = self.context.new_page()
         self.page.set_default_timeout(60_000)  # a browser without a graphics card on a busy machine is slow
-        self.asked: list[str] = []
+        self.requested: list[str] = []
         self.errors: list[str] = []
-        self.page.on("request", lambda request: self.asked.append(request.url))
-        self.page.on("websocket", lambda socket: self.asked.append(socket.url))
+        self.page.on("request", lambda request: self.requested.append(request.url))
+        self.page.on("websocket", lambda socket: self.requested.append(socket.url))
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
 
     @property
@@ -46,7 +46,7 @@ class Window:
         """Requests that left the machine."""
         return [
             url
-            for url in self.asked
+            for url in self.requested
             if urlparse(url).scheme in ("http", "https", "ws", "wss") and urlparse(url).hostname not in _LOCAL
         ]
 
@@ -84,8 +84,8 @@ class Window:
     def place_of(self, point: Any, app: Any) -> tuple[float, float]:
         """Where a point (3,) world [m] is drawn, in pixels of the window."""
         camera = next(iter(app.server.get_clients().values())).camera
-        turn = matrix_from_quaternion(np.array([camera.wxyz]))[0]
-        x, y, z = turn.T @ (np.asarray(point) - camera.position)
+        index = matrix_from_quaternion(np.array([camera.wxyz]))[0]
+        x, y, z = index.T @ (np.asarray(point) - camera.position)
         box = self.page.locator("canvas").first.bounding_box()
         scale = 0.5 * box["height"] / np.tan(0.5 * camera.fov)
         return box["x"] + 0.5 * box["width"] + scale * x / z, box["y"] + 0.5 * box["height"] + scale * y / z

@@ -38,10 +38,10 @@ _STILL = 0.004  # of the diagonal: a corner that moves farther from frame to fra
 _POLL = 0.005  # s between two looks for a frame
 _SCENE = DrawnScene(blur=1.0, noise=5.0)
 _SHAKE = 1e-4  # m per axis, of a board that somebody holds or a fixture
-_ON_THE_WAY, _AT_REST = 0.2, 0.25  # s of an emulated hand from place to place, and there
+_MOVING, _AT_REST = 0.2, 0.25  # s of an emulated hand from place to place, and there
 _FOCUS, _ASPECT, _CENTRE = 0.04, 0.005, 0.012  # of an emulated lens: off by these parts at most
 _BENT, _TANGENT = (-0.25, -0.1), 5e-4  # of its k1, from and to, and of its p1 and p2
-_MOVED, _TURNED = 0.005, math.radians(2.0)  # of where an emulated camera stands, at most
+_MOVED, _ROTATED = 0.005, math.radians(2.0)  # of where an emulated camera stands, at most
 
 
 class BoardMover(Protocol):
@@ -55,7 +55,7 @@ class BoardMover(Protocol):
 
 
 @final
-class AskingBoardHands:
+class BoardPrompts:
     """A person at the terminal."""
 
     def wave(self) -> None:
@@ -79,7 +79,7 @@ class BoardEye:
     def __init__(self, camera: Camera, board: CharucoBoard, *, clock: Clock, seed: int = 0) -> None:
         """`camera` is the true one; `seed` draws noise and where hands go."""
         self.camera, self.board, self.clock = camera, board, clock
-        self._rng, self._ways = np.random.default_rng([seed, 0]), np.random.default_rng([seed, 1])
+        self._rng, self._path_rng = np.random.default_rng([seed, 0]), np.random.default_rng([seed, 1])
         self._next, self._number = clock.now(), 0
         self._still: Pose | None = None
         self._began, self._places = clock.now(), [self._somewhere()]
@@ -110,7 +110,7 @@ class BoardEye:
 
     def _somewhere(self) -> Pose:
         """Base_from_board where a hand might hold it: before the camera, most of it in the picture."""
-        rng, camera = self._ways, self.camera
+        rng, camera = self._path_rng, self.camera
         azimuth, tilt, roll = rng.uniform(0.0, 2.0 * math.pi), rng.uniform(0.1, 0.65), rng.uniform(-0.5, 0.5)
         aside = rng.uniform(-0.2, 0.2, 2) * np.array(camera.size)
         return compose(
@@ -119,14 +119,14 @@ class BoardEye:
         )
 
     def _waved(self, t: float) -> Pose:
-        each = _ON_THE_WAY + _AT_REST
+        each = _MOVING + _AT_REST
         k = int(t / each)
         while len(self._places) < k + 2:
             self._places.append(self._somewhere())
-        part = min((t - k * each) / _ON_THE_WAY, 1.0)
-        (p, q), (ahead, turned) = self._places[k], self._places[k + 1]
-        between = (1.0 - part) * q + part * math.copysign(1.0, float(q @ turned)) * turned
-        return p + part * (ahead - p), between / np.linalg.norm(between)
+        fraction = min((t - k * each) / _MOVING, 1.0)
+        (p, q), (ahead, orientation) = self._places[k], self._places[k + 1]
+        between = (1.0 - fraction) * q + fraction * math.copysign(1.0, float(q @ orientation)) * orientation
+        return p + fraction * (ahead - p), between / np.linalg.norm(between)
 
 
 def bent(camera: Camera, seed: int) -> Camera:
@@ -150,7 +150,7 @@ def moved(camera: Camera, seed: int) -> Camera:
     rng = np.random.default_rng([seed, 3])
     position = np.array(camera.position) + _MOVED * rng.uniform(-1.0, 1.0, 3)
     quaternion = product(
-        np.array(camera.quaternion), quaternion_from_vector(_TURNED * rng.uniform(-1.0, 1.0, 3))
+        np.array(camera.quaternion), quaternion_from_vector(_ROTATED * rng.uniform(-1.0, 1.0, 3))
     )
     x, y, z = position.tolist()
     w, a, b, c = (quaternion / np.linalg.norm(quaternion)).tolist()
@@ -160,8 +160,8 @@ def moved(camera: Camera, seed: int) -> Camera:
 def fixtures(camera: Camera, board: CharucoBoard) -> tuple[Pose, ...]:
     """Four places base_from_board that `camera` sees well, tilted to four sides: where an emulated bench
     fixes the board."""
-    turns = [_before(camera, board, 0.5, azimuth, 0.4, 0.0, np.zeros(2)) for azimuth in (0.0, 1.6, 3.1, 4.7)]
-    return tuple(compose(camera.base_from_camera, there) for there in turns)
+    views = [_before(camera, board, 0.5, azimuth, 0.4, 0.0, np.zeros(2)) for azimuth in (0.0, 1.6, 3.1, 4.7)]
+    return tuple(compose(camera.base_from_camera, there) for there in views)
 
 
 def _before(
@@ -186,7 +186,7 @@ class Collected:
     """Why a frame was not taken -> how many."""
 
     @property
-    def told(self) -> str:
+    def counted(self) -> str:
         """The frames passed over, in words."""
         return (
             ", ".join(f"{n} {why}" for why, n in sorted(self.passed.items(), key=lambda item: -item[1]))
@@ -212,7 +212,7 @@ def collect(
     """
     if isinstance(n, bool) or not isinstance(n, int) or n < 1:
         raise InputError(f"{n!r} pictures of the board are asked for; it must be a whole number from 1.")
-    finder, tell = BoardFinder(board), progress or (lambda *_: None)
+    finder, report = BoardFinder(board), progress or (lambda *_: None)
     pictures: list[Picture] = []
     quads: list[Floats] = []
     passed: Counter[str] = Counter()
@@ -239,11 +239,11 @@ def collect(
             pictures.append(frame.image)
             quads.append(quad)
             until = clock.now() + patience
-            tell("views", len(pictures), n)
+            report("views", len(pictures), n)
     made = Collected(pictures=tuple(pictures), passed=dict(passed))
     if not pictures:
         raise CalibrationError(
-            f"no picture of the board could be taken in {patience:g} s; frames passed over: {made.told}."
+            f"no picture of the board could be taken in {patience:g} s; frames passed over: {made.counted}."
         )
     return made
 
@@ -289,7 +289,7 @@ def place_table(found: MarkerRegistration, file: Camera, truth: Camera | None) -
         [] if truth is None else [truth.base_from_camera]
     )
     rows = [
-        np.concatenate([1e3 * position, np.degrees(_turn(file.quaternion, quaternion))])
+        np.concatenate([1e3 * position, np.degrees(_rotation_between(file.quaternion, quaternion))])
         for position, quaternion in poses
     ]
     errors = np.concatenate([1e3 * found.position_stderr, np.degrees(found.rotation_stderr)])
@@ -300,7 +300,7 @@ def place_table(found: MarkerRegistration, file: Camera, truth: Camera | None) -
     return table
 
 
-def _turn(start: tuple[float, float, float, float], end: Floats) -> Floats:
+def _rotation_between(start: tuple[float, float, float, float], end: Floats) -> Floats:
     """(3,) rotation vector from one orientation to the other, about the axes of the first [rad]."""
     w, *v = product(inverse((np.zeros(3), np.array(start)))[1], end).tolist()
     vector = math.copysign(1.0, w) * np.array(v)

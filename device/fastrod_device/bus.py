@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 _NOTIFIER_CYCLE = 0.05  # s; how long closing may take, no more
 
 
-def guest(name: str) -> Any:
-    """A module of the device's libraries.
+def guest(name: str, needs: str = "the CAN bus") -> Any:
+    """A module of the device's libraries, which `needs` needs.
 
     Raises `DeviceError` where it is not installed.
     """
@@ -26,7 +26,7 @@ def guest(name: str) -> Any:
         return importlib.import_module(name)
     except ImportError as error:
         raise DeviceError(
-            f"the CAN bus needs {name.split('.')[0]}: pip install 'fastrod[device]' ({error})."
+            f"{needs} needs {name.split('.')[0]}: pip install 'fastrod[device]' ({error})."
         ) from error
 
 

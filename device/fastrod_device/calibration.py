@@ -199,14 +199,14 @@ def calibrate(
     flags |= cv2.CALIB_USE_INTRINSIC_GUESS
     points_32, pixels_32 = [p.astype(np.float32) for p in points], [p.astype(np.float32) for p in pixels]
     try:
-        error, matrix, distortion, turns, _, spread, _, _ = cv2.calibrateCameraExtended(
+        error, matrix, distortion, orientations, _, spread, _, _ = cv2.calibrateCameraExtended(
             points_32, pixels_32, size, start, np.zeros(5), flags=flags
         )
     except cv2.error as problem:
         raise CalibrationError(
             "the views do not determine a camera; show the board tilted to all sides, near and far."
         ) from problem
-    normals = np.stack([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
+    normals = np.stack([cv2.Rodrigues(orientation)[0][:, 2] for orientation in orientations])
     apart = float(np.arccos(np.clip(normals @ normals.T, -1.0, 1.0)).max())
     if apart < _LEAST_TILT:
         raise CalibrationError(
@@ -245,25 +245,25 @@ def register_base(
         raise InputError(f"the pictures are {_size(images)} px; those of the camera are {camera.size} px.")
     try:
         places = np.broadcast_to(np.asarray(position, dtype=np.float64), (len(images), 3))
-        turns = np.broadcast_to(np.asarray(quaternion, dtype=np.float64), (len(images), 4))
+        orientations = np.broadcast_to(np.asarray(quaternion, dtype=np.float64), (len(images), 4))
     except ValueError as error:
         shapes = f"{np.shape(position)} and {np.shape(quaternion)}"
         raise InputError(
             f"position and quaternion have shapes {shapes}; (3,) and (4,), or a row for each picture, would "
             "be right."
         ) from error
-    if not (np.isfinite(places).all() and np.allclose(np.linalg.norm(turns, axis=1), 1.0, atol=1e-4)):
+    if not (np.isfinite(places).all() and np.allclose(np.linalg.norm(orientations, axis=1), 1.0, atol=1e-4)):
         raise InputError(
             "a place of the board is not finite, or its quaternion not of norm 1 (order w x y z)."
         )
     used, refused, points, pixels = _corners(images, board)
     if not used:
         raise CalibrationError(f"none of {len(images)} views shows the board well enough{_why(refused)}.")
-    space = [p @ rotation(turns[k]).T + places[k] for k, p in zip(used, points, strict=True)]
+    space = [p @ rotation(orientations[k]).T + places[k] for k, p in zip(used, points, strict=True)]
     singles = []
     for k, p, seen in zip(used, points, pixels, strict=True):
         camera_from_board = _board_pose(p, seen, camera)
-        singles.append(compose((places[k], turns[k]), inverse(camera_from_board)))
+        singles.append(compose((places[k], orientations[k]), inverse(camera_from_board)))
     found, misfit, spread = _stand(singles[0], np.concatenate(space), np.concatenate(pixels), camera)
     if len(used) >= _SCATTER_VIEWS:
         one = [
@@ -333,11 +333,13 @@ def _board_pose(points: Floats, pixels: Floats, camera: Camera) -> Pose:
     """Camera_from_board of one view."""
     import cv2
 
-    good, turn, shift = cv2.solvePnP(points, pixels, camera.intrinsics, camera.lens, flags=cv2.SOLVEPNP_IPPE)
+    good, orientation, shift = cv2.solvePnP(
+        points, pixels, camera.intrinsics, camera.lens, flags=cv2.SOLVEPNP_IPPE
+    )
     if not good:
         raise CalibrationError("a view of the board gives no pose; is the camera's matrix right?")
     return np.ravel(shift).astype(np.float64), quaternion_from_matrix(
-        np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64)
+        np.asarray(cv2.Rodrigues(orientation)[0], dtype=np.float64)
     )
 
 
@@ -346,9 +348,9 @@ def _stand(start: Pose, points: Floats, pixels: Floats, camera: Camera) -> tuple
     (6,) [m, rad]."""
     import cv2
 
-    place, turn = start
+    place, orientation = start
     for _ in range(20):
-        R = rotation(turn)
+        R = rotation(orientation)
         y = (points - place) @ R
         seen, by = cv2.projectPoints(y, np.zeros(3), np.zeros(3), camera.intrinsics, camera.lens)
         by_y = np.asarray(by[:, 3:6], dtype=np.float64).reshape(-1, 2, 3)
@@ -356,20 +358,27 @@ def _stand(start: Pose, points: Floats, pixels: Floats, camera: Camera) -> tuple
         # y = exp(-phi) R^T (x - p): by p it is -R^T, by phi y x
         J = np.concatenate([-by_y @ R.T, np.cross(by_y, y[:, None])], axis=2).reshape(-1, 6)
         step = np.linalg.lstsq(J, r.ravel(), rcond=None)[0]
-        place, turn = place + step[:3], product(turn, quaternion_from_vector(step[3:]))
+        place, orientation = place + step[:3], product(orientation, quaternion_from_vector(step[3:]))
         if np.abs(step).max() < 1e-10:
             break
-    turn = turn / np.linalg.norm(turn)
+    orientation = orientation / np.linalg.norm(orientation)
     variance = float((r * r).sum()) / max(r.size - 6, 1)
     spread = np.sqrt(variance * np.diagonal(np.linalg.inv(J.T @ J)))
-    return (place, turn), math.sqrt(float((r * r).sum(1).mean())), spread
+    return (place, orientation), math.sqrt(float((r * r).sum(1).mean())), spread
 
 
 def _scatter(ones: Sequence[Pose], mean: Pose) -> Floats:
     """(6,) standard errors [m, rad] of a mean from single values."""
     moved = np.stack([place - mean[0] for place, _ in ones])
-    turn = matrix_from_quaternion(np.stack([product(inverse(mean)[1], quaternion) for _, quaternion in ones]))
-    turned = 0.5 * np.stack(
-        [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=1
+    orientation = matrix_from_quaternion(
+        np.stack([product(inverse(mean)[1], quaternion) for _, quaternion in ones])
     )
-    return np.asarray(np.concatenate([moved, turned], axis=1).std(0, ddof=1) / math.sqrt(len(ones)))
+    rotated = 0.5 * np.stack(
+        [
+            orientation[:, 2, 1] - orientation[:, 1, 2],
+            orientation[:, 0, 2] - orientation[:, 2, 0],
+            orientation[:, 1, 0] - orientation[:, 0, 1],
+        ],
+        axis=1,
+    )
+    return np.asarray(np.concatenate([moved, rotated], axis=1).std(0, ddof=1) / math.sqrt(len(ones)))

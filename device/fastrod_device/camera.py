@@ -206,12 +206,12 @@ def save_camera(camera: Camera, path: str | Path) -> None:
     if target.suffix != ".toml":
         raise InputError(f"{str(path)!r} does not end in .toml; a camera file does.")
     data = {f.name: getattr(camera, f.name) for f in fields(Camera)}
-    part = target.with_suffix(".toml.part")
+    unfinished = target.with_suffix(".toml.part")
     try:
-        part.write_text(tomli_w.dumps(data), encoding="utf-8")
-        part.replace(target)
+        unfinished.write_text(tomli_w.dumps(data), encoding="utf-8")
+        unfinished.replace(target)
     except OSError as error:
-        part.unlink(missing_ok=True)
+        unfinished.unlink(missing_ok=True)
         raise InputError(f"{str(path)!r} cannot be written: {error.strerror}.") from error
 
 

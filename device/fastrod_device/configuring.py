@@ -77,7 +77,7 @@ class DriveLimits:
     torque_limit: Ints | int
     """Greatest torque, either way [thousandths of the rated one]."""
     hold: bool
-    """After a quick stop the motor holds the wire; otherwise it is switched off."""
+    """After a quick stop the motor holds the tendon; otherwise it is switched off."""
 
     def of(self, name: str, n_drives: int) -> list[int]:
         """One of them for each drive. Raises `InputError` where it is of another shape or cannot be."""
@@ -154,7 +154,7 @@ class Configurator:
     def _read(self, drive: int, index: int, sub: int) -> int | None:
         """None where there is no such object, in the dictionary or in the drive."""
         var = find(self._dictionary, index, sub)
-        data = None if var is None else self._ask(drive, index, sub, None)
+        data = None if var is None else self._request(drive, index, sub, None)
         if var is None or data is None:
             return None
         if 8 * len(data) != len(var):
@@ -176,9 +176,9 @@ class Configurator:
                 f"{value} does not fit object {titled(index, sub)} of node {self._specs[drive].node},"
                 f" whose data type is 0x{var.data_type:02X} in its dictionary."
             ) from error
-        return self._ask(drive, index, sub, data) is not None
+        return self._request(drive, index, sub, data) is not None
 
-    def _ask(self, drive: int, index: int, sub: int, data: bytes | None) -> bytes | None:
+    def _request(self, drive: int, index: int, sub: int, data: bytes | None) -> bytes | None:
         """What was read, or nothing after a write; None where the drive has no such object."""
         node, what = self._specs[drive].node, f"0x{index:04X}:{sub:02X}"
         self._beat()

@@ -27,7 +27,7 @@ from fastrod_device.units import DriveSpec
 
 OFF, STOP, RUN, START, RESET = 0x0000, 0x0002, 0x000F, 0x001F, 0x0080
 """Controlwords: no voltage, quick stop, operation, operation with bit 4 (a move begins), fault reset."""
-_SHARE = 0.6  # of a cycle that is waited for answers
+_WAITED = 0.6  # of a cycle that is waited for answers
 _STEPPED_WAIT = 1.0  # s, the same where time is stepped
 # s; beyond it the drives may have stopped by themselves, and must not be told to go on
 _PAUSE = 0.8 * PATIENCE
@@ -86,7 +86,7 @@ class Cycle:
             self._unsent = f"nothing can be sent: {error}"
         else:
             self._unsent = ""
-            self.inbox.wait(_STEPPED_WAIT if self.clock.stepped else _SHARE / self.rate)
+            self.inbox.wait(_STEPPED_WAIT if self.clock.stepped else _WAITED / self.rate)
         self.newest = feedback = self.gather()
         self._let_go(feedback)
         return feedback

@@ -265,12 +265,12 @@ def _picture(
     return np.asarray(cv2.add(picture, noise, dtype=cv2.CV_8U), dtype=np.uint8)
 
 
-def _blurred(part: Singles, n: int, sigma: float) -> Singles:
+def _blurred(fraction: Singles, n: int, sigma: float) -> Singles:
     """By a Gaussian of n x n pixels."""
     import cv2
 
     return np.asarray(
-        cv2.GaussianBlur(part, (n, n), sigma, borderType=cv2.BORDER_REPLICATE), dtype=np.float32
+        cv2.GaussianBlur(fraction, (n, n), sigma, borderType=cv2.BORDER_REPLICATE), dtype=np.float32
     )
 
 
@@ -285,8 +285,8 @@ def _edges(camera: Camera, sheet: _Print, camera_from_print: Pose) -> tuple[Floa
     corner = np.stack(
         [np.stack([left, right, right, left], 1), np.stack([top, top, bottom, bottom], 1)], axis=2
     )
-    turn = rotation(camera_from_print[1])
-    space = corner @ turn[:, :2].T + camera_from_print[0]  # (n, 4, 3)
+    frame = rotation(camera_from_print[1])
+    space = corner @ frame[:, :2].T + camera_from_print[0]  # (n, 4, 3)
     if space[..., 2].min() < _NEAR:
         return None
     flat = space[0, :, :2] / space[0, :, 2:]
@@ -301,8 +301,8 @@ def _edges(camera: Camera, sheet: _Print, camera_from_print: Pose) -> tuple[Floa
     n = np.minimum(np.ceil(1.2 * length * uneven) + 1, 20000).astype(int)
     edge = np.repeat(np.arange(len(n)), n + 1)
     first = np.cumsum(n + 1) - (n + 1)
-    part = ((np.arange(len(edge)) - first[edge]) / n[edge])[:, None]
-    points = project(camera, a[edge] * (1.0 - part) + b[edge] * part)
+    fraction = ((np.arange(len(edge)) - first[edge]) / n[edge])[:, None]
+    points = project(camera, a[edge] * (1.0 - fraction) + b[edge] * fraction)
     whole = edge[1:] == edge[:-1]
     paper = np.zeros(len(sheet.ink))
     paper[0] = 1.0
@@ -324,7 +324,7 @@ def _cover(start: Floats, end: Floats, weight: Floats, size: tuple[int, int]) ->
     fall = point[1:, :, 1] - point[:-1, :, 1]
     column, row = np.floor(middle[..., 0]).astype(int), np.floor(middle[..., 1]).astype(int)
     inside = (row >= 0) & (row < height) & (column < width) & (fall != 0.0)
-    part = np.where(column < 0, 0.0, middle[..., 0] - column)[inside]
+    fraction = np.where(column < 0, 0.0, middle[..., 0] - column)[inside]
     place = (row * (width + 1) + np.maximum(column, 0))[inside]
     fall, which = fall[inside], np.broadcast_to(np.arange(len(start)), column.shape)[inside]
     covers = []
@@ -332,7 +332,8 @@ def _cover(start: Floats, end: Floats, weight: Floats, size: tuple[int, int]) ->
         moved = -weight[which, channel] * fall
         n = height * (width + 1)
         area = (
-            np.bincount(place, moved * (1.0 - part), n)[:n] + np.bincount(place + 1, moved * part, n + 1)[:n]
+            np.bincount(place, moved * (1.0 - fraction), n)[:n]
+            + np.bincount(place + 1, moved * fraction, n + 1)[:n]
         )
         covers.append(area.reshape(height, width + 1).cumsum(1)[:, :width].astype(np.float32))
     return covers[0], covers[1]

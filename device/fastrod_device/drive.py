@@ -46,7 +46,7 @@ class Jitter:
 
 @final
 class DriveBus:
-    """All drives of a robot on one CAN bus.
+    """All EPOS4 drives of a robot on one CAN bus, as `Drives`.
 
     `connect`, then `enable`, then `exchange` once a cycle; its caller keeps the time (`Pacer`). `exchange`
     and the calls that cycle by themselves (`enable`, `disable`, `reset_faults`, `profile_move`, `homing`)
@@ -65,11 +65,13 @@ class DriveBus:
         *,
         clock: Clock,
         rate: float = 200.0,
+        bitrate: int = 1_000_000,
         eds: str | Path | None = None,
     ) -> None:
-        """`rate` [1/s], of cycles; its period is a whole number of ms. `eds`: the drives' own dictionary.
+        """`rate` [1/s], of cycles; its period is a whole number of ms. `bitrate` [bit/s], of an adapter.
+        `eds`: the drives' own dictionary.
 
-        Raises `InputError`, or `DeviceError` for the bus and the EDS file.
+        Raises `InputError`, also for the EDS file, or `DeviceError` for the bus.
         """
         period = (
             1e3 / rate if isinstance(rate, (int, float)) and math.isfinite(rate) and rate > 0.0 else math.nan
@@ -80,7 +82,7 @@ class DriveBus:
             )
         self._specs = Transmission(specs).specs
         dictionary = object_dictionary(eds)
-        self._line = BusLine(bus)
+        self._line = BusLine(bus, bitrate)
         self._cycle = Cycle(self._line, self._specs, clock, float(rate))
         self._configurator = Configurator(self._line, dictionary, self._specs, self._cycle.beat)
         self._closed = False
@@ -342,12 +344,12 @@ class DriveBus:
         rounds: int = 2,
         time_limit: float = 30.0,
     ) -> DriveFeedback:
-        """Pull the wires in, one after another, until each is taut; the counts there become 0.
+        """Pull the tendons in, one after another, until each is taut; the counts there become 0.
 
         `threshold` (n_drives,) [thousandths of the rated torque], at `speed` [counts/s], one number or
         (n_drives,), reached by
         `acceleration` [counts/s2]; then to `offset` (n_drives,) [counts]. `order` of the drives; `rounds`:
-        what one wire pulls the others feel, so all are done more than once; `time_limit` [s] for each. The
+        what one tendon pulls the others feel, so all are done more than once; `time_limit` [s] for each. The
         drives end enabled in the mode "csp". Raises `InputError`, or `DeviceError`: stopped, a fault, or no
         end; the drives are then stopped.
         """
@@ -385,20 +387,20 @@ class DriveBus:
         setup.write(i, 0x6099, 1, setup.speed(i, speed))
         setup.write(i, 0x609A, 0, setup.acceleration(i, acceleration))
         setup.write(i, 0x30B1, 0, away)
-        setup.write(i, 0x30B0, 0, away)  # the count where the move ends: 0 is where the wire was taut
+        setup.write(i, 0x30B0, 0, away)  # the count where the move ends: 0 is where the tendon was taut
         setup.write(i, 0x30B2, 0, current)  # mA
         setup.set_mode(i, 6)
 
         def attained(now: DriveFeedback) -> bool:
             if now.statusword[i] & _ERROR:
                 raise DeviceError(
-                    f"the drive at node {spec.node} reports a homing error; is its wire on the drum?"
+                    f"the drive at node {spec.node} reports a homing error; is its tendon on the drum?"
                 )
             return bool(now.statusword[i] & _ACKNOWLEDGED and now.statusword[i] & _REACHED)
 
         self._cycle.until(0.5, _once, "be homed", running=True)
         self._cycle.words[i] = START
-        self._cycle.until(limit, attained, f"find the wire of node {spec.node} taut", running=True)
+        self._cycle.until(limit, attained, f"find the tendon of node {spec.node} taut", running=True)
         self._cycle.words[i] = RUN
         self._cycle.hold[i] = int(self._cycle.newest.position[i])
         self._cycle.until(0.5, _once, "be homed", running=True)

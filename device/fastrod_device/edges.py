@@ -11,7 +11,7 @@ import numpy as np
 from fastrod.types import Floats
 from fastrod_device.camera import Camera, Picture
 
-_REACH = 3.0  # of the strip that is fitted, to either side of an edge [px]
+_STRIP = 3.0  # of the strip that is fitted, to either side of an edge [px]
 _LEAST_STEP = 15.0  # least contrast of a side [grey levels]
 _SHARP = 0.28  # of a picture without blur: the standard deviation of a pixel [px]
 _FARTHEST = 4.0  # that a fit may move a corner [px]
@@ -66,8 +66,8 @@ class SideFit:
         shortest = float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).min())
         # first from some rows of pixels only, to lay the strips right; then from all, or half of very many
         rough, fine = int(np.clip(shortest / 20.0, 1.0, 4.0)), int(np.clip(shortest / 45.0, 1.0, 3.0))
-        for stride, enough in ((rough, 0.1), (fine, 5e-3)):
-            found = self._lines(image, raw, ideal, cells, stride, enough)
+        for spacing, enough in ((rough, 0.1), (fine, 5e-3)):
+            found = self._lines(image, raw, ideal, cells, spacing, enough)
             if found is None:
                 return _sides(start, _lines(start), fitted=False)
             lines, ideal = found, _crossings(found)
@@ -101,31 +101,33 @@ class SideFit:
         ).reshape(-1, 2)
 
     def _lines(
-        self, image: Picture, raw: Floats, ideal: Floats, cells: int, stride: int, enough: float
+        self, image: Picture, raw: Floats, ideal: Floats, cells: int, spacing: int, enough: float
     ) -> Floats | None:
         """(4, 3) better lines, or None. Grey = b + (a - b) Phi(d / s): d distance outward, a outside, b
         inside, s the blur.
 
-        Every `stride`-th row of pixels across a side takes part, until it moves by less than `enough` [px].
+        Every `spacing`-th row of pixels across a side takes part, until it moves by less than `enough` [px].
         """
         ahead = np.roll(ideal, -1, axis=0)
         middle, length = 0.5 * (ideal + ahead), np.linalg.norm(ahead - ideal, axis=1)
         along = (ahead - ideal) / length[:, None]
         out = np.stack([along[:, 1], -along[:, 0]], axis=1)
         depth = -((np.roll(ideal, -2, axis=0) + np.roll(ideal, -3, axis=0)) / 2.0 - middle) @ out.T
-        reach = np.clip(0.6 * np.diagonal(depth) / cells, 1.0, _REACH)
-        x, y, inside = self._strips(raw, int(np.ceil((reach / np.abs(along).max(1)).max() + 0.5)), stride)
+        half_width = np.clip(0.6 * np.diagonal(depth) / cells, 1.0, _STRIP)
+        x, y, inside = self._strips(
+            raw, int(np.ceil((half_width / np.abs(along).max(1)).max() + 0.5)), spacing
+        )
         p = self._ideal[y, x] - middle[:, None]  # (4, n, 2)
         d0 = (p * out[:, None]).sum(-1)
         u = (p * along[:, None]).sum(-1) * (2.0 / length)[:, None]
-        end = 1.0 - 2.0 * np.minimum((reach + 1.0) / length, 0.3)
-        inside &= (np.abs(d0) <= reach[:, None]) & (np.abs(u) <= end[:, None])
+        end = 1.0 - 2.0 * np.minimum((half_width + 1.0) / length, 0.3)
+        inside &= (np.abs(d0) <= half_width[:, None]) & (np.abs(u) <= end[:, None])
         n = inside.sum(1)
         if (n < 12).any():
             return None
         grey = image[y, x].astype(np.float64)
         use = inside.astype(np.float64)
-        far = [inside & (sign * d0 > 0.4 * reach[:, None]) for sign in (1.0, -1.0)]
+        far = [inside & (sign * d0 > 0.4 * half_width[:, None]) for sign in (1.0, -1.0)]
         if any((side.sum(1) < 3).any() for side in far):
             return None
         high, low = ((grey * side).sum(1) / side.sum(1) for side in far)
@@ -160,21 +162,21 @@ class SideFit:
         return np.column_stack([normal / scale[:, None], ((normal * middle).sum(1) + offset) / scale])
 
     def _strips(
-        self, raw: Floats, half: int, stride: int
+        self, raw: Floats, half: int, spacing: int
     ) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.int64]], ...]:
         """Pixels along the four sides: columns and rows (4, n), and which of them count; a side is walked
         along its longer axis."""
         ahead = np.roll(raw, -1, axis=0)
         width, height = self._camera.size
-        way = ahead - raw
-        steep = np.abs(way[:, 1]) > np.abs(way[:, 0])
+        edge = ahead - raw
+        steep = np.abs(edge[:, 1]) > np.abs(edge[:, 0])
         major = np.where(steep[:, None], raw[:, ::-1], raw)  # (4, 2) walked, crossed
-        way = np.where(steep[:, None], way[:, ::-1], way)
-        sign = np.where(way[:, 0] < 0.0, -1, 1)
-        n = np.floor(np.abs(way[:, 0])).astype(np.int64)
-        k = np.arange(0, n.max() + 1, stride)
+        edge = np.where(steep[:, None], edge[:, ::-1], edge)
+        sign = np.where(edge[:, 0] < 0.0, -1, 1)
+        n = np.floor(np.abs(edge[:, 0])).astype(np.int64)
+        k = np.arange(0, n.max() + 1, spacing)
         walked = np.rint(major[:, 0]).astype(np.int64)[:, None] + sign[:, None] * k
-        crossed = major[:, 1, None] + (way[:, 1] / way[:, 0])[:, None] * (walked - major[:, 0, None])
+        crossed = major[:, 1, None] + (edge[:, 1] / edge[:, 0])[:, None] * (walked - major[:, 0, None])
         across = np.rint(crossed).astype(np.int64)[:, :, None] + np.arange(-half, half + 1)
         walked = np.broadcast_to(walked[:, :, None], across.shape)
         counts = np.broadcast_to((k <= n[:, None])[:, :, None], across.shape)
@@ -188,8 +190,8 @@ class SideFit:
 
 def _lines(corners: Floats) -> Floats:
     """(4, 3) of the sides of a clockwise quad, normals outward."""
-    way = np.roll(corners, -1, axis=0) - corners
-    normal = np.stack([way[:, 1], -way[:, 0]], axis=1) / np.linalg.norm(way, axis=1)[:, None]
+    edge = np.roll(corners, -1, axis=0) - corners
+    normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1)[:, None]
     return np.column_stack([normal, (normal * corners).sum(1)])
 
 

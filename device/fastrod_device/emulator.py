@@ -1,7 +1,7 @@
 """`Emulator`: the prototype without hardware; the same protocols through the same libraries, and a plant
 behind them that nothing reads.
 
-Drives on a CAN bus (`nodes`), a camera whose frames are drawn (`drawing`), wires that are slack until the
+Drives on a CAN bus (`nodes`), a camera whose frames are drawn (`drawing`), tendons that are slack until the
 robot is homed, and a sealed plant (`plant`). Hands that hang a load and turn the base are methods; so are
 faults.
 """
@@ -20,8 +20,8 @@ from fastrod.types import Floats
 from fastrod_device.camera import CameraFrame
 from fastrod_device.clock import Clock
 from fastrod_device.drawing import DrawnScene, Eye
+from fastrod_device.drives import emulated_drives
 from fastrod_device.hardware import Hardware
-from fastrod_device.nodes import EmulatedDrives
 from fastrod_device.plant import Plant
 from fastrod_device.plant_rod import COMPLIANCE
 from fastrod_device.seal import Seal
@@ -31,14 +31,14 @@ if TYPE_CHECKING:
 
 _SHAKE = 1e-4  # m per axis, of the marker against the camera: a bench is not still
 _SCENE = DrawnScene(blur=1.0, noise=5.0)
-_HANDS = 1.0  # s for which hands that hang a load cover the marker
-_SLACK = 1e-3  # m, of a wire before it is homed, at most
+_COVERING = 1.0  # s for which hands that hang a load cover the marker
+_SLACK = 1e-3  # m, of a tendon before it is homed, at most
 _KEPT = 8  # frames that nobody has fetched
 
 
 @final
 class Emulator:
-    """Drives, wires, plant and camera. It is the `Wires` of its drives and the `FrameSource` of whoever
+    """Drives, tendons, plant and camera. It is the `Tendons` of its drives and the `FrameSource` of whoever
     looks."""
 
     def __init__(
@@ -72,19 +72,19 @@ class Emulator:
         self._covered = -np.inf
         self.frozen = self.hidden = False
         """The camera repeats its last frame; the marker is covered."""
-        self.drives = EmulatedDrives(hardware.drives, bus, clock=clock, wires=self, eds=eds)
+        self.drives = emulated_drives(hardware, bus, clock=clock, tendons=self, eds=eds)
 
     def move(self, t: float, pulled: Floats) -> Floats:
-        """Wires wound by (n_drives,) [m] since power-on: their tensions [N]. The rod stands straight until
-        every wire is taut."""
+        """Tendons wound by (n_drives,) [m] since power-on: their tensions [N]. The rod stands straight until
+        every tendon is taut."""
         with self._lock:
-            in_hand = pulled - self._slack
+            taken_up = pulled - self._slack
             if not self._taut:
-                self._taut = bool((in_hand > -1e-6).all())
+                self._taut = bool((taken_up > -1e-6).all())
                 self.plant.advance(t, np.zeros(len(pulled)))
                 self._expose(t)
-                return np.asarray(np.maximum(in_hand, 0.0) / COMPLIANCE)
-            self.plant.advance(t, -in_hand)
+                return np.asarray(np.maximum(taken_up, 0.0) / COMPLIANCE)
+            self.plant.advance(t, -taken_up)
             self._expose(t)
             return self.plant.tension()
 
@@ -124,14 +124,14 @@ class Emulator:
         """Hang a known load [kg] on the tip."""
         with self._lock:
             self.plant.hang(mass)
-            self._covered = self.clock.now() + _HANDS
+            self._covered = self.clock.now() + _COVERING
 
-    def turn(self, quaternion: Floats) -> None:
+    def rotate(self, quaternion: Floats) -> None:
         """Turn the whole bench to the quaternion world_from_base (4,) w x y z; hands cover the marker
         meanwhile."""
         with self._lock:
-            self.plant.turn(quaternion)
-            self._covered = self.clock.now() + _HANDS
+            self.plant.rotate(quaternion)
+            self._covered = self.clock.now() + _COVERING
 
     def close(self) -> None:
         """Switch it off."""

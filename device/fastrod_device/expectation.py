@@ -27,8 +27,8 @@ class Expectation:
     def pose(
         self, dl: Floats, payload: float, base_quaternion: Floats | None
     ) -> tuple[Floats, Floats] | None:
-        """(3,) [m] and (4,) base_from_tip for these wires (n_tendons,) [m], a mass at the tip [kg] and
-        world_from_base (4,); None where the wires are not known or the model finds no rest."""
+        """(3,) [m] and (4,) base_from_tip for these tendons (n_tendons,) [m], a mass at the tip [kg] and
+        world_from_base (4,); None where the tendons are not known or the model finds no rest."""
         if not np.isfinite(dl).all():
             return None
         base = np.array(self._robot.base_quaternion) if base_quaternion is None else base_quaternion
@@ -45,5 +45,7 @@ class Expectation:
         self._cold = not bool(state.ok[0])
         if self._cold:
             return None
-        turn = matrix_from_quaternion(base).T
-        return turn @ state.tip_position[0], quaternion_from_matrix((turn @ state.tip_rotation[0])[None])[0]
+        base_from_world = matrix_from_quaternion(base).T
+        return base_from_world @ state.tip_position[0], quaternion_from_matrix(
+            (base_from_world @ state.tip_rotation[0])[None]
+        )[0]

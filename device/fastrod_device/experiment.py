@@ -23,22 +23,22 @@ Progress = Callable[[str, int, int], None]
 """What is done, how far, of how much."""
 Law = Callable[[Floats, float], Floats]
 """(3,) measured tip [m], nan where it is not known, and seconds since the path began -> (n_tendons,) changes
-of wire length [m]."""
+of tendon length [m]."""
 _SETTLE = 1.0  # s at rest before a path begins
 
 
-class HandMover(Protocol):
+class BenchAssistant(Protocol):
     """Who hangs the load and turns the bench: a person, or the emulator's own."""
 
     def hang(self, mass: float) -> None:
         """A known mass [kg] hangs on the tip when this returns; 0: none."""
 
-    def turn(self, quaternion: Floats) -> None:
+    def rotate(self, quaternion: Floats) -> None:
         """The base stands at world_from_base (4,) when this returns."""
 
 
 @final
-class AskingHands:
+class BenchPrompts:
     """A person at the terminal."""
 
     def hang(self, mass: float) -> None:
@@ -46,7 +46,7 @@ class AskingHands:
         what = f"hang {1e3 * mass:.0f} g on the tip" if mass else "take the load off the tip"
         input(f"Please {what}, then press Enter: ")
 
-    def turn(self, quaternion: Floats) -> None:
+    def rotate(self, quaternion: Floats) -> None:
         """Ask for it, and wait for the Enter key."""
         input(
             f"Please turn the base to world_from_base w x y z = {np.round(quaternion, 3).tolist()}, then "
@@ -57,7 +57,7 @@ class AskingHands:
 def excite(
     prototype: Prototype,
     run: Excitation,
-    hands: HandMover,
+    assistant: BenchAssistant,
     path: str | Path,
     *,
     progress: Progress | None = None,
@@ -67,7 +67,7 @@ def excite(
 
     Raises what `Prototype.follow` raises; what was recorded until then is on disk all the same.
     """
-    log, tell = run.log, progress or (lambda *_: None)
+    log, report = run.log, progress or (lambda *_: None)
     assert log.payload is not None
     assert log.base_quaternion is not None
     known = np.column_stack([log.payload, log.base_quaternion])
@@ -77,22 +77,22 @@ def excite(
     recorder.start(prototype.elapsed)
     try:
         for number, (start, end) in enumerate(zip(starts, [*starts[1:], len(log)], strict=True)):
-            tell("excitation", start, len(log))
+            report("excitation", start, len(log))
             load, base = float(log.payload[start]), log.base_quaternion[start]
             hang = load != (log.payload[start - 1] if number else 0.0)
-            turn = number > 0 and (base != log.base_quaternion[start - 1]).any()
-            if hang or turn:
+            rotate = number > 0 and (base != log.base_quaternion[start - 1]).any()
+            if hang or rotate:
                 with prototype.resting():
                     if hang:
-                        hands.hang(load)
-                    if turn:
-                        hands.turn(base)
+                        assistant.hang(load)
+                    if rotate:
+                        assistant.rotate(base)
             prototype.payload, prototype.base_quaternion = load, base
             prototype.record(recorder)
             t, dl = log.t[start : end + 1] - log.t[start], log.dl[start : end + 1]
             for piece in _pieces(t[-1] if end < len(log) else t[-1] + np.diff(log.t[-2:])[0]):
                 prototype.follow(partial(_piece_of, t, dl, piece[0]), piece[1])
-                tell(
+                report(
                     "excitation",
                     min(start + int((piece[0] + piece[1]) / t[-1] * (end - start)), end),
                     len(log),
@@ -162,11 +162,11 @@ def drive_lag(log: RunLog) -> float:
     names = [f"cmd_dl_{k}" for k in range(1, log.dl.shape[1] + 1)]
     if any(name not in log.extra for name in names):
         return 0.0
-    told = np.stack([numbers(dict(log.extra), name, log.name) for name in names], axis=1)
-    good = np.isfinite(told).all(axis=1) & np.isfinite(log.dl).all(axis=1)
-    t, told, done = log.t[good], told[good], log.dl[good]
+    commands = np.stack([numbers(dict(log.extra), name, log.name) for name in names], axis=1)
+    good = np.isfinite(commands).all(axis=1) & np.isfinite(log.dl).all(axis=1)
+    t, commands, done = log.t[good], commands[good], log.dl[good]
     found = minimize_scalar(
-        lambda lag: float(np.mean((_between(t - lag, t, told) - done) ** 2)),
+        lambda lag: float(np.mean((_between(t - lag, t, commands) - done) ** 2)),
         bounds=(0.0, 0.2),
         method="bounded",
     )
@@ -242,5 +242,5 @@ def _between(t: Floats | float, times: Floats, rows: Floats) -> Floats:
     """(..., n) rows at times in between, by straight lines."""
     at = np.clip(np.asarray(t, dtype=np.float64), times[0], times[-1])
     k = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 2)
-    part = ((at - times[k]) / (times[k + 1] - times[k]))[..., None]
-    return np.asarray(rows[k] + part * (rows[k + 1] - rows[k]))
+    fraction = ((at - times[k]) / (times[k + 1] - times[k]))[..., None]
+    return np.asarray(rows[k] + fraction * (rows[k + 1] - rows[k]))

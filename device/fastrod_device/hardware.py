@@ -4,7 +4,7 @@ they move."""
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from fastrod.loading import load_robot
 from fastrod.model.robot import Robot
 from fastrod.tomlfile import parse, read_text
 from fastrod_device.camera import Camera, Marker, from_table, load_camera
+from fastrod_device.drives import BusSpec
 from fastrod_device.safety import Limits
 from fastrod_device.units import DriveSpec, Transmission
 
@@ -27,7 +28,7 @@ _SLOWEST, _QUICKEST = 50.0, 500.0  # Hz
 
 @dataclass(frozen=True, kw_only=True)
 class Hardware:
-    """A robot, one drive for each of its wires in the robot file's order, and what watches it. Raises
+    """A robot, one drive for each of its tendons in the robot file's order, and what watches it. Raises
     `InputError`."""
 
     robot: Robot
@@ -40,9 +41,11 @@ class Hardware:
     rate: float = 100.0
     """Control cycles a second, each with one SYNC [Hz]."""
     pretension: float = 1.0
-    """Of every wire when it is homed [N]."""
+    """Of every tendon when it is homed [N]."""
     homing_speed: float = 0.005
-    """Of a wire [m/s]."""
+    """Of a tendon [m/s]."""
+    bus: BusSpec = field(default_factory=BusSpec)
+    """Kind of the drives, and bitrate."""
 
     def __post_init__(self) -> None:
         nodes = [spec.node for spec in self.drives]
@@ -66,7 +69,7 @@ class Hardware:
             k, least = int(steps.argmax()), math.ceil(1e3 * steps.max()) / 1e3
             raise InputError(
                 f"pretension is {self.pretension!r} N; the drive at node {nodes[k]} tells torque in steps "
-                f"of {steps[k]:.3g} N of its wire, "
+                f"of {steps[k]:.3g} N of its tendon, "
                 f"so it must be at least {least:g} N."
             )
 
@@ -82,7 +85,7 @@ def load_hardware(path: str | Path | None = None, robot: Robot | None = None) ->
     source = SHIPPED if path is None else Path(path)
     where = f"hardware file {(source.name if path is None else str(path))!r}"
     data = parse(read_text(source, where, InputError), where, InputError, "hardware file")
-    known = (*_NEEDED, "limits", *_NUMBERS)
+    known = (*_NEEDED, "limits", "bus", *_NUMBERS)
     for key in data:
         if key not in known:
             raise UnknownNameError(f"{where} has an unknown key {key!r}; {nearest(key, known)}")
@@ -90,18 +93,21 @@ def load_hardware(path: str | Path | None = None, robot: Robot | None = None) ->
         raise InputError(f"{where} lacks {', '.join(missing)}.")
     if not isinstance(data["drive"], list):
         raise InputError(
-            f"{where}: drive is one table; write [[drive]], in double brackets, one for each wire."
+            f"{where}: drive is one table; write [[drive]], in double brackets, one for each tendon."
         )
     drives = tuple(
         from_table(DriveSpec, table, f"{where}: drive {k}") for k, table in enumerate(data["drive"], 1)
     )
     limits = from_table(Limits, data.get("limits", {}), f"{where}: [limits]")
+    bus = from_table(BusSpec, data.get("bus", {}), f"{where}: [bus]")
     marker = from_table(Marker, data["marker"], f"{where}: [marker]")
     camera = _camera(data["camera"], source, where)
     model = _robot(data["robot"], source, where) if robot is None else robot
     numbers = {name: data[name] for name in _NUMBERS if name in data}
     try:
-        return Hardware(robot=model, drives=drives, limits=limits, camera=camera, marker=marker, **numbers)
+        return Hardware(
+            robot=model, drives=drives, limits=limits, camera=camera, marker=marker, bus=bus, **numbers
+        )
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
 

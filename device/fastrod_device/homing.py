@@ -1,11 +1,10 @@
-"""Homing: where the robot is straight and every wire pulls with its pretension; zero is there.
+"""Homing: where the robot is straight and every tendon pulls with its pretension; zero is there.
 
-One wire after another is wound in until it is taut; that leaves the robot bent, as what one pulls the others
-feel. So all then move together until they pull alike. By tension alone the robot stands straight no better
-than friction and the motors' torque let it, where
-0.1 N is half a millimetre at the tip; the camera does the rest. Before it looks, the robot circles in smaller
-and smaller turns: friction and backlash then forget from where they came, and zero lies in the middle of
-their loops.
+One tendon after another is wound in until it is taut; that leaves the robot bent, as what one pulls the
+others feel. So all then move together until they pull alike. By tension alone the robot stands straight no
+better than friction and the motors' torque let it, where 0.1 N is half a millimetre at the tip; the camera
+does the rest. Before it looks, the robot circles in smaller and smaller turns: friction and backlash then
+forget from where they came, and zero lies in the middle of their loops.
 
 The supervisor does not watch yet, so every cycle is looked at here, and what is wrong stops the drives at
 once.
@@ -23,7 +22,7 @@ from fastrod.model.robot import Robot
 from fastrod.model.routing import wire
 from fastrod.types import Floats
 from fastrod_device.clock import Clock
-from fastrod_device.drive import DriveBus
+from fastrod_device.drives import Drives
 from fastrod_device.errors import DeviceError
 from fastrod_device.faultcodes import ENABLED, in_words, state_in_words
 from fastrod_device.hardware import Hardware
@@ -33,30 +32,30 @@ from fastrod_device.tracker import MarkerSighting
 from fastrod_device.units import Transmission
 
 ZERO_SD = 2e-5
-"""How sure the wires' zeros are, homed by camera: 0.1 mm at the tip, a fifth of it in the wires [m]."""
-_TIGHTENED = 6.0  # s in which the wires come to one tension
+"""How sure the tendons' zeros are, homed by camera: 0.1 mm at the tip, a fifth of it in the tendons [m]."""
+_TIGHTENED = 6.0  # s in which the tendons come to one tension
 _YIELD = 0.03  # of what would mend the tensions, in a cycle
-_STIFFEST = 1e-4  # m/N that a wire is taken to give at least
+_STIFFEST = 1e-4  # m/N that a tendon is taken to give at least
 _SMOOTH = 0.2  # of what the motors' torque says in a cycle
 _UNEVEN = 0.3  # of the pretension
 # times that the tip is looked at, for how long [s], sightings that it takes
 _ROUNDS, _LOOKING, _LEAST = 2, 1.5, 8
-_FAR, _NEAR = 1e-3, 5e-5  # m of wire: a greater correction means a wrong camera, a smaller one is none
+_FAR, _NEAR = 1e-3, 5e-5  # m of tendon: a greater correction means a wrong camera, a smaller one is none
 _MEASURED = 0.3  # s for which the tensions are taken in the end
 _BEHIND = 0.25  # of the limits' following error, for a drive that hardly moves; at the full rate all of it
 _OLD = 5  # cycles without a drive's process data
-_PULL, _LEAST_PULL = 5.0, 3.0  # pretensions, N: no wire pulls more while it is homed
-_BEND, _TURNS, _TURN = 0.45, 4, 1.4  # rad at first, turns of the spiral, s each
+_PULL, _LEAST_PULL = 5.0, 3.0  # pretensions, N: no tendon pulls more while it is homed
+_BEND, _REVOLUTIONS, _REVOLUTION = 0.45, 4, 1.4  # rad at first, turns of the spiral, s each
 
 
 def home(
-    drives: DriveBus, hardware: Hardware, clock: Clock, look: Callable[[], MarkerSighting | None] | None
+    drives: Drives, hardware: Hardware, clock: Clock, look: Callable[[], MarkerSighting | None] | None
 ) -> tuple[Transmission, Robot]:
-    """Do it; wires as drives with their zero, and the robot with the tensions that its wires have there.
+    """Do it; tendons as drives with their zero, and the robot with the tensions that its tendons have there.
 
     `look` gives the newest sighting that was not given yet; None: there is no camera, and tension alone
     decides. Raises `DeviceError`, with the drives stopped, where one of them does not do as it is told, a
-    wire does not come to its pretension or pulls far more, the marker is not seen, or it is seen where the
+    tendon does not come to its pretension or pulls far more, the marker is not seen, or it is seen where the
     robot cannot be.
     """
     transmission, n = Transmission(hardware.drives), len(hardware.drives)
@@ -68,7 +67,7 @@ def home(
     pacer, last, speed = Pacer(clock, hardware.rate), transmission.dl(drives.newest.position), 0.0
 
     def cycle(at: Floats) -> Floats:
-        """(n_drives,) tensions with the wires at `at` [N]."""
+        """(n_drives,) tensions with the tendons at `at` [N]."""
         nonlocal last, speed
         pacer.wait()
         feedback = drives.exchange(transmission.counts(at))
@@ -86,7 +85,7 @@ def home(
         if (off > _UNEVEN * hardware.pretension).any():
             k = int(off.argmax())
             raise DeviceError(
-                f"the wire of node {hardware.drives[k].node} pulls with {tension[k]:.2f} N after homing; "
+                f"the tendon of node {hardware.drives[k].node} pulls with {tension[k]:.2f} N after homing; "
                 f"{hardware.pretension:g} N were "
                 "asked for. Is it caught, or a direction wrong?"
             )
@@ -96,7 +95,7 @@ def home(
             if (tension <= 0.0).any():
                 k = int(tension.argmin())
                 raise DeviceError(
-                    f"the wire of node {hardware.drives[k].node} is slack where the camera sees the robot "
+                    f"the tendon of node {hardware.drives[k].node} is slack where the camera sees the robot "
                     f"straight ({tension[k]:.2f} N). "
                     "Is the camera registered? `fastrod drive register` does it."
                 )
@@ -110,7 +109,7 @@ def trouble(feedback: DriveFeedback, hardware: Hardware, *, speed: float = 0.0) 
     """What is wrong with drives that are homed: one sentence without its full stop, of the first that is
     found; empty where all is well.
 
-    `speed` of the quickest wire [m/s]: a drive that moves may be further behind where it was told to be.
+    `speed` of the quickest tendon [m/s]: a drive that moves may be further behind where it was told to be.
     """
     nodes = [spec.node for spec in hardware.drives]
     if feedback.lost:
@@ -145,12 +144,12 @@ def trouble(feedback: DriveFeedback, hardware: Hardware, *, speed: float = 0.0) 
         return f"{slow}; {1e3 * late:.2g} mm are allowed"
     if abs(tension[k]) > most:
         also = f", and {slow}" if behind[b] > _BEHIND * limits.following_error else ""
-        return f"the wire of node {nodes[k]} pulls with {tension[k]:.2f} N; {most:g} N are allowed{also}"
+        return f"the tendon of node {nodes[k]} pulls with {tension[k]:.2f} N; {most:g} N are allowed{also}"
     return ""
 
 
 def tightened(robot: Robot, tension: Floats) -> Robot:
-    """The robot whose wires pull with `tension` (n_tendons,) [N] where their change of length is zero, and
+    """The robot whose tendons pull with `tension` (n_tendons,) [N] where their change of length is zero, and
     whose zeros are no surer than homing makes them. Its pretension adds to the stiffness in torsion: a model
     that does not know it finds another shear modulus."""
     left = iter(tension.tolist())
@@ -163,30 +162,30 @@ def tightened(robot: Robot, tension: Floats) -> Robot:
 
 
 def softness(robot: Robot) -> Floats:
-    """(n_tendons, n_tendons) change of wire length by tension [m/N], straight and unloaded: what the wires
-    give and the body bends."""
-    wiring = wire(robot)
+    """(n_tendons, n_tendons) change of tendon length by tension [m/N], straight and unloaded: what the
+    tendons give and the body bends."""
+    routing = wire(robot)
     body = np.repeat([segment.length / min(segment.bending_stiffness) for segment in robot.segments], 2)
     own = np.array(
         [max(tendon.compliance, _STIFFEST) for segment in robot.segments for tendon in segment.tendons]
     )
-    return np.asarray(np.diag(own) + (wiring.arms * body) @ wiring.arms.T)
+    return np.asarray(np.diag(own) + (routing.arms * body) @ routing.arms.T)
 
 
 def lean(robot: Robot, tip: Floats) -> Floats:
-    """(n_tendons,) wire lengths [m] that bend a straight robot so that its tip (3,) is beside the axis by as
-    much as this one; the least bends that do it."""
-    wiring = wire(robot)
+    """(n_tendons,) tendon lengths [m] that bend a straight robot so that its tip (3,) is beside the axis by
+    as much as this one; the least bends that do it."""
+    routing = wire(robot)
     # from the middle of a segment to the tip
-    beyond = np.cumsum(wiring.length[::-1])[::-1] - 0.5 * wiring.length
+    beyond = np.cumsum(routing.length[::-1])[::-1] - 0.5 * routing.length
     by_bend = np.zeros((2, 2 * robot.n_segments))
     by_bend[0, 1::2], by_bend[1, 0::2] = beyond, -beyond
     bend = np.linalg.pinv(by_bend) @ tip[:2]
-    return wiring.wires(bend.reshape(robot.n_segments, 2))
+    return routing.wires(bend.reshape(robot.n_segments, 2))
 
 
 def _tightened(cycle: Callable[[Floats], Floats], at: Floats, hardware: Hardware) -> Floats:
-    """(n_drives,) where the wires pull alike [m]."""
+    """(n_drives,) where the tendons pull alike [m]."""
     tension, give = cycle(at), softness(hardware.robot)
     for _ in range(round(_TIGHTENED * hardware.rate)):
         step = _YIELD * (give @ (tension - hardware.pretension))
@@ -196,7 +195,7 @@ def _tightened(cycle: Callable[[Floats], Floats], at: Floats, hardware: Hardware
 
 
 def _measured(cycle: Callable[[Floats], Floats], at: Floats, hardware: Hardware) -> Floats:
-    """(n_drives,) tensions of wires that are held [N], a mean of some cycles."""
+    """(n_drives,) tensions of tendons that are held [N], a mean of some cycles."""
     return np.asarray(np.mean([cycle(at) for _ in range(round(_MEASURED * hardware.rate))], axis=0))
 
 
@@ -207,7 +206,7 @@ def _straightened(
     hardware: Hardware,
     clock: Clock,
 ) -> Floats:
-    """(n_drives,) where the wires are when the tip is seen on the axis [m]. Raises `DeviceError` where the
+    """(n_drives,) where the tendons are when the tip is seen on the axis [m]. Raises `DeviceError` where the
     camera cannot be believed."""
     before = np.inf
     for _ in range(_ROUNDS):
@@ -227,8 +226,8 @@ def _straightened(
             times = f"{len(seen)} times in {_LOOKING:g} s of homing"
             raise DeviceError(f"the camera saw the marker {times}; it must see it {_LEAST} times{why}.")
         tip = np.mean(seen, axis=0)
-        way = -lean(hardware.robot, tip)
-        far = float(np.abs(way).max())
+        shift = -lean(hardware.robot, tip)
+        far = float(np.abs(shift).max())
         if far > _FAR or (far > _NEAR and far >= before):
             why = (
                 f"by {1e3 * _FAR:g} mm at most"
@@ -236,27 +235,27 @@ def _straightened(
                 else (f"and {1e3 * before:.2f} mm before did not bring it nearer")
             )
             raise DeviceError(
-                f"the tip is seen {1e3 * float(np.hypot(tip[0], tip[1])):.2g} mm beside the axis; the wires "
-                f"would move by {1e3 * far:.2f} "
+                f"the tip is seen {1e3 * float(np.hypot(tip[0], tip[1])):.2g} mm beside the axis; "
+                f"the tendons would move by {1e3 * far:.2f} "
                 f"mm, {why}; is the camera registered? `fastrod drive register` does it."
             )
         before = far
         steps = max(round(far / hardware.homing_speed * hardware.rate), round(0.5 * hardware.rate))
         for _ in range(steps):
-            at = at + way / steps
+            at = at + shift / steps
             cycle(at)
     return at
 
 
 def _spiral(hardware: Hardware) -> Floats:
-    """(n, n_tendons) wire lengths [m] of a bend that circles and shrinks to nothing, all segments alike, at
+    """(n, n_tendons) tendon lengths [m] of a bend that circles and shrinks to nothing, all segments alike, at
     half of the rate at most."""
-    wiring, limits = wire(hardware.robot), hardware.limits
-    n = round(_TURNS * _TURN * hardware.rate)
-    angle = 2.0 * np.pi * _TURNS * np.arange(1, n + 1) / n
+    routing, limits = wire(hardware.robot), hardware.limits
+    n = round(_REVOLUTIONS * _REVOLUTION * hardware.rate)
+    angle = 2.0 * np.pi * _REVOLUTIONS * np.arange(1, n + 1) / n
     bend = np.sin(np.pi * np.arange(1, n + 1) / n) ** 0.25 * (1.0 - np.arange(1, n + 1) / n)
-    way = np.stack([bend * np.cos(angle), bend * np.sin(angle)], axis=1)
-    dl = wiring.wires(np.repeat(way[:, None], wiring.n_segments, axis=1))
+    shift = np.stack([bend * np.cos(angle), bend * np.sin(angle)], axis=1)
+    dl = routing.wires(np.repeat(shift[:, None], routing.n_segments, axis=1))
     quickest = float(np.abs(np.diff(dl, axis=0, prepend=0.0)).max()) * hardware.rate
     return (
         _BEND

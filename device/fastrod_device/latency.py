@@ -23,7 +23,7 @@ _LEAST_EXPLAINED = 0.5  # of the positions' variance
 _LARGEST_ERROR = 0.1  # standard error, as a part of `longest`
 _SWEEP, _RAMP = 15.0, 1.5  # s that the robot moves, and in which the motion grows and fades
 _BEND, _WAVES = 0.6, (0.45, 0.31)  # rad at most, and Hz to either side: never the same twice
-_PART = 0.5  # of what the limits allow
+_MARGIN = 0.5  # of what the limits allow
 _PLAYS = (0.05, 0.15)  # half widths of lost motion, as parts of the largest motion
 
 
@@ -43,7 +43,7 @@ def estimate_latency(
     """Delay of positions (n, 3) [m] at times t_camera (n,) behind a motion (m, k) at rising times t_motion
     (m,) [s].
 
-    What the motion is does not matter (wire lengths, encoder counts, a predicted tip): positions are fitted
+    What the motion is does not matter (tendon lengths, encoder counts, a predicted tip): positions are fitted
     by least squares with the delayed motion, its products, and a constant; the delay is the one that leaves
     least, searched from -longest/4 to longest. The standard error allows for residuals that are alike from
     frame to frame. Rows with nan are dropped. Raises `CalibrationError` where too little moved to tell,
@@ -131,11 +131,10 @@ def measure_latency(prototype: Prototype) -> LoopLatency:
     sightings.
 
     The delay is beyond `Camera.latency` of its hardware: sightings are stamped by that. Friction and backlash
-    make the tip late, too, the more the slower it moves; so the tip is fitted with the wires and with what a
-    play of two widths would leave of them, and the sweep has two frequencies. A sixth of what they would
+    make the tip late, too, the more the slower it moves; so the tip is fitted with the tendons and with what
+    a play of two widths would leave of them, and the sweep has two frequencies. A sixth of what they would
     count for may remain. It ends where it began. Raises what a stopped prototype raises, and
-    `CalibrationError` where the sightings do not tell.
-    """
+    `CalibrationError` where the sightings do not tell."""
     start, began = prototype.commanded, prototype.clock.now()
     dt = 1.0 / prototype.hardware.rate
     motion: list[tuple[float, Floats]] = []
@@ -164,7 +163,7 @@ def measure_latency(prototype: Prototype) -> LoopLatency:
     largest = float(np.abs(dl - dl[0]).max())
     return estimate_latency(
         t_motion,
-        np.concatenate([dl, *(play(dl, part * largest) for part in _PLAYS)], axis=1),
+        np.concatenate([dl, *(play(dl, fraction * largest) for fraction in _PLAYS)], axis=1),
         t_camera,
         position,
     )
@@ -181,24 +180,24 @@ def play(motion: Floats, half_width: float) -> Floats:
 
 
 def sweep(hardware: Hardware, t: Floats) -> Floats:
-    """(n, n_tendons) changes of wire length [m] at times (n,) [s] of `measure_latency`'s motion: all segments
-    bend alike, to and fro."""
-    wiring, limits = wire(hardware.robot), hardware.limits
+    """(n, n_tendons) changes of tendon length [m] at times (n,) [s] of `measure_latency`'s motion: all
+    segments bend alike, to and fro."""
+    routing, limits = wire(hardware.robot), hardware.limits
     whole = np.arange(0.0, _SWEEP, 1.0 / hardware.rate)
 
-    def wires(times: Floats) -> Floats:
+    def lengths_at(times: Floats) -> Floats:
         grown = np.clip(np.minimum(times, _SWEEP - times) / _RAMP, 0.0, 1.0)
-        bend = _BEND / wiring.n_segments * grown[:, None] * np.sin(2.0 * np.pi * np.outer(times, _WAVES))
-        return wiring.wires(np.repeat(bend[:, None], wiring.n_segments, axis=1))
+        bend = _BEND / routing.n_segments * grown[:, None] * np.sin(2.0 * np.pi * np.outer(times, _WAVES))
+        return routing.wires(np.repeat(bend[:, None], routing.n_segments, axis=1))
 
-    way = wires(whole)
-    bends = _BEND * math.sqrt(2.0) / wiring.n_segments
-    asked = (
-        float(np.abs(np.diff(way, axis=0)).max()) * hardware.rate / limits.rate,
-        float(np.abs(way).max()) / limits.displacement,
-        bends / float(wiring.length.min()) / limits.curvature,
+    path = lengths_at(whole)
+    bends = _BEND * math.sqrt(2.0) / routing.n_segments
+    needed = (
+        float(np.abs(np.diff(path, axis=0)).max()) * hardware.rate / limits.rate,
+        float(np.abs(path).max()) / limits.displacement,
+        bends / float(routing.length.min()) / limits.curvature,
     )
-    return wires(t) * min(1.0, _PART / max(asked))
+    return lengths_at(t) * min(1.0, _MARGIN / max(needed))
 
 
 def _directions(motion: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""`Limits`: what a robot on the bench must keep within, and the step that keeps a wire's rate."""
+"""`Limits`: what a robot on the bench must keep within, and the step that keeps a tendon's rate."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ class Limits:
     """
 
     displacement: float = 0.008
-    """Largest change of a wire's length, either way [m]."""
+    """Largest change of a tendon's length, either way [m]."""
     rate: float = 0.03
-    """Largest rate of a wire [m/s]: the set-points keep to it."""
+    """Largest rate of a tendon [m/s]: the set-points keep to it."""
     curvature: float = 20.0
-    """Largest of any segment [1/m], by the constant curvature that the wires ask for."""
+    """Largest of any segment [1/m], by the constant curvature that the tendons ask for."""
     tension: float = 15.0
-    """Largest of any wire, from the motor's torque, either way [N]."""
+    """Largest of any tendon, from the motor's torque, either way [N]."""
     slack: float | None = None
-    """Least tension of any wire while the drives are enabled [N]; None: a wire may hang."""
+    """Least tension of any tendon while the drives are enabled [N]; None: a tendon may hang."""
     command_age: float = 0.5
     """A command that was meant longer ago is refused, and one must be renewed this often while the robot
     moves [s]."""
@@ -51,9 +51,9 @@ class Limits:
     cycle: float = 0.05
     """Longest gap between two control cycles [s]."""
     following_error: float = 0.001
-    """Largest difference of where a drive was told to be and where it is, as wire [m]."""
+    """Largest difference of where a drive was told to be and where it is, as tendon [m]."""
     encoder_jump: float = 0.0005
-    """Largest change of a wire's length between two samples beyond what `rate` explains [m]."""
+    """Largest change of a tendon's length between two samples beyond what `rate` explains [m]."""
     clock_jump: float = 0.2
     """Largest disagreement of the wall clock with the monotonic one over a control cycle [s]."""
 
@@ -83,10 +83,10 @@ class Limits:
 
 
 def limited(previous: Floats, wanted: Floats, rate: float, dt: float) -> Floats:
-    """Wire lengths (n_tendons,) [m] after `dt` [s], from `previous` straight toward `wanted`, no wire faster
-    than `rate` [m/s].
+    """Tendon lengths (n_tendons,) [m] after `dt` [s], from `previous` straight toward `wanted`, no tendon
+    faster than `rate` [m/s].
 
-    All wires are scaled alike, so that the robot goes straight to where it was told, and a way between two
+    All tendons are scaled alike, so that the robot goes straight to where it was told, and a way between two
     shapes within the limits stays within them. Raises `InputError` for figures that are not finite or run
     back.
 

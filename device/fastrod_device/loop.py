@@ -17,7 +17,15 @@ from fastrod.identification.excite import excitation
 from fastrod.identification.report.result import Result
 from fastrod.logs.runlog import RunLog
 from fastrod.model.robot import Robot
-from fastrod_device.experiment import HandMover, Progress, TrackingRun, drive_lag, excite, follow, tracking
+from fastrod_device.experiment import (
+    BenchAssistant,
+    Progress,
+    TrackingRun,
+    drive_lag,
+    excite,
+    follow,
+    tracking,
+)
 from fastrod_device.prototype import Prototype
 
 APPROACH = 2.0
@@ -48,7 +56,7 @@ class Loop:
 
 def close_loop(
     prototype: Prototype,
-    hands: HandMover,
+    assistant: BenchAssistant,
     out: Path,
     *,
     payload: float | None = None,
@@ -62,22 +70,22 @@ def close_loop(
     turned for a part of it. Raises what a stopped prototype raises, and `LogError` where a log cannot tell
     anything.
     """
-    tell = progress or (lambda *_: None)
+    notify = progress or (lambda *_: None)
     robot = prototype.robot
     run = excitation(robot, payload=payload, turn=turn, rate=prototype.hardware.camera.rate)
-    log = excite(prototype, run, hands, out / "excite.csv", progress=tell)
-    _rest(prototype, hands)
+    log = excite(prototype, run, assistant, out / "excite.csv", progress=notify)
+    _rest(prototype, assistant)
     known, lag = references(robot.length), drive_lag(log)
     before = [
-        _track(prototype, path, robot, lag, out / f"{name}_before.csv", f"tracking before: {name}", tell)
+        _track(prototype, path, robot, lag, out / f"{name}_before.csv", f"tracking before: {name}", notify)
         for name, path in known.items()
     ]
     result = identify(
-        log, robot, progress=lambda what, done, total: tell(f"identification: {what}", done, total)
+        log, robot, progress=lambda what, done, total: notify(f"identification: {what}", done, total)
     )
     better = result.identified
     after = [
-        _track(prototype, path, better, lag, out / f"{name}_after.csv", f"tracking after: {name}", tell)
+        _track(prototype, path, better, lag, out / f"{name}_after.csv", f"tracking after: {name}", notify)
         for name, path in known.items()
     ]
     return Loop(
@@ -91,19 +99,19 @@ def close_loop(
     )
 
 
-def _rest(prototype: Prototype, hands: HandMover) -> None:
+def _rest(prototype: Prototype, assistant: BenchAssistant) -> None:
     """Load off, base as in the robot's file."""
     own = np.array(prototype.robot.base_quaternion)
     with prototype.resting():
-        hands.hang(0.0)
-        hands.turn(own)
+        assistant.hang(0.0)
+        assistant.rotate(own)
     prototype.payload, prototype.base_quaternion = 0.0, own
 
 
 def _track(
-    prototype: Prototype, path: Trajectory, model: Robot, lag: float, out: Path, stage: str, tell: Progress
+    prototype: Prototype, path: Trajectory, model: Robot, lag: float, out: Path, stage: str, notify: Progress
 ) -> tuple[RunLog, InversePlan]:
-    tell(f"{stage}, planning", 0, 2)
+    notify(f"{stage}, planning", 0, 2)
     made = planned(model, path)
-    tell(stage, 1, 2)
+    notify(stage, 1, 2)
     return follow(prototype, made, out, lead=lag), made

@@ -96,11 +96,11 @@ def tracking_table(rows: Sequence[tuple[str, TrackingRun]]) -> Table:
 
 
 def _unsealed(sealed: Mapping[str, Any]) -> str:
-    parts = [
+    pieces = [
         f"{name} ({', '.join(f'{key} {value:.3g}' for key, value in numbers.items())})"
         for name, numbers in sealed.items()
     ]
-    return "; ".join(parts) or "no effect at all"
+    return "; ".join(pieces) or "no effect at all"
 
 
 def draw(loop: Loop) -> Any:

@@ -32,9 +32,9 @@ _REGISTER = {0x2: 0x02, 0x3: 0x04, 0x4: 0x08}
 
 @final
 class Motor:
-    """One axis. Positions in counts; growing counts pull the wire where the spec's direction is +1.
+    """One axis. Positions in counts; growing counts pull the tendon where the spec's direction is +1.
 
-    A shaft without current is held by the friction of its gear. The current is that of the wire's tension;
+    A shaft without current is held by the friction of its gear. The current is that of the tendon's tension;
     the motor's own inertia and friction are left out. Where the tendon pulls with what the greatest current
     (object 0x3001:02) gives or more, the shaft turns no further against it. A limit that its dictionary lacks
     limits nothing; any other absent object has the shipped dictionary's value.
@@ -50,7 +50,7 @@ class Motor:
         self.offset = 0.0
         """What the drive's counter says beyond the true angle [counts]."""
         self.torque = 0.0
-        """That holds the wire, [thousandths of the rated torque]."""
+        """That holds the tendon, [thousandths of the rated torque]."""
         self.noise = 0.0
         """Of the torque that is told."""
         self.blocked = False
@@ -64,11 +64,11 @@ class Motor:
         """When it came to rest in the last `advance`, from its beginning [s]."""
         live = objects.live
         live[(0x6041, 0)], live[(0x6064, 0)] = self.statusword, self.position
-        live[(0x606C, 0)], live[(0x6077, 0)] = self.velocity, self.told_torque
+        live[(0x606C, 0)], live[(0x6077, 0)] = self.velocity, self.reported_torque
         live[(0x60F4, 0)], live[(0x6061, 0)] = self.following_error, lambda: self.mode
         live[(0x1001, 0)], live[(0x603F, 0)] = lambda: self.register, lambda: self.code
         live[(0x30D1, 1)] = live[(0x30D1, 2)] = self.current
-        live[(0x30D2, 1)] = self.told_torque
+        live[(0x30D2, 1)] = self.reported_torque
         self.restart()
 
     def restart(self) -> None:
@@ -113,7 +113,7 @@ class Motor:
         """Object 0x606C, in the unit of object 0x60A9."""
         return _int32(round(self.v / self._rate_unit()))
 
-    def told_torque(self) -> int:
+    def reported_torque(self) -> int:
         """Object 0x6077; 0 without current."""
         most = self._greatest_torque()
         carried = max(-most, min(most, self.torque))
@@ -121,7 +121,7 @@ class Motor:
 
     def current(self) -> int:
         """Object 0x30D1 [mA]."""
-        return round(self.told_torque() / self._per_milliampere())
+        return round(self.reported_torque() / self._per_milliampere())
 
     def following_error(self) -> int:
         """Object 0x60F4 [counts]."""

@@ -33,11 +33,11 @@ _TICK = 5e-3  # s, of the thread that keeps time where nobody steps it
 _CHUNK = 0.02  # s; longer gaps are gone through in pieces
 
 
-class Wires(Protocol):
-    """What the wires are fastened to: the emulated robot."""
+class Tendons(Protocol):
+    """What the tendons are fastened to: the emulated robot."""
 
     def move(self, t: float, pulled: Floats) -> Floats:
-        """(n,) tensions [N] at time `t` [s], when `pulled` (n,) [m] of each wire has been wound since
+        """(n,) tensions [N] at time `t` [s], when `pulled` (n,) [m] of each tendon has been wound since
         power-on (+ = pulled)."""
 
 
@@ -47,7 +47,7 @@ class EmulatedDrives:
 
     One network and one thread for all of them. Where time is stepped they live by the SYNCs that come;
     otherwise a thread of theirs keeps time as well. Faults on demand: one method each, and `restore`. A drive
-    holds its wire by friction while it is switched off.
+    holds its tendon by friction while it is switched off.
 
     `moving`, `true_pulled` and `stopped_at` are what a test may know and a master never does.
     """
@@ -58,7 +58,7 @@ class EmulatedDrives:
         bus: str | can.BusABC,
         *,
         clock: Clock,
-        wires: Wires,
+        tendons: Tendons,
         rate: float = 200.0,
         seed: int = 0,
         torque_noise: float = 1.0,
@@ -67,12 +67,12 @@ class EmulatedDrives:
         """`rate` [1/s]: of the set-points until the master sets another; `torque_noise` [thousandths of the
         rated torque], 1 sigma; `eds`: the file that lists their objects, by default an EPOS4's.
 
-        Raises `InputError` for drives that cannot be, `DeviceError` for the bus or the file.
+        Raises `InputError` for drives that cannot be and for the file, `DeviceError` for the bus.
         """
         if not (np.isfinite(rate) and rate > 0.0):
             raise InputError(f"EmulatedDrives.rate is {rate!r} 1/s; it must be positive.")
         self._transmission = Transmission(specs)
-        self._clock, self._wires = clock, wires
+        self._clock, self._tendons = clock, tendons
         self._rng, self._noise = np.random.default_rng(seed), torque_noise
         self._nodes = [Node(spec, 1.0 / rate, eds) for spec in specs]
         self._motors = [node.motor for node in self._nodes]
@@ -119,7 +119,7 @@ class EmulatedDrives:
 
     @property
     def true_pulled(self) -> Floats:
-        """(n,) wire wound since power-on [m], + = pulled."""
+        """(n,) tendon wound since power-on [m], + = pulled."""
         with self._lock:
             return self._pulled()
 
@@ -203,7 +203,7 @@ class EmulatedDrives:
             pass
 
     def close(self) -> None:
-        """Leave the bus. Raises `DeviceError` with its cause where the wires failed meanwhile."""
+        """Leave the bus. Raises `DeviceError` with its cause where the tendons failed meanwhile."""
         if self._done.is_set():
             return
         self._done.set()
@@ -251,7 +251,7 @@ class EmulatedDrives:
                         handle(cob_id, bytes(data))
                     elif self._clock.stepped:  # deaf, but alive
                         self._advance(self._clock.now())
-                except Exception as error:  # of the wires; canopen would only log it
+                except Exception as error:  # of the tendons; canopen would only log it
                     self._wrong, self._off = error, True
 
         return receive
@@ -377,7 +377,7 @@ class EmulatedDrives:
                     if now - self._synced > 2.0 * _TICK or any(now > node.deadline() for node in self._nodes):
                         self._advance(now)
                     self._speak(now)
-                except Exception as error:  # of the wires or of the bus
+                except Exception as error:  # of the tendons or of the bus
                     self._wrong, self._off = error, True
                     return
 
@@ -392,14 +392,14 @@ class EmulatedDrives:
             if late:
                 to = max(self._t, min(node.deadline() for node in late))
             for motor in self._motors:
-                turned = motor.v != 0.0
+                moved = motor.v != 0.0
                 motor.advance(to - self._t)
                 if motor.v != 0.0:
                     motor.stopped_at = np.nan
-                elif turned:
+                elif moved:
                     motor.stopped_at = self._t + motor.rested
             self._t = to
-            torque = self._wires.move(to, self._pulled()) * self._per_newton
+            torque = self._tendons.move(to, self._pulled()) * self._per_newton
             for motor, value in zip(self._motors, torque, strict=True):
                 motor.torque = float(value)
             for node in [node for node in late if node.deadline() <= to]:

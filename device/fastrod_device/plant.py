@@ -1,14 +1,14 @@
-"""The emulated robot itself, which nobody can open: wires -> transmission -> rod -> tip.
+"""The emulated robot itself, which nobody can open: tendons -> transmission -> rod -> tip.
 
 It shares no code with the simulator and its effects have other forms than the library's (gaps whose corners
-are exponential, friction after Dahl, creep after Eyring, wires whose strands settle), so what is found in its
-motion was understood and not recognised.
+are exponential, friction after Dahl, creep after Eyring, tendons whose strands settle), so what is found in
+its motion was understood and not recognised.
 
     plant = Plant(seal())
     plant.advance(t, dl)                                # again and again
     position, rotation = plant.tip_seen(t)              # what a camera sees
 
-The pairs p = (half the difference of two opposite wires) carry the effects; what the two have in common
+The pairs p = (half the difference of two opposite tendons) carry the effects; what the two have in common
 passes through.
 """
 
@@ -32,7 +32,7 @@ _G = 9.81  # m/s^2
 _MEMORY = 0.5  # s of the past that a late camera may ask for
 _HELD = 1.0 / 30.0  # s for which tensions are carried on from the last shape
 _STEP, _CUTS = 0.02, 100  # s: longer moves are cut, into so many parts at most
-_MOST = 0.05  # m of wire
+_MOST = 0.05  # m of tendon
 _NOTHING: Mapping[str, float] = {}
 
 
@@ -49,13 +49,13 @@ class _Moment(NamedTuple):
     """What reached the rod at one time."""
 
     t: float
-    wires: tuple[float, float, float, float]
+    tendons: tuple[float, float, float, float]
     """[m]."""
     load: _Load
 
 
 class _Pair:
-    """Two opposite wires from the drums to the tip: what their half difference becomes [m]."""
+    """Two opposite tendons from the drums to the tip: what their half difference becomes [m]."""
 
     def __init__(self, inside: Mapping[str, Mapping[str, float]], index: int) -> None:
         gap = inside.get("backlash", _NOTHING)
@@ -64,10 +64,10 @@ class _Pair:
         rub = inside.get("friction", _NOTHING)
         self._loss, self._growth = OFFSET * rub.get("loss", 0.0), rub.get("growth", 0.0)
         self._travel = (OFFSET * rub.get("quick", 1.0), OFFSET * rub.get("late", 1.0))
-        self._part = rub.get("share", 0.0)
+        self._fraction = rub.get("share", 0.0)
         self._strain = (0.0, 0.0)
         lag = inside.get("creep", _NOTHING)
-        self._share = (lag.get("share", 0.0), lag.get("slow_share", 0.0))
+        self._fractions = (lag.get("share", 0.0), lag.get("slow_share", 0.0))
         self._tau = (lag.get("time_constant", 1.0), lag.get("slow_time_constant", 1.0))
         self._active = 0.5 * lag.get("activation", 1.0)
         self._behind = (0.0, 0.0)
@@ -77,9 +77,9 @@ class _Pair:
         self._phase = (drum.get(f"phase_{2 * index}", 0.0), drum.get(f"phase_{2 * index + 1}", 0.0))
         self._drum = self._taut = 0.0
         self.bend = 0.0
-        """Past the gap, and so what the wires wrap [rad]."""
+        """Past the gap, and so what the tendons wrap [rad]."""
 
-    def turn(self, p: float) -> None:
+    def rotate(self, p: float) -> None:
         """The drums move to p [m]."""
         if self._once or self._often:
             angle = p / self._radius
@@ -98,21 +98,21 @@ class _Pair:
         self.bend = self._taut / OFFSET
 
     def arrive(self, wrapped: float, h: float) -> float:
-        """[m] that reaches the tip after h [s], with the wires wrapped by an angle [rad]."""
+        """[m] that reaches the tip after h [s], with the tendons wrapped by an angle [rad]."""
         first, second = self._strain
         p = self._taut
         if self._loss:
             p -= (
                 self._loss
                 * math.exp(self._growth * wrapped)
-                * (self._part * first + (1.0 - self._part) * second)
+                * (self._fraction * first + (1.0 - self._fraction) * second)
             )
-        if self._share[0]:
+        if self._fractions[0]:
             self._behind = (
                 self._relax(self._behind[0], p, h / self._tau[0]),
                 self._relax(self._behind[1], p, h / self._tau[1]),
             )
-            p -= self._share[0] * (p - self._behind[0]) + self._share[1] * (p - self._behind[1])
+            p -= self._fractions[0] * (p - self._behind[0]) + self._fractions[1] * (p - self._behind[1])
         return p
 
     def _relax(self, x: float, p: float, h: float) -> float:
@@ -125,20 +125,20 @@ def _across(side: float, moved: float, sharp: float) -> float:
     side)) of it."""
     if moved == 0.0:
         return side
-    way = 1.0 if moved > 0.0 else -1.0
-    y = 1.0 + math.expm1(sharp * (1.0 - way * side)) * math.exp(-sharp * abs(moved))
-    return way * (1.0 - math.log(y) / sharp)
+    direction = 1.0 if moved > 0.0 else -1.0
+    y = 1.0 + math.expm1(sharp * (1.0 - direction * side)) * math.exp(-sharp * abs(moved))
+    return direction * (1.0 - math.log(y) / sharp)
 
 
 def _rub(strain: float, moved: float) -> float:
     """Dahl: dz = (sign - z) |dx| / r."""
-    way = 1.0 if moved > 0.0 else -1.0
-    return way - (way - strain) * math.exp(-abs(moved))
+    direction = 1.0 if moved > 0.0 else -1.0
+    return direction - (direction - strain) * math.exp(-abs(moved))
 
 
 @final
 class Plant:
-    """One robot of one segment and four wires, with what the seal hides. Calls may come from several
+    """One robot of one segment and four tendons, with what the seal hides. Calls may come from several
     threads."""
 
     def __init__(self, seal: Seal) -> None:
@@ -169,10 +169,10 @@ class Plant:
             for name, neutral in (("delay", 0.0), ("wander", 0.0), ("period", 1.0), ("phase", 0.0))
         )
         self._shift = np.array([bump.get(name, 0.0) for name in "xyz"])
-        self._tilt = _turn(*(bump.get(f"about_{name}", 0.0) for name in "xyz"))
+        self._tilt = _rotation(*(bump.get(f"about_{name}", 0.0) for name in "xyz"))
         self._bumped = bump.get("at", math.inf)
         self._lock = threading.RLock()
-        self._told: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+        self._commanded: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
         self._load = _Load(0.0, (0.0, 0.0, -1.0))
         self._past: deque[_Moment] = deque()
         self._began = math.nan
@@ -184,7 +184,7 @@ class Plant:
         return "Plant(sealed)"
 
     def advance(self, t: float, dl: Sequence[float] | Floats) -> None:
-        """The wires have gone straight to `dl` (4,) [m], negative = pulled, by the time `t` [s]; before the
+        """The tendons have gone straight to `dl` (4,) [m], negative = pulled, by the time `t` [s]; before the
         first call they were at 0.
 
         Raises `InputError` for anything but four finite lengths of at most 0.05 m, and where `t` is before
@@ -194,10 +194,10 @@ class Plant:
             a, b, c, d = dl.tolist() if isinstance(dl, np.ndarray) else map(float, dl)
             most = max(abs(a), abs(b), abs(c), abs(d))
         except (TypeError, ValueError) as error:
-            raise InputError(f"dl is {dl!r}; it must be four lengths of wire (4,) [m].") from error
+            raise InputError(f"dl is {dl!r}; it must be four lengths of tendon (4,) [m].") from error
         if not (most <= _MOST and math.isfinite(a + b + c + d)):
             raise InputError(
-                f"dl is {[a, b, c, d]} m; wires change by at most {_MOST} m. Was it given in mm?"
+                f"dl is {[a, b, c, d]} m; tendons change by at most {_MOST} m. Was it given in mm?"
             )
         with self._lock:
             if not (math.isfinite(t) and t >= self._now.t):
@@ -209,37 +209,37 @@ class Plant:
                 self._began, h = t, 0.0
             else:
                 h = t - self._now.t
-            told = (a, b, c, d)
-            if told == self._told:  # creep at rest is exact over any time
-                wires = self._move(told, h)
+            commanded = (a, b, c, d)
+            if commanded == self._commanded:  # creep at rest is exact over any time
+                tendons = self._move(commanded, h)
             else:
                 cuts = min(max(1, math.ceil(h / _STEP)), _CUTS)
-                wires, before, here = self._now.wires, self._told, self._told
+                tendons, before, here = self._now.tendons, self._commanded, self._commanded
                 for k in range(1, cuts + 1):
                     # half of the time before the move and half after: second order
                     self._move(here, 0.5 * h / cuts)
                     x = k / cuts
                     here = (
-                        told
+                        commanded
                         if k == cuts
-                        else tuple(old + x * (new - old) for old, new in zip(before, told, strict=True))
+                        else tuple(old + x * (new - old) for old, new in zip(before, commanded, strict=True))
                     )
-                    wires = self._move(here, 0.5 * h / cuts)
-                self._told = told
-            self._now = _Moment(float(t), wires, self._load)
+                    tendons = self._move(here, 0.5 * h / cuts)
+                self._commanded = commanded
+            self._now = _Moment(float(t), tendons, self._load)
             self._past.append(self._now)
             while len(self._past) > 2 and self._past[1].t < t - _MEMORY:
                 self._past.popleft()
 
-    def _move(self, told: tuple[float, ...], h: float) -> tuple[float, float, float, float]:
-        """Lengths that reach the rod [m] when the drums are at `told`, after h [s]."""
-        p, q = 0.5 * (told[0] - told[2]), 0.5 * (told[1] - told[3])
+    def _move(self, commanded: tuple[float, ...], h: float) -> tuple[float, float, float, float]:
+        """Lengths that reach the rod [m] when the drums are at `commanded`, after h [s]."""
+        p, q = 0.5 * (commanded[0] - commanded[2]), 0.5 * (commanded[1] - commanded[3])
         first, second = self._pairs
-        first.turn(p)
-        second.turn(q)
+        first.rotate(p)
+        second.rotate(q)
         wrapped = math.hypot(first.bend, second.bend)
         x, y = first.arrive(wrapped, h), second.arrive(wrapped, h)
-        return told[0] - p + x, told[1] - q + y, told[2] + p - x, told[3] + q - y
+        return commanded[0] - p + x, commanded[1] - q + y, commanded[2] + p - x, commanded[3] + q - y
 
     def hang(self, mass: float) -> None:
         """A known mass on the tip [kg], from now on. Raises `InputError` unless it is from 0 to 1 kg."""
@@ -249,7 +249,7 @@ class Plant:
             self._load = self._load._replace(mass=float(mass))
             self._now = self._now._replace(load=self._load)
 
-    def turn(self, quaternion: ArrayLike) -> None:
+    def rotate(self, quaternion: ArrayLike) -> None:
         """The base stands so in the world, from now on: world_from_base (4,), w x y z; gravity is along -z of
         the world.
 
@@ -293,7 +293,7 @@ class Plant:
             return position, rotation
 
     def tension(self) -> Floats:
-        """(4,) of the wires now [N], pushing where negative; for up to a thirtieth of a second they go on
+        """(4,) of the tendons now [N], pushing where negative; for up to a thirtieth of a second they go on
         linearly from the last shape."""
         with self._lock:
             if (
@@ -303,10 +303,10 @@ class Plant:
             ):
                 self._true = self._solve(self._now, self._true)
             rest = self._true[1]
-            return np.asarray(rest.tension + rest.slope @ (np.array(self._now.wires) - rest.dl))
+            return np.asarray(rest.tension + rest.slope @ (np.array(self._now.tendons) - rest.dl))
 
     def _at(self, t: float | None) -> _Moment:
-        """The moment t [s]: between two of them the wires went straight."""
+        """The moment t [s]: between two of them the tendons went straight."""
         if t is None or t >= self._now.t or not self._past:
             return self._now
         if not math.isfinite(t):
@@ -316,7 +316,7 @@ class Plant:
             if moment.t <= t:
                 x = (t - moment.t) / (after.t - moment.t)
                 a, b, c, d = (
-                    old + x * (new - old) for old, new in zip(moment.wires, after.wires, strict=True)
+                    old + x * (new - old) for old, new in zip(moment.tendons, after.tendons, strict=True)
                 )
                 return _Moment(t, (a, b, c, d), moment.load)
             after = moment
@@ -328,15 +328,15 @@ class Plant:
         return rest.position.copy(), rest.rotation.copy()
 
     def _solve(self, moment: _Moment, last: tuple[_Moment, PlantRest] | None) -> tuple[_Moment, PlantRest]:
-        if last is not None and last[0].wires == moment.wires and last[0].load == moment.load:
+        if last is not None and last[0].tendons == moment.tendons and last[0].load == moment.load:
             return moment, last[1]
         down = np.array(moment.load.down)
         return moment, self._rod.rest(
-            np.array(moment.wires), moment.load.mass * _G * down, down, None if last is None else last[1]
+            np.array(moment.tendons), moment.load.mass * _G * down, down, None if last is None else last[1]
         )
 
 
-def _turn(x: float, y: float, z: float) -> Floats:
+def _rotation(x: float, y: float, z: float) -> Floats:
     """(3, 3) of a rotation vector [rad]."""
     angle = math.sqrt(x * x + y * y + z * z)
     hat = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -1,11 +1,11 @@
 """The rod of the emulated robot: virtual work on Legendre curvatures, one robot at a time. numpy only,
 nothing shared with the models.
 
-One segment of LENGTH whose four wires sit OFFSET from the backbone at 0, 90, 180 and 270 degrees and end at
+One segment of LENGTH whose four tendons sit OFFSET from the backbone at 0, 90, 180 and 270 degrees and end at
 the tip; they push and pull. r' = R e3, R' = R [u]x; the base is the origin, its frame the identity. The
 energy, per arclength s,
-    integral u' K u / 2 ds  +  energy of the wires  -  integral N . R e3 ds,   N(s) the dead force beyond s,
-is at rest over u(s) = sum_m P_m(s) a_m, with the wires' tensions T as unknowns of their own: l_i(a) - L_i =
+    integral u' K u / 2 ds  +  energy of the tendons  -  integral N . R e3 ds,   N(s) the dead force beyond s,
+is at rest over u(s) = sum_m P_m(s) a_m, with the tendons' tensions T as unknowns of their own: l_i(a) - L_i =
 extension(T_i).
 """
 
@@ -22,11 +22,11 @@ from fastrod.types import Floats
 from fastrod_device.errors import DeviceError
 
 LENGTH, EI, GJ, OFFSET, COMPLIANCE = 0.07, 2.2e-3, 1.0e-3, 0.0075, 1e-5
-"""m, N m^2, N m^2, m; of each wire m/N."""
+"""m, N m^2, N m^2, m; of each tendon m/N."""
 _NODES, _MODES = 8, 5
 _SIZE = 3 * _MODES
 _PASSES = 12  # of Newton, before it counts as lost
-_STRIDES = (1, 4, 16, 64)  # in how many parts loads and wires come on from the straight rod
+_CUTS = (1, 4, 16, 64)  # in how many parts loads and tendons come on from the straight rod
 
 
 def _tables() -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
@@ -60,9 +60,11 @@ _LATER = np.ascontiguousarray((_WEIGHT[:, None] * _UPTO).T)  # what later nodes 
 _HAT = np.zeros((3, 9))
 _HAT[0, [5, 7]], _HAT[1, [2, 6]], _HAT[2, [1, 3]] = (-1.0, 1.0), (1.0, -1.0), (-1.0, 1.0)
 _EYE = np.eye(3)
-# d|q|/du is (b y, -b x, d^2 u_z) / |q| for a wire at (x, y), with q = e3 + u x d and b its component along
+# d|q|/du is (b y, -b x, d^2 u_z) / |q| for a tendon at (x, y), with q = e3 + u x d and b its component along
 # the backbone
-_LEVER = OFFSET * np.array([[0.0, 1.0, 0.0, -1.0], [-1.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 0.0]])  # (3, wires)
+_LEVER = OFFSET * np.array(
+    [[0.0, 1.0, 0.0, -1.0], [-1.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 0.0]]
+)  # (3, tendons)
 _TWIST = np.zeros((3, 4))
 _TWIST[2] = OFFSET**2
 _LOCK = np.einsum("xi,yi->ixy", _LEVER, _LEVER).reshape(4, 9)
@@ -77,25 +79,25 @@ class PlantRest(NamedTuple):
     rotation: Floats
     """(3, 3) base_from_tip."""
     tension: Floats
-    """(4,) of the wires [N]; they push where it is negative."""
+    """(4,) of the tendons [N]; they push where it is negative."""
     slope: Floats
-    """(4, 4) change of the tensions with the lengths of the wires [N/m]."""
+    """(4, 4) change of the tensions with the lengths of the tendons [N/m]."""
     modes: Floats
     """(modes, 3) of the curvature [1/m]."""
     dl: Floats
-    """(4,) of the wires [m]."""
+    """(4,) of the tendons [m]."""
     lever: Floats
-    """(3 modes, 4) change of the modes with the lengths of the wires."""
+    """(3 modes, 4) change of the modes with the lengths of the tendons."""
 
 
 @final
 @dataclass(frozen=True, kw_only=True, repr=False)
 class PlantRod:
-    """A rod and its wires. The extension of a wire by T is c ((1 - q) T + q T0 arcsinh(T / T0)): strands
+    """A rod and its tendons. The extension of a tendon by T is c ((1 - q) T + q T0 arcsinh(T / T0)): strands
     settle under load."""
 
     compliance: float = COMPLIANCE
-    """c, of a wire that is hardly pulled [m/N]."""
+    """c, of a tendon that is hardly pulled [m/N]."""
     settling: float = 0.0
     """q, the share of it that goes as the strands settle, 0 to 1."""
     knee: float = 1.0
@@ -117,7 +119,7 @@ class PlantRod:
         return np.array([self.bending, self.bending, self.torsion])
 
     def rest(self, dl: Floats, tip_force: Floats, down: Floats, start: PlantRest | None = None) -> PlantRest:
-        """The shape for wires `dl` (4,) [m] under the dead load `tip_force` (3,) [N], with the unit vector
+        """The shape for tendons `dl` (4,) [m] under the dead load `tip_force` (3,) [N], with the unit vector
         `down` (3,), base frame.
 
         Quick from a `start` near by. Raises `DeviceError` where it finds none, as under a load that makes the
@@ -128,7 +130,7 @@ class PlantRod:
             found = self._from(start, dl, tip_force, line)
             if found is not None:
                 return found
-        for parts in _STRIDES:
+        for cuts in _CUTS:
             at: PlantRest | None = PlantRest(
                 np.zeros(3),
                 _EYE,
@@ -138,18 +140,22 @@ class PlantRod:
                 np.zeros(4),
                 np.zeros((_SIZE, 4)),
             )
-            for k in range(parts + 1):
-                part = k / parts
-                at = None if at is None else self._from(at, part * dl, part * tip_force, part * line)
+            for k in range(cuts + 1):
+                fraction = k / cuts
+                at = (
+                    None
+                    if at is None
+                    else self._from(at, fraction * dl, fraction * tip_force, fraction * line)
+                )
             if at is not None:
                 return at
         raise DeviceError(
-            "the emulated robot finds no rest with these wires and loads; load it less, and "
-            "let no two wires pull apart."
+            "the emulated robot finds no rest with these tendons and loads; load it less, and "
+            "let no two tendons pull apart."
         )
 
     def _from(self, start: PlantRest, dl: Floats, tip_force: Floats, line: Floats) -> PlantRest | None:
-        """Newton from a shape whose wires are moved to first order."""
+        """Newton from a shape whose tendons are moved to first order."""
         moved = dl - start.dl
         modes = start.modes + (start.lever @ moved).reshape(_MODES, 3)
         return self._newton(dl, tip_force, line, modes, start.tension + start.slope @ moved)
@@ -172,31 +178,31 @@ class PlantRod:
         for _ in range(_PASSES):
             u = _MODE @ modes
             frame = _frames(modes)
-            # wires
+            # tendons
             along = 1.0 + u @ _LEVER
             twist = u[:, 2:]
             length = np.sqrt(along * along + (OFFSET * twist) ** 2)
-            turn = (along[:, None] * _LEVER + twist[:, None] * _TWIST) / length[:, None]  # (n, 3, wires)
+            curl = (along[:, None] * _LEVER + twist[:, None] * _TWIST) / length[:, None]  # (n, 3, tendons)
             pull = tension / length
             curving = (
                 (pull @ _LOCK).reshape(_NODES, 3, 3)
-                - (turn * pull[:, None]) @ turn.transpose(0, 2, 1)
+                - (curl * pull[:, None]) @ curl.transpose(0, 2, 1)
                 + np.diag(elastic)
             )
-            slope = (_WEIGHTED @ turn.reshape(_NODES, 12)).reshape(_SIZE, 4)
+            slope = (_WEIGHTED @ curl.reshape(_NODES, 12)).reshape(_SIZE, 4)
             # loads: d(R e3) = dtheta x R e3, and dtheta is the integral of R du
             tangent = frame[:, :, 2]
             torque = _cross(tangent, force)
             laid = _LATER @ torque / _WEIGHT[:, None]
             moment = u * elastic - (laid[:, None] @ frame)[:, 0]
-            turned = (frame[:, :, None] * _MODE[:, None, :, None]).reshape(_NODES, 3, _SIZE)
-            swept = (_UPTO @ turned.reshape(_NODES, -1)).reshape(_NODES, 3, _SIZE)
+            rotated = (frame[:, :, None] * _MODE[:, None, :, None]).reshape(_NODES, 3, _SIZE)
+            swept = (_UPTO @ rotated.reshape(_NODES, -1)).reshape(_NODES, 3, _SIZE)
             lock = (
                 force[:, :, None] * tangent[:, None]
                 - np.einsum("nx,nx->n", force, tangent)[:, None, None] * _EYE
             )
             # (laid x) as a matrix is the hat of laid; the turn nearer to the base is the outer one
-            swing = lock @ swept - (laid @ _HAT).reshape(_NODES, 3, 3) @ turned
+            swing = lock @ swept - (laid @ _HAT).reshape(_NODES, 3, 3) @ rotated
             load = swept.reshape(-1, _SIZE).T @ (_WEIGHT[:, None, None] * swing).reshape(-1, _SIZE)
             bend = (
                 (_PRODUCTS @ curving.reshape(_NODES, 9))
@@ -223,9 +229,9 @@ class PlantRod:
             most = LENGTH * float(np.abs(move[:_SIZE]).sum())
             if not most < 30.0:
                 return None
-            part = min(1.0, 1.0 / max(most, 1e-12))  # a radian in one pass is far enough
-            modes = modes - part * move[:_SIZE].reshape(_MODES, 3)
-            tension = tension - part * move[_SIZE:]
+            fraction = min(1.0, 1.0 / max(most, 1e-12))  # a radian in one pass is far enough
+            modes = modes - fraction * move[:_SIZE].reshape(_MODES, 3)
+            tension = tension - fraction * move[_SIZE:]
             if most < 3e-4:  # the next step would be its square
                 last = _frames(modes)
                 gain = inverse[:, _SIZE:]

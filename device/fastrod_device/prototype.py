@@ -23,7 +23,7 @@ from fastrod.types import Floats
 from fastrod_device import columns
 from fastrod_device.camera import CameraFrame, FrameSource
 from fastrod_device.clock import Clock, WallClock
-from fastrod_device.drive import DriveBus
+from fastrod_device.drives import Drives, open_drives
 from fastrod_device.errors import DeviceError, RefusedError
 from fastrod_device.expectation import Expectation
 from fastrod_device.faultcodes import in_words
@@ -40,11 +40,11 @@ from fastrod_device.tracker import MarkerSighting, MarkerTracker, outlined
 from fastrod_device.units import Transmission
 
 Plan = Callable[[float], Floats]
-"""Seconds since it began -> (n_tendons,) changes of wire length [m], negative = pulled."""
+"""Seconds since it began -> (n_tendons,) changes of tendon length [m], negative = pulled."""
 
 _COVERED = 20.0  # s that the marker may stay covered after hands are done
 _SLOWEST = 1e-6  # m/s of a glide
-_REMEMBERED = 3.0  # s of wire lengths, for frames that come late
+_REMEMBERED = 3.0  # s of tendon lengths, for frames that come late
 _FROZEN = 3  # frames alike: a camera at 15 Hz never draws the same noise twice
 _MARGIN = 1.5  # of our limits: where the drives refuse by themselves
 _STOPS = 0.015  # s from the fastest to rest
@@ -76,9 +76,10 @@ class Prototype:
         journal: Journal | None = None,
         wall: Callable[[], float] | None = None,
     ) -> None:
-        """Drives on `bus` ("socketcan:can0"), pictures from `source` (None: no camera). `wall` tells the time
-        of day [s], by default the machine's, and nothing where time is stepped; it must run as the clock
-        does. Raises `DeviceError` where there is no such bus."""
+        """Drives on `bus` ("socketcan:can0", or what drives of the hardware's kind take), pictures from
+        `source` (None: no camera). `wall` tells the time of day [s], by default the machine's, and nothing
+        where time is stepped; it must run as the clock does. Raises `DeviceError` where there is no such
+        bus."""
         self.hardware, self.source = hardware, source
         self._robot = hardware.robot
         self.clock: Clock = WallClock() if clock is None else clock
@@ -86,7 +87,7 @@ class Prototype:
         self.transmission = Transmission(hardware.drives)
         self._wall = time.time if wall is None and not self.clock.stepped else wall
         with urgently(not self.clock.stepped):  # for the bus's thread
-            self.drives = DriveBus(hardware.drives, bus, clock=self.clock, rate=hardware.rate, eds=eds)
+            self.drives: Drives = open_drives(hardware, bus, clock=self.clock, eds=eds)
         nodes = [spec.node for spec in hardware.drives]
         self.supervisor = Supervisor(
             hardware.robot, hardware.limits, on_stop=self._on_stop, nodes=nodes, words=in_words
@@ -125,7 +126,7 @@ class Prototype:
 
     @property
     def robot(self) -> Robot:
-        """What is driven: the hardware's model with the pretension that its wires had when they were
+        """What is driven: the hardware's model with the pretension that its tendons had when they were
         homed."""
         return self._robot
 
@@ -147,7 +148,7 @@ class Prototype:
         self.close()
 
     def start(self, *, home: bool = True) -> None:
-        """Find the drives, wind the wires until each has its pretension (`home`; where they are then is
+        """Find the drives, wind the tendons until each has its pretension (`home`; where they are then is
         zero), and enable them.
 
         Raises `DeviceError`, one sentence, for what does not answer or will not move; nothing is enabled
@@ -291,7 +292,7 @@ class Prototype:
             self._resting = False
 
     def read(self) -> Measurement:
-        """The newest sighting with the wires as they were then; without a camera the wires alone."""
+        """The newest sighting with the tendons as they were then; without a camera the tendons alone."""
         with self._lock:
             sighting, readings = self.sighting, self.readings
         problem = self.supervisor.status if self.supervisor.state is SafetyState.STOPPED else ""
@@ -361,7 +362,7 @@ class Prototype:
         self.journal.close()
 
     def _enable(self) -> None:
-        self.drives.enable("csp")
+        self.drives.enable()
         newest = self.drives.newest
         with self._lock:
             self._set = self._wanted = self.transmission.dl(newest.position)
@@ -398,14 +399,14 @@ class Prototype:
         now, dt = self.clock.now(), 1.0 / self.hardware.rate
         planned = self._plan if self.supervisor.state in (SafetyState.READY, SafetyState.RUNNING) else None
         # unlocked: nobody knows how long it takes
-        told = None if planned is None else planned[0](now - planned[1])
+        planned_length = None if planned is None else planned[0](now - planned[1])
         with self._lock:
             moving = self.supervisor.state in (
                 SafetyState.READY,
                 SafetyState.RUNNING,
             )  # a stop may have come meanwhile
-            if moving and told is not None and self._plan is planned:
-                self._wanted = self.supervisor.check(told, now)
+            if moving and planned_length is not None and self._plan is planned:
+                self._wanted = self.supervisor.check(planned_length, now)
             before, wanted = self._set, self._wanted
             pace = self._pace if self._plan is None else self.hardware.limits.rate
         target = limited(before, wanted, min(pace, self.hardware.limits.rate), dt) if moving else None
@@ -439,7 +440,7 @@ class Prototype:
             frame = None if self.source is None else self.source.read()
             if frame is None:
                 return
-            now, dl = self.clock.now(), self._wires_at(frame.t)[0]
+            now, dl = self.clock.now(), self._lengths_at(frame.t)[0]
             expected = self._expectation.pose(dl, self.payload, self.base_quaternion)
             sighting = self.tracker.look(frame, expected, now=now)
             self._alike = self._alike + 1 if sighting.flag in (FROZEN, REPEATED) else 0
@@ -451,7 +452,7 @@ class Prototype:
             if recorder is None or not recorder.recording:
                 return
             row, extra = self._measured(sighting, ""), columns.values(sighting, self.readings)
-            commanded = self._wires_at(sighting.t)[1]
+            commanded = self._lengths_at(sighting.t)[1]
             try:
                 recorder.add(
                     row,
@@ -469,7 +470,7 @@ class Prototype:
         trusted = sighting.ok
         return Measurement(
             t=sighting.t - self._zero,
-            dl=self._wires_at(sighting.t)[0],
+            dl=self._lengths_at(sighting.t)[0],
             ext=np.zeros(self.robot.n_segments),
             tip_position=sighting.position if trusted else np.full(3, np.nan),
             tip_quaternion=sighting.quaternion if trusted else np.full(4, np.nan),
@@ -477,7 +478,7 @@ class Prototype:
             problem=problem,
         )
 
-    def _wires_at(self, t: float) -> tuple[Floats, Floats]:
+    def _lengths_at(self, t: float) -> tuple[Floats, Floats]:
         """(n_tendons,) what the encoders said at `t`, between two cycles by a straight line, and the
         set-points then [m]."""
         with self._lock:

@@ -59,7 +59,7 @@ class Readings:
     t: float
     """[s]."""
     dl: Floats
-    """(n_drives,) change of wire length [m], negative = pulled."""
+    """(n_drives,) change of tendon length [m], negative = pulled."""
     rate: Floats
     """(n_drives,) of it [m/s]."""
     tension: Floats

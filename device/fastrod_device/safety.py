@@ -93,12 +93,12 @@ class Supervisor:
         """`on_stop` sends the safe stop and must bear being called again; `nodes` are the drives' node ids,
         `words` tells emergency codes.
 
-        Raises `InputError` for a robot without wires or a wrong number of nodes.
+        Raises `InputError` for a robot without tendons or a wrong number of nodes.
         """
         if robot.n_tendons == 0:
-            raise InputError(f"robot {robot.name!r} has no wires; there is nothing to drive.")
+            raise InputError(f"robot {robot.name!r} has no tendons; there is nothing to drive.")
         self.limits = limits
-        self._wiring = wire(robot)
+        self._routing = wire(robot)
         self._inspector = Inspector(robot.n_tendons, limits, nodes, words)
         self._on_stop = on_stop
         self._lock = threading.RLock()  # a signal handler may press stop while this thread holds it
@@ -144,14 +144,14 @@ class Supervisor:
                     SafetyState.READY: "The drives are enabled and hold.",
                 }
                 return words.get(mode, "The robot follows commands.")
-            parts = [f"Stopped ({faults[0].kind}): {faults[0].sentence.rstrip('.')}"]
+            clauses = [f"Stopped ({faults[0].kind}): {faults[0].sentence.rstrip('.')}"]
             if len(faults) > 1:
-                parts.append("then " + ", ".join(fault.kind for fault in faults[1:]))
+                clauses.append("then " + ", ".join(fault.kind for fault in faults[1:]))
             if self._unsent:
-                parts.append(f"THE STOP COULD NOT BE SENT ({self._unsent})")
+                clauses.append(f"THE STOP COULD NOT BE SENT ({self._unsent})")
             if self._refusal:
-                parts.append(f"not released, as {self._refusal.rstrip('.')}")
-            return "; ".join(parts) + "."
+                clauses.append(f"not released, as {self._refusal.rstrip('.')}")
+            return "; ".join(clauses) + "."
 
     def enabled(self, now: float) -> None:
         """The drives have been enabled: OFF becomes READY.
@@ -282,7 +282,7 @@ class Supervisor:
         Raises `RefusedError` where it is not stopped, the stop could not be sent, nobody has looked at the
         drives lately, or a cause is still there. A drive's own fault is no such cause: a drive keeps it until
         it is reset, which is what follows. An encoder that has jumped stays one: only a new start, which
-        homes, finds the wire again.
+        homes, finds the tendon again.
         """
         with self._lock:
             if self.state is not SafetyState.STOPPED:
@@ -305,7 +305,7 @@ class Supervisor:
             )
         jumped = next((fault for fault in self._faults if fault.kind == "encoder jump"), None)
         if jumped is not None:
-            return f"{jumped.sentence.rstrip('.')}; where its wire is may be lost: start anew, and home it."
+            return f"{jumped.sentence.rstrip('.')}; where its tendon is may be lost: start anew, and home it."
         return self._lasting[0].sentence if self._lasting else ""
 
     def _step(self, event: str, now: float, why: str) -> None:
@@ -378,26 +378,28 @@ class Supervisor:
             wanted = np.array(dl, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise RefusedError(
-                f"the command is {dl!r}; it must be {self._wiring.n_tendons} numbers [m]."
+                f"the command is {dl!r}; it must be {self._routing.n_tendons} numbers [m]."
             ) from error
-        if wanted.shape != (self._wiring.n_tendons,):
+        if wanted.shape != (self._routing.n_tendons,):
             raise RefusedError(
                 f"the command has shape {wanted.shape}; it must be "
-                f"({self._wiring.n_tendons},), one [m] for each wire."
+                f"({self._routing.n_tendons},), one [m] for each tendon."
             )
         if not np.isfinite(wanted).all():
             k = int(np.argmin(np.isfinite(wanted)))
-            raise RefusedError(f"wire {k + 1} was told {wanted[k]} m; it must be a finite number.")
+            raise RefusedError(f"tendon {k + 1} was told {wanted[k]} m; it must be a finite number.")
         k = int(np.argmax(np.abs(wanted)))
         if abs(wanted[k]) > self.limits.displacement:
-            told, limit = 1e3 * wanted[k], 1e3 * self.limits.displacement
-            raise RefusedError(f"wire {k + 1} was told {told:.6g} mm; this robot's limit is {limit:.6g} mm.")
-        curvature = np.linalg.norm(self._wiring.bend(wanted), axis=-1) / self._wiring.length
+            given, limit = 1e3 * wanted[k], 1e3 * self.limits.displacement
+            raise RefusedError(
+                f"tendon {k + 1} was told {given:.6g} mm; this robot's limit is {limit:.6g} mm."
+            )
+        curvature = np.linalg.norm(self._routing.bend(wanted), axis=-1) / self._routing.length
         k = int(np.argmax(curvature))
         if curvature[k] > self.limits.curvature:
-            asked, most = curvature[k], self.limits.curvature
+            needed, most = curvature[k], self.limits.curvature
             raise RefusedError(
-                f"segment {k + 1} was told to bend with {asked:.6g} 1/m; this robot's limit "
+                f"segment {k + 1} was told to bend with {needed:.6g} 1/m; this robot's limit "
                 f"is {most:.6g} 1/m."
             )
         return wanted

@@ -29,7 +29,7 @@ KINDS = (
     "following error",
     "tension",
     "displacement",
-    "slack wire",
+    "slack tendon",
     "camera frozen",
     "marker lost",
     "command stale",
@@ -64,7 +64,7 @@ _LONG = {
     0x07: "in a quick stop",
 }
 _NMT = {-1: "none yet", 0: "booting", 4: "stopped", 5: "operational", 127: "pre-operational"}
-_MOVES = 0.1  # of the largest rate: a wire that is slower stands
+_MOVES = 0.1  # of the largest rate: a tendon that is slower stands
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,8 +127,8 @@ class Inspector:
         """Raises `InputError` where `nodes` is neither empty nor one node id for each drive."""
         if nodes and len(nodes) != n_drives:
             raise InputError(
-                f"nodes has {len(nodes)} node ids and the robot {n_drives} wires; give one for "
-                "each wire, or none."
+                f"nodes has {len(nodes)} node ids and the robot {n_drives} tendons; give one for "
+                "each tendon, or none."
             )
         self._n, self._limits, self._nodes, self._words = n_drives, limits, tuple(nodes), words
 
@@ -164,7 +164,7 @@ class Inspector:
             state = int(readings.nmt[k])
             text = (
                 f"its NMT state is {state} ({_NMT.get(state, 'unknown')}), not 5 (operational); where "
-                "its wire is may be lost"
+                "its tendon is may be lost"
             )
             yield self._of("node reboot", k, f"was started anew or left operation: {text}", now)
         heart = np.where(readings.nmt == NMT_NONE, np.inf, readings.heartbeat_age + old)
@@ -180,11 +180,11 @@ class Inspector:
             now,
         )
         yield from self._beyond(
-            "tension", readings.tension, limits.tension, "pulls its wire with {}", "N", now
+            "tension", readings.tension, limits.tension, "pulls its tendon with {}", "N", now
         )
-        reach = limits.displacement + limits.following_error
-        where = "has its wire at {}, further than a command and its following error can lead"
-        yield from self._beyond("displacement", readings.dl, reach, where, "mm", now)
+        furthest = limits.displacement + limits.following_error
+        where = "has its tendon at {}, further than a command and its following error can lead"
+        yield from self._beyond("displacement", readings.dl, furthest, where, "mm", now)
         if camera is None or limits.sighting_age is None:
             return
         if camera.frozen:
@@ -231,10 +231,10 @@ class Inspector:
         if limits.slack is not None:
             for k in _first(~(readings.tension >= limits.slack)):
                 text = (
-                    f"pulls its wire with {readings.tension[k]:.3g} N; a wire is slack below "
+                    f"pulls its tendon with {readings.tension[k]:.3g} N; a tendon is slack below "
                     f"{limits.slack:g} N"
                 )
-                yield self._of("slack wire", k, text, now)
+                yield self._of("slack tendon", k, text, now)
 
     def times(self, now: float, wall: float | None, last: float, last_wall: float | None) -> Iterator[Fault]:
         """Clocks that jump and a control loop that stood still, between the cycle `last` [s] and `now`."""
@@ -305,7 +305,7 @@ class Inspector:
         allowed = self._limits.rate * dt + self._limits.encoder_jump
         for k in _first(known & ~(np.abs(change) <= allowed)):
             text = (
-                f"moved its wire by {1e3 * change[k]:.3g} mm in {_ms(float(dt[k]))}; the limit is "
+                f"moved its tendon by {1e3 * change[k]:.3g} mm in {_ms(float(dt[k]))}; the limit is "
                 f"{1e3 * allowed[k]:.3g} mm"
             )
             yield self._of("encoder jump", k, text, now)

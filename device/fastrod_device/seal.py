@@ -86,11 +86,11 @@ def _numbers(name: str, rng: np.random.Generator) -> dict[str, float]:
     def log(low: float, high: float) -> float:
         return math.exp(uniform(math.log(low), math.log(high)))
 
-    def turn() -> float:
+    def phase() -> float:
         return uniform(0.0, 2.0 * math.pi)
 
     match name:
-        case "backlash":  # m of wire; how sharp the corners of the gap are
+        case "backlash":  # m of tendon; how sharp the corners of the gap are
             return {"half_width": uniform(1.5e-4, 4e-4), "sharpness": uniform(8.0, 14.0)}
         # bend lost when straight [rad], its growth [1/rad], travel until it slides [rad], share of the quick
         # part
@@ -101,7 +101,7 @@ def _numbers(name: str, rng: np.random.Generator) -> dict[str, float]:
                 "late": uniform(4.0, 9.0) * _DEGREE,
                 "share": uniform(0.4, 0.7),
             }
-        # m/N beyond the wires' own; share that goes as strands settle; N; what a small bend loses
+        # m/N beyond the tendons' own; share that goes as strands settle; N; what a small bend loses
         case "tendon_stretch":
             lost = uniform(0.06, 0.20)
             compliance = 2.0 * OFFSET**2 * LENGTH / EI * lost / (1.0 - lost)
@@ -113,12 +113,12 @@ def _numbers(name: str, rng: np.random.Generator) -> dict[str, float]:
             }
         case "creep":  # shares, s, rate of quickening with the strain [1/m]
             whole, split = uniform(0.06, 0.12), uniform(0.35, 0.65)
-            parts = {
+            creep_sizes = {
                 "share": whole * split,
                 "time_constant": log(1.0, 5.0),
                 "slow_share": whole * (1.0 - split),
             }
-            return parts | {"slow_time_constant": log(10.0, 60.0), "activation": uniform(60.0, 160.0)}
+            return creep_sizes | {"slow_time_constant": log(10.0, 60.0), "activation": uniform(60.0, 160.0)}
         case "gravity":  # N/m, and how it is spread
             return {"weight": uniform(3.0, 6.0), "slope": uniform(-0.15, 0.15), "bulge": uniform(-0.25, 0.25)}
         case "latency":  # s; share by which it wanders, s, rad
@@ -126,12 +126,12 @@ def _numbers(name: str, rng: np.random.Generator) -> dict[str, float]:
                 "delay": log(0.04, 0.15),
                 "wander": uniform(0.01, 0.04),
                 "period": uniform(15.0, 50.0),
-                "phase": turn(),
+                "phase": phase(),
             }
-        case "ripple":  # m of wire once in a drum's turn and once in a tooth; m; teeth
+        case "ripple":  # m of tendon once in a drum's turn and once in a tooth; m; teeth
             sizes = {"amplitude": uniform(1e-4, 2.5e-4), "tooth_amplitude": uniform(0.8e-4, 1.6e-4)}
             drum = {"drum_radius": uniform(4e-3, 8e-3), "teeth": float(rng.integers(9, 20))}
-            return sizes | drum | {f"phase_{k}": turn() for k in range(4)}
+            return sizes | drum | {f"phase_{k}": phase() for k in range(4)}
         case _:  # bump: m along x, y, z, rad about x, y, z, s after the first moment
             away, about = rng.normal(size=3), rng.normal(size=3)
             away *= uniform(1e-3, 3e-3) / np.linalg.norm(away)

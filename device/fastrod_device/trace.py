@@ -1,4 +1,4 @@
-"""`Trace`: where the wires were lately, for frames that come late."""
+"""`Trace`: where the tendons were lately, for frames that come late."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from fastrod.types import Floats
 class Trace:
     """What encoders said and what was told, of the newest cycles. Its caller has a lock."""
 
-    def __init__(self, n_wires: int, n_cycles: int) -> None:
+    def __init__(self, n_tendons: int, n_cycles: int) -> None:
         """Empty."""
-        self._nowhere: Floats = np.full(n_wires, np.nan)
+        self._nowhere: Floats = np.full(n_tendons, np.nan)
         self._past: deque[tuple[float, Floats, Floats]] = deque(maxlen=n_cycles)
 
-    def add(self, t: float, dl: Floats, told: Floats) -> None:
+    def add(self, t: float, dl: Floats, commanded: Floats) -> None:
         """(n_wires,) by the encoders at `t` [s], and the set-points then [m]."""
-        self._past.append((t, dl, told))
+        self._past.append((t, dl, commanded))
 
     def clear(self) -> None:
         """Forget all of it."""
@@ -36,6 +36,6 @@ class Trace:
         k = next((k for k in range(len(past) - 1, -1, -1) if past[k][0] <= t), 0)
         if k == len(past) - 1 or t <= past[0][0]:
             return past[k][1], past[k][2]
-        (t0, dl0, told0), (t1, dl1, told1) = past[k], past[k + 1]
-        part = (t - t0) / (t1 - t0)
-        return dl0 + part * (dl1 - dl0), told0 + part * (told1 - told0)
+        (t0, dl0, commanded0), (t1, dl1, commanded1) = past[k], past[k + 1]
+        fraction = (t - t0) / (t1 - t0)
+        return dl0 + fraction * (dl1 - dl0), commanded0 + fraction * (commanded1 - commanded0)

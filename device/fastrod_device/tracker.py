@@ -5,7 +5,7 @@ Which of both: each solution costs (misfit of the sides / `sigma`)^2, the square
 points from the sides seen, plus (angle to the last accepted sighting / its sigma)^2, plus (angle to the
 expected pose / its sigma)^2 where one is given. The angle terms end at `_CAP`, so that no belief outweighs a
 picture that says otherwise for long. The cheaper one is taken. A sighting is "ambiguous" where the costs
-differ by less than `_TELL`, the solutions by more than `_ALIKE`: then nothing tells them apart. It is an
+differ by less than `_DECISIVE`, the solutions by more than `_ALIKE`: then nothing tells them apart. It is an
 "outlier" where its corners do not fit a square, or where a side could not be fitted: covered, cut off, or too
 small, and then off by millimetres.
 
@@ -43,9 +43,9 @@ if TYPE_CHECKING:
     import cv2
 
 _CAP = 36.0
-_TELL = 4.6  # twice the logarithm of a likelihood ratio of 10
+_DECISIVE = 4.6  # twice the logarithm of a likelihood ratio of 10
 _ALIKE = math.radians(6.0)
-_LAST_ANGLE, _TURN, _EXPECTED_ANGLE = 0.05, 1.5, 0.1  # [rad], [rad/s], [rad]
+_LAST_ANGLE, _SPIN, _EXPECTED_ANGLE = 0.05, 1.5, 0.1  # [rad], [rad/s], [rad]
 _SIX = np.eye(6)
 _GAUSS = 1.0 / math.sqrt(3.0)  # two points that weigh on a line as much as all points of a side do
 
@@ -152,17 +152,21 @@ class MarkerTracker:
         if len(found) != 1:
             return _nothing(t, frame.number, flag or (TWICE if found else "no marker"))
         sides = self._fit(image, found[0], self._cells)
-        turns, shifts, cost = self._solve(sides)
-        poses = [self._tip(turn, shift) for turn, shift in zip(turns, shifts, strict=True)]
+        orientations, shifts, cost = self._solve(sides)
+        poses = [
+            self._tip(orientation, shift) for orientation, shift in zip(orientations, shifts, strict=True)
+        ]
         belief = np.array([self._belief(t, quaternion, expected) for _, quaternion in poses])
         total = cost / self._sigma**2 + belief
         best = int(np.argmin(total))
         other = 1 - best if len(poses) > 1 else best
-        errors = self._errors(turns, shifts, sides.corners)
+        errors = self._errors(orientations, shifts, sides.corners)
         if not sides.fitted or errors[best] > self._limit:
             flag = "outlier"
         elif not (flag := self._refusal(t, poses[best][0], expected)) and (
-            other != best and total[other] - total[best] < _TELL and _angle(poses[0][1], poses[1][1]) > _ALIKE
+            other != best
+            and total[other] - total[best] < _DECISIVE
+            and _angle(poses[0][1], poses[1][1]) > _ALIKE
         ):
             flag = "ambiguous"
         pixels = self._fit.distorted(sides.corners)
@@ -205,18 +209,20 @@ class MarkerTracker:
         (n,) [px^2]."""
         import cv2
 
-        _, turns, shifts, _ = cv2.solvePnPGeneric(
+        _, orientations, shifts, _ = cv2.solvePnPGeneric(
             self._corners, sides.corners, self._matrix, None, flags=cv2.SOLVEPNP_IPPE_SQUARE
         )
-        turn = np.stack([np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64) for turn in turns])
+        orientation = np.stack(
+            [np.asarray(cv2.Rodrigues(orientation)[0], dtype=np.float64) for orientation in orientations]
+        )
         shift = np.stack([np.asarray(np.ravel(shift), dtype=np.float64) for shift in shifts])
         targets = self._targets(sides)
-        fine = self._refine(turn, shift, targets)
-        if len(turn) > 1 and np.linalg.norm(fine[0][0] - fine[0][1]) < 0.01:
+        fine = self._refine(orientation, shift, targets)
+        if len(orientation) > 1 and np.linalg.norm(fine[0][0] - fine[0][1]) < 0.01:
             # both went to one minimum: the other solution is none of its own. It is told as it was, and never
             # taken
             return (
-                np.stack([fine[0][0], turn[1]]),
+                np.stack([fine[0][0], orientation[1]]),
                 np.stack([fine[1][0], shift[1]]),
                 np.array([fine[2][0], np.inf]),
             )
@@ -243,27 +249,30 @@ class MarkerTracker:
         ax, ay, az = arm[..., 0], arm[..., 1], arm[..., 2]
         return r, np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx, bx, by, bz], axis=-1)
 
-    def _refine(self, turn: Floats, shift: Floats, targets: Floats) -> tuple[Floats, Floats, Floats]:
+    def _refine(self, orientation: Floats, shift: Floats, targets: Floats) -> tuple[Floats, Floats, Floats]:
         """Levenberg's descent from each solution to the nearest least misfit: rotations, positions [m],
         squared misfits [px^2]."""
-        r, J = self._misfit(self._points @ turn.transpose(0, 2, 1), shift, targets)
+        r, J = self._misfit(self._points @ orientation.transpose(0, 2, 1), shift, targets)
         cost, damping = (r * r).sum(1), np.full(len(r), 1e-4)
         for _ in range(8):
             across = J.transpose(0, 2, 1)
             H = across @ J
             H += (damping[:, None] * np.einsum("nii->ni", H) + 1e-12)[:, :, None] * _SIX
             step: Floats = np.asarray(-np.linalg.solve(H, across @ r[..., None])[..., 0], dtype=np.float64)
-            new_turn, new_shift = _turned(step[:, :3]) @ turn, shift + step[:, 3:]
-            new_r, new_J = self._misfit(self._points @ new_turn.transpose(0, 2, 1), new_shift, targets)
+            new_orientation, new_shift = _rotation_of(step[:, :3]) @ orientation, shift + step[:, 3:]
+            new_r, new_J = self._misfit(self._points @ new_orientation.transpose(0, 2, 1), new_shift, targets)
             new_cost = (new_r * new_r).sum(1)
             better = new_cost < cost
             done = bool((cost - new_cost < 1e-6).all())
             damping = np.where(better, 0.1 * damping, 30.0 * damping)
             if better.all():
-                turn, shift, r, J, cost = new_turn, new_shift, new_r, new_J, new_cost
+                orientation, shift, r, J, cost = new_orientation, new_shift, new_r, new_J, new_cost
             else:
                 each = better[:, None]
-                turn, J = np.where(each[..., None], new_turn, turn), np.where(each[..., None], new_J, J)
+                orientation, J = (
+                    np.where(each[..., None], new_orientation, orientation),
+                    np.where(each[..., None], new_J, J),
+                )
                 shift, r, cost = (
                     np.where(each, new_shift, shift),
                     np.where(each, new_r, r),
@@ -271,12 +280,13 @@ class MarkerTracker:
                 )
             if done:
                 break
-        return turn, shift, cost
+        return orientation, shift, cost
 
-    def _tip(self, turn: Floats, shift: Floats) -> Pose:
+    def _tip(self, orientation: Floats, shift: Floats) -> Pose:
         """Base_from_tip, w not negative."""
         position, quaternion = compose(
-            compose(self._base_from_camera, (shift, quaternion_from_matrix(turn))), self._marker_from_tip
+            compose(self._base_from_camera, (shift, quaternion_from_matrix(orientation))),
+            self._marker_from_tip,
         )
         return position, -quaternion if quaternion[0] < 0.0 else quaternion
 
@@ -284,16 +294,16 @@ class MarkerTracker:
         """What a solution costs by its angles to the last sighting and to the expected pose."""
         cost = 0.0
         if self._last is not None:
-            sigma = _LAST_ANGLE + _TURN * abs(t - self._last.t)
+            sigma = _LAST_ANGLE + _SPIN * abs(t - self._last.t)
             if sigma < 1.0:
                 cost += min((_angle(quaternion, self._last.quaternion) / sigma) ** 2, _CAP)
         if expected is not None:
             cost += min((_angle(quaternion, expected[1]) / _EXPECTED_ANGLE) ** 2, _CAP)
         return cost
 
-    def _errors(self, turn: Floats, shift: Floats, corners: Floats) -> Floats:
+    def _errors(self, orientation: Floats, shift: Floats, corners: Floats) -> Floats:
         """(n,) root mean square distance of the corners [px]."""
-        y = self._corners @ turn.transpose(0, 2, 1) + shift[:, None]
+        y = self._corners @ orientation.transpose(0, 2, 1) + shift[:, None]
         k = self._matrix
         pixels = y[..., :2] / y[..., 2:] * (k[0, 0], k[1, 1]) + k[:2, 2]
         return np.asarray(np.sqrt(((pixels - corners) ** 2).sum(-1).mean(-1)))
@@ -343,7 +353,7 @@ def _angle(a: Floats, b: Floats) -> float:
     return 2.0 * math.acos(min(1.0, abs(float(a @ b))))
 
 
-def _turned(vector: Floats) -> Floats:
+def _rotation_of(vector: Floats) -> Floats:
     """(n, 3, 3) rotation by vectors (n, 3) [rad], Cayley's: right to second order, and a rotation to the last
     bit."""
     a = 0.5 * vector

@@ -1,4 +1,4 @@
-"""The one place where metres of wire become counts of a motor, and its torque becomes newtons."""
+"""The one place where metres of tendon become counts of a motor, and its torque becomes newtons."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _RANGE = {
 
 @dataclass(frozen=True, kw_only=True)
 class DriveSpec:
-    """A motor that winds one wire on a drum. The order of the drives is that of the robot file's tendons.
+    """A motor that winds one tendon on a drum. The order of the drives is that of the robot file's tendons.
 
     >>> round(DriveSpec(node=1, drum_radius=0.008).metres_per_count * 1e9)  # nm
     584
@@ -35,9 +35,9 @@ class DriveSpec:
     node: int
     """CANopen node id, 1 to 126."""
     drum_radius: float
-    """To the middle of the wound wire [m]."""
+    """To the middle of the wound tendon [m]."""
     direction: int = 1
-    """+1 where growing counts pull the wire in, -1 where they let it out."""
+    """+1 where growing counts pull the tendon in, -1 where they let it out."""
     gear: float = 21.0
     """Turns of the motor in one turn of the drum."""
     counts_per_turn: int = 4096
@@ -73,19 +73,19 @@ class DriveSpec:
 
     @property
     def metres_per_count(self) -> float:
-        """Wire wound by one count [m]."""
+        """Tendon wound by one count [m]."""
         return 2.0 * math.pi * self.drum_radius / (self.gear * self.counts_per_turn)
 
     @property
     def newtons_per_torque(self) -> float:
-        """Tension of the wire by torque of the motor [1/m]."""
+        """Tension of the tendon by torque of the motor [1/m]."""
         return self.gear * self.efficiency / self.drum_radius
 
 
 @final
 class Transmission:
-    """Drives as wires: changes of wire length [m], negative = pulled, against the straight rest robot, where
-    counts are `zero`."""
+    """Drives as tendons: changes of tendon length [m], negative = pulled, against the straight rest robot,
+    where counts are `zero`."""
 
     def __init__(self, specs: Sequence[DriveSpec], zero: Ints | None = None) -> None:
         """`zero` (n_drives,) counts at which the robot is straight, 0 by default. Raises `InputError` where
@@ -109,11 +109,11 @@ class Transmission:
         return len(self.specs)
 
     def counts(self, dl: Floats) -> Ints:
-        """(n_drives,) nearest counts of changes of wire length (n_drives,) [m]."""
+        """(n_drives,) nearest counts of changes of tendon length (n_drives,) [m]."""
         return np.asarray(np.rint(dl / self._metres), dtype=np.int64) + self.zero
 
     def dl(self, counts: Ints) -> Floats:
-        """(..., n_drives) changes of wire length [m] of counts."""
+        """(..., n_drives) changes of tendon length [m] of counts."""
         return np.asarray((counts - self.zero) * self._metres, dtype=np.float64)
 
     def wound(self, counts: Ints) -> Floats:

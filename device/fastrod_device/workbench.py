@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fastrod.errors import InputError
-from fastrod_device.boards import AskingBoardHands, BoardEye, BoardMover, bent, moved
+from fastrod_device.boards import BoardEye, BoardMover, BoardPrompts, bent, moved
 from fastrod_device.calibration import CharucoBoard
 from fastrod_device.camera import Camera, FrameSource, VideoCamera
 from fastrod_device.clock import Clock, SteppedClock, WallClock
 from fastrod_device.emulator import Emulator
-from fastrod_device.experiment import AskingHands, HandMover
+from fastrod_device.experiment import BenchAssistant, BenchPrompts
 from fastrod_device.hardware import Hardware
 from fastrod_device.journal import Journal
 from fastrod_device.prototype import Prototype
@@ -31,7 +31,7 @@ class EmulatedBench:
     """A prototype and who helps it."""
 
     prototype: Prototype
-    hands: HandMover
+    assistant: BenchAssistant
     emulator: Emulator | None
     """None where the prototype is real."""
 
@@ -41,7 +41,7 @@ class BoardBench:
     """A camera and who shows a board to it."""
 
     source: FrameSource
-    hands: BoardMover
+    assistant: BoardMover
     clock: Clock
     truth: Camera | None
     """What an emulated camera is and where it stands; None where it is real."""
@@ -73,7 +73,7 @@ def emulated(
     try:
         with Prototype(hardware, name, emulator, clock=clock, eds=eds, journal=Journal(journal)) as prototype:
             prototype.start(home=home)
-            yield EmulatedBench(prototype=prototype, hands=emulator, emulator=emulator)
+            yield EmulatedBench(prototype=prototype, assistant=emulator, emulator=emulator)
     finally:
         emulator.close()
 
@@ -97,7 +97,7 @@ def real(
     try:
         with Prototype(hardware, bus, source, eds=eds, journal=Journal(journal)) as prototype:
             prototype.start(home=home)
-            yield EmulatedBench(prototype=prototype, hands=AskingHands(), emulator=None)
+            yield EmulatedBench(prototype=prototype, assistant=BenchPrompts(), emulator=None)
     finally:
         if source is not None:
             source.close()
@@ -116,7 +116,7 @@ def emulated_board(
         raise InputError(f"seed is {seed!r}; it must be a whole number from 0.")
     truth = bent(camera, drawn) if lens else moved(camera, drawn)
     eye = BoardEye(truth, board, clock=clock, seed=drawn)
-    yield BoardBench(source=eye, hands=eye, clock=clock, truth=truth)
+    yield BoardBench(source=eye, assistant=eye, clock=clock, truth=truth)
 
 
 @contextmanager
@@ -125,6 +125,6 @@ def real_board(camera: Camera, device: int | str) -> Iterator[BoardBench]:
     opened."""
     source = VideoCamera(camera, device)
     try:
-        yield BoardBench(source=source, hands=AskingBoardHands(), clock=WallClock(), truth=None)
+        yield BoardBench(source=source, assistant=BoardPrompts(), clock=WallClock(), truth=None)
     finally:
         source.close()

@@ -12,17 +12,17 @@ from fastrod.errors import UnknownNameError, nearest
 ACTIONS = {
     "teleop": "by hand, in the browser",
     "excite": "the run that separates effects, recorded for `fastrod identify`",
-    "track": "one turn of a path, by the model or by a policy, recorded",
+    "track": "one lap of a path, by the model or by a policy, recorded",
     "loop": "excite, identify, plan anew, track; the error before and after",
     "calibrate": "the camera's lens, from pictures of a charuco board that is waved; no drives needed",
     "register": "where the camera stands, from pictures of a board at known places; no drives needed",
     "latency": "how late the camera is, from a motion of some seconds",
 }
-"""What `fastrod drive` can do, and what that is."""
+"""Actions of `fastrod drive`, and what they do."""
 BOARD_ACTIONS = ("calibrate", "register")
 """Those that need a camera and a board, and no drives."""
 DATA_SETS = ("shapes", "rollouts", "sweep")
-"""What `fastrod generate` makes."""
+"""Kinds of data that `fastrod generate` makes."""
 _MOVING = tuple(name for name in ACTIONS if name not in BOARD_ACTIONS)
 _OF: dict[str, tuple[str, ...]] = {
     "eds": _MOVING,
@@ -46,7 +46,7 @@ _OF: dict[str, tuple[str, ...]] = {
 
 
 class UsageError(Exception):
-    """What argparse would have printed over several lines."""
+    """Error that argparse would have printed over several lines."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -58,7 +58,7 @@ class _Front(_Parser):
     """Its help has the commands in the order of what one wants to do, not of the alphabet."""
 
     commands: dict[str, str]
-    """What each does, in a line."""
+    """Description of each command, in a line."""
 
     def format_help(self) -> str:
         return overview(self.commands)
@@ -211,10 +211,9 @@ def build() -> tuple[argparse.ArgumentParser, list[str]]:
             formatter_class=argparse.RawDescriptionHelpFormatter,
             description="The prototype on its bus, or its emulator.\n\nactions:\n"
             + "\n".join(f"  {name:<11}{what}" for name, what in ACTIONS.items()),
-            epilog="exit code:\n  0  done\n  1  the bench does not answer, was stopped on the way, or what "
-            "it measured does not tell;\n"
-            "     what was recorded until then is kept\n  2  the words or a file are wrong, and nothing has "
-            "moved",
+            epilog="exit code:\n  0  done\n  1  the robot does not answer, was stopped during the run, or "
+            "what it measured does not suffice;\n     what was recorded until then is kept\n"
+            "  2  the arguments or a file are wrong, and nothing has moved",
         )
     )
 
@@ -274,9 +273,7 @@ def build() -> tuple[argparse.ArgumentParser, list[str]]:
         help="policy, configuration, checkpoints, curves (default: NAME_ALGO_SEED)",
     )
     train.add_argument(
-        "--resume",
-        action="store_true",
-        help="go on with the training in --out, after a kill or to more --steps",
+        "--resume", action="store_true", help="resume the training in --out, after a kill or to more --steps"
     )
     _add_trust(train, "--resume: ")
 
@@ -359,7 +356,7 @@ def _add_trust(parser: argparse._ActionsContainer, of: str = "") -> None:
         "--trust",
         action="store_true",
         help=f"{of}read a file of stable-baselines3 where the folder has none of our own; "
-        "this runs code of whoever made the file",
+        "this runs code of the file's author",
     )
 
 
@@ -387,7 +384,7 @@ def _add_drive(drive: argparse.ArgumentParser) -> None:
     bench.add_argument(
         "--no-home",
         action="store_true",
-        help="the wires are taut and zero where they should be; do not wind them",
+        help="the tendons are taut and zero where they should be; do not wind them",
     )
 
     bench.add_argument("--eds", type=Path, metavar="FILE", help="EDS or DCF of the drives (default: EPOS4)")
@@ -450,7 +447,7 @@ def _add_drive(drive: argparse.ArgumentParser) -> None:
         metavar=("X", "Y", "Z", "QW", "QX", "QY", "QZ"),
         help="register: where the board is, base_from_board [m] and quaternion; its origin is the outer "
         "corner at the print's top left, "
-        "x right, y down, z into the paper. Several times: it is put there in turn",
+        "x right, y down, z into the paper. Several times: it is put at one after the other",
     )
 
     page = drive.add_argument_group("teleop")
@@ -478,7 +475,7 @@ def _add_generate(generate: argparse.ArgumentParser) -> None:
             type=Path,
             required=True,
             metavar="DIR",
-            help="folder of plan.json and shards; with what is there it goes on",
+            help="folder of plan.json and shards; a run that was cut off is resumed",
         )
         kind.add_argument(
             "--robot",
@@ -491,7 +488,7 @@ def _add_generate(generate: argparse.ArgumentParser) -> None:
             "--workers",
             type=int,
             metavar="N",
-            help="processes, or tasks under way on Ray (default: one for each core)",
+            help="processes, or pending tasks on Ray (default: one for each core)",
         )
         where.add_argument(
             "--ray",
@@ -547,7 +544,7 @@ def _add_generate(generate: argparse.ArgumentParser) -> None:
     )
     rollouts.add_argument("--env", metavar="ENV", help="a task, such as Reach; not with --robot")
     rollouts.add_argument(
-        "--policy", metavar="P", help="who acts: shipped, baseline or random (default: random)"
+        "--policy", metavar="P", help="the policy that acts: shipped, baseline or random (default: random)"
     )
     _add_options(rollouts)
     rollouts.add_argument("--steps", type=int, metavar="N", help="robot: of an episode (default: 200)")
@@ -580,7 +577,7 @@ def _add_generate(generate: argparse.ArgumentParser) -> None:
         action="extend",
         default=[],
         metavar="NAME",
-        help="sealed in turn (default: backlash)",
+        help="sealed one after the other (default: backlash)",
     )
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 import io
 import json
-import runpy
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -50,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                     *([arguments.kind] if arguments.command == "generate" else []),
                 ]
             )
-            return _refuse(f"{what} does not know {rest[0]!r}; `{what} --help` tells.")
+            return _refuse(f"{what} does not know {rest[0]!r}; `{what} --help` lists them.")
         return _RUN[arguments.command](arguments)
     except UsageError as error:
         return _refuse(str(error))
@@ -94,7 +94,7 @@ def _replay(arguments: argparse.Namespace) -> int:
         return _refuse(f"the model converged on none of the {len(log)} rows.", FAILED)
     for written in room.write(result, out):
         console.print(f"wrote {written}", soft_wrap=True, highlight=False)
-    for question in result.questions:  # it has shown what it was asked for: to ask is not to refuse
+    for question in result.questions:  # it has shown what was requested: that is no refusal
         _refuse(question, DONE)
     return DONE
 
@@ -163,20 +163,20 @@ def _excite(arguments: argparse.Namespace) -> int:
         raise InputError(f"{str(path)!r} does not end in .csv or .parquet; a run log does.")
     write_log(made.log, path, comment=made.comment)
     grid = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    for name in ("from", "to", "part", "tells"):
+    for name in ("from", "to", "section", "purpose"):
         grid.add_column(
             f"{name} s" if name in ("from", "to") else name,
             justify="right" if name in ("from", "to") else "left",
         )
     said: set[str] = set()
-    for part in made.parts:
+    for section in made.phases:
         grid.add_row(
-            f"{part.start:.1f}",
-            f"{part.end:.1f}",
-            part.name,
-            part.purpose if part.purpose not in said else "as above",
+            f"{section.start:.1f}",
+            f"{section.end:.1f}",
+            section.name,
+            section.purpose if section.purpose not in said else "as above",
         )
-        said.add(part.purpose)
+        said.add(section.purpose)
     console = Console()
     console.print(grid)
     console.print(
@@ -208,8 +208,8 @@ def _view(arguments: argparse.Namespace) -> int:
 
 
 def _drive(arguments: argparse.Namespace) -> int:
-    """A bench that does not answer or is stopped on the way, a plan that it refused, measurements that do not
-    tell: all that failed."""
+    """Errors of a run that failed: a robot that does not answer or is stopped, a plan that it refused,
+    measurements that do not suffice."""
     check_drive(arguments)
     for module in ("cv2",) if arguments.action in BOARD_ACTIONS else ("can", "canopen", "cv2"):
         _need(module, "drive", "device")
@@ -222,7 +222,9 @@ def _drive(arguments: argparse.Namespace) -> int:
         except (DeviceError, CalibrationError, RefusedError) as error:
             return _refuse(str(error), FAILED)
         except EOFError:
-            return _refuse("nobody answers; give it a terminal, as it asks for loads and boards.", FAILED)
+            return _refuse(
+                "nobody answers; give it a terminal, since it prompts for loads and boards.", FAILED
+            )
 
 
 def _envs(arguments: argparse.Namespace) -> int:
@@ -242,7 +244,7 @@ def _train(arguments: argparse.Namespace) -> int:
     out: Path | None = arguments.out
     if arguments.resume:
         if out is None:
-            raise InputError("--resume needs --out DIR, the folder of the training to go on with.")
+            raise InputError("--resume needs --out DIR, the folder of the training to resume.")
         plan = read_config(out)[0]
         with _progress() as bar:
             path = resume(out, arguments.steps, bar, trust=arguments.trust)
@@ -325,16 +327,16 @@ def _generate(arguments: argparse.Namespace) -> int:
 
 def _pairs(given: Sequence[str], flag: str) -> dict[str, object]:
     """NAME=VALUE as names and numbers, lists, true, false, none, or words."""
-    told: dict[str, object] = {}
+    options: dict[str, object] = {}
     for pair in given:
         name, equals, word = pair.partition("=")
         if not equals or not name:
             raise InputError(f"{flag} is {pair!r}; give NAME=VALUE.")
         try:
-            told[name] = None if word in ("none", "None") else json.loads(word)
+            options[name] = None if word in ("none", "None") else json.loads(word)
         except ValueError:
-            told[name] = word
-    return told
+            options[name] = word
+    return options
 
 
 def _need(module: str, command: str, extra: str) -> None:
@@ -378,9 +380,12 @@ _PERF = Path(__file__).parents[2] / "perf"
 
 def _script(path: Path, argv: list[str]) -> int:
     """The exit code of the script's `main(argv)`."""
-    sys.path.insert(0, str(path.parent))  # as `python perf/bench_NAME.py` has it, for what the scripts share
+    sys.path.insert(
+        0, str(path.parent)
+    )  # as `python perf/bench_NAME.py` has it, for the scripts' common modules
     try:
-        return int(runpy.run_path(str(path))["main"](argv) or DONE)
+        # imported by name, so that a process that a benchmark starts finds its functions
+        return int(import_module(path.stem).main(argv) or DONE)
     finally:
         sys.path.remove(str(path.parent))
 
@@ -398,7 +403,7 @@ _RUN: dict[str, Callable[[argparse.Namespace], int]] = {
     "generate": _generate,
     "bench": _bench,
 }
-"""What each command does."""
+"""Functions of the commands."""
 
 
 @contextmanager

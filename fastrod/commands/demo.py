@@ -96,10 +96,10 @@ def _batch(robot: Robot, console: Console) -> None:
     clock = time.perf_counter()
     state = Simulator(robot, n_robots=N_ROBOTS, dt=DT).settle(start, tip_force=force)
     settled = time.perf_counter() - clock
-    reach = 1e3 * np.ptp(state.tip_position, axis=0)
+    extent = 1e3 * np.ptp(state.tip_position, axis=0)
     console.print(
         f"  settle: {int(np.sum(state.ok))} of {N_ROBOTS} converged in {1e3 * settled:.1f} ms; "
-        f"tips span {reach[0]:.0f} x {reach[1]:.0f} x {reach[2]:.0f} mm"
+        f"tips span {extent[0]:.0f} x {extent[1]:.0f} x {extent[2]:.0f} mm"
     )
     per_pass, residual = _steps(sim, start, end, force)
     console.print(
@@ -110,8 +110,7 @@ def _batch(robot: Robot, console: Console) -> None:
 
 
 def _steps(sim: Any, start: Floats, end: Floats, force: Floats) -> tuple[float, float]:
-    """Seconds a robot and pass, and the median boundary residual at the end [m], on the way from `start` to
-    `end`."""
+    """Seconds a robot and pass, and the median boundary residual at the end [m], from `start` to `end`."""
     commands = [start + (k + 1) / N_STEPS * (end - start) for k in range(N_STEPS)]
     clock = time.perf_counter()
     for command in commands:
@@ -141,7 +140,7 @@ def _looped(console: Console, out: Path, seed: int | None, *, keep: bool, view: 
     )
     stages = Stages(console)
     with stages, emulated(load_hardware(), seed=seed) as bench:
-        loop = close_loop(bench.prototype, bench.hands, out, progress=stages)
+        loop = close_loop(bench.prototype, bench.assistant, out, progress=stages)
         assert bench.emulator is not None
         sealed = bench.emulator.seal.open()
     written = loop_report.write(loop, out, sealed)
@@ -194,8 +193,7 @@ class Stages:
             self.begin("")
 
     def __call__(self, what: str, done: int, total: int) -> None:
-        """What is being done, "stage" or "stage: detail", and how far it is; another stage ends the one
-        before."""
+        """Show progress: "stage" or "stage: detail", and how far it is; another stage ends the one before."""
         if self._status is not None:
             self._status.update(f"{what}: {done} of {total}")
         if (stage := what.partition(":")[0]) != self._what:

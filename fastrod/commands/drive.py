@@ -1,7 +1,7 @@
 """`fastrod drive`: the prototype or its emulator, by hand, through a run, along a path, through the whole
 loop.
 
-What needs two wings at once is put together here: the viewer drives a link, a policy asks for commands.
+What needs two wings at once is put together here: the viewer drives a link, a policy computes commands.
 """
 
 from __future__ import annotations
@@ -33,13 +33,12 @@ _EVENTS = "events.csv"
 
 
 def _teleop(arguments: argparse.Namespace, _: Progress | None) -> int:
-    """Hands drive in the browser; nothing moves when nobody watches. Stops and their reasons are kept in a
+    """Drive by hand in the browser; nothing moves when nobody watches. Stops and their reasons are kept in a
     file."""
     import contextlib
     import itertools
     import signal
     import sys
-    import webbrowser
 
     from fastrod_device.pacer import ordinary, urgent
     from fastrod_viewer.app import view
@@ -52,14 +51,14 @@ def _teleop(arguments: argparse.Namespace, _: Progress | None) -> int:
     # homing, too, ends with the drives switched off
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     hardware = _hardware(arguments)
-    urgent(1)  # all threads of the page, too: one that waits for its turn holds up those of the drives
+    urgent(1)  # all threads of the page, too: one that waits for the lock holds up those of the drives
     server = serve(port=arguments.port)  # a port that is taken is no news for after the homing
     say("Preparing the model ...")
     FreeWorld(hardware.robot).jacobian()  # compiled or loaded now: nothing may hold up the drives later
     say(
         "Finding the drives ..."
         if arguments.no_home
-        else "Finding the drives, winding the wires, looking for the marker: about 25 s ..."
+        else "Finding the drives, winding the tendons, looking for the marker: about 25 s ..."
     )
     names = itertools.chain(["drive.csv"], (f"drive-{k}.csv" for k in itertools.count(2)))
     journal = next(path for name in names if not (path := Path(name)).with_suffix(".events.csv").exists())
@@ -72,7 +71,7 @@ def _teleop(arguments: argparse.Namespace, _: Progress | None) -> int:
             model = FreeWorld(bench.prototype.robot)
             if not arguments.no_open:
                 ordinary()  # a browser must not come before other programs
-                webbrowser.open(server.address)
+                server.open_browser()
                 urgent(1)
             view(model, link=bench.prototype, server=server, open_browser=False)
         say("The drives are switched off.")
@@ -97,7 +96,7 @@ def _excite(arguments: argparse.Namespace, progress: Progress | None) -> int:
     out = _recorded(arguments.out or Path("excite.csv"), hardware)
     run = excitation(hardware.robot, payload=arguments.payload, rate=hardware.camera.rate)
     with _kept(out), _bench(arguments, hardware, journal=out) as bench:
-        log = excite(bench.prototype, run, bench.hands, out, progress=progress)
+        log = excite(bench.prototype, run, bench.assistant, out, progress=progress)
     print(
         f"wrote {out}: {len(log)} rows, {int(log.measured.sum())} with the tip; next: fastrod identify "
         f"{out} --robot {_named(arguments)}"
@@ -106,7 +105,7 @@ def _excite(arguments: argparse.Namespace, progress: Progress | None) -> int:
 
 
 def _track(arguments: argparse.Namespace, _: Progress | None) -> int:
-    """One turn of a path, by the model or by a policy, recorded."""
+    """Follow one lap of a path, by the model or by a policy, recorded."""
     from rich.console import Console
 
     from fastrod.control import references
@@ -135,12 +134,12 @@ def _track(arguments: argparse.Namespace, _: Progress | None) -> int:
 def _policy(given: str, path: str, begins: float, robot: Robot, trust: bool) -> Law:
     """A policy of Track as a law; the path begins so many seconds into the plan."""
     try:
-        from fastrod_envs.pilot import PolicyDriver
         from fastrod_envs.policies import Policy, find
+        from fastrod_envs.policy_driver import PolicyDriver
     except ImportError as error:
         raise InputError("--policy needs gymnasium: pip install 'fastrod[envs]'.") from error
-    pilot = PolicyDriver(Policy(find("Track", given), trust=trust), path, robot)
-    return lambda tip, t: pilot.command(tip, t - begins)
+    driver = PolicyDriver(Policy(find("Track", given), trust=trust), path, robot)
+    return lambda tip, t: driver.command(tip, t - begins)
 
 
 def _loop(arguments: argparse.Namespace, progress: Progress | None) -> int:
@@ -158,7 +157,7 @@ def _loop(arguments: argparse.Namespace, progress: Progress | None) -> int:
         )
     make_folder(out)
     with _kept(out), _bench(arguments, hardware, journal=out / _EVENTS) as bench:
-        loop = close_loop(bench.prototype, bench.hands, out, payload=arguments.payload, progress=progress)
+        loop = close_loop(bench.prototype, bench.assistant, out, payload=arguments.payload, progress=progress)
         sealed = None if bench.emulator is None else bench.emulator.seal.open()
     written = write(loop, out, sealed)
     show(loop, Console(), sealed)
@@ -168,7 +167,7 @@ def _loop(arguments: argparse.Namespace, progress: Progress | None) -> int:
 
 
 def _calibrate(arguments: argparse.Namespace, progress: Progress | None) -> int:
-    """What the lens is, from pictures of a board that is waved."""
+    """Calibrate the lens from pictures of a board that is waved."""
     from rich.console import Console
 
     from fastrod_device.boards import collect, lens_table
@@ -182,18 +181,18 @@ def _calibrate(arguments: argparse.Namespace, progress: Progress | None) -> int:
     )
     before = hardware.camera
     with _board_bench(arguments, before, board, lens=True) as bench:
-        bench.hands.wave()
+        bench.assistant.wave()
         taken = collect(bench.source, board, _views(arguments), bench.clock, progress=progress)
     found = calibrate(taken.pictures, board)
     Console().print(lens_table(found, before, bench.truth))
-    _tell_views(found, taken.told)
+    _report_views(found, taken.counted)
     save_camera(replace(before, matrix=found.camera().matrix, distortion=found.camera().distortion), out)
     print(f"wrote {out}: the file's camera with this lens; {_put_camera(out, arguments)}")
     return DONE
 
 
 def _register(arguments: argparse.Namespace, progress: Progress | None) -> int:
-    """Where the camera stands, from pictures of a board at known places."""
+    """Calibrate the camera's pose from pictures of a board at known places."""
     from rich.console import Console
 
     from fastrod_device.boards import collect, fixtures, place_table
@@ -216,21 +215,21 @@ def _register(arguments: argparse.Namespace, progress: Progress | None) -> int:
     with _board_bench(arguments, before, board, lens=False) as bench:
         taken = []
         for position, quaternion in places:
-            bench.hands.place(position, quaternion)
+            bench.assistant.place(position, quaternion)
             taken.append(collect(bench.source, board, each, bench.clock, apart=0.0, progress=progress))
     pictures = [picture for some in taken for picture in some.pictures]
     counts = [len(some.pictures) for some in taken]
     position, quaternion = (np.repeat(np.stack(rows), counts, axis=0) for rows in zip(*places, strict=True))
     found = register_base(pictures, board, before, position=position, quaternion=quaternion)
     Console().print(place_table(found, before, bench.truth))
-    _tell_views(found, "; ".join(some.told for some in taken))
+    _report_views(found, "; ".join(some.counted for some in taken))
     save_camera(found.camera(before), out)
     print(f"wrote {out}: the file's camera at this place; {_put_camera(out, arguments)}")
     return DONE
 
 
 def _latency(arguments: argparse.Namespace, _: Progress | None) -> int:
-    """How late the camera is, from a motion of some seconds."""
+    """Measure the camera's latency from a motion of some seconds."""
     from fastrod_device.camera import save_camera
     from fastrod_device.latency import measure_latency
 
@@ -238,10 +237,10 @@ def _latency(arguments: argparse.Namespace, _: Progress | None) -> int:
     with _bench(arguments, hardware) as bench:
         found = measure_latency(bench.prototype)
         sealed = None if bench.emulator is None else bench.emulator.seal.open()
-    told, now = hardware.camera.latency, max(0.0, round(hardware.camera.latency + found.delay, 4))
+    stated, now = hardware.camera.latency, max(0.0, round(hardware.camera.latency + found.delay, 4))
     print(
         f"the tip is seen {1e3 * found.delay:.1f} ms late (standard error {1e3 * found.stderr:.1f} ms), "
-        f"beyond the {1e3 * told:g} ms "
+        f"beyond the {1e3 * stated:g} ms "
         "that the hardware file has; of strong friction or backlash some ms may count as late, too"
     )
     if sealed is not None:
@@ -264,7 +263,7 @@ ACTIONS: dict[str, Callable[[argparse.Namespace, Progress | None], int]] = {
     "register": _register,
     "latency": _latency,
 }
-"""What each action does; the exit code."""
+"""Run an action and return the exit code."""
 
 
 def _hardware(arguments: argparse.Namespace) -> Hardware:
@@ -416,7 +415,7 @@ def _place(row: Sequence[float]) -> tuple[Floats, Floats]:
     return position, quaternion / norm
 
 
-def _tell_views(found: CameraCalibration | MarkerRegistration, passed: str) -> None:
+def _report_views(found: CameraCalibration | MarkerRegistration, passed: str) -> None:
     print(
         f"{len(found.used)} views used, reprojection error {found.error:.3f} px rms; {len(found.refused)} "
         "views refused"

@@ -33,7 +33,7 @@ def run(
     options: Mapping[str, object],
     progress: Callable[[str, int, int], None] | None,
 ) -> Summary:
-    """Make what the words ask for."""
+    """Make what the arguments say."""
     plan = plan_of(arguments, options)
     return generate(plan, arguments.out, workers=arguments.workers, ray=arguments.ray, progress=progress)
 

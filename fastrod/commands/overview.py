@@ -30,5 +30,9 @@ def overview(helps: Mapping[str, str]) -> str:
         lines += ["", f"{title}:", *(f"  {name:<10}{helps[name]}" for name in names)]
     width = max(len(line) for line, _ in _EXAMPLES)
     lines += ["", "examples:", *(f"  {line:<{width}}  {what}" for line, what in _EXAMPLES)]
-    lines += ["", "`fastrod COMMAND --help` tells all options of one; `fastrod --version` the version.", ""]
+    lines += [
+        "",
+        "`fastrod COMMAND --help` lists all options of one; `fastrod --version` prints the version.",
+        "",
+    ]
     return "\n".join(lines)

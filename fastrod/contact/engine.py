@@ -243,9 +243,7 @@ class Engine:
         """Threads for n robots, or worlds."""
         return 1 if n <= _FEW else min(self.threads, n)
 
-    def motion(
-        self, shape: RodShape, tolerance: float, done: Floats, aim: Floats, damping: float = 0.0
-    ) -> ContactMotion:
+    def motion(self, shape: RodShape, tolerance: float, done: Floats, aim: Floats) -> ContactMotion:
         """Rods in `shape` and the obstacles at the fraction `aim` of their displacement, where the fraction
         `done` is behind."""
         if self.poses is self.poses_before and not self.velocities:
@@ -267,7 +265,6 @@ class Engine:
             slides=self.tracked & self.slides,
             tolerance=tolerance,
             margin=self.scene.watch,
-            damping=damping,
         )
 
 
@@ -281,20 +278,24 @@ def motion_of(
     slides: Flags,
     tolerance: float,
     margin: float,
-    damping: float = 0.0,
 ) -> ContactMotion:
-    """Put together what kernels read of one pass: `frames` now, before, and for slip."""
+    """Put together what kernels read of one pass, without damping: `frames` now, before, and for slip."""
     return ContactMotion(
         *frames,
         *(shape.position, shape.rotation, shape.curvature, shape.arclength, shape.residual),
-        *(before.position, before.rotation, before.curvature, before.arclength),
+        *_curves(before),
+        *_curves(before),
         *clearance,
         tracked,
         slides,
         tolerance,
         margin,
-        damping,
+        np.zeros(len(tracked)),
     )
+
+
+def _curves(shape: RodShape) -> tuple[Floats, Floats, Floats, Floats]:
+    return shape.position, shape.rotation, shape.curvature, shape.arclength
 
 
 def unknown_clearance(n: int, n_points: int) -> Clearance:

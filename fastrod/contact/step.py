@@ -16,9 +16,10 @@ import numpy as np
 
 from fastrod.contact.engine import Engine
 from fastrod.contact.frames import blended, longest_move
+from fastrod.contact.progress import Damping, Progress
 from fastrod.contact.trouble import NO_CONTACT_LEFT, NO_NODE_LEFT
 from fastrod.kernels.batch import iterate_parallel, iterate_serial
-from fastrod.kernels.contact.iteration import AT_REST, GOES_ON, INSIDE, LOST, MOVES, UNSOLVED
+from fastrod.kernels.contact.iteration import AT_REST, BACK, GOES_ON, INSIDE, LOST, MOVES, UNSOLVED
 from fastrod.kernels.contact.problem import contact_problem
 from fastrod.kernels.contact.proximity import search_work
 from fastrod.types import ContactMotion, ContactRows, Flags, Floats, Ints, PointLoads, Ports, RodShape
@@ -26,13 +27,15 @@ from fastrod.types import ContactMotion, ContactRows, Flags, Floats, Ints, Point
 COLD_ITERATIONS = 2000
 """Iterations of a robot that begins from nothing: its whole load, where a step brings a fraction."""
 _BLOCK = 2048  # robots whose linear models are held at once: 40 MB with 16 contacts each
-# and twice as many for a robot that moves by less than this fraction of its length
-_MOST_ITERATIONS, _NEARLY = 16, 1e-4
+_MOST_ITERATIONS = 16  # and more for a robot that comes closer to rest
+_NEARLY = 1e-4  # of the length
+# as many times the iterations are the end; iterations in a row that came no closer: it goes in circles
+_LONGEST, _IDLE = 4, 6
 _MOST_INSIDE = 8  # iterations in a row with the centreline inside of an obstacle: the step was too long
 _SMALLEST_FRACTION = 1.0 / 64.0
 # of the inputs: below it a failure is taken for the loss of the equilibrium, not for too long a step
 _HARD = 1.0 / 4.0
-_DAMPING, _MOST_DAMPED, _DAMPED_TRIES = 1.5, 60, 6
+_MOST_DAMPED, _DAMPED_TRIES, _MOST_REFUSED = 150, 10, 12
 _WANDERS = 1e-2  # of the length: a robot that moves by less goes around a place where it may come to rest
 # iterations in a row without forces that obey the law: the hold is lost, and plain ones do not bring it back
 _UNSOLVED = 6
@@ -41,10 +44,15 @@ _UNSOLVED = 6
 class ContactSolver(Protocol):
     """What contact needs of the rods' solver; `fastrod.solver.contact_solver` is the one that there is."""
 
-    x: Floats
-    """(n_robots, n_x) boundary unknowns: contact changes them, and puts back what it does not keep."""
-    used: Ints
-    """(n_robots,) passes that each robot has taken in this step."""
+    @property
+    def x(self) -> Floats:
+        """(n_robots, n_x) boundary unknowns: contact changes them, and puts back what it does not keep."""
+        ...
+
+    @property
+    def used(self) -> Ints:
+        """(n_robots,) passes that each robot has taken in this step."""
+        ...
 
     def run_free(self, rows: Ints, ports: Ports, into: RodShape, *, settle: bool = False) -> Flags:
         """A step without contact, or with `settle` from the cold guess until at rest; (n_robots,) which of
@@ -152,7 +160,7 @@ class ContactStep:
             engine.clearance.distance[elsewhere] -= moved[elsewhere, None]
             ports = self.end if start is None or (aim[left] >= 1.0).all() else blended(start, self.end, aim)
             motion = engine.motion(self.shape, self.tolerance, done, aim)
-            rest, unheld = self._settle(left, ports, motion, _MOST_ITERATIONS)
+            rest, unheld = self._settle(left, ports, motion)
             wanders = (engine.trouble["cause"] == MOVES) & (
                 engine.trouble["distance"] < _WANDERS * engine.rods.length
             )
@@ -165,8 +173,8 @@ class ContactStep:
                     used[hard],
                     contact[hard],
                 )
-                damped = engine.motion(self.shape, self.tolerance, done, aim, _DAMPING)
-                rest |= self._settle(hard, ports, damped, _MOST_DAMPED)[0]
+                damped = engine.motion(self.shape, self.tolerance, done, aim)
+                rest |= self._descend(hard, ports, damped, tries)
             good, bad = left[rest[left]], left[~rest[left]]
             trouble[bad] = engine.trouble[bad]
             done[good] = aim[good]
@@ -190,35 +198,88 @@ class ContactStep:
                 now[lost] = then[lost]
         return arrived, done
 
-    def _settle(self, rows: Ints, ports: Ports, motion: ContactMotion, most: int) -> tuple[Flags, Flags]:
+    def _settle(self, rows: Ints, ports: Ports, motion: ContactMotion) -> tuple[Flags, Flags]:
         """Pass and law in turn on these inputs; (n_robots,) which came to rest, and which were given up as no
         forces hold them."""
         engine, trouble, rods = self.engine, self.engine.trouble, self.engine.rods
         rest = np.zeros(len(trouble), bool)
-        unsolved, inside = np.zeros(len(rest), np.int64), np.zeros(len(rest), np.int64)
-        still, plain = rows, motion.damping == 0.0
-        for count in range(2 * most if plain else 3 * most):
-            status = np.zeros(len(still), np.int64)
-            for block, n_loads in self._blocks(still):
-                status[block] = self._iterate(still[block], n_loads, ports, motion)
+        unsolved, inside = (np.zeros(len(rest), np.int64) for _ in range(2))
+        progress, still = Progress(len(rest)), rows
+        for count in range(_LONGEST * _MOST_ITERATIONS):
+            status = self._iterate_all(still, ports, motion)
             rest[still[status == AT_REST]] = True
             unsolved[still] = np.where(trouble["cause"][still] == UNSOLVED, unsolved[still] + 1, 0)
             deep = engine.tracked[still] & (
                 engine.clearance.gap[still] < -rods.radius[still].max(1) - _NEARLY * rods.length[still]
             )
             inside[still] = np.where(deep, inside[still] + 1, 0)
-            hopeless = (inside >= (_MOST_INSIDE if plain else 3 * _MOST_INSIDE)) | (
-                plain & (unsolved >= _UNSOLVED)
-            )
-            if count >= most - 1:  # go on with what has nearly come to rest
-                hopeless |= ~(
-                    (trouble["distance"] < _NEARLY * rods.length) & np.isin(trouble["cause"], (MOVES, INSIDE))
-                )
+            hopeless = (inside >= _MOST_INSIDE) | (unsolved >= _UNSOLVED)
+            progress.note(still, trouble["from_rest"][still])
+            if count >= _MOST_ITERATIONS - 1:  # go on with what comes closer to rest
+                hopeless |= progress.idle >= _IDLE
             still = still[(status != AT_REST) & (status != LOST) & ~engine.whole_worlds(hopeless)[still]]
             if not len(still):
                 break
         self._count_contacts(rows[~rest[rows]], ports)
         return rest, unsolved >= _UNSOLVED
+
+    def _descend(self, rows: Ints, ports: Ports, motion: ContactMotion, tries: Ints) -> Flags:
+        """The same where no equilibrium is near, damped: down in energy to one, in iterations that go through
+        nothing; (n_robots,) which came to rest. One that goes through something, or finds no forces, is taken
+        back; `tries` counts this one."""
+        engine, solver, contacts, n = (
+            self.engine,
+            self.solver,
+            self.engine.contact_set,
+            len(self.engine.tracked),
+        )
+        rest, still, trouble = np.zeros(n, bool), rows, engine.trouble
+        progress, damping = Progress(n), Damping(motion.damping, rows, tries)
+        frames = np.broadcast_to(motion.frames, (n, *motion.frames.shape[1:]))
+        frames_before = np.array(np.broadcast_to(motion.frames_before, frames.shape))
+        before = [
+            np.array(motion.position_before),
+            np.array(motion.rotation_before),
+            np.array(motion.curvature_before),
+            np.array(motion.arclength_before),
+        ]
+        motion = motion._replace(
+            frames_before=frames_before,
+            position_before=before[0],
+            rotation_before=before[1],
+            curvature_before=before[2],
+            arclength_before=before[3],
+        )
+        x, used, contact = solver.x.copy(), contacts.used.copy(), contacts.contact.copy()
+        for count in range(_LONGEST * _MOST_DAMPED):
+            here = solver.x[still].copy(), contacts.used[still].copy(), contacts.contact[still].copy()
+            status = self._iterate_all(still, ports, motion)
+            rest[still[status == AT_REST]] = True
+            away, on = still[status == BACK], still[status != BACK]
+            solver.x[away], contacts.used[away], contacts.contact[away] = x[away], used[away], contact[away]
+            x[on], used[on], contact[on] = (a[status != BACK] for a in here)
+            for last, now in zip(before, self.shape[:4], strict=True):
+                last[on] = now[on]
+            frames_before[on] = frames[on]
+            progress.note(on, trouble["from_rest"][on])
+            damping.note(on, trouble["from_rest"][on])
+            damping.refuse(away)
+            hopeless = damping.refused >= _MOST_REFUSED
+            hopeless[away] |= used[away] == 0  # what touches nothing is not damped
+            if count >= _MOST_DAMPED - 1:
+                hopeless |= progress.idle >= 2 * _IDLE
+            still = still[(status != AT_REST) & (status != LOST) & ~engine.whole_worlds(hopeless)[still]]
+            if not len(still):
+                break
+        self._count_contacts(rows[~rest[rows]], ports)
+        return rest
+
+    def _iterate_all(self, rows: Ints, ports: Ports, motion: ContactMotion) -> Ints:
+        """One pass and one round of the law for the worlds of `rows`; their status."""
+        status = np.zeros(len(rows), np.int64)
+        for block, n_loads in self._blocks(rows):
+            status[block] = self._iterate(rows[block], n_loads, ports, motion)
+        return status
 
     def _blocks(self, rows: Ints) -> Iterator[tuple[Ints, int]]:
         """Rows of worlds that are solved together, and the contacts that each has room for: worlds with as
@@ -256,7 +317,8 @@ class ContactStep:
         body(each, engine.rods, engine.surfaces, motion, contacts, loads, problem, search)
         for r in np.flatnonzero(homeless.any(1)):  # more contacts than nodes: one without has not been felt
             c = contact[r, homeless[r].argmax()]
-            engine.trouble[rows[r]] = NO_NODE_LEFT, c.obstacle, c.arclength, 0.0
+            far = engine.trouble["from_rest"][rows[r]]
+            engine.trouble[rows[r]] = NO_NODE_LEFT, c.obstacle, c.arclength, 0.0, far
             status[r] = LOST if status[r] == LOST else GOES_ON
         return status
 

@@ -1,5 +1,5 @@
-"""Inverse by learning: the wire lengths with which the tip, as it is measured through all effects of a robot,
-follows a path."""
+"""Inverse by iterative learning: the tendon lengths with which the tip, as measured through all effects of a
+robot, follows a path."""
 
 from __future__ import annotations
 
@@ -34,15 +34,16 @@ _SMOOTHEST = 8  # averages over neighbours; a correction that makes it worse is 
 @final
 @dataclass(frozen=True, kw_only=True, eq=False)
 class InversePlan:
-    """What to tell a robot, sample after sample, and where it then goes. The first `n_approach` rows lead to
+    """Commands of a robot, sample after sample, and the predicted motion. The first `n_approach` rows lead to
     the path."""
 
     robot: Robot
-    """Whose plan it is."""
+    """Name of the robot that the plan is for."""
     t: Floats
     """(n,) when to send each row, from 0 [s]."""
     dl: Floats
-    """(n, n_tendons) change of each wire's length against the straight rest robot [m], negative = pulled."""
+    """(n, n_tendons) change of each tendon's length against the straight rest robot [m], negative =
+    pulled."""
     ext: Floats
     """(n, n_segments) change of each segment's length [m]."""
     target: Floats
@@ -50,7 +51,7 @@ class InversePlan:
     predicted: Floats
     """(n, 3) the tip as it is measured at t + lead, base frame [m]."""
     nearest: Floats
-    """(n, 3) points in reach that are nearest to the path, base frame [m]; nan in the approach."""
+    """(n, 3) points of the workspace that are nearest to the path, base frame [m]; nan in the approach."""
     lead: float
     """So much earlier than the path each row is sent: the robot's latency [s]."""
     n_approach: int
@@ -58,9 +59,9 @@ class InversePlan:
     rms_predicted: float
     """Root mean square distance of the predicted tip from the path [m]."""
     rms_nearest: float
-    """That of the nearest points in reach [m]: no plan is better."""
+    """That of the nearest points of the workspace [m]: no plan is better."""
     rms_distance: float
-    """That of the predicted tip from the nearest points in reach [m]."""
+    """That of the predicted tip from the nearest points of the workspace [m]."""
     rollouts: int
     """Simulations of the whole sequence that were spent."""
 
@@ -82,26 +83,26 @@ def plan(
     rollouts: int = 15,
     tolerance: float = 1e-6,
 ) -> InversePlan:
-    """The plan for a tip that is to be measured at `target` (n, 3), base frame [m], one row each 1 / `rate`
-    [Hz].
+    """Return the plan for a tip that is to be measured at `target` (n, 3), base frame [m], one row each 1 /
+    `rate` [Hz].
 
     Effects of the robot's file are all in: sensing decides where the tip is measured, memory (backlash,
-    friction, creep ...) how the wires lead it there; the robot begins at rest. A latency is led by sending
-    earlier (`InversePlan.lead`). A robot with two coordinates reaches a surface only; the tip then goes to
-    the points of it that are nearest to the path.
+    friction, creep ...) how the tendons move it there; the robot begins at rest. A latency is compensated by
+    sending earlier (`InversePlan.lead`). A robot with two coordinates reaches a surface only; the tip then
+    goes to the points of it that are nearest to the path.
 
-    `start` (n_tendons,) wire lengths where the robot stands [m], None for straight; from there it takes
+    `start` (n_tendons,) tendon lengths where the robot stands [m], None for straight; from there it takes
     `approach` seconds to the first row of the path, at rest at both ends; with 0 s it begins on the path.
-    `limit` [m] is the largest displacement (`SegmentActions`), None for a bend of half a turn; extensions
-    stay within each segment's range. Method: the whole sequence is simulated; then every displacement is
+    `limit` [m] is the largest displacement (`SegmentActions`), None for a bend of 180 degrees; extensions
+    stay within each segment's range.
+    Method: the whole sequence is simulated; then every displacement is
     corrected by `gain` times what, on the robot without effects of actuation, leads from the measured tip to
-    the path, and so on, until no correction is above `tolerance` [m], for at most
-    `rollouts` simulations. A correction that made it worse (one that rings) is taken back, and made smoother
-    in time; the best is kept. What rings slowly (`dynamics` of a period of many samples) is mended in part
-    only. Source: iterative learning control (Arimoto, Kawamura and Miyazaki 1984), here on the model.
-    Raises `InputError` on what is not such a path or number, where the robot's shape is not found, and where
-    a wire would move faster than `rate_limit` [m/s]; `RobotError` where the robot is not one for
-    `SegmentActions`.
+    the path, and so on, until no correction is above `tolerance` [m], for at most `rollouts` simulations. A
+    correction that made it worse (one that rings) is taken back, and made smoother in time; the best is kept.
+    What rings slowly (`dynamics` of a period of many samples) is corrected only partly. Source: iterative
+    learning control (Arimoto, Kawamura and Miyazaki 1984), here on the model. Raises `InputError` on what is
+    not such a path or number, where the robot's shape is not found, and where a tendon would move faster than
+    `rate_limit` [m/s]; `RobotError` where the robot is not one for `SegmentActions`.
     """
     path = _path(target)
     for name, value, unit in (("rate", rate, "Hz"), ("gain", gain, ""), ("tolerance", tolerance, "m")):
@@ -182,29 +183,29 @@ class _Drive:
         self.unit: Floats = np.array(bend)[free]
         """(n_q,) displacement of one radian [m]."""
         self.matrix: Floats = actions.matrix[:, free]
-        """(n_tendons + n_segments, n_q) d(wire length, extension)/d(q)."""
+        """(n_tendons + n_segments, n_q) d(tendon length, extension)/d(q)."""
 
     def inputs(self, q: Floats) -> Floats:
-        """(n, n_tendons + n_segments) changes of wire length and of segment length of coordinates (n, n_q)
+        """(n, n_tendons + n_segments) changes of tendon length and of segment length of coordinates (n, n_q)
         [m]."""
         return np.asarray(q @ self.matrix.T)
 
     def coordinates(self, start: ArrayLike | None) -> Floats:
-        """(n_q,) of wire lengths (n_tendons,). Raises `InputError` where they are of no displacement."""
+        """(n_q,) of tendon lengths (n_tendons,). Raises `InputError` where they are of no displacement."""
         n = self.robot.n_tendons
         if start is None:
             return np.zeros(len(self.low))
         try:
             dl = np.asarray(start, dtype=np.float64)
         except (TypeError, ValueError) as error:
-            raise InputError(f"start is {start!r}; give {n} changes of wire length [m].") from error
+            raise InputError(f"start is {start!r}; give {n} changes of tendon length [m].") from error
         if dl.shape != (n,) or not np.isfinite(dl).all():
-            raise InputError(f"start is {start!r}; give {n} changes of wire length, finite [m].")
+            raise InputError(f"start is {start!r}; give {n} changes of tendon length, finite [m].")
         q: Floats = np.asarray(np.linalg.lstsq(self.matrix[:n], dl, rcond=None)[0], dtype=np.float64)
         left = np.abs(self.matrix[:n] @ q - dl).max()
         if left > 1e-5:
             raise InputError(
-                f"start asks the wires for {left:g} m that no bend gives; pull one wire as far "
+                f"start moves the tendons by {left:g} m that no bend gives; pull one tendon as far "
                 "as its opposite gives."
             )
         if ((q < self.low - 1e-9) | (q > self.high + 1e-9)).any():
@@ -215,9 +216,9 @@ class _Drive:
 
 
 def _nearest(drive: _Drive, path: Floats) -> tuple[Floats, Floats, Floats]:
-    """(n, 3) points in reach that are nearest to `path`, (n, n_q) coordinates there of the robot without
-    effects of actuation, and (n, 3, n_q) slopes of the measured tip by them: Gauss-Newton steps, halved where
-    they lead away."""
+    """(n, 3) points of the workspace that are nearest to `path`, (n, n_q) coordinates there of the robot
+    without effects of actuation, and (n, 3, n_q) slopes of the measured tip by them: Gauss-Newton steps,
+    halved where they lead away."""
     tables = named_effects(drive.robot)
     plain = _with_effects(
         drive.robot, [name for name in tables if get_effect(name).seam is not Seam.ACTUATION]
@@ -238,19 +239,19 @@ def _nearest(drive: _Drive, path: Floats) -> tuple[Floats, Floats, Floats]:
 
     q = np.clip(np.zeros((len(path), len(drive.low))), drive.low, drive.high)
     seen = measured(q)
-    share = np.ones(len(path))
+    fraction = np.ones(len(path))
     jacobian = slopes(q)
     for _ in range(_NEWTON):
         step = _held(drive, q, jacobian, _inverse(jacobian), path - seen)
         longest = np.abs(step / drive.unit).max(axis=1)
         moved = np.clip(
-            q + (share * np.minimum(1.0, _LARGEST / np.maximum(longest, _LARGEST)))[:, None] * step,
+            q + (fraction * np.minimum(1.0, _LARGEST / np.maximum(longest, _LARGEST)))[:, None] * step,
             drive.low,
             drive.high,
         )
         there = measured(moved)
         closer = _norm(path - there) <= _norm(path - seen) + 1e-12
-        share = np.where(closer, np.minimum(1.0, 2.0 * share), 0.5 * share)
+        fraction = np.where(closer, np.minimum(1.0, 2.0 * fraction), 0.5 * fraction)
         q, seen = np.where(closer[:, None], moved, q), np.where(closer[:, None], there, seen)
         if longest.max() < 1e-7 or not (closer | (longest > 1e-6)).any():
             break
@@ -298,8 +299,8 @@ def _rollout(simulator: Simulator, drive: _Drive, q: Floats) -> Floats:
         seen[k] = simulator.measure().tip_position[0] if sensed else simulator.state.tip_position[0]
     if sensed:
         return seen
-    turn = matrix_from_quaternion(np.array([drive.robot.base_quaternion]))[0]
-    return np.asarray((seen - drive.robot.base_position) @ turn)
+    rotation = matrix_from_quaternion(np.array([drive.robot.base_quaternion]))[0]
+    return np.asarray((seen - drive.robot.base_position) @ rotation)
 
 
 def _at(simulator: Simulator, drive: _Drive, q: Floats) -> Floats:
@@ -364,9 +365,9 @@ def _check_number(name: str, value: object, unit: str, *, zero: bool) -> None:
 def _check_speed(dl: Floats, rate: float, rate_limit: float) -> None:
     speed = np.abs(np.diff(dl, axis=0)) * rate
     if speed.max() > rate_limit:
-        k, wire = np.unravel_index(int(np.argmax(speed)), speed.shape)
+        k, tendon = np.unravel_index(int(np.argmax(speed)), speed.shape)
         raise InputError(
-            f"wire {wire + 1} would move at {speed.max():.3g} m/s at {k / rate:.3g} s, beyond rate_limit "
+            f"tendon {tendon + 1} would move at {speed.max():.3g} m/s at {k / rate:.3g} s, beyond rate_limit "
             f"{rate_limit:g} m/s; "
             "give a slower path, or a longer approach."
         )

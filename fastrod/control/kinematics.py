@@ -21,8 +21,8 @@ _STRAIGHT: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 
 class BaseKinematics(Protocol):
-    """What carries a soft robot: a flange whose pose follows from coordinates of its own (`Arm` is the same
-    by another name)."""
+    """Carrier of a soft robot: a flange whose pose follows from coordinates of its own (`Arm` is the same by
+    another name)."""
 
     @property
     def n_joints(self) -> int:
@@ -66,11 +66,11 @@ class FixedBase:
 @final
 @dataclass(frozen=True)
 class MovingBase:
-    """A flange that moves along the world's axes, and turns about them where `rotates`. Raises `InputError`
+    """A flange that moves along the world's axes, and rotates about them where `rotates`. Raises `InputError`
     where `pose` is none.
 
-    q is the displacement from `pose` (3,) [m], and then the rotation vector (3,) [rad], world, that turns it
-    from there.
+    q is the displacement from `pose` (3,) [m], and then the rotation vector (3,) [rad], world, that rotates
+    it from there.
     """
 
     pose: ArrayLike = _STRAIGHT
@@ -97,7 +97,7 @@ class MovingBase:
         """(6, n_joints)."""
         jacobian = np.eye(6, self.n_joints)
         if self.rotates:
-            jacobian[3:, 3:] = _turn_by_vector(np.asarray(q[3:6], dtype=np.float64))
+            jacobian[3:, 3:] = _rotation_jacobian(np.asarray(q[3:6], dtype=np.float64))
         return jacobian
 
 
@@ -147,7 +147,7 @@ class SoftTip:
     def place(
         self, q: ArrayLike, *, base_pose: ArrayLike | None = None, settle: bool = False, **loads: Any
     ) -> State:
-        """Step the simulator once to q (n_q,) (`settle`: until it rests) and hand out its state.
+        """Step the simulator once to q (n_q,) (`settle`: until it rests) and return its state.
 
         `base_pose` (7,): the measured world_from_base, position [m] and quaternion w x y z, in the place of
         the one that follows from q. `loads` are those of `Simulator.step`: tip_force, line_force,
@@ -168,20 +168,20 @@ class SoftTip:
 
     @property
     def position(self) -> Floats:
-        """(3,) of the tip, world [m], where it was placed last. Raises `InputError` before the first
-        `place`."""
-        return np.asarray(self._placed("position")[1].tip_position[0])
+        """Return the position of the tip (3,), world [m], at the last `place`. Raises `InputError` before the
+        first `place`."""
+        return np.asarray(self._with_state("position")[1].tip_position[0])
 
     def jacobian(self, *, rotation: bool = False) -> Floats:
-        """(3, n_q) d(tip position [m]) / dq, world, where it was placed last; with `rotation` (6, n_q),
-        rotation vector [rad] below.
+        """Return the Jacobian (3, n_q) d(tip position [m]) / dq, world, at the last `place`; with `rotation`
+        (6, n_q), rotation vector [rad] below.
 
         Columns of the base: its twist moved to the tip, J_v + J_w x (tip - base), and by how much the rod
-        bends as its base turns under loads that keep their direction in the world, its weight included. Those
-        of the actions: `Simulator.jacobian` by wires and extensions, times these by actions. Raises
+        bends as its base rotates under loads that keep their direction in the world, its weight included.
+        Those of the actions: `Simulator.jacobian` by tendons and extensions, times these by actions. Raises
         `InputError` before the first `place`.
         """
-        q, state = self._placed("jacobian")
+        q, state = self._with_state("jacobian")
         jacobian = np.empty((6, self.n_q))
         n_inputs = len(self.actions.matrix)
         twist = np.asarray(self.base.jacobian(q[: self.n_base]), dtype=np.float64)
@@ -217,10 +217,10 @@ class SoftTip:
         return low.ravel(), high.ravel()
 
     def finite_differences(self, q: ArrayLike, step: float = 1e-4, **loads: Any) -> Floats:
-        """(3, n_q) the paper's way to the same (SoftManiSim, CoRL 2024): central differences of the settled
-        tip, a column after the other, by `step` [m or rad]; one-sided at an end of an extension's range, zero
-        where there is no range. The simulator is left as it was. Raises `InputError`, also where an end does
-        not settle."""
+        """Return the same (3, n_q) by the paper's method (SoftManiSim, CoRL 2024): central differences of the
+        settled tip, a column after the other, by `step` [m or rad]; one-sided at an end of an extension's
+        range, zero where there is no range. The simulator is left as it was. Raises `InputError`, also where
+        an end does not settle."""
         q = self._read(q)
         if not isinstance(step, (int, float, np.floating)) or not (math.isfinite(step) and step > 0.0):
             raise InputError(f"step is {step!r}; it must be a number, positive and finite.")
@@ -285,7 +285,7 @@ class SoftTip:
             raise InputError(f"q holds a value that is not finite: {found}.")
         return found
 
-    def _placed(self, what: str) -> tuple[Floats, State]:
+    def _with_state(self, what: str) -> tuple[Floats, State]:
         if self._q is None or self._state is None:
             raise InputError(f"{what} needs a placed robot; call place first.")
         return self._q, self._state
@@ -296,7 +296,7 @@ def _cross(a: Floats, b: Floats) -> Floats:
     return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
-def _turn_by_vector(v: Floats) -> Floats:
+def _rotation_jacobian(v: Floats) -> Floats:
     """(3, 3) world rotation by the change of a rotation vector: I + (1 - cos a) / a^2 [v] + (a - sin a) / a^3
     [v]^2, the left Jacobian of SO(3)."""
     a = float(np.linalg.norm(v))

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from fastrod.errors import InputError
 from fastrod.types import Flags, Floats
 
-_RANK = 1e-9  # of the largest singular value: below it, no coordinate moves the task that way
+_RANK = 1e-9  # of the largest singular value: below it, no coordinate moves the task in that direction
 _ROOM = 1e-12  # of a rate: nearer to its limit is at it
 
 
@@ -24,7 +24,8 @@ class ResolvedRate:
 
     J# is the pseudo-inverse of least sum of weight q_dot^2. Near a singularity, where the smallest singular
     value s of the weighted Jacobian is below `threshold`, it is damped by l^2 = (1 - (s / threshold)^2)
-    damping^2: s / (s^2 + l^2) in the place of 1 / s. Source: Whitney 1969 (resolved rates); Nakamura and
+    damping^2: s / (s^2 + l^2) in the place of 1 / s.
+    Source: Whitney 1969 (resolved rates); Nakamura and
     Hanafusa 1986, Maciejewski and Klein 1988 (damping near a singularity alone); Flacco, De Luca and Khatib
     2012 (saturation in the null space).
 
@@ -120,9 +121,9 @@ class ResolvedRate:
         `q` (n_q,); `jacobian` (m, n_q) of the task by q; `error` (m,) goal minus task [m]; `feedforward` (m,)
         velocity of the goal [m/s]. |q_dot| stays within `rate`, and q + dt q_dot within `lower` and `upper`;
         a q that is outside comes back, as fast as its rate allows. A coordinate that would leave its limits
-        is held at them and the others take over its part; where they cannot, the task is scaled: its
-        direction is kept, where any motion that way is left. The posture gives way first. Raises
-        `InputError` on wrong shapes and on what is not finite.
+        is held at them and the others compensate; where they cannot, the task is scaled: its direction is
+        kept, where any motion in it is left. The posture is given up first. Raises `InputError` on wrong
+        shapes and on what is not finite.
         """
         q, J, error, feedforward = (
             np.asarray(a, dtype=np.float64) for a in (q, jacobian, error, feedforward)
@@ -176,7 +177,7 @@ class ResolvedRate:
         return low, high
 
     def _inverse(self, J: Floats, active: Flags | None, projector: bool) -> tuple[Floats, Floats | None]:
-        """(n_q, m) weighted pseudo-inverse, damped, or undamped by the coordinates `active`; where asked for,
+        """(n_q, m) weighted pseudo-inverse, damped, or undamped by the coordinates `active`; where requested,
         (n_q, n_q) projector on the null space."""
         root = self._root if active is None else active * (1.0 if self._root is None else self._root)
         u, s, vt = np.linalg.svd(J if root is None else J * root, full_matrices=False)
@@ -203,9 +204,9 @@ class ResolvedRate:
         return inverse, root[:, None] * free * back
 
     def _saturated(self, J: Floats, task: Floats, wish: Floats | None, low: Floats, high: Floats) -> Floats:
-        """The coordinate that limits the task most goes to its limit and leaves its part to the others, until
-        all are within theirs; failing that, the set that can do the largest share of the task (Flacco 2012,
-        algorithm 1). Then the posture, the same way."""
+        """Saturate the coordinate that limits the task most and let the others compensate, until all are
+        within their limits; failing that, keep the set that can do the largest fraction of the task (Flacco
+        2012, algorithm 1). Then do the same for the posture."""
         active, fixed = np.ones(len(low), dtype=bool), np.zeros(len(low))
         best_scale, best, best_active = -1.0, np.clip(0.0, low, high), ~active
         goal = np.linalg.norm(task)
@@ -216,7 +217,7 @@ class ResolvedRate:
                 J @ rest
             ) > 1e-6 * np.linalg.norm(J @ fixed):
                 break  # those that are left cannot
-            scale, worst = _share(by_task, rest, low, high, active)
+            scale, worst = _step_fraction(by_task, rest, low, high, active)
             if scale > best_scale:
                 best_scale, best, best_active = scale, scale * by_task + rest, active.copy()
             if scale >= 1.0 or worst < 0:
@@ -225,17 +226,17 @@ class ResolvedRate:
         rates, active = np.clip(best, low, high), best_active
         while wish is not None and active.any():
             step = cast(Floats, self._inverse(J, active, True)[1]) @ (wish - rates)
-            share, worst = _share(step, rates, low, high, active)
-            rates = rates + max(share, 0.0) * step
-            if share >= 1.0 or worst < 0:
+            fraction, worst = _step_fraction(step, rates, low, high, active)
+            rates = rates + max(fraction, 0.0) * step
+            if fraction >= 1.0 or worst < 0:
                 break
             active[worst] = False
         return np.asarray(np.clip(rates, low, high))
 
 
-def _share(step: Floats, rest: Floats, low: Floats, high: Floats, active: Flags) -> tuple[float, int]:
-    """Largest share of the step, at most 1, with which rest + share step is within the limits, or -1, and the
-    active coordinate that limits it most, or -1."""
+def _step_fraction(step: Floats, rest: Floats, low: Floats, high: Floats, active: Flags) -> tuple[float, int]:
+    """Return the largest fraction of the step, at most 1, with which rest + fraction step is within the
+    limits, or -1, and the active coordinate that limits it most, or -1."""
     slack = _ROOM * np.maximum(1.0, np.abs(rest))
     still = np.abs(step) <= slack
     inside = (rest >= low - slack) & (rest <= high + slack)
@@ -245,10 +246,10 @@ def _share(step: Floats, rest: Floats, low: Floats, high: Floats, active: Flags)
     least = np.where(still, -np.inf, np.where(step > 0.0, *ends[::-1]))
     key = np.where(active, np.where(least > 1.0, -np.inf, most), np.inf)
     worst = int(np.argmin(key))
-    share = min(1.0, float(most.min()))
-    if share < max(0.0, float(least.max())) - _ROOM:
-        share = -1.0
-    return share, worst if key[worst] < 1.0 else -1
+    fraction = min(1.0, float(most.min()))
+    if fraction < max(0.0, float(least.max())) - _ROOM:
+        fraction = -1.0
+    return fraction, worst if key[worst] < 1.0 else -1
 
 
 def _is_number(value: object) -> bool:

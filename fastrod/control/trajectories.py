@@ -28,7 +28,7 @@ class Trajectory:
 
     name: str
     period: float
-    """Of one turn [s]; a path in the plane is then back where it began."""
+    """Of one lap [s]; a path in the plane is then back where it began."""
     center: tuple[float, float, float]
     """World [m]."""
     path: Path
@@ -78,9 +78,8 @@ def triangle(*, side: float = 0.04, period: float = 20.0, center: ArrayLike = (0
 
 
 def circle(*, radius: float = 0.2, period: float = 20.0, center: ArrayLike = (0.0, 0.0, 0.0)) -> Trajectory:
-    """A circle of this radius [m] about the center, counterclockwise from (+x, 0), one turn a period [s].
-    Source: SoftManiSim, CoRL
-    2024, its tracking experiment. Raises `InputError`."""
+    """A circle of this radius [m] about the center, counterclockwise from (+x, 0), one lap a period [s].
+    Source: SoftManiSim, CoRL 2024, its tracking experiment. Raises `InputError`."""
     _check_positive("circle", "radius", radius, "m")
     return Trajectory(
         name="circle", period=period, center=_center(center), path=lambda t: _circle(t, radius, period)
@@ -114,8 +113,8 @@ def helix(
     period: float = 20.0,
     center: ArrayLike = (0.0, 0.0, 0.0),
 ) -> Trajectory:
-    """The circle that sinks (or, `downward` False, rises) by `pitch` [m] a turn, from the height of the
-    center; a turn takes one period [s]. Source: SoftManiSim, CoRL 2024, its tracking experiment. Raises
+    """The circle that sinks (or, `downward` False, rises) by `pitch` [m] a lap, from the height of the
+    center; a lap takes one period [s]. Source: SoftManiSim, CoRL 2024, its tracking experiment. Raises
     `InputError`."""
     _check_positive("helix", "radius", radius, "m")
     rise = _rise("helix", pitch, downward, period)
@@ -135,8 +134,8 @@ def square_helix(
     period: float = 20.0,
     center: ArrayLike = (0.0, 0.0, 0.0),
 ) -> Trajectory:
-    """The square that sinks (or, `downward` False, rises) evenly by `pitch` [m] a turn, from the height of
-    the center; a turn takes one period [s]. Source: SoftManiSim, CoRL 2024, its tracking experiment. Raises
+    """The square that sinks (or, `downward` False, rises) evenly by `pitch` [m] a lap, from the height of the
+    center; a lap takes one period [s]. Source: SoftManiSim, CoRL 2024, its tracking experiment. Raises
     `InputError`."""
     _check_positive("square_helix", "side", side, "m")
     rise = _rise("square_helix", pitch, downward, period)
@@ -160,7 +159,7 @@ _KNOWN: dict[str, tuple[Callable[..., Trajectory], tuple[str, ...]]] = {
 
 def references(height: float, period: float = 9.0) -> dict[str, Trajectory]:
     """The references of the paper's real prototype (SoftManiSim, CoRL 2024, appendix H) by name: a triangle
-    and a square of 40 and 25 mm and a circle of 20 mm radius, one turn in `period` [s], in the plane `height`
+    and a square of 40 and 25 mm and a circle of 20 mm radius, one lap in `period` [s], in the plane `height`
     [m] above the base. Raises `InputError`."""
     center = (0.0, 0.0, height)
     return {
@@ -214,15 +213,15 @@ def _polygon(
 ) -> tuple[Floats, Floats]:
     """Along equal sides from corner to corner."""
     n = len(corners)
-    turns = n * t / period
-    k = np.floor(turns)
+    laps = n * t / period
+    k = np.floor(laps)
     # a corner belongs to the side that begins, also where the division fell short of the whole number by its
     # rounding
-    k += turns - k > 1.0 - 4.0 * np.spacing(np.maximum(np.abs(turns), 1.0))
-    part = np.maximum(turns - k, 0.0)[..., None]
+    k += laps - k > 1.0 - 4.0 * np.spacing(np.maximum(np.abs(laps), 1.0))
+    fraction = np.maximum(laps - k, 0.0)[..., None]
     which = k.astype(np.int64) % n
     along = directions[which]
-    return corners[which] + side * part * along, n * side / period * along
+    return corners[which] + side * fraction * along, n * side / period * along
 
 
 def _circle(t: Floats, radius: float, period: float) -> tuple[Floats, Floats]:

@@ -36,7 +36,7 @@ class Seam(Enum):
     """Where an effect enters, from motor to camera; effects act in this order."""
 
     ACTUATION = 1
-    """Between the commanded wires and those that the rod feels: `tendon_length`, `extension`, `offset`,
+    """Between the commanded tendons and those that the rod feels: `tendon_length`, `extension`, `offset`,
     `compliance`."""
     MATERIAL = 2
     """The rod itself: `stiffness`, `precurvature`."""
@@ -44,6 +44,19 @@ class Seam(Enum):
     """What pushes it: `tip_force`, `tip_moment`, `line_force`."""
     SENSING = 4
     """Between the true tip and the measured one: `tip_position`, `tip_rotation`, `points`."""
+
+
+class Signal(Enum):
+    """What an effect's residual is drawn against in a report."""
+
+    TIME = "time since the start of the run"
+    MOTION = "speed of the tip"
+    GRAVITY = "direction of gravity against the robot"
+    FORCE = "direction of the effect's own force, its parameters x, y, z, against the robot"
+    TIP = "place of the tip"
+    LAG = "the bend less its mean over the effect's `time_constant`"
+    LOOP = "commanded bend, as loops"
+    BEND = "commanded bend"
 
 
 @dataclass(frozen=True)
@@ -67,10 +80,10 @@ class Parameter:
     starts: tuple[float, ...] = ()
     """Values that a fit starts from; `typical` where not given."""
     per: Per = "robot"
-    """One value for the robot, for each segment, or for each drive (a wire, or an antagonistic pair of
-    wires)."""
-    of: Literal["", "reach", "length"] = ""
-    """Bounds, typical size and starts are multiples of this: the wires' mean distance from the backbone, or
+    """One value for the robot, for each segment, or for each drive (a tendon, or an antagonistic pair of
+    tendons)."""
+    of: Literal["", "offset", "length"] = ""
+    """Bounds, typical size and starts are multiples of this: the tendons' mean distance from the backbone, or
     the robot's length."""
     shape: bool = False
     """True: it shapes an effect whose size another parameter gives (a time constant, a width); no size of its
@@ -83,6 +96,12 @@ class Parameter:
                 f"parameter {self.name!r} has neutral value {self.neutral}; it must lie in "
                 f"its bounds {low} to {high}."
             )
+        given: str = self.of  # a law of somebody's package may say anything
+        if given not in ("", "offset", "length"):
+            old = " ('reach' is called 'offset' now)" if given == "reach" else ""
+            raise EffectError(
+                f"parameter {self.name!r} is of {given!r}; it must be 'offset', 'length' or ''{old}."
+            )
         if self.typical is None:
             span = 0.1 * (high - low)
             object.__setattr__(self, "typical", span if math.isfinite(span) and span > 0.0 else 1.0)
@@ -92,14 +111,14 @@ class Parameter:
                 self, "starts", (self.neutral + self.typical,) if not self.shape else (self.typical,)
             )
 
-    def on(self, wiring: Routing) -> Parameter:
+    def on(self, routing: Routing) -> Parameter:
         """This parameter in its unit, for one robot."""
         if not self.of:
             return self
         size = (
-            float(wiring.length.sum())
-            if self.of == "length" or not wiring.n_tendons
-            else float(wiring.reach.mean())
+            float(routing.length.sum())
+            if self.of == "length" or not routing.n_tendons
+            else float(routing.reach.mean())
         )
         assert self.typical is not None
         return Parameter(
@@ -123,8 +142,7 @@ class Parameter:
 
 @runtime_checkable
 class Effect(Protocol):
-    """What `@effect` asks of a class. Optional: `order`, `excited_by`, `confounded_with`, `synonyms`, and
-    `sweep` (see `Operator`)."""
+    """What `@effect` requires of a class. Optional: the attributes of `Law`, and `sweep` (see `Operator`)."""
 
     seam: ClassVar[Seam]
     parameters: ClassVar[tuple[Parameter, ...]]
@@ -141,46 +159,70 @@ class Effect(Protocol):
         ...
 
 
-class Static:
-    """Base of the library's effects without memory."""
+class Law:
+    """What identification and its report know of an effect; each attribute may be left out."""
 
-    excited_by: ClassVar[str] = ""
-    confounded_with: ClassVar[tuple[str, ...]] = ()
-    synonyms: ClassVar[tuple[str, ...]] = ()
     order: ClassVar[float] = 50.0
     """Place among the effects of the same seam, from the motor to the camera."""
+    synonyms: ClassVar[tuple[str, ...]] = ()
+    """Other names of it."""
+    excited_by: ClassVar[str] = ""
+    """Motion that shows it."""
+    confounded_with: ClassVar[tuple[str, ...]] = ()
+    """Effects that look alike in many logs."""
+    separated_by: ClassVar[Mapping[str, str]] = {}
+    """The run that separates it from another effect, by the other's name; either of two may say it."""
+    signal: ClassVar[Signal | None] = None
+    """What its residual is drawn against; None: what its seam suggests."""
+    least_segments: ClassVar[int] = 1
+    """A robot with fewer segments cannot show it."""
+    frequent: ClassVar[bool] = False
+    """Met on many robots: where nothing was found, its bound comes first."""
+
+
+def trait(what: Effect, name: str) -> Any:
+    """An optional attribute of an effect, one of `Law`."""
+    return getattr(what, name, getattr(Law, name))
+
+
+def signal_of(what: Effect) -> Signal:
+    """What an effect's residual is drawn against."""
+    given: Signal | None = trait(what, "signal")
+    if given is not None:
+        return given
+    if what.seam in (Seam.LOAD, Seam.SENSING):
+        return Signal.GRAVITY if what.seam is Seam.LOAD else Signal.TIP
+    return Signal.LOOP if has_memory(what) else Signal.BEND
+
+
+class Static(Law):
+    """Base of the library's effects without memory."""
 
     def memory(self, n_robots: int, n_tendons: int) -> Floats:
         """None."""
         return np.empty((n_robots, 0))
 
 
-class Operator(ABC):
-    """Base of the library's effects with a memory: operators on the wires' lengths over time.
+class Operator(Law, ABC):
+    """Base of the library's effects with a memory: operators on the tendons' lengths over time.
 
     `sweep` is the law, over many steps at once: a simulator calls it with one step, identification with a
     whole log.
     """
 
-    excited_by: ClassVar[str] = ""
-    confounded_with: ClassVar[tuple[str, ...]] = ()
-    synonyms: ClassVar[tuple[str, ...]] = ()
-    order: ClassVar[float] = 50.0
-
     @abstractmethod
-    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Routing) -> Floats:
-        """(n_robots, n_steps, n_tendons) what the wires end up at, from `dl` commanded [m] and `dt`
+    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, routing: Routing) -> Floats:
+        """(n_robots, n_steps, n_tendons) what the tendons end up at, from `dl` commanded [m] and `dt`
         (n_steps,) before each step [s].
 
-        `memory` (n_robots, m) is changed in place; nan in it means that the wires begin at rest at the first
-        step.
-        """
+        `memory` (n_robots, m) is changed in place; nan in it means that the tendons begin at rest at the
+        first step."""
         ...
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         """One step of `sweep`."""
         dl = ports.tendon_length - ports.rest_length
-        ports.shift_wires(self.sweep(values, memory, dl[:, None], np.array([dt]), ports.wiring)[:, 0] - dl)
+        ports.shift_tendons(self.sweep(values, memory, dl[:, None], np.array([dt]), ports.routing)[:, 0] - dl)
 
 
 _REGISTRY: dict[str, Effect] = {}
@@ -200,10 +242,11 @@ def effect(cls: _Class) -> _Class:
             raise EffectError(
                 f"effect {name!r} does not say its {section}; its docstring needs a line '{section}: ...'."
             )
-    for part in ("seam", "parameters", "memory", "apply"):
-        if not hasattr(cls, part):
+    for member in ("seam", "parameters", "memory", "apply"):
+        if not hasattr(cls, member):
             raise EffectError(
-                f"effect {name!r} has no {part}; an effect has seam, parameters, memory(...) and apply(...)."
+                f"effect {name!r} has no {member}; an effect has seam, parameters, memory(...) and "
+                "apply(...)."
             )
     made: Any = cls()
     if not isinstance(made.seam, Seam):
@@ -212,7 +255,7 @@ def effect(cls: _Class) -> _Class:
         raise EffectError(
             f"effect {name!r} has parameters {made.parameters!r}; give a tuple of Parameter, at least one."
         )
-    synonyms = tuple(getattr(cls, "synonyms", ()))
+    synonyms = tuple(trait(made, "synonyms"))
     for word in (name, *synonyms):
         taken = _REGISTRY.get(_SYNONYMS.get(word, word))
         if (
@@ -237,8 +280,7 @@ def effect_names() -> list[str]:
     """Names of all registered effects, from the motor to the camera."""
     load_library()
     return sorted(
-        _REGISTRY,
-        key=lambda name: (_REGISTRY[name].seam.value, getattr(_REGISTRY[name], "order", 50.0), name),
+        _REGISTRY, key=lambda name: (_REGISTRY[name].seam.value, trait(_REGISTRY[name], "order"), name)
     )
 
 
@@ -270,16 +312,16 @@ def load_library() -> None:
         plug_in.load()
 
 
-def columns(what: Effect, wiring: Routing) -> list[str]:
+def columns(what: Effect, routing: Routing) -> list[str]:
     """Names of the value columns of an effect on this robot: half_width, or half_width_1, half_width_2 ..."""
     names = []
     for parameter in what.parameters:
-        count = wiring.count(parameter.per)
+        count = routing.count(parameter.per)
         names += [parameter.name] if count == 1 else [f"{parameter.name}_{k}" for k in range(1, count + 1)]
     return names
 
 
-def read_values(name: str, given: Mapping[str, object], wiring: Routing, where: str) -> Floats:
+def read_values(name: str, given: Mapping[str, object], routing: Routing, where: str) -> Floats:
     """(n_columns,) values of an effect from its table in a robot file; a parameter that is not given is
     neutral.
 
@@ -293,9 +335,9 @@ def read_values(name: str, given: Mapping[str, object], wiring: Routing, where: 
                 f"{where}: effect {name!r} has no parameter {key!r}; {nearest(str(key), known)}"
             )
     values: list[float] = []
-    for parameter in (p.on(wiring) for p in what.parameters):
+    for parameter in (p.on(routing) for p in what.parameters):
         value = given.get(parameter.name, parameter.neutral)
-        count = wiring.count(parameter.per)
+        count = routing.count(parameter.per)
         listed: Sequence[object] = value if isinstance(value, (list, tuple)) else (value,) * count
         if len(listed) != count:
             raise EffectError(

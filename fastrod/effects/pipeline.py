@@ -58,7 +58,7 @@ def named_effects(robot: Robot) -> dict[str, dict[str, Any]]:
 
 
 def _alike(one: Routing, other: Routing) -> bool:
-    """Whether wires and segments are the same to a part in a million million."""
+    """Whether tendons and segments are the same to a part in a million million."""
     return bool(
         np.allclose(one.arms, other.arms, rtol=1e-12, atol=0.0)
         and np.allclose(one.length, other.length, rtol=1e-12, atol=0.0)
@@ -71,7 +71,7 @@ class EffectPipeline:
     def __init__(self, robots: Sequence[Robot], n_robots: int) -> None:
         """Raises `EffectError`, `UnknownNameError` for effects that are not, `RobotError` where robots name
         different ones."""
-        self.wiring = wire(robots[0])
+        self.routing = wire(robots[0])
         tables = [named_effects(robot) for robot in robots]
         for i, named in enumerate(tables):
             if list(named) != list(tables[0]):
@@ -80,9 +80,9 @@ class EffectPipeline:
                     f"{', '.join(tables[0]) or 'none'}; "
                     "name the same effects in each, with neutral values where one has none."
                 )
-            if named and robots[i] is not robots[0] and not _alike(wire(robots[i]), self.wiring):
+            if named and robots[i] is not robots[0] and not _alike(wire(robots[i]), self.routing):
                 raise RobotError(
-                    f"robot {i} of the batch has segments of other lengths or wires at other places than "
+                    f"robot {i} of the batch has segments of other lengths or tendons at other places than "
                     "robot 0; "
                     "with effects these must agree: give robots that differ there a simulator each."
                 )
@@ -96,7 +96,7 @@ class EffectPipeline:
         self.links: list[Link] = []
         for name in tables[0]:
             rows = [
-                read_values(name, named[name], self.wiring, f"robot {r.name!r}")
+                read_values(name, named[name], self.routing, f"robot {r.name!r}")
                 for named, r in zip(tables, robots, strict=True)
             ]
             values = np.broadcast_to(np.array(rows), (n_robots, len(rows[0]))).copy()
@@ -108,7 +108,7 @@ class EffectPipeline:
         return bool(self.links)
 
     def _fresh(self, what: Effect) -> Floats:
-        memory = what.memory(self.n_robots, self.wiring.n_tendons)
+        memory = what.memory(self.n_robots, self.routing.n_tendons)
         return np.empty((self.n_robots, 0)) if memory.size == 0 else memory
 
     def reset(self, rows: Any) -> None:
@@ -143,32 +143,37 @@ class EffectPipeline:
         return close_ports(opened, ports, params)
 
     def slopes(self, ports: Ports, params: Params, state: Any, dt: float, n_steps: int) -> Floats:
-        """(n_robots, n, n) d(what the rod feels) / d(what is commanded), of tendon lengths [m] then
-        extensions [m], where the robots stand; memories stay. `ports` are those before the effects."""
+        """(n_robots, n, n) d(what the rod feels) / d(what is commanded), of tendon lengths [m], or tensions
+        [N] where these are commanded, then extensions [m], where the robots stand; memories stay. `ports` are
+        those before the effects."""
 
-        def felt(length: Floats, extension: Floats) -> Floats:
+        def felt(driven: Floats, extension: Floats) -> Floats:
             links = [link._replace(memory=link.memory.copy()) for link in self.links]
-            opened = self._open(ports._replace(tendon_length=length, extension=extension), params, n_steps)
+            given = {"tendon_length": driven, "tension": driven, "extension": extension}
+            opened = self._open(ports._replace(**given), params, n_steps)
             self._apply(opened, state, 0.0 * dt, links)
-            return np.concatenate([opened.tendon_length, opened.extension], axis=1)
+            driven = np.where(self._pulled, opened.tension, opened.tendon_length)
+            return np.concatenate([driven, opened.extension], axis=1)
 
-        n_tendons = self.wiring.n_tendons
-        delta = 1e-7 * float(self.wiring.length.sum())
+        n_tendons = self.routing.n_tendons
+        step = 1e-7 * float(self.routing.length.sum())
+        driven = np.where(self._pulled, ports.tension, ports.tendon_length)
         inputs = np.concatenate(
-            [np.broadcast_to(a, (self.n_robots, a.shape[1])) for a in (ports.tendon_length, ports.extension)],
-            axis=1,
+            [np.broadcast_to(a, (self.n_robots, a.shape[1])) for a in (driven, ports.extension)], axis=1
         )
         slopes = np.empty((self.n_robots, inputs.shape[1], inputs.shape[1]))
         for j in range(inputs.shape[1]):
-            if j < n_tendons and self._pulled[j]:  # a tension: no effect changes it
-                slopes[:, :, j] = np.arange(inputs.shape[1]) == j
-                continue
-            ends = []
+            pulled = j < n_tendons and self._pulled[j]
+            delta = 1e-4 * float(params.tension_scale.min()) if pulled else step
+            ends, unchanged = [], True
             for sign in (1.0, -1.0):
                 moved = inputs.copy()
                 moved[:, j] += sign * delta
                 ends.append(felt(moved[:, :n_tendons], moved[:, n_tendons:]))
+                unchanged &= np.array_equal(ends[-1][:, j], moved[:, j], equal_nan=True)
             slopes[:, :, j] = (ends[0] - ends[1]) / (2.0 * delta)
+            if pulled and unchanged:  # exactly, where no effect changes a tension
+                slopes[:, j, j] = 1.0
         return slopes
 
     def sense(
@@ -186,7 +191,7 @@ class EffectPipeline:
         opened = open_ports(
             ports,
             params,
-            self.wiring,
+            self.routing,
             n=self.n_robots,
             rest_length=self.rest_length,
             gravity=self._felt,
@@ -198,6 +203,8 @@ class EffectPipeline:
         opened.tendon_length[:, self._pulled] = self.rest_length[self._pulled]
         for given in (
             opened.tendon_length,
+            opened.tension,
+            opened.base_pose,
             opened.extension,
             opened.tip_force,
             opened.tip_moment,

@@ -3,11 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from fastrod.model.routing import Routing
+from fastrod.rotation import product, quaternion_from_vector
 from fastrod.types import Floats, Params, Ports
+
+CHANGEABLE = (
+    "tendon_length",
+    "tension",
+    "base_pose",
+    "extension",
+    "offset",
+    "compliance",
+    "pretension",
+    "stiffness",
+    "precurvature",
+    "tip_force",
+    "tip_moment",
+    "line_force",
+)
+"""Ports that an effect before the camera may change."""
 
 
 def _none() -> Floats:
@@ -19,8 +37,8 @@ class EffectPorts:
     """The ports of a step with the robot's own numbers beside them; every array has its row axis expanded and
     may be changed in place, unless "read" is said. World frame unless said otherwise."""
 
-    wiring: Routing
-    """Read: how wires and bends hang together."""
+    routing: Routing
+    """Read: how tendons and bends hang together."""
     rest_length: Floats
     """Read: (n_tendons,) lengths of the straight rest robot [m]."""
     gravity: Floats
@@ -30,13 +48,21 @@ class EffectPorts:
     time: Floats
     """Read: (n,) since the start of the run [s]."""
     tendon_length: Floats
-    """(n, n_tendons) absolute [m]; change it through `shift_wires`, `shift_bend`."""
+    """(n, n_tendons) absolute [m]; change it through `shift_tendons`, `shift_bend`."""
     extension: Floats
     """(n, n_segments) [m]."""
     offset: Floats
-    """(n, n_segments, n_tendons, 2) wire positions in the material frame [m]."""
+    """(n, n_segments, n_tendons, 2) tendon positions in the material frame [m]."""
     compliance: Floats
     """(n, n_tendons) [m/N]."""
+    pretension: Floats
+    """(n, n_tendons) of tendons at their rest length [N]."""
+    tension: Floats
+    """(n, n_tendons) that is commanded where a segment is driven by tension [N]; nothing reads the others."""
+    base_pose: Floats
+    """(n, 7) position [m] and unit quaternion w x y z, world_from_base; change it through `move_base`.
+    `measure` goes by the base as it then stands, as a camera on it does; `base_rotation` stays that of the
+    command."""
     stiffness: Floats
     """(n, n_segments, n_k, 3) diag K, n_k 1 or 2 n_steps + 1 [N m^2]; see `resolve`."""
     precurvature: Floats
@@ -59,38 +85,49 @@ class EffectPorts:
     def __len__(self) -> int:
         return len(self.time)
 
+    def __getattr__(self, name: str) -> Any:
+        if name in (old := {"wiring": "routing", "shift_wires": "shift_tendons"}):
+            raise AttributeError(f"ports have no {name!r} any more; it is {old[name]!r}.")
+        raise AttributeError(f"ports have no {name!r}.")
+
     @property
     def dl(self) -> Floats:
-        """(n, n_tendons) wire lengths against the straight rest robot [m], a new array."""
+        """(n, n_tendons) tendon lengths against the straight rest robot [m], a new array."""
         return self.tendon_length - self.rest_length
 
     def bend(self) -> Floats:
-        """(n, n_segments, 2) bend about d1 and d2 that the wires ask for now [rad], a new array."""
-        return self.wiring.bend(self.dl)
+        """(n, n_segments, 2) bend about d1 and d2 that the tendons ask for now [rad], a new array."""
+        return self.routing.bend(self.dl)
 
     def common(self) -> Floats:
-        """(n, n_segments) change of length that the wires of a segment share, beyond that of the segment
+        """(n, n_segments) change of length that the tendons of a segment share, beyond that of the segment
         before [m]."""
-        odd = self.dl - self.wiring.wires(self.bend())
-        ends = np.zeros((len(odd), self.wiring.n_segments))
-        for k in range(self.wiring.n_segments):
-            if (own := self.wiring.tendon_segment == k).any():
+        odd = self.dl - self.routing.wires(self.bend())
+        ends = np.zeros((len(odd), self.routing.n_segments))
+        for k in range(self.routing.n_segments):
+            if (own := self.routing.tendon_segment == k).any():
                 ends[:, k] = odd[:, own].mean(1)
             elif k:
                 ends[:, k] = ends[:, k - 1]
         return np.diff(ends, axis=1, prepend=0.0)
 
     def shift_bend(self, change: Floats) -> None:
-        """Let the wires ask for another bend: (n, n_segments, 2) [rad] more."""
-        self.tendon_length += self.wiring.wires(change)
+        """Let the tendons ask for another bend: (n, n_segments, 2) [rad] more."""
+        self.tendon_length += self.routing.wires(change)
 
-    def shift_wires(self, change: Floats) -> None:
-        """Change wire lengths by (n, n_tendons) [m], the part of it that bends.
+    def shift_tendons(self, change: Floats) -> None:
+        """Change tendon lengths by (n, n_tendons) [m], the part of it that bends.
 
-        A change that all wires of a segment share would be taken up by tendons and backbone; between stiff
-        wires and an incompressible rod it would only be tension without bound.
+        A change that all tendons of a segment share would be taken up by tendons and backbone; between stiff
+        tendons and an incompressible rod it would only be tension without bound.
         """
-        self.shift_bend(self.wiring.bend(change))
+        self.shift_bend(self.routing.bend(change))
+
+    def move_base(self, shift: Floats, rotation: Floats) -> None:
+        """Move the base by (n, 3) [m] and about itself by rotation vectors (n, 3) [rad], both world: a mount
+        that gives."""
+        self.base_pose[:, :3] += shift
+        self.base_pose[:, 3:] = product(quaternion_from_vector(rotation), self.base_pose[:, 3:])
 
     def resolve(self) -> None:
         """Give `stiffness` and `precurvature` a value at every half step, n_k = 2 n_steps + 1: the kernel
@@ -117,7 +154,7 @@ def _rows(a: Floats, n: int) -> Floats:
 def open_ports(
     ports: Ports,
     params: Params,
-    wiring: Routing,
+    routing: Routing,
     *,
     n: int,
     rest_length: Floats,
@@ -128,7 +165,7 @@ def open_ports(
 ) -> EffectPorts:
     """The ports of a step with a row for each of `n` robots, ready to be changed."""
     return EffectPorts(
-        wiring=wiring,
+        routing=routing,
         rest_length=rest_length,
         gravity=np.broadcast_to(gravity, (n, 3)),
         base_rotation=np.broadcast_to(base_rotation, (n, 3, 3)),
@@ -137,6 +174,9 @@ def open_ports(
         extension=_rows(ports.extension, n),
         offset=_rows(params.offset, n),
         compliance=_rows(params.compliance, n),
+        pretension=_rows(params.pretension, n),
+        tension=_rows(ports.tension, n),
+        base_pose=_rows(ports.base_pose, n),
         stiffness=_rows(ports.stiffness, n),
         precurvature=_rows(ports.precurvature, n),
         tip_force=_rows(ports.tip_force, n),
@@ -151,6 +191,8 @@ def close_ports(opened: EffectPorts, ports: Ports, params: Params) -> tuple[Port
     return (
         ports._replace(
             tendon_length=opened.tendon_length,
+            tension=opened.tension,
+            base_pose=opened.base_pose,
             extension=opened.extension,
             stiffness=np.ascontiguousarray(opened.stiffness),
             precurvature=np.ascontiguousarray(opened.precurvature),
@@ -158,5 +200,5 @@ def close_ports(opened: EffectPorts, ports: Ports, params: Params) -> tuple[Port
             tip_moment=opened.tip_moment,
             line_force=np.ascontiguousarray(opened.line_force),
         ),
-        params._replace(offset=opened.offset, compliance=opened.compliance),
+        params._replace(offset=opened.offset, compliance=opened.compliance, pretension=opened.pretension),
     )

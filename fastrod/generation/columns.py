@@ -22,11 +22,11 @@ class Column:
     unit: str
     """SI; empty for what has none."""
     about: str
-    """What it is, in a few words."""
+    """Description in a few words."""
 
 
 class ColumnWork(Protocol):
-    """What a shard holds, and how it is made. A frozen dataclass of plain numbers and words, so that it can
+    """Content of a shard, and how it is made. A frozen dataclass of plain numbers and words, so that it can
     be written and compared."""
 
     @property
@@ -46,7 +46,7 @@ class ColumnWork(Protocol):
         ...
 
     def failed(self, columns: Sequence[Column]) -> int:
-        """How many rows (or episodes) did not succeed; they are kept, and marked."""
+        """Number of rows (or episodes) that did not succeed; they are kept, and marked."""
         ...
 
 
@@ -56,7 +56,7 @@ def several(names: Sequence[str], values: NDArray[Any], unit: str, about: str) -
 
 
 def numbered(prefix: str, values: NDArray[Any], unit: str, about: str) -> list[Column]:
-    """As `several`, of `values` (n_rows, m) named prefix_1 to prefix_m."""
+    """Return columns of `values` (n_rows, m) named prefix_1 to prefix_m."""
     return several([f"{prefix}_{k}" for k in range(1, values.shape[1] + 1)], values, unit, about)
 
 

@@ -1,4 +1,4 @@
-"""What a data set draws of its robots: parameters of effects, of the size that is seen on real robots."""
+"""Random parameters of a data set's robots: effects of the size that is seen on real robots."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def with_effects(
     """
     wiring = wire(robot)
     tables: dict[str, dict[str, Any]] = {name: dict(table) for name, table in named_effects(robot).items()}
-    told: dict[str, float] = {}
+    drawn: dict[str, float] = {}
     for effect in effects:
         table: dict[str, Any] = {}
         for parameter in (p.on(wiring) for p in get_effect(effect).parameters):
@@ -68,9 +68,9 @@ def with_effects(
             values = np.clip(centre + size, *parameter.bounds)
             table[parameter.name] = float(values[0]) if count == 1 else values.tolist()
             names = [parameter.name] if count == 1 else [f"{parameter.name}_{k}" for k in range(1, count + 1)]
-            told |= {f"{effect}.{name}": float(value) for name, value in zip(names, values, strict=True)}
+            drawn |= {f"{effect}.{name}": float(value) for name, value in zip(names, values, strict=True)}
         tables[effect] = table
-    return replace(robot, effects=tuple({"name": name, **table} for name, table in tables.items())), told
+    return replace(robot, effects=tuple({"name": name, **table} for name, table in tables.items())), drawn
 
 
 def in_ball(rng: np.random.Generator, n: int, dimension: int) -> Floats:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -25,11 +26,16 @@ ONE_THREAD = dict.fromkeys(
 _AHEAD = 2  # tasks a worker has before it, so that it never waits for the driver
 
 
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+
+
 def run_here(plan: Plan, folder: Path, todo: Sequence[int], workers: int) -> Generator[Shard, None, None]:
     """Make the shards `todo` with so many processes, in any order. Killed workers are replaced, and their
     shards made again.
 
-    An interrupt lets the shards under way of several processes be finished; the one of a single process, this
+    An interrupt lets the pending shards of several processes be finished; the one of a single process, this
     one, is dropped. Raises what a task raises, and `HostError` where every worker dies.
     """
     if workers == 1:
@@ -59,15 +65,15 @@ def _pool(plan: Plan, folder: Path, todo: Sequence[int], workers: int) -> Iterat
         pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_begin)
         try:
             coming = iter(todo)
-            under_way: set[Future[Shard]] = set()
+            pending: set[Future[Shard]] = set()
             while True:
                 for index in coming:
-                    under_way.add(pool.submit(make_shard, plan, str(folder), index))
-                    if len(under_way) >= workers * _AHEAD:
+                    pending.add(pool.submit(make_shard, plan, str(folder), index))
+                    if len(pending) >= workers * _AHEAD:
                         break
-                if not under_way:
+                if not pending:
                     return
-                ended, under_way = wait(under_way, return_when=FIRST_COMPLETED)
+                ended, pending = wait(pending, return_when=FIRST_COMPLETED)
                 broken: BrokenProcessPool | None = None
                 for future in ended:
                     if isinstance(error := future.exception(), BrokenProcessPool):
@@ -95,7 +101,7 @@ def _leave_with(sentinel: int) -> None:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """What processes that are started meanwhile find in their environment."""
+    """Set the environment of processes that are started meanwhile to one thread each."""
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(ONE_THREAD)
     try:

@@ -1,5 +1,5 @@
-"""Shards as Ray tasks: each holds one native batch, writes its file itself, and tells the driver only what it
-is called."""
+"""Shards as Ray tasks: each holds one native batch, writes its file itself, and reports only its name to the
+driver."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from fastrod.errors import HostError, InputError
-from fastrod.generation.here import ONE_THREAD
+from fastrod.generation.here import ONE_THREAD, cores
 from fastrod.generation.plan import Plan
 from fastrod.generation.shards import Shard
 
@@ -30,7 +30,7 @@ def run_on_ray(
     `local` for a new one here of
     `workers` cores. A Ray that is initialised already is used as it is, and left running.
 
-    `workers` bounds the tasks under way. A machine that is lost is no matter: its tasks go elsewhere. Raises
+    `workers` bounds the pending tasks. A machine that is lost is no matter: its tasks go elsewhere. Raises
     `HostError` where the cluster does not answer, `InputError` where a machine does not see the folder, and
     what a task raises.
     """
@@ -38,18 +38,18 @@ def run_on_ray(
         _probe(ray, folder)
         remote = ray.remote(num_cpus=1, max_retries=_RETRIES, runtime_env={"env_vars": ONE_THREAD})(_make)
         what = ray.put(plan)
-        coming, under_way = iter(todo), list[Any]()
+        coming, pending = iter(todo), list[Any]()
         try:
             while True:
                 most = workers or _AHEAD * max(1, int(ray.cluster_resources().get("CPU", 1)))
-                while len(under_way) < most and (index := next(coming, None)) is not None:
-                    under_way.append(remote.remote(what, str(folder), index))
-                if not under_way:
+                while len(pending) < most and (index := next(coming, None)) is not None:
+                    pending.append(remote.remote(what, str(folder), index))
+                if not pending:
                     return
-                ended, under_way = ray.wait(under_way, num_returns=1)
+                ended, pending = ray.wait(pending, num_returns=1)
                 yield from (Shard(*_got(ray, reference)) for reference in ended)
         finally:
-            for reference in under_way:
+            for reference in pending:
                 ray.cancel(reference, force=True)
 
 
@@ -86,7 +86,7 @@ def _cluster(address: str, workers: int | None) -> Iterator[Any]:
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
     try:
         if address == "local":
-            ray.init(num_cpus=workers or _cores(), include_dashboard=False, **quiet)
+            ray.init(num_cpus=workers or cores(), include_dashboard=False, **quiet)
         else:
             ray.init(address=address, **quiet)
     except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
@@ -101,16 +101,16 @@ def _probe(ray: Any, folder: Path) -> None:
     """Every machine writes a file; the driver must find them all. Raises `InputError`."""
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-    asked = {}
+    answers = {}
     for node in ray.nodes():
         if node["Alive"] and node["Resources"].get("CPU"):
             path = folder / f".probe-{uuid.uuid4().hex[:12]}.part"
             where = NodeAffinitySchedulingStrategy(node_id=node["NodeID"], soft=False)
-            asked[node["NodeName"]] = (
+            answers[node["NodeName"]] = (
                 path,
-                ray.remote(num_cpus=0, scheduling_strategy=where)(_touch).remote(str(path)),
+                ray.remote(num_cpus=0, scheduling_strategy=where)(_write_probe).remote(str(path)),
             )
-    for name, (path, reference) in asked.items():
+    for name, (path, reference) in answers.items():
         try:
             why = ray.get(reference, timeout=_PATIENCE)
         except ray.exceptions.RayError as error:
@@ -123,11 +123,11 @@ def _probe(ray: Any, folder: Path) -> None:
             raise InputError(
                 f"machine {name} of the cluster does not see folder "
                 f"{str(folder)!r}{f' ({why})' if why else ''}; "
-                "give --out a folder that all machines share."
+                "give --out a folder that all machines see."
             )
 
 
-def _touch(path: str) -> str:
+def _write_probe(path: str) -> str:
     """In a worker: what is wrong, or nothing."""
     try:
         Path(path).write_text("", encoding="utf-8")
@@ -140,9 +140,3 @@ def _one_line(error: BaseException) -> str:
     """The last line that says something, as a sentence."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return (lines[-1] if lines else type(error).__name__).rstrip(".") + "."
-
-
-def _cores() -> int:
-    from fastrod.generation.run import cores
-
-    return cores()

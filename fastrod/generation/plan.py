@@ -75,11 +75,11 @@ class Plan:
     @property
     def hash(self) -> str:
         """Of everything but the count: a data set may grow."""
-        told = json.dumps({**self.told(), "count": None}, sort_keys=True)
-        return hashlib.sha256(told.encode()).hexdigest()[:32]
+        record = json.dumps({**self.record(), "count": None}, sort_keys=True)
+        return hashlib.sha256(record.encode()).hexdigest()[:32]
 
-    def told(self) -> dict[str, Any]:
-        """As JSON has it."""
+    def record(self) -> dict[str, Any]:
+        """Return the plan as JSON has it."""
         return {"kind": self.kind, **asdict(self)}
 
 
@@ -100,13 +100,13 @@ def read_plan(folder: str | Path) -> Plan | None:
     if not text.strip("\0 \n"):
         return None
     try:
-        told = json.loads(text)
-        kind: Any = KINDS[told.pop("kind")]
+        record = json.loads(text)
+        kind: Any = KINDS[record.pop("kind")]
         work = {
             name: tuple(value) if isinstance(value, list) else value
-            for name, value in told.pop("work").items()
+            for name, value in record.pop("work").items()
         }
-        return Plan(work=kind(**work), **told)
+        return Plan(work=kind(**work), **record)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError, FastrodError) as error:
         raise InputError(
             f"{str(path)!r} is no plan of fastrod generate; give --out another folder."
@@ -125,7 +125,7 @@ def settle_plan(plan: Plan, folder: Path) -> None:
         any((*folder.glob("*.parquet"), *folder.glob(f"{SHARDS}/*.parquet"))),
     )
     if before is None:
-        # of an empty one, the shards themselves tell whose they are
+        # of an empty one, the shards themselves say whose they are
         if any_there and not (folder / PLAN).exists():
             raise InputError(
                 f"folder {str(folder)!r} holds Parquet files and no {PLAN}; give --out a folder of its own."
@@ -136,19 +136,19 @@ def settle_plan(plan: Plan, folder: Path) -> None:
             "--out another folder."
         )
     if before != plan:
-        part = folder / f"{PLAN}.{os.getpid()}.part"
+        partial = folder / f"{PLAN}.{os.getpid()}.part"
         try:
-            with part.open("w", encoding="utf-8") as file:
-                file.write(json.dumps(plan.told(), indent=1) + "\n")
+            with partial.open("w", encoding="utf-8") as file:
+                file.write(json.dumps(plan.record(), indent=1) + "\n")
                 file.flush()
                 os.fsync(file.fileno())
-            part.replace(folder / PLAN)
+            partial.replace(folder / PLAN)
         except OSError as error:
             raise OSError(
                 error.errno or errno.EIO, error.strerror or str(error), str(folder / PLAN)
             ) from error
         finally:
-            part.unlink(missing_ok=True)
+            partial.unlink(missing_ok=True)
 
 
 def _difference(before: Plan, now: Plan) -> str:

@@ -29,7 +29,7 @@ class Rollouts:
     env: str
     """A task's name or id."""
     policy: str = "random"
-    """Who acts: one of `POLICIES`."""
+    """Policy that acts: one of `POLICIES`."""
     options: tuple[tuple[str, Any], ...] = ()
     """Of the environment, name and value, as JSON has it. A robot, or a robot file's name, becomes the file's
     text, so that the data set hangs on no file that may change."""
@@ -125,14 +125,14 @@ class Rollouts:
             )
             act = np.clip(np.asarray(act, np.float32), -1.0, 1.0)
             seen[open_, step], done[open_, step] = observation[open_], act[open_]
-            observation, gained, terminated, truncated, told = env.step(act)
-            reward[open_, step], distance[open_, step] = gained[open_], told["distance"][open_]
-            for name, values in {**told, "terminated": terminated, "truncated": truncated}.items():
+            observation, gained, terminated, truncated, info = env.step(act)
+            reward[open_, step], distance[open_, step] = gained[open_], info["distance"][open_]
+            for name, values in {**info, "terminated": terminated, "truncated": truncated}.items():
                 if name in flags:
                     flags[name][open_, step] = values[open_]
             ended = np.flatnonzero((terminated | truncated) & open_)
             for i in ended:
-                seen[i, step + 1], length[i] = told["final_obs"][i], step + 1
+                seen[i, step + 1], length[i] = info["final_obs"][i], step + 1
             open_[ended] = False
             if not open_.any():
                 break
@@ -164,17 +164,19 @@ def _written(name: str, value: object) -> Any:
     raises."""
     from fastrod_envs.randomisation import Randomisation
 
-    told = value
+    plain = value
     if name == "randomise":
-        if isinstance(told, Randomisation):
-            told = {field.name: getattr(told, field.name) for field in fields(told)}
-        if isinstance(told, Mapping):
-            told = {**told, **({"robot": _text(told["robot"])} if "robot" in told else {})}
-            told = {key: dict(part) if isinstance(part, Mapping) else part for key, part in told.items()}
+        if isinstance(plain, Randomisation):
+            plain = {field.name: getattr(plain, field.name) for field in fields(plain)}
+        if isinstance(plain, Mapping):
+            plain = {**plain, **({"robot": _text(plain["robot"])} if "robot" in plain else {})}
+            plain = {
+                key: dict(entry) if isinstance(entry, Mapping) else entry for key, entry in plain.items()
+            }
         else:
-            told = _text(told)
+            plain = _text(plain)
     try:
-        return json.loads(json.dumps(told, allow_nan=False))
+        return json.loads(json.dumps(plain, allow_nan=False))
     except (TypeError, ValueError) as error:
         raise InputError(
             f"option {name!r} is {shown(value)}; a plan holds finite numbers, words, lists and mappings."

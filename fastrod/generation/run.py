@@ -1,11 +1,10 @@
-"""`generate`: a plan into a folder of shards; begins, goes on, or finds everything there."""
+"""`generate`: a plan into a folder of shards; begins, continues, or finds everything there."""
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
 import os
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,10 +15,10 @@ from typing import NamedTuple, final
 
 from fastrod.errors import InputError, shown
 from fastrod.generation.columns import within
-from fastrod.generation.here import run_here
+from fastrod.generation.here import cores, run_here
 from fastrod.generation.on_ray import run_on_ray
 from fastrod.generation.plan import PLAN, SHARDS, Plan, settle_plan
-from fastrod.generation.shards import counted, found, sweep_parts
+from fastrod.generation.shards import counted, found, remove_partial_files
 from fastrod.generation.tasks import missing
 
 _LOCK = ".lock"
@@ -28,7 +27,7 @@ _LOCK = ".lock"
 @final
 @dataclass(frozen=True, kw_only=True)
 class Summary:
-    """What a folder holds now, and what this run had to do with it."""
+    """Content of a folder, and what this run added."""
 
     folder: str
     kind: str
@@ -53,11 +52,6 @@ class Summary:
         return self.made_count / self.seconds if self.made else 0.0
 
 
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
-
-
 def generate(
     plan: Plan,
     folder: str | Path,
@@ -69,9 +63,9 @@ def generate(
     """Make all shards of `plan` that are not in `folder` yet, and check that every row is there once.
 
     `workers` processes here, one for each core by default; with `ray` the tasks of a cluster (`run_on_ray`),
-    by default as many as it has cores for. A run that was killed, whole or in part, is finished by the same
-    call: a shard is there whole or not at all, and is the same whoever makes it. Call it below `if __name__
-    == "__main__":`, as with every program that starts processes.
+    by default as many as it has cores for. A run that was killed is finished by the same call: a shard is
+    there whole or not at all, and is the same whichever process makes it. Call it below `if __name__ ==
+    "__main__":`, as with every program that starts processes.
 
     Raises `InputError` where the folder holds another plan, where another run writes into it, or cannot be
     written; `HostError` where workers or cluster are lost; `OSError` where the disk is full.
@@ -100,7 +94,7 @@ def generate(
             )
         settle_plan(plan, folder)
         files.mkdir(exist_ok=True)
-        sweep_parts(files)
+        remove_partial_files(files)
         whole = found(plan, files)
         todo = missing(plan, whole)
         done, made = sum(shard.units for shard in whole.values()), 0
@@ -121,7 +115,7 @@ def generate(
                         progress(plan.kind, done + made, plan.count)
             finally:
                 run.close()
-                sweep_parts(files)
+                remove_partial_files(files)
         rows = counted(plan, files)
         return Summary(
             folder=str(folder),
@@ -174,7 +168,7 @@ def _own(folder: Path) -> Iterator[Callable[[], None]]:
 
 
 class _State(NamedTuple):
-    """What a folder held before."""
+    """Content of a folder before the run."""
 
     plan: bytes | None
     files: frozenset[str] | None
@@ -189,7 +183,7 @@ class _State(NamedTuple):
         )
 
     def put_back(self, folder: Path) -> bool:
-        """Whether nothing was made; the plan is then as before."""
+        """Restore the plan and return True if nothing was made."""
         now = _State.of(folder)
         if (now.files or frozenset()) - (self.files or frozenset()):
             return False

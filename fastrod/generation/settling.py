@@ -1,9 +1,9 @@
-"""Shapes along chains of neighbouring inputs: where the last ones stood foretells the next.
+"""Shapes along chains of neighbouring inputs: the last solutions predict the next (continuation).
 
-The boundary unknowns x of a robot whose inputs move along a smooth curve are a smooth function of the place
+The boundary unknowns x of a robot whose inputs move along a smooth curve are a smooth function of arclength
 on it. A polynomial through the last four solutions is then so good a guess that one Newton pass, and one more
 with the gain of the first, which is a quarter of the work, bring the residual below the tolerance. Where they
-do not, `fastrod.solver.settle` does, from the same guess or cold.
+do not, `fastrod.solver.settle` solves it, from the same guess or cold.
 """
 
 from __future__ import annotations
@@ -84,10 +84,10 @@ class ChainSolver:
         near = shape.residual < self._near
         left, far = np.flatnonzero(near), np.flatnonzero(~near)
         n_free = len(self.layout.free_tendon)
-        for turn in range(_ROUNDS):
+        for attempt in range(_ROUNDS):
             if not len(left):
                 break
-            if turn in _ANEW:
+            if attempt in _ANEW:
                 self._passes.run(left, ports, shape, noise=_NOISE)
             before = memory.x[left, 3 : 3 + n_free]
             self._passes.run(left, ports, shape, n_col=0)

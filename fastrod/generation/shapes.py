@@ -19,7 +19,7 @@ from fastrod.rotation import matrix_from_quaternion, quaternion_from_matrix
 from fastrod.solver.inputs import Inputs
 from fastrod.types import Floats
 
-STRIDE = 0.0625
+STEP_ANGLE = 0.0625
 """Rad on each great circle between neighbours of a chain."""
 LONGEST_CHAIN = 100
 """Rows: so that no circle closes, 100 * 0.0625 rad < 2 pi."""
@@ -35,7 +35,7 @@ class Shapes:
     A row is a point on a great circle of a sphere for each of these. By Archimedes, two coordinates of a
     point even on the sphere of four dimensions are even in the disc, three of five even in the ball, one of
     three even in the interval: each row by itself is distributed exactly so, and neighbours of a chain,
-    `STRIDE` apart on every circle, are near each other. Chains are independent.
+    `STEP_ANGLE` apart on every circle, are near each other. Chains are independent.
     """
 
     robot: str = field(repr=False)
@@ -76,7 +76,7 @@ class Shapes:
             near = min((k for k in range(1, nodes + 1) if nodes % k == 0), key=lambda k: abs(k - self.points))
             raise InputError(
                 f"points is {self.points}; the rod has {nodes} steps, of which they must be an "
-                f"even part, such as {near}."
+                f"even fraction, such as {near}."
             )
 
     @property
@@ -116,28 +116,33 @@ class Shapes:
         return sum(int((~np.asarray(column.values)).sum()) for column in columns if column.name == "ok")
 
     def _inputs(self, robot: Robot, drawn: Drawn) -> Inputs:
-        turn = matrix_from_quaternion(np.array(robot.base_quaternion))
+        rotation = matrix_from_quaternion(np.array(robot.base_quaternion))
         return Inputs(
             tendon_length=robot.rest_tendon_length + drawn.dl,
             extension=drawn.extension,
-            tip_force=drawn.force @ turn.T,
+            tip_force=drawn.force @ rotation.T,
         )
 
     def _rows(self, robot: Robot, drawn: Drawn, settled: Settled) -> list[Column]:
         """One row of each lane; base frame, as in a run log."""
         shape, ok = settled
-        turn, origin = matrix_from_quaternion(np.array(robot.base_quaternion)), np.array(robot.base_position)
+        rotation, origin = (
+            matrix_from_quaternion(np.array(robot.base_quaternion)),
+            np.array(robot.base_position),
+        )
         lost = ~ok[:, None]
 
         def seen(a: Floats, kind: type = np.float32) -> np.ndarray:
-            """Nothing of a row that did not converge."""
+            """Return the columns of the outputs; nan in a row that did not converge."""
             return np.where(lost, np.nan, a).astype(kind)
 
-        tip = (shape.tip_position - origin) @ turn
+        tip = (shape.tip_position - origin) @ rotation
         quaternion = quaternion_from_matrix(
-            turn.T @ np.where(lost[:, :, None], np.eye(3), shape.tip_rotation)
+            rotation.T @ np.where(lost[:, :, None], np.eye(3), shape.tip_rotation)
         )
-        wrench = np.concatenate([shape.base_wrench[:, :3] @ turn, shape.base_wrench[:, 3:] @ turn], axis=1)
+        wrench = np.concatenate(
+            [shape.base_wrench[:, :3] @ rotation, shape.base_wrench[:, 3:] @ rotation], axis=1
+        )
         columns = numbered(
             "dl",
             drawn.dl,
@@ -159,14 +164,14 @@ class Shapes:
         )
         if self.points:
             every = (shape.position.shape[1] - 1) // self.points
-            nodes = (shape.position[:, every::every] - origin) @ turn
+            nodes = (shape.position[:, every::every] - origin) @ rotation
             for k in range(self.points):
                 names = (f"p{k + 1}_x", f"p{k + 1}_y", f"p{k + 1}_z")
                 columns += several(
                     names,
                     seen(nodes[:, k]),
                     "m",
-                    f"backbone after {k + 1} of {self.points} parts, base frame",
+                    f"backbone after {k + 1} of {self.points} sections, base frame",
                 )
         columns.append(
             Column("residual", shape.residual.astype(np.float32), "m", "largest boundary residual")
@@ -223,4 +228,4 @@ def _circle(rng: np.random.Generator, shape: tuple[int, ...]) -> tuple[Floats, F
 
 
 def _on(circle: tuple[Floats, Floats], step: int) -> Floats:
-    return np.asarray(math.cos(step * STRIDE) * circle[0] + math.sin(step * STRIDE) * circle[1])
+    return np.asarray(math.cos(step * STEP_ANGLE) * circle[0] + math.sin(step * STEP_ANGLE) * circle[1])

@@ -57,20 +57,20 @@ def write(plan: Plan, folder: Path, index: int, columns: Sequence[Column]) -> Sh
     about = {_HASH: plan.hash, _INDEX: str(index), _FAILED: str(made.failed), _UNITS: str(made.units)}
     table = arrow.Table.from_arrays(arrays, schema=arrow.schema(kinds, metadata=about))
     path = path_of(plan, folder, index)
-    part = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:12]}.part")
+    partial = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:12]}.part")
     try:
-        with part.open("wb") as file:
+        with partial.open("wb") as file:
             parquet.write_table(
                 table, file, compression="zstd", compression_level=_LEVEL, use_dictionary=False
             )
             file.flush()
             os.fsync(file.fileno())
-        os.replace(part, path)  # noqa: PTH105
+        os.replace(partial, path)  # noqa: PTH105
     except OSError as error:
         raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(path)) from error
     finally:
         with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
+            partial.unlink(missing_ok=True)
     return made
 
 
@@ -86,26 +86,28 @@ def found(plan: Plan, folder: Path) -> dict[int, Shard]:
                 raise InputError(f"{str(path)!r} is no shard of this plan; give --out a folder of its own.")
             continue
         index = int(match[1])
-        told = _told(path)
-        if told is None:
+        metadata = _metadata_of(path)
+        if metadata is None:
             continue
         if (
-            told.get(_HASH, b"").decode() != plan.hash
+            metadata.get(_HASH, b"").decode() != plan.hash
             or path != path_of(plan, folder, index)
             or index >= plan.n_shards
         ):
             raise InputError(f"{str(path)!r} is a shard of another plan; give --out a folder of its own.")
         if (
-            int(told[_INDEX]) == index
-            and int(told[_UNITS]) == len(plan.rows(index))
+            int(metadata[_INDEX]) == index
+            and int(metadata[_UNITS]) == len(plan.rows(index))
             and _index(plan, path) is not None
         ):
-            shards[index] = Shard(index, int(told[_UNITS]), int(told[b"rows"]), int(told[_FAILED]))
+            shards[index] = Shard(
+                index, int(metadata[_UNITS]), int(metadata[b"rows"]), int(metadata[_FAILED])
+            )
     return shards
 
 
-def _told(path: Path) -> dict[bytes, bytes] | None:
-    """What a file says of itself, or None where it is torn."""
+def _metadata_of(path: Path) -> dict[bytes, bytes] | None:
+    """Return the metadata of a file, or None where it is torn."""
     import pyarrow as arrow
     import pyarrow.parquet as parquet
 
@@ -130,12 +132,12 @@ def _index(plan: Plan, path: Path) -> Any:
     return table if table.column_names == names else None
 
 
-def sweep_parts(folder: Path) -> int:
+def remove_partial_files(folder: Path) -> int:
     """Remove what killed writers left half done; how many that were."""
-    parts = [path for path in folder.iterdir() if path.suffix == ".part"]
-    for path in parts:
+    partials = [path for path in folder.iterdir() if path.suffix == ".part"]
+    for path in partials:
         path.unlink(missing_ok=True)
-    return len(parts)
+    return len(partials)
 
 
 def counted(plan: Plan, folder: Path) -> int:

@@ -13,7 +13,7 @@ from fastrod.generation.shards import Shard, write
 
 
 def columns_of(plan: Plan, index: int) -> list[Column]:
-    """The columns of a shard: the same whoever makes it, and however often.
+    """Return the columns of a shard: the same in whichever process, and however often.
 
     It is drawn at full length and cut, so that a row stays what it is when the data set grows.
     """

@@ -69,7 +69,7 @@ class Trajectories:
         rng = np.random.default_rng(seed)
         plain = robot_of(self.robot)
         robots, drawn = zip(*(with_effects(plain, self.effects, rng) for _ in range(count)), strict=True)
-        turn = matrix_from_quaternion(np.array(plain.base_quaternion))
+        rotation = matrix_from_quaternion(np.array(plain.base_quaternion))
         force = self.force * in_ball(rng, count, 3)
         simulator = Simulator(
             list(robots) if self.effects else plain, count, self.dt, _POINTS, outputs="tip", threads=1
@@ -85,16 +85,16 @@ class Trajectories:
             fresh = self.bend * in_ball(rng, count * n, 2).reshape(count, n, 2)
             aim_bend = np.where(new[:, :, None], fresh, aim_bend)
             aim_extension = np.where(new, low + (high - low) * rng.random((count, n)), aim_extension)
-            way = aim_bend - bend
-            far = np.linalg.norm(way, axis=-1, keepdims=True)
-            bend = bend + way * np.minimum(1.0, self.speed * self.dt / np.maximum(far, 1e-12))
+            displacement = aim_bend - bend
+            far = np.linalg.norm(displacement, axis=-1, keepdims=True)
+            bend = bend + displacement * np.minimum(1.0, self.speed * self.dt / np.maximum(far, 1e-12))
             most = self.speed * self.dt / self.bend * (high - low)
             extension = np.clip(extension + np.clip(aim_extension - extension, -most, most), low, high)
             action = np.concatenate([extension[..., None], bend * actions.offset[:, None]], axis=-1).reshape(
                 count, -1
             )
             given = actions.inputs(action)
-            state = (simulator.step if step else simulator.settle)(**given, tip_force=force @ turn.T)
+            state = (simulator.step if step else simulator.settle)(**given, tip_force=force @ rotation.T)
             seen = simulator.measure()
             dl = given["tendon_length"] - plain.rest_tendon_length
             rows.append(
@@ -108,7 +108,7 @@ class Trajectories:
             )
             ok.append(state.ok)
         dl, ext, tip, quaternion, residual = (
-            np.stack(parts, 1).reshape(count * self.steps, -1) for parts in zip(*rows, strict=True)
+            np.stack(columns, 1).reshape(count * self.steps, -1) for columns in zip(*rows, strict=True)
         )
         good = np.stack(ok, 1).ravel()
         tip, quaternion = (np.where(good[:, None], a, np.nan) for a in (tip, quaternion))

@@ -20,12 +20,12 @@ _STARTS = 8
 
 @final
 class BulletArm:
-    """The joints from a body's base to its tip link, one after the other, each turning or sliding.
+    """The joints from a body's base to its tip link, one after the other, each revolute or prismatic.
 
     The joints of one arm are numbered in the order of `names`; joint positions q are (n_joints,) [rad], or
     [m] where a joint slides. Frames are URDF frames, not those of the centres of mass. The kinematics are
-    computed outside of PyBullet, from what it tells of the body: they hold at any q and move nothing. Joints
-    on the way to the tip that are not the arm's own are taken where they stand.
+    computed outside of PyBullet, from its data of the body: they hold at any q and move nothing. Joints on
+    the chain to the tip that are not the arm's own are taken where they stand.
     """
 
     def __init__(self, bullet: Any, body: int, tip: int | str, joints: Sequence[str] | None = None) -> None:
@@ -59,7 +59,7 @@ class BulletArm:
         self._other = [k for k in range(len(known)) if k not in self._own]
         self.n_joints = len(self.names)
         info = [b.getJointInfo(body, j) for j in self._joint]
-        free = np.array([i[8] > i[9] for i in info])  # so PyBullet marks a joint that turns without end
+        free = np.array([i[8] > i[9] for i in info])  # so PyBullet marks a continuous joint
         self.lower: Floats = np.where(free, -np.inf, [i[8] for i in info])
         """(n_joints,) limits [rad or m]; -inf where there is none."""
         self.upper: Floats = np.where(free, np.inf, [i[9] for i in info])
@@ -87,13 +87,13 @@ class BulletArm:
         `quaternion` (4,) w x y z, world. Raises `HostError` for a file that PyBullet cannot load,
         `InputError` for a pose that is none."""
         b = Bullet(bullet)
-        place, turn = _floats(position), _floats(quaternion)
-        if place.shape != (3,) or turn.shape != (4,):
+        place, orientation = _floats(position), _floats(quaternion)
+        if place.shape != (3,) or orientation.shape != (4,):
             raise InputError(
                 f"the arm's base is at {position!r}, {quaternion!r}; give position (3,) [m] "
                 "and quaternion (4,) w x y z."
             )
-        pose = _target(np.concatenate([place, turn]), "base pose", (7,))
+        pose = _target(np.concatenate([place, orientation]), "base pose", (7,))
         flags = b.URDF_USE_INERTIA_FROM_FILE
         try:
             body = b.loadURDF(
@@ -184,11 +184,11 @@ class BulletArm:
                 best, off = q, e
             if _reached(off):
                 return best
-        turn = f" and {np.linalg.norm(off[3:]):.3g} rad" if rows == 6 else ""
+        orientation = f" and {np.linalg.norm(off[3:]):.3g} rad" if rows == 6 else ""
         raise HostError(
             "no joint positions within the limits were found near q0 for the target "
             f"{np.round(to, 4).tolist()}; the best is "
-            f"{np.linalg.norm(off[:3]):.3g} m{turn} off."
+            f"{np.linalg.norm(off[:3]):.3g} m{orientation} off."
         )
 
     def _descend(self, goal: Floats, rows: int, q: Floats) -> tuple[Floats, Floats]:
@@ -307,17 +307,17 @@ def _chain(b: Bullet, body: int, tip: int) -> _Chain:
     axes, constant, sine, cosine = (list[Floats]() for _ in range(4))
     for i, link in enumerate(links):
         info = b.getJointInfo(body, link)
-        # PyBullet tells where the joint is in the parent's frame of mass, and the turn from there to the
-        # child's frame of mass inverted.
-        turn = _matrix((0.0, 0.0, 0.0), info[15]).T
-        turn[:3, :3] = turn[:3, :3] @ com[i + 1][:3, :3].T
-        turn[:3, 3] = info[14]
-        fixed = fixed @ com[i] @ turn
+        # PyBullet gives the joint's position in the parent's frame of mass, and the rotation from there
+        # to the child's frame of mass inverted.
+        orientation = _matrix((0.0, 0.0, 0.0), info[15]).T
+        orientation[:3, :3] = orientation[:3, :3] @ com[i + 1][:3, :3].T
+        orientation[:3, 3] = info[14]
+        fixed = fixed @ com[i] @ orientation
         if info[2] == b.JOINT_FIXED:
             continue
         if info[2] not in (b.JOINT_REVOLUTE, b.JOINT_PRISMATIC):
             raise HostError(
-                f"joint {info[1].decode()!r} of body {body} neither turns about one axis nor "
+                f"joint {info[1].decode()!r} of body {body} neither rotates about one axis nor "
                 "slides; an arm's joints do."
             )
         axis = com[i + 1][:3, :3] @ np.array(info[13])
@@ -331,8 +331,8 @@ def _chain(b: Bullet, body: int, tip: int) -> _Chain:
         joint.append(link)
         slides.append(info[2] == b.JOINT_PRISMATIC)
         axes.append(axis)
-        for matrices, part in ((constant, still), (sine, s), (cosine, c)):
-            matrices.append(fixed @ part)
+        for matrices, term in ((constant, still), (sine, s), (cosine, c)):
+            matrices.append(fixed @ term)
         fixed = np.eye(4)
     if not joint:
         raise HostError(
@@ -386,7 +386,7 @@ def _pose(matrix: Floats) -> Floats:
 
 
 def _floats(values: ArrayLike) -> Floats:
-    """An empty array for what are no numbers: it has no shape that is asked for."""
+    """Return an array of floats; an empty one for what are no numbers, which has no valid shape."""
     try:
         return np.asarray(values, float)
     except (TypeError, ValueError):
@@ -410,14 +410,15 @@ def _target(values: ArrayLike, name: str, *shapes: tuple[int]) -> Floats:
 
 
 def _error(goal: Floats, tip: Floats, rows: int) -> Floats:
-    """(rows,) way [m] and, of 6, rotation vector [rad] from the tip to the goal, both (4, 4), world."""
-    way = goal[:3, 3] - tip[:3, 3]
+    """Return the displacement [m] and, of 6 rows, the rotation vector [rad] (rows,) from the tip to the goal,
+    both (4, 4), world."""
+    displacement = goal[:3, 3] - tip[:3, 3]
     if rows == 3:
-        return np.asarray(way)
-    w, *turn = _quaternion(goal[:3, :3] @ tip[:3, :3].T)
-    size = math.hypot(*turn)
+        return np.asarray(displacement)
+    w, *orientation = _quaternion(goal[:3, :3] @ tip[:3, :3].T)
+    size = math.hypot(*orientation)
     scale = 2.0 * math.atan2(size, w) / size if size > 1e-12 else 2.0
-    return np.array([*way.tolist(), *(scale * t for t in turn)])
+    return np.array([*displacement.tolist(), *(scale * t for t in orientation)])
 
 
 def _reached(error: Floats) -> bool:

@@ -9,18 +9,18 @@ import numpy as np
 
 from fastrod.errors import HostError
 from fastrod.hosts.bullet import Bullet
-from fastrod.hosts.capsules import chords, turn_between
+from fastrod.hosts.capsules import chords, rotation_between
 from fastrod.hosts.link import to_xyzw
 from fastrod.types import Floats
 
 
 @final
 class RodBodies:
-    """Capsules along the backbone, their axes its chords and their cross-sections turned with it; they have
-    no mass, and move as told.
+    """Capsules along the backbone, their axes its chords and their cross-sections rotated with it; they have
+    no mass, and move as commanded.
 
     A capsule pushes what it meets with the velocity at which it moves. It never touches its own kind, nor
-    bodies it is told to `ignore`.
+    bodies given to `ignore`.
     """
 
     def __init__(
@@ -82,11 +82,11 @@ class RodBodies:
             self.bullet.resetBaseVelocity(own, [0.0] * 3, [0.0] * 3)
 
     def head_for(self, position: Floats, rotation: Floats, dt: float) -> None:
-        """Move toward these nodes so that the next step of `dt` [s] ends there: what is in the way feels the
-        velocity. `place` them afterwards, or they go on."""
-        to, turned = chords(position, rotation)
+        """Move toward these nodes so that the next step of `dt` [s] ends there: what they meet feels the
+        velocity. `place` them afterwards, or they keep moving."""
+        to, orientation = chords(position, rotation)
         linear = (to - self._position) / dt
-        angular = turn_between(self._quaternion, turned) / dt
+        angular = rotation_between(self._quaternion, orientation) / dt
         for own, v, w in zip(self.ids, linear.tolist(), angular.tolist(), strict=True):
             self.bullet.resetBaseVelocity(own, v, w)
 

@@ -58,7 +58,7 @@ class Bullet:
             raise AttributeError(f"PyBullet has no {name!r}; {nearest(name, dir(module))}") from None
         if callable(value):
             value = self._bound(name, value, module.error)
-        self.__dict__[name] = value  # asked once
+        self.__dict__[name] = value  # read once
         return value
 
     def _bound(self, name: str, function: Callable[..., Any], error: type[Exception]) -> Callable[..., Any]:

@@ -15,7 +15,7 @@ from fastrod.types import Floats
 
 
 class Image(NamedTuple):
-    """What a camera sees; rows from the top, columns from the left."""
+    """Picture of a camera; rows from the top, columns from the left."""
 
     rgb: NDArray[np.uint8]
     """(height, width, 3) red, green, blue."""
@@ -27,7 +27,7 @@ class Image(NamedTuple):
 
 
 class CameraView(NamedTuple):
-    """Where a camera stands and where it looks, world."""
+    """Position and target of a camera, world."""
 
     eye: ArrayLike
     """(3,) optical centre [m]."""
@@ -42,7 +42,7 @@ class HostCamera:
     """A pinhole camera. It draws on the CPU (PyBullet's TinyRenderer), so it needs neither a display nor a
     graphics card.
 
-    >>> Camera(width=64, height=48).fov
+    >>> HostCamera(width=64, height=48).fov
     60.0
     """
 
@@ -53,9 +53,9 @@ class HostCamera:
     fov: float = 60.0
     """Vertical angle of view [deg]."""
     near: float = 0.01
-    """Nothing nearer along the optical axis is drawn [m]."""
+    """Nearest distance along the optical axis that is drawn [m]."""
     far: float = 5.0
-    """Nothing farther along the optical axis is drawn [m]."""
+    """Farthest distance along the optical axis that is drawn [m]."""
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):

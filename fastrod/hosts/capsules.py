@@ -19,7 +19,7 @@ class Capsules(NamedTuple):
     quaternion: Floats
     """(n, 4) w x y z: z along the capsule, x as near as can be to the material's d1."""
     half_length: Floats
-    """(n,) of the straight part, without the half spheres [m]."""
+    """(n,) of the cylinder, without the half spheres [m]."""
     radius: Floats
     """(n,) [m]."""
     velocity: Floats
@@ -60,14 +60,16 @@ def moved(before: Capsules, after: Capsules, time: float) -> Capsules:
     """`after` with the velocity that leads there from `before` within a time [s]."""
     linear = (after.center - before.center) / time
     return after._replace(
-        velocity=np.concatenate([linear, turn_between(before.quaternion, after.quaternion) / time], axis=-1)
+        velocity=np.concatenate(
+            [linear, rotation_between(before.quaternion, after.quaternion) / time], axis=-1
+        )
     )
 
 
-def turn_between(before: Floats, after: Floats) -> Floats:
+def rotation_between(before: Floats, after: Floats) -> Floats:
     """(..., 3) rotation vector, world, from one set of quaternions (..., 4) to the next."""
-    turn = product(after, before * [1.0, -1.0, -1.0, -1.0])
-    turn = np.where(turn[..., :1] < 0.0, -turn, turn)
-    size = np.linalg.norm(turn[..., 1:], axis=-1, keepdims=True)
-    angle = 2.0 * np.arctan2(size, turn[..., :1])
-    return np.asarray(np.where(size > 1e-12, angle / np.maximum(size, 1e-12), 2.0) * turn[..., 1:])
+    relative = product(after, before * [1.0, -1.0, -1.0, -1.0])
+    relative = np.where(relative[..., :1] < 0.0, -relative, relative)
+    size = np.linalg.norm(relative[..., 1:], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(size, relative[..., :1])
+    return np.asarray(np.where(size > 1e-12, angle / np.maximum(size, 1e-12), 2.0) * relative[..., 1:])

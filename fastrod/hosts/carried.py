@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
+import functools
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from typing import Any, final
+from collections.abc import Callable, Sequence
+from typing import Any, ParamSpec, TypeVar, final
 
 import numpy as np
 
 from fastrod.contact import ContactScene
 from fastrod.errors import HostError, InputError, nearest
+from fastrod.hosts.body_contact import BodyContact
 from fastrod.hosts.host import Host
 from fastrod.hosts.rod import INPUTS, Rod
-from fastrod.hosts.touching import BodyContact
 from fastrod.model.robot import Robot
 from fastrod.simulator import Simulator
 from fastrod.solver.state import State
 from fastrod.types import Floats
 
+P = ParamSpec("P")
+T = TypeVar("T")
+
 
 class CarriedRod(ABC):
-    """One rod on one body of an engine, both ways: the body's motion moves the rod's base, the body feels the
-    base's wrench.
+    """One rod on one body of an engine, coupled in both directions: the body's motion moves the rod's base,
+    the body feels the base's wrench.
 
     Bodies that the rod touches are its obstacles: contact bends the rod, its host feels the force, and the
     body is pushed with it. Any other body meets the rod's capsules. The rod's weight is that in the gravity
@@ -31,7 +35,7 @@ class CarriedRod(ABC):
     each.
     """
 
-    touched: Sequence[BodyContact]
+    body_contacts: Sequence[BodyContact]
     rod: Rod
     """The rod itself, without the engine."""
 
@@ -81,7 +85,7 @@ class CarriedRod(ABC):
 
     @abstractmethod
     def _forget(self) -> None:
-        """What the engine still has of the rod's forces is gone."""
+        """Remove the rod's forces that the engine still has."""
 
     @final
     @property
@@ -91,7 +95,7 @@ class CarriedRod(ABC):
 
     @final
     def settle(self, **inputs: Any) -> State:
-        """Bring the rod to rest where its host is now; inputs as for `step`. The host feels nothing yet."""
+        """Settle the rod where its host is now; inputs as for `step`. The host feels nothing yet."""
         inputs = _checked(inputs)
         self.state = self.rod.settle(self._host.motion().pose, **self._scene(), **self._loads(inputs))
         self._accepted(inputs)
@@ -100,10 +104,10 @@ class CarriedRod(ABC):
 
     @final
     def step(self, **inputs: Any) -> State:
-        """One step of rod and world together.
+        """Do one step of rod and world together.
 
         Inputs as for `Simulator.step`, but base and obstacles, which the world gives; what is not given stays
-        as it was commanded last, and the wires are those of the straight robot until then.
+        as it was commanded last, and the tendons are those of the straight robot until then.
         """
         state = self.begin(**inputs)
         self._step_engine()
@@ -112,14 +116,13 @@ class CarriedRod(ABC):
 
     @final
     def begin(self, **inputs: Any) -> State:
-        """Where the rod will be at the end of the next step; its wrench goes to the host, its pushes to what
-        it touches.
+        """Compute the rod at the end of the next step; its wrench goes to the host, its pushes to what it
+        touches.
 
         A step that cannot be solved (`state.ok` is false, and `state.problems` says why) leaves the rod where
-        it came to, with half the forces of the step before; after a few in a row the rod settles anew. Raises
-        `InputError` as
-        `Simulator.step`, `HostError` where the rod is lost, where 25 steps in a row cannot be solved, or
-        where the world's time step has changed.
+        it stopped, with half the forces of the step before; after a few in a row the rod settles anew. Raises
+        `InputError` as `Simulator.step`, `HostError` where the rod is lost, where 25 steps in a row cannot be
+        solved, or where the world's time step has changed.
         """
         self._look()
         inputs = _checked(inputs)
@@ -132,14 +135,14 @@ class CarriedRod(ABC):
         self._accepted(inputs)
         if state.ok[0]:
             self.wrench = state.base_wrench[0].copy()
-            for touched in self.touched:
-                more, point = touched.push(state)
+            for contact in self.body_contacts:
+                more, point = contact.push(state)
                 self.wrench[:3] -= more[:3]
                 self.wrench[3:] -= more[3:] + np.cross(point - self.rod.base[:3], more[:3])
         else:
             self.wrench = 0.5 * self.wrench
-            for touched in self.touched:
-                touched.push_half()
+            for contact in self.body_contacts:
+                contact.push_half()
         self._host.exert(self.wrench)
         self._head_for()
         return state
@@ -159,20 +162,20 @@ class CarriedRod(ABC):
         self.rod.reset()
         self.state, self.wrench = None, np.zeros(6)
         self._forget()
-        for touched in self.touched:
-            touched.forget()
+        for contact in self.body_contacts:
+            contact.forget()
 
     def _scene(self) -> dict[str, Any]:
-        """What the rod is told of the world: its gravity, and the bodies around."""
+        """Return the rod's inputs from the world: gravity, and the bodies around."""
         world: dict[str, Any] = {"gravity": self._gravity()}
-        if not self.touched:
+        if not self.body_contacts:
             return world
         poses: dict[str, Floats] = {}
         velocities: dict[str, Floats] = {}
-        for k, touched in enumerate(self.touched):
-            p, v = touched.expected(self._shapes())
-            for name in touched.names:
-                self.simulator.set_free(name, *touched.give(), body=k)
+        for k, contact in enumerate(self.body_contacts):
+            p, v = contact.expected(self._shapes())
+            for name in contact.names:
+                self.simulator.set_free(name, *contact.mobility(), body=k)
             poses |= p
             velocities |= v
         return world | {"obstacle_pose": poses, "obstacle_velocity": velocities}
@@ -180,18 +183,19 @@ class CarriedRod(ABC):
 
 def rod_of(
     robot: Robot,
-    touched: Sequence[BodyContact],
+    body_contacts: Sequence[BodyContact],
     *,
     dt: float,
     max_contacts: int,
     points_per_segment: int,
     capsules_per_segment: int,
 ) -> Rod:
-    """The rod of a `CarriedRod` that feels what it touches. Raises `InputError`, `RobotError`."""
+    """Build the rod of a `CarriedRod` that feels what it touches. Raises `InputError`, `RobotError`."""
     scene = None
-    if touched:
+    if body_contacts:
         scene = ContactScene(
-            obstacles=[part.obstacle for body in touched for part in body.parts], max_contacts=max_contacts
+            obstacles=[shape.obstacle for body in body_contacts for shape in body.shapes],
+            max_contacts=max_contacts,
         )
     return Rod(
         robot,
@@ -214,10 +218,28 @@ def check_gravity(robot: Robot, gravity: Floats, how: str) -> None:
         )
 
 
-def check_touch(touch: object) -> None:
+def refuse_old_names(**now: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Make a function refuse keywords by their old names, with `HostError` and the name they have `now`."""
+
+    def wrap(function: Callable[P, T]) -> Callable[P, T]:
+        @functools.wraps(function)
+        def checked(*args: P.args, **kwargs: P.kwargs) -> T:
+            for old in now.keys() & kwargs.keys():
+                raise HostError(f"{old} is now {now[old]}; give {now[old]}=... instead.")
+            return function(*args, **kwargs)
+
+        return checked
+
+    return wrap
+
+
+def check_bodies(contact_bodies: object) -> None:
     """Raises `HostError` for a name, which would be read letter by letter, and for what is no sequence."""
-    if not isinstance(touch, (list, tuple, set, frozenset, range, np.ndarray)):
-        raise HostError(f"touch is {touch!r}; give a list of bodies, as touch=[{touch!r}].")
+    if not isinstance(contact_bodies, (list, tuple, set, frozenset, range, np.ndarray)):
+        raise HostError(
+            f"contact_bodies is {contact_bodies!r}; give a list of bodies, as "
+            f"contact_bodies=[{contact_bodies!r}]."
+        )
 
 
 def check_contact(relaxation: float, friction: float) -> None:

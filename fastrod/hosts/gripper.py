@@ -9,31 +9,31 @@ import numpy as np
 
 from fastrod.errors import HostError
 from fastrod.hosts.bullet import Bullet
-from fastrod.hosts.capsules import turn_between
+from fastrod.hosts.capsules import rotation_between
 from fastrod.hosts.link import to_xyzw
 from fastrod.types import Floats
 
-TOUCH = 1e-3
+CONTACT_DISTANCE = 1e-3
 """Surfaces nearer than this touch [m]: the engine's contacts stand open by some tenths of a millimetre."""
 _FINGER = (0.006, 0.02, 0.025)  # m: thickness, width, and how far it stands out before the head
 _FINGER_MASS = 0.02  # kg
 _SPEED = 0.05  # m/s at which a finger opens and closes
-_GRIP = 10.0  # N, the most that a finger pushes with
+_FINGER_FORCE = 10.0  # N, the most that a finger pushes with
 _SUCTION = 200.0  # N
 # head, fingers; PyBullet multiplies it with the other body's, 0.5 by default: rubber on anything is 1
 _FRICTION = 0.5, 2.0
 _GAIN = 0.3  # of a finger's error that its motor removes in a step
-# m/s, times the step: how far a finger is told to go beyond what stops it, so that its motor pushes in full
+# m/s, times the step: how far a finger is commanded beyond what stops it, so that its motor pushes in full
 _SQUEEZE = 0.2
 
 
 @final
 class Gripper:
-    """A sphere at the rod's tip, which moves as told, and two box fingers that slide on it along the tip's
-    d1, driven by motors.
+    """A sphere at the rod's tip, which moves as commanded, and two box fingers that slide on it along the
+    tip's d1, driven by motors.
 
     The fingers are bodies with mass: what is between them is held by friction alone, with at most 10 N a
-    finger, and stops them. Both are told the same opening, so that what is held stays in the middle.
+    finger, and stops them. Both get the same command, so that what is held stays in the middle.
     """
 
     def __init__(self, bullet: Any, radius: float, max_width: float, color: Sequence[float]) -> None:
@@ -70,8 +70,8 @@ class Gripper:
         """The head is its base, the fingers are its links 0 and 1."""
         self.links = range(-1, n)
         self.fingers = range(n)
-        self.reach = long
-        """From the tip to the fingers' ends [m]."""
+        self.length = long
+        """Distance from the tip to the fingers' ends [m]."""
         for link in self.links:
             friction = _FRICTION[link >= 0]
             b.changeDynamics(
@@ -86,11 +86,11 @@ class Gripper:
         for finger in self.fingers:
             # without it what is held creeps down, 5 mm/s with steps of 10 ms
             b.changeDynamics(self.body, finger, frictionAnchor=1)
-        self._max, self._wanted, self._told = max_width, max_width, max_width
+        self._max, self._wanted, self._commanded = max_width, max_width, max_width
         self._held = False
         for finger in self.fingers:
             b.resetJointState(self.body, finger, 0.5 * (max_width + _FINGER[0]))
-        self._tell()
+        self._command_fingers()
         self._position, self._quaternion = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
         self._suction: tuple[int, int, list[tuple[int, int]]] | None = None
 
@@ -102,12 +102,12 @@ class Gripper:
         ] * len(self.fingers)
 
     def open_to(self, fraction: float) -> None:
-        """Tell the fingers to open or close to this fraction of the largest width; they get there at 5 cm/s,
-        as time passes."""
+        """Command the fingers to this fraction of the largest width; they move there at 5 cm/s, as time
+        passes."""
         self._wanted, self._held = fraction * self._max, False
 
     def place(self, position: Floats, quaternion: Floats) -> None:
-        """Stand at rest at `position` (3,) world [m], turned by `quaternion` (4,) w x y z."""
+        """Stand at rest at `position` (3,) world [m], rotated by `quaternion` (4,) w x y z."""
         self._position, self._quaternion = position.copy(), quaternion.copy()
         self.bullet.resetBasePositionAndOrientation(
             self.body, position.tolist(), to_xyzw(quaternion).tolist()
@@ -117,36 +117,39 @@ class Gripper:
     def head_for(self, position: Floats, quaternion: Floats, dt: float) -> None:
         """Move so that the next step of `dt` [s] ends at this pose; `place` it there afterwards."""
         linear = (position - self._position) / dt
-        angular = turn_between(self._quaternion[None], quaternion[None])[0] / dt
+        angular = rotation_between(self._quaternion[None], quaternion[None])[0] / dt
         self.bullet.resetBaseVelocity(self.body, linear.tolist(), angular.tolist())
 
     def drive(self, dt: float) -> None:
-        """Before each step: tell the fingers how far to go in it."""
+        """Command the fingers' motion in the next step; call it before each."""
         if self._held and not self._touching():
             self._held = False  # what was held has gone
-        if self._held or self._told == self._wanted:
+        if self._held or self._commanded == self._wanted:
             return
         step, beyond = _SPEED * dt, max(_SQUEEZE * dt, 5e-4)
         if (
-            self._wanted < self._told
-            and self.width - self._told > 2.0 * (beyond + step / _GAIN)
+            self._wanted < self._commanded
+            and self.width - self._commanded > 2.0 * (beyond + step / _GAIN)
             and self._touching()
         ):
             self._held = True
-            self._told = self.width - 2.0 * beyond
+            self._commanded = self.width - 2.0 * beyond
         else:
-            self._told += float(np.clip(self._wanted - self._told, -2.0 * step, 2.0 * step))
-        self._tell()
+            self._commanded += float(np.clip(self._wanted - self._commanded, -2.0 * step, 2.0 * step))
+        self._command_fingers()
 
     def attach(self, others: Sequence[int]) -> int | None:
-        """Fix to the head what is nearest of what it touches and can be moved, as it stands; `others` of the
-        robot that are near pass through it while it is held. The body, or None where there is none."""
+        """Fix to the head the nearest movable body that it touches, as it stands; `others` of the robot that
+        are near pass through it while it is held. Return the body, or None where there is none."""
         self.release()
         b = self.bullet
         own = {self.body, *others}
         known = [b.getBodyUniqueId(i) for i in range(b.getNumBodies())]
         points = [
-            p for other in known if other not in own for p in b.getClosestPoints(self.body, other, TOUCH)
+            p
+            for other in known
+            if other not in own
+            for p in b.getClosestPoints(self.body, other, CONTACT_DISTANCE)
         ]
         points = [p for p in points if b.getDynamicsInfo(p[2], p[4])[0] > 0.0]
         if not points:
@@ -159,7 +162,7 @@ class Gripper:
             else b.getLinkState(body, link, computeForwardKinematics=1)[:2]
         )
         back = b.invertTransform(*b.getBasePositionAndOrientation(self.body))
-        position, turn = b.multiplyTransforms(*back, *pose)
+        position, orientation = b.multiplyTransforms(*back, *pose)
         hold = b.createConstraint(
             self.body,
             -1,
@@ -169,12 +172,12 @@ class Gripper:
             [0.0] * 3,
             position,
             [0.0] * 3,
-            turn,
+            orientation,
             [0.0, 0.0, 0.0, 1.0],
         )
         b.changeConstraint(hold, maxForce=_SUCTION)
         pairs = [(self.body, own_link) for own_link in self.links]
-        pairs += [(other, -1) for other in others if b.getClosestPoints(other, body, self.reach)]
+        pairs += [(other, -1) for other in others if b.getClosestPoints(other, body, self.length)]
         self._suction = hold, body, pairs
         self._filter(0)
         return body
@@ -195,19 +198,19 @@ class Gripper:
         self.bullet.removeBody(self.body)
 
     def _touching(self) -> bool:
-        """Whether both fingers had contact in the last step."""
+        """Return whether both fingers had contact in the last step."""
         return all(
             self.bullet.getContactPoints(bodyA=self.body, linkIndexA=finger) for finger in self.fingers
         )
 
-    def _tell(self) -> None:
+    def _command_fingers(self) -> None:
         for finger in self.fingers:
             self.bullet.setJointMotorControl2(
                 self.body,
                 finger,
                 self.bullet.POSITION_CONTROL,
-                targetPosition=0.5 * (self._told + _FINGER[0]),
-                force=_GRIP,
+                targetPosition=0.5 * (self._commanded + _FINGER[0]),
+                force=_FINGER_FORCE,
                 positionGain=_GAIN,
                 velocityGain=1.0,
                 maxVelocity=1.0,

@@ -9,7 +9,7 @@ from fastrod.types import Floats
 
 
 class Motion(NamedTuple):
-    """How a frame moves, world; several frames have an axis before."""
+    """Motion of a frame, world; several frames have an axis before."""
 
     pose: Floats
     """(7,) position [m] and quaternion w x y z, world_from_frame."""

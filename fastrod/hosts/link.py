@@ -65,12 +65,12 @@ class BulletLink:
 def link_motion(bullet: Bullet, body: int, link: int) -> Motion:
     """Of a link's URDF frame."""
     if link < 0:
-        com, turn = bullet.getBasePositionAndOrientation(body)
+        com, orientation = bullet.getBasePositionAndOrientation(body)
         linear, angular = bullet.getBaseVelocity(body)
         inertial = bullet.getDynamicsInfo(body, -1)
         # com_from_frame, for bodies whose mass is off their origin
         back = bullet.invertTransform(inertial[3], inertial[4])
-        position, quaternion = bullet.multiplyTransforms(com, turn, *back)
+        position, quaternion = bullet.multiplyTransforms(com, orientation, *back)
     else:
         state = bullet.getLinkState(body, link, computeLinkVelocity=1, computeForwardKinematics=1)
         com, position, quaternion, linear, angular = state[0], state[4], state[5], state[6], state[7]

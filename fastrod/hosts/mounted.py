@@ -9,7 +9,14 @@ import numpy as np
 
 from fastrod.errors import HostError
 from fastrod.hosts.bodies import RodBodies
-from fastrod.hosts.carried import CarriedRod, check_contact, check_gravity, check_touch, rod_of
+from fastrod.hosts.carried import (
+    CarriedRod,
+    check_bodies,
+    check_contact,
+    check_gravity,
+    refuse_old_names,
+    rod_of,
+)
 from fastrod.hosts.link import BulletLink
 from fastrod.hosts.rod import check_robot
 from fastrod.hosts.surroundings import BulletBodyContact
@@ -19,16 +26,17 @@ from fastrod.types import Floats
 
 @final
 class MountedRod(CarriedRod):
-    """One rod on a link of a PyBullet body (`CarriedRod`). Bodies that are not named in `touch` meet the
-    rod's capsules, which push them at their speed and feel nothing.
+    """One rod on a link of a PyBullet body (`CarriedRod`). Bodies that are not named in `contact_bodies` meet
+    the rod's capsules, which push them at their speed and feel nothing.
     """
 
+    @refuse_old_names(touch="contact_bodies")
     def __init__(
         self,
         robot: Robot,
         host: BulletLink,
         *,
-        touch: Sequence[int | tuple[int, int]] = (),
+        contact_bodies: Sequence[int | tuple[int, int]] = (),
         friction: float = 0.3,
         relaxation: float = 0.1,
         points_per_segment: int = 10,
@@ -37,9 +45,9 @@ class MountedRod(CarriedRod):
         color: Sequence[float] = (0.5, 0.0, 0.6, 1.0),
         head_color: Sequence[float] | None = None,
     ) -> None:
-        """`touch`: numbers of bodies, each its base alone, or (body, link); `friction` of the rod on them;
-        `relaxation` [s] of the rod against a changing contact force (`Touching`). The time step is the
-        world's. Raises `HostError`, `InputError`."""
+        """`contact_bodies`: numbers of bodies, each its base alone, or (body, link); `friction` of the rod on
+        them; `relaxation` [s] of the rod against a changing contact force (`BodyContact`). The time step is
+        the world's. Raises `HostError`, `InputError`."""
         if not isinstance(host, BulletLink):
             raise HostError(
                 f"host is {host!r}; give BulletLink(world, body, link), the link that carries the rod."
@@ -49,21 +57,21 @@ class MountedRod(CarriedRod):
         check_robot(robot)
         check_gravity(robot, self._gravity(), "setGravity() in the world")
         check_contact(relaxation, friction)
-        check_touch(touch)
-        links = [_link_of(t) for t in touch]
-        self.touched = [
+        check_bodies(contact_bodies)
+        links = [_link_of(t) for t in contact_bodies]
+        self.body_contacts = [
             BulletBodyContact(self.bullet, body, link, dt=self.dt, relaxation=relaxation, friction=friction)
             for body, link in links
         ]
         self.rod = rod_of(
             robot,
-            self.touched,
+            self.body_contacts,
             dt=self.dt,
             max_contacts=max_contacts,
             points_per_segment=points_per_segment,
             capsules_per_segment=capsules_per_segment,
         )
-        self._stride = points_per_segment // capsules_per_segment
+        self._nodes_per_capsule = points_per_segment // capsules_per_segment
         radii = self.rod.radius.tolist()
         lengths = (
             np.repeat([segment.length for segment in robot.segments], capsules_per_segment)
@@ -112,16 +120,16 @@ class MountedRod(CarriedRod):
         """PyBullet forgets its external forces by itself."""
 
     def _forget(self) -> None:
-        """As above."""
+        """Forget nothing: PyBullet forgets its external forces by itself."""
 
     def _nodes(self) -> tuple[Floats, Floats]:
         state = self.rod.state
-        return state.position[0, :: self._stride], state.rotation[0, :: self._stride]
+        return state.position[0, :: self._nodes_per_capsule], state.rotation[0, :: self._nodes_per_capsule]
 
 
-def _link_of(touch: object) -> tuple[int, int]:
+def _link_of(body: object) -> tuple[int, int]:
     """Body and link."""
-    pair = touch if isinstance(touch, (tuple, list)) else (touch, -1)
+    pair = body if isinstance(body, (tuple, list)) else (body, -1)
     if len(pair) != 2 or not all(isinstance(i, (int, np.integer)) and not isinstance(i, bool) for i in pair):
-        raise HostError(f"touch holds {touch!r}; give the number of a body, or (body, link).")
+        raise HostError(f"contact_bodies holds {body!r}; give the number of a body, or (body, link).")
     return int(pair[0]), int(pair[1])

@@ -11,10 +11,17 @@ from numpy.typing import ArrayLike
 
 from fastrod.contact import ContactScene
 from fastrod.errors import HostError, InputError, nearest
-from fastrod.hosts.carried import CarriedRod, check_contact, check_gravity, check_touch, rod_of
+from fastrod.hosts.carried import (
+    CarriedRod,
+    check_bodies,
+    check_contact,
+    check_gravity,
+    refuse_old_names,
+    rod_of,
+)
 from fastrod.hosts.mujoco_body import MujocoBody, body_number, mujoco
+from fastrod.hosts.mujoco_body_contact import MujocoBodyContact
 from fastrod.hosts.mujoco_contacts import ContactFeedback, Felt, read
-from fastrod.hosts.mujoco_touched import MujocoBodyContact
 from fastrod.hosts.rod import check_robot
 from fastrod.model.robot import Robot
 from fastrod.types import Floats
@@ -22,12 +29,13 @@ from fastrod.types import Floats
 __all__ = ["MujocoBody", "MujocoRod", "add_capsules"]
 
 
+@refuse_old_names(touch="contact_bodies")
 def add_capsules(
     spec: Any,
     robot: Robot,
     host: str,
     *,
-    touch: Sequence[str] = (),
+    contact_bodies: Sequence[str] = (),
     name: str = "rod",
     capsules_per_segment: int = 10,
     friction: float = 0.5,
@@ -37,10 +45,10 @@ def add_capsules(
     """Add a rod's body to a `mujoco.MjSpec`: mocap bodies `name 0`, `name 1`, ... with a capsule each, base
     first; returns their names.
 
-    They pass through the bodies of the host's kinematic tree, and through those named in `touch`, which the
-    rod itself will touch: give both here as to `MujocoRod`. `friction` against all others; colours RGBA.
-    Bodies of the tree that have no name get one, since MuJoCo's exclusions go by name. Raises `HostError`,
-    `InputError`.
+    They pass through the bodies of the host's kinematic tree, and through those named in `contact_bodies`,
+    with which the rod itself will make contact: give both the same as to `MujocoRod`. `friction` against all
+    others; colours RGBA. Bodies of the tree that have no name get one, since MuJoCo's exclusions go by name.
+    Raises `HostError`, `InputError`.
     """
     lib = mujoco()
     if not isinstance(spec, lib.MjSpec):
@@ -49,7 +57,7 @@ def add_capsules(
             "mujoco.MjSpec.from_file(path)."
         )
     check_robot(robot)
-    check_touch(touch)
+    check_bodies(contact_bodies)
     check_contact(0.0, friction)
     if (
         isinstance(capsules_per_segment, bool)
@@ -60,7 +68,7 @@ def add_capsules(
     color = _rgba("color", color)
     head_color = None if head_color is None else _rgba("head_color", head_color)
     passed = list(_tree(_spec_body(spec, host)))
-    for other in touch:
+    for other in contact_bodies:
         if (body := _spec_body(spec, other)).name not in [b.name for b in passed]:
             passed.append(body)
     for k, body in enumerate(passed):
@@ -93,15 +101,16 @@ def add_capsules(
 class MujocoRod(CarriedRod):
     """One rod on a body of a MuJoCo model (`CarriedRod`).
 
-    The rod's capsules are mocap bodies (`add_capsules`). MuJoCo puts them where it is told, but its contacts
-    take them to be at rest: a body in their way is pushed by how deep they have come, follows them at their
-    speed some hundredths of a second behind, and is held by friction as if by a thing that stands still. What
-    the rod feels, and pushes at the right speed, are bodies in `touch`.
+    The rod's capsules are mocap bodies (`add_capsules`). MuJoCo puts them where it is commanded, but its
+    contacts take them to be at rest: a body that they meet is pushed by how deep they have come, follows them
+    at their speed some hundredths of a second behind, and is held by friction as if by a thing that stands
+    still. What the rod feels, and pushes at the right speed, are bodies in `contact_bodies`.
 
-    Bodies that are not in `touch` meet the capsules, and `felt` tells how hard. With `feel` these forces bend
-    the rod too.
+    Bodies that are not in `contact_bodies` meet the capsules, and `felt` reports the forces. With `feel`
+    these forces bend the rod too.
     """
 
+    @refuse_old_names(touch="contact_bodies")
     def __init__(
         self,
         robot: Robot,
@@ -111,7 +120,7 @@ class MujocoRod(CarriedRod):
         *,
         position: ArrayLike = (0.0, 0.0, 0.0),
         quaternion: ArrayLike = (1.0, 0.0, 0.0, 0.0),
-        touch: Sequence[int | str] = (),
+        contact_bodies: Sequence[int | str] = (),
         friction: float = 0.3,
         relaxation: float = 0.1,
         feel: bool = False,
@@ -120,36 +129,34 @@ class MujocoRod(CarriedRod):
         max_contacts: int = 16,
     ) -> None:
         """`body`: name or number of what carries the rod, with the mount `position` (3,) [m] and `quaternion`
-        (4,) w x y z, body_from_base.
-        `touch`: names or numbers of bodies; `friction` of the rod on them; `relaxation` [s] of the rod
-        against a changing contact force (`Touching`). `feel`: MuJoCo's contacts of the capsules bend the rod
-        (`ContactFeedback`). `name` as given to `add_capsules`. The time step is the model's. Raises
-        `HostError`,
-        `InputError`."""
+        (4,) w x y z, body_from_base. `contact_bodies`: names or numbers of bodies; `friction` of the rod on
+        them; `relaxation` [s] of the rod against a changing contact force (`BodyContact`). `feel`: MuJoCo's
+        contacts of the capsules bend the rod (`ContactFeedback`). `name` as given to `add_capsules`. The time
+        step is the model's. Raises `HostError`, `InputError`."""
         check_robot(robot)
         host = MujocoBody(model, data, body, position=position, quaternion=quaternion)
         super().__init__(host, float(model.opt.timestep))
         self.host, self.model, self.data = host, model, data
         check_gravity(robot, self._gravity(), "set model.opt.gravity")
         check_contact(relaxation, friction)
-        check_touch(touch)
-        touched = [body_number(model, other) for other in touch]
+        check_bodies(contact_bodies)
+        others = [body_number(model, other) for other in contact_bodies]
         self.capsule_bodies: list[int] = _capsule_bodies(model, name, robot)
         """Number of each capsule's body, base first."""
         self._mocap = model.body_mocapid[self.capsule_bodies]
         self._geoms: list[int] = model.body_geomadr[self.capsule_bodies].tolist()
         _check_fit(model.geom_size[self._geoms], robot, name)
-        for other in touched:
+        for other in others:
             self._check_excluded(other, name)
         self._bodies = [
             MujocoBodyContact(model, data, b, dt=self.dt, relaxation=relaxation, friction=friction)
-            for b in touched
+            for b in others
         ]
-        self.touched = self._bodies
+        self.body_contacts = self._bodies
         per_segment = len(self._geoms) // robot.n_segments
         self.rod = rod_of(
             robot,
-            self.touched,
+            self.body_contacts,
             dt=self.dt,
             max_contacts=max_contacts,
             points_per_segment=points_per_segment,
@@ -245,8 +252,8 @@ class MujocoRod(CarriedRod):
 
     def _release(self) -> None:
         self.host.release()
-        for touched in self._bodies:
-            touched.release()
+        for contact in self._bodies:
+            contact.release()
 
     def _check_excluded(self, body: int, name: str) -> None:
         """Two contacts of one pair, the rod's and MuJoCo's, would push twice."""
@@ -257,7 +264,7 @@ class MujocoRod(CarriedRod):
             raise HostError(
                 f"the capsules of {name!r} collide with {self.model.body(body).name!r}, which the rod is to "
                 "touch itself; "
-                "name it in add_capsules(..., touch=[...]) too."
+                "name it in add_capsules(..., contact_bodies=[...]) too."
             )
 
 
@@ -289,7 +296,7 @@ def _rgba(name: str, value: Sequence[float]) -> list[float]:
         rgba = np.empty(0)
     if rgba.shape != (4,) or not np.isfinite(rgba).all():
         raise InputError(f"{name} is {value!r}; give red, green, blue and opacity, four numbers from 0 to 1.")
-    return [float(part) for part in rgba]
+    return [float(component) for component in rgba]
 
 
 def _sizes(robot: Robot, per_segment: int) -> tuple[Floats, Floats]:

@@ -76,16 +76,16 @@ def velocity_of(model: Any, data: Any, body: int, *, com: bool) -> Floats:
 
 def com_motion(model: Any, data: Any, body: int) -> Motion:
     """Of the frame of a body's centre of mass, as `data` have it."""
-    turn = quaternion_from_matrix(data.ximat[body].reshape(1, 3, 3))[0]
-    return Motion(np.concatenate([data.xipos[body], turn]), velocity_of(model, data, body, com=True))
+    orientation = quaternion_from_matrix(data.ximat[body].reshape(1, 3, 3))[0]
+    return Motion(np.concatenate([data.xipos[body], orientation]), velocity_of(model, data, body, com=True))
 
 
 @final
 class Applied:
-    """One rod's share of what `data.xfrc_applied` has for a body.
+    """One rod's forces in `data.xfrc_applied` for a body.
 
     MuJoCo keeps these forces until somebody clears them, and others may have put their own there: this adds
-    its own, and takes just that away again.
+    its own, and removes just that again.
     """
 
     def __init__(self, data: Any, body: int) -> None:
@@ -103,8 +103,8 @@ class Applied:
         self._left = there.copy()
 
     def take(self) -> None:
-        """Leave the forces as they were, and what others added since. Who has cleared them meanwhile is not
-        contradicted."""
+        """Leave the forces as they were, and what others added since. Forces that somebody has cleared
+        meanwhile stay cleared."""
         left, self._left = self._left, None
         there = self._data.xfrc_applied[self._body]
         if left is None or not there.any():

@@ -1,4 +1,4 @@
-"""What MuJoCo's own contacts do to a rod's capsules, read back, and as loads of the rod."""
+"""MuJoCo's own contacts of a rod's capsules, read back, and as loads of the rod."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from fastrod.hosts.mujoco_body import mujoco
 from fastrod.simulator import Simulator
 from fastrod.types import Floats, Ints
 
-# that the part grows in a step: one that is larger without contact than with it would take over too little on
-# average
+# factor by which the relaxation grows in a step: one that is larger without contact than with it would take
+# over too little on average
 _SLOWLY = 1.01
 _SHALLOW = 1e-5  # m: less is not taken for the depth that a force belongs to
 
@@ -70,7 +70,7 @@ class ContactFeedback:
     """MuJoCo's contact forces as a line force of the rod, relaxed against its compliance.
 
     A contact of stiffness k at a point of compliance C, taken over at once, diverges where k C exceeds 1: the
-    rod gives way, the force is gone, the rod is back. A part 1 / (1 + sum k C) of the change is what an
+    rod moves away, the force is gone, the rod is back. A fraction 1 / (1 + sum k C) of the change is what an
     implicit step would take; C falls with the cube of the arclength.
     """
 
@@ -79,7 +79,7 @@ class ContactFeedback:
         self._n, self._per, self._width = n_segments, per_segment, width
         self.force: Floats = np.zeros((n_segments * per_segment, 2, 3))
         """(n_capsules, 2, 3) on both ends of each capsule, world [N]."""
-        self._part = 1.0
+        self._relaxation = 1.0
 
     def take(self, felt: Felt, simulator: Simulator) -> None:
         """Go toward the forces of the last step; stay where the rod could not be solved, whose compliance
@@ -89,13 +89,13 @@ class ContactFeedback:
         wanted = np.zeros_like(self.force)
         if len(felt.capsule):
             starts = np.concatenate([[0.0], np.cumsum(self._width)])
-            share = (felt.arclength - starts[felt.capsule]) / self._width[felt.capsule]
-            np.add.at(wanted[:, 0], felt.capsule, (1.0 - share)[:, None] * felt.force)
-            np.add.at(wanted[:, 1], felt.capsule, share[:, None] * felt.force)
+            fraction = (felt.arclength - starts[felt.capsule]) / self._width[felt.capsule]
+            np.add.at(wanted[:, 0], felt.capsule, (1.0 - fraction)[:, None] * felt.force)
+            np.add.at(wanted[:, 1], felt.capsule, fraction[:, None] * felt.force)
             stiffness = np.linalg.norm(felt.force, axis=1) / np.maximum(felt.depth, _SHALLOW)
-            give = np.linalg.norm(simulator.compliance()[0, :3], 2) * (felt.arclength / starts[-1]) ** 3
-            self._part = min(_SLOWLY * self._part, 1.0 / (1.0 + float(stiffness @ give)))
-        self.force += self._part * (wanted - self.force)
+            compliance = np.linalg.norm(simulator.compliance()[0, :3], 2) * (felt.arclength / starts[-1]) ** 3
+            self._relaxation = min(_SLOWLY * self._relaxation, 1.0 / (1.0 + float(stiffness @ compliance)))
+        self.force += self._relaxation * (wanted - self.force)
 
     def line_force(self) -> Floats:
         """(n_segments, capsules of one + 1, 3) [N/m]: linear between the capsules' ends, with the sum of the
@@ -113,4 +113,4 @@ class ContactFeedback:
     def forget(self) -> None:
         """No force carries over."""
         self.force[:] = 0.0
-        self._part = 1.0
+        self._relaxation = 1.0

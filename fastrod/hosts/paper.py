@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from fastrod.errors import InputError
 from fastrod.hosts.bullet import pybullet
-from fastrod.hosts.capsules import turn_between
+from fastrod.hosts.capsules import rotation_between
 from fastrod.hosts.link import from_xyzw
 from fastrod.model.robot import Robot, Segment, Tendon
 from fastrod.model.segment_actions import SegmentActions
@@ -24,7 +24,7 @@ _MOST_BEND = math.pi  # of a segment [rad]
 
 
 class Command(NamedTuple):
-    """What a user asks of the robot, checked."""
+    """Command of a user, checked."""
 
     action: Floats
     """(3 n_segments,) extension and two displacements of each segment, base first [m]."""
@@ -35,7 +35,7 @@ class Command(NamedTuple):
 
 
 class PaperShape(NamedTuple):
-    """Where a command brings the robot: points evenly along the backbone, quaternions w x y z."""
+    """Shape of the robot under a command: points evenly along the backbone, quaternions w x y z."""
 
     command: Command
     own: Floats
@@ -60,7 +60,7 @@ class PaperShapes:
 
     def command(self, action: ArrayLike | None, base_pos: ArrayLike, base_orin: ArrayLike) -> Command:
         """A checked command; `action` None is the straight robot. Raises `InputError` on a wrong length, on
-        what is not finite, and beyond the range of extension or half a turn of bend."""
+        what is not finite, and beyond the range of extension or a bend of 180 degrees."""
         given = (
             np.zeros(self._actions.n_actions)
             if action is None
@@ -76,58 +76,61 @@ class PaperShapes:
             if math.hypot(*bends) > (most := _MOST_BEND * float(self._actions.offset[k])) * (1.0 + 1e-9):
                 raise InputError(
                     f"the displacements of segment {k + 1} are {bends} m; together at most "
-                    f"{most:.4g} m, half a turn of bend."
+                    f"{most:.4g} m, a bend of 180 degrees."
                 )
-        return Command(given, numbers("base_pos", base_pos, 3), turn_of("base_orin", base_orin))
+        return Command(given, numbers("base_pos", base_pos, 3), orientation_of("base_orin", base_orin))
 
     def at(self, command: Command) -> PaperShape:
         """The robot at rest under its own weight, without contact. Raises `InputError` where there is no such
         shape."""
         base = np.concatenate([command.base_position, product(command.base_quaternion, _FROM_FASTROD)])
-        self._simulator.reset()  # a cold start, so that the answer does not depend on what was asked before
+        self._simulator.reset()  # a cold start, so that the answer does not depend on earlier commands
         signed = (command.action.reshape(-1, 3) * _SIGNS).ravel()
         state = self._simulator.settle(**self._actions.inputs(signed), base_pose=base)
         if not state.ok[0]:
             raise InputError(f"action {command.action.tolist()} has no shape: {state.problems[0]}.")
         pose = self._simulator.shape(np.linspace(0.0, state.arclength[0, -1], self.n_points))
-        turn = matrix_from_quaternion(command.base_quaternion[None])[0]
+        orientation = matrix_from_quaternion(command.base_quaternion[None])[0]
         back = command.base_quaternion * [1.0, -1.0, -1.0, -1.0]
         own_q = product(np.broadcast_to(back, (self.n_points, 4)), quaternion_from_matrix(pose.rotation[0]))
-        own = np.concatenate([(pose.position[0] - command.base_position) @ turn, own_q], axis=1)
+        own = np.concatenate([(pose.position[0] - command.base_position) @ orientation, own_q], axis=1)
         world_q = product(np.broadcast_to(command.base_quaternion, (self.n_points, 4)), own_q)
-        world = np.concatenate([own[:, :3] @ turn.T + command.base_position, world_q], axis=1)
+        world = np.concatenate([own[:, :3] @ orientation.T + command.base_position, world_q], axis=1)
         return PaperShape(command, own, world, pose.rotation[0])
 
 
-def between(a: Command, b: Command, share: float) -> Command:
-    """Part of the way from one command to the other."""
-    turn = quaternion_from_vector(share * turn_between(a.base_quaternion[None], b.base_quaternion[None])[0])
-    action, position = (
-        (1.0 - share) * x + share * y for x, y in ((a.action, b.action), (a.base_position, b.base_position))
+def between(a: Command, b: Command, fraction: float) -> Command:
+    """Interpolate from one command to the other."""
+    orientation = quaternion_from_vector(
+        fraction * rotation_between(a.base_quaternion[None], b.base_quaternion[None])[0]
     )
-    return Command(action, position, product(turn, a.base_quaternion))
+    action, position = (
+        (1.0 - fraction) * x + fraction * y
+        for x, y in ((a.action, b.action), (a.base_position, b.base_position))
+    )
+    return Command(action, position, product(orientation, a.base_quaternion))
 
 
 def paper_robot(n: int, radius: float) -> Robot:
-    """The paper's prototype in `n` extensible segments of 0.1 m, of body `radius` [m]; the wires are so stiff
-    that a bend is what its displacement says to 1e-4 rad, and the offset of 7.5 mm is not the paper's, which
-    gives none."""
-    wires = tuple(Tendon(offset=0.0075, angle=k * math.pi / 2.0, compliance=1e-8) for k in range(4))
+    """The paper's prototype in `n` extensible segments of 0.1 m, of body `radius` [m]; the tendons are so
+    stiff that a bend is what its displacement says to 1e-4 rad, and the offset of 7.5 mm is not the paper's,
+    which gives none."""
+    tendons = tuple(Tendon(offset=0.0075, angle=k * math.pi / 2.0, compliance=1e-8) for k in range(4))
     segment = Segment(
         length=0.1,
         bending_stiffness=(0.0022, 0.0022),
         torsional_stiffness=0.001,
         extension=(-0.05, 0.1),
         body_radius=max(radius, 0.0075),
-        tendons=wires,
+        tendons=tendons,
     )
     return Robot(name=f"softmanisim_{n}", segments=(segment,) * n, gravity=(0.0, 0.0, 0.0))
 
 
-def turn_of(name: str, turn: ArrayLike) -> Floats:
+def orientation_of(name: str, orientation: ArrayLike) -> Floats:
     """(4,) w x y z of three Euler angles as for getQuaternionFromEuler [rad], or of a quaternion x y z w.
     Raises `InputError`."""
-    q = numbers(name, turn, 3, 4)
+    q = numbers(name, orientation, 3, 4)
     if len(q) == 3:
         return from_xyzw(pybullet().getQuaternionFromEuler(q.tolist()))
     if abs((norm := float(np.linalg.norm(q))) - 1.0) > 1e-3:

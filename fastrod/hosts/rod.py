@@ -34,16 +34,16 @@ INPUTS = (
     "follower_tip_force",
     "gravity",
 )
-"""What an engine may tell a rod beside its base: keyword arguments of `Simulator.step`."""
+"""Inputs of a rod beside its base: keyword arguments of `Simulator.step`."""
 OBSTACLES = ("obstacle_pose", "obstacle_velocity")
-"""The same of rods with a contact scene."""
+"""Inputs of rods with a contact scene."""
 _PATIENCE = 2  # steps that fail before a rod in contact settles anew
 _MOST_FAILED = 25
 _MOST_SUBSTEPS = 100_000
 
 
 class RodSnapshot(NamedTuple):
-    """Everything that a later `Rod.advance` depends on."""
+    """State of a rod: everything that a later `Rod.advance` depends on."""
 
     simulator: Snapshot
     time: float
@@ -54,12 +54,12 @@ class RodSnapshot(NamedTuple):
     """(n_robots, 7) pose of the base, world."""
     inputs: dict[str, Any]
     obstacles: dict[str, Floats]
-    """Name -> (1 or n_robots, 7) pose as it was told last, world."""
+    """Name -> (1 or n_robots, 7) pose as it was given last, world."""
     capsules: Capsules | None
     failed: Ints
     """(n_robots,) the rod's own steps in a row that could not be solved."""
     fresh: Flags
-    """(n_robots,) who settles before the next step."""
+    """(n_robots,) robots that settle before the next step."""
 
 
 @final
@@ -70,8 +70,8 @@ class Rod:
     until then.
 
     With `n_robots` every array has a robot axis first; without it there is one rod and no such axis, but in
-    `state`, which always has one. Inputs that are not given stay as they were given last; the wires are those
-    of the straight robot until then.
+    `state`, which always has one. Inputs that are not given stay as they were given last; the tendons are
+    those of the straight robot until then.
 
     >>> import fastrod
     >>> rod = fastrod.Rod(fastrod.load_robot("prototype"), dt=0.01)
@@ -91,8 +91,8 @@ class Rod:
         capsules_per_segment: int = 10,
         threads: int | None = 1,
     ) -> None:
-        """`dt`: the rod's longest step [s]; an engine's step that is longer is done in equal parts.
-        `contact`: what the rod feels. Capsules are as thick as contact has the rod. Raises `InputError`,
+        """`dt`: the rod's longest step [s]; an engine's longer step is done in equal substeps. `contact`:
+        what the rod feels. Capsules are as thick as contact has the rod. Raises `InputError`,
         `RobotError`."""
         check_robot(robot)
         if isinstance(n_robots, bool):
@@ -133,14 +133,16 @@ class Rod:
         """Longest step of the rod [s]."""
         self.robot = self.simulator.robots[0]
         self.n_robots = n_robots
-        self._stride = points_per_segment // capsules_per_segment
+        self._nodes_per_capsule = points_per_segment // capsules_per_segment
         radius = (contact or ContactScene()).radius_of(robot)
         self.radius: Floats = np.repeat(radius, capsules_per_segment)
         """(n_capsules,) [m]."""
         self.time = 0.0
         """The rod's clock: the sum of the engine's steps [s]."""
-        wires = any(segment.mode in ("tendon_length", "paper") for segment in robot.segments)
-        self._inputs: dict[str, Any] = {"tendon_length": np.array(robot.rest_tendon_length)} if wires else {}
+        by_length = any(segment.mode in ("tendon_length", "paper") for segment in robot.segments)
+        self._inputs: dict[str, Any] = (
+            {"tendon_length": np.array(robot.rest_tendon_length)} if by_length else {}
+        )
         self._home: Floats = np.array([*robot.base_position, *robot.base_quaternion], float)
         self._obstacles: dict[str, Floats] = {}
         self._state: State | None = None
@@ -200,16 +202,16 @@ class Rod:
             raise
 
     def advance(self, base_pose: ArrayLike, base_twist: ArrayLike, time_step: float, **inputs: Any) -> State:
-        """The rod at the end of the engine's next step of `time_step` [s].
+        """Return the rod at the end of the engine's next step of `time_step` [s].
 
         `base_pose` (7,) where the base is before the step, position [m] and quaternion w x y z, world;
         `base_twist` (6,) velocity of its origin [m/s] and angular velocity [rad/s], world, at which it is
-        taken to go on. Inputs as for `Simulator.step`: `INPUTS`, and `obstacle_pose` and `obstacle_velocity`
-        at the end of the step where there is a contact scene. Base and obstacles are led there in the rod's
-        own steps.
+        taken to continue. Inputs as for `Simulator.step`: `INPUTS`, and `obstacle_pose` and
+        `obstacle_velocity` at the end of the step where there is a contact scene. Base and obstacles move
+        there in the rod's own steps.
 
         A step that cannot be solved (`state.ok` is false, and `state.problems` says why) leaves the rod where
-        it came to, with half the wrench of the engine's step before; after a few in a row the rod settles
+        it stopped, with half the wrench of the engine's step before; after a few in a row the rod settles
         anew. Of several rods, each fails alone: one whose input cannot be used, or that is lost, keeps shape,
         capsules and base as well. Raises `InputError` for unusable input, `HostError` where all rods are
         lost, one was lost before it had a shape, or 25 steps in a row could not be solved of any rod; then
@@ -238,7 +240,7 @@ class Rod:
             self._solved(
                 motion.after((k + 1) * h),
                 given,
-                self._part_way(around, n - k) if n > 1 else around,
+                self._obstacles_after(around, n - k) if n > 1 else around,
                 0.5 * wrench,
             )
         before, self._capsules = self._capsules, self._along(self.state)
@@ -250,8 +252,8 @@ class Rod:
     def reset(self, rows: ArrayLike | None = None) -> None:
         """Forget the rod's shape and its contacts, but not its inputs nor its clock: after the base was put
         somewhere else. The next step settles where the base then is. `rows`: indices or a mask of the rods
-        that are reset, all without it; the others go on, and shapes and capsules of these are shown as they
-        were until then. Raises `InputError` for what is no rows."""
+        that are reset, all without it; the others continue, and shapes and capsules of these are shown as
+        they were until then. Raises `InputError` for what is no rows."""
         which = np.ones(self.simulator.n_robots, bool)
         self.simulator.reset(rows)
         if rows is not None:
@@ -302,7 +304,7 @@ class Rod:
         return self.state
 
     def _settled_again(self, base: Floats, given: dict[str, Any], around: dict[str, Any]) -> None:
-        """Rods that were reset, while the others are on their way."""
+        """Settle rods that were reset, while the others continue."""
         rows, going = self._fresh, self._wrench
         self._keep(self._anew(rows, base, given, around), given, around, base, going)
         self._wrench = np.where(rows[:, None], self._wrench, going)
@@ -388,8 +390,8 @@ class Rod:
         around = {name: inputs[name] for name in OBSTACLES if name in inputs}
         return self._inputs | {name: value for name, value in inputs.items() if name not in OBSTACLES}, around
 
-    def _part_way(self, around: dict[str, Any], steps: int) -> dict[str, Any]:
-        """Obstacles after the first of the `steps` that lead to where they are told to be."""
+    def _obstacles_after(self, around: dict[str, Any], steps: int) -> dict[str, Any]:
+        """Return the obstacles after the first of the `steps` that lead to their given poses."""
         scene = self.simulator.contact
         if scene is None or not around.get("obstacle_pose"):
             return around
@@ -402,7 +404,11 @@ class Rod:
         return around | {"obstacle_pose": poses}
 
     def _along(self, state: State) -> Capsules:
-        return along(state.position[:, :: self._stride], state.rotation[:, :: self._stride], self.radius)
+        return along(
+            state.position[:, :: self._nodes_per_capsule],
+            state.rotation[:, :: self._nodes_per_capsule],
+            self.radius,
+        )
 
     def _substeps(self, time_step: float) -> int:
         if isinstance(time_step, bool) or not isinstance(time_step, (int, float, np.floating, np.integer)):
@@ -463,7 +469,8 @@ class Rod:
 
 
 def _copied(value: Any) -> Any:
-    """The caller may write into its own; what no copy can be made of is refused by who reads it."""
+    """Copy a value, since the caller may write into its own; what cannot be copied is refused where it is
+    read."""
     try:
         return np.array(value) if isinstance(value, np.ndarray) else copy.deepcopy(value)
     except Exception:

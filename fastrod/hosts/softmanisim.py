@@ -15,9 +15,9 @@ from fastrod.errors import HostError, InputError
 from fastrod.hosts.bodies import RodBodies
 from fastrod.hosts.bullet import Bullet, connect
 from fastrod.hosts.camera import CameraView, HostCamera, Image
-from fastrod.hosts.gripper import TOUCH, Gripper
+from fastrod.hosts.gripper import CONTACT_DISTANCE, Gripper
 from fastrod.hosts.link import to_xyzw
-from fastrod.hosts.paper import PaperShape, PaperShapes, between, numbers, paper_robot, turn_of
+from fastrod.hosts.paper import PaperShape, PaperShapes, between, numbers, orientation_of, paper_robot
 from fastrod.model.robot import Robot
 from fastrod.types import Floats
 
@@ -32,12 +32,12 @@ _MARKER_RADIUS = 0.01  # m
 @final
 class SoftManiSim:
     """A tendon robot with a head and a gripper in a PyBullet world: it moves where its actions say, and
-    pushes what is in the way.
+    pushes what it meets.
 
     An action is, for each segment, base segment first, the extension [m] and two tendon displacements [m]; a
     displacement d bends the segment by d / offset [rad]. In the robot's frame, which `base_orin` orients, the
     straight robot points along +y; the first displacement bends it toward +x, the second toward +z. (The
-    paper's code maps its rod's x, y, z to x, z, y, which is a reflection; here fastrod's frame is turned, d1
+    paper's code maps its rod's x, y, z to x, z, y, which is a reflection; here fastrod's frame is rotated, d1
     to +x, d2 to -z, d3 to +y, and the second displacement changes its sign: the same directions in the world,
     with a frame that is right-handed, and orientations that are rotations.)
 
@@ -111,7 +111,7 @@ class SoftManiSim:
         self.camera = HostCamera(near=0.05, far=5.0)
         """Of `capture_image`; set another to change it."""
         self.view = CameraView(eye=(0.65, 0.35, 0.45), target=(0.0, 0.15, 0.08))
-        """Where that camera stands and looks, world; set another to change it."""
+        """Position and target of that camera, world; set another to change it."""
         self.in_hand_camera = HostCamera(near=0.005, far=3.0)
         """Of `in_hand_camera_capture_image`."""
         self._colors = (
@@ -131,7 +131,7 @@ class SoftManiSim:
         """Build the robot's bodies, straight from the origin along +y, fingers open; those that are there
         already are replaced.
 
-        They touch nothing until the next `move_robot_ori`, which puts them in their place at once.
+        They touch nothing until the next `move_robot_ori`, which moves them to their pose at once.
         """
         self._remove()
         body_color, head_color = self._colors
@@ -142,7 +142,7 @@ class SoftManiSim:
         self._bodies.ignore(self._gripper.body)
         self._collide(False)
         self._place(self._shapes.at(self._shapes.command(None, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))))
-        self._placed = False
+        self._standing = False
 
     def move_robot_ori(
         self,
@@ -152,29 +152,27 @@ class SoftManiSim:
         camera_marker: bool = True,
     ) -> tuple[Floats, Floats]:
         """Move to the shape of `action` (3 number_of_segment,) [m], None for straight, on a base at
-        `base_pos` (3,) world [m], turned by
-        `base_orin`: three Euler angles as for getQuaternionFromEuler [rad], or a quaternion x y z w.
+        `base_pos` (3,) world [m], rotated by `base_orin`: three Euler angles as for getQuaternionFromEuler
+        [rad], or a quaternion x y z w.
 
         Returns the points (number_of_sphere, 7) evenly along the backbone, base first, tip last: position [m]
         and quaternion x y z w, world_from_material, whose z is the tangent; in the world, and in the robot's
         frame, so that the first is the base's pose times the second. The head's centre is at the tip.
 
         The world advances one step. Where a point would have to move farther than `body_sphere_radius` in it,
-        or faster than
-        `max_speed`, the robot goes there through the shapes between, in as many steps as that takes. The
-        first motion after
-        `create_robot` puts the robot in its place at once, at rest.
+        or faster than `max_speed`, the robot goes there through the shapes between, in as many steps as that
+        takes. The first motion after `create_robot` puts the robot at its pose at once, at rest.
 
         `camera_marker`: show a marker, which touches nothing, 0.1 m before the tip. Raises `InputError` on a
         wrong action or base, or a motion of more than 10000 steps.
         """
         goal = self._shapes.at(self._shapes.command(action, base_pos, base_orin))
-        if self._placed:
+        if self._standing:
             self._travel(goal)
         else:
             self._place(goal)
             self._collide(True)
-            self._placed = True
+            self._standing = True
             self._step()
         self._mark(camera_marker)
         return _xyzw(goal.world), _xyzw(goal.own)
@@ -185,9 +183,8 @@ class SoftManiSim:
         base_pos: ArrayLike = (0.0, 0.0, 0.0),
         base_orin: ArrayLike = (0.0, 0.0, 0.0),
     ) -> tuple[Floats, Floats]:
-        """Where `move_robot_ori` would bring the tip: position (3,) [m] and quaternion (4,) x y z w, world.
-        Nothing moves. Raises
-        `InputError`."""
+        """Return where `move_robot_ori` would bring the tip: position (3,) [m] and quaternion (4,) x y z w,
+        world. Nothing moves. Raises `InputError`."""
         tip = _xyzw(self._shapes.at(self._shapes.command(action, base_pos, base_orin)).world)[-1]
         return tip[:3], tip[3:]
 
@@ -219,7 +216,7 @@ class SoftManiSim:
         stands; or release it.
 
         Returns [its id], or -1 where nothing touches, which is logged; None on release. The body keeps its
-        mass. While it is held it passes through the gripper and through those parts of the robot that are
+        mass. While it is held it passes through the gripper and through those bodies of the robot that are
         near it.
         """
         if not enable:
@@ -232,20 +229,21 @@ class SoftManiSim:
         return [body]
 
     def is_robot_in_contact(self, obj_id: int) -> bool:
-        """Whether any part of the robot touches this body: surfaces nearer than 1 mm. Raises `HostError`."""
+        """Return whether any body of the robot touches this body: surfaces nearer than 1 mm. Raises
+        `HostError`."""
         return self.is_gripper_in_contact(obj_id) or any(
-            self.bullet.getClosestPoints(own, obj_id, TOUCH) for own in self._capsules.ids
+            self.bullet.getClosestPoints(own, obj_id, CONTACT_DISTANCE) for own in self._capsules.ids
         )
 
     def is_gripper_in_contact(self, obj_id: int) -> bool:
-        """Whether head or fingers touch this body. Raises `HostError`."""
+        """Return whether head or fingers touch this body. Raises `HostError`."""
         self.bullet.check(obj_id)
-        return bool(self.bullet.getClosestPoints(self._gripper.body, obj_id, TOUCH))
+        return bool(self.bullet.getClosestPoints(self._gripper.body, obj_id, CONTACT_DISTANCE))
 
     def is_tip_in_contact(self, obj_id: int) -> bool:
-        """Whether the head touches this body. Raises `HostError`."""
+        """Return whether the head touches this body. Raises `HostError`."""
         self.bullet.check(obj_id)
-        return bool(self.bullet.getClosestPoints(self._gripper.body, obj_id, TOUCH, linkIndexA=-1))
+        return bool(self.bullet.getClosestPoints(self._gripper.body, obj_id, CONTACT_DISTANCE, linkIndexA=-1))
 
     def add_a_cube(
         self,
@@ -257,7 +255,7 @@ class SoftManiSim:
         textureUniqueId: int | None = None,
     ) -> int:
         """A box of `size` (3,) [m] and `mass` [kg], 0 for one that never moves, at `pos` (3,) world [m],
-        turned by `ori` (4,), a quaternion x y z w; the body's id. Moves without damping. Raises
+        rotated by `ori` (4,), a quaternion x y z w; returns the body's id. Moves without damping. Raises
         `InputError`."""
         b, half = self.bullet, 0.5 * numbers("size", size, 3)
         if not (half > 0.0).all():
@@ -270,20 +268,20 @@ class SoftManiSim:
                 f"ori is {ori!r}; it must be a quaternion x y z w. The size comes third: "
                 "add_a_cube(pos, ori, size, mass)."
             )
-        turn = to_xyzw(turn_of("ori", ori)).tolist()
+        orientation = to_xyzw(orientation_of("ori", ori)).tolist()
         shape = b.createCollisionShape(b.GEOM_BOX, halfExtents=half.tolist())
         seen = b.createVisualShape(
             b.GEOM_BOX, halfExtents=half.tolist(), rgbaColor=numbers("color", color, 4).tolist()
         )
-        body: int = b.createMultiBody(mass, shape, seen, position, turn)
+        body: int = b.createMultiBody(mass, shape, seen, position, orientation)
         b.changeDynamics(body, -1, linearDamping=0.0, angularDamping=0.0)
         if textureUniqueId is not None:
             b.changeVisualShape(body, -1, textureUniqueId=textureUniqueId)
         return body
 
     def capture_image(self, removeBackground: bool = False) -> tuple[NDArray[np.uint8], Floats]:
-        """What the camera beside the robot sees (`camera`, `view`): RGB (height, width, 3), and the distance
-        along the optical axis (height, width) [m], inf where there is nothing.
+        """Return the picture of the camera beside the robot (`camera`, `view`): RGB (height, width, 3), and
+        the distance along the optical axis (height, width) [m], inf where there is nothing.
 
         `removeBackground`: what is neither robot nor object is white, and inf far: the ground planes and the
         marker too.
@@ -297,8 +295,9 @@ class SoftManiSim:
         return rgb, depth
 
     def in_hand_camera_capture_image(self) -> tuple[NDArray[np.uint8], Floats]:
-        """What a camera on the front of the head sees along the tip's tangent; as `capture_image`. It rolls
-        with the robot: up in the picture is +z of the straight robot's frame. The marker is left out."""
+        """Return the picture of a camera on the front of the head along the tip's tangent; as
+        `capture_image`. It rolls with the robot: up in the picture is +z of the straight robot's frame. The
+        marker is left out."""
         position, rotation = self._now.world[-1, :3], self._now.rotation[-1]
         eye = position + (self._radius + _HEAD + 1e-3) * rotation[:, 2]
         if self._marker is None:
@@ -338,18 +337,18 @@ class SoftManiSim:
         """Go there, each step as far as the limits allow."""
         start, dt = self._now, self.bullet.dt
         most = min(self._radius, self._max_speed * dt)
-        steps = math.ceil(self._way(start, goal) / most)
+        steps = math.ceil(self._largest_displacement(start, goal) / most)
         if steps > _MOST_STEPS:
             raise InputError(
                 f"the robot would move for {steps} steps at {most / dt:g} m/s, more than {_MOST_STEPS}; "
                 "create_robot() first puts it in its new place at once."
             )
-        done, share = 0.0, 1.0 / max(1, steps)
+        done, fraction = 0.0, 1.0 / max(1, steps)
         while done < 1.0:
-            end = done + share
+            end = done + fraction
             to = goal if end > 1.0 - 1e-9 else self._shapes.at(between(start.command, goal.command, end))
-            if (way := self._way(self._now, to)) > most * (1.0 + 1e-6):
-                share *= 0.95 * most / way
+            if (displacement := self._largest_displacement(self._now, to)) > most * (1.0 + 1e-6):
+                fraction *= 0.95 * most / displacement
                 continue
             nodes = to.world[:, :3], to.rotation
             self._capsules.head_for(*nodes, dt)
@@ -357,18 +356,18 @@ class SoftManiSim:
             self._step()
             self._place(to)
             done = 1.0 if to is goal else end
-            share = min(share * min(2.0, 0.95 * most / max(way, 1e-12)), 1.0 - done)
+            fraction = min(fraction * min(2.0, 0.95 * most / max(displacement, 1e-12)), 1.0 - done)
 
-    def _way(self, a: PaperShape, b: PaperShape) -> float:
+    def _largest_displacement(self, a: PaperShape, b: PaperShape) -> float:
         """The farthest that any point of the robot moves between two shapes [m]."""
-        corners = np.array([[x, y, self._gripper.reach] for x in (-0.5, 0.5) for y in (-0.5, 0.5)]) * [
+        corners = np.array([[x, y, self._gripper.length] for x in (-0.5, 0.5) for y in (-0.5, 0.5)]) * [
             self._max_width,
             0.02,
             1.0,
         ]
         gripper = [shape.world[-1, :3] + corners @ shape.rotation[-1].T for shape in (a, b)]
-        ways = np.concatenate([b.world[:, :3] - a.world[:, :3], gripper[1] - gripper[0]])
-        return float(np.linalg.norm(ways, axis=1).max())
+        displacements = np.concatenate([b.world[:, :3] - a.world[:, :3], gripper[1] - gripper[0]])
+        return float(np.linalg.norm(displacements, axis=1).max())
 
     def _place(self, shape: PaperShape) -> None:
         self._capsules.place(shape.world[:, :3], shape.rotation)

@@ -9,16 +9,16 @@ import numpy as np
 
 from fastrod.contact import Obstacle, box, capsule, cylinder, mesh, plane, sphere
 from fastrod.errors import HostError
+from fastrod.hosts.body_contact import BodyContact, CollisionShape
 from fastrod.hosts.bullet import Bullet
 from fastrod.hosts.host import Motion
 from fastrod.hosts.link import exert, from_xyzw
-from fastrod.hosts.touching import BodyContact, BodyPart
 from fastrod.types import Floats
 
 
 @final
 class BulletBodyContact(BodyContact):
-    """A link (-1: the base) that a rod touches, and what the rod does to it (`BodyContact`)."""
+    """Contact of a rod with a link (-1: the base) of a PyBullet body (`BodyContact`)."""
 
     def __init__(
         self, bullet: Any, body: int, link: int = -1, *, dt: float, relaxation: float, friction: float
@@ -39,8 +39,8 @@ class BulletBodyContact(BodyContact):
         return _com_motion(self.bullet, self.body, self.link)
 
     def overlap(self, capsules: Sequence[int]) -> Floats:
-        """(3,) the link's way out of its deepest overlap with one of these bodies, world [m]; its length is
-        the depth."""
+        """Return the link's displacement (3,) out of its deepest overlap with one of these bodies, world [m];
+        its length is the depth."""
         found = [
             p for own in capsules for p in self.bullet.getClosestPoints(own, self.body, 0.0, -1, self.link)
         ]
@@ -66,14 +66,14 @@ def _com_motion(bullet: Bullet, body: int, link: int) -> Motion:
     return Motion(np.array([*position, *from_xyzw(quaternion)]), np.array([*linear, *angular]))
 
 
-def _shapes(bullet: Bullet, body: int, link: int) -> list[BodyPart]:
+def _shapes(bullet: Bullet, body: int, link: int) -> list[CollisionShape]:
     """The collision shapes of a link."""
     found = []
     label = bullet.getBodyInfo(body)[1].decode() or "body"
     for i, (_, _, kind, size, _file, position, quaternion) in enumerate(
         bullet.getCollisionShapeData(body, link)
     ):
-        name = f"{label} {body}" + (f" link {link}" if link >= 0 else "") + (f" part {i}" if i else "")
+        name = f"{label} {body}" + (f" link {link}" if link >= 0 else "") + (f" shape {i}" if i else "")
         if kind == bullet.GEOM_BOX:
             made = box(size, name=name)
         elif kind == bullet.GEOM_SPHERE:
@@ -91,7 +91,7 @@ def _shapes(bullet: Bullet, body: int, link: int) -> list[BodyPart]:
                 f"body {body} has a collision shape of PyBullet's kind {kind}, which a rod "
                 "cannot touch; give it a mesh."
             )
-        found.append(BodyPart(made, np.asarray(position, float), from_xyzw(quaternion)))
+        found.append(CollisionShape(made, np.asarray(position, float), from_xyzw(quaternion)))
     return found
 
 

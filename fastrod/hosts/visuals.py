@@ -24,7 +24,7 @@ _UNKNOWN = 0.05
 
 
 class VisualShape(NamedTuple):
-    """Everything on one link that has one colour."""
+    """Mesh of everything on one link that has one colour."""
 
     name: str
     """Unique in its world."""
@@ -57,10 +57,10 @@ class Visuals:
                 continue
             inertial = b.getDynamicsInfo(body, -1)
             self._frame_from_com[body] = b.invertTransform(inertial[3], inertial[4])
-            for (link, rgba), parts in _grouped(b, body).items():
+            for (link, rgba), visuals in _grouped(b, body).items():
                 label = b.getBodyInfo(body)[1].decode() or "body"
                 name = f"{label} {body}" + (f" link {link}" if link >= 0 else "")
-                meshes = [_placed(*self._mesh(body, link, part), part) for part in parts]
+                meshes = [_in_link_frame(*self._mesh(body, link, visual), visual) for visual in visuals]
                 taken = sum(place == (body, link) for place in places)
                 shapes.append(
                     VisualShape(name + (f" colour {taken + 1}" if taken else ""), *_joined(meshes), rgba)
@@ -89,11 +89,11 @@ class Visuals:
             poses[k, :3], poses[k, 3:] = position, from_xyzw(quaternion)
         return poses
 
-    def _mesh(self, body: int, link: int, part: Any) -> tuple[Floats, NDArray[np.int64], bool]:
+    def _mesh(self, body: int, link: int, visual: Any) -> tuple[Floats, NDArray[np.int64], bool]:
         """Vertices, faces, and whether they are in the visual's frame; otherwise they are in the link's."""
         import trimesh
 
-        b, kind, size = self.bullet, part[2], part[3]
+        b, kind, size = self.bullet, visual[2], visual[3]
         if kind == b.GEOM_BOX:
             made = trimesh.creation.box(extents=size)
         elif kind == b.GEOM_SPHERE:
@@ -104,21 +104,21 @@ class Visuals:
             made = trimesh.creation.capsule(radius=size[1], height=size[0], count=[16, 16])
         elif kind == b.GEOM_PLANE:
             made = _ground()
-        elif (read := _read(part[4].decode(), size)) is not None:
+        elif (read := _read(visual[4].decode(), size)) is not None:
             made = read
         else:
-            vertices, faces = self._box_around(body, link, part)
+            vertices, faces = self._box_around(body, link, visual)
             return vertices, faces, False
         return np.asarray(made.vertices), np.asarray(made.faces), True
 
-    def _box_around(self, body: int, link: int, part: Any) -> tuple[Floats, NDArray[np.int64]]:
+    def _box_around(self, body: int, link: int, visual: Any) -> tuple[Floats, NDArray[np.int64]]:
         """In the link's frame."""
         import trimesh
 
         b = self.bullet
         if not b.getCollisionShapeData(body, link):
             cube = trimesh.creation.box(extents=[_UNKNOWN] * 3)
-            return np.asarray(cube.vertices) + part[5], np.asarray(cube.faces)
+            return np.asarray(cube.vertices) + visual[5], np.asarray(cube.faces)
         box = trimesh.creation.box(bounds=np.array(b.getAABB(body, link)))
         if link >= 0:
             position, quaternion = b.getLinkState(body, link, computeForwardKinematics=1)[4:6]
@@ -126,17 +126,17 @@ class Visuals:
             position, quaternion = b.multiplyTransforms(
                 *b.getBasePositionAndOrientation(body), *self._frame_from_com[body]
             )
-        turn = matrix_from_quaternion(from_xyzw(quaternion)[None])[0]
-        return (np.asarray(box.vertices) - position) @ turn, np.asarray(box.faces)
+        rotation = matrix_from_quaternion(from_xyzw(quaternion)[None])[0]
+        return (np.asarray(box.vertices) - position) @ rotation, np.asarray(box.faces)
 
 
 def _grouped(b: Bullet, body: int) -> dict[tuple[int, tuple[float, float, float, float]], list[Any]]:
     """PyBullet's visual shapes of a body by link and colour; what nobody can see is left out."""
     groups: dict[tuple[int, tuple[float, float, float, float]], list[Any]] = {}
-    for part in b.getVisualShapeData(body):
-        red, green, blue, alpha = (min(max(float(c), 0.0), 1.0) for c in part[7])
+    for visual in b.getVisualShapeData(body):
+        red, green, blue, alpha = (min(max(float(c), 0.0), 1.0) for c in visual[7])
         if alpha > 0.0:
-            groups.setdefault((part[1], (red, green, blue, alpha)), []).append(part)
+            groups.setdefault((visual[1], (red, green, blue, alpha)), []).append(visual)
     return groups
 
 
@@ -171,14 +171,14 @@ def _ground() -> Any:
     return ground
 
 
-def _placed(
-    vertices: Floats, faces: NDArray[np.int64], own: bool, part: Any
+def _in_link_frame(
+    vertices: Floats, faces: NDArray[np.int64], own: bool, visual: Any
 ) -> tuple[Floats, NDArray[np.int64]]:
     """In the link's frame."""
     if not own:
         return vertices, faces
-    turn = matrix_from_quaternion(from_xyzw(part[6])[None])[0]
-    return vertices @ turn.T + part[5], faces
+    rotation = matrix_from_quaternion(from_xyzw(visual[6])[None])[0]
+    return vertices @ rotation.T + visual[5], faces
 
 
 def _joined(meshes: list[tuple[Floats, NDArray[np.int64]]]) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:

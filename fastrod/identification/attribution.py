@@ -33,7 +33,9 @@ from fastrod.types import Ints
 MAX_EFFECTS = 4
 # samples that the search looks at; the operators run over all, and what is found is fitted to all
 _SEARCH_ROWS = 1500
-_MENDS = 0.02  # of the error above the noise: an effect beside a dominant one that brings less is not named
+_MIN_GAIN = (
+    0.02  # of the error above the noise: an effect beside a dominant one that brings less is not named
+)
 # effects beyond max_effects that the search may hold: among many small ones the dominant one may come late
 _SPARE = 2
 _MORE_STAGES = 3  # beyond max_effects: foils take stages too
@@ -71,7 +73,7 @@ def identify(
         )
     samples = sample(log)
     check_log(samples, robot)
-    tell = progress or (lambda *_: None)
+    progressed = progress or (lambda *_: None)
     tested, labels = held_out_rows(samples, held_out)
     train = samples.rows[~tested[samples.rows]]
     if len(train) < LEAST_ROWS:
@@ -81,19 +83,19 @@ def identify(
         )
     base_model(robot, free_camera=free_camera)  # refuses a wrong [fit] before anything is solved
     chosen = _thinned(train, _SEARCH_ROWS)
-    tell("registration", 0, max_effects + _SPARE + 2)
+    progressed("registration", 0, max_effects + _SPARE + 2)
     reading = read(samples.on(chosen), robot, threads=threads)
     if reading.refusal:
         raise LogError(reading.refusal)
-    placed = robot if reading.registration is None else reading.registration.on(robot)
-    model = base_model(placed, free_camera=free_camera, registered=placed is not robot)
-    tell("base fit", 0, max_effects + _SPARE + 2)
+    registered_robot = robot if reading.registration is None else reading.registration.on(robot)
+    model = base_model(registered_robot, free_camera=free_camera, registered=registered_robot is not robot)
+    progressed("base fit", 0, max_effects + _SPARE + 2)
     base = BaseFit(samples.on(chosen), train, model, robot, threads)
     base.notes += reading.questions
     search = Search(base.samples, base.rod, base.target, base.block, frozenset(exclude))
     start, fixed = base.fit(search)
     check_motion(base, start, reading.guess)
-    found, last, steps = _found(search, base, start, max_effects + _SPARE if max_effects else 0, tell)
+    found, last, steps = _found(search, base, start, max_effects + _SPARE if max_effects else 0, progressed)
     last_sigma = base.weights[-1]
     state, found = _library(search, base, start, last, found, max_effects, steps) if found else (start, found)
     if search.spent:
@@ -102,7 +104,7 @@ def identify(
             "for each row; "
             "more effects may be missing"
         )
-    tell("prediction on all samples", max_effects + _SPARE + 1, max_effects + _SPARE + 2)
+    progressed("prediction on all samples", max_effects + _SPARE + 1, max_effects + _SPARE + 2)
     result = assemble(
         samples=samples,
         rows=_thinned(train, ALL_AT_ONCE),
@@ -119,25 +121,31 @@ def identify(
         fixed=fixed,
         threads=threads,
     )
-    if placed is not robot:
+    if registered_robot is not robot:
         at = between(robot, result.identified)
         sentence = f"{at.sentence().capitalize()}; all errors are given with it registered there."
         result = replace(result, registration=at, summary=f"{result.summary} {sentence}")
     return replace(result, network=residual_network(samples, model.wiring, result)) if network else result
 
 
-def _report_stage(tell: Callable[[str, int, int], None], stage: int, max_effects: int, name: str) -> None:
-    tell(name, min(stage + 1, max_effects), max_effects + 2)
+def _report_stage(
+    progressed: Callable[[str, int, int], None], stage: int, max_effects: int, name: str
+) -> None:
+    progressed(name, min(stage + 1, max_effects), max_effects + 2)
 
 
 def _found(
-    search: Search, base: BaseFit, start: ModelState, max_effects: int, tell: Callable[[str, int, int], None]
+    search: Search,
+    base: BaseFit,
+    start: ModelState,
+    max_effects: int,
+    progressed: Callable[[str, int, int], None],
 ) -> tuple[list[str], ModelState, list[SearchStep]]:
     """Effects in the order in which they were found, the state with them (and with foils), the steps."""
     state, steps = start, list[SearchStep]()
     found: list[str] = []
     for stage in range(max_effects + _MORE_STAGES):
-        search.report = partial(_report_stage, tell, stage, max_effects)
+        search.report = partial(_report_stage, progressed, stage, max_effects)
         step = search.stage(state)
         if step.taken is None and stage == 0:
             pair = _pair(search, state, step)
@@ -145,10 +153,10 @@ def _found(
         steps.append(step)
         if step.taken is None or step.taken.state is None:
             break
-        if step.taken.foil is None and len(found) == max_effects:
+        if step.taken.alternative is None and len(found) == max_effects:
             break
         state = base.weighed(search, step.taken.state)
-        if step.taken.foil is None:
+        if step.taken.alternative is None:
             found += [
                 name for name in state.model.effects if name not in found and name not in start.model.effects
             ]
@@ -165,14 +173,14 @@ def _library(
     steps: list[SearchStep],
 ) -> tuple[ModelState, list[str]]:
     """The effects that are needed once foils are gone, with their state."""
-    alone = search.bare(state) if state.foils else state
+    alone = search.bare(state) if state.alternatives else state
     noise = start.fit.residual.size * float((base.noise.sigma**2).mean())
     while (
-        state.foils
+        state.alternatives
         and len(found) < max_effects
         and alone.fit.loss * float((base.target.sigma**2).mean()) > 2.0 * noise
     ):
-        step = search.stage(alone, with_foils=False)
+        step = search.stage(alone, with_alternatives=False)
         if step.taken is None or step.taken.state is None:
             break
         steps.append(step)
@@ -180,7 +188,7 @@ def _library(
         alone = base.weighed(search, step.taken.state)
     if len(found) > 1:
         excess = start.fit.loss * float((base.weights[0] ** 2).mean()) - noise
-        alone, found = search.eliminated(alone, found, _MENDS * max(excess, 0.0), noise)
+        alone, found = search.eliminated(alone, found, _MIN_GAIN * max(excess, 0.0), noise)
     while len(found) > max_effects:
         fewer = {name: search.without(alone, name) for name in found}
         least = min(fewer, key=lambda name: fewer[name].fit.loss)
@@ -191,8 +199,8 @@ def _library(
 def _pair(search: Search, state: ModelState, step: SearchStep) -> SearchStep | None:
     """Two effects at once, where none passes alone: of the five that come nearest."""
     near = sorted(
-        (c for c in step.candidates if c.state is not None and c.foil is None and c.share > 0.01),
-        key=lambda c: -c.share,
+        (c for c in step.candidates if c.state is not None and c.alternative is None and c.fraction > 0.01),
+        key=lambda c: -c.fraction,
     )[:5]
     best: Candidate | None = None
     for i, one in enumerate(near):

@@ -2,7 +2,7 @@
 
 Rest; four blocks in base orientations A-B-B-A with a known load off-on-off-on; rest; the first block's start
 again. Each block moves one segment at a time and then all, in triangles of decreasing amplitude, circles,
-holds and at random. Which part separates which pair of effects was measured on simulated logs by leaving it
+holds and at random. Which phase separates which pair of effects was measured on simulated logs by leaving it
 out.
 """
 
@@ -47,13 +47,14 @@ class Excitation:
     """A run to be driven: inputs as a log whose tip is empty, and its parts."""
 
     log: RunLog
-    parts: tuple[MotionPhase, ...]
+    phases: tuple[MotionPhase, ...]
 
     @property
     def comment(self) -> str:
         """The parts as text, a line each."""
         lines = [
-            f"{part.start:7.1f} to {part.end:6.1f} s  {part.name}: {part.purpose}" for part in self.parts
+            f"{phase.start:7.1f} to {phase.end:6.1f} s  {phase.name}: {phase.purpose}"
+            for phase in self.phases
         ]
         return (
             "Inputs of a run that separates effects; drive them, fill tip_x tip_y tip_z, and give the file "
@@ -96,12 +97,12 @@ def excitation(
     wiring = wire(robot)
     rng = np.random.default_rng(seed)
     rows: list[Floats] = []
-    parts: list[MotionPhase] = []
+    phases: list[MotionPhase] = []
 
     def add(name: str, what: Floats, purpose: str) -> None:
         start = sum(len(r) for r in rows) / rate
         rows.append(what)
-        parts.append(MotionPhase(name, start, start + len(what) / rate, purpose))
+        phases.append(MotionPhase(name, start, start + len(what) / rate, purpose))
 
     def still(seconds: float) -> Floats:
         return np.zeros((round(seconds * rate), wiring.n_segments, 2))
@@ -142,7 +143,7 @@ def excitation(
     # about the base's x, or y where x is the steeper: gravity must change
     quarter = np.zeros(4)
     quarter[[0, 1 + int(abs(down[1]) < abs(down[0]))]] = np.sqrt(0.5)
-    other_way = product(own, quarter) if turn else own
+    tilted = product(own, quarter) if turn else own
     log = RunLog(
         name=f"{robot.name}_excitation",
         t=np.arange(len(path)) / rate,
@@ -150,9 +151,9 @@ def excitation(
         dl=np.round(wiring.wires(path), 9),
         tip_position=np.full((len(path), 3), np.nan),
         payload=np.where(np.concatenate(loaded), payload, 0.0),
-        base_quaternion=np.where(np.concatenate(turned)[:, None], other_way, own),
+        base_quaternion=np.where(np.concatenate(turned)[:, None], tilted, own),
     )
-    return Excitation(log, tuple(parts))
+    return Excitation(log, tuple(phases))
 
 
 def _block(
@@ -167,7 +168,11 @@ def _block(
         direction = number * np.pi / 2.0 + k * np.pi / 4.0
         unit = np.zeros((n, 2))
         unit[k] = np.cos(direction), np.sin(direction)
-        corners = [zero, *(side * share * bend * unit for share in _LADDER for side in (1.0, -1.0)), zero]
+        corners = [
+            zero,
+            *(side * fraction * bend * unit for fraction in _LADDER for side in (1.0, -1.0)),
+            zero,
+        ]
         alone = f" of segment {k + 1} alone" if n > 1 else ""
         pieces.append(
             (
@@ -177,13 +182,13 @@ def _block(
             )
         )
     slow = number % 2 == 0
-    turns = _circle(n, 0.75 * bend, rate, 6.0 if slow else 2.5, 1.0 if slow else -1.0)
-    way = _through([zero, turns[0]], bend, rate, speed)
-    back = _through([turns[-1], zero], bend, rate, speed)
+    circles = _circle(n, 0.75 * bend, rate, 6.0 if slow else 2.5, 1.0 if slow else -1.0)
+    approach = _through([zero, circles[0]], bend, rate, speed)
+    back = _through([circles[-1], zero], bend, rate, speed)
     pieces.append(
         (
             "slow circle" if slow else "fast circle",
-            np.concatenate([way, turns, back]),
+            np.concatenate([approach, circles, back]),
             "routing, anisotropy; two speeds: latency and dynamics against creep",
         )
     )
@@ -207,8 +212,8 @@ def _line(start: Floats, end: Floats, bend: float, rate: float, speed: float) ->
     """Straight from start (excluded) to end at `speed`."""
     distance = float(np.linalg.norm(end - start, axis=-1).max())
     steps = max(2, int(np.ceil(max(distance, 0.02 * bend) / speed * rate)))
-    part = (np.arange(1, steps + 1) / steps)[:, None, None]
-    return np.asarray(start + part * (end - start))
+    fraction = (np.arange(1, steps + 1) / steps)[:, None, None]
+    return np.asarray(start + fraction * (end - start))
 
 
 def _through(corners: list[Floats], bend: float, rate: float, speed: float) -> Floats:

@@ -1,1 +1,1 @@
-"""What a robot did: run logs, their recording, and the link to a robot, real or simulated."""
+"""Logs of a robot's motion, their recording, and the link to a robot, real or simulated."""

@@ -9,7 +9,8 @@ from pathlib import Path
 
 
 def append_lines(file: FileIO, lines: str) -> None:
-    """Write the lines at once. Raises `OSError`: no part stays then, as the next would go on from there."""
+    """Write the lines at once. Raises `OSError`: no fragment stays then, since the next write would continue
+    from there."""
     data, end = lines.encode(), file.tell()
     try:
         while data:
@@ -23,7 +24,7 @@ def append_lines(file: FileIO, lines: str) -> None:
 
 
 def is_at(file: FileIO, path: Path) -> bool:
-    """Whether `path` still names the open file.
+    """Return whether `path` still names the open file.
 
     What was removed takes lines all the same, and they are nowhere; what was renamed, or whose folder was,
     takes them where nobody looks.

@@ -1,4 +1,4 @@
-"""`RobotLink`: a robot that is driven by its wires and tells where it is; a simulated one, an emulated one
+"""`RobotLink`: a robot that is driven by its tendons and reports its pose; a simulated one, an emulated one
 and a prototype all are."""
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from fastrod.types import Floats
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Measurement:
-    """One reading of a robot, in the units, signs and frames of a `RunLog` row. What a robot cannot tell is
+    """One reading of a robot, in the units, signs and frames of a `RunLog` row. What a robot cannot report is
     nan.
 
     Raises `InputError` where a length, a position or a quaternion has the wrong shape.
@@ -36,7 +36,7 @@ class Measurement:
     tension: Floats
     """(n_tendons,) [N]."""
     problem: str = ""
-    """What is wrong with the robot, one sentence; empty where nothing is."""
+    """Fault of the robot, one sentence; empty where there is none."""
 
     def __post_init__(self) -> None:
         sizes = {"tip_position": 3, "tip_quaternion": 4}
@@ -52,12 +52,12 @@ class Measurement:
 
 @runtime_checkable
 class RobotLink(Protocol):
-    """What teleop drives and a recorder records. Commands and readings may come from different threads; none
-    of them waits for motion."""
+    """Robot that teleop drives and a recorder records. Commands and readings may come from different threads;
+    none of them waits for motion."""
 
     @property
     def robot(self) -> Robot:
-        """What is at the other end."""
+        """Model of the robot at the other end."""
 
     @property
     def real(self) -> bool:
@@ -65,8 +65,8 @@ class RobotLink(Protocol):
 
     def command(self, dl: ArrayLike, ext: ArrayLike | None = None) -> None:
         """Go to these changes of tendon length (n_tendons,) [m], negative = pulled, and of segment length
-        (n_segments,) [m]. A link that is stopped ignores it. Raises `InputError` for what no robot of this
-        kind can be told."""
+        (n_segments,) [m]. A link that is stopped ignores it. Raises `InputError` for a command that no robot
+        of this kind can follow."""
 
     def read(self) -> Measurement:
         """The newest reading."""

@@ -42,8 +42,8 @@ class Recorder:
 
     Each row goes to PATH.part at once, in one write to the operating system: a process that is killed loses
     none. Rows are not forced onto the disk itself (fsync), so a machine that loses power may lose the last
-    seconds. `stop` writes the finished log to PATH and takes the part away; what a killed session leaves,
-    `recover` turns into a log. Where PATH.part is removed or renamed, or its folder is, the next row notices:
+    seconds. `stop` writes the finished log to PATH and removes PATH.part; what a killed session leaves,
+    `recover` makes a log of. Where PATH.part is removed or renamed, or its folder is, the next row notices:
     all rows are written again at PATH, or, where that cannot be, in the system's temporary folder. Rows
     without a measured tip are kept. Commands (cmd_dl_1 ...), tensions (tension_1 ...) and `extra` are kept as
     further columns. May be used from several threads.
@@ -63,13 +63,13 @@ class Recorder:
         sentence: where they are, how many.
 
         Raises `InputError` where the path cannot be one, or, but for `overwrite`, where a file or a left-over
-        part is there; where a name of `extra` is taken, given twice, or none.
+        PATH.part is there; where a name of `extra` is taken, given twice, or none.
         """
         self.robot = robot
         self.extra = _names(extra)
         """Names of the further columns."""
         self.path = None if path is None else _checked(Path(path), overwrite)
-        """Where the log will be; another than was given where that could not be kept."""
+        """Path of the log; another than was given where that could not be kept."""
         self.moved = ""
         """Why rows were written again, and where they are, one sentence; empty where that was not needed."""
         self._on_move = on_move
@@ -143,15 +143,15 @@ class Recorder:
         base_quaternion: ArrayLike | None = None,
         extra: Mapping[str, float] | None = None,
     ) -> bool:
-        """Append a reading; whether it was new: one from before the start, or the same one again, is left
-        out.
+        """Append a reading and return whether it was new: one from before the start, or the same one again,
+        is left out.
 
         `tip_force` (3,) known force on the tip, base frame [N], None for none; `payload` known mass at the
         tip [kg]; nan where a load is not known. `commanded_dl` (n_tendons,) [m], None where nothing was
-        commanded. `base_quaternion` (4,) world_from_base, w x y z, None where nobody asks: a log keeps it if
-        any row has it. `extra` numbers of the further columns; what is not given is nan. Raises `InputError`
-        for a reading of another robot, for an `extra` that was not named before, for a clock that runs back,
-        and where the row cannot be written.
+        commanded. `base_quaternion` (4,) world_from_base, w x y z, None where it is not needed: a log keeps
+        it if any row has it. `extra` numbers of the further columns; what is not given is nan. Raises
+        `InputError` for a reading of another robot, for an `extra` that was not named before, for a clock
+        that runs back, and where the row cannot be written.
         """
         n = self.robot.n_tendons
         more = {} if extra is None else extra
@@ -207,30 +207,29 @@ class Recorder:
                     append_lines(self._file, self._row(-1))
                     self._on_disk += 1
                 except OSError as error:
-                    if is_at(self._file, _part(self.path)):
+                    if is_at(self._file, _partial(self.path)):
                         why = f"{self.path.name}.part cannot be written: {error.strerror or error}"
                         raise InputError(f"{why}; {self._kept()}.") from error
                 self._stay()
             return True
 
     def stop(self) -> RunLog:
-        """End the recording: the log, written to the path where there is one.
+        """End the recording and return the log, written to the path where there is one.
 
         Raises `InputError` where nothing is recorded, or where the log cannot be written; it says how many
-        rows are in PATH.part then.
+        rows are in PATH.part then. Where they are in no file, it may be called again.
         """
         with self._lock:
-            if not self._recording:
+            # an open file that nothing is recorded to: no place took its rows when it was stopped before
+            if not self._recording and (self._file is None or not self._rows):
                 raise InputError("nothing is being recorded; start first.")
             self._recording = False
-            try:
-                self._stay()
-                kept = self._kept()
-            finally:
-                self._close()
+            self._stay()
+            kept = self._kept()
+            self._close()
             if not self._rows:
                 if self.path is not None:
-                    _part(self.path).unlink(missing_ok=True)
+                    _partial(self.path).unlink(missing_ok=True)
                 raise InputError("no reading came in while recording; there is nothing to keep.")
             log = _log(
                 self._columns,
@@ -244,10 +243,11 @@ class Recorder:
             return log
 
     def _open(self) -> None:
+        self._close()
         if self.path is None:
             return
         try:
-            self._file = _part(self.path).open("wb", buffering=0)
+            self._file = _partial(self.path).open("wb", buffering=0)
             append_lines(self._file, self._head())
         except OSError as error:
             raise InputError(f"{str(self.path)!r} cannot be written: {error.strerror or error}.") from error
@@ -261,20 +261,25 @@ class Recorder:
 
     def _stay(self) -> None:
         """Write all rows again if the file is no longer at its path. Raises `InputError`."""
-        if not self._rows or self._file is None or self.path is None or is_at(self._file, _part(self.path)):
+        if (
+            not self._rows
+            or self._file is None
+            or self.path is None
+            or is_at(self._file, _partial(self.path))
+        ):
             return
         lost, why = f"{self.path.name}.part was removed or renamed while it was recorded", ""
         for path in (self.path, Path(tempfile.gettempdir()) / self.path.name):
             try:
-                target = free_path(path) if _part(path).exists() or path is not self.path else path
+                target = free_path(path) if _partial(path).exists() or path is not self.path else path
                 rows = "".join(map(self._row, range(len(self._rows))))
-                file = made_again(_part(target), self._head() + rows)
+                file = made_again(_partial(target), self._head() + rows)
             except OSError as error:
                 why = why or f"{str(path)!r} cannot be written: {error.strerror or error}"
                 continue
             self._file.close()
             self._file, self.path, self._on_disk = file, target, len(self._rows)
-            where = f"all {len(self._rows)} rows are in {str(_part(target))!r} now"
+            where = f"all {len(self._rows)} rows are in {str(_partial(target))!r} now"
             self.moved = f"{lost}; {where}, and more go there."
             if self._on_move is not None:
                 self._on_move(self.moved)
@@ -283,11 +288,11 @@ class Recorder:
         raise InputError(f"{lost}, and {why}; {self._kept()}.")
 
     def _kept(self) -> str:
-        """Where the rows are, without a full stop."""
-        if self.path is None or self._file is None or not is_at(self._file, _part(self.path)):
+        """Return a clause that says where the rows are, without a full stop."""
+        if self.path is None or self._file is None or not is_at(self._file, _partial(self.path)):
             return f"its {len(self._rows)} rows are in no file"
         some = "" if self._on_disk == len(self._rows) else f"{self._on_disk} of "
-        return f"{some}its {len(self._rows)} rows are in {_part(self.path).name}"
+        return f"{some}its {len(self._rows)} rows are in {_partial(self.path).name}"
 
     def _close(self) -> None:
         if self._file is not None:
@@ -296,42 +301,42 @@ class Recorder:
 
 
 def recover(path: str | Path) -> RunLog:
-    """The log of a session that was killed: PATH, made of the PATH.part that it left (either may be given),
-    which is then taken away.
+    """Recover the log of a session that was killed: PATH, made of the PATH.part that it left (either may be
+    given), which is then removed.
 
-    A last row that was cut short is left out. Raises `LogError` where there is no part, or no whole row in
-    it; `InputError` where PATH is there already or cannot be written.
+    A last row that was cut short is left out. Raises `LogError` where there is no PATH.part, or no whole row
+    in it; `InputError` where PATH is there already or cannot be written.
     """
     path = Path(path)
     target = path.with_name(path.name.removesuffix(".part"))
-    part = _part(target)
+    partial = _partial(target)
     if target.exists():
-        raise InputError(f"{str(target)!r} is there already; rename it, then recover {part.name}.")
+        raise InputError(f"{str(target)!r} is there already; rename it, then recover {partial.name}.")
     try:
-        lines = part.read_text(encoding="utf-8").splitlines(keepends=True)
+        lines = partial.read_text(encoding="utf-8").splitlines(keepends=True)
     except (OSError, UnicodeDecodeError) as error:
         raise LogError(
-            f"{str(part)!r} cannot be recovered: {getattr(error, 'strerror', None) or error}."
+            f"{str(partial)!r} cannot be recovered: {getattr(error, 'strerror', None) or error}."
         ) from error
     whole = lines if lines and lines[-1].endswith("\n") else lines[:-1]
-    table = read_table(_rewritten(part, whole)) if len(whole) != len(lines) else read_table(part)
+    table = read_table(_rewritten(partial, whole)) if len(whole) != len(lines) else read_table(partial)
     if not table.get("t", ("",)):
-        raise LogError(f"{part.name} has no whole row; there is nothing to recover.")
+        raise LogError(f"{partial.name} has no whole row; there is nothing to recover.")
     if missing := [name for name in _ALWAYS if name not in table]:
-        raise LogError(f"{part.name} is no recording: it lacks column {missing[0]}.")
+        raise LogError(f"{partial.name} is no recording: it lacks column {missing[0]}.")
     names = list(table)
-    rows = np.stack([numbers(table, name, part.name) for name in names if name != "run"], axis=1)
+    rows = np.stack([numbers(table, name, partial.name) for name in names if name != "run"], axis=1)
     log = _log(names, [str(label) for label in table["run"]], rows, target.stem)
-    _finish(log, target, "Recovered from a session that did not end.", f"its rows are in {part.name}")
+    _finish(log, target, "Recovered from a session that did not end.", f"its rows are in {partial.name}")
     return log
 
 
 def free_path(path: str | Path) -> Path:
-    """`path`, or where it or its part is there already, the next free name: session.csv, session-2.csv,
-    session-3.csv ..."""
+    """Return `path`, or where it or its partial file is there already, the next free name: session.csv,
+    session-2.csv, session-3.csv ..."""
     path = Path(path)
     stem, number, found = path.stem, 2, path
-    while found.exists() or _part(found).exists():
+    while found.exists() or _partial(found).exists():
         found = path.with_name(f"{stem}-{number}{path.suffix}")
         number += 1
     return found
@@ -346,7 +351,7 @@ def _checked(path: Path, overwrite: bool) -> Path:
         raise InputError(f"{str(path)!r} is a folder; give the file to record to.")
     for taken, what in (
         (path, "is there already"),
-        (_part(path), "is what a session that did not end has left: recover it"),
+        (_partial(path), "is what a session that did not end has left: recover it"),
     ):
         if taken.exists() and not overwrite:
             raise InputError(f"{str(taken)!r} {what}, or record to {free_path(path).name!r}.")
@@ -371,19 +376,19 @@ def _names(extra: Sequence[str]) -> tuple[str, ...]:
     return names
 
 
-def _part(path: Path) -> Path:
+def _partial(path: Path) -> Path:
     return path.with_name(path.name + ".part")
 
 
-def _rewritten(part: Path, lines: Sequence[str]) -> Path:
-    """`part` with these lines alone, whole or not at all."""
-    beside = part.with_name(part.name + ".whole")
+def _rewritten(partial: Path, lines: Sequence[str]) -> Path:
+    """`partial` with these lines alone, whole or not at all."""
+    beside = partial.with_name(partial.name + ".whole")
     beside.write_text("".join(lines), encoding="utf-8")
-    return beside.replace(part)
+    return beside.replace(partial)
 
 
 def _finish(log: RunLog, path: Path, comment: str, kept: str) -> None:
-    """Write `log` to `path` and take the part away; `kept` says where the rows are if that fails.
+    """Write `log` to `path` and remove the partial file; `kept` says where the rows are if that fails.
 
     `write_log` would begin by emptying PATH.part, which still holds the only copy.
     """
@@ -391,7 +396,7 @@ def _finish(log: RunLog, path: Path, comment: str, kept: str) -> None:
     try:
         write_log(log, beside, comment=comment)
         beside.replace(path)
-        _part(path).unlink(missing_ok=True)
+        _partial(path).unlink(missing_ok=True)
     except OSError as error:
         beside.unlink(missing_ok=True)
         why = f"{str(path)!r} cannot be written: {error.strerror or error}"

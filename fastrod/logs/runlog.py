@@ -25,10 +25,11 @@ _TIP = ("tip_x", "tip_y", "tip_z")
 _TIP_QUATERNION = ("tip_qw", "tip_qx", "tip_qy", "tip_qz")
 _TIP_FORCE = ("tip_fx", "tip_fy", "tip_fz")
 _BASE_QUATERNION = ("base_qw", "base_qx", "base_qy", "base_qz")
-_REACH = 3.0  # robot lengths; nothing on the robot moves further, so the unit is wrong
+_LONGEST_MOVE = 3.0  # robot lengths; nothing on the robot moves further, so the unit is wrong
 _FAR = 30.0  # robot lengths; no camera that sees the robot is further off
 _LIKE_REST = 0.2  # of the rest length: tendon lengths that stay so near to it are no changes
-_MOST_VALUES, _MOST_BYTES = 30_000_000, 500_000_000  # of a Parquet file unpacked: 1.5 GB at its peak
+# of a Parquet file unpacked: 1.5 GB at its peak; the bytes of a CSV, too
+_MOST_VALUES, _MOST_BYTES = 30_000_000, 500_000_000
 _HEAVIEST = 10.0  # kg; a heavier payload was given in g
 _QUATERNION_SLACK = 1e-2  # trackers write three or four digits
 
@@ -41,7 +42,7 @@ class RunLog:
     """
 
     name: str
-    """What the log is called in tables: its file's name without suffix."""
+    """Name of the log in tables: its file's name without suffix."""
     t: Floats
     """(n,) time [s], non-decreasing inside a run."""
     run: NDArray[np.str_]
@@ -62,7 +63,7 @@ class RunLog:
     payload: Floats | None = None
     """(n,) known mass at the tip [kg]."""
     base_quaternion: Floats | None = None
-    """(n, 4) world_from_base, w x y z: which way gravity points."""
+    """(n, 4) world_from_base, w x y z: the direction of gravity."""
     extra: Mapping[str, Sequence[str] | Floats] = field(default_factory=dict)
     """Columns that fastrod does not know, kept as they were read."""
 
@@ -196,12 +197,12 @@ def write_log(log: RunLog, path: str | Path, *, comment: str = "") -> None:
     """
     path = Path(path)
     columns = _columns(log)
-    part = path.with_name(path.name + ".part")
+    partial = path.with_name(path.name + ".part")
     table = None
     if path.suffix == ".parquet":
         table = _pyarrow("pyarrow").table({name: np.asarray(cells) for name, cells in columns.items()})
         write_table = _pyarrow("pyarrow.parquet").write_table
-    file = part.open("wb")
+    file = partial.open("wb")
     try:
         with file, TextIOWrapper(file, encoding="utf-8", newline="") as text:
             if table is not None:
@@ -211,9 +212,9 @@ def write_log(log: RunLog, path: str | Path, *, comment: str = "") -> None:
                 writer = csv.writer(text, lineterminator="\n")
                 writer.writerow(columns)
                 writer.writerows(zip(*(_texts(cells) for cells in columns.values()), strict=True))
-        part.replace(path)
+        partial.replace(path)
     except BaseException:
-        part.unlink(missing_ok=True)  # it takes room on a disk that is full
+        partial.unlink(missing_ok=True)  # it takes room on a disk that is full
         raise
 
 
@@ -224,6 +225,8 @@ def read_table(path: str | Path) -> Table:
     """
     path = Path(path)
     try:
+        if path.exists() and not path.is_file():  # a pipe or a device may have no end
+            raise ValueError("it is no file")
         return _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path)
     except LogError:
         raise
@@ -258,6 +261,8 @@ def numbers(table: Table, name: str, where: str) -> Floats:
 
 
 def _read_csv(path: Path) -> Table:
+    if (size := path.stat().st_size) > _MOST_BYTES:
+        raise LogError(f"{path.name} has {size} bytes; a log may have {_MOST_BYTES}. Cut it in parts.")
     with path.open(encoding="utf-8-sig", newline="") as file:
         rows = [row for row in csv.reader(line for line in file if not line.startswith("#")) if row]
     if not rows:
@@ -325,7 +330,7 @@ def _check_declared(metadata: Any, where: str) -> None:
     if n_values > _MOST_VALUES or n_bytes > _MOST_BYTES:
         raise LogError(
             f"{where} declares {n_values} values of {n_bytes} bytes; a log may have {_MOST_VALUES} of "
-            f"{_MOST_BYTES} bytes. Cut it in parts."
+            f"{_MOST_BYTES} bytes. Split it."
         )
 
 
@@ -339,8 +344,7 @@ def _check_words(column: Any, where: str) -> None:
             )
     if n_bytes > _MOST_BYTES:
         raise LogError(
-            f"{where} declares a column of {n_bytes} bytes of text; a log may have "
-            f"{_MOST_BYTES}. Cut it in parts."
+            f"{where} declares a column of {n_bytes} bytes of text; a log may have {_MOST_BYTES}. Split it."
         )
 
 
@@ -496,14 +500,23 @@ def _check_units(log: RunLog, robot: Robot, where: str) -> None:
         with np.errstate(over="ignore"):  # of 1e300, which is too far then
             return np.asarray(np.linalg.norm(points, axis=1))
 
-    far = f"more than {_REACH:g} lengths of robot {robot.name!r} ({robot.length:g} m). Was it given in mm?"
+    far = (
+        f"more than {_LONGEST_MOVE:g} lengths of robot {robot.name!r} ({robot.length:g} m). "
+        "Was it given in mm?"
+    )
     for name, places in _measured(log):
         away = norm(places)
         refuse(away > _FAR * length, f"{name} from the base", away, "m", far)
         if not np.isfinite(away).any():
             continue
         moved = norm(places - np.nanmedian(places, axis=0))  # wherever the camera stands
-        refuse((moved > _REACH * length) & (away > _REACH * length), f"{name} from the base", away, "m", far)
+        refuse(
+            (moved > _LONGEST_MOVE * length) & (away > _LONGEST_MOVE * length),
+            f"{name} from the base",
+            away,
+            "m",
+            far,
+        )
     _check_changes(log, robot, where)
     for k in range(log.dl.shape[1]):
         long = f"more than robot {robot.name!r} is long ({robot.length:g} m). Was it given in mm?"

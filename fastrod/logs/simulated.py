@@ -1,4 +1,4 @@
-"""`SimulatedRobot`: a simulator as a `RobotLink`, for those who would drive a robot and have none."""
+"""`SimulatedRobot`: a simulator as a `RobotLink`, to drive without a real robot."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ from fastrod.types import Floats
 
 @final
 class SimulatedRobot:
-    """A robot that moves at once to what it is told, effects of its file included, and measures without
-    noise.
+    """A robot that moves at once to its command, effects of its file included, and measures without noise.
 
     >>> import fastrod
     >>> link = SimulatedRobot(fastrod.load_robot("prototype"))
@@ -38,9 +37,8 @@ class SimulatedRobot:
         real: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`dt` [s] between two readings, as effects with a memory count time; `real` asks to be treated like
-        a robot that can do harm;
-        `clock` gives its time [s]."""
+        """`dt` [s] between two readings, as effects with a memory count time; `real` has it treated like a
+        robot that can do harm; `clock` gives its time [s]."""
         self._robot, self._real, self._clock = robot, real, clock
         self._simulator = Simulator(robot, dt=dt, points_per_segment=10, threads=1)
         self._lock = threading.Lock()
@@ -53,16 +51,17 @@ class SimulatedRobot:
 
     @property
     def robot(self) -> Robot:
-        """What is simulated."""
+        """Model that is simulated."""
         return self._robot
 
     @property
     def real(self) -> bool:
-        """As it was made."""
+        """Value given at construction."""
         return self._real
 
     def command(self, dl: ArrayLike, ext: ArrayLike | None = None) -> None:
-        """As `RobotLink.command`. Raises `InputError` on wrong shapes and on what is not finite."""
+        """Move at once to these changes of length (`RobotLink.command`). Raises `InputError` on wrong shapes
+        and on what is not finite."""
         change = _numbers("dl", dl, self._robot.n_tendons)
         extension = (
             np.zeros(self._robot.n_segments) if ext is None else _numbers("ext", ext, self._robot.n_segments)
@@ -81,19 +80,19 @@ class SimulatedRobot:
             if state is None or not state.ok[0]:
                 state = self._simulator.settle(lengths, extension=extension)
         base, rotation = state.position[0, 0], state.rotation[0, 0]
-        turn = rotation.T @ state.tip_rotation[0]
+        relative = rotation.T @ state.tip_rotation[0]
         return Measurement(
             t=self._clock() - self._began,
             dl=change,
             ext=extension,
             tip_position=rotation.T @ (state.tip_position[0] - base),
-            tip_quaternion=quaternion_from_matrix(turn[None])[0],
+            tip_quaternion=quaternion_from_matrix(relative[None])[0],
             tension=state.tension[0],
             problem=state.problems.get(0, ""),
         )
 
     def stop(self) -> None:
-        """Stay where it was told to be last."""
+        """Stay at the last command."""
         with self._lock:
             self.stopped = True
 

@@ -2,7 +2,7 @@
 
 One robot a call and no code shared with the kernels. `shoot` and `solve_bvp` solve the tendon rod of Rucker
 and Webster, IEEE T-RO 27(6), 2011, section III (and, in mode `paper`, the reduced one of Kasaei et al., CoRL
-2024, eq. 1-3) in two ways; `constant_curvature` is the geometry that needs no mechanics.
+2024, eq. 1-3) by two methods; `constant_curvature` is the geometry that needs no mechanics.
 """
 
 from fastrod.reference.arcs import constant_curvature

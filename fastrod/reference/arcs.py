@@ -25,9 +25,9 @@ from fastrod.reference.rod import (
     curvature_of_moment,
     hat,
     internal_force,
+    rotation_of,
     shape_of,
     span_moment,
-    turn,
 )
 
 _ROUNDS = 20  # of the guess, at most
@@ -40,17 +40,18 @@ def constant_curvature(
     *,
     points_per_segment: int = 20,
 ) -> ReferenceShape:
-    """Shape of a chain of constant-curvature arcs from the tendon lengths alone: no stiffness, no loads.
+    """Return the shape of a chain of constant-curvature arcs from the tendon lengths alone: no stiffness, no
+    loads.
 
     Per segment the least-squares (u_x, u_y) with u_z = 0, after a distal tendon's path through the segments
     before it, at its own offsets there, is taken off its length. A segment without tendons keeps its
-    precurvature. Without loads, with lengths that fit together and wires that do not stretch this is the
+    precurvature. Without loads, with lengths that fit together and tendons that do not stretch this is the
     rod's own shape, whatever its stiffness.
 
     `tendon_length` (n_tendons,) [m], absolute, base to where the tendon ends; `extension` (n_segments,) [m].
-    `residual` is the largest length that the arcs miss [m]; `tension` is nan.
-    Source: Kasaei et al., CoRL 2024, eq. 2b (curvature of the segment base from the wire lengths), one arc a
-    segment. Raises `InputError` on wrong shapes and ranges.
+    `residual` is the largest length that the arcs miss [m]; `tension` is nan. Source: Kasaei et al., CoRL
+    2024, eq. 2b (curvature of the segment base from the tendon lengths), one arc a segment. Raises
+    `InputError` on wrong shapes and ranges.
     """
     length = np.asarray(tendon_length, dtype=np.float64)
     if length.shape != (robot.n_tendons,) or not np.all(np.isfinite(length)):
@@ -112,7 +113,7 @@ def arc_states(robot: Robot, backbone: Array, u: Array, fraction: Array) -> Arra
         for s in step * fraction:
             state = start.copy()
             state[POSITION] += rotation @ _chord(u[k], s)
-            state[ROTATION] = (rotation @ turn(s * u[k])).ravel()
+            state[ROTATION] = (rotation @ rotation_of(s * u[k])).ravel()
             state[CURVATURE] = u[k]
             state[PATH][crossing] += s * _growth(offset, u[k])
             states.append(state)
@@ -120,8 +121,8 @@ def arc_states(robot: Robot, backbone: Array, u: Array, fraction: Array) -> Arra
 
 
 def first_guess(problem: Problem) -> tuple[Array, Array, Array, Array]:
-    """Where the solvers start: arc curvature (n_segments, 3), tension (n_tendons,), base moment (3,),
-    follower force (3,).
+    """Return the first guess of the solvers: arc curvature (n_segments, 3), tension (n_tendons,), base moment
+    (3,), follower force (3,).
 
     The cantilever is statically determinate: on the arc that the lengths prescribe, the loads give every
     moment, and the least-norm tensions follow. A guess of zero instead diverges.

@@ -84,8 +84,8 @@ def solve_bvp(
         all_tension, follower = unpack(p)
         out = []
         for span, state in zip(problem.spans, y.reshape(n_spans, width, -1), strict=True):
-            reach = span.end - span.start
-            out.append(reach * slope(span, all_tension, follower, span.start + reach * x, state.T).T)
+            length = span.end - span.start
+            out.append(length * slope(span, all_tension, follower, span.start + length * x, state.T).T)
         return np.concatenate(out)
 
     def conditions(first: Array, last: Array, p: Array) -> Array:
@@ -129,13 +129,13 @@ def _conditions(problem: Problem, first: Array, last: Array, tension: Array, fol
     `first`, `last` (n_spans, width)."""
     scale = problem.length**2 / problem.bending_stiffness
     still = np.r_[: CURVATURE.start, PATH.start : first.shape[1]]
-    parts = [(first[0] - base_state(problem.robot))[still]]
+    residuals = [(first[0] - base_state(problem.robot))[still]]
     for k in range(1, len(problem.spans)):
-        parts.append((first[k] - last[k - 1])[still])
+        residuals.append((first[k] - last[k - 1])[still])
         jump = span_moment(problem.spans[k], tension, first[k, CURVATURE])
         jump -= span_moment(problem.spans[k - 1], tension, last[k - 1, CURVATURE])
-        parts.append(scale * jump)
-    return np.concatenate([*parts, tip_residual(problem, tension, follower, last[-1])])
+        residuals.append(scale * jump)
+    return np.concatenate([*residuals, tip_residual(problem, tension, follower, last[-1])])
 
 
 def _guess(problem: Problem, nodes: Array) -> tuple[Array, Array]:

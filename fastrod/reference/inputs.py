@@ -1,4 +1,4 @@
-"""From a robot and its inputs to a `Problem`, with a sentence for everything that cannot be one."""
+"""Make a `Problem` of a robot and its inputs, with a sentence for everything that cannot be one."""
 
 from __future__ import annotations
 
@@ -89,7 +89,8 @@ def segment_length(robot: Robot, extension: ArrayLike | None) -> Array:
 
 
 def tendon_offset(robot: Robot, segment: int) -> tuple[NDArray[np.int64], Array]:
-    """Which tendons cross a segment (n_crossing,), and where: (n_crossing, 3) d_i, material frame [m]."""
+    """Return the tendons that cross a segment (n_crossing,), and their positions (n_crossing, 3) d_i,
+    material frame [m]."""
     ends = robot.tendon_segment
     crossing = np.flatnonzero(ends >= segment)
     offset = [(*robot.tendons[i].position(int(ends[i]) + 1)[segment], 0.0) for i in crossing]
@@ -187,7 +188,7 @@ def _per_tendon(name: str, value: ArrayLike | None, needed: NDArray[np.bool_], u
     if value is None:
         if needed.any():
             raise InputError(
-                f"{name} is missing; the modes of this robot ask for it: ({len(needed)},) [{unit}]."
+                f"{name} is missing; the modes of this robot need it: ({len(needed)},) [{unit}]."
             )
         return np.zeros(len(needed))
     array = _array(name, value, needed)

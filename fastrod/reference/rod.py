@@ -84,7 +84,7 @@ class Span:
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """What one robot is asked: its spans from the base to the tip, its commands and its loads."""
+    """Boundary value problem of one robot: its spans from the base to the tip, its commands and its loads."""
 
     robot: Robot
     paper: bool
@@ -100,7 +100,7 @@ class Problem:
     tip_moment: Array
     """(3,) world [N m]."""
     follower: Array
-    """(3,) force that turns with the tip, material frame [N]."""
+    """(3,) force that rotates with the tip, material frame [N]."""
 
     @property
     def length(self) -> float:
@@ -128,7 +128,7 @@ class Problem:
         return np.array([tendon.pretension for tendon in self.robot.tendons])
 
     def scaled(self, fraction: float) -> Problem:
-        """The same robot under a fraction of its loads."""
+        """Return this robot under a fraction of its loads."""
         spans = tuple(
             replace(s, line_force=fraction * s.line_force, force=fraction * s.force) for s in self.spans
         )
@@ -144,7 +144,7 @@ def hat(v: Array) -> Array:
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*v.shape, 3)
 
 
-def turn(angle: Array) -> Array:
+def rotation_of(angle: Array) -> Array:
     """Rotation matrix (3, 3) of a rotation vector (3,) [rad], by Rodrigues' formula."""
     theta = float(np.linalg.norm(angle))
     k = hat(angle)
@@ -191,7 +191,7 @@ def internal_force(span: Span, s: Array, tip_force: Array) -> Array:
     """n(s) = F + integral_s^l f + the point forces beyond s, world (p, 3) [N]; eq. 1c is printed with
     integral_0^s.
 
-    `tip_force` (3,) is the part that the tip's own rotation decides.
+    `tip_force` (3,) is the component that the tip's own rotation decides.
     """
     weight = ((s - span.start) / (span.end - span.start))[:, None]
     here = (1.0 - weight) * span.line_force[0] + weight * span.line_force[1]
@@ -236,7 +236,8 @@ def curvature_of_moment(span: Span, tension: Array, moment: Array, u: Array) -> 
 
 
 def tip_residual(problem: Problem, tension: Array, tip_force: Array, tip: Array) -> Array:
-    """What the tip of a trial misses [m]: lengths of the free tendons, m(l) - R^T M, follower force.
+    """Return the residual at the tip of a trial [m]: lengths of the free tendons, m(l) - R^T M, follower
+    force.
 
     l_i = L_i + c_i (T_i - T0_i): a stretching tendon is what makes the tensions unique for any number of
     tendons.
@@ -245,10 +246,10 @@ def tip_residual(problem: Problem, tension: Array, tip_force: Array, tip: Array)
     rotation = tip[ROTATION].reshape(3, 3)
     length = tip[PATH] - problem.tendon_length - problem.compliance * (tension - problem.pretension)
     moment = span_moment(problem.spans[-1], tension, tip[CURVATURE]) - rotation.T @ problem.tip_moment
-    parts = [length[problem.free], scale * moment]
+    blocks = [length[problem.free], scale * moment]
     if problem.follows:
-        parts.append(scale * problem.length * (rotation @ problem.follower - tip_force))
-    return np.concatenate(parts)
+        blocks.append(scale * problem.length * (rotation @ problem.follower - tip_force))
+    return np.concatenate(blocks)
 
 
 def grid(problem: Problem, points_per_segment: int) -> Array:

@@ -1,4 +1,4 @@
-"""Shooting: integrate the rod from a guessed base, mend the guess until the tip fits."""
+"""Shooting: integrate the rod from a guessed base, correct the guess until the tip fits."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ Residual: TypeAlias = Callable[[Array], Array]
 _METHODS = ("lm", "slsqp", "trust-constr")
 _INTEGRATORS = ("RK45", "RK23", "DOP853", "Radau", "BDF", "LSODA")
 _LARGE = 6.0  # rad of bend by the loads; beyond it the first guess is too far away for a shot
-_LOST = 100.0  # rad of bend; a trial that coils up further costs much time and tells nothing
+_LOST = 100.0  # rad of bend; a trial that coils up further costs much time and yields nothing
 
 
 def shoot(
@@ -131,7 +131,7 @@ def shoot(
 
 @dataclass(frozen=True)
 class _Search:
-    """How to solve: the numerical words of `shoot`, and the passes they cost."""
+    """Options of the search: the numerical arguments of `shoot`, and the passes they cost."""
 
     method: Method
     integrator: str
@@ -152,8 +152,8 @@ def _scale(problem: Problem) -> tuple[float, float, float]:
 
 def _pack(problem: Problem, base: Array, tension: Array, follower: Array) -> Array:
     first, second, third = _scale(problem)
-    parts = [base.ravel() / first, tension[problem.free] / second]
-    return np.concatenate([*parts, follower / third] if problem.follows else parts)
+    blocks = [base.ravel() / first, tension[problem.free] / second]
+    return np.concatenate([*blocks, follower / third] if problem.follows else blocks)
 
 
 def _unpack(problem: Problem, x: Array) -> tuple[Array, Array, Array]:
@@ -431,9 +431,9 @@ def _load_bend(problem: Problem) -> float:
 def _complementary(
     search: _Search, problem: Problem, guess: Array | None
 ) -> tuple[Problem, Array, float, int]:
-    """Search with the right tendons slack: T >= 0, path no longer than the wire, and one of them tight."""
+    """Search with the right tendons slack: T >= 0, path no longer than the tendon, and one of them tight."""
     unilateral = np.array([tendon.unilateral for tendon in problem.robot.tendons], dtype=bool) & problem.free
-    wire = problem.tendon_length - problem.compliance * problem.pretension
+    tendon_path = problem.tendon_length - problem.compliance * problem.pretension
     passes = 0
     for _ in range(2 * problem.robot.n_tendons + 1):
         x, missed, more = _continued(search, problem, guess)
@@ -443,7 +443,9 @@ def _complementary(
             break
         path = _march(search, problem, x)[0, PATH]
         slack = unilateral & ~problem.free
-        wrong = (unilateral & problem.free & (tension < 0.0)) | (slack & (path - wire > search.tolerance))
+        wrong = (unilateral & problem.free & (tension < 0.0)) | (
+            slack & (path - tendon_path > search.tolerance)
+        )
         if not wrong.any():
             break
         problem = replace(problem, free=problem.free ^ wrong)

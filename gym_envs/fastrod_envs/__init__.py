@@ -2,15 +2,19 @@
 
 >>> import fastrod_envs
 >>> fastrod_envs.ids()[0]
-'fastrod/Reach-v0'
+'fastrod/BoxExplore-v0'
+
+A task of your own is a class derived from `fastrod_envs.rodtask.RodTask` (or `task.Task`) with
+`@fastrod_envs.register` on it.
 """
 
 from fastrod_envs.randomisation import Randomisation
-from fastrod_envs.registration import ids, names, register_all
+from fastrod_envs.registration import ids, load_plug_ins, names, register, register_all, unregister
 
 try:
     register_all()
 except ModuleNotFoundError as error:
     raise ImportError("fastrod_envs needs gymnasium: pip install fastrod[envs].") from error
+load_plug_ins()
 
-__all__ = ["Randomisation", "ids", "names"]
+__all__ = ["Randomisation", "ids", "names", "register", "unregister"]

@@ -28,7 +28,7 @@ class Actor(NamedTuple):
     """Each (n_out,)."""
     middle: Singles
     """(n_obs,) of the observations' bounds."""
-    reach: Singles
+    half_range: Singles
     """(n_obs,) from there to a bound."""
     activation: Activation
     """Of the hidden layers."""
@@ -37,7 +37,7 @@ class Actor(NamedTuple):
 
     def act(self, observation: np.ndarray) -> Floats:
         """(n, n_actions) of observations (n, n_obs)."""
-        x = (np.asarray(observation, np.float32) - self.middle) / self.reach
+        x = (np.asarray(observation, np.float32) - self.middle) / self.half_range
         for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             x = x @ weight.T + bias
             if k < len(self.weights) - 1:
@@ -50,7 +50,7 @@ class Actor(NamedTuple):
         held |= {f"bias_{k}": b for k, b in enumerate(self.biases)}
         held |= {
             "middle": self.middle,
-            "reach": self.reach,
+            "reach": self.half_range,
             "activation": self.activation,
             "squashed": self.squashed,
         }
@@ -75,13 +75,13 @@ def load_actor(path: Path) -> Actor:
             "missing or too much."
         )
     weights, biases = [held[f"weight_{k}"] for k in range(n)], [held[f"bias_{k}"] for k in range(n)]
-    activation, squashed, middle, reach = (
+    activation, squashed, middle, half_range = (
         str(held["activation"]),
         held["squashed"],
         held["middle"],
         held["reach"],
     )
-    why = _misfit(weights, biases, middle, reach)
+    why = _misfit(weights, biases, middle, half_range)
     if activation not in get_args(Activation) or squashed.shape != () or squashed.dtype != np.bool_:
         why = f"its activation is {shown(activation, 40)} and squashed {shown(squashed.tolist(), 40)}"
     if why:
@@ -90,22 +90,22 @@ def load_actor(path: Path) -> Actor:
         tuple(weights),
         tuple(biases),
         middle,
-        reach,
+        half_range,
         "tanh" if activation == "tanh" else "relu",
         bool(squashed),
     )
 
 
 def _misfit(
-    weights: list[np.ndarray], biases: list[np.ndarray], middle: np.ndarray, reach: np.ndarray
+    weights: list[np.ndarray], biases: list[np.ndarray], middle: np.ndarray, half_range: np.ndarray
 ) -> str:
     """What hinders the layers to be one network of finite numbers, or nothing."""
-    arrays = (middle, reach, *weights, *biases)
+    arrays = (middle, half_range, *weights, *biases)
     if not weights or any(a.dtype != np.float32 for a in arrays):
         return "its layers are not numbers of single precision"
     if any(not np.isfinite(a).all() for a in arrays):
         return "it holds a number that is not finite"
-    ends = [*(w.shape for w in weights), *(b.shape for b in biases), middle.shape, reach.shape]
+    ends = [*(w.shape for w in weights), *(b.shape for b in biases), middle.shape, half_range.shape]
     widths = [middle.size, *(b.size for b in biases)]
     fitting = [
         *zip(widths[1:], widths[:-1], strict=True),
@@ -117,7 +117,9 @@ def _misfit(
         return f"its layers of shapes {shown([*ends])} do not fit together"
     if any(np.abs(a).max() > _MOST for a in arrays):
         return f"it holds a number beyond {_MOST:g}, which no training comes to"
-    return "" if (reach >= _LEAST).all() else "its observations have bounds without a distance between them"
+    return (
+        "" if (half_range >= _LEAST).all() else "its observations have bounds without a distance between them"
+    )
 
 
 def actor_of(model: Any) -> Actor:
@@ -126,30 +128,30 @@ def actor_of(model: Any) -> Actor:
 
     policy = model.policy
     if hasattr(policy, "mlp_extractor"):  # PPO
-        parts, features, squashed = (
+        modules, features, squashed = (
             [*policy.mlp_extractor.policy_net, policy.action_net],
             policy.features_extractor,
             False,
         )
     elif hasattr(policy.actor, "latent_pi"):  # SAC
-        parts, features, squashed = (
+        modules, features, squashed = (
             [*policy.actor.latent_pi, policy.actor.mu],
             policy.actor.features_extractor,
             True,
         )
     else:  # TD3
-        parts, features, squashed = list(policy.actor.mu), policy.actor.features_extractor, True
+        modules, features, squashed = list(policy.actor.mu), policy.actor.features_extractor, True
 
     def plain(a: Any) -> Singles:
         return np.array(a.detach().cpu().numpy(), dtype=np.float32)
 
-    linear = [part for part in parts if isinstance(part, torch.nn.Linear)]
-    hidden = next(part for part in parts if not isinstance(part, torch.nn.Linear))
+    linear = [module for module in modules if isinstance(module, torch.nn.Linear)]
+    hidden = next(module for module in modules if not isinstance(module, torch.nn.Linear))
     return Actor(
-        tuple(plain(part.weight) for part in linear),
-        tuple(plain(part.bias) for part in linear),
+        tuple(plain(module.weight) for module in linear),
+        tuple(plain(module.bias) for module in linear),
         plain(features.middle),
-        plain(features.reach),
+        plain(features.half_range),
         "tanh" if isinstance(hidden, torch.nn.Tanh) else "relu",
         squashed,
     )

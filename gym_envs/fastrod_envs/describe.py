@@ -30,7 +30,7 @@ def describe(name: str, options: Mapping[str, Any] | None = None) -> str:
     task = make_task(name, 1, options or {})
     try:
         seen = task.goals if task.options.observation == "goal" else task.states
-        parts = [
+        entries = [
             f"fastrod/{name_of(name)}-v0",
             inspect.getdoc(kind) or "",
             f"An episode has {task.options.n_steps or task.n_steps} steps of {task.dt:g} s.",
@@ -40,21 +40,21 @@ def describe(name: str, options: Mapping[str, Any] | None = None) -> str:
         ]
     finally:
         task.close()
-    return "\n\n".join(parts)
+    return "\n\n".join(entries)
 
 
-def _fields(parts: tuple[Field, ...]) -> str:
+def _fields(entries: tuple[Field, ...]) -> str:
     lines, at = [], 0
-    for part in parts:
-        n = len(part.low)
+    for entry in entries:
+        n = len(entry.low)
         where = f"{at}" if n == 1 else f"{at}..{at + n - 1}"
-        low, high = ("same" if len(set(side)) == 1 else "mixed" for side in (part.low, part.high))
+        low, high = ("same" if len(set(side)) == 1 else "mixed" for side in (entry.low, entry.high))
         span = (
-            f"{part.low[0]:g} to {part.high[0]:g}"
+            f"{entry.low[0]:g} to {entry.high[0]:g}"
             if low == high == "same"
-            else "; ".join(f"{a:g} to {b:g}" for a, b in zip(part.low, part.high, strict=True))
+            else "; ".join(f"{a:g} to {b:g}" for a, b in zip(entry.low, entry.high, strict=True))
         )
-        lines.append(f"  {where:>7}  {part.name:<12} {part.unit or '-':<5} {part.about} ({span})")
+        lines.append(f"  {where:>7}  {entry.name:<12} {entry.unit or '-':<5} {entry.about} ({span})")
         at += n
     return "\n".join(lines)
 

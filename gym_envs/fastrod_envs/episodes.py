@@ -41,8 +41,8 @@ class Episodes:
         self.returned: Floats = np.zeros(self.n)
         """(n,) sum of its rewards."""
         self._streams = Streams(self.n, task.total_draws)
-        parts = task.goals if task.options.observation == "goal" else task.states
-        low, high = bounds(parts)
+        entries = task.goals if task.options.observation == "goal" else task.states
+        low, high = bounds(entries)
         self.low: Singles = low.astype(np.float32)
         """(n_obs,) least observation."""
         self.high: Singles = high.astype(np.float32)
@@ -108,7 +108,7 @@ class Episodes:
         """Arrays (n, ...) of what happened: distance, success, contact, lost, position, desired, the terms of
         the reward, and facts."""
         o = moment.outcome
-        told: dict[str, Any] = {
+        reported: dict[str, Any] = {
             "distance": o.distance,
             "success": o.success,
             "contact": o.contact,
@@ -117,6 +117,6 @@ class Episodes:
             "desired": o.desired,
             **o.facts,
         }
-        return {name: a.copy() for name, a in told.items()} | {
+        return {name: a.copy() for name, a in reported.items()} | {
             "reward_terms": {name: a.copy() for name, a in o.terms.items()}
         }

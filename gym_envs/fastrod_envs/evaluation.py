@@ -108,7 +108,7 @@ def evaluate(
             }
             for name, agent in blind.items():
                 trials[name], _ = _run(batch, agent, episodes, seed, name, progress)
-        return Evaluation(f"fastrod/{name_of(env)}-v0", seed, wanted, kind.accuracy, trials)
+        return Evaluation(f"fastrod/{name_of(env)}-v0", seed, wanted, batch.task.accuracy, trials)
     finally:
         batch.close()
 
@@ -129,9 +129,9 @@ def _run(
             actions = np.asarray(agent(env, observation, step), dtype=float)
             np.add.at(total, step[open_], np.clip(actions[open_], -1.0, 1.0))
             np.add.at(count, step[open_], 1.0)
-            observation, _, terminated, truncated, told = env.step(actions)
+            observation, _, terminated, truncated, info = env.step(actions)
             for i in np.flatnonzero((terminated | truncated) & open_):
-                final = told["final_info"]
+                final = info["final_info"]
                 found[i] = {
                     key: value[i]
                     for key, value in final.items()
@@ -174,9 +174,9 @@ def correlation(trial: Trial) -> Floats:
 
 def figures(evaluation: Evaluation) -> dict[str, dict[str, Any]]:
     """The table's numbers by agent."""
-    told: dict[str, dict[str, Any]] = {}
+    info: dict[str, dict[str, Any]] = {}
     for name, trial in evaluation.trials.items():
-        told[name] = {
+        info[name] = {
             "episodes": len(trial.distance),
             "success": float(trial.success.mean()),
             "distance_mean_m": float(trial.distance.mean()),
@@ -192,7 +192,7 @@ def figures(evaluation: Evaluation) -> dict[str, dict[str, Any]]:
                 key: np.asarray(value, float).mean(0).tolist() for key, value in trial.facts.items()
             },
         }
-    return told
+    return info
 
 
 def table(evaluation: Evaluation) -> Table:
@@ -244,7 +244,7 @@ def table(evaluation: Evaluation) -> Table:
 def write(evaluation: Evaluation, out: Path) -> list[Path]:
     """evaluation.json and evaluation.png in the folder `out`; the files written."""
     out.mkdir(parents=True, exist_ok=True)
-    told = {
+    info = {
         "env": evaluation.env,
         "seed": evaluation.seed,
         "options": {key: str(v) for key, v in evaluation.options.items()},
@@ -252,7 +252,7 @@ def write(evaluation: Evaluation, out: Path) -> list[Path]:
         "agents": figures(evaluation),
     }
     path = out / "evaluation.json"
-    path.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+    path.write_text(json.dumps(info, indent=1) + "\n", encoding="utf-8")
     return [path, _plot(evaluation, out / "evaluation.png")]
 
 

@@ -62,7 +62,7 @@ class Cell(ABC):
         """(n_actions,) of the scripted baseline."""
 
     @abstractmethod
-    def scenery(self) -> Backdrop:
+    def backdrop(self) -> Backdrop:
         """What it looks like, for the page; pictures come from PyBullet."""
 
     @abstractmethod
@@ -103,7 +103,7 @@ class HostedTask(Task):
             self.cells.append(self.cell())
         self._lost = np.zeros(n_envs, bool)
         self._sane: list[HostedResult | None] = [None] * n_envs
-        self._seen: Floats = np.zeros((n_envs, sum(len(part.low) for part in states)))
+        self._seen: Floats = np.zeros((n_envs, sum(len(entry.low) for entry in states)))
 
     @abstractmethod
     def cell(self) -> Cell:
@@ -170,9 +170,9 @@ class HostedTask(Task):
         """(n_envs, n_actions) of the cells' own baselines, clipped to -1 and 1."""
         return np.asarray(np.clip(np.array([cell.baseline() for cell in self.cells]), -1.0, 1.0))
 
-    def scenery(self, i: int) -> Backdrop:
+    def backdrop(self, i: int) -> Backdrop:
         """As cell i gives it."""
-        return self.cells[i].scenery()
+        return self.cells[i].backdrop()
 
     def picture(self, i: int, width: int, height: int) -> np.ndarray | None:
         """(height, width, 3) uint8 by PyBullet's camera; never None."""

@@ -58,14 +58,14 @@ def imitate(
     optimizer = torch.optim.Adam(parameters, lr=1e-3)
     left = float("nan")
     for k in range(_ROUNDS):
-        share = 0.5**k if k < _ROUNDS // 2 else 0.0
+        fraction = 0.5**k if k < _ROUNDS // 2 else 0.0
         for _ in range(per_round):
             lesson = env.baseline()
             seen.append(observation)
             said.append(lesson)
             own, _ = model.predict(observation, deterministic=True)
             noise = rng.normal(0.0, 0.1, lesson.shape)
-            acts = np.where(rng.random((env.num_envs, 1)) < share, lesson, own) + noise
+            acts = np.where(rng.random((env.num_envs, 1)) < fraction, lesson, own) + noise
             observation, *_ = env.step(acts)
         if progress is not None:
             progress("lessons", k, _ROUNDS)

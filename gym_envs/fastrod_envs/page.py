@@ -36,7 +36,7 @@ class EnvPage:
         self._served = serve_guarded(_HOST, _free_port(), label=f"fastrod {task.name}")
         self._server, self.address = self._served.viser, self._served.address
         self._drawn: dict[str, tuple[Any, Floats]] = {}
-        first = task.scenery(0)
+        first = task.backdrop(0)
         self._places = _places(min(task.n_envs, SHOWN), _extent(first))
         self._furnish(first)
         self.update(task)
@@ -44,9 +44,9 @@ class EnvPage:
 
     def update(self, task: Task) -> None:
         """Show the environments as they are now."""
-        scenes = [task.scenery(i) for i in range(len(self._places))]
+        scenes = [task.backdrop(i) for i in range(len(self._places))]
         with self._server.atomic():
-            names = {name for i, scenery in enumerate(scenes) for name in self._draw(f"/env{i}", scenery)}
+            names = {name for i, backdrop in enumerate(scenes) for name in self._draw(f"/env{i}", backdrop)}
             for name in set(self._drawn) - names:
                 self._drawn.pop(name)[0].remove()
         self._server.flush()
@@ -55,7 +55,7 @@ class EnvPage:
         """Stop the server."""
         self._served.stop()
 
-    def _furnish(self, scenery: Backdrop) -> None:
+    def _furnish(self, backdrop: Backdrop) -> None:
         """Light, a floor, a frame for every environment, and from where one looks."""
         scene, self._server.initial_camera.fov = self._server.scene, math.radians(45.0)
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
@@ -82,7 +82,7 @@ class EnvPage:
         )
         for i, place in enumerate(self._places):
             scene.add_frame(f"/env{i}", show_axes=False, position=place)
-        eye, target = np.array(scenery.eye), np.array(scenery.target)
+        eye, target = np.array(backdrop.eye), np.array(backdrop.target)
         away = eye - target
         back = 1.0 + 1.2 * float(np.ptp(self._places, axis=0).max()) / max(float(np.linalg.norm(away)), 1e-9)
         self._server.initial_camera.position, self._server.initial_camera.look_at = (
@@ -90,13 +90,13 @@ class EnvPage:
             target,
         )
 
-    def _draw(self, at: str, scenery: Backdrop) -> list[str]:
+    def _draw(self, at: str, backdrop: Backdrop) -> list[str]:
         """Everything of one environment; the names it has in the page."""
         names = []
-        for i, tube in enumerate(scenery.tubes):
+        for i, tube in enumerate(backdrop.tubes):
             names.append(f"{at}/tube{i}")
             self._mesh(names[-1], *tube_mesh(tube.points, tube.radius, 16), tube.color, 1.0, flat=False)
-        for i, ball in enumerate(scenery.balls):
+        for i, ball in enumerate(backdrop.balls):
             names.append(f"{at}/ball{i}")
             mesh = ball_mesh()
             self._mesh(
@@ -107,10 +107,10 @@ class EnvPage:
                 1.0,
                 flat=False,
             )
-        for i, solid in enumerate(scenery.solids):
+        for i, solid in enumerate(backdrop.solids):
             names.append(f"{at}/solid{i}")
             self._mesh(names[-1], solid.vertices, solid.faces, solid.color, solid.opacity, flat=True)
-        for i, line in enumerate(scenery.lines):
+        for i, line in enumerate(backdrop.lines):
             names.append(f"{at}/line{i}")
             points = np.asarray(line.points, float)
             self._line(names[-1], np.stack([points[:-1], points[1:]], axis=1), line.color)
@@ -157,20 +157,20 @@ class EnvPage:
 
 
 def _bytes(color: tuple[float, ...]) -> tuple[int, int, int]:
-    red, green, blue = (round(255.0 * part) for part in color)
+    red, green, blue = (round(255.0 * channel) for channel in color)
     return red, green, blue
 
 
-def _extent(scenery: Backdrop) -> float:
+def _extent(backdrop: Backdrop) -> float:
     """Width of a square around an environment, from above [m]."""
-    parts = (
-        [t.points for t in scenery.tubes]
-        + [s.vertices for s in scenery.solids]
-        + [line.points for line in scenery.lines]
+    clouds = (
+        [t.points for t in backdrop.tubes]
+        + [s.vertices for s in backdrop.solids]
+        + [line.points for line in backdrop.lines]
     )
-    parts += [np.asarray(ball.position)[None] for ball in scenery.balls]
-    points = np.concatenate([np.asarray(part, float)[:, :2] for part in parts])
-    lengths = [float(np.linalg.norm(np.diff(tube.points, axis=0), axis=1).sum()) for tube in scenery.tubes]
+    clouds += [np.asarray(ball.position)[None] for ball in backdrop.balls]
+    points = np.concatenate([np.asarray(channel, float)[:, :2] for channel in clouds])
+    lengths = [float(np.linalg.norm(np.diff(tube.points, axis=0), axis=1).sum()) for tube in backdrop.tubes]
     return float(max([np.ptp(points, axis=0).max(), *lengths])) + 0.2  # a rod may lie down
 
 

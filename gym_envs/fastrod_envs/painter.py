@@ -74,29 +74,30 @@ class PainterCamera(NamedTuple):
         return np.asarray(aside[:, None] * right + down[:, None] * below + ahead)
 
 
-def paint(scenery: Backdrop, width: int, height: int) -> np.ndarray:
+def paint(backdrop: Backdrop, width: int, height: int) -> np.ndarray:
     """(height, width, 3) uint8 of an environment."""
-    heights = [tube.points[:, 2] for tube in scenery.tubes] + [
-        solid.vertices[:, 2] for solid in scenery.solids
+    heights = [tube.points[:, 2] for tube in backdrop.tubes] + [
+        solid.vertices[:, 2] for solid in backdrop.solids
     ]
-    heights += [ball.position[2:] for ball in scenery.balls]
+    heights += [ball.position[2:] for ball in backdrop.balls]
     lowest = min((float(z.min()) for z in heights if len(z)), default=0.0)
     # a step at a time, so that it stays under what moves
     floor = 0.0 if lowest > -0.02 else 0.25 * math.floor(4.0 * lowest)
-    camera = _camera(scenery.eye, scenery.target, width, height)
+    camera = _camera(backdrop.eye, backdrop.target, width, height)
     opaque = [
-        _lit(PaintedMesh(s.vertices, s.faces), s.color, True) for s in scenery.solids if s.opacity >= 1.0
+        _lit(PaintedMesh(s.vertices, s.faces), s.color, True) for s in backdrop.solids if s.opacity >= 1.0
     ]
-    opaque += [layer for tube in scenery.tubes for layer in _tube_layers(tube)]
-    opaque += [_ball_layer(ball) for ball in scenery.balls]
+    opaque += [layer for tube in backdrop.tubes for layer in _tube_layers(tube)]
+    opaque += [_ball_layer(ball) for ball in backdrop.balls]
     solid = _joined([layer for layer in opaque if len(layer.corners)])
     picture = (
-        _ground(scenery.eye, scenery.target, width, height, floor) * _shadow(solid, camera, floor)[:, :, None]
+        _ground(backdrop.eye, backdrop.target, width, height, floor)
+        * _shadow(solid, camera, floor)[:, :, None]
     )
-    ribbons = [_ribbon(line, camera) for line in scenery.lines if len(line.points) > 1]
+    ribbons = [_ribbon(line, camera) for line in backdrop.lines if len(line.points) > 1]
     layers = [(_joined([solid, *ribbons]), 1.0)] + [
         (_lit(PaintedMesh(s.vertices, s.faces), s.color, True), s.opacity)
-        for s in _far_to_near(scenery, camera)
+        for s in _far_to_near(backdrop, camera)
     ]
     _lay(picture.reshape(-1, 3), layers, camera)
     return np.asarray(np.clip(255.0 * picture + 0.5, 0.0, 255.0).astype(np.uint8))
@@ -116,12 +117,12 @@ def tube_mesh(points: Floats, radius: float, sides: int = _SIDES) -> PaintedMesh
     v = np.cross(tangents, u)
     cap = np.linspace(0.0, 0.5 * np.pi, 6)[1:]
     centre = np.concatenate([points, points[-1] + radius * np.sin(cap)[:, None] * tangents[-1]])
-    reach = np.concatenate([np.full(len(points), radius), radius * np.cos(cap)])
+    radii = np.concatenate([np.full(len(points), radius), radius * np.cos(cap)])
     u, v = (np.concatenate([a, np.repeat(a[-1:], len(cap), axis=0)]) for a in (u, v))
     angle = np.linspace(0.0, 2.0 * np.pi, sides, endpoint=False)
     ring = u[:, None] * np.cos(angle)[:, None] + v[:, None] * np.sin(angle)[:, None]
     return PaintedMesh(
-        (centre[:, None] + reach[:, None, None] * ring).reshape(-1, 3), _grid_faces(len(centre), sides)
+        (centre[:, None] + radii[:, None, None] * ring).reshape(-1, 3), _grid_faces(len(centre), sides)
     )
 
 
@@ -206,9 +207,9 @@ def _shadow(layer: Layer, camera: PainterCamera, floor: float) -> Floats:
         slice(max(columns[0] - margin, 0), columns[-1] + margin + 1),
     )
     soft = dark[window]
-    for reach in (1, 2, 3):
+    for radii in (1, 2, 3):
         for axis in (0, 1):
-            soft = (np.roll(soft, reach, axis) + 2.0 * soft + np.roll(soft, -reach, axis)) / 4.0
+            soft = (np.roll(soft, radii, axis) + 2.0 * soft + np.roll(soft, -radii, axis)) / 4.0
     light[window] = 1.0 - 0.3 * soft
     return light
 
@@ -229,11 +230,11 @@ def _tube_layers(tube: Tube) -> list[Layer]:
     ]
 
 
-def _plate(foot: Floats, along: Floats, radius: float) -> Layer:
+def _plate(bottom: Floats, along: Floats, radius: float) -> Layer:
     """What a rod of this radius stands on."""
-    ends = np.array([foot - 0.7 * radius * along, foot])
+    ends = np.array([bottom - 0.7 * radius * along, bottom])
     rim = tube_mesh(ends, 2.2 * radius, 2 * _SIDES).vertices[: 4 * _SIDES].reshape(2, 2 * _SIDES, 3)
-    outward = (rim[1] - foot) / (2.2 * radius)
+    outward = (rim[1] - bottom) / (2.2 * radius)
     rings = np.concatenate(
         [np.broadcast_to(ends[:1, None], rim[:1].shape), rim, np.broadcast_to(ends[1:, None], rim[:1].shape)]
     )
@@ -299,12 +300,12 @@ def _ribbon(line: DrawnLine, camera: PainterCamera) -> Layer:
 
 def _joined(layers: list[Layer]) -> Layer:
     empty = Layer(np.zeros((0, 3, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0))
-    return Layer(*(np.concatenate(parts) for parts in zip(empty, *layers, strict=True)))
+    return Layer(*(np.concatenate(arrays) for arrays in zip(empty, *layers, strict=True)))
 
 
-def _far_to_near(scenery: Backdrop, camera: PainterCamera) -> list[Solid]:
+def _far_to_near(backdrop: Backdrop, camera: PainterCamera) -> list[Solid]:
     """Solids that one sees through."""
-    clear = [solid for solid in scenery.solids if solid.opacity < 1.0]
+    clear = [solid for solid in backdrop.solids if solid.opacity < 1.0]
     return sorted(
         clear, key=lambda solid: -float(np.linalg.norm(np.asarray(solid.vertices).mean(0) - camera.eye))
     )
@@ -396,20 +397,20 @@ def _lay(picture: Floats, layers: list[tuple[Layer, float]], camera: PainterCame
     for covered, *_ in found:
         mark[covered] = True
     touched = np.flatnonzero(mark)
-    slots = np.empty(len(mark), np.int32)
-    slots[touched] = np.arange(len(touched))
+    places = np.empty(len(mark), np.int32)
+    places[touched] = np.arange(len(touched))
     parent = (touched // fine.width // _FINE) * camera.width + touched % fine.width // _FINE
     behind = picture[parent].astype(np.float32)
     color, depth_of = behind.copy(), np.zeros(len(touched))
     for k, (covered, depth, shaded, opacity) in enumerate(found):
-        slot = slots[covered]
+        place = places[covered]
         if k == 0:
-            depth_of[slot] = depth
-            color[slot] = shaded
+            depth_of[place] = depth
+            color[place] = shaded
             continue
-        seen = depth >= depth_of[slot]
-        slot = slot[seen]
-        color[slot] += opacity * (shaded[seen] - color[slot])
+        seen = depth >= depth_of[place]
+        place = place[seen]
+        color[place] += opacity * (shaded[seen] - color[place])
     color -= behind
     for k in range(3):
         picture[:, k] += np.bincount(parent, color[:, k], len(picture)) / _FINE**2

@@ -101,13 +101,13 @@ class Drive:
         """(3,) from -1, the least, to 1, the largest."""
         return np.asarray((2.0 * q - self.low - self.high) / (self.high - self.low))
 
-    def placed(self, posture: Floats) -> Floats:
+    def action_at(self, posture: Floats) -> Floats:
         """(3,) of a posture from -1 to 1."""
         return np.asarray(0.5 * (self.low + self.high) + 0.5 * (self.high - self.low) * posture)
 
-    def reach(self, simulator: Simulator, tip: Floats) -> Floats:
+    def posture_for(self, simulator: Simulator, tip: Floats) -> Floats:
         """(3,) with which the tip of a simulated robot is there, world [m], by Newton's method."""
-        q = self.placed(np.zeros(3))
+        q = self.action_at(np.zeros(3))
         for _ in range(30):
             at = simulator.settle(**self.inputs(q)).tip_position[0]
             off = tip - at

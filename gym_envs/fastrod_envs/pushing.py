@@ -37,11 +37,11 @@ _WITHIN = 10  # steps of the world in one of the rod
 _ON_BAR, _ON_FLOOR = 1.0, 0.25  # friction of the cube
 _POINTS = 4  # of a segment
 _CAPSULES = 2
-_STRIDE = _POINTS // _CAPSULES
+_EVERY = _POINTS // _CAPSULES
 _NEAR = 0.1  # m, the longest vector to the goal in an observation
 _AROUND = 0.15  # m, the longest vector to the cube
 _AWAY = 0.6  # m, no cube is pushed farther
-_SHIFT, _TURN = 0.01, 0.1  # m and rad, the most by which the cube begins elsewhere
+_SHIFT, _SKEW = 0.01, 0.1  # m and rad, the most by which the cube begins elsewhere
 _MOST = 1.0  # N that a robot feels: a bar that jams the cube against the floor would exert any force
 # s, in which a robot answers what it feels: it has no mass, and would swing with what it pushes
 _RELAXATION = 0.3
@@ -63,16 +63,16 @@ class PushCell(Cell):
         robot: Robot,
         options: PushOptions,
         duration: float,
-        backdrop: Callable[[], Bullet],
+        picture_world: Callable[[], Bullet],
     ) -> None:
-        """`robot` before it is randomised; `duration` of an environment step [s]; `backdrop` makes the world
-        for pictures."""
-        self.course, self.options, self._backdrop = course, options, backdrop
+        """`robot` before it is randomised; `duration` of an environment step [s]; `picture_world` makes the
+        world for pictures."""
+        self.course, self.options, self._picture_world = course, options, picture_world
         self._n = max(1, math.ceil(duration / _STEP - 1e-9))
         self._dt = duration / self._n
         self.drive = Drive(robot, course.bend)
         self._own = self._simulator(robot)
-        self.home = self.drive.reach(
+        self.home = self.drive.posture_for(
             self._own,
             np.array([course.place[0] - course.behind - course.gap, course.place[1], course.height]),
         )
@@ -111,7 +111,7 @@ class PushCell(Cell):
             self.simulator = self._simulator(robot)
             self._settled(passes=0)
         self._build(
-            np.array(course.place) + _SHIFT * (2.0 * draws[2:4] - 1.0), _TURN * (2.0 * draws[4] - 1.0)
+            np.array(course.place) + _SHIFT * (2.0 * draws[2:4] - 1.0), _SKEW * (2.0 * draws[4] - 1.0)
         )
 
     def act(self, action: Floats, duration: float) -> None:
@@ -123,7 +123,7 @@ class PushCell(Cell):
             there = self.q + duration * drive.rate * action
         else:
             there = self.q + np.clip(
-                drive.placed(action) - self.q, -duration * drive.rate, duration * drive.rate
+                drive.action_at(action) - self.q, -duration * drive.rate, duration * drive.rate
             )
         there = np.clip(there, drive.low, drive.high)
         for left in range(self._n, 0, -1):
@@ -142,15 +142,15 @@ class PushCell(Cell):
     def state(self) -> Floats:
         """(17,) in the order of `PushTask.states`."""
         position, rotation = self._cube()
-        turn = 4.0 * math.atan2(rotation[1, 0], rotation[0, 0])
+        angle = 4.0 * math.atan2(rotation[1, 0], rotation[0, 0])
         cube, tip = position[:2], self.tip
         to_goal, to_cube = _at_most(self.desired - cube, _NEAR), _at_most(cube - tip[:2], _AROUND)
         return np.array(
             [
                 *self.desired,
                 *cube,
-                math.cos(turn),
-                math.sin(turn),
+                math.cos(angle),
+                math.sin(angle),
                 *tip,
                 *to_goal,
                 *to_cube,
@@ -166,10 +166,10 @@ class PushCell(Cell):
     def baseline(self) -> Floats:
         """(3,) straight along the way that the cube has to go, slower when near; the cube stays on the bar,
         which keeps its height."""
-        drive, way = self.drive, self.desired - self._cube()[0][:2]
-        d = float(np.hypot(*way))
+        drive, ahead = self.drive, self.desired - self._cube()[0][:2]
+        d = float(np.hypot(*ahead))
         velocity = np.array(
-            [*(way * min(SPEED / max(d, 1e-9), 1.0 / TIME)), (self.course.height - self.tip[2]) / TIME]
+            [*(ahead * min(SPEED / max(d, 1e-9), 1.0 / TIME)), (self.course.height - self.tip[2]) / TIME]
         )
         jacobian = drive.jacobian(self.simulator) * drive.rate
         rates = resolved(jacobian[None], velocity[None], np.zeros((1, 3)))[0]
@@ -177,7 +177,7 @@ class PushCell(Cell):
             return np.asarray(rates)
         return drive.posture(self.q + self._n * self._dt * drive.rate * rates)
 
-    def scenery(self) -> Backdrop:
+    def backdrop(self) -> Backdrop:
         """Rod and bar as tubes, the cube, and its goal as a ball; seen from the course's right."""
         position, rotation = self._cube()
         vertices, faces = box_mesh([self.course.size] * 3, position.tolist(), rotation)
@@ -199,11 +199,11 @@ class PushCell(Cell):
         the first is asked for."""
         course = self.course
         if self._studio is None:
-            self._studio = self._backdrop()
+            self._studio = self._picture_world()
         studio, (position, _) = self._studio, self._cube()
         tube, bar = _bodies(studio, course, self._own.robots[0])
         _place(course, self.simulator.state, tube, bar)
-        turn = self.world.getBasePositionAndOrientation(self._cube_body)[1]
+        angle = self.world.getBasePositionAndOrientation(self._cube_body)[1]
         box = studio.createVisualShape(
             studio.GEOM_BOX, halfExtents=[0.5 * course.size] * 3, rgbaColor=[*_CUBE, 1.0]
         )
@@ -211,7 +211,7 @@ class PushCell(Cell):
             studio.GEOM_CYLINDER, radius=0.02, length=0.002, rgbaColor=[*_GOAL, 1.0]
         )
         shown = [
-            studio.createMultiBody(0.0, -1, box, position.tolist(), turn),
+            studio.createMultiBody(0.0, -1, box, position.tolist(), angle),
             studio.createMultiBody(0.0, -1, disc, [*self.desired, 0.001]),
         ]
         eye, target = self._view()
@@ -245,7 +245,7 @@ class PushCell(Cell):
     def _simulator(self, robot: Robot) -> Simulator:
         return Simulator(robot, dt=self._dt, points_per_segment=_POINTS, threads=1)
 
-    def _build(self, place: Floats, turn: float) -> None:
+    def _build(self, place: Floats, angle: float) -> None:
         """The world with the cube there [m], turned about z [rad], and the robot as it is."""
         world, course = self.world, self.course
         world.resetSimulation()
@@ -257,8 +257,8 @@ class PushCell(Cell):
             0.0, world.createCollisionShape(world.GEOM_BOX, halfExtents=[5.0, 5.0, 0.5]), -1, [0.0, 0.0, -0.5]
         )
         box = world.createCollisionShape(world.GEOM_BOX, halfExtents=half)
-        turned = [0.0, 0.0, math.sin(0.5 * turn), math.cos(0.5 * turn)]
-        self._cube_body = int(world.createMultiBody(course.mass, box, -1, [*place, half[0]], turned))
+        skewed = [0.0, 0.0, math.sin(0.5 * angle), math.cos(0.5 * angle)]
+        self._cube_body = int(world.createMultiBody(course.mass, box, -1, [*place, half[0]], skewed))
         self._tube, self._bar = _bodies(world, course, self._own.robots[0])
         world.changeDynamics(self._cube_body, -1, lateralFriction=1.0, linearDamping=0.0, angularDamping=0.0)
         world.changeDynamics(ground, -1, lateralFriction=_ON_FLOOR)  # PyBullet multiplies the two
@@ -268,7 +268,7 @@ class PushCell(Cell):
 
     def _move(self, state: State) -> None:
         """Bring the bodies there within a step of the rod, and note what the bar feels."""
-        self._tube.head_for(state.position[0, ::_STRIDE], state.rotation[0, ::_STRIDE], self._dt)
+        self._tube.head_for(state.position[0, ::_EVERY], state.rotation[0, ::_EVERY], self._dt)
         self._bar.head_for(*_bar_nodes(self.course, state), self._dt)
         total, tip = np.zeros(6), state.tip_position[0]
         for _ in range(_WITHIN):
@@ -325,7 +325,7 @@ class PushTask(HostedTask):
     options_class: ClassVar[type[EnvOptions]] = PushOptions
     n_steps: ClassVar[int] = 40
     n_draws: ClassVar[int] = 5
-    accuracy: ClassVar[float] = ACCURACY
+    accuracy: float = ACCURACY
     duration: ClassVar[float] = 4.0
 
     def __init__(self, n_envs: int, options: EnvOptions, course: Course) -> None:
@@ -339,7 +339,7 @@ class PushTask(HostedTask):
         unit = "m/s" if options.action == "rate" else "m"
         names = "extension, displacements toward d1 and d2 of every segment alike"
         actions = (Field("displacement", unit, tuple(low), tuple(high), f"{what} {names}".strip()),)
-        foot, far, place = (
+        base, far, place = (
             np.array(course.robot.base_position),
             1.5 * course.robot.length,
             np.array(course.place),
@@ -351,7 +351,7 @@ class PushTask(HostedTask):
             Field(
                 "turn", "", (-1.0,) * 2, (1.0,) * 2, "cosine and sine of four times the cube's angle about z"
             ),
-            Field("tip", "m", tuple(foot - far), tuple(foot + far), "of the robot, world"),
+            Field("tip", "m", tuple(base - far), tuple(base + far), "of the robot, world"),
             Field(
                 "error",
                 "m",
@@ -372,14 +372,14 @@ class PushTask(HostedTask):
         super().__init__(n_envs, options, course.robot, actions, states, (goal,))
 
     @abstractmethod
-    def backdrop(self) -> Bullet:
+    def picture_world(self) -> Bullet:
         """A world for pictures, without robot and cube."""
 
     def cell(self) -> Cell:
         """A `PushCell` with this course, these options, and the robot as it is before it is randomised."""
         options = self.options
         assert isinstance(options, PushOptions)
-        return PushCell(self.course, self.base_robot, options, self.dt, self.backdrop)
+        return PushCell(self.course, self.base_robot, options, self.dt, self.picture_world)
 
 
 def _load(wrench: Floats) -> dict[str, Any]:
@@ -402,7 +402,7 @@ def _bar_nodes(course: Course, state: State) -> tuple[Floats, Floats]:
 
 
 def _place(course: Course, state: State, tube: RodBodies, bar: RodBodies) -> None:
-    tube.place(state.position[0, ::_STRIDE], state.rotation[0, ::_STRIDE])
+    tube.place(state.position[0, ::_EVERY], state.rotation[0, ::_EVERY])
     bar.place(*_bar_nodes(course, state))
 
 

@@ -34,7 +34,7 @@ class Randomisation:
     """
 
     robot: Robot | None = None
-    """Stands for the task's robot: an identified one with its effects. Its segments and wires are those of
+    """Stands for the task's robot: an identified one with its effects. Its segments and tendons are those of
     the task's."""
     spread: float = 0.0
     """Every number of the robot's own effects is drawn from (1 - spread, 1 + spread) of its value, within
@@ -196,7 +196,7 @@ def _neutral(name: str) -> float:
 
 def _scaled(segment: Any, factor: Mapping[str, float]) -> Any:
     """A segment with factors on its numbers."""
-    wires = tuple(
+    scaled_tendons = tuple(
         replace(
             tendon,
             compliance=tendon.compliance * factor.get("compliance", 1.0),
@@ -210,7 +210,7 @@ def _scaled(segment: Any, factor: Mapping[str, float]) -> Any:
         bending_stiffness=(bend * segment.bending_stiffness[0], bend * segment.bending_stiffness[1]),
         torsional_stiffness=factor.get("torsional_stiffness", 1.0) * segment.torsional_stiffness,
         line_density=factor.get("line_density", 1.0) * segment.line_density,
-        tendons=wires,
+        tendons=scaled_tendons,
     )
 
 

@@ -2,54 +2,59 @@
 
 from __future__ import annotations
 
+import inspect
+import warnings
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
 from importlib import import_module
-from typing import Any
+from importlib.metadata import entry_points
+from typing import Any, TypeVar
 
-from fastrod.errors import UnknownNameError, nearest
+from fastrod.errors import InputError, UnknownNameError, nearest, shown
 from fastrod_envs.options import EnvOptions
 from fastrod_envs.task import Task
 
-_TASKS: Mapping[str, str] = {
-    "BoxExplore": "fastrod_envs.tasks.box_explore:BoxExplore",
-    "Catch": "fastrod_envs.tasks.catch:Catch",
-    "DualArm": "fastrod_envs.tasks.dual_arm:DualArm",
-    "PickPlace": "fastrod_envs.tasks.pick_place:PickPlace",
-    "Push": "fastrod_envs.tasks.push:Push",
-    "QuadrupedPush": "fastrod_envs.tasks.quadruped_push:QuadrupedPush",
-    "Reach": "fastrod_envs.tasks.reach:Reach",
-    "TubeInsert": "fastrod_envs.tasks.tube_insert:TubeInsert",
-    "ReachObstacle": "fastrod_envs.tasks.reach_obstacle:ReachObstacle",
-    "Track": "fastrod_envs.tasks.track:Track",
-}
-N_STEPS: Mapping[str, int] = {
-    "BoxExplore": 40,
-    "Catch": 40,
-    "DualArm": 40,
-    "PickPlace": 60,
-    "Push": 40,
-    "QuadrupedPush": 40,
-    "Reach": 40,
-    "TubeInsert": 50,
-    "ReachObstacle": 40,
-    "Track": 200,
-}
-"""`n_steps` of each task's class, for Gymnasium: the tasks themselves, which import numba, are imported when
-one is made."""
-SOLVED: Mapping[str, float] = {
-    "BoxExplore": 34.0,
-    "Catch": 5.0,
-    "PickPlace": 67.0,
-    "Push": 49.0,
-    "QuadrupedPush": 43.0,
-    "Reach": 31.0,
-    "ReachObstacle": 31.0,
-    "Track": 196.0,
-}
-"""Mean return from which a task counts as solved, for Gymnasium: nine tenths of the way from a robot at rest
-to the shipped policy, with the task's own options (100 episodes from seed 100, of hosted tasks 4)."""
 NAMESPACE = "fastrod"
 VERSION = "v0"
+GROUP = "fastrod.tasks"
+"""Entry points of this group name modules of installed packages whose import registers tasks."""
+_Class = TypeVar("_Class", bound=type[Task])
+
+
+@dataclass(frozen=True)
+class TaskEntry:
+    """One task of the registry."""
+
+    source: str | type[Task]
+    """`module:Class` of a shipped task, which imports numba and is imported when one is made; or the
+    class."""
+    n_steps: int
+    """Of an episode, for Gymnasium."""
+    solved: float | None = None
+    """Mean return from which the task counts as solved, for Gymnasium; None: nobody has said."""
+
+    @property
+    def place(self) -> str:
+        """`module:Class`."""
+        kind = self.source
+        return kind if isinstance(kind, str) else f"{kind.__module__}:{kind.__qualname__}"
+
+
+# solved: nine tenths of the way from a robot at rest to the shipped policy, with the task's own options (100
+# episodes from seed 100, of hosted tasks 4)
+_TASKS: dict[str, TaskEntry] = {
+    "BoxExplore": TaskEntry("fastrod_envs.tasks.box_explore:BoxExplore", 40, 34.0),
+    "Catch": TaskEntry("fastrod_envs.tasks.catch:Catch", 40, 5.0),
+    "DualArm": TaskEntry("fastrod_envs.tasks.dual_arm:DualArm", 40),
+    "PickPlace": TaskEntry("fastrod_envs.tasks.pick_place:PickPlace", 60, 67.0),
+    "Push": TaskEntry("fastrod_envs.tasks.push:Push", 40, 49.0),
+    "QuadrupedPush": TaskEntry("fastrod_envs.tasks.quadruped_push:QuadrupedPush", 40, 43.0),
+    "Reach": TaskEntry("fastrod_envs.tasks.reach:Reach", 40, 31.0),
+    "TubeInsert": TaskEntry("fastrod_envs.tasks.tube_insert:TubeInsert", 50),
+    "ReachObstacle": TaskEntry("fastrod_envs.tasks.reach_obstacle:ReachObstacle", 40, 31.0),
+    "Track": TaskEntry("fastrod_envs.tasks.track:Track", 200, 196.0),
+}
 
 
 def names() -> tuple[str, ...]:
@@ -59,7 +64,12 @@ def names() -> tuple[str, ...]:
 
 def ids() -> tuple[str, ...]:
     """`fastrod/<Name>-v0` of every task."""
-    return tuple(f"{NAMESPACE}/{name}-{VERSION}" for name in _TASKS)
+    return tuple(map(id_of, _TASKS))
+
+
+def id_of(name: str) -> str:
+    """`fastrod/<Name>-v0` of a task's name."""
+    return f"{NAMESPACE}/{name}-{VERSION}"
 
 
 def name_of(given: str) -> str:
@@ -70,33 +80,111 @@ def name_of(given: str) -> str:
     return name
 
 
-def task_class(name: str) -> type[Task]:
-    """The class of a task by its name or id. Raises `UnknownNameError`."""
-    module, word = _TASKS[name_of(name)].split(":")
+def entry_of(name: str) -> TaskEntry:
+    """The entry of a task by its name or id. Raises `UnknownNameError`."""
+    return _TASKS[name_of(name)]
+
+
+def task_class(task: str | type[Task]) -> type[Task]:
+    """The class of a task by its name or id; a class, registered or not, is returned as it is. Raises
+    `UnknownNameError`, and `InputError` for a class that is no complete task."""
+    if isinstance(task, type):
+        return _checked(task)
+    source = entry_of(task).source
+    if isinstance(source, type):
+        return source
+    module, _, word = source.partition(":")
     found: type[Task] = getattr(import_module(module), word)
     return found
 
 
-def make_task(name: str, n_envs: int, options: Mapping[str, Any]) -> Task:
+def make_task(task: str | type[Task], n_envs: int, options: Mapping[str, Any]) -> Task:
     """A task for so many robots. Raises `UnknownNameError`, `InputError`."""
-    kind = task_class(name)
+    kind = task_class(task)
     return kind(n_envs, kind.options_class.read(options))
 
 
+def register(task: _Class) -> _Class:
+    """Register a task's class under its `name`; returns the class, so that it is also a decorator.
+
+    `gymnasium.make("fastrod/<name>-v0")`, `make_vec`, `BatchEnv` and the commands know it from then on.
+    Raises `InputError` for a class that is no complete task, or whose name another class has."""
+    _checked(task)
+    entry = TaskEntry(task, task.n_steps, task.solved)
+    known = _TASKS.get(task.name)
+    if known is not None and known.place != entry.place:
+        raise InputError(
+            f"a task named {task.name!r} is already registered, {known.place}; choose another name."
+        )
+    if known is not None:
+        unregister(task.name)
+    _TASKS[task.name] = entry
+    _add_to_gymnasium(task.name)
+    return task
+
+
+def unregister(name: str) -> None:
+    """Take a task out of the registry, and of Gymnasium's. Raises `UnknownNameError`."""
+    from gymnasium.envs.registration import registry
+
+    name = name_of(name)
+    del _TASKS[name]
+    registry.pop(id_of(name), None)
+
+
 def register_all() -> None:
-    """Tell Gymnasium of every task."""
+    """Register the shipped tasks with Gymnasium."""
+    for name in names():
+        _add_to_gymnasium(name)
+
+
+@cache
+def load_plug_ins() -> None:
+    """Import the modules that installed packages name as entry points of the group `fastrod.tasks`. Warns of
+    one that cannot be imported; the others are there all the same."""
+    for plug_in in entry_points(group=GROUP):
+        try:
+            plug_in.load()
+        except Exception as error:  # a stranger's module raises what it likes
+            warnings.warn(f"the tasks of {plug_in.value!r} are missing: {error!r}.", stacklevel=2)
+
+
+def _checked(task: type[Any]) -> type[Task]:
+    """The class, where it is a complete task, or `InputError`."""
+    if not (isinstance(task, type) and issubclass(task, Task)):
+        raise InputError(
+            f"the task is {shown(task)}; give a name, or a class derived from fastrod_envs.task.Task."
+        )
+    if inspect.isabstract(task):
+        missing = ", ".join(sorted(task.__abstractmethods__))
+        raise InputError(f"task {task.__name__} is not complete; it lacks {missing}.")
+    for name, kind in (("name", str), ("n_steps", int), ("n_draws", int), ("accuracy", float)):
+        value = getattr(task, name, None)
+        if not isinstance(value, kind) or isinstance(value, bool):
+            raise InputError(f"{task.__name__}.{name} is {shown(value)}; it must be of type {kind.__name__}.")
+    if not task.name.isidentifier():
+        raise InputError(f"{task.__name__}.name is {task.name!r}; it must be one word of letters and digits.")
+    if task.n_steps < 1 or task.n_draws < 0:
+        raise InputError(
+            f"{task.__name__} has n_steps {task.n_steps} and n_draws {task.n_draws}; "
+            "an episode has at least one step, and no fewer than 0 draws."
+        )
+    return task
+
+
+def _add_to_gymnasium(name: str) -> None:
+    """Register a task's id with Gymnasium, unless it is registered."""
     from gymnasium.envs.registration import register, registry
 
-    for name, id_ in zip(names(), ids(), strict=True):
-        if id_ not in registry:
-            register(
-                id=id_,
-                entry_point="fastrod_envs.single:SingleEnv",
-                vector_entry_point="fastrod_envs.vector:BatchEnv",
-                kwargs={"task": name},
-                max_episode_steps=N_STEPS[name],
-                reward_threshold=SOLVED.get(name),
-            )
+    if id_of(name) not in registry:
+        register(
+            id=id_of(name),
+            entry_point="fastrod_envs.single:SingleEnv",
+            vector_entry_point="fastrod_envs.vector:BatchEnv",
+            kwargs={"task": name},
+            max_episode_steps=_TASKS[name].n_steps,
+            reward_threshold=_TASKS[name].solved,
+        )
 
 
-__all__ = ["EnvOptions", "ids", "make_task", "name_of", "names", "register_all", "task_class"]
+__all__ = ["EnvOptions", "ids", "make_task", "name_of", "names", "register", "register_all", "task_class"]

@@ -49,4 +49,4 @@ class Renderer:
 
 def _picture(task: Task, i: int) -> np.ndarray:
     taken = task.picture(i, WIDTH, HEIGHT)
-    return paint(task.scenery(i), WIDTH, HEIGHT) if taken is None else taken
+    return paint(task.backdrop(i), WIDTH, HEIGHT) if taken is None else taken

@@ -29,9 +29,9 @@ class RodTask(Task):
     `"displacement"`: it is where they go, at once, from the least to the largest, and the rod settles there.
     """
 
-    points_per_segment: ClassVar[int]
+    points_per_segment: int
     outputs: ClassVar[Any] = "tip"
-    hold_gain: ClassVar[float] = 5e-5
+    hold_gain: float = 5e-5
     """`Simulator(hold_gain=...)` [m]."""
     loaded: ClassVar[bool] = False
     """An episode brings loads of its own: robots settle under them when it begins."""
@@ -66,15 +66,15 @@ class RodTask(Task):
         self.home: Floats = np.zeros(len(self.driven)) if home is None else np.asarray(home, float)
         """(n_driven,) displacements at the start of an episode [m]."""
         rate_mode = options.action == "rate"
-        unit, reach = ("m/s", (-self._rate, self._rate)) if rate_mode else ("m", (self._low, self._high))
+        unit, span = ("m/s", (-self._rate, self._rate)) if rate_mode else ("m", (self._low, self._high))
         about = "rate of the displacements" if rate_mode else "displacements"
         names = ", ".join(f"{k // 3 + 1}{'eab'[k % 3]}" for k in self.driven)
         self.actions = (
             Field(
                 "displacement",
                 unit,
-                tuple(reach[0]),
-                tuple(reach[1]),
+                tuple(span[0]),
+                tuple(span[1]),
                 f"{about} ({names}: segment, and e extension, a, b toward d1, d2)",
             ),
         )
@@ -91,8 +91,8 @@ class RodTask(Task):
             feel_contact=feel_contact,
             device=options.device,
         )
-        self._turn = matrix_from_quaternion(np.array([self.base_robot.base_quaternion]))[0]
-        self._foot = np.array(self.base_robot.base_position)
+        self._base_rotation = matrix_from_quaternion(np.array([self.base_robot.base_quaternion]))[0]
+        self._base_position = np.array(self.base_robot.base_position)
         self.displacement: Floats = np.tile(self.home, (n_envs, 1))
         """(n_envs, n_driven) [m]."""
         self.tip: Floats = np.zeros((n_envs, 3))
@@ -109,7 +109,7 @@ class RodTask(Task):
         self._home_tip, self._home_direction = self.tip[0].copy(), self.direction[0].copy()
 
     def loads(self) -> dict[str, Any]:
-        """What the simulator is told besides wires: loads, obstacles."""
+        """What the simulator is told besides tendons: loads, obstacles."""
         return {}
 
     def start(self, rows: Ints, draws: Floats) -> None:
@@ -153,17 +153,30 @@ class RodTask(Task):
         if not self.base_robot.effects:
             return self.tip
         seen = self.simulator.measure().tip_position
-        p = self._foot + (
-            seen[:, :1] * self._turn[:, 0] + seen[:, 1:2] * self._turn[:, 1] + seen[:, 2:] * self._turn[:, 2]
+        p = self._base_position + (
+            seen[:, :1] * self._base_rotation[:, 0]
+            + seen[:, 1:2] * self._base_rotation[:, 1]
+            + seen[:, 2:] * self._base_rotation[:, 2]
         )
         return np.where(np.isfinite(p), p, self.tip)
 
+    def jacobian(self) -> Floats:
+        """(n_envs, 6, n_driven) d(tip position, rotation vector)/d(driven), world, by the `model`: rows 0 to
+        2 per metre [m/m], 3 to 5 [rad/m]."""
+        return self.by_driven(self.model().jacobian())
+
+    def by_driven(self, jacobian: Floats) -> Floats:
+        """(n_envs, m, n_driven) of derivatives (n_envs, m, n_tendons + n_segments) by tendon lengths and
+        extensions, as `Simulator.jacobian` gives them."""
+        return np.asarray(jacobian @ self._actions.matrix[:, self.driven])
+
     def toward(self, velocity: Floats, jacobian: Floats | None = None, weight: ArrayLike = 1.0) -> Floats:
-        """(n_envs, n_actions) the action that moves the tips with these velocities (n_envs, 3) [m/s]: damped
-        resolved rates, with the simulator's Jacobian or one of d(tip)/d(driven) (n_envs, 3, n_driven).
-        Numbers with a smaller `weight` (n_driven,) move less."""
+        """(n_envs, n_actions) the action that moves the tips with these velocities (n_envs, m): damped
+        resolved rates by `jacobian` (n_envs, m, n_driven), the rows of `RodTask.jacobian` that the velocities
+        belong to; without one, m is 3 and they are those of the tips [m/s]. Numbers with a smaller `weight`
+        (n_driven,) move less."""
         if jacobian is None:
-            jacobian = self.model().jacobian()[:, :3] @ self._actions.matrix[:, self.driven]
+            jacobian = self.by_driven(self.model().jacobian()[:, :3])
         scale = self._rate * np.asarray(weight)
         q = scale * resolved(np.nan_to_num(jacobian) * scale, velocity, -self.posture())
         if self.options.action == "rate":
@@ -220,7 +233,7 @@ class RodTask(Task):
         """Note where the tips of these robots are; those that are lost stay where they were last seen."""
         some = np.ones(self.n_envs, bool) if rows is None else np.isin(np.arange(self.n_envs), rows)
         with np.errstate(invalid="ignore"):
-            sane = (np.abs(tip - self._foot) < _FAR * self.base_robot.length).all(1) & np.isfinite(
+            sane = (np.abs(tip - self._base_position) < _FAR * self.base_robot.length).all(1) & np.isfinite(
                 direction
             ).all(1)
         good = some & ok & sane

@@ -46,14 +46,14 @@ class BatchVecEnv(VecEnv):
 
     def step_wait(self) -> Any:
         """Observations, rewards, dones and infos of the step."""
-        observation, reward, terminated, truncated, told = self.env.step(
+        observation, reward, terminated, truncated, batch_info = self.env.step(
             self._action if self._action is not None else []
         )
         done = terminated | truncated
         nothing: dict[str, Any] = {}
         infos = [nothing] * self.num_envs
         if done.any():
-            final = told["final_info"]
+            final = batch_info["final_info"]
             plain = [
                 name for name, a in final.items() if not name.startswith("_") and not isinstance(a, dict)
             ]
@@ -62,7 +62,7 @@ class BatchVecEnv(VecEnv):
                 episode = final["episode"]
                 row["episode"] = {"r": float(episode["r"][i]), "l": int(episode["l"][i]), "t": 0.0}
                 row["is_success"] = bool(final["success"][i])
-                row["terminal_observation"] = told["final_obs"][i]
+                row["terminal_observation"] = batch_info["final_obs"][i]
                 row["TimeLimit.truncated"] = bool(truncated[i])
                 infos[i] = row
         return observation, reward.astype(np.float32), done, infos

@@ -16,6 +16,7 @@ from fastrod_envs.episodes import Episodes, Singles
 from fastrod_envs.options import checked_difficulty, checked_mapping, with_steps
 from fastrod_envs.registration import make_task, task_class
 from fastrod_envs.rendering import Renderer
+from fastrod_envs.task import Task
 from fastrod_envs.vector import action_space
 
 
@@ -38,7 +39,7 @@ class SingleEnv(gymnasium.Env[Singles, Any]):
 
     def __init__(
         self,
-        task: str,
+        task: str | type[Task],
         *,
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
@@ -127,10 +128,10 @@ class SingleEnv(gymnasium.Env[Singles, Any]):
         self.task.close()
 
 
-def _first(told: dict[str, Any]) -> dict[str, Any]:
+def _first(reported: dict[str, Any]) -> dict[str, Any]:
     """The first row of every array, numbers as Python's own."""
     row: dict[str, Any] = {}
-    for name, value in told.items():
+    for name, value in reported.items():
         row[name] = (
             _first(value) if isinstance(value, dict) else value[0].item() if np.ndim(value) == 1 else value[0]
         )

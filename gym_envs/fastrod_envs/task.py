@@ -111,8 +111,11 @@ class Task(ABC):
     """Of an episode, unless the options say otherwise."""
     n_draws: ClassVar[int]
     """Numbers from 0 to 1 that an episode draws for its goal and scene, randomisation apart."""
-    accuracy: ClassVar[float]
-    """Distance below which the task is done [m]."""
+    accuracy: float
+    """Distance below which the task is done [m]; a number of the class, which a robot of another size may
+    change."""
+    solved: ClassVar[float | None] = None
+    """Mean return from which the task counts as solved, for Gymnasium; None: nobody has said."""
     options_class: ClassVar[type[EnvOptions]] = EnvOptions
     """Its options."""
     hosted: ClassVar[bool] = False
@@ -172,12 +175,12 @@ class Task(ABC):
         simulator knows."""
 
     @abstractmethod
-    def scenery(self, i: int) -> Backdrop:
+    def backdrop(self, i: int) -> Backdrop:
         """What environment i looks like now."""
 
     def picture(self, i: int, width: int, height: int) -> np.ndarray | None:  # noqa: ARG002
         """(height, width, 3) uint8 of environment i where a host draws it; None leaves it to the drawing of
-        `scenery`."""
+        `backdrop`."""
         return None
 
     def close(self) -> None:  # noqa: B027
@@ -189,15 +192,15 @@ class Task(ABC):
         return size(self.actions)
 
 
-def size(parts: tuple[Field, ...]) -> int:
+def size(entries: tuple[Field, ...]) -> int:
     """Numbers in these parts."""
-    return sum(len(part.low) for part in parts)
+    return sum(len(entry.low) for entry in entries)
 
 
-def bounds(parts: tuple[Field, ...]) -> tuple[Floats, Floats]:
+def bounds(entries: tuple[Field, ...]) -> tuple[Floats, Floats]:
     """(n,) least and (n,) largest value of every number of these parts, each in its unit."""
-    return np.concatenate([np.array(p.low, float) for p in parts]), np.concatenate(
-        [np.array(p.high, float) for p in parts]
+    return np.concatenate([np.array(p.low, float) for p in entries]), np.concatenate(
+        [np.array(p.high, float) for p in entries]
     )
 
 

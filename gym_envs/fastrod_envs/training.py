@@ -18,7 +18,7 @@ import msgspec
 from fastrod.errors import InputError, UnknownNameError, nearest, shown
 from fastrod_envs.actor import actor_of
 from fastrod_envs.checkpoints import load_checkpoint, load_replay, save_checkpoint, save_replay
-from fastrod_envs.presets import ALGORITHMS, NETWORK, preset_of, settings_of
+from fastrod_envs.presets import ALGORITHMS, NETWORK, check_settings, preset_of, settings_of
 from fastrod_envs.registration import NAMESPACE, VERSION, name_of
 
 Progress = Callable[[str, int, int], None]
@@ -74,6 +74,7 @@ class TrainingPlan:
             raise InputError(
                 f"curriculum is {self.curriculum!r}; it must be the difficulty at the start, from 0 to 1."
             )
+        check_settings(self.algorithm, self.settings)
 
 
 class _State(TypedDict):
@@ -298,7 +299,8 @@ def _fresh(plan: TrainingPlan, vec: Any, board: str | None) -> Any:
             policy_kwargs={**policy, **own},
             **settings,
         )
-    except (TypeError, ValueError, AssertionError, MemoryError) as error:  # of stable-baselines3 and torch
+    # of stable-baselines3 and torch
+    except (TypeError, ValueError, AssertionError, MemoryError, RuntimeError) as error:
         raise InputError(
             f"{plan.algorithm} cannot be set up with the settings {shown(settings)}: "
             f"{str(error).rstrip('.')}."
@@ -314,14 +316,14 @@ def _callback(plan: TrainingPlan, note: Callable[[], None], progress: Progress |
     class TrainingWatch(BaseCallback):
         def __init__(self) -> None:
             super().__init__()
-            self.told: dict[str, deque[float]] = {
+            self.reported: dict[str, deque[float]] = {
                 name: deque(maxlen=1000) for name in ("distance", "is_success", "contact", "lost")
             }
             self.next_note = -1
 
         def _on_step(self) -> bool:
             for i in self.locals["dones"].nonzero()[0]:
-                for name, values in self.told.items():
+                for name, values in self.reported.items():
                     values.append(float(self.locals["infos"][i][name]))
             every = max(1, plan.steps // _EVERY)
             if self.next_note < 0:
@@ -330,16 +332,16 @@ def _callback(plan: TrainingPlan, note: Callable[[], None], progress: Progress |
                 note()
                 self.next_note += every
             if plan.curriculum < 1.0:
-                part = min(1.0, 2.0 * self.num_timesteps / plan.steps)
+                done_fraction = min(1.0, 2.0 * self.num_timesteps / plan.steps)
                 self.training_env.env_method(
-                    "set_difficulty", plan.curriculum + (1.0 - plan.curriculum) * part
+                    "set_difficulty", plan.curriculum + (1.0 - plan.curriculum) * done_fraction
                 )
             if progress is not None:
                 progress(f"{plan.env} {plan.algorithm}", min(self.num_timesteps, plan.steps), plan.steps)
             return True
 
         def _on_rollout_end(self) -> None:
-            for name, values in self.told.items():
+            for name, values in self.reported.items():
                 if values:
                     self.logger.record(f"episodes/{name}", sum(values) / len(values))
 

@@ -51,15 +51,16 @@ class BatchEnv(VectorEnv[Singles, Any, Any]):
 
     def __init__(
         self,
-        task: str,
+        task: str | type[Task],
         num_envs: int = 1,
         *,
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        """`task` is the name in the id; `options` are those of the task (`Options`), `max_episode_steps` is
-        another name of n_steps. Raises `InputError`, `UnknownNameError`, `HostError`."""
+        """`task` is the name in the id, or a task's class; `options` are those of the task (`Options`),
+        `max_episode_steps` is another name of n_steps. Raises `InputError`, `UnknownNameError`,
+        `HostError`."""
         if not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
             raise InputError(f"num_envs is {num_envs!r}; it must be a whole number, at least 1.")
         self.render_mode = render_mode
@@ -140,8 +141,8 @@ class BatchEnv(VectorEnv[Singles, Any, Any]):
         Raises `InputError` on a wrong shape and on what is not finite; then nothing was simulated.
         """
         moment = self._episodes.advance(actions)
-        told = self._episodes.info(moment)
-        infos = _masked(told, self._every)
+        reported = self._episodes.info(moment)
+        infos = _masked(reported, self._every)
         observation = self._episodes.observation()
         done = moment.terminated | moment.truncated
         if done.any():
@@ -149,11 +150,11 @@ class BatchEnv(VectorEnv[Singles, Any, Any]):
             final = np.full(self.num_envs, None, dtype=object)
             for i in rows:
                 final[i] = observation[i]
-            told["episode"] = {"r": self._episodes.returned.copy(), "l": self._episodes.elapsed.copy()}
+            reported["episode"] = {"r": self._episodes.returned.copy(), "l": self._episodes.elapsed.copy()}
             infos |= {
                 "final_obs": final,
                 "_final_obs": done,
-                "final_info": _masked(told, done),
+                "final_info": _masked(reported, done),
                 "_final_info": done,
             }
             self._episodes.begin(rows)
@@ -180,10 +181,10 @@ class BatchEnv(VectorEnv[Singles, Any, Any]):
         self.task.close()
 
 
-def _masked(told: dict[str, Any], mask: Flags) -> dict[str, Any]:
+def _masked(reported: dict[str, Any], mask: Flags) -> dict[str, Any]:
     """Gymnasium's infos of a batch: every array with the mask of those who have it."""
     infos: dict[str, Any] = {}
-    for name, value in told.items():
+    for name, value in reported.items():
         infos[name] = _masked(value, mask) if isinstance(value, dict) else value
         infos[f"_{name}"] = mask
     return infos

@@ -29,7 +29,7 @@ TWIST = 0.5
 """Bend across over bend along: the tips go round, not to and fro."""
 RESIDUAL = 1e-3
 """Largest of a step's boundary [m]."""
-WAY = 0.1
+DISPLACEMENT = 0.1
 """Least that each tip covers, corner to corner of the box around its path [m]."""
 DIFFERENT = 0.01
 """Least distance of two neighbours' tips in their own frames, at every time [m]."""
@@ -82,8 +82,8 @@ class Grid(RodScene):
         return {**self.actions.inputs(self.action(t)), "base_pose": self.bases}
 
     def check(self) -> dict[str, float]:
-        """The waves must be solved to `RESIDUAL`, move every tip by `WAY`, differ between neighbours, and
-        come back after a period."""
+        """The waves must be solved to `RESIDUAL`, move every tip by `DISPLACEMENT`, differ between
+        neighbours, and come back after a period."""
         tips: list[Floats] = []
         residual = 0.0
         for t, state in self.run():
@@ -94,12 +94,15 @@ class Grid(RodScene):
             residual = max(residual, float(state.residual.max()))
             tips.append(state.tip_position - self.bases[:, :3])
         path, steps = np.array(tips), round(PERIOD / self.dt)
-        way = float(np.linalg.norm(np.ptp(path, axis=0), axis=1).min())
+        displacement = float(np.linalg.norm(np.ptp(path, axis=0), axis=1).min())
         field = path.reshape(len(path), SIDE, SIDE, 3)
         apart = min(float(np.linalg.norm(np.diff(field, axis=axis), axis=3).min()) for axis in (1, 2))
         off = float(np.linalg.norm(path[2 * steps :] - path[steps : len(path) - steps], axis=2).max())
         self.expect(residual < RESIDUAL, f"a boundary is {residual:.3g} m off.")
-        self.expect(way > WAY, f"a tip covers {way:.3g} m; it must be {WAY:g} m.")
+        self.expect(
+            displacement > DISPLACEMENT,
+            f"the tip's displacement is {displacement:.3g} m; it must be {DISPLACEMENT:g} m.",
+        )
         self.expect(
             apart > DIFFERENT,
             f"two neighbours are {apart:.3g} m from being alike; each must have a phase of its own.",
@@ -107,7 +110,7 @@ class Grid(RodScene):
         self.expect(off < PERIODIC, f"a tip is {off:.3g} m from where it was a period before.")
         return {
             "boundary residual, m": residual,
-            "way of a tip, least, m": way,
+            "displacement of a tip, least, m": displacement,
             "neighbours from being alike, m": apart,
             "tip after a period, m": off,
         }

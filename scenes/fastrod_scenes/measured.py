@@ -21,7 +21,8 @@ from fastrod.model.robot import Robot, Segment, Tendon
 from fastrod.model.robotfile import load_robot
 
 _UPSIDE_DOWN = (0.0, 1.0, 0.0, 0.0)
-"""world_from_base of a robot that hangs: half a turn about x, so that z of the base points down."""
+"""world_from_base of a robot that hangs: rotated by 180 degrees about x, so that z of the base points
+down."""
 
 ASL_DISKS = (0.106, 0.202, 0.320)
 """Distance of the three disks below the base at rest [m], published."""
@@ -37,14 +38,14 @@ ASL_PITCH_RADIUS = 0.03
 ASL_NOISE = 5e-6
 """Of the tip at rest, per axis, published [m]."""
 ASL_COMPLIANCE = 1e-3
-"""Nominal [m/N]: the wires are kept tight by springs."""
+"""Nominal [m/N]: the tendons are kept tight by springs."""
 
 ARMLAB_LENGTH = 0.108
 """Nominal [m]: the middle of the published fits, 0.096 to 0.119 m."""
 ARMLAB_PITCH_RADIUS = 0.0045
 """Nominal [m]: the middle of the published fits, 0.0038 to 0.0051 m."""
 ARMLAB_COMPLIANCE = 1e-4
-"""Nominal [m/N]: all three wires pulled by 10 mm then draw 100 N each, on a body that cannot shorten."""
+"""Nominal [m/N]: all three tendons pulled by 10 mm then draw 100 N each, on a body that cannot shorten."""
 ARMLAB_NOISE = 6e-5
 """Of the tip, per axis, published as 0.03 to 0.06 mm [m]."""
 ARMLAB_CELL = 0.0025
@@ -63,11 +64,10 @@ def asl_trunk(path: str | Path, run: str | None = None) -> tuple[RunLog, Robot]:
 
     Published: disk heights, which motor ends where, pull directions, payload. Antagonistic pairs on one spool
     are one push-pull tendon each, so the robot has six, in the order of motors 3 5 | 1 6 | 2 4. `dl` = -spool
-    radius times the
-    *commanded* motor angle u, for that is what a user has beforehand; `extra` keeps the measured angles phi
-    (up to 5 rows stale). Tip = disk 3; points p1, p2 = disks 1 and 2.
-    Nominal: spool radius, pitch radius, wire compliance, bending stiffness 0.05, torsional stiffness 0.5 N
-    m^2 (a corrugated hose bends but hardly twists; much less, and the pushing half of the pairs, which has no
+    radius times the *commanded* motor angle u, for that is what a user has beforehand; `extra` keeps the
+    measured angles phi (up to 5 rows stale). Tip = disk 3; points p1, p2 = disks 1 and 2. Nominal: spool
+    radius, pitch radius, tendon compliance, bending stiffness 0.05, torsional stiffness 0.5 N m^2 (a
+    corrugated hose bends but hardly twists; much less, and the pushing half of the pairs, which has no
     pretension here, would buckle it), a weightless body. Only `payload` loads the rod, and how far it sags
     rests on the nominal stiffness.
     """
@@ -179,12 +179,12 @@ def armlab_tdcr(path: str | Path) -> tuple[RunLog, Robot]:
     acquired, 1 s each.
 
     Published: three tendons 120 deg apart, their shortening (`dl` = -l_mm / 1000), tip position. Every sweep
-    only loads. Rows with glitch = 1 are given as missing.
-    Nominal: length and pitch radius in the middle of the published fits; stiffness as the paper's prototype;
-    weightless; angles 205, 85, 325 deg, which is where the tip went when one tendon was pulled alone (-155,
-    86, -37 deg), rounded to 5 deg and 120 deg apart. The grid pulls all three tendons together too. The real
-    body shortens then; this rod cannot, so the common part of the pull stretches the tendons and only the
-    differences bend: the tensions mean nothing here.
+    only loads. Rows with glitch = 1 are given as missing. Nominal: length and pitch radius in the middle of
+    the published fits; stiffness as the paper's prototype; weightless; angles 205, 85, 325 deg, which is
+    where the tip went when one tendon was pulled alone (-155, 86, -37 deg), rounded to 5 deg and 120 deg
+    apart. The grid pulls all three tendons together too. The real body shortens then; this rod cannot, so the
+    common component of the pull stretches the tendons and only the differences bend: the tensions mean
+    nothing here.
     """
     table, where = _table(path, "armlab_tdcr"), Path(path).name
     pull = _metres(table, ("l1_mm", "l2_mm", "l3_mm"), where)
@@ -242,11 +242,13 @@ _ADAPTERS: dict[str, Callable[[str | Path], tuple[RunLog, Robot]]] = {
 def detect(path: str | Path) -> Callable[[str | Path], tuple[RunLog, Robot]] | None:
     """The adapter of the measured set whose raw file `path` is, known by its header; None for any other
     file."""
+    if not Path(path).is_file():
+        return None  # a pipe would wait for whoever writes into it
     try:
         with Path(path).open(encoding="utf-8-sig") as file:
             header = {name.strip() for name in file.readline(4096).split(",")}
     except (OSError, UnicodeDecodeError):
-        return None  # whoever reads the file says what is wrong with it
+        return None  # the reader of the file says what is wrong with it
     return next((_ADAPTERS[name] for name, columns in _HEADERS.items() if header.issuperset(columns)), None)
 
 

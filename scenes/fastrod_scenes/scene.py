@@ -1,5 +1,5 @@
-"""`Scene`: robots, what surrounds them, what they are told, and what physics expects of it; `load(name)`
-finds one."""
+"""`Scene`: robots, their surroundings, their inputs, and what physics expects of them; `load(name)` finds
+one."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Scene(ABC):
 
     @final
     def progress(self, t: float) -> float:
-        """Part of the run that is over at time t [s], from 0 to 1."""
+        """Fraction of the run that is over at time t [s], from 0 to 1."""
         return min(max(t / self.duration, 0.0), 1.0)
 
     @final
@@ -107,7 +107,7 @@ class SoftBody(NamedTuple):
     state: State
     """Of this robot alone."""
     capsules: tuple[int, ...]
-    """Numbers of the bodies that stand for it in the world: who draws the rod leaves them out."""
+    """Numbers of the bodies that stand for it in the world: a drawing of the rod leaves them out."""
 
 
 class HostedWorld(ABC):
@@ -130,7 +130,7 @@ class HostedWorld(ABC):
         """Command and simulate the step that begins at time t [s]."""
 
     def picture(self) -> Image | None:
-        """What the camera on the first soft robot sees now, where there is one."""
+        """Return the present picture of the camera on the first soft robot, where there is one."""
         return None
 
     def close(self) -> None:
@@ -163,9 +163,9 @@ class SceneStage(HostedWorld):
             if rod.state is not None
         )
 
-    def carry(self) -> None:
-        """Put what follows the arm for the eye alone to where the arm is now: `advance` does so itself, who
-        drives the arm by other ways does it after each step of the world."""
+    def follow_arm(self) -> None:
+        """Move visuals that follow the arm to where the arm is now: `advance` does so itself; anything else
+        that drives the arm calls it after each step of the world."""
 
 
 class HostedScene(Scene):

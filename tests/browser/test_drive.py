@@ -36,8 +36,10 @@ def test_a_slider_moved_by_keys_bends_the_robot_and_the_picture(app: App, window
     thumb.focus()
     for _ in range(45):
         thumb.press("ArrowRight")
-    assert seen.until(lambda: page_of(app).pilot.arrived and page_of(app).pilot.bent(0)[0] > np.radians(44.0))
-    # an arc of 45 degrees and 0.07 m ends at (1 - cos a) l / a beside its base; wires of 1e-5 m/N give way a
+    assert seen.until(
+        lambda: page_of(app).teleop.arrived and page_of(app).teleop.bent(0)[0] > np.radians(44.0)
+    )
+    # an arc of 45 degrees and 0.07 m ends at (1 - cos a) l / a beside its base; tendons of 1e-5 m/N stretch a
     # little
     a, length = np.radians(45.0), 0.07
     assert tip_of(app)[0] - before[0] == pytest.approx((1.0 - np.cos(a)) * length / a, rel=0.03)
@@ -59,12 +61,12 @@ def test_the_tip_follows_a_drag(app: App, window: Windows) -> None:
     for k in range(1, 21):
         mouse.move(x + 6 * k, y + 3 * k)
         seen.page.wait_for_timeout(30)
-    assert seen.until(lambda: page_of(app).pilot.dragged_to is not None)
-    pull = page_of(app).pilot.dragged_to
+    assert seen.until(lambda: page_of(app).teleop.dragged_to is not None)
+    pull = page_of(app).teleop.dragged_to
     assert pull is not None
     assert seen.until(lambda: bool(np.linalg.norm(tip_of(app) - pull) < 2e-3))
     mouse.up()
-    assert seen.until(lambda: page_of(app).pilot.dragged_to is None)
+    assert seen.until(lambda: page_of(app).teleop.dragged_to is None)
     held = tip_of(app)
     seen.page.wait_for_timeout(500)
     assert np.linalg.norm(held - before) > 0.02
@@ -85,8 +87,8 @@ def test_keys_bend_pause_reset_and_stop(app: App, window: Windows) -> None:
     keys.press("2")
     for _ in range(3):
         keys.press("l")
-    assert seen.until(lambda: abs(page.pilot.bent(1)[0] - np.radians(15.0)) < 1e-6)
-    assert page.pilot.bent(0)[0] == pytest.approx(0.0, abs=1e-6)
+    assert seen.until(lambda: abs(page.teleop.bent(1)[0] - np.radians(15.0)) < 1e-6)
+    assert page.teleop.bent(0)[0] == pytest.approx(0.0, abs=1e-6)
     seen.page.wait_for_timeout(500)
     assert at_rest()  # keys that bend do not fly the camera
     keys.press("Space")
@@ -95,17 +97,17 @@ def test_keys_bend_pause_reset_and_stop(app: App, window: Windows) -> None:
     assert seen.until(lambda: not page.session.paused)
     keys.press("Escape")
     assert seen.until(lambda: page.session.stopped)
-    page.pilot.bend(0, 0.5, 0.0)
+    page.teleop.bend(0, 0.5, 0.0)
     seen.page.wait_for_timeout(300)
-    assert abs(page.pilot.now.action[1]) < 1e-12
+    assert abs(page.teleop.now.action[1]) < 1e-12
     keys.press("Escape")
     seen.page.get_by_role("button", name="STOP", exact=True).dblclick()
     seen.page.wait_for_timeout(300)
     assert page.session.stopped
-    seen.page.get_by_role("button", name="GO ON").click()
+    seen.page.get_by_role("button", name="Resume", exact=True).click()
     assert seen.until(lambda: not page.session.stopped)
     keys.press("r")
-    assert seen.until(lambda: float(np.abs(page.pilot.goals.action).max()) < 1e-9)
+    assert seen.until(lambda: float(np.abs(page.teleop.goals.action).max()) < 1e-9)
 
 
 def test_another_scene_is_picked_in_the_page(app: App, window: Windows) -> None:
@@ -142,7 +144,7 @@ def test_two_pages_show_the_same_and_closing_one_changes_nothing(app: App, windo
     thumb = second.slider("Bend x [°]")
     thumb.focus()
     thumb.press("ArrowRight")
-    assert second.until(lambda: abs(page_of(app).pilot.bent(0)[0] - np.radians(21.0)) < 1e-6)
+    assert second.until(lambda: abs(page_of(app).teleop.bent(0)[0] - np.radians(21.0)) < 1e-6)
 
 
 def test_of_two_pages_one_drives(app: App, window: Windows, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -151,26 +153,26 @@ def test_of_two_pages_one_drives(app: App, window: Windows, monkeypatch: pytest.
     monkeypatch.setattr("fastrod_viewer.holder.AGAIN", 0.0)
     app.open("prototype")
     first, second = window(app.address), window(app.address)
-    pilot = page_of(app).pilot
+    teleop = page_of(app).teleop
     assert first.until(lambda: first.page.get_by_text("No page has the controls.").count() == 1)
     first.page.keyboard.press("l")
     assert first.until(lambda: first.page.get_by_text("This page has the controls.").count() == 1)
     assert second.until(lambda: second.page.get_by_text("This one watches").count() == 1)
-    bent = pilot.bent(0)[0]
+    bent = teleop.bent(0)[0]
     assert bent > 0.05
     thumb = second.slider("Bend x [°]")
     thumb.focus()
     thumb.press("End")
-    assert second.until(lambda: second.page.get_by_text("Ask for them in the window Controls").count() == 1)
+    assert second.until(lambda: second.page.get_by_text("Request them in the window Controls").count() == 1)
     assert second.until(lambda: thumb.get_attribute("aria-valuenow") == "5")  # it goes back
-    assert pilot.bent(0)[0] == bent
+    assert teleop.bent(0)[0] == bent
     for answer in ("Keep control", "Yield control"):
-        second.page.get_by_role("button", name="Ask for control").click()
+        second.page.get_by_role("button", name="Request control").click()
         first.page.get_by_role("button", name=answer).click()
     assert second.until(lambda: second.page.get_by_text("This page has the controls.").count() == 1)
     thumb.focus()
     thumb.press("ArrowRight")
-    assert second.until(lambda: pilot.bent(0)[0] > bent + 0.01)
+    assert second.until(lambda: teleop.bent(0)[0] > bent + 0.01)
     first.page.keyboard.press("Escape")
     assert first.until(lambda: page_of(app).session.stopped)
     assert first.errors == second.errors == []
@@ -216,7 +218,7 @@ def test_closing_the_page_stops_a_real_robot(app: App, window: Windows) -> None:
     assert there.min() > -0.0075 * np.pi / 2.0 + 1e-3  # it had not arrived
     other.go(app.address)
     other.page.wait_for_timeout(1100)  # sooner it is ignored
-    other.page.get_by_role("button", name="GO ON").click()
+    other.page.get_by_role("button", name="Resume", exact=True).click()
     assert other.until(lambda: not link.stopped)
 
 

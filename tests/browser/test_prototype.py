@@ -31,7 +31,7 @@ from fastrod_viewer.worlds import FreeWorld
 
 Windows = Callable[..., Window]
 CYCLE = 0.01
-STANDS = 2e-5  # m of a wire: what noise of the plant and the drives' regulators leave
+STANDS = 2e-5  # m of a tendon: what noise of the plant and the drives' regulators leave
 
 
 class Paced:
@@ -40,15 +40,15 @@ class Paced:
 
     real = True
 
-    def __init__(self, bench: EmulatedBench) -> None:
-        self.prototype = bench.prototype
+    def __init__(self, setup: EmulatedBench) -> None:
+        self.prototype = setup.prototype
         self.robot, self.supervisor, self.clock = (
-            bench.prototype.robot,
-            bench.prototype.supervisor,
-            bench.prototype.clock,
+            setup.prototype.robot,
+            setup.prototype.supervisor,
+            setup.prototype.clock,
         )
-        self.source = bench.prototype.source
-        self.asked: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self.source = setup.prototype.source
+        self.requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self.ended = threading.Event()
         self.thread = threading.Thread(target=self._run, daemon=True)
         self.thread.start()
@@ -68,7 +68,7 @@ class Paced:
         self.prototype.stop()
 
     def release(self) -> None:
-        self.asked.put(self.prototype.release)
+        self.requests.put(self.prototype.release)
 
     def recorder_for(self, path: str) -> Recorder:
         return self.prototype.recorder_for(path)
@@ -89,12 +89,12 @@ class Paced:
         while not self.ended.is_set():
             began = time.perf_counter()
             with contextlib.suppress(queue.Empty):
-                self.asked.get_nowait()()
+                self.requests.get_nowait()()
             with contextlib.suppress(DeviceError):  # it has stopped; its page says so
                 self.prototype.wait(CYCLE)
             self.ended.wait(max(CYCLE - (time.perf_counter() - began), 0.0))
 
-    def wires(self) -> np.ndarray:
+    def change(self) -> np.ndarray:
         """(4,) where the drives say they are [m]."""
         assert self.readings is not None
         return np.array(self.readings.dl)
@@ -103,10 +103,10 @@ class Paced:
 class Bed:
     """A prototype, its page, and a window."""
 
-    def __init__(self, bench: EmulatedBench, app: App) -> None:
-        assert bench.emulator is not None
-        self.app, self.emulator, self.link = app, bench.emulator, Paced(bench)
-        app.open(FreeWorld(bench.prototype.robot), link=self.link)
+    def __init__(self, setup: EmulatedBench, app: App) -> None:
+        assert setup.emulator is not None
+        self.app, self.emulator, self.link = app, setup.emulator, Paced(setup)
+        app.open(FreeWorld(setup.prototype.robot), link=self.link)
         assert isinstance(app.page, DrivePage)
         self.page = app.page
 
@@ -116,21 +116,21 @@ class Bed:
         thumb.press(key)
 
     def slowly(self, seen: Window) -> None:
-        """At 5 degrees a second, so that it is under way for long."""
+        """At 5 degrees a second, so that it moves for long."""
         self.bend(seen, "Home", "Speed [°/s]")
 
     def stands(self, seen: Window) -> bool:
         """The drives stand, for so many cycles."""
         until = self.link.elapsed + 0.2
         assert seen.until(lambda: self.link.elapsed > until)  # a ramp has ended
-        before, until = self.link.wires(), self.link.elapsed + 0.5
+        before, until = self.link.change(), self.link.elapsed + 0.5
         assert seen.until(lambda: self.link.elapsed > until)
-        return bool(np.abs(self.link.wires() - before).max() < STANDS)
+        return bool(np.abs(self.link.change() - before).max() < STANDS)
 
     def go_on(self, seen: Window) -> None:
         """When a person has had time to see why it stopped."""
         seen.page.wait_for_timeout(1100)
-        seen.page.get_by_role("button", name="GO ON").click()
+        seen.page.get_by_role("button", name="Resume", exact=True).click()
 
     def says(self, seen: Window, words: str) -> bool:
         return seen.until(lambda: seen.page.get_by_text(re.compile(words)).count() > 0)
@@ -138,23 +138,29 @@ class Bed:
 
 @pytest.fixture
 def bed(app: App) -> Iterator[Bed]:
-    with emulated(load_hardware(), seed=3, effect="none", home=False) as bench:
-        made = Bed(bench, app)
+    with emulated(load_hardware(), seed=3, effect="none", home=False) as setup:
+        made = Bed(setup, app)
         yield made
         app.close()
 
 
-def test_hands_drive_it_and_the_page_shows_what_it_says(bed: Bed, window: Windows) -> None:
+def test_a_person_drives_it_and_the_page_shows_what_it_says(bed: Bed, window: Windows) -> None:
     seen = window(bed.app.address)
     bed.bend(seen, "End")
-    assert seen.until(lambda: bed.page.pilot.arrived and bool(bed.link.wires()[0] < -7.9e-3))
-    # 61 degrees are the most whole ones that 8 mm of wire are good for, at 7.5 mm from the backbone
-    np.testing.assert_allclose(bed.link.wires(), 0.0075 * np.radians([-61.0, 0.0, 61.0, 0.0]), atol=1e-4)
-    for words in ("The robot follows commands.", "marker seen", "Wires pull", "Measured tip", "as measured"):
+    assert seen.until(lambda: bed.page.teleop.arrived and bool(bed.link.change()[0] < -7.9e-3))
+    # 61 degrees are the most whole ones that 8 mm of tendon are good for, at 7.5 mm from the backbone
+    np.testing.assert_allclose(bed.link.change(), 0.0075 * np.radians([-61.0, 0.0, 61.0, 0.0]), atol=1e-4)
+    for words in (
+        "The robot follows commands.",
+        "marker seen",
+        "Tendons pull",
+        "Measured tip",
+        "as measured",
+    ):
         assert bed.says(seen, words), words
     measured = bed.link.read().tip_position
     assert seen.until(lambda: "measured" in bed.page.drawing.canvas.names)
-    assert measured[0] > 0.025  # (1 - cos a) l / a is 34 mm; friction and stretched wires take some of it
+    assert measured[0] > 0.025  # (1 - cos a) l / a is 34 mm; friction and stretched tendons take some of it
     green = (np.abs(seen.pixels().astype(int) - (20, 200, 40)).max(axis=2) < 25)[:400, 800:].sum()
     assert green > 10_000  # the camera's picture
     assert seen.errors == []
@@ -162,18 +168,18 @@ def test_hands_drive_it_and_the_page_shows_what_it_says(bed: Bed, window: Window
 
 def test_what_is_beyond_a_limit_is_said_and_not_done(app: App, window: Windows) -> None:
     hardware = load_hardware()
-    # 0.56 rad; the slider goes to 61 degrees by its wires
+    # 0.56 rad; the slider goes to 61 degrees by its tendons
     tight = replace(hardware, limits=replace(hardware.limits, curvature=8.0))
-    with emulated(tight, seed=3, effect="none", home=False) as bench:
-        bed = Bed(bench, app)
+    with emulated(tight, seed=3, effect="none", home=False) as setup:
+        bed = Bed(setup, app)
         seen = window(app.address)
         bed.bend(seen, "End")
         assert bed.says(seen, "segment 1 was told to bend with 8.* 1/m; this robot's limit is 8 1/m.")
-        assert 0.52 < bed.page.pilot.bent(0)[0] <= 8.0 * 0.07
+        assert 0.52 < bed.page.teleop.bent(0)[0] <= 8.0 * 0.07
         assert bed.stands(seen)
         assert not bed.page.session.stopped
         bed.bend(seen, "Home")
-        assert seen.until(lambda: bool(bed.link.wires()[0] > 1e-3))
+        assert seen.until(lambda: bool(bed.link.change()[0] > 1e-3))
         assert seen.errors == []
         app.close()
 
@@ -182,21 +188,21 @@ def test_stop_stands_at_once_and_go_on_moves_nothing(bed: Bed, window: Windows) 
     seen = window(bed.app.address)
     bed.slowly(seen)
     bed.bend(seen, "End")
-    assert seen.until(lambda: bool(bed.link.wires()[0] < -3e-4))
+    assert seen.until(lambda: bool(bed.link.change()[0] < -3e-4))
     seen.page.get_by_role("button", name="STOP", exact=True).click()
     assert seen.until(lambda: bed.page.session.stopped)
     assert bed.stands(seen)
-    there = bed.link.wires()
+    there = bed.link.change()
     bed.bend(seen, "End")
     assert bed.stands(seen)
     assert bed.says(seen, "emergency stop was pressed")
     bed.go_on(seen)
     assert seen.until(lambda: not bed.page.session.stopped)
     assert bed.stands(seen)
-    np.testing.assert_allclose(bed.link.wires(), there, atol=5e-5)
-    assert bed.page.pilot.bent(0)[0] == pytest.approx(-there[0] / 0.0075, abs=0.01)
+    np.testing.assert_allclose(bed.link.change(), there, atol=5e-5)
+    assert bed.page.teleop.bent(0)[0] == pytest.approx(-there[0] / 0.0075, abs=0.01)
     bed.bend(seen, "Home")
-    assert seen.until(lambda: bool(bed.link.wires()[0] > there[0] + 2e-4))
+    assert seen.until(lambda: bool(bed.link.change()[0] > there[0] + 2e-4))
 
 
 def test_stop_only_stops_however_often_it_is_pressed(
@@ -206,14 +212,14 @@ def test_stop_only_stops_however_often_it_is_pressed(
     monkeypatch.setattr("fastrod_viewer.session._HASTY", 60.0)
     seen, other = window(bed.app.address), window(bed.app.address)
     for each in (seen, other):
-        assert each.page.get_by_role("button", name="GO ON").is_disabled()
+        assert each.page.get_by_role("button", name="Resume", exact=True).is_disabled()
     bed.slowly(seen)
     bed.bend(seen, "End")
-    assert seen.until(lambda: bool(bed.link.wires()[0] < -3e-4))
+    assert seen.until(lambda: bool(bed.link.change()[0] < -3e-4))
     seen.page.get_by_role("button", name="STOP", exact=True).dblclick()
     assert seen.until(lambda: bed.page.session.stopped)
-    seen.page.get_by_role("button", name="GO ON").click()
-    assert bed.says(seen, "GO ON within a second of a stop is ignored; press it again.")
+    seen.page.get_by_role("button", name="Resume", exact=True).click()
+    assert bed.says(seen, "Resume within a second of a stop is ignored; press it again.")
     assert bed.stands(seen)
     monkeypatch.undo()
     for press in (
@@ -226,12 +232,14 @@ def test_stop_only_stops_however_often_it_is_pressed(
         assert bed.link.prototype.supervisor.first is not None
         assert bed.stands(other)
     bed.go_on(other)  # not for the page that only watches
-    assert bed.says(other, "Another page has the controls. Ask for them")
+    assert bed.says(other, "Another page has the controls. Request them")
     assert bed.page.session.stopped
     bed.go_on(seen)
     assert other.until(lambda: not bed.page.session.stopped)
     for each in (seen, other):
-        assert each.until(lambda each=each: each.page.get_by_role("button", name="GO ON").is_disabled())
+        assert each.until(
+            lambda each=each: each.page.get_by_role("button", name="Resume", exact=True).is_disabled()
+        )
         assert each.errors == []
 
 
@@ -259,7 +267,7 @@ def test_nothing_moves_when_nobody_watches(bed: Bed, window: Windows, how: str) 
     seen, other = window(bed.app.address), window()
     bed.slowly(seen)
     bed.bend(seen, "End")
-    assert seen.until(lambda: bool(bed.link.wires()[0] < -3e-4))
+    assert seen.until(lambda: bool(bed.link.change()[0] < -3e-4))
     if how == "closed":
         seen.close()
     else:
@@ -268,13 +276,13 @@ def test_nothing_moves_when_nobody_watches(bed: Bed, window: Windows, how: str) 
         )
     assert other.until(lambda: bed.link.prototype.supervisor.first is not None)
     assert bed.stands(other)
-    there = bed.link.wires()
+    there = bed.link.change()
     assert there[0] > 0.0075 * np.radians(-60.0)  # it had not arrived
     other.go(bed.app.address)
     assert bed.says(other, "nobody watches the robot any more")
     bed.bend(other, "End")
     assert bed.stands(other)
-    np.testing.assert_allclose(bed.link.wires(), there, atol=STANDS)
+    np.testing.assert_allclose(bed.link.change(), there, atol=STANDS)
     bed.go_on(other)
     assert other.until(lambda: not bed.page.session.stopped)
 
@@ -288,7 +296,7 @@ def test_a_recording_has_the_cameras_sightings_by_the_robots_clock(
     assert seen.until(lambda: bed.page.session.recorder is not None)
     for _ in range(4):
         seen.page.keyboard.press("l")
-    assert seen.until(lambda: bool(bed.link.wires()[0] < -0.0075 * np.radians(19.0)))
+    assert seen.until(lambda: bool(bed.link.change()[0] < -0.0075 * np.radians(19.0)))
     until = bed.link.elapsed + 0.5
     assert seen.until(lambda: bed.link.elapsed > until)
     seen.page.get_by_role("button", name="Stop and save").click()

@@ -43,14 +43,15 @@ def test_the_time_slider_moves_the_robot_and_the_figures(app: App, window: Windo
     assert seen.until(lambda: page.frame == 0)
     seen.page.wait_for_timeout(500)
     before, left = seen.pixels(), thumb.bounding_box()
-    turned = float(
+    rotated_at = float(
         page.playback.frame_time[np.argmin(np.abs(page.playback.base_quaternion[:, 0] - np.sqrt(0.5)))]
     )
-    part = (turned + 5.0) / page.playback.duration  # the base lies on its side there
+    fraction = (rotated_at + 5.0) / page.playback.duration  # the base lies on its side there
     seen.page.mouse.click(
-        left["x"] + 0.5 * left["width"] + part * (right["x"] - left["x"]), left["y"] + 0.5 * left["height"]
+        left["x"] + 0.5 * left["width"] + fraction * (right["x"] - left["x"]),
+        left["y"] + 0.5 * left["height"],
     )
-    assert seen.until(lambda: abs(page.playback.frame_time[page.frame] - turned) < 10.0)
+    assert seen.until(lambda: abs(page.playback.frame_time[page.frame] - rotated_at) < 10.0)
     seen.page.wait_for_timeout(500)
     assert (np.abs(seen.pixels().astype(int) - before)[:500, 340:].max(axis=2) > 40).sum() > 1000
     assert seen.errors == []
@@ -118,7 +119,7 @@ def test_an_exported_page_opens_from_disk_without_a_network(
     picture = alone.pixels()
     assert len(np.unique(picture[150:600, 420:860].reshape(-1, 3), axis=0)) > 200  # a robot, and not a blank
     assert alone.errors == []
-    assert [url for url in alone.asked if not url.startswith(("file:", "data:", "blob:"))] == []
+    assert [url for url in alone.requested if not url.startswith(("file:", "data:", "blob:"))] == []
     assert app.served.key not in path.read_text(encoding="utf-8")
 
 

@@ -1,5 +1,5 @@
-"""Plans by learning: without effects they are the nearest points in reach; with effects the tip still goes
-there."""
+"""Plans by learning: without effects they are the nearest points of the workspace; with effects the tip still
+goes there."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from fastrod.types import Floats
 
 RATE = 20.0
 PROTOTYPE = fastrod.load_robot("prototype")
-TURN = triangle(side=0.03, period=6.0, center=(0.0, 0.0, PROTOTYPE.length)).position(np.arange(120) / RATE)
+LAP = triangle(side=0.03, period=6.0, center=(0.0, 0.0, PROTOTYPE.length)).position(np.arange(120) / RATE)
 EFFECTS: dict[str, dict[str, float]] = {
     "backlash": {"half_width": 3e-4},
     "friction": {"half_width": 3e-4, "growth": 0.4},
@@ -39,7 +39,7 @@ def with_effects(*names: str) -> Robot:
 
 @cache
 def made(*names: str) -> InversePlan:
-    return plan(with_effects(*names), TURN, RATE)
+    return plan(with_effects(*names), LAP, RATE)
 
 
 def run(robot: Robot, given: InversePlan, lead: float = 0.0) -> Floats:
@@ -63,12 +63,12 @@ def test_without_effects_the_tip_goes_to_the_nearest_points() -> None:
     assert given.rollouts == 1
     assert_allclose(given.predicted[path], given.nearest[path], atol=1e-5)
     assert_allclose(run(PROTOTYPE, given), given.predicted, atol=1e-5)
-    assert_array_equal(given.target[path], TURN)
+    assert_array_equal(given.target[path], LAP)
 
 
 def test_the_nearest_points_are_nearest() -> None:
     given = made()
-    near, goal = given.nearest[given.n_approach :], TURN
+    near, goal = given.nearest[given.n_approach :], LAP
     # a single arc of length l that bends by b in the plane phi: the tip is l / b (1 - cos b) out and l / b
     # sin b up
     b, phi = np.meshgrid(np.linspace(1e-6, 2.0, 800), np.linspace(-np.pi, np.pi, 721), indexing="ij")
@@ -89,7 +89,7 @@ def test_nearest_is_stationary() -> None:
     simulator = Simulator(robot, n_robots=len(q), points_per_segment=20)
     tip = simulator.settle(**actions.inputs(q)).tip_position
     slopes = simulator.jacobian()[:, :3] @ actions.matrix[:, 1:]
-    left = np.einsum("nij,ni->nj", slopes, TURN - tip)
+    left = np.einsum("nij,ni->nj", slopes, LAP - tip)
     # slopes of some 5, errors of some mm: the product is 1e-2 where it is not stationary
     assert np.abs(left).max() < 1e-5
     assert_allclose(tip, given.nearest[given.n_approach :], atol=1e-6)
@@ -112,7 +112,7 @@ def test_all_at_once_and_a_camera_that_is_off() -> None:
     names = ("backlash", "friction", "creep", "gravity", "latency")
     seen_by = {"name": "frame_misalignment", "rotation_x": 0.03, "shift_x": 5e-4}
     robot = replace(with_effects(*names), effects=(*with_effects(*names).effects, seen_by))
-    given = plan(robot, TURN, RATE)
+    given = plan(robot, LAP, RATE)
     path = slice(given.n_approach, None)
     seen = run(robot, given, given.lead)
     assert rms(seen[path] - given.nearest[path]) < 0.1 * rms(run(robot, made())[path] - given.nearest[path])
@@ -126,7 +126,7 @@ def test_the_base_may_stand_anyhow() -> None:
         base_position=(0.3, -0.2, 0.1),
         base_quaternion=(np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0),
     )
-    given = plan(lying, TURN, RATE)
+    given = plan(lying, LAP, RATE)
     path = slice(given.n_approach, None)
     assert_allclose(given.predicted[path], given.nearest[path], atol=1e-5)
     # gravity points elsewhere in this frame
@@ -135,25 +135,25 @@ def test_the_base_may_stand_anyhow() -> None:
 
 def test_the_approach_is_smooth_and_begins_where_the_robot_stands() -> None:
     start = np.array([-0.002, 0.001, 0.002, -0.001])
-    given = plan(PROTOTYPE, TURN, RATE, start=start, approach=1.5)
+    given = plan(PROTOTYPE, LAP, RATE, start=start, approach=1.5)
     n = given.n_approach
     assert n == 30
     assert_allclose(given.dl[0], start, atol=1e-12)
     assert np.isnan(given.target[:n]).all()
     assert np.isnan(given.nearest[:n]).all()
     assert np.isfinite(given.predicted).all()
-    assert_allclose(given.t, np.arange(n + len(TURN)) / RATE)
-    assert len(given) == n + len(TURN)
+    assert_allclose(given.t, np.arange(n + len(LAP)) / RATE)
+    assert len(given) == n + len(LAP)
     steps = np.abs(np.diff(given.dl[: n + 1], axis=0)).max(axis=1)
     assert max(steps[0], steps[-1]) < 0.02 * steps.max()
     assert_array_equal(given.ext, np.zeros((len(given), 1)))
-    at_once = plan(PROTOTYPE, TURN, RATE, approach=0.0)
+    at_once = plan(PROTOTYPE, LAP, RATE, approach=0.0)
     assert at_once.n_approach == 0
     assert_allclose(at_once.dl, given.dl[n:], atol=1e-12)
 
 
 def test_a_limit_is_kept_and_the_rest_done() -> None:
-    given = plan(PROTOTYPE, TURN, RATE, limit=0.003)
+    given = plan(PROTOTYPE, LAP, RATE, limit=0.003)
     q = np.linalg.lstsq(SegmentActions(PROTOTYPE).matrix[:4, 1:], given.dl.T, rcond=None)[0].T
     free = made().dl[made().n_approach :]
     assert np.abs(q).max() == pytest.approx(0.003)
@@ -166,19 +166,19 @@ def test_a_limit_is_kept_and_the_rest_done() -> None:
     assert given.rms_nearest > made().rms_nearest
 
 
-def test_a_segment_that_extends_reaches_the_path_itself() -> None:
+def test_a_segment_that_extends_gets_to_the_path_itself() -> None:
     longer = replace(
         PROTOTYPE, segments=tuple(replace(segment, extension=(0.0, 0.02)) for segment in PROTOTYPE.segments)
     )
-    given = plan(longer, TURN, RATE)
+    given = plan(longer, LAP, RATE)
     path = slice(given.n_approach, None)
     assert given.rms_nearest < 1e-6
-    assert_allclose(given.predicted[path], TURN, atol=1e-5)
+    assert_allclose(given.predicted[path], LAP, atol=1e-5)
     assert given.ext.min() >= 0.0
     assert given.ext.max() > 1e-3
 
 
-def test_two_segments_reach_points_that_one_does_not() -> None:
+def test_two_segments_get_to_points_that_one_does_not() -> None:
     first = PROTOTYPE.segments[0]
     tendons = tuple(replace(tendon, angle=float(np.ravel(tendon.angle)[0]) + 0.5) for tendon in first.tendons)
     two = Robot(name="two", segments=(first, replace(first, tendons=tendons)))
@@ -189,7 +189,7 @@ def test_two_segments_reach_points_that_one_does_not() -> None:
 
 
 def test_it_is_the_same_again() -> None:
-    one, other = (plan(with_effects("backlash", "latency"), TURN, RATE, rollouts=3) for _ in range(2))
+    one, other = (plan(with_effects("backlash", "latency"), LAP, RATE, rollouts=3) for _ in range(2))
     assert_array_equal(one.dl, other.dl)
     assert_array_equal(one.predicted, other.predicted)
     assert one.rollouts == other.rollouts == 3
@@ -197,7 +197,7 @@ def test_it_is_the_same_again() -> None:
 
 
 def test_more_rollouts_are_never_worse() -> None:
-    found = [plan(with_effects("backlash"), TURN, RATE, rollouts=n).rms_distance for n in (1, 2, 4)]
+    found = [plan(with_effects("backlash"), LAP, RATE, rollouts=n).rms_distance for n in (1, 2, 4)]
     assert found == sorted(found, reverse=True)
     assert found[2] < 0.5 * found[0]
 
@@ -205,27 +205,27 @@ def test_more_rollouts_are_never_worse() -> None:
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"target": TURN[:, :2]}, r"target has shape \(120, 2\); it must be \(n, 3\)"),
-        ({"target": TURN[:1]}, "two or more positions"),
+        ({"target": LAP[:, :2]}, r"target has shape \(120, 2\); it must be \(n, 3\)"),
+        ({"target": LAP[:1]}, "two or more positions"),
         ({"target": "circle"}, "target is not an array of numbers"),
-        ({"target": np.where(np.arange(120)[:, None] == 7, np.nan, TURN)}, "not finite"),
+        ({"target": np.where(np.arange(120)[:, None] == 7, np.nan, LAP)}, "not finite"),
         ({"rate": 0.0}, "rate is 0.0 Hz; it must be a finite number, positive"),
         ({"approach": -1.0}, "approach is -1.0 s; it must be a finite number, zero or positive"),
         ({"limit": np.nan}, "limit is nan m"),
         ({"gain": "much"}, "gain is 'much'; it must be"),
         ({"rollouts": 0}, "rollouts is 0; it must be a whole number"),
-        ({"start": [0.001, 0.0]}, "give 4 changes of wire length"),
-        ({"start": [0.001, 0.0, 0.001, 0.0]}, "pull one wire as far as its opposite gives"),
+        ({"start": [0.001, 0.0]}, "give 4 changes of tendon length"),
+        ({"start": [0.001, 0.0, 0.001, 0.0]}, "pull one tendon as far as its opposite gives"),
         ({"start": [-0.01, 0.0, 0.01, 0.0], "limit": 0.005}, "within the limits"),
         (
             {"rate_limit": 1e-3},
-            r"wire \d would move at 0.0\d+ m/s at .* s, beyond rate_limit 0.001 m/s; "
+            r"tendon \d would move at 0.0\d+ m/s at .* s, beyond rate_limit 0.001 m/s; "
             r"give a slower path",
         ),
     ],
 )
 def test_what_cannot_be_planned_is_said(options: dict[str, Any], sentence: str) -> None:
-    given: dict[str, Any] = {"target": TURN, "rate": RATE, **options}
+    given: dict[str, Any] = {"target": LAP, "rate": RATE, **options}
     with pytest.raises(InputError, match=sentence):
         plan(PROTOTYPE, given.pop("target"), given.pop("rate"), **given)
 
@@ -235,4 +235,4 @@ def test_a_robot_without_displacements_is_refused() -> None:
         PROTOTYPE, segments=tuple(replace(segment, mode="tendon_tension") for segment in PROTOTYPE.segments)
     )
     with pytest.raises(RobotError, match="an action needs wires driven by length"):
-        plan(pulled, TURN, RATE)
+        plan(pulled, LAP, RATE)

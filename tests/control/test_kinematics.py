@@ -16,27 +16,27 @@ from fastrod.control import FixedBase, MovingBase, ResolvedRate, SoftTip
 from fastrod.errors import InputError, RobotError
 
 MOUNT = (0.01, -0.02, 0.03, np.cos(0.3), 0.0, np.sin(0.3), 0.0)
-TURNED = (0.3, 0.1, 0.5, 0.5, 0.5, -0.5, 0.5)
+ROTATED = (0.3, 0.1, 0.5, 0.5, 0.5, -0.5, 0.5)
 Q_ARM = [0.3, -1.2, 1.4, -0.9, -1.1, 0.4]
 ACTION = [0.012, 0.004, -0.003, 0.02, -0.002, 0.005]
 LOADS = {"tip_force": (0.05, -0.04, 0.06), "line_force": (0.1, 0.0, -0.1)}
 BASES: list[tuple[Any, list[float]]] = [
-    (FixedBase(TURNED), []),
-    (MovingBase(TURNED), [0.1, -0.2, 0.05]),
-    (MovingBase(TURNED, rotates=True), [0.1, -0.2, 0.05, 0.4, -0.8, 0.3]),
+    (FixedBase(ROTATED), []),
+    (MovingBase(ROTATED), [0.1, -0.2, 0.05]),
+    (MovingBase(ROTATED, rotates=True), [0.1, -0.2, 0.05, 0.4, -0.8, 0.3]),
     (DhArm(), Q_ARM),
 ]
 
 
 def two_segments(line_density: float = 0.15) -> Robot:
-    wires = tuple(Tendon(offset=0.0075, angle=k * np.pi / 2) for k in range(4))
+    tendons = tuple(Tendon(offset=0.0075, angle=k * np.pi / 2) for k in range(4))
     segment = Segment(
         length=0.1,
         bending_stiffness=(0.0022, 0.0022),
         torsional_stiffness=0.001,
         extension=(0.0, 0.03),
         line_density=line_density,
-        tendons=wires,
+        tendons=tendons,
     )
     return Robot(name="two", segments=(segment, segment))
 
@@ -61,7 +61,7 @@ def test_the_jacobian_is_that_of_the_settled_tip_under_weight_and_loads(
 
 
 @pytest.mark.parametrize(("base", "q_base"), BASES[2:], ids=["turning", "arm"])
-def test_without_loads_a_turn_of_the_base_carries_the_tip_rigidly(base: Any, q_base: list[float]) -> None:
+def test_without_loads_a_rotation_of_the_base_moves_the_tip_rigidly(base: Any, q_base: list[float]) -> None:
     tip = soft_tip(base, line_density=0.0)
     state = tip.place([*q_base, *ACTION], settle=True)
     J = tip.jacobian(rotation=True)[:, : len(q_base)]
@@ -72,7 +72,7 @@ def test_without_loads_a_turn_of_the_base_carries_the_tip_rigidly(base: Any, q_b
 
 
 def test_rows_of_rotation_are_those_of_the_settled_tip() -> None:
-    tip = soft_tip(MovingBase(TURNED, rotates=True))
+    tip = soft_tip(MovingBase(ROTATED, rotates=True))
     q = np.array([0.1, -0.2, 0.05, 0.4, -0.8, 0.3, *ACTION])
     tip.place(q, settle=True, tolerance=1e-12)
     J = tip.jacobian(rotation=True)
@@ -82,9 +82,17 @@ def test_rows_of_rotation_are_those_of_the_settled_tip() -> None:
             tip.place(q + sign * 1e-5 * np.eye(12)[j], settle=True, tolerance=1e-13).tip_rotation[0]
             for sign in (1.0, -1.0)
         ]
-        turn = ends[0] @ ends[1].T
+        rotation = ends[0] @ ends[1].T
         expected = (
-            0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2e-5
+            0.5
+            * np.array(
+                [
+                    rotation[2, 1] - rotation[1, 2],
+                    rotation[0, 2] - rotation[2, 0],
+                    rotation[1, 0] - rotation[0, 1],
+                ]
+            )
+            / 2e-5
         )
         assert_allclose(J[3:, j], expected, atol=1e-5 * np.abs(J[3:]).max())  # (1e-5 / 0.0075)^2 is 2e-6
 
@@ -111,9 +119,9 @@ def test_a_fixed_base_is_by_default_where_the_robot_says() -> None:
 
 
 def test_a_measured_base_is_used_in_the_place_of_its_frame() -> None:
-    tip, other = soft_tip(DhArm(), flange_from_base=MOUNT), soft_tip(FixedBase(TURNED))
+    tip, other = soft_tip(DhArm(), flange_from_base=MOUNT), soft_tip(FixedBase(ROTATED))
     q = np.array([*Q_ARM, *ACTION])
-    state = tip.place(q, base_pose=TURNED, settle=True, **LOADS)
+    state = tip.place(q, base_pose=ROTATED, settle=True, **LOADS)
     expected = other.place(ACTION, settle=True, **LOADS)
     assert_array_equal(state.tip_position, expected.tip_position)
     assert_allclose(tip.jacobian()[:, 6:], other.jacobian(), atol=1e-9)
@@ -121,7 +129,7 @@ def test_a_measured_base_is_used_in_the_place_of_its_frame() -> None:
 
 
 def test_finite_differences_leave_the_simulator_as_it_was() -> None:
-    tip, twin = (soft_tip(MovingBase(TURNED)) for _ in range(2))
+    tip, twin = (soft_tip(MovingBase(ROTATED)) for _ in range(2))
     q = np.array([0.0, 0.0, 0.0, *ACTION])
     for each in (tip, twin):
         each.place(q, settle=True)
@@ -275,7 +283,7 @@ def test_steps_that_extend_keep_up_with_the_rod() -> None:
         q[[0, 3]] += 5e-4
         state = tip.place(q)
         assert state.ok[0]
-        # a moment counts as its length; pulling at every wire loses the robot here
+        # a moment counts as its length; pulling at every tendon loses the robot here
         assert state.residual[0] < 3e-3
     stepped = tip.place(q).tip_position[0]
     assert_allclose(stepped, tip.place(q, settle=True).tip_position[0], atol=2e-5)

@@ -95,10 +95,10 @@ def test_no_limit_is_ever_left_and_the_direction_is_kept(size: float, with_postu
         assert (q + 0.05 * rates <= high + 1e-12).all()
         assert (q + 0.05 * rates >= low - 1e-12).all()
         done = J @ rates
-        share = done @ task / (task @ task)
-        assert_allclose(done, share * task, atol=1e-9 * max(size, 1.0))
-        assert -1e-12 <= share <= 1.0 + 1e-9
-        scaled, met = scaled + (share < 1.0 - 1e-9), met + (share > 1.0 - 1e-9)
+        fraction = done @ task / (task @ task)
+        assert_allclose(done, fraction * task, atol=1e-9 * max(size, 1.0))
+        assert -1e-12 <= fraction <= 1.0 + 1e-9
+        scaled, met = scaled + (fraction < 1.0 - 1e-9), met + (fraction > 1.0 - 1e-9)
     assert met > 150 if size < 1.0 else scaled > 0  # both are really tested
     assert scaled > 150 if size > 10.0 else met > 0
 
@@ -113,7 +113,7 @@ def test_the_others_take_over_from_a_coordinate_at_its_limit() -> None:
     assert_allclose(control.rates([0.0, 0.0, 0.0], J, [0.0], [7.0], 0.01), [0.0, 1.0, 1.0], atol=1e-12)
 
 
-def test_the_share_is_the_largest_that_can_be_had() -> None:
+def test_the_fraction_is_the_largest_possible() -> None:
     from scipy.optimize import linprog
 
     short = 0
@@ -127,9 +127,9 @@ def test_the_share_is_the_largest_that_can_be_had() -> None:
             b_eq=[0.0, 0.0],
             bounds=[(-1.0, 1.0)] * 5 + [(0.0, 1.0)],
         )
-        share = J @ rates @ task / (task @ task)
-        assert share <= -best.fun + 1e-9
-        short += share < -0.9 * best.fun
+        fraction = J @ rates @ task / (task @ task)
+        assert fraction <= -best.fun + 1e-9
+        short += fraction < -0.9 * best.fun
     assert short <= 4  # one coordinate after another is no linear program, but near it
 
 

@@ -40,12 +40,12 @@ def test_a_path_in_the_plane_is_closed(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "pitch", "turn"), [("helix", 0.1, "circle"), ("square_helix", 0.02, "square")]
+    ("name", "pitch", "lap"), [("helix", 0.1, "circle"), ("square_helix", 0.02, "square")]
 )
-def test_a_helix_is_its_turn_that_sinks_by_the_pitch(name: str, pitch: float, turn: str) -> None:
+def test_a_helix_is_its_lap_that_sinks_by_the_pitch(name: str, pitch: float, lap: str) -> None:
     t = np.linspace(-7.0, 45.0, 60)
-    size = {"radius": 0.2} if turn == "circle" else {"side": 0.2}
-    path, flat = trajectory(name, center=CENTER), trajectory(turn, center=CENTER, **size)
+    size = {"radius": 0.2} if lap == "circle" else {"side": 0.2}
+    path, flat = trajectory(name, center=CENTER), trajectory(lap, center=CENTER, **size)
     assert_array_equal(path.position(t)[:, :2], flat.position(t)[:, :2])
     assert_allclose(
         path.position(t + 20.0) - path.position(t), np.broadcast_to([0.0, 0.0, -pitch], (60, 3)), atol=1e-12

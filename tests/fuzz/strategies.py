@@ -113,7 +113,7 @@ def is_sentence(error: BaseException) -> bool:
     )
 
 
-def told(error: BaseException, *names: str) -> None:
+def one_sentence(error: BaseException, *names: str) -> None:
     """Assert that an error is one sentence, in which these names stand."""
     assert is_sentence(error), repr(str(error))
     assert all(name in str(error) for name in names), repr(str(error))
@@ -164,7 +164,7 @@ def good_tables(draw: st.DrawFn) -> dict[str, Any]:
                 "mode": mode,
             }
             if mode != "passive":
-                wire = st.fixed_dictionaries(
+                tendon = st.fixed_dictionaries(
                     {"offset": st.floats(0.002, 0.02), "angle": st.floats(0.0, 6.28)},
                     optional={
                         "compliance": st.floats(0.0, 1e-3),
@@ -172,7 +172,7 @@ def good_tables(draw: st.DrawFn) -> dict[str, Any]:
                         "unilateral": st.booleans(),
                     },
                 )
-                segment["tendons"] = draw(st.lists(wire, min_size=1, max_size=4))
+                segment["tendons"] = draw(st.lists(tendon, min_size=1, max_size=4))
             table["segment"].append(segment)
     for name in draw(st.lists(st.sampled_from(sorted(SECTIONS)), unique=True, max_size=3)):
         table[name] = copy.deepcopy(SECTIONS[name])

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fuzz.strategies import SLOW, odd_values, told, tried
+from fuzz.strategies import SLOW, odd_values, one_sentence, tried
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
@@ -170,7 +170,7 @@ def tried_call(sim: Simulator, call: str, given: dict[str, Any]) -> State | None
     try:
         state = sim.step(**given) if call == "step" else sim.settle(**given)
     except FastrodError as error:
-        told(error)
+        one_sentence(error)
         return None
     well(state)
     return state
@@ -271,7 +271,7 @@ def test_odd_rows_and_arclengths_are_refused_and_change_nothing(rows: Any, what:
             case "inverse":
                 sim.replace([0], rows)
     except FastrodError as error:
-        told(error)
+        one_sentence(error)
         for seed in (1, 2):
             assert differing(sim.step(**good(sim, seed)), twin.step(**good(twin, seed))) == []
 
@@ -299,7 +299,7 @@ def test_an_odd_simulator_is_one_or_a_sentence(name: str, value: Any) -> None:
     try:
         sim = Simulator(**{"robot": robot(), name: value})
     except FastrodError as error:
-        told(error)
+        one_sentence(error)
     else:
         assert sim.settle(sim.robots[0].rest_tendon_length).ok.all()
 
@@ -378,7 +378,7 @@ def test_a_session_with_bad_input_is_the_session_without(tmp_path: Any) -> None:
 
 
 @pytest.mark.parametrize("what", ["state", "shape", "jacobian", "compliance", "measure"])
-def test_nothing_is_told_before_the_first_step(what: str) -> None:
+def test_nothing_is_reported_before_the_first_step(what: str) -> None:
     sim = simulator()
     with pytest.raises(FastrodError, match="needs a state; call step or settle first"):
         getattr(sim, what) if what == "state" else getattr(sim, what)(*([0.01] if what == "shape" else []))

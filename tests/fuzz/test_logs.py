@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fuzz.strategies import broken_texts, odd_numbers, odd_words, told, tried
+from fuzz.strategies import broken_texts, odd_numbers, odd_words, one_sentence, tried
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
@@ -180,7 +180,7 @@ def read(path: Path) -> RunLog | None:
     try:
         return read_log(path, ROBOT)
     except FastrodError as error:
-        told(error, path.name)
+        one_sentence(error, path.name)
         return None
 
 
@@ -334,30 +334,30 @@ HEADER = ",".join(
     ]
 )
 ROWS = [f"{0.02 * k!r},free,0,0,0,0,0.0,{1e-3 * k!r},0.07,1,0,0,0,0,0,0,0.0,,,," for k in range(4)]
-PART = "\n".join(["# Recorded on robot prototype.", HEADER, *ROWS, ""])
+PARTIAL = "\n".join(["# Recorded on robot prototype.", HEADER, *ROWS, ""])
 
 
 @tried(100)
 @given(data=st.data())
-def test_a_torn_part_is_recovered_or_kept(folder: Path, data: st.DataObject) -> None:
+def test_a_torn_partial_file_is_recovered_or_kept(folder: Path, data: st.DataObject) -> None:
     """What a killed session left, cut and broken: whole rows come back as they were; where nothing comes
     back, nothing is taken away."""
-    at = data.draw(st.integers(0, len(PART)))
-    raw = data.draw(st.just(PART[:at].encode()) | broken_texts(PART))
-    target, part = folder / "torn.csv", folder / "torn.csv.part"
+    at = data.draw(st.integers(0, len(PARTIAL)))
+    raw = data.draw(st.just(PARTIAL[:at].encode()) | broken_texts(PARTIAL))
+    target, partial = folder / "torn.csv", folder / "torn.csv.part"
     target.unlink(missing_ok=True)
-    part.write_bytes(raw)
+    partial.write_bytes(raw)
     try:
-        log = recover(part)
+        log = recover(partial)
     except FastrodError as error:
-        told(error, part.name)
-        assert part.exists()
+        one_sentence(error, partial.name)
+        assert partial.exists()
         assert not target.exists()
     else:
-        assert not part.exists()
+        assert not partial.exists()
         assert len(log) > 0
-        if raw == PART[:at].encode():
-            assert_array_equal(log.t, [0.02 * k for k in range(PART[:at].count("\n") - 2)])
+        if raw == PARTIAL[:at].encode():
+            assert_array_equal(log.t, [0.02 * k for k in range(PARTIAL[:at].count("\n") - 2)])
             same(log, read_log(target, ROBOT))
     assert (
         [file.name for file in folder.glob("torn*")] == ["torn.csv"] if target.exists() else ["torn.csv.part"]

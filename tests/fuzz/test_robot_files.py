@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fuzz.strategies import broken_texts, good_tables, mutated_tables, told, tried, written
+from fuzz.strategies import broken_texts, good_tables, mutated_tables, one_sentence, tried, written
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -21,7 +21,7 @@ def loaded(path: Path) -> Robot | None:
     try:
         return load_robot(path)
     except FastrodError as error:
-        told(error, path.name)
+        one_sentence(error, path.name)
         return None
 
 
@@ -37,7 +37,7 @@ def simulated(robot: Robot, path: Path) -> None:
         states = [sim.settle(**inputs), sim.step(**inputs)]
         measured = sim.measure()
     except FastrodError as error:
-        told(error)
+        one_sentence(error)
         return
     for state in states:
         for name in (

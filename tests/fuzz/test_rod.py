@@ -6,7 +6,7 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from fuzz.strategies import odd_values, told, tried
+from fuzz.strategies import odd_values, one_sentence, tried
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
@@ -54,7 +54,7 @@ def test_call_that_is_refused_changes_nothing(n_robots, inputs, base, twist, ste
             state = body.settle(base, **inputs) if settles else body.advance(base, twist, step, **inputs)
     except FastrodError as error:
         refused = True
-        told(error)
+        one_sentence(error)
     if refused:
         assert body.time == then.time
         assert body.state is then.state

@@ -49,12 +49,12 @@ def test_an_episode_is_played_again_from_its_seed(policy: str) -> None:
         observation, _ = env.reset(seed=int(table["seed"][rows[0]]))
         for row in rows[:-1]:
             np.testing.assert_array_equal(observed[row], observation[0])
-            observation, reward, terminated, truncated, told = env.step(acted[row : row + 1])
+            observation, reward, terminated, truncated, info = env.step(acted[row : row + 1])
             assert table["reward"][row] == reward[0]
-            assert table["distance"][row] == told["distance"][0]
+            assert table["distance"][row] == info["distance"][0]
             assert (table["terminated"][row], table["truncated"][row]) == (terminated[0], truncated[0])
         assert table["terminated"][rows[-2]] or table["truncated"][rows[-2]]
-        np.testing.assert_array_equal(observed[rows[-1]], told["final_obs"][0])
+        np.testing.assert_array_equal(observed[rows[-1]], info["final_obs"][0])
         assert np.isnan(acted[rows[-1]]).all()
         assert np.isnan(table["reward"][rows[-1]])
         env.close()
@@ -106,14 +106,14 @@ def test_a_robots_own_motion_keeps_its_limits() -> None:
     np.testing.assert_allclose(table["t"], 0.05 * table["step"])
 
 
-def test_the_measured_tip_is_that_of_the_effects_that_are_told() -> None:
+def test_the_measured_tip_is_that_of_the_stated_effects() -> None:
     plain = fastrod.load_robot("prototype")
     table = made(Trajectories(robot=dumps(plain), effects=("backlash", "gravity"), steps=40), 3)
     for episode in range(3):
         rows = table["episode"] == episode
-        told = {name: float(table[name][rows][0]) for name in table if "." in name}
+        info = {name: float(table[name][rows][0]) for name in table if "." in name}
         effects: dict[str, dict[str, Any]] = {}
-        for name, value in told.items():
+        for name, value in info.items():
             effects.setdefault(name.partition(".")[0], {})[name.partition(".")[2]] = value
         robot = fastrod.Robot(
             name="one", segments=plain.segments, effects=tuple({"name": n, **v} for n, v in effects.items())
@@ -129,14 +129,14 @@ def test_values_of_effects_are_of_their_typical_size() -> None:
     robot = fastrod.load_robot("prototype")
     rng = np.random.default_rng(5)
     drawn = [with_effects(robot, ["backlash", "frame_misalignment"], rng) for _ in range(50)]
-    for made_robot, told in drawn:
+    for made_robot, info in drawn:
         assert [table["name"] for table in made_robot.effects] == ["backlash", "frame_misalignment"]
-        for name, value in told.items():
+        for name, value in info.items():
             effect, _, key = name.partition(".")
             parameter = next(p.on(wire(robot)) for p in get_effect(effect).parameters if p.name == key)
             assert parameter.bounds[0] <= value <= parameter.bounds[1]
             assert 0.49 * parameter.scale <= abs(value) <= 1.51 * parameter.scale
-    assert len({told["backlash.half_width"] for _, told in drawn}) == 50
+    assert len({info["backlash.half_width"] for _, info in drawn}) == 50
     ball = np.linalg.norm(in_ball(rng, 20000, 3), axis=1)
     assert np.mean(ball**3) == pytest.approx(0.5, abs=0.01)
 
@@ -152,7 +152,7 @@ def test_a_sweep_names_what_it_sealed() -> None:
     assert table["floor"][0] == pytest.approx(3e-4 * np.sqrt(3.0), rel=0.3)
 
 
-def test_effects_take_turns_and_a_log_that_tells_nothing_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_effects_alternate_and_a_log_without_a_verdict_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     def nothing(*_: Any, **__: Any) -> None:
         raise InputError("the log tells nothing.")
 
@@ -198,15 +198,15 @@ def test_a_robot_file_named_by_an_option_is_in_the_plan(tmp_path: Path) -> None:
     assert read_plan(out) == plan
 
 
-def test_all_ways_to_say_a_robot_make_one_plan(tmp_path: Path) -> None:
+def test_all_forms_of_a_robot_make_one_plan(tmp_path: Path) -> None:
     mine = tmp_path / "mine.toml"
     robot = fastrod.load_robot("five_segment_reacher")
     mine.write_text(dumps(robot))
-    ways: list[Any] = [str(mine), mine, robot, dumps(robot)]
-    plans = [Plan(work=Rollouts(env="Reach", options=(("randomise", way),)), count=1) for way in ways]
+    forms: list[Any] = [str(mine), mine, robot, dumps(robot)]
+    plans = [Plan(work=Rollouts(env="Reach", options=(("randomise", form),)), count=1) for form in forms]
     assert len({plan.hash for plan in plans}) == 1
-    ways = [{"robot": way, "spread": 0.1, "bending_stiffness": (0.9, 1.1)} for way in ways]
-    plans = [Plan(work=Rollouts(env="Reach", options=(("randomise", way),)), count=1) for way in ways]
+    forms = [{"robot": form, "spread": 0.1, "bending_stiffness": (0.9, 1.1)} for form in forms]
+    plans = [Plan(work=Rollouts(env="Reach", options=(("randomise", form),)), count=1) for form in forms]
     assert len({plan.hash for plan in plans}) == 1
     whole = Randomisation(robot=robot, spread=0.1, parameters={"bending_stiffness": (0.9, 1.1)})
     assert Rollouts(env="Reach", options=(("randomise", whole),))._given()["randomise"]["robot"] == robot

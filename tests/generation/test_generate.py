@@ -38,7 +38,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_what_is_made_is_told_and_read_back(whole: Path) -> None:
+def test_what_is_made_is_reported_and_read_back(whole: Path) -> None:
     again = generate(small(), whole, workers=1)
     assert (again.count, again.rows, again.failed, again.shards, again.made, again.rate) == (
         600,
@@ -51,9 +51,9 @@ def test_what_is_made_is_told_and_read_back(whole: Path) -> None:
     assert rows_of(whole) == list(range(600))
     assert read_plan(whole) == small()
     table = parquet.read_table(whole / "shards")
-    told = {field.name: field.metadata for field in table.schema}
-    assert told["tip_x"] == {b"unit": b"m", b"about": b"tip, base frame"}
-    assert all(set(metadata) == {b"unit", b"about"} for metadata in told.values())
+    metadata = {field.name: field.metadata for field in table.schema}
+    assert metadata["tip_x"] == {b"unit": b"m", b"about": b"tip, base frame"}
+    assert all(set(entry) == {b"unit", b"about"} for entry in metadata.values())
     first = parquet.read_metadata(whole / "shards" / "shapes-000000.parquet").metadata
     assert first is not None
     assert first[b"fastrod_plan"].decode() == small().hash
@@ -196,7 +196,7 @@ def test_a_folder_of_another_plan_is_refused(whole: Path, plan: Callable[[], Pla
     assert bits(whole) == before
 
 
-def test_a_plan_without_shards_gives_way(tmp_path: Path) -> None:
+def test_a_plan_without_shards_is_replaced(tmp_path: Path) -> None:
     generate(small(count=50), tmp_path, workers=1)
     (tmp_path / "shards" / "shapes-000000.parquet").unlink()
     assert generate(small(count=40, seed=8), tmp_path, workers=1).rows == 40
@@ -412,7 +412,7 @@ def test_a_run_that_makes_nothing_leaves_the_folder_as_it_was(
         ),
         (
             ("--foo",),
-            "fastrod generate shapes does not know '--foo'; `fastrod generate shapes --help` tells.\n",
+            "fastrod generate shapes does not know '--foo'; `fastrod generate shapes --help` lists them.\n",
         ),
         (("--count", "0"), "count is 0; it must be a whole number at least 1 and at most 1e+12.\n"),
         (("--seed", "-1"), "seed is -1; it must be a whole number at least 0 and at most 9.22337e+18.\n"),

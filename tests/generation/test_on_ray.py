@@ -85,24 +85,24 @@ def test_a_machine_that_does_not_see_the_folder_is_named(
 
     elsewhere = str(tmp_path / "elsewhere")
 
-    def touch(path: str) -> str:
+    def write_probe(path: str) -> str:
         return "" if elsewhere else path
 
-    monkeypatch.setattr(on_ray, "_touch", touch)
+    monkeypatch.setattr(on_ray, "_write_probe", write_probe)
     with pytest.raises(
         InputError,
         match=r"machine .* does not see folder .*shards'; give --out a folder "
-        r"that all machines share\.",
+        r"that all machines see\.",
     ):
         generate(small(), tmp_path, ray="auto")
     assert bits(tmp_path) == {}
 
 
 def test_a_folder_that_a_machine_cannot_write_is_named(tmp_path: Path) -> None:
-    from fastrod.generation.on_ray import _touch
+    from fastrod.generation.on_ray import _write_probe
 
-    assert _touch(str(tmp_path / "probe")) == ""
-    assert _touch(str(tmp_path / "missing" / "probe")) == "No such file or directory"
+    assert _write_probe(str(tmp_path / "probe")) == ""
+    assert _write_probe(str(tmp_path / "missing" / "probe")) == "No such file or directory"
     assert stat.S_ISREG((tmp_path / "probe").stat().st_mode)
 
 

@@ -13,7 +13,7 @@ import fastrod
 from fastrod.errors import InputError, RobotError
 from fastrod.generation import Plan, Shapes
 from fastrod.generation.settling import ChainSolver
-from fastrod.generation.shapes import LONGEST_CHAIN, STRIDE, Draw
+from fastrod.generation.shapes import LONGEST_CHAIN, STEP_ANGLE, Draw
 from fastrod.generation.tasks import columns_of
 from fastrod.model.robot import Robot
 from fastrod.model.robotfile import dumps
@@ -39,7 +39,7 @@ def group(table: dict[str, np.ndarray], *names: str) -> np.ndarray:
     return np.stack([table[name] for name in names], axis=1).astype(float)
 
 
-def wires(table: dict[str, np.ndarray], robot: Robot) -> dict[str, np.ndarray]:
+def inputs(table: dict[str, np.ndarray], robot: Robot) -> dict[str, np.ndarray]:
     """Inputs of `Simulator.settle`."""
     dl = group(table, *(f"dl_{k + 1}" for k in range(robot.n_tendons)))
     return {
@@ -54,7 +54,7 @@ def test_a_row_is_what_a_cold_simulator_finds(name: str) -> None:
     robot = heavy(name)
     table = made(robot, 320, tolerance=1e-6)
     sim = fastrod.Simulator(robot, 320, points_per_segment=6)
-    state = sim.settle(**wires(table, robot), tolerance=1e-10)
+    state = sim.settle(**inputs(table, robot), tolerance=1e-10)
     assert table["ok"].all()
     assert state.ok.all()
     assert (table["residual"] <= 1e-6).all()
@@ -70,7 +70,7 @@ def test_six_steps_a_segment_are_within_the_tolerance_of_sixty() -> None:
     robot = heavy()
     table = made(robot, 128)
     state = fastrod.Simulator(robot, 128, points_per_segment=60, outputs="tip").settle(
-        **wires(table, robot), tolerance=1e-10
+        **inputs(table, robot), tolerance=1e-10
     )
     error = np.linalg.norm(group(table, "tip_x", "tip_y", "tip_z") - state.tip_position, axis=1)
     assert np.median(error) < 1e-6
@@ -91,10 +91,10 @@ def test_the_base_bears_tip_force_and_weight() -> None:
 def test_the_last_point_is_the_tip_and_frames_are_the_bases() -> None:
     plain = heavy("prototype")
     # about gravity
-    turned = replace(
+    rotated = replace(
         plain, base_position=(0.3, -0.2, 0.1), base_quaternion=(np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
     )
-    one, other = (made(robot, 64, points=3) for robot in (plain, turned))
+    one, other = (made(robot, 64, points=3) for robot in (plain, rotated))
     np.testing.assert_allclose(
         group(one, "p3_x", "p3_y", "p3_z"), group(one, "tip_x", "tip_y", "tip_z"), atol=1e-8
     )
@@ -124,13 +124,13 @@ def test_every_step_of_a_chain_is_drawn_evenly(step: int) -> None:
     assert np.abs(correlation).max() < 5.0 / np.sqrt(5000)
 
 
-def test_neighbours_are_near_and_chains_are_told() -> None:
+def test_neighbours_are_near_and_chains_are_numbered() -> None:
     robot = fastrod.load_robot("prototype")
     work = Shapes(robot=dumps(robot))
     draw = Draw(work, robot, 50, np.random.default_rng(2))
     one, other = (wire(robot).bend(draw.at(step).dl) for step in (7, 8))
-    assert np.linalg.norm(one - other, axis=-1).max() <= 2.0 * np.sin(0.5 * STRIDE) + 1e-12
-    assert 2.0 * np.pi > LONGEST_CHAIN * STRIDE
+    assert np.linalg.norm(one - other, axis=-1).max() <= 2.0 * np.sin(0.5 * STEP_ANGLE) + 1e-12
+    assert 2.0 * np.pi > LONGEST_CHAIN * STEP_ANGLE
     chains = [made(robot, 128, shard)["chain"] for shard in (0, 1)]
     assert all(np.unique(chain, return_counts=True)[1].tolist() == [64, 64] for chain in chains)
     assert not set(chains[0]) & set(chains[1])
@@ -158,7 +158,7 @@ def test_a_shard_is_a_pure_function_of_plan_and_number() -> None:
 def test_rows_of_their_own_are_settled_cold() -> None:
     robot = heavy("prototype")
     table = made(robot, 40, chain=1)
-    state = fastrod.Simulator(robot, 40, points_per_segment=6).settle(**wires(table, robot), tolerance=1e-6)
+    state = fastrod.Simulator(robot, 40, points_per_segment=6).settle(**inputs(table, robot), tolerance=1e-6)
     assert len(set(table["chain"])) == 40
     np.testing.assert_allclose(
         group(table, "tip_x", "tip_y", "tip_z"), state.tip_position, rtol=0.0, atol=5e-6
@@ -200,7 +200,10 @@ def test_chains_that_loads_tear_apart_are_settled_all_the_same() -> None:
         ({"tolerance": 1.0}, "tolerance is 1.0 m; it must be a number at least 1e-12 and at most 0.01."),
         ({"chain": 101}, "chain is 101; it must be a whole number at least 1 and at most 100."),
         ({"chain": 2.5}, "chain is 2.5; it must be a whole number at least 1 and at most 100."),
-        ({"points": 4}, "points is 4; the rod has 30 steps, of which they must be an even part, such as 3."),
+        (
+            {"points": 4},
+            "points is 4; the rod has 30 steps, of which they must be an even fraction, such as 3.",
+        ),
         ({"force": float("inf")}, "force is inf N; it must be a number at least 0 and finite."),
     ],
 )

@@ -13,7 +13,7 @@ from rods import rod
 
 from fastrod.identification.excite import excitation
 from fastrod.identification.log.forward import LogSamples, sample
-from fastrod.identification.search.residual_test import ResidualStructure, audit
+from fastrod.identification.search.residual_test import ResidualStructure, residual_structure
 from fastrod.model.routing import wire
 
 RATE, SIZE = 8.0, 0.9
@@ -40,13 +40,13 @@ def bends() -> np.ndarray:
 
 
 def run(residual: np.ndarray, lag1: float = 0.0) -> ResidualStructure:
-    return audit(samples(), wire(one_segment()), residual, lag1)
+    return residual_structure(samples(), wire(one_segment()), residual, lag1)
 
 
-def planted(pattern: np.ndarray, share: float, seed: int) -> np.ndarray:
+def planted(pattern: np.ndarray, fraction: float, seed: int) -> np.ndarray:
     """White noise with a pattern (N, 3) that carries this share of the variance."""
     pattern = pattern - pattern.mean(0)
-    return noise(seed) + pattern * np.sqrt(share / (1.0 - share) * 3.0 / (pattern**2).sum(1).mean())
+    return noise(seed) + pattern * np.sqrt(fraction / (1.0 - fraction) * 3.0 / (pattern**2).sum(1).mean())
 
 
 def patterns() -> dict[str, np.ndarray]:
@@ -74,12 +74,12 @@ def test_white_noise_has_no_structure(seed: int) -> None:
 
 @pytest.mark.parametrize("kind", ["static", "memory", "drift"])
 def test_what_is_planted_comes_out_as_its_kind(kind: str) -> None:
-    for seed, share in ((0, 0.1), (1, 0.5)):
-        found = run(planted(patterns()[kind], share, seed))
+    for seed, fraction in ((0, 0.1), (1, 0.5)):
+        found = run(planted(patterns()[kind], fraction, seed))
         assert found.kind == kind
         # held-out features find most of it, and no more than the noise lets it look (0.05)
-        assert 0.6 * share < getattr(found, kind) < share + 0.05
-        assert found.structured < share + 0.08
+        assert 0.6 * fraction < getattr(found, kind) < fraction + 0.05
+        assert found.structured < fraction + 0.08
         assert found.z > 3.0
 
 
@@ -121,7 +121,10 @@ def test_shares_are_of_the_variance() -> None:
 def test_only_some_rows_and_a_robot_without_wires() -> None:
     few = samples().on(np.arange(0, N, 3))
     residual = planted(patterns()["static"], 0.5, 2)[::3]
-    assert audit(few, wire(one_segment()), residual).kind == "static"
+    assert residual_structure(few, wire(one_segment()), residual).kind == "static"
     passive = sample(log_of(rod("passive"), np.zeros((N, 0)), DT))
-    assert audit(passive, wire(rod("passive")), noise(1)).kind == "none"
-    assert audit(passive, wire(rod("passive")), planted(patterns()["drift"], 0.5, 1)).kind == "drift"
+    assert residual_structure(passive, wire(rod("passive")), noise(1)).kind == "none"
+    assert (
+        residual_structure(passive, wire(rod("passive")), planted(patterns()["drift"], 0.5, 1)).kind
+        == "drift"
+    )

@@ -39,16 +39,16 @@ def rows(run: Excitation, start: float, end: float) -> slice:
 @ROBOTS
 def test_parts_cover_the_time_exactly(robot: Robot) -> None:
     run = made(robot)
-    assert run.parts[0].start == 0.0
-    for one, other in zip(run.parts, run.parts[1:], strict=False):
+    assert run.phases[0].start == 0.0
+    for one, other in zip(run.phases, run.phases[1:], strict=False):
         assert_allclose(one.end, other.start, rtol=1e-12)
         assert_allclose(one.end * RATE, round(one.end * RATE), rtol=1e-12)  # whole samples
         assert one.end > one.start
-    assert_allclose(run.parts[-1].end * RATE, len(run.log), rtol=1e-12)
+    assert_allclose(run.phases[-1].end * RATE, len(run.log), rtol=1e-12)
     assert_allclose(run.log.t, np.arange(len(run.log)) / RATE, rtol=1e-15)
-    assert all(part.purpose and part.name for part in run.parts)
-    for part in run.parts:
-        assert f"{part.name}: {part.purpose}" in run.comment
+    assert all(phase.purpose and phase.name for phase in run.phases)
+    for phase in run.phases:
+        assert f"{phase.name}: {phase.purpose}" in run.comment
 
 
 @ROBOTS
@@ -66,11 +66,11 @@ def test_every_wire_stays_within_the_largest_bend(robot: Robot) -> None:
 @ROBOTS
 def test_it_rests_where_it_says(robot: Robot) -> None:
     run = made(robot)
-    rests = [part for part in run.parts if part.name == "rest"]
+    rests = [phase for phase in run.phases if phase.name == "rest"]
     assert len(rests) == 2
-    for part in rests:
-        assert_allclose(part.end - part.start, REST, atol=1.0 / RATE)
-        assert (run.log.dl[rows(run, part.start, part.end)] == 0.0).all()
+    for phase in rests:
+        assert_allclose(phase.end - phase.start, REST, atol=1.0 / RATE)
+        assert (run.log.dl[rows(run, phase.start, phase.end)] == 0.0).all()
     assert rests[0].start == 0.0
 
 
@@ -95,10 +95,10 @@ def test_base_orientations_are_a_b_b_a_with_the_load_off_and_on(
     assert base is not None
     assert payload is not None
     for number, turned, load in ((1, False, 0.0), (2, True, 0.03), (3, True, 0.0), (4, False, 0.03)):
-        parts = [part for part in run.parts if part.name.startswith(f"block {number}")]
-        assert f"base {'B' if turned else 'A'}" in parts[0].name
-        assert ("load on" in parts[0].name) == (load > 0.0)
-        block = rows(run, parts[0].start, parts[-1].end)
+        phases = [phase for phase in run.phases if phase.name.startswith(f"block {number}")]
+        assert f"base {'B' if turned else 'A'}" in phases[0].name
+        assert ("load on" in phases[0].name) == (load > 0.0)
+        block = rows(run, phases[0].start, phases[-1].end)
         assert_array_equal(payload[block], load)
         assert (base[block] == base[block][0]).all()
         turn = Rotation.from_quat(base[block][0], scalar_first=True)
@@ -110,7 +110,7 @@ def test_base_orientations_are_a_b_b_a_with_the_load_off_and_on(
         moved = np.linalg.norm(turn.inv().apply(down) - own.inv().apply(down))
         assert (moved > 0.5) == turned
     outside = np.ones(len(run.log), bool)
-    blocks = [part for part in run.parts if part.name.startswith("block")]
+    blocks = [phase for phase in run.phases if phase.name.startswith("block")]
     outside[rows(run, blocks[0].start, blocks[-1].end)] = False
     assert (payload[outside] == 0.0).all()
     assert (base[outside] == base[0]).all()
@@ -136,13 +136,13 @@ def test_nothing_jumps(robot: Robot, speed: float) -> None:
     run = made(robot, speed=speed)
     rate = np.linalg.norm(np.diff(bends(robot, run), axis=0), axis=-1) * RATE
     assert rate.max() <= max(3.0 * speed, 0.6 * BEND * np.sqrt(8.0) * 2.0 * np.pi * np.sqrt(2.0)) * 1.001
-    for part in run.parts:
-        if "triangles" in part.name:
-            inside = rate[rows(run, part.start, part.end - 1.0 / RATE)]
+    for phase in run.phases:
+        if "triangles" in phase.name:
+            inside = rate[rows(run, phase.start, phase.end - 1.0 / RATE)]
             assert inside.max() <= speed * 1.001
             assert inside.max() > 0.8 * speed
-        if "step and hold" in part.name:
-            assert rate[rows(run, part.start, part.end - 1.0 / RATE)].max() <= 3.0 * speed * 1.001
+        if "step and hold" in phase.name:
+            assert rate[rows(run, phase.start, phase.end - 1.0 / RATE)].max() <= 3.0 * speed * 1.001
     assert_allclose(bends(robot, run)[[0, -1]], 0.0, atol=1e-6)
 
 
@@ -152,7 +152,7 @@ def test_each_block_has_triangles_of_each_segment_a_circle_holds_and_noise() -> 
     found = bends(robot, run)
     for number in range(1, 5):
         names = [
-            part.name.partition(": ")[2] for part in run.parts if part.name.startswith(f"block {number}")
+            phase.name.partition(": ")[2] for phase in run.phases if phase.name.startswith(f"block {number}")
         ]
         circle = "slow circle" if number % 2 else "fast circle"
         holds = [f"step and hold {k}" for k in (1, 2, 3)]
@@ -164,22 +164,22 @@ def test_each_block_has_triangles_of_each_segment_a_circle_holds_and_noise() -> 
             *holds,
             "random",
         ]
-    for part in run.parts:
-        here = found[rows(run, part.start, part.end)]
-        if "alone" in part.name:
-            other = 1 if "segment 1" in part.name else 0
+    for phase in run.phases:
+        here = found[rows(run, phase.start, phase.end)]
+        if "alone" in phase.name:
+            other = 1 if "segment 1" in phase.name else 0
             assert_allclose(here[:, other], 0.0, atol=1e-6)
-            turns = here[:, 1 - other] @ (
+            circles = here[:, 1 - other] @ (
                 here[:, 1 - other][np.argmax(np.linalg.norm(here[:, 1 - other], axis=1))] / BEND
             )
-            top = turns[1:-1][(np.diff(turns)[:-1] * np.diff(turns)[1:]) < 0.0]
+            top = circles[1:-1][(np.diff(circles)[:-1] * np.diff(circles)[1:]) < 0.0]
             # decreasing, each to both sides
             assert_allclose(np.abs(top), BEND * np.repeat([1.0, 0.6, 0.28], 2), rtol=1e-5)
-        if "hold" in part.name:
+        if "hold" in phase.name:
             still = (np.linalg.norm(np.diff(here, axis=0), axis=(1, 2)) == 0.0).sum() / RATE
             assert still >= 3.9  # of four seconds
-    repeat = next(part for part in run.parts if part.name == "repeat")
-    first = next(part for part in run.parts if "block 1" in part.name and "triangles" in part.name)
+    repeat = next(phase for phase in run.phases if phase.name == "repeat")
+    first = next(phase for phase in run.phases if "block 1" in phase.name and "triangles" in phase.name)
     n = round((repeat.end - repeat.start) * RATE)
     begin = round(first.start * RATE)
     assert_array_equal(run.log.dl[rows(run, repeat.start, repeat.end)], run.log.dl[begin : begin + n])
@@ -190,7 +190,7 @@ def test_a_run_without_load_and_one_by_default() -> None:
     none = made(one_segment(), payload=0.0)
     assert none.log.payload is not None
     assert (none.log.payload == 0.0).all()
-    assert not any("load on" in part.name for part in none.parts)
+    assert not any("load on" in phase.name for phase in none.phases)
     robot = two_segments()
     usual = excitation(robot).log.payload
     assert usual is not None
@@ -201,9 +201,9 @@ def test_a_run_without_load_and_one_by_default() -> None:
 def test_the_seed_changes_only_what_is_random() -> None:
     one, again, other = (excitation(one_segment(), seed=seed) for seed in (1, 1, 2))
     assert_array_equal(one.log.dl, again.log.dl)
-    for part in one.parts:
-        here = rows(one, part.start, part.end)
-        assert ("random" in part.name) == (not np.array_equal(one.log.dl[here], other.log.dl[here]))
+    for phase in one.phases:
+        here = rows(one, phase.start, phase.end)
+        assert ("random" in phase.name) == (not np.array_equal(one.log.dl[here], other.log.dl[here]))
 
 
 def test_it_is_written_and_read_as_a_run_log(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from truth import plant
 from fastrod.identification.excite import excitation
 from fastrod.identification.log.forward import PredictedRod, sample
 from fastrod.identification.log.unknowns import base_model
-from fastrod.identification.search.alternatives import AlternativePattern, foils
+from fastrod.identification.search.alternatives import AlternativePattern, alternatives
 from fastrod.identification.search.linearised import LinearisedModel, Target
 from fastrod.model.robotfile import load_robot
 
@@ -45,7 +45,7 @@ def bare() -> np.ndarray:
 
 
 @cache
-def local() -> LinearisedModel:
+def linearised() -> LinearisedModel:
     robot = load_robot("prototype")
     log = replace(excitation(robot, rate=5.0).log, tip_position=bare())
     model, samples = base_model(robot), sample(log)
@@ -60,7 +60,7 @@ def local() -> LinearisedModel:
 
 @cache
 def tangent() -> np.ndarray:
-    here = local()
+    here = linearised()
     return here.slopes(here.model, here.theta, here.residual(here.model, here.theta))
 
 
@@ -79,8 +79,8 @@ def left_by(columns: np.ndarray, residual: np.ndarray) -> float:
 
 def ranked(residual: np.ndarray) -> list[tuple[float, AlternativePattern]]:
     """Every family's best by BIC, the best first."""
-    made = foils(local(), tangent(), residual)
-    assert {foil.name for foil in made} == FAMILIES
+    made = alternatives(linearised(), tangent(), residual)
+    assert {alternative.name for alternative in made} == FAMILIES
     n = residual.size
     scores = [
         n * np.log(left_by(f.columns, residual) / n) + (f.columns.shape[-1] + f.n_hidden) * np.log(n)
@@ -106,9 +106,9 @@ def planted(name: str, seed: int) -> np.ndarray:
     ],
 )
 def test_each_family_is_the_name_of_its_own_pattern(outside: str, family: str, seed: int) -> None:
-    (best, foil), (second, _) = ranked(residual(planted(outside, seed)))[:2]
-    assert foil.name == family
-    assert foil.kind == KINDS[family]
+    (best, alternative), (second, _) = ranked(residual(planted(outside, seed)))[:2]
+    assert alternative.name == family
+    assert alternative.kind == KINDS[family]
     assert second - best > 10.0  # BIC
 
 
@@ -117,7 +117,7 @@ def test_a_contact_is_static_whatever_its_name(seed: int) -> None:
     """Of six walls, these two (normals near a wire's plane) fit a patch better than a contact; why is not
     known. Both are static."""
     scores = ranked(residual(planted("contact", seed)))
-    assert [foil.name for _, foil in scores[:2]] in (["patch", "contact"], ["contact", "patch"])
+    assert [alternative.name for _, alternative in scores[:2]] in (["patch", "contact"], ["contact", "patch"])
     assert scores[0][1].kind == "static"
 
 
@@ -125,19 +125,19 @@ def test_what_is_off_in_one_corner_is_a_patch() -> None:
     """A round hat, which is no Gaussian, at three quarters of the reach."""
     place = 0.75 * np.abs(bare()[:, :2]).max() * np.array([np.cos(0.7), np.sin(0.7)])
     hat = np.maximum(0.0, 1.0 - ((bare()[:, :2] - place) ** 2).sum(1) / 0.02**2)
-    _, foil = ranked(residual(hat[:, None] * np.array([1e-3, 5e-4, -2e-3])))[0]
-    assert foil.name == "patch"
+    _, alternative = ranked(residual(hat[:, None] * np.array([1e-3, 5e-4, -2e-3])))[0]
+    assert alternative.name == "patch"
 
 
 def test_times_and_frequencies_are_those_that_were_planted() -> None:
     log = inputs()
     seal = plant.draw(2, ["bump"])
-    best = {f.name: f for f in foils(local(), tangent(), residual(planted("bump", 2)))}["bump"]
+    best = {f.name: f for f in alternatives(linearised(), tangent(), residual(planted("bump", 2)))}["bump"]
     said = float(best.what.split("at ")[1].split(" s")[0])
     # 48 places are tried
     assert_allclose(said, log.t[0] + seal.effects["bump"]["at"] * np.ptp(log.t), atol=0.015 * np.ptp(log.t))
     seal = plant.draw(2, ["sway"])
-    best = {f.name: f for f in foils(local(), tangent(), residual(planted("sway", 2)))}["sway"]
+    best = {f.name: f for f in alternatives(linearised(), tangent(), residual(planted("sway", 2)))}["sway"]
     said = float(best.what.split("at ")[1].split(" Hz")[0])
     assert_allclose(said, seal.effects["sway"]["frequency"], atol=1.0 / np.ptp(log.t))
 
@@ -150,13 +150,13 @@ def test_of_noise_no_family_makes_anything() -> None:
 
 
 def test_columns_of_rows_that_do_not_count_are_zero() -> None:
-    here = local()
+    here = linearised()
     here.target.weight[5] = 0.0
     try:
-        made = foils(here, tangent(), residual(planted("bump", 1)))
+        made = alternatives(here, tangent(), residual(planted("bump", 1)))
     finally:
         here.target.weight[5] = 1.0
-    for foil in made:
-        assert foil.columns.shape[:2] == (len(inputs().t), 3)
-        assert (foil.columns[5] == 0.0).all()
-        assert np.isfinite(foil.columns).all()
+    for alternative in made:
+        assert alternative.columns.shape[:2] == (len(inputs().t), 3)
+        assert (alternative.columns[5] == 0.0).all()
+        assert np.isfinite(alternative.columns).all()

@@ -58,7 +58,7 @@ class Place:
         self.samples = samples()
         self.rod = PredictedRod(self.samples, self.model.robot, points=True)
         self.target = Target(self.samples, SIGMA, rotation_sigma=0.01, points=True)
-        self.local = LinearisedModel(self.model, self.theta, self.samples, self.rod, self.target)
+        self.linearised = LinearisedModel(self.model, self.theta, self.samples, self.rod, self.target)
 
     def exact(self, model: Model, theta: np.ndarray) -> np.ndarray:
         residual, ok = exact_residual(model, theta, self.samples, self.rod, self.target)
@@ -79,7 +79,7 @@ def with_memory() -> Place:
 @pytest.mark.parametrize("place", [base, with_memory])
 def test_at_the_reference_it_is_the_model(place: Any) -> None:
     here = place()
-    found, exact = here.local.residual(here.model, here.theta), here.exact(here.model, here.theta)
+    found, exact = here.linearised.residual(here.model, here.theta), here.exact(here.model, here.theta)
     assert found.shape == (N, 3 + 3 + 6)
     # the rod is settled to 1e-8 of 0.13 m, which is 1e-5 sigma
     assert_allclose(found, exact, atol=1e-4)
@@ -137,8 +137,8 @@ NOTHING = 0.01  # sigma, by a typical size: a slope that small is not compared; 
 def assert_slopes(
     here: Place, model: Model, theta: np.ndarray, first: int, tolerance: dict[str, float]
 ) -> None:
-    residual = here.local.residual(model, theta)
-    J = here.local.slopes(model, theta, residual)
+    residual = here.linearised.residual(model, theta)
+    J = here.linearised.slopes(model, theta, residual)
     assert J.shape == (*residual.shape, len(theta))
     seen = 0
     for j in range(first, len(theta)):
@@ -196,7 +196,7 @@ def test_slopes_of_the_base_parameters() -> None:
 def test_slopes_of_effects_that_need_no_rod(name: str) -> None:
     here, model, theta, first = near_neutral(name)
     before = here.rod.runs
-    here.local.slopes(model, theta, here.local.residual(model, theta))
+    here.linearised.slopes(model, theta, here.linearised.residual(model, theta))
     assert here.rod.runs - before <= 4 + 3  # at most what `by_bend` and `by_force` took, once
     assert_slopes(here, model, theta, first, WIRES | CAMERA | FORCE | MEMORY)
 
@@ -215,7 +215,7 @@ def test_one_effect_on_the_rod_is_exact_at_its_typical_size(name: str) -> None:
     for j in range(first, len(model.unknowns)):
         theta = np.concatenate([here.theta, [u.mean for u in model.unknowns[first:]]])
         theta[j] += model.unknowns[j].scale
-        found, exact = here.local.residual(model, theta), here.exact(model, theta)
+        found, exact = here.linearised.residual(model, theta), here.exact(model, theta)
         # but for the rotation of what the camera sees, which is exact to the third order of a vector
         assert_allclose(found, exact, atol=2e-3)
 
@@ -228,7 +228,9 @@ def test_the_local_model_errs_by_the_square_of_the_distance() -> None:
     errors = []
     for part in (1.0, 0.5):
         theta = np.concatenate([here.theta, [u.mean + part * u.scale for u in model.unknowns[first:]]])
-        errors.append(np.sqrt(((here.local.residual(model, theta) - here.exact(model, theta)) ** 2).mean()))
+        errors.append(
+            np.sqrt(((here.linearised.residual(model, theta) - here.exact(model, theta)) ** 2).mean())
+        )
     assert 3.0 < errors[0] / errors[1] < 5.0
     moved = np.sqrt(((here.exact(model, theta) - here.exact(here.model, here.theta)) ** 2).mean())
     assert errors[1] < 0.1 * moved
@@ -246,10 +248,10 @@ def test_a_local_fit_finds_what_was_planted() -> None:
     told.tip = pose.position + SIGMA * np.random.default_rng(8).normal(size=(N, 3))
     told.rotation, told.points, told.seen = None, np.zeros((N, 0, 3)), np.zeros((N, 0, 3), bool)
     assert len(log) == N
-    local = LinearisedModel(
+    linearised = LinearisedModel(
         here.model, here.theta, here.samples, PredictedRod(here.samples, here.model.robot, points=True), told
     )
-    fit = local.fit(here.model, here.theta, 20)
+    fit = linearised.fit(here.model, here.theta, 20)
     error = np.sqrt(np.diag(np.linalg.inv(fit.hessian)))
     assert abs(fit.theta[place] - true[place]) < 3.0 * error[place]
     assert error[place] < 0.02  # the data say more than the prior

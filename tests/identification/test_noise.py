@@ -43,10 +43,10 @@ def white(seed: int, n: int = N) -> np.ndarray:
     return SIGMA * np.random.default_rng(seed).normal(size=(n, 3))
 
 
-def spoilt(noise: np.ndarray, share: float, seed: int, size: float) -> tuple[np.ndarray, np.ndarray]:
+def spoilt(noise: np.ndarray, fraction: float, seed: int, size: float) -> tuple[np.ndarray, np.ndarray]:
     """The noise with outliers of one to two times `size` sigma along each axis, and which rows they are."""
     rng = np.random.default_rng(seed)
-    bad = rng.random(len(noise)) < share
+    bad = rng.random(len(noise)) < fraction
     way = rng.uniform(1.0, 2.0, noise.shape) * rng.choice([-1.0, 1.0], noise.shape)
     return noise + np.where(bad[:, None], size * SIGMA * way, 0.0), bad
 

@@ -106,7 +106,7 @@ def test_points_on_a_line_tell_no_rotation_about_it(turn: float) -> None:
     spun = rotation @ Rotation.from_rotvec([1.1, 0.0, 0.0]).as_matrix()
     measured = points @ spun.T + 3e-4 * rng.normal(size=points.shape)
     turns = np.broadcast_to(spun, (300, 3, 3))
-    assert np.allclose(align(measured, points, turns=turns, lever=0.03).rotation, spun, atol=0.03)
+    assert np.allclose(align(measured, points, rotations=turns, lever=0.03).rotation, spun, atol=0.03)
 
 
 def test_a_file_that_has_a_camera_gets_one_registration_on_the_other() -> None:

@@ -15,7 +15,7 @@ from fastrod.identification.report.verdict import (
     _PARTLY,
     _UNCERTAIN,
     VerdictGrounds,
-    judge,
+    choose_verdict,
 )
 from fastrod.identification.search.alternatives import AlternativePattern
 from fastrod.identification.search.model_selection import Candidate, SearchStep
@@ -29,24 +29,24 @@ SWAY = AlternativePattern("sway", "exogenous", "a line", np.zeros((1, 3, 6)), 1)
 RIPPLE = AlternativePattern("ripple", "static", "periodic", np.zeros((1, 3, 2)), 1)
 
 
-def took(foil: AlternativePattern | None, name: str = "backlash") -> SearchStep:
+def took(alternative: AlternativePattern | None, name: str = "backlash") -> SearchStep:
     """A stage that took a foil, or an effect."""
-    taken = Candidate(foil.name if foil else name, None, 9.0, 99.0, 0.5, 1, "", foil)
+    taken = Candidate(alternative.name if alternative else name, None, 9.0, 99.0, 0.5, 1, "", alternative)
     return SearchStep(None, (), taken)
 
 
-def opinion(**changed: Any) -> VerdictGrounds:
+def grounds(**changed: Any) -> VerdictGrounds:
     given = {
         "base": BASE,
         "library": BASE,
         "after": BASE,
         "floor": FLOOR,
         "left_out": 0.0,
-        "audit": CLEAN,
+        "structure": CLEAN,
         "steps": [],
         "found": [],
     }
-    made = judge(**(given | changed))
+    made = choose_verdict(**(given | changed))
     assert made.verdict in get_args(Verdict)
     assert made.kind in KINDS
     assert 0.0 <= made.left <= 1.0
@@ -58,17 +58,17 @@ def opinion(**changed: Any) -> VerdictGrounds:
 def found(left: float, **changed: Any) -> VerdictGrounds:
     """Backlash, with a static structure that carries `left` of the error above the noise."""
     after = 0.5
-    return opinion(
+    return grounds(
         library=after,
         after=after,
-        audit=ResidualStructure(left / after, 0.0, 0.0, 0.0, 5.0),
+        structure=ResidualStructure(left / after, 0.0, 0.0, 0.0, 5.0),
         found=["backlash"],
         **changed,
     )
 
 
 def test_a_residual_of_noise_is_none() -> None:
-    made = opinion(base=1.02 * FLOOR, library=1.02 * FLOOR, after=1.02 * FLOOR)
+    made = grounds(base=1.02 * FLOOR, library=1.02 * FLOOR, after=1.02 * FLOOR)
     assert (made.verdict, made.kind, made.left, made.patterns, made.drop_effects) == (
         "none",
         "none",
@@ -79,7 +79,7 @@ def test_a_residual_of_noise_is_none() -> None:
 
 
 @pytest.mark.parametrize(
-    ("audit", "kind"),
+    ("structure", "kind"),
     [
         (ResidualStructure(0.07, 0.01, 0.0, 0.0, 5.0), "static"),
         (ResidualStructure(0.01, 0.07, 0.0, 0.0, 5.0), "memory"),
@@ -87,29 +87,40 @@ def test_a_residual_of_noise_is_none() -> None:
         (ResidualStructure(0.0, 0.0, 0.01, 0.07, 5.0), "unknown"),
     ],
 )
-def test_structure_that_nothing_explains_is_not_in_the_library(audit: ResidualStructure, kind: str) -> None:
-    made = opinion(audit=audit)
+def test_structure_that_nothing_explains_is_not_in_the_library(
+    structure: ResidualStructure, kind: str
+) -> None:
+    made = grounds(structure=structure)
     assert (made.verdict, made.kind, made.patterns) == ("not_in_library", kind, ())
     assert_allclose(made.left, 0.08 * BASE)
 
 
 def test_structure_below_six_percent_is_none() -> None:
-    assert opinion(audit=ResidualStructure(0.03, 0.02, 0.009, 0.0, 5.0)).verdict == "none"
-    assert opinion(audit=ResidualStructure(0.03, 0.02, 0.011, 0.0, 5.0)).verdict == "not_in_library"
+    assert grounds(structure=ResidualStructure(0.03, 0.02, 0.009, 0.0, 5.0)).verdict == "none"
+    assert grounds(structure=ResidualStructure(0.03, 0.02, 0.011, 0.0, 5.0)).verdict == "not_in_library"
 
 
-@pytest.mark.parametrize(("foil", "kind"), [(JUMP, "drift"), (SWAY, "unknown"), (RIPPLE, "static")])
-def test_a_foil_alone_is_not_in_the_library_and_gives_its_kind(foil: AlternativePattern, kind: str) -> None:
-    made = opinion(after=FLOOR, steps=[took(foil), SearchStep(None, (), None)])
-    assert (made.verdict, made.kind, made.left, made.patterns) == ("not_in_library", kind, 1.0, (foil.what,))
-    assert foil.what in made.summary
+@pytest.mark.parametrize(("alternative", "kind"), [(JUMP, "drift"), (SWAY, "unknown"), (RIPPLE, "static")])
+def test_a_foil_alone_is_not_in_the_library_and_gives_its_kind(
+    alternative: AlternativePattern, kind: str
+) -> None:
+    made = grounds(after=FLOOR, steps=[took(alternative), SearchStep(None, (), None)])
+    assert (made.verdict, made.kind, made.left, made.patterns) == (
+        "not_in_library",
+        kind,
+        1.0,
+        (alternative.what,),
+    )
+    assert alternative.what in made.summary
 
 
 def test_the_kind_is_of_what_is_larger_the_foil_or_the_structure_behind_it() -> None:
     after = 0.8  # the foil has taken 0.3
     small, large = (
-        opinion(after=after, steps=[took(JUMP)], audit=ResidualStructure(0.0, share / after, 0.0, 0.0, 5.0))
-        for share in (0.29, 0.31)
+        grounds(
+            after=after, steps=[took(JUMP)], structure=ResidualStructure(0.0, fraction / after, 0.0, 0.0, 5.0)
+        )
+        for fraction in (0.29, 0.31)
     )
     assert (small.kind, large.kind) == ("drift", "memory")
 
@@ -167,7 +178,7 @@ def test_held_out_error_counts() -> None:
 )
 def test_a_foil_beside_an_effect_counts_by_what_it_takes(foreign: float, verdict: str, dropped: bool) -> None:
     library = 0.7
-    made = opinion(
+    made = grounds(
         library=library, after=library - foreign, steps=[took(None), took(JUMP)], found=["backlash"]
     )
     assert (made.verdict, made.drop_effects, made.patterns) == (verdict, dropped, (JUMP.what,))
@@ -183,7 +194,7 @@ def test_the_share_that_is_gone_is_of_the_held_out_error() -> None:
 
 
 def test_several_effects_are_listed() -> None:
-    made = opinion(library=FLOOR, after=FLOOR, found=["backlash", "creep", "gravity"])
+    made = grounds(library=FLOOR, after=FLOOR, found=["backlash", "creep", "gravity"])
     assert "backlash, creep and gravity; with them" in made.summary
 
 
@@ -191,11 +202,11 @@ def test_a_log_at_its_floor_divides_by_no_zero() -> None:
     """The base model below the noise estimate: the error above it is none, and what seems left stays a
     share."""
     for base in (0.5 * FLOOR, FLOOR):
-        assert opinion(base=base, library=base, after=base).verdict == "none"
+        assert grounds(base=base, library=base, after=base).verdict == "none"
         assert (
-            opinion(
-                base=base, library=base, after=base, audit=ResidualStructure(0.5, 0.0, 0.0, 0.0, 5.0)
+            grounds(
+                base=base, library=base, after=base, structure=ResidualStructure(0.5, 0.0, 0.0, 0.0, 5.0)
             ).left
             == 1.0
         )
-    assert opinion(base=0.0, library=0.0, after=0.0, floor=0.0).verdict == "none"
+    assert grounds(base=0.0, library=0.0, after=0.0, floor=0.0).verdict == "none"

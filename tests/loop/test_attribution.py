@@ -126,7 +126,7 @@ def test_without_the_true_effect_no_sibling_is_called_the_explanation() -> None:
     assert all(c.name != "stiffness_anisotropy" for c in result.tried)
     assert result.verdict in ("not_in_library", "partly_explained")
     assert result.remaining_kind == "static"
-    assert result.remaining_share > 0.03
+    assert result.remaining_fraction > 0.03
 
 
 @pytest.mark.parametrize("effect", ["latency", "gravity"])

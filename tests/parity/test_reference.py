@@ -52,7 +52,7 @@ def in_mode(robot: Robot, mode: Mode) -> Robot:
     return replace(robot, segments=tuple(replace(segment, mode=mode) for segment in robot.segments))
 
 
-def with_wires(robot: Robot, **change: Any) -> Robot:
+def with_tendons(robot: Robot, **change: Any) -> Robot:
     return replace(
         robot,
         segments=tuple(
@@ -126,7 +126,7 @@ def test_shoot_is_the_truth_in_passive_mode() -> None:
 @pytest.mark.parametrize("method", ["lm", "slsqp", "trust-constr"])
 def test_shoot_is_the_truth_in_paper_mode(case: int, method: Any) -> None:
     row = rows("appB_truth.csv")[case]
-    robot = in_mode(with_wires(load_robot("prototype"), offset=0.01), "paper")
+    robot = in_mode(with_tendons(load_robot("prototype"), offset=0.01), "paper")
     loads = {"tip_force": numbers(row, "Fx", "Fy", "Fz"), "line_force": numbers(row, "fx", "fy", "fz")}
     shape = shoot(robot, numbers(row, "L1", "L2", "L3", "L4"), **loads, method=method)
     assert_allclose(shape.tip_position, numbers(row, "tip_x", "tip_y", "tip_z"), rtol=0, atol=TIP)
@@ -218,7 +218,7 @@ def test_constant_curvature_is_an_arc() -> None:
     assert np.isnan(shape.tension).all()
     # without loads and stretch the mechanics have nothing to add: 1e-10 m/N under 2 N over an offset of
     # 0.0075 m
-    rod = shoot(with_wires(robot, compliance=1e-10), length)
+    rod = shoot(with_tendons(robot, compliance=1e-10), length)
     assert_allclose(shape.position, rod.position, rtol=0, atol=1e-8)
 
 
@@ -240,12 +240,12 @@ def test_constant_curvature_takes_off_what_distal_tendons_use() -> None:
 def test_the_base_pose_carries_the_whole_robot_along() -> None:
     robot, length = prototype(-0.004, -0.002, 0.004, 0.002)
     half = np.sqrt(0.5)
-    turned = replace(robot, base_position=(0.1, 0.2, 0.3), base_quaternion=(half, half, 0.0, 0.0))
-    x_turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    rotated = replace(robot, base_position=(0.1, 0.2, 0.3), base_quaternion=(half, half, 0.0, 0.0))
+    x_rotation = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     force = np.array([0.1, 0.2, -0.1])
-    here, there = shoot(robot, length, tip_force=force), shoot(turned, length, tip_force=x_turn @ force)
-    assert_allclose(there.position, here.position @ x_turn.T + [0.1, 0.2, 0.3], rtol=0, atol=TIP)
-    assert_allclose(there.tip_rotation, x_turn @ here.tip_rotation, rtol=0, atol=1e-8)
+    here, there = shoot(robot, length, tip_force=force), shoot(rotated, length, tip_force=x_rotation @ force)
+    assert_allclose(there.position, here.position @ x_rotation.T + [0.1, 0.2, 0.3], rtol=0, atol=TIP)
+    assert_allclose(there.tip_rotation, x_rotation @ here.tip_rotation, rtol=0, atol=1e-8)
 
 
 def test_self_weight_is_a_line_force() -> None:
@@ -267,7 +267,7 @@ def test_many_point_forces_are_a_line_force() -> None:
     assert_allclose(lumped.position, spread.position, rtol=0, atol=1e-6)
 
 
-def test_a_follower_force_turns_with_the_tip() -> None:
+def test_a_follower_force_rotates_with_the_tip() -> None:
     follower = np.array([0.2, 0.1, -0.1])
     robot, length = prototype(-0.004, -0.002, 0.004, 0.002)
     shape = shoot(robot, length, follower_tip_force=follower)
@@ -283,8 +283,8 @@ def test_extension_is_a_longer_segment() -> None:
     )
 
 
-def test_a_slack_wire_pulls_no_more() -> None:
-    robot = with_wires(load_robot("prototype"), unilateral=True)
+def test_a_slack_tendon_pulls_no_more() -> None:
+    robot = with_tendons(load_robot("prototype"), unilateral=True)
     length = robot.rest_tendon_length + np.array([-0.004, 0.0, 0.006, 0.0])
     shape = shoot(robot, length, tip_force=(0.0, 0.05, 0.0))
     assert shape.success, shape.message
@@ -292,15 +292,15 @@ def test_a_slack_wire_pulls_no_more() -> None:
     assert slack[2]
     assert not slack[0]
     assert (shape.tension >= 0.0).all()
-    # a slack wire is longer than its path; a taut one is stretched by its tension
+    # a slack tendon is longer than its path; a taut one is stretched by its tension
     assert (shape.tendon_length[slack] <= length[slack]).all()
     assert_allclose((shape.tendon_length - length - 1e-5 * shape.tension)[~slack], 0.0, rtol=0, atol=TIP)
 
 
 def test_a_mixed_chain_with_a_passive_end() -> None:
-    wired = load_robot("prototype").segments[0]
+    first = load_robot("prototype").segments[0]
     tail = Segment(length=0.05, bending_stiffness=(EI, EI), torsional_stiffness=0.001, mode="passive")
-    robot = Robot(name="mixed", segments=(wired, replace(wired, mode="tendon_tension"), tail))
+    robot = Robot(name="mixed", segments=(first, replace(first, mode="tendon_tension"), tail))
     length, tension = np.full(8, np.nan), np.full(8, np.nan)
     length[:4], tension[4:] = [0.067, 0.071, 0.073, 0.069], [0.4, 0.1, 0.0, 0.2]
     inputs: dict[str, Any] = {"tendon_length": length, "tension": tension, "tip_force": (0.02, 0.05, -0.03)}
@@ -339,7 +339,7 @@ def test_a_guess_saves_passes() -> None:
         ({"tendon_length": [0.07] * 4, "tip_force": "up"}, "must be numbers"),
     ],
 )
-def test_wrong_inputs_are_told(inputs: dict[str, Any], sentence: str) -> None:
+def test_wrong_inputs_are_reported(inputs: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         shoot(load_robot("prototype"), **inputs)
 

@@ -18,7 +18,7 @@ def test_push_holds_at_other_time_steps(dt, monkeypatch):
     assert figures["balance of the cube's momentum, N s"] < 1e-12
 
 
-def test_push_that_misses_is_told(monkeypatch):
+def test_push_that_misses_is_reported(monkeypatch):
     monkeypatch.setattr(push, "PLACE", (0.36, 0.3, push.SIZE / 2))
     with pytest.raises(
         SceneError,
@@ -28,19 +28,19 @@ def test_push_that_misses_is_told(monkeypatch):
         push.NeckPush().check()
 
 
-def test_look_that_sees_nothing_is_told(monkeypatch):
+def test_look_that_sees_nothing_is_reported(monkeypatch):
     monkeypatch.setattr(look, "CORNERS", ((1, 1), (1, -1), (-1, 1), (-30, -1)))
     with pytest.raises(SceneError, match=r"^scene neck_look: 3 of 4 corners were seen"):
         look.NeckLook().check()
 
 
-def test_neck_that_touches_the_wall_is_told(monkeypatch):
+def test_neck_in_contact_with_the_wall_is_reported(monkeypatch):
     monkeypatch.setattr(look, "MIDDLE", (0.77, 0.0))
     with pytest.raises(SceneError, match=r"^scene neck_look: .*the neck "):
         look.NeckLook().check()
 
 
-def test_neck_stands_on_the_head_with_its_axes_as_told():
+def test_neck_stands_on_the_head_with_its_axes_as_stated():
     world, mount = standing(0.005, 0.5)
     pose, trunk = mount.motion().pose, world.getBasePositionAndOrientation(mount.body)
     axes = np.array(world.getMatrixFromQuaternion(np.roll(pose[3:], -1).tolist())).reshape(3, 3)

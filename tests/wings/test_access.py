@@ -1,9 +1,10 @@
-"""Who may load a page, open its websocket, and drive: strangers, nonsense, too many, and two at once."""
+"""Access to a page, its websocket and its controls: strangers, nonsense, too many, and two at once."""
 
 from __future__ import annotations
 
 import re
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -152,6 +153,7 @@ def test_a_client_without_a_browser_gets_what_the_page_shows(address: str) -> No
         ("0.0.0.0", "192.168.1.5", "192.168.1.5:80", True),
         ("0.0.0.0", "192.168.1.5", "192.168.1.5", True),  # a browser leaves out port 80
         ("0.0.0.0", "192.168.1.5", "192.168.1.6:80", False),
+        ("0.0.0.0", "192.168.1.5", f"{socket.gethostname()}:80", True),  # printed where there is no route
         ("0.0.0.0", "192.168.1.5", "evil.example:80", False),
         ("0.0.0.0", "192.168.1.5", "0.0.0.0:80", False),
         ("robot.lab", "192.168.1.5", "Robot.lab:80", True),
@@ -169,7 +171,7 @@ def test_another_host_is_served_by_its_addresses(bound: str, reached: str, host:
     assert access.refusal("/", Given(Host=host), (reached, 80)) is not None
 
 
-def test_each_server_has_a_key_of_its_own_and_says_who_reaches_it(tmp_path: Path) -> None:
+def test_each_server_has_a_key_of_its_own_and_says_who_has_access(tmp_path: Path) -> None:
     made = [serve_guarded(host, 0) for host in ("127.0.0.1", "127.0.0.1", "0.0.0.0")]
     try:
         assert len({served.key for served in made}) == 3
@@ -212,7 +214,7 @@ def app(tmp_path: Path) -> Iterator[App]:
 
 def arrived(page: DrivePage, bend_x: float) -> bool:
     """Segment 1 gets there [degrees]; nothing is on its way then."""
-    return until(lambda: page.pilot.arrived and abs(page.pilot.bent(0)[0] - np.radians(bend_x)) < 1e-6)
+    return until(lambda: page.teleop.arrived and abs(page.teleop.bent(0)[0] - np.radians(bend_x)) < 1e-6)
 
 
 def page_of(app: App) -> DrivePage:
@@ -224,10 +226,10 @@ def test_an_exported_page_and_a_log_hold_no_key(app: App, tmp_path: Path) -> Non
     app.open("prototype")
     page, key = page_of(app), app.served.key
     assert key in app.address
-    page.session.ask(lambda: page.session.record(tmp_path / "log.csv"))
+    page.session.submit(lambda: page.session.record(tmp_path / "log.csv"))
     assert until(lambda: page.session.recorder is not None)
     html = page.export()
-    page.session.ask(lambda: page.session.end_recording() and None)
+    page.session.submit(lambda: page.session.end_recording() and None)
     assert until(lambda: (tmp_path / "log.csv").is_file())
     assert key not in html + (tmp_path / "log.csv").read_text()
     assert f":{app.server.get_port()}" not in html
@@ -288,7 +290,7 @@ def nonsense(uuid: str) -> dict[str, bytes | str]:
         "a drag to nowhere": {
             "type": "SceneNodeDragMessage",
             "phase": "update",
-            "name": "/grip",
+            "name": "/drag_handle",
             "instance_index": None,
             "start_position": [0.0] * 3,
             "start_screen_pos": [0.0] * 2,
@@ -351,7 +353,7 @@ def test_of_many_pages_some_are_refused_in_a_sentence_and_any_other_stops(app: A
 
 
 class Clock:
-    """Stands until it is told."""
+    """Stands until it is released."""
 
     now = 100.0
 
@@ -366,8 +368,8 @@ def test_one_page_has_the_controls_and_another_asks_for_them() -> None:
     assert holder.acts(1)  # the first that acts
     assert not holder.acts(2)
     assert [holder.standing(page) for page in (1, 2)] == ["has", "other"]
-    holder.ask(2)
-    holder.ask(3)  # waits its turn
+    holder.request(2)
+    holder.request(3)  # waits in the queue
     assert [holder.standing(page) for page in (1, 2, 3)] == ["requested", "asking", "other"]
     assert holder.acts(1)
     clock.now += 0.9 * PATIENCE
@@ -376,24 +378,24 @@ def test_one_page_has_the_controls_and_another_asks_for_them() -> None:
     holder.grant(3)
     holder.keep(1)
     assert [holder.standing(page) for page in (1, 2)] == ["has", "refused"]
-    holder.ask(2)  # too soon
+    holder.request(2)  # too soon
     assert holder.standing(1) == "has"
     clock.now += 1.1 * AGAIN
     holder.tick()
     assert holder.standing(2) == "other"
     assert holder.acts(1)
-    holder.ask(2)
+    holder.request(2)
     assert moved == []
     clock.now += 1.1 * PATIENCE
     holder.tick()  # nobody refused
     assert [holder.standing(page) for page in (1, 2)] == ["other", "has"]
     assert moved == [clock.now]
     assert not holder.acts(1)
-    holder.ask(1)
+    holder.request(1)
     holder.grant(2)
     assert holder.standing(1) == "has"
     clock.now += 1.1 * IDLE
-    holder.ask(3)  # at once: page 1 did nothing for long
+    holder.request(3)  # at once: page 1 did nothing for long
     assert [holder.acts(page) for page in (1, 2, 3)] == [False, False, True]
     pages.remove(3)  # it left
     holder.tick()
@@ -442,23 +444,23 @@ def test_two_pages_do_not_drive_at_once_and_either_stops(app: App, monkeypatch: 
     two.put(page.run, "Pause")
     assert until(lambda: page.session.paused)
     two.put(page.run, "Resume")
-    one.key("Pause, or go on")
+    one.key("Pause or resume")
     assert until(lambda: not page.session.paused)
 
-    assert until(lambda: two.own("Ask for control").visible)
-    two.press(two.own("Ask for control"))
+    assert until(lambda: two.own("Request control").visible)
+    two.press(two.own("Request control"))
     assert until(lambda: one.own("Keep control").visible)
     one.press(one.own("Keep control"))
     assert until(lambda: app.holder.standing(two.number) == "refused")
     monkeypatch.setattr("fastrod_viewer.holder.AGAIN", 0.0)
     monkeypatch.setattr("fastrod_viewer.holder.PATIENCE", 0.0)
-    assert until(lambda: two.own("Ask for control").visible)
-    two.press(two.own("Ask for control"))
+    assert until(lambda: two.own("Request control").visible)
+    two.press(two.own("Request control"))
     assert until(lambda: app.holder.standing(two.number) == "has")
     one.put(bend, -10.0)
     two.put(other, 15.0)
-    assert until(lambda: page.pilot.arrived and abs(page.pilot.bent(0)[1] - np.radians(15.0)) < 1e-6)
-    assert page.pilot.bent(0)[0] == pytest.approx(np.radians(20.0), abs=1e-6)
+    assert until(lambda: page.teleop.arrived and abs(page.teleop.bent(0)[1] - np.radians(15.0)) < 1e-6)
+    assert page.teleop.bent(0)[0] == pytest.approx(np.radians(20.0), abs=1e-6)
     one.close()
     two.close()
 
@@ -475,7 +477,7 @@ def test_a_page_that_closes_in_motion_leaves_no_motion_behind(app: App, watched:
     driver.put(bend, 85.0)
     assert until(lambda: bool(link.read().dl.min() < -1e-5))
     driver.close()
-    assert until(lambda: page.pilot.arrived)  # what it was sent to is given up
+    assert until(lambda: page.teleop.arrived)  # what it was sent to is given up
     assert link.read().dl.min() > -0.0075 * np.radians(80.0)
     assert until(lambda: link.stopped != watched)
     if watcher is not None:

@@ -61,8 +61,8 @@ def dh_frames(q: Floats) -> list[Floats]:
 
 def apart(a: Floats, b: Floats) -> float:
     """Largest difference of two poses (7,), as position [m] and rotation matrix."""
-    turns = matrix_from_quaternion(np.stack([a[3:], b[3:]]))
-    return float(max(abs(a[:3] - b[:3]).max(), abs(turns[0] - turns[1]).max()))
+    rotations = matrix_from_quaternion(np.stack([a[3:], b[3:]]))
+    return float(max(abs(a[:3] - b[:3]).max(), abs(rotations[0] - rotations[1]).max()))
 
 
 @pytest.fixture
@@ -110,9 +110,10 @@ def test_jacobian_is_the_slope_of_the_frame(world: Bullet) -> None:
         slopes = []
         for d in h * np.eye(6):
             after, before = arm.frame(q + d), arm.frame(q - d)
-            turn = product(after[3:], before[3:] * [1.0, -1.0, -1.0, -1.0])
+            rotation = product(after[3:], before[3:] * [1.0, -1.0, -1.0, -1.0])
             slopes.append(
-                np.concatenate([after[:3] - before[:3], 2.0 * np.sign(turn[0]) * turn[1:]]) / (2.0 * h)
+                np.concatenate([after[:3] - before[:3], 2.0 * np.sign(rotation[0]) * rotation[1:]])
+                / (2.0 * h)
             )
         assert_allclose(arm.jacobian(q), np.transpose(slopes), atol=1e-9)
 

@@ -153,16 +153,16 @@ def test_it_is_drawn_and_taken_apart(name: str) -> None:
     env = SingleEnv(name, threads=1)
     env.reset(seed=0)
     picture = env.task.picture(0, 64, 48)
-    scenery = env.task.scenery(0)
+    backdrop = env.task.backdrop(0)
     env.close()
     assert picture is not None
     assert picture.shape == (48, 64, 3)
     assert picture.dtype == np.uint8
     assert np.ptp(picture) > 50, "the picture is of one colour"
-    assert scenery.tubes
-    assert scenery.balls
-    assert scenery.solids
-    for solid in scenery.solids:
+    assert backdrop.tubes
+    assert backdrop.balls
+    assert backdrop.solids
+    for solid in backdrop.solids:
         assert solid.faces.max() < len(solid.vertices)
 
 

@@ -157,7 +157,7 @@ def test_boards_that_cannot_be():
 
 
 def recording(seed, rate, delay, amplitude=0.003, noise=3e-4):
-    """Four wires that bend a 70 mm arc, and the tip as a camera sees it, late."""
+    """Four tendons that bend a 70 mm arc, and the tip as a camera sees it, late."""
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, 15.0, 0.01)
     f, phase = rng.uniform(0.1, 0.8, 4), rng.uniform(0.0, 6.28, 4)

@@ -34,7 +34,7 @@ _names = itertools.count()
 
 
 class Springs:
-    """Slack wires, then springs."""
+    """Slack tendons, then springs."""
 
     def move(self, t: float, pulled: Floats) -> Floats:
         return np.maximum(0.0, STIFFNESS * (pulled - SLACK))
@@ -46,7 +46,7 @@ class Bench:
     def __init__(self, clock: SteppedClock | WallClock | None = None, rate: float = 100.0) -> None:
         self.name = f"virtual:drives-{next(_names)}"
         self.clock = SteppedClock() if clock is None else clock
-        self.nodes = EmulatedDrives(SPECS, self.name, clock=self.clock, wires=Springs())
+        self.nodes = EmulatedDrives(SPECS, self.name, clock=self.clock, tendons=Springs())
         self.bus = DriveBus(SPECS, self.name, clock=self.clock, rate=rate)
         self.rate = rate
 
@@ -147,7 +147,7 @@ def test_pdos_that_the_dictionary_lacks_are_left_alone(tmp_path: Path):
     canopen.export_od(dictionary, str(own))
     clock, name = SteppedClock(), f"virtual:drives-{next(_names)}"
     with (
-        EmulatedDrives(SPECS, name, clock=clock, wires=Springs()) as nodes,
+        EmulatedDrives(SPECS, name, clock=clock, tendons=Springs()) as nodes,
         DriveBus(SPECS, name, clock=clock, rate=100.0, eds=own) as bus,
     ):
         bus.connect()
@@ -214,7 +214,7 @@ def test_homing_then_goes_to_its_offset(ready):
 
 
 def test_homing_of_a_wire_that_never_gets_taut_stops_the_drives(ready):
-    with pytest.raises(DeviceError, match=r"find the wire of node 1 taut within 0\.5 s"):
+    with pytest.raises(DeviceError, match=r"find the tendon of node 1 taut within 0\.5 s"):
         ready.bus.homing(np.full(4, 900), 1000, time_limit=0.5)
     assert ready.bus.stop_reason == "homing did not end"
     assert states(ready.run(5)[-1]) == ["quick stop active"] * 4
@@ -426,7 +426,7 @@ def test_a_bus_that_hears_itself_takes_its_own_sync_for_nobody_elses():
     with (
         can.Bus(interface="virtual", channel=name, receive_own_messages=True) as echoing,
         open_bus(f"virtual:{name}") as other,
-        EmulatedDrives(SPECS, f"virtual:{name}", clock=clock, wires=Springs()),
+        EmulatedDrives(SPECS, f"virtual:{name}", clock=clock, tendons=Springs()),
         DriveBus(SPECS, echoing, clock=clock, rate=100.0) as bus,
     ):
         bus.connect()
@@ -472,7 +472,7 @@ def test_a_drive_that_is_not_there_is_named():
     name = f"virtual:drives-{next(_names)}"
     clock = SteppedClock()
     with (
-        EmulatedDrives(SPECS[:1], name, clock=clock, wires=Springs()) as _,
+        EmulatedDrives(SPECS[:1], name, clock=clock, tendons=Springs()) as _,
         DriveBus(SPECS[:2], name, clock=clock) as bus,
     ):
         with pytest.raises(DeviceError, match="the drive at node 2 does not answer"):
@@ -485,7 +485,7 @@ def test_a_motor_of_another_rated_torque_is_refused():
     name = f"virtual:drives-{next(_names)}"
     clock, other = SteppedClock(), [DriveSpec(node=1, drum_radius=0.008, rated_torque=0.1)]
     with (
-        EmulatedDrives(SPECS[:1], name, clock=clock, wires=Springs()),
+        EmulatedDrives(SPECS[:1], name, clock=clock, tendons=Springs()),
         DriveBus(other, name, clock=clock) as bus,
         pytest.raises(DeviceError, match=r"rated torque is 0\.054 N m"),
     ):
@@ -540,11 +540,11 @@ def test_a_bus_that_is_not_there(name, says):
 
 
 def test_an_own_dictionary_must_be_one(tmp_path: Path):
-    with pytest.raises(DeviceError, match="does not exist"):
+    with pytest.raises(InputError, match="does not exist"):
         object_dictionary(tmp_path / "none.eds")
     bad = tmp_path / "bad.eds"
     bad.write_text("no dictionary")
-    with pytest.raises(DeviceError, match="cannot be read"):
+    with pytest.raises(InputError, match="cannot be read"):
         object_dictionary(bad)
 
 
@@ -556,7 +556,7 @@ def test_an_own_dictionary_takes_the_place_of_ours(tmp_path: Path):
     assert len(object_dictionary(own)) == len(dictionary)
     del dictionary[0x6502]
     canopen.export_od(dictionary, str(poor))
-    with pytest.raises(DeviceError, match="has no object 0x6502:00"):
+    with pytest.raises(InputError, match="has no object 0x6502:00"):
         object_dictionary(poor)
 
 

@@ -52,15 +52,15 @@ class TinyEngine:
         return 2.0 * np.array(self.orientation[:3]) * np.sign(self.orientation[3])
 
     def step(self, dt) -> None:
-        turn = matrix_from_quaternion(np.roll(self.orientation, 1)[None])[0]
+        rotation = matrix_from_quaternion(np.roll(self.orientation, 1)[None])[0]
         force = (
             self._force
             + self.mass * self.gravity
             - self.spring * np.array(self.position)
             - self.damping * self.velocity
         )
-        inertia = turn @ np.diag(self.inertia) @ turn.T
-        moment = turn @ self._torque - self.twist * self.vector() - 0.2 * self.damping * self.spin
+        inertia = rotation @ np.diag(self.inertia) @ rotation.T
+        moment = rotation @ self._torque - self.twist * self.vector() - 0.2 * self.damping * self.spin
         self.velocity = self.velocity + dt * force / self.mass
         self.spin = self.spin + dt * np.linalg.solve(
             inertia, moment - np.cross(self.spin, inertia @ self.spin)
@@ -135,17 +135,17 @@ def test_tilted_body_feels_the_torque_in_its_own_frame(embedded_step) -> None:
     half = np.sqrt(0.5)
     body, rod, offset = TinyEngine(), Rod(soft_robot(line_density=0.5), dt=0.01), np.array([0.1, 0.0, 0.05])
     body.orientation = [half, 0.0, 0.0, half]
-    turn = matrix_from_quaternion(np.array([[half, half, 0.0, 0.0]]))[0]
+    rotation = matrix_from_quaternion(np.array([[half, half, 0.0, 0.0]]))[0]
     embedded_step(rod, body, offset, 0.001)
-    moment = turn.T @ (rod.wrench[3:] + np.cross(turn @ offset, rod.wrench[:3]))
-    np.testing.assert_allclose(turn.T @ body.spin, 0.001 * moment / body.inertia, rtol=1e-9, atol=1e-15)
+    moment = rotation.T @ (rod.wrench[3:] + np.cross(rotation @ offset, rod.wrench[:3]))
+    np.testing.assert_allclose(rotation.T @ body.spin, 0.001 * moment / body.inertia, rtol=1e-9, atol=1e-15)
     assert np.abs(moment).max() > 0.05
 
 
-@pytest.mark.parametrize(("part", "calm"), [(0.9, True), (1.1, False)])
-def test_limit_of_the_time_step_is_where_the_page_has_it(part: float, calm: bool) -> None:
+@pytest.mark.parametrize(("fraction", "calm"), [(0.9, True), (1.1, False)])
+def test_limit_of_the_time_step_is_where_the_page_has_it(fraction: float, calm: bool) -> None:
     # x' = x + dt v', v' = v - dt K / m (x + dt v): eigenvalues leave the unit circle where dt^2 K / m is 4/3
-    robot, dt, turn = soft_robot(), 0.01, (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)
+    robot, dt, rotation = soft_robot(), 0.01, (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)
     scene = ContactScene(
         obstacles=[plane(point=(0, 0, -0.005), normal=(0, 0, 1), name="floor", stiffness=4.0)]
     )
@@ -153,17 +153,17 @@ def test_limit_of_the_time_step_is_where_the_page_has_it(part: float, calm: bool
     start = 0.006
 
     def press(z: float) -> float:
-        rod.settle((0.0, 0.0, z, *turn))
+        rod.settle((0.0, 0.0, z, *rotation))
         return float(rod.wrench[2])
 
     stiffness = -(press(start + 1e-4) - press(start - 1e-4)) / 2e-4
-    mass = stiffness * dt**2 / (4.0 / 3.0 * part)
+    mass = stiffness * dt**2 / (4.0 / 3.0 * fraction)
     z, v, rest = start + 1e-6, 0.0, press(start)
-    ways = []
+    runs = []
     for _ in range(60):
-        rod.advance((0.0, 0.0, z, *turn), (0.0, 0.0, v, 0.0, 0.0, 0.0), dt)
+        rod.advance((0.0, 0.0, z, *rotation), (0.0, 0.0, v, 0.0, 0.0, 0.0), dt)
         v += dt / mass * (rod.wrench[2] - rest)
         z += dt * v
-        ways.append(abs(z - start))
+        runs.append(abs(z - start))
     assert stiffness > 0.1
-    assert (max(ways[-5:]) < 1e-7) == calm
+    assert (max(runs[-5:]) < 1e-7) == calm

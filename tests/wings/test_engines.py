@@ -95,7 +95,7 @@ def test_rod_follows_a_host_that_moves(stage):
     pulled = robot.rest_tendon_length + np.array([-3, 0, 3, 0, -6, 2, 6, -2]) * 1e-3
     rest = s.rod.settle(tendon_length=pulled).tip_position[0]
     for k in range(20):
-        s.carry([0.2 * k * s.dt, 0.0, 0.1 * k * s.dt], [0.2, 0.0, 0.1])
+        s.move([0.2 * k * s.dt, 0.0, 0.1 * k * s.dt], [0.2, 0.0, 0.1])
         state = s.rod.step()
     np.testing.assert_allclose(state.tip_position[0], rest + 20 * s.dt * np.array([0.2, 0.0, 0.1]), atol=1e-6)
 
@@ -119,7 +119,7 @@ def test_touched_body_may_be_put_somewhere_else(stage):
     s = stage(soft_robot(), cubes=[Cube(SIZE, MASS, [BEYOND, 0.0, 0.0])])
     s.rod.settle()
     for k in range(20):
-        s.carry([SPEED * k * s.dt, 0.0, 0.0], [SPEED, 0.0, 0.0])
+        s.move([SPEED * k * s.dt, 0.0, 0.0], [SPEED, 0.0, 0.0])
         s.rod.step()
     assert np.linalg.norm(s.velocity()[:3]) > 0.9 * SPEED
     s.put(0, [2.0, 0.0, 0.0])
@@ -134,7 +134,7 @@ def test_step_that_cannot_be_solved_keeps_action_and_reaction(stage, monkeypatch
     s.rod.settle()
     impulse, solved = np.zeros(3), s.rod.simulator.step
     for k in range(30):
-        s.carry([SPEED * k * s.dt, 0.0, 0.0], [SPEED, 0.0, 0.0])
+        s.move([SPEED * k * s.dt, 0.0, 0.0], [SPEED, 0.0, 0.0])
         if k == 8:  # while it presses
             monkeypatch.setattr(
                 s.rod.simulator, "step", lambda *a, **b: replace(solved(*a, **b), ok=np.array([False]))
@@ -147,9 +147,9 @@ def test_step_that_cannot_be_solved_keeps_action_and_reaction(stage, monkeypatch
     np.testing.assert_allclose(MASS * s.velocity()[:3], -impulse, atol=1e-9)
 
 
-def test_capsules_push_what_the_rod_does_not_touch_itself_and_nothing_twice(stage):
+def test_capsules_push_what_the_rod_has_no_contact_with_and_nothing_twice(stage):
     gap = Cube(SIZE, MASS, [BEYOND - 0.01, 0.0, 0.0])  # 8 mm in the capsules, and nobody moves
-    alone, touched = stage(soft_robot(), cubes=[gap], touch=False), stage(soft_robot(), cubes=[gap])
+    alone, touched = stage(soft_robot(), cubes=[gap], contact_bodies=False), stage(soft_robot(), cubes=[gap])
     pushed = np.zeros(3)
     for _ in range(3):
         alone.rod.step()
@@ -189,11 +189,11 @@ def test_bad_input_is_not_kept(stage):
     np.testing.assert_allclose(s.rod.wrench[:3], [0.01, 0.0, 0.0], atol=1e-9)
 
 
-def test_rod_that_stays_lost_is_told(stage, monkeypatch):
+def test_rod_that_stays_lost_is_reported(stage, monkeypatch):
     s = stage(soft_robot(), cubes=[Cube(SIZE, MASS, [1.0, 0.0, 0.0])])
     lost = replace(s.rod.step(), ok=np.array([False]), problems={0: "contact: it stands."})
-    for way in ("step", "settle"):
-        monkeypatch.setattr(s.rod.simulator, way, lambda *a, **b: lost)
+    for direction in ("step", "settle"):
+        monkeypatch.setattr(s.rod.simulator, direction, lambda *a, **b: lost)
     for _ in range(25):
         assert not s.rod.step().ok[0]
     with pytest.raises(

@@ -9,7 +9,7 @@ from engines import ENGINES, Cube
 
 SPEED, RADIUS, SIZE, MASS = 0.1, 0.012, 0.08, 0.1
 END = {"axial": [0.2 + RADIUS + 0.002 + SIZE / 2, 0.0, 0.0], "side": [0.18, RADIUS + 0.002 + SIZE / 2, 0.0]}
-WAY = {"axial": np.array([1.0, 0.0, 0.0]), "side": np.array([0.0, 1.0, 0.0])}
+DISPLACEMENT = {"axial": np.array([1.0, 0.0, 0.0]), "side": np.array([0.0, 1.0, 0.0])}
 
 
 @pytest.fixture(params=list(ENGINES))
@@ -30,12 +30,12 @@ def push(stage, dt, direction, gravity, duration=0.8, mass=MASS, place=None):
         floor=floor,
     )
     s.rod.settle()
-    way, forces, speeds, ok = WAY[direction], [], [], True
+    direction, forces, speeds, ok = DISPLACEMENT[direction], [], [], True
     for k in range(round(duration / dt)):
-        s.carry(SPEED * k * dt * way, SPEED * way)
+        s.move(SPEED * k * dt * direction, SPEED * direction)
         state = s.rod.step()
         forces.append(s.rod.wrench[:3])
-        speeds.append(s.velocity()[:3] @ way)
+        speeds.append(s.velocity()[:3] @ direction)
         ok = ok and bool(state.ok[0])
     return np.array(speeds), mass * s.velocity()[:3], dt * np.cumsum(forces, axis=0), ok
 
@@ -45,7 +45,7 @@ def push(stage, dt, direction, gravity, duration=0.8, mass=MASS, place=None):
 def test_momentum_of_a_free_cube_is_the_impulse_on_the_host(stage, dt, direction):
     speeds, momentum, impulse, ok = push(stage, dt, direction, gravity=0.0, duration=0.5)
     assert ok
-    assert momentum @ WAY[direction] > 0.9 * MASS * SPEED
+    assert momentum @ DISPLACEMENT[direction] > 0.9 * MASS * SPEED
     np.testing.assert_allclose(momentum, -impulse[-1], atol=1e-9)
     # an elastic rod without any loss would leave it at twice the speed; along its axis this one is stiff, and
     # only stops it
@@ -63,7 +63,7 @@ def test_cube_on_the_floor_follows_the_tip(stage, dt, direction):
     assert ok
     assert speeds[len(speeds) // 2 :].mean() == pytest.approx(SPEED, rel=0.02)
     assert speeds.max() < stage.hop * SPEED  # no launch
-    assert -impulse[-1] @ WAY[direction] > 0.0
+    assert -impulse[-1] @ DISPLACEMENT[direction] > 0.0
 
 
 def test_push_against_friction_is_the_friction(stage):
@@ -83,7 +83,7 @@ def test_light_and_heavy_cubes_are_not_launched(stage, mass):
     np.testing.assert_allclose(momentum, -impulse[-1], atol=1e-9)
 
 
-def test_cube_that_is_hit_off_its_middle_turns_and_is_not_launched(stage):
+def test_cube_that_is_hit_off_its_middle_rotates_and_is_not_launched(stage):
     speeds, momentum, impulse, ok = push(
         stage, 0.005, "axial", gravity=0.0, duration=0.4, place=[END["axial"][0], 0.03, 0.02]
     )
@@ -116,11 +116,13 @@ def test_cube_that_falls_on_a_long_soft_rod_gains_no_energy(stage, dt):
 
 @pytest.mark.parametrize("dt", [0.002, 0.01])
 def test_body_without_a_word_to_the_rod_gets_the_speed_of_the_capsule(stage, dt):
-    s = stage(soft_robot(), dt=dt, cubes=[Cube(0.04, 0.1, [0.2, RADIUS + 0.001 + 0.02, 0.0])], touch=False)
+    s = stage(
+        soft_robot(), dt=dt, cubes=[Cube(0.04, 0.1, [0.2, RADIUS + 0.001 + 0.02, 0.0])], contact_bodies=False
+    )
     s.rod.settle()
     speeds = []
     for k in range(round(0.3 / dt)):
-        s.carry([0.0, 0.1 * k * dt, 0.0], [0.0, 0.1, 0.0])
+        s.move([0.0, 0.1 * k * dt, 0.0], [0.0, 0.1, 0.0])
         s.rod.step()
         speeds.append(s.velocity()[1])
     assert speeds[-1] == pytest.approx(0.1, rel=0.02)

@@ -19,7 +19,7 @@ from fastrod import save_robot
 from fastrod.errors import EffectError, InputError, UnknownNameError
 from fastrod_envs.painter import ball_mesh, paint, tube_mesh
 from fastrod_envs.randomisation import Randomisation
-from fastrod_envs.registration import SOLVED, task_class
+from fastrod_envs.registration import entry_of, task_class
 from fastrod_envs.rodtask import RodTask
 from fastrod_envs.single import SingleEnv
 from fastrod_envs.task import Backdrop, Ball, DrawnLine, Solid, Tube
@@ -181,7 +181,7 @@ def test_a_number_of_steps_beyond_the_limit_of_make_is_not_cut_in_silence() -> N
 def test_gymnasium_knows_the_length_of_an_episode(name: str) -> None:
     spec = gymnasium.spec(f"fastrod/{name}-v0")
     assert spec.max_episode_steps == task_class(name).n_steps
-    assert (spec.reward_threshold is None) == (name not in SOLVED)
+    assert (spec.reward_threshold is None) == (entry_of(name).solved is None)
 
 
 def test_the_precise_reward_adds_a_term() -> None:

@@ -52,11 +52,11 @@ class Noting:
 
     def hang(self, mass: float) -> None:
         self._note("hang", mass)
-        self.bench.hands.hang(mass)
+        self.bench.assistant.hang(mass)
 
-    def turn(self, quaternion: Floats) -> None:
+    def rotate(self, quaternion: Floats) -> None:
         self._note("turn", float(quaternion[1]))
-        self.bench.hands.turn(quaternion)
+        self.bench.assistant.rotate(quaternion)
 
     def _note(self, what: str, number: float) -> None:
         self.asked.append((what, number))
@@ -86,7 +86,7 @@ def short_run() -> Excitation:
         payload=payload,
         base_quaternion=base,
     )
-    return Excitation(log=log, parts=())
+    return Excitation(log=log, phases=())
 
 
 def circle_plan() -> InversePlan:
@@ -128,13 +128,13 @@ def test_hands_are_asked_in_the_order_of_the_run(bench: EmulatedBench, tmp_path:
 
 def test_the_wires_go_where_the_run_says(bench: EmulatedBench, tmp_path: Path) -> None:
     run = short_run()
-    log = excite(bench.prototype, run, bench.hands, tmp_path / "run.csv")
+    log = excite(bench.prototype, run, bench.assistant, tmp_path / "run.csv")
     log = log.rows(log.t < SECONDS)  # later, hands have taken their time
     asked = np.stack([np.interp(log.t, run.log.t, column) for column in run.log.dl.T], axis=1)
-    # a drive follows its set-point a cycle or two late: 0.02 s of the quickest wire
+    # a drive follows its set-point a cycle or two late: 0.02 s of the quickest tendon
     quickest = np.abs(np.diff(run.log.dl, axis=0)).max() * 15.0
     assert np.abs(log.dl - asked).max() < 0.03 * quickest + 2e-5
-    # and the tip is where a model with these wires has it, to what a body that is a little stiffer leaves
+    # and the tip is where a model with these tendons has it, to what a body that is a little stiffer leaves
     free = log.measured & (log.payload == 0.0)
     state = Simulator(ROBOT, int(free.sum()), dt=0.05).settle(ROBOT.rest_tendon_length + log.dl[free])
     assert np.sqrt(np.mean((state.tip_position - log.tip_position[free]) ** 2)) < 1e-3
@@ -142,7 +142,7 @@ def test_the_wires_go_where_the_run_says(bench: EmulatedBench, tmp_path: Path) -
 
 def test_what_is_returned_is_what_is_on_disk(bench: EmulatedBench, tmp_path: Path) -> None:
     path = tmp_path / "run.csv"
-    log = excite(bench.prototype, short_run(), bench.hands, path)
+    log = excite(bench.prototype, short_run(), bench.assistant, path)
     again = read_log(path, ROBOT)
     for name in ("t", "dl", "tip_position", "payload"):
         assert_array_equal(getattr(again, name), getattr(log, name))
@@ -167,8 +167,8 @@ def test_a_stop_half_way_keeps_the_rows(bench: EmulatedBench, tmp_path: Path) ->
 
 def test_a_plan_is_followed_by_the_model_and_by_the_policy(bench: EmulatedBench, tmp_path: Path) -> None:
     pytest.importorskip("gymnasium", reason="gymnasium is not installed: pip install 'fastrod[envs]'")
-    from fastrod_envs.pilot import PolicyDriver
     from fastrod_envs.policies import Policy, find
+    from fastrod_envs.policy_driver import PolicyDriver
 
     made = circle_plan()
     model = tracking("circle", follow(bench.prototype, made, tmp_path / "model.csv"), made)
@@ -182,8 +182,8 @@ def test_a_plan_is_followed_by_the_model_and_by_the_policy(bench: EmulatedBench,
         on_path = np.isfinite(found.path).all(axis=1)
         assert on_path.sum() == pytest.approx(references(ROBOT.length)["circle"].period * 15.0, abs=4)
         assert found.log.measured[on_path].mean() > 0.9
-    # 20 mm of circle by a body that is some per cent stiffer or softer than the model's: the wires decide, to
-    # some tenths of a millimetre;
+    # 20 mm of circle by a body that is some per cent stiffer or softer than the model's: the tendons decide,
+    # to some tenths of a millimetre;
     # the policy sees the tip, a frame and a latency late: its own residual is about a millimetre
     assert model.distance < 1e-3
     assert policy.distance < 2e-3

@@ -33,7 +33,7 @@ pytest.importorskip("canopen", reason="canopen is not installed: pip install 'fa
 pytest.importorskip("cv2", reason="opencv-python-headless is not installed: pip install 'fastrod[device]'")
 
 SAFE = 0.05  # s
-RADIUS, TURN = 0.0025, 1.0  # m of wire, s
+RADIUS, TURN = 0.0025, 1.0  # m of tendon, s
 _names = itertools.count()
 
 
@@ -106,7 +106,7 @@ class Rig:
 def moving(
     folder: Path, moment: float, *, rate: float = 0.02, following_error: float = 2.5e-4
 ) -> Iterator[Rig]:
-    """With a following error of 1 mm a wire that stalls is found by its tension before."""
+    """With a following error of 1 mm a tendon that stalls is found by its tension before."""
     rig = Rig(folder, rate=rate, following_error=following_error)
     try:
         rig.go_on(moment)
@@ -161,7 +161,7 @@ FAULTS: dict[str, tuple[Callable[[Rig], None], tuple[str, ...]]] = {
     "clock jump": (jump, ("the wall clock jumped by 3.6e+06 ms",)),
     "encoder jump": (
         lambda rig: rig.drives.encoder_jump(0, 2500),
-        ("drive 1 (node 1)", "moved its wire by -1."),
+        ("drive 1 (node 1)", "moved its tendon by -1."),
     ),
     "foreign SYNC": (storm, ("another node sends SYNC (5 since the last cycle)",)),
 }
@@ -223,7 +223,7 @@ def test_a_release_waits_for_the_end_of_the_cause(name: str, tmp_path: Path) -> 
         # its counter is lost: only a new start, with its homing, helps
         if name in ("node reboot", "encoder jump"):
             assert rig.stopped
-            assert "where its wire is may be lost" in rig.prototype.read().problem
+            assert "where its tendon is may be lost" in rig.prototype.read().problem
             return
         assert rig.supervisor.state is SafetyState.READY
         assert all(rig.enabled)

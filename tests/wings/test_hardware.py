@@ -102,13 +102,13 @@ MISTAKES = {
     "pretension that no drive can tell": (
         "pretension = 1.0 ",
         "pretension = 0.1 ",
-        "pretension is 0.1 N; the drive at node 1 tells torque in steps of 0.113 N of its wire, so it must "
+        "pretension is 0.1 N; the drive at node 1 tells torque in steps of 0.113 N of its tendon, so it must "
         "be at least 0.114 N.",
     ),
     "a coarser drive": (
         "node = 3\ndrum_radius = 0.008",
         "node = 3\ndrum_radius = 0.0008",
-        "node 3 tells torque in steps of 1.13 N of its wire, so it must",
+        "node 3 tells torque in steps of 1.13 N of its tendon, so it must",
     ),
     "rate out of range": ("rate = 100.0 ", "rate = 5.0 ", "rate is 5.0; it must be from 50 to 500 Hz."),
     "drum in mm": (

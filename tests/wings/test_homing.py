@@ -1,5 +1,5 @@
 """Homing is watched: what goes wrong on the way stops the drives at once and is named, and a camera that is
-wrong moves no wire far."""
+wrong moves no tendon far."""
 
 from __future__ import annotations
 
@@ -124,11 +124,11 @@ def test_nothing_is_wrong_with_drives_that_do_as_they_are_told() -> None:
         ),
         (
             {"torque": TRANSMISSION.torque(np.array([1.0, 5.5, 1.0, 1.0]))},
-            "the wire of node 2 pulls with 5.56 N; 5 N are allowed",
+            "the tendon of node 2 pulls with 5.56 N; 5 N are allowed",
         ),
         (
             {"torque": TRANSMISSION.torque(np.array([1.0, 1.0, -6.0, 1.0]))},
-            "the wire of node 3 pulls with -6.01 N; 5 N are allowed",
+            "the tendon of node 3 pulls with -6.01 N; 5 N are allowed",
         ),
     ],
 )
@@ -144,7 +144,7 @@ def test_a_drive_that_moves_may_be_further_behind() -> None:
     assert trouble(told, HARDWARE, speed=0.0).startswith("the drive at node 2")
     fast = trouble(told, HARDWARE, speed=0.015)
     assert fast == (
-        "the wire of node 4 pulls with 7.03 N; 5 N are allowed, and the drive at node 2 is 0.12 "
+        "the tendon of node 4 pulls with 7.03 N; 5 N are allowed, and the drive at node 2 is 0.12 "
         "mm from where it was told to be"
     )
     assert "0.3 mm are allowed" in trouble(well(following_error=np.full(4, 600)), HARDWARE, speed=1.0)

@@ -38,8 +38,8 @@ def test_joints_feel_the_wrench_through_the_transposed_jacobian(seed):
     rod.begin(tip_force=(0.5, 0.2, -0.3), tip_moment=(0.01, 0.02, -0.01))
     felt = mass @ (rates() - free) / world.dt
     world.restoreState(start)
-    _, _, _, _, frame, turn = world.getLinkState(arm, n - 1, computeForwardKinematics=1)[:6]
-    local, _ = world.multiplyTransforms(*world.invertTransform(frame, turn), point.tolist(), [0, 0, 0, 1])
+    _, _, _, _, frame, rotation = world.getLinkState(arm, n - 1, computeForwardKinematics=1)[:6]
+    local, _ = world.multiplyTransforms(*world.invertTransform(frame, rotation), point.tolist(), [0, 0, 0, 1])
     by_rate = np.concatenate(world.calculateJacobian(arm, n - 1, local, q.tolist(), rate.tolist(), [0.0] * n))
     expected = by_rate.T @ rod.wrench
     assert np.abs(expected).max() > 0.1
@@ -58,8 +58,8 @@ def test_free_body_feels_force_and_moment(inertial):
     world.changeDynamics(body, -1, linearDamping=0.0, angularDamping=0.0)
     link = BulletLink(world, body, **MOUNT)
     wrench = np.array([0.5, -0.3, 0.2, 0.02, 0.01, -0.03])
-    com, turn = world.getBasePositionAndOrientation(body)
-    rotation = matrix_from_quaternion(from_xyzw(turn)[None])[0]
+    com, rotation = world.getBasePositionAndOrientation(body)
+    rotation = matrix_from_quaternion(from_xyzw(rotation)[None])[0]
     inertia = rotation @ np.diag(world.getDynamicsInfo(body, -1)[2]) @ rotation.T
     moment = wrench[3:] + np.cross(link.motion().pose[:3] - com, wrench[:3])
     link.exert(wrench)
@@ -83,8 +83,8 @@ def test_motion_of_the_base_is_the_derivative_of_its_pose(seed):
     after, before, motion = pose(h), pose(-h), (pose(0.0), link.motion())[1]
     # poses in single precision: 1e-7 / h
     np.testing.assert_allclose((after - before)[:3] / (2 * h), motion.velocity[:3], atol=2e-4)
-    turn = matrix_from_quaternion(after[None, 3:])[0] @ matrix_from_quaternion(before[None, 3:])[0].T
-    spin = np.array([turn[2, 1], turn[0, 2], turn[1, 0]]) / (2 * h)
+    rotation = matrix_from_quaternion(after[None, 3:])[0] @ matrix_from_quaternion(before[None, 3:])[0].T
+    spin = np.array([rotation[2, 1], rotation[0, 2], rotation[1, 0]]) / (2 * h)
     np.testing.assert_allclose(spin, motion.velocity[3:], atol=5e-4)
     predicted = motion.after(h)
     np.testing.assert_allclose(predicted[:3], after[:3], atol=1e-6)
@@ -101,7 +101,7 @@ def test_base_of_a_body_is_its_frame_and_not_its_centre_of_mass():
     np.testing.assert_allclose(link_motion(world, body, -1).velocity[:3], [0.2, 0.0, 0.0], atol=1e-6)
 
 
-def test_rod_follows_a_host_that_moves_and_turns():
+def test_rod_follows_a_host_that_moves_and_rotates():
     world, robot = empty_world(), soft_robot()
     link = carrier(world)
     rod = MountedRod(robot, link)
@@ -111,11 +111,11 @@ def test_rod_follows_a_host_that_moves_and_turns():
         link.body, [0.3, -0.2, 0.1], to_xyzw([0.5, 0.5, -0.5, 0.5]).tolist()
     )
     rod.step()
-    turn = matrix_from_quaternion(np.array([[0.5, 0.5, -0.5, 0.5]]))[0]
-    np.testing.assert_allclose(rod.state.tip_position[0], [0.3, -0.2, 0.1] + turn @ rest, atol=1e-6)
+    rotation = matrix_from_quaternion(np.array([[0.5, 0.5, -0.5, 0.5]]))[0]
+    np.testing.assert_allclose(rod.state.tip_position[0], [0.3, -0.2, 0.1] + rotation @ rest, atol=1e-6)
 
 
-def test_capsules_lie_along_the_backbone_and_turn_with_it():
+def test_capsules_lie_along_the_backbone_and_rotate_with_it():
     world, robot = empty_world(), soft_robot()
     rod = MountedRod(robot, carrier(world), points_per_segment=10, capsules_per_segment=5)
     state = rod.settle(tendon_length=robot.rest_tendon_length + np.array([-8, 0, 8, 0, -8, -5, 8, 5]) * 1e-3)
@@ -152,7 +152,7 @@ def test_worlds_do_not_disturb_each_other():
     assert one.getNumBodies() == 1
 
 
-def test_two_rods_in_one_world_share_a_step():
+def test_two_rods_in_one_world_take_one_step():
     world, robot = empty_world(gravity=9.81), soft_robot(line_density=0.5)
     rods = [MountedRod(robot, carrier(world, axis)) for axis in ("z", "x")]
     falling = cube(world, 0.04, 0.1, [1.0, 1.0, 1.0])

@@ -1,4 +1,4 @@
-"""What links offer beyond driving and reading, found and used; and what a link without it is driven like."""
+"""What links offer beyond driving and reading is found and used; a link without it is driven all the same."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from fastrod.errors import InputError
 from fastrod.logs.recording import Recorder
 from fastrod.logs.runlog import read_log
 from fastrod.logs.simulated import SimulatedRobot
+from fastrod_viewer.controls import drive_controls
 from fastrod_viewer.drive_page import far_rows, fitted
-from fastrod_viewer.knobs import drive_knobs
 from fastrod_viewer.linked import Linked, TendonLimits
-from fastrod_viewer.pilot import Speeds, Teleop
 from fastrod_viewer.session import Session
+from fastrod_viewer.teleop import Speeds, Teleop
 from fastrod_viewer.worlds import FreeWorld
 
 DT = 1.0 / 30.0
@@ -55,7 +55,7 @@ class Watched:
         self.sighting = SimpleNamespace(t=6.96, flag="")
         self.readings = SimpleNamespace(dl=np.zeros(4), tension=np.array([1.0, 2.0, 3.0, 4.0]))
         self.glides: list[tuple[np.ndarray, float]] = []
-        self.asked = 0
+        self.requested = 0
         self.rows = 0
 
     @property
@@ -74,7 +74,7 @@ class Watched:
         self.halt("a button")
 
     def release(self) -> None:
-        self.asked += 1
+        self.requested += 1
 
     def settle(self) -> None:
         self.inner.release()
@@ -99,83 +99,83 @@ def until(holds: Callable[[], bool], seconds: float = 30.0) -> bool:
 
 def driven(link: object) -> Session:
     world = FreeWorld(fastrod.load_robot("prototype"))
-    return Session(world, Teleop(world, reach=Linked(link).reach), draw=lambda frame: None, link=link)
+    return Session(world, Teleop(world, limits=Linked(link).limits), draw=lambda frame: None, link=link)
 
 
-def test_wires_keep_to_the_rate_of_the_link_and_go_straight() -> None:
+def test_tendons_keep_to_the_rate_of_the_link_and_go_straight() -> None:
     world = FreeWorld(fastrod.load_robot("prototype"))
-    pilot = Teleop(world, Speeds(bend=20.0), reach=TendonLimits(rate=0.004))
-    pilot.bend(0, 0.4, 0.2)
-    pilot.wire(0, -0.004)
-    told = [world.robot.rest_tendon_length]
-    while not pilot.arrived:
-        told.append(pilot.step(DT).tendon_length)
-    steps = np.diff(told, axis=0)
+    teleop = Teleop(world, Speeds(bend=20.0), limits=TendonLimits(rate=0.004))
+    teleop.bend(0, 0.4, 0.2)
+    teleop.change_tendon(0, -0.004)
+    held = [world.robot.rest_tendon_length]
+    while not teleop.arrived:
+        held.append(teleop.step(DT).tendon_length)
+    steps = np.diff(held, axis=0)
     assert np.abs(steps).max() <= 0.004 * DT * (1.0 + 1e-9)
     assert np.abs(steps).max(axis=1)[:-1] == pytest.approx(0.004 * DT, rel=1e-9)  # as fast as it may
-    np.testing.assert_allclose(told[-1] - told[0], pilot.change, atol=1e-15)
+    np.testing.assert_allclose(held[-1] - held[0], teleop.change, atol=1e-15)
 
 
-def test_bends_and_knobs_end_where_the_wires_do() -> None:
+def test_bends_and_controls_end_where_the_tendons_do() -> None:
     world = FreeWorld(fastrod.load_robot("prototype"))
-    pilot = Teleop(world, reach=TendonLimits(displacement=0.005))
-    pilot.bend(0, 9.0, -9.0)
-    assert np.abs(pilot.change).max() < 0.005
-    groups = {group.title: group for group in drive_knobs(world, pilot)}
-    assert groups["Segment 1"].knobs[0].high == np.floor(np.degrees(0.005 / 0.0075))
-    assert groups["Wires"].knobs[0].high < 5.0
+    teleop = Teleop(world, limits=TendonLimits(displacement=0.005))
+    teleop.bend(0, 9.0, -9.0)
+    assert np.abs(teleop.change).max() < 0.005
+    groups = {group.title: group for group in drive_controls(world, teleop)}
+    assert groups["Segment 1"].controls[0].high == np.floor(np.degrees(0.005 / 0.0075))
+    assert groups["Tendons"].controls[0].high < 5.0
     assert "Base" not in groups  # nothing moves the base of a robot at the other end
 
 
 @pytest.mark.parametrize("name", ["displacement", "rate"])
-def test_a_reach_is_positive(name: str) -> None:
-    with pytest.raises(InputError, match=f"Reach.{name} is 0.0; it must be positive"):
+def test_a_limit_is_positive(name: str) -> None:
+    with pytest.raises(InputError, match=f"TendonLimits.{name} is 0.0; it must be positive"):
         TendonLimits(**{name: 0.0})
 
 
 def test_a_link_that_offers_nothing_is_driven_all_the_same() -> None:
     link = SimulatedRobot(fastrod.load_robot("prototype"))
     far = Linked(link)
-    assert far.reach == TendonLimits()
+    assert far.limits == TendonLimits()
     assert far.ready
     assert not far.stopped
     assert (far.status, far.camera(), far.picture(), far.sees) == ("", "", None, False)
     far.command(np.array([-0.001, 0.0, 0.001, 0.0]), np.zeros(1), DT)
-    np.testing.assert_array_equal(far.told()[0], [-0.001, 0.0, 0.001, 0.0])
-    np.testing.assert_array_equal(far.standing()[0], far.told()[0])
+    np.testing.assert_array_equal(far.held()[0], [-0.001, 0.0, 0.001, 0.0])
+    np.testing.assert_array_equal(far.standing()[0], far.held()[0])
 
 
-def test_a_link_that_glides_is_told_for_how_long() -> None:
+def test_a_link_that_glides_knows_for_how_long() -> None:
     link = Watched()
     session = driven(link)
     session.start()
-    session.pilot.bend(0, 0.3, 0.0)
-    session.touch()
-    assert until(lambda: session.pilot.arrived and len(link.glides) > 20)
+    session.teleop.bend(0, 0.3, 0.0)
+    session.wake()
+    assert until(lambda: session.teleop.arrived and len(link.glides) > 20)
     session.close()
-    told = np.array([dl for dl, _ in link.glides])
+    held = np.array([dl for dl, _ in link.glides])
     seconds = np.array([s for _, s in link.glides])
-    assert (np.abs(np.diff(told, axis=0)).max(axis=1) <= 0.004 * seconds[1:] + 1e-12).all()
-    assert told[-1][0] == pytest.approx(-0.3 * 0.0075)
+    assert (np.abs(np.diff(held, axis=0)).max(axis=1) <= 0.004 * seconds[1:] + 1e-12).all()
+    assert held[-1][0] == pytest.approx(-0.3 * 0.0075)
 
 
 def test_a_fault_stops_the_session_which_waits_until_the_link_is_ready() -> None:
     link = Watched()
     session = driven(link)
     session.start()
-    session.pilot.bend(0, 0.5, 0.0)
-    session.touch()
+    session.teleop.bend(0, 0.5, 0.0)
+    session.wake()
     assert until(lambda: link.readings.dl[0] < -3e-4)
-    link.halt("a wire broke")
+    link.halt("a tendon broke")
     assert until(lambda: session.stopped)
     link.readings.dl = np.array([-0.001, 0.0, 0.001, 0.0])  # where it came to rest
     n = len(link.glides)
-    session.pilot.bend(0, 0.6, 0.0)
+    session.teleop.bend(0, 0.6, 0.0)
     # the model stands as the encoders say
-    assert until(lambda: session.pilot.bent(0)[0] == pytest.approx(0.001 / 0.0075))
+    assert until(lambda: session.teleop.bent(0)[0] == pytest.approx(0.001 / 0.0075))
     time.sleep(1.1)  # sooner it is ignored
     session.release()
-    assert link.asked == 1
+    assert link.requested == 1
     time.sleep(0.2)
     assert session.stopped
     assert session.releasing
@@ -191,20 +191,20 @@ def test_a_real_robot_is_not_released_within_a_second_of_a_stop() -> None:
     link = Watched()
     session = driven(link)
     session.release()
-    assert link.asked == 0  # nothing is stopped
+    assert link.requested == 0  # nothing is stopped
     session.stop()
     for _ in range(2):
         session.release()
-    assert (session.stopped, session.releasing, session.hasty, link.asked) == (True, False, True, 0)
+    assert (session.stopped, session.releasing, session.hasty, link.requested) == (True, False, True, 0)
     time.sleep(0.9)
     session.stop()
     time.sleep(0.2)
     session.release()
-    assert link.asked == 0  # it counts from the last stop
+    assert link.requested == 0  # it counts from the last stop
     time.sleep(0.9)
     session.release()
     session.release()
-    assert (session.releasing, session.hasty, link.asked) == (True, False, 1)  # one release at a time
+    assert (session.releasing, session.hasty, link.requested) == (True, False, 1)  # one release at a time
     session.stop()
     assert (session.stopped, session.releasing) == (True, False)
     session.close()
@@ -224,7 +224,7 @@ def test_a_simulated_robot_is_released_at_once() -> None:
     session.close()
 
 
-def test_when_nobody_watches_the_guard_is_told_so() -> None:
+def test_when_nobody_watches_the_guard_hears_so() -> None:
     link = Watched()
     session = driven(link)
     session.nobody()
@@ -237,7 +237,7 @@ def test_figures_of_a_link() -> None:
     link = Watched()
     far, now = Linked(link), link.read()
     assert far_rows(far, now) == [
-        ("Wires pull", "1.00 · 2.00 · 3.00 · 4.00 N"),
+        ("Tendons pull", "1.00 · 2.00 · 3.00 · 4.00 N"),
         ("Camera", "marker seen 40 ms ago"),
     ]
     link.sighting = SimpleNamespace(t=6.99, flag="no marker")
@@ -255,7 +255,7 @@ def test_a_recording_of_a_link_begins_by_its_clock(tmp_path: Path) -> None:
     for _ in range(60):
         world.play()
     session = Session(world, Teleop(world), draw=lambda frame: None, link=link)
-    session.ask(lambda: session.record(tmp_path / "a.csv"))
+    session.submit(lambda: session.record(tmp_path / "a.csv"))
     session.start()
     assert until(lambda: session.recorder is not None and len(session.recorder) > 5)
     session.close()
@@ -279,7 +279,7 @@ def test_a_link_that_records_fills_the_log_by_itself(tmp_path: Path) -> None:
 
     link = Own()
     session = driven(link)
-    session.ask(lambda: session.record(tmp_path / "a.csv"))
+    session.submit(lambda: session.record(tmp_path / "a.csv"))
     session.start()
     assert until(lambda: link.to is not None)
     assert link.to is not None

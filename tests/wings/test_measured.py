@@ -208,7 +208,7 @@ def test_nominal_replay_of_the_beam_is_an_unshearable_rod() -> None:
 
 
 @needs_data
-def test_motors_of_the_trunk_follow_what_they_are_told_late() -> None:
+def test_motors_of_the_trunk_follow_their_commands_late() -> None:
     """Why it matters whether `dl` is commanded or measured: on the wandering run they are 11.5 deg apart
     (rms, to 80 deg of motion)."""
     log, _ = asl_trunk(DATA / "asl_trunk.csv", run="perlin_0g")

@@ -15,7 +15,7 @@ from fastrod.contact import ContactScene
 from fastrod.errors import HostError, InputError, RobotError
 from fastrod.hosts import MujocoBody, MujocoRod, add_capsules
 from fastrod.hosts.mujoco_body import com_motion, refresh
-from fastrod.hosts.mujoco_touched import MujocoBodyContact
+from fastrod.hosts.mujoco_body_contact import MujocoBodyContact
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.simulator import Simulator
 from fastrod_scenes.ur5.mujoco_arm import JOINTS, MujocoArm, arm_spec
@@ -63,12 +63,12 @@ def test_joints_feel_the_wrench_through_the_transposed_jacobian(seed):
     point = rod.host.motion().pose[:3]
     rod.begin(tip_force=(0.5, 0.2, -0.3), tip_moment=(0.01, 0.02, -0.01))
     mujoco.mj_forward(model, data)
-    mass, by_point, by_turn = np.zeros((6, 6)), np.zeros((3, 6)), np.zeros((3, 6))
+    mass, by_point, by_angle = np.zeros((6, 6)), np.zeros((3, 6)), np.zeros((3, 6))
     mujoco.mj_fullM(model, data, mass)
-    mujoco.mj_jac(model, data, by_point, by_turn, point, rod.host.body)
+    mujoco.mj_jac(model, data, by_point, by_angle, point, rod.host.body)
     mujoco.mj_step(model, data)
     felt = mass @ (data.qvel - free.qvel) / rod.dt
-    expected = np.concatenate([by_point, by_turn]).T @ rod.wrench
+    expected = np.concatenate([by_point, by_angle]).T @ rod.wrench
     assert np.abs(data.qvel - start).max() > 0.0
     assert np.abs(expected).max() > 0.1
     np.testing.assert_allclose(felt, expected, atol=1e-8 * np.abs(expected).max())
@@ -84,9 +84,17 @@ def test_motion_of_the_base_is_the_derivative_of_its_pose():
 
     after, before, now = pose(h), pose(-h), (pose(0.0), link.motion())[1]
     np.testing.assert_allclose((after - before)[:3] / (2 * h), now.velocity[:3], atol=1e-8)
-    turn = matrix_from_quaternion(after[None, 3:])[0] @ matrix_from_quaternion(before[None, 3:])[0].T
+    rotation = matrix_from_quaternion(after[None, 3:])[0] @ matrix_from_quaternion(before[None, 3:])[0].T
     spin = (
-        0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / (2 * h)
+        0.5
+        * np.array(
+            [
+                rotation[2, 1] - rotation[1, 2],
+                rotation[0, 2] - rotation[2, 0],
+                rotation[1, 0] - rotation[0, 1],
+            ]
+        )
+        / (2 * h)
     )
     np.testing.assert_allclose(spin, now.velocity[3:], atol=1e-8)
 
@@ -160,12 +168,13 @@ def test_every_geom_is_an_obstacle_where_it_is():
     data = mujoco.MjData(model)
     refresh(model, data)
     for name in shapes:
-        touched = MujocoBodyContact(model, data, model.body(name).id, dt=0.005, relaxation=0.1, friction=0.3)
-        assert [part.obstacle.shape for part in touched.parts] == [name]
-        pose = touched.expected([])[0][name]
+        contact = MujocoBodyContact(model, data, model.body(name).id, dt=0.005, relaxation=0.1, friction=0.3)
+        assert [shape.obstacle.shape for shape in contact.shapes] == [name]
+        pose = contact.expected([])[0][name]
         robot = soft_robot(1)
         sim = Simulator(
-            robot, contact=ContactScene(obstacles=[touched.parts[0].obstacle], rod_radius=0.001, mounting=0.0)
+            robot,
+            contact=ContactScene(obstacles=[contact.shapes[0].obstacle], rod_radius=0.001, mounting=0.0),
         )
         # the rod's base is where the probe is, and its tip beside it: both must be as far from the body
         state = sim.settle(
@@ -181,14 +190,14 @@ def test_every_geom_is_an_obstacle_where_it_is():
         assert min(ends) > 0.0
         assert 0.0 < sim.clearance()[0] <= min(ends) + 1e-5
         np.testing.assert_allclose(
-            touched.com().pose[:3], com_motion(model, data, model.body(name).id).pose[:3]
+            contact.com().pose[:3], com_motion(model, data, model.body(name).id).pose[:3]
         )
 
 
 def stand(ball=BALL, **options):
     """A straight rod on a post, and a ball that its capsules may meet."""
     spec, robot = spec_of(POST + ball), soft_robot()
-    add_capsules(spec, robot, "post", touch=options.get("touch", ()))
+    add_capsules(spec, robot, "post", contact_bodies=options.get("contact_bodies", ()))
     model = spec.compile()
     data = mujoco.MjData(model)
     return MujocoRod(robot, model, data, "post", **options), model, data
@@ -244,8 +253,8 @@ def test_step_that_fails_in_contact_leaves_the_felt_force_and_nothing_of_its_own
     assert np.abs(force).max() > 0.0
     lost = dataclasses.replace(last, ok=np.array([False]), problems={0: "it stands."})
     with monkeypatch.context() as patch:
-        for way in ("step", "settle"):
-            patch.setattr(rod.simulator, way, lambda *a, **b: lost)
+        for method in ("step", "settle"):
+            patch.setattr(rod.simulator, method, lambda *a, **b: lost)
         patch.setattr(rod.simulator, "_state", lost)
         patch.setattr(rod.simulator, "_warm", np.array([False]))
         rod.step()
@@ -319,7 +328,7 @@ def test_rod_stands_on_the_world_too():
     assert rod.wrench[2] == pytest.approx(0.0, abs=1e-12)
 
 
-def test_servos_hold_the_arm_where_it_is_told():
+def test_servos_hold_the_arm_where_it_is_commanded():
     spec = arm_spec(0.005)
     model = spec.compile()
     data = mujoco.MjData(model)
@@ -363,7 +372,11 @@ def test_servos_hold_the_arm_where_it_is_told():
         ({"head_color": "red"}, InputError, r"^head_color is 'red'; give red, green, blue and opacity"),
         ({"friction": np.nan}, InputError, r"^friction is nan; it must be a number, zero or positive\.$"),
         ({"friction": -1}, InputError, r"^friction is -1; it must be a number, zero or positive\.$"),
-        ({"touch": "ball"}, HostError, r"^touch is 'ball'; give a list of bodies, as touch=\['ball'\]\.$"),
+        (
+            {"contact_bodies": "ball"},
+            HostError,
+            r"^contact_bodies is 'ball'; give a list of bodies, as contact_bodies=\['ball'\]\.$",
+        ),
     ],
 )
 def test_capsules_that_no_model_can_have_are_a_sentence(options, error, sentence):
@@ -377,8 +390,8 @@ def test_rod_of_a_model_asks_for_a_robot_and_a_list():
     rod, model, data = stand()
     with pytest.raises(RobotError, match=r"^robot is 'prototype'; give one Robot"):
         MujocoRod("prototype", model, data, "post")
-    with pytest.raises(HostError, match=r"^touch is 'ball'; give a list of bodies"):
-        MujocoRod(soft_robot(), model, data, "post", touch="ball")
+    with pytest.raises(HostError, match=r"^contact_bodies is 'ball'; give a list of bodies"):
+        MujocoRod(soft_robot(), model, data, "post", contact_bodies="ball")
     rod.step(tip_force=(0.1, 0.0, 0.0))
     assert rod.wrench.any()
     rod.reset()
@@ -417,9 +430,9 @@ def test_what_is_not_there_is_a_sentence(monkeypatch):
         ({"body": "pots"}, r"^the model has no body 'pots'; did you mean 'post'\?"),
         ({"body": 99}, r"^body is 99; give the name of a body, or its number from 0 \(the world\) to 23\.$"),
         (
-            {"touch": ["ball"]},
+            {"contact_bodies": ["ball"]},
             r"^the capsules of 'rod' collide with 'ball', .*; name it in add_capsules\(\.\.\., "
-            r"touch=\[\.\.\.\]\) too\.$",
+            r"contact_bodies=\[\.\.\.\]\) too\.$",
         ),
         (
             {"quaternion": (1, 1, 0, 0)},

@@ -27,7 +27,7 @@ _names = itertools.count()
 
 
 class Loose:
-    """Wires fastened to nothing."""
+    """Tendons fastened to nothing."""
 
     def move(self, t: float, pulled: Floats) -> Floats:
         return np.zeros_like(pulled)
@@ -40,7 +40,7 @@ class Wire:
         name = f"virtual:nodes-{next(_names)}"
         self.clock = SteppedClock() if clock is None else clock
         self.bus = open_bus(name)
-        self.nodes = EmulatedDrives([SPEC], name, clock=self.clock, wires=Loose(), torque_noise=0.0)
+        self.nodes = EmulatedDrives([SPEC], name, clock=self.clock, tendons=Loose(), torque_noise=0.0)
 
     def send(self, cob_id: int, data: bytes = b"") -> None:
         import can
@@ -245,12 +245,12 @@ def test_a_motor_pulls_no_harder_than_its_greatest_torque(way):
             motor.written((0x607A, 0), way * 20 * k)
             motor.setpoint()
             motor.advance(0.01)
-            motor.torque = 0.5 * motor.x  # a wire as a spring
+            motor.torque = 0.5 * motor.x  # a tendon as a spring
         return motor
 
     free, held = pulled(3000), pulled(200)
-    assert free.told_torque() == pytest.approx(way * 0.5 * 20 * 59, abs=12)
-    assert held.told_torque() == way * 200
+    assert free.reported_torque() == pytest.approx(way * 0.5 * 20 * 59, abs=12)
+    assert held.reported_torque() == way * 200
     assert 400 <= way * held.x < 425  # 200 / 0.5, and one step until the torque is known
     assert way * held.following_error() > 700
     held.written((0x607A, 0), 0)
@@ -438,7 +438,7 @@ def test_wires_that_fail_are_told_when_it_is_closed():
 
     name = f"virtual:nodes-{next(_names)}"
     bus, clock = open_bus(name), SteppedClock()
-    nodes = EmulatedDrives([SPEC], name, clock=clock, wires=Broken())
+    nodes = EmulatedDrives([SPEC], name, clock=clock, tendons=Broken())
     import can
 
     clock.sleep_until(0.1)
@@ -454,9 +454,9 @@ def test_wires_that_fail_are_told_when_it_is_closed():
 
 def test_bad_input():
     with pytest.raises(InputError, match="rate is 0"):
-        EmulatedDrives([SPEC], "virtual:none", clock=SteppedClock(), wires=Loose(), rate=0)
+        EmulatedDrives([SPEC], "virtual:none", clock=SteppedClock(), tendons=Loose(), rate=0)
     with pytest.raises(InputError, match="each once"):
-        EmulatedDrives([SPEC, SPEC], "virtual:none", clock=SteppedClock(), wires=Loose())
+        EmulatedDrives([SPEC, SPEC], "virtual:none", clock=SteppedClock(), tendons=Loose())
     with Wire() as wire, pytest.raises(InputError, match="there is no drive 1"):
         wire.nodes.block(1)
 

@@ -23,7 +23,7 @@ def test_any_cube_ends_on_the_spot(scene: type[PickSuction | PickGripper], seed:
     )
     figures = scene(cube).check()
     assert figures["off the spot, m"] < scene.accuracy
-    assert figures["way sideways, m"] == pytest.approx(0.16 - start[1], abs=2e-3)
+    assert figures["displacement sideways, m"] == pytest.approx(0.16 - start[1], abs=2e-3)
 
 
 def pull(stage: Picking) -> float:

@@ -26,7 +26,7 @@ from fastrod_device.seal import KINDS, NAMES, Seal, seal
 
 DOWN = np.array([0.0, 0.0, -1.0])
 STILL = np.zeros(3)
-STIFF = 1e-9  # m/N: wires that do not stretch
+STIFF = 1e-9  # m/N: tendons that do not stretch
 ABOUT_X = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)
 
 
@@ -97,8 +97,8 @@ def test_without_load_it_is_an_arc(bend: float) -> None:
         rtol=0,
         atol=2e-7,
     )
-    # EI u = sum of tension times distance, shared by the two wires of the pair; 1e-9 m/N makes newtons of the
-    # last picometres
+    # EI u = sum of tension times distance, shared by the two tendons of the pair; 1e-9 m/N makes newtons of
+    # the last picometres
     assert_allclose(
         rest.tension, EI * bend / (2.0 * OFFSET * LENGTH) * np.array([1.0, 0.0, -1.0, 0.0]), rtol=0, atol=0.05
     )
@@ -182,7 +182,7 @@ def test_a_wire_whose_strands_settle_gives_less_the_more_it_is_pulled() -> None:
 )
 def test_a_mass_pulls_down_in_the_world_however_the_base_stands(quaternion: tuple[float, ...]) -> None:
     robot = Plant(seal(0, "none"))
-    robot.turn(quaternion)
+    robot.rotate(quaternion)
     free, _ = robot.tip()
     robot.hang(0.005)
     pulled, _ = robot.tip()
@@ -196,7 +196,7 @@ def test_a_mass_pulls_down_in_the_world_however_the_base_stands(quaternion: tupl
 def test_hidden_weight_turns_with_the_base_and_a_mass_adds_to_it() -> None:
     robot = Plant(seal(3, "gravity"))
     upright, _ = robot.tip()
-    robot.turn(ABOUT_X)  # y of the base is up
+    robot.rotate(ABOUT_X)  # y of the base is up
     aside, _ = robot.tip()
     weight = seal(3, "gravity").open()["gravity"]["weight"]
     assert_allclose(upright, [0.0, 0.0, LENGTH], rtol=0, atol=1e-9)
@@ -211,7 +211,7 @@ def test_what_all_wires_share_passes_through() -> None:
     robot = Plant(hidden("friction"))
     robot.advance(0.0, np.zeros(4))
     robot.advance(0.01, np.full(4, -1e-4))
-    # a backbone of fixed length: each wire stretches by what it is pulled
+    # a backbone of fixed length: each tendon stretches by what it is pulled
     assert_allclose(robot.tension(), 1e-4 / plant_rod.COMPLIANCE, rtol=1e-9)
 
 
@@ -224,7 +224,7 @@ def test_tensions_between_two_shapes_are_those_of_the_shape() -> None:
         other.advance(t, dl)
         other.tip()
         rod_now = PlantRod().rest(dl, STILL, DOWN)
-        # 1/30 s of this motion bends by 0.05 rad, and what is of second order in it meets wires of 1e5 N/m
+        # 1/30 s of this motion bends by 0.05 rad, and what is of second order in it meets tendons of 1e5 N/m
         assert_allclose(one.tension(), rod_now.tension, rtol=0, atol=0.02)
         assert_allclose(other.tension(), rod_now.tension, rtol=0, atol=0.02)
 
@@ -262,7 +262,7 @@ def test_friction_loses_the_sealed_bend_and_more_the_further_it_bends() -> None:
     lost["down", 1.0] = bend_of(robot.tip()[1])
     drive(robot, [3.01, 4.0], [(1.0, 0.0), (0.3, 0.0)])
     lost["down", 0.3] = bend_of(robot.tip()[1])
-    stretch = 1.0 + EI / LENGTH * plant_rod.COMPLIANCE / (2.0 * OFFSET**2)  # of the wires themselves
+    stretch = 1.0 + EI / LENGTH * plant_rod.COMPLIANCE / (2.0 * OFFSET**2)  # of the tendons themselves
     slid = 1.0 - math.exp(-0.6 / numbers["late"])
     for bend in (0.3, 1.0):
         claim = numbers["loss"] * math.exp(numbers["growth"] * bend)
@@ -331,11 +331,11 @@ def test_stretch_loses_the_sealed_share_of_a_small_bend_and_lets_a_load_turn_the
     lost = hidden("tendon_stretch").open()["tendon_stretch"]["gain_loss"]
     robot = Plant(hidden("tendon_stretch"))
     robot.advance(0.0, wires(0.05, 0.0))
-    # beside it the wires' own 0.3 percent
+    # beside it the tendons' own 0.3 percent
     assert bend_of(robot.tip()[1]) == pytest.approx(0.05 * (1.0 - lost), rel=0.01)
     loaded, plain = Plant(hidden("tendon_stretch")), Plant(seal(0, "none"))
     for it in (loaded, plain):
-        it.turn(ABOUT_X)
+        it.rotate(ABOUT_X)
         it.hang(0.05)
     assert bend_of(loaded.tip()[1]) > 5.0 * bend_of(plain.tip()[1])
 
@@ -365,7 +365,7 @@ def test_latency_is_the_past_of_the_motion_and_the_tip_itself_is_not_late() -> N
 
 def test_a_load_is_seen_as_late_as_the_motion() -> None:
     robot = Plant(hidden("latency"))
-    robot.turn(ABOUT_X)
+    robot.rotate(ABOUT_X)
     for k in range(100):
         robot.advance(0.01 * k, np.zeros(4))
     before = robot.tip()[0]
@@ -421,7 +421,7 @@ def test_ripple_comes_again_with_every_turn_of_the_drum() -> None:
 def test_every_effect_moves_the_tip_by_millimetres(kind: str, seed: int) -> None:
     robot, plain, apart = Plant(seal(seed, kind)), Plant(seal(0, "none")), []
     for it in (robot, plain):
-        it.turn(ABOUT_X)
+        it.rotate(ABOUT_X)
     rng = np.random.default_rng(9)
     frequency, phase = rng.uniform(0.02, 0.2, (2, 3)), rng.uniform(0.0, 6.0, (2, 3))
     for k in range(3001):  # 120 s
@@ -517,7 +517,7 @@ def test_wrong_inputs_say_so_and_leave_the_plant_as_it_was() -> None:
     robot.advance(1.0, wires(0.2, 0.2))
     before = robot.tip()[0]
     for wrong in ([0.0] * 3, [0.0] * 5, [0.0, 0.0, "a", 0.0], np.zeros((4, 1)), None):
-        with pytest.raises(InputError, match="it must be four lengths of wire"):
+        with pytest.raises(InputError, match="it must be four lengths of tendon"):
             robot.advance(1.1, wrong)
     for far in (
         [math.nan, 0.0, 0.0, 0.0],
@@ -535,7 +535,7 @@ def test_wrong_inputs_say_so_and_leave_the_plant_as_it_was() -> None:
             robot.hang(mass)
     for turn in ((1.0, 1.0, 0.0, 0.0), (1.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 0.0)):
         with pytest.raises(InputError, match="it must be a unit quaternion"):
-            robot.turn(turn)
+            robot.rotate(turn)
     with pytest.raises(InputError, match="it must be finite"):
         robot.tip(math.nan)
     assert_allclose(robot.tip()[0], before, rtol=0, atol=1e-12)

@@ -80,10 +80,10 @@ def test_the_drawn_tip_is_the_predicted_tip(demo: RunLog, robot: Robot) -> None:
 
 def test_a_camera_sees_the_whole_backbone_move(demo: RunLog) -> None:
     plain, seen = (Playback.of(demo, robot, frames=50).before.shapes for robot in (ROBOT, with_(CAMERA)))
-    turn = matrix_from_quaternion(np.array([np.cos(0.05), 0.0, np.sin(0.05), 0.0]))
+    rotation = matrix_from_quaternion(np.array([np.cos(0.05), 0.0, np.sin(0.05), 0.0]))
     # of two step sizes
-    assert_allclose(seen.position, plain.position @ turn.T + (0.004, 0.0, 0.0), rtol=0, atol=2e-5)
-    assert_allclose(seen.rotation, turn @ plain.rotation, rtol=0, atol=1e-3)
+    assert_allclose(seen.position, plain.position @ rotation.T + (0.004, 0.0, 0.0), rtol=0, atol=2e-5)
+    assert_allclose(seen.rotation, rotation @ plain.rotation, rtol=0, atol=1e-3)
 
 
 def test_a_marker_stands_off_the_tip(demo: RunLog) -> None:

@@ -79,7 +79,7 @@ def bench(
     change: Callable[[CameraFrame], CameraFrame] | None = None,
     journal: Journal | None = None,
 ) -> Iterator[tuple[Prototype, Emulator]]:
-    """Started, with wires that have their pretension at power-on; `change` is made to each frame."""
+    """Started, with tendons that have their pretension at power-on; `change` is made to each frame."""
     clock, bus = SteppedClock() if clock is None else clock, f"virtual:prototype-{next(_names)}"
     with pytest.MonkeyPatch.context() as patch:
         if not clock.stepped:  # drives that bear a busy machine, too
@@ -169,8 +169,8 @@ def test_a_release_of_what_is_not_stopped_does_nothing() -> None:
     ("told", "words"),
     [
         ({"dl": [-0.0081, 0.0, 0.0081, 0.0]}, "the limit is|limit is 8 mm"),
-        ({"dl": [0.0, np.nan, 0.0, 0.0]}, "wire 2 was told nan m"),
-        ({"dl": [0.0, 0.0, np.inf, 0.0]}, "wire 3 was told inf m"),
+        ({"dl": [0.0, np.nan, 0.0, 0.0]}, "tendon 2 was told nan m"),
+        ({"dl": [0.0, 0.0, np.inf, 0.0]}, "tendon 3 was told inf m"),
         ({"dl": [0.0, 0.0, 0.0]}, "shape"),
         ({"dl": ["a", 0.0, 0.0, 0.0]}, "4 numbers"),
         ({"dl": BENT, "ext": [0.001]}, "extend"),
@@ -578,10 +578,10 @@ def test_homing_finds_where_the_robot_is_straight(effect: str) -> None:
     with emulated(HARDWARE, seed=2, effect=effect) as made:
         prototype, emulator = made.prototype, made.emulator
         assert emulator is not None
-        true = -(emulator.drives.true_pulled - emulator._slack)  # wire beyond the slack
+        true = -(emulator.drives.true_pulled - emulator._slack)  # tendon beyond the slack
         bending = 0.5 * (true[:2] - true[2:])
         assert np.abs(bending).max() < 3e-5  # m
-        assert (true < 0.0).all()  # every wire is pulled
+        assert (true < 0.0).all()  # every tendon is pulled
         assert np.abs(prototype.readings.dl if prototype.readings is not None else np.zeros(4)).max() < 1e-6
         assert [tendon.pretension for tendon in prototype.robot.segments[0].tendons] == pytest.approx(
             [1.0] * 4, abs=0.35

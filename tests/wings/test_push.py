@@ -13,7 +13,7 @@ from fastrod.simulator import Simulator
 SPEED = 0.1
 RADIUS, SIZE, MASS = 0.012, 0.08, 0.1
 END = {"axial": [0.2 + RADIUS + 0.002 + SIZE / 2, 0.0, 0.0], "side": [0.18, RADIUS + 0.002 + SIZE / 2, 0.0]}
-WAY = {"axial": np.array([1.0, 0.0, 0.0]), "side": np.array([0.0, 1.0, 0.0])}
+DISPLACEMENT = {"axial": np.array([1.0, 0.0, 0.0]), "side": np.array([0.0, 1.0, 0.0])}
 
 
 def test_still_wall_is_felt_by_the_host_as_the_simulator_has_it():
@@ -21,7 +21,7 @@ def test_still_wall_is_felt_by_the_host_as_the_simulator_has_it():
     wall = world.createMultiBody(
         0.0, world.createCollisionShape(world.GEOM_BOX, halfExtents=[0.05, 0.5, 0.5]), -1, [0.12, 0.0, 0.1]
     )
-    rod = MountedRod(robot, carrier(world), touch=[wall], friction=0.0)
+    rod = MountedRod(robot, carrier(world), contact_bodies=[wall], friction=0.0)
     rod.settle(tendon_length=robot.rest_tendon_length)
     alone = Simulator(
         robot,
@@ -41,7 +41,7 @@ def test_still_wall_is_felt_by_the_host_as_the_simulator_has_it():
 
 def test_every_shape_of_pybullet_is_an_obstacle_where_it_is():
     world = empty_world()
-    turn = world.getQuaternionFromEuler([0.3, -0.4, 0.5])
+    angle = world.getQuaternionFromEuler([0.3, -0.4, 0.5])
     hull = np.random.default_rng(8).normal(size=(40, 3)) * 0.03
     shapes = {
         "box": world.createCollisionShape(world.GEOM_BOX, halfExtents=[0.01, 0.02, 0.03]),
@@ -55,20 +55,21 @@ def test_every_shape_of_pybullet_is_an_obstacle_where_it_is():
     )
     for name, shape in shapes.items():
         body = world.createMultiBody(
-            1.0, shape, -1, [0.1, 0.2, 0.3], turn, baseInertialFramePosition=[0.01, 0.0, 0.0]
+            1.0, shape, -1, [0.1, 0.2, 0.3], angle, baseInertialFramePosition=[0.01, 0.0, 0.0]
         )
-        touched = BulletBodyContact(world, body, dt=0.005, relaxation=0.1, friction=0.3)
-        assert [part.obstacle.shape for part in touched.parts] == [name]
-        pose = touched.expected([])[0][touched.names[0]]
+        contact = BulletBodyContact(world, body, dt=0.005, relaxation=0.1, friction=0.3)
+        assert [shape.obstacle.shape for shape in contact.shapes] == [name]
+        pose = contact.expected([])[0][contact.names[0]]
         robot = soft_robot(1)
         sim = Simulator(
-            robot, contact=ContactScene(obstacles=[touched.parts[0].obstacle], rod_radius=0.001, mounting=0.0)
+            robot,
+            contact=ContactScene(obstacles=[contact.shapes[0].obstacle], rod_radius=0.001, mounting=0.0),
         )
         # the rod's base is where the probe is, and its tip beside it: both must be as far from the body
         state = sim.settle(
             robot.rest_tendon_length,
             base_pose=(0.15, 0.1, 0.12, 1, 0, 0, 0),
-            obstacle_pose={touched.names[0]: pose},
+            obstacle_pose={contact.names[0]: pose},
         )
         ends = []
         for point in state.position[0, [0, -1]]:
@@ -105,17 +106,24 @@ def test_rod_can_be_taken_out_of_the_world():
     assert world.getNumBodies() == 1
 
 
-@pytest.mark.parametrize("touch", ["cube", (1, 2, 3), 1.5, True])
-def test_touch_names_bodies(touch):
-    with pytest.raises(HostError, match=r"^touch holds .*; give the number of a body, or \(body, link\)\.$"):
-        MountedRod(soft_robot(), carrier(empty_world()), touch=[touch])
+def test_the_old_name_of_contact_bodies_is_refused():
+    with pytest.raises(HostError, match=r"^touch is now contact_bodies; give contact_bodies=\.\.\."):
+        MountedRod(soft_robot(), carrier(empty_world()), touch=[0])
+
+
+@pytest.mark.parametrize("contact_bodies", ["cube", (1, 2, 3), 1.5, True])
+def test_contact_bodies_names_bodies(contact_bodies):
+    with pytest.raises(
+        HostError, match=r"^contact_bodies holds .*; give the number of a body, or \(body, link\)\.$"
+    ):
+        MountedRod(soft_robot(), carrier(empty_world()), contact_bodies=[contact_bodies])
 
 
 def test_world_or_body_that_has_gone_is_a_sentence():
     world, robot = empty_world(), soft_robot()
     link = carrier(world)
     box = cube(world, SIZE, MASS, END["axial"])
-    rod = MountedRod(robot, link, touch=[np.int64(box)])
+    rod = MountedRod(robot, link, contact_bodies=[np.int64(box)])
     rod.step()
     world.removeBody(box)
     with pytest.raises(

@@ -103,7 +103,7 @@ def test_the_bar_does_not_enter_the_floor(name):
     lowest = []
     for _ in range(40):
         task.act(np.array([[1.0, 0.0, 0.0]]))  # longer and longer
-        ends = np.array(cell.scenery().tubes[1].points)
+        ends = np.array(cell.backdrop().tubes[1].points)
         lowest.append(ends[:, 2].min() - cell.course.thickness)
     assert min(lowest) > 0.0
     assert min(lowest) < 0.5 * cell.course.thickness

@@ -72,12 +72,12 @@ def test_rod_is_where_the_base_will_be_at_the_end_of_the_step(step):
         state = rod.advance(pose, twist, step)
         end = Motion(pose, twist).after(step)
         assert_allclose(rod.base, end, atol=1e-12)
-        turn = matrix_from_quaternion(end[None, 3:])[0]
+        orientation = matrix_from_quaternion(end[None, 3:])[0]
         # without loads it is carried as it is
-        assert_allclose(state.tip_position[0], end[:3] + turn @ rest, atol=1e-6)
+        assert_allclose(state.tip_position[0], end[:3] + orientation @ rest, atol=1e-6)
 
 
-def test_substeps_are_those_of_a_simulator_on_the_same_way():
+def test_substeps_are_those_of_a_simulator_on_the_same_path():
     robot = soft_robot(line_density=0.3)
     rod, sim = Rod(robot, dt=0.01), Simulator(robot, dt=0.01, points_per_segment=10, threads=1)
     pose, twist = np.array(HOME), np.array([0.1, 0.0, 0.2, 0.0, 1.5, 0.3])
@@ -107,9 +107,9 @@ def test_weight_is_that_in_the_gravity_that_the_engine_gives():
         rod.advance(HOME, STILL, 0.01, gravity=np.ma.array(given[0], mask=[1, 0, 0]))
 
 
-def test_memory_of_the_wires_runs_on_the_engines_clock():
-    # a second-order lag of the wires: what it has done after 60 ms is the same in steps of any length, to the
-    # order of the steps
+def test_memory_of_the_tendons_runs_on_the_engines_clock():
+    # a second-order lag of the tendons: what it has done after 60 ms is the same in steps of any length, to
+    # the order of the steps
     robot = soft_robot(1)
     slow = replace(robot, effects=({"name": "dynamics", "period": 0.1, "damping": 0.7},))
     tips = []
@@ -141,7 +141,7 @@ def test_capsules_follow_the_chords_and_their_velocity_leads_there():
     assert_allclose(velocity[:, 3:], np.tile(twist[3:], (10, 1)), atol=1e-4)
 
 
-def test_wall_bends_the_rod_as_in_the_simulator_and_comes_in_parts():
+def test_wall_bends_the_rod_as_in_the_simulator_and_comes_in_substeps():
     robot = soft_robot()
     scene = ContactScene(obstacles=[plane(point=(0, 0, 0), normal=(-1, 0, 0), name="wall")])
     rod, sim = (make(robot, dt=0.01, contact=scene, points_per_segment=10) for make in (Rod, Simulator))
@@ -185,7 +185,7 @@ def test_many_rods_are_as_many_single_ones():
 
 @pytest.mark.parametrize("walled", [False, True])
 def test_rod_that_fails_leaves_its_neighbour_alone(monkeypatch, walled):
-    # what the wires of row 0 remember has moved once a step, as in a lone rod, whatever becomes of row 1
+    # what the tendons of row 0 remember has moved once a step, as in a lone rod, whatever becomes of row 1
     robot = replace(soft_robot(1), effects=({"name": "dynamics", "period": 0.1, "damping": 0.7},))
     scene = (
         ContactScene(obstacles=[plane(point=(0.01, 0, 0), normal=(-1, 0, 0), name="wall")])
@@ -208,10 +208,10 @@ def test_rod_that_fails_leaves_its_neighbour_alone(monkeypatch, walled):
         rod.settle(HOME)
     monkeypatch.setattr(pair.simulator, "step", fails)
     monkeypatch.setattr(pair.simulator, "settle", counted)
-    wires = robot.rest_tendon_length + PULL[:4]
+    tendons = robot.rest_tendon_length + PULL[:4]
     for k in range(6):
-        both = pair.advance(HOME, STILL, 0.01, tendon_length=wires, tip_force=(0.02 * k, 0.0, 0.0))
-        one = lone.advance(HOME, STILL, 0.01, tendon_length=wires, tip_force=(0.02 * k, 0.0, 0.0))
+        both = pair.advance(HOME, STILL, 0.01, tendon_length=tendons, tip_force=(0.02 * k, 0.0, 0.0))
+        one = lone.advance(HOME, STILL, 0.01, tendon_length=tendons, tip_force=(0.02 * k, 0.0, 0.0))
         assert_array_equal(both.position[0], one.position[0])
         assert_array_equal(pair.wrench[0], lone.wrench)
     assert settled
@@ -219,7 +219,7 @@ def test_rod_that_fails_leaves_its_neighbour_alone(monkeypatch, walled):
 
 
 @pytest.mark.parametrize("walled", [False, True])
-def test_bad_input_of_one_rod_is_told_and_the_others_go_on(walled):
+def test_bad_input_of_one_rod_is_reported_and_the_others_continue(walled):
     robot = replace(soft_robot(1), effects=({"name": "dynamics", "period": 0.1, "damping": 0.7},))
     scene = (
         ContactScene(obstacles=[plane(point=(0.01, 0, 0), normal=(-1, 0, 0), name="wall")])
@@ -227,10 +227,10 @@ def test_bad_input_of_one_rod_is_told_and_the_others_go_on(walled):
         else None
     )
     pair, lone = Rod(robot, n_robots=2, contact=scene), Rod(robot, contact=scene)
-    wires, force = robot.rest_tendon_length + PULL[:4], np.array([0.02, 0.01, 0.0])
+    tendons, force = robot.rest_tendon_length + PULL[:4], np.array([0.02, 0.01, 0.0])
     for rod in (pair, lone):
         for _ in range(3):
-            rod.advance(HOME, STILL, 0.015, tendon_length=wires, tip_force=force)
+            rod.advance(HOME, STILL, 0.015, tendon_length=tendons, tip_force=force)
     shape, wrench, capsules = pair.state.position[1], pair.wrench[1], pair.capsules.center[1]
     for k in range(4):
         both = pair.advance(HOME, (0.1, 0, 0, 0, 0, 0), 0.015, tip_force=[force, [np.nan, 0.0, 0.0]])
@@ -255,7 +255,7 @@ def test_bad_input_of_one_rod_is_told_and_the_others_go_on(walled):
 def test_rod_that_is_reset_settles_and_the_others_go_on():
     robot = replace(soft_robot(1), effects=({"name": "dynamics", "period": 0.1, "damping": 0.7},))
     pair, going, again = Rod(robot, n_robots=2), Rod(robot), Rod(robot)
-    wires = robot.rest_tendon_length + PULL[:4]
+    tendons = robot.rest_tendon_length + PULL[:4]
     for k in range(5):
         if k == 3:
             pair.reset(rows=[1])
@@ -266,7 +266,7 @@ def test_rod_that_is_reset_settles_and_the_others_go_on():
                 HOME,
                 STILL,
                 0.01,
-                tendon_length=wires if k else robot.rest_tendon_length,
+                tendon_length=tendons if k else robot.rest_tendon_length,
                 tip_force=(0.0, 0.02, 0.0),
             )
         assert_array_equal(pair.state.position[0], going.state.position[0])
@@ -279,23 +279,23 @@ def test_rod_that_is_reset_settles_and_the_others_go_on():
 
 def test_what_the_caller_writes_into_its_own_arrays_changes_nothing():
     robot = soft_robot()
-    wires, force, where = (
+    tendons, force, where = (
         robot.rest_tendon_length + PULL,
         np.array([0.02, 0.0, 0.0]),
         [(0.13, np.array([0.0, 0.05, 0.0]))],
     )
     rod, twin = Rod(robot), Rod(robot)
-    rod.advance(HOME, STILL, 0.01, tendon_length=wires, tip_force=force, point_force=where)
+    rod.advance(HOME, STILL, 0.01, tendon_length=tendons, tip_force=force, point_force=where)
     twin.advance(
         HOME,
         STILL,
         0.01,
-        tendon_length=wires.copy(),
+        tendon_length=tendons.copy(),
         tip_force=force.copy(),
         point_force=[(0.13, (0.0, 0.05, 0.0))],
     )
     then = rod.snapshot()
-    wires[:], force[:] = 0.0, 7.0
+    tendons[:], force[:] = 0.0, 7.0
     where[0][1][:] = -3.0
     rod.capsules.center[:] = 0.0
     for _ in range(2):
@@ -458,12 +458,12 @@ def test_what_no_rod_can_be_is_a_sentence():
         Rod(robot, n_robots=2).advance(np.tile(HOME, (4, 1)), STILL, 0.01)
 
 
-def test_rod_that_stays_lost_is_told(monkeypatch):
+def test_rod_that_stays_lost_is_reported(monkeypatch):
     rod = Rod(soft_robot())
     good = rod.advance(HOME, STILL, 0.01, tip_force=(0.1, 0.0, 0.0))
     lost = replace(good, ok=np.array([False]), problems={0: "contact: it stands."})
-    for way in ("step", "settle"):
-        monkeypatch.setattr(rod.simulator, way, lambda *a, **b: lost)
+    for path in ("step", "settle"):
+        monkeypatch.setattr(rod.simulator, path, lambda *a, **b: lost)
     rod.advance(HOME, STILL, 0.01)
     assert_allclose(rod.wrench, 0.5 * good.base_wrench[0])
     assert rod.failed == 1

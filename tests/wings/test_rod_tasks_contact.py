@@ -13,7 +13,7 @@ from fastrod_envs.tasks import tube_insert
 from fastrod_envs.tasks.tube_insert import TubeInsert, middle, place, thin_robot, tube_mesh
 from fastrod_envs.vector import BatchEnv
 
-LENGTH = tube_insert.STRAIGHT + tube_insert.TURN * tube_insert.ANGLE
+LENGTH = tube_insert.STRAIGHT + tube_insert.BEND_RADIUS * tube_insert.ANGLE
 
 
 def task_of(env: BatchEnv | SingleEnv) -> TubeInsert:

@@ -119,7 +119,7 @@ CASES: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
         ("drive 2 (node 5)", "-9.3 mm", "9 mm"),
     ),
     (
-        "slack wire",
+        "slack tendon",
         {"tension": (1, 0.1), "limits": Limits(slack=0.2)},
         ("drive 2 (node 5)", "0.1 N", "0.2 N"),
     ),
@@ -298,9 +298,9 @@ def test_what_is_off_is_looked_at_and_not_stopped() -> None:
 @pytest.mark.parametrize(
     ("dl", "words"),
     [
-        ([0.001, -0.0091, 0.0, 0.0], "wire 2 was told -9.1 mm; this robot's limit is 8 mm."),
-        ([0.0, 0.0, NAN, 0.0], "wire 3 was told nan"),
-        ([0.0, 0.0, 0.0, INF], "wire 4 was told inf"),
+        ([0.001, -0.0091, 0.0, 0.0], "tendon 2 was told -9.1 mm; this robot's limit is 8 mm."),
+        ([0.0, 0.0, NAN, 0.0], "tendon 3 was told nan"),
+        ([0.0, 0.0, 0.0, INF], "tendon 4 was told inf"),
         ([0.0, 0.0, 0.0], r"shape \(3,\)"),
         ([[0.0] * 4], r"shape \(1, 4\)"),
         (["a"] * 4, "must be 4 numbers"),
@@ -320,7 +320,7 @@ def test_a_command_beyond_a_limit_is_refused_with_its_figures(dl: Any, words: st
 
 
 def test_curvature_is_that_of_the_constant_curvature_arc() -> None:
-    """Wires at 7.5 mm, bend 1.05 rad over 70 mm: dl = -offset * bend * (cos, sin); 15 1/m."""
+    """Tendons at 7.5 mm, bend 1.05 rad over 70 mm: dl = -offset * bend * (cos, sin); 15 1/m."""
     bend = 0.07 * 15.0
     dl = -0.0075 * bend * np.array([1.0, 0.0, -1.0, 0.0])
     for most, fits in ((14.999, False), (15.001, True)):
@@ -419,7 +419,12 @@ def test_nobody_watches() -> None:
 
 @pytest.mark.parametrize(
     "error",
-    [ValueError("no such\nthing"), KeyboardInterrupt(), SystemExit(0), RefusedError("wire 1 was told 9 mm.")],
+    [
+        ValueError("no such\nthing"),
+        KeyboardInterrupt(),
+        SystemExit(0),
+        RefusedError("tendon 1 was told 9 mm."),
+    ],
 )
 def test_whatever_leaves_a_guarded_block_stops_first(error: BaseException) -> None:
     bench, clock = Bench(), SteppedClock()
@@ -428,7 +433,7 @@ def test_whatever_leaves_a_guarded_block_stops_first(error: BaseException) -> No
         assert bench.stops == []
         raise error
     assert [(fault.kind, fault.t) for fault in bench.stops] == [("exception", 7.0)]
-    name = "wire 1 was told 9 mm" if isinstance(error, RefusedError) else type(error).__name__
+    name = "tendon 1 was told 9 mm" if isinstance(error, RefusedError) else type(error).__name__
     assert name in bench.stops[0].sentence
     assert "\n" not in bench.stops[0].sentence
     with bench.supervisor.guard(clock):
@@ -487,7 +492,7 @@ def test_an_encoder_that_has_jumped_is_no_more_to_be_trusted() -> None:
     assert bench.watch(dl=(1, 0.003)) is not None
     for _ in range(10):
         bench.watch(dl=(1, 0.003))
-    with pytest.raises(RefusedError, match=r"drive 2 \(node 5\) moved its wire .* start anew, and home it"):
+    with pytest.raises(RefusedError, match=r"drive 2 \(node 5\) moved its tendon .* start anew, and home it"):
         bench.supervisor.acknowledge(bench.now)
 
 
@@ -606,7 +611,7 @@ def test_a_command_passes_as_it_is_or_not_at_all(dl: list[float]) -> None:
     supervisor = Supervisor(ROBOT, Limits())
     supervisor.enabled(0.0)
     x, y = dl[0] - dl[2], dl[1] - dl[3]
-    # the closed form of four wires
+    # the closed form of four tendons
     fits = max(map(abs, dl)) <= 0.008 and math.hypot(x, y) / (2.0 * 0.0075) / 0.07 <= 20.0
     try:
         told: np.ndarray | None = supervisor.check(dl, 0.0)
@@ -699,9 +704,9 @@ def test_a_camera_that_stops_nothing() -> None:
 
 def test_a_supervisor_that_cannot_be_is_named() -> None:
     rod = Segment(length=0.07, bending_stiffness=(0.002, 0.002), torsional_stiffness=0.001, mode="passive")
-    with pytest.raises(InputError, match="has no wires"):
+    with pytest.raises(InputError, match="has no tendons"):
         Supervisor(Robot(name="bare", segments=(rod,)), Limits())
-    with pytest.raises(InputError, match="nodes has 3 node ids and the robot 4 wires"):
+    with pytest.raises(InputError, match="nodes has 3 node ids and the robot 4 tendons"):
         Supervisor(ROBOT, Limits(), nodes=(1, 2, 3))
     with pytest.raises(UnknownNameError, match="did you mean 'bus off'"):
         Fault(kind="bus of", sentence="", t=0.0)

@@ -1,4 +1,4 @@
-"""What the viewer draws lies where the rod is; nothing here needs a browser."""
+"""The viewer's drawing lies where the rod is; nothing here needs a browser."""
 
 import itertools
 from dataclasses import replace
@@ -13,12 +13,12 @@ from fastrod.errors import InputError
 from fastrod.model.segment_actions import SegmentActions
 from fastrod_scenes import load
 from fastrod_viewer import palette
-from fastrod_viewer.chains import tangents
+from fastrod_viewer.curves import tangents
 from fastrod_viewer.scene_graph import (
     SHAPES,
-    Options,
     Picture,
     Trail,
+    ViewOptions,
     ball,
     bounds,
     ghost,
@@ -51,7 +51,7 @@ def bent(name, n_robots=1, seed=3, points=20):
 
 
 def ends(batch):
-    """Both ends of pieces along z, from their centres, turns and lengths."""
+    """Both ends of pieces along z, from their centres, orientations and lengths."""
     half = 0.5 * batch.scale[:, 2:] * tangents(batch.wxyz.astype(float))
     return batch.position - half, batch.position + half
 
@@ -79,14 +79,14 @@ def check(batches):
 
 
 def test_pieces_of_an_arc_lie_on_the_arc():
-    robot = rod(compliance=0.0)  # wires that do not stretch bend it by just the angle
+    robot = rod(compliance=0.0)  # tendons that do not stretch bend it by just the angle
     angle = 1.2
     state = fastrod.Simulator(robot).settle(bend(robot, 0.0, angle))
-    body = check(Picture(seen(robot, state), Options(tendons=False)).frame(seen(robot, state)))["body"]
+    body = check(Picture(seen(robot, state), ViewOptions(tendons=False)).frame(seen(robot, state)))["body"]
     n, length = 40, 0.07
     middle = (np.arange(n) + 0.5) / n * angle
-    turn = angle / n
-    radius = length / angle * np.cos(turn / 2)  # of the circle through the middles of chords of an arc
+    step = angle / n
+    radius = length / angle * np.cos(step / 2)  # of the circle through the middles of chords of an arc
     arc = np.stack([length / angle - radius * np.cos(middle), 0.0 * middle, radius * np.sin(middle)], axis=1)
     assert_allclose(body.position, arc, atol=1e-5)
     direction = np.stack([np.sin(middle), 0.0 * middle, np.cos(middle)], axis=1)
@@ -95,7 +95,7 @@ def test_pieces_of_an_arc_lie_on_the_arc():
 
 @pytest.mark.parametrize("name", fastrod.robot_names())
 @pytest.mark.parametrize("points", [4, 10, 20])
-def test_chain_follows_the_rod(name, points):
+def test_line_follows_the_rod(name, points):
     robot, simulator, state = bent(name, points=points)
     picture = Picture(seen(robot, state))
     body = check(picture.frame(seen(robot, state)))["body"]
@@ -118,9 +118,9 @@ def test_chain_follows_the_rod(name, points):
     # the bend
     over = body.scale[:, 2].reshape(-1, p, 1) - size
     tangent = pose.rotation[0, :, :, 2].reshape(-1, p + 1, 3)
-    turn = np.linalg.norm(tangent[:, 1:] - tangent[:, :-1], axis=-1, keepdims=True)
-    # turns evenly between nodes
-    assert_allclose(over, picture.tube_radius[:, None, None] * turn, atol=1e-2 * size.max())
+    change = np.linalg.norm(tangent[:, 1:] - tangent[:, :-1], axis=-1, keepdims=True)
+    # rotates evenly between nodes
+    assert_allclose(over, picture.tube_radius[:, None, None] * change, atol=1e-2 * size.max())
     assert (over >= -1e-6).all()
 
 
@@ -138,7 +138,7 @@ def test_nodes_that_are_not_even_do_not_show():
 
 def test_tip_is_at_the_tip():
     robot, _, state = bent("five_segment_reacher", n_robots=3)
-    tip = Picture(seen(robot, state), Options(body="skin")).frame(seen(robot, state))["tip"]
+    tip = Picture(seen(robot, state), ViewOptions(body="skin")).frame(seen(robot, state))["tip"]
     assert tip.shape == "cap"
     assert_allclose(tip.position, state.tip_position, atol=1e-6)
     assert_allclose(tangents(tip.wxyz.astype(float)), state.tip_rotation[:, :, 2], atol=1e-6)
@@ -180,8 +180,8 @@ def test_tendons_run_at_their_offsets_and_are_as_long_as_they_are(name):
 def test_tendons_on_the_skin_are_on_its_surface():
     robot, _, state = bent("tdcr_b")
     rods = seen(robot, state)
-    assert "tendons" not in Picture(rods, Options(body="skin")).frame(rods)
-    found = Picture(rods, Options(body="skin", color_by="tension", pieces=32)).frame(rods)
+    assert "tendons" not in Picture(rods, ViewOptions(body="skin")).frame(rods)
+    found = Picture(rods, ViewOptions(body="skin", color_by="tension", pieces=32)).frame(rods)
     nearest = np.linalg.norm(found["tendons"].position[:, None] - found["body"].position, axis=2).min(1)
     assert_allclose(nearest, 0.012, atol=4e-4)
 
@@ -204,12 +204,14 @@ def test_a_spacer_stands_at_the_base_and_at_the_end_of_every_segment():
 def test_robot_without_tendons_is_its_body():
     robot, _, state = bent("ethz_beam")
     rods = seen(robot, state)
-    found = check(Picture(rods, Options(color_by="tension")).frame(rods))
+    found = check(Picture(rods, ViewOptions(color_by="tension")).frame(rods))
     assert set(found) == {"body", "tip", "load_shafts", "load_heads"}
     assert_allclose(found["body"].scale[:, 0], 0.015)
     assert (
         "no tendons"
-        in legend(rods, Options(color_by="tension"), Picture(rods, Options(color_by="tension"))).html()
+        in legend(
+            rods, ViewOptions(color_by="tension"), Picture(rods, ViewOptions(color_by="tension"))
+        ).html()
     )
 
 
@@ -218,7 +220,8 @@ def test_robot_without_tendons_is_its_body():
 
 
 @pytest.mark.parametrize(
-    "options", [Options(frames=True), Options(color_by="strain", body="skin"), Options(color_by="tension")]
+    "options",
+    [ViewOptions(frames=True), ViewOptions(color_by="strain", body="skin"), ViewOptions(color_by="tension")],
 )
 def test_counts_stay_over_a_rollout(options):
     robot = fastrod.load_robot("five_segment_reacher")
@@ -238,12 +241,12 @@ def test_counts_stay_over_a_rollout(options):
 def test_batch_is_its_robots(color_by):
     robot, _, state = bent("tdcr_a", n_robots=3)
     place = grid_places(3, 0.5)
-    picture = Picture(seen(robot, state, place), Options(color_by=color_by))
+    picture = Picture(seen(robot, state, place), ViewOptions(color_by=color_by))
     many = picture.frame(seen(robot, state, place), tip_force=np.eye(3))
     along = [name for name, value in vars(state).items() if isinstance(value, np.ndarray)]
     for i in range(3):
         one = replace(state, **{name: getattr(state, name)[i : i + 1] for name in along})
-        single = Picture(seen(robot, one, place[i : i + 1]), Options(color_by=color_by))
+        single = Picture(seen(robot, one, place[i : i + 1]), ViewOptions(color_by=color_by))
         if picture.range is not None:
             single.range = picture.range
         for name, batch in single.frame(seen(robot, one, place[i : i + 1]), tip_force=np.eye(3)[i]).items():
@@ -266,7 +269,9 @@ def test_place_moves_the_picture():
 
 def test_many_robots_are_drawn_light():
     robot, _, state = bent("prototype", n_robots=17, points=10)
-    found = check(Picture(seen(robot, state), Options(tendons=True, spacers=True)).frame(seen(robot, state)))
+    found = check(
+        Picture(seen(robot, state), ViewOptions(tendons=True, spacers=True)).frame(seen(robot, state))
+    )
     assert set(found) == {"body", "tip", "load_shafts", "load_heads"}
     assert len(found["body"].position) == 17 * 10
 
@@ -325,7 +330,7 @@ def test_more_bend_is_brighter():
     state = fastrod.Simulator(robot, 4).settle(lengths)
     brightness = {}
     for color_by in ("curvature", "strain"):
-        picture = Picture(seen(robot, state), Options(color_by=color_by))
+        picture = Picture(seen(robot, state), ViewOptions(color_by=color_by))
         color = picture.frame(seen(robot, state))["body"].color.reshape(4, 40, 3)
         brightness[color_by] = color.mean(1) @ [0.2126, 0.7152, 0.0722]
         assert (np.diff(brightness[color_by]) > 10.0).all()
@@ -334,7 +339,7 @@ def test_more_bend_is_brighter():
     largest = 1.3 / 0.07
     assert (
         largest
-        <= Picture(seen(robot, state), Options(color_by="curvature")).range.see(np.array([largest]))
+        <= Picture(seen(robot, state), ViewOptions(color_by="curvature")).range.see(np.array([largest]))
         <= 1.5 * largest
     )
 
@@ -344,7 +349,7 @@ def test_proximal_segment_has_its_own_curvature_up_to_the_joint():
     actions = SegmentActions(robot)
     weightless = replace(robot, gravity=(0.0, 0.0, 0.0))
     state = fastrod.Simulator(weightless).settle(**actions.inputs([0.0, 0.008, 0.0, 0.0, -0.001, 0.0]))
-    picture = Picture(seen(robot, state), Options(color_by="curvature"))
+    picture = Picture(seen(robot, state), ViewOptions(color_by="curvature"))
     color = picture.frame(seen(robot, state))["body"].color.reshape(2, 40, 3).astype(int)
     assert np.abs(np.diff(color[0], axis=0)).max() <= 4
     assert np.abs(color[0, -1] - color[1, 0]).max() > 60
@@ -361,10 +366,10 @@ def test_range_grows_and_does_not_shrink():
     assert scale.top == 1.0
 
 
-def test_slack_wire_is_light_and_thin():
+def test_slack_tendon_is_light_and_thin():
     whole = rod("tendon_length")
-    wires = tuple(replace(tendon, unilateral=True) for tendon in whole.segments[0].tendons)
-    robot = replace(whole, segments=(replace(whole.segments[0], tendons=wires),))
+    tendons = tuple(replace(tendon, unilateral=True) for tendon in whole.segments[0].tendons)
+    robot = replace(whole, segments=(replace(whole.segments[0], tendons=tendons),))
     state = fastrod.Simulator(robot).settle(
         bend(robot, 0.0, 0.8) + np.array([-0.0001, 0.0001, 0.003, 0.0001])
     )
@@ -373,13 +378,13 @@ def test_slack_wire_is_light_and_thin():
     assert not slack.all()
     rods = seen(robot, state)
     picture = Picture(rods)
-    tendons = picture.frame(rods)["tendons"]
-    color, thick = tendons.color.reshape(4, -1, 3), tendons.scale[:, 0].reshape(4, -1)
+    drawn = picture.frame(rods)["tendons"]
+    color, thick = drawn.color.reshape(4, -1, 3), drawn.scale[:, 0].reshape(4, -1)
     assert (color[slack] == palette.SLACK).all()
     assert (color[~slack] == palette.TAUT).all()
     assert thick[slack].max() < thick[~slack].min()
-    assert "slack" in legend(rods, Options(), picture).html()
-    assert "pushing" not in legend(rods, Options(), picture).html()
+    assert "slack" in legend(rods, ViewOptions(), picture).html()
+    assert "pushing" not in legend(rods, ViewOptions(), picture).html()
 
 
 def test_pushing_rod_is_violet_and_tension_has_two_sides():
@@ -391,7 +396,7 @@ def test_pushing_rod_is_violet_and_tension_has_two_sides():
     color = Picture(rods).frame(rods)["tendons"].color.reshape(4, -1, 3)
     assert (color[push] == palette.PUSHING).all()
     assert (color[pull] == palette.TAUT).all()
-    by = Picture(rods, Options(color_by="tension"))
+    by = Picture(rods, ViewOptions(color_by="tension"))
     shown = by.frame(rods)
     color = shown["tendons"].color.reshape(4, -1, 3)[:, 0].astype(int)
     assert by.range.top >= state.tension.max()
@@ -448,7 +453,7 @@ def test_load_arrow_is_at_the_tip():
 
 def test_axes_of_the_tip():
     robot, _, state = bent("tdcr_a")
-    found = check(Picture(seen(robot, state), Options(frames=True)).frame(seen(robot, state)))["frames"]
+    found = check(Picture(seen(robot, state), ViewOptions(frames=True)).frame(seen(robot, state)))["frames"]
     assert_allclose(tangents(found.wxyz.astype(float)), state.tip_rotation[0].T, atol=1e-5)
     assert_allclose(ends(found)[0], np.broadcast_to(state.tip_position, (3, 3)), atol=1e-5)
     assert_array_equal(found.color, palette.AXES)
@@ -456,14 +461,14 @@ def test_axes_of_the_tip():
 
 def test_ghost_goes_through_its_points():
     points = np.random.default_rng(1).normal(size=(9, 3))
-    points[3] = points[2] - [0.0, 0.0, 0.4]  # straight down, where the shortest turn of z is not unique
-    chain = ghost(points, 0.001, (9, 9, 9))
-    first, last = ends(chain)
+    points[3] = points[2] - [0.0, 0.0, 0.4]  # straight down, where the shortest rotation of z is not unique
+    line = ghost(points, 0.001, (9, 9, 9))
+    first, last = ends(line)
     assert_allclose(first, points[:-1], atol=1e-6)
     assert_allclose(last, points[1:], atol=1e-6)
     points[5] = np.nan
-    chain = check({"ghost": ghost(points, 0.001, (9, 9, 9))})["ghost"]
-    assert_array_equal(chain.scale[:, 2] > 0.0, [True] * 4 + [False] * 2 + [True] * 2)
+    line = check({"ghost": ghost(points, 0.001, (9, 9, 9))})["ghost"]
+    assert_array_equal(line.scale[:, 2] > 0.0, [True] * 4 + [False] * 2 + [True] * 2)
     with pytest.raises(InputError, match=r"points has shape \(1, 3\); a ghost needs \(n, 3\)"):
         ghost(points[:1], 0.001, (9, 9, 9))
 
@@ -473,12 +478,12 @@ def test_trail_keeps_the_last_positions_and_fades():
     assert not check({"trail": trail.instances(0.001, (200, 0, 0))})["trail"].scale.any()
     for x in (0.0, 0.005, 0.02, np.nan, 0.04, 0.06, 0.08, 0.10):
         trail.add(np.array([x, 0.0, 0.0]))
-    chain = check({"trail": trail.instances(0.001, (200, 0, 0))})["trail"]
+    line = check({"trail": trail.instances(0.001, (200, 0, 0))})["trail"]
     assert len(trail) == 5
-    assert_allclose(chain.position[:, 0], [0.03, 0.05, 0.07, 0.09], atol=1e-7)
-    assert (np.diff(chain.color[:, 1].astype(int)) < 0).all()
-    assert (np.diff(chain.scale[:, 0]) > 0.0).all()
-    assert tuple(chain.color[-1]) == (200, 0, 0)
+    assert_allclose(line.position[:, 0], [0.03, 0.05, 0.07, 0.09], atol=1e-7)
+    assert (np.diff(line.color[:, 1].astype(int)) < 0).all()
+    assert (np.diff(line.scale[:, 0]) > 0.0).all()
+    assert tuple(line.color[-1]) == (200, 0, 0)
     trail.clear()
     assert len(trail) == 0
     with pytest.raises(InputError, match="a trail of 0 pieces"):
@@ -508,7 +513,7 @@ def test_closed_meshes_are_closed_and_outward(name, volume):
     assert signed < volume
 
 
-@pytest.mark.parametrize("name", ["tube", "wire", "cap"])
+@pytest.mark.parametrize("name", ["tube", "thin_tube", "cap"])
 def test_open_meshes_face_outward(name):
     mesh = SHAPES[name]
     corners = mesh.vertices[mesh.faces].astype(float)
@@ -519,14 +524,14 @@ def test_open_meshes_face_outward(name):
 
 
 def test_meshes_have_the_sizes_they_are_said_to_have():
-    reach = {
+    extent = {
         name: (mesh.vertices.min(0).round(5).tolist(), mesh.vertices.max(0).round(5).tolist())
         for name, mesh in SHAPES.items()
     }
-    for name in ("tube", "wire", "bar", "disc"):
-        assert reach[name] == ([-1.0, -1.0, -0.5], [1.0, 1.0, 0.5])
-    assert reach["ball"] == ([-1.0] * 3, [1.0] * 3)
-    assert reach["cone"] == reach["cap"] == ([-1.0, -1.0, 0.0], [1.0, 1.0, 1.0])
+    for name in ("tube", "thin_tube", "bar", "disc"):
+        assert extent[name] == ([-1.0, -1.0, -0.5], [1.0, 1.0, 0.5])
+    assert extent["ball"] == ([-1.0] * 3, [1.0] * 3)
+    assert extent["cone"] == extent["cap"] == ([-1.0, -1.0, 0.0], [1.0, 1.0, 1.0])
 
 
 def test_grid_is_square_and_centred():
@@ -564,7 +569,7 @@ def test_bounds_hold_the_robots():
 @pytest.mark.parametrize("color_by", ["segment", "curvature", "strain", "tension"])
 def test_legend_says_what_colours_mean(color_by):
     robot, _, state = bent("tdcr_a")
-    options = Options(color_by=color_by)
+    options = ViewOptions(color_by=color_by)
     picture = Picture(seen(robot, state), options)
     picture.frame(seen(robot, state))
     found = legend(seen(robot, state), options, picture)
@@ -587,18 +592,18 @@ def test_legend_says_what_colours_mean(color_by):
 
 
 def test_bad_option_is_one_sentence():
-    with pytest.raises(InputError, match=r"^Options.color_by is 'curvatur'; did you mean 'curvature'\?$"):
-        Options(color_by="curvatur")
-    with pytest.raises(InputError, match=r"^Options.body is 'skins'; did you mean 'skin'\?$"):
-        Options(body="skins")
-    with pytest.raises(InputError, match=r"^Options.tendons is 1; it must be True or False\.$"):
-        Options(tendons=1)
+    with pytest.raises(InputError, match=r"^ViewOptions.color_by is 'curvatur'; did you mean 'curvature'\?$"):
+        ViewOptions(color_by="curvatur")
+    with pytest.raises(InputError, match=r"^ViewOptions.body is 'skins'; did you mean 'skin'\?$"):
+        ViewOptions(body="skins")
+    with pytest.raises(InputError, match=r"^ViewOptions.tendons is 1; it must be True or False\.$"):
+        ViewOptions(tendons=1)
     with pytest.raises(
         InputError,
-        match=r"^Options.pieces is 0; it must be a whole number, at least 1, or "
+        match=r"^ViewOptions.pieces is 0; it must be a whole number, at least 1, or "
         r"None\.$",
     ):
-        Options(pieces=0)
+        ViewOptions(pieces=0)
 
 
 def test_state_of_the_tip_only_is_refused():

@@ -103,7 +103,7 @@ def test_airway_is_open_at_its_three_ends():
         ).all()
 
 
-def test_middle_of_the_airway_is_as_long_as_its_depth_and_turns_as_it_heads():
+def test_middle_of_the_airway_is_as_long_as_its_depth_and_bends_as_it_heads():
     depth = np.linspace(0.0, airway_mesh.path_length(), 4001)
     for branch, toward in airway_mesh.BRANCHES.items():
         step = np.diff(airway_mesh.middle(branch, depth), axis=0)

@@ -102,21 +102,21 @@ def test_orientations_are_those_of_the_backbone(make: Callable[..., SoftManiSim]
         for k, end in enumerate(np.cumsum(0.1 + action[:, 0])):
             inside = (s >= end - 0.1 - action[k, 0]) & (s <= end)
             first, last = axis(world[inside][[0, -1], 3:], 2)
-            share = np.ptp(s[inside]) / (0.1 + action[k, 0])
+            fraction = np.ptp(s[inside]) / (0.1 + action[k, 0])
             bend = math.acos(np.clip(first @ last, -1, 1))
-            assert bend == pytest.approx(share * np.hypot(*action[k, 1:]) / OFFSET, abs=1e-4)
+            assert bend == pytest.approx(fraction * np.hypot(*action[k, 1:]) / OFFSET, abs=1e-4)
 
 
-def test_world_is_base_times_robot_and_the_base_turns_it(make: Callable[..., SoftManiSim]) -> None:
+def test_world_is_base_times_robot_and_the_base_rotates_it(make: Callable[..., SoftManiSim]) -> None:
     sim = make()
     action, base, angles = [0.01, 0.003, -0.002] * 3, [0.3, -0.2, 0.5], [0.4, -0.7, 1.9]
-    turn = pybullet.getQuaternionFromEuler(angles)
+    rotation = pybullet.getQuaternionFromEuler(angles)
     world, own = sim.move_robot_ori(action, base, angles)
     for w, r in zip(world, own, strict=True):
-        position, quaternion = pybullet.multiplyTransforms(base, turn, r[:3].tolist(), r[3:].tolist())
+        position, quaternion = pybullet.multiplyTransforms(base, rotation, r[:3].tolist(), r[3:].tolist())
         assert_allclose(w[:3], position, atol=1e-6)  # PyBullet multiplies in single precision
         assert_allclose(w[3:] * np.sign(np.dot(w[3:], quaternion)), quaternion, atol=1e-6)
-    still, _ = sim.move_robot_ori(action, base, turn)  # the same base as a quaternion
+    still, _ = sim.move_robot_ori(action, base, rotation)  # the same base as a quaternion
     assert_allclose(still, world, atol=1e-12)
     assert_allclose(sim.move_robot_ori(action)[1], own, atol=1e-9)
     assert_allclose(sim.calc_tip_pos(None, (0, 0, 1), DOWN)[0], [0, 0, 0.7], atol=1e-9)
@@ -128,14 +128,14 @@ def test_calc_tip_pos_agrees_with_the_motion_and_moves_nothing(make: Callable[..
     for s in (sim, twin):
         s.move_robot_ori([0, 0.001, 0] * 3, [0, 0, 0.3])
     before = poses(sim.bullet)
-    action, base, turn = [0.02, 0.008, -0.01] * 3, [0.1, 0, 0.4], [0.3, 0, 0]
-    position, quaternion = sim.calc_tip_pos(action, base, turn)
+    action, base, rotation = [0.02, 0.008, -0.01] * 3, [0.1, 0, 0.4], [0.3, 0, 0]
+    position, quaternion = sim.calc_tip_pos(action, base, rotation)
     assert_array_equal(list(poses(sim.bullet).values()), list(before.values()))
     assert cube in before
-    world, _ = sim.move_robot_ori(action, base, turn)
+    world, _ = sim.move_robot_ori(action, base, rotation)
     assert_array_equal(world[-1], [*position, *quaternion])
-    assert_array_equal(world, twin.move_robot_ori(action, base, turn)[0])  # nor did it change what came later
-    assert_array_equal(sim.calc_tip_pos(action, base, turn)[0], position)
+    assert_array_equal(world, twin.move_robot_ori(action, base, rotation)[0])  # nor did it change later ones
+    assert_array_equal(sim.calc_tip_pos(action, base, rotation)[0], position)
 
 
 # bodies
@@ -271,19 +271,19 @@ def test_contact_is_of_surfaces_not_of_boxes(make: Callable[..., SoftManiSim]) -
     assert not sim.is_tip_in_contact(on)
 
 
-def test_a_tilted_cube_near_the_tip_does_not_touch_it(make: Callable[..., SoftManiSim]) -> None:
+def test_a_tilted_cube_near_the_tip_makes_no_contact(make: Callable[..., SoftManiSim]) -> None:
     sim = make(dt=0.005, gravity=0.0, max_grasp_width=0.0)
     sim.move_robot_ori()
     side, tilt = 0.1, math.pi / 4
-    reach = 0.0225 + 0.5 * side
+    extent = 0.0225 + 0.5 * side
     for gap, touches in ((0.003, False), (0.0005, True)):
-        at = np.array([0.0, 0.3, 0.0]) + (reach + gap) * np.array([math.cos(tilt), math.sin(tilt), 0.0])
+        at = np.array([0.0, 0.3, 0.0]) + (extent + gap) * np.array([math.cos(tilt), math.sin(tilt), 0.0])
         cube = sim.add_a_cube(at, ori=about_z(tilt), size=[side] * 3)
         box, head = sim.bullet.getAABB(cube), sim.bullet.getAABB(sim._gripper.body)
         assert (np.array(box[0]) < head[1]).all()  # their boxes overlap
         assert (np.array(head[0]) < box[1]).all()
-        for asked in (sim.is_robot_in_contact, sim.is_gripper_in_contact, sim.is_tip_in_contact):
-            assert asked(cube) is touches
+        for given in (sim.is_robot_in_contact, sim.is_gripper_in_contact, sim.is_tip_in_contact):
+            assert given(cube) is touches
         sim.bullet.removeBody(cube)
 
 
@@ -356,12 +356,12 @@ def test_the_gripper_holds_what_it_closes_on(make: Callable[..., SoftManiSim], d
 # cubes and time
 
 
-def test_a_cube_stands_as_told_and_falls_without_damping(make: Callable[..., SoftManiSim]) -> None:
+def test_a_cube_stands_as_given_and_falls_without_damping(make: Callable[..., SoftManiSim]) -> None:
     sim = make(dt=0.002)
-    turn = np.array([0.1, -0.4, 0.2, 0.8]) / np.linalg.norm([0.1, -0.4, 0.2, 0.8])
-    cube = sim.add_a_cube([1, 2, 3], turn, [0.02, 0.04, 0.06], 0.3, [0, 1, 0, 1])
+    rotation = np.array([0.1, -0.4, 0.2, 0.8]) / np.linalg.norm([0.1, -0.4, 0.2, 0.8])
+    cube = sim.add_a_cube([1, 2, 3], rotation, [0.02, 0.04, 0.06], 0.3, [0, 1, 0, 1])
     position, quaternion = sim.bullet.getBasePositionAndOrientation(cube)
-    assert_allclose([*position, *quaternion], [1, 2, 3, *turn], atol=1e-9)
+    assert_allclose([*position, *quaternion], [1, 2, 3, *rotation], atol=1e-9)
     assert_allclose(sim.bullet.getCollisionShapeData(cube, -1)[0][3], [0.02, 0.04, 0.06])
     sim.bullet.resetBaseVelocity(cube, [1.0, 0, 0], [0, 0, 5.0])
     sim.wait(0.5)
@@ -401,7 +401,7 @@ def test_pictures_have_true_colours_and_depth(make: Callable[..., SoftManiSim]) 
     assert_array_equal(far[~gone], depth[~gone])
 
 
-def test_the_camera_in_the_hand_rolls_with_the_robot(make: Callable[..., SoftManiSim]) -> None:
+def test_the_camera_in_the_head_rolls_with_the_robot(make: Callable[..., SoftManiSim]) -> None:
     sim = make(max_grasp_width=0.0)
     sim.in_hand_camera = HostCamera(width=64, height=48, near=0.005, far=3.0)
     # up and right of the tip

@@ -20,8 +20,8 @@ from fastrod.logs.simulated import SimulatedRobot
 from fastrod.model.robot import Robot
 from fastrod.simulator import Simulator
 from fastrod.types import Floats
-from fastrod_envs.pilot import PolicyDriver
 from fastrod_envs.policies import Policy, find
+from fastrod_envs.policy_driver import PolicyDriver
 from fastrod_envs.randomisation import Randomisation
 from fastrod_envs.single import SingleEnv
 from fastrod_envs.tasks.track import APPROACH, DT, Track
@@ -50,7 +50,7 @@ def episode(path: str, seed: int, robot: Robot, n_steps: int = 120) -> dict[str,
     observation, _ = env.reset(seed=seed)
     task = env.task
     assert isinstance(task, Track)
-    found: dict[str, Any] = {"phase": task._phase[0], "way": int(task._way[0]), "dl": [], "tip": []}
+    found: dict[str, Any] = {"phase": task._phase[0], "sense": int(task._sense[0]), "dl": [], "tip": []}
     for _ in range(n_steps):
         observation, _, _, _, info = env.step(policy().act(observation[None])[0])
         found["dl"].append(task._inputs()["tendon_length"][0] - robot.rest_tendon_length)
@@ -84,7 +84,7 @@ def follow(pilot: PolicyDriver, robot: Robot, n_steps: int = 120) -> dict[str, A
 @pytest.mark.parametrize(("path", "seed"), [("triangle", 1), ("square", 2), ("circle", 4)])
 def test_it_does_what_the_environment_does(path: Any, seed: int, robot: Robot) -> None:
     there = episode(path, seed, robot)
-    here = follow(PolicyDriver(policy(), path, robot, phase=there["phase"], way=there["way"]), robot)
+    here = follow(PolicyDriver(policy(), path, robot, phase=there["phase"], sense=there["sense"]), robot)
     assert np.ptp(there["dl"], axis=0).min() > 1e-3
     # lengths minus rest lengths round at 1e-17
     assert_allclose(here["dl"], there["dl"], rtol=0.0, atol=1e-9)
@@ -184,7 +184,11 @@ def pilot_of(
     [
         (lambda: pilot_of("cirle"), UnknownNameError, r"no path 'cirle'; did you mean 'circle'\?"),
         (lambda: pilot_of(name="Reach"), InputError, "was trained on fastrod/Reach-v0 .* give one of Track"),
-        (lambda: pilot_of(way=0), InputError, "phase is 0.0 s and way 0; give a finite time, and 1 or -1"),
+        (
+            lambda: pilot_of(sense=0),
+            InputError,
+            "phase is 0.0 s and sense 0; give a finite time, and 1 or -1",
+        ),
         (lambda: pilot_of(phase=np.nan), InputError, "phase is nan s"),
         (lambda: pilot_of(helix(radius=0.02, pitch=0.01)), InputError, r"path 'helix' rises by 0.01 m"),
         (

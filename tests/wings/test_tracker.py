@@ -383,7 +383,7 @@ def test_a_covered_side_is_an_outlier():
     image = frames(CAMERA, [pose(0.15, 0.2, 0.0, 0.0)])[0].image.copy()
     whole = MarkerTracker(CAMERA, MARKER).look(CameraFrame(image=image, t=0.0, number=1))
     left, top = whole.corners[0]
-    # a wire as dark as the ink along the left side
+    # a tendon as dark as the ink along the left side
     image[int(top) - 8 : int(top) + 70, int(left) + 5 : int(left) - 20 : -1] = 40
     seen = MarkerTracker(CAMERA, MARKER).look(CameraFrame(image=image, t=0.0, number=1))
     assert whole.ok

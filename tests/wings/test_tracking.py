@@ -1,5 +1,5 @@
-"""The tracks: their checks can fail, shares are counted right, what is held does not move, and the soft robot
-can do it alone."""
+"""The tracks: their checks can fail, fractions are counted right, what is held does not move, and the soft
+robot can do it alone."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from fastrod_scenes.ur5.tracking import (
     APPROACH,
     CENTER,
     LARGEST_ERROR,
-    LEAST_SHARE,
+    LEAST_FRACTION,
     TrackCircle,
     TrackingError,
     TrackingScene,
+    fraction_of,
     record,
-    share,
 )
 
 
@@ -69,24 +69,28 @@ def test_check_fails_where_the_arm_does_it(monkeypatch):
     assert float(str(error.value).split(" does ")[1].split()[0]) < 0.25
 
 
-def test_share_of_a_known_split():
+def test_fraction_of_a_known_split():
     angle = np.linspace(0.0, 2.0 * np.pi, 201)
-    way = np.diff(np.stack([np.cos(angle), np.sin(angle), 0.1 * angle], axis=1), axis=0)
-    across = np.cross(way, [0.0, 0.0, 1.0])
-    assert share(0.3 * way, way) == pytest.approx(0.3)
-    assert share(0.3 * way, way) + share(0.7 * way, way) == pytest.approx(1.0)
-    assert share(across, way) == pytest.approx(0.0, abs=1e-12)
-    assert share(-0.5 * way, way) == pytest.approx(-0.5)
+    displacement = np.diff(np.stack([np.cos(angle), np.sin(angle), 0.1 * angle], axis=1), axis=0)
+    across = np.cross(displacement, [0.0, 0.0, 1.0])
+    assert fraction_of(0.3 * displacement, displacement) == pytest.approx(0.3)
+    assert fraction_of(0.3 * displacement, displacement) + fraction_of(
+        0.7 * displacement, displacement
+    ) == pytest.approx(1.0)
+    assert fraction_of(across, displacement) == pytest.approx(0.0, abs=1e-12)
+    assert fraction_of(-0.5 * displacement, displacement) == pytest.approx(-0.5)
 
 
-def test_parts_make_up_the_way():
+def test_components_add_up_to_the_displacement():
     run = follow(load("track_figure_eight").path(), 1.5)
-    assert np.linalg.norm(run.way, axis=1).min() > 1e-3
+    assert np.linalg.norm(run.displacement, axis=1).min() > 1e-3
     going = slice(5, None)  # the first steps set out from rest
     assert_allclose(
-        (run.by_soft + run.by_arm)[going], run.way[going], atol=0.02 * np.linalg.norm(run.way, axis=1).max()
+        (run.by_soft + run.by_arm)[going],
+        run.displacement[going],
+        atol=0.02 * np.linalg.norm(run.displacement, axis=1).max(),
     )
-    assert run.soft_share(0.0) > LEAST_SHARE
+    assert run.soft_fraction(0.0) > LEAST_FRACTION
 
 
 def test_soft_robot_alone_tracks_the_full_circle_and_the_held_arm_stays():
@@ -133,22 +137,20 @@ def test_scaled_path_is_the_path_about_the_center(name):
     )
 
 
-def test_following_a_mounted_rod_is_as_placing_it():
+def test_following_a_mounted_rod_equals_its_own_kinematics():
     world = connect(gravity=(0.0, 0.0, -9.81))
     try:
-        turn = quaternion_from_vector(np.array([2.0, 0.3, 0.0]))
-        link = BulletLink(world, world.createMultiBody(0.0, -1, -1, [0.1, 0.2, 0.5]), quaternion=turn)
+        rotation = quaternion_from_vector(np.array([2.0, 0.3, 0.0]))
+        link = BulletLink(world, world.createMultiBody(0.0, -1, -1, [0.1, 0.2, 0.5]), quaternion=rotation)
         rod = MountedRod(track_robot(), link, capsules_per_segment=5)
         pose = link.motion().pose
         followed = SoftTip(rod.simulator, FixedBase(pose))
-        placed = SoftTip(Simulator(track_robot(), dt=rod.dt, points_per_segment=10), FixedBase(pose))
+        held = SoftTip(Simulator(track_robot(), dt=rod.dt, points_per_segment=10), FixedBase(pose))
         q = np.array([0.01, 0.5 * OFFSET, 0.2 * OFFSET, 0.02, -0.3 * OFFSET, 0.4 * OFFSET])
         state = rod.settle(**followed.actions.inputs(q))
         followed.follow(q, state, pose)
-        placed.place(q, settle=True)
-        assert_allclose(followed.position, placed.position, atol=1e-9)
-        assert_allclose(
-            followed.jacobian(rotation=True), placed.jacobian(rotation=True), rtol=1e-6, atol=1e-6
-        )
+        held.place(q, settle=True)
+        assert_allclose(followed.position, held.position, atol=1e-9)
+        assert_allclose(followed.jacobian(rotation=True), held.jacobian(rotation=True), rtol=1e-6, atol=1e-6)
     finally:
         world.disconnect()

@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-
-@pytest.fixture(autouse=True)
-def _perf_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "perf"))
+from two_engines import CASES, apart, at_rest, carried
 
 
 @pytest.mark.parametrize("case", ["hanging", "pulled by 0.3 N", "on a fixed block", "on a sprung block"])
 def test_tip_and_base_wrench_agree_within_one_percent(case: str) -> None:
-    from two_engines import CASES, apart, at_rest, carried
-
     assert case in CASES
     found = [at_rest(engine, case, 200) for engine in ("PyBullet", "MuJoCo")]
-    parts = apart(*found)
-    assert max(parts.values()) < 0.01, parts
+    costs = apart(*found)
+    assert max(costs.values()) < 0.01, costs
     # nothing agrees by being nothing: the weight hangs on the flange, and what pushes is felt
     weight = np.array([0.0, 0.0, -0.1 * carried()[0].length * 9.81])
     for result in found:

@@ -66,15 +66,15 @@ def test_aim_jacobian_is_the_slope_of_the_miss_where_it_is_zero() -> None:
         for column in jacobian.T:
             ends = []
             for s in (h, -h):
-                turn = matrix_from_quaternion(quaternion_from_vector(s * column[3:])[None])[0]
-                ends.append(miss(tip + s * column[:3], turn @ rotation, point))
+                angle = matrix_from_quaternion(quaternion_from_vector(s * column[3:])[None])[0]
+                ends.append(miss(tip + s * column[:3], angle @ rotation, point))
             slopes.append((ends[0] - ends[1]) / (2.0 * h))
         # the point comes nearer by as much as the line's end moves; central differences: h^2, and 1e-16 / h
         # from rounding
         assert_allclose(-aim_jacobian(tip, rotation, point, jacobian), np.transpose(slopes), atol=1e-8)
 
 
-def test_miss_is_an_arc_and_behind_is_half_a_turn() -> None:
+def test_miss_is_an_arc_and_behind_is_180_degrees() -> None:
     still = np.zeros(3), np.eye(3)
     assert_allclose(miss(*still, np.array([0.2, 0.0, 0.0])), [0.1 * np.pi, 0.0])
     assert_allclose(miss(*still, np.array([0.0, 0.0, 0.3])), [0.0, 0.0])
@@ -88,7 +88,7 @@ def test_eased_rests_at_both_ends() -> None:
     assert eased(1e-3) < 1e-8
 
 
-def test_bracket_is_where_its_link_is_and_nothing_can_touch_it() -> None:
+def test_bracket_is_where_its_link_is_and_has_no_contact() -> None:
     world = connect()
     host = BulletLink(world, world.createMultiBody(1.0, -1, -1, [0.1, 0.2, 0.3]))
     bracket = Bracket(
@@ -111,7 +111,7 @@ def test_bracket_is_where_its_link_is_and_nothing_can_touch_it() -> None:
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_planned_way_of_the_ur5_is_clear_of_the_box_from_every_start(seed: int) -> None:
+def test_planned_path_of_the_ur5_is_clear_of_the_box_from_every_start(seed: int) -> None:
     stage = Exploration(Box(), seed, Explore.dt)
     q, step = stage.q, 0.0
     times = np.linspace(0.0, INSIDE, 51)

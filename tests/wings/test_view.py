@@ -10,6 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 import urllib.request
 import webbrowser
@@ -98,7 +99,7 @@ def test_a_message_is_sent_although_a_client_began_to_wait_in_that_moment() -> N
         assert event.is_set()
 
 
-def test_loopback_is_told_from_the_rest() -> None:
+def test_loopback_is_distinguished() -> None:
     assert [
         is_loopback(h) for h in ("127.0.0.1", "localhost", "::1", "0.0.0.0", "192.168.1.2", "robot.lab")
     ] == [True] * 3 + [False] * 3
@@ -184,19 +185,32 @@ def _address() -> str:
 
 @pytest.mark.parametrize(("host", "announced"), [("127.0.0.1", False), ("0.0.0.0", True)])
 def test_the_address_is_the_key(
-    host: str, announced: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    host: str,
+    announced: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     opened: list[str] = []
+
+    def browse(page: str) -> None:
+        """Go where a file leads that others cannot read: they can read a command line."""
+        path = Path(page.removeprefix("file://"))
+        assert path.stat().st_mode & 0o077 == 0
+        opened.extend(re.findall('url=(.+)"', path.read_text()))
+
     monkeypatch.setattr(App, "wait", lambda app: opened.append(app.served.key))
-    monkeypatch.setattr(webbrowser, "open", opened.append)
+    monkeypatch.setattr(webbrowser, "open", browse)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     before = signal.getsignal(signal.SIGTERM)
     try:
         view("prototype", host=host, port=0)
     finally:
         signal.signal(signal.SIGTERM, before)
     said = capsys.readouterr()
+    assert list(tmp_path.iterdir()) == []
     address, key = opened
     assert address.endswith(f"/{key}/")
     assert f"prototype: {address} (Ctrl+C ends it)" in said.out
-    assert ("Other machines reach this page, too, at http://" in said.err) == announced
+    assert ("Other machines can open this page, too, at http://" in said.err) == announced
     assert (f"/{key}/ and whoever has this address can drive: it is the key" in said.err) == announced

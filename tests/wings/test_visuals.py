@@ -12,7 +12,7 @@ from fastrod.rotation import matrix_from_quaternion
 from fastrod_scenes.robots import ur5_path
 
 WIDTH, HEIGHT, FOV = 240, 180, 40.0
-TURN = [0.1, 0.2, -0.3, 0.927361849549570]  # x y z w
+ROTATION = [0.1, 0.2, -0.3, 0.927361849549570]  # x y z w
 
 
 @pytest.fixture
@@ -26,9 +26,9 @@ def world():
 def corners(visuals):
     """(n, 3) vertices of all shapes, world."""
     poses = visuals.poses()
-    turns = matrix_from_quaternion(poses[:, 3:])
+    rotations = matrix_from_quaternion(poses[:, 3:])
     return np.concatenate(
-        [s.vertices @ r.T + p[:3] for s, r, p in zip(visuals.shapes, turns, poses, strict=True)]
+        [s.vertices @ r.T + p[:3] for s, r, p in zip(visuals.shapes, rotations, poses, strict=True)]
     )
 
 
@@ -73,7 +73,9 @@ def made(world, kind, tmp_path):
 @pytest.mark.parametrize("link", [False, True])
 def test_shape_stands_where_the_camera_sees_it(world, tmp_path, kind, link):
     seen = world.createVisualShape(
-        **made(world, kind, tmp_path), visualFramePosition=[0.05, -0.03, 0.04], visualFrameOrientation=TURN
+        **made(world, kind, tmp_path),
+        visualFramePosition=[0.05, -0.03, 0.04],
+        visualFrameOrientation=ROTATION,
     )
     links = {
         "linkMasses": [1.0],
@@ -167,13 +169,13 @@ def test_mesh_that_cannot_be_read_is_a_box_around_what_touches(world):
     seen = world.createVisualShape(world.GEOM_MESH, vertices=vertices, indices=faces)
     touched = world.createCollisionShape(world.GEOM_MESH, vertices=vertices)
     body = world.createMultiBody(
-        1.0, touched, seen, [1.0, 2.0, 3.0], TURN, baseInertialFramePosition=[0.1, 0.0, 0.0]
+        1.0, touched, seen, [1.0, 2.0, 3.0], ROTATION, baseInertialFramePosition=[0.1, 0.0, 0.0]
     )
     points, box = corners(Visuals(world)), np.array(world.getAABB(body))
     np.testing.assert_allclose([points.min(axis=0), points.max(axis=0)], box, atol=1e-6)
 
 
-def test_body_that_is_gone_is_told(world):
+def test_body_that_is_gone_is_reported(world):
     body = world.createMultiBody(0.0, -1, world.createVisualShape(world.GEOM_SPHERE, radius=0.1))
     visuals = Visuals(world)
     world.removeBody(body)

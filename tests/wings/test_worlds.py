@@ -1,5 +1,5 @@
-"""The worlds that the viewer shows: they play and obey a hand, and what a hand does has the effect that
-physics gives it."""
+"""The worlds that the viewer shows: they play and obey commands, and a command has the effect that physics
+gives it."""
 
 import sys
 from dataclasses import replace
@@ -21,20 +21,20 @@ HOSTED = ["dual_arm", "explore", "neck_look", "neck_push", "pick_suction", "trac
 
 
 def still(world, **options):
-    """A hand that keeps the straight robot."""
+    """A command that keeps the straight robot."""
     return ManualCommand(world.robot.rest_tendon_length, np.zeros(world.robot.n_segments), **options)
 
 
 def heavy(mode="tendon_length"):
     """A level, heavy robot of one segment."""
-    wires = tuple(Tendon(offset=0.0075, angle=k * np.pi / 2) for k in range(4))
+    tendons = tuple(Tendon(offset=0.0075, angle=k * np.pi / 2) for k in range(4))
     segment = Segment(
         length=0.2,
         bending_stiffness=(0.01, 0.01),
         torsional_stiffness=0.008,
         line_density=0.3,
         mode=mode,
-        tendons=() if mode == "passive" else wires,
+        tendons=() if mode == "passive" else tendons,
     )
     return Robot(name="heavy", segments=(segment,), base_quaternion=(np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0))
 
@@ -43,9 +43,9 @@ def tip(world):
     return world.rods[0].state.tip_position[0].copy()
 
 
-def rest(world, hand, steps=8):
+def rest(world, command, steps=8):
     for _ in range(steps):
-        world.drive(hand)
+        world.drive(command)
     return tip(world)
 
 
@@ -55,7 +55,7 @@ def test_world_plays_and_obeys(name):
     try:
         start = world.t
         for move in (
-            [world.play] * 5 + [lambda: world.drive(still(world))] * 5 * world.by_hand + [world.reset]
+            [world.play] * 5 + [lambda: world.drive(still(world))] * 5 * world.drivable + [world.reset]
         ):
             move()
             poses = world.poses()
@@ -73,18 +73,18 @@ def test_world_plays_and_obeys(name):
         world.close()
 
 
-def test_scene_in_mujoco_is_played_and_no_hand_drives_it():
+def test_scene_in_mujoco_is_played_and_nobody_drives_it():
     world, scene = open_world("ur5_mujoco"), load("ur5_mujoco")
     for t, state in zip(range(5), scene.run(), strict=False):
         world.play()
         assert world.t == pytest.approx((t + 1) * scene.dt)
         assert_allclose(tip(world), state[1].tip_position[0], atol=1e-12)
-    assert not world.by_hand
+    assert not world.drivable
     for refused in (lambda: world.drive(still(world)), world.jacobian):
         with pytest.raises(
             InputError,
-            match=r"^scene 'ur5_mujoco' has a script that moves its robots; no "
-            r"hand can drive them\.$",
+            match=r"^scene 'ur5_mujoco' has a script that moves its robots; they "
+            r"cannot be driven by hand\.$",
         ):
             refused()
     world.reset()
@@ -139,11 +139,13 @@ def test_base_moves_the_tip_along(name):
     assert_allclose(moved - before, by, atol=1e-8)
 
 
-def test_base_turns_about_its_origin():
+def test_base_rotates_about_its_origin():
     world = FreeWorld(load_robot("prototype"))
-    before, turn = rest(world, still(world)), np.array([0.3, -0.2, 0.1])
-    turned = rest(world, still(world, base=np.concatenate([np.zeros(3), turn])))
-    assert_allclose(turned, matrix_from_quaternion(quaternion_from_vector(turn)[None])[0] @ before, atol=1e-8)
+    before, angle = rest(world, still(world)), np.array([0.3, -0.2, 0.1])
+    rotated = rest(world, still(world, base=np.concatenate([np.zeros(3), angle])))
+    assert_allclose(
+        rotated, matrix_from_quaternion(quaternion_from_vector(angle)[None])[0] @ before, atol=1e-8
+    )
 
 
 def test_payload_is_the_force_of_its_weight():
@@ -170,7 +172,7 @@ def test_gravity_off_takes_the_sag_away():
     )
 
 
-def test_hand_sets_the_tension():
+def test_command_sets_the_tension():
     world = FreeWorld(heavy("tendon_tension"))
     pulled = rest(world, replace(still(world), tension=np.array([0.0, 2.0, 0.0, 0.0])))
     assert_allclose(world.rods[0].state.tension[0], [0.0, 2.0, 0.0, 0.0])
@@ -214,7 +216,7 @@ def test_robots_in_a_grid_are_driven_alike():
     assert gaps.min() == pytest.approx(0.8 * 0.07)
 
 
-def test_obstacle_follows_the_script_and_waits_for_the_hand():
+def test_obstacle_follows_the_script_and_waits_for_commands():
     world = SceneWorld(load("draped"))
     low = world.poses()[0, 2]
     for _ in range(60):
@@ -246,8 +248,8 @@ def test_world_goes_on_after_what_cannot_be_done():
     for wrong, sentence in (
         (replace(still(world), extension=np.full(5, 0.4)), "extension .* lies outside"),
         (replace(still(world), tendon_length=np.full(15, 0.9)), "tendon_length"),
-        (still(world, base=np.full(6, np.nan)), "Hand.base is"),
-        (still(world, base=np.zeros(3)), "Hand.base is"),
+        (still(world, base=np.full(6, np.nan)), "ManualCommand.base is"),
+        (still(world, base=np.zeros(3)), "ManualCommand.base is"),
     ):
         with pytest.raises(InputError, match=sentence):
             world.drive(wrong)
@@ -266,21 +268,21 @@ def test_world_goes_on_after_what_cannot_be_done():
 def test_tracking_jacobian_against_the_model():
     world = open_world("track_circle")
     try:
-        hand = ManualCommand(
+        command = ManualCommand(
             **{
                 k: world.actions.inputs([0.015, 0.004, 0.002, 0.015, -0.003, 0.003])[k]
                 for k in ("tendon_length", "extension")
             }
         )
-        rest(world, hand, 40)
+        rest(world, command, 40)
         jacobian = world.jacobian()
         assert jacobian.shape == (3, 6 + 6)
         arm, kinematics = world._stage.arm, world._stage.robot.kinematics
         q = np.concatenate([arm.position(), [0.015, 0.004, 0.002, 0.015, -0.003, 0.003]])
         assert_allclose(jacobian, kinematics.finite_differences(q, 1e-5), atol=2e-3 * np.abs(jacobian).max())
-        world.drive(replace(hand, freeze=True))
+        world.drive(replace(command, freeze=True))
         held = arm.position()
-        rest(world, replace(hand, freeze=True, base=np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])), 10)
+        rest(world, replace(command, freeze=True, base=np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])), 10)
         assert_allclose(arm.position(), held, atol=1e-4)
         assert not world.jacobian()[:, :6].any()
         assert_allclose(world.jacobian()[:, 6:], jacobian[:, 6:], atol=1e-2 * np.abs(jacobian).max())
@@ -296,15 +298,15 @@ def test_tracking_jacobian_against_the_model():
         ("dual_arm", lambda s: s.bracket),
     ],
 )
-def test_hand_moves_the_flange(name, bracket):
+def test_command_moves_the_flange(name, bracket):
     world = open_world(name)
     try:
         stage = world._stage
-        hand = still(world)
-        before = rest(world, hand, 60)
+        command = still(world)
+        before = rest(world, command, 60)
         flange = stage.arm.frame(stage.arm.position())
         by = np.array([0.01, -0.02, 0.015])
-        rest(world, replace(hand, base=np.concatenate([by, np.zeros(3)])), 60)
+        rest(world, replace(command, base=np.concatenate([by, np.zeros(3)])), 60)
         assert_allclose(stage.arm.frame(stage.arm.position())[:3] - flange[:3], by, atol=2e-4)
         assert_allclose(tip(world) - before, by, atol=5e-4)
         place = [
@@ -321,10 +323,12 @@ def test_hand_moves_the_flange(name, bracket):
 def test_arm_stays_where_it_cannot_go_and_the_soft_robot_goes_on():
     world = open_world("track_circle")
     try:
-        hand = still(world)
-        rest(world, hand, 30)
+        command = still(world)
+        rest(world, command, 30)
         before = world._stage.arm.position()
-        far = replace(hand, base=np.array([3.0, 0.0, 0.0, 0.0, 0.0, 0.0]), extension=np.array([0.01, 0.01]))
+        far = replace(
+            command, base=np.array([3.0, 0.0, 0.0, 0.0, 0.0, 0.0]), extension=np.array([0.01, 0.01])
+        )
         far = replace(
             far, tendon_length=world.actions.inputs([0.01, 0.0, 0.0, 0.01, 0.0, 0.0])["tendon_length"]
         )
@@ -335,21 +339,21 @@ def test_arm_stays_where_it_cannot_go_and_the_soft_robot_goes_on():
         assert world.rods[0].state.arclength[0, -1] == pytest.approx(0.22)
         assert_allclose(world._stage.arm.position(), before, atol=1e-4)
         rate = np.array([0.3, 0.0, 0.0, 0.0, 0.0, -0.5])
-        rest(world, replace(hand, base_rate=rate), 50)
+        rest(world, replace(command, base_rate=rate), 50)
         assert_allclose(world._stage.arm.position() - before, 50 * world.dt * rate, atol=2e-3)
         after = world._stage.arm.position()
-        # where a drag has brought the arm, the hand's base goes on
-        rest(world, replace(hand, base=far.base), 5)
+        # from where a drag has brought the arm, the commanded base continues
+        rest(world, replace(command, base=far.base), 5)
         assert_allclose(world._stage.arm.position(), after, atol=2e-3)
         with pytest.raises(InputError, match="extension"):
-            world.drive(replace(hand, extension=np.array([0.5, 0.0])))
+            world.drive(replace(command, extension=np.array([0.5, 0.0])))
         world.play()
         assert world.t == 0.0  # the script begins anew
     finally:
         world.close()
 
 
-def test_other_rods_keep_what_they_were_told():
+def test_other_rods_keep_their_inputs():
     world = open_world("dual_arm")
     try:
         second = world.rods[1].state.path_length.copy()
@@ -366,7 +370,7 @@ def test_other_rods_keep_what_they_were_told():
         world.close()
 
 
-def test_pictures_and_scripts_without_a_hand():
+def test_pictures_and_scripts_without_a_command():
     explore, pick = open_world("explore"), open_world("pick_suction")
     try:
         picture = explore.picture()
@@ -374,9 +378,9 @@ def test_pictures_and_scripts_without_a_hand():
         assert picture.dtype == np.uint8
         assert np.ptp(picture) > 0
         assert pick.picture() is None
-        assert (pick.by_hand, pick.host, pick.base_moves, pick.loads) == (False,) * 4
+        assert (pick.drivable, pick.host, pick.base_moves, pick.loads) == (False,) * 4
         assert not any("Capsule" in body.name for body in pick.bodies)
-        with pytest.raises(InputError, match="no hand can drive"):
+        with pytest.raises(InputError, match="cannot be driven by hand"):
             pick.drive(still(pick))
         with pytest.raises(InputError, match="no Jacobian"):
             pick.jacobian()
@@ -392,7 +396,7 @@ def test_rods_capsules_are_no_bodies():
         assert not numbers & set(world._stage.rod.bodies.ids)
         assert world._stage.cube in numbers
         assert not world.host
-        assert world.by_hand
+        assert world.drivable
     finally:
         world.close()
 

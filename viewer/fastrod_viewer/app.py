@@ -22,7 +22,7 @@ from fastrod_viewer.catalogue import catalogue, open_world
 from fastrod_viewer.drive_page import DrivePage
 from fastrod_viewer.holder import Holder
 from fastrod_viewer.holder_panel import HolderPanels
-from fastrod_viewer.page import ViewerPage, is_upright, tell
+from fastrod_viewer.page import ViewerPage, is_upright, notify
 from fastrod_viewer.playback import Playback, load
 from fastrod_viewer.replay_page import ReplayPage
 from fastrod_viewer.server import serve
@@ -31,7 +31,7 @@ from fastrod_viewer.world import World
 from fastrod_viewer.worlds import FreeWorld
 
 FIRST = "five_segment_reacher"
-"""What is shown where nothing is named."""
+"""Shown unless something is named."""
 MOST = 1024
 """Robots in a grid."""
 _BRAND = (37, 99, 235)
@@ -79,7 +79,7 @@ class App:
 
     @property
     def address(self) -> str:
-        """Where a browser finds it, with the key that the page and its websocket need."""
+        """URL of the page, with the key that the page and its websocket need."""
         return self.served.address
 
     def open(
@@ -89,9 +89,9 @@ class App:
         link: RobotLink | None = None,
         script: bool = False,
     ) -> None:
-        """Show a scene or robot by name or file, a world, a robot, or a log with what models say to it. With
-        a `link`, hands drive that robot, and the world is its model. What was shown before stays where this
-        cannot be: raises `FastrodError`."""
+        """Show a scene or robot by name or file, a world, a robot, or a log with the predictions of models.
+        With a `link`, manual commands drive that robot, and the world is its model. Raises `FastrodError`,
+        and what was shown before stays."""
         with self._lock:
             new = self._found(what)
             _check_link(new, link)
@@ -166,7 +166,7 @@ class App:
         try:
             self.open(name)
         except FastrodError as error:
-            tell(event.client, f"{name} cannot be shown", str(error), failed=True)
+            notify(event.client, f"{name} cannot be shown", str(error), failed=True)
             self._picker.value = before
         finally:
             note.remove()
@@ -181,7 +181,7 @@ class App:
             except FastrodError as error:
                 self.say(str(error))
                 for client in self.server.get_clients().values():
-                    tell(client, "The recording cannot be replayed", str(error), failed=True)
+                    notify(client, "The recording cannot be replayed", str(error), failed=True)
 
         threading.Thread(target=job, name="replay", daemon=True).start()
 
@@ -224,8 +224,9 @@ DEMO_LOG = "measured log (demo)"
 def found(
     what: str | Path | World | Robot | Playback, robot: str | Path | None = None, n_robots: int = 1
 ) -> World | Playback:
-    """What a page shows: the log or world that a name or a path stands for, or what was given; `robot` is a
-    log's, `n_robots` of a robot stand in a grid. Raises `FastrodError`, one sentence, where there is none."""
+    """Return what a page shows: the log or world that a name or a path stands for, or what was given; `robot`
+    is a log's, `n_robots` of a robot stand in a grid. Raises `FastrodError`, one sentence, where there is
+    none."""
     if isinstance(what, (World, Playback)):
         return what
     if n_robots > MOST:
@@ -297,13 +298,11 @@ def view(
     with contextlib.suppress(KeyboardInterrupt), App(host=host, port=port, server=server) as app:
         shown = found(what, robot, n_robots)
         if open_browser:
-            import webbrowser
-
-            webbrowser.open(app.address)
+            app.served.open_browser()
         app.open(shown, link=link, script=script)
         if app.served.elsewhere:
             app.say(
-                f"Other machines reach this page, too, at {app.served.elsewhere} and whoever has this "
+                f"Other machines can open this page, too, at {app.served.elsewhere} and whoever has this "
                 "address can drive: it is the key, nobody gets in without it, and it travels unencrypted."
             )
         print(f"{app.page.title if app.page else what}: {app.address} (Ctrl+C ends it)", flush=True)

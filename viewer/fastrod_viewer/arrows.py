@@ -9,14 +9,14 @@ import numpy as np
 from fastrod.errors import InputError
 from fastrod.rotation import product
 from fastrod.types import Floats
-from fastrod_viewer.chains import aim, tangents
+from fastrod_viewer.curves import aim, tangents
 from fastrod_viewer.palette import AXES, Color, blend
 from fastrod_viewer.shapes import Instances, instances
 
-_TURNS = np.array(
+_AXIS_ORIENTATIONS = np.array(
     [[np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0], [np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]]
 )
-"""From z to x, y and z."""
+"""Rotations of z to x, y and z."""
 _PAPER: Color = (255, 255, 255)
 
 
@@ -31,18 +31,22 @@ def arrows(
     head = np.minimum(6.0 * radius, 0.5 * length)
     thick = 0.4 * head
     thin = np.minimum(radius, 0.5 * thick)
-    turn = aim(direction)
+    orientation = aim(direction)
     shaft = length - head
     return (
         instances(
             "bar",
             start + direction * (0.5 * shaft)[:, None],
-            turn,
+            orientation,
             np.stack([thin, thin, shaft], axis=1),
             color,
         ),
         instances(
-            "cone", start + direction * shaft[:, None], turn, np.stack([thick, thick, head], axis=1), color
+            "cone",
+            start + direction * shaft[:, None],
+            orientation,
+            np.stack([thick, thick, head], axis=1),
+            color,
         ),
     )
 
@@ -50,11 +54,13 @@ def arrows(
 def frames(position: Floats, quaternion: Floats, length: float) -> Instances:
     """Red, green and blue axes of frames at `position` (n, 3) [m], `quaternion` (n, 4) world_from_frame,
     `length` [m] long."""
-    turns = product(quaternion[:, None, :], np.broadcast_to(_TURNS, (len(quaternion), 3, 4)))
-    ends = position[:, None, :] + 0.5 * length * tangents(turns)
-    scale = np.broadcast_to([0.04 * length, 0.04 * length, length], (*turns.shape[:2], 3))
+    orientations = product(
+        quaternion[:, None, :], np.broadcast_to(_AXIS_ORIENTATIONS, (len(quaternion), 3, 4))
+    )
+    ends = position[:, None, :] + 0.5 * length * tangents(orientations)
+    scale = np.broadcast_to([0.04 * length, 0.04 * length, length], (*orientations.shape[:2], 3))
     return instances(
-        "bar", ends, turns, scale, np.broadcast_to(np.array(AXES, np.uint8), (len(position), 3, 3))
+        "bar", ends, orientations, scale, np.broadcast_to(np.array(AXES, np.uint8), (len(position), 3, 3))
     )
 
 
@@ -66,24 +72,28 @@ def ghost(points: Floats, radius: float, color: Color) -> Instances:
         raise InputError(
             f"points has shape {points.shape}; a ghost needs (n, 3) with two or more points [m]."
         )
-    return _chain(points, np.full(len(points) - 1, radius), color)
+    return _polyline(points, np.full(len(points) - 1, radius), color)
 
 
-def _chain(points: Floats, radius: Floats, color: Color) -> Instances:
+def _polyline(points: Floats, radius: Floats, color: Color) -> Instances:
     there = np.asarray(np.isfinite(points[1:] + points[:-1]).all(axis=1))
     points = np.where(np.isfinite(points), points, 0.0)
     chord = points[1:] - points[:-1]
     length = np.where(there, np.linalg.norm(chord, axis=1), 0.0)
     thick = np.where(there, radius, 0.0)
-    turn = aim(np.where(there[:, None], chord, 0.0) / np.maximum(length, 1e-30)[:, None])
+    orientation = aim(np.where(there[:, None], chord, 0.0) / np.maximum(length, 1e-30)[:, None])
     return instances(
-        "wire", 0.5 * (points[1:] + points[:-1]), turn, np.stack([thick, thick, length], axis=1), color
+        "thin_tube",
+        0.5 * (points[1:] + points[:-1]),
+        orientation,
+        np.stack([thick, thick, length], axis=1),
+        color,
     )
 
 
 @final
 class Trail:
-    """Where a point was: a chain that fades toward its old end."""
+    """Trail of a point: a line that fades toward its old end."""
 
     def __init__(self, capacity: int, min_step: float) -> None:
         """Of `capacity` pieces, each at least `min_step` [m] long. Raises `InputError`."""
@@ -113,11 +123,11 @@ class Trail:
         """`capacity` pieces, oldest first; the newest has the full `radius` [m] and colour."""
         if self._drawn is None or self._drawn[:2] != (radius, color):
             age = np.linspace(0.0, 1.0, self.capacity + 1)[1:]
-            chain = _chain(self._points, radius * (0.3 + 0.7 * age), color)
+            line = _polyline(self._points, radius * (0.3 + 0.7 * age), color)
             self._drawn = (
                 radius,
                 color,
-                chain._replace(color=blend(color, _PAPER, 0.85 * (1.0 - age)[:, None])),
+                line._replace(color=blend(color, _PAPER, 0.85 * (1.0 - age)[:, None])),
             )
         return self._drawn[2]
 

@@ -22,7 +22,7 @@ _FLOOR = (226, 229, 235), (196, 202, 212)
 
 @final
 class Canvas:
-    """The 3D part of a page. One thread draws; names are those of the scene graph."""
+    """The 3D view of a page. One thread draws; names are those of the scene graph."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self.server = server
@@ -109,7 +109,7 @@ class Canvas:
             self._poses[k] = poses[k]
 
     def fade(self, k: int, opacity: float) -> None:
-        """How opaque a body is from now on."""
+        """Set the opacity of a body."""
         wanted = None if opacity >= 1.0 else opacity
         if self._bodies[k].opacity != wanted:
             self._bodies[k].opacity = wanted
@@ -170,7 +170,7 @@ class Canvas:
         ]:
             self.show(name, None)
         for shape, some in by_shape.items():
-            arrays = (np.concatenate(parts) for parts in zip(*(batch[1:] for batch in some), strict=True))
+            arrays = (np.concatenate(columns) for columns in zip(*(batch[1:] for batch in some), strict=True))
             self.show(prefix + shape, some[0] if len(some) == 1 else Instances(shape, *arrays))
 
     def note(self, name: str, text: str, position: Sequence[float] | NDArray[np.floating] | None) -> None:

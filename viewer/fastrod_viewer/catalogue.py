@@ -11,6 +11,7 @@ from fastrod.errors import UnknownNameError, nearest
 from fastrod.model.robot import Robot
 from fastrod.model.robotfile import load_robot, robot_names
 from fastrod_scenes.scene import HostedScene, MujocoScene, RodScene, load, names
+from fastrod_viewer.robots import about
 
 if TYPE_CHECKING:
     from fastrod_viewer.world import World
@@ -49,27 +50,6 @@ MUJOCO_SCENES: Mapping[str, str] = {
     "feels the spring in its joints."
 }
 """Scenes in a MuJoCo model (`pip install fastrod[mujoco]`), likewise."""
-_DRIVES = {
-    "tendon_length": "driven by the lengths of its tendons",
-    "tendon_tension": "driven by the tensions of its tendons",
-    "passive": "without tendons",
-    "paper": "driven by the lengths of its tendons, by the paper's reduced model",
-}
-
-
-def about(robot: Robot) -> str:
-    """One sentence on a robot.
-
-    >>> about(load_robot("prototype"))
-    'One segment, 0.07 m, driven by the lengths of its tendons.'
-    """
-    n = robot.n_segments
-    modes = dict.fromkeys(segment.mode for segment in robot.segments)
-    how = " and ".join(_DRIVES[mode] for mode in modes)
-    return (
-        f"{'One segment' if n == 1 else f'{n} segments'}, {robot.length:g} "
-        f"m{' in all' if n > 1 else ''}, {how}."
-    )
 
 
 def catalogue() -> dict[str, str]:

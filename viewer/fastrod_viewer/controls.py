@@ -1,211 +1,239 @@
-"""`Controls`: sliders, buttons and keys by which hands drive a robot, on a page."""
+"""`Control`: one number that a person sets, in the unit in which people think of it; and those of a robot,
+group by group."""
 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
-from functools import partial
-from typing import TYPE_CHECKING, Any, final
+from dataclasses import dataclass
 
 import numpy as np
 
-from fastrod_viewer.knobs import Group, drive_knobs, load_knobs
-from fastrod_viewer.pilot import Speeds
-from fastrod_viewer.session import Session
+from fastrod.model.robot import Robot
+from fastrod_viewer.teleop import LARGEST_BEND, LARGEST_TENSION, Teleop
+from fastrod_viewer.world import World
 
-if TYPE_CHECKING:
-    import viser
-
-_KEY_STEP = math.radians(5.0)  # of a segment's bend, by a press
-_FASTEST = 360  # °/s
-_SETTLED = 0.3  # s after a change in which a control is left alone: it may be under a finger
+_ALL = 60.0  # deg, of each segment
+_NICE = (1.0, 2.0, 5.0, 10.0)
+_MM, _GRAM, _DEGREE = 1e-3, 1e-3, math.pi / 180.0
 
 
-@final
-class Controls:
-    """Handles of one robot's controls, made inside the tabs `drive` and `loads`; they follow the pilot,
-    whoever moves it."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Control:
+    """A slider without its page."""
 
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        session: Session,
-        drive: Any,
-        loads: Any,
-        *,
-        may: Callable[[Any], bool],
-    ) -> None:
-        """`may` says of an event whether the page it comes from may act."""
-        self.server, self.session, self.pilot, self._may = server, session, session.pilot, may
-        self.chosen = 0
-        """Segment that keys bend."""
-        self._followers: list[tuple[Any, Callable[[], Any]]] = []
-        self._commands: list[Any] = []
-        with drive:
-            self._drive()
-        with loads:
-            self._loads()
-        self._keys()
+    label: str
+    """Its name, with its unit in brackets."""
+    low: float
+    high: float
+    step: float
+    get: Callable[[], float]
+    """Returns its value, in that unit."""
+    put: Callable[[float], None]
+    hint: str
 
-    def follow(self) -> None:
-        """Show where the pilot's goals stand."""
-        for handle, value in self._followers:
-            now = value()
-            if handle.value != now and time.time() - handle.update_timestamp > _SETTLED:
-                handle.value = now
+    @property
+    def value(self) -> float:
+        """Its value, rounded to a tenth of a step, and to 0 within half a step of it, within its ends."""
+        digits = max(0, 1 - math.floor(math.log10(self.step)))
+        value = self.get()
+        return min(max(round(value, digits) if abs(value) >= 0.5 * self.step else 0.0, self.low), self.high)
 
-    def close(self) -> None:
-        """Take the keys back; the tabs are removed by their owner."""
-        for command in self._commands:
-            command.remove()
-        self._followers, self._commands = [], []
 
-    def _drive(self) -> None:
-        gui, session, pilot = self.server.gui, self.session, self.pilot
-        world = session.world
-        if not world.by_hand:
-            gui.add_markdown("This scene plays its own script; it cannot be driven by hand.")
-            return
-        if world.scripted and session.link is None:
-            script = gui.add_checkbox(
-                "Demo motion", session.scripted, hint="It moves by itself until you move it."
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Controls that belong together."""
+
+    title: str
+    """Empty for those that stand first, without a heading."""
+    controls: tuple[Control, ...]
+    open: bool = True
+    """At first."""
+
+
+def nice(value: float) -> float:
+    """The next of 1, 2, 5 times a power of ten that is not below a positive value.
+
+    >>> nice(0.43), nice(2.0)
+    (0.5, 2.0)
+    """
+    power = 10.0 ** math.floor(math.log10(value))
+    return float(f"{next(n for n in _NICE if n * power >= value * (1.0 - 1e-9)) * power:.6g}")
+
+
+def largest_force(robot: Robot) -> float:
+    """Return the tip force [N] that bends the robot by a good fraction of its length: twice EI / l^2, rounded
+    up."""
+    return nice(2.0 * min(min(s.bending_stiffness) for s in robot.segments) / robot.length**2)
+
+
+def drive_controls(world: World, teleop: Teleop) -> list[Group]:
+    """Return groups for bends and extensions, tendons, and base: those that the robot has."""
+    robot, groups = world.robot, []
+    n = robot.n_segments
+    if teleop.actions is not None:
+        if n > 1:
+            groups.append(Group("", tuple(_all_bend(teleop, n, axis) for axis in (0, 1))))
+        groups += [Group(f"Segment {k + 1}", _segment(robot, teleop, k), n <= 2) for k in range(n)]
+    if robot.n_tendons:
+        groups.append(
+            Group(
+                "Tendons",
+                tuple(_tendon(robot, teleop, i) for i in range(robot.n_tendons)),
+                teleop.actions is None,
             )
-            self._listen(script, lambda on: setattr(session, "scripted", bool(on)), take_over=False)
-            self._followers.append((script, lambda: session.scripted))
-        if world.host:
-            frozen = gui.add_checkbox(
-                "Freeze the rigid host", False, hint="Its joints hold still; only the soft robot moves."
-            )
-            self._listen(frozen, lambda on: pilot.freeze(bool(on)))
-        if not world.robot.n_tendons:
-            gui.add_markdown("This robot has no wires. Load its tip instead: tab *Loads*.")
-        groups = drive_knobs(world, pilot)
-        for group in [group for group in groups if not group.title or group.title.startswith("Segment")]:
-            self._add(group)
-        if pilot.actions is not None:
-            self._button("Straighten", pilot.all_zero)
-        for group in [group for group in groups if group.title and not group.title.startswith("Segment")]:
-            self._add(group)
-        if world.robot.n_tendons:
-            most = self._fastest()
-            now = min(most, max(5, 5 * round(math.degrees(self.pilot.speeds.bend) / 5)))
-            speed = gui.add_slider(
-                "Speed [°/s]",
-                5,
-                most,
-                5,
-                now,
-                hint="Largest rate at which a segment bends; wires and base in step.",
-            )
-            self._listen(speed, self._set_speed, take_over=False)
-
-    def _fastest(self) -> int:
-        """Largest speed that is offered [°/s]: a linked robot's wires do not follow every one."""
-        if self.pilot.actions is None or not math.isfinite(self.pilot.reach.rate):
-            return _FASTEST
-        return min(
-            _FASTEST,
-            max(10, 5 * int(math.degrees(self.pilot.reach.rate / self.pilot.actions.offset.max()) / 5)),
         )
-
-    def _set_speed(self, degrees: float) -> None:
-        usual = Speeds()
-        self.pilot.speeds = usual.times(math.radians(degrees) / usual.bend)
-
-    def _loads(self) -> None:
-        if not self.session.world.loads or self.session.link is not None:
-            self.server.gui.add_markdown("Loads cannot be put on this robot from here.")
-            return
-        self._add(load_knobs(self.session.world.robot, self.pilot))
-        self._button("No loads", lambda: self.pilot.load(tip_force=np.zeros(3), payload=0.0, gravity=1.0))
-
-    def _add(self, group: Group) -> None:
-        gui = self.server.gui
-        with gui.add_folder(group.title or None, expand_by_default=group.open):
-            for knob in group.knobs:
-                handle = gui.add_slider(
-                    knob.label, knob.low, knob.high, float(f"{knob.step:.6g}"), knob.value, hint=knob.hint
-                )
-                self._listen(handle, knob.put)
-                self._followers.append((handle, partial(getattr, knob, "value")))
-
-    def _button(self, label: str, do: Callable[[], None]) -> None:
-        def press(event: Any) -> None:
-            if not self._may(event):
-                return
-            self.session.take_over()
-            do()
-            self.session.touch()
-
-        self.server.gui.add_button(label, color="gray").on_click(press)
-
-    def _listen(self, handle: Any, put: Callable[[Any], None], *, take_over: bool = True) -> None:
-        """What a person changes goes to `put`; what `follow` shows does not. Where the page may not act it
-        goes back."""
-        kept = handle.value
-
-        def changed(event: Any) -> None:
-            nonlocal kept
-            if event.client_id is None:
-                return
-            if not self._may(event):
-                handle.value = next((value() for one, value in self._followers if one is handle), kept)
-                return
-            kept = event.target.value
-            if take_over:
-                self.session.take_over()
-            put(event.target.value)
-            self.session.touch()
-
-        handle.on_update(changed)
-
-    def _keys(self) -> None:
-        session = self.session
-        self._command("Stop", "escape").on_trigger(stops(session))
-        self._command("Pause, or go on", "space").on_trigger(self._pause)
-        self._key("Reset", "R", session.reset)
-        if self.pilot.actions is None or not session.world.by_hand:
-            return
-        # not A, D, W, S, nor arrows: with these viser flies the camera
-        for name, key, axis, sign in (
-            ("+x", "L", 0, 1),
-            ("-x", "J", 0, -1),
-            ("+y", "I", 1, 1),
-            ("-y", "K", 1, -1),
-        ):
-            self._key(f"Bend toward {name}", key, partial(self._bend, axis, sign))
-        for k in range(min(session.world.robot.n_segments, 9)):
-            self._key(f"Keys bend segment {k + 1}", str(k + 1), partial(setattr, self, "chosen", k))
-
-    def _key(self, label: str, key: Any, do: Callable[[], None]) -> None:
-        self._command(label, key).on_trigger(lambda event: do() if self._may(event) else None)
-
-    def _command(self, label: str, key: Any) -> Any:
-        command = self.server.gui.add_command(label, hotkey=key)
-        self._commands.append(command)
-        return command
-
-    def _pause(self, event: Any) -> None:
-        """Every page may pause; to go on is for the one that has the controls."""
-        if not self.session.paused:
-            self.session.paused = True
-        elif self._may(event):
-            self.session.paused = False
-
-    def _bend(self, axis: int, sign: int) -> None:
-        self.session.take_over()
-        bends = list(self.pilot.bent(self.chosen))
-        bends[axis] += sign * _KEY_STEP
-        self.pilot.bend(self.chosen, *bends)
-        self.session.touch()
+    if world.base_moves and not teleop.linked:
+        title = "Flange of the host" if world.host else "Base"
+        groups.append(Group(title, tuple(_base(robot, teleop, axis) for axis in range(6)), open=False))
+    return groups
 
 
-def stops(session: Session) -> Callable[[Any], Any]:
-    """Return what a STOP calls, on every page: it runs in viser's own loop, before what is sent later and
-    whatever else pages have asked for."""
+def load_controls(robot: Robot, teleop: Teleop) -> Group:
+    """Tip force, payload, gravity."""
+    most = largest_force(robot)
+    heaviest = nice(most / 9.81 / _GRAM)
+    payload = Control(
+        label="Payload [g]",
+        low=0.0,
+        high=heaviest,
+        step=heaviest / 100.0,
+        hint="Mass at the tip.",
+        get=lambda: teleop.loads[1] / _GRAM,
+        put=lambda v: teleop.load(payload=v * _GRAM),
+    )
+    gravity = Control(
+        label="Gravity [× g]",
+        low=0.0,
+        high=3.0,
+        step=0.05,
+        hint="On robot and payload.",
+        get=lambda: teleop.loads[2],
+        put=lambda v: teleop.load(gravity=v),
+    )
+    return Group("", (*(_force(teleop, axis, most) for axis in range(3)), payload, gravity))
 
-    async def stop(_: object) -> None:
-        session.stop()
 
-    return stop
+def _all_bend(teleop: Teleop, n: int, axis: int) -> Control:
+    def get() -> float:
+        return float(np.mean([teleop.bent(k)[axis] for k in range(n)])) / _DEGREE
+
+    def put(degrees: float) -> None:
+        for k in range(n):
+            _bend(teleop, k, axis, degrees)
+
+    name = "xy"[axis]
+    hint = f"Bends every segment by so many degrees toward {name}."
+    return Control(label=f"All bend {name} [°]", low=-_ALL, high=_ALL, step=1.0, get=get, put=put, hint=hint)
+
+
+def _segment(robot: Robot, teleop: Teleop, k: int) -> tuple[Control, ...]:
+    most = min(LARGEST_BEND / _DEGREE, _whole(teleop.limits.displacement, _arm(teleop, k) * _DEGREE))
+    bends = tuple(
+        Control(
+            label=f"Bend {name} [°]",
+            low=-most,
+            high=most,
+            step=1.0,
+            hint=f"Bends the segment toward {name} of its base.",
+            get=lambda axis=axis: teleop.bent(k)[axis] / _DEGREE,  # type: ignore[misc]
+            put=lambda v, axis=axis: _bend(teleop, k, axis, v),  # type: ignore[misc]
+        )
+        for axis, name in enumerate("xy")
+    )
+    low, high = (v / _MM for v in robot.segments[k].extension)
+    if high <= low:
+        return bends
+    extend = Control(
+        label="Extend [mm]",
+        low=low,
+        high=high,
+        step=0.1,
+        hint="Lengthens the segment.",
+        get=lambda: float(teleop.goals.action[3 * k]) / _MM,
+        put=lambda v: teleop.extend(k, v * _MM),
+    )
+    return (*bends, extend)
+
+
+def _arm(teleop: Teleop, k: int) -> float:
+    """Return the lever arm of a segment's bend on its tendons [m]."""
+    return math.inf if teleop.actions is None else float(teleop.actions.offset[k])
+
+
+def _whole(most: float, step: float) -> float:
+    """The largest whole number of steps within `most`."""
+    return float(math.floor(most / step)) if math.isfinite(most) else most
+
+
+def _bend(teleop: Teleop, k: int, axis: int, degrees: float) -> None:
+    bends = list(teleop.bent(k))
+    bends[axis] = degrees * _DEGREE
+    teleop.bend(k, *bends)
+
+
+def _tendon(robot: Robot, teleop: Teleop, i: int) -> Control:
+    k = int(robot.tendon_segment[i])
+    segment = robot.segments[k]
+    name = f"Tendon {i + 1}" + (f", segment {k + 1}" if robot.n_segments > 1 else "")
+    if segment.mode == "tendon_tension":
+        return Control(
+            label=f"{name} [N]",
+            low=0.0,
+            high=LARGEST_TENSION,
+            step=0.05,
+            hint="Tension of the tendon.",
+            get=lambda: float(teleop.goals.tension[i]),
+            put=lambda v: teleop.pull_with(i, v),
+        )
+    most = min(
+        nice(LARGEST_BEND * sum(math.hypot(*place) for place in robot.tendons[i].position(k + 1)) / _MM),
+        0.05 * _whole(teleop.limits.displacement / _MM - 1e-3, 0.05),
+    )
+    return Control(
+        label=f"{name} [mm]",
+        low=-most,
+        high=most,
+        step=0.05,
+        hint="Positive pulls the tendon, negative lets it out.",
+        get=lambda: -float(teleop.change[i]) / _MM,
+        put=lambda v: teleop.change_tendon(i, -v * _MM),
+    )
+
+
+def _base(robot: Robot, teleop: Teleop, axis: int) -> Control:
+    straight = axis < 3
+    unit, word, factor = ("mm", "", _MM) if straight else ("°", "Rotate ", _DEGREE)
+    most = nice(0.5 * robot.length / _MM) if straight else 90.0
+
+    def put(value: float) -> None:
+        base = teleop.goals.base.copy()
+        base[axis] = value * factor
+        teleop.move_base(base)
+
+    return Control(
+        label=f"{word}{'xyz'[axis % 3]} [{unit}]",
+        low=-most,
+        high=most,
+        step=1.0,
+        hint="From where it began, world axes.",
+        get=lambda: float(teleop.goals.base[axis]) / factor,
+        put=put,
+    )
+
+
+def _force(teleop: Teleop, axis: int, most: float) -> Control:
+    def put(value: float) -> None:
+        force = teleop.loads[0].copy()
+        force[axis] = value
+        teleop.load(tip_force=force)
+
+    return Control(
+        label=f"Tip force {'xyz'[axis]} [N]",
+        low=-most,
+        high=most,
+        step=most / 100.0,
+        hint="Force on the tip, world axes.",
+        get=lambda: float(teleop.loads[0][axis]),
+        put=put,
+    )

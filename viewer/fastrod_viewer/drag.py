@@ -1,4 +1,4 @@
-"""The tip follows a hand: inverse kinematics of a drag, step by step."""
+"""Inverse kinematics of a drag of the tip, step by step."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ GAIN = 8.0
 FARTHEST = 0.25
 """Of the robot's length: a tip that is dragged farther counts as this far."""
 DAMPING = 0.02
-"""Of the robot's length by 1 rad: where less than that moves the tip, the way is given up rather than the
+"""Of the robot's length by 1 rad: where less than that moves the tip, the motion is given up rather than the
 segments thrown about."""
 JOINT_RATE = 0.4
 """Largest of a host's joint in a drag [rad/s]."""
 JOINT_COST = 25.0
-"""Of a joint's 1 rad, where that of a segment's bend by 1 rad is 1: the soft robot goes first."""
+"""Weight of a joint's 1 rad, where that of a segment's bend by 1 rad is 1: the soft robot goes first."""
 
 
 def drag_rates(
@@ -30,17 +30,16 @@ def drag_rates(
     limits: tuple[Floats, Floats, Floats],
     dt: float,
 ) -> Floats:
-    """(n_joints + n_actions,) rates of a host's joints [rad/s] and of the segments' actions [m/s] for the
-    next `dt` [s].
+    """Return the rates (n_joints + n_actions,) of a host's joints [rad/s] and of the segments' actions [m/s]
+    for the next `dt` [s].
 
     `action` (n_actions,) now [m]; `jacobian` (3, n_joints + n_actions) of the tip; `error` (3,) from the tip
-    to the hand [m]; `limits`:
-    least and largest action, and largest rates, (n_actions,) each.
+    to the drag point [m]; `limits`: least and largest action, and largest rates, (n_actions,) each.
 
     The rates x that minimise |J x - gain error|^2 + l^2 sum of weight x^2 within the limits: damped least
     squares (Wampler 1986, Nakamura and Hanafusa 1986) with bounds. `ResolvedRate` would keep the direction of
-    the error, or stand still; a hand pulls wherever it likes, also where a robot at its limits can go part of
-    the way only.
+    the error, or stand still; a drag may pull anywhere, also where a robot at its limits can follow only
+    partly.
     """
     from scipy.optimize import lsq_linear
 

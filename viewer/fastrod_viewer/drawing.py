@@ -39,7 +39,7 @@ class Drawing:
         trail: bool = True,
         measured: bool = False,
     ) -> None:
-        """`measured`: frames will tell where the tip was measured, and the legend says what that looks
+        """`measured`: frames will report where the tip was measured, and the legend says what that looks
         like."""
         self.canvas, self.world = canvas, world
         self.options, self.trail, self._tips = options, trail, measured
@@ -78,17 +78,17 @@ class Drawing:
         return replace(made, tips=tips).html()
 
     def tip(self) -> Floats:
-        """(3,) where the tip of the robot that hands drive is drawn [m]."""
+        """Return where the tip of the driven robot is drawn (3,) [m]."""
         rods = self.world.rods[0]
         return np.asarray(rods.state.tip_position[0] + rods.place[0])
 
     def draw(self, frame: ViewFrame) -> None:
         """One picture."""
-        hand = frame.hand
+        command = frame.command
         force = None
-        if hand is not None:
-            weight = hand.payload * hand.gravity * np.array(self.world.robot.gravity)
-            force = hand.tip_force + weight
+        if command is not None:
+            weight = command.payload * command.gravity * np.array(self.world.robot.gravity)
+            force = command.tip_force + weight
         for k, (rods, picture) in enumerate(zip(self.world.rods, self._pictures, strict=True)):
             shown = picture.frame(rods, tip_force=force if k == 0 else None)
             if self.trail:
@@ -102,11 +102,15 @@ class Drawing:
         self.canvas.move_bodies(poses)
         self._see_through(poses)
         self._measured(frame)
-        text = f"{np.linalg.norm(hand.tip_force):.3g} N" if hand is not None and hand.tip_force.any() else ""
+        text = (
+            f"{np.linalg.norm(command.tip_force):.3g} N"
+            if command is not None and command.tip_force.any()
+            else ""
+        )
         self.canvas.note("force", text, self.tip() + 1.5 * self.radius if text else None)
 
     def _see_through(self, poses: Floats) -> None:
-        """What the tip has entered hides it no longer."""
+        """Make see-through what the tip has entered."""
         if not len(poses):
             return
         tip = self.world.rods[0].state.tip_position[0]
@@ -118,7 +122,7 @@ class Drawing:
             self.canvas.fade(k, min(body.opacity, _GLASS) if within[k] else body.opacity)
 
     def _measured(self, frame: ViewFrame) -> None:
-        """The tip that the robot itself tells: a plate with axes, and where it was."""
+        """Draw the tip that the robot itself reports: a plate with axes, and its trail."""
         now = frame.measured
         seen = now is not None and bool(np.isfinite(now.tip_position).all())
         if now is None or not seen:
@@ -131,10 +135,11 @@ class Drawing:
             self._track.add(place)
             upright = not np.isfinite(now.tip_quaternion).all()
             own = np.array([1.0, 0.0, 0.0, 0.0]) if upright else now.tip_quaternion
-            turn = product(quaternion_from_matrix(base[None])[0], own)
-            self.canvas.show("measured", _plate(place, turn, self.radius))
+            orientation = product(quaternion_from_matrix(base[None])[0], own)
+            self.canvas.show("measured", _plate(place, orientation, self.radius))
             self.canvas.show(
-                "measured axes", None if upright else frames(place[None], turn[None], 1.7 * self.radius)
+                "measured axes",
+                None if upright else frames(place[None], orientation[None], 1.7 * self.radius),
             )
         self.canvas.show(
             "measured trail",
@@ -147,7 +152,7 @@ class Drawing:
         return [[Trail(_TRAIL, 0.6 * self.radius) for _ in range(n if n <= FINE else 0)] for n in counts]
 
 
-def _plate(place: Floats, turn: Floats, radius: float) -> Instances:
-    """A disc at `place` (3,), turned by `turn` (4,), as large as the tip of a body of `radius` [m], and then
-    some."""
-    return instances("disc", place, turn, radius * np.array([_WIDE, _WIDE, _THIN]), MEASURED)
+def _plate(place: Floats, orientation: Floats, radius: float) -> Instances:
+    """Return a disc at `place` (3,), rotated by `orientation` (4,), somewhat larger than the tip of a body of
+    `radius` [m]."""
+    return instances("disc", place, orientation, radius * np.array([_WIDE, _WIDE, _THIN]), MEASURED)

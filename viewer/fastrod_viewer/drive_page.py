@@ -15,15 +15,15 @@ from fastrod.logs.link import Measurement, RobotLink
 from fastrod.logs.recording import free_path
 from fastrod.logs.runlog import RunLog
 from fastrod_viewer.canvas import Canvas
-from fastrod_viewer.controls import Controls, stops
+from fastrod_viewer.control_panel import ControlPanel, stops
+from fastrod_viewer.drag_handle import DragHandle
 from fastrod_viewer.drawing import Drawing
 from fastrod_viewer.export import wrap
-from fastrod_viewer.grip import DragHandle
 from fastrod_viewer.linked import Linked
 from fastrod_viewer.options import FINE, ViewOptions
-from fastrod_viewer.page import PageView, ViewerPage, facts, picture, save_name, send, stand_back, tell
-from fastrod_viewer.pilot import Speeds, Teleop
+from fastrod_viewer.page import PageView, ViewerPage, facts, notify, picture, save_name, send, stand_back
 from fastrod_viewer.session import Session, ViewFrame
+from fastrod_viewer.teleop import Speeds, Teleop
 from fastrod_viewer.world import World
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 _GENTLE = 1.0 / 6.0  # of the usual speeds, among obstacles
 _REAL = 0.25  # of the usual speeds, where motion may do harm
-_TOLD = 0.2  # s between two changes of figures and sliders
+_SHOW_EVERY = 0.2  # s between two changes of figures and sliders
 _WIDE = 320  # pixels of the window for a camera in hand
 _LOOKS = 0.15  # s between two pictures of a camera in hand
 _LONG = 1.5  # s of one step
@@ -46,16 +46,16 @@ _COLORS = {
     "segment": "segment",
     "curvature": "curvature",
     "surface strain": "strain",
-    "wire tension": "tension",
+    "tendon tension": "tension",
 }
-_PARTS = {
+_OPTION_LABELS = {
     "spacers": "Spacers",
-    "tendons": "Wires",
+    "tendons": "Tendons",
     "contacts": "Contact forces",
     "loads": "Loads",
     "frames": "Tip frame",
 }
-_BODIES = {"backbone and wires": "backbone", "skin": "skin"}
+_BODIES = {"backbone and tendons": "backbone", "skin": "skin"}
 
 
 @final
@@ -79,26 +79,26 @@ class DrivePage(ViewerPage):
         `may` says of an event whether the page it comes from may act."""
         self.server, self.world, self.title, self._may = server, world, world.name, may
         self._folder, self._replay, self._echo = folder, replay, echo
-        touches = world.rods[0].state.contacts is not None
+        has_contact = world.rods[0].state.contacts is not None
         far = None if link is None else Linked(link)
-        gentle = _GENTLE if touches else _REAL if link is not None and link.real else 1.0
-        self.pilot = Teleop(world, Speeds().times(gentle), reach=None if far is None else far.reach)
+        gentle = _GENTLE if has_contact else _REAL if link is not None and link.real else 1.0
+        self.teleop = Teleop(world, Speeds().times(gentle), limits=None if far is None else far.limits)
         many = len(world.rods[0].state.ok) > FINE
         self.drawing = Drawing(
             canvas,
             world,
-            ViewOptions(body="skin" if touches or many else "backbone"),
+            ViewOptions(body="skin" if has_contact or many else "backbone"),
             measured=link is not None,
         )
         self.sight = PageView(
             self.drawing.middle, self.drawing.size * (1.0 if far is None or not far.sees else _FARTHER)
         )
-        self.session = Session(world, self.pilot, draw=self._draw, link=link, script=script)
+        self.session = Session(world, self.teleop, draw=self._draw, link=link, script=script)
         ball = min(1.25 * self.drawing.radius, 0.1 * world.robot.length)
         middle, can = world.rods[0].place[0], self._can_drag()
-        self.grip = DragHandle(server, self.session, ball, middle, may=may) if can else None
+        self.drag_handle = DragHandle(server, self.session, ball, middle, may=may) if can else None
         self._latency = float("nan")
-        self._told = self._looked = 0.0
+        self._shown = self._looked = 0.0
         self._last: RunLog | None = None
         self._path = folder
         self._closing = False
@@ -112,8 +112,8 @@ class DrivePage(ViewerPage):
         self._closing = True
         self.session.close()
         self.controls.close()
-        if self.grip is not None:
-            self.grip.remove()
+        if self.drag_handle is not None:
+            self.drag_handle.remove()
         self.panel.remove()
         self.aside.remove()
         if self.camera is not None:
@@ -121,7 +121,7 @@ class DrivePage(ViewerPage):
         self.drawing.canvas.clear()
 
     def rest(self, on: bool) -> None:
-        """Pause the session, or let it go on."""
+        """Pause the session, or resume it."""
         self.session.paused = on
 
     def tick(self) -> None:
@@ -130,17 +130,17 @@ class DrivePage(ViewerPage):
             self.figures.content = facts([("Tip", self._tip())], news=_COMPILING)
 
     def lost(self, client: int, left: int) -> None:
-        """The client's hand lets go of the grip; with nobody left, what was on its way stops
+        """Release the drag handle for this client; with nobody left, every motion stops
         (`Session.nobody`)."""
-        if self.grip is not None:
-            self.grip.lost(client)
+        if self.drag_handle is not None:
+            self.drag_handle.lost(client)
         if left == 0:
             self.session.nobody()
 
     def passed_on(self) -> None:
-        """What was on its way stops: whoever sent it there has the controls no longer."""
-        self.session.pilot.hold()
-        self.session.touch()
+        """Stop every motion: the page that commanded it has the controls no longer."""
+        self.session.teleop.hold()
+        self.session.wake()
 
     def export(self) -> str:
         """The robot as it stands now, with its legend, time and tip; nothing moves in it."""
@@ -157,11 +157,11 @@ class DrivePage(ViewerPage):
             legend_html=self.drawing.legend,
             plot_svg=None,
             facts=shown,
-            note="Drag to turn, scroll to zoom.",
+            note="Drag to rotate, scroll to zoom.",
         )
 
     def _can_drag(self) -> bool:
-        return self.world.by_hand and self.pilot.actions is not None
+        return self.world.drivable and self.teleop.actions is not None
 
     def _build(self) -> None:
         import viser
@@ -177,10 +177,10 @@ class DrivePage(ViewerPage):
             )
             self.stop.on_click(stops(session))
             self.go_on = gui.add_button(
-                "GO ON", color="green", icon=viser.Icon.PLAYER_PLAY, disabled=True, hint=_GO_ON
+                "Resume", color="green", icon=viser.Icon.PLAYER_PLAY, disabled=True, hint=_GO_ON
             )
             self.go_on.on_click(lambda event: session.release() if self._may(event) else None)
-            # below: as it grows and shrinks, it must not move GO ON to where STOP was
+            # below: as it grows and shrinks, it must not move Resume to where STOP was
             self.figures = gui.add_html("")
             self.run = gui.add_button_group("Run", self._runs())
             self.run.on_click(self._run)
@@ -189,7 +189,7 @@ class DrivePage(ViewerPage):
                 tabs.add_tab("Drive", viser.Icon.ADJUSTMENTS),
                 tabs.add_tab("Loads", viser.Icon.WEIGHT),
             )
-            self.controls = Controls(self.server, session, drive, loads, may=self._may)
+            self.controls = ControlPanel(self.server, session, drive, loads, may=self._may)
             with tabs.add_tab("View", viser.Icon.EYE):
                 self._view()
             with tabs.add_tab("Save", viser.Icon.FILE_EXPORT):
@@ -230,19 +230,21 @@ class DrivePage(ViewerPage):
         body = gui.add_dropdown(
             "Body", tuple(_BODIES), initial_value=next(k for k, v in _BODIES.items() if v == options.body)
         )
-        boxes = {name: gui.add_checkbox(label, getattr(options, name)) for name, label in _PARTS.items()}
+        boxes = {
+            name: gui.add_checkbox(label, getattr(options, name)) for name, label in _OPTION_LABELS.items()
+        }
         trail = gui.add_checkbox("Trail of the tip", True)
 
         def change(_: object) -> None:
             shown = {name: bool(box.value) for name, box in boxes.items()}
             new = ViewOptions(color_by=_COLORS[color.value], body=_BODIES[body.value], **shown)
-            self.session.ask(lambda: self._look(new, bool(trail.value)))
+            self.session.submit(lambda: self._look(new, bool(trail.value)))
 
         color.on_update(change)
         body.on_update(change)
         for box in (trail, *boxes.values()):
             box.on_update(change)
-        back = gui.add_button("Look at the robot again", color="gray")
+        back = gui.add_button("Reset camera", color="gray")
         back.on_click(lambda _: stand_back(self.server, self.sight))
 
     def _look(self, options: ViewOptions, trail: bool) -> None:
@@ -271,7 +273,7 @@ class DrivePage(ViewerPage):
 
     def _recording(self, event: Any) -> None:
         if self._may(event):
-            self.session.ask(lambda: self._toggle_record(event.client))
+            self.session.submit(lambda: self._toggle_record(event.client))
 
     def _play_back(self) -> None:
         if self._last is not None:
@@ -291,12 +293,12 @@ class DrivePage(ViewerPage):
             log = session.end_recording()
         except InputError as error:
             self.recorded.content = str(error)
-            tell(client, "Nothing was saved", str(error), failed=True)
+            notify(client, "Nothing was saved", str(error), failed=True)
             return
         if log is not None:
             self._last, self.again.disabled = log, session.link is not None
             self.recorded.content = f"Saved {len(log)} samples in `{save_name(self._path)}`."
-            tell(client, "Saved", f"{len(log)} samples in {save_name(self._path)}")
+            notify(client, "Saved", f"{len(log)} samples in {save_name(self._path)}")
 
     def _run(self, event: Any) -> None:
         session, what = self.session, event.target.value
@@ -309,7 +311,7 @@ class DrivePage(ViewerPage):
                 session.step()
             case "Reset":
                 session.reset()
-                self.session.ask(self.drawing.forget)
+                self.session.submit(self.drawing.forget)
 
     def _draw(self, frame: ViewFrame) -> None:
         """In the session's thread."""
@@ -318,21 +320,21 @@ class DrivePage(ViewerPage):
         began = time.perf_counter()
         with self.server.atomic():
             self.drawing.draw(frame)
-            if self.grip is not None:
-                self.grip.follow(self.drawing.tip())
+            if self.drag_handle is not None:
+                self.drag_handle.follow(self.drawing.tip())
         self.server.flush()
         if frame.latency == frame.latency:
             self._latency = frame.latency + time.perf_counter() - began
-        if began - self._told > _TOLD or frame.latency == frame.latency:
-            self._told = began
-            self._tell(frame)
+        if began - self._shown > _SHOW_EVERY or frame.latency == frame.latency:
+            self._shown = began
+            self._show_status(frame)
         if self.camera is not None and began - self._looked > _LOOKS:
             self._looked = began
             seen = self._seen()
             if seen is not None:
                 self.camera[1].image = fitted(seen)
 
-    def _tell(self, frame: ViewFrame) -> None:
+    def _show_status(self, frame: ViewFrame) -> None:
         rows = [("Tip", self._tip())]
         session = self.session
         if frame.measured is not None and np.isfinite(frame.measured.tip_position).all():
@@ -358,7 +360,7 @@ class DrivePage(ViewerPage):
         if content != self.figures.content:
             self.figures.content = content
         releasing = session.releasing
-        label, off = "RELEASING …" if releasing else "GO ON", releasing or not session.stopped
+        label, off = "RELEASING …" if releasing else "Resume", releasing or not session.stopped
         if self.go_on.label != label:
             self.go_on.label = label
         if self.go_on.disabled != off:  # it stays in its place: what comes and goes would slip under a click
@@ -374,16 +376,16 @@ class DrivePage(ViewerPage):
             self.legend.content = legend
 
     def _state(self, frame: ViewFrame) -> tuple[str, str]:
-        """What is wrong, and what is worth knowing."""
+        """Return what is wrong, and what is worth knowing."""
         session = self.session
         status = "" if session.far is None else session.far.status
         if session.releasing:
             return "", f"Releasing. {status}"
         if session.stopped:
             how = (
-                "GO ON within a second of a stop is ignored; press it again."
+                "Resume within a second of a stop is ignored; press it again."
                 if session.hasty
-                else "Press the green button to go on."
+                else "Press the green button to resume."
             )
             return f"{status or 'Stopped.'} {how}", ""
         if session.link is not None:
@@ -404,10 +406,10 @@ def fitted(seen: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def far_rows(far: Linked, measured: Measurement) -> list[tuple[str, str]]:
-    """What a robot at the other end of a link tells of itself."""
+    """Return what a robot at the other end of a link reports of itself."""
     tension = far.tension(measured)
     rows = (
-        [("Wires pull", " · ".join(f"{value:.2f}" for value in tension.tolist()) + " N")]
+        [("Tendons pull", " · ".join(f"{value:.2f}" for value in tension.tolist()) + " N")]
         if np.isfinite(tension).all()
         else []
     )

@@ -47,9 +47,9 @@ def wrap(
     facts: Sequence[tuple[str, str]] = (),
     note: str = "",
 ) -> str:
-    """`viser_html`, what a viser serializer's `as_html` gives, with our own words over it; the middle stays
-    free for the hand that turns the view. `legend_html` (see `legend`) and `plot_svg` are put in as they are,
-    all else as text.
+    """Return `viser_html`, from a viser serializer's `as_html`, with our own words over it; the middle stays
+    free for the mouse that rotates the view. `legend_html` (see `legend`) and `plot_svg` are put in as they
+    are, all else as text.
 
     Raises `InputError` where `viser_html` is no whole page, or where what is added would load something from
     elsewhere.
@@ -106,13 +106,13 @@ def write_page(html: str, path: str | Path) -> Path:
         )
     if target.is_dir():
         raise InputError(f"{str(path)!r} is a folder; give the file to write the page to.")
-    part = target.with_name(target.name + ".part")
+    partial = target.with_name(target.name + ".part")
     try:
-        part.write_text(html, encoding="utf-8")
-        part.replace(target)
+        partial.write_text(html, encoding="utf-8")
+        partial.replace(target)
     except OSError as error:
-        if part.is_file():
-            part.unlink()
+        if partial.is_file():
+            partial.unlink()
         raise InputError(f"{str(path)!r} cannot be written: {error.strerror or error}.") from error
     return target
 
@@ -157,8 +157,8 @@ class _References(HTMLParser):
             if value is None:
                 continue
             if name in _LOADS:
-                parts = value.split(",") if name == "srcset" else [value]
-                self.found += [part.strip().split()[0] for part in parts if _OUTWARD.match(part)]
+                sources = value.split(",") if name == "srcset" else [value]
+                self.found += [source.strip().split()[0] for source in sources if _OUTWARD.match(source)]
             elif name == "style" or "url(" in value:
                 self.found += _in_css(value)
 

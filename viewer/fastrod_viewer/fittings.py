@@ -1,4 +1,4 @@
-"""What sits on a backbone: spacer discs, and the tendons that run through them."""
+"""Spacer discs on a backbone, and the tendons that run through them."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ import numpy as np
 from fastrod.model.robot import Robot
 from fastrod.types import Flags, Floats, Params
 from fastrod_viewer import palette
-from fastrod_viewer.chains import Nodes, Sampler, pieces
+from fastrod_viewer.curves import Nodes, Sampler, pieces
 from fastrod_viewer.options import ViewOptions
 from fastrod_viewer.palette import Colors, Range
 from fastrod_viewer.shapes import Instances, instances
 
 SLACK = 1e-3
-"""A wire that can go slack is drawn so at tensions below this share of EI/(d l); a rod that can push, below
-minus that."""
+"""A tendon that can go slack is drawn so at tensions below this fraction of EI/(d l); one that can push,
+below minus that."""
 
-_WIRE = 0.06  # of the smallest tendon offset
-_PROBLEM = 0.65  # share of the warning in the colour of a robot that is not ok
+_TENDON_RADIUS = 0.06  # of the smallest tendon offset
+_PROBLEM = 0.65  # fraction of the warning in the colour of a robot that is not ok
 
 
 def warned(color: Colors, bad: Flags) -> Colors:
@@ -66,9 +66,8 @@ class Spacers:
 
 
 @final
-class Tendons:
-    """Chains of wires at the tendons' offsets from the backbone, for each segment that a tendon crosses
-    one."""
+class TendonLines:
+    """Lines of tendons at their offsets from the backbone, one for each segment that a tendon crosses."""
 
     def __init__(
         self, robot: Robot, params: Params, surface: Floats | None, n_steps: int, n_pieces: int
@@ -83,7 +82,7 @@ class Tendons:
         if surface is not None:
             offset = offset * (surface[self.segment] / np.linalg.norm(offset, axis=-1))[..., None]
         self._offset: Floats = np.ascontiguousarray(offset)  # (1 or n_robots, n_crossings, 2)
-        self._radius = _WIRE * smallest_offset(params)
+        self._radius = _TENDON_RADIUS * smallest_offset(params)
         self._small = SLACK * params.tension_scale[:, None]
         # the reduced model of the paper has no tensions: it knows of no slack
         self._unilateral = params.unilateral & (robot.segments[0].mode != "paper")
@@ -96,9 +95,9 @@ class Tendons:
         """(n_robots * n_crossings * n_pieces) of `tension` (n_robots, n_tendons) [N], coloured by it within a
         range, which grows with the tensions of robots that are `ok`, or None: by taut, slack and pushing.
         What is not known, nan, is taut."""
-        strand = pieces(self._sample(rod), self._n_segments, self.segment, self._offset)
+        line = pieces(self._sample(rod), self._n_segments, self.segment, self._offset)
         # the arc over the chord, so that a chain is as long as its tendon
-        length = strand.length * (1.0 + strand.bend**2 / 24.0)
+        length = line.length * (1.0 + line.bend**2 / 24.0)
         slack = self._unilateral & (tension <= self._small)
         thick = np.where(slack, 0.6 * self._radius, self._radius)[:, self.tendon, None]
         thick = np.broadcast_to(thick, length.shape)
@@ -110,5 +109,5 @@ class Tendons:
             color = palette.diverging(known, colors.see(known[ok]))
         color = np.broadcast_to(color[:, self.tendon, None], (*length.shape, 3))
         return instances(
-            "wire", strand.centre, strand.quaternion, np.stack([thick, thick, length], axis=-1), color
+            "thin_tube", line.centre, line.quaternion, np.stack([thick, thick, length], axis=-1), color
         )

@@ -8,22 +8,21 @@ from collections.abc import Callable, Collection
 from typing import Literal, final
 
 IDLE = 30.0
-"""s without an action, after which the page that has the controls is not asked: the first that asks gets
-them."""
+"""s without an action, after which the controls go to the first page that requests them."""
 PATIENCE = 5.0
-"""s in which the page that is asked may keep them; after that they go to the page that asked."""
+"""s in which the holder may refuse a request; after that the controls go to the page that requested them."""
 AGAIN = 10.0
-"""s after a refusal in which the same page does not ask again."""
+"""s after a refusal in which requests of the same page are ignored."""
 
 Standing = Literal["free", "has", "requested", "other", "asking", "refused"]
-"""Of one page: the controls are free; it has them; it is asked for them; another has them; it asks; it was
-refused."""
+"""Of one page: the controls are free; it has them; another page requests them from it; another has them; it
+requests them; its request was refused."""
 
 
 @final
 class Holder:
-    """One page drives at a time: the first that acts, until it leaves, hands over, or does not refuse a page
-    that asks.
+    """One page drives at a time: the first that acts, until it leaves, hands over, or does not refuse a
+    request.
 
     A page is a number. Every method may be called from any thread. Any page may stop the robot, and needs
     none of this.
@@ -38,7 +37,7 @@ class Holder:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """`pages` are those that are open and answer; `changed` hears when a standing has changed, and
-        `moved` when the controls have left a page: what is on its way stops then."""
+        `moved` when the controls have left a page: every motion stops then."""
         self._pages, self._changed, self._moved, self._clock = pages, changed, moved, clock
         self._lock = threading.RLock()
         self._has: int | None = None
@@ -65,9 +64,9 @@ class Holder:
             self._changed()
         return may
 
-    def ask(self, page: int) -> None:
-        """This page would have the controls: at once where nobody holds on to them, else if it is not refused
-        in time. Nothing comes of it while a third is asking."""
+    def request(self, page: int) -> None:
+        """Request the controls for this page: granted at once where nobody holds on to them, else unless
+        refused in time. Ignored while a third page's request is open."""
         with self._lock:
             now = self._clock()
             if self._has == page or now - self._refused.get(page, -AGAIN) < AGAIN:
@@ -80,7 +79,7 @@ class Holder:
         self._changed()
 
     def keep(self, page: int) -> None:
-        """The page that is asked refuses."""
+        """Refuse the request, from the page that has the controls."""
         with self._lock:
             if page != self._has or self._asks is None:
                 return
@@ -88,7 +87,7 @@ class Holder:
         self._changed()
 
     def grant(self, page: int) -> None:
-        """The page that is asked agrees."""
+        """Grant the request, from the page that has the controls."""
         with self._lock:
             if page != self._has or self._asks is None:
                 return

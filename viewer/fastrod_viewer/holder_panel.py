@@ -1,4 +1,4 @@
-"""`HolderPanels`: where more than one page is open, each says who has the controls, and offers to ask for
+"""`HolderPanels`: where more than one page is open, each says who has the controls, and offers to request
 them."""
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ if TYPE_CHECKING:
 _TEXTS: dict[Standing, str] = {
     "free": "No page has the controls. The first that moves something gets them.",
     "has": "This page has the controls. The others watch; STOP works on all of them.",
-    "requested": f"Another page asks for control and gets them after {PATIENCE:g} s, unless you keep them.",
+    "requested": f"Another page requests control and gets it after {PATIENCE:g} s, unless you keep them.",
     "other": "Another page has the controls. This one watches; STOP works here, too.",
-    "asking": f"The other page is asked, and may refuse within {PATIENCE:g} s.",
-    "refused": f"The other page keeps the controls. Ask again {AGAIN:g} s after that.",
+    "asking": f"The other page may refuse within {PATIENCE:g} s.",
+    "refused": f"The other page keeps the controls. Request them again {AGAIN:g} s after that.",
 }
 _QUIET = 3.0  # s between two notes on one page that it may not act
 
 
 @final
 class HolderPanels:
-    """A small window of its own on each page: it shifts no other button while somebody reaches for STOP."""
+    """A small window of its own on each page: it shifts no other button while somebody moves to STOP."""
 
     def __init__(self, server: viser.ViserServer, holder: Holder) -> None:
         self.server, self.holder = server, holder
@@ -41,7 +41,7 @@ class HolderPanels:
         now = time.monotonic()
         if now - self._noted.get(event.client_id, -_QUIET) >= _QUIET:
             self._noted[event.client_id] = now
-            why = "Another page has the controls. Ask for them in the window Controls."
+            why = "Another page has the controls. Request them in the window Controls."
             event.client.add_notification("Not done", why, auto_close_seconds=5.0, color="yellow")
         return False
 
@@ -67,11 +67,11 @@ class _Panel:
         self._panel: Any = gui.add_panel()
         with self._panel.add_tab("Controls"):
             self._text = gui.add_markdown("")
-            self._ask = gui.add_button("Ask for control", visible=False)
+            self._request = gui.add_button("Request control", visible=False)
             self._keep = gui.add_button("Keep control", visible=False)
             self._grant = gui.add_button("Yield control", color="gray", visible=False)
         self._panel.float(x=15, y=-260, width=250)  # below viser's notes, above the plot of a log
-        self._ask.on_click(lambda _: holder.ask(page))
+        self._request.on_click(lambda _: holder.request(page))
         self._keep.on_click(lambda _: holder.keep(page))
         self._grant.on_click(lambda _: holder.grant(page))
 
@@ -79,7 +79,7 @@ class _Panel:
         if standing == self._standing:
             return
         self._standing, self._text.content = standing, _TEXTS[standing]
-        self._ask.visible = standing == "other"
+        self._request.visible = standing == "other"
         self._keep.visible = self._grant.visible = standing == "requested"
 
     def remove(self) -> None:

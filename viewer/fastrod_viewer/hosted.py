@@ -15,21 +15,21 @@ from fastrod.model.robot import Robot
 from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_vector
 from fastrod.types import Floats
 from fastrod_scenes.scene import HostedScene, HostedWorld, SceneStage, SoftBody
+from fastrod_viewer.robots import Loads, actions_of, moved, radii, tendon_inputs
 from fastrod_viewer.world import Body, DrawnRods, ManualCommand, World
-from fastrod_viewer.worlds import Loads, actions_of, moved, radii, wires
 
 SWING = 1.0
-"""Largest way of a joint to where the flange is told to be [rad]: what is farther is another posture of the
+"""Largest displacement of a joint to a commanded flange pose [rad]: what is farther is another posture of the
 arm."""
 _INVERSE = np.array([1.0, -1.0, -1.0, -1.0])  # of a unit quaternion w x y z
 
 
 @final
 class HostedView(World):
-    """One scene. A hand drives the first soft robot and the arm that carries it; other soft robots keep what
-    they were told last.
+    """One scene. Manual commands drive the first soft robot and the arm that carries it; other soft robots
+    keep their last inputs.
 
-    After a hand has driven, the script begins anew with the next `play`. Worlds whose soft robot is no
+    After a manual command, the script begins anew with the next `play`. Worlds whose soft robot is no
     `MountedRod` only play.
     """
 
@@ -41,12 +41,12 @@ class HostedView(World):
         self.name, self.about, self.dt, self.duration = scene.name, scene.about, scene.dt, scene.duration
         self._stage: HostedWorld = scene.stage()
         self._kinematics: SoftTip | None = None
-        self._joints: Floats | None = None  # that a hand drives the arm to
-        self._home: Floats = np.zeros(7)  # of the flange, where Hand.base is zero
-        # the last that the arm has followed; None: it was moved by other ways since
+        self._joints: Floats | None = None  # where manual commands drive the arm
+        self._home: Floats = np.zeros(7)  # of the flange, where ManualCommand.base is zero
+        # the last that the arm has followed; None: something else has moved it since
         self._base: Floats | None = None
         self._steps, self._driven, self._frozen = 0, False, False
-        self.by_hand = self.loads = isinstance(self._stage, SceneStage)
+        self.drivable = self.loads = isinstance(self._stage, SceneStage)
         self.host = self.base_moves = isinstance(self._stage, SceneStage) and self._stage.arm is not None
         self._see()
         self.robot: Robot = self._soft[0].robot
@@ -83,7 +83,7 @@ class HostedView(World):
         return self._visuals.poses()
 
     def play(self) -> None:
-        """One step of the script, or from its end, or from a hand's, back to its beginning."""
+        """Play one step of the script; from its end, or after a manual command, go back to its beginning."""
         if self._driven or self._steps >= round(self.duration / self.dt):
             self.reset()
             return
@@ -94,21 +94,21 @@ class HostedView(World):
             raise
         self._arrived()
 
-    def drive(self, hand: ManualCommand) -> None:
-        """One step by hand. Where the arm cannot do what it is told, it stays, the step is done, and
-        `HostError` then says why; where the soft robot is lost the world is reset. Raises `InputError` for
-        what no robot can be told; the world then has not moved."""
+    def drive(self, command: ManualCommand) -> None:
+        """Do one step of a manual command. Where the arm cannot follow, it stays, the step is done, and
+        `HostError` then says why; where the soft robot is lost the world is reset. Raises `InputError` for a
+        command that no robot can follow; the world then has not moved."""
         stage = self._stage
         if not isinstance(stage, SceneStage):
             raise InputError(
-                f"scene {self.name!r} has a script that moves its robots; no hand can drive them."
+                f"scene {self.name!r} has a script that moves its robots; they cannot be driven by hand."
             )
-        given = self._loads.added(wires(self.robot, hand), hand)
-        moved(np.zeros(7), hand.base)  # refuses what is no motion
+        given = self._loads.added(tendon_inputs(self.robot, command), command)
+        moved(np.zeros(7), command.base)  # refuses what is no motion
         refused: HostError | None = None
         if stage.arm is not None:
             try:
-                self._drive_arm(stage.arm, hand)
+                self._drive_arm(stage.arm, command)
             except HostError as error:
                 refused = error
         try:
@@ -117,7 +117,7 @@ class HostedView(World):
             stage.world.stepSimulation()
             for rod in stage.rods:
                 rod.end()
-            stage.carry()
+            stage.follow_arm()
         except HostError:
             self.reset()
             raise
@@ -153,7 +153,7 @@ class HostedView(World):
             return jacobian
         if self._kinematics is None:
             self._kinematics = SoftTip(rod.simulator, arm, flange_from_base=_mount(arm, rod))
-        # the tip's way by an action is the simulator's own
+        # the tip's displacement by an action is the simulator's own
         q = np.concatenate([arm.position(), np.zeros(self.actions.n_actions)])
         self._kinematics.follow(q, self._soft[0].state, _unit(rod.host.motion().pose))
         jacobian = self._kinematics.jacobian()
@@ -182,31 +182,31 @@ class HostedView(World):
         self._soft = self._stage.soft_bodies
         self._steps += 1
 
-    def _drive_arm(self, arm: BulletArm, hand: ManualCommand) -> None:
-        """Tell the motors. Raises `HostError` where the flange cannot go there; what they were told before
-        then holds."""
+    def _drive_arm(self, arm: BulletArm, command: ManualCommand) -> None:
+        """Command the motors. Raises `HostError` where the flange cannot go there; the command before then
+        holds."""
         if self._joints is None:
             self._joints = np.clip(arm.position(), arm.lower, arm.upper)
             self._home, self._base = arm.frame(self._joints), np.zeros(6)
-        if hand.freeze:
+        if command.freeze:
             if not self._frozen:
                 arm.freeze()
                 self._joints = np.clip(arm.position(), arm.lower, arm.upper)
             self._frozen, self._base = True, None
             return
         self._frozen = False
-        base = np.asarray(hand.base, dtype=np.float64)
-        if hand.base_rate is not None:
-            rate = np.asarray(hand.base_rate, dtype=np.float64)
+        base = np.asarray(command.base, dtype=np.float64)
+        if command.base_rate is not None:
+            rate = np.asarray(command.base_rate, dtype=np.float64)
             if rate.shape != (arm.n_joints,) or not np.isfinite(rate).all():
                 raise HostError(
-                    f"Hand.base_rate is {hand.base_rate!r}; give {arm.n_joints} finite numbers, "
+                    f"ManualCommand.base_rate is {command.base_rate!r}; give {arm.n_joints} finite numbers, "
                     "one a joint [rad/s]."
                 )
             self._joints, self._base = np.clip(self._joints + self.dt * rate, arm.lower, arm.upper), None
             arm.drive(self._joints)
             return
-        if self._base is None:  # from here the hand's base goes on
+        if self._base is None:  # from here the commanded base continues
             flange = arm.frame(self._joints)
             back = quaternion_from_vector(base[3:]) * _INVERSE
             self._home = np.concatenate([flange[:3] - base[:3], product(back, flange[3:])])
@@ -225,8 +225,10 @@ class HostedView(World):
 def _mount(arm: BulletArm, rod: MountedRod) -> Floats:
     """(7,) flange_from_base of a rod on an arm."""
     flange, base = arm.frame(arm.position()), rod.host.motion().pose
-    turn = matrix_from_quaternion(flange[None, 3:])[0]
-    mount: Floats = np.concatenate([(base[:3] - flange[:3]) @ turn, product(flange[3:] * _INVERSE, base[3:])])
+    orientation = matrix_from_quaternion(flange[None, 3:])[0]
+    mount: Floats = np.concatenate(
+        [(base[:3] - flange[:3]) @ orientation, product(flange[3:] * _INVERSE, base[3:])]
+    )
     return _unit(mount)
 
 

@@ -1,4 +1,5 @@
-"""What a page may send: a value that a control can have. All else ends here, without a traceback."""
+"""Filter of what a page may send: a value that a control can have. All else ends here, without a
+traceback."""
 
 from __future__ import annotations
 
@@ -57,7 +58,7 @@ def _checked(handler: Callable[[Any, Any], Any], gui: Any, ignored: Ignored) -> 
     async def heed(client: Any, message: Any) -> None:
         handle = gui._gui_input_handle_from_uuid.get(message.uuid) if isinstance(message.uuid, str) else None
         if handle is None:
-            return  # removed while the message was on its way
+            return  # removed before the message arrived
         if fits(handle, message.updates):
             await handler(client, message)
         else:

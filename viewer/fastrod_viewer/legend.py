@@ -1,4 +1,4 @@
-"""What the colours of a picture mean, for a page."""
+"""Legend of the colours of a picture, for a page."""
 
 from __future__ import annotations
 
@@ -49,37 +49,37 @@ class Legend:
     """Evenly spaced from the left end of the bar to the right."""
     bar: tuple[Color, ...] = ()
     """Evenly spaced colours of the bar, more than there are ticks."""
-    wires: tuple[Entry, ...] = ()
+    tendons: tuple[Entry, ...] = ()
     tips: tuple[Entry, ...] = ()
     """And their trails."""
 
     def html(self) -> str:
         """A snippet that needs nothing but itself, for a white background."""
         unit = f' <span style="color:#667;font-weight:400">[{escape(self.unit)}]</span>' if self.unit else ""
-        parts = [f'<div style="font-weight:600;margin-bottom:4px">{escape(self.title)}{unit}</div>']
+        html = [f'<div style="font-weight:600;margin-bottom:4px">{escape(self.title)}{unit}</div>']
         if self.entries:
-            parts.append(_swatches(self.entries, "12px"))
+            html.append(_swatches(self.entries, "12px"))
         if self.bar:
             stops = ",".join(palette.css(color) for color in self.bar)
             labels = "".join(f"<span>{_number(tick.value)}</span>" for tick in self.ticks)
-            parts.append(
+            html.append(
                 '<div style="height:10px;border-radius:5px;background:linear-gradient(to '
                 f'right,{stops})"></div>'
                 "<div "
                 f'style="display:flex;justify-content:space-between;color:#445;margin-top:2px">{labels}</div>'
             )
-        if self.wires:
-            parts.append(
-                '<div style="font-weight:600;margin:6px 0 4px">Tendons</div>' + _swatches(self.wires, "4px")
+        if self.tendons:
+            html.append(
+                '<div style="font-weight:600;margin:6px 0 4px">Tendons</div>' + _swatches(self.tendons, "4px")
             )
         if self.tips:
-            parts.append(
+            html.append(
                 '<div style="font-weight:600;margin:6px 0 4px">Tip, and its trail</div>'
                 + _swatches(self.tips, "4px")
             )
         return (
             '<div style="font:12px/1.4 system-ui,sans-serif;color:#223;padding:4px '
-            f'2px">{"".join(parts)}</div>'
+            f'2px">{"".join(html)}</div>'
         )
 
 
@@ -109,7 +109,7 @@ def legend(rods: DrawnRods, options: ViewOptions, picture: Picture) -> Legend:
         return Legend(title, "", (Entry(why, palette.BODY), *problem))
     if picture.range is None:
         names = tuple(Entry(f"Segment {k + 1}", palette.segment_color(k)) for k in range(robot.n_segments))
-        return Legend(title, unit, names + problem, wires=_wires(rods, picture))
+        return Legend(title, unit, names + problem, tendons=_tendons(rods, picture))
     low = -picture.range.top if options.color_by == "tension" else 0.0
     values = np.linspace(low, picture.range.top, 5)
     table = palette.DIVERGING if options.color_by == "tension" else palette.SEQUENTIAL
@@ -121,7 +121,7 @@ def legend(rods: DrawnRods, options: ViewOptions, picture: Picture) -> Legend:
         problem,
         tuple(Tick(float(value), _color(table[i])) for value, i in zip(values, at, strict=True)),
         tuple(_color(table[i]) for i in stops),
-        () if options.color_by == "tension" else _wires(rods, picture),
+        () if options.color_by == "tension" else _tendons(rods, picture),
     )
 
 
@@ -130,14 +130,14 @@ def _color(row: palette.Colors) -> Color:
     return r, g, b
 
 
-def _wires(rods: DrawnRods, picture: Picture) -> tuple[Entry, ...]:
+def _tendons(rods: DrawnRods, picture: Picture) -> tuple[Entry, ...]:
     """The colours that the tendons of these robots can have."""
     if not picture.tendons_drawn:
         return ()
-    one_way = [tendon.unilateral for robot in rods.robots for tendon in robot.tendons]
+    unilateral = [tendon.unilateral for robot in rods.robots for tendon in robot.tendons]
     found = [Entry("taut", palette.TAUT)]
-    if any(one_way):
+    if any(unilateral):
         found.append(Entry("slack", palette.SLACK))
-    if not all(one_way):
+    if not all(unilateral):
         found.append(Entry("pushing", palette.PUSHING))
     return tuple(found)

@@ -25,26 +25,25 @@ _MAY_MOVE = ("ready", "running")
 
 @dataclass(frozen=True, kw_only=True)
 class TendonLimits:
-    """What the wires of a linked robot may do; nothing keeps those of a simulated one. Raises
-    `InputError`."""
+    """Limits of the tendons of a linked robot; a simulated one has none. Raises `InputError`."""
 
     displacement: float = math.inf
-    """Largest change of a wire's length, either way [m]."""
+    """Largest change of a tendon's length, in either direction [m]."""
     rate: float = math.inf
-    """Largest rate of a wire [m/s]."""
+    """Largest rate of a tendon [m/s]."""
 
     def __post_init__(self) -> None:
         for name in ("displacement", "rate"):
             if not getattr(self, name) > 0.0:
-                raise InputError(f"Reach.{name} is {getattr(self, name)!r}; it must be positive.")
+                raise InputError(f"TendonLimits.{name} is {getattr(self, name)!r}; it must be positive.")
 
 
 class Bounds(Protocol):
-    """Limits of a robot's wires."""
+    """Limits of a robot's tendons."""
 
     @property
     def displacement(self) -> float:
-        """[m], either way."""
+        """[m], in either direction."""
 
     @property
     def rate(self) -> float:
@@ -52,7 +51,7 @@ class Bounds(Protocol):
 
 
 class Guard(Protocol):
-    """Who watches a robot, and stops it."""
+    """Supervisor of a robot, which stops it."""
 
     limits: Bounds
 
@@ -66,10 +65,10 @@ class Guard(Protocol):
 
     @property
     def first(self) -> object | None:
-        """What stopped the robot; None while it is not stopped."""
+        """Cause of the stop; None while it is not stopped."""
 
     def client_lost(self, now: float) -> object | None:
-        """Nobody watches any more."""
+        """Report that nobody watches any more."""
 
 
 class Ticking(Protocol):
@@ -80,14 +79,14 @@ class Ticking(Protocol):
 
 
 class LinkedSighting(Protocol):
-    """What a camera's frame says about the tip."""
+    """Report of a camera's frame about the tip."""
 
     t: float
     flag: str
 
 
 class Encoders(Protocol):
-    """What drives say."""
+    """Report of the drives."""
 
     dl: Floats
     """(n_tendons,) as `Measurement.dl` [m]."""
@@ -105,7 +104,7 @@ class Guarded(Protocol):
 
 @runtime_checkable
 class Driven(Protocol):
-    """A link that tells its set-points and encoders apart from its camera, which is slower."""
+    """A link that reports its set-points and encoders apart from its camera, which is slower."""
 
     @property
     def commanded(self) -> Floats:
@@ -118,10 +117,10 @@ class Driven(Protocol):
 
 @runtime_checkable
 class Gliding(Protocol):
-    """A link that goes evenly to where it is told, rather than at once and as fast as it may."""
+    """A link that moves evenly to a set-point, rather than at once and as fast as it may."""
 
     def glide(self, dl: ArrayLike, seconds: float) -> None:
-        """As `RobotLink.command`, spread evenly over so long [s]."""
+        """Command set-points like `RobotLink.command`, spread evenly over so long [s]."""
 
 
 @runtime_checkable
@@ -162,7 +161,7 @@ class Recording(Protocol):
 
 @final
 class Linked:
-    """A link, asked for what it can do. Every method may be called from any thread."""
+    """A link and its capabilities. Every method may be called from any thread."""
 
     def __init__(self, link: RobotLink) -> None:
         self.link = link
@@ -179,8 +178,8 @@ class Linked:
         self._seen = -math.inf
 
     @property
-    def reach(self) -> TendonLimits:
-        """What its wires may do."""
+    def limits(self) -> TendonLimits:
+        """Limits of its tendons."""
         if self._guarded is None:
             return TendonLimits()
         limits = self._guarded.supervisor.limits
@@ -198,7 +197,7 @@ class Linked:
 
     @property
     def status(self) -> str:
-        """State and reason in one sentence; empty where it tells none."""
+        """State and reason in one sentence; empty where it reports none."""
         return "" if self._guarded is None else self._guarded.supervisor.status
 
     @property
@@ -232,8 +231,9 @@ class Linked:
         now = self.link.read()
         return now.dl, now.ext
 
-    def told(self) -> tuple[Floats, Floats]:
-        """(n_tendons,), (n_segments,) changes of length that it holds [m]: to be told these moves nothing."""
+    def held(self) -> tuple[Floats, Floats]:
+        """Return the changes of length (n_tendons,), (n_segments,) that it holds [m]: to command these moves
+        nothing."""
         if self._driven is not None:
             return self._driven.commanded, np.zeros(self.link.robot.n_segments)
         now = self.link.read()
@@ -246,7 +246,7 @@ class Linked:
         return measured.tension
 
     def camera(self) -> str:
-        """How well the tip is seen, in a few words; empty where nothing looks."""
+        """Return how well the tip is seen, in a few words; empty where nothing looks."""
         if self._sighted is None:
             return ""
         sighting, now = self._sighted.sighting, self._sighted.clock.now()

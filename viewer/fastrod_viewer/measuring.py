@@ -10,14 +10,14 @@ from fastrod.types import Floats
 from fastrod_viewer.world import ManualCommand, World
 
 
-def measure(world: World, hand: ManualCommand | None) -> Measurement:
-    """What a perfect encoder and camera say of the world's first robot now; t is the world's, frames those of
-    a run log."""
+def measure(world: World, command: ManualCommand | None) -> Measurement:
+    """Return what a perfect encoder and camera measure of the world's first robot now; t is the world's,
+    frames those of a run log."""
     state = world.rods[0].state
     base, rotation = state.position[0, 0], state.rotation[0, 0]
     tip = rotation.T @ state.tip_rotation[0]
-    if hand is not None:
-        change, extension = hand.tendon_length - world.robot.rest_tendon_length, hand.extension
+    if command is not None:
+        change, extension = command.tendon_length - world.robot.rest_tendon_length, command.extension
     else:
         change = state.path_length[0] - _stretch(world) - world.robot.rest_tendon_length
         extension = np.diff(_ends(world), prepend=0.0) - [segment.length for segment in world.robot.segments]
@@ -32,7 +32,8 @@ def measure(world: World, hand: ManualCommand | None) -> Measurement:
 
 
 def _stretch(world: World) -> Floats:
-    """(n_tendons,) by which each wire is longer than it was told to be: compliance (T - pretension) [m]."""
+    """Return by how much each tendon (n_tendons,) is longer than commanded: compliance (T - pretension)
+    [m]."""
     tendons = [tendon for segment in world.robot.segments for tendon in segment.tendons]
     compliance, pretension = (
         np.array([getattr(tendon, name) for tendon in tendons]) for name in ("compliance", "pretension")

@@ -7,13 +7,13 @@ from typing import Any, NoReturn, final
 import numpy as np
 
 from fastrod.errors import HostError, InputError
-from fastrod.hosts.mujoco_touched import obstacle_of
+from fastrod.hosts.mujoco_body_contact import obstacle_of
 from fastrod.model.robot import Robot
 from fastrod.rotation import quaternion_from_matrix
 from fastrod.types import Floats
 from fastrod_scenes.scene import MujocoScene
+from fastrod_viewer.robots import actions_of, radii
 from fastrod_viewer.world import Body, DrawnRods, ManualCommand, World
-from fastrod_viewer.worlds import actions_of, radii
 
 _GROUND = 2.0  # m, edge of a plane
 
@@ -22,7 +22,7 @@ _GROUND = 2.0  # m, edge of a plane
 class MujocoView(World):
     """One scene, moved by its script alone."""
 
-    by_hand = False
+    drivable = False
     scripted = True
     host = True
     base_moves = False
@@ -58,8 +58,8 @@ class MujocoView(World):
     def poses(self) -> Floats:
         """(n_bodies, 7) of the geoms' frames, world."""
         data = self._stage.data
-        turn = quaternion_from_matrix(data.geom_xmat[self._geoms].reshape(-1, 3, 3))
-        return np.concatenate([data.geom_xpos[self._geoms], turn], axis=1)
+        orientation = quaternion_from_matrix(data.geom_xmat[self._geoms].reshape(-1, 3, 3))
+        return np.concatenate([data.geom_xpos[self._geoms], orientation], axis=1)
 
     def play(self) -> None:
         """One step of the script, or from its end back to its beginning. Raises `HostError` where the rod is
@@ -74,7 +74,7 @@ class MujocoView(World):
             raise
         self._steps += 1
 
-    def drive(self, hand: ManualCommand) -> NoReturn:  # noqa: ARG002
+    def drive(self, command: ManualCommand) -> NoReturn:  # noqa: ARG002
         """Raises `InputError`: only the script moves this world."""
         self._refuse()
 
@@ -91,7 +91,9 @@ class MujocoView(World):
         """All is in MuJoCo's own arrays, which go with them."""
 
     def _refuse(self) -> NoReturn:
-        raise InputError(f"scene {self.name!r} has a script that moves its robots; no hand can drive them.")
+        raise InputError(
+            f"scene {self.name!r} has a script that moves its robots; they cannot be driven by hand."
+        )
 
 
 def _body(model: Any, geom: int) -> Body:

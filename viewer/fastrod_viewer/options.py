@@ -1,4 +1,4 @@
-"""What is drawn of robots, and what colours mean."""
+"""Options of a view: what is drawn of robots, and what colours mean."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ have too much to do."""
 
 @dataclass(frozen=True, kw_only=True)
 class ViewOptions:
-    """What is drawn, and what colours mean."""
+    """Options of a view."""
 
     color_by: str = "segment"
     """`segment`; `curvature`, |u_xy| [1/m]; `strain`, body radius times |u_xy|, the largest of bending in the
@@ -37,18 +37,17 @@ class ViewOptions:
 
     def __post_init__(self) -> None:
         for name, known in (("color_by", COLOR_BY), ("body", BODIES)):
-            if getattr(self, name) not in known:
-                raise InputError(
-                    f"Options.{name} is {getattr(self, name)!r}; {nearest(str(getattr(self, name)), known)}"
-                )
+            given = getattr(self, name)
+            if given not in known:
+                raise InputError(f"ViewOptions.{name} is {given!r}; {nearest(str(given), known)}")
         for name in ("tendons", "spacers", "contacts", "loads", "frames"):
             if not isinstance(getattr(self, name), bool):
-                raise InputError(f"Options.{name} is {getattr(self, name)!r}; it must be True or False.")
+                raise InputError(f"ViewOptions.{name} is {getattr(self, name)!r}; it must be True or False.")
         if self.pieces is not None and (
             not isinstance(self.pieces, int) or isinstance(self.pieces, bool) or self.pieces < 1
         ):
             raise InputError(
-                f"Options.pieces is {self.pieces!r}; it must be a whole number, at least 1, or None."
+                f"ViewOptions.pieces is {self.pieces!r}; it must be a whole number, at least 1, or None."
             )
 
     def pieces_of(self, n_robots: int) -> int:

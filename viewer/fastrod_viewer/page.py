@@ -29,7 +29,7 @@ class ViewerPage(ABC):
     title: str
     """A few words."""
     sight: PageView
-    """Where to look at first."""
+    """Sphere of the first look."""
 
     @abstractmethod
     def export(self) -> str:
@@ -45,7 +45,7 @@ class ViewerPage(ABC):
 
     @abstractmethod
     def rest(self, on: bool) -> None:
-        """Compute nothing while another page is being made, or go on after all."""
+        """Compute nothing while another page is being made, or resume after all."""
 
     @abstractmethod
     def tick(self) -> None:
@@ -58,7 +58,7 @@ class ViewerPage(ABC):
 
 @dataclass(frozen=True, eq=False)
 class PageView:
-    """What a first look shows: a sphere about `middle` (3,) of radius `size` [m], from in front and a little
+    """Sphere that a first look shows, about `middle` (3,) of radius `size` [m], from in front and a little
     above."""
 
     middle: Floats
@@ -124,7 +124,7 @@ def save_name(path: Path) -> str:
         return str(path)
 
 
-def tell(client: Any, title: str, body: str, *, failed: bool = False) -> None:
+def notify(client: Any, title: str, body: str, *, failed: bool = False) -> None:
     """A note in the corner of one client's page, if it is still there."""
     if client is not None:
         client.add_notification(
@@ -139,4 +139,4 @@ def send(client: Any, name: str, make: Callable[[], bytes]) -> None:
     try:
         client.send_file_download(name, make(), save_immediately=True)
     except (FastrodError, TimeoutError, RuntimeError) as error:
-        tell(client, f"{name} was not saved", str(error), failed=True)
+        notify(client, f"{name} was not saved", str(error), failed=True)

@@ -1,4 +1,4 @@
-"""Colours: of segments, of wires, of things, and of numbers. All read well on white and for colour-blind
+"""Colours: of segments, of tendons, of things, and of numbers. All read well on white and for colour-blind
 eyes."""
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ PUSHING: Color = (148, 62, 200)
 CONTACT: Color = (220, 38, 50)
 LOAD: Color = (245, 140, 20)
 GHOST: Color = (150, 156, 168)
-"""What is only compared with."""
+"""For comparison only."""
 MEASURED: Color = (20, 140, 90)
 TRAIL: Color = (120, 90, 190)
 ACCENT: Color = (255, 170, 20)
-"""What a hand can take hold of."""
+"""For what can be dragged."""
 AXES: tuple[Color, Color, Color] = ((222, 48, 48), (40, 165, 70), (45, 90, 220))
 
 _NICE = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
@@ -92,10 +92,10 @@ def diverging(values: Floats, top: float) -> Colors:
     return np.asarray(DIVERGING[np.clip(127.5 + values * (127.5 / top), 0.0, 255.0).astype(np.intp)])
 
 
-def blend(color: Colors | Color, other: Color, share: float | Floats) -> Colors:
-    """(..., 3) colours with this share of another, one or (..., 1)."""
+def blend(color: Colors | Color, other: Color, fraction: float | Floats) -> Colors:
+    """Return colours (..., 3) with this fraction of another, one or (..., 1)."""
     color = np.asarray(color, np.float64)
-    return np.asarray((color * (1.0 - share) + np.asarray(other) * share).round().astype(np.uint8))
+    return np.asarray((color * (1.0 - fraction) + np.asarray(other) * fraction).round().astype(np.uint8))
 
 
 def css(color: Color | Colors) -> str:
@@ -117,8 +117,8 @@ def nice_above(value: float) -> float:
 
 
 class Range:
-    """How far a range of colours goes: to a round number beyond what was seen, and never back, so that
-    colours do not flicker."""
+    """End of a range of colours: a round number beyond what was seen, which never shrinks, so that colours do
+    not flicker."""
 
     def __init__(self, least: float) -> None:
         """`least` [unit of the values]: it goes that far from the beginning."""

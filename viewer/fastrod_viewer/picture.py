@@ -14,8 +14,8 @@ from fastrod.solver.state import State
 from fastrod.types import Flags, Floats
 from fastrod_viewer import palette
 from fastrod_viewer.arrows import arrows, frames
-from fastrod_viewer.chains import ChainSamples, Nodes, Sampler, along, nodes, pieces
-from fastrod_viewer.fittings import Spacers, Tendons, smallest_offset, warned
+from fastrod_viewer.curves import CurveSamples, Nodes, Sampler, along, nodes, pieces
+from fastrod_viewer.fittings import Spacers, TendonLines, smallest_offset, warned
 from fastrod_viewer.options import FINE, ViewOptions
 from fastrod_viewer.palette import Color, Colors, Range
 from fastrod_viewer.shapes import Instances, instances
@@ -81,9 +81,9 @@ class Picture:
             if few and options.spacers and not skin
             else None
         )
-        self._tendons: Tendons | None = None
+        self._tendons: TendonLines | None = None
         if few and options.tendons and (by_tension or not skin):
-            self._tendons = Tendons(
+            self._tendons = TendonLines(
                 robot, params, self.body_radius if skin else None, n_steps, max(8, self.pieces // 4)
             )
         # intervals that end where another segment begins
@@ -103,7 +103,7 @@ class Picture:
             (32 if self.n_robots <= 4 else 8) if options.contacts and state.contacts is not None else 0
         )
         self._half_force = params.moment_scale / params.reach  # (1 or n_robots,)
-        self._reach = params.reach
+        self._length = params.reach
         self._last = _at_rest(rods, params.length, n_steps)
         self._tension: Floats = np.zeros(state.tension.shape)
         self._hidden: dict[tuple[int, Color], tuple[Instances, Instances]] = {}
@@ -114,10 +114,9 @@ class Picture:
         return self._tendons is not None
 
     def frame(self, rods: DrawnRods, *, tip_force: Floats | None = None) -> dict[str, Instances]:
-        """What is seen now: `body`, `tip`, and where options, robots and scene have them `spacers`,
-        `tendons`, `contact_shafts`,
-        `contact_heads`, `load_shafts`, `load_heads`, `frames`; the same keys and counts in every frame. World
-        frame, each robot at its place.
+        """Return what is seen now: `body`, `tip`, and where options, robots and scene have them `spacers`,
+        `tendons`, `contact_shafts`, `contact_heads`, `load_shafts`, `load_heads`, `frames`; the same keys and
+        counts in every frame. World frame, each robot at its place.
 
         Arrows begin where the force acts. Those of contacts show the force on the rod, from the obstacle into
         the rod; the largest 32 a robot, or 8 of more than 4 robots. Those of loads show `tip_force` (3,) or
@@ -138,7 +137,7 @@ class Picture:
             found["tendons"] = self._tendons.instances(rod, self._tension, ~bad, by_number)
         tip = rod.position[:, -1]
         if self._contacts:
-            point, force = self._touches(state.contacts)
+            point, force = self._contact_arrows(state.contacts)
             found["contact_shafts"], found["contact_heads"] = self._arrows(
                 point + place[:, None, :], force, palette.CONTACT
             )
@@ -152,7 +151,7 @@ class Picture:
                 tip[:, None], load[:, None], palette.LOAD
             )
         if self.options.frames:
-            size = max(3.0 * float(self.body_radius[-1]), 0.06 * float(self._reach.max()))
+            size = max(3.0 * float(self.body_radius[-1]), 0.06 * float(self._length.max()))
             found["frames"] = frames(tip, rod.quaternion[:, -1], size)
         return found
 
@@ -177,11 +176,11 @@ class Picture:
             "tip": instances("cap", at.position[:, -1], at.quaternion[:, -1], end, color[:, -1, -1]),
         }
 
-    def _bending(self, curvature: Floats, at: ChainSamples) -> Floats:
+    def _bending(self, curvature: Floats, at: CurveSamples) -> Floats:
         """(n_robots, m) the number that colours stand for."""
         size = np.hypot(curvature[..., 0], curvature[..., 1])
         end = size[:, 1:].copy()
-        # a node between segments has the distal one's curvature: the proximal one's goes on as it came
+        # a node between segments has the distal one's curvature; the proximal one's is extrapolated
         end[:, self._joints] = np.maximum(2.0 * size[:, self._joints] - size[:, self._joints - 1], 0.0)
         found = along((size[:, :-1], end), at)
         return (
@@ -190,7 +189,7 @@ class Picture:
             else 100.0 * self.body_radius[self._sample.segment] * found
         )
 
-    def _touches(self, contacts: Contacts | None) -> tuple[Floats, Floats]:
+    def _contact_arrows(self, contacts: Contacts | None) -> tuple[Floats, Floats]:
         """Points and forces (n_robots, n_arrows, 3) of the largest contact forces, then zeros."""
         point, force = np.zeros((2, self.n_robots, self._contacts, 3))
         if contacts is not None:
@@ -210,7 +209,7 @@ class Picture:
             return self._no_arrows(start.size // 3, color)
         force = np.where(np.isfinite(force).all(-1, keepdims=True), force, 0.0)
         size = np.linalg.norm(force, axis=-1)
-        length = _ARROW * self._reach[:, None] * size / (size + self._half_force[:, None])
+        length = _ARROW * self._length[:, None] * size / (size + self._half_force[:, None])
         direction = force / np.maximum(size, 1e-30)[..., None]
         return arrows(
             start.reshape(-1, 3),
@@ -251,11 +250,11 @@ def _at_rest(rods: DrawnRods, length: Floats, n_steps: int) -> _Pose:
     joints = np.concatenate([np.zeros((len(base), 1)), np.cumsum(length, axis=1)], axis=1)
     at = np.arange(length.shape[1] * n_steps + 1) / n_steps
     s = np.stack([np.interp(at, np.arange(joints.shape[1]), row) for row in joints])
-    turn = matrix_from_quaternion(base[:, 3:])
+    orientation = matrix_from_quaternion(base[:, 3:])
     n, p = len(rods.state.ok), len(at)
     return _Pose(
-        np.broadcast_to(base[:, None, :3] + s[..., None] * turn[:, None, :, 2], (n, p, 3)),
-        np.broadcast_to(turn[:, None], (n, p, 3, 3)),
+        np.broadcast_to(base[:, None, :3] + s[..., None] * orientation[:, None, :, 2], (n, p, 3)),
+        np.broadcast_to(orientation[:, None], (n, p, 3, 3)),
         np.broadcast_to(s, (n, p)),
         np.zeros((n, p, 3)),
     )

@@ -51,7 +51,7 @@ class PlayedShapes(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlayedTrack:
-    """What one model says to the log. The row axis is that of `Playback.log`; residual = measured -
+    """Prediction of one model for the log. The row axis is that of `Playback.log`; residual = measured -
     predicted."""
 
     label: str
@@ -75,18 +75,18 @@ class PlayedTrack:
 
 @dataclass(frozen=True, kw_only=True)
 class Findings:
-    """What an identification said about the log."""
+    """Verdict of an identification about the log."""
 
     verdict: str
     summary: str
     effects: tuple[str, ...]
     """Names of the effects that `after` has and `before` has not."""
     held_out: tuple[str, ...]
-    """What no fit saw, in words."""
+    """Rows that no fit saw, in words."""
     held_out_rms: tuple[float, float]
     """Before and after, on what no fit saw, outliers left out, as the report has it [m]."""
     source: str
-    """Where it comes from: a folder, or 'this session'."""
+    """Source: a folder, or 'this session'."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -97,7 +97,7 @@ class Playback:
     log: RunLog
     """Rows with a time and all inputs, run after run."""
     nominal: Robot
-    """What an identification of the log starts from."""
+    """Options that an identification of the log starts from."""
     origin: Ints
     """(n,) their rows in the log that was given."""
     time: Floats
@@ -143,11 +143,11 @@ class Playback:
         each = n + len(kept)
         for k, robot in enumerate(robots):
 
-            def tell(done: int, _: int, start: int = k * each) -> None:
+            def notify(done: int, _: int, start: int = k * each) -> None:
                 if progress is not None:
                     progress(start + min(int(done), n), each * len(robots))
 
-            tracks.append(_track(log, robot, kept, labels[k], tell))
+            tracks.append(_track(log, robot, kept, labels[k], notify))
             if progress is not None:
                 progress((k + 1) * each, each * len(robots))
         return Playback(
@@ -180,7 +180,7 @@ class Playback:
 
     @cached_property
     def base_quaternion(self) -> Floats:
-        """(m, 4) world_from_base at each frame, w x y z: which way is up."""
+        """(m, 4) world_from_base at each frame, w x y z: the direction of up."""
         if self.log.base_quaternion is not None:
             return self.log.base_quaternion[self.frames]
         return np.tile(np.array(self.before.robot.base_quaternion), (len(self.frames), 1))
@@ -321,8 +321,8 @@ def _identification(path: Path, folder: Path | None, given: Robot | None) -> _Fo
 
 
 def _report(folder: Path, path: Path) -> _Found | None:
-    """What report.json and identified.toml in `folder` say about the log at `path`; None where they are not
-    there, or of another log."""
+    """Return what report.json and identified.toml in `folder` say about the log at `path`; None where they
+    are not there, or of another log."""
     report, robot = folder / "report.json", folder / "identified.toml"
     if not (report.is_file() and robot.is_file()):
         return None
@@ -394,15 +394,15 @@ def _tested(samples: Any, findings: Findings | None) -> Flags | None:
 def _clock(log: RunLog) -> tuple[Floats, Ints]:
     """(n,) time of the playback [s], and the rows before which it leaves time out."""
     step = np.diff(log.t)
-    turn = log.run[1:] != log.run[:-1]
-    inside = step[~turn & (step > 0.0)]
+    new_run = log.run[1:] != log.run[:-1]
+    inside = step[~new_run & (step > 0.0)]
     usual = float(np.median(inside)) if len(inside) else 1.0
-    cut = turn | (step > _LONG * usual)
+    cut = new_run | (step > _LONG * usual)
     return np.concatenate([[0.0], np.cumsum(np.where(cut, usual, step))]), np.flatnonzero(cut) + 1
 
 
-def _track(log: RunLog, robot: Robot, frames: Ints, label: str, tell: Progress) -> PlayedTrack:
-    answer = replay(log, robot, progress=tell)
+def _track(log: RunLog, robot: Robot, frames: Ints, label: str, progress: Progress) -> PlayedTrack:
+    answer = replay(log, robot, progress=progress)
     residual = np.asarray(np.linalg.norm(answer.residual, axis=1))
     return PlayedTrack(
         label=label,
@@ -424,28 +424,28 @@ def _shapes(log: RunLog, robot: Robot, frames: Ints) -> PlayedShapes:
     from fastrod.simulator import Simulator
 
     bare, cut = replace(robot, effects=()), log.rows(frames)
-    turn, origin = base_of(cut, robot)
+    base, origin = base_of(cut, robot)
     if not robot.effects:
         given: dict[str, Any] = dict(inputs(cut, robot))
         state = Simulator(bare, n_robots=len(frames), points_per_segment=POINTS_PER_SEGMENT).settle(**given)
         position, rotation, arclength = state.position, state.rotation, state.arclength
     else:
         model = known_model(robot)
-        place = forward.bench(forward.sample(log).on(frames), robot, model.wiring)
-        chain = forward.chain_of(model, np.zeros(0))
+        place = forward.prepare_log(forward.sample(log).on(frames), robot, model.wiring)
+        effects = forward.effects_at(model, np.zeros(0))
         sim = Simulator(bare, n_robots=len(frames), points_per_segment=forward.N_STEPS)
-        state = sim.settle_ports(*place.kernel(place.drive(chain)), forward.TOLERANCE * robot.length)
+        state = sim.settle_ports(*place.kernel(place.drive(effects)), forward.TOLERANCE * robot.length)
         arclength = _finer(state.arclength, robot.n_segments)
         fine = sim.shape(arclength)
         position, rotation = fine.position, fine.rotation
-    into = np.swapaxes(turn, 1, 2)
+    into = np.swapaxes(base, 1, 2)
     position = np.einsum("nij,nkj->nki", into, position - origin)
     rotation = into[:, None] @ rotation
     tip = position[:, -1]
     if robot.effects:
-        seen = place.see(forward.PredictedPose(tip, rotation[:, -1], position, state.ok), chain)
-        turned = seen.rotation @ np.swapaxes(rotation[:, -1], 1, 2)
-        tip, position, rotation = seen.position, seen.points, turned[:, None] @ rotation
+        seen = place.see(forward.PredictedPose(tip, rotation[:, -1], position, state.ok), effects)
+        rotated = seen.rotation @ np.swapaxes(rotation[:, -1], 1, 2)
+        tip, position, rotation = seen.position, seen.points, rotated[:, None] @ rotation
     for array in (tip, position, rotation):
         array[~state.ok] = np.nan
     return PlayedShapes(position, rotation, arclength, tip, state.ok)
@@ -455,6 +455,6 @@ def _finer(arclength: Floats, n_segments: int) -> Floats:
     """(m, n_segments * POINTS_PER_SEGMENT + 1) arclengths, even within each segment, from the nodes of a
     coarser rod."""
     ends = arclength[:, :: (arclength.shape[1] - 1) // n_segments]
-    part = np.linspace(0.0, 1.0, POINTS_PER_SEGMENT, endpoint=False)
-    inner = ends[:, :-1, None] + np.diff(ends, axis=1)[:, :, None] * part
+    fraction = np.linspace(0.0, 1.0, POINTS_PER_SEGMENT, endpoint=False)
+    inner = ends[:, :-1, None] + np.diff(ends, axis=1)[:, :, None] * fraction
     return np.concatenate([inner.reshape(len(ends), -1), ends[:, -1:]], axis=1)

@@ -19,9 +19,9 @@ from fastrod_viewer.page import PageView
 from fastrod_viewer.palette import CONTACT, GHOST, MEASURED
 from fastrod_viewer.picture import Picture
 from fastrod_viewer.playback import Playback, PlayedShapes
+from fastrod_viewer.robots import radii
 from fastrod_viewer.shapes import ball
 from fastrod_viewer.world import DrawnRods
-from fastrod_viewer.worlds import radii
 
 BOTH = "both"
 """In the place of a model's label: all of them, the last one in full."""
@@ -45,8 +45,8 @@ class ReplayDrawing:
         up = matrix_from_quaternion(playback.base_quaternion)[:, 2, 2].min() > _UPRIGHT
         middle, size, floor = (0.22, 0.95, 0.0) if up else (-0.4, 1.5, -1.15)
         self.sight = PageView(np.array([0.0, 0.0, middle * robot.length]), size * robot.length)
-        """The robot in the upper part of the picture, above the plot, and all around its base where that
-        turns."""
+        """View of the robot in the upper half of the picture, above the plot, and all around its base where
+        that rotates."""
         canvas.clear()
         canvas.floor(1.5 * robot.length, floor * robot.length, np.zeros(3))
 
@@ -70,7 +70,7 @@ class ReplayDrawing:
         long."""
         playback, last = self.playback, len(self.playback.tracks) - 1
         quaternion, row = playback.base_quaternion[frame], playback.frames[frame]
-        turn = matrix_from_quaternion(quaternion[None])[0]
+        orientation = matrix_from_quaternion(quaternion[None])[0]
         for k, (track, rods, picture) in enumerate(
             zip(playback.tracks, self._rods, self._pictures, strict=True)
         ):
@@ -82,7 +82,7 @@ class ReplayDrawing:
             )
             self.canvas.show(f"ghost{k}", thin)
         shown = next((track for track in playback.tracks if track.label == choice), playback.tracks[last])
-        measured, predicted = turn @ playback.measured_tip[row], turn @ shown.tip_position[row]
+        measured, predicted = orientation @ playback.measured_tip[row], orientation @ shown.tip_position[row]
         self._measured(measured)
         self._residual(measured, predicted, magnify)
 
@@ -99,13 +99,13 @@ class ReplayDrawing:
         self.canvas.show("measured_trail", self._trail.instances(0.1 * self._radius, MEASURED))
 
     def _residual(self, measured: Floats, predicted: Floats, magnify: float) -> None:
-        way = measured - predicted
-        if not np.isfinite(way).all():
+        residual = measured - predicted
+        if not np.isfinite(residual).all():
             self.canvas.show_all({}, "residual/")
             self.canvas.note("residual", "", None)
             return
-        size = float(np.linalg.norm(way))
-        along = way[None] / max(size, 1e-12)
+        size = float(np.linalg.norm(residual))
+        along = residual[None] / max(size, 1e-12)
         shaft, head = arrows(predicted[None], along, np.array([magnify * size]), 0.08 * self._radius, CONTACT)
         self.canvas.show_all({"shaft": shaft, "head": head}, "residual/")
         self.canvas.note(
@@ -115,9 +115,9 @@ class ReplayDrawing:
 
 def state_of(shapes: PlayedShapes, frame: int, quaternion: Floats, n_tendons: int) -> State:
     """The rod of one frame as a `State` in the world of `quaternion` (4,) world_from_log; tensions, which a
-    log does not tell, are nan."""
-    turn = matrix_from_quaternion(quaternion[None])[0]
-    position, rotation = shapes.position[frame] @ turn.T, turn @ shapes.rotation[frame]
+    log does not hold, are nan."""
+    orientation = matrix_from_quaternion(quaternion[None])[0]
+    position, rotation = shapes.position[frame] @ orientation.T, orientation @ shapes.rotation[frame]
     arclength = shapes.arclength[frame]
     step = np.diff(arclength)
     relative = np.swapaxes(rotation[:-1], 1, 2) @ rotation[1:]

@@ -12,7 +12,7 @@ from fastrod.errors import FastrodError
 from fastrod.types import Floats
 from fastrod_viewer.canvas import Canvas
 from fastrod_viewer.export import wrap
-from fastrod_viewer.page import ViewerPage, facts, picture, send, stand_back, tell
+from fastrod_viewer.page import ViewerPage, facts, notify, picture, send, stand_back
 from fastrod_viewer.palette import MEASURED, css
 from fastrod_viewer.playback import Playback, identify
 from fastrod_viewer.replay_drawing import BOTH, ReplayDrawing
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import viser
 
 _RATE = 30.0
-_TOLD = 0.15  # s between two changes of slider and plot
+_SHOW_EVERY = 0.15  # s between two changes of slider and plot
 _HELD = 0.3  # s after a person has moved the slider, in which it is left alone
 _FAR = 30  # frames: a longer jump is no motion, and leaves no trail
 _SPEEDS = {"¼ ×": 0.25, "1 ×": 1.0, "4 ×": 4.0, "16 ×": 16.0}
@@ -45,7 +45,7 @@ class ReplayPage(ViewerPage):
         self._lock = threading.RLock()
         self._closed, self._wake = threading.Event(), threading.Event()
         self._speed, self._playing = 1.0, True
-        self._scrubbed = self._told = 0.0
+        self._scrubbed = self._shown = 0.0
         self._made: list[Any] = []
         self._take(playback)
         self._thread = threading.Thread(target=self._run, name=f"replay {self.title}", daemon=True)
@@ -63,7 +63,7 @@ class ReplayPage(ViewerPage):
         """It computes next to nothing."""
 
     def tick(self) -> None:
-        """Nothing to do."""
+        """Do nothing."""
 
     def lost(self, client: int, left: int) -> None:
         """With nobody left it plays no further."""
@@ -268,7 +268,7 @@ class ReplayPage(ViewerPage):
         try:
             made = identify(self.playback, progress=progress)
         except FastrodError as error:
-            tell(client, "Nothing could be found", str(error), failed=True)
+            notify(client, "Nothing could be found", str(error), failed=True)
             button.disabled, button.label = False, _FIND
             return
         if not self._closed.is_set():
@@ -300,9 +300,9 @@ class ReplayPage(ViewerPage):
             self.drawing.forget()
         self._draw(frame)
         self.frame = frame
-        if self._playing and now - self._told < _TOLD:
+        if self._playing and now - self._shown < _SHOW_EVERY:
             return
-        self._told = now
+        self._shown = now
         playback, row = self.playback, self.playback.frames[frame]
         rows = [("Time", f"{self._time:.2f} s of {playback.duration:.1f} s")]
         if run := playback.run_at(frame):

@@ -134,8 +134,8 @@ def _name(track: PlayedTrack) -> str:
 
 
 def _thin(values: Floats, first: Ints, whole: bool) -> Floats:
-    """The least and the greatest of each stretch that begins at `first`, in turn; nan where all of a stretch
-    is."""
+    """Return the least and the greatest of each stretch that begins at `first`, alternating; nan where all of
+    a stretch is."""
     if whole:
         return values
     return np.stack([np.fmin.reduceat(values, first), np.fmax.reduceat(values, first)], axis=1).ravel()

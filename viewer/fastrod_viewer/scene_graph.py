@@ -1,5 +1,4 @@
-"""From states to what is seen: poses, sizes and colours of instances of a few unit meshes; nothing here knows
-a browser.
+"""Pictures of states: poses, sizes and colours of instances of a few unit meshes; independent of a browser.
 
 The one door of `picture`, `fittings`, `arrows`, `legend`, `options` and `shapes`.
 """
@@ -63,9 +62,11 @@ def bounds(rods: DrawnRods, bodies: Sequence[Body] = (), poses: Floats | None = 
     n = len(state.ok)
     longest = max(robot.length for robot in rods.robots)
     base = np.broadcast_to([robot.base_position for robot in rods.robots], (n, 3))
-    turn = matrix_from_quaternion(np.array([robot.base_quaternion for robot in rods.robots]))
-    reach = np.array([robot.length for robot in rods.robots])
-    straight = np.stack([base, base + np.broadcast_to(reach[:, None] * turn[:, :, 2], (n, 3))], axis=1)
+    orientation = matrix_from_quaternion(np.array([robot.base_quaternion for robot in rods.robots]))
+    length = np.array([robot.length for robot in rods.robots])
+    straight = np.stack(
+        [base, base + np.broadcast_to(length[:, None] * orientation[:, :, 2], (n, 3))], axis=1
+    )
     whole = state.position.size and np.isfinite(state.position).all()
     points = [((state.position if whole else straight) + rods.place[:, None]).reshape(-1, 3)]
     for body, pose in zip(bodies, np.zeros((0, 7)) if poses is None else poses, strict=True):

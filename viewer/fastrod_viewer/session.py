@@ -19,7 +19,7 @@ from fastrod.logs.recording import Recorder
 from fastrod.logs.runlog import RunLog
 from fastrod_viewer.linked import Linked
 from fastrod_viewer.measuring import measure
-from fastrod_viewer.pilot import Teleop
+from fastrod_viewer.teleop import Teleop
 from fastrod_viewer.world import ManualCommand, World
 
 RATE = 30.0
@@ -27,7 +27,7 @@ RATE = 30.0
 _BEHIND = 0.25  # s: a world that falls farther behind runs slower than real time
 _REST = 12  # pictures after the last motion, in which an observer comes to rest
 _SAID = 4.0  # s for which a problem stays on the page
-_QUICKEST = 0.008  # s between two pictures, when hands are quick
+_QUICKEST = 0.008  # s between two pictures, when commands come quickly
 _SPREAD = 1.25  # of a step, over which a robot spreads it: the next one may come late
 _RELEASED = 3.0  # s in which a robot must be ready after a release, or stays stopped
 # s after a stop in which a real robot is not released: that was a click too many, or one meant for something
@@ -37,16 +37,16 @@ _HASTY = 1.0
 
 @dataclass(frozen=True, eq=False)
 class ViewFrame:
-    """What a picture shows."""
+    """Content of a picture."""
 
     world: World
-    hand: ManualCommand | None
-    """What the world was told last; None before, and where its script moves it."""
+    command: ManualCommand | None
+    """The last command; None before the first, and where its script moves the world."""
     measured: Measurement | None
     """Of a robot that is not the world itself."""
     latency: float
-    """From the oldest input that this picture answers to the end of its computation [s]; nan where there was
-    none."""
+    """Time from the oldest input that this picture answers to the end of its computation [s]; nan where there
+    was none."""
     pace: float
     """Seconds of the world in a second, lately; 1 while nothing moves."""
     problem: str
@@ -58,25 +58,24 @@ class Session:
     """Advances a world and hands a `ViewFrame` to `draw` when something has changed. Every method may be
     called from any thread.
 
-    With a `link`, hands drive that robot, the world is its model and gets the same commands, and
-    `ViewFrame.measured` is what the robot says. A real robot stops when `nobody` watches. Where it has
+    With a `link`, manual commands drive that robot, the world is its model and gets the same commands, and
+    `ViewFrame.measured` is what the robot reports. A real robot stops when `nobody` watches. Where it has
     stopped, by whatever it was, the session is stopped too, and the model stands as the robot's encoders say,
-    until
-    `release`.
+    until `release`.
     """
 
     def __init__(
         self,
         world: World,
-        pilot: Teleop,
+        teleop: Teleop,
         *,
         draw: Callable[[ViewFrame], None],
         link: RobotLink | None = None,
         script: bool = False,
     ) -> None:
-        self.world, self.pilot, self.link = world, pilot, link
+        self.world, self.teleop, self.link = world, teleop, link
         self.far = None if link is None else Linked(link)
-        """The link, asked for what it can do."""
+        """The link and its capabilities."""
         self.recorder: Recorder | None = None
         self._draw = draw
         self._jobs: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
@@ -90,8 +89,8 @@ class Session:
         self._moved = time.perf_counter()
         self._steps = 0
         self._since: float | None = None
-        self._asked = 0.0
-        self._hand: ManualCommand | None = None
+        self._woken = 0.0
+        self._command: ManualCommand | None = None
         self._problem, self._said = "", 0.0
         self._recorded, self._restarts = -np.inf, 0
         self._pace = 1.0
@@ -113,27 +112,27 @@ class Session:
 
     @property
     def scripted(self) -> bool:
-        """The script moves the world, not hands."""
+        """The script moves the world, not a person."""
         return self._scripted
 
     @scripted.setter
     def scripted(self, on: bool) -> None:
         if on and self.link is None and self.world.scripted:
             self._scripted = True
-        elif self._scripted and not on and self.world.by_hand:
+        elif self._scripted and not on and self.world.drivable:
             self._adopt()
             self._scripted = False
-        self.touch()
+        self.wake()
 
     @property
     def paused(self) -> bool:
-        """Nothing moves until `paused` is False again, or `step`."""
+        """True while everything stands still, until it is set to False or `step` is called."""
         return self._paused
 
     @paused.setter
     def paused(self, on: bool) -> None:
         self._paused = bool(on)
-        self.touch()
+        self.wake()
 
     @property
     def stopped(self) -> bool:
@@ -142,7 +141,7 @@ class Session:
 
     @property
     def releasing(self) -> bool:
-        """A release was asked for, and the robot at the other end of the link has not said yet that it is
+        """A release was requested, and the robot at the other end of the link has not said yet that it is
         ready."""
         return self._stopped and time.perf_counter() - self._released < _RELEASED
 
@@ -152,25 +151,25 @@ class Session:
         stopped."""
         return self._stopped and not self.releasing and time.perf_counter() - self._hasty < _SAID
 
-    def touch(self) -> None:
-        """Hands have moved something: answer at once."""
+    def wake(self) -> None:
+        """Answer at once: a control was moved."""
         if self._since is None:
             self._since = time.perf_counter()
-        self._asked = time.perf_counter()
+        self._woken = time.perf_counter()
         self._wake.set()
 
     def take_over(self) -> None:
-        """Hands drive from here on, from where the script has left the robot."""
+        """Drive manually from here on, from where the script has left the robot."""
         self.scripted = False
 
-    def ask(self, job: Callable[[], None]) -> None:
+    def submit(self, job: Callable[[], None]) -> None:
         """Do something between two steps, in the session's thread."""
         self._jobs.put(job)
-        self.touch()
+        self.wake()
 
     def stop(self) -> None:
-        """Everything stands still, at once; commands wait for `release`. While stopped it is a stop again,
-        and ends a release under way."""
+        """Stop everything at once; commands wait for `release`. While stopped it is a stop again, and ends a
+        release in progress."""
         self._halt(nobody=False)
 
     def _halt(self, *, nobody: bool) -> None:
@@ -178,19 +177,19 @@ class Session:
             self._stopped, self._released, self._halted = True, -np.inf, time.perf_counter()
         if self.far is not None:
             self.far.stop(nobody=nobody)
-        self.pilot.hold()
-        self.touch()
+        self.teleop.hold()
+        self.wake()
 
     def release(self) -> None:
         """Take commands again, from where the robot stands. A linked robot may take a while until it is
-        ready, or refuse. Ignored while nothing is stopped or a release is under way, and, where the robot is
-        real, within a second of the last stop.
+        ready, or refuse. Ignored while nothing is stopped or a release is in progress, and, where the robot
+        is real, within a second of the last stop.
         """
         with self._gate:  # a stop that is pressed meanwhile comes after it
             now = time.perf_counter()
             if not self._stopped or self.releasing:
                 return
-            self.pilot.hold()
+            self.teleop.hold()
             if self.far is None:
                 self._stopped = False
             elif self.far.link.real and now - self._halted < _HASTY:
@@ -198,20 +197,20 @@ class Session:
             else:
                 self.far.link.release()
                 self._released = now
-        self.touch()
+        self.wake()
 
     def nobody(self) -> None:
-        """Nobody watches any more: what was on its way stops; a real robot is stopped as by `stop`."""
+        """Stop every motion because nobody watches any more; a real robot is stopped as by `stop`."""
         if self.link is not None and self.link.real:
             self._halt(nobody=True)
         else:
-            self.pilot.hold()
+            self.teleop.hold()
 
     def step(self) -> None:
         """One picture's worth of steps while paused."""
         self._paused = True
         self._steps += 1
-        self.touch()
+        self.wake()
 
     def reset(self) -> None:
         """World and controls back to the beginning; a robot at the other end of a link goes there, straight,
@@ -219,14 +218,14 @@ class Session:
 
         def job() -> None:
             if self.link is not None:
-                self.pilot.all_zero()
+                self.teleop.all_zero()
                 return
-            self.pilot.reset()
+            self.teleop.reset()
             self.world.reset()
             self._adopt()
-            self._hand, self._problem = None, ""
+            self._command, self._problem = None, ""
 
-        self.ask(job)
+        self.submit(job)
 
     def _adopt(self) -> None:
         """The controls stand where the robot is: that at the other end of the link, where there is one."""
@@ -234,12 +233,13 @@ class Session:
             now = measure(self.world, None)
             dl, ext = now.dl, now.ext
         else:
-            dl, ext = self.far.told()
+            dl, ext = self.far.held()
         if np.isfinite(dl).all():
-            self.pilot.adopt(dl, np.nan_to_num(ext))
+            self.teleop.adopt(dl, np.nan_to_num(ext))
 
     def _keep_stopped(self, far: Linked) -> None:
-        """As the robot is at the other end of the link: it may have stopped by itself, or be ready again."""
+        """Follow the state of the robot at the other end of the link: it may have stopped by itself, or be
+        ready again."""
         with self._gate:  # a stop that is pressed meanwhile must not be forgotten
             if far.stopped and not self._stopped:
                 self._stopped, self._released, self._halted = True, -np.inf, time.perf_counter()
@@ -250,7 +250,7 @@ class Session:
                 return
         dl, ext = far.standing()
         if np.isfinite(dl).all():
-            self.pilot.adopt(dl, np.nan_to_num(ext))
+            self.teleop.adopt(dl, np.nan_to_num(ext))
 
     def _run(self) -> None:
         due = time.perf_counter()
@@ -295,7 +295,7 @@ class Session:
 
     def _moves(self) -> bool:
         """Something is to be computed for the next picture."""
-        if self.far is not None:  # it must be looked at, whatever hands do
+        if self.far is not None:  # it must be looked at, whatever is commanded
             return True
         if self._stopped or (self._paused and not self._steps):
             return False
@@ -307,10 +307,11 @@ class Session:
             or self.recorder is not None
         ):
             return True
-        return not self.pilot.arrived or time.perf_counter() - self._asked < _REST / RATE
+        return not self.teleop.arrived or time.perf_counter() - self._woken < _REST / RATE
 
     def _advance(self, due: float, began: float, *, at_once: bool) -> float:
-        """Steps of the world up to now, one at least where hands wait for it; when the next one is due."""
+        """Do the steps of the world up to now, one at least where a command waits for it; return when the
+        next one is due."""
         if self.far is not None:
             # late, it is slower: nothing is made up for
             self._try(min(max(began - self._moved, _QUICKEST), 1.0 / RATE))
@@ -332,20 +333,20 @@ class Session:
         return due
 
     def _try(self, dt: float) -> bool:
-        """One step; whether it could be done. Otherwise the problem is kept, and hands are where they were
+        """Do one step; return whether it could be done. Otherwise the problem is kept, and the goals are as
         before."""
         try:
             self._one(dt)
         except FastrodError as error:
             self._problem, self._said = str(error), time.perf_counter()
             if not self._scripted:
-                self.pilot.retreat()
+                self.teleop.retreat()
             return False
         return True
 
     @property
     def waiting(self) -> float:
-        """How long the step that is being computed has taken so far [s]; 0 between two steps."""
+        """Time that the step in progress has taken so far [s]; 0 between two steps."""
         since = self._since_step
         return 0.0 if since is None else time.perf_counter() - since
 
@@ -358,23 +359,27 @@ class Session:
 
     def _compute(self, dt: float) -> None:
         if self._scripted:
-            self._hand = None
+            self._command = None
             self.world.play()
         elif self.far is None:
-            self._hand = self.pilot.step(dt) if not self._stopped or self._hand is None else self._hand
-            self.world.drive(self._hand)
+            self._command = (
+                self.teleop.step(dt) if not self._stopped or self._command is None else self._command
+            )
+            self.world.drive(self._command)
         else:
             self._keep_stopped(self.far)
-            still = self._hand if self._paused and not self._stopped else None
-            hand = self.pilot.step(dt) if still is None else still
+            still = self._command if self._paused and not self._stopped else None
+            command = self.teleop.step(dt) if still is None else still
             if not self._stopped:
                 self.far.command(
-                    hand.tendon_length - self.world.robot.rest_tendon_length, hand.extension, _SPREAD * dt
+                    command.tendon_length - self.world.robot.rest_tendon_length,
+                    command.extension,
+                    _SPREAD * dt,
                 )
-            self._hand = hand
-            self.world.drive(hand)
+            self._command = command
+            self.world.drive(command)
         if time.perf_counter() - self._said > _SAID:
-            self._problem = self.pilot.problem
+            self._problem = self.teleop.problem
         if self.recorder is None:
             self._recorded = -np.inf
         elif self.recorder.recording and not self._fed:
@@ -398,19 +403,22 @@ class Session:
         return recorder.stop() if recorder is not None and recorder.recording else None
 
     def _record(self, recorder: Recorder) -> None:
-        hand = self._hand
-        measurement = self.link.read() if self.link is not None else measure(self.world, hand)
+        command = self._command
+        measurement = self.link.read() if self.link is not None else measure(self.world, command)
         if measurement.t < self._recorded:  # a reset, or a script that begins again
             self._restarts += 1
             recorder.start(measurement.t, f"again {self._restarts}")
         self._recorded = measurement.t
-        if hand is None:
+        if command is None:
             recorder.add(measurement)
             return
         rotation = self.world.rods[0].state.rotation[0, 0]
-        change = hand.tendon_length - self.world.robot.rest_tendon_length
+        change = command.tendon_length - self.world.robot.rest_tendon_length
         recorder.add(
-            measurement, tip_force=rotation.T @ hand.tip_force, payload=hand.payload, commanded_dl=change
+            measurement,
+            tip_force=rotation.T @ command.tip_force,
+            payload=command.payload,
+            commanded_dl=change,
         )
 
     def _show(self, since: float | None) -> None:
@@ -418,13 +426,13 @@ class Session:
         problem = self._problem or (measured.problem if measured is not None else "")
         now = time.perf_counter()
         latency = float("nan") if since is None else now - since
-        self._draw(ViewFrame(self.world, self._hand, measured, latency, self._pace, problem))
+        self._draw(ViewFrame(self.world, self._command, measured, latency, self._pace, problem))
 
     def _let_go(self) -> None:
         if self.link is not None:
             self.link.stop()  # before a long log is written
         try:
-            # no reading, or no room: nobody is left to be told, and rows are in PATH.part
+            # no reading, or no room: nobody is left to hear of it, and rows are in PATH.part
             with contextlib.suppress(InputError):
                 self.end_recording()
         finally:

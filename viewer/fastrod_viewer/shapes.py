@@ -1,4 +1,4 @@
-"""Unit meshes, and instances of them: all that moves is drawn as these, placed, turned and stretched."""
+"""Unit meshes, and instances of them: all that moves is drawn as these, moved, rotated and stretched."""
 
 from __future__ import annotations
 
@@ -40,7 +40,8 @@ class Instances(NamedTuple):
 
 
 def instances(shape: str, position: Floats, wxyz: Floats, scale: Floats, color: Colors | Color) -> Instances:
-    """From arrays with any leading axes (..., 3), (..., 4), (..., 3); `color` (..., 3), or one for all."""
+    """Build instances of arrays with any leading axes (..., 3), (..., 4), (..., 3); `color` (..., 3), or one
+    for all."""
     position = position.reshape(-1, 3)
     n = len(position)
     colors = np.asarray(color, np.uint8)
@@ -58,9 +59,13 @@ def ball(position: Floats, radius: float, color: Color) -> Instances:
     """A ball at `position` (3,), or balls at (n, 3), world [m]; none where that is not finite."""
     centre = np.asarray(position, dtype=np.float64).reshape(-1, 3)
     there = np.isfinite(centre).all(1, keepdims=True)
-    turn = np.broadcast_to([1.0, 0.0, 0.0, 0.0], (len(centre), 4))
+    orientation = np.broadcast_to([1.0, 0.0, 0.0, 0.0], (len(centre), 4))
     return instances(
-        "ball", np.where(there, centre, 0.0), turn, np.where(there, np.full(centre.shape, radius), 0.0), color
+        "ball",
+        np.where(there, centre, 0.0),
+        orientation,
+        np.where(there, np.full(centre.shape, radius), 0.0),
+        color,
     )
 
 
@@ -95,7 +100,7 @@ def _arc(first: float, last: float, n: int) -> list[tuple[float, float]]:
 SHAPES: Mapping[str, DrawnMesh] = MappingProxyType(
     {
         "tube": _lathe([(1.0, -0.5), (1.0, 0.5)], 24),
-        "wire": _lathe([(1.0, -0.5), (1.0, 0.5)], 8),
+        "thin_tube": _lathe([(1.0, -0.5), (1.0, 0.5)], 8),
         "bar": _lathe([(0.0, -0.5), (1.0, -0.5), (1.0, 0.5), (0.0, 0.5)], 16),
         "disc": _lathe([(0.0, -0.5), (0.95, -0.5), (1.0, -0.3), (1.0, 0.3), (0.95, 0.5), (0.0, 0.5)], 32),
         "ball": _lathe(_arc(-np.pi / 2, np.pi / 2, 13), 24),
@@ -103,6 +108,6 @@ SHAPES: Mapping[str, DrawnMesh] = MappingProxyType(
         "cap": _lathe(_arc(0.0, np.pi / 2, 8), 24),
     }
 )
-"""Of radius 1 around z. `tube` and `wire`: open, from z = -1/2 to 1/2; `bar` and `disc`: the same, closed,
-`disc` with a slight bevel; `ball`; `cone`: closed, base at z = 0, apex at z = 1; `cap`: the half of a ball
-above z = 0, open below."""
+"""Of radius 1 around z. `tube` and `thin_tube`: open, from z = -1/2 to 1/2; `bar` and `disc`: the same,
+closed, `disc` with a slight bevel; `ball`; `cone`: closed, base at z = 0, apex at z = 1; `cap`: the half of a
+ball above z = 0, open below."""

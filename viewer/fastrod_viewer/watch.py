@@ -17,11 +17,11 @@ _KEY = "fastrod-echo"
 
 @final
 class SceneWatch:
-    """Asks every page for an answer every second, and tells who came and went, `lost(client, clients left)`
-    for the latter.
+    """Pings every page every second, and reports which came and went, `lost(client, clients left)` for the
+    latter.
 
-    A page that does not answer within three seconds counts as gone until it answers again. Each is asked in a
-    thread of its own, so that those which do not answer hide no other.
+    A page that does not answer within three seconds counts as gone until it answers again. Each is pinged in
+    a thread of its own, so that those which do not answer hide no other.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class SceneWatch:
         self._thread.start()
 
     def close(self) -> None:
-        """Ask no more."""
+        """Stop pinging."""
         self._closed.set()
 
     @property
@@ -60,7 +60,7 @@ class SceneWatch:
 
     def _came(self, client: Any) -> None:
         name = f"watch {client.client_id}"
-        threading.Thread(target=self._ask, args=(client,), name=name, daemon=True).start()
+        threading.Thread(target=self._query, args=(client,), name=name, daemon=True).start()
 
     def _gone(self, client: int) -> None:
         self._silent.discard(client)
@@ -68,7 +68,7 @@ class SceneWatch:
         if not self._closed.is_set():
             self._lost(client, len(self))
 
-    def _ask(self, client: Any) -> None:
+    def _query(self, client: Any) -> None:
         number = client.client_id
         while not self._closed.wait(_EVERY) and number in self.server.get_clients():
             began = time.perf_counter()
@@ -80,7 +80,7 @@ class SceneWatch:
                     self._echoes.pop(number, None)
                     self._lost(number, len(self))
                 continue
-            except RuntimeError:  # it has just left, or keeps no storage: either way it has answered
+            except RuntimeError:  # it has just left, or keeps no storage: in both cases it has answered
                 pass
             self._silent.discard(number)
             self._echoes[number] = 0.5 * (time.perf_counter() - began)

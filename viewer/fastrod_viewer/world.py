@@ -1,4 +1,5 @@
-"""`World`: what the viewer shows and a hand drives; robots free in space, in a scene, or on a rigid host."""
+"""`World`: robots that the viewer shows and a person drives; free in space, in a scene, or on a rigid
+host."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ from fastrod.types import Floats
 
 
 class Body(NamedTuple):
-    """A rigid thing that is drawn: part of a host, an obstacle, a floor."""
+    """A rigid thing that is drawn: a link of a host, an obstacle, a floor."""
 
     name: str
     """Unique in its world."""
@@ -44,7 +45,7 @@ class DrawnRods(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ManualCommand:
-    """What a hand tells a world for one step."""
+    """Manual command to a world for one step."""
 
     tendon_length: Floats
     """(n_tendons,) absolute [m]; for robots that are driven by tension, not used."""
@@ -75,10 +76,10 @@ class World(ABC):
     dt: float
     """[s] of a step."""
     robot: Robot
-    """The one that a hand drives; of many, all are driven alike."""
+    """The robot that is driven by hand; of many, all are driven alike."""
     actions: SegmentActions | None
     """Its segments as one drives them; None where they are not driven by tendon lengths."""
-    by_hand: bool
+    drivable: bool
     """It can be driven by hand; otherwise only its script moves it."""
     scripted: bool
     """It has a script."""
@@ -99,7 +100,7 @@ class World(ABC):
     @property
     @abstractmethod
     def rods(self) -> tuple[DrawnRods, ...]:
-        """All soft robots; the first robot of the first is the one that a hand drives."""
+        """All soft robots; the first robot of the first is the one that is driven."""
 
     @property
     @abstractmethod
@@ -115,9 +116,9 @@ class World(ABC):
         """One step of the script. Raises `FastrodError` where it cannot be done."""
 
     @abstractmethod
-    def drive(self, hand: ManualCommand) -> None:
-        """One step by hand. Raises `FastrodError` where it cannot be done; the world is then as after its
-        last good step, or reset."""
+    def drive(self, command: ManualCommand) -> None:
+        """Do one step of a manual command. Raises `FastrodError` where it cannot be done; the world is then
+        as after its last good step, or reset."""
 
     @abstractmethod
     def reset(self) -> None:
@@ -130,7 +131,7 @@ class World(ABC):
         none."""
 
     def picture(self) -> NDArray[np.uint8] | None:
-        """(height, width, 3) what a camera in hand sees now, where there is one."""
+        """Return the picture (height, width, 3) of the tip camera now, where there is one."""
         return None
 
     @abstractmethod

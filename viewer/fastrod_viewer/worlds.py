@@ -11,19 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fastrod.contact import ContactScene, Obstacle
-from fastrod.errors import InputError, RobotError
+from fastrod.errors import InputError
 from fastrod.model.robot import Robot
 from fastrod.model.segment_actions import SegmentActions
-from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_vector
+from fastrod.rotation import matrix_from_quaternion
 from fastrod.simulator import Simulator
 from fastrod.solver.state import State
 from fastrod.types import Floats
 from fastrod_scenes.scene import RodScene
-from fastrod_viewer.catalogue import about, catalogue, open_world
+from fastrod_viewer.robots import Loads, about, actions_of, moved, radii, tendon_inputs
 from fastrod_viewer.scene_graph import grid_places
 from fastrod_viewer.world import Body, DrawnRods, ManualCommand, World
-
-__all__ = ["FreeWorld", "SceneWorld", "SimulatedWorld", "catalogue", "open_world"]
 
 PERIOD = 6.0
 """Of the motion that shows what a free robot can do [s]."""
@@ -38,14 +36,14 @@ _COLORS = ((146, 154, 166), (176, 146, 110), (120, 150, 132), (160, 128, 146))
 
 
 class SimulatedWorld(World):
-    """What worlds of one simulator, without a host, have in common.
+    """Worlds of one simulator, without a host.
 
     A step that is not ok is settled; where that fails too, the simulator is as before the step. Where contact
-    is in the way the robots stand as far as they came, and go on from there. Either way an `InputError` says
+    blocks them the robots stand as far as they came, and continue from there. Either way an `InputError` says
     why.
     """
 
-    by_hand = True
+    drivable = True
     scripted = True
     host = False
     base_moves = True
@@ -60,7 +58,7 @@ class SimulatedWorld(World):
         self.dt = simulator.dt
         self.robot: Robot = simulator.robots[0]
         self.actions = actions_of(self.robot)
-        self._touches = contact is not None
+        self._has_contact = contact is not None
         self._radius = radii(self.robot, contact)
         self._place = place
         self._home: Floats = np.array([[*r.base_position, *r.base_quaternion] for r in simulator.robots])
@@ -105,22 +103,22 @@ class SimulatedWorld(World):
         if clock > self.duration + 1e-9 and not self.endless:
             self.reset()
             return
-        # beyond a step that fails the script goes on
+        # beyond a step that fails the script continues
         self._clock = clock % self.duration if self.endless else clock
-        self._advance(self.inputs(self._clock), part_way=True)
+        self._advance(self.inputs(self._clock), partial=True)
 
     @final
-    def drive(self, hand: ManualCommand) -> None:
-        """One step by hand. What the hand does not tell, obstacles and the base's own way among it, stays as
-        the script has it now. Among obstacles, robots that the script has bent in ways of their own are moved
-        by what the first one is: no robot could jump to another's bends there."""
+    def drive(self, command: ManualCommand) -> None:
+        """Do one step of a manual command. What the command does not set, obstacles and the base's own motion
+        among it, stays as the script has it now. Among obstacles, robots that the script has bent differently
+        are moved by the same change as the first one: no robot could jump to another's bends there."""
         held = self.held(self._clock)
-        given = held | wires(self.robot, hand)
-        if self._touches and np.ndim(own := held.get("tendon_length", 0.0)) == 2:
-            given["tendon_length"] = np.asarray(own) + (hand.tendon_length - np.asarray(own)[0])
+        given = held | tendon_inputs(self.robot, command)
+        if self._has_contact and np.ndim(own := held.get("tendon_length", 0.0)) == 2:
+            given["tendon_length"] = np.asarray(own) + (command.tendon_length - np.asarray(own)[0])
         pose = np.asarray(given.get("base_pose", self._home), dtype=np.float64)
-        given["base_pose"] = moved(pose, hand.base)
-        self._advance(self._loads.added(given, hand))
+        given["base_pose"] = moved(pose, command.base)
+        self._advance(self._loads.added(given, command))
 
     @final
     def jacobian(self) -> Floats:
@@ -144,22 +142,22 @@ class SimulatedWorld(World):
 
     @abstractmethod
     def held(self, t: float) -> dict[str, Any]:
-        """What of the script's inputs at time t [s] stays while a hand drives."""
+        """Return the script's inputs at time t [s] that stay during manual commands."""
 
     @abstractmethod
     def arrived(self, given: dict[str, Any]) -> None:
         """These inputs have been simulated; after a reset they are the first."""
 
     @final
-    def _advance(self, given: dict[str, Any], *, part_way: bool = False) -> None:
-        """Simulate these inputs; a step that cannot be done is as if it had not been, or with `part_way`,
-        among obstacles, done as far as it could be: a script goes on from there."""
+    def _advance(self, given: dict[str, Any], *, partial: bool = False) -> None:
+        """Simulate these inputs. A step that cannot be done is undone, or with `partial`, among obstacles,
+        done as far as possible: a script continues from there."""
         before = self.simulator.snapshot()
         state = self.simulator.step(**given)
-        if not state.ok.all() and not self._touches:
+        if not state.ok.all() and not self._has_contact:
             state = self.simulator.settle(**given)
         done = bool(state.ok.all()) and _finite(state)
-        if done or (part_way and self._touches and _finite(state)):
+        if done or (partial and self._has_contact and _finite(state)):
             self._state, self._given = state, given
             self._t = self._t + self.dt
         else:
@@ -180,7 +178,7 @@ class FreeWorld(SimulatedWorld):
     def __init__(
         self, robot: Robot, n_robots: int = 1, dt: float = 1.0 / 30.0, *, points_per_segment: int = 6
     ) -> None:
-        """As for `Simulator`. Raises `InputError`, `RobotError`."""
+        """Arguments of `Simulator`. Raises `InputError`, `RobotError`."""
         simulator = Simulator(robot, n_robots, dt, points_per_segment, threads=1 if n_robots == 1 else None)
         super().__init__(simulator, None, grid_places(n_robots, _APART * robot.length))
         self.name, self.about = robot.name, about(robot)
@@ -191,7 +189,7 @@ class FreeWorld(SimulatedWorld):
         return sway(self.robot, self.actions, 2.0 * math.pi * t / PERIOD)
 
     def held(self, t: float) -> dict[str, Any]:  # noqa: ARG002
-        """Nothing."""
+        """Do nothing."""
         return {}
 
     def arrived(self, given: dict[str, Any]) -> None:
@@ -239,7 +237,7 @@ class SceneWorld(SimulatedWorld):
         }
 
     def arrived(self, given: dict[str, Any]) -> None:
-        """The obstacles are where they were told to be."""
+        """Keep the poses of the obstacles."""
         if self._t == 0.0:
             self._poses = dict(self._rest)
         for name, pose in (given.get("obstacle_pose") or {}).items():
@@ -251,67 +249,8 @@ class SceneWorld(SimulatedWorld):
         return self._bodies
 
     def poses(self) -> Floats:
-        """(n_obstacles, 7) as they were told last, or as they are built."""
+        """Return the poses (n_obstacles, 7) as last given, or as built."""
         return np.array(list(self._poses.values())).reshape(-1, 7)
-
-
-@final
-class Loads:
-    """What a hand loads a robot with: tip force, payload, more or less gravity."""
-
-    def __init__(self, robot: Robot) -> None:
-        self._gravity = np.array(robot.gravity)
-        density = np.array([segment.line_density for segment in robot.segments])
-        # (n_segments, 2, 3) [N/m]
-        self._weight: Floats = np.repeat((density[:, None] * self._gravity)[:, None], 2, axis=1)
-
-    def added(self, given: dict[str, Any], hand: ManualCommand) -> dict[str, Any]:
-        """`given` with these loads on top of its own, as `Simulator.step` takes them."""
-        force = np.asarray(hand.tip_force, dtype=np.float64) + hand.payload * hand.gravity * self._gravity
-        more: dict[str, Any] = {"tip_force": force + np.asarray(given.get("tip_force", np.zeros(3)))}
-        if hand.gravity != 1.0 and self._weight.any():
-            own = np.asarray(given.get("line_force", np.zeros(3)), dtype=np.float64)
-            own = own[:, None, None] if own.ndim == 2 else own
-            more["line_force"] = own + (hand.gravity - 1.0) * self._weight
-        return {**given, **more}
-
-
-def actions_of(robot: Robot) -> SegmentActions | None:
-    """Its segments as one drives them; None where they are not driven by tendon lengths, two ways each."""
-    try:
-        return SegmentActions(robot)
-    except RobotError:
-        return None
-
-
-def radii(robot: Robot, contact: ContactScene | None = None) -> tuple[float, ...]:
-    """(n_segments,) of its body [m], as contact has them; a robot of which nobody knows is drawn slim."""
-    return tuple(radius or 0.01 * robot.length for radius in (contact or ContactScene()).radius_of(robot))
-
-
-def wires(robot: Robot, hand: ManualCommand) -> dict[str, Any]:
-    """What a hand tells the tendons and the segments, as `Simulator.step` takes it."""
-    modes = {segment.mode for segment in robot.segments}
-    given: dict[str, Any] = {"extension": hand.extension}
-    if modes & {"tendon_length", "paper"}:
-        given["tendon_length"] = hand.tendon_length
-    if "tendon_tension" in modes:
-        given["tension"] = np.zeros(robot.n_tendons) if hand.tension is None else hand.tension
-    return given
-
-
-def moved(pose: Floats, base: Floats) -> Floats:
-    """Poses (..., 7) displaced and turned, each about its own origin, by `base` (6,) as in `ManualCommand`.
-    Raises
-    `InputError`."""
-    by = np.asarray(base, dtype=np.float64)
-    if by.shape != (6,) or not np.isfinite(by).all():
-        raise InputError(
-            f"Hand.base is {base!r}; give six finite numbers, displacement [m] and rotation "
-            "vector [rad], world."
-        )
-    turn = np.broadcast_to(quaternion_from_vector(by[3:]), pose[..., 3:].shape)
-    return np.concatenate([pose[..., :3] + by[:3], product(turn, pose[..., 3:])], axis=-1)
 
 
 def sway(robot: Robot, actions: SegmentActions | None, angle: float) -> dict[str, Any]:
@@ -373,11 +312,15 @@ def _finite(state: State) -> bool:
 def _body(obstacle: Obstacle, color: tuple[int, int, int], robot: Robot) -> Body:
     drawn = obstacle.as_trimesh()
     vertices: NDArray[np.float64] = np.asarray(drawn.vertices)
-    if obstacle.shape == "plane":  # the part of it that is nearest to the robot
+    if obstacle.shape == "plane":  # the region of it that is nearest to the robot
         base = matrix_from_quaternion(np.array([robot.base_quaternion]))[0]
         middle = np.array(robot.base_position) + 0.5 * robot.length * base[:, 2]
-        turn = matrix_from_quaternion(np.array([obstacle.quaternion]))[0]
-        vertices = _SQUARE * robot.length * vertices + ((middle - obstacle.position) @ turn) * [1.0, 1.0, 0.0]
+        orientation = matrix_from_quaternion(np.array([obstacle.quaternion]))[0]
+        vertices = _SQUARE * robot.length * vertices + ((middle - obstacle.position) @ orientation) * [
+            1.0,
+            1.0,
+            0.0,
+        ]
     opacity = _GLASS if obstacle.shape in ("plane", "mesh") else 1.0
     return Body(
         obstacle.name, vertices.astype(np.float32), np.asarray(drawn.faces).astype(np.uint32), color, opacity

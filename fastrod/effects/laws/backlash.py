@@ -1,6 +1,9 @@
-"""Play of gears and of wires in their holes."""
+"""Play of gears and of tendons in their holes."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
 
 import numpy as np
 
@@ -12,10 +15,11 @@ from fastrod.types import Floats
 
 @effect
 class Backlash(Operator):
-    """Play of gears and of wires in their holes.
+    """Play of gears and of tendons in their holes.
 
     Equation: p = max(l - w, min(l + w, p)); rounded corners are the mean over half widths w (1 - c), w, w (1
-    + c) Source: play operator (Visintin 1994); backlash of wire drives (Palli and Melchiorri)
+    + c)
+    Source: play operator (Visintin 1994); backlash of tendon drives (Palli and Melchiorri)
     Residual signature: flat spot after every reversal, as wide at small as at large bends, the same at every
     speed
     """
@@ -30,18 +34,24 @@ class Backlash(Operator):
             typical=0.03,
             starts=(0.012, 0.04),
             per="segment",
-            of="reach",
+            of="offset",
         ),
         Parameter("rounding", "", bounds=(0.0, 0.4), typical=0.15, starts=(0.15,), shape=True),
     )
     excited_by = "slow reversals of many sizes"
     confounded_with = ("friction", "slack")
     synonyms = ("gear_play", "play")
+    separated_by: ClassVar[Mapping[str, str]] = {
+        "slack": "reversals away from neutral: backlash shows there, slack only around neutral"
+    }
+    frequent = True
 
     def memory(self, n_robots: int, n_tendons: int) -> Floats:
         return np.full((n_robots, 3 * n_tendons), np.nan)
 
-    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Routing) -> Floats:
+    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, routing: Routing) -> Floats:
         out = dl.copy()
-        play(out, memory, wiring.by_end(values[:, :-1]), np.repeat(values[:, -1:], wiring.n_tendons, axis=1))
+        play(
+            out, memory, routing.by_end(values[:, :-1]), np.repeat(values[:, -1:], routing.n_tendons, axis=1)
+        )
         return out

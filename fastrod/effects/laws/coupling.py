@@ -1,8 +1,9 @@
-"""Wires of one segment bend its neighbour too."""
+"""Tendons of one segment bend its neighbour too."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from fastrod.types import Floats
 
 @effect
 class Coupling(Static):
-    """Wires of one segment bend its neighbour too.
+    """Tendons of one segment bend its neighbour too.
 
     Equation: theta_k -> theta_k + c theta_(k+1) + d theta_(k-1)
     Source: Camarillo, Carlson and Salisbury 2009; Roy, Wang and Simaan 2017
@@ -29,9 +30,11 @@ class Coupling(Static):
     excited_by = "one segment moved at a time, then both"
     confounded_with = ("encoder_offset",)
     synonyms = ("inter_segment_coupling",)
+    separated_by: ClassVar[Mapping[str, str]] = {"encoder_offset": "one segment moved alone, then the other"}
+    least_segments = 2
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
-        if ports.wiring.n_segments < 2:
+        if ports.routing.n_segments < 2:
             return
         bend = ports.bend()
         change = np.zeros_like(bend)

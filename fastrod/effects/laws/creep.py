@@ -1,10 +1,13 @@
-"""Viscoelastic body or wires: part of the bend comes late."""
+"""Viscoelastic body or tendons: part of the bend comes late."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 import numpy as np
 
-from fastrod.effects.base import Operator, Parameter, Seam, effect
+from fastrod.effects.base import Operator, Parameter, Seam, Signal, effect
 from fastrod.kernels.operators import relaxation
 from fastrod.model.routing import Routing
 from fastrod.types import Floats
@@ -12,10 +15,10 @@ from fastrod.types import Floats
 
 @effect
 class Creep(Operator):
-    """Viscoelastic body or wires: part of the bend comes late.
+    """Viscoelastic body or tendons: part of the bend comes late.
 
     Equation: l -> l - c (l - x), tau x' = l - x
-    Source: standard linear solid (Zener); creep of polymer wires and silicone bodies
+    Source: standard linear solid (Zener); creep of polymer tendons and silicone bodies
     Residual signature: after a step it decays with time whatever the direction; loops that depend on speed
     """
 
@@ -36,12 +39,18 @@ class Creep(Operator):
     excited_by = "steps and holds of several time constants, the same path at two speeds"
     confounded_with = ("friction", "time_drift", "dynamics")
     synonyms = ("relaxation", "viscoelasticity")
+    separated_by: ClassVar[Mapping[str, str]] = {
+        "dynamics": "holds of 4 s and more",
+        "time_drift": "the first block of motion once more at the end",
+    }
+    signal = Signal.LAG
+    frequent = True
 
     def memory(self, n_robots: int, n_tendons: int) -> Floats:
         return np.full((n_robots, 2 * n_tendons), np.nan)
 
-    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Routing) -> Floats:
+    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, routing: Routing) -> Floats:
         out = dl.copy()
-        share, tau = (np.repeat(values[:, k : k + 1], wiring.n_tendons, axis=1) for k in (0, 1))
-        relaxation(out, memory, share, tau, dt)
+        fraction, tau = (np.repeat(values[:, k : k + 1], routing.n_tendons, axis=1) for k in (0, 1))
+        relaxation(out, memory, fraction, tau, dt)
         return out

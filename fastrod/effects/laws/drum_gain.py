@@ -1,4 +1,4 @@
-"""Each drive pays out more or less wire than it reports: a drum of another radius, layers of wire."""
+"""Each drive pays out more or less tendon than it reports: a drum of another radius, layers of tendon."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fastrod.types import Floats
 
 @effect
 class DrumGain(Static):
-    """Each drive pays out more or less wire than it reports: a drum of another radius, layers of wire.
+    """Each drive pays out more or less tendon than it reports: a drum of another radius, layers of tendon.
 
     Equation: dl_i -> (1 + g_i) dl_i, antagonists alike (the part that bends)
     Source: definition; multi-layer winding of a drum
@@ -26,5 +26,5 @@ class DrumGain(Static):
     synonyms = ("spool_radius", "actuation_gain")
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
-        gain = ports.wiring.by_tendon(values)
-        ports.shift_wires(gain * ports.dl)
+        gain = ports.routing.by_tendon(values)
+        ports.shift_tendons(gain * ports.dl)

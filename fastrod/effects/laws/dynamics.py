@@ -1,10 +1,10 @@
-"""Inertia: the bend follows its wires as a damped oscillator."""
+"""Inertia: the bend follows its tendons as a damped oscillator."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from fastrod.effects.base import Operator, Parameter, Seam, effect
+from fastrod.effects.base import Operator, Parameter, Seam, Signal, effect
 from fastrod.kernels.operators import second_order
 from fastrod.model.routing import Routing
 from fastrod.types import Floats
@@ -12,7 +12,7 @@ from fastrod.types import Floats
 
 @effect
 class Dynamics(Operator):
-    """Inertia: the bend follows its wires as a damped oscillator.
+    """Inertia: the bend follows its tendons as a damped oscillator.
 
     Equation: T^2 y'' + 2 z T y' + y = theta
     Source: first bending mode of a cantilever, f = 0.56 sqrt(EI / (m l^3))
@@ -30,12 +30,13 @@ class Dynamics(Operator):
     excited_by = "steps and fast reversals, sampled at ten times the frequency"
     confounded_with = ("latency", "creep")
     synonyms = ("inertia", "oscillation")
+    signal = Signal.MOTION
 
     def memory(self, n_robots: int, n_tendons: int) -> Floats:
         return np.full((n_robots, 3 * n_tendons), np.nan)
 
-    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Routing) -> Floats:
+    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, routing: Routing) -> Floats:
         out = dl.copy()
-        period, damping = (np.repeat(values[:, k : k + 1], wiring.n_tendons, axis=1) for k in (0, 1))
+        period, damping = (np.repeat(values[:, k : k + 1], routing.n_tendons, axis=1) for k in (0, 1))
         second_order(out, memory, period, damping, dt)
         return out

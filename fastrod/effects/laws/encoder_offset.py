@@ -20,10 +20,10 @@ class EncoderOffset(Static):
 
     seam = Seam.ACTUATION
     order = 22.0
-    parameters = (Parameter("offset", "m", bounds=(-1.0, 1.0), typical=0.02, per="drive", of="reach"),)
+    parameters = (Parameter("offset", "m", bounds=(-1.0, 1.0), typical=0.02, per="drive", of="offset"),)
     excited_by = "wide bends in every direction"
     confounded_with = ("precurvature", "frame_misalignment", "marker_offset")
     synonyms = ("zero_offset", "motor_zero")
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
-        ports.shift_wires(ports.wiring.by_tendon(values) * ports.wiring.drive_sign)
+        ports.shift_tendons(ports.routing.by_tendon(values) * ports.routing.drive_sign)

@@ -11,7 +11,7 @@ from fastrod.effects.ports import EffectPorts
 from fastrod.rotation import matrix_from_quaternion
 from fastrod.types import Floats
 
-_TURN = 2.0 * np.pi  # rad: any rotation, and a fit may pass half a turn
+_REVOLUTION = 2.0 * np.pi  # rad: any rotation, and a fit may pass half a turn
 _FAR = 30.0  # robot lengths: as far as a run log's tips may be
 
 
@@ -27,9 +27,9 @@ class FrameMisalignment(Static):
     seam = Seam.SENSING
     order = 20.0
     parameters = (
-        Parameter("rotation_x", "rad", bounds=(-_TURN, _TURN), typical=0.03, starts=(0.01,)),
-        Parameter("rotation_y", "rad", bounds=(-_TURN, _TURN), typical=0.03, starts=(0.01,)),
-        Parameter("rotation_z", "rad", bounds=(-_TURN, _TURN), typical=0.03, starts=(0.01,)),
+        Parameter("rotation_x", "rad", bounds=(-_REVOLUTION, _REVOLUTION), typical=0.03, starts=(0.01,)),
+        Parameter("rotation_y", "rad", bounds=(-_REVOLUTION, _REVOLUTION), typical=0.03, starts=(0.01,)),
+        Parameter("rotation_z", "rad", bounds=(-_REVOLUTION, _REVOLUTION), typical=0.03, starts=(0.01,)),
         Parameter("shift_x", "m", bounds=(-_FAR, _FAR), typical=0.03, starts=(0.01,), of="length"),
         Parameter("shift_y", "m", bounds=(-_FAR, _FAR), typical=0.03, starts=(0.01,), of="length"),
         Parameter("shift_z", "m", bounds=(-_FAR, _FAR), typical=0.03, starts=(0.01,), of="length"),
@@ -39,13 +39,13 @@ class FrameMisalignment(Static):
     synonyms = ("registration",)
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
-        turn = _turn(values[:, :3])
-        ports.tip_position[:] = np.einsum("nij,nj->ni", turn, ports.tip_position) + values[:, 3:]
-        ports.tip_rotation[:] = turn @ ports.tip_rotation
-        ports.points[:] = np.einsum("nij,nkj->nki", turn, ports.points) + values[:, None, 3:]
+        rotation = _rotation(values[:, :3])
+        ports.tip_position[:] = np.einsum("nij,nj->ni", rotation, ports.tip_position) + values[:, 3:]
+        ports.tip_rotation[:] = rotation @ ports.tip_rotation
+        ports.points[:] = np.einsum("nij,nkj->nki", rotation, ports.points) + values[:, None, 3:]
 
 
-def _turn(vector: Floats) -> Floats:
+def _rotation(vector: Floats) -> Floats:
     """(n, 3, 3) rotation by a rotation vector (n, 3) [rad]."""
     half = 0.5 * np.linalg.norm(vector, axis=1)
     return matrix_from_quaternion(

@@ -1,6 +1,9 @@
-"""Dry friction of the wires along the backbone, growing with the bend as a capstan."""
+"""Dry friction of the tendons along the backbone, growing with the bend as a capstan."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
 
 import numpy as np
 
@@ -12,19 +15,27 @@ from fastrod.types import Floats
 
 @effect
 class Friction(Operator):
-    """Dry friction of the wires along the backbone, growing with the bend as a capstan.
+    """Dry friction of the tendons along the backbone, growing with the bend as a capstan.
 
-    Equation: l -> l - a (1 + k phi) mean z_j, z_j = clip(z_j + l' / r_j, -1, 1), phi the angle that the wire
-    wraps, r_j over r e^(-+s) Source: Iwan 1966, Prandtl and Ishlinskii (sliders in parallel); capstan, Kato
-    et al. 2015, Palli and Melchiorri Residual signature: sign of the last direction of motion, saturating
-    with travel; loops that grow with the bend, blind to speed
+    Equation: l -> l - a (1 + k phi) mean z_j, z_j = clip(z_j + l' / r_j, -1, 1), phi the angle that the
+    tendon wraps, r_j over r e^(-+s)
+    Source: Iwan 1966, Prandtl and Ishlinskii (sliders in parallel); capstan, Kato et al. 2015, Palli and
+    Melchiorri
+    Residual signature: sign of the last direction of motion, saturating with travel; loops that grow with the
+    bend, blind to speed
     """
 
     seam = Seam.ACTUATION
     order = 40.0
     parameters = (
         Parameter(
-            "half_width", "m", bounds=(0.0, 0.6), typical=0.04, starts=(0.02, 0.08), per="segment", of="reach"
+            "half_width",
+            "m",
+            bounds=(0.0, 0.6),
+            typical=0.04,
+            starts=(0.02, 0.08),
+            per="segment",
+            of="offset",
         ),
         Parameter(
             "presliding",
@@ -33,7 +44,7 @@ class Friction(Operator):
             bounds=(0.004, 1.5),
             typical=0.15,
             starts=(0.05, 0.2),
-            of="reach",
+            of="offset",
             shape=True,
         ),
         Parameter("growth", "1/rad", bounds=(0.0, 5.0), typical=0.4, starts=(0.4,), shape=True),
@@ -42,18 +53,27 @@ class Friction(Operator):
     excited_by = "nested loops of decreasing amplitude at two speeds, with holds"
     confounded_with = ("backlash", "plastic_set", "creep")
     synonyms = ("hysteresis", "coulomb_friction", "capstan")
+    separated_by: ClassVar[Mapping[str, str]] = {
+        "backlash": "reversals of many sizes, slowly, the smallest below three gaps: backlash is as wide "
+        "at every bend",
+        "creep": "holds of 4 s and more after steps, and the same loop at two speeds: friction stays, "
+        "creep decays",
+        "plastic_set": "small loops after a large one: friction shows in each, a set only after a new "
+        "extreme",
+    }
+    frequent = True
 
     def memory(self, n_robots: int, n_tendons: int) -> Floats:
         return np.full((n_robots, (1 + SLIDERS) * n_tendons), np.nan)
 
-    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Routing) -> Floats:
+    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, routing: Routing) -> Floats:
         out = dl.copy()
-        n = wiring.n_segments
-        wrapped = np.cumsum(np.linalg.norm(wiring.bend(dl), axis=-1), axis=-1)
+        n = routing.n_segments
+        wrapped = np.cumsum(np.linalg.norm(routing.bend(dl), axis=-1), axis=-1)
         presliding, growth, spread = (
-            np.repeat(values[:, k : k + 1], wiring.n_tendons, axis=1) for k in (n, n + 1, n + 2)
+            np.repeat(values[:, k : k + 1], routing.n_tendons, axis=1) for k in (n, n + 1, n + 2)
         )
         elastoplastic(
-            out, memory, wiring.by_end(values[:, :n]), presliding, spread, growth, wiring.by_end(wrapped)
+            out, memory, routing.by_end(values[:, :n]), presliding, spread, growth, routing.by_end(wrapped)
         )
         return out

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 from fastrod.effects.base import Parameter, Seam, Static, effect
 from fastrod.effects.ports import EffectPorts
@@ -27,6 +28,13 @@ class Gravity(Static):
     excited_by = "two base orientations"
     confounded_with = ("payload", "precurvature", "frame_misalignment", "tip_force")
     synonyms = ("self_weight", "sag")
+    separated_by: ClassVar[Mapping[str, str]] = {
+        "payload": "a known mass of 50 g at the tip on and off; or weigh what hangs there",
+        "precurvature": "a second base orientation, turned by 90 degrees",
+        "frame_misalignment": "a second base orientation, turned by 90 degrees",
+        "tip_force": "a second base orientation, turned by 90 degrees",
+    }
+    frequent = True
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         ports.add_line_force(values[:, :, None] * ports.gravity[:, None, :])

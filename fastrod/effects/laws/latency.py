@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 import numpy as np
 
-from fastrod.effects.base import Operator, Parameter, Seam, effect
+from fastrod.effects.base import Operator, Parameter, Seam, Signal, effect
 from fastrod.kernels.operators import BUFFER, delay
 from fastrod.model.routing import Routing
 from fastrod.types import Floats
@@ -16,8 +19,8 @@ class Latency(Operator):
 
     Equation: l(t) = l_cmd(t - d), a cubic between samples; d is cut to the last 128 samples
     Source: transport delay; sensor delay as a parameter, as in MATLAB System Identification (delay of a
-    process model) Residual signature: along the velocity of the predicted tip and in proportion to it, zero
-    at rest
+    process model)
+    Residual signature: along the velocity of the predicted tip and in proportion to it, zero at rest
     """
 
     seam = Seam.ACTUATION
@@ -26,11 +29,17 @@ class Latency(Operator):
     excited_by = "motion at two speeds, with stops"
     confounded_with = ("dynamics", "creep")
     synonyms = ("delay", "time_delay")
+    separated_by: ClassVar[Mapping[str, str]] = {
+        "dynamics": "fast and slow motion with sudden stops, beyond 50 degrees: only dynamics ring",
+        "creep": "stops and holds: a delay is over after the delay",
+    }
+    signal = Signal.MOTION
+    frequent = True
 
     def memory(self, n_robots: int, n_tendons: int) -> Floats:
         return np.full((n_robots, 1 + BUFFER * (1 + n_tendons)), np.nan)
 
-    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Routing) -> Floats:
+    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, routing: Routing) -> Floats:
         out = dl.copy()
         delay(out, memory, np.ascontiguousarray(values[:, 0]), dt)
         return out

@@ -26,7 +26,7 @@ class Lens(Static):
     synonyms = ("lens_distortion",)
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
-        square = (ports.wiring.length.sum()) ** 2
+        square = (ports.routing.length.sum()) ** 2
         for place in (ports.tip_position[:, None], ports.points):
             place[..., :2] += (
                 values[:, :, None] * (place[..., :2] ** 2).sum(-1, keepdims=True) / square * place[..., :2]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 from fastrod.effects.base import Parameter, Seam, Static, effect
 from fastrod.effects.ports import EffectPorts
@@ -24,6 +25,10 @@ class Payload(Static):
     excited_by = "a known mass on and off, two base orientations"
     confounded_with = ("gravity", "tip_force")
     synonyms = ("tip_mass",)
+    separated_by: ClassVar[Mapping[str, str]] = {
+        "tip_force": "a second base orientation, turned by 90 degrees"
+    }
+    frequent = True
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         ports.tip_force += values * ports.gravity

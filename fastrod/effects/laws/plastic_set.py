@@ -40,14 +40,14 @@ class PlasticSet(Operator):
     def memory(self, n_robots: int, n_tendons: int) -> Floats:
         return np.full((n_robots, 2 * n_tendons), np.nan)
 
-    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, wiring: Routing) -> Floats:
-        change = wiring.bend(dl)
-        # where no wire ends nothing is commanded, and `memory` has no room
-        driven = np.unique(wiring.tendon_segment)
+    def sweep(self, values: Floats, memory: Floats, dl: Floats, dt: Floats, routing: Routing) -> Floats:
+        change = routing.bend(dl)
+        # where no tendon ends nothing is commanded, and `memory` has no room
+        driven = np.unique(routing.tendon_segment)
         bend = np.ascontiguousarray(change[:, :, driven])
-        share, at = (np.repeat(values[:, k : k + 1], len(driven), axis=1) for k in (0, 1))
-        yielding(bend, memory, share, at)
+        fraction, at = (np.repeat(values[:, k : k + 1], len(driven), axis=1) for k in (0, 1))
+        yielding(bend, memory, fraction, at)
         bend -= change[:, :, driven]
         change[:] = 0.0
         change[:, :, driven] = bend
-        return dl + wiring.wires(change)
+        return dl + routing.wires(change)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 from fastrod.effects.base import Parameter, Seam, Static, effect
 from fastrod.effects.ports import EffectPorts
@@ -13,8 +14,9 @@ from fastrod.types import Floats
 class Precurvature(Static):
     """The body is not straight without moments.
 
-    Equation: u*(s) -> u*(s) + b (1 - 2 s / l) + u_0: a bow, which stiff wires do not straighten, and a
-    uniform part, which they do Source: paper eq. 1c, m = K (u - u*)
+    Equation: u*(s) -> u*(s) + b (1 - 2 s / l) + u_0: a bow, which stiff tendons do not straighten, and a
+    uniform part, which they do
+    Source: paper eq. 1c, m = K (u - u*)
     Residual signature: constant in the body frame: the tip moves and does not turn
     """
 
@@ -26,12 +28,18 @@ class Precurvature(Static):
         Parameter("uniform_x", "1/m", bounds=(-30.0, 30.0), typical=2.0, starts=(0.0,), per="segment"),
         Parameter("uniform_y", "1/m", bounds=(-30.0, 30.0), typical=2.0, starts=(0.0,), per="segment"),
     )
-    excited_by = "wide bends with tip orientation; the free shape with slack wires"
+    excited_by = "wide bends with tip orientation; the free shape with slack tendons"
     confounded_with = ("frame_misalignment", "encoder_offset", "marker_offset")
     synonyms = ("pre_curvature", "initial_curvature")
+    separated_by: ClassVar[Mapping[str, str]] = {
+        "frame_misalignment": "the free shape with slack tendons, or a marker at half length: the tip cannot "
+        "tell",
+        "encoder_offset": "wide bends with the tip's orientation measured",
+        "marker_offset": "wide bends with the tip's orientation measured",
+    }
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
-        n = ports.wiring.n_segments
+        n = ports.routing.n_segments
         ports.resolve()
         for axis in (0, 1):
             bow, uniform = values[:, axis * n : (axis + 1) * n], values[:, (2 + axis) * n : (3 + axis) * n]

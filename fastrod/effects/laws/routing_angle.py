@@ -1,4 +1,4 @@
-"""Wires sit at other angles around the backbone than drawn."""
+"""Tendons sit at other angles around the backbone than drawn."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fastrod.types import Floats
 
 @effect
 class RoutingAngle(Static):
-    """Wires sit at other angles around the backbone than drawn.
+    """Tendons sit at other angles around the backbone than drawn.
 
     Equation: d_i -> rotation by beta_i about the tangent
     Source: definition; d_i = offset (cos b_i, sin b_i)
@@ -28,7 +28,7 @@ class RoutingAngle(Static):
     synonyms = ("mis_routing",)
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
-        angle = ports.wiring.by_tendon(values)[:, None]
+        angle = ports.routing.by_tendon(values)[:, None]
         c, s = np.cos(angle), np.sin(angle)
         x, y = ports.offset[..., 0].copy(), ports.offset[..., 1].copy()
         ports.offset[..., 0] = c * x - s * y

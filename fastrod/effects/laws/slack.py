@@ -1,4 +1,4 @@
-"""Dead zone at neutral: an antagonistic pair that hangs loose before either wire pulls."""
+"""Dead zone at neutral: an antagonistic pair that hangs loose before either tendon pulls."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from fastrod.types import Floats
 
 @effect
 class Slack(Static):
-    """Dead zone at neutral: an antagonistic pair that hangs loose before either wire pulls.
+    """Dead zone at neutral: an antagonistic pair that hangs loose before either tendon pulls.
 
     Equation: dl -> sgn(dl) max(|dl| - w, 0) (the part that bends)
-    Source: dead zone of slack wires, T = max(0, k lambda)
+    Source: dead zone of slack tendons, T = max(0, k lambda)
     Residual signature: static, odd, only around neutral of each pair; no loop
     """
 
@@ -30,7 +30,7 @@ class Slack(Static):
             typical=0.04,
             starts=(0.015, 0.05),
             per="segment",
-            of="reach",
+            of="offset",
         ),
     )
     excited_by = "slow crossings of neutral, large bends"
@@ -38,5 +38,5 @@ class Slack(Static):
     synonyms = ("dead_zone",)
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
-        dl, gap = ports.dl, ports.wiring.by_end(values)
-        ports.shift_wires(-np.clip(dl, -gap, gap))
+        dl, gap = ports.dl, ports.routing.by_end(values)
+        ports.shift_tendons(-np.clip(dl, -gap, gap))

@@ -1,8 +1,9 @@
-"""The body gets stiffer (or softer) as it bends, and its wires stretch for it."""
+"""The body gets stiffer (or softer) as it bends, and its tendons stretch for it."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -13,10 +14,10 @@ from fastrod.types import Floats
 
 @effect
 class Stiffening(Static):
-    """The body gets stiffer (or softer) as it bends, and its wires stretch for it.
+    """The body gets stiffer (or softer) as it bends, and its tendons stretch for it.
 
     Equation: theta -> theta (1 - c min(|theta|^2, 2)) in each segment
-    Source: Yeoh 1993, cubic term of a hyperelastic bending moment against wires in series
+    Source: Yeoh 1993, cubic term of a hyperelastic bending moment against tendons in series
     Residual signature: odd and cubic in the bend, static
     """
 
@@ -28,6 +29,10 @@ class Stiffening(Static):
     excited_by = "bends of many amplitudes up to 60 degrees and more"
     confounded_with = ("drum_gain", "slack", "lens")
     synonyms = ("nonlinear_material",)
+    separated_by: ClassVar[Mapping[str, str]] = {
+        "drum_gain": "bends of many amplitudes, to 50 degrees and more",
+        "slack": "bends of many amplitudes, slowly through neutral",
+    }
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         bend = ports.bend()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 from fastrod.effects.base import Parameter, Seam, Static, effect
 from fastrod.effects.ports import EffectPorts
@@ -24,6 +25,9 @@ class StiffnessTaper(Static):
     excited_by = "large bends; a marker at half length"
     confounded_with = ("drum_gain", "tendon_stretch", "marker_offset")
     synonyms = ("taper",)
+    separated_by: ClassVar[Mapping[str, str]] = {
+        "drum_gain": "bends to 50 degrees and more, or a marker at half length"
+    }
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         ports.resolve()

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 
-from fastrod.effects.base import Parameter, Seam, Static, effect
+from fastrod.effects.base import Parameter, Seam, Signal, Static, effect
 from fastrod.effects.ports import EffectPorts
 from fastrod.types import Floats
 
@@ -37,7 +38,12 @@ class Temperature(Static):
     excited_by = "the first block of motion repeated at the end"
     confounded_with = ("time_drift", "creep", "drum_gain")
     synonyms = ("warm_up",)
+    separated_by: ClassVar[Mapping[str, str]] = {
+        "drum_gain": "the first block of motion once more after some minutes",
+        "time_drift": "the first block of motion and a rest once more after some minutes",
+    }
+    signal = Signal.TIME
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         warm = values[:, 0] * (1.0 - np.exp(-ports.time / values[:, 1]))
-        ports.shift_wires(warm[:, None] * ports.dl)
+        ports.shift_tendons(warm[:, None] * ports.dl)

@@ -1,8 +1,9 @@
-"""Wires stretch under tension."""
+"""Tendons stretch under tension."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 from fastrod.effects.base import Parameter, Seam, Static, effect
 from fastrod.effects.ports import EffectPorts
@@ -11,7 +12,7 @@ from fastrod.types import Floats
 
 @effect
 class TendonStretch(Static):
-    """Wires stretch under tension.
+    """Tendons stretch under tension.
 
     Equation: l_i = L_i + (c_i + c) T_i
     Source: Oliver-Butler, Till and Rucker 2019
@@ -26,6 +27,10 @@ class TendonStretch(Static):
     excited_by = "a known load of 50 to 100 g on and off"
     confounded_with = ("drum_gain", "stiffness_taper")
     synonyms = ("tendon_compliance", "wire_stretch")
+    separated_by: ClassVar[Mapping[str, str]] = {
+        "drum_gain": "a known mass of 50 to 100 g at the tip on and off: only stretch gives way to it",
+        "stiffness_taper": "a known mass of 50 to 100 g at the tip on and off",
+    }
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
-        ports.compliance += ports.wiring.by_end(values)
+        ports.compliance += ports.routing.by_end(values)

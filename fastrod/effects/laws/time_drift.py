@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from fastrod.effects.base import Parameter, Seam, Static, effect
+from fastrod.effects.base import Parameter, Seam, Signal, Static, effect
 from fastrod.effects.ports import EffectPorts
 from fastrod.types import Floats
 
@@ -28,6 +28,7 @@ class TimeDrift(Static):
     excited_by = "the first block of motion repeated at the end; rest poses revisited"
     confounded_with = ("creep", "temperature", "plastic_set")
     synonyms = ("drift",)
+    signal = Signal.TIME
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         shift = values * ports.time[:, None]

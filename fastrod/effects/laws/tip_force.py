@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fastrod.effects.base import Parameter, Seam, Static, effect
+from fastrod.effects.base import Parameter, Seam, Signal, Static, effect
 from fastrod.effects.ports import EffectPorts
 from fastrod.types import Floats
 
@@ -30,6 +30,7 @@ class TipForce(Static):
     excited_by = "wide bends in two base orientations"
     confounded_with = ("gravity", "payload", "stiffness_taper", "frame_misalignment")
     synonyms = ("external_force",)
+    signal = Signal.FORCE
 
     def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
         ports.tip_force += np.einsum("nij,nj->ni", ports.base_rotation, values)

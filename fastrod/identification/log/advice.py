@@ -6,55 +6,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fastrod.effects.base import get_effect
+from fastrod.effects.base import get_effect, trait
 from fastrod.identification.log.forward import LogSamples
 from fastrod.identification.log.noise import at_rest
 from fastrod.model.robot import Robot
 from fastrod.types import Floats
 
-_SEPARATES: dict[frozenset[str], str] = {
-    frozenset(pair.split("/")): run
-    for pair, run in {
-        "friction/backlash": "reversals of many sizes, slowly, the smallest below three gaps: backlash is "
-        "as wide at every bend",
-        "friction/creep": "holds of 4 s and more after steps, and the same loop at two speeds: friction "
-        "stays, creep decays",
-        "friction/plastic_set": "small loops after a large one: friction shows in each, a set only after a "
-        "new extreme",
-        "backlash/slack": "reversals away from neutral: backlash shows there, slack only around neutral",
-        "latency/dynamics": "fast and slow motion with sudden stops, beyond 50 degrees: only dynamics ring",
-        "latency/creep": "stops and holds: a delay is over after the delay",
-        "creep/dynamics": "holds of 4 s and more",
-        "creep/time_drift": "the first block of motion once more at the end",
-        "gravity/payload": "a known mass of 50 g at the tip on and off; or weigh what hangs there",
-        "gravity/precurvature": "a second base orientation, turned by 90 degrees",
-        "gravity/frame_misalignment": "a second base orientation, turned by 90 degrees",
-        "gravity/tip_force": "a second base orientation, turned by 90 degrees",
-        "payload/tip_force": "a second base orientation, turned by 90 degrees",
-        "precurvature/frame_misalignment": "the free shape with slack wires, or a marker at half length: "
-        "the tip cannot tell",
-        "precurvature/encoder_offset": "wide bends with the tip's orientation measured",
-        "precurvature/marker_offset": "wide bends with the tip's orientation measured",
-        "tendon_stretch/drum_gain": "a known mass of 50 to 100 g at the tip on and off: only stretch gives "
-        "way to it",
-        "tendon_stretch/stiffness_taper": "a known mass of 50 to 100 g at the tip on and off",
-        "stiffness_taper/drum_gain": "bends to 50 degrees and more, or a marker at half length",
-        "stiffening/drum_gain": "bends of many amplitudes, to 50 degrees and more",
-        "stiffening/slack": "bends of many amplitudes, slowly through neutral",
-        "axial_compression/marker_offset": "bends to 50 degrees and more, or all wires pulled together",
-        "axial_compression/stiffening": "bends to 50 degrees and more, or all wires pulled together",
-        "temperature/drum_gain": "the first block of motion once more after some minutes",
-        "temperature/time_drift": "the first block of motion and a rest once more after some minutes",
-        "coupling/encoder_offset": "one segment moved alone, then the other",
-    }.items()
-}
-
 
 def separating_run(one: str, other: str) -> str:
     """Which run would tell two effects apart."""
-    run = _SEPARATES.get(frozenset((one, other)))
+    first, second = get_effect(one), get_effect(other)
+    run = trait(first, "separated_by").get(other) or trait(second, "separated_by").get(one)
     if run is None:
-        both = [getattr(get_effect(name), "excited_by", "") for name in (one, other)]
+        both = [trait(what, "excited_by") for what in (first, second)]
         run = (
             "; ".join(dict.fromkeys(text for text in both if text))
             or "motion over the whole workspace at two speeds, with holds"

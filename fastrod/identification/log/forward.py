@@ -75,9 +75,9 @@ def sample(log: RunLog, rows: Ints | None = None) -> LogSamples:
     ends = [*starts[1:].tolist(), len(ordered)]
     runs = tuple(slice(int(a), b) for a, b in zip(starts, ends, strict=True))
     time, dt = np.empty(len(ordered)), np.zeros(len(ordered))
-    for part in runs:
-        time[part] = ordered.t[part] - ordered.t[part.start]
-        dt[part.start + 1 : part.stop] = np.diff(ordered.t[part])
+    for span in runs:
+        time[span] = ordered.t[span] - ordered.t[span.start]
+        dt[span.start + 1 : span.stop] = np.diff(ordered.t[span])
     measured = np.flatnonzero(ordered.measured) if rows is None else rows
     return LogSamples(ordered, order, measured, runs, time, dt)
 
@@ -116,7 +116,7 @@ class PredictedRod:
             ports, params, self._tolerance, None if rows is None or rows.all() else np.flatnonzero(rows)
         )
         self.cost += float(np.where(state.passes < 0, _LOST, state.passes).mean())
-        turn = matrix_from_quaternion(np.broadcast_to(ports.base_pose, (len(state.ok), 7))[:, 3:])
+        rotation = matrix_from_quaternion(np.broadcast_to(ports.base_pose, (len(state.ok), 7))[:, 3:])
         origin = ports.base_pose[:, :3]
         points = np.zeros((len(state.ok), 0, 3))
         if self.points:
@@ -127,9 +127,9 @@ class PredictedRod:
                 - origin[:, None]
             )
         return PredictedPose(
-            np.einsum("nji,nj->ni", turn, state.tip_position - origin),
-            np.swapaxes(turn, 1, 2) @ state.tip_rotation,
-            np.einsum("nji,nkj->nki", turn, points),
+            np.einsum("nji,nj->ni", rotation, state.tip_position - origin),
+            np.swapaxes(rotation, 1, 2) @ state.tip_rotation,
+            np.einsum("nji,nkj->nki", rotation, points),
             state.ok,
         )
 
@@ -176,47 +176,47 @@ class PreparedLog:
             n_steps=N_STEPS,
         )
 
-    def wires(self, chain: list[tuple[Effect, Floats]]) -> Floats | None:
-        """(n_rows, n_tendons) change of wire length [m] after the effects of `chain` up to the last one with
-        a memory, over every sample; None where none has a memory."""
-        last = max((i for i, (what, _) in enumerate(chain) if has_memory(what)), default=-1)
+    def tendon_changes(self, effects: list[tuple[Effect, Floats]]) -> Floats | None:
+        """(n_rows, n_tendons) change of wire length [m] after the effects of `effects` up to the last one
+        with a memory, over every sample; None where none has a memory."""
+        last = max((i for i, (what, _) in enumerate(effects) if has_memory(what)), default=-1)
         if last < 0:
             return None
         samples, n = self.samples, len(self.dl)
         opened = self._open(
             self._alone(self.dl + self.robot.rest_tendon_length), n, samples.time, self.base_rotation[:1]
         )
-        for what, values in chain[: last + 1]:
+        for what, values in effects[: last + 1]:
             if not has_memory(what):
                 what.apply(np.broadcast_to(values, (n, len(values))), np.empty((n, 0)), opened, None, 0.0)
                 continue
             dl = opened.dl
             out = np.empty_like(dl)
-            for part in samples.runs:
+            for span in samples.runs:
                 if hasattr(what, "sweep"):
                     memory = what.memory(1, self.wiring.n_tendons)
-                    out[part] = what.sweep(
-                        values[None], memory, dl[None, part], samples.dt[part], self.wiring
+                    out[span] = what.sweep(
+                        values[None], memory, dl[None, span], samples.dt[span], self.wiring
                     )[0]
                 else:
-                    out[part] = self._step_by_step(what, values, dl[part], part)
-            opened.shift_wires(out - dl)
+                    out[span] = self._step_by_step(what, values, dl[span], span)
+            opened.shift_tendons(out - dl)
         return opened.dl[samples.rows]
 
     def _alone(self, length: Floats) -> Ports:
         """Ports with these wire lengths and nothing else."""
         bare = {
             name: getattr(self.ports, name)[:1]
-            for name in ("extension", "tip_force", "tip_moment", "line_force")
+            for name in ("tension", "base_pose", "extension", "tip_force", "tip_moment", "line_force")
         }
         return self.ports._replace(tendon_length=length, **bare)
 
-    def _step_by_step(self, what: Effect, values: Floats, dl: Floats, part: slice) -> Floats:
+    def _step_by_step(self, what: Effect, values: Floats, dl: Floats, span: slice) -> Floats:
         """An effect with a memory that has no `sweep`, over one run: one sample after the other, slowly."""
         memory = what.memory(1, self.wiring.n_tendons)
         out = np.empty_like(dl)
         for i in range(len(dl)):
-            at = part.start + i
+            at = span.start + i
             one = self._open(
                 self._alone(dl[i : i + 1] + self.robot.rest_tendon_length),
                 1,
@@ -227,9 +227,9 @@ class PreparedLog:
             out[i] = one.dl[0]
         return out
 
-    def drive(self, chain: list[tuple[Effect, Floats]]) -> EffectPorts:
-        """Ports of the rows after the effects of `chain`, but for sensing."""
-        before = [link for link in chain if link[0].seam is Seam.ACTUATION]
+    def drive(self, effects: list[tuple[Effect, Floats]]) -> EffectPorts:
+        """Ports of the rows after the effects of `effects`, but for sensing."""
+        before = [each for each in effects if each[0].seam is Seam.ACTUATION]
         last = max((i for i, (what, _) in enumerate(before) if has_memory(what)), default=-1)
         opened = self.open()
         for what, values in before[: last + 1]:  # for what they change beside the wires' lengths
@@ -241,10 +241,10 @@ class PreparedLog:
                     None,
                     0.0,
                 )
-        wires = self.wires(before)
-        if wires is not None:
-            opened.tendon_length = wires + self.robot.rest_tendon_length
-        rest = before[last + 1 :] + [link for link in chain if link[0].seam in (Seam.MATERIAL, Seam.LOAD)]
+        tendon_changes = self.tendon_changes(before)
+        if tendon_changes is not None:
+            opened.tendon_length = tendon_changes + self.robot.rest_tendon_length
+        rest = before[last + 1 :] + [each for each in effects if each[0].seam in (Seam.MATERIAL, Seam.LOAD)]
         for what, values in rest:
             what.apply(
                 np.broadcast_to(values, (len(opened), len(values))),
@@ -260,12 +260,12 @@ class PreparedLog:
         return close_ports(opened, self.ports, self.params)
 
     def see(
-        self, pose: PredictedPose, chain: list[tuple[Effect, Floats]], opened: EffectPorts | None = None
+        self, pose: PredictedPose, effects: list[tuple[Effect, Floats]], opened: EffectPorts | None = None
     ) -> PredictedPose:
-        """The pose as the camera sees it, by the effects of sensing in `chain`; `opened`: ports that the
+        """The pose as the camera sees it, by the effects of sensing in `effects`; `opened`: ports that the
         others have changed."""
-        links = [link for link in chain if link[0].seam is Seam.SENSING]
-        if not links:
+        sensing = [each for each in effects if each[0].seam is Seam.SENSING]
+        if not sensing:
             return pose
         ports = self.open() if opened is None else opened
         ports.tip_position, ports.tip_rotation, ports.points = (
@@ -273,7 +273,7 @@ class PreparedLog:
             pose.rotation.copy(),
             pose.points.copy(),
         )
-        for what, values in links:
+        for what, values in sensing:
             what.apply(
                 np.broadcast_to(values, (len(ports), len(values))),
                 np.empty((len(ports), 0)),
@@ -284,7 +284,7 @@ class PreparedLog:
         return PredictedPose(ports.tip_position, ports.tip_rotation, ports.points, pose.ok)
 
 
-def bench(samples: LogSamples, robot: Robot, wiring: Routing) -> PreparedLog:
+def prepare_log(samples: LogSamples, robot: Robot, wiring: Routing) -> PreparedLog:
     """The inputs of the rows of `samples` for `robot`."""
     log = samples.log.rows(samples.rows)
     layout, params, rest = compile_robots((replace(robot, effects=()),), N_STEPS)
@@ -304,7 +304,7 @@ def _given(keywords: dict[str, Floats]) -> Inputs:
     return Inputs(**dict[str, Any](keywords))
 
 
-def chain_of(model: Model, theta: Floats) -> list[tuple[Effect, Floats]]:
+def effects_at(model: Model, theta: Floats) -> list[tuple[Effect, Floats]]:
     """The effects of a model at `theta` with their values, in the order in which they act.
 
     Raises `InputError` for a memory beyond the wires: only those are carried over a log.
@@ -322,7 +322,7 @@ def chain_of(model: Model, theta: Floats) -> list[tuple[Effect, Floats]]:
 def predict(model: Model, theta: Floats, samples: LogSamples, rod: PredictedRod) -> PredictedPose:
     """What the camera sees at the rows of `samples`, solved exactly."""
     robot = model.robot_at(theta)
-    place = bench(samples, robot, model.wiring)
-    chain = chain_of(model, theta)
-    pose = rod.solve(*place.kernel(place.drive(chain)), robot)
-    return place.see(pose, chain)
+    place = prepare_log(samples, robot, model.wiring)
+    effects = effects_at(model, theta)
+    pose = rod.solve(*place.kernel(place.drive(effects)), robot)
+    return place.see(pose, effects)

@@ -17,10 +17,10 @@ def limits(robot: Robot, samples: LogSamples) -> list[str]:
     """Sentences on shear and inertia, where this robot is thick or slow enough for them."""
     found = []
     thickest = max((s.body_radius / robot.length for s in robot.segments), default=0.0)
-    if (share := _SHEAR * thickest**2) > _WORTH_SAYING:
+    if (fraction := _SHEAR * thickest**2) > _WORTH_SAYING:
         found.append(
             f"shear is not the rod's: {1.0 / (2.0 * thickest):.1f} times as long as thick, it is some "
-            f"{100 * share:.0f} % of the deflection"
+            f"{100 * fraction:.0f} % of the deflection"
         )
     mass = sum(s.line_density * s.length for s in robot.segments)
     if mass > 0.0:

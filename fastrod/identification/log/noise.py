@@ -64,12 +64,12 @@ def at_rest(samples: LogSamples) -> list[Ints]:
 def read_noise(samples: LogSamples, tip: Floats, residual: Floats) -> Noise:
     """Noise of the measured `tip` (n_rows, 3) [m] from stretches at rest, or from the fastest part of a
     `residual` where the robot never rests."""
-    parts = at_rest(samples)
-    if sum(len(p) for p in parts) >= ENOUGH:
+    pieces = at_rest(samples)
+    if sum(len(p) for p in pieces) >= ENOUGH:
         flat = []
         pairs = np.zeros(2)
         weight = 0.0
-        for rows in parts:
+        for rows in pieces:
             line = np.linspace(-1.0, 1.0, len(rows))[:, None]
             middle = tip[rows] - np.median(tip[rows], axis=0)
             for _ in range(2):  # the drift, of samples that are no outliers
@@ -90,7 +90,7 @@ def read_noise(samples: LogSamples, tip: Floats, residual: Floats) -> Noise:
         lag1 = float(pairs[0] / max(pairs[1], 1e-30))
         if lag1 > _MOVES:  # what moves at rest is no noise: a base that sways
             return Noise(
-                _fast(np.concatenate([np.diff(tip[rows], n=3, axis=0) for rows in parts])),
+                _fast(np.concatenate([np.diff(tip[rows], n=3, axis=0) for rows in pieces])),
                 lag1,
                 f"{len(every)} samples at rest, fast part",
             )
@@ -115,7 +115,7 @@ def keep(samples: LogSamples, residual: Floats, noise: Noise) -> Flags:
     """(n_rows,) rows that are no outliers: Hampel's filter on a residual (n_rows, 3), the same mask for every
     model."""
     good = np.ones(len(residual), bool)
-    run = np.searchsorted([part.start for part in samples.runs], samples.rows, side="right")
+    run = np.searchsorted([span.start for span in samples.runs], samples.rows, side="right")
     for label in np.unique(run):
         rows = np.flatnonzero(run == label)
         if len(rows) < 2 * _WINDOW + 1:

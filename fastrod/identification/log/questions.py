@@ -81,9 +81,9 @@ def questions(log: RunLog, robot: Robot, *, threads: int | None = None) -> tuple
 def read(samples: LogSamples, robot: Robot, *, threads: int | None = None) -> Reading:
     """Look at the rows of `samples`; nothing is fitted but where the camera stands."""
     late = time_question(samples)
-    asked = [late] if late else []
+    questions = [late] if late else []
     look = _Look(samples, robot, threads)
-    nothing = Reading(registration=None, questions=tuple(asked), refusal="", guess="")
+    nothing = Reading(registration=None, questions=tuple(questions), refusal="", guess="")
     frame, far = look.frame, look.frame.is_large(robot.length)
     # a small misalignment is for the search to name
     as_it_is = look.as_it_is if far else min(look.as_it_is, frame.left)
@@ -112,25 +112,25 @@ def read(samples: LogSamples, robot: Robot, *, threads: int | None = None) -> Re
         times = f" {as_it_is / left:.0f} times as closely" if np.isfinite(as_it_is) else ""
         guess = f"The model would follow{times} with {words}."
         if moved:
-            turn = f"{np.degrees(frame.angle):.0f} deg"
+            rotation = f"{np.degrees(frame.angle):.0f} deg"
             guess += (
-                f" A camera turned by {turn} would look the same: if yours is, give [sensor] "
+                f" A camera turned by {rotation} would look the same: if yours is, give [sensor] "
                 "registration_sd in the robot file."
             )
     further = look.centred > _FURTHER * look.motion and not (moved and not guess)
     name = samples.log.name
     refusal = ""
     if further:
-        asked.append(further_than_still(samples, robot, look.scale, guess))
+        questions.append(further_than_still(samples, robot, look.scale, guess))
     elif guess:
-        asked.append(
+        questions.append(
             f"log {name!r} fits robot {robot.name!r} badly. {guess}" + ("" if mirrored else f" {_RIGHT}")
         )
     if mirrored or (guess and further and "times" not in words):
-        refusal = asked[-1]
+        refusal = questions[-1]
     return Reading(
         registration=frame if moved and not guess else None,
-        questions=tuple(asked),
+        questions=tuple(questions),
         refusal=refusal,
         guess=guess,
     )
@@ -186,7 +186,7 @@ class _Look:
             if log.tip_quaternion is None
             else np.isfinite(log.tip_quaternion).all(1)
         )
-        self.turn = (
+        self.rotation = (
             np.eye(3)[None]
             if log.tip_quaternion is None
             else matrix_from_quaternion(np.nan_to_num(log.tip_quaternion, nan=0.5))
@@ -230,18 +230,20 @@ class _Look:
         seen = np.concatenate([self.tip[pose.ok], self.points[both].reshape(-1, 3)])
         made = np.concatenate([pose.position[pose.ok], pose.points[both].reshape(-1, 3)])
         rows = pose.ok & self.turned
-        turns = (
-            self.turn[rows] @ np.swapaxes(pose.rotation[rows], 1, 2) if rows.any() and not mirrored else None
+        rotations = (
+            self.rotation[rows] @ np.swapaxes(pose.rotation[rows], 1, 2)
+            if rows.any() and not mirrored
+            else None
         )
-        found = align(seen, made, turns=turns, lever=_LEVER * self.robot.length, mirrored=mirrored)
+        found = align(seen, made, rotations=rotations, lever=_LEVER * self.robot.length, mirrored=mirrored)
         return replace(found, left=size((self.tip - pose.position @ found.rotation.T - found.shift)[pose.ok]))
 
 
 def _declared(robot: Robot, found: CameraRegistration) -> bool:
     """Whether the robot file's [sensor] allows for a camera that is turned so far."""
     given = robot.sensor.get("registration_sd", 0.0)
-    turn = float(given[1]) if isinstance(given, (tuple, list)) else float(given)
-    return found.angle < 3.0 * turn
+    rotation = float(given[1]) if isinstance(given, (tuple, list)) else float(given)
+    return found.angle < 3.0 * rotation
 
 
 def _other_inputs(samples: LogSamples, robot: Robot, scale: float) -> Iterator[tuple[Floats, str]]:

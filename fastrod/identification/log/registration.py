@@ -93,25 +93,26 @@ def align(
     measured: Floats,
     predicted: Floats,
     *,
-    turns: Floats | None = None,
+    rotations: Floats | None = None,
     lever: float = 0.0,
     mirrored: bool = False,
 ) -> CameraRegistration:
     """The rigid motion from `predicted` to `measured` points (n, 3) [m], robustly (Kabsch 1976, Cauchy
     weights by distance).
 
-    `turns` (m, 3, 3) are measured rotations times the transposes of predicted ones; each counts as points at
+    `rotations` (m, 3, 3) are measured rotations times the transposes of predicted ones; each counts as points
+    at
     `lever` [m]. What the points do not determine, as the rotation about a line of them, stays zero.
     `mirrored`: the best improper rotation instead.
     """
     weight = np.ones(len(measured))
     rotation, shift = np.eye(3), np.zeros(3)
     for _ in range(_ROUNDS):
-        share = weight / weight.sum()
-        middle, aim = share @ predicted, share @ measured
-        spread = np.einsum("n,ni,nj->ij", share, measured - aim, predicted - middle)
-        if turns is not None and len(turns):
-            spread = spread + lever**2 * turns.mean(0)
+        fraction = weight / weight.sum()
+        middle, aim = fraction @ predicted, fraction @ measured
+        spread = np.einsum("n,ni,nj->ij", fraction, measured - aim, predicted - middle)
+        if rotations is not None and len(rotations):
+            spread = spread + lever**2 * rotations.mean(0)
         if not mirrored:
             spread = spread + _PULL * float(np.linalg.norm(spread, 2)) * np.eye(3)
         U, _, V = np.linalg.svd(spread)

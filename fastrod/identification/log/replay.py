@@ -99,9 +99,9 @@ class Replay:
     @property
     def run_rms(self) -> dict[str, float]:
         """`rms` of each run that has compared rows [m]."""
-        return {label: part.rms for label, part in self.parts() if part.compared.any()}
+        return {label: piece.rms for label, piece in self.pieces() if piece.compared.any()}
 
-    def parts(self) -> Iterator[tuple[str, Replay]]:
+    def pieces(self) -> Iterator[tuple[str, Replay]]:
         """Each run's label and its part of this replay."""
         for label in self.log.runs:
             yield label, self.rows(self.log.run == label)
@@ -137,15 +137,15 @@ def replay(
             f"log {log.name!r} has no row in which every input and the tip are there; there is "
             "nothing to compare."
         )
-    asked: tuple[str, ...] = ()
+    open_questions: tuple[str, ...] = ()
     if simulator is None:
         # these load numba, which no other command line word needs
         from fastrod.identification.log.questions import questions
         from fastrod.simulator import Simulator
 
-        asked = questions(log, robot)
+        open_questions = questions(log, robot)
         if robot.effects:
-            return _with_effects(log, robot, progress, asked)
+            return _with_effects(log, robot, progress, open_questions)
         simulator = Simulator
     n_points = 0 if log.points is None else len(robot.log_points)
     tip, points, converged = (
@@ -166,11 +166,11 @@ def replay(
         tip_position=tip,
         converged=converged,
         points=points if n_points else None,
-        questions=asked,
+        questions=open_questions,
     )
 
 
-def _with_effects(log: RunLog, robot: Robot, progress: Progress | None, asked: tuple[str, ...]) -> Replay:
+def _with_effects(log: RunLog, robot: Robot, progress: Progress | None, questions: tuple[str, ...]) -> Replay:
     from fastrod.identification.log.forward import PredictedRod, predict, sample  # they load numba
     from fastrod.identification.log.unknowns import known_model
 
@@ -182,19 +182,19 @@ def _with_effects(log: RunLog, robot: Robot, progress: Progress | None, asked: t
         np.zeros(len(log), dtype=np.bool_),
     )
     for start in range(0, len(samples.log), CHUNK):
-        part = samples.on(np.arange(start, min(start + CHUNK, len(samples.log))))
-        pose = predict(model, np.zeros(0), part, PredictedRod(part, robot, points=n_points > 0))
-        rows = samples.origin[part.rows[pose.ok]]
+        piece = samples.on(np.arange(start, min(start + CHUNK, len(samples.log))))
+        pose = predict(model, np.zeros(0), piece, PredictedRod(piece, robot, points=n_points > 0))
+        rows = samples.origin[piece.rows[pose.ok]]
         tip[rows], points[rows], converged[rows] = pose.position[pose.ok], pose.points[pose.ok], True
         if progress is not None:
-            progress(part.rows[-1] + 1, len(samples.log))
+            progress(piece.rows[-1] + 1, len(samples.log))
     return Replay(
         log=log,
         robot=robot,
         tip_position=tip,
         converged=converged,
         points=points if n_points else None,
-        questions=asked,
+        questions=questions,
     )
 
 
@@ -216,12 +216,12 @@ def write(result: Replay, out_dir: str | Path) -> list[Path]:
     """Write residuals.csv and replay.png into `out_dir`, each whole or not at all; the paths written."""
     out = make_folder(out_dir)
     residuals, picture = out / "residuals.csv", out / "replay.png"
-    part = residuals.with_name("residuals.csv.part")
-    _write_residuals(result, part)
-    part.replace(residuals)
-    part = picture.with_name("replay.png.part")
-    draw(result).savefig(part, format="png", dpi=130)
-    part.replace(picture)
+    piece = residuals.with_name("residuals.csv.part")
+    _write_residuals(result, piece)
+    piece.replace(residuals)
+    piece = picture.with_name("replay.png.part")
+    draw(result).savefig(piece, format="png", dpi=130)
+    piece.replace(picture)
     return [residuals, picture]
 
 
@@ -242,11 +242,11 @@ def table(result: Replay) -> Table:
     )
     for name in ("run", "rms x", "rms y", "rms z", "rms", "max", "excursion", "converged"):
         grid.add_column(name, justify="left" if name == "run" else "right")
-    parts = list(result.parts())
-    for label, part in parts[:_MOST_RUNS] if len(parts) > 1 else []:
-        grid.add_row(escape(label or "-"), *_cells(part))
-    if len(parts) > _MOST_RUNS:
-        grid.add_row(f"... {len(parts) - _MOST_RUNS} more runs")
+    pieces = list(result.pieces())
+    for label, piece in pieces[:_MOST_RUNS] if len(pieces) > 1 else []:
+        grid.add_row(escape(label or "-"), *_cells(piece))
+    if len(pieces) > _MOST_RUNS:
+        grid.add_row(f"... {len(pieces) - _MOST_RUNS} more runs")
     grid.add_row("all", *_cells(result), style="bold")
     grid.caption = (
         f"{_MEANING}; rms, max of its length\nexcursion: measured tip from its own mean; {_NONE} "
@@ -277,16 +277,16 @@ def draw(result: Replay) -> Figure:
     _path(places[1], shown, (0, 1))
     _spread(places[2], shown)
     right.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=2, frameon=False)
-    share = f", {1e2 * result.rms / result.excursion_rms:.0f} % of the excursion" if _moves(result) else ""
+    fraction = f", {1e2 * result.rms / result.excursion_rms:.0f} % of the excursion" if _moves(result) else ""
     figure.suptitle(
-        f"{result.log.name} on {result.robot.name}: tip error {1e3 * result.rms:.3g} mm rms{share}",
+        f"{result.log.name} on {result.robot.name}: tip error {1e3 * result.rms:.3g} mm rms{fraction}",
         x=0.01,
         ha="left",
         fontweight="bold",
     )
     rows = f"{int(result.compared.sum())} of {len(result.log)} rows compared; only measured rows are drawn"
     rows += (
-        f"; a band spans the least to the greatest of {_stride(shown.log, _BINS)} rows"
+        f"; a band spans the least to the greatest of {_every(shown.log, _BINS)} rows"
         if len(shown.log) > DENSE
         else ""
     )
@@ -332,18 +332,22 @@ def _rms(vectors: Floats) -> float:
     return math.sqrt(float(np.mean(np.sum(vectors**2, axis=-1)))) if len(vectors) else math.nan
 
 
-def _cells(part: Replay) -> list[str]:
-    converged = f"{int(part.compared.sum())}/{int(part.log.measured.sum())}"
-    if not part.compared.any():
+def _cells(piece: Replay) -> list[str]:
+    converged = f"{int(piece.compared.sum())}/{int(piece.log.measured.sum())}"
+    if not piece.compared.any():
         return ["-"] * 6 + [converged]
-    excursion = f"{1e3 * part.excursion_rms:.2f}" if _moves(part) else _NONE
-    return [*(f"{1e3 * length:.2f}" for length in (*part.axis_rms, part.rms, part.max)), excursion, converged]
+    excursion = f"{1e3 * piece.excursion_rms:.2f}" if _moves(piece) else _NONE
+    return [
+        *(f"{1e3 * length:.2f}" for length in (*piece.axis_rms, piece.rms, piece.max)),
+        excursion,
+        converged,
+    ]
 
 
-def _moves(part: Replay) -> bool:
+def _moves(piece: Replay) -> bool:
     """Whether the measured tip moves by at least the rms of its residual; otherwise a share of the excursion
     says nothing."""
-    return part.excursion_rms > 0.0 and part.excursion_rms >= part.rms
+    return piece.excursion_rms > 0.0 and piece.excursion_rms >= piece.rms
 
 
 def _write_residuals(result: Replay, path: Path) -> None:
@@ -399,7 +403,7 @@ def _over_time(panels: list[Axes], shown: Replay) -> None:
     """x, y, z of both tips and their distance [mm] over time [s], one panel each."""
     time, breaks = _timeline(shown.log)
     gaps = _gaps(time, breaks)
-    curve = partial(_band, stride=_stride(shown.log, _BINS)) if len(time) > DENSE else _line
+    curve = partial(_band, every=_every(shown.log, _BINS)) if len(time) > DENSE else _line
     for k, axis in enumerate("xyz"):
         curve(
             panels[k],
@@ -451,11 +455,11 @@ def _band(
     colour: str,
     width: float,
     label: str,
-    stride: int,
+    every: int,
 ) -> None:
-    """The least and the greatest of each `stride` rows, none across a gap, filled between; edges half as wide
+    """The least and the greatest of each `every` rows, none across a gap, filled between; edges half as wide
     as a line's `width`."""
-    starts = np.union1d(np.arange(0, len(time), stride), gaps)
+    starts = np.union1d(np.arange(0, len(time), every), gaps)
     breaks = np.searchsorted(starts, gaps)
     ends = np.append(starts[1:], len(time)) - 1
     x = np.stack([time[starts], time[ends]], axis=1).ravel()
@@ -473,9 +477,9 @@ def _band(
     )
 
 
-def _stride(log: RunLog, parts: int) -> int:
-    """Rows of each of at most `parts` equal parts of the log."""
-    return math.ceil(len(log) / parts)
+def _every(log: RunLog, pieces: int) -> int:
+    """Rows of each of at most `pieces` equal parts of the log."""
+    return math.ceil(len(log) / pieces)
 
 
 def _path(axes: Axes, shown: Replay, plane: tuple[int, int]) -> None:
@@ -484,7 +488,7 @@ def _path(axes: Axes, shown: Replay, plane: tuple[int, int]) -> None:
     a, b = plane
     tips = [1e3 * shown.tip_position[:, plane], 1e3 * shown.log.tip_position[:, plane]]
     if len(shown.log) > DENSE:
-        step = _stride(shown.log, DENSE)
+        step = _every(shown.log, DENSE)
         points = np.stack([tip[::step] for tip in tips], axis=1).reshape(-1, 2)
         colours = np.tile(np.array([_PREDICTED, _MEASURED]), len(points) // 2)
         axes.scatter(points[:, 0], points[:, 1], c=colours.tolist(), s=1.6, lw=0.0, alpha=0.8)

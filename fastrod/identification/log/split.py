@@ -36,14 +36,17 @@ def merged(logs: Sequence[RunLog]) -> RunLog:
     optional = ("ext", "tip_quaternion", "points", "tip_force", "payload", "base_quaternion")
     columns: dict[str, Any] = {}
     for name in optional:
-        parts = [getattr(log, name) for log in logs]
-        have = [part is not None for part in parts]
+        pieces = [getattr(log, name) for log in logs]
+        have = [span is not None for span in pieces]
         if all(have):
-            columns[name] = np.concatenate(parts)
+            columns[name] = np.concatenate(pieces)
         elif any(have) and name in ("payload", "tip_force"):
             width = () if name == "payload" else (3,)
             columns[name] = np.concatenate(
-                [np.zeros((len(log), *width)) if p is None else p for p, log in zip(parts, logs, strict=True)]
+                [
+                    np.zeros((len(log), *width)) if p is None else p
+                    for p, log in zip(pieces, logs, strict=True)
+                ]
             )
         elif any(have):
             has, lacks = (logs[have.index(flag)].name for flag in (True, False))
@@ -72,9 +75,9 @@ def held_out_rows(samples: LogSamples, held_out: Sequence[str]) -> tuple[Flags, 
     log = samples.log
     mask = np.zeros(len(log), bool)
     if not held_out:
-        for part in samples.runs:
-            n = part.stop - part.start
-            mask[part] = (np.arange(n) * _STRETCHES // n) % 4 == 2
+        for span in samples.runs:
+            n = span.stop - span.start
+            mask[span] = (np.arange(n) * _STRETCHES // n) % 4 == 2
         return mask, [f"every fourth of {_STRETCHES} stretches of each run"]
     for text in map(str, held_out):  # numpy's words quote as np.str_(...)
         label, _, window = text.partition("@")
@@ -97,8 +100,8 @@ def held_out_rows(samples: LogSamples, held_out: Sequence[str]) -> tuple[Flags, 
                     f"for example {label}@90:150."
                 )
             start, end = (
-                float(part) if part else edge
-                for part, edge in zip(match.groups(), (-np.inf, np.inf), strict=True)
+                float(span) if span else edge
+                for span, edge in zip(match.groups(), (-np.inf, np.inf), strict=True)
             )
             rows = rows & (samples.time >= start) & (samples.time < end)
         if not rows.any():

@@ -146,9 +146,9 @@ class Model:
             at = 0
             for parameter in get_effect(name).parameters:
                 count = self.wiring.count(parameter.per)
-                part = [float(v) for v in values[at : at + count]]
+                group = [float(v) for v in values[at : at + count]]
                 at += count
-                table[parameter.name] = part[0] if len(set(part)) == 1 else part
+                table[parameter.name] = group[0] if len(set(group)) == 1 else group
             tables.append(table)
         return replace(self.robot_at(theta), effects=tuple(tables), fit={}, sensor={})
 
@@ -332,22 +332,22 @@ def _drive_unknowns(
 
 def _pair(registration: Any) -> tuple[float, float]:
     """Shift [m] and rotation [rad] of `registration_sd`; one number stands for both."""
-    shift, turn = registration if isinstance(registration, (tuple, list)) else (registration, registration)
-    return float(shift), float(turn)
+    shift, angle = registration if isinstance(registration, (tuple, list)) else (registration, registration)
+    return float(shift), float(angle)
 
 
 def _wider(given: Any, least: tuple[float, float]) -> tuple[float, float]:
-    shift, turn = _pair(given)
-    return max(shift, least[0]), max(turn, least[1])
+    shift, angle = _pair(given)
+    return max(shift, least[0]), max(angle, least[1])
 
 
 def _camera(sensor: Mapping[str, Any], robot: Robot, wiring: Routing) -> list[Unknown]:
     """The camera's unknowns, about where the effects of the robot file have it."""
     made: list[Unknown] = []
     known = named_effects(robot)
-    shift, turn = _pair(sensor.get("registration_sd", 0.0))
+    shift, angle = _pair(sensor.get("registration_sd", 0.0))
     for names, sd, effect_name in (
-        ([f"rotation_{a}" for a in "xyz"], turn, "frame_misalignment"),
+        ([f"rotation_{a}" for a in "xyz"], angle, "frame_misalignment"),
         ([f"shift_{a}" for a in "xyz"], shift, "frame_misalignment"),
         (["x", "y", "z"], float(sensor.get("marker_offset_sd", 0.0)), "marker_offset"),
         (["delay"], float(sensor.get("latency_sd", 0.0)), "latency"),

@@ -15,10 +15,10 @@ from fastrod.identification.log.limits import limits
 from fastrod.identification.log.noise import keep
 from fastrod.identification.log.unknowns import Model
 from fastrod.identification.report.result import Error, Found, Result, SearchStage, Tried
-from fastrod.identification.report.verdict import judge
+from fastrod.identification.report.verdict import choose_verdict
 from fastrod.identification.search.base import SEEN, BaseFit, rms
 from fastrod.identification.search.model_selection import ModelState, SearchStep
-from fastrod.identification.search.residual_test import audit
+from fastrod.identification.search.residual_test import residual_structure
 from fastrod.identification.search.search import Search
 from fastrod.identification.search.solve import Estimate, covariance
 from fastrod.model.robot import Robot
@@ -52,7 +52,7 @@ def assemble(
     """The result of a search: `start` without effects, `state` with those `found`, `last` with foils too.
     What was found is fitted again to the training `rows`, of which the search saw a part."""
     robot = base.robot
-    inspected = audit(search.samples, last.model.wiring, last.fit.residual, base.noise.lag1)
+    inspected = residual_structure(search.samples, last.model.wiring, last.fit.residual, base.noise.lag1)
     squares = {"base": _square(start, base.weights[0]), "library": _square(state, base.target.sigma)}
     squares["after"] = min(squares["library"], _square(last, last_sigma))
     order = np.argsort([-_own(state, name) for name in found]) if len(found) > 1 else range(len(found))
@@ -78,16 +78,16 @@ def assemble(
     train_error = _error(samples, before, after, used)
     test_error = _error(samples, before, after, test)
     path = _path(start, state, found, samples, robot, used, test, search, threads)
-    opinion = judge(
+    grounds = choose_verdict(
         **squares,
         left_out=max(0.0, test_error.after**2 - _SURE * base.noise.floor**2)
         / max(test_error.before**2 - base.noise.floor**2, 1e-30),
         floor=base.noise.floor**2,
-        audit=inspected,
+        structure=inspected,
         steps=steps,
         found=found,
     )
-    kept = [] if opinion.drop_effects else found
+    kept = [] if grounds.drop_effects else found
     final = state if kept else start
     if not kept:
         after = before
@@ -103,7 +103,7 @@ def assemble(
         if wiring.n_tendons
         else []
     )
-    recommended = [advice.look_at(pattern) for pattern in opinion.patterns]
+    recommended = [advice.look_at(pattern) for pattern in grounds.patterns]
     recommended += [advice.separating_run(e.name, other) for e in effects for other in e.cannot_be_told_from]
     base_estimates = {name: e for name, e in estimates.items() if name.partition(".")[0] not in kept} | fixed
     return Result(
@@ -121,14 +121,14 @@ def assemble(
         train=train_error,
         test=test_error,
         verdict="ambiguous"
-        if opinion.verdict == "explained" and effects and effects[0].cannot_be_told_from
-        else opinion.verdict,
+        if grounds.verdict == "explained" and effects and effects[0].cannot_be_told_from
+        else grounds.verdict,
         summary=" ".join(
             [
-                opinion.summary,
+                grounds.summary,
                 *(
                     _sentences(limits(robot, samples))
-                    if opinion.left > _SAY_LIMITS or not robot.n_tendons
+                    if grounds.left > _SAY_LIMITS or not robot.n_tendons
                     else []
                 ),
             ]
@@ -137,9 +137,9 @@ def assemble(
         base_parameters=base_estimates,
         correlation=correlation,
         remaining=inspected,
-        remaining_kind=opinion.kind,
-        remaining_share=opinion.left,
-        patterns=opinion.patterns,
+        remaining_kind=grounds.kind,
+        remaining_fraction=grounds.left,
+        patterns=grounds.patterns,
         tried=_tried(steps[0], kept, base) if steps else [],
         path=path,
         bounds=search.bounds(final),
@@ -154,10 +154,10 @@ def _nearer(
 ) -> ModelState:
     """The state whose prediction is nearer at the rows: a fit that goes by slopes can leave the valley where
     a load makes the rod snap."""
-    part = samples.on(rows)
+    piece = samples.on(rows)
 
     def off(state: ModelState) -> float:
-        pose = predict(state.model, state.theta, part, PredictedRod(part, robot, threads=threads))
+        pose = predict(state.model, state.theta, piece, PredictedRod(piece, robot, threads=threads))
         error = np.linalg.norm(np.asarray(samples.log.tip_position)[rows] - pose.position, axis=1)
         return float(
             np.mean(np.where(pose.ok, np.minimum(error, _FAR * robot.length), _FAR * robot.length) ** 2)
@@ -179,7 +179,7 @@ def _own(state: ModelState, name: str) -> float:
     for j, unknown in enumerate(state.model.unknowns):
         if unknown.place[:2] == ("effect", name) and not unknown.shape:
             theta[j] = unknown.mean
-    with_it, without = (state.local.residual(state.model, at) for at in (state.theta, theta))
+    with_it, without = (state.linearised.residual(state.model, at) for at in (state.theta, theta))
     return float(((with_it - without) ** 2).sum())
 
 
@@ -195,7 +195,7 @@ def _effect(
         key.partition(".")[2]: value for key, value in estimates.items() if key.partition(".")[0] == name
     }
     taken = next((s.taken for s in steps if s.taken is not None and s.taken.name == name), None)
-    evidence = {} if taken is None else {"z": taken.z, "bic": taken.bic_gain, "loss_share": taken.share}
+    evidence = {} if taken is None else {"z": taken.z, "bic": taken.bic_gain, "loss_share": taken.fraction}
     at = next(i for i, stage in enumerate(path) if stage.name == name)
     excess = max(path[0].held_out ** 2 - floor**2, 1e-18)
     gain = (path[at - 1].held_out ** 2 - path[at].held_out ** 2) / excess
@@ -235,7 +235,7 @@ def _tried(step: SearchStep, kept: list[str], base: BaseFit) -> list[Tried]:
                 bic_gain=c.bic_gain,
                 kept=c.name in kept,
                 why="kept" if c.name in kept else c.why or "another explains more",
-                kind=c.foil.kind if c.foil else "effect",
+                kind=c.alternative.kind if c.alternative else "effect",
             )
         )
     return made
@@ -272,8 +272,8 @@ def _everywhere(
     tip = np.full((len(samples.log), 3), np.nan)
     for start in range(0, len(tip), ALL_AT_ONCE):
         rows = np.arange(start, min(start + ALL_AT_ONCE, len(tip)))
-        part = samples.on(rows)
-        pose = predict(model, theta, part, PredictedRod(part, robot, threads=threads))
+        piece = samples.on(rows)
+        pose = predict(model, theta, piece, PredictedRod(piece, robot, threads=threads))
         tip[rows] = np.where(pose.ok[:, None], pose.position, np.nan)
     return tip
 
@@ -295,9 +295,9 @@ def _interval(samples: LogSamples, predicted: Floats, which: Flags) -> tuple[flo
     squares = _distance(samples, predicted, which)
     if len(squares) < 20:
         return float("nan"), float("nan")
-    parts = [b.mean() for b in np.array_split(squares, min(20, len(squares) // 5))]
+    means_of_blocks = [b.mean() for b in np.array_split(squares, min(20, len(squares) // 5))]
     rng = np.random.default_rng(0)
-    means = rng.choice(parts, (2000, len(parts))).mean(1)
+    means = rng.choice(means_of_blocks, (2000, len(means_of_blocks))).mean(1)
     low, high = np.sqrt(np.quantile(means, [0.025, 0.975]))
     return float(low), float(high)
 
@@ -325,10 +325,10 @@ def _path(
 
     stages = [stage("base", start)]
     for i in range(1, len(found) + 1):
-        part = state
+        piece = state
         for name in found[i:]:
-            part = search.without(part, name)
-        stages.append(stage(found[i - 1], part))
+            piece = search.without(piece, name)
+        stages.append(stage(found[i - 1], piece))
     return stages
 
 

@@ -162,9 +162,9 @@ def against_signal(view: SignalView, result: Result, name: str) -> str:
     held = result.tested[view.rows]
     panels = [("before", BEFORE, view.before), ("after", AFTER, view.after)]
     panels = panels if result.effects else [("base model", BEFORE, view.before)]
-    reach = 1.08 * 1e3 * float(np.quantile(np.abs(view.before), 0.998)) or 1.0
+    limit = 1.08 * 1e3 * float(np.quantile(np.abs(view.before), 0.998)) or 1.0
     sigma = 1e3 * float(np.sqrt(np.mean(result.noise.sigma**2)))
-    reach = max(reach, 3.5 * sigma)
+    limit = max(limit, 3.5 * sigma)
     with _figure(name, 3.7) as (figure, out):
         grid = np.atleast_1d(figure.subplots(1, len(panels), sharex=True, sharey=True))
         for axes, (title, colour, values) in zip(grid, panels, strict=True):
@@ -173,7 +173,7 @@ def against_signal(view: SignalView, result: Result, name: str) -> str:
                 axes.axhline(level, color=NOISE, ls="--", lw=1.0)
             (_loops if view.connected else _cloud)(axes, view, 1e3 * values, held, colour)
             axes.axhline(0.0, color="#9ca3af", lw=0.7)
-            axes.set(title=title, xlabel=view.signal_label, ylim=(-reach, reach))
+            axes.set(title=title, xlabel=view.signal_label, ylim=(-limit, limit))
         grid[0].set_ylabel(f"{view.residual_label} [mm]")
     return out()
 
@@ -231,9 +231,9 @@ def added(result: Result) -> str:
                     alpha=alpha,
                     label=label if i == 1 else "",
                 )
-            share = (stages[0].held_out ** 2 - stage.held_out**2) / excess if excess > 0.0 else 0.0
+            fraction = (stages[0].held_out ** 2 - stage.held_out**2) / excess if excess > 0.0 else 0.0
             text = f" {millimetres(stage.held_out)} mm" + (
-                f",  {min(100.0, 100.0 * share):.0f} % explained" if i and excess > 0.0 else ""
+                f",  {min(100.0, 100.0 * fraction):.0f} % explained" if i and excess > 0.0 else ""
             )
             axes.text(
                 1e3 * max(np.nan_to_num(stage.held_out), floor) + 0.006 * widest,
@@ -328,7 +328,7 @@ def _figure(name: str, height: float, width: float = _WIDE) -> Iterator[tuple[Fi
     written.append(_inline(file.getvalue(), name, width / _WIDE))
 
 
-def _inline(svg: str, name: str, share: float) -> str:
+def _inline(svg: str, name: str, fraction: float) -> str:
     """An SVG file as an element of a page: no header, no addresses, its own ids."""
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
@@ -337,7 +337,7 @@ def _inline(svg: str, name: str, share: float) -> str:
     svg = re.sub(r"url\(#", f"url(#{name}-", svg)
     svg = re.sub(r'href="#', f'href="#{name}-', svg)
     svg = re.sub(r'(?<=href="data:image/png;base64,)[^"]*', _small, svg)
-    head = rf'<svg viewBox="\1" role="img" aria-label="{name}" style="--share:{share:.3f}">'
+    head = rf'<svg viewBox="\1" role="img" aria-label="{name}" style="--share:{fraction:.3f}">'
     return re.sub(r'<svg [^>]*?viewBox="([^"]*)"[^>]*>', head, svg, count=1)
 
 
@@ -362,10 +362,10 @@ def _cloud(axes: Axes, view: SignalView, values: Floats, held: Flags, colour: st
     """Points, the held-out ones dark; and the mean over the signal."""
     rows = np.arange(len(values))[:: max(1, -(-len(values) // _MOST))]
     for which, alpha in ((~held[rows], 0.22), (held[rows], 0.75)):
-        part = rows[which]
+        span = rows[which]
         axes.scatter(
-            view.signal[part],
-            values[part],
+            view.signal[span],
+            values[span],
             s=6.0,
             c=colour,
             alpha=alpha,
@@ -452,10 +452,10 @@ def _worst_stretch(result: Result, signals: Signals) -> Ints:
     best: tuple[float, Ints] | None = None
     for start, end in _stretches(held):
         for run in np.unique(signals.run[start : end + 1]):
-            part = np.arange(start, end + 1)[signals.run[start : end + 1] == run]
-            first = signals.time[part[0]]
-            for k in np.unique(((signals.time[part] - first) // _CLOSE_UP).astype(int)):
-                piece = part[((signals.time[part] - first) // _CLOSE_UP).astype(int) == k]
+            span = np.arange(start, end + 1)[signals.run[start : end + 1] == run]
+            first = signals.time[span[0]]
+            for k in np.unique(((signals.time[span] - first) // _CLOSE_UP).astype(int)):
+                piece = span[((signals.time[span] - first) // _CLOSE_UP).astype(int) == k]
                 score = float(squares[piece].mean()) * min(1.0, len(piece) / 20.0)
                 if best is None or score > best[0]:
                     best = score, piece

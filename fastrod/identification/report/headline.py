@@ -6,7 +6,8 @@ import math
 import re
 from html import escape
 
-from fastrod.identification.report.markup import SHARES, listed, mark
+from fastrod.effects.base import get_effect, trait
+from fastrod.identification.report.markup import FRACTIONS, listed, mark
 from fastrod.identification.report.result import Result
 from fastrod.identification.report.wording import (
     NOTHING,
@@ -47,12 +48,13 @@ def header(result: Result) -> str:
 def hero(result: Result) -> str:
     """The first screen: verdict, error before and after, effects, what cannot be told, what to do."""
     error = f"<h3>Tip error on samples that no fit has seen</h3>{_numbers(result)}{_bars(result)}"
-    left, right = [("a", error), ("c", _told_apart(result))], [("b", _found(result))]
+    left, right = [("a", error), ("c", _distinguished(result))], [("b", _found(result))]
     (left if len(result.effects) > 1 else right).append(("d", _next(result)))
     grid = ""
-    for parts in (left, right):
+    for blocks in (left, right):
         grid += (
-            f'<div class="col">{"".join(f"<div class={place}>{part}</div>" for place, part in parts)}</div>'
+            "<div "
+            f'class="col">{"".join(f"<div class={place}>{block}</div>" for place, block in blocks)}</div>'
         )
     first, *rest = re.split(r"(?<=[.!?]) (?=[A-Z])", result.summary, maxsplit=1)
     more = f'<p class="more">{escape(rest[0])}</p>' if rest else ""
@@ -71,10 +73,10 @@ def _numbers(result: Result) -> str:
         what = _number(error, f"before → after, {interval}")
     else:
         what = _number(f'<em class="was">{millimetres(test.before)}</em> mm', f"base model, {interval}")
-    share = explained(result)
+    fraction = explained(result)
     gone = (
-        _number(percent(max(share, 0.0)), "of the error above the noise explained")
-        if result.effects and math.isfinite(share)
+        _number(percent(max(fraction, 0.0)), "of the error above the noise explained")
+        if result.effects and math.isfinite(fraction)
         else ""
     )
     times = _number(f"{rounded(ratio, 3)} ×" if math.isfinite(ratio) else NOTHING, "the noise floor")
@@ -142,9 +144,9 @@ def _found(result: Result) -> str:
                 f'class="n">{with_error(e.value, e.stderr, e.unit)}</td><td>{mark(e)}</td></tr>'
                 for name, e in found.parameters.items()
             )
-            share = f"{_of_all(found.held_out_gain)} of the held-out error above the noise"
+            fraction = f"{_of_all(found.held_out_gain)} of the held-out error above the noise"
             cards.append(
-                f'<div class="card effect"><h2>{escape(words(found.name))} <small>{share}</small></h2>'
+                f'<div class="card effect"><h2>{escape(words(found.name))} <small>{fraction}</small></h2>'
                 f'<div class="soft">{escape(found.title)}</div><table>{rows}</table></div>'
             )
         return f"<h3>What the model lacked</h3>{''.join(cards)}"
@@ -152,28 +154,25 @@ def _found(result: Result) -> str:
         return f'<h3>What it looks like</h3><div class="card">{listed(result.patterns)}</div>'
     if result.verdict == "none":
         seen = [b for b in result.bounds if math.isfinite(b.value)]
-        first = sorted(
-            seen,
-            key=lambda b: b.name not in ("payload", "gravity", "friction", "backlash", "latency", "creep"),
-        )[:6]
+        first = sorted(seen, key=lambda b: not trait(get_effect(b.name), "frequent"))[:6]
         return (
             "<h3>What would have shown</h3><div "
             f'class="card">{listed(bound_sentence(b) for b in first)}</div>'
         )
-    kind = SHARES.get(
+    kind = FRACTIONS.get(
         {"unknown": "exogenous"}.get(result.remaining_kind, result.remaining_kind), ("of no known kind", "")
     )[0]
     return (
-        f'<h3>What is left</h3><div class="card">{percent(result.remaining_share)} of the error above '
+        f'<h3>What is left</h3><div class="card">{percent(result.remaining_fraction)} of the error above '
         f"the noise: {kind}.</div>"
     )
 
 
-def _of_all(share: float) -> str:
-    return "all" if share >= 0.995 else percent(max(share, 0.0))
+def _of_all(fraction: float) -> str:
+    return "all" if fraction >= 0.995 else percent(max(fraction, 0.0))
 
 
-def _told_apart(result: Result) -> str:
+def _distinguished(result: Result) -> str:
     lines = [
         f"<b>{escape(words(f.name))}</b>: this log cannot tell it from "
         + ", ".join(f'<span class="chip">{escape(words(other))}</span>' for other in f.cannot_be_told_from)

@@ -7,7 +7,7 @@ from html import escape
 
 from fastrod.identification.search.solve import Estimate
 
-SHARES = {
+FRACTIONS = {
     "static": ("follows from the present inputs", "#6d5bd0"),
     "memory": ("follows from the inputs before", "#2166c4"),
     "drift": ("slow in time", "#c2790a"),
@@ -15,9 +15,9 @@ SHARES = {
 }
 
 
-def section(title: str, lead: str, *parts: str) -> str:
-    """A part of the page under a heading; `title` is escaped here, `lead` and `parts` are HTML already."""
-    return f'<section><h2>{escape(title)}</h2><p class="lead">{lead}</p>{"".join(parts)}</section>'
+def section(title: str, lead: str, *blocks: str) -> str:
+    """A part of the page under a heading; `title` is escaped here, `lead` and `blocks` are HTML already."""
+    return f'<section><h2>{escape(title)}</h2><p class="lead">{lead}</p>{"".join(blocks)}</section>'
 
 
 def figure(svg: str, caption: str) -> str:

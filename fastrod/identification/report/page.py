@@ -9,7 +9,7 @@ from importlib.resources import files
 
 from fastrod.identification.report import figures
 from fastrod.identification.report.headline import header, hero
-from fastrod.identification.report.markup import SHARES, figure, listed, mark, section
+from fastrod.identification.report.markup import FRACTIONS, figure, listed, mark, section
 from fastrod.identification.report.result import Found, Result
 from fastrod.identification.report.signals import Signals, SignalView
 from fastrod.identification.report.wording import (
@@ -55,7 +55,7 @@ def page(result: Result) -> str:
         '<meta charset="utf-8">\n<meta name="viewport" content="width=device-width, '
         f'initial-scale=1">\n<title>{escape(title)}</title>'
     )
-    inside = "\n".join(part for part in body if part)
+    inside = "\n".join(block for block in body if block)
     return (
         "<!DOCTYPE html>\n<html "
         f'lang="en">\n<head>\n{head}\n<style>\n{style}</style>\n</head>\n<body>\n{inside}\n</body>\n</html>\n'
@@ -69,7 +69,7 @@ def _fit(result: Result, signals: Signals) -> str:
         if result.effects
         else "Orange should lie on the noise floor."
     )
-    parts = [
+    blocks = [
         figure(
             figures.error_over_time(result, signals),
             f"Distance between measured and predicted tip, rms over short bins. {blue} Shaded: held out, "
@@ -86,7 +86,7 @@ def _fit(result: Result, signals: Signals) -> str:
         ),
     ]
     if len(result.path) > 1:
-        parts.append(
+        blocks.append(
             figure(
                 figures.added(result),
                 "Effects in the order of what they bring. An effect that helps "
@@ -97,9 +97,9 @@ def _fit(result: Result, signals: Signals) -> str:
         return section(
             "Before and after",
             "The base model with its own parameters fitted, against the model with what was found.",
-            *parts,
+            *blocks,
         )
-    return section("Measured and predicted", "The base model with its own parameters fitted.", *parts)
+    return section("Measured and predicted", "The base model with its own parameters fitted.", *blocks)
 
 
 def _effect(result: Result, found: Found, view: SignalView) -> str:
@@ -128,21 +128,21 @@ def _effect(result: Result, found: Found, view: SignalView) -> str:
 
 
 def _memory(result: Result, signals: Signals, drawn: Sequence[SignalView]) -> str:
-    parts = []
+    blocks = []
     if not any(view.connected for view in drawn) and (loops := signals.loops()) is not None:
         caption = (
             "Residual along the bend against the commanded bend. Open loops: memory, such as friction or "
             "backlash. "
             "A line that is not flat: something static."
         )
-        parts.append(figure(figures.against_signal(loops, result, "loops"), caption))
+        blocks.append(figure(figures.against_signal(loops, result, "loops"), caption))
     caption = (
         "How alike the residual is to itself some time later. Above the band: something is left that a "
         "model could explain. "
         f"The camera at rest has {_signed(result.noise.lag1)} from one sample to the next."
     )
-    parts.append(figure(figures.autocorrelation(result, signals), caption))
-    return section("Hysteresis and memory", "Does the residual know where the robot came from?", *parts)
+    blocks.append(figure(figures.autocorrelation(result, signals), caption))
+    return section("Hysteresis and memory", "Does the residual know where the robot came from?", *blocks)
 
 
 def _parameters(result: Result) -> str:
@@ -150,14 +150,14 @@ def _parameters(result: Result) -> str:
         "of the robot": result.base_parameters,
         **{f"of {words(found.name)}": found.parameters for found in result.effects},
     }
-    parts = [_estimates(groups)]
+    blocks = [_estimates(groups)]
     names, matrix = result.correlation
     if len(names) > 1:
         caption = "Correlations of the fitted numbers. Near ±1: this log knows only their sum or difference."
         plain = [plain_name(name) for name in names]
-        parts.append(figure(figures.correlations(plain, matrix), caption))
+        blocks.append(figure(figures.correlations(plain, matrix), caption))
     lead = "Estimate and standard error; the prior that the fit began with; what this log says nothing about."
-    return section("Parameters", lead, *parts)
+    return section("Parameters", lead, *blocks)
 
 
 def _estimates(groups: Mapping[str, Mapping[str, Estimate]]) -> str:
@@ -180,42 +180,43 @@ def _estimates(groups: Mapping[str, Mapping[str, Estimate]]) -> str:
 
 
 def _remaining(result: Result, signals: Signals) -> str:
-    audit = result.remaining
-    parts = []
+    structure = result.remaining
+    blocks = []
     if result.patterns:
-        parts.append(f"<p>Outside the library, but found as a pattern:</p>{listed(result.patterns)}")
-    shares = [(key, getattr(audit, key), *SHARES[key]) for key in SHARES]
-    rest = max(0.0, 1.0 - sum(share for _, share, _, _ in shares))
+        blocks.append(f"<p>Outside the library, but found as a pattern:</p>{listed(result.patterns)}")
+    fractions = [(key, getattr(structure, key), *FRACTIONS[key]) for key in FRACTIONS]
+    rest = max(0.0, 1.0 - sum(fraction for _, fraction, _, _ in fractions))
     bars = "".join(
-        f'<div style="width:{100 * share:.2f}%;background:{colour}"></div>' for _, share, _, colour in shares
+        f'<div style="width:{100 * fraction:.2f}%;background:{colour}"></div>'
+        for _, fraction, _, colour in fractions
     )
-    shares.append(("noise", rest, "the remainder", "#e3e7ed"))
+    fractions.append(("noise", rest, "the remainder", "#e3e7ed"))
     legend = "".join(
-        f'<span style="--c:{colour}">{key}: {percent(share)} <em class="soft">({text})</em></span>'
-        for key, share, text, colour in shares
+        f'<span style="--c:{colour}">{key}: {percent(fraction)} <em class="soft">({text})</em></span>'
+        for key, fraction, text, colour in fractions
     )
     taken_off = " once the pattern above is taken off" if result.patterns else ""
-    parts.append(f"<h3>The residual's variance{taken_off}</h3>")
-    parts.append(f'<div class="shares">{bars}</div><div class="legend">{legend}</div>')
+    blocks.append(f"<h3>The residual's variance{taken_off}</h3>")
+    blocks.append(f'<div class="shares">{bars}</div><div class="legend">{legend}</div>')
     if len(signals.rows):
         caption = (
             "What is left of each axis, mean over stretches of time, and the band in which noise would "
             "leave it. "
             "A step, a slope or a wave is no noise."
         )
-        parts.append(figure(figures.left_over_time(result, signals), caption))
+        blocks.append(figure(figures.left_over_time(result, signals), caption))
     if result.network:
         with_it = result.network["held_out_rms_m"]
-        parts.append(
+        blocks.append(
             f"<p>A network on what is left brings the held-out error from {millimetres(result.test.after)} "
             f"to {millimetres(with_it)} mm; "
             "it names nothing and is no part of <em>after</em>.</p>"
         )
-    lead = f"{percent(result.remaining_share)} of the error above the noise remains unexplained."
-    if result.remaining_share == 0.0:
+    lead = f"{percent(result.remaining_fraction)} of the error above the noise remains unexplained."
+    if result.remaining_fraction == 0.0:
         lead = "Nothing that held-out blocks confirm: what is left looks like noise."
     notes = f"<h3 style='margin-top:16px'>About this log</h3>{listed(result.notes)}" if result.notes else ""
-    return section("What remains", lead, *parts, notes)
+    return section("What remains", lead, *blocks, notes)
 
 
 def _bounds(result: Result) -> str:

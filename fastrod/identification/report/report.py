@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 def to_json(result: Result) -> dict[str, Any]:
     """The result as plain data, SI units; what is not a number is None."""
-    audit = result.remaining
+    structure = result.remaining
     names, matrix = result.correlation
     made: dict[str, Any] = {
         "log": result.log.name,
@@ -63,10 +63,10 @@ def to_json(result: Result) -> dict[str, Any]:
         "registration": _registration(result.registration),
         "correlation": {"names": list(names), "matrix": matrix},
         "remaining": {
-            "structured_fraction": result.remaining_share,
+            "structured_fraction": result.remaining_fraction,
             "kind": result.remaining_kind,
             "patterns": list(result.patterns),
-            "shares": {key: getattr(audit, key) for key in ("static", "memory", "drift", "exogenous")},
+            "shares": {key: getattr(structure, key) for key in ("static", "memory", "drift", "exogenous")},
         },
         "patterns": list(result.patterns),
         "path": [{"name": s.name, "train_rms_m": s.train, "held_out_rms_m": s.held_out} for s in result.path],
@@ -108,14 +108,14 @@ def write(result: Result, out_dir: str | Path) -> list[Path]:
     written = []
     for name, make in (("report.json", text), ("report.html", page)):
         path = out / name
-        part = path.with_name(f"{name}.part")
+        partial = path.with_name(f"{name}.part")
         content = make(result) + "\n"
         try:
-            part.write_text(content, encoding="utf-8")
-            part.replace(path)
+            partial.write_text(content, encoding="utf-8")
+            partial.replace(path)
         except OSError:
-            if part.is_file():
-                part.unlink()
+            if partial.is_file():
+                partial.unlink()
             raise
         written.append(path)
     save_robot(result.identified, out / "identified.toml")
@@ -155,7 +155,7 @@ def table(result: Result) -> Group:
         floor,
         style="bold",
     )
-    parts: list[Any] = [title, Text(result.summary), Text(), errors]
+    blocks: list[Any] = [title, Text(result.summary), Text(), errors]
     if result.effects:
         grid = Table(
             box=box.SIMPLE_HEAD,
@@ -177,11 +177,11 @@ def table(result: Result) -> Group:
                     escape(note),
                 )
                 label = ""
-        share = explained(result)
-        if math.isfinite(share):
-            grid.caption = f"{percent(max(share, 0.0))} of the held-out error above the noise is explained"
+        fraction = explained(result)
+        if math.isfinite(fraction):
+            grid.caption = f"{percent(max(fraction, 0.0))} of the held-out error above the noise is explained"
             grid.caption_justify = "left"
-        parts.append(grid)
+        blocks.append(grid)
     lines = [
         f"{words(f.name)} cannot be told from {', '.join(map(words, f.cannot_be_told_from))} on this log"
         for f in result.effects
@@ -194,7 +194,7 @@ def table(result: Result) -> Group:
     ]
     lines += [f"remains: {pattern}" for pattern in result.patterns if result.effects]
     lines += [f"note: {note}" for note in result.notes] + [f"run next: {line}" for line in result.advice]
-    return Group(*parts, *(Text(f"- {line}") for line in lines))
+    return Group(*blocks, *(Text(f"- {line}") for line in lines))
 
 
 def _error(error: Error) -> dict[str, float]:

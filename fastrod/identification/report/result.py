@@ -109,7 +109,7 @@ class Result:
     remaining: ResidualStructure
     remaining_kind: str
     """none | static | memory | drift | unknown."""
-    remaining_share: float
+    remaining_fraction: float
     """Of the mean square error above the noise that the base model left."""
     patterns: Sequence[str]
     """What the remaining structure looks like, where a pattern outside the library fits it."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fastrod.effects.base import Seam, get_effect, has_memory
+from fastrod.effects.base import Signal, get_effect, signal_of
 from fastrod.identification.report.result import Found, Result
 from fastrod.model.routing import wire
 from fastrod.rotation import matrix_from_quaternion
@@ -19,9 +19,6 @@ _ACROSS = 0.12  # of the largest bend: motion that counts as along one direction
 _DIRECTIONS = 4
 _LEAST_LOOP = 50  # rows
 _NEAR_AXIS = 0.02  # of the robot's length: nearer to the axis no sideways direction is defined
-_SPEED = ("latency", "dynamics")
-_TIME = ("temperature", "time_drift")
-_WEIGHT = ("gravity", "payload")
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,34 +71,31 @@ class Signals:
 
     def view(self, found: Found) -> SignalView:
         """The residual against what explains this effect."""
-        name = found.name
-        what = get_effect(name)
-        if name in _TIME:
+        signal = signal_of(get_effect(found.name))
+        if signal is Signal.TIME:
             return self._best([("time since the start of the run [s]", self.time)], self._axes())
-        if name in _SPEED:
+        if signal is Signal.MOTION:
             return self._along_motion()
-        if name in _WEIGHT or (what.seam is Seam.LOAD and name != "tip_force"):
+        if signal is Signal.GRAVITY:
             return self._along_force(
                 self._gravity(),
                 "share of gravity that pulls across the robot",
                 "residual the way gravity pulls",
             )
-        if name == "tip_force":
+        if signal is Signal.FORCE:
             force = np.array(
                 [found.parameters[axis].value if axis in found.parameters else 0.0 for axis in "xyz"]
             )
             return self._along_force(
                 force, "share of the force that pulls across the robot", "residual the way the force pulls"
             )
-        if what.seam is Seam.SENSING or not self.bend.shape[1]:
+        if signal is Signal.TIP or not self.bend.shape[1]:
             return self._over_tip()
-        if name == "creep":
+        if signal is Signal.LAG:
             return self._behind(
                 found.parameters["time_constant"].value if "time_constant" in found.parameters else 5.0
             )
-        if has_memory(what):
-            return self.loops() or self._over_bend()
-        return self._over_bend()
+        return (self.loops() if signal is Signal.LOOP else None) or self._over_bend()
 
     def loops(self) -> SignalView | None:
         """The residual along the bend against the commanded bend, where motion is in one direction; None
@@ -221,13 +215,17 @@ class Signals:
         force = force / np.where(size > 0.0, size, np.nan)
         chord = self.tip / np.linalg.norm(self.tip, axis=1, keepdims=True)
         across = force - (force * chord).sum(1, keepdims=True) * chord
-        share = np.linalg.norm(across, axis=1)
-        unit = across / np.where(share > 0.02, share, np.nan)[:, None]
-        return self._best([(signal, share)], [(residual, unit)])
+        fraction = np.linalg.norm(across, axis=1)
+        unit = across / np.where(fraction > 0.02, fraction, np.nan)[:, None]
+        return self._best([(signal, fraction)], [(residual, unit)])
 
     def _gravity(self) -> Floats:
-        robot, turn = self.result.robot, self.log.base_quaternion
-        quaternion = np.array([robot.base_quaternion]) if turn is None else np.asarray(turn)
+        robot, quaternion_of_base = self.result.robot, self.log.base_quaternion
+        quaternion = (
+            np.array([robot.base_quaternion])
+            if quaternion_of_base is None
+            else np.asarray(quaternion_of_base)
+        )
         return np.asarray(np.einsum("nji,j->ni", matrix_from_quaternion(quaternion), np.array(robot.gravity)))
 
     def _follows(self) -> Flags:
@@ -270,7 +268,7 @@ def _turned(bend: Floats, angle: float) -> tuple[Floats, Floats]:
 def _low_pass(values: Floats, step: Floats, follows: Flags, time_constant: float) -> Floats:
     """First-order lag of values (n, 2), begun anew where a row does not follow the one before."""
     out = values.copy()
-    share = 1.0 - np.exp(-np.maximum(step, 0.0) / time_constant)
+    fraction = 1.0 - np.exp(-np.maximum(step, 0.0) / time_constant)
     for i in np.flatnonzero(follows):
-        out[i] = out[i - 1] + share[i] * (values[i] - out[i - 1])
+        out[i] = out[i - 1] + fraction[i] * (values[i] - out[i - 1])
     return out

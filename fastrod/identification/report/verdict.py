@@ -36,14 +36,14 @@ class VerdictGrounds:
     """The effects that were found are not certain: do not name them."""
 
 
-def judge(
+def choose_verdict(
     *,
     base: float,
     library: float,
     after: float,
     floor: float,
     left_out: float,
-    audit: ResidualStructure,
+    structure: ResidualStructure,
     steps: Sequence[SearchStep],
     found: Sequence[str],
 ) -> VerdictGrounds:
@@ -52,19 +52,25 @@ def judge(
     `after` those and foils, and the noise `floor`; `left_out`: share of the held-out error above the noise
     that is left."""
     excess = max(base - floor, _MIN_EXCESS * floor, 1e-30)
-    foils = [step.taken.foil for step in steps if step.taken is not None and step.taken.foil is not None]
+    alternatives = [
+        step.taken.alternative
+        for step in steps
+        if step.taken is not None and step.taken.alternative is not None
+    ]
     # the strongest of each family
-    patterns = tuple({foil.name: foil.what for foil in reversed(foils)}.values())[::-1]
-    foreign = max(library - after, 0.0) / excess if foils else 0.0
-    structured = audit.structured * after / excess
+    patterns = tuple({alternative.name: alternative.what for alternative in reversed(alternatives)}.values())[
+        ::-1
+    ]
+    foreign = max(library - after, 0.0) / excess if alternatives else 0.0
+    structured = structure.structured * after / excess
     left = min(1.0, foreign + structured)
     kind = (
-        {"exogenous": "unknown"}.get(foils[0].kind, foils[0].kind)
-        if foils and foreign >= structured
-        else audit.kind
+        {"exogenous": "unknown"}.get(alternatives[0].kind, alternatives[0].kind)
+        if alternatives and foreign >= structured
+        else structure.kind
     )
-    if not found and not foils:
-        if audit.structured <= _CLEAN:
+    if not found and not alternatives:
+        if structure.structured <= _CLEAN:
             return VerdictGrounds(
                 "none",
                 "The model explains this log down to its noise; nothing is missing that this log could show.",
@@ -92,7 +98,7 @@ def judge(
         gone = 100.0 * (1.0 - (left if np.isnan(left_out) else min(max(left_out, 0.0), 1.0)))
         it = "it" if len(found) == 1 else "them"
         said = (
-            f"The model lacked {names}; with {it}, {_share(gone)} of the held-out mean square above the "
+            f"The model lacked {names}; with {it}, {_fraction(gone)} of the held-out mean square above the "
             f"noise is gone.{more}"
         )
         return VerdictGrounds("explained", said, kind if left > 0.02 else "none", left, patterns, False)
@@ -100,10 +106,10 @@ def judge(
         what = f": {patterns[0]}" if patterns else f"; what is left is {_words(kind)}"
         certain = foreign < 0.5 and left < _UNCERTAIN
         also = f" {names} {'is' if len(found) == 1 else 'are'} there too." if certain else ""
-        part = "Most" if max(foreign, left) > 0.5 else "A good part"
+        quantity = "Most" if max(foreign, left) > 0.5 else "A good part"
         return VerdictGrounds(
             "not_in_library",
-            f"{part} of what is missing is not in the library{what}.{also}",
+            f"{quantity} of what is missing is not in the library{what}.{also}",
             kind,
             left,
             patterns,
@@ -120,7 +126,7 @@ def judge(
     )
 
 
-def _share(percent: float) -> str:
+def _fraction(percent: float) -> str:
     return "over 99 %" if 99.0 < percent < 100.0 else f"{percent:.0f} %"
 
 

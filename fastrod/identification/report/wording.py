@@ -7,7 +7,7 @@ import inspect
 import math
 import re
 
-from fastrod.effects.base import get_effect
+from fastrod.effects.base import get_effect, trait
 from fastrod.identification.search.model_selection import Bound
 
 NOTHING = "–"
@@ -88,13 +88,15 @@ def millimetres(metres: float, digits: int = 3) -> str:
     return rounded(1e3 * metres, digits) if math.isfinite(metres) else NOTHING
 
 
-def percent(share: float) -> str:
+def percent(fraction: float) -> str:
     """A share of one, never rounded up to all of it."""
-    if not math.isfinite(share):
+    if not math.isfinite(fraction):
         return NOTHING
-    if 0.99 < share < 1.0:
+    if 0.99 < fraction < 1.0:
         return "over 99 %"
-    return f"{100 * share:.0f} %" if abs(share) >= 0.0995 or share == 0.0 else f"{100 * share:.1f} %"
+    return (
+        f"{100 * fraction:.0f} %" if abs(fraction) >= 0.0995 or fraction == 0.0 else f"{100 * fraction:.1f} %"
+    )
 
 
 def rounded(value: float, digits: int) -> str:
@@ -114,10 +116,10 @@ def a(noun: str) -> str:
 
 def plain_name(name: str) -> str:
     """`segment.*.bending_stiffness` as 'bending stiffness, all segments'."""
-    part, _, rest = name.partition(".")
+    owner, _, rest = name.partition(".")
     number, _, what = rest.partition(".")
-    if part in ("segment", "tendon") and what:
-        return f"{words(what)}, {'all ' + part + 's' if number == '*' else f'{part} {number}'}"
+    if owner in ("segment", "tendon") and what:
+        return f"{words(what)}, {'all ' + owner + 's' if number == '*' else f'{owner} {number}'}"
     return words(name.replace(".", ", "))
 
 
@@ -137,7 +139,7 @@ def bound_sentence(bound: Bound) -> str:
         stem, f"component along {stem}" if len(stem) == 1 else "size" if stem == "size" else words(stem)
     )
     if not math.isfinite(bound.value):
-        needs = str(getattr(get_effect(bound.name), "excited_by", ""))
+        needs = str(trait(get_effect(bound.name), "excited_by"))
         return f"this log cannot show {words(bound.name)}" + (f"; it takes {needs}" if needs else "")
     return f"{words(bound.name)}: {a(noun)} above {amount(bound.value, bound.unit)} would have shown"
 

@@ -37,20 +37,20 @@ class AlternativePattern:
     """Parameters that a scan has chosen, beside the k amplitudes."""
 
 
-def foils(local: LinearisedModel, tangent: Floats, residual: Floats) -> list[AlternativePattern]:
+def alternatives(linearised: LinearisedModel, tangent: Floats, residual: Floats) -> list[AlternativePattern]:
     """The best of each family for a residual (n, n_out) that `tangent` (n, n_out, p) can absorb part of."""
     solver = _Projected(tangent, residual)
     found = []
-    families = [_ripple(local), _contact(local), _attraction(local), _patch(local)]
+    families = [_ripple(linearised), _contact(linearised), _attraction(linearised), _patch(linearised)]
     # short runs have no history of their own
-    if all(local.samples.time[part].max() > _LONG for part in local.samples.runs):
-        families += [_bump(local), _slip(local), _sway(local, residual)]
+    if all(linearised.samples.time[span].max() > _LONG for span in linearised.samples.runs):
+        families += [_bump(linearised), _slip(linearised), _sway(linearised, residual)]
     for family in families:
         best: tuple[float, AlternativePattern] | None = None
-        for foil in family:
-            loss = solver.loss(foil.columns)
+        for alternative in family:
+            loss = solver.loss(alternative.columns)
             if best is None or loss < best[0]:
-                best = loss, foil
+                best = loss, alternative
         if best is not None:
             found.append(best[1])
     return found
@@ -75,76 +75,79 @@ class _Projected:
         return self.start - float(b @ np.linalg.solve(gram + ridge * np.eye(len(gram)), b))
 
 
-def _sensed(local: LinearisedModel, change: Floats) -> Floats:
+def _sensed(linearised: LinearisedModel, change: Floats) -> Floats:
     """(n, n_out, k) weighted columns of changes of the seen tip (n, 3, k) [m]."""
     return _weighted(
-        local,
+        linearised,
         np.concatenate(
-            [change, np.zeros((len(change), 3 + 3 * local.pose.points.shape[1], change.shape[2]))], axis=1
+            [change, np.zeros((len(change), 3 + 3 * linearised.pose.points.shape[1], change.shape[2]))],
+            axis=1,
         ),
     )
 
 
-def _weighted(local: LinearisedModel, change: Floats) -> Floats:
+def _weighted(linearised: LinearisedModel, change: Floats) -> Floats:
     """(n, n_out, k) weighted from changes of the pose (n, 6 + 3k', k)."""
-    target = local.target
-    parts = [change[:, :3] / target.sigma[:, None]]
+    target = linearised.target
+    blocks = [change[:, :3] / target.sigma[:, None]]
     if target.rotation is not None:
-        parts.append(change[:, 3:6] / target.rotation_sigma)
+        blocks.append(change[:, 3:6] / target.rotation_sigma)
     if target.points.shape[1]:
-        parts.append(change[:, 6:] / np.tile(target.sigma, target.points.shape[1])[:, None])
-    return np.asarray(np.concatenate(parts, axis=1) * (target.weight > 0.0)[:, None, None])
+        blocks.append(change[:, 6:] / np.tile(target.sigma, target.points.shape[1])[:, None])
+    return np.asarray(np.concatenate(blocks, axis=1) * (target.weight > 0.0)[:, None, None])
 
 
-def _log_time(local: LinearisedModel) -> Floats:
+def _log_time(linearised: LinearisedModel) -> Floats:
     """(n_rows,) time, runs one after the other [s]."""
-    samples = local.samples
+    samples = linearised.samples
     return np.cumsum(samples.dt)[samples.rows]
 
 
-def _when(local: LinearisedModel, at: float) -> str:
+def _when(linearised: LinearisedModel, at: float) -> str:
     """A moment of `_log_time` in the log's own time, with its run where there are several."""
-    samples = local.samples
-    row = int(samples.rows[int(np.argmax(_log_time(local) > at))])
+    samples = linearised.samples
+    row = int(samples.rows[int(np.argmax(_log_time(linearised) > at))])
     run = f" of run {str(samples.log.run[row])!r}" if len(samples.runs) > 1 else ""
     return f"{samples.log.t[row]:.1f} s{run}"
 
 
-def _bump(local: LinearisedModel) -> Iterator[AlternativePattern]:
-    t = _log_time(local)
+def _bump(linearised: LinearisedModel) -> Iterator[AlternativePattern]:
+    t = _log_time(linearised)
     for at in np.quantile(t, np.linspace(0.03, 0.97, _TIMES)):
         step = (t > at).astype(float)
-        columns = _sensed(local, step[:, None, None] * np.eye(3)[None])
+        columns = _sensed(linearised, step[:, None, None] * np.eye(3)[None])
         yield AlternativePattern(
             "bump",
             "drift",
-            f"the measured tip jumps at {_when(local, at)} and stays: base or camera was moved",
+            f"the measured tip jumps at {_when(linearised, at)} and stays: base or camera was moved",
             columns,
             1,
         )
 
 
-def _slip(local: LinearisedModel) -> Iterator[AlternativePattern]:
-    if not local.model.wiring.n_tendons:
+def _slip(linearised: LinearisedModel) -> Iterator[AlternativePattern]:
+    if not linearised.model.wiring.n_tendons:
         return
-    t = _log_time(local)
-    wiring = local.model.wiring
+    t = _log_time(linearised)
+    wiring = linearised.model.wiring
     for at in np.quantile(t, np.linspace(0.03, 0.97, _TIMES)):
         step = (t > at).astype(float)
         for drive in range(wiring.n_drives):
             pull = np.where(wiring.drive == drive, wiring.drive_sign, 0.0)
-            columns = _weighted(local, (local.by_bend @ wiring.bend(pull).ravel() * step[:, None])[..., None])
+            columns = _weighted(
+                linearised, (linearised.by_bend @ wiring.bend(pull).ravel() * step[:, None])[..., None]
+            )
             yield AlternativePattern(
                 "slip",
                 "drift",
-                f"the zero of drive {drive + 1} jumps at {_when(local, at)}: its wire slipped",
+                f"the zero of drive {drive + 1} jumps at {_when(linearised, at)}: its wire slipped",
                 columns,
                 2,
             )
 
 
-def _sway(local: LinearisedModel, residual: Floats) -> Iterator[AlternativePattern]:
-    t = _log_time(local)
+def _sway(linearised: LinearisedModel, residual: Floats) -> Iterator[AlternativePattern]:
+    t = _log_time(linearised)
     duration = float(np.ptp(t))
     if duration < 4.0 or len(t) < 32:
         return
@@ -160,7 +163,7 @@ def _sway(local: LinearisedModel, residual: Floats) -> Iterator[AlternativePatte
             angle = 2.0 * np.pi * fine * t
             both = np.stack([np.sin(angle), np.cos(angle)], axis=1)
             columns = _sensed(
-                local, (both[:, None, :, None] * np.eye(3)[None, :, None, :]).reshape(len(t), 3, 6)
+                linearised, (both[:, None, :, None] * np.eye(3)[None, :, None, :]).reshape(len(t), 3, 6)
             )
             yield AlternativePattern(
                 "sway",
@@ -171,44 +174,44 @@ def _sway(local: LinearisedModel, residual: Floats) -> Iterator[AlternativePatte
             )
 
 
-def _ripple(local: LinearisedModel) -> Iterator[AlternativePattern]:
-    wiring = local.model.wiring
-    if not local.model.wiring.n_tendons:
+def _ripple(linearised: LinearisedModel) -> Iterator[AlternativePattern]:
+    wiring = linearised.model.wiring
+    if not linearised.model.wiring.n_tendons:
         return
-    dl = local.bench.dl[local.samples.rows]
+    dl = linearised.prepared.dl[linearised.samples.rows]
     span = float(np.ptp(dl, axis=0).max())
     if span <= 0.0:
         return
     for wavelength in span / np.arange(0.75, 16.0, 0.25):
-        parts = []
+        blocks = []
         for drive in range(wiring.n_drives):
             pull = np.where(wiring.drive == drive, wiring.drive_sign, 0.0)
             angle = 2.0 * np.pi * dl[:, int(np.flatnonzero(wiring.drive == drive)[0])] / wavelength
-            response = local.by_bend @ wiring.bend(pull).ravel()
-            parts += [response * np.sin(angle)[:, None], response * np.cos(angle)[:, None]]
+            response = linearised.by_bend @ wiring.bend(pull).ravel()
+            blocks += [response * np.sin(angle)[:, None], response * np.cos(angle)[:, None]]
         yield AlternativePattern(
             "ripple",
             "static",
             f"periodic in the wires with {1e3 * wavelength:.2f} mm: an eccentric drum or a gear",
-            _weighted(local, np.stack(parts, axis=-1)),
+            _weighted(linearised, np.stack(blocks, axis=-1)),
             1,
         )
 
 
-def _contact(local: LinearisedModel) -> Iterator[AlternativePattern]:
+def _contact(linearised: LinearisedModel) -> Iterator[AlternativePattern]:
     """One-sided push along n where the tip goes beyond a plane n . x = c."""
-    tip = local.pose.position
+    tip = linearised.pose.position
     angle = np.arange(24) * np.pi / 12.0
     directions = [
         np.array([np.cos(a) * c, np.sin(a) * c, z]) for a, (c, z) in product(angle, ((1.0, 0.0), (0.8, -0.6)))
     ]
     for n in directions:
         along = tip @ n
-        for share in (0.5, 0.65, 0.75, 0.85, 0.93):
-            beyond = np.maximum(along - np.quantile(along, share), 0.0)
+        for fraction in (0.5, 0.65, 0.75, 0.85, 0.93):
+            beyond = np.maximum(along - np.quantile(along, fraction), 0.0)
             if beyond.max() <= 0.0:
                 continue
-            columns = _sensed(local, (beyond[:, None] * n)[..., None])
+            columns = _sensed(linearised, (beyond[:, None] * n)[..., None])
             yield AlternativePattern(
                 "contact",
                 "static",
@@ -219,18 +222,18 @@ def _contact(local: LinearisedModel) -> Iterator[AlternativePattern]:
             )
 
 
-def _attraction(local: LinearisedModel) -> Iterator[AlternativePattern]:
+def _attraction(linearised: LinearisedModel) -> Iterator[AlternativePattern]:
     """A force towards a fixed point, as a magnet's."""
-    tip = local.pose.position
-    reach = float(np.quantile(np.linalg.norm(tip - tip.mean(0), axis=1), 0.98)) + 1e-9
-    base = local.bench.base_rotation
+    tip = linearised.pose.position
+    extent = float(np.quantile(np.linalg.norm(tip - tip.mean(0), axis=1), 0.98)) + 1e-9
+    base = linearised.prepared.base_rotation
     for a, far, height in product(np.arange(12) * np.pi / 6.0, (1.2, 1.6, 2.2), (-0.4, 0.2)):
-        place = tip.mean(0) + reach * np.array([far * np.cos(a), far * np.sin(a), height])
-        way = place - tip
-        d2 = (way**2).sum(1) + (0.3 * reach) ** 2
-        force = way / d2[:, None] ** 1.5 * reach**2
+        place = tip.mean(0) + extent * np.array([far * np.cos(a), far * np.sin(a), height])
+        offset = place - tip
+        d2 = (offset**2).sum(1) + (0.3 * extent) ** 2
+        force = offset / d2[:, None] ** 1.5 * extent**2
         world = np.einsum("nij,nj->ni", np.broadcast_to(base, (len(tip), 3, 3)), force)
-        columns = _weighted(local, np.einsum("nij,nj->ni", local.by_force, world)[..., None])
+        columns = _weighted(linearised, np.einsum("nij,nj->ni", linearised.by_force, world)[..., None])
         yield AlternativePattern(
             "attraction",
             "static",
@@ -240,14 +243,14 @@ def _attraction(local: LinearisedModel) -> Iterator[AlternativePattern]:
         )
 
 
-def _patch(local: LinearisedModel) -> Iterator[AlternativePattern]:
+def _patch(linearised: LinearisedModel) -> Iterator[AlternativePattern]:
     """Something in one corner of the workspace only."""
-    tip = local.pose.position[:, :2]
-    reach = float(np.quantile(np.linalg.norm(tip - tip.mean(0), axis=1), 0.98)) + 1e-9
+    tip = linearised.pose.position[:, :2]
+    extent = float(np.quantile(np.linalg.norm(tip - tip.mean(0), axis=1), 0.98)) + 1e-9
     for a, far, width in product(np.arange(12) * np.pi / 6.0, (0.5, 1.0), (0.35, 0.6)):
-        place = tip.mean(0) + reach * far * np.array([np.cos(a), np.sin(a)])
-        near = np.exp(-0.5 * ((tip - place) ** 2).sum(1) / (width * reach) ** 2)
-        columns = _sensed(local, near[:, None, None] * np.eye(3)[None])
+        place = tip.mean(0) + extent * far * np.array([np.cos(a), np.sin(a)])
+        near = np.exp(-0.5 * ((tip - place) ** 2).sum(1) / (width * extent) ** 2)
+        columns = _sensed(linearised, near[:, None, None] * np.eye(3)[None])
         yield AlternativePattern(
             "patch",
             "static",

@@ -53,29 +53,31 @@ class BaseFit:
         """The base model with its own parameters fitted; those that this log cannot see stay nominal, with
         the reason."""
         model, target = self.model, self.target
-        local = LinearisedModel(model, model.start, self.samples, self.rod, target)
-        if not local.pose.ok.all():
-            lost = int((~local.pose.ok).sum())
+        linearised = LinearisedModel(model, model.start, self.samples, self.rod, target)
+        if not linearised.pose.ok.all():
+            lost = int((~linearised.pose.ok).sum())
             self.notes.append(
-                f"the model did not converge on {lost} of {len(local.pose.ok)} rows; they do not count"
+                f"the model did not converge on {lost} of {len(linearised.pose.ok)} rows; they do not count"
             )
-        raw = target.tip - local.pose.position
+        raw = target.tip - linearised.pose.position
         self.noise = self._noise()
         given = self.robot.sensor.get("noise", 0.0)
         declared = float(max(given) if isinstance(given, tuple) else given)
         if declared > 0.0:
             self.noise = Noise(np.full(3, declared), self.noise.lag1, "the robot file's [sensor] noise")
-        target.weight = (keep(self.samples, np.nan_to_num(raw), self.noise) & local.pose.ok).astype(float)
+        target.weight = (keep(self.samples, np.nan_to_num(raw), self.noise) & linearised.pose.ok).astype(
+            float
+        )
         out = int((target.weight == 0.0).sum())
         if out > 0.005 * len(raw):
             self.notes.append(f"{out} of {len(raw)} rows are outliers and do not count")
         self.weigh(self.noise.sigma)
-        fixed = self._unseen(local)
+        fixed = self._unseen(linearised)
         model = Model(
             model.robot, model.wiring, model.effects, tuple(u for u in model.unknowns if u.name not in fixed)
         )
         self.model = model
-        self.weigh(self.noise.sigma * max(1.0, rms(target.residual(local.pose))))
+        self.weigh(self.noise.sigma * max(1.0, rms(target.residual(linearised.pose))))
         state = search.start(model, model.start)
         for _ in range(2):
             state = self.weighed(search, state)
@@ -120,13 +122,13 @@ class BaseFit:
         self.weights.append(self.target.sigma.copy())
         return search.refined(search.refined(state))
 
-    def _unseen(self, local: LinearisedModel) -> dict[str, Estimate]:
+    def _unseen(self, linearised: LinearisedModel) -> dict[str, Estimate]:
         """Base parameters whose prior this log does not narrow: Fisher information at the noise, others free.
         And stiffnesses that nobody put into `[fit]`, where no load is known: what the wires' give would show
         of them, any gain of the drives shows as well."""
         model = self.model
-        r = local.residual(model, model.start)
-        J = local.slopes(model, model.start, r)
+        r = linearised.residual(model, model.start)
+        J = linearised.slopes(model, model.start, r)
         flat = J.reshape(r.size, J.shape[-1])
         _, sd = model.prior
         H = flat.T @ flat + np.diag(1.0 / sd**2)
@@ -153,14 +155,14 @@ class BaseFit:
 def check_motion(base: BaseFit, state: ModelState, guess: str) -> None:
     """Refuse a log that the fitted model follows worse than a robot that stands still: it is of another
     robot, or in other units, as the sentence `guess` may say. Raises `LogError`."""
-    good = (base.target.weight > 0.0) & state.local.pose.ok
+    good = (base.target.weight > 0.0) & state.linearised.pose.ok
     measured, predicted = (
         base.target.tip[good],
-        state.local.seen(state.model, state.theta, state.local.solved(state.model, state.theta)).position[
-            good
-        ],
+        state.linearised.seen(
+            state.model, state.theta, state.linearised.solved(state.model, state.theta)
+        ).position[good],
     )
-    if 2 * state.local.pose.ok.sum() < state.local.pose.ok.size or not np.isfinite(predicted).all():
+    if 2 * state.linearised.pose.ok.sum() < state.linearised.pose.ok.size or not np.isfinite(predicted).all():
         raise LogError(further_than_still(base.samples, base.robot, np.nan, guess))
     measured, predicted = measured - measured.mean(0), predicted - predicted.mean(0)
     moves = float((measured**2).sum())

@@ -13,7 +13,14 @@ from typing import ClassVar
 import numpy as np
 
 from fastrod.effects.base import Seam, get_effect, has_memory
-from fastrod.identification.log.forward import LogSamples, PredictedPose, PredictedRod, bench, chain_of
+from fastrod.effects.ports import CHANGEABLE
+from fastrod.identification.log.forward import (
+    LogSamples,
+    PredictedPose,
+    PredictedRod,
+    effects_at,
+    prepare_log,
+)
 from fastrod.identification.log.unknowns import Model, Unknown, effect_unknowns
 from fastrod.identification.search.solve import Fit, minimise
 from fastrod.rotation import matrix_from_quaternion
@@ -44,25 +51,30 @@ class Target:
     def residual(self, pose: PredictedPose) -> Floats:
         """(n, n_out) measured - predicted over sigma: tip, rotation vector, points; 0 for rows that do not
         count."""
-        parts = [(self.tip - pose.position) / self.sigma]
+        blocks = [(self.tip - pose.position) / self.sigma]
         if self.rotation is not None:
-            turn = self.rotation @ np.swapaxes(pose.rotation, 1, 2)
-            parts.append(_vector(turn) / self.rotation_sigma)
+            rotation = self.rotation @ np.swapaxes(pose.rotation, 1, 2)
+            blocks.append(_vector(rotation) / self.rotation_sigma)
         if self.points.shape[1]:
-            parts.append(
+            blocks.append(
                 (np.where(self.seen, self.points - pose.points, 0.0) / self.sigma).reshape(len(self.tip), -1)
             )
-        every = np.concatenate(parts, axis=1)
+        every = np.concatenate(blocks, axis=1)
         return np.asarray(np.where((self.weight > 0.0)[:, None] & pose.ok[:, None], every, 0.0))
 
 
-def _vector(turn: Floats) -> Floats:
+def _vector(rotation: Floats) -> Floats:
     """(n, 3) rotation vector of rotations that are small (exact to third order)."""
     skew = 0.5 * np.stack(
-        [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=1
+        [
+            rotation[:, 2, 1] - rotation[:, 1, 2],
+            rotation[:, 0, 2] - rotation[:, 2, 0],
+            rotation[:, 1, 0] - rotation[:, 0, 1],
+        ],
+        axis=1,
     )
     sine = np.linalg.norm(skew, axis=1, keepdims=True)
-    angle = np.arctan2(sine, 0.5 * (np.trace(turn, axis1=1, axis2=2)[:, None] - 1.0))
+    angle = np.arctan2(sine, 0.5 * (np.trace(rotation, axis1=1, axis2=2)[:, None] - 1.0))
     return np.asarray(skew * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-9), 1.0))
 
 
@@ -86,21 +98,21 @@ class LinearisedModel:
             target,
         )
         self.robot = model.robot_at(theta)
-        self.bench = bench(samples, self.robot, model.wiring)
-        self.chain = chain_of(model, theta)
-        self.opened = self.bench.drive(self.chain)
-        self.pose = rod.solve(*self.bench.kernel(self.opened), self.robot)
+        self.prepared = prepare_log(samples, self.robot, model.wiring)
+        self.effects = effects_at(model, theta)
+        self.opened = self.prepared.drive(self.effects)
+        self.pose = rod.solve(*self.prepared.kernel(self.opened), self.robot)
         self._kept = rod.keep()
         self._columns: dict[tuple[str, ...], Floats] = {}
-        light = [link for link, name in zip(self.chain, model.effects, strict=True) if self.is_light(name)]
-        at = self.bench.drive(light)
+        light = [each for each, name in zip(self.effects, model.effects, strict=True) if self.is_light(name)]
+        at = self.prepared.drive(light)
         self._length, self._force = at.tendon_length.copy(), at.tip_force.copy()
 
     def _difference(self, pose: PredictedPose) -> Floats:
         """(n, 6 + 3k) from the reference: tip, rotation vector, points."""
-        turn = pose.rotation @ np.swapaxes(self.pose.rotation, 1, 2)
-        points = (pose.points - self.pose.points).reshape(len(turn), -1)
-        return np.concatenate([pose.position - self.pose.position, _vector(turn), points], axis=1)
+        rotation = pose.rotation @ np.swapaxes(self.pose.rotation, 1, 2)
+        points = (pose.points - self.pose.points).reshape(len(rotation), -1)
+        return np.concatenate([pose.position - self.pose.position, _vector(rotation), points], axis=1)
 
     def _solved(self, length: Floats | None = None, force: Floats | None = None) -> Floats:
         opened = self.opened
@@ -110,7 +122,7 @@ class LinearisedModel:
         if force is not None:
             opened.tip_force = force
         self.rod.back(self._kept)
-        pose = self.rod.solve(*self.bench.kernel(opened), self.robot, self.pose.ok)
+        pose = self.rod.solve(*self.prepared.kernel(opened), self.robot, self.pose.ok)
         opened.tendon_length, opened.tip_force = before
         return np.where(self.pose.ok[:, None], self._difference(pose), 0.0)
 
@@ -152,22 +164,15 @@ class LinearisedModel:
     _columns_kind: ClassVar[dict[tuple[str, str], bool]] = {}
 
     def _probe(self, name: str) -> bool:
-        what, opened = get_effect(name), self.bench.open()
+        what, opened = get_effect(name), self.prepared.open()
         unknowns = effect_unknowns(name, self.model.wiring)
         values = Model(self.model.robot, self.model.wiring, (name,), unknowns).values(
             np.array([u.outside(u.start) for u in unknowns])
         )[name]
         before = {
             key: getattr(opened, key).copy()
-            for key in (
-                "extension",
-                "offset",
-                "compliance",
-                "stiffness",
-                "precurvature",
-                "tip_moment",
-                "line_force",
-            )
+            for key in CHANGEABLE
+            if key not in ("tendon_length", "tip_force")
         }
         what.apply(
             np.broadcast_to(values, (len(opened), len(values))), np.empty((len(opened), 0)), opened, None, 0.0
@@ -195,20 +200,24 @@ class LinearisedModel:
                 step = -step
             moved[j] = unknown.outside(here + step)
             robot = model.robot_at(moved)
-            place = self.bench if unknown.place[0] == "effect" else bench(self.samples, robot, model.wiring)
+            place = (
+                self.prepared
+                if unknown.place[0] == "effect"
+                else prepare_log(self.samples, robot, model.wiring)
+            )
             self.rod.back(self._kept)
-            pose = self.rod.solve(*place.kernel(place.drive(chain_of(model, moved))), robot, self.pose.ok)
+            pose = self.rod.solve(*place.kernel(place.drive(effects_at(model, moved))), robot, self.pose.ok)
             self._columns[unknown.place] = np.where(pose.ok[:, None], self._difference(pose) / step, 0.0)
         return self._columns[unknown.place]
 
     def driven(self, model: Model, theta: Floats) -> Floats:
         """(n, 6 + 3k) change of the true pose by wires and tip forces."""
         light = [
-            link
-            for link, name in zip(chain_of(model, theta), model.effects, strict=True)
+            each
+            for each, name in zip(effects_at(model, theta), model.effects, strict=True)
             if self.is_light(name)
         ]
-        opened = self.bench.drive(light)
+        opened = self.prepared.drive(light)
         change = np.zeros((len(opened), 6 + 3 * self.pose.points.shape[1]))
         moved = opened.tendon_length - self._length
         if moved.any():
@@ -235,12 +244,12 @@ class LinearisedModel:
         """What the camera sees after a change (n, 6 + 3k) of the true pose: tip [m], rotation vector [rad],
         points [m], base frame."""
         rotation = self.pose.rotation
-        links = [link for link in chain_of(model, theta) if link[0].seam is Seam.SENSING]
-        if links or self.target.rotation is not None:
+        sensing = [each for each in effects_at(model, theta) if each[0].seam is Seam.SENSING]
+        if sensing or self.target.rotation is not None:
             rotation = _turned(rotation, change[:, 3:6])
         points = self.pose.points + change[:, 6:].reshape(self.pose.points.shape)
-        return self.bench.see(
-            PredictedPose(self.pose.position + change[:, :3], rotation, points, self.pose.ok), links
+        return self.prepared.see(
+            PredictedPose(self.pose.position + change[:, :3], rotation, points, self.pose.ok), sensing
         )
 
     def residual(self, model: Model, theta: Floats) -> Floats:

@@ -14,12 +14,12 @@ from fastrod.identification.search.linearised import LinearisedModel
 from fastrod.identification.search.solve import Fit, bic, effective_size, paired
 from fastrod.types import Floats
 
-Z_ACCEPT, BIC_ACCEPT, SHARE_ACCEPT = 3.0, 10.0, 0.006
+Z_ACCEPT, BIC_ACCEPT, FRACTION_ACCEPT = 3.0, 10.0, 0.006
 Z_STRONG, BIC_STRONG = 1.7, 60.0  # an effect that shows in a few blocks only, but there beyond doubt
 # or one that block after block confirms, where a smooth residual is worth few samples
-Z_BLOCKS, SHARE_BLOCKS = 3.5, 0.03
+Z_BLOCKS, FRACTION_BLOCKS = 3.5, 0.03
 Z_RIVAL, BIC_RIVAL = 2.0, 10.0
-Z_KEEP, BIC_KEEP, SHARE_KEEP = 2.0, 6.0, 0.015
+Z_KEEP, BIC_KEEP, FRACTION_KEEP = 2.0, 6.0, 0.015
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,12 +27,12 @@ class ModelState:
     """A model with its fit: what is accepted so far."""
 
     model: Model
-    local: LinearisedModel
+    linearised: LinearisedModel
     fit: Fit
     """Of the unknowns, then of the accepted foils' amplitudes."""
     losses: Floats
     """(N_BLOCKS,) held out."""
-    foils: tuple[AlternativePattern, ...] = ()
+    alternatives: tuple[AlternativePattern, ...] = ()
 
     @property
     def theta(self) -> Floats:
@@ -43,7 +43,7 @@ class ModelState:
     def columns(self) -> Floats:
         """(n, n_out, k) of the accepted foils."""
         shape = (*self.fit.residual.shape, 0)
-        return np.concatenate([np.zeros(shape), *(f.columns for f in self.foils)], axis=-1)
+        return np.concatenate([np.zeros(shape), *(f.columns for f in self.alternatives)], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,12 +56,12 @@ class Candidate:
     z: float
     """Of the gain over held-out blocks."""
     bic_gain: float
-    share: float
+    fraction: float
     """Of the loss that it takes away."""
     n_parameters: int
     why: str
     """Why it is not the one, in a sentence."""
-    foil: AlternativePattern | None = None
+    alternative: AlternativePattern | None = None
 
     @property
     def passes(self) -> bool:

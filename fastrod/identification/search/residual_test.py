@@ -44,12 +44,17 @@ class ResidualStructure:
     @property
     def kind(self) -> str:
         """The largest share; `none` where there is no structure."""
-        parts = {"static": self.static, "memory": self.memory, "drift": self.drift, "unknown": self.exogenous}
-        name = max(parts, key=lambda key: parts[key])
-        return name if self.structured > 0.0 and parts[name] > 0.0 else "none"
+        pieces = {
+            "static": self.static,
+            "memory": self.memory,
+            "drift": self.drift,
+            "unknown": self.exogenous,
+        }
+        name = max(pieces, key=lambda key: pieces[key])
+        return name if self.structured > 0.0 and pieces[name] > 0.0 else "none"
 
 
-def audit(
+def residual_structure(
     samples: LogSamples, wiring: Routing, residual: Floats, noise_lag1: float = 0.0, n_blocks: int = 10
 ) -> ResidualStructure:
     """Audit a residual (n_rows, n_out) in order of time, on `n_blocks` folds of short blocks."""
@@ -63,17 +68,17 @@ def audit(
     ]
     columns = np.zeros((len(residual), 0))
     left = residual
-    shares = []
+    fractions = []
     for more in (static, memory, drift):
         columns = np.concatenate([columns, more], axis=1)
         loss, rest = _ridge(columns, residual, block, n_blocks)
         gain = losses[-1] - loss
         if gain.sum() > 0.0 and paired(losses[-1], loss) > 2.5:
-            shares.append(float(gain.sum()) / variance)
+            fractions.append(float(gain.sum()) / variance)
             losses.append(loss)
             left = rest
         else:
-            shares.append(0.0)
+            fractions.append(0.0)
     order = np.diff(samples.rows) <= max(
         1.0, 1.5 * float(np.median(np.diff(samples.rows))) if len(samples.rows) > 1 else 1.0
     )
@@ -86,7 +91,7 @@ def audit(
     )
     z = paired(losses[0], losses[-1]) if len(losses) > 1 else 0.0
     return ResidualStructure(
-        shares[0], shares[1], shares[2], exogenous, float(max(z, beyond * np.sqrt(left.size)))
+        fractions[0], fractions[1], fractions[2], exogenous, float(max(z, beyond * np.sqrt(left.size)))
     )
 
 
@@ -139,7 +144,7 @@ def features(samples: LogSamples, wiring: Routing) -> tuple[Floats, Floats, Floa
         for width in (1.5, 5.0):
             direction = width * rng.normal(size=(now.shape[1], _RANDOM // 2))
             static.append(np.cos(now @ direction + rng.uniform(0.0, 2.0 * np.pi, _RANDOM // 2)))
-    memory = [_memory(b[part], samples.dt[part]) for part in samples.runs]
+    memory = [_memory(b[span], samples.dt[span]) for span in samples.runs]
     t = np.cumsum(samples.dt)
     t = t / max(float(t[-1]), 1e-9)
     drift = np.stack([f(np.pi * k * t) for k in range(1, 7) for f in (np.sin, np.cos)] + [t, t**2], axis=1)

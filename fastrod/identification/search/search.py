@@ -1,8 +1,8 @@
 """The search for what the model lacks: fit every candidate beside what is known, judge it on blocks it has
 not seen, keep the best, ask again.
 
-Every candidate starts from the same reference, weights and outlier mask. Foils (`foils`) compete on the same
-terms.
+Every candidate starts from the same reference, weights and outlier mask. Foils (`alternatives`) compete on
+the same terms.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ from itertools import product
 
 import numpy as np
 
-from fastrod.effects.base import effect_names, get_effect
+from fastrod.effects.base import effect_names, get_effect, trait
 from fastrod.identification.log.forward import LogSamples, PredictedRod
 from fastrod.identification.log.unknowns import Model
-from fastrod.identification.search.alternatives import AlternativePattern, foils
+from fastrod.identification.search.alternatives import AlternativePattern, alternatives
 from fastrod.identification.search.linearised import LinearisedModel, Target
 from fastrod.identification.search.model_selection import (
     BIC_ACCEPT,
     BIC_KEEP,
     BIC_RIVAL,
     BIC_STRONG,
-    SHARE_ACCEPT,
-    SHARE_BLOCKS,
-    SHARE_KEEP,
+    FRACTION_ACCEPT,
+    FRACTION_BLOCKS,
+    FRACTION_KEEP,
     Z_ACCEPT,
     Z_BLOCKS,
     Z_KEEP,
@@ -52,7 +52,7 @@ _FEW, _MANY = 3, 12  # iterations of a start, and of the best of them
 _REFINED = 6  # candidates that are solved exactly at each stage
 _NEAR = 3.0  # times what the best leaves, or less than it takes: others are not worth an exact solution
 _CLOSE = 200.0  # BIC to the best within which a candidate is solved once more
-_FOIL_SD = 30.0  # of a foil's amplitude, in units of its own columns' size that would explain all
+_ALTERNATIVE_SD = 30.0  # of a foil's amplitude, in units of its own columns' size that would explain all
 
 
 @dataclass
@@ -70,62 +70,70 @@ class Search:
     def start(self, model: Model, theta: Floats, iterations: int = 6) -> ModelState:
         """The state of a model without anything found, linearised twice: at `theta` (p,), and where the fit
         from there ends."""
-        local = LinearisedModel(model, theta, self.samples, self.rod, self.target)
-        fit = self._fit(local, model, theta, np.zeros((0,)), (), iterations)
-        return self.refined(self._state(model, local, fit, ()))
+        linearised = LinearisedModel(model, theta, self.samples, self.rod, self.target)
+        fit = self._fit(linearised, model, theta, np.zeros((0,)), (), iterations)
+        return self.refined(self._state(model, linearised, fit, ()))
 
     def refined(self, state: ModelState, iterations: int = 4) -> ModelState:
         """The same with the rod solved at the state's own parameters."""
-        local = LinearisedModel(state.model, state.theta, self.samples, self.rod, self.target)
+        linearised = LinearisedModel(state.model, state.theta, self.samples, self.rod, self.target)
         fit = self._fit(
-            local, state.model, state.theta, state.fit.theta[len(state.theta) :], state.foils, iterations
+            linearised,
+            state.model,
+            state.theta,
+            state.fit.theta[len(state.theta) :],
+            state.alternatives,
+            iterations,
         )
         if not np.isfinite(fit.loss):
             return state
-        return self._state(state.model, local, fit, state.foils)
+        return self._state(state.model, linearised, fit, state.alternatives)
 
     def again(self, state: ModelState) -> ModelState:
         """A state of other samples, fitted to these; foils, which belong to their samples, are left
         behind."""
-        local = LinearisedModel(state.model, state.theta, self.samples, self.rod, self.target)
+        linearised = LinearisedModel(state.model, state.theta, self.samples, self.rod, self.target)
         return self.refined(
             self._state(
-                state.model, local, self._fit(local, state.model, state.theta, np.zeros(0), (), 6), ()
+                state.model,
+                linearised,
+                self._fit(linearised, state.model, state.theta, np.zeros(0), (), 6),
+                (),
             )
         )
 
     def _state(
-        self, model: Model, local: LinearisedModel, fit: Fit, found: tuple[AlternativePattern, ...]
+        self, model: Model, linearised: LinearisedModel, fit: Fit, found: tuple[AlternativePattern, ...]
     ) -> ModelState:
         losses = held_out_losses(fit.residual, fit.slopes, fit.precision, self.block, N_BLOCKS)
-        return ModelState(model, local, fit, losses, found)
+        return ModelState(model, linearised, fit, losses, found)
 
     def _fit(
         self,
-        local: LinearisedModel,
+        linearised: LinearisedModel,
         model: Model,
         theta: Floats,
         amplitudes: Floats,
         found: Sequence[AlternativePattern],
         iterations: int,
     ) -> Fit:
-        """The best parameters near `local`, with the amplitudes of foils as further linear unknowns."""
+        """The best parameters near `linearised`, with the amplitudes of foils as further linear unknowns."""
         n = len(model.unknowns)
         mean, sd = model.prior
         low, high = model.limits
         if not found:
-            return local.fit(model, theta, iterations)
+            return linearised.fit(model, theta, iterations)
         columns = np.concatenate([f.columns for f in found], axis=-1)
         size = np.sqrt((columns**2).sum((0, 1)))
-        wide = _FOIL_SD * np.sqrt(local.residual(model, theta).size) / np.maximum(size, 1e-12)
+        wide = _ALTERNATIVE_SD * np.sqrt(linearised.residual(model, theta).size) / np.maximum(size, 1e-12)
         k = columns.shape[-1]
         free = np.full(k, np.inf)
 
         def residual(both: Floats) -> Floats:
-            return local.residual(model, both[:n]) - columns @ both[n:]
+            return linearised.residual(model, both[:n]) - columns @ both[n:]
 
         def slopes(both: Floats, at: Floats) -> Floats:
-            own = local.slopes(model, both[:n], at + columns @ both[n:])
+            own = linearised.slopes(model, both[:n], at + columns @ both[n:])
             return np.concatenate([own, columns], axis=-1)
 
         return minimise(
@@ -165,8 +173,7 @@ class Search:
                 0.0,
                 0.0,
                 0,
-                "this log does not excite it: "
-                + (getattr(get_effect(name), "excited_by", "") or "no response"),
+                "this log does not excite it: " + (trait(get_effect(name), "excited_by") or "no response"),
             )
         model = state.model.with_effect(name, drop=drop)
         fits = self._from_starts(state, model, name)
@@ -180,7 +187,7 @@ class Search:
                 len(model.unknowns) - len(state.model.unknowns),
                 "its slopes promise nothing",
             )
-        return self.judged(state, self._state(model, state.local, fits, state.foils), name)
+        return self.judged(state, self._state(model, state.linearised, fits, state.alternatives), name)
 
     def _unseen(self, state: ModelState, name: str) -> list[str]:
         """Size parameters of an effect that this log does not move at all: left at neutral."""
@@ -191,19 +198,19 @@ class Search:
         for j, u in enumerate(model.unknowns[n:], n):
             if not u.shape:
                 at_zero[j] = u.mean
-        base = state.local.residual(model, at_zero)
+        base = state.linearised.residual(model, at_zero)
         unseen = []
         for j, u in enumerate(model.unknowns[n:], n):
             if u.shape:
                 continue
             moved = at_zero.copy()
             moved[j] = np.clip(u.mean + u.scale, *u.limits)
-            if float(((state.local.residual(model, moved) - base) ** 2).sum()) < 4.0:
+            if float(((state.linearised.residual(model, moved) - base) ** 2).sum()) < 4.0:
                 unseen.append(u.name.partition(".")[2])
         return unseen
 
     def _from_starts(self, state: ModelState, model: Model, name: str) -> Fit | None:
-        local, n = state.local, len(state.model.unknowns)
+        linearised, n = state.linearised, len(state.model.unknowns)
         added = model.unknowns[n:]
         starts = {p.name: p.on(model.wiring).starts for p in get_effect(name).parameters}
         # per-segment and per-drive columns share their parameter's starts
@@ -240,16 +247,16 @@ class Search:
         if promising[0][0] < _SCREEN * state.fit.loss:
             return None
         for _, theta in promising[:3]:
-            fit = self._fit(local, model, theta, amplitudes, state.foils, _FEW)
+            fit = self._fit(linearised, model, theta, amplitudes, state.alternatives, _FEW)
             if best is None or fit.loss < best.loss:
                 best = fit
         assert best is not None
         return self._fit(
-            local,
+            linearised,
             model,
             best.theta[: len(model.unknowns)],
             best.theta[len(model.unknowns) :],
-            state.foils,
+            state.alternatives,
             _MANY,
         )
 
@@ -257,8 +264,8 @@ class Search:
         """Loss that the response to the new parameters could take away at best, beside what the others can
         absorb."""
         n = len(state.model.unknowns)
-        at = state.local.residual(model, theta) - (
-            state.columns @ state.fit.theta[n:] if state.foils else 0.0
+        at = state.linearised.residual(model, theta) - (
+            state.columns @ state.fit.theta[n:] if state.alternatives else 0.0
         )
         # the response at the start itself: operators have no slope at neutral
         shift = (state.fit.residual - at).reshape(-1, 1)
@@ -273,8 +280,8 @@ class Search:
                 moved[j] = model.unknowns[j].mean
                 columns.append(
                     (
-                        state.local.residual(model, moved)
-                        - (state.columns @ state.fit.theta[n:] if state.foils else 0.0)
+                        state.linearised.residual(model, moved)
+                        - (state.columns @ state.fit.theta[n:] if state.alternatives else 0.0)
                         - at
                     ).ravel()
                 )
@@ -289,116 +296,124 @@ class Search:
         return float(b @ np.linalg.lstsq(gram, b, rcond=1e-12)[0])
 
     def judged(
-        self, state: ModelState, with_it: ModelState, name: str, foil: AlternativePattern | None = None
+        self, state: ModelState, with_it: ModelState, name: str, alternative: AlternativePattern | None = None
     ) -> Candidate:
         """A candidate's evidence against the state without it."""
-        k = len(with_it.fit.theta) - len(state.fit.theta) + (foil.n_hidden if foil else 0)
+        k = len(with_it.fit.theta) - len(state.fit.theta) + (alternative.n_hidden if alternative else 0)
         size = effective_size(with_it.fit.residual)
         gain = bic(state.fit.loss, 0, size) - bic(with_it.fit.loss, k, size)
         z = paired(state.losses, with_it.losses)
-        share = 1.0 - with_it.fit.loss / state.fit.loss
-        why = "" if foil else unphysical(with_it, name)
+        fraction = 1.0 - with_it.fit.loss / state.fit.loss
+        why = "" if alternative else unphysical(with_it, name)
         evident = (
             (z > Z_ACCEPT and gain > BIC_ACCEPT)
             or (z > Z_STRONG and gain > BIC_STRONG)
-            or (z > Z_BLOCKS and share > SHARE_BLOCKS)
+            or (z > Z_BLOCKS and fraction > FRACTION_BLOCKS)
         )
-        if not why and not (share > SHARE_ACCEPT and evident):
-            why = f"no gain on held-out blocks (z {z:.1f}, BIC {gain:.0f}, {100 * share:.1f} % of the loss)"
-        return Candidate(name, with_it, z, gain, share, k, why, foil)
+        if not why and not (fraction > FRACTION_ACCEPT and evident):
+            why = (
+                f"no gain on held-out blocks (z {z:.1f}, BIC {gain:.0f}, {100 * fraction:.1f} % of the loss)"
+            )
+        return Candidate(name, with_it, z, gain, fraction, k, why, alternative)
 
-    def foil_candidates(self, state: ModelState) -> list[Candidate]:
+    def alternative_candidates(self, state: ModelState) -> list[Candidate]:
         """The best foil of each family beside a state, linear in everything."""
         made = []
-        for foil in foils(state.local, state.fit.slopes, state.fit.residual):
+        for alternative in alternatives(state.linearised, state.fit.slopes, state.fit.residual):
             # a row without a shape tells nothing
-            columns = np.where(np.isfinite(foil.columns), foil.columns, 0.0)
+            columns = np.where(np.isfinite(alternative.columns), alternative.columns, 0.0)
             slopes = np.concatenate([state.fit.slopes, columns], axis=-1)
             flat = slopes.reshape(-1, slopes.shape[-1])
-            precision = np.concatenate([state.fit.precision, np.full(foil.columns.shape[-1], 1e-9)])
+            precision = np.concatenate([state.fit.precision, np.full(alternative.columns.shape[-1], 1e-9)])
             H = flat.T @ flat + np.diag(precision)
             b = flat.T @ state.fit.residual.ravel()
             b[: len(state.fit.theta)] = 0.0
             step = np.linalg.lstsq(H, b, rcond=1e-12)[0]
             residual = state.fit.residual - slopes @ step
-            theta = np.concatenate([state.fit.theta, np.zeros(foil.columns.shape[-1])]) + step
+            theta = np.concatenate([state.fit.theta, np.zeros(alternative.columns.shape[-1])]) + step
             fit = Fit(
-                theta, residual, slopes, precision, (*state.fit.at_bound, *(False,) * foil.columns.shape[-1])
+                theta,
+                residual,
+                slopes,
+                precision,
+                (*state.fit.at_bound, *(False,) * alternative.columns.shape[-1]),
             )
             with_it = ModelState(
                 state.model,
-                state.local,
+                state.linearised,
                 fit,
                 held_out_losses(residual, slopes, precision, self.block, N_BLOCKS),
-                (*state.foils, foil),
+                (*state.alternatives, alternative),
             )
-            made.append(self.judged(state, with_it, foil.name, foil))
+            made.append(self.judged(state, with_it, alternative.name, alternative))
         return made
 
     # ------------------------------------------------------------ stages
 
     def names(self, state: ModelState) -> list[str]:
         """Effects that may be tried."""
-        single = state.model.wiring.n_segments < 2
-        driven = state.model.wiring.n_tendons > 0
+        n_segments, driven = state.model.wiring.n_segments, state.model.wiring.n_tendons > 0
         return [
             name
             for name in effect_names()
             if name not in state.model.effects
             and name not in self.excluded
-            and not (name == "coupling" and single)
+            and trait(get_effect(name), "least_segments") <= n_segments
             and (driven or get_effect(name).seam.name != "ACTUATION")
         ]
 
-    def stage(self, state: ModelState, *, with_foils: bool = True) -> SearchStep:
+    def stage(self, state: ModelState, *, with_alternatives: bool = True) -> SearchStep:
         """Try everything beside `state`; take the best, if any passes."""
         tried = []
         for name in self.names(state):
             self.report(name)
             tried.append(self.candidate(state, name))
-        return self.choose(state, tried, with_foils=with_foils)
+        return self.choose(state, tried, with_alternatives=with_alternatives)
 
-    def choose(self, state: ModelState, tried: list[Candidate], *, with_foils: bool) -> SearchStep:
+    def choose(self, state: ModelState, tried: list[Candidate], *, with_alternatives: bool) -> SearchStep:
         """Solve the promising ones exactly, then take the best by evidence; foils only where they beat it
         clearly."""
         fitted = sorted(
-            (c for c in tried if c.state is not None and c.z > 1.0 and c.share > SHARE_ACCEPT),
-            key=lambda c: -c.share,
+            (c for c in tried if c.state is not None and c.z > 1.0 and c.fraction > FRACTION_ACCEPT),
+            key=lambda c: -c.fraction,
         )
-        most = fitted[0].share if fitted else 0.0
-        near = [c for c in fitted if 1.0 - c.share < _NEAR * (1.0 - most) and c.share > most / _NEAR][
+        most = fitted[0].fraction if fitted else 0.0
+        near = [c for c in fitted if 1.0 - c.fraction < _NEAR * (1.0 - most) and c.fraction > most / _NEAR][
             :_REFINED
         ]
         # of these even the fit so far is linear
-        heavy = [c for c in fitted if not state.local.is_light(c.name) and c.share > 0.6 * most]
+        heavy = [c for c in fitted if not state.linearised.is_light(c.name) and c.fraction > 0.6 * most]
         exact = {}
         for candidate in dict.fromkeys([*near, *heavy]):
             assert candidate.state is not None
             exact[candidate.name] = self.judged(state, self.refined(candidate.state), candidate.name)
-        best = best_of([c for c in exact.values() if c.state is not None and c.share > SHARE_ACCEPT])
+        best = best_of([c for c in exact.values() if c.state is not None and c.fraction > FRACTION_ACCEPT])
         for name, candidate in exact.items():
             if best is not None and candidate.state is not None and advantage(best, candidate) < _CLOSE:
                 exact[name] = self.judged(state, self.refined(candidate.state), name)
         tried = [exact.get(c.name, c) for c in tried]
         passing = [c for c in tried if c.passes]
         best = best_of(passing)
-        foil = None
-        if with_foils:
-            others = self.foil_candidates(state)
+        alternative = None
+        if with_alternatives:
+            others = self.alternative_candidates(state)
             tried += others
-            foil = best_of([c for c in others if c.passes])
-        if foil is not None and (
-            best is None or (advantage(foil, best) > BIC_RIVAL and z_between(foil, best) > Z_RIVAL)
+            alternative = best_of([c for c in others if c.passes])
+        if alternative is not None and (
+            best is None
+            or (advantage(alternative, best) > BIC_RIVAL and z_between(alternative, best) > Z_RIVAL)
         ):
-            return SearchStep(state, tuple(tried), foil)
+            return SearchStep(state, tuple(tried), alternative)
         if best is None:
             return SearchStep(state, tuple(tried), None)
         sure = [
-            c for c in passing if c is not best and c.share > best.share and z_between(c, best) > Z_ACCEPT
+            c
+            for c in passing
+            if c is not best and c.fraction > best.fraction and z_between(c, best) > Z_ACCEPT
         ]
         # blocks that no fit has seen overrule the count of parameters
-        best = max(sure, key=lambda c: c.share) if sure else best
-        rivals = [c for c in tried if c.foil is None and c.name != best.name and self._rival(best, c)]
+        best = max(sure, key=lambda c: c.fraction) if sure else best
+        rivals = [c for c in tried if c.alternative is None and c.name != best.name and self._rival(best, c)]
         fewer = best_of(
             [
                 c
@@ -412,24 +427,26 @@ class Search:
         return SearchStep(state, tuple(tried), best, tuple(c.name for c in rivals))
 
     def _rival(self, best: Candidate, other: Candidate) -> bool:
-        if other.state is None or other.share < SHARE_ACCEPT or unphysical(other.state, other.name):
+        if other.state is None or other.fraction < FRACTION_ACCEPT or unphysical(other.state, other.name):
             return False
         return advantage(best, other) < BIC_RIVAL or z_between(best, other) < Z_RIVAL
 
     def bare(self, state: ModelState) -> ModelState:
         """`state` without its foils, fitted again: what the library alone explains."""
-        local = LinearisedModel(state.model, state.theta, self.samples, self.rod, self.target)
-        fit = self._fit(local, state.model, state.theta, np.zeros(0), (), 8)
-        return self._state(state.model, local, fit, ())
+        linearised = LinearisedModel(state.model, state.theta, self.samples, self.rod, self.target)
+        fit = self._fit(linearised, state.model, state.theta, np.zeros(0), (), 8)
+        return self._state(state.model, linearised, fit, ())
 
     def without(self, state: ModelState, name: str) -> ModelState:
         """`state` without one of its effects, fitted again."""
         model = state.model.without(name)
         kept = [j for j, u in enumerate(state.model.unknowns) if u.place[:2] != ("effect", name)]
         theta = state.theta[kept]
-        local = LinearisedModel(model, theta, self.samples, self.rod, self.target)
-        fit = self._fit(local, model, theta, state.fit.theta[len(state.model.unknowns) :], state.foils, 8)
-        return self._state(model, local, fit, state.foils)
+        linearised = LinearisedModel(model, theta, self.samples, self.rod, self.target)
+        fit = self._fit(
+            linearised, model, theta, state.fit.theta[len(state.model.unknowns) :], state.alternatives, 8
+        )
+        return self._state(model, linearised, fit, state.alternatives)
 
     def eliminated(
         self, state: ModelState, found: Sequence[str], least: float, noise: float
@@ -443,7 +460,9 @@ class Search:
             for name in left:
                 fewer = self.without(state, name)
                 verdict = self.judged(fewer, state, name)
-                needed = verdict.z > Z_KEEP and (verdict.bic_gain > BIC_KEEP or verdict.share > SHARE_KEEP)
+                needed = verdict.z > Z_KEEP and (
+                    verdict.bic_gain > BIC_KEEP or verdict.fraction > FRACTION_KEEP
+                )
                 needless = not needed and not (verdict.z > Z_STRONG and verdict.bic_gain > BIC_STRONG)
                 variance = float((self.target.sigma**2).mean())
                 small = (
@@ -474,7 +493,7 @@ class Search:
             for j, u in enumerate(model.unknowns[n:], n):
                 if not u.shape:
                     theta[j] = u.mean
-            at = state.local.residual(model, theta)
+            at = state.linearised.residual(model, theta)
             worst: dict[str, float] = {}
             units: dict[str, str] = {}
             sizes = [j for j, u in enumerate(model.unknowns) if j >= n and not u.shape]
@@ -483,7 +502,7 @@ class Search:
                 moved = theta.copy()
                 step = u.scale if u.mean + u.scale <= u.bounds[1] else -u.scale
                 moved[j] = u.mean + step
-                column = (at - state.local.residual(model, moved)).ravel() / step
+                column = (at - state.linearised.residual(model, moved)).ravel() / step
                 cross = flat.T @ column
                 power = float(column @ column - cross @ np.linalg.lstsq(base, cross, rcond=1e-12)[0])
                 # x, y, z of one kind, and drives, are one size; a bound in another unit is a bound of its own

@@ -15,7 +15,7 @@ from ..jit import inline, kernel
 from ..rod.gather import pick
 from ..vec import Vec, add, cross, dot, mul, scale, sub
 from .bvh import Numbers, Record, normal_of
-from .centreline import curve_before, interval_of, point_at, rotation_at
+from .centreline import curve_slip, interval_of, point_at, rotation_at
 from .contact_set import arm_of, force_of, set_normal, wall_at
 from .mobility import add_mobility, axis_of
 from .problem import World, node_position
@@ -34,7 +34,7 @@ def tangents(n: Vec) -> tuple[Vec, Vec]:
 @kernel
 def _material_before(i: int, node: int, contact: Record, world: World) -> Vec:
     """Position at the last step of the rod's material point of contact, world."""
-    before = curve_before(world.motion, i)
+    before = curve_slip(world.motion, i)
     rotation = world.motion.rotation[i, node]
     arm = arm_of(contact)
     local = (

@@ -32,12 +32,20 @@ def curve_of(motion: ContactMotion, i: int) -> Curve:
 
 @inline
 def curve_before(motion: ContactMotion, i: int) -> Curve:
-    """Robot i at the last step."""
+    """Robot i where it came from."""
     return Curve(
         motion.position_before[i],
         motion.rotation_before[i],
         motion.curvature_before[i],
         motion.arclength_before[i],
+    )
+
+
+@inline
+def curve_slip(motion: ContactMotion, i: int) -> Curve:
+    """Robot i at the last step."""
+    return Curve(
+        motion.position_slip[i], motion.rotation_slip[i], motion.curvature_slip[i], motion.arclength_slip[i]
     )
 
 

@@ -18,6 +18,7 @@ from .bvh import FAR, Numbers, Record, normal_of
 from .surface import ray_hit, signed_distance, walls
 
 _SAME_WALL = 0.99999  # cosine: normals 0.26 degrees apart, far less than two faces of a corner
+_SAME_GAP = 1e-10  # m; a contact with friction does not move for less
 _CLOSE = 1e-3  # of a step: the least that two contacts of one obstacle are apart
 
 
@@ -238,7 +239,7 @@ def _nearest(candidate: Record, n: int, contacts: Records, rules: ContactRules) 
 def _follow(contact: Record, candidate: Record, rules: ContactRules) -> bool:
     """Move a contact to the minimum of the gap near it; False where it should stay, and another be put beside
     it."""
-    if candidate.gap >= contact.gap - 1e-10:
+    if candidate.gap >= contact.gap - (_SAME_GAP if contact.arm > 0.0 else 0.0):
         return True
     away = abs(contact.arclength - candidate.arclength)
     settles = away < max(0.5 * contact.shift, _CLOSE * rules.spacing)

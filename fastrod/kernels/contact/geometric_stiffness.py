@@ -120,12 +120,13 @@ def geometric_stiffness(
 def keep_damping(m: int, world: World, problem: ContactProblem) -> None:
     """Where no contact is curved any more, damp by a fraction of what was stiff some passes ago: a contact
     that goes to and fro between an edge and a face would not come to rest, as the face by itself is not
-    damped."""
-    most, kept, stiffness = 0.0, 0.0, problem.stiffness
+    damped. No contact that presses is damped less than by the bending stiffness of its rod, EI/l^3."""
+    most, kept, least, stiffness = 0.0, 0.0, 0.0, problem.stiffness
     for c in range(m):
         most = max(most, stiffness[c])
     for r in range(world.first, world.last):
         i = world.robot[r]
+        least = max(least, world.rods.moment_scale[i] / world.rods.length[i] ** 2)
         for q in range(world.contacts.used[i]):
             kept = max(kept, _FORGETS * world.contacts.contact[i, q].damped_stiffness)
     for c in range(m if most == 0.0 else 0):
@@ -134,6 +135,9 @@ def keep_damping(m: int, world: World, problem: ContactProblem) -> None:
         i = world.robot[r]
         for q in range(world.contacts.used[i]):
             world.contacts.contact[i, q].damped_stiffness = max(most, kept)
+    for c in range(m):
+        if problem.force[3 * c] > 0.0:
+            stiffness[c] = max(stiffness[c], least)
 
 
 @kernel
@@ -173,7 +177,8 @@ def stiffen_model(n: int, m: int, damping: float, problem: ContactProblem) -> No
 
 @kernel
 def add_turned_forces(n: int, m: int, damping: float, problem: ContactProblem) -> None:
-    """Add to the change of forces what the motion under it turns; overwrites `problem.force`."""
+    """Add to the change of forces what the motion under it turns; what is open carries nothing. Overwrites
+    `problem.place`."""
     for c in range(m):
         g, h = problem.point[c, 0], problem.point[c, 1]
         v = moved(n, problem.model, g, problem.change)
@@ -182,9 +187,10 @@ def add_turned_forces(n: int, m: int, damping: float, problem: ContactProblem) -
         for a in range(3):
             row = problem.turned[c, a]
             along = row[0] * v[0] + row[1] * v[1] + row[2] * v[2]
-            problem.force[3 * c + a] = along - damping * problem.stiffness[c] * v[a]
+            change = along - damping * problem.stiffness[c] * v[a]
+            problem.place[c, a] = change if problem.force[3 * c] > 0.0 else 0.0
     for c in range(m):
         for side in range(2):
             g = problem.point[c, side]
             for a in range(3 if g >= 0 else 0):
-                problem.change[3 * g + a] += (1.0 if side == 0 else -1.0) * problem.force[3 * c + a]
+                problem.change[3 * g + a] += (1.0 if side == 0 else -1.0) * problem.place[c, a]

@@ -31,13 +31,15 @@ from ..vec import dot
 from .bvh import Numbers, Record
 from .centreline import curve_of, interval_of, point_at
 from .contact_set import ContactRules, add_walls, choose, force_of, merge, pressed_only, stands, violation
-from .problem import World, rod_search, thread_problem
+from .problem import World, damping_of, rod_search, thread_problem
 from .proximity import ProximityOptions, ProximitySearch, search_obstacles, thread_search_work
 from .rod_proximity import search_rods
 from .solve import solve_contacts
 from .tunnelling import face_entered_sides, moved_far, tunnelled
 
-GOES_ON, AT_REST, LOST = 0, 1, 2
+GOES_ON, AT_REST, LOST, BACK = 0, 1, 2, 3
+"""Of a world after a pass; BACK: a damped iteration went through something, or found no forces, and is to go
+less far."""
 NOTHING, MOVES, UNSOLVED, INSIDE, THROUGH, DIVERGED = 0, 1, 2, 3, 4, 5
 """What keeps a robot from rest: it still moves, its forces do not obey the law, the rod is inside of
 something, it went through something, its numbers are no numbers."""
@@ -48,6 +50,7 @@ _LONGEST_MOVE = 0.05  # of the rod's length, of a contact point
 _KEPT = 0.2
 # of an integration step: candidates of one obstacle nearer than this are one
 _SAME_PLACE = 0.05
+_NO_FORCE = 1e-12  # of the largest: what rounding leaves of a force that is gone
 _EVERYWHERE = 1.0  # a margin beyond the rod's length asks for the smallest gap, wherever it is
 
 
@@ -201,14 +204,15 @@ def _search_world(world: World, problem: ContactProblem, work: SearchWork, troub
 
 @kernel
 def _went_through(world: World, stack: Numbers, trouble: Records) -> bool:
-    """Whether a robot of the world went through an obstacle since the last step; notes what."""
+    """Whether a robot of the world went through an obstacle since the shape before; notes what."""
     through = False
     for r in range(world.first, world.last):
         i, k, s = world.robot[r], -1, 0.0
         if world.motion.tracked[i]:
             k, s = tunnelled(i, world.motion, world.rods.first[i], world.surfaces, stack)
         through = through or k >= 0
-        _write(trouble[i], THROUGH if k >= 0 else NOTHING, k, s, 0.0)
+        if k >= 0:
+            _write(trouble[i], THROUGH, k, s, 0.0)
     return through
 
 
@@ -216,11 +220,17 @@ def _went_through(world: World, stack: Numbers, trouble: Records) -> bool:
 def _take_step(fraction: float, world: World, problem: ContactProblem, x: Floats) -> None:
     """Move by this fraction to the proposed forces and the closed boundary."""
     for r in range(world.first, world.last):
-        i, o = world.robot[r], r - world.first
+        i, o, most = world.robot[r], r - world.first, 0.0
         for q in range(world.contacts.used[i]):
             force, applied = world.contacts.contact[i, q].force, world.loads.force[r, q]
             for a in range(3):
                 force[a] = applied[a] + fraction * (problem.proposed[o, q, a] - applied[a])
+                most = max(most, abs(force[a]))
+        for q in range(world.contacts.used[i]):
+            force = world.contacts.contact[i, q].force
+            for a in range(3):
+                if abs(force[a]) <= _NO_FORCE * most:
+                    force[a] = 0.0
         for a in range(world.loads.unknown.shape[1]):
             x[i, a] += fraction * problem.unknown[o, a]
 
@@ -272,11 +282,20 @@ def _iterate_world(world: World, rows: ContactRows, problem: ContactProblem, wor
         for r in range(world.first, world.last):
             i = world.robot[r]
             solved = solved and stands(used[i], contacts[i], tolerance)
-    if solved and farthest <= tolerance and worst <= tolerance:
-        through = _went_through(world, work.stack, rows.trouble)
+    for r in range(world.first, world.last):
+        rows.trouble[world.robot[r]].from_rest = max(farthest, worst)
+    rest = solved and farthest <= tolerance and worst <= tolerance
+    damped = damping_of(world) > 0.0
+    through = (rest or damped) and _went_through(world, work.stack, rows.trouble)
+    if rest:
         for r in range(world.first, world.last):
             i = world.robot[r]
+            if rows.trouble[i].cause != THROUGH:
+                _write(rows.trouble[i], NOTHING, -1, 0.0, 0.0)
             used[i] = pressed_only(used[i], contacts[i])
+    if damped and (through or not solved):
+        return BACK
+    if rest:
         return LOST if through else AT_REST
     _take_step(fraction, world, problem, rows.x)
     for r in range(world.first, world.last):

@@ -129,6 +129,15 @@ def node_position(world: World, i: int, node: int) -> Vec:
     return row[0], row[1], row[2]
 
 
+@inline
+def damping_of(world: World) -> float:
+    """The largest of the world's robots."""
+    most = 0.0
+    for r in range(world.first, world.last):
+        most = max(most, world.motion.damping[world.robot[r]])
+    return most
+
+
 @kernel
 def row_of_robot(robot: int, world: World) -> int:
     """The row that holds this robot; -1 if none does."""

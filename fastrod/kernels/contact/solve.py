@@ -12,7 +12,7 @@ from .bvh import Numbers
 from .contact_law import ContactLaw, contact_forces
 from .geometric_stiffness import add_turned_forces, geometric_stiffness, keep_damping, stiffen_model
 from .mobility import axis_of
-from .problem import World, row_of_robot
+from .problem import World, damping_of, row_of_robot
 from .rod_proximity import partner_of
 
 
@@ -51,7 +51,7 @@ def _propose(world: World, problem: ContactProblem) -> None:
 def solve_contacts(world: World, stack: Numbers, problem: ContactProblem) -> bool:
     """Forces that the law asks for on the linear model, into `problem.proposed`; whether it could be
     solved."""
-    damping = world.motion.damping
+    damping = damping_of(world)
     n = assemble_model(world, problem)
     m = _measure_all(world, stack, problem)
     if m == 0:  # no contacts, or such as have lost their other side

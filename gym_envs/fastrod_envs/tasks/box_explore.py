@@ -88,7 +88,7 @@ class BoxExplore(HostedTask):
     name = "BoxExplore"
     n_steps: ClassVar[int] = 40
     n_draws: ClassVar[int] = 14
-    accuracy: ClassVar[float] = 0.01
+    accuracy: float = 0.01
     duration: ClassVar[float] = 2.0
     options_class: ClassVar[type[EnvOptions]] = BoxExploreOptions
 
@@ -157,7 +157,7 @@ class _Inside(Cell):
     def __init__(self, task: BoxExplore) -> None:
         self.box, self.camera, self.at_once = Box(), task.camera, task.options.action == "displacement"
         self.accuracy, self.dt = task.accuracy, task.dt
-        self.n_parts = max(1, math.ceil(task.dt / STEP - 1e-9))
+        self.n_substeps = max(1, math.ceil(task.dt / STEP - 1e-9))
         self.world = connect()
         self.walls, self.cubes = self.box.build(self.world)
         self.arm = BulletArm.load(self.world, ur5_path(), tip="tool0")
@@ -167,7 +167,7 @@ class _Inside(Cell):
         robot = task.base_robot
         self.soft = SoftArm(
             robot,
-            dt=task.dt / self.n_parts,
+            dt=task.dt / self.n_substeps,
             points_per_segment=_POINTS,
             largest_bend=LARGEST_BEND,
             bend_rate=BEND_RATE,
@@ -201,8 +201,8 @@ class _Inside(Cell):
         if self.at_once:
             soft.settle(0.5 * (soft.lower + soft.upper) + 0.5 * (soft.upper - soft.lower) * action)
             gap = self._clearance()
-        for _ in range(0 if self.at_once else self.n_parts):
-            soft.drive(soft.action + duration / self.n_parts * soft.rate * action)
+        for _ in range(0 if self.at_once else self.n_substeps):
+            soft.drive(soft.action + duration / self.n_substeps * soft.rate * action)
             gap = min(gap, self._clearance())
             if gap < 0.0:
                 break
@@ -272,10 +272,10 @@ class _Inside(Cell):
         to = soft.action + STEP * rates
         return np.asarray((2.0 * to - soft.lower - soft.upper) / np.maximum(soft.upper - soft.lower, 1e-12))
 
-    def scenery(self) -> Backdrop:
+    def backdrop(self) -> Backdrop:
         solids = []
-        for part in self.box.parts():
-            c, s = math.cos(part.turn), math.sin(part.turn)
+        for part in self.box.pieces():
+            c, s = math.cos(part.angle), math.sin(part.angle)
             turn = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
             solids.append(solid_box(part.middle, part.half, part.color[:3], turn, 0.2))
         solids += [solid_box(self.box.cube_at(k), [0.5 * self.box.cube] * 3, COLORS[k]) for k in self.cubes]

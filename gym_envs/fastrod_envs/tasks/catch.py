@@ -30,12 +30,12 @@ NEAR = 0.05
 PACE = 0.2
 """Speed at which the baseline expects the tip to go [m/s]."""
 _DRIVEN = (1, 2, 4, 5, 3)  # both bends of both segments, then the extension of the second
-_PART = 0.7  # of the ranges: where crossing points lie
+_INNER = 0.7  # of the ranges: where crossing points lie
 _STEP = 1e-6  # m, of the arcs' Jacobian
 
 
 def standing_robot() -> Robot:
-    """Two weightless segments that stand upright on the origin, three wires each."""
+    """Two weightless segments that stand upright on the origin, three tendons each."""
     segments = tuple(
         Segment(
             length=SEGMENT,
@@ -75,7 +75,7 @@ class Catch(RodTask):
     name = "Catch"
     n_steps: ClassVar[int] = 40
     n_draws: ClassVar[int] = 12
-    accuracy: ClassVar[float] = 0.01
+    accuracy: float = 0.01
     points_per_segment = 4
     loaded = True
     dt = 0.05
@@ -98,16 +98,16 @@ class Catch(RodTask):
         self.least: Floats = np.full(n_envs, np.inf)
         """(n_envs,) the least distance of the episode [m]."""
         self._path: Floats = np.zeros((n_envs, 2, 3))
-        reach = self.base_robot.length + EXTENSION[1] + 0.05
+        span = self.base_robot.length + EXTENSION[1] + 0.05
         self._time = self.dt * (options.n_steps or self.n_steps)
-        far = reach + FASTEST * self._time
+        far = span + FASTEST * self._time
         self.goals = (
             Field("target", "m", (-far,) * 3, (far,) * 3, "where it is, world"),
             Field("velocity", "m/s", (-FASTEST,) * 3, (FASTEST,) * 3, "of the target, world"),
         )
         self.states = (
             *self.goals,
-            Field("tip", "m", (-reach,) * 3, (reach,) * 3, "where it is measured, world"),
+            Field("tip", "m", (-span,) * 3, (span,) * 3, "where it is measured, world"),
             Field("direction", "", (-1.0,) * 3, (1.0,) * 3, "of the tip's tangent, world"),
             Field("error", "m", (-NEAR,) * 3, (NEAR,) * 3, f"from tip to target, at most {NEAR:g} m of it"),
             Field("posture", "", (-1.0,) * 5, (1.0,) * 5, "displacements, from their least to their largest"),
@@ -123,7 +123,7 @@ class Catch(RodTask):
         )
         self.start(rows, draws)
         low, high = self._limit.T
-        posture = ease * _PART * (0.5 * (low + high) + (draws[:, 3:8] - 0.5) * (high - low))
+        posture = ease * _INNER * (0.5 * (low + high) + (draws[:, 3:8] - 0.5) * (high - low))
         speed = SLOWEST + ease * draws[:, 8:9] * (FASTEST - SLOWEST)
         self.velocity[rows] = speed * directions(draws[:, 9:11])
         when = np.maximum(self.dt, (0.4 + 0.4 * draws[:, 11:12]) * self._time)
@@ -169,12 +169,12 @@ class Catch(RodTask):
         soon = (along + np.sqrt(along**2 + lead * square)) / lead
         velocity = (away + soon[:, None] * v) / np.maximum(soon, 2.0 * self.dt)[:, None]
         jacobian, posture = arcs_jacobian(self.displacement), self.posture()
-        asked = self.toward(velocity, jacobian)
-        pushes = asked if self.options.action == "rate" else asked - posture
+        wanted = self.toward(velocity, jacobian)
+        pushes = wanted if self.options.action == "rate" else wanted - posture
         stuck = (np.abs(posture) > 0.999) & (posture * pushes > 0.0)
         return self.toward(velocity, np.where(stuck[:, None, :], 0.0, jacobian))
 
-    def scenery(self, i: int) -> Backdrop:
+    def backdrop(self, i: int) -> Backdrop:
         return Backdrop(
             tubes=(self.tube(i),),
             balls=(Ball(self.desired[i], self.accuracy, (0.85, 0.2, 0.15)),),
@@ -203,13 +203,13 @@ def arcs_tip(displacement: Floats) -> Floats:
     bend = np.hypot(a, b)
     sine, versine = np.sinc(bend / np.pi), 0.5 * np.sinc(0.5 * bend / np.pi) ** 2
     along = a * x + b * y  # turned about (-b, a, 0) by the bend (Rodrigues)
-    turned = (
+    rotated = (
         x + a * (sine * z - versine * along),
         y + b * (sine * z - versine * along),
         z * np.cos(bend) - sine * along,
     )
     return np.stack(
-        [p + q for p, q in zip(_arc(a, b, np.full(len(a), SEGMENT)), turned, strict=True)], axis=1
+        [p + q for p, q in zip(_arc(a, b, np.full(len(a), SEGMENT)), rotated, strict=True)], axis=1
     )
 
 

@@ -33,7 +33,7 @@ START_BEND = 0.2
 """Of each segment at the start, either way [rad]."""
 SPEED = 0.1
 """Largest of a tip along x, y and z [m/s]."""
-REACH = ((-0.11, -0.1, HEIGHT - 0.1), (-0.01, 0.1, HEIGHT + 0.1))
+WORKSPACE = ((-0.11, -0.1, HEIGHT - 0.1), (-0.01, 0.1, HEIGHT + 0.1))
 """Where the first tip may be sent, world [m]; the second's range is its mirror image."""
 EXTENSION, LARGEST_BEND = 0.03, 1.2
 """Of a segment, either way [m], [rad]."""
@@ -46,7 +46,7 @@ NEAR = 0.05
 _HEAD = RADIUS + 0.0025  # m
 _HOLD = _HEAD + BALL  # m, from a tip to the middle of a ball that it touches
 _FALLEN = 0.15  # m, below the bases
-_PART, _DT = 0.05, 0.01  # s, longest step of the soft robots, of the world
+_SUBSTEP, _DT = 0.05, 0.01  # s, longest step of the soft robots, of the world
 _MASS = 0.005  # kg
 _POINTS = 5
 _SIDES = (-1.0, 1.0)
@@ -78,11 +78,11 @@ class DualArm(HostedTask):
     name = "DualArm"
     n_steps: ClassVar[int] = 40
     n_draws: ClassVar[int] = 11
-    accuracy: ClassVar[float] = 0.01
+    accuracy: float = 0.01
     duration: ClassVar[float] = 4.0
 
     def __init__(self, n_envs: int, options: EnvOptions) -> None:
-        grips = Field("grips", "", (-1.0, -1.0), (1.0, 1.0), "of both heads, on above 0")
+        grasps = Field("grips", "", (-1.0, -1.0), (1.0, 1.0), "of both heads, on above 0")
         low, high = tips_range()
         if options.action == "rate":
             moves = Field(
@@ -133,7 +133,7 @@ class DualArm(HostedTask):
             ),
         )
         robot = soft_robot("passer", 2, extension=EXTENSION, line_density=0.03)
-        super().__init__(n_envs, options, robot, (moves, grips), states, goals)
+        super().__init__(n_envs, options, robot, (moves, grasps), states, goals)
 
     def cell(self) -> Cell:
         return _Pair(self)
@@ -141,7 +141,7 @@ class DualArm(HostedTask):
 
 def tips_range() -> tuple[Floats, Floats]:
     """(2, 3) least and largest places of both tips, world [m]."""
-    (x, y, z), (a, b, c) = REACH
+    (x, y, z), (a, b, c) = WORKSPACE
     return np.array([(x, y, z), (-a, y, z)]), np.array([(a, b, c), (-x, b, c)])
 
 
@@ -150,16 +150,16 @@ class _Pair(Cell):
 
     def __init__(self, task: DualArm) -> None:
         self.at_once, self.accuracy = task.options.action == "displacement", task.accuracy
-        self.n_parts = max(1, math.ceil(task.dt / _PART - 1e-9))
-        self.n_steps = max(1, math.ceil(task.dt / self.n_parts / _DT - 1e-9))
-        self.step = task.dt / (self.n_parts * self.n_steps)
+        self.n_substeps = max(1, math.ceil(task.dt / _SUBSTEP - 1e-9))
+        self.n_steps = max(1, math.ceil(task.dt / self.n_substeps / _DT - 1e-9))
+        self.step = task.dt / (self.n_substeps * self.n_steps)
         self.low, self.high = tips_range()
         self.world, self.shown = connect(dt=self.step), connect()
         robot = task.base_robot
         self.softs = [
             SoftArm(
                 robot,
-                dt=task.dt / self.n_parts,
+                dt=task.dt / self.n_substeps,
                 points_per_segment=_POINTS,
                 largest_bend=LARGEST_BEND,
                 bend_rate=BEND_RATE,
@@ -196,36 +196,36 @@ class _Pair(Cell):
         b.setGravity(0.0, 0.0, -9.81)
         b.setTimeStep(self.step)
         self.ball, self.heads = _furnish(b)
-        self.told, self.held = [False, False], [False, False]
+        self.commanded, self.held = [False, False], [False, False]
         self._holds = [np.zeros(3), np.zeros(3)]
         for soft, head in zip(self.softs, self.heads, strict=True):
             head.place(soft.tip, quaternion_from_matrix(soft.tip_rotation))
         first = self.softs[0]
         place = first.tip + (_HOLD + 2e-4) * first.tip_rotation[:, 2]
         b.resetBasePositionAndOrientation(self.ball, place.tolist(), [0.0, 0.0, 0.0, 1.0])
-        self.told[0] = True
+        self.commanded[0] = True
         self._take()
         self._look()
         if not self.held[0]:
             raise HostError("the first robot does not hold the ball at the start of the episode.")
 
     def act(self, action: Floats, duration: float) -> None:
-        moves, part = action[:6].reshape(2, 3), duration / self.n_parts
+        moves, substep = action[:6].reshape(2, 3), duration / self.n_substeps
         for k, head in enumerate(self.heads):
-            self.told[k] = bool(action[6 + k] > 0.0)
-            if not self.told[k] and self.held[k]:
+            self.commanded[k] = bool(action[6 + k] > 0.0)
+            if not self.commanded[k] and self.held[k]:
                 head.release()
                 self.held[k] = False
-        for _ in range(self.n_parts):
+        for _ in range(self.n_substeps):
             for k, soft in enumerate(self.softs):
                 velocity = SPEED * moves[k]
                 if self.at_once:
                     to = 0.5 * (self.low[k] + self.high[k]) + 0.5 * (self.high[k] - self.low[k]) * moves[k]
-                    velocity = np.clip((to - soft.tip) / part, -SPEED, SPEED)
+                    velocity = np.clip((to - soft.tip) / substep, -SPEED, SPEED)
                 jacobian = soft.jacobian()[:3] * soft.rate
                 rates = resolved(jacobian[None], velocity[None], -soft.posture()[None])[0]
-                soft.drive(soft.action + part * soft.rate * rates)
-            self._advance(part)
+                soft.drive(soft.action + substep * soft.rate * rates)
+            self._advance(substep)
             self._look()
             self._slip()
             if self._over():
@@ -270,7 +270,7 @@ class _Pair(Cell):
                 short(self.place - second.tip, NEAR),
                 short(self.goal_at - self.place, NEAR),
                 [min(max(self._gap, -NEAR), NEAR)],
-                self.told,
+                self.commanded,
                 self.held,
                 first.posture(),
                 second.posture(),
@@ -281,7 +281,7 @@ class _Pair(Cell):
         return self.goal_at
 
     def baseline(self) -> Floats:
-        grips = [0.0 if self.held[1] else 1.0, 1.0]
+        grasps = [0.0 if self.held[1] else 1.0, 1.0]
         if self.held[1]:
             velocity = np.zeros((2, 3))
             if not self.held[0]:
@@ -289,19 +289,19 @@ class _Pair(Cell):
                 velocity[1] = 4.0 * (self.goal_at - self.place)
         else:
             to_meet = 3.0 * (np.array([0.0, 0.0, HEIGHT]) - self.place)
-            way = self.place - self.softs[1].tip
-            aside = float(np.hypot(way[1], way[2]))
-            way[0] += _HOLD - 0.002 + min(0.03, max(0.0, 2.0 * (aside - 0.004)))
-            velocity = np.stack([to_meet, to_meet + 4.0 * way])
+            to_place = self.place - self.softs[1].tip
+            aside = float(np.hypot(to_place[1], to_place[2]))
+            to_place[0] += _HOLD - 0.002 + min(0.03, max(0.0, 2.0 * (aside - 0.004)))
+            velocity = np.stack([to_meet, to_meet + 4.0 * to_place])
         velocity = np.clip(velocity, -SPEED, SPEED)
         if not self.at_once:
             moves = velocity / SPEED
         else:
             to = np.stack([soft.tip for soft in self.softs]) + 0.1 * velocity
             moves = (2.0 * to - self.low - self.high) / (self.high - self.low)
-        return np.array([*moves.ravel(), *(2.0 * np.array(grips) - 1.0)])
+        return np.array([*moves.ravel(), *(2.0 * np.array(grasps) - 1.0)])
 
-    def scenery(self) -> Backdrop:
+    def backdrop(self) -> Backdrop:
         return Backdrop(
             tubes=tuple(
                 Tube(soft.nodes, RADIUS, color) for soft, color in zip(self.softs, _COLORS, strict=True)
@@ -348,7 +348,7 @@ class _Pair(Cell):
     def _take(self) -> None:
         """Heads that are told to hold, and touch the ball, hold it."""
         for k, head in enumerate(self.heads):
-            if self.told[k] and not self.held[k] and head.attach(()) is not None:
+            if self.commanded[k] and not self.held[k] and head.attach(()) is not None:
                 self.held[k] = True
                 self._holds[k] = self._seen_from(head)
 

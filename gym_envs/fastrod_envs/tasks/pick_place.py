@@ -12,7 +12,7 @@ import numpy as np
 from fastrod.errors import InputError
 from fastrod.hosts import Bullet, BulletArm, BulletLink, HostCamera, connect
 from fastrod.hosts.bodies import RodBodies
-from fastrod.hosts.capsules import turn_between
+from fastrod.hosts.capsules import rotation_between
 from fastrod.hosts.gripper import Gripper
 from fastrod.hosts.link import from_xyzw, to_xyzw
 from fastrod.model.robot import Robot
@@ -50,7 +50,7 @@ _HEAD = RADIUS + 0.0025  # m
 _ABOVE = {"suction": 0.0, "gripper": 0.003}  # m, least from the head to the top of a cube on the table
 _HIGH = 0.16  # m, of the tip's range above that
 _RANGE = ((0.36, 0.64), (-0.26, 0.26))  # m, of the tip in x and y
-_PART, _DT = 0.05, 0.01  # s, longest step of arm and soft robot, of the world
+_SUBSTEP, _DT = 0.05, 0.01  # s, longest step of arm and soft robot, of the world
 _MASS, _TABLE = 0.05, ((0.5, 0.0, TOP - 0.01), (0.2, 0.32, 0.01))  # kg; middle and half size
 # world_from_tip without weight; it bends toward d1, world -y
 _DOWN = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -95,7 +95,7 @@ class PickPlace(HostedTask):
     name = "PickPlace"
     n_steps: ClassVar[int] = 60
     n_draws: ClassVar[int] = 5
-    accuracy: ClassVar[float] = 0.02
+    accuracy: float = 0.02
     duration: ClassVar[float] = 6.0
     options_class: ClassVar[type[EnvOptions]] = PickPlaceOptions
 
@@ -169,9 +169,9 @@ class _Table(Cell):
             task.options.action == "displacement",
             task.accuracy,
         )
-        self.n_parts = max(1, math.ceil(task.dt / _PART - 1e-9))
-        self.n_steps = max(1, math.ceil(task.dt / self.n_parts / _DT - 1e-9))
-        self.step = task.dt / (self.n_parts * self.n_steps)
+        self.n_substeps = max(1, math.ceil(task.dt / _SUBSTEP - 1e-9))
+        self.n_steps = max(1, math.ceil(task.dt / self.n_substeps / _DT - 1e-9))
+        self.step = task.dt / (self.n_substeps * self.n_steps)
         self.low, self.high = tip_range(task.grip)
         self.above = np.array([0.0, 0.0, 0.5 * SIDE + _HEAD + _ABOVE[task.grip]])
         self.width = WIDTH if task.grip == "gripper" else 0.0
@@ -187,7 +187,7 @@ class _Table(Cell):
         robot = task.base_robot
         self.soft = SoftArm(
             robot,
-            dt=task.dt / self.n_parts,
+            dt=task.dt / self.n_substeps,
             points_per_segment=_POINTS,
             largest_bend=0.5 * BEND,
             bend_rate=BEND_RATE,
@@ -216,31 +216,35 @@ class _Table(Cell):
         b.setTimeStep(self.step)
         self.cube, _, self.gripper = _furnish(b, self.width)
         b.resetBasePositionAndOrientation(self.cube, [*start, z], [0.0, 0.0, 0.0, 1.0])
-        self.told = self.held = False
+        self.commanded = self.held = False
         self._head = self.soft.tip, quaternion_from_matrix(self.soft.tip_rotation)
         self.gripper.place(*self._head)
         self._look()
         self._first = float(np.linalg.norm(self.place - self.spot))
 
     def act(self, action: Floats, duration: float) -> None:
-        velocity, bend_rate, part = SPEED * action[:3], BEND_RATE * float(action[3]), duration / self.n_parts
+        velocity, bend_rate, substep = (
+            SPEED * action[:3],
+            BEND_RATE * float(action[3]),
+            duration / self.n_substeps,
+        )
         to, bend = (
             0.5 * (self.low + self.high) + 0.5 * (self.high - self.low) * action[:3],
             BEND * float(action[3]),
         )
-        self._tell(bool(action[4] > 0.0))
-        for _ in range(self.n_parts):
+        self._command(bool(action[4] > 0.0))
+        for _ in range(self.n_substeps):
             if self.at_once:
-                velocity = np.clip((to - self.soft.tip) / part, -SPEED, SPEED)
-                bend_rate = min(max((bend - self.bend) / part, -BEND_RATE), BEND_RATE)
-            self._move(velocity, bend_rate, part)
+                velocity = np.clip((to - self.soft.tip) / substep, -SPEED, SPEED)
+                bend_rate = min(max((bend - self.bend) / substep, -BEND_RATE), BEND_RATE)
+            self._move(velocity, bend_rate, substep)
         self._look()
 
     def result(self) -> HostedResult:
         distance = float(np.linalg.norm(self.place - self.spot))
         there, fell = distance < self.accuracy, bool(self.place[2] < TOP - 0.02)
         grasp = float(np.linalg.norm(self.place + self.above - self.soft.tip))
-        success = there and not self.held and not self.told and self.speed < REST
+        success = there and not self.held and not self.commanded and self.speed < REST
         return HostedResult(
             terms={
                 "reach": 0.2 if self.held or there else 0.2 * math.exp(-grasp / 0.05),
@@ -260,7 +264,9 @@ class _Table(Cell):
     def state(self) -> Floats:
         soft = self.soft
         low, high = _cube_range()
-        opening = min(max(self.gripper.width / self.width, 0.0), 1.0) if self.width else float(not self.told)
+        opening = (
+            min(max(self.gripper.width / self.width, 0.0), 1.0) if self.width else float(not self.commanded)
+        )
         return np.concatenate(
             [
                 self.spot,
@@ -269,7 +275,7 @@ class _Table(Cell):
                 soft.tip_rotation[:, 2],
                 short(self.place + self.above - soft.tip, NEAR),
                 short(self.spot - self.place, NEAR),
-                [self.bend, self.told, opening, self.held],
+                [self.bend, self.commanded, opening, self.held],
             ]
         )
 
@@ -279,7 +285,7 @@ class _Table(Cell):
     def baseline(self) -> Floats:
         left = self.spot - self.place
         aside = float(np.hypot(left[0], left[1]))
-        way = self.place + self.above - self.soft.tip
+        displacement = self.place + self.above - self.soft.tip
         if self.held:  # up, across, and down within a funnel around the spot
             low = -float(left[2])
             want = min(LIFT, 3.0 * max(0.0, aside - 0.006))
@@ -289,9 +295,9 @@ class _Table(Cell):
         elif aside < 0.015:
             velocity, grip = np.array([0.0, 0.0, LIFT]), -1.0
         else:
-            off, high = float(np.hypot(way[0], way[1])), -float(way[2])
+            off, high = float(np.hypot(displacement[0], displacement[1])), -float(displacement[2])
             want = min(LIFT, 3.0 * max(0.0, off - 0.004))
-            velocity = np.array([way[0], way[1], want - PRESS - high])
+            velocity = np.array([displacement[0], displacement[1], want - PRESS - high])
             grip = (
                 min(0.006 - off, 0.004 - high) / 0.002 if self.width else min(0.03 - off, 0.04 - high) / 0.01
             )
@@ -303,14 +309,14 @@ class _Table(Cell):
         to = 2.0 * (self.soft.tip + 0.1 * velocity - self.low) / (self.high - self.low) - 1.0
         return np.array([*to, (self.bend + 0.1 * bend_rate) / BEND, grip])
 
-    def scenery(self) -> Backdrop:
+    def backdrop(self) -> Backdrop:
         self._pose()
-        turn = matrix_from_quaternion(self._turn[None])[0]
-        solids = [solid_box(*_TABLE, _WOOD), solid_box(self.place, [0.5 * SIDE] * 3, _ORANGE, turn)]
+        orientation = matrix_from_quaternion(self._orientation[None])[0]
+        solids = [solid_box(*_TABLE, _WOOD), solid_box(self.place, [0.5 * SIDE] * 3, _ORANGE, orientation)]
         rotation = self.soft.tip_rotation
         for finger in self.gripper.fingers:
             side = self.world.getJointState(self.gripper.body, finger)[0] * (1.0 if finger == 0 else -1.0)
-            half = np.array([0.003, 0.01, 0.5 * self.gripper.reach])
+            half = np.array([0.003, 0.01, 0.5 * self.gripper.length])
             solids.append(
                 solid_box(self.soft.tip + rotation @ [side, 0.0, half[2]], half, (0.25, 0.25, 0.28), rotation)
             )
@@ -337,12 +343,14 @@ class _Table(Cell):
     def _move(self, velocity: Floats, bend_rate: float, duration: float) -> None:
         """One step of arm and soft robot, and those of the world meanwhile."""
         tip = self.soft.tip
-        way = np.clip(tip + duration * velocity, self.low, self.high) - tip
+        displacement = np.clip(tip + duration * velocity, self.low, self.high) - tip
         length = self.soft.actions.robot.length
         before = _flange(np.zeros(3), self.bend, length)[:3]
         self.bend = min(max(self.bend + duration * bend_rate, -BEND), BEND)
         wanted = _flange(np.zeros(3), self.bend, length)
-        at = self.flange[:3] + np.clip(way, -SPEED * duration, SPEED * duration) + wanted[:3] - before
+        at = (
+            self.flange[:3] + np.clip(displacement, -SPEED * duration, SPEED * duration) + wanted[:3] - before
+        )
         self.flange = np.concatenate([at, wanted[3:]])
         self._follow()
         self.soft.drive(self._action(), self._base())
@@ -351,7 +359,7 @@ class _Table(Cell):
         for _ in range(self.n_steps):
             self.gripper.drive(self.step)
             self.world.stepSimulation()
-            if self.told and not self.held and not self.width:
+            if self.commanded and not self.held and not self.width:
                 self.held = self.gripper.attach(()) is not None
         self.gripper.place(*head)
         self._head = head
@@ -360,7 +368,7 @@ class _Table(Cell):
         """The joints, by resolved rates toward the flange's pose."""
         now = self.arm.frame(self.q)
         error = np.concatenate(
-            [self.flange[:3] - now[:3], turn_between(now[None, 3:], self.flange[None, 3:])[0]]
+            [self.flange[:3] - now[:3], rotation_between(now[None, 3:], self.flange[None, 3:])[0]]
         )
         jacobian = self.arm.jacobian(self.q)
         step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + 1e-6 * np.eye(6), error)
@@ -377,10 +385,10 @@ class _Table(Cell):
         """(6,) of the soft robot: both segments share the bend [m]."""
         return np.ravel([(0.0, 0.5 * self.bend * offset, 0.0) for offset in self.soft.actions.offset])
 
-    def _tell(self, on: bool) -> None:
-        if on == self.told:
+    def _command(self, on: bool) -> None:
+        if on == self.commanded:
             return
-        self.told = on
+        self.commanded = on
         if self.width:
             self.gripper.open_to(0.0 if on else 1.0)
         elif not on:
@@ -390,12 +398,12 @@ class _Table(Cell):
     def _look(self) -> None:
         """Where the cube is, how fast, and whether the fingers hold it."""
         b = self.world
-        place, turn = b.getBasePositionAndOrientation(self.cube)
-        self.place, self._turn = np.array(place), from_xyzw(turn)
+        place, orientation = b.getBasePositionAndOrientation(self.cube)
+        self.place, self._orientation = np.array(place), from_xyzw(orientation)
         self.speed = float(np.linalg.norm(b.getBaseVelocity(self.cube)[0]))
         if self.width:
             fingers = self.gripper.fingers
-            self.held = self.told and all(
+            self.held = self.commanded and all(
                 b.getContactPoints(self.gripper.body, self.cube, finger, -1) for finger in fingers
             )
 
@@ -405,7 +413,9 @@ class _Table(Cell):
         self.arm.place(self.q)
         self.bracket.follow()
         self.bodies.place(self.soft.nodes, self.soft.rotations)
-        b.resetBasePositionAndOrientation(self.shown_cube, self.place.tolist(), to_xyzw(self._turn).tolist())
+        b.resetBasePositionAndOrientation(
+            self.shown_cube, self.place.tolist(), to_xyzw(self._orientation).tolist()
+        )
         b.resetBasePositionAndOrientation(
             self.shown_spot, [*self.spot[:2], TOP + 0.0002], [0.0, 0.0, 0.0, 1.0]
         )
@@ -425,8 +435,10 @@ def _flange(tip: Floats, bend: float, length: float) -> Floats:
         (length * (1.0 - c) / bend, length * s / bend) if abs(bend) > 1e-4 else (0.5 * length * bend, length)
     )
     # world_from_flange: the rod's axes are the flange's
-    turn = _DOWN @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]).T
-    return np.concatenate([tip - turn @ [x, 0.0, z + ADAPTER], quaternion_from_matrix(turn[None])[0]])
+    orientation = _DOWN @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]).T
+    return np.concatenate(
+        [tip - orientation @ [x, 0.0, z + ADAPTER], quaternion_from_matrix(orientation[None])[0]]
+    )
 
 
 def _furnish(b: Bullet, width: float) -> tuple[int, int, Gripper]:

@@ -38,7 +38,8 @@ class Push(PushTask):
 
     Reward: exp(-50 d^2), and 0.5 once the robot has touched the cube in this episode; d is the distance of
     the cube's middle from its goal in the plane [m]. Success: d below 20 mm. An episode has 40 steps of 0.1 s
-    and does not end before. Baseline: as in QuadrupedPush; it ends within a centimetre, farthest off for
+    and does not end before.
+    Baseline: as in QuadrupedPush; it ends within a centimetre, farthest off for
     goals at the side, where the bar slips.
 
     The paper's goals (x 0.1 to 0.2 m, y -0.3 to 0.3 m) lie mostly beside the cube, where a robot that stands
@@ -51,7 +52,7 @@ class Push(PushTask):
     def __init__(self, n_envs: int, options: EnvOptions) -> None:
         super().__init__(n_envs, options, course())
 
-    def backdrop(self) -> Bullet:
+    def picture_world(self) -> Bullet:
         world = connect()
         floor(world)
         plate = world.createVisualShape(

@@ -27,10 +27,10 @@ def course() -> Course:
     pose = mount.motion().pose
     world.disconnect()
     c, s = math.cos(PITCH), math.sin(PITCH)
-    turn = quaternion_from_matrix(np.array([[-s, 0.0, c], [0.0, -1.0, 0.0], [c, 0.0, s]]))
+    quaternion = quaternion_from_matrix(np.array([[-s, 0.0, c], [0.0, -1.0, 0.0], [c, 0.0, s]]))
     robot = longer(neck(3), 0.14, (-0.04, 0.05))
     robot = replace(
-        robot, base_position=(float(pose[0]), 0.0, float(pose[2])), base_quaternion=tuple(turn.tolist())
+        robot, base_position=(float(pose[0]), 0.0, float(pose[2])), base_quaternion=tuple(quaternion.tolist())
     )
     return Course(robot=robot, place=(0.42, 0.0), least=(0.55, -0.1), largest=(0.7, 0.1), steepness=300.0)
 
@@ -48,14 +48,15 @@ class QuadrupedPush(PushTask):
 
     Reward: exp(-300 d^2), and 0.5 once the neck has touched the cube in this episode; d is the distance of
     the cube's middle from its goal in the plane [m]. Success: d below 20 mm. An episode has 40 steps of 0.1 s
-    and does not end before. Baseline: the tip goes straight along the way that the cube has to go, by damped
+    and does not end before.
+    Baseline: the tip goes straight along the way that the cube has to go, by damped
     resolved rates with the simulator's Jacobian. The cube stays on the bar; it ends within a few millimetres.
 
     What is left out: the trunk stands still (a push of 0.12 N does not move 12 kg), so the legs are drawn
     only, and the bar has no weight. The bar pushes the cube as it moves; with the option `feels` the neck
     bends under what the bar felt, 0.3 s later. A rod that touches the cube within steps of 10 ms
-    (`MountedRod(touch=...)`) costs ten times as much, and its round tip does not steer a cube. A controller
-    keeps the bar off the floor.
+    (`MountedRod(contact_bodies=...)`) costs ten times as much, and its round tip does not steer a cube. A
+    controller keeps the bar off the floor.
     """
 
     name = "QuadrupedPush"
@@ -63,5 +64,5 @@ class QuadrupedPush(PushTask):
     def __init__(self, n_envs: int, options: EnvOptions) -> None:
         super().__init__(n_envs, options, course())
 
-    def backdrop(self) -> Bullet:
+    def picture_world(self) -> Bullet:
         return standing(0.005, PITCH)[0]

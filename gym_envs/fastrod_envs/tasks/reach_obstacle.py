@@ -54,37 +54,37 @@ class ReachObstacle(ReachTask):
             Field("clearance", "m", (-SEEN,), (SEEN,), f"of the robot from the bar, at most {SEEN:g} m"),
         )
         self._clearance: Floats = np.full(n_envs, SEEN)
-        self._touches: Flags = np.zeros(n_envs, bool)
+        self._touching_bar: Flags = np.zeros(n_envs, bool)
 
     def begin(self, rows: Ints, draws: Floats) -> None:
         super().begin(rows, draws)
         self._clearance[rows] = self.simulator.clearance()[rows]
-        self._touches[rows] = False
+        self._touching_bar[rows] = False
 
     def act(self, action: Floats) -> None:
         before = self.simulator.state.position
         super().act(action)
         gap = np.nan_to_num(self.simulator.clearance(), nan=SEEN, posinf=SEEN)
-        self._touches = gap < 0.0
+        self._touching_bar = gap < 0.0
         moved = np.sqrt(((self.simulator.state.position - before) ** 2).sum(2).max(1))
         # who may have gone through it within the step
-        jumps = (moved > SIZE[1]) & (gap + self._clearance < moved) & ~self._touches
+        jumps = (moved > SIZE[1]) & (gap + self._clearance < moved) & ~self._touching_bar
         if jumps.any() and self.options.action == "rate":
-            self._touches |= jumps & (self.simulator.swept_clearance(0.002, jumps) < 0.0)
+            self._touching_bar |= jumps & (self.simulator.swept_clearance(0.002, jumps) < 0.0)
         self._clearance = gap
 
     def outcome(self) -> Outcome:
         distance = length(self.tip - self.desired)
-        touches = self._touches
-        terms = {name: np.where(touches, 0.0, term) for name, term in self.rewards(distance).items()}
+        in_contact = self._touching_bar
+        terms = {name: np.where(in_contact, 0.0, term) for name, term in self.rewards(distance).items()}
         return Outcome(
-            terms={**terms, "contact": np.where(touches, -1.0, 0.0)},
+            terms={**terms, "contact": np.where(in_contact, -1.0, 0.0)},
             distance=distance,
-            success=(distance < self.accuracy) & ~touches & ~self.lost,
+            success=(distance < self.accuracy) & ~in_contact & ~self.lost,
             position=self.tip,
             desired=self.desired.copy(),
-            terminated=touches.copy(),
-            contact=touches.copy(),
+            terminated=in_contact.copy(),
+            contact=in_contact.copy(),
             lost=self.lost,
             facts={"clearance": self._clearance.copy()},
         )
@@ -96,7 +96,7 @@ class ReachObstacle(ReachTask):
         weight = np.where(self.driven < 6, 0.1, 1.0)  # the first two segments are beside the bar
         return self.toward((self.desired - self.measured()) / (2.0 * self.dt), weight=weight)
 
-    def scenery(self, i: int) -> Backdrop:
+    def backdrop(self, i: int) -> Backdrop:
         bar = Solid(*box_mesh(SIZE, BAR), (0.55, 0.57, 0.6))
         return Backdrop(
             tubes=(self.tube(i),), balls=(Ball(self.desired[i], 0.012, (0.85, 0.2, 0.15)),), solids=(bar,)

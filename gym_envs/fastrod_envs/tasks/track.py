@@ -61,8 +61,8 @@ class TrackOptions(EnvOptions):
 
 def fields(robot: Robot) -> tuple[tuple[Field, ...], tuple[Field, ...]]:
     """Parts of the goal, and of the state, as they are observed."""
-    reach = 1.2 * robot.length
-    box = (-reach,) * 3, (reach,) * 3
+    span = 1.2 * robot.length
+    box = (-span,) * 3, (span,) * 3
     goals = (
         Field(
             "path", "m", box[0] * 4, box[1] * 4, f"now and {', '.join(map(str, AHEAD))} s ahead, base frame"
@@ -144,9 +144,9 @@ class Track(RodTask):
     name = "Track"
     n_steps: ClassVar[int] = 200
     n_draws: ClassVar[int] = 3
-    accuracy: ClassVar[float] = 5e-4
+    accuracy: float = 5e-4
     options_class: ClassVar[type[EnvOptions]] = TrackOptions
-    points_per_segment: ClassVar[int] = 6
+    points_per_segment: int = 6
     dt = DT
 
     def __init__(self, n_envs: int, options: EnvOptions) -> None:
@@ -158,7 +158,7 @@ class Track(RodTask):
         self._surface = ReachableSurface(self.base_robot, height=self.base_robot.length, radius=RADIUS)
         self.goals, self.states = fields(self.base_robot)
         n = n_envs
-        self._which, self._phase, self._way, self._size = (
+        self._which, self._phase, self._sense, self._size = (
             np.zeros(n, np.int64),
             np.zeros(n),
             np.ones(n),
@@ -174,14 +174,14 @@ class Track(RodTask):
             (draws[:, 0] * len(self._names)).astype(np.int64), len(self._names) - 1
         )
         self._phase[rows] = PERIOD * draws[:, 1]
-        self._way[rows] = np.where(draws[:, 2] < 0.5, 1.0, -1.0)
+        self._sense[rows] = np.where(draws[:, 2] < 0.5, 1.0, -1.0)
         self._size[rows] = self.difficulty
         self._t[rows], self._sums[rows], self._counted[rows] = 0.0, 0.0, 0.0
         self._sight.begin(rows, self._surface.nearest(self.path(0.0)), self.measured())
 
     def path(self, ahead: float) -> Floats:
         """(n_envs, 3) the path so many seconds from now, base frame [m]."""
-        t = self._phase + self._way * (self._t + ahead)
+        t = self._phase + self._sense * (self._t + ahead)
         found = np.zeros((self.n_envs, 3))
         for k, name in enumerate(self._names):
             on = self._which == k
@@ -235,7 +235,7 @@ class Track(RodTask):
         error = self._surface.nearest(self.path(0.0)) - self.measured()
         return self.toward(ahead / self.dt + error / (2.0 * self.dt))
 
-    def scenery(self, i: int) -> Backdrop:
+    def backdrop(self, i: int) -> Backdrop:
         t = np.linspace(0.0, PERIOD, 90)
         line = self._known[self._names[self._which[i]]].position(t) * [self._size[i], self._size[i], 1.0]
         now = Ball(self.path(0.0)[i], 0.0015, (0.85, 0.2, 0.15))

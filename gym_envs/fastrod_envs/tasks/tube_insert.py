@@ -27,7 +27,7 @@ STIFFNESS = 1e-3
 """EI [N m^2]."""
 OFFSET = 0.0015
 """Of the tendons from the backbone [m]."""
-STRAIGHT, TURN, ANGLE = 0.015, 0.07, math.radians(60.0)
+STRAIGHT, BEND_RADIUS, ANGLE = 0.015, 0.07, math.radians(60.0)
 """The tube: length before the turn [m], radius of the turn of its middle [m], and by how much it turns
 [rad]."""
 LUMEN, WALL = 0.0055, 0.003
@@ -56,14 +56,14 @@ SUBSTEPS = 16
 """Steps of the simulator on the way to a displacement."""
 _BENDS = (1, 2, 4, 5)
 LIMIT = np.array([(-0.8 * OFFSET, 0.8 * OFFSET)] * 4 + [(0.0, OUTSIDE + 2.0 * SEGMENT)])
-"""(5, 2) ranges of the displacements of the wires, two a segment, and of the feed [m]."""
+"""(5, 2) ranges of the displacements of the tendons, two a segment, and of the feed [m]."""
 RATE = np.array([0.4 * OFFSET] * 4 + [0.02])
 """(5,) their largest rates [m/s]."""
 _SECTORS, _RINGS, _FILLET = 24, 12, 8
 
 
 def thin_robot() -> Robot:
-    """Two weightless segments along z, three wires each."""
+    """Two weightless segments along z, three tendons each."""
     segments = tuple(
         Segment(
             length=SEGMENT,
@@ -108,7 +108,7 @@ class TubeInsert(Task):
     name = "TubeInsert"
     n_steps: ClassVar[int] = 50
     n_draws: ClassVar[int] = 4
-    accuracy: ClassVar[float] = 0.005
+    accuracy: float = 0.005
     dt = 0.1
 
     def __init__(self, n_envs: int, options: EnvOptions) -> None:
@@ -123,8 +123,8 @@ class TubeInsert(Task):
         self._varies = self._random is not None and self._random.n_draws > 0
         if self._varies and self._random is not None:
             self.total_draws = self.n_draws + self._random.n_draws
-        wires = SegmentActions(self.base_robot).matrix[: self.base_robot.n_tendons]
-        self._wires = wires[:, list(_BENDS)]
+        by_bend = SegmentActions(self.base_robot).matrix[: self.base_robot.n_tendons]
+        self._by_bend = by_bend[:, list(_BENDS)]
         self.simulator = Simulator(
             [self.base_robot] * n_envs if self._varies else self.base_robot,
             n_robots=n_envs,
@@ -133,9 +133,9 @@ class TubeInsert(Task):
             threads=options.threads,
             contact=ContactScene(obstacles=[mesh(tube_mesh(), name="tube")], max_iterations=250),
         )
-        self._parts()
+        self._set_fields()
         self.displacement: Floats = np.zeros((n_envs, 5))
-        """(n_envs, 5) of the wires, two a segment, and the feed [m]."""
+        """(n_envs, 5) of the tendons, two a segment, and the feed [m]."""
         self.roll: Floats = np.zeros((n_envs, 2))
         """(n_envs, 2) cosine and sine of the robot's roll about z."""
         self.roll[:, 0] = 1.0
@@ -159,7 +159,7 @@ class TubeInsert(Task):
         self.simulator.settle(**self._inputs())
         self._home = self.simulator.snapshot()
 
-    def _parts(self) -> None:
+    def _set_fields(self) -> None:
         rate = self.options.action == "rate"
         low, high = (-RATE, RATE) if rate else LIMIT.T
         unit, word = ("m/s", "rate of the ") if rate else ("m", "")
@@ -254,13 +254,13 @@ class TubeInsert(Task):
     def act(self, action: Floats) -> None:
         low, high = LIMIT.T
         if self.options.action == "rate":
-            way = [np.clip(self.displacement + self.dt * RATE * action, low, high)]
+            poses = [np.clip(self.displacement + self.dt * RATE * action, low, high)]
         else:
             end = 0.5 * (low + high) + 0.5 * (high - low) * action
             start = self.displacement
-            way = [start + (part / SUBSTEPS) * (end - start) for part in range(1, SUBSTEPS + 1)]
+            poses = [start + (substep / SUBSTEPS) * (end - start) for substep in range(1, SUBSTEPS + 1)]
         self.force = np.zeros(self.n_envs)
-        for there in way:
+        for there in poses:
             self._go(there)
 
     def _go(self, there: Floats) -> None:
@@ -289,7 +289,7 @@ class TubeInsert(Task):
         sim.reset(stuck)
         state = sim.settle(**self._inputs())
         station, out, across = (a.reshape(self.n_envs, -1) for a in place(state.position.reshape(-1, 3)))
-        within = (station > 0.0) & (station < STRAIGHT + TURN * ANGLE)
+        within = (station > 0.0) & (station < STRAIGHT + BEND_RADIUS * ANGLE)
         beside = within & ~(np.hypot(out, across) < LUMEN)
         sim.restore(before, ~(stuck & state.ok & ~beside.any(1)))
         return sim.state
@@ -335,9 +335,9 @@ class TubeInsert(Task):
         )
 
     def goal(self) -> Floats:
-        turn = self.roll * (1.0, -1.0)
+        spin = self.roll * (1.0, -1.0)
         aside = self._own(np.column_stack([self.aside, np.zeros(self.n_envs)]))[:, :2]
-        return np.column_stack([self.depth, turn, aside])
+        return np.column_stack([self.depth, spin, aside])
 
     def posture(self) -> Floats:
         """(n_envs, 5) displacements from -1, the least, to 1, the largest."""
@@ -350,16 +350,16 @@ class TubeInsert(Task):
             return self.tip
         seen = self.simulator.measure().tip_position
         c, s = self.roll.T
-        foot = self._inputs()["base_pose"][:, :3]
-        p = foot + np.stack(
+        root = self._inputs()["base_pose"][:, :3]
+        p = root + np.stack(
             [c * seen[:, 0] - s * seen[:, 1], s * seen[:, 0] + c * seen[:, 1], seen[:, 2]], axis=1
         )
         return np.where(np.isfinite(p), p, self.tip)
 
     def baseline(self) -> Floats:
         station, out, across = place(self.measured())
-        feed = np.clip((self.depth - station) / 0.01, -1.0, 1.0)
-        ahead = self.displacement[:, 4] - OUTSIDE + self.dt * RATE[4] * feed
+        advance = np.clip((self.depth - station) / 0.01, -1.0, 1.0)
+        ahead = self.displacement[:, 4] - OUTSIDE + self.dt * RATE[4] * advance
         outer, inner = heading(ahead - LAG), heading(ahead - SEGMENT - LAG)
         inside = np.clip(station / 0.01, 0.0, 1.0)
         inward = outer - inner + inside * out * GAIN
@@ -367,14 +367,14 @@ class TubeInsert(Task):
         c, s = self.roll[:, 0], -self.roll[:, 1]
         bends = [c * inner, s * inner, c * inward - s * sideways, s * inward + c * sideways]
         there = np.column_stack(
-            [OFFSET * np.stack(bends, axis=1), self.displacement[:, 4] + self.dt * RATE[4] * feed]
+            [OFFSET * np.stack(bends, axis=1), self.displacement[:, 4] + self.dt * RATE[4] * advance]
         )
         low, high = LIMIT.T
         if self.options.action == "rate":
             return np.asarray(np.clip((there - self.displacement) / (self.dt * RATE), -1.0, 1.0))
         return np.asarray(np.clip((2.0 * there - low - high) / (high - low), -1.0, 1.0))
 
-    def scenery(self, i: int) -> Backdrop:
+    def backdrop(self, i: int) -> Backdrop:
         vertices, faces = tube_mesh()
         return Backdrop(
             tubes=(Tube(self.simulator.state.position[i], BODY, (0.9, 0.55, 0.15)),),
@@ -385,9 +385,9 @@ class TubeInsert(Task):
         )
 
     def _inputs(self) -> dict[str, Any]:
-        tendons = np.zeros((self.n_envs, len(self._wires)))
+        tendons = np.zeros((self.n_envs, len(self._by_bend)))
         for j in range(4):  # term by term: a BLAS would sum otherwise for other numbers of robots
-            tendons += self.displacement[:, j, None] * self._wires[:, j]
+            tendons += self.displacement[:, j, None] * self._by_bend[:, j]
         pose = np.zeros((self.n_envs, 7))
         pose[:, :2], pose[:, 2] = self.aside, self.base_robot.base_position[2] + self.displacement[:, 4]
         half = 0.5 * np.arctan2(self.roll[:, 1], self.roll[:, 0])
@@ -415,32 +415,36 @@ def pressed(state: State) -> Floats:
 
 def heading(depth: Floats) -> Floats:
     """(n,) angle between z and the tube's middle at these depths [rad]."""
-    return np.clip((depth - STRAIGHT) / TURN, 0.0, ANGLE)
+    return np.clip((depth - STRAIGHT) / BEND_RADIUS, 0.0, ANGLE)
 
 
 def middle(depth: Floats) -> Floats:
     """(n, 3) points of the tube's middle at these depths [m], straight on before and beyond."""
-    angle, beyond = heading(depth), np.maximum(depth - STRAIGHT - TURN * ANGLE, 0.0)
-    along = np.minimum(depth, STRAIGHT) + TURN * np.sin(angle) + beyond * math.cos(ANGLE)
+    angle, beyond = heading(depth), np.maximum(depth - STRAIGHT - BEND_RADIUS * ANGLE, 0.0)
+    along = np.minimum(depth, STRAIGHT) + BEND_RADIUS * np.sin(angle) + beyond * math.cos(ANGLE)
     return np.stack(
-        [TURN * (1.0 - np.cos(angle)) + beyond * math.sin(ANGLE), np.zeros(len(angle)), along], axis=1
+        [BEND_RADIUS * (1.0 - np.cos(angle)) + beyond * math.sin(ANGLE), np.zeros(len(angle)), along], axis=1
     )
 
 
 def place(points: Floats) -> tuple[Floats, Floats, Floats]:
     """Depth along the tube's middle of points (n, 3), and how far they are from it: in the plane of the turn,
     away from the turn's centre, and across, along y; each (n,) [m]."""
-    x, z = points[:, 0] - TURN, points[:, 2] - STRAIGHT
-    turned = np.clip(np.arctan2(np.maximum(z, 0.0), -x), 0.0, ANGLE)
-    c, s = np.cos(turned), np.sin(turned)
-    return STRAIGHT + TURN * turned + (x * s + z * c), -(x * c) + z * s - TURN, points[:, 1]
+    x, z = points[:, 0] - BEND_RADIUS, points[:, 2] - STRAIGHT
+    heading_angle = np.clip(np.arctan2(np.maximum(z, 0.0), -x), 0.0, ANGLE)
+    c, s = np.cos(heading_angle), np.sin(heading_angle)
+    return (
+        STRAIGHT + BEND_RADIUS * heading_angle + (x * s + z * c),
+        -(x * c) + z * s - BEND_RADIUS,
+        points[:, 1],
+    )
 
 
 @lru_cache(maxsize=1)
 def tube_mesh() -> tuple[Floats, Ints]:
     """(n_vertices, 3) [m] and (n_faces, 3) of the tube's wall, watertight, counter-clockwise seen from
     outside; do not write to them."""
-    end = STRAIGHT + TURN * ANGLE
+    end = STRAIGHT + BEND_RADIUS * ANGLE
     round_ = np.linspace(0.0, 0.5 * np.pi, _FILLET)  # the mouth is rounded, for no edge to stand into the way
     depth = np.concatenate([MOUTH * (1.0 - np.cos(round_)), np.linspace(STRAIGHT, end, _RINGS)])
     inner = np.concatenate([LUMEN + FLARE * (1.0 - np.sin(round_)), np.full(_RINGS, LUMEN)])
@@ -449,8 +453,8 @@ def tube_mesh() -> tuple[Floats, Ints]:
     rings = [*range(len(depth)), *range(len(depth) - 1, -1, -1)]
     radius = np.concatenate([inner, outer[::-1]])
     angle = 2.0 * np.pi * np.arange(_SECTORS) / _SECTORS
-    turned, centre = heading(depth)[rings], middle(depth)[rings]
-    normal = np.stack([np.cos(turned), np.zeros(len(rings)), -np.sin(turned)], axis=1)
+    heading_angle, centre = heading(depth)[rings], middle(depth)[rings]
+    normal = np.stack([np.cos(heading_angle), np.zeros(len(rings)), -np.sin(heading_angle)], axis=1)
     across = np.array([0.0, 1.0, 0.0])
     vertices = centre[:, None] + radius[:, None, None] * (
         np.cos(angle)[None, :, None] * normal[:, None] + np.sin(angle)[None, :, None] * across

@@ -23,14 +23,14 @@ MIDDLE = (0.67, 0.0)
 WIDTH, HEIGHT, WALL = 0.3, 0.26, 0.01
 """Of the box inside, its walls and their thickness [m]."""
 SWAY = 0.25
-"""How far the neck bends to either side while it looks [rad]."""
+"""Bend of the neck to either side while it looks [rad]."""
 CORNERS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 PIXELS = 20
 """A marker of which so many are in the picture has been seen."""
 
 
 class Seen(NamedTuple):
-    """What the camera at the tip has seen so far."""
+    """Corners that the camera at the tip has seen so far."""
 
     pixels: NDArray[np.int64]
     """(4,) most pixels of each corner's marker in one picture."""
@@ -50,7 +50,7 @@ class _Look(SceneStage):
         self.rod = MountedRod(
             self.robot,
             self.mount,
-            touch=self.walls,
+            contact_bodies=self.walls,
             points_per_segment=8,
             capsules_per_segment=8,
             color=(0.9, 0.55, 0.15, 1.0),
@@ -76,19 +76,19 @@ class _Look(SceneStage):
         """Of the camera in the tip, which looks along the neck; d1 is up in it."""
         state = self.rod.state
         assert state is not None
-        turn, eye = (
+        axes, eye = (
             state.tip_rotation[0],
             state.tip_position[0] + (RADIUS + 0.002) * state.tip_rotation[0, :, 2],
         )
-        return self.camera.look(self.world, eye, eye + turn[:, 2], turn[:, 0])
+        return self.camera.look(self.world, eye, eye + axes[:, 2], axes[:, 0])
 
 
-def _script(part: float) -> tuple[float, float]:
+def _script(fraction: float) -> tuple[float, float]:
     """Bend over the wall in the first two fifths of the run, look to both sides, and go back in the last two
     fifths."""
-    over = min(1.0, 2.5 * part, 2.5 * (1.0 - part))
+    over = min(1.0, 2.5 * fraction, 2.5 * (1.0 - fraction))
     return 0.5 - 0.5 * math.cos(math.pi * max(over, 0.0)), SWAY * math.sin(
-        2.0 * math.pi * min(max(5.0 * (part - 0.4), 0.0), 1.0)
+        2.0 * math.pi * min(max(5.0 * (fraction - 0.4), 0.0), 1.0)
     )
 
 
@@ -173,7 +173,7 @@ class NeckLook(HostedScene):
         self.expect(clearance > 0.0, f"the neck touches the box; clearance {clearance:.3g} m.")
         self.expect(lowest < HEIGHT, f"the tip comes down to {lowest:.3g} m; the wall is {HEIGHT:g} m high.")
         self.expect(weighed < 1e-6, f"the trunk feels {weighed:.3g} N more or less than the neck's weight.")
-        self.expect(gave < 0.02, f"the trunk gave way by {gave:.3g} m.")
+        self.expect(gave < 0.02, f"the trunk was pushed back by {gave:.3g} m.")
         return {
             "corners seen": float(count),
             "pixels of a marker, least": float(seen.pixels.min()),
@@ -181,7 +181,7 @@ class NeckLook(HostedScene):
             "clearance of the neck to the box, m": clearance,
             "force on the box, N": force,
             "tip below the wall's edge, m": HEIGHT - lowest,
-            "trunk gave way, m": gave,
+            "trunk displacement, m": gave,
         }
 
     def _look(self, stage: _Look, so_far: Seen) -> Seen:

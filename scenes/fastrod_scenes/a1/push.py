@@ -26,12 +26,12 @@ STRETCH = 0.024
 RATE = 2.0
 """omega of its gait [rad/s]."""
 FOLLOWS = 0.1
-"""How far the cube's speed may be off the tip's while it is pushed (rms), of the tip's largest: the tip
-slides up the cube as it swings."""
+"""Largest difference of the cube's speed from the tip's while it is pushed (rms), as a fraction of the tip's
+largest: the tip slides up the cube as it swings."""
 LAUNCH = 1.3
 """Largest speed of the cube, of the tip's."""
 STANDS = 0.02
-"""How far the trunk may give way [m]."""
+"""Largest displacement of the trunk [m]."""
 
 
 @final
@@ -45,7 +45,7 @@ class _Push(SceneStage):
         self.rod = MountedRod(
             robot,
             mount,
-            touch=[self.cube],
+            contact_bodies=[self.cube],
             points_per_segment=8,
             capsules_per_segment=8,
             color=(0.9, 0.55, 0.15, 1.0),
@@ -103,7 +103,7 @@ class NeckPush(HostedScene):
             assert state is not None
             assert state.contacts is not None
             self.expect(bool(state.ok[0]), f"at {t:.3g} s the neck is not ok: {state.problems.get(0)}")
-            force = rod.touched[0].exerted[:3]
+            force = rod.body_contacts[0].exerted[:3]
             extended = weight * state.arclength[0, -1] / stage.robot.length
             balance = max(balance, float(np.abs(rod.wrench[:3] + force - [0.0, 0.0, -extended]).max()))
             velocity = np.array(world.getBaseVelocity(cube)[0])
@@ -149,16 +149,16 @@ class NeckPush(HostedScene):
         )
         launch = float(own.max() / tip.max())
         self.expect(launch < LAUNCH, f"the cube moves {launch:.3g} times as fast as the tip ever does.")
-        self.expect(gave < STANDS, f"the trunk gave way by {gave:.3g} m.")
+        self.expect(gave < STANDS, f"the trunk was pushed back by {gave:.3g} m.")
         return {
             "cube moved, m": float(moved),
             "impulse of the neck on the cube, N s": pushed,
             "balance of forces at the trunk, N": balance,
             "balance of the cube's momentum, N s": momentum,
-            "cube's speed off the tip's while pushing, rms, part of its largest": follows,
+            "cube's speed off the tip's while pushing, rms, fraction of its largest": follows,
             "cube's largest speed over the tip's": launch,
-            "trunk gave way, m": gave,
-            "cube gives way within a step, m": depth,
+            "trunk displacement, m": gave,
+            "cube displacement within a step, m": depth,
         }
 
 

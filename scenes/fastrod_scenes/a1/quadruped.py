@@ -11,7 +11,7 @@ from fastrod.model.robot import Robot, Segment, Tendon
 from fastrod.rotation import quaternion_from_matrix
 
 OFFSET = 0.012
-"""Of the neck's wires from its backbone [m]."""
+"""Distance of the neck's tendons from its backbone [m]."""
 RADIUS = 0.018
 """Of the neck [m]."""
 MOUNT = (0.25, 0.0, 0.06)
@@ -24,7 +24,7 @@ _REST = 200  # steps until it stands still on its own
 def neck(n_segments: int, stretch: float = 0.0) -> Robot:
     """Segments of 0.1 m that stretch by up to `stretch` [m], 0.4 kg/m, stiff enough to push 50 g over a
     floor."""
-    wires = tuple(Tendon(offset=OFFSET, angle=0.5 * math.pi * k, compliance=1e-6) for k in range(4))
+    tendons = tuple(Tendon(offset=OFFSET, angle=0.5 * math.pi * k, compliance=1e-6) for k in range(4))
     segment = Segment(
         length=0.1,
         extension=(0.0, stretch),
@@ -32,7 +32,7 @@ def neck(n_segments: int, stretch: float = 0.0) -> Robot:
         torsional_stiffness=0.03,
         body_radius=RADIUS,
         line_density=0.4,
-        tendons=wires,
+        tendons=tendons,
     )
     return Robot(name=f"neck of {n_segments}", segments=(segment,) * n_segments)
 
@@ -51,7 +51,7 @@ def standing(dt: float, pitch: float) -> tuple[Bullet, BulletLink]:
     """A world with an A1 that stands in it, and the mount of its neck, which points `pitch` above forward
     [rad]; its d1 is up from there, its d2 to the right."""
     world = connect(dt=dt)
-    import pybullet_data  # comes with PyBullet, which `connect` asks for in a sentence
+    import pybullet_data  # comes with PyBullet, which `connect` requires in a sentence
 
     floor(world)
     body = world.loadURDF(f"{pybullet_data.getDataPath()}/a1/a1.urdf", [0.0, 0.0, _HEIGHT + 0.01])
@@ -59,7 +59,7 @@ def standing(dt: float, pitch: float) -> tuple[Bullet, BulletLink]:
         name, kind = world.getJointInfo(body, j)[1:3]
         if kind != world.JOINT_REVOLUTE:
             continue
-        angle = next(a for part, a in _STANCE.items() if part in name.decode())
+        angle = next(a for joint, a in _STANCE.items() if joint in name.decode())
         world.resetJointState(body, j, angle)
         world.setJointMotorControl2(
             body, j, world.POSITION_CONTROL, angle, force=33.5, positionGain=0.5, velocityGain=1.0

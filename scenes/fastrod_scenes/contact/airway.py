@@ -27,10 +27,10 @@ OFFSET = 0.0015
 OUTSIDE, INSIDE = -0.005, 0.09
 """Depth of the fed length, at first and at last, along z from the entry [m]."""
 LAG = 0.0063
-"""A segment bends as the airway does so far behind its end: a segment that is half in a turn bends outside of
-it too [m]."""
+"""A segment bends as the airway does so far behind its end: a segment that is half in a curve bends outside
+of it too [m]."""
 FACET = 1.5e-4
-"""How far the mesh may stand into the smooth lumen [m]: a cell of 1.8 mm on a curve of 6 mm gives 0.07 mm,
+"""Largest intrusion of the mesh into the smooth lumen [m]: a cell of 1.8 mm on a curve of 6 mm gives 0.07 mm,
 its shifted vertices as much."""
 LARGEST = 0.05
 """Force of the wall that a bronchus takes without harm, at one place [N]."""
@@ -58,7 +58,7 @@ def _inside(state: State, robot: int) -> NDArray[np.float64]:
 
 @final
 class Airway(RodScene):
-    """Two robots, each in a world of its own: the first is steered left, the second right. The feed is
+    """Two robots, each in a world of its own: the first is steered left, the second right. The insertion is
     straight, along z."""
 
     name = "airway"
@@ -90,11 +90,11 @@ class Airway(RodScene):
     def check(self) -> dict[str, float]:
         figures: list[Worst] = []
         closest, largest = -math.inf, 0.0
-        steps, touched = 0, np.zeros(len(BRANCHES), int)
+        steps, in_contact = 0, np.zeros(len(BRANCHES), int)
         passes = np.zeros(len(BRANCHES))
         for t, state in watch(self, self.run(), figures):
             contacts = contacts_of(state)
-            steps, touched, passes = steps + 1, touched + (contacts.count > 0), passes + state.passes
+            steps, in_contact, passes = steps + 1, in_contact + (contacts.count > 0), passes + state.passes
             largest = max(
                 largest, float(np.linalg.norm(np.nan_to_num(contacts.force), axis=2).max(initial=0.0))
             )
@@ -104,7 +104,7 @@ class Airway(RodScene):
                 closest < FACET - BODY,
                 f"at {t:.3g} s the centreline comes within {-closest:.4g} m of the lumen's wall.",
             )
-        self.expect(bool((touched > 0).all()), "a robot never touches the wall.")
+        self.expect(bool((in_contact > 0).all()), "a robot never touches the wall.")
         self.expect(
             largest < LARGEST,
             f"the wall is pressed with {largest:.3g} N at one place, more than {LARGEST:g} N.",
@@ -125,8 +125,8 @@ class Airway(RodScene):
         return {
             "centreline to the lumen's wall, least, m": -closest,
             "force at one place, largest, N": largest,
-            "steps in contact, left": float(touched[0]),
-            "steps in contact, right": float(touched[1]),
+            "steps in contact, left": float(in_contact[0]),
+            "steps in contact, right": float(in_contact[1]),
             "tip from the middle, m": max(off),
             "balance of forces, N": most.force,
             "balance of moments, N m": most.moment,

@@ -2,8 +2,8 @@
 watertight mesh.
 
 Frame: the entry lies at the origin, z runs into the trachea; lengths in metres. The lumen is the smooth union
-of one tube for each bronchus; the two share the trachea, which is wider by the smoothing. The wall is what
-lies between the lumen and the same union with a larger radius, cut off at the entry and at the bronchi's
+of one tube for each bronchus; the trachea is common to both, which is wider by the smoothing. The wall is
+what lies between the lumen and the same union with a larger radius, cut off at the entry and at the bronchi's
 ends, where the lumen is open to the outside.
 """
 
@@ -20,15 +20,15 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 TRACHEA = 0.03
-"""Length of the straight part before the fork [m]."""
+"""Length of the straight section before the fork [m]."""
 BEND = math.radians(60.0)
-"""Angle by which a bronchus turns away from the trachea [rad]."""
-TURN = 0.06
-"""Radius of that turn [m]."""
+"""Angle by which a bronchus bends away from the trachea [rad]."""
+BEND_RADIUS = 0.06
+"""Radius of that bend [m]."""
 OUTLET = 0.012
-"""Length of the straight part after it [m]."""
+"""Length of the straight section after it [m]."""
 BRANCHES = {"left": math.radians(160.0), "right": math.radians(20.0)}
-"""Direction into which each bronchus turns, about z from x toward y [rad]."""
+"""Direction in which each bronchus bends, about z from x toward y [rad]."""
 RADIUS = 0.006
 """Of the lumen of a bronchus [m]."""
 WALL = 0.004
@@ -37,28 +37,28 @@ BLEND = 0.004
 """Distance over which the tubes melt into each other; the trachea's lumen is wider than a bronchus' by a
 quarter of it [m]."""
 
-_SPACING = 0.002  # m between the points of a tube's polyline: it cuts a turn's corner by 8 um
+_SPACING = 0.002  # m between the points of a tube's polyline: it cuts a bend's corner by 8 um
 _CELL = 0.0018  # m
 _SHORTEST = 0.05  # of an edge: a vertex keeps so far from the lattice points, for no face to be a sliver
 
 
 def path_length() -> float:
-    """From the entry to the end of either bronchus, along its middle [m]."""
-    return TRACHEA + TURN * BEND + OUTLET
+    """Return the length from the entry to the end of either bronchus, along its middle [m]."""
+    return TRACHEA + BEND_RADIUS * BEND + OUTLET
 
 
 def heading(depth: float) -> float:
     """Angle between the trachea and a tube's middle at `depth` from the entry [rad]."""
-    return min(max((depth - TRACHEA) / TURN, 0.0), BEND)
+    return min(max((depth - TRACHEA) / BEND_RADIUS, 0.0), BEND)
 
 
 def middle(branch: str, depth: Floats) -> Floats:
     """(n, 3) points on the middle of the tube into `branch`, at depths (n,) along it; straight on before and
     beyond [m]."""
-    angle = np.clip((depth - TRACHEA) / TURN, 0.0, BEND)
-    beyond = np.maximum(depth - TRACHEA - TURN * BEND, 0.0)
-    along = np.minimum(depth, TRACHEA) + TURN * np.sin(angle) + beyond * math.cos(BEND)
-    aside = TURN * (1.0 - np.cos(angle)) + beyond * math.sin(BEND)
+    angle = np.clip((depth - TRACHEA) / BEND_RADIUS, 0.0, BEND)
+    beyond = np.maximum(depth - TRACHEA - BEND_RADIUS * BEND, 0.0)
+    along = np.minimum(depth, TRACHEA) + BEND_RADIUS * np.sin(angle) + beyond * math.cos(BEND)
+    aside = BEND_RADIUS * (1.0 - np.cos(angle)) + beyond * math.sin(BEND)
     toward = BRANCHES[branch]
     return np.stack([aside * math.cos(toward), aside * math.sin(toward), along], axis=-1)
 
@@ -80,10 +80,10 @@ def airway() -> tuple[Floats, Ints]:
     >>> len(vertices) - len(faces) // 2  # two handles: the three ends of one wall are open
     -2
     """
-    reach = RADIUS + WALL + 2.0 * _CELL
+    half_width = RADIUS + WALL + 2.0 * _CELL
     ends = np.concatenate([middle(branch, np.linspace(0.0, path_length(), 50)) for branch in BRANCHES])
     axes = [
-        np.arange(low - reach, high + reach, _CELL)
+        np.arange(low - half_width, high + half_width, _CELL)
         for low, high in zip(ends.min(axis=0), ends.max(axis=0), strict=True)
     ]
     lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -102,20 +102,20 @@ def airway() -> tuple[Floats, Ints]:
 
 def surface(values: Floats, cell: float) -> tuple[Floats, Ints]:
     """Zero level of `values` on a cubic lattice of edge `cell` [m] by marching tetrahedra: (n, 3) vertices,
-    (m, 3) faces around the negative side, which must not reach the lattice's border. Each cube is six
+    (m, 3) faces around the negative side, which must not meet the lattice's border. Each cube is six
     tetrahedra along its diagonal, so that neighbours share their edges and the surface is closed.
     """
     shape = np.array(values.shape)
-    stride = np.array([shape[1] * shape[2], shape[2], 1])
+    index_step = np.array([shape[1] * shape[2], shape[2], 1])
     flat = np.where(values.ravel() == 0.0, 1e-300, values.ravel())
     inside = values < 0.0
     mixed = np.zeros(shape - 1, int)
     for corner in np.ndindex(2, 2, 2):
         mixed += inside[tuple(slice(c, n - 1 + c) for c, n in zip(corner, shape, strict=True))]
-    base = np.argwhere((mixed > 0) & (mixed < 8)) @ stride
+    base = np.argwhere((mixed > 0) & (mixed < 8)) @ index_step
     sixth = []
     for order in permutations(range(3)):
-        steps = np.cumsum([0, *(stride[axis] for axis in order)])
+        steps = np.cumsum([0, *(index_step[axis] for axis in order)])
         odd = order in ((0, 2, 1), (1, 0, 2), (2, 1, 0))
         sixth.append(base[:, None] + (steps[[0, 1, 3, 2]] if odd else steps))
     tetra = np.concatenate(sixth)
@@ -125,9 +125,9 @@ def surface(values: Floats, cell: float) -> tuple[Floats, Ints]:
         np.sort(edges, axis=-1).reshape(-1, 2) @ [len(flat), 1], return_index=True, return_inverse=True
     )
     start, end = np.sort(edges, axis=-1).reshape(-1, 2)[first].T
-    part = np.clip(flat[start] / (flat[start] - flat[end]), _SHORTEST, 1.0 - _SHORTEST)[:, None]
+    fraction = np.clip(flat[start] / (flat[start] - flat[end]), _SHORTEST, 1.0 - _SHORTEST)[:, None]
     place = [np.stack(np.unravel_index(corner, tuple(shape)), axis=-1) * cell for corner in (start, end)]
-    return place[0] + part * (place[1] - place[0]), names.reshape(-1, 3).astype(np.int64)
+    return place[0] + fraction * (place[1] - place[0]), names.reshape(-1, 3).astype(np.int64)
 
 
 def _crossed(tetra: Ints, below: NDArray[np.bool_]) -> Ints:
@@ -165,7 +165,7 @@ def _to_polyline(points: Floats, line: Floats) -> Floats:
     square = np.full(len(points), np.inf)
     for start, end in pairwise(line):
         along = end - start
-        part = np.clip((points - start) @ along / (along @ along), 0.0, 1.0)
-        away = points - start - part[:, None] * along
+        fraction = np.clip((points - start) @ along / (along @ along), 0.0, 1.0)
+        away = points - start - fraction[:, None] * along
         square = np.minimum(square, np.einsum("ij,ij->i", away, away))
     return np.asarray(np.sqrt(square))

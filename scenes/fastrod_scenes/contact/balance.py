@@ -1,5 +1,5 @@
-"""What every scene with contact must obey, as figures: balance of forces and moments, and how deep anything
-lies in a wall."""
+"""Checks of every scene with contact, as figures: balance of forces and moments, and depth of anything in a
+wall."""
 
 from __future__ import annotations
 

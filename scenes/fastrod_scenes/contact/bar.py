@@ -18,7 +18,7 @@ from fastrod_scenes.contact.balance import FORCE, Worst, contacts_of, watch, wor
 from fastrod_scenes.scene import RodScene
 
 RADIUS = 0.065
-"""Of the bar, whose axis is along y [m]: what a triangle of this robot can reach around."""
+"""Of the bar, whose axis is along y [m]: what fits into a triangle of this robot."""
 ROD = 0.012
 """Radius of the robot [m]."""
 GAP = 0.001
@@ -55,8 +55,8 @@ class Bar(RodScene):
 
     def inputs(self, t: float) -> dict[str, Any]:
         robot = load_robot("five_segment_reacher")
-        part = 2.0 * self.progress(t)
-        bend = np.cumsum([0.0, FIRST * min(part, 1.0), 0.0, SECOND * max(part - 1.0, 0.0), 0.0])[
+        phase = 2.0 * self.progress(t)
+        bend = np.cumsum([0.0, FIRST * min(phase, 1.0), 0.0, SECOND * max(phase - 1.0, 0.0), 0.0])[
             robot.tendon_segment
         ]
         angle = np.array([tendon.angle for tendon in robot.tendons])

@@ -32,8 +32,8 @@ UNDER = LENGTH / 2.0
 LOW, HIGH = -0.11, -RADIUS - BODY
 """Height of the cylinder's axis, first and last [m]."""
 BEAM = 0.01
-"""Part by which the support may differ from the closed form: slopes of 0.2 cost their square, a quarter of it
-here."""
+"""Fraction by which the support may differ from the closed form: slopes of 0.2 cost their square, a quarter
+of it here."""
 
 _ACROSS = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)
 
@@ -89,7 +89,9 @@ class Draped(RodScene):
             balance < FORCE, f"weight, base force and the drum's force are {balance:.3g} N out of balance."
         )
         self.expect(reaction < 1e-12, f"the drum's force and the rod's differ by {reaction:.3g} N.")
-        self.expect(torque < FORCE, f"a drum without friction is turned about its axis by {torque:.3g} N m.")
+        self.expect(
+            torque < FORCE, f"a drum without friction has about its axis a moment of {torque:.3g} N m."
+        )
         self.expect(depth <= DEPTH, f"the rod lies {depth:.3g} m deep in the drum.")
         self.expect(len(support) > 50 and rises(support), "the drum does not carry more the higher it is.")
         self.expect(

@@ -28,7 +28,7 @@ BEND = 0.25
 """Of the first rod toward the second at the end [rad]."""
 OFFSET = 0.01
 """Of the tendons from the backbone [m]."""
-TOUCH = 1e-7
+CONTACT_GAP = 1e-7
 """Largest gap of a contact that presses [m]."""
 
 
@@ -78,7 +78,7 @@ class Pair(RodScene):
         self.expect(rises(force), "the force between the rods does not grow with every bit of bend.")
         self.expect(reaction < 1e-12, f"what one rod does to the other and back differ by {reaction:.3g} N.")
         self.expect(
-            gap < TOUCH and apart < TOUCH,
+            gap < CONTACT_GAP and apart < CONTACT_GAP,
             f"the rods press on each other {gap:.3g} m apart, at points {apart:.3g} m apart.",
         )
         most = worst(figures)

@@ -26,7 +26,7 @@ CORNERS = tuple(
         ("front", "left", "top"),
     )
 )
-"""As one looks through the entry, each beside the one before it."""
+"""In the order seen through the entry, each beside the one before it."""
 COLORS = (
     (0.90, 0.10, 0.10),
     (0.10, 0.70, 0.15),
@@ -41,14 +41,14 @@ COLORS = (
 _WOOD, _PLINTH = (0.80, 0.72, 0.60, 1.0), (0.45, 0.47, 0.50, 1.0)
 
 
-class BoxPart(NamedTuple):
-    """A plate: a box of its own, turned about x."""
+class BoxPiece(NamedTuple):
+    """A plate: a box of its own, rotated about x."""
 
     middle: tuple[float, float, float]
     """World [m]."""
     half: tuple[float, float, float]
     """Half of its size along its own axes [m]."""
-    turn: float = 0.0
+    angle: float = 0.0
     """About x [rad]."""
     color: tuple[float, float, float, float] = _WOOD
     """RGBA."""
@@ -105,53 +105,55 @@ class Box:
             np.abs(np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0))
         )
 
-    def parts(self) -> list[BoxPart]:
+    def pieces(self) -> list[BoxPiece]:
         """Walls, and the plinth below them."""
         x, (a, b, c), t, z = self.front + self.wall, self.inner, self.wall, self.height
         low = z - 0.5 * c - t
         middle, whole = (x + 0.5 * a, 0.0, z), 0.5 * c + t
-        parts = [BoxPart((x + a + 0.5 * t, 0.0, z), (0.5 * t, 0.5 * b + t, whole))]
+        pieces = [BoxPiece((x + a + 0.5 * t, 0.0, z), (0.5 * t, 0.5 * b + t, whole))]
         for sign in (-1.0, 1.0):
-            parts.append(BoxPart((middle[0], sign * 0.5 * (b + t), z), (0.5 * a, 0.5 * t, whole)))
-            parts.append(BoxPart((middle[0], 0.0, z + sign * 0.5 * (c + t)), (0.5 * a, 0.5 * b, 0.5 * t)))
-        parts.append(BoxPart((middle[0], 0.0, 0.5 * low), (0.35 * a, 0.35 * b, 0.5 * low), color=_PLINTH))
-        return parts + self._front()
+            pieces.append(BoxPiece((middle[0], sign * 0.5 * (b + t), z), (0.5 * a, 0.5 * t, whole)))
+            pieces.append(BoxPiece((middle[0], 0.0, z + sign * 0.5 * (c + t)), (0.5 * a, 0.5 * b, 0.5 * t)))
+        pieces.append(BoxPiece((middle[0], 0.0, 0.5 * low), (0.35 * a, 0.35 * b, 0.5 * low), color=_PLINTH))
+        return pieces + self._front()
 
-    def _front(self) -> list[BoxPart]:
+    def _front(self) -> list[BoxPiece]:
         x, (_, b, c), t, e = self.front + 0.5 * self.wall, self.inner, 0.5 * self.wall, self.entry
         wide, tall = 0.5 * b + self.wall, 0.5 * c + self.wall
         if e == 0.0:
-            return [BoxPart((x, 0.0, self.height), (t, wide, tall))]
-        parts = []
+            return [BoxPiece((x, 0.0, self.height), (t, wide, tall))]
+        pieces = []
         for sign in (-1.0, 1.0):
-            parts.append(BoxPart((x, sign * 0.5 * (wide + e), self.height), (t, 0.5 * (wide - e), tall)))
-            parts.append(BoxPart((x, 0.0, self.height + sign * 0.5 * (tall + e)), (t, e, 0.5 * (tall - e))))
+            pieces.append(BoxPiece((x, sign * 0.5 * (wide + e), self.height), (t, 0.5 * (wide - e), tall)))
+            pieces.append(BoxPiece((x, 0.0, self.height + sign * 0.5 * (tall + e)), (t, e, 0.5 * (tall - e))))
         side = e * math.tan(math.pi / 8.0)  # half of one; the square's corner is as far beyond it
         for k in range(4):
-            turn = math.pi / 4.0 + k * math.pi / 2.0
-            y, z = (e + 0.5 * side) * math.cos(turn), (e + 0.5 * side) * math.sin(turn)
-            parts.append(BoxPart((x, y, self.height + z), (t, 0.5 * side, side), turn))
-        return parts
+            angle = math.pi / 4.0 + k * math.pi / 2.0
+            y, z = (e + 0.5 * side) * math.cos(angle), (e + 0.5 * side) * math.sin(angle)
+            pieces.append(BoxPiece((x, y, self.height + z), (t, 0.5 * side, side), angle))
+        return pieces
 
     def build(self, world: Bullet) -> tuple[int, dict[int, int]]:
         """Body of the walls, and bodies of the cubes by the numbers of their corners; the cubes touch
         nothing."""
-        parts = self.parts()
-        half, places = [part.half for part in parts], [part.middle for part in parts]
-        turns = [(math.sin(0.5 * part.turn), 0.0, 0.0, math.cos(0.5 * part.turn)) for part in parts]
-        kinds = [world.GEOM_BOX] * len(parts)
+        pieces = self.pieces()
+        half, places = [piece.half for piece in pieces], [piece.middle for piece in pieces]
+        quaternions = [
+            (math.sin(0.5 * piece.angle), 0.0, 0.0, math.cos(0.5 * piece.angle)) for piece in pieces
+        ]
+        kinds = [world.GEOM_BOX] * len(pieces)
         solid = world.createCollisionShapeArray(
             shapeTypes=kinds,
             halfExtents=half,
             collisionFramePositions=places,
-            collisionFrameOrientations=turns,
+            collisionFrameOrientations=quaternions,
         )
         seen = world.createVisualShapeArray(
             shapeTypes=kinds,
             halfExtents=half,
             visualFramePositions=places,
-            visualFrameOrientations=turns,
-            rgbaColors=[part.color for part in parts],
+            visualFrameOrientations=quaternions,
+            rgbaColors=[piece.color for piece in pieces],
         )
         walls: int = world.createMultiBody(0.0, solid, seen)
         cubes = {}

@@ -20,12 +20,12 @@ APART, DEEP, PRONG = 0.06, 0.04, 0.02
 TILT = math.radians(20.0)
 """Of either prong, outward [rad]."""
 FLANGE = (0.45, 0.10, 0.60, 0.0, math.sqrt(0.5), math.sqrt(0.5), 0.0)
-"""Where the UR5 holds still: position [m] and quaternion w x y z, world; the flange looks down, the fork is
-along y."""
-WAY = (0.0, -0.09, 0.04)
-"""From there, as the UR5 moves [m]: so slowly that a base, placed by its mount's speed, lags by less than
-`POSE_ERROR`."""
-TURN = 0.15
+"""Pose in which the UR5 holds still: position [m] and quaternion w x y z, world; the flange looks down, the
+fork is along y."""
+DISPLACEMENT = (0.0, -0.09, 0.04)
+"""Displacement from there, as the UR5 moves [m]: so slowly that a base, positioned by its mount's speed, lags
+by less than `POSE_ERROR`."""
+ROTATION = 0.15
 """About the vertical, meanwhile [rad]."""
 ELBOW_UP = (0.0, -1.5, 1.6, -1.7, -1.57, 0.0)
 """Joints of the UR5 near that pose [rad]."""
@@ -34,7 +34,7 @@ PERIOD, STILL, MOVE = 2.0, 3.0, 6.0
 BENDS = (0.35, 0.7)
 """Of the segments, base first [rad]."""
 EXTENSION = 0.02
-"""Of the outer segment, either way [m]."""
+"""Of the outer segment, in either direction [m]."""
 POSE_ERROR = 1e-6
 """Largest of a base from its mount [m], and of its axes."""
 FORCE_ERROR = 1e-9
@@ -75,7 +75,7 @@ class DualArmScene(SceneStage):
         self.q: Floats = self.arm.solve(FLANGE, ELBOW_UP)
         """(6,) joints that the UR5 is driven to [rad]."""
         self.arm.place(self.q)
-        for link in range(-1, self.world.getNumJoints(self.arm.body)):  # PyBullet's own, no part of a UR5
+        for link in range(-1, self.world.getNumJoints(self.arm.body)):  # PyBullet's own, nothing of a UR5
             self.world.changeDynamics(
                 self.arm.body, link, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0
             )
@@ -111,10 +111,13 @@ class DualArmScene(SceneStage):
 
     def flange(self, t: float) -> Floats:
         """(7,) pose at time t [s] that the UR5 is driven to, world."""
-        part = eased((t - STILL) / MOVE)
-        turn = quaternion_from_vector(np.array([0.0, 0.0, part * TURN]))
+        fraction = eased((t - STILL) / MOVE)
+        orientation = quaternion_from_vector(np.array([0.0, 0.0, fraction * ROTATION]))
         return np.concatenate(
-            [np.array(FLANGE[:3]) + part * np.array(WAY), product(turn, np.array(FLANGE[3:]))]
+            [
+                np.array(FLANGE[:3]) + fraction * np.array(DISPLACEMENT),
+                product(orientation, np.array(FLANGE[3:])),
+            ]
         )
 
     def advance(self, t: float) -> None:
@@ -130,9 +133,9 @@ class DualArmScene(SceneStage):
         self.world.stepSimulation()
         for rod in self.rods:
             rod.end()
-        self.carry()
+        self.follow_arm()
 
-    def carry(self) -> None:
+    def follow_arm(self) -> None:
         """Put the fork where the flange is."""
         self.bracket.follow()
 
@@ -146,14 +149,14 @@ class DualArmScene(SceneStage):
         """(2,) how far either base is from its mount on the flange, as the measured joints have it: the
         larger of the position's error [m] and of any axis's."""
         flange = self.arm.frame(self.arm.position())
-        turn = matrix_from_quaternion(flange[None, 3:])[0]
+        orientation = matrix_from_quaternion(flange[None, 3:])[0]
         off = np.empty(2)
         for k, (rod, mount) in enumerate(zip(self.rods, self.mounts, strict=True)):
             assert rod.state is not None
             position, rotation = rod.state.position[0, 0], rod.state.rotation[0, 0]
-            axes = turn @ matrix_from_quaternion(mount[None, 3:])[0]
+            axes = orientation @ matrix_from_quaternion(mount[None, 3:])[0]
             off[k] = max(
-                np.abs(position - flange[:3] - turn @ mount[:3]).max(), np.abs(rotation - axes).max()
+                np.abs(position - flange[:3] - orientation @ mount[:3]).max(), np.abs(rotation - axes).max()
             )
         return off
 
@@ -221,7 +224,7 @@ class DualArmScene(SceneStage):
 
 @final
 class DualArms(HostedScene):
-    """The UR5 holds still for a while, then it moves and turns; the soft robots never rest."""
+    """The UR5 holds still for a while, then it moves and rotates; the soft robots never rest."""
 
     name = "dual_arm"
     about = "A UR5 carries two soft robots that move in opposite phase, and feels the sum of both."
@@ -261,7 +264,7 @@ class DualArms(HostedScene):
                 error = float(np.abs(felt - expected).max()) / torque
         path = np.array(tips)[half:]  # the first half period starts from rest
         mirror = float(np.abs(path[half:, 0] * [-1.0, 1.0, 1.0] - path[:-half, 1]).max())
-        way = float(np.linalg.norm(np.ptp(path[:, 0], axis=0)))
+        displacement = float(np.linalg.norm(np.ptp(path[:, 0], axis=0)))
         self.expect(off < POSE_ERROR, f"a base is {off:.3g} (m, or of its axes) off its mount on the flange.")
         self.expect(
             weight < FORCE_ERROR,
@@ -271,7 +274,7 @@ class DualArms(HostedScene):
             error < WRENCH_ERROR,
             f"what the joints feel differs by {error:.3g} from the torques of the sum of both wrenches.",
         )
-        self.expect(way > 0.1, f"a tip covers {way:.3g} m; it must go round.")
+        self.expect(displacement > 0.1, f"a tip's displacement is {displacement:.3g} m; it must go round.")
         self.expect(mirror < MIRROR_ERROR, f"the paths of the tips are {mirror:.3g} m off mirror images.")
         return {
             "base from its mount, m": off,
@@ -279,7 +282,7 @@ class DualArms(HostedScene):
             "torque of the wrenches, N m": torque,
             "error of the torques": error,
             "tips from mirror images, m": mirror,
-            "way of a tip, m": way,
+            "displacement of a tip, m": displacement,
             "clearance between the soft robots, m": gap,
             "clearance from the UR5, m": rigid,
         }

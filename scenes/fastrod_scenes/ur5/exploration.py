@@ -23,22 +23,23 @@ ADAPTER = 0.03
 INTO = (0.5, 0.5, 0.5, 0.5)
 """Of the flange as the robot enters, w x y z: its x, y, z are y, z, x of the world."""
 BEFORE = 0.05
-"""From the straight robot's tip to the entry, before it enters [m]."""
+"""Distance from the straight robot's tip to the entry, before it enters [m]."""
 STANDOFF = 0.03
-"""From the soft robot's base to the front wall, while it looks around [m]."""
+"""Distance from the soft robot's base to the front wall, while it looks around [m]."""
 ELBOW_UP = ((-0.4, -1.9, 1.8, 0.1, 1.1, 0.0), (-0.4, -1.9, 2.2, 2.8, -1.1, 3.1))
-"""Joints of the UR5 about its pose before the entry, wrist one way and the other [rad]."""
+"""Joints of the UR5 about its pose before the entry, wrist in both directions [rad]."""
 ENTRY = (0.006, 0.008, 0.008, 0.7, 0.06, 0.06)
-"""How far a flange may be from the middle of the entry: [m], and turned about x, y and z [rad]."""
+"""Tolerance of a flange about the middle of the entry: displacement [m], and rotation about x, y and z
+[rad]."""
 EXTENSION = 0.03
-"""Of a segment, either way [m]."""
+"""Of a segment, in either direction [m]."""
 LARGEST_BEND = 1.7
 """Of a segment [rad]."""
 FORWARD, BACKWARD = (0.0, 0.3, 0.3), (-0.2, 1.2, 1.4)
 """Bends of the segments toward a corner that roughly look at it, in the back and in the front of the box
 [rad]."""
 APPROACH, ENTER, BEND, AIM, STRAIGHTEN, LEAVE = 2.0, 3.0, 1.2, 0.8, 1.2, 2.5
-"""Parts of a run; `BEND` and `AIM` for each corner [s]."""
+"""Phases of a run; `BEND` and `AIM` for each corner [s]."""
 INSIDE = APPROACH + ENTER
 """The UR5 stands still from here ... [s]"""
 AROUND = INSIDE + (BEND + AIM) * len(CORNERS)
@@ -132,8 +133,8 @@ class Exploration(SceneStage):
         return posture.ravel()
 
     def advance(self, t: float) -> None:
-        """What the operator does at time t [s]: approach, enter, bend toward and aim at each corner in turn,
-        straighten, leave. After each aim a picture of the corner goes into `looks`."""
+        """Act as the operator at time t [s]: approach, enter, bend toward and aim at each corner one after
+        the other, straighten, leave. After each aim a picture of the corner goes into `looks`."""
         end = t + self.dt
         corner, over = divmod(round((t - INSIDE) / self.dt), round((BEND + AIM) / self.dt))
         looking = 0 <= corner < len(CORNERS)
@@ -146,7 +147,7 @@ class Exploration(SceneStage):
         self.frozen = frozen
         bent = over * self.dt + self.dt - BEND
         if looking and bent > 1e-9:
-            self._turn_to(corner)
+            self._aim_at(corner)
         elif looking:
             self._go(self.posture(corner), over == 0, 1.0 + bent / BEND)
         elif frozen:
@@ -154,21 +155,21 @@ class Exploration(SceneStage):
         elif end < APPROACH + 1e-9:
             self._go(np.zeros(9), t == 0.0, end / APPROACH)
         self.rod.step(**self.actions.inputs(self.action))
-        self.carry()
+        self.follow_arm()
         if looking and bent > AIM - 1e-9:
             self.looks[corner] = self.look(corner)
 
-    def carry(self) -> None:
+    def follow_arm(self) -> None:
         """Put the bracket where the flange is."""
         self.bracket.follow()
 
-    def _go(self, to: Floats, begins: bool, part: float) -> None:
-        """Be a part, from 0 to 1, of the way to an action."""
+    def _go(self, to: Floats, begins: bool, fraction: float) -> None:
+        """Be at a fraction, from 0 to 1, of the path to an action."""
         if begins:
             self._from = self.action
-        self.action = self._from + eased(part) * (to - self._from)
+        self.action = self._from + eased(fraction) * (to - self._from)
 
-    def _turn_to(self, corner: int) -> None:
+    def _aim_at(self, corner: int) -> None:
         """One step of the line of sight toward the cube in a corner."""
         tip, rotation = self.tip()
         point = self.box.cube_at(corner)
@@ -183,7 +184,7 @@ class Exploration(SceneStage):
         return state.tip_position[0], state.tip_rotation[0]
 
     def picture(self) -> Image:
-        """From before the tip's cap, along d3; d2 is up in it."""
+        """Return the picture from before the tip's cap, along d3; d2 is up in it."""
         _, rotation = self.tip()
         eye = self._eye()
         return self.camera.look(self.world, eye, eye + 0.1 * rotation[:, 2], rotation[:, 1])
@@ -222,7 +223,7 @@ class Exploration(SceneStage):
         points = look.eye + image.depth[rows, columns][:, None] * rays
         return len(rows), float(self.box.off_cube(corner, points).max())
 
-    def arm_touches(self) -> bool:
+    def arm_in_contact(self) -> bool:
         """The UR5 touches the box."""
         return any(p[8] <= 0.0 for p in self.world.getContactPoints(self.arm.body, self.walls))
 

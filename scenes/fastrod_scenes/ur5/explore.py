@@ -65,7 +65,7 @@ class Explore(HostedScene):
         pixels: list[int] = []
         held: Floats | None = None
         for k, t in enumerate(self.play(stage)):
-            collisions += stage.arm_touches()
+            collisions += stage.arm_in_contact()
             self.expect(collisions == 0, f"at {t:.3g} s the UR5 touches the box.")
             if k % _EVERY == 0:
                 arm, soft = min(arm, stage.arm_distance()), min(soft, stage.soft_clearance())

@@ -19,7 +19,7 @@ def miss(tip: Floats, rotation: Floats, point: Floats) -> Floats:
     x, y, z = rotation.T @ (point - tip)
     aside, far = math.hypot(x, y), math.hypot(x, y, z)
     if aside < 1e-12 * far:
-        return np.array([0.0 if z > 0.0 else math.pi * far, 0.0])  # behind it, any way round is as good
+        return np.array([0.0 if z > 0.0 else math.pi * far, 0.0])  # behind it, either direction is as good
     return far * math.atan2(aside, z) / aside * np.array([x, y])
 
 
@@ -28,7 +28,7 @@ def aim_jacobian(tip: Floats, rotation: Floats, point: Floats, jacobian: Floats)
     motion of the coordinates.
 
     `jacobian` (6, n) of the tip: position [m], then rotation vector [rad], world. Where it is this long, the
-    line of sight turns with the tip, and moves with it.
+    line of sight rotates with the tip, and moves with it.
     """
     sight = np.linalg.norm(point - tip) * rotation[:, 2]
     moved = jacobian[:3] + np.cross(jacobian[3:].T, sight).T

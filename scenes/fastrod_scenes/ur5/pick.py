@@ -14,9 +14,9 @@ from fastrod_scenes.ur5.picking import SPOT, Cube, Picking, duration
 LIFTED = 0.1
 """Least height of the cube above where it was, all the time that it is carried [m]."""
 CARRIED = 0.2
-"""Least way of the cube sideways at that height [m]."""
-SHARE = 0.05
-"""Least part of that way by either, arm and soft robot [m]."""
+"""Least displacement of the cube sideways at that height [m]."""
+LEAST_DISPLACEMENT = 0.05
+"""Least displacement by each of the two, arm and soft robot [m]."""
 BENT = 0.5
 """Least change of the soft robot's bend meanwhile [rad]."""
 SPEED = 0.6
@@ -34,7 +34,7 @@ AWAY = 0.03
 
 
 class _Pick(HostedScene):
-    """What both ways of holding have in common."""
+    """Pick and place, with either way of holding."""
 
     fingers: ClassVar[bool]
     """That hold by friction; otherwise suction."""
@@ -89,17 +89,18 @@ class _Pick(HostedScene):
                     stage.clearance([stage.cube], stage.table),
                 )
         height, sideways, base, bend = np.array(carried).T
-        lifted, way, by_arm, bent = height.min(), np.ptp(sideways), np.ptp(base), np.ptp(bend)
+        lifted, displacement, by_arm, bent = height.min(), np.ptp(sideways), np.ptp(base), np.ptp(bend)
         self.expect(
             lifted > LIFTED,
             f"the cube is carried {lifted:.3g} m above the table; it must be {LIFTED:g} m or more.",
         )
         self.expect(
-            way > CARRIED, f"the cube is carried {way:.3g} m sideways; it must be {CARRIED:g} m or more."
+            displacement > CARRIED,
+            f"the cube is carried {displacement:.3g} m sideways; it must be {CARRIED:g} m or more.",
         )
         self.expect(
-            min(by_arm, way - by_arm) > SHARE,
-            f"of {way:.3g} m sideways, {by_arm:.3g} m are by the arm; both must take part.",
+            min(by_arm, displacement - by_arm) > LEAST_DISPLACEMENT,
+            f"of {displacement:.3g} m sideways, {by_arm:.3g} m are by the arm; both must contribute.",
         )
         self.expect(
             bent > BENT, f"the soft robot bends by {bent:.3g} rad meanwhile; it must be {BENT:g} rad or more."
@@ -118,8 +119,8 @@ class _Pick(HostedScene):
         )
         return {
             "height of the lift, m": float(lifted),
-            "way sideways, m": float(way),
-            "way sideways by the arm, m": float(by_arm),
+            "displacement sideways, m": float(displacement),
+            "displacement sideways by the arm, m": float(by_arm),
             "change of bend meanwhile, rad": float(bent),
             "slip, m": slip,
             "speed of the cube, most, m/s": fastest,

@@ -26,7 +26,7 @@ SIDE = 0.03
 TOP = 0.15
 """Of the table [m]."""
 SPOT = (0.5, 0.16)
-"""Where the cube is to be put, world [m]."""
+"""Target of the cube, world [m]."""
 HOME = (0.42, 0.0, TOP + 0.22)
 """Of the tip at the start, world [m]."""
 LIFT = 0.14
@@ -43,7 +43,7 @@ _HEAD = RADIUS + 0.0025  # m, the head's radius
 # m, onto the table before it lets go: PyBullet's boxes touch where they overlap, and what is above falls onto
 # an edge
 _PRESS = 1e-4
-# m from the cube to the head that grasps it by suction, which asks for touch, and by fingers
+# m from the cube to the head that grasps it by suction, which needs contact, and by fingers
 _ABOVE = 0.0005, 0.003
 # world_from_tip; the robot bends toward its d1, world -y
 _DOWN = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -54,7 +54,7 @@ _ELBOW_UP = (0.3, -1.5, 1.5, -1.5, -1.57, 0.3)  # rad
 
 
 class Phase(NamedTuple):
-    """A part of the script: where it brings the tip, in one motion that begins and ends at rest."""
+    """A phase of the script: the tip's goal, in one motion that begins and ends at rest."""
 
     name: str
     duration: float
@@ -66,7 +66,7 @@ class Phase(NamedTuple):
 
 
 class Cube(NamedTuple):
-    """What is picked up: a cube, parallel to the world's axes."""
+    """Object that is picked up: a cube, parallel to the world's axes."""
 
     start: tuple[float, float] = (0.5, -0.14)
     """x and y of its middle, world [m]."""
@@ -217,18 +217,18 @@ class Picking(HostedWorld):
         phase, before = self.script[k], self.script[k - 1] if k else self._before
         if phase is not self.phase:
             self.phase = phase
-            self._grip(phase.name)
+            self._operate_gripper(phase.name)
         if (phase.tip, phase.bend) == (before.tip, before.bend):
             self.sim.wait(self.dt)
             return
-        part = eased(1.0 - (float(self._ends[k]) - end) / phase.duration)
-        self._bend = before.bend + part * (phase.bend - before.bend)
-        tip = np.array(before.tip) + part * np.subtract(phase.tip, before.tip)
+        fraction = eased(1.0 - (float(self._ends[k]) - end) / phase.duration)
+        self._bend = before.bend + fraction * (phase.bend - before.bend)
+        tip = np.array(before.tip) + fraction * np.subtract(phase.tip, before.tip)
         self._q = self._joints(tip, self._bend, self._q)
         self.arm.drive(self._q)
         self._follow()
 
-    def _grip(self, phase: str) -> None:
+    def _operate_gripper(self, phase: str) -> None:
         """Take hold, or let go, where this phase begins with it."""
         if phase not in ("grasp", "release"):
             return
@@ -247,7 +247,8 @@ class Picking(HostedWorld):
         self._bracket.follow()
 
     def _joints(self, tip: Floats, bend: float, near: ArrayLike) -> Floats:
-        """(6,) that bring the tip of the soft robot of this bend to a point, looking down."""
+        """Return the joint positions (6,) that bring the tip of the soft robot of this bend to a point,
+        looking down."""
         if self._planned is None or self._planned[0] != bend:
             state = self._model.settle(**self._actions.inputs(self._action(bend)), base_pose=_ORIGIN)
             self._planned = (
@@ -255,12 +256,12 @@ class Picking(HostedWorld):
                 np.concatenate([state.tip_rotation[0], state.tip_position[0][:, None]], axis=1),
             )
         from_base = self._planned[1]
-        turn = _DOWN @ from_base[:, :3].T  # world_from_flange: the rod's axes are the flange's
-        flange = tip - turn @ (from_base[:, 3] + [0.0, 0.0, ADAPTER])
-        return self.arm.solve(np.concatenate([flange, quaternion_from_matrix(turn[None])[0]]), near)
+        orientation = _DOWN @ from_base[:, :3].T  # world_from_flange: the rod's axes are the flange's
+        flange = tip - orientation @ (from_base[:, 3] + [0.0, 0.0, ADAPTER])
+        return self.arm.solve(np.concatenate([flange, quaternion_from_matrix(orientation[None])[0]]), near)
 
     def _action(self, bend: float) -> Floats:
-        """(6,) extensions and displacements [m] of both segments, which share the bend, toward d1."""
+        """Return extensions and displacements (6,) [m] of both segments, which bend alike, toward d1."""
         return np.ravel([(0.0, 0.5 * bend * offset, 0.0) for offset in self._actions.offset])
 
     def _furnish(self) -> int:

@@ -18,7 +18,7 @@ from fastrod_scenes.ur5.mujoco_arm import MujocoArm, arm_spec
 START = (0.0, -1.2, 1.4, -1.77, -1.57, 0.0)
 """Joints of the arm: the flange looks down [rad]."""
 SWING = 0.04
-"""By which the first joint turns to the plate, and back [rad]."""
+"""Rotation of the first joint to the plate, and back [rad]."""
 BEND = 0.9
 """Of the soft robot, both segments together [rad]."""
 ADAPTER = 0.03
@@ -52,13 +52,19 @@ class Pressing(MujocoStage):
         plate.add_geom(
             type=lib.mjtGeom.mjGEOM_BOX, size=[0.06, 0.5 * _THICK, 0.06], mass=MASS, rgba=[0.9, 0.6, 0.2, 1.0]
         )
-        add_capsules(spec, robot, "tool0", touch=["plate"])
+        add_capsules(spec, robot, "tool0", contact_bodies=["plate"])
         self.model = spec.compile()
         self.data = lib.MjData(self.model)
         self.arm = MujocoArm(self.model, self.data)
         self.arm.place(START)
         self.rod = MujocoRod(
-            robot, self.model, self.data, "tool0", position=(0.0, 0.0, ADAPTER), touch=["plate"], friction=0.1
+            robot,
+            self.model,
+            self.data,
+            "tool0",
+            position=(0.0, 0.0, ADAPTER),
+            contact_bodies=["plate"],
+            friction=0.1,
         )
         self._actions = SegmentActions(robot)
         self._toward = self._plate_side()
@@ -79,8 +85,8 @@ class Pressing(MujocoStage):
 
     def _plate_side(self) -> Floats:
         """(2,) bend of a segment by 1 rad that leads the tip to +y, world, in the rod's d1 and d2."""
-        turn = self.rod.settle().rotation[0, 0]
-        return np.asarray(turn[1, :2] / np.linalg.norm(turn[1, :2]))
+        axes = self.rod.settle().rotation[0, 0]
+        return np.asarray(axes[1, :2] / np.linalg.norm(axes[1, :2]))
 
 
 @final

@@ -18,7 +18,7 @@ from fastrod_scenes.robots import ur5_path
 from fastrod_scenes.ur5.carried import OFFSET, Bracket, soft_robot
 
 Movers: TypeAlias = Literal["both", "arm", "soft"]
-"""Who moves: arm and soft robot, or one while the other is held."""
+"""Choice of what moves: arm and soft robot, or one while the other is held."""
 ADAPTER = 0.03
 """Of the bracket between flange and soft robot [m]."""
 EXTENSION = 0.03
@@ -47,13 +47,13 @@ JOINT_RATE, BEND_RATE, EXTENSION_RATE = 1.0, 2.0, 0.06
 
 
 class ArmStep(NamedTuple):
-    """What one step did to the tip, world."""
+    """Effect of one step on the tip, world."""
 
     tip: Floats
     """(3,) at its end [m]."""
     by_soft: Floats
-    """(3,) way of the tip by the soft robot's actions: the tip's Jacobian before the step times their change
-    [m]."""
+    """(3,) displacement of the tip by the soft robot's actions: the tip's Jacobian before the step times
+    their change [m]."""
     by_arm: Floats
     """(3,) the same by the arm's joints, as measured [m]."""
 
@@ -74,10 +74,10 @@ class SoftUR5:
     Coordinates q (12,): the joints [rad], then extension and two displacements for each segment [m]
     (`SoftTip`).
 
-    The task leaves q nine ways to move. In these it goes toward the posture in which it began, in the metric
-    of the weights: where the tip is slow, q comes to rest where the weighted square of its way from that
-    posture is least. So the weights alone share the motion out: bends are cheap, and the arm takes the part
-    of the way that would bend the soft robot too much.
+    The task leaves q nine degrees of freedom. In these it goes toward the posture in which it began, in the
+    metric of the weights: where the tip is slow, q comes to rest where the weighted square of its
+    displacement from that posture is least. So the weights alone divide the motion: bends are cheap, and the
+    arm takes over where the soft robot would bend too much.
     """
 
     def __init__(self, *, dt: float, tip: ArrayLike, depth: float = DEPTH, movers: Movers = "both") -> None:
@@ -111,16 +111,16 @@ class SoftUR5:
         rate = np.concatenate(
             [np.full(n, JOINT_RATE), [EXTENSION_RATE, BEND_RATE * OFFSET, BEND_RATE * OFFSET] * 2]
         )
-        part = self.moving
+        moving = self.moving
         self.control = ResolvedRate(
             gain=GAIN,
-            lower=self.lower[part],
-            upper=self.upper[part],
-            rate=rate[part],
-            weight=weight[part],
+            lower=self.lower[moving],
+            upper=self.upper[moving],
+            rate=rate[moving],
+            weight=weight[moving],
             error_limit=ERROR_LIMIT,
             damping=1e-3,
-            posture=start[part],
+            posture=start[moving],
             posture_gain=POSTURE_GAIN,
         )
         self.action: Floats = start[n:]
@@ -147,21 +147,21 @@ class SoftUR5:
         return still
 
     def advance(self, error: Floats, velocity: Floats) -> ArmStep:
-        """One step: the tip makes up for its `error` (3,) [m], as fast as the gain has it, and goes on with
+        """One step: the tip makes up for its `error` (3,) [m], as fast as the gain has it, and continues with
         `velocity` (3,) [m/s]."""
-        q, n, part = self.q(), self.arm.n_joints, self.moving
+        q, n, moving = self.q(), self.arm.n_joints, self.moving
         self.kinematics.follow(q, self._state, self._base)
         jacobian = self.kinematics.jacobian()
         to = q.copy()
-        to[part] += self.dt * self.control.rates(q[part], jacobian[:, part], error, velocity, self.dt)
+        to[moving] += self.dt * self.control.rates(q[moving], jacobian[:, moving], error, velocity, self.dt)
         if self.movers != "soft":
             self.arm.drive(to[:n])
         self.action = to[n:]
         self._state = self.rod.step(**self.kinematics.actions.inputs(self.action))
         self._base = self.rod.host.motion().pose
         self.bracket.follow()
-        way = self.q() - q
-        return ArmStep(self.tip(), jacobian[:, n:] @ way[n:], jacobian[:, :n] @ way[:n])
+        displacement = self.q() - q
+        return ArmStep(self.tip(), jacobian[:, n:] @ displacement[n:], jacobian[:, :n] @ displacement[:n])
 
     def clearance(self, within: float = 0.1) -> float:
         """Of the soft robot from the arm's links, at most `within` [m]; negative inside one."""
@@ -169,5 +169,5 @@ class SoftUR5:
         return min((float(p[8]) for points in near for p in points), default=within)
 
     def _carried(self, state: State) -> Floats:
-        turn = matrix_from_quaternion(self._base[None, 3:])[0] @ state.rotation[0, 0].T
-        return np.asarray(self._base[:3] + turn @ (state.tip_position[0] - state.position[0, 0]))
+        orientation = matrix_from_quaternion(self._base[None, 3:])[0] @ state.rotation[0, 0].T
+        return np.asarray(self._base[:3] + orientation @ (state.tip_position[0] - state.position[0, 0]))

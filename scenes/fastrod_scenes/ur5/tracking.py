@@ -1,4 +1,5 @@
-"""The tip of a soft robot on a UR5 follows five paths (SoftManiSim, CoRL 2024), and who moves it how far."""
+"""The tip of a soft robot on a UR5 follows five paths (SoftManiSim, CoRL 2024), and how much of its motion is
+by each of the two."""
 
 from __future__ import annotations
 
@@ -21,7 +22,7 @@ APPROACH = 2.0
 caught up [s]."""
 LARGEST_ERROR = 1e-6
 """Mean square, over time and over x, y and z [m^2]."""
-LEAST_SHARE = 0.5
+LEAST_FRACTION = 0.5
 """Of the motion by the soft robot."""
 LEAST_CLEARANCE = 0.005
 """Of the soft robot from the arm [m]."""
@@ -39,12 +40,12 @@ class Record(NamedTuple):
     """(n, 3) world [m]."""
     tip: Floats
     """(n, 3) world [m]."""
-    way: Floats
+    displacement: Floats
     """(n, 3) of the tip in the step [m]."""
     by_soft: Floats
-    """(n, 3) the part of it by the soft robot (`Step`) [m]."""
+    """(n, 3) the component of it by the soft robot (`ArmStep`) [m]."""
     by_arm: Floats
-    """(n, 3) the part of it by the arm [m]."""
+    """(n, 3) the component of it by the arm [m]."""
     q: Floats
     """(n, 12)."""
     clearance: float
@@ -57,25 +58,25 @@ class Record(NamedTuple):
         on = (self.t > start + 1e-9) & (self.t <= end + 1e-9)
         return float(((self.goal - self.tip)[on] ** 2).mean())
 
-    def soft_share(self, start: float) -> float:
-        """See `share`, from a time [s] on."""
+    def soft_fraction(self, start: float) -> float:
+        """Return `fraction_of` the soft robot's motion, from a time [s] on."""
         on = self.t > start + 1e-9
-        return share(self.by_soft[on], self.way[on])
+        return fraction_of(self.by_soft[on], self.displacement[on])
 
     def lengths(self, start: float) -> tuple[float, float]:
         """Of the tip's paths by the soft robot alone and by the arm alone, from a time [s] on [m]."""
         on = self.t > start + 1e-9
         by_soft, by_arm = (
-            float(np.linalg.norm(part[on], axis=1).sum()) for part in (self.by_soft, self.by_arm)
+            float(np.linalg.norm(component[on], axis=1).sum()) for component in (self.by_soft, self.by_arm)
         )
         return by_soft, by_arm
 
 
-def share(part: Floats, way: Floats) -> float:
-    """Sum of part . way over the sum of way . way, both (n, 3), step by step [m]: what part of the tip's
-    motion was done by one of those who move it. The shares of all are 1 together; one that moves across the
-    path has none, one that works against it less."""
-    return float((part * way).sum() / (way * way).sum())
+def fraction_of(component: Floats, displacement: Floats) -> float:
+    """Return the fraction of the tip's motion by one of those that move it: sum of component . displacement
+    over the sum of displacement . displacement, both (n, 3), step by step [m]. The fractions of all add up to
+    1; one that moves across the path has none, one that works against it less."""
+    return float((component * displacement).sum() / (displacement * displacement).sum())
 
 
 @final
@@ -90,7 +91,8 @@ class TrackingError(SceneStage):
         self.tip: Floats = self.robot.tip()
         """(3,) measured, world [m]."""
         self.steps: list[tuple[Floats, ...]] = []
-        """Goal, tip, way, way by the soft robot, way by the arm and q of each step."""
+        """Goal, tip, displacement, displacement by the soft robot, displacement by the arm and q of each
+        step."""
 
     def advance(self, t: float) -> None:
         """The tip makes up for its error at t [s] and goes with the goal; what it did is added to `steps`."""
@@ -99,7 +101,7 @@ class TrackingError(SceneStage):
         self.steps.append((goal, step.tip, step.tip - self.tip, step.by_soft, step.by_arm, self.robot.q()))
         self.tip = step.tip
 
-    def carry(self) -> None:
+    def follow_arm(self) -> None:
         """Put the bracket where the flange is."""
         self.robot.bracket.follow()
 
@@ -148,12 +150,12 @@ class TrackingScene(HostedScene):
 
     @final
     def check(self) -> dict[str, float]:
-        """The tip's error, the soft robot's share, room to the limits, clearance and lag must be within the
-        bounds of this module."""
+        """The tip's error, the soft robot's fraction, room to the limits, clearance and lag must be within
+        the bounds of this module."""
         stage = self.stage()
         lower, upper = stage.robot.lower, stage.robot.upper
         run = self.record(stage)
-        error, part = run.mean_square(APPROACH), run.soft_share(APPROACH)
+        error, fraction = run.mean_square(APPROACH), run.soft_fraction(APPROACH)
         by_soft, by_arm = run.lengths(APPROACH)
         room = float(np.minimum(run.q - lower, upper - run.q).min())
         self.expect(
@@ -161,8 +163,8 @@ class TrackingScene(HostedScene):
             f"the mean squared error after the approach is {error:.3g} m^2; at most {LARGEST_ERROR:g}.",
         )
         self.expect(
-            part >= LEAST_SHARE,
-            f"the soft robot does {part:.3f} of the tip's motion; it must be {LEAST_SHARE} or more.",
+            fraction >= LEAST_FRACTION,
+            f"the soft robot does {fraction:.3f} of the tip's motion; it must be {LEAST_FRACTION} or more.",
         )
         self.expect(room >= -1e-6, f"a coordinate is {-room:.3g} beyond its limit.")
         self.expect(
@@ -175,7 +177,7 @@ class TrackingScene(HostedScene):
         return {
             "mean squared error, m^2": error,
             "with the approach, m^2": run.mean_square(0.0, PERIOD),
-            "soft share": part,
+            "soft fraction": fraction,
             "path by the soft robot, m": by_soft,
             "path by the arm, m": by_arm,
             "clearance, m": run.clearance,
@@ -184,7 +186,7 @@ class TrackingScene(HostedScene):
 
 
 def record(stage: TrackingError, times: Iterable[float]) -> Record:
-    """What the stage does at these times, the end of each step [s]."""
+    """Record of the stage at these times, the end of each step [s]."""
     t: list[float] = []
     clearance, lag = np.inf, 0.0
     every = round(_SAMPLE / stage.dt)
@@ -194,8 +196,10 @@ def record(stage: TrackingError, times: Iterable[float]) -> Record:
             clearance = min(clearance, stage.robot.clearance())
             if end > APPROACH:
                 lag = max(lag, float(np.linalg.norm(stage.robot.rest() - stage.tip)))
-    goal, tip, way, by_soft, by_arm, q = (np.array(column) for column in zip(*stage.steps, strict=True))
-    return Record(np.array(t), goal, tip, way, by_soft, by_arm, q, clearance, lag)
+    goal, tip, displacement, by_soft, by_arm, q = (
+        np.array(column) for column in zip(*stage.steps, strict=True)
+    )
+    return Record(np.array(t), goal, tip, displacement, by_soft, by_arm, q, clearance, lag)
 
 
 @final
@@ -222,7 +226,7 @@ class TrackCircle(TrackingScene):
 
 @final
 class TrackFigureEight(TrackingScene):
-    """0.4 m either way."""
+    """0.4 m in either direction."""
 
     name = "track_figure_eight"
     about = "The tip of a soft robot on a UR5 follows a figure eight."

@@ -1,7 +1,7 @@
 """scipy as a peer of fastrod: one segment with four tendons, solved by shooting, as lean as scipy lets it be.
 
-The slope of the rod comes in three kinds: written with numpy, as most people would; in plain scalar Python,
-which is several times as fast; and that function compiled by numba, which leaves scipy's own time.
+The slope of the rod comes in three kinds: written with numpy, as most people would; in plain scalar
+Python, which is several times as fast; and that function compiled by numba, which leaves scipy's own time.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fastrod.model.robot import Robot
+from cases import Array
+from fastrod import Robot
+from report import Measurement
 
-Array: TypeAlias = NDArray[np.float64]
 Tendons: TypeAlias = tuple[tuple[float, float, float], ...]
 """Position d_x, d_y [m] and tension [N] of each."""
 Points: TypeAlias = Sequence[tuple[Array, Sequence[float], Array]]
@@ -49,7 +49,7 @@ def rod_slope(s: float, y: Any, load: Any, rod: Any, tendons: Any, out: Any) -> 
         q = math.sqrt(p * p + b * uz * uz)
         out[i] = q
         i += 1
-        # c = d|q|/du, and T/|q| (|d|^2 I - d d^T - c c^T) is the tendon's share of the stiffness
+        # c = d|q|/du, and T/|q| (|d|^2 I - d d^T - c c^T) is the tendon's part of the stiffness
         if tension != 0.0:
             cx, cy, cz = dy * p / q, -dx * p / q, b * uz / q
             k = tension / q
@@ -74,29 +74,23 @@ def rod_slope(s: float, y: Any, load: Any, rod: Any, tendons: Any, out: Any) -> 
 def array_slope(s: float, y: Array, load: Array, rod: Array, tendons: Array) -> Array:
     """The same slope as one writes it with numpy; `load` (6), `rod` (4), `tendons` (4, 3) as there."""
     rotation, u, n = y[3:12].reshape(3, 3), y[12:15], load[:3] + (rod[0] - s) * load[3:]
-    turn = np.array([[0.0, -u[2], u[1]], [u[2], 0.0, -u[0]], [-u[1], u[0], 0.0]])
+    hat = np.array([[0.0, -u[2], u[1]], [u[2], 0.0, -u[0]], [-u[1], u[0], 0.0]])
     dx, dy, tension = tendons.T
     square = dx * dx + dy * dy
     p = 1.0 + u[0] * dy - u[1] * dx
     q = np.sqrt(p * p + square * u[2] ** 2)
     m, stiffness = rod[1:] * u, np.diag(rod[1:])
     if tension.any():
+        k = tension / q
         c = np.stack([dy * p, -dx * p, square * u[2]]) / q
         d = np.stack([dx, dy, np.zeros(N_TENDONS)])
         m = m + c @ tension
-        stiffness = (
-            stiffness
-            + (tension / q * square).sum() * np.eye(3)
-            - (d * (tension / q)) @ d.T
-            - (c * (tension / q)) @ c.T
-        )
-    turning = turn @ m
-    load_here = rotation.T @ n
-    turning[0] -= load_here[1]
-    turning[1] += load_here[0]
-    return np.concatenate(
-        [rotation[:, 2], (rotation @ turn).ravel(), -np.linalg.solve(stiffness, turning), q]
-    )
+        stiffness = stiffness + (k * square).sum() * np.eye(3) - (d * k) @ d.T - (c * k) @ c.T
+    moment, load_here = hat @ m, rotation.T @ n
+    moment[0] -= load_here[1]
+    moment[1] += load_here[0]
+    change = -np.linalg.solve(stiffness, moment)
+    return np.concatenate([rotation[:, 2], (rotation @ hat).ravel(), change, q])
 
 
 @functools.cache
@@ -108,16 +102,13 @@ def compiled_slope() -> Callable[..., Any]:
     return made
 
 
-Slope: TypeAlias = Literal["arrays", "scalars", "compiled"]
-
-
 @dataclass
-class Peer:
+class Shooter:
     """One robot of one segment and four tendons, solved by shooting with scipy; warm after the first
     solve."""
 
     robot: Robot
-    slope: Slope
+    slope: Literal["arrays", "scalars", "compiled"]
     integrator: str = "RK23"
     rtol: float = 1e-3
     atol: float = 1e-6
@@ -136,14 +127,11 @@ class Peer:
         self.compliance = np.array([tendon.compliance for tendon in segment.tendons])
         length, stiffness = self.rod[:2]
         tension = stiffness / (length * math.hypot(*self.places[0]))
-        self.unit = (
-            np.full(2, 1.0 / length)
-            if self.paper
-            else np.array([stiffness / length] * 3 + [tension] * N_TENDONS)
-        )
+        full = np.array([stiffness / length] * 3 + [tension] * N_TENDONS)
+        self.unit = np.full(2, 1.0 / length) if self.paper else full
         self.tolerance = self.atol / length ** np.repeat([0, 1, 2, 0], [3, 9, 3, N_TENDONS])
         self.x = np.zeros(len(self.unit))
-        self.passes = self.slopes = 0
+        self.passes = 0
 
     def right_hand_side(self, load: Sequence[float], tendons: Tendons) -> Callable[[float, Array], Any]:
         """f(s, y) as `solve_ivp` wants it."""
@@ -173,22 +161,9 @@ class Peer:
 
         self.passes += 1
         state, tendons = self.start(x)
-        options: Any = {"method": self.integrator, "rtol": self.rtol, "atol": self.tolerance}
-        found: Any = solve_ivp(self.right_hand_side(load, tendons), (0.0, self.rod[0]), state, **options)
-        self.slopes += found.nfev
+        slope, tolerances = self.right_hand_side(load, tendons), {"rtol": self.rtol, "atol": self.tolerance}
+        found: Any = solve_ivp(slope, (0.0, self.rod[0]), state, method=self.integrator, **tolerances)
         return np.asarray(found.y[:, -1])
-
-    def tip(self, x: Array, load: Sequence[float]) -> Array:
-        """Tip position (3,) [m] of a forward pass; `odeint` is a method here too."""
-        if self.integrator != "odeint":
-            return self.march(x, load)[:3]
-        from scipy.integrate import odeint
-
-        state, tendons = self.start(x)
-        options: Any = {"tfirst": True, "rtol": self.rtol, "atol": self.tolerance, "full_output": True}
-        states, notes = odeint(self.right_hand_side(load, tendons), state, [0.0, self.rod[0]], **options)
-        self.slopes += int(notes["nfe"][-1])
-        return np.asarray(states[-1, :3])
 
     def moment(self, u: Sequence[float], tendons: Tendons) -> tuple[Array, Array]:
         """m = K u + sum T c of a cut (3,) [N m], and dm/du."""
@@ -201,7 +176,7 @@ class Peer:
         return m, a
 
     def curvature(self, m: Array, tendons: Tendons) -> Array:
-        """u (3,) of a cut that carries the moment `m` (3,) [N m]: three Newton steps reach rounding."""
+        """u (3,) of a cut that carries the moment `m` (3,) [N m]: three Newton steps get to rounding."""
         u = m / self.rod[1:]
         for _ in range(3):
             at, stiffness = self.moment(u.tolist(), tendons)
@@ -212,11 +187,9 @@ class Peer:
         """All boundary residuals [m]: lengths as they are, moments times l^2/EI."""
         if self.paper:
             return np.asarray(tip[15:] - length)
-        tension = x[3:] * self.unit[3:]
+        stretch = self.compliance * x[3:] * self.unit[3:]
         moment, _ = self.moment(tip[12:15].tolist(), self.start(x)[1])
-        return np.concatenate(
-            [tip[15:] - length - self.compliance * tension, self.rod[0] ** 2 / self.rod[1] * moment]
-        )
+        return np.concatenate([tip[15:] - length - stretch, self.rod[0] ** 2 / self.rod[1] * moment])
 
     def solve(self, length: Array, load: Sequence[float]) -> tuple[Array, float]:
         """Tip position (3,) [m] and the largest residual [m], from the solution before."""
@@ -234,11 +207,10 @@ class Peer:
                     raise _EnoughError
             return e / self.rod[0]
 
+        ends = {"ftol": self.ftol, "xtol": self.ftol, "gtol": 1e-12}
         with contextlib.suppress(_EnoughError):
             # the difference step lies well above the integrator's own noise
-            least_squares(
-                fun, self.x, method="lm", ftol=self.ftol, xtol=self.ftol, gtol=1e-12, diff_step=[1e-4]
-            )
+            least_squares(fun, self.x, method="lm", diff_step=[1e-4], **ends)
         self.x = best["x"]
         return best["tip"][:3], best["largest"]
 
@@ -247,31 +219,26 @@ class _EnoughError(Exception):
     """The residual is small enough."""
 
 
-@dataclass(frozen=True)
-class Run:
-    """What a peer took over a stretch of points."""
+class Run(NamedTuple):
+    """What a shooter took over stretches of points."""
 
     cpu_s: float
     """CPU time of one solve, mean over the points, best of the rounds [s]."""
     passes: float
     error_m: Array
-    residual_m: Array
 
 
-def follow(peer: Peer, stretches: Sequence[tuple[Array, Points]], rounds: int) -> Run:
+def follow(peer: Shooter, stretches: Sequence[tuple[Array, Points]], rounds: int) -> Run:
     """Solve the points of each stretch one after the other, warm from its first unknowns, `rounds` times
     over."""
     n_points = sum(len(points) for _, points in stretches)
-    least = math.inf
+    means = []
     for _ in range(rounds):
-        errors, residuals, used, peer.passes = [], [], 0.0, 0
+        used, errors, peer.passes = Measurement(time.process_time), [], 0
         for first, points in stretches:
             peer.x = first.copy()
             for length, load, truth in points:
-                before = time.process_time()
-                tip, residual = peer.solve(length, load)
-                used += time.process_time() - before
+                tip, _ = used.take(functools.partial(peer.solve, length, load))
                 errors.append(float(np.linalg.norm(tip - truth)))
-                residuals.append(residual)
-        least = min(least, used / n_points)
-    return Run(least, peer.passes / n_points, np.array(errors), np.array(residuals))
+        means.append(sum(used.times) / n_points)
+    return Run(min(means), peer.passes / n_points, np.array(errors))

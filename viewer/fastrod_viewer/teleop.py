@@ -1,4 +1,4 @@
-"""`Teleop`: what hands want, from sliders, keys or a drag of the tip, as motion within limits."""
+"""`Teleop`: goals from sliders, keys or a drag of the tip, as motion within limits."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from fastrod_viewer.world import ManualCommand, World
 LARGEST_BEND = math.pi / 2.0
 """Of a segment toward either side [rad]."""
 LARGEST_TENSION = 20.0
-"""Of a wire that is driven by tension [N]."""
+"""Of a tendon that is driven by tension [N]."""
 _INSIDE = 0.999  # of a limit: sums of floats must not be beyond it
-_NOTHING = 1e-6  # m of a wire, below which a robot is bent by its segments alone
+_NOTHING = 1e-6  # m of a tendon, below which a robot is bent by its segments alone
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +31,7 @@ class Speeds:
     """Largest rates, each positive. Raises `InputError`."""
 
     bend: float = math.pi
-    """Of a segment [rad/s]; wires move no faster than this bend needs."""
+    """Of a segment [rad/s]; tendons move no faster than this bend needs."""
     extension: float = 0.5
     """Of a segment, in its own range a second [1/s]."""
     base: float = 0.2
@@ -50,12 +50,12 @@ class Speeds:
 
 @dataclass(frozen=True, eq=False)
 class Goals:
-    """Where the controls of a robot stand, or where it is on its way there."""
+    """Values of a robot's controls: the goals, or the present ones on the path there."""
 
     action: Floats
     """(3 n_segments,) extension and two displacements of each segment [m]; empty where it is not driven
     so."""
-    wire: Floats
+    tendon_change: Floats
     """(n_tendons,) change of each tendon's length on top of what the actions take [m]."""
     tension: Floats
     """(n_tendons,) [N] of the segments that are driven by it."""
@@ -70,30 +70,30 @@ class Goals:
 
 @final
 class Teleop:
-    """Takes what hands want from any thread, and tells a world step by step how to get there.
+    """Takes goals from any thread, and gives a world the command of each step toward them.
 
     >>> import fastrod
     >>> from fastrod_viewer.worlds import FreeWorld
-    >>> pilot = Pilot(FreeWorld(fastrod.load_robot("prototype")))
-    >>> pilot.bend(0, math.pi / 4, 0.0)
-    >>> hand = pilot.step(0.1)
-    >>> bool((hand.tendon_length != 0.07).any())
+    >>> teleop = Teleop(FreeWorld(fastrod.load_robot("prototype")))
+    >>> teleop.bend(0, math.pi / 4, 0.0)
+    >>> command = teleop.step(0.1)
+    >>> bool((command.tendon_length != 0.07).any())
     True
     """
 
     def __init__(
-        self, world: World, speeds: Speeds | None = None, *, reach: TendonLimits | None = None
+        self, world: World, speeds: Speeds | None = None, *, limits: TendonLimits | None = None
     ) -> None:
-        """`reach`: what the wires of the robot that is driven may do; they keep to its rate whatever the
-        speeds are."""
-        self.linked, self.reach = reach is not None, reach or TendonLimits()
+        """`limits` of the tendons of the robot that is driven; they keep to its rate whatever the speeds
+        are."""
+        self.linked, self.limits = limits is not None, limits or TendonLimits()
         self.robot: Robot = world.robot
         self.actions: SegmentActions | None = world.actions
         self._world = world
         self._lock = threading.RLock()
         self._zero = Goals.zero(0 if self.actions is None else self.actions.n_actions, self.robot.n_tendons)
         self._speeds = speeds or Speeds()
-        self._lower, self._upper = _limits(self.robot, self.actions, self.reach)
+        self._lower, self._upper = _limits(self.robot, self.actions, self.limits)
         self._offset = _arm(self.robot)
         self.reset()
 
@@ -118,13 +118,13 @@ class Teleop:
 
     @property
     def goals(self) -> Goals:
-        """Where the controls stand."""
+        """The goals of the controls."""
         with self._lock:
             return self._goals
 
     @property
     def now(self) -> Goals:
-        """What the robot was told last."""
+        """The last command, as goals."""
         with self._lock:
             return self._now
 
@@ -136,7 +136,7 @@ class Teleop:
 
     @property
     def arrived(self) -> bool:
-        """Nothing is on its way."""
+        """Every goal is met."""
         with self._lock:
             pairs = zip(_arrays(self._goals), _arrays(self._now), strict=True)
             return self._pull is None and all(np.array_equal(goal, now) for goal, now in pairs)
@@ -150,7 +150,7 @@ class Teleop:
     def bend(self, segment: int, toward_x: float, toward_y: float) -> None:
         """Bend a segment (from 0, base first) toward x and y of its base [rad], within `LARGEST_BEND`."""
         if self.actions is None:
-            raise InputError(f"robot {self.robot.name!r} has no segments that bends drive; move its wires.")
+            raise InputError(f"robot {self.robot.name!r} has no segments that bends drive; move its tendons.")
         self._act(segment, 1, float(toward_x) * self.actions.offset[segment])
         self._act(segment, 2, float(toward_y) * self.actions.offset[segment])
 
@@ -165,13 +165,13 @@ class Teleop:
         """Lengthen a segment (from 0) [m], within its range."""
         self._act(segment, 0, float(extension))
 
-    def wire(self, tendon: int, change: float) -> None:
+    def change_tendon(self, tendon: int, change: float) -> None:
         """Change one tendon's length to `change` against the straight rest robot [m], negative = pulled; the
         bends keep theirs."""
         with self._lock:
-            wire = self._goals.wire.copy()
-            wire[tendon] += float(change) - self._change(self._goals)[tendon]
-            self._goals = _with(self._goals, wire=wire)
+            changed = self._goals.tendon_change.copy()
+            changed[tendon] += float(change) - self._change(self._goals)[tendon]
+            self._goals = _with(self._goals, tendon_change=changed)
             self._pull = None
 
     def pull_with(self, tendon: int, tension: float) -> None:
@@ -221,7 +221,7 @@ class Teleop:
                 self.hold()
 
     def hold(self) -> None:
-        """Stand still: what is on its way stops where it is."""
+        """Stand still: every motion stops where it is."""
         with self._lock:
             self._goals, self._pull = self._now, None
 
@@ -235,15 +235,15 @@ class Teleop:
         """Take over a robot as it stands: changes of tendon length (n_tendons,) and of segment length
         (n_segments,) [m]."""
         with self._lock:
-            action, rest = self._zero.action, np.array(change, dtype=np.float64)
+            action, left = self._zero.action, np.array(change, dtype=np.float64)
             if self.actions is not None:
                 taken = np.linalg.lstsq(self.actions.matrix, np.concatenate([change, extension]), rcond=None)[
                     0
                 ]
                 action = np.clip(taken, self._lower, self._upper)
-                rest -= self.actions.matrix[: len(rest)] @ action
-            rest[np.abs(rest) < _NOTHING] = 0.0
-            self._goals = self._now = self._before = _with(self._now, action=action, wire=rest)
+                left -= self.actions.matrix[: len(left)] @ action
+            left[np.abs(left) < _NOTHING] = 0.0
+            self._goals = self._now = self._before = _with(self._now, action=action, tendon_change=left)
             self._pull = None
 
     def all_zero(self) -> None:
@@ -252,7 +252,7 @@ class Teleop:
             self._goals, self._pull = self._zero, None
 
     def step(self, dt: float) -> ManualCommand:
-        """What the world is told for the next `dt` [s]."""
+        """Return the command for the next `dt` [s]."""
         with self._lock:
             rate = self._follow_drag(dt) if self._pull is not None else None
             goals, now, speeds = self._goals, self._now, self._speeds
@@ -261,7 +261,7 @@ class Teleop:
                 action = now.action + np.clip(goals.action - now.action, -limit, limit)
             else:
                 action = now.action
-            wire = _toward(now.wire, goals.wire, speeds.bend * self._offset * dt)
+            changed = _toward(now.tendon_change, goals.tendon_change, speeds.bend * self._offset * dt)
             tension = _toward(now.tension, goals.tension, LARGEST_TENSION * dt)
             base = np.concatenate(
                 [
@@ -269,7 +269,7 @@ class Teleop:
                     _toward(now.base[3:], goals.base[3:], 5.0 * speeds.base * dt),
                 ]
             )
-            self._before, self._now = now, self._within_rate(now, Goals(action, wire, tension, base), dt)
+            self._before, self._now = now, self._within_rate(now, Goals(action, changed, tension, base), dt)
             there = self._now
             extension = np.zeros(self.robot.n_segments) if self.actions is None else there.action[::3]
             return ManualCommand(
@@ -285,12 +285,13 @@ class Teleop:
             )
 
     def _within_rate(self, now: Goals, then: Goals, dt: float) -> Goals:
-        """As far from `now` toward `then` as no wire is faster than it may be; straight there."""
+        """Return the goals from `now` toward `then`, on the straight path, at which no tendon exceeds its
+        rate."""
         largest = float(np.abs(self._change(then) - self._change(now)).max(initial=0.0))
-        if largest <= self.reach.rate * dt:
+        if largest <= self.limits.rate * dt:
             return then
-        part = self.reach.rate * dt / largest
-        return Goals(*(a + part * (b - a) for a, b in zip(_arrays(now), _arrays(then), strict=True)))
+        fraction = self.limits.rate * dt / largest
+        return Goals(*(a + fraction * (b - a) for a, b in zip(_arrays(now), _arrays(then), strict=True)))
 
     def _act(self, segment: int, which: int, value: float) -> None:
         with self._lock:
@@ -307,8 +308,8 @@ class Teleop:
 
     def _change(self, goals: Goals) -> Floats:
         if self.actions is None:
-            return goals.wire
-        return np.asarray(self.actions.matrix[: self.robot.n_tendons] @ goals.action + goals.wire)
+            return goals.tendon_change
+        return np.asarray(self.actions.matrix[: self.robot.n_tendons] @ goals.action + goals.tendon_change)
 
     def _action_rates(self, actions: SegmentActions, speeds: Speeds) -> Floats:
         """(3 n_segments,) [m/s]"""
@@ -337,11 +338,16 @@ class Teleop:
 
 
 def _arrays(goals: Goals) -> tuple[Floats, ...]:
-    return goals.action, goals.wire, goals.tension, goals.base
+    return goals.action, goals.tendon_change, goals.tension, goals.base
 
 
 def _with(goals: Goals, **changed: Floats) -> Goals:
-    kept = {"action": goals.action, "wire": goals.wire, "tension": goals.tension, "base": goals.base}
+    kept = {
+        "action": goals.action,
+        "tendon_change": goals.tendon_change,
+        "tension": goals.tension,
+        "base": goals.base,
+    }
     return Goals(**(kept | changed))
 
 
@@ -357,11 +363,11 @@ def _arm(robot: Robot) -> float:
     )
 
 
-def _limits(robot: Robot, actions: SegmentActions | None, reach: TendonLimits) -> tuple[Floats, Floats]:
+def _limits(robot: Robot, actions: SegmentActions | None, limits: TendonLimits) -> tuple[Floats, Floats]:
     """(3 n_segments,) least and largest action [m]."""
     if actions is None:
         return np.zeros(0), np.zeros(0)
-    upper = np.repeat(np.minimum(LARGEST_BEND * actions.offset, _INSIDE * reach.displacement), 3)
+    upper = np.repeat(np.minimum(LARGEST_BEND * actions.offset, _INSIDE * limits.displacement), 3)
     lower = -upper
     lower[::3], upper[::3] = (np.array([segment.extension[i] for segment in robot.segments]) for i in (0, 1))
     return lower, upper

@@ -1,4 +1,4 @@
-"""The files of `fuzz_files.py`: fine ones of every kind, and the ways in which they are spoilt."""
+"""Files of every kind that are read: fine ones, and how they are spoilt (`python perf/fuzz_files.py`)."""
 
 from __future__ import annotations
 
@@ -205,10 +205,10 @@ def spoilt(data: bytes, rng: Rng, *, text: bool) -> tuple[bytes, str]:
     """`data` after one to three changes, and what they were; now and then after none."""
     if rng.random() < 0.02:
         return data, "nothing"
-    ways: dict[str, Spoil] = _TEXT if text or rng.random() < 0.2 else _BYTES
-    names = [sorted(ways)[rng.integers(len(ways))] for _ in range(1 + int(rng.integers(6) // 4))]
+    spoilers: dict[str, Spoil] = _TEXT if text or rng.random() < 0.2 else _BYTES
+    names = [sorted(spoilers)[rng.integers(len(spoilers))] for _ in range(1 + int(rng.integers(6) // 4))]
     for name in names:
-        data = ways[name](data, rng)
+        data = spoilers[name](data, rng)
     return data, ", ".join(names)
 
 
@@ -263,7 +263,7 @@ def _large(data: bytes, rng: Rng) -> bytes:
     return data[:start] + piece + data[start + len(piece) :]
 
 
-def _number(data: bytes, rng: Rng) -> bytes:
+def _odd_number(data: bytes, rng: Rng) -> bytes:
     """A number, or a word, becomes an odd one."""
     found = list(re.finditer(rb"-?\d+\.?\d*(?:[eE][-+]?\d+)?" if rng.random() < 0.9 else rb"\w+", data))
     if not found:
@@ -290,10 +290,10 @@ def _fields(data: bytes, rng: Rng) -> bytes:
     """Two words of a line change places, or a separator becomes another."""
     lines = data.split(b"\n")
     i = int(rng.integers(len(lines)))
-    parts = re.split(rb"([ ,=]+)", lines[i])
-    j, k = rng.integers(len(parts), size=2).tolist()
-    parts[j], parts[k] = parts[k], parts[j]
-    lines[i] = b"".join(parts)
+    words = re.split(rb"([ ,=]+)", lines[i])
+    j, k = rng.integers(len(words), size=2).tolist()
+    words[j], words[k] = words[k], words[j]
+    lines[i] = b"".join(words)
     return b"\n".join(lines)
 
 
@@ -321,8 +321,8 @@ _BYTES: dict[str, Spoil] = {
 }
 _TEXT: dict[str, Spoil] = {
     **_BYTES,
-    "odd number": _number,
-    "odd numbers": lambda data, rng: _number(_number(data, rng), rng),
+    "odd number": _odd_number,
+    "odd numbers": lambda data, rng: _odd_number(_odd_number(data, rng), rng),
     "lines": _lines,
     "fields": _fields,
     "line breaks": _breaks,

@@ -1,4 +1,4 @@
-"""Rods between their nodes, and chains of short straight pieces along curves."""
+"""Rods between their nodes, and curves as series of short straight pieces."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fastrod.types import Floats, Ints
-from fastrod_viewer import chain_kernels as kernels
+from fastrod_viewer import curve_kernels as kernels
 
 
 class Nodes(NamedTuple):
@@ -23,7 +23,7 @@ class Nodes(NamedTuple):
     """(n_robots, n_points) [m]."""
 
 
-class ChainSamples(NamedTuple):
+class CurveSamples(NamedTuple):
     """Cross-sections between the nodes."""
 
     position: Floats
@@ -32,12 +32,12 @@ class ChainSamples(NamedTuple):
     """(n_robots, m, 4) world_from_material; its sign does not jump along the rod."""
     interval: Ints
     """(n_robots, m) the node before."""
-    part: Floats
-    """(n_robots, m) of the way to the next node, 0 to 1."""
+    interval_fraction: Floats
+    """(n_robots, m) fraction of the interval to the next node, 0 to 1."""
 
 
 class Pieces(NamedTuple):
-    """Straight pieces of strands: (n_robots, n_strands, n_pieces, ...)."""
+    """Straight pieces of lines along rods: (n_robots, n_lines, n_pieces, ...)."""
 
     centre: Floats
     """(..., 3) [m]."""
@@ -46,12 +46,12 @@ class Pieces(NamedTuple):
     length: Floats
     """(...) from end to end [m]."""
     bend: Floats
-    """(...) by how much the rod's tangent changes over the piece."""
+    """(...) change of the rod's tangent over the piece."""
 
 
 def nodes(position: Floats, rotation: Floats, arclength: Floats) -> Nodes:
-    """Of positions (n_robots, n_points, 3), rotations (n_robots, n_points, 3, 3) and arclengths (n_robots,
-    n_points), finite."""
+    """Build nodes of positions (n_robots, n_points, 3), rotations (n_robots, n_points, 3, 3) and arclengths
+    (n_robots, n_points), finite."""
     quaternion = np.empty((*rotation.shape[:2], 4))
     kernels.quaternions(rotation, quaternion)
     return Nodes(
@@ -71,10 +71,10 @@ class Sampler:
         nodes."""
         self.n_steps, self.segment, self.fraction = n_steps, segment, fraction
 
-    def __call__(self, rods: Nodes) -> ChainSamples:
+    def __call__(self, rods: Nodes) -> CurveSamples:
         """(n_robots, m, ...) at the m cross-sections of these rods."""
         n, m = len(rods.position), len(self.segment)
-        found = ChainSamples(
+        found = CurveSamples(
             np.empty((n, m, 3)), np.empty((n, m, 4)), np.empty((n, m), np.int64), np.empty((n, m))
         )
         kernels.sample(
@@ -88,16 +88,16 @@ class Sampler:
             found.position,
             found.quaternion,
             found.interval,
-            found.part,
+            found.interval_fraction,
         )
         return found
 
 
-def along(between: tuple[Floats, Floats], samples: ChainSamples) -> Floats:
+def along(between: tuple[Floats, Floats], samples: CurveSamples) -> Floats:
     """(n_robots, m) linear between the values (n_robots, n_points - 1) at the start and the end of each
     interval."""
     start, end = (np.take_along_axis(a, samples.interval, axis=1) for a in between)
-    return np.asarray(start + samples.part * (end - start))
+    return np.asarray(start + samples.interval_fraction * (end - start))
 
 
 def tangents(quaternion: Floats) -> Floats:
@@ -114,14 +114,14 @@ def aim(direction: Floats) -> Floats:
     return np.asarray(found / np.linalg.norm(found, axis=-1, keepdims=True))
 
 
-def pieces(samples: ChainSamples, n_strips: int, source: Ints, offset: Floats) -> Pieces:
-    """Of strands through segments: `samples` are those of `n_strips` segments, as many of each; strand c runs
-    through those of `source[c]` (n_strands,) at `offset` (1 or n_robots, n_strands, 2) along d1 and d2
-    [m]."""
-    n, count = samples.part.shape
+def pieces(samples: CurveSamples, n_strips: int, source: Ints, offset: Floats) -> Pieces:
+    """Return the pieces of lines through segments: `samples` are those of `n_strips` segments, as many of
+    each; line c runs through those of `source[c]` (n_lines,) at `offset` (1 or n_robots, n_lines, 2) along d1
+    and d2 [m]."""
+    n, count = samples.interval_fraction.shape
     ends = count // n_strips
     shape = n, len(source), ends - 1
     made = Pieces(np.empty((*shape, 3)), np.empty((*shape, 4)), np.empty(shape), np.empty(shape))
-    at, turn = (a.reshape(n, n_strips, ends, -1) for a in (samples.position, samples.quaternion))
-    kernels.strands(at, turn, source, offset, ends - 1, *made)
+    at, orientation = (a.reshape(n, n_strips, ends, -1) for a in (samples.position, samples.quaternion))
+    kernels.offset_pieces(at, orientation, source, offset, ends - 1, *made)
     return made

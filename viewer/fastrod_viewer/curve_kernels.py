@@ -1,7 +1,6 @@
-"""Cross-sections between nodes, and pieces between cross-sections, compiled: a picture has a thousand of
-them, thirty times a second.
+"""Compiled kernels for curves: cross-sections between nodes, and straight pieces between cross-sections.
 
-All in one file, by which numba keys its cache.
+A picture has a thousand of them, thirty times a second. All are in one file, by which numba keys its cache.
 """
 
 from __future__ import annotations
@@ -64,12 +63,12 @@ def sample(
     segment: Ints,
     fraction: Floats,
     at: Floats,
-    turn: Floats,
+    orientation: Floats,
     interval: Ints,
-    part: Floats,
+    interval_fraction: Floats,
 ) -> None:
-    """Fill `at` (n, m, 3), `turn` (n, m, 4), `interval` (n, m) and `part` (n, m) at `fraction` (m,) of
-    `segment` (m,).
+    """Fill `at` (n, m, 3), `orientation` (n, m, 4), `interval` (n, m) and `interval_fraction` (n, m) at
+    `fraction` (m,) of `segment` (m,).
 
     Positions by cubic Hermite polynomials of position (n, p, 3) and tangent (n, p, 3), rotations by
     normalised lerp of quaternion (n, p, 4); nodes need not be even: where forces act on points, nodes stand
@@ -94,18 +93,20 @@ def sample(
                 )
             size = 0.0
             for c in range(4):
-                turn[i, j, c] = quaternion[i, k, c] + t * (quaternion[i, k + 1, c] - quaternion[i, k, c])
-                size += turn[i, j, c] ** 2
+                orientation[i, j, c] = quaternion[i, k, c] + t * (
+                    quaternion[i, k + 1, c] - quaternion[i, k, c]
+                )
+                size += orientation[i, j, c] ** 2
             size = math.sqrt(size)
             for c in range(4):
-                turn[i, j, c] /= size
-            interval[i, j], part[i, j] = k, t
+                orientation[i, j, c] /= size
+            interval[i, j], interval_fraction[i, j] = k, t
 
 
 @entry
-def strands(
+def offset_pieces(
     at: Floats,
-    turn: Floats,
+    orientation: Floats,
     source: Ints,
     offset: Floats,
     n_pieces: int,
@@ -114,13 +115,13 @@ def strands(
     length: Floats,
     bend: Floats,
 ) -> None:
-    """Straight pieces of strands that run beside rods, each through one segment.
+    """Compute straight pieces of lines that run parallel to rods, each through one segment.
 
-    Cross-sections `at` (n, q, n_pieces + 1, 3) and `turn` (n, q, n_pieces + 1, 4); strand c runs through
+    Cross-sections `at` (n, q, n_pieces + 1, 3) and `orientation` (n, q, n_pieces + 1, 4); line c runs through
     those of `source[c]`, at `offset` (1 or n, m, 2) along d1 and d2. Fill `centre` (n, m, n_pieces, 3),
-    `along` (n, m, n_pieces, 4), whose z is along the piece, `length` and
-    `bend` (n, m, n_pieces), by how much the rod's tangent changes over the piece. In the middle of an arc the
-    tangent is parallel to the chord, so that a strand in the middle of the rod takes the rod's own rotation.
+    `along` (n, m, n_pieces, 4), whose z is along the piece, `length` and `bend` (n, m, n_pieces), the change
+    of the rod's tangent over the piece. In the middle of an arc the tangent is parallel to the chord, so that
+    a line in the middle of the rod takes the rod's own rotation.
     """
     point, q = np.empty((2, 3)), np.empty(4)
     d = np.empty((2, 3, 3))  # at both ends of a piece: d1, d2, d3
@@ -130,7 +131,12 @@ def strands(
             k = source[c]
             x, y = offset[row, c, 0], offset[row, c, 1]
             for j in range(n_pieces + 1):
-                a, b, u, v = turn[i, k, j, 0], turn[i, k, j, 1], turn[i, k, j, 2], turn[i, k, j, 3]
+                a, b, u, v = (
+                    orientation[i, k, j, 0],
+                    orientation[i, k, j, 1],
+                    orientation[i, k, j, 2],
+                    orientation[i, k, j, 3],
+                )
                 d[0], point[0] = d[1], point[1]
                 d[1, 0, 0], d[1, 0, 1], d[1, 0, 2] = (
                     1.0 - 2.0 * (u * u + v * v),
@@ -151,21 +157,21 @@ def strands(
                     point[1, e] = at[i, k, j, e] + x * d[1, 0, e] + y * d[1, 1, e]
                 if j == 0:
                     continue
-                size = turned = norm = 0.0
+                size = change = norm = 0.0
                 for e in range(4):
-                    q[e] = turn[i, k, j - 1, e] + turn[i, k, j, e]
+                    q[e] = orientation[i, k, j - 1, e] + orientation[i, k, j, e]
                     norm += q[e] ** 2
                 for e in range(3):
                     size += (point[1, e] - point[0, e]) ** 2
-                    turned += (d[1, 2, e] - d[0, 2, e]) ** 2
+                    change += (d[1, 2, e] - d[0, 2, e]) ** 2
                     centre[i, c, j - 1, e] = 0.5 * (point[0, e] + point[1, e])
                 q /= math.sqrt(norm)
                 size = math.sqrt(size)
-                length[i, c, j - 1], bend[i, c, j - 1] = size, math.sqrt(turned)
+                length[i, c, j - 1], bend[i, c, j - 1] = size, math.sqrt(change)
                 if (x == 0.0 and y == 0.0) or size < 1e-30:
                     along[i, c, j - 1] = q
                     continue
-                # the shortest turn from the rod's middle tangent to the chord, then the rod's: r q
+                # the shortest rotation from the rod's middle tangent to the chord, then the rod's: r q
                 mx, my, mz = (
                     2.0 * (q[1] * q[3] + q[0] * q[2]),
                     2.0 * (q[2] * q[3] - q[0] * q[1]),

@@ -1,5 +1,5 @@
-"""One rod on one UR5 in PyBullet and in MuJoCo: where its tip is and what the flange feels, at rest, hanging
-and pushed."""
+"""One rod on one UR5 in PyBullet and in MuJoCo: its tip and the wrench on the flange, at rest, hanging and
+pushed."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Result(NamedTuple):
 
 
 def carried() -> tuple[Any, dict[str, Any]]:
-    """The rod, and its wires as they bend it toward the block."""
+    """The rod, and its tendons as they bend it toward the block."""
     from fastrod.model.segment_actions import SegmentActions
     from fastrod_scenes.ur5.carried import OFFSET, soft_robot
 
@@ -65,7 +65,7 @@ def in_pybullet(case: str) -> tuple[Any, Callable[[], Any]]:
     world = connect(dt=DT)
     arm = BulletArm.load(world, ur5_path(), tip="tool0")
     arm.place(JOINTS)
-    touch: list[Any] = []
+    contact_bodies: list[Any] = []
     if case in CASES[2:]:
         shape = world.createCollisionShape(world.GEOM_BOX, halfExtents=list(HALF))
         still = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
@@ -85,11 +85,11 @@ def in_pybullet(case: str) -> tuple[Any, Callable[[], Any]]:
             linkJointAxis=[[0, 1, 0]],
             linkJointTypes=[world.JOINT_PRISMATIC if case == CASES[3] else world.JOINT_FIXED],
         )
-        touch = [(block, 0)]
+        contact_bodies = [(block, 0)]
     rod = MountedRod(
         carried()[0],
         BulletLink(world, arm.body, arm.tip, position=(0.0, 0.0, ADAPTER)),
-        touch=touch,
+        contact_bodies=contact_bodies,
         friction=0.0,
     )
     given = inputs(case)
@@ -114,7 +114,7 @@ def in_mujoco(case: str) -> tuple[Any, Callable[[], Any]]:
     from fastrod_scenes.ur5.mujoco_arm import MujocoArm, arm_spec
 
     spec = arm_spec(DT)
-    touch: list[str] = []
+    contact_bodies: list[str] = []
     if case in CASES[2:]:
         block = spec.worldbody.add_body(name="block", pos=block_at().tolist(), gravcomp=1.0)
         if case == CASES[3]:
@@ -122,13 +122,15 @@ def in_mujoco(case: str) -> tuple[Any, Callable[[], Any]]:
                 type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 1, 0], stiffness=SPRING, damping=DAMPER
             )
         block.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=list(HALF), mass=MASS)
-        touch = ["block"]
+        contact_bodies = ["block"]
     robot = carried()[0]
-    add_capsules(spec, robot, "tool0", touch=touch)
+    add_capsules(spec, robot, "tool0", contact_bodies=contact_bodies)
     model = spec.compile()
     data = mujoco.MjData(model)
     MujocoArm(model, data).place(JOINTS)
-    rod = MujocoRod(robot, model, data, "tool0", position=(0.0, 0.0, ADAPTER), touch=touch, friction=0.0)
+    rod = MujocoRod(
+        robot, model, data, "tool0", position=(0.0, 0.0, ADAPTER), contact_bodies=contact_bodies, friction=0.0
+    )
     given = inputs(case)
     return rod, lambda: rod.step(**given)
 
@@ -148,11 +150,11 @@ def apart(a: Result, b: Result) -> dict[str, float]:
     """How far two engines are apart: tips by the rod's length, forces and moments by the larger."""
     robot = carried()[0]
 
-    def part(u: Any, v: Any) -> float:
+    def relative(u: Any, v: Any) -> float:
         return float(np.linalg.norm(u - v) / max(np.linalg.norm(u), np.linalg.norm(v)))
 
     return {
         "tip": float(np.linalg.norm(a.tip - b.tip)) / robot.length,
-        "force": part(a.wrench[:3], b.wrench[:3]),
-        "moment": part(a.wrench[3:], b.wrench[3:]),
+        "force": relative(a.wrench[:3], b.wrench[:3]),
+        "moment": relative(a.wrench[3:], b.wrench[3:]),
     }

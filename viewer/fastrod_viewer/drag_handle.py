@@ -1,4 +1,4 @@
-"""`DragHandle`: the ball at the tip that hands pull."""
+"""`DragHandle`: the ball at the tip that a person drags."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _HINT = "drag me"
 
 @final
 class DragHandle:
-    """Follows the tip, or the hand that has got hold of it; the pilot then takes the tip there by inverse
+    """Ball that follows the tip, or the page that drags it; `Teleop` then moves the tip there by inverse
     kinematics."""
 
     def __init__(
@@ -32,12 +32,12 @@ class DragHandle:
         *,
         may: Callable[[Any], bool],
     ) -> None:
-        """`radius` of the ball [m]; `place` (3,) is where the world's origin is drawn for the robot that
-        hands drive [m]; `may` says of an event whether the page it comes from may act."""
+        """`radius` of the ball [m]; `place` (3,) is where the world's origin is drawn for the robot that is
+        driven [m]; `may` says of an event whether the page it comes from may act."""
         self.session, self._place, self._may = session, place, may
         self._held_by: int | None = None
         self._ball: Any = server.scene.add_icosphere(
-            "/grip",
+            "/drag_handle",
             radius,
             color=ACCENT,
             opacity=0.55,
@@ -45,21 +45,23 @@ class DragHandle:
             cast_shadow=False,
             receive_shadow=False,
         )
-        self._hint: Any = server.scene.add_label("/grip/hint", _HINT, position=(0.0, 0.0, 2.2 * radius))
+        self._hint: Any = server.scene.add_label(
+            "/drag_handle/hint", _HINT, position=(0.0, 0.0, 2.2 * radius)
+        )
         self._ball.on_drag("left")(self._dragged)
 
     def follow(self, tip: Floats) -> None:
-        """Be at the tip (3,) as it is drawn [m], or at the hand."""
-        goal = self.session.pilot.dragged_to
+        """Move to the tip (3,) as it is drawn [m], or to the drag point."""
+        goal = self.session.teleop.dragged_to
         at = tip if goal is None else goal + self._place
         if np.isfinite(at).all() and math.dist(at, self._ball.position) > 1e-6:
             self._ball.position = at
 
     def lost(self, client: int) -> None:
-        """A client is gone, or its hand lets go."""
+        """Let go: a client is gone, or has released the ball."""
         if self._held_by == client:
             self._held_by = None
-            self.session.pilot.drag(None)
+            self.session.teleop.drag(None)
 
     def remove(self) -> None:
         """Take the ball away."""
@@ -77,5 +79,5 @@ class DragHandle:
                 self._hint = None
             self._held_by = event.client_id
             session.take_over()
-            session.pilot.drag(np.array(event.end_position) - self._place)
-        session.touch()
+            session.teleop.drag(np.array(event.end_position) - self._place)
+        session.wake()

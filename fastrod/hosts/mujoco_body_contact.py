@@ -9,9 +9,9 @@ import numpy as np
 
 from fastrod.contact import Obstacle, box, capsule, cylinder, mesh, plane, sphere
 from fastrod.errors import HostError
+from fastrod.hosts.body_contact import BodyContact, CollisionShape
 from fastrod.hosts.host import Motion
 from fastrod.hosts.mujoco_body import Applied, com_motion, mujoco
-from fastrod.hosts.touching import BodyContact, BodyPart
 from fastrod.rotation import matrix_from_quaternion, product
 from fastrod.types import Floats
 
@@ -20,15 +20,14 @@ _INVERSE = np.array([1.0, -1.0, -1.0, -1.0])  # of a unit quaternion w x y z
 
 @final
 class MujocoBodyContact(BodyContact):
-    """A body that a rod touches, and what the rod does to it (`BodyContact`). Poses and velocities are as
-    `data` have them:
-    `MujocoBody.motion` has brought them up to date."""
+    """Contact of a rod with a body of a MuJoCo model (`BodyContact`). Poses and velocities are as `data` have
+    them: `MujocoBody.motion` has brought them up to date."""
 
     def __init__(
         self, model: Any, data: Any, body: int, *, dt: float, relaxation: float, friction: float
     ) -> None:
-        """`relaxation` tau [s]; `friction` of rod on the body. Raises `HostError` where nothing of the body
-        can be touched."""
+        """`relaxation` tau [s]; `friction` of rod on the body. Raises `HostError` where no geom of the body
+        collides."""
         self.model, self.data, self.body = model, data, body
         solid = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
         self.geoms: list[int] = np.flatnonzero(solid & (model.geom_bodyid == body)).tolist()
@@ -38,10 +37,10 @@ class MujocoBodyContact(BodyContact):
             )
         still = model.body_weldid[body] == 0 or model.body_mocapid[model.body_weldid[body]] >= 0
         mass = 0.0 if still else float(model.body_mass[body])
-        parts = _parts(model, body, self.geoms)
+        shapes = _shapes(model, body, self.geoms)
         self._applied = Applied(data, body)
         super().__init__(
-            parts, mass, model.body_inertia[body].copy(), dt=dt, relaxation=relaxation, friction=friction
+            shapes, mass, model.body_inertia[body].copy(), dt=dt, relaxation=relaxation, friction=friction
         )
 
     def com(self) -> Motion:
@@ -49,15 +48,15 @@ class MujocoBodyContact(BodyContact):
         return com_motion(self.model, self.data, self.body)
 
     def overlap(self, capsules: Sequence[int]) -> Floats:
-        """(3,) the body's way out of the deepest overlap of one of its geoms with one of these, world [m];
-        its length is the depth."""
+        """Return the body's displacement (3,) out of the deepest overlap of one of its geoms with one of
+        these, world [m]; its length is the depth."""
         lib = mujoco()
-        deepest, way, ends = 0.0, np.zeros(3), np.zeros(6)
+        deepest, separation, ends = 0.0, np.zeros(3), np.zeros(6)
         for own in capsules:
             for geom in self.geoms:
                 if (gap := lib.mj_geomDistance(self.model, self.data, own, geom, 0.0, ends)) < deepest:
-                    deepest, way = gap, ends[:3] - ends[3:]
-        return way
+                    deepest, separation = gap, ends[:3] - ends[3:]
+        return separation
 
     def apply(self, wrench: Floats) -> None:
         """(6,) force [N] and moment about the centre of mass [N m], world, in place of the last; it acts
@@ -69,18 +68,18 @@ class MujocoBodyContact(BodyContact):
         self._applied.take()
 
 
-def _parts(model: Any, body: int, geoms: Sequence[int]) -> list[BodyPart]:
+def _shapes(model: Any, body: int, geoms: Sequence[int]) -> list[CollisionShape]:
     """The geoms of a body."""
     label = model.body(body).name or f"body {body}"
-    turn = matrix_from_quaternion(model.body_iquat[body][None])[0].T
-    parts = []
+    rotation = matrix_from_quaternion(model.body_iquat[body][None])[0].T
+    shapes = []
     for i, geom in enumerate(geoms):
-        made = obstacle_of(model, geom, label + (f" part {i}" if i else ""))
-        position = turn @ (model.geom_pos[geom] - model.body_ipos[body])
-        parts.append(
-            BodyPart(made, position, product(model.body_iquat[body] * _INVERSE, model.geom_quat[geom]))
+        made = obstacle_of(model, geom, label + (f" shape {i}" if i else ""))
+        position = rotation @ (model.geom_pos[geom] - model.body_ipos[body])
+        shapes.append(
+            CollisionShape(made, position, product(model.body_iquat[body] * _INVERSE, model.geom_quat[geom]))
         )
-    return parts
+    return shapes
 
 
 def obstacle_of(model: Any, geom: int, name: str) -> Obstacle:

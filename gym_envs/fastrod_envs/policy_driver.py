@@ -30,9 +30,9 @@ class PolicyDriver:
     task Track has them.
 
     The policy is asked once a step, with the very observation of the task; between steps the command stays,
-    and a call that comes late is one step. The first call begins at home, with straight wires. A tip that is
-    not measured (nan) is taken to be where it was last seen, for one step; after that the robot stays where
-    it is until the tip is seen again.
+    and a call that comes late is one step. The first call begins at home, with straight tendons. A tip that
+    is not measured (nan) is taken to be where it was last seen, for one step; after that the robot stays
+    where it is until the tip is seen again.
 
     >>> from fastrod_envs.policies import Policy, find
     >>> pilot = TrackPilot(Policy(find("Track", "shipped")), "circle")
@@ -50,30 +50,30 @@ class PolicyDriver:
         robot: Robot | None = None,
         *,
         phase: float = 0.0,
-        way: int = 1,
+        sense: int = 1,
     ) -> None:
         """Follow `path`, of the task by its name or a trajectory in a plane across the robot, base frame:
-        from `phase` [s] on it, forward (`way` 1) or backward (-1). `robot`, by default the prototype, says
+        from `phase` [s] on it, forward (`sense` 1) or backward (-1). `robot`, by default the prototype, says
         what is in reach, as in `ReachableSurface`.
 
         Raises `InputError` for a policy of another task, or of other observations or actions than the task
-        has by default; for a robot that is not one segment with two pairs of wires; for a path out of a
+        has by default; for a robot that is not one segment with two pairs of tendons; for a path out of a
         plane. Raises `UnknownNameError` for a name of no path.
         """
-        told = policy.options
+        trained_on = policy.options
         if (
             name_of(policy.plan.env) != "Track"
-            or told.get("observation", "state") != "state"
-            or told.get("action", "rate") != "rate"
+            or trained_on.get("observation", "state") != "state"
+            or trained_on.get("action", "rate") != "rate"
         ):
             raise InputError(
-                f"the policy was trained on {policy.plan.env} with {told}; give one of Track that observes "
-                "the state and tells rates."
+                f"the policy was trained on {policy.plan.env} with {trained_on}; "
+                "give one of Track that observes the state and tells rates."
             )
-        if way not in (1, -1) or not math.isfinite(phase):
-            raise InputError(f"phase is {phase!r} s and way {way!r}; give a finite time, and 1 or -1.")
+        if sense not in (1, -1) or not math.isfinite(phase):
+            raise InputError(f"phase is {phase!r} s and sense {sense!r}; give a finite time, and 1 or -1.")
         self.robot = load_robot("prototype") if robot is None else robot
-        """Whose wires they are."""
+        """Whose tendons they are."""
         if self.robot.n_segments != 1:
             raise InputError(
                 f"robot {self.robot.name!r} has {self.robot.n_segments} segments; a policy of "
@@ -86,15 +86,15 @@ class PolicyDriver:
         if not isinstance(path, (str, Trajectory)):
             raise InputError(f"path is {path!r}; give a Trajectory or one of {', '.join(map(repr, known))}.")
         self._path = known[path] if isinstance(path, str) else path
-        self._phase, self._way = float(phase), float(way)
-        turn = self._path.position(np.linspace(0.0, self._path.period, 721))
-        if np.ptp(turn[:, 2]) > 1e-9:
+        self._phase, self._sense = float(phase), float(sense)
+        points = self._path.position(np.linspace(0.0, self._path.period, 721))
+        if np.ptp(points[:, 2]) > 1e-9:
             raise InputError(
-                f"path {self._path.name!r} rises by {np.ptp(turn[:, 2]):g} m; a policy of "
+                f"path {self._path.name!r} rises by {np.ptp(points[:, 2]):g} m; a policy of "
                 "Track follows one in a plane."
             )
-        radius = max(RADIUS, float(np.hypot(turn[:, 0], turn[:, 1]).max()))
-        self._surface = ReachableSurface(self.robot, height=float(turn[0, 2]), radius=radius)
+        radius = max(RADIUS, float(np.hypot(points[:, 0], points[:, 1]).max()))
+        self._surface = ReachableSurface(self.robot, height=float(points[0, 2]), radius=radius)
         self._policy = policy
         states = fields(self.robot)[1]
         self._least, self._largest = (a.astype(np.float32) for a in bounds(states))
@@ -119,9 +119,9 @@ class PolicyDriver:
         return np.array(self._surface.nearest(self._along(t))[0])
 
     def command(self, tip: ArrayLike, t: float) -> Floats:
-        """(n_tendons,) change of each wire's length [m] for a tip that is measured at `tip` (3,), base frame
-        [m], nan where it is not, at the path's time `t` [s]. Raises `InputError` on a tip that is not one and
-        on a time that runs back."""
+        """(n_tendons,) change of each tendon's length [m] for a tip that is measured at `tip` (3,), base
+        frame [m], nan where it is not, at the path's time `t` [s]. Raises `InputError` on a tip that is not
+        one and on a time that runs back."""
         try:
             seen = np.array(tip, dtype=np.float64)
         except (TypeError, ValueError) as error:
@@ -168,4 +168,4 @@ class PolicyDriver:
 
     def _along(self, t: float) -> Floats:
         """(1, 3) the path at a time [s]."""
-        return self._path.position(np.array([self._phase + self._way * t]))
+        return self._path.position(np.array([self._phase + self._sense * t]))

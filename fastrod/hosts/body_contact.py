@@ -18,7 +18,7 @@ from fastrod.types import Floats
 _LEFT = 0.8  # of an overlap after a step
 
 
-class BodyPart(NamedTuple):
+class CollisionShape(NamedTuple):
     """One collision shape of a body."""
 
     obstacle: Obstacle
@@ -29,10 +29,10 @@ class BodyPart(NamedTuple):
 
 
 class BodyContact(ABC):
-    """A body that a rod touches, and what the rod does to it.
+    """Contact of a rod with a body of another engine: its obstacles, and the rod's push on it.
 
     A step is implicit in the body's inertia: to the rod it is where it would be at the step's end without the
-    rod, and gives way by F dt^2 / m and M dt^2 / I. A contact that lasts gives no more momentum than stops
+    rod, and moves away by F dt^2 / m and M dt^2 / I. A contact that lasts gives no more momentum than stops
     the body at the rod, at any time step.
 
     The rod answers a changing load with tau dF/dt more (Kelvin and Voigt): a rod without mass and damping
@@ -42,7 +42,7 @@ class BodyContact(ABC):
 
     def __init__(
         self,
-        parts: Sequence[BodyPart],
+        shapes: Sequence[CollisionShape],
         mass: float,
         inertia: Floats,
         *,
@@ -56,10 +56,11 @@ class BodyContact(ABC):
         self.mass = mass
         """0: it does not move for the rod [kg]."""
         self._inertia: Floats = np.maximum(inertia, 1e-12)
-        self.parts = [
-            part._replace(obstacle=dataclasses.replace(part.obstacle, friction=friction)) for part in parts
+        self.shapes = [
+            shape._replace(obstacle=dataclasses.replace(shape.obstacle, friction=friction))
+            for shape in shapes
         ]
-        self.names = tuple(part.obstacle.name for part in self.parts)
+        self.names = tuple(shape.obstacle.name for shape in self.shapes)
         self.exerted: Floats = np.zeros(6)
         """Force [N] and moment about its centre of mass [N m] that the rod exerted on it in the last step,
         world."""
@@ -71,8 +72,8 @@ class BodyContact(ABC):
 
     @abstractmethod
     def overlap(self, capsules: Sequence[int]) -> Floats:
-        """(3,) the way out of what it overlaps most of these bodies or geoms of its engine, world [m]; zero
-        where it overlaps none."""
+        """Return the displacement (3,) out of the deepest overlap with one of these bodies or geoms of its
+        engine, world [m]; zero where it overlaps none."""
 
     @abstractmethod
     def apply(self, wrench: Floats) -> None:
@@ -80,39 +81,40 @@ class BodyContact(ABC):
         step."""
 
     @final
-    def give(self) -> tuple[float, Floats, Floats]:
-        """How far it moves per force [m/N] and turns per moment (3, 3) [rad/(N m)] in the next step, and its
-        centre of mass (3,)."""
+    def mobility(self) -> tuple[float, Floats, Floats]:
+        """Return its mobility in the next step: displacement per force [m/N] and rotation per moment (3, 3)
+        [rad/(N m)], and its centre of mass (3,)."""
         pose = self.com().pose
         if self.mass == 0.0:
             return 0.0, np.zeros((3, 3)), pose[:3]
-        turn, square = matrix_from_quaternion(pose[None, 3:])[0], self.dt**2 + self.relaxation * self.dt
-        return square / self.mass, square * turn @ (turn.T / self._inertia[:, None]), pose[:3]
+        rotation, square = matrix_from_quaternion(pose[None, 3:])[0], self.dt**2 + self.relaxation * self.dt
+        return square / self.mass, square * rotation @ (rotation.T / self._inertia[:, None]), pose[:3]
 
     @final
     def expected(self, capsules: Sequence[int]) -> tuple[dict[str, Floats], dict[str, Floats]]:
-        """Pose (7,) and velocity (6,) of each part at the end of the next step, were it not for the rod.
+        """Return pose (7,) and velocity (6,) of each shape at the end of the next step, were it not for the
+        rod.
 
-        What overlaps the rod's `capsules` already (a contact that was lost for a step) is expected most of
-        the way outside: out at once it would leave at overlap / dt.
+        What overlaps the rod's `capsules` already (a contact that was lost for a step) is expected mostly
+        outside: out at once it would leave at overlap / dt.
         """
         motion = self.com()
         if self.mass > 0.0:
             # per step: tau dt of the force before, as a velocity
             back = self.relaxation / (self.dt**2 + self.relaxation * self.dt)
-            by_force, by_moment, _ = self.give()
+            by_force, by_moment, _ = self.mobility()
             change = np.concatenate([by_force * self._before[:3], by_moment @ self._before[3:]])
             motion = motion._replace(velocity=motion.velocity - back * change)
         pose = motion.after(self.dt)
         if self.mass > 0.0:
             pose[:3] += _LEFT * self.overlap(capsules)
-        turn = matrix_from_quaternion(pose[None, 3:])[0]
+        rotation = matrix_from_quaternion(pose[None, 3:])[0]
         poses, velocities = {}, {}
-        for part in self.parts:
-            arm = turn @ part.position
-            poses[part.obstacle.name] = np.concatenate([pose[:3] + arm, product(pose[3:], part.quaternion)])
+        for shape in self.shapes:
+            arm = rotation @ shape.position
+            poses[shape.obstacle.name] = np.concatenate([pose[:3] + arm, product(pose[3:], shape.quaternion)])
             linear = motion.velocity[:3] + np.cross(motion.velocity[3:], arm)
-            velocities[part.obstacle.name] = np.concatenate([linear, motion.velocity[3:]])
+            velocities[shape.obstacle.name] = np.concatenate([linear, motion.velocity[3:]])
         return poses, velocities
 
     @final

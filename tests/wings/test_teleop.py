@@ -1,4 +1,4 @@
-"""What hands want becomes motion within limits; sessions that run, stop and record; all without a browser."""
+"""Goals become motion within limits; sessions run, stop and record; all without a browser."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from fastrod.errors import InputError
 from fastrod.logs.link import Measurement, RobotLink
 from fastrod.logs.recording import Recorder
 from fastrod.logs.simulated import SimulatedRobot
-from fastrod_viewer.knobs import drive_knobs, largest_force, load_knobs, nice
+from fastrod_viewer.controls import drive_controls, largest_force, load_controls, nice
 from fastrod_viewer.measuring import measure
-from fastrod_viewer.pilot import LARGEST_BEND, Speeds, Teleop
 from fastrod_viewer.session import Session
+from fastrod_viewer.teleop import LARGEST_BEND, Speeds, Teleop
 from fastrod_viewer.world import ManualCommand
 from fastrod_viewer.worlds import FreeWorld
 
@@ -36,93 +36,93 @@ def until(holds: Callable[[], bool], seconds: float = 30.0) -> bool:
 
 
 def test_a_bend_arrives_at_its_speed_and_bends_an_arc() -> None:
-    world, pilot = piloted("prototype")
-    pilot.speeds = Speeds(bend=1.0)
-    pilot.bend(0, 0.5, 0.0)
-    before = pilot.step(0.1).tendon_length
-    # 0.1 rad of the 0.5 in a tenth of a second, times the wires' 7.5 mm
+    world, teleop = piloted("prototype")
+    teleop.speeds = Speeds(bend=1.0)
+    teleop.bend(0, 0.5, 0.0)
+    before = teleop.step(0.1).tendon_length
+    # 0.1 rad of the 0.5 in a tenth of a second, times the tendons' 7.5 mm
     np.testing.assert_allclose(before - 0.07, [-0.00075, 0.0, 0.00075, 0.0], atol=1e-12)
     for _ in range(30):
-        world.drive(pilot.step(DT))
-    assert pilot.arrived
+        world.drive(teleop.step(DT))
+    assert teleop.arrived
     length, angle = 0.07, 0.5
     tip = world.rods[0].state.tip_position[0]
     arc = length / angle * np.array([1.0 - np.cos(angle), 0.0, np.sin(angle)])
-    np.testing.assert_allclose(tip, arc, atol=3e-4)  # the wires stretch by 1e-5 m/N
+    np.testing.assert_allclose(tip, arc, atol=3e-4)  # the tendons stretch by 1e-5 m/N
 
 
 def test_bends_and_extensions_stay_within_their_ranges() -> None:
-    _, pilot = piloted()
-    pilot.bend(2, 9.0, -9.0)
-    assert pilot.bent(2) == pytest.approx((LARGEST_BEND, -LARGEST_BEND))
-    pilot.extend(2, 0.1)
-    assert pilot.goals.action[6] == 0.0  # this robot does not extend
+    _, teleop = piloted()
+    teleop.bend(2, 9.0, -9.0)
+    assert teleop.bent(2) == pytest.approx((LARGEST_BEND, -LARGEST_BEND))
+    teleop.extend(2, 0.1)
+    assert teleop.goals.action[6] == 0.0  # this robot does not extend
 
 
 @pytest.mark.parametrize("goal", [(0.10, 0.05, 0.40), (-0.15, 0.0, 0.35), (0.0, 0.2, 0.3)])
 def test_a_drag_brings_the_tip_there(goal: tuple[float, float, float]) -> None:
-    world, pilot = piloted()
-    world.drive(pilot.step(DT))
-    pilot.drag(goal)
+    world, teleop = piloted()
+    world.drive(teleop.step(DT))
+    teleop.drag(goal)
     away = []
     for _ in range(120):
-        world.drive(pilot.step(DT))
+        world.drive(teleop.step(DT))
         away.append(float(np.linalg.norm(world.rods[0].state.tip_position[0] - goal)))
     assert away[-1] < 1e-4
     assert max(np.diff(away)) < 1e-3  # nearly straight there
-    pilot.drag(None)
-    assert pilot.arrived
+    teleop.drag(None)
+    assert teleop.arrived
 
 
-def test_a_drag_out_of_reach_ends_near_it_and_within_the_limits() -> None:
-    world, pilot = piloted()
-    world.drive(pilot.step(DT))
-    pilot.drag((2.0, 0.0, 0.3))
+def test_a_drag_beyond_the_workspace_ends_near_it_and_within_the_limits() -> None:
+    world, teleop = piloted()
+    world.drive(teleop.step(DT))
+    teleop.drag((2.0, 0.0, 0.3))
     for _ in range(150):
-        world.drive(pilot.step(DT))
+        world.drive(teleop.step(DT))
     state = world.rods[0].state
     assert np.isfinite(state.tip_position).all()
-    assert np.abs(pilot.goals.action.reshape(-1, 3)[:, 1:]).max() <= LARGEST_BEND * 0.0075 + 1e-12
+    assert np.abs(teleop.goals.action.reshape(-1, 3)[:, 1:]).max() <= LARGEST_BEND * 0.0075 + 1e-12
     assert state.tip_position[0, 0] > 0.35  # as far toward it as half a metre of robot goes
 
 
-def test_one_wire_moves_alone() -> None:
-    _, pilot = piloted("tdcr_a")
-    pilot.bend(0, 0.3, 0.1)
-    before = pilot.change
-    pilot.wire(4, -0.002)
+def test_one_tendon_moves_alone() -> None:
+    _, teleop = piloted("tdcr_a")
+    teleop.bend(0, 0.3, 0.1)
+    before = teleop.change
+    teleop.change_tendon(4, -0.002)
     expected = before.copy()
     expected[4] = -0.002
-    np.testing.assert_allclose(pilot.change, expected, atol=1e-15)
-    assert pilot.bent(0) == pytest.approx((0.3, 0.1))
+    np.testing.assert_allclose(teleop.change, expected, atol=1e-15)
+    assert teleop.bent(0) == pytest.approx((0.3, 0.1))
 
 
 def test_taking_over_moves_nothing() -> None:
-    world, pilot = piloted()
+    world, teleop = piloted()
     for _ in range(40):
         world.play()
     tip = world.rods[0].state.tip_position[0].copy()
     now = measure(world, None)
-    pilot.adopt(now.dl, now.ext)
+    teleop.adopt(now.dl, now.ext)
     for _ in range(3):
-        world.drive(pilot.step(DT))
+        world.drive(teleop.step(DT))
     np.testing.assert_allclose(world.rods[0].state.tip_position[0], tip, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", fastrod.robot_names())
-def test_every_knob_reads_what_it_was_put_to(name: str) -> None:
-    world, pilot = piloted(name)
-    knobs = [knob for group in drive_knobs(world, pilot) for knob in group.knobs] + list(
-        load_knobs(world.robot, pilot).knobs
+def test_every_control_reads_what_it_was_put_to(name: str) -> None:
+    world, teleop = piloted(name)
+    controls = [control for group in drive_controls(world, teleop) for control in group.controls] + list(
+        load_controls(world.robot, teleop).controls
     )
-    for knob in knobs:
-        assert knob.low < knob.high
-        assert knob.label.endswith("]")
-        wanted = knob.low + 0.7 * (knob.high - knob.low)
-        knob.put(wanted)
-        assert knob.get() == pytest.approx(wanted, abs=1e-9), knob.label
-        assert abs(knob.value - wanted) <= 0.11 * knob.step
-        pilot.reset()
+    for control in controls:
+        assert control.low < control.high
+        assert control.label.endswith("]")
+        wanted = control.low + 0.7 * (control.high - control.low)
+        control.put(wanted)
+        assert control.get() == pytest.approx(wanted, abs=1e-9), control.label
+        assert abs(control.value - wanted) <= 0.11 * control.step
+        teleop.reset()
 
 
 def test_ranges_are_round_numbers_that_suit_the_robot() -> None:
@@ -138,56 +138,56 @@ def test_speeds_are_positive() -> None:
 
 @pytest.mark.real_time
 def test_a_session_moves_in_real_time_and_stops_at_once() -> None:
-    world, pilot = piloted("prototype")
+    world, teleop = piloted("prototype")
     drawn: list[float] = []
-    session = Session(world, pilot, draw=lambda frame: drawn.append(frame.world.t))
+    session = Session(world, teleop, draw=lambda frame: drawn.append(frame.world.t))
     session.start()
-    pilot.speeds = Speeds(bend=0.2)
+    teleop.speeds = Speeds(bend=0.2)
     session.take_over()
-    pilot.bend(0, 1.0, 0.0)
-    session.touch()
-    assert until(lambda: pilot.now.action[1] > 1e-4)
+    teleop.bend(0, 1.0, 0.0)
+    session.wake()
+    assert until(lambda: teleop.now.action[1] > 1e-4)
     session.stop()
-    there = pilot.now.action.copy()
+    there = teleop.now.action.copy()
     time.sleep(0.2)
-    np.testing.assert_array_equal(pilot.now.action, there)
+    np.testing.assert_array_equal(teleop.now.action, there)
     assert there[1] < 0.9 * 0.0075
     session.release()
-    pilot.bend(0, 0.0, 0.0)
-    session.touch()
-    assert until(lambda: pilot.arrived)
+    teleop.bend(0, 0.0, 0.0)
+    session.wake()
+    assert until(lambda: teleop.arrived)
     session.close()
     assert len(drawn) > 5
 
 
 def test_what_cannot_be_done_is_said_and_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A world that refuses bends beyond 0.5 rad: the robot stands before them, and the session goes on."""
-    world, pilot = piloted("prototype")
+    """A world that refuses bends beyond 0.5 rad: the robot stands before them, and the session continues."""
+    world, teleop = piloted("prototype")
     drive = FreeWorld.drive
 
-    def refuse(self: FreeWorld, hand: ManualCommand) -> None:
-        if hand.tendon_length[0] < 0.07 - 0.5 * 0.0075:
+    def refuse(self: FreeWorld, command: ManualCommand) -> None:
+        if command.tendon_length[0] < 0.07 - 0.5 * 0.0075:
             raise InputError("robot 0 cannot be brought there: a wall.")
-        drive(self, hand)
+        drive(self, command)
 
     monkeypatch.setattr(FreeWorld, "drive", refuse)
     problems: list[str] = []
-    session = Session(world, pilot, draw=lambda frame: problems.append(frame.problem))
+    session = Session(world, teleop, draw=lambda frame: problems.append(frame.problem))
     session.start()
-    pilot.bend(0, 1.0, 0.0)
-    session.touch()
+    teleop.bend(0, 1.0, 0.0)
+    session.wake()
     assert until(lambda: "robot 0 cannot be brought there: a wall." in problems)
-    assert until(lambda: pilot.arrived)
-    assert pilot.bent(0)[0] < 0.5
-    pilot.all_zero()
-    session.touch()
+    assert until(lambda: teleop.arrived)
+    assert teleop.bent(0)[0] < 0.5
+    teleop.all_zero()
+    session.wake()
     assert until(lambda: bool(np.linalg.norm(world.rods[0].state.tip_position[0] - [0.0, 0.0, 0.07]) < 1e-6))
     session.close()
 
 
 def test_a_paused_session_steps_one_picture_at_a_time() -> None:
-    world, pilot = piloted("prototype")
-    session = Session(world, pilot, draw=lambda frame: None, script=True)
+    world, teleop = piloted("prototype")
+    session = Session(world, teleop, draw=lambda frame: None, script=True)
     session.paused = True
     session.start()
     time.sleep(0.2)
@@ -205,16 +205,16 @@ def test_a_real_robot_stops_when_nobody_watches_and_a_simulated_one_holds() -> N
         link = SimulatedRobot(robot, real=real)
         assert isinstance(link, RobotLink)
         world = FreeWorld(robot)
-        pilot = Teleop(world, Speeds(bend=0.1))
-        session = Session(world, pilot, draw=lambda frame: None, link=link)
+        teleop = Teleop(world, Speeds(bend=0.1))
+        session = Session(world, teleop, draw=lambda frame: None, link=link)
         session.start()
-        pilot.bend(0, 1.0, 0.0)
-        session.touch()
+        teleop.bend(0, 1.0, 0.0)
+        session.wake()
         assert until(lambda link=link: bool(link.read().dl[0] < -1e-5))
         session.nobody()
-        there = pilot.now.action[1]
+        there = teleop.now.action[1]
         time.sleep(0.3)
-        assert pilot.now.action[1] == pytest.approx(there, abs=1e-4)
+        assert teleop.now.action[1] == pytest.approx(there, abs=1e-4)
         assert link.stopped is real
         session.close()
         assert link.stopped
@@ -224,40 +224,40 @@ def test_a_linked_robot_is_taken_over_where_it_stands_and_never_jumps() -> None:
     robot = fastrod.load_robot("prototype")
     link = SimulatedRobot(robot, real=True)
     link.command([-0.006, 0.0, 0.006, 0.0])
-    told: list[np.ndarray] = []
+    held: list[np.ndarray] = []
     command = link.command
 
     class Heard:
-        """The link, and what it is told."""
+        """The link, and the commands that it gets."""
 
         robot, real = link.robot, link.real
         read, stop, release, close = link.read, link.stop, link.release, link.close
 
         def command(self, dl: np.ndarray, ext: np.ndarray | None = None) -> None:
-            told.append(np.array(dl))
+            held.append(np.array(dl))
             command(dl, ext)
 
     world = FreeWorld(robot)
-    pilot = Teleop(world, Speeds(bend=0.5))
-    session = Session(world, pilot, draw=lambda frame: None, link=Heard())
+    teleop = Teleop(world, Speeds(bend=0.5))
+    session = Session(world, teleop, draw=lambda frame: None, link=Heard())
     session.start()
-    assert until(lambda: len(told) > 3)
-    np.testing.assert_allclose(told[0], [-0.006, 0.0, 0.006, 0.0], atol=1e-9)
+    assert until(lambda: len(held) > 3)
+    np.testing.assert_allclose(held[0], [-0.006, 0.0, 0.006, 0.0], atol=1e-9)
     session.reset()
-    assert until(lambda: bool(np.abs(told[-1]).max() < 1e-9))
+    assert until(lambda: bool(np.abs(held[-1]).max() < 1e-9))
     session.stop()
     time.sleep(1.1)  # sooner it is ignored
-    n = len(told)
+    n = len(held)
     session.release()
-    assert until(lambda: len(told) > n)
+    assert until(lambda: len(held) > n)
     session.close()
-    steps = np.abs(np.diff(told, axis=0)).max()
+    steps = np.abs(np.diff(held, axis=0)).max()
     assert steps <= 0.5 * 0.0075 * DT * 1.001
 
 
 def test_a_reset_while_recording_begins_another_run() -> None:
-    world, pilot = piloted("prototype")
-    session = Session(world, pilot, draw=lambda frame: None, script=True)
+    world, teleop = piloted("prototype")
+    session = Session(world, teleop, draw=lambda frame: None, script=True)
     recorder = Recorder(world.robot)
     recorder.start(0.0, "by script")
     session.recorder = recorder
@@ -275,21 +275,21 @@ def test_a_reset_while_recording_begins_another_run() -> None:
 
 
 def test_a_measured_robot_that_differs_shows_its_residual() -> None:
-    """The link's robot has softer wires than its model; what is measured is the link's."""
+    """The link's robot has softer tendons than its model; what is measured is the link's."""
     robot = fastrod.load_robot("prototype")
     world = FreeWorld(robot)
-    pilot = Teleop(world)
+    teleop = Teleop(world)
     seen: list[Measurement | None] = []
     session = Session(
-        world, pilot, draw=lambda frame: seen.append(frame.measured), link=SimulatedRobot(robot)
+        world, teleop, draw=lambda frame: seen.append(frame.measured), link=SimulatedRobot(robot)
     )
     recorder = Recorder(robot)
     recorder.start(0.0, "by hand")
     session.recorder = recorder
     session.start()
-    pilot.bend(0, 0.5, 0.0)
-    session.touch()
-    assert until(lambda: pilot.arrived and len(seen) > 20)
+    teleop.bend(0, 0.5, 0.0)
+    session.wake()
+    assert until(lambda: teleop.arrived and len(seen) > 20)
     session.close()
     last = seen[-1]
     assert last is not None
