@@ -13,12 +13,13 @@ from fastrod.contact import queries
 from fastrod.contact.engine import Engine
 from fastrod.contact.frames import blended
 from fastrod.contact.scene import ContactScene
-from fastrod.contact.step import COLD_PASSES, Ways, contact_step
+from fastrod.contact.step import COLD_ITERATIONS, ContactStep
 from fastrod.effects.pipeline import SensedPoses
 from fastrod.errors import InputError, Problem
 from fastrod.kernels.rod.dense import between_nodes
 from fastrod.model.robot import Robot
 from fastrod.rotation import matrix_from_quaternion
+from fastrod.solver.contact_solver import RodSolver
 from fastrod.solver.gpu import device as devices
 from fastrod.solver.inputs import (
     Inputs,
@@ -32,12 +33,11 @@ from fastrod.solver.inputs import (
     renamed_options,
     robot_mask,
 )
-from fastrod.solver.recovery import TOLERANCE, Boundary, overloaded
+from fastrod.solver.recovery import Boundary, overloaded
 from fastrod.solver.response import stretch
-from fastrod.solver.settle import settle
 from fastrod.solver.state import Observer, Pose, State
-from fastrod.solver.statics import DIVERGED, LOST, Statics
-from fastrod.types import Flags, Floats, Ints, PointLoads, Ports, RodShape
+from fastrod.solver.statics import DIVERGED, Statics
+from fastrod.types import Floats, Ports
 
 _config: Any = numba.config
 _AT_REST = 1e-6  # m: contact and boundary of a step, where `settle` has a tolerance of its own
@@ -193,7 +193,7 @@ class Simulator(Statics):
             gravity,
         )
         if self._felt is not None:
-            return self._touch(self._felt, given, obstacle_pose, obstacle_velocity, None)
+            return self._contact_step(self._felt, given, obstacle_pose, obstacle_velocity, None)
         return self._step(given, self._moved_obstacles(obstacle_pose, obstacle_velocity), derive)
 
     @named_inputs
@@ -246,14 +246,14 @@ class Simulator(Statics):
                     "settle with rows is for simulators without a contact scene; settle all, "
                     "or restore a snapshot's rows."
                 )
-            return self._touch(self._felt, given, obstacle_pose, obstacle_velocity, tolerance)
+            return self._contact_step(self._felt, given, obstacle_pose, obstacle_velocity, tolerance)
         moved = self._moved_obstacles(obstacle_pose, obstacle_velocity)
         only = None if rows is None else robot_mask(rows, self.n_robots)
         ports, read = self._read(given, only)
         self._move_obstacles(moved)
         return self._settle(ports, read, tolerance, only)
 
-    def _touch(
+    def _contact_step(
         self,
         engine: Engine,
         given: Inputs,
@@ -270,64 +270,37 @@ class Simulator(Statics):
             stretch(self._passes, rows, ports.extension - start.extension)
         engine.given_arclength, engine.given_force = self._reader.loads
         engine.move(poses, velocities, self.dt)
-        boundary = Boundary(self._passes) if self.recover else None
-        shape = self._passes.new_shape("full", True)
-        passes = np.zeros(self.n_robots, np.int64)
-
-        def run(which: Ints, at: Ports, into: RodShape, loads: PointLoads) -> None:
-            self._passes.run(
-                which, at, into, loads=loads, update=False, noise=1e-10 if self._layout.paper else 1e-20
-            )
-
-        def free(which: Ints, at: Ports, into: RodShape) -> Flags:
-            if tolerance is not None:
-                return bring_to_rest(which, at, into)
-            process, noise = self.observer.process_noise * self.dt, self.observer.measurement_noise / self.dt
-            self._passes.run(
-                which, at, into, predict=True, propagate=self._passes.propagate, process=process, noise=noise
-            )
-            passes[which] += 1
-            well = self._passes.finite & (into.residual < LOST * self._passes.params.rod_length)
-            well &= np.isin(self._all, which)
-            lost = which[~well[which]]
-            if boundary is not None and len(lost):
-                used = boundary.recover(lost, self._warm, at, self._into(into))
-                passes[lost] += np.abs(used[lost])
-                well[lost] = used[lost] > 0
-            return np.asarray(well)
-
-        def bring_to_rest(which: Ints, at: Ports, into: RodShape) -> Flags:
-            used = settle(which, self._warm, self._passes, at, tolerance or TOLERANCE, self._into(into))
-            passes[which] += np.abs(used[which])
-            return np.asarray(used > 0)
-
-        ok, done = contact_step(
-            engine,
-            Ways(free, bring_to_rest, run),
-            rows,
-            self._warm,
-            start,
-            ports,
-            self._unloaded(ports),
-            self._passes.memory,
-            shape,
-            tolerance or _AT_REST,
-            passes,
-            engine.scene.max_passes if tolerance is None else COLD_PASSES,
+        solver = RodSolver(
+            boundary=self._passes,
+            warm=self._warm,
+            tolerance=tolerance,
+            recovery=Boundary(self._passes) if self.recover else None,
+            process=self.observer.process_noise * self.dt,
+            noise=self.observer.measurement_noise / self.dt,
+            used=np.zeros(self.n_robots, np.int64),
         )
+        shape, passes = self._passes.new_shape("full", True), solver.used
+        ok, done = ContactStep(
+            engine=engine,
+            solver=solver,
+            shape=shape,
+            end=ports,
+            tolerance=tolerance or _AT_REST,
+            most=engine.scene.max_iterations if tolerance is None else COLD_ITERATIONS,
+        ).run(rows, self._warm, start, self._unloaded(ports))
         for i in rows[~ok[rows]]:
-            if engine.led[i] and not overloaded(self._passes, ports, int(i)):
+            if engine.continued[i] and not overloaded(self._passes, ports, int(i)):
                 why = engine.why(int(i), float(done[i]))
             else:
                 why = self._sentence(DIVERGED, Problem.DIVERGED, ports, shape, int(i))
             self._reader.problems.setdefault(int(i), why)
         # a cold robot has no last inputs to go on from: it begins anew
         gone = np.isin(self._all, rows) & ~ok
-        held = gone & (engine.led | self.recover) & engine.tracked & ~engine.whole_worlds(~self._warm)
+        held = gone & (engine.continued | self.recover) & engine.tracked & ~engine.whole_worlds(~self._warm)
         if held.any() and start is not None:
             ports = blended(start, ports, done)
-        self._passes.arrive_at(np.flatnonzero(held | (ok & engine.led)), ports)
-        lost = np.flatnonzero(gone & ~(held & engine.led))
+        self._passes.arrive_at(np.flatnonzero(held | (ok & engine.continued)), ports)
+        lost = np.flatnonzero(gone & ~(held & engine.continued))
         state = self._finish(
             ports, shape, ok, np.where(ok, passes, -1), "contact", Problem.CONTACT_STUCK, lost
         )
@@ -417,7 +390,7 @@ class Simulator(Statics):
         """
         engine = self._contact("set_free")
         k = engine.scene.index(obstacle)
-        engine.surfaces.give[k] = mobility(obstacle, translation, rotation, center)
+        engine.surfaces.mobility[k] = mobility(obstacle, translation, rotation, center)
         engine.surfaces.body[k] = k if body is None else len(engine.surfaces.body) + body
 
     def clearance(self, obstacle: str | None = None) -> Floats:

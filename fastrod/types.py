@@ -6,7 +6,7 @@ used has length 0. Frames: world unless "material" is said.
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,8 @@ Floats: TypeAlias = NDArray[np.float64]
 Singles: TypeAlias = NDArray[np.float32]
 Ints: TypeAlias = NDArray[np.int64]
 Flags: TypeAlias = NDArray[np.bool_]
+Records: TypeAlias = NDArray[Any]
+"""An array of records (`_record`); mypy does not know their fields."""
 
 
 class Layout(NamedTuple):
@@ -158,10 +160,10 @@ class Surfaces(NamedTuple):
     """(n_obstacles,) depth per normal force; 0 is rigid [m/N]."""
     body: Ints
     """(n_obstacles,) number of the rigid body that it is part of."""
-    give: Floats
-    """(n_obstacles, 13) how far that body moves within a step under a unit force at its centre of mass [m/N],
-    and turns under a unit moment [rad/(N m)], (3, 3) row by row, world; the centre of mass, world [m]. Zero:
-    it goes where it is told."""
+    mobility: Floats
+    """(n_obstacles, 13) motion of that body within a step under a unit force at its centre of mass [m/N], and
+    its rotation under a unit moment [rad/(N m)], (3, 3) row by row, world; the centre of mass, world [m].
+    Zero: the body is not free, its pose is prescribed."""
     root: Ints
     """(n_obstacles,) link to the top of a mesh's hierarchy."""
     box: Floats
@@ -179,16 +181,65 @@ class PointLoads(NamedTuple):
     Length 0 if none."""
 
     node: Ints
-    """(n_rows, n_probes) node that the contact is on; -1 where there is none."""
+    """(n_rows, n_loads) node that the contact is on; -1 where there is none."""
     force: Floats
-    """(n_rows, n_probes, 3) on the rod, world [N]."""
+    """(n_rows, n_loads, 3) on the rod, world [N]."""
     arm: Floats
-    """(n_rows, n_probes, 3) from the centreline to the point of contact, world [m]."""
+    """(n_rows, n_loads, 3) from the centreline to the point of contact, world [m]."""
     motion: Floats
-    """(n_rows, 3 n_probes, 1 + 3 n_probes) motion of the contact points, world: first what closing the
-    boundary does at these forces [m], then the compliance [m/N]."""
+    """(n_rows, 3 n_loads, 1 + 3 n_loads) motion of the contact points, world: first what closing the boundary
+    does at these forces [m], then the compliance [m/N]."""
     unknown: Floats
-    """(n_rows, n_x, 1 + 3 n_probes) the same of the boundary unknowns."""
+    """(n_rows, n_x, 1 + 3 n_loads) change of the boundary unknowns, in the same columns."""
+
+
+def _record(*fields: tuple[Any, ...]) -> np.dtype[Any]:
+    """A dtype whose elements have their fields as attributes, in Python as in a kernel. (No field may have
+    the name of an attribute that numpy gives every element, such as `size`.)"""
+    return np.dtype((np.record, np.dtype(list(fields), align=True)))
+
+
+CONTACT = _record(
+    ("obstacle", np.int64),
+    ("partner", np.int64),
+    ("arclength", np.float64),
+    ("normal", np.float64, (3,)),
+    ("gap", np.float64),
+    ("force", np.float64, (3,)),
+    ("radius", np.float64),
+    ("arm", np.float64),
+    ("shift", np.float64),
+    ("damped_stiffness", np.float64),
+    ("matched", np.bool_),
+)
+"""One contact of a rod. obstacle: its index, from n_obstacles on a rod's; partner: number that both sides of
+a contact between rods share, or -1; arclength [m]; normal: toward the rod, world; gap [m]; force: on the rod,
+world [N]; radius: of the rod there [m]; arm: how far below the centreline the force acts, the radius where
+there is friction, else 0, for a normal force has no moment [m]; shift: how far it moved along the rod the
+last time [m]; damped_stiffness: what damping was based on last [N/m]; matched: a candidate of this iteration
+belongs to it."""
+
+CANDIDATE = _record(
+    ("obstacle", np.int64), ("arclength", np.float64), ("gap", np.float64), ("normal", np.float64, (3,))
+)
+"""A local minimum of the gap along a rod: where a contact may be needed."""
+
+WALL = _record(("distance", np.float64), ("normal", np.float64, (3,)), ("triangle", np.int64))
+"""A face of a mesh that a point is in front of."""
+
+SAMPLE = _record(("fraction", np.float64), ("distance", np.float64), ("slope", np.float64))
+"""Signed distance of the centreline and its slope along the rod, at a fraction of an interval."""
+
+TROUBLE = _record(
+    ("cause", np.int64),
+    ("obstacle", np.int64),
+    ("arclength", np.float64),
+    ("distance", np.float64),
+    ("from_rest", np.float64),
+)
+"""What keeps a robot from rest: which of `kernels.contact.iteration`'s causes, on what obstacle (from
+n_obstacles on a rod; -1: none), where [m], by how much [m], and how far its world is from rest: the largest
+of motion, residual and violation [m]."""
 
 
 class ContactRods(NamedTuple):
@@ -200,8 +251,8 @@ class ContactRods(NamedTuple):
     """(n_robots,) arclength where contact begins: what is nearer to the base belongs to its mounting [m]."""
     spacing: Floats
     """(n_robots,) length of an integration step [m]."""
-    reach: Floats
-    """(n_robots,) length of the whole chain [m]."""
+    length: Floats
+    """(n_robots,) of the whole chain [m]."""
     moment_scale: Floats
     """(n_robots,) EI/l [N m]."""
     tension_scale: Floats
@@ -217,21 +268,162 @@ class ContactRods(NamedTuple):
     """1: a rod touches itself too."""
 
 
+class ContactMotion(NamedTuple):
+    """Rods and obstacles in one pass, and at the last step.
+
+    The rods' arrays one by one, for numba hands no tuple of tuples to threads.
+    """
+
+    frames: Floats
+    """(1 or n_robots, n_obstacles, 12) rotation row by row, position: world_from_obstacle."""
+    frames_before: Floats
+    """(1 or n_robots, n_obstacles, 12) when the rods were in the shape before."""
+    frames_slip: Floats
+    """(1 or n_robots, n_obstacles, 12) where the obstacles' material was at the last step: what slip is
+    counted from. Another than `frames_before` where a velocity was given (a belt moves, its frame does
+    not)."""
+    position: Floats
+    rotation: Floats
+    curvature: Floats
+    arclength: Floats
+    residual: Floats
+    """These five as in `RodShape`."""
+    position_before: Floats
+    rotation_before: Floats
+    curvature_before: Floats
+    arclength_before: Floats
+    """Where the rods have come from, and through nothing since: the last step, or the last pass of a damped
+    iteration."""
+    position_slip: Floats
+    rotation_slip: Floats
+    curvature_slip: Floats
+    arclength_slip: Floats
+    """The shapes at the last step: what slip is counted from."""
+    distance: Floats
+    measured_at: Floats
+    gap: Floats
+    """The fields of `Clearance`, to be kept up to date."""
+    tracked: Flags
+    """(n_robots,) the shape before holds where the robot was."""
+    slides: Flags
+    """(n_robots,) slip is counted from there; where not, friction is left out."""
+    tolerance: float
+    """Motion, residual and violation below which a world is at rest [m]."""
+    margin: float
+    """Gap below which a contact is watched, as a fraction of the rod's length."""
+    damping: Floats
+    """(n_robots,) 0, or how many times the largest geometric stiffness is held against the motion of its
+    point: where the plain iteration finds no rest, this one goes down in energy, slowly."""
+
+
 class ContactSet(NamedTuple):
     """The contacts of every robot, kept from one step to the next."""
 
     used: Ints
-    """(n_robots,) slots in use."""
-    slot: Floats
-    """(n_robots, n_slots, SLOT) the numbers of one contact, in the order of `kernels.slots`."""
+    """(n_robots,) how many each has."""
+    contact: Records
+    """(n_robots, max_contacts) of `CONTACT`."""
 
 
 class Clearance(NamedTuple):
-    """What is known about how far each node is from all obstacles: while it moves less, it need not be asked
-    again."""
+    """Distances that are known between each robot and all obstacles: while a node moves less, its own need
+    not be evaluated again."""
 
     distance: Floats
     """(n_robots, n_points) lower bound of the signed distance of the centreline; -inf where nothing is known
     [m]."""
     position: Floats
     """(n_robots, n_points, 3) where that was, world [m]."""
+    gap: Floats
+    """(n_robots,) smallest gap of the rod's surface to anything [m]."""
+
+
+class ContactRows(NamedTuple):
+    """The robots of one contact iteration, world by world, and what comes of it."""
+
+    start: Ints
+    """(n_worlds + 1,) first row of each world (the robots that may touch each other), with the end at
+    last."""
+    robot: Ints
+    """(n_rows,) index of the robot."""
+    status: Ints
+    """(n_rows,) whether the row's world is at rest (`kernels.contact.iteration`)."""
+    trouble: Records
+    """(n_robots,) of `TROUBLE`."""
+    x: Floats
+    """(n_robots, n_x) boundary unknowns, `Memory.x`."""
+
+
+class SearchWork(NamedTuple):
+    """Workspace of a search; in the arguments of a batch with an axis more at first, one part of it a
+    thread."""
+
+    known: Floats
+    """(n_points,) lower bound of each node's distance from all obstacles [m]."""
+    least: Floats
+    """(n_points,) smallest distance that was evaluated [m]."""
+    phi: Floats
+    """(n_points,) signed distance of one obstacle [m]."""
+    slope: Floats
+    """(n_points,) its slope along the rod."""
+    sample: Records
+    """(n_samples,) of `SAMPLE`: the halves of one interval."""
+    stack: Floats
+    """Links of a mesh's hierarchy that wait (`kernels.contact.bvh`)."""
+
+
+class ContactProblem(NamedTuple):
+    """Workspace of the contact problem of one world: `m` contacts (both sides of one between rods are one),
+    `n` contact points (one for each side on a rod). In the arguments of a batch with an axis more at first,
+    one part of it a thread."""
+
+    first_point: Ints
+    """(n_rows,) first contact point of each row."""
+    point: Ints
+    """(m, 2) contact points of both sides; -1 is an obstacle."""
+    obstacle: Ints
+    """(m,) its index; -1 is a rod."""
+    place: Floats
+    """(m, 3) where the force acts, world [m]."""
+    axes: Floats
+    """(m, 3, 3) normal and two tangents, world."""
+    friction: Floats
+    """(m,) Coulomb coefficients."""
+    compliance: Floats
+    """(m,) depth per normal force [m/N]."""
+    free: Floats
+    """(3 m,) motion without contact forces, along each contact's axes [m]."""
+    delassus: Floats
+    """(3 m, 3 m) compliance between contacts, along their axes [m/N]."""
+    force: Floats
+    """(3 m,) along the axes [N]."""
+    turned: Floats
+    """(m, 3, 3) geometric stiffness: change of the force as its point moves, world [N/m]."""
+    stiffness: Floats
+    """(m,) the largest size of that [N/m]."""
+    applied: Floats
+    """(3 n,) forces of the pass on the contact points, world [N]."""
+    change: Floats
+    """(3 n,) forces sought less those [N]."""
+    model: Floats
+    """(3 n, 1 + 3 n) motion of the contact points as in `PointLoads.motion`, of all rows."""
+    system: Floats
+    """(3 n, 6 n + 1) linear equations and their right-hand sides."""
+    start: Floats
+    """(3 m,) forces before the law was solved [N]."""
+    state: Ints
+    """(m,) open, sticking or slipping."""
+    along: Floats
+    """(m, 2) direction of the friction where it slips."""
+    proposed: Floats
+    """(n_rows, n_loads, 3) what the law answers, world [N]."""
+    unknown: Floats
+    """(n_rows, n_x) change of the boundary unknowns."""
+    n_found: Ints
+    """(n_rows,) candidates of each row."""
+    found: Records
+    """(n_rows, n) of `CANDIDATE`."""
+    centre: Floats
+    """(max_contacts, 3) centreline at each contact of a robot, world [m]."""
+    wall: Records
+    """(n,) of `WALL`."""

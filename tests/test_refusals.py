@@ -92,8 +92,12 @@ SENTENCES: list[tuple[Callable[[], object], str]] = [
     ),
     (lambda: scene(rod_friction=-1.0), "rod_friction is -1.0; it must be zero or positive"),
     (lambda: scene(max_contacts=65), "max_contacts is 65; it must be a whole number from 1 to 64"),
-    (lambda: scene(max_passes=3), "max_passes is 3; it must be a whole number, at least 20"),
-    (lambda: scene(watch=0.5), "watch is 0.5; it is a part of the rod's length"),
+    (
+        lambda: scene(max_passes=60),
+        r"max_passes is now max_iterations; give ContactScene\(max_iterations=60\)",
+    ),
+    (lambda: scene(max_iterations=3), "max_iterations is 3; it must be a whole number, at least 20"),
+    (lambda: scene(watch=0.5), "watch is 0.5; it is a fraction of the rod's length"),
     (lambda: scene(mounting=-0.1), "mounting is -0.1 m; it must be zero or positive"),
     (
         lambda: Simulator(rod(), contact=scene(rod_radius=(1.0, 2.0))),

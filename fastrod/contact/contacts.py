@@ -1,4 +1,4 @@
-"""`Contacts`: what touches what, as a state hands it out."""
+"""`Contacts`: the contacts of a state, as it hands them out."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from fastrod.errors import UnknownNameError, nearest
-from fastrod.types import Flags, Floats, Ints
+from fastrod.types import Clearance, ContactSet, Flags, Floats, Ints, RodShape
 
-TOUCHES = 1e-9
+CLOSED = 1e-9
 """A gap below it is contact, also where no force is needed to keep it [m]."""
 
 
 @dataclass(frozen=True)
 class Contacts:
     """The contacts of a state, robot axis first, world frame. Rows are filled from the left; what is beyond
-    `count` is nan, or
-    -1 in `obstacle`. One touch may be held by several neighbouring contacts that share its force."""
+    `count` is nan, or -1 in `obstacle`. One touch may be held by several neighbouring contacts that share its
+    force."""
 
     names: tuple[str, ...]
     """Of the obstacles; then come the rods of the robots, `rod 0`, `rod 1`, ..."""
@@ -69,3 +69,56 @@ class Contacts:
     def total_force(self) -> Floats:
         """(n_robots, 3) of all contacts on each rod, world [N]."""
         return np.asarray(np.nansum(self.force, axis=1))
+
+
+def contacts_of(
+    names: tuple[str, ...],
+    contact_set: ContactSet,
+    clearance: Clearance,
+    poses: Floats,
+    shape: RodShape,
+    ok: Flags,
+    thinnest: Floats,
+) -> Contacts:
+    """The contacts of the robots that are `ok`, in `shape`, with obstacles of these names at `poses` (1 or
+    n_robots, n_obstacles, 7); `thinnest` (n_robots,) is the least radius of each [m]."""
+    n, n_obstacles = len(ok), len(names)
+    contact = contact_set.contact
+    live = (np.arange(contact.shape[1]) < contact_set.used[:, None]) & ok[:, None]
+    live &= (contact["force"] != 0.0).any(2) | (contact["gap"] < CLOSED)
+    count = np.asarray(live.sum(1))
+    width = int(count.max(initial=0))
+    order = np.argsort(~live, axis=1, kind="stable")[:, :width]
+    kept = np.take_along_axis(contact, order, axis=1)
+    beyond = np.arange(width) >= count[:, None]
+
+    def field(name: str) -> Floats:
+        return np.where(beyond.reshape(*beyond.shape, *[1] * (kept[name].ndim - 2)), np.nan, kept[name])
+
+    normal, force, s = field("normal"), field("force"), field("arclength")
+    nodes = np.abs(np.where(beyond, 0.0, kept["arclength"])[:, :, None] - shape.arclength[:, None, :])
+    at = np.where(np.isfinite(nodes), nodes, np.inf).argmin(2)  # every contact has a node of its own
+    point = np.take_along_axis(shape.position, at[:, :, None], axis=1) - field("radius")[:, :, None] * normal
+    index = np.where(beyond, -1, kept["obstacle"])
+    wrench = np.zeros((n, n_obstacles, 6))
+    origin = np.broadcast_to(poses[:, :, :3], (n, n_obstacles, 3))
+    for k in range(n_obstacles):
+        on = np.where((index == k)[:, :, None], -force, 0.0)
+        wrench[:, k, :3] = on.sum(1)
+        wrench[:, k, 3:] = np.cross(
+            np.where((index == k)[:, :, None], point - origin[:, None, k], 0.0), on
+        ).sum(1)
+    return Contacts(
+        names=names,
+        count=count,
+        obstacle=index,
+        point=point,
+        normal=normal,
+        gap=field("gap"),
+        force=force,
+        arclength=s,
+        wrench=wrench,
+        clearance=np.where(ok, clearance.gap, np.nan),
+        deep=ok & (clearance.gap < -thinnest),
+        tip_arclength=shape.arclength[:, -1],
+    )

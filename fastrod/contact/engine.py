@@ -1,97 +1,51 @@
-"""Contact in the step loop: free robots by their own pass, touching ones by passes and the contact law in
-turn until at rest.
-
-Inputs that lead a world too far for one linear model are followed in parts, from the last step to this one: a
-world that does not come to rest, or a rod that would go through an obstacle, goes half as far. A rod never
-continues beyond what it could solve: it stays where it came to, and says so.
-"""
+"""What contact remembers between steps, and what it knows of rods and obstacles in one pass."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from fastrod.contact.contacts import TOUCHES, Contacts
-from fastrod.contact.frames import back_by, between, blended, frames_of, longest_move
-from fastrod.contact.progress import Damping, Progress
+from fastrod.contact.contacts import Contacts, contacts_of
+from fastrod.contact.frames import back_by, between, frames_of, longest_move
 from fastrod.contact.scene import ContactScene
 from fastrod.contact.tree import pack
-from fastrod.contact.trouble import NO_CONTACT_LEFT, NO_NODE_LEFT, sentence
+from fastrod.contact.trouble import sentence
 from fastrod.errors import Problem, ProblemSentence
-from fastrod.kernels.batch import (
-    arrange,
-    iterate_parallel,
-    iterate_serial,
-    look_at_rods,
-    look_parallel,
-    look_serial,
-)
-from fastrod.kernels.contact.bvh import STACK
-from fastrod.kernels.contact.contact_set import SLOT, T_FORCE, T_GAP, T_N, T_OBSTACLE, T_RADIUS, T_S
-from fastrod.kernels.contact.iteration import (
-    AT_REST,
-    BACK,
-    GOES_ON,
-    INSIDE,
-    LOST,
-    MOVES,
-    NOTHING,
-    TROUBLE,
-    UNSOLVED,
-    world_size,
-)
-from fastrod.kernels.contact.problem import SceneArrays
-from fastrod.kernels.contact.proximity import CANDIDATE
+from fastrod.kernels.batch import arrange, search_parallel, search_serial, search_worlds
+from fastrod.kernels.contact.iteration import NOTHING
+from fastrod.kernels.contact.problem import MOST_FOUND
+from fastrod.kernels.contact.proximity import search_work
+from fastrod.kernels.contact.rod_proximity import RodSearch
 from fastrod.types import (
+    CANDIDATE,
+    CONTACT,
+    TROUBLE,
     Clearance,
+    ContactMotion,
     ContactRods,
+    ContactRows,
     ContactSet,
     Flags,
     Floats,
     Ints,
-    Memory,
     PointLoads,
     Ports,
     RodShape,
 )
 
-Pass = Callable[[Ints, Ports, RodShape, PointLoads], None]
-"""(robots, ports, shape, probes): one forward pass into `shape` that leaves the boundary as it is."""
-
-MOST_FOUND = 64
-"""Candidates of one robot that a look notes."""
-_BLOCK = 2048  # robots whose linear models are held at once
-_MOST_PASSES = 16  # and more for a robot that comes closer to rest
-_NEARLY = 1e-4  # of the length
-_LONGEST, _IDLE = (
-    4,
-    6,
-)  # as many times the passes are the end; passes in a row that came no closer: it goes in circles
-_MOST_INSIDE = 8  # passes in a row with the centreline inside of an obstacle: the step led too far
-_SMALLEST_PART = 1.0 / 64.0
-_HARD = (
-    1.0 / 4.0
-)  # part of the way below which a failure is taken for the loss of the equilibrium, not for too long a step
-_MOST_DAMPED, _DAMPED_TRIES, _MOST_REFUSED = 150, 10, 12
-_WANDERS = 1e-2  # of the length: a robot that moves by less goes around a place where it may come to rest
-# passes in a row without forces that obey the law: the hold is lost, and plain passes do not bring it back
-_UNSOLVED = 6
 _FEW = 64  # robots below which starting threads costs more than it saves
 
 
 class ContactSnapshot(NamedTuple):
     """What an `Engine` remembers."""
 
-    touching: ContactSet
+    contact_set: ContactSet
     clearance: Clearance
     before: RodShape | None
     """Shapes at the last step."""
     tracked: Flags
     """(n_robots,) `before` holds where the robot was."""
-    gap: Floats
-    """(n_robots,) smallest to anything [m]."""
     poses: Floats
     """(1 or n_robots, n_obstacles, 7) world."""
     poses_before: Floats
@@ -101,13 +55,12 @@ class ContactSnapshot(NamedTuple):
 
 
 class Engine:
-    """What contact remembers between steps, and how a step is done. Rows are robots' indices; arrays have the
-    robot axis first."""
+    """What contact remembers between steps. Rows are robots' indices; arrays have the robot axis first."""
 
     def __init__(
         self, scene: ContactScene, rods: ContactRods, length: Floats, n_points: int, threads: int
     ) -> None:
-        n = len(rods.reach)
+        n = len(rods.length)
         self.scene, self.rods, self.length, self.threads = scene, rods, length, threads
         self.surfaces = pack(scene.obstacles)
         self.world = scene.world_of(n)
@@ -116,14 +69,13 @@ class Engine:
         self.dt = 0.0
         self.at_last_step: tuple[RodShape | None, Floats] = (None, self.poses)
         """Shape and obstacles before the last step."""
-        self.touching = ContactSet(np.zeros(n, np.int64), np.zeros((n, scene.max_contacts, SLOT)))
-        self.clearance = Clearance(np.full((n, n_points), -np.inf), np.zeros((n, n_points, 3)))
+        self.contact_set = ContactSet(np.zeros(n, np.int64), np.zeros((n, scene.max_contacts), CONTACT))
+        self.clearance = unknown_clearance(n, n_points)
         self.before: RodShape | None = None
         self.tracked, self.slides = np.zeros(n, bool), np.ones(n, bool)
-        self.gap = np.full(n, np.inf)
-        self.trouble = np.zeros((n, TROUBLE))
-        """What kept each robot from rest in its last pass (kernels.touch)."""
-        self.led = np.zeros(n, bool)
+        self.trouble = np.zeros(n, TROUBLE)
+        """What kept each robot from rest in its last iteration."""
+        self.continued = np.zeros(n, bool)
         """Robots that contact brought to the inputs of the last step."""
         self.given_arclength, self.given_force = np.zeros((1, 0)), np.zeros((1, 0, 3))
         """Point forces that the caller gave: (n_robots, m) [m] and (n_robots, m, 3) world [N]."""
@@ -148,47 +100,47 @@ class Engine:
 
     def forget(self, rows: Ints | Flags) -> None:
         """No contacts, no history."""
-        self.touching.used[rows] = 0
+        self.contact_set.used[rows] = 0
         self.clearance.distance[rows] = -np.inf
         self.tracked[rows] = False
 
     def snapshot(self) -> ContactSnapshot:
         """A copy of everything that a later step depends on; shapes are handed out once and not written
         again."""
-        touching = ContactSet(self.touching.used.copy(), self.touching.slot.copy())
-        clearance = Clearance(self.clearance.distance.copy(), self.clearance.position.copy())
-        poses = self.poses, self.poses_before, self.at_last_step
-        return ContactSnapshot(touching, clearance, self.before, self.tracked.copy(), self.gap.copy(), *poses)
+        return ContactSnapshot(
+            ContactSet(*(a.copy() for a in self.contact_set)),
+            Clearance(*(a.copy() for a in self.clearance)),
+            self.before,
+            self.tracked.copy(),
+            self.poses,
+            self.poses_before,
+            self.at_last_step,
+        )
 
     def restore(self, snapshot: ContactSnapshot) -> None:
         """Go back to a `snapshot` of this engine."""
-        self.touching = ContactSet(snapshot.touching.used.copy(), snapshot.touching.slot.copy())
-        self.clearance = Clearance(snapshot.clearance.distance.copy(), snapshot.clearance.position.copy())
-        self.before, self.tracked, self.gap = snapshot.before, snapshot.tracked.copy(), snapshot.gap.copy()
-        self.poses, self.poses_before, self.at_last_step = (
-            snapshot.poses,
-            snapshot.poses_before,
-            snapshot.at_last_step,
-        )
+        self.contact_set = ContactSet(*(a.copy() for a in snapshot.contact_set))
+        self.clearance = Clearance(*(a.copy() for a in snapshot.clearance))
+        self.before, self.tracked = snapshot.before, snapshot.tracked.copy()
+        self.poses, self.poses_before = snapshot.poses, snapshot.poses_before
+        self.at_last_step = snapshot.at_last_step
 
-    def in_worlds(self, rows: Ints) -> tuple[Ints, Ints]:
-        """`rows` (n,) world by world, and (n_worlds + 1,) where in them each world begins, with the end at
-        last."""
+    def in_worlds(self, rows: Ints) -> ContactRows:
+        """`rows` (n,) world by world."""
         ordered = rows[np.argsort(self.world[rows], kind="stable")]
-        return ordered, np.append(np.flatnonzero(np.diff(self.world[ordered], prepend=-1)), len(ordered))
+        start = np.append(np.flatnonzero(np.diff(self.world[ordered], prepend=-1)), len(ordered))
+        return ContactRows(start, ordered, np.zeros(0, np.int64), self.trouble[:0], np.zeros((0, 0)))
 
     @property
-    def rods_touch(self) -> bool:
+    def rods_meet(self) -> bool:
         """A rod may touch itself or another."""
         return self.scene.self_contact or self.scene.worlds is not None
 
     def pressed(self) -> Flags:
         """(n_robots,) in a world where some contact carries a force."""
-        slots = np.arange(self.touching.slot.shape[1])
-        force = (self.touching.slot[:, :, T_FORCE : T_FORCE + 3] != 0.0).any(2) & (
-            slots < self.touching.used[:, None]
-        )
-        return self.whole_worlds(force.any(1))
+        used, contact = self.contact_set
+        there = np.arange(contact.shape[1]) < used[:, None]
+        return self.whole_worlds(((contact["force"] != 0.0).any(2) & there).any(1))
 
     def whole_worlds(self, some: Flags) -> Flags:
         """(n_robots,) all robots of the worlds of those that are marked."""
@@ -198,104 +150,33 @@ class Engine:
         worlds[self.world[some]] = True
         return np.asarray(worlds[self.world])
 
-    def touches(self, rows: Ints, shape: RodShape) -> Flags:
+    def overlap(self, rows: Ints, shape: RodShape) -> Flags:
         """(n_robots,) which of `rows`, free until now, overlap something in `shape` or have gone through it;
         with their worlds."""
-        some = np.zeros(len(self.gap), bool)
+        some = np.zeros(len(self.tracked), bool)
         if not len(rows):
             return some
-        parts = self._parts(len(rows))
-        found, n_found = np.empty((len(rows), MOST_FOUND, CANDIDATE)), np.zeros(len(rows), np.int64)
-        scratch = np.empty((parts, 4 * shape.arclength.shape[1] + 4 * STACK))
-        body = look_serial if parts == 1 else look_parallel
+        threads = self.thread_count(len(rows))
+        found, n_found = np.empty((len(rows), MOST_FOUND), CANDIDATE), np.zeros(len(rows), np.int64)
         one = np.ones(1)
-        scenery = self._scenery(shape, 1e-9, 0.0 * one, one)._replace(margin=0.0)
-        body(rows, *scenery, self.clearance, self.gap, found, n_found, scratch)
-        if self.rods_touch:
-            ordered, worlds = self.in_worlds(rows)
-            look_at_rods(worlds, ordered, scenery, self.touching, self.gap)
-        some[rows] = (self.gap[rows] < 0.0) | (n_found < 0)
+        motion = self.motion(shape, 1e-9, 0.0 * one, one)._replace(margin=0.0)
+        body = search_serial if threads == 1 else search_parallel
+        work = search_work(threads, shape.arclength.shape[1])
+        body(rows, self.rods, self.surfaces, motion, found, n_found, work)
+        if self.rods_meet:
+            self.lower_gaps(rows, motion)
+        some[rows] = (self.clearance.gap[rows] < 0.0) | (n_found < 0)
         return self.whole_worlds(some)
 
-    def follow(
-        self,
-        rows: Ints,
-        start: Ports | None,
-        end: Ports,
-        memory: Memory,
-        shape: RodShape,
-        run: Pass,
-        tolerance: float,
-        passes: Ints,
-        most: int,
-    ) -> tuple[Flags, Floats]:
-        """Lead the worlds of `rows` from the inputs `start`, where they are at rest, to `end`, or settle them
-        there at once, in about
-        `most` passes.
+    def lower_gaps(self, rows: Ints, motion: ContactMotion) -> None:
+        """Lower the gaps of these robots in `motion` to those between rods."""
+        search = RodSearch(motion, self.rods, self.contact_set, motion.frames.shape[1], 0.0)
+        search_worlds(self.in_worlds(rows), search)
 
-        (n_robots,) which arrived, and the part of the way that each came. Those that did not keep the last
-        shape, boundary and contacts in which they were at rest.
-        """
-        n = len(self.gap)
-        done, stride, arrived = np.zeros(n), np.ones(n), np.zeros(n, bool)
-        x, count, slot = memory.x.copy(), self.touching.used.copy(), self.touching.slot.copy()
-        way, begun, tries = rows, passes.copy(), np.zeros(n, np.int64)
-        trouble = np.zeros_like(self.trouble)  # of the last try that failed
-        moved = np.broadcast_to(longest_move(self.poses_before, self.poses, self.surfaces.sphere), n)
-        aim = np.ones(n)
-        while len(way):
-            last, aim = aim, np.minimum(done + stride, 1.0)
-            # what was clear of the obstacles was so where they were in the try before
-            elsewhere = way[(aim != last)[way]]
-            self.clearance.distance[elsewhere] -= moved[elsewhere, None]
-            ports = end if start is None or (aim[way] >= 1.0).all() else blended(start, end, aim)
-            rest, unheld = self._settle(
-                way, ports, memory, shape, run, self._scenery(shape, tolerance, done, aim), passes
-            )
-            wanders = (self.trouble[:, 0] == MOVES) & (self.trouble[:, 3] < _WANDERS * self.rods.reach)
-            given_up = (stride <= _HARD) | unheld | self.whole_worlds(wanders)
-            hard = way[(~rest & given_up & (tries < _DAMPED_TRIES))[way]]
-            if len(hard):  # no equilibrium near: let it go to the next one, downhill
-                tries[hard] += 1
-                memory.x[hard], self.touching.used[hard], self.touching.slot[hard] = (
-                    x[hard],
-                    count[hard],
-                    slot[hard],
-                )
-                rest |= self._descend(
-                    hard, ports, memory, shape, run, self._scenery(shape, tolerance, done, aim), passes, tries
-                )
-            good, bad = way[rest[way]], way[~rest[way]]
-            trouble[bad] = self.trouble[bad]
-            done[good] = aim[good]
-            arrived[good] = done[good] >= 1.0
-            between_steps = good[~arrived[good]]
-            if len(between_steps):
-                self.accept(between_steps, shape, on_the_way=True)
-            x[good], count[good], slot[good] = (
-                memory.x[good],
-                self.touching.used[good],
-                self.touching.slot[good],
-            )
-            memory.x[bad], self.touching.used[bad], self.touching.slot[bad] = x[bad], count[bad], slot[bad]
-            stride[good] *= 2.0
-            stride[bad] *= 0.5
-            if start is None:
-                break
-            way = way[~arrived[way] & (stride[way] >= _SMALLEST_PART) & (passes[way] - begun[way] < most)]
-        self.trouble[rows] = trouble[rows]
-        short = rows[~arrived[rows]]
-        self.clearance.distance[short] -= moved[short, None]
-        lost = rows[~arrived[rows] & self.tracked[rows]]
-        if len(lost) and self.before is not None:
-            for now, last in zip(shape, self.before, strict=True):
-                now[lost] = last[lost]
-        return arrived, done
-
-    def accept(self, rows: Ints, shape: RodShape, on_the_way: bool = False) -> None:
-        """These robots are at rest in `shape`: from there they slip and move. `on_the_way`: it will be
-        written to again."""
-        if len(rows) == len(self.gap) and not on_the_way:
+    def accept(self, rows: Ints, shape: RodShape, between_steps: bool = False) -> None:
+        """These robots are at rest in `shape`: from there they slip and move. `between_steps`: it will
+        be written to again."""
+        if len(rows) == len(self.tracked) and not between_steps:
             self.before = shape
         else:
             self.before = RodShape(*(np.array(a) for a in (shape if self.before is None else self.before)))
@@ -304,251 +185,45 @@ class Engine:
         self.tracked[rows] = True
 
     def end_step(self, done: Floats) -> None:
-        """The obstacles are where they were to go; for a robot that came only the part `done` (n_robots,) of
-        the way, where it met them."""
+        """The obstacles are at the end of their displacement; for a robot that came only the fraction `done`
+        (n_robots,), where it met them."""
         self.poses_before = (
             self.poses if (done >= 1.0).all() else between(self.poses_before, self.poses, done)
         )
 
-    def held(self, rows: Ints, ports: Ports, n_x: int) -> tuple[Ports, PointLoads]:
-        """The present contacts of these robots as loads of a pass, and a probe at the tip that carries
-        none."""
-        most = int(self.touching.used[rows].max(initial=0))
-        probes = empty_probes(len(rows), most + 1, n_x)
-        ports = self._arranged(rows, ports, probes)
-        probes.node[:, -1], probes.force[:, -1], probes.arm[:, -1] = (
+    def held(self, rows: Ints, ports: Ports, loads: PointLoads) -> Ports:
+        """The present contacts of these robots as loads of a pass, into `loads`, the last of which is a point
+        at the tip that carries none; the ports with nodes under them."""
+        ports = self.arranged(rows, ports, loads)
+        loads.node[:, -1], loads.force[:, -1], loads.arm[:, -1] = (
             self.clearance.distance.shape[1] - 1,
             0.0,
             0.0,
         )
-        return ports, probes
+        return ports
 
     def why(self, i: int, done: float) -> ProblemSentence:
-        """What stopped robot i, which came the part `done` of its step."""
-        if self.trouble[i, 0] == NOTHING:
-            if self.gap[i] < 0.0:
-                deep = f"contact: the rod overlaps an obstacle by {-self.gap[i]:.3g} m"
+        """What stopped robot i, which came the fraction `done` of its step."""
+        gap = self.clearance.gap[i]
+        if self.trouble[i].cause == NOTHING:
+            if gap < 0.0:
+                deep = f"contact: the rod overlaps an obstacle by {-gap:.3g} m"
                 return ProblemSentence(f"{deep}, and no way out of it was found.", Problem.CONTACT_INSIDE)
             unsolved = "contact: neither the rod's rest shape nor these inputs could be solved."
             return ProblemSentence(unsolved, Problem.CONTACT_DIVERGED)
-        return sentence(
-            self.trouble[i],
-            self.scene,
-            self.rods.n_steps,
-            self.length[i if len(self.length) > 1 else 0],
-            done,
-        )
+        length = self.length[i if len(self.length) > 1 else 0]
+        return sentence(self.trouble[i], self.scene, self.rods.n_steps, length, done)
 
     def contacts(self, shape: RodShape, ok: Flags) -> Contacts:
-        """What touches what now."""
-        n, n_obstacles = len(self.gap), len(self.surfaces.kind)
-        slot = self.touching.slot
-        live = (np.arange(slot.shape[1]) < self.touching.used[:, None]) & ok[:, None]
-        live &= (slot[:, :, T_FORCE : T_FORCE + 3] != 0.0).any(2) | (slot[:, :, T_GAP] < TOUCHES)
-        count = np.asarray(live.sum(1))
-        width = int(count.max(initial=0))
-        order = np.argsort(~live, axis=1, kind="stable")[:, :width]
-        kept = np.take_along_axis(slot, order[:, :, None], axis=1)
-        kept[np.arange(width) >= count[:, None]] = np.nan
-        obstacle, normal, force, s = (
-            kept[:, :, T_OBSTACLE],
-            kept[:, :, T_N : T_N + 3],
-            kept[:, :, T_FORCE : T_FORCE + 3],
-            kept[:, :, T_S],
-        )
-        nodes = np.abs(np.where(np.isfinite(s), s, 0.0)[:, :, None] - shape.arclength[:, None, :])
-        at = np.where(np.isfinite(nodes), nodes, np.inf).argmin(2)  # every contact has a node of its own
-        point = (
-            np.take_along_axis(shape.position, at[:, :, None], axis=1) - kept[:, :, T_RADIUS, None] * normal
-        )
-        index = np.where(np.isfinite(obstacle), obstacle, -1).astype(np.int64)
-        wrench = np.zeros((n, n_obstacles, 6))
-        origin = np.broadcast_to(self.poses[:, :, :3], (n, n_obstacles, 3))
-        for k in range(n_obstacles):
-            on = np.where((index == k)[:, :, None], -force, 0.0)
-            wrench[:, k, :3] = on.sum(1)
-            wrench[:, k, 3:] = np.cross(
-                np.where((index == k)[:, :, None], point - origin[:, None, k], 0.0), on
-            ).sum(1)
-        gap = np.where(ok, self.gap, np.nan)
-        return Contacts(
-            names=self.scene.names,
-            count=count,
-            obstacle=index,
-            point=point,
-            normal=normal,
-            gap=kept[:, :, T_GAP],
-            force=force,
-            arclength=s,
-            wrench=wrench,
-            clearance=gap,
-            deep=ok & (self.gap < -np.maximum(self.rods.radius.min(1), 1e-6)),
-            tip_arclength=shape.arclength[:, -1],
+        """The contacts of a state."""
+        thinnest = np.maximum(self.rods.radius.min(1), 1e-6)
+        return contacts_of(
+            self.scene.names, self.contact_set, self.clearance, self.poses, shape, ok, thinnest
         )
 
-    def _settle(
-        self,
-        rows: Ints,
-        ports: Ports,
-        memory: Memory,
-        shape: RodShape,
-        run: Pass,
-        scenery: SceneArrays,
-        passes: Ints,
-    ) -> tuple[Flags, Flags]:
-        """Pass and law in turn on these inputs; (n_robots,) which came to rest, and which were given up as no
-        forces hold them."""
-        rest = np.zeros(len(self.gap), bool)
-        unsolved, inside = (np.zeros(len(rest), np.int64) for _ in range(2))
-        progress, still = Progress(len(rest)), rows
-        for count in range(_LONGEST * _MOST_PASSES):
-            status = self._iterate(still, ports, memory, shape, run, scenery)
-            passes[still] += 1
-            rest[still[status == AT_REST]] = True
-            unsolved[still] = np.where(self.trouble[still, 0] == UNSOLVED, unsolved[still] + 1, 0)
-            deep = self.tracked[still] & (
-                self.gap[still] < -self.rods.radius[still].max(1) - _NEARLY * self.rods.reach[still]
-            )
-            inside[still] = np.where(deep, inside[still] + 1, 0)
-            hopeless = (inside >= _MOST_INSIDE) | (unsolved >= _UNSOLVED)
-            progress.note(still, self.trouble[still, 4])
-            if count >= _MOST_PASSES - 1:  # go on with what comes closer to rest
-                hopeless |= progress.idle >= _IDLE
-            still = still[(status != AT_REST) & (status != LOST) & ~self.whole_worlds(hopeless)[still]]
-            if not len(still):
-                break
-        self._count_contacts(rows[~rest[rows]], ports)
-        return rest, unsolved >= _UNSOLVED
-
-    def _descend(
-        self,
-        rows: Ints,
-        ports: Ports,
-        memory: Memory,
-        shape: RodShape,
-        run: Pass,
-        scenery: SceneArrays,
-        passes: Ints,
-        tries: Ints,
-    ) -> Flags:
-        """The same where no equilibrium is near, damped: down in energy to one, in passes that go through
-        nothing; (n_robots,) which came to rest. A pass that goes through something, or finds no forces, is
-        taken back; `tries` counts this one."""
-        n = len(self.gap)
-        rest, still = np.zeros(n, bool), rows
-        progress, damping = Progress(n), Damping(scenery.damping, rows, tries)
-        frames = np.broadcast_to(scenery.frames, (n, *scenery.frames.shape[1:]))
-        frames_before = np.array(np.broadcast_to(scenery.frames_before, frames.shape))
-        scenery = scenery._replace(
-            before=RodShape(*(np.array(a) for a in scenery.before)), frames_before=frames_before
-        )
-        x, used, slot = memory.x.copy(), self.touching.used.copy(), self.touching.slot.copy()
-        for count in range(_LONGEST * _MOST_DAMPED):
-            here = memory.x[still].copy(), self.touching.used[still].copy(), self.touching.slot[still].copy()
-            status = self._iterate(still, ports, memory, shape, run, scenery)
-            passes[still] += 1
-            rest[still[status == AT_REST]] = True
-            away, on = still[status == BACK], still[status != BACK]
-            memory.x[away], self.touching.used[away], self.touching.slot[away] = (
-                x[away],
-                used[away],
-                slot[away],
-            )
-            x[on], used[on], slot[on] = (a[status != BACK] for a in here)
-            for last, now in zip(scenery.before, shape, strict=True):
-                last[on] = now[on]
-            frames_before[on] = frames[on]
-            progress.note(on, self.trouble[on, 4])
-            damping.note(on, self.trouble[on, 4])
-            damping.refuse(away)
-            hopeless = damping.refused >= _MOST_REFUSED
-            hopeless[away] |= used[away] == 0  # what touches nothing is not damped
-            if count >= _MOST_DAMPED - 1:
-                hopeless |= progress.idle >= 2 * _IDLE
-            still = still[(status != AT_REST) & (status != LOST) & ~self.whole_worlds(hopeless)[still]]
-            if not len(still):
-                break
-        self._count_contacts(rows[~rest[rows]], ports)
-        return rest
-
-    def _count_contacts(self, rows: Ints, ports: Ports) -> None:
-        """Say of robots that stay inside of something whether they lack contacts, or nodes to put them on."""
-        for i in rows[self.trouble[rows, 0] == INSIDE]:
-            ends = np.cumsum(
-                self.length[i if len(self.length) > 1 else 0]
-                + ports.extension[i if len(ports.extension) > 1 else 0]
-            )
-            used = self.touching.slot[i, : self.touching.used[i], T_S]
-            here = np.searchsorted(ends[:-1], self.trouble[i, 2], side="right")
-            if (np.searchsorted(ends[:-1], used, side="right") == here).sum() >= self.rods.n_steps - 1:
-                self.trouble[i, 0] = NO_NODE_LEFT
-            elif len(used) >= self.touching.slot.shape[1]:
-                self.trouble[i, 0] = NO_CONTACT_LEFT
-
-    def _iterate(
-        self, rows: Ints, ports: Ports, memory: Memory, shape: RodShape, run: Pass, scenery: SceneArrays
-    ) -> Ints:
-        """One pass and one round of the law for the worlds of `rows`; their status. Worlds with as many
-        contacts go together."""
-        status = np.zeros(len(rows), np.int64)
-        most = np.zeros(self.world.max() + 1, np.int64)
-        np.maximum.at(most, self.world[rows], self.touching.used[rows])
-        slots = np.minimum(
-            2 ** np.ceil(np.log2(np.maximum(most[self.world[rows]], 1))).astype(np.int64),
-            self.scene.max_contacts,
-        )
-        for n_slots in np.unique(slots):
-            members = np.flatnonzero(slots == n_slots)
-            members = members[np.argsort(self.world[rows[members]], kind="stable")]
-            starts = np.flatnonzero(np.diff(self.world[rows[members]], prepend=-1))
-            cuts = np.unique(np.searchsorted(starts, np.arange(_BLOCK, len(members), _BLOCK)))
-            for block in np.split(members, starts[cuts[cuts < len(starts)]]):
-                status[block] = self._iterate_block(
-                    rows[block], int(n_slots), ports, memory, shape, run, scenery
-                )
-        return status
-
-    def _iterate_block(
-        self,
-        rows: Ints,
-        n_slots: int,
-        ports: Ports,
-        memory: Memory,
-        shape: RodShape,
-        run: Pass,
-        scenery: SceneArrays,
-    ) -> Ints:
-        n, n_x = len(rows), memory.x.shape[1]
-        probes = empty_probes(n, n_slots, n_x)
-        ports = self._arranged(rows, ports, probes)
-        run(rows, ports, shape, probes)
-        worlds = np.append(np.flatnonzero(np.diff(self.world[rows], prepend=-1)), n)
-        status = np.zeros(n, np.int64)
-        parts = self._parts(len(worlds) - 1)
-        scratch = np.empty(
-            (
-                parts,
-                world_size(
-                    int(np.diff(worlds).max()), n_slots, self.touching.slot.shape[1], shape.arclength.shape[1]
-                ),
-            )
-        )
-        body = iterate_serial if parts == 1 else iterate_parallel
-        proposed, unknown = np.zeros((n, n_slots, 3)), np.zeros((n, n_x))
-        used, slot = self.touching.used[rows], self.touching.slot[rows, :n_slots]
-        homeless = (probes.node < 0) & (np.arange(n_slots) < used[:, None])
-        held = self.touching, self.clearance, probes, memory, proposed, unknown
-        body(worlds, rows, *scenery, *held, self.gap, self.trouble, status, scratch)
-        if homeless.any():  # more contacts than nodes: what has no node has not been felt
-            for r in np.flatnonzero(homeless.any(1)):
-                q = homeless[r].argmax()
-                self.trouble[rows[r], :4] = NO_NODE_LEFT, slot[r, q, T_OBSTACLE], slot[r, q, T_S], 0.0
-                status[r] = LOST if status[r] == LOST else GOES_ON
-        return status
-
-    def _arranged(self, rows: Ints, ports: Ports, probes: PointLoads) -> Ports:
-        """The ports with a node under every contact; fills the loads of the probes."""
-        n_robots, n_steps = len(self.gap), self.rods.n_steps
+    def arranged(self, rows: Ints, ports: Ports, loads: PointLoads) -> Ports:
+        """The ports with a node under every contact; fills the point loads."""
+        n_robots, n_steps = len(self.tracked), self.rods.n_steps
         n_segments = self.rods.radius.shape[1]
         ends = np.cumsum(self.length + ports.extension, axis=1)
         starts = np.concatenate([np.zeros((len(ends), 1)), ends], axis=1)
@@ -556,7 +231,7 @@ class Engine:
         m = self.given_arclength.shape[1]
         node = np.zeros((n_robots, m), np.int64)
         given = np.broadcast_to(self.given_arclength, (n_robots, m))
-        arrange(rows, self.touching, np.ascontiguousarray(given), starts, n_steps, grid, node, probes)
+        arrange(rows, self.contact_set, np.ascontiguousarray(given), starts, n_steps, grid, node, loads)
         if not m:
             return ports._replace(grid=grid)
         node_force = np.zeros((n_robots, n_segments * n_steps + 1, 3))
@@ -565,46 +240,65 @@ class Engine:
             np.add.at(node_force, (rows, node[rows, q]), force[rows, q])
         return ports._replace(grid=grid, node_force=node_force)
 
-    def _parts(self, n: int) -> int:
+    def thread_count(self, n: int) -> int:
+        """Threads for n robots, or worlds."""
         return 1 if n <= _FEW else min(self.threads, n)
 
-    def _scenery(self, shape: RodShape, tolerance: float, done: Floats, aim: Floats) -> SceneArrays:
-        """The obstacles at the part `aim` of their way, and at the part `done` that is behind."""
+    def motion(self, shape: RodShape, tolerance: float, done: Floats, aim: Floats) -> ContactMotion:
+        """Rods in `shape` and the obstacles at the fraction `aim` of their displacement, where the fraction
+        `done` is behind."""
         if self.poses is self.poses_before and not self.velocities:
             frames = before = slip = frames_of(self.poses)
         else:
-            poses, last = (between(self.poses_before, self.poses, part) for part in (aim, done))
+            poses, last = (between(self.poses_before, self.poses, fraction) for fraction in (aim, done))
             ago = last.repeat(max(len(poses), 1) // max(len(last), 1), axis=0) if self.velocities else last
             for k, velocity in self.velocities.items():
                 slid = back_by(poses[:, k], velocity, self.dt * (aim - done))
                 ago = ago.repeat(len(slid) // len(ago), axis=0)
                 ago[:, k] = slid
             frames, before, slip = frames_of(poses), frames_of(last), frames_of(ago)
-        history = shape if self.before is None else self.before
-        return SceneArrays(
-            self.rods,
-            self.surfaces,
-            frames,
-            before,
-            slip,
+        return motion_of(
+            (frames, before, slip),
             shape,
-            history,
-            history,
-            self.tracked,
-            self.tracked & self.slides,
-            tolerance,
-            self.scene.watch,
-            np.zeros(len(self.gap)),
+            shape if self.before is None else self.before,
+            self.clearance,
+            tracked=self.tracked,
+            slides=self.tracked & self.slides,
+            tolerance=tolerance,
+            margin=self.scene.watch,
         )
 
 
-def empty_probes(n_rows: int, n_probes: int, n_x: int) -> PointLoads:
-    """Room for the contact points of a pass."""
-    n_f = 3 * n_probes
-    loads = np.zeros((n_rows, n_probes, 3)), np.zeros((n_rows, n_probes, 3))
-    return PointLoads(
-        np.full((n_rows, n_probes), -1),
-        *loads,
-        np.zeros((n_rows, n_f, 1 + n_f)),
-        np.zeros((n_rows, n_x, 1 + n_f)),
+def motion_of(
+    frames: tuple[Floats, Floats, Floats],
+    shape: RodShape,
+    before: RodShape,
+    clearance: Clearance,
+    *,
+    tracked: Flags,
+    slides: Flags,
+    tolerance: float,
+    margin: float,
+) -> ContactMotion:
+    """Put together what kernels read of one pass, without damping: `frames` now, before, and for slip."""
+    return ContactMotion(
+        *frames,
+        *(shape.position, shape.rotation, shape.curvature, shape.arclength, shape.residual),
+        *_curves(before),
+        *_curves(before),
+        *clearance,
+        tracked,
+        slides,
+        tolerance,
+        margin,
+        np.zeros(len(tracked)),
     )
+
+
+def _curves(shape: RodShape) -> tuple[Floats, Floats, Floats, Floats]:
+    return shape.position, shape.rotation, shape.curvature, shape.arclength
+
+
+def unknown_clearance(n: int, n_points: int) -> Clearance:
+    """Nothing is known about n robots."""
+    return Clearance(np.full((n, n_points), -np.inf), np.zeros((n, n_points, 3)), np.full(n, np.inf))

@@ -11,20 +11,20 @@ from fastrod.types import Floats, Ports
 def frames_of(poses: Floats) -> Floats:
     """(n, n_obstacles, 7) position and quaternion to (n, n_obstacles, 12): rotation row by row, then
     position."""
-    turn = matrix_from_quaternion(poses[..., 3:].reshape(-1, 4)).reshape(*poses.shape[:2], 9)
-    return np.ascontiguousarray(np.concatenate([turn, poses[..., :3]], axis=-1))
+    rotation = matrix_from_quaternion(poses[..., 3:].reshape(-1, 4)).reshape(*poses.shape[:2], 9)
+    return np.ascontiguousarray(np.concatenate([rotation, poses[..., :3]], axis=-1))
 
 
-def between(start: Floats, end: Floats, part: Floats) -> Floats:
-    """Poses (..., 7) at the part (n,) of the way: positions in a straight line, quaternions along the shorter
-    arc."""
-    n = max(len(start), len(end), len(part))
+def between(start: Floats, end: Floats, fraction: Floats) -> Floats:
+    """Poses (..., 7) a fraction (n,) from `start` to `end`: positions in a straight line, quaternions along
+    the shorter arc."""
+    n = max(len(start), len(end), len(fraction))
     a, b = (np.broadcast_to(p, (n, *p.shape[1:])) for p in (start, end))
-    t = part.reshape(-1, *[1] * (a.ndim - 1))
+    t = fraction.reshape(-1, *[1] * (a.ndim - 1))
     sign = np.where((a[..., 3:] * b[..., 3:]).sum(-1, keepdims=True) < 0.0, -1.0, 1.0)
-    turn = (1.0 - t) * a[..., 3:] + t * sign * b[..., 3:]
-    turn /= np.linalg.norm(turn, axis=-1, keepdims=True)
-    return np.concatenate([(1.0 - t) * a[..., :3] + t * b[..., :3], turn], axis=-1)
+    rotation = (1.0 - t) * a[..., 3:] + t * sign * b[..., 3:]
+    rotation /= np.linalg.norm(rotation, axis=-1, keepdims=True)
+    return np.concatenate([(1.0 - t) * a[..., :3] + t * b[..., :3], rotation], axis=-1)
 
 
 def back_by(poses: Floats, velocity: Floats, time: Floats) -> Floats:
@@ -33,8 +33,8 @@ def back_by(poses: Floats, velocity: Floats, time: Floats) -> Floats:
     pose, v, t = (np.broadcast_to(a, (n, *a.shape[1:])) for a in (poses, velocity, time))
     angle = -np.linalg.norm(v[:, 3:], axis=1) * t
     unit = v[:, 3:] / np.maximum(np.linalg.norm(v[:, 3:], axis=1, keepdims=True), 1e-300)
-    turn = np.column_stack([np.cos(0.5 * angle), np.sin(0.5 * angle)[:, None] * unit])
-    return np.column_stack([pose[:, :3] - t[:, None] * v[:, :3], product(turn, pose[:, 3:])])
+    rotation = np.column_stack([np.cos(0.5 * angle), np.sin(0.5 * angle)[:, None] * unit])
+    return np.column_stack([pose[:, :3] - t[:, None] * v[:, :3], product(rotation, pose[:, 3:])])
 
 
 def longest_move(start: Floats, end: Floats, ball: Floats) -> Floats:
@@ -43,19 +43,19 @@ def longest_move(start: Floats, end: Floats, ball: Floats) -> Floats:
     if start.shape == end.shape and np.array_equal(start, end):
         return np.zeros(1)
     shift = np.linalg.norm(end[..., :3] - start[..., :3], axis=-1)
-    turn = np.minimum(
+    rotation = np.minimum(
         np.linalg.norm(end[..., 3:] - start[..., 3:], axis=-1),
         np.linalg.norm(end[..., 3:] + start[..., 3:], axis=-1),
     )
     radius = np.linalg.norm(ball[:, :3], axis=1) + ball[:, 3]
     with np.errstate(invalid="ignore"):
         # |dq| is half the angle, to first order and from above
-        far = np.where(turn > 0.0, 2.0 * turn * radius, 0.0)
+        far = np.where(rotation > 0.0, 2.0 * rotation * radius, 0.0)
     return np.asarray((shift + far).max(-1, initial=0.0))
 
 
-def blended(start: Ports, end: Ports, part: Floats) -> Ports:
-    """The inputs at the part (n,) of the way from `start` to `end`; what has another number of points comes
+def blended(start: Ports, end: Ports, fraction: Floats) -> Ports:
+    """The inputs a fraction (n,) of the way from `start` to `end`; what has another number of points comes
     at once."""
     fields = {}
     for name in Ports._fields:
@@ -63,8 +63,8 @@ def blended(start: Ports, end: Ports, part: Floats) -> Ports:
         if name in ("grid", "node_force", "follower_force") or a.shape[1:] != b.shape[1:] or a is b:
             continue
         if name == "base_pose":
-            fields[name] = np.ascontiguousarray(between(a, b, part))
+            fields[name] = np.ascontiguousarray(between(a, b, fraction))
             continue
-        t = part.reshape(-1, *[1] * (a.ndim - 1))
+        t = fraction.reshape(-1, *[1] * (a.ndim - 1))
         fields[name] = np.ascontiguousarray((1.0 - t) * a + t * b)
     return end._replace(**fields)

@@ -1,4 +1,4 @@
-"""Questions about the last state: how near, how near on the way, and what a distance sensor sees."""
+"""Queries of the last state: clearance, clearance on the way to it, and rays of a distance sensor."""
 
 from __future__ import annotations
 
@@ -7,17 +7,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fastrod.contact.engine import MOST_FOUND, Engine
+from fastrod.contact.engine import Engine, motion_of, unknown_clearance
 from fastrod.contact.frames import between, frames_of
 from fastrod.errors import InputError, refuse_masked
-from fastrod.kernels.batch import cast_rays, look_at_rods, look_serial
-from fastrod.kernels.contact.bvh import STACK
-from fastrod.kernels.contact.problem import SceneArrays
-from fastrod.kernels.contact.proximity import CANDIDATE
-from fastrod.types import Clearance, Flags, Floats, Ints, RodShape
+from fastrod.kernels.batch import cast_rays, search_serial
+from fastrod.kernels.contact.problem import MOST_FOUND
+from fastrod.kernels.contact.proximity import search_work
+from fastrod.types import CANDIDATE, Flags, Floats, Ints, RodShape
 
 _EVERYTHING = 1e6  # of the rod's length: a margin within which all is near
-_MOST_LOOKS = 400
+_MOST_SPLITS = 400  # of the way between two states: a bound on time
 
 
 class Hits(NamedTuple):
@@ -51,36 +50,31 @@ def _gap(
         friction=surfaces.friction[which],
         compliance=surfaces.compliance[which],
         body=surfaces.body[which],
-        give=surfaces.give[which],
+        mobility=surfaces.mobility[which],
         root=surfaces.root[which],
     )
     frames = np.ascontiguousarray(frames_of(poses)[:, which])
     nobody = np.zeros(n, bool)
-    scenery = SceneArrays(
-        engine.rods,
-        surfaces,
-        frames,
-        frames,
-        frames,
+    known = unknown_clearance(n, n_points)
+    motion = motion_of(
+        (frames, frames, frames),
         shape,
         shape,
-        shape,
-        nobody,
-        nobody,
-        1e-9,
-        _EVERYTHING,
-        np.zeros(len(nobody)),
+        known,
+        tracked=nobody,
+        slides=nobody,
+        tolerance=1e-9,
+        margin=_EVERYTHING,
     )
     finite = np.isfinite(shape.position).all((1, 2))
-    gap, some = np.full(n, np.nan), np.flatnonzero(finite if rows is None else finite & rows)
-    found, n_found = np.empty((len(some), MOST_FOUND, CANDIDATE)), np.zeros(len(some), np.int64)
-    unknown = Clearance(np.full((n, n_points), -np.inf), np.zeros((n, n_points, 3)))
-    gap[some] = np.inf
+    some = np.flatnonzero(finite if rows is None else finite & rows)
     if len(surfaces.kind):
-        look_serial(some, *scenery, unknown, gap, found, n_found, np.empty((1, 4 * n_points + 4 * STACK)))
-    if only is None and engine.rods_touch:
-        ordered, worlds = engine.in_worlds(some)
-        look_at_rods(worlds, ordered, scenery, engine.touching, gap)
+        found, n_found = np.empty((len(some), MOST_FOUND), CANDIDATE), np.zeros(len(some), np.int64)
+        search_serial(some, engine.rods, surfaces, motion, found, n_found, search_work(1, n_points))
+    if only is None and engine.rods_meet:
+        engine.lower_gaps(some, motion)
+    gap = np.full(n, np.nan)
+    gap[some] = known.gap[some]
     return gap
 
 
@@ -102,10 +96,10 @@ def swept_clearance(
     )
 
     def gap_at(t: Floats, some: Flags) -> Floats:
-        part = t[:, None, None]
-        tangent = (1.0 - part[..., None]) * before.rotation + part[..., None] * after.rotation
+        fraction = t[:, None, None]
+        tangent = (1.0 - fraction[..., None]) * before.rotation + fraction[..., None] * after.rotation
         there = after._replace(
-            position=(1.0 - part) * before.position + part * after.position, rotation=tangent
+            position=(1.0 - fraction) * before.position + fraction * after.position, rotation=tangent
         )
         gap = _gap(engine, there, between(poses_before, engine.poses, t), rows=some)
         return np.where(np.isnan(gap), np.inf, gap)
@@ -116,7 +110,7 @@ def swept_clearance(
         np.tile([0.0, 1.0], (n, 1)),
         np.stack([gap_at(np.zeros(n), wanted), gap_at(np.ones(n), wanted)], axis=1),
     )
-    for _ in range(_MOST_LOOKS):
+    for _ in range(_MOST_SPLITS):
         bound = 0.5 * (gaps[:, 1:] + gaps[:, :-1] - np.nan_to_num(moved)[:, None] * np.diff(times, axis=1))
         worst = bound.argmin(1)
         still = wanted & (bound[each, worst] < gaps.min(1) - tolerance)
@@ -131,20 +125,20 @@ def swept_clearance(
 
 def _obstacles_move(engine: Engine, poses_before: Floats) -> Floats:
     """(1 or n,) a bound of how far a point of an obstacle near the rods has moved; for a plane, of one within
-    its robots' reach."""
+    ten lengths."""
     ball = engine.surfaces.sphere.copy()
-    ball[~np.isfinite(ball[:, 3]), 3] = 10.0 * float(engine.rods.reach.max())
+    ball[~np.isfinite(ball[:, 3]), 3] = 10.0 * float(engine.rods.length.max())
     shift = np.linalg.norm(engine.poses[..., :3] - poses_before[..., :3], axis=-1)
-    turn = np.linalg.norm(np.abs(engine.poses[..., 3:]) - np.abs(poses_before[..., 3:]), axis=-1)
+    rotation = np.linalg.norm(np.abs(engine.poses[..., 3:]) - np.abs(poses_before[..., 3:]), axis=-1)
     return np.asarray(
-        (shift + 2.0 * turn * (np.linalg.norm(ball[:, :3], axis=1) + ball[:, 3])).max(-1, initial=0.0)
+        (shift + 2.0 * rotation * (np.linalg.norm(ball[:, :3], axis=1) + ball[:, 3])).max(-1, initial=0.0)
     )
 
 
 def ray_cast(engine: Engine, origin: ArrayLike, direction: ArrayLike, longest: float) -> Hits:
     """Rays (n_robots, n_rays, 3) or (n_rays, 3), world, against the obstacles where they are now; directions
     need not be unit."""
-    n = len(engine.gap)
+    n = len(engine.tracked)
     refuse_masked("origin", origin)
     refuse_masked("direction", direction)
     try:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import InitVar, dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fastrod.contact.geometry import Obstacle
-from fastrod.errors import InputError, UnknownNameError, nearest, refuse_masked
+from fastrod.errors import InputError, UnknownNameError, nearest, refuse_masked, shown
 from fastrod.model.robot import Robot
 from fastrod.types import ContactRods, Floats, Ints, Layout, Params
 
@@ -19,7 +19,7 @@ _BEYOND_TENDONS = 1.1  # a body radius of 0 stands for just beyond the outermost
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ContactScene:
-    """Obstacles and the ways in which rods touch them, themselves and each other.
+    """Obstacles, and how rods touch them, themselves and each other.
 
     >>> from fastrod.contact import ContactScene, plane
     >>> ContactScene(obstacles=[plane(point=(0.012, 0, 0), normal=(-1, 0, 0), name="wall")]).names
@@ -45,12 +45,19 @@ class ContactScene:
     max_contacts: int = 16
     """Contacts that a rod can have at once."""
     watch: float = 0.01
-    """Gap below which a contact is watched before it closes, as a part of the rod's length."""
-    max_passes: int = 600
-    """Passes after which a step that cannot be solved is given up: fewer where many robots wait for one, as
-    in training."""
+    """Gap below which a contact is watched before it closes, as a fraction of the rod's length."""
+    max_iterations: int = 600
+    """Iterations after which a step that cannot be solved is given up: fewer where many robots wait for one,
+    as in training."""
+    max_passes: InitVar[int | None] = None
+    """The old name of `max_iterations`, which is refused."""
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, max_passes: int | None) -> None:
+        if max_passes is not None:
+            raise InputError(
+                "ContactScene.max_passes is now max_iterations; give "
+                f"ContactScene(max_iterations={shown(max_passes)}) instead."
+            )
         obstacles = (self.obstacles,) if isinstance(self.obstacles, Obstacle) else tuple(self.obstacles)
         object.__setattr__(self, "obstacles", obstacles)
         for o in obstacles:
@@ -78,13 +85,15 @@ class ContactScene:
             raise InputError(
                 f"ContactScene.max_contacts is {self.max_contacts!r}; it must be a whole number from 1 to 64."
             )
-        if not isinstance(self.max_passes, int) or self.max_passes < 20:
+        if not isinstance(self.max_iterations, int) or self.max_iterations < 20:
             raise InputError(
-                f"ContactScene.max_passes is {self.max_passes!r}; it must be a whole number, at least 20."
+                f"ContactScene.max_iterations is {self.max_iterations!r}; it must be a whole number, at "
+                "least 20."
             )
         if not 0.0 < self.watch <= 0.2:
             raise InputError(
-                f"ContactScene.watch is {self.watch!r}; it is a part of the rod's length, between 0 and 0.2."
+                f"ContactScene.watch is {self.watch!r}; it is a fraction of the rod's length, between 0 and "
+                "0.2."
             )
         if self.mounting is not None and not (math.isfinite(self.mounting) and self.mounting >= 0.0):
             raise InputError(f"ContactScene.mounting is {self.mounting!r} m; it must be zero or positive.")
@@ -115,11 +124,11 @@ class ContactScene:
     def rods(self, robots: Sequence[Robot], n_robots: int, layout: Layout, params: Params) -> ContactRods:
         """What contact needs to know of the robots of a simulator."""
         radius = np.array([self.radius_of(robot) for robot in robots])
-        reach = np.array([robot.length for robot in robots])
+        length = np.array([robot.length for robot in robots])
         first = 1.5 * radius[:, 0] if self.mounting is None else np.full(len(robots), self.mounting)
-        if (first >= reach).any():
+        if (first >= length).any():
             raise InputError(
-                f"the mounting takes {first.max():.4g} m of a rod of {reach.min():.4g} m; give "
+                f"the mounting takes {first.max():.4g} m of a rod of {length.min():.4g} m; give "
                 "ContactScene(mounting=...)."
             )
         spacing = np.array([min(s.length for s in robot.segments) for robot in robots]) / layout.n_steps
@@ -132,7 +141,7 @@ class ContactScene:
             each(radius),
             each(first),
             each(spacing),
-            each(reach),
+            each(length),
             each(params.moment_scale),
             each(params.tension_scale),
             len(layout.free_tendon),

@@ -1,109 +1,350 @@
-"""One step of robots that may touch something: who is free, who is led, and who begins from nothing."""
+"""One step of robots that may touch something: free ones by their own pass, the others by passes and the
+contact law in turn until at rest, cold ones from nothing.
+
+Inputs that move a world too far for one linear model are followed by fractions, from the last step to this
+one (load continuation): a world that does not come to rest, or a rod that would go through an obstacle, goes
+half as far. A rod never continues beyond what it could solve: it stays where it came to, and says so.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
-from fastrod.contact.engine import Engine, Pass
-from fastrod.types import Flags, Floats, Ints, Memory, Ports, RodShape
+from fastrod.contact.engine import Engine
+from fastrod.contact.frames import blended, longest_move
+from fastrod.contact.progress import Damping, Progress
+from fastrod.contact.trouble import NO_CONTACT_LEFT, NO_NODE_LEFT
+from fastrod.kernels.batch import iterate_parallel, iterate_serial
+from fastrod.kernels.contact.iteration import AT_REST, BACK, GOES_ON, INSIDE, LOST, MOVES, UNSOLVED
+from fastrod.kernels.contact.problem import contact_problem
+from fastrod.kernels.contact.proximity import search_work
+from fastrod.types import ContactMotion, ContactRows, Flags, Floats, Ints, PointLoads, Ports, RodShape
 
-COLD_PASSES = 2000
-
-
-class Ways(NamedTuple):
-    """How a simulator moves robots without contact."""
-
-    free: Callable[[Ints, Ports, RodShape], Flags]
-    """A step, or `settle`, of these robots; (n_robots,) which are well."""
-    settle: Callable[[Ints, Ports, RodShape], Flags]
-    """From the cold guess until at rest."""
-    run: Pass
-
-
-def contact_step(
-    engine: Engine,
-    ways: Ways,
-    rows: Ints,
-    warm: Flags,
-    start: Ports | None,
-    end: Ports,
-    rest: Ports,
-    memory: Memory,
-    shape: RodShape,
-    tolerance: float,
-    passes: Ints,
-    most: int,
-) -> tuple[Flags, Floats]:
-    """Bring `rows` from the inputs `start` of the last step to `end`, in `shape`; (n_robots,) who is well,
-    and how far each came.
-
-    `rest` are the inputs of the straight, unloaded robots: a cold robot that would overlap something is led
-    from there, if it is clear there; else it is pushed out of where it is. Without a last step there is no
-    slip, and so no friction. `most` passes are spent on a warm robot, about: a step ends.
-    """
-    n = len(warm)
-    cold = engine.whole_worlds(np.isin(np.arange(n), rows) & ~warm)
-    engine.forget(cold)
-    engine.place_at_once(cold)
-    ok, done = np.zeros(n, bool), np.ones(n)
-    pressed = engine.pressed()
-    x = memory.x.copy()
-    warm_free, cold_rows = rows[~cold[rows] & ~pressed[rows]], rows[cold[rows]]
-    if len(warm_free):
-        ok |= ways.free(warm_free, end, shape)
-        done[warm_free[~ok[warm_free]]] = 0.0
-    if len(cold_rows):
-        ok |= ways.settle(cold_rows, end, shape)
-    touched = engine.touches(rows[ok[rows]], shape)
-    led = rows[(pressed[rows] | touched[rows]) & ~cold[rows]]
-    if len(led):
-        memory.x[led] = x[led]
-        ok[led] = False
-        arrived, came = engine.follow(led, start, end, memory, shape, ways.run, tolerance, passes, most)
-        ok |= arrived
-        done[led] = came[led]
-    new = cold_rows[touched[cold_rows] | ~ok[cold_rows]]
-    if len(new):
-        ok[new] = False
-        done[new] = _begin(engine, ways, new, end, rest, memory, shape, tolerance, passes)[new]
-        ok[new] = done[new] >= 1.0
-    engine.slides[:], engine.led[:] = True, False
-    engine.led[led], engine.led[new] = True, True
-    engine.accept(rows[ok[rows]], shape)
-    engine.end_step(done)
-    return ok, done
+COLD_ITERATIONS = 2000
+"""Iterations of a robot that begins from nothing: its whole load, where a step brings a fraction."""
+_BLOCK = 2048  # robots whose linear models are held at once: 40 MB with 16 contacts each
+_MOST_ITERATIONS = 16  # and more for a robot that comes closer to rest
+_NEARLY = 1e-4  # of the length
+# as many times the iterations are the end; iterations in a row that came no closer: it goes in circles
+_LONGEST, _IDLE = 4, 6
+_MOST_INSIDE = 8  # iterations in a row with the centreline inside of an obstacle: the step was too long
+_SMALLEST_FRACTION = 1.0 / 64.0
+# of the inputs: below it a failure is taken for the loss of the equilibrium, not for too long a step
+_HARD = 1.0 / 4.0
+_MOST_DAMPED, _DAMPED_TRIES, _MOST_REFUSED = 150, 10, 12
+_WANDERS = 1e-2  # of the length: a robot that moves by less goes around a place where it may come to rest
+# iterations in a row without forces that obey the law: the hold is lost, and plain ones do not bring it back
+_UNSOLVED = 6
 
 
-def _begin(
-    engine: Engine,
-    ways: Ways,
-    rows: Ints,
-    end: Ports,
-    rest: Ports,
-    memory: Memory,
-    shape: RodShape,
-    tolerance: float,
-    passes: Ints,
-) -> Floats:
-    """Cold robots that would overlap something: led from their rest shape, or pushed out; how far each
-    came."""
-    x = memory.x.copy()
-    free_shape = RodShape(*(a.copy() for a in shape))
-    straight = ways.settle(rows, rest, shape)
-    clear = straight & ~engine.touches(rows[straight[rows]], shape)
-    engine.slides[rows] = False
-    done = np.zeros(len(clear))
-    if len(able := rows[clear[rows]]):
-        engine.accept(able, shape, on_the_way=True)
-        done = engine.follow(able, rest, end, memory, shape, ways.run, tolerance, passes, COLD_PASSES)[1]
-    if len(stuck := rows[~clear[rows]]):
-        memory.x[stuck] = x[stuck]
-        for now, then in zip(shape, free_shape, strict=True):
-            now[stuck] = then[stuck]
-        done[stuck] = engine.follow(
-            stuck, None, end, memory, shape, ways.run, tolerance, passes, COLD_PASSES
-        )[1][stuck]
-    return done
+class ContactSolver(Protocol):
+    """What contact needs of the rods' solver; `fastrod.solver.contact_solver` is the one that there is."""
+
+    @property
+    def x(self) -> Floats:
+        """(n_robots, n_x) boundary unknowns: contact changes them, and puts back what it does not keep."""
+        ...
+
+    @property
+    def used(self) -> Ints:
+        """(n_robots,) passes that each robot has taken in this step."""
+        ...
+
+    def run_free(self, rows: Ints, ports: Ports, into: RodShape, *, settle: bool = False) -> Flags:
+        """A step without contact, or with `settle` from the cold guess until at rest; (n_robots,) which of
+        these rows are well."""
+        ...
+
+    def run_loaded(self, rows: Ints, ports: Ports, into: RodShape, loads: PointLoads) -> None:
+        """One pass with these point loads, and how contact points and unknowns move with them; the boundary
+        stays as it is."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContactStep:
+    """Bring robots to the inputs `end`, in `shape`."""
+
+    engine: Engine
+    solver: ContactSolver
+    shape: RodShape
+    end: Ports
+    tolerance: float
+    """Of motion, residual and violation at rest [m]."""
+    most: int
+    """Passes of a warm robot, about: a step ends."""
+
+    def run(self, rows: Ints, warm: Flags, start: Ports | None, unloaded: Ports) -> tuple[Flags, Floats]:
+        """Bring `rows` from the inputs `start` of the last step; (n_robots,) which robots are well, and the
+        fraction that each came.
+
+        `unloaded` are the inputs of the straight robots: a cold robot that would overlap something begins
+        there, if it is clear there; else it is pushed out of where it is. Without a last step there is no
+        slip, and so no friction.
+        """
+        engine, solver, n = self.engine, self.solver, len(warm)
+        cold = engine.whole_worlds(np.isin(np.arange(n), rows) & ~warm)
+        engine.forget(cold)
+        engine.place_at_once(cold)
+        ok, done = np.zeros(n, bool), np.ones(n)
+        pressed = engine.pressed()
+        x = solver.x.copy()
+        warm_free, cold_rows = rows[~cold[rows] & ~pressed[rows]], rows[cold[rows]]
+        if len(warm_free):
+            ok |= solver.run_free(warm_free, self.end, self.shape)
+            done[warm_free[~ok[warm_free]]] = 0.0
+        if len(cold_rows):
+            ok |= solver.run_free(cold_rows, self.end, self.shape, settle=True)
+        overlap = engine.overlap(rows[ok[rows]], self.shape)
+        held = rows[(pressed[rows] | overlap[rows]) & ~cold[rows]]
+        if len(held):
+            solver.x[held] = x[held]
+            ok[held] = False
+            arrived, came = self._continue(held, start, self.most)
+            ok |= arrived
+            done[held] = came[held]
+        new = cold_rows[overlap[cold_rows] | ~ok[cold_rows]]
+        if len(new):
+            ok[new] = False
+            done[new] = self._begin(new, unloaded)[new]
+            ok[new] = done[new] >= 1.0
+        engine.slides[:], engine.continued[:] = True, False
+        engine.continued[held], engine.continued[new] = True, True
+        engine.accept(rows[ok[rows]], self.shape)
+        engine.end_step(done)
+        return ok, done
+
+    def _begin(self, rows: Ints, unloaded: Ports) -> Floats:
+        """Cold robots that would overlap something: continued from their straight shape, or pushed out; the
+        fraction that each came."""
+        engine, solver = self.engine, self.solver
+        x = solver.x.copy()
+        free_shape = RodShape(*(a.copy() for a in self.shape))
+        straight = solver.run_free(rows, unloaded, self.shape, settle=True)
+        clear = straight & ~engine.overlap(rows[straight[rows]], self.shape)
+        engine.slides[rows] = False
+        done = np.zeros(len(clear))
+        if len(able := rows[clear[rows]]):
+            engine.accept(able, self.shape, between_steps=True)
+            done = self._continue(able, unloaded, COLD_ITERATIONS)[1]
+        if len(stuck := rows[~clear[rows]]):
+            solver.x[stuck] = x[stuck]
+            for now, then in zip(self.shape, free_shape, strict=True):
+                now[stuck] = then[stuck]
+            done[stuck] = self._continue(stuck, None, COLD_ITERATIONS)[1][stuck]
+        return done
+
+    def _continue(self, rows: Ints, start: Ports | None, most: int) -> tuple[Flags, Floats]:
+        """Lead the worlds of `rows` from the inputs `start`, where they are at rest, or settle them at the
+        end at once, in about `most` passes.
+
+        (n_robots,) which arrived, and the fraction that each came. Those that did not keep the last shape,
+        boundary and contacts in which they were at rest.
+        """
+        engine, solver, n = self.engine, self.solver, len(self.engine.tracked)
+        done, length, arrived = np.zeros(n), np.ones(n), np.zeros(n, bool)
+        contacts = engine.contact_set
+        x, used, contact = solver.x.copy(), contacts.used.copy(), contacts.contact.copy()
+        left, begun, tries = rows, solver.used.copy(), np.zeros(n, np.int64)
+        trouble = np.zeros_like(engine.trouble)  # of the last try that failed
+        moved = np.broadcast_to(longest_move(engine.poses_before, engine.poses, engine.surfaces.sphere), n)
+        aim = np.ones(n)
+        while len(left):
+            last, aim = aim, np.minimum(done + length, 1.0)
+            # what was clear of the obstacles was so where they were in the try before
+            elsewhere = left[(aim != last)[left]]
+            engine.clearance.distance[elsewhere] -= moved[elsewhere, None]
+            ports = self.end if start is None or (aim[left] >= 1.0).all() else blended(start, self.end, aim)
+            motion = engine.motion(self.shape, self.tolerance, done, aim)
+            rest, unheld = self._settle(left, ports, motion)
+            wanders = (engine.trouble["cause"] == MOVES) & (
+                engine.trouble["distance"] < _WANDERS * engine.rods.length
+            )
+            given_up = (length <= _HARD) | unheld | engine.whole_worlds(wanders)
+            hard = left[(~rest & given_up & (tries < _DAMPED_TRIES))[left]]
+            if len(hard):  # no equilibrium near: let it go to the next one, downhill
+                tries[hard] += 1
+                solver.x[hard], contacts.used[hard], contacts.contact[hard] = (
+                    x[hard],
+                    used[hard],
+                    contact[hard],
+                )
+                damped = engine.motion(self.shape, self.tolerance, done, aim)
+                rest |= self._descend(hard, ports, damped, tries)
+            good, bad = left[rest[left]], left[~rest[left]]
+            trouble[bad] = engine.trouble[bad]
+            done[good] = aim[good]
+            arrived[good] = done[good] >= 1.0
+            if len(halfway := good[~arrived[good]]):
+                engine.accept(halfway, self.shape, between_steps=True)
+            x[good], used[good], contact[good] = solver.x[good], contacts.used[good], contacts.contact[good]
+            solver.x[bad], contacts.used[bad], contacts.contact[bad] = x[bad], used[bad], contact[bad]
+            length[good] *= 2.0
+            length[bad] *= 0.5
+            if start is None:
+                break
+            spent = solver.used[left] - begun[left]
+            left = left[~arrived[left] & (length[left] >= _SMALLEST_FRACTION) & (spent < most)]
+        engine.trouble[rows] = trouble[rows]
+        short = rows[~arrived[rows]]
+        engine.clearance.distance[short] -= moved[short, None]
+        lost = rows[~arrived[rows] & engine.tracked[rows]]
+        if len(lost) and engine.before is not None:
+            for now, then in zip(self.shape, engine.before, strict=True):
+                now[lost] = then[lost]
+        return arrived, done
+
+    def _settle(self, rows: Ints, ports: Ports, motion: ContactMotion) -> tuple[Flags, Flags]:
+        """Pass and law in turn on these inputs; (n_robots,) which came to rest, and which were given up as no
+        forces hold them."""
+        engine, trouble, rods = self.engine, self.engine.trouble, self.engine.rods
+        rest = np.zeros(len(trouble), bool)
+        unsolved, inside = (np.zeros(len(rest), np.int64) for _ in range(2))
+        progress, still = Progress(len(rest)), rows
+        for count in range(_LONGEST * _MOST_ITERATIONS):
+            status = self._iterate_all(still, ports, motion)
+            rest[still[status == AT_REST]] = True
+            unsolved[still] = np.where(trouble["cause"][still] == UNSOLVED, unsolved[still] + 1, 0)
+            deep = engine.tracked[still] & (
+                engine.clearance.gap[still] < -rods.radius[still].max(1) - _NEARLY * rods.length[still]
+            )
+            inside[still] = np.where(deep, inside[still] + 1, 0)
+            hopeless = (inside >= _MOST_INSIDE) | (unsolved >= _UNSOLVED)
+            progress.note(still, trouble["from_rest"][still])
+            if count >= _MOST_ITERATIONS - 1:  # go on with what comes closer to rest
+                hopeless |= progress.idle >= _IDLE
+            still = still[(status != AT_REST) & (status != LOST) & ~engine.whole_worlds(hopeless)[still]]
+            if not len(still):
+                break
+        self._count_contacts(rows[~rest[rows]], ports)
+        return rest, unsolved >= _UNSOLVED
+
+    def _descend(self, rows: Ints, ports: Ports, motion: ContactMotion, tries: Ints) -> Flags:
+        """The same where no equilibrium is near, damped: down in energy to one, in iterations that go through
+        nothing; (n_robots,) which came to rest. One that goes through something, or finds no forces, is taken
+        back; `tries` counts this one."""
+        engine, solver, contacts, n = (
+            self.engine,
+            self.solver,
+            self.engine.contact_set,
+            len(self.engine.tracked),
+        )
+        rest, still, trouble = np.zeros(n, bool), rows, engine.trouble
+        progress, damping = Progress(n), Damping(motion.damping, rows, tries)
+        frames = np.broadcast_to(motion.frames, (n, *motion.frames.shape[1:]))
+        frames_before = np.array(np.broadcast_to(motion.frames_before, frames.shape))
+        before = [
+            np.array(motion.position_before),
+            np.array(motion.rotation_before),
+            np.array(motion.curvature_before),
+            np.array(motion.arclength_before),
+        ]
+        motion = motion._replace(
+            frames_before=frames_before,
+            position_before=before[0],
+            rotation_before=before[1],
+            curvature_before=before[2],
+            arclength_before=before[3],
+        )
+        x, used, contact = solver.x.copy(), contacts.used.copy(), contacts.contact.copy()
+        for count in range(_LONGEST * _MOST_DAMPED):
+            here = solver.x[still].copy(), contacts.used[still].copy(), contacts.contact[still].copy()
+            status = self._iterate_all(still, ports, motion)
+            rest[still[status == AT_REST]] = True
+            away, on = still[status == BACK], still[status != BACK]
+            solver.x[away], contacts.used[away], contacts.contact[away] = x[away], used[away], contact[away]
+            x[on], used[on], contact[on] = (a[status != BACK] for a in here)
+            for last, now in zip(before, self.shape[:4], strict=True):
+                last[on] = now[on]
+            frames_before[on] = frames[on]
+            progress.note(on, trouble["from_rest"][on])
+            damping.note(on, trouble["from_rest"][on])
+            damping.refuse(away)
+            hopeless = damping.refused >= _MOST_REFUSED
+            hopeless[away] |= used[away] == 0  # what touches nothing is not damped
+            if count >= _MOST_DAMPED - 1:
+                hopeless |= progress.idle >= 2 * _IDLE
+            still = still[(status != AT_REST) & (status != LOST) & ~engine.whole_worlds(hopeless)[still]]
+            if not len(still):
+                break
+        self._count_contacts(rows[~rest[rows]], ports)
+        return rest
+
+    def _iterate_all(self, rows: Ints, ports: Ports, motion: ContactMotion) -> Ints:
+        """One pass and one round of the law for the worlds of `rows`; their status."""
+        status = np.zeros(len(rows), np.int64)
+        for block, n_loads in self._blocks(rows):
+            status[block] = self._iterate(rows[block], n_loads, ports, motion)
+        return status
+
+    def _blocks(self, rows: Ints) -> Iterator[tuple[Ints, int]]:
+        """Rows of worlds that are solved together, and the contacts that each has room for: worlds with as
+        many contacts go together."""
+        engine = self.engine
+        most = np.zeros(engine.world.max() + 1, np.int64)
+        np.maximum.at(most, engine.world[rows], engine.contact_set.used[rows])
+        room = np.minimum(
+            2 ** np.ceil(np.log2(np.maximum(most[engine.world[rows]], 1))).astype(np.int64),
+            engine.scene.max_contacts,
+        )
+        for n_loads in np.unique(room):
+            members = np.flatnonzero(room == n_loads)
+            members = members[np.argsort(engine.world[rows[members]], kind="stable")]
+            starts = np.flatnonzero(np.diff(engine.world[rows[members]], prepend=-1))
+            cuts = np.unique(np.searchsorted(starts, np.arange(_BLOCK, len(members), _BLOCK)))
+            for block in np.split(members, starts[cuts[cuts < len(starts)]]):
+                yield block, int(n_loads)
+
+    def _iterate(self, rows: Ints, n_loads: int, ports: Ports, motion: ContactMotion) -> Ints:
+        """One pass and one round of the law for these rows, world by world; their status."""
+        engine, n, n_x = self.engine, len(rows), self.solver.x.shape[1]
+        loads = empty_loads(n, n_loads, n_x)
+        self.solver.run_loaded(rows, engine.arranged(rows, ports, loads), self.shape, loads)
+        start = np.append(np.flatnonzero(np.diff(engine.world[rows], prepend=-1)), n)
+        threads = engine.thread_count(len(start) - 1)
+        contacts = engine.contact_set
+        problem = contact_problem(threads, int(np.diff(start).max()), n_loads, n_x, contacts.contact.shape[1])
+        search = search_work(threads, self.shape.arclength.shape[1])
+        used, contact = contacts.used[rows], contacts.contact[rows, :n_loads]
+        homeless = (loads.node < 0) & (np.arange(n_loads) < used[:, None])
+        status = np.zeros(n, np.int64)
+        each = ContactRows(start, rows, status, engine.trouble, self.solver.x)
+        body = iterate_serial if threads == 1 else iterate_parallel
+        body(each, engine.rods, engine.surfaces, motion, contacts, loads, problem, search)
+        for r in np.flatnonzero(homeless.any(1)):  # more contacts than nodes: one without has not been felt
+            c = contact[r, homeless[r].argmax()]
+            far = engine.trouble["from_rest"][rows[r]]
+            engine.trouble[rows[r]] = NO_NODE_LEFT, c.obstacle, c.arclength, 0.0, far
+            status[r] = LOST if status[r] == LOST else GOES_ON
+        return status
+
+    def _count_contacts(self, rows: Ints, ports: Ports) -> None:
+        """Say of robots that stay inside of something whether they lack contacts, or nodes to put them on."""
+        engine, contacts = self.engine, self.engine.contact_set
+        for i in rows[engine.trouble["cause"][rows] == INSIDE]:
+            ends = np.cumsum(
+                engine.length[i if len(engine.length) > 1 else 0]
+                + ports.extension[i if len(ports.extension) > 1 else 0]
+            )
+            used = contacts.contact["arclength"][i, : contacts.used[i]]
+            here = np.searchsorted(ends[:-1], engine.trouble["arclength"][i], side="right")
+            if (np.searchsorted(ends[:-1], used, side="right") == here).sum() >= engine.rods.n_steps - 1:
+                engine.trouble["cause"][i] = NO_NODE_LEFT
+            elif len(used) >= contacts.contact.shape[1]:
+                engine.trouble["cause"][i] = NO_CONTACT_LEFT
+
+
+def empty_loads(n_rows: int, n_loads: int, n_x: int) -> PointLoads:
+    """Room for the contact points of a pass."""
+    n = 3 * n_loads
+    return PointLoads(
+        np.full((n_rows, n_loads), -1),
+        np.zeros((n_rows, n_loads, 3)),
+        np.zeros((n_rows, n_loads, 3)),
+        np.zeros((n_rows, n, 1 + n)),
+        np.zeros((n_rows, n_x, 1 + n)),
+    )

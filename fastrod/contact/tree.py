@@ -48,7 +48,7 @@ def pack(obstacles: Sequence[Obstacle]) -> Surfaces:
         friction=np.array([o.friction for o in obstacles], float),
         compliance=np.array([1.0 / o.stiffness for o in obstacles], float),
         body=np.arange(len(obstacles)),
-        give=np.zeros((len(obstacles), 13)),
+        mobility=np.zeros((len(obstacles), 13)),
         root=np.array(roots, np.int64),
         box=np.concatenate(boxes),
         link=np.concatenate(links),

@@ -9,10 +9,11 @@ import numpy as np
 from numba import prange
 
 from fastrod.types import (
-    Clearance,
+    ContactMotion,
+    ContactProblem,
     ContactRods,
+    ContactRows,
     ContactSet,
-    Flags,
     Floats,
     Ints,
     Layout,
@@ -20,17 +21,17 @@ from fastrod.types import (
     Params,
     PointLoads,
     Ports,
+    Records,
     Response,
     RodShape,
+    SearchWork,
     Surfaces,
 )
 
 from .contact.bvh import STACK
-from .contact.contact_set import T_ARM, T_FORCE, T_N, T_S
-from .contact.iteration import iterate_world, look_at
+from .contact.iteration import ContactIteration, iterate_worlds, search_robots
 from .contact.node_placement import place_nodes
-from .contact.problem import SceneArrays
-from .contact.rod_proximity import search_rods
+from .contact.rod_proximity import RodSearch, search_rods
 from .contact.surface import ray_hit
 from .jit import LANES, entry, parallel_entry
 from .rod.chunk import Batch, Chunk, Mode, Output, pass_chunk
@@ -69,71 +70,20 @@ def _pass(
 
 
 def _iterate(
-    worlds: Ints,
-    rows: Ints,
+    rows: ContactRows,
     rods: ContactRods,
     surfaces: Surfaces,
-    frames: Floats,
-    frames_before: Floats,
-    frames_slip: Floats,
-    shape: RodShape,
-    before: RodShape,
-    before_slip: RodShape,
-    tracked: Flags,
-    slides: Flags,
-    tolerance: float,
-    margin: float,
-    damping: Floats,
-    touching: ContactSet,
-    clearance: Clearance,
-    probes: PointLoads,
-    memory: Memory,
-    proposed: Floats,
-    unknown: Floats,
-    gap: Floats,
-    trouble: Floats,
-    status: Ints,
-    scratch: Floats,
+    motion: ContactMotion,
+    contacts: ContactSet,
+    loads: PointLoads,
+    problem: ContactProblem,
+    search: SearchWork,
 ) -> None:
-    """One contact iteration (`iterate_world`) of the worlds whose rows begin at worlds[0], worlds[1], ...;
-    the last entry is the end.
-
-    The fields of the `SceneArrays` come one by one, for numba hands no tuple of tuples to threads.
-    """
-    n_parts = scratch.shape[0]
-    for part in prange(n_parts):
-        for k in range(part, len(worlds) - 1, n_parts):
-            scenery = SceneArrays(
-                rods,
-                surfaces,
-                frames,
-                frames_before,
-                frames_slip,
-                shape,
-                before,
-                before_slip,
-                tracked,
-                slides,
-                tolerance,
-                margin,
-                damping,
-            )
-            iterate_world(
-                worlds[k],
-                worlds[k + 1],
-                rows,
-                scenery,
-                touching,
-                clearance,
-                probes,
-                memory,
-                proposed,
-                unknown,
-                gap,
-                trouble,
-                status,
-                scratch[part],
-            )
+    """One contact iteration of every world (`iterate_worlds`), on as many threads as there are workspaces."""
+    for thread in prange(len(problem.first_point)):
+        iterate_worlds(
+            thread, ContactIteration(rows, rods, surfaces, motion, contacts, loads, problem, search)
+        )
 
 
 @entry
@@ -149,82 +99,50 @@ def place_all(s: Floats, starts: Floats, n_steps: int, grid: Floats, node: Ints)
 @entry
 def arrange(
     rows: Ints,
-    touching: ContactSet,
+    contacts: ContactSet,
     s_given: Floats,
     starts: Floats,
     n_steps: int,
     grid: Floats,
     node_given: Ints,
-    probes: PointLoads,
+    loads: PointLoads,
 ) -> bool:
     """Put a node under every contact of these robots, and under the point forces that were given (arclengths
-    `s_given` (n_robots, m)); fills the loads of `probes`. False where a segment has more of them than
-    nodes."""
-    m, n_slots = s_given.shape[1], probes.node.shape[1]
-    s, node, work = np.empty(m + n_slots), np.empty(m + n_slots, np.int64), np.empty(m + n_slots)
+    `s_given` (n_robots, m)); fills the point loads of the contacts. False where a segment has more of them
+    than nodes."""
+    m, n_loads = s_given.shape[1], loads.node.shape[1]
+    s, node, work = np.empty(m + n_loads), np.empty(m + n_loads, np.int64), np.empty(m + n_loads)
     fits = True
     for r in range(len(rows)):
         i = rows[r]
+        used, contact = contacts.used[i], contacts.contact[i]
         for q in range(m):
             s[q] = s_given[i, q]
-        for q in range(n_slots):
-            s[m + q] = touching.slot[i, q, T_S] if q < touching.used[i] else np.nan
+        for q in range(n_loads):
+            s[m + q] = contact[q].arclength if q < used else np.nan
         fits = place_nodes(s, starts[i if len(starts) > 1 else 0], n_steps, grid[i], node, work) and fits
         for q in range(m):
             node_given[i, q] = node[q]
-        for q in range(n_slots):
-            probes.node[r, q] = node[m + q]
+        for q in range(n_loads):
+            loads.node[r, q] = node[m + q]
             for a in range(3):
-                taken = q < touching.used[i]
-                probes.force[r, q, a] = touching.slot[i, q, T_FORCE + a] if taken else 0.0
-                probes.arm[r, q, a] = (
-                    -touching.slot[i, q, T_ARM] * touching.slot[i, q, T_N + a] if taken else 0.0
-                )
+                loads.force[r, q, a] = contact[q].force[a] if q < used else 0.0
+                loads.arm[r, q, a] = -contact[q].arm * contact[q].normal[a] if q < used else 0.0
     return fits
 
 
-def _look(
+def _search(
     rows: Ints,
     rods: ContactRods,
     surfaces: Surfaces,
-    frames: Floats,
-    frames_before: Floats,
-    frames_slip: Floats,
-    shape: RodShape,
-    before: RodShape,
-    before_slip: RodShape,
-    tracked: Flags,
-    slides: Flags,
-    tolerance: float,
-    margin: float,
-    damping: Floats,
-    clearance: Clearance,
-    gap: Floats,
-    found: Floats,
+    motion: ContactMotion,
+    found: Records,
     n_found: Ints,
-    scratch: Floats,
+    work: SearchWork,
 ) -> None:
-    """`look_at` of each robot: its smallest gap and, in row order, its candidates for contact."""
-    n_parts = scratch.shape[0]
-    for part in prange(n_parts):
-        for r in range(part, len(rows), n_parts):
-            i = rows[r]
-            scenery = SceneArrays(
-                rods,
-                surfaces,
-                frames,
-                frames_before,
-                frames_slip,
-                shape,
-                before,
-                before_slip,
-                tracked,
-                slides,
-                tolerance,
-                margin,
-                damping,
-            )
-            n_found[r], gap[i] = look_at(i, scenery, clearance, found[r], scratch[part])
+    """Smallest gap of each robot and, in row order, its candidates for contact (`search_robots`)."""
+    for thread in prange(len(work.known)):
+        search_robots(thread, rows, rods, surfaces, motion, found, n_found, work)
 
 
 @entry
@@ -257,21 +175,10 @@ def cast_rays(
 
 
 @entry
-def look_at_rods(worlds: Ints, rows: Ints, scenery: SceneArrays, touching: ContactSet, gap: Floats) -> None:
+def search_worlds(rows: ContactRows, search: RodSearch) -> None:
     """Lower each robot's smallest gap to that between rods (`search_rods`)."""
-    for k in range(len(worlds) - 1):
-        search_rods(
-            worlds[k],
-            worlds[k + 1],
-            rows,
-            scenery.shape,
-            scenery.rods,
-            touching,
-            len(scenery.surfaces.kind),
-            0.0,
-            gap,
-            False,
-        )
+    for k in range(len(rows.start) - 1):
+        search_rods(rows.start[k], rows.start[k + 1], rows.robot, search, False)
 
 
 def _named(body: Callable[..., None], name: str) -> Callable[..., None]:
@@ -286,5 +193,5 @@ pass_serial = entry(_named(_pass, "pass_serial"))
 pass_parallel = parallel_entry(_named(_pass, "pass_parallel"))
 iterate_serial = entry(_named(_iterate, "iterate_serial"))
 iterate_parallel = parallel_entry(_named(_iterate, "iterate_parallel"))
-look_serial = entry(_named(_look, "look_serial"))
-look_parallel = parallel_entry(_named(_look, "look_parallel"))
+search_serial = entry(_named(_search, "search_serial"))
+search_parallel = parallel_entry(_named(_search, "search_parallel"))

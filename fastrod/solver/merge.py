@@ -10,7 +10,7 @@ import numpy as np
 
 from fastrod.contact.engine import ContactSnapshot, Engine
 from fastrod.solver.state import State
-from fastrod.types import Clearance, ContactSet, Flags, Ints, Ports, RodShape
+from fastrod.types import Flags, Ints, Ports, RodShape
 
 Arrays = TypeVar("Arrays", bound=tuple[Any, ...])
 
@@ -41,14 +41,11 @@ def merge_shape(now: RodShape, then: State, rows: Flags) -> RodShape:
 def restore_contact(engine: Engine, then: ContactSnapshot, rows: Flags) -> None:
     """Put the robots `rows` of an engine back: their contacts, where they were, and the obstacles around
     them."""
-    engine.touching = merge_arrays(engine.touching, ContactSet(*then.touching), rows)
-    engine.clearance = merge_arrays(engine.clearance, Clearance(*then.clearance), rows)
+    engine.contact_set = merge_arrays(engine.contact_set, then.contact_set, rows)
+    engine.clearance = merge_arrays(engine.clearance, then.clearance, rows)
     if engine.before is not None and then.before is not None:
         engine.before = merge_arrays(engine.before, then.before, rows)
-    engine.tracked, engine.gap = (
-        np.where(rows, then.tracked, engine.tracked),
-        np.where(rows, then.gap, engine.gap),
-    )
+    engine.tracked = np.where(rows, then.tracked, engine.tracked)
     engine.poses = merge_rows(engine.poses, then.poses, rows)
     engine.poses_before = merge_rows(engine.poses_before, then.poses_before, rows)
     engine.at_last_step = (engine.before, engine.poses_before)

@@ -10,11 +10,13 @@ import numpy as np
 
 from fastrod.solver.boundary import BoundarySolver
 from fastrod.solver.guess import cold_start
-from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports
+from fastrod.types import Flags, Floats, Ints, Layout, Params, Ports, RodShape
 
 Pass: TypeAlias = Callable[[Ints, Ports], Floats]
 """(robots, ports) -> residual of these robots at the x before the update [m]."""
 
+LOST = 0.1
+"""Of the robot's length: a residual beyond it is no shape of this robot."""
 _MAX_ITERATIONS = 40
 _FREE_ITERATIONS = (
     20  # robots with tendons that can go slack: semi-smooth Newton first, monotone only after that
@@ -69,6 +71,22 @@ def settle(
             boundary.x[left] = x
     passes[left] = -1
     return passes
+
+
+def frozen_noise(boundary: BoundarySolver) -> float:
+    """Residual variance of a pass on frozen inputs [m^2]: none but rounding, more where the paper's residuals
+    contradict each other."""
+    return 1e-10 if boundary.layout.paper else 1e-20
+
+
+def frozen_pass(boundary: BoundarySolver, shape: RodShape) -> Pass:
+    """Passes on frozen inputs that write into `shape`, and return the residuals of their rows."""
+
+    def run(rows: Ints, ports: Ports) -> Floats:
+        boundary.run(rows, ports, shape, noise=frozen_noise(boundary))
+        return boundary.collect(shape, "residual").residual[rows]
+
+    return run
 
 
 def load_parameter(rows: Ints, params: Params, ports: Ports) -> Floats:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fastrod.contact.engine import Engine
+from fastrod.contact.step import empty_loads
 from fastrod.effects.pipeline import EffectPipeline
 from fastrod.errors import InputError, Problem, ProblemSentence, RobotError, shown
 from fastrod.model.compile import compile_robots
@@ -32,7 +33,7 @@ from fastrod.solver.merge import (
 )
 from fastrod.solver.recovery import Boundary, overloaded, unstable, what_to_do
 from fastrod.solver.response import Linear, stretch
-from fastrod.solver.settle import Pass, settle
+from fastrod.solver.settle import LOST, Pass, frozen_pass, settle
 from fastrod.solver.state import Observer, Snapshot, State, check_snapshot, copied
 from fastrod.types import Flags, Floats, Ints, Params, Ports, RodShape
 
@@ -47,7 +48,6 @@ _ALONG = (
     "path_length",
     "base_wrench",
 )
-LOST = 0.1  # of the robot's length: a residual beyond it is no shape of this robot
 DIVERGED = "the observer diverged, and no shape was found on these inputs"
 _UNSTABLE = "the shape that balances its loads is an unstable one"
 
@@ -185,12 +185,7 @@ class Statics:
 
     def _into(self, shape: RodShape) -> Pass:
         """Passes on frozen inputs that write into `shape`."""
-
-        def run(rows: Ints, ports: Ports) -> Floats:
-            self._passes.run(rows, ports, shape, noise=1e-10 if self._layout.paper else 1e-20)
-            return self._passes.collect(shape, "residual").residual[rows]
-
-        return run
+        return frozen_pass(self._passes, shape)
 
     def reset(self, rows: ArrayLike | None = None) -> None:
         """Forget the boundary of these robots (all by default): their next step begins from the cold guess,
@@ -363,7 +358,9 @@ class Statics:
         rows = np.flatnonzero(self._warm)
         if self._felt is None:
             return Linear(self._passes, rows, ports)
-        return Linear(self._passes, rows, *self._felt.held(rows, ports, self._passes.n_x))
+        most = int(self._felt.contact_set.used[rows].max(initial=0))
+        loads = empty_loads(len(rows), most + 1, self._passes.n_x)
+        return Linear(self._passes, rows, self._felt.held(rows, ports, loads), loads)
 
     def _relocated(self, extension: Floats) -> dict[str, Floats]:
         """The loads at other extensions: point forces stay at their arclength, so nodes and samples move over
@@ -400,7 +397,9 @@ class Statics:
         """Note who is not ok, so that nothing continues on NaN, and hand out the state. What a pass wrote of
         the robots `lost` is no shape of theirs: they keep the one before."""
         problems = dict(self._reader.problems)
-        solved = ok if self._felt is None else ok & ~self._felt.led  # what touches something is held by it
+        solved = (
+            ok if self._felt is None else ok & ~self._felt.continued
+        )  # what touches something is held by it
         if len(fallen := unstable(self._passes, ports, shape, np.flatnonzero(solved))):
             ok, passes, self._derived = ok.copy(), np.array(passes), None
             ok[fallen], passes[fallen] = False, -1

@@ -10,7 +10,7 @@ import pytest
 from numba import njit
 from numpy.testing import assert_allclose
 
-from fastrod.kernels.contact.contact_law import contact_forces, law_size
+from fastrod.kernels.contact.contact_law import ContactLaw, contact_forces
 
 GOOD = 5e-9
 """m; the law is solved to 1e-10 m in its own measure, motions of some mm; conditions add up several of
@@ -18,10 +18,13 @@ these."""
 
 
 @njit()
-def _solve_all(W, b, friction, compliance, force, agreed, work):
+def _solve_all(W, b, friction, compliance, force, agreed):
     m = friction.shape[1]
+    state, along, start = np.empty(m, np.int64), np.empty((m, 2)), np.empty(3 * m)
+    system = np.empty((3 * m, 3 * m + 1))
     for i in range(len(W)):
-        agreed[i] = 1 if contact_forces(m, W[i], b[i], friction[i], compliance[i], force[i], work) else 0
+        law = ContactLaw(W[i], b[i], friction[i], compliance[i], force[i], state, along, start, system)
+        agreed[i] = 1 if contact_forces(m, law) else 0
 
 
 def solve(W, b, friction=0.0, compliance=0.0, start=None):
@@ -33,7 +36,7 @@ def solve(W, b, friction=0.0, compliance=0.0, start=None):
         np.array(np.broadcast_to(a, (n, m)), float, order="C") for a in (friction, compliance)
     )
     W, b = (np.array(a, float, order="C") for a in (W, b))
-    _solve_all(W, b, friction, compliance, force, agreed, np.empty(law_size(m)))
+    _solve_all(W, b, friction, compliance, force, agreed)
     return force, agreed == 1
 
 

@@ -89,7 +89,7 @@ def test_mobility_is_that_of_a_rigid_body(seed):
                     place[e] - g[10:]
                 )
                 expected[3 * c : 3 * c + 3, 3 * e : 3 * e + 3] += axes[c] @ block @ axes[e].T
-    add_mobility(m, touched, place.ravel(), axes.ravel(), body, give, W)
+    add_mobility(m, touched, place, axes, body, give, W)
     np.testing.assert_allclose(W, expected, atol=1e-12)
 
 

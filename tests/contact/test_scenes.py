@@ -22,7 +22,7 @@ def test_no_scene_is_deeper_than_it_says(scenes, seed, index, rows):
     """A slice of `perf/contact_scenes.py`: whoever is ok is outside, and whoever is not says what is
     stuck."""
     batch = scenes.make_batch(seed, index)
-    played = scenes.play(batch, rows, max_passes=40)
+    played = scenes.play(batch, rows, max_iterations=40)
     assert played.touching.any() or played.sentences
     assert (
         np.nanmax(np.where(played.ok, played.depth, np.nan)) < 3e-5

@@ -13,16 +13,23 @@ import fastrod
 from fastrod.contact import ContactScene, box, mesh, plane, sphere
 from fastrod.contact.frames import frames_of
 from fastrod.contact.tree import pack
-from fastrod.kernels.contact.bvh import STACK
 from fastrod.kernels.contact.centreline import Curve
-from fastrod.kernels.contact.proximity import CANDIDATE, UNSEEN, ProximityOptions, search_obstacles
+from fastrod.kernels.contact.proximity import (
+    UNSEEN,
+    ProximityOptions,
+    ProximitySearch,
+    search_obstacles,
+    search_work,
+    thread_search_work,
+)
+from fastrod.types import CANDIDATE
 
 
 @njit()
-def _search(curve, sweep, surfaces, frames, found):
-    n = len(curve.arclength)
-    distance, position, work = np.full(n, -np.inf), np.zeros((n, 3)), np.empty(4 * n + 4 * STACK)
-    return search_obstacles(curve, sweep, surfaces, frames, distance, position, work, found)
+def _search(curve, options, surfaces, frames, distance, position, work, found):
+    return search_obstacles(
+        ProximitySearch(curve, options, surfaces, frames, distance, position, work, found)
+    )
 
 
 @pytest.mark.parametrize("nearest", [False, True])
@@ -44,19 +51,26 @@ def test_every_dip_of_an_interval_is_found(scenes, radius, nearest):
             ball.apply_translation([radius + 0.002 - d, 0.0, z])
         obstacle = mesh(trimesh.util.concatenate(balls))
         phi = scenes.distances(obstacle, np.array([0.0, 0, 0, 1, 0, 0, 0]), line)
-        found = np.zeros((64, CANDIDATE))
-        sweep = ProximityOptions(np.array([radius]), 2, 0.0, 1e-3, 1e-3, nearest)
+        found = np.zeros(64, CANDIDATE)
+        options = ProximityOptions(np.array([radius]), 2, 0.0, 1e-3, 1e-3, nearest)
         count, gap = _search(
-            curve, sweep, pack([obstacle]), frames_of(np.array([[[0.0, 0, 0, 1, 0, 0, 0]]]))[0], found
+            curve,
+            options,
+            pack([obstacle]),
+            frames_of(np.array([[[0.0, 0, 0, 1, 0, 0, 0]]]))[0],
+            np.full(len(s), -np.inf),
+            np.zeros((len(s), 3)),
+            thread_search_work(search_work(1, len(s)), 0),
+            found,
         )
         assert gap <= phi.min() - radius + UNSEEN
         dips = 1 + np.flatnonzero(
             (phi[1:-1] < phi[:-2]) & (phi[1:-1] <= phi[2:]) & (phi[1:-1] < radius - UNSEEN)
         )
         for k in dips if not nearest else []:
-            near = np.abs(found[:count, 1] - dense[k]) < 1e-3
+            near = np.abs(found["arclength"][:count] - dense[k]) < 1e-3
             assert near.any(), (at, depth, dense[k])
-            assert found[:count, 2][near].min() <= phi[k] - radius + 1e-8
+            assert found["gap"][:count][near].min() <= phi[k] - radius + 1e-8
         hidden += len(dips)
     assert hidden > 20
 
@@ -96,7 +110,7 @@ def test_the_curve_of_contact_is_the_shape():
 def test_what_is_stuck_is_said(obstacle, points, words):
     """An obstacle comes down on the whole rod in one step: it is not gone through, and one sentence says
     what, where, and what to do."""
-    scene = ContactScene(obstacles=[obstacle], rod_radius=0.004, max_passes=60)
+    scene = ContactScene(obstacles=[obstacle], rod_radius=0.004, max_iterations=60)
     sim = fastrod.Simulator(prototype(1e-5), points_per_segment=points, contact=scene)
     sim.step(bent(1.0))
     q = obstacle.quaternion

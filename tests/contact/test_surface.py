@@ -16,6 +16,7 @@ from fastrod.contact.geometry import Obstacle, box, capsule, cylinder, mesh, pla
 from fastrod.contact.tree import pack
 from fastrod.kernels.contact.bvh import FAR, LEAF_CODE, STACK
 from fastrod.kernels.contact.surface import MOST_PLANES, ray_hit, signed_distance, surface_curvature, walls
+from fastrod.types import WALL
 
 SAME = 1e-9  # m; two paths in double precision on 0.1 m
 SOLIDS = {
@@ -58,15 +59,12 @@ def _rays(k, frame, points, directions, longest, surfaces, out):
 
 
 @njit()
-def _walls(k, frame, points, reach, surfaces, count, out):
-    stack, found = np.empty(2 * STACK), np.empty(5 * MOST_PLANES)
+def _walls(k, frame, points, reach, surfaces, count, found):
+    stack = np.empty(2 * STACK)
     for i in range(len(points)):
         p = (points[i, 0], points[i, 1], points[i, 2])
-        count[i] = walls(
-            k, frame, p, reach, signed_distance(k, frame, p, FAR, surfaces, stack)[0], surfaces, stack, found
-        )
-        for j in range(5 * count[i]):
-            out[i, j] = found[j]
+        nearest = signed_distance(k, frame, p, FAR, surfaces, stack)[0]
+        count[i] = walls(k, frame, p, reach, nearest, surfaces, stack, found[i])
 
 
 @njit()
@@ -117,11 +115,11 @@ class Seen:
 
     def walls(self, points, reach):
         """For each point its walls, (distance, normal) by distance."""
-        count, out = np.zeros(len(points), np.int64), np.empty((len(points), 5 * MOST_PLANES))
-        _walls(1, self.frame, np.ascontiguousarray(points), reach, self.surfaces, count, out)
+        count, found = np.zeros(len(points), np.int64), np.empty((len(points), MOST_PLANES), WALL)
+        _walls(1, self.frame, np.ascontiguousarray(points), reach, self.surfaces, count, found)
         return [
-            sorted((row[5 * j], *row[5 * j + 1 : 5 * j + 4]) for j in range(n))
-            for n, row in zip(count, out, strict=True)
+            sorted((wall.distance, *wall.normal) for wall in row[:n])
+            for n, row in zip(count, found, strict=True)
         ]
 
     def second_derivative(self, points):

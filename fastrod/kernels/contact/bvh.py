@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from fastrod.types import Floats, Surfaces
+from fastrod.types import Floats, Records, Surfaces
 
 from ..jit import inline, kernel
 from ..vec import Vec, axpy, cross, dot, sub
@@ -21,6 +21,14 @@ LEAF_CODE = 8
 STACK = 64  # links that wait: one for each level of the hierarchy
 FAR = 1e300
 Numbers = Any  # one-dimensional float64 scratch; numba's types are not mypy's
+Record = Any  # one element of a record array: its fields are attributes
+
+
+@inline
+def normal_of(record: Record) -> Vec:
+    """Unit normal of a contact, a candidate or a wall."""
+    n = record.normal
+    return n[0], n[1], n[2]
 
 
 @inline
@@ -127,45 +135,38 @@ def signed_triangle(
 
 
 @kernel
-def _keep_plane(d: float, normal: Vec, t: int, found: Numbers, n_found: int, most: int) -> int:
+def _keep_plane(d: float, normal: Vec, t: int, found: Records, n_found: int) -> int:
     """Note a plane, in place of one with the same normal or of the farthest that is farther; returns how many
     there are."""
     at, farthest = n_found, -1.0
     for j in range(n_found):
-        if dot(normal, (found[5 * j + 1], found[5 * j + 2], found[5 * j + 3])) > 0.99999:
-            at, farthest = j, found[5 * j]
+        if dot(normal, normal_of(found[j])) > 0.99999:
+            at, farthest = j, found[j].distance
             break
-        if n_found == most and found[5 * j] > farthest:
-            at, farthest = j, found[5 * j]
+        if n_found == len(found) and found[j].distance > farthest:
+            at, farthest = j, found[j].distance
     if at < n_found and farthest <= d:
         return n_found
-    found[5 * at], found[5 * at + 4] = d, float(t)
-    found[5 * at + 1], found[5 * at + 2], found[5 * at + 3] = normal
+    wall = found[at]
+    wall.distance, wall.triangle = d, t
+    wall.normal[0], wall.normal[1], wall.normal[2] = normal
     return max(n_found, at + 1)
 
 
 @kernel
 def facing_planes(
-    p: Vec,
-    reach: float,
-    nearest: float,
-    root: int,
-    surfaces: Surfaces,
-    stack: Numbers,
-    found: Numbers,
-    most: int,
+    p: Vec, limit: float, nearest: float, root: int, surfaces: Surfaces, stack: Numbers, found: Records
 ) -> int:
-    """Faces that p is in front of, closer than `reach`: the walls of a concave corner.
+    """Faces that p is in front of, closer than `limit`: the walls of a concave corner.
 
     p projects inside them, or their planes are no nearer than the surface itself, which is `nearest`: around
     a concave edge each plane bounds the free side on both, around a convex one p beyond a face is nearer to
     its plane.
 
-    Writes distance, normal and triangle of the `most` nearest with different normals to `found` (5 numbers
-    each); returns how many.
+    Writes the nearest with different normals, as many as there is room for, to `found`; returns how many.
     """
     n_found = 0
-    limit = reach * reach
+    square = limit * limit
     stack[0] = float(root)
     n = 1
     while n > 0:
@@ -174,7 +175,7 @@ def facing_planes(
         if link >= 0:
             box = surfaces.box[link]
             for side in range(2):
-                if _box_distance(p, box, 6 * side) < limit:
+                if _box_distance(p, box, 6 * side) < square:
                     stack[n] = float(surfaces.link[link, side])
                     n += 1
             continue
@@ -184,13 +185,13 @@ def facing_planes(
             row = surfaces.normal[t, 0]
             normal = (row[0], row[1], row[2])
             d = dot(sub(p, a), normal)
-            if d < 0.0 or d >= reach:
+            if d < 0.0 or d >= limit:
                 continue
             q, feature = closest_on_triangle(p, a, corner(surfaces, t, 1), corner(surfaces, t, 2))
             e = sub(p, q)
-            if dot(e, e) >= limit or (feature != 0 and d < nearest - 1e-9):
+            if dot(e, e) >= square or (feature != 0 and d < nearest - 1e-9):
                 continue
-            n_found = _keep_plane(d, normal, t, found, n_found, most)
+            n_found = _keep_plane(d, normal, t, found, n_found)
     return n_found
 
 

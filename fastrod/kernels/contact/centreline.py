@@ -1,14 +1,14 @@
 """Between the nodes of one robot's shape: cubic Hermite curves through positions and tangents, and through
 rotations.
 
-`Curve` is one robot's rows of a `RodShape`. The error is of fourth order in the spacing, as the integrator's.
+`Curve` is one robot's rows of a shape. The error is of fourth order in the spacing, as the integrator's.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from fastrod.types import Floats, RodShape
+from fastrod.types import ContactMotion, Floats
 
 from ..jit import inline, kernel
 from ..vec import Mat, Vec
@@ -25,26 +25,45 @@ class Curve(NamedTuple):
 
 
 @inline
-def curve_of(shape: RodShape, i: int) -> Curve:
-    """Robot i."""
-    return Curve(shape.position[i], shape.rotation[i], shape.curvature[i], shape.arclength[i])
+def curve_of(motion: ContactMotion, i: int) -> Curve:
+    """Robot i, now."""
+    return Curve(motion.position[i], motion.rotation[i], motion.curvature[i], motion.arclength[i])
 
 
 @inline
-def _weights(part: float, h: float) -> tuple[float, float, float, float]:
+def curve_before(motion: ContactMotion, i: int) -> Curve:
+    """Robot i where it came from."""
+    return Curve(
+        motion.position_before[i],
+        motion.rotation_before[i],
+        motion.curvature_before[i],
+        motion.arclength_before[i],
+    )
+
+
+@inline
+def curve_slip(motion: ContactMotion, i: int) -> Curve:
+    """Robot i at the last step."""
+    return Curve(
+        motion.position_slip[i], motion.rotation_slip[i], motion.curvature_slip[i], motion.arclength_slip[i]
+    )
+
+
+@inline
+def _weights(fraction: float, h: float) -> tuple[float, float, float, float]:
     """Of the value at the start, the slope there, the value at the end and the slope there."""
-    t, u = part, 1.0 - part
+    t, u = fraction, 1.0 - fraction
     return (1.0 + 2.0 * t) * u * u, h * t * u * u, t * t * (3.0 - 2.0 * t), -h * t * t * u
 
 
 @inline
-def point_at(curve: Curve, j: int, part: float) -> Vec:
-    """Centreline at the fraction `part` of the interval after node j."""
-    if part == 0.0:
+def point_at(curve: Curve, j: int, fraction: float) -> Vec:
+    """Centreline at a fraction of the interval after node j."""
+    if fraction == 0.0:
         return curve.position[j, 0], curve.position[j, 1], curve.position[j, 2]
-    if part == 1.0:
+    if fraction == 1.0:
         return curve.position[j + 1, 0], curve.position[j + 1, 1], curve.position[j + 1, 2]
-    a, b, c, d = _weights(part, curve.arclength[j + 1] - curve.arclength[j])
+    a, b, c, d = _weights(fraction, curve.arclength[j + 1] - curve.arclength[j])
     p, q, r, s = curve.position[j], curve.rotation[j], curve.position[j + 1], curve.rotation[j + 1]
     return (
         a * p[0] + b * q[0, 2] + c * r[0] + d * s[0, 2],
@@ -54,9 +73,9 @@ def point_at(curve: Curve, j: int, part: float) -> Vec:
 
 
 @inline
-def tangent_at(curve: Curve, j: int, part: float) -> Vec:
+def tangent_at(curve: Curve, j: int, fraction: float) -> Vec:
     """Slope of that curve; a unit vector at the nodes."""
-    t, h = part, curve.arclength[j + 1] - curve.arclength[j]
+    t, h = fraction, curve.arclength[j + 1] - curve.arclength[j]
     a = 6.0 * t * (t - 1.0) / h
     b, d = (1.0 - t) * (1.0 - 3.0 * t), t * (3.0 * t - 2.0)
     p, q, r, s = curve.position[j], curve.rotation[j], curve.position[j + 1], curve.rotation[j + 1]
@@ -77,17 +96,17 @@ def interval_of(curve: Curve, s: float, j: int) -> tuple[int, float]:
     while j < last and curve.arclength[j + 1] <= s:
         j += 1
     h = curve.arclength[j + 1] - curve.arclength[j]
-    part = min(max((s - curve.arclength[j]) / h, 0.0), 1.0)
-    return (j, part) if part < 1.0 - 1e-12 else (j, 1.0)
+    fraction = min(max((s - curve.arclength[j]) / h, 0.0), 1.0)
+    return (j, fraction) if fraction < 1.0 - 1e-12 else (j, 1.0)
 
 
 @kernel
-def rotation_at(curve: Curve, j: int, part: float) -> Mat:
+def rotation_at(curve: Curve, j: int, fraction: float) -> Mat:
     """world_from_material between two nodes; orthonormal to fourth order."""
-    if part == 0.0 or part == 1.0:
-        m = curve.rotation[j if part == 0.0 else j + 1]
+    if fraction == 0.0 or fraction == 1.0:
+        m = curve.rotation[j if fraction == 0.0 else j + 1]
         return m[0, 0], m[0, 1], m[0, 2], m[1, 0], m[1, 1], m[1, 2], m[2, 0], m[2, 1], m[2, 2]
-    a, b, c, d = _weights(part, curve.arclength[j + 1] - curve.arclength[j])
+    a, b, c, d = _weights(fraction, curve.arclength[j + 1] - curve.arclength[j])
     m, k, u, v = curve.rotation[j], curve.rotation[j + 1], curve.curvature[j], curve.curvature[j + 1]
     x = _row(a, b, c, d, m[0], k[0], u, v)
     y = _row(a, b, c, d, m[1], k[1], u, v)

@@ -1,11 +1,10 @@
 """Contact forces of one world from the compliance of its contact points: Signorini's law with Coulomb
 friction.
 
-The motion of contact c in its own frame (normal, two tangents) is u = b + W lambda; W is the compliance
-between contacts (symmetric), b the motion without contact forces: the gap along the normal, the slip since
-the last step along the tangents.
-Normal:   0 <= lambda_n,  0 <= u_n + compliance lambda_n,  their product 0.
-Friction: |lambda_t| <= mu lambda_n; where it slips, lambda_t = -mu lambda_n u_t / |u_t|.
+The motion of contact c in its own frame (normal, two tangents) is u = b + W lambda; W is the Delassus matrix,
+the compliance between contacts (symmetric), b the motion without contact forces: the gap along the normal,
+the slip since the last step along the tangents. Normal: 0 <= lambda_n, 0 <= u_n + compliance lambda_n, their
+product 0. Friction: |lambda_t| <= mu lambda_n; where it slips, lambda_t = -mu lambda_n u_t / |u_t|.
 
 First an active set: each contact is open, sticks or slips; the equations of these states are solved together,
 the states corrected until they agree (a semi-smooth Newton method; Alart and Curnier 1991). Where they do not
@@ -16,57 +15,80 @@ that is positive.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
-from fastrod.types import Floats
+from fastrod.types import Floats, Ints
 
 from ..jit import kernel
-from .bvh import FAR, Numbers
+from .bvh import FAR
 
 _ROUNDS = 40
+"""Of the active set: those that agree do so in a dozen, the others go to and fro."""
 _SWEEPS = 400
-_LOOK = 50
+_CHECK = 50
+"""Rounds of Gauss-Seidel, and how often their rate of convergence is looked at."""
 _AGREE = 1e-10
+"""Motion to which states and sweeps agree [m]: a ten-thousandth of the tolerance at which a step rests."""
 _HOLDS = 1e-9
-OPEN, STICK, SLIP = 0.0, 1.0, 2.0
+"""Motion to which an answer must obey the law [m]: `_AGREE` and the rounding of a nearly singular system."""
+OPEN, STICK, SLIP = 0, 1, 2
 
 
-def law_size(m: int) -> int:
-    """Numbers of scratch that `contact_forces` needs for m contacts."""
-    return 3 * m * (3 * m + 1) + 9 * m
+class ContactLaw(NamedTuple):
+    """The law's numbers and its workspace, for m contacts or more."""
+
+    W: Floats
+    """(3 m, 3 m) [m/N]."""
+    b: Floats
+    """(3 m,) [m]."""
+    friction: Floats
+    """(m,) Coulomb coefficients."""
+    compliance: Floats
+    """(m,) [m/N]."""
+    force: Floats
+    """(3 m,) normal and two tangents of each contact: a start, and the answer [N]."""
+    state: Ints
+    """(m,) open, sticking or slipping."""
+    along: Floats
+    """(m, 2) direction of the friction where it slips."""
+    start: Floats
+    """(3 m,) the force at the start [N]."""
+    system: Floats
+    """(3 m, 3 m + 1) linear equations, the last column their right-hand side."""
 
 
 @kernel
-def solve_dense(a: Numbers, n: int, stride: int) -> bool:
-    """Gauss elimination with partial pivoting of n equations in `a`, rows `stride` apart, with stride - n
+def solve_dense(a: Floats, n: int, width: int) -> bool:
+    """Gauss elimination with partial pivoting of n equations, the rows of `a`, whose columns n to `width` are
     right-hand sides; the solutions replace those. False where the matrix is singular."""
     for c in range(n):
         pivot = c
         for r in range(c + 1, n):
-            if abs(a[r * stride + c]) > abs(a[pivot * stride + c]):
+            if abs(a[r, c]) > abs(a[pivot, c]):
                 pivot = r
-        if not abs(a[pivot * stride + c]) > 0.0:
+        if not abs(a[pivot, c]) > 0.0:
             return False
         if pivot != c:
-            for i in range(c, stride):
-                a[c * stride + i], a[pivot * stride + i] = a[pivot * stride + i], a[c * stride + i]
-        inverse = 1.0 / a[c * stride + c]
+            for i in range(c, width):
+                a[c, i], a[pivot, i] = a[pivot, i], a[c, i]
+        inverse = 1.0 / a[c, c]
         for r in range(c + 1, n):
-            factor = a[r * stride + c] * inverse
+            factor = a[r, c] * inverse
             if factor != 0.0:
-                for i in range(c + 1, stride):
-                    a[r * stride + i] -= factor * a[c * stride + i]
+                for i in range(c + 1, width):
+                    a[r, i] -= factor * a[c, i]
     for c in range(n - 1, -1, -1):
-        inverse = 1.0 / a[c * stride + c]
-        for i in range(n, stride):
-            value = a[c * stride + i]
+        inverse = 1.0 / a[c, c]
+        for i in range(n, width):
+            value = a[c, i]
             for q in range(c + 1, n):
-                value -= a[c * stride + q] * a[q * stride + i]
-            a[c * stride + i] = value * inverse
+                value -= a[c, q] * a[q, i]
+            a[c, i] = value * inverse
     return True
 
 
 @kernel
-def _motion(W: Floats, b: Numbers, force: Numbers, row: int, n: int) -> float:
+def _motion(W: Floats, b: Floats, force: Floats, row: int, n: int) -> float:
     u = b[row]
     for i in range(n):
         u += W[row, i] * force[i]
@@ -74,8 +96,9 @@ def _motion(W: Floats, b: Numbers, force: Numbers, row: int, n: int) -> float:
 
 
 @kernel
-def _sweep(m: int, W: Floats, b: Numbers, friction: Numbers, compliance: Numbers, force: Numbers) -> float:
+def _sweep(m: int, law: ContactLaw) -> float:
     """One round of Gauss-Seidel over the contacts; the largest change of force times compliance."""
+    W, b, friction, compliance, force = law.W, law.b, law.friction, law.compliance, law.force
     largest = 0.0
     for c in range(m):
         o = 3 * c
@@ -104,49 +127,32 @@ def _sweep(m: int, W: Floats, b: Numbers, friction: Numbers, compliance: Numbers
 
 
 @kernel
-def _row_of_state(
-    c: int,
-    i: int,
-    m: int,
-    W: Floats,
-    b: Numbers,
-    compliance: Numbers,
-    friction: Numbers,
-    state: Numbers,
-    along: Numbers,
-    a: Numbers,
-) -> None:
-    """Equation i (normal, tangents) of contact c in its state, as a row of the linear system."""
-    n = 3 * m
-    row = a[(3 * c + i) * (n + 1) :]
-    kind = state[c]
-    for q in range(n + 1):
-        row[q] = 0.0
-    if kind == OPEN or (i > 0 and friction[c] <= 0.0):
-        row[3 * c + i] = 1.0
-    elif i == 0 or kind == STICK:
-        for q in range(n):
-            row[q] = W[3 * c + i, q]
-        row[3 * c + i] += compliance[c] if i == 0 else 0.0
-        row[3 * c + i] *= 1.0 + 1e-12  # two contacts that say the same leave a singular system otherwise
-        row[n] = -b[3 * c + i]
-    else:  # slip: lambda_t = mu lambda_n along
-        row[3 * c + i] = 1.0
-        row[3 * c] = -friction[c] * along[2 * c + i - 1]
+def _write_system(m: int, law: ContactLaw) -> None:
+    """Equations (normal, tangents) of every contact in its state, as rows of the linear system."""
+    n, W, b, friction, compliance = 3 * m, law.W, law.b, law.friction, law.compliance
+    for o in range(n):
+        c, i = o // 3, o % 3
+        row, kind = law.system[o], law.state[c]
+        for q in range(n + 1):
+            row[q] = 0.0
+        if kind == OPEN or (i > 0 and friction[c] <= 0.0):
+            row[o] = 1.0
+        elif i == 0 or kind == STICK:
+            for q in range(n):
+                row[q] = W[o, q]
+            row[o] += compliance[c] if i == 0 else 0.0
+            row[o] *= 1.0 + 1e-12  # two contacts that say the same leave a singular system otherwise
+            row[n] = -b[o]
+        else:  # slip: lambda_t = mu lambda_n along
+            row[o] = 1.0
+            row[3 * c] = -friction[c] * law.along[c, i - 1]
 
 
 @kernel
-def _correct_states(
-    m: int,
-    W: Floats,
-    b: Numbers,
-    friction: Numbers,
-    compliance: Numbers,
-    force: Numbers,
-    state: Numbers,
-    along: Numbers,
-) -> float:
+def _correct_states(m: int, law: ContactLaw) -> float:
     """States that these forces ask for; how far they are from agreement, as a motion [m]."""
+    W, b, friction, compliance, force = law.W, law.b, law.friction, law.compliance, law.force
+    state, along = law.state, law.along
     wrong = 0.0
     for c in range(m):
         o = 3 * c
@@ -173,25 +179,26 @@ def _correct_states(
                 )
             state[c] = STICK
         else:
-            turn = abs(along[2 * c] - t1 / size) + abs(along[2 * c + 1] - t2 / size)
+            rotation = abs(along[c, 0] - t1 / size) + abs(along[c, 1] - t2 / size)
             if state[c] != SLIP:
                 wrong = max(wrong, soft * (size - friction[c] * force[o]))
-            wrong = max(wrong, soft * friction[c] * force[o] * turn)
-            state[c], along[2 * c], along[2 * c + 1] = SLIP, t1 / size, t2 / size
+            wrong = max(wrong, soft * friction[c] * force[o] * rotation)
+            state[c], along[c, 0], along[c, 1] = SLIP, t1 / size, t2 / size
     return wrong
 
 
 @kernel
-def _obeys(m: int, W: Floats, b: Numbers, friction: Numbers, compliance: Numbers, force: Numbers) -> bool:
+def _obeys(m: int, law: ContactLaw) -> bool:
     """The forces obey the law to 1e-9 m: a singular system can have a solution that does not."""
+    W, b, force = law.W, law.b, law.force
     for c in range(m):
         o = 3 * c
-        un = _motion(W, b, force, o, 3 * m) + compliance[c] * force[o]
+        un = _motion(W, b, force, o, 3 * m) + law.compliance[c] * force[o]
         closed = abs(un) <= _HOLDS or force[o] == 0.0
         if not (force[o] >= 0.0 and un >= -_HOLDS and closed):
             return False
         u1, u2 = _motion(W, b, force, o + 1, 3 * m), _motion(W, b, force, o + 2, 3 * m)
-        most, size = friction[c] * force[o], math.sqrt(force[o + 1] ** 2 + force[o + 2] ** 2)
+        most, size = law.friction[c] * force[o], math.sqrt(force[o + 1] ** 2 + force[o + 2] ** 2)
         slip = math.sqrt(u1 * u1 + u2 * u2)
         if not size <= most * (1.0 + 1e-6) + 1e-12:
             return False
@@ -206,53 +213,58 @@ def _obeys(m: int, W: Floats, b: Numbers, friction: Numbers, compliance: Numbers
 
 
 @kernel
-def contact_forces(
-    m: int, W: Floats, b: Numbers, friction: Numbers, compliance: Numbers, force: Numbers, work: Numbers
-) -> bool:
-    """Forces (3 m: normal and two tangents of each contact), from the given ones as a start; whether they
-    obey the law."""
-    n = 3 * m
-    a, o = work[: n * (n + 1)], n * (n + 1)
-    state, along, best = work[o : o + m], work[o + m : o + 3 * m], work[o + 3 * m : o + 6 * m]
-    for i in range(n):
-        best[i] = force[i]
+def _first_states(m: int, law: ContactLaw) -> None:
+    """States of the forces at the start."""
+    force, friction = law.force, law.friction
     for c in range(m):
-        state[c] = OPEN if force[3 * c] <= 0.0 else STICK
+        kind = OPEN if force[3 * c] <= 0.0 else STICK
         size = math.sqrt(force[3 * c + 1] ** 2 + force[3 * c + 2] ** 2)
         slips = (
             friction[c] > 0.0
-            and state[c] == STICK
+            and kind == STICK
             and size >= friction[c] * force[3 * c] * (1.0 - 1e-6)
             and size > 0.0
         )
-        along[2 * c], along[2 * c + 1] = (
+        law.along[c, 0], law.along[c, 1] = (
             (force[3 * c + 1] / size, force[3 * c + 2] / size) if slips else (0.0, 0.0)
         )
-        state[c] = SLIP if slips else state[c]
-    agreed = False
+        law.state[c] = SLIP if slips else kind
+
+
+@kernel
+def _active_set(m: int, law: ContactLaw) -> bool:
+    """Forces by Newton's method on the states; whether the states agree."""
+    n = 3 * m
     for count in range(_ROUNDS):
-        wrong = _correct_states(m, W, b, friction, compliance, force, state, along)
-        agreed = wrong <= _AGREE and count > 0
-        if agreed:
-            break
-        for c in range(m):
-            for i in range(3):
-                _row_of_state(c, i, m, W, b, compliance, friction, state, along, a)
-        if not solve_dense(a, n, n + 1):
-            break
+        wrong = _correct_states(m, law)
+        if wrong <= _AGREE and count > 0:
+            return True
+        _write_system(m, law)
+        if not solve_dense(law.system, n, n + 1):
+            return False
         for i in range(n):
-            force[i] = a[i * (n + 1) + n]
-    if agreed and _obeys(m, W, b, friction, compliance, force):
+            law.force[i] = law.system[i, n]
+    return False
+
+
+@kernel
+def contact_forces(m: int, law: ContactLaw) -> bool:
+    """Replace the forces of m contacts by those that the law asks for; whether they obey it."""
+    n = 3 * m
+    for i in range(n):
+        law.start[i] = law.force[i]
+    _first_states(m, law)
+    if _active_set(m, law) and _obeys(m, law):
         return True
     for i in range(n):
-        force[i] = best[i] if best[i] == best[i] else 0.0
+        law.force[i] = law.start[i] if law.start[i] == law.start[i] else 0.0
     left, last = 1.0, FAR
     for count in range(_SWEEPS):
-        left = _sweep(m, W, b, friction, compliance, force)
+        left = _sweep(m, law)
         if left < _AGREE:
             break
-        if count % _LOOK == _LOOK - 1:  # at this rate the rounds that are left would not do
-            if not left * (left / last) ** ((_SWEEPS - count) // _LOOK) < _AGREE:
+        if count % _CHECK == _CHECK - 1:  # at this rate the rounds that are left would not do
+            if not left * (left / last) ** ((_SWEEPS - count) // _CHECK) < _AGREE:
                 break
             last = left
-    return left < _AGREE and _obeys(m, W, b, friction, compliance, force)
+    return left < _AGREE and _obeys(m, law)

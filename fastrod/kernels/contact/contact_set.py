@@ -1,83 +1,88 @@
-"""The contacts of one robot: which to keep, to move and to add, from what the search has found.
+"""The contact set of one robot: contacts to keep, to move and to add, from what the search has found.
 
-A contact holds at one arclength, against one wall of one obstacle. A superset does no harm, for the law opens
-those that are not needed; so contacts that carry a force stay, move along the rod to the minimum of the gap
-near them, and new ones come where the gap is violated (an exchange method for the constraint gap(s) >= 0 at
-every s).
+A contact (`CONTACT`) holds at one arclength, against one wall of one obstacle. A superset does no harm, for
+the law opens those that are not needed; so contacts that carry a force stay, move along the rod to the
+minimum of the gap near them, and new ones come where the gap is violated (an exchange method for the
+constraint gap(s) >= 0 at every s).
 """
 
 from __future__ import annotations
 
-from fastrod.types import Floats, Surfaces
+from typing import NamedTuple
+
+from fastrod.types import Floats, Records, Surfaces
 
 from ..jit import inline, kernel
 from ..vec import Vec, dot, scale
-from .bvh import FAR, Numbers
+from .bvh import FAR, Numbers, Record, normal_of
 from .surface import ray_hit, signed_distance, walls
 
-T_OBSTACLE, T_S, T_TWIN, T_N, T_GAP, T_FORCE, T_RADIUS, T_ARM, T_TAKEN, T_SHIFT, T_HOLD, SLOT = (
-    0,
-    1,
-    2,
-    3,
-    6,
-    7,
-    10,
-    11,
-    12,
-    13,
-    14,
-    15,
-)
-"""Obstacle (from n_obstacles on: rods), arclength, number that links both sides of a contact between rods or
--1, normal toward the rod, gap, force on the rod (world), radius of the rod there; arm: how far below the
-centreline the force acts, the radius where there is friction, else 0, for a normal force has no moment;
-taken: scratch of `choose`; shift: how far it moved along the rod the last time; hold: stiffness that damping
-took last [N/m]."""
-_SAME_WALL = 0.99999
+_SAME_WALL = 0.99999  # cosine: normals 0.26 degrees apart, far less than two faces of a corner
+_SAME_GAP = 1e-10  # m; a contact with friction does not move for less
 _CLOSE = 1e-3  # of a step: the least that two contacts of one obstacle are apart
 
 
-@inline
-def slot_normal(slot: Numbers) -> Vec:
-    """Unit vector toward the rod, world."""
-    return slot[T_N], slot[T_N + 1], slot[T_N + 2]
+class ContactRules(NamedTuple):
+    """What the choice of one robot's contacts depends on, beside the contacts."""
+
+    surfaces: Surfaces
+    n_obstacles: int
+    radius: Floats
+    """(n_segments,) [m]."""
+    n_steps: int
+    arclength: Floats
+    """(n_points,) [m]."""
+    spacing: float
+    """Length of an integration step [m]."""
+    tolerance: float
+    """Violation that counts as none [m]."""
+    keep: float
+    """Gap below which an idle contact is kept [m]."""
 
 
 @inline
-def slot_force(slot: Numbers) -> Vec:
+def force_of(contact: Record) -> Vec:
     """On the rod, world [N]."""
-    return slot[T_FORCE], slot[T_FORCE + 1], slot[T_FORCE + 2]
+    f = contact.force
+    return f[0], f[1], f[2]
 
 
 @inline
-def carries(slot: Numbers) -> bool:
+def carries(contact: Record) -> bool:
     """F . F > 0: the contact presses."""
-    f = slot_force(slot)
+    f = force_of(contact)
     return dot(f, f) > 0.0
 
 
 @inline
-def open_slot(
-    slot: Numbers, obstacle: int, s: float, twin: int, n: Vec, gap: float, radius: float, friction: float
+def arm_of(contact: Record) -> Vec:
+    """From the centreline to where the force acts."""
+    return scale(-contact.arm, normal_of(contact))
+
+
+@inline
+def set_normal(contact: Record, n: Vec) -> None:
+    """Unit vector toward the rod, world."""
+    contact.normal[0], contact.normal[1], contact.normal[2] = n
+
+
+@inline
+def open_contact(
+    contact: Record, obstacle: int, s: float, n: Vec, gap: float, radius: float, friction: float
 ) -> None:
     """Write a contact that carries nothing yet: normal n, world, `gap` and `radius` [m]. Only friction gives
     its force an arm."""
-    slot[T_OBSTACLE], slot[T_S], slot[T_TWIN], slot[T_GAP], slot[T_RADIUS] = (
-        float(obstacle),
-        s,
-        float(twin),
-        gap,
-        radius,
-    )
-    slot[T_N], slot[T_N + 1], slot[T_N + 2] = n
-    slot[T_ARM], slot[T_SHIFT], slot[T_HOLD] = radius if friction > 0.0 else 0.0, FAR, 0.0
-    slot[T_FORCE], slot[T_FORCE + 1], slot[T_FORCE + 2], slot[T_TAKEN] = 0.0, 0.0, 0.0, 0.0
+    contact.obstacle, contact.partner = obstacle, -1
+    contact.arclength, contact.gap, contact.radius = s, gap, radius
+    set_normal(contact, n)
+    contact.arm, contact.shift, contact.damped_stiffness = radius if friction > 0.0 else 0.0, FAR, 0.0
+    contact.force[0], contact.force[1], contact.force[2] = 0.0, 0.0, 0.0
+    contact.matched = False
 
 
 @kernel
 def wall_at(
-    k: int, frame: Floats, p: Vec, old: Vec, margin: float, surfaces: Surfaces, stack: Numbers, found: Numbers
+    k: int, frame: Floats, p: Vec, old: Vec, margin: float, surfaces: Surfaces, stack: Numbers, found: Records
 ) -> tuple[float, Vec]:
     """Signed distance of the centreline point p to that wall of obstacle k which faces as `old` does, and its
     normal.
@@ -96,42 +101,44 @@ def wall_at(
     best, alike = -1, dot(n, old) + 1e-6
     count = walls(k, frame, p, d + margin, d, surfaces, stack, found)
     for j in range(count):
-        facing = dot((found[5 * j + 1], found[5 * j + 2], found[5 * j + 3]), old)
+        facing = dot(normal_of(found[j]), old)
         if facing > alike:
             best, alike = j, facing
     if best >= 0:
-        return found[5 * best], (found[5 * best + 1], found[5 * best + 2], found[5 * best + 3])
+        return found[best].distance, normal_of(found[best])
     return d, n
 
 
 @inline
-def gives_way(k: int, surfaces: Surfaces) -> bool:
+def compliant(k: int, surfaces: Surfaces) -> bool:
     """A rod may be deep in obstacle k: it is soft, or free to move."""
-    return bool(surfaces.compliance[k] > 0.0 or surfaces.give[k, 0] > 0.0)
+    return bool(surfaces.compliance[k] > 0.0 or surfaces.mobility[k, 0] > 0.0)
 
 
 @kernel
-def _held_depth(k: int, s: float, count: int, slot: Floats, spacing: float) -> float:
+def _held_depth(k: int, s: float, count: int, contacts: Records, spacing: float) -> float:
     """The smallest gap of the contacts with obstacle k beside arclength s, at most 0 [m]."""
     level = 0.0
     for c in range(count):
-        if int(slot[c, T_OBSTACLE]) == k and abs(slot[c, T_S] - s) < spacing:
-            level = min(level, slot[c, T_GAP])
+        if contacts[c].obstacle == k and abs(contacts[c].arclength - s) < spacing:
+            level = min(level, contacts[c].gap)
     return level
 
 
 @kernel
 def violation(
-    n_found: int, found: Floats, count: int, slot: Floats, spacing: float, surfaces: Surfaces
+    n_found: int, found: Records, count: int, contacts: Records, spacing: float, surfaces: Surfaces
 ) -> tuple[float, int]:
-    """How far the gap falls below what the contacts that there are can mend [m], and the candidate where it
-    falls deepest. Only where an obstacle gives way may a contact be deep."""
+    """How far the gap falls below what the present contacts can close [m], and the candidate where it falls
+    deepest. Only where an obstacle is compliant may a contact be deep."""
     worst, where = 0.0, -1
     for f in range(n_found):
-        k = int(found[f, 0])
-        level = _held_depth(k, found[f, 1], count, slot, spacing) if gives_way(k, surfaces) else 0.0
-        if level - found[f, 2] > worst:
-            worst, where = level - found[f, 2], f
+        k = found[f].obstacle
+        level = 0.0
+        if compliant(k, surfaces):
+            level = _held_depth(k, found[f].arclength, count, contacts, spacing)
+        if level - found[f].gap > worst:
+            worst, where = level - found[f].gap, f
     return worst, where
 
 
@@ -147,26 +154,26 @@ def segment_at(arclength: Floats, n_steps: int, s: float) -> int:
 
 
 @kernel
-def _segment_is_full(s: float, count: int, slot: Floats, arclength: Floats, n_steps: int) -> bool:
+def _segment_is_full(s: float, count: int, contacts: Records, rules: ContactRules) -> bool:
     """As many contacts on this segment as it has nodes inside to put them on."""
-    k = segment_at(arclength, n_steps, s)
+    k = segment_at(rules.arclength, rules.n_steps, s)
     members = 0
     for c in range(count):
-        members += segment_at(arclength, n_steps, slot[c, T_S]) == k
-    return members >= n_steps - 1
+        members += segment_at(rules.arclength, rules.n_steps, contacts[c].arclength) == k
+    return members >= rules.n_steps - 1
 
 
 @kernel
-def _spare(c: int, count: int, slot: Floats, spacing: float, tolerance: float) -> bool:
+def _spare(c: int, count: int, contacts: Records, rules: ContactRules) -> bool:
     """An idle contact, open and beside one that presses: it is not wanted next, and its node is better spread
     out."""
-    if slot[c, T_GAP] < 10.0 * tolerance:
+    if contacts[c].gap < 10.0 * rules.tolerance:
         return False
     for e in range(count):
         if (
-            slot[e, T_OBSTACLE] == slot[c, T_OBSTACLE]
-            and abs(slot[e, T_S] - slot[c, T_S]) < spacing
-            and carries(slot[e])
+            contacts[e].obstacle == contacts[c].obstacle
+            and abs(contacts[e].arclength - contacts[c].arclength) < rules.spacing
+            and carries(contacts[e])
         ):
             return True
     return False
@@ -174,136 +181,150 @@ def _spare(c: int, count: int, slot: Floats, spacing: float, tolerance: float) -
 
 @kernel
 def _least_wanted(
-    s: float, gap: float, count: int, slot: Floats, arclength: Floats, n_steps: int, anywhere: bool
+    s: float, gap: float, count: int, contacts: Records, rules: ContactRules, anywhere: bool
 ) -> int:
     """Of the idle contacts on the segment of s, or `anywhere`, the one with the widest gap, if it is wider
     than `gap`; -1 if none is."""
-    k, widest, at = segment_at(arclength, n_steps, s), gap, -1
+    k, widest, at = segment_at(rules.arclength, rules.n_steps, s), gap, -1
     for c in range(count):
-        here = anywhere or segment_at(arclength, n_steps, slot[c, T_S]) == k
-        if here and slot[c, T_TWIN] < 0.0 and slot[c, T_GAP] > widest and not carries(slot[c]):
-            widest, at = slot[c, T_GAP], c
+        here = anywhere or segment_at(rules.arclength, rules.n_steps, contacts[c].arclength) == k
+        if here and contacts[c].partner < 0 and contacts[c].gap > widest and not carries(contacts[c]):
+            widest, at = contacts[c].gap, c
     return at
 
 
 @inline
-def _other_wall(slot: Numbers, gap: float, away: float, tolerance: float) -> bool:
+def _other_wall(contact: Record, gap: float, away: float, tolerance: float) -> bool:
     """The contact holds another wall than the one with this gap, so far away along the rod: the gap to one
-    changes by at most 1 per metre. To move it there would mend nothing."""
-    return bool(slot[T_GAP] - gap > away + tolerance)
+    changes by at most 1 per metre. Moving it there would close nothing."""
+    return bool(contact.gap - gap > away + tolerance)
 
 
 @kernel
-def choose(
-    n_found: int,
-    found: Floats,
-    count: int,
-    slot: Floats,
-    n_obstacles: int,
-    radius: Floats,
-    surfaces: Surfaces,
-    n_steps: int,
-    arclength: Floats,
-    spacing: float,
-    tolerance: float,
-    keep: float,
-) -> int:
-    """Contacts for the next pass, in place; returns how many. Those that press stay, and idle ones whose gap
-    is below `keep`:
-    they may be wanted next. A contact follows the minimum of the gap as long as its shifts shrink; where they
-    do not (a rod that hugs a curved surface), another is put beside it, and the law shares the force out."""
+def _keep_wanted(count: int, contacts: Records, rules: ContactRules) -> int:
+    """Drop the contacts that neither press nor may be wanted next; returns how many are left."""
     n = 0
-    room = count <= len(slot) - 4
+    room = count <= len(contacts) - 4
     for c in range(count):
-        idle = slot[c, T_GAP] < (keep if int(slot[c, T_OBSTACLE]) < n_obstacles else 0.0)
-        if carries(slot[c]) or (idle and room and not _spare(c, count, slot, spacing, tolerance)):
+        contact = contacts[c]
+        idle = contact.gap < (rules.keep if contact.obstacle < rules.n_obstacles else 0.0)
+        if carries(contact) or (idle and room and not _spare(c, count, contacts, rules)):
             if n != c:
-                for a in range(SLOT):
-                    slot[n, a] = slot[c, a]
-            slot[n, T_TAKEN] = 0.0
+                contacts[n] = contacts[c]
+            contacts[n].matched = False
             n += 1
-    for f in range(n_found):
-        k, s, gap = int(found[f, 0]), found[f, 1], found[f, 2]
-        normal = (found[f, 3], found[f, 4], found[f, 5])
-        near, nearest, lonely = -1, FAR, spacing
-        for c in range(n):
-            away = abs(slot[c, T_S] - s)
-            if int(slot[c, T_OBSTACLE]) != k:
-                continue
-            free = (
-                slot[c, T_TAKEN] == 0.0
-                and dot(slot_normal(slot[c]), normal) > 0.5
-                and not _other_wall(slot[c], gap, away, tolerance)
-            )
-            if free and away < spacing and away < nearest:
-                near, nearest = c, away
-        if gap < -tolerance:
-            lonely = _CLOSE * spacing
-        if near >= 0:
-            slot[near, T_TAKEN] = 1.0
-            if gap >= slot[near, T_GAP] - (1e-10 if slot[near, T_ARM] > 0.0 else 0.0):
-                continue
-            settles = nearest < max(0.5 * slot[near, T_SHIFT], _CLOSE * spacing)
-            if settles or not carries(slot[near]) or slot[near, T_ARM] > 0.0:
-                slot[near, T_S], slot[near, T_SHIFT] = s, nearest if carries(slot[near]) else FAR
-                continue
-            lonely = _CLOSE * spacing
-        if (
-            k < n_obstacles
-            and gives_way(k, surfaces)
-            and gap >= _held_depth(k, s, n, slot, spacing) - tolerance
-        ):
-            continue  # a contact more would only stiffen the obstacle
-        crowded, full = False, n >= len(slot) or _segment_is_full(s, n, slot, arclength, n_steps)
-        for c in range(n):
-            away = abs(slot[c, T_S] - s)
-            if int(slot[c, T_OBSTACLE]) == k and away < lonely and dot(slot_normal(slot[c]), normal) > 0.5:
-                crowded = crowded or not _other_wall(slot[c], gap, away, tolerance)
-        at = n
-        if full and not crowded and gap < -tolerance:
-            at = _least_wanted(
-                s, gap, n, slot, arclength, n_steps, not _segment_is_full(s, n, slot, arclength, n_steps)
-            )
-        if not crowded and (not full or at >= 0) and at < len(slot):
-            open_slot(
-                slot[at],
-                k,
-                s,
-                -1,
-                normal,
-                gap,
-                radius[segment_at(arclength, n_steps, s)],
-                surfaces.friction[k],
-            )
-            slot[at, T_TAKEN] = 1.0
-            n = max(n, at + 1)
     return n
 
 
 @kernel
-def stands(count: int, slot: Floats, tolerance: float) -> bool:
-    """Contacts without friction that the law need not be asked about: none is deeper than `tolerance`, none
-    presses that is open by more, none pulls."""
-    for c in range(count):
-        press = dot(slot_force(slot[c]), slot_normal(slot[c]))
+def _nearest(candidate: Record, n: int, contacts: Records, rules: ContactRules) -> int:
+    """The contact that a candidate belongs to, nearer than a step and not matched yet; -1 if none."""
+    normal = normal_of(candidate)
+    near, nearest = -1, rules.spacing
+    for c in range(n):
+        contact = contacts[c]
+        away = abs(contact.arclength - candidate.arclength)
         if (
-            slot[c, T_ARM] > 0.0
-            or slot[c, T_GAP] < -tolerance
+            contact.obstacle == candidate.obstacle
+            and not contact.matched
+            and away < nearest
+            and dot(normal_of(contact), normal) > 0.5
+            and not _other_wall(contact, candidate.gap, away, rules.tolerance)
+        ):
+            near, nearest = c, away
+    return near
+
+
+@kernel
+def _follow(contact: Record, candidate: Record, rules: ContactRules) -> bool:
+    """Move a contact to the minimum of the gap near it; False where it should stay, and another be put beside
+    it."""
+    if candidate.gap >= contact.gap - (_SAME_GAP if contact.arm > 0.0 else 0.0):
+        return True
+    away = abs(contact.arclength - candidate.arclength)
+    settles = away < max(0.5 * contact.shift, _CLOSE * rules.spacing)
+    if settles or not carries(contact) or contact.arm > 0.0:
+        contact.arclength, contact.shift = candidate.arclength, away if carries(contact) else FAR
+        return True
+    return False
+
+
+@kernel
+def _add(candidate: Record, n: int, contacts: Records, apart: float, rules: ContactRules) -> int:
+    """Open a contact for a candidate, unless one with its normal is nearer than `apart`, or there is no room;
+    returns how many there are."""
+    s, gap, normal = candidate.arclength, candidate.gap, normal_of(candidate)
+    for c in range(n):
+        away = abs(contacts[c].arclength - s)
+        if (
+            contacts[c].obstacle == candidate.obstacle
+            and away < apart
+            and dot(normal_of(contacts[c]), normal) > 0.5
+            and not _other_wall(contacts[c], gap, away, rules.tolerance)
+        ):
+            return n
+    at, segment_full = n, _segment_is_full(s, n, contacts, rules)
+    if (n >= len(contacts) or segment_full) and gap < -rules.tolerance:
+        at = _least_wanted(s, gap, n, contacts, rules, not segment_full)
+    if not 0 <= at < len(contacts):
+        return n
+    radius = rules.radius[segment_at(rules.arclength, rules.n_steps, s)]
+    friction = rules.surfaces.friction[candidate.obstacle]
+    open_contact(contacts[at], candidate.obstacle, s, normal, gap, radius, friction)
+    contacts[at].matched = True
+    return max(n, at + 1)
+
+
+@kernel
+def choose(n_found: int, found: Records, count: int, contacts: Records, rules: ContactRules) -> int:
+    """Contacts for the next pass, in place; returns how many. Those that press stay, and idle ones whose gap
+    is below `rules.keep`: they may be wanted next. A contact follows the minimum of the gap as long as its
+    shifts shrink; where they do not (a rod that hugs a curved surface), another is put beside it, and the law
+    shares the force out."""
+    n = _keep_wanted(count, contacts, rules)
+    for f in range(n_found):
+        candidate = found[f]
+        k = candidate.obstacle
+        apart = _CLOSE * rules.spacing if candidate.gap < -rules.tolerance else rules.spacing
+        near = _nearest(candidate, n, contacts, rules)
+        if near >= 0:
+            contacts[near].matched = True
+            if _follow(contacts[near], candidate, rules):
+                continue
+            apart = _CLOSE * rules.spacing
+        if k < rules.n_obstacles and compliant(k, rules.surfaces):
+            held = _held_depth(k, candidate.arclength, n, contacts, rules.spacing)
+            if candidate.gap >= held - rules.tolerance:
+                continue  # a contact more would only stiffen the obstacle
+        n = _add(candidate, n, contacts, apart, rules)
+    return n
+
+
+@kernel
+def stands(count: int, contacts: Records, tolerance: float) -> bool:
+    """Contacts without friction that need no law: none is deeper than `tolerance`, none presses that is open
+    by more, none pulls."""
+    for c in range(count):
+        contact = contacts[c]
+        press = dot(force_of(contact), normal_of(contact))
+        if (
+            contact.arm > 0.0
+            or contact.gap < -tolerance
             or press < 0.0
-            or (carries(slot[c]) and slot[c, T_GAP] > tolerance)
+            or (carries(contact) and contact.gap > tolerance)
         ):
             return False
     return True
 
 
 @kernel
-def pressed_only(count: int, slot: Floats) -> int:
+def pressed_only(count: int, contacts: Records) -> int:
     """Drop the contacts that carry nothing; returns how many are left."""
     n = 0
     for c in range(count):
-        if carries(slot[c]):
-            for a in range(SLOT if n != c else 0):
-                slot[n, a] = slot[c, a]
+        if carries(contacts[c]):
+            if n != c:
+                contacts[n] = contacts[c]
             n += 1
     return n
 
@@ -311,74 +332,63 @@ def pressed_only(count: int, slot: Floats) -> int:
 @kernel
 def add_walls(
     count: int,
-    slot: Floats,
-    points: Floats,
+    contacts: Records,
+    centre: Floats,
     frames: Floats,
     margin: float,
     surfaces: Surfaces,
     stack: Numbers,
-    found: Numbers,
+    found: Records,
 ) -> int:
-    """Give every further wall of a concave corner a contact of its own; `points` (n_slots, 3) are the
+    """Give every further wall of a concave corner a contact of its own; `centre` (max_contacts, 3) is the
     centreline at each."""
     n = count
     for c in range(count):
-        k = int(slot[c, T_OBSTACLE])
+        contact = contacts[c]
+        k = contact.obstacle
         if k >= len(frames):
             continue
-        p = (points[c, 0], points[c, 1], points[c, 2])
+        p = (centre[c, 0], centre[c, 1], centre[c, 2])
         d, _, _ = signed_distance(k, frames[k], p, FAR, surfaces, stack)
-        reach = slot[c, T_RADIUS] + margin
-        n_walls = walls(k, frames[k], p, reach, d, surfaces, stack, found) if 0.0 <= d < reach else 0
+        limit = contact.radius + margin
+        n_walls = walls(k, frames[k], p, limit, d, surfaces, stack, found) if 0.0 <= d < limit else 0
         for j in range(n_walls):
-            normal = (found[5 * j + 1], found[5 * j + 2], found[5 * j + 3])
-            known = n >= len(slot)
+            normal = normal_of(found[j])
+            known = n >= len(contacts)
             for e in range(n):
-                same = int(slot[e, T_OBSTACLE]) == k and abs(slot[e, T_S] - slot[c, T_S]) < 1e-9
-                known = known or (same and dot(slot_normal(slot[e]), normal) > _SAME_WALL)
+                same = contacts[e].obstacle == k and abs(contacts[e].arclength - contact.arclength) < 1e-9
+                known = known or (same and dot(normal_of(contacts[e]), normal) > _SAME_WALL)
             if not known:
-                open_slot(
-                    slot[n],
-                    k,
-                    slot[c, T_S],
-                    -1,
-                    normal,
-                    found[5 * j] - slot[c, T_RADIUS],
-                    slot[c, T_RADIUS],
-                    surfaces.friction[k],
+                gap = found[j].distance - contact.radius
+                open_contact(
+                    contacts[n], k, contact.arclength, normal, gap, contact.radius, surfaces.friction[k]
                 )
                 n += 1
     return n
 
 
 @kernel
-def merge(count: int, slot: Floats, spacing: float) -> int:
+def merge(count: int, contacts: Records, spacing: float) -> int:
     """Contacts of one obstacle at one place with one normal become one."""
     n = 0
     for c in range(count):
+        contact = contacts[c]
         into = -1
         for e in range(n):
-            same = (
-                slot[e, T_OBSTACLE] == slot[c, T_OBSTACLE] and slot[e, T_TWIN] < 0.0 and slot[c, T_TWIN] < 0.0
-            )
+            other = contacts[e]
             if (
-                same
-                and abs(slot[e, T_S] - slot[c, T_S]) < 1e-4 * spacing
-                and dot(slot_normal(slot[e]), slot_normal(slot[c])) > _SAME_WALL
+                other.obstacle == contact.obstacle
+                and other.partner < 0
+                and contact.partner < 0
+                and abs(other.arclength - contact.arclength) < 1e-4 * spacing
+                and dot(normal_of(other), normal_of(contact)) > _SAME_WALL
             ):
                 into = e
         if into >= 0:
             for a in range(3):
-                slot[into, T_FORCE + a] += slot[c, T_FORCE + a]
+                contacts[into].force[a] += contact.force[a]
             continue
         if n != c:
-            for a in range(SLOT):
-                slot[n, a] = slot[c, a]
+            contacts[n] = contacts[c]
         n += 1
     return n
-
-
-@kernel
-def arm_of(slot: Numbers) -> Vec:
-    """From the centreline to where the force acts."""
-    return scale(-slot[T_ARM], slot_normal(slot))

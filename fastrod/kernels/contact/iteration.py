@@ -9,30 +9,33 @@ that linear model the boundary is closed. The search on the same shape says wher
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
-from fastrod.types import Clearance, ContactSet, Floats, Ints, Memory, PointLoads
+from fastrod.types import (
+    ContactMotion,
+    ContactProblem,
+    ContactRods,
+    ContactRows,
+    ContactSet,
+    Floats,
+    Ints,
+    PointLoads,
+    Records,
+    SearchWork,
+    Surfaces,
+)
 
 from ..jit import inline, kernel
 from ..rod.gather import pick
 from ..vec import dot
-from .bvh import FAR, STACK, Numbers
-from .centreline import Curve, curve_of, interval_of, point_at
-from .contact_set import (
-    T_FORCE,
-    T_OBSTACLE,
-    T_S,
-    add_walls,
-    choose,
-    merge,
-    pressed_only,
-    segment_at,
-    slot_force,
-    stands,
-    violation,
-)
-from .problem import SceneArrays, apply_law, forces_size
-from .proximity import CANDIDATE, ProximityOptions, crosses, entered, search_obstacles
+from .bvh import Numbers, Record
+from .centreline import curve_of, interval_of, point_at
+from .contact_set import ContactRules, add_walls, choose, force_of, merge, pressed_only, stands, violation
+from .problem import World, damping_of, rod_search, thread_problem
+from .proximity import ProximityOptions, ProximitySearch, search_obstacles, thread_search_work
 from .rod_proximity import search_rods
+from .solve import solve_contacts
+from .tunnelling import face_entered_sides, moved_far, tunnelled
 
 GOES_ON, AT_REST, LOST, BACK = 0, 1, 2, 3
 """Of a world after a pass; BACK: a damped iteration went through something, or found no forces, and is to go
@@ -40,335 +43,303 @@ less far."""
 NOTHING, MOVES, UNSOLVED, INSIDE, THROUGH, DIVERGED = 0, 1, 2, 3, 4, 5
 """What keeps a robot from rest: it still moves, its forces do not obey the law, the rod is inside of
 something, it went through something, its numbers are no numbers."""
-TROUBLE = 5
-"""Numbers of one: which of these, obstacle (from n_obstacles on: rods; -1: none), arclength, size [m], and
-how far its world is from rest: the largest of motion, residual and violation [m]."""
-_NO_FORCE = 1e-12  # of the largest: what rounding leaves of a force that is gone
-_MOST_FOUND = 64
-# of EI/l in the base moment, about radians of bend: farther the linear model does not reach
-_LONGEST_TURN = 0.5
+# of EI/l in the base moment, about radians of bend: farther the linear model does not hold
+_LONGEST_ROTATION = 0.5
 _LONGEST_MOVE = 0.05  # of the rod's length, of a contact point
+# of the margin: a contact that opens less between two passes is kept, for it may close again with the next
+_KEPT = 0.2
+# of an integration step: candidates of one obstacle nearer than this are one
+_SAME_PLACE = 0.05
+_NO_FORCE = 1e-12  # of the largest: what rounding leaves of a force that is gone
+_EVERYWHERE = 1.0  # a margin beyond the rod's length asks for the smallest gap, wherever it is
 
 
-def world_size(n_rows: int, n_slots: int, most_slots: int, n_points: int) -> int:
-    """Numbers of scratch that `iterate_world` needs, with `n_slots` contacts in this pass and `most_slots` in
-    the next."""
-    search = n_rows * (1 + _MOST_FOUND * CANDIDATE) + 3 * most_slots + 4 * n_points + 4 * STACK
-    return max(forces_size(n_rows, n_slots), search)
+class ContactIteration(NamedTuple):
+    """What one iteration of a batch reads and writes."""
+
+    rows: ContactRows
+    rods: ContactRods
+    surfaces: Surfaces
+    motion: ContactMotion
+    contacts: ContactSet
+    loads: PointLoads
+    problem: ContactProblem
+    search: SearchWork
+
+
+@inline
+def _search_of(
+    i: int, rods: ContactRods, surfaces: Surfaces, motion: ContactMotion, work: SearchWork, found: Records
+) -> ProximitySearch:
+    """Robot i among the obstacles."""
+    margin = motion.margin
+    options = ProximityOptions(
+        rods.radius[i],
+        rods.n_steps,
+        rods.first[i],
+        margin * rods.length[i],
+        _SAME_PLACE * rods.spacing[i],
+        margin > _EVERYWHERE,
+    )
+    frames = motion.frames[pick(i, len(motion.frames))]
+    return ProximitySearch(
+        curve_of(motion, i), options, surfaces, frames, motion.distance[i], motion.measured_at[i], work, found
+    )
 
 
 @kernel
-def _stride(
-    r: int, i: int, count: int, scenery: SceneArrays, probes: PointLoads, proposed: Floats, unknown: Numbers
-) -> tuple[float, float]:
-    """How far the proposed forces and the closing boundary move the row [m], and the part of it that may be
-    taken; the change of the unknowns goes to `unknown`."""
-    n_x = probes.unknown.shape[1]
-    rods = scenery.rods
-    turn, pull = 0.0, 0.0
-    for a in range(n_x):
-        value = probes.unknown[r, a, 0]
+def search_robots(
+    thread: int,
+    rows: Ints,
+    rods: ContactRods,
+    surfaces: Surfaces,
+    motion: ContactMotion,
+    found: Records,
+    n_found: Ints,
+    work: SearchWork,
+) -> None:
+    """Candidates of every n-th of these robots, as the thread of this number of n, and its smallest gap into
+    `motion`; -1 candidates where it has gone through an obstacle since the last step."""
+    own = thread_search_work(work, thread)
+    for r in range(thread, len(rows), len(work.known)):
+        i = rows[r]
+        far = motion.tracked[i] and moved_far(i, motion)
+        if far and tunnelled(i, motion, rods.first[i], surfaces, own.stack)[0] >= 0:
+            n_found[r], motion.gap[i] = -1, 0.0
+        else:
+            n_found[r], motion.gap[i] = search_obstacles(_search_of(i, rods, surfaces, motion, own, found[r]))
+
+
+@kernel
+def _limit_step(r: int, world: World, problem: ContactProblem) -> tuple[float, float]:
+    """Motion of row r under the proposed forces and the closing boundary [m], and the fraction of it that may
+    be taken; the change of the unknowns goes to `problem.unknown`."""
+    i, o, loads, rods = world.robot[r], r - world.first, world.loads, world.rods
+    count, proposed, unknown = world.contacts.used[i], problem.proposed[o], problem.unknown[o]
+    rotation, tension = 0.0, 0.0
+    for a in range(loads.unknown.shape[1]):
+        value = loads.unknown[r, a, 0]
         for p in range(count):
             for g in range(3):
-                value += probes.unknown[r, a, 1 + 3 * p + g] * (proposed[r, p, g] - probes.force[r, p, g])
+                value += loads.unknown[r, a, 1 + 3 * p + g] * (proposed[p, g] - loads.force[r, p, g])
         unknown[a] = value
         if a < 3:
-            turn = max(turn, abs(value) / rods.moment_scale[i])
+            rotation = max(rotation, abs(value) / rods.moment_scale[i])
         elif a < 3 + rods.n_free:
-            pull = max(pull, abs(value) / rods.tension_scale[i])
-    move, m = 0.0, probes.motion[r]
+            tension = max(tension, abs(value) / rods.tension_scale[i])
+    move, m = 0.0, loads.motion[r]
     for q in range(count):
         square = 0.0
         for a in range(3):
             v = m[3 * q + a, 0]
             for p in range(count):
                 for g in range(3):
-                    v += m[3 * q + a, 1 + 3 * p + g] * (proposed[r, p, g] - probes.force[r, p, g])
+                    v += m[3 * q + a, 1 + 3 * p + g] * (proposed[p, g] - loads.force[r, p, g])
             square += v * v
         move = max(move, math.sqrt(square))
-    part = min(
+    fraction = min(
         1.0,
-        min(_LONGEST_TURN / max(turn, max(pull, 1e-300)), _LONGEST_MOVE * rods.reach[i] / max(move, 1e-300)),
+        min(
+            _LONGEST_ROTATION / max(rotation, max(tension, 1e-300)),
+            _LONGEST_MOVE * rods.length[i] / max(move, 1e-300),
+        ),
     )
-    return max(move, turn * rods.reach[i]), part
+    return max(move, rotation * rods.length[i]), fraction
 
 
 @kernel
-def _press(
-    r: int, i: int, scenery: SceneArrays, touching: ContactSet, probes: PointLoads, proposed: Floats
-) -> float:
+def _indent(r: int, world: World, proposed: Floats) -> float:
     """How much farther the proposed forces go into soft obstacles, or move free ones [m]; where a rod is
     pressed along its axis nothing else moves."""
-    deepest = 0.0
-    for q in range(touching.used[i]):
-        k = int(touching.slot[i, q, T_OBSTACLE])
-        own = k < len(scenery.surfaces.kind)
-        soft = (
-            scenery.surfaces.compliance[k] + scenery.surfaces.give[k, 0] if own else scenery.rods.compliance
-        )
+    deepest, i, surfaces = 0.0, world.robot[r], world.surfaces
+    for q in range(world.contacts.used[i]):
+        k = world.contacts.contact[i, q].obstacle
+        own = k < len(surfaces.kind)
+        soft = surfaces.compliance[k] + surfaces.mobility[k, 0] if own else world.rods.compliance
         for a in range(3):
-            deepest = max(deepest, soft * abs(proposed[r, q, a] - probes.force[r, q, a]))
+            deepest = max(deepest, soft * abs(proposed[q, a] - world.loads.force[r, q, a]))
     return deepest
 
 
-@inline
-def sweep_of(i: int, scenery: SceneArrays, margin: float) -> ProximityOptions:
-    """How robot i is searched; `margin` is a part of its length, and candidates nearer than a twentieth of an
-    integration step are one."""
-    rods = scenery.rods
-    return ProximityOptions(
+@kernel
+def _apply_law(
+    world: World, stack: Numbers, problem: ContactProblem, trouble: Records
+) -> tuple[bool, float, float]:
+    """Solve the contact problem: whether the law could be solved, how far the farthest row moves or its
+    boundary is open (nan where the numbers are none) [m], and the fraction of the motion that may be
+    taken."""
+    solved = solve_contacts(world, stack, problem)
+    farthest, fraction = 0.0, 1.0
+    for r in range(world.first, world.last):
+        i = world.robot[r]
+        move, most = _limit_step(r, world, problem)
+        residual = world.motion.residual[i]
+        if not (math.isfinite(move) and math.isfinite(residual)):
+            return False, math.nan, 0.0
+        move = max(move, _indent(r, world, problem.proposed[r - world.first]))
+        farthest, fraction = max(farthest, max(move, residual)), min(fraction, most)
+        contacts = world.contacts.contact[i]
+        cause = MOVES if solved else UNSOLVED
+        _name_hardest(trouble[i], cause, max(move, residual), world.contacts.used[i], contacts)
+    return solved, farthest, fraction
+
+
+@kernel
+def _search_world(world: World, problem: ContactProblem, work: SearchWork, trouble: Records) -> float:
+    """Candidates of every row, and the largest violation [m]."""
+    worst, gap = 0.0, world.motion.gap
+    for r in range(world.first, world.last):
+        i, o = world.robot[r], r - world.first
+        found, spacing = problem.found[o], world.rods.spacing[i]
+        search = _search_of(i, world.rods, world.surfaces, world.motion, work, found)
+        count, gap[i] = search_obstacles(search)
+        problem.n_found[o] = count
+        used, contacts = world.contacts.used[i], world.contacts.contact[i]
+        deep, where = violation(count, found, used, contacts, spacing, world.surfaces)
+        worst = max(worst, deep)
+        if deep > world.motion.tolerance:
+            _write(trouble[i], INSIDE, found[where].obstacle, found[where].arclength, deep)
+    return max(worst, search_rods(world.first, world.last, world.robot, rod_search(world), False))
+
+
+@kernel
+def _went_through(world: World, stack: Numbers, trouble: Records) -> bool:
+    """Whether a robot of the world went through an obstacle since the shape before; notes what."""
+    through = False
+    for r in range(world.first, world.last):
+        i, k, s = world.robot[r], -1, 0.0
+        if world.motion.tracked[i]:
+            k, s = tunnelled(i, world.motion, world.rods.first[i], world.surfaces, stack)
+        through = through or k >= 0
+        if k >= 0:
+            _write(trouble[i], THROUGH, k, s, 0.0)
+    return through
+
+
+@kernel
+def _take_step(fraction: float, world: World, problem: ContactProblem, x: Floats) -> None:
+    """Move by this fraction to the proposed forces and the closed boundary."""
+    for r in range(world.first, world.last):
+        i, o, most = world.robot[r], r - world.first, 0.0
+        for q in range(world.contacts.used[i]):
+            force, applied = world.contacts.contact[i, q].force, world.loads.force[r, q]
+            for a in range(3):
+                force[a] = applied[a] + fraction * (problem.proposed[o, q, a] - applied[a])
+                most = max(most, abs(force[a]))
+        for q in range(world.contacts.used[i]):
+            force = world.contacts.contact[i, q].force
+            for a in range(3):
+                if abs(force[a]) <= _NO_FORCE * most:
+                    force[a] = 0.0
+        for a in range(world.loads.unknown.shape[1]):
+            x[i, a] += fraction * problem.unknown[o, a]
+
+
+@kernel
+def _renew_contacts(r: int, world: World, problem: ContactProblem, stack: Numbers) -> None:
+    """The contacts of row r for its next pass."""
+    i, o, rods, surfaces, motion = world.robot[r], r - world.first, world.rods, world.surfaces, world.motion
+    contacts, frames, curve = (
+        world.contacts.contact[i],
+        motion.frames[pick(i, len(motion.frames))],
+        curve_of(motion, i),
+    )
+    n_found, found, margin = problem.n_found[o], problem.found[o], motion.margin * rods.length[i]
+    face_entered_sides(i, n_found, found, motion, rods, surfaces, stack)
+    rules = ContactRules(
+        surfaces,
+        len(frames),
         rods.radius[i],
         rods.n_steps,
-        rods.first[i],
-        margin * rods.reach[i],
-        0.05 * rods.spacing[i],
-        margin > 1.0,
+        curve.arclength,
+        rods.spacing[i],
+        motion.tolerance,
+        _KEPT * margin,
+    )
+    count = choose(n_found, found, world.contacts.used[i], contacts, rules)
+    count = merge(count, contacts, rods.spacing[i])
+    for c in range(count):
+        j, fraction = interval_of(curve, contacts[c].arclength, 0)
+        problem.centre[c, 0], problem.centre[c, 1], problem.centre[c, 2] = point_at(curve, j, fraction)
+    world.contacts.used[i] = add_walls(
+        count, contacts, problem.centre, frames, margin, surfaces, stack, problem.wall
     )
 
 
 @kernel
-def went_through(
-    i: int, scenery: SceneArrays, clearance: Clearance, close: bool, work: Numbers
-) -> tuple[int, float]:
-    """The obstacle that robot i has gone through since the last step, and where on the rod; -1 where there is
-    none. Unless `close` asked only where some node has moved farther than it was away from all."""
-    if not scenery.tracked[i]:
-        return -1, 0.0
-    shape = scenery.shape
-    frames_before = scenery.frames_before[pick(i, len(scenery.frames_before))]
-    frames = scenery.frames[pick(i, len(scenery.frames))]
-    for j in range(shape.arclength.shape[1]):
-        p, q = shape.position[i, j], clearance.position[i, j]
-        close = close or not clearance.distance[i, j] > math.sqrt(
-            (p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2
-        )
-    if not close:
-        return -1, 0.0
-    sweep = sweep_of(i, scenery, scenery.margin)
-    return crosses(
-        curve_of(scenery.before, i), curve_of(shape, i), frames_before, frames, sweep, scenery.surfaces, work
-    )
-
-
-@kernel
-def look_at(
-    i: int, scenery: SceneArrays, clearance: Clearance, found: Floats, work: Numbers
-) -> tuple[int, float]:
-    """Number of candidates of robot i and its smallest gap; -1 where it has gone through an obstacle since
-    the last step."""
-    if went_through(i, scenery, clearance, False, work)[0] >= 0:
-        return -1, 0.0
-    return search_obstacles(
-        curve_of(scenery.shape, i),
-        sweep_of(i, scenery, scenery.margin),
-        scenery.surfaces,
-        scenery.frames[pick(i, len(scenery.frames))],
-        clearance.distance[i],
-        clearance.position[i],
-        work,
-        found,
-    )
-
-
-@kernel
-def iterate_world(
-    first: int,
-    last: int,
-    rows: Ints,
-    scenery: SceneArrays,
-    touching: ContactSet,
-    clearance: Clearance,
-    probes: PointLoads,
-    memory: Memory,
-    proposed: Floats,
-    unknown: Floats,
-    gap: Floats,
-    trouble: Floats,
-    status: Ints,
-    work: Numbers,
-) -> None:
-    """Rows `first` to `last` of one pass. Writes the smallest gap of each row, its status and what keeps it
-    from rest (`trouble` (n_robots, TROUBLE)); a world that is not at rest gets its next forces, unknowns and
-    contacts."""
-    n_slots, n_obstacles, n_x = touching.slot.shape[1], len(scenery.surfaces.kind), probes.unknown.shape[1]
-    solved = apply_law(first, last, rows, scenery, touching, probes, proposed, work)
-    farthest, part = 0.0, 1.0
-    for r in range(first, last):
-        i = rows[r]
-        move, most = _stride(r, i, touching.used[i], scenery, probes, proposed, unknown[r])
-        residual = scenery.shape.residual[i]
-        if not (math.isfinite(move) and math.isfinite(residual)):
-            for lost in range(first, last):
-                status[lost] = LOST
-                _say(trouble[rows[lost]], DIVERGED, -1, 0.0, 0.0)
-            return
-        move = max(move, _press(r, i, scenery, touching, probes, proposed))
-        farthest, part = max(farthest, max(move, residual)), min(part, most)
-        _name_hardest(
-            trouble[i], MOVES if solved else UNSOLVED, max(move, residual), touching.used[i], touching.slot[i]
-        )
-    o, size, worst = 0, _MOST_FOUND * CANDIDATE, 0.0
-    n_found, o = work[o : o + last - first], o + last - first
-    points, o = work[o : o + 3 * n_slots].reshape((n_slots, 3)), o + 3 * n_slots
-    all_found, o = work[o : o + (last - first) * size], o + (last - first) * size
-    scratch = work[o:]
-    for r in range(first, last):
-        i = rows[r]
-        found = all_found[(r - first) * size : (r - first + 1) * size].reshape((_MOST_FOUND, CANDIDATE))
-        count, gap[i] = search_obstacles(
-            curve_of(scenery.shape, i),
-            sweep_of(i, scenery, scenery.margin),
-            scenery.surfaces,
-            scenery.frames[pick(i, len(scenery.frames))],
-            clearance.distance[i],
-            clearance.position[i],
-            scratch,
-            found,
-        )
-        n_found[r - first] = float(count)
-        deep, where = violation(
-            count, found, touching.used[i], touching.slot[i], scenery.rods.spacing[i], scenery.surfaces
-        )
-        worst = max(worst, deep)
-        if deep > scenery.tolerance:
-            _say(trouble[i], INSIDE, int(found[where, 0]), found[where, 1], deep)
-    worst = max(
-        worst,
-        search_rods(
-            first, last, rows, scenery.shape, scenery.rods, touching, n_obstacles, scenery.margin, gap, False
-        ),
-    )
-    if not solved and farthest <= scenery.tolerance:
+def _iterate_world(world: World, rows: ContactRows, problem: ContactProblem, work: SearchWork) -> int:
+    """One contact iteration: the smallest gap of each row and what keeps it from rest; a world that is not at
+    rest gets its next forces, unknowns and contacts. Returns its status."""
+    tolerance, used, contacts = world.motion.tolerance, world.contacts.used, world.contacts.contact
+    solved, farthest, fraction = _apply_law(world, work.stack, problem, rows.trouble)
+    if math.isnan(farthest):
+        for r in range(world.first, world.last):
+            _write(rows.trouble[world.robot[r]], DIVERGED, -1, 0.0, 0.0)
+        return LOST
+    worst = _search_world(world, problem, work, rows.trouble)
+    if not solved and farthest <= tolerance:
         solved = True
-        for r in range(first, last):
-            solved = solved and stands(touching.used[rows[r]], touching.slot[rows[r]], scenery.tolerance)
-    rest = solved and farthest <= scenery.tolerance and worst <= scenery.tolerance
-    through = False
-    for r in range(first, last):
-        trouble[rows[r], 4] = max(farthest, worst)
-    damped = scenery.damping[rows[first]] > 0.0
-    for r in range(first, last if rest or damped else first):
-        crossed, where_s = went_through(rows[r], scenery, clearance, True, scratch)
-        through = through or crossed >= 0
-        if crossed >= 0:
-            _say(trouble[rows[r]], THROUGH, crossed, where_s, 0.0)
-        elif rest:
-            _say(trouble[rows[r]], NOTHING, -1, 0.0, 0.0)
-    back = damped and (through or not solved)
-    for r in range(first, last):
-        status[r] = BACK if back else LOST if through else AT_REST if rest else GOES_ON
-    if rest or back:
-        for r in range(first, last if rest else first):
-            touching.used[rows[r]] = pressed_only(touching.used[rows[r]], touching.slot[rows[r]])
-        return
-    for r in range(first, last):
-        i = rows[r]
-        slot, most = touching.slot[i], 0.0
-        for q in range(touching.used[i]):
-            for a in range(3):
-                slot[q, T_FORCE + a] = probes.force[r, q, a] + part * (
-                    proposed[r, q, a] - probes.force[r, q, a]
-                )
-                most = max(most, abs(slot[q, T_FORCE + a]))
-        for q in range(touching.used[i]):
-            for a in range(3):
-                if abs(slot[q, T_FORCE + a]) <= _NO_FORCE * most:
-                    slot[q, T_FORCE + a] = 0.0
-        for a in range(n_x):
-            memory.x[i, a] += part * unknown[r, a]
-    for r in range(first, last):
-        i = rows[r]
-        found = all_found[(r - first) * size : (r - first + 1) * size].reshape((_MOST_FOUND, CANDIDATE))
-        _renew(
-            i, int(n_found[r - first]), found, points, curve_of(scenery.shape, i), scenery, touching, scratch
+        for r in range(world.first, world.last):
+            i = world.robot[r]
+            solved = solved and stands(used[i], contacts[i], tolerance)
+    for r in range(world.first, world.last):
+        rows.trouble[world.robot[r]].from_rest = max(farthest, worst)
+    rest = solved and farthest <= tolerance and worst <= tolerance
+    damped = damping_of(world) > 0.0
+    through = (rest or damped) and _went_through(world, work.stack, rows.trouble)
+    if rest:
+        for r in range(world.first, world.last):
+            i = world.robot[r]
+            if rows.trouble[i].cause != THROUGH:
+                _write(rows.trouble[i], NOTHING, -1, 0.0, 0.0)
+            used[i] = pressed_only(used[i], contacts[i])
+    if damped and (through or not solved):
+        return BACK
+    if rest:
+        return LOST if through else AT_REST
+    _take_step(fraction, world, problem, rows.x)
+    for r in range(world.first, world.last):
+        _renew_contacts(r, world, problem, work.stack)
+    search_rods(world.first, world.last, world.robot, rod_search(world), True)
+    return GOES_ON
+
+
+@kernel
+def iterate_worlds(thread: int, batch: ContactIteration) -> None:
+    """One contact iteration of every n-th world, as the thread of this number of n."""
+    rows, problem = batch.rows, thread_problem(batch.problem, thread)
+    work = thread_search_work(batch.search, thread)
+    for k in range(thread, len(rows.start) - 1, len(batch.problem.first_point)):
+        world = World(
+            rows.start[k],
+            rows.start[k + 1],
+            rows.robot,
+            batch.rods,
+            batch.surfaces,
+            batch.motion,
+            batch.contacts,
+            batch.loads,
         )
-    search_rods(
-        first, last, rows, scenery.shape, scenery.rods, touching, n_obstacles, scenery.margin, gap, True
-    )
+        status = _iterate_world(world, rows, problem, work)
+        for r in range(world.first, world.last):
+            rows.status[r] = status
 
 
 @inline
-def _say(trouble: Numbers, what: int, obstacle: int, s: float, size: float) -> None:
+def _write(trouble: Record, cause: int, obstacle: int, s: float, distance: float) -> None:
     """Write what keeps a robot from rest."""
-    trouble[0], trouble[1], trouble[2], trouble[3] = float(what), float(obstacle), s, size
+    trouble.cause, trouble.obstacle, trouble.arclength, trouble.distance = cause, obstacle, s, distance
 
 
 @kernel
-def _name_hardest(trouble: Numbers, what: int, size: float, count: int, slot: Floats) -> None:
+def _name_hardest(trouble: Record, cause: int, size: float, count: int, contacts: Records) -> None:
     """Write trouble of this size at the contact that presses hardest."""
     hardest, at = 0.0, -1
     for c in range(count):
-        f = slot_force(slot[c])
+        f = force_of(contacts[c])
         if dot(f, f) >= hardest:
             hardest, at = dot(f, f), c
-    _say(trouble, what, int(slot[at, T_OBSTACLE]) if at >= 0 else -1, slot[at, T_S] if at >= 0 else 0.0, size)
-
-
-@kernel
-def _face(i: int, n_found: int, found: Floats, scenery: SceneArrays, stack: Numbers) -> None:
-    """Candidates whose centreline is inside an obstacle face the side by which it came in."""
-    if not scenery.tracked[i]:
-        return
-    before, curve, rods = curve_of(scenery.before, i), curve_of(scenery.shape, i), scenery.rods
-    frames_before, frames = (
-        scenery.frames_before[pick(i, len(scenery.frames_before))],
-        scenery.frames[pick(i, len(scenery.frames))],
-    )
-    seen = False
-    for f in range(n_found):
-        s, k = found[f, 1], int(found[f, 0])
-        radius = rods.radius[i, segment_at(curve.arclength, rods.n_steps, s)]
-        if found[f, 2] + radius >= 0.0:
-            continue
-        d, n = entered(k, before, curve, s, frames_before[k], frames[k], scenery.surfaces, stack)
-        # across a thin plate the nearest side says nothing: the deepest node does
-        for j in range(0 if seen else len(curve.arclength)):
-            if curve.arclength[j] > rods.first[i]:
-                d_j, n_j = entered(
-                    k, before, curve, curve.arclength[j], frames_before[k], frames[k], scenery.surfaces, stack
-                )
-                if d_j < FAR and (d_j < d or d == FAR):
-                    d, n, s = d_j, n_j, curve.arclength[j]
-        seen = True
-        if d < FAR:
-            radius = rods.radius[i, segment_at(curve.arclength, rods.n_steps, s)]
-            found[f, 1], found[f, 2], found[f, 3], found[f, 4], found[f, 5] = s, d - radius, n[0], n[1], n[2]
-
-
-@kernel
-def _renew(
-    i: int,
-    n_found: int,
-    found: Floats,
-    points: Floats,
-    curve: Curve,
-    scenery: SceneArrays,
-    touching: ContactSet,
-    scratch: Numbers,
-) -> None:
-    """The contacts of robot i for its next pass."""
-    slot, rods, frames = touching.slot[i], scenery.rods, scenery.frames[pick(i, len(scenery.frames))]
-    spacing = rods.spacing[i]
-    margin = scenery.margin * rods.reach[i]
-    _face(i, n_found, found, scenery, scratch)
-    count = choose(
-        n_found,
-        found,
-        touching.used[i],
-        slot,
-        len(frames),
-        rods.radius[i],
-        scenery.surfaces,
-        rods.n_steps,
-        curve.arclength,
-        spacing,
-        scenery.tolerance,
-        0.2 * margin,
-    )
-    count = merge(count, slot, spacing)
-    for c in range(count):
-        j, part = interval_of(curve, slot[c, T_S], 0)
-        points[c, 0], points[c, 1], points[c, 2] = point_at(curve, j, part)
-    touching.used[i] = add_walls(
-        count, slot, points, frames, margin, scenery.surfaces, scratch[2 * STACK :], scratch
-    )
+    if at >= 0:
+        _write(trouble, cause, contacts[at].obstacle, contacts[at].arclength, size)
+    else:
+        _write(trouble, cause, -1, 0.0, size)

@@ -1,4 +1,4 @@
-"""Obstacles that are free: how a rod's forces move them within the step, beside how they move the rod."""
+"""Mobility of free bodies: motion of obstacles within the step under the forces of rods."""
 
 from __future__ import annotations
 
@@ -10,42 +10,49 @@ from .bvh import Numbers
 
 
 @inline
-def axis_of(axes: Numbers, a: int) -> Vec:
+def axis_of(axes: Floats, a: int) -> Vec:
     """Axis a (normal, two tangents) of a contact, world."""
-    return axes[3 * a], axes[3 * a + 1], axes[3 * a + 2]
+    return axes[a, 0], axes[a, 1], axes[a, 2]
 
 
 @inline
-def given_way(give: Numbers, here: Vec, there: Vec, force: Vec) -> Vec:
+def point_of(rows: Floats, i: int) -> Vec:
+    """Row i as a vector."""
+    row = rows[i]
+    return row[0], row[1], row[2]
+
+
+@inline
+def motion_under(mobility: Numbers, here: Vec, there: Vec, force: Vec) -> Vec:
     """Motion of a body at `here` under a force at `there`: f t + (W (r x f)) x q, r and q from its centre of
     mass."""
-    centre = (give[10], give[11], give[12])
+    centre = (mobility[10], mobility[11], mobility[12])
     moment = cross(sub(there, centre), force)
-    turn = (
-        give[1] * moment[0] + give[2] * moment[1] + give[3] * moment[2],
-        give[4] * moment[0] + give[5] * moment[1] + give[6] * moment[2],
-        give[7] * moment[0] + give[8] * moment[1] + give[9] * moment[2],
+    rotation = (
+        mobility[1] * moment[0] + mobility[2] * moment[1] + mobility[3] * moment[2],
+        mobility[4] * moment[0] + mobility[5] * moment[1] + mobility[6] * moment[2],
+        mobility[7] * moment[0] + mobility[8] * moment[1] + mobility[9] * moment[2],
     )
-    return axpy(1.0, cross(turn, sub(here, centre)), scale(give[0], force))
+    return axpy(1.0, cross(rotation, sub(here, centre)), scale(mobility[0], force))
 
 
 @kernel
 def add_mobility(
-    m: int, touched: Numbers, place: Numbers, axes: Numbers, body: Ints, give: Floats, W: Floats
+    m: int, obstacle: Ints, place: Floats, axes: Floats, body: Ints, mobility: Floats, W: Floats
 ) -> None:
-    """Add to the compliance W of m contacts what the bodies of the obstacles `touched` (-1: a rod) give way,
-    both sides being pushed apart by the same force at `place` (3 each, world)."""
+    """Add the motion of free bodies to the compliance W (3 m, 3 m) of m contacts with these obstacles (-1: a
+    rod): rod and body are pushed apart by the same force at `place` (m, 3), world; `axes` (m, 3, 3)."""
     for c in range(m):
-        k = int(touched[c])
-        if k < 0 or not give[k, 0] > 0.0:
+        k = obstacle[c]
+        if k < 0 or not mobility[k, 0] > 0.0:
             continue
-        here = (place[3 * c], place[3 * c + 1], place[3 * c + 2])
+        here = point_of(place, c)
         for e in range(m):
-            h = int(touched[e])
+            h = obstacle[e]
             if h < 0 or body[h] != body[k]:
                 continue
-            there = (place[3 * e], place[3 * e + 1], place[3 * e + 2])
+            there = point_of(place, e)
             for d in range(3):
-                moved = given_way(give[k], here, there, axis_of(axes[9 * e :], d))
+                moved = motion_under(mobility[k], here, there, axis_of(axes[e], d))
                 for a in range(3):
-                    W[3 * c + a, 3 * e + d] += dot(axis_of(axes[9 * c :], a), moved)
+                    W[3 * c + a, 3 * e + d] += dot(axis_of(axes[c], a), moved)

@@ -58,7 +58,7 @@ def ray_primitive(kind: int, size: Vec, p: Vec, direction: Vec, longest: float) 
     """Length to the surface along a unit direction, by stepping to tangent planes; FAR where it is not met up
     to `longest`."""
     if signed_primitive(kind, size, p)[0] < 0.0:
-        return _way_out(kind, size, p, direction, longest)
+        return _exit_length(kind, size, p, direction, longest)
     t = 0.0
     for _ in range(512):
         d, n = signed_primitive(kind, size, axpy(t, direction, p))
@@ -75,7 +75,7 @@ def ray_primitive(kind: int, size: Vec, p: Vec, direction: Vec, longest: float) 
 
 
 @kernel
-def _way_out(kind: int, size: Vec, p: Vec, direction: Vec, longest: float) -> float:
+def _exit_length(kind: int, size: Vec, p: Vec, direction: Vec, longest: float) -> float:
     """From inside: the distance is convex along the ray, so it has one root there; by doubling, then
     bisection."""
     low, high = 0.0, 1e-3

@@ -1,35 +1,59 @@
-"""Where rods come near each other, or one rod near itself: minima of the distance between two centrelines.
+"""Rod-rod proximity: minima of the distance between two centrelines, or of one from itself.
 
 Pairs of intervals that cannot be near are skipped by as many intervals as their distance allows. From the
-closest points of two chords a Newton iteration finds the minimum on the curves. Both rods get a slot; the
-same number in T_TWIN links them.
+closest points of two chords a Newton iteration finds the minimum on the curves. Both rods get a contact; the
+same number in `partner` links them.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
-from fastrod.types import ContactRods, ContactSet, Floats, Ints, RodShape
+from fastrod.types import ContactMotion, ContactRods, ContactSet, Ints
 
 from ..jit import inline, kernel
 from ..vec import Vec, axpy, dot, scale, sub
 from .bvh import FAR
 from .centreline import Curve, curve_of, interval_of, point_at, tangent_at
-from .contact_set import T_GAP, T_OBSTACLE, T_S, T_TWIN, open_slot, segment_at
+from .contact_set import open_contact, segment_at
 
-_ROUNDS = 12
+_ROUNDS = 12  # of Newton's method, which doubles the digits of the chords' answer at each
+
+
+class RodSearch(NamedTuple):
+    """The rods of a batch and their contacts."""
+
+    motion: ContactMotion
+    rods: ContactRods
+    contacts: ContactSet
+    n_obstacles: int
+    margin: float
+    """Gap below which a minimum is a contact, as a fraction of the rod's length."""
+
+
+class Nearest(NamedTuple):
+    """A minimum of the distance between two centrelines."""
+
+    s: float
+    """Arclength on the first [m]."""
+    t: float
+    """Arclength on the other [m]."""
+    distance: float
+    normal: Vec
+    """From the other to the first, world."""
 
 
 @kernel
-def twin_of(touching: ContactSet, n_obstacles: int, robot: int, q: int) -> int:
-    """Slot on the other rod that belongs to slot q of `robot`."""
-    slot = touching.slot[robot, q]
-    other = int(slot[T_OBSTACLE]) - n_obstacles
-    for p in range(touching.used[other]):
-        twin = touching.slot[other, p]
+def partner_of(contacts: ContactSet, n_obstacles: int, robot: int, q: int) -> int:
+    """Number of the contact on the other rod that belongs to contact q of `robot`."""
+    contact = contacts.contact[robot, q]
+    other = contact.obstacle - n_obstacles
+    for p in range(contacts.used[other]):
+        partner = contacts.contact[other, p]
         if (
-            twin[T_TWIN] == slot[T_TWIN]
-            and int(twin[T_OBSTACLE]) == n_obstacles + robot
+            partner.partner == contact.partner
+            and partner.obstacle == n_obstacles + robot
             and not (other == robot and p == q)
         ):
             return p
@@ -58,10 +82,8 @@ def _closest_on_chords(p: Vec, u: Vec, q: Vec, v: Vec) -> tuple[float, float]:
 
 
 @kernel
-def _nearest_on_curves(
-    a: Curve, b: Curve, s: float, t: float, low_a: float, low_b: float
-) -> tuple[float, float, float, Vec]:
-    """Arclengths of the minimum near s and t, the distance there and the direction from b to a."""
+def _nearest_on_curves(a: Curve, b: Curve, s: float, t: float, low_a: float, low_b: float) -> Nearest:
+    """The minimum near the arclengths s and t."""
     end_a, end_b = a.arclength[len(a.arclength) - 1], b.arclength[len(b.arclength) - 1]
     e = (0.0, 0.0, 1.0)
     for _ in range(_ROUNDS):
@@ -81,90 +103,82 @@ def _nearest_on_curves(
         if moved < 1e-12:
             break
     length = math.sqrt(dot(e, e))
-    return s, t, length, scale(1.0 / length, e) if length > 1e-12 else (1.0, 0.0, 0.0)
+    return Nearest(s, t, length, scale(1.0 / length, e) if length > 1e-12 else (1.0, 0.0, 0.0))
 
 
 @kernel
-def _known(
-    touching: ContactSet, n_obstacles: int, robot: int, other: int, s: float, t: float, spacing: float
-) -> int:
-    """Slot of `robot` that holds this contact with `other` already; -1 if none does."""
-    for q in range(touching.used[robot]):
-        slot = touching.slot[robot, q]
-        if int(slot[T_OBSTACLE]) == n_obstacles + other and abs(slot[T_S] - s) < spacing:
-            p = twin_of(touching, n_obstacles, robot, q)
-            if p >= 0 and abs(touching.slot[other, p][T_S] - t) < spacing:
+def _known(robot: int, other: int, near: Nearest, search: RodSearch) -> int:
+    """Contact of `robot` that holds this minimum with `other` already; -1 if none does."""
+    contacts, spacing = search.contacts, search.rods.spacing[robot]
+    for q in range(contacts.used[robot]):
+        contact = contacts.contact[robot, q]
+        if contact.obstacle == search.n_obstacles + other and abs(contact.arclength - near.s) < spacing:
+            p = partner_of(contacts, search.n_obstacles, robot, q)
+            if p >= 0 and abs(contacts.contact[other, p].arclength - near.t) < spacing:
                 return q
     return -1
 
 
+@inline
+def _radius_at(i: int, s: float, search: RodSearch) -> float:
+    """Of robot i at arclength s [m]."""
+    return float(search.rods.radius[i, segment_at(search.motion.arclength[i], search.rods.n_steps, s)])
+
+
 @kernel
-def _add_pair(
-    touching: ContactSet,
-    n_obstacles: int,
-    robot: int,
-    other: int,
-    s: float,
-    t: float,
-    n: Vec,
-    gap: float,
-    rods: ContactRods,
-    a: Curve,
-    b: Curve,
-) -> bool:
-    """A slot on both rods, linked by a number that neither has used; False where one of them is full."""
+def _add_pair(robot: int, other: int, near: Nearest, gap: float, search: RodSearch) -> bool:
+    """A contact on both rods, linked by a number that neither has used; False where one of them is full."""
+    used, contact = search.contacts.used, search.contacts.contact
     need = 2 if robot == other else 1
-    most = touching.slot.shape[1]
-    if touching.used[robot] + need > most or touching.used[other] + need > most:
+    most = contact.shape[1]
+    if used[robot] + need > most or used[other] + need > most:
         return False
-    link = 0.0
+    link = 0
     for i in range(2):
         which = robot if i == 0 else other
-        for q in range(touching.used[which]):
-            link = max(link, touching.slot[which, q, T_TWIN] + 1.0)
-    r_a = rods.radius[robot, segment_at(a.arclength, rods.n_steps, s)]
-    r_b = rods.radius[other, segment_at(b.arclength, rods.n_steps, t)]
-    open_slot(
-        touching.slot[robot, touching.used[robot]],
-        n_obstacles + other,
-        s,
-        int(link),
-        n,
-        gap,
-        r_a,
-        rods.friction,
-    )
-    touching.used[robot] += 1
-    open_slot(
-        touching.slot[other, touching.used[other]],
-        n_obstacles + robot,
-        t,
-        int(link),
-        scale(-1.0, n),
-        gap,
-        r_b,
-        rods.friction,
-    )
-    touching.used[other] += 1
+        for q in range(used[which]):
+            link = max(link, contact[which, q].partner + 1)
+    for i in range(2):
+        which, touched = (robot, other) if i == 0 else (other, robot)
+        s, n = (near.s, near.normal) if i == 0 else (near.t, scale(-1.0, near.normal))
+        new = contact[which, used[which]]
+        radius = _radius_at(which, s, search)
+        open_contact(new, search.n_obstacles + touched, s, n, gap, radius, search.rods.friction)
+        new.partner = link
+        used[which] += 1
     return True
 
 
 @kernel
-def _search_pair(
-    robot: int,
-    other: int,
-    shape: RodShape,
-    rods: ContactRods,
-    touching: ContactSet,
-    n_obstacles: int,
-    margin: float,
-    gap: Floats,
-    add: bool,
-) -> float:
-    a, b = curve_of(shape, robot), curve_of(shape, other)
+def _hold_nearest(robot: int, other: int, near: Nearest, search: RodSearch, add: bool) -> float:
+    """Lower both gaps to this minimum; with `add` a contact of the two moves there, or is opened. Returns the
+    violation [m]."""
+    gap = near.distance - (_radius_at(robot, near.s, search) + _radius_at(other, near.t, search))
+    least = search.motion.gap
+    least[robot], least[other] = min(least[robot], gap), min(least[other], gap)
+    known = _known(robot, other, near, search)
+    if known >= 0:
+        contact = search.contacts.contact[robot, known]
+        violated = min(0.0, contact.gap) - gap
+        if add and gap < contact.gap - 1e-10:
+            contact.arclength = near.s
+            partner = partner_of(search.contacts, search.n_obstacles, robot, known)
+            search.contacts.contact[other, partner].arclength = near.t
+        return float(violated)
+    if not gap < search.margin * search.rods.length[robot]:
+        return 0.0
+    if add:
+        _add_pair(robot, other, near, gap, search)
+    return float(-gap)
+
+
+@kernel
+def _search_pair(robot: int, other: int, search: RodSearch, add: bool) -> float:
+    """Violation of the contacts between two robots, or of one with itself [m]."""
+    rods = search.rods
+    a, b = curve_of(search.motion, robot), curve_of(search.motion, other)
     n = len(a.arclength)
-    worst, length = 0.0, rods.reach[robot]
-    thickest = 0.0
+    worst, length, thickest = 0.0, rods.length[robot], 0.0
     for k in range(rods.radius.shape[1]):
         thickest = max(thickest, rods.radius[robot, k] + rods.radius[other, k])
     # along one rod, nearer is no contact
@@ -186,7 +200,7 @@ def _search_pair(
             q = point_at(b, j, 0.0)
             v = sub(point_at(b, j, 1.0), q)
             between = sub(axpy(0.5, u, p), axpy(0.5, v, q))
-            spare = math.sqrt(dot(between, between)) - 0.5 * (h_a + h_b) - thickest - margin * length
+            spare = math.sqrt(dot(between, between)) - 0.5 * (h_a + h_b) - thickest - search.margin * length
             if spare > 0.0:
                 s = b.arclength[j] + max(spare, 0.0)
                 j += 1
@@ -194,55 +208,21 @@ def _search_pair(
                     j += 1
                 continue
             x, y = _closest_on_chords(p, u, q, v)
-            s, t, distance, normal = _nearest_on_curves(
-                a, b, a.arclength[i] + x * h_a, b.arclength[j] + y * h_b, rods.first[robot], rods.first[other]
-            )
-            here = (
-                abs(s - a.arclength[i] - x * h_a) < 2.0 * h_a
-                and abs(t - b.arclength[j] - y * h_b) < 2.0 * h_b
-            )
-            if here and not (robot == other and t - s < apart):
-                thick = (
-                    rods.radius[robot, segment_at(a.arclength, rods.n_steps, s)]
-                    + rods.radius[other, segment_at(b.arclength, rods.n_steps, t)]
-                )
-                open_gap = distance - thick
-                gap[robot], gap[other] = min(gap[robot], open_gap), min(gap[other], open_gap)
-                known = _known(touching, n_obstacles, robot, other, s, t, rods.spacing[robot])
-                if known >= 0:
-                    slot = touching.slot[robot, known]
-                    worst = max(worst, min(0.0, slot[T_GAP]) - open_gap)
-                    if add and open_gap < slot[T_GAP] - 1e-10:
-                        slot[T_S] = s
-                        touching.slot[other, twin_of(touching, n_obstacles, robot, known)][T_S] = t
-                elif open_gap < margin * length:
-                    worst = max(worst, -open_gap)
-                    if add:
-                        _add_pair(touching, n_obstacles, robot, other, s, t, normal, open_gap, rods, a, b)
+            s_chord, t_chord = a.arclength[i] + x * h_a, b.arclength[j] + y * h_b
+            near = _nearest_on_curves(a, b, s_chord, t_chord, rods.first[robot], rods.first[other])
+            here = abs(near.s - s_chord) < 2.0 * h_a and abs(near.t - t_chord) < 2.0 * h_b
+            if here and not (robot == other and near.t - near.s < apart):
+                worst = max(worst, _hold_nearest(robot, other, near, search, add))
             j += 1
     return worst
 
 
 @kernel
-def search_rods(
-    first: int,
-    last: int,
-    rows: Ints,
-    shape: RodShape,
-    rods: ContactRods,
-    touching: ContactSet,
-    n_obstacles: int,
-    margin: float,
-    gap: Floats,
-    add: bool,
-) -> float:
-    """Violation of the contacts between the robots of one world [m]; with `add` they are also moved and new
-    ones added."""
+def search_rods(first: int, last: int, rows: Ints, search: RodSearch, add: bool) -> float:
+    """Violation of the contacts between the robots of one world, the `rows` from `first` to `last` [m]; with
+    `add` they are also moved and new ones added."""
     worst = 0.0
     for r in range(first, last):
-        for other in range(r if rods.own else r + 1, last):
-            worst = max(
-                worst,
-                _search_pair(rows[r], rows[other], shape, rods, touching, n_obstacles, margin, gap, add),
-            )
+        for other in range(r if search.rods.own else r + 1, last):
+            worst = max(worst, _search_pair(rows[r], rows[other], search, add))
     return worst

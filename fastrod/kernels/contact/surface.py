@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import math
 
-from fastrod.types import Surfaces
+from fastrod.types import Records, Surfaces
 
 from ..jit import inline, kernel
 from ..vec import Mat, Vec, dot, mul, mul_t, sub
-from .bvh import FAR, Numbers, corner, facing_planes, first_hit, nearest_triangle, signed_triangle
+from .bvh import FAR, Numbers, corner, facing_planes, first_hit, nearest_triangle, normal_of, signed_triangle
 from .primitive import BOX, CAPSULE, MESH, PLANE, SPHERE, ray_primitive, signed_primitive
 
 MOST_PLANES = 4
+"""Walls that a point is given at once: three make a corner, one more is to spare."""
 
 
 @inline
-def turn_of(frame: Numbers) -> Mat:
+def rotation_of(frame: Numbers) -> Mat:
     """world_from_obstacle rotation; a frame is that, row by row, then the position."""
     return frame[0], frame[1], frame[2], frame[3], frame[4], frame[5], frame[6], frame[7], frame[8]
 
@@ -23,7 +24,7 @@ def turn_of(frame: Numbers) -> Mat:
 @inline
 def to_obstacle(frame: Numbers, p: Vec) -> Vec:
     """R^T (p - o): the world point p in the obstacle's frame."""
-    return mul_t(turn_of(frame), (p[0] - frame[9], p[1] - frame[10], p[2] - frame[11]))
+    return mul_t(rotation_of(frame), (p[0] - frame[9], p[1] - frame[10], p[2] - frame[11]))
 
 
 @inline
@@ -49,11 +50,11 @@ def signed_distance(
         return lower, nothing, False
     if surfaces.kind[k] != MESH:
         d, n = signed_primitive(surfaces.kind[k], _size(k, surfaces), local)
-        return d, mul(turn_of(frame), n), True
+        return d, mul(rotation_of(frame), n), True
     d, n, triangle = signed_triangle(local, bound, surfaces.root[k], surfaces, stack)
     if triangle < 0:
         return bound, nothing, False
-    return d, mul(turn_of(frame), n), True
+    return d, mul(rotation_of(frame), n), True
 
 
 @kernel
@@ -61,22 +62,20 @@ def walls(
     k: int,
     frame: Numbers,
     p: Vec,
-    reach: float,
+    limit: float,
     nearest: float,
     surfaces: Surfaces,
     stack: Numbers,
-    found: Numbers,
+    found: Records,
 ) -> int:
-    """Faces of obstacle k around the world point p, nearer than `reach` (`facing_planes`), normals in the
+    """Faces of obstacle k around the world point p, nearer than `limit` (`facing_planes`), normals in the
     world; `nearest` is its distance."""
     if surfaces.kind[k] != MESH:
         return 0
-    n = facing_planes(
-        to_obstacle(frame, p), reach, nearest, surfaces.root[k], surfaces, stack, found, MOST_PLANES
-    )
+    n = facing_planes(to_obstacle(frame, p), limit, nearest, surfaces.root[k], surfaces, stack, found)
     for j in range(n):
-        normal = mul(turn_of(frame), (found[5 * j + 1], found[5 * j + 2], found[5 * j + 3]))
-        found[5 * j + 1], found[5 * j + 2], found[5 * j + 3] = normal
+        normal = found[j].normal
+        normal[0], normal[1], normal[2] = mul(rotation_of(frame), normal_of(found[j]))
     return n
 
 
@@ -86,27 +85,27 @@ def ray_hit(
 ) -> tuple[float, Vec]:
     """Length to obstacle k along a unit direction, up to `longest`, and the outward normal there; FAR where
     it is not met."""
-    local, along = to_obstacle(frame, p), mul_t(turn_of(frame), direction)
+    local, along = to_obstacle(frame, p), mul_t(rotation_of(frame), direction)
     if surfaces.kind[k] == MESH:
         t, triangle = first_hit(local, along, longest, surfaces.root[k], surfaces, stack)
         if triangle < 0:
             return FAR, (0.0, 0.0, 0.0)
         row = surfaces.normal[triangle, 0]
-        return t, mul(turn_of(frame), (row[0], row[1], row[2]))
+        return t, mul(rotation_of(frame), (row[0], row[1], row[2]))
     t = ray_primitive(surfaces.kind[k], _size(k, surfaces), local, along, longest)
     if t >= FAR:
         return FAR, (0.0, 0.0, 0.0)
     at = (local[0] + t * along[0], local[1] + t * along[1], local[2] + t * along[2])
-    return t, mul(turn_of(frame), signed_primitive(surfaces.kind[k], _size(k, surfaces), at)[1])
+    return t, mul(rotation_of(frame), signed_primitive(surfaces.kind[k], _size(k, surfaces), at)[1])
 
 
 @kernel
 def surface_curvature(
     k: int, frame: Numbers, p: Vec, surfaces: Surfaces, stack: Numbers
 ) -> tuple[float, float, Vec]:
-    """How the normal of obstacle k turns as the world point p, outside, moves across it: by the first number
-    per length [1/m], and along the unit direction that is returned by the second. (The second derivative of
-    the distance.)"""
+    """Principal curvatures of the distance from obstacle k at the world point p, outside: rotation of the
+    normal per length as p moves across the unit direction that is returned, and along it [1/m]. (The second
+    derivative of the distance.)"""
     local = to_obstacle(frame, p)
     kind, size = surfaces.kind[k], _size(k, surfaces)
     first, second, along = 0.0, 0.0, (0.0, 0.0, 1.0)
@@ -147,4 +146,4 @@ def surface_curvature(
             along = (-local[1] / radial, local[0] / radial, 0.0)
         elif over <= 0.0 and radial - size[0] >= over:
             first = 1.0 / radial
-    return first, second, mul(turn_of(frame), along)
+    return first, second, mul(rotation_of(frame), along)

@@ -131,7 +131,7 @@ class TubeInsert(Task):
             dt=self.dt,
             points_per_segment=10,
             threads=options.threads,
-            contact=ContactScene(obstacles=[mesh(tube_mesh(), name="tube")], max_passes=250),
+            contact=ContactScene(obstacles=[mesh(tube_mesh(), name="tube")], max_iterations=250),
         )
         self._set_fields()
         self.displacement: Floats = np.zeros((n_envs, 5))
