@@ -54,8 +54,8 @@ def one_compilation() -> Iterator[None]:
         "pass_parallel",
         "iterate_serial",
         "iterate_parallel",
-        "look_serial",
-        "look_parallel",
+        "search_serial",
+        "search_parallel",
         "move_to_inputs",
     )
     counts = {name: len(getattr(batch, name).signatures) for name in big}

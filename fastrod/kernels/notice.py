@@ -10,7 +10,7 @@ from typing import Any
 from numba.core import event
 
 _register: Any = event.register  # it has no types
-_CONTACT = ("iterate_serial", "iterate_parallel", "look_serial", "look_parallel")
+_CONTACT = ("iterate_serial", "iterate_parallel", "search_serial", "search_parallel")
 
 
 class _Notice(event.Listener):

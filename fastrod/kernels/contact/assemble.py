@@ -18,7 +18,7 @@ from .bvh import Numbers, Record, normal_of
 from .centreline import curve_slip, interval_of, point_at, rotation_at
 from .contact_set import arm_of, force_of, set_normal, wall_at
 from .mobility import add_mobility, axis_of
-from .problem import World, node_position
+from .problem import ContactWorld, node_position
 from .tunnelling import carried
 
 
@@ -32,7 +32,7 @@ def tangents(n: Vec) -> tuple[Vec, Vec]:
 
 
 @kernel
-def _material_before(i: int, node: int, contact: Record, world: World) -> Vec:
+def _material_before(i: int, node: int, contact: Record, world: ContactWorld) -> Vec:
     """Position at the last step of the rod's material point of contact, world."""
     before = curve_slip(world.motion, i)
     rotation = world.motion.rotation[i, node]
@@ -47,7 +47,7 @@ def _material_before(i: int, node: int, contact: Record, world: World) -> Vec:
 
 
 @kernel
-def _measure_obstacle(r: int, q: int, world: World, stack: Numbers, problem: ContactProblem) -> Vec:
+def _measure_obstacle(r: int, q: int, world: ContactWorld, stack: Numbers, problem: ContactProblem) -> Vec:
     """Gap and normal of a contact with an obstacle on the present shape, kept in it; the slip since the last
     step (world)."""
     i, motion = world.robot[r], world.motion
@@ -65,7 +65,7 @@ def _measure_obstacle(r: int, q: int, world: World, stack: Numbers, problem: Con
 
 
 @kernel
-def _measure_rods(r: int, q: int, other: int, q_other: int, world: World) -> Vec:
+def _measure_rods(r: int, q: int, other: int, q_other: int, world: ContactWorld) -> Vec:
     """Gap and normal of a contact between two rods, kept in both its sides; the slip (world)."""
     i, b = world.robot[r], world.robot[other]
     contact, partner = world.contacts.contact[i, q], world.contacts.contact[b, q_other]
@@ -91,7 +91,14 @@ def _measure_rods(r: int, q: int, other: int, q_other: int, world: World) -> Vec
 
 @kernel
 def measure(
-    r: int, q: int, other: int, q_other: int, world: World, stack: Numbers, problem: ContactProblem, m: int
+    r: int,
+    q: int,
+    other: int,
+    q_other: int,
+    world: ContactWorld,
+    stack: Numbers,
+    problem: ContactProblem,
+    m: int,
 ) -> None:
     """Measure contact q of row r (against contact `q_other` of row `other`, or an obstacle if that is -1) and
     write it as contact m of the problem."""
@@ -122,7 +129,7 @@ def measure(
 
 
 @kernel
-def assemble_model(world: World, problem: ContactProblem) -> int:
+def assemble_model(world: ContactWorld, problem: ContactProblem) -> int:
     """The linear models of all rows side by side, the forces that they belong to, and the change that takes
     these away. Returns how many contact points there are."""
     n, used, model = 0, world.contacts.used, problem.model
@@ -173,7 +180,7 @@ def _coupling(c: int, e: int, a: int, b: int, point: Ints, axes: Floats, model: 
 
 
 @kernel
-def assemble_delassus(m: int, n: int, world: World, problem: ContactProblem) -> None:
+def assemble_delassus(m: int, n: int, world: ContactWorld, problem: ContactProblem) -> None:
     """The Delassus matrix of m contacts, from the model of n contact points and the mobility of free bodies,
     and their motion without contact forces."""
     point, axes, model, delassus = problem.point, problem.axes, problem.model, problem.delassus

@@ -16,7 +16,7 @@ from .assemble import moved
 from .bvh import Numbers, normal_of
 from .contact_law import solve_dense
 from .contact_set import force_of
-from .problem import World, node_position
+from .problem import ContactWorld, node_position
 from .surface import surface_curvature
 
 _FORGETS, _FRACTION_KEPT = 0.5, 0.3
@@ -57,7 +57,14 @@ def _across(first: float, second: float, along: Vec, n: Vec, v: Vec) -> Vec:
 
 @kernel
 def geometric_stiffness(
-    r: int, q: int, other: int, q_other: int, world: World, stack: Numbers, problem: ContactProblem, m: int
+    r: int,
+    q: int,
+    other: int,
+    q_other: int,
+    world: ContactWorld,
+    stack: Numbers,
+    problem: ContactProblem,
+    m: int,
 ) -> float:
     """Change of the force of contact m as its point moves, force times curvature of the gap, into
     `problem.turned`; its largest size [N/m]. The contact as in `assemble.measure`.
@@ -117,7 +124,7 @@ def geometric_stiffness(
 
 
 @kernel
-def keep_damping(m: int, world: World, problem: ContactProblem) -> None:
+def keep_damping(m: int, world: ContactWorld, problem: ContactProblem) -> None:
     """Where no contact is curved any more, damp by a fraction of what was stiff some passes ago: a contact
     that goes to and fro between an edge and a face would not come to rest, as the face by itself is not
     damped. No contact that presses is damped less than by the bending stiffness of its rod, EI/l^3."""

@@ -31,7 +31,7 @@ from ..vec import dot
 from .bvh import Numbers, Record
 from .centreline import curve_of, interval_of, point_at
 from .contact_set import ContactRules, add_walls, choose, force_of, merge, pressed_only, stands, violation
-from .problem import World, damping_of, rod_search, thread_problem
+from .problem import ContactWorld, damping_of, rod_search, thread_problem
 from .proximity import ProximityOptions, ProximitySearch, search_obstacles, thread_search_work
 from .rod_proximity import search_rods
 from .solve import solve_contacts
@@ -111,7 +111,7 @@ def search_robots(
 
 
 @kernel
-def _limit_step(r: int, world: World, problem: ContactProblem) -> tuple[float, float]:
+def _limit_step(r: int, world: ContactWorld, problem: ContactProblem) -> tuple[float, float]:
     """Motion of row r under the proposed forces and the closing boundary [m], and the fraction of it that may
     be taken; the change of the unknowns goes to `problem.unknown`."""
     i, o, loads, rods = world.robot[r], r - world.first, world.loads, world.rods
@@ -148,7 +148,7 @@ def _limit_step(r: int, world: World, problem: ContactProblem) -> tuple[float, f
 
 
 @kernel
-def _indent(r: int, world: World, proposed: Floats) -> float:
+def _indent(r: int, world: ContactWorld, proposed: Floats) -> float:
     """How much farther the proposed forces go into soft obstacles, or move free ones [m]; where a rod is
     pressed along its axis nothing else moves."""
     deepest, i, surfaces = 0.0, world.robot[r], world.surfaces
@@ -163,7 +163,7 @@ def _indent(r: int, world: World, proposed: Floats) -> float:
 
 @kernel
 def _apply_law(
-    world: World, stack: Numbers, problem: ContactProblem, trouble: Records
+    world: ContactWorld, stack: Numbers, problem: ContactProblem, trouble: Records
 ) -> tuple[bool, float, float]:
     """Solve the contact problem: whether the law could be solved, how far the farthest row moves or its
     boundary is open (nan where the numbers are none) [m], and the fraction of the motion that may be
@@ -185,7 +185,7 @@ def _apply_law(
 
 
 @kernel
-def _search_world(world: World, problem: ContactProblem, work: SearchWork, trouble: Records) -> float:
+def _search_world(world: ContactWorld, problem: ContactProblem, work: SearchWork, trouble: Records) -> float:
     """Candidates of every row, and the largest violation [m]."""
     worst, gap = 0.0, world.motion.gap
     for r in range(world.first, world.last):
@@ -203,7 +203,7 @@ def _search_world(world: World, problem: ContactProblem, work: SearchWork, troub
 
 
 @kernel
-def _went_through(world: World, stack: Numbers, trouble: Records) -> bool:
+def _went_through(world: ContactWorld, stack: Numbers, trouble: Records) -> bool:
     """Whether a robot of the world went through an obstacle since the shape before; notes what."""
     through = False
     for r in range(world.first, world.last):
@@ -217,7 +217,7 @@ def _went_through(world: World, stack: Numbers, trouble: Records) -> bool:
 
 
 @kernel
-def _take_step(fraction: float, world: World, problem: ContactProblem, x: Floats) -> None:
+def _take_step(fraction: float, world: ContactWorld, problem: ContactProblem, x: Floats) -> None:
     """Move by this fraction to the proposed forces and the closed boundary."""
     for r in range(world.first, world.last):
         i, o, most = world.robot[r], r - world.first, 0.0
@@ -236,7 +236,7 @@ def _take_step(fraction: float, world: World, problem: ContactProblem, x: Floats
 
 
 @kernel
-def _renew_contacts(r: int, world: World, problem: ContactProblem, stack: Numbers) -> None:
+def _renew_contacts(r: int, world: ContactWorld, problem: ContactProblem, stack: Numbers) -> None:
     """The contacts of row r for its next pass."""
     i, o, rods, surfaces, motion = world.robot[r], r - world.first, world.rods, world.surfaces, world.motion
     contacts, frames, curve = (
@@ -267,7 +267,7 @@ def _renew_contacts(r: int, world: World, problem: ContactProblem, stack: Number
 
 
 @kernel
-def _iterate_world(world: World, rows: ContactRows, problem: ContactProblem, work: SearchWork) -> int:
+def _iterate_world(world: ContactWorld, rows: ContactRows, problem: ContactProblem, work: SearchWork) -> int:
     """One contact iteration: the smallest gap of each row and what keeps it from rest; a world that is not at
     rest gets its next forces, unknowns and contacts. Returns its status."""
     tolerance, used, contacts = world.motion.tolerance, world.contacts.used, world.contacts.contact
@@ -310,7 +310,7 @@ def iterate_worlds(thread: int, batch: ContactIteration) -> None:
     rows, problem = batch.rows, thread_problem(batch.problem, thread)
     work = thread_search_work(batch.search, thread)
     for k in range(thread, len(rows.start) - 1, len(batch.problem.first_point)):
-        world = World(
+        world = ContactWorld(
             rows.start[k],
             rows.start[k + 1],
             rows.robot,

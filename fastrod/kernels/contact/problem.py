@@ -29,7 +29,7 @@ MOST_FOUND = 64
 """Candidates of one robot that a search notes: the most contacts that a robot can have."""
 
 
-class World(NamedTuple):
+class ContactWorld(NamedTuple):
     """One world in one pass."""
 
     first: int
@@ -117,20 +117,20 @@ def thread_problem(problem: ContactProblem, i: int) -> ContactProblem:
 
 
 @inline
-def rod_search(world: World) -> RodSearch:
+def rod_search(world: ContactWorld) -> RodSearch:
     """What the search between rods needs of a world."""
     return RodSearch(world.motion, world.rods, world.contacts, len(world.surfaces.kind), world.motion.margin)
 
 
 @inline
-def node_position(world: World, i: int, node: int) -> Vec:
+def node_position(world: ContactWorld, i: int, node: int) -> Vec:
     """Of robot i, world [m]."""
     row = world.motion.position[i, node]
     return row[0], row[1], row[2]
 
 
 @inline
-def damping_of(world: World) -> float:
+def damping_of(world: ContactWorld) -> float:
     """The largest of the world's robots."""
     most = 0.0
     for r in range(world.first, world.last):
@@ -139,7 +139,7 @@ def damping_of(world: World) -> float:
 
 
 @kernel
-def row_of_robot(robot: int, world: World) -> int:
+def row_of_robot(robot: int, world: ContactWorld) -> int:
     """The row that holds this robot; -1 if none does."""
     for r in range(world.first, world.last):
         if world.robot[r] == robot:

@@ -12,12 +12,12 @@ from .bvh import Numbers
 from .contact_law import ContactLaw, contact_forces
 from .geometric_stiffness import add_turned_forces, geometric_stiffness, keep_damping, stiffen_model
 from .mobility import axis_of
-from .problem import World, damping_of, row_of_robot
+from .problem import ContactWorld, damping_of, row_of_robot
 from .rod_proximity import partner_of
 
 
 @kernel
-def _measure_all(world: World, stack: Numbers, problem: ContactProblem) -> int:
+def _measure_all(world: ContactWorld, stack: Numbers, problem: ContactProblem) -> int:
     """Write every contact of the world into the problem, with its geometric stiffness; returns how many there
     are."""
     n_obstacles, m = len(world.surfaces.kind), 0
@@ -37,7 +37,7 @@ def _measure_all(world: World, stack: Numbers, problem: ContactProblem) -> int:
 
 
 @kernel
-def _propose(world: World, problem: ContactProblem) -> None:
+def _propose(world: ContactWorld, problem: ContactProblem) -> None:
     """Forces of all contacts, applied and changed, into `problem.proposed`."""
     for r in range(world.first, world.last):
         base = problem.first_point[r - world.first]
@@ -48,7 +48,7 @@ def _propose(world: World, problem: ContactProblem) -> None:
 
 
 @kernel
-def solve_contacts(world: World, stack: Numbers, problem: ContactProblem) -> bool:
+def solve_contacts(world: ContactWorld, stack: Numbers, problem: ContactProblem) -> bool:
     """Forces that the law asks for on the linear model, into `problem.proposed`; whether it could be
     solved."""
     damping = damping_of(world)

@@ -18,7 +18,7 @@ from .surface import ray_hit, signed_distance
 
 @inline
 def carried(before: Floats, after: Floats, p: Vec) -> Vec:
-    """World point p after it has moved with a frame."""
+    """ContactWorld point p after it has moved with a frame."""
     x, y, z = p[0] - before[9], p[1] - before[10], p[2] - before[11]
     a = before[0] * x + before[3] * y + before[6] * z
     b = before[1] * x + before[4] * y + before[7] * z
