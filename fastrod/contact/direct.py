@@ -44,7 +44,7 @@ from fastrod.types import Floats
 Signed: TypeAlias = tuple[float, Triple]
 """Signed distance [m] and its gradient, in the frame of the obstacle."""
 
-_TOUCH = 1e-9  # m; nearer than this the direction from the surface is the feature's normal
+_AT_SURFACE = 1e-9  # m; nearer than this the direction from the surface is the feature's normal
 _NUDGE: Floats = 1e-11 * np.array([0.31, 0.57, 0.76])
 """Per length, in a direction that no face is likely to have: takes a segment out of being exactly parallel to
 one."""
@@ -151,27 +151,27 @@ class DirectScene:
         """Stand obstacle `k` at world_from_obstacle: position [m], quaternion w x y z, its norm 1 within
         1e-6."""
         self._check(k)
-        at, turn = _finite("position", position, 3), _finite("quaternion", quaternion, 4)
-        norm = float(np.linalg.norm(turn))
+        at, rotation = _finite("position", position, 3), _finite("quaternion", quaternion, 4)
+        norm = float(np.linalg.norm(rotation))
         if abs(norm - 1.0) > 1e-6:
             raise InputError(
                 f"quaternion of obstacle {self.obstacles[k].name!r} has norm {norm:.6g}; it must be 1."
             )
         self._position[k] = at
-        self._rotation[k] = matrix_from_quaternion(turn[None] / norm)[0]
+        self._rotation[k] = matrix_from_quaternion(rotation[None] / norm)[0]
 
     def point(self, k: int, p: Sequence[float] | Floats) -> Closest:
         """Signed distance of the world point `p` (3,) [m] to the surface of obstacle `k`, and where that
         is."""
         self._check(k)
-        at, turn = self._position[k], self._rotation[k]
+        at, rotation = self._position[k], self._rotation[k]
         world = _finite("point", p, 3)
-        local = turn.T @ (world - at)
+        local = rotation.T @ (world - at)
         mesh = self._meshes[k]
         if mesh is None:
             obstacle = self.obstacles[k]
             distance, gradient = _SIGNED[obstacle.shape](_triple(local), obstacle.size)
-            normal = turn @ np.array(gradient)
+            normal = rotation @ np.array(gradient)
             return Closest(distance, normal, world - distance * normal, -1)
         fcl = _fcl()
         answer = fcl.DistanceResult()
@@ -182,16 +182,16 @@ class DirectScene:
         away = local - np.array(nearest)
         outward = mesh.normals[face, feature]
         distance = math.copysign(math.hypot(*away), float(away @ outward))
-        normal = turn @ (away / distance if abs(distance) > _TOUCH else outward)
-        return Closest(distance, normal, turn @ np.array(nearest) + at, face)
+        normal = rotation @ (away / distance if abs(distance) > _AT_SURFACE else outward)
+        return Closest(distance, normal, rotation @ np.array(nearest) + at, face)
 
     def segment(self, k: int, a: Sequence[float] | Floats, b: Sequence[float] | Floats) -> SegmentClosest:
         """Distance of the world segment from `a` to `b`, each (3,) [m], to obstacle `k`, and where that
         is."""
         self._check(k)
-        at, turn = self._position[k], self._rotation[k]
+        at, rotation = self._position[k], self._rotation[k]
         start, end = _finite("segment start", a, 3), _finite("segment end", b, 3)
-        p, q = turn.T @ (start - at), turn.T @ (end - at)
+        p, q = rotation.T @ (start - at), rotation.T @ (end - at)
         mesh = self._meshes[k]
         if mesh is None:
             obstacle = self.obstacles[k]
@@ -200,7 +200,7 @@ class DirectScene:
             distance, gradient = signed(_triple(p + fraction * (q - p)), size)
             on_segment = start + fraction * (end - start)
             return SegmentClosest(
-                distance, on_segment - distance * (turn @ np.array(gradient)), on_segment, fraction, -1
+                distance, on_segment - distance * (rotation @ np.array(gradient)), on_segment, fraction, -1
             )
         found = []
         for face in {mesh.face_near(p, q), mesh.face_near(p, q + math.dist(p, q) * _NUDGE)}:
@@ -208,7 +208,7 @@ class DirectScene:
             found.append((math.dist(p + fraction * (q - p), nearest), face, fraction, nearest))
         distance, face, fraction, nearest = min(found)
         return SegmentClosest(
-            distance, turn @ np.array(nearest) + at, start + fraction * (end - start), fraction, face
+            distance, rotation @ np.array(nearest) + at, start + fraction * (end - start), fraction, face
         )
 
     def _check(self, k: int) -> None:

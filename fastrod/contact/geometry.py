@@ -57,11 +57,11 @@ def _number(where: str, value: object, unit: str) -> float:
         raise InputError(f"{where} is {value!r}; it must be a number [{unit}].") from None
 
 
-def _check_extent(where: str, extent: float, mend: str) -> None:
+def _check_extent(where: str, extent: float, remedy: str) -> None:
     if extent > _LARGEST:
         raise InputError(
             f"{where} is {extent:.6g} m wide; more than {_LARGEST:g} m. Was it given in mm? "
-            f"{mend}=0.001 mends that."
+            f"{remedy}=0.001 mends that."
         )
     if extent < _SMALLEST:
         raise InputError(
@@ -201,8 +201,8 @@ def _primitive(shape: ObstacleShape, size: Sequence[float], given: Placement) ->
         3 - _SIZES[shape]
     )
     none, nothing = np.empty((0, 3)), np.empty((0, 3), dtype=np.int64)
-    parts: dict[str, Any] = {"size": full, "vertices": none, "faces": nothing, "closed": True}
-    return Obstacle(shape=shape, **parts, **options)
+    fields: dict[str, Any] = {"size": full, "vertices": none, "faces": nothing, "closed": True}
+    return Obstacle(shape=shape, **fields, **options)
 
 
 def sphere(radius: float, **options: Unpack[Placement]) -> Obstacle:
@@ -248,12 +248,12 @@ def plane(
         raise InputError(f"plane normal is {list(n)!r}; it must have a direction, for example (0, 0, 1).")
     x, y, z = (v / length for v in n)
     w = math.sqrt(max(0.0, (1.0 + z) / 2.0))
-    turn = (w, -y / (2.0 * w), x / (2.0 * w), 0.0) if w > 1e-6 else (0.0, 1.0, 0.0, 0.0)
+    facing = (w, -y / (2.0 * w), x / (2.0 * w), 0.0) if w > 1e-6 else (0.0, 1.0, 0.0, 0.0)
     at = _numbers("plane point", point, 3, "m")
     return _primitive(
         "plane",
         (),
-        {"name": name, "position": at, "quaternion": turn, "friction": friction, "stiffness": stiffness},
+        {"name": name, "position": at, "quaternion": facing, "friction": friction, "stiffness": stiffness},
     )
 
 
@@ -306,7 +306,7 @@ def mesh(
         )
     _check_extent(where, float(np.ptp(vertices, axis=0).max()), "scale")
     closed = _check_surface(where, vertices, faces, open_surface)
-    placed: dict[str, Any] = {"position": position, "quaternion": quaternion}  # `Obstacle` checks them
+    pose: dict[str, Any] = {"position": position, "quaternion": quaternion}  # `Obstacle` checks them
     return Obstacle(
         name=name,
         shape="mesh",
@@ -316,7 +316,7 @@ def mesh(
         closed=closed,
         friction=friction,
         stiffness=stiffness,
-        **placed,
+        **pose,
     )
 
 

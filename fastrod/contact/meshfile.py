@@ -301,8 +301,8 @@ def _glb(file: int, size: int) -> _Declared:
     if len(set(below)) < len(below):  # a node below two others is drawn twice, and below itself without end
         raise ValueError("one of its nodes stands below two others")
     shown_ = [_index(node["mesh"], faces) for node in nodes if "mesh" in node]
-    n_parts = sum(len(mesh["primitives"]) for mesh in tree.get("meshes", []))
-    return _Declared(sum(faces[k] for k in shown_), sum(corners[k] for k in shown_), len(nodes) + n_parts)
+    n_pieces = sum(len(mesh["primitives"]) for mesh in tree.get("meshes", []))
+    return _Declared(sum(faces[k] for k in shown_), sum(corners[k] for k in shown_), len(nodes) + n_pieces)
 
 
 def _view(view: Mapping[str, Any], held: int) -> int:

@@ -52,8 +52,8 @@ def pseudonormals(vertices: Floats, faces: Ints) -> Floats:
         face = np.where(flat, around, face)
 
     back = np.roll(edge, 1, axis=1)  # ca, ab, bc: the edge that comes in
-    turn = np.linalg.norm(np.cross(edge, back), axis=-1)
-    angle = np.arctan2(turn, -(edge * back).sum(-1))
+    sine = np.linalg.norm(np.cross(edge, back), axis=-1)
+    angle = np.arctan2(sine, -(edge * back).sum(-1))
     weighted = (face[:, None, :] * angle[:, :, None]).reshape(-1, 3)
     vertex_sum = np.stack(
         [np.bincount(faces.ravel(), weights=w, minlength=n_vertices) for w in weighted.T], axis=-1

@@ -54,7 +54,7 @@ def settle(
     left = np.sort(np.concatenate([left, steep]))
     # hundreds of times what bends a rod by a radian: steps without end; a pull may be solved at once all the
     # same
-    heavy = left[_longest_stride(left, params, ports) < _SMALLEST_LOAD_STEP]
+    heavy = left[_longest_load_step(left, params, ports) < _SMALLEST_LOAD_STEP]
     if len(heavy):
         cold_start(heavy, layout, params, ports, boundary.memory)
         stuck = _newton(heavy, boundary, ports, tolerance, run, passes)
@@ -206,28 +206,28 @@ def _continuation(
     layout, params = boundary.layout, boundary.params
     fraction = np.zeros(boundary.n_robots)
     longest = np.full(boundary.n_robots, 0.25)
-    longest[rows] = _longest_stride(rows, params, ports)
-    stride = longest.copy()
+    longest[rows] = _longest_load_step(rows, params, ports)
+    load_step = longest.copy()
     unloaded = _loaded(ports, fraction)
     cold_start(rows, layout, params, unloaded, boundary.memory)
     lost = _newton(rows, boundary, unloaded, tolerance, run, passes)
     rows = np.setdiff1d(rows, lost)
     held = boundary.x.copy()
     while len(rows):
-        aim = np.minimum(fraction + stride, 1.0)
+        aim = np.minimum(fraction + load_step, 1.0)
         missed = _newton(rows, boundary, _loaded(ports, aim), tolerance, run, passes)
         arrived = np.setdiff1d(rows, missed)
         fraction[arrived] = aim[arrived]
         held[arrived] = boundary.x[arrived]
-        stride[arrived] = np.minimum(2.0 * stride[arrived], longest[arrived])
+        load_step[arrived] = np.minimum(2.0 * load_step[arrived], longest[arrived])
         boundary.x[missed] = held[missed]
-        stride[missed] *= 0.5
-        lost = np.concatenate([lost, missed[stride[missed] < _SMALLEST_LOAD_STEP]])
+        load_step[missed] *= 0.5
+        lost = np.concatenate([lost, missed[load_step[missed] < _SMALLEST_LOAD_STEP]])
         rows = np.setdiff1d(rows[fraction[rows] < 1.0], lost)
     return np.sort(lost)
 
 
-def _longest_stride(rows: Ints, params: Params, ports: Ports) -> Floats:
+def _longest_load_step(rows: Ints, params: Params, ports: Ports) -> Floats:
     """Fraction of the loads that one step of the continuation may bring: more than a load parameter of three
     could land
     on another equilibrium."""

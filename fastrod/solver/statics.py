@@ -260,7 +260,7 @@ class Statics:
         problems = merge_problems(state.problems, snapshot.state.problems, rows)
         ok = np.where(rows, snapshot.state.ok, state.ok)
         passes = np.where(rows, snapshot.state.passes, state.passes)
-        self._hand_out(merge_shape(state.as_shape(), snapshot.state, rows), ok, passes, problems)
+        self._return_state(merge_shape(state.as_shape(), snapshot.state, rows), ok, passes, problems)
 
     def replace(self, rows: ArrayLike, robots: Sequence[Robot]) -> None:
         """Other robots in these rows (indices, one robot each): their numbers and the values of their
@@ -431,9 +431,9 @@ class Statics:
             if self._ports is not None:
                 ports = merge_arrays(ports, self._ports, ~only)
         self._ports = ports
-        return self._hand_out(shape, ok, passes, problems)
+        return self._return_state(shape, ok, passes, problems)
 
-    def _hand_out(self, shape: RodShape, ok: Flags, passes: Ints, problems: dict[int, str]) -> State:
+    def _return_state(self, shape: RodShape, ok: Flags, passes: Ints, problems: dict[int, str]) -> State:
         contacts = None if self._felt is None else self._felt.contacts(shape, ok)
         if self._engine is not None and self._felt is None:
             self._engine.before = shape

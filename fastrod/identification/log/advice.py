@@ -51,7 +51,7 @@ def why_unknown(name: str, samples: LogSamples, robot: Robot) -> str:
         )
     if "stiffness" in name:
         return "the known loads in this log bend the robot too little to show it"
-    if "line_density" in name and not _turns(log.base_quaternion):
+    if "line_density" in name and not _base_rotates(log.base_quaternion):
         return "one base orientation only: self-weight looks like a bent robot"
     return "this log does not move it: its effect is within the noise, or others do the same"
 
@@ -61,7 +61,7 @@ def missing_excitation(samples: LogSamples, bend: Floats) -> list[str]:
     [rad]."""
     log = samples.log
     lacks = []
-    if not _turns(log.base_quaternion):
+    if not _base_rotates(log.base_quaternion):
         lacks.append(
             "one base orientation only: gravity and payload cannot be told from zeros, "
             "registration or precurvature"
@@ -100,5 +100,5 @@ def unique(lines: Sequence[str]) -> list[str]:
     return list(dict.fromkeys(lines))
 
 
-def _turns(quaternion: Floats | None) -> bool:
+def _base_rotates(quaternion: Floats | None) -> bool:
     return quaternion is not None and bool(np.nanmax(np.ptp(quaternion, axis=0)) > 0.1)

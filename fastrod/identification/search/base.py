@@ -22,7 +22,7 @@ LEAST_ROWS = 40
 SEEN = 0.7
 """Of the prior's sd: a parameter whose data say less is not identifiable."""
 _FOR_NOISE = 20000  # samples
-_TURN = 0.01  # rad, noise of a measured orientation
+_ANGLE = 0.01  # rad, noise of a measured orientation
 _RESTLESS = 0.25  # of the motion: noise beyond it is no noise
 
 
@@ -39,7 +39,7 @@ class BaseFit:
         self.target = Target(
             samples,
             np.full(3, 1e-3 * robot.length),
-            rotation_sigma=_TURN,
+            rotation_sigma=_ANGLE,
             points=samples.log.points is not None,
         )
         n = len(samples.rows)
@@ -110,7 +110,7 @@ class BaseFit:
         """Positions count by `sigma` (3,) [m], and orientations as much more or less than by their noise as
         positions do: weighed apart, what one of them cannot explain would leave the other to decide alone."""
         self.target.sigma = sigma.copy()
-        self.target.rotation_sigma = _TURN * float((sigma / self.noise.sigma).max())
+        self.target.rotation_sigma = _ANGLE * float((sigma / self.noise.sigma).max())
 
     def weighed(self, search: Search, state: ModelState) -> ModelState:
         """The state fitted again with weights of the size of its own residual, never below the noise: what a

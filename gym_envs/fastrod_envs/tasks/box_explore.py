@@ -231,7 +231,7 @@ class _Inside(Cell):
         soft, rotation, base = self.soft, self.soft.tip_rotation, self._base_rotation
         shown, fine = (self._miss * (most / max(self._off, most)) for most in (FAR, FINE))
         far = np.linalg.norm(self._goal - soft.tip)
-        parts = [
+        blocks = [
             self._goal,
             soft.tip,
             rotation[:, 0],
@@ -246,8 +246,8 @@ class _Inside(Cell):
             soft.posture(),
         ]
         if self.camera:
-            parts.append(self._where())
-        return np.concatenate(parts)
+            blocks.append(self._where())
+        return np.concatenate(blocks)
 
     def goal(self) -> Floats:
         return self._goal
@@ -274,10 +274,10 @@ class _Inside(Cell):
 
     def backdrop(self) -> Backdrop:
         solids = []
-        for part in self.box.pieces():
-            c, s = math.cos(part.angle), math.sin(part.angle)
-            turn = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
-            solids.append(solid_box(part.middle, part.half, part.color[:3], turn, 0.2))
+        for piece in self.box.pieces():
+            c, s = math.cos(piece.angle), math.sin(piece.angle)
+            rotation = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+            solids.append(solid_box(piece.middle, piece.half, piece.color[:3], rotation, 0.2))
         solids += [solid_box(self.box.cube_at(k), [0.5 * self.box.cube] * 3, COLORS[k]) for k in self.cubes]
         far = np.linalg.norm(self._goal - self.soft.tip)
         sight = np.stack([self.soft.tip, self.soft.tip + far * self.soft.tip_rotation[:, 2]])
