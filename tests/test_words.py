@@ -151,7 +151,8 @@ def test_what_is_allowed_is_there() -> None:
 
 def test_no_file_is_called_by_a_word_that_is_gone() -> None:
     named = {str(file.relative_to(ROOT)): words_of(file.stem) for file in sources(*PACKAGES)}
-    assert [file for file, words in named.items() if INSTEAD.keys() & set(words)] == []
+    gone = INSTEAD.keys() - {"reach"}  # Reach is an environment's id
+    assert [file for file, words in named.items() if gone & set(words)] == []
 
 
 def test_names_in_the_expressions_of_f_strings_are_seen() -> None:
