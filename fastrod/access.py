@@ -10,11 +10,14 @@ import logging
 import secrets
 import socket
 import sys
+import tempfile
 import threading
 import warnings
+import webbrowser
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from http import HTTPStatus
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
 from fastrod.errors import InputError
@@ -58,7 +61,8 @@ class Access:
         """`host` as the server is bound to it."""
         self.key = secrets.token_urlsafe()
         """First part of the path; new with every server."""
-        self._names = () if _every(host) else (f"[{host}]" if ":" in host else host.lower(),)
+        name = socket.gethostname() if _every(host) else host  # `elsewhere` prints it without a route
+        self._names = (f"[{name}]" if ":" in name else name.lower(),)
 
     def refusal(self, path: str, headers: Headers, arrived: tuple[str, int]) -> str | None:
         """Return one sentence that says why this request is refused, or None; `arrived` is the address and
@@ -142,6 +146,7 @@ class Served:
     """First part of every path."""
     ignored: Ignored
     """Hears of messages that make no sense."""
+    _closing: contextlib.ExitStack = field(default_factory=contextlib.ExitStack, init=False, repr=False)
 
     @property
     def address(self) -> str:
@@ -159,8 +164,18 @@ class Served:
             return ""
         return self.at(_outward(self.host) if _every(self.host) else self.host)
 
+    def open_browser(self) -> None:
+        """Open the page by a file that leads to it and that this user alone can read: other users of this
+        machine can read a command line, so the key must not be on the browser's."""
+        with contextlib.suppress(OSError):  # the address is printed, too
+            with tempfile.NamedTemporaryFile("w", prefix="fastrod-", suffix=".html", delete=False) as file:
+                self._closing.callback(Path(file.name).unlink, missing_ok=True)
+                file.write(f'<!doctype html><meta http-equiv="refresh" content="0; url={self.address}">\n')
+            webbrowser.open(Path(file.name).as_uri())
+
     def stop(self) -> None:
-        """End it."""
+        """End it, and remove what `open_browser` has written."""
+        self._closing.close()
         with contextlib.redirect_stdout(io.StringIO()):  # it says goodbye
             self.viser.stop()
 

@@ -37,7 +37,6 @@ def _teleop(arguments: argparse.Namespace, _: Progress | None) -> int:
     import itertools
     import signal
     import sys
-    import webbrowser
 
     from fastrod_device.pacer import ordinary, urgent
     from fastrod_viewer.app import view
@@ -65,7 +64,7 @@ def _teleop(arguments: argparse.Namespace, _: Progress | None) -> int:
             model = FreeWorld(bench.prototype.robot)
             if not arguments.no_open:
                 ordinary()  # a browser must not come before other programs
-                webbrowser.open(server.address)
+                server.open_browser()
                 urgent(1)
             view(model, link=bench.prototype, server=server, open_browser=False)
         say("The drives are switched off.")

@@ -30,9 +30,11 @@ def check_size(layout: Layout, n_robots: int, outputs: Literal["full", "tip"]) -
     machine's memory."""
     n_tendons = len(layout.tendon_segment)
     n_x = max(3 + len(layout.free_tendon), 2 * len(layout.first_tendon))
-    points = len(layout.first_tendon) * layout.n_steps + 1
+    most_said = 10**100  # a float holds what is said of it
+    points = min(len(layout.first_tendon) * layout.n_steps + 1, most_said)
     each = 4 * n_x * (len(layout.row_tendon) + 8) + 8 * (n_x + 3 * n_tendons + 24)
     each += 8 * 22 * points if outputs == "full" else 0
+    n_robots = min(n_robots, most_said)
     if (needed := each * n_robots) > (most := _physical_memory()):
         less = "take fewer, or outputs='tip'" if outputs == "full" else "take fewer"
         raise InputError(

@@ -181,17 +181,16 @@ class Recorder:
         """End the recording: the log, written to the path where there is one.
 
         Raises `InputError` where nothing is recorded, or where the log cannot be written; it says how many
-        rows are in PATH.part then.
+        rows are in PATH.part then. Where they are in no file, it may be called again.
         """
         with self._lock:
-            if not self._recording:
+            # an open file that nothing is recorded to: no place took its rows when it was stopped before
+            if not self._recording and (self._file is None or not self._rows):
                 raise InputError("nothing is being recorded; start first.")
             self._recording = False
-            try:
-                self._stay()
-                kept = self._kept()
-            finally:
-                self._close()
+            self._stay()
+            kept = self._kept()
+            self._close()
             if not self._rows:
                 if self.path is not None:
                     _part(self.path).unlink(missing_ok=True)
@@ -203,6 +202,7 @@ class Recorder:
             return log
 
     def _open(self) -> None:
+        self._close()
         if self.path is None:
             return
         try:

@@ -28,7 +28,8 @@ _BASE_QUATERNION = ("base_qw", "base_qx", "base_qy", "base_qz")
 _REACH = 3.0  # robot lengths; nothing on the robot moves further, so the unit is wrong
 _FAR = 30.0  # robot lengths; no camera that sees the robot is further off
 _LIKE_REST = 0.2  # of the rest length: tendon lengths that stay so near to it are no changes
-_MOST_VALUES, _MOST_BYTES = 30_000_000, 500_000_000  # of a Parquet file unpacked: 1.5 GB at its peak
+# of a Parquet file unpacked: 1.5 GB at its peak; the bytes of a CSV, too
+_MOST_VALUES, _MOST_BYTES = 30_000_000, 500_000_000
 _HEAVIEST = 10.0  # kg; a heavier payload was given in g
 _QUATERNION_SLACK = 1e-2  # trackers write three or four digits
 
@@ -207,6 +208,8 @@ def read_table(path: str | Path) -> Table:
     """
     path = Path(path)
     try:
+        if path.exists() and not path.is_file():  # a pipe or a device may have no end
+            raise ValueError("it is no file")
         return _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path)
     except LogError:
         raise
@@ -232,6 +235,8 @@ def numbers(table: Table, name: str, where: str) -> Floats:
 
 
 def _read_csv(path: Path) -> Table:
+    if (size := path.stat().st_size) > _MOST_BYTES:
+        raise LogError(f"{path.name} has {size} bytes; a log may have {_MOST_BYTES}. Cut it in parts.")
     with path.open(encoding="utf-8-sig", newline="") as file:
         rows = [row for row in csv.reader(line for line in file if not line.startswith("#")) if row]
     if not rows:

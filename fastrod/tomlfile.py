@@ -16,6 +16,8 @@ _DEEPEST = 50  # parts of a dotted key
 def read_text(path: Path, where: str, error: type[FastrodError]) -> str:
     """The text of a TOML file, with or without a byte order mark. Raises `error`; `where` names the file."""
     try:
+        if path.exists() and not path.is_file():  # a pipe or a device may have no end
+            raise ValueError("it is no file")
         with path.open("rb") as file:
             content = file.read(_LARGEST + 1)
         if len(content) > _LARGEST:

@@ -424,6 +424,12 @@ def test_rows_that_no_place_takes_are_in_no_file(tmp_path: Path, monkeypatch: py
     with pytest.raises(InputError, match=r"its 3 rows are in no file\."):
         recorder.stop()
     assert not recorder.recording
+    folder.unlink()  # there is room for it again
+    log = recorder.stop()
+    assert len(log) == 3
+    assert_same(read_log(folder / "session.csv", ROBOT), log)
+    with pytest.raises(InputError, match="nothing is being recorded"):
+        recorder.stop()
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])

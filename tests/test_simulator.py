@@ -245,6 +245,8 @@ def test_bad_input_gets_one_sentence(given: dict[str, object], sentence: str) ->
     [
         ({"n_robots": 0}, "n_robots is 0"),
         ({"n_robots": 2.5}, "whole number"),
+        ({"n_robots": 10**400}, "take fewer"),
+        ({"points_per_segment": 10**400}, "take fewer"),
         ({"dt": -1.0}, "dt is -1.0"),
         ({"points_per_segment": 1}, "at least 2"),
         ({"outputs": "tips"}, "'full' or 'tip'"),

@@ -13,9 +13,9 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fastrod.errors import InputError
 from fastrod_device.bus import guest
 from fastrod_device.eds import read_eds
-from fastrod_device.errors import DeviceError
 
 if TYPE_CHECKING:
     import canopen
@@ -55,7 +55,7 @@ class Row:
 def object_dictionary(eds: str | Path | None = None) -> canopen.ObjectDictionary:
     """The dictionary of one drive; from an EDS or DCF file where one is given.
 
-    Raises `DeviceError`: the file cannot be read, or lacks an object that is needed here.
+    Raises `InputError`: the file cannot be read, or lacks an object that is needed here.
     """
     if eds is None:
         return _assembled(_table())
@@ -63,7 +63,7 @@ def object_dictionary(eds: str | Path | None = None) -> canopen.ObjectDictionary
     for index, sub in NEEDED:
         if find(dictionary, index, sub) is None:
             lacks = f"the EDS file {eds} has no object {titled(index, sub)}"
-            raise DeviceError(f"{lacks}; is it that of a CiA 402 drive (EPOS4)?")
+            raise InputError(f"{lacks}; is it that of a CiA 402 drive (EPOS4)?")
     return dictionary
 
 

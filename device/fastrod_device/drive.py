@@ -61,7 +61,7 @@ class DriveBus:
     ) -> None:  # fmt: skip
         """`rate` [1/s], of cycles; its period is a whole number of ms. `eds`: the drives' own dictionary.
 
-        Raises `InputError`, or `DeviceError` for the bus and the EDS file.
+        Raises `InputError`, also for the EDS file, or `DeviceError` for the bus.
         """
         period = 1e3 / rate if isinstance(rate, (int, float)) and math.isfinite(rate) and rate > 0.0 else math.nan
         if not (1.0 <= period <= 40.0 and abs(period - round(period)) < 1e-6):

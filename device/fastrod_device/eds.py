@@ -13,11 +13,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from fastrod.errors import InputError
 from fastrod_device.bus import guest
-from fastrod_device.errors import DeviceError
 
 _OBJECT = re.compile(r"([0-9a-f]{4})(?:\s*sub\s*([0-9a-f]{1,2}))?", re.IGNORECASE)
-_NODE_ID = re.compile(r"\s*\+?\s*\$nodeid\s*\+?\s*", re.IGNORECASE)
+_NODE_ID = re.compile(r" ?\+? ?\$nodeid ?\+? ?", re.IGNORECASE)
 _SIGNED = (0x02, 0x03, 0x10, 0x04, 0x15)
 """Signed whole numbers among the data types of CiA 301."""
 _TEXTS = (0x09, 0x0B)
@@ -25,6 +25,8 @@ _BYTES = 0x0F
 """DOMAIN: the type of what has none that is known."""
 _MEMBERS = 254
 """Most subindices of an object, beside 0."""
+_MOST = 20_000
+"""Sections, and variables, of a file; EPOS4's have some 600."""
 _LARGEST = 16 * 2**20
 """Bytes of a file that can be an EDS; EPOS4's have about 10^5."""
 
@@ -33,29 +35,32 @@ def read_eds(path: Path) -> Any:
     """The canopen object dictionary of a file.
 
     A value with `$NODEID` is kept without it; a DCF's own values take the place of defaults.
-    Raises `DeviceError` in a sentence: no such file, no EDS, or without objects.
+    Raises `InputError` in a sentence: no such file, no EDS, without objects, or with too many.
     """
     where = f"the EDS file {path}"
     if not path.is_file():
-        raise DeviceError(f"{where} does not exist; give the path of the drive's .eds file, or none.")
+        raise InputError(f"{where} does not exist; give the path of the drive's .eds file, or none.")
     try:
         if path.stat().st_size > _LARGEST:
-            raise DeviceError(f"{where} cannot be read: it is larger than {_LARGEST // 2**20} MiB.")
+            raise InputError(f"{where} cannot be read: it is larger than {_LARGEST // 2**20} MiB.")
         sections = _sections(_text(path.read_bytes()))
     except OSError as error:
-        raise DeviceError(f"{where} cannot be read: {error.strerror or error}.") from error
+        raise InputError(f"{where} cannot be read: {error.strerror or error}.") from error
     except Error as error:
         why = " ".join(str(error).split())
-        raise DeviceError(f"{where} cannot be read: it is no EDS ({why}).") from error
+        raise InputError(f"{where} cannot be read: it is no EDS ({why}).") from error
     if not sections:
-        raise DeviceError(f"{where} describes no object; an EDS has sections such as [6040].")
+        raise InputError(f"{where} describes no object; an EDS has sections such as [6040].")
+    members = {key: _members(options) for key, options in sections.items()}
+    if len(sections) + sum(members.values()) > _MOST:
+        raise InputError(f"{where} cannot be read: it describes more than {_MOST} variables.")
     library = guest("canopen.objectdictionary")
     od = library.ObjectDictionary()
     parents = {index for index, sub in sections if sub is not None}
     for (index, sub), options in sections.items():
         name = options.get("parametername") or "object"
         own = f"{name} 0x{index:04X}" if name in od.names or name == "object" else name
-        compact = max(0, min(_number(options.get("compactsubobj", "")) or 0, _MEMBERS))
+        compact = members[index, sub]
         if index not in od.indices and (index in parents or compact):
             od.add_object(library.ODRecord(own, index))
         if sub is not None:
@@ -69,6 +74,11 @@ def read_eds(path: Path) -> Any:
     return od
 
 
+def _members(options: dict[str, str]) -> int:
+    """Of an object that is described in one section with all its members."""
+    return max(0, min(_number(options.get("compactsubobj", "")) or 0, _MEMBERS))
+
+
 def _text(data: bytes) -> str:
     """EDS files name no encoding: that of their first bytes, UTF-8, or else Windows'."""
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
@@ -80,7 +90,10 @@ def _text(data: bytes) -> str:
 
 
 def _sections(text: str) -> dict[tuple[int, int | None], dict[str, str]]:
-    """Options of objects by index and subindex; keys in small letters. A section that comes twice adds up."""
+    """Options of objects by index and subindex; keys in small letters. A section that comes twice adds up.
+
+    Raises `configparser.Error`.
+    """
     parser = RawConfigParser(
         strict=False,
         allow_no_value=True,
@@ -88,7 +101,10 @@ def _sections(text: str) -> dict[tuple[int, int | None], dict[str, str]]:
         comment_prefixes=(";", "#"),
         default_section="",
     )
-    lines = (line.replace("\0", "").strip() for line in text.splitlines())  # an indent continues nothing
+    # an indent continues nothing, and a row of spaces would cost the parser the square of its length
+    lines = [" ".join(line.replace("\0", "").split()) for line in text.splitlines()]
+    if sum(line.startswith("[") for line in lines) > _MOST:
+        raise Error(f"it has more than {_MOST} sections")
     parser.read_string("\n".join(line for line in lines if not line.startswith("=")))
     found: dict[tuple[int, int | None], dict[str, str]] = {}
     for name in parser.sections():

@@ -57,7 +57,7 @@ class EmulatedDrives:
         """`rate` [1/s]: of the set-points until the master sets another; `torque_noise` [thousandths of the
         rated torque], 1 sigma; `eds`: the file that lists their objects, by default an EPOS4's.
 
-        Raises `InputError` for drives that cannot be, `DeviceError` for the bus or the file.
+        Raises `InputError` for drives that cannot be and for the file, `DeviceError` for the bus.
         """
         if not (np.isfinite(rate) and rate > 0.0):
             raise InputError(f"EmulatedDrives.rate is {rate!r} 1/s; it must be positive.")

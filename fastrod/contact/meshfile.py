@@ -23,6 +23,7 @@ from fastrod.types import Floats, Ints
 
 _SMALL, _FEW = 4_000_000, 100  # bytes and bodies up to which a file is read in this process: at worst 2 s
 _DESCRIPTION = 16_000_000  # bytes of the JSON of a .glb
+_OVERLAP = 16  # times its size that a .glb may read: 2 of what trimesh writes, some more of interleaved views
 _LINE = 10_000  # bytes of a line of an .obj or .off
 _HEADER = 65_536  # bytes in which the header of a .ply or .off ends
 
@@ -86,6 +87,8 @@ def read_mesh(path: Path, limits: MeshLimits) -> tuple[Floats, Ints]:
     _within(where, "vertices", declared.vertices, "n_faces", 3 * limits.n_faces)
     vertices, faces = (_here if size <= _SMALL and declared.bodies <= _FEW else _apart)(where, path, kind, limits)
     _within(where, "faces", len(faces), "n_faces", limits.n_faces)
+    if not len(faces):
+        raise InputError(f"{where} has no faces; give a surface of triangles.")
     return vertices, faces
 
 
@@ -222,11 +225,20 @@ def _glb(file: int, size: int) -> _Declared:
         if (length := int.from_bytes(data[12:16], "little")) > _DESCRIPTION:
             raise ValueError(f"its description takes {length} bytes, more than {_DESCRIPTION}")
         tree = json.loads(data[20 : 20 + length])
+        chunk = data[20 + length : 28 + length]
+    held = int.from_bytes(chunk[:4], "little") if chunk[4:] == b"BIN\0" else 0
     if packed := [name for name in tree.get("extensionsRequired", []) if "compression" in name or "meshopt" in name]:
         raise ValueError(f"it is packed by {shown(packed[0], 60)}, which is not read; save it without")
     if any("uri" in buffer for buffer in tree.get("buffers", [])):
         raise ValueError("it refers to another file for its numbers; save it as one file")
-    accessors = [_accessor(tree, accessor) for accessor in tree.get("accessors", [])]
+    taken = sum(_view(view, held) for view in tree.get("bufferViews", []))
+    accessors = []
+    for accessor in tree.get("accessors", []):
+        count, width = _accessor(tree, accessor)
+        accessors.append(count)
+        taken += count * width
+    if taken > _OVERLAP * size:  # each is copied
+        raise ValueError(f"its views and accessors take {taken} bytes, more than {_OVERLAP} times its {size}")
     faces, corners = [], []
     for mesh in tree.get("meshes", []):
         used = [accessors[_index(p.get("indices", p["attributes"]["POSITION"]), accessors)] for p in mesh["primitives"]]
@@ -243,18 +255,31 @@ def _glb(file: int, size: int) -> _Declared:
     return _Declared(sum(faces[k] for k in shown_), sum(corners[k] for k in shown_), len(nodes) + n_parts)
 
 
-def _accessor(tree: Mapping[str, Any], accessor: Mapping[str, Any]) -> int:
-    """Its count, where its view has as many bytes. Raises `ValueError`."""
+def _view(view: Mapping[str, Any], held: int) -> int:
+    """Its length, where the `held` bytes of the file's numbers have it. Raises `ValueError`."""
+    start, length = view.get("byteOffset", 0), view["byteLength"]
+    if not (isinstance(start, int) and isinstance(length, int) and 0 <= start <= start + length <= held):
+        raise ValueError(f"a view of it takes {shown(length, 40)} bytes from {shown(start, 40)} on, of {held}")
+    if view["buffer"] != 0:
+        raise ValueError(f"a view of it refers to buffer {shown(view['buffer'], 40)}, and it has one")
+    return length
+
+
+def _accessor(tree: Mapping[str, Any], accessor: Mapping[str, Any]) -> tuple[int, int]:
+    """Its count and the bytes of an element, where its view has as many. Raises `ValueError`."""
     count, width = accessor["count"], _COMPONENTS[accessor["type"]] * _BYTES[accessor["componentType"]]
     if not isinstance(count, int) or count < 0:
         raise ValueError(f"an accessor of it has {shown(count, 40)} elements")
     if "bufferView" not in accessor or "sparse" in accessor:
         raise ValueError("an accessor of it has no numbers, or sparse ones, which is not read")
     views = tree["bufferViews"]
-    length = views[_index(accessor["bufferView"], views)]["byteLength"]
-    if count * width > length:
-        raise ValueError(f"an accessor of it declares {count} elements of {width} bytes, and its view has {shown(length, 40)}")
-    return count
+    view = views[_index(accessor["bufferView"], views)]
+    start, step, length = accessor.get("byteOffset", 0), view.get("byteStride", width), view["byteLength"]
+    if not (isinstance(start, int) and isinstance(step, int) and start >= 0 and step > 0):
+        raise ValueError(f"an accessor of it begins at {shown(start, 40)}, with steps of {shown(step, 40)} bytes")
+    if max(count * width, start + (count - 1) * step + width) > length:
+        raise ValueError(f"an accessor of it declares {count} elements of {width} bytes, and its view has {length}")
+    return count, width
 
 
 def _index(number: object, into: list[Any]) -> int:

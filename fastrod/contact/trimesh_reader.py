@@ -6,6 +6,7 @@ It needs nothing else of the package.
 from __future__ import annotations
 
 import io
+import json
 import logging
 import re
 import sys
@@ -44,7 +45,21 @@ def _plain_stl(data: bytes) -> bytes:
     return b"solid\n" + re.sub(rb"^[ \t]*(end)?solid\b[^\r\n]*", b"", data, flags=re.IGNORECASE | re.MULTILINE) + b"\nendsolid\n"
 
 
-_PLAIN: dict[str, Callable[[bytes], bytes]] = {"obj": _plain_obj, "stl": _plain_stl}
+def _plain_glb(data: bytes) -> bytes:
+    """Positions and faces alone: trimesh copies each further attribute, and any number of them may name the
+    same numbers."""
+    end = 20 + int.from_bytes(data[12:16], "little")
+    tree = json.loads(data[20:end])
+    for mesh in tree.get("meshes", []):
+        for primitive in mesh["primitives"]:
+            primitive["attributes"] = {"POSITION": primitive["attributes"]["POSITION"]}
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    rest = len(text).to_bytes(4, "little") + b"JSON" + text + data[end:]
+    return data[:8] + (12 + len(rest)).to_bytes(4, "little") + rest
+
+
+_PLAIN: dict[str, Callable[[bytes], bytes]] = {"glb": _plain_glb, "obj": _plain_obj, "stl": _plain_stl}
 
 
 @contextmanager

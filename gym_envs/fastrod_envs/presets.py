@@ -67,7 +67,7 @@ def settings_of(algorithm: str, n_envs: int, n_steps: int, steps: int, given: Ma
     """
     if algorithm not in ALGORITHMS:
         raise UnknownNameError(f"no algorithm {algorithm!r}; {nearest(algorithm, ALGORITHMS)}")
-    _check_settings(algorithm, given)
+    check_settings(algorithm, given)
     common = {"learning_rate": LEARNING_RATE, "gamma": DISCOUNT}
     if algorithm == "ppo":
         rollout = int(given.get("n_steps", min(max(n_steps, 4096 // n_envs), max(steps // n_envs, 2))))
@@ -110,6 +110,9 @@ _SETTINGS: Mapping[str, Mapping[str, _Range]] = {
 _WORDS: Mapping[str, str] = {"ent_coef": "auto", "target_entropy": "auto"}
 """Of SAC: a word that is as good as a number."""
 _NONE = ("clip_range_vf", "target_kl")
+_POLICY: Mapping[str, _Range] = {"log_std_init": (float, -20.0, 20.0), "n_critics": (int, 1, 100)}
+"""Numbers of policy_kwargs."""
+_DEEPEST, _WIDEST = 16, 4096  # layers of a network and their width: 1 GB of weights
 _SYNONYMS: Mapping[str, str] = {
     "lr": "learning_rate", "discount": "gamma", "epochs": "n_epochs", "minibatch": "batch_size", "rollout": "n_steps",
     "lambda": "gae_lambda", "entropy": "ent_coef",
@@ -117,11 +120,13 @@ _SYNONYMS: Mapping[str, str] = {
 """What other libraries call them."""
 
 
-def _check_settings(algorithm: str, given: Mapping[str, Any]) -> None:
-    """Raises `UnknownNameError` for a setting that the algorithm does not take, `InputError` for a value that it cannot have."""
+def check_settings(algorithm: str, given: Mapping[str, Any]) -> None:
+    """Raises `UnknownNameError` for a setting that the algorithm does not take, `InputError` for a value that
+    it cannot have."""
     known = _SETTINGS[algorithm]
     for name, value in given.items():
         if name == "policy_kwargs" and isinstance(value, Mapping):
+            _check_policy(algorithm, value)
             continue
         if name not in known:
             meant = _SYNONYMS.get(name.lower())
@@ -129,12 +134,36 @@ def _check_settings(algorithm: str, given: Mapping[str, Any]) -> None:
             raise UnknownNameError(f"{algorithm} has no setting {name!r}; {hint}")
         if (algorithm == "sac" and _is_word(name, value)) or (value is None and name in _NONE):
             continue
-        kind, least, most = known[name]
-        right = isinstance(value, bool) if kind is bool else isinstance(value, (int, kind)) and not isinstance(value, bool)
-        if not right or not least <= value <= most or (name == "learning_rate" and value == 0.0):
-            what = {bool: "true or false", int: f"a whole number from {least:g} to {most:g}", float: f"a number from {least:g} to {most:g}"}
-            above = ", above 0" if name == "learning_rate" else ""
-            raise InputError(f"setting {name!r} of {algorithm} is {shown(value)}; it must be {what[kind]}{above}.")
+        _check_range(algorithm, name, value, known[name])
+
+
+def _check_policy(algorithm: str, given: Mapping[str, Any]) -> None:
+    net = given.get("net_arch", ())
+    for layers in net.values() if isinstance(net, Mapping) else (net,):
+        if (
+            not isinstance(layers, (list, tuple))
+            or len(layers) > _DEEPEST
+            or not all(type(width) is int and 1 <= width <= _WIDEST for width in layers)
+        ):
+            raise InputError(
+                f"setting 'net_arch' of {algorithm} is {shown(net)}; it must be a list of at most {_DEEPEST} "
+                f"whole numbers from 1 to {_WIDEST}, the widths of its layers."
+            )
+    for name in _POLICY.keys() & given.keys():
+        _check_range(algorithm, name, given[name], _POLICY[name])
+
+
+def _check_range(algorithm: str, name: str, value: Any, allowed: _Range) -> None:
+    kind, least, most = allowed
+    right = isinstance(value, bool) if kind is bool else isinstance(value, (int, kind)) and not isinstance(value, bool)
+    if not right or not least <= value <= most or (name == "learning_rate" and value == 0.0):
+        what = {
+            bool: "true or false",
+            int: f"a whole number from {least:g} to {most:g}",
+            float: f"a number from {least:g} to {most:g}",
+        }
+        above = ", above 0" if name == "learning_rate" else ""
+        raise InputError(f"setting {name!r} of {algorithm} is {shown(value)}; it must be {what[kind]}{above}.")
 
 
 def _is_word(name: str, value: object) -> bool:

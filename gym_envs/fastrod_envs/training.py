@@ -17,7 +17,7 @@ import msgspec
 from fastrod.errors import InputError, UnknownNameError, nearest, shown
 from fastrod_envs.actor import actor_of
 from fastrod_envs.checkpoints import load_checkpoint, load_replay, save_checkpoint, save_replay
-from fastrod_envs.presets import ALGORITHMS, NETWORK, preset_of, settings_of
+from fastrod_envs.presets import ALGORITHMS, NETWORK, check_settings, preset_of, settings_of
 from fastrod_envs.registration import NAMESPACE, VERSION, name_of
 
 Progress = Callable[[str, int, int], None]
@@ -58,6 +58,7 @@ class Plan:
                 raise InputError(f"{what} is {shown(value)}; it must be a whole number from {least} to {most}.")
         if not 0.0 <= self.curriculum <= 1.0:
             raise InputError(f"curriculum is {self.curriculum!r}; it must be the difficulty at the start, from 0 to 1.")
+        check_settings(self.algorithm, self.settings)
 
 
 class _State(TypedDict):
@@ -229,7 +230,8 @@ def _fresh(plan: Plan, vec: Any, board: str | None) -> Any:
         return kind(
             "MlpPolicy", vec, seed=plan.seed, device="cpu", verbose=0, tensorboard_log=board, policy_kwargs={**policy, **own}, **settings
         )
-    except (TypeError, ValueError, AssertionError, MemoryError) as error:  # of stable-baselines3 and torch
+    # of stable-baselines3 and torch
+    except (TypeError, ValueError, AssertionError, MemoryError, RuntimeError) as error:
         raise InputError(f"{plan.algorithm} cannot be set up with the settings {shown(settings)}: {str(error).rstrip('.')}.") from error
 
 

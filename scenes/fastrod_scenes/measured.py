@@ -211,7 +211,10 @@ _ADAPTERS: dict[str, Callable[[str | Path], tuple[RunLog, Robot]]] = {
 
 
 def detect(path: str | Path) -> Callable[[str | Path], tuple[RunLog, Robot]] | None:
-    """The adapter of the measured set whose raw file `path` is, known by its header; None for any other file."""
+    """The adapter of the measured set whose raw file `path` is, known by its header; None for any other
+    file."""
+    if not Path(path).is_file():
+        return None  # a pipe would wait for whoever writes into it
     try:
         with Path(path).open(encoding="utf-8-sig") as file:
             header = {name.strip() for name in file.readline(4096).split(",")}

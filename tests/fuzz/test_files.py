@@ -5,7 +5,9 @@ from __future__ import annotations
 import io
 import json
 import logging
+import os
 import sys
+import tracemalloc
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -21,11 +23,13 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "perf"))
 
 from fastrod.cli import main
 from fastrod.contact import MeshLimits, mesh
+from fastrod.contact.meshfile import read_mesh
 from fastrod.errors import FastrodError, InputError, LogError, RobotError, UnknownNameError
 from fastrod.robotfile import load_robot
 from fastrod.runlog import read_log
 from fastrod_device.hardware import SHIPPED, load_hardware
 from fastrod_envs.policies import Policy, find
+from fastrod_scenes.measured import read
 from fuzz_files import FINE, try_file, warm
 from fuzz_seeds import KINDS, Originals, foreign, npz
 
@@ -149,6 +153,22 @@ CONFIGS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "algorithm": (lambda c: c["plan"].update(algorithm="pp0"), "did you mean 'ppo'?"),
     "unknown key": (lambda c: c["plan"].update(curiculum=1.0), "unknown key 'curiculum'; did you mean 'curriculum'?"),
     "seconds": (lambda c: c["state"].update(seconds=float("nan")), "it says that nan s are done"),
+    "gamma": (lambda c: c["plan"]["settings"].update(gamma="x"), "setting 'gamma' of ppo is 'x'"),
+    "large gamma": (lambda c: c["plan"]["settings"].update(gamma=5.0), "'gamma' of ppo is 5.0; it must be a"),
+    "n_epochs": (lambda c: c["plan"]["settings"].update(n_epochs="x"), "'n_epochs' of ppo is 'x'; it must"),
+    "n_steps": (lambda c: c["plan"]["settings"].update(n_steps=10**7), "'n_steps' of ppo is 10000000"),
+    "no setting": (
+        lambda c: c["plan"]["settings"].update(gama=0.9),
+        "no setting 'gama'; did you mean 'gamma'?",
+    ),
+    "network": (
+        lambda c: c["plan"]["settings"].update(policy_kwargs={"net_arch": {"pi": [10**9]}}),
+        "it must be a list of at most 16 whole numbers from 1 to 4096, the widths of its layers",
+    ),
+    "log_std_init": (
+        lambda c: c["plan"]["settings"].update(policy_kwargs={"log_std_init": "x"}),
+        "setting 'log_std_init' of ppo is 'x'; it must be a number from -20 to 20",
+    ),
 }
 
 
@@ -168,6 +188,26 @@ def text_of(n: int) -> str:
     return "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\n" + "f 1 2 3\n" * n
 
 
+def glb(*, views: int = 1, accessors: int = 1, **others: Any) -> bytes:
+    """100 triangles; `others` of its view, `attributes` beside its position."""
+    numbers = np.eye(300, 3, dtype=np.float32).tobytes()
+    extra = {f"_{k}": 0 for k in range(others.pop("attributes", 0))}
+    tree = {
+        "asset": {"version": "2.0"},
+        "buffers": [{"byteLength": len(numbers)}],
+        "bufferViews": [{"buffer": 0, "byteLength": len(numbers), **others}] * views,
+        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 300, "type": "VEC3"}] * accessors,
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, **extra}}]}],
+        "nodes": [{"mesh": 0}],
+        "scenes": [{"nodes": [0]}],
+    }
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    parts = ((b"JSON", text), (b"BIN\0", numbers))
+    rest = b"".join(len(part).to_bytes(4, "little") + kind + part for kind, part in parts)
+    return b"glTF" + (2).to_bytes(4, "little") + (12 + len(rest)).to_bytes(4, "little") + rest
+
+
 MESHES: dict[str, tuple[str, str | bytes, MeshLimits | None, str]] = {
     "archive": ("a.zip", b"PK", None, "has the unknown suffix '.zip'"),
     "collada": ("a.dae", b"<COLLADA/>", None, "An archive, or a scene that refers to other files, is not read"),
@@ -180,6 +220,19 @@ MESHES: dict[str, tuple[str, str | bytes, MeshLimits | None, str]] = {
     "memory": ("a.obj", text_of(600_000), MeshLimits(memory=150_000_000), "needs more than 150000000 bytes of memory to be read"),
     "cut": ("a.stl", bytes(80) + (5).to_bytes(4, "little") + bytes(249), None, "declares 5 faces, which take 334 bytes, and it has 333"),
     "no faces": ("a.stl", b"", None, "is empty: it has 0 bytes"),
+    "no body": ("a.obj", "v 0 0 0\n", None, "mesh file 'a.obj' has no faces"),
+    "long view": (
+        "a.glb",
+        glb(byteLength=10**12),
+        None,
+        "a view of it takes 1000000000000 bytes from 0 on, of 3600",
+    ),
+    "late view": ("a.glb", glb(byteOffset=1), None, "a view of it takes 3600 bytes from 1 on, of 3600"),
+    "other buffer": ("a.glb", glb(buffer=1), None, "refers to buffer 1, and it has one"),
+    "wide steps": ("a.glb", glb(byteStride=13), None, "300 elements of 12 bytes, and its view has 3600"),
+    "no steps": ("a.glb", glb(byteStride=0), None, "begins at 0, with steps of 0 bytes"),
+    "views": ("a.glb", glb(views=10_000), None, "more than 16 times its"),
+    "accessors": ("a.glb", glb(accessors=10_000), None, "more than 16 times its"),
     "declared": (
         "a.ply",
         "ply\nformat ascii 1.0\nelement vertex 1000000000000\nproperty float x\nend_header\n0\n",
@@ -199,6 +252,19 @@ def test_a_mesh_beyond_the_limits_is_refused_in_a_sentence(name: str, tmp_path: 
     assert words in str(caught.value)
     assert str(caught.value).isprintable()
     assert capfd.readouterr() == ("", "")
+
+
+def test_attributes_beside_the_position_cost_nothing(tmp_path: Path) -> None:
+    for n in (0, 20_000):
+        (tmp_path / f"{n}.glb").write_bytes(glb(attributes=n))
+    plain = read_mesh(tmp_path / "0.glb", MeshLimits())  # trimesh is imported now
+    tracemalloc.start()
+    many = read_mesh(tmp_path / "20000.glb", MeshLimits())
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 10_000_000  # of 100 MB with each of them copied
+    for mine, its in zip(many, plain, strict=True):
+        np.testing.assert_array_equal(mine, its)
 
 
 def test_a_file_that_is_read_apart_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, originals: Originals) -> None:
@@ -240,6 +306,30 @@ def test_a_small_parquet_that_unpacks_to_much_is_refused(file: str, words: str, 
     path.write_bytes(getattr(originals, file))
     with pytest.raises(LogError, match=words):
         read_log(path, load_robot("prototype"))
+
+
+PIPES: dict[str, Callable[[Path], object]] = {
+    "log.csv": lambda path: read_log(path, load_robot("prototype")),
+    "log": lambda path: read(path, load_robot("prototype")),
+    "log.parquet": lambda path: read_log(path, load_robot("prototype")),
+    "robot.toml": load_robot,
+    "hardware.toml": load_hardware,
+}
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+@pytest.mark.parametrize("name", PIPES)
+def test_a_pipe_that_nobody_writes_into_is_refused(name: str, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(FastrodError, match=r"cannot be read: it is no file\.$"):
+        PIPES[name](tmp_path / name)
+
+
+def test_a_csv_has_a_most_of_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, originals: Originals) -> None:
+    (tmp_path / "log.csv").write_bytes(originals.log[0])
+    monkeypatch.setattr("fastrod.runlog._MOST_BYTES", 100)
+    with pytest.raises(LogError, match=r"log\.csv has \d+ bytes; a log may have 100\. Cut it in parts\.$"):
+        read_log(tmp_path / "log.csv", load_robot("prototype"))
 
 
 def test_a_refusal_quotes_libraries_in_one_line(tmp_path: Path, originals: Originals) -> None:

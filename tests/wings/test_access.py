@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -142,6 +143,7 @@ def test_a_client_without_a_browser_gets_what_the_page_shows(address: str) -> No
         ("0.0.0.0", "192.168.1.5", "192.168.1.5:80", True),
         ("0.0.0.0", "192.168.1.5", "192.168.1.5", True),  # a browser leaves out port 80
         ("0.0.0.0", "192.168.1.5", "192.168.1.6:80", False),
+        ("0.0.0.0", "192.168.1.5", f"{socket.gethostname()}:80", True),  # printed where there is no route
         ("0.0.0.0", "192.168.1.5", "evil.example:80", False),
         ("0.0.0.0", "192.168.1.5", "0.0.0.0:80", False),
         ("robot.lab", "192.168.1.5", "Robot.lab:80", True),

@@ -519,11 +519,11 @@ def test_a_bus_that_is_not_there(name, says):
 
 
 def test_an_own_dictionary_must_be_one(tmp_path: Path):
-    with pytest.raises(DeviceError, match="does not exist"):
+    with pytest.raises(InputError, match="does not exist"):
         object_dictionary(tmp_path / "none.eds")
     bad = tmp_path / "bad.eds"
     bad.write_text("no dictionary")
-    with pytest.raises(DeviceError, match="cannot be read"):
+    with pytest.raises(InputError, match="cannot be read"):
         object_dictionary(bad)
 
 
@@ -535,7 +535,7 @@ def test_an_own_dictionary_takes_the_place_of_ours(tmp_path: Path):
     assert len(object_dictionary(own)) == len(dictionary)
     del dictionary[0x6502]
     canopen.export_od(dictionary, str(poor))
-    with pytest.raises(DeviceError, match="has no object 0x6502:00"):
+    with pytest.raises(InputError, match="has no object 0x6502:00"):
         object_dictionary(poor)
 
 

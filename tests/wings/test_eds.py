@@ -14,10 +14,12 @@ import numpy as np
 import pytest
 
 from fastrod.driving import _bench
+from fastrod.errors import InputError
 from fastrod.types import Floats
 from fastrod_device.clock import SteppedClock
 from fastrod_device.dictionary import NEEDED, find, object_dictionary
 from fastrod_device.drive import DriveBus
+from fastrod_device.eds import read_eds
 from fastrod_device.errors import DeviceError
 from fastrod_device.hardware import load_hardware
 from fastrod_device.nodes import EmulatedDrives
@@ -286,7 +288,7 @@ def test_what_a_drive_lacks_is_left_out_and_said(index: int, says: str, known: b
 def test_what_is_needed_is_demanded_by_name(index: int, sub: int, tmp_path: Path) -> None:
     path = tmp_path / "poor.eds"
     path.write_bytes(WRITTEN["Windows"](eds(without(index))))
-    with pytest.raises(DeviceError, match=rf"has no object 0x{index:04X}:\d\d \(.+\); is it that of"):
+    with pytest.raises(InputError, match=rf"has no object 0x{index:04X}:\d\d \(.+\); is it that of"):
         object_dictionary(path)
     with Bench() as bench:
         bench.nodes.drop(1, index)
@@ -361,15 +363,27 @@ def test_a_file_of_another_drive_is_found_out(facts: Facts, says: str, tmp_path:
             b"[6040]\nDataType=\nCompactSubObj=0xFFFFFFFF\nPDOMapping=yes\nDefaultValue=$NODEID\n",
             "has no object 0x1000:00",
         ),
+        (
+            b"".join(b"[%04X]\nCompactSubObj=254\n" % k for k in range(100)),
+            "describes more than 20000 variables.",
+        ),
+        (b"[a]\n" * 20_001, "it has more than 20000 sections"),
     ],
 )
 def test_what_is_no_such_file_is_one_sentence(data: bytes, says: str, tmp_path: Path) -> None:
     path = tmp_path / "bad.eds"
     path.write_bytes(data)
-    with pytest.raises(DeviceError) as caught:
+    with pytest.raises(InputError) as caught:
         object_dictionary(path)
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_rows_of_spaces_are_read_in_no_time(tmp_path: Path) -> None:
+    path, gap = tmp_path / "wide.eds", " " * 100_000  # hours, where time grows with a power of its length
+    path.write_text(f"[6040]\nDataType=6\na{gap}b\nDefaultValue=1{gap}2\n[6041]\nDefaultValue={gap}3\nDataType=6\n")
+    od = read_eds(path)
+    assert (find(od, 0x6040).default, find(od, 0x6041).default) == (None, 3)
 
 
 def test_what_is_not_limited_is_printed_and_in_the_journal(tmp_path: Path, capsys: Any) -> None:

@@ -10,6 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 import urllib.request
 import webbrowser
@@ -169,17 +170,30 @@ def _address() -> str:
 
 @pytest.mark.parametrize(("host", "announced"), [("127.0.0.1", False), ("0.0.0.0", True)])
 def test_the_address_is_the_key(
-    host: str, announced: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:  # fmt: skip
+    host: str,
+    announced: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     opened: list[str] = []
+
+    def browse(page: str) -> None:
+        """Go where a file leads that others cannot read: they can read a command line."""
+        path = Path(page.removeprefix("file://"))
+        assert path.stat().st_mode & 0o077 == 0
+        opened.extend(re.findall('url=(.+)"', path.read_text()))
+
     monkeypatch.setattr(App, "wait", lambda app: opened.append(app.served.key))
-    monkeypatch.setattr(webbrowser, "open", opened.append)
+    monkeypatch.setattr(webbrowser, "open", browse)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     before = signal.getsignal(signal.SIGTERM)
     try:
         view("prototype", host=host, port=0)
     finally:
         signal.signal(signal.SIGTERM, before)
     said = capsys.readouterr()
+    assert list(tmp_path.iterdir()) == []
     address, key = opened
     assert address.endswith(f"/{key}/")
     assert f"prototype: {address} (Ctrl+C ends it)" in said.out

@@ -261,9 +261,7 @@ def view(
     with contextlib.suppress(KeyboardInterrupt), App(host=host, port=port, server=server) as app:
         shown = found(what, robot, n_robots)
         if open_browser:
-            import webbrowser
-
-            webbrowser.open(app.address)
+            app.served.open_browser()
         app.open(shown, link=link, script=script)
         if app.served.elsewhere:
             app.say(
