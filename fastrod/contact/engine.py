@@ -317,8 +317,8 @@ class Engine:
         rest, still = np.zeros(n, bool), rows
         progress, damping = Progress(n), Damping(scenery.damping, rows, tries)
         frames = np.broadcast_to(scenery.frames, (n, *scenery.frames.shape[1:]))
-        frames_before = np.array(np.broadcast_to(scenery.frames_before, frames.shape))
-        scenery = scenery._replace(before=Shape(*(np.array(a) for a in scenery.before)), frames_before=frames_before)
+        frames_before = np.array(np.broadcast_to(scenery.frames_before, frames.shape), order="C")
+        scenery = scenery._replace(before=Shape(*(np.array(a, order="C") for a in scenery.before)), frames_before=frames_before)
         x, used, slot = memory.x.copy(), self.touching.used.copy(), self.touching.slot.copy()
         for count in range(_LONGEST * _MOST_DAMPED):
             here = memory.x[still].copy(), self.touching.used[still].copy(), self.touching.slot[still].copy()
