@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -46,7 +47,7 @@ CASES: dict[str, tuple[Robot, dict[str, Any]]] = {
     "tip only": (REACHER, {"outputs": "tip"}),
     "effects with memory": (replace(REACHER, effects=LASH), {}),
     "contact scene": (REACHER, {"contact": FAR}),
-    "threads": (REACHER, {"threads": 2}),
+    "threads": (REACHER, {"threads": min(2, numba.config.NUMBA_NUM_THREADS)}),
 }
 
 

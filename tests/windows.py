@@ -24,6 +24,8 @@ ARGUMENTS = [
     "--disable-sync",
 ]
 _LOCAL = ("127.0.0.1", "localhost")
+PATIENCE = 240.0
+"""s: what ends a test that hangs. Without a graphics card, and on one core, a frame may take a second."""
 
 
 class Window:
@@ -34,7 +36,7 @@ class Window:
             viewport={"width": width, "height": height}, offline=offline, accept_downloads=True
         )
         self.page = self.context.new_page()
-        self.page.set_default_timeout(60_000)  # a browser without a graphics card on a busy machine is slow
+        self.page.set_default_timeout(1e3 * PATIENCE)
         self.requested: list[str] = []
         self.errors: list[str] = []
         self.page.on("request", lambda request: self.requested.append(request.url))
@@ -53,7 +55,7 @@ class Window:
     def go(self, address: str) -> None:
         """Open a page and wait until it draws."""
         self.page.goto(address)
-        self.page.wait_for_selector("canvas", timeout=60_000)
+        self.page.wait_for_selector("canvas")
 
     def close_toast(self) -> None:
         """Close the note that the page is drawn in software, which covers a corner of the picture."""
@@ -63,7 +65,7 @@ class Window:
         except Exception:  # a browser with a graphics card shows none
             return
 
-    def until(self, holds: Callable[[], bool], seconds: float = 40.0) -> bool:
+    def until(self, holds: Callable[[], bool], seconds: float = PATIENCE) -> bool:
         """Wait until something holds; whether it does."""
         end = time.monotonic() + seconds
         while not holds() and time.monotonic() < end:

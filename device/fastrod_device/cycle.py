@@ -28,7 +28,7 @@ from fastrod_device.units import DriveSpec
 OFF, STOP, RUN, START, RESET = 0x0000, 0x0002, 0x000F, 0x001F, 0x0080
 """Controlwords: no voltage, quick stop, operation, operation with bit 4 (a move begins), fault reset."""
 _WAITED = 0.6  # of a cycle that is waited for answers
-_STEPPED_WAIT = 1.0  # s, the same where time is stepped
+_STEPPED_WAIT = 3.0  # s, the same where time is stepped
 # s; beyond it the drives may have stopped by themselves, and must not be told to go on
 _PAUSE = 0.8 * PATIENCE
 _COMMAND = struct.Struct("<Hi")

@@ -28,6 +28,14 @@ def tip_of(app: App) -> np.ndarray:
     return page_of(app).world.rods[0].state.tip_position[0].copy()
 
 
+def at_rest(app: App) -> bool:
+    """The page's camera has come to where it begins, and the server knows."""
+    clients = list(app.server.get_clients().values())
+    return bool(
+        clients and np.linalg.norm(clients[0].camera.position - app.server.initial_camera.position) < 1e-2
+    )
+
+
 def test_a_slider_moved_by_keys_bends_the_robot_and_the_picture(app: App, window: Windows) -> None:
     app.open("prototype")
     seen = window(app.address)
@@ -53,7 +61,7 @@ def test_the_tip_follows_a_drag(app: App, window: Windows) -> None:
     app.open("five_segment_reacher")
     seen = window(app.address)
     before = tip_of(app)
-    seen.page.wait_for_timeout(2500)  # the camera has come to rest, and the server knows where
+    assert seen.until(lambda: at_rest(app))
     x, y = seen.place_of(page_of(app).drawing.tip(), app)
     mouse = seen.page.mouse
     mouse.move(x, y)
@@ -77,20 +85,14 @@ def test_keys_bend_pause_reset_and_stop(app: App, window: Windows) -> None:
     app.open("five_segment_reacher")
     seen = window(app.address)
     page, keys = page_of(app), seen.page.keyboard
-    eye = np.array(app.server.initial_camera.position)
-
-    def at_rest() -> bool:
-        clients = list(app.server.get_clients().values())
-        return bool(clients and np.linalg.norm(clients[0].camera.position - eye) < 1e-2)
-
-    assert seen.until(at_rest)
+    assert seen.until(lambda: at_rest(app))
     keys.press("2")
     for _ in range(3):
         keys.press("l")
     assert seen.until(lambda: abs(page.teleop.bent(1)[0] - np.radians(15.0)) < 1e-6)
     assert page.teleop.bent(0)[0] == pytest.approx(0.0, abs=1e-6)
     seen.page.wait_for_timeout(500)
-    assert at_rest()  # keys that bend do not fly the camera
+    assert at_rest(app)  # keys that bend do not fly the camera
     keys.press("Space")
     assert seen.until(lambda: page.session.paused)
     keys.press("Space")

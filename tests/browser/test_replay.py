@@ -30,10 +30,10 @@ def test_the_time_slider_moves_the_robot_and_the_figures(app: App, window: Windo
     app.open(DEMO_LOG)
     seen = window(app.address)
     page = replayed(app)
-    seen.page.get_by_role("button", name="Pause").click()
     thumb = seen.slider("Time [s]")
     thumb.focus()
-    thumb.press("End")
+    thumb.press("End")  # whoever moves the slider has paused it
+    assert seen.until(lambda: seen.page.get_by_role("button", name="Play").count() == 1)
     assert seen.until(lambda: page.frame == len(page.playback.frames) - 1)
     row = page.playback.frames[-1]
     shown = f"{1e3 * page.playback.before.residual[row]:.2f} mm"
@@ -108,7 +108,7 @@ def test_an_exported_page_opens_from_disk_without_a_network(
     seen = window(app.address)
     if what == "prototype":
         seen.page.get_by_role("tab", name="Save").click()
-    with seen.page.expect_download(timeout=60_000) as waiting:
+    with seen.page.expect_download() as waiting:
         seen.page.get_by_role("button", name="Export as a web page").click()
     path = tmp_path / "page.html"
     waiting.value.save_as(path)
@@ -129,7 +129,7 @@ def test_a_picture_is_saved(app: App, window: Windows, tmp_path: Path) -> None:
     app.open("prototype")
     seen = window(app.address)
     seen.page.get_by_role("tab", name="Save").click()
-    with seen.page.expect_download(timeout=60_000) as waiting:
+    with seen.page.expect_download() as waiting:
         seen.page.get_by_role("button", name="Save a picture (PNG)").click()
     path = tmp_path / "picture.png"
     waiting.value.save_as(path)
