@@ -174,10 +174,10 @@ def query(timed: Timed, repeats: int) -> tuple[float, float]:
     """Seconds of one search of all robots against their meshes: with nothing known, and from what the step
     before knew."""
     engine: Any = timed.sim._engine
-    before, distance, position = timed.earlier
+    before, distance, position, _ = timed.earlier
     shape = before._replace(**{name: getattr(timed.last, name) for name in before._fields})
     rows, clearance = np.arange(timed.sim.n_robots), engine.clearance
-    kept = engine.before, engine.gap.copy(), *(a.copy() for a in clearance)
+    kept = engine.before, *(a.copy() for a in clearance)
     engine.before, found = before, []
     for cold in (True, False):
         searched = Measurement()
@@ -185,9 +185,9 @@ def query(timed: Timed, repeats: int) -> tuple[float, float]:
             clearance.distance[:] = -np.inf if cold else distance
             clearance.position[:] = position
             engine.tracked[:] = not cold  # what has no past has gone through nothing
-            searched.take(partial(engine.touches, rows, shape))
+            searched.take(partial(engine.overlap, rows, shape))
         found.append(searched.least)
-    engine.before, engine.gap[:], clearance.distance[:], clearance.position[:] = kept
+    engine.before, clearance.distance[:], clearance.position[:], clearance.gap[:] = kept
     return found[0], found[1]
 
 

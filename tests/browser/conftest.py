@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from windows import ARGUMENTS, Window
+from windows import ARGUMENTS, PATIENCE, Window
 
 import fastrod
 from fastrod.identification.attribution import identify
@@ -44,6 +44,13 @@ def chromium() -> Iterator[Any]:
         browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=ARGUMENTS)
         yield browser
         browser.close()
+
+
+@pytest.fixture(autouse=True)
+def _slow(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a graphics card, and on one core, a browser takes seconds to answer."""
+    monkeypatch.setattr("fastrod_viewer.watch._PATIENCE", 30.0)
+    monkeypatch.setattr("fastrod_viewer.session._SAID", PATIENCE)
 
 
 @pytest.fixture

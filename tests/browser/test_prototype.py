@@ -136,13 +136,6 @@ class Bed:
         return seen.until(lambda: seen.page.get_by_text(re.compile(words)).count() > 0)
 
 
-@pytest.fixture(autouse=True)
-def _slow(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a graphics card, and on one core, a browser takes seconds to answer."""
-    monkeypatch.setattr("fastrod_viewer.watch._PATIENCE", 30.0)
-    monkeypatch.setattr("fastrod_viewer.session._SAID", PATIENCE)
-
-
 @pytest.fixture
 def bed(app: App) -> Iterator[Bed]:
     with emulated(load_hardware(), seed=3, effect="none", home=False) as setup:

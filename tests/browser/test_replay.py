@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,6 +27,19 @@ def replayed(app: App) -> ReplayPage:
     return app.page
 
 
+def box_at_rest(seen: Window, thumb: Any) -> Any:
+    """The box of a slider's thumb when it has come to where it goes."""
+    boxes = [thumb.bounding_box()]
+
+    def stands() -> bool:
+        seen.page.wait_for_timeout(500)
+        boxes.append(thumb.bounding_box())
+        return bool(boxes[-1] == boxes[-2])
+
+    assert seen.until(stands)
+    return boxes[-1]
+
+
 def test_the_time_slider_moves_the_robot_and_the_figures(app: App, window: Windows) -> None:
     app.open(DEMO_LOG)
     seen = window(app.address)
@@ -38,11 +52,12 @@ def test_the_time_slider_moves_the_robot_and_the_figures(app: App, window: Windo
     row = page.playback.frames[-1]
     shown = f"{1e3 * page.playback.before.residual[row]:.2f} mm"
     assert seen.until(lambda: seen.page.get_by_text(shown).count() > 0)
-    right = thumb.bounding_box()
+    right = box_at_rest(seen, thumb)
     thumb.press("Home")
     assert seen.until(lambda: page.frame == 0)
-    seen.page.wait_for_timeout(500)
-    before, left = seen.pixels(), thumb.bounding_box()
+    left = box_at_rest(seen, thumb)
+    assert left["x"] < right["x"]
+    before = seen.pixels()
     rotated_at = float(
         page.playback.frame_time[np.argmin(np.abs(page.playback.base_quaternion[:, 0] - np.sqrt(0.5)))]
     )
