@@ -83,6 +83,7 @@ ALLOWED: dict[str, str] = {
     "fastrod/identification/report/page.py": "evidence",
     "fastrod/identification/report/report.py": "cannot_be_told_from evidence",
     "fastrod/identification/report/result.py": "cannot_be_told_from evidence",
+    "gym_envs/fastrod_envs/actor.py": "reach",
     "gym_envs/fastrod_envs/sb3.py": "reach",
     "gym_envs/fastrod_envs/tasks/pick_place.py": "Grip grip",
     "gym_envs/fastrod_envs/tasks/reach.py": "Reach ReachOptions ReachRewardOptions ReachTask",

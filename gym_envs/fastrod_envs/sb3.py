@@ -105,14 +105,14 @@ class ScaledFeatures(BaseFeaturesExtractor):
     beside its file."""
 
     middle: torch.Tensor
-    half_range: torch.Tensor
+    reach: torch.Tensor
 
     def __init__(self, observation_space: gymnasium.spaces.Box) -> None:
         super().__init__(observation_space, features_dim=int(np.prod(observation_space.shape)))
         low, high = torch.as_tensor(observation_space.low), torch.as_tensor(observation_space.high)
         self.register_buffer("middle", 0.5 * (low + high))
-        self.register_buffer("half_range", (0.5 * (high - low)).clamp(min=1e-6))
+        self.register_buffer("reach", (0.5 * (high - low)).clamp(min=1e-6))
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """(batch, n_obs)"""
-        return (observations - self.middle) / self.half_range
+        return (observations - self.middle) / self.reach
