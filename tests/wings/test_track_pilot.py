@@ -99,7 +99,7 @@ def test_it_does_what_the_environment_does(path: Any, seed: int, robot: Robot) -
 
 def test_both_ways_round_were_seen() -> None:
     ways = {
-        episode(path, seed, PROTOTYPE, n_steps=1)["way"]
+        episode(path, seed, PROTOTYPE, n_steps=1)["sense"]
         for path, seed in (("triangle", 1), ("square", 2), ("circle", 4))
     }
     assert ways == {-1, 1}
