@@ -436,14 +436,12 @@ def test_effects_of_a_robot_file_come_back_and_act(tmp_path: Path) -> None:
         (
             [{"name": "backlash", "half_width": -1e-4}],
             EffectError,
-            r"is -0.0001 m; it must be a number from "
-            r"0 to",
+            r"is -0.0001 m; it must be a number from 0 to",
         ),
         (
             [{"name": "backlash", "half_width": 1.0}],
             EffectError,
-            r"is 1.0 m; it must be a number from 0 to "
-            r"0.00",
+            r"is 1.0 m; it must be a number from 0 to 0.00",
         ),
         ([{"name": "creep", "share": "a"}], EffectError, "share of effect 'creep' is 'a'"),
         ([{"name": "creep", "share": True}], EffectError, "is True"),
@@ -679,9 +677,7 @@ def test_a_class_that_is_no_effect_is_refused(made: type, sentence: str) -> None
 
 def test_a_parameter_has_its_neutral_value_in_its_bounds() -> None:
     with pytest.raises(
-        EffectError,
-        match=r"'size' has neutral value 0\.0; it must lie in its bounds 1\.0 "
-        r"to 2\.0",
+        EffectError, match=r"'size' has neutral value 0\.0; it must lie in its bounds 1\.0 to 2\.0"
     ):
         Parameter("size", "m", bounds=(1.0, 2.0))
     assert Parameter("size", "m", bounds=(0.0, 2.0)).scale == pytest.approx(0.2)

@@ -83,8 +83,7 @@ SENTENCES: list[tuple[Callable[[], object], str]] = [
     (lambda: touching().state.contacts.in_contact("bal"), "no obstacle 'bal'; did you mean 'ball'"),
     (
         lambda: touching().step(REST, obstacle_pose={"ball": "here"}),
-        r"obstacle_pose\['ball'\] is not an "
-        r"array of numbers",
+        r"obstacle_pose\['ball'\] is not an array of numbers",
     ),
     (
         lambda: touching().step(REST, obstacle_pose={"ball": [math.nan] * 7}),
@@ -112,8 +111,7 @@ SENTENCES: list[tuple[Callable[[], object], str]] = [
     (lambda: recorder().add(reading(math.inf)), "the reading has t = inf; a row needs a finite time"),
     (
         lambda: reference.constant_curvature(rod(), [0.07]),
-        r"tendon_length has shape \(1,\); it must be "
-        r"\(4,\) finite lengths",
+        r"tendon_length has shape \(1,\); it must be \(4,\) finite lengths",
     ),
     (lambda: reference.shoot(slack(), tension=[-1.0]), "a unilateral tendon cannot push"),
     (lambda: reference.shoot(rod(), REST, point_force=[(0.01,)]), "each entry must be a pair of arclength"),
@@ -126,8 +124,7 @@ SENTENCES: list[tuple[Callable[[], object], str]] = [
     (lambda: segment(precurvature=(1.0, 2.0)), r"precurvature is \[1.0, 2.0\]; it must be 3 finite numbers"),
     (
         lambda: segment(extension=(-0.1, 0.0)),
-        r"extension is \[-0.1, 0.0\] m; give \[smallest, largest\] "
-        r"change",
+        r"extension is \[-0.1, 0.0\] m; give \[smallest, largest\] change",
     ),
     (lambda: segment(mode="tendon_lenght"), "mode is 'tendon_lenght'; did you mean 'tendon_length'"),
     (lambda: segment(mode="passive"), "A passive segment has no tendons; it was given 1"),

@@ -63,8 +63,7 @@ TEXTS = {
     ),
     "a long table": (
         "name = 'x'\nsegment = ['" + LONG + "']",
-        r"robot file: segment 1 is 'aaa+ \.\.\. a+'; "
-        r"it must be a table",
+        r"robot file: segment 1 is 'aaa+ \.\.\. a+'; it must be a table",
     ),
     "sensor list": (
         PROTOTYPE + "[sensor]\nlatency_sd = [0.1, 0.1]\n",
@@ -72,8 +71,7 @@ TEXTS = {
     ),
     "sensor single": (
         PROTOTYPE + "[sensor]\nlatency_sd = [0.1]\n",
-        r"\[sensor\] latency_sd is \[0.1\]; "
-        r"give one number\.",
+        r"\[sensor\] latency_sd is \[0.1\]; give one number\.",
     ),
     "sensor pair": (
         PROTOTYPE + "[sensor]\nregistration_sd = [0.1]\n",
@@ -81,13 +79,11 @@ TEXTS = {
     ),
     "sensor negative": (
         PROTOTYPE + "[sensor]\nnoise = -1e-3\n",
-        r"\[sensor\] noise is -0.001; it must be "
-        r"zero or positive, and finite\.",
+        r"\[sensor\] noise is -0.001; it must be zero or positive, and finite\.",
     ),
     "sensor nan": (
         PROTOTYPE + "[sensor]\nnoise = nan\n",
-        r"\[sensor\] noise is nan; it must be zero or "
-        r"positive",
+        r"\[sensor\] noise is nan; it must be zero or positive",
     ),
 }
 
@@ -103,19 +99,16 @@ def test_texts_of_robots_that_are_none(case: str) -> None:
 NUMBERS: dict[str, tuple[Any, str]] = {
     "stiffness": (
         lambda: rod(bending_stiffness=(1e-300, 1.0)),
-        r"bending_stiffness is 1e-300 N m\^2; it "
-        r"must be between 1e-20 and 1e\+15",
+        r"bending_stiffness is 1e-300 N m\^2; it must be between 1e-20 and 1e\+15",
     ),
     "torsion": (
         lambda: rod(torsional_stiffness=1e200),
-        r"torsional_stiffness is 1e\+200 N m\^2; it must be "
-        r"between",
+        r"torsional_stiffness is 1e\+200 N m\^2; it must be between",
     ),
     "length": (lambda: rod(length=1e-300), r"Segment.length is 1e-300 m; it must be between 1e-06 and inf m"),
     "offset": (
         lambda: Tendon(offset=5e-324, angle=0.0),
-        r"Tendon.offset is 5e-324 m; it must be between "
-        r"1e-06 and 10 m",
+        r"Tendon.offset is 5e-324 m; it must be between 1e-06 and 10 m",
     ),
     "compliance": (
         lambda: Tendon(offset=0.01, angle=0.0, compliance=1e300),
@@ -124,8 +117,7 @@ NUMBERS: dict[str, tuple[Any, str]] = {
     "pretension": (lambda: Tendon(offset=0.01, angle=0.0, pretension=1e300), "Tendon.pretension is 1e.300 N"),
     "gravity": (
         lambda: replace(rod(), gravity=(0.0, 0.0, 1e300)),
-        r"Robot.gravity is \[0.0, 0.0, "
-        r"1e\+300\]; its numbers must be between",
+        r"Robot.gravity is \[0.0, 0.0, 1e\+300\]; its numbers must be between",
     ),
     "line density": (lambda: rod(line_density=1e300), "Segment.line_density is 1e.300 kg/m"),
 }
@@ -157,9 +149,7 @@ def test_an_effect_without_bounds_still_needs_a_number_that_is_finite() -> None:
     try:
         for value in (np.inf, 10**400, "x"):
             with pytest.raises(
-                EffectError,
-                match=r"size of effect 'boundless' is .* N; it must be a number "
-                r"from",
+                EffectError, match=r"size of effect 'boundless' is .* N; it must be a number from"
             ) as caught:
                 Simulator(replace(rod(), effects=({"name": "boundless", "size": value},)))
             assert len(str(caught.value)) < 400
@@ -208,9 +198,7 @@ def test_a_bad_row_changes_no_bit_of_its_neighbours(name: str, value: float, col
 def test_a_value_beyond_any_unit_is_refused() -> None:
     sim, _, lengths = pair()
     with pytest.raises(
-        InputError,
-        match=r"tip_force holds a value beyond 1e\+12 N: \[0\.e\+00 0\.e\+00 "
-        r"1\.e\+13\]\.",
+        InputError, match=r"tip_force holds a value beyond 1e\+12 N: \[0\.e\+00 0\.e\+00 1\.e\+13\]\."
     ):
         sim.step(lengths, tip_force=(0.0, 0.0, 1e13))
     with pytest.raises(InputError, match="tip_force is not an array of numbers"):
@@ -338,9 +326,7 @@ def test_modes_say_what_they_take() -> None:
     tip = Simulator(rod(), outputs="tip")
     tip.settle(lengths)
     with pytest.raises(
-        InputError,
-        match=r"shape needs Simulator\(..., outputs='full'\); this one keeps the "
-        r"tip only",
+        InputError, match=r"shape needs Simulator\(..., outputs='full'\); this one keeps the tip only"
     ):
         tip.shape(0.01)
 

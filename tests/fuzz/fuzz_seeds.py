@@ -122,8 +122,7 @@ class Originals:
         folder = files("fastrod") / "robots"
         full = (folder / "prototype.toml").read_text(encoding="utf-8") + (
             '\n[[effect]]\nname = "backlash"\nhalf_width = 0.0002\n[fit]\n"tendon.*.offset" = { sd = 0.001, '
-            "shared = true }\n"
-            "[sensor]\nnoise = [0.001, 0.001, 0.001]\n"
+            "shared = true }\n[sensor]\nnoise = [0.001, 0.001, 0.001]\n"
         )
         hardware = (files("fastrod_device") / "prototype.toml").read_bytes()
         wide = (
@@ -395,8 +394,7 @@ _BOMBS: Mapping[str, Mapping[str, str]] = {
     },
     "stl": {
         "many solids": "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 0.1 0 0\nvertex 0 0.1 "
-        "0\n"
-        "endloop\nendfacet\nendsolid\n" * 5000,
+        "0\nendloop\nendfacet\nendsolid\n" * 5000,
         "half a facet": "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0\n",
     },
     "ply": {

@@ -212,8 +212,7 @@ def test_all_forms_of_a_robot_make_one_plan(tmp_path: Path) -> None:
     assert Rollouts(env="Reach", options=(("randomise", whole),))._given()["randomise"]["robot"] == robot
     with pytest.raises(
         InputError,
-        match=r"^option 'n_steps' is \{1\}; a plan holds finite numbers, words, "
-        r"lists and mappings\.$",
+        match=r"^option 'n_steps' is \{1\}; a plan holds finite numbers, words, lists and mappings\.$",
     ):
         Rollouts(env="Reach", options=(("n_steps", {1}),))
 

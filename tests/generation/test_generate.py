@@ -148,9 +148,7 @@ def test_a_shard_with_a_broken_page_is_made_again(whole: Path, tmp_path: Path) -
     broken.write_bytes(good[:4] + b"\xff" * 60 + good[64:])  # the first pages; the footer stays
     assert parquet.read_metadata(broken).num_rows == 50
     with pytest.raises(
-        InputError,
-        match=r"shapes-000004.parquet' cannot be read; remove it, and generate "
-        r"again\.$",
+        InputError, match=r"shapes-000004.parquet' cannot be read; remove it, and generate again\.$"
     ):
         shards.counted(small(), tmp_path / "shards")
     assert generate(small(), tmp_path, workers=1).made == 1
@@ -246,9 +244,7 @@ def test_rows_that_are_doubled_are_found(whole: Path, tmp_path: Path) -> None:
     table = parquet.read_table(path)
     parquet.write_table(table.take([0, *range(49)]).replace_schema_metadata(table.schema.metadata), path)
     with pytest.raises(
-        InputError,
-        match=r"shapes-000002.parquet' does not hold each row from 100 to 149 "
-        r"once; remove it",
+        InputError, match=r"shapes-000002.parquet' does not hold each row from 100 to 149 once; remove it"
     ):
         generate(small(), tmp_path, workers=1)
 
@@ -314,9 +310,7 @@ def test_work_that_kills_every_worker_ends(tmp_path: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(here, "_pool", dying)
     with pytest.raises(
-        HostError,
-        match=r"the workers died 3 times without a shard; is there memory enough "
-        r"for 2\?",
+        HostError, match=r"the workers died 3 times without a shard; is there memory enough for 2\?"
     ):
         generate(small(), tmp_path, workers=2)
     assert pools == [12, 12, 12]
@@ -482,8 +476,7 @@ def test_shards_that_are_a_file_are_refused(tmp_path: Path) -> None:
     (tmp_path / "shards").write_text("")
     with pytest.raises(
         InputError,
-        match=r"shards' is a file; it must be a folder: remove it, or give --out "
-        r"another folder\.$",
+        match=r"shards' is a file; it must be a folder: remove it, or give --out another folder\.$",
     ):
         generate(small(), tmp_path, workers=1)
     assert [path.name for path in tmp_path.iterdir()] == ["shards"]

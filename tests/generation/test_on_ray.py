@@ -91,8 +91,7 @@ def test_a_machine_that_does_not_see_the_folder_is_named(
     monkeypatch.setattr(on_ray, "_write_probe", write_probe)
     with pytest.raises(
         InputError,
-        match=r"machine .* does not see folder .*shards'; give --out a folder "
-        r"that all machines see\.",
+        match=r"machine .* does not see folder .*shards'; give --out a folder that all machines see\.",
     ):
         generate(small(), tmp_path, ray="auto")
     assert bits(tmp_path) == {}

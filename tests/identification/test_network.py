@@ -77,9 +77,7 @@ def test_missing_rows_are_left_out() -> None:
 def test_without_scikit_learn_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "sklearn.neural_network", None)
     with pytest.raises(
-        InputError,
-        match=r"needs scikit-learn; install fastrod\[network\], or leave "
-        r"--network out",
+        InputError, match=r"needs scikit-learn; install fastrod\[network\], or leave --network out"
     ):
         left(noise())
 

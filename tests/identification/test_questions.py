@@ -171,8 +171,7 @@ REFUSED = {
     ),
     "half a turn": (
         lambda: log_of(farlog.log(900, rotation=HALF)),
-        r"A camera turned by 1[78]\d deg would "
-        r"look the same: if yours is",
+        r"A camera turned by 1[78]\d deg would look the same: if yours is",
     ),
     "columns moved on": (
         order(1, 2, 0, 4, 5, 3),
@@ -199,13 +198,11 @@ ASKED = {
     "half": (scaled(0.5), r"with every dl_ times 2 \(a radius for a diameter\)"),
     "time in ms": (
         lambda: replace(seen(), t=1e3 * seen().t),
-        r"has a row every 50 s and lasts .* s; is "
-        r"column t in ms\?",
+        r"has a row every 50 s and lasts .* s; is column t in ms\?",
     ),
     "a camera far off": (
         lambda: seen(0.6, 0.34),
-        r"the camera stands 34\.\d deg and 0\.34 m from where the "
-        r"robot file says",
+        r"the camera stands 34\.\d deg and 0\.34 m from where the robot file says",
     ),
 }
 

@@ -84,9 +84,7 @@ def test_what_cannot_be_held_out(text: list[str], kind: type[Exception], sentenc
 
 def test_runs_that_have_no_names() -> None:
     with pytest.raises(
-        UnknownNameError,
-        match=r"no run 'c' to hold out; log 'log' names no runs: give a "
-        r"time, as in '@60:'",
+        UnknownNameError, match=r"no run 'c' to hold out; log 'log' names no runs: give a time, as in '@60:'"
     ):
         held_out_rows(sample(log(labels=("",))), ["c"])
     with pytest.raises(UnknownNameError, match="did you mean 'circle'"):

@@ -170,8 +170,7 @@ def test_body_radii_and_log_points_stay_where_they_fit() -> None:
         (
             "segment.1.lenght",
             {"sd": 1e-3},
-            r"\[fit\] 'segment.1.lenght' is no parameter; did you mean "
-            r"'segment.\*.length'",
+            r"\[fit\] 'segment.1.lenght' is no parameter; did you mean 'segment.\*.length'",
         ),
         ("tendon.*.gian", {"sd": 1e-3}, r"did you mean 'tendon.\*.gain'"),
         ("tendons.1.gain", {"sd": 1e-3}, r"did you mean 'tendon.\*.gain'"),
