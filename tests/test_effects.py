@@ -44,17 +44,7 @@ from fastrod.types import Floats
 NAMES = effect_names()
 OPERATORS = [name for name in NAMES if isinstance(get_effect(name), Operator)]
 N_STEPS, N_ROBOTS, DT = 15, 3, 0.05
-STATE = (
-    "position",
-    "rotation",
-    "curvature",
-    "arclength",
-    "tension",
-    "path_length",
-    "base_wrench",
-    "residual",
-    "passes",
-)
+STATE = "position rotation curvature arclength tension path_length base_wrench residual passes"
 Table = dict[str, Any]
 Seen = dict[str, np.ndarray]
 
@@ -142,7 +132,7 @@ def run(
             for k, v in given(sim.robots[0], i, moving).items()
         }
         state = sim.step(here[rows], **loads)
-        for name in STATE:
+        for name in STATE.split():
             seen.setdefault(name, []).append(getattr(state, name))
         for name, value in sim.measure()._asdict().items():
             seen.setdefault(f"measured {name}", []).append(value)

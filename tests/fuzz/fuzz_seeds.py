@@ -18,53 +18,16 @@ from typing import Any
 
 import numpy as np
 
-KINDS = (
-    "policy",
-    "robot",
-    "hardware",
-    "log csv",
-    "log parquet",
-    "mesh stl",
-    "mesh stl text",
-    "mesh obj",
-    "mesh ply",
-    "mesh ply text",
-    "mesh off",
-    "mesh glb",
-)
+_MESHES = ("stl", "stl text", "obj", "ply", "ply text", "off", "glb")
+KINDS = ("policy", "robot", "hardware", "log csv", "log parquet", *(f"mesh {name}" for name in _MESHES))
 """What reads a file, and its format: file number k is of kind k modulo their number."""
 _SUFFIX = {"robot": "toml", "hardware": "toml"}
 Rng = np.random.Generator
 Spoil = Callable[[bytes, Rng], bytes]
 
-_ODD = (
-    "nan",
-    "inf",
-    "-inf",
-    "1e400",
-    "1e308",
-    "-1e308",
-    "1e-320",
-    "0",
-    "-0.0",
-    "-1",
-    "1e9",
-    "2147483648",
-    "-9223372036854775809",
-    "9" * 40,
-    "9" * 5000,
-    "true",
-    '""',
-    '"x\\ny"',
-    "[]",
-    "{}",
-    "[[1]]",
-    "''",
-    "0x1p3",
-    "1_0",
-    "7.5",
-    "null",
-)
+_NUMBERS = "nan inf -inf 1e400 1e308 -1e308 1e-320 0 -0.0 -1 1e9 2147483648 -9223372036854775809"
+_OTHERS = 'true "" "x\\ny" [] {} [[1]] \'\' 0x1p3 1_0 7.5 null'
+_ODD = (*_NUMBERS.split(), "9" * 40, "9" * 5000, *_OTHERS.split())
 """What may stand in place of a number."""
 
 
@@ -250,14 +213,8 @@ def _double(data: bytes, rng: Rng) -> bytes:
 def _large(data: bytes, rng: Rng) -> bytes:
     """Four or eight bytes become the largest or the most negative number there is."""
     start, _ = _span(data, rng)
-    most = (
-        b"\xff" * 4,
-        b"\xff\xff\xff\x7f",
-        b"\x00\x00\x00\x80",
-        b"\xff" * 8,
-        b"\x00\x00\xc0\x7f",
-        b"\x00\x00\x80\x7f",
-    )
+    whole = b"\xff" * 4, b"\xff\xff\xff\x7f", b"\x00\x00\x00\x80", b"\xff" * 8
+    most = (*whole, b"\x00\x00\xc0\x7f", b"\x00\x00\x80\x7f")
     piece = most[rng.integers(len(most))]
     return data[:start] + piece + data[start + len(piece) :]
 

@@ -32,51 +32,9 @@ FURTHER = [
     ["note"],
     ["p1_x", "p1_y", "p1_z"],
 ]
-CELLS = [
-    "",
-    "nan",
-    "NaN",
-    "inf",
-    "-inf",
-    "x",
-    "1e400",
-    "1e308",
-    "-1e308",
-    "1_0",
-    "0x1p-3",
-    "1,5",
-    " 0.01 ",
-    '"',
-    "\0",
-    "٣",
-    "1e-320",
-    "70",
-    "b",
-    "--",
-    "True",
-]
-NAMES = [
-    "t",
-    "run",
-    "dl_1",
-    "dl_5",
-    "dl_01",
-    "tip_x",
-    "Tip_x",
-    "p1_x",
-    "p2_x",
-    "ext_2",
-    "ext_0",
-    "",
-    " ",
-    "t ",
-    "payload",
-    "a,b",
-    "a\nb",
-    "é",
-    "#",
-    "dl_١",
-]
+CELLS = '|nan|NaN|inf|-inf|x|1e400|1e308|-1e308|1_0|0x1p-3|1,5| 0.01 |"|\0|٣|1e-320|70|b|--|True'
+NAMES = "t|run|dl_1|dl_5|dl_01|tip_x|Tip_x|p1_x|p2_x|ext_2|ext_0|| |t |payload|a,b|a\nb|é|#|dl_١"
+CHANGES = "cell cell number name drop twice row short long swap"
 
 
 def cells(draw: st.DrawFn, name: str, row: int) -> str:
@@ -105,11 +63,7 @@ def grids(draw: st.DrawFn) -> list[list[str]]:
     grid = [header, *([cells(draw, name, row) for name in header] for row in range(draw(st.integers(0, 5))))]
     for _ in range(draw(st.integers(0, 3))):
         i, j = draw(st.integers(0, len(grid) - 1)), draw(st.integers(0, max(0, len(grid[0]) - 1)))
-        change = draw(
-            st.sampled_from(
-                ["cell", "cell", "number", "name", "drop", "twice", "row", "short", "long", "swap"]
-            )
-        )
+        change = draw(st.sampled_from(CHANGES.split()))
         if change == "row":
             grid.insert(i, list(grid[i]))
         elif change == "short":
@@ -120,14 +74,14 @@ def grids(draw: st.DrawFn) -> list[list[str]]:
             k = draw(st.integers(0, len(grid) - 1))
             grid[i], grid[k] = grid[k], grid[i]
         elif change == "name" and j < len(grid[0]):
-            grid[0][j] = draw(st.sampled_from(NAMES) | odd_words)
+            grid[0][j] = draw(st.sampled_from(NAMES.split("|")) | odd_words)
         elif change in ("drop", "twice"):
             for row in grid:
                 if j < len(row):
                     row[j : j + 1] = [] if change == "drop" else [row[j]] * 2
         elif j < len(grid[i]) and i:
             grid[i][j] = (
-                draw(st.sampled_from(CELLS))
+                draw(st.sampled_from(CELLS.split("|")))
                 if change == "cell"
                 else repr(draw(odd_numbers.filter(lambda n: abs(n) < 1e300 or n != n)))
             )
@@ -149,20 +103,12 @@ def texts(draw: st.DrawFn) -> str:
     return head + made.getvalue()
 
 
+COLUMNS = "t run dl tip_position ext tip_quaternion points tip_force payload base_quaternion"
+
+
 def same(one: RunLog, other: RunLog) -> None:
     """Two logs have the same numbers and texts."""
-    for name in (
-        "t",
-        "run",
-        "dl",
-        "tip_position",
-        "ext",
-        "tip_quaternion",
-        "points",
-        "tip_force",
-        "payload",
-        "base_quaternion",
-    ):
+    for name in COLUMNS.split():
         a, b = getattr(one, name), getattr(other, name)
         assert (a is None) == (b is None), name
         if a is not None:
@@ -313,26 +259,10 @@ def run(*words: str) -> tuple[int, str]:
     return code, err.getvalue()
 
 
-HEADER = ",".join(
-    [
-        "t",
-        "run",
-        *INPUTS,
-        *TIP,
-        "tip_qw",
-        "tip_qx",
-        "tip_qy",
-        "tip_qz",
-        "tip_fx",
-        "tip_fy",
-        "tip_fz",
-        "payload",
-        "base_qw",
-        "base_qx",
-        "base_qy",
-        "base_qz",
-    ]
+HEADER = (
+    f"t,run,{','.join(INPUTS)},tip_x,tip_y,tip_z,tip_qw,tip_qx,tip_qy,tip_qz,tip_fx,tip_fy,tip_fz,payload"
 )
+HEADER += ",base_qw,base_qx,base_qy,base_qz"
 ROWS = [f"{0.02 * k!r},free,0,0,0,0,0.0,{1e-3 * k!r},0.07,1,0,0,0,0,0,0,0.0,,,," for k in range(4)]
 PARTIAL = "\n".join(["# Recorded on robot prototype.", HEADER, *ROWS, ""])
 

@@ -17,72 +17,15 @@ from fastrod.commands.arguments import ACTIONS
 
 COMMANDS = ("demo", "replay", "identify", "excite", "view", "drive", "envs", "train", "evaluate", "bench")
 OPTIONS = (
-    "--out",
-    "--seed",
-    "--no-view",
-    "--robot",
-    "--run",
-    "--held-out",
-    "--max-effects",
-    "--free-camera",
-    "--network",
-    "--json",
-    "--bend",
-    "--payload",
-    "--rate",
-    "--speed",
-    "--robots",
-    "--play",
-    "--port",
-    "--host",
-    "--no-open",
-    "--option",
-    "--algo",
-    "--steps",
-    "--envs",
-    "--imitate",
-    "--curriculum",
-    "--set",
-    "--resume",
-    "--episodes",
-    "--no-baselines",
-    "--bus",
-    "--emulate",
-    "--hardware",
-    "--camera",
-    "--eds",
-    "--path",
-    "--policy",
-    "--views",
-    "--board",
-    "--square",
-    "--at",
-    "--dictionary",
-    "--board-marker",
-    "--real-time",
-    "--no-home",
+    "--out --seed --no-view --robot --run --held-out --max-effects --free-camera --network --json --bend "
+    "--payload --rate --speed --robots --play --port --host --no-open --option --algo --steps --envs "
+    "--imitate --curriculum --set --resume --episodes --no-baselines --bus --emulate --hardware --camera "
+    "--eds --path --policy --views --board --square --at --dictionary --board-marker --real-time --no-home"
 )
-VALUES = [
-    "1",
-    "-1",
-    "0",
-    "nan",
-    "inf",
-    "1e400",
-    "7x5",
-    "x",
-    "none",
-    "socketcan:can0",
-    "prototype",
-    "none.csv",
-    "a=b",
-    "=",
-    "--",
-    "-",
-    ".",
-]
+VALUES = "1 -1 0 nan inf 1e400 7x5 x none socketcan:can0 prototype none.csv a=b = -- - ."
 # no shell can give a NUL
-words = st.sampled_from([*OPTIONS, *ACTIONS, *VALUES]) | odd_words.filter(lambda word: "\0" not in word)
+words = st.sampled_from([*OPTIONS.split(), *ACTIONS, *VALUES.split()])
+words |= odd_words.filter(lambda word: "\0" not in word)
 
 
 class BegunError(Exception):
