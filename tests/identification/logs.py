@@ -45,3 +45,12 @@ def log_of(robot: Robot, dl: np.ndarray, dt: float | np.ndarray = 0.05, **column
     t = dt * np.arange(n) if isinstance(dt, float) else np.cumsum(dt)
     given = {"name": "log", "run": np.full(n, ""), "tip_position": np.zeros((n, 3)), "t": t} | columns
     return RunLog(dl=dl, **given)
+
+
+def runs_of(
+    name: str = "log", labels: tuple[str, ...] = ("a", "b"), n: int = 40, begin: float = 5.0
+) -> RunLog:
+    """Runs of 4 s at 10 Hz, whose clocks begin at `begin`."""
+    t = np.tile(begin + 0.1 * np.arange(n), len(labels))
+    dl = np.full((n * len(labels), 4), 1e-3)
+    return log_of(one_segment(), dl, name=name, t=t, run=np.repeat(labels, n))

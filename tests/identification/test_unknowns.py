@@ -14,7 +14,6 @@ from rods import rod
 
 from fastrod import Robot
 from fastrod.effects.base import columns, effect_names, get_effect
-from fastrod.errors import RobotError
 from fastrod.identification.log.forward import PredictedRod, predict, sample
 from fastrod.identification.log.replay import replay
 from fastrod.identification.log.unknowns import FREE_CAMERA, STIFFNESS_SD, Model, base_model, effect_unknowns
@@ -162,34 +161,6 @@ def test_body_radii_and_log_points_stay_where_they_fit() -> None:
     assert_allclose(robot.log_points, (0.05, 0.9 * 0.13), rtol=1e-14)
     # 7.5 mm by 1.2; 5 and 6 mm fit
     assert_allclose([s.body_radius for s in robot.segments], [0.009, 0.0078], rtol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("target", "prior", "sentence"),
-    [
-        (
-            "segment.1.lenght",
-            {"sd": 1e-3},
-            r"\[fit\] 'segment.1.lenght' is no parameter; did you mean 'segment.\*.length'",
-        ),
-        ("tendon.*.gian", {"sd": 1e-3}, r"did you mean 'tendon.\*.gain'"),
-        ("tendons.1.gain", {"sd": 1e-3}, r"did you mean 'tendon.\*.gain'"),
-        ("tendon.*.length", {"sd": 1e-3}, r"'tendon.\*.length' is no parameter"),
-        ("length", {"sd": 1e-3}, "'length' is no parameter"),
-        ("segment.3.length", {"sd": 1e-3}, "'segment.3.length'; the robot has segments 1 to 2"),
-        ("segment.0.length", {"sd": 1e-3}, "segments 1 to 2"),
-        ("tendon.9.gain", {"sd": 1e-3}, "the robot has tendons 1 to 8"),
-        ("segment.1.length", {"sd": 0.0}, "has sd 0.0; it must be positive: leave out what is known"),
-        ("segment.1.length", {"sd": float("nan")}, "has sd nan"),
-        ("segment.1.length", {"std": 1e-3}, r"is \{'std': 0.001\}; give \{sd = ...\}"),
-        ("segment.1.length", {}, "give {sd = ...}"),
-    ],
-)
-def test_bad_targets_get_one_sentence(target: str, prior: dict[str, float], sentence: str) -> None:
-    with pytest.raises(RobotError, match=sentence) as caught:
-        base_model(two_segments(fit={target: prior}))
-    assert "\n" not in str(caught.value)
-    assert "'two'" in str(caught.value)
 
 
 def test_the_camera_is_known_unless_it_is_said_not_to_be() -> None:
