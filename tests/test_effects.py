@@ -5,12 +5,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from identification import logs
 from numpy.testing import assert_allclose, assert_array_equal
 from rods import bend, rod
 from verification.test_derivatives import difference
@@ -49,18 +51,7 @@ Table = dict[str, Any]
 Seen = dict[str, np.ndarray]
 
 
-def one_segment() -> Robot:
-    return replace(rod(line_density=0.1, extension=(-0.01, 0.01)), name="one", log_points=(0.03,))
-
-
-def two_segments() -> Robot:
-    """Antagonistic wires, those of the far segment at places of their own in the near one."""
-    (near,) = one_segment().segments
-    wires = tuple(replace(t, offset=(0.006, 0.005), angle=(t.angle + 0.7, t.angle)) for t in near.tendons)
-    far = replace(near, length=0.06, bending_stiffness=(0.0015, 0.002), tendons=wires)
-    return Robot(name="two", segments=(near, far), log_points=(0.05, 0.1))
-
-
+one_segment, two_segments = (partial(make, 0.1) for make in (logs.one_segment, logs.two_segments))
 ROBOTS = pytest.mark.parametrize("robot", [one_segment(), two_segments()], ids=lambda robot: robot.name)
 
 
