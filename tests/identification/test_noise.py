@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from identification.logs import log_of, one_segment, wires
@@ -33,10 +31,8 @@ def samples(n: int = N, *, rests: bool = True) -> LogSamples:
 
 def smooth(seed: int, n: int = N) -> np.ndarray:
     """(n, 3) what the model lacks: slow, some sigma large."""
-    t = np.arange(n)[:, None] / RATE
-    return (
-        4.0 * SIGMA * np.sin(np.array([0.5, 0.8, 1.1]) * t + np.random.default_rng(seed).uniform(0.0, 6.0, 3))
-    )
+    phase = np.random.default_rng(seed).uniform(0.0, 6.0, 3)
+    return 4.0 * SIGMA * np.sin(np.array([0.5, 0.8, 1.1]) * np.arange(n)[:, None] / RATE + phase)
 
 
 def white(seed: int, n: int = N) -> np.ndarray:
@@ -61,14 +57,8 @@ def test_rest_is_where_no_input_moves() -> None:
         assert (np.diff(rows) == 1).all()
     assert at_rest(samples(rests=False)) == []
     # a load that is hung on is a motion, and so is a new run
-    still = log_of(
-        one_segment(),
-        np.zeros((60, 4)),
-        0.1,
-        payload=np.repeat([0.0, 0.02], 30),
-        run=np.repeat(["a", "a", "b"], 20),
-    )
-    still = replace(still, t=np.concatenate([0.1 * np.arange(40), 0.1 * np.arange(20)]))
+    t, run = 0.1 * np.array([*range(40), *range(20)]), np.repeat(["a", "a", "b"], 20)
+    still = log_of(one_segment(), np.zeros((60, 4)), t=t, run=run, payload=np.repeat([0.0, 0.02], 30))
     assert [(rows[0], rows[-1]) for rows in at_rest(sample(still))] == [(10, 29), (50, 59)]
 
 
@@ -88,9 +78,8 @@ def test_noise_at_rest(seed: int) -> None:
 def test_noise_without_rest(seed: int) -> None:
     """From the fastest part of a residual that also has slow structure: a median of 2250 correlated third
     differences, 3 to 4 %."""
-    found = read_noise(
-        samples(LONG, rests=False), np.zeros((LONG, 3)), white(seed, LONG) + smooth(seed, LONG)
-    )
+    residual = white(seed, LONG) + smooth(seed, LONG)
+    found = read_noise(samples(LONG, rests=False), np.zeros((LONG, 3)), residual)
     assert "never rests" in found.how
     assert_allclose(found.sigma, SIGMA, rtol=0.1)
 
@@ -144,10 +133,7 @@ def test_outliers_are_looked_for_in_each_run_alone() -> None:
     robot = one_segment()
     label = np.repeat(["a", "b", "c"], [60, 60, 10])
     log = log_of(robot, np.zeros((130, 4)), 0.1, run=label)
-    residual = np.where(label == "a", 0.0, 1.0)[:, None] * 50.0 * SIGMA + SIGMA * np.random.default_rng(
-        1
-    ).normal(size=(130, 3))
-    residual[30] += 30.0 * SIGMA
-    residual[125] += 30.0 * SIGMA
+    residual = np.where(label == "a", 0.0, 1.0)[:, None] * 50.0 * SIGMA + white(1, 130)
+    residual[[30, 125]] += 30.0 * SIGMA
     good = keep(sample(log), residual, Noise(SIGMA, 0.0, "known"))
     assert np.flatnonzero(~good).tolist() == [30]

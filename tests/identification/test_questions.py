@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from fastrod import load_robot
 from fastrod.commands.cli import main
+from fastrod.effects.base import get_effect
 from fastrod.errors import LogError
 from fastrod.identification.attribution import identify
 from fastrod.identification.log.questions import questions
@@ -38,14 +39,8 @@ RIGHT = re.escape(
 
 
 def log_of(run: farlog.Run, **columns: Any) -> RunLog:
-    given = {
-        "name": "far",
-        "t": run.t,
-        "run": np.full(len(run.t), ""),
-        "dl": run.dl,
-        "tip_position": run.tip,
-    } | columns
-    return RunLog(**given)
+    given = {"name": "far", "t": run.t, "run": np.full(len(run.t), ""), "dl": run.dl, "tip_position": run.tip}
+    return RunLog(**given | columns)
 
 
 @cache
@@ -136,11 +131,8 @@ def test_a_camera_far_off_is_registered_and_the_effect_named_as_ever(
     assert result.registration is not None
     assert result.registration.angle == pytest.approx(angle, abs=0.02)
     assert result.registration.distance == pytest.approx(distance, abs=3e-3)
-    said = (
-        f"The camera stands {np.degrees(result.registration.angle):.1f} deg and "
-        f"{result.registration.distance:.2g} m from where the robot"
-    )
-    assert said in result.summary
+    place = f"{np.degrees(result.registration.angle):.1f} deg and {result.registration.distance:.2g} m"
+    assert f"The camera stands {place} from where the robot" in result.summary
     assert report.to_json(result)["registration"]["angle_rad"] == result.registration.angle
     assert result.effects[0].name in ("backlash", "friction")  # friction without spread is backlash
     width = result.effects[0].parameters["half_width"]
@@ -279,25 +271,24 @@ def names_of_runs() -> RunLog:
     return replace(seen(), run=np.repeat(np.array(["one", "two"]), 450))
 
 
-PROVOKED: dict[str, Callable[[], object]] = {
-    "held out": lambda: identify(names_of_runs(), ROBOT, held_out=list(np.array(["tow"]))),
-    "held out window": lambda: identify(names_of_runs(), ROBOT, held_out=list(np.array(["two@x:"]))),
-    "held out too late": lambda: identify(names_of_runs(), ROBOT, held_out=list(np.array(["two@900:"]))),
-    "one run": lambda: names_of_runs().only(np.array(["tow"])[0]),
-    "excluded effect": lambda: load_effect(np.array(["backlsh"])[0]),
+def held_out(word: np.str_) -> Result:
+    return identify(names_of_runs(), ROBOT, held_out=[word])
+
+
+PROVOKED: dict[str, tuple[Callable[[np.str_], object], str]] = {
+    "held out": (held_out, "tow"),
+    "held out window": (held_out, "two@x:"),
+    "held out too late": (held_out, "two@900:"),
+    "one run": (lambda word: names_of_runs().only(word), "tow"),
+    "excluded effect": (get_effect, "backlsh"),
 }
-
-
-def load_effect(name: str) -> object:
-    from fastrod.effects.base import get_effect
-
-    return get_effect(name)
 
 
 @pytest.mark.parametrize("case", PROVOKED)
 def test_no_message_quotes_words_as_an_array_does(case: str) -> None:
+    call, word = PROVOKED[case]
     with pytest.raises(Exception, match=r"tow|two|backlsh") as caught:
-        PROVOKED[case]()
+        call(np.str_(word))
     assert "np.str_" not in str(caught.value)
 
 
