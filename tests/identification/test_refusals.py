@@ -14,6 +14,7 @@ from rods import rod
 from fastrod.errors import FastrodError, InputError, LogError, RobotError, UnknownNameError
 from fastrod.identification.excite import excitation
 from fastrod.identification.log.forward import sample
+from fastrod.identification.log.replay import replay
 from fastrod.identification.log.split import held_out_rows, merged
 from fastrod.identification.log.unknowns import base_model
 
@@ -43,6 +44,10 @@ def fitted(target: str, **prior: float) -> object:
 
 Rows = list[tuple[Callable[[], object], str]]
 INPUTS: Rows = [
+    (
+        lambda: replay(runs_of(), rod("tendon_tension")),
+        "mode 'tendon_tension', but a run log gives tendon lengths",
+    ),
     (lambda: excitation(rod("passive")), "robot 'passive' has no tendons; there is nothing to excite"),
     (lambda: excited(bend=0.0), "bend is 0.0 rad; it must be positive"),
     (lambda: excited(rate=-15.0), "rate is -15.0 Hz; it must be positive"),

@@ -136,9 +136,8 @@ def test_a_dominant_effect_dominates() -> None:
     effects = plant.draw_many(1, inputs).effects
     assert len(effects) == 9
     assert set(effects) <= set(plant.LIBRARY)
-    bare, *tips = (
-        plant.pose(inputs, plant.Seal(e, 1))[0] for e in ({}, *({n: e} for n, e in effects.items()))
-    )
+    alone = ({name: effect} for name, effect in effects.items())
+    bare, *tips = (plant.pose(inputs, plant.Seal(one, 1))[0] for one in ({}, *alone))
     moved = [np.sqrt(np.mean((tip - bare) ** 2)) for tip in tips]
     # 0.1 to 0.2 of the dominant one, were every effect in proportion to its size
     assert max(moved[1:]) < 0.4 * moved[0]
