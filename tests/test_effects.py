@@ -67,13 +67,9 @@ def at_neutral(name: str, robot: Robot, *, shaped: bool = False) -> Table:
 
 def at_typical(name: str, robot: Robot, times: float = 1.0) -> Table:
     """The effect's table with typical sizes, or a multiple of them; what shapes it is neutral."""
-    parameters = [p.on(route(robot)) for p in get_effect(name).parameters]
-    sizes = {
-        p.name: float(np.clip(p.neutral + times * (p.typical or 0.0), *p.bounds))
-        for p in parameters
-        if not p.shape
-    }
-    return {"name": name} | sizes
+    sizes = [p for p in (p.on(route(robot)) for p in get_effect(name).parameters) if not p.shape]
+    values = (float(np.clip(p.neutral + times * (p.typical or 0.0), *p.bounds)) for p in sizes)
+    return {"name": name, **dict(zip((p.name for p in sizes), values, strict=True))}
 
 
 def commands(robot: Robot, n_steps: int = N_STEPS) -> np.ndarray:
@@ -84,27 +80,20 @@ def commands(robot: Robot, n_steps: int = N_STEPS) -> np.ndarray:
     for k in range(robot.n_segments):
         size = 1.2 / robot.n_segments
         x, y = size * np.sin(7.0 * t + k), 0.6 * size * np.cos(5.0 * t - 2 * k)
-        unit_x, unit_y = (
-            bend(robot, *a, segment=k) - robot.rest_tendon_length for a in ((1.0, 0.0), (0.0, 1.0))
-        )
-        lengths += x[..., None] * unit_x + y[..., None] * unit_y
+        unit = [bend(robot, *a, segment=k) - robot.rest_tendon_length for a in np.eye(2)]
+        lengths += x[..., None] * unit[0] + y[..., None] * unit[1]
     return np.asarray(lengths + robot.rest_tendon_length * (1.0 - 1e-4 * t[..., None]))
 
 
 def given(robot: Robot, step: int, moving: bool) -> dict[str, np.ndarray]:
     """Every kind of load and another base for each robot; `moving`: the tip force changes while they run."""
-    tip = np.outer(np.arange(N_ROBOTS), [0.02, -0.03, 0.01]) * (1.0 + 0.1 * step * moving)
-    half = 0.3 * np.arange(N_ROBOTS)
-    pose = np.column_stack(
-        [np.outer(np.arange(N_ROBOTS), [0.1, 0.2, 0.3]), np.cos(half), np.sin(half), 0.0 * half, 0.0 * half]
-    )
+    number, half = np.arange(N_ROBOTS), 0.3 * np.arange(N_ROBOTS)
+    tip = np.outer(number, [0.02, -0.03, 0.01]) * (1.0 + 0.1 * step * moving)
+    turned = np.column_stack([np.cos(half), np.sin(half), 0.0 * half, 0.0 * half])
+    pose = np.column_stack([np.outer(number, [0.1, 0.2, 0.3]), turned])
     line = np.full((robot.n_segments, 4, 3), 0.05) * np.arange(4)[:, None]
-    return {
-        "tip_force": tip,
-        "base_pose": pose,
-        "line_force": line,
-        "tip_moment": np.array([1e-4, 0.0, 2e-4]),
-    }
+    loads = {"tip_force": tip, "line_force": line, "tip_moment": np.array([1e-4, 0.0, 2e-4])}
+    return loads | {"base_pose": pose}
 
 
 def simulator(robot: Robot | list[Robot], n_robots: int = N_ROBOTS) -> Simulator:
@@ -118,10 +107,8 @@ def run(
     has."""
     seen: dict[str, list[np.ndarray]] = {}
     for i, here in enumerate(lengths, first):
-        loads = {
-            k: v[rows] if k in ("tip_force", "base_pose") else v
-            for k, v in given(sim.robots[0], i, moving).items()
-        }
+        loads = given(sim.robots[0], i, moving)
+        loads |= {name: loads[name][rows] for name in ("tip_force", "base_pose")}
         state = sim.step(here[rows], **loads)
         for name in STATE.split():
             seen.setdefault(name, []).append(getattr(state, name))
@@ -151,10 +138,7 @@ def test_a_neutral_effect_is_the_base_model_bit_for_bit(name: str, robot: Robot)
 def test_the_whole_library_at_once_at_neutral_is_the_base_model() -> None:
     robot = two_segments()
     everything = having(robot, *(at_neutral(name, robot) for name in reversed(NAMES)))
-    assert_same(
-        run(simulator(robot), commands(robot), moving=True),
-        run(simulator(everything), commands(robot), moving=True),
-    )
+    assert_same(*(run(simulator(r), commands(robot), moving=True) for r in (robot, everything)))
 
 
 @ROBOTS
@@ -228,12 +212,8 @@ def test_a_bad_input_spoils_no_memory(name: str) -> None:
     assert_same(alone, {key: np.delete(a, [5, 6], axis=0) for key, a in seen.items()}, [0], [1])
     late = lengths.copy()
     late[0, 1] = np.nan  # and a robot whose first input is bad begins with its second
-    assert_same(
-        run(simulator(robot, 1), lengths[1:], rows=[1]),
-        {key: a[1:] for key, a in run(simulator(robot), late).items()},
-        [0],
-        [1],
-    )
+    after = {key: a[1:] for key, a in run(simulator(robot), late).items()}
+    assert_same(run(simulator(robot, 1), lengths[1:], rows=[1]), after, [0], [1])
 
 
 def changes_tendons(robot: Robot, **inputs: Any) -> bool:
@@ -243,9 +223,8 @@ def changes_tendons(robot: Robot, **inputs: Any) -> bool:
     ports = Reader(layout, params, rest, 1).ports(Inputs(**inputs))
     pipeline = EffectPipeline([robot], 1)
     _, changed = pipeline.act(ports, params, None, DT, N_STEPS, np.zeros(1, bool))
-    return not all(
-        np.array_equal(getattr(changed, name), getattr(params, name)) for name in ("offset", "compliance")
-    )
+    pairs = ((getattr(changed, name), getattr(params, name)) for name in ("offset", "compliance"))
+    return not all(np.array_equal(now, then) for now, then in pairs)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -256,10 +235,7 @@ def test_robots_without_wires_or_with_tensions_take_every_effect(name: str) -> N
         (rod("tendon_tension", 3, extension=(-0.01, 0.01)), {"tension": [0.3, 0.0, 0.1]}),
     ):
         table = at_typical(name, robot)
-        base, sim = (
-            Simulator(robot, points_per_segment=3),
-            Simulator(having(robot, table), points_per_segment=3),
-        )
+        base, sim = (Simulator(r, points_per_segment=3) for r in (robot, having(robot, table)))
         for _ in range(2):
             one, two = base.step(**inputs), sim.step(**inputs)
         assert two.ok.all()
@@ -302,13 +278,8 @@ def test_memories_are_as_wide_as_their_operators_need() -> None:
     for name in OPERATORS:
         what: Any = get_effect(name)
         memory = what.memory(1, n)
-        what.sweep(
-            np.array([registry.read_values(name, at_typical(name, robot), wiring, "test")]),
-            memory,
-            dl,
-            np.full(20, 0.1),
-            wiring,
-        )
+        values = np.array([registry.read_values(name, at_typical(name, robot), wiring, "test")])
+        what.sweep(values, memory, dl, np.full(20, 0.1), wiring)
         if name == "latency":
             assert memory.shape[1] == 1 + BUFFER * (1 + n)
             used = 1 + 20 * (1 + n)
@@ -325,10 +296,7 @@ def test_a_set_needs_no_memory_where_no_wire_ends() -> None:
     and nothing is written beside the memory."""
     (near,) = one_segment().segments
     chain = (replace(near, mode="passive", tendons=()),) * 2 + (replace(near, tendons=near.tendons[:2]),)
-    robot = having(
-        Robot(name="few wires", segments=chain), {"name": "plastic_set", "share": 0.2, "yield_at": 0.1}
-    )
-    wiring = route(robot)
+    wiring = route(Robot(name="few tendons", segments=chain))
     what: Any = get_effect("plastic_set")
     memory = what.memory(1, 2)
     dl = 0.004 * np.ones((1, 5, 2)) * np.arange(5)[:, None]
@@ -357,18 +325,14 @@ JACOBIANS: list[Table] = [
 def test_the_jacobian_is_by_what_is_commanded(tables: list[Table]) -> None:
     robot = having(two_segments(), *tables)
     lengths = bend(robot, 0.4, -0.3) + bend(robot, -0.3, 0.5, 1) - robot.rest_tendon_length - 1e-5
-    base = {
-        "tendon_length": lengths,
-        "tip_force": np.array([0.05, 0.02, -0.03]),
-        "extension": np.array([0.001, -0.002]),
-    }
+    force, extension = np.array([0.05, 0.02, -0.03]), np.array([0.001, -0.002])
+    base = {"tendon_length": lengths, "tip_force": force, "extension": extension}
     sim = Simulator(robot, points_per_segment=4)
     assert sim.settle(**base, tolerance=1e-13).ok.all()
     jacobian = sim.jacobian()[0]
     columns = [("tendon_length", i, 1e-6, 1e-6) for i in range(8)]
-    # wires that hold a body that stretches twist it, steeply: the step of 1e-4 of the length that `jacobian`
-    # takes is then too
-    # long by its square; twice what is left
+    # tendons that hold a body that stretches twist it, steeply: the step of 1e-4 of the length of `jacobian`
+    # is then too long by its square; twice what is left
     columns += [("extension", k, 1e-6, 5e-6) for k in range(2)]
     for j, (name, i, delta, tolerance) in enumerate(columns):
         expected = difference(sim, base, name, i, delta)
@@ -388,10 +352,8 @@ def test_the_jacobian_of_an_effect_with_memory_stays_in_its_loop() -> None:
 
 
 def test_effects_of_a_robot_file_come_back_and_act(tmp_path: Path) -> None:
-    tables = (
-        {"name": "drum_gain", "gain": [0.1, 0.0, -0.1, 0.2]},
-        {"name": "creep", "share": 0.1, "time_constant": 2.0},
-    )
+    gain = {"name": "drum_gain", "gain": [0.1, 0.0, -0.1, 0.2]}
+    tables = gain, {"name": "creep", "share": 0.1, "time_constant": 2.0}
     robot = having(two_segments(), *tables)
     save_robot(robot, tmp_path / "mine.toml")
     again = load_robot(tmp_path / "mine.toml")
@@ -524,14 +486,11 @@ def test_effects_act_from_the_motor_to_the_camera() -> None:
     seams = [get_effect(name).seam.value for name in NAMES]
     assert seams == sorted(seams)
     contracted = (
-        "gravity payload tip_force friction backlash tendon_stretch creep latency "
-        "frame_misalignment marker_offset drum_gain "
+        "gravity payload tip_force friction backlash tendon_stretch creep latency frame_misalignment "
+        "marker_offset drum_gain encoder_offset precurvature routing_angle coupling stiffness_anisotropy "
+        "stiffness_taper stiffening axial_compression time_drift"
     )
-    contracted += (
-        "encoder_offset precurvature routing_angle coupling stiffness_anisotropy stiffness_taper "
-        "stiffening axial_compression "
-    )
-    assert set(contracted.split()) | {"time_drift"} <= set(NAMES)
+    assert set(contracted.split()) <= set(NAMES)
 
 
 def test_wires_and_bends_belong_together() -> None:
@@ -590,11 +549,8 @@ def test_a_users_effect_works_where_the_librarys_do() -> None:
     here = Simulator(robot).settle(bend(robot, 0.5, 0.0))
     there = Simulator(rod(line_density=0.1)).settle(bend(robot, 0.5, 0.0))
     assert_allclose(here.position, there.position, atol=1e-14)
-    base = run(simulator(two_segments()), commands(two_segments()), moving=True)
-    assert_same(
-        base,
-        run(simulator(having(two_segments(), {"name": "weight"})), commands(two_segments()), moving=True),
-    )
+    pair = (two_segments(), having(two_segments(), {"name": "weight"}))
+    assert_same(*(run(simulator(r), commands(r), moving=True) for r in pair))
     unregister("weight")
     with pytest.raises(UnknownNameError, match="no effect 'weight'"):
         Simulator(robot)
@@ -649,11 +605,8 @@ def test_a_parameter_has_its_neutral_value_in_its_bounds() -> None:
     assert Parameter("size", "m", bounds=(0.0, 2.0)).scale == pytest.approx(0.2)
     assert Parameter("size", "m").starts == (1.0,)
     scaled = Parameter("size", "m", bounds=(0.0, 2.0), typical=0.5, of="length").on(route(two_segments()))
-    assert (scaled.bounds, scaled.typical, scaled.of) == (
-        (0.0, pytest.approx(0.26)),
-        pytest.approx(0.065),
-        "",
-    )
+    assert (scaled.bounds, scaled.of) == ((0.0, pytest.approx(0.26)), "")
+    assert scaled.typical == pytest.approx(0.065)
 
 
 @pytest.mark.usefixtures("clean_registry")
@@ -679,14 +632,10 @@ class Wind(Static):
     (tmp_path / "breezy_effects.py").write_text(source)
     monkeypatch.syspath_prepend(tmp_path)
     plug_in = EntryPoint("breezy", "breezy_effects", "fastrod.effects")
-    monkeypatch.setattr(
-        registry, "entry_points", lambda group: [plug_in] if group == "fastrod.effects" else []
-    )
+    found = {"fastrod.effects": [plug_in]}
+    monkeypatch.setattr(registry, "entry_points", lambda group: found.get(group, []))
     registry.load_library.cache_clear()
     assert "wind" in effect_names()
-    robot = having(rod(), {"name": "wind", "force": 0.1})
-    here, there = (
-        Simulator(robot).settle(bend(robot, 0.3, 0.1)),
-        Simulator(rod()).settle(bend(robot, 0.3, 0.1), tip_force=(0.1, 0.0, 0.0)),
-    )
+    here = Simulator(having(rod(), {"name": "wind", "force": 0.1})).settle(bend(rod(), 0.3, 0.1))
+    there = Simulator(rod()).settle(bend(rod(), 0.3, 0.1), tip_force=(0.1, 0.0, 0.0))
     assert_array_equal(here.position, there.position)

@@ -20,10 +20,7 @@ from fastrod.solver.recovery import pressed
 
 N, ROWS, OTHERS = 4, np.array([1, 3]), np.array([0, 2])
 REACHER = load_robot("five_segment_reacher")
-LASH: tuple[dict[str, Any], ...] = (
-    {"name": "backlash", "half_width": 3e-4},
-    {"name": "gravity", "line_density": 0.02},
-)
+LASH = {"name": "backlash", "half_width": 3e-4}, {"name": "gravity", "line_density": 0.02}
 FAR = ContactScene(obstacles=[plane(point=(0, 0, -5.0), normal=(0, 0, 1), name="floor")], rod_radius=0.005)
 FIELDS = ("position", "rotation", "tip_position", "tension", "base_wrench", "residual", "ok", "passes")
 

@@ -165,9 +165,8 @@ def test_a_buffer_that_its_owner_writes_into_is_a_new_input() -> None:
     two.settle(rest, tip_force=force)
     for k in range(1, 6):
         force[:] = [0.0, 0.01 * k, 0.0]
-        assert_array_equal(
-            one.step(rest, tip_force=force).position, two.step(rest, tip_force=force.copy()).position
-        )
+        expected = two.step(rest, tip_force=force.copy()).position
+        assert_array_equal(one.step(rest, tip_force=force).position, expected)
 
 
 def test_snapshot_restores_every_bit() -> None:
@@ -198,19 +197,9 @@ def test_tip_outputs_keep_little_memory() -> None:
     robot = load_robot("five_segment_reacher")
     sim = Simulator(robot, n_robots=64, points_per_segment=4, outputs="tip")
     state = sim.settle(robot.rest_tendon_length)
-    kept = sum(a.nbytes for a in sim._passes.memory) + state.residual.nbytes + state.ok.nbytes
-    kept += sum(
-        a.nbytes
-        for a in (
-            state.position,
-            state.rotation,
-            state.tension,
-            state.base_wrench,
-            state.tip_position,
-            state.tip_rotation,
-        )
-    )
-    assert kept / 64 <= 2000
+    names = "residual ok position rotation tension base_wrench tip_position tip_rotation"
+    kept = [*sim._passes.memory, *(getattr(state, name) for name in names.split())]
+    assert sum(a.nbytes for a in kept) / 64 <= 2000
     with pytest.raises(InputError, match="outputs='full'"):
         sim.shape([0.1])
 
@@ -222,11 +211,9 @@ def test_robot_files_survive_a_round_trip(name: str) -> None:
 
 
 def test_moduli_stand_for_stiffness() -> None:
-    moduli = (
-        "[[segment]]\nlength = 0.07\nyoungs_modulus = 3e5\nshear_modulus = 7e4\nsecond_moment = "
-        "7e-9\npolar_moment = 1.4e-8\n"
-    )
-    segment = loads('name = "a"\n' + moduli + 'mode = "passive"').segments[0]
+    moduli = "youngs_modulus = 3e5\nshear_modulus = 7e4\nsecond_moment = 7e-9\npolar_moment = 1.4e-8\n"
+    text = f'name = "a"\n[[segment]]\nlength = 0.07\n{moduli}mode = "passive"'
+    segment = loads(text).segments[0]
     assert segment.bending_stiffness == pytest.approx((2.1e-3, 2.1e-3))
     assert segment.torsional_stiffness == pytest.approx(9.8e-4)
 
@@ -249,14 +236,9 @@ def test_an_edit_in_a_kernel_is_never_stale(tmp_path: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(tmp_path), "FASTROD_CACHE_DIR": str(tmp_path / "cache")}
 
     def folder() -> str:
-        return subprocess.run(
-            [sys.executable, "-c", script],
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=True,
-            cwd=tmp_path,
-        ).stdout
+        given = {"env": environment, "cwd": tmp_path}
+        words = [sys.executable, "-c", script]
+        return subprocess.run(words, capture_output=True, text=True, check=True, **given).stdout
 
     seen = [folder()]
     for edited in (copy / "kernels" / "vec.py", copy / "types.py"):
@@ -285,9 +267,8 @@ def test_jacobian_that_comes_with_the_step_is_the_same(n_robots, force):
     for _ in range(3):  # to rest: the plain one is asked at the boundary after the pass
         plain.step(**inputs)
         derived.step(**inputs, derive=True)
-    np.testing.assert_allclose(plain.jacobian(), derived.jacobian(), rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(
-        plain.jacobian(turning=True), derived.jacobian(turning=True), rtol=1e-6, atol=1e-6
-    )
+    for turning in (False, True):
+        a, b = (sim.jacobian(turning=turning) for sim in (plain, derived))
+        np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
     derived.settle(**inputs)
     np.testing.assert_allclose(plain.jacobian(), derived.jacobian(), rtol=1e-6, atol=1e-6)
