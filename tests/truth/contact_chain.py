@@ -72,15 +72,10 @@ def slope_of(rod: Rod, u: Floats, chain: Chain) -> Floats:
     h = rod.step[:, None]
     out = h * rod.stiffness * (u - rod.precurvature)
     # d|q|/du = d x t
-    out = out + h * np.einsum(
-        "i,ji,jix->jx", stretch / rod.compliance, rod.crossing, np.cross(rod.offset, direction)
-    )
+    arms = np.cross(rod.offset, direction)
+    out = out + h * np.einsum("i,ji,jix->jx", stretch / rod.compliance, rod.crossing, arms)
     beyond, lever = _carried(chain, rod.node_force)
-    turning = np.stack(
-        [lever[:, 1, 2] - lever[:, 2, 1], lever[:, 2, 0] - lever[:, 0, 2], lever[:, 0, 1] - lever[:, 1, 0]],
-        axis=1,
-    )
-    work = np.einsum("jxa,jx->ja", chain.spin, turning) + np.einsum("jxa,jx->ja", chain.shift, beyond)
+    work = np.einsum("jxa,jx->ja", chain.spin, _axial(lever)) + np.einsum("jxa,jx->ja", chain.shift, beyond)
     return rod.coarse(out - h * work)
 
 
@@ -92,9 +87,8 @@ def hessian_of(rod: Rod, u: Floats, chain: Chain, node_force: Floats) -> Floats:
     # summed
     trace = np.trace(lever, axis1=1, axis2=2)[:, None, None]
     torque = np.cross(chain.shift, beyond[:, :, None], axis=1) + lever @ chain.spin - trace * chain.spin
-    pairs = -np.einsum(
-        "ixa,jxb->iajb", chain.spin * h[:, None, None], torque * h[:, None, None], optimize=True
-    )
+    sides = chain.spin * h[:, None, None], torque * h[:, None, None]
+    pairs = -np.einsum("ixa,jxb->iajb", *sides, optimize=True)
     later = np.arange(n)[:, None] < np.arange(n)
     pairs *= later[:, None, :, None]
     pairs = pairs + pairs.transpose(2, 3, 0, 1)
@@ -128,20 +122,16 @@ def _own(rod: Rod, u: Floats, chain: Chain, beyond: Floats, lever: Floats) -> Fl
     columns = []
     for b in range(3):
         side = theta + 1j * tiny * np.eye(3)[b]
-        turned = rotation_of(side) @ before
-        moment = np.stack(
-            [
-                turned[:, 1, 2] - turned[:, 2, 1],
-                turned[:, 2, 0] - turned[:, 0, 2],
-                turned[:, 0, 1] - turned[:, 1, 0],
-            ],
-            axis=1,
-        )
-        slope = np.einsum("jya,jy->ja", turning_of(side), moment) + np.einsum(
-            "jya,jy->ja", _bending(side), pull
-        )
+        moment = _axial(rotation_of(side) @ before)
+        slope = np.einsum("jya,jy->ja", turning_of(side), moment)
+        slope = slope + np.einsum("jya,jy->ja", _bending(side), pull)
         columns.append(slope.imag / tiny)
     return np.stack(columns, axis=-1)
+
+
+def _axial(a: NDArray[Any]) -> NDArray[Any]:
+    """(n, 3) of a - a^T, (n, 3, 3)."""
+    return np.stack([a[:, 1, 2] - a[:, 2, 1], a[:, 2, 0] - a[:, 0, 2], a[:, 0, 1] - a[:, 1, 0]], axis=1)
 
 
 def _carried(chain: Chain, node_force: Floats) -> tuple[Floats, Floats]:
@@ -164,9 +154,8 @@ def chain_of(rod: Rod, u: Floats) -> Chain:
         start[j] = frame
         frame = frame @ turn[j]
     # the chord of an arc is the same series as the derivative of its turn
-    node = rod.base_position + np.cumsum(
-        rod.step[:, None] * np.einsum("jxy,jy->jx", start, turning[:, :, 2]), axis=0
-    )
+    chords = rod.step[:, None] * np.einsum("jxy,jy->jx", start, turning[:, :, 2])
+    node = rod.base_position + np.cumsum(chords, axis=0)
     return Chain(start, node, frame, start @ turning, rod.step[:, None, None] * (start @ _bending(theta)))
 
 

@@ -32,9 +32,8 @@ class HalfSpace:
     def distance(self, p: Floats) -> Distance:
         """Signed distance of points (p, 3)."""
         n = _unit(self.normal)
-        return Distance(
-            (p - np.asarray(self.point)) @ n, np.broadcast_to(n, p.shape), np.zeros((*p.shape, 3))
-        )
+        depth = (p - np.asarray(self.point)) @ n
+        return Distance(depth, np.broadcast_to(n, p.shape), np.zeros((*p.shape, 3)))
 
 
 @dataclass(frozen=True)
@@ -68,15 +67,13 @@ class Cylinder:
         round_ = (np.eye(3) - np.outer(a, a) - outer(n, n)) / d[:, None, None]
         side, end = d - self.radius, np.abs(along) - self.half_length
         cap = np.sign(along)[:, None] * a
-        corner, c = _length_and_direction(
-            np.maximum(side, 0.0)[:, None] * n + np.maximum(end, 0.0)[:, None] * cap
-        )
+        out, up = np.maximum(side, 0.0), np.maximum(end, 0.0)
+        corner, c = _length_and_direction(out[:, None] * n + up[:, None] * cap)
         on_side, on_end = (end <= 0.0) & (side >= end), (side <= 0.0) & (end > side)
         value = np.where(on_side, side, np.where(on_end, end, corner))
         normal = np.where(on_side[:, None], n, np.where(on_end[:, None], cap, c))
-        rim = (
-            outer(n, n) + np.outer(a, a) - outer(c, c) + np.maximum(side, 0.0)[:, None, None] * round_
-        ) / corner[:, None, None]
+        rim = outer(n, n) + np.outer(a, a) - outer(c, c) + out[:, None, None] * round_
+        rim = rim / corner[:, None, None]
         hessian = np.where(on_side[:, None, None], round_, np.where(on_end[:, None, None], 0.0, rim))
         return Distance(value, normal, hessian)
 
