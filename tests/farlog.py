@@ -73,9 +73,8 @@ def log(
 def camera(angle: float, distance: float, seed: int = 3) -> tuple[np.ndarray, np.ndarray]:
     """A rotation by `angle` [rad] about a random axis, a shift by `distance` [m] in a random direction."""
     axis, way = np.random.default_rng(seed).normal(size=(2, 3))
-    return Rotation.from_rotvec(
-        angle * axis / np.linalg.norm(axis)
-    ).as_matrix(), distance * way / np.linalg.norm(way)
+    rotation = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis))
+    return rotation.as_matrix(), distance * way / np.linalg.norm(way)
 
 
 def csv(run: Run) -> str:

@@ -72,10 +72,8 @@ def pair(**given: Any) -> tuple[Simulator, Simulator, np.ndarray]:
     """Two simulators that have settled, and lengths."""
     robot = rod(extension=(-0.005, 0.02))
     one, other = (Simulator(robot, 3, points_per_segment=5, **given) for _ in range(2))
-    lengths = robot.rest_tendon_length + np.array([[0.001, 0.0, -0.001, 0.0]]) * np.array(
-        [[1.0], [2.0], [-1.0]]
-    )
-    return one, other, lengths
+    pull = np.outer([1.0, 2.0, -1.0], [0.001, 0.0, -0.001, 0.0])
+    return one, other, robot.rest_tendon_length + pull
 
 
 @pytest.mark.parametrize("name", ["tip_force", "extension", "base_pose", "tip_moment", "line_force"])
@@ -83,9 +81,8 @@ def pair(**given: Any) -> tuple[Simulator, Simulator, np.ndarray]:
 @pytest.mark.parametrize("cold", [True, False])
 def test_a_bad_row_changes_no_bit_of_its_neighbours(name: str, value: float, cold: bool) -> None:
     sim, twin, lengths = pair()
-    usual = {"extension": np.zeros((3, 1)), "base_pose": np.tile([0.0, 0, 0, 1, 0, 0, 0], (3, 1))}.get(
-        name, np.zeros((3, 3))
-    )
+    others = {"extension": np.zeros((3, 1)), "base_pose": np.tile([0.0, 0, 0, 1, 0, 0, 0], (3, 1))}
+    usual = others.get(name, np.zeros((3, 3)))
     bad = usual.copy()
     bad[1, -1] = value
     if not cold:

@@ -319,10 +319,8 @@ def _hostile(kind: str, data: bytes, canary: Path, originals: Originals) -> dict
     if kind == "mesh glb":
         made |= {name: partial(_glb, data, change) for name, change in _GLB.items()}
     if kind.startswith("mesh"):
-        made |= {
-            name: partial(text.encode)
-            for name, text in _BOMBS.get(kind.removeprefix("mesh ").removesuffix(" text"), {}).items()
-        }
+        bombs = _BOMBS.get(kind.removeprefix("mesh ").removesuffix(" text"), {})
+        made |= {name: partial(text.encode) for name, text in bombs.items()}
     return made
 
 

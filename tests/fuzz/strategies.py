@@ -24,9 +24,8 @@ SLOW = [
 
 def tried(times: int) -> settings:
     """The same `times` examples on every machine."""
-    return settings(
-        derandomize=True, deadline=None, max_examples=times, database=None, suppress_health_check=SLOW
-    )
+    always: Any = {"derandomize": True, "deadline": None, "database": None, "suppress_health_check": SLOW}
+    return settings(max_examples=times, **always)
 
 
 LONGEST = 1500
@@ -67,13 +66,9 @@ def is_sentence(error: BaseException) -> bool:
     ours."""
     text = str(error)
     foreign = ("Traceback", "msgspec", "numpy", "ndarray", "object of type", "tuple index", "NoneType")
-    return (
-        0 < len(text) <= LONGEST
-        and "\n" not in text
-        and "\r" not in text
-        and text.rstrip()[-1] in ".?!)"
-        and not any(w in text for w in foreign)
-    )
+    if not 0 < len(text) <= LONGEST or text.rstrip()[-1] not in ".?!)":
+        return False
+    return not any(word in text for word in ("\n", "\r", *foreign))
 
 
 def one_sentence(error: BaseException, *names: str) -> None:
@@ -121,14 +116,9 @@ def good_tables(draw: st.DrawFn) -> dict[str, Any]:
                 "mode": mode,
             }
             if mode != "passive":
-                tendon = st.fixed_dictionaries(
-                    {"offset": st.floats(0.002, 0.02), "angle": st.floats(0.0, 6.28)},
-                    optional={
-                        "compliance": st.floats(0.0, 1e-3),
-                        "pretension": st.floats(0.0, 5.0),
-                        "unilateral": st.booleans(),
-                    },
-                )
+                place = {"offset": st.floats(0.002, 0.02), "angle": st.floats(0.0, 6.28)}
+                more = {"compliance": st.floats(0.0, 1e-3), "pretension": st.floats(0.0, 5.0)}
+                tendon = st.fixed_dictionaries(place, optional=more | {"unilateral": st.booleans()})
                 segment["tendons"] = draw(st.lists(tendon, min_size=1, max_size=4))
             table["segment"].append(segment)
     for name in draw(st.lists(st.sampled_from(sorted(SECTIONS)), unique=True, max_size=3)):
@@ -144,6 +134,7 @@ def _places(node: Any) -> list[tuple[Any, Any]]:
 
 KEYS = "name segment lenght length tendons offset mode youngs_modulus second_moment gravity points sd"
 
+keys = st.sampled_from([*KEYS.split(), "", "é", "half_width"]) | odd_words
 CHANGES = "put put number number drop add rename wrap empty twice"
 
 
@@ -164,13 +155,9 @@ def mutated_tables(draw: st.DrawFn) -> dict[str, Any]:
             case "drop":
                 del node[key]
             case "add" if isinstance(node, dict):
-                node[draw(st.sampled_from([*KEYS.split(), "", "é", "half_width"]) | odd_words)] = draw(
-                    odd_values
-                )
+                node[draw(keys)] = draw(odd_values)
             case "rename" if isinstance(node, dict):
-                node[draw(st.sampled_from([*KEYS.split(), "", "é", "half_width"]) | odd_words)] = node.pop(
-                    key
-                )
+                node[draw(keys)] = node.pop(key)
             case "wrap":
                 node[key] = [node[key]]
             case "empty":

@@ -108,13 +108,11 @@ def test_code_in_a_folder_runs_with_trust_alone(
     canary = tmp_path / "canary"
     config = json.loads(originals.policy[1])
     config["plan"]["n_envs"] = 2
-    text = json.dumps(config).replace(
-        "fastrod/Reach-v0", f"fastrod/{'Track' if name == 'drive' else 'Reach'}-v0"
-    )
+    task = "Track" if name == "drive" else "Reach"
+    text = json.dumps(config).replace("fastrod/Reach-v0", f"fastrod/{task}-v0")
     theirs = dict.fromkeys(("policy.zip", "checkpoint.zip", "replay.pkl"), foreign(canary))
-    path = policy(
-        tmp_path / "theirs", originals, **theirs, **{"actor.npz": b"", "config.json": text.encode()}
-    )
+    theirs |= {"actor.npz": b"", "config.json": text.encode()}
+    path = policy(tmp_path / "theirs", originals, **theirs)
     words = FOREIGN[name].replace("FOLDER", str(path)).split()
     # with trust their code has run, and what it made is no model
     assert main([*words, *(["--trust"] if trust else [])]) == 2

@@ -22,6 +22,7 @@ FIELDS = (
     "position rotation curvature arclength moment force tip_position tip_rotation tension path_length "
     "base_wrench residual"
 )
+EVERY = f"{FIELDS} ok passes"
 SHAPES = {"tendon_length": (4,), "extension": (1,), "tip_force": (3,), "tip_moment": (3,)}
 SHAPES |= {"line_force": (3,), "follower_tip_force": (3,), "base_pose": (7,)}
 NUMBERS = [np.float64, np.float32, np.float16, np.int64, np.uint8]
@@ -65,18 +66,15 @@ def well(state: State) -> None:
     for name in FIELDS.split():
         assert np.isfinite(getattr(state, name)[state.ok]).all(), name
     assert set(state.problems) == set(np.flatnonzero(~state.ok).tolist())
-    assert not any(
-        "\n" in sentence or not sentence.rstrip().endswith((".", "?")) for sentence in state.problems.values()
-    ), state.problems
+    for sentence in state.problems.values():
+        assert "\n" not in sentence
+        assert sentence.rstrip().endswith((".", "?")), sentence
 
 
 def differing(one: State, other: State, rows: Any = slice(None)) -> list[str]:
     """In what two states are not the same bit for bit."""
-    return [
-        name
-        for name in (*FIELDS.split(), "ok", "passes")
-        if not np.array_equal(getattr(one, name)[rows], getattr(other, name)[rows], equal_nan=True)
-    ]
+    pairs = ((name, getattr(one, name)[rows], getattr(other, name)[rows]) for name in EVERY.split())
+    return [name for name, a, b in pairs if not np.array_equal(a, b, equal_nan=True)]
 
 
 @st.composite
@@ -319,9 +317,8 @@ class Twins(RuleBasedStateMachine):
 def test_a_session_with_bad_input_is_the_session_without(tmp_path: Any) -> None:
     from hypothesis.stateful import run_state_machine_as_test
 
-    run_state_machine_as_test(
-        Twins, settings=settings(tried(25), stateful_step_count=12, suppress_health_check=SLOW)
-    )
+    steps = settings(tried(25), stateful_step_count=12, suppress_health_check=SLOW)
+    run_state_machine_as_test(Twins, settings=steps)
     assert Twins.alike is not None
 
 

@@ -55,11 +55,8 @@ def cells(draw: st.DrawFn, name: str, row: int) -> str:
 @st.composite
 def grids(draw: st.DrawFn) -> list[list[str]]:
     """A header and rows of a run log with up to three things changed."""
-    header = ["t", *INPUTS, *TIP] + [
-        name
-        for group in draw(st.lists(st.sampled_from(FURTHER), max_size=3, unique_by=tuple))
-        for name in group
-    ]
+    further = draw(st.lists(st.sampled_from(FURTHER), max_size=3, unique_by=tuple))
+    header = ["t", *INPUTS, *TIP, *(name for group in further for name in group)]
     grid = [header, *([cells(draw, name, row) for name in header] for row in range(draw(st.integers(0, 5))))]
     for _ in range(draw(st.integers(0, 3))):
         i, j = draw(st.integers(0, len(grid) - 1)), draw(st.integers(0, max(0, len(grid[0]) - 1)))
@@ -80,11 +77,8 @@ def grids(draw: st.DrawFn) -> list[list[str]]:
                 if j < len(row):
                     row[j : j + 1] = [] if change == "drop" else [row[j]] * 2
         elif j < len(grid[i]) and i:
-            grid[i][j] = (
-                draw(st.sampled_from(CELLS.split("|")))
-                if change == "cell"
-                else repr(draw(odd_numbers.filter(lambda n: abs(n) < 1e300 or n != n)))
-            )
+            number = odd_numbers.filter(lambda n: abs(n) < 1e300 or n != n).map(repr)
+            grid[i][j] = draw(st.sampled_from(CELLS.split("|")) if change == "cell" else number)
     return grid
 
 
@@ -241,9 +235,7 @@ def test_replay_of_an_odd_log_answers(folder: Path, text: str) -> None:
 def test_identify_of_an_odd_log_answers(folder: Path, text: str) -> None:
     path, out = folder / "identified.csv", folder / "identified"
     path.write_text(text, encoding="utf-8", newline="")
-    code, printed = run(
-        "identify", str(path), "--robot", "prototype", "--max-effects", "0", "--out", str(out)
-    )
+    code, printed = run(*f"identify {path} --robot prototype --max-effects 0 --out {out}".split())
     assert code == 2  # none is long enough
     assert printed.count("\n") == 1, printed
     assert not out.exists()
@@ -289,6 +281,5 @@ def test_a_torn_partial_file_is_recovered_or_kept(folder: Path, data: st.DataObj
         if raw == PARTIAL[:at].encode():
             assert_array_equal(log.t, [0.02 * k for k in range(PARTIAL[:at].count("\n") - 2)])
             same(log, read_log(target, ROBOT))
-    assert (
-        [file.name for file in folder.glob("torn*")] == ["torn.csv"] if target.exists() else ["torn.csv.part"]
-    )
+    left = [file.name for file in folder.glob("torn*")]
+    assert left == ["torn.csv" if target.exists() else "torn.csv.part"]

@@ -118,9 +118,8 @@ def test_a_killed_command_is_finished_by_the_same_command(whole: Path, tmp_path:
     out = tmp_path / "out"
     paths = os.pathsep.join(filter(None, [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH")]))
     kill = [sys.executable, "-c", KILLED, str(out)]
-    first = subprocess.run(
-        kill, check=False, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": paths}
-    )
+    environment = {**os.environ, "PYTHONPATH": paths}
+    first = subprocess.run(kill, check=False, stdout=subprocess.PIPE, text=True, env=environment)
     assert first.returncode == -signal.SIGKILL
     workers = [int(pid) for pid in first.stdout.split()]
     assert len(workers) >= 2
@@ -161,11 +160,9 @@ def test_a_shard_with_a_broken_page_is_made_again(whole: Path, copy: Path) -> No
 def test_a_data_set_grows_with_its_count(whole: Path, tmp_path: Path) -> None:
     assert generate(small(count=575), tmp_path, workers=1).made == 12
     for name in ("row", "chain", "dl_1", "tip_x"):  # rows that are there stay what they are
-        values = [
-            parquet.read_table(folder / "shards", columns=[name]).column(name).to_pylist()
-            for folder in (tmp_path, whole)
-        ]
-        assert values[0] == values[1][:575]
+        folders = (folder / "shards" for folder in (tmp_path, whole))
+        mine, all_ = (parquet.read_table(folder, columns=[name])[name].to_pylist() for folder in folders)
+        assert mine == all_[:575]
     summary = generate(small(count=600), tmp_path, workers=1)
     assert summary.made == 1  # the last one was short
     assert bits(tmp_path) == bits(whole)

@@ -37,6 +37,10 @@ def group(table: dict[str, np.ndarray], *names: str) -> np.ndarray:
     return np.stack([table[name] for name in names], axis=1).astype(float)
 
 
+def tip(table: dict[str, np.ndarray]) -> np.ndarray:
+    return group(table, "tip_x", "tip_y", "tip_z")
+
+
 def inputs(table: dict[str, np.ndarray], robot: Robot) -> dict[str, np.ndarray]:
     """Inputs of `Simulator.settle`."""
     dl = group(table, *(f"dl_{k + 1}" for k in range(robot.n_tendons)))
@@ -57,9 +61,7 @@ def test_a_row_is_what_a_cold_simulator_finds(name: str) -> None:
     assert state.ok.all()
     assert (table["residual"] <= 1e-6).all()
     # the boundary is within the tolerance; the tip, further out, is by a few times that
-    np.testing.assert_allclose(
-        group(table, "tip_x", "tip_y", "tip_z"), state.tip_position, rtol=0.0, atol=5e-6
-    )
+    np.testing.assert_allclose(tip(table), state.tip_position, rtol=0.0, atol=5e-6)
     tension = group(table, *(f"tension_{k + 1}" for k in range(robot.n_tendons)))
     np.testing.assert_allclose(tension, state.tension, rtol=0.0, atol=1e-4 * np.abs(state.tension).max())
 
@@ -67,10 +69,9 @@ def test_a_row_is_what_a_cold_simulator_finds(name: str) -> None:
 def test_six_steps_a_segment_are_within_the_tolerance_of_sixty() -> None:
     robot = heavy()
     table = made(robot, 128)
-    state = fastrod.Simulator(robot, 128, points_per_segment=60, outputs="tip").settle(
-        **inputs(table, robot), tolerance=1e-10
-    )
-    error = np.linalg.norm(group(table, "tip_x", "tip_y", "tip_z") - state.tip_position, axis=1)
+    sim = fastrod.Simulator(robot, 128, points_per_segment=60, outputs="tip")
+    state = sim.settle(**inputs(table, robot), tolerance=1e-10)
+    error = np.linalg.norm(tip(table) - state.tip_position, axis=1)
     assert np.median(error) < 1e-6
     assert error.max() < 5e-6
 
@@ -80,22 +81,18 @@ def test_the_base_bears_tip_force_and_weight() -> None:
     table = made(robot, 192)
     # a segment that grows keeps its mass per length
     length = robot.length + table["ext_5"]
-    expected = group(table, "tip_fx", "tip_fy", "tip_fz") + DENSITY * length[:, None] * np.array(
-        robot.gravity
-    )
+    weight = DENSITY * length[:, None] * np.array(robot.gravity)
+    expected = group(table, "tip_fx", "tip_fy", "tip_fz") + weight
     np.testing.assert_allclose(group(table, "base_fx", "base_fy", "base_fz"), expected, atol=1e-8)
 
 
 def test_the_last_point_is_the_tip_and_frames_are_the_bases() -> None:
     plain = heavy("prototype")
     # about gravity
-    rotated = replace(
-        plain, base_position=(0.3, -0.2, 0.1), base_quaternion=(np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
-    )
+    quarter = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
+    rotated = replace(plain, base_position=(0.3, -0.2, 0.1), base_quaternion=quarter)
     one, other = (made(robot, 64, points=3) for robot in (plain, rotated))
-    np.testing.assert_allclose(
-        group(one, "p3_x", "p3_y", "p3_z"), group(one, "tip_x", "tip_y", "tip_z"), atol=1e-8
-    )
+    np.testing.assert_allclose(group(one, "p3_x", "p3_y", "p3_z"), tip(one), atol=1e-8)
     for name, values in one.items():
         np.testing.assert_allclose(other[name], values, atol=2e-6, err_msg=name)
 
@@ -150,9 +147,7 @@ def test_rows_of_their_own_are_settled_cold() -> None:
     table = made(robot, 40, chain=1)
     state = fastrod.Simulator(robot, 40, points_per_segment=6).settle(**inputs(table, robot), tolerance=1e-6)
     assert len(set(table["chain"])) == 40
-    np.testing.assert_allclose(
-        group(table, "tip_x", "tip_y", "tip_z"), state.tip_position, rtol=0.0, atol=5e-6
-    )
+    np.testing.assert_allclose(tip(table), state.tip_position, rtol=0.0, atol=5e-6)
 
 
 def test_a_row_that_does_not_converge_is_kept_and_marked(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -33,10 +33,8 @@ def chain() -> Robot:
 
 
 def pair(robot: Robot | Sequence[Robot], n: int | None = 3, **options: Any) -> list[Simulator]:
-    return [
-        Simulator(robot, n_robots=n, device=device, **{"points_per_segment": 3, **options})
-        for device in ("cpu", "cuda")
-    ]
+    given = {"n_robots": n, "points_per_segment": 3, **options}
+    return [Simulator(robot, device=device, **given) for device in ("cpu", "cuda")]
 
 
 def inputs(robot: Robot, k: int, n: int = 3) -> dict[str, Any]:

@@ -104,11 +104,8 @@ def test_shares_are_of_the_variance() -> None:
     """In whatever unit; and nothing has no share of anything."""
     residual = planted(patterns()["static"], 0.5, 0)
     one, other = run(residual), run(1e-4 * residual)
-    assert_allclose(
-        [other.static, other.memory, other.drift, other.exogenous],
-        [one.static, one.memory, one.drift, one.exogenous],
-        atol=1e-9,
-    )
+    for kind in ("static", "memory", "drift", "exogenous"):
+        assert_allclose(getattr(other, kind), getattr(one, kind), atol=1e-9)
     nothing = run(np.zeros((N, 3)))
     assert (nothing.structured, nothing.kind, nothing.z) == (0.0, "none", 0.0)
 

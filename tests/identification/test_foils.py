@@ -68,10 +68,8 @@ def ranked(residual: np.ndarray) -> list[tuple[float, AlternativePattern]]:
     made = alternatives(linearised(), tangent(), residual)
     assert {alternative.name for alternative in made} == {*KINDS}
     n = residual.size
-    scores = [
-        n * np.log(left_by(f.columns, residual) / n) + (f.columns.shape[-1] + f.n_hidden) * np.log(n)
-        for f in made
-    ]
+    fits = (n * np.log(left_by(f.columns, residual) / n) for f in made)
+    scores = [fit + (f.columns.shape[-1] + f.n_hidden) * np.log(n) for fit, f in zip(fits, made, strict=True)]
     return sorted(zip(scores, made, strict=True), key=lambda pair: pair[0])
 
 

@@ -242,9 +242,8 @@ def test_replay_prints_its_questions_and_is_done(tmp_path: Path, monkeypatch: An
     assert main(["replay", "flipped.csv", "--robot", "mine.toml"]) == 0
     told = capsys.readouterr()
     assert "excursion" in told.out
-    assert re.search(
-        r"^log 'flipped' is further from robot 'mine' .* the sign of every dl_ reversed", told.err
-    )
+    words = r"^log 'flipped' is further from robot 'mine' .* the sign of every dl_ reversed"
+    assert re.search(words, told.err)
     assert len(told.err.splitlines()) == 1
     rest = np.asarray(ROBOT.rest_tendon_length)
     Path("absolute.csv").write_text(farlog.csv(run._replace(dl=run.dl + rest)))

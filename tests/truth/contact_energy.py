@@ -414,9 +414,8 @@ def _answer(
     contact = np.zeros((len(look.rod.step) + 1, 3))
     np.add.at(contact, look.node + 1, force[look.slot][:, None] * look.normal)
     positions = np.concatenate([rod.base_position[None], look.chain.node])
-    gap = np.min(
-        [np.full(len(positions), np.inf), *(o.distance(positions).value - rod.rho for o in obstacles)], 0
-    )
+    gaps = [o.distance(positions).value - rod.rho for o in obstacles]
+    gap = np.min(gaps, axis=0) if gaps else np.full(len(positions), np.inf)
     u = rod.fine(x)
     chain = chain_of(rod, u)
     stretch, direction = stretch_of(rod, u)

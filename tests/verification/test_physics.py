@@ -223,9 +223,8 @@ def test_cable_robots_taut_and_loose_match_the_twin(pull: float) -> None:
     rng = np.random.default_rng(4)
     for robot in (one_sided(rod()), one_sided(load_robot("tdcr_a"))):
         angles = rng.uniform(-0.6, 0.6, (40, 2 * robot.n_segments))
-        lengths = np.stack(
-            [sum(bend(robot, *a[2 * k : 2 * k + 2], k) for k in range(robot.n_segments)) for a in angles]
-        )
+        each = range(robot.n_segments)
+        lengths = np.stack([sum(bend(robot, *a[2 * k : 2 * k + 2], k) for k in each) for a in angles])
         lengths -= (robot.n_segments - 1) * robot.rest_tendon_length + pull * (1 + robot.tendon_segment)
         force = rng.uniform(-0.1, 0.1, (40, 3))
         state = Simulator(robot, n_robots=40).settle(lengths, tip_force=force)
@@ -247,9 +246,8 @@ def test_any_sampling_of_a_line_force_keeps_its_force_and_moment() -> None:
         line = rng.uniform(-1.0, 1.0, (1, points, 3))
         loads = {"line_force": line, "point_force": [(0.0237, (0.0, 1e-9, 0.0))]}  # which moves the nodes
         state = Simulator(rod("passive")).settle(**loads)
-        assert_allclose(
-            state.base_wrench[0, :3], np.trapezoid(line[0], dx=0.07 / (points - 1), axis=0), atol=2e-9
-        )
+        whole = np.trapezoid(line[0], dx=0.07 / (points - 1), axis=0)
+        assert_allclose(state.base_wrench[0, :3], whole, atol=2e-9)
         twin = shoot(rod("passive"), **loads)
         # a polyline that bends inside a step is met in force and moment there: what is left is of third order
         assert_allclose(state.tip_position[0], twin.tip_position, atol=2e-6)
