@@ -366,68 +366,63 @@ def test_effects_of_a_robot_file_come_back_and_act(tmp_path: Path) -> None:
     assert (link.name, link.values.tolist()) == ("backlash", [[0.0002, 0.0]])
 
 
-@pytest.mark.parametrize(
-    ("tables", "kind", "sentence"),
-    [
-        ([{"name": "backlsh"}], UnknownNameError, "no effect 'backlsh'; did you mean 'backlash'"),
-        ([{"name": "gear_ply"}], UnknownNameError, "did you mean 'gear_play'"),
-        (
-            [{"name": "backlash", "half_widht": 1e-4}],
-            EffectError,
-            "robot 'two': .* no parameter 'half_widht'; did you mean 'half_width'",
-        ),
-        (
-            [{"name": "backlash", "half_width": -1e-4}],
-            EffectError,
-            r"is -0.0001 m; it must be a number from 0 to",
-        ),
-        (
-            [{"name": "backlash", "half_width": 1.0}],
-            EffectError,
-            r"is 1.0 m; it must be a number from 0 to 0.00",
-        ),
-        ([{"name": "creep", "share": "a"}], EffectError, "share of effect 'creep' is 'a'"),
-        ([{"name": "creep", "share": True}], EffectError, "is True"),
-        ([{"name": "creep", "share": float("nan")}], EffectError, "is nan"),
-        ([{"name": "creep", "time_constant": 0.0}], EffectError, "it must be a number from 0.05 to 300"),
-        (
-            [{"name": "drum_gain", "gain": [0.1, 0.2]}],
-            EffectError,
-            "gain of effect 'drum_gain' has 2 values; give one, or 4, one per drive",
-        ),
-        ([{"name": "creep", "share": [0.1, 0.2]}], EffectError, "has 2 values; give one"),
-        ([{"name": "payload"}, {"name": "payload"}], EffectError, "has effect 'payload' twice"),
-        ([{"name": "backlash"}, {"name": "gear_play"}], EffectError, "has effect 'backlash' twice"),
-        ([{"half_width": 1e-4}], EffectError, "has no name"),
-    ],
-)
-def test_bad_tables_get_one_sentence(tables: list[Table], kind: type[Exception], sentence: str) -> None:
+def lash(**values: Any) -> Table:
+    return {"name": "backlash", **values}
+
+
+def creep(**values: Any) -> Table:
+    return {"name": "creep", **values}
+
+
+UNKNOWN: list[tuple[Any, ...]] = [
+    ("no effect 'backlsh'; did you mean 'backlash'", {"name": "backlsh"}),
+    ("did you mean 'gear_play'", {"name": "gear_ply"}),
+]
+WRONG: list[tuple[Any, ...]] = [
+    ("robot 'two': .* no parameter 'half_widht'; did you mean 'half_width'", lash(half_widht=1e-4)),
+    ("is -0.0001 m; it must be a number from 0 to", lash(half_width=-1e-4)),
+    ("is 1.0 m; it must be a number from 0 to 0.00", lash(half_width=1.0)),
+    ("share of effect 'creep' is 'a'", creep(share="a")),
+    ("is True", creep(share=True)),
+    ("is nan", creep(share=float("nan"))),
+    ("it must be a number from 0.05 to 300", creep(time_constant=0.0)),
+    (
+        "gain of effect 'drum_gain' has 2 values; give one, or 4, one per drive",
+        {"name": "drum_gain", "gain": [0.1, 0.2]},
+    ),
+    ("has 2 values; give one", creep(share=[0.1, 0.2])),
+    ("has effect 'payload' twice", {"name": "payload"}, {"name": "payload"}),
+    ("has effect 'backlash' twice", lash(), {"name": "gear_play"}),
+    ("has no name", {"half_width": 1e-4}),
+]
+TABLES = [*((UnknownNameError, *row) for row in UNKNOWN), *((EffectError, *row) for row in WRONG)]
+
+
+@pytest.mark.parametrize("row", TABLES, ids=[row[1][:40] for row in TABLES])
+def test_bad_tables_get_one_sentence(row: tuple[Any, ...]) -> None:
+    kind, sentence, *tables = row
     with pytest.raises(kind, match=sentence) as caught:
         Simulator(having(two_segments(), *tables))
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("table", "kind", "sentence"),
-    [
-        ('name = "backlsh"', UnknownNameError, "no effect 'backlsh'; did you mean 'backlash'"),
-        (
-            'name = "backlash"\nhalf_widht = 1e-4',
-            EffectError,
-            "has no parameter 'half_widht'; did you mean 'half_width'",
-        ),
-        (
-            'name = "backlash"\nhalf_width = 1.0',
-            EffectError,
-            "half_width of effect 'backlash' is 1.0 m; it must be a number from 0",
-        ),
-        ('name = "play"\n[[effect]]\nname = "backlash"', EffectError, "has effect 'backlash' twice"),
-    ],
-)
+LASH = 'name = "backlash"\n'
+FILES = {
+    'name = "backlsh"': (UnknownNameError, "no effect 'backlsh'; did you mean 'backlash'"),
+    LASH + "half_widht = 1e-4": (EffectError, "has no parameter 'half_widht'; did you mean 'half_width'"),
+    LASH + "half_width = 1.0": (
+        EffectError,
+        "half_width of effect 'backlash' is 1.0 m; it must be a number from 0",
+    ),
+    'name = "play"\n[[effect]]\nname = "backlash"': (EffectError, "has effect 'backlash' twice"),
+}
+
+
+@pytest.mark.parametrize("table", FILES)
 def test_a_robot_file_with_an_effect_that_is_none_is_refused_when_it_is_loaded(
-    table: str, kind: type[Exception], sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    table: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = tmp_path / "mine.toml"
+    path, (kind, sentence) = tmp_path / "mine.toml", FILES[table]
     path.write_text(dumps(load_robot("prototype")) + f"[[effect]]\n{table}\n")
     with pytest.raises(kind, match=sentence) as caught:
         fastrod.load_robot(path)
