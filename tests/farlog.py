@@ -85,8 +85,7 @@ def csv(run: Run) -> str:
 
 
 def _routing() -> np.ndarray:
-    """(6, 4) change of tendon length per bend about x and y of each segment: a tendon on the inner side is
-    shorter."""
+    """(6, 4) change of tendon length per bend about x and y of each segment: shorter on the inner side."""
     one = OFFSET * np.stack([np.sin(ANGLES), -np.cos(ANGLES)], axis=1)
     made = np.zeros((6, 4))
     made[:, :2], made[3:, 2:] = one, one[3:]

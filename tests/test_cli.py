@@ -43,8 +43,7 @@ def log(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def straight(monkeypatch: Patch) -> None:
-    """A simulator whose robots stay straight, so that the words of the command line are tested without the
-    model."""
+    """A simulator whose robots stay straight: the words are tested without the model."""
 
     class Straight:
         def __init__(self, robot: Robot, n_robots: int) -> None:

@@ -1,5 +1,4 @@
-"""Ports beside lengths and loads: an effect on tensions, on pretension and on the base is what a user would
-give."""
+"""Ports beside lengths and loads: an effect on them is what a user would give."""
 
 from __future__ import annotations
 

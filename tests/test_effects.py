@@ -1,5 +1,4 @@
-"""Laws over the whole registry of effects, so that a new one is tested the day it is written; robot files; a
-user's own effect."""
+"""Laws over the whole registry of effects, robot files that name them, and a user's own effect."""
 
 from __future__ import annotations
 
@@ -73,8 +72,7 @@ def at_typical(name: str, robot: Robot, times: float = 1.0) -> Table:
 
 
 def commands(robot: Robot, n_steps: int = N_STEPS) -> np.ndarray:
-    """(n_steps, N_ROBOTS, n_tendons) bends there and back, up to about 1.2 rad in all, with a little common
-    pull; robots out of step."""
+    """(n_steps, N_ROBOTS, n_tendons) bends there and back, up to about 1.2 rad; robots out of step."""
     t = np.linspace(0.0, 1.0, n_steps)[:, None] + 0.1 * np.arange(N_ROBOTS)
     lengths = np.zeros((n_steps, N_ROBOTS, robot.n_tendons))
     for k in range(robot.n_segments):
@@ -103,8 +101,7 @@ def simulator(robot: Robot | list[Robot], n_robots: int = N_ROBOTS) -> Simulator
 def run(
     sim: Simulator, lengths: np.ndarray, *, moving: bool = False, first: int = 0, rows: Any = slice(None)
 ) -> Seen:
-    """Everything that is seen of a simulator while it steps along `lengths`; `rows`: which of the N_ROBOTS it
-    has."""
+    """All that is seen of a simulator along `lengths`; `rows`: which of the N_ROBOTS it has."""
     seen: dict[str, list[np.ndarray]] = {}
     for i, here in enumerate(lengths, first):
         loads = given(sim.robots[0], i, moving)
@@ -217,8 +214,7 @@ def test_a_bad_input_spoils_no_memory(name: str) -> None:
 
 
 def changes_tendons(robot: Robot, **inputs: Any) -> bool:
-    """Whether a robot's effects change where its tendons run or how they stretch, and not only their
-    lengths."""
+    """Whether effects change where tendons run or how they stretch, and not only their lengths."""
     layout, params, rest = compile_robots((replace(robot, effects=()),), N_STEPS)
     ports = Reader(layout, params, rest, 1).ports(Inputs(**inputs))
     pipeline = EffectPipeline([robot], 1)
@@ -268,8 +264,7 @@ def test_a_sweep_over_a_log_is_its_steps_one_by_one(name: str) -> None:
 
 
 def test_memories_are_as_wide_as_their_operators_need() -> None:
-    """What a sweep leaves behind: numbers in every column that a wire, a bend or a past step has, and no
-    column beside the memory."""
+    """What a sweep leaves behind: numbers in every column of a tendon, a bend or a step, and no other."""
     wires = {"backlash": 3, "friction": 6, "creep": 2, "dynamics": 3}
     assert {*wires, "latency", "plastic_set"} <= set(OPERATORS)
     robot = two_segments()

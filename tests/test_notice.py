@@ -1,5 +1,4 @@
-"""The line on stderr before kernels are compiled: in scripts too, once a process, and not where they are
-cached."""
+"""The line on stderr before kernels are compiled: once a process, and not where they are cached."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""What is built is what was meant: one wheel with five import names, an sdist that builds the same, and
-extras that stand alone."""
+"""What is built is what was meant: one wheel, an sdist that builds the same, extras that stand alone."""
 
 from __future__ import annotations
 

@@ -50,8 +50,7 @@ def other_robot() -> Robot:
 
 
 def log_of_the_other(n: int = 8) -> RunLog:
-    """What shooting makes of `other_robot`, without noise: two runs along a spiral of bends, the second one
-    under a known load."""
+    """What shooting makes of `other_robot`: two runs along a spiral of bends, the second one under a load."""
     from fastrod.reference import shoot
 
     fraction = np.tile(np.arange(1, n + 1) / n, 2)
@@ -67,8 +66,7 @@ def log_of_the_other(n: int = 8) -> RunLog:
 
 
 class Arc:
-    """A stand-in for the simulator: constant curvature of a one-segment robot, no loads; it remembers its
-    inputs."""
+    """A stand-in for the simulator: constant curvature, no loads; it remembers its inputs."""
 
     seen: dict[str, Any]
     refuse: tuple[int, ...] = ()
@@ -250,8 +248,7 @@ def test_shipped_log_does_not_say_what_is_in_it() -> None:
 
 
 def test_right_model_leaves_nothing_and_the_nominal_one_its_difference() -> None:
-    """A log by another solver: the robot that it was made on leaves the solvers' steps, with loads and
-    without."""
+    """A log by another solver: the robot that it was made on leaves the solvers' steps alone."""
     log = log_of_the_other()
     nominal = replay(log, load_robot("prototype"))
     assert nominal.converged.all()

@@ -1,5 +1,4 @@
-"""The report of an identification: the contract's keys, one offline page, files whole or not at all, numbers
-in friendly units."""
+"""The report of an identification: the contract's keys, one offline page, whole files, friendly units."""
 
 from __future__ import annotations
 

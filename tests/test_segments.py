@@ -1,5 +1,4 @@
-"""Actions of segments: the bends they name are the bends that come, and their matrix is the slope of their
-inputs."""
+"""Actions of segments: the bends they name are those that come; their matrix is the slope of the inputs."""
 
 from __future__ import annotations
 
@@ -28,8 +27,7 @@ def stiff_wires(n_segments: int = 2, n_tendons: int = 4, offset: float = 0.008) 
 
 
 def arc(bend: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation and end of an arc along e3 that bends toward d1 by bend[0] and toward d2 by bend[1]: the
-    closed form."""
+    """Rotation and end of an arc along e3 that bends toward d1 and d2 by bend: the closed form."""
     angle = float(np.hypot(*bend))
     if angle == 0.0:
         return np.eye(3), np.array([0.0, 0.0, length])

@@ -128,8 +128,7 @@ def test_rows_of_no_robot() -> None:
 
 
 def test_merged_rows_keep_the_order_that_kernels_are_compiled_for() -> None:
-    """Another order of axes in memory is another type to numba: a first call would wait for its
-    compilation."""
+    """Another order of axes is another type to numba: a first call would wait for its compilation."""
     now, then = np.zeros((1, 2, 3, 4)), np.ones((3, 2, 3, 4))
     merged = merge_rows(now, then, np.array([True, False, False]))
     assert merged.flags.c_contiguous

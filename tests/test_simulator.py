@@ -60,8 +60,7 @@ def test_hot_loops_are_simd_code() -> None:
 
 
 def test_a_load_that_no_number_of_steps_would_bring_on_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Steps are in proportion to one over the load: 10 kN on a rod of 2 N mm^2 would take thousands, each of
-    several passes."""
+    """Steps are in proportion to one over the load: 10 kN on 2 N mm^2 would take thousands."""
     sim, ran = Simulator(rod(), n_robots=2, points_per_segment=6), 0
     run = BoundarySolver.run
 

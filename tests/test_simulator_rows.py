@@ -1,5 +1,4 @@
-"""Robots of a batch held, put back, settled or replaced one by one: exact for them, and nothing to the
-others."""
+"""Robots of a batch held, put back, settled or replaced one by one: exact, and nothing to the others."""
 
 from __future__ import annotations
 
@@ -26,8 +25,7 @@ Step = Callable[[int], Inputs]
 
 
 def reacher() -> tuple[Robot, Callable[[float], Inputs]]:
-    """The five-segment reacher on a slow path: all bends at some 10 mm/s, its last segment extending, as a
-    function of time [s]."""
+    """The five-segment reacher on a slow path of some 10 mm/s, as a function of time [s]."""
     robot = load_robot("five_segment_reacher")
     matrix = SegmentActions(robot).matrix
 

@@ -173,8 +173,7 @@ def _remove(path: Path) -> None:
 
 
 def warm(folder: Path, originals: Originals) -> None:
-    """Import what reads, and load the kernels: no file's time. Raises `AssertionError` where a fine file is
-    not read."""
+    """Import what reads, and load the kernels: no file's time. Raises `AssertionError` on a fine file."""
     for kind in KINDS:
         path = write_fine(kind, folder / "fine", originals)
         with redirect_stdout(io.StringIO()):

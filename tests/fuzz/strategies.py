@@ -1,5 +1,4 @@
-"""What the fuzz tests share: how often they try, odd values, mutations of tables and texts, and what a
-sentence is."""
+"""What the fuzz tests share: settings, odd values, mutations of tables and texts, what a sentence is."""
 
 from __future__ import annotations
 
@@ -62,8 +61,7 @@ odd_values = st.recursive(
 
 
 def is_sentence(error: BaseException) -> bool:
-    """Whether this error is told in one line that ends, and that nobody else's words stand in place of
-    ours."""
+    """Whether this error is one line that ends, in our own words."""
     text = str(error)
     foreign = ("Traceback", "msgspec", "numpy", "ndarray", "object of type", "tuple index", "NoneType")
     if not 0 < len(text) <= LONGEST or text.rstrip()[-1] not in ".?!)":

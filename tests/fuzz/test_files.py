@@ -1,5 +1,4 @@
-"""Files from strangers: a slice of `python perf/fuzz_files.py`, and what it can only stumble on, one row
-each."""
+"""Files from strangers: a slice of `python perf/fuzz_files.py`, and what it can only stumble on."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Any values at all as a simulator's inputs: a state, or one sentence; and what was refused has changed
-nothing."""
+"""Any values at all as a simulator's inputs: a state, or one sentence that has changed nothing."""
 
 from __future__ import annotations
 
@@ -251,8 +250,7 @@ def test_an_odd_simulator_is_one_or_a_sentence(name: str, value: Any) -> None:
 
 
 class Twins(RuleBasedStateMachine):
-    """Two simulators driven alike, one of which is given bad input in between, and sent back to where it
-    was."""
+    """Two simulators driven alike, one of which is given bad input in between, and sent back."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -110,8 +110,7 @@ def die(_, done, __):
 
 generate(small(), sys.argv[1], workers=2, progress=die)
 """
-"""A command that is killed after its second shard, however fast its workers are: it lets them run no more
-than a few shards ahead."""
+"""A command that is killed after its second shard: its workers are but a few shards ahead."""
 
 
 def test_a_killed_command_is_finished_by_the_same_command(whole: Path, tmp_path: Path) -> None:

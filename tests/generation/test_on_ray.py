@@ -39,8 +39,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_killed_ray_worker_loses_and_doubles_nothing(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: bool
 ) -> None:
-    """A worker that kills itself in its sixth shard, before or after writing it: none has to be caught at
-    work."""
+    """A worker that kills itself in its sixth shard, before or after writing it."""
     from fastrod.generation import on_ray
 
     mark = tmp_path / "killed"

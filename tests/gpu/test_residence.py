@@ -1,5 +1,4 @@
-"""What lives on the device: nothing is lost between the two copies of the memory, and a steady step moves
-what it must and no more."""
+"""What lives on the device: no copy of the memory is stale, and a steady step moves what it must alone."""
 
 from __future__ import annotations
 

@@ -51,8 +51,7 @@ def log_of(robot: Robot, dl: np.ndarray, dt: float | np.ndarray = 0.05, **column
 
 
 def bare_run(rate: float) -> LogSamples:
-    """The designed run: rests, holds, reversals, and its beginning once more at the end; no load, one
-    base."""
+    """The designed run, its beginning once more at the end; no load, one base."""
     run = excitation(one_segment(), rate=rate).log
     return sample(replace(run, tip_position=np.zeros((len(run), 3)), payload=None, base_quaternion=None))
 

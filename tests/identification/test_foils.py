@@ -89,8 +89,7 @@ def test_each_family_is_the_name_of_its_own_pattern(outside: str, seed: int) -> 
 
 @pytest.mark.parametrize("seed", [2, 4])
 def test_a_contact_is_static_whatever_its_name(seed: int) -> None:
-    """Of six walls, these two (normals near a wire's plane) fit a patch better than a contact; why is not
-    known. Both are static."""
+    """Of six walls, these two (normals near a tendon's plane) fit a patch better; why is not known."""
     scores = ranked(residual(planted("contact", seed)))
     assert [alternative.name for _, alternative in scores[:2]] in (["patch", "contact"], ["contact", "patch"])
     assert scores[0][1].kind == "static"

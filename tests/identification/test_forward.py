@@ -39,8 +39,7 @@ TABLES: dict[str, dict[str, Any]] = {
     for name in registry.effect_names()
     if has_memory(get_effect(name)) or signal_of(get_effect(name)) is Signal.TIME
 }
-"""Every effect with a memory or a clock; one that is not given above has the values that a fit starts
-from."""
+"""Every effect with a memory or a clock; one that is not given above as a fit starts it."""
 MEMORIES = [{"name": name} | table for name, table in TABLES.items()]
 STATIC: list[dict[str, Any]] = [
     {"name": "drum_gain", "gain": [0.03, -0.02, 0.04, 0.01]},
@@ -100,8 +99,7 @@ def stepped(robot: Robot, what: RunLog) -> PredictedPose:
 
 
 def predicted(robot: Robot, what: RunLog) -> PredictedPose:
-    """The rows of a log as identification sees them: the robot's effects are known, nothing else is
-    fitted."""
+    """The rows of a log as identification sees them: the robot's effects are known, no more is fitted."""
     samples = sample(what)
     model = base_model(robot)
     pose = predict(model, model.start, samples, PredictedRod(samples, robot, points=True))

@@ -28,8 +28,7 @@ def robot() -> Robot:
 
 
 def samples() -> LogSamples:
-    """Loads, two base orientations, and a measured tip that is some tenths of a millimetre from the nominal
-    one."""
+    """Loads, two base orientations, a measured tip some tenths of a millimetre from the nominal one."""
     turned = Rotation.from_rotvec(np.where(np.arange(N)[:, None] < N // 2, 0.0, [0.9, -0.5, 0.3]))
     inputs: dict[str, Any] = {
         "payload": np.where(np.arange(N) % 20 < 10, 0.0, 0.02),

@@ -1,5 +1,4 @@
-"""The network on what is left: it finds what follows from the inputs, and nothing in noise; it is never part
-of the result."""
+"""The network on what is left: it finds what follows from the inputs, nothing in noise, and stands apart."""
 
 from __future__ import annotations
 

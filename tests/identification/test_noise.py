@@ -64,8 +64,7 @@ def test_rest_is_where_no_input_moves() -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_noise_at_rest(seed: int) -> None:
-    """Some 690 samples: known to 1 / sqrt(1380) = 2.7 %; a slow drift of the camera is not counted as
-    noise."""
+    """Some 690 samples: known to 1 / sqrt(1380) = 2.7 %; a slow drift of the camera is no noise."""
     drift = np.linspace(0.0, 20.0, N)[:, None] * SIGMA
     found = read_noise(samples(), white(seed) + drift, np.zeros((N, 3)))
     assert "at rest" in found.how
@@ -76,8 +75,7 @@ def test_noise_at_rest(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_noise_without_rest(seed: int) -> None:
-    """From the fastest part of a residual that also has slow structure: a median of 2250 correlated third
-    differences, 3 to 4 %."""
+    """From the fastest of a residual with slow structure: a median of 2250 third differences, 3 to 4 %."""
     residual = white(seed, LONG) + smooth(seed, LONG)
     found = read_noise(samples(LONG, rests=False), np.zeros((LONG, 3)), residual)
     assert "never rests" in found.how

@@ -1,5 +1,4 @@
-"""A log with measured orientations: they inform the base model, and what they cannot explain does not lead it
-astray."""
+"""Measured orientations inform the base model, and what they cannot explain does not lead it astray."""
 
 from __future__ import annotations
 

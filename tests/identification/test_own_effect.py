@@ -1,5 +1,4 @@
-"""An effect in a package of its own: what identification knows of effects, it knows of this one without an
-edit."""
+"""An effect in a package of its own: identification knows it as it knows the library's."""
 
 from __future__ import annotations
 
@@ -112,8 +111,7 @@ def test_its_bound_is_among_the_first(package: None) -> None:
 
 
 def test_every_law_of_the_library_has_what_it_had() -> None:
-    """Which signal, how many segments and which rank are theirs: by seam and memory unless a law says its
-    own."""
+    """Signal, segments and rank are by seam and memory unless a law says its own."""
     own = {name: signal_of(get_effect(name)) for name in effect_names() if trait(get_effect(name), "signal")}
     assert own == {
         "creep": Signal.LAG,

@@ -1,5 +1,4 @@
-"""What a log of another camera, of mixed-up inputs or of another unit makes `identify` and `replay` do:
-register, ask, or refuse."""
+"""What a log of another camera, of mixed-up inputs or another unit makes `identify` and `replay` do."""
 
 from __future__ import annotations
 
@@ -90,8 +89,7 @@ def test_points_in_space_or_in_a_plane_tell_any_rotation(cloud: str, angle: floa
 
 @pytest.mark.parametrize("turn", [0.0, 0.6])
 def test_points_on_a_line_tell_no_rotation_about_it(turn: float) -> None:
-    """Turned about another axis the line follows, and nothing turns about the line itself; with measured
-    orientations all is known."""
+    """About another axis the line follows, about itself nothing; with orientations all is known."""
     rng = np.random.default_rng(5)
     points = np.column_stack([rng.uniform(-0.05, 0.05, 300), np.zeros(300), np.full(300, 0.07)])
     rotation = Rotation.from_rotvec([0.0, turn, 0.0]).as_matrix()

@@ -1,5 +1,4 @@
-"""The least-squares solver on problems with certified answers, and the statistics on problems with exact
-ones."""
+"""The least-squares solver on certified answers, and the statistics on problems with exact ones."""
 
 from __future__ import annotations
 
@@ -99,8 +98,7 @@ CASES = [(name, start) for name, case in NIST.items() for start in range(len(cas
 
 
 def solve(name: str, start: list[float]) -> tuple[Fit, float]:
-    """The fit with hardly any prior, residuals in the certified standard deviation, slopes by central
-    differences."""
+    """The fit with hardly any prior, residuals in the certified deviation, slopes by central differences."""
     model, x, y, certified, _, squares, _ = NIST[name]
     at, data = np.array(x), np.array(y)
     sigma = float(np.sqrt(squares / (len(x) - len(certified))))
@@ -202,8 +200,7 @@ def test_the_effective_size_of_little_or_nothing() -> None:
 
 
 def test_bic_is_the_likelihood_with_the_noise_fitted() -> None:
-    """-2 log L + p log n, the constant dropped: of two models of the same data the difference is that of full
-    likelihoods."""
+    """-2 log L + p log n, the constant dropped: differences are those of full likelihoods."""
     rng = np.random.default_rng(5)
     one, other = rng.normal(0.0, 1.3, 80), rng.normal(0.0, 1.0, 80)
     full = [
@@ -241,8 +238,7 @@ def test_bounds_hold_at_every_trial_and_are_named() -> None:
 
 
 def test_a_step_to_nan_is_taken_back() -> None:
-    """Beyond 1.5 there is no model; the first Gauss-Newton step would lead to 3.2 (and does where there is
-    one)."""
+    """Beyond 1.5 there is no model; the first Gauss-Newton step would lead to 3.2."""
 
     def run(edge: float) -> tuple[Fit, list[float]]:
         tried: list[float] = []

@@ -99,8 +99,7 @@ def test_the_kind_is_of_what_is_larger_the_foil_or_the_structure_behind_it() -> 
 
 
 def test_borders_are_in_order() -> None:
-    """What the words must mean, whatever the exact numbers: half of the squares left is not partly
-    explained."""
+    """What the words must mean: half of the squares left is not partly explained."""
     assert 0.01 <= _EXPLAINED <= 0.12
     assert 0.2 <= _PARTLY <= 0.5
     assert _EXPLAINED < _FOREIGN <= _PARTLY
@@ -171,8 +170,7 @@ def test_several_effects_are_listed() -> None:
 
 
 def test_a_log_at_its_floor_divides_by_no_zero() -> None:
-    """The base model below the noise estimate: the error above it is none, and what seems left stays a
-    share."""
+    """The base model below the noise: the error above it is none, and what seems left stays a fraction."""
     half = ResidualStructure(0.5, 0.0, 0.0, 0.0, 5.0)
     for base in (0.5 * FLOOR, FLOOR):
         assert grounds(base=base, library=base, after=base).verdict == "none"

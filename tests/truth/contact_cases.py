@@ -1,5 +1,4 @@
-"""Rods in contact as plain numbers, by name: what the package's own contact is held against; and as its
-robots."""
+"""Rods in contact as plain numbers, by name, and as robots of the package, which is held against them."""
 
 from __future__ import annotations
 
@@ -36,16 +35,14 @@ def bent(
     kappa_x: Sequence[float],
     kappa_y: Sequence[float],
 ) -> list[float]:
-    """Tendon lengths [m] that bend segment k toward +x by kappa_x[k] and toward +y by kappa_y[k] [1/m] in the
-    mean."""
+    """Tendon lengths [m] that bend segment k toward +x and +y by kappa_x[k], kappa_y[k] [1/m] in the mean."""
     places = np.asarray(offsets, dtype=float)
     pulled = places[..., 0] * np.asarray(kappa_x)[:, None] + places[..., 1] * np.asarray(kappa_y)[:, None]
     return np.nansum(np.asarray(length)[:, None] * (1.0 - pulled), axis=0).tolist()
 
 
 def cases() -> dict[str, dict[str, Any]]:
-    """Rods in contact, by name, as plain numbers: the arguments of `minimise`, the obstacle as a dict with
-    its kind."""
+    """Rods in contact, by name: the arguments of `minimise`, the obstacle as a dict with its kind."""
     four = [ring(4, 0.0075)]
     away = [[float("nan")] * 2] * 4
     pair = [ring(4, 0.0075) + ring(4, 0.0075, np.pi / 4.0), away + ring(4, 0.0075, np.pi / 4.0)]

@@ -1,5 +1,4 @@
-"""A row of exact arcs, its energy with tendons that stretch, and the first and second derivatives of both:
-numpy only."""
+"""A row of exact arcs, its energy with tendons that stretch, and two derivatives of both: numpy only."""
 
 from __future__ import annotations
 
@@ -48,8 +47,7 @@ class Rod:
 
 
 class Chain(NamedTuple):
-    """Where the steps are in the world, and what follows from theta = h u of each, material frame (last
-    index)."""
+    """The steps in the world, and what follows from theta = h u of each, material frame (last index)."""
 
     start: Floats  # (n, 3, 3) frame at the start of each step
     node: Floats  # (n, 3) position at its end
@@ -111,8 +109,7 @@ def hessian_of(rod: Rod, u: Floats, chain: Chain, node_force: Floats) -> Floats:
 
 
 def _own(rod: Rod, u: Floats, chain: Chain, beyond: Floats, lever: Floats) -> Floats:
-    """(n, 3, 3) second derivative of the work of all forces beyond a step by its own theta: an imaginary
-    step."""
+    """(n, 3, 3) second derivative of the work beyond a step by its own theta: an imaginary step."""
     theta = rod.step[:, None] * u
     there = np.swapaxes(chain.start, 1, 2)
     # sum of r G^T about the step's end, in its start frame and before its own turn
@@ -135,8 +132,7 @@ def _axial(a: NDArray[Any]) -> NDArray[Any]:
 
 
 def _carried(chain: Chain, node_force: Floats) -> tuple[Floats, Floats]:
-    """For the end of each step: force at and beyond it (n, 3), and sum of (r - r_end) G^T over those nodes
-    (n, 3, 3)."""
+    """At the end of each step: force at and beyond it (n, 3), sum of (r - r_end) G^T there (n, 3, 3)."""
 
     def to_tip(a: Floats) -> Floats:
         return np.flip(np.cumsum(np.flip(a, 0), axis=0), 0)
@@ -189,8 +185,7 @@ def _hat(w: NDArray[Any]) -> NDArray[Any]:
 
 
 def _series(square: NDArray[Any], first: int) -> tuple[NDArray[Any], NDArray[Any]]:
-    """sum_k (-square)^k / (first + 2 k)! and its derivative by `square`, analytic at zero: angles of a step
-    are below one."""
+    """sum_k (-square)^k / (first + 2 k)! and its derivative by `square`, analytic at zero."""
     coefficient = 1.0 / float(np.prod(np.arange(1, first + 1)))
     total, slope, power = np.full_like(square, coefficient), np.zeros_like(square), np.ones_like(square)
     for k in range(1, 9):
@@ -212,8 +207,7 @@ def rotation_of(w: NDArray[Any]) -> NDArray[Any]:
 
 
 def turning_of(w: NDArray[Any]) -> NDArray[Any]:
-    """Left Jacobian of SO(3), the integral of exp [s w]x over s in (0, 1): how exp [w]x turns, in the frame
-    it starts from."""
+    """Left Jacobian of SO(3), the integral of exp [s w]x over s in (0, 1), in the frame it starts from."""
     k, square = _hat(w), _square(w)
     return np.asarray(np.eye(3) + _series(square, 2)[0] * k + _series(square, 3)[0] * (k @ k))
 

@@ -271,8 +271,7 @@ def _bottom(
 
 
 def _look(rod: Rod, obstacles: tuple[Obstacle, ...], x: Floats) -> _Look:
-    """The rod at curvatures x (3 e,), with a node at each minimum of an obstacle's distance within a step
-    that may touch."""
+    """The rod at curvatures x (3 e,), with a node at each minimum of distance that may touch."""
     u, n = rod.fine(x), len(rod.step)
     chain = chain_of(rod, u)
     begins = np.concatenate([rod.base_position[None], chain.node[:-1]])
@@ -343,8 +342,7 @@ def _cut(rod: Rod, at: NDArray[np.intp], where: Floats) -> Rod:
 
 
 def _sliding(look: _Look, u: Floats, c: int, there: Floats) -> Floats:
-    """(3 e, 3 e) what the touching point's own motion along the rod takes off the second derivative of its
-    gap."""
+    """(3 e, 3 e) what the contact's own motion along the rod takes off the gap's second derivative."""
     p, chain, rod = look.node[c], look.chain, look.rod
     frame = chain.start[p] @ rotation_of(rod.step[p] * u[p])
     tangent = frame[:, 2]
@@ -390,8 +388,7 @@ def _quadratic(
 def _search(
     rod: Rod, obstacles: tuple[Obstacle, ...], x: Floats, move: Floats, part: float, price: float
 ) -> tuple[Floats, float]:
-    """Halve the move until energy plus `price` [N] times the depth of the nodes falls, or it is only
-    rounding."""
+    """Halve the move until energy plus `price` [N] times the depth falls, or it is only rounding."""
 
     def merit(x: Floats) -> float:
         look = _look(rod, obstacles, x)

@@ -51,8 +51,7 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Cylinder:
-    """A bar of `radius` [m] about the line through `point` along `axis`; `half_length` [m] caps it on both
-    sides of `point`."""
+    """A bar of `radius` [m] about the line through `point` along `axis`, of twice `half_length` [m]."""
 
     point: ArrayLike
     axis: ArrayLike
@@ -80,8 +79,7 @@ class Cylinder:
 
 @dataclass(frozen=True)
 class Box:
-    """A box with half edges `half` (3,) [m] about `centre`; columns of `axes` are its directions in the
-    world."""
+    """A box with half edges `half` (3,) [m] about `centre`; its directions are the columns of `axes`."""
 
     centre: ArrayLike
     half: ArrayLike
@@ -105,8 +103,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Tube:
-    """All points further than `radius` [m] from the line through `point` along `axis` are solid: the rod is
-    inside."""
+    """All points further than `radius` [m] from the line through `point` along `axis`: the rod is inside."""
 
     point: ArrayLike
     axis: ArrayLike
@@ -135,8 +132,7 @@ def _unit(a: ArrayLike) -> Floats:
 
 
 def _length_and_direction(v: Floats) -> tuple[Floats, Floats]:
-    """Of (p, 3); on the point itself, where there is no direction, a zero vector, and a length that can
-    divide."""
+    """Of (p, 3); on the point itself a zero vector, and a length that can divide."""
     d = np.linalg.norm(v, axis=1)
     some = np.maximum(d, 1e-12)
     return some, v / some[:, None]

@@ -190,8 +190,7 @@ def _answer(rod: _Rod, u: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _richardson(answers: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """The elements' error runs in even powers of h, because every rule used is symmetric about the middle of
-    an element."""
+    """The elements' error runs in even powers of h: every rule is symmetric about an element's middle."""
     table = list(answers)
     for power in range(1, len(table)):
         table = [(4.0**power * fine - coarse) / (4.0**power - 1.0) for coarse, fine in pairwise(table)]
@@ -207,8 +206,7 @@ def _path(rod: _Rod, u: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
 
 
 def _frames(rod: _Rod, u: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Frame at each element's start (batch, e, 3, 3), tangent at its middle (batch, e, 3), frame at the tip
-    (batch, 3, 3)."""
+    """Frame at each start (batch, e, 3, 3), tangent at each middle (batch, e, 3), frame at the tip."""
     h = rod.step[:, None]
     whole, half = _rotation(h * u), _rotation(0.5 * h * u)
     frame = np.broadcast_to(np.eye(3, dtype=u.dtype), (len(u), 3, 3))
@@ -232,8 +230,7 @@ def _hat(w: NDArray[Any]) -> NDArray[Any]:
 
 
 def _series(square: NDArray[Any], first: int) -> NDArray[Any]:
-    """sum_k (-theta^2)^k / (first + 2 k)!, analytic where sin(theta)/theta is not: element angles are below
-    one."""
+    """sum_k (-theta^2)^k / (first + 2 k)!, analytic where sin(theta)/theta is not; angles below one."""
     term = np.ones_like(square) / float(np.prod(np.arange(1, first + 1)))
     total = term
     for k in range(1, 14):

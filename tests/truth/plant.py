@@ -46,8 +46,7 @@ class Inputs:
     t: Array
     """(n,) [s], increasing."""
     dl: Array
-    """(n, n_tendons) commanded change of wire length [m]; wire i at 90 i deg, distal ones at 45 + 90 i
-    deg."""
+    """(n, n_tendons) commanded change of length [m]; tendon i at 90 i deg, distal ones at 45 + 90 i deg."""
     payload: Array
     """(n,) known mass at the tip [kg]."""
     base_quaternion: Array
@@ -96,8 +95,7 @@ def draw_pair(seed: int, *, segments: int = 1) -> Seal:
 
 
 def draw_many(seed: int, inputs: Inputs) -> Seal:
-    """One dominant effect, which comes first, and eight others that each move the tip by 0.1 to 0.2 of what
-    it does on these inputs."""
+    """One dominant effect, and eight others that each move the tip by 0.1 to 0.2 of what it does."""
     rng = np.random.default_rng([seed, 3])
     segments = inputs.segments
     names = [str(name) for name in rng.choice(library(segments), 9, replace=False)]
@@ -125,8 +123,7 @@ def _generator(seed: int, name: str) -> np.random.Generator:
 
 
 def _parameters(name: str, rng: np.random.Generator, segments: int, size: Size) -> dict[str, Any]:
-    """One effect's numbers; `amount` is what `size` scales. The longer robot has three times the reach: its
-    typical is lower."""
+    """One effect's numbers; `amount` is what `size` scales. The longer robot's typical is lower."""
     as_ever = name in ("stiffness_anisotropy", "time_drift", "lens", "bump", "sway")
     typical = (0.35, 0.85) if segments == 1 or as_ever else (0.05, 0.4)
     spans = {"small": (0.0, 0.35), "large": (0.85, 1.0)}
@@ -501,8 +498,7 @@ def operator_inputs(rng: np.random.Generator, segments: int = 1, seconds: float 
 
 
 def _wander(rng: np.random.Generator, x: Array, seconds: float, every: float, reach: float) -> Array:
-    """Random points of the disc every so many seconds, joined smoothly; zero at both ends and outside (n, 2)
-    [rad]."""
+    """Random points of the disc, joined smoothly; zero at both ends and outside (n, 2) [rad]."""
     n = max(int(seconds / every), 4)
     angle, size = rng.uniform(0.0, 2.0 * np.pi, n + 1), reach * np.sqrt(rng.uniform(0.0, 1.0, n + 1))
     size[[0, -1]] = 0.0

@@ -34,8 +34,7 @@ def angles(segments: int) -> Array:
 
 
 def routing(segments: int) -> Array:
-    """(2 segments, 2 segments) pair lengths [m] of bends [rad]; a distal pair feels the segments before its
-    own too."""
+    """(2 segments, 2 segments) pair lengths [m] of bends [rad]; a distal pair feels the segments before."""
     angle = angles(segments).reshape(segments, 4)[:, :2].reshape(-1)
     row = OFFSET * np.stack([np.sin(angle), -np.cos(angle)], axis=1)
     crosses = np.arange(segments)[None] <= (np.arange(2 * segments) // 2)[:, None]
@@ -73,8 +72,7 @@ NODES, _BEYOND, _MODE, _MODE_GAUSS = _lobatto()
 
 @cache
 def _chain(segments: int) -> tuple[Array, Array]:
-    """Integral from each node to the tip (nodes, nodes) [m] and modes at the nodes (nodes, modes), of the
-    whole chain."""
+    """Integral from each node to the tip (nodes, nodes) [m], modes at the nodes (nodes, modes)."""
     later = np.triu(np.ones((segments, segments)), 1)
     beyond = np.kron(np.eye(segments), _BEYOND) + np.kron(later, np.tile(_BEYOND[0], (len(NODES), 1)))
     return LENGTH * beyond, np.kron(np.eye(segments), _MODE)

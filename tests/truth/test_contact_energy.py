@@ -1,5 +1,4 @@
-"""The constrained minimum of energy against published figures, against the free minimum, and against the
-package's own rod."""
+"""The constrained minimum of energy against published figures, the free minimum, and the package's rod."""
 
 from __future__ import annotations
 
@@ -27,8 +26,7 @@ def at_rest(name: str, elements: int = 40) -> contact_energy.Minimum:
 
 
 def pressed(kappa: float, compliance: float, elements: int = 20, **options: Any) -> contact_energy.Minimum:
-    """The prototype, bent in the plane to a mean curvature kappa [1/m] that would take its tip through the
-    wall at x = 12 mm."""
+    """The prototype, bent to a mean curvature kappa [1/m] that would take its tip through the wall."""
     lengths = contact_cases.bent([0.07], [RING], [kappa], [0.0])
     rod = 0.07, [0.0022, 0.0022, 0.001], RING, lengths, compliance
     return contact_energy.minimise(*rod, obstacle=WALL, elements=elements, load_steps=4, **options)
@@ -62,8 +60,7 @@ def test_wires_that_stretch_press_less() -> None:
 
 
 def test_bent_far_the_planar_answer_is_a_ridge() -> None:
-    """From a mean curvature of about 12.4 1/m on the tip slides along the wall and the rod leaves the
-    plane."""
+    """From a mean curvature of about 12.4 1/m the tip slides along the wall and leaves the plane."""
     assert pressed(12.0, 1e-5).stability > 0.05
     ridge, valley = pressed(16.0, 1e-5, planar=True), pressed(16.0, 1e-5, nudge=[0.0, 0.01, 0.0])
     assert ridge.stability < -0.5
@@ -106,8 +103,7 @@ def test_signorini(name: str) -> None:
 
 @pytest.mark.parametrize("name", CASES)
 def test_a_force_between_the_ends_is_square_to_the_rod(name: str) -> None:
-    """Where phi is least along the rod its normal has no part along it; a node that held the rod would fail
-    this."""
+    """Where phi is least its normal has no component along the rod; a node that held it would fail this."""
     found = at_rest(name)
     for i in np.flatnonzero(np.linalg.norm(found.contact_force[:-1], axis=1) > 1e-6):
         # both sides are arcs of one curvature: the tangent in the middle is the chord from the far ends,
@@ -161,8 +157,7 @@ def test_error_falls_with_the_square_of_the_element(name: str) -> None:
 
 @pytest.mark.parametrize("name", CASES)
 def test_the_package_has_the_same_rod_under_these_forces(name: str) -> None:
-    """Contact forces as point forces on the package's rod, which solves a boundary value problem and knows no
-    obstacle."""
+    """Contact forces as point forces on the package's rod, a boundary value problem without obstacles."""
     case, found = CASES[name], at_rest(name, 80)
     on = np.flatnonzero(np.linalg.norm(found.contact_force[:-1], axis=1) > 1e-9)
     state = fastrod.Simulator(contact_cases.robot_of(case), points_per_segment=80).settle(

@@ -1,5 +1,4 @@
-"""The package's contact against the constrained minimum of energy: forces, shape and place of contact,
-without friction."""
+"""The package's contact without friction against the constrained minimum of energy."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Jacobian, compliance and dense output against central differences of the settled answer: exact for the
-discrete rod."""
+"""Jacobian, compliance and dense output against central differences of the settled answer."""
 
 from __future__ import annotations
 
@@ -14,8 +13,7 @@ from fastrod import Robot, Simulator, load_robot
 
 
 def difference(sim: Simulator, base: dict[str, np.ndarray], name: str, axis: int, delta: float) -> np.ndarray:
-    """(6,) central difference of the settled tip pose by one entry of one input, with the next order taken
-    off."""
+    """(6,) central difference of the settled tip pose by one entry of an input, the next order taken off."""
     fine, coarse = (_central(sim, base, name, axis, k * delta) for k in (1.0, 2.0))
     return (4.0 * fine - coarse) / 3.0
 

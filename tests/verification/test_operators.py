@@ -93,8 +93,7 @@ def test_a_loop_does_not_know_how_finely_its_path_is_sampled(law: Law) -> None:
 
 @LOOPS
 def test_a_loop_within_a_loop_is_wiped_out(law: Law) -> None:
-    """Return-point memory: back at the corner where a small loop left the large one, as if it had not
-    been."""
+    """Return-point memory: back where a small loop left the large one, as if it had not been."""
     plain = law(along([0.0, 1.0, -0.8, 0.5, 0.9], 50))
     looped = law(along([0.0, 1.0, -0.8, 0.5, -0.1, 0.3, 0.05, 0.5, 0.9], 50))
     assert_allclose(looped[-51:], plain[-51:], atol=ROUNDING)
@@ -284,8 +283,7 @@ def test_a_delayed_ramp_is_the_ramp_of_a_moment_ago() -> None:
 
 
 def test_a_delayed_parabola_is_exact_from_the_third_sample_on() -> None:
-    """A cubic with the slopes of the parabolas through three samples is the parabola itself; a line would be
-    off by up to h^2 / 4."""
+    """A cubic with the slopes of parabolas is the parabola itself; a line would be off by h^2 / 4."""
     dt = np.random.default_rng(10).uniform(0.01, 0.03, 100)
     t = np.cumsum(dt)
     for lag in (0.005, 0.061, 0.25):  # between the last two samples, and further back
@@ -296,8 +294,7 @@ def test_a_delayed_parabola_is_exact_from_the_third_sample_on() -> None:
 
 
 def test_a_delayed_wave_converges_faster_than_with_lines() -> None:
-    """Halved steps: errors of lines fall by 4, of cubics by 8, but for the turns, where the slope is taken as
-    zero and they are lines'."""
+    """Halved steps: errors of lines fall by 4, of cubics by 8, but for the turns, where they are lines'."""
     errors = []
     for n in (200, 400):
         t = np.linspace(0.0, 10.0, n + 1)
@@ -314,8 +311,7 @@ def test_a_delayed_wave_converges_faster_than_with_lines() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_delay_overshoots_nowhere(seed: int) -> None:
-    """At reversals, sudden stops and irregular times: what comes out lies between the two samples around
-    it."""
+    """At reversals, stops and irregular times: what comes out lies between the two samples around it."""
     rng = np.random.default_rng(seed)
     dt = rng.uniform(0.001, 0.05, 120)
     t = np.cumsum(dt)
@@ -503,8 +499,7 @@ TWINS: dict[str, tuple[tuple[Any, ...], tuple[Any, ...]]] = {
         (with_segments(CHAIN, precurvature=lambda s, k: (k + 1.0, -2.0, 0.0)), PULLED, LOADS),
     ),
 }
-"""A robot that has the effect, and one that is built or driven the way the effect says: robot, lengths,
-loads."""
+"""A robot that has the effect, and one that is built or driven so: robot, lengths, loads."""
 
 
 @pytest.mark.parametrize("case", TWINS)
@@ -622,8 +617,7 @@ def test_effects_of_the_camera_act_from_the_marker_on() -> None:
     [("latency", {"delay": 0.12}), ("dynamics", {"period": 0.2}), ("creep", {"share": 0.2})],
 )
 def test_an_effect_on_the_tendons_is_its_operator_on_what_bends(name: str, values: dict[str, float]) -> None:
-    """In a simulator, step by step, an operator is the simulator of the base model on tendons that went
-    through it."""
+    """Step by step, an operator is the base model on tendons that went through it."""
     robot = rod()
     path = np.stack([bend(robot, 0.8 * np.sin(0.4 * k), 0.5 * np.cos(0.3 * k)) for k in range(12)])
     what: Any = get_effect(name)
