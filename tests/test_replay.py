@@ -272,8 +272,7 @@ def test_replay_of_the_simulators_own_run_leaves_nothing(
     assert first.points is not None
     again = replay(changed(log, tip_position=first.tip_position, points=first.points), heavy)
     assert again.rms == 0.0
-    # hanging or standing, the base frame sees gravity turn: the upright and the hung robot differ only
-    # through weight
+    # hanging or standing, the upright and the hung robot differ only through weight
     one = simulator.Simulator(heavy, n_robots=1)
     pose = np.array([[0.0, 0.0, 0.0, *orientation]])
     weight = 0.005 * np.array([[0.0, 0.0, -9.81]])

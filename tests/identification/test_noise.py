@@ -121,8 +121,7 @@ def test_planted_outliers_are_found_and_good_rows_kept(seed: int) -> None:
     good = keep(samples(), residual, Noise(SIGMA, 0.0, "known"))
     assert not good[bad].any()
     assert good[~bad].mean() >= 0.98
-    # and where nothing is planted hardly anything is thrown away: 5 sigma of a normal, with a spread from 15
-    # samples
+    # and where nothing is planted hardly anything goes: 5 sigma, with a spread from 15 samples
     assert keep(samples(), white(seed) + smooth(seed), Noise(SIGMA, 0.0, "known")).mean() >= 0.995
 
 

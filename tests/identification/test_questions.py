@@ -80,8 +80,7 @@ def test_points_in_space_or_in_a_plane_tell_any_rotation(cloud: str, angle: floa
     measured = points @ rotation.T + shift + 3e-4 * rng.normal(size=points.shape)
     measured[::11] += 0.2 * rng.normal(size=measured[::11].shape)  # outliers
     found = align(measured, points)
-    # the pull towards no rotation is a thousandth of the spread: of an arc, whose other spread is a third, up
-    # to some hundredths
+    # the pull towards no rotation is a thousandth of the spread: of an arc, some hundredths
     assert Rotation.from_matrix(found.rotation @ rotation.T).magnitude() < 0.03
     assert np.linalg.det(found.rotation) == pytest.approx(1.0)
     assert np.linalg.norm(found.shift - shift) < 2e-3
@@ -135,8 +134,7 @@ def test_a_camera_far_off_is_registered_and_the_effect_named_as_ever(
     assert result.effects[0].name in ("backlash", "friction")  # friction without spread is backlash
     width = result.effects[0].parameters["half_width"]
     assert width.value == pytest.approx(farlog.PLAY, rel=0.03)
-    # arcs are no rods of Kirchhoff: measured when this was written 1.40, and 1.00 with coupling beside it on
-    # the camera of the file
+    # arcs are no rods of Kirchhoff: measured 1.40, and 1.00 with coupling on the camera of the file
     assert result.test.after < 1.5 * result.noise.floor < 0.2 * result.test.before
     paths = {path.name: path for path in report.write(result, tmp_path)}
     again = replay(seen(angle, distance), load_robot(paths["identified.toml"]))

@@ -128,8 +128,7 @@ def test_certified_values_are_found(name: str, start: int) -> None:
     assert_allclose((fit.theta - certified) / deviations, 0.0, atol=0.02)
     assert_allclose(fit.loss * sigma**2, squares, rtol=1e-4)
     assert_allclose(np.sqrt(np.diag(np.linalg.inv(fit.hessian))), deviations, rtol=0.02)
-    # and `covariance` is that, the samples counted as what they are worth (at the optimum the variance is
-    # what was certified)
+    # and `covariance` is that, the samples counted as what they are worth
     worth = len(x) / effective_size(fit.residual)
     assert_allclose(np.sqrt(np.diag(covariance(fit))), np.array(deviations) * np.sqrt(worth), rtol=0.02)
     assert not any(fit.at_bound)
@@ -188,8 +187,7 @@ def test_the_effective_size_of_an_ar1_is_that_of_its_mean(rho: float) -> None:
     rtol = 4.0 * 2.0 / (1.0 - rho**2) * np.sqrt((1.0 - rho**2) / (2 * n))
     assert_allclose(size, 2 * n * (1.0 - rho) / (1.0 + rho), rtol=rtol)
     assert size <= 2 * n
-    # by definition: the variance of a mean is that of a sample over the size; known from 400 copies to sqrt(2
-    # / 400)
+    # by definition: the variance of a mean; known from 400 copies to sqrt(2 / 400)
     assert_allclose(x.var() / x.mean(0).var(), size / 2.0, rtol=4.0 * np.sqrt(2.0 / copies))
 
 

@@ -81,8 +81,7 @@ def hessian_of(rod: Rod, u: Floats, chain: Chain, node_force: Floats) -> Floats:
     """(3 e, 3 e) second derivative of V with these forces on the nodes, dead."""
     n, h = len(u), rod.step
     beyond, lever = _carried(chain, node_force)
-    # what a distal step moves is carried round by the spin w of a proximal one: (w x dr) . G = w . (dr x G),
-    # summed
+    # a distal step's motion is carried round by a proximal spin w: (w x dr) . G = w . (dr x G), summed
     trace = np.trace(lever, axis1=1, axis2=2)[:, None, None]
     torque = np.cross(chain.shift, beyond[:, :, None], axis=1) + lever @ chain.spin - trace * chain.spin
     sides = chain.spin * h[:, None, None], torque * h[:, None, None]

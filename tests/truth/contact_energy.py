@@ -298,8 +298,7 @@ def _look(rod: Rod, obstacles: tuple[Obstacle, ...], x: Floats) -> _Look:
     fine = _cut(rod, at, np.array([s for _, s, _ in cuts]))
     if cuts:
         chain = chain_of(fine, fine.fine(x))
-    # node numbers in the cut rod: the ends of elements, each before it in the list moved on by the cuts up to
-    # it
+    # node numbers in the cut rod: the ends of elements, moved on by the cuts before them
     ends = np.arange(n) + np.searchsorted(at, np.arange(n), side="right")
     touch = at + np.arange(len(cuts))
     found = [o.distance(chain.node) for o in obstacles]

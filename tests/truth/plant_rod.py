@@ -215,8 +215,7 @@ class Rod:
         lift = np.stack([work[..., j, k] - work[..., k, j] for j, k in ((1, 2), (2, 0), (0, 1))], axis=-1)
         moment = moment - (lift[:, :, None] @ frame)[:, :, 0]
         twice = (work - np.trace(work, axis1=2, axis2=3)[..., None, None] * np.eye(3)) @ frame
-        # what each mode has turned before a node: integral from the base of P_m R', then both orders of the
-        # two turns
+        # what each mode has turned before a node: integral of P_m R', then both orders of the two turns
         turned = (beyond[0] - beyond) @ (mode[:, :, None, None] * frame[:, :, None]).reshape(n, nodes, -1)
         turned = turned.reshape(n, nodes, -1, 3, 3).transpose(0, 2, 4, 1, 3).reshape(n, size, -1)
         half = turned @ (weighted[:, None, :, None] * twice[:, :, :, None]).reshape(n, 3 * nodes, size)

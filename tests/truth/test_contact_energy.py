@@ -106,8 +106,7 @@ def test_a_force_between_the_ends_is_square_to_the_rod(name: str) -> None:
     """Where phi is least its normal has no component along the rod; a node that held it would fail this."""
     found = at_rest(name)
     for i in np.flatnonzero(np.linalg.norm(found.contact_force[:-1], axis=1) > 1e-6):
-        # both sides are arcs of one curvature: the tangent in the middle is the chord from the far ends,
-        # weighted
+        # both sides are arcs of one curvature: the tangent is the mean of both chords, weighted
         behind, ahead = np.diff(found.positions[i - 1 : i + 2], axis=0)
         a, b = np.linalg.norm(ahead), np.linalg.norm(behind)
         tangent = (ahead / a * b + behind / b * a) / (a + b)
@@ -126,8 +125,7 @@ def test_balance(name: str) -> None:
     force[-1] += case["tip_force"]
     assert_allclose(found.base_force + force.sum(axis=0), 0.0, rtol=0, atol=1e-6)
     moment = np.cross(found.positions - found.positions[0], force).sum(axis=0)
-    # carried from the middles of three elements to the base; and a line force on the ends of its element is f
-    # h^2 / 8 of moment
+    # carried from the middles of three elements; a line force on the ends of its element is f h^2 / 8
     atol = 1e-4 * np.abs(moment).max() + np.linalg.norm(line) * step.max() ** 2 / 6.0
     assert_allclose(found.base_moment, -moment, rtol=0, atol=atol)
 
@@ -167,8 +165,7 @@ def test_the_package_has_the_same_rod_under_these_forces(name: str) -> None:
         point_force=[(found.arclength[i], found.contact_force[i]) for i in on] or None,
     )
     assert state.ok.all()
-    # what 80 elements leave, mostly by the contact force they are given: 3e-6 m, and 7e-6 m for the heavy rod
-    # of 0.3 m
+    # what 80 elements leave, mostly by the contact force: 3e-6 m, and 7e-6 m for the rod of 0.3 m
     assert_allclose(state.tip_position[0], found.tip_position, rtol=0, atol=1e-5)
     assert_allclose(state.tension[0], found.tension, rtol=0, atol=5e-4)
     # on the host, so of the other sign

@@ -33,8 +33,7 @@ def obstacle_of(o: dict[str, Any]) -> Obstacle:
         return box(tuple(2.0 * h for h in o["half"]), position=o["centre"])
     import trimesh
 
-    # a hole with 400 sides of the same mean radius: 0.3 um in and out, and facets of 0.16 mm, on which a tip
-    # may rest anywhere
+    # a hole with 400 sides of the same mean radius: 0.3 um in and out, and facets of 0.16 mm
     wide = o["radius"] / np.sqrt(np.cos(np.pi / 400))
     hole = trimesh.creation.annulus(wide, wide + 0.01, 0.3, sections=400)
     return mesh(hole, position=o["point"], quaternion=to_axis(o["axis"]))

@@ -142,8 +142,7 @@ def test_friction_saturates_at_its_half_width() -> None:
 
 
 def test_the_area_of_a_friction_loop() -> None:
-    # one slider's loop is a parallelogram of height 2 a and width 2 (A - r_j): closed area 4 a mean max(A -
-    # r_j, 0)
+    # one slider's loop is a parallelogram, 2 a high and 2 (A - r_j) wide: 4 a mean max(A - r_j, 0) in all
     radii = 0.2 * np.exp(0.4 * np.linspace(-1.0, 1.0, SLIDERS))
     areas = []
     for amplitude in (0.05, 0.2, 0.5, 1.0):
@@ -548,8 +547,7 @@ def test_taper_is_a_chain_of_ever_softer_pieces() -> None:
 
 
 def test_a_bow_moves_the_tip_and_does_not_turn_it() -> None:
-    # theta(s) = b (s - s^2 / l): nothing at the tip, and its integral is b l^2 / 6; beyond it terms of
-    # theta^2, 1e-5 here
+    # theta(s) = b (s - s^2 / l): nothing at the tip, its integral is b l^2 / 6; beyond it 1e-5 here
     state = settled(having(rod("passive"), "precurvature", bow_x=0.3, bow_y=-0.2))
     assert_allclose(state.tip_rotation[0], np.eye(3), atol=1e-5)
     assert_allclose(state.tip_position[0, :2], np.array([-0.2, -0.3]) * 0.07**2 / 6.0, rtol=1e-4)

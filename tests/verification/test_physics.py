@@ -19,8 +19,7 @@ ELASTICA = {1.0: 0.301720773800, 2.0: 0.493457480397, 5.0: 0.713791523612, 10.0:
 
 
 def test_no_load_and_equal_bends_give_an_arc() -> None:
-    # r(l) of an arc of angle b about d1 is (0, -(1 - cos b), sin b) l/b: the method is exact for constant
-    # moment
+    # r(l) of an arc of angle b about d1 is (0, -(1 - cos b), sin b) l/b: exact for constant moment
     for angle in (0.3, 1.0, 2.5):
         state = Simulator(rod()).settle(bend(rod(), angle, 0.0))
         u = state.curvature[0, 0, 0]
