@@ -271,7 +271,7 @@ MESHES: dict[str, tuple[Any, ...]] = {
         "a.obj",
         text_of(600_000),
         "needs more than 150000000 bytes of memory to be read",
-        MeshLimits(memory=150_000_000),
+        MeshLimits(memory=150_000_000, seconds=300.0),
     ),
     "cut": (
         "a.stl",
