@@ -41,8 +41,7 @@ def kuka(world, seed):
 
 
 def carrier(world, axis="z"):
-    """A body without mass or shape that is moved by hand, and the base on it with the rod along this world
-    axis."""
+    """A body without mass or shape that is moved by hand, its rod along this world axis."""
     half = np.sqrt(0.5)
     angle = {"z": (1.0, 0.0, 0.0, 0.0), "x": (half, 0.0, half, 0.0), "-z": (0.0, 1.0, 0.0, 0.0)}[axis]
     return BulletLink(world, world.createMultiBody(0.0, -1, -1, [0.0] * 3), quaternion=angle)

@@ -1,5 +1,4 @@
-"""`RawPage`: a page of the viewer without a browser, which sends what a page of viser sends, or anything
-else."""
+"""`RawPage`: a page of the viewer without a browser, which sends what a page of viser sends, or anything."""
 
 from __future__ import annotations
 

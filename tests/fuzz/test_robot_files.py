@@ -26,8 +26,7 @@ def loaded(path: Path) -> Robot | None:
 
 
 def simulated(robot: Robot, path: Path) -> None:
-    """Settle a robot at rest, and step it: finite where ok, a reason where not; no warning and no other
-    error."""
+    """Settle a robot at rest, and step it: finite where ok, a reason where not; no other error."""
     modes = {segment.mode for segment in robot.segments}
     inputs: dict[str, Any] = {"tendon_length": robot.rest_tendon_length}
     if "tendon_tension" in modes:
