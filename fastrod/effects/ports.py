@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -84,6 +84,16 @@ class EffectPorts:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def rows(self, which: slice) -> EffectPorts:
+        """A copy of some rows."""
+        alike = ("routing", "rest_length", "n_steps")
+        return EffectPorts(
+            **{
+                f.name: getattr(self, f.name) if f.name in alike else getattr(self, f.name)[which].copy()
+                for f in fields(self)
+            }
+        )
 
     def __getattr__(self, name: str) -> Any:
         if name in (old := {"wiring": "routing", "shift_wires": "shift_tendons"}):

@@ -13,6 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 from fastrod.effects.base import Seam, get_effect, has_memory
+from fastrod.effects.executor import act
 from fastrod.effects.ports import CHANGEABLE
 from fastrod.identification.log.forward import (
     LogSamples,
@@ -104,8 +105,7 @@ class LinearisedModel:
         self.pose = rod.solve(*self.prepared.kernel(self.opened), self.robot)
         self._kept = rod.keep()
         self._columns: dict[tuple[str, ...], Floats] = {}
-        light = [each for each, name in zip(self.effects, model.effects, strict=True) if self.is_light(name)]
-        at = self.prepared.drive(light)
+        at = self.prepared.drive([each for each in self.effects if self.is_light(each.name)])
         self._length, self._force = at.tendon_length.copy(), at.tip_force.copy()
 
     def _difference(self, pose: PredictedPose) -> Floats:
@@ -166,19 +166,15 @@ class LinearisedModel:
     _columns_kind: ClassVar[dict[tuple[str, str], bool]] = {}
 
     def _probe(self, name: str) -> bool:
-        what, opened = get_effect(name), self.prepared.open()
-        unknowns = effect_unknowns(name, self.model.wiring)
-        values = Model(self.model.robot, self.model.wiring, (name,), unknowns).values(
-            np.array([u.outside(u.start) for u in unknowns])
-        )[name]
+        opened, unknowns = self.prepared.open(), effect_unknowns(name, self.model.wiring)
+        alone = Model(self.model.robot, self.model.wiring, (name,), unknowns)
+        (one,) = effects_at(alone, alone.start)
         before = {
             key: getattr(opened, key).copy()
             for key in CHANGEABLE
             if key not in ("tendon_length", "tip_force")
         }
-        what.apply(
-            np.broadcast_to(values, (len(opened), len(values))), np.empty((len(opened), 0)), opened, None, 0.0
-        )
+        act([one.on(len(opened))], opened)
         return all(np.array_equal(getattr(opened, key), old) for key, old in before.items())
 
     def _is_light(self, unknown: Unknown) -> bool:
@@ -214,12 +210,7 @@ class LinearisedModel:
 
     def driven(self, model: Model, theta: Floats) -> Floats:
         """(n, 6 + 3k) change of the true pose by wires and tip forces."""
-        light = [
-            each
-            for each, name in zip(effects_at(model, theta), model.effects, strict=True)
-            if self.is_light(name)
-        ]
-        opened = self.prepared.drive(light)
+        opened = self.prepared.drive([each for each in effects_at(model, theta) if self.is_light(each.name)])
         change = np.zeros((len(opened), 6 + 3 * self.pose.points.shape[1]))
         moved = opened.tendon_length - self._length
         if moved.any():
@@ -246,7 +237,7 @@ class LinearisedModel:
         """What the camera sees after a change (n, 6 + 3k) of the true pose: tip [m], rotation vector [rad],
         points [m], base frame."""
         rotation = self.pose.rotation
-        sensing = [each for each in effects_at(model, theta) if each[0].seam is Seam.SENSING]
+        sensing = [each for each in effects_at(model, theta) if each.effect.seam is Seam.SENSING]
         if sensing or self.target.rotation is not None:
             rotation = _turned(rotation, change[:, 3:6])
         points = self.pose.points + change[:, 6:].reshape(self.pose.points.shape)
