@@ -61,6 +61,7 @@ def link(name: str, values: Floats, n_tendons: int) -> Link:
 def act(links: Iterable[Link], opened: EffectPorts, state: Any = None, dt: float = 0.0) -> None:
     """Let the effects before the camera change `opened`; memories move on by `dt` [s]. `state`: the last one
     of a simulator."""
+    opened.state = state
     for each in links:
         if each.effect.seam is not Seam.SENSING:
             each.effect.apply(each.values, each.memory, opened, state, dt)

@@ -102,9 +102,9 @@ class EffectPipeline:
         n_steps: int,
         skip: Flags,
         gravity: Floats | None = None,
-    ) -> tuple[Ports, Params]:
-        """What the kernel reads at this step; memories move on, but for the robots `skip`, whose inputs
-        cannot be used.
+    ) -> tuple[Ports, Params, list[tuple[Floats, Floats]]]:
+        """What the kernel reads at this step, and the point forces of effects (`close_ports`). Memories move
+        on, but for the robots `skip`, whose inputs cannot be used.
 
         `gravity` (1 or n_robots, 3) [m/s^2] is that of the world at this step, the robots' own if left out.
         """

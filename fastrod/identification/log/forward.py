@@ -149,6 +149,7 @@ class PreparedLog:
     ports: Ports
     """Of the rows."""
     params: Params
+    reader: Reader
     dl: Floats
     """(n, n_tendons) commanded, of every sample [m]."""
     base_rotation: Floats
@@ -171,6 +172,7 @@ class PreparedLog:
             base_rotation=base_rotation,
             time=time,
             n_steps=N_STEPS,
+            stateless=True,
         )
 
     def drive(self, links: Sequence[Link]) -> EffectPorts:
@@ -202,7 +204,8 @@ class PreparedLog:
 
     def kernel(self, opened: EffectPorts) -> tuple[Ports, Params]:
         """What the kernel reads."""
-        return close_ports(opened, self.ports, self.params)
+        ports, params, points = close_ports(opened, self.ports, self.params)
+        return self.reader.with_point_forces(ports, Inputs(), points)[0] if points else ports, params
 
     def see(self, pose: PredictedPose, links: Sequence[Link]) -> PredictedPose:
         """The pose as the camera sees it, by the effects of sensing in `links`."""
@@ -216,20 +219,18 @@ def prepare_log(samples: LogSamples, robot: Robot, wiring: Routing) -> PreparedL
     """The inputs of the rows of `samples` for `robot`."""
     log = samples.log.rows(samples.rows)
     layout, params, rest = compile_robots((replace(robot, effects=()),), N_STEPS)
-    ports = Reader(layout, params, rest, len(log)).ports(_given(inputs(log, robot)))
+    reader = Reader(layout, params, rest, len(log))
+    ports = reader.ports(Inputs(**dict[str, Any](inputs(log, robot))))
     return PreparedLog(
         robot,
         wiring,
         samples,
         ports,
         params,
+        reader,
         np.asarray(samples.log.dl),
         matrix_from_quaternion(ports.base_pose[:, 3:]),
     )
-
-
-def _given(keywords: dict[str, Floats]) -> Inputs:
-    return Inputs(**dict[str, Any](keywords))
 
 
 def effects_at(model: Model, theta: Floats) -> list[Link]:

@@ -175,7 +175,8 @@ class LinearisedModel:
             if key not in ("tendon_length", "tip_force")
         }
         act([one.on(len(opened))], opened)
-        return all(np.array_equal(getattr(opened, key), old) for key, old in before.items())
+        same = all(np.array_equal(getattr(opened, key), old) for key, old in before.items())
+        return same and not opened.point_forces
 
     def _is_light(self, unknown: Unknown) -> bool:
         return unknown.place[0] == "effect" and self.is_light(unknown.place[1])
