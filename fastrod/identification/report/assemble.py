@@ -3,6 +3,7 @@ verdict."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -11,7 +12,6 @@ import numpy as np
 from fastrod.effects.base import get_effect
 from fastrod.identification.log import advice
 from fastrod.identification.log.forward import LogSamples, PredictedRod, predict
-from fastrod.identification.log.limits import limits
 from fastrod.identification.log.noise import keep
 from fastrod.identification.log.unknowns import Model
 from fastrod.identification.report.result import Error, Found, Result, SearchStage, Tried
@@ -30,6 +30,9 @@ _SURE = 1.06  # the variance of the noise is known from rest to about 6 %
 _FAR = 0.3  # of the robot's length: an error beyond counts no more, as an outlier's
 # of the error above the noise: where so much is left, shear and inertia are worth a sentence
 _SAY_LIMITS = 0.05
+_SHEAR = 2.65  # (r / l)^2 times this is shear over bending at the tip: 3 EI / (k G A l^2), E = 3 G, circle
+_WORTH_SAYING = 0.03
+_SLOW = 10.0  # Hz; a rod that rings more slowly shows it
 
 
 def assemble(
@@ -330,6 +333,29 @@ def _path(
             piece = search.without(piece, name)
         stages.append(stage(found[i - 1], piece))
     return stages
+
+
+def limits(robot: Robot, samples: LogSamples) -> list[str]:
+    """Sentences on shear and inertia, which the rod's state does not hold and no effect can carry, where this
+    robot is thick or slow enough for them."""
+    found = []
+    thickest = max((s.body_radius / robot.length for s in robot.segments), default=0.0)
+    if (fraction := _SHEAR * thickest**2) > _WORTH_SAYING:
+        found.append(
+            f"shear is not the rod's: {1.0 / (2.0 * thickest):.1f} times as long as thick, it is some "
+            f"{100 * fraction:.0f} % of the deflection"
+        )
+    mass = sum(s.line_density * s.length for s in robot.segments)
+    if mass > 0.0:
+        soft = min(min(s.bending_stiffness) for s in robot.segments)
+        frequency = 0.56 * math.sqrt(soft / (mass * robot.length**3))
+        steps = sorted(samples.dt[samples.dt > 0.0].tolist())
+        if frequency < _SLOW and steps and 2.0 * frequency * steps[len(steps) // 2] < 1.0:
+            found.append(
+                f"inertia and damping are not the rod's: it rings near {frequency:.1f} Hz, which a "
+                "static model cannot follow"
+            )
+    return found
 
 
 def _sentences(lines: Sequence[str]) -> list[str]:
