@@ -19,7 +19,7 @@ from fastrod.effects.ports import EffectPorts
 from fastrod.errors import EffectError
 from fastrod.identification.log.forward import N_STEPS, PredictedPose, PredictedRod, predict, sample
 from fastrod.identification.log.unknowns import base_model
-from fastrod.identification.search.linearised import LinearisedModel, Target
+from fastrod.identification.search.linearised import LinearisedModel, target_of
 from fastrod.logs.runlog import RunLog
 from fastrod.model.routing import route
 from fastrod.types import Floats
@@ -282,7 +282,7 @@ def test_a_point_force_over_a_log_is_the_simulators(monkeypatch: pytest.MonkeyPa
     assert np.abs(found.position - predicted(two_segments(), what).position).max() > 1e-4
     samples, model = sample(what), base_model(two_segments())
     rod = PredictedRod(samples, model.robot)
-    target = Target(samples, np.full(3, 1e-4), rotation_sigma=0.01, points=False)
+    target = target_of(samples, np.full(3, 1e-4), rotation_sigma=0.01, points=False)
     assert not LinearisedModel(model, model.start, samples, rod, target).is_light("poke")
     monkeypatch.setattr(Poke, "frame", "material")
     with pytest.raises(EffectError, match="material frame goes by the last shape; over a log no state"):

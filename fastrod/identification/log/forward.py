@@ -1,6 +1,6 @@
 """A log through the model: commands, effects, rod, camera; for any vector of unknowns.
 
-The operators on the wires run causally over every sample of every run. The rod is static, so each sample is
+The operators on the tendons run causally over every sample of every run. The rod is static, so each sample is
 one robot of a batch, and only those samples are solved that the loss looks at.
 """
 
@@ -181,9 +181,8 @@ class PreparedLog:
         opened, rest = self.open(), self.robot.rest_tendon_length
         swept = 1 + max((i for i, each in enumerate(links) if has_memory(each.effect)), default=-1)
         if swept:
-            every = self._open(
-                self._alone(self.dl + rest), len(self.dl), self.samples.time, self.base_rotation[:1]
-            )
+            alone = Ports(*(a[:1] for a in self.ports))._replace(tendon_length=self.dl + rest)
+            every = self._open(alone, len(self.dl), self.samples.time, self.base_rotation[:1])
             for each in links[:swept]:
                 if has_memory(each.effect):
                     sweep(each, every, self.samples.runs, self.samples.dt)
@@ -193,14 +192,6 @@ class PreparedLog:
             opened.tendon_length = every.dl[self.samples.rows] + rest
         act([each.on(len(opened)) for each in links[swept:]], opened)
         return opened
-
-    def _alone(self, length: Floats) -> Ports:
-        """Ports with these tendon lengths and nothing else."""
-        bare = {
-            name: getattr(self.ports, name)[:1]
-            for name in ("tension", "base_pose", "extension", "tip_force", "tip_moment", "line_force")
-        }
-        return self.ports._replace(tendon_length=length, **bare)
 
     def kernel(self, opened: EffectPorts) -> tuple[Ports, Params]:
         """What the kernel reads."""
