@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -23,6 +23,7 @@ from fastrod.effects.base import (
     Operator,
     Parameter,
     Seam,
+    Static,
     columns,
     effect,
     effect_names,
@@ -261,7 +262,7 @@ def changes_tendons(robot: Robot, **inputs: Any) -> bool:
     layout, params, rest = compile_robots((replace(robot, effects=()),), N_STEPS)
     ports = Reader(layout, params, rest, 1).ports(Inputs(**inputs))
     pipeline = EffectPipeline([robot], 1)
-    _, changed = pipeline.act(ports, params, None, DT, N_STEPS, np.zeros(1, bool))
+    _, changed, _ = pipeline.act(ports, params, None, DT, N_STEPS, np.zeros(1, bool))
     return not all(
         np.array_equal(getattr(changed, name), getattr(params, name)) for name in ("offset", "compliance")
     )
@@ -644,6 +645,115 @@ def test_unregister_takes_a_synonym_too() -> None:
         with pytest.raises(UnknownNameError):
             get_effect(name)
     assert "gear_play" not in registry._SYNONYMS
+
+
+class Poke(Static):
+    """Something leans on the backbone, written by a user.
+
+    Equation: F at arclength a
+    Source: cantilever with a load within its span
+    Residual signature: a bend that no tendon asks for
+    """
+
+    frame: ClassVar[Any] = "world"
+    seam = Seam.LOAD
+    parameters = (
+        Parameter("force", "N", typical=0.05),
+        Parameter("arclength", "m", bounds=(0.0, 1.0), typical=0.03, shape=True),
+    )
+
+    def apply(self, values: Floats, memory: Floats, ports: EffectPorts, state: Any, dt: float) -> None:
+        ports.add_point_force(values[:, 1], values[:, :1] * np.array([0.0, 1.0, 0.0]), self.frame)
+
+
+Lean = type("Lean", (Poke,), {"__doc__": Poke.__doc__, "__module__": __name__, "frame": "material"})
+
+
+def poked(robot: Robot, force: float, arclength: float, name: str = "poke") -> Robot:
+    """The robot under a force of Poke, or of Lean."""
+    effect({"poke": Poke, "lean": Lean}[name])
+    return having(robot, {"name": name, "force": force, "arclength": arclength})
+
+
+@pytest.mark.usefixtures("clean_registry")
+@pytest.mark.parametrize("name", ["poke", "lean"])
+def test_a_point_force_of_an_effect_bends_a_cantilever_as_the_closed_form_says(name: str) -> None:
+    """Half way: P l^3 / 24 EI there, 5 P l^3 / 48 EI at the tip."""
+    load, length = 1e-3, 0.07  # P l^2 / EI; what the closed form leaves out is its square, 1e-6
+    sim = Simulator(poked(rod("passive"), load * 0.0022 / length**2, 0.5 * length, name))
+    state = sim.settle(tolerance=1e-13)
+    assert_allclose(state.tip_position[0, 1], 5.0 / 48.0 * load * length, rtol=1e-5)
+    assert_allclose(sim.shape(0.5 * length).position[0, 0, 1], load * length / 24.0, rtol=1e-5)
+
+
+@pytest.mark.usefixtures("clean_registry")
+def test_a_point_force_of_an_effect_is_one_that_is_given() -> None:
+    lengths, near, far = bend(rod(), 0.5, -0.3), (0.031, (0.0, 0.1, 0.0)), (0.05, (0.02, 0.0, -0.03))
+    one, two = Simulator(poked(rod(), 0.1, 0.031), n_robots=2), Simulator(rod(), n_robots=2)
+    for given in ({}, {"line_force": np.outer(np.arange(4), [0.1, 0.3, 0.0])[None]}):
+        here = one.settle(lengths, point_force=[far], tolerance=1e-13, **given)
+        there = two.settle(lengths, point_force=[far, near], tolerance=1e-13, **given)
+        assert_allclose(here.position, there.position, rtol=0.0, atol=1e-12)
+        assert_allclose(here.tension, there.tension, rtol=0.0, atol=1e-8)  # 1e-13 m of stiff tendons
+        assert_allclose(one.jacobian(), two.jacobian(), rtol=1e-6, atol=1e-7)
+    assert_array_equal(
+        Simulator(poked(rod(), 0.0, 0.031)).settle(lengths).tension,
+        Simulator(rod()).settle(lengths, point_force=[(0.031, (0.0, 0.0, 0.0))]).tension,
+    )
+    beyond = Simulator(poked(rod(), 0.1, 0.9)).settle(lengths, tolerance=1e-13)
+    at_tip = Simulator(rod()).settle(lengths, tip_force=(0.0, 0.1, 0.0), tolerance=1e-13)
+    assert_allclose(beyond.position, at_tip.position, atol=1e-13)
+    broken = np.tile(lengths, (2, 1))
+    broken[1, 2] = np.nan
+    assert one.settle(broken).ok.tolist() == [True, False]
+
+
+@pytest.mark.usefixtures("clean_registry")
+def test_the_jacobian_keeps_what_effects_add_beside_a_point_force() -> None:
+    robot = having(
+        poked(rod(extension=(-0.01, 0.01)), 0.1, 0.031),
+        {"name": "poke", "force": 0.1, "arclength": 0.031},
+        {"name": "gravity", "line_density": 0.3},
+    )
+    sim = Simulator(robot, points_per_segment=4)
+    base = {"tendon_length": bend(robot, 0.5, -0.3), "extension": np.array([0.001])}
+    assert sim.settle(**base, tolerance=1e-13).ok.all()
+    jacobian = sim.jacobian()[0]
+    expected = difference(sim, base, "extension", 0, 1e-6)
+    assert_allclose(jacobian[:, 4], expected, atol=5e-6 * np.abs(expected).max())
+
+
+@pytest.mark.usefixtures("clean_registry")
+def test_a_material_force_of_an_effect_turns_with_the_rod() -> None:
+    lengths, half = bend(rod(), 0.9, -0.4), np.sqrt(0.5)
+    sim = Simulator(poked(rod(), 0.1, 0.031, "lean"))
+    first = sim.settle(lengths, tolerance=1e-13)
+    for _ in range(8):  # each by the shape of the one before
+        state = sim.settle(lengths, tolerance=1e-13)
+    assert np.abs(state.position - first.position).max() > 1e-6
+    force = sim.shape(0.031).rotation[0, 0] @ [0.0, 0.1, 0.0]
+    there = Simulator(rod()).settle(lengths, point_force=[(0.031, force)], tolerance=1e-13)
+    assert_allclose(state.position, there.position, atol=1e-11)
+    turned = sim.settle(lengths, base_pose=(0.1, 0.2, 0.3, half, half, 0.0, 0.0), tolerance=1e-13)
+    quarter = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # about x
+    assert_allclose(turned.position[0], state.position[0] @ quarter.T + [0.1, 0.2, 0.3], atol=1e-11)
+
+
+@pytest.mark.usefixtures("clean_registry")
+def test_a_point_force_that_cannot_be_is_refused_in_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    short = Simulator(poked(rod(), 0.1, 0.031, "lean"), outputs="tip")
+    lengths = bend(rod(), 0.5, 0.0)
+    short.step(lengths)  # straight before
+    with pytest.raises(EffectError, match="material frame goes by the last shape; outputs='tip' keeps no"):
+        short.step(lengths)
+    monkeypatch.setattr(Poke, "frame", "materiel")
+    with pytest.raises(EffectError, match="no frame 'materiel' of a point force; did you mean 'material'"):
+        Simulator(poked(rod(), 0.1, 0.031)).step(lengths)
+    monkeypatch.setattr(
+        Poke, "apply", lambda self, values, memory, ports, state, dt: ports.add_point_force(0.1, (1.0, 2.0))
+    )
+    with pytest.raises(EffectError, match=r"force of shape \(2,\); give \(1,\) \[m\] and \(1, 3\) \[N\]"):
+        Simulator(poked(rod(), 0.1, 0.031)).step(lengths)
 
 
 def variant(name: str = "Weight", **changes: Any) -> type:

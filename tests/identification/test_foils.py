@@ -14,7 +14,7 @@ from fastrod.identification.excite import excitation
 from fastrod.identification.log.forward import PredictedRod, sample
 from fastrod.identification.log.unknowns import base_model
 from fastrod.identification.search.alternatives import AlternativePattern, alternatives
-from fastrod.identification.search.linearised import LinearisedModel, Target
+from fastrod.identification.search.linearised import LinearisedModel, target_of
 from fastrod.model.robotfile import load_robot
 
 NOISE = 3e-4  # m
@@ -54,7 +54,7 @@ def linearised() -> LinearisedModel:
         model.start,
         samples,
         PredictedRod(samples, robot, threads=1),
-        Target(samples, np.full(3, NOISE), rotation_sigma=0.01, points=False),
+        target_of(samples, np.full(3, NOISE), rotation_sigma=0.01, points=False),
     )
 
 

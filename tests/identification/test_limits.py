@@ -11,7 +11,7 @@ from rods import rod
 
 from fastrod import load_robot
 from fastrod.identification.log.forward import LogSamples, sample
-from fastrod.identification.log.limits import limits
+from fastrod.identification.report.assemble import limits
 
 
 def moving(rate: float) -> LogSamples:

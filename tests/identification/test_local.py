@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -14,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from fastrod import Robot
 from fastrod.identification.log.forward import LogSamples, PredictedRod, predict, sample
 from fastrod.identification.log.unknowns import Model, base_model
-from fastrod.identification.search.linearised import LinearisedModel, Target, exact_residual
+from fastrod.identification.search.linearised import LinearisedModel, target_of
 
 N = 40
 SIGMA = np.array([2e-4, 3e-4, 4e-4])
@@ -57,13 +58,13 @@ class Place:
         self.theta = self.model.start
         self.samples = samples()
         self.rod = PredictedRod(self.samples, self.model.robot, points=True)
-        self.target = Target(self.samples, SIGMA, rotation_sigma=0.01, points=True)
+        self.target = target_of(self.samples, SIGMA, rotation_sigma=0.01, points=True)
         self.linearised = LinearisedModel(self.model, self.theta, self.samples, self.rod, self.target)
 
     def exact(self, model: Model, theta: np.ndarray) -> np.ndarray:
-        residual, ok = exact_residual(model, theta, self.samples, self.rod, self.target)
-        assert ok.all()
-        return residual
+        pose = predict(model, theta, self.samples, self.rod)
+        assert pose.ok.all()
+        return self.target.residual(pose)
 
 
 @cache
@@ -244,9 +245,11 @@ def test_a_local_fit_finds_what_was_planted() -> None:
     true[place] = 0.03
     pose = predict(here.model, true, here.samples, here.rod)
     log = here.samples.log
-    told = Target(here.samples, SIGMA, rotation_sigma=0.01, points=True)
-    told.tip = pose.position + SIGMA * np.random.default_rng(8).normal(size=(N, 3))
-    told.rotation, told.points, told.seen = None, np.zeros((N, 0, 3)), np.zeros((N, 0, 3), bool)
+    told = replace(
+        target_of(here.samples, SIGMA, rotation_sigma=0.01, points=False),
+        tip=pose.position + SIGMA * np.random.default_rng(8).normal(size=(N, 3)),
+        rotation=None,
+    )
     assert len(log) == N
     linearised = LinearisedModel(
         here.model, here.theta, here.samples, PredictedRod(here.samples, here.model.robot, points=True), told
@@ -261,8 +264,8 @@ def test_a_local_fit_finds_what_was_planted() -> None:
 def test_rows_that_do_not_count() -> None:
     """Outliers and rows that did not converge have no residual and no slope."""
     here = base()
-    target = Target(here.samples, SIGMA, rotation_sigma=0.01, points=True)
-    target.weight = np.where(np.arange(N) == 7, 0.0, 1.0)
+    target = target_of(here.samples, SIGMA, rotation_sigma=0.01, points=True)
+    target = replace(target, weight=np.where(np.arange(N) == 7, 0.0, 1.0))
     pose = predict(here.model, here.theta, here.samples, here.rod)
     ok = pose.ok.copy()
     ok[9] = False

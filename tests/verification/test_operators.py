@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from fastrod import Robot, Segment, Simulator, Tendon, load_robot
 from fastrod.effects.base import get_effect
-from fastrod.effects.pipeline import SensedPoses
+from fastrod.effects.executor import SensedPoses
 from fastrod.kernels.operators import (
     BUFFER,
     SLIDERS,
