@@ -212,9 +212,7 @@ def test_stop_stands_at_once_and_go_on_moves_nothing(bed: Bed, window: Windows) 
     assert seen.until(lambda: bool(bed.link.change()[0] > there[0] + 2e-4))
 
 
-def test_stop_only_stops_however_often_it_is_pressed(
-    bed: Bed, window: Windows, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stop_only_stops_however_often_it_is_pressed(bed, window, monkeypatch):
     seen, other = window(bed.app.address), window(bed.app.address)
     for each in (seen, other):
         assert each.page.get_by_role("button", name="Resume", exact=True).is_disabled()
@@ -249,9 +247,7 @@ def test_stop_only_stops_however_often_it_is_pressed(
         assert each.errors == []
 
 
-def test_after_a_fault_the_page_says_why_and_releases_when_the_cause_is_gone(
-    bed: Bed, window: Windows
-) -> None:
+def test_after_a_fault_the_page_says_why_and_releases_when_the_cause_is_gone(bed, window):
     seen = window(bed.app.address)
     assert bed.says(seen, "marker seen")
     bed.emulator.hidden = True
@@ -269,9 +265,7 @@ def test_after_a_fault_the_page_says_why_and_releases_when_the_cause_is_gone(
 
 
 @pytest.mark.parametrize("how", ["closed", "frozen"])
-def test_nothing_moves_when_nobody_watches(
-    bed: Bed, window: Windows, how: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_moves_when_nobody_watches(bed, window, how, monkeypatch):
     seen, other = window(bed.app.address), window()
     bed.slowly(seen)
     bed.bend(seen, "End")
@@ -297,9 +291,7 @@ def test_nothing_moves_when_nobody_watches(
     assert other.until(lambda: not bed.page.session.stopped)
 
 
-def test_a_recording_has_the_cameras_sightings_by_the_robots_clock(
-    bed: Bed, window: Windows, tmp_path: Path
-) -> None:
+def test_a_recording_has_the_cameras_sightings_by_the_robots_clock(bed, window, tmp_path):
     seen = window(bed.app.address)
     seen.page.get_by_role("tab", name="Save").click()
     seen.page.get_by_role("button", name="Record a run log").click()

@@ -57,9 +57,7 @@ def test_the_time_slider_moves_the_robot_and_the_figures(app: App, window: Windo
     assert seen.errors == []
 
 
-def test_before_and_after_can_be_switched(
-    app: App, window: Windows, tmp_path: Path, log_with_report: Path
-) -> None:
+def test_before_and_after_can_be_switched(app, window, tmp_path, log_with_report):
     app.open(load(log_with_report))
     seen = window(app.address)
     page = replayed(app)
@@ -101,9 +99,7 @@ def test_a_session_is_recorded_read_back_and_replayed(app: App, window: Windows,
 
 
 @pytest.mark.parametrize("what", ["prototype", DEMO_LOG])
-def test_an_exported_page_opens_from_disk_without_a_network(
-    app: App, window: Windows, tmp_path: Path, what: str
-) -> None:
+def test_an_exported_page_opens_from_disk_without_a_network(app, window, tmp_path, what):
     app.open(what)
     seen = window(app.address)
     if what == "prototype":

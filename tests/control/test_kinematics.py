@@ -46,9 +46,7 @@ def soft_tip(base: Any, line_density: float = 0.15, **options: Any) -> SoftTip:
 
 
 @pytest.mark.parametrize(("base", "q_base"), BASES, ids=["fixed", "moving", "turning", "arm"])
-def test_the_jacobian_is_that_of_the_settled_tip_under_weight_and_loads(
-    base: Any, q_base: list[float]
-) -> None:
+def test_the_jacobian_is_that_of_the_settled_tip_under_weight_and_loads(base, q_base):
     tip = soft_tip(base, flange_from_base=MOUNT)
     q = np.array([*q_base, *ACTION])
     tip.place(q, settle=True, tolerance=1e-12, **LOADS)
@@ -252,11 +250,8 @@ def test_refusals(make: Any, sentence: str) -> None:
 
 
 def test_a_robot_that_no_action_drives_is_refused() -> None:
-    with pytest.raises(
-        RobotError,
-        match=r"^segment 1 of robot .* is passive; an action needs tendons driven "
-        r"by length\.$",
-    ):
+    sentence = r"^segment 1 of robot .* is passive; an action needs tendons driven by length\.$"
+    with pytest.raises(RobotError, match=sentence):
         SoftTip(
             Simulator(
                 Robot(
@@ -291,9 +286,7 @@ def test_steps_that_extend_keep_up_with_the_rod() -> None:
 
 @pytest.mark.parametrize("rows", [1024, 3], ids=["at once", "one input after another"])
 @pytest.mark.parametrize("loaded", [False, True])
-def test_many_robots_have_the_jacobians_of_one(
-    rows: int, loaded: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_many_robots_have_the_jacobians_of_one(rows, loaded, monkeypatch):
     monkeypatch.setattr(fastrod.solver.response, "_ROWS", rows)
     robot, n = two_segments(), 9
     actions = SoftTip(Simulator(robot)).actions.inputs(

@@ -299,11 +299,8 @@ def test_neighbouring_columns_that_are_swapped_explain_nothing() -> None:
 
 
 def test_too_much_held_out_is_refused() -> None:
-    with pytest.raises(
-        LogError,
-        match=r"leaves \d+ rows to fit once two, three, one@2: are held out; it "
-        r"needs 40",
-    ):
+    sentence = r"leaves \d+ rows to fit once two, three, one@2: are held out; it needs 40"
+    with pytest.raises(LogError, match=sentence):
         identify(backlash_log(), robot(), held_out=["two", "three", "one@2:"], threads=1)
 
 

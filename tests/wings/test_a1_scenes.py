@@ -20,11 +20,8 @@ def test_push_holds_at_other_time_steps(dt, monkeypatch):
 
 def test_push_that_misses_is_reported(monkeypatch):
     monkeypatch.setattr(push, "PLACE", (0.36, 0.3, push.SIZE / 2))
-    with pytest.raises(
-        SceneError,
-        match=r"^scene neck_push: the cube moved .* m; the neck is to push it "
-        r"farther than it is wide\.$",
-    ):
+    sentence = r"^scene neck_push: the cube moved .* m; the neck is to push it farther than it is wide\.$"
+    with pytest.raises(SceneError, match=sentence):
         push.NeckPush().check()
 
 

@@ -201,9 +201,7 @@ def test_what_is_no_task_is_refused_in_a_sentence(package: Path, make: Any, sent
     assert fastrod_envs.names() == before
 
 
-def test_a_package_that_cannot_be_imported_takes_nothing_else_away(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_package_that_cannot_be_imported_takes_nothing_else_away(tmp_path, monkeypatch):
     (tmp_path / "broken.py").write_text("raise ValueError('no such camera')\n")
     (tmp_path / "broken-1.0.dist-info").mkdir()
     (tmp_path / "broken-1.0.dist-info" / "METADATA").write_text(

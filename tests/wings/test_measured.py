@@ -159,9 +159,8 @@ def test_detect_knows_the_raw_files_by_their_header(tmp_path: Path) -> None:
 
 def test_wrong_file_and_wrong_run_answer_with_one_sentence(tmp_path: Path) -> None:
     path = asl_file(tmp_path)
-    with pytest.raises(
-        LogError, match=r"trunk\.csv is not the raw file of armlab_tdcr: it lacks column l1_mm"
-    ):
+    sentence = r"trunk\.csv is not the raw file of armlab_tdcr: it lacks column l1_mm"
+    with pytest.raises(LogError, match=sentence):
         armlab_tdcr(path)
     with pytest.raises(UnknownNameError, match="no run 'frist' in log 'trunk'; did you mean 'first'"):
         asl_trunk(path, run="frist")

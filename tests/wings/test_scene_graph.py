@@ -545,11 +545,8 @@ def test_bad_option_is_one_sentence():
         ViewOptions(body="skins")
     with pytest.raises(InputError, match=r"^ViewOptions.tendons is 1; it must be True or False\.$"):
         ViewOptions(tendons=1)
-    with pytest.raises(
-        InputError,
-        match=r"^ViewOptions.pieces is 0; it must be a whole number, at least 1, or "
-        r"None\.$",
-    ):
+    sentence = r"^ViewOptions.pieces is 0; it must be a whole number, at least 1, or None\.$"
+    with pytest.raises(InputError, match=sentence):
         ViewOptions(pieces=0)
 
 

@@ -72,9 +72,7 @@ def axis(quaternion: Any, k: int) -> np.ndarray[Any, Any]:
 # shape
 
 
-def test_the_straight_robot_points_along_y_and_bends_as_in_the_paper(
-    make: Callable[..., SoftManiSim],
-) -> None:
+def test_the_straight_robot_points_along_y_and_bends_as_in_the_paper(make):
     sim = make(number_of_segment=1)
     world, own = sim.move_robot_ori()
     assert world.shape == own.shape == (30, 7)
@@ -290,9 +288,7 @@ def test_a_tilted_cube_near_the_tip_makes_no_contact(make: Callable[..., SoftMan
 # grasping
 
 
-def test_suction_carries_a_cube_as_it_stands_and_lets_it_fall(
-    make: Callable[..., SoftManiSim], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_suction_carries_a_cube_as_it_stands_and_lets_it_fall(make, caplog):
     sim = make(max_grasp_width=0.0)
     cube = sim.add_a_cube([0.005, 0, 0.03], ori=about_z(0.3), size=[0.06] * 3, mass=0.5)
     sim.wait(0.1)

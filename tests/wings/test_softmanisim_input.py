@@ -101,9 +101,7 @@ def one() -> Iterator[SoftManiSim]:
 
 
 @pytest.mark.parametrize(("call", "error", "sentence"), [w[1:] for w in WRONG], ids=[w[0] for w in WRONG])
-def test_bad_input_gets_one_sentence(
-    one: SoftManiSim, call: Callable[[SoftManiSim], Any], error: type[Exception], sentence: str
-) -> None:
+def test_bad_input_gets_one_sentence(one, call, error, sentence):
     count = one.bullet.getNumBodies() - (one._marker is not None)
     with pytest.raises(error, match=sentence) as caught:
         call(one)

@@ -44,9 +44,7 @@ from fastrod_viewer.worlds import FreeWorld, SceneWorld
         (["prototype", "--host", "192.0.2.1"], "host '192.0.2.1' is not an address of this machine"),
     ],
 )
-def test_what_cannot_be_shown_is_one_sentence(
-    words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_shown_is_one_sentence(words, sentence, capsys):
     assert main(["view", "--no-open", *words]) == 2
     said = capsys.readouterr()
     assert sentence in said.err
@@ -184,13 +182,7 @@ def _address() -> str:
 
 
 @pytest.mark.parametrize(("host", "announced"), [("127.0.0.1", False), ("0.0.0.0", True)])
-def test_the_address_is_the_key(
-    host: str,
-    announced: bool,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_address_is_the_key(host, announced, tmp_path, monkeypatch, capsys):
     opened: list[str] = []
 
     def browse(page: str) -> None:

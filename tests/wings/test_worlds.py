@@ -81,11 +81,8 @@ def test_scene_in_mujoco_is_played_and_nobody_drives_it():
         assert_allclose(tip(world), state[1].tip_position[0], atol=1e-12)
     assert not world.drivable
     for refused in (lambda: world.drive(still(world)), world.jacobian):
-        with pytest.raises(
-            InputError,
-            match=r"^scene 'ur5_mujoco' has a script that moves its robots; they "
-            r"cannot be driven by hand\.$",
-        ):
+        sentence = r"^scene 'ur5_mujoco' has a script that moves its robots; they cannot be driven by hand\.$"
+        with pytest.raises(InputError, match=sentence):
             refused()
     world.reset()
     assert world.t == 0.0
