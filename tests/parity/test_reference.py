@@ -40,9 +40,6 @@ def one_segment(row: dict[str, str]) -> tuple[Robot, dict[str, Any]]:
     return rod(length=length, **tendons, **material), inputs
 
 
-PULLED: dict[str, Any] = {"tip_force": (0.1, 0.2, -0.1)}
-
-
 def in_mode(robot: Robot, mode: Mode) -> Robot:
     return replace(robot, segments=tuple(replace(segment, mode=mode) for segment in robot.segments))
 
@@ -84,11 +81,8 @@ def test_shoot_is_the_truth_on_a_chain(case: str, mode: Mode) -> None:
     tension, length = (numbers(row, *[f"{name}{i}" for i in range(1, 7)]) for name in ("q", "kir_len"))
     compliance = np.array([tendon.compliance for tendon in robot.tendons])
     loads = {"tip_force": numbers(row, "fx", "fy", "fz"), "tip_moment": numbers(row, "mx", "my", "mz")}
-    given = {
-        "tendon_tension": {"tension": tension},
-        "tendon_length": {"tendon_length": length - compliance * tension},
-    }
-    shape = shoot(robot, **given[mode], **loads)
+    pulled, set_to = {"tension": tension}, {"tendon_length": length - compliance * tension}
+    shape = shoot(robot, **(pulled if mode == "tendon_tension" else set_to), **loads)
     assert shape.success, shape.message
     assert_allclose(shape.tip_position, numbers(row, "kir_px", "kir_py", "kir_pz"), rtol=0, atol=TIP)
     assert_allclose(shape.tip_rotation, rotation(row, "kir_r"), rtol=0, atol=1e-8)
@@ -137,11 +131,9 @@ def test_methods_and_integrators_agree() -> None:
         "follower_tip_force": (0.1, 0.0, 0.2),
     }
     best = shoot(robot, length, **loads)
-    # each stops below the tolerance of 1e-9 m at the boundary; lower orders of integrators at the same rtol let
-    # more local errors add up
     for name, others, tolerance in (
-        ("method", ("slsqp", "trust-constr"), 3e-9),
-        ("integrator", ("RK45", "LSODA"), 1e-8),
+        ("method", ("slsqp", "trust-constr"), 3e-9),  # each stops below 1e-9 m at the boundary
+        ("integrator", ("RK45", "LSODA"), 1e-8),  # lower orders at the same rtol: more local errors add up
     ):
         for value in others:
             other = shoot(robot, length, **loads, **{name: value})
