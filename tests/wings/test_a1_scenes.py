@@ -1,5 +1,7 @@
 """The quadruped's scenes can fail, and hold at other time steps."""
 
+import sys
+
 import numpy as np
 import pytest
 
@@ -18,23 +20,29 @@ def test_push_holds_at_other_time_steps(dt, monkeypatch):
     assert figures["balance of the cube's momentum, N s"] < 1e-12
 
 
-def test_push_that_misses_is_reported(monkeypatch):
-    monkeypatch.setattr(push, "PLACE", (0.36, 0.3, push.SIZE / 2))
-    sentence = r"^scene neck_push: the cube moved .* m; the neck is to push it farther than it is wide\.$"
-    with pytest.raises(SceneError, match=sentence):
-        push.NeckPush().check()
-
-
-def test_look_that_sees_nothing_is_reported(monkeypatch):
-    monkeypatch.setattr(look, "CORNERS", ((1, 1), (1, -1), (-1, 1), (-30, -1)))
-    with pytest.raises(SceneError, match=r"^scene neck_look: 3 of 4 corners were seen"):
-        look.NeckLook().check()
-
-
-def test_neck_in_contact_with_the_wall_is_reported(monkeypatch):
-    monkeypatch.setattr(look, "MIDDLE", (0.77, 0.0))
-    with pytest.raises(SceneError, match=r"^scene neck_look: .*the neck "):
-        look.NeckLook().check()
+@pytest.mark.parametrize(
+    ("scene", "setting", "value", "sentence"),
+    [
+        (
+            push.NeckPush,
+            "PLACE",
+            (0.36, 0.3, push.SIZE / 2),
+            r"neck_push: the cube moved .* m; the neck is to push it farther than it is wide\.$",
+        ),
+        (
+            look.NeckLook,
+            "CORNERS",
+            ((1, 1), (1, -1), (-1, 1), (-30, -1)),
+            "neck_look: 3 of 4 corners were seen",
+        ),
+        (look.NeckLook, "MIDDLE", (0.77, 0.0), r"neck_look: .*the neck "),
+    ],
+    ids=["a push that misses", "a look that sees nothing", "a neck that touches the wall"],
+)
+def test_what_fails_is_reported(scene, setting, value, sentence, monkeypatch):
+    monkeypatch.setattr(sys.modules[scene.__module__], setting, value)
+    with pytest.raises(SceneError, match=f"^scene {sentence}"):
+        scene().check()
 
 
 def test_neck_stands_on_the_head_with_its_axes_as_stated():

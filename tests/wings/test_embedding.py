@@ -20,25 +20,18 @@ from fastrod.rotation import matrix_from_quaternion, product, quaternion_from_ve
 
 PAGE = (Path(fastrod.hosts.__file__).parent / "README.md").read_text(encoding="utf-8")
 EXAMPLES = re.findall(r"```python\n(.*?)```\n\n```\n(.*?)```", PAGE, flags=re.S)
-RECIPE = next(
-    block for block in re.findall(r"```python\n(.*?)```", PAGE, flags=re.S) if "def embedded_step" in block
-)
+BLOCKS = re.findall(r"```python\n(.*?)```", PAGE, flags=re.S)
+RECIPE = next(block for block in BLOCKS if "def embedded_step" in block)
 
 
 class TinyEngine:
     """One rigid body on a spring: x y z w, forces at the centre of mass, torque and inertia in the body
     frame, semi-implicit Euler."""
 
-    def __init__(
-        self, mass=1.0, inertia=(0.1, 0.2, 0.15), spring=0.0, twist=0.0, damping=0.0, gravity=0.0
-    ) -> None:
-        self.mass, self.inertia, self.spring, self.twist, self.damping = (
-            mass,
-            np.array(inertia),
-            spring,
-            twist,
-            damping,
-        )
+    mass, inertia = 1.0, np.array([0.1, 0.2, 0.15])
+
+    def __init__(self, spring=0.0, twist=0.0, damping=0.0, gravity=0.0) -> None:
+        self.spring, self.twist, self.damping = spring, twist, damping
         self.gravity = np.array([0.0, 0.0, -gravity])
         self.position, self.orientation = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
         self.velocity, self.spin = np.zeros(3), np.zeros(3)
@@ -53,18 +46,13 @@ class TinyEngine:
 
     def step(self, dt) -> None:
         rotation = matrix_from_quaternion(np.roll(self.orientation, 1)[None])[0]
-        force = (
-            self._force
-            + self.mass * self.gravity
-            - self.spring * np.array(self.position)
-            - self.damping * self.velocity
-        )
+        held = self.spring * np.array(self.position) + self.damping * self.velocity
+        force = self._force + self.mass * self.gravity - held
         inertia = rotation @ np.diag(self.inertia) @ rotation.T
         moment = rotation @ self._torque - self.twist * self.vector() - 0.2 * self.damping * self.spin
         self.velocity = self.velocity + dt * force / self.mass
-        self.spin = self.spin + dt * np.linalg.solve(
-            inertia, moment - np.cross(self.spin, inertia @ self.spin)
-        )
+        gyration = np.cross(self.spin, inertia @ self.spin)
+        self.spin = self.spin + dt * np.linalg.solve(inertia, moment - gyration)
         self.position = (np.array(self.position) + dt * self.velocity).tolist()
         turned = product(quaternion_from_vector(dt * self.spin), np.roll(self.orientation, 1))
         self.orientation = np.roll(turned / np.linalg.norm(turned), -1).tolist()
@@ -146,10 +134,8 @@ def test_tilted_body_feels_the_torque_in_its_own_frame(embedded_step) -> None:
 def test_limit_of_the_time_step_is_where_the_page_has_it(fraction: float, calm: bool) -> None:
     # x' = x + dt v', v' = v - dt K / m (x + dt v): eigenvalues leave the unit circle where dt^2 K / m is 4/3
     robot, dt, rotation = soft_robot(), 0.01, (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)
-    scene = ContactScene(
-        obstacles=[plane(point=(0, 0, -0.005), normal=(0, 0, 1), name="floor", stiffness=4.0)]
-    )
-    rod = Rod(robot, dt=dt, contact=scene)
+    floor = plane(point=(0, 0, -0.005), normal=(0, 0, 1), name="floor", stiffness=4.0)
+    rod = Rod(robot, dt=dt, contact=ContactScene(obstacles=[floor]))
     start = 0.006
 
     def press(z: float) -> float:

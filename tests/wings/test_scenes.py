@@ -80,12 +80,10 @@ def test_airway_is_a_watertight_wall_with_two_handles():
 
 def test_airway_stands_where_the_distance_says():
     vertices, _ = airway_mesh.airway()
-    ends = [
-        airway_mesh.middle(branch, np.array([airway_mesh.path_length()])) for branch in airway_mesh.BRANCHES
-    ]
-    cut = np.min([np.linalg.norm(vertices - end, axis=1) for end in ends], axis=0) < 2.0 * (
-        airway_mesh.RADIUS + airway_mesh.WALL
-    )
+    depth = np.array([airway_mesh.path_length()])
+    ends = [airway_mesh.middle(branch, depth) for branch in airway_mesh.BRANCHES]
+    apart = np.min([np.linalg.norm(vertices - end, axis=1) for end in ends], axis=0)
+    cut = apart < 2.0 * (airway_mesh.RADIUS + airway_mesh.WALL)
     distance = airway_mesh.lumen_distance(vertices[~cut & (vertices[:, 2] > 0.004)])
     inner = distance < airway_mesh.WALL / 2.0
     assert inner.sum() > 1000
@@ -98,9 +96,8 @@ def test_airway_stands_where_the_distance_says():
 def test_airway_is_open_at_its_three_ends():
     depth = np.linspace(-0.02, airway_mesh.path_length() + 0.02, 60)
     for branch in airway_mesh.BRANCHES:
-        assert (
-            airway_mesh.lumen_distance(airway_mesh.middle(branch, depth)) < -0.9 * airway_mesh.RADIUS
-        ).all()
+        distance = airway_mesh.lumen_distance(airway_mesh.middle(branch, depth))
+        assert (distance < -0.9 * airway_mesh.RADIUS).all()
 
 
 def test_middle_of_the_airway_is_as_long_as_its_depth_and_bends_as_it_heads():
