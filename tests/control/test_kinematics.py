@@ -178,44 +178,41 @@ def test_moving_in_the_null_space_leaves_the_tip() -> None:
 SEVEN = "give seven finite numbers, "
 
 
-@refusals(
-    {
-        InputError: {
-            r"^simulator is Simulator\(.*\); give a Simulator of one robot\.$": lambda: SoftTip(simulator(2)),
-            rf"^FixedBase\.pose is \(0\.0, 0\.0, 0\.0\); {SEVEN}position \[m\] and ": lambda: FixedBase(
-                (0.0, 0.0, 0.0)
-            ),
-            r"^MovingBase\.pose has a quaternion of norm 2; it must be 1, as w x y z\.$": lambda: MovingBase(
-                (0, 0, 0, 2, 0, 0, 0)
-            ),
-            rf"^flange_from_base is \[nan.*\]; {SEVEN}": lambda: soft_tip(
-                FixedBase(), flange_from_base=[np.nan] * 7
-            ),
-            (
-                r"^q has shape \(6,\); it must be \(9,\): 3 of the base, then extension and "
-                r"two displacements for each of 2 segments \[m\]\.$"
-            ): lambda: soft_tip(MovingBase()).place([0.0] * 6),
-            r"^q holds a value that is not finite: \[nan nan nan nan nan nan\]\.$": lambda: soft_tip(
-                FixedBase()
-            ).place([np.nan] * 6),
-            r"^q is 'here'; give 6 numbers\.$": lambda: soft_tip(FixedBase()).place("here"),
-            rf"^base_pose is \[0\.0\]; {SEVEN}": lambda: soft_tip(FixedBase()).place(ACTION, base_pose=[0.0]),
-            r"^position needs a placed robot; call place first\.$": lambda: soft_tip(FixedBase()).position,
-            r"^jacobian needs a placed robot; call place first\.$": lambda: soft_tip(FixedBase()).jacobian(),
-            r"^largest_bend is 0\.0 rad; it must be a number, positive and finite\.$": lambda: soft_tip(
-                FixedBase()
-            ).limits(0.0),
-            r"^step is -1\.0; it must be a number, positive and finite\.$": lambda: soft_tip(
-                FixedBase()
-            ).finite_differences(ACTION, -1.0),
-        },
-        RobotError: {
-            r"^segment 1 of robot .* is passive; an action needs tendons driven by length\.$": lambda: (
-                SoftTip(Simulator(rod("passive")))
-            )
-        },
-    }
-)
+BAD_INPUT = {
+    r"^simulator is Simulator\(.*\); give a Simulator of one robot\.$": lambda: SoftTip(simulator(2)),
+    rf"^FixedBase\.pose is \(0\.0, 0\.0, 0\.0\); {SEVEN}position \[m\] and ": lambda: FixedBase(
+        (0.0, 0.0, 0.0)
+    ),
+    r"^MovingBase\.pose has a quaternion of norm 2; it must be 1, as w x y z\.$": lambda: MovingBase(
+        (0, 0, 0, 2, 0, 0, 0)
+    ),
+    rf"^flange_from_base is \[nan.*\]; {SEVEN}": lambda: soft_tip(FixedBase(), flange_from_base=[np.nan] * 7),
+    (
+        r"^q has shape \(6,\); it must be \(9,\): 3 of the base, then extension and "
+        r"two displacements for each of 2 segments \[m\]\.$"
+    ): lambda: soft_tip(MovingBase()).place([0.0] * 6),
+    r"^q holds a value that is not finite: \[nan nan nan nan nan nan\]\.$": lambda: soft_tip(
+        FixedBase()
+    ).place([np.nan] * 6),
+    r"^q is 'here'; give 6 numbers\.$": lambda: soft_tip(FixedBase()).place("here"),
+    rf"^base_pose is \[0\.0\]; {SEVEN}": lambda: soft_tip(FixedBase()).place(ACTION, base_pose=[0.0]),
+    r"^position needs a placed robot; call place first\.$": lambda: soft_tip(FixedBase()).position,
+    r"^jacobian needs a placed robot; call place first\.$": lambda: soft_tip(FixedBase()).jacobian(),
+    r"^largest_bend is 0\.0 rad; it must be a number, positive and finite\.$": lambda: soft_tip(
+        FixedBase()
+    ).limits(0.0),
+    r"^step is -1\.0; it must be a number, positive and finite\.$": lambda: soft_tip(
+        FixedBase()
+    ).finite_differences(ACTION, -1.0),
+}
+NO_ROBOT = {
+    r"^segment 1 of robot .* is passive; an action needs tendons driven by length\.$": lambda: SoftTip(
+        Simulator(rod("passive"))
+    )
+}
+
+
+@refusals({InputError: BAD_INPUT, RobotError: NO_ROBOT})
 def test_refusals(error: type[Exception], sentence: str, call: Any) -> None:
     with pytest.raises(error, match=sentence):
         call()

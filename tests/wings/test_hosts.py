@@ -196,31 +196,28 @@ def mounted(**options):
     return lambda w: MountedRod(soft_robot(), carrier(w), **options)
 
 
-@refusals(
-    {
-        HostError: {
-            r"this PyBullet world has no body 7; it has \[0\]\.": lambda w: (kuka(w, 0), BulletLink(w, 7)),
-            r"body 0 has no link 9; -1 is its base, links are numbered from 0 to 6\.": on(9),
-            r"body 0 has no link 'lbr_iiwa_link_8'; did you mean 'lbr_iiwa_link_7'\?": on("lbr_iiwa_link_8"),
-            r"quaternion \[1.0, 1.0, 0.0, 0.0\] has norm 1.41421; it must be 1": on(quaternion=(1, 1, 0, 0)),
-            r"body \d+ has no link 2; -1 is its base, it has no others\.": lambda w: BulletLink(
-                w, carrier(w).body, 2
-            ),
-            r"give a physicsClientId, the pybullet module or a BulletClient": lambda w: Bullet("world"),
-            r"PyBullet has no world 9999; connect first": lambda w: Bullet(9999),
-            r"0 capsules for 0.2 m; give at least one": lambda w: RodBodies(w, 0.2, 0.01, 0),
-            r"^host is 3; give BulletLink\(world, body, link\)": lambda w: MountedRod(soft_robot(), 3),
-        },
-        InputError: {
-            r"3 capsules for 10 points of a segment; give a divisor of the points\.": mounted(
-                capsules_per_segment=3
-            ),
-            r"relaxation is -1 s; it must be a number, zero or positive\.": mounted(relaxation=-1),
-            r"^gravity is 9.81; give three numbers": lambda w: connect(gravity=9.81),
-            r"^dt is 0 s; it must be positive": lambda w: connect(dt=0),
-        },
-    }
-)
+NOT_THERE = {
+    r"this PyBullet world has no body 7; it has \[0\]\.": lambda w: (kuka(w, 0), BulletLink(w, 7)),
+    r"body 0 has no link 9; -1 is its base, links are numbered from 0 to 6\.": on(9),
+    r"body 0 has no link 'lbr_iiwa_link_8'; did you mean 'lbr_iiwa_link_7'\?": on("lbr_iiwa_link_8"),
+    r"quaternion \[1.0, 1.0, 0.0, 0.0\] has norm 1.41421; it must be 1": on(quaternion=(1, 1, 0, 0)),
+    r"body \d+ has no link 2; -1 is its base, it has no others\.": lambda w: BulletLink(
+        w, carrier(w).body, 2
+    ),
+    r"give a physicsClientId, the pybullet module or a BulletClient": lambda w: Bullet("world"),
+    r"PyBullet has no world 9999; connect first": lambda w: Bullet(9999),
+    r"0 capsules for 0.2 m; give at least one": lambda w: RodBodies(w, 0.2, 0.01, 0),
+    r"^host is 3; give BulletLink\(world, body, link\)": lambda w: MountedRod(soft_robot(), 3),
+}
+BAD_INPUT = {
+    r"3 capsules for 10 points of a segment; give a divisor of the points\.": mounted(capsules_per_segment=3),
+    r"relaxation is -1 s; it must be a number, zero or positive\.": mounted(relaxation=-1),
+    r"^gravity is 9.81; give three numbers": lambda w: connect(gravity=9.81),
+    r"^dt is 0 s; it must be positive": lambda w: connect(dt=0),
+}
+
+
+@refusals({HostError: NOT_THERE, InputError: BAD_INPUT})
 def test_what_is_not_there_is_a_sentence(error, sentence, call):
     with pytest.raises(error, match=sentence):
         call(empty_world())

@@ -314,38 +314,33 @@ def capsules(**options):
     return lambda spec: add_capsules(**{"spec": spec, "robot": soft_robot(1), "host": "post"} | options)
 
 
-@refusals(
-    {
-        InputError: {
-            r"^'a' capsules a segment; give at least one, a whole number\.$": capsules(
-                capsules_per_segment="a"
-            ),
-            r"^0 capsules a segment; give at least one, a whole number\.$": capsules(capsules_per_segment=0),
-            r"^2.5 capsules a segment; give at least one": capsules(capsules_per_segment=2.5),
-            r"^True capsules a segment; give at least one": capsules(capsules_per_segment=True),
-            r"^color is \(1, 2\); give red, green, blue and opacity, four numbers from 0 to 1\.$": capsules(
-                color=(1, 2)
-            ),
-            r"^head_color is 'red'; give red, green, blue and opacity": capsules(head_color="red"),
-            r"^friction is nan; it must be a number, zero or positive\.$": capsules(friction=np.nan),
-            r"^friction is -1; it must be a number, zero or positive\.$": capsules(friction=-1),
-        },
-        HostError: {
-            (
-                r"^contact_bodies is 'ball'; give a list of bodies, "
-                r"as contact_bodies=\['ball'\]\.$"
-            ): capsules(contact_bodies="ball"),
-            r"^spec is a str; give a mujoco.MjSpec": capsules(spec="arm.xml"),
-            r"^the spec has no body 'pst'; did you mean 'post'\?": capsules(host="pst"),
-        },
-        RobotError: {
-            (
-                r"^robot is 'prototype'; give one Robot, "
-                r"for example fastrod.load_robot\('prototype'\)\.$"
-            ): capsules(robot="prototype")
-        },
-    }
-)
+CAPSULE_INPUT = {
+    r"^'a' capsules a segment; give at least one, a whole number\.$": capsules(capsules_per_segment="a"),
+    r"^0 capsules a segment; give at least one, a whole number\.$": capsules(capsules_per_segment=0),
+    r"^2.5 capsules a segment; give at least one": capsules(capsules_per_segment=2.5),
+    r"^True capsules a segment; give at least one": capsules(capsules_per_segment=True),
+    r"^color is \(1, 2\); give red, green, blue and opacity, four numbers from 0 to 1\.$": capsules(
+        color=(1, 2)
+    ),
+    r"^head_color is 'red'; give red, green, blue and opacity": capsules(head_color="red"),
+    r"^friction is nan; it must be a number, zero or positive\.$": capsules(friction=np.nan),
+    r"^friction is -1; it must be a number, zero or positive\.$": capsules(friction=-1),
+}
+CAPSULE_HOSTS = {
+    r"^contact_bodies is 'ball'; give a list of bodies, as contact_bodies=\['ball'\]\.$": capsules(
+        contact_bodies="ball"
+    ),
+    r"^spec is a str; give a mujoco.MjSpec": capsules(spec="arm.xml"),
+    r"^the spec has no body 'pst'; did you mean 'post'\?": capsules(host="pst"),
+}
+CAPSULE_ROBOTS = {
+    r"^robot is 'prototype'; give one Robot, for example fastrod.load_robot\('prototype'\)\.$": capsules(
+        robot="prototype"
+    )
+}
+
+
+@refusals({InputError: CAPSULE_INPUT, HostError: CAPSULE_HOSTS, RobotError: CAPSULE_ROBOTS})
 def test_capsules_that_no_model_can_have_are_a_sentence(error, sentence, call):
     spec = spec_of(POST + BALL)
     with pytest.raises(error, match=sentence):
@@ -387,47 +382,38 @@ def without_capsules():
     return {"model": model, "data": mujoco.MjData(model)}
 
 
-@refusals(
-    {
-        HostError: {
-            (
-                r"^the model has no capsules of a rod 'rod'; "
-                r"call add_capsules\(\.\.\., name='rod'\) on its spec"
-            ): mounted(**without_capsules()),
-            r"^the model has a body 'rod 0' already; give each rod a name of its own": lambda spec, *_: (
-                add_capsules(spec, soft_robot(), "post")
-            ),
-            r"^the model has no body 'pots'; did you mean 'post'\?": mounted(body="pots"),
-            r"^body is 99; give the name of a body, or its number from 0 \(the world\) to 23\.$": mounted(
-                body=99
-            ),
-            (
-                r"^the capsules of 'rod' collide with 'ball', .*; "
-                r"name it in add_capsules\(\.\.\., contact_bodies=\[\.\.\.\]\) too\.$"
-            ): mounted(contact_bodies=["ball"]),
-            r"^contact_bodies is 'ball'; give a list of bodies": mounted(contact_bodies="ball"),
-            r"^the mount's quaternion \[1.0, 1.0, 0.0, 0.0\] has norm 1.41421; it must be 1": mounted(
-                quaternion=(1, 1, 0, 0)
-            ),
-            r"^the 20 capsules of 'rod' do not fit 3 segments; they were added for another robot\.$": mounted(
-                robot=soft_robot(3)
-            ),
-            r"^the data are of another model: 2 bodies, where this one has 24\.$": mounted(
-                data=without_capsules()["data"]
-            ),
-            r"^model and data are str and MjData; give a mujoco.MjModel and its MjData\.$": mounted(
-                model="model"
-            ),
-            r"^body 'ghost' has no geom that collides, so nothing can touch it\.$": lambda *_: felt(
-                GHOST, "ghost"
-            ),
-            r"^geom 0 of 'egg' is of the kind ellipsoid, which a rod cannot touch": lambda *_: felt(
-                EGG, "egg"
-            ),
-        },
-        RobotError: {r"^robot is 'prototype'; give one Robot": mounted(robot="prototype")},
-    }
-)
+NOT_THERE = {
+    (
+        r"^the model has no capsules of a rod 'rod'; "
+        r"call add_capsules\(\.\.\., name='rod'\) on its spec"
+    ): mounted(**without_capsules()),
+    r"^the model has a body 'rod 0' already; give each rod a name of its own": lambda spec, *_: add_capsules(
+        spec, soft_robot(), "post"
+    ),
+    r"^the model has no body 'pots'; did you mean 'post'\?": mounted(body="pots"),
+    r"^body is 99; give the name of a body, or its number from 0 \(the world\) to 23\.$": mounted(body=99),
+    (
+        r"^the capsules of 'rod' collide with 'ball', .*; "
+        r"name it in add_capsules\(\.\.\., contact_bodies=\[\.\.\.\]\) too\.$"
+    ): mounted(contact_bodies=["ball"]),
+    r"^contact_bodies is 'ball'; give a list of bodies": mounted(contact_bodies="ball"),
+    r"^the mount's quaternion \[1.0, 1.0, 0.0, 0.0\] has norm 1.41421; it must be 1": mounted(
+        quaternion=(1, 1, 0, 0)
+    ),
+    r"^the 20 capsules of 'rod' do not fit 3 segments; they were added for another robot\.$": mounted(
+        robot=soft_robot(3)
+    ),
+    r"^the data are of another model: 2 bodies, where this one has 24\.$": mounted(
+        data=without_capsules()["data"]
+    ),
+    r"^model and data are str and MjData; give a mujoco.MjModel and its MjData\.$": mounted(model="model"),
+    r"^body 'ghost' has no geom that collides, so nothing can touch it\.$": lambda *_: felt(GHOST, "ghost"),
+    r"^geom 0 of 'egg' is of the kind ellipsoid, which a rod cannot touch": lambda *_: felt(EGG, "egg"),
+}
+NO_ROBOT = {r"^robot is 'prototype'; give one Robot": mounted(robot="prototype")}
+
+
+@refusals({HostError: NOT_THERE, RobotError: NO_ROBOT})
 def test_what_is_not_there_is_a_sentence(scene, error, sentence, call):
     with pytest.raises(error, match=sentence):
         call(*scene)

@@ -340,35 +340,30 @@ def stepped():
     return rod
 
 
-@refusals(
-    {
-        InputError: {
-            (
-                r"^base_pose has shape \(3,\); it must be \(7,\), "
-                r"position \[m\] and quaternion w x y z, world\.$"
-            ): moved((0, 0, 0)),
-            r"^base_twist has shape \(3,\); it must be \(6,\), velocity": moved(twist=(0, 0, 0)),
-            r"^base_pose has a quaternion of norm 2; it must be 1, as w x y z\.$": moved(
-                (0, 0, 0, 2, 0, 0, 0)
-            ),
-            r"^base_pose holds a value that is not finite": moved((np.nan, 0, 0, 1, 0, 0, 0)),
-            r"^base_twist holds a value that is not finite": moved(twist=(np.inf, 0, 0, 0, 0, 0)),
-            r"^base_pose is not an array of numbers; give \(7,\)": moved("here"),
-            r"^time_step is -0.01 s; the length of the engine's step must be positive and finite\.$": moved(
-                step=-0.01
-            ),
-            r"^time_step is 'dt'; give the length of the engine's step": moved(step="dt"),
-            r"^time_step is 5000 s, 500000 of the rod's steps of 0.01 s; was it given in ms\?$": moved(
-                step=5000.0
-            ),
-            r"^a rod has no input 'tip_fource'; did you mean 'tip_force'\?$": moved(tip_fource=(0, 0, 0)),
-            r"^a rod has no input 'obstacle_pose'; it needs a contact scene: Rod\(robot, contact=": moved(
-                obstacle_pose={}
-            ),
-            r"^tip_force holds a value that is not finite": moved(tip_force=(0, np.nan, 0)),
-        }
-    }
-)
+BAD_INPUT = {
+    (
+        r"^base_pose has shape \(3,\); it must be \(7,\), "
+        r"position \[m\] and quaternion w x y z, world\.$"
+    ): moved((0, 0, 0)),
+    r"^base_twist has shape \(3,\); it must be \(6,\), velocity": moved(twist=(0, 0, 0)),
+    r"^base_pose has a quaternion of norm 2; it must be 1, as w x y z\.$": moved((0, 0, 0, 2, 0, 0, 0)),
+    r"^base_pose holds a value that is not finite": moved((np.nan, 0, 0, 1, 0, 0, 0)),
+    r"^base_twist holds a value that is not finite": moved(twist=(np.inf, 0, 0, 0, 0, 0)),
+    r"^base_pose is not an array of numbers; give \(7,\)": moved("here"),
+    r"^time_step is -0.01 s; the length of the engine's step must be positive and finite\.$": moved(
+        step=-0.01
+    ),
+    r"^time_step is 'dt'; give the length of the engine's step": moved(step="dt"),
+    r"^time_step is 5000 s, 500000 of the rod's steps of 0.01 s; was it given in ms\?$": moved(step=5000.0),
+    r"^a rod has no input 'tip_fource'; did you mean 'tip_force'\?$": moved(tip_fource=(0, 0, 0)),
+    r"^a rod has no input 'obstacle_pose'; it needs a contact scene: Rod\(robot, contact=": moved(
+        obstacle_pose={}
+    ),
+    r"^tip_force holds a value that is not finite": moved(tip_force=(0, np.nan, 0)),
+}
+
+
+@refusals({InputError: BAD_INPUT})
 def test_bad_input_moves_nothing(stepped, error, sentence, call):
     before = stepped.snapshot()
     with pytest.raises(error, match=sentence):
@@ -381,40 +376,37 @@ def two_in_one_world():
     return ContactScene(obstacles=[box((1, 1, 1), name="b", position=(9, 0, 0))], worlds=[0, 0])
 
 
-@refusals(
-    {
-        InputError: {
-            r"^the rod has no state yet; call advance or settle first\.$": lambda r: Rod(r).state,
-            r"^the rod has no state yet": lambda r: Rod(r).capsules,
-            r"^3 capsules for 10 points of a segment; give a divisor of the points\.$": lambda r: Rod(
-                r, capsules_per_segment=3
-            ),
-            (
-                r"^contact is 'x'; give "
-                r"fastrod.contact.ContactScene\(obstacles=\[\.\.\.\]\) or None\.$"
-            ): lambda r: Rod(r, contact="x"),
-            (
-                r"^n_robots is True; give how many rods there are, or None for one "
-                r"without a robot axis\.$"
-            ): lambda r: Rod(r, n_robots=True),
-            r"^dt is 0 s; it must be a number, positive and finite\.$": lambda r: Rod(r, dt=0),
-            r"^ContactScene.worlds puts several rods into one world": lambda r: Rod(
-                r, n_robots=2, contact=two_in_one_world()
-            ),
-            r"^base_pose has shape \(4, 7\); it must be \(7,\) or \(2, 7\)": lambda r: Rod(
-                r, n_robots=2
-            ).advance(np.tile(HOME, (4, 1)), STILL, 0.01),
-        },
-        RobotError: {
-            r"^robot is \[.*; give one Robot, for example fastrod.load_robot\('prototype'\)\.$": lambda r: (
-                Rod([r, r], n_robots=2)
-            ),
-            r"^robot is '.*; give one Robot, for example fastrod.load_robot\('prototype'\)\.$": lambda r: Rod(
-                "prototype", n_robots=2
-            ),
-        },
-    }
-)
+NO_ROD = {
+    r"^the rod has no state yet; call advance or settle first\.$": lambda r: Rod(r).state,
+    r"^the rod has no state yet": lambda r: Rod(r).capsules,
+    r"^3 capsules for 10 points of a segment; give a divisor of the points\.$": lambda r: Rod(
+        r, capsules_per_segment=3
+    ),
+    r"^contact is 'x'; give fastrod.contact.ContactScene\(obstacles=\[\.\.\.\]\) or None\.$": lambda r: Rod(
+        r, contact="x"
+    ),
+    r"^n_robots is True; give how many rods there are, or None for one without a robot axis\.$": lambda r: (
+        Rod(r, n_robots=True)
+    ),
+    r"^dt is 0 s; it must be a number, positive and finite\.$": lambda r: Rod(r, dt=0),
+    r"^ContactScene.worlds puts several rods into one world": lambda r: Rod(
+        r, n_robots=2, contact=two_in_one_world()
+    ),
+    r"^base_pose has shape \(4, 7\); it must be \(7,\) or \(2, 7\)": lambda r: Rod(r, n_robots=2).advance(
+        np.tile(HOME, (4, 1)), STILL, 0.01
+    ),
+}
+NO_ROBOT = {
+    r"^robot is \[.*; give one Robot, for example fastrod.load_robot\('prototype'\)\.$": lambda r: Rod(
+        [r, r], n_robots=2
+    ),
+    r"^robot is '.*; give one Robot, for example fastrod.load_robot\('prototype'\)\.$": lambda r: Rod(
+        "prototype", n_robots=2
+    ),
+}
+
+
+@refusals({InputError: NO_ROD, RobotError: NO_ROBOT})
 def test_what_no_rod_can_be_is_a_sentence(error, sentence, call):
     with pytest.raises(error, match=sentence):
         call(soft_robot())

@@ -203,23 +203,20 @@ def test_shipped_policies_are_small_and_fit_their_environment(name: str) -> None
     assert sum(path.stat().st_size for path in folder.iterdir()) < 1_000_000
 
 
-@refusals(
-    {
-        UnknownNameError: {
-            "did you mean 'ppo'": lambda folder: make_plan("Reach", algorithm="pp0"),
-            "did you mean 'Reach'": lambda folder: make_plan("Reech"),
-        },
-        InputError: {
-            "no option 'n_step'; did you mean 'n_steps'": lambda folder: make_plan(
-                "Reach", options={"n_step": 3}
-            ),
-            "n_envs is 0": lambda folder: make_plan("Reach", n_envs=0),
-            "curriculum is 2": lambda folder: make_plan("Reach", curriculum=2),
-            "no configuration of a training": resume,
-        },
-        FastrodError: {"holds no policy": lambda folder: find("Reach", str(folder / "nowhere"))},
-    }
-)
+NO_NAMES = {
+    "did you mean 'ppo'": lambda folder: make_plan("Reach", algorithm="pp0"),
+    "did you mean 'Reach'": lambda folder: make_plan("Reech"),
+}
+BAD_INPUT = {
+    "no option 'n_step'; did you mean 'n_steps'": lambda folder: make_plan("Reach", options={"n_step": 3}),
+    "n_envs is 0": lambda folder: make_plan("Reach", n_envs=0),
+    "curriculum is 2": lambda folder: make_plan("Reach", curriculum=2),
+    "no configuration of a training": resume,
+}
+NO_POLICY = {"holds no policy": lambda folder: find("Reach", str(folder / "nowhere"))}
+
+
+@refusals({UnknownNameError: NO_NAMES, InputError: BAD_INPUT, FastrodError: NO_POLICY})
 def test_wrong_plans_are_refused_in_a_sentence(tmp_path, error, sentence, call):
     with pytest.raises(error, match=sentence):
         call(tmp_path)
