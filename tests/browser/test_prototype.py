@@ -15,6 +15,7 @@ from subprocess import PIPE, Popen
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from pages import DRIVE
 from windows import PATIENCE, Window
@@ -142,7 +143,7 @@ def test_a_person_drives_it_and_the_page_shows_what_it_says(bed: Bed, window: Wi
     bed.bend(seen, "End")
     assert seen.until(lambda: bed.page.teleop.arrived and bool(bed.link.change()[0] < -7.9e-3))
     # 61 degrees are the most whole ones that 8 mm of tendon are good for, at 7.5 mm from the backbone
-    np.testing.assert_allclose(bed.link.change(), 0.0075 * np.radians([-61.0, 0.0, 61.0, 0.0]), atol=1e-4)
+    assert_allclose(bed.link.change(), 0.0075 * np.radians([-61.0, 0.0, 61.0, 0.0]), atol=1e-4)
     for words in (
         "The robot follows commands.",
         "marker seen",
@@ -190,7 +191,7 @@ def test_stop_stands_at_once_and_go_on_moves_nothing(bed: Bed, window: Windows) 
     bed.go_on(seen)
     assert seen.until(lambda: not bed.page.session.stopped)
     assert bed.stands(seen)
-    np.testing.assert_allclose(bed.link.change(), there, atol=5e-5)
+    assert_allclose(bed.link.change(), there, atol=5e-5)
     assert bed.page.teleop.bent(0)[0] == pytest.approx(-there[0] / 0.0075, abs=0.01)
     bed.bend(seen, "Home")
     assert seen.until(lambda: bool(bed.link.change()[0] > there[0] + 2e-4))
@@ -259,7 +260,7 @@ def test_nothing_moves_when_nobody_watches(bed, window, how, monkeypatch):
     assert bed.says(other, "nobody watches the robot any more")
     bed.bend(other, "End")
     assert bed.stands(other)
-    np.testing.assert_allclose(bed.link.change(), there, atol=STANDS)
+    assert_allclose(bed.link.change(), there, atol=STANDS)
     bed.go_on(other)
     assert other.until(lambda: not bed.page.session.stopped)
 
@@ -281,7 +282,7 @@ def test_a_recording_has_the_cameras_sightings_by_the_robots_clock(bed, window, 
     rate = load_hardware().camera.rate
     assert len(log) > 8
     # each frame once, by the clock that cycles count
-    np.testing.assert_allclose(np.diff(log.t), 1.0 / rate, atol=0.011)
+    assert_allclose(np.diff(log.t), 1.0 / rate, atol=0.011)
     assert 0.0 <= log.t[0] < 0.2
     assert log.dl[-1, 0] == pytest.approx(-0.0075 * np.radians(20.0), abs=1e-4)
     # an arc of 20 degrees and 70 mm ends 12 mm beside its base

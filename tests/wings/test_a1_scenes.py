@@ -4,6 +4,7 @@ import sys
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from fastrod.model.segment_actions import SegmentActions
 from fastrod_scenes.a1 import look, push
@@ -50,8 +51,8 @@ def test_neck_stands_on_the_head_with_its_axes_as_stated():
     pose, trunk = mount.motion().pose, world.getBasePositionAndOrientation(mount.body)
     axes = np.array(world.getMatrixFromQuaternion(np.roll(pose[3:], -1).tolist())).reshape(3, 3)
     # the trunk stands level to that
-    np.testing.assert_allclose(axes[:, 2], [np.cos(0.5), 0.0, np.sin(0.5)], atol=0.01)
-    np.testing.assert_allclose(axes[:, 1], [0.0, -1.0, 0.0], atol=0.01)
+    assert_allclose(axes[:, 2], [np.cos(0.5), 0.0, np.sin(0.5)], atol=0.01)
+    assert_allclose(axes[:, 1], [0.0, -1.0, 0.0], atol=0.01)
     assert np.abs(pose[:2] - np.array(trunk[0])[:2] - MOUNT[:2]).max() < 0.02
     assert max(abs(v) for v in world.getBaseVelocity(mount.body)[0]) < 0.01
     world.disconnect()
@@ -68,5 +69,5 @@ def test_gait_of_the_neck_is_a_sine():
             - np.cumsum(stage.gait(t)["extension"])[robot.tendon_segment]
         )
         each = np.linalg.lstsq(bends, pulled, rcond=None)[0] / stage.actions.offset
-        np.testing.assert_allclose(each, push.SWING / 3 * np.sin(push.RATE * t - np.pi / 2), atol=1e-12)
+        assert_allclose(each, push.SWING / 3 * np.sin(push.RATE * t - np.pi / 2), atol=1e-12)
     stage.close()

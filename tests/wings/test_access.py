@@ -12,6 +12,7 @@ from subprocess import PIPE, Popen
 import msgspec.msgpack
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 pytest.importorskip("viser", reason="viser is not installed: pip install 'fastrod[viewer]'")
 
@@ -385,7 +386,7 @@ def test_two_pages_do_not_drive_at_once_and_either_stops(app: App, monkeypatch: 
     two.key("Bend toward +x")
     two.put(page.run, "Reset")
     assert until(lambda: other.value == 0.0 and bend.value == 20.0)  # they go back
-    np.testing.assert_array_equal(link.read().dl, before)
+    assert_array_equal(link.read().dl, before)
     answered(two)  # the one that may not drive stops
     assert link.stopped
     two.press(page.go_on)

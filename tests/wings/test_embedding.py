@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bullets import soft_robot
+from numpy.testing import assert_allclose
 
 import fastrod.hosts
 from fastrod.contact import ContactScene, plane
@@ -89,7 +90,7 @@ def test_rod_hangs_on_the_spring_with_its_weight_and_turns_it_with_its_moment(em
     state = rod.state
     middle = np.trapezoid(state.position[0], state.arclength[0], axis=0) / robot.length - body.position
     expected = np.cross(middle, [0.0, 0.0, -weight]) / 40.0
-    np.testing.assert_allclose(2.0 * np.arcsin(0.5 * body.vector()), expected, rtol=2e-3, atol=1e-6)
+    assert_allclose(2.0 * np.arcsin(0.5 * body.vector()), expected, rtol=2e-3, atol=1e-6)
     assert rod.time == pytest.approx(round(2.0 / dt) * dt)
 
 
@@ -99,7 +100,7 @@ def test_impulse_of_the_tip_force_is_the_bodys_momentum(embedded_step) -> None:
     force = np.array([0.02, 0.01, -0.03])
     for _ in range(100):
         embedded_step(rod, body, np.array([0.0, 0.02, 0.03]), 0.005, tip_force=force)
-    np.testing.assert_allclose(body.mass * body.velocity, 0.5 * force, rtol=1e-6)
+    assert_allclose(body.mass * body.velocity, 0.5 * force, rtol=1e-6)
     assert np.linalg.norm(body.spin) > 0.01  # and turns it
 
 
@@ -126,7 +127,7 @@ def test_tilted_body_feels_the_torque_in_its_own_frame(embedded_step) -> None:
     rotation = matrix_from_quaternion(np.array([[half, half, 0.0, 0.0]]))[0]
     embedded_step(rod, body, offset, 0.001)
     moment = rotation.T @ (rod.wrench[3:] + np.cross(rotation @ offset, rod.wrench[:3]))
-    np.testing.assert_allclose(rotation.T @ body.spin, 0.001 * moment / body.inertia, rtol=1e-9, atol=1e-15)
+    assert_allclose(rotation.T @ body.spin, 0.001 * moment / body.inertia, rtol=1e-9, atol=1e-15)
     assert np.abs(moment).max() > 0.05
 
 

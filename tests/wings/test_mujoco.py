@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 from bullets import clearance_of, soft_robot
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals
 from scipy.spatial.transform import Rotation
 
@@ -71,7 +72,7 @@ def test_joints_feel_the_wrench_through_the_transposed_jacobian(seed):
     expected = np.concatenate([by_point, by_angle]).T @ rod.wrench
     assert np.abs(data.qvel - start).max() > 0.0
     assert np.abs(expected).max() > 0.1
-    np.testing.assert_allclose(felt, expected, atol=1e-8 * np.abs(expected).max())
+    assert_allclose(felt, expected, atol=1e-8 * np.abs(expected).max())
 
 
 def test_motion_of_the_base_is_the_derivative_of_its_pose():
@@ -83,9 +84,9 @@ def test_motion_of_the_base_is_the_derivative_of_its_pose():
         return link.motion().pose
 
     after, before, now = pose(h), pose(-h), (pose(0.0), link.motion())[1]
-    np.testing.assert_allclose((after - before)[:3] / (2 * h), now.velocity[:3], atol=1e-8)
+    assert_allclose((after - before)[:3] / (2 * h), now.velocity[:3], atol=1e-8)
     end, start = (Rotation.from_quat(np.roll(pose[3:], -1)) for pose in (after, before))
-    np.testing.assert_allclose((end * start.inv()).as_rotvec() / (2 * h), now.velocity[3:], atol=1e-8)
+    assert_allclose((end * start.inv()).as_rotvec() / (2 * h), now.velocity[3:], atol=1e-8)
 
 
 def test_motion_is_that_of_the_joints_now_and_not_of_the_last_steps_start():
@@ -95,7 +96,7 @@ def test_motion_is_that_of_the_joints_now_and_not_of_the_last_steps_start():
     data.qvel[0] = 2.0
     mujoco.mj_step(model, data)
     assert data.xpos[1, 0] == 0.0
-    np.testing.assert_allclose(MujocoBody(model, data, "cart").motion().pose[:3], [0.01, 0.0, 0.0])
+    assert_allclose(MujocoBody(model, data, "cart").motion().pose[:3], [0.01, 0.0, 0.0])
 
 
 def test_forces_of_others_stay_and_the_rods_own_go():
@@ -112,15 +113,15 @@ def test_forces_of_others_stay_and_the_rods_own_go():
     before, both = data.qvel[:3].copy(), others[:3] + np.array([1.0, 2.0, 0.0])
     for rod, force in zip(rods, ((1.0, 0.0, 0.0), (0.0, 2.0, 0.0)), strict=True):
         rod.begin(tip_force=force)
-    np.testing.assert_allclose(data.xfrc_applied[cart, :3], both, atol=1e-7)
+    assert_allclose(data.xfrc_applied[cart, :3], both, atol=1e-7)
     mujoco.mj_step(model, data)
     for rod in rods:
         rod.end()
-    np.testing.assert_allclose(data.qvel[:3] - before, 0.005 * both, atol=1e-9)
-    np.testing.assert_allclose(data.xfrc_applied[cart], others, atol=1e-15)
+    assert_allclose(data.qvel[:3] - before, 0.005 * both, atol=1e-9)
+    assert_allclose(data.xfrc_applied[cart], others, atol=1e-15)
     rods[0].step()
     rods[0].step()
-    np.testing.assert_allclose(data.xfrc_applied[cart], others, atol=1e-15)
+    assert_allclose(data.xfrc_applied[cart], others, atol=1e-15)
     rods[0].begin()
     data.xfrc_applied[:] = 0.0  # somebody clears everything
     rods[0].end()
@@ -164,7 +165,7 @@ def test_every_geom_is_an_obstacle_where_it_is():
             ends.append(mujoco.mj_geomDistance(model, data, *geoms, 1.0, None))
         assert min(ends) > 0.0
         assert 0.0 < clearance <= min(ends) + 1e-5
-        np.testing.assert_allclose(contact.com().pose[:3], com_motion(model, data, body).pose[:3])
+        assert_allclose(contact.com().pose[:3], com_motion(model, data, body).pose[:3])
 
 
 def stand(ball=BALL, **options):
@@ -184,10 +185,10 @@ def test_contacts_of_the_capsules_are_read_back():
     felt = rod.felt
     assert set(felt.body) == {model.body("ball").id}
     # the ball rests, so the rod bears what presses it; at the height of its middle, on the rod's surface
-    np.testing.assert_allclose(felt.force.sum(0), [-0.05, 0.0, 0.0], atol=1e-4)
-    np.testing.assert_allclose(rod.contact_force.sum(0), felt.force.sum(0))
-    np.testing.assert_allclose(felt.arclength, 0.15, atol=2e-3)
-    np.testing.assert_allclose(felt.point[:, 0], 0.012, atol=1e-3)
+    assert_allclose(felt.force.sum(0), [-0.05, 0.0, 0.0], atol=1e-4)
+    assert_allclose(rod.contact_force.sum(0), felt.force.sum(0))
+    assert_allclose(felt.arclength, 0.15, atol=2e-3)
+    assert_allclose(felt.point[:, 0], 0.012, atol=1e-3)
     assert (np.abs(rod.wrench) < 1e-9).all()  # the rod itself knows nothing of it
 
 
@@ -228,9 +229,9 @@ def test_step_that_fails_in_contact_leaves_the_felt_force_and_nothing_of_its_own
         patch.setattr(rod.simulator, "_state", lost)
         patch.setattr(rod.simulator, "_warm", np.array([False]))
         rod.step()
-    np.testing.assert_array_equal(rod._feedback.force, force)
+    assert_array_equal(rod._feedback.force, force)
     assert not data.xfrc_applied[post].any()
-    np.testing.assert_array_equal(data.xfrc_applied[ball], [-0.05, 0, 0, 0, 0, 0])
+    assert_array_equal(data.xfrc_applied[ball], [-0.05, 0, 0, 0, 0, 0])
     assert rod.step().ok[0]
 
 
@@ -287,7 +288,7 @@ def test_rod_stands_on_the_world_too():
     add_capsules(spec, robot, "world")
     model = spec.compile()
     rod = MujocoRod(robot, model, mujoco.MjData(model), 0, position=(0.1, 0.2, 0.3))
-    np.testing.assert_allclose(rod.step().position[0, 0], [0.1, 0.2, 0.3])
+    assert_allclose(rod.step().position[0, 0], [0.1, 0.2, 0.3])
     assert rod.wrench[2] == pytest.approx(-0.5 * 0.2 * 9.81)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_GRAVITY
     rod.step()
@@ -302,7 +303,7 @@ def test_servos_hold_the_arm_where_it_is_commanded():
     arm.place(q)
     for _ in range(50):
         mujoco.mj_step(model, data)
-    np.testing.assert_allclose(arm.position(), q, atol=1e-9)  # its weight is balanced
+    assert_allclose(arm.position(), q, atol=1e-9)  # its weight is balanced
     assert np.abs(arm.torque()).max() < 1e-4
     with pytest.raises(
         InputError, match=rf"^q is \[0, 0\]; give 6 finite numbers, one for each of {JOINTS[0]}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'fastrod[hosts]'")
 
@@ -52,12 +53,12 @@ def test_the_held_cube_has_its_weight(scene: type[PickSuction | PickGripper]) ->
             found.append(pull(stage))
             assert stage.world.getDynamicsInfo(stage.cube, -1)[0] == 0.1
         if stage.phase.name == "carry":
-            np.testing.assert_allclose(stage.state.tip_position[0], stage.tip[0], atol=1e-6)
+            assert_allclose(stage.state.tip_position[0], stage.tip[0], atol=1e-6)
             break
         before = rate
     assert len(needed) == 70
     assert np.ptp(needed) > 0.2
-    np.testing.assert_allclose(found[5:], needed[5:], rtol=0.01)  # the first steps take it off the table
+    assert_allclose(found[5:], needed[5:], rtol=0.01)  # the first steps take it off the table
 
 
 def test_without_suction_nothing_is_lifted(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@ input."""
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'fastrod[hosts]'")
 
@@ -42,7 +43,7 @@ def test_the_bar_begins_behind_the_cube(name, begun):
     _, cell = begun(name)
     course = cell.course
     behind = course.place[0] - course.size / 2 - course.thickness - course.gap
-    np.testing.assert_allclose(cell.tip, [behind, course.place[1], course.height], atol=1e-3)
+    assert_allclose(cell.tip, [behind, course.place[1], course.height], atol=1e-3)
     assert 0.5 * course.size < course.height < course.size
 
 
@@ -107,10 +108,10 @@ def test_the_bar_does_not_enter_the_floor(name, begun):
 def test_goals_fill_their_rectangle_and_gather_in_its_middle_when_it_is_easy(name, begun):
     for draws, corner in ((np.zeros(5), "least"), (np.ones(5), "largest")):
         task, cell = begun(name, draws)
-        np.testing.assert_allclose(cell.desired, getattr(cell.course, corner))
+        assert_allclose(cell.desired, getattr(cell.course, corner))
         task.set_difficulty(0.0)
         task.begin(np.array([0]), draws[None])
-        np.testing.assert_allclose(cell.desired, 0.5 * (np.array(cell.course.least) + cell.course.largest))
+        assert_allclose(cell.desired, 0.5 * (np.array(cell.course.least) + cell.course.largest))
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -131,7 +132,7 @@ def test_pictures_show_goal_and_cube_and_leave_the_world_as_it_is(name, begun):
             red, green, blue = picture.astype(int).transpose(2, 0, 1)
             assert ((red > 2 * blue) & (red > 2 * green)).any()
             assert ((blue > 1.5 * red) & (blue > green)).any()
-    np.testing.assert_array_equal(seen[0], seen[1])
+    assert_array_equal(seen[0], seen[1])
 
 
 @pytest.mark.parametrize("name", TASKS)

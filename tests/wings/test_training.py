@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 pytest.importorskip(
     "stable_baselines3", reason="stable-baselines3 is not installed: pip install 'fastrod[rl]'"
@@ -104,7 +105,7 @@ def test_a_training_that_is_killed_goes_on_from_its_checkpoint(tmp_path: Path, a
         observation, *_ = env.step(env.baseline())
     model = algorithm_class(algorithm).load(path, device="cpu")
     expected, _ = model.predict(observation, deterministic=True)
-    np.testing.assert_allclose(Policy(run).act(observation), expected, atol=2e-5)
+    assert_allclose(Policy(run).act(observation), expected, atol=2e-5)
 
 
 def test_resume_takes_more_steps(tmp_path: Path) -> None:
@@ -170,15 +171,15 @@ def test_the_adapter_tells_what_stable_baselines_asks_for() -> None:
     twin = BatchEnv("Reach", num_envs=4, n_steps=3)
     expected, _ = twin.reset(seed=7)
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (3, 4, 11))
-    np.testing.assert_array_equal(env.reset(), expected)
+    assert_array_equal(env.reset(), expected)
     for k in range(3):
         observation, reward, done, infos = env.step(actions[k])
         own = twin.step(actions[k])
-        np.testing.assert_array_equal(observation, own[0])
-        np.testing.assert_allclose(reward, own[1], rtol=1e-6)
+        assert_array_equal(observation, own[0])
+        assert_allclose(reward, own[1], rtol=1e-6)
         assert done.all() == (k == 2)
     for i in range(4):
-        np.testing.assert_array_equal(infos[i]["terminal_observation"], own[4]["final_obs"][i])
+        assert_array_equal(infos[i]["terminal_observation"], own[4]["final_obs"][i])
         assert infos[i]["TimeLimit.truncated"] is True
         assert infos[i]["episode"]["l"] == 3
     assert env.env_method("set_difficulty", 0.5) == [None] * 4
