@@ -1,7 +1,5 @@
 """The same world in PyBullet and in MuJoCo: a rod on a body that is moved by hand, cubes, a floor."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

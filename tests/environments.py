@@ -1,7 +1,5 @@
 """What one environment did, alone or beside others."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 

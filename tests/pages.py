@@ -1,8 +1,6 @@
 """`RawPage`: a page of the viewer without a browser, which sends what a page of viser sends, or anything
 else."""
 
-from __future__ import annotations
-
 import sys
 import threading
 import time

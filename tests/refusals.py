@@ -1,7 +1,5 @@
 """`refusals`: a test of many sentences, each with the call that it answers."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

@@ -1,8 +1,6 @@
 """One rod on one UR5 in PyBullet and in MuJoCo: its tip and the wrench on the flange, at rest, hanging and
 pushed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 

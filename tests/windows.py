@@ -1,7 +1,5 @@
 """`Window`: one page of the viewer in a browser, as a person uses it."""
 
-from __future__ import annotations
-
 import io
 import re
 import time

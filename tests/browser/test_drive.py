@@ -1,8 +1,6 @@
 """Driving a robot in a real browser: sliders, drag, keys, scenes, stop, and what happens when a page is
 closed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The emulated prototype in a real browser: driven, stopped, released, left alone, recorded."""
 
-from __future__ import annotations
-
 import contextlib
 import queue
 import re

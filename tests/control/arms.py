@@ -1,7 +1,5 @@
 """A serial arm that shares no code with the package: chain of homogeneous matrices."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

@@ -1,8 +1,6 @@
 """Plans by learning: without effects they are the nearest points of the workspace; with effects the tip still
 goes there."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from typing import Any

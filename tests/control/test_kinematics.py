@@ -1,8 +1,6 @@
 """The tip on a base: analytic Jacobian against differences of the settled tip, frames, control that closes
 the loop, refusals."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

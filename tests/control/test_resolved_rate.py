@@ -1,7 +1,5 @@
 """Resolved rates against numpy's pseudo-inverse, and their limits."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

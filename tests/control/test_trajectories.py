@@ -1,7 +1,5 @@
 """The paths: velocity is the slope of position, and sizes are what their options say."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -4,8 +4,6 @@ names it, the seal is opened.
 Statistics over hundreds of logs are in perf/bench_attribution.py; here is one log of each kind.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import cache

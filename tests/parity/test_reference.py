@@ -1,7 +1,5 @@
 """The slow twins against the truth files, against each other and against closed forms."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What a test opens is closed after it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from typing import Any

@@ -1,7 +1,5 @@
 """Access to a page, its websocket and its controls: strangers, nonsense, too many, and two at once."""
 
-from __future__ import annotations
-
 import re
 import signal
 import socket

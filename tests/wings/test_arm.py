@@ -1,8 +1,6 @@
 """`BulletArm` and the UR5 that ships: kinematics against the published table, statics against PyBullet,
 motors against the clock."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,8 +1,6 @@
 """Tasks with arms in PyBullet worlds: episodes that depend on their draws alone, baselines that solve them,
 geometry against PyBullet's."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

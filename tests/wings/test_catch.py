@@ -1,7 +1,5 @@
 """Catch: arcs against the simulator, the target's path, the load that nobody sees, and seeds."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,8 +1,6 @@
 """The page on embedding runs as it stands, and its recipe keeps to physics on an engine with conventions of
 its own."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import re

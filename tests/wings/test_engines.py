@@ -1,7 +1,5 @@
 """The same rod, host and cubes in PyBullet and in MuJoCo keep to the same physics."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

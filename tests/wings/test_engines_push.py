@@ -1,7 +1,5 @@
 """A rod pushes cubes in PyBullet and in MuJoCo, and both engines keep momentum, friction and energy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from bullets import soft_robot

@@ -1,7 +1,5 @@
 """What an environment can be told: its options, randomised robots, difficulty, and how it is shown."""
 
-from __future__ import annotations
-
 import re
 import sys
 import urllib.request

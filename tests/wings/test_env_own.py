@@ -1,8 +1,6 @@
 """Tasks and robots of users: a package with one file and one entry point, a class without either, a robot
 file."""
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Iterator

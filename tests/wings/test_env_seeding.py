@@ -1,8 +1,6 @@
 """The same seed gives the same rollout, bit for bit: whatever stands beside an environment, and whatever
 happened in it before."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium

@@ -1,7 +1,5 @@
 """What every registered task owes to Gymnasium and to its users, whatever it is about."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Evaluation: whose episodes they are, what the figures mean, what is written."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The exported page: whole, offline, and with our words in it."""
 
-from __future__ import annotations
-
 import socket
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """No episode ends as lost while `settle` can solve the robot."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,8 +1,6 @@
 """Adapters of the measured sets: units, frames, order, on a few rows in the published form; and on the sets
 where they are there."""
 
-from __future__ import annotations
-
 import math
 import os
 from pathlib import Path

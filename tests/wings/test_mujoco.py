@@ -1,7 +1,5 @@
 """A MuJoCo body carries a rod: what its joints feel, whose forces are whose, what the capsules meet."""
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 

@@ -1,8 +1,6 @@
 """A UR5 with a soft robot picks and places a cube: from other starts, with its weight; and the check fails
 where it must."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose

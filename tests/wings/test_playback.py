@@ -1,8 +1,6 @@
 """Playback: the same figures as `replay`, the true shape behind every predicted tip, and a clock without
 pauses."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from importlib.resources import as_file, files

@@ -1,7 +1,5 @@
 """`Rod`: any engine's base in, capsules and wrench out, on a clock of its own."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """TubeInsert: the tube's geometry, forces on its wall, what ends an episode, and seeds."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,8 +1,6 @@
 """What `fastrod train --set` takes: the settings of an algorithm, answered with the nearest name before
 anything is made."""
 
-from __future__ import annotations
-
 import inspect
 import re
 

@@ -1,8 +1,6 @@
 """The paper's class on fastrod's model: every method, and the faults of the paper's own code that it must not
 have."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Callable, Iterator

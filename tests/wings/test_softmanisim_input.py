@@ -1,7 +1,5 @@
 """The paper's class on fastrod's model: bad input gets one sentence, and leaves nothing behind."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from typing import Any

@@ -1,7 +1,5 @@
 """Goals become motion within limits; sessions run, stop and record; all without a browser."""
 
-from __future__ import annotations
-
 import time
 from typing import Any
 

@@ -1,8 +1,6 @@
 """Training on stable-baselines3: a small one to its end, one that is broken off and goes on, and what is
 written."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,8 +1,6 @@
 """The box that a soft robot explores, and the fork that carries two: what the scenes' own checks leave
 open."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`fastrod view`: ports, hosts and names, right and wrong, without a browser."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import os
