@@ -7,8 +7,7 @@ import pytest
 
 
 def refusals(tables: Mapping[type[Exception], Mapping[str, Callable[..., Any]]]) -> pytest.MarkDecorator:
-    """Parametrise a test by the error, the sentence (a pattern), and the call; the sentence is the case's
-    name."""
+    """Parametrise a test by error, sentence (a pattern) and call; the sentence names the case."""
     return pytest.mark.parametrize(
         ("error", "sentence", "call"),
         [

@@ -1,5 +1,4 @@
-"""One rod on one UR5 in PyBullet and in MuJoCo: its tip and the wrench on the flange, at rest, hanging and
-pushed."""
+"""One rod on one UR5 in PyBullet and in MuJoCo: its tip and the wrench on the flange."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple

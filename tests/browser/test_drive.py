@@ -1,5 +1,4 @@
-"""Driving a robot in a real browser: sliders, drag, keys, scenes, stop, and what happens when a page is
-closed."""
+"""Driving a robot in a real browser: sliders, drag, keys, scenes, stop, and a page that is closed."""
 
 from collections.abc import Callable
 

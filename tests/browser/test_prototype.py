@@ -33,8 +33,7 @@ STANDS = 2e-5  # m of a tendon: what noise of the plant and the drives' regulato
 
 
 class Paced:
-    """The emulated prototype in stepped time, a cycle every 10 ms at most: however busy the machine is, no
-    cycle of its own is late."""
+    """The emulated prototype in stepped time: on the busiest machine no cycle of its own is late."""
 
     real = True
 

@@ -1,5 +1,4 @@
-"""Plans by learning: without effects they are the nearest points of the workspace; with effects the tip still
-goes there."""
+"""Plans by learning: the nearest points of the workspace, and with effects the tip still goes there."""
 
 from dataclasses import replace
 from functools import cache

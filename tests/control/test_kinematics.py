@@ -1,5 +1,4 @@
-"""The tip on a base: analytic Jacobian against differences of the settled tip, frames, control that closes
-the loop, refusals."""
+"""The tip on a base: its Jacobian against differences of the settled tip, frames, closed loops, refusals."""
 
 from typing import Any
 

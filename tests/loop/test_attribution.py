@@ -126,8 +126,7 @@ def test_without_the_true_effect_no_sibling_is_called_the_explanation() -> None:
 
 @pytest.mark.parametrize("effect", ["latency", "gravity"])
 def test_the_identified_robot_predicts_what_the_report_says(effect: str, tmp_path: Path) -> None:
-    """Written, read, and replayed by itself: the error on held-out rows is `after`, to the rod's step of
-    settling."""
+    """Written, read and replayed: the error on held-out rows is `after`, to the rod's step of settling."""
     result = found(effect)
     paths = {path.name: path for path in report.write(result, tmp_path)}
     again = load_robot(paths["identified.toml"])
@@ -252,8 +251,7 @@ def test_a_log_that_cannot_tell_anything_is_refused_in_a_sentence(case: str) -> 
 
 
 def test_neighbouring_columns_that_are_swapped_explain_nothing() -> None:
-    """Half of the motion is as predicted, so it is not refused; but no effect of the library is made of
-    it."""
+    """Half of the motion is as predicted, so it is not refused; but no effect is made of it."""
     result = identify(other([1, 0, 2, 3]), robot(), threads=1)
     assert result.verdict == "not_in_library"
     assert list(result.effects) == []

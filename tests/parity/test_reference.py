@@ -169,8 +169,7 @@ def test_collocation_agrees_with_shooting_on_a_chain() -> None:
 
 
 def test_constant_curvature_is_an_arc() -> None:
-    """Lengths of an arc of angle a toward d1: l_i = l - a offset cos b_i; tip at l/a (1 - cos a, 0, sin
-    a)."""
+    """An arc of angle a toward d1: l_i = l - a offset cos b_i; tip at l/a (1 - cos a, 0, sin a)."""
     angle = 1.2
     robot, length = prototype(*(-angle * 0.0075 * np.cos(np.arange(4) * np.pi / 2.0)))
     shape = constant_curvature(robot, length)

@@ -370,8 +370,7 @@ def test_two_pages_do_not_drive_at_once_and_either_stops(app: App, monkeypatch: 
     one, two = RawPage(app), RawPage(app)
 
     def answered(by: RawPage) -> None:
-        """All that this page has sent before was dealt with: a stop from it, and from the other, is what
-        comes after."""
+        """All that this page sent before was dealt with: its stop, after the other's, comes last."""
         by.press(page.stop)
         assert until(lambda: page.session.stopped)
 

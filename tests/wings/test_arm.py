@@ -158,8 +158,7 @@ def cranked(tmp_path: Path) -> str:
 
 
 def test_a_body_of_any_shape(world: Bullet, cranked: str) -> None:
-    """Tilted frames of mass, axes of any direction, a slide, a fixed joint on the way, a joint without
-    limits."""
+    """Tilted frames of mass, axes of any direction, a slide, a fixed joint, a joint without limits."""
     arm = BulletArm.load(
         world, cranked, tip="hand", position=(1.0, 2.0, 3.0), quaternion=(0.8, 0.0, 0.6, 0.0)
     )

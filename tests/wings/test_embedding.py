@@ -1,5 +1,4 @@
-"""The page on embedding runs as it stands, and its recipe keeps to physics on an engine with conventions of
-its own."""
+"""The page on embedding runs as it stands, and its recipe keeps to physics on an engine of its own."""
 
 import contextlib
 import io

@@ -14,8 +14,7 @@ pytestmark = pytest.mark.parametrize("stage", list(ENGINES.values()), ids=list(E
 
 
 def push(stage, dt, direction, gravity, duration=0.8, mass=MASS, place=None):
-    """A rod along x is carried against a cube; the cube's velocity along the way, its momentum, the host's
-    impulse."""
+    """Carry a rod along x against a cube: the cube's speed along it, its momentum, the host's impulse."""
     cubes, floor = [Cube(SIZE, mass, place or END[direction], 1.0)], -SIZE / 2 if gravity else None
     s = stage(soft_robot(), dt=dt, gravity=gravity, cubes=cubes, floor=floor)
     s.rod.settle()

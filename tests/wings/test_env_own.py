@@ -1,5 +1,4 @@
-"""Tasks and robots of users: a package with one file and one entry point, a class without either, a robot
-file."""
+"""Tasks and robots of users: a package with an entry point, a class without one, a robot file."""
 
 import re
 import sys

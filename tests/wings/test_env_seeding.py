@@ -1,5 +1,4 @@
-"""The same seed gives the same rollout, bit for bit: whatever stands beside an environment, and whatever
-happened in it before."""
+"""The same seed gives the same rollout, bit for bit, whatever stands beside it and came before it."""
 
 from typing import Any
 

@@ -112,8 +112,7 @@ def test_a_pull_at_the_edge_of_the_cube_is_in_the_last_cell(tmp_path: Path) -> N
 
 
 def test_robots_say_what_is_not_known_of_them(tmp_path: Path) -> None:
-    """Free are the numbers that nobody publishes: identification may move them, and the frame, but not what
-    is published."""
+    """Identification may move the numbers that nobody publishes, and the frame, but not what is published."""
     (_, trunk), (_, tdcr) = asl_trunk(asl_file(tmp_path)), armlab_tdcr(armlab_file(tmp_path))
     free = {robot.name: [u.name for u in base_model(robot).unknowns] for robot in (trunk, tdcr)}
     tendons = {f"tendon.{k}.{what}" for k in range(1, 7) for what in ("gain", "zero")}

@@ -1,5 +1,4 @@
-"""A UR5 with a soft robot picks and places a cube: from other starts, with its weight; and the check fails
-where it must."""
+"""A UR5 with a soft robot picks and places any cube, with its weight; the check fails where it must."""
 
 import numpy as np
 import pytest
@@ -26,8 +25,7 @@ def test_any_cube_ends_on_the_spot(scene: type[PickSuction | PickGripper], seed:
 
 
 def pull(stage: Picking) -> float:
-    """Force that the robot holds the cube up with [N]: of the suction, or of friction and squeeze in all
-    contacts of the cube."""
+    """Force that holds the cube up [N]: of the suction, or of friction and squeeze in all its contacts."""
     b = stage.world
     if not stage.fingers:
         return -float(b.getConstraintState(b.getConstraintUniqueId(0))[2])
@@ -40,8 +38,7 @@ def pull(stage: Picking) -> float:
 
 @pytest.mark.parametrize("scene", [PickSuction, PickGripper])
 def test_the_held_cube_has_its_weight(scene: type[PickSuction | PickGripper]) -> None:
-    """What holds it up is m (g + a), a by differences of its velocity, and it has the mass that it was
-    given."""
+    """What holds it up is m (g + a), a by differences of its velocity; its mass is the given one."""
     stage = scene(Cube(mass=0.1)).stage()
     before, needed, found = 0.0, [], []
     for _ in scene().play(stage):

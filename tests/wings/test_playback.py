@@ -1,5 +1,4 @@
-"""Playback: the same figures as `replay`, the true shape behind every predicted tip, and a clock without
-pauses."""
+"""Playback: the figures of `replay`, the true shape behind every predicted tip, a clock without pauses."""
 
 import json
 from dataclasses import replace

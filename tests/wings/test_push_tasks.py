@@ -1,5 +1,4 @@
-"""Push and QuadrupedPush: mechanics of the bar and the cube, exact episodes, what the baseline reaches, wrong
-input."""
+"""Push and QuadrupedPush: mechanics of bar and cube, what the baseline reaches, wrong input."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,4 @@
-"""What `fastrod train --set` takes: the settings of an algorithm, answered with the nearest name before
-anything is made."""
+"""What `fastrod train --set` takes: an algorithm's settings, checked before anything is made."""
 
 import inspect
 import re

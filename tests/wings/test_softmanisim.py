@@ -1,5 +1,4 @@
-"""The paper's class on fastrod's model: every method, and the faults of the paper's own code that it must not
-have."""
+"""The paper's class on fastrod's model: every method, without the faults of the paper's own code."""
 
 import logging
 import math
@@ -79,8 +78,7 @@ def test_the_straight_robot_points_along_y_and_bends_as_in_the_paper(make):
 
 
 def test_orientations_are_those_of_the_backbone(make):
-    """z of each quaternion is the tangent, to the order of central differences; the whole bend is
-    displacement over offset."""
+    """z of each quaternion is the tangent, by central differences; the bend is displacement over offset."""
     sim = make(number_of_sphere=200)
     rng = np.random.default_rng(3)
     for _ in range(3):
@@ -191,8 +189,7 @@ def test_the_marker_is_only_seen(make):
 
 @pytest.mark.parametrize("dt", STEPS)
 def test_a_cube_takes_the_speed_of_what_pushes_it(make, dt):
-    """In the step of the first contact the head may be one step's way inside: the engine takes out a fifth of
-    it a step, as speed."""
+    """The head may begin one step's way inside: the engine takes out a fifth of it a step, as speed."""
     sim = make(dt=dt, gravity=0.0, max_grasp_width=0.0)
     cube = sim.add_a_cube([0, 0.3 + 0.0225 + 0.02 + 0.01, 0], size=[0.04] * 3)
     seen = []

@@ -1,5 +1,4 @@
-"""The box that a soft robot explores, and the fork that carries two: what the scenes' own checks leave
-open."""
+"""The box that a soft robot explores, and the fork that carries two: what the scenes' checks leave open."""
 
 from itertools import combinations
 
@@ -31,8 +30,7 @@ def test_corners_are_eight_and_their_cubes_lie_in_them() -> None:
 
 
 def test_walls_leave_the_entry_open_and_nothing_else() -> None:
-    """Rays along x at the front wall: those within the octagon pass, those outside do not; a box without an
-    entry stops all."""
+    """Rays along x at the front wall pass within the octagon alone; a box without an entry stops all."""
     at = np.random.default_rng(30).uniform(-0.09, 0.09, (400, 2))
     turned = np.abs(np.concatenate([at, (at @ [[1.0, 1.0], [-1.0, 1.0]]) / np.sqrt(2.0)], axis=1)).max(axis=1)
     for box in (Box(), Box(entry=0.0)):

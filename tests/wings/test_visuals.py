@@ -1,5 +1,4 @@
-"""What the bodies of a PyBullet world look like: the triangles stand where PyBullet's own camera sees
-them."""
+"""What a PyBullet world looks like: the triangles stand where PyBullet's own camera sees them."""
 
 import numpy as np
 import pytest
@@ -37,8 +36,7 @@ def corners(visuals):
 
 
 def picture_bounds(world, body, eye=(0.9, -1.1, 1.6), target=(0.1, 0.1, 1.0)):
-    """Least and largest pixel (column, row) that shows the body, and the function that projects points to
-    pixels."""
+    """Least and largest pixel (column, row) that shows the body, and what projects points to pixels."""
     view = np.reshape(world.computeViewMatrix(eye, target, (0, 0, 1)), (4, 4)).T
     projection = np.reshape(world.computeProjectionMatrixFOV(FOV, WIDTH / HEIGHT, 0.05, 10.0), (4, 4)).T
     matrices = view.T.ravel().tolist(), projection.T.ravel().tolist()

@@ -1,5 +1,4 @@
-"""The worlds that the viewer shows: they play and obey commands, and a command has the effect that physics
-gives it."""
+"""The worlds that the viewer shows play and obey commands, and a command does what physics says."""
 
 import sys
 from dataclasses import replace
