@@ -1,10 +1,11 @@
 """Worlds and robots that the tests of hosts share."""
 
 import numpy as np
+from rods import rod
 
 from fastrod.contact import ContactScene
 from fastrod.hosts import BulletLink, connect
-from fastrod.model.robot import Robot, Segment, Tendon
+from fastrod.model.robot import Robot
 from fastrod.simulator import Simulator
 
 HALF = np.sqrt(0.5)
@@ -12,18 +13,9 @@ ROTATION = {"z": (1.0, 0.0, 0.0, 0.0), "x": (HALF, 0.0, HALF, 0.0), "-z": (0.0, 
 """Of the base with the rod along a world axis, w x y z."""
 
 
-def soft_robot(n_segments=2, line_density=0.0, extension=(0.0, 0.0)):
-    tendons = tuple(Tendon(offset=0.0075, angle=k * np.pi / 2) for k in range(4))
-    segment = Segment(
-        length=0.1,
-        bending_stiffness=(0.0022, 0.0022),
-        torsional_stiffness=0.001,
-        body_radius=0.012,
-        line_density=line_density,
-        extension=extension,
-        tendons=tendons,
-    )
-    return Robot(name="soft", segments=(segment,) * n_segments)
+def soft_robot(n_segments=2, **segment):
+    own = rod(length=0.1, body_radius=0.012, **segment).segments[0]
+    return Robot(name="soft", segments=(own,) * n_segments)
 
 
 def empty_world(dt=0.005, gravity=0.0):

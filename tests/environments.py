@@ -14,10 +14,15 @@ from fastrod_envs.vector import BatchEnv
 NAMES = fastrod_envs.names()
 
 
-def batch(name: str, n: int = 2, **options: Any) -> BatchEnv:
-    """Environments on one thread; skips where the task's host is not installed."""
+def needed(name: str) -> None:
+    """Skip where the task's host is not installed."""
     if task_class(name).hosted:
         pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'fastrod[hosts]'")
+
+
+def batch(name: str, n: int = 2, **options: Any) -> BatchEnv:
+    """Environments on one thread."""
+    needed(name)
     return BatchEnv(name, n, **{"threads": 1, **options})
 
 
@@ -62,3 +67,11 @@ def alone(env: Any, given: Iterable[np.ndarray], seed: int) -> Rollout:
 def assert_same(one: Rollout, other: Rollout) -> None:
     for a, b in zip(one, other, strict=True):
         assert_array_equal(a, b)
+
+
+def to_the_end(env: Any) -> Any:
+    """The last step of an episode of the baseline; of several environments, the first that ends."""
+    while True:
+        step = env.step(env.baseline())
+        if np.any(step[2] | step[3]):
+            return step

@@ -6,7 +6,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from environments import NAMES, drawn
+from environments import NAMES, drawn, needed
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from numpy.testing import assert_allclose, assert_array_equal
@@ -24,19 +24,17 @@ SIZES = {"Catch": (20, 6), "TubeInsert": (28, 5)}
 
 @pytest.fixture
 def single(opened):
-    """Makes one environment on one thread; skips where the task's host is not installed."""
+    """Makes one environment on one thread."""
 
     def make(name: str, **options: Any) -> gymnasium.Env[Any, Any]:
-        if task_class(name).hosted:
-            pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'fastrod[hosts]'")
+        needed(name)
         return opened(gymnasium.make(f"fastrod/{name}-v0", threads=1, **options))
 
     return make
 
 
 def several(name: str, n: int, **options: Any) -> BatchEnv:
-    if task_class(name).hosted:
-        pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'fastrod[hosts]'")
+    needed(name)
     env = gymnasium.make_vec(f"fastrod/{name}-v0", num_envs=n, threads=1, **options)
     assert isinstance(env, BatchEnv)
     return env

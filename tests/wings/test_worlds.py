@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from rods import rod
 
-from fastrod import Robot, Segment, Tendon, load_robot, robot_names, save_robot
+from fastrod import load_robot, robot_names, save_robot
 from fastrod.errors import HostError, InputError, RobotError, UnknownNameError
 from fastrod.rotation import matrix_from_quaternion, quaternion_from_vector
 from fastrod_scenes import load, names
@@ -26,16 +27,9 @@ def still(world, **options):
 
 def heavy(mode="tendon_length"):
     """A level, heavy robot of one segment."""
-    tendons = tuple(Tendon(offset=0.0075, angle=k * np.pi / 2) for k in range(4))
-    segment = Segment(
-        length=0.2,
-        bending_stiffness=(0.01, 0.01),
-        torsional_stiffness=0.008,
-        line_density=0.3,
-        mode=mode,
-        tendons=() if mode == "passive" else tendons,
-    )
-    return Robot(name="heavy", segments=(segment,), base_quaternion=(np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0))
+    level = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)
+    material = {"bending_stiffness": (0.01, 0.01), "torsional_stiffness": 0.008, "line_density": 0.3}
+    return replace(rod(mode, length=0.2, **material), name=f"heavy, {mode}", base_quaternion=level)
 
 
 @pytest.fixture
