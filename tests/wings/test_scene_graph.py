@@ -81,8 +81,7 @@ def check(batches):
     return batches
 
 
-# -- the rod
-# ----------------------------------------------------------------------------------------------------
+# the rod
 
 
 def test_pieces_of_an_arc_lie_on_the_arc():
@@ -146,8 +145,7 @@ def test_tip_is_at_the_tip():
     assert_allclose(tip.scale, 0.012)
 
 
-# -- what sits on it
-# ----------------------------------------------------------------------------------------------------
+# what sits on it
 
 
 @pytest.mark.parametrize("name", ["prototype", "tdcr_a", "tdcr_b", "five_segment_reacher"])
@@ -207,8 +205,7 @@ def test_robot_without_tendons_is_its_body():
     assert "no tendons" in legend(rods, options, picture).html()
 
 
-# -- frames
-# ----------------------------------------------------------------------------------------------------
+# frames
 
 
 @pytest.mark.parametrize(
@@ -282,8 +279,7 @@ def test_robot_that_was_never_there_is_straight():
     assert_allclose(found["body"].position[:, 2], (np.arange(40) + 0.5) * 0.07 / 40, atol=1e-7)
 
 
-# -- colours
-# ----------------------------------------------------------------------------------------------------
+# colours
 
 
 def test_segments_have_colours_of_their_own():
@@ -364,8 +360,7 @@ def test_pushing_rod_is_violet_and_tension_has_two_sides():
     assert (shown["body"].color == palette.BODY).all()
 
 
-# -- arrows
-# ----------------------------------------------------------------------------------------------------
+# arrows
 
 
 def test_contact_arrow_begins_on_the_wall_and_points_off_it():
@@ -448,8 +443,7 @@ def test_ball_that_is_nowhere_has_no_size():
     assert_allclose(found.scale[:, 0], [0.01, 0.0])
 
 
-# -- meshes, places, words
-# ----------------------------------------------------------------------------------------------------
+# meshes, places, words
 
 
 @pytest.mark.parametrize(
