@@ -39,12 +39,8 @@ class Paced:
 
     def __init__(self, setup: EmulatedBench) -> None:
         self.prototype = made = setup.prototype
-        self.robot, self.supervisor, self.clock, self.source = (
-            made.robot,
-            made.supervisor,
-            made.clock,
-            made.source,
-        )
+        self.robot, self.supervisor = made.robot, made.supervisor
+        self.clock, self.source = made.clock, made.source
         self.command, self.read, self.stop = made.command, made.read, made.stop
         self.recorder_for, self.record = made.recorder_for, made.record
         self.requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()

@@ -138,15 +138,9 @@ def test_the_loop_closes_on_a_point_that_can_be_reached(base: Any, q_base: list[
     goal = tip.place(np.array([*q_base, *ACTION]) + 0.3e-2, settle=True, **load).tip_position[0]
     q = np.array([*q_base, 0.01, 0.002, 0.0, 0.01, -0.001, 0.001])
     tip.place(q, settle=True, **load)
-    control = ResolvedRate(
-        gain=5.0,
-        damping=1e-3,
-        weight=[1.0] * n + [25.0] * 6,
-        rate=[1.0] * n + [0.05] * 6,
-        error_limit=0.02,
-        lower=[-7.0] * n + low.tolist(),
-        upper=[7.0] * n + high.tolist(),
-    )
+    limits = {"lower": [-7.0] * n + low.tolist(), "upper": [7.0] * n + high.tolist(), "error_limit": 0.02}
+    costs = {"weight": [1.0] * n + [25.0] * 6, "rate": [1.0] * n + [0.05] * 6}
+    control = ResolvedRate(gain=5.0, damping=1e-3, **costs, **limits)
     for _ in range(400):
         q = q + 0.01 * control.rates(q, tip.jacobian(), goal - tip.position, np.zeros(3), 0.01)
         tip.place(q, **load)

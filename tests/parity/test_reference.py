@@ -15,6 +15,11 @@ from fastrod.model.robotfile import load_robot
 from fastrod.reference import constant_curvature, shoot, solve_bvp
 
 EI, LENGTH = 0.0022, 0.07
+LOADS: dict[str, Any] = {
+    "tip_force": (0.1, 0.2, -0.1),
+    "point_force": [(0.03, (0.3, 0.0, 0.0))],
+    "follower_tip_force": (0.1, 0.0, 0.2),
+}
 
 # The truth files hold 1e-12 m; the integrator's rtol of 1e-9 over a rod of 0.1 to 0.4 m leaves 1e-11 m of
 # each.
@@ -123,31 +128,21 @@ def test_elastica(load: float, deflection: float, method: Any) -> None:
 
 def test_methods_and_integrators_agree() -> None:
     robot, length = prototype()
-    loads: dict[str, Any] = {
-        "tip_force": (0.1, 0.2, -0.1),
-        "point_force": [(0.03, (0.3, 0.0, 0.0))],
-        "follower_tip_force": (0.1, 0.0, 0.2),
-    }
-    best = shoot(robot, length, **loads)
+    best = shoot(robot, length, **LOADS)
     for name, others, tolerance in (
         ("method", ("slsqp", "trust-constr"), 3e-9),  # each stops below 1e-9 m at the boundary
         ("integrator", ("RK45", "LSODA"), 1e-8),  # lower orders at the same rtol: more local errors add up
     ):
         for value in others:
-            other = shoot(robot, length, **loads, **{name: value})
+            other = shoot(robot, length, **LOADS, **{name: value})
             assert other.success, other.message
             assert_allclose(other.position, best.position, rtol=0, atol=tolerance)
 
 
 def test_collocation_agrees_with_shooting() -> None:
     robot, length = prototype()
-    loads: dict[str, Any] = {
-        "tip_force": (0.1, 0.2, -0.1),
-        "tip_moment": (0.001, 0.0, 0.0005),
-        "line_force": [[(0.0, 0.0, 0.0), (0.0, 2.0, 0.0), (1.0, 0.0, 0.0)]],
-        "point_force": [(0.03, (0.3, 0.0, 0.0))],
-        "follower_tip_force": (0.1, 0.0, 0.2),
-    }
+    line = [[(0.0, 0.0, 0.0), (0.0, 2.0, 0.0), (1.0, 0.0, 0.0)]]
+    loads = LOADS | {"tip_moment": (0.001, 0.0, 0.0005), "line_force": line}
     one, two = shoot(robot, length, **loads), solve_bvp(robot, length, **loads)
     assert one.success
     assert two.success, two.message

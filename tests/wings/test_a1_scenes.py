@@ -63,11 +63,9 @@ def test_gait_of_the_neck_is_a_sine():
     stage = push.NeckPush().stage()
     bends = SegmentActions(robot).matrix[: robot.n_tendons, 1::3]
     for t in (0.0, 0.3, 1.1):
-        pulled = (
-            stage.gait(t)["tendon_length"]
-            - robot.rest_tendon_length
-            - np.cumsum(stage.gait(t)["extension"])[robot.tendon_segment]
-        )
+        gait = stage.gait(t)
+        longer = np.cumsum(gait["extension"])[robot.tendon_segment]
+        pulled = gait["tendon_length"] - robot.rest_tendon_length - longer
         each = np.linalg.lstsq(bends, pulled, rcond=None)[0] / stage.actions.offset
         assert_allclose(each, push.SWING / 3 * np.sin(push.RATE * t - np.pi / 2), atol=1e-12)
     stage.close()

@@ -16,9 +16,8 @@ from fastrod_scenes.ur5.picking import Cube, Picking
 def test_any_cube_ends_on_the_spot(scene: type[PickSuction | PickGripper], seed: int) -> None:
     rng = np.random.default_rng(seed)
     start = np.array([0.5, -0.14]) + rng.uniform(-0.04, 0.04, 2)
-    cube = Cube(
-        (float(start[0]), float(start[1])), mass=rng.uniform(0.05, 0.1), friction=rng.uniform(0.4, 0.8)
-    )
+    place = (float(start[0]), float(start[1]))
+    cube = Cube(place, mass=rng.uniform(0.05, 0.1), friction=rng.uniform(0.4, 0.8))
     figures = scene(cube).check()
     assert figures["off the spot, m"] < scene.accuracy
     assert figures["displacement sideways, m"] == pytest.approx(0.16 - start[1], abs=2e-3)
@@ -29,11 +28,8 @@ def pull(stage: Picking) -> float:
     b = stage.world
     if not stage.fingers:
         return -float(b.getConstraintState(b.getConstraintUniqueId(0))[2])
-    return float(
-        sum(
-            p[9] * p[7][2] + p[10] * p[11][2] + p[12] * p[13][2] for p in b.getContactPoints(bodyA=stage.cube)
-        )
-    )
+    points = b.getContactPoints(bodyA=stage.cube)
+    return float(sum(p[9] * p[7][2] + p[10] * p[11][2] + p[12] * p[13][2] for p in points))
 
 
 @pytest.mark.parametrize("scene", [PickSuction, PickGripper])
