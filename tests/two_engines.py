@@ -66,16 +66,17 @@ def in_pybullet(case: str) -> tuple[Any, Callable[[], Any]]:
     if case in CASES[2:]:
         shape = world.createCollisionShape(world.GEOM_BOX, halfExtents=list(HALF))
         sprung = case == CASES[3]
-        link = dict.fromkeys(("linkPositions", "linkInertialFramePositions"), [[0.0, 0.0, 0.0]])
-        link |= dict.fromkeys(("linkOrientations", "linkInertialFrameOrientations"), [[0.0, 0.0, 0.0, 1.0]])
+        zero, level = [[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0, 1.0]]
+        link = {"linkPositions": zero, "linkInertialFramePositions": zero}
+        link |= {"linkOrientations": level, "linkInertialFrameOrientations": level}
         link |= {"linkMasses": [MASS if sprung else 0.0], "linkParentIndices": [0]}
         link |= {"linkCollisionShapeIndices": [shape], "linkVisualShapeIndices": [-1]}
         link |= {"linkJointTypes": [world.JOINT_PRISMATIC if sprung else world.JOINT_FIXED]}
         link |= {"linkJointAxis": [[0, 1, 0]]}
         block = world.createMultiBody(0.0, -1, -1, block_at().tolist(), **link)
         contact_bodies = [(block, 0)]
-    flange = BulletLink(world, arm.body, arm.tip, position=(0.0, 0.0, ADAPTER))
-    rod = MountedRod(carried()[0], flange, contact_bodies=contact_bodies, friction=0.0)
+    base = BulletLink(world, arm.body, arm.tip, position=(0.0, 0.0, ADAPTER))
+    rod = MountedRod(carried()[0], base, contact_bodies=contact_bodies, friction=0.0)
     given = inputs(case)
     if case == CASES[3]:
         world.setJointMotorControl2(block, 0, world.VELOCITY_CONTROL, force=0.0)
