@@ -38,7 +38,7 @@ class Rollout(NamedTuple):
     """(n,)"""
     endings: np.ndarray
     """(n,) bool"""
-    told: np.ndarray
+    reported: np.ndarray
     """(n, ...) what info says of every step under some key, the last of an episode included."""
 
 

@@ -9,7 +9,6 @@ from environments import batch, drawn
 from numpy.testing import assert_allclose, assert_array_equal
 
 import fastrod
-from fastrod.model.robot import Robot
 from fastrod.model.segment_actions import SegmentActions
 from fastrod_envs.tasks import catch
 from fastrod_envs.tasks.catch import Catch, arcs_jacobian, arcs_tip, directions, standing_robot
@@ -24,20 +23,15 @@ def begun(n: int, seed: int = 0, **options: Any) -> tuple[BatchEnv, Catch]:
     return env, env.task
 
 
-def stiff_wires() -> Robot:
-    """The same robot with wires that hardly stretch."""
+def test_arcs_are_the_unloaded_robot():
     robot = standing_robot()
     tendons = [tuple(replace(t, compliance=1e-9) for t in s.tendons) for s in robot.segments]
     segments = (replace(s, tendons=own) for s, own in zip(robot.segments, tendons, strict=True))
-    return replace(robot, segments=tuple(segments))
-
-
-def test_arcs_are_the_unloaded_robot():
+    stiff = replace(robot, segments=tuple(segments))
     displacement = np.random.default_rng(0).uniform(-0.8, 0.8, (6, 5)) * [0.012, 0.012, 0.012, 0.012, 0.02]
     actions = np.zeros((6, 6))
     actions[:, [1, 2, 4, 5, 3]] = displacement
-    wires = SegmentActions(standing_robot()).inputs(actions)
-    state = fastrod.Simulator(stiff_wires(), 6, points_per_segment=40).settle(**wires)
+    state = fastrod.Simulator(stiff, 6, points_per_segment=40).settle(**SegmentActions(robot).inputs(actions))
     assert_allclose(arcs_tip(displacement), state.tip_position, rtol=0, atol=1e-7)
 
 

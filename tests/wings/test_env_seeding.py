@@ -85,7 +85,7 @@ def test_a_seed_is_a_rollout_whatever_is_beside_it(name, steps, key, options, op
         assert_same(found, again)
     assert not np.array_equal(beside[0].observations, beside[1].observations)
     if key == "largest_force":
-        assert beside[2].told.max() > 0.0
+        assert beside[2].reported.max() > 0.0
 
 
 @pytest.mark.parametrize("name", ["Catch", "TubeInsert", "BoxExplore", "PickPlace", "DualArm"])

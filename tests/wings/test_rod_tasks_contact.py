@@ -78,7 +78,7 @@ def test_a_rolled_robot_sees_and_does_the_same_as_one_that_is_not():
     for _ in range(35):
         task.act(task.baseline())
     assert task.tip[0, 0] > 0.01
-    # three wires are not the same from every side
+    # three tendons are not the same from every side
     assert_allclose(task.tip[1], task.tip[0], rtol=0, atol=2e-4)
     first, second = task.state()
     assert_allclose(second[1:3], [np.cos(angle), -np.sin(angle)], atol=1e-12)
