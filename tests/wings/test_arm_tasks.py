@@ -5,13 +5,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from environments import to_the_end
 from numpy.testing import assert_allclose, assert_array_equal
 
 from fastrod.errors import InputError
 
 pytest.importorskip("pybullet", reason="pybullet is not installed: pip install 'fastrod[hosts]'")
 pytest.importorskip("gymnasium", reason="gymnasium is not installed: pip install 'fastrod[envs]'")
+
+from environments import to_the_end
 
 from fastrod_envs.single import SingleEnv
 from fastrod_envs.task import size
@@ -44,10 +45,8 @@ def single(opened):
     "randomise", [None, {"bending_stiffness": (0.9, 1.1), "backlash.half_width": (0.0, 1e-5)}]
 )
 def test_an_environment_of_a_batch_is_the_single_one_of_its_seed(name, randomise, single, opened):
-    batch, env = (
-        opened(BatchEnv(name, num_envs=3, threads=1, randomise=randomise)),
-        single(name, randomise=randomise),
-    )
+    batch = opened(BatchEnv(name, num_envs=3, threads=1, randomise=randomise))
+    env = single(name, randomise=randomise)
     seen, _ = batch.reset(seed=7)
     alone, _ = env.reset(seed=9)
     assert_array_equal(seen[2], alone)
