@@ -1,8 +1,6 @@
 """A real browser: Debian's chromium, driven by playwright. Where it is missing these tests skip, but for
 .ci/run, where they fail."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable, Iterator

@@ -1,13 +1,12 @@
 """Evaluation: whose episodes they are, what the figures mean, what is written."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 pytest.importorskip(
     "stable_baselines3", reason="stable-baselines3 is not installed: pip install 'fastrod[rl]'"
@@ -47,7 +46,7 @@ def test_episode_k_is_that_of_its_seed() -> None:
         trial = result.trials["baseline"]
         assert trial.distance[k] == pytest.approx(info["distance"], abs=1e-9)
         assert trial.returned[k] == pytest.approx(returned, abs=1e-6)
-        np.testing.assert_allclose(trial.desired[k], info["desired"], atol=0.0)
+        assert_allclose(trial.desired[k], info["desired"], atol=0.0)
 
 
 def test_correlation_is_of_axes_on_which_goals_differ() -> None:
