@@ -1,5 +1,4 @@
-"""The one runner of the benchmarks: takes times, prints tables for people and the same rows as JSON for
-programs.
+"""The one runner of the benchmarks: takes times, prints tables for people and the same rows as JSON.
 
 A benchmark is a file `bench_NAME.py` with `main = report.bench(__doc__, measure, ...)`; `measure` returns
 tables.
@@ -14,6 +13,7 @@ import math
 import os
 import platform
 import statistics
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -129,14 +129,11 @@ def machine() -> dict[str, str]:
     cpu = Path("/proc/cpuinfo")
     lines = cpu.read_text().splitlines() if cpu.exists() else []
     model = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
-    versions = (
-        f"Python {platform.python_version()}, numpy {numpy.__version__}, numba {numba.__version__}, "
-        f"scipy {scipy.__version__}"
-    )
+    libraries = ", ".join(f"{one.__name__} {one.__version__}" for one in (numpy, numba, scipy))
     return {
         "cpu": model or platform.processor() or platform.machine(),
         "cores": str(numba.config.NUMBA_NUM_THREADS),
-        "versions": versions,
+        "versions": f"Python {platform.python_version()}, {libraries}",
     }
 
 
@@ -200,6 +197,19 @@ def best(run: Callable[[], object], repeats: int) -> float:
     return alternate([run], repeats)[0].least
 
 
+def in_fresh_process(file: str, given: Any, **environment: str) -> Any:
+    """What a script prints as JSON, given this as JSON on its standard input."""
+    done = subprocess.run(
+        [sys.executable, file],
+        input=json.dumps(given),
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+        env={**os.environ, **environment},
+    )
+    return json.loads(done.stdout)
+
+
 Option = tuple[str, Any, str]
 """`--name`, its default (or a type, where there is none; False for a switch; a list of choices), and its
 help."""
@@ -208,12 +218,14 @@ help."""
 def bench(
     doc: str | None, measure: Callable[[argparse.Namespace], Sequence[Section]], *options: Option
 ) -> Callable[[Sequence[str] | None], int]:
-    """The `main` of a benchmark, with `--json`, `--quick` and these options."""
+    """The `main` of a benchmark, with `--json`, `--quick` and these options; where `measure` is of the script
+    that runs, its exit."""
 
     def main(argv: Sequence[str] | None = None) -> int:
         form = argparse.RawDescriptionHelpFormatter
         parser = argparse.ArgumentParser(description=doc, formatter_class=form)
-        for name, default, words in options:
+        common = ("--json", False, "print one JSON object and nothing else"), ("--quick", False, _QUICK)
+        for name, default, words in (*options, *common):
             if default is False:
                 parser.add_argument(name, action="store_true", help=words)
             elif isinstance(default, list):
@@ -225,22 +237,20 @@ def bench(
             else:
                 words += " (default: %(default)s)"
                 parser.add_argument(name, type=type(default), default=default, help=words)
-        return command(parser, argv, measure)
+        return _run(measure, parser.parse_args(argv))
 
+    if measure.__module__ == "__main__":
+        sys.exit(main())
     return main
 
 
-def command(
-    parser: argparse.ArgumentParser,
-    argv: Sequence[str] | None,
-    measure: Callable[[argparse.Namespace], Sequence[Section]],
-) -> int:
-    """Read a benchmark's command line, measure and print; the exit code."""
+_QUICK = "little of everything: figures mean little"
+
+
+def _run(measure: Callable[[argparse.Namespace], Sequence[Section]], options: argparse.Namespace) -> int:
+    """Measure and print; the exit code."""
     from fastrod.errors import FastrodError
 
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    parser.add_argument("--quick", action="store_true", help="little of everything: figures mean little")
-    options = parser.parse_args(argv)
     # other work on the machine spoils figures, of two threads first
     start, load = time.perf_counter(), os.getloadavg()[0]
     try:
