@@ -7,12 +7,10 @@ perf/bench_attribution.py --share 0.1   a tenth of them; --only single,none
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import multiprocessing
 import os
-import sys
 import time
 from collections import Counter
 from collections.abc import Iterable
@@ -217,7 +215,7 @@ def sections(rows: list[dict[str, Any]], processes: int) -> list[Section]:
     ]
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     os.environ |= {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     fraction = 0.0 if options.quick else options.share
     todo = cases(fraction, options.only.split(",") if options.only else [], options.first_seed)
@@ -241,5 +239,3 @@ main = bench(
     ("--processes", os.cpu_count() or 1, "at a time"),
     ("--rows", Path, "write one JSON line a log there"),
 )
-if __name__ == "__main__":
-    sys.exit(main())

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import argparse
 import math
-import sys
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -20,12 +18,9 @@ ERROR_TARGETS = {0.10: 0.2, 0.20: 0.9, 0.40: 3.0}
 """Root mean square error of the position [mm] by distance [m]."""
 LATENCY_TARGET, TIME_TARGET = 5.0, 4.0
 """[ms]."""
-TILTS = (0, 15, 30, 45, 60)
-"""[deg]."""
-FLIP = math.radians(5.0)
-"""From here on the wrong one of both solutions counts as a flip."""
-LOAD = 0.03
-"""On the tip while gates are tried [kg]."""
+TILTS = (0, 15, 30, 45, 60)  # [deg]
+FLIP = math.radians(5.0)  # from here on the wrong one of both solutions counts as a flip
+LOAD = 0.03  # on the tip while gates are tried [kg]
 KINDS = ("none", "backlash", "friction", "tendon_stretch", "creep", "gravity", "outside", "latency")
 
 
@@ -240,7 +235,7 @@ def times(repeats: int, distance: float) -> Row:
     return {"distance": 100.0 * distance, **took, "target": TIME_TARGET, "draw": 1e3 * drawn.median}
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     import cv2
 
     cv2.setNumThreads(1)
@@ -294,5 +289,3 @@ def measure(options: argparse.Namespace) -> list[Section]:
 
 
 main = bench(__doc__, measure)
-if __name__ == "__main__":
-    sys.exit(main())

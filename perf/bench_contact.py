@@ -83,8 +83,8 @@ def measure(options: Any) -> list[Section]:
             f"| target:,.0f target,~{MANY} threads | met",
             steps,
             f"{n} five-segment robots of 30 intervals, each bent its own way, its mesh in a place of its "
-            f"own; the free tip goes {1e3 * batch.travel:.2f} mm a step. Mean over the steps of a swing, each "
-            "the best of its rounds where time allowed several.",
+            f"own; the free tip goes {1e3 * batch.travel:.2f} mm a step. Mean over the steps of a swing, "
+            "each the best of its rounds where time allowed several.",
             "Grazing: the ball around the mesh leaves 2 mm to the free rod. In contact: it is 3 mm too near. "
             "In contact is the fraction of robot-steps; not ok counts robot-steps of both runs, the mesh's "
             "approach included.",

@@ -3,10 +3,8 @@ differences."""
 
 from __future__ import annotations
 
-import argparse
 import math
 import statistics
-import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -116,7 +114,7 @@ def follow(loop: Loop, jacobian: Callable[[], Any], steps: int) -> Row:
     return {"rate": 1.0 / total, "total_us": 1e6 * total, **times, "error_m": error, "steps": steps}
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     """The same loop with the analytic Jacobian and with finite differences."""
     loop, twin = Loop(), Loop()
     note_progress("the analytic Jacobian")
@@ -144,5 +142,3 @@ def measure(options: argparse.Namespace) -> list[Section]:
 
 
 main = bench(__doc__, measure)
-if __name__ == "__main__":
-    sys.exit(main())

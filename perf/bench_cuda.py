@@ -3,8 +3,6 @@ sentence."""
 
 from __future__ import annotations
 
-import argparse
-import sys
 from functools import partial
 from typing import Any
 
@@ -30,7 +28,7 @@ def case_of(key: str, n: int) -> Case:
     return next(case for case in cases.cases(n) if case.key == key)
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     """Both tables; without a GPU the second alone."""
     n_robots, absent = options.robots or (64 if options.quick else 1_000_000), ""
     try:
@@ -224,5 +222,3 @@ def work_section(rows: list[Row], absent: str) -> Section:
 main = bench(
     __doc__, measure, ("--robots", int, "prototypes; reachers are a fifth as many (1000000; 64 with --quick)")
 )
-if __name__ == "__main__":
-    sys.exit(main())

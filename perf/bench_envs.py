@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -159,7 +157,7 @@ def endurance_section(total: int) -> Section:
     )
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     if options.endurance:
         return [endurance_section(0 if options.quick else options.endurance)]
     return [reach_section(options.quick), task_section(options.quick)]
@@ -167,5 +165,3 @@ def measure(options: argparse.Namespace) -> list[Section]:
 
 words = "only this: so many random steps over all tasks, 1000000 say"
 main = bench(__doc__, measure, ("--endurance", 0, words))
-if __name__ == "__main__":
-    sys.exit(main())

@@ -7,10 +7,8 @@ machines
 
 from __future__ import annotations
 
-import argparse
 import math
 import statistics
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -45,16 +43,11 @@ TARGET = 60.0  # s for a million shapes on two cores
 class Costs(NamedTuple):
     """What the table of N machines is computed from, all measured here."""
 
-    task: float
-    """Of one worker for one shard, written [s]."""
-    start: float
-    """Until the first worker begins, the cluster being there [s]."""
-    dispatch: float
-    """Of the driver for one task [s]."""
-    check: float
-    """Of the driver at the end, a row [s]."""
-    bytes: float
-    """Of a row on the disk."""
+    task: float  # of one worker for one shard, written [s]
+    start: float  # until the first worker begins, the cluster being there [s]
+    dispatch: float  # of the driver for one task [s]
+    check: float  # of the driver at the end, a row [s]
+    bytes: float  # of a row on the disk
 
 
 def loaded(**options: Any) -> Shapes:
@@ -64,7 +57,7 @@ def loaded(**options: Any) -> Shapes:
     return Shapes(robot=dumps(replace(robot, segments=segments)), **options)
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     quick, ray = options.quick, find_spec("ray") is not None
     rows = 512 if quick else Plan(work=loaded(), count=1).shard_rows
     with tempfile.TemporaryDirectory(prefix="fastrod-bench-") as folder:
@@ -273,5 +266,3 @@ def million(folder: Path) -> Section:
 
 
 main = bench(__doc__, measure, ("--cores", 16, "of a machine, in the table of N machines"))
-if __name__ == "__main__":
-    sys.exit(main())

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -13,8 +11,7 @@ import numpy as np
 from report import Measurement, Row, Section, bench, note_progress, table
 
 DT = 0.005
-SIZE = 0.06
-"""Edge of the cube [m]."""
+SIZE = 0.06  # edge of the cube [m]
 
 
 def mounted(robot: str, mass: float, place: Sequence[float], gravity: float, touch: bool) -> tuple[Any, int]:
@@ -108,7 +105,7 @@ def engines(steps: int) -> list[Row]:
     return rows
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     steps = 10 if options.quick else 200
     return [
         table(
@@ -134,5 +131,3 @@ def measure(options: argparse.Namespace) -> list[Section]:
 
 
 main = bench(__doc__, measure)
-if __name__ == "__main__":
-    sys.exit(main())

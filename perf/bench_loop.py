@@ -6,8 +6,6 @@ anew and tracks. The seal is opened when the verdict is in.
 
 from __future__ import annotations
 
-import argparse
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -73,7 +71,7 @@ def _right(verdict: str, classes: dict[str, list[str]], sealed: list[str]) -> bo
     return first is not None and sealed[0] in (first[0], *first[1])
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     rows: list[Any] = []
     for seed in range(options.first_seed, options.first_seed + (1 if options.quick else options.seeds)):
         rows.append(_one(seed, options.effect, load=not options.no_load))
@@ -108,5 +106,3 @@ main = bench(
     ("--effect", str, "seal this one in all of them; none and outside too"),
     ("--no-load", False, "nothing known hangs on the tip, and the base stays upright"),
 )
-if __name__ == "__main__":
-    sys.exit(main())

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import argparse
 import resource
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -30,23 +28,17 @@ _TOLERANCE = 1e-9
 class Count:
     """What happened to the robots of one task."""
 
-    steps: int = 0
-    """Of environments."""
-    robots: int = 0
-    """Robot-steps of all simulators."""
+    steps: int = 0  # of environments
+    robots: int = 0  # robot-steps of all simulators
     settled: int = 0
     """Robot-steps without contact that took more than a step's passes: the pass diverged and `step`
     settled."""
-    lost: int = 0
-    """Robot-steps that were not ok, though their input could be used."""
-    solvable: int = 0
-    """Of those, which a new simulator settles on the same inputs."""
-    in_contact: int = 0
-    """Of the lost, those of a simulator whose rods feel contact."""
+    lost: int = 0  # robot-steps that were not ok, though their input could be used
+    solvable: int = 0  # of those, which a new simulator settles on the same inputs
+    in_contact: int = 0  # of the lost, those of a simulator whose rods feel contact
     solvable_in_contact: int = 0
     """Of those, which a new simulator settles: cold, so it may find a rod on the other side of a wall."""
-    ended: int = 0
-    """Episodes that ended as lost."""
+    ended: int = 0  # episodes that ended as lost
 
 
 @contextmanager
@@ -159,11 +151,10 @@ def endure(task: str, total: int) -> Row | None:
     return {"task": task, "steps": n * steps, **found}
 
 
-_FRACTION = {"Reach": 0.4, "Catch": 0.3, "Track": 0.2, "ReachObstacle": 0.08}
-"""Of all steps of `endure`."""
+_FRACTION = {"Reach": 0.4, "Catch": 0.3, "Track": 0.2, "ReachObstacle": 0.08}  # of all steps of `endure`
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     tasks = options.tasks or fastrod_envs.names()
     each = 4 if options.quick else -(-options.steps // (2 * len(tasks)))
     rows: list[Row] = []
@@ -195,5 +186,3 @@ main = bench(
     ("--tasks", (str,), "these alone"),
     ("--seed", 0, "of all"),
 )
-if __name__ == "__main__":
-    sys.exit(main())

@@ -5,7 +5,6 @@ fastrod bench measured             reads ../shared/data beside the checkout, or 
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 from collections.abc import Callable
@@ -28,8 +27,7 @@ sys.path.append(str(ROOT / "scenes"))
 from fastrod_scenes.measured import armlab_tdcr, asl_trunk, ethz_beam
 
 DATA = Path(os.environ.get("FASTROD_DATA", SHARED / "data"))
-Found = tuple[Row, list[str]]
-"""A row, and its notes."""
+Found = tuple[Row, list[str]]  # A row, and its notes
 
 
 def row(name: str, result: Result) -> Found:
@@ -134,7 +132,7 @@ def beam() -> list[Found]:
 SETS: dict[str, Callable[[], list[Found]]] = {"armlab": armlab, "beam": beam, "trunk": trunk}
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     if not DATA.is_dir():
         raise InputError(f"the measured sets are not at {str(DATA)!r}; set FASTROD_DATA to their folder.")
     found: list[Found] = []
@@ -156,5 +154,3 @@ def measure(options: argparse.Namespace) -> list[Section]:
 
 
 main = bench(__doc__, measure, ("--only", list(SETS), "this set alone"))
-if __name__ == "__main__":
-    sys.exit(main())

@@ -3,10 +3,9 @@ start."""
 
 from __future__ import annotations
 
-import argparse
-import sys
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -35,12 +34,10 @@ class Timed:
     case: Case
     forces: bool
     points: int
-    seconds: list[float]
-    """Of one step of the batch, on one thread and on several [s]."""
+    seconds: list[float]  # of one step of the batch, on one thread and on several [s]
     settled: TipError
     moving: TipError
-    travel: float
-    """Median displacement of the tip in one step [m]."""
+    travel: float  # median displacement of the tip in one step [m]
 
     @property
     def head(self) -> Row:
@@ -146,7 +143,7 @@ def arithmetic_section(rows: list[Timed], n_robots: int) -> Section:
     }
     made = []
     for row in rows:
-        tally = sum(tallies[row.forces][row.case.key].values(), flops.Tally())
+        tally = tallies[row.forces][row.case.key]
         slow = tally.divide + tally.root
         done = [n_robots / t for t in row.seconds]
         floor = (tally.instructions - slow) / fma + slow / divide
@@ -202,7 +199,7 @@ def cantilever_section() -> Section:
     )
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     """All tables, one after the other in this process (memory and start: in processes of their own)."""
     quick = options.quick
     n_robots = 256 if quick else 8192
@@ -221,5 +218,3 @@ def measure(options: argparse.Namespace) -> list[Section]:
 
 
 main = bench(__doc__, measure)
-if __name__ == "__main__":
-    sys.exit(main())

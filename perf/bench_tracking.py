@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -18,14 +16,10 @@ if TYPE_CHECKING:
 ERROR_TARGET, FRACTION_TARGET = 1e-6, 0.5
 """Mean squared error after the approach [m^2], and the soft robot's fraction of the motion."""
 SCENES = ("track_square", "track_circle", "track_figure_eight", "track_helix", "track_square_helix")
-POINTS = 40
-"""Of a period, for the soft robot's workspace."""
-DEPTHS = np.arange(0.02, 0.235, 0.01)
-"""Of a path's center below the base of the soft robot [m]."""
-SCALES = np.arange(1.0, 0.0, -0.05)
-"""Of a path."""
-NEAR = 1e-5
-"""A point this near is in the workspace [m]."""
+POINTS = 40  # of a period, for the soft robot's workspace
+DEPTHS = np.arange(0.02, 0.235, 0.01)  # of a path's center below the base of the soft robot [m]
+SCALES = np.arange(1.0, 0.0, -0.05)  # of a path
+NEAR = 1e-5  # A point this near is in the workspace [m]
 
 
 class Workspace:
@@ -143,7 +137,7 @@ def track(name: str, workspace: Workspace | None, dt: float | None, seconds: flo
     }
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     """The tracks, and the parts of the motion."""
     workspace = None if options.quick else Workspace()
     seconds = 2.5 if options.quick else None
@@ -182,5 +176,3 @@ def measure(options: argparse.Namespace) -> list[Section]:
 
 
 main = bench(__doc__, measure, ("--dt", float, "time step [s], by default the scenes'"))
-if __name__ == "__main__":
-    sys.exit(main())

@@ -6,7 +6,6 @@ for the whole check).
 
 from __future__ import annotations
 
-import argparse
 import os
 import shutil
 import subprocess
@@ -23,10 +22,8 @@ import numpy as np
 from fastrod.errors import InputError
 from report import Row, Section, bench, goal, note_progress, table
 
-PAGES = 5
-"""That come and go."""
-STAY = 12.0
-"""Of a page [s]."""
+PAGES = 5  # that come and go
+STAY = 12.0  # of a page [s]
 
 
 def check_installed() -> None:
@@ -185,7 +182,7 @@ def memory(minutes: float, port: int) -> list[Row]:
     return rows
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     check_installed()
     port, seconds = options.port, 3.0 if options.quick else 20.0
     note_progress("answer to a slider")
@@ -228,5 +225,3 @@ def measure(options: argparse.Namespace) -> list[Section]:
 
 
 main = bench(__doc__, measure, ("--minutes", 2.0, "of motion, for memory"), ("--port", 8471, "of the server"))
-if __name__ == "__main__":
-    sys.exit(main())

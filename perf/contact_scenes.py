@@ -73,7 +73,7 @@ def _encloses(point: Array, corners: Array) -> bool:
 
 def distances(obstacle: Obstacle, pose: Array, points: Array) -> Array:
     """(n,) signed distance of world points (n, 3) to an obstacle at a pose (7,): negative inside [m]."""
-    p = Rotation.from_quat(pose[3:], scalar_first=True).inv().apply(points - pose[:3])
+    p = Rotation.from_quat(pose[[4, 5, 6, 3]]).inv().apply(points - pose[:3])
     a, b, c = obstacle.size
     if obstacle.shape == "sphere":
         return np.asarray(np.linalg.norm(p, axis=1) - a)

@@ -1,5 +1,5 @@
-"""How much arithmetic an observer pass is: a child process, this module as a script, runs the kernels as plain
-Python, one lane wide, on numbers that count what is done with them.
+"""How much arithmetic an observer pass is: a process of its own, this module as a script, runs the kernels as
+plain Python, one lane wide, on numbers that count what is done with them.
 
 Each integration step costs the same, so with N >= 2 steps a segment operations(N) = operations(2) + (N - 2)
 (operations(3) - operations(2)) is exact. What the compiler saves by common subexpressions is not taken off,
@@ -49,8 +49,7 @@ class Tally(NamedTuple):
 class Counted(float):
     """A number that notes in `now`, by the fields of `Tally`, what is done with it."""
 
-    product = False
-    """Whether it is a product, which an addition would fuse with."""
+    product = False  # whether it is a product, which an addition would fuse with
     __array_ufunc__ = None  # a numpy number on the left leaves the operation to this class
     now = [0.0] * 5
 

@@ -10,7 +10,6 @@ number, which `--only K` reads again. Exit code 1 where any file was neither.
 
 from __future__ import annotations
 
-import argparse
 import math
 import multiprocessing
 import sys
@@ -116,7 +115,7 @@ def figures(outcomes: Sequence[Outcome]) -> list[Row]:
     return rows
 
 
-def measure(options: argparse.Namespace) -> list[Section]:
+def measure(options: Any) -> list[Section]:
     outcomes, count = [], 2 * len(KINDS) if options.quick else options.count
     for outcome in run(options.only or range(count), options.seed, options.workers):
         outcomes.append(outcome)
@@ -141,5 +140,3 @@ main = bench(
     ("--workers", 2, "processes"),
     ("--only", (int,), "these files alone, by number, each with what was said"),
 )
-if __name__ == "__main__":
-    sys.exit(main())

@@ -15,8 +15,7 @@ from fastrod import Simulator, State
 from report import Measurement, Row, Section, goal, note_progress, table, thread_counts
 from scipy_rod import Points, Run, Shooter, follow
 
-GOAL = 1e-4
-"""A full solve is one to this: a boundary residual [m], or more strictly the tip error [m]."""
+GOAL = 1e-4  # A full solve is one to this: a boundary residual [m], or more strictly the tip error [m]
 TARGET_RATIO = {"paper": 5000.0, "full": 1500.0}
 RESIDUAL_TARGET = 5e-5
 
@@ -29,8 +28,7 @@ class Path:
     case: Case
     fine: Simulator
     truth: State
-    points: int
-    """The fewest points per segment that keep `cases.TIP_ERROR` at every point."""
+    points: int  # the fewest points per segment that keep `cases.TIP_ERROR` at every point
     error: TipError
 
     def at(self, index: Any) -> tuple[dict[str, Any], Array]:
@@ -50,8 +48,7 @@ class Solved(NamedTuple):
     """Warm solves of a batch whose robots stand at all points of the path."""
 
     tolerance: float
-    seconds: list[float]
-    """Of one solve of the whole batch, on one and on several threads [s]."""
+    seconds: list[float]  # of one solve of the whole batch, on one and on several threads [s]
     passes: float
     error: TipError
 

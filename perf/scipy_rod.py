@@ -20,8 +20,7 @@ from cases import Array
 from fastrod import Robot
 from report import Measurement
 
-Tendons: TypeAlias = tuple[tuple[float, float, float], ...]
-"""Position d_x, d_y [m] and tension [N] of each."""
+Tendons: TypeAlias = tuple[tuple[float, float, float], ...]  # position d_x, d_y [m] and tension [N] of each
 Points: TypeAlias = Sequence[tuple[Array, Sequence[float], Array]]
 """Tendon lengths (4,) [m], tip force and line force (6) [N, N/m], true tip (3,) [m]."""
 N_TENDONS = 4
@@ -113,8 +112,7 @@ class Shooter:
     rtol: float = 1e-3
     atol: float = 1e-6
     """Of lengths [m]; of the rotation's entries this over the length, of curvature over its square."""
-    ftol: float = 1e-8
-    """Where the search ends, ftol and xtol of least_squares."""
+    ftol: float = 1e-8  # where the search ends, ftol and xtol of least_squares
     stop: float = 0.0
     """Largest boundary residual at which the search ends at once [m]; 0: only where least_squares itself
     ends."""
@@ -222,8 +220,7 @@ class _EnoughError(Exception):
 class Run(NamedTuple):
     """What a shooter took over stretches of points."""
 
-    cpu_s: float
-    """CPU time of one solve, mean over the points, best of the rounds [s]."""
+    cpu_s: float  # CPU time of one solve, mean over the points, best of the rounds [s]
     passes: float
     error_m: Array
 
