@@ -42,10 +42,7 @@ def measure(options: Any) -> list[Section]:
     for key, n in sizes.items() if not absent else ():
         note_progress(f"{key}, {n} robots")
         times += time_rows(case_of(key, n), n, points[key])
-    work = [
-        work_row(key, n, points[key], sum(tallies[key].values(), flops.Tally()).flops)
-        for key, n in sizes.items()
-    ]
+    work = [work_row(key, n, points[key], tallies[key].flops) for key, n in sizes.items()]
     return ([time_section(times)] if times else []) + [work_section(work, absent)]
 
 

@@ -19,7 +19,7 @@ SCENES = ("track_square", "track_circle", "track_figure_eight", "track_helix", "
 POINTS = 40  # of a period, for the soft robot's workspace
 DEPTHS = np.arange(0.02, 0.235, 0.01)  # of a path's center below the base of the soft robot [m]
 SCALES = np.arange(1.0, 0.0, -0.05)  # of a path
-NEAR = 1e-5  # A point this near is in the workspace [m]
+NEAR = 1e-5  # a point this near is in the workspace [m]
 
 
 class Workspace:

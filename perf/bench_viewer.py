@@ -1,8 +1,4 @@
-"""The viewer in a real browser: answer to a slider, load of the server, start, memory.
-
-Needs Debian's chromium and playwright. `--minutes` of motion with pages that come and go, for memory (10
-for the whole check).
-"""
+"""The viewer in a real browser: answer to a slider, load of the server, start, memory."""
 
 from __future__ import annotations
 
@@ -80,8 +76,7 @@ def wait_for_controls(page: Any, address: str, seconds: float = 120.0) -> None:
 
 @contextmanager
 def shown(*words: str, port: int) -> Iterator[tuple[Any, Any, str, Any, float]]:
-    """Chromium, the server's process, its address, a window with its controls, and the time that this took
-    [s]."""
+    """Chromium, the server's process, its address, a window with its controls, and the time it took [s]."""
     from windows import Window
 
     with browser() as chromium:
@@ -93,8 +88,7 @@ def shown(*words: str, port: int) -> Iterator[tuple[Any, Any, str, Any, float]]:
 
 
 def answers(presses: int) -> list[float]:
-    """From a key on a slider to the change of the simulator's state, each [s]; browser and server in one
-    machine, one page."""
+    """From a key on a slider to the change of the simulator's state, each [s]; one page."""
     from windows import Window
 
     from fastrod_viewer.app import App
@@ -137,7 +131,6 @@ def answers(presses: int) -> list[float]:
 
 
 def load(what: str, seconds: float, port: int) -> float:
-    """Per cent of a core that the server takes while its script plays for one page."""
     note_progress(f"load, {what}")
     with shown(what, "--play", port=port) as (_, process, *_):
         time.sleep(4.0)
@@ -148,7 +141,6 @@ def load(what: str, seconds: float, port: int) -> float:
 
 
 def start(port: int) -> float:
-    """From the command to a page with its controls [s], kernels from the cache, the browser open."""
     note_progress("start")
     with shown("five_segment_reacher", port=port) as (*_, taken):
         return taken
@@ -187,17 +179,13 @@ def measure(options: Any) -> list[Section]:
     port, seconds = options.port, 3.0 if options.quick else 20.0
     note_progress("answer to a slider")
     taken = 1e3 * np.array(answers(6 if options.quick else 60))
+    loads = [load(what, seconds, port) for what in ("five_segment_reacher", "grid")]
     rows = [
         ("slider to server state, median", float(np.median(taken)), "ms", 80.0),
         ("slider to server state, 95 %", float(np.quantile(taken, 0.95)), "ms", 150.0),
         ("page ready from `fastrod view`", start(port), "s", 5.0),
-        (
-            "server, one five-segment robot at 30 Hz",
-            load("five_segment_reacher", seconds, port),
-            "% of a core",
-            10.0,
-        ),
-        ("server, 64 five-segment robots at 30 Hz", load("grid", seconds, port), "% of a core", 60.0),
+        ("server, one five-segment robot at 30 Hz", loads[0], "% of a core", 10.0),
+        ("server, 64 five-segment robots at 30 Hz", loads[1], "% of a core", 60.0),
     ]
     found = memory(0.2 if options.quick else options.minutes, port)
     growth = 100.0 * (found[-1]["value"] / found[1 if len(found) > 1 else 0]["value"] - 1.0)
@@ -206,10 +194,7 @@ def measure(options: Any) -> list[Section]:
             "viewer",
             "The viewer, one page",
             "what | value:.3g measured | unit | target:g | met",
-            (
-                {"what": what, "value": value, "unit": unit, **goal(value, target)}
-                for what, value, unit, target in rows
-            ),
+            [{"what": what, "value": x, "unit": unit, **goal(x, target)} for what, x, unit, target in rows],
             f"{len(taken)} key presses on a slider. Chromium draws in software beside the server, on "
             f"{os.cpu_count()} cores.",
         ),

@@ -15,7 +15,7 @@ from fastrod import Simulator, State
 from report import Measurement, Row, Section, goal, note_progress, table, thread_counts
 from scipy_rod import Points, Run, Shooter, follow
 
-GOAL = 1e-4  # A full solve is one to this: a boundary residual [m], or more strictly the tip error [m]
+GOAL = 1e-4  # a full solve is one to this: a boundary residual [m], or more strictly the tip error [m]
 TARGET_RATIO = {"paper": 5000.0, "full": 1500.0}
 RESIDUAL_TARGET = 5e-5
 
