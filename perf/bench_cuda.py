@@ -1,5 +1,4 @@
-"""A large batch on a GPU beside the CPU; without a GPU: what a pass reads, writes and computes, and one
-sentence."""
+"""A large batch on a GPU beside the CPU; without a GPU: what a pass reads, writes and computes."""
 
 from __future__ import annotations
 
@@ -30,11 +29,7 @@ def case_of(key: str, n: int) -> Case:
 
 def measure(options: Any) -> list[Section]:
     """Both tables; without a GPU the second alone."""
-    n_robots, absent = options.robots or (64 if options.quick else 1_000_000), ""
-    try:
-        checked("cuda")
-    except InputError as missing:
-        absent = str(missing)
+    n_robots, absent = options.robots or (64 if options.quick else 1_000_000), without_gpu()
     sizes = {"prototype": n_robots, "reacher": max(1, n_robots // 5)}
     points = {key: points_of(key, 16 if options.quick else 256) for key in sizes}
     tallies = flops.count(points, False)
@@ -44,6 +39,15 @@ def measure(options: Any) -> list[Section]:
         times += time_rows(case_of(key, n), n, points[key])
     work = [work_row(key, n, points[key], tallies[key].flops) for key, n in sizes.items()]
     return ([time_section(times)] if times else []) + [work_section(work, absent)]
+
+
+def without_gpu() -> str:
+    """A sentence where there is none."""
+    try:
+        checked("cuda")
+    except InputError as missing:
+        return str(missing)
+    return ""
 
 
 def points_of(key: str, n: int) -> int:
@@ -113,14 +117,13 @@ def time_rows(case: Case, n: int, points: int) -> list[Row]:
         two = two or timed
         ratio = two.kernel / timed.kernel
         error = np.abs(timed.state.tip_position - two.state.tip_position)[two.state.ok]
-        rows.append(
-            {"robot": case.key, "robots": n, "points": points, "device": f"{device} {threads or ''}".strip()}
-            | {f"{stage}_ms": 1e3 * getattr(timed, stage) for stage in ("step", "kernel", "send", "fetch")}
-            | {"sent_bytes": timed.sent / n, "fetched_bytes": timed.fetched / n}
-            | {"step_ratio": two.step / timed.step, "kernel_ratio": ratio}
-            | (goal(ratio, _TARGET, least=True) if device == "cuda" else {})
-            | {"difference_m": float(error.max(initial=0.0)), "ok": float(timed.state.ok.mean())}
-        )
+        row: Row = {"robot": case.key, "robots": n, "points": points}
+        row |= {"device": f"{device} {threads or ''}".strip(), "ok": timed.state.ok.mean()}
+        row |= {f"{stage}_ms": 1e3 * getattr(timed, stage) for stage in ("step", "kernel", "send", "fetch")}
+        row |= {"sent_bytes": timed.sent / n, "fetched_bytes": timed.fetched / n}
+        row |= {"step_ratio": two.step / timed.step, "kernel_ratio": ratio}
+        row |= goal(ratio, _TARGET, least=True) if device == "cuda" else {}
+        rows.append(row | {"difference_m": error.max(initial=0.0)})
     return rows
 
 
@@ -156,13 +159,8 @@ def work_row(key: str, n_robots: int, points: int, operations: float) -> Row:
     def each(arrays: Any) -> float:
         return sum(a.nbytes for a in arrays if isinstance(a, np.ndarray) and len(a) == n > 1) / n
 
-    moved = (
-        each(ports)
-        + each(passes.params)
-        + 2.0 * each(passes.peek())
-        + each(passes.new_shape("tip", False))
-        + 8.0
-    )
+    moved = each(ports) + each(passes.params) + 2.0 * each(passes.peek()) + 8.0
+    moved += each(passes.new_shape("tip", False))
     n_tendons, n_columns = len(passes.layout.tendon_segment), passes.n_columns(ports)
     scratch = scratch_size(n_tendons, passes.n_x, n_columns, passes.n_residuals(ports))
     bandwidth, peak, name = device_limits()
@@ -174,9 +172,7 @@ def work_row(key: str, n_robots: int, points: int, operations: float) -> Row:
 
 def device_limits() -> tuple[float, float, str]:
     """Bytes and double-precision operations a second: copied and computed here, or of an H100."""
-    try:
-        checked("cuda")
-    except InputError:
+    if without_gpu():
         return *_H100, "H100 SXM, data sheet"
     from numba import cuda
 

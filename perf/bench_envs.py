@@ -8,6 +8,12 @@ from typing import Any
 
 import numpy as np
 
+import fastrod_envs
+from bench_lost import endure
+from fastrod.errors import HostError
+from fastrod_envs.registration import task_class
+from fastrod_envs.single import SingleEnv
+from fastrod_envs.vector import BatchEnv
 from report import Measurement, Row, Section, bench, best, note_progress, seconds, table, thread_counts
 
 SEED = 0
@@ -64,9 +70,6 @@ def reach_section(quick: bool) -> Section:
     """Reach in native batches, beside Gymnasium's SyncVectorEnv of its single environments."""
     from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-    from fastrod_envs.single import SingleEnv
-    from fastrod_envs.vector import BatchEnv
-
     repeats, mode = 1 if quick else 5, AutoresetMode.SAME_STEP
     sync: dict[int, float] = {}
     rows: list[Row] = []
@@ -82,10 +85,8 @@ def reach_section(quick: bool) -> Section:
             note_progress(f"{n} environments, {threads} threads")
             batch, steps = BatchEnv("Reach", n, threads=threads), steps_for(n, quick)
             took = step_seconds(batch, steps, repeats)
-            more = {
-                "ratio": sync.get(n, sync[most] * n / most) / took,
-                "fraction": simulator_fraction(batch, steps),
-            }
+            ratio = sync.get(n, sync[most] * n / most) / took
+            more = {"ratio": ratio, "fraction": simulator_fraction(batch, steps)}
             rows.append(row("native batch", n, threads, took) | more)
             batch.close()
     return table(
@@ -106,11 +107,6 @@ def reach_section(quick: bool) -> Section:
 
 def task_section(quick: bool) -> Section:
     """Every other task, few steps: a batch where the rods are one simulator's, otherwise one environment."""
-    import fastrod_envs
-    from fastrod.errors import HostError
-    from fastrod_envs.registration import task_class
-    from fastrod_envs.vector import BatchEnv
-
     rows: list[Row] = []
     for name in fastrod_envs.names():
         if name == "Reach":
@@ -143,9 +139,6 @@ def task_section(quick: bool) -> Section:
 
 def endurance_section(total: int) -> Section:
     """About `total` random steps over all tasks: what they leave behind."""
-    import fastrod_envs
-    from bench_lost import endure
-
     rows = [row for name in fastrod_envs.names() if (row := endure(name, total))]
     return table(
         "endurance",
@@ -163,5 +156,6 @@ def measure(options: Any) -> list[Section]:
     return [reach_section(options.quick), task_section(options.quick)]
 
 
-words = "only this: so many random steps over all tasks, 1000000 say"
-main = bench(__doc__, measure, ("--endurance", 0, words))
+main = bench(
+    __doc__, measure, ("--endurance", 0, "only this: so many random steps over all tasks, 1000000 say")
+)

@@ -31,8 +31,6 @@ def mounted(robot: str, mass: float, place: Sequence[float], gravity: float, tou
 def timed(
     what: str, step: Callable[[int], Any], steps: int, contact: Callable[[], bool] = lambda: False
 ) -> Row:
-    """Milliseconds of a step: median, 95th percentile and the longest, and how many were in contact or
-    failed."""
     note_progress(what)
     for k in range(3):
         step(k)
@@ -75,16 +73,17 @@ def paper(steps: int) -> list[Row]:
 
     soft = SoftManiSim()
     soft.add_a_cube([0.1, 0.1, 0.03], size=[0.06] * 3)
-    wave = np.array([0.0, 0.002, 0.001] * 3)
-    calls: dict[str, tuple[Callable[[int], Any], int]] = {
-        "SoftManiSim, 3 segments: move_robot_ori": (
-            lambda k: soft.move_robot_ori(wave * np.sin(0.02 * k)),
-            steps,
-        ),
-        "calc_tip_pos": (lambda k: soft.calc_tip_pos(wave * np.sin(0.02 * k)), steps),
-        "capture_image, 640 x 480": (lambda _: soft.capture_image(), max(3, steps // 20)),
-    }
-    rows = [timed(what, lambda k, call=call: call(k) and None, n) for what, (call, n) in calls.items()]
+    most = np.array([0.0, 0.002, 0.001] * 3)
+
+    def wave(k: int) -> Any:
+        return most * np.sin(0.02 * k)
+
+    calls: list[tuple[str, Callable[[int], Any], int]] = [
+        ("SoftManiSim, 3 segments: move_robot_ori", lambda k: soft.move_robot_ori(wave(k)), steps),
+        ("calc_tip_pos", lambda k: soft.calc_tip_pos(wave(k)), steps),
+        ("capture_image, 640 x 480", lambda _: soft.capture_image(), max(3, steps // 20)),
+    ]
+    rows = [timed(what, lambda k, call=call: call(k) and None, n) for what, call, n in calls]
     soft.close()
     return rows
 

@@ -88,15 +88,11 @@ def time_section(rows: list[Timed], n_robots: int) -> Section:
     one, many = thread_counts()
     made = []
     for row in rows:
-        us = [1e6 * t / n_robots for t in row.seconds]
-        each = [t / row.case.robot.n_segments for t in us]
-        made.append(
-            row.head
-            | {"points": row.points, "us_one": us[0], "us_many": us[1], "us_segment_one": each[0]}
-            | {"us_segment_many": each[1], "ratio": us[0] / us[1]}
-            | {"error_max_m": row.settled.largest, "error_median_m": row.settled.median}
-            | goal(row.settled.largest, cases.TIP_ERROR)
-        )
+        us, n = [1e6 * t / n_robots for t in row.seconds], row.case.robot.n_segments
+        line = row.head | {"points": row.points, "us_one": us[0], "us_many": us[1], "ratio": us[0] / us[1]}
+        line |= {"us_segment_one": us[0] / n, "us_segment_many": us[1] / n}
+        line |= {"error_max_m": row.settled.largest, "error_median_m": row.settled.median}
+        made.append(line | goal(row.settled.largest, cases.TIP_ERROR))
     return table(
         "observer_pass",
         "One observer pass: time and accuracy",
@@ -147,13 +143,10 @@ def arithmetic_section(rows: list[Timed], n_robots: int) -> Section:
         slow = tally.divide + tally.root
         done = [n_robots / t for t in row.seconds]
         floor = (tally.instructions - slow) / fma + slow / divide
-        made.append(
-            row.head
-            | {"columns": row.columns, "flops": tally.flops, "instructions": tally.instructions, "slow": slow}
-            | {"gflops_one": 1e-9 * tally.flops * done[0], "gflops_many": 1e-9 * tally.flops * done[1]}
-            | {"peak_one": tally.flops * done[0] / (2.0 * fma), "floor_us": 1e6 * floor}
-            | {"fraction_one": floor * done[0], "fraction_many": floor * done[1] / many}
-        )
+        line = row.head | {"columns": row.columns, "flops": tally.flops, "instructions": tally.instructions}
+        line |= {"gflops_one": 1e-9 * tally.flops * done[0], "gflops_many": 1e-9 * tally.flops * done[1]}
+        line |= {"slow": slow, "peak_one": tally.flops * done[0] / (2.0 * fma), "floor_us": 1e6 * floor}
+        made.append(line | {"fraction_one": floor * done[0], "fraction_many": floor * done[1] / many})
     return table(
         "arithmetic",
         "The same passes: arithmetic",

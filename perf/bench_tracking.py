@@ -17,7 +17,7 @@ ERROR_TARGET, FRACTION_TARGET = 1e-6, 0.5
 """Mean squared error after the approach [m^2], and the soft robot's fraction of the motion."""
 SCENES = ("track_square", "track_circle", "track_figure_eight", "track_helix", "track_square_helix")
 POINTS = 40  # of a period, for the soft robot's workspace
-DEPTHS = np.arange(0.02, 0.235, 0.01)  # of a path's center below the base of the soft robot [m]
+DEPTHS = np.arange(0.02, 0.235, 0.01)  # m, of a path's center below the base of the soft robot
 SCALES = np.arange(1.0, 0.0, -0.05)  # of a path
 NEAR = 1e-5  # a point this near is in the workspace [m]
 
@@ -56,8 +56,7 @@ class Workspace:
         return None
 
     def points(self, path: Trajectory, depth: float, whole: bool) -> float:
-        """Fraction of the path's points that are in the workspace; with `whole`, 0 after the first that is
-        not."""
+        """Fraction of the path's points in the workspace; with `whole`, 0 after the first that is not."""
         start = np.array(path.center) + np.array([0.0, 0.0, depth])
         targets = path.position(np.arange(POINTS + 1) * path.period / POINTS) - start
         found, last = 0, []
@@ -75,8 +74,8 @@ class Workspace:
         return found / len(targets)
 
     def best(self, scene: TrackingScene) -> tuple[float, float, float]:
-        """Largest fraction of the path from one place of the base; the largest scale at which all of it is
-        in the workspace; a depth for that."""
+        """Largest fraction of the path from one place of the base; the largest scale at which all of it is in
+        the workspace; a depth for that."""
         most = max(self.points(scene.path(), depth, False) for depth in DEPTHS[::2])
         for scale in SCALES:
             depths = [depth for depth in DEPTHS if self.points(scene.path(scale), depth, True) == 1.0]
@@ -100,13 +99,13 @@ def played(name: str, seconds: float, *given: Any, **options: Any) -> tuple[Reco
     note_progress(name)
     stage = TrackingError(*given, **options)
     run = record(stage, steps(stage))
-    errors = run.mean_square(APPROACH), run.mean_square(0.0, PERIOD)
-    return run, {f"{name}_after": errors[0], f"{name}_with": errors[1]}
+    errors = {"after": run.mean_square(APPROACH), "with": run.mean_square(0.0, PERIOD)}
+    return run, {f"{name}_{kind}": error for kind, error in errors.items()}
 
 
 def track(name: str, workspace: Workspace | None, dt: float | None, seconds: float | None) -> Row:
-    """One path by both, by the arm alone and by the soft robot alone; without `workspace` the last as far
-    as it needs no search."""
+    """One path by both, by the arm alone and by the soft robot alone; its scale is searched by
+    `workspace`."""
     from fastrod_scenes import load
     from fastrod_scenes.ur5.soft_ur5 import DEPTH
     from fastrod_scenes.ur5.tracking import APPROACH
@@ -118,23 +117,12 @@ def track(name: str, workspace: Workspace | None, dt: float | None, seconds: flo
     by_soft, by_arm = both.lengths(APPROACH)
     moved = both.soft_fraction(APPROACH)
     within, scale, depth = workspace.best(scene) if workspace else (1.0, 0.5, DEPTH)
-    return {
-        "path": scene.shape,
-        "paper": scene.paper,
-        **found,
-        **goal(found["both_after"], ERROR_TARGET, name="error_"),
-        "fraction": moved,
-        **goal(moved, FRACTION_TARGET, least=True, name="fraction_"),
-        "by_soft": by_soft,
-        "by_arm": by_arm,
-        "lag": both.lag,
-        "clearance": both.clearance,
-        **played("arm", seconds, scene.path(), dt=dt, movers="arm")[1],
-        "within": within,
-        "scale": scale,
-        "depth": depth,
-        **played("soft", seconds, scene.path(scale), dt=dt, movers="soft", depth=depth)[1],
-    }
+    row: Row = {"path": scene.shape, "paper": scene.paper, "lag": both.lag, "clearance": both.clearance}
+    row |= found | goal(found["both_after"], ERROR_TARGET, name="error_") | {"fraction": moved}
+    row |= goal(moved, FRACTION_TARGET, least=True, name="fraction_")
+    row |= {"by_soft": by_soft, "by_arm": by_arm, "within": within, "scale": scale, "depth": depth}
+    row |= played("arm", seconds, scene.path(), dt=dt, movers="arm")[1]
+    return row | played("soft", seconds, scene.path(scale), dt=dt, movers="soft", depth=depth)[1]
 
 
 def measure(options: Any) -> list[Section]:

@@ -1,7 +1,4 @@
-"""Files from strangers by the thousand: each damaged, hostile or fine, and given to what reads it; a table of
-the outcomes.
-
-python perf/fuzz_files.py --count 20000 --seed 1
+"""Files from strangers by the thousand: each damaged, hostile or fine, and given to what reads it.
 
 File number k is the same for the same seed (`tests/fuzz/fuzz_seeds.py` makes it). It is read right, or
 refused in one sentence with exit code 2; anything else is counted in a column of its own and listed by
@@ -90,8 +87,8 @@ class Worker:
 
 
 def run(indices: Sequence[int], seed: int, workers: int) -> Iterator[Outcome]:
-    """Outcomes of these files, as they come, from so many processes; one that is stuck or dies is counted,
-    and another goes on."""
+    """Outcomes as they come, from so many processes; one that is stuck or dies is counted, another goes
+    on."""
     every = [Worker(list(indices[k::workers]), seed) for k in range(workers) if indices[k::workers]]
     while live := {worker.ends: worker for worker in every if worker.todo}:
         for ready in wait(list(live), timeout=1.0):

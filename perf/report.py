@@ -71,8 +71,9 @@ class Section:
 
 
 def table(key: str, title: str, text: str, rows: Iterable[Row], *notes: str, failed: bool = False) -> Section:
-    """A table whose columns are written as in `columns`."""
-    return Section(key, title, columns(text), list(rows), list(notes), failed)
+    """A table whose columns are written as in `columns`; numbers of numpy become Python's."""
+    plain = [{name: x.item() if hasattr(x, "item") else x for name, x in row.items()} for row in rows]
+    return Section(key, title, columns(text), plain, list(notes), failed)
 
 
 def goal(value: float, target: float, *, least: bool = False, name: str = "") -> Row:
