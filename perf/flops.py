@@ -13,7 +13,7 @@ import json
 import math
 import pkgutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -53,36 +53,8 @@ class Counted(float):
     __array_ufunc__ = None  # a numpy number on the left leaves the operation to this class
     now = [0.0] * 5
 
-    def _done(self, operation: int, value: float, times: int = 1) -> Counted:
-        Counted.now[operation] += times
-        made = Counted(value)
-        made.product = operation == 1
-        return made
-
-    def _sum(self, other: Any, value: float) -> Counted:
-        Counted.now[4] += self.product or (isinstance(other, Counted) and other.product)
-        return self._done(0, value)
-
-    def __add__(self, other: Any) -> Counted:
-        return self._sum(other, float(self) + float(other))
-
-    def __sub__(self, other: Any) -> Counted:
-        return self._sum(other, float(self) - float(other))
-
-    def __rsub__(self, other: Any) -> Counted:
-        return self._sum(other, float(other) - float(self))
-
-    def __mul__(self, other: Any) -> Counted:
-        return self._done(1, float(self) * float(other))
-
-    def __truediv__(self, other: Any) -> Counted:
-        return self._done(2, float(self) / float(other))
-
-    def __rtruediv__(self, other: Any) -> Counted:
-        return self._done(2, float(other) / float(self))
-
     def __pow__(self, power: int) -> Counted:
-        return self._done(1, float(self) ** power, power - 1)
+        return _noted(1, float(self) ** power, power - 1)
 
     def __neg__(self) -> Counted:
         made = Counted(-float(self))
@@ -92,7 +64,28 @@ class Counted(float):
     def __abs__(self) -> Counted:
         return Counted(abs(float(self)))
 
-    __radd__, __rmul__ = __add__, __mul__
+
+def _noted(operation: int, value: float, times: int = 1) -> Counted:
+    Counted.now[operation] += times
+    made = Counted(value)
+    made.product = operation == 1
+    return made
+
+
+def _operator(name: str, operation: int) -> Callable[[Counted, Any], Counted]:
+    plain = getattr(float, name)
+
+    def run(self: Counted, other: Any) -> Counted:
+        if operation == 0:
+            Counted.now[4] += self.product or getattr(other, "product", False)
+        return _noted(operation, plain(self, float(other)))
+
+    return run
+
+
+for _operation, _names in enumerate(("add radd sub rsub", "mul rmul", "truediv rtruediv")):
+    for _name in _names.split():
+        setattr(Counted, f"__{_name}__", _operator(f"__{_name}__", _operation))
 
 
 class _Math:
@@ -100,7 +93,7 @@ class _Math:
 
     @staticmethod
     def sqrt(x: Any) -> Counted:
-        return Counted()._done(3, math.sqrt(float(x)))
+        return _noted(3, math.sqrt(float(x)))
 
     def __getattr__(self, name: str) -> Any:
         return getattr(math, name)
