@@ -122,9 +122,8 @@ def measure(options: Any) -> list[Section]:
             "[us]| jitter_max:.0f max [us] | exchange_p50:.0f exchange~p50 [us] | exchange_p99:.0f p99 [us]"
             "| sdo:d SDO in~the loop | cpu:.2f CPU~[cores]",
             rows,
-            "A set-point is missed where a drive, operation enabled, got a SYNC and no new target; a cycle "
-            "is not answered where a drive's process data did not come within 0.6 of it. 'stepped': no "
-            "waiting at all, the rate is what the machine computes. 'first': before other programs, where "
+            "A cycle is not answered where a drive's process data did not come within 0.6 of it. 'stepped': "
+            "no waiting at all, the rate is what the machine computes. 'first': before other programs, where "
             "the machine grants that; 'collector on': garbage is collected in the loop.",
             f"Both ends use one interpreter on 'virtual', and {os.cpu_count()} cores; with udp_multicast the "
             "drives are another process.",

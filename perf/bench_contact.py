@@ -85,11 +85,7 @@ def measure(options: Any) -> list[Section]:
             f"{n} five-segment robots of 30 intervals, each bent its own way, its mesh in a place of its "
             f"own; the free tip goes {1e3 * batch.travel:.2f} mm a step. Mean over the steps of a swing, "
             "each the best of its rounds where time allowed several.",
-            "Grazing: the ball around the mesh leaves 2 mm to the free rod. In contact: it is 3 mm too near. "
-            "In contact is the fraction of robot-steps; not ok counts robot-steps of both runs, the mesh's "
-            "approach included.",
-            "Steps/s: robot-steps a second. Contact: what a step takes more than that of the same robots "
-            "without a scene.",
+            "In contact: fraction of robot-steps; not ok: robot-steps of both runs, the approach included.",
         ),
         table(
             "contact_query",
@@ -100,14 +96,11 @@ def measure(options: Any) -> list[Section]:
             f"| warm_ratio_many:.0f FCL/warm~{MANY} threads | step_ratio:.1f FCL/step~{ONE} thread"
             f"| step_ratio_many:.1f FCL/step~{MANY} threads | target:.0f FCL/warm~target | met",
             queries,
-            "FCL: one fcl.distance(mesh, capsule of radius 1e-6 m) from Python for each of a robot's 30 "
-            f"intervals, {asked} robots, on one thread: it holds the interpreter's lock. Capsules and poses "
-            "are made beforehand; the calls alone are timed.",
+            f"FCL: {asked} robots, capsules of radius 1e-6 m, on one thread: it holds the interpreter's "
+            "lock. Capsules and poses are made beforehand; the calls alone are timed. A step with FCL would "
+            "ask once a pass.",
             "Search: candidates and smallest gap of every robot, tessellation and minima along the curve "
-            "included. Cold: nothing is known; warm: from the step before. Met: the warm search, one thread "
-            "against one.",
-            "Step: FCL's queries alone against the whole step, its passes and forces included. A step with "
-            "FCL would ask once a pass.",
+            "included. Met: the warm search, one thread against one.",
         ),
         table(
             "contact_growth",

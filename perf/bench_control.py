@@ -133,8 +133,8 @@ def measure(options: Any) -> list[Section]:
             "| total_us:,.0f step~us | place_us:,.0f place~us | jacobian_us:,.0f Jacobian~us"
             "| rates_us:,.0f rates~us | error_m:.1e error [m]~median | steps:d",
             [{"kind": "analytic", **exact}, {"kind": "finite differences", **slow}],
-            "A tip on six joints and two segments (100 mm, four tendons, extension) follows a circle of 50 "
-            "mm in 20 s, 100 control steps a second of its time. Medians, warm.",
+            "Two segments of 100 mm, four tendons and extension; a circle of 50 mm in 20 s, 100 control "
+            "steps a second of its time. Medians, warm.",
             "Place: the arm's frame, tendon lengths of the action and one step of the rod. Differences: "
             "central, 24 settled tips, from the same snapshot.",
         )

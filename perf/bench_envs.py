@@ -95,11 +95,8 @@ def reach_section(quick: bool) -> Section:
         "kind fastrod/Reach-v0 | n:,d N | threads:d | rate:,.0f env steps/s | step_us:,.2f us / env step"
         "| ratio:,.1f times as fast as~SyncVectorEnv | fraction:.0% simulator's fraction~of a step",
         rows,
-        "Random actions, drawn beforehand; episodes of 40 steps end and begin in between. Warm, best of "
-        "several runs. A step: action to tendon lengths, one observer pass, reward, observation, info, and "
-        "new episodes where one has ended.",
-        "SyncVectorEnv holds our own single environments, in this process; their simulators have one thread. "
-        f"Beyond N = {most} the ratio is to its time an environment at N = {most}.",
+        "Random actions; episodes of 40 steps. Warm, best of several runs. The simulators of SyncVectorEnv "
+        f"have one thread; beyond N = {most} the ratio is to its time an environment at N = {most}.",
         "For information, measured elsewhere: the paper's public reacher takes 240 to 390 env steps/s in one "
         "process, 686 on 64 workers.",
     )

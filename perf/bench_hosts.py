@@ -114,7 +114,7 @@ def measure(options: Any) -> list[Section]:
             "| in_contact:.2f in contact | failed:d not ok | steps:d",
             rods(steps) + paper(steps),
             f"One thread, world steps of {1e3 * DT:g} ms, ten points a segment; the step of PyBullet's world "
-            "is in it. Warm. The longest step is that in which a rod loses its hold.",
+            "is in it. Warm.",
         ),
         table(
             "engines",

@@ -123,8 +123,8 @@ def lag_section(rows: list[Timed]) -> Section:
             | {"settled_error_max_m": row.settled.largest, "compared": row.moving.compared}
             for row in rows
         ),
-        "The tip that the last timed pass itself gave, whose boundary was predicted before the pass. The "
-        "inputs swing by 5 % of the difference to other random inputs, 200 steps a cycle.",
+        "The tip that the last timed pass itself gave. The inputs swing by 5 % of the difference to other "
+        "random inputs, 200 steps a cycle.",
     )
 
 
@@ -159,8 +159,7 @@ def arithmetic_section(rows: list[Timed], n_robots: int) -> Section:
         f"Peak: {2e-9 * fma:.1f} GFLOP/s of fused multiply-adds in registers, measured here on {one} thread, "
         f"and as much for each thread. A division takes the time of {fma / divide:.1f} of them.",
         "Operations fused: a product and a sum that can fuse are one. Floor: these at the rate of "
-        "multiply-adds, divisions and square roots at that of divisions: the time a robot if nothing was "
-        "loaded or waited for.",
+        "multiply-adds, divisions and square roots at that of divisions.",
     )
 
 

@@ -140,12 +140,10 @@ def measure(options: Any) -> list[Section]:
             "| arm_with:.1e with it~m^2 | within:.2f soft alone:~in workspace | scale:.2f tracked~at scale"
             "| depth:.2f base above~center m | soft_after:.1e after~m^2 | soft_with:.1e with it~m^2",
             rows,
-            "A period is 20 s. The goal is on the path from t = 0 on, the tip rests at the path's center "
-            "(soft alone: straight below its base). With the approach: the first 20 s from the jump on; "
-            "after it: 20 s from t = 2 s on.",
-            "Soft alone: the UR5's joints are held, the base is above the center. In workspace: fraction of "
-            "the full-size path that inverse kinematics finds from the best height; then the largest scale "
-            "at which it finds all, in steps of 0.05.",
+            "A period is 20 s. The tip begins at rest at the path's center (soft alone: straight below its "
+            "base). With the approach: the first 20 s from the jump on; after it: 20 s from t = 2 s on.",
+            "In workspace: fraction of the full-size path that inverse kinematics finds from the best "
+            "height; then the largest scale at which it finds all, in steps of 0.05.",
             "The paper moves both; its figures are those of SoftManiSim (CoRL 2024).",
         ),
         table(

@@ -195,8 +195,7 @@ def measure(options: Any) -> list[Section]:
             "The viewer, one page",
             "what | value:.3g measured | unit | target:g | met",
             [{"what": what, "value": x, "unit": unit, **goal(x, target)} for what, x, unit, target in rows],
-            f"{len(taken)} key presses on a slider. Chromium draws in software beside the server, on "
-            f"{os.cpu_count()} cores.",
+            f"{len(taken)} key presses on a slider; {os.cpu_count()} cores.",
         ),
         table(
             "memory",

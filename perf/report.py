@@ -16,10 +16,10 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared"
@@ -30,8 +30,7 @@ Row = dict[str, Value]
 _WIDTH = 166  # characters of the widest table; a narrower terminal wraps its lines but loses nothing
 
 
-@dataclass(frozen=True)
-class Column:
+class Column(NamedTuple):
     """One column of a table: its key in a row, its heading, and the format of its values."""
 
     key: str
@@ -40,10 +39,8 @@ class Column:
 
 
 def columns(text: str) -> list[Column]:
-    """Columns written as `key:format heading`, one after the other between bars; `~` breaks a heading's line.
-
-    A column without a heading is headed by its key.
-    """
+    """Columns written as `key:format heading` between bars; `~` breaks a heading, the key stands in for
+    none."""
     found = []
     for one in text.split("|"):
         name, _, head = one.strip().partition(" ")
@@ -61,12 +58,15 @@ class Section:
     columns: Sequence[Column]
     rows: list[Row]
     notes: list[str] = field(default_factory=list)
-    failed: bool = False
-    """Whether this table is a check, and something in it is not as it must be: the exit code is then 1."""
+    failed: bool = False  # a check in which something is not as it must be: the exit code is then 1
 
-    def as_json(self) -> Mapping[str, object]:
+    def as_json(self) -> dict[str, object]:
+        """As JSON knows it, which knows neither nan nor infinity."""
         meaning = {column.key: column.head.replace("\n", " ") for column in self.columns}
-        rows = [{key: _plain(value) for key, value in row.items()} for row in self.rows]
+        rows = [
+            {key: None if isinstance(x, float) and not math.isfinite(x) else x for key, x in row.items()}
+            for row in self.rows
+        ]
         return {"title": self.title, "columns": meaning, "rows": rows, "notes": self.notes}
 
 
@@ -80,11 +80,6 @@ def goal(value: float, target: float, *, least: bool = False, name: str = "") ->
     """A target beside its figure, and whether it is met: at most `target`, or at `least` that much."""
     met = value >= target if least else value <= target
     return {f"{name}target": target, f"{name}met": bool(met)}
-
-
-def _plain(value: Any) -> Any:
-    """JSON knows neither nan nor infinity."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def show(sections: Sequence[Section], head: str) -> None:
@@ -152,7 +147,7 @@ class Measurement:
         self.clock, self.times = clock, list[float]()
 
     def take(self, run: Callable[[], Any]) -> Any:
-        """Call once, without the collector of garbage; what the call returned."""
+        """What one call returns, timed without the collector of garbage."""
         gc.disable()
         try:
             start = self.clock()
@@ -164,7 +159,6 @@ class Measurement:
 
     @property
     def least(self) -> float:
-        """What the machine can do when nothing else wants it; nan before the first call."""
         return min(self.times, default=math.nan)
 
     @property
@@ -186,11 +180,11 @@ def alternate(runs: Sequence[Callable[[], Any]], rounds: int) -> list[Measuremen
     return found
 
 
-def seconds(run: Callable[[], Any], clock: Callable[[], float] = time.perf_counter) -> tuple[float, Any]:
-    """Time of one call [s], and what it returned."""
-    measurement = Measurement(clock)
-    result = measurement.take(run)
-    return measurement.least, result
+def seconds(run: Callable[[], Any]) -> tuple[float, Any]:
+    """Wall time of one call [s], and what it returned."""
+    taken = Measurement()
+    result = taken.take(run)
+    return taken.least, result
 
 
 def best(run: Callable[[], object], repeats: int) -> float:
@@ -200,13 +194,9 @@ def best(run: Callable[[], object], repeats: int) -> float:
 
 def in_fresh_process(file: str, given: Any, **environment: str) -> Any:
     """What a script prints as JSON, given this as JSON on its standard input."""
+    env, words = {**os.environ, **environment}, json.dumps(given)
     done = subprocess.run(
-        [sys.executable, file],
-        input=json.dumps(given),
-        stdout=subprocess.PIPE,
-        text=True,
-        check=True,
-        env={**os.environ, **environment},
+        [sys.executable, file], input=words, stdout=subprocess.PIPE, text=True, check=True, env=env
     )
     return json.loads(done.stdout)
 
@@ -259,13 +249,8 @@ def _run(measure: Callable[[argparse.Namespace], Sequence[Section]], options: ar
     except FastrodError as error:
         print(error, file=sys.stderr)
         return 2
-    head = {
-        **machine(),
-        "load_before": f"{load:.2f}",
-        "load_after": f"{os.getloadavg()[0]:.2f}",
-        "seconds": f"{time.perf_counter() - start:.0f}",
-        "quick": str(options.quick).lower(),
-    }
+    head = {**machine(), "load_before": f"{load:.2f}", "load_after": f"{os.getloadavg()[0]:.2f}"}
+    head |= {"seconds": f"{time.perf_counter() - start:.0f}", "quick": str(options.quick).lower()}
     if options.json:
         made = {section.key: section.as_json() for section in measured}
         print(json.dumps({"machine": head, "sections": made}))

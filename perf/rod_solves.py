@@ -153,8 +153,8 @@ def solve_section(paths: Sequence[Path], n_robots: int, quick: bool) -> Section:
         "thread. arrays: the slope as one writes it with numpy, scipy's default tolerances. scalars, "
         "compiled: the slope in plain scalars, and that compiled by numba; the loosest of several tolerances "
         "that bring every tip within 1e-4 m, and the search ends at the residual `stop`.",
-        "Ratio: scipy's time over fastrod's in the last fastrod row of the model, both with every tip within "
-        "1e-4 m. The targets were set with a scipy solve of about 25 ms in mind.",
+        "Ratio: to the last fastrod row of the model. The targets were set with a scipy solve of 25 ms in "
+        "mind.",
     )
 
 
@@ -186,7 +186,6 @@ def path_section(paths: Sequence[Path], steps: int) -> Section:
         "| error_median_m:.1e tip error~median [m] | error_max_m:.1e tip error~max [m] | lost:.2% steps "
         "not~ok",
         rows,
-        "One `step` a point, lengths and tip force both moving; residual: of the boundary that the step "
-        "predicted, before it corrects it. The paper reports 5e-4 m. Any number of threads gives the same "
-        "numbers.",
+        "Lengths and tip force both moving. The paper reports a residual of 5e-4 m. Any number of threads "
+        "gives the same numbers.",
     )
