@@ -69,7 +69,7 @@ def measure(options: Any) -> list[Section]:
             added = [1e6 * (run.step_s - alone.step_s) / n for run, alone in zip(runs, bare, strict=True)]
             row = step_row(state, runs, n) | {"added_one": added[0], "added_many": added[1]}
             steps.append(row | goal(row["rate_many"], target, least=True))
-            fcl_s, asked = c.fcl_seconds(runs[0], obstacle, c.places(batch, gap), sample)
+            fcl_s, queried = c.fcl_seconds(runs[0], obstacle, c.places(batch, gap), sample)
             queries.append(query_row(state, runs, fcl_s, n))
     free = c.make_mesh(2 if quick else 5)
     return [
@@ -96,7 +96,7 @@ def measure(options: Any) -> list[Section]:
             f"| warm_ratio_many:.0f FCL/warm~{MANY} threads | step_ratio:.1f FCL/step~{ONE} thread"
             f"| step_ratio_many:.1f FCL/step~{MANY} threads | target:.0f FCL/warm~target | met",
             queries,
-            f"FCL: {asked} robots, capsules of radius 1e-6 m, on one thread: it holds the interpreter's "
+            f"FCL: {queried} robots, capsules of radius 1e-6 m, on one thread: it holds the interpreter's "
             "lock. Capsules and poses are made beforehand; the calls alone are timed. A step with FCL would "
             "ask once a pass.",
             "Search: candidates and smallest gap of every robot, tessellation and minima along the curve "

@@ -93,14 +93,14 @@ class Loop:
         target, velocity = self.path.position(self.t), self.path.velocity(self.t)
         began = time.perf_counter()
         self.tip.place(self.q)
-        placed = time.perf_counter()
+        at_place = time.perf_counter()
         J = jacobian()
         known = time.perf_counter()
         error = target - self.tip.position
         self.q = self.q + DT * self.control.rates(self.q, J, error, velocity, DT)
         done = time.perf_counter()
         self.t += DT
-        return placed - began, known - placed, done - known, float(np.linalg.norm(error))
+        return at_place - began, known - at_place, done - known, float(np.linalg.norm(error))
 
 
 def follow(loop: Loop, jacobian: Callable[[], Any], steps: int) -> Row:

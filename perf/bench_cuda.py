@@ -58,7 +58,7 @@ def points_of(key: str, n: int) -> int:
 
 
 class Timed:
-    """Best times of a simulator's steps, and of their parts."""
+    """Best times of a simulator's steps, and of their stages."""
 
     def __init__(self, sim: Simulator, case: Case) -> None:
         self.sim, steps = sim, Measurement()
@@ -67,13 +67,13 @@ class Timed:
             self.state = steps.take(partial(sim.step, **inputs))
             self.sent, self.fetched = (after - b for after, b in zip(self._moved(), before, strict=True))
         self.step = min(steps.times[1:])
-        self._parts()
+        self._time_stages()
 
     def _moved(self) -> tuple[int, int]:
         runner = self.sim._passes._runner
         return (0, 0) if runner is None else (runner.sent_bytes, runner.fetched_bytes)
 
-    def _parts(self) -> None:
+    def _time_stages(self) -> None:
         """The pass alone, on ports that are there already; then what it costs more on new ones, and to
         bring its shape back."""
         sim, passes = self.sim, self.sim._passes

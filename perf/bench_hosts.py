@@ -14,8 +14,8 @@ DT = 0.005
 SIZE = 0.06  # edge of the cube [m]
 
 
-def mounted(robot: str, mass: float, place: Sequence[float], gravity: float, touch: bool) -> tuple[Any, int]:
-    """A rod along x on a fixed body, and a cube at `place`, which it feels if `touch`."""
+def mounted(robot: str, mass: float, place: Sequence[float], gravity: float, felt: bool) -> tuple[Any, int]:
+    """A rod along x on a fixed body, and a cube at `place`, which it feels if `felt`."""
     import fastrod
     from fastrod.hosts import BulletLink, MountedRod, connect
 
@@ -25,7 +25,7 @@ def mounted(robot: str, mass: float, place: Sequence[float], gravity: float, tou
     cube = world.createMultiBody(mass, shape, -1, list(place))
     world.changeDynamics(cube, -1, linearDamping=0.0, angularDamping=0.0)
     along_x = BulletLink(world, post, quaternion=(0.5**0.5, 0.0, 0.5**0.5, 0.0))
-    return MountedRod(fastrod.load_robot(robot), along_x, contact_bodies=[cube] if touch else []), cube
+    return MountedRod(fastrod.load_robot(robot), along_x, contact_bodies=[cube] if felt else []), cube
 
 
 def timed(
@@ -48,10 +48,10 @@ def rods(steps: int) -> list[Row]:
     """Mounted rods, free and in contact."""
     rows = []
     for robot in ("prototype", "five_segment_reacher"):
-        rod, _ = mounted(robot, 0.1, (5.0, 0.0, 0.0), 0.0, touch=False)
+        rod, _ = mounted(robot, 0.1, (5.0, 0.0, 0.0), 0.0, felt=False)
         swing = lambda k, rod=rod: rod.step(tip_force=(0.0, 0.0, 1e-4 * np.sin(0.1 * k)))  # noqa: E731
         rows.append(timed(f"{robot}, free", swing, steps))
-    rod, _ = mounted("prototype", 0.1, (0.1 + 0.5 * SIZE - 0.017, 0.0, 0.0), 0.0, touch=True)
+    rod, _ = mounted("prototype", 0.1, (0.1 + 0.5 * SIZE - 0.017, 0.0, 0.0), 0.0, felt=True)
     rest, world = rod.simulator.robots[0].rest_tendon_length, rod.bullet
 
     def push(k: int) -> Any:
@@ -59,13 +59,13 @@ def rods(steps: int) -> list[Row]:
         world.resetBaseVelocity(rod.host.body, [0.1, 0.0, 0.0], [0.0, 0.0, 0.0])
         return rod.step(tendon_length=rest)
 
-    def felt(rod: Any) -> bool:
+    def in_contact(rod: Any) -> bool:
         return bool(rod.state.contacts.count[0])
 
-    rows.append(timed("prototype, pushes a free cube", push, steps, partial(felt, rod)))
-    long, _ = mounted("five_segment_reacher", 0.02, (0.15, 0.0, 0.1), 9.81, touch=True)
+    rows.append(timed("prototype, pushes a free cube", push, steps, partial(in_contact, rod)))
+    long, _ = mounted("five_segment_reacher", 0.02, (0.15, 0.0, 0.1), 9.81, felt=True)
     what = "five_segment_reacher, 20 g fall on it"
-    return [*rows, timed(what, lambda _: long.step(), steps, partial(felt, long))]
+    return [*rows, timed(what, lambda _: long.step(), steps, partial(in_contact, long))]
 
 
 def paper(steps: int) -> list[Row]:

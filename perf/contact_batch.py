@@ -127,7 +127,7 @@ def run(batch: Batch, obstacle: Obstacle | None, gap: float, threads: int, budge
     while sum(sum(each.times) for each in taken) < budget or k < _WARM + 3:
         k += 1
         engine = sim._engine
-        earlier = () if engine is None else (engine.before, *(a.copy() for a in engine.clearance))
+        earlier = () if engine is None else (engine.before, _copied(engine.clearance))
         state = taken[k % N_CYCLE].take(partial(sim.step, length[k % N_CYCLE]))
         not_ok += int((~state.ok).sum())
         passes.append(state.passes[state.ok])
@@ -154,21 +154,24 @@ def query(timed: Timed, repeats: int) -> list[float]:
     """Seconds of one search of all robots against their meshes: with nothing known, and from what the step
     before knew."""
     engine: Any = timed.sim._engine
-    before, distance, position = timed.earlier
+    before, clearance = timed.earlier
     shape = before._replace(**{name: getattr(timed.last, name) for name in before._fields})
-    rows, clearance = np.arange(timed.sim.n_robots), engine.clearance
-    kept = engine.before, engine.gap.copy(), *(a.copy() for a in clearance)
-    engine.before, found = before, []
+    rows, kept, found = np.arange(timed.sim.n_robots), engine.snapshot(), []
+    engine.before = before
     for cold in (True, False):
         searched = Measurement()
         for _ in range(repeats):
-            clearance.distance[:] = -np.inf if cold else distance
-            clearance.position[:] = position
+            engine.clearance = _copied(clearance)
+            engine.clearance.distance[:] += -np.inf if cold else 0.0
             engine.tracked[:] = not cold  # what has no past has gone through nothing
-            searched.take(partial(engine.touches, rows, shape))
+            searched.take(partial(engine.overlap, rows, shape))
         found.append(searched.least)
-    engine.before, engine.gap[:], clearance.distance[:], clearance.position[:] = kept
+    engine.restore(kept)
     return found
+
+
+def _copied(clearance: Any) -> Any:
+    return type(clearance)(*(a.copy() for a in clearance))
 
 
 def questions(timed: Timed, obstacle: Obstacle, pose: Array, rows: Iterable[int]) -> list[tuple[Any, ...]]:

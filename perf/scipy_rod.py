@@ -131,7 +131,7 @@ class Shooter:
         self.x = np.zeros(len(self.unit))
         self.passes = 0
 
-    def right_hand_side(self, load: Sequence[float], tendons: Tendons) -> Callable[[float, Array], Any]:
+    def slope_of(self, load: Sequence[float], tendons: Tendons) -> Callable[[float, Array], Any]:
         """f(s, y) as `solve_ivp` wants it."""
         rod = self.rod
         if self.slope == "arrays":
@@ -159,7 +159,7 @@ class Shooter:
 
         self.passes += 1
         state, tendons = self.start(x)
-        slope, tolerances = self.right_hand_side(load, tendons), {"rtol": self.rtol, "atol": self.tolerance}
+        slope, tolerances = self.slope_of(load, tendons), {"rtol": self.rtol, "atol": self.tolerance}
         found: Any = solve_ivp(slope, (0.0, self.rod[0]), state, method=self.integrator, **tolerances)
         return np.asarray(found.y[:, -1])
 
