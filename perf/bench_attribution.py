@@ -84,7 +84,7 @@ def run(case: Case) -> dict[str, Any]:
     clock = time.perf_counter()
     result = identify(log, robot, exclude=exclude, free_camera=case.kind == "operator", threads=1)
     row: dict[str, Any] = {"case": case.kind, "seed": case.seed, "true": list(seal.effects)}
-    row |= {"verdict": result.verdict, "kind": result.remaining_kind, "left": result.remaining_share}
+    row |= {"verdict": result.verdict, "kind": result.remaining_kind, "left": result.remaining_fraction}
     row |= {"named": [e.name for e in result.effects], "bounds": len(result.bounds), "rows": len(log)}
     row |= {"classes": [list(e.cannot_be_told_from) for e in result.effects], "floor": result.noise.floor}
     row |= {"before": result.test.before, "after": result.test.after}

@@ -162,7 +162,8 @@ def query(timed: Timed, repeats: int) -> list[float]:
         searched = Measurement()
         for _ in range(repeats):
             engine.clearance = _copied(clearance)
-            engine.clearance.distance[:] += -np.inf if cold else 0.0
+            if cold:
+                engine.clearance.distance[:] = -np.inf
             engine.tracked[:] = not cold  # what has no past has gone through nothing
             searched.take(partial(engine.overlap, rows, shape))
         found.append(searched.least)
