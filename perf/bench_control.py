@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from fastrod import Robot, Segment, Simulator, Tendon
+from fastrod.control import ResolvedRate, SoftTip, circle
 from report import Row, Section, bench, goal, note_progress, seconds, table
 
 RATE_TARGET, RATIO_TARGET = 1000.0, 20.0
@@ -72,9 +74,6 @@ class Loop:
     segment."""
 
     def __init__(self) -> None:
-        from fastrod import Robot, Segment, Simulator, Tendon
-        from fastrod.control import ResolvedRate, SoftTip, circle
-
         tendons = tuple(Tendon(offset=0.0075, angle=k * np.pi / 2) for k in range(4))
         stiffness: Any = {"bending_stiffness": (0.0022, 0.0022), "torsional_stiffness": 0.001}
         segment = Segment(length=0.1, extension=(0.0, 0.03), line_density=0.1, tendons=tendons, **stiffness)

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+import fastrod
+from fastrod.hosts import BulletLink, MountedRod, SoftManiSim, connect
 from report import Measurement, Row, Section, bench, note_progress, table
 
 DT = 0.005
@@ -16,9 +18,6 @@ SIZE = 0.06  # edge of the cube [m]
 
 def mounted(robot: str, mass: float, place: Sequence[float], gravity: float, felt: bool) -> tuple[Any, int]:
     """A rod along x on a fixed body, and a cube at `place`, which it feels if `felt`."""
-    import fastrod
-    from fastrod.hosts import BulletLink, MountedRod, connect
-
     world = connect(dt=DT, gravity=(0.0, 0.0, -gravity))
     post = world.createMultiBody(0.0, -1, -1, [0.0, 0.0, 0.0])
     shape = world.createCollisionShape(world.GEOM_BOX, halfExtents=[SIZE / 2] * 3)
@@ -69,8 +68,6 @@ def rods(steps: int) -> list[Row]:
 
 
 def paper(steps: int) -> list[Row]:
-    from fastrod.hosts import SoftManiSim
-
     soft = SoftManiSim()
     soft.add_a_cube([0.1, 0.1, 0.03], size=[0.06] * 3)
     most = np.array([0.0, 0.002, 0.001] * 3)

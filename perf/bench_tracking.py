@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from fastrod import Simulator
+from fastrod.control import FixedBase, ResolvedRate, SoftTip, Trajectory
+from fastrod_scenes import load
+from fastrod_scenes.ur5.soft_ur5 import DEPTH, DOWN, LARGEST_BEND, OFFSET, STRAIGHT, track_robot
+from fastrod_scenes.ur5.tracking import APPROACH, PERIOD, Record, TrackingError, TrackingScene, record
 from report import Row, Section, bench, goal, note_progress, table
-
-if TYPE_CHECKING:
-    from fastrod.control import Trajectory
-    from fastrod_scenes.ur5.tracking import Record, TrackingError, TrackingScene
 
 ERROR_TARGET, FRACTION_TARGET = 1e-6, 0.5
 """Mean squared error after the approach [m^2], and the soft robot's fraction of the motion."""
@@ -26,10 +27,6 @@ class Workspace:
     """Inverse kinematics of the soft robot alone, its base fixed above a path's center and its tip down."""
 
     def __init__(self) -> None:
-        from fastrod import Simulator
-        from fastrod.control import FixedBase, ResolvedRate, SoftTip
-        from fastrod_scenes.ur5.soft_ur5 import DOWN, LARGEST_BEND, OFFSET, STRAIGHT, track_robot
-
         self.tip = SoftTip(Simulator(track_robot(), threads=1), FixedBase((0.0, 0.0, 0.0, *DOWN)))
         self.low, self.high = self.tip.limits(LARGEST_BEND)
         # in the same metric as the tracks: extension by its range, bends by a radian
@@ -86,7 +83,6 @@ class Workspace:
 
 def played(name: str, seconds: float, *given: Any, **options: Any) -> tuple[Record, Row]:
     """One run, and its errors by name."""
-    from fastrod_scenes.ur5.tracking import APPROACH, PERIOD, TrackingError, record
 
     def steps(stage: TrackingError) -> Iterator[float]:
         try:
@@ -106,10 +102,6 @@ def played(name: str, seconds: float, *given: Any, **options: Any) -> tuple[Reco
 def track(name: str, workspace: Workspace | None, dt: float | None, seconds: float | None) -> Row:
     """One path by both, by the arm alone and by the soft robot alone; its scale is searched by
     `workspace`."""
-    from fastrod_scenes import load
-    from fastrod_scenes.ur5.soft_ur5 import DEPTH
-    from fastrod_scenes.ur5.tracking import APPROACH
-
     scene: Any = load(name)
     note_progress(name)
     dt, seconds = dt or scene.dt, seconds or scene.duration
