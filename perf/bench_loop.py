@@ -20,8 +20,8 @@ NOMINAL = {"bending_stiffness": 2.2e-3, "torsional_stiffness": 1.0e-3}
 
 
 def _one(seed: int, effect: str | None, *, load: bool) -> Row:
-    prototype = emulated(load_hardware(), seed=seed, effect=effect)
-    with tempfile.TemporaryDirectory() as folder, prototype as bench:
+    workbench = emulated(load_hardware(), seed=seed, effect=effect)
+    with tempfile.TemporaryDirectory() as folder, workbench as bench:
         payload = None if load else 0.0
         loop = close_loop(bench.prototype, bench.assistant, Path(folder), payload=payload, turn=load)
         assert bench.emulator is not None

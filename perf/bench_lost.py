@@ -69,7 +69,7 @@ def watched(count: Count) -> Iterator[None]:
 
 
 def _anew(simulator: Simulator, i: int, **changes: Any) -> Simulator:
-    """Another simulator of robot i alone, its effects left out or its contact the same."""
+    """Another simulator of robot i alone: as it is, or changed and without contact."""
     robot = replace(simulator.robots[i if len(simulator.robots) > 1 else 0], **changes)
     scene, points = None if changes else simulator.contact, simulator._layout.n_steps
     return Simulator(robot, points_per_segment=points, threads=1, contact=scene)

@@ -8,7 +8,6 @@ import json
 from collections import Counter
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,12 +15,6 @@ import pytest
 from rods import bend, rod
 
 from fastrod.reference import shoot
-
-
-@pytest.fixture(autouse=True)
-def _perf_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    for folder in (Path(__file__).parent / "truth", Path(__file__).parents[1] / "perf"):
-        monkeypatch.syspath_prepend(str(folder))
 
 
 def measured(capsys: pytest.CaptureFixture[str], name: str, *words: str) -> dict[str, Any]:
