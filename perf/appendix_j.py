@@ -1,5 +1,4 @@
-"""The rod of the paper's Appendix J, a passive cantilever under a dead force across its tip; what a peer
-is."""
+"""The rod of the paper's Appendix J, a passive cantilever under a dead tip force, and what a peer is."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""How often the missing effect is named: sealed logs of a plant that has no code of the model, opened after
-the verdict."""
+"""How often the missing effect is named: sealed logs of a plant that shares no code with the model."""
 
 from __future__ import annotations
 
@@ -148,8 +147,7 @@ def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def confusion(rows: list[dict[str, Any]]) -> dict[str, dict[str, int]]:
-    """True effect -> what was named first (or the verdict where nothing was) -> logs, of the single, noise
-    and outside cases."""
+    """True effect -> what was named first, or the verdict -> logs; single, noise and outside cases."""
     counts: dict[str, Counter[str]] = {}
     for row in rows:
         if row["case"] in ("single", "outside", "none", "noise") and "error" not in row:

@@ -67,8 +67,7 @@ def rms(a: Any) -> float:
 
 
 def errors(n: int, distance: float, tilt: float | None) -> Row:
-    """Single frames at one distance; tilts up to 50 deg where none is given. The model expects the tip's
-    orientation within 3 deg."""
+    """Single frames; tilts up to 50 deg where none is given. The model expects the tip within 3 deg."""
     note_progress(f"{distance} m")
     studio, off = Studio(0), []
     rng = studio.rng
@@ -96,8 +95,7 @@ def errors(n: int, distance: float, tilt: float | None) -> Row:
 
 
 def flips(n: int, distance: float, swing: float) -> Row:
-    """Smooth motion through the frontal pose: OpenCV's first solution from its own corners, and the
-    tracker without a model."""
+    """Smooth motion through the frontal pose: OpenCV's first solution, and the tracker without a model."""
     import cv2
 
     note_progress(f"flips at {distance} m")
@@ -127,8 +125,7 @@ def flips(n: int, distance: float, swing: float) -> Row:
 
 
 def latency(seeds: int, rate: float, delay: float) -> Row:
-    """Four tendons bend a 70 mm arc for 20 s, its tip seen late, with 0.3 mm of noise, one frame in ten
-    lost."""
+    """A 70 mm arc bends for 20 s; its tip is seen late, with 0.3 mm of noise, one frame in ten lost."""
     note_progress(f"latency {delay} s")
     t, seen = np.arange(0.0, 20.0, 0.01), np.arange(0.003, 20.0, 1.0 / rate)
     found = []

@@ -1,5 +1,4 @@
-"""Control of a soft tip on an arm: one step with the analytic Jacobian, and with the paper's finite
-differences."""
+"""Control of a soft tip on an arm, by the analytic Jacobian and by the paper's finite differences."""
 
 from __future__ import annotations
 
@@ -70,8 +69,7 @@ class SerialArm:
 
 
 class Loop:
-    """A tip that follows a circle: six joints and two segments, four tendons each, six intervals a
-    segment."""
+    """A tip that follows a circle: six joints, two segments of four tendons, six intervals a segment."""
 
     def __init__(self) -> None:
         tendons = tuple(Tendon(offset=0.0075, angle=k * np.pi / 2) for k in range(4))

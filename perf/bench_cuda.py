@@ -74,8 +74,7 @@ class Timed:
         return (0, 0) if runner is None else (runner.sent_bytes, runner.fetched_bytes)
 
     def _time_stages(self) -> None:
-        """The pass alone, on ports that are there already; then what it costs more on new ones, and to
-        bring its shape back."""
+        """The pass alone, on ports that are there; its extra cost on new ones; bringing its shape back."""
         sim, passes = self.sim, self.sim._passes
         ports = sim._ports
         assert ports is not None

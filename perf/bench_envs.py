@@ -39,8 +39,7 @@ def step_seconds(env: Any, n: int, repeats: int) -> float:
 
 
 def simulator_fraction(env: Any, n: int) -> float:
-    """Fraction of a step's time that the simulator takes, its settling and putting back of robots
-    included."""
+    """Fraction of a step's time that the simulator takes, settling and putting back robots included."""
     simulator, spent, names = env.task.simulator, Measurement(), ("step", "settle", "restore", "replace")
 
     def timed(call: Callable[..., Any]) -> Callable[..., Any]:

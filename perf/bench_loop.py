@@ -1,5 +1,4 @@
-"""The whole loop on sealed emulators: excite, identify, plan anew and track; the seal is opened when the
-verdict is in."""
+"""The whole loop on sealed emulators: excite, identify, plan anew, track, and open the seal."""
 
 from __future__ import annotations
 

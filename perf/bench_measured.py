@@ -56,8 +56,7 @@ def trunk() -> list[Found]:
 
 
 def stiffer(robot: Robot, factor: float) -> Robot:
-    """The same robot stiffer, its tendons as much: without loads nothing changes, under loads it deflects
-    less."""
+    """The same robot stiffer, its tendons as much: it deflects less under loads, and as before without."""
 
     def stiff(s: Segment) -> Segment:
         tendons = tuple(replace(t, compliance=t.compliance / factor) for t in s.tendons)

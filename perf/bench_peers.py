@@ -202,8 +202,7 @@ def _range(ratios: Sequence[Ratio]) -> str:
 
 
 def batch_section(points: Sequence[Point], n: int, within: float) -> Section:
-    """Each peer at its coarsest setting that is good enough; those that have none are left out by a
-    sentence."""
+    """Each peer at its coarsest setting that is good enough; where none is, a sentence says so."""
     force = np.random.default_rng(_SEED).uniform(appendix_j.FORCES[0], appendix_j.FORCES[-1], n)
     rows: list[Row] = []
     failed: list[str] = []

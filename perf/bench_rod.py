@@ -1,5 +1,4 @@
-"""The rod solver's figures: a pass and its arithmetic, full solves beside scipy, PyElastica, memory,
-start."""
+"""The rod solver's figures: a pass, its arithmetic, full solves beside scipy, PyElastica, memory, start."""
 
 from __future__ import annotations
 

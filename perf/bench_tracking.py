@@ -100,8 +100,7 @@ def played(name: str, seconds: float, *given: Any, **options: Any) -> tuple[Reco
 
 
 def track(name: str, workspace: Workspace | None, dt: float | None, seconds: float | None) -> Row:
-    """One path by both, by the arm alone and by the soft robot alone; its scale is searched by
-    `workspace`."""
+    """One path by both, by the arm alone and by the soft robot alone, at the scale of `workspace`."""
     scene: Any = load(name)
     note_progress(name)
     dt, seconds = dt or scene.dt, seconds or scene.duration

@@ -55,8 +55,7 @@ class Case:
 
 
 def appendix_b_robot(paper: bool) -> Robot:
-    """The prototype with its tendons at 0.01 m, as in Appendix B; in paper mode or with the full tendon
-    model."""
+    """The prototype with its tendons at 0.01 m, as in Appendix B; paper mode or the full tendon model."""
     robot = load_robot("prototype")
     (segment,) = robot.segments
     tendons = tuple(replace(tendon, offset=0.01) for tendon in segment.tendons)
@@ -81,8 +80,7 @@ _COLUMNS = ("L1 L2 L3 L4", "Fx Fy Fz")
 
 
 def path() -> Pose:
-    """The 500 points of Appendix B: from each case to the next in `STEPS_PER_CASE` steps, the last to the
-    first."""
+    """The 500 points of Appendix B: from case to case in `STEPS_PER_CASE` steps, the last to the first."""
     cases, _ = appendix_b()
     n = len(cases.tip_force)
     case, step = np.divmod(np.arange(n * STEPS_PER_CASE), STEPS_PER_CASE)
@@ -159,8 +157,7 @@ def fine_solution(case: Case, pose: Pose, outputs: Any = "tip") -> tuple[Simulat
 def settled(
     case: Case, pose: Pose, points: int, fine: Simulator, threads: int | None = None
 ) -> tuple[Simulator, State]:
-    """A simulator with `points` per segment, settled from the boundary of a fine one, so on the same
-    branch."""
+    """A simulator with `points` per segment, settled from the boundary of a fine one: on its branch."""
     n = len(pose.tip_force)
     sim = Simulator(case.robot, n, points_per_segment=points, outputs="tip", threads=threads)
     sim.restore(fine.snapshot())

@@ -23,8 +23,7 @@ RADIUS = 0.12  # m, of the ball that the meshes approximate
 N_CYCLE = 12  # steps in which the tendons swing once around; the timed steps are one cycle
 SWING = 1.5e-3  # rad of bend that each segment gains and loses in a cycle: the tip goes about 1 mm a step
 FAR, GRAZING, PRESSED = 0.4, 2e-3, -3e-3
-"""Smallest gap between mesh and free rod over a cycle, negative: the overlap that the mesh then prevents
-[m]."""
+"""Smallest gap between mesh and free rod over a cycle; negative: the overlap that the mesh prevents [m]."""
 _APPROACH, _AWAY = 8, 0.03  # steps in which the mesh comes to its place, m that it begins farther off
 _WARM = 1  # steps before the timed ones
 
@@ -75,8 +74,7 @@ def make_mesh(subdivisions: int) -> Obstacle:
 
 
 def places(batch: Batch, gap: float) -> Array:
-    """(n_robots, 7) poses of the mesh whose ball leaves `gap` to the free rods of the whole cycle; by
-    bisection."""
+    """(n_robots, 7) poses of the mesh whose ball leaves `gap` to the free rods of a cycle; by bisection."""
     near, far = np.full(len(batch.out), -0.1), np.full(len(batch.out), 0.5 + gap)
     wanted = gap + batch.rod_radius + RADIUS
     for _ in range(50):

@@ -62,8 +62,7 @@ def _mesh_distances(points, corners, out):  # type: ignore[no-untyped-def]
 
 
 def _encloses(point: Array, corners: Array) -> bool:
-    """Whether a closed mesh holds the point, by the solid angle of its triangles (Van Oosterom and Strackee
-    1983)."""
+    """Whether a closed mesh holds the point: solid angle of its triangles (Van Oosterom, Strackee 1983)."""
     a, b, c = (corners[:, k] - point for k in range(3))
     x, y, z = (np.linalg.norm(v, axis=1) for v in (a, b, c))
     dots = (a * b).sum(1) * z + (b * c).sum(1) * x + (c * a).sum(1) * y
@@ -156,8 +155,7 @@ class Batch:
 
 
 def make_batch(seed: int, index: int, n: int = TOGETHER) -> Batch:
-    """Batch `index` of a seed: a robot and an obstacle drawn at random; each scene has its poses and its
-    motion."""
+    """Batch `index` of a seed: a random robot and obstacle; each scene has its poses and its motion."""
     rng = np.random.default_rng((seed, index))
     robot = load_robot(robot_names()[int(rng.integers(len(robot_names())))])
     points, kind = int(rng.choice(_POINTS)), KINDS[int(rng.integers(len(KINDS)))]
@@ -228,8 +226,7 @@ def _along(z: Array) -> Array:
 
 
 def _away(solid: Obstacle, centre: Array, out: Array, rotation: Array, nodes: Array, wanted: float) -> float:
-    """How far from `centre` along `out` the obstacle is `wanted` away from these nodes, coming from
-    outside."""
+    """Distance along `out` at which the obstacle is `wanted` away from the nodes, coming from outside."""
 
     def clear(away: float) -> bool:
         return bool(distances(solid, np.concatenate([centre + away * out, rotation]), nodes).min() > wanted)

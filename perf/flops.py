@@ -100,8 +100,7 @@ class _Math:
 
 
 def count(wanted: dict[str, int], forces: bool) -> dict[str, Tally]:
-    """Robot key -> operations of one pass with that many points per segment; `forces`: the tip force
-    moves."""
+    """Robot key -> operations of a pass of that many points per segment; `forces`: the tip force moves."""
     two, three = counted(list(wanted), forces, (2, 3))
     return {key: two[key] * (3 - points) + three[key] * (points - 2) for key, points in wanted.items()}
 

@@ -87,8 +87,7 @@ class Worker:
 
 
 def run(indices: Sequence[int], seed: int, workers: int) -> Iterator[Outcome]:
-    """Outcomes as they come, from so many processes; one that is stuck or dies is counted, another goes
-    on."""
+    """Outcomes as they come, from so many processes; one that is stuck or dies is counted and replaced."""
     every = [Worker(list(indices[k::workers]), seed) for k in range(workers) if indices[k::workers]]
     while live := {worker.ends: worker for worker in every if worker.todo}:
         for ready in wait(list(live), timeout=1.0):

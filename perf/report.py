@@ -39,8 +39,7 @@ class Column(NamedTuple):
 
 
 def columns(text: str) -> list[Column]:
-    """Columns written as `key:format heading` between bars; `~` breaks a heading, the key stands in for
-    none."""
+    """Columns written as `key:format heading` between bars; `~` breaks a heading's line."""
     found = []
     for one in text.split("|"):
         name, _, head = one.strip().partition(" ")

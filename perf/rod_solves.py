@@ -73,8 +73,7 @@ def batch(path: Path, n_robots: int, tolerance: float, steps: int) -> Solved:
 
 
 def batches(path: Path, n_robots: int, steps: int) -> list[Solved]:
-    """With a residual tolerance of `GOAL`, and where that leaves the tip farther off, the loosest that
-    brings it within."""
+    """To a residual of `GOAL`; where the tip is still farther off, also to the loosest that suffices."""
     found = [batch(path, n_robots, GOAL, steps)]
     for fraction in (0.5, 0.2, 0.1, 0.05):
         if found[-1].error.largest <= GOAL:

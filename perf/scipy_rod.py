@@ -103,8 +103,7 @@ def compiled_slope() -> Callable[..., Any]:
 
 @dataclass
 class Shooter:
-    """One robot of one segment and four tendons, solved by shooting with scipy; warm after the first
-    solve."""
+    """One robot of one segment and four tendons, shooting with scipy; warm after the first solve."""
 
     robot: Robot
     slope: Literal["arrays", "scalars", "compiled"]
@@ -114,8 +113,7 @@ class Shooter:
     """Of lengths [m]; of the rotation's entries this over the length, of curvature over its square."""
     ftol: float = 1e-8  # where the search ends, ftol and xtol of least_squares
     stop: float = 0.0
-    """Largest boundary residual at which the search ends at once [m]; 0: only where least_squares itself
-    ends."""
+    """Largest boundary residual at which the search ends at once [m]; 0: where least_squares ends."""
 
     def __post_init__(self) -> None:
         (segment,) = self.robot.segments
@@ -226,8 +224,7 @@ class Run(NamedTuple):
 
 
 def follow(peer: Shooter, stretches: Sequence[tuple[Array, Points]], rounds: int) -> Run:
-    """Solve the points of each stretch one after the other, warm from its first unknowns, `rounds` times
-    over."""
+    """Solve the points of each stretch in turn, warm from its first unknowns, `rounds` times over."""
     n_points = sum(len(points) for _, points in stretches)
     means = []
     for _ in range(rounds):
