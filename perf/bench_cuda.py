@@ -57,40 +57,29 @@ def points_of(key: str, n: int) -> int:
     return cases.fewest_points(case, pose, *cases.fine_solution(case, pose))[0]
 
 
-class Timed:
-    """Best times of a simulator's steps, and of their stages."""
+def transferred(sim: Simulator) -> tuple[int, int]:
+    """Bytes sent and fetched until now."""
+    runner = sim._passes._runner
+    return (0, 0) if runner is None else (runner.sent_bytes, runner.fetched_bytes)
 
-    def __init__(self, sim: Simulator, case: Case) -> None:
-        self.sim, steps = sim, Measurement()
-        for k in range(1, _STEPS + 1):
-            inputs, before = case.inputs(case.at(k, False)), self._moved()
-            self.state = steps.take(partial(sim.step, **inputs))
-            self.sent, self.fetched = (after - b for after, b in zip(self._moved(), before, strict=True))
-        self.step = min(steps.times[1:])
-        self._time_stages()
 
-    def _moved(self) -> tuple[int, int]:
-        runner = self.sim._passes._runner
-        return (0, 0) if runner is None else (runner.sent_bytes, runner.fetched_bytes)
+def stages(sim: Simulator) -> dict[str, float]:
+    """Seconds of the pass alone, on ports that are there; its extra cost on new ones; bringing its shape
+    back."""
+    passes, ports, sending = sim._passes, sim._ports, Measurement()
+    assert ports is not None
+    shape = passes.new_shape("tip", False)
 
-    def _time_stages(self) -> None:
-        """The pass alone, on ports that are there; its extra cost on new ones; bringing its shape back."""
-        sim, passes = self.sim, self.sim._passes
-        ports = sim._ports
-        assert ports is not None
-        shape = passes.new_shape("tip", False)
+    def run(at: Ports) -> None:
+        passes.run(sim._all, at, shape, predict=True, process=1.0, noise=1e-20)
+        wait(sim.device)
 
-        def run(at: Ports) -> None:
-            passes.run(sim._all, at, shape, predict=True, process=1.0, noise=1e-20)
-            wait(sim.device)
-
-        run(ports)
-        self.kernel = best(partial(run, ports), _STEPS)
-        sending = Measurement()
-        for new in [ports._replace(tendon_length=ports.tendon_length.copy()) for _ in range(_STEPS)]:
-            sending.take(partial(run, new))
-        self.send = max(0.0, sending.least - self.kernel)
-        self.fetch = best(lambda: passes.collect(shape), _STEPS)
+    run(ports)
+    kernel = best(partial(run, ports), _STEPS)
+    for new in [ports._replace(tendon_length=ports.tendon_length.copy()) for _ in range(_STEPS)]:
+        sending.take(partial(run, new))
+    send, fetch = max(0.0, sending.least - kernel), best(lambda: passes.collect(shape), _STEPS)
+    return {"kernel": kernel, "send": send, "fetch": fetch}
 
 
 def wait(device: str) -> None:
@@ -112,17 +101,21 @@ def time_rows(case: Case, n: int, points: int) -> list[Row]:
     for device, threads in [("cpu", t) for t in sorted({min(2, most), most})] + [("cuda", None)]:
         sim = Simulator(case.robot, n, threads=threads, device=device, **options)
         sim.restore(start)
-        timed = Timed(sim, case)
-        two = two or timed
-        ratio = two.kernel / timed.kernel
-        error = np.abs(timed.state.tip_position - two.state.tip_position)[two.state.ok]
-        row: Row = {"robot": case.key, "robots": n, "points": points}
-        row |= {"device": f"{device} {threads or ''}".strip(), "ok": timed.state.ok.mean()}
-        row |= {f"{stage}_ms": 1e3 * getattr(timed, stage) for stage in ("step", "kernel", "send", "fetch")}
-        row |= {"sent_bytes": timed.sent / n, "fetched_bytes": timed.fetched / n}
-        row |= {"step_ratio": two.step / timed.step, "kernel_ratio": ratio}
-        row |= goal(ratio, _TARGET, least=True) if device == "cuda" else {}
-        rows.append(row | {"difference_m": error.max(initial=0.0)})
+        steps = Measurement()
+        for k in range(1, _STEPS + 1):
+            inputs, before = case.inputs(case.at(k, False)), transferred(sim)
+            state = steps.take(partial(sim.step, **inputs))
+            sent, fetched = (after - b for after, b in zip(transferred(sim), before, strict=True))
+        times = {"step": min(steps.times[1:]), **stages(sim)}
+        two = two or (times, state)
+        step_ratio, ratio = (two[0][stage] / times[stage] for stage in ("step", "kernel"))
+        error = np.abs(state.tip_position - two[1].tip_position)[two[1].ok]
+        row: Row = {"robot": case.key, "robots": n, "points": points, "ok": state.ok.mean()}
+        row |= {"device": f"{device} {threads or ''}".strip(), "difference_m": error.max(initial=0.0)}
+        row |= {f"{stage}_ms": 1e3 * took for stage, took in times.items()}
+        row |= {"sent_bytes": sent / n, "fetched_bytes": fetched / n}
+        row |= {"step_ratio": step_ratio, "kernel_ratio": ratio}
+        rows.append(row | (goal(ratio, _TARGET, least=True) if device == "cuda" else {}))
     return rows
 
 

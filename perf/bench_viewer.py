@@ -42,23 +42,6 @@ def browser() -> Iterator[Any]:
         found.close()
 
 
-@contextmanager
-def serving(*words: str, port: int) -> Iterator[tuple[Any, str]]:
-    """`fastrod view` in a process of its own, and the address that it would open a browser with."""
-    import psutil
-
-    command = [sys.executable, "-m", "fastrod.commands.cli", "view", *words, "--port", str(port)]
-    environment = {**os.environ, "BROWSER": "echo"}  # prints the address when a browser is opened
-    pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
-    with subprocess.Popen(command, env=environment, **pipes) as process:
-        try:
-            assert process.stdout is not None
-            yield psutil.Process(process.pid), process.stdout.readline().strip()
-        finally:
-            process.terminate()
-            process.communicate(timeout=20)
-
-
 def wait_for_controls(page: Any, address: str, seconds: float = 120.0) -> None:
     """Load a page as soon as it is served, and wait until it has its controls."""
     end = time.monotonic() + seconds
@@ -75,15 +58,25 @@ def wait_for_controls(page: Any, address: str, seconds: float = 120.0) -> None:
 
 
 @contextmanager
-def shown(*words: str, port: int) -> Iterator[tuple[Any, Any, str, Any, float]]:
-    """Chromium, the server's process, its address, a window with its controls, and the time it took [s]."""
+def shown(*words: str, port: int) -> Iterator[tuple[Any, Any, str, float]]:
+    """Chromium with a window on `fastrod view`, that server's process, its address, and the time to its
+    controls [s]."""
+    import psutil
     from windows import Window
 
+    command = [sys.executable, "-m", "fastrod.commands.cli", "view", *words, "--port", str(port)]
+    environment = {**os.environ, "BROWSER": "echo"}  # prints the address when a browser is opened
+    pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
     with browser() as chromium:
         window, began = Window(chromium), time.perf_counter()
-        with serving(*words, port=port) as (process, address):
-            wait_for_controls(window.page, address)
-            yield chromium, process, address, window, time.perf_counter() - began
+        with subprocess.Popen(command, env=environment, **pipes) as server:
+            try:
+                address = server.stdout.readline().strip()
+                wait_for_controls(window.page, address)
+                yield chromium, psutil.Process(server.pid), address, time.perf_counter() - began
+            finally:
+                server.terminate()
+                server.communicate(timeout=20)
         window.close()
 
 
