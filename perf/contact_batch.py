@@ -153,9 +153,8 @@ def query(timed: Timed, repeats: int) -> list[float]:
     before knew."""
     engine: Any = timed.sim._engine
     before, clearance = timed.earlier
-    shape = before._replace(**{name: getattr(timed.last, name) for name in before._fields})
     rows, kept, found = np.arange(timed.sim.n_robots), engine.snapshot(), []
-    engine.before = before
+    engine.before, shape = before, timed.last.as_shape()
     for cold in (True, False):
         searched = Measurement()
         for _ in range(repeats):
