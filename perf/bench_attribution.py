@@ -101,7 +101,7 @@ def run(case: Case) -> dict[str, Any]:
         "after": result.test.after,
         "floor": result.noise.floor,
         "bounds": len(result.bounds),
-        "left": result.remaining_share,
+        "left": result.remaining_fraction,
         "seconds": time.perf_counter() - clock,
         "rows": len(log),
     }
