@@ -308,7 +308,7 @@ def _heard(bus: object, frames: int) -> None:
 CHILD = """
 import sys, time
 import numpy as np
-from fastrod_device.camera import Frame
+from fastrod_device.camera import CameraFrame
 from fastrod_device.drawing import Eye
 from fastrod_device.hardware import load_hardware
 from fastrod_device.prototype import Prototype
@@ -326,7 +326,7 @@ class Still:
             return None
         self.due, self.number = now + 1.0 / hardware.camera.rate, self.number + 1
         image = self.eye.draw(np.array([0.0, 0.0, 0.07]), np.array([1.0, 0.0, 0.0, 0.0]))
-        return Frame(image=image, t=now - 0.03, number=self.number)
+        return CameraFrame(image=image, t=now - 0.03, number=self.number)
     def close(self):
         pass
 with Prototype(hardware, sys.argv[1], Still()) as prototype:
