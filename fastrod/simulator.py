@@ -380,7 +380,7 @@ class Simulator(Statics):
         center: ArrayLike,
         body: int | None = None,
     ) -> None:
-        """From the next step on this obstacle gives way to the rods: what it is told by `obstacle_pose` is
+        """From the next step on this obstacle gives way to the rods: what it is given by `obstacle_pose` is
         where it would be without them. `translation` [m/N] under a force at its `center` (3,) of mass,
         `rotation` (3, 3) [rad/(N m)] under a moment, both world and within one step: dt^2 / m and dt^2 I^-1
         for a body in free flight. Obstacles of one rigid body have the same number

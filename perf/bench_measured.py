@@ -38,7 +38,7 @@ def row(name: str, result: Result) -> Found:
     for e in result.effects:
         values = ", ".join(f"{k} {v.value:.3g} {v.unit}" for k, v in e.parameters.items())
         others = ", ".join(e.cannot_be_told_from) or "nothing"
-        notes.append(f"  {e.name}: {values}; cannot be told from {others}")
+        notes.append(f"  {e.name}: {values}; cannot be distinguished from {others}")
     return made | {"verdict": result.verdict, "remaining": result.remaining_kind}, notes
 
 

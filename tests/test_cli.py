@@ -356,7 +356,7 @@ def test_demo_leaves_what_it_says(demo: tuple[Path, str]) -> None:
         assert f"wrote {out / name}" in printed
     found = load_robot(out / "identified.toml")
     named = [effect["name"] for effect in json.loads((out / "report.json").read_text())["effects"]]
-    # beside them the zeros of the wires, which homing does not know better than it says
+    # beside them the zeros of the tendons, which homing does not know better than it says
     assert {table["name"] for table in found.effects} == {*named, "encoder_offset"}
     driven = {f"{path}_{when}" for path in ("triangle", "square", "circle") for when in ("before", "after")}
     assert sorted(path.stem for path in out.glob("*.csv")) == sorted(driven | {"excite"})

@@ -67,8 +67,8 @@ def one_segment() -> Robot:
 def two_segments() -> Robot:
     """Antagonistic wires, those of the far segment at places of their own in the near one."""
     (near,) = one_segment().segments
-    wires = tuple(replace(t, offset=(0.006, 0.005), angle=(t.angle + 0.7, t.angle)) for t in near.tendons)
-    far = replace(near, length=0.06, bending_stiffness=(0.0015, 0.002), tendons=wires)
+    routed = tuple(replace(t, offset=(0.006, 0.005), angle=(t.angle + 0.7, t.angle)) for t in near.tendons)
+    far = replace(near, length=0.06, bending_stiffness=(0.0015, 0.002), tendons=routed)
     return Robot(name="two", segments=(near, far), log_points=(0.05, 0.1))
 
 
@@ -312,10 +312,10 @@ def test_a_sweep_over_a_log_is_its_steps_one_by_one(name: str) -> None:
 
 
 def test_memories_are_as_wide_as_their_operators_need() -> None:
-    """What a sweep leaves behind: numbers in every column that a wire, a bend or a past step has, and no
+    """What a sweep leaves behind: numbers in every column that a tendon, a bend or a past step has, and no
     column beside the memory."""
-    wires = {"backlash": 3, "friction": 6, "creep": 2, "dynamics": 3}
-    assert {*wires, "latency", "plastic_set"} <= set(OPERATORS)
+    columns_of = {"backlash": 3, "friction": 6, "creep": 2, "dynamics": 3}
+    assert {*columns_of, "latency", "plastic_set"} <= set(OPERATORS)
     robot = two_segments()
     wiring, n = route(robot), robot.n_tendons
     dl = 0.002 * np.cumsum(np.random.default_rng(3).uniform(-1.0, 1.0, (1, 20, n)), axis=1)
@@ -333,7 +333,7 @@ def test_memories_are_as_wide_as_their_operators_need() -> None:
             assert memory.shape[1] == 1 + BUFFER * (1 + n)
             used = 1 + 20 * (1 + n)
         else:
-            width = wires.get(name, memory.shape[1] // n) * n  # of others, whole columns for each wire
+            width = columns_of.get(name, memory.shape[1] // n) * n  # of others, whole columns for each tendon
             used = 2 * robot.n_segments if name == "plastic_set" else width
             assert memory.shape[1] == (2 * n if name == "plastic_set" else used)
         assert np.isfinite(memory[0, :used]).all()
@@ -341,12 +341,12 @@ def test_memories_are_as_wide_as_their_operators_need() -> None:
 
 
 def test_a_set_needs_no_memory_where_no_wire_ends() -> None:
-    """More segments than wires: a passive one, then one with two wires. What no wire commands keeps no set,
-    and nothing is written beside the memory."""
+    """More segments than tendons: a passive one, then one with two tendons. What no tendon commands keeps no
+    set, and nothing is written beside the memory."""
     (near,) = one_segment().segments
     chain = (replace(near, mode="passive", tendons=()),) * 2 + (replace(near, tendons=near.tendons[:2]),)
     robot = having(
-        Robot(name="few wires", segments=chain), {"name": "plastic_set", "share": 0.2, "yield_at": 0.1}
+        Robot(name="few tendons", segments=chain), {"name": "plastic_set", "share": 0.2, "yield_at": 0.1}
     )
     wiring = route(robot)
     what: Any = get_effect("plastic_set")
@@ -386,7 +386,8 @@ def test_the_jacobian_is_by_what_is_commanded(tables: list[Table]) -> None:
     assert sim.settle(**base, tolerance=1e-13).ok.all()
     jacobian = sim.jacobian()[0]
     columns = [("tendon_length", i, 1e-6, 1e-6) for i in range(8)]
-    # wires that hold a body that stretches twist it, steeply: the step of 1e-4 of the length that `jacobian`
+    # tendons that hold a body that stretches twist it, steeply: the step of 1e-4 of the length that
+    # `jacobian`
     # takes is then too
     # long by its square; twice what is left
     columns += [("extension", k, 1e-6, 5e-6) for k in range(2)]

@@ -16,7 +16,7 @@ from fastrod.reference import constant_curvature
 
 
 def stiff_wires(n_segments: int = 2, n_tendons: int = 4, offset: float = 0.008) -> Robot:
-    """Weightless, of wires that hardly stretch; those of the second segment between those of the first."""
+    """Weightless, of tendons that hardly stretch; those of the second segment between those of the first."""
     stiffness: Any = {"bending_stiffness": (0.0022, 0.0022), "torsional_stiffness": 0.001}
     segments = []
     for k in range(n_segments):

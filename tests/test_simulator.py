@@ -94,9 +94,9 @@ def test_one_bad_robot_leaves_its_neighbours_alone() -> None:
     assert "impossible" in state.problems[11]
     assert np.isnan(state.position[[7, 11]]).all()
     assert_array_equal(state.position[good], clean.position[good])
-    mended = sim.settle(lengths)
-    assert mended.ok.all()
-    assert_allclose(mended.tip_position, clean.tip_position, atol=1e-8)
+    repaired = sim.settle(lengths)
+    assert repaired.ok.all()
+    assert_allclose(repaired.tip_position, clean.tip_position, atol=1e-8)
 
 
 def test_a_diverged_robot_starts_anew_and_nothing_continues_on_nan() -> None:

@@ -123,7 +123,7 @@ def simulator(robot: Robot | list[Robot], **options: Any) -> Simulator:
 
 
 def made(case: str) -> tuple[Simulator, Inputs, Step]:
-    """A simulator at home, its inputs there, and what it is told after."""
+    """A simulator at home, its inputs there, and what it is commanded after."""
     robot, step, contact, hold = CASES[case]
     home = {"tendon_length": bend(robot, 0.1, -0.05)}
     sim = simulator(robot, contact=contact, kept_jacobian_tolerance=hold)

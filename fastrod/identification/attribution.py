@@ -33,7 +33,7 @@ _MIN_GAIN = (
 )
 # effects beyond max_effects that the search may hold: among many small ones the dominant one may come late
 _SPARE = 2
-_MORE_STAGES = 3  # beyond max_effects: foils take stages too
+_MORE_STAGES = 3  # beyond max_effects: alternative patterns take stages too
 
 
 def identify(
@@ -92,8 +92,8 @@ def identify(
 def _candidates(
     base: BaseFit, max_effects: int, progressed: Callable[[str, int, int], None]
 ) -> SearchOutcome:
-    """Effects and foils that explain the residual of the base model, in the order in which they were
-    found."""
+    """Effects and alternative patterns that explain the residual of the base model, in the order in which
+    they were found."""
     most = max_effects + _SPARE if max_effects else 0
     search, state, known = base.search, base.start, base.start.model.effects
     names, steps = list[str](), list[SearchStep]()
@@ -120,7 +120,7 @@ def _candidates(
 
 
 def _needed(base: BaseFit, all_found: SearchOutcome, max_effects: int) -> SearchOutcome:
-    """The effects that are needed once foils are gone, with their state."""
+    """The effects that are needed once alternative patterns are gone, with their state."""
     search, state, found, steps = all_found.search, all_found.last, [*all_found.names], [*all_found.steps]
     alone = base.start
     if found:

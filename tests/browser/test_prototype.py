@@ -154,7 +154,7 @@ def test_what_is_beyond_a_limit_is_said_and_not_done(app: App, window: Windows) 
         bed = Bed(setup, app)
         seen = window(app.address)
         bed.bend(seen, "End")
-        assert bed.says(seen, "segment 1 was told to bend with 8.* 1/m; this robot's limit is 8 1/m.")
+        assert bed.says(seen, "segment 1 was commanded to bend with 8.* 1/m; this robot's limit is 8 1/m.")
         assert 0.52 < bed.page.teleop.bent(0)[0] <= 8.0 * 0.07
         assert bed.stands(seen)
         assert not bed.page.session.stopped

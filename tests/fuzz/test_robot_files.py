@@ -66,7 +66,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_good_robot_is_read_written_and_simulated(path: Path, table: dict[str, Any]) -> None:
     path.write_text(written(table), encoding="utf-8")
     robot = loaded(path)
-    if robot is None:  # the wires of a made-up robot may not fit its segments
+    if robot is None:  # the tendons of a made-up robot may not fit its segments
         return
     save_robot(robot, path)
     assert dumps(load_robot(path)) == dumps(robot)

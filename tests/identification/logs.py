@@ -23,12 +23,12 @@ def one_segment(line_density: float = 0.0, **changes: Any) -> Robot:
 def two_segments(line_density: float = 0.0, **changes: Any) -> Robot:
     """Antagonistic wires, those of the far segment at places of their own in the near one."""
     (near,) = one_segment(line_density).segments
-    wires = tuple(replace(t, offset=(0.006, 0.005), angle=(t.angle + 0.7, t.angle)) for t in near.tendons)
-    far = replace(near, length=0.06, bending_stiffness=(0.0015, 0.002), tendons=wires)
+    routed = tuple(replace(t, offset=(0.006, 0.005), angle=(t.angle + 0.7, t.angle)) for t in near.tendons)
+    far = replace(near, length=0.06, bending_stiffness=(0.0015, 0.002), tendons=routed)
     return Robot(name="two", segments=(near, far), log_points=(0.05, 0.1), **changes)
 
 
-def wires(robot: Robot, bends: np.ndarray) -> np.ndarray:
+def displacement_of(robot: Robot, bends: np.ndarray) -> np.ndarray:
     """(n, n_tendons) dl of bends (n, n_segments, 2)."""
     return route(robot).tendon_change(bends)
 
@@ -39,7 +39,7 @@ def wave(robot: Robot, n: int, dt: float = 0.05, size: float = 0.7, seed: int = 
     phase = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, (robot.n_segments, 2))
     held = np.where((t > 0.3 * t[-1]) & (t < 0.4 * t[-1]), 0.3 * t[-1], t)
     way = np.sin(2.1 * held[:, None, None] + phase) * (0.6 + 0.4 * np.cos(0.7 * held[:, None, None]))
-    return wires(robot, size * way)
+    return displacement_of(robot, size * way)
 
 
 def log_of(robot: Robot, dl: np.ndarray, dt: float | np.ndarray = 0.05, **columns: Any) -> RunLog:

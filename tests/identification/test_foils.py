@@ -1,4 +1,5 @@
-"""Foils against patterns that another program made: each family is the best name for its own."""
+"""Alternative patterns against patterns that another program made: each family is the best name for its
+own."""
 
 from __future__ import annotations
 
@@ -143,7 +144,8 @@ def test_times_and_frequencies_are_those_that_were_planted() -> None:
 
 
 def test_of_noise_no_family_makes_anything() -> None:
-    """The BIC of the best of seven families, scans counted, is above that of the model without a foil."""
+    """The BIC of the best of seven families, scans counted, is above that of the model without an alternative
+    pattern."""
     white = residual(np.zeros((len(inputs().t), 3)))
     nothing = white.size * np.log(left_by(np.zeros((*white.shape, 0)), white) / white.size)
     assert ranked(white)[0][0] > nothing - 5.0

@@ -102,7 +102,7 @@ def exact_slopes(here: Place, model: Model, theta: np.ndarray, j: int) -> np.nda
 
 # What a local slope may be off by, as a share of the exact one (root mean square over rows and numbers seen):
 # wires go through the rod by one-sided differences of 2 mrad, the camera by none;
-WIRES = dict.fromkeys(
+TENDONS = dict.fromkeys(
     ["drum_gain", "encoder_offset", "coupling", "slack", "stiffening", "temperature"], 0.004
 )
 CAMERA = dict.fromkeys(["marker_offset", "frame_misalignment", "lens", "camera_scale", "time_drift"], 1e-4)
@@ -121,7 +121,7 @@ MEMORY = {
     "dynamics": 0.15,
 }
 # what changes the rod has one secant, over a typical size: it is off by how much the effect saturates over
-# that. Wires that stretch
+# that. Tendons that stretch
 # by thirty times their compliance here do so by a third.
 ROD = {
     "gravity": 0.07,
@@ -189,17 +189,17 @@ def test_slopes_of_the_base_parameters() -> None:
         here.model,
         here.theta,
         0,
-        {"bending_stiffness": 0.07, "torsional_stiffness": 0.05, "length": 0.01, **WIRES, **CAMERA},
+        {"bending_stiffness": 0.07, "torsional_stiffness": 0.05, "length": 0.01, **TENDONS, **CAMERA},
     )
 
 
-@pytest.mark.parametrize("name", [*WIRES, *CAMERA, *FORCE, *MEMORY])
+@pytest.mark.parametrize("name", [*TENDONS, *CAMERA, *FORCE, *MEMORY])
 def test_slopes_of_effects_that_need_no_rod(name: str) -> None:
     here, model, theta, first = near_neutral(name)
     before = here.rod.runs
     here.linearised.slopes(model, theta, here.linearised.residual(model, theta))
     assert here.rod.runs - before <= 4 + 3  # at most what `by_bend` and `by_force` took, once
-    assert_slopes(here, model, theta, first, WIRES | CAMERA | FORCE | MEMORY)
+    assert_slopes(here, model, theta, first, TENDONS | CAMERA | FORCE | MEMORY)
 
 
 @pytest.mark.parametrize("name", ROD)
@@ -245,14 +245,18 @@ def test_a_local_fit_finds_what_was_planted() -> None:
     true[place] = 0.03
     pose = predict(here.model, true, here.samples, here.rod)
     log = here.samples.log
-    told = replace(
+    reported = replace(
         target_of(here.samples, SIGMA, rotation_sigma=0.01, points=False),
         tip=pose.position + SIGMA * np.random.default_rng(8).normal(size=(N, 3)),
         rotation=None,
     )
     assert len(log) == N
     linearised = LinearisedModel(
-        here.model, here.theta, here.samples, PredictedRod(here.samples, here.model.robot, points=True), told
+        here.model,
+        here.theta,
+        here.samples,
+        PredictedRod(here.samples, here.model.robot, points=True),
+        reported,
     )
     fit = linearised.fit(here.model, here.theta, 20)
     error = np.sqrt(np.diag(np.linalg.inv(fit.hessian)))

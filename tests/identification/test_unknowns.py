@@ -235,13 +235,13 @@ def test_the_identified_robot_is_the_prediction_and_survives_its_file() -> None:
             assert_allclose(values, model.values(theta)[name], rtol=1e-12)
     log = log_of(robot, wave(robot, 25), tip_force=np.tile([0.01, -0.02, 0.0], (25, 1)))
     samples = sample(log)
-    told = predict(model, theta, samples, PredictedRod(samples, robot))
-    assert told.ok.all()
+    reported = predict(model, theta, samples, PredictedRod(samples, robot))
+    assert reported.ok.all()
     shown = replay(log, back)
     assert shown.converged.all()
     # both to 1e-8 of the length, but with other numbers of integration steps
-    assert_allclose(shown.tip_position, told.position, atol=5e-6)
-    assert np.abs(replay(log, robot).tip_position - told.position).max() > 1e-3
+    assert_allclose(shown.tip_position, reported.position, atol=5e-6)
+    assert np.abs(replay(log, robot).tip_position - reported.position).max() > 1e-3
 
 
 @pytest.mark.parametrize(
@@ -252,8 +252,8 @@ def test_replay_of_the_identified_robot_knows_camera_memory_and_time(name: str) 
     model = base_model(robot).with_effect(name)
     log = log_of(robot, wave(robot, 25))
     samples = sample(log)
-    told = predict(model, model.start, samples, PredictedRod(samples, robot))
-    assert_allclose(replay(log, model.identified(model.start)).tip_position, told.position, atol=5e-6)
+    reported = predict(model, model.start, samples, PredictedRod(samples, robot))
+    assert_allclose(replay(log, model.identified(model.start)).tip_position, reported.position, atol=5e-6)
 
 
 def test_a_passive_robot_has_a_model_too() -> None:

@@ -30,7 +30,7 @@ RIPPLE = AlternativePattern("ripple", "static", "periodic", np.zeros((1, 3, 2)),
 
 
 def took(alternative: AlternativePattern | None, name: str = "backlash") -> SearchStep:
-    """A stage that took a foil, or an effect."""
+    """A stage that took an alternative pattern, or an effect."""
     taken = Candidate(alternative.name if alternative else name, None, 9.0, 99.0, 0.5, 1, "", alternative)
     return SearchStep(None, (), taken)
 
@@ -92,7 +92,7 @@ def test_a_foil_alone_is_not_in_the_library_and_gives_its_kind(
 
 
 def test_the_kind_is_of_what_is_larger_the_foil_or_the_structure_behind_it() -> None:
-    after = 0.8  # the foil has taken 0.3
+    after = 0.8  # the alternative pattern has taken 0.3
     behind = (ResidualStructure(0.0, fraction / after, 0.0, 0.0, 5.0) for fraction in (0.29, 0.31))
     small, large = (grounds(after=after, steps=[took(JUMP)], structure=structure) for structure in behind)
     assert (small.kind, large.kind) == ("drift", "memory")

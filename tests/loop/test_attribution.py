@@ -228,7 +228,7 @@ UNITS = (
 SIGNS = r"it moves -0\.9\d* times as predicted.*signs \(negative = pulled\)"
 BAD = {
     "three rows": (lambda: backlash_log().rows(slice(0, 3)), "has 3 measured rows; identification needs 40"),
-    "constant input": (lambda: all_rows(dl=1e-3), "no input ever changes; nothing can be told"),
+    "constant input": (lambda: all_rows(dl=1e-3), "no input ever changes; nothing can be learnt"),
     "no tip": (lambda: all_rows(tip_position=np.nan), "there is nothing to explain"),
     "no input": (lambda: all_rows(dl=np.nan), "no row in which every input is there"),
     "a tip that stands still": (lambda: all_rows(tip_position=0.05), "the measured tip never moves"),

@@ -22,7 +22,7 @@ class Rod:
     precurvature: Floats  # (n, 3)
     crossing: Floats  # (n, m) 1 where the tendon runs through
     offset: Floats  # (n, m, 3)
-    free_length: Floats  # (m,) of the wire without tension
+    free_length: Floats  # (m,) of the tendon without tension
     compliance: Floats  # (m,)
     unilateral: bool
     node_force: Floats  # (n, 3) dead load at the end of each step
@@ -171,7 +171,7 @@ def path_of(rod: Rod, u: Floats) -> tuple[Floats, Floats]:
 
 
 def stretch_of(rod: Rod, u: Floats) -> tuple[Floats, Floats]:
-    """Stretch of the wires (m,) [m], zero where slack, and their directions (n, m, 3)."""
+    """Stretch of the tendons (m,) [m], zero where slack, and their directions (n, m, 3)."""
     path, direction = path_of(rod, u)
     stretch = path - rod.free_length
     return np.maximum(stretch, 0.0) if rod.unilateral else stretch, direction

@@ -165,8 +165,8 @@ def minimise(
     - `planar` keeps the curvature about d2 alone, that is the rod in its own x z plane, ridge or not.
     """
     lengths = np.atleast_1d(np.asarray(length, dtype=float))
-    wires = np.atleast_1d(np.asarray(tendon_length, dtype=float))
-    n_segments, m = len(lengths), len(wires)
+    tendons = np.atleast_1d(np.asarray(tendon_length, dtype=float))
+    n_segments, m = len(lengths), len(tendons)
     given = np.zeros((0, 2)) if offsets is None else np.asarray(offsets, dtype=float)
     places = np.broadcast_to(given, (n_segments, m, 2))
     compliances = np.broadcast_to(np.asarray(compliance, dtype=float), (m,))
@@ -191,7 +191,7 @@ def minimise(
             precurvature=along(precurvature),
             crossing=(~np.isnan(place[..., 0])).astype(float),
             offset=flat,
-            free_length=rest + share * (wires - compliances * np.asarray(pretension, dtype=float) - rest),
+            free_length=rest + share * (tendons - compliances * np.asarray(pretension, dtype=float) - rest),
             compliance=compliances,
             unilateral=unilateral,
             node_force=share * node_force if share == 1.0 else share * node_force + aside,

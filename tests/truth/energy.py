@@ -44,7 +44,7 @@ class _Rod:
     precurvature: NDArray[np.float64]  # (e, 3)
     crossing: NDArray[np.float64]  # (e, n) 1 where the tendon runs through
     offset: NDArray[np.float64]  # (e, n, 3)
-    free_length: NDArray[np.float64]  # (n,) of the wire without tension
+    free_length: NDArray[np.float64]  # (n,) of the tendon without tension
     compliance: NDArray[np.float64]  # (n,)
     unilateral: bool
     node_force: NDArray[np.float64]  # (e, 3) at the end of each element
@@ -77,8 +77,8 @@ def minimise(
     - `elements` a segment on the coarsest of `levels` grids, each twice as fine as the one before.
     """
     lengths = np.atleast_1d(np.asarray(length, dtype=float))
-    wires = np.atleast_1d(np.asarray(tendon_length, dtype=float))
-    n_segments, n = len(lengths), len(wires)
+    tendons = np.atleast_1d(np.asarray(tendon_length, dtype=float))
+    n_segments, n = len(lengths), len(tendons)
     places = np.broadcast_to(np.asarray(offsets, dtype=float), (n_segments, n, 2))
     compliances = np.broadcast_to(np.asarray(compliance, dtype=float), (n,))
     answers, u = [], None
@@ -101,7 +101,7 @@ def minimise(
             precurvature=bent,
             crossing=crossing.astype(float),
             offset=flat,
-            free_length=wires - compliances * np.asarray(pretension, dtype=float),
+            free_length=tendons - compliances * np.asarray(pretension, dtype=float),
             compliance=compliances,
             unilateral=unilateral,
             node_force=node_force,
@@ -120,10 +120,12 @@ def energy(rod: _Rod, u: NDArray[Any]) -> NDArray[Any]:
     stretch = _path(rod, u)[0] - rod.free_length
     if rod.unilateral:
         stretch = np.maximum(stretch, 0.0)
-    wires = np.einsum("bi,bi,i->b", stretch, stretch, 0.5 / rod.compliance)
+    tendons = np.einsum("bi,bi,i->b", stretch, stretch, 0.5 / rod.compliance)
     _, tangent, _ = _frames(rod, u)
     # the force beyond an element moves with every tangent before it: sum_k F_k . r_k = sum_j h t_j . N_j
-    return np.asarray(elastic + wires - np.einsum("j,bjx,jx->b", rod.step, tangent, _beyond(rod.node_force)))
+    return np.asarray(
+        elastic + tendons - np.einsum("j,bjx,jx->b", rod.step, tangent, _beyond(rod.node_force))
+    )
 
 
 def gradient(rod: _Rod, u: NDArray[Any]) -> NDArray[Any]:

@@ -1,7 +1,7 @@
 """A plant: the real robot with an undeclared effect inside. numpy and scipy only, nothing shared with the
 package under test.
 
-It plays one or two push-pull segments and writes the log a camera would: wires -> transmission -> rod ->
+It plays one or two push-pull segments and writes the log a camera would: tendons -> transmission -> rod ->
 camera. Every effect is in another functional form than the obvious one (two creep times, sums of plays,
 half-cosine precurvature, ...), so a library that fits it has understood the effect and not recognised its own
 code. The rod is the principle of virtual work on Legendre curvatures, batched.
@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from plant_rod import EI, GJ, GRAVITY, LENGTH, NODES, OFFSET, Array, Rod, angles, pairs, routing, wires
+from plant_rod import EI, GJ, GRAVITY, LENGTH, NODES, OFFSET, Array, Rod, angles, pairs, routing, tendons
 from scipy.interpolate import CubicSpline, PchipInterpolator
 from scipy.signal import bilinear, lfilter, lfilter_zi
 from scipy.spatial.transform import Rotation, Slerp
@@ -41,7 +41,7 @@ OUTSIDE = ("bump", "sway", "ripple", "contact", "slip", "magnet")
 
 @dataclass(frozen=True)
 class Inputs:
-    """What the robot was told and what is known of its surroundings, a row per sample."""
+    """What the robot was commanded and what is known of its surroundings, a row per sample."""
 
     t: Array
     """(n,) [s], increasing."""
@@ -265,12 +265,12 @@ def pose(inputs: Inputs, seal: Seal) -> tuple[Array, Array]:
 def _transmission(inputs: Inputs, effects: dict[str, dict[str, Any]]) -> tuple[Array, Array]:
     """Lengths that reach the rod (n, tendons) [m] and the bend they ask for (n, segments, 2) [rad].
 
-    Pairs p [m] (half the difference of two opposite wires) carry the effects; what the two wires share stays
-    as commanded.
+    Pairs p [m] (half the difference of two opposite wires) carry the effects; what the two tendons share
+    stays as commanded.
     """
     t, segments = inputs.t, inputs.segments
     p = pairs(inputs.dl)
-    common = inputs.dl - wires(p)
+    common = inputs.dl - tendons(p)
     share = (t - t[0]) / (t[-1] - t[0])
     to_pairs = routing(segments)
     to_bend = np.linalg.inv(to_pairs)
@@ -309,7 +309,7 @@ def _transmission(inputs: Inputs, effects: dict[str, dict[str, Any]]) -> tuple[A
     if e := effects.get("stiffening"):
         size = np.linalg.norm(bend, axis=2, keepdims=True)
         bend = bend * (1.0 - e["cubic"] * (e["saturation"] * np.tanh(size / e["saturation"])) ** 2)
-    return common + wires(bend.reshape(len(t), -1) @ to_pairs.T), bend
+    return common + tendons(bend.reshape(len(t), -1) @ to_pairs.T), bend
 
 
 def _play(x: Array, radius: float | Array) -> Array:
@@ -449,7 +449,7 @@ def _loaded(
 
 def arc_lengths(bend: Array) -> Array:
     """Commands (n, tendons) [m] of bends (n, segments, 2) [rad]."""
-    return wires(bend.reshape(len(bend), -1) @ routing(bend.shape[1]).T)
+    return tendons(bend.reshape(len(bend), -1) @ routing(bend.shape[1]).T)
 
 
 def designed_inputs(rng: np.random.Generator, segments: int = 1) -> Inputs:

@@ -1,8 +1,8 @@
 """The rod of the plant: virtual work on Legendre curvatures, many samples at once. numpy only, nothing shared
 with the package under test.
 
-Equal segments with four wires each; wire i sits at OFFSET (cos a_i, sin a_i) in the material frame and runs
-from the base to the end of its segment. r' = R e3, R' = R [u]x; the base is the origin, its frame the
+Equal segments with four tendons each; tendon i sits at OFFSET (cos a_i, sin a_i) in the material frame and
+runs from the base to the end of its segment. r' = R e3, R' = R [u]x; the base is the origin, its frame the
 identity. Energy, per arclength s,
     integral (u - u*)' K (u - u*) / 2 ds  +  sum_i (l_i - L_i)^2 / (2 c)  -  work of dead loads,   l_i =
     integral |e3 + u x d_i| ds,
@@ -24,12 +24,12 @@ Field = Callable[[Array], tuple[Array, Array]]
 """Of tip positions (n, 3) [m]: force (n, 3) [N] and its change with the position (n, 3, 3) [N/m]."""
 
 LENGTH, EI, GJ, OFFSET, COMPLIANCE, GRAVITY = 0.07, 2.2e-3, 1.0e-3, 0.0075, 1e-5, 9.81
-"""Of each segment: m, N m^2, N m^2, m; of each wire m/N; m/s^2 along -z of the world."""
+"""Of each segment: m, N m^2, N m^2, m; of each tendon m/N; m/s^2 along -z of the world."""
 _NODES, _MODES = 8, 5
 
 
 def angles(segments: int) -> Array:
-    """Of the wires (tendons,) [rad]: each segment's four are 45 degrees on from those of the one before."""
+    """Of the tendons (tendons,) [rad]: each segment's four are 45 degrees on from those of the one before."""
     return np.concatenate([0.25 * np.pi * k + 0.5 * np.pi * np.arange(4) for k in range(segments)])
 
 
@@ -42,13 +42,13 @@ def routing(segments: int) -> Array:
 
 
 def pairs(dl: Array) -> Array:
-    """Half the difference of opposite wires (n, 2 segments) [m]."""
-    wire = dl.reshape(len(dl), -1, 2, 2)
-    return 0.5 * (wire[:, :, 0] - wire[:, :, 1]).reshape(len(dl), -1)
+    """Half the difference of opposite tendons (n, 2 segments) [m]."""
+    tendon = dl.reshape(len(dl), -1, 2, 2)
+    return 0.5 * (tendon[:, :, 0] - tendon[:, :, 1]).reshape(len(dl), -1)
 
 
-def wires(pair: Array) -> Array:
-    """Both wires of each pair (n, tendons) [m] from the pairs (n, 2 segments)."""
+def tendons(pair: Array) -> Array:
+    """Both tendons of each pair (n, tendons) [m] from the pairs (n, 2 segments)."""
     first = pair.reshape(len(pair), -1, 1, 2)
     return np.concatenate([first, -first], axis=2).reshape(len(pair), -1)
 
@@ -84,9 +84,9 @@ class Rod:
 
     segments: int = 1
     compliance: float = COMPLIANCE
-    """Of each wire [m/N]."""
+    """Of each tendon [m/N]."""
     angle: Array | None = None
-    """Of the wires (tendons,) [rad]; None: where they belong."""
+    """Of the tendons (tendons,) [rad]; None: where they belong."""
     stiffness: Array | None = None
     """(nodes, 3, 3) [N m^2]; None: uniform."""
     precurvature: Array | float = 0.0
@@ -162,8 +162,8 @@ class Rod:
     ) -> tuple[Array, Array]:
         """A step of the modes (n, segments * modes, 3) and the tensions (n, tendons) [N] after it.
 
-        Tensions are unknowns of their own: what a stiff wire would pull in a shape that is not yet the right
-        one is absurd.
+        Tensions are unknowns of their own: what a stiff tendon would pull in a shape that is not yet the
+        right one is absurd.
         """
         n, size = len(modes), 3 * modes.shape[1]
         beyond, mode = _chain(self.segments)
@@ -174,7 +174,7 @@ class Rod:
         uniform = np.tile(np.diag([EI, EI, GJ]), (nodes, 1, 1))
         stiffness = uniform if self.stiffness is None else self.stiffness
         moment = np.einsum("jxy,njy->njx", stiffness, u - self.precurvature)
-        # wires
+        # tendons
         angle = angles(self.segments) if self.angle is None else self.angle
         place = OFFSET * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
         last = np.repeat(np.arange(self.segments), 4)

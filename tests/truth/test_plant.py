@@ -59,7 +59,7 @@ def test_weight_and_stretch_are_those_of_least_energy() -> None:
 def test_stretch_loses_the_share_of_the_bend_that_it_claims() -> None:
     bend = np.array([[0.4, 0.0]])
     _, turn = plant.pose(still(bend, 0.0), plant.Seal({"tendon_stretch": {"gain_loss": 0.2}}, 0))
-    # small bends: the wires' own path, which the share leaves out, is of second order
+    # small bends: the tendons' own path, which the share leaves out, is of second order
     assert_allclose(np.arccos(turn[0, 2, 2]), 0.8 * 0.4, rtol=1e-2)
 
 

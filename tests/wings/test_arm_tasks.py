@@ -261,7 +261,7 @@ def test_a_head_that_is_pulled_too_far_lets_go(single):
     while not cell.held[1]:
         action = env.baseline()
         env.step(action)
-    both = np.array([-1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 1.0])  # apart, both told to hold
+    both = np.array([-1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 1.0])  # apart, both commanded to hold
     for _ in range(10):
         env.step(both)
     assert sum(cell.held) == 1

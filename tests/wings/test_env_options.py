@@ -1,4 +1,4 @@
-"""What an environment can be told: its options, randomised robots, difficulty, and how it is shown."""
+"""What an environment can be given: its options, randomised robots, difficulty, and how it is shown."""
 
 import re
 import sys
@@ -330,10 +330,10 @@ def test_a_page_shows_the_environments_and_goes_away(capsys, made):
     env = made("Reach", 20, render_mode="viser")
     env.reset(seed=0)
     assert env.render() is None
-    told = capsys.readouterr()
-    address = re.search(r"http://127\.0\.0\.1:\d+/\S{40,}/", told.err)
+    reported = capsys.readouterr()
+    address = re.search(r"http://127\.0\.0\.1:\d+/\S{40,}/", reported.err)
     assert address
-    assert told.out == ""
+    assert reported.out == ""
     page = urllib.request.urlopen(address.group(), timeout=10).read()
     assert b"<html" in page.lower()
     env.step(drawn(env, 1)[0])

@@ -135,11 +135,11 @@ def test_episodes_end_and_begin_in_the_same_step(batch: BatchEnv) -> None:
         assert ("final_obs" in info) == ended.any()
         if ended.any():
             assert_array_equal(info["_final_obs"], ended)
-            told = info["final_info"]
-            assert_array_equal(told["_episode"], ended)
-            assert_allclose(told["episode"]["r"][ended], total[ended], rtol=1e-12)
-            assert_array_equal(told["episode"]["l"][ended], steps[ended])
-            assert_array_equal(told["distance"], info["distance"])
+            reported = info["final_info"]
+            assert_array_equal(reported["_episode"], ended)
+            assert_allclose(reported["episode"]["r"][ended], total[ended], rtol=1e-12)
+            assert_array_equal(reported["episode"]["l"][ended], steps[ended])
+            assert_array_equal(reported["distance"], info["distance"])
             for i, last in enumerate(info["final_obs"]):
                 assert (last is not None) == ended[i]
                 assert last is None or batch.single_observation_space.contains(last)

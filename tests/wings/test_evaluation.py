@@ -24,14 +24,14 @@ from fastrod_envs.single import SingleEnv
 
 def test_the_baseline_beats_those_that_do_not_look() -> None:
     result = evaluate("Reach", None, episodes=20, seed=5)
-    told = figures(result)
-    assert list(told) == ["baseline", "goal-blind", "random", "still"]
-    assert told["baseline"]["success"] == 1.0
-    assert told["baseline"]["distance_mean_m"] < 1e-3
-    assert min(told["baseline"]["correlation"]) > 0.99
+    reported = figures(result)
+    assert list(reported) == ["baseline", "goal-blind", "random", "still"]
+    assert reported["baseline"]["success"] == 1.0
+    assert reported["baseline"]["distance_mean_m"] < 1e-3
+    assert min(reported["baseline"]["correlation"]) > 0.99
     for blind in ("goal-blind", "random", "still"):
-        assert told[blind]["distance_mean_m"] > 0.05
-        assert told[blind]["success"] < 0.1
+        assert reported[blind]["distance_mean_m"] > 0.05
+        assert reported[blind]["success"] < 0.1
 
 
 def test_episode_k_is_that_of_its_seed() -> None:

@@ -101,7 +101,7 @@ BEHIND = {"following_error": np.array([1, -200, 3, 2])}
             {"statusword": np.array([0x1637, 0x1637, 0x1637, 0x1618])},
             "node 4 went to the state 'fault' (statusword 0x1618)",
         ),
-        (BEHIND, "node 2 is 0.12 mm from where it was told to be; 0.075 mm are allowed"),
+        (BEHIND, "node 2 is 0.12 mm from where it was commanded to be; 0.075 mm are allowed"),
         (torque(1.0, 5.5, 1.0, 1.0), "the tendon of node 2 pulls with 5.56 N; 5 N are allowed"),
         (torque(1.0, 1.0, -6.0, 1.0), "the tendon of node 3 pulls with -6.01 N; 5 N are allowed"),
     ],
@@ -112,7 +112,7 @@ def test_what_is_wrong_names_the_node_and_the_figure(changed, sentence):
 
 def test_a_drive_that_moves_may_be_further_behind():
     feedback = well(following_error=np.array([0, -200, 0, 0]), **torque(1.0, 1.0, 1.0, 7.0))
-    behind = "the drive at node 2 is 0.12 mm from where it was told to be"
+    behind = "the drive at node 2 is 0.12 mm from where it was commanded to be"
     assert trouble(feedback, HARDWARE, speed=0.0).startswith("the drive at node 2")
     pulls = "the tendon of node 4 pulls with 7.03 N; 5 N are allowed"
     assert trouble(feedback, HARDWARE, speed=0.015) == f"{pulls}, and {behind}"
@@ -189,7 +189,7 @@ def test_a_blocked_drive_is_the_one_that_is_blamed(drive, phase, rig, monkeypatc
 
     monkeypatch.setattr(homing, phase, blocked)
     with pytest.raises(
-        DeviceError, match=rf"the drive at node {drive + 1} is .* from where it was told to be"
+        DeviceError, match=rf"the drive at node {drive + 1} is .* from where it was commanded to be"
     ):
         rig.home()
     assert rig.clock.now() - since[0] < 2.0

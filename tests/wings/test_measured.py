@@ -194,10 +194,10 @@ def test_motors_of_the_trunk_follow_their_commands_late() -> None:
     (rms, to 80 deg of motion)."""
     log, _ = asl_trunk(DATA / "asl_trunk.csv", run="perlin_0g")
     order = [motor for pair in measured.ASL_MOTORS for motor in pair]
-    told = np.degrees(-log.dl / measured.ASL_SPOOL_RADIUS)
+    reported = np.degrees(-log.dl / measured.ASL_SPOOL_RADIUS)
     felt = np.stack([log.extra[f"phi{motor}_deg"] for motor in order], axis=1)
-    assert np.sqrt(np.mean((felt - told) ** 2)) == pytest.approx(11.5, abs=0.1)
-    late = [np.sqrt(np.mean((felt[k:] - told[: len(told) - k]) ** 2)) for k in range(12)]
+    assert np.sqrt(np.mean((felt - reported) ** 2)) == pytest.approx(11.5, abs=0.1)
+    late = [np.sqrt(np.mean((felt[k:] - reported[: len(reported) - k]) ** 2)) for k in range(12)]
     assert int(np.argmin(late)) > 0
 
 

@@ -264,16 +264,16 @@ def test_what_is_off_is_looked_at_and_not_stopped():
 @pytest.mark.parametrize(
     ("dl", "words"),
     [
-        ([0.001, -0.0091, 0.0, 0.0], "tendon 2 was told -9.1 mm; this robot's limit is 8 mm."),
-        ([0.0, 0.0, NAN, 0.0], "tendon 3 was told nan"),
-        ([0.0, 0.0, 0.0, INF], "tendon 4 was told inf"),
+        ([0.001, -0.0091, 0.0, 0.0], "tendon 2 was commanded -9.1 mm; this robot's limit is 8 mm."),
+        ([0.0, 0.0, NAN, 0.0], "tendon 3 was commanded nan"),
+        ([0.0, 0.0, 0.0, INF], "tendon 4 was commanded inf"),
         ([0.0, 0.0, 0.0], r"shape \(3,\)"),
         ([[0.0] * 4], r"shape \(1, 4\)"),
         (["a"] * 4, "must be 4 numbers"),
         (None, "shape"),
         (
             [-0.0079, -0.0079, 0.0079, 0.0079],
-            "segment 1 was told to bend with 21.2[0-9]* 1/m; this robot's limit is 20 1/m",
+            "segment 1 was commanded to bend with 21.2[0-9]* 1/m; this robot's limit is 20 1/m",
         ),
     ],
 )
@@ -303,9 +303,9 @@ def test_a_command_that_was_meant_long_ago_is_refused(stamp):
 
 def test_a_command_is_a_copy():
     mine = BENT.copy()
-    told = Bench().check(mine)
+    reported = Bench().check(mine)
     mine[0] = 1.0
-    assert_array_equal(told, BENT)
+    assert_array_equal(reported, BENT)
 
 
 lengths = st.lists(st.floats(-0.02, 0.02), min_size=4, max_size=4).map(np.array)
@@ -355,7 +355,7 @@ def test_nobody_watches():
     assert bench.supervisor.client_lost(bench.now) is None
 
 
-NINE = RefusedError("tendon 1 was told 9 mm.")
+NINE = RefusedError("tendon 1 was commanded 9 mm.")
 
 
 @pytest.mark.parametrize("error", [ValueError("no such\nthing"), KeyboardInterrupt(), SystemExit(0), NINE])
@@ -366,7 +366,9 @@ def test_whatever_leaves_a_guarded_block_stops_first(error):
         assert bench.stops == []
         raise error
     assert [(fault.kind, fault.t) for fault in bench.stops] == [("exception", 7.0)]
-    assert ("tendon 1 was told 9 mm" if error is NINE else type(error).__name__) in bench.stops[0].sentence
+    assert ("tendon 1 was commanded 9 mm" if error is NINE else type(error).__name__) in bench.stops[
+        0
+    ].sentence
     assert "\n" not in bench.stops[0].sentence
     with bench.supervisor.guard(clock):
         pass
@@ -474,10 +476,10 @@ def test_whatever_happens_only_a_release_ends_a_stop(events, wild):
     bench = Bench(running=False)
     s = bench.supervisor
     for event in events:
-        before, first, stops, told = s.state, s.first, len(bench.stops), None
+        before, first, stops, reported = s.state, s.first, len(bench.stops), None
         try:
             if event in ("check", "wild"):
-                told = bench.check(BENT if event == "check" else wild)
+                reported = bench.check(BENT if event == "check" else wild)
             elif event in ("watch", "sick", "late"):
                 sick = (0, 9.0 if event == "sick" else 0.01)
                 bench.watch(dt=0.3 if event == "late" else DT, heartbeat_age=sick)
@@ -490,16 +492,16 @@ def test_whatever_happens_only_a_release_ends_a_stop(events, wild):
         if before is STOPPED:
             assert s.state is STOPPED or (event, s.state) == ("acknowledge", OFF)
             assert s.first is first or event == "acknowledge"
-            assert told is None
+            assert reported is None
         elif s.state is STOPPED:
             assert len(bench.stops) == stops + 1
             assert s.first is bench.stops[-1]
         if event == "emergency_stop":
             assert s.state is STOPPED
-        if told is not None:
+        if reported is not None:
             assert before in (READY, RUNNING)
-            assert np.isfinite(told).all()
-            assert np.abs(told).max() <= s.limits.displacement
+            assert np.isfinite(reported).all()
+            assert np.abs(reported).max() <= s.limits.displacement
         assert (s.state is STOPPED) == bool(s.faults)
 
 
@@ -510,11 +512,11 @@ def test_a_command_passes_as_it_is_or_not_at_all(dl):
     # the closed form of four tendons
     fits = max(map(abs, dl)) <= 0.008 and math.hypot(x, y) / (2.0 * 0.0075) / 0.07 <= 20.0
     try:
-        told = Bench().check(dl)
+        reported = Bench().check(dl)
     except RefusedError:
-        told = None
-    assert (told is not None) == fits
-    assert told is None or np.array_equal(told, dl)
+        reported = None
+    assert (reported is not None) == fits
+    assert reported is None or np.array_equal(reported, dl)
 
 
 def test_stop_is_pressed_by_another_thread_while_the_loop_watches():

@@ -36,7 +36,7 @@ def begun(world: FreeWorld, teleop: Teleop, draw: Any = lambda frame: None, **op
 
 
 def bent(teleop: Teleop, session: Session, x: float, y: float = 0.0) -> None:
-    """Segment 1 is told to bend."""
+    """Segment 1 is commanded to bend."""
     teleop.bend(0, x, y)
     session.wake()
 

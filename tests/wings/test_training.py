@@ -154,8 +154,8 @@ def test_lessons_bring_the_policy_to_the_baseline() -> None:
         observation, _ = env.reset(seed=50)
         for _ in range(20):
             action, _ = model.predict(observation, deterministic=True)
-            observation, _, _, _, told = env.step(action)
-        return float(told["final_info"]["distance"].mean())
+            observation, _, _, _, reported = env.step(action)
+        return float(reported["final_info"]["distance"].mean())
 
     untaught = ends()
     left = imitate(model, env, 6400, seed=0)

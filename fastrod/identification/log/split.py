@@ -70,7 +70,7 @@ def merged(logs: Sequence[RunLog]) -> RunLog:
     if len(set(names)) < len(names):
         raise LogError(
             f"two logs are named {next(n for n in names if names.count(n) > 1)!r}; rename one, so that "
-            "their runs can be told apart."
+            "their runs can be distinguished."
         )
     if len({log.dl.shape[1] for log in logs}) > 1:
         raise LogError("the logs have different numbers of tendons; they must be of one robot.")
@@ -182,7 +182,7 @@ def check_log(samples: LogSamples, robot: Robot) -> None:
     moves = np.concatenate([np.ptp(a, axis=0) for a in inputs]) if inputs else np.zeros(0)
     if not (moves > 1e-9).any():
         raise LogError(
-            f"in log {log.name!r} no input ever changes; nothing can be told from it. fastrod "
+            f"in log {log.name!r} no input ever changes; nothing can be learnt from it. fastrod "
             "excite writes a run that does."
         )
     if float(np.ptp(np.asarray(log.tip_position)[log.measured], axis=0).max()) < 1e-7 * robot.length:

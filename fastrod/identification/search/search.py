@@ -1,8 +1,8 @@
 """The search for what the model lacks: fit every candidate beside what is known, judge it on blocks it has
 not seen, keep the best, ask again.
 
-Every candidate starts from the same reference, weights and outlier mask. Foils (`alternatives`) compete on
-the same terms.
+Every candidate starts from the same reference, weights and outlier mask. Alternative patterns
+(`alternatives`) compete on the same terms.
 """
 
 from __future__ import annotations
@@ -60,7 +60,8 @@ _FEW, _MANY = 3, 12  # iterations of a start, and of the best of them
 _REFINED = 6  # candidates that are solved exactly at each stage
 _NEAR = 3.0  # times what the best leaves, or less than it takes: others are not worth an exact solution
 _CLOSE = 200.0  # BIC to the best within which a candidate is solved once more
-_ALTERNATIVE_SD = 30.0  # of a foil's amplitude, in units of its own columns' size that would explain all
+# of an alternative pattern's amplitude, in units of its own columns' size that would explain all
+_ALTERNATIVE_SD = 30.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,8 +107,8 @@ class Search:
         return search, search.refined(search.refined(state))
 
     def again(self, state: ModelState) -> ModelState:
-        """A state of other samples, fitted to these; foils, which belong to their samples, are left
-        behind."""
+        """A state of other samples, fitted to these; alternative patterns, which belong to their samples, are
+        left behind."""
         return self.refined(self._fitted(state.model, state.theta, np.zeros(0), (), 6))
 
     def _fitted(
@@ -138,7 +139,8 @@ class Search:
         found: Sequence[AlternativePattern],
         iterations: int,
     ) -> Fit:
-        """The best parameters near `linearised`, with the amplitudes of foils as further linear unknowns."""
+        """The best parameters near `linearised`, with the amplitudes of alternative patterns as further
+        linear unknowns."""
         n = len(model.unknowns)
         mean, sd = model.prior
         low, high = model.limits
@@ -303,7 +305,7 @@ class Search:
         return Candidate(name, with_it, z, gain, fraction, k, why, alternative)
 
     def alternative_candidates(self, state: ModelState) -> list[Candidate]:
-        """The best foil of each family beside a state, linear in everything."""
+        """The best alternative pattern of each family beside a state, linear in everything."""
         made = []
         for alternative in alternatives(state.linearised, state.fit.slopes, state.fit.residual):
             # a row without a shape tells nothing
@@ -357,8 +359,8 @@ class Search:
         return self.choose(state, tried, with_alternatives=with_alternatives)
 
     def choose(self, state: ModelState, tried: list[Candidate], *, with_alternatives: bool) -> SearchStep:
-        """Solve the promising ones exactly, then take the best by evidence; foils only where they beat it
-        clearly."""
+        """Solve the promising ones exactly, then take the best by evidence; alternative patterns only where
+        they beat it clearly."""
         fitted = sorted(
             (c for c in tried if c.state is not None and c.z > 1.0 and c.fraction > FRACTION_ACCEPT),
             key=lambda c: -c.fraction,
@@ -418,7 +420,7 @@ class Search:
         return advantage(best, other) < BIC_RIVAL or z_between(best, other) < Z_RIVAL
 
     def bare(self, state: ModelState) -> ModelState:
-        """`state` without its foils, fitted again: what the library alone explains."""
+        """`state` without its alternative patterns, fitted again: what the library alone explains."""
         return self._fitted(state.model, state.theta, np.zeros(0), (), 8)
 
     def without(self, state: ModelState, name: str) -> ModelState:
@@ -433,7 +435,7 @@ class Search:
     ) -> tuple[ModelState, list[str]]:
         """Drop effects that what came later has made needless, and those that bring less than `least` where
         what is left is of the size of the `noise` [both m^2 summed over the residual]: beside a dominant
-        effect they only mend its form. The state, and who is left."""
+        effect they only correct its form. The state, and who is left."""
         left = list(found)
         while len(left) > 1:
             weakest: tuple[float, str, ModelState] | None = None
@@ -520,7 +522,7 @@ class SearchOutcome:
     start: ModelState
     """Without any of it, weighed as `search` does."""
     last: ModelState
-    """With foils."""
+    """With alternative patterns."""
     state: ModelState
     """With the effects alone."""
     names: tuple[str, ...]
