@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,14 +19,12 @@ ELASTICA = {1.0: 0.301720773800, 2.0: 0.493457480397, 5.0: 0.713791523612, 10.0:
 
 
 def test_no_load_and_equal_bends_give_an_arc() -> None:
-    # r(l) of an arc of angle b about d1 is (0, -(1 - cos b), sin b) l/b: the method is exact for constant
-    # moment
-    robot = rod()
+    # r(l) of an arc of angle b about d1 is (0, -(1 - cos b), sin b) l/b: exact for constant moment
     for angle in (0.3, 1.0, 2.5):
-        state = Simulator(robot).settle(bend(robot, angle, 0.0))
-        tip = 0.07 / state.curvature[0, 0, 0] / 0.07
-        b = state.curvature[0, 0, 0] * 0.07
-        assert_allclose(state.tip_position[0], np.array([0.0, -(1 - np.cos(b)), np.sin(b)]) * tip, atol=1e-12)
+        state = Simulator(rod()).settle(bend(rod(), angle, 0.0))
+        u = state.curvature[0, 0, 0]
+        b = u * 0.07
+        assert_allclose(state.tip_position[0], np.array([0.0, -(1 - np.cos(b)), np.sin(b)]) / u, atol=1e-12)
         assert_allclose(state.curvature[0], np.tile(state.curvature[0, 0], (21, 1)), atol=1e-9)
 
 
@@ -34,13 +33,11 @@ def test_a_precurved_twisted_rod_is_a_helix() -> None:
     u = np.array([12.0, 0.0, 30.0])
     state = Simulator(rod("passive", precurvature=tuple(u))).settle()
     axis = u / np.linalg.norm(u)
-    centre_line = state.position[0] - np.outer(state.position[0] @ axis, axis)
+    across = np.eye(3) - np.outer(axis, axis)
     # the axis passes at distance k/(k^2+t^2) from the base, toward the first normal
-    normal = np.cross(u, [0.0, 0.0, 1.0])
-    centre = normal / (u @ u)
-    assert_allclose(
-        np.linalg.norm(centre_line - (centre - (centre @ axis) * axis), axis=1), 12.0 / (u @ u), rtol=1e-6
-    )
+    centre = np.cross(u, [0.0, 0.0, 1.0]) / (u @ u)
+    radius = np.linalg.norm((state.position[0] - centre) @ across, axis=1)
+    assert_allclose(radius, 12.0 / (u @ u), rtol=1e-6)
 
 
 @pytest.mark.parametrize(("load", "deflection"), ELASTICA.items())
@@ -56,11 +53,8 @@ def test_shape_is_fourth_order_in_the_step(mode: str) -> None:
     lengths = bend(robot, 0.8, -0.5) if mode != "passive" else None
 
     def tip(n: int) -> np.ndarray:
-        return (
-            Simulator(robot, points_per_segment=n)
-            .settle(lengths, tip_force=(0.1, 0.3, -0.1), tolerance=1e-12)
-            .tip_position[0]
-        )
+        sim = Simulator(robot, points_per_segment=n)
+        return sim.settle(lengths, tip_force=(0.1, 0.3, -0.1), tolerance=1e-12).tip_position[0]
 
     exact, steps = tip(320), np.array([8, 16, 32])
     slope = np.polyfit(np.log(steps), np.log([np.linalg.norm(tip(n) - exact) for n in steps]), 1)[0]
@@ -90,23 +84,18 @@ def test_out_of_plane_loads_against_the_energy_minimum() -> None:
 
 
 def test_rotating_the_world_rotates_the_answer() -> None:
-    robot = rod(line_density=0.3)
-    robot = replace(robot, gravity=(0.0, 0.0, 0.0))
+    robot = replace(rod(line_density=0.3), gravity=(0.0, 0.0, 0.0))
     half = np.pi / 7
     quaternion = np.array([np.cos(half), *(np.sin(half) * np.array([1, 2, -2]) / 3)])
-    rotation = (
-        Simulator(replace(robot, base_quaternion=tuple(quaternion)))
-        .settle(robot.rest_tendon_length)
-        .tip_rotation[0]
-    )
-    force = np.array([0.1, -0.2, 0.05])
-    lengths = bend(robot, 0.6, 0.7)
+    rotated = Simulator(replace(robot, base_quaternion=tuple(quaternion)))
+    rotation = rotated.settle(robot.rest_tendon_length).tip_rotation[0]
+    force, lengths = np.array([0.1, -0.2, 0.05]), bend(robot, 0.6, 0.7)
     one = Simulator(robot).settle(lengths, tip_force=force)
     two = Simulator(robot).settle(lengths, tip_force=rotation @ force, base_pose=[1.0, 2.0, 3.0, *quaternion])
     assert_allclose(two.tip_position[0], rotation @ one.tip_position[0] + [1, 2, 3], atol=1e-9)
     assert_allclose(two.tension, one.tension, atol=1e-6)
-    assert_allclose(two.base_wrench[0, :3], rotation @ one.base_wrench[0, :3], atol=1e-9)
-    assert_allclose(two.base_wrench[0, 3:], rotation @ one.base_wrench[0, 3:], atol=1e-9)
+    for part in (slice(0, 3), slice(3, 6)):  # force and moment
+        assert_allclose(two.base_wrench[0, part], rotation @ one.base_wrench[0, part], atol=1e-9)
 
 
 def test_the_base_carries_all_loads() -> None:
@@ -146,10 +135,7 @@ def test_inextensible_tendons_lock_the_twist_and_loose_ones_let_the_rod_go() -> 
 
 
 def test_a_slack_tendon_carries_nothing() -> None:
-    robot = rod()
-    (segment,) = robot.segments
-    slack = tuple(replace(t, unilateral=True, pretension=0.2) for t in segment.tendons)
-    robot = replace(robot, segments=(replace(segment, tendons=slack),))
+    robot = one_sided(rod(), pretension=0.2)
     # pulled by one, the opposite one paid out far
     lengths = robot.rest_tendon_length + np.array([-0.004, 0.0, 0.01, 0.0])
     state = Simulator(robot).settle(lengths)
@@ -157,8 +143,7 @@ def test_a_slack_tendon_carries_nothing() -> None:
     assert state.tension[0, 2] == 0.0
     assert (state.tension >= 0.0).all()
     assert state.path_length[0, 2] < lengths[2]  # it hangs loose
-    twin = shoot(robot, lengths)
-    assert_allclose(state.tip_position[0], twin.tip_position, atol=1e-7)
+    assert_allclose(state.tip_position[0], shoot(robot, lengths).tip_position, atol=1e-7)
 
 
 def test_a_follower_force_keeps_its_place_on_the_tip() -> None:
@@ -173,34 +158,27 @@ def test_a_follower_force_keeps_its_place_on_the_tip() -> None:
 
 
 def test_point_force_anywhere_matches_the_twin_and_keeps_the_order() -> None:
-    robot = rod()
-    lengths = bend(robot, 0.7, 0.2)
-    loads = {
-        "point_force": [(0.0313, (0.2, 0.1, 0.0)), (0.0521, (-0.1, 0.0, 0.3))],
-        "tip_force": (0.0, 0.1, 0.0),
-    }
-    twin = shoot(robot, lengths, **loads)
-    error = [
-        np.linalg.norm(
-            Simulator(robot, points_per_segment=n).settle(lengths, **loads).tip_position[0]
-            - twin.tip_position
-        )
-        for n in (6, 24)
-    ]
-    assert error[1] < 1e-7
-    assert error[1] < error[0] / 50.0  # fourth order: 256; a kink inside a step would leave first or second
+    lengths = bend(rod(), 0.7, 0.2)
+    points = [(0.0313, (0.2, 0.1, 0.0)), (0.0521, (-0.1, 0.0, 0.3))]
+    loads = {"point_force": points, "tip_force": (0.0, 0.1, 0.0)}
+    twin = shoot(rod(), lengths, **loads)
+
+    def error(n: int) -> float:
+        state = Simulator(rod(), points_per_segment=n).settle(lengths, **loads)
+        return np.linalg.norm(state.tip_position[0] - twin.tip_position)
+
+    assert error(24) < 1e-7
+    assert error(24) < error(6) / 50.0  # fourth order: 256; a kink inside a step would leave first or second
 
 
 def test_sampled_line_force_and_extension_match_the_twin() -> None:
     robot = load_robot("five_segment_reacher")
     robot = replace(robot, segments=robot.segments[3:])
-    last = robot.segments[1]
-    robot = replace(robot, segments=(robot.segments[0], last))
     lengths = bend(robot, 0.2, 0.1) + np.where(robot.tendon_segment == 1, 0.03, 0.0)
     line = np.array([[[0.1, 0.0, -0.2], [0.0, 0.2, -0.1]], [[0.0, 0.0, -0.1], [0.1, 0.1, 0.0]]])
-    extension = (0.0, 0.03)
-    state = Simulator(robot, points_per_segment=20).settle(lengths, extension=extension, line_force=line)
-    twin = shoot(robot, lengths, extension=extension, line_force=line)
+    loads = {"extension": (0.0, 0.03), "line_force": line}
+    state = Simulator(robot, points_per_segment=20).settle(lengths, **loads)
+    twin = shoot(robot, lengths, **loads)
     assert_allclose(state.tip_position[0], twin.tip_position, atol=1e-7)
     assert_allclose(state.tension[0], twin.tension, atol=1e-4)
     assert state.arclength[0, -1] == pytest.approx(0.23)
@@ -211,37 +189,31 @@ def test_stiffness_and_precurvature_that_vary_along_the_rod() -> None:
     n, length, force = 10, 0.07, 1e-6
     sim = Simulator(rod("passive"), points_per_segment=n)
     s = np.linspace(0.0, length, 2 * n + 1)
-    stiffness = (
-        np.tile([0.0022, 0.0022, 0.001], (2 * n + 1, 1)) * (1.0 + 0.5 * (1.0 - 2.0 * s / length))[:, None]
-    )
-    bare = sim._reader.rest
-    rest = np.zeros((1, 1, 2 * n + 1, 3))
+    stiffness = np.array([0.0022, 0.0022, 0.001]) * (1.0 + 0.5 * (1.0 - 2.0 * s / length))[:, None]
+    bare, rest = sim._reader.rest, np.zeros((1, 1, 2 * n + 1, 3))
     sim._reader.rest = bare._replace(stiffness=stiffness[None, None], precurvature=rest)
     state = sim.settle(tip_force=(0.0, force, 0.0))
     # so small a force bends as the linear beam does: w = integral of F (l - s)^2 / EI(s)
     fine = np.linspace(0.0, length, 20001)
     w = np.trapezoid((length - fine) ** 2 / (0.0022 * (1.0 + 0.5 * (1.0 - 2.0 * fine / length))), fine)
     assert_allclose(state.tip_position[0, 1], force * w, rtol=1e-5)
-    assert_allclose(
-        sim.shape([0.033]).position[0, 0, 1],
-        np.interp(0.033, state.arclength[0], state.position[0, :, 1]),
-        rtol=2e-2,
-    )
+    between = np.interp(0.033, state.arclength[0], state.position[0, :, 1])
+    assert_allclose(sim.shape([0.033]).position[0, 0, 1], between, rtol=2e-2)
     # and a plane u*(s) without load turns the tip by its integral
     rest[0, 0, :, 0] = 8.0 * np.cos(20.0 * s)
     sim._reader.rest = bare._replace(stiffness=stiffness[None, None], precurvature=rest)
-    state = sim.settle()
+    rotation = sim.settle().tip_rotation[0]
     angle = 8.0 / 20.0 * np.sin(20.0 * length)
-    assert_allclose(np.arctan2(-state.tip_rotation[0, 1, 2], state.tip_rotation[0, 2, 2]), angle, atol=1e-6)
+    assert_allclose(np.arctan2(-rotation[1, 2], rotation[2, 2]), angle, atol=1e-6)
 
 
-def one_sided(robot: Robot) -> Robot:
-    return replace(
-        robot,
-        segments=tuple(
-            replace(s, tendons=tuple(replace(t, unilateral=True) for t in s.tendons)) for s in robot.segments
-        ),
+def one_sided(robot: Robot, **changes: Any) -> Robot:
+    """The robot with tendons that can only pull."""
+    segments = (
+        replace(s, tendons=tuple(replace(t, unilateral=True, **changes) for t in s.tendons))
+        for s in robot.segments
     )
+    return replace(robot, segments=tuple(segments))
 
 
 @pytest.mark.parametrize("pull", [0.0, 3e-4, -1e-3])
@@ -250,9 +222,8 @@ def test_cable_robots_taut_and_loose_match_the_twin(pull: float) -> None:
     rng = np.random.default_rng(4)
     for robot in (one_sided(rod()), one_sided(load_robot("tdcr_a"))):
         angles = rng.uniform(-0.6, 0.6, (40, 2 * robot.n_segments))
-        lengths = np.stack(
-            [sum(bend(robot, *a[2 * k : 2 * k + 2], k) for k in range(robot.n_segments)) for a in angles]
-        )
+        each = range(robot.n_segments)
+        lengths = np.stack([sum(bend(robot, *a[2 * k : 2 * k + 2], k) for k in each) for a in angles])
         lengths -= (robot.n_segments - 1) * robot.rest_tendon_length + pull * (1 + robot.tendon_segment)
         force = rng.uniform(-0.1, 0.1, (40, 3))
         state = Simulator(robot, n_robots=40).settle(lengths, tip_force=force)
@@ -274,9 +245,8 @@ def test_any_sampling_of_a_line_force_keeps_its_force_and_moment() -> None:
         line = rng.uniform(-1.0, 1.0, (1, points, 3))
         loads = {"line_force": line, "point_force": [(0.0237, (0.0, 1e-9, 0.0))]}  # which moves the nodes
         state = Simulator(rod("passive")).settle(**loads)
-        assert_allclose(
-            state.base_wrench[0, :3], np.trapezoid(line[0], dx=0.07 / (points - 1), axis=0), atol=2e-9
-        )
+        whole = np.trapezoid(line[0], dx=0.07 / (points - 1), axis=0)
+        assert_allclose(state.base_wrench[0, :3], whole, atol=2e-9)
         twin = shoot(rod("passive"), **loads)
         # a polyline that bends inside a step is met in force and moment there: what is left is of third order
         assert_allclose(state.tip_position[0], twin.tip_position, atol=2e-6)
