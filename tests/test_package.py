@@ -1,5 +1,4 @@
-"""What is built is what was meant: one wheel with five import names, an sdist that builds the same, and
-extras that stand alone."""
+"""What is built is what was meant: one wheel, an sdist that builds the same, extras that stand alone."""
 
 from __future__ import annotations
 
@@ -45,12 +44,8 @@ ALSO = {
 
 
 def built(target: Path, source: Path) -> list[Path]:
-    subprocess.run(
-        [sys.executable, "-m", "hatchling", "build", "-d", str(target)],
-        cwd=source,
-        check=True,
-        capture_output=True,
-    )
+    words = [sys.executable, "-m", "hatchling", "build", "-d", str(target)]
+    subprocess.run(words, cwd=source, check=True, capture_output=True)
     return sorted(target.iterdir())
 
 
@@ -98,27 +93,19 @@ def test_it_works_in_an_empty_environment_with_one_extra(extra: str, wheel: Path
         pytest.skip("uv is not installed; pip install uv")
     # uv reads neither pip's settings nor its environment
     places = {"UV_FIND_LINKS": os.environ["PIP_FIND_LINKS"]} if "PIP_FIND_LINKS" in os.environ else {}
-    environment = {
-        name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")
-    } | places
+    given = {"env": {**os.environ, **places}, "capture_output": True, "text": True}
+    for name in ("PYTHONPATH", "VIRTUAL_ENV"):
+        given["env"].pop(name, None)
     python = tmp_path / "venv" / "bin" / "python"
     wanted = f"{wheel}[{extra}]" if extra else str(wheel)
     for command in (
         [uv, "venv", "-q", "--python", sys.executable, str(tmp_path / "venv")],
         [uv, "pip", "install", "-q", "--python", str(python), wanted],
     ):
-        done = subprocess.run(command, env=environment, capture_output=True, text=True)
+        done = subprocess.run(command, **given)
         assert done.returncode == 0, done.stderr
     (tmp_path / "empty").mkdir()
-    done = subprocess.run(
-        [python, "-c", SMOKE + ALSO[extra]],
-        cwd=tmp_path / "empty",
-        env=environment,
-        capture_output=True,
-        text=True,
-    )
+    done = subprocess.run([python, "-c", SMOKE + ALSO[extra]], cwd=tmp_path / "empty", **given)
     assert done.returncode == 0, done.stderr
-    reported = subprocess.run(
-        [python.parent / "fastrod", "--version"], env=environment, capture_output=True, text=True, check=True
-    ).stdout
-    assert reported.strip().endswith(wheel.name.split("-")[1])
+    version = subprocess.run([python.parent / "fastrod", "--version"], check=True, **given).stdout
+    assert version.strip().endswith(wheel.name.split("-")[1])

@@ -1,5 +1,4 @@
-"""The report of an identification: the contract's keys, one offline page, files whole or not at all, numbers
-in friendly units."""
+"""The report of an identification: the contract's keys, one offline page, whole files, friendly units."""
 
 from __future__ import annotations
 
@@ -52,37 +51,33 @@ def html(result: Result) -> str:
     return page(result)
 
 
+def found(
+    name: str, title: str, gain: float, evidence: Any = None, others: Any = (), **parameters: Estimate
+) -> Found:
+    return Found(
+        name=name,
+        title=title,
+        parameters=parameters,
+        held_out_gain=gain,
+        evidence=evidence or {},
+        cannot_be_told_from=[*others],
+    )
+
+
 def wild(result: Result) -> Result:
     """The same with all that may turn up: three effects, odd text, nan, marks."""
     delay = Estimate(value=0.043, stderr=0.002, unit="s", identifiable=True, prior_sd=0.1, at_bound=True)
     mass = Estimate(value=0.012, stderr=NAN, unit="kg", identifiable=True, prior_sd=NAN)
     more = [
-        Found(
-            name="latency",
-            title="Delay <b> & more",
-            parameters={"delay": delay},
-            held_out_gain=0.04,
-            evidence={"z": NAN},
-            cannot_be_told_from=["dynamics"],
-        ),
-        Found(
-            name="payload",
-            title="Mass",
-            parameters={"mass": mass},
-            held_out_gain=0.2,
-            evidence={},
-            cannot_be_told_from=[],
-        ),
+        found("latency", "Delay <b> & more", 0.04, {"z": NAN}, ["dynamics"], delay=delay),
+        found("payload", "Mass", 0.2, mass=mass),
     ]
-    base = dict(result.base_parameters)
-    base["tendon.1.gain"] = Estimate(
-        value=0.0, stderr=0.3, unit="", identifiable=False, why="no <load>", prior_sd=0.3
-    )
+    gain = Estimate(value=0.0, stderr=0.3, unit="", identifiable=False, why="no <load>", prior_sd=0.3)
     return replace(
         result,
         log=replace(result.log, name="a <script>alert(1)</script> & $x$"),
         effects=[*result.effects, *more],
-        base_parameters=base,
+        base_parameters={**result.base_parameters, "tendon.1.gain": gain},
         remaining=ResidualStructure(0.1, 0.05, 0.02, 0.01, 3.0),
         remaining_kind="static",
         remaining_fraction=0.12,
@@ -95,34 +90,17 @@ def wild(result: Result) -> Result:
     )
 
 
+KEYS = (
+    "log robot n_samples held_out noise_floor_m error verdict effects base_parameters remaining candidates "
+    "advice bounds path patterns summary notes correlation"
+)
+
+
 def test_json_has_the_keys_and_types_of_the_contract(result: Result) -> None:
     made = report.to_json(result)
-    assert set(made) >= {
-        "log",
-        "robot",
-        "n_samples",
-        "held_out",
-        "noise_floor_m",
-        "error",
-        "verdict",
-        "effects",
-        "base_parameters",
-        "remaining",
-        "candidates",
-        "advice",
-        "bounds",
-        "path",
-        "patterns",
-        "summary",
-        "notes",
-        "correlation",
-    }
-    assert (made["log"], made["robot"], made["n_samples"], made["held_out"]) == (
-        "small",
-        "prototype",
-        420,
-        ["two"],
-    )
+    assert set(made) >= set(KEYS.split())
+    head = [made[key] for key in ("log", "robot", "n_samples", "held_out")]
+    assert head == ["small", "prototype", 420, ["two"]]
     assert made["noise_floor_m"] == result.noise.floor
     assert set(made["error"]["train"]) == {"before_rms_m", "after_rms_m"}
     assert set(made["error"]["held_out"]) == {"before_rms_m", "after_rms_m", "interval_m"}
@@ -134,9 +112,8 @@ def test_json_has_the_keys_and_types_of_the_contract(result: Result) -> None:
     assert set(effect) >= {"name", "parameters", "held_out_gain", "evidence", "cannot_be_told_from"}
     assert set(effect["parameters"]["half_width"]) >= {"value", "stderr", "unit", "identifiable"}
     assert_allclose(effect["parameters"]["half_width"]["value"], 3e-4, atol=2e-5)
-    assert all(
-        set(e) >= {"value", "stderr", "unit", "identifiable", "why"} for e in made["base_parameters"].values()
-    )
+    numbers = made["base_parameters"].values()
+    assert all(set(e) >= {"value", "stderr", "unit", "identifiable", "why"} for e in numbers)
     assert set(made["remaining"]) >= {"structured_fraction", "kind"}
     assert made["remaining"]["kind"] in ("none", "static", "memory", "drift", "unknown")
     assert all(set(c) >= {"name", "held_out_rms_m", "score", "kept", "why"} for c in made["candidates"])
@@ -175,11 +152,8 @@ class Reader(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.add(tag)
-        self.addresses += [
-            value or ""
-            for name, value in attrs
-            if name in ("src", "href", "xlink:href", "srcset", "data", "action")
-        ]
+        places = ("src", "href", "xlink:href", "srcset", "data", "action")
+        self.addresses += [value or "" for name, value in attrs if name in places]
         self.ids += [value or "" for name, value in attrs if name == "id"]
         if tag not in self.void:
             self.open.append(tag)
@@ -204,9 +178,8 @@ def test_page_is_one_offline_file(html: str) -> None:
     assert not re.search(r"https?:|@import|url\((?!#)", html)
     assert not read.tags & {"script", "link", "iframe", "object"}
     assert len(html) < 1_500_000
-    inside = {address[1:] for address in read.addresses if address.startswith("#")} | set(
-        re.findall(r"url\(#([^)]*)\)", html)
-    )
+    inside = {address[1:] for address in read.addresses if address.startswith("#")}
+    inside |= set(re.findall(r"url\(#([^)]*)\)", html))
     assert inside <= set(read.ids)  # no figure took another one's names
 
 
@@ -230,37 +203,17 @@ def test_page_escapes_what_others_wrote_and_takes_what_is_missing(result: Result
     assert read.open == []
     assert "script" not in read.tags
     assert escape("a <script>alert(1)</script> & $x$") in html
-    for text in (
-        "Delay <b> & more",
-        "it <jumps>",
-        "turn <it>",
-        "odd & even",
-        "no <load>",
-        "at bound",
-        "dynamics",
-        "43.0 ± 2.0 ms",
-    ):
+    odd = ("Delay <b> & more", "it <jumps>", "turn <it>", "odd & even", "no <load>")
+    for text in (*odd, "at bound", "dynamics", "43.0 ± 2.0 ms"):
         assert text in read.words, text
-    assert (
-        "nan" not in unescape(re.sub(r"base64,[^\"]*|<style.*?</style>", "", html, flags=re.DOTALL)).lower()
-    )
+    plain = unescape(re.sub(r"base64,[^\"]*|<style.*?</style>", "", html, flags=re.DOTALL))
+    assert "nan" not in plain.lower()
 
 
 def test_page_without_effects_shows_the_base_model_alone(result: Result) -> None:
-    bare = replace(
-        result,
-        effects=[],
-        path=result.path[:1],
-        after=result.before,
-        verdict="not_in_library",
-        patterns=["the tip jumps"],
-        correlation=(["a"], np.ones((1, 1))),
-        tried=[],
-        bounds=[],
-        advice=[],
-        summary="No effect explains it.",
-    )
-    words = Reader(page(bare)).words
+    bare = replace(result, effects=[], path=result.path[:1], after=result.before, tried=[], bounds=[])
+    bare = replace(bare, correlation=(["a"], np.ones((1, 1))), advice=[], summary="No effect explains it.")
+    words = Reader(page(replace(bare, verdict="not_in_library", patterns=["the tip jumps"]))).words
     assert "the tip jumps" in words
     assert "base model" in words
     assert "Before and after" not in words
@@ -270,11 +223,7 @@ def test_page_without_effects_shows_the_base_model_alone(result: Result) -> None
 def test_files_are_written_whole(result: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     written = report.write(result, tmp_path / "out")
     assert [path.name for path in written] == ["report.json", "report.html", "identified.toml"]
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
-        "identified.toml",
-        "report.html",
-        "report.json",
-    ]
+    assert sorted((tmp_path / "out").iterdir()) == sorted(written)
     before = (tmp_path / "out" / "report.html").read_bytes()
     assert report.write(result, tmp_path / "out") == written
     assert (tmp_path / "out" / "report.html").read_bytes() == before  # deterministic
@@ -304,24 +253,15 @@ def test_terminal_table_fits_80_columns(result: Result) -> None:
     console.print(report.table(wild(result)))
     text = console.export_text()
     assert max(map(len, text.splitlines())) <= 80
-    for word in (
-        "tip error, rms [mm]",
-        "backlash",
-        "half width",
-        "latency cannot be distinguished from dynamics",
-        "run next: turn <it>",
-    ):
+    words = ("tip error, rms [mm]", "backlash", "half width", "latency cannot be distinguished from dynamics")
+    for word in (*words, "run next: turn <it>"):
         assert word in text, word
 
 
 @pytest.mark.parametrize("name", effect_names())
 def test_every_effect_has_a_signal(result: Result, name: str) -> None:
     value = Estimate(value=1.0, stderr=0.1, unit="", identifiable=True)
-    given = dict.fromkeys(("x", "y", "time_constant"), value)
-    found = Found(
-        name=name, title="", parameters=given, held_out_gain=1.0, evidence={}, cannot_be_told_from=[]
-    )
-    view = Signals(result).view(found)
+    view = Signals(result).view(found(name, "", 1.0, x=value, y=value, time_constant=value))
     assert len(view.rows) == len(view.signal) == len(view.before) == len(view.after) > 0.2 * 420
     assert np.isfinite([view.signal, view.before, view.after]).all()
 
@@ -360,17 +300,15 @@ def test_numbers_are_said_in_friendly_units() -> None:
     assert plain_name("tendon.2.gain") == "gain, tendon 2"
 
 
+BOUNDS = {
+    Bound("payload", "mass", "kg", 0.007): "payload: a mass above 7.0 g",
+    Bound("encoder_offset", "offset_1", "m", 1e-4): "encoder offset: an offset above 0.10 mm",
+    Bound("tip_force", "x", "N", 0.2): "tip force: a component along x above 0.20 N",
+}
+
+
 def test_bounds_are_sentences() -> None:
-    assert bound_sentence(Bound("payload", "mass", "kg", 0.007)) == (
-        "payload: a mass above 7.0 g would have shown"
-    )
-    assert (
-        bound_sentence(Bound("encoder_offset", "offset_1", "m", 1e-4))
-        == "encoder offset: an offset above 0.10 mm would have shown"
-    )
-    assert bound_sentence(Bound("tip_force", "x", "N", 0.2)) == (
-        "tip force: a component along x above 0.20 N would have shown"
-    )
-    assert bound_sentence(Bound("axial_compression", "per_bend", "1/rad", NAN)).startswith(
-        "this log cannot show axial compression"
-    )
+    for bound, words in BOUNDS.items():
+        assert bound_sentence(bound) == f"{words} would have shown"
+    none = bound_sentence(Bound("axial_compression", "per_bend", "1/rad", NAN))
+    assert none.startswith("this log cannot show axial compression")

@@ -1,5 +1,4 @@
-"""Any values at all as a simulator's inputs: a state, or one sentence; and what was refused has changed
-nothing."""
+"""Any values at all as a simulator's inputs: a state, or one sentence that has changed nothing."""
 
 from __future__ import annotations
 
@@ -19,40 +18,14 @@ from fastrod.errors import FastrodError
 
 N = 4
 FIELDS = (
-    "position",
-    "rotation",
-    "curvature",
-    "arclength",
-    "moment",
-    "force",
-    "tip_position",
-    "tip_rotation",
-    "tension",
-    "path_length",
-    "base_wrench",
-    "residual",
+    "position rotation curvature arclength moment force tip_position tip_rotation tension path_length "
+    "base_wrench residual"
 )
-SHAPES = {
-    "tendon_length": (4,),
-    "extension": (1,),
-    "tip_force": (3,),
-    "tip_moment": (3,),
-    "line_force": (3,),
-    "follower_tip_force": (3,),
-    "base_pose": (7,),
-}
-DTYPES = [
-    np.float64,
-    np.float32,
-    np.float16,
-    np.int64,
-    np.uint8,
-    bool,
-    complex,
-    object,
-    np.str_,
-    "datetime64[s]",
-]
+EVERY = f"{FIELDS} ok passes"
+SHAPES = {"tendon_length": (4,), "extension": (1,), "tip_force": (3,), "tip_moment": (3,)}
+SHAPES |= {"line_force": (3,), "follower_tip_force": (3,), "base_pose": (7,)}
+NUMBERS = [np.float64, np.float32, np.float16, np.int64, np.uint8]
+DTYPES = [*NUMBERS, bool, complex, object, np.str_, "datetime64[s]"]
 HUGE = [np.nan, np.inf, -np.inf, 1e-320, 1e3, 1e9, 1e30, 1e100, 1e200, 1.7e308, -1e30, -1.7e308]
 
 
@@ -62,12 +35,8 @@ def robot(kind: str = "plain") -> Robot:
 
     made = rod(extension=(-0.005, 0.02), line_density=0.01)
     if kind == "effects":
-        effects = (
-            {"name": "backlash", "half_width": 1e-4},
-            {"name": "creep", "share": 0.1},
-            {"name": "payload", "mass": 0.01},
-        )
-        made = replace(made, effects=effects)
+        slow = {"name": "creep", "share": 0.1}, {"name": "payload", "mass": 0.01}
+        made = replace(made, effects=({"name": "backlash", "half_width": 1e-4}, *slow))
     return made
 
 
@@ -93,22 +62,18 @@ def good(sim: Simulator, seed: int) -> dict[str, Any]:
 
 def well(state: State) -> None:
     """Where a state is ok it is finite; where it is not, it says why in one line."""
-    for name in FIELDS:
+    for name in FIELDS.split():
         assert np.isfinite(getattr(state, name)[state.ok]).all(), name
     assert set(state.problems) == set(np.flatnonzero(~state.ok).tolist())
-    assert not any(
-        "\n" in sentence or not sentence.rstrip().endswith((".", "?")) for sentence in state.problems.values()
-    ), state.problems
+    for sentence in state.problems.values():
+        assert "\n" not in sentence
+        assert sentence.rstrip().endswith((".", "?")), sentence
 
 
 def differing(one: State, other: State, rows: Any = slice(None)) -> list[str]:
     """In what two states are not the same bit for bit."""
-    names = (*FIELDS, "ok", "passes")
-    return [
-        name
-        for name in names
-        if not np.array_equal(getattr(one, name)[rows], getattr(other, name)[rows], equal_nan=True)
-    ]
+    pairs = ((name, getattr(one, name)[rows], getattr(other, name)[rows]) for name in EVERY.split())
+    return [name for name, a, b in pairs if not np.array_equal(a, b, equal_nan=True)]
 
 
 @st.composite
@@ -116,22 +81,8 @@ def arrays(draw: st.DrawFn, core: tuple[int, ...]) -> Any:
     """What stands where an array (N, *core) should."""
     if draw(st.integers(0, 9)) == 0:
         return draw(odd_values)
-    shape = draw(
-        st.sampled_from(
-            [
-                core,
-                (1, *core),
-                (N, *core),
-                (N + 1, *core),
-                (),
-                (0, *core),
-                (*core, 1),
-                (N, *core, 2),
-                (N, 1),
-                (2, N, *core),
-            ]
-        )
-    )
+    before = [core, (1, *core), (N, *core), (N + 1, *core), (), (0, *core)]
+    shape = draw(st.sampled_from([*before, (*core, 1), (N, *core, 2), (N, 1), (2, N, *core)]))
     base = np.broadcast_to(np.float64(draw(st.sampled_from([0.0, 0.07, 0.1, 1.0]))), shape).copy()
     if base.size and draw(st.booleans()):
         base.flat[draw(st.integers(0, base.size - 1))] = draw(st.sampled_from(HUGE) | st.floats())
@@ -147,14 +98,8 @@ def arrays(draw: st.DrawFn, core: tuple[int, ...]) -> Any:
 def inputs(draw: st.DrawFn) -> dict[str, Any]:
     """Keyword arguments of a step, most of them bad."""
     given: dict[str, Any] = {"tendon_length": np.full((N, 4), 0.07)}
-    for name in draw(
-        st.lists(
-            st.sampled_from([*SHAPES, "tension", "point_force", "line_force 4"]),
-            min_size=1,
-            max_size=3,
-            unique=True,
-        )
-    ):
+    names = st.sampled_from([*SHAPES, "tension", "point_force", "line_force 4"])
+    for name in draw(st.lists(names, min_size=1, max_size=3, unique=True)):
         if name == "point_force":
             pair = st.tuples(arrays(()), arrays((3,)))
             given[name] = draw(st.lists(pair, max_size=3) | odd_values | st.lists(odd_values, max_size=2))
@@ -305,8 +250,7 @@ def test_an_odd_simulator_is_one_or_a_sentence(name: str, value: Any) -> None:
 
 
 class Twins(RuleBasedStateMachine):
-    """Two simulators driven alike, one of which is given bad input in between, and sent back to where it
-    was."""
+    """Two simulators driven alike, one of which is given bad input in between, and sent back."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -371,9 +315,8 @@ class Twins(RuleBasedStateMachine):
 def test_a_session_with_bad_input_is_the_session_without(tmp_path: Any) -> None:
     from hypothesis.stateful import run_state_machine_as_test
 
-    run_state_machine_as_test(
-        Twins, settings=settings(tried(25), stateful_step_count=12, suppress_health_check=SLOW)
-    )
+    steps = settings(tried(25), stateful_step_count=12, suppress_health_check=SLOW)
+    run_state_machine_as_test(Twins, settings=steps)
     assert Twins.alike is not None
 
 

@@ -13,15 +13,8 @@ from rods import bend
 from fastrod import Robot, Simulator, State, load_robot
 
 LENGTHS = ("position", "arclength", "tip_position", "path_length", "residual")
-OTHERS = {
-    "rotation": 1.0,
-    "curvature": 14.0,
-    "moment": 0.03,
-    "force": 0.5,
-    "tip_rotation": 1.0,
-    "tension": 5.0,
-    "base_wrench": 0.03,
-}
+OTHERS = {"rotation": 1.0, "curvature": 14.0, "moment": 0.03, "force": 0.5, "tip_rotation": 1.0}
+OTHERS |= {"tension": 5.0, "base_wrench": 0.03}
 """Sizes of the numbers of a state in these robots: 1/l, EI/l, EI/l^2, EI/(d l)."""
 PAPER_STEP = ("position", "arclength", "tip_position", "path_length", "residual", "rotation", "tip_rotation")
 """Of a step in paper mode: four tendons on two unknowns have many gains, which single precision tells apart,
@@ -35,21 +28,13 @@ def chain() -> Robot:
     robot = load_robot("tdcr_b")
     first, last = robot.segments
     slack = tuple(replace(t, unilateral=True, pretension=0.1) for t in last.tendons)
-    last = replace(
-        last,
-        bending_stiffness=(0.002, 0.003),
-        precurvature=(1.0, -2.0, 0.5),
-        tendons=slack,
-        extension=(0.0, 0.02),
-    )
-    return replace(robot, segments=(first, last))
+    bent = replace(last, bending_stiffness=(0.002, 0.003), precurvature=(1.0, -2.0, 0.5))
+    return replace(robot, segments=(first, replace(bent, tendons=slack, extension=(0.0, 0.02))))
 
 
 def pair(robot: Robot | Sequence[Robot], n: int | None = 3, **options: Any) -> list[Simulator]:
-    return [
-        Simulator(robot, n_robots=n, device=device, **{"points_per_segment": 3, **options})
-        for device in ("cpu", "cuda")
-    ]
+    given = {"n_robots": n, "points_per_segment": 3, **options}
+    return [Simulator(robot, device=device, **given) for device in ("cpu", "cuda")]
 
 
 def inputs(robot: Robot, k: int, n: int = 3) -> dict[str, Any]:
@@ -78,9 +63,8 @@ def assert_same(here: State, there: State, *, only: Sequence[str] | None = None)
 
 def assert_same_memory(here: Simulator, there: Simulator) -> None:
     paper = here.robots[0].segments[0].mode == "paper"
-    for name, a, b in zip(
-        here.snapshot().memory._fields, here.snapshot().memory, there.snapshot().memory, strict=True
-    ):
+    one, two = here.snapshot().memory, there.snapshot().memory
+    for name, a, b in zip(one._fields, one, two, strict=True):
         if paper and name in ("gain", "curvature_guess"):  # `PAPER_STEP`
             continue
         natural = {"move": 1.0, "defect": 1.0, "curvature_guess": OTHERS["curvature"]}

@@ -1,5 +1,4 @@
-"""What lives on the device: nothing is lost between the two copies of the memory, and a steady step moves
-what it must and no more."""
+"""What lives on the device: no copy of the memory is stale, and a steady step moves what it must alone."""
 
 from __future__ import annotations
 
@@ -88,9 +87,7 @@ def test_a_memory_that_the_host_wrote_into_is_the_newer_one() -> None:
 
 
 def test_outputs_full_and_tip_agree() -> None:
-    full, tip = (
-        Simulator(rod(), n_robots=3, points_per_segment=3, outputs=o, device="cuda") for o in ("full", "tip")
-    )
+    (_, full), (_, tip) = pair(rod()), pair(rod(), outputs="tip")
     for k in range(3):
         a, b = (sim.step(**inputs(rod(), k)) for sim in (full, tip))
     assert_allclose(b.tip_position, a.tip_position, atol=1e-15)
@@ -103,9 +100,6 @@ def test_rods_that_feel_contact_are_refused() -> None:
     scene = ContactScene(obstacles=[sphere(0.01, name="ball", position=(0.05, 0.0, 0.05))])
     with pytest.raises(InputError, match="contact was given with device 'cuda', where rods feel none"):
         Simulator(robot, contact=scene, device="cuda")
-    sims = [
-        Simulator(robot, points_per_segment=3, contact=scene, feel_contact=False, device=d)
-        for d in ("cpu", "cuda")
-    ]
+    sims = pair(robot, 1, contact=scene, feel_contact=False)
     assert_same(*(sim.settle(robot.rest_tendon_length) for sim in sims))
     assert_allclose(sims[1].clearance(), sims[0].clearance(), atol=1e-12)

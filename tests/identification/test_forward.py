@@ -41,8 +41,8 @@ TABLES: dict[str, dict[str, Any]] = {
     for name in registry.effect_names()
     if has_memory(get_effect(name)) or signal_of(get_effect(name)) is Signal.TIME
 }
-"""Every effect with a memory or a clock; one that is not given above has the values that a fit starts
-from."""
+"""Every effect with a memory or a clock; one that is not given above as a fit starts it."""
+MEMORIES = [{"name": name} | table for name, table in TABLES.items()]
 STATIC: list[dict[str, Any]] = [
     {"name": "drum_gain", "gain": [0.03, -0.02, 0.04, 0.01]},
     {"name": "encoder_offset", "offset": 1e-4},
@@ -86,27 +86,22 @@ def stepped(robot: Robot, what: RunLog) -> PredictedPose:
     seen = []
     for i in range(len(what)):
         sim.dt = float(what.t[i] - what.t[i - 1]) if i else 1.0  # the first is no step
-        assert what.tip_force is not None
-        assert what.payload is not None
-        assert what.base_quaternion is not None
-        assert what.ext is not None
-        turn = Rotation.from_quat(what.base_quaternion[i].copy(), scalar_first=True)
-        given = {
-            "tip_force": turn.apply(what.tip_force[i].copy()) + what.payload[i] * np.array(robot.gravity),
-            "base_pose": np.concatenate([robot.base_position, what.base_quaternion[i]]),
-            "extension": what.ext[i],
-        }
-        assert sim.settle(
-            robot.rest_tendon_length + what.dl[i], tolerance=1e-10 * robot.length, **given
-        ).ok.all()
+        rotation = Rotation.from_quat(what.base_quaternion[i].copy(), scalar_first=True)
+        state = sim.settle(
+            robot.rest_tendon_length + what.dl[i],
+            tip_force=rotation.apply(what.tip_force[i].copy()) + what.payload[i] * np.array(robot.gravity),
+            base_pose=np.concatenate([robot.base_position, what.base_quaternion[i]]),
+            extension=what.ext[i],
+            tolerance=1e-10 * robot.length,
+        )
+        assert state.ok.all()
         seen.append(sim.measure())
     position, rotation, points = (np.concatenate(parts) for parts in zip(*seen, strict=True))
     return PredictedPose(position, rotation, points, np.ones(len(what), bool))
 
 
 def predicted(robot: Robot, what: RunLog) -> PredictedPose:
-    """The rows of a log as identification sees them: the robot's effects are known, nothing else is
-    fitted."""
+    """The rows of a log as identification sees them: the robot's effects are known, no more is fitted."""
     samples = sample(what)
     model = base_model(robot)
     pose = predict(model, model.start, samples, PredictedRod(samples, robot, points=True))
@@ -141,33 +136,23 @@ def test_a_log_in_one_go_is_a_simulator_step_by_step(name: str) -> None:
     assert np.abs(found.position - predicted(two_segments(), what).position).max() > 1e-4
 
 
-def test_all_effects_at_once_are_the_simulator() -> None:
+@pytest.mark.parametrize("tables", [STATIC, [*MEMORIES, *STATIC]], ids=["static", "all"])
+def test_effects_at_once_are_the_simulator(tables: list[dict[str, Any]]) -> None:
     """With static ones before, between and after those with a memory."""
-    robot = having(two_segments(), *({"name": name} | table for name, table in TABLES.items()), *STATIC)
-    what = log(robot)
-    assert_alike(predicted(robot, what), stepped(robot, what), robot.length)
-
-
-def test_static_effects_are_the_simulator() -> None:
-    robot = having(two_segments(), *STATIC)
+    robot = having(two_segments(), *tables)
     what = log(robot)
     assert_alike(predicted(robot, what), stepped(robot, what), robot.length)
 
 
 def test_several_runs_begin_with_no_memory() -> None:
     """Two runs, interleaved in the file, the second at another time of day: each as if it were alone."""
-    robot = having(two_segments(), *({"name": name} | table for name, table in TABLES.items()))
+    robot = having(two_segments(), *MEMORIES)
     alone = log(robot)
     other = replace(alone, dl=wave(robot, N, seed=5), t=alone.t + 100.0)
     order = np.argsort(np.concatenate([np.arange(N), np.arange(N) + 0.5]), kind="stable")
-    both = RunLog(
-        name="both",
-        run=np.repeat(["a", "b"], N)[order],
-        **{
-            key: np.concatenate([getattr(alone, key), getattr(other, key)])[order]
-            for key in ("t", "dl", "tip_position", "payload", "ext", "tip_force", "base_quaternion", "points")
-        },
-    )
+    names = ("t", "dl", "tip_position", "payload", "ext", "tip_force", "base_quaternion", "points")
+    columns = {n: np.concatenate([getattr(alone, n), getattr(other, n)])[order] for n in names}
+    both = RunLog(name="both", run=np.repeat(["a", "b"], N)[order], **columns)
     samples = sample(both)
     assert [(part.start, part.stop) for part in samples.runs] == [(0, N), (N, 2 * N)]
     assert_allclose(samples.time[[0, N]], 0.0)
@@ -182,7 +167,7 @@ def test_several_runs_begin_with_no_memory() -> None:
 
 
 def test_a_loss_that_looks_at_some_rows_does_not_shorten_the_memory() -> None:
-    robot = having(two_segments(), *({"name": name} | table for name, table in TABLES.items()))
+    robot = having(two_segments(), *MEMORIES)
     what = log(robot)
     whole = predicted(robot, what)
     samples = sample(what).on(np.array([3, 11, 12, 29]))

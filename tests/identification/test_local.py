@@ -29,8 +29,7 @@ def robot() -> Robot:
 
 
 def samples() -> LogSamples:
-    """Loads, two base orientations, and a measured tip that is some tenths of a millimetre from the nominal
-    one."""
+    """Loads, two base orientations, a measured tip some tenths of a millimetre from the nominal one."""
     turned = Rotation.from_rotvec(np.where(np.arange(N)[:, None] < N // 2, 0.0, [0.9, -0.5, 0.3]))
     inputs: dict[str, Any] = {
         "payload": np.where(np.arange(N) % 20 < 10, 0.0, 0.02),
@@ -100,38 +99,23 @@ def exact_slopes(here: Place, model: Model, theta: np.ndarray, j: int) -> np.nda
     return (ends[1] - ends[0]) / (2.0 * step)
 
 
-# What a local slope may be off by, as a share of the exact one (root mean square over rows and numbers seen):
-# wires go through the rod by one-sided differences of 2 mrad, the camera by none;
-TENDONS = dict.fromkeys(
-    ["drum_gain", "encoder_offset", "coupling", "slack", "stiffening", "temperature"], 0.004
-)
+# What a local slope may be off by, as a fraction of the exact one (root mean square over rows and numbers
+# seen): tendons go through the rod by one-sided differences of 2 mrad, the camera by none;
+LENGTHS = "drum_gain encoder_offset coupling slack stiffening temperature"
+TENDONS = dict.fromkeys(LENGTHS.split(), 0.004)
 CAMERA = dict.fromkeys(["marker_offset", "frame_misalignment", "lens", "camera_scale", "time_drift"], 1e-4)
 # a force from the tip by one-sided differences of 2e-3 EI / l^2, and from there on linear: a twentieth of a
 # typical payload here;
 FORCE = dict.fromkeys(["payload", "tip_force"], 0.02)
 # operators have corners, which the local difference of a fiftieth of a typical size looks over: play has
-# nothing but corners, and an
-# oscillator that is sampled more slowly than it rings answers to its period at any phase;
-MEMORY = {
-    "latency": 0.015,
-    "backlash": 0.15,
-    "friction": 0.01,
-    "creep": 0.004,
-    "plastic_set": 0.006,
-    "dynamics": 0.15,
-}
+# nothing but corners, and an oscillator that is sampled more slowly than it rings answers to its period at
+# any phase;
+MEMORY = {"latency": 0.015, "backlash": 0.15, "friction": 0.01, "creep": 0.004, "plastic_set": 0.006}
+MEMORY |= {"dynamics": 0.15}
 # what changes the rod has one secant, over a typical size: it is off by how much the effect saturates over
-# that. Tendons that stretch
-# by thirty times their compliance here do so by a third.
-ROD = {
-    "gravity": 0.07,
-    "tendon_stretch": 0.45,
-    "routing_angle": 0.15,
-    "axial_compression": 0.03,
-    "precurvature": 0.02,
-    "stiffness_taper": 0.05,
-    "stiffness_anisotropy": 0.2,
-}
+# that. Tendons that stretch by thirty times their compliance here do so by a third.
+ROD = {"gravity": 0.07, "tendon_stretch": 0.45, "routing_angle": 0.15, "axial_compression": 0.03}
+ROD |= {"precurvature": 0.02, "stiffness_taper": 0.05, "stiffness_anisotropy": 0.2}
 NOTHING = 0.01  # sigma, by a typical size: a slope that small is not compared; nobody can see it
 
 
@@ -162,16 +146,8 @@ def near_neutral(name: str) -> tuple[Place, Model, np.ndarray, int]:
     here = base()
     model = here.model.without(name).with_effect(name)
     first = len(model.without(name).unknowns)
-    theta = np.concatenate(
-        [
-            [
-                v
-                for u, v in zip(here.model.unknowns, here.theta, strict=True)
-                if u.place[:2] != ("effect", name)
-            ],
-            model.start[first:],
-        ]
-    )
+    others = [u.place[:2] != ("effect", name) for u in here.model.unknowns]
+    theta = np.concatenate([here.theta[others], model.start[first:]])
     for j in range(first, len(theta)):
         unknown = model.unknowns[j]
         if name == "dynamics":
@@ -183,14 +159,8 @@ def near_neutral(name: str) -> tuple[Place, Model, np.ndarray, int]:
 
 def test_slopes_of_the_base_parameters() -> None:
     """Stiffness by a one-sided difference of 5 %, lengths of two."""
-    here = base()
-    assert_slopes(
-        here,
-        here.model,
-        here.theta,
-        0,
-        {"bending_stiffness": 0.07, "torsional_stiffness": 0.05, "length": 0.01, **TENDONS, **CAMERA},
-    )
+    here, own = base(), {"bending_stiffness": 0.07, "torsional_stiffness": 0.05, "length": 0.01}
+    assert_slopes(here, here.model, here.theta, 0, own | TENDONS | CAMERA)
 
 
 @pytest.mark.parametrize("name", [*TENDONS, *CAMERA, *FORCE, *MEMORY])
@@ -227,14 +197,12 @@ def test_the_local_model_errs_by_the_square_of_the_distance() -> None:
     first = len(here.theta)
     model = here.model.with_effect("payload").with_effect("stiffening").with_effect("lens")
     errors = []
-    for part in (1.0, 0.5):
-        theta = np.concatenate([here.theta, [u.mean + part * u.scale for u in model.unknowns[first:]]])
-        errors.append(
-            np.sqrt(((here.linearised.residual(model, theta) - here.exact(model, theta)) ** 2).mean())
-        )
+    for fraction in (1.0, 0.5):
+        theta = np.concatenate([here.theta, [u.mean + fraction * u.scale for u in model.unknowns[first:]]])
+        exact = here.exact(model, theta)
+        errors.append(np.sqrt(((here.linearised.residual(model, theta) - exact) ** 2).mean()))
     assert 3.0 < errors[0] / errors[1] < 5.0
-    moved = np.sqrt(((here.exact(model, theta) - here.exact(here.model, here.theta)) ** 2).mean())
-    assert errors[1] < 0.1 * moved
+    assert errors[1] < 0.1 * np.sqrt(((exact - here.exact(here.model, here.theta)) ** 2).mean())
 
 
 def test_a_local_fit_finds_what_was_planted() -> None:
@@ -244,21 +212,12 @@ def test_a_local_fit_finds_what_was_planted() -> None:
     place = [u.name for u in here.model.unknowns].index("tendon.1.gain")
     true[place] = 0.03
     pose = predict(here.model, true, here.samples, here.rod)
-    log = here.samples.log
-    reported = replace(
-        target_of(here.samples, SIGMA, rotation_sigma=0.01, points=False),
-        tip=pose.position + SIGMA * np.random.default_rng(8).normal(size=(N, 3)),
-        rotation=None,
-    )
-    assert len(log) == N
-    linearised = LinearisedModel(
-        here.model,
-        here.theta,
-        here.samples,
-        PredictedRod(here.samples, here.model.robot, points=True),
-        reported,
-    )
-    fit = linearised.fit(here.model, here.theta, 20)
+    tip = pose.position + SIGMA * np.random.default_rng(8).normal(size=(N, 3))
+    target = target_of(here.samples, SIGMA, rotation_sigma=0.01, points=False)
+    target = replace(target, tip=tip, rotation=None)
+    assert len(here.samples.log) == N
+    rod = PredictedRod(here.samples, here.model.robot, points=True)
+    fit = LinearisedModel(here.model, here.theta, here.samples, rod, target).fit(here.model, here.theta, 20)
     error = np.sqrt(np.diag(np.linalg.inv(fit.hessian)))
     assert abs(fit.theta[place] - true[place]) < 3.0 * error[place]
     assert error[place] < 0.02  # the data say more than the prior
@@ -275,6 +234,5 @@ def test_rows_that_do_not_count() -> None:
     ok[9] = False
     residual = target.residual(pose._replace(ok=ok))
     assert_array_equal(residual[[7, 9]], 0.0)
-    assert_array_equal(
-        np.delete(residual, [7, 9], axis=0), np.delete(here.target.residual(pose), [7, 9], axis=0)
-    )
+    others = np.delete(np.arange(N), [7, 9])
+    assert_array_equal(residual[others], here.target.residual(pose)[others])

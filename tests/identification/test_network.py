@@ -1,24 +1,21 @@
-"""The network on what is left: it finds what follows from the inputs, and nothing in noise; it is never part
-of the result."""
+"""The network on what is left: it finds what follows from the inputs, nothing in noise, and stands apart."""
 
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from identification.logs import one_segment
+from identification.logs import bare_run, one_segment
 from numpy.testing import assert_array_equal
 from reportlog import backlash_log
 
 from fastrod.errors import InputError
 from fastrod.identification.attribution import identify
-from fastrod.identification.excite import excitation
 from fastrod.identification.learned.network import residual_network
-from fastrod.identification.log.forward import LogSamples, sample
+from fastrod.identification.log.forward import LogSamples
 from fastrod.identification.log.split import held_out_rows
 from fastrod.model.robotfile import load_robot
 from fastrod.model.routing import route
@@ -28,18 +25,15 @@ NOISE = 3e-4
 
 @cache
 def samples() -> LogSamples:
-    run = excitation(one_segment(), rate=8.0).log
-    return sample(replace(run, tip_position=np.zeros((len(run), 3)), payload=None, base_quaternion=None))
+    return bare_run(8.0)
 
 
 def left(residual: np.ndarray) -> tuple[float, float]:
     """Held-out rms of a residual, without the network and with it [m]."""
-    here = samples()
-    tested, _ = held_out_rows(here, ())
-    result = SimpleNamespace(
-        residual_after=residual, used=~tested, tested=tested, outlier=np.zeros_like(tested)
-    )
-    reported = residual_network(here, route(one_segment()), result)
+    tested, _ = held_out_rows(samples(), ())
+    rows = {"used": ~tested, "tested": tested, "outlier": np.zeros_like(tested)}
+    result = SimpleNamespace(residual_after=residual, **rows)
+    reported = residual_network(samples(), route(one_segment()), result)
     assert reported["inputs"] > 4
     return float(np.sqrt((residual[tested] ** 2).sum(1).mean())), reported["held_out_rms_m"]
 
@@ -66,20 +60,13 @@ def test_noise_is_not_predicted() -> None:
 def test_missing_rows_are_left_out() -> None:
     residual = noise()
     residual[::7] = np.nan
-    here = samples()
-    tested, _ = held_out_rows(here, ())
-    result = SimpleNamespace(
-        residual_after=residual, used=~tested, tested=tested, outlier=np.zeros_like(tested)
-    )
-    assert np.isfinite(residual_network(here, route(one_segment()), result)["held_out_rms_m"])
+    assert np.isfinite(left(residual)[1])
 
 
 def test_without_scikit_learn_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "sklearn.neural_network", None)
     with pytest.raises(
-        InputError,
-        match=r"needs scikit-learn; install fastrod\[network\], or leave "
-        r"--network out",
+        InputError, match=r"needs scikit-learn; install fastrod\[network\], or leave --network out"
     ):
         left(noise())
 
@@ -93,8 +80,5 @@ def test_it_is_reported_apart() -> None:
     assert without.network == {}
     assert 0.0 < with_it.network["held_out_rms_m"] < with_it.test.after
     assert_array_equal(with_it.after, without.after)
-    assert (with_it.test, with_it.verdict, with_it.identified) == (
-        without.test,
-        without.verdict,
-        without.identified,
-    )
+    for name in ("test", "verdict", "identified"):
+        assert getattr(with_it, name) == getattr(without, name)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from identification.logs import displacement_of, log_of, one_segment
@@ -33,10 +31,8 @@ def samples(n: int = N, *, rests: bool = True) -> LogSamples:
 
 def smooth(seed: int, n: int = N) -> np.ndarray:
     """(n, 3) what the model lacks: slow, some sigma large."""
-    t = np.arange(n)[:, None] / RATE
-    return (
-        4.0 * SIGMA * np.sin(np.array([0.5, 0.8, 1.1]) * t + np.random.default_rng(seed).uniform(0.0, 6.0, 3))
-    )
+    phase = np.random.default_rng(seed).uniform(0.0, 6.0, 3)
+    return 4.0 * SIGMA * np.sin(np.array([0.5, 0.8, 1.1]) * np.arange(n)[:, None] / RATE + phase)
 
 
 def white(seed: int, n: int = N) -> np.ndarray:
@@ -61,21 +57,14 @@ def test_rest_is_where_no_input_moves() -> None:
         assert (np.diff(rows) == 1).all()
     assert at_rest(samples(rests=False)) == []
     # a load that is hung on is a motion, and so is a new run
-    still = log_of(
-        one_segment(),
-        np.zeros((60, 4)),
-        0.1,
-        payload=np.repeat([0.0, 0.02], 30),
-        run=np.repeat(["a", "a", "b"], 20),
-    )
-    still = replace(still, t=np.concatenate([0.1 * np.arange(40), 0.1 * np.arange(20)]))
+    t, run = 0.1 * np.array([*range(40), *range(20)]), np.repeat(["a", "a", "b"], 20)
+    still = log_of(one_segment(), np.zeros((60, 4)), t=t, run=run, payload=np.repeat([0.0, 0.02], 30))
     assert [(rows[0], rows[-1]) for rows in at_rest(sample(still))] == [(10, 29), (50, 59)]
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_noise_at_rest(seed: int) -> None:
-    """Some 690 samples: known to 1 / sqrt(1380) = 2.7 %; a slow drift of the camera is not counted as
-    noise."""
+    """Some 690 samples: known to 1 / sqrt(1380) = 2.7 %; a slow drift of the camera is no noise."""
     drift = np.linspace(0.0, 20.0, N)[:, None] * SIGMA
     found = read_noise(samples(), white(seed) + drift, np.zeros((N, 3)))
     assert "at rest" in found.how
@@ -86,11 +75,9 @@ def test_noise_at_rest(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_noise_without_rest(seed: int) -> None:
-    """From the fastest part of a residual that also has slow structure: a median of 2250 correlated third
-    differences, 3 to 4 %."""
-    found = read_noise(
-        samples(LONG, rests=False), np.zeros((LONG, 3)), white(seed, LONG) + smooth(seed, LONG)
-    )
+    """From the fastest of a residual with slow structure: a median of 2250 third differences, 3 to 4 %."""
+    residual = white(seed, LONG) + smooth(seed, LONG)
+    found = read_noise(samples(LONG, rests=False), np.zeros((LONG, 3)), residual)
     assert "never rests" in found.how
     assert_allclose(found.sigma, SIGMA, rtol=0.1)
 
@@ -134,8 +121,7 @@ def test_planted_outliers_are_found_and_good_rows_kept(seed: int) -> None:
     good = keep(samples(), residual, Noise(SIGMA, 0.0, "known"))
     assert not good[bad].any()
     assert good[~bad].mean() >= 0.98
-    # and where nothing is planted hardly anything is thrown away: 5 sigma of a normal, with a spread from 15
-    # samples
+    # and where nothing is planted hardly anything goes: 5 sigma, with a spread from 15 samples
     assert keep(samples(), white(seed) + smooth(seed), Noise(SIGMA, 0.0, "known")).mean() >= 0.995
 
 
@@ -144,10 +130,7 @@ def test_outliers_are_looked_for_in_each_run_alone() -> None:
     robot = one_segment()
     label = np.repeat(["a", "b", "c"], [60, 60, 10])
     log = log_of(robot, np.zeros((130, 4)), 0.1, run=label)
-    residual = np.where(label == "a", 0.0, 1.0)[:, None] * 50.0 * SIGMA + SIGMA * np.random.default_rng(
-        1
-    ).normal(size=(130, 3))
-    residual[30] += 30.0 * SIGMA
-    residual[125] += 30.0 * SIGMA
+    residual = np.where(label == "a", 0.0, 1.0)[:, None] * 50.0 * SIGMA + white(1, 130)
+    residual[[30, 125]] += 30.0 * SIGMA
     good = keep(sample(log), residual, Noise(SIGMA, 0.0, "known"))
     assert np.flatnonzero(~good).tolist() == [30]

@@ -1,5 +1,4 @@
-"""A log with measured orientations: they inform the base model, and what they cannot explain does not lead it
-astray."""
+"""Measured orientations inform the base model, and what they cannot explain does not lead it astray."""
 
 from __future__ import annotations
 
@@ -23,46 +22,34 @@ def nominal() -> Robot:
     return load_robot("prototype")
 
 
+def seen(robot: Robot, run: RunLog) -> tuple[np.ndarray, Rotation]:
+    """Tips and orientations of a robot that is driven as in this run, from its base."""
+    simulator = Simulator(robot, n_robots=len(run), points_per_segment=12)
+    pose = np.column_stack([np.zeros((len(run), 3)), run.base_quaternion])
+    weight = run.payload[:, None] * np.array(robot.gravity)
+    state = simulator.settle(robot.rest_tendon_length + run.dl, tip_force=weight, base_pose=pose)
+    assert state.ok.all()
+    base = Rotation.from_quat(run.base_quaternion, scalar_first=True)
+    return base.inv().apply(state.tip_position), base.inv() * Rotation.from_matrix(state.tip_rotation)
+
+
 @pytest.fixture(scope="module")
 def late(nominal: Robot) -> RunLog:
     """What a camera measures that is two samples late, of a robot a tenth stiffer than its file says."""
     run = excitation(nominal).log
-    assert run.base_quaternion is not None
-    assert run.payload is not None
     (segment,) = nominal.segments
-    stiff = replace(
-        nominal,
-        segments=(replace(segment, bending_stiffness=tuple(1.1 * k for k in segment.bending_stiffness)),),
-    )
-    simulator = Simulator(stiff, n_robots=len(run), points_per_segment=12)
-    pose = np.column_stack([np.zeros((len(run), 3)), run.base_quaternion])
-    weight = run.payload[:, None] * np.array(nominal.gravity)
-    state = simulator.settle(nominal.rest_tendon_length + run.dl, tip_force=weight, base_pose=pose)
-    assert state.ok.all()
-    base = Rotation.from_quat(run.base_quaternion, scalar_first=True)
-    tip, turn = base.inv().apply(state.tip_position), base.inv() * Rotation.from_matrix(state.tip_rotation)
-    rng = np.random.default_rng(3)
-    tip = tip[np.maximum(np.arange(len(run)) - LATE, 0)] + NOISE * rng.normal(size=tip.shape)
-    turn = (
-        Rotation.from_rotvec(TURN * rng.normal(size=tip.shape))
-        * turn[np.maximum(np.arange(len(run)) - LATE, 0)]
-    )
+    stiffer = tuple(1.1 * k for k in segment.bending_stiffness)
+    tip, turn = seen(replace(nominal, segments=(replace(segment, bending_stiffness=stiffer),)), run)
+    rng, then = np.random.default_rng(3), np.maximum(np.arange(len(run)) - LATE, 0)
+    tip = tip[then] + NOISE * rng.normal(size=tip.shape)
+    turn = Rotation.from_rotvec(TURN * rng.normal(size=tip.shape)) * turn[then]
     return replace(run, tip_position=tip, tip_quaternion=quaternion_from_matrix(turn.as_matrix()))
 
 
 def test_the_base_fit_is_no_worse_than_the_model_as_it_was(late: RunLog, nominal: Robot) -> None:
     # no stiffness explains a delay: fitted, it must stay near the truth, and the error must not grow
     found = identify(late, nominal, max_effects=0)
-    simulator = Simulator(nominal, n_robots=len(late), points_per_segment=12)
-    assert late.base_quaternion is not None
-    assert late.payload is not None
-    pose = np.column_stack([np.zeros((len(late), 3)), late.base_quaternion])
-    state = simulator.settle(
-        nominal.rest_tendon_length + late.dl,
-        tip_force=late.payload[:, None] * np.array(nominal.gravity),
-        base_pose=pose,
-    )
-    tip = Rotation.from_quat(late.base_quaternion, scalar_first=True).inv().apply(state.tip_position)
+    tip, _ = seen(nominal, late)
     off = np.linalg.norm(late.tip_position - tip, axis=1)[found.used]
     assert found.train.before <= np.sqrt(np.mean(off**2))
     assert found.base_parameters["segment.*.bending_stiffness"].value == pytest.approx(1.1, rel=0.1)

@@ -1,5 +1,4 @@
-"""What a log of another camera, of mixed-up inputs or of another unit makes `identify` and `replay` do:
-register, ask, or refuse."""
+"""What a log of another camera, of mixed-up inputs or another unit makes `identify` and `replay` do."""
 
 from __future__ import annotations
 
@@ -17,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from fastrod import load_robot
 from fastrod.commands.cli import main
+from fastrod.effects.base import get_effect
 from fastrod.errors import LogError
 from fastrod.identification.attribution import identify
 from fastrod.identification.log.questions import questions
@@ -38,14 +38,8 @@ RIGHT = re.escape(
 
 
 def log_of(run: farlog.Run, **columns: Any) -> RunLog:
-    given = {
-        "name": "far",
-        "t": run.t,
-        "run": np.full(len(run.t), ""),
-        "dl": run.dl,
-        "tip_position": run.tip,
-    } | columns
-    return RunLog(**given)
+    given = {"name": "far", "t": run.t, "run": np.full(len(run.t), ""), "dl": run.dl, "tip_position": run.tip}
+    return RunLog(**given | columns)
 
 
 @cache
@@ -86,8 +80,7 @@ def test_points_in_space_or_in_a_plane_tell_any_rotation(cloud: str, angle: floa
     measured = points @ rotation.T + shift + 3e-4 * rng.normal(size=points.shape)
     measured[::11] += 0.2 * rng.normal(size=measured[::11].shape)  # outliers
     found = align(measured, points)
-    # the pull towards no rotation is a thousandth of the spread: of an arc, whose other spread is a third, up
-    # to some hundredths
+    # the pull towards no rotation is a thousandth of the spread: of an arc, some hundredths
     assert Rotation.from_matrix(found.rotation @ rotation.T).magnitude() < 0.03
     assert np.linalg.det(found.rotation) == pytest.approx(1.0)
     assert np.linalg.norm(found.shift - shift) < 2e-3
@@ -95,8 +88,7 @@ def test_points_in_space_or_in_a_plane_tell_any_rotation(cloud: str, angle: floa
 
 @pytest.mark.parametrize("turn", [0.0, 0.6])
 def test_points_on_a_line_tell_no_rotation_about_it(turn: float) -> None:
-    """Turned about another axis the line follows, and nothing turns about the line itself; with measured
-    orientations all is known."""
+    """About another axis the line follows, about itself nothing; with orientations all is known."""
     rng = np.random.default_rng(5)
     points = np.column_stack([rng.uniform(-0.05, 0.05, 300), np.zeros(300), np.full(300, 0.07)])
     rotation = Rotation.from_rotvec([0.0, turn, 0.0]).as_matrix()
@@ -136,17 +128,13 @@ def test_a_camera_far_off_is_registered_and_the_effect_named_as_ever(
     assert result.registration is not None
     assert result.registration.angle == pytest.approx(angle, abs=0.02)
     assert result.registration.distance == pytest.approx(distance, abs=3e-3)
-    said = (
-        f"The camera stands {np.degrees(result.registration.angle):.1f} deg and "
-        f"{result.registration.distance:.2g} m from where the robot"
-    )
-    assert said in result.summary
+    place = f"{np.degrees(result.registration.angle):.1f} deg and {result.registration.distance:.2g} m"
+    assert f"The camera stands {place} from where the robot" in result.summary
     assert report.to_json(result)["registration"]["angle_rad"] == result.registration.angle
     assert result.effects[0].name in ("backlash", "friction")  # friction without spread is backlash
     width = result.effects[0].parameters["half_width"]
     assert width.value == pytest.approx(farlog.PLAY, rel=0.03)
-    # arcs are no rods of Kirchhoff: measured when this was written 1.40, and 1.00 with coupling beside it on
-    # the camera of the file
+    # arcs are no rods of Kirchhoff: measured 1.40, and 1.00 with coupling on the camera of the file
     assert result.test.after < 1.5 * result.noise.floor < 0.2 * result.test.before
     paths = {path.name: path for path in report.write(result, tmp_path)}
     again = replay(seen(angle, distance), load_robot(paths["identified.toml"]))
@@ -171,8 +159,7 @@ REFUSED = {
     ),
     "half a turn": (
         lambda: log_of(farlog.log(900, rotation=HALF)),
-        r"A camera turned by 1[78]\d deg would "
-        r"look the same: if yours is",
+        r"A camera turned by 1[78]\d deg would look the same: if yours is",
     ),
     "columns moved on": (
         order(1, 2, 0, 4, 5, 3),
@@ -199,13 +186,11 @@ ASKED = {
     "half": (scaled(0.5), r"with every dl_ times 2 \(a radius for a diameter\)"),
     "time in ms": (
         lambda: replace(seen(), t=1e3 * seen().t),
-        r"has a row every 50 s and lasts .* s; is "
-        r"column t in ms\?",
+        r"has a row every 50 s and lasts .* s; is column t in ms\?",
     ),
     "a camera far off": (
         lambda: seen(0.6, 0.34),
-        r"the camera stands 34\.\d deg and 0\.34 m from where the "
-        r"robot file says",
+        r"the camera stands 34\.\d deg and 0\.34 m from where the robot file says",
     ),
 }
 
@@ -251,12 +236,11 @@ def test_replay_prints_its_questions_and_is_done(tmp_path: Path, monkeypatch: An
     run = farlog.log(300)
     Path("flipped.csv").write_text(farlog.csv(run._replace(dl=-run.dl)))
     assert main(["replay", "flipped.csv", "--robot", "mine.toml"]) == 0
-    reported = capsys.readouterr()
-    assert "excursion" in reported.out
-    assert re.search(
-        r"^log 'flipped' is further from robot 'mine' .* the sign of every dl_ reversed", reported.err
-    )
-    assert len(reported.err.splitlines()) == 1
+    told = capsys.readouterr()
+    assert "excursion" in told.out
+    words = r"^log 'flipped' is further from robot 'mine' .* the sign of every dl_ reversed"
+    assert re.search(words, told.err)
+    assert len(told.err.splitlines()) == 1
     rest = np.asarray(ROBOT.rest_tendon_length)
     Path("absolute.csv").write_text(farlog.csv(run._replace(dl=run.dl + rest)))
     for command in ("replay", "identify"):
@@ -282,25 +266,24 @@ def names_of_runs() -> RunLog:
     return replace(seen(), run=np.repeat(np.array(["one", "two"]), 450))
 
 
-PROVOKED: dict[str, Callable[[], object]] = {
-    "held out": lambda: identify(names_of_runs(), ROBOT, held_out=list(np.array(["tow"]))),
-    "held out window": lambda: identify(names_of_runs(), ROBOT, held_out=list(np.array(["two@x:"]))),
-    "held out too late": lambda: identify(names_of_runs(), ROBOT, held_out=list(np.array(["two@900:"]))),
-    "one run": lambda: names_of_runs().only(np.array(["tow"])[0]),
-    "excluded effect": lambda: load_effect(np.array(["backlsh"])[0]),
+def held_out(word: np.str_) -> Result:
+    return identify(names_of_runs(), ROBOT, held_out=[word])
+
+
+PROVOKED: dict[str, tuple[Callable[[np.str_], object], str]] = {
+    "held out": (held_out, "tow"),
+    "held out window": (held_out, "two@x:"),
+    "held out too late": (held_out, "two@900:"),
+    "one run": (lambda word: names_of_runs().only(word), "tow"),
+    "excluded effect": (get_effect, "backlsh"),
 }
-
-
-def load_effect(name: str) -> object:
-    from fastrod.effects.base import get_effect
-
-    return get_effect(name)
 
 
 @pytest.mark.parametrize("case", PROVOKED)
 def test_no_message_quotes_words_as_an_array_does(case: str) -> None:
+    call, word = PROVOKED[case]
     with pytest.raises(Exception, match=r"tow|two|backlsh") as caught:
-        PROVOKED[case]()
+        call(np.str_(word))
     assert "np.str_" not in str(caught.value)
 
 

@@ -1,5 +1,4 @@
-"""The least-squares solver on problems with certified answers, and the statistics on problems with exact
-ones."""
+"""The least-squares solver on certified answers, and the statistics on problems with exact ones."""
 
 from __future__ import annotations
 
@@ -23,10 +22,9 @@ from fastrod.identification.search.solve import (
 Model = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 # NIST Statistical Reference Datasets, nonlinear regression
-# (https://www.itl.nist.gov/div898/strd/nls/nls_main.shtml): Misra1a (lower
-# difficulty, 2 parameters), Thurber (higher, 7) and MGH09 (higher, 4). Data, certified values, their standard
-# deviations, residual
-# sum of squares, and NIST's starts; of Thurber and MGH09 only the second, nearer one.
+# (https://www.itl.nist.gov/div898/strd/nls/nls_main.shtml): Misra1a (lower difficulty, 2 parameters), Thurber
+# (higher, 7) and MGH09 (higher, 4). Data, certified values, their standard deviations, residual sum of
+# squares, and NIST's starts; of Thurber and MGH09 only the second, nearer one.
 
 
 def misra1a(b: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -41,9 +39,33 @@ def mgh09(b: np.ndarray, x: np.ndarray) -> np.ndarray:
     return b[0] * (x**2 + x * b[1]) / (x**2 + x * b[2] + b[3])
 
 
-NIST: dict[
-    str, tuple[Model, list[float], list[float], list[float], list[float], float, list[list[float]]]
-] = {
+THURBER_X = """
+-3.067 -2.981 -2.921 -2.912 -2.840 -2.797 -2.702 -2.699 -2.633 -2.481 -2.363 -2.322 -1.501 -1.460
+-1.274 -1.212 -1.100 -1.046 -0.915 -0.714 -0.566 -0.545 -0.400 -0.309 -0.109 -0.103 0.010 0.119
+0.377 0.790 0.963 1.006 1.115 1.572 1.841 2.047 2.200
+"""
+THURBER_Y = """
+80.574 84.248 87.264 87.195 89.076 89.608 89.868 90.101 92.405 95.854 100.696 101.060 401.672
+390.724 567.534 635.316 733.054 759.087 894.206 990.785 1090.109 1080.914 1122.643 1178.351
+1260.531 1273.514 1288.339 1327.543 1353.863 1414.509 1425.208 1421.384 1442.962 1464.350 1468.705
+1447.894 1457.628
+"""
+THURBER_B = """
+1.2881396800e3 1.4910792535e3 5.8323836877e2 7.5416644291e1 9.6629502864e-1 3.9797285797e-1
+4.9727297349e-2
+"""
+THURBER_SD = """
+4.6647963344 3.9571156086e1 2.8698696102e1 5.5675370270 3.1333340687e-2 1.4984928198e-2
+6.5842344623e-3
+"""
+
+
+def numbers(text: str) -> list[float]:
+    return [float(word) for word in text.split()]
+
+
+Numbers = list[float]
+NIST: dict[str, tuple[Model, Numbers, Numbers, Numbers, Numbers, float, list[Numbers]]] = {
     "Misra1a": (
         misra1a,
         [77.6, 114.9, 141.1, 190.8, 239.9, 289.0, 332.8, 378.4, 434.8, 477.3, 536.8, 593.1, 689.1, 760.0],
@@ -55,102 +77,10 @@ NIST: dict[
     ),
     "Thurber": (
         thurber,
-        [
-            -3.067,
-            -2.981,
-            -2.921,
-            -2.912,
-            -2.840,
-            -2.797,
-            -2.702,
-            -2.699,
-            -2.633,
-            -2.481,
-            -2.363,
-            -2.322,
-            -1.501,
-            -1.460,
-            -1.274,
-            -1.212,
-            -1.100,
-            -1.046,
-            -0.915,
-            -0.714,
-            -0.566,
-            -0.545,
-            -0.400,
-            -0.309,
-            -0.109,
-            -0.103,
-            0.010,
-            0.119,
-            0.377,
-            0.790,
-            0.963,
-            1.006,
-            1.115,
-            1.572,
-            1.841,
-            2.047,
-            2.200,
-        ],
-        [
-            80.574,
-            84.248,
-            87.264,
-            87.195,
-            89.076,
-            89.608,
-            89.868,
-            90.101,
-            92.405,
-            95.854,
-            100.696,
-            101.060,
-            401.672,
-            390.724,
-            567.534,
-            635.316,
-            733.054,
-            759.087,
-            894.206,
-            990.785,
-            1090.109,
-            1080.914,
-            1122.643,
-            1178.351,
-            1260.531,
-            1273.514,
-            1288.339,
-            1327.543,
-            1353.863,
-            1414.509,
-            1425.208,
-            1421.384,
-            1442.962,
-            1464.350,
-            1468.705,
-            1447.894,
-            1457.628,
-        ],
-        [
-            1.2881396800e3,
-            1.4910792535e3,
-            5.8323836877e2,
-            7.5416644291e1,
-            9.6629502864e-1,
-            3.9797285797e-1,
-            4.9727297349e-2,
-        ],
-        [
-            4.6647963344,
-            3.9571156086e1,
-            2.8698696102e1,
-            5.5675370270,
-            3.1333340687e-2,
-            1.4984928198e-2,
-            6.5842344623e-3,
-        ],
+        numbers(THURBER_X),
+        numbers(THURBER_Y),
+        numbers(THURBER_B),
+        numbers(THURBER_SD),
         5.6427082397e3,
         [[1300.0, 1500.0, 500.0, 75.0, 1.0, 0.4, 0.05]],
     ),
@@ -167,9 +97,8 @@ NIST: dict[
 CASES = [(name, start) for name, case in NIST.items() for start in range(len(case[-1]))]
 
 
-def solve(name: str, start: list[float], iterations: int = 200) -> tuple[Fit, float]:
-    """The fit with hardly any prior, residuals in the certified standard deviation, slopes by central
-    differences."""
+def solve(name: str, start: list[float]) -> tuple[Fit, float]:
+    """The fit with hardly any prior, residuals in the certified deviation, slopes by central differences."""
     model, x, y, certified, _, squares, _ = NIST[name]
     at, data = np.array(x), np.array(y)
     sigma = float(np.sqrt(squares / (len(x) - len(certified))))
@@ -184,16 +113,8 @@ def solve(name: str, start: list[float], iterations: int = 200) -> tuple[Fit, fl
         return np.stack(columns, axis=-1)
 
     begin = np.array(start)
-    nothing = 1e9 * np.abs(certified)
-    return minimise(
-        residual,
-        slopes,
-        begin,
-        begin,
-        nothing,
-        (np.full(len(begin), -np.inf), np.full(len(begin), np.inf)),
-        iterations,
-    ), sigma
+    limits = np.full(len(begin), -np.inf), np.full(len(begin), np.inf)
+    return minimise(residual, slopes, begin, begin, 1e9 * np.abs(certified), limits, 200), sigma
 
 
 @pytest.mark.parametrize(("name", "start"), CASES)
@@ -203,13 +124,11 @@ def test_certified_values_are_found(name: str, start: int) -> None:
     assert_allclose(((np.array(y) - model(np.array(certified), np.array(x))) ** 2).sum(), squares, rtol=1e-9)
     fit, sigma = solve(name, starts[start])
     # the fit ends where a step is below 1e-3 of a standard error, or gains less than 1e-4 of the loss, after
-    # which Gauss and Newton
-    # converge at once: some hundredths of a standard error
+    # which Gauss and Newton converge at once: some hundredths of a standard error
     assert_allclose((fit.theta - certified) / deviations, 0.0, atol=0.02)
     assert_allclose(fit.loss * sigma**2, squares, rtol=1e-4)
     assert_allclose(np.sqrt(np.diag(np.linalg.inv(fit.hessian))), deviations, rtol=0.02)
-    # and `covariance` is that, the samples counted as what they are worth (at the optimum the variance is
-    # what was certified)
+    # and `covariance` is that, the samples counted as what they are worth
     worth = len(x) / effective_size(fit.residual)
     assert_allclose(np.sqrt(np.diag(covariance(fit))), np.array(deviations) * np.sqrt(worth), rtol=0.02)
     assert not any(fit.at_bound)
@@ -225,28 +144,13 @@ def line(n: int = 60, p: int = 4, seed: int = 3) -> tuple[np.ndarray, np.ndarray
 def refit(J: np.ndarray, data: np.ndarray, mean: np.ndarray, sd: np.ndarray) -> np.ndarray:
     """Normal equations with the prior."""
     flat = J.reshape(-1, J.shape[-1])
-    return np.asarray(
-        np.linalg.solve(flat.T @ flat + np.diag(sd**-2.0), flat.T @ data.ravel() + mean / sd**2)
-    )
-
-
-def linear_fit(
-    J: np.ndarray,
-    data: np.ndarray,
-    mean: np.ndarray,
-    sd: np.ndarray,
-    low: float = -np.inf,
-    high: float = np.inf,
-) -> Fit:
-    limits = np.full(len(mean), low), np.full(len(mean), high)
-    return minimise(
-        lambda b: data - J @ b, lambda b, r: J, np.clip(np.zeros(len(mean)), low, high), mean, sd, limits, 60
-    )
+    return np.linalg.solve(flat.T @ flat + np.diag(sd**-2.0), flat.T @ data.ravel() + mean / sd**2)
 
 
 def test_a_linear_problem_with_priors_is_its_normal_equations() -> None:
     J, data, mean, sd = line()
-    fit = linear_fit(J, data, mean, sd)
+    limits = np.full(4, -np.inf), np.full(4, np.inf)
+    fit = minimise(lambda b: data - J @ b, lambda b, r: J, np.zeros(4), mean, sd, limits, 60)
     # steps below 1e-3 of a standard error are the last; the damping then is 1e-5 of the step before
     assert_allclose(fit.theta, refit(J, data, mean, sd), atol=1e-6)
     assert_array_equal(fit.residual, data - J @ fit.theta)
@@ -277,18 +181,13 @@ def test_the_effective_size_of_an_ar1_is_that_of_its_mean(rho: float) -> None:
     x[0] = rng.normal(size=copies) / np.sqrt(1.0 - rho**2)
     for i in range(1, n):
         x[i] = rho * x[i - 1] + rng.normal(size=copies)
-    # two independent columns are worth two: the formula's N (1 - rho) / (1 + rho), rho itself estimated to 1
-    # / sqrt(8000); a
-    # negative one counts as zero
+    # two independent columns are worth two: the formula's N (1 - rho) / (1 + rho), rho itself estimated to
+    # 1 / sqrt(8000); a negative one counts as zero
     size = effective_size(x[:, :2])
-    assert_allclose(
-        size,
-        2 * n * (1.0 - rho) / (1.0 + rho),
-        rtol=4.0 * 2.0 / (1.0 - rho**2) * np.sqrt((1.0 - rho**2) / (2 * n)),
-    )
+    rtol = 4.0 * 2.0 / (1.0 - rho**2) * np.sqrt((1.0 - rho**2) / (2 * n))
+    assert_allclose(size, 2 * n * (1.0 - rho) / (1.0 + rho), rtol=rtol)
     assert size <= 2 * n
-    # by definition: the variance of a mean is that of a sample over the size; known from 400 copies to sqrt(2
-    # / 400)
+    # by definition: the variance of a mean; known from 400 copies to sqrt(2 / 400)
     assert_allclose(x.var() / x.mean(0).var(), size / 2.0, rtol=4.0 * np.sqrt(2.0 / copies))
 
 
@@ -299,8 +198,7 @@ def test_the_effective_size_of_little_or_nothing() -> None:
 
 
 def test_bic_is_the_likelihood_with_the_noise_fitted() -> None:
-    """-2 log L + p log n, the constant dropped: of two models of the same data the difference is that of full
-    likelihoods."""
+    """-2 log L + p log n, the constant dropped: differences are those of full likelihoods."""
     rng = np.random.default_rng(5)
     one, other = rng.normal(0.0, 1.3, 80), rng.normal(0.0, 1.0, 80)
     full = [
@@ -333,35 +231,25 @@ def test_bounds_hold_at_every_trial_and_are_named() -> None:
     assert_array_equal(fit.theta[outside], np.where(free < low, low, high)[outside])
     # and the free ones are the least squares beside those held
     inside = J[:, :, ~outside]
-    assert_allclose(
-        fit.theta[~outside],
-        refit(inside, data - J[:, :, outside] @ fit.theta[outside], np.zeros(2), np.full(2, 1e6)),
-        atol=1e-4,
-    )
+    beside = data - J[:, :, outside] @ fit.theta[outside]
+    assert_allclose(fit.theta[~outside], refit(inside, beside, np.zeros(2), np.full(2, 1e6)), atol=1e-4)
 
 
 def test_a_step_to_nan_is_taken_back() -> None:
-    """Beyond 1.5 there is no model; the first Gauss-Newton step would lead to 3.2 (and does where there is
-    one)."""
+    """Beyond 1.5 there is no model; the first Gauss-Newton step would lead to 3.2."""
 
     def run(edge: float) -> tuple[Fit, list[float]]:
         tried: list[float] = []
 
         def residual(b: np.ndarray) -> np.ndarray:
             tried.append(float(b[0]))
-            return (
-                np.array([[10.0 * (np.tanh(1.2) - np.tanh(b[0]))]])
-                if b[0] < edge
-                else np.full((1, 1), np.nan)
-            )
+            return np.array([[10.0 * (np.tanh(1.2) - np.tanh(b[0])) if b[0] < edge else np.nan]])
 
         def slopes(b: np.ndarray, r: np.ndarray) -> np.ndarray:
             return np.array([[[10.0 / np.cosh(b[0]) ** 2]]])
 
-        unbounded = np.array([-np.inf]), np.array([np.inf])
-        return minimise(
-            residual, slopes, np.array([-1.0]), np.zeros(1), np.full(1, 1e6), unbounded, 50
-        ), tried
+        free = np.array([-np.inf]), np.array([np.inf])
+        return minimise(residual, slopes, np.array([-1.0]), np.zeros(1), np.full(1, 1e6), free, 50), tried
 
     for edge in (np.inf, 1.5):
         fit, tried = run(edge)

@@ -1,9 +1,7 @@
-"""The constrained minimum of energy against published figures, against the free minimum, and against the
-package's own rod."""
+"""The constrained minimum of energy against published figures, the free minimum, and the package's rod."""
 
 from __future__ import annotations
 
-import math
 from functools import cache
 from typing import Any
 
@@ -28,20 +26,10 @@ def at_rest(name: str, elements: int = 40) -> contact_energy.Minimum:
 
 
 def pressed(kappa: float, compliance: float, elements: int = 20, **options: Any) -> contact_energy.Minimum:
-    """The prototype, bent in the plane to a mean curvature kappa [1/m] that would take its tip through the
-    wall at x = 12 mm."""
+    """The prototype, bent to a mean curvature kappa [1/m] that would take its tip through the wall."""
     lengths = contact_cases.bent([0.07], [RING], [kappa], [0.0])
-    return contact_energy.minimise(
-        0.07,
-        [0.0022, 0.0022, 0.001],
-        RING,
-        lengths,
-        compliance,
-        obstacle=WALL,
-        elements=elements,
-        load_steps=4,
-        **options,
-    )
+    rod = 0.07, [0.0022, 0.0022, 0.001], RING, lengths, compliance
+    return contact_energy.minimise(*rod, obstacle=WALL, elements=elements, load_steps=4, **options)
 
 
 def extrapolated(coarse: Any, fine: Any) -> Any:
@@ -59,9 +47,8 @@ def test_tip_on_a_wall(kappa: float, force: float, z: float) -> None:
     assert coarse.converged
     assert fine.converged
     assert fine.tip_position[0] == pytest.approx(0.012, abs=1e-9)
-    assert_allclose(
-        extrapolated(coarse.total_force, fine.total_force), [-force, 0.0, 0.0], rtol=0, atol=0.002 * force
-    )
+    found = extrapolated(coarse.total_force, fine.total_force)
+    assert_allclose(found, [-force, 0.0, 0.0], rtol=0, atol=0.002 * force)
     assert extrapolated(coarse.tip_position, fine.tip_position)[2] == pytest.approx(z, abs=3e-6)
     # the whole of it acts on the tip
     assert [p.arclength for p in contact_energy.patches(fine)] == pytest.approx([0.07])
@@ -74,8 +61,7 @@ def test_wires_that_stretch_press_less() -> None:
 
 
 def test_bent_far_the_planar_answer_is_a_ridge() -> None:
-    """From a mean curvature of about 12.4 1/m on the tip slides along the wall and the rod leaves the
-    plane."""
+    """From a mean curvature of about 12.4 1/m the tip slides along the wall and leaves the plane."""
     assert pressed(12.0, 1e-5).stability > 0.05
     ridge, valley = pressed(16.0, 1e-5, planar=True), pressed(16.0, 1e-5, nudge=[0.0, 0.01, 0.0])
     assert ridge.stability < -0.5
@@ -96,13 +82,9 @@ def test_away_from_the_obstacle_it_is_the_free_rod(name: str) -> None:
     free = energy.minimise(**case, levels=3)
     assert not fine.contact_force.any()
     # two extrapolations of different rules: the fourth power of h is left
-    assert_allclose(
-        extrapolated(coarse.tip_position, fine.tip_position), free.tip_position, rtol=0, atol=2e-8
-    )
-    assert_allclose(
-        extrapolated(coarse.tip_rotation, fine.tip_rotation), free.tip_rotation, rtol=0, atol=2e-6
-    )
-    assert_allclose(extrapolated(coarse.tension, fine.tension), free.tension, rtol=0, atol=1e-4)
+    for name, atol in (("tip_position", 2e-8), ("tip_rotation", 2e-6), ("tension", 1e-4)):
+        found = extrapolated(getattr(coarse, name), getattr(fine, name))
+        assert_allclose(found, getattr(free, name), rtol=0, atol=atol)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -122,16 +104,11 @@ def test_signorini(name: str) -> None:
 
 @pytest.mark.parametrize("name", CASES)
 def test_a_force_between_the_ends_is_square_to_the_rod(name: str) -> None:
-    """Where phi is least along the rod its normal has no part along it; a node that held the rod would fail
-    this."""
+    """Where phi is least its normal has no component along the rod; a node that held it would fail this."""
     found = at_rest(name)
     for i in np.flatnonzero(np.linalg.norm(found.contact_force[:-1], axis=1) > 1e-6):
-        # both sides are arcs of one curvature: the tangent in the middle is the chord from the far ends,
-        # weighted
-        ahead, behind = (
-            found.positions[i + 1] - found.positions[i],
-            found.positions[i] - found.positions[i - 1],
-        )
+        # both sides are arcs of one curvature: the tangent is the mean of both chords, weighted
+        behind, ahead = np.diff(found.positions[i - 1 : i + 2], axis=0)
         a, b = np.linalg.norm(ahead), np.linalg.norm(behind)
         tangent = (ahead / a * b + behind / b * a) / (a + b)
         across = found.contact_force[i] @ tangent / np.linalg.norm(found.contact_force[i])
@@ -149,8 +126,7 @@ def test_balance(name: str) -> None:
     force[-1] += case["tip_force"]
     assert_allclose(found.base_force + force.sum(axis=0), 0.0, rtol=0, atol=1e-6)
     moment = np.cross(found.positions - found.positions[0], force).sum(axis=0)
-    # carried from the middles of three elements to the base; and a line force on the ends of its element is f
-    # h^2 / 8 of moment
+    # carried from the middles of three elements; a line force on the ends of its element is f h^2 / 8
     atol = 1e-4 * np.abs(moment).max() + np.linalg.norm(line) * step.max() ** 2 / 6.0
     assert_allclose(found.base_moment, -moment, rtol=0, atol=atol)
 
@@ -170,74 +146,32 @@ def test_base_force_is_the_work_of_moving_the_base(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["bar", "sphere", "heavy", "tube"])
 def test_error_falls_with_the_square_of_the_element(name: str) -> None:
-    tips, forces = zip(
-        *[(found.tip_position, found.total_force) for found in (at_rest(name, n) for n in (10, 20, 40))],
-        strict=True,
-    )
-    for values in (tips, forces):
-        far, near = np.linalg.norm(values[0] - values[1]), np.linalg.norm(values[1] - values[2])
+    found = [at_rest(name, n) for n in (10, 20, 40)]
+    for values in ([one.total_force for one in found], [one.tip_position for one in found]):
+        far, near = np.linalg.norm(np.diff(values, axis=0), axis=1)
         # where in its element the rod touches changes from grid to grid: no clean power of four
         assert near < 0.5 * far
-    assert np.linalg.norm(tips[1] - tips[2]) < 2e-5
+    assert near < 2e-5  # of the tip
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_the_package_has_the_same_rod_under_these_forces(name: str) -> None:
-    """Contact forces as point forces on the package's rod, which solves a boundary value problem and knows no
-    obstacle."""
+    """Contact forces as point forces on the package's rod, a boundary value problem without obstacles."""
     case, found = CASES[name], at_rest(name, 80)
-    on = [
-        i
-        for i in np.flatnonzero(np.linalg.norm(found.contact_force, axis=1) > 1e-9)
-        if i < len(found.arclength) - 1
-    ]
-    state = fastrod.Simulator(robot(case), points_per_segment=80).settle(
+    on = np.flatnonzero(np.linalg.norm(found.contact_force[:-1], axis=1) > 1e-9)
+    state = fastrod.Simulator(contact_cases.robot_of(case), points_per_segment=80).settle(
         case["tendon_length"] or None,
         tip_force=found.contact_force[-1] + np.asarray(case["tip_force"]),
         line_force=case["line_force"],
         point_force=[(found.arclength[i], found.contact_force[i]) for i in on] or None,
     )
     assert state.ok.all()
-    # what 80 elements leave, mostly by the contact force they are given: 3e-6 m, and 7e-6 m for the heavy rod
-    # of 0.3 m
+    # what 80 elements leave, mostly by the contact force: 3e-6 m, and 7e-6 m for the rod of 0.3 m
     assert_allclose(state.tip_position[0], found.tip_position, rtol=0, atol=1e-5)
     assert_allclose(state.tension[0], found.tension, rtol=0, atol=5e-4)
     # on the host, so of the other sign
     assert_allclose(state.base_wrench[0, :3], -found.base_force, rtol=0, atol=1e-6)
     assert_allclose(state.base_wrench[0, 3:], -found.base_moment, rtol=0, atol=1e-5)
-
-
-def robot(case: dict[str, Any]) -> fastrod.Robot:
-    """The package's words for a case."""
-    segments = []
-    places = np.zeros((len(case["length"]), 0, 2)) if case["offsets"] is None else np.asarray(case["offsets"])
-    crossed = (~np.isnan(places[..., 0])).sum(axis=0)
-    for k, (length, K) in enumerate(zip(case["length"], case["K"], strict=True)):
-        routed = tuple(
-            fastrod.Tendon(
-                offset=tuple(float(np.hypot(*p)) for p in places[: k + 1, i]),
-                angle=tuple(math.atan2(p[1], p[0]) for p in places[: k + 1, i]),
-                compliance=case["compliance"],
-                pretension=case["pretension"],
-            )
-            for i in np.flatnonzero(crossed == k + 1)
-        )
-        mode = "tendon_length" if routed else "passive"
-        segments.append(
-            fastrod.Segment(
-                length=length,
-                bending_stiffness=(K[0], K[1]),
-                torsional_stiffness=K[2],
-                tendons=routed,
-                mode=mode,
-            )
-        )
-    # upright, or turned about y so that d3 lies along x
-    quarter = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
-    upright = np.array_equal(case["base_rotation"], np.eye(3))
-    return fastrod.Robot(
-        name="case", segments=tuple(segments), base_quaternion=(1.0, 0.0, 0.0, 0.0) if upright else quarter
-    )
 
 
 @pytest.mark.parametrize(
@@ -257,26 +191,12 @@ def robot(case: dict[str, Any]) -> fastrod.Robot:
 def test_distances(solid: contact_shapes.Obstacle) -> None:
     """A signed distance has a unit gradient; and ours are the derivatives they say, by differences."""
     points = np.random.default_rng(0).normal(size=(200, 3))
-    found, step = solid.distance(points), 1e-6
-    sides = [
-        (solid.distance(points + step * axis), solid.distance(points - step * axis)) for axis in np.eye(3)
-    ]
+    found, steps = solid.distance(points), 1e-6 * np.eye(3)
+    sides = [(solid.distance(points + step), solid.distance(points - step)) for step in steps]
+    normal = np.stack([(a.value - b.value) / 2e-6 for a, b in sides], axis=1)
+    hessian = np.stack([(a.normal - b.normal) / 2e-6 for a, b in sides], axis=2)
     assert_allclose(np.linalg.norm(found.normal, axis=1), 1.0, rtol=1e-12)
-    assert_allclose(
-        found.normal,
-        np.stack([(a.value - b.value) / (2.0 * step) for a, b in sides], axis=1),
-        rtol=0,
-        atol=1e-8,
-    )
-    assert_allclose(
-        found.hessian,
-        np.stack([(a.normal - b.normal) / (2.0 * step) for a, b in sides], axis=2),
-        rtol=0,
-        atol=1e-7,
-    )
-    assert_allclose(
-        solid.distance(points - found.value[:, None] * found.normal).value[found.value > 0],
-        0.0,
-        rtol=0,
-        atol=1e-12,
-    )
+    assert_allclose(found.normal, normal, rtol=0, atol=1e-8)
+    assert_allclose(found.hessian, hessian, rtol=0, atol=1e-7)
+    nearest = solid.distance(points - found.value[:, None] * found.normal)
+    assert_allclose(nearest.value[found.value > 0], 0.0, rtol=0, atol=1e-12)

@@ -26,10 +26,8 @@ def test_appendix_j_cantilever(truth: Read) -> None:
 
 def test_appendix_b_paper_mode_from_a_cold_start(truth: Read) -> None:
     table = truth("appB_truth.csv")
-    sim = Simulator(rod("paper", offset=0.01), n_robots=100)
-    state = sim.settle(
-        table("L1", "L2", "L3", "L4"), tip_force=table("Fx", "Fy", "Fz"), line_force=(1.0, 1.0, 1.0)
-    )
+    loads = {"tip_force": table("Fx", "Fy", "Fz"), "line_force": (1.0, 1.0, 1.0)}
+    state = Simulator(rod("paper", offset=0.01), n_robots=100).settle(table("L1", "L2", "L3", "L4"), **loads)
     assert state.ok.all()
     assert state.passes.max() <= 6
     assert state.residual.max() <= 1e-9
@@ -58,11 +56,8 @@ def test_two_segment_robots(truth: Read, name: str, mode: str) -> None:
     tension, length = table(*(f"q{i}" for i in range(1, 7))), table(*(f"kir_len{i}" for i in range(1, 7)))
     loads = {"tip_force": table("fx", "fy", "fz"), "tip_moment": table("mx", "my", "mz")}
     sim = Simulator(robot, n_robots=len(tension))
-    state = (
-        sim.settle(tension=tension, **loads)
-        if mode == "tendon_tension"
-        else sim.settle(length - 1e-5 * tension, **loads)
-    )
+    given = {"tension": tension} if mode == "tendon_tension" else {"tendon_length": length - 1e-5 * tension}
+    state = sim.settle(**given, **loads)
     assert state.ok.all()
     np.testing.assert_allclose(state.tip_position, table("kir_px", "kir_py", "kir_pz"), rtol=0, atol=1e-7)
     rotation = table(*(f"kir_r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))).reshape(-1, 3, 3)
@@ -71,32 +66,21 @@ def test_two_segment_robots(truth: Read, name: str, mode: str) -> None:
     np.testing.assert_allclose(state.tension, tension, rtol=0, atol=1e-5)
 
 
+def robot_of(row: dict[str, str], n: int) -> Robot:
+    number = {name: float(row[name]) for name in ("l", "EI", "GJ", "offset", "c")}
+    stiffness = {"bending_stiffness": (number["EI"],) * 2, "torsional_stiffness": number["GJ"]}
+    tendons = tuple(
+        Tendon(offset=number["offset"], angle=2 * np.pi * i / n, compliance=number["c"]) for i in range(n)
+    )
+    return Robot(name=row["case"], segments=(Segment(length=number["l"], **stiffness, tendons=tendons),))
+
+
 @pytest.mark.parametrize("n", [3, 4])
 def test_prescribed_lengths_loads_in_any_direction(truth: Read, n: int) -> None:
     table = truth("tendon_length_truth.csv").where("n", str(n))
-    robots = [
-        Robot(
-            name=row["case"],
-            segments=(
-                Segment(
-                    length=float(row["l"]),
-                    bending_stiffness=(float(row["EI"]), float(row["EI"])),
-                    torsional_stiffness=float(row["GJ"]),
-                    tendons=tuple(
-                        Tendon(
-                            offset=float(row["offset"]), angle=2 * np.pi * i / n, compliance=float(row["c"])
-                        )
-                        for i in range(n)
-                    ),
-                ),
-            ),
-        )
-        for row in table.rows
-    ]
     lengths, tension = table(*(f"L{i + 1}" for i in range(n))), table(*(f"T{i + 1}" for i in range(n)))
-    state = Simulator(robots).settle(
-        lengths, tip_force=table("Fx", "Fy", "Fz"), line_force=table("fx", "fy", "fz")
-    )
+    loads = {"tip_force": table("Fx", "Fy", "Fz"), "line_force": table("fx", "fy", "fz")}
+    state = Simulator([robot_of(row, n) for row in table.rows]).settle(lengths, **loads)
     assert state.ok.all()
     np.testing.assert_allclose(state.tip_position, table("tip_x", "tip_y", "tip_z"), rtol=0, atol=1e-7)
     np.testing.assert_allclose(state.tension, tension, rtol=1e-4)
