@@ -266,8 +266,8 @@ def test_a_sweep_over_a_log_is_its_steps_one_by_one(name: str) -> None:
 
 def test_memories_are_as_wide_as_their_operators_need() -> None:
     """What a sweep leaves behind: numbers in every column of a tendon, a bend or a step, and no other."""
-    wires = {"backlash": 3, "friction": 6, "creep": 2, "dynamics": 3}
-    assert {*wires, "latency", "plastic_set"} <= set(OPERATORS)
+    columns_of = {"backlash": 3, "friction": 6, "creep": 2, "dynamics": 3}
+    assert {*columns_of, "latency", "plastic_set"} <= set(OPERATORS)
     robot = two_segments()
     wiring, n = route(robot), robot.n_tendons
     dl = 0.002 * np.cumsum(np.random.default_rng(3).uniform(-1.0, 1.0, (1, 20, n)), axis=1)

@@ -192,7 +192,7 @@ def test_one_effect_on_the_rod_is_exact_at_its_typical_size(name: str) -> None:
 
 
 def test_the_local_model_errs_by_the_square_of_the_distance() -> None:
-    """Wires, forces and camera together: half the way, a quarter of the error."""
+    """Tendons, forces and camera together: half the way, a quarter of the error."""
     here = base()
     first = len(here.theta)
     model = here.model.with_effect("payload").with_effect("stiffening").with_effect("lens")

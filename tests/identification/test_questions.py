@@ -236,11 +236,11 @@ def test_replay_prints_its_questions_and_is_done(tmp_path: Path, monkeypatch: An
     run = farlog.log(300)
     Path("flipped.csv").write_text(farlog.csv(run._replace(dl=-run.dl)))
     assert main(["replay", "flipped.csv", "--robot", "mine.toml"]) == 0
-    told = capsys.readouterr()
-    assert "excursion" in told.out
+    reported = capsys.readouterr()
+    assert "excursion" in reported.out
     words = r"^log 'flipped' is further from robot 'mine' .* the sign of every dl_ reversed"
-    assert re.search(words, told.err)
-    assert len(told.err.splitlines()) == 1
+    assert re.search(words, reported.err)
+    assert len(reported.err.splitlines()) == 1
     rest = np.asarray(ROBOT.rest_tendon_length)
     Path("absolute.csv").write_text(farlog.csv(run._replace(dl=run.dl + rest)))
     for command in ("replay", "identify"):
