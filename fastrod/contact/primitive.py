@@ -93,7 +93,8 @@ class Primitive:
         """Raise `InputError` where a shape of this size has no distance, or is not convex."""
         signed, radius = self._distance[0], self.radius(size)
         scale = radius if math.isfinite(radius) else 1.0
-        where, first = f"primitive {self.name!r} of size {_shown(size)} m", None
+        where = f"primitive {self.name!r} of size {_rounded(size)} m"
+        first: Triple | None = None
         for x, y, z in _TRIED:
             p = (scale * x, scale * y, scale * z)
             d, n = signed(size, p)
@@ -103,7 +104,7 @@ class Primitive:
             unit = abs(math.hypot(*n) - 1.0) < _CLOSE
             if not (d > 0.0 and unit and abs(signed(size, q)[0]) < _CLOSE * scale):
                 raise InputError(
-                    f"{where} has the distance {d:.6g} m and the normal {_shown(n)} at {_shown(p)} m; beyond "
+                    f"{where} has the distance {d:.6g} m and the normal {_rounded(n)} at {_rounded(p)} m; beyond "
                     "its radius a distance is positive, a normal has length 1, and the point one distance "
                     "back along it is on the surface."
                 )
@@ -111,7 +112,7 @@ class Primitive:
             middle = (0.5 * (q[0] + first[0]), 0.5 * (q[1] + first[1]), 0.5 * (q[2] + first[2]))
             if signed(size, middle)[0] > _CLOSE * scale:
                 raise InputError(
-                    f"{where} is not convex: {_shown(middle)} m is outside, between two points of its "
+                    f"{where} is not convex: {_rounded(middle)} m is outside, between two points of its "
                     "surface; make a mesh of it."
                 )
 
@@ -125,7 +126,7 @@ class Primitive:
             ) from error
 
 
-def _shown(v: Triple) -> str:
+def _rounded(v: Triple) -> str:
     return f"({v[0]:.6g}, {v[1]:.6g}, {v[2]:.6g})"
 
 
