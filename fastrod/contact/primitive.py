@@ -104,9 +104,9 @@ class Primitive:
             unit = abs(math.hypot(*n) - 1.0) < _CLOSE
             if not (d > 0.0 and unit and abs(signed(size, q)[0]) < _CLOSE * scale):
                 raise InputError(
-                    f"{where} has the distance {d:.6g} m and the normal {_rounded(n)} at {_rounded(p)} m; beyond "
-                    "its radius a distance is positive, a normal has length 1, and the point one distance "
-                    "back along it is on the surface."
+                    f"{where} has the distance {d:.6g} m and the normal {_rounded(n)} at {_rounded(p)} m; "
+                    "beyond its radius a distance is positive, a normal has length 1, and the point one "
+                    "distance back along it is on the surface."
                 )
             first = first or q
             middle = (0.5 * (q[0] + first[0]), 0.5 * (q[1] + first[1]), 0.5 * (q[2] + first[2]))
