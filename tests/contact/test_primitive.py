@@ -45,7 +45,7 @@ def smallest_distance(size, p) -> float:
     def square(angles) -> float:
         return float(((on_surface(size, angles) - p) ** 2).sum()) / scale
 
-    options = {"xatol": 1e-9, "fatol": 1e-18, "maxiter": 2000}
+    options = {"xatol": 1e-7, "fatol": 1e-15}
     found = [minimize(square, grid[k], method="Nelder-Mead", options=options).fun for k in order]
     return math.sqrt(min(found) * scale)
 
