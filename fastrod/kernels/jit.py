@@ -112,12 +112,12 @@ def pointed(function: _Function, signature: Any) -> tuple[_Function, int]:
     """`function` compiled by itself for one signature, and its address in this process for a `caller`: the
     kernels that call it need not be compiled again. Without the compiler a number that stands for it."""
     function = getattr(function, "py_func", function)
-    _POINTED.append(function)
     if _config.DISABLE_JIT:
+        _POINTED.append(function)
         return function, len(_POINTED)
     compiled: Any = _compile(function, folder=_own_folder(function))
     result = compiled.get_compile_result(signature)
-    _POINTED[-1] = compiled
+    _POINTED.append(compiled)
     return compiled, result.library.get_pointer_to_function(result.fndesc.llvm_func_name)
 
 
